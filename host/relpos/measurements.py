@@ -1,0 +1,124 @@
+"""The vocabulary of everything behind the link: what a node, or a recording, can tell us.
+
+Frames and signs: world x east-like, y north-like, z up, metres, radians counter-clockwise
+(REP-103). Times are seconds from the start of the run on one clock. Every class is one row of
+the run format's file of the same name, so that a live link, a recording and a simulation speak
+alike and an estimator cannot tell them apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Displacement of ``node`` since its previous motion, seen from that previous pose.
+
+    ``dx_m`` is forward and ``dy_m`` left in the node's own heading frame at the previous motion
+    (paper sect. IV-B reports the same three numbers); ``dtheta_rad`` is counter-clockwise. The
+    sigmas are standard deviations where the source knows them.
+    """
+
+    time_s: float
+    node: int
+    dx_m: float
+    dy_m: float
+    dtheta_rad: float
+    sigma_x_m: float | None = None
+    sigma_y_m: float | None = None
+    sigma_theta_rad: float | None = None
+    gain_version: int | None = None
+    moving: bool | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """One UWB two-way-ranging result between ``node`` (the initiator) and ``peer``."""
+
+    time_s: float
+    node: int
+    peer: int
+    range_m: float
+    rss_dbm: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Height:
+    """Height of ``node`` over its own start, from pressure."""
+
+    time_s: float
+    node: int
+    height_m: float
+    sigma_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Heading:
+    """An absolute heading of ``node``: magnetic, or a phone's."""
+
+    time_s: float
+    node: int
+    heading_rad: float
+    sigma_rad: float | None = None
+    source: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """One health figure of ``node``: battery, link, bus errors, resets."""
+
+    time_s: float
+    node: int
+    name: str
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """A mark in the recording: landmark press, foot contact, bout."""
+
+    time_s: float
+    node: int
+    event: str
+    value: str
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step as the node's dead reckoning saw it, at mid-stance."""
+
+    time_s: float
+    node: int
+    length_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """Ground truth of ``node``, for evaluation alone: no estimator ever sees one."""
+
+    time_s: float
+    node: int
+    x_m: float
+    y_m: float
+    heading_rad: float | None = None
+    z_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """What is known of ``node``'s pose at the start; ``None`` sigmas mean exactly known."""
+
+    node: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    sigma_m: float = 0.0
+    sigma_rad: float = 0.0
+
+
+Measurement = Motion | Range | Height | Heading
+"""What an estimator consumes."""
+
+Observation = Motion | Range | Height | Heading | Status | Event | Step
+"""What a link, a recording or an emulated team delivers."""
