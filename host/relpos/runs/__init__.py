@@ -1,0 +1,1 @@
+"""Run directories: how a recording comes in and an estimate goes out."""

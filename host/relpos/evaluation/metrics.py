@@ -1,0 +1,328 @@
+"""The metrics of the run format, exactly: how far an estimate of a team is from its truth.
+
+Everything here works on arrays and knows neither files nor estimators. With estimated positions
+p_i(t), true ones q_i(t) and pairs i < j, the epochs are all whole seconds where both exist; a
+track is interpolated linearly between rows at most ``MAX_GAP_S`` apart, its heading on the
+circle (the short way round).
+
+All figures are invariant to the frame of the estimate: distances, shapes after the best
+rotation without reflection, and vectors in the body frame of the node that looks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+
+MAX_GAP_S = 2.0
+"""Rows further apart than this are not interpolated between (run format, "Metrics, exactly")."""
+
+_TIME_SLACK_S = 1e-6
+"""A row this near to a whole second is on it: files carry times rounded to 0.1 ms or so."""
+
+MIN_NODES_FOR_SHAPE = 3
+"""The aligned position error says nothing for two nodes, so epochs with fewer are left out."""
+
+
+def _floats(values: object) -> Floats:
+    return np.asarray(values, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Track:
+    """Where one node was, or was believed to be: equally long arrays, NaN where not known.
+
+    Rows may come in any order; of rows at the same time the last one counts. A row without a
+    position (NaN) is no row.
+    """
+
+    time_s: Floats
+    x_m: Floats
+    y_m: Floats
+    heading_rad: Floats = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        """Make float arrays of equal length of whatever sequences were given."""
+        for name in ("time_s", "x_m", "y_m", "heading_rad"):
+            object.__setattr__(self, name, _floats(getattr(self, name)))
+        if self.heading_rad.size == 0:
+            object.__setattr__(self, "heading_rad", np.full(self.time_s.shape, np.nan))
+        shapes = {a.shape for a in (self.time_s, self.x_m, self.y_m, self.heading_rad)}
+        if len(shapes) != 1 or self.time_s.ndim != 1:
+            raise ValueError(f"a track needs arrays of one dimension and one length, not {shapes}")
+
+
+@dataclass(frozen=True)
+class PairTrack:
+    """The estimated distance of one pair and its standard deviation over time, (n,) arrays."""
+
+    time_s: Floats
+    distance_m: Floats
+    sigma_distance_m: Floats
+
+    def __post_init__(self) -> None:
+        """Make float arrays of equal length of whatever sequences were given."""
+        for name in ("time_s", "distance_m", "sigma_distance_m"):
+            object.__setattr__(self, name, _floats(getattr(self, name)))
+        if not self.time_s.shape == self.distance_m.shape == self.sigma_distance_m.shape:
+            raise ValueError("a pair's track needs arrays of one length")
+
+
+Tracks = Mapping[int, Track]
+Pair = tuple[int, int]
+Pairs = Mapping[Pair, PairTrack]
+
+
+@dataclass(frozen=True)
+class PairMetrics:
+    """One pair i < j over all its epochs; NaN where a figure is undefined.
+
+    ``distance_error_mean_m`` is estimated minus true; ``body_frame_rmse_m`` covers both
+    directions.
+    """
+
+    epochs: int
+    distance_rmse_m: float
+    distance_error_mean_m: float
+    distance_error_max_m: float
+    body_frame_rmse_m: float
+    nees_distance: float
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """The four figures of the run format, per pair and over time.
+
+    ``time_s`` is (T,): the epochs at which at least one pair, or one node, could be scored. The
+    ``*_over_time`` arrays are (T,) and hold the same root mean square (NEES: mean) at one epoch;
+    the ``pair_*`` arrays are (T, P) in the order of ``pair_ids``. NaN means undefined there.
+    """
+
+    relative_distance_rmse_m: float
+    relative_position_rmse_m: float
+    body_frame_rmse_m: float
+    nees_distance: float
+    pairs: dict[Pair, PairMetrics]
+    time_s: Floats
+    distance_rmse_over_time_m: Floats
+    position_rmse_over_time_m: Floats
+    body_frame_rmse_over_time_m: Floats
+    nees_over_time: Floats
+    pair_ids: tuple[Pair, ...]
+    pair_distance_m: Floats
+    pair_true_distance_m: Floats
+
+    @property
+    def epochs(self) -> int:
+        """Epochs at which at least one pair could be scored."""
+        return int(np.isfinite(self.distance_rmse_over_time_m).sum())
+
+
+def interpolate(time_s: Floats, values: Floats, at_s: Floats, *, circular: bool = False) -> Floats:
+    """Values of a sampled signal at other times, (n,), (n,), (m,) -> (m,).
+
+    NaN outside the samples and inside gaps wider than ``MAX_GAP_S``; a sample that lies on a
+    wanted time counts whatever is around it. ``circular`` interpolates angles the short way
+    round.
+    """
+    good = np.isfinite(time_s) & np.isfinite(values)
+    time_s, values = time_s[good], values[good]
+    order = np.argsort(time_s, kind="stable")
+    time_s, values = time_s[order], values[order]
+    if time_s.size:
+        last_of_equal = np.append(np.diff(time_s) > 0.0, True)
+        time_s, values = time_s[last_of_equal], values[last_of_equal]
+    result = np.full(at_s.shape, np.nan)
+    if not time_s.size:
+        return result
+
+    after = np.searchsorted(time_s, at_s)
+    before = np.clip(after - 1, 0, time_s.size - 1)
+    after = np.clip(after, 0, time_s.size - 1)
+    step_s = time_s[after] - time_s[before]
+    inside = (step_s > 0.0) & (step_s <= MAX_GAP_S + _TIME_SLACK_S)
+    inside &= (time_s[before] <= at_s) & (at_s <= time_s[after])
+    change = values[after] - values[before]
+    if circular:
+        change = wrap_angle(change)
+    share = np.divide(at_s - time_s[before], step_s, out=np.zeros_like(at_s), where=step_s > 0.0)
+    result[inside] = (values[before] + share * change)[inside]
+    for neighbour in (after, before):
+        on_sample = np.abs(time_s[neighbour] - at_s) <= _TIME_SLACK_S
+        result[on_sample] = values[neighbour][on_sample]
+    return result
+
+
+def wrap_angle(angle_rad: Floats) -> Floats:
+    """Angles moved into [-pi, pi)."""
+    return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def whole_seconds(tracks: Iterable[Track]) -> Floats:
+    """Every whole second from the first to the last row of any of the tracks."""
+    times = [t.time_s[np.isfinite(t.time_s)] for t in tracks]
+    times = [t for t in times if t.size]
+    if not times:
+        return np.empty(0)
+    first = math.ceil(min(float(t.min()) for t in times) - _TIME_SLACK_S)
+    last = math.floor(max(float(t.max()) for t in times) + _TIME_SLACK_S)
+    return np.arange(first, last + 1, dtype=np.float64)
+
+
+def aligned_squared_distances(estimate_m: Floats, truth_m: Floats) -> Floats:
+    """Squared distances after the best rigid fit without reflection, (n, 2), (n, 2) -> (n,).
+
+    Both sets are centred and the estimate is rotated by the angle that minimises the sum. In
+    the plane that angle is the argument of sum(conj(p) q), which can only be a rotation.
+    """
+    p = estimate_m - estimate_m.mean(axis=0)
+    q = truth_m - truth_m.mean(axis=0)
+    cosine = float((p * q).sum())
+    sine = float((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum())
+    norm = math.hypot(cosine, sine)
+    c, s = (cosine / norm, sine / norm) if norm > 0.0 else (1.0, 0.0)
+    rotated = np.column_stack((c * p[:, 0] - s * p[:, 1], s * p[:, 0] + c * p[:, 1]))
+    squared: Floats = ((rotated - q) ** 2).sum(axis=1)
+    return squared
+
+
+def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Metrics:
+    """Score an estimate against the truth, as the run format says.
+
+    ``pairs`` gives the estimated distance and its sigma for the NEES (``pairs.csv``), under
+    (node, peer) in either order; without it the NEES is NaN. Nodes that only one side knows
+    are left out. Never raises for missing data: a figure nothing can be said about is NaN.
+    """
+    nodes = sorted(set(estimate) & set(truth))
+    at_s = whole_seconds([truth[n] for n in nodes])
+    count = len(nodes)
+    p, p_heading = _sample([estimate[n] for n in nodes], at_s)
+    q, q_heading = _sample([truth[n] for n in nodes], at_s)
+    known = np.isfinite(p).all(axis=2) & np.isfinite(q).all(axis=2)
+
+    pair_indices = [(i, j) for i in range(count) for j in range(i + 1, count)]
+    pair_ids = tuple((nodes[i], nodes[j]) for i, j in pair_indices)
+    shape = (at_s.size, len(pair_ids))
+    estimated_m, true_m = np.full(shape, np.nan), np.full(shape, np.nan)
+    nees = np.full(shape, np.nan)
+    body_squared = np.full((*shape, 2), np.nan)
+    for k, (i, j) in enumerate(pair_indices):
+        both = known[:, i] & known[:, j]
+        true_distance_m = np.hypot(*(q[:, i] - q[:, j]).T)
+        estimated_m[both, k] = np.hypot(*(p[:, i] - p[:, j]).T)[both]
+        true_m[both, k] = true_distance_m[both]
+        for direction, (a, b) in enumerate(((i, j), (j, i))):
+            seen = _turn(p[:, b] - p[:, a], -p_heading[:, a])
+            really = _turn(q[:, b] - q[:, a], -q_heading[:, a])
+            body_squared[both, k, direction] = ((seen - really) ** 2).sum(axis=1)[both]
+        nees[:, k] = _pair_nees(pairs or {}, pair_ids[k], at_s, true_distance_m)
+
+    position_squared = np.full((at_s.size, count), np.nan)
+    for epoch in np.flatnonzero(known.sum(axis=1) >= MIN_NODES_FOR_SHAPE):
+        there = known[epoch]
+        position_squared[epoch, there] = aligned_squared_distances(p[epoch, there], q[epoch, there])
+
+    error_m = estimated_m - true_m
+    figures = np.concatenate((error_m, position_squared, nees), axis=1)
+    scored = np.flatnonzero(np.isfinite(figures).any(axis=1))
+    return Metrics(
+        relative_distance_rmse_m=_root_mean(error_m**2),
+        relative_position_rmse_m=_root_mean(position_squared),
+        body_frame_rmse_m=_root_mean(body_squared),
+        nees_distance=_mean(nees),
+        pairs={
+            pair: PairMetrics(
+                epochs=int(np.isfinite(error_m[:, k]).sum()),
+                distance_rmse_m=_root_mean(error_m[:, k] ** 2),
+                distance_error_mean_m=_mean(error_m[:, k]),
+                distance_error_max_m=_max_abs(error_m[:, k]),
+                body_frame_rmse_m=_root_mean(body_squared[:, k]),
+                nees_distance=_mean(nees[:, k]),
+            )
+            for k, pair in enumerate(pair_ids)
+        },
+        time_s=at_s[scored],
+        distance_rmse_over_time_m=_root_mean_rows(error_m**2)[scored],
+        position_rmse_over_time_m=_root_mean_rows(position_squared)[scored],
+        body_frame_rmse_over_time_m=_root_mean_rows(body_squared.reshape(at_s.size, -1))[scored],
+        nees_over_time=_mean_rows(nees)[scored],
+        pair_ids=pair_ids,
+        pair_distance_m=estimated_m[scored],
+        pair_true_distance_m=true_m[scored],
+    )
+
+
+def over_seeds(figures: Sequence[float]) -> tuple[float, float]:
+    """Mean of the runs' figures and its standard error (NaN for fewer than two runs)."""
+    values = _floats(figures)
+    if values.size == 0:
+        return math.nan, math.nan
+    if values.size == 1:
+        return float(values[0]), math.nan
+    return float(values.mean()), float(values.std(ddof=1) / math.sqrt(values.size))
+
+
+def _sample(tracks: Sequence[Track], at_s: Floats) -> tuple[Floats, Floats]:
+    """Positions (T, N, 2) and headings (T, N) of the tracks at the wanted times."""
+    position_m = np.full((at_s.size, len(tracks), 2), np.nan)
+    heading_rad = np.full((at_s.size, len(tracks)), np.nan)
+    for n, track in enumerate(tracks):
+        # A half-known position is no position: otherwise x and y could bridge different rows.
+        there = np.isfinite(track.x_m) & np.isfinite(track.y_m)
+        time_s = track.time_s[there]
+        position_m[:, n, 0] = interpolate(time_s, track.x_m[there], at_s)
+        position_m[:, n, 1] = interpolate(time_s, track.y_m[there], at_s)
+        heading_rad[:, n] = interpolate(track.time_s, track.heading_rad, at_s, circular=True)
+    return position_m, heading_rad
+
+
+def _turn(vector_m: Floats, angle_rad: Floats) -> Floats:
+    """Vectors (T, 2) rotated counter-clockwise by angles (T,)."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    x, y = vector_m[:, 0], vector_m[:, 1]
+    return np.column_stack((c * x - s * y, s * x + c * y))
+
+
+def _pair_nees(pairs: Pairs, pair: Pair, at_s: Floats, true_distance_m: Floats) -> Floats:
+    track = pairs.get(pair) or pairs.get((pair[1], pair[0]))
+    if track is None:
+        return np.full(at_s.shape, np.nan)
+    # A sigma of zero claims certainty; the quotient would be infinite and say only that.
+    good = track.sigma_distance_m > 0.0
+    distance_m = interpolate(track.time_s[good], track.distance_m[good], at_s)
+    sigma_m = interpolate(track.time_s[good], track.sigma_distance_m[good], at_s)
+    result: Floats = ((distance_m - true_distance_m) / sigma_m) ** 2
+    return result
+
+
+def _mean(values: Floats) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else math.nan
+
+
+def _root_mean(squares: Floats) -> float:
+    return math.sqrt(_mean(squares)) if np.isfinite(squares).any() else math.nan
+
+
+def _max_abs(values: Floats) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.abs(finite).max()) if finite.size else math.nan
+
+
+def _mean_rows(values: Floats) -> Floats:
+    count = np.isfinite(values).sum(axis=1)
+    total = np.where(np.isfinite(values), values, 0.0).sum(axis=1)
+    means = np.full(count.shape, np.nan)
+    np.divide(total, count, out=means, where=count > 0)
+    return means
+
+
+def _root_mean_rows(squares: Floats) -> Floats:
+    result: Floats = np.sqrt(_mean_rows(squares))
+    return result
