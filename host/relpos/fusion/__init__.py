@@ -1,0 +1,1 @@
+"""From measurements to one picture of the team."""

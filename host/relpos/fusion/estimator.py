@@ -1,0 +1,108 @@
+"""What every estimator takes and gives.
+
+An estimator takes measurements in roughly time order, however they come about (serial port,
+recording, simulation), and yields an :class:`Estimate` at every motion epoch. It knows neither
+files nor ports nor the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from math import atan2, hypot, sqrt
+from typing import Protocol, runtime_checkable
+
+from relpos.measurements import Measurement
+
+
+class NodeStatus(StrEnum):
+    """How far a node's estimate may be trusted; the words of ``estimate.csv``."""
+
+    OK = "ok"
+    AMBIGUOUS = "ambiguous"
+    UNLOCATED = "unlocated"
+    STALE = "stale"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True)
+class NodeEstimate:
+    """One node's pose in the common frame: world axes, metres, radians counter-clockwise.
+
+    The 2 x 2 position covariance is given by its three distinct entries in m^2. An
+    ``unlocated`` node carries the mean of what is known of it and a covariance to match; its
+    numbers are no position to rely on.
+    """
+
+    node: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    variance_x_m2: float
+    variance_y_m2: float
+    covariance_xy_m2: float
+    sigma_heading_rad: float
+    status: NodeStatus
+    z_m: float = 0.0
+    sigma_z_m: float = 0.0
+
+    def _semi_axes(self) -> tuple[float, float]:
+        middle = 0.5 * (self.variance_x_m2 + self.variance_y_m2)
+        radius = hypot(0.5 * (self.variance_x_m2 - self.variance_y_m2), self.covariance_xy_m2)
+        return sqrt(max(middle + radius, 0.0)), sqrt(max(middle - radius, 0.0))
+
+    @property
+    def sigma_major_m(self) -> float:
+        """Standard deviation along the ellipse's long axis."""
+        return self._semi_axes()[0]
+
+    @property
+    def sigma_minor_m(self) -> float:
+        """Standard deviation along the ellipse's short axis."""
+        return self._semi_axes()[1]
+
+    @property
+    def sigma_angle_rad(self) -> float:
+        """Direction of the long axis, counter-clockwise from world x, in (-pi/2, pi/2]."""
+        return 0.5 * atan2(2.0 * self.covariance_xy_m2, self.variance_x_m2 - self.variance_y_m2)
+
+
+@dataclass(frozen=True, slots=True)
+class PairEstimate:
+    """``peer`` as seen from ``node``; the bearing is in the common frame, from world x."""
+
+    node: int
+    peer: int
+    distance_m: float
+    sigma_distance_m: float
+    bearing_rad: float
+    sigma_bearing_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """All nodes at one time in one common frame.
+
+    The frame is that of the priors where there are any, else the pose of the first located node
+    at the start. ``nodes`` is ordered by node id, ``pairs`` holds node < peer of every two
+    located nodes.
+    """
+
+    time_s: float
+    nodes: tuple[NodeEstimate, ...]
+    pairs: tuple[PairEstimate, ...]
+
+
+@runtime_checkable
+class Estimator(Protocol):
+    """Measurements in, estimates out; live, replay and simulation call it in the same way."""
+
+    def process(self, measurement: Measurement) -> list[Estimate]:
+        """Take one measurement; return the estimates it completes, oldest first."""
+
+    def finish(self) -> list[Estimate]:
+        """Work off what waits for a later motion; raise RelposError if the data were unfit."""
+
+    def counters(self) -> Mapping[str, int]:
+        """Name -> how often: everything dropped, rejected, clamped, reset or resampled."""
