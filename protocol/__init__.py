@@ -1,0 +1,1 @@
+"""The wire between node and host, written once: see ``messages.py``."""

@@ -1,0 +1,368 @@
+"""Every message between node and host: the one place where the wire is written.
+
+``generate.py`` makes ``firmware/lib/wire/messages.h``, the C++ test vectors and
+``docs/protocol.md`` from this file. A frame is the payload of one XBee packet:
+
+    magic  version  type  node  boot  sequence(2)   body   crc(2)   [counter(4) tag(8)]
+
+All integers are little-endian. Of the 66 bytes that every XBee variant carries, 12 are kept for
+the authentication (4-byte counter, 8-byte tag), so header, body and CRC have 54. The first two
+bytes mean the same in every version for ever: a frame of a foreign version can always be named.
+The CRC-16/CCITT starts from the layout's fingerprint, not from a constant, so that a peer with
+another layout fails the check instead of being misread (the habit of MAVLink's CRC_EXTRA).
+"""
+
+from __future__ import annotations
+
+import binascii
+import enum
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from .schema import Entries, Message, OutOfRangeError, Quantity
+
+MAGIC = 0xB5
+PROTOCOL_VERSION = 1
+XBEE_PAYLOAD_BYTES = 66
+AUTHENTICATION_BYTES = 12
+FRAME_BYTES = XBEE_PAYLOAD_BYTES - AUTHENTICATION_BYTES
+CRC_BYTES = 2
+COORDINATOR = 0
+BROADCAST = 255
+
+
+class ResetCause(enum.IntEnum):
+    """Why the node started."""
+
+    UNKNOWN = 0
+    POWER_ON = 1
+    EXTERNAL = 2
+    BROWN_OUT = 3
+    WATCHDOG = 4
+    COMMAND = 5
+
+
+class MotionState(enum.IntEnum):
+    """What the wearer does, as the node's gait detection sees it."""
+
+    STARTING = 0
+    STANDING = 1
+    MOVING = 2
+
+
+class Quality(enum.IntFlag):
+    """What weakens the motion since the last report."""
+
+    MAGNETOMETER_VALID = 0x01
+    MAGNETOMETER_DISTURBED = 0x02
+    SATURATED = 0x04
+    FORWARD_AXIS_UNKNOWN = 0x08
+    IMU_GAP = 0x10
+    IRREGULAR_GAIT = 0x20
+    HEIGHT_VALID = 0x40
+    FILTER_RESET = 0x80
+
+
+class RangeQuality(enum.IntFlag):
+    """What weakens one range."""
+
+    WEAK_SIGNAL = 0x01
+    RETRIED = 0x02
+
+
+class CommandCode(enum.IntEnum):
+    """What the host may ask of a node; ``value`` is the command's argument."""
+
+    PING = 0
+    REBOOT = 1
+    SET_REPORT_PERIOD_MS = 2
+    SET_RANGING_PERIOD_MS = 3
+    SET_LEG_LENGTH_MM = 4
+    SET_STEP_GAIN_PERMILLE = 5
+    SET_TEAM_SIZE = 6
+    SET_STEP_REPORTS = 7
+    SET_LED = 8
+    SET_STATUS_PERIOD_MS = 9
+
+
+class CommandResult(enum.IntEnum):
+    """How a command ended."""
+
+    DONE = 0
+    UNKNOWN_COMMAND = 1
+    OUT_OF_RANGE = 2
+    BUSY = 3
+
+
+HEADER = (
+    Quantity("magic", "u8", "Always 0xB5; the same in every version", low=MAGIC, high=MAGIC),
+    Quantity("version", "u8", "Protocol version; the second byte in every version"),
+    Quantity("type", "u8", "Message type"),
+    Quantity("node", "u8", "Whose frame: the sender going up, the addressee going down "
+             "(255: everybody)"),
+    Quantity("boot", "u8", "Counts the node's starts; totals and clock begin anew with each",
+             wraps=True),
+    Quantity("sequence", "u16", "Counts the sender's frames", wraps=True),
+)
+HEADER_BYTES = sum(f.byte_count for f in HEADER)
+
+
+def _time(meaning: str) -> Quantity:
+    return Quantity("time_s", "u32", meaning, raw_name="time_ms", unit="s", per_unit=1000,
+                    wraps=True)
+
+
+MOTION = Message(
+    1,
+    "motion",
+    "Dead reckoning since the node's start, as running totals: the host takes differences, so a "
+    "lost frame loses no motion.",
+    (
+        _time("Node clock at the end of the motion"),
+        Quantity("x_m", "i32", "Total displacement along the heading at the start",
+                 raw_name="x_mm", unit="m", per_unit=1000, wraps=True),
+        Quantity("y_m", "i32", "Total displacement to the left of the heading at the start",
+                 raw_name="y_mm", unit="m", per_unit=1000, wraps=True),
+        Quantity("heading_rad", "i32", "Total turn, counter-clockwise, whole turns included",
+                 raw_name="heading_100urad", unit="rad", per_unit=10_000, wraps=True),
+        Quantity("path_m", "u32", "Total of the step lengths", raw_name="path_mm", unit="m",
+                 per_unit=1000, wraps=True),
+        Quantity("steps", "u16", "Total number of steps", wraps=True),
+        Quantity("variance_along_m2", "u32", "Total variance along the walking direction",
+                 raw_name="variance_along_mm2", unit="m^2", per_unit=1_000_000, wraps=True),
+        Quantity("variance_across_m2", "u32", "Total variance across the walking direction",
+                 raw_name="variance_across_mm2", unit="m^2", per_unit=1_000_000, wraps=True),
+        Quantity("variance_heading_rad2", "u32", "Total variance of the heading",
+                 raw_name="variance_heading_100urad2", unit="rad^2", per_unit=100_000_000,
+                 wraps=True),
+        Quantity("height_m", "i16", "Height over the start, from pressure; see HEIGHT_VALID",
+                 raw_name="height_cm", unit="m", per_unit=100),
+        Quantity("magnetic_heading_rad", "i16", "Heading of the body over magnetic north, "
+                 "counter-clockwise; see MAGNETOMETER_VALID", raw_name="magnetic_heading_100urad",
+                 unit="rad", per_unit=10_000, low=-31_416, high=31_416),
+        Quantity("state", "u8", "Standing or moving", values=MotionState),
+        Quantity("gain_version", "u8", "Counts the changes of leg length and step gain",
+                 wraps=True),
+        Quantity("quality", "u8", "What weakens this motion", values=Quality),
+    ),
+)
+
+RANGES = Message(
+    2,
+    "ranges",
+    "Distances to other nodes by UWB two-way ranging; failures are counted in the status.",
+    (_time("Node clock when the frame was filled"),),
+    Entries(
+        "ranges",
+        "range",
+        (
+            Quantity("peer", "u8", "The other node"),
+            Quantity("range_m", "u24", "Distance", raw_name="range_mm", unit="m", per_unit=1000,
+                     low=1, high=200_000),
+            Quantity("rss_dbm", "i8", "Signal strength", unit="dBm"),
+            Quantity("age_s", "u16", "How long before the frame's time it was measured",
+                     raw_name="age_ms", unit="s", per_unit=1000),
+            Quantity("quality", "u8", "What weakens this range", values=RangeQuality),
+        ),
+        most=5,
+    ),
+)
+
+STATUS = Message(
+    3,
+    "status",
+    "The node's health.",
+    (
+        _time("Node clock"),
+        Quantity("firmware_major", "u8", "Firmware version, first part"),
+        Quantity("firmware_minor", "u8", "Firmware version, second part"),
+        Quantity("firmware_patch", "u8", "Firmware version, third part"),
+        Quantity("uptime_s", "u32", "Time since the start", unit="s"),
+        Quantity("reset_cause", "u8", "Why the node started", values=ResetCause),
+        Quantity("battery_v", "u16", "Supply voltage; 0 where it is not measured",
+                 raw_name="battery_mv", unit="V", per_unit=1000),
+        Quantity("bus_errors", "u16", "I2C transactions that failed", wraps=True),
+        Quantity("ranging_successes", "u16", "Ranges obtained", wraps=True),
+        Quantity("ranging_failures", "u16", "Ranging exchanges that gave none", wraps=True),
+        Quantity("worst_tick_s", "u16", "Longest 50 Hz tick since the last status",
+                 raw_name="worst_tick_us", unit="s", per_unit=1_000_000),
+        Quantity("missed_ticks", "u16", "50 Hz ticks that came too late to be kept", wraps=True),
+        Quantity("free_stack_bytes", "u16", "Bytes between heap end and deepest stack so far",
+                 unit="B"),
+        Quantity("bad_frames", "u16", "Received frames that failed a check", wraps=True),
+        Quantity("dropped_ranges", "u16", "Ranges dropped because the radio was busy", wraps=True),
+        Quantity("radio_failures", "u16", "Frames that the radio reported as not delivered",
+                 wraps=True),
+    ),
+)
+
+STEPS = Message(
+    4,
+    "steps",
+    "Single steps, sent where SET_STEP_REPORTS asks for them (calibration and deadreckon).",
+    (_time("Node clock when the frame was filled"),),
+    Entries(
+        "steps",
+        "step",
+        (
+            Quantity("age_s", "u16", "How long before the frame's time the mid-stance was",
+                     raw_name="age_ms", unit="s", per_unit=1000),
+            Quantity("length_m", "u16", "Step length", raw_name="length_mm", unit="m",
+                     per_unit=1000),
+        ),
+        most=10,
+    ),
+)
+
+COMMAND = Message(
+    16,
+    "command",
+    "The host asks a node; repeating a token repeats the acknowledgement, not the effect.",
+    (
+        Quantity("token", "u16", "Chosen by the host, returned in the acknowledgement"),
+        Quantity("command", "u8", "What to do", values=CommandCode),
+        Quantity("value", "i32", "The command's argument"),
+    ),
+)
+
+ACKNOWLEDGEMENT = Message(
+    17,
+    "acknowledgement",
+    "A node's answer to a command.",
+    (
+        Quantity("token", "u16", "The command's token"),
+        Quantity("command", "u8", "The command's code; unknown codes come back as they were"),
+        Quantity("result", "u8", "How it ended", values=CommandResult),
+        Quantity("value", "i32", "The value now in force"),
+    ),
+)
+
+MESSAGES = (MOTION, RANGES, STATUS, STEPS, COMMAND, ACKNOWLEDGEMENT)
+BY_NUMBER = {message.number: message for message in MESSAGES}
+BY_NAME = {message.name: message for message in MESSAGES}
+ENUMS = (ResetCause, MotionState, Quality, RangeQuality, CommandCode, CommandResult)
+
+
+def layout_text() -> str:
+    """Everything that decides how bytes are read, as canonical text: the fingerprint's input."""
+
+    def line(field: Quantity) -> str:
+        return (f"{field.label} {field.wire} {field.per_unit} {field.unit} "
+                f"{field.low} {field.high} {field.wraps}")
+
+    lines = [f"magic {MAGIC} version {PROTOCOL_VERSION} frame {FRAME_BYTES}"]
+    lines += [f"header {line(f)}" for f in HEADER]
+    for message in MESSAGES:
+        lines += [f"{message.number} {message.name} {line(f)}" for f in message.fields]
+        if message.entries is not None:
+            lines += [f"{message.number} {message.name}[{message.entries.most}] {line(f)}"
+                      for f in message.entries.fields]
+    for kind in ENUMS:
+        lines += [f"{kind.__name__} {member.name} {member.value}" for member in kind]
+    return "\n".join(lines) + "\n"
+
+
+FINGERPRINT = int.from_bytes(hashlib.sha256(layout_text().encode()).digest()[:2], "big")
+"""Seed of the CRC: the first two bytes of SHA-256 over :func:`layout_text`."""
+
+
+def crc16(data: bytes, seed: int = FINGERPRINT) -> int:
+    """CRC-16/CCITT, polynomial 0x1021, most significant bit first, no final inversion."""
+    return binascii.crc_hqx(data, seed)
+
+
+class FrameError(ValueError):
+    """A frame that must not be used; the class says why."""
+
+
+class NotOursError(FrameError):
+    """The first byte is not the magic: another system's packet."""
+
+
+class ForeignVersionError(FrameError):
+    """A node that speaks another protocol version; ``version`` and ``node`` name it."""
+
+    def __init__(self, version: int, node: int | None) -> None:
+        who = "a node" if node is None else f"node {node}"
+        super().__init__(
+            f"{who} speaks protocol version {version}, this host speaks {PROTOCOL_VERSION}: "
+            "flash the firmware that belongs to this version"
+        )
+        self.version = version
+        self.node = node
+
+
+class FrameLengthError(FrameError):
+    """Too short, too long, or not the length that its type and count ask for."""
+
+
+class FrameCrcError(FrameError):
+    """The CRC does not fit: damaged on the way, or another layout."""
+
+
+class UnknownTypeError(FrameError):
+    """A type number that this version does not have."""
+
+
+class FrameValueError(FrameError):
+    """A field outside its range."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One checked frame: who, which, and its values in SI units."""
+
+    message: Message
+    node: int
+    boot: int
+    sequence: int
+    values: Mapping[str, Any]
+
+
+def encode(message: Message, node: int, boot: int, sequence: int, values: Mapping[str, Any]) -> bytes:
+    """The frame's bytes, CRC included. Raises OutOfRangeError where a value does not fit."""
+    header = {"magic": MAGIC, "version": PROTOCOL_VERSION, "type": message.number, "node": node,
+              "boot": boot, "sequence": sequence}
+    raw = b"".join(
+        f.to_raw(header[f.label]).to_bytes(f.byte_count, "little") for f in HEADER
+    ) + message.build(values)
+    return raw + crc16(raw).to_bytes(CRC_BYTES, "little")
+
+
+def decode(data: bytes) -> Frame:
+    """Check everything, then read: magic, version, length, CRC, type, layout, ranges.
+
+    Raises a subclass of :class:`FrameError` that says what was wrong; nothing of a frame that
+    fails is ever returned.
+    """
+    if not data or data[0] != MAGIC:
+        raise NotOursError("not a relpos frame: the first byte is not the magic")
+    if len(data) >= 2 and data[1] != PROTOCOL_VERSION:
+        raise ForeignVersionError(data[1], data[3] if len(data) > 3 else None)
+    if not HEADER_BYTES + CRC_BYTES <= len(data) <= FRAME_BYTES:
+        raise FrameLengthError(f"a frame of {len(data)} bytes")
+    if crc16(data[:-CRC_BYTES]) != int.from_bytes(data[-CRC_BYTES:], "little"):
+        raise FrameCrcError("the CRC does not fit")
+    header: dict[str, int] = {}
+    position = 0
+    for field in HEADER:
+        header[field.label] = int.from_bytes(data[position:position + field.byte_count], "little")
+        position += field.byte_count
+    message = BY_NUMBER.get(header["type"])
+    if message is None:
+        raise UnknownTypeError(f"message type {header['type']} is not of this version")
+    body = data[position:-CRC_BYTES]
+    if not message.length_fits(body):
+        raise FrameLengthError(f"a {message.name} body of {len(body)} bytes")
+    try:
+        values = message.parse(body)
+    except OutOfRangeError as error:
+        raise FrameValueError(f"{message.name}: {error}") from error
+    return Frame(message, header["node"], header["boot"], header["sequence"], values)
+
+
+for _message in MESSAGES:
+    if HEADER_BYTES + _message.most_bytes + CRC_BYTES > FRAME_BYTES:
+        raise AssertionError(f"{_message.name} needs {_message.most_bytes} bytes: too long")
