@@ -1,0 +1,105 @@
+"""How PlatformIO runs the suites of this folder: Unity's output, on this computer and on simavr.
+
+PlatformIO's own Unity parser reads the lines that `support/check.h` prints. Three things differ from
+its Unity runner: no library is fetched, a simulated board is not uploaded to, and a program that
+falls silent, dies or ends before its closing line is an error (PlatformIO would call what had passed
+until then a success).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import threading
+from pathlib import Path
+
+from platformio.test.exception import UnitTestError
+from platformio.test.runners.readers.native import NativeTestOutputReader
+from platformio.test.runners.readers.serial import SerialTestOutputReader
+from platformio.test.runners.unity import UnityTestRunner
+
+# The slowest suite needs about ten seconds on simavr; a suite that hangs must not hold up the rest.
+TIME_LIMIT_S = 120.0
+
+CLOSING_LINE = re.compile(r"(\d+) Tests (\d+) Failures (\d+) Ignored")
+
+
+class CustomTestRunner(UnityTestRunner):
+    """Runs one suite in one environment."""
+
+    EXTRA_LIB_DEPS = None
+    closing: re.Match[str] | None = None
+
+    def configure_build_env(self, env):
+        """Build the suite as it is: there is no Unity to configure."""
+        return env
+
+    def setup(self):
+        """Keep avrdude away from a board that is only simulated."""
+        if self.testing_command():
+            self.options.without_uploading = True
+
+    def testing_command(self):
+        """Return the command of the environment that runs the program, if it has one."""
+        return self.project_config.get(
+            f"env:{self.test_suite.env_name}", "test_testing_command", None
+        )
+
+    def stage_testing(self):
+        """Run the program and insist on its closing line."""
+        if self.options.without_testing:
+            return
+        print("Testing...", flush=True)
+        if self.platform.is_embedded() and not self.testing_command():
+            SerialTestOutputReader(self).begin()
+        else:
+            self.run_program(NativeTestOutputReader(self).get_testing_command())
+        if self.closing is None:
+            raise UnitTestError("The program ended before its closing line")
+        told = int(self.closing[1])
+        seen = len(self.test_suite.cases)
+        if told != seen or told == 0:
+            raise UnitTestError(f"The closing line counts {told} tests, its output shows {seen}")
+
+    def run_program(self, command: list[str]) -> None:
+        """Feed the program's output to the parser, at most TIME_LIMIT_S long."""
+        environment = dict(os.environ)
+        simulator = self.platform.get_package_dir("tool-simavr") if self.platform.packages else None
+        if simulator:
+            environment["PATH"] = f"{Path(simulator) / 'bin'}{os.pathsep}{environment['PATH']}"
+        try:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                env=environment,
+            )
+        except FileNotFoundError as error:
+            raise UnitTestError(f"{command[0]} is not installed") from error
+        expired = threading.Event()
+
+        def expire() -> None:
+            expired.set()
+            process.kill()
+
+        timer = threading.Timer(TIME_LIMIT_S, expire)
+        timer.start()
+        try:
+            assert process.stdout is not None
+            for line in process.stdout:
+                self.on_testing_data_output(line)
+            status = process.wait()
+        finally:
+            timer.cancel()
+        if expired.is_set():
+            raise UnitTestError(f"The program did not end within {TIME_LIMIT_S:.0f} s")
+        # The programs return the number of failures; those are told by their own lines.
+        if status and (self.closing is None or int(self.closing[2]) == 0):
+            raise UnitTestError(f"The program ended with status {status}")
+
+    def on_testing_line_output(self, line):
+        """Remember the closing line besides what Unity's parser does."""
+        self.closing = CLOSING_LINE.search(line or "") or self.closing
+        super().on_testing_line_output(line)
