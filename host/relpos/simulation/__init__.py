@@ -1,0 +1,1 @@
+"""Worlds and walkers: physical truth for the emulator, and measurements made directly."""

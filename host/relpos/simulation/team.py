@@ -1,0 +1,120 @@
+"""Teams: who walks where in which scenario.
+
+`make_team` is the one entry: the emulator samples what it returns, the fast simulation and the
+evaluation read the same truth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from relpos.errors import DataError
+from relpos.simulation.gait import make_grid, walk
+from relpos.simulation.walker import Route, WalkerTruth, make_person, make_plan
+from relpos.simulation.world import MagneticField, UwbChannel, World
+
+MAX_WALKERS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """What is the same for everybody in a walk. Change one with `dataclasses.replace`."""
+
+    name: str
+    path_m: tuple[float, float]
+    """Sides of the rectangle that is walked counter-clockwise from the origin."""
+    speed_m_s: tuple[float, float]
+    """Each walker's mean speed is drawn uniformly from here."""
+    spacing_m: float
+    """A walker starts when the one before has this lead."""
+    still_s: float = 5.0
+    """Everybody stands at least this long at the beginning."""
+    pause_every_s: float = 0.0
+    """Mean time between brief pauses; 0 for none."""
+    distance_limit_m: float | None = None
+    start_heading_spread_rad: float = 0.0
+    """0: all face along the first leg; else uniform within plus or minus this."""
+    mount_sd_rad: float = math.radians(3.0)
+    world: World = field(default_factory=World)
+
+
+SCENARIOS = {
+    "paper": Scenario(
+        name="paper",
+        path_m=(20.0, 10.0),
+        speed_m_s=(0.5, 1.1),
+        spacing_m=8.0,
+        pause_every_s=120.0,
+        world=World(name="paper", size_m=(20.0, 10.0)),
+    ),
+    "lab": Scenario(
+        name="lab",
+        # One metre from the walls of 25 m x 15 m.
+        path_m=(23.0, 13.0),
+        # 310 m of the 380 s, of which the first seconds are spent standing and waiting.
+        speed_m_s=(0.82, 0.88),
+        spacing_m=4.0,
+        distance_limit_m=310.0,
+        world=World(
+            name="lab",
+            size_m=(25.0, 15.0),
+            uwb=UwbChannel(detection_near=0.9, detection_far=0.5, nlos_probability=0.05),
+            magnetic=MagneticField(disturbance_ut=5.0),
+        ),
+    ),
+}
+"""By name. `paper` with the paper's own pace: replace(SCENARIOS["paper"], speed_m_s=(0.5, 0.5))."""
+
+
+def make_team(
+    scenario: str | Scenario, nodes: int | Sequence[int], seconds: float, seed: int
+) -> tuple[list[WalkerTruth], World]:
+    """Truth of a whole team and its world; the same arguments give the same arrays.
+
+    ``nodes`` is a count (ids 1 to N) or the ids themselves, 1 to 20 of them. Raises `DataError`
+    for an unknown scenario, a number of nodes or a duration that cannot be.
+    """
+    if isinstance(scenario, str):
+        if scenario not in SCENARIOS:
+            known = ", ".join(sorted(SCENARIOS))
+            raise DataError(f"unknown scenario {scenario!r}; known are {known}")
+        scenario = SCENARIOS[scenario]
+    ids = list(range(1, nodes + 1)) if isinstance(nodes, int) else list(nodes)
+    if not 1 <= len(ids) <= MAX_WALKERS or len(set(ids)) != len(ids):
+        raise DataError(f"a team has 1 to {MAX_WALKERS} different nodes, not {nodes}")
+    if not (math.isfinite(seconds) and 0.0 < seconds <= 86_400.0):
+        raise DataError(f"a walk lasts more than 0 and at most 86400 seconds, not {seconds}")
+    if seed < 0:
+        raise DataError(f"a seed is not negative, unlike {seed}")
+
+    world = replace(scenario.world, magnetic=replace(scenario.world.magnetic, seed=seed))
+    width, depth = scenario.path_m
+    corners = np.array([[0.0, 0.0], [width, 0.0], [width, depth], [0.0, depth]])
+    grid = make_grid(seconds)
+    until_s = float(grid.time_s[-1])
+    start_s = scenario.still_s
+    team: list[WalkerTruth] = []
+    for place, node in enumerate(ids):
+        # One stream a place: more walkers in the team do not change those before them.
+        rng = np.random.default_rng([seed, place])
+        person = make_person(rng, scenario.speed_m_s, scenario.mount_sd_rad)
+        spread = scenario.start_heading_spread_rad
+        heading = float(rng.uniform(-spread, spread)) if spread > 0 else None
+        route = Route(corners, person.turn_length_m)
+        plan_rng, walk_rng = rng.spawn(2)
+        plan = make_plan(
+            plan_rng,
+            person,
+            route,
+            start_s,
+            until_s,
+            scenario.pause_every_s,
+            scenario.distance_limit_m,
+        )
+        team.append(walk(walk_rng, node, person, route, plan, grid, world, heading))
+        start_s += scenario.spacing_m / person.speed_m_s
+    return team, world

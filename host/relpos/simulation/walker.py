@@ -1,0 +1,279 @@
+"""Who walks, where along, and with which steps: everything decided before the torso moves."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from relpos.errors import DataError
+from relpos.simulation.world import FloatArray
+
+RATE_HZ = 200.0
+
+
+@dataclass(frozen=True, slots=True)
+class Person:
+    """Body and habits of one wearer. Lengths in metres, angles in radians.
+
+    ``walk_ratio_m_s`` is step length over step frequency, which people keep nearly constant over
+    speed (0.39 m s is 0.0065 m per step/min, Sekiya and Nagasaki 1998). ``pendulum_gain`` is the
+    factor by which the plain pendulum of the leg falls short of this person's step length
+    (Zijlstra and Hof 1997: 1.25; 1.04 to 1.13 in `walk_daily_lowerback`), ``speed_m_s`` the mean
+    speed on the route, corners included, pauses not.
+    """
+
+    stature_m: float
+    leg_length_m: float
+    sensor_height_m: float
+    speed_m_s: float
+    walk_ratio_m_s: float
+    pendulum_gain: float
+    turn_length_m: float
+    asymmetry: float
+    lateral_scale: float
+    sway_scale: float
+    impact_scale: float
+    roll_rad: float
+    pitch_rad: float
+    yaw_rad: float
+    lean_rad: float
+    mount_rad: tuple[float, float, float]
+    """Mounting error about the body's forward, left and up axis."""
+
+
+def make_person(
+    rng: np.random.Generator, speed_range_m_s: tuple[float, float], mount_sd_rad: float
+) -> Person:
+    """Draw an adult. Leg length is 0.53 of stature (Winter) give or take 2.5 %."""
+    stature = float(np.clip(rng.normal(1.72, 0.09), 1.50, 2.00))
+    return Person(
+        stature_m=stature,
+        leg_length_m=0.53 * stature * float(np.clip(rng.normal(1.0, 0.025), 0.94, 1.06)),
+        sensor_height_m=0.73 * stature,
+        speed_m_s=float(rng.uniform(*speed_range_m_s)),
+        walk_ratio_m_s=0.39 * stature / 1.72 * math.exp(rng.normal(0.0, 0.06)),
+        pendulum_gain=float(np.clip(rng.normal(1.18, 0.06), 1.0, 1.36)),
+        turn_length_m=float(rng.uniform(1.2, 2.4)),
+        asymmetry=float(rng.normal(0.0, 0.02)),
+        lateral_scale=math.exp(rng.normal(0.0, 0.15)),
+        sway_scale=math.exp(rng.normal(0.0, 0.25)),
+        impact_scale=math.exp(rng.normal(0.0, 0.2)),
+        roll_rad=math.radians(1.5) * math.exp(rng.normal(0.0, 0.25)),
+        pitch_rad=math.radians(1.3) * math.exp(rng.normal(0.0, 0.25)),
+        yaw_rad=math.radians(2.0) * math.exp(rng.normal(0.0, 0.3)),
+        lean_rad=math.radians(float(rng.normal(3.0, 1.5))),
+        mount_rad=(
+            float(rng.normal(0.0, mount_sd_rad)),
+            # A sensor on the breastbone leans back with the chest's slope.
+            float(rng.normal(-math.radians(8.0), mount_sd_rad)),
+            float(rng.normal(0.0, mount_sd_rad)),
+        ),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class StepTruth:
+    """Mid-stance times (k,) and the way since the previous mid-stance (k,), in metres.
+
+    The first step after standing counts from where the person stood, so the lengths up to a
+    mid-stance sum to the whole way walked until then.
+    """
+
+    time_s: FloatArray
+    length_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class WalkerTruth:
+    """Physical truth of one wearer at 200 Hz, noise-free; what the emulated chips sample.
+
+    World frame z up, origin at the start corner on the floor. ``position_m`` is the sensor's and
+    the tag's, ``heading_rad`` the torso's yaw, unwrapped. Specific force, angular rate and
+    magnetic field are in the sensor's axes: x up, y left, z backward but for the mounting error;
+    ``attitude`` (n, 3, 3) turns sensor axes into world axes.
+    """
+
+    node: int
+    person: Person
+    time_s: FloatArray
+    position_m: FloatArray
+    velocity_m_s: FloatArray
+    heading_rad: FloatArray
+    attitude: FloatArray
+    specific_force_m_s2: FloatArray
+    angular_rate_rad_s: FloatArray
+    magnetic_field_ut: FloatArray
+    pressure_pa: FloatArray
+    steps: StepTruth
+    walk_start_s: float
+
+    def position_at(self, time_s: float) -> FloatArray:
+        """Position (3,) at any time, held at the ends: exact to 0.1 mm between samples."""
+        place = min(max(time_s * RATE_HZ, 0.0), len(self.time_s) - 1.0)
+        low = min(int(place), len(self.time_s) - 2)
+        share = place - low
+        between = (1.0 - share) * self.position_m[low] + share * self.position_m[low + 1]
+        return np.asarray(between, dtype=np.float64)
+
+
+class Route:
+    """A closed polygon walked for ever from its first corner, its corners rounded.
+
+    In a corner the curvature rises and falls as a raised cosine over ``turn_length_m`` of way,
+    so heading, turn rate and its rate are all smooth. The first corner is only rounded from the
+    second lap on: the walk starts in it.
+    """
+
+    def __init__(self, corners_m: FloatArray, turn_length_m: float) -> None:
+        sides = np.roll(corners_m, -1, axis=0) - corners_m
+        side_m = np.hypot(sides[:, 0], sides[:, 1])
+        direction = np.arctan2(sides[:, 1], sides[:, 0])
+        turn = (np.roll(direction, -1) - direction + np.pi) % (2 * np.pi) - np.pi  # at k + 1
+        if np.any(np.abs(turn) > np.radians(150)):
+            raise DataError("a route's corner turns by more than 150 degrees")
+        grid = np.linspace(0.0, 1.0, 2001)
+        profile = grid - np.sin(2 * np.pi * grid) / (2 * np.pi)
+        # Length of the tangent from the corner's point to where the rounding begins.
+        chord = np.array(
+            [abs(np.trapezoid(np.exp(1j * a * profile), grid)) * turn_length_m for a in turn]
+        )
+        tangent = chord / (2 * np.cos(turn / 2))  # of corner k + 1
+        before = np.roll(tangent, 1)  # of corner k
+        straight = side_m - tangent - before
+        if np.any(straight <= 0.1):
+            raise DataError("a route's sides are too short for the way its corners need")
+        starts = np.cumsum(straight + turn_length_m) - turn_length_m
+        self._initial_m = float(before[0])
+        self.lap_m = float(starts[-1] + turn_length_m)
+        self.turn_rad = float(turn.sum())
+        self._direction = float(direction[0])
+        self._origin = corners_m[0]
+        s = np.linspace(0.0, self.lap_m, math.ceil(self.lap_m / 0.01) + 1)
+        heading = np.full_like(s, direction[0])
+        bend = np.zeros_like(s)
+        for begin, angle in zip(starts, turn, strict=True):
+            u = np.clip((s - begin) / turn_length_m, 0.0, 1.0)
+            heading += angle * (u - np.sin(2 * np.pi * u) / (2 * np.pi))
+            bend += abs(angle) / turn_length_m * (1 - np.cos(2 * np.pi * u))
+        first = corners_m[0] + self._initial_m * np.array(
+            [math.cos(direction[0]), math.sin(direction[0])]
+        )
+        spline = CubicSpline(s, heading)
+        # Three-point Gauss between the nodes: exact far below the strapdown test's bound.
+        mid, half = (s[1:] + s[:-1]) / 2, (s[1:] - s[:-1]) / 2
+        integral = np.zeros(len(s) - 1, dtype=np.complex128)
+        for node, weight in ((-math.sqrt(0.6), 5 / 9), (0.0, 8 / 9), (math.sqrt(0.6), 5 / 9)):
+            integral += weight * half * np.exp(1j * spline(mid + node * half))
+        place = np.concatenate([[0.0], np.cumsum(integral)])
+        self._table = CubicSpline(
+            s, np.column_stack([first[0] + place.real, first[1] + place.imag, heading])
+        )
+        self._s, self._bend = s, bend
+
+    def at(self, way_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Position (n, 2) and unwrapped heading (n,) after ``way_m`` of way from the start."""
+        lap = np.maximum(np.floor((way_m - self._initial_m) / self.lap_m), 0.0)
+        in_lap = way_m - self._initial_m - lap * self.lap_m
+        table = np.asarray(self._table(np.maximum(in_lap, 0.0)), dtype=np.float64)
+        first = np.minimum(in_lap, 0.0)
+        position = table[:, :2] + first[:, None] * np.array(
+            [math.cos(self._direction), math.sin(self._direction)]
+        )
+        return position, table[:, 2] + lap * self.turn_rad
+
+    def curvature(self, way_m: float) -> float:
+        """Absolute curvature in 1/m after ``way_m`` of way."""
+        if way_m < self._initial_m:
+            return 0.0
+        return float(np.interp((way_m - self._initial_m) % self.lap_m, self._s, self._bend))
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Steps as decided: knots of step phase and way over time, and when feet come down.
+
+    The phase grows by one a step and is whole in the middle of double support; between knots
+    both go on steadily, standing where neither changes. ``contact_*`` belong to heel strikes.
+    """
+
+    knot_time_s: FloatArray
+    knot_phase: FloatArray
+    knot_way_m: FloatArray
+    step_strength: FloatArray
+    """Vertical excursion of each step against what its length asks, about 1."""
+    walk_start_s: float
+
+
+def make_plan(
+    rng: np.random.Generator,
+    person: Person,
+    route: Route,
+    walk_start_s: float,
+    until_s: float,
+    pause_every_s: float,
+    distance_limit_m: float | None,
+) -> Plan:
+    """Decide every step until ``until_s``.
+
+    Speed wanders by 4 % over some ten steps and falls in bends; length and duration of a step
+    vary by 2.5 % and 2 % beyond that (Hausdorff 1996 and many since: 2 to 4 % in the healthy).
+    Gait starts and stops with a shortened step.
+    """
+    slow = 1.0 - 0.25 * np.minimum(route._bend * 0.7, 1.0)
+    # Mean speed on a lap is what the person chose: the straights make up for the bends.
+    straight_speed = person.speed_m_s * float(np.mean(1.0 / slow))
+    times, phases, ways = [-1e3, walk_start_s], [0.0, 0.0], [0.0, 0.0]
+    strength: list[float] = []
+    time_s, phase, way, wander = walk_start_s, 0.0, 0.0, 0.0
+    since_stand = 0
+
+    def next_pause() -> float:
+        if pause_every_s <= 0:
+            return math.inf
+        return time_s + 8.0 + float(rng.exponential(pause_every_s))
+
+    pause_at = next_pause()
+    while time_s < until_s:
+        pausing = time_s >= pause_at
+        finished = distance_limit_m is not None and way >= distance_limit_m
+        if (pausing or finished) and since_stand > 0:
+            times.append(time_s + (1e6 if finished else float(rng.uniform(1.5, 5.0))))
+            phases.append(phase)
+            ways.append(way)
+            time_s = times[-1]
+            pause_at = next_pause()
+            since_stand = 0
+            continue
+        wander = 0.9 * wander + 0.04 * math.sqrt(1 - 0.9**2) * rng.standard_normal()
+        bend = 0.25 * min(route.curvature(way + 0.3) * 0.7, 1.0)
+        speed = straight_speed * (1.0 - bend) * math.exp(wander)
+        cadence = math.sqrt(speed / person.walk_ratio_m_s)
+        side = 1.0 if int(phase) % 2 == 0 else -1.0
+        length = speed / cadence * math.exp(0.025 * rng.standard_normal())
+        length *= 1.0 + side * person.asymmetry
+        duration = math.exp(0.02 * rng.standard_normal()) / cadence
+        duration *= 1.0 - side * 0.5 * person.asymmetry
+        last = pausing or time_s + 1.5 * duration >= pause_at
+        if since_stand == 0 or last:
+            length *= 0.65
+            duration *= 1.1
+        time_s += duration
+        way += length
+        phase += 1.0
+        since_stand += 1
+        times.append(time_s)
+        phases.append(phase)
+        ways.append(way)
+        strength.append(
+            (1.0 + side * 2.0 * person.asymmetry) * math.exp(0.06 * rng.standard_normal())
+        )
+    return Plan(
+        np.array(times),
+        np.array(phases),
+        np.array(ways),
+        np.array(strength),
+        walk_start_s,
+    )
