@@ -204,7 +204,7 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
     count = len(nodes)
     p, p_heading = _sample([estimate[n] for n in nodes], at_s)
     q, q_heading = _sample([truth[n] for n in nodes], at_s)
-    known = np.isfinite(p).all(axis=2) & np.isfinite(q).all(axis=2)
+    known = np.isfinite(p.sum(axis=2)) & np.isfinite(q.sum(axis=2))
 
     pair_indices = [(i, j) for i in range(count) for j in range(i + 1, count)]
     pair_ids = tuple((nodes[i], nodes[j]) for i, j in pair_indices)

@@ -1,0 +1,41 @@
+"""Estimates and truth as the arrays that the metrics work on."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+
+import numpy as np
+
+from relpos.evaluation.metrics import Pair, PairTrack, Track
+from relpos.fusion.estimator import Estimate
+from relpos.measurements import Truth
+
+
+def estimated_tracks(estimates: Iterable[Estimate]) -> dict[int, Track]:
+    """Return the track of every node, whatever its status: a guess is scored as one."""
+    rows: dict[int, list[tuple[float, float, float, float]]] = defaultdict(list)
+    for estimate in estimates:
+        for node in estimate.nodes:
+            rows[node.node].append((estimate.time_s, node.x_m, node.y_m, node.heading_rad))
+    return {node: Track(*np.array(rows[node]).T) for node in sorted(rows)}
+
+
+def estimated_pairs(estimates: Iterable[Estimate]) -> dict[Pair, PairTrack]:
+    """Return each pair's distance and sigma over time, under (node, peer) as it was reported."""
+    rows: dict[Pair, list[tuple[float, float, float]]] = defaultdict(list)
+    for estimate in estimates:
+        for pair in estimate.pairs:
+            rows[pair.node, pair.peer].append(
+                (estimate.time_s, pair.distance_m, pair.sigma_distance_m)
+            )
+    return {pair: PairTrack(*np.array(rows[pair]).T) for pair in sorted(rows)}
+
+
+def true_tracks(truth: Iterable[Truth]) -> dict[int, Track]:
+    """Return the true track of every node; a heading that was not recorded is NaN."""
+    rows: dict[int, list[tuple[float, float, float, float]]] = defaultdict(list)
+    for row in truth:
+        heading_rad = np.nan if row.heading_rad is None else row.heading_rad
+        rows[row.node].append((row.time_s, row.x_m, row.y_m, heading_rad))
+    return {node: Track(*np.array(rows[node]).T) for node in sorted(rows)}

@@ -1,0 +1,206 @@
+"""``run.toml``: what a recording says about itself, every key optional."""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from relpos.errors import DataError
+from relpos.measurements import Prior
+
+
+class InitialPose(StrEnum):
+    """What a run says of where its nodes start; the words of ``initial_pose``."""
+
+    UNKNOWN = "unknown"
+    COMMON = "common"
+    FROM_TRUTH = "from truth"
+
+
+@dataclass(frozen=True)
+class NodeInfo:
+    """What is known of the wearer and the mounting of one node; None where it is not."""
+
+    name: str | None = None
+    stature_m: float | None = None
+    leg_length_m: float | None = None
+    height_m: float | None = None
+    antenna_offset_m: tuple[float, float] | None = None
+    """The antenna's place (forward, left) of the point whose motion is reported."""
+
+
+@dataclass(frozen=True)
+class Description:
+    """The content of ``run.toml``; ``priors`` are its ``[initial.NODE]`` tables."""
+
+    name: str | None = None
+    source: str | None = None
+    initial_pose: InitialPose = InitialPose.UNKNOWN
+    heading_known: bool = False
+    priors: tuple[Prior, ...] = ()
+    nodes: Mapping[int, NodeInfo] = field(default_factory=dict)
+    stature_m: float | None = None
+    sensor_height_m: float | None = None
+    mount: str | None = None
+    true_distance_m: float | None = None
+    true_turn_deg: float | None = None
+
+
+_PLAIN_NUMBERS = ("stature_m", "sensor_height_m", "true_distance_m", "true_turn_deg")
+
+
+def read_description(path: Path) -> Description:
+    """Read ``run.toml``; a missing file says nothing. DataError names file and key or line."""
+    if not path.exists():
+        return Description()
+    try:
+        document = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: not UTF-8 text") from None
+    except tomllib.TOMLDecodeError as error:
+        raise DataError(f"{path}: not TOML: {error}") from None
+    reader = _Reader(path)
+
+    pose = reader.text(document, "initial_pose")
+    if pose is not None and pose not in list(InitialPose):
+        known = ", ".join(f'"{p}"' for p in InitialPose)
+        raise DataError(f'{path}: key initial_pose: "{pose}" is none of {known}')
+    priors = [
+        Prior(
+            node=node,
+            x_m=reader.needed_number(table, "x_m", where),
+            y_m=reader.needed_number(table, "y_m", where),
+            heading_rad=reader.needed_number(table, "heading_rad", where),
+            sigma_m=reader.sigma(table, "sigma_m", where),
+            sigma_rad=reader.sigma(table, "sigma_rad", where),
+        )
+        for node, table, where in reader.tables(document, "initial")
+    ]
+    nodes = {
+        node: NodeInfo(
+            name=reader.text(table, "name", where),
+            stature_m=reader.number(table, "stature_m", where),
+            leg_length_m=reader.number(table, "leg_length_m", where),
+            height_m=reader.number(table, "height_m", where),
+            antenna_offset_m=reader.offset(table, "antenna_offset_m", where),
+        )
+        for node, table, where in reader.tables(document, "nodes")
+    }
+    return Description(
+        name=reader.text(document, "name"),
+        source=reader.text(document, "source"),
+        initial_pose=InitialPose(pose) if pose is not None else InitialPose.UNKNOWN,
+        heading_known=reader.flag(document, "heading_known"),
+        priors=tuple(sorted(priors, key=lambda prior: prior.node)),
+        nodes=nodes,
+        mount=reader.text(document, "mount"),
+        **{key: reader.number(document, key) for key in _PLAIN_NUMBERS},
+    )
+
+
+def write_description(path: Path, description: Description) -> None:
+    """Write ``run.toml`` so that reading it gives the same description."""
+    lines: list[str] = []
+    for key in ("name", "source", "initial_pose", "heading_known", "mount", *_PLAIN_NUMBERS):
+        value = getattr(description, key)
+        if value is not None:
+            lines.append(f"{key} = {_toml(value)}")
+    for prior in description.priors:
+        lines += ["", f"[initial.{prior.node}]"]
+        for key in ("x_m", "y_m", "heading_rad", "sigma_m", "sigma_rad"):
+            lines.append(f"{key} = {_toml(getattr(prior, key))}")
+    for node, info in sorted(description.nodes.items()):
+        lines += ["", f"[nodes.{node}]"]
+        for key in ("name", "stature_m", "leg_length_m", "height_m", "antenna_offset_m"):
+            value = getattr(info, key)
+            if value is not None:
+                lines.append(f"{key} = {_toml(value)}")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        # A JSON string is a TOML basic string, but for the one control character JSON lets pass.
+        return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_toml(v) for v in value) + "]"
+    return repr(float(str(value)))
+
+
+class _Reader:
+    """Typed access to a TOML document; every complaint names the file and the key."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def _fail(self, where: str, key: str, value: object, words: str) -> DataError:
+        shown = repr(value) if len(repr(value)) <= 40 else repr(value)[:40] + "..."
+        return DataError(f"{self._path}: key {where}{key}: {shown} {words}")
+
+    def text(self, table: Mapping[str, Any], key: str, where: str = "") -> str | None:
+        value = table.get(key)
+        if value is not None and not isinstance(value, str):
+            raise self._fail(where, key, value, "is not text")
+        return value
+
+    def flag(self, table: Mapping[str, Any], key: str, where: str = "") -> bool:
+        value = table.get(key, False)
+        if not isinstance(value, bool):
+            raise self._fail(where, key, value, "is neither true nor false")
+        return value
+
+    def number(self, table: Mapping[str, Any], key: str, where: str = "") -> float | None:
+        value = table.get(key)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self._fail(where, key, value, "is not a number")
+        if not math.isfinite(value):
+            raise self._fail(where, key, value, "is not a finite number")
+        return float(value)
+
+    def needed_number(self, table: Mapping[str, Any], key: str, where: str) -> float:
+        value = self.number(table, key, where)
+        if value is None:
+            raise DataError(f"{self._path}: key {where}{key} is missing")
+        return value
+
+    def sigma(self, table: Mapping[str, Any], key: str, where: str) -> float:
+        value = self.number(table, key, where) or 0.0
+        if value < 0.0:
+            raise self._fail(where, key, value, "is negative")
+        return value
+
+    def offset(self, table: Mapping[str, Any], key: str, where: str) -> tuple[float, float] | None:
+        value = table.get(key)
+        if value is None:
+            return None
+        if not isinstance(value, list) or len(value) != 2:
+            raise self._fail(where, key, value, "is not [forward, left]")
+        forward, left = (self.needed_number({key: part}, key, where) for part in value)
+        return forward, left
+
+    def tables(
+        self, document: Mapping[str, Any], key: str
+    ) -> list[tuple[int, Mapping[str, Any], str]]:
+        group = document.get(key, {})
+        if not isinstance(group, dict):
+            raise self._fail("", key, group, "is not a group of tables")
+        result: list[tuple[int, Mapping[str, Any], str]] = []
+        for name, table in group.items():
+            if not (name.isascii() and name.isdigit()):
+                raise DataError(f"{self._path}: table {key}.{name}: {name!r} is no node id")
+            if not isinstance(table, dict):
+                raise self._fail(f"{key}.", name, table, "is not a table")
+            result.append((int(name), table, f"{key}.{name}."))
+        return result

@@ -1,0 +1,256 @@
+"""What a fusion leaves behind: the files under "Out" of the run format."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from relpos.errors import DataError
+from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, PairEstimate
+from relpos.measurements import Step
+from relpos.runs.run import write_rows
+from relpos.runs.table import Column, find_table, node_id, not_negative, number, read_rows
+
+ESTIMATE_COLUMNS = [
+    "time_s",
+    "node",
+    "x_m",
+    "y_m",
+    "z_m",
+    "heading_rad",
+    "sigma_major_m",
+    "sigma_minor_m",
+    "sigma_angle_rad",
+    "sigma_z_m",
+    "sigma_heading_rad",
+    "status",
+]
+PAIR_COLUMNS = [
+    "time_s",
+    "node",
+    "peer",
+    "distance_m",
+    "sigma_distance_m",
+    "bearing_rad",
+    "sigma_bearing_rad",
+]
+ALTERNATIVE_COLUMNS = [
+    "time_s",
+    "alternative",
+    "probability",
+    "node",
+    "x_m",
+    "y_m",
+    "heading_rad",
+    "sigma_major_m",
+    "sigma_minor_m",
+    "sigma_angle_rad",
+    "shape",
+]
+PARAMETER_COLUMNS = ["time_s", "node", "peer", "name", "value", "sigma"]
+
+_DECIMALS = 6
+"""Micrometres and microradians: far below any sensor here, and files a third the size."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alternative:
+    """One node in one of the possible pictures of the team while anything is ambiguous.
+
+    ``shape`` is ``ellipse`` or ``ring``; of a ring x, y is the centre, ``sigma_major_m`` the
+    radius and ``sigma_minor_m`` the width.
+    """
+
+    time_s: float
+    alternative: int
+    probability: float
+    node: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    sigma_major_m: float
+    sigma_minor_m: float
+    sigma_angle_rad: float
+    shape: str = "ellipse"
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One learned constant: ``step_scale``, ``heading_drift_rad_s``, ``range_bias_m`` and so on."""
+
+    time_s: float
+    node: int
+    peer: int | None
+    name: str
+    value: float
+    sigma: float
+
+
+def write_estimates(
+    directory: Path | str,
+    estimates: Sequence[Estimate],
+    *,
+    alternatives: Sequence[Alternative] = (),
+    parameters: Sequence[Parameter] = (),
+    steps: Sequence[Step] = (),
+) -> list[Path]:
+    """Write ``estimate.csv``, ``pairs.csv`` and ``parameters.csv``, the others when any.
+
+    An ``alternatives.csv`` or ``steps.csv`` that an earlier run left here and this one has
+    nothing for is removed, lest it be taken for this one's. Returns the files written.
+    """
+    directory = Path(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    tables: list[tuple[str, Sequence[str], Iterable[Sequence[object]], bool]] = [
+        ("estimate.csv", ESTIMATE_COLUMNS, _estimate_rows(estimates), True),
+        ("pairs.csv", PAIR_COLUMNS, _pair_rows(estimates), True),
+        (
+            "alternatives.csv",
+            ALTERNATIVE_COLUMNS,
+            _attribute_rows(alternatives, ALTERNATIVE_COLUMNS),
+            bool(alternatives),
+        ),
+        ("parameters.csv", PARAMETER_COLUMNS, _attribute_rows(parameters, PARAMETER_COLUMNS), True),
+        (
+            "steps.csv",
+            ("time_s", "node", "length_m"),
+            _attribute_rows(steps, ("time_s", "node", "length_m")),
+            bool(steps),
+        ),
+    ]
+    written: list[Path] = []
+    for name, header, rows, wanted in tables:
+        path = directory / name
+        if wanted:
+            write_rows(path, header, ([_rounded(cell) for cell in row] for row in rows))
+            written.append(path)
+        else:
+            path.unlink(missing_ok=True)
+    return written
+
+
+def read_estimates(directory: Path | str) -> list[Estimate]:
+    """Read ``estimate.csv`` and ``pairs.csv`` back, ordered by time.
+
+    Somebody else's estimate may hold times, nodes and positions alone: what is missing becomes
+    NaN, a missing status ``ok``. DataError where there is no ``estimate.csv``.
+    """
+    directory = Path(directory)
+    path = find_table(directory, "estimate.csv")
+    if path is None:
+        raise DataError(f"{directory}: no estimate.csv in there")
+    nodes: dict[float, list[NodeEstimate]] = {}
+    for time_s, node, x_m, y_m, *rest in read_rows(path, _ESTIMATE_TABLE):
+        heading, major, minor, angle, sigma_heading, status, z, sigma_z = rest
+        nodes.setdefault(time_s, []).append(
+            _node_estimate(
+                node, x_m, y_m, heading, major, minor, angle, sigma_heading, status, z, sigma_z
+            )
+        )
+    pairs: dict[float, list[PairEstimate]] = {}
+    pairs_path = find_table(directory, "pairs.csv")
+    if pairs_path is not None:
+        for time_s, *cells in read_rows(pairs_path, _PAIR_TABLE):
+            node, peer, *figures = cells
+            pairs.setdefault(time_s, []).append(
+                PairEstimate(node, peer, *(_nan_if_none(figure) for figure in figures))
+            )
+    return [
+        Estimate(time_s, tuple(nodes.get(time_s, ())), tuple(pairs.get(time_s, ())))
+        for time_s in sorted(nodes.keys() | pairs.keys())
+    ]
+
+
+def _estimate_rows(estimates: Iterable[Estimate]) -> Iterable[Sequence[object]]:
+    for estimate in estimates:
+        for node in estimate.nodes:
+            yield (
+                estimate.time_s,
+                *(getattr(node, name) for name in ESTIMATE_COLUMNS[1:-1]),
+                str(node.status),
+            )
+
+
+def _pair_rows(estimates: Iterable[Estimate]) -> Iterable[Sequence[object]]:
+    for estimate in estimates:
+        for pair in estimate.pairs:
+            yield (estimate.time_s, *(getattr(pair, name) for name in PAIR_COLUMNS[1:]))
+
+
+def _attribute_rows(rows: Iterable[object], names: Sequence[str]) -> Iterable[Sequence[object]]:
+    return ([getattr(row, name) for name in names] for row in rows)
+
+
+def _rounded(value: object) -> object:
+    return round(float(value), _DECIMALS) if isinstance(value, float) else value
+
+
+def _status(text: str) -> NodeStatus:
+    try:
+        return NodeStatus(text)
+    except ValueError:
+        raise ValueError(f"is none of {', '.join(NodeStatus)}") from None
+
+
+_ESTIMATE_TABLE = (
+    Column("time_s", number),
+    Column("node", node_id),
+    # An estimator that knows nothing of a node may leave its cells empty.
+    Column("x_m", number, optional=True),
+    Column("y_m", number, optional=True),
+    Column("heading_rad", number, optional=True),
+    Column("sigma_major_m", not_negative, optional=True),
+    Column("sigma_minor_m", not_negative, optional=True),
+    Column("sigma_angle_rad", number, optional=True),
+    Column("sigma_heading_rad", not_negative, optional=True),
+    Column("status", _status, optional=True),
+    Column("z_m", number, optional=True),
+    Column("sigma_z_m", not_negative, optional=True),
+)
+_PAIR_TABLE = (
+    Column("time_s", number),
+    Column("node", node_id),
+    Column("peer", node_id),
+    Column("distance_m", number),
+    Column("sigma_distance_m", not_negative, optional=True),
+    Column("bearing_rad", number, optional=True),
+    Column("sigma_bearing_rad", not_negative, optional=True),
+)
+
+
+def _nan_if_none(value: Any) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _node_estimate(
+    node: int,
+    x_m: float | None,
+    y_m: float | None,
+    heading: float | None,
+    major: float | None,
+    minor: float | None,
+    angle: float | None,
+    sigma_heading: float | None,
+    status: NodeStatus | None,
+    z_m: float | None,
+    sigma_z: float | None,
+) -> NodeEstimate:
+    """Undo the ellipse: its axes and angle back to the three entries of the covariance."""
+    along, across = _nan_if_none(major) ** 2, _nan_if_none(minor) ** 2
+    c, s = math.cos(_nan_if_none(angle)), math.sin(_nan_if_none(angle))
+    return NodeEstimate(
+        node=node,
+        x_m=_nan_if_none(x_m),
+        y_m=_nan_if_none(y_m),
+        heading_rad=_nan_if_none(heading),
+        variance_x_m2=along * c * c + across * s * s,
+        variance_y_m2=along * s * s + across * c * c,
+        covariance_xy_m2=(along - across) * c * s,
+        sigma_heading_rad=_nan_if_none(sigma_heading),
+        status=status or NodeStatus.OK,
+        z_m=_nan_if_none(z_m),
+        sigma_z_m=_nan_if_none(sigma_z),
+    )

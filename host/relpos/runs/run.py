@@ -1,0 +1,417 @@
+"""A run directory as a whole: measurements in time order, priors, and the truth kept apart."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from relpos.errors import DataError
+from relpos.measurements import (
+    Event,
+    Heading,
+    Height,
+    Measurement,
+    Motion,
+    Prior,
+    Range,
+    Status,
+    Step,
+    Truth,
+)
+from relpos.runs.description import (
+    Description,
+    InitialPose,
+    NodeInfo,
+    read_description,
+    write_description,
+)
+from relpos.runs.imu import ImuRecording, read_imu
+from relpos.runs.table import (
+    Column,
+    find_table,
+    flag,
+    node_id,
+    not_negative,
+    number,
+    numbered_rows,
+    read_text,
+    whole,
+)
+
+UNKNOWN_HEADING_SIGMA_RAD = math.pi
+"""Of a first truth pose without a heading: wider than any heading can be wrong."""
+
+PRIOR_FROM_TRUTH_WITHIN_S = 2.0
+"""A first truth pose later than this after a node's start says nothing of its start. The same
+2 s as the metrics allow between two rows that are interpolated."""
+
+
+@dataclass(frozen=True, slots=True)
+class Landmark:
+    """A surveyed place a wearer can press a button at."""
+
+    landmark: str
+    x_m: float
+    y_m: float
+    z_m: float | None = None
+
+
+@dataclass(frozen=True)
+class Run:
+    """One recording. ``measurements`` are what an estimator may see, sorted by time.
+
+    ``truth`` is for evaluation alone. ``counters`` says how many rows of note were met:
+    ``failed_ranges`` (a range of 0 or less, kept as the failure marker it is),
+    ``landmarks_unknown`` (presses of a landmark nobody surveyed) and ``unsorted_rows``.
+    """
+
+    name: str
+    description: Description = field(default_factory=Description)
+    measurements: tuple[Measurement, ...] = ()
+    events: tuple[Event, ...] = ()
+    statuses: tuple[Status, ...] = ()
+    steps: tuple[Step, ...] = ()
+    landmarks: tuple[Landmark, ...] = ()
+    truth: tuple[Truth, ...] = ()
+    directory: Path | None = None
+    counters: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def node_ids(self) -> tuple[int, ...]:
+        """Every node that moves, ranges, is ranged to or is described, in order."""
+        ids = set(self.description.nodes)
+        for measurement in self.measurements:
+            ids.add(measurement.node)
+            if isinstance(measurement, Range):
+                ids.add(measurement.peer)
+        return tuple(sorted(ids))
+
+    @property
+    def nodes(self) -> dict[int, NodeInfo]:
+        """What is known of each node; the defaults where ``run.toml`` is silent."""
+        return {node: self.description.nodes.get(node, NodeInfo()) for node in self.node_ids}
+
+    @property
+    def heading_known(self) -> bool:
+        """Whether the nodes' headings share one reference."""
+        return self.description.heading_known
+
+    @property
+    def motions(self) -> tuple[Motion, ...]:
+        """The motions among the measurements."""
+        return tuple(m for m in self.measurements if isinstance(m, Motion))
+
+    @property
+    def ranges(self) -> tuple[Range, ...]:
+        """The ranges among the measurements, failures (0) included."""
+        return tuple(m for m in self.measurements if isinstance(m, Range))
+
+    @property
+    def priors(self) -> tuple[Prior, ...]:
+        """What the run itself says of its start."""
+        return self.priors_for(self.description.initial_pose)
+
+    def priors_for(self, initial: InitialPose) -> tuple[Prior, ...]:
+        """Return one prior a node that is known of under ``initial``, ordered by node.
+
+        Tables in ``run.toml`` overrule whatever ``initial`` says of their node, unless it says
+        unknown where the file does not. DataError where the truth is asked for and is not there.
+        """
+        tables = {prior.node: prior for prior in self.description.priors}
+        if initial is InitialPose.UNKNOWN:
+            asked_to_forget = self.description.initial_pose is not InitialPose.UNKNOWN
+            return () if asked_to_forget else tuple(tables[n] for n in sorted(tables))
+        if initial is InitialPose.COMMON:
+            common = {node: Prior(node, 0.0, 0.0, 0.0) for node in self.node_ids}
+            merged = common | tables
+        else:
+            merged = _priors_from_truth(self) | tables
+        return tuple(merged[node] for node in sorted(merged))
+
+    def load_imu(self) -> dict[int, ImuRecording]:
+        """Read the raw inertial recording of every node; empty where the run has none."""
+        return read_imu(self.directory) if self.directory is not None else {}
+
+
+def load_run(path: Path | str) -> Run:
+    """Read a run directory; DataError names the file, line and column of the first fault."""
+    directory = Path(path)
+    if not directory.exists():
+        raise DataError(f"{directory}: no such run directory")
+    if not directory.is_dir():
+        raise DataError(f"{directory}: not a directory")
+    description = read_description(directory / "run.toml")
+    counters: Counter[str] = Counter()
+    rows = {table.name: table.read(directory, counters) for table in _TABLES}
+    measurements = sorted(
+        (row for name in _MEASUREMENT_TABLES for row in rows[name]), key=attrgetter("time_s")
+    )
+    counters["failed_ranges"] += sum(row.range_m <= 0.0 for row in rows["ranges.csv"])
+    landmarks = tuple(_read_landmarks(directory))
+    truth = rows["truth.csv"]
+    if not truth:
+        truth = _truth_from_landmarks(landmarks, rows["events.csv"], counters)
+    return Run(
+        name=description.name or directory.resolve().name,
+        description=description,
+        measurements=tuple(measurements),
+        events=tuple(rows["events.csv"]),
+        statuses=tuple(rows["status.csv"]),
+        steps=tuple(rows["steps.csv"]),
+        landmarks=landmarks,
+        truth=tuple(truth),
+        directory=directory,
+        counters=dict(+counters),
+    )
+
+
+def save_run(run: Run, path: Path | str) -> None:
+    """Write a run directory that :func:`load_run` reads back to the same run.
+
+    Files that the run has nothing for are not written; ``imu.csv`` is copied through.
+    """
+    directory = Path(path)
+    imu = run.load_imu()
+    directory.mkdir(parents=True, exist_ok=True)
+    description = replace(run.description, name=run.name)
+    write_description(directory / "run.toml", description)
+    content: dict[str, Sequence[Any]] = {
+        "motion.csv": run.motions,
+        "ranges.csv": run.ranges,
+        "height.csv": [m for m in run.measurements if isinstance(m, Height)],
+        "heading.csv": [m for m in run.measurements if isinstance(m, Heading)],
+        "events.csv": run.events,
+        "status.csv": run.statuses,
+        "steps.csv": run.steps,
+        "truth.csv": run.truth,
+    }
+    for table in _TABLES:
+        if content[table.name]:
+            names = [column.name for column in table.columns]
+            write_rows(
+                directory / table.name,
+                names,
+                ([getattr(row, name) for name in names] for row in content[table.name]),
+            )
+    if run.landmarks:
+        write_rows(
+            directory / "landmarks.csv",
+            ["id", "x_m", "y_m", "z_m"],
+            ([mark.landmark, mark.x_m, mark.y_m, mark.z_m] for mark in run.landmarks),
+        )
+    if imu:
+        write_imu(directory, imu)
+
+
+def write_imu(directory: Path, recordings: Mapping[int, ImuRecording]) -> None:
+    """Write ``imu.csv`` of one or more nodes, by time."""
+    blocks = [
+        np.column_stack(
+            (
+                recording.time_s,
+                np.full(recording.time_s.shape, float(node)),
+                recording.acceleration_m_s2,
+                recording.angular_rate_rad_s,
+                recording.magnetic_field_ut,
+            )
+        )
+        for node, recording in recordings.items()
+    ]
+    table = np.concatenate(blocks)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    header = "time_s,node,ax_m_s2,ay_m_s2,az_m_s2,gx_rad_s,gy_rad_s,gz_rad_s,mx_ut,my_ut,mz_ut"
+    write_rows(
+        directory / "imu.csv",
+        header.split(","),
+        ([row[0], int(row[1]), *row[2:]] for row in table.tolist()),
+    )
+
+
+def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write one CSV file; None and NaN become empty cells, a bool 0 or 1, floats in full."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows([_cell(value) for value in row] for row in rows)
+
+
+def _cell(value: object) -> object:
+    if isinstance(value, bool):
+        return int(value)
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return ""
+    return value
+
+
+@dataclass(frozen=True)
+class _Table:
+    """One file of the run directory: its columns, and the class each row becomes."""
+
+    name: str
+    make: Callable[..., Any]
+    columns: tuple[Column, ...]
+
+    def read(self, directory: Path, counters: Counter[str]) -> list[Any]:
+        """Rows sorted by time, rows at the same time in the order of the file."""
+        path = find_table(directory, self.name)
+        if path is None:
+            return []
+        rows: list[Any] = []
+        for line, cells in numbered_rows(path, read_text(path), self.columns):
+            row = self.make(*cells)
+            if isinstance(row, Range) and row.node == row.peer:
+                raise DataError(
+                    f"{path}: line {line}: column peer: node {row.node} ranges to itself"
+                )
+            rows.append(row)
+        counters["unsorted_rows"] += sum(
+            after.time_s < before.time_s for before, after in pairwise(rows)
+        )
+        rows.sort(key=attrgetter("time_s"))
+        return rows
+
+
+_TIME_AND_NODE = (Column("time_s", number), Column("node", node_id))
+
+_TABLES = (
+    _Table(
+        "motion.csv",
+        Motion,
+        (
+            *_TIME_AND_NODE,
+            Column("dx_m", number),
+            Column("dy_m", number),
+            Column("dtheta_rad", number),
+            Column("sigma_x_m", not_negative, optional=True),
+            Column("sigma_y_m", not_negative, optional=True),
+            Column("sigma_theta_rad", not_negative, optional=True),
+            Column("gain_version", whole, optional=True),
+            Column("moving", flag, optional=True),
+        ),
+    ),
+    _Table(
+        "ranges.csv",
+        Range,
+        (
+            *_TIME_AND_NODE,
+            Column("peer", node_id),
+            Column("range_m", number),
+            Column("rss_dbm", number, optional=True),
+        ),
+    ),
+    _Table(
+        "height.csv",
+        Height,
+        (
+            *_TIME_AND_NODE,
+            Column("height_m", number),
+            Column("sigma_m", not_negative, optional=True),
+        ),
+    ),
+    _Table(
+        "heading.csv",
+        Heading,
+        (
+            *_TIME_AND_NODE,
+            Column("heading_rad", number),
+            Column("sigma_rad", not_negative, optional=True),
+            Column("source", str, optional=True),
+        ),
+    ),
+    _Table(
+        "events.csv",
+        lambda time_s, node, event, value: Event(time_s, node, event, value or ""),
+        (*_TIME_AND_NODE, Column("event", str), Column("value", str, optional=True)),
+    ),
+    _Table(
+        "status.csv",
+        Status,
+        (*_TIME_AND_NODE, Column("name", str), Column("value", number)),
+    ),
+    _Table("steps.csv", Step, (*_TIME_AND_NODE, Column("length_m", number))),
+    _Table(
+        "truth.csv",
+        Truth,
+        (
+            *_TIME_AND_NODE,
+            Column("x_m", number),
+            Column("y_m", number),
+            Column("heading_rad", number, optional=True),
+            Column("z_m", number, optional=True),
+        ),
+    ),
+)
+_MEASUREMENT_TABLES = ("motion.csv", "ranges.csv", "height.csv", "heading.csv")
+
+
+def _read_landmarks(directory: Path) -> list[Landmark]:
+    path = find_table(directory, "landmarks.csv")
+    if path is None:
+        return []
+    columns = (
+        Column("id", str),
+        Column("x_m", number),
+        Column("y_m", number),
+        Column("z_m", number, optional=True),
+    )
+    landmarks: dict[str, Landmark] = {}
+    for line, cells in numbered_rows(path, read_text(path), columns):
+        landmark = Landmark(*cells)
+        if landmark.landmark in landmarks:
+            raise DataError(f"{path}: line {line}: column id: {landmark.landmark!r} is there twice")
+        landmarks[landmark.landmark] = landmark
+    return list(landmarks.values())
+
+
+def _truth_from_landmarks(
+    landmarks: Sequence[Landmark], events: Sequence[Event], counters: Counter[str]
+) -> list[Truth]:
+    places = {landmark.landmark: landmark for landmark in landmarks}
+    truth: list[Truth] = []
+    for event in events:
+        if event.event != "landmark" or not places:
+            continue
+        place = places.get(event.value)
+        if place is None:
+            counters["landmarks_unknown"] += 1
+            continue
+        truth.append(
+            Truth(event.time_s, event.node, place.x_m, place.y_m, heading_rad=None, z_m=place.z_m)
+        )
+    return truth
+
+
+def _priors_from_truth(run: Run) -> dict[int, Prior]:
+    if not run.truth:
+        raise DataError(
+            f"{run.name}: the initial pose is to come from the truth, but there is none"
+        )
+    starts: dict[int, float] = {}
+    for measurement in run.measurements:
+        starts.setdefault(measurement.node, measurement.time_s)
+    priors: dict[int, Prior] = {}
+    for row in run.truth:
+        if row.node in priors:
+            continue
+        late_s = row.time_s - starts.get(row.node, row.time_s)
+        if late_s > PRIOR_FROM_TRUTH_WITHIN_S:
+            continue
+        known = row.heading_rad is not None
+        priors[row.node] = Prior(
+            row.node,
+            row.x_m,
+            row.y_m,
+            row.heading_rad if row.heading_rad is not None else 0.0,
+            sigma_m=0.0,
+            sigma_rad=0.0 if known else UNKNOWN_HEADING_SIGMA_RAD,
+        )
+    return priors

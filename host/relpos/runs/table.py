@@ -1,0 +1,182 @@
+"""Strict reading of one CSV file: a wrong cell is named by file, line and column.
+
+The standard library's ``csv`` does the splitting; this adds what a recording needs: plain or
+gzipped, columns by name in any order, unknown ones ignored, optional cells empty, no NaN.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import math
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from relpos.errors import DataError
+
+Parser = Callable[[str], Any]
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a table: its name, how a cell is read, and whether it may be missing.
+
+    A parser raises ``ValueError`` with the words that follow the cell: ``"is not a number"``.
+    """
+
+    name: str
+    parse: Parser
+    optional: bool = False
+
+
+def number(text: str) -> float:
+    """Read a finite decimal number; NaN and infinity are refused: a recording has no such value."""
+    try:
+        value = math.nan if "_" in text else float(text)
+    except ValueError:
+        raise ValueError("is not a number") from None
+    if not math.isfinite(value):
+        raise ValueError("is not a finite number")
+    return value
+
+
+def not_negative(text: str) -> float:
+    """Read a standard deviation or a length."""
+    value = number(text)
+    if value < 0.0:
+        raise ValueError("is negative")
+    return value
+
+
+def whole(text: str) -> int:
+    """Read a whole number; ``3.0`` is one, as spreadsheets write it."""
+    try:
+        value = number(text)
+    except ValueError:
+        raise ValueError("is not a whole number") from None
+    if value != int(value):
+        raise ValueError("is not a whole number")
+    return int(value)
+
+
+def node_id(text: str) -> int:
+    """Read a node's id, which is never negative."""
+    value = whole(text)
+    if value < 0:
+        raise ValueError("is no node id")
+    return value
+
+
+def flag(text: str) -> bool:
+    """Read 0 or 1, or false or true."""
+    try:
+        return {"0": False, "1": True, "false": False, "true": True}[text.lower()]
+    except KeyError:
+        raise ValueError("is neither 0 nor 1") from None
+
+
+def find_table(directory: Path, name: str) -> Path | None:
+    """Return the file of a table: ``NAME`` or ``NAME.gz``, or None; both at once are refused."""
+    found = [p for p in (directory / name, directory / f"{name}.gz") if p.exists()]
+    if len(found) == 2:
+        raise DataError(f"{directory}: both {name} and {name}.gz are there; which one counts?")
+    return found[0] if found else None
+
+
+def read_text(path: Path) -> str:
+    """Read a whole file as text, unpacked where it is gzipped; DataError in one line otherwise."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
+    if path.suffix == ".gz":
+        try:
+            data = gzip.decompress(data)
+        except (EOFError, gzip.BadGzipFile, zlib.error):
+            raise DataError(f"{path}: the gzip file is truncated or damaged") from None
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise DataError(f"{path}: line {line}: not UTF-8 text") from None
+
+
+def read_rows(path: Path, columns: Sequence[Column]) -> Iterator[tuple[Any, ...]]:
+    """Yield one tuple of cells a row, in the order of ``columns``; None for a missing option.
+
+    Lines without any content are skipped. DataError names the first thing wrong.
+    """
+    for _, cells in numbered_rows(path, read_text(path), columns):
+        yield cells
+
+
+def numbered_rows(
+    path: Path, text: str, columns: Sequence[Column]
+) -> Iterator[tuple[int, tuple[Any, ...]]]:
+    """Like :func:`read_rows` on text at hand, with the number of the line each row ends on."""
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    try:
+        header = next(reader, None)
+        if header is None:
+            raise DataError(f"{path}: empty, not even a header line")
+        places = find_columns(path, header, columns)
+        for cells in reader:
+            if not any(cell.strip() for cell in cells):
+                continue
+            yield reader.line_num, _parse_row(path, reader.line_num, header, cells, places)
+    except csv.Error as error:
+        raise DataError(f"{path}: line {reader.line_num}: not CSV: {error}") from None
+
+
+def find_columns(
+    path: Path, header: Sequence[str], columns: Sequence[Column]
+) -> list[tuple[Column, int | None]]:
+    """Return each column with its place in the header (None: an optional one is missing)."""
+    names = [name.strip() for name in header]
+    places: list[tuple[Column, int | None]] = []
+    for column in columns:
+        if names.count(column.name) > 1:
+            raise DataError(f"{path}: line 1: column {column.name} is there twice")
+        place = names.index(column.name) if column.name in names else None
+        if place is None and not column.optional:
+            hint = "; cells are separated by ',' here" if len(names) == 1 else ""
+            raise DataError(f"{path}: line 1: column {column.name} is missing{hint}")
+        places.append((column, place))
+    return places
+
+
+def _parse_row(
+    path: Path,
+    line: int,
+    header: Sequence[str],
+    cells: Sequence[str],
+    places: Sequence[tuple[Column, int | None]],
+) -> tuple[Any, ...]:
+    if any(cell.strip() for cell in cells[len(header) :]):
+        raise DataError(
+            f"{path}: line {line}: {len(cells)} cells for {len(header)} columns, "
+            f"after column {header[-1].strip()}"
+        )
+    row: list[Any] = []
+    for column, place in places:
+        text = cells[place].strip() if place is not None and place < len(cells) else ""
+        if not text:
+            if not column.optional:
+                raise DataError(f"{path}: line {line}: column {column.name} is empty")
+            row.append(None)
+            continue
+        try:
+            row.append(column.parse(text))
+        except ValueError as error:
+            raise DataError(
+                f"{path}: line {line}: column {column.name}: {_quote(text)} {error}"
+            ) from None
+    return tuple(row)
+
+
+def _quote(text: str) -> str:
+    return repr(text if len(text) <= 40 else text[:40] + "...")
