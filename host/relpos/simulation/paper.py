@@ -1,0 +1,253 @@
+"""The simulation of the paper's section V, as measurements and truth.
+
+Six people walk round a 20 m x 10 m rectangle, counter-clockwise from one corner, one after the
+other. The paper leaves the noise open; what is fixed here is scenario P of the project's fusion
+notes (``paper``) and its variants:
+
+===========  ==========================================================================
+paper        P: heading noise at the corners only, sigma 1 m, under 15 m, detection 0.5
+paper-p1     P with sigma 0.1 m
+paper-a      white heading noise every step, sigma 0.1 m, unlimited range, detection 1
+paper-h      A with ranges under 10 m only
+paper-h2     H with detection 0.5 and sigma 0.3 m
+===========  ==========================================================================
+
+Everything is a pure function of the settings and the seed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.errors import RelposError
+from relpos.measurements import Measurement, Motion, Prior, Range, Truth
+
+Floats = npt.NDArray[np.float64]
+
+DISTANCE_NOISE = (0.05, 0.10, 0.20, 0.10, 0.15, 0.10)
+"""s_i: standard deviation of user i's relative error of a step's length."""
+
+HEADING_PATTERN = (1.0, 2.0, 4.0, 2.0, 3.0, 2.0)
+"""User i's heading noise relative to user 1's (mean 2.33)."""
+
+
+@dataclass(frozen=True, slots=True)
+class PaperSettings:
+    """What ``--set`` may change; the defaults are scenario P.
+
+    Users repeat the six noise levels when there are more of them. ``turn_noise`` is the mean
+    over the six users of the relative error of a turn; ``heading_noise_deg`` the white error a
+    step of user 1 (the others by ``HEADING_PATTERN``). ``start_shift_m`` moves every user's
+    prior, untold, by this distance into a random direction. ``nlos_probability`` of the ranges
+    are too long by ``nlos_min_m`` to ``nlos_max_m``. ``max_range_m`` 0 means unlimited.
+    """
+
+    nodes: int = 6
+    seconds: float = 600.0
+    length_m: float = 20.0
+    width_m: float = 10.0
+    speed_m_s: float = 0.5
+    spacing_s: float = 16.0
+    motion_period_s: float = 1.0
+    range_period_s: float = 2.0
+    distance_noise_scale: float = 1.0
+    turn_noise: float = 0.18
+    heading_noise_deg: float = 0.0
+    sigma_range_m: float = 1.0
+    max_range_m: float = 15.0
+    detection: float = 0.5
+    start_shift_m: float = 0.0
+    nlos_probability: float = 0.0
+    nlos_min_m: float = 2.0
+    nlos_max_m: float = 6.0
+
+
+_BOUNDS: Mapping[str, tuple[float, float]] = {
+    "nodes": (2, 1000),
+    "seconds": (1.0, 1e6),
+    "length_m": (0.1, 1e4),
+    "width_m": (0.1, 1e4),
+    "speed_m_s": (0.01, 100.0),
+    "spacing_s": (0.0, 1e5),
+    "motion_period_s": (0.01, 60.0),
+    "range_period_s": (0.01, 60.0),
+    "detection": (0.0, 1.0),
+    "nlos_probability": (0.0, 1.0),
+}
+
+_WHITE_HEADING: Mapping[str, float] = {
+    "turn_noise": 0.0,
+    "heading_noise_deg": 1.65,
+    "sigma_range_m": 0.1,
+    "max_range_m": 0.0,
+    "detection": 1.0,
+}
+
+SCENARIOS: Mapping[str, Mapping[str, float]] = {
+    "paper": {},
+    "paper-p1": {"sigma_range_m": 0.1},
+    "paper-a": _WHITE_HEADING,
+    "paper-h": {**_WHITE_HEADING, "max_range_m": 10.0},
+    "paper-h2": {**_WHITE_HEADING, "max_range_m": 10.0, "detection": 0.5, "sigma_range_m": 0.3},
+}
+"""Scenario name -> how it differs from P."""
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedRun:
+    """A run without a folder: measurements sorted by time, priors, and the truth apart."""
+
+    name: str
+    measurements: tuple[Measurement, ...]
+    priors: tuple[Prior, ...]
+    truth: tuple[Truth, ...]
+
+
+def settings_of(scenario: str, overrides: Mapping[str, str | float] | None = None) -> PaperSettings:
+    """Return a scenario's settings, changed by ``overrides`` (the values of ``--set``).
+
+    Raises RelposError for an unknown scenario or key and for a value out of range.
+    """
+    if scenario not in SCENARIOS:
+        raise RelposError(f"unknown scenario '{scenario}': one of {', '.join(SCENARIOS)}")
+    changes: dict[str, float | int] = dict(SCENARIOS[scenario])
+    known = {f.name for f in fields(PaperSettings)}
+    for key, text in (overrides or {}).items():
+        if key not in known:
+            raise RelposError(
+                f"scenario {scenario} has no setting '{key}': one of {', '.join(sorted(known))}"
+            )
+        try:
+            value = float(text)
+        except ValueError:
+            raise RelposError(f"setting {key}: '{text}' is not a number") from None
+        low, high = _BOUNDS.get(key, (0.0, 1e6))
+        if not low <= value <= high:
+            raise RelposError(f"setting {key}: {text} is not within {low:g} to {high:g}")
+        if key == "nodes" and value != int(value):
+            raise RelposError(f"setting nodes: {text} is not a whole number")
+        changes[key] = int(value) if key == "nodes" else value
+    settings = replace(PaperSettings(), **changes)  # type: ignore[arg-type]
+    if settings.nlos_max_m < settings.nlos_min_m:
+        raise RelposError("setting nlos_max_m is less than nlos_min_m")
+    return settings
+
+
+def _corners(settings: PaperSettings) -> tuple[Floats, Floats]:
+    """Path length at each corner of one lap, (5,), and the corners' positions, (5, 2)."""
+    length, width = settings.length_m, settings.width_m
+    corners = np.array([[0, 0], [length, 0], [length, width], [0, width], [0, 0]], dtype=float)
+    return np.cumsum([0.0, length, width, length, width]), corners
+
+
+def true_poses(settings: PaperSettings) -> tuple[Floats, Floats, Floats]:
+    """Give times (T,), positions (N, T, 2) and unwrapped headings (N, T) of all users.
+
+    The heading at a corner is still that of the side behind: people turn, then move.
+    """
+    count = math.floor(settings.seconds / settings.motion_period_s + 1e-9)
+    times = np.arange(count + 1, dtype=np.float64) * settings.motion_period_s
+    starts = settings.spacing_s * np.arange(settings.nodes)
+    path: Floats = settings.speed_m_s * np.maximum(times[None, :] - starts[:, None], 0.0)
+    arcs, corners = _corners(settings)
+    lap, along = np.divmod(path, arcs[-1])
+    # Rounding must not put somebody who has just reached a corner behind or beyond it.
+    positions: Floats = np.stack([np.interp(along, arcs, corners[:, k]) for k in (0, 1)], axis=-1)
+    side = np.clip(np.searchsorted(arcs, along - 1e-9, side="left") - 1, -1, 3)
+    heading: Floats = np.maximum((4.0 * lap + side) * (math.pi / 2.0), 0.0)
+    return times, positions, heading
+
+
+def _motions(
+    settings: PaperSettings,
+    times: Floats,
+    positions: Floats,
+    heading: Floats,
+    rng: np.random.Generator,
+) -> list[Motion]:
+    pattern = np.resize(np.array(HEADING_PATTERN), settings.nodes)
+    spread = np.resize(np.array(DISTANCE_NOISE), settings.nodes) * settings.distance_noise_scale
+    turn_spread = settings.turn_noise * pattern / 2.33
+    white_rad = math.radians(settings.heading_noise_deg) * pattern
+    chord = np.diff(positions, axis=1)
+    turn = np.diff(heading, axis=1)
+    distance = np.linalg.norm(chord, axis=-1)
+    # A chord that cuts a corner is not along the new heading; turn-then-move has it so only
+    # where the corner falls between two motions.
+    direction = np.where(
+        distance > 0.0, np.arctan2(chord[..., 1], chord[..., 0]) - heading[:, 1:], 0.0
+    )
+    shape = distance.shape
+    measured = distance * (1.0 + spread[:, None] * rng.standard_normal(shape))
+    turned = turn * (1.0 + turn_spread[:, None] * rng.standard_normal(shape))
+    turned += white_rad[:, None] * rng.standard_normal(shape) * (distance > 0.0)
+    dx, dy = measured * np.cos(turned + direction), measured * np.sin(turned + direction)
+    return [
+        Motion(float(times[k + 1]), i + 1, float(dx[i, k]), float(dy[i, k]), float(turned[i, k]))
+        for k in range(shape[1])
+        for i in range(settings.nodes)
+    ]
+
+
+def _ranges(
+    settings: PaperSettings, times: Floats, positions: Floats, rng: np.random.Generator
+) -> list[Range]:
+    first, second = np.triu_indices(settings.nodes, 1)
+    instants = np.arange(
+        settings.range_period_s, times[-1] + 1e-9, settings.range_period_s, dtype=float
+    )
+    at = np.stack(
+        [
+            [np.interp(instants, times, positions[i, :, k]) for k in (0, 1)]
+            for i in range(settings.nodes)
+        ]
+    )
+    distance = np.hypot(*(at[first] - at[second]).transpose(1, 0, 2))
+    noise = settings.sigma_range_m * rng.standard_normal(distance.shape)
+    heard = rng.random(distance.shape) < settings.detection
+    late = rng.random(distance.shape) < settings.nlos_probability
+    excess = rng.uniform(settings.nlos_min_m, settings.nlos_max_m, distance.shape)
+    if settings.max_range_m > 0.0:
+        heard &= distance < settings.max_range_m
+    # A ranging chip reports no negative distance; it matters only where two stand together.
+    value = np.abs(distance + noise + late * excess)
+    return [
+        Range(float(instants[k]), int(first[p]) + 1, int(second[p]) + 1, float(value[p, k]))
+        for k, p in zip(*np.nonzero(heard.T), strict=True)
+    ]
+
+
+def simulate_paper(
+    scenario: str = "paper", seed: int = 0, overrides: Mapping[str, str | float] | None = None
+) -> SimulatedRun:
+    """Measurements, priors and truth of one run; the same arguments give the same run."""
+    settings = settings_of(scenario, overrides)
+    motion_rng, range_rng, shift_rng = (
+        np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3)
+    )
+    times, positions, heading = true_poses(settings)
+    motions = _motions(settings, times, positions, heading, motion_rng)
+    ranges = _ranges(settings, times, positions, range_rng)
+    shift = shift_rng.uniform(0.0, 2.0 * math.pi, settings.nodes)
+    priors = tuple(
+        Prior(
+            i + 1,
+            float(positions[i, 0, 0] + settings.start_shift_m * math.cos(shift[i])),
+            float(positions[i, 0, 1] + settings.start_shift_m * math.sin(shift[i])),
+            float(heading[i, 0]),
+        )
+        for i in range(settings.nodes)
+    )
+    measurements: list[Measurement] = sorted([*motions, *ranges], key=lambda m: m.time_s)
+    truth = tuple(
+        Truth(float(t), i + 1, float(positions[i, k, 0]), float(positions[i, k, 1]),
+              math.remainder(float(heading[i, k]), 2.0 * math.pi))
+        for k, t in enumerate(times)
+        for i in range(settings.nodes)
+    )  # fmt: skip
+    return SimulatedRun(scenario, tuple(measurements), priors, truth)
