@@ -1,0 +1,44 @@
+"""What the emulated team needs of a board, whatever executes the firmware on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+NEVER_US = 1 << 62
+"""A due time that does not come."""
+
+
+@dataclass(frozen=True, slots=True)
+class NodeClockError:
+    """How a board's clock differs from virtual time: node = (1 + ppm 1e-6) t + offset."""
+
+    drift_ppm: float = 0.0
+    offset_us: int = 0
+
+    def node_us(self, time_us: int) -> int:
+        """Node clock at virtual time ``time_us``, not wrapped."""
+        return time_us + round(time_us * self.drift_ppm * 1e-6) + self.offset_us
+
+    def virtual_us(self, node_interval_us: int) -> int:
+        """Virtual time that ``node_interval_us`` of the node's clock takes, rounded up."""
+        return -int(-node_interval_us // (1.0 + self.drift_ppm * 1e-6))
+
+
+class Engine(Protocol):
+    """One board that executes the firmware in lock-step with the virtual clock."""
+
+    next_due_us: int
+    """Earliest virtual time at which it must run again."""
+    on_transmit: Callable[[int, bytes], None]
+    """Called with (virtual time in microseconds, bytes leaving the UART)."""
+
+    def run(self, until_us: int) -> None:
+        """Advance the board to virtual time ``until_us``."""
+
+    def receive(self, data: bytes) -> None:
+        """Bytes that arrive now at the board's UART."""
+
+    def close(self) -> None:
+        """Free what the engine holds; it must not be used afterwards."""
