@@ -100,18 +100,21 @@ HEADER = (
     Quantity("magic", "u8", "Always 0xB5; the same in every version", low=MAGIC, high=MAGIC),
     Quantity("version", "u8", "Protocol version; the second byte in every version"),
     Quantity("type", "u8", "Message type"),
-    Quantity("node", "u8", "Whose frame: the sender going up, the addressee going down "
-             "(255: everybody)"),
-    Quantity("boot", "u8", "Counts the node's starts; totals and clock begin anew with each",
-             wraps=True),
+    Quantity(
+        "node", "u8", "Whose frame: the sender going up, the addressee going down (255: everybody)"
+    ),
+    Quantity(
+        "boot", "u8", "Counts the node's starts; totals and clock begin anew with each", wraps=True
+    ),
     Quantity("sequence", "u16", "Counts the sender's frames", wraps=True),
 )
 HEADER_BYTES = sum(f.byte_count for f in HEADER)
 
 
 def _time(meaning: str) -> Quantity:
-    return Quantity("time_s", "u32", meaning, raw_name="time_ms", unit="s", per_unit=1000,
-                    wraps=True)
+    return Quantity(
+        "time_s", "u32", meaning, raw_name="time_ms", unit="s", per_unit=1000, wraps=True
+    )
 
 
 MOTION = Message(
@@ -121,30 +124,92 @@ MOTION = Message(
     "lost frame loses no motion.",
     (
         _time("Node clock at the end of the motion"),
-        Quantity("x_m", "i32", "Total displacement along the heading at the start",
-                 raw_name="x_mm", unit="m", per_unit=1000, wraps=True),
-        Quantity("y_m", "i32", "Total displacement to the left of the heading at the start",
-                 raw_name="y_mm", unit="m", per_unit=1000, wraps=True),
-        Quantity("heading_rad", "i32", "Total turn, counter-clockwise, whole turns included",
-                 raw_name="heading_100urad", unit="rad", per_unit=10_000, wraps=True),
-        Quantity("path_m", "u32", "Total of the step lengths", raw_name="path_mm", unit="m",
-                 per_unit=1000, wraps=True),
+        Quantity(
+            "x_m",
+            "i32",
+            "Total displacement along the heading at the start",
+            raw_name="x_mm",
+            unit="m",
+            per_unit=1000,
+            wraps=True,
+        ),
+        Quantity(
+            "y_m",
+            "i32",
+            "Total displacement to the left of the heading at the start",
+            raw_name="y_mm",
+            unit="m",
+            per_unit=1000,
+            wraps=True,
+        ),
+        Quantity(
+            "heading_rad",
+            "i32",
+            "Total turn, counter-clockwise, whole turns included",
+            raw_name="heading_100urad",
+            unit="rad",
+            per_unit=10_000,
+            wraps=True,
+        ),
+        Quantity(
+            "path_m",
+            "u32",
+            "Total of the step lengths",
+            raw_name="path_mm",
+            unit="m",
+            per_unit=1000,
+            wraps=True,
+        ),
         Quantity("steps", "u16", "Total number of steps", wraps=True),
-        Quantity("variance_along_m2", "u32", "Total variance along the walking direction",
-                 raw_name="variance_along_mm2", unit="m^2", per_unit=1_000_000, wraps=True),
-        Quantity("variance_across_m2", "u32", "Total variance across the walking direction",
-                 raw_name="variance_across_mm2", unit="m^2", per_unit=1_000_000, wraps=True),
-        Quantity("variance_heading_rad2", "u32", "Total variance of the heading",
-                 raw_name="variance_heading_100urad2", unit="rad^2", per_unit=100_000_000,
-                 wraps=True),
-        Quantity("height_m", "i16", "Height over the start, from pressure; see HEIGHT_VALID",
-                 raw_name="height_cm", unit="m", per_unit=100),
-        Quantity("magnetic_heading_rad", "i16", "Heading of the body over magnetic north, "
-                 "counter-clockwise; see MAGNETOMETER_VALID", raw_name="magnetic_heading_100urad",
-                 unit="rad", per_unit=10_000, low=-31_416, high=31_416),
+        Quantity(
+            "variance_along_m2",
+            "u32",
+            "Total variance along the walking direction",
+            raw_name="variance_along_mm2",
+            unit="m^2",
+            per_unit=1_000_000,
+            wraps=True,
+        ),
+        Quantity(
+            "variance_across_m2",
+            "u32",
+            "Total variance across the walking direction",
+            raw_name="variance_across_mm2",
+            unit="m^2",
+            per_unit=1_000_000,
+            wraps=True,
+        ),
+        Quantity(
+            "variance_heading_rad2",
+            "u32",
+            "Total variance of the heading",
+            raw_name="variance_heading_100urad2",
+            unit="rad^2",
+            per_unit=100_000_000,
+            wraps=True,
+        ),
+        Quantity(
+            "height_m",
+            "i16",
+            "Height over the start, from pressure; see HEIGHT_VALID",
+            raw_name="height_cm",
+            unit="m",
+            per_unit=100,
+        ),
+        Quantity(
+            "magnetic_heading_rad",
+            "i16",
+            "Heading of the body over magnetic north, counter-clockwise; see MAGNETOMETER_VALID",
+            raw_name="magnetic_heading_100urad",
+            unit="rad",
+            per_unit=10_000,
+            low=-31_416,
+            high=31_416,
+        ),
         Quantity("state", "u8", "Standing or moving", values=MotionState),
-        Quantity("gain_version", "u8", "Counts the changes of leg length and step gain",
-                 wraps=True),
+        Quantity(
+            "gain_version", "u8", "Counts the changes of leg length and step gain", wraps=True
+        ),
         Quantity("quality", "u8", "What weakens this motion", values=Quality),
     ),
 )
@@ -159,11 +224,25 @@ RANGES = Message(
         "range",
         (
             Quantity("peer", "u8", "The other node"),
-            Quantity("range_m", "u24", "Distance", raw_name="range_mm", unit="m", per_unit=1000,
-                     low=1, high=200_000),
+            Quantity(
+                "range_m",
+                "u24",
+                "Distance",
+                raw_name="range_mm",
+                unit="m",
+                per_unit=1000,
+                low=1,
+                high=200_000,
+            ),
             Quantity("rss_dbm", "i8", "Signal strength", unit="dBm"),
-            Quantity("age_s", "u16", "How long before the frame's time it was measured",
-                     raw_name="age_ms", unit="s", per_unit=1000),
+            Quantity(
+                "age_s",
+                "u16",
+                "How long before the frame's time it was measured",
+                raw_name="age_ms",
+                unit="s",
+                per_unit=1000,
+            ),
             Quantity("quality", "u8", "What weakens this range", values=RangeQuality),
         ),
         most=5,
@@ -181,20 +260,34 @@ STATUS = Message(
         Quantity("firmware_patch", "u8", "Firmware version, third part"),
         Quantity("uptime_s", "u32", "Time since the start", unit="s"),
         Quantity("reset_cause", "u8", "Why the node started", values=ResetCause),
-        Quantity("battery_v", "u16", "Supply voltage; 0 where it is not measured",
-                 raw_name="battery_mv", unit="V", per_unit=1000),
+        Quantity(
+            "battery_v",
+            "u16",
+            "Supply voltage; 0 where it is not measured",
+            raw_name="battery_mv",
+            unit="V",
+            per_unit=1000,
+        ),
         Quantity("bus_errors", "u16", "I2C transactions that failed", wraps=True),
         Quantity("ranging_successes", "u16", "Ranges obtained", wraps=True),
         Quantity("ranging_failures", "u16", "Ranging exchanges that gave none", wraps=True),
-        Quantity("worst_tick_s", "u16", "Longest 50 Hz tick since the last status",
-                 raw_name="worst_tick_us", unit="s", per_unit=1_000_000),
+        Quantity(
+            "worst_tick_s",
+            "u16",
+            "Longest 50 Hz tick since the last status",
+            raw_name="worst_tick_us",
+            unit="s",
+            per_unit=1_000_000,
+        ),
         Quantity("missed_ticks", "u16", "50 Hz ticks that came too late to be kept", wraps=True),
-        Quantity("free_stack_bytes", "u16", "Bytes between heap end and deepest stack so far",
-                 unit="B"),
+        Quantity(
+            "free_stack_bytes", "u16", "Bytes between heap end and deepest stack so far", unit="B"
+        ),
         Quantity("bad_frames", "u16", "Received frames that failed a check", wraps=True),
         Quantity("dropped_ranges", "u16", "Ranges dropped because the radio was busy", wraps=True),
-        Quantity("radio_failures", "u16", "Frames that the radio reported as not delivered",
-                 wraps=True),
+        Quantity(
+            "radio_failures", "u16", "Frames that the radio reported as not delivered", wraps=True
+        ),
     ),
 )
 
@@ -207,10 +300,17 @@ STEPS = Message(
         "steps",
         "step",
         (
-            Quantity("age_s", "u16", "How long before the frame's time the mid-stance was",
-                     raw_name="age_ms", unit="s", per_unit=1000),
-            Quantity("length_m", "u16", "Step length", raw_name="length_mm", unit="m",
-                     per_unit=1000),
+            Quantity(
+                "age_s",
+                "u16",
+                "How long before the frame's time the mid-stance was",
+                raw_name="age_ms",
+                unit="s",
+                per_unit=1000,
+            ),
+            Quantity(
+                "length_m", "u16", "Step length", raw_name="length_mm", unit="m", per_unit=1000
+            ),
         ),
         most=10,
     ),
@@ -249,16 +349,20 @@ def layout_text() -> str:
     """Everything that decides how bytes are read, as canonical text: the fingerprint's input."""
 
     def line(field: Quantity) -> str:
-        return (f"{field.label} {field.wire} {field.per_unit} {field.unit} "
-                f"{field.low} {field.high} {field.wraps}")
+        return (
+            f"{field.label} {field.wire} {field.per_unit} {field.unit} "
+            f"{field.low} {field.high} {field.wraps}"
+        )
 
     lines = [f"magic {MAGIC} version {PROTOCOL_VERSION} frame {FRAME_BYTES}"]
     lines += [f"header {line(f)}" for f in HEADER]
     for message in MESSAGES:
         lines += [f"{message.number} {message.name} {line(f)}" for f in message.fields]
         if message.entries is not None:
-            lines += [f"{message.number} {message.name}[{message.entries.most}] {line(f)}"
-                      for f in message.entries.fields]
+            lines += [
+                f"{message.number} {message.name}[{message.entries.most}] {line(f)}"
+                for f in message.entries.fields
+            ]
     for kind in ENUMS:
         lines += [f"{kind.__name__} {member.name} {member.value}" for member in kind]
     return "\n".join(lines) + "\n"
@@ -321,10 +425,18 @@ class Frame:
     values: Mapping[str, Any]
 
 
-def encode(message: Message, node: int, boot: int, sequence: int, values: Mapping[str, Any]) -> bytes:
+def encode(
+    message: Message, node: int, boot: int, sequence: int, values: Mapping[str, Any]
+) -> bytes:
     """The frame's bytes, CRC included. Raises OutOfRangeError where a value does not fit."""
-    header = {"magic": MAGIC, "version": PROTOCOL_VERSION, "type": message.number, "node": node,
-              "boot": boot, "sequence": sequence}
+    header = {
+        "magic": MAGIC,
+        "version": PROTOCOL_VERSION,
+        "type": message.number,
+        "node": node,
+        "boot": boot,
+        "sequence": sequence,
+    }
     raw = b"".join(
         f.to_raw(header[f.label]).to_bytes(f.byte_count, "little") for f in HEADER
     ) + message.build(values)
@@ -348,7 +460,7 @@ def decode(data: bytes) -> Frame:
     header: dict[str, int] = {}
     position = 0
     for field in HEADER:
-        header[field.label] = int.from_bytes(data[position:position + field.byte_count], "little")
+        header[field.label] = int.from_bytes(data[position : position + field.byte_count], "little")
         position += field.byte_count
     message = BY_NUMBER.get(header["type"])
     if message is None:

@@ -53,7 +53,9 @@ class Quantity(cs.Adapter):  # type: ignore[type-arg]
         subcon, self.byte_count, self.signed = _WIDTHS[wire]
         super().__init__(subcon)
         bits = 8 * self.byte_count
-        full_low, full_high = (-(1 << bits - 1), (1 << bits - 1) - 1) if self.signed else (0, (1 << bits) - 1)
+        full_low, full_high = (
+            (-(1 << bits - 1), (1 << bits - 1) - 1) if self.signed else (0, (1 << bits) - 1)
+        )
         self.label = name
         self.wire = wire
         self.meaning = meaning
@@ -144,7 +146,7 @@ class Message:
         if entries is not None:
             record = cs.Struct(*(cs.Renamed(f, newname=f.label) for f in entries.fields))
             subcons.append(cs.Renamed(cs.PrefixedArray(cs.Int8ul, record), newname=entries.name))
-        self.body: cs.Struct[Any, Any] = cs.Struct(*subcons)
+        self.body: Any = cs.Struct(*subcons)
 
     @property
     def fixed_size(self) -> int:

@@ -11,7 +11,7 @@ constexpr uint8_t kMagic = 181;
 constexpr uint8_t kProtocolVersion = 1;
 constexpr uint16_t kFingerprint = 6654;  // seed of the CRC
 constexpr uint8_t kFrameBytes = 54;  // header, body and CRC
-constexpr uint8_t kAuthenticationBytes = 12;  // kept free behind
+constexpr uint8_t kAuthenticationBytes = 12;  // kept free
 constexpr uint8_t kHeaderBytes = 7;
 constexpr uint8_t kCrcBytes = 2;
 constexpr uint8_t kCoordinator = 0;
@@ -103,8 +103,8 @@ struct Motion {
 
 constexpr uint8_t kMotionBytes = 41;  // the longest body
 
-// Writes the body, returns its length; 0, and nothing useful written, where a value is
-// outside its range.
+// Writes the body, returns its length; 0 where a value is outside
+// its range; body is then half-written.
 uint8_t encode(const Motion& message, uint8_t* body);
 // False, and the message untouched or half-filled, where length or a value is wrong.
 bool decode(const uint8_t* body, uint8_t length, Motion* message);
@@ -127,8 +127,8 @@ struct Ranges {
 
 constexpr uint8_t kRangesBytes = 45;  // the longest body
 
-// Writes the body, returns its length; 0, and nothing useful written, where a value is
-// outside its range.
+// Writes the body, returns its length; 0 where a value is outside
+// its range; body is then half-written.
 uint8_t encode(const Ranges& message, uint8_t* body);
 // False, and the message untouched or half-filled, where length or a value is wrong.
 bool decode(const uint8_t* body, uint8_t length, Ranges* message);
@@ -155,8 +155,8 @@ struct Status {
 
 constexpr uint8_t kStatusBytes = 32;  // the longest body
 
-// Writes the body, returns its length; 0, and nothing useful written, where a value is
-// outside its range.
+// Writes the body, returns its length; 0 where a value is outside
+// its range; body is then half-written.
 uint8_t encode(const Status& message, uint8_t* body);
 // False, and the message untouched or half-filled, where length or a value is wrong.
 bool decode(const uint8_t* body, uint8_t length, Status* message);
@@ -176,8 +176,8 @@ struct Steps {
 
 constexpr uint8_t kStepsBytes = 45;  // the longest body
 
-// Writes the body, returns its length; 0, and nothing useful written, where a value is
-// outside its range.
+// Writes the body, returns its length; 0 where a value is outside
+// its range; body is then half-written.
 uint8_t encode(const Steps& message, uint8_t* body);
 // False, and the message untouched or half-filled, where length or a value is wrong.
 bool decode(const uint8_t* body, uint8_t length, Steps* message);
@@ -191,8 +191,8 @@ struct Command {
 
 constexpr uint8_t kCommandBytes = 7;  // the longest body
 
-// Writes the body, returns its length; 0, and nothing useful written, where a value is
-// outside its range.
+// Writes the body, returns its length; 0 where a value is outside
+// its range; body is then half-written.
 uint8_t encode(const Command& message, uint8_t* body);
 // False, and the message untouched or half-filled, where length or a value is wrong.
 bool decode(const uint8_t* body, uint8_t length, Command* message);
@@ -207,8 +207,8 @@ struct Acknowledgement {
 
 constexpr uint8_t kAcknowledgementBytes = 8;  // the longest body
 
-// Writes the body, returns its length; 0, and nothing useful written, where a value is
-// outside its range.
+// Writes the body, returns its length; 0 where a value is outside
+// its range; body is then half-written.
 uint8_t encode(const Acknowledgement& message, uint8_t* body);
 // False, and the message untouched or half-filled, where length or a value is wrong.
 bool decode(const uint8_t* body, uint8_t length, Acknowledgement* message);

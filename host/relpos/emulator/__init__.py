@@ -1,0 +1,1 @@
+"""The boards and everything around them, on a virtual clock."""

@@ -1,0 +1,1 @@
+"""The radio link: serial bytes to measurements."""

@@ -1,0 +1,233 @@
+"""Frames of all nodes to observations: running totals to motion, node clocks to host time.
+
+Sans I/O: bytes and their arrival times go in, observations come out. A frame is verified whole
+(magic, version, length, CRC, layout, ranges) before anything is changed by it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from relpos.link.clock import NodeClock
+from relpos.measurements import Heading, Height, Motion, Observation, Range, Status, Step
+from relpos.protocol import messages as wire
+
+MAGNETIC_SIGMA_RAD = math.radians(25.0)
+"""Indoor magnetic heading, one sample (the dead-reckoning filter weighs it alike)."""
+UNSEEN_SPEED_M_S = 1.5
+UNSEEN_TURN_RAD_S_SQRT = 0.5
+"""What a wearer may have done while the node restarted: brisk walking (Bohannon 1997: 1.3 to
+1.5 m/s), and turning as a random walk that loses the heading after some ten seconds."""
+REMEMBERED_SEQUENCES = 64
+STALE_BOOT_S = 5.0
+"""A frame of an earlier boot this soon after a newer one's was held up on the air."""
+
+
+@dataclass
+class NodeTrack:
+    """What the host remembers of one node between two frames."""
+
+    boot: int
+    clock: NodeClock = field(default_factory=NodeClock)
+    newest_sequence: int | None = None
+    seen: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED_SEQUENCES))
+    totals: Mapping[str, Any] | None = None
+    motion_s: float | None = None
+    arrival_s: float = 0.0
+    rssi_dbm: int | None = None
+    unseen_s: float = 0.0
+    counts: Counter[str] = field(default_factory=Counter)
+
+
+@dataclass(frozen=True, slots=True)
+class Acknowledged:
+    """A node's answer to a command."""
+
+    node: int
+    token: int
+    command: int
+    result: wire.CommandResult
+    value: int
+
+
+class Decoder:
+    """Frames in, observations out; one instance for the whole team.
+
+    ``counts`` holds every rejected frame by its reason, ``nodes`` each node's own counts:
+    ``received``, ``lost``, ``duplicate``, ``late_motion``, ``restarts``. Node ids, boots and
+    sequences are the sender's claim: without authentication anybody can send them.
+    """
+
+    def __init__(self) -> None:
+        self.nodes: dict[int, NodeTrack] = {}
+        self.counts: Counter[str] = Counter()
+        self.foreign_versions: dict[int, int] = {}
+        self.acknowledged: list[Acknowledged] = []
+
+    def feed(self, data: bytes, arrival_s: float, rssi_dbm: int | None = None) -> list[Observation]:
+        """Observations of one frame that arrived at ``arrival_s`` (host clock, seconds)."""
+        try:
+            frame = wire.decode(data)
+        except wire.ForeignVersionError as error:
+            self.counts["ForeignVersionError"] += 1
+            if error.node is not None:
+                self.foreign_versions[error.node] = error.version
+            return []
+        except wire.FrameError as error:
+            self.counts[type(error).__name__] += 1
+            return []
+        if frame.node in (wire.COORDINATOR, wire.BROADCAST) or frame.message is wire.COMMAND:
+            self.counts["not_from_a_node"] += 1
+            return []
+        track = self._track(frame, arrival_s)
+        if track is None:
+            return []
+        observations: list[Observation] = []
+        if rssi_dbm is not None:
+            track.rssi_dbm = rssi_dbm
+        track.arrival_s = arrival_s
+        values = frame.values
+        if frame.message is wire.ACKNOWLEDGEMENT:
+            self.acknowledged.append(
+                Acknowledged(
+                    frame.node,
+                    values["token"],
+                    values["command"],
+                    wire.CommandResult(values["result"]),
+                    values["value"],
+                )
+            )
+            return observations
+        track.clock.observe(values["time_s"], arrival_s)
+        if frame.message is wire.MOTION:
+            observations += self._motion(frame.node, track, values)
+        elif frame.message is wire.RANGES:
+            observations += [
+                Range(
+                    track.clock.to_host_s(values["time_s"] - entry["age_s"]),
+                    frame.node,
+                    entry["peer"],
+                    entry["range_m"],
+                    float(entry["rss_dbm"]),
+                )
+                for entry in values["ranges"]
+            ]
+        elif frame.message is wire.STATUS:
+            time_s = track.clock.to_host_s(values["time_s"])
+            observations += [
+                Status(time_s, frame.node, name, float(value))
+                for name, value in values.items()
+                if name != "time_s"
+            ]
+            observations += self._link_status(frame.node, track, time_s)
+        elif frame.message is wire.STEPS:
+            observations += [
+                Step(
+                    track.clock.to_host_s(values["time_s"] - entry["age_s"]),
+                    frame.node,
+                    entry["length_m"],
+                )
+                for entry in values["steps"]
+            ]
+        return observations
+
+    def _track(self, frame: wire.Frame, arrival_s: float) -> NodeTrack | None:
+        """The node's track if the frame is new, after booking its sequence; else ``None``."""
+        track = self.nodes.get(frame.node)
+        if track is None:
+            track = self.nodes[frame.node] = NodeTrack(frame.boot, arrival_s=arrival_s)
+        if frame.boot != track.boot:
+            earlier = (track.boot - frame.boot) % 256 < 128
+            if earlier and arrival_s - track.arrival_s < STALE_BOOT_S:
+                track.counts["stale_boot"] += 1
+                return None
+            # Totals, clock and sequence of the node begin anew; only counts and pose go on.
+            unseen_s = arrival_s - track.arrival_s if track.totals is not None else 0.0
+            track = self.nodes[frame.node] = NodeTrack(
+                frame.boot,
+                counts=track.counts,
+                arrival_s=arrival_s,
+                motion_s=track.motion_s,
+                unseen_s=unseen_s,
+            )
+            track.counts["restarts"] += 1
+        if frame.sequence in track.seen:
+            track.counts["duplicate"] += 1
+            return None
+        track.seen.append(frame.sequence)
+        track.counts["received"] += 1
+        if track.newest_sequence is None:
+            track.newest_sequence = frame.sequence
+        else:
+            ahead = (frame.sequence - track.newest_sequence) % 65536
+            if ahead < 32768:
+                track.counts["lost"] += ahead - 1
+                track.newest_sequence = frame.sequence
+            else:
+                track.counts["lost"] -= 1
+                track.counts["reordered"] += 1
+        return track
+
+    def _motion(self, node: int, track: NodeTrack, values: Mapping[str, Any]) -> list[Observation]:
+        fields = wire.MOTION.field
+        older = track.totals or dict.fromkeys(fields, 0)
+
+        def total(name: str) -> float:
+            return fields[name].difference(values[name], older[name])
+
+        if track.totals is not None and total("time_s") <= 0.0:
+            track.counts["late_motion"] += 1
+            return []
+        time_s = track.clock.to_host_s(values["time_s"])
+        if track.motion_s is not None and time_s <= track.motion_s:
+            # Two reports whose clock estimates cross: keep the order, half a millisecond apart.
+            track.counts["clock_step"] += 1
+            time_s = track.motion_s + 0.0005
+        unseen_s = track.unseen_s
+        heading_rad = float(older["heading_rad"])
+        cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
+        dx_m, dy_m = total("x_m"), total("y_m")
+        quality = wire.Quality(values["quality"])
+        observations: list[Observation] = [
+            Motion(
+                time_s,
+                node,
+                cosine * dx_m + sine * dy_m,
+                cosine * dy_m - sine * dx_m,
+                total("heading_rad"),
+                math.sqrt(
+                    max(total("variance_along_m2"), 0.0) + (UNSEEN_SPEED_M_S * unseen_s) ** 2
+                ),
+                math.sqrt(
+                    max(total("variance_across_m2"), 0.0) + (UNSEEN_SPEED_M_S * unseen_s) ** 2
+                ),
+                math.sqrt(
+                    max(total("variance_heading_rad2"), 0.0) + UNSEEN_TURN_RAD_S_SQRT**2 * unseen_s
+                ),
+                values["gain_version"],
+                values["state"] == wire.MotionState.MOVING,
+            )
+        ]
+        if quality & wire.Quality.HEIGHT_VALID:
+            observations.append(Height(time_s, node, values["height_m"]))
+        if quality & wire.Quality.MAGNETOMETER_VALID:
+            observations.append(
+                Heading(
+                    time_s, node, values["magnetic_heading_rad"], MAGNETIC_SIGMA_RAD, "magnetic"
+                )
+            )
+        track.totals = dict(values)
+        track.motion_s = time_s
+        track.unseen_s = 0.0
+        return observations
+
+    def _link_status(self, node: int, track: NodeTrack, time_s: float) -> list[Observation]:
+        figures: dict[str, float] = {f"link_{name}": n for name, n in track.counts.items()}
+        figures["link_clock_drift"] = track.clock.drift
+        if track.rssi_dbm is not None:
+            figures["link_rssi_dbm"] = track.rssi_dbm
+        return [Status(time_s, node, name, float(value)) for name, value in figures.items()]

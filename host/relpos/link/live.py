@@ -1,0 +1,118 @@
+"""The serial port side of the link: an XBee coordinator in, observations out, commands back."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import serial
+
+from relpos.errors import DeviceError
+from relpos.link import xbee
+from relpos.link.decoder import Decoder
+from relpos.measurements import Observation
+from relpos.protocol import messages as wire
+
+BAUD = 38_400
+"""0.2 % off on the ATmega at 16 MHz, where 115200 is 2.1 % off; the coordinator uses the same."""
+READ_TIMEOUT_S = 0.05
+"""Longest wait for bytes: bounds how late silence is noticed."""
+READ_BYTES = 4096
+
+
+class Link:
+    """XBee bytes to observations, and commands to bytes: no I/O of its own."""
+
+    def __init__(self, *, escaped: bool = True) -> None:
+        self.parser = xbee.Parser(escaped=escaped)
+        self.decoder = Decoder()
+        self._escaped = escaped
+        self._sequence = 0
+        self._token = 0
+
+    def feed(self, data: bytes, arrival_s: float) -> list[Observation]:
+        """Observations completed by ``data``, whose last byte arrived at ``arrival_s``."""
+        observations: list[Observation] = []
+        for frame in self.parser.feed(data):
+            if isinstance(frame, xbee.Receive16 | xbee.Receive64):
+                observations += self.decoder.feed(frame.data, arrival_s, frame.rssi_dbm)
+            elif isinstance(frame, xbee.ReceivePacket):
+                observations += self.decoder.feed(frame.data, arrival_s)
+            else:
+                self.decoder.counts[type(frame).__name__] += 1
+        return observations
+
+    def command(
+        self, node: int, code: wire.CommandCode, value: int, *, token: int | None = None
+    ) -> tuple[int, bytes]:
+        """Token and serial bytes of a command; the same token again repeats, not re-does, it."""
+        if token is None:
+            self._token = self._token % 0xFFFF + 1
+            token = self._token
+        self._sequence = (self._sequence + 1) % 0x10000
+        data = wire.encode(
+            wire.COMMAND,
+            node,
+            0,
+            self._sequence,
+            {"token": token, "command": code, "value": value},
+        )
+        address = xbee.BROADCAST_16 if node == wire.BROADCAST else node
+        return token, xbee.encode(xbee.Transmit16(0, address, data), escaped=self._escaped)
+
+    def summary(self) -> dict[str, float]:
+        """Counts of the whole link, for the user: frames, losses, rejections."""
+        figures: dict[str, float] = dict(self.decoder.counts)
+        counts = self.parser.counts
+        figures |= {
+            "frames": counts.frames,
+            "bad_checksums": counts.bad_checksums,
+            "bad_lengths": counts.bad_lengths,
+            "broken_off": counts.broken_off,
+            "skipped_bytes": counts.skipped_bytes,
+        }
+        for track in self.decoder.nodes.values():
+            for name, count in track.counts.items():
+                figures[name] = figures.get(name, 0) + count
+        return figures
+
+
+def open_port(port: str, baud: int = BAUD) -> serial.Serial:
+    """The serial port (or pyserial URL) ``port``. Raises DeviceError with the reason."""
+    try:
+        device: serial.Serial = serial.serial_for_url(port, baudrate=baud, timeout=READ_TIMEOUT_S)
+    except (serial.SerialException, OSError, ValueError) as error:
+        known = "" if "://" in port or Path(port).exists() else " (no such device)"
+        raise DeviceError(
+            f"{port}: cannot open the serial port{known}: {_reason(error)}"
+        ) from error
+    return device
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return str(error).splitlines()[0]
+
+
+def observe(
+    device: serial.Serial,
+    link: Link,
+    clock: Callable[[], float] | None = None,
+) -> Iterator[list[Observation]]:
+    """Lists of observations as they arrive, an empty one after each silent READ_TIMEOUT_S.
+
+    ``clock`` gives the host's time in seconds (default: monotonic, from 0 at the first call).
+    Raises DeviceError when the port vanishes; all that came before has been yielded.
+    """
+    if clock is None:
+        start_s = time.monotonic()
+        clock = lambda: time.monotonic() - start_s  # noqa: E731
+    while True:
+        try:
+            data = device.read(max(1, min(device.in_waiting, READ_BYTES)))
+        except (serial.SerialException, OSError, TypeError) as error:
+            # pyserial raises TypeError when the port is closed under a waiting read.
+            raise DeviceError(f"{device.port}: the port vanished: {_reason(error)}") from error
+        yield link.feed(data, clock()) if data else []
