@@ -30,6 +30,7 @@ class CustomTestRunner(UnityTestRunner):
 
     EXTRA_LIB_DEPS = None
     closing: re.Match[str] | None = None
+    restarted = False
 
     def configure_build_env(self, env):
         """Build the suite as it is: there is no Unity to configure."""
@@ -65,9 +66,10 @@ class CustomTestRunner(UnityTestRunner):
     def run_program(self, command: list[str]) -> None:
         """Feed the program's output to the parser, at most TIME_LIMIT_S long."""
         environment = dict(os.environ)
-        simulator = self.platform.get_package_dir("tool-simavr") if self.platform.packages else None
-        if simulator:
-            environment["PATH"] = f"{Path(simulator) / 'bin'}{os.pathsep}{environment['PATH']}"
+        if "tool-simavr" in self.platform.packages:
+            simulator = self.platform.get_package_dir("tool-simavr")
+            if simulator:
+                environment["PATH"] = f"{Path(simulator) / 'bin'}{os.pathsep}{environment['PATH']}"
         try:
             process = subprocess.Popen(
                 command,
@@ -90,9 +92,14 @@ class CustomTestRunner(UnityTestRunner):
             assert process.stdout is not None
             for line in process.stdout:
                 self.on_testing_data_output(line)
+                if self.restarted:
+                    process.kill()
+                    break
             status = process.wait()
         finally:
             timer.cancel()
+        if self.restarted:
+            raise UnitTestError("The program crashed and started again")
         if expired.is_set():
             raise UnitTestError(f"The program did not end within {TIME_LIMIT_S:.0f} s")
         # The programs return the number of failures; those are told by their own lines.
@@ -100,6 +107,15 @@ class CustomTestRunner(UnityTestRunner):
             raise UnitTestError(f"The program ended with status {status}")
 
     def on_testing_line_output(self, line):
-        """Remember the closing line besides what Unity's parser does."""
-        self.closing = CLOSING_LINE.search(line or "") or self.closing
-        super().on_testing_line_output(line)
+        """Do what Unity's parser does, remember the closing line and notice a second beginning."""
+        if not self.restarted:
+            self.closing = CLOSING_LINE.search(line or "") or self.closing
+            super().on_testing_line_output(line)
+
+    def parse_test_case(self, line):
+        """Parse a test's line; a crash of an AVR shows as a test that is told twice."""
+        case = super().parse_test_case(line)
+        if case and any(case.name == other.name for other in self.test_suite.cases):
+            self.restarted = True
+            return None
+        return case
