@@ -1,0 +1,169 @@
+"""The wire: golden frames, order of checks, wrap-around, and what a damaged frame may do."""
+
+import contextlib
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from relpos.protocol import messages as wire
+from relpos.protocol.schema import OutOfRangeError
+
+VECTORS = json.loads(
+    (Path(__file__).parents[2] / "protocol" / "vectors" / "frames.json").read_text()
+)
+BY_NAME = {v["name"]: v for v in VECTORS}
+
+
+def crc_by_polynomial_division(data: bytes, seed: int) -> int:
+    """CRC-16/CCITT bit by bit, from its definition: independent of the table in binascii."""
+    register = seed
+    for byte in data:
+        for bit in range(7, -1, -1):
+            out = register >> 15 ^ (byte >> bit & 1)
+            register = register << 1 & 0xFFFF
+            if out:
+                register ^= 0x1021
+    return register
+
+
+@pytest.mark.parametrize("vector", VECTORS, ids=lambda v: v["name"])
+def test_golden_values_encode_to_the_golden_bytes(vector):
+    encoded = wire.encode(
+        wire.BY_NAME[vector["message"]],
+        vector["node"],
+        vector["boot"],
+        vector["sequence"],
+        vector["values"],
+    )
+    assert encoded.hex() == vector["hex"]
+
+
+@pytest.mark.parametrize("vector", VECTORS, ids=lambda v: v["name"])
+def test_golden_bytes_decode_to_the_golden_values(vector):
+    frame = wire.decode(bytes.fromhex(vector["hex"]))
+    assert (frame.message.name, frame.node, frame.boot, frame.sequence) == (
+        vector["message"],
+        vector["node"],
+        vector["boot"],
+        vector["sequence"],
+    )
+    assert dict(frame.values) == vector["values"]
+
+
+def test_the_crc_is_the_published_one():
+    assert wire.crc16(b"123456789", 0) == 0x31C3  # CRC-16/XMODEM check value
+    assert wire.crc16(b"123456789", 0xFFFF) == 0x29B1  # CRC-16/CCITT-FALSE check value
+    data = bytes.fromhex(BY_NAME["status"]["hex"])
+    assert crc_by_polynomial_division(data[:-2], wire.FINGERPRINT) == int.from_bytes(
+        data[-2:], "little"
+    )
+
+
+def test_every_frame_leaves_room_for_the_authentication_in_66_bytes():
+    for message in wire.MESSAGES:
+        longest = wire.HEADER_BYTES + message.most_bytes + wire.CRC_BYTES
+        assert longest + wire.AUTHENTICATION_BYTES <= 66, message.name
+
+
+def test_every_message_type_has_a_golden_frame():
+    assert {v["message"] for v in VECTORS} == {m.name for m in wire.MESSAGES}
+
+
+def test_a_foreign_version_is_named_even_when_the_rest_is_not_ours():
+    with pytest.raises(
+        wire.ForeignVersionError, match="node 6 speaks protocol version 9"
+    ) as caught:
+        wire.decode(bytes((wire.MAGIC, 9, 77, 6)) + b"whatever a later version may hold" * 3)
+    assert (caught.value.version, caught.value.node) == (9, 6)
+    with pytest.raises(wire.ForeignVersionError, match="a node speaks"):
+        wire.decode(bytes((wire.MAGIC, 2)))
+
+
+def test_another_systems_packet_is_not_ours():
+    for data in (b"", b"\x00", b"\x00" * 50):
+        with pytest.raises(wire.NotOursError):
+            wire.decode(data)
+
+
+def test_another_layout_fails_the_crc_instead_of_being_misread():
+    data = bytes.fromhex(BY_NAME["motion_walking"]["hex"])[:-2]
+    other = crc_by_polynomial_division(data, wire.FINGERPRINT ^ 1)
+    with pytest.raises(wire.FrameCrcError):
+        wire.decode(data + other.to_bytes(2, "little"))
+
+
+@pytest.mark.parametrize("vector", VECTORS, ids=lambda v: v["name"])
+def test_every_single_bit_error_and_truncation_is_refused(vector):
+    data = bytes.fromhex(vector["hex"])
+    for bit in range(8 * len(data)):
+        damaged = bytearray(data)
+        damaged[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(wire.FrameError):
+            wire.decode(bytes(damaged))
+    for length in range(len(data)):
+        with pytest.raises(wire.FrameError):
+            wire.decode(data[:length])
+
+
+def sealed(type_number: int, body: bytes) -> bytes:
+    raw = bytes((wire.MAGIC, wire.PROTOCOL_VERSION, type_number, 1, 0, 0, 0)) + body
+    return raw + wire.crc16(raw).to_bytes(2, "little")
+
+
+def test_a_count_that_does_not_fit_the_length_is_refused_despite_a_good_crc():
+    body = bytes(4) + b"\x02" + bytes(8)
+    with pytest.raises(wire.FrameLengthError):
+        wire.decode(sealed(wire.RANGES.number, body))
+    with pytest.raises(wire.FrameLengthError):
+        wire.decode(sealed(wire.RANGES.number, bytes(4) + b"\xff" + bytes(8)))
+
+
+def test_a_value_out_of_its_range_is_refused_despite_a_good_crc():
+    zero_range = bytes(4) + b"\x01" + b"\x02" + bytes(3) + bytes(4)
+    with pytest.raises(wire.FrameValueError, match="range_m"):
+        wire.decode(sealed(wire.RANGES.number, zero_range))
+
+
+def test_an_unknown_type_is_refused_despite_a_good_crc():
+    with pytest.raises(wire.UnknownTypeError):
+        wire.decode(sealed(200, b""))
+
+
+def test_what_does_not_fit_is_not_sent():
+    with pytest.raises(OutOfRangeError, match="range_m"):
+        wire.RANGES.build(
+            {
+                "time_s": 0,
+                "ranges": [{"peer": 1, "range_m": 0, "rss_dbm": 0, "age_s": 0, "quality": 0}],
+            }
+        )
+    entry = {"peer": 1, "range_m": 1.0, "rss_dbm": 0, "age_s": 0, "quality": 0}
+    with pytest.raises(OutOfRangeError, match="at most 5"):
+        wire.RANGES.build({"time_s": 0, "ranges": [entry] * 6})
+
+
+@given(st.data())
+@settings(max_examples=200, deadline=None)
+def test_differences_survive_the_wrap_of_every_counter(data):
+    message = data.draw(st.sampled_from(wire.MESSAGES))
+    counters = [f for f in message.fields if f.wraps]
+    if not counters:
+        return
+    field = data.draw(st.sampled_from(counters))
+    older = data.draw(st.integers(field.wrap(field.modulus // 2), field.modulus - 1))
+    ahead = data.draw(st.integers(-(field.modulus // 2), field.modulus // 2 - 1))
+    older_value = field.wrap(older) / field.per_unit
+    newer_value = field.wrap(older + ahead) / field.per_unit
+    assert field.difference(newer_value, older_value) == pytest.approx(
+        ahead / field.per_unit, abs=0.01 / field.per_unit
+    )
+
+
+@given(st.binary(max_size=80))
+@settings(max_examples=300, deadline=None)
+def test_any_bytes_end_in_a_frame_or_a_named_refusal(data):
+    with contextlib.suppress(wire.FrameError):
+        wire.decode(data)
