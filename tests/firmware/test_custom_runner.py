@@ -1,9 +1,9 @@
 """How PlatformIO runs the suites of this folder: Unity's output, on this computer and on simavr.
 
-PlatformIO's own Unity parser reads the lines that `support/check.h` prints. Three things differ from
-its Unity runner: no library is fetched, a simulated board is not uploaded to, and a program that
-falls silent, dies or ends before its closing line is an error (PlatformIO would call what had passed
-until then a success).
+PlatformIO's own Unity parser reads the lines that `support/check.h` prints. Three things differ
+from its Unity runner: no library is fetched, a simulated board is not uploaded to, and a program
+that falls silent, dies or ends before its closing line is an error (PlatformIO would call what had
+passed until then a success).
 """
 
 from __future__ import annotations

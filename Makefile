@@ -1,0 +1,97 @@
+# relpos: every target prepares what it needs, and nothing is installed twice.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+# Stamps are folder-wide state: two recipes at once would install into one environment.
+.NOTPARALLEL:
+
+VENV := .venv
+PYTHON := $(VENV)/bin/python
+# A stamp stands for what pip put into .venv, and goes with it.
+RUN := $(VENV)/.relpos-run
+DEVELOP := $(VENV)/.relpos-develop
+
+PIP := $(PYTHON) -m pip --disable-pip-version-check install --progress-bar on
+title = @printf '\n\033[1m== %s\033[0m\n' "$(1)"
+
+.PHONY: help setup demo test lint bench firmware docs wire clean \
+        system-demo system-avr native-tests board-builds simulated-tests python-tests
+
+help: ## this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup: $(DEVELOP) ## everything Python in .venv; the command is then .venv/bin/relpos
+
+demo: $(RUN) | system-demo ## six emulated nodes through a serial port into the fusion, shown; report in out/demo
+	$(VENV)/bin/relpos demo --out out/demo
+
+test: lint wire-check native-tests board-builds simulated-tests python-tests ## every check; pytest last
+
+lint: $(DEVELOP) ## ruff, its formatter, mypy
+	$(call title,Lint: ruff)
+	$(VENV)/bin/ruff check
+	$(call title,Lint: ruff format)
+	$(VENV)/bin/ruff format --check
+	$(call title,Lint: mypy)
+	$(VENV)/bin/mypy
+
+wire: $(DEVELOP) ## regenerate the wire's C++ and its page from protocol/messages.py
+	$(PYTHON) protocol/generate.py
+
+.PHONY: wire-check
+wire-check: $(DEVELOP)
+	$(call title,Wire: the generated files are those of protocol/messages.py)
+	$(PYTHON) protocol/generate.py --check
+
+native-tests: $(DEVELOP) | system-demo
+	$(call title,Firmware suites on this computer)
+	tools/pio test -e native
+
+board-builds: $(DEVELOP) | system-avr
+	$(call title,Firmware for both boards)
+	tools/pio run -e uno -e megaatmega2560
+
+simulated-tests: $(DEVELOP) | system-avr
+	$(call title,Firmware suites on the simulated Uno)
+	tools/pio test -e uno_sim
+
+# Last, so that its closing line is the last of `make test`.
+python-tests: $(DEVELOP) | system-avr
+	$(call title,Python tests)
+	$(VENV)/bin/pytest -n auto
+
+firmware: board-builds ## both boards: flash, RAM, cycles of the worst tick, deepest stack
+	$(call title,Budget: cycles and stack on simavr)
+	$(PYTHON) -m relpos.emulator.avr.budget
+
+bench: $(DEVELOP) ## what is timed, in bench/
+	@found=; for file in bench/bench_*.py; do \
+	    [ -e "$$file" ] || continue; found=1; echo "== $$file"; $(PYTHON) "$$file"; \
+	done; [ -n "$$found" ] || { echo "make bench: there is no bench/bench_*.py yet" >&2; exit 1; }
+
+docs: wire ## regenerate the pages that come from the sources
+
+clean: ## remove what was built; .venv stays
+	rm -rf .build .pio out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+
+$(PYTHON): | system-demo
+	$(call title,Setting up .venv)
+	"$$(tools/find_python.sh)" -m venv $(VENV)
+
+$(RUN): pyproject.toml | $(PYTHON)
+	$(call title,Installing relpos and its libraries)
+	$(PIP) --editable .
+	@touch $@
+
+$(DEVELOP): pyproject.toml | $(PYTHON)
+	$(call title,Installing the tools for tests and firmware)
+	$(PIP) --editable '.[test,lint,firmware]'
+	@touch $@ $(RUN)
+
+system-demo:
+	@tools/system_packages.sh demo
+
+system-avr:
+	@tools/system_packages.sh avr
