@@ -1,0 +1,137 @@
+"""The AVR engine: an emulated node whose board executes the very firmware that is flashed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from relpos.emulator.avr.board import (
+    BUS_HANGS,
+    Board,
+    BoardKind,
+    BusOperation,
+    ResetCause,
+)
+from relpos.emulator.avr.elf import Firmware
+from relpos.emulator.avr.library import SimulatorError
+from relpos.emulator.bus import I2cBus
+
+QUANTUM_US = 1000
+"""How far a board may run ahead of the others: one frame of 3 bytes at 38400 baud takes as long."""
+
+XBEE_BAUD = 38400
+
+
+class BusBridge:
+    """Drives an I2cBus with the two-wire conditions and bytes of a simulated master."""
+
+    def __init__(self, bus: I2cBus, time_us: Callable[[int], int]) -> None:
+        """``time_us`` turns the board's cycles into virtual time."""
+        self.bus = bus
+        self._time_us = time_us
+
+    def __call__(self, operation: BusOperation, value: int, cycle: int) -> int:
+        """Answer one operation as shim.h asks: result | microseconds of clock stretching << 8."""
+        bus = self.bus
+        if operation == BusOperation.RELEASE:
+            bus.release()
+            return 0
+        bus.time_us = self._time_us(cycle)
+        if operation == BusOperation.STOP:
+            bus.stop()
+            return 0
+        if bus.stuck:
+            return BUS_HANGS
+        if operation == BusOperation.START:
+            result = int(bus.start(value >> 1, bool(value & 1)))
+        elif operation == BusOperation.WRITE:
+            result = int(bus.write(value))
+        else:
+            result = bus.read() & 0xFF
+        if bus.stuck:
+            return BUS_HANGS
+        return result | bus.take_stretch_us() << 8
+
+
+class AvrEngine:
+    """Runs a firmware image on a simulated Uno or Mega in lock-step with the virtual clock.
+
+    ``eeprom`` is loaded at power-on and kept up to date with what the firmware writes. The board's
+    crystal is off by ``drift_ppm``; it is powered on at ``power_on_us`` of virtual time.
+    """
+
+    def __init__(
+        self,
+        kind: BoardKind,
+        firmware: Firmware,
+        bus: I2cBus,
+        eeprom: bytearray,
+        node_id: int,
+        *,
+        drift_ppm: float = 0.0,
+        power_on_us: int = 0,
+        line_baud: int = XBEE_BAUD,
+        reset_cause: ResetCause = ResetCause.POWER_ON,
+    ) -> None:
+        self.node_id = node_id
+        self.bus = bus
+        self.on_transmit: Callable[[int, bytes], None] = _nowhere
+        self.next_due_us = power_on_us
+        self._power_on_us = power_on_us
+        self._frequency_hz = round(kind.frequency_hz * (1.0 + drift_ppm * 1e-6))
+        self._eeprom = eeprom
+        self._eeprom_writes = 0
+        self._now_us = power_on_us
+        self.board = Board(
+            kind,
+            firmware,
+            BusBridge(bus, self._time_us),
+            frequency_hz=self._frequency_hz,
+            line_baud=line_baud,
+            reset_cause=reset_cause,
+        )
+        self.board.load_eeprom(bytes(eeprom))
+
+    def _time_us(self, cycle: int) -> int:
+        return self._power_on_us + cycle * 1_000_000 // self._frequency_hz
+
+    def _cycle(self, time_us: int) -> int:
+        return (time_us - self._power_on_us) * self._frequency_hz // 1_000_000
+
+    def run(self, until_us: int) -> None:
+        """Advance the board to virtual time ``until_us``; what it sent goes to ``on_transmit``.
+
+        Raises SimulatorError when the firmware crashes, after handing over what it sent before.
+        """
+        if until_us > self._now_us:
+            try:
+                self.board.run(self._cycle(until_us))
+            except SimulatorError as error:
+                self._hand_over()
+                raise SimulatorError(f"node {self.node_id}: {error}") from error
+            self._now_us = until_us
+            self._hand_over()
+        self.next_due_us = self._now_us + QUANTUM_US
+
+    def _hand_over(self) -> None:
+        for cycle, byte in self.board.take_sent():
+            self.on_transmit(self._time_us(cycle), bytes([byte]))
+        writes = self.board.counters().eeprom_writes
+        if writes != self._eeprom_writes:
+            self._eeprom_writes = writes
+            self._eeprom[:] = self.board.eeprom()[: len(self._eeprom)]
+
+    def receive(self, data: bytes) -> None:
+        """Bytes that begin to arrive now at the board's UART, at the line's speed."""
+        self.board.receive(data, max(0, self._cycle(self._now_us)))
+
+    def reset(self, cause: ResetCause) -> None:
+        """Reset the board as by its button, a dip of the supply or a new battery."""
+        self.board.reset(cause)
+
+    def close(self) -> None:
+        """Free the simulated board."""
+        self.board.close()
+
+
+def _nowhere(_time_us: int, _data: bytes) -> None:
+    """Nobody listens yet."""
