@@ -1,0 +1,44 @@
+"""``relpos emulate``: the emulated team behind a pseudo-terminal."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from relpos.cli import output
+from relpos.cli.demo import Board
+
+
+def emulate(
+    nodes: Annotated[int, typer.Option(min=1, max=20, help="How many people.")],
+    board: Annotated[Board, typer.Option(help="What runs the firmware.")] = Board.NATIVE,
+    scenario: Annotated[str, typer.Option(metavar="NAME", help="Where they walk.")] = "paper",
+    speed: Annotated[
+        float, typer.Option(min=0.0, help="1 is real time; 0 is as fast as it goes.")
+    ] = 1.0,
+    seconds: Annotated[
+        float | None, typer.Option(min=1.0, help="End after so long. (default: Ctrl-C ends)")
+    ] = None,
+    fault: Annotated[
+        list[str] | None, typer.Option(metavar="SPEC", help="A fault to inject; repeatable.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same bytes.")] = 0,
+) -> None:
+    """Offer an emulated team on a pseudo-terminal that speaks as an XBee coordinator.
+
+    Prints the pseudo-terminal's path, which `relpos fuse` takes as its SOURCE.
+    """
+    # serve_team(nodes=, board=, scenario=, speed=, seconds=, faults=, seed=, announce=) -> None:
+    # calls announce(path) once the pseudo-terminal is there, returns at the end or on Ctrl-C.
+    serve_team = output.provided("relpos.emulator.team", "serve_team", "relpos emulate")
+    serve_team(
+        nodes=nodes,
+        board=str(board),
+        scenario=scenario,
+        speed=speed,
+        seconds=seconds,
+        faults=tuple(fault or ()),
+        seed=seed,
+        announce=lambda path: typer.echo(path),
+    )

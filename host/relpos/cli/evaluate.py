@@ -1,0 +1,40 @@
+"""``relpos evaluate``: score an estimate against a run's truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from relpos.errors import DataError
+
+
+def evaluate(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run directory with truth.")],
+    estimate: Annotated[
+        Path, typer.Option("--estimate", metavar="DIR", help="Where estimate.csv lies.")
+    ],
+    json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
+) -> None:
+    """Print the metrics of an estimate: for the team, per pair and over time."""
+    from relpos.cli import output
+    from relpos.evaluation import metrics as scoring
+    from relpos.evaluation import summary, tracks
+    from relpos.runs import load_run, read_estimates
+
+    recording = load_run(run)
+    if not recording.truth:
+        raise DataError(f"{run}: the run has no truth to score against")
+    estimates = read_estimates(estimate)
+    metrics = scoring.evaluate(
+        tracks.estimated_tracks(estimates),
+        tracks.true_tracks(recording.truth),
+        tracks.estimated_pairs(estimates),
+    )
+    if not metrics.epochs:
+        raise DataError(f"{estimate}: no two nodes have an estimate and a truth at the same time")
+    if json:
+        output.print_json({"run": recording.name, **summary.as_json(metrics)})
+    else:
+        output.print_metrics(recording.name, metrics)

@@ -1,0 +1,362 @@
+"""``relpos fuse``: from a run directory or a port to where everybody is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from relpos.cli import output
+from relpos.cli import source as sources
+from relpos.errors import DataError, DeviceError, RelposError
+
+if TYPE_CHECKING:
+    from relpos.evaluation.metrics import Metrics
+    from relpos.fusion.estimator import Estimate, Estimator
+    from relpos.measurements import Observation, Prior
+    from relpos.runs import Run
+
+
+GATHER_S = 3.0
+"""A node reports its motion every second; with two losses in a row it has still been heard."""
+
+
+class EstimatorName(StrEnum):
+    """The estimators by the names people's scripts rely on."""
+
+    BANK = "bank"
+    PARTICLE = "particle"
+    DEADRECKONING = "deadreckoning"
+
+
+class Initial(StrEnum):
+    """Where the nodes start, as the user says."""
+
+    UNKNOWN = "unknown"
+    COMMON = "common"
+    TRUTH = "truth"
+
+
+def fuse(
+    source: Annotated[
+        str, typer.Argument(metavar="SOURCE", help="Run directory, serial port or pyserial URL.")
+    ],
+    estimator: Annotated[
+        EstimatorName, typer.Option(help="Which estimator; bank is not built yet.")
+    ] = EstimatorName.PARTICLE,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="A setting of the estimator; see below."),
+    ] = None,
+    initial: Annotated[
+        Initial | None,
+        typer.Option(help="Where the nodes start. (default: what the run says, else unknown)"),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the estimator's randomness.")] = 0,
+    smooth: Annotated[bool, typer.Option("--smooth", help="Smooth over the whole run.")] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Where the output goes. (default: out/NAME)"),
+    ] = None,
+    record: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Record what is received.")
+    ] = None,
+    view: Annotated[bool, typer.Option("--view", help="Show the live page.")] = False,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="Listen to a port this long, then end.")
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
+    report: Annotated[
+        bool | None,
+        typer.Option(
+            "--report/--no-report",
+            help="Draw pictures where the run has truth. (default: unless --json)",
+        ),
+    ] = None,
+) -> None:
+    """Fuse motion and ranges into relative positions; score them where there is truth.
+
+    Writes estimate.csv, pairs.csv and parameters.csv, and index.html with pictures where the
+    source has truth. From a port, what was received is kept too, as a run directory under
+    received/; Ctrl-C ends it.
+    """
+    chosen = output.parse_settings(settings or [])
+    for wanted, name in ((smooth, "--smooth"), (record, "--record"), (view, "--view")):
+        if wanted:
+            raise output.not_built_yet(name)
+    if estimator is EstimatorName.BANK:
+        raise output.not_built_yet("the estimator bank")
+    job = Job(source, estimator, chosen, seed, out or Path("out") / _base_name(source))
+    if sources.is_port(source):
+        _fuse_port(job, initial, seconds, as_json=json)
+    else:
+        _fuse_run(job, initial, as_json=json, report=not json if report is None else report)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is to be done, as the command line said it."""
+
+    source: str
+    estimator: EstimatorName
+    settings: dict[str, str]
+    seed: int
+    out: Path
+
+    def make(self, priors: Sequence[Prior]) -> Estimator:
+        """Make the wanted estimator; RelposError where a setting does not fit it."""
+        from relpos import fusion
+
+        return fusion.make(self.estimator, priors, self.settings, self.seed)
+
+
+@dataclass
+class _Outcome:
+    """What a pass over a source gave, also where it broke off."""
+
+    estimates: list[Estimate] = field(default_factory=list)
+    received: list[Observation] = field(default_factory=list)
+    interrupted: bool = False
+    failure: RelposError | None = None
+
+
+def _base_name(source: str) -> str:
+    return Path(source).resolve().name or "run" if "://" not in source else "live"
+
+
+def _pass_through(
+    estimator: Estimator,
+    observations: Iterable[Observation],
+    *,
+    keep: bool = False,
+) -> _Outcome:
+    """Give the estimator everything it can use; a failure or Ctrl-C keeps what came before."""
+    from relpos.measurements import Heading, Height, Motion, Range
+
+    outcome = _Outcome()
+    try:
+        for observation in observations:
+            if keep:
+                outcome.received.append(observation)
+            if isinstance(observation, Motion | Range | Height | Heading):
+                outcome.estimates += estimator.process(observation)
+    except KeyboardInterrupt:
+        outcome.interrupted = True
+    except RelposError as error:
+        outcome.failure = error
+    try:
+        outcome.estimates += estimator.finish()
+    except RelposError as error:
+        outcome.failure = outcome.failure or error
+    return outcome
+
+
+def _fuse_run(job: Job, initial: Initial | None, *, as_json: bool, report: bool) -> None:
+    from relpos.runs import load_run
+
+    run = load_run(sources.check_recording(job.source))
+    fuse_recording(job, run, _priors(run, initial), as_json=as_json, report=report)
+
+
+def fuse_recording(
+    job: Job, run: Run, priors: Sequence[Prior], *, as_json: bool, report: bool
+) -> None:
+    """Fuse a whole run, write the output files and the report, print the result."""
+    from relpos.runs import write_estimates
+
+    _check_usable(run, job.estimator)
+    estimator = job.make(priors)
+    outcome = _pass_through(
+        estimator, output.with_progress(run.measurements, len(run.measurements), "fusing")
+    )
+    write_estimates(job.out, outcome.estimates, steps=run.steps)
+    if outcome.failure is not None:
+        raise outcome.failure
+    if outcome.interrupted:
+        raise RelposError(f"interrupted; the estimates so far are in {job.out}")
+
+    counters = {**run.counters, **estimator.counters()}
+    scored = _score(job, run, priors, outcome.estimates) if run.truth else None
+    if report and scored is not None:
+        scored.write_report(job, run, outcome.estimates)
+    _tell(job, run.name, counters, outcome.estimates, scored, as_json=as_json)
+
+
+def _check_usable(run: Run, estimator: EstimatorName) -> None:
+    """Refuse a run nothing can be concluded from, before anything is computed."""
+    if not run.motions:
+        raise DataError(f"{run.directory}: no motion in this run (motion.csv): nothing to fuse")
+    if estimator is EstimatorName.DEADRECKONING:
+        return
+    if not run.ranges:
+        raise DataError(f"{run.directory}: no ranges in this run (ranges.csv): nothing to fuse")
+    if all(measured.range_m <= 0.0 for measured in run.ranges):
+        raise DataError(
+            f"{run.directory}: all {len(run.ranges)} ranges are 0, which marks a failed "
+            "measurement: nothing to fuse"
+        )
+
+
+def _priors(run: Run, initial: Initial | None) -> tuple[Prior, ...]:
+    from relpos.runs import InitialPose
+
+    if initial is None:
+        return run.priors
+    words = {
+        Initial.UNKNOWN: InitialPose.UNKNOWN,
+        Initial.COMMON: InitialPose.COMMON,
+        Initial.TRUTH: InitialPose.FROM_TRUTH,
+    }
+    return run.priors_for(words[initial])
+
+
+@dataclass(frozen=True)
+class _Scored:
+    """The fusion's score, beside that of dead reckoning over the same run."""
+
+    metrics: Metrics
+    baseline: Metrics
+    baseline_estimates: list[Estimate]
+    baseline_start: str
+
+    def write_report(self, job: Job, run: Run, estimates: Sequence[Estimate]) -> None:
+        from relpos.evaluation import report, tracks
+
+        report.write_report(
+            job.out,
+            report.Content(
+                title=run.name,
+                subtitle=f"estimator {job.estimator}, seed {job.seed}; {self.baseline_start}",
+                truth=tracks.true_tracks(run.truth),
+                fused=tracks.estimated_tracks(estimates),
+                dead_reckoning=tracks.estimated_tracks(self.baseline_estimates),
+                pairs=tracks.estimated_pairs(estimates),
+                ranges=run.ranges,
+                metrics=self.metrics,
+                baseline=self.baseline,
+            ),
+        )
+
+
+def _score(
+    job: Job, run: Run, priors: Sequence[Prior], estimates: Sequence[Estimate]
+) -> _Scored | None:
+    from relpos import fusion
+    from relpos.evaluation import metrics, tracks
+    from relpos.runs import InitialPose
+
+    truth = tracks.true_tracks(run.truth)
+    score = metrics.evaluate(
+        tracks.estimated_tracks(estimates), truth, tracks.estimated_pairs(estimates)
+    )
+    if not score.epochs:
+        return None
+    # Dead reckoning can place nobody by itself: without priors it is given the true start,
+    # which is more than the fusion had.
+    start = "dead reckoning from the same start"
+    moving = {motion.node for motion in run.motions}
+    if not moving <= {prior.node for prior in priors}:
+        priors = run.priors_for(InitialPose.FROM_TRUTH)
+        start = "dead reckoning from the true start"
+    plain = fusion.make(EstimatorName.DEADRECKONING, priors, {}, job.seed)
+    baseline = _pass_through(plain, run.measurements).estimates
+    return _Scored(
+        score, metrics.evaluate(tracks.estimated_tracks(baseline), truth), baseline, start
+    )
+
+
+def _fuse_port(job: Job, initial: Initial | None, seconds: float | None, *, as_json: bool) -> None:
+    from relpos.measurements import Event, Heading, Height, Motion, Prior, Range, Status, Step
+    from relpos.runs import Run, save_run, write_estimates
+
+    if initial is Initial.TRUTH:
+        raise DataError(f"{job.source}: a port brings no truth to start from")
+    port = sources.Port(job.source, seconds)
+    if not as_json:
+        output.remark(f"listening to {job.source}; Ctrl-C ends")
+    stream = iter(output.with_progress(port, None, "received"))
+    first: list[Observation] = []
+    priors: list[Prior] = []
+    if initial is Initial.COMMON:
+        first, nodes = _who_is_there(stream)
+        priors = [Prior(node, 0.0, 0.0, 0.0) for node in nodes]
+    estimator = job.make(priors)
+    outcome = _pass_through(estimator, chain(first, stream), keep=True)
+    steps = [o for o in outcome.received if isinstance(o, Step)]
+    received = Run(
+        name=_base_name(job.source),
+        measurements=tuple(
+            sorted(
+                (o for o in outcome.received if isinstance(o, Motion | Range | Height | Heading)),
+                key=lambda o: o.time_s,
+            )
+        ),
+        events=tuple(o for o in outcome.received if isinstance(o, Event)),
+        statuses=tuple(o for o in outcome.received if isinstance(o, Status)),
+        steps=tuple(steps),
+    )
+    save_run(received, job.out / "received")
+    write_estimates(job.out, outcome.estimates, steps=steps)
+    if outcome.failure is not None:
+        if isinstance(outcome.failure, DeviceError):
+            raise DeviceError(f"{outcome.failure}; what was received is in {job.out}")
+        raise outcome.failure
+    counters = {**port.counters, **estimator.counters()}
+    _tell(job, received.name, counters, outcome.estimates, None, as_json=as_json)
+
+
+def _who_is_there(stream: Iterator[Observation]) -> tuple[list[Observation], list[int]]:
+    """Listen until every node that is on has had time to report; return what came and who."""
+    from relpos.measurements import Motion, Range
+
+    came: list[Observation] = []
+    nodes: set[int] = set()
+    for observation in stream:
+        came.append(observation)
+        if isinstance(observation, Motion | Range):
+            nodes.add(observation.node)
+        if isinstance(observation, Range):
+            nodes.add(observation.peer)
+        if observation.time_s - came[0].time_s > GATHER_S:
+            break
+    return came, sorted(nodes)
+
+
+def _tell(
+    job: Job,
+    name: str,
+    counters: dict[str, Any],
+    estimates: Sequence[Estimate],
+    scored: _Scored | None,
+    *,
+    as_json: bool,
+) -> None:
+    from relpos.evaluation import summary
+
+    if as_json:
+        output.print_json(
+            {
+                "run": name,
+                "estimator": str(job.estimator),
+                "seed": job.seed,
+                "out": str(job.out),
+                "estimates": len(estimates),
+                "counters": counters,
+                **(summary.as_json(scored.metrics) if scored else summary.no_metrics()),
+                "dead_reckoning": summary.figures(scored.baseline) if scored else None,
+            }
+        )
+        return
+    if scored is not None:
+        output.print_metrics(f"{name}: {job.estimator}", scored.metrics, scored.baseline)
+    else:
+        output.print_last_pairs(f"{name}: {job.estimator}", estimates)
+    noted = {key: value for key, value in counters.items() if value}
+    if noted:
+        output.remark("counted: " + ", ".join(f"{k} {v:g}" for k, v in sorted(noted.items())))
+    output.remark(f"written to {job.out}")

@@ -1,0 +1,80 @@
+"""``relpos``: the commands, and how a failure is told.
+
+Every command lives in its own file and imports what is heavy inside its body, so that
+``relpos --help`` answers at once. Exit status: 0 done, 1 the data or device failed (one clear
+line on stderr), 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from relpos import __version__
+from relpos.cli import deadreckon, demo, emulate, evaluate, fuse, simulate
+from relpos.errors import RelposError
+
+
+class Commands(TyperGroup):
+    """The group of commands; turns what a user can cause into one line and exit status 1."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; never let an expected failure become a traceback."""
+        try:
+            return super().invoke(ctx)
+        except RelposError as error:
+            _fail(str(error))
+        except BrokenPipeError:
+            # Whoever read our output has gone; a second complaint at exit would only confuse.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(1) from None
+        except KeyboardInterrupt:
+            _fail("interrupted")
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            _fail(f"{where}{error.strerror or error}")
+
+
+def _fail(words: str) -> None:
+    typer.echo(f"relpos: {' '.join(words.split())}", err=True)
+    raise typer.Exit(1)
+
+
+app = typer.Typer(
+    cls=Commands,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Where everybody is, relative to each other: IMU and UWB, no anchors, no map.",
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"relpos {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def main(
+    version: bool = typer.Option(
+        False, "--version", callback=_print_version, is_eager=True, help="Print the version."
+    ),
+) -> None:
+    """Where everybody is, relative to each other: IMU and UWB, no anchors, no map."""
+
+
+app.command("demo")(demo.demo)
+app.command("emulate")(emulate.emulate)
+app.command("fuse")(fuse.fuse)
+app.command("simulate")(simulate.simulate)
+app.command("evaluate")(evaluate.evaluate)
+app.command("deadreckon")(deadreckon.deadreckon)
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,222 @@
+"""What the commands print: results on stdout, progress and remarks on stderr."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import typer
+
+from relpos.errors import RelposError
+
+if TYPE_CHECKING:
+    from relpos.evaluation.metrics import Metrics
+    from relpos.fusion.estimator import Estimate
+
+T = TypeVar("T")
+
+PROGRESS_AFTER_S = 1.0
+"""Nothing is shown for what is quicker than this; the promise is two seconds."""
+
+PLAIN_PROGRESS_EVERY_S = 5.0
+"""Where stderr is no terminal, a line this often does not flood a log."""
+
+
+def print_json(document: Mapping[str, Any]) -> None:
+    """Print one JSON document, the only thing on stdout."""
+    typer.echo(json.dumps(document, allow_nan=False))
+
+
+def remark(words: str) -> None:
+    """Say something beside the result, on stderr."""
+    typer.echo(words, err=True)
+
+
+def parse_settings(pairs: Sequence[str]) -> dict[str, str]:
+    """Split the ``--set KEY=VALUE`` options; wrong usage where there is no ``=``."""
+    settings: dict[str, str] = {}
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        if not (key.strip() and equals and value.strip()):
+            raise typer.BadParameter(f"'{pair}' is not KEY=VALUE", param_hint="--set")
+        settings[key.strip()] = value.strip()
+    return settings
+
+
+def with_progress(items: Iterable[T], total: int | None, label: str) -> Iterator[T]:
+    """Pass the items on and show how far it is, once it takes noticeably long."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    started = last_said = time.monotonic()
+    bar: Progress | None = None
+    task = None
+    try:
+        for done, item in enumerate(items):
+            now = time.monotonic()
+            if console.is_terminal:
+                if bar is None and now - started > PROGRESS_AFTER_S:
+                    bar = Progress(console=console, transient=True)
+                    bar.start()
+                    task = bar.add_task(label, total=total)
+                if bar is not None and task is not None:
+                    bar.update(task, completed=done)
+            elif now - last_said > PLAIN_PROGRESS_EVERY_S:
+                last_said = now
+                share = f"{100 * done // total} %" if total else f"{done}"
+                print(f"{label}: {share}", file=sys.stderr, flush=True)
+            yield item
+    finally:
+        if bar is not None:
+            bar.stop()
+
+
+def print_metrics(title: str, metrics: Metrics, baseline: Metrics | None = None) -> None:
+    """Print a table per pair, the team's figures and how they go over time."""
+    from rich.console import Console
+    from rich.table import Table
+
+    # A pipe has no width; 80 columns would squeeze the numbers out of the table.
+    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+    table = Table(title=title, caption=f"{metrics.epochs} whole seconds scored")
+    table.add_column("pair")
+    columns = ["estimated (end)", "true (end)", "error (end)", "RMSE", "mean error", "body frame"]
+    for column in (*columns, "NEES"):
+        table.add_column(column, justify="right")
+    if baseline is not None:
+        table.add_column("dead reckoning RMSE", justify="right")
+    for k, (pair, figures) in enumerate(metrics.pairs.items()):
+        ends = [
+            (float(e), float(t))
+            for e, t in zip(
+                metrics.pair_distance_m[:, k], metrics.pair_true_distance_m[:, k], strict=True
+            )
+            if math.isfinite(e) and math.isfinite(t)
+        ]
+        estimated, true = ends[-1] if ends else (math.nan, math.nan)
+        cells = [
+            metres(estimated),
+            metres(true),
+            metres(estimated - true, sign=True),
+            metres(figures.distance_rmse_m),
+            metres(figures.distance_error_mean_m, sign=True),
+            metres(figures.body_frame_rmse_m),
+            plain(figures.nees_distance),
+        ]
+        if baseline is not None:
+            other = baseline.pairs.get(pair)
+            cells.append(metres(other.distance_rmse_m if other else math.nan))
+        table.add_row(f"{pair[0]} - {pair[1]}", *cells)
+    console.print(table)
+    console.print(f"relative distance RMSE   {metres(metrics.relative_distance_rmse_m)}")
+    console.print(f"aligned position RMSE    {metres(metrics.relative_position_rmse_m)}")
+    console.print(f"body-frame RMSE          {metres(metrics.body_frame_rmse_m)}")
+    console.print(f"NEES of the distance     {plain(metrics.nees_distance)} (1 is honest)")
+    if baseline is not None:
+        factor = baseline.relative_distance_rmse_m / metrics.relative_distance_rmse_m
+        console.print(
+            f"dead reckoning           {metres(baseline.relative_distance_rmse_m)} relative "
+            f"distance RMSE: the fusion is {plain(factor)} times as good"
+        )
+    _print_over_time(console, metrics)
+
+
+def print_last_pairs(title: str, estimates: Sequence[Estimate]) -> None:
+    """Print where everybody was relative to each other at the end, with the uncertainty."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+    if not estimates:
+        console.print(f"{title}: nothing could be estimated")
+        return
+    last = estimates[-1]
+    table = Table(title=f"{title}, at {last.time_s:.1f} s")
+    for column in ("pair", "distance", "sigma", "bearing", "sigma "):
+        table.add_column(column, justify="left" if column == "pair" else "right")
+    for pair in last.pairs:
+        table.add_row(
+            f"{pair.node} - {pair.peer}",
+            metres(pair.distance_m),
+            metres(pair.sigma_distance_m),
+            degrees(pair.bearing_rad),
+            degrees(pair.sigma_bearing_rad),
+        )
+    console.print(table)
+    states = [f"{node.node} {node.status}" for node in last.nodes if node.status != "ok"]
+    if states:
+        console.print(f"not located for sure: {', '.join(states)}")
+
+
+def _print_over_time(console: Any, metrics: Metrics) -> None:
+    import numpy as np
+    from rich.table import Table
+
+    if metrics.time_s.size < 2:
+        return
+    edges = np.linspace(metrics.time_s[0], metrics.time_s[-1] + 1e-9, 7)
+    table = Table(title="over time")
+    for column in ("seconds", "distance RMSE", "aligned RMSE", "body frame", "NEES"):
+        table.add_column(column, justify="right")
+    for first, last in pairwise(edges):
+        inside = (metrics.time_s >= first) & (metrics.time_s < last)
+        if not inside.any():
+            continue
+        table.add_row(
+            f"{first:.0f} to {last:.0f}",
+            metres(_root_mean_square(metrics.distance_rmse_over_time_m[inside])),
+            metres(_root_mean_square(metrics.position_rmse_over_time_m[inside])),
+            metres(_root_mean_square(metrics.body_frame_rmse_over_time_m[inside])),
+            plain(_mean(metrics.nees_over_time[inside])),
+        )
+    console.print(table)
+
+
+def _mean(values: Any) -> float:
+    finite = [float(v) for v in values if math.isfinite(v)]
+    return sum(finite) / len(finite) if finite else math.nan
+
+
+def _root_mean_square(values: Any) -> float:
+    mean = _mean(values**2)
+    return math.sqrt(mean) if math.isfinite(mean) else math.nan
+
+
+def metres(value: float, *, sign: bool = False) -> str:
+    """Two decimals and the unit; a dash where nothing can be said."""
+    if not math.isfinite(value):
+        return "-"
+    return f"{value:+.2f} m" if sign else f"{value:.2f} m"
+
+
+def degrees(value_rad: float) -> str:
+    """Whole degrees; a dash where nothing can be said."""
+    return f"{math.degrees(value_rad):.0f} deg" if math.isfinite(value_rad) else "-"
+
+
+def plain(value: float) -> str:
+    """Two decimals; a dash where nothing can be said."""
+    return f"{value:.2f}" if math.isfinite(value) else "-"
+
+
+def not_built_yet(what: str) -> RelposError:
+    """Return the error for an option or command whose machinery is still to come."""
+    return RelposError(f"{what} is not built yet")
+
+
+def provided(module: str, name: str, wanted_by: str) -> Any:
+    """Return a function of a part that is imported only when it is wanted."""
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ModuleNotFoundError, AttributeError) as error:
+        missing = getattr(error, "name", None) or ""
+        if missing != name and not module.startswith(missing or "?"):
+            raise
+        raise not_built_yet(f"{wanted_by} ({module}.{name})") from None

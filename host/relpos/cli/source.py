@@ -1,0 +1,64 @@
+"""What ``relpos fuse`` is given: a run directory, a recording or a port."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from relpos.errors import DataError
+
+if TYPE_CHECKING:
+    from relpos.measurements import Observation
+
+
+def is_port(source: str) -> bool:
+    """Tell whether the source can only be a serial port: a device, a pyserial URL, a COM name."""
+    if "://" in source or (source.upper().startswith("COM") and source[3:].isdigit()):
+        return True
+    path = Path(source)
+    return path.is_char_device() or (not path.exists() and path.is_relative_to("/dev"))
+
+
+def check_recording(source: str) -> Path:
+    """Return the run directory that the source names; DataError says what it is instead."""
+    path = Path(source)
+    if path.is_dir():
+        return path
+    if path.exists():
+        raise DataError(f"{source}: a file; recordings other than run directories are not read yet")
+    raise DataError(f"{source}: no such run directory or port")
+
+
+class Port:
+    """A live team behind a serial port, as one stream of observations.
+
+    ``counters`` are the link's: frames, losses, rejections. ``DeviceError`` from the iteration
+    says that the port does not exist or has vanished; what came before has been yielded.
+    """
+
+    def __init__(self, port: str, seconds: float | None = None) -> None:
+        from relpos.link import live
+
+        self._link = live.Link()
+        self._device = live.open_port(port)
+        self._seconds = seconds
+
+    @property
+    def counters(self) -> Mapping[str, float]:
+        """Counts of the whole link so far."""
+        return self._link.summary()
+
+    def __iter__(self) -> Iterator[Observation]:
+        """Yield observations until the seconds are over, or for ever."""
+        from relpos.link import live
+
+        started = time.monotonic()
+        try:
+            for batch in live.observe(self._device, self._link):
+                yield from batch
+                if self._seconds is not None and time.monotonic() - started > self._seconds:
+                    return
+        finally:
+            self._device.close()

@@ -1,0 +1,65 @@
+"""Metrics as plain JSON values: what ``--json`` prints and a script reads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+from relpos.evaluation.metrics import Metrics
+
+FIGURES = (
+    "relative_distance_rmse_m",
+    "relative_position_rmse_m",
+    "body_frame_rmse_m",
+    "nees_distance",
+)
+
+
+def as_json(metrics: Metrics) -> dict[str, Any]:
+    """Return the figures under their names in the run format, per pair and over time.
+
+    A figure that nothing can be said about is None, which JSON writes as null.
+    """
+    return {
+        **figures(metrics),
+        "epochs": metrics.epochs,
+        "pairs": [
+            {
+                "node": node,
+                "peer": peer,
+                "epochs": pair.epochs,
+                "distance_rmse_m": _figure(pair.distance_rmse_m),
+                "distance_error_mean_m": _figure(pair.distance_error_mean_m),
+                "distance_error_max_m": _figure(pair.distance_error_max_m),
+                "body_frame_rmse_m": _figure(pair.body_frame_rmse_m),
+                "nees_distance": _figure(pair.nees_distance),
+            }
+            for (node, peer), pair in metrics.pairs.items()
+        ],
+        "over_time": {
+            "time_s": _series(metrics.time_s.tolist()),
+            "relative_distance_rmse_m": _series(metrics.distance_rmse_over_time_m.tolist()),
+            "relative_position_rmse_m": _series(metrics.position_rmse_over_time_m.tolist()),
+            "body_frame_rmse_m": _series(metrics.body_frame_rmse_over_time_m.tolist()),
+            "nees_distance": _series(metrics.nees_over_time.tolist()),
+        },
+    }
+
+
+def figures(metrics: Metrics) -> dict[str, float | None]:
+    """Return the four figures of the team alone."""
+    return {name: _figure(getattr(metrics, name)) for name in FIGURES}
+
+
+def no_metrics() -> dict[str, None]:
+    """Return the same names where there is no truth to score against."""
+    return dict.fromkeys(FIGURES)
+
+
+def _figure(value: float) -> float | None:
+    return round(value, 6) if math.isfinite(value) else None
+
+
+def _series(values: Iterable[float]) -> list[float | None]:
+    return [_figure(value) for value in values]
