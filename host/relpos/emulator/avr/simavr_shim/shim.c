@@ -104,7 +104,17 @@ static void logger(avr_t *avr, const int level, const char *format, va_list argu
 	if (!e) return;
 	char text[160];
 	vsnprintf(text, sizeof text, format, arguments);
-	fail(e, "%s", text);
+	char plain[sizeof text];
+	size_t n = 0;
+	for (const char *c = text; *c; c++) { /* without terminal colours */
+		if (*c == '\x1b') { while (c[1] && *c != 'm') c++; }
+		else plain[n++] = *c;
+	}
+	plain[n] = 0;
+	if (strstr(plain, "avr_sadly_crashed"))
+		fail(e, "the simulated processor crashed at pc %#x", (unsigned)avr->pc);
+	else
+		fail(e, "%s", plain);
 }
 
 static void append(relpos_avr *e, record_list *list, uint64_t cycle, uint8_t value)
