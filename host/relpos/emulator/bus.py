@@ -1,4 +1,4 @@
-"""The I2C bus of an emulated board, for engines that speak bytes and engines that speak transactions.
+"""The I2C bus of an emulated board, for engines that speak bytes and for those of transactions.
 
 A chip model is written once, at the byte level (:class:`I2cDevice`). The AVR engine drives it
 condition by condition through :class:`I2cBus` (``start``, ``write``, ``read``, ``stop``), the
