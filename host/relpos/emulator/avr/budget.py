@@ -1,0 +1,225 @@
+"""What the whole firmware costs on each board, measured on the simulator.
+
+    python -m relpos.emulator.avr.budget [--board uno] [--seconds 60]
+
+The firmware .elf runs with register-level chips under a walking member of a team of six: every
+report, ranging round, magnetometer reading and command of normal service happens. Exit status 1
+where a budget is exceeded or the firmware did not do its work.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress, TimeElapsedColumn
+from rich.table import Table
+
+from relpos.emulator.avr.board import BOARDS
+from relpos.emulator.avr.elf import read_firmware
+from relpos.emulator.avr.library import SimulatorError
+from relpos.emulator.avr.service import Service
+from relpos.errors import RelposError
+
+TICK_CYCLES = 320_000
+"""One 50 Hz tick at 16 MHz."""
+ENVIRONMENTS = {"uno": "uno", "mega": "megaatmega2560"}
+STEP_US = 250_000
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The most that a board's firmware may take."""
+
+    flash_bytes: int
+    ram_bytes: int
+    """Static RAM and deepest stack together."""
+    worst_tick_share: float
+
+
+BUDGETS = {
+    # Issue 2: 31 KB of the Uno's 31.5 KB beside its boot loader, 1.85 KB of its 2 KB.
+    "uno": Budget(31 * 1024, 1894, 0.60),
+    # The Mega holds the same firmware: its own limits less its boot loader and the same reserve.
+    "mega": Budget(248 * 1024, 8192 - (2048 - 1894), 0.60),
+}
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one board's firmware took in one run."""
+
+    board: str
+    seconds: float
+    flash_bytes: int
+    static_ram_bytes: int
+    stack_bytes: int
+    ticks: int
+    mean_tick_cycles: float
+    worst_tick_cycles: int
+    worst_tick_at_s: float
+    work: str
+    """What the firmware did meanwhile, in words."""
+    faults: tuple[str, ...]
+    """Why the run does not count, or past which budget it is."""
+
+    @property
+    def ram_bytes(self) -> int:
+        """Static RAM and deepest stack."""
+        return self.static_ram_bytes + self.stack_bytes
+
+    @property
+    def worst_tick_share(self) -> float:
+        """Of the 20 ms between two ticks."""
+        return self.worst_tick_cycles / TICK_CYCLES
+
+
+def default_build_folder() -> Path:
+    """Where PlatformIO builds: tools/pio into .build/pio, a user's own pio into .pio."""
+    root = Path(__file__).resolve().parents[4]
+    ours = root / ".build" / "pio" / "build"
+    return ours if ours.is_dir() else root / ".pio" / "build"
+
+
+def find_firmware(board: str, folder: Path) -> Path:
+    """The board's .elf under PlatformIO's build folder; SimulatorError where it is not built."""
+    path = folder / ENVIRONMENTS[board] / "firmware.elf"
+    if not path.is_file():
+        raise SimulatorError(f"there is no firmware for the {board} at {path}: run `make firmware`")
+    return path
+
+
+def measure(
+    board: str,
+    elf: Path,
+    seconds: float,
+    seed: int = 1,
+    progress: Callable[[float], None] = lambda _seconds: None,
+) -> Cost:
+    """Run the firmware for so many seconds of normal service and measure what it takes."""
+    firmware = read_firmware(elf)
+    with Service(BOARDS[board], firmware, seconds, seed) as service:
+        until_us = 0
+        while until_us < seconds * 1e6:
+            until_us = min(until_us + STEP_US, round(seconds * 1e6))
+            service.run(until_us)
+            progress(until_us / 1e6)
+        counters = service.engine.board.counters()
+        stack = service.engine.board.deepest_stack_bytes
+        work, faults = service.work_done()
+    limits = BUDGETS[board]
+    worst = counters.tick_cycles_max
+    ram = firmware.static_ram_bytes + stack
+    past = list(faults)
+    if counters.ticks < 0.9 * 50 * (seconds - 2.0):
+        past.append(f"only {counters.ticks} ticks in {seconds:g} s")
+    if firmware.flash_bytes > limits.flash_bytes:
+        past.append(f"flash {firmware.flash_bytes} B is past {limits.flash_bytes} B")
+    if ram > limits.ram_bytes:
+        past.append(f"static RAM and deepest stack {ram} B are past {limits.ram_bytes} B")
+    if worst > limits.worst_tick_share * TICK_CYCLES:
+        past.append(f"worst tick {worst} cycles is past {limits.worst_tick_share:.0%} of 20 ms")
+    return Cost(
+        board=board,
+        seconds=seconds,
+        flash_bytes=firmware.flash_bytes,
+        static_ram_bytes=firmware.static_ram_bytes,
+        stack_bytes=stack,
+        ticks=counters.ticks,
+        mean_tick_cycles=counters.tick_cycles_sum / max(counters.ticks, 1),
+        worst_tick_cycles=worst,
+        worst_tick_at_s=counters.worst_tick_at_cycle / BOARDS[board].frequency_hz,
+        work=work,
+        faults=tuple(past),
+    )
+
+
+def table(costs: Sequence[Cost]) -> Table:
+    """Costs beside budgets, one column a board."""
+    shown = Table(title="Firmware on simavr")
+    shown.add_column("")
+    for cost in costs:
+        shown.add_column(cost.board, justify="right")
+
+    def row(label: str, cell: Callable[[Cost, Budget], str]) -> None:
+        shown.add_row(label, *(cell(cost, BUDGETS[cost.board]) for cost in costs))
+
+    row("flash", lambda c, b: f"{c.flash_bytes} of {b.flash_bytes} B")
+    row("static RAM", lambda c, _: f"{c.static_ram_bytes} B")
+    row("deepest stack", lambda c, _: f"{c.stack_bytes} B")
+    row("RAM together", lambda c, b: f"{c.ram_bytes} of {b.ram_bytes} B")
+    row("ticks", lambda c, _: f"{c.ticks} in {c.seconds:g} s")
+    row(
+        "mean tick",
+        lambda c, _: f"{c.mean_tick_cycles:.0f} cycles, {c.mean_tick_cycles / TICK_CYCLES:.1%}",
+    )
+    row(
+        "worst tick",
+        lambda c, b: (
+            f"{c.worst_tick_cycles} cycles, {c.worst_tick_share:.1%} of {b.worst_tick_share:.0%}"
+        ),
+    )
+    row("worst tick at", lambda c, _: f"{c.worst_tick_at_s:.2f} s")
+    return shown
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, print, and return the exit status."""
+    parser = argparse.ArgumentParser(
+        prog="python -m relpos.emulator.avr.budget", description=__doc__
+    )
+    parser.add_argument("--board", action="append", choices=sorted(BOARDS), help="default: both")
+    parser.add_argument(
+        "--seconds", type=float, default=60.0, help="length of the walk (default 60)"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="of the walk and the chips' errors")
+    parser.add_argument("--build", type=Path, default=None, help="PlatformIO's build folder")
+    given = parser.parse_args(arguments)
+    boards: list[str] = given.board or list(BOARDS)
+    folder: Path = given.build or default_build_folder()
+    try:
+        if not 5.0 <= given.seconds <= 3600.0:
+            raise SimulatorError(f"a walk lasts 5 to 3600 seconds, not {given.seconds:g}")
+        files = {board: find_firmware(board, folder) for board in boards}
+        costs = _measure_all(files, given.seconds, given.seed)
+    except RelposError as error:
+        print(f"budget: {error}", file=sys.stderr)
+        return 1
+    console = Console()
+    console.print(table(costs))
+    for cost in costs:
+        console.print(f"{cost.board}: {cost.work}", highlight=False)
+    faults = [f"{cost.board}: {fault}" for cost in costs for fault in cost.faults]
+    for fault in faults:
+        print(f"budget: {fault}", file=sys.stderr)
+    return 1 if faults else 0
+
+
+def _measure_all(files: dict[str, Path], seconds: float, seed: int) -> list[Cost]:
+    lock = threading.Lock()
+    with (
+        Progress(
+            *Progress.get_default_columns(), TimeElapsedColumn(), console=Console(stderr=True)
+        ) as bars,
+        ThreadPoolExecutor(len(files)) as pool,  # the simulation itself runs outside Python's lock
+    ):
+        tasks = {board: bars.add_task(f"simulating {board}", total=seconds) for board in files}
+
+        def one(board: str) -> Cost:
+            def show(done: float) -> None:
+                with lock:
+                    bars.update(tasks[board], completed=done)
+
+            return measure(board, files[board], seconds, seed, show)
+
+        return list(pool.map(one, files))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
