@@ -5,55 +5,19 @@ uart(51) is 16 MHz / 8 / 52 = 38462 baud.
 
 from __future__ import annotations
 
-import os
-import shutil
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from avr_programs import MISSING, Builder
 
 from relpos.emulator.avr import BOARDS, AvrEngine, Board, Firmware, SimulatorError, read_firmware
 from relpos.emulator.avr.board import BUS_HANGS, BusOperation, ResetCause
-from relpos.emulator.avr.library import missing_parts
 from relpos.emulator.bus import I2cBus, I2cDevice
 
-MISSING = missing_parts() or (None if shutil.which("avr-gcc") else "avr-gcc (Debian: gcc-avr)")
 pytestmark = pytest.mark.skipif(MISSING is not None, reason=f"{MISSING} is not installed")
-
-HEAD = r"""
-#include <avr/io.h>
-#include <avr/interrupt.h>
-#include <avr/eeprom.h>
-#include <avr/wdt.h>
-#include <util/delay.h>
-static inline void uart(uint8_t divisor) {
-  UCSR0A = _BV(U2X0); UBRR0 = divisor; UCSR0B = _BV(TXEN0) | _BV(RXEN0); }
-static inline void put(uint8_t b) { while (!(UCSR0A & _BV(UDRE0))); UDR0 = b; }
-static inline uint8_t twi(uint8_t c) {
-  TWCR = c | _BV(TWINT) | _BV(TWEN); while (!(TWCR & _BV(TWINT))); return TWSR & 0xf8; }
-static inline void twi_stop(void) {
-  TWCR = _BV(TWINT) | _BV(TWSTO) | _BV(TWEN); while (TWCR & _BV(TWSTO)); }
-"""
-
-
-class Builder:
-    """Compiles C programs for a chip."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def __call__(self, program: str, mmcu: str = "atmega328p", *options: str) -> Firmware:
-        number = len(list(self.folder.iterdir()))
-        source = self.folder / f"p{number}.c"
-        source.write_text(HEAD + program)
-        elf = source.with_suffix(".elf")
-        command = [
-            "avr-gcc", f"-mmcu={mmcu}", "-DF_CPU=16000000UL", "-Os", "-std=gnu11", *options,
-            "-o", str(elf), str(source),
-        ]  # fmt: skip
-        subprocess.run(command, check=True, env={**os.environ, "LC_ALL": "C"})
-        return read_firmware(elf)
 
 
 @pytest.fixture
@@ -625,3 +589,38 @@ def test_a_truncated_firmware_is_an_error_wherever_it_is_cut(
         path.write_bytes(whole[:length])
         with pytest.raises(SimulatorError):
             read_firmware(path)
+
+
+def test_what_comes_before_power_on_is_lost_and_counted(build: Builder) -> None:
+    bus = I2cBus()
+    board = AvrEngine(
+        BOARDS["uno"], build(ECHO), bus, bytearray(1024), 1, power_on_us=50_000, line_baud=38400
+    )
+    heard: list[tuple[int, bytes]] = []
+    board.on_transmit = lambda time_us, data: heard.append((time_us, data))
+    board.run(20_000)
+    board.receive(b"early")
+    board.run(60_000)
+    board.receive(b"!")
+    board.run(70_000)
+    board.close()
+    assert board.lost_before_power_on == 5
+    assert [data for _, data in heard] == [b"!"]
+    assert heard[0][0] == pytest.approx(60_000 + 2 * 260, abs=10)
+
+
+def test_boards_in_different_threads_do_not_disturb_each_other(build: Builder) -> None:
+    good, bad = build(ECHO), build('int main(void) { asm volatile(".word 1"); for (;;); }')
+
+    def one(number: int) -> str:
+        with Board(BOARDS["uno"], bad if number % 2 else good) as board:
+            try:
+                board.run(1_600_000)
+            except SimulatorError as error:
+                return str(error)
+            return "ran"
+
+    with ThreadPoolExecutor(4) as pool:
+        results = list(pool.map(one, range(16)))
+    assert results[::2] == ["ran"] * 8
+    assert all("Invalid Opcode" in result for result in results[1::2])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from enum import IntEnum
@@ -79,7 +78,6 @@ class Counters:
 
 _COUNTERS = len(fields(Counters))
 _ROOM = 1024
-_lock = threading.Lock()  # the shim keeps a list of its boards
 
 
 class Board:
@@ -107,18 +105,17 @@ class Board:
         self._failure: BaseException | None = None
         # The callback object must outlive the board.
         self._callback = BusCallback(self._on_bus)
-        with _lock:
-            self._board = self._library.relpos_avr_create(
-                kind.mmcu.encode(),
-                firmware.flash,
-                len(firmware.flash),
-                self.frequency_hz,
-                firmware.static_end,
-                line_baud,
-                int(reset_cause),
-                self._callback,
-                None,
-            )
+        self._board = self._library.relpos_avr_create(
+            kind.mmcu.encode(),
+            firmware.flash,
+            len(firmware.flash),
+            self.frequency_hz,
+            firmware.static_end,
+            line_baud,
+            int(reset_cause),
+            self._callback,
+            None,
+        )
         if not self._board:
             raise SimulatorError(
                 f"simavr cannot run {len(firmware.flash)} bytes of program on an {kind.mmcu}"
@@ -227,8 +224,7 @@ class Board:
     def close(self) -> None:
         """Free the board."""
         if self._board:
-            with _lock:
-                self._library.relpos_avr_destroy(self._board)
+            self._library.relpos_avr_destroy(self._board)
             self._board = None
 
     def __enter__(self) -> Self:

@@ -81,6 +81,9 @@ class AvrEngine:
         self._eeprom = eeprom
         self._eeprom_writes = 0
         self._now_us = power_on_us
+        self.powered = power_on_us <= 0
+        self.lost_before_power_on = 0
+        """Received bytes for which there was no board yet."""
         self.board = Board(
             kind,
             firmware,
@@ -102,6 +105,7 @@ class AvrEngine:
 
         Raises SimulatorError when the firmware crashes, after handing over what it sent before.
         """
+        self.powered = until_us >= self._power_on_us
         if until_us > self._now_us:
             try:
                 self.board.run(self._cycle(until_us))
@@ -122,7 +126,10 @@ class AvrEngine:
 
     def receive(self, data: bytes) -> None:
         """Bytes that begin to arrive now at the board's UART, at the line's speed."""
-        self.board.receive(data, max(0, self._cycle(self._now_us)))
+        if self.powered:
+            self.board.receive(data, self._cycle(self._now_us))
+        else:
+            self.lost_before_power_on += len(data)
 
     def reset(self, cause: ResetCause) -> None:
         """Reset the board as by its button, a dip of the supply or a new battery."""

@@ -50,7 +50,7 @@ struct relpos_avr {
 	avr_t *avr;
 	relpos_avr_bus bus;
 	void *context;
-	int failed, reached;
+	int failed;
 	char error[200];
 	uint8_t next_cause;
 	uint64_t counter[COUNTER_COUNT];
@@ -78,10 +78,9 @@ struct relpos_avr {
 	uint16_t write_address;
 	uint8_t write_value;
 	int writing;
-	struct relpos_avr *next;
 };
 
-static relpos_avr *boards; /* for the logger, which gets only the avr_t */
+static __thread relpos_avr *current; /* for the logger, which gets only the avr_t */
 
 static void fail(relpos_avr *e, const char *format, ...)
 {
@@ -98,10 +97,8 @@ static void fail(relpos_avr *e, const char *format, ...)
 
 static void logger(avr_t *avr, const int level, const char *format, va_list arguments)
 {
-	if (level != LOG_ERROR || !avr) return;
-	relpos_avr *e = __atomic_load_n(&boards, __ATOMIC_ACQUIRE);
-	while (e && e->avr != avr) e = e->next;
-	if (!e) return;
+	relpos_avr *e = current;
+	if (level != LOG_ERROR || !e || e->avr != avr) return;
 	char text[160];
 	vsnprintf(text, sizeof text, format, arguments);
 	char plain[sizeof text];
@@ -543,9 +540,8 @@ static void sph_write(avr_t *avr, avr_io_addr_t address, uint8_t v, void *param)
 
 static avr_cycle_count_t reached(avr_t *avr, avr_cycle_count_t when, void *param)
 {
-	(void)avr; (void)when;
-	((relpos_avr *)param)->reached = 1;
-	return 0;
+	(void)avr; (void)when; (void)param;
+	return 0; /* its being due is what ends the burst */
 }
 
 static void no_sleep(avr_t *avr, avr_cycle_count_t how_long)
@@ -587,7 +583,7 @@ int32_t relpos_avr_run(relpos_avr *e, uint64_t cycle)
 {
 	avr_t *avr = e->avr;
 	uint64_t resets = e->counter[COUNTER_RESETS];
-	e->reached = 0;
+	current = e;
 	if (avr->cycle < cycle) avr_cycle_timer_register(avr, cycle - avr->cycle, reached, e);
 	while (!e->failed && avr->cycle < cycle) {
 		avr_run(avr);
@@ -686,8 +682,6 @@ relpos_avr *relpos_avr_create(const char *mmcu, const uint8_t *flash, uint32_t f
 	avr_io_t *last = avr->io_port;
 	while (last->next) last = last->next;
 	last->next = &e->io;
-	e->next = boards;
-	__atomic_store_n(&boards, e, __ATOMIC_RELEASE);
 	e->next_cause = reset_cause;
 	avr_reset(avr);
 	e->counter[COUNTER_RESETS] = 0;
@@ -697,8 +691,6 @@ relpos_avr *relpos_avr_create(const char *mmcu, const uint8_t *flash, uint32_t f
 void relpos_avr_destroy(relpos_avr *e)
 {
 	if (!e) return;
-	for (relpos_avr **link = &boards; *link; link = &(*link)->next)
-		if (*link == e) { *link = e->next; break; }
 	e->bus = NULL;
 	for (avr_io_t *io = e->avr->io_port; io; io = io->next)
 		if (io->next == &e->io) io->next = NULL;
@@ -712,6 +704,7 @@ void relpos_avr_destroy(relpos_avr *e)
 
 void relpos_avr_reset(relpos_avr *e, uint8_t cause)
 {
+	current = e;
 	e->next_cause = cause;
 	avr_reset(e->avr);
 }

@@ -1,0 +1,98 @@
+"""The whole firmware stays within its budgets, and a firmware that does not is refused."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from avr_programs import MISSING, Builder
+
+from relpos.emulator.avr import budget
+from relpos.emulator.avr.budget import find_firmware, main, measure
+
+pytestmark = pytest.mark.skipif(MISSING is not None, reason=f"{MISSING} is not installed")
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def place(elf: Path, folder: Path) -> None:
+    """Put a program where PlatformIO would."""
+    target = folder / "uno" / "firmware.elf"
+    target.parent.mkdir(parents=True)
+    target.write_bytes(elf.read_bytes())
+
+
+TICKING = r"""
+volatile uint8_t variables[VARIABLES];
+const uint8_t filler[FILLER] PROGMEM = {1};
+int main(void) {
+  uart(51);
+  variables[1] = pgm_read_byte(filler);
+  for (;;) { GPIOR0 = 1; _delay_ms(BUSY_MS); GPIOR0 = 0; _delay_ms(20 - BUSY_MS); }
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (("-DVARIABLES=2", "-DFILLER=2", "-DBUSY_MS=13"), "worst tick 2080"),
+        (("-DVARIABLES=1900", "-DFILLER=2", "-DBUSY_MS=1"), "static RAM and deepest stack 19"),
+        (("-DVARIABLES=2", "-DFILLER=31700", "-DBUSY_MS=1"), "flash 31"),
+    ],
+)
+def test_each_budget_that_is_exceeded_is_named(
+    tmp_path: Path, options: tuple[str, ...], complaint: str
+) -> None:
+    elf = Builder(tmp_path).elf("#include <avr/pgmspace.h>\n" + TICKING, "atmega328p", *options)
+    faults = measure("uno", elf, 5.0).faults
+    past = [fault for fault in faults if " past " in fault]
+    assert len(past) == 1
+    assert complaint in past[0]
+
+
+def test_a_firmware_that_does_nothing_is_not_within_budget(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place(Builder(tmp_path).elf("int main(void) { for (;;); }"), tmp_path)
+    assert main(["--board", "uno", "--seconds", "5", "--build", str(tmp_path)]) == 1
+    assert "uno: only 0 ticks in 5 s" in capsys.readouterr().err
+
+
+def test_a_firmware_that_crashes_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place(Builder(tmp_path).elf('int main(void) { asm volatile(".word 1"); }'), tmp_path)
+    assert main(["--board", "uno", "--seconds", "5", "--build", str(tmp_path)]) == 1
+    lines = [line for line in capsys.readouterr().err.splitlines() if "budget:" in line]
+    assert len(lines) == 1
+    assert "Invalid Opcode" in lines[0]
+
+
+def test_a_firmware_that_is_not_built_is_one_line_that_says_how(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--board", "mega", "--build", str(tmp_path)]) == 1
+    assert "run `make firmware`" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def built() -> Path:
+    """PlatformIO's build folder with both boards' firmware as the sources now are."""
+    result = subprocess.run(
+        [sys.executable, str(ROOT / "tools" / "pio"), "run", "-e", "uno", "-e", "megaatmega2560"],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=ROOT,
+    )
+    assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-2000:]
+    return budget.default_build_folder()
+
+
+@pytest.mark.parametrize("board", ["uno", "mega"])
+def test_the_whole_firmware_stays_within_its_budgets(built: Path, board: str) -> None:
+    cost = measure(board, find_firmware(board, built), 45.0)
+    assert cost.faults == (), cost
