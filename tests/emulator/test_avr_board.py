@@ -624,3 +624,77 @@ def test_boards_in_different_threads_do_not_disturb_each_other(build: Builder) -
         results = list(pool.map(one, range(16)))
     assert results[::2] == ["ran"] * 8
     assert all("Invalid Opcode" in result for result in results[1::2])
+
+
+CYCLES = {  # ATmega328P and ATmega2560 data sheets, instruction set summary: (16-bit PC, 22-bit PC)
+    "nop": (1, 1),
+    "mul r18, r19": (2, 2),
+    "adiw r26, 1": (2, 2),
+    "push r18\n pop r18": (4, 4),
+    "lds r18, 0x200": (2, 2),
+    "sts 0x200, r18": (2, 2),
+    "ld r18, X": (2, 2),
+    "ld r18, -X": (2, 2),
+    "ldd r18, Z+3": (2, 2),
+    "st X+, r18": (2, 2),
+    "lpm r18, Z": (3, 3),
+    "rjmp 1f\n 1:": (2, 2),
+    "jmp 1f\n 1:": (3, 3),
+    "rcall 1f\n rjmp 2f\n 1: ret\n 2:": (3 + 4 + 2, 4 + 5 + 2),
+    "call 1f\n rjmp 2f\n 1: ret\n 2:": (4 + 4 + 2, 5 + 5 + 2),
+    "ldi r30, pm_lo8(1f)\n ldi r31, pm_hi8(1f)\n icall\n rjmp 2f\n 1: ret\n 2:": (
+        2 + 3 + 4 + 2,
+        2 + 4 + 5 + 2,
+    ),
+    "sbi 0x05, 0": (2, 2),
+    "in r18, 0x3f": (1, 1),
+    "sbrc r25, 0\n nop": (2, 2),  # r25 is 0: skips one word
+    "sbrs r25, 0\n nop": (2, 2),
+    "sbrc r25, 0\n jmp 0": (3, 3),  # skips two words
+    "cpse r25, r25\n nop": (2, 2),
+    "cp r25, r25\n breq 1f\n 1:": (1 + 2, 1 + 2),
+    "cp r25, r25\n brne 1f\n 1:": (1 + 1, 1 + 1),
+}
+
+
+@pytest.mark.parametrize(("name", "mmcu"), [("uno", "atmega328p"), ("mega", "atmega2560")])
+def test_instructions_take_the_cycles_of_the_data_sheet(
+    build: Builder, name: str, mmcu: str
+) -> None:
+    body = "".join(
+        f'asm volatile("ldi r26, 0\\n ldi r27, 3\\n ldi r30, 0\\n ldi r31, 3\\n ldi r25, 0\\n'
+        f' ldi r24, 1\\n out 0x1e, r24\\n {escaped}\\n out 0x1e, r25\\n"\n'
+        f'::: "r18", "r19", "r24", "r25", "r26", "r27", "r30", "r31", "r0", "r1");'
+        for escaped in (code.replace("\n", "\\n") for code in CYCLES)
+    )
+    column = 0 if name == "uno" else 1
+    with Board(BOARDS[name], build(f"int main(void) {{ {body} for (;;); }}", mmcu)) as board:
+        board.run(16_000)
+        marks = [cycle for cycle, _ in board.take_marks()]
+    taken = [end - begin - 1 for begin, end in zip(marks[::2], marks[1::2], strict=True)]
+    expected = {code: both[column] for code, both in CYCLES.items()}
+    assert dict(zip(CYCLES, taken, strict=True)) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "mmcu", "cost"), [("uno", "atmega328p", 4 + 3 + 4), ("mega", "atmega2560", 5 + 3 + 5)]
+)
+def test_an_interrupt_costs_entry_jump_and_return(
+    build: Builder, name: str, mmcu: str, cost: int
+) -> None:
+    program = r"""
+ISR(TIMER1_COMPA_vect, ISR_NAKED) { asm volatile("reti"); }
+int main(void) {
+  OCR1A = 200; TCCR1B = _BV(WGM12) | _BV(CS10); TIMSK1 = WITH ? _BV(OCIE1A) : 0; TCNT1 = 0; sei();
+  asm volatile("ldi r24, 1\n ldi r25, 0\n out 0x1e, r24\n .rept 300\n nop\n .endr\n out 0x1e, r25\n"
+      ::: "r24", "r25");
+  for (;;);
+}
+"""
+    taken = []
+    for wanted in (0, 1):
+        with Board(BOARDS[name], build(program, mmcu, f"-DWITH={wanted}")) as board:
+            board.run(1600)
+            taken.append(board.counters().tick_cycles_max)
+    assert taken[0] == 301
+    assert taken[1] - taken[0] == cost
