@@ -19,10 +19,11 @@ class Person:
     """Body and habits of one wearer. Lengths in metres, angles in radians.
 
     ``walk_ratio_m_s`` is step length over step frequency, which people keep nearly constant over
-    speed (0.39 m s is 0.0065 m per step/min, Sekiya and Nagasaki 1998). ``pendulum_gain`` is the
-    factor by which the plain pendulum of the leg falls short of this person's step length
-    (Zijlstra and Hof 1997: 1.25; 1.04 to 1.13 in `walk_daily_lowerback`), ``speed_m_s`` the mean
-    speed on the route, corners included, pauses not.
+    speed (Sekiya and Nagasaki 1998: 0.0065 m per step/min, which is 0.39; walk_lowerback_20m:
+    0.33). ``pendulum_gain`` is the factor by which the plain pendulum of the leg falls short of
+    this person's step length (Zijlstra and Hof 1997: 1.25; from the sensor's own rise it is 1.14
+    give or take 0.08 in walk_lowerback_20m, where arm and shock add to the rise). ``speed_m_s``
+    is the mean speed on the route, corners included, pauses not.
     """
 
     stature_m: float
@@ -54,8 +55,8 @@ def make_person(
         leg_length_m=0.53 * stature * float(np.clip(rng.normal(1.0, 0.025), 0.94, 1.06)),
         sensor_height_m=0.73 * stature,
         speed_m_s=float(rng.uniform(*speed_range_m_s)),
-        walk_ratio_m_s=0.39 * stature / 1.72 * math.exp(rng.normal(0.0, 0.06)),
-        pendulum_gain=float(np.clip(rng.normal(1.18, 0.06), 1.0, 1.36)),
+        walk_ratio_m_s=0.36 * stature / 1.72 * math.exp(rng.normal(0.0, 0.08)),
+        pendulum_gain=float(np.clip(rng.normal(1.22, 0.07), 1.0, 1.45)),
         turn_length_m=float(rng.uniform(1.2, 2.4)),
         asymmetry=float(rng.normal(0.0, 0.02)),
         lateral_scale=math.exp(rng.normal(0.0, 0.15)),

@@ -1,0 +1,196 @@
+"""Numbers that describe a walk seen by a torso IMU, for synthesised and recorded walks alike.
+
+``python -m relpos.simulation.gait_statistics [DATA]`` prints the comparison of docs/gait.md;
+DATA is the folder of recordings, by default RELPOS_DATA or ../shared/data.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy import signal
+
+from relpos.simulation.team import SCENARIOS, make_team
+from relpos.simulation.world import FloatArray
+
+HARMONICS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0)
+"""In multiples of the step frequency: halves belong to the stride."""
+
+
+@dataclass(frozen=True, slots=True)
+class GaitStatistics:
+    """Root mean squares of a stretch of walking; harmonics (8,) as in `HARMONICS`.
+
+    Vertical is along the mean specific force, fore-aft the horizontal direction that moves most
+    at the step frequency, lateral across both.
+    """
+
+    step_frequency_hz: float
+    vertical_rms_m_s2: float
+    vertical_peak_m_s2: float
+    horizontal_rms_m_s2: float
+    vertical: FloatArray
+    fore_aft: FloatArray
+    lateral: FloatArray
+    yaw_rate: FloatArray
+    pitch_rate: FloatArray
+    roll_rate: FloatArray
+    step_similarity: float
+    """Autocorrelation of the vertical acceleration one step later, 1 for equal steps."""
+    stride_similarity: float
+    above_15_hz: float
+    """Share of the vertical acceleration's rms that lies above 15 Hz."""
+
+
+def gait_statistics(force: FloatArray, rate: FloatArray, rate_hz: float) -> GaitStatistics:
+    """Statistics of specific force and angular rate, both (n, 3), sampled at ``rate_hz``."""
+    mean = force.mean(axis=0)
+    up = mean / np.linalg.norm(mean)
+    vertical = force @ up - float(np.linalg.norm(mean))
+    frequency, power = _spectrum(vertical, rate_hz)
+    band = (frequency > 0.8) & (frequency < 2.6)
+    step = float(frequency[band][np.argmax(power[band])])
+    horizontal = force - np.outer(force @ up, up)
+    horizontal = horizontal - horizontal.mean(axis=0)
+    sos = signal.butter(2, (0.85 * step, 1.15 * step), "band", fs=rate_hz, output="sos")
+    moving = signal.sosfiltfilt(sos, horizontal, axis=0)
+    fore = np.linalg.svd(moving, full_matrices=False)[2][0]
+    left = np.cross(up, fore)
+    correlation = signal.correlate(vertical, vertical, "full", "fft")[len(vertical) - 1 :]
+    correlation = correlation / correlation[0]
+    lag = rate_hz / step
+
+    def near(middle: float) -> float:
+        return float(correlation[round(0.85 * middle) : round(1.15 * middle) + 1].max())
+
+    high = power[frequency > 15.0].sum() / power.sum()
+    return GaitStatistics(
+        step_frequency_hz=step,
+        vertical_rms_m_s2=float(vertical.std()),
+        vertical_peak_m_s2=float(np.quantile(vertical, 0.995)),
+        horizontal_rms_m_s2=float(np.sqrt((horizontal**2).sum(axis=1).mean())),
+        vertical=_harmonics(vertical, step, rate_hz),
+        fore_aft=_harmonics(horizontal @ fore, step, rate_hz),
+        lateral=_harmonics(horizontal @ left, step, rate_hz),
+        yaw_rate=_harmonics(rate @ up, step, rate_hz),
+        pitch_rate=_harmonics(rate @ left, step, rate_hz),
+        roll_rate=_harmonics(rate @ fore, step, rate_hz),
+        step_similarity=near(lag),
+        stride_similarity=near(2 * lag),
+        above_15_hz=math.sqrt(float(high)),
+    )
+
+
+def _spectrum(values: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:
+    segment = min(len(values), round(10 * rate_hz))
+    frequency, power = signal.welch(
+        values - values.mean(), rate_hz, nperseg=segment, nfft=8 * segment
+    )
+    return np.asarray(frequency), np.asarray(power)
+
+
+def _harmonics(values: FloatArray, step_hz: float, rate_hz: float) -> FloatArray:
+    frequency, power = _spectrum(values, rate_hz)
+    width = frequency[1] - frequency[0]
+    return np.array(
+        [
+            math.sqrt(float(power[np.abs(frequency - k * step_hz) < 0.2].sum() * width))
+            for k in HARMONICS
+        ]
+    )
+
+
+def recorded_walk(folder: Path) -> GaitStatistics | None:
+    """Statistics of a recording's walking part; None where there is less than 8 s of it."""
+    table = np.genfromtxt(folder / "imu.csv.gz", delimiter=",", names=True)
+    rate_hz = 1.0 / float(np.median(np.diff(table["time_s"])))
+    force = np.column_stack([table[f"a{axis}_m_s2"] for axis in "xyz"])
+    rate = np.column_stack([table[f"g{axis}_rad_s"] for axis in "xyz"])
+    norm = np.linalg.norm(force, axis=1)
+    # Walking: the norm moves by more than 0.7 m/s2 rms within two seconds.
+    kernel = np.ones(round(2 * rate_hz)) / round(2 * rate_hz)
+    spread = np.convolve((norm - norm.mean()) ** 2, kernel, "same")
+    walking = np.flatnonzero(spread > 0.5)
+    if len(walking) < 8 * rate_hz:
+        return None
+    part = slice(int(walking[0]), int(walking[-1]) + 1)
+    return gait_statistics(force[part], rate[part], rate_hz)
+
+
+def simulated_walks(
+    speed_m_s: tuple[float, float], walkers: int, seed: int, seconds: float = 70.0
+) -> list[GaitStatistics]:
+    """Statistics of walkers on the rectangle at given speeds, sampled at 100 Hz like the data."""
+    scenario = replace(
+        SCENARIOS["lab"],
+        speed_m_s=speed_m_s,
+        spacing_m=0.0,
+        path_m=(60.0, 30.0),
+    )
+    team, _ = make_team(scenario, walkers, seconds, seed)
+    part = slice(round(8.0 * 200), None)
+    return [
+        gait_statistics(
+            signal.decimate(w.specific_force_m_s2[part], 2, ftype="fir", axis=0),
+            signal.decimate(w.angular_rate_rad_s[part], 2, ftype="fir", axis=0),
+            100.0,
+        )
+        for w in team
+    ]
+
+
+def _print(title: str, walks: list[GaitStatistics]) -> None:
+    def mean(name: str) -> FloatArray:
+        return np.asarray(np.mean([getattr(w, name) for w in walks], axis=0))
+
+    def row(values: FloatArray) -> str:
+        return " ".join(f"{v:5.2f}" for v in values)
+
+    scalar = (
+        "step_frequency_hz",
+        "vertical_rms_m_s2",
+        "vertical_peak_m_s2",
+        "horizontal_rms_m_s2",
+        "step_similarity",
+        "stride_similarity",
+        "above_15_hz",
+    )
+    print(f"{title} ({len(walks)} walks)")
+    for name in scalar:
+        values = [getattr(w, name) for w in walks]
+        print(f"  {name:22s} {np.mean(values):5.2f}  from {min(values):.2f} to {max(values):.2f}")
+    print(f"  {'harmonic':22s} " + row(np.array(HARMONICS)))
+    for name in ("vertical", "fore_aft", "lateral", "yaw_rate", "pitch_rate", "roll_rate"):
+        print(f"  {name:22s} " + row(mean(name)))
+
+
+def data_folder() -> Path | None:
+    """Find the folder of recordings, None where it is missing."""
+    beside = Path(__file__).resolve().parents[4] / "shared" / "data"
+    folder = Path(os.environ.get("RELPOS_DATA", beside))
+    return folder if folder.is_dir() else None
+
+
+def main(arguments: list[str]) -> int:
+    """Print simulated and recorded walks side by side."""
+    folder = Path(arguments[0]) if arguments else data_folder()
+    if folder is None or not folder.is_dir():
+        print("no recordings: give their folder, or set RELPOS_DATA", file=sys.stderr)
+        return 1
+    for name, groups in (("walk_chest", ((1.4, 1.68), (1.68, 1.9))), ("walk_lowerback_20m", ())):
+        walks = [w for f in sorted((folder / name).iterdir()) if (w := recorded_walk(f))]
+        for low, high in groups or ((0.8, 2.6),):
+            some = [w for w in walks if low <= w.step_frequency_hz < high]
+            _print(f"recorded {name}, {low} to {high} steps/s", some)
+    for speeds in ((0.8, 0.95), (1.1, 1.25), (0.5, 0.6)):
+        _print(f"simulated, {speeds[0]} to {speeds[1]} m/s", simulated_walks(speeds, 12, 3))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))
