@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from avr_programs import MISSING, Builder
 
@@ -698,3 +699,47 @@ int main(void) {
             taken.append(board.counters().tick_cycles_max)
     assert taken[0] == 301
     assert taken[1] - taken[0] == cost
+
+
+CORE = Path("/usr/share/arduino/hardware/arduino/avr")
+
+
+@pytest.mark.skipif(not CORE.is_dir(), reason="arduino-core-avr is not installed")
+@pytest.mark.parametrize(
+    ("name", "mmcu", "variant"), [("uno", "atmega328p", "standard"), ("mega", "atmega2560", "mega")]
+)
+def test_arduinos_micros_follows_the_cycles_and_never_steps_back(
+    build: Builder, name: str, mmcu: str, variant: str
+) -> None:
+    program = r"""
+#include <stdbool.h>
+#include "Arduino.h"
+int main(void) {
+  init();
+  uint32_t last = 0; uint8_t backwards = 0;
+  uart(51);
+  for (uint16_t turn = 0; turn < 3000; turn++) {
+    GPIOR0 = 7;
+    uint32_t now = micros();
+    if (now < last) backwards++;
+    last = now;
+    if (!(turn % 500)) { put(now); put(now >> 8); put(now >> 16); put(now >> 24); }
+  }
+  put(backwards);
+  for (;;);
+}
+"""
+    firmware = build(
+        program, mmcu, str(CORE / "cores" / "arduino" / "wiring.c"), "-DARDUINO=10819", "-Wl,--gc-sections", "-ffunction-sections",
+        f"-I{CORE / 'cores' / 'arduino'}", f"-I{CORE / 'variants' / variant}",
+    )  # fmt: skip
+    with Board(BOARDS[name], firmware) as board:
+        board.run(16_000_00)
+        out = sent(board)
+        marks = [cycle for cycle, value in board.take_marks() if value == 7]
+    assert len(out) == 6 * 4 + 1
+    assert out[-1] == 0
+    stamps = np.frombuffer(out[:-1], dtype="<u4").astype(float)
+    true = np.array(marks[::500]) / 16.0
+    drift = (stamps - stamps[0]) - (true - true[0])
+    assert np.abs(drift).max() <= 8.0  # micros() counts in steps of 4
