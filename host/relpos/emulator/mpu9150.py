@@ -13,6 +13,7 @@ DLPF_CFG 1 to 6: 2.0/2.2, 3.0/3.4, 4.9/5.1, 8.5/10.7, 13.8/22.5, 19.0/45).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
@@ -138,7 +139,7 @@ class _Pipeline:
 
     def _raw(self, begin: int, end: int, config: int) -> FloatArray:
         steps = np.arange(begin, end)
-        times: FloatArray = steps * self.step_s - _EXTRA_DELAY_S[config]
+        times = np.asarray(steps * self.step_s - _EXTRA_DELAY_S[config], dtype=np.float64)
         true = self._surroundings.inertial_at(times)
         rows: FloatArray = true @ self._gain + self._bias
         if self._sigma.any() or self._errors.gyroscope_walk_rad_s_rts:
@@ -169,12 +170,12 @@ class Mpu9150(I2cDevice):
         self,
         surroundings: Surroundings,
         errors: InertialErrors | None = None,
-        auxiliary: dict[int, I2cDevice] | None = None,
+        auxiliary: Mapping[int, I2cDevice] | None = None,
     ) -> None:
         self._surroundings = surroundings
         self._errors = errors or InertialErrors()
         self._pipeline = _Pipeline(surroundings, self._errors)
-        self.auxiliary = auxiliary or {}
+        self.auxiliary: Mapping[int, I2cDevice] = {} if auxiliary is None else auxiliary
         self.time_us = 0
         self._registers = bytearray(128)
         self._pointer = 0

@@ -1,0 +1,223 @@
+"""Virtual time, and the two airs that boards share in it: UWB between tags, radio between XBees."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from relpos.simulation.world import FloatArray, World
+
+from .pozyx import (
+    ERROR_RESPONSE_TIMEOUT_1,
+    ERROR_RESPONSE_TIMEOUT_2,
+    Pozyx,
+    RangeResult,
+)
+from .xbee import BROADCAST, DELIVERED, NO_ACKNOWLEDGEMENT, XbeeModule
+
+Action = Callable[[int], None]
+
+EXCHANGE_US = 20_000
+"""One two-way ranging at 110 kbit/s and a preamble of 1024 symbols (assumed: pypozyx first
+allowed 25 ms for all of it)."""
+FAILED_EXCHANGE_US = 30_000
+"""Until the initiator gives up on an answer (assumed)."""
+NO_ACKNOWLEDGEMENT_US = 40_000
+"""Until an XBee gives up: four attempts of 802.15.4 with carrier sensing (assumed)."""
+
+
+class VirtualClock:
+    """Actions in the order of their due times; those due at once in the order they were asked."""
+
+    def __init__(self) -> None:
+        self.now_us = 0
+        self._heap: list[tuple[int, int, Action]] = []
+        self._asked = 0
+
+    def at(self, time_us: int, action: Action) -> None:
+        """Call ``action(time)`` at ``time_us``, or now where that is past."""
+        self._asked += 1
+        heapq.heappush(self._heap, (max(time_us, self.now_us), self._asked, action))
+
+    def run(self, until_us: int) -> None:
+        """Carry out everything due by ``until_us``; then that is the time."""
+        heap = self._heap
+        pop = heapq.heappop
+        while heap and heap[0][0] <= until_us:
+            time_us, _, action = pop(heap)
+            self.now_us = time_us
+            action(time_us)
+        self.now_us = max(self.now_us, until_us)
+
+
+@dataclass(slots=True)
+class _Exchange:
+    end_us: int
+    ends: tuple[Pozyx | None, Pozyx | None]
+    collided: bool = False
+
+
+class UwbAir:
+    """Ranging between tags at their true positions.
+
+    Two exchanges that overlap in time, with a tag of the one in reach of a tag of the other, both
+    fail (switched off by ``collisions=False``). ``counts``: attempts, ranges, undetected,
+    collisions, absent.
+    """
+
+    def __init__(
+        self,
+        clock: VirtualClock,
+        world: World,
+        position_m: Callable[[Pozyx, int], FloatArray],
+        rng: np.random.Generator,
+        *,
+        collisions: bool = True,
+    ) -> None:
+        self.tags: list[Pozyx] = []
+        self.counts: Counter[str] = Counter()
+        self._clock = clock
+        self._world = world
+        self._position_m = position_m
+        self._rng = rng
+        self._collisions = collisions
+        self._under_way: list[_Exchange] = []
+
+    def begin_exchange(self, initiator: Pozyx, destination: int, time_us: int) -> None:
+        """See :class:`relpos.emulator.pozyx.UwbMedium`."""
+        self.counts["attempts"] += 1
+        responder = self._find(initiator, destination, time_us)
+        # Drawn at once, so that the order of draws is that of the attempts.
+        measured = None
+        if responder is None:
+            self.counts["absent"] += 1
+        else:
+            measured = self._world.measure_range(
+                self._rng, self._distance_m(initiator, responder, time_us)
+            )
+            if measured is None:
+                self.counts["undetected"] += 1
+        duration_us = FAILED_EXCHANGE_US if measured is None else EXCHANGE_US
+        exchange = _Exchange(time_us + duration_us, (initiator, responder))
+        self._under_way = [e for e in self._under_way if e.end_us > time_us]
+        if self._collisions:
+            for other in self._under_way:
+                if self._in_reach(exchange, other, time_us):
+                    other.collided = exchange.collided = True
+        self._under_way.append(exchange)
+
+        def end(now_us: int) -> None:
+            result, error = None, ERROR_RESPONSE_TIMEOUT_1
+            if exchange.collided:
+                self.counts["collisions"] += 1
+                error = ERROR_RESPONSE_TIMEOUT_2
+            elif measured is not None and responder is not None:
+                self.counts["ranges"] += 1
+                result = RangeResult(round(measured * 1000.0), _uwb_rss_dbm(measured))
+                responder.finish_ranging(initiator.network_id, result, 0, now_us, started=False)
+            initiator.finish_ranging(destination, result, error, now_us, started=True)
+
+        self._clock.at(exchange.end_us, end)
+
+    def _find(self, initiator: Pozyx, destination: int, time_us: int) -> Pozyx | None:
+        for tag in self.tags:
+            if (
+                tag is not initiator
+                and tag.network_id == destination
+                and tag.awake(time_us)
+                and tag.uwb_settings == initiator.uwb_settings
+            ):
+                return tag
+        return None
+
+    def _distance_m(self, a: Pozyx, b: Pozyx, time_us: int) -> float:
+        return math.dist(self._position_m(a, time_us), self._position_m(b, time_us))
+
+    def _in_reach(self, one: _Exchange, other: _Exchange, time_us: int) -> bool:
+        reach_m = self._world.uwb.max_range_m
+        return any(
+            a is b or self._distance_m(a, b, time_us) <= reach_m
+            for a in one.ends
+            if a is not None
+            for b in other.ends
+            if b is not None
+        )
+
+
+def _uwb_rss_dbm(distance_m: float) -> int:
+    """Free space from -79 dBm at 1 m, what Pozyx tags show; no weaker than the receiver's floor."""
+    return max(round(-79.0 - 20.0 * math.log10(max(distance_m, 0.3))), -105)
+
+
+class RadioAir:
+    """802.15.4 between the modules: the world's loss and delay, in order from each sender."""
+
+    def __init__(
+        self,
+        clock: VirtualClock,
+        world: World,
+        distance_m: Callable[[XbeeModule, XbeeModule, int], float],
+        rng: np.random.Generator,
+    ) -> None:
+        self.modules: list[XbeeModule] = []
+        self.counts: Counter[str] = Counter()
+        self._clock = clock
+        self._world = world
+        self._distance_m = distance_m
+        self._rng = rng
+        self._last_us: dict[int, int] = {}
+
+    def send(
+        self,
+        sender: XbeeModule,
+        destination: int,
+        long: bool,
+        data: bytes,
+        time_us: int,
+        report: Callable[[int, int], None],
+    ) -> None:
+        """See :class:`relpos.emulator.xbee.Air`."""
+        self.counts["sent"] += 1
+        broadcast = destination == BROADCAST and not long
+        others = [m for m in self.modules if m is not sender]
+        if broadcast:
+            receivers = others
+        elif long:
+            receivers = [m for m in others if m.serial_number == destination]
+        else:
+            receivers = [m for m in others if m.address == destination]
+        heard = False
+        done_us = time_us
+        for receiver in receivers:
+            delay_s = self._world.transmit(self._rng)
+            if delay_s is None:
+                self.counts["lost"] += 1
+                continue
+            heard = True
+            arrival_us = max(
+                time_us + round(delay_s * 1e6), self._last_us.get(sender.serial_number, 0) + 1
+            )
+            done_us = max(done_us, arrival_us)
+            self._clock.at(arrival_us, self._arrival(sender, receiver, data, broadcast))
+        if broadcast or heard:
+            status = DELIVERED
+        else:
+            status = NO_ACKNOWLEDGEMENT
+            done_us = max(time_us + NO_ACKNOWLEDGEMENT_US, done_us)
+        self._last_us[sender.serial_number] = done_us
+        self._clock.at(done_us, lambda now_us: report(now_us, status))
+
+    def _arrival(
+        self, sender: XbeeModule, receiver: XbeeModule, data: bytes, broadcast: bool
+    ) -> Action:
+        def arrive(now_us: int) -> None:
+            distance_m = self._distance_m(sender, receiver, now_us)
+            rssi_dbm = max(round(-40.0 - 20.0 * math.log10(max(distance_m, 1.0))), -92)
+            receiver.deliver(sender, rssi_dbm, data, broadcast, now_us)
+
+        return arrive

@@ -1,0 +1,280 @@
+"""The native engine: the production firmware compiled for this computer, driven poll by poll.
+
+Virtual time is mapped to the node's 32-bit microsecond clock with its drift and offset; the
+firmware says when it wants its next pass, so that a sleeping node costs nothing.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+from relpos.errors import DeviceError
+from relpos.protocol.messages import ResetCause
+
+from .bus import BusStatus, I2cBus
+from .engine import NodeClockError
+from .xbee import line_time_us
+
+_COMPILE = ("-std=gnu++11", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
+_WARNINGS = ("-Wall", "-Wextra", "-Werror")
+LOOP_US = 200
+"""Shortest time of one pass of the main loop, where the firmware wants the next at once: about
+what the Uno needs for an idle pass with its interrupts. Without it virtual time would stand."""
+EEPROM_BYTES = 1024
+UART_BAUD = 38_400
+RESTART_US = 70_000
+"""From a reset to the first pass: 65 ms start-up of the ATmega's fuses, then the C runtime."""
+
+_U8 = ctypes.c_uint8
+_U16 = ctypes.c_uint16
+_U32 = ctypes.c_uint32
+_POINTER = ctypes.c_void_p
+
+# Plain addresses instead of POINTER(c_uint8): making pointer objects costs more than the chips do.
+_I2cTransfer = ctypes.CFUNCTYPE(
+    _U8, _POINTER, _U8, _POINTER, _U8, _POINTER, _U8, _POINTER, _U8
+)
+_UartWrite = ctypes.CFUNCTYPE(None, _POINTER, _POINTER, _U16)
+_Reset = ctypes.CFUNCTYPE(None, _POINTER)
+
+
+class _Callbacks(ctypes.Structure):
+    _fields_ = (
+        ("context", _POINTER),
+        ("i2c_transfer", _I2cTransfer),
+        ("uart_write", _UartWrite),
+        ("reset", _Reset),
+    )
+
+
+def repository_root() -> Path:
+    """The repository that this package lies in. DeviceError where it was installed without one."""
+    root = Path(__file__).resolve().parents[3]
+    if not (root / "firmware" / "lib").is_dir():
+        raise DeviceError("the firmware's sources are not here: run relpos from its repository")
+    return root
+
+
+def _sources(library: Path) -> list[Path]:
+    """Everything that can end up in the native library, sorted; the Arduino board is not in it."""
+    return sorted(
+        path
+        for path in library.rglob("*")
+        if path.suffix in (".h", ".cpp", ".c") and "arduino" not in path.parts
+    )
+
+
+def build(library: Path | None = None, output: Path | None = None) -> Path:
+    """Compile ``firmware/lib`` where its content has changed; returns the shared library.
+
+    Raises DeviceError where the compiler is missing, or with its first complaint.
+    """
+    library = library or repository_root() / "firmware" / "lib"
+    output = output or repository_root() / ".build" / "native"
+    sources = _sources(library)
+    units = [path for path in sources if path.suffix != ".h"]
+    if not any(path.parent.name == "native" for path in units):
+        raise DeviceError("the firmware has no native board (firmware/lib/board/native)")
+    compiler = os.environ.get("CXX", "g++")
+    digest = hashlib.sha256(" ".join((compiler, *_COMPILE)).encode())
+    for path in sources:
+        digest.update(path.relative_to(library).as_posix().encode() + b"\0")
+        digest.update(path.read_bytes() + b"\0")
+    target = output / f"relpos-node-{digest.hexdigest()[:16]}.so"
+    if target.is_file():
+        return target
+    if shutil.which(compiler) is None:
+        raise DeviceError(
+            f"the native board needs a C++ compiler: {compiler} is not there (apt install g++)"
+        )
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=output) as folder:
+            made = Path(folder) / target.name
+            command = [compiler, *_COMPILE, *_WARNINGS, "-I", str(library), "-o", str(made)]
+            result = subprocess.run(
+                [*command, *map(str, units)], capture_output=True, text=True, check=False
+            )
+            if result.returncode:
+                raise DeviceError(f"the firmware does not compile: {_first_error(result.stderr)}")
+            made.replace(target)  # atomic: two processes may build at once
+    except OSError as error:
+        raise DeviceError(f"{output}: cannot be written: {error.strerror or error}") from error
+    return target
+
+
+def _first_error(text: str) -> str:
+    lines = [line for line in text.splitlines() if line.strip()]
+    for line in lines:
+        if "error:" in line or "undefined reference" in line:
+            return line.strip()
+    return lines[0].strip() if lines else "the compiler gave no reason"
+
+
+@cache
+def load(path: Path) -> ctypes.CDLL:
+    """Load a library made by :func:`build` and declare its functions."""
+    try:
+        library = ctypes.CDLL(str(path))
+    except OSError as error:
+        raise DeviceError(f"{path.name}: cannot be loaded: {error}") from error
+    library.relpos_node_create.restype = _POINTER
+    library.relpos_node_create.argtypes = [
+        ctypes.POINTER(_Callbacks), _POINTER, _U16, _U8, _U8, _U32,
+    ]  # fmt: skip
+    library.relpos_node_destroy.restype = None
+    library.relpos_node_destroy.argtypes = [_POINTER]
+    library.relpos_node_receive.restype = None
+    library.relpos_node_receive.argtypes = [_POINTER, ctypes.c_char_p, _U16]
+    library.relpos_node_poll.restype = _U32
+    library.relpos_node_poll.argtypes = [_POINTER, _U32]
+    return library
+
+
+def _nowhere(_time_us: int, _data: bytes) -> None:
+    """Nobody listens yet."""
+
+
+class NativeEngine:
+    """One node of the native library: an Engine.
+
+    ``eeprom`` is written in place and survives resets, as does the chips' state. ``resets``
+    counts the reboots that the node asked for.
+    """
+
+    def __init__(
+        self,
+        bus: I2cBus,
+        eeprom: bytearray,
+        node_id: int,
+        *,
+        clock: NodeClockError | None = None,
+        power_on_us: int = 0,
+        reset_cause: ResetCause = ResetCause.POWER_ON,
+        library: Path | None = None,
+    ) -> None:
+        self.node_id = node_id
+        self.bus = bus
+        self.on_transmit: Callable[[int, bytes], None] = _nowhere
+        self.next_due_us = power_on_us
+        self.resets = 0
+        self._clock = clock or NodeClockError()
+        self._power_on_us = power_on_us
+        self._rate = 1.0 + self._clock.drift_ppm * 1e-6
+        self._library = load(library or build())
+        self._poll = self._library.relpos_node_poll
+        self._eeprom = (_U8 * len(eeprom)).from_buffer(eeprom)
+        self._error: BaseException | None = None
+        self._reset_asked = False
+        self._line_free_us = 0
+        self._now_us = power_on_us
+        # Kept alive here: ctypes does not.
+        self._callbacks = _Callbacks(
+            None, _I2cTransfer(self._transfer), _UartWrite(self._written), _Reset(self._asked)
+        )
+        self._node: int | None = None
+        self._create(reset_cause)
+
+    def _create(self, cause: ResetCause) -> None:
+        self._node = self._library.relpos_node_create(
+            ctypes.byref(self._callbacks),
+            ctypes.addressof(self._eeprom),
+            len(self._eeprom),
+            self.node_id,
+            int(cause),
+            self._node_us(self._power_on_us),
+        )
+        if not self._node:
+            raise DeviceError(f"node {self.node_id}: the firmware refuses to start")
+
+    def _node_us(self, time_us: int) -> int:
+        """Node clock, 32 bits: it begins at the offset when the node is powered on."""
+        since_us = int((time_us - self._power_on_us) * self._rate)
+        return (since_us + self._clock.offset_us) & 0xFFFFFFFF
+
+    # -- called by the firmware -----------------------------------------------------------------
+
+    def _transfer(
+        self,
+        _context: int | None,
+        address: int,
+        first: int | None,
+        first_count: int,
+        second: int | None,
+        second_count: int,
+        read: int | None,
+        read_count: int,
+    ) -> int:
+        try:
+            status, data = self.bus.transfer(
+                address,
+                ctypes.string_at(first, first_count) if first_count and first else b"",
+                ctypes.string_at(second, second_count) if second_count and second else b"",
+                read_count,
+            )
+            if data and read:
+                ctypes.memmove(read, data, read_count)
+        except BaseException as error:  # ctypes would print it and go on
+            self._error = error
+            return int(BusStatus.TIMEOUT)
+        return status
+
+    def _written(self, _context: int | None, data: int | None, count: int) -> None:
+        try:
+            if data and count:
+                begin = max(self._now_us, self._line_free_us)
+                self._line_free_us = begin + line_time_us(count, UART_BAUD)
+                self.on_transmit(self._line_free_us, ctypes.string_at(data, count))
+        except BaseException as error:
+            self._error = error
+
+    def _asked(self, _context: int | None) -> None:
+        self._reset_asked = True
+
+    # -- Engine -----------------------------------------------------------------------------------
+
+    def run(self, until_us: int) -> None:
+        """Make every pass that is due by ``until_us``."""
+        while self.next_due_us <= until_us:
+            self._pass(self.next_due_us)
+
+    def _pass(self, time_us: int) -> None:
+        self._now_us = self.bus.time_us = time_us
+        wait_us = self._poll(self._node, self._node_us(time_us))
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+        if self._reset_asked:
+            self.reset(time_us, ResetCause.COMMAND)
+            return
+        self.next_due_us = time_us + (
+            LOOP_US if wait_us < LOOP_US else int(wait_us / self._rate) + 1
+        )
+
+    def receive(self, data: bytes) -> None:
+        """Bytes that have arrived at the UART; the node runs again at once."""
+        if self._node:
+            self._library.relpos_node_receive(self._node, data, len(data))
+
+    def reset(self, time_us: int, cause: ResetCause) -> None:
+        """Restart the firmware: its RAM is lost, EEPROM and chips keep their state."""
+        self._reset_asked = False
+        self.resets += 1
+        self._library.relpos_node_destroy(self._node)
+        self._power_on_us = time_us + RESTART_US
+        self.next_due_us = self._power_on_us
+        self._create(cause)
+
+    def close(self) -> None:
+        """Free the node."""
+        if self._node:
+            self._library.relpos_node_destroy(self._node)
+            self._node = None

@@ -1,0 +1,289 @@
+"""The emulated team: walkers, their boards, the two airs and the coordinator, on one clock.
+
+The same arguments give the same bytes at the coordinator's serial port, at the same virtual times.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from relpos.errors import RelposError
+from relpos.measurements import Prior, Truth
+from relpos.protocol import messages as wire
+from relpos.simulation.team import Scenario, make_team
+from relpos.simulation.walker import RATE_HZ, WalkerTruth
+from relpos.simulation.world import FloatArray
+
+from .air import RadioAir, UwbAir, VirtualClock
+from .node import BoardKind, EmulatedNode, NodeErrors, draw_node_errors
+from .pozyx import Pozyx
+from .surroundings import Surroundings
+from .xbee import XbeeModule, line_time_us
+
+if TYPE_CHECKING:
+    from relpos.runs import Run
+
+STEP_US = 20_000
+"""How far the clock goes in one step of :meth:`EmulatedTeam.stream`."""
+LEG_OF_STATURE = 0.53
+"""What a wearer who knows only their stature sets as leg length (Winter)."""
+SET_UP_AFTER_US = 1_500_000
+"""After power-on: the boards have booted and their tags, too."""
+TRUTH_PERIOD_S = 0.2
+PRIOR_SIGMA_M = 0.1
+PRIOR_SIGMA_RAD = 0.1
+"""How well the start is known where a scenario has a common one: feet on a mark, facing a wall."""
+UNLIMITED_S = 3600.0
+"""Walk prepared where none was asked for: an hour takes 12 s and 1 GB for six."""
+
+
+class EmulatedTeam:
+    """Six people, say, and everything they wear.
+
+    ``configured`` nodes know the team's size and their wearer's leg length from the stature, as
+    after ``relpos node set``; others run on the firmware's defaults. ``node_errors`` replaces
+    what is drawn by the seed. The truth methods are for evaluation alone.
+    """
+
+    def __init__(
+        self,
+        scenario: str | Scenario = "paper",
+        nodes: int | Sequence[int] = 6,
+        seconds: float = 300.0,
+        seed: int = 0,
+        board: BoardKind | str = BoardKind.NATIVE,
+        *,
+        collisions: bool = True,
+        configured: bool = True,
+        node_errors: Callable[[int, int], NodeErrors] = draw_node_errors,
+    ) -> None:
+        walkers, self.world = make_team(scenario, nodes, seconds, seed)
+        self.walkers: dict[int, WalkerTruth] = {walker.node: walker for walker in walkers}
+        self.seconds = seconds
+        self.end_us = round(seconds * 1e6)
+        self.clock = VirtualClock()
+        uwb_rng, radio_rng = (np.random.default_rng([seed, k, 0xA17]) for k in (1, 2))
+        self.uwb = UwbAir(
+            self.clock, self.world, self._tag_position_m, uwb_rng, collisions=collisions
+        )
+        self.radio = RadioAir(self.clock, self.world, self._module_distance_m, radio_rng)
+        self._output: list[tuple[int, bytes]] = []
+        self.coordinator = XbeeModule(
+            wire.COORDINATOR, 0x40000000, self.radio, self._from_coordinator
+        )
+        self.radio.modules.append(self.coordinator)
+        self.nodes: dict[int, EmulatedNode] = {}
+        self._walker_of_tag: dict[Pozyx, WalkerTruth] = {}
+        self._walker_of_module: dict[XbeeModule, WalkerTruth] = {}
+        try:
+            for walker in walkers:
+                self._add(walker, board, node_errors(seed, walker.node), configured)
+        except BaseException:
+            self.close()
+            raise
+
+    def _add(
+        self, walker: WalkerTruth, board: BoardKind | str, errors: NodeErrors, configured: bool
+    ) -> None:
+        surroundings = Surroundings(
+            rate_hz=RATE_HZ,
+            specific_force_m_s2=walker.specific_force_m_s2,
+            angular_rate_rad_s=walker.angular_rate_rad_s,
+            magnetic_field_ut=walker.magnetic_field_ut,
+            pressure_pa=walker.pressure_pa,
+        )
+        node = EmulatedNode(
+            walker.node, board, surroundings, errors, self.clock, self.uwb, self.radio
+        )
+        self.nodes[walker.node] = node
+        self.uwb.tags.append(node.tag)
+        self.radio.modules.append(node.radio)
+        self._walker_of_tag[node.tag] = walker
+        self._walker_of_module[node.radio] = walker
+        if configured:
+            at_us = errors.power_on_us + SET_UP_AFTER_US
+            leg_mm = round(LEG_OF_STATURE * walker.person.stature_m * 1000.0)
+            settings = (
+                (wire.CommandCode.SET_TEAM_SIZE, len(self.walkers)),
+                (wire.CommandCode.SET_LEG_LENGTH_MM, leg_mm),
+            )
+            for k, (code, value) in enumerate(settings):
+                node.command(self.coordinator, code, value, 0xFF00 + k, at_us + 100_000 * k)
+
+    # -- the coordinator's serial port ----------------------------------------------------------
+
+    @property
+    def time_us(self) -> int:
+        """Virtual time."""
+        return self.clock.now_us
+
+    def run(self, until_us: int) -> list[tuple[int, bytes]]:
+        """Advance to ``until_us``; (time in microseconds, bytes) that left the serial port."""
+        self.clock.run(until_us)
+        output, self._output = self._output, []
+        return output
+
+    def send(self, data: bytes) -> None:
+        """Bytes from the host begin to arrive now at the coordinator's serial port."""
+        arrived_us = self.clock.now_us + line_time_us(len(data), self.coordinator.baud)
+        self.clock.at(arrived_us, lambda now_us: self.coordinator.from_serial(now_us, data))
+
+    def stream(self) -> Iterator[tuple[int, bytes]]:
+        """Everything that leaves the serial port until the walk ends; ``send`` in between."""
+        while self.clock.now_us < self.end_us:
+            yield from self.run(min(self.clock.now_us + STEP_US, self.end_us))
+
+    def _from_coordinator(self, left_us: int, data: bytes) -> None:
+        self.clock.at(left_us, lambda now_us: self._output.append((now_us, data)))
+
+    def close(self) -> None:
+        """Free the boards."""
+        for node in self.nodes.values():
+            node.close()
+
+    def __enter__(self) -> EmulatedTeam:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # -- truth ------------------------------------------------------------------------------------
+
+    def position_m(self, node: int, time_s: float) -> FloatArray:
+        """True position (3,) of a node's tag in the world frame."""
+        return self.walkers[node].position_at(time_s)
+
+    def heading_rad(self, node: int, time_s: float) -> float:
+        """True heading of a node's wearer, unwrapped."""
+        walker = self.walkers[node]
+        return float(np.interp(time_s * RATE_HZ, np.arange(len(walker.heading_rad)),
+                               walker.heading_rad))  # fmt: skip
+
+    def truth(self, period_s: float = TRUTH_PERIOD_S) -> list[Truth]:
+        """True poses of everybody, by time."""
+        rows = []
+        stride = max(round(period_s * RATE_HZ), 1)
+        for node, walker in self.walkers.items():
+            rows += [
+                Truth(
+                    float(walker.time_s[k]),
+                    node,
+                    float(walker.position_m[k, 0]),
+                    float(walker.position_m[k, 1]),
+                    math.remainder(float(walker.heading_rad[k]), 2.0 * math.pi),
+                    float(walker.position_m[k, 2]),
+                )
+                for k in range(0, len(walker.time_s), stride)
+            ]
+        return sorted(rows, key=lambda row: row.time_s)
+
+    def priors(self) -> list[Prior]:
+        """What the team knows of its start."""
+        return [
+            Prior(
+                node,
+                float(walker.position_m[0, 0]),
+                float(walker.position_m[0, 1]),
+                math.remainder(float(walker.heading_rad[0]), 2.0 * math.pi),
+                PRIOR_SIGMA_M,
+                PRIOR_SIGMA_RAD,
+            )
+            for node, walker in self.walkers.items()
+        ]
+
+    def _tag_position_m(self, tag: Pozyx, time_us: int) -> FloatArray:
+        return self._walker_of_tag[tag].position_at(time_us * 1e-6)
+
+    def _module_distance_m(self, one: XbeeModule, other: XbeeModule, time_us: int) -> float:
+        return math.dist(self._place_m(one, time_us), self._place_m(other, time_us))
+
+    def _place_m(self, module: XbeeModule, time_us: int) -> FloatArray:
+        walker = self._walker_of_module.get(module)
+        if walker is None:  # the coordinator lies on a table in the middle
+            return np.array((self.world.size_m[0] / 2.0, self.world.size_m[1] / 2.0, 1.0))
+        return walker.position_at(time_us * 1e-6)
+
+
+def serve_team(
+    *,
+    nodes: int,
+    board: str,
+    scenario: str,
+    speed: float,
+    seconds: float | None,
+    faults: Sequence[str],
+    seed: int,
+    announce: Callable[[str], None],
+) -> None:
+    """Body of ``relpos emulate``: the team behind a pseudo-terminal until its walk ends or Ctrl-C.
+
+    ``announce(path)`` is called once the pseudo-terminal is there. ``speed`` 0 is as fast as the
+    reader takes it; other than 1, time frames mark the virtual time (see ``pty``).
+    """
+    from .pty import PseudoTerminal
+
+    if faults:
+        raise RelposError(f"unknown fault '{faults[0]}': this version has none to inject")
+    with EmulatedTeam(
+        scenario, nodes, UNLIMITED_S if seconds is None else seconds, seed, board
+    ) as team, PseudoTerminal(team, speed=speed, mark_time=speed != 1.0) as terminal:
+        announce(terminal.path)
+        terminal.serve()
+
+
+def record_team(
+    *, board: str, nodes: int, seconds: float, scenario: str, seed: int
+) -> Run:
+    """Body of ``relpos demo``'s first half: the team through a real serial port into a Run.
+
+    The bytes go through a pseudo-terminal and pyserial as from a real coordinator, as fast as they
+    are taken; each arrives at its virtual time, so that the same arguments give the same Run.
+    """
+    from relpos.link.live import Link, observe
+    from relpos.measurements import Event, Motion, Range, Status, Step
+    from relpos.measurements import Heading, Height  # isort: skip
+    from relpos.runs import Description, NodeInfo, Run
+
+    from .pty import PseudoTerminal
+
+    link = Link()
+    measurements: list[Motion | Range | Height | Heading] = []
+    statuses: list[Status] = []
+    steps: list[Step] = []
+    with EmulatedTeam(scenario, nodes, seconds, seed, board) as team:
+        with PseudoTerminal(team, speed=0.0) as terminal, terminal.open_port() as port:
+            terminal.start()
+            for batch in observe(port, link, port.virtual_time_s):
+                for observation in batch:
+                    if isinstance(observation, Status):
+                        statuses.append(observation)
+                    elif isinstance(observation, Step):
+                        steps.append(observation)
+                    elif not isinstance(observation, Event):
+                        measurements.append(observation)
+                if port.exhausted:
+                    break
+            terminal.join()
+        priors = team.priors()
+        return Run(
+            name=f"{scenario}-{board}-{seed}",
+            description=Description(
+                source=f"relpos demo --board {board} --scenario {scenario} --nodes {nodes} "
+                f"--seconds {seconds:g} --seed {seed}",
+                heading_known=True,
+                priors=tuple(priors),
+                nodes={
+                    node: NodeInfo(stature_m=walker.person.stature_m)
+                    for node, walker in team.walkers.items()
+                },
+            ),
+            measurements=tuple(sorted(measurements, key=lambda m: m.time_s)),
+            statuses=tuple(sorted(statuses, key=lambda s: s.time_s)),
+            steps=tuple(sorted(steps, key=lambda s: s.time_s)),
+            truth=tuple(team.truth()),
+            counters={name: int(count) for name, count in link.summary().items()},
+        )
