@@ -175,20 +175,47 @@ def whole_seconds(tracks: Iterable[Track]) -> Floats:
     return np.arange(first, last + 1, dtype=np.float64)
 
 
-def aligned_squared_distances(estimate_m: Floats, truth_m: Floats) -> Floats:
-    """Squared distances after the best rigid fit without reflection, (n, 2), (n, 2) -> (n,).
+@dataclass(frozen=True)
+class Alignment:
+    """The rigid motion of the plane, without reflection, that fits one set of points on another."""
 
-    Both sets are centred and the estimate is rotated by the angle that minimises the sum. In
-    the plane that angle is the argument of sum(conj(p) q), which can only be a rotation.
+    cosine: float
+    sine: float
+    from_m: Floats
+    to_m: Floats
+
+    @property
+    def angle_rad(self) -> float:
+        """By how much headings turn."""
+        return math.atan2(self.sine, self.cosine)
+
+    def __call__(self, points_m: Floats) -> Floats:
+        """Move points, (n, 2) -> (n, 2)."""
+        x, y = (points_m - self.from_m).T
+        c, s = self.cosine, self.sine
+        return np.column_stack((c * x - s * y, s * x + c * y)) + self.to_m
+
+
+def align(estimate_m: Floats, truth_m: Floats) -> Alignment:
+    """Fit an estimate on the truth, (n, 2), (n, 2), in the least-squares sense.
+
+    Both sets are centred; in the plane the best angle is the argument of sum(conj(p) q), which
+    can only be a rotation. Where every angle is as good, none is taken.
     """
-    p = estimate_m - estimate_m.mean(axis=0)
-    q = truth_m - truth_m.mean(axis=0)
+    from_m, to_m = estimate_m.mean(axis=0), truth_m.mean(axis=0)
+    p, q = estimate_m - from_m, truth_m - to_m
     cosine = float((p * q).sum())
     sine = float((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum())
     norm = math.hypot(cosine, sine)
-    c, s = (cosine / norm, sine / norm) if norm > 0.0 else (1.0, 0.0)
-    rotated = np.column_stack((c * p[:, 0] - s * p[:, 1], s * p[:, 0] + c * p[:, 1]))
-    squared: Floats = ((rotated - q) ** 2).sum(axis=1)
+    if norm == 0.0:
+        return Alignment(1.0, 0.0, from_m, to_m)
+    return Alignment(cosine / norm, sine / norm, from_m, to_m)
+
+
+def aligned_squared_distances(estimate_m: Floats, truth_m: Floats) -> Floats:
+    """Squared distances after the best rigid fit without reflection, (n, 2), (n, 2) -> (n,)."""
+    moved = align(estimate_m, truth_m)(estimate_m)
+    squared: Floats = ((moved - truth_m) ** 2).sum(axis=1)
     return squared
 
 
@@ -202,8 +229,8 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
     nodes = sorted(set(estimate) & set(truth))
     at_s = whole_seconds([truth[n] for n in nodes])
     count = len(nodes)
-    p, p_heading = _sample([estimate[n] for n in nodes], at_s)
-    q, q_heading = _sample([truth[n] for n in nodes], at_s)
+    p, p_heading = sample([estimate[n] for n in nodes], at_s)
+    q, q_heading = sample([truth[n] for n in nodes], at_s)
     known = np.isfinite(p.sum(axis=2)) & np.isfinite(q.sum(axis=2))
 
     pair_indices = [(i, j) for i in range(count) for j in range(i + 1, count)]
@@ -268,8 +295,8 @@ def over_seeds(figures: Sequence[float]) -> tuple[float, float]:
     return float(values.mean()), float(values.std(ddof=1) / math.sqrt(values.size))
 
 
-def _sample(tracks: Sequence[Track], at_s: Floats) -> tuple[Floats, Floats]:
-    """Positions (T, N, 2) and headings (T, N) of the tracks at the wanted times."""
+def sample(tracks: Sequence[Track], at_s: Floats) -> tuple[Floats, Floats]:
+    """Return positions (T, N, 2) and headings (T, N) of the tracks at the wanted times."""
     position_m = np.full((at_s.size, len(tracks), 2), np.nan)
     heading_rad = np.full((at_s.size, len(tracks)), np.nan)
     for n, track in enumerate(tracks):

@@ -50,7 +50,14 @@ ALTERNATIVE_COLUMNS = [
     "sigma_angle_rad",
     "shape",
 ]
-PARAMETER_COLUMNS = ["time_s", "node", "peer", "name", "value", "sigma"]
+PARAMETER_COLUMNS = (
+    "time_s",
+    "node",
+    "peer",
+    "name",
+    "value",
+    "sigma",
+)
 
 _DECIMALS = 6
 """Micrometres and microradians: far below any sensor here, and files a third the size."""
