@@ -1,0 +1,112 @@
+"""Synthesised torso motion against real recordings: how far apart they may be.
+
+Bounds are on ratios of group means. They are wider than what docs/gait.md prints, as the
+recorded chests are those of a few people, and narrow enough that a lost harmonic, a doubled
+excursion or a wrong frequency fails.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from relpos.simulation.gait_statistics import (
+    GaitStatistics,
+    data_folder,
+    recorded_walk,
+    simulated_walks,
+)
+
+FOLDER = data_folder()
+pytestmark = pytest.mark.skipif(
+    FOLDER is None, reason="no recordings beside the repository nor in RELPOS_DATA"
+)
+
+
+def mean(walks: list[GaitStatistics], name: str) -> np.ndarray:
+    return np.asarray(np.mean([getattr(w, name) for w in walks], axis=0))
+
+
+@pytest.fixture(scope="module")
+def recorded() -> dict[str, list[GaitStatistics]]:
+    assert FOLDER is not None
+    walks = [w for f in sorted((FOLDER / "walk_chest").iterdir()) if (w := recorded_walk(f))]
+    return {
+        "slow": [w for w in walks if w.step_frequency_hz < 1.68],
+        "brisk": [w for w in walks if w.step_frequency_hz >= 1.68],
+    }
+
+
+@pytest.fixture(scope="module")
+def simulated() -> dict[str, list[GaitStatistics]]:
+    return {
+        "slow": simulated_walks((0.88, 0.95), 12, 21, 40.0),
+        "brisk": simulated_walks((1.07, 1.15), 12, 22, 40.0),
+    }
+
+
+@pytest.mark.parametrize("pace", ["slow", "brisk"])
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [
+        ("step_frequency_hz", 0.9, 1.1),
+        ("vertical_rms_m_s2", 0.75, 1.35),
+        ("vertical_peak_m_s2", 0.65, 1.3),
+        ("horizontal_rms_m_s2", 0.7, 1.35),
+    ],
+)
+def test_sizes_are_those_of_real_chests(
+    recorded: dict[str, list[GaitStatistics]],
+    simulated: dict[str, list[GaitStatistics]],
+    pace: str,
+    name: str,
+    low: float,
+    high: float,
+) -> None:
+    ratio = mean(simulated[pace], name) / mean(recorded[pace], name)
+    assert low < float(ratio) < high
+
+
+@pytest.mark.parametrize("pace", ["slow", "brisk"])
+@pytest.mark.parametrize(
+    ("name", "harmonics"),
+    [
+        # Of the step (1 2 3 4) for what repeats each step, of the stride (1 3) for what
+        # alternates: indices into HARMONICS.
+        ("vertical", [1, 3, 5, 6]),
+        ("fore_aft", [1, 3, 5, 6]),
+        ("pitch_rate", [1, 3, 5, 6]),
+        ("lateral", [0, 2]),
+        ("roll_rate", [0, 2]),
+        ("yaw_rate", [0, 2]),
+    ],
+)
+def test_harmonics_are_within_a_factor_of_two_of_real_chests(
+    recorded: dict[str, list[GaitStatistics]],
+    simulated: dict[str, list[GaitStatistics]],
+    pace: str,
+    name: str,
+    harmonics: list[int],
+) -> None:
+    ratio = (mean(simulated[pace], name) / mean(recorded[pace], name))[harmonics]
+    assert ratio.min() > 0.5, ratio.round(2)
+    assert ratio.max() < 2.0, ratio.round(2)
+
+
+def test_brisker_walking_shakes_more_as_it_does_in_real_chests(
+    recorded: dict[str, list[GaitStatistics]], simulated: dict[str, list[GaitStatistics]]
+) -> None:
+    name = "vertical_rms_m_s2"
+    real = mean(recorded["brisk"], name) / mean(recorded["slow"], name)
+    ours = mean(simulated["brisk"], name) / mean(simulated["slow"], name)
+    assert real > 1.2
+    assert 0.75 < float(ours / real) < 1.3
+
+
+def test_steps_repeat_neither_exactly_nor_less_than_real_ones(
+    simulated: dict[str, list[GaitStatistics]],
+) -> None:
+    # Recorded group means: 0.62 and 0.87 a step later, 0.42 and 0.83 a stride later.
+    for walks in simulated.values():
+        assert 0.55 < float(mean(walks, "step_similarity")) < 0.97
+        assert 0.4 < float(mean(walks, "stride_similarity")) < 0.95
