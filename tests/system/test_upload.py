@@ -1,0 +1,111 @@
+"""`pio run -t upload`, end to end: avrdude writes into a bootloader that runs on a simulated Uno."""
+
+import os
+import select
+import shutil
+import subprocess
+import threading
+import tty
+from pathlib import Path
+
+import pytest
+
+from relpos.emulator.avr.board import BOARDS, Board, ResetCause
+from relpos.emulator.avr.elf import Firmware, read_firmware
+from relpos.emulator.avr.library import missing_parts
+
+ROOT = Path(__file__).resolve().parents[2]
+OPTIBOOT = Path("/usr/share/arduino/hardware/arduino/avr/bootloaders/optiboot/optiboot.c")
+# The Uno's bootloader: 512 bytes at the end of flash, started by a fuse instead of address 0.
+BOOT_ADDRESS = 0x7E00
+JUMP_TO_BOOT = bytes.fromhex("0c94003f")
+MILLISECOND_CYCLES = 16_000
+
+
+def needs() -> str | None:
+    for command in ("avr-gcc", "avrdude"):
+        if shutil.which(command) is None:
+            return f"{command} is not installed"
+    if not OPTIBOOT.is_file():
+        return "arduino-core-avr is not installed"
+    if not (ROOT / ".venv" / "bin" / "platformio").is_file():
+        return "PlatformIO is not in .venv"
+    return missing_parts()
+
+
+def build_bootloader(folder: Path) -> Firmware:
+    # Built, because the image that Debian ships reaches beyond the end of flash.
+    elf = folder / "optiboot.elf"
+    subprocess.run(
+        ["avr-gcc", "-w", "-Os", "-fno-inline-small-functions", "-fno-split-wide-types"]
+        + ["-mshort-calls", "-mrelax", "-mmcu=atmega328p", "-nostartfiles"]
+        + ["-DF_CPU=16000000L", "-DLED_START_FLASHES=0", "-DBAUD_RATE=115200"]
+        + [f"-Wl,--section-start=.text={BOOT_ADDRESS:#x}", "-Wl,--section-start=.version=0x7ffe"]
+        + [str(OPTIBOOT), "-o", str(elf)],
+        check=True,
+    )
+    image = bytearray(read_firmware(elf).flash)
+    image[: len(JUMP_TO_BOOT)] = JUMP_TO_BOOT
+    return Firmware(bytes(image), 0, 0x100, b"")
+
+
+class SerialBoard(threading.Thread):
+    """A board behind a pseudo-terminal; as if DTR had reset it, it starts with the first byte."""
+
+    def __init__(self, board: Board, terminal: int) -> None:
+        super().__init__(daemon=True)
+        self.board = board
+        self.terminal = terminal
+        self.stop = threading.Event()
+        self.handed_over = threading.Event()
+
+    def run(self) -> None:
+        started = False
+        while not self.stop.is_set():
+            # Simulated time may pass only as fast as avrdude answers: optiboot gives up after 1 s.
+            busy = select.select([self.terminal], [], [], 0.001)[0]
+            if busy:
+                started = True
+                cycle = self.board.cycle
+                self.board.receive(os.read(self.terminal, 4096), cycle)
+            if started:
+                self.board.run(self.board.cycle + MILLISECOND_CYCLES)
+                sent = bytes(value for _, value in self.board.take_sent())
+                while sent:
+                    sent = sent[os.write(self.terminal, sent) :]
+                # The bootloader hands over to the sketch by letting the watchdog bite.
+                if self.board.counters().watchdog_resets:
+                    self.handed_over.set()
+
+
+@pytest.mark.skipif(needs() is not None, reason=str(needs()))
+def test_upload_writes_and_verifies_the_firmware_through_the_bootloader(tmp_path):
+    terminal, port = os.openpty()
+    tty.setraw(port)
+    with Board(
+        BOARDS["uno"],
+        build_bootloader(tmp_path),
+        line_baud=115200,
+        reset_cause=ResetCause.EXTERNAL,
+    ) as board:
+        serial_board = SerialBoard(board, terminal)
+        serial_board.start()
+        try:
+            done = subprocess.run(
+                [ROOT / "tools" / "pio", "run", "-e", "uno", "-t", "upload"]
+                + ["--upload-port", os.ttyname(port)],
+                cwd=ROOT,
+                capture_output=True,
+                text=True,
+                timeout=120,
+                check=False,
+            )
+            handed_over = serial_board.handed_over.wait(timeout=10)
+        finally:
+            serial_board.stop.set()
+            serial_board.join()
+            os.close(terminal)
+            os.close(port)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "bytes of flash verified" in done.stdout + done.stderr
+        assert handed_over
