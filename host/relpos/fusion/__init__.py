@@ -1,1 +1,58 @@
 """From measurements to one picture of the team."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from relpos.errors import RelposError
+from relpos.fusion.deadreckoning import DeadReckoning, DeadReckoningSettings
+from relpos.fusion.estimator import Estimate, Estimator, NodeEstimate, NodeStatus, PairEstimate
+from relpos.fusion.particle import ParticleFilter, ParticleSettings
+from relpos.fusion.settings import SettingInfo, describe, parse
+from relpos.measurements import Prior
+
+SETTINGS: Mapping[str, type] = {
+    "particle": ParticleSettings,
+    "deadreckoning": DeadReckoningSettings,
+}
+"""Estimator name -> its settings."""
+
+
+def make(
+    name: str,
+    priors: Sequence[Prior] = (),
+    settings: Mapping[str, object] | None = None,
+    seed: int = 0,
+) -> Estimator:
+    """Make an estimator by its name, from ``--set`` keys and values.
+
+    Nodes without a prior start unknown. RelposError for an unknown name or key and for a value
+    that is out of range.
+    """
+    given = settings or {}
+    match str(name):
+        case "particle":
+            return ParticleFilter(priors, parse(ParticleSettings, given, "particle"), seed)
+        case "deadreckoning":
+            return DeadReckoning(priors, parse(DeadReckoningSettings, given, "deadreckoning"), seed)
+    raise RelposError(f"unknown estimator '{name}': one of {', '.join(SETTINGS)}")
+
+
+def settings_of(name: str) -> list[SettingInfo]:
+    """List an estimator's settings, with defaults and bounds, for a help text."""
+    if name not in SETTINGS:
+        raise RelposError(f"unknown estimator '{name}': one of {', '.join(SETTINGS)}")
+    return describe(SETTINGS[name])
+
+
+__all__ = [
+    "SETTINGS",
+    "Estimate",
+    "Estimator",
+    "NodeEstimate",
+    "NodeStatus",
+    "PairEstimate",
+    "SettingInfo",
+    "make",
+    "settings_of",
+]

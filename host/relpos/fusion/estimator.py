@@ -7,10 +7,10 @@ files nor ports nor the truth.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from math import atan2, hypot, sqrt
+from math import atan2, hypot, pi, sqrt
 from typing import Protocol, runtime_checkable
 
 from relpos.measurements import Measurement
@@ -106,3 +106,40 @@ class Estimator(Protocol):
 
     def counters(self) -> Mapping[str, int]:
         """Name -> how often: everything dropped, rejected, clamped, reset or resampled."""
+
+
+STALE_EPOCHS = 3
+LOST_EPOCHS = 10
+"""Without news for so many epochs a node is ``stale``, then ``lost`` (run format, "Out")."""
+
+
+def pairs_of(nodes: Sequence[NodeEstimate]) -> tuple[PairEstimate, ...]:
+    """Give distance and bearing of every two nodes, their errors taken as independent.
+
+    For estimators that keep no cross-covariance. Distances are horizontal, as positions are;
+    unlocated nodes are left out.
+    """
+    located = [n for n in nodes if n.status is not NodeStatus.UNLOCATED]
+    return tuple(_pair(a, b) for k, a in enumerate(located) for b in located[k + 1 :])
+
+
+def _pair(node: NodeEstimate, peer: NodeEstimate) -> PairEstimate:
+    dx, dy = peer.x_m - node.x_m, peer.y_m - node.y_m
+    distance = hypot(dx, dy)
+    xx = node.variance_x_m2 + peer.variance_x_m2
+    yy = node.variance_y_m2 + peer.variance_y_m2
+    xy = node.covariance_xy_m2 + peer.covariance_xy_m2
+    if distance > 0.0:
+        c, s = dx / distance, dy / distance
+        along = c * c * xx + 2.0 * c * s * xy + s * s * yy
+        across = s * s * xx - 2.0 * c * s * xy + c * c * yy
+        bearing_sd = min(sqrt(max(across, 0.0)) / distance, _ANY_BEARING_RAD)
+    else:
+        along, bearing_sd = 0.5 * (xx + yy), _ANY_BEARING_RAD
+    return PairEstimate(
+        node.node, peer.node, distance, sqrt(max(along, 0.0)), atan2(dy, dx), bearing_sd
+    )
+
+
+_ANY_BEARING_RAD = pi / sqrt(3.0)
+"""Standard deviation of a bearing of which nothing is known."""

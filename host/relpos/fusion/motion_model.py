@@ -1,0 +1,81 @@
+"""How a reported displacement moves a pose: the paper's eqs. (2) to (4).
+
+The paper writes, for each user,
+
+    x     <- x + dx + dx N(0, sigma_d^2)                                        (2)
+    y     <- y + dy + dy N(0, sigma_d^2)                                        (3)
+    theta <- theta + dtheta + dtheta N(0, sigma_theta^2)                        (4)
+
+Taken literally in the global frame, theta does nothing. It has to be read as a displacement in
+the *body* frame that is turned by the particle's own theta: (dx, dy) is noised first, then
+rotated, and theta is updated last, because a motion is given in the heading frame of its
+beginning.
+
+The noise is proportional to the displacement, so a standing node gets none, and a straight walk
+none in heading. What a real sensor adds on top is set by the two floors, which grow with the
+square root of time and are zero by default, and by the standard deviations that a report brings
+with it (``motion.csv``); the larger variance counts.
+
+A chord that the timeline has cut carries its share f of the report: with the standard deviation
+divided by sqrt(f) the pieces' variances add up to the whole report's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.timeline import Advance
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class MotionNoise:
+    """Parameters of the motion model.
+
+    ``sigma_d`` and ``sigma_theta`` are relative (paper: 0.2 and 0.1); the floors are in
+    m/sqrt(s) and rad/sqrt(s).
+    """
+
+    sigma_d: float = 0.2
+    sigma_theta: float = 0.1
+    floor_d_m: float = 0.0
+    floor_theta_rad: float = 0.0
+
+    def sigmas(self, step: Advance) -> tuple[float, float, float]:
+        """Standard deviations of forward (m), left (m) and turn (rad) for one piece."""
+        share = max(step.fraction, 1e-9) ** 0.5
+        root_s = step.duration_s**0.5
+        relative_d, relative_theta = self.sigma_d / share, self.sigma_theta / share
+        floor_d, floor_theta = self.floor_d_m * root_s, self.floor_theta_rad * root_s
+        return (
+            max(abs(step.dx_m) * relative_d, floor_d, step.sigma_x_m or 0.0),
+            max(abs(step.dy_m) * relative_d, floor_d, step.sigma_y_m or 0.0),
+            max(abs(step.dtheta_rad) * relative_theta, floor_theta, step.sigma_theta_rad or 0.0),
+        )
+
+
+def move(poses: Floats, displacement: Floats) -> None:
+    """Move ``poses`` (3, ...) in place by body-frame displacements (3, ...), x, y, theta."""
+    c, s = np.cos(poses[2]), np.sin(poses[2])
+    poses[0] += c * displacement[0] - s * displacement[1]
+    poses[1] += s * displacement[0] + c * displacement[1]
+    poses[2] += displacement[2]
+
+
+def predict(
+    poses: Floats, steps: list[Advance], noise: MotionNoise, rng: np.random.Generator
+) -> None:
+    """Move particles ``poses`` (3, K, M) in place, row k by ``steps[k]``, each with own noise."""
+    mean = np.array([(a.dx_m, a.dy_m, a.dtheta_rad) for a in steps]).T[:, :, None]
+    sigma = np.array([noise.sigmas(a) for a in steps]).T[:, :, None]
+    if not sigma.any():
+        move(poses, mean)
+        return
+    drawn = rng.standard_normal(poses.shape)
+    drawn *= sigma
+    drawn += mean
+    move(poses, drawn)
