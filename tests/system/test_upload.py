@@ -1,4 +1,4 @@
-"""`pio run -t upload`, end to end: avrdude writes into a bootloader that runs on a simulated Uno."""
+"""`pio run -t upload`, end to end: avrdude writes through a bootloader into a simulated Uno."""
 
 import os
 import select
@@ -36,14 +36,12 @@ def needs() -> str | None:
 def build_bootloader(folder: Path) -> Firmware:
     # Built, because the image that Debian ships reaches beyond the end of flash.
     elf = folder / "optiboot.elf"
-    subprocess.run(
-        ["avr-gcc", "-w", "-Os", "-fno-inline-small-functions", "-fno-split-wide-types"]
-        + ["-mshort-calls", "-mrelax", "-mmcu=atmega328p", "-nostartfiles"]
-        + ["-DF_CPU=16000000L", "-DLED_START_FLASHES=0", "-DBAUD_RATE=115200"]
-        + [f"-Wl,--section-start=.text={BOOT_ADDRESS:#x}", "-Wl,--section-start=.version=0x7ffe"]
-        + [str(OPTIBOOT), "-o", str(elf)],
-        check=True,
-    )
+    options = "-w -Os -fno-inline-small-functions -fno-split-wide-types -mshort-calls -mrelax"
+    chip = "-mmcu=atmega328p -nostartfiles -DF_CPU=16000000L"
+    settings = "-DLED_START_FLASHES=0 -DBAUD_RATE=115200"
+    places = f"-Wl,--section-start=.text={BOOT_ADDRESS:#x} -Wl,--section-start=.version=0x7ffe"
+    arguments = f"{options} {chip} {settings} {places}".split()
+    subprocess.run(["avr-gcc", *arguments, str(OPTIBOOT), "-o", str(elf)], check=True)
     image = bytearray(read_firmware(elf).flash)
     image[: len(JUMP_TO_BOOT)] = JUMP_TO_BOOT
     return Firmware(bytes(image), 0, 0x100, b"")
@@ -91,9 +89,9 @@ def test_upload_writes_and_verifies_the_firmware_through_the_bootloader(tmp_path
         serial_board = SerialBoard(board, terminal)
         serial_board.start()
         try:
+            arguments = f"run -e uno -t upload --upload-port {os.ttyname(port)}".split()
             done = subprocess.run(
-                [ROOT / "tools" / "pio", "run", "-e", "uno", "-t", "upload"]
-                + ["--upload-port", os.ttyname(port)],
+                [ROOT / "tools" / "pio", *arguments],
                 cwd=ROOT,
                 capture_output=True,
                 text=True,
