@@ -114,7 +114,7 @@ def test_integrating_the_sensors_returns_the_path(team: list[WalkerTruth]) -> No
     error = np.linalg.norm(path - walker.position_m[begin : end + 1 : 2], axis=1)
     walked = np.linalg.norm(np.diff(walker.position_m[begin:end, :2], axis=0), axis=1).sum()
     assert walked > 25.0
-    assert error.max() < 0.01
+    assert error.max() < 0.002  # 0.1 to 0.5 mm over six walkers
     assert np.abs(attitude - walker.attitude[end]).max() < 1e-5
 
 

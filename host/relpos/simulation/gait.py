@@ -296,8 +296,10 @@ def walk(
     # What heel strikes shake.
     whole = np.arange(len(plan.step_strength))
     strike_s = np.interp(whole + _STRIKE_PHASE, plan.knot_phase[1:], plan.knot_time_s[1:])
+    # Strikes are not as punctual as the vault: 12 ms, and 20 % in size.
+    strike_s = strike_s + 0.012 * rng.standard_normal(len(whole))
     pace = np.interp(strike_s, t, speed) / 1.2
-    spread = np.exp(0.15 * rng.standard_normal((6, len(whole))))
+    spread = np.exp(0.2 * rng.standard_normal((6, len(whole))))
     foot = np.where(whole % 2 == 0, 1.0, -1.0)
 
     def shock(kind: tuple[float, float, float, float], row: int, sign: FloatArray) -> FloatArray:

@@ -6,9 +6,11 @@ DATA is the folder of recordings, by default RELPOS_DATA or ../shared/data.
 
 from __future__ import annotations
 
+import csv
 import math
 import os
 import sys
+import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -144,6 +146,77 @@ def simulated_walks(
     ]
 
 
+def apparent_gain(
+    force: FloatArray, rate_hz: float, step_hz: float, length_m: float, leg_m: float
+) -> tuple[float, float]:
+    """Rise of the sensor within a step, in metres, and the pendulum gain it would take.
+
+    The rise is the median over steps of the peak-to-peak height, from the vertical acceleration
+    integrated twice between 0.6 and 3.5 times the step frequency; the gain is ``length_m`` over
+    the plain pendulum's step for that rise.
+    """
+    mean = force.mean(axis=0)
+    vertical = force @ (mean / np.linalg.norm(mean)) - np.linalg.norm(mean)
+    frequency = np.fft.rfftfreq(len(vertical), 1.0 / rate_hz)
+    kept = (frequency > 0.6 * step_hz) & (frequency < 3.5 * step_hz)
+    spectrum = np.where(
+        kept, -np.fft.rfft(vertical) / (2 * np.pi * np.maximum(frequency, 1e-9)) ** 2, 0.0
+    )
+    edge, step = round(rate_hz), round(rate_hz / step_hz)
+    height = np.fft.irfft(spectrum, len(vertical))[edge:-edge]
+    steps = height[: len(height) // step * step].reshape(-1, step)
+    rise = float(np.median(np.ptp(steps, axis=1)))
+    return rise, length_m / (2.0 * math.sqrt(2.0 * leg_m * rise - rise**2))
+
+
+def recorded_gains(folder: Path) -> FloatArray:
+    """Speed, step length, walk ratio, rise and gain (k, 5) of the ways out in walk_lowerback_20m.
+
+    The step length is the nominal 20 m over the number of foot contacts, the leg 0.53 of the
+    stature; runs without stature or with fewer than 8 contacts before the turn are left out.
+    """
+    rows = []
+    for run in sorted(folder.iterdir()):
+        about = tomllib.loads((run / "run.toml").read_text(encoding="utf-8"))
+        with (run / "events.csv").open(encoding="utf-8") as file:
+            events = [(float(r["time_s"]), r["event"]) for r in csv.DictReader(file)]
+        contacts = np.array([t for t, event in events if event == "foot_contact"])
+        turn = next((t for t, event in events if event == "uturn_start"), math.inf)
+        out = contacts[contacts < turn]
+        if "stature_m" not in about or len(out) < 8:
+            continue
+        table = np.genfromtxt(run / "imu.csv.gz", delimiter=",", names=True)
+        part = (table["time_s"] > out[1]) & (table["time_s"] < out[-1])
+        force = np.column_stack([table[f"a{axis}_m_s2"][part] for axis in "xyz"])
+        step_hz = (len(out) - 2) / (out[-1] - out[1])
+        length = 20.0 / len(contacts)
+        rise, gain = apparent_gain(force, 100.0, step_hz, length, 0.53 * about["stature_m"])
+        rows.append((length * step_hz, length, length / step_hz, rise, gain))
+    return np.array(rows)
+
+
+def simulated_gains(speed_m_s: tuple[float, float], walkers: int, seed: int) -> FloatArray:
+    """Compute the same (k, 5) for walkers of given speeds, over ten seconds of a straight."""
+    scenario = replace(SCENARIOS["lab"], speed_m_s=speed_m_s, spacing_m=0.0, path_m=(60.0, 30.0))
+    rows = []
+    for walker in make_team(scenario, walkers, 30.0, seed)[0]:
+        part = (walker.time_s > 10.0) & (walker.time_s < 20.0)
+        steps = (walker.steps.time_s > 10.0) & (walker.steps.time_s < 20.0)
+        length = float(walker.steps.length_m[steps].mean())
+        step_hz = 1.0 / float(np.diff(walker.steps.time_s[steps]).mean())
+        leg = 0.53 * walker.person.stature_m
+        rise, gain = apparent_gain(walker.specific_force_m_s2[part], 200.0, step_hz, length, leg)
+        rows.append((length * step_hz, length, length / step_hz, rise, gain))
+    return np.array(rows)
+
+
+def _print_gains(title: str, gains: FloatArray) -> None:
+    names = ("speed_m_s", "step_length_m", "walk_ratio_m_s", "rise_m", "pendulum_gain")
+    print(f"{title} ({len(gains)} walks)")
+    for name, mean, sd in zip(names, gains.mean(axis=0), gains.std(axis=0), strict=True):
+        print(f"  {name:22s} {mean:6.3f} +- {sd:.3f}")
+
+
 def _print(title: str, walks: list[GaitStatistics]) -> None:
     def mean(name: str) -> FloatArray:
         return np.asarray(np.mean([getattr(w, name) for w in walks], axis=0))
@@ -187,8 +260,13 @@ def main(arguments: list[str]) -> int:
         for low, high in groups or ((0.8, 2.6),):
             some = [w for w in walks if low <= w.step_frequency_hz < high]
             _print(f"recorded {name}, {low} to {high} steps/s", some)
-    for speeds in ((0.8, 0.95), (1.1, 1.25), (0.5, 0.6)):
-        _print(f"simulated, {speeds[0]} to {speeds[1]} m/s", simulated_walks(speeds, 12, 3))
+    for speeds in ((0.88, 0.95), (1.07, 1.15), (0.5, 0.6)):
+        _print(f"simulated, {speeds[0]} to {speeds[1]} m/s", simulated_walks(speeds, 20, 3))
+    gains = recorded_gains(folder / "walk_lowerback_20m")
+    _print_gains("recorded walk_lowerback_20m, under 1 m/s", gains[gains[:, 0] < 1.0])
+    _print_gains("recorded walk_lowerback_20m, from 1 m/s", gains[gains[:, 0] >= 1.0])
+    for speeds in ((0.5, 0.6), (0.85, 1.0), (1.0, 1.3)):
+        _print_gains(f"simulated, {speeds[0]} to {speeds[1]} m/s", simulated_gains(speeds, 20, 3))
     return 0
 
 

@@ -58,7 +58,7 @@ def make_person(
         walk_ratio_m_s=0.36 * stature / 1.72 * math.exp(rng.normal(0.0, 0.08)),
         pendulum_gain=float(np.clip(rng.normal(1.22, 0.07), 1.0, 1.45)),
         turn_length_m=float(rng.uniform(1.2, 2.4)),
-        asymmetry=float(rng.normal(0.0, 0.02)),
+        asymmetry=float(rng.normal(0.0, 0.03)),
         lateral_scale=math.exp(rng.normal(0.0, 0.15)),
         sway_scale=math.exp(rng.normal(0.0, 0.25)),
         impact_scale=math.exp(rng.normal(0.0, 0.2)),
