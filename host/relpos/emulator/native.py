@@ -255,9 +255,15 @@ class NativeEngine:
         if self._reset_asked:
             self.reset(time_us, ResetCause.COMMAND)
             return
-        self.next_due_us = time_us + (
-            LOOP_US if wait_us < LOOP_US else int(wait_us / self._rate) + 1
-        )
+        if wait_us < LOOP_US:
+            self.next_due_us = time_us + LOOP_US
+            return
+        # First virtual microsecond at which the node's clock, cut to whole ones, shows that time.
+        due_node_us = int((time_us - self._power_on_us) * self._rate) + wait_us
+        since_us = int(due_node_us / self._rate)
+        while int(since_us * self._rate) < due_node_us:
+            since_us += 1
+        self.next_due_us = self._power_on_us + since_us
 
     def receive(self, data: bytes) -> None:
         """Bytes that have arrived at the UART; the node runs again at once."""

@@ -1,0 +1,272 @@
+"""Recorded inertial data through the emulated chip and the firmware: the body of deadreckon.
+
+The recording becomes what the MPU-9150 and the AK8975 feel; the production driver configures
+range, filter and rate, the chip quantises accordingly, and what the firmware reports comes back on
+the recording's clock. Nothing is taken from the recording but its samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from relpos.errors import DataError, DeviceError
+from relpos.link.decoder import Decoder
+from relpos.measurements import Motion, Step
+from relpos.protocol import messages as wire
+from relpos.runs import Run
+from relpos.runs.imu import ImuRecording
+from relpos.simulation.world import World
+
+from .air import UwbAir, VirtualClock
+from .node import BoardKind, EmulatedNode, NodeErrors
+from .surroundings import FloatArray, Surroundings
+from .xbee import DELIVERED, XbeeModule
+
+GRID_HZ = 200.0
+"""The recording is brought to this uniform rate before the chip's filter feels it."""
+LEAD_S = 1.0
+"""From power-on to the first sample: the board boots and is configured, the chip is silent."""
+TAIL_S = 2.5
+"""Behind the last sample: the report that is then under way still comes out."""
+GAP_PERIODS = 3.5
+LEAST_GAP_S = 0.05
+"""Samples further apart than both (in median periods, in seconds) are a gap, not a slow sensor."""
+LEG_OF_STATURE = 0.53
+STANDARD_PRESSURE_PA = 101_325.0
+FIRST_GAIN_PERMILLE = 1250
+CALIBRATION_PASSES = 4
+CALIBRATED_WITHIN = 0.001
+"""The gain is found when the calibration walk comes out this close to its true length."""
+
+
+@dataclass(frozen=True)
+class Wearer:
+    """What the node is told before the recording is played; None leaves the firmware's default."""
+
+    leg_length_m: float | None = None
+    step_gain_permille: int | None = None
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What one node reported, on the recording's clock; ``counts`` are the frames by name."""
+
+    motions: tuple[Motion, ...]
+    steps: tuple[Step, ...]
+    counts: Mapping[str, int]
+
+    @property
+    def distance_m(self) -> float:
+        """Sum of the step lengths."""
+        return sum(step.length_m for step in self.steps)
+
+
+def surroundings_of(recording: ImuRecording) -> Surroundings:
+    """What the chips feel while the recording is played, ``LEAD_S`` after power-on.
+
+    Samples are joined by shape-preserving cubics; no sample is made inside a gap. DataError where
+    there is no motion to play.
+    """
+    time_s, rows = _increasing(recording)
+    if len(time_s) < 2:
+        raise DataError("an inertial recording of fewer than two samples cannot be played")
+    time_s = time_s - time_s[0] + LEAD_S
+    grid_s = np.arange(int((time_s[-1] + TAIL_S) * GRID_HZ) + 1) / GRID_HZ
+    inside = np.clip(grid_s, time_s[0], time_s[-1])
+    inertial: FloatArray = PchipInterpolator(time_s, rows[:, :6])(inside)
+    step_s = np.diff(time_s)
+    period_s = float(np.median(step_s))
+    gaps = np.flatnonzero(step_s > max(GAP_PERIODS * period_s, LEAST_GAP_S))
+    silent = [(0.0, LEAD_S)]
+    silent += [(float(time_s[k]) + period_s, float(time_s[k + 1])) for k in gaps]
+    silent.append((float(time_s[-1]) + period_s, float(grid_s[-1]) + 3600.0))
+    magnetic = np.full((len(grid_s), 3), np.nan)
+    known = np.isfinite(rows[:, 6:]).all(axis=1)
+    if known.any():
+        for axis in range(3):
+            magnetic[:, axis] = np.interp(inside, time_s[known], rows[known, 6 + axis])
+    return Surroundings(
+        rate_hz=GRID_HZ,
+        specific_force_m_s2=inertial[:, :3],
+        angular_rate_rad_s=inertial[:, 3:],
+        magnetic_field_ut=magnetic,
+        pressure_pa=np.full(len(grid_s), STANDARD_PRESSURE_PA),
+        silent_us=tuple((round(a * 1e6), round(b * 1e6)) for a, b in silent),
+    )
+
+
+def _increasing(recording: ImuRecording) -> tuple[FloatArray, FloatArray]:
+    """Times and (n, 9) rows, of samples at the same time the first."""
+    keep = np.concatenate(([True], np.diff(recording.time_s) > 1e-6))
+    rows = np.concatenate(
+        (
+            recording.acceleration_m_s2,
+            recording.angular_rate_rad_s,
+            recording.magnetic_field_ut,
+        ),
+        axis=1,
+    )
+    return recording.time_s[keep], rows[keep]
+
+
+class _Recorder:
+    """The radio's other end: everything arrives, at once, and is decoded."""
+
+    def __init__(self) -> None:
+        self.decoder = Decoder()
+        self.motions: list[Motion] = []
+        self.steps: list[Step] = []
+
+    def send(
+        self,
+        sender: XbeeModule,
+        destination: int,
+        long: bool,
+        data: bytes,
+        time_us: int,
+        report: Callable[[int, int], None],
+    ) -> None:
+        """See :class:`relpos.emulator.xbee.Air`."""
+        try:
+            frame = wire.decode(data)
+        except wire.FrameError:
+            arrival_s = time_us * 1e-6
+        else:
+            # The node's clock is the recording's: as if the frame had arrived when it was stamped.
+            arrival_s = float(frame.values.get("time_s", time_us * 1e-6))
+        for observation in self.decoder.feed(data, arrival_s):
+            if isinstance(observation, Motion):
+                self.motions.append(observation)
+            elif isinstance(observation, Step):
+                self.steps.append(observation)
+        report(time_us, DELIVERED)
+
+
+def play(
+    node: int,
+    recording: ImuRecording,
+    wearer: Wearer,
+    board: BoardKind | str = BoardKind.NATIVE,
+) -> Replay:
+    """Run the firmware over one node's recording.
+
+    DataError where a setting is refused, DeviceError where the node does not answer.
+    """
+    surroundings = surroundings_of(recording)
+    clock = VirtualClock()
+    recorder = _Recorder()
+    nowhere = UwbAir(clock, World(), lambda tag, time: np.zeros(3), np.random.default_rng(0))
+    # A wire node id is 1 to 254; what the recording calls its node is put back below.
+    emulated = EmulatedNode(1, board, surroundings, NodeErrors(), clock, nowhere, recorder)
+    try:
+        nowhere.tags.append(emulated.tag)
+        coordinator = XbeeModule(wire.COORDINATOR, 0x40000000, recorder, lambda time, data: None)
+        settings = [(wire.CommandCode.SET_STEP_REPORTS, 1)]
+        if wearer.leg_length_m is not None:
+            settings.append(
+                (wire.CommandCode.SET_LEG_LENGTH_MM, round(wearer.leg_length_m * 1000.0))
+            )
+        if wearer.step_gain_permille is not None:
+            settings.append((wire.CommandCode.SET_STEP_GAIN_PERMILLE, wearer.step_gain_permille))
+        for k, (code, value) in enumerate(settings):
+            emulated.command(coordinator, code, value, k + 1, 400_000 + 100_000 * k)
+        clock.run(round((len(surroundings.pressure_pa) - 1) / surroundings.rate_hz * 1e6))
+    finally:
+        emulated.close()
+    answers = {answer.token: answer for answer in recorder.decoder.acknowledged}
+    for k, (code, value) in enumerate(settings):
+        answer = answers.get(k + 1)
+        if answer is None:
+            raise DeviceError(f"node {node}: the firmware did not answer {code.name}")
+        if answer.result != wire.CommandResult.DONE:
+            raise DataError(f"node {node}: the firmware refuses {code.name} {value}")
+    shift_s = float(recording.time_s[0]) - LEAD_S
+    motions = tuple(
+        replace(motion, node=node, time_s=motion.time_s + shift_s)
+        for motion in recorder.motions
+        if motion.time_s > LEAD_S or motion.dx_m or motion.dy_m or motion.dtheta_rad
+    )
+    steps = tuple(
+        replace(step, node=node, time_s=step.time_s + shift_s) for step in recorder.steps
+    )
+    counts = dict(recorder.decoder.counts)
+    for track in recorder.decoder.nodes.values():
+        counts.update(track.counts)
+    return Replay(motions, steps, counts)
+
+
+def calibrate(
+    node: int,
+    recording: ImuRecording,
+    true_distance_m: float,
+    leg_length_m: float | None,
+    board: BoardKind | str = BoardKind.NATIVE,
+) -> int:
+    """Step gain in permille with which the walk comes out at ``true_distance_m``.
+
+    The step length is not quite linear in the gain (the filter weighs it), hence more than one
+    pass. DataError where no step is found or the distance is not positive.
+    """
+    if not true_distance_m > 0.0:
+        raise DataError(f"a calibration walk of {true_distance_m:g} m")
+    gain = FIRST_GAIN_PERMILLE
+    for _ in range(CALIBRATION_PASSES):
+        walked_m = play(node, recording, Wearer(leg_length_m, gain), board).distance_m
+        if walked_m <= 0.0:
+            raise DataError(f"node {node}: no step is found in the calibration walk")
+        if abs(walked_m / true_distance_m - 1.0) < CALIBRATED_WITHIN:
+            break
+        gain = round(gain * true_distance_m / walked_m)
+    return gain
+
+
+def replay_imu(
+    run: Run,
+    *,
+    board: BoardKind | str = BoardKind.NATIVE,
+    stature_m: float | None = None,
+    calibration: Run | None = None,
+) -> tuple[list[Motion], list[Step]]:
+    """What the firmware reports while the run's ``imu.csv`` is played, for every node in it.
+
+    The leg length is the run's own, or 0.53 of ``stature_m`` or of the run's stature. With
+    ``calibration``, a walk of the same wearer with ``true_distance_m``, the step gain comes from
+    it. DataError or DeviceError where that cannot be done.
+    """
+    recordings = run.load_imu()
+    if not recordings:
+        raise DataError(f"{run.name}: no inertial data (imu.csv)")
+    walks = calibration.load_imu() if calibration is not None else {}
+    motions: list[Motion] = []
+    steps: list[Step] = []
+    for node, recording in recordings.items():
+        leg_m = _leg_length_m(run, node, stature_m)
+        gain = None
+        if calibration is not None:
+            walk = walks.get(node) or (next(iter(walks.values())) if len(walks) == 1 else None)
+            distance_m = calibration.description.true_distance_m
+            if walk is None or distance_m is None:
+                raise DataError(
+                    f"{calibration.name}: no walk of node {node} with true_distance_m in it"
+                )
+            # The calibration walk's own leg length would put another gain beside this one.
+            gain = calibrate(node, walk, distance_m, leg_m, board)
+        replay = play(node, recording, Wearer(leg_m, gain), board)
+        motions += replay.motions
+        steps += replay.steps
+    return sorted(motions, key=lambda m: m.time_s), sorted(steps, key=lambda s: s.time_s)
+
+
+def _leg_length_m(run: Run, node: int, stature_m: float | None) -> float | None:
+    info = run.description.nodes.get(node)
+    if stature_m is None and info is not None and info.leg_length_m is not None:
+        return info.leg_length_m
+    if stature_m is None and info is not None:
+        stature_m = info.stature_m
+    if stature_m is None:
+        stature_m = run.description.stature_m
+    return None if stature_m is None else LEG_OF_STATURE * stature_m
