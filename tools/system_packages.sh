@@ -26,7 +26,8 @@ want_package() { # PACKAGE FILE...: one of the files will do where there is no d
     missing="$missing $package"
 }
 
-# Debian's python3, or the newest that Ubuntu offers beside an older python3.
+# Debian's python3, or the newest that Ubuntu offers beside an older python3; nothing where there is
+# none: find_python.sh then says so.
 python_packages() {
     default=$(apt-cache policy python3 2>/dev/null | sed -n 's/^ *Candidate: *\([0-9]*\.[0-9]*\).*/\1/p')
     case $default in
@@ -38,8 +39,10 @@ python_packages() {
                 fi
             done
             ;;
+        *)
+            echo python3-venv
+            ;;
     esac
-    echo python3-venv
 }
 
 find_missing() { # GROUP
