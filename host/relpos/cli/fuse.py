@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from relpos.cli import output
 from relpos.cli import source as sources
@@ -40,6 +41,22 @@ class Initial(StrEnum):
     UNKNOWN = "unknown"
     COMMON = "common"
     TRUTH = "truth"
+
+
+class FuseCommand(TyperCommand):
+    """The command with the estimators' settings below its help, read from the estimators."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help, then every key of ``--set`` with its default."""
+        super().format_help(ctx, formatter)
+        from relpos import fusion
+
+        for name in fusion.SETTINGS:
+            infos = fusion.settings_of(name)
+            typer.echo(f" Settings of {name} (--set KEY=VALUE):" if infos else "", nl=bool(infos))
+            for info in infos:
+                typer.echo(f"   {info.key} {info.default:g}".ljust(28) + f"  {info.text}")
+        typer.echo()
 
 
 def fuse(

@@ -70,7 +70,7 @@ def main(
 
 app.command("demo")(demo.demo)
 app.command("emulate")(emulate.emulate)
-app.command("fuse")(fuse.fuse)
+app.command("fuse", cls=fuse.FuseCommand)(fuse.fuse)
 app.command("simulate")(simulate.simulate)
 app.command("evaluate")(evaluate.evaluate)
 app.command("deadreckon")(deadreckon.deadreckon)

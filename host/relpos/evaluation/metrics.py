@@ -277,7 +277,9 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
         time_s=at_s[scored],
         distance_rmse_over_time_m=_root_mean_rows(error_m**2)[scored],
         position_rmse_over_time_m=_root_mean_rows(position_squared)[scored],
-        body_frame_rmse_over_time_m=_root_mean_rows(body_squared.reshape(at_s.size, -1))[scored],
+        body_frame_rmse_over_time_m=_root_mean_rows(
+            np.hstack((body_squared[..., 0], body_squared[..., 1]))
+        )[scored],
         nees_over_time=_mean_rows(nees)[scored],
         pair_ids=pair_ids,
         pair_distance_m=estimated_m[scored],

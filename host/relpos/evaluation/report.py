@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 NODE_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 NODE_LINES = ("-", "--", "-.", ":")
-TRUTH_COLOUR = "#666666"
+TRUTH_COLOUR = "#cfcfcf"
 FUSED_COLOUR = "#0072B2"
 DEAD_RECKONING_COLOUR = "#D55E00"
 
@@ -90,25 +90,39 @@ def draw_tracks(content: Content) -> Figure:
     shown = [("fused", content.fused)]
     if content.dead_reckoning:
         shown.insert(0, ("dead reckoning", content.dead_reckoning))
-    figure = _figure(6.2 * len(shown), 5.6)
+    moved = {name: _onto_truth(tracks, content.truth) for name, tracks in shown}
+    everywhere = [np.column_stack((t.x_m, t.y_m)) for t in content.truth.values()]
+    everywhere += [points_m for tracks in moved.values() for points_m in tracks.values()]
+    width_m, depth_m = np.ptp(_finite_rows(np.concatenate(everywhere)), axis=0) + 1.0
+    height_in = 5.0
+    width_in = min(max(height_in * width_m / depth_m, 3.6), 8.0)
+    figure = _figure(width_in * len(shown) + 0.6, height_in + 0.9)
     panels = figure.subplots(1, len(shown), squeeze=False, sharex=True, sharey=True)[0]
-    for axes, (name, tracks) in zip(panels, shown, strict=True):
-        moved = _onto_truth(tracks, content.truth)
+    for axes, (name, tracks) in zip(panels, moved.items(), strict=True):
         for k, node in enumerate(sorted(content.truth)):
             colour, line = _style(k)
             true = content.truth[node]
             axes.plot(
                 *_broken_at_gaps(true.time_s, true.x_m, true.y_m),
                 color=TRUTH_COLOUR,
-                linewidth=3.5,
-                alpha=0.25,
+                linewidth=5.0,
                 solid_capstyle="round",
+                zorder=1,
                 label="truth" if k == 0 else None,
             )
-            if node not in moved:
+            if node not in tracks:
                 continue
-            x_m, y_m = moved[node].T
-            axes.plot(x_m, y_m, color=colour, linestyle=line, linewidth=1.2, label=f"node {node}")
+            x_m, y_m = tracks[node].T
+            axes.plot(
+                x_m,
+                y_m,
+                color=colour,
+                linestyle=line,
+                linewidth=1.1,
+                alpha=0.85,
+                label=f"node {node}",
+                zorder=2,
+            )
             there = np.isfinite(x_m)
             if there.any():
                 axes.plot(x_m[there][-1], y_m[there][-1], "o", color=colour, markersize=6, zorder=4)
@@ -227,6 +241,11 @@ def _band(track: PairTrack) -> tuple[Floats, Floats, Floats]:
     return track.time_s, low, track.distance_m + track.sigma_distance_m
 
 
+def _finite_rows(points_m: Floats) -> Floats:
+    finite = points_m[np.isfinite(points_m).all(axis=1)]
+    return finite if len(finite) else np.zeros((1, 2))
+
+
 def _onto_truth(tracks: Tracks, truth: Tracks) -> dict[int, Floats]:
     """Whole tracks (n, 2), gaps as NaN, moved by the one rigid motion that fits the truth best."""
     moving = _alignment(tracks, truth)
@@ -276,6 +295,7 @@ def _figure(width_in: float, height_in: float) -> Figure:
             "font.size": 10,
             "axes.grid": True,
             "grid.alpha": 0.25,
+            "axes.axisbelow": True,
             "axes.spines.top": False,
             "axes.spines.right": False,
             "legend.frameon": False,

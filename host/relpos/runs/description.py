@@ -111,6 +111,8 @@ def write_description(path: Path, description: Description) -> None:
     lines: list[str] = []
     for key in ("name", "source", "initial_pose", "heading_known", "mount", *_PLAIN_NUMBERS):
         value = getattr(description, key)
+        if key == "initial_pose" and value is InitialPose.UNKNOWN and description.priors:
+            continue  # the tables say it
         if value is not None:
             lines.append(f"{key} = {_toml(value)}")
     for prior in description.priors:

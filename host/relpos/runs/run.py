@@ -117,25 +117,22 @@ class Run:
 
     @property
     def priors(self) -> tuple[Prior, ...]:
-        """What the run itself says of its start."""
-        return self.priors_for(self.description.initial_pose)
+        """What the run itself says of its start; a table of one node overrules the rest."""
+        tables = {prior.node: prior for prior in self.description.priors}
+        merged = {p.node: p for p in self.priors_for(self.description.initial_pose)} | tables
+        return tuple(merged[node] for node in sorted(merged))
 
     def priors_for(self, initial: InitialPose) -> tuple[Prior, ...]:
-        """Return one prior a node that is known of under ``initial``, ordered by node.
+        """Return one prior a node that is known of under ``initial``, whatever the run says.
 
-        Tables in ``run.toml`` overrule whatever ``initial`` says of their node, unless it says
-        unknown where the file does not. DataError where the truth is asked for and is not there.
+        DataError where the truth is asked for and is not there.
         """
-        tables = {prior.node: prior for prior in self.description.priors}
         if initial is InitialPose.UNKNOWN:
-            asked_to_forget = self.description.initial_pose is not InitialPose.UNKNOWN
-            return () if asked_to_forget else tuple(tables[n] for n in sorted(tables))
+            return ()
         if initial is InitialPose.COMMON:
-            common = {node: Prior(node, 0.0, 0.0, 0.0) for node in self.node_ids}
-            merged = common | tables
-        else:
-            merged = _priors_from_truth(self) | tables
-        return tuple(merged[node] for node in sorted(merged))
+            return tuple(Prior(node, 0.0, 0.0, 0.0) for node in self.node_ids)
+        priors = _priors_from_truth(self)
+        return tuple(priors[node] for node in sorted(priors))
 
     def load_imu(self) -> dict[int, ImuRecording]:
         """Read the raw inertial recording of every node; empty where the run has none."""

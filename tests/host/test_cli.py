@@ -1,0 +1,285 @@
+"""The command line from outside: what scripts rely on, and what bad input gets for an answer."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import pty
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from relpos.cli import main, output
+from relpos.evaluation.summary import FIGURES
+from relpos.runs import load_run, read_estimates
+
+MOTION_HEADER = "time_s,node,dx_m,dy_m,dtheta_rad\n"
+
+
+def relpos(*arguments: object) -> Result:
+    return CliRunner().invoke(main.app, [str(a) for a in arguments], catch_exceptions=False)
+
+
+def one_clear_line(result: Result) -> str:
+    """The complaint: a single line on stderr, nothing on stdout, exit status 1."""
+    assert result.exit_code == 1, result.output
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1
+    assert result.stderr.startswith("relpos: ")
+    assert "Traceback" not in result.stderr
+    return result.stderr
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A minute of the paper's scenario with three users."""
+    directory = tmp_path_factory.mktemp("run") / "walk"
+    result = relpos(
+        "simulate", "--scenario", "paper", "--seed", 3, "--out", directory,
+        "--set", "seconds=60", "--set", "nodes=3",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    return directory
+
+
+def a_run(directory: Path, ranges: str | None = None, motion: str | None = None) -> Path:
+    directory.mkdir(exist_ok=True)
+    if motion is None:
+        rows = "".join(f"{t},{n},0.5,0,0.1\n" for t in range(1, 9) for n in (1, 2))
+        motion = MOTION_HEADER + rows
+    (directory / "run.toml").write_text('initial_pose = "common"\n')
+    (directory / "motion.csv").write_text(motion)
+    if ranges is not None:
+        (directory / "ranges.csv").write_text("time_s,node,peer,range_m\n" + ranges)
+    return directory
+
+
+def test_help_names_the_commands_scripts_rely_on() -> None:
+    shown = relpos("--help").stdout
+    for command in ("demo", "emulate", "fuse", "simulate", "evaluate", "deadreckon"):
+        assert command in shown
+
+
+def test_help_does_not_wait_for_numerical_libraries() -> None:
+    program = (
+        "import sys\nfrom typer.testing import CliRunner\nfrom relpos.cli import main\n"
+        "CliRunner().invoke(main.app, ['--help'])\n"
+        "print([m for m in ('numpy', 'scipy', 'matplotlib') if m in sys.modules])"
+    )
+    shown = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert shown.stdout.strip() == "[]"
+
+
+def test_fuse_help_lists_every_setting_with_its_default() -> None:
+    from relpos import fusion
+
+    shown = " ".join(relpos("fuse", "--help").stdout.replace("│", " ").split())
+    for info in fusion.settings_of("particle"):
+        assert f"{info.key} {info.default:g}" in shown, info.key
+
+
+def test_simulated_runs_repeat_by_their_seed(simulated: Path, tmp_path: Path) -> None:
+    relpos(
+        "simulate", "--scenario", "paper", "--seed", 3, "--out", tmp_path / "again",
+        "--set", "seconds=60", "--set", "nodes=3",
+    )  # fmt: skip
+    for name in ("motion.csv", "ranges.csv", "truth.csv"):
+        assert (tmp_path / "again" / name).read_bytes() == (simulated / name).read_bytes()
+    assert len(load_run(simulated).priors) == 3
+
+
+def test_fuse_writes_estimates_and_scores_them(simulated: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    result = relpos("fuse", simulated, "--out", out)
+    assert result.exit_code == 0, result.stderr
+    assert "1 - 2" in result.stdout
+    assert "relative distance RMSE" in result.stdout
+    assert read_estimates(out)
+    for name in ("pairs.csv", "parameters.csv", "tracks.png", "error.png", "distances.png"):
+        assert (out / name).stat().st_size > 0, name
+    page = (out / "index.html").read_text()
+    assert page.count("data:image/png;base64,") == 3
+    assert "http" not in page, "the page is to work without a network"
+
+
+def test_evaluate_gives_the_figures_fuse_gave(simulated: Path, tmp_path: Path) -> None:
+    fused = relpos("fuse", simulated, "--out", tmp_path, "--seed", 7, "--json")
+    scored = relpos("evaluate", simulated, "--estimate", tmp_path, "--json")
+    first, second = json.loads(fused.stdout), json.loads(scored.stdout)
+    for name in FIGURES:
+        assert second[name] == pytest.approx(first[name], rel=1e-3), name
+    assert [(p["node"], p["peer"]) for p in second["pairs"]] == [(1, 2), (1, 3), (2, 3)]
+    series = second["over_time"]
+    assert len(series["time_s"]) == len(series["relative_distance_rmse_m"]) == second["epochs"]
+    assert first["dead_reckoning"]["relative_distance_rmse_m"] > 0.0
+    table = relpos("evaluate", simulated, "--estimate", tmp_path).stdout
+    assert "over time" in table
+
+
+def test_the_same_seed_gives_the_same_estimate(simulated: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        relpos("fuse", simulated, "--out", tmp_path / name, "--seed", 5, "--json")
+    assert (tmp_path / "a/estimate.csv").read_bytes() == (tmp_path / "b/estimate.csv").read_bytes()
+
+
+def test_a_run_without_truth_is_fused_and_shown(tmp_path: Path) -> None:
+    ranges = "".join(f"{t},1,2,{1 + 0.1 * t}\n" for t in range(1, 9))
+    result = relpos("fuse", a_run(tmp_path / "r", ranges), "--out", tmp_path / "o")
+    assert result.exit_code == 0, result.stderr
+    assert "1 - 2" in result.stdout
+    document = json.loads(relpos("fuse", tmp_path / "r", "--out", tmp_path / "o", "--json").stdout)
+    assert document["relative_distance_rmse_m"] is None
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("fuse",),
+        ("fuse", "x", "--estimator", "magic"),
+        ("fuse", "x", "--no-such-option"),
+        ("fuse", "x", "--set", "particles"),
+        ("simulate", "--scenario", "paper"),
+        ("nonsense",),
+        ("evaluate", "x"),
+    ],
+)
+def test_wrong_usage_is_exit_status_two(arguments: tuple[str, ...]) -> None:
+    assert relpos(*arguments).exit_code == 2
+
+
+@pytest.mark.parametrize(
+    "option", [("--estimator", "bank"), ("--smooth",), ("--record", "f"), ("--view",)]
+)
+def test_what_is_not_built_yet_is_said(simulated: Path, option: tuple[str, ...]) -> None:
+    assert "not built yet" in one_clear_line(relpos("fuse", simulated, *option))
+
+
+def test_an_unknown_setting_is_one_clear_line(simulated: Path) -> None:
+    assert "no setting 'bogus'" in one_clear_line(relpos("fuse", simulated, "--set", "bogus=1"))
+    one_clear_line(relpos("fuse", simulated, "--set", "particles=many"))
+
+
+def test_a_missing_directory_is_one_clear_line(tmp_path: Path) -> None:
+    for arguments in (
+        ("fuse", tmp_path / "nowhere"),
+        ("evaluate", tmp_path / "nowhere", "--estimate", tmp_path),
+        ("deadreckon", tmp_path / "nowhere"),
+    ):
+        assert "nowhere" in one_clear_line(relpos(*arguments))
+
+
+def test_a_port_that_does_not_exist_is_one_clear_line() -> None:
+    assert "ttyNOPE" in one_clear_line(relpos("fuse", "/dev/ttyNOPE7"))
+    one_clear_line(relpos("fuse", "nonsense://port"))
+
+
+def test_a_truncated_table_is_one_clear_line(tmp_path: Path) -> None:
+    motion = MOTION_HEADER + "1,1,0.5,0,0\n2,1,0.5,0"
+    message = one_clear_line(relpos("fuse", a_run(tmp_path / "r", "1,1,2,3\n", motion)))
+    assert "motion.csv: line 3: column dtheta_rad is empty" in message
+
+
+def test_a_truncated_gzip_file_is_one_clear_line(tmp_path: Path) -> None:
+    run = a_run(tmp_path / "r")
+    whole = gzip.compress(b"time_s,node,peer,range_m\n" + b"1,1,2,3\n" * 500)
+    (run / "ranges.csv.gz").write_bytes(whole[:40])
+    assert "ranges.csv.gz" in one_clear_line(relpos("fuse", run))
+
+
+def test_a_corrupted_description_is_one_clear_line(tmp_path: Path) -> None:
+    run = a_run(tmp_path / "r", "1,1,2,3\n")
+    for content in (b'name = "x', b"\x00\xff\xfe\n\n", b'initial_pose = "here"'):
+        (run / "run.toml").write_bytes(content)
+        assert "run.toml" in one_clear_line(relpos("fuse", run))
+
+
+def test_binary_garbage_is_one_clear_line(tmp_path: Path) -> None:
+    run = a_run(tmp_path / "r", "1,1,2,3\n")
+    (run / "motion.csv").write_bytes(b"\x00\x9f\x92\x96\n" * 40)
+    assert "motion.csv" in one_clear_line(relpos("fuse", run))
+    (tmp_path / "file.bin").write_bytes(b"\x00\x9f")
+    assert "file.bin" in one_clear_line(relpos("fuse", tmp_path / "file.bin"))
+
+
+def test_ranges_that_all_failed_are_one_clear_line(tmp_path: Path) -> None:
+    run = a_run(tmp_path / "r", "".join(f"{t},1,2,0\n" for t in range(1, 9)))
+    assert "all 8 ranges are 0" in one_clear_line(relpos("fuse", run))
+
+
+def test_no_ranges_at_all_are_one_clear_line(tmp_path: Path) -> None:
+    assert "no ranges" in one_clear_line(relpos("fuse", a_run(tmp_path / "a")))
+    assert "no ranges" in one_clear_line(relpos("fuse", a_run(tmp_path / "b", ranges="")))
+
+
+def test_no_motion_at_all_is_one_clear_line(tmp_path: Path) -> None:
+    run = a_run(tmp_path / "r", "1,1,2,3\n", MOTION_HEADER)
+    assert "no motion" in one_clear_line(relpos("fuse", run))
+    assert "no motion" in one_clear_line(relpos("fuse", run, "--estimator", "deadreckoning"))
+
+
+def test_an_output_that_cannot_be_written_is_one_clear_line(
+    simulated: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    message = one_clear_line(relpos("fuse", simulated, "--out", tmp_path / "file" / "sub"))
+    assert "file" in message
+
+
+def test_evaluating_without_truth_or_estimate_is_one_clear_line(
+    simulated: Path, tmp_path: Path
+) -> None:
+    assert "no truth" in one_clear_line(
+        relpos("evaluate", a_run(tmp_path / "r"), "--estimate", tmp_path)
+    )
+    assert "no estimate.csv" in one_clear_line(
+        relpos("evaluate", simulated, "--estimate", tmp_path)
+    )
+
+
+def test_deadreckon_without_inertial_data_is_one_clear_line(tmp_path: Path) -> None:
+    assert "imu.csv" in one_clear_line(relpos("deadreckon", a_run(tmp_path / "r")))
+
+
+def test_dead_reckoning_needs_no_ranges(tmp_path: Path) -> None:
+    run = a_run(tmp_path / "r")
+    result = relpos("fuse", run, "--estimator", "deadreckoning", "--out", tmp_path / "o")
+    assert result.exit_code == 0, result.stderr
+
+
+def test_json_is_all_there_is_on_stdout(simulated: Path, tmp_path: Path) -> None:
+    result = relpos("fuse", simulated, "--out", tmp_path, "--json")
+    assert result.stdout.count("\n") == 1
+    json.loads(result.stdout)
+    assert not (tmp_path / "index.html").exists(), "scripts do not wait for pictures"
+
+
+def test_a_port_that_vanishes_keeps_what_was_received(tmp_path: Path) -> None:
+    ours, theirs = pty.openpty()
+    path = os.ttyname(theirs)
+    os.close(theirs)
+
+    def vanish() -> None:
+        time.sleep(0.5)
+        os.close(ours)
+
+    closing = threading.Thread(target=vanish)
+    closing.start()
+    result = relpos("fuse", path, "--out", tmp_path)
+    closing.join()
+    assert result.exit_code == 1
+    assert "vanished" in result.stderr.splitlines()[-1]
+    assert "Traceback" not in result.stderr
+    assert (tmp_path / "received" / "run.toml").exists()
+    assert (tmp_path / "estimate.csv").exists()
+
+
+def test_settings_are_split_at_their_first_equals_sign() -> None:
+    assert output.parse_settings(["a=1", " b = x=y "]) == {"a": "1", "b": "x=y"}
