@@ -38,6 +38,7 @@ SETTLE_S = 0.1
 DRAIN_S = 2.0
 """How long the end waits for a reader that does not read."""
 _POLL_S = 0.02
+_QUIET_POLLS = 5
 
 
 class PseudoTerminal:
@@ -216,15 +217,18 @@ class PseudoTerminal:
             self.team.send(data)
 
     def _drain(self) -> None:
-        """Give a reader the time to take what is left."""
+        """Give a reader the time to take what is left: closing would throw it away."""
         deadline_s = time.monotonic() + DRAIN_S
+        quiet = 0
         try:
             slave = os.open(self.path, os.O_RDWR | os.O_NOCTTY)
         except OSError:
             return
         try:
-            while time.monotonic() < deadline_s and _waiting(slave):
+            # Empty once is not empty: the kernel hands on what was written piece by piece.
+            while time.monotonic() < deadline_s and quiet < _QUIET_POLLS:
                 time.sleep(_POLL_S)
+                quiet = 0 if _waiting(slave) else quiet + 1
         finally:
             os.close(slave)
 

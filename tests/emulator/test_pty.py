@@ -1,0 +1,244 @@
+"""The pseudo-terminal: nothing lost at any speed, readers that come and go, virtual times."""
+
+import os
+import select
+import threading
+import time
+
+import pytest
+import serial
+
+from relpos.emulator.pty import VIRTUAL_TIME, PseudoTerminal
+from relpos.emulator.xbee import Parser, Receive16, UnknownFrame, encode
+from relpos.errors import DeviceError
+from relpos.link.live import Link, observe
+from relpos.protocol import messages as wire
+
+
+class Talker:
+    """Stands in for a team: one numbered frame every ``period_us`` of virtual time."""
+
+    def __init__(self, seconds, period_us=10_000, size=40):
+        self.seconds = seconds
+        self.end_us = round(seconds * 1e6)
+        self.time_us = 0
+        self.heard = bytearray()
+        self.period_us = period_us
+        self.size = size
+        self.fails_at_us = None
+
+    def frame(self, number):
+        # 7E, 7D, 11, 13 and line ends: what a terminal in the way would spoil.
+        data = number.to_bytes(4, "big") + b"\x7e\x7d\x11\x13\x0d\x0a\x03\x04\x1a\x7f\xff"
+        return encode(Receive16(1, -40, data.ljust(self.size, b".")))
+
+    def run(self, until_us):
+        first = self.time_us // self.period_us + 1
+        last = until_us // self.period_us
+        self.time_us = until_us
+        if self.fails_at_us is not None and until_us >= self.fails_at_us:
+            raise DeviceError("node 3: the firmware crashed")
+        return [(k * self.period_us, self.frame(k)) for k in range(first, last + 1)]
+
+    def send(self, data):
+        self.heard += data
+
+
+def numbers(data):
+    parser = Parser()
+    frames = parser.feed(data)
+    assert parser.counts.skipped_bytes == parser.counts.bad_checksums == 0
+    return [int.from_bytes(f.data[:4], "big") for f in frames if isinstance(f, Receive16)]
+
+
+def read_all(port, enough):
+    data = b""
+    deadline = time.monotonic() + 10.0
+    while time.monotonic() < deadline and (len(data) < enough):
+        data += port.read(max(1, port.in_waiting))
+    return data
+
+
+def test_nothing_is_lost_at_full_speed_with_a_slow_reader():
+    talker = Talker(seconds=60.0)
+    with PseudoTerminal(talker, speed=0.0) as terminal:
+        with serial.Serial(terminal.path, 38_400, timeout=0.05) as port:
+            terminal.start()
+            total = sum(len(talker.frame(k)) for k in range(1, 6001))
+            data = b""
+            while len(data) < total:
+                chunk = port.read(1500)
+                assert chunk or not terminal.finished
+                data += chunk
+                if len(data) < 40_000:
+                    time.sleep(0.002)
+        terminal.join()
+    assert numbers(data) == list(range(1, 6001))
+
+
+def test_the_clock_stands_while_nobody_reads():
+    talker = Talker(seconds=1000.0)
+    with PseudoTerminal(talker, speed=0.0) as terminal:
+        terminal.start()
+        time.sleep(0.2)
+        assert talker.time_us == 0
+        with serial.Serial(terminal.path, 38_400):
+            time.sleep(0.4)
+            stood_us = talker.time_us
+            time.sleep(0.2)
+            assert 0 < stood_us == talker.time_us < talker.end_us
+
+
+def test_a_reader_that_comes_back_goes_on_reading_whole_frames():
+    talker = Talker(seconds=1000.0)
+    with PseudoTerminal(talker, speed=0.0) as terminal:
+        terminal.start()
+        seen = []
+        for _ in range(3):
+            with serial.Serial(terminal.path, 38_400, timeout=0.05) as port:
+                data = read_all(port, 3000)
+            # The first and the last frame may be cut by opening and closing.
+            frames = Parser().feed(data[data.index(b"\x7e"):])
+            seen.append([int.from_bytes(f.data[:4], "big") for f in frames])
+        assert all(len(s) > 30 for s in seen)
+        assert seen[0][-1] < seen[1][0] < seen[1][-1] < seen[2][0]
+
+
+def test_real_time_is_real_time():
+    talker = Talker(seconds=1000.0)
+    with PseudoTerminal(talker, speed=2.0) as terminal:
+        terminal.start()
+        with serial.Serial(terminal.path, 38_400, timeout=0.05) as port:
+            read_all(port, 1)
+            start, start_us = time.monotonic(), talker.time_us
+            while time.monotonic() < start + 0.5:
+                port.read(4096)
+            speed = (talker.time_us - start_us) * 1e-6 / (time.monotonic() - start)
+    assert speed == pytest.approx(2.0, rel=0.2)
+
+
+def test_what_the_host_writes_reaches_the_coordinator_unspoilt():
+    talker = Talker(seconds=1000.0)
+    message = bytes(range(256)) * 4
+    with PseudoTerminal(talker, speed=1.0) as terminal:
+        terminal.start()
+        with serial.Serial(terminal.path, 38_400, timeout=0.05) as port:
+            read_all(port, 1)
+            port.write(message)
+            deadline = time.monotonic() + 5.0
+            while len(talker.heard) < len(message) and time.monotonic() < deadline:
+                port.read(4096)
+    assert bytes(talker.heard) == message
+
+
+def test_a_reader_without_settings_of_its_own_gets_raw_bytes():
+    talker = Talker(seconds=10.0)
+    with PseudoTerminal(talker, speed=0.0) as terminal:
+        terminal.start()
+        reader = os.open(terminal.path, os.O_RDWR | os.O_NOCTTY)
+        try:
+            data = b""
+            while not terminal.finished or select.select([reader], [], [], 0.1)[0]:
+                if select.select([reader], [], [], 0.1)[0]:
+                    data += os.read(reader, 4096)
+        finally:
+            os.close(reader)
+        terminal.join()
+    assert numbers(data) == list(range(1, 1001))
+    assert talker.heard == b""  # nothing was echoed
+
+
+def test_marks_tell_the_virtual_time_of_what_follows():
+    talker = Talker(seconds=5.0)
+    with PseudoTerminal(talker, speed=0.0, mark_time=True) as terminal:
+        with serial.Serial(terminal.path, 38_400, timeout=0.05) as port:
+            terminal.start()
+            data = b""
+            while (chunk := port.read(4096)) or not terminal.finished:
+                data += chunk
+        terminal.join()
+    frames = Parser().feed(data)
+    assert len(frames) == 1000
+    for mark, frame in zip(frames[::2], frames[1::2], strict=True):
+        assert isinstance(mark, UnknownFrame)
+        assert mark.type == VIRTUAL_TIME
+        number = int.from_bytes(frame.data[:4], "big")
+        assert int.from_bytes(mark.data, "big") == number * 10_000
+
+
+def test_the_port_of_the_same_process_tells_the_exact_arrival_of_every_byte():
+    talker = Talker(seconds=20.0, period_us=7_000)
+    parser = Parser()
+    arrivals = []
+    with PseudoTerminal(talker, speed=0.0) as terminal, terminal.open_port() as port:
+        terminal.start()
+        while not port.exhausted:
+            data = port.read(max(1, min(port.in_waiting, 4096)))
+            arrivals += [(int.from_bytes(f.data[:4], "big"), port.virtual_time_s())
+                         for f in parser.feed(data)]
+        terminal.join()
+    assert [a[0] for a in arrivals] == list(range(1, 20_000_000 // 7_000 + 1))
+    assert all(at == pytest.approx(number * 0.007, abs=1e-9) for number, at in arrivals)
+
+
+def test_the_link_reads_motion_at_virtual_times_through_the_port():
+    class Walker(Talker):
+        def frame(self, number):
+            values = dict.fromkeys(wire.MOTION.field, 0) | {
+                "time_s": 0.01 * number - 0.004, "x_m": 0.02 * number,
+                "state": wire.MotionState.MOVING}
+            return encode(Receive16(5, -40, wire.encode(wire.MOTION, 5, 0, number, values)))
+
+    link = Link()
+    motions = []
+    with PseudoTerminal(Walker(seconds=10.0), speed=0.0) as terminal, terminal.open_port() as port:
+        terminal.start()
+        for batch in observe(port, link, port.virtual_time_s):
+            motions += [o for o in batch if type(o).__name__ == "Motion"]
+            if port.exhausted:
+                break
+        terminal.join()
+    assert len(motions) == 1000
+    assert sum(m.dx_m for m in motions) == pytest.approx(20.0)
+    assert motions[-1].time_s == pytest.approx(10.0, abs=0.001)
+
+
+def test_a_team_that_fails_tells_the_reader_why():
+    talker = Talker(seconds=10.0)
+    talker.fails_at_us = 5_000_000
+    with PseudoTerminal(talker, speed=0.0) as terminal, terminal.open_port() as port:
+        terminal.start()
+
+        def read_on():
+            for _ in observe(port, Link(), port.virtual_time_s):
+                assert not port.exhausted
+
+        with pytest.raises(DeviceError, match="node 3"):
+            read_on()
+
+
+def test_the_end_is_said_in_words_and_the_last_byte_arrives(capsys):
+    talker = Talker(seconds=3.0)
+    terminal = PseudoTerminal(talker, speed=0.0)
+    data = b""
+
+    def serve():
+        terminal.serve()
+        terminal.close()
+
+    thread = threading.Thread(target=serve)
+    with serial.Serial(terminal.path, 38_400, timeout=0.05) as port:
+        thread.start()
+        try:
+            while True:
+                data += port.read(max(1, port.in_waiting))
+        except (serial.SerialException, OSError):
+            pass  # the port vanished: the end
+    thread.join()
+    assert numbers(data) == list(range(1, 301))
+    assert "over" in capsys.readouterr().err
+
+
+def test_a_negative_speed_is_refused():
+    with pytest.raises(DeviceError, match="speed"):
+        PseudoTerminal(Talker(1.0), speed=-1.0)
