@@ -17,6 +17,7 @@ from typer.testing import CliRunner, Result
 
 from relpos.cli import main, output
 from relpos.evaluation.summary import FIGURES
+from relpos.measurements import Motion, Step
 from relpos.runs import load_run, read_estimates
 
 MOTION_HEADER = "time_s,node,dx_m,dy_m,dtheta_rad\n"
@@ -246,6 +247,25 @@ def test_evaluating_without_truth_or_estimate_is_one_clear_line(
 
 def test_deadreckon_without_inertial_data_is_one_clear_line(tmp_path: Path) -> None:
     assert "imu.csv" in one_clear_line(relpos("deadreckon", a_run(tmp_path / "r")))
+
+
+def test_deadreckon_sums_what_the_firmware_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def replayed(*_: object, **__: object) -> tuple[list[Motion], list[Step]]:
+        motions = [Motion(1.0, 4, 0.5, 0.0, 0.25), Motion(2.0, 4, 0.5, 0.0, 0.5)]
+        return motions, [Step(0.5, 4, 0.75), Step(1.5, 4, 0.5)]
+
+    monkeypatch.setattr("relpos.emulator.replay.replay_imu", replayed)
+    columns = "ax_m_s2,ay_m_s2,az_m_s2,gx_rad_s,gy_rad_s,gz_rad_s,mx_ut,my_ut,mz_ut"
+    (tmp_path / "imu.csv").write_text(f"time_s,node,{columns}\n0,4,0,0,9.8,0,0,0,,,\n")
+    result = relpos("deadreckon", tmp_path, "--out", tmp_path / "o", "--json")
+    assert json.loads(result.stdout) == {
+        "nodes": {"4": {"distance_m": 1.25, "steps": 2, "turn_rad": 0.75}}
+    }
+    written = load_run(tmp_path / "o")
+    assert len(written.motions) == 2
+    assert len(written.steps) == 2
 
 
 def test_dead_reckoning_needs_no_ranges(tmp_path: Path) -> None:

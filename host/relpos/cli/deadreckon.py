@@ -32,7 +32,7 @@ def deadreckon(
     """Play imu.csv into the emulated sensor chip, run the firmware, print the walked path."""
     from dataclasses import replace
 
-    from relpos.measurements import Motion, Step
+    from relpos.emulator.replay import replay_imu
     from relpos.runs import Run, load_run, save_run
 
     recording = load_run(run)
@@ -48,12 +48,10 @@ def deadreckon(
             raise DataError(f"{calibrate_from}: no inertial data in this run (imu.csv)")
     else:
         walk = None
-    # replay_imu(run, board=, stature_m=, calibration=) -> (motions, steps): what the firmware
-    # reported when the run's imu.csv came out of the emulated chip, for every node in it.
-    replay_imu = output.provided("relpos.emulator.replay", "replay_imu", "relpos deadreckon")
-    motions: list[Motion]
-    steps: list[Step]
-    motions, steps = replay_imu(recording, board=str(board), stature_m=stature, calibration=walk)
+    with output.working("running the firmware over the recording"):
+        motions, steps = replay_imu(
+            recording, board=str(board), stature_m=stature, calibration=walk
+        )
 
     nodes = {
         node: {

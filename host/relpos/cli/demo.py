@@ -31,14 +31,13 @@ def demo(
     json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
 ) -> None:
     """Run the production firmware of an emulated team and show who was where."""
-    from relpos.runs import Run, save_run
+    from relpos.emulator.team import record_team
+    from relpos.runs import save_run
 
-    # record_team(board=, nodes=, seconds=, scenario=, seed=) -> Run: what came through the port,
-    # priors where the scenario gives them, and the walkers' truth.
-    record_team = output.provided("relpos.emulator.team", "record_team", "relpos demo")
-    run: Run = record_team(
-        board=str(board), nodes=nodes, seconds=seconds, scenario=scenario, seed=seed
-    )
+    with output.working(f"emulating {nodes} nodes for {seconds:g} s"):
+        run = record_team(
+            board=str(board), nodes=nodes, seconds=seconds, scenario=scenario, seed=seed
+        )
     save_run(run, out / "run")
     job = fuse.Job(str(out / "run"), fuse.EstimatorName.PARTICLE, {}, seed, out)
     fuse.fuse_recording(job, run, run.priors, as_json=json, report=True)

@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-from relpos.cli import output
 from relpos.cli.demo import Board
 
 
@@ -29,9 +28,8 @@ def emulate(
 
     Prints the pseudo-terminal's path, which `relpos fuse` takes as its SOURCE.
     """
-    # serve_team(nodes=, board=, scenario=, speed=, seconds=, faults=, seed=, announce=) -> None:
-    # calls announce(path) once the pseudo-terminal is there, returns at the end or on Ctrl-C.
-    serve_team = output.provided("relpos.emulator.team", "serve_team", "relpos emulate")
+    from relpos.emulator.team import serve_team
+
     serve_team(
         nodes=nodes,
         board=str(board),
@@ -40,5 +38,5 @@ def emulate(
         seconds=seconds,
         faults=tuple(fault or ()),
         seed=seed,
-        announce=lambda path: typer.echo(path),
+        announce=typer.echo,
     )

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
+from threading import Timer
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import typer
@@ -76,6 +77,26 @@ def with_progress(items: Iterable[T], total: int | None, label: str) -> Iterator
     finally:
         if bar is not None:
             bar.stop()
+
+
+@contextmanager
+def working(label: str) -> Iterator[None]:
+    """Show that something of unknown length is going on: a spinner, or a line in a log."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    if console.is_terminal:
+        with console.status(label):
+            yield
+        return
+    # Only what really takes long is announced: a quick failure stays one line.
+    late = Timer(PROGRESS_AFTER_S, remark, args=(f"{label} ...",))
+    late.daemon = True
+    late.start()
+    try:
+        yield
+    finally:
+        late.cancel()
 
 
 def print_metrics(title: str, metrics: Metrics, baseline: Metrics | None = None) -> None:
@@ -209,14 +230,3 @@ def plain(value: float) -> str:
 def not_built_yet(what: str) -> RelposError:
     """Return the error for an option or command whose machinery is still to come."""
     return RelposError(f"{what} is not built yet")
-
-
-def provided(module: str, name: str, wanted_by: str) -> Any:
-    """Return a function of a part that is imported only when it is wanted."""
-    try:
-        return getattr(importlib.import_module(module), name)
-    except (ModuleNotFoundError, AttributeError) as error:
-        missing = getattr(error, "name", None) or ""
-        if missing != name and not module.startswith(missing or "?"):
-            raise
-        raise not_built_yet(f"{wanted_by} ({module}.{name})") from None
