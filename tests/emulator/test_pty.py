@@ -8,10 +8,10 @@ import time
 import pytest
 import serial
 
-from relpos.emulator.pty import VIRTUAL_TIME, PseudoTerminal
-from relpos.emulator.xbee import Parser, Receive16, UnknownFrame, encode
+from relpos.emulator.pty import PseudoTerminal
 from relpos.errors import DeviceError
 from relpos.link.live import Link, observe
+from relpos.link.xbee import VIRTUAL_TIME, Parser, Receive16, UnknownFrame, encode
 from relpos.protocol import messages as wire
 
 
@@ -201,6 +201,17 @@ def test_the_link_reads_motion_at_virtual_times_through_the_port():
     assert len(motions) == 1000
     assert sum(m.dx_m for m in motions) == pytest.approx(20.0)
     assert motions[-1].time_s == pytest.approx(10.0, abs=0.001)
+
+
+def test_the_link_lives_in_the_marked_time_whatever_its_own_clock_says():
+    values = dict.fromkeys(wire.MOTION.field, 0) | {"state": wire.MotionState.MOVING}
+    link = Link()
+    motions = []
+    for k in range(1, 100):
+        frame = wire.encode(wire.MOTION, 5, 0, k, values | {"time_s": float(k)})
+        data = encode(UnknownFrame(VIRTUAL_TIME, (k * 1_000_000 + 2_000).to_bytes(8, "big")))
+        motions += link.feed(data + encode(Receive16(5, -40, frame)), arrival_s=0.05 * k)
+    assert [m.time_s for m in motions] == pytest.approx([k + 0.002 for k in range(1, 100)])
 
 
 def test_a_team_that_fails_tells_the_reader_why():

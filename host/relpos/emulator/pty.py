@@ -27,12 +27,10 @@ import serial
 
 from relpos.errors import DeviceError
 from relpos.link.live import BAUD, READ_TIMEOUT_S
-from relpos.link.xbee import UnknownFrame, encode
+from relpos.link.xbee import VIRTUAL_TIME, UnknownFrame, encode
 
 from .team import STEP_US, EmulatedTeam
 
-VIRTUAL_TIME = 0xF0
-"""Type of the frame that tells the virtual time; Digi's 802.15.4 modules have none from 0xA4 on."""
 SETTLE_S = 0.1
 """From an open to the first byte: the reader configures and empties its port meanwhile."""
 DRAIN_S = 2.0

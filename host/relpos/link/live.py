@@ -30,15 +30,23 @@ class Link:
         self._escaped = escaped
         self._sequence = 0
         self._token = 0
+        self._virtual_s: float | None = None
 
     def feed(self, data: bytes, arrival_s: float) -> list[Observation]:
-        """Observations completed by ``data``, whose last byte arrived at ``arrival_s``."""
+        """Observations completed by ``data``, whose last byte arrived at ``arrival_s``.
+
+        An emulated team's own frames of virtual time overrule ``arrival_s`` from then on.
+        """
         observations: list[Observation] = []
         for frame in self.parser.feed(data):
+            if self._virtual_s is not None:
+                arrival_s = self._virtual_s
             if isinstance(frame, xbee.Receive16 | xbee.Receive64):
                 observations += self.decoder.feed(frame.data, arrival_s, frame.rssi_dbm)
             elif isinstance(frame, xbee.ReceivePacket):
                 observations += self.decoder.feed(frame.data, arrival_s)
+            elif isinstance(frame, xbee.UnknownFrame) and frame.type == xbee.VIRTUAL_TIME:
+                self._virtual_s = int.from_bytes(frame.data, "big") * 1e-6
             else:
                 self.decoder.counts[type(frame).__name__] += 1
         return observations

@@ -18,6 +18,9 @@ ESCAPE_XOR = 0x20
 MOST_FRAME_DATA = 128
 """Longest frame data that any module we speak to sends: 116 bytes of RF data and 12 of header."""
 BROADCAST_16 = 0xFFFF
+VIRTUAL_TIME = 0xF0
+"""Frame by which an emulated team that does not run in real time tells the time of what follows:
+8 bytes, microseconds. Digi's 802.15.4 modules have no frame of this type."""
 
 
 @dataclass(frozen=True, slots=True)
