@@ -273,7 +273,10 @@ class _Start:
     weights: Floats
     heading_known: bool
     drawn: bool = False
+    small_epochs: int = 0
     settled_epochs: int = 0
+    placed: bool = False
+    """Its position is known, if not its heading: others may refer to it."""
 
 
 @dataclass(slots=True)
@@ -455,23 +458,32 @@ class ParticleFilter:
                 known.news_s = max(known.news_s, step.time_s)
         if not self._nodes:
             self._found_frame(step.ranges)
-        means = weighted_means(self._poses, self._weights)
-        self._range_starts(step.ranges, means)
+        column, means = self._references()
+        self._range_starts(step.ranges, column, means)
         looks, seen, height, measured_m = [], [], [], []
         for measured in step.ranges:
-            a, b = self._row.get(measured.node), self._row.get(measured.peer)
-            if a is None or b is None or max(a, b) >= means.shape[1]:
-                continue
             dz = self._known[measured.node].height_m - self._known[measured.peer].height_m
-            looks += [a, b]
-            seen += [b, a]
-            height += [dz, dz]
-            measured_m += [measured.range_m, measured.range_m]
-            self._ranges_used += 1
+            for node, peer in ((measured.node, measured.peer), (measured.peer, measured.node)):
+                if node in self._row and peer in column:
+                    looks.append(self._row[node])
+                    seen.append(column[peer])
+                    height.append(dz)
+                    measured_m.append(measured.range_m)
+        self._ranges_used += len(looks)
         if looks:
             self._correct(
                 Sight.of(np.array(looks), means[:, seen], np.array(height), np.array(measured_m))
             )
+
+    def _references(self) -> tuple[dict[int, int], Floats]:
+        """Positions that ranges may refer to: node -> column of the means (2, C)."""
+        column = dict(self._row)
+        means = [weighted_means(self._poses, self._weights)]
+        for node, start in self._starts.items():
+            if start.placed:
+                column[node] = len(column)
+                means.append(weighted_means(start.poses, start.weights))
+        return column, np.concatenate(means, axis=1)
 
     def _correct(self, sight: Sight) -> None:
         s = self.settings
@@ -503,19 +515,21 @@ class ParticleFilter:
         pose = self._starts.pop(node).poses[:, 0, :1]
         self._add_row(node, np.repeat(pose, self.settings.particles, axis=1))
 
-    def _range_starts(self, ranges: Sequence[Range], means: Floats) -> None:
+    def _range_starts(
+        self, ranges: Sequence[Range], column: Mapping[int, int], means: Floats
+    ) -> None:
         """Weigh the clouds of unlocated nodes by their ranges to located ones."""
         edges: dict[int, list[tuple[int, Range]]] = {}
         for measured in ranges:
             for node, peer in ((measured.node, measured.peer), (measured.peer, measured.node)):
-                if node in self._starts and peer in self._row:
+                if node in self._starts and peer in column:
                     edges.setdefault(node, []).append((peer, measured))
-            if measured.node in self._starts and measured.peer in self._starts:
+            if measured.node not in column and measured.peer not in column:
                 self._own["ranges_between_unlocated"] += 1
         for node, seen in edges.items():
             self._ranges_used += len(seen)
             start = self._starts[node]
-            at = means[:, [self._row[peer] for peer, _ in seen]]
+            at = means[:, [column[peer] for peer, _ in seen]]
             measured_m = np.array([measured.range_m for _, measured in seen])
             height = np.array(
                 [self._known[node].height_m - self._known[peer].height_m for peer, _ in seen]
@@ -554,14 +568,20 @@ class ParticleFilter:
             self._own["starts_resampled"] += 1
 
     def _settle(self, node: int, start: _Start) -> None:
-        """Let a node join the located ones once its cloud has been small for long enough."""
+        """Let a node join the located ones once its cloud has been small for long enough.
+
+        One that stands still shows its position but not its heading: it stays a cloud, so that
+        its heading is found when it moves, and others may refer to it meanwhile.
+        """
         s = self.settings
         if not start.drawn:
             return
         _, covariance, _, sigma_heading = _moments(start.poses[:, 0], start.weights[0])
         spread = math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
-        small = spread < s.resolved_m and sigma_heading < s.resolved_rad
-        start.settled_epochs = start.settled_epochs + 1 if small else 0
+        start.small_epochs = start.small_epochs + 1 if spread < s.resolved_m else 0
+        settled = spread < s.resolved_m and sigma_heading < s.resolved_rad
+        start.settled_epochs = start.settled_epochs + 1 if settled else 0
+        start.placed = start.small_epochs >= s.resolved_epochs
         if start.settled_epochs >= s.resolved_epochs:
             index = systematic(start.weights, s.particles, self._rng)[0]
             del self._starts[node]
@@ -609,7 +629,7 @@ class ParticleFilter:
             return NodeStatus.LOST
         if silent >= STALE_EPOCHS:
             return NodeStatus.STALE
-        return NodeStatus.OK if start is None else NodeStatus.AMBIGUOUS
+        return NodeStatus.OK if start is None or start.placed else NodeStatus.AMBIGUOUS
 
 
 _NOISELESS = MotionNoise(0.0, 0.0)

@@ -1,0 +1,105 @@
+"""The particle filter on the real recordings, against dead reckoning from the true start.
+
+    python bench/recordings.py [--seeds 4] [--set KEY=VALUE ...] [--after 0]
+
+For every run of two_robots_vio and four_robots_uwb: distance, aligned and body-frame RMSE (m,
+mean over seeds) from known and from unknown starts, and when unknown starts were resolved.
+``--after`` leaves the first seconds out of the score.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
+from itertools import repeat
+from pathlib import Path
+
+import numpy as np
+
+from relpos import fusion
+from relpos.evaluation import metrics, tracks
+from relpos.fusion import NodeStatus
+from relpos.runs import InitialPose, load_run
+
+DATA = Path(
+    os.environ.get("RELPOS_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data"
+)
+RUNS = (
+    "two_robots_vio/exp1_los",
+    "two_robots_vio/exp3_los",
+    "two_robots_vio/exp4_los",
+    "two_robots_vio/exp1_unobservable",
+    "four_robots_uwb/run1",
+)
+
+
+def score(
+    name: str,
+    estimator: str,
+    initial: InitialPose,
+    settings: Mapping[str, str],
+    seed: int,
+    after_s: float,
+) -> tuple[float, float, float, float, float]:
+    """Give distance, aligned, body-frame RMSE (m), distance NEES and the resolving time (s)."""
+    run = load_run(DATA / name)
+    made = fusion.make(estimator, run.priors_for(initial), settings, seed)
+    estimates = [e for m in run.measurements for e in made.process(m)] + made.finish()
+    vague = [
+        e.time_s
+        for e in estimates
+        if any(n.status in (NodeStatus.AMBIGUOUS, NodeStatus.UNLOCATED) for n in e.nodes)
+    ]
+    kept = [e for e in estimates if e.time_s >= after_s]
+    m = metrics.evaluate(
+        tracks.estimated_tracks(kept), tracks.true_tracks(run.truth), tracks.estimated_pairs(kept)
+    )
+    figures = (
+        m.relative_distance_rmse_m, m.relative_position_rmse_m, m.body_frame_rmse_m, m.nees_distance
+    )  # fmt: skip
+    a, b, c, d = (np.nan if x is None else x for x in figures)
+    return a, b, c, d, max(vague, default=0.0)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--after", type=float, default=0.0)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--only", default="", help="known or unknown starts alone")
+    given = parser.parse_args()
+    settings = dict(item.split("=", 1) for item in given.set)
+    cases = (
+        ("dead reckoning", "deadreckoning", InitialPose.FROM_TRUTH, {}, 1),
+        ("known start", "particle", InitialPose.FROM_TRUTH, settings, given.seeds),
+        ("unknown start", "particle", InitialPose.UNKNOWN, settings, given.seeds),
+    )
+    print(f"{'':34}{'':15}{'dist':>6}{'align':>7}{'body':>7}{'NEES':>7}  resolved at s")
+    with ProcessPoolExecutor(given.workers) as pool:
+        for name in RUNS:
+            for label, estimator, initial, chosen, seeds in cases:
+                if given.only and given.only not in label.split():
+                    continue
+                results = np.array(
+                    list(
+                        pool.map(
+                            score, repeat(name), repeat(estimator), repeat(initial),
+                            repeat(chosen), range(seeds), repeat(given.after),
+                        )
+                    )
+                )  # fmt: skip
+                mean = results.mean(axis=0)
+                when = " ".join(f"{t:.0f}" for t in sorted(results[:, 4])) if "un" in label else ""
+                print(
+                    f"{name:34}{label:15}{mean[0]:6.2f}{mean[1]:7.2f}{mean[2]:7.2f}{mean[3]:7.2f}"
+                    f"  {when}",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()
