@@ -6,10 +6,12 @@ import gzip
 import json
 import os
 import pty
+import signal
 import subprocess
 import sys
 import threading
 import time
+import tty
 from pathlib import Path
 
 import pytest
@@ -17,7 +19,9 @@ from typer.testing import CliRunner, Result
 
 from relpos.cli import main, output
 from relpos.evaluation.summary import FIGURES
+from relpos.link import xbee
 from relpos.measurements import Motion, Step
+from relpos.protocol import messages as wire
 from relpos.runs import load_run, read_estimates
 
 MOTION_HEADER = "time_s,node,dx_m,dy_m,dtheta_rad\n"
@@ -299,6 +303,58 @@ def test_a_port_that_vanishes_keeps_what_was_received(tmp_path: Path) -> None:
     assert "Traceback" not in result.stderr
     assert (tmp_path / "received" / "run.toml").exists()
     assert (tmp_path / "estimate.csv").exists()
+
+
+def motion_bytes(node: int, second: int) -> bytes:
+    """What a coordinator hands over when ``node`` reports half a metre a second."""
+    values = dict.fromkeys(wire.MOTION.field, 0) | {"time_s": float(second), "x_m": 0.5 * second}
+    frame = wire.encode(wire.MOTION, node, 0, second, values)
+    return xbee.encode(xbee.Receive16(node, -50, frame), escaped=True)
+
+
+def ranges_bytes(node: int, second: int, peer: int, range_m: float) -> bytes:
+    entry = {"peer": peer, "range_m": range_m, "rss_dbm": -80, "age_s": 0.0, "quality": 0}
+    frame = wire.encode(
+        wire.RANGES, node, 0, 1000 + second, {"time_s": float(second), "ranges": [entry]}
+    )
+    return xbee.encode(xbee.Receive16(node, -50, frame), escaped=True)
+
+
+def test_an_interrupt_ends_listening_and_keeps_what_was_received(tmp_path: Path) -> None:
+    ours, theirs = pty.openpty()
+    tty.setraw(theirs)
+    listening = subprocess.Popen(
+        [
+            sys.executable, "-m", "relpos.cli.main", "fuse", os.ttyname(theirs),
+            "--initial", "common", "--out", str(tmp_path),
+        ],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert listening.stderr is not None
+        assert "listening" in listening.stderr.readline()
+        for second in range(1, 13):
+            for node in (1, 2):
+                os.write(ours, motion_bytes(node, second))
+            os.write(ours, ranges_bytes(1, second, 2, 1.5))
+            # Ten times the real pace: what counts is that it is read as it comes.
+            time.sleep(0.1)
+        time.sleep(0.5)
+        listening.send_signal(signal.SIGINT)
+        stdout, stderr = listening.communicate(timeout=20)
+    finally:
+        listening.kill()
+        os.close(ours)
+        os.close(theirs)
+    assert listening.returncode == 0, stderr
+    assert "Traceback" not in stderr
+    assert "frames 36" in stderr
+    assert "1 - 2" in stdout
+    received = load_run(tmp_path / "received")
+    # The first report of a node only says where its totals stand.
+    assert len(received.motions) >= 22
+    assert len(received.ranges) == 12
+    assert read_estimates(tmp_path)
 
 
 def test_settings_are_split_at_their_first_equals_sign() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -297,13 +296,12 @@ def _fuse_port(job: Job, initial: Initial | None, seconds: float | None, *, as_j
     if not as_json:
         output.remark(f"listening to {job.source}; Ctrl-C ends")
     stream = iter(output.with_progress(port, None, "received"))
-    first: list[Observation] = []
     priors: list[Prior] = []
     if initial is Initial.COMMON:
-        first, nodes = _who_is_there(stream)
+        stream, nodes = _who_is_there(stream)
         priors = [Prior(node, 0.0, 0.0, 0.0) for node in nodes]
     estimator = job.make(priors)
-    outcome = _pass_through(estimator, chain(first, stream), keep=True)
+    outcome = _pass_through(estimator, stream, keep=True)
     steps = [o for o in outcome.received if isinstance(o, Step)]
     received = Run(
         name=_base_name(job.source),
@@ -327,21 +325,36 @@ def _fuse_port(job: Job, initial: Initial | None, seconds: float | None, *, as_j
     _tell(job, received.name, counters, outcome.estimates, None, as_json=as_json)
 
 
-def _who_is_there(stream: Iterator[Observation]) -> tuple[list[Observation], list[int]]:
-    """Listen until every node that is on has had time to report; return what came and who."""
+def _who_is_there(stream: Iterator[Observation]) -> tuple[Iterator[Observation], list[int]]:
+    """Listen until every node that is on has had time to report.
+
+    Returns the whole stream again, from its beginning, and the nodes. Where it breaks off
+    already here, it breaks off in the same way when it is read again.
+    """
     from relpos.measurements import Motion, Range
 
     came: list[Observation] = []
     nodes: set[int] = set()
-    for observation in stream:
-        came.append(observation)
-        if isinstance(observation, Motion | Range):
-            nodes.add(observation.node)
-        if isinstance(observation, Range):
-            nodes.add(observation.peer)
-        if observation.time_s - came[0].time_s > GATHER_S:
-            break
-    return came, sorted(nodes)
+    broke: BaseException | None = None
+    try:
+        for observation in stream:
+            came.append(observation)
+            if isinstance(observation, Motion | Range):
+                nodes.add(observation.node)
+            if isinstance(observation, Range):
+                nodes.add(observation.peer)
+            if observation.time_s - came[0].time_s > GATHER_S:
+                break
+    except (KeyboardInterrupt, RelposError) as error:
+        broke = error
+
+    def again() -> Iterator[Observation]:
+        yield from came
+        if broke is not None:
+            raise broke
+        yield from stream
+
+    return again(), sorted(nodes)
 
 
 def _tell(
