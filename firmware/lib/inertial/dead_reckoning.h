@@ -9,79 +9,126 @@
 
 #include <stdint.h>
 
+#include "attitude.h"
+#include "displacement.h"
+#include "filter.h"
+#include "gait.h"
+
 namespace relpos {
 
 // One reading of accelerometer and gyroscope, in the sensor's own axes. At rest the accelerometer
 // shows +g upwards (specific force).
 struct ImuSample {
-  float acceleration_m_s2[3];
-  float angular_rate_rad_s[3];
+  float acceleration_m_s2[kAxes];
+  float angular_rate_rad_s[kAxes];
 };
 
 // What is known of the wearer and of the sensor. The defaults are used until configure().
 struct InertialConfig {
-  float leg_length_m = 0.93f;           // 0.53 of the stature (Zijlstra and Hof 1997); here of 1.75 m
-  float step_gain = 1.25f;              // k of s = k 2 sqrt(2 l h - h^2), waist-worn literature value
-  float scale_sigma = 0.07f;            // relative, correlated: 0.05 to 0.09 uncalibrated, 0.03 calibrated
-  float scale_correlation_m = 10.0f;    // path over which the scale error is charged as one and the same
-  float acceleration_limit_m_s2 = 39.0f;  // a component beyond it is saturated: just under 4 g
-  float angular_rate_limit_rad_s = 8.7f;  // just under 500 deg/s
-};
-
-// Bits of Displacement::quality_flags.
-enum QualityFlag : uint16_t {
-  kAccelerationSaturated = 1u << 0,  // within the last two seconds
-  kAngularRateSaturated = 1u << 1,   // within the last two seconds
-  kMagneticDisturbed = 1u << 2,      // the last magnetometer reading was rejected
-  kForwardUnknown = 1u << 3,         // forward axis not found yet: steps go along the heading axis
-  kBiasUncertain = 1u << 4,          // started while moving and gyro bias not observed well since
-  kStanding = 1u << 5,               // accelerometer and gyroscope quiet
-  kBadInput = 1u << 6,               // a sample or dt was refused within the last two seconds
-  kCovarianceRepaired = 1u << 7,     // a variance had to be lifted to stay positive, since the reset
-  kStepRejected = 1u << 8,           // a step's displacement contradicted the model, last two seconds
-  kStarting = 1u << 9,               // still gathering the first attitude
-};
-
-// Running totals since the reset, in the wearer's heading frame at the reset: x forward, y left.
-// The along/across variances and the heading variance only grow: the difference of two readings is
-// the variance of the motion between them, so that a receiver that loses reports loses nothing.
-struct Displacement {
-  float x_m, y_m, heading_rad;  // heading is continuous in (-pi, pi]
-  float variance_along_m2, variance_across_m2, variance_heading_rad2;
-  float path_m;
-  uint16_t steps;               // wraps
-  uint32_t last_step_tick;      // update() calls since the reset at the last mid-stance
-  float last_step_length_m;
-  float magnetic_heading_rad;   // raw: azimuth of the heading axis against magnetic north
-  bool magnetic_heading_valid;  // reading was plausible (norm and vertical part)
-  bool moving;
-  bool initialised;
-  uint16_t quality_flags;
+  float leg_length_m = 0.93f;  // 0.53 of the stature (Zijlstra and Hof 1997); here of 1.75 m
+  float step_gain = 1.25f;     // k of s = k 2 sqrt(2 l h - h^2), waist-worn literature value
+  float scale_sigma = 0.07f;   // relative, correlated: 0.05 to 0.09 uncalibrated, 0.03 calibrated
+  float scale_correlation_m = 10.0f;  // path over which the scale error is charged as one
+  float acceleration_limit_m_s2 = 39.0f;   // a component beyond it is saturated: just under 4 g
+  float angular_rate_limit_rad_s = 8.7f;   // just under 500 deg/s
 };
 
 // What was refused, limited or repaired since the reset. Each count stops at its maximum.
 struct InertialCounters {
-  uint16_t refused_samples;       // not finite, or dt outside (0, 0.2] s
+  uint16_t refused_samples;     // not finite, or dt outside (0, 0.2] s
   uint16_t saturated_samples;
-  uint16_t rejected_steps;        // candidates that were no step, or that contradicted the filter
+  uint16_t rejected_steps;      // arcs while walking that were no step
+  uint16_t doubtful_steps;      // steps whose length contradicted the inertial motion
   uint16_t rejected_magnetic;
-  uint16_t covariance_repairs;
 };
 
 class DeadReckoning {
  public:
   DeadReckoning();
-  void configure(const InertialConfig& config);  // takes effect from the next step; keeps the totals
+  void configure(const InertialConfig& config);  // from the next step on; keeps the totals
   void reset();
   void update(const ImuSample& sample, float dt_s);  // at 50 Hz; dt nominally 0.02 s
-  void magnetometer(const float field_ut[3]);        // in the accelerometer's axes, about 5 Hz
+  void magnetometer(const float field_ut[kAxes]);    // in the accelerometer's axes, about 5 Hz
   const Displacement& displacement() const { return displacement_; }
   const InertialCounters& counters() const { return counters_; }
 
+  // For tests and tools.
+  const ErrorFilter& filter() const { return filter_; }
+  const float* gyro_bias_rad_s() const { return bias_rad_s_; }
+  const ForwardFinder& forward() const { return forward_; }
+
  private:
+  // Heavy work waits here and is done one piece a tick, so that no tick is long.
+  enum Job : uint8_t {
+    kIdle,
+    kFlush,  // bring the covariance to the mid-stance
+    kForward,
+    kLateral,
+    kVertical,
+    kDrift,
+    kCommit,
+    kStillX,
+    kStillY,
+    kStillZ,
+    kStillCommit
+  };
+
+  bool refuse(const ImuSample& sample, float dt_s);
+  void watch_limits(const ImuSample& sample);
+  void watch_quiet(const ImuSample& sample, float dt_s);
+  void gather(const ImuSample& sample, float dt_s);
+  void initialise(bool still);
+  void on_stance(const Stance& stance);
+  void work(const float rotation[kAxes * kAxes]);
+  void run_job(const float rotation[kAxes * kAxes]);
+  void capture_span();
+  void predict_attitude(const float rotation[kAxes * kAxes]);
+  void measure(State group, const float direction[kAxes], float innovation, float variance);
+  void commit_step();
+  void commit_still();
+  void apply_magnetic();
+  void to_wearer(const float navigation[kAxes], float* x_m, float* y_m) const;
+  void publish();
+
   InertialConfig config_;
   Displacement displacement_;
   InertialCounters counters_;
+  Totals totals_;
+  ErrorFilter filter_;
+  GaitDetector gait_;
+  ForwardFinder forward_;
+
+  // Nominal state. While gathering, velocity_ and position_ hold the sums of force and rate.
+  Attitude attitude_;
+  float bias_rad_s_[kAxes];
+  float velocity_m_s_[kAxes];
+  float position_m_[kAxes];         // since the last mid-stance
+  float stance_position_m_[kAxes];  // of the step whose updates are under way
+  float gravity_m_s2_;
+  float heading_axis_[kAxes];  // body vector that was along x at the start
+
+  float impulse_m_s_[kAxes], elapsed_s_;    // since the covariance's time
+  float span_impulse_m_s_[kAxes], span_s_;  // being predicted
+
+  // The step under way and the one whose updates are under way.
+  float heading_sum_rad_;
+  float stance_heading_rad_[2];  // at the last mid-stance and the one before
+  float stance_interval_s_;      // between those two
+  float step_length_m_, step_sigma_m_, step_speed_m_s_;
+  float step_cosine_, step_sine_;  // mean heading over the step
+  float step_rate_rad_s_;          // yaw rate over two steps; NaN-free: see step_straight_
+
+  float magnetic_reference_ut_[kAxes];
+  float magnetic_residual_rad_;
+  float quiet_s_, mean_force_m_s2_;
+
+  uint32_t ticks_;
+  uint16_t step_ticks_;
+  uint8_t stances_;  // in this walk, saturating
+  uint8_t magnetic_count_;
+  uint8_t hold_acceleration_, hold_rate_, hold_input_, hold_doubt_;  // ticks a flag stays up
+  Job job_;
+  bool motion_pending_, magnetic_pending_, step_directed_, step_straight_, velocity_known_;
 };
 
 }  // namespace relpos

@@ -1,0 +1,114 @@
+#include "devices/ak8975.h"
+
+namespace relpos {
+namespace {
+
+enum Register : uint8_t {
+  kWhoAmI = 0x00,
+  kStatus1 = 0x02,  // then the field and ST2
+  kControl = 0x0A,
+  kAdjustment = 0x10
+};
+enum Mode : uint8_t { kPowerDownMode = 0x00, kSingleMode = 0x01, kFuseRomMode = 0x0F };
+
+constexpr uint8_t kIdentity = 0x48;
+constexpr uint8_t kDataReady = 0x01;     // ST1
+constexpr uint8_t kDataError = 0x04;     // ST2
+constexpr uint8_t kOverflow = 0x08;      // ST2
+constexpr uint8_t kPeriodTicks = 10;     // 5 Hz
+constexpr uint8_t kAbsentTicks = 50;     // between attempts to reach a chip that does not answer
+constexpr uint8_t kMostFailures = 3;     // in a row, then set up anew
+constexpr float kUnit = 0.3f / 256.0f;   // 0.3 uT a count, adjusted by (ASA + 128) / 256
+
+int16_t little_endian(const uint8_t* bytes) {
+  return static_cast<int16_t>(static_cast<uint16_t>(static_cast<uint16_t>(bytes[1]) << 8) |
+                              bytes[0]);
+}
+
+}  // namespace
+
+void Ak8975::fail() {
+  if (state_ >= State::kIdle && ++failures_ < kMostFailures) {
+    state_ = State::kIdle;
+    wait_ticks_ = kPeriodTicks - 1;
+    return;
+  }
+  state_ = State::kIdentify;
+  wait_ticks_ = kAbsentTicks;
+}
+
+bool Ak8975::step(Board& board, float field_ut[3]) {
+  if (wait_ticks_ > 0) {
+    --wait_ticks_;
+    return false;
+  }
+  switch (state_) {
+    case State::kIdentify: {
+      uint8_t identity = 0;
+      if (!board.read_registers(kAddress, kWhoAmI, &identity, 1) || identity != kIdentity) {
+        fail();
+        return false;
+      }
+      state_ = State::kPowerDown;
+      return false;
+    }
+    case State::kPowerDown:
+    case State::kFuseMode:
+    case State::kLeaveFuse: {
+      // From mode to mode only through power-down, with at least 100 us between: a tick.
+      const uint8_t mode = state_ == State::kFuseMode ? kFuseRomMode : kPowerDownMode;
+      if (!board.write_register(kAddress, kControl, mode)) {
+        fail();
+        return false;
+      }
+      failures_ = 0;
+      state_ = static_cast<State>(static_cast<uint8_t>(state_) + 1);
+      return false;
+    }
+    case State::kFuseRead:
+      if (!board.read_registers(kAddress, kAdjustment, adjustment_, 3)) {
+        fail();
+        return false;
+      }
+      state_ = State::kLeaveFuse;
+      return false;
+    case State::kIdle:
+      if (!board.write_register(kAddress, kControl, kSingleMode)) {
+        fail();
+        return false;
+      }
+      state_ = State::kFetch;
+      return false;
+    case State::kFetch:
+      break;
+  }
+  uint8_t raw[8];  // ST1, X, Y, Z, ST2
+  if (!board.read_registers(kAddress, kStatus1, raw, sizeof raw)) {
+    fail();
+    return false;
+  }
+  if ((raw[0] & kDataReady) == 0) {
+    ++rejected_;
+    fail();
+    return false;
+  }
+  state_ = State::kIdle;
+  wait_ticks_ = kPeriodTicks - 2;
+  failures_ = 0;
+  if ((raw[7] & (kDataError | kOverflow)) != 0) {
+    ++rejected_;
+    return false;
+  }
+  float own[3];
+  for (uint8_t axis = 0; axis < 3; ++axis) {
+    own[axis] = static_cast<float>(little_endian(raw + 1 + 2 * axis)) *
+                static_cast<float>(adjustment_[axis] + 128) * kUnit;
+  }
+  // The die lies turned in the package: its x is the accelerometer's y, its y the x, its z is -z.
+  field_ut[0] = own[1];
+  field_ut[1] = own[0];
+  field_ut[2] = -own[2];
+  return true;
+}
+
+}  // namespace relpos

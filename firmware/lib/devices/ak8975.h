@@ -1,0 +1,34 @@
+// AsahiKasei AK8975: the magnetometer inside the MPU-9150, behind its bypass.
+#pragma once
+
+#include <stdint.h>
+
+#include "board/board.h"
+
+namespace relpos {
+
+// Single measurements without waiting: one transaction a call, called once a 50 Hz tick. A
+// measurement (at most 9 ms) is started in one tick and fetched in the next.
+class Ak8975 {
+ public:
+  static constexpr uint8_t kAddress = 0x0C;
+
+  // True where *field_ut holds a new field in the axes of accelerometer and gyroscope.
+  bool step(Board& board, float field_ut[3]);
+  bool running() const { return state_ >= State::kIdle; }
+  void restart() { state_ = State::kIdentify; wait_ticks_ = 0; }
+  uint16_t rejected() const { return rejected_; }  // overflows, data errors, late results; wraps
+
+ private:
+  enum class State : uint8_t { kIdentify, kPowerDown, kFuseMode, kFuseRead, kLeaveFuse, kIdle, kFetch };
+
+  void fail();
+
+  State state_ = State::kIdentify;
+  uint8_t wait_ticks_ = 0;
+  uint8_t failures_ = 0;
+  uint8_t adjustment_[3] = {128, 128, 128};  // ASA; 128: none
+  uint16_t rejected_ = 0;
+};
+
+}  // namespace relpos

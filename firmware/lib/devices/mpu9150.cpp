@@ -1,0 +1,116 @@
+#include "devices/mpu9150.h"
+
+#include "devices/flash.h"
+
+namespace relpos {
+namespace {
+
+enum Register : uint8_t {
+  kSampleRateDivider = 0x19,
+  kConfig = 0x1A,
+  kGyroConfig = 0x1B,
+  kAccelConfig = 0x1C,
+  kIntPinConfig = 0x37,
+  kIntEnable = 0x38,
+  kIntStatus = 0x3A,
+  kAccelXHigh = 0x3B,
+  kUserControl = 0x6A,
+  kPowerManagement1 = 0x6B,
+  kWhoAmI = 0x75
+};
+
+constexpr uint8_t kIdentity = 0x34;       // bits 6:1 of WHO_AM_I; the others are not specified
+constexpr uint8_t kIdentityMask = 0x7E;
+constexpr uint8_t kDataReady = 0x01;
+constexpr uint8_t kBurst = 14;
+
+// DLPF 4 (21 Hz, 8.5 ms): under the 25 Hz that 50 Hz sampling carries, above the harmonics of a
+// walk's vertical motion (2 Hz and multiples). 4 g: heel strikes clip at 2 g. Bypass leads the host
+// to the magnetometer, which needs the MPU's own I2C master off.
+struct Setting {
+  uint8_t reg, value, wait_ms;
+};
+const Setting kSetup[] RELPOS_FLASH = {
+    {kPowerManagement1, 0x80, 100},  // reset
+    {kPowerManagement1, 0x00, 100},  // wake
+    {kPowerManagement1, 0x01, 1},    // clock from the X gyro's PLL
+    {kUserControl, 0x00, 1},
+    {kConfig, 0x04, 1},
+    {kSampleRateDivider, 19, 1},     // 1 kHz / (1 + 19)
+    {kGyroConfig, 0x08, 1},          // 500 deg/s
+    {kAccelConfig, 0x08, 1},         // 4 g
+    {kIntPinConfig, 0x22, 1},        // latched until INT_STATUS is read; bypass
+    {kIntEnable, kDataReady, 1},
+};
+constexpr uint8_t kSetupCount = sizeof kSetup / sizeof kSetup[0];
+
+constexpr uint32_t kRetryUs = 500;          // between looks for a sample that is not there yet
+constexpr uint32_t kAfterSampleUs = 19000;  // the chip's clock is within 2 % [K]: 20 ms - 1 ms
+constexpr uint32_t kAbsentUs = 1000000;     // between attempts to set up a chip that does not answer
+// Without a sample for so long the chip has lost its settings (brown-out: it sleeps).
+constexpr uint32_t kSilentUs = 120000;
+constexpr uint8_t kMostFailures = 5;        // transactions in a row, then set up anew
+
+constexpr float kAccelerationUnit = 9.80665f / 8192.0f;                   // 4 g range
+constexpr float kAngularRateUnit = 3.14159265f / 180.0f * 500.0f / 32768.0f;  // 500 deg/s range
+
+int16_t big_endian(const uint8_t* bytes) {
+  return static_cast<int16_t>(static_cast<uint16_t>(static_cast<uint16_t>(bytes[0]) << 8) |
+                              bytes[1]);
+}
+
+}  // namespace
+
+Mpu9150::Event Mpu9150::step(Board& board, uint32_t now_us, uint32_t* wait_us) {
+  if (position_ < kSetupCount) {
+    *wait_us = kAbsentUs;
+    const uint8_t reg = flash_byte(&kSetup[position_].reg);
+    if (position_ == 0) {
+      uint8_t identity = 0;
+      if (!board.read_registers(kAddress, kWhoAmI, &identity, 1)) return Event::kNothing;
+      if ((identity & kIdentityMask) >> 1 != kIdentity) return Event::kNothing;
+    }
+    if (!board.write_register(kAddress, reg, flash_byte(&kSetup[position_].value))) {
+      restart();
+      return Event::kNothing;
+    }
+    *wait_us = 1000UL * flash_byte(&kSetup[position_].wait_ms);
+    if (++position_ == kSetupCount) {
+      position_ = kRunning;
+      failures_ = 0;
+      last_ready_us_ = now_us;
+    }
+    return Event::kNothing;
+  }
+  *wait_us = kRetryUs;
+  uint8_t status = 0;
+  if (!board.read_registers(kAddress, kIntStatus, &status, 1)) {
+    // A bus that fails is asked again a little later: a stuck one costs a millisecond each time.
+    *wait_us = 10 * kRetryUs;
+    if (++failures_ >= kMostFailures) restart();
+    return Event::kNothing;
+  }
+  if ((status & kDataReady) == 0) {
+    if (now_us - last_ready_us_ > kSilentUs) restart();
+    return Event::kNothing;
+  }
+  last_ready_us_ = now_us;
+  *wait_us = kAfterSampleUs;
+  return Event::kReady;
+}
+
+bool Mpu9150::read(Board& board, Mpu9150Sample* sample) {
+  uint8_t raw[kBurst];
+  if (!board.read_registers(kAddress, kAccelXHigh, raw, kBurst)) {
+    if (++failures_ >= kMostFailures) restart();
+    return false;
+  }
+  failures_ = 0;
+  for (uint8_t axis = 0; axis < 3; ++axis) {
+    sample->acceleration_m_s2[axis] = big_endian(raw + 2 * axis) * kAccelerationUnit;
+    sample->angular_rate_rad_s[axis] = big_endian(raw + 8 + 2 * axis) * kAngularRateUnit;
+  }
+  return true;
+}
+
+}  // namespace relpos

@@ -1,0 +1,39 @@
+// Attitude as a unit quaternion that turns body vectors into the navigation frame (z up).
+#ifndef RELPOS_INERTIAL_ATTITUDE_H
+#define RELPOS_INERTIAL_ATTITUDE_H
+
+#include <stdint.h>
+
+namespace relpos {
+
+enum Axis : uint8_t { kX = 0, kY = 1, kZ = 2, kAxes = 3 };
+
+const float kPi = 3.14159265f;
+
+float wrap_angle(float angle_rad);  // to (-pi, pi]; for angles within a few turns
+
+struct Attitude {
+  float w, x, y, z;
+
+  void set_identity();
+  // The shortest rotation that brings the body vector `up` (any length > 0) to the vertical.
+  void level(const float up[kAxes]);
+  // Turn by rate * dt, measured in the body frame.
+  void integrate(const float angle_body_rad[kAxes]);
+  // Turn by a small angle given in the navigation frame (a filter correction).
+  void correct(const float angle_navigation_rad[kAxes]);
+  // Rotation matrix body to navigation, row by row.
+  void matrix(float rotation[kAxes * kAxes]) const;
+  // this := first * this, i.e. apply `first` after what is already there.
+  void premultiply(const Attitude& first);
+
+ private:
+  void normalise();
+};
+
+// out = rotation * in, and with the transposed matrix.
+void rotate(const float rotation[kAxes * kAxes], const float in[kAxes], float out[kAxes]);
+
+}  // namespace relpos
+
+#endif

@@ -1,0 +1,63 @@
+// Running totals of a walk: where the node is relative to its reset, how far it came and how
+// uncertain that is.
+#ifndef RELPOS_INERTIAL_DISPLACEMENT_H
+#define RELPOS_INERTIAL_DISPLACEMENT_H
+
+#include <stdint.h>
+
+namespace relpos {
+
+// Bits of Displacement::quality_flags.
+enum QualityFlag : uint16_t {
+  kAccelerationSaturated = 1u << 0,  // within the last two seconds
+  kAngularRateSaturated = 1u << 1,   // within the last two seconds
+  kMagneticDisturbed = 1u << 2,      // the last magnetometer reading was rejected
+  kForwardUnknown = 1u << 3,         // forward axis not found yet: steps go along the heading axis
+  kBiasUncertain = 1u << 4,          // vertical gyroscope bias not known to 0.3 deg/s
+  kStanding = 1u << 5,               // accelerometer and gyroscope quiet
+  kBadInput = 1u << 6,               // a sample or dt was refused within the last two seconds
+  kCovarianceRepaired = 1u << 7,     // a variance had to be lifted to stay positive, since the reset
+  kStepDoubtful = 1u << 8,           // a step contradicted the inertial motion, last two seconds
+  kStarting = 1u << 9                // still gathering the first attitude
+};
+
+// Running totals since the reset, in the wearer's heading frame at the reset: x forward, y left.
+// The three variances only grow: the difference of two readings is the variance of the motion
+// between them, so that a receiver that loses reports loses nothing.
+struct Displacement {
+  float x_m, y_m, heading_rad;  // heading in (-pi, pi]
+  float variance_along_m2, variance_across_m2, variance_heading_rad2;
+  float path_m;                 // sum of the step lengths
+  uint16_t steps;               // wraps
+  uint32_t last_step_tick;      // update() calls since the reset at the last mid-stance
+  float last_step_length_m;
+  float magnetic_heading_rad;   // raw: the heading axis against magnetic north, counter-clockwise
+  bool magnetic_heading_valid;  // the reading was plausible (norm and vertical part)
+  bool moving;
+  bool initialised;
+  uint16_t quality_flags;
+};
+
+// Totals in units of 2^-16 m: 15 um wherever the walk has led, 32 km before the sign turns over.
+class Totals {
+ public:
+  void reset();
+  void add(float x_m, float y_m);
+  void add_path(float length_m);
+  float x_m() const;
+  float y_m() const;
+  float path_m() const;
+
+ private:
+  int32_t x_, y_;
+  uint32_t path_;
+};
+
+// Growth of the along-track variance over one step from a scale error that stays the same over
+// `correlation_m` of path and wanders beyond (first-order Gauss-Markov over the path walked):
+// the total's variance is (sigma D)^2 for D well under the correlation, 2 sigma^2 L D well over it.
+float scale_variance_growth_m2(float path_m, float length_m, float sigma, float correlation_m);
+
+}  // namespace relpos
+
+#endif

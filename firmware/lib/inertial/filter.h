@@ -1,0 +1,64 @@
+// Covariance of the error-state Kalman filter: twelve states, packed, predicted in two stages.
+//
+//   attitude' = attitude - R dt bias            (error as a rotation in the navigation frame)
+//   velocity' = velocity - [F x] attitude       (F = integral of the specific force, navigation)
+//   position' = position + dt velocity
+//
+// The stages may run in different ticks: predict_attitude, then predict_motion over the same span.
+#ifndef RELPOS_INERTIAL_FILTER_H
+#define RELPOS_INERTIAL_FILTER_H
+
+#include <stdint.h>
+
+#include "attitude.h"
+
+namespace relpos {
+
+enum State : uint8_t {
+  kAttitude = 0,   // three each: x, y, z
+  kBias = 3,
+  kVelocity = 6,
+  kPosition = 9,   // since the last mid-stance
+  kStates = 12
+};
+
+class ErrorFilter {
+ public:
+  static const uint8_t kPacked = kStates * (kStates + 1) / 2;
+
+  // Diagonal start; standard deviations, one a group of three.
+  void reset(float tilt_rad, float heading_rad, float bias_rad_s, float velocity_m_s);
+  void predict_attitude(const float rotation[kAxes * kAxes], float dt_s);
+  void predict_motion(const float impulse_m_s[kAxes], float dt_s);
+  // Scalar measurement z = direction . x[group .. group+2] with the innovation and variance given;
+  // correction[kStates] is what to add to the nominal state. Returns the innovation variance.
+  float update(State group, const float direction[kAxes], float innovation, float variance,
+               float correction[kStates]);
+  // A group becomes known exactly (position at a step's end) or anew with the given sigma.
+  void restart(State group, float sigma);
+
+  float covariance(uint8_t i, uint8_t j) const { return p_[index(i, j)]; }
+  void set_covariance(uint8_t i, uint8_t j, float value) { p_[index(i, j)] = value; }
+  float along(State group, float x, float y) const;  // variance along a horizontal unit vector
+  uint16_t repairs() const { return repairs_; }      // variances that had to be lifted
+
+ private:
+  static uint8_t index(uint8_t i, uint8_t j) {
+    if (i > j) {
+      const uint8_t swap = i;
+      i = j;
+      j = swap;
+    }
+    return static_cast<uint8_t>(static_cast<uint8_t>(i * (2 * kStates - 1 - i)) / 2 + j);
+  }
+  void move_position(float dt_s);
+  // x_to += M x_from for two groups, M 3x3; the workhorse of the structured prediction.
+  void couple(State to, State from, const float matrix[kAxes * kAxes]);
+
+  float p_[kPacked];
+  uint16_t repairs_;
+};
+
+}  // namespace relpos
+
+#endif

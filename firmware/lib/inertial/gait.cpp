@@ -1,0 +1,122 @@
+#include "gait.h"
+
+#include <math.h>
+
+#include "attitude.h"
+
+namespace relpos {
+namespace {
+
+const float kMeanTime_s = 1.5f;   // mean of the vertical acceleration: two to three steps
+const float kLeakTime_s = 0.7f;   // of both integrals: passes 0.8 Hz steps, forgets a bias in 2 s
+const float kShortestStep_s = 0.28f;   // 3.6 steps/s: faster than anybody walks (running 3.2)
+const float kSmallestSwing_m = 0.004f;  // below it lies standing sway; slow walking lifts 8 mm
+const float kSmallestRange_m_s2 = 0.6f;  // standing sway stays under 0.3, 0.4 m/s walking over 1
+const float kPause_s = 1.5f;      // longest time between steps of one walk
+
+const float kForwardMemory_s = 12.0f;  // about twenty steps: a body-fixed axis, yet free to move
+const uint8_t kForwardSteps = 4;       // two strides: the sway of left and right cancels
+// Squared coherence of the horizontal acceleration with the downward velocity. Two dozen walks of
+// walk_chest and walk_lowerback_20m had 0.16 to 0.45; noise and standing stay under 0.03.
+const float kForwardCoherence = 0.06f;
+
+}  // namespace
+
+void GaitDetector::reset() {
+  mean_m_s2_ = velocity_m_s_ = height_m_ = 0.0f;
+  peak_m_ = 0.0f;
+  since_s_ = kPause_s + 1.0f;
+  rejected_ = 0;
+  running_ = false;
+  restart_arc();
+}
+
+void GaitDetector::restart_arc() {
+  trough_m_ = height_m_;
+  lowest_m_s2_ = 1e6f;
+  highest_m_s2_ = -1e6f;
+}
+
+bool GaitDetector::walking() const { return since_s_ < kPause_s; }
+
+uint16_t GaitDetector::take_rejected() {
+  const uint16_t count = rejected_;
+  rejected_ = 0;
+  return count;
+}
+
+bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance* stance) {
+  if (!running_) {
+    mean_m_s2_ = vertical_m_s2;
+    running_ = true;
+  }
+  mean_m_s2_ += (vertical_m_s2 - mean_m_s2_) * (dt_s * (1.0f / kMeanTime_s));
+  const float acceleration = vertical_m_s2 - mean_m_s2_;
+  const float before = velocity_m_s_;
+  const float leak = 1.0f - dt_s * (1.0f / kLeakTime_s);
+  velocity_m_s_ = velocity_m_s_ * leak + acceleration * dt_s;
+  height_m_ = height_m_ * leak + velocity_m_s_ * dt_s;
+  if (since_s_ < 1000.0f) since_s_ += dt_s;
+  if (height_m_ < trough_m_) trough_m_ = height_m_;
+  if (acceleration < lowest_m_s2_) lowest_m_s2_ = acceleration;
+  if (acceleration > highest_m_s2_) highest_m_s2_ = acceleration;
+
+  if (!(before > 0.0f && velocity_m_s_ <= 0.0f)) return false;
+  const float swing = height_m_ - trough_m_;
+  const bool first = !walking();
+  if (since_s_ < kShortestStep_s || swing < kSmallestSwing_m ||
+      highest_m_s2_ - lowest_m_s2_ < kSmallestRange_m_s2) {
+    if (walking() && rejected_ < 255) ++rejected_;
+    if (first) restart_arc();
+    return false;
+  }
+  float excursion = first ? swing : 0.5f * (height_m_ + peak_m_) - trough_m_;
+  if (excursion < 0.5f * swing) excursion = 0.5f * swing;
+  stance->first = first;
+  stance->interval_s = first ? 0.6f : since_s_;
+  // The three leaky filters shrink an oscillation of period T by 1/sqrt(1 + (T / 2 pi tau)^2) each.
+  const float leak_ratio = stance->interval_s * (1.0f / (2.0f * kPi * kLeakTime_s));
+  const float mean_ratio = stance->interval_s * (1.0f / (2.0f * kPi * kMeanTime_s));
+  stance->excursion_m =
+      excursion * (1.0f + leak_ratio * leak_ratio) * (1.0f + 0.5f * mean_ratio * mean_ratio);
+  peak_m_ = height_m_;
+  since_s_ = 0.0f;
+  restart_arc();
+  return true;
+}
+
+float pendulum_step_m(float excursion_m, float leg_length_m, float gain) {
+  // Beyond h = l the arc is past the horizontal: no leg does that, the chord stays at 2 l.
+  const float h = excursion_m < leg_length_m ? excursion_m : leg_length_m;
+  return gain * 2.0f * sqrtf(h * (2.0f * leg_length_m - h));
+}
+
+void ForwardFinder::reset() {
+  product_x_ = product_y_ = power_a_ = power_v_ = 0.0f;
+  offset_rad_ = sine_ = 0.0f;
+  cosine_ = 1.0f;
+  steps_ = 0;
+  found_ = false;
+}
+
+void ForwardFinder::update(float ax, float ay, float vertical_velocity_m_s, float dt_s) {
+  const float gain = dt_s * (1.0f / kForwardMemory_s);
+  product_x_ -= gain * (product_x_ + ax * vertical_velocity_m_s);
+  product_y_ -= gain * (product_y_ + ay * vertical_velocity_m_s);
+  power_a_ += gain * (ax * ax + ay * ay - power_a_);
+  power_v_ += gain * (vertical_velocity_m_s * vertical_velocity_m_s - power_v_);
+}
+
+void ForwardFinder::step() {
+  if (steps_ < 255) ++steps_;
+  if (steps_ < kForwardSteps) return;
+  const float product = product_x_ * product_x_ + product_y_ * product_y_;
+  if (product < kForwardCoherence * power_a_ * power_v_) return;
+  offset_rad_ = atan2f(product_y_, product_x_);
+  const float scale = 1.0f / sqrtf(product);
+  cosine_ = product_x_ * scale;
+  sine_ = product_y_ * scale;
+  found_ = true;
+}
+
+}  // namespace relpos
