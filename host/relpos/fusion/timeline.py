@@ -166,8 +166,10 @@ class Timeline:
         steps = list(self._release(final=True))
         last = max((t.reported_s for t in self._tracks.values() if t.heard), default=-inf)
         last = max(last, self._frontier_s)
-        if self._epoch_s > -inf and last > self._epoch_s:
-            steps += self._advance_all(last)
+        # A displacement that came late may still lie behind the frontier.
+        rest = list(self._advance_all(last))
+        steps += rest
+        if self._epoch_s > -inf and (rest or last > self._epoch_s):
             steps.append(Epoch(last))
             self._epoch_s = last
         return steps

@@ -1,0 +1,177 @@
+"""The timeline puts asynchronous reports into exact order."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from relpos.errors import DataError
+from relpos.fusion.timeline import Advance, Displacement, Epoch, Ranging, Step, Timeline
+from relpos.measurements import Measurement, Motion, Range
+
+Pose = tuple[float, float, float]
+
+
+def compose(pose: Pose, dx: float, dy: float, dtheta: float) -> Pose:
+    """Compose by complex numbers: independent of the code under test."""
+    place = complex(pose[0], pose[1]) + complex(dx, dy) * complex(
+        math.cos(pose[2]), math.sin(pose[2])
+    )
+    return place.real, place.imag, pose[2] + dtheta
+
+
+def advances(steps: Iterable[Step], node: int) -> list[Advance]:
+    return [s for s in steps if isinstance(s, Advance) and s.node == node]
+
+
+def end_of(steps: Iterable[Step], node: int) -> Pose:
+    pose: Pose = (0.0, 0.0, 0.0)
+    for a in advances(steps, node):
+        pose = compose(pose, a.dx_m, a.dy_m, a.dtheta_rad)
+    return pose
+
+
+def run(timeline: Timeline, measurements: Iterable[Measurement]) -> list[Step]:
+    steps = [s for m in measurements for s in timeline.push(m)]
+    return steps + timeline.finish()
+
+
+size = st.floats(-3.0, 3.0)
+
+
+@given(size, size, size, st.floats(0.0, 1.0))
+def test_a_split_increment_composes_exactly_to_the_whole(
+    dx: float, dy: float, dtheta: float, cut: float
+) -> None:
+    first, second = Displacement(dx, dy, dtheta).split(cut)
+    half = compose((0.0, 0.0, 0.0), first.dx_m, first.dy_m, first.dtheta_rad)
+    whole = compose(half, second.dx_m, second.dy_m, second.dtheta_rad)
+    assert whole == pytest.approx((dx, dy, dtheta), abs=1e-12)
+
+
+def test_a_split_piece_is_the_straight_share_of_the_chord() -> None:
+    first, _ = Displacement(4.0, 2.0, 1.0).split(0.25)
+    assert (first.dx_m, first.dy_m, first.dtheta_rad) == (1.0, 0.5, 0.25)
+
+
+def test_both_nodes_are_at_the_time_of_a_range_when_it_is_weighed() -> None:
+    steps = run(
+        Timeline(),
+        [
+            Motion(1.0, 1, 1.0, 0.0, 0.0),
+            Range(1.2, 1, 2, 5.0),
+            Motion(1.6, 2, 3.2, 0.0, 0.0),
+            Motion(2.0, 1, 1.0, 0.0, 0.0),
+            Motion(2.6, 2, 1.0, 0.0, 0.0),
+        ],
+    )
+    at = next(k for k, s in enumerate(steps) if isinstance(s, Ranging))
+    assert end_of(steps[:at], 1) == pytest.approx((1.2, 0.0, 0.0))
+    assert end_of(steps[:at], 2) == pytest.approx((2.4, 0.0, 0.0))
+    assert end_of(steps, 1) == pytest.approx((2.0, 0.0, 0.0))
+    assert end_of(steps, 2) == pytest.approx((4.2, 0.0, 0.0))
+
+
+@given(
+    st.lists(st.tuples(size, size, size), min_size=1, max_size=6),
+    st.lists(st.floats(0.01, 7.0), max_size=12),
+)
+def test_ranges_at_any_time_cost_no_displacement(
+    motions: list[tuple[float, float, float]], ranges: list[float]
+) -> None:
+    pose: Pose = (0.0, 0.0, 0.0)
+    measurements: list[Measurement] = []
+    for k, (dx, dy, dtheta) in enumerate(motions):
+        pose = compose(pose, dx, dy, dtheta)
+        measurements.append(Motion(k + 1.0, 1, dx, dy, dtheta))
+    measurements += [Range(t, 1, 2, 1.0) for t in ranges]
+    steps = run(Timeline(), sorted(measurements, key=lambda m: m.time_s))
+    assert end_of(steps, 1) == pytest.approx(pose, abs=1e-9)
+    assert sum(a.fraction for a in advances(steps, 1)) == pytest.approx(len(motions))
+
+
+def test_the_variances_of_the_pieces_add_up_to_the_reports() -> None:
+    steps = run(
+        Timeline(), [Range(0.3, 1, 2, 1.0), Range(0.8, 1, 2, 1.0),
+                     Motion(1.0, 1, 1.0, 0.0, 0.0, 0.1, 0.2, 0.3)]
+    )  # fmt: skip
+    pieces = advances(steps, 1)
+    assert len(pieces) == 3
+    assert sum((a.sigma_x_m or 0.0) ** 2 for a in pieces) == pytest.approx(0.01)
+    assert sum((a.sigma_theta_rad or 0.0) ** 2 for a in pieces) == pytest.approx(0.09)
+
+
+def test_measurements_out_of_order_within_the_bound_give_the_same_steps() -> None:
+    ordered: list[Measurement] = []
+    for k in range(1, 8):
+        ordered += [Range(k - 0.5, 1, 2, 3.0), Motion(float(k), 1, 0.5, 0.0, 0.1),
+                    Motion(k + 0.1, 2, 0.5, 0.0, 0.1)]  # fmt: skip
+    shuffled = ordered[:]
+    for k in range(0, len(shuffled) - 1, 2):
+        shuffled[k], shuffled[k + 1] = shuffled[k + 1], shuffled[k]
+    straight = Timeline(reorder_s=1.0)
+    mixed = Timeline(reorder_s=1.0)
+    assert run(mixed, shuffled) == run(straight, ordered)
+    assert not mixed.counters
+
+
+def test_a_silent_node_holds_nobody_up_longer_than_the_bound() -> None:
+    timeline = Timeline(nodes=[1, 2], max_lag_s=3.0, reorder_s=0.0)
+    closed: list[float] = []
+    for k in range(1, 11):
+        steps = timeline.push(Motion(float(k), 1, 1.0, 0.0, 0.0))
+        closed += [s.time_s for s in steps if isinstance(s, Epoch)]
+    assert closed == [float(k) for k in range(1, 11)]
+
+
+def test_the_displacement_of_a_node_that_comes_back_is_not_lost() -> None:
+    timeline = Timeline(nodes=[1, 2], max_lag_s=3.0, reorder_s=0.0)
+    measurements: list[Measurement] = [Motion(float(k), 1, 1.0, 0.0, 0.0) for k in range(1, 11)]
+    steps = run(timeline, [*measurements, Motion(9.5, 2, 7.0, 0.0, 0.0)])
+    assert end_of(steps, 2) == pytest.approx((7.0, 0.0, 0.0))
+    assert timeline.counters["motions_late"] == 1
+
+
+def test_a_range_that_comes_too_late_is_dropped_and_counted() -> None:
+    timeline = Timeline(nodes=[1], reorder_s=0.5)
+    steps = run(
+        timeline,
+        [*(Motion(float(k), 1, 1.0, 0.0, 0.0) for k in range(1, 11)), Range(2.0, 1, 2, 3.0)],
+    )
+    assert not any(isinstance(s, Ranging) for s in steps)
+    assert timeline.counters["ranges_late"] == 1
+
+
+def test_zero_self_and_repeated_ranges_are_dropped_and_counted() -> None:
+    timeline = Timeline()
+    steps = run(
+        timeline,
+        [Range(0.5, 1, 2, 0.0), Range(0.5, 1, 1, 2.0), Range(0.6, 1, 2, 2.0),
+         Range(0.6, 1, 2, 2.0), Motion(1.0, 1, 1.0, 0.0, 0.0)],
+    )  # fmt: skip
+    assert [len(s.ranges) for s in steps if isinstance(s, Ranging)] == [1]
+    assert timeline.counters == {
+        "ranges_failed": 1, "ranges_to_itself": 1, "ranges_duplicate": 1
+    }  # fmt: skip
+
+
+def test_a_number_that_is_none_is_an_error() -> None:
+    with pytest.raises(DataError, match="finite"):
+        Timeline().push(Motion(1.0, 1, math.nan, 0.0, 0.0))
+
+
+def test_one_epoch_a_round_of_reports_with_everybody_at_its_time() -> None:
+    measurements: list[Measurement] = []
+    for k in range(1, 6):
+        measurements += [Motion(k + 0.2 * n, n, 1.0, 0.0, 0.0) for n in (0, 1, 2)]
+    steps = run(Timeline(), measurements)
+    epochs = [s.time_s for s in steps if isinstance(s, Epoch)]
+    assert epochs == [1.0, 2.0, 3.0, 4.0, 5.0, 5.4]
+    for time_s in epochs[1:-1]:
+        reached = steps[: steps.index(Epoch(time_s))]
+        for node in (0, 1, 2):
+            assert advances(reached, node)[-1].time_s == pytest.approx(time_s)
