@@ -28,8 +28,11 @@ from .xbee import DELIVERED, XbeeModule
 
 GRID_HZ = 200.0
 """The recording is brought to this uniform rate before the chip's filter feels it."""
-LEAD_S = 1.0
-"""From power-on to the first sample: the board boots and is configured, the chip is silent."""
+LEAD_S = 0.3
+"""From power-on to the first sample: the board boots, configures its sensor and is told its
+wearer. The first sample is held meanwhile, of which the node sees the last tenth of a second."""
+FIRST_COMMAND_US = 20_000
+COMMAND_PERIOD_US = 40_000
 TAIL_S = 2.5
 """Behind the last sample: the report that is then under way still comes out."""
 GAP_PERIODS = 3.5
@@ -81,8 +84,7 @@ def surroundings_of(recording: ImuRecording) -> Surroundings:
     step_s = np.diff(time_s)
     period_s = float(np.median(step_s))
     gaps = np.flatnonzero(step_s > max(GAP_PERIODS * period_s, LEAST_GAP_S))
-    silent = [(0.0, LEAD_S)]
-    silent += [(float(time_s[k]) + period_s, float(time_s[k + 1])) for k in gaps]
+    silent = [(float(time_s[k]) + period_s, float(time_s[k + 1])) for k in gaps]
     silent.append((float(time_s[-1]) + period_s, float(grid_s[-1]) + 3600.0))
     magnetic = np.full((len(grid_s), 3), np.nan)
     known = np.isfinite(rows[:, 6:]).all(axis=1)
@@ -173,7 +175,8 @@ def play(
         if wearer.step_gain_permille is not None:
             settings.append((wire.CommandCode.SET_STEP_GAIN_PERMILLE, wearer.step_gain_permille))
         for k, (code, value) in enumerate(settings):
-            emulated.command(coordinator, code, value, k + 1, 400_000 + 100_000 * k)
+            at_us = FIRST_COMMAND_US + COMMAND_PERIOD_US * k
+            emulated.command(coordinator, code, value, k + 1, at_us)
         clock.run(round((len(surroundings.pressure_pa) - 1) / surroundings.rate_hz * 1e6))
     finally:
         emulated.close()

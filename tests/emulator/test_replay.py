@@ -1,0 +1,159 @@
+"""Recordings played into the emulated chip, on the production firmware."""
+
+import numpy as np
+import pytest
+
+from relpos.emulator.replay import Wearer, calibrate, play, replay_imu, surroundings_of
+from relpos.errors import DataError
+from relpos.runs import Description, Run
+from relpos.runs.imu import ImuRecording
+from relpos.simulation.team import make_team
+from relpos.simulation.walker import RATE_HZ
+
+UPRIGHT = np.eye(3)
+
+
+@pytest.fixture(scope="module")
+def walker():
+    return make_team("paper", 1, 75.0, 11)[0][0]
+
+
+def recorded(walker, times_s, start_s=0.0, turned=UPRIGHT, magnetic=True):
+    """The walker's sensors read at ``times_s``, mounted turned, on a clock from ``start_s``."""
+    def at(rows):
+        columns = [np.interp(times_s, walker.time_s, rows[:, k]) for k in range(3)]
+        return np.column_stack(columns) @ turned.T
+
+    field = at(walker.magnetic_field_ut) if magnetic else np.full((len(times_s), 3), np.nan)
+    return ImuRecording(times_s + start_s, at(walker.specific_force_m_s2),
+                        at(walker.angular_rate_rad_s), field)
+
+
+def even(rate_hz, seconds=75.0):
+    return np.arange(int(seconds * rate_hz) - 1) / rate_hz
+
+
+def test_a_walk_comes_out_with_about_its_steps_and_its_turns(walker):
+    replay = play(1, recorded(walker, even(RATE_HZ)), Wearer(walker.person.leg_length_m))
+    assert len(replay.steps) == pytest.approx(len(walker.steps.time_s), abs=6)
+    assert replay.distance_m == pytest.approx(walker.steps.length_m.sum(), rel=0.25)
+    turn = sum(m.dtheta_rad for m in replay.motions)
+    assert turn == pytest.approx(walker.heading_rad[-1] - walker.heading_rad[0], abs=0.4)
+
+
+def test_steps_come_at_their_times_on_the_recordings_clock(walker):
+    replay = play(1, recorded(walker, even(100.0), start_s=-3.2), Wearer())
+    found = np.array([s.time_s for s in replay.steps]) + 3.2
+    nearest = np.abs(found[:, None] - walker.steps.time_s).min(axis=1)
+    assert np.median(nearest) < 0.25
+    assert replay.motions[0].time_s < 0.0
+    assert replay.motions[-1].time_s + 3.2 == pytest.approx(75.0, abs=2.6)
+
+
+@pytest.mark.parametrize("rate_hz", [52.0, 100.0, 400.0])
+def test_the_recordings_rate_does_not_matter(walker, rate_hz):
+    reference = play(1, recorded(walker, even(RATE_HZ)), Wearer()).distance_m
+    assert play(1, recorded(walker, even(rate_hz)), Wearer()).distance_m == pytest.approx(
+        reference, rel=0.06)
+
+
+def test_uneven_times_and_repeated_samples_do_not_matter(walker):
+    rng = np.random.default_rng(1)
+    times_s = np.sort(np.concatenate((even(100.0) + rng.uniform(-0.002, 0.002, 7499),
+                                      [10.0, 10.0, 20.0, 20.0])))
+    reference = play(1, recorded(walker, even(100.0)), Wearer()).distance_m
+    assert play(1, recorded(walker, times_s), Wearer()).distance_m == pytest.approx(
+        reference, rel=0.04)
+
+
+def test_any_mounting_gives_the_same_walk(walker):
+    upside_down = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
+    reference = play(1, recorded(walker, even(100.0)), Wearer())
+    turned = play(1, recorded(walker, even(100.0), turned=upside_down), Wearer())
+    assert turned.distance_m == pytest.approx(reference.distance_m, rel=0.05)
+    assert sum(m.dtheta_rad for m in turned.motions) == pytest.approx(
+        sum(m.dtheta_rad for m in reference.motions), abs=0.1)
+
+
+def test_a_recording_without_magnetometer_is_played(walker):
+    replay = play(1, recorded(walker, even(100.0), magnetic=False), Wearer())
+    assert len(replay.steps) > 60
+
+
+def test_longer_legs_walk_further_in_the_same_recording(walker):
+    recording = recorded(walker, even(100.0))
+    short, long = (play(1, recording, Wearer(leg)).distance_m for leg in (0.8, 1.0))
+    # s = k 2 sqrt(2 l h - h^2): as the root of the leg, less where the filter disagrees.
+    assert 1.03 < long / short < 1.16
+
+
+def test_the_same_recording_gives_the_same_motion(walker):
+    recording = recorded(walker, even(100.0))
+    assert play(1, recording, Wearer()) == play(1, recording, Wearer())
+
+
+def test_a_gap_is_silence_and_not_motion(walker):
+    times_s = even(100.0)
+    times_s = times_s[(times_s < 30.0) | (times_s > 34.0)]
+    recording = recorded(walker, times_s)
+    silent = surroundings_of(recording).silent_us
+    assert len(silent) == 2  # the gap, and behind the end
+    assert silent[0][1] - silent[0][0] == pytest.approx(4.0e6, abs=0.02e6)
+    replay = play(1, recording, Wearer())
+    inside = [s for s in replay.steps if 30.8 < s.time_s < 34.0]
+    assert inside == []
+    assert len(replay.steps) > 60
+
+
+def test_a_calibration_walk_sets_the_gain_that_makes_it_come_out(walker):
+    recording = recorded(walker, even(100.0))
+    true_m = 1.1 * play(1, recording, Wearer(0.9, 1250)).distance_m
+    gain = calibrate(1, recording, true_m, 0.9)
+    assert play(1, recording, Wearer(0.9, gain)).distance_m == pytest.approx(true_m, rel=0.005)
+
+
+class InertialRun(Run):
+    """A run whose inertial data are in memory."""
+
+    def load_imu(self):
+        return self.recordings
+
+
+def run_of(recordings, **description):
+    run = InertialRun("memory", Description(**description))
+    object.__setattr__(run, "recordings", recordings)
+    return run
+
+
+def test_every_node_of_a_run_is_played_under_its_own_name(walker):
+    recording = recorded(walker, even(100.0, 30.0))
+    motions, steps = replay_imu(run_of({3: recording, 300: recording}))
+    assert {m.node for m in motions} == {s.node for s in steps} == {3, 300}
+    assert [m.time_s for m in motions] == sorted(m.time_s for m in motions)
+
+
+def test_the_stature_sets_the_leg_length(walker):
+    recording = recorded(walker, even(100.0, 30.0))
+    given = replay_imu(run_of({1: recording}), stature_m=1.9)[1]
+    own = replay_imu(run_of({1: recording}, stature_m=1.9))[1]
+    direct = play(1, recording, Wearer(0.53 * 1.9)).steps
+    assert given == own == list(direct)
+
+
+def test_calibration_needs_a_true_distance_and_the_node(walker):
+    recording = recorded(walker, even(100.0, 30.0))
+    run = run_of({1: recording})
+    with pytest.raises(DataError, match="true_distance_m"):
+        replay_imu(run, calibration=run_of({1: recording}))
+    with pytest.raises(DataError, match="node 1"):
+        replay_imu(run, calibration=run_of({2: recording, 3: recording}, true_distance_m=20.0))
+
+
+def test_what_cannot_be_played_is_refused(walker):
+    with pytest.raises(DataError, match="fewer than two"):
+        surroundings_of(recorded(walker, np.array([1.0])))
+    with pytest.raises(DataError, match="no inertial data"):
+        replay_imu(run_of({}))
+    still = recorded(walker, np.linspace(0.0, 4.0, 400))
+    with pytest.raises(DataError, match="no step"):
+        calibrate(1, still, 20.0, None)
