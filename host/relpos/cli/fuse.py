@@ -382,10 +382,9 @@ def _tell(
             }
         )
         return
+    output.print_last_pairs(f"{name}: {job.estimator}", estimates)
     if scored is not None:
-        output.print_metrics(f"{name}: {job.estimator}", scored.metrics, scored.baseline)
-    else:
-        output.print_last_pairs(f"{name}: {job.estimator}", estimates)
+        output.print_metrics(f"{name}: scored", scored.metrics, scored.baseline)
     noted = {key: value for key, value in counters.items() if value}
     if noted:
         output.remark("counted: " + ", ".join(f"{k} {v:g}" for k, v in sorted(noted.items())))

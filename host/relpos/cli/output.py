@@ -144,7 +144,7 @@ def print_metrics(title: str, metrics: Metrics, baseline: Metrics | None = None)
         factor = baseline.relative_distance_rmse_m / metrics.relative_distance_rmse_m
         console.print(
             f"dead reckoning           {metres(baseline.relative_distance_rmse_m)} relative "
-            f"distance RMSE: the fusion is {plain(factor)} times as good"
+            f"distance RMSE, {plain(factor)} times the fusion's"
         )
     _print_over_time(console, metrics)
 
