@@ -730,11 +730,12 @@ int main(void) {
 }
 """
     firmware = build(
-        program, mmcu, str(CORE / "cores" / "arduino" / "wiring.c"), "-DARDUINO=10819", "-Wl,--gc-sections", "-ffunction-sections",
+        program, mmcu, str(CORE / "cores" / "arduino" / "wiring.c"), "-DARDUINO=10819",
+        "-Wl,--gc-sections", "-ffunction-sections",
         f"-I{CORE / 'cores' / 'arduino'}", f"-I{CORE / 'variants' / variant}",
     )  # fmt: skip
     with Board(BOARDS[name], firmware) as board:
-        board.run(16_000_00)
+        board.run(1_600_000)
         out = sent(board)
         marks = [cycle for cycle, value in board.take_marks() if value == 7]
     assert len(out) == 6 * 4 + 1
