@@ -181,6 +181,23 @@ def test_the_same_seed_gives_the_same_samples_in_whatever_order_they_are_asked_f
     assert seldom.at(9_000_000).read(MPU, 0x3B, 14) == often.at(9_000_000).read(MPU, 0x3B, 14)
 
 
+def test_a_sample_that_comes_in_the_middle_of_a_burst_does_not_tear_it():
+    surroundings = of_signal(2.0, force=lambda t: 20.0 * t, rate=lambda t: 5.0 * t)
+    host = configured(board(surroundings)).at(518_000)
+    bus = host.bus
+    expected = host.read(MPU, 0x3B, 14)
+    bus.start(MPU, False)
+    bus.write(0x3B)
+    bus.start(MPU, True)
+    got = bytearray()
+    for _ in range(14):
+        got.append(bus.read())
+        bus.time_us += 1_000
+    bus.stop()
+    assert bytes(got) == expected
+    assert host.read(MPU, 0x3B, 14) != expected
+
+
 def test_the_fifo_holds_the_enabled_sources_in_register_order(by_bytes):
     host = board(constant(force=(GRAVITY, 0, 0), rate=(0, 0, DEGREE * 100)), by_bytes=by_bytes)
     configured(host)

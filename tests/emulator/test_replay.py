@@ -152,6 +152,8 @@ def test_calibration_needs_a_true_distance_and_the_node(walker):
 def test_what_cannot_be_played_is_refused(walker):
     with pytest.raises(DataError, match="fewer than two"):
         surroundings_of(recorded(walker, np.array([1.0])))
+    with pytest.raises(DataError, match="more than a day"):
+        surroundings_of(recorded(walker, np.array([0.0, 0.01, 1.7e9])))
     with pytest.raises(DataError, match="no inertial data"):
         replay_imu(run_of({}))
     still = recorded(walker, np.linspace(0.0, 4.0, 400))

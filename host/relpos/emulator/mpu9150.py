@@ -205,7 +205,7 @@ class Mpu9150(I2cDevice):
         self._status = 0
         self._fifo = bytearray()
         self._last_popped = 0
-        self._data = bytes(14)
+        self._data = self._shown = bytes(14)
         self._external = bytearray(24)
         self._reset_pending = False
         self._reschedule()
@@ -375,7 +375,7 @@ class Mpu9150(I2cDevice):
         if self._registers[INT_PIN_CFG] & CLEAR_ON_ANY_READ:
             self._status = 0
         if ACCEL_XOUT_H <= address <= GYRO_ZOUT_L:
-            return self._data[address - ACCEL_XOUT_H]
+            return self._shown[address - ACCEL_XOUT_H]
         if EXT_SENS_DATA <= address < EXT_SENS_DATA + 24:
             return self._external[address - EXT_SENS_DATA]
         if address == FIFO_COUNT_H:
@@ -420,8 +420,13 @@ class Mpu9150(I2cDevice):
     # -- bus ----------------------------------------------------------------------------------
 
     def start(self, read: bool) -> bool:
-        """Every start is acknowledged; after one for writing the first byte is the register."""
-        if not read:
+        """Every start is acknowledged; after one for writing the first byte is the register.
+
+        A burst shows one sample: the registers do not change under it.
+        """
+        if read:
+            self._shown = self._data
+        else:
             self._pointed = False
         return True
 

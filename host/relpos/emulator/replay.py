@@ -35,6 +35,7 @@ FIRST_COMMAND_US = 20_000
 COMMAND_PERIOD_US = 40_000
 TAIL_S = 2.5
 """Behind the last sample: the report that is then under way still comes out."""
+MOST_S = 86_400.0
 GAP_PERIODS = 3.5
 LEAST_GAP_S = 0.05
 """Samples further apart than both (in median periods, in seconds) are a gap, not a slow sensor."""
@@ -77,6 +78,10 @@ def surroundings_of(recording: ImuRecording) -> Surroundings:
     time_s, rows = _increasing(recording)
     if len(time_s) < 2:
         raise DataError("an inertial recording of fewer than two samples cannot be played")
+    if time_s[-1] - time_s[0] > MOST_S:
+        raise DataError(
+            f"an inertial recording of {time_s[-1] - time_s[0]:g} s is more than a day: not played"
+        )
     time_s = time_s - time_s[0] + LEAD_S
     grid_s = np.arange(int((time_s[-1] + TAIL_S) * GRID_HZ) + 1) / GRID_HZ
     inside = np.clip(grid_s, time_s[0], time_s[-1])
