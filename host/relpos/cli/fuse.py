@@ -249,7 +249,7 @@ class _Scored:
                 title=run.name,
                 subtitle=f"estimator {job.estimator}, seed {job.seed}; {self.baseline_start}",
                 truth=tracks.true_tracks(run.truth),
-                fused=tracks.estimated_tracks(estimates),
+                fused=tracks.located_tracks(estimates),
                 dead_reckoning=tracks.estimated_tracks(self.baseline_estimates),
                 pairs=tracks.estimated_pairs(estimates),
                 ranges=run.ranges,

@@ -159,7 +159,8 @@ def print_last_pairs(title: str, estimates: Sequence[Estimate]) -> None:
         console.print(f"{title}: nothing could be estimated")
         return
     last = estimates[-1]
-    table = Table(title=f"{title}, at {last.time_s:.1f} s")
+    console.print(f"{title}, at {last.time_s:.1f} s")
+    table = Table()
     for column in ("pair", "distance", "sigma", "bearing", "sigma "):
         table.add_column(column, justify="left" if column == "pair" else "right")
     for pair in last.pairs:

@@ -306,7 +306,8 @@ def _figure(width_in: float, height_in: float) -> Figure:
 
 _TRACKS_CAPTION = (
     "Tracks. Wide grey: truth. Filled dot: estimated position at the end, open dot: the true one. "
-    "Each estimate is moved as a whole (turned and shifted, never mirrored) onto the truth."
+    "Each estimate is moved as a whole (turned and shifted, never mirrored) onto the truth. "
+    "A node is left out while it was not located."
 )
 _ERROR_CAPTION = "Error over time, fused against dead reckoning."
 

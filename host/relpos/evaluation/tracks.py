@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from relpos.evaluation.metrics import Pair, PairTrack, Track
-from relpos.fusion.estimator import Estimate
+from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.measurements import Truth
 
 
@@ -18,6 +18,22 @@ def estimated_tracks(estimates: Iterable[Estimate]) -> dict[int, Track]:
     for estimate in estimates:
         for node in estimate.nodes:
             rows[node.node].append((estimate.time_s, node.x_m, node.y_m, node.heading_rad))
+    return {node: Track(*np.array(rows[node]).T) for node in sorted(rows)}
+
+
+def located_tracks(estimates: Iterable[Estimate]) -> dict[int, Track]:
+    """Return the tracks for a picture: NaN while a node was ambiguous or not located.
+
+    The mean of what is possible jumps between the possibilities; a line through it says nothing.
+    """
+    nowhere = (NodeStatus.AMBIGUOUS, NodeStatus.UNLOCATED)
+    rows: dict[int, list[tuple[float, float, float, float]]] = defaultdict(list)
+    for estimate in estimates:
+        for node in estimate.nodes:
+            pose = (node.x_m, node.y_m, node.heading_rad)
+            if node.status in nowhere:
+                pose = (np.nan, np.nan, np.nan)
+            rows[node.node].append((estimate.time_s, *pose))
     return {node: Track(*np.array(rows[node]).T) for node in sorted(rows)}
 
 
