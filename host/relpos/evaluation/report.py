@@ -74,7 +74,7 @@ def write_report(directory: Path | str, content: Content) -> Path:
     for name, (figure, caption) in pictures.items():
         path = directory / name
         # Without a date in it the same report is the same file.
-        figure.savefig(path, dpi=130, metadata={"Software": None})
+        figure.savefig(path, dpi=130, bbox_inches="tight", metadata={"Software": None})
         embedded = base64.b64encode(path.read_bytes()).decode("ascii")
         sections.append(
             f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{embedded}">'
@@ -166,7 +166,7 @@ def draw_error(content: Content) -> Figure:
     ):  # fmt: skip
         axes.set_ylabel(words)
         axes.set_ylim(bottom=0.0)
-        axes.legend(loc="upper left")
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.2)
     panels[-1].set_xlabel("time (s)")
     return figure
 
