@@ -307,3 +307,19 @@ def test_a_node_without_news_is_stale_after_three_epochs_and_lost_after_ten() ->
 
 def test_effective_size_counts_equal_weights() -> None:
     assert effective_size(np.array([[0.25] * 4, [0.5, 0.5, 0.0, 0.0]])) == pytest.approx([4, 2])
+
+
+def test_a_node_that_joins_late_is_found_by_its_ranges_to_the_team() -> None:
+    run = simulate_paper("paper-p1", 2, {"seconds": 200, "detection": 1, "max_range_m": 0})
+    measurements = [
+        m
+        for m in run.measurements
+        if m.time_s > 60.0 or 4 not in (m.node, m.peer if isinstance(m, Range) else m.node)
+    ]
+    priors = tuple(p for p in run.priors if p.node != 4)
+    estimates = fuse(measurements, priors)
+    assert [n.node for n in estimates[30].nodes] == [1, 2, 3, 5, 6]
+    last = {n.node: n for n in estimates[-1].nodes}
+    truth = {t.node: t for t in run.truth if t.time_s == 200.0}
+    assert last[4].status is NodeStatus.OK
+    assert math.hypot(last[4].x_m - truth[4].x_m, last[4].y_m - truth[4].y_m) < 3.0
