@@ -1,0 +1,61 @@
+// Digi XBee 802.15.4 in API mode with escapes (AP=2), 16-bit addresses.
+#pragma once
+
+#include <stdint.h>
+
+#include "board/board.h"
+#include "wire/frame.h"
+
+namespace relpos {
+
+// Streams without waiting and without a second buffer: the sender's bytes are escaped straight into
+// the UART; of what comes only RF payloads are kept.
+class Xbee {
+ public:
+  static constexpr uint8_t kMostPayload = wire::kFrameBytes + wire::kAuthenticationBytes;
+
+  bool busy() const { return sending_; }
+  // Begins a TX16 request. The data must stay unchanged until !busy(). False while busy().
+  bool send(uint16_t destination, const uint8_t* data, uint8_t length);
+  // Pushes what fits into the UART and reads what has come, up to the end of the first RF payload.
+  // True where there is one: received(), received_length() and source() hold until the next step.
+  bool step(Board& board);
+  const uint8_t* received() const { return payload_; }
+  uint8_t received_length() const { return payload_length_; }
+  uint16_t source() const { return source_; }            // of a 64-bit address the low part
+  uint16_t bad_frames() const { return bad_frames_; }    // checksum, length, broken off; wraps
+  uint16_t failures() const { return failures_; }        // TX status other than 0; wraps
+
+ private:
+  enum class Part : uint8_t { kNone, kLengthHigh, kLengthLow, kData, kChecksum };
+
+  void push(Board& board);
+  uint8_t next_byte() const;
+  bool take(uint8_t byte);
+  void take_data(uint8_t byte);
+  bool finish();
+  void reject();
+
+  const uint8_t* data_ = nullptr;
+  uint16_t destination_ = 0;
+  uint16_t position_ = 0;  // in the outgoing frame, delimiter included, escapes not
+  uint8_t data_length_ = 0;
+  uint8_t frame_id_ = 0;
+  uint8_t sent_sum_ = 0;
+  bool sending_ = false;
+  bool sent_escape_ = false;
+
+  Part part_ = Part::kNone;
+  bool took_escape_ = false;
+  uint8_t type_ = 0;
+  uint8_t sum_ = 0;
+  uint8_t payload_length_ = 0;
+  uint16_t length_ = 0;  // of the incoming frame data
+  uint16_t index_ = 0;   // in it
+  uint16_t source_ = 0;
+  uint16_t bad_frames_ = 0;
+  uint16_t failures_ = 0;
+  uint8_t payload_[kMostPayload];
+};
+
+}  // namespace relpos
