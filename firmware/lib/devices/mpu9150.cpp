@@ -79,6 +79,9 @@ Mpu9150::Event Mpu9150::step(Board& board, uint32_t now_us, uint32_t* wait_us) {
       position_ = kRunning;
       failures_ = 0;
       last_ready_us_ = now_us;
+      // What is announced by now was measured at the former range: twice the value.
+      uint8_t stale = 0;
+      board.read_registers(kAddress, kIntStatus, &stale, 1);
     }
     return Event::kNothing;
   }
