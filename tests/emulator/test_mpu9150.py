@@ -198,6 +198,15 @@ def test_a_sample_that_comes_in_the_middle_of_a_burst_does_not_tear_it():
     assert host.read(MPU, 0x3B, 14) != expected
 
 
+def test_a_sample_taken_before_the_range_changed_is_still_announced_in_the_old_counts():
+    host = configured(board(constant(force=(GRAVITY, 0, 0))), accel=0).at(300_000)
+    host.write(MPU, 0x1C, 1 << 3)
+    assert host.byte(MPU, 0x3A) == 1
+    assert words(host.read(MPU, 0x3B, 2)) == [16384]
+    host.at(325_000)
+    assert words(host.read(MPU, 0x3B, 2)) == [8192]
+
+
 def test_the_fifo_holds_the_enabled_sources_in_register_order(by_bytes):
     host = board(constant(force=(GRAVITY, 0, 0), rate=(0, 0, DEGREE * 100)), by_bytes=by_bytes)
     configured(host)

@@ -1,0 +1,200 @@
+"""The emulated team end to end on the production firmware: bytes at the coordinator's port."""
+
+import hashlib
+import itertools
+import math
+import threading
+from collections import Counter
+
+import pytest
+
+from relpos.emulator.pty import PseudoTerminal
+from relpos.emulator.team import EmulatedTeam, record_team, serve_team
+from relpos.errors import DataError, RelposError
+from relpos.link.live import Link, observe, open_port
+from relpos.link.xbee import Parser, Receive16
+from relpos.measurements import Motion, Range, Status
+from relpos.protocol import messages as wire
+
+SECONDS = 40.0
+NODES = 3
+
+
+def serial_output(seed, seconds=SECONDS, nodes=NODES, **options):
+    with EmulatedTeam("paper", nodes, seconds, seed, **options) as team:
+        return list(team.stream())
+
+
+@pytest.fixture(scope="module")
+def heard():
+    """A team after its walk, what left its port, and the link that read it."""
+    with EmulatedTeam("paper", NODES, SECONDS, 5) as team:
+        link = Link()
+        chunks, observations = [], []
+        for time_us, data in team.stream():
+            chunks.append((time_us, data))
+            observations += link.feed(data, time_us * 1e-6)
+        yield team, chunks, link, observations
+
+
+def frames_of(chunks):
+    parser = Parser()
+    frames = [frame for _, data in chunks for frame in parser.feed(data)]
+    assert parser.counts.skipped_bytes == parser.counts.bad_checksums == 0
+    return frames
+
+
+def test_everything_at_the_port_is_a_frame_of_this_protocol(heard):
+    _, chunks, _, _ = heard
+    frames = frames_of(chunks)
+    assert all(isinstance(frame, Receive16) for frame in frames)
+    decoded = [wire.decode(frame.data) for frame in frames]
+    assert {f.node for f in decoded} == {1, 2, 3}
+    assert all(f.node == frame.source for f, frame in zip(decoded, frames, strict=True))
+    assert {"motion", "ranges", "status"} <= {f.message.name for f in decoded}
+
+
+def test_times_rise_and_bytes_keep_to_the_speed_of_the_line(heard):
+    _, chunks, _, _ = heard
+    for (before, _), (after, data) in itertools.pairwise(chunks):
+        assert after - before >= len(data) * 10 / 38_400 * 1e6 - 1
+
+
+def test_every_node_reports_its_motion_every_second(heard):
+    team, _, _, observations = heard
+    counts = Counter(o.node for o in observations if isinstance(o, Motion))
+    # 2 % of the frames are lost on the air, the first second is for booting.
+    assert all(0.85 * SECONDS <= counts[node] <= SECONDS for node in team.nodes)
+
+
+def test_the_same_seed_gives_the_same_bytes_at_the_same_times():
+    one, other = serial_output(7, 15.0), serial_output(7, 15.0)
+    assert one == other
+    assert hashlib.sha256(repr(serial_output(8, 15.0)).encode()).digest() != hashlib.sha256(
+        repr(one).encode()).digest()
+
+
+def test_ranges_are_the_true_distances_at_their_times(heard):
+    team, _, _, observations = heard
+    ranges = [o for o in observations if isinstance(o, Range)]
+    assert len(ranges) > 10
+    for r in ranges:
+        true = math.dist(team.position_m(r.node, r.time_s), team.position_m(r.peer, r.time_s))
+        # 0.1 m of noise, and what people walk in the 50 ms that the node's clock may be off.
+        assert r.range_m == pytest.approx(true, abs=0.55)
+
+
+def test_dead_reckoning_goes_where_the_walker_goes(heard):
+    """A coarse check of the whole chain's scales and signs, not of its accuracy."""
+    team, _, _, observations = heard
+    motions = [o for o in observations if isinstance(o, Motion) and o.node == 1]
+    x = y = heading = 0.0
+    for m in motions:
+        x += math.cos(heading) * m.dx_m - math.sin(heading) * m.dy_m
+        y += math.sin(heading) * m.dx_m + math.cos(heading) * m.dy_m
+        heading += m.dtheta_rad
+    true = team.position_m(1, motions[-1].time_s) - team.position_m(1, 0.0)
+    true_turn = team.heading_rad(1, motions[-1].time_s) - team.heading_rad(1, 0.0)
+    assert math.dist((x, y), true[:2]) < 0.25 * math.hypot(*true[:2])
+    assert heading == pytest.approx(true_turn, abs=0.5)
+
+
+def test_what_the_radio_loses_is_what_the_link_misses(heard):
+    team, _, link, _ = heard
+    assert team.radio.counts["sent"] - team.radio.counts["lost"] == pytest.approx(
+        link.summary()["received"], abs=3)
+    assert link.summary()["lost"] <= team.radio.counts["lost"]
+
+
+def test_chips_are_driven_without_bus_errors(heard):
+    team, _, _, observations = heard
+    for node in team.nodes.values():
+        failed = sum(n for (_, status), n in node.bus.counts.items() if status)
+        assert failed < 0.02 * node.bus.transactions
+    errors = {o.node: o.value for o in observations
+              if isinstance(o, Status) and o.name == "bus_errors"}
+    assert all(count < 100 for count in errors.values())
+
+
+def test_a_command_reaches_its_node_and_is_acknowledged():
+    link = Link()
+    with EmulatedTeam("paper", 2, 20.0, 3) as team:
+        for time_us, data in team.run(3_000_000):
+            link.feed(data, time_us * 1e-6)
+        token, request = link.command(2, wire.CommandCode.PING, 0)
+        for _ in range(5):  # the radio loses one in fifty
+            team.send(request)
+            for time_us, data in team.run(team.time_us + 500_000):
+                link.feed(data, time_us * 1e-6)
+    answers = [a for a in link.decoder.acknowledged if a.token == token]
+    assert {a.node for a in answers} == {2}
+    assert all(a.result == wire.CommandResult.DONE for a in answers)
+
+
+def test_collisions_can_be_switched_off():
+    with EmulatedTeam("paper", 4, 20.0, 3, collisions=False) as team:
+        for _ in team.stream():
+            pass
+        assert team.uwb.counts["attempts"] > 10
+        assert team.uwb.counts["collisions"] == 0
+
+
+def test_an_unknown_scenario_or_fault_is_one_clear_error():
+    with pytest.raises(DataError, match="moon"):
+        EmulatedTeam("moon", 2, 10.0, 1)
+    with pytest.raises(RelposError, match="gremlins"):
+        serve_team(nodes=2, board="native", scenario="paper", speed=1.0, seconds=10.0,
+                   faults=("gremlins",), seed=1, announce=print)
+
+
+def test_a_recorded_team_is_the_same_run_each_time():
+    arguments = {"board": "native", "nodes": 2, "seconds": 15.0, "scenario": "paper", "seed": 4}
+    one, other = record_team(**arguments), record_team(**arguments)
+    assert one.measurements == other.measurements
+    assert one.statuses == other.statuses
+    assert {m.node for m in one.motions} == {1, 2}
+    assert one.truth[-1].time_s >= 14.5
+    assert {p.node for p in one.priors} == {1, 2}
+
+
+def test_an_emulated_port_faster_than_real_time_is_read_in_virtual_time(capsys):
+    path, opened = [], threading.Event()
+
+    def announce(name):
+        path.append(name)
+        opened.set()
+
+    thread = threading.Thread(target=serve_team, kwargs={
+        "nodes": 2, "board": "native", "scenario": "paper", "speed": 0.0, "seconds": 30.0,
+        "faults": (), "seed": 2, "announce": announce})
+    thread.start()
+    assert opened.wait(20.0)
+    link, motions = Link(), []
+
+    def read_on():
+        with open_port(path[0]) as port:
+            for batch in observe(port, link):
+                motions.extend(o for o in batch if isinstance(o, Motion))
+
+    with pytest.raises(RelposError, match="vanished"):
+        read_on()
+    thread.join()
+    times = [m.time_s for m in motions if m.node == 1]
+    assert len(times) >= 25
+    assert times[-1] - times[0] == pytest.approx(len(times) - 1, abs=3.0)
+    assert "over" in capsys.readouterr().err
+
+
+def test_a_terminal_of_a_real_team_gives_its_bytes_whole():
+    expected = b"".join(data for _, data in serial_output(9, 10.0, 2))
+    got = b""
+    with (
+        EmulatedTeam("paper", 2, 10.0, 9) as team,
+        PseudoTerminal(team, 0.0) as terminal,
+        terminal.open_port() as port,
+    ):
+        terminal.start()
+        while not port.exhausted:
+            got += port.read(max(1, port.in_waiting))
+        terminal.join()
+    assert got == expected
