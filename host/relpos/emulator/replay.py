@@ -21,7 +21,7 @@ from relpos.runs import Run
 from relpos.runs.imu import ImuRecording
 from relpos.simulation.world import World
 
-from .air import UwbAir, VirtualClock
+from .air import Action, UwbAir, VirtualClock
 from .node import BoardKind, EmulatedNode, NodeErrors
 from .surroundings import FloatArray, Surroundings
 from .xbee import DELIVERED, XbeeModule
@@ -31,7 +31,8 @@ GRID_HZ = 200.0
 LEAD_S = 0.3
 """From power-on to the first sample: the board boots, configures its sensor and is told its
 wearer. The first sample is held meanwhile, of which the node sees the last tenth of a second."""
-FIRST_COMMAND_US = 20_000
+COMMAND_ATTEMPTS_US = (20_000, 180_000, 500_000, 1_000_000, 2_000_000)
+"""A board that is still starting misses the first; a token that is repeated has no effect twice."""
 COMMAND_PERIOD_US = 40_000
 TAIL_S = 2.5
 """Behind the last sample: the report that is then under way still comes out."""
@@ -153,6 +154,21 @@ class _Recorder:
         report(time_us, DELIVERED)
 
 
+def _unless_answered(
+    emulated: EmulatedNode,
+    coordinator: XbeeModule,
+    recorder: _Recorder,
+    code: wire.CommandCode,
+    value: int,
+    token: int,
+) -> Action:
+    def send(now_us: int) -> None:
+        if all(answer.token != token for answer in recorder.decoder.acknowledged):
+            emulated.command(coordinator, code, value, token, now_us)
+
+    return send
+
+
 def play(
     node: int,
     recording: ImuRecording,
@@ -180,8 +196,11 @@ def play(
         if wearer.step_gain_permille is not None:
             settings.append((wire.CommandCode.SET_STEP_GAIN_PERMILLE, wearer.step_gain_permille))
         for k, (code, value) in enumerate(settings):
-            at_us = FIRST_COMMAND_US + COMMAND_PERIOD_US * k
-            emulated.command(coordinator, code, value, k + 1, at_us)
+            for attempt_us in COMMAND_ATTEMPTS_US:
+                clock.at(
+                    attempt_us + COMMAND_PERIOD_US * k,
+                    _unless_answered(emulated, coordinator, recorder, code, value, k + 1),
+                )
         clock.run(round((len(surroundings.pressure_pa) - 1) / surroundings.rate_hz * 1e6))
     finally:
         emulated.close()
