@@ -16,11 +16,11 @@ class Pozyx {
 
   // Result::error where the fault was not found by the chip, in a gap of the chip's own codes.
   enum Error : uint8_t {
-    kTimedOut = 0x80,    // neither result nor error within 100 ms
+    kTimedOut = 0x80,     // neither result nor error within 100 ms
     kBusFailed = 0x81,
-    kRefused = 0x82,     // a function call was answered with failure
-    kImplausible = 0x83, // the distance is none
-    kStale = 0x84,       // the distance is an older one
+    kRefused = 0x82,      // a function call was answered with failure, or an error has no code
+    kImplausible = 0x83,  // not a distance
+    kStale = 0x84,        // an older distance
   };
 
   struct Result {
