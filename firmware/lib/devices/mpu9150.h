@@ -7,12 +7,6 @@
 
 namespace relpos {
 
-// One reading in SI units, in the sensor's own axes.
-struct Mpu9150Sample {
-  float acceleration_m_s2[3];
-  float angular_rate_rad_s[3];
-};
-
 // Set-up and reading without waiting: each call does at most one transaction and says after how
 // many microseconds it wants the next.
 class Mpu9150 {
@@ -26,8 +20,8 @@ class Mpu9150 {
 
   // Call when due. *wait_us: when to call again (after kReady: counted from read()).
   Event step(Board& board, uint32_t now_us, uint32_t* wait_us);
-  // Fetches the sample announced by kReady. False where the bus fails.
-  bool read(Board& board, Mpu9150Sample* sample);
+  // Fetches the sample announced by kReady, in the sensor's own axes. False where the bus fails.
+  bool read(Board& board, float acceleration_m_s2[3], float angular_rate_rad_s[3]);
   bool running() const { return position_ == kRunning; }
 
  private:

@@ -1,0 +1,71 @@
+// Time inside a node, from a 32-bit microsecond counter that wraps every 71 minutes.
+#pragma once
+
+#include <stdint.h>
+
+namespace relpos {
+
+// Whether `now` has reached `due`, on any counter that wraps, as long as they are less than half
+// its span apart.
+inline bool reached(uint32_t now, uint32_t due) { return static_cast<int32_t>(now - due) >= 0; }
+
+// Milliseconds since begin(). They wrap after 49 days.
+class NodeClock {
+ public:
+  void begin(uint32_t now_us) {
+    last_us_ = now_us;
+    ms_ = 0;
+  }
+  void advance(uint32_t now_us) {  // at least every 71 minutes
+    const uint32_t whole = (now_us - last_us_) / 1000;
+    ms_ += whole;
+    last_us_ += whole * 1000;
+  }
+  uint32_t ms() const { return ms_; }
+
+ private:
+  uint32_t last_us_ = 0;
+  uint32_t ms_ = 0;
+};
+
+// The IMU samples by its own clock, up to 1 % off; integrating with a wrong period would turn every
+// angle wrong by as much. The period is measured in blocks by the node's clock.
+class SampleClock {
+ public:
+  static constexpr uint32_t kNominalUs = 20000;
+  static constexpr uint32_t kGapUs = 30000;  // longer: at least one sample is missing
+
+  // A sample seen at now_us. Returns the time that it stands for.
+  uint32_t step_us(uint32_t now_us) {
+    const uint32_t gap_us = now_us - last_us_;
+    last_us_ = now_us;
+    if (!started_ || gap_us > kGapUs) {
+      block_start_us_ = now_us;
+      block_samples_ = 0;
+      const bool first = !started_;
+      started_ = true;
+      return first ? kNominalUs : gap_us;
+    }
+    if (++block_samples_ == kBlockSamples) {
+      // Seen with up to 1 ms of jitter: 1e-4 of a block. Half of each block's news is taken.
+      const uint32_t measured_us = (now_us - block_start_us_) / kBlockSamples;
+      period_us_ = (period_us_ + measured_us) / 2;
+      block_start_us_ = now_us;
+      block_samples_ = 0;
+    }
+    return period_us_;
+  }
+  uint32_t since_us(uint32_t now_us) const { return now_us - last_us_; }
+  void begin(uint32_t now_us) { last_us_ = now_us; }
+
+ private:
+  static constexpr uint16_t kBlockSamples = 512;  // 10 s
+
+  uint32_t last_us_ = 0;
+  uint32_t block_start_us_ = 0;
+  uint32_t period_us_ = kNominalUs;
+  uint16_t block_samples_ = 0;
+  bool started_ = false;
+};
+
+}  // namespace relpos

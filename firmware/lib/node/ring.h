@@ -1,0 +1,35 @@
+// A fixed ring that gives up its oldest entry when it is full, and says so.
+#pragma once
+
+#include <stdint.h>
+
+namespace relpos {
+
+template <typename Entry, uint8_t kSize>
+class Ring {
+ public:
+  uint8_t count() const { return count_; }
+  bool push(const Entry& entry) {  // false: the oldest one was lost
+    const bool full = count_ == kSize;
+    if (full) pop();
+    uint8_t at = static_cast<uint8_t>(first_ + count_);
+    if (at >= kSize) at = static_cast<uint8_t>(at - kSize);
+    entries_[at] = entry;
+    ++count_;
+    return !full;
+  }
+  Entry pop() {  // only with count() > 0
+    const Entry entry = entries_[first_];
+    if (++first_ == kSize) first_ = 0;
+    --count_;
+    return entry;
+  }
+  void clear() { count_ = 0; }
+
+ private:
+  Entry entries_[kSize];
+  uint8_t first_ = 0;
+  uint8_t count_ = 0;
+};
+
+}  // namespace relpos
