@@ -24,6 +24,7 @@ class Ring {
     --count_;
     return entry;
   }
+  const Entry& oldest() const { return entries_[first_]; }  // only with count() > 0
   void clear() { count_ = 0; }
 
  private:

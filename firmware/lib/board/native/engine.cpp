@@ -1,0 +1,125 @@
+#include "engine.h"
+
+#if !defined(ARDUINO)
+
+#include <new>
+
+#include "board/board.h"
+#include "node/node.h"
+#include "node/settings.h"
+
+namespace relpos {
+namespace {
+
+// The PC's board: the bus and the line are the caller's, the clock is the one handed to poll().
+class NativeBoard final : public Board {
+ public:
+  NativeBoard(const relpos_board_callbacks& callbacks, uint8_t* eeprom, uint16_t eeprom_size,
+              uint32_t now_us)
+      : callbacks_(callbacks), eeprom_(eeprom), eeprom_size_(eeprom_size), now_us_(now_us) {}
+
+  void set_now(uint32_t now_us) { now_us_ = now_us; }
+  void receive(uint8_t byte) {
+    if (received_count_ == kReceiveBytes) return;
+    received_[(received_first_ + received_count_++) % kReceiveBytes] = byte;
+  }
+  void flush() {
+    if (written_count_ == 0) return;
+    const uint16_t count = written_count_;
+    written_count_ = 0;
+    callbacks_.uart_write(callbacks_.context, written_, count);
+  }
+
+  uint8_t uart_write_space() override {
+    return static_cast<uint8_t>(kWriteBytes - written_count_);
+  }
+  void uart_write(uint8_t byte) override {
+    if (written_count_ < kWriteBytes) written_[written_count_++] = byte;
+  }
+  int16_t uart_read() override {
+    if (received_count_ == 0) return -1;
+    const uint8_t byte = received_[received_first_];
+    received_first_ = static_cast<uint16_t>((received_first_ + 1) % kReceiveBytes);
+    --received_count_;
+    return byte;
+  }
+  uint8_t storage_read(uint16_t at) override { return at < eeprom_size_ ? eeprom_[at] : 0xFF; }
+  bool storage_write(uint16_t at, uint8_t value) override {
+    if (at < eeprom_size_) eeprom_[at] = value;
+    return true;
+  }
+  uint32_t now_us() override { return now_us_; }
+  void watchdog_reset() override {}
+  void led(bool) override {}
+  void reset() override { callbacks_.reset(callbacks_.context); }
+  uint16_t free_stack() override { return 0xFFFF; }  // a PC has enough
+  void mark(uint8_t) override {}
+
+ protected:
+  BusStatus i2c_transfer(uint8_t address, const uint8_t* first, uint8_t first_count,
+                         const uint8_t* second, uint8_t second_count, uint8_t* read,
+                         uint8_t read_count) override {
+    const uint8_t status = callbacks_.i2c_transfer(callbacks_.context, address, first, first_count,
+                                                   second, second_count, read, read_count);
+    return status <= static_cast<uint8_t>(BusStatus::kTimeout) ? static_cast<BusStatus>(status)
+                                                               : BusStatus::kTimeout;
+  }
+
+ private:
+  static constexpr uint16_t kReceiveBytes = 256;
+  static constexpr uint8_t kWriteBytes = 255;
+
+  relpos_board_callbacks callbacks_;
+  uint8_t* eeprom_;
+  uint16_t eeprom_size_;
+  uint32_t now_us_;
+  uint8_t received_[kReceiveBytes];
+  uint16_t received_first_ = 0;
+  uint16_t received_count_ = 0;
+  uint8_t written_[kWriteBytes];
+  uint8_t written_count_ = 0;
+};
+
+}  // namespace
+}  // namespace relpos
+
+struct relpos_node {
+  relpos_node(const relpos_board_callbacks& callbacks, uint8_t* eeprom, uint16_t eeprom_size,
+              uint32_t now_us)
+      : board(callbacks, eeprom, eeprom_size, now_us), node(board) {}
+  relpos::NativeBoard board;
+  relpos::Node node;
+};
+
+relpos_node* relpos_node_create(const relpos_board_callbacks* callbacks, uint8_t* eeprom,
+                                uint16_t eeprom_size, uint8_t node_id, uint8_t reset_cause,
+                                uint32_t now_us) {
+  if (callbacks == nullptr || callbacks->i2c_transfer == nullptr ||
+      callbacks->uart_write == nullptr || callbacks->reset == nullptr || eeprom == nullptr ||
+      eeprom_size < relpos::kStorageBytes || node_id == relpos::wire::kBroadcast) {
+    return nullptr;
+  }
+  relpos_node* node = new (std::nothrow) relpos_node(*callbacks, eeprom, eeprom_size, now_us);
+  if (node == nullptr) return nullptr;
+  const uint8_t most = static_cast<uint8_t>(relpos::wire::ResetCause::kCommand);
+  node->node.begin(now_us,
+                   reset_cause <= most ? static_cast<relpos::wire::ResetCause>(reset_cause)
+                                       : relpos::wire::ResetCause::kUnknown,
+                   node_id);
+  return node;
+}
+
+void relpos_node_destroy(relpos_node* node) { delete node; }
+
+void relpos_node_receive(relpos_node* node, const uint8_t* bytes, uint16_t count) {
+  for (uint16_t i = 0; i < count; ++i) node->board.receive(bytes[i]);
+}
+
+uint32_t relpos_node_poll(relpos_node* node, uint32_t now_us) {
+  node->board.set_now(now_us);
+  const uint32_t wait_us = node->node.poll(now_us);
+  node->board.flush();
+  return wait_us;
+}
+
+#endif

@@ -1,0 +1,600 @@
+#include "node/node.h"
+
+#include <math.h>
+
+#include "node/version.h"
+
+namespace relpos {
+namespace {
+
+constexpr uint32_t kMostStepUs = 200000;   // dead reckoning takes no longer step: it starts anew
+constexpr uint32_t kSilentMs = 500;        // without a sample for so long there is no motion to tell
+constexpr uint32_t kFieldStaleMs = 1000;
+constexpr uint16_t kSilentPollUs = 500;    // two bytes at 38400 baud
+constexpr uint32_t kMostWaitUs = 100000;
+constexpr uint8_t kBytesAPoll = 24;
+// The module answers in some 10 ms, with its own retries in under 100 ms. No answer is a failure.
+constexpr uint32_t kTransmitStatusMs = 200;
+constexpr int16_t kWeakSignalDbm = -95;    // DW1000: close to the sensitivity limit [K]
+constexpr uint16_t kMotionPhaseMs = 157;   // between the reports of neighbouring ids, modulo period
+constexpr uint16_t kMostStepAgeMs = 2000;  // then it is sent without waiting for others
+constexpr uint8_t kRebootBytes = 5;
+
+enum : int32_t {
+  kLeastReportMs = 100,
+  kMostPeriodMs = 60000,
+  kLeastRangingMs = 200,
+  kLeastStatusMs = 1000,
+  kLeastLegMm = 400,
+  kMostLegMm = 1400,
+  kLeastGainPermille = 300,
+  kMostGainPermille = 3000,
+  kMostTeam = 20
+};
+
+constexpr uint8_t flag(wire::Quality quality) { return static_cast<uint8_t>(quality); }
+
+}  // namespace
+
+void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
+  clock_.begin(now_us);
+  sample_clock_.begin(now_us);
+  imu_due_us_ = now_us;
+  pozyx_due_us_ = now_us;
+
+  id_ = node_id;
+  if (id_ == 0) {
+    const uint8_t stored = board_.storage_read(kStoredNodeId);
+    const uint8_t complement = board_.storage_read(kStoredNodeIdComplement);
+    const bool good = stored != wire::kCoordinator && stored != wire::kBroadcast &&
+                      static_cast<uint8_t>(stored ^ 0xFF) == complement;
+    id_ = good ? stored : kDefaultNodeId;
+  }
+  store_.load(board_, &settings_);
+
+  // A reboot on command is remembered with its token: the host may not have heard the answer, and
+  // repeating the command must not reboot the node again.
+  uint8_t reboot[kRebootBytes];
+  for (uint8_t i = 0; i < kRebootBytes; ++i) reboot[i] = board_.storage_read(kStoredReboot + i);
+  const uint8_t previous = board_.storage_read(kStoredBootCount);
+  reset_cause_ = cause;
+  if (reboot[0] == previous &&
+      (cause == wire::ResetCause::kWatchdog || cause == wire::ResetCause::kCommand)) {
+    reset_cause_ = wire::ResetCause::kCommand;
+    DoneCommand& done = commands_[0];
+    done.token = static_cast<uint16_t>(reboot[1] | static_cast<uint16_t>(reboot[2]) << 8);
+    done.key = static_cast<uint16_t>(reboot[3] | static_cast<uint16_t>(reboot[4]) << 8);
+    done.command = static_cast<uint8_t>(wire::CommandCode::kReboot);
+    done.result = static_cast<uint8_t>(wire::CommandResult::kDone);
+    done.known = true;
+    next_command_ = 1;
+  }
+  boot_ = static_cast<uint8_t>(previous + 1);
+  board_.storage_write(kStoredBootCount, boot_);  // the only write a start
+
+  pozyx_.begin(id_);
+  configure_inertial();
+  // Nodes switched on together do not all speak and range at the same moment.
+  motion_due_ms_ = settings_.report_period_ms +
+                   static_cast<uint32_t>(id_) * kMotionPhaseMs % settings_.report_period_ms;
+  round_due_ms_ = settings_.ranging_period_ms +
+                  static_cast<uint32_t>(id_ - 1) % settings_.team_size *
+                      settings_.ranging_period_ms / settings_.team_size;
+  status_due_ms_ = motion_due_ms_;  // the first one tells who is there, and why
+  show_health();
+}
+
+uint32_t Node::poll(uint32_t now_us) {
+  board_.watchdog_reset();
+  clock_.advance(now_us);
+  sender_.pump(board_);
+  if (reached(now_us, imu_due_us_)) {
+    run_imu(now_us);
+    return 0;
+  }
+  if (peer_ == kNoPeer && settings_.ranging_period_ms != 0 &&
+      period_over(&round_due_ms_, settings_.ranging_period_ms)) {
+    begin_round(now_us);
+  }
+  if (reached(now_us, pozyx_due_us_)) {
+    run_ranging(now_us);
+    return 0;
+  }
+  if (receive()) return 0;
+  store_.step(board_, settings_);
+  if (radio_free() && (send_next() || run_reboot())) return 0;
+  show_health();
+  return wait_us(now_us);
+}
+
+// Microseconds until something is due. Radio and storage in progress are looked after meanwhile.
+uint32_t Node::wait_us(uint32_t now_us) const {
+  uint32_t wait = kMostWaitUs;
+  if (sender_.busy() || awaiting_status_ || store_.saving() || reboot_step_ != 0) {
+    wait = sender_.busy() ? kSilentPollUs : 4 * kSilentPollUs;
+  }
+  const uint32_t imu = imu_due_us_ - now_us;
+  if (imu < wait) wait = imu;
+  const uint32_t pozyx = pozyx_due_us_ - now_us;
+  if (pozyx < wait) wait = pozyx;
+  const uint32_t dues_ms[] = {motion_due_ms_, status_due_ms_, round_due_ms_};
+  for (const uint32_t& due_ms : dues_ms) {
+    if (&due_ms == &dues_ms[2] && (peer_ != kNoPeer || settings_.ranging_period_ms == 0)) continue;
+    const uint32_t ms = due_ms - clock_.ms();
+    if (ms < wait / 1000) wait = ms * 1000;
+  }
+  return wait;
+}
+
+// Whether a period has ended. Periods that could not be kept are skipped, not made up for.
+bool Node::period_over(uint32_t* due_ms, uint16_t period_ms) {
+  const uint32_t now_ms = clock_.ms();
+  if (!reached(now_ms, *due_ms)) return false;
+  *due_ms += period_ms;
+  if (reached(now_ms, *due_ms)) *due_ms = now_ms + period_ms;
+  return true;
+}
+
+void Node::show_health() {
+  bool on = settings_.led == kLedOn;
+  if (settings_.led == kLedHealth) {
+    // Short flash a second: all well. Fast blinking: a sensor is missing.
+    const uint16_t ms = static_cast<uint16_t>(clock_.ms());
+    const bool well = !imu_silent() && magnetometer_.running() && pozyx_.present();
+    on = well ? (ms & 1023) < 64 : (ms & 255) < 128;
+  }
+  if (on != led_) {
+    led_ = on;
+    board_.led(on);
+  }
+}
+
+// ---- motion ----
+
+bool Node::imu_silent() const { return !sampled_ || clock_.ms() - last_sample_ms_ > kSilentMs; }
+
+void Node::configure_inertial() {
+  InertialConfig config;
+  config.leg_length_m = static_cast<float>(settings_.leg_length_mm) * 1e-3f;
+  config.step_gain = static_cast<float>(settings_.step_gain_permille) * 1e-3f;
+  dead_reckoning_.configure(config);
+}
+
+void Node::run_imu(uint32_t now_us) {
+  uint32_t wait = 0;
+  const bool was_running = imu_.running();
+  const Mpu9150::Event event = imu_.step(board_, now_us, &wait);
+  imu_due_us_ = now_us + wait;
+  if (event == Mpu9150::Event::kReady) {
+    board_.mark(1);
+    const uint32_t start_us = board_.now_us();
+    tick(now_us);
+    const uint32_t took_us = board_.now_us() - start_us;
+    board_.mark(0);
+    if (took_us > worst_tick_us_) {
+      worst_tick_us_ = took_us > 0xFFFF ? 0xFFFF : static_cast<uint16_t>(took_us);
+    }
+  }
+  // A new set-up closes and opens the bypass: the magnetometer has to be found again.
+  if (was_running && !imu_.running()) magnetometer_.restart();
+}
+
+void Node::tick(uint32_t now_us) {
+  ImuSample sample;
+  if (!imu_.read(board_, sample.acceleration_m_s2, sample.angular_rate_rad_s)) {
+    return;  // the next sample's time shows the gap
+  }
+  uint32_t step_us = sample_clock_.step_us(now_us);
+  if (sampled_ && step_us > SampleClock::kGapUs) {
+    const uint32_t missed = (step_us + SampleClock::kNominalUs / 2) / SampleClock::kNominalUs - 1;
+    missed_ticks_ = static_cast<uint16_t>(missed_ticks_ + missed);
+    quality_ |= flag(wire::Quality::kImuGap);
+    if (step_us > kMostStepUs) {
+      totals_.rebase(dead_reckoning_.displacement(), static_cast<float>(step_us) * 1e-6f);
+      dead_reckoning_.reset();
+      quality_ |= flag(wire::Quality::kFilterReset);
+      updates_ = 0;
+      seen_steps_ = 0;
+      step_us = SampleClock::kNominalUs;
+    }
+  }
+  sampled_ = true;
+  last_sample_ms_ = clock_.ms();
+  dead_reckoning_.update(sample, static_cast<float>(step_us) * 1e-6f);
+  ++updates_;
+
+  float field_ut[3];
+  if (magnetometer_.step(board_, field_ut)) {
+    dead_reckoning_.magnetometer(field_ut);
+    last_field_ms_ = clock_.ms();
+    field_seen_ = true;
+  }
+
+  const Displacement& now = dead_reckoning_.displacement();
+  totals_.track(now);
+  const uint16_t flags = now.quality_flags;
+  if ((flags & kMagneticDisturbed) != 0) quality_ |= flag(wire::Quality::kMagnetometerDisturbed);
+  if ((flags & (kAccelerationSaturated | kAngularRateSaturated)) != 0) {
+    quality_ |= flag(wire::Quality::kSaturated);
+  }
+  if ((flags & kForwardUnknown) != 0) quality_ |= flag(wire::Quality::kForwardAxisUnknown);
+  if ((flags & kStepDoubtful) != 0) quality_ |= flag(wire::Quality::kIrregularGait);
+  if ((flags & kBadInput) != 0) quality_ |= flag(wire::Quality::kImuGap);
+  if (now.steps != seen_steps_) note_step();
+}
+
+void Node::note_step() {
+  const Displacement& now = dead_reckoning_.displacement();
+  seen_steps_ = now.steps;
+  if (settings_.step_reports == 0) return;
+  const uint32_t age_ms = (updates_ - now.last_step_tick) * (SampleClock::kNominalUs / 1000);
+  PendingStep step;
+  step.time_ms = static_cast<uint16_t>(clock_.ms() - age_ms);
+  step.length_mm = static_cast<uint16_t>(scaled(now.last_step_length_m, 1000));
+  // The status has no count of its own for these; they are lost for the same reason.
+  if (!steps_.push(step)) ++dropped_ranges_;
+}
+
+// ---- ranging ----
+
+void Node::begin_round(uint32_t now_us) {
+  if (!pozyx_.idle()) return;  // missing: the bus errors tell
+  next_peer(now_us);
+}
+
+void Node::next_peer(uint32_t now_us) {
+  if (++peer_ == id_) ++peer_;
+  if (peer_ > settings_.team_size || !pozyx_.idle()) {
+    peer_ = kNoPeer;
+    return;
+  }
+  pozyx_.start(peer_);
+  pozyx_due_us_ = now_us;
+}
+
+void Node::run_ranging(uint32_t now_us) {
+  uint32_t wait = 0;
+  PozyxRange range;
+  const Pozyx::Event event = pozyx_.step(board_, now_us, &range, &wait);
+  pozyx_due_us_ = now_us + wait;
+  if (event == Pozyx::Event::kNothing) return;
+  if (event == Pozyx::Event::kRanged) {
+    ++ranging_successes_;
+    PendingRange pending;
+    pending.time_ms = clock_.ms();
+    pending.range_mm = range.range_mm;
+    pending.rss_dbm = static_cast<int8_t>(
+        range.rss_dbm < -128 ? -128 : range.rss_dbm > 127 ? 127 : range.rss_dbm);
+    pending.peer = peer_;
+    if (!ranges_.push(pending)) ++dropped_ranges_;
+  } else {
+    ++ranging_failures_;
+  }
+  next_peer(now_us);
+}
+
+// ---- commands ----
+
+bool Node::receive() {
+  for (uint8_t i = 0; i < kBytesAPoll; ++i) {
+    const int16_t byte = board_.uart_read();
+    if (byte < 0) return false;
+    switch (receiver_.feed(static_cast<uint8_t>(byte))) {
+      case XbeeReceiver::Event::kPacket:
+        receive_packet();
+        return true;
+      case XbeeReceiver::Event::kTransmitStatus:
+        if (awaiting_status_ && receiver_.status_frame_id() == frame_id_) {
+          awaiting_status_ = false;
+          if (receiver_.status() != 0) ++radio_failures_;
+        }
+        return true;
+      case XbeeReceiver::Event::kNothing:
+        break;
+    }
+  }
+  return true;
+}
+
+void Node::receive_packet() {
+  const uint8_t* frame = receiver_.payload();
+  const uint8_t length = receiver_.payload_count();
+  wire::Header header;
+  if (wire::open(frame, length, &header) != wire::FrameStatus::kGood) {
+    ++bad_frames_;
+    return;
+  }
+  if (header.node != id_ && header.node != wire::kBroadcast) return;
+  if (header.type != wire::MessageType::kCommand) return;
+  obey(frame + wire::kHeaderBytes,
+       static_cast<uint8_t>(length - wire::kHeaderBytes - wire::kCrcBytes));
+}
+
+void Node::obey(const uint8_t* body, uint8_t length) {
+  if (length != wire::kCommandBytes) {
+    ++bad_frames_;
+    return;
+  }
+  wire::Command command;
+  const bool known = wire::decode(body, length, &command);
+  const uint16_t key = wire::crc16(body, length);
+  if (!known) {
+    command.token = static_cast<uint16_t>(body[0] | static_cast<uint16_t>(body[1]) << 8);
+    command.command = body[2];
+    command.value = 0;
+  }
+  for (DoneCommand& done : commands_) {
+    if (done.known && done.token == command.token && done.key == key) {
+      done.answer_due = true;
+      return;
+    }
+  }
+  DoneCommand& done = commands_[next_command_];
+  if (done.known && done.answer_due) {  // four answers wait: the host will ask again
+    ++bad_frames_;
+    return;
+  }
+  if (++next_command_ == kRememberedCommands) next_command_ = 0;
+  done.token = command.token;
+  done.key = key;
+  done.command = command.command;
+  done.value = command.value;
+  done.result = static_cast<uint8_t>(
+      known ? apply(command.command, command.value, &done.value) : wire::CommandResult::kUnknownCommand);
+  done.known = true;
+  done.answer_due = true;
+}
+
+bool Node::set(uint16_t* setting, int32_t value, int32_t low, int32_t high, int32_t* in_force) {
+  const bool good = value >= low && value <= high;
+  if (good && *setting != value) {
+    *setting = static_cast<uint16_t>(value);
+    store_.save(settings_);
+  }
+  *in_force = *setting;
+  return good;
+}
+
+bool Node::set(uint8_t* setting, int32_t value, int32_t low, int32_t high, int32_t* in_force) {
+  uint16_t wide = *setting;
+  const bool good = value >= low && value <= high;
+  if (good && wide != value) {
+    *setting = static_cast<uint8_t>(value);
+    store_.save(settings_);
+  }
+  *in_force = *setting;
+  return good;
+}
+
+wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_force) {
+  Settings& s = settings_;
+  bool good = true;
+  switch (static_cast<wire::CommandCode>(command)) {
+    case wire::CommandCode::kPing:
+      break;
+    case wire::CommandCode::kReboot:
+      if (reboot_step_ == 0) reboot_step_ = 1;
+      break;
+    case wire::CommandCode::kSetReportPeriodMs:
+      good = set(&s.report_period_ms, value, kLeastReportMs, kMostPeriodMs, in_force);
+      if (good) motion_due_ms_ = clock_.ms() + s.report_period_ms;
+      break;
+    case wire::CommandCode::kSetRangingPeriodMs:  // 0: no ranging
+      good = set(&s.ranging_period_ms, value, value == 0 ? 0 : kLeastRangingMs, kMostPeriodMs,
+                 in_force);
+      if (good) round_due_ms_ = clock_.ms() + s.ranging_period_ms;
+      break;
+    case wire::CommandCode::kSetStatusPeriodMs:
+      good = set(&s.status_period_ms, value, kLeastStatusMs, kMostPeriodMs, in_force);
+      if (good) status_due_ms_ = clock_.ms() + s.status_period_ms;
+      break;
+    case wire::CommandCode::kSetLegLengthMm:
+    case wire::CommandCode::kSetStepGainPermille: {
+      const bool leg = static_cast<wire::CommandCode>(command) == wire::CommandCode::kSetLegLengthMm;
+      uint16_t* setting = leg ? &s.leg_length_mm : &s.step_gain_permille;
+      const uint16_t before = *setting;
+      good = set(setting, value, leg ? kLeastLegMm : kLeastGainPermille,
+                 leg ? kMostLegMm : kMostGainPermille, in_force);
+      if (*setting != before) {
+        ++s.gain_version;
+        store_.save(s);
+        configure_inertial();
+      }
+      break;
+    }
+    case wire::CommandCode::kSetTeamSize:
+      good = set(&s.team_size, value, 1, kMostTeam, in_force);
+      break;
+    case wire::CommandCode::kSetStepReports:
+      good = set(&s.step_reports, value, 0, 1, in_force);
+      if (s.step_reports == 0) steps_.clear();
+      break;
+    case wire::CommandCode::kSetLed:
+      good = set(&s.led, value, kLedOff, kLedHealth, in_force);
+      break;
+  }
+  return good ? wire::CommandResult::kDone : wire::CommandResult::kOutOfRange;
+}
+
+bool Node::answer_due() const {
+  for (const DoneCommand& done : commands_) {
+    if (done.answer_due) return true;
+  }
+  return false;
+}
+
+// Behind the answer: writes down whose command it was, a byte a poll, then restarts.
+bool Node::run_reboot() {
+  if (reboot_step_ == 0 || store_.saving() || answer_due()) return false;
+  if (reboot_step_ > kRebootBytes) {
+    board_.reset();
+    reboot_step_ = 0;  // where the board outlives its reset
+    return false;
+  }
+  const DoneCommand* reboot = &commands_[0];
+  for (const DoneCommand& done : commands_) {
+    if (done.known && done.command == static_cast<uint8_t>(wire::CommandCode::kReboot)) {
+      reboot = &done;
+    }
+  }
+  const uint8_t bytes[kRebootBytes] = {
+      boot_, static_cast<uint8_t>(reboot->token), static_cast<uint8_t>(reboot->token >> 8),
+      static_cast<uint8_t>(reboot->key), static_cast<uint8_t>(reboot->key >> 8)};
+  const uint8_t at = static_cast<uint8_t>(reboot_step_ - 1);
+  if (!board_.storage_write(kStoredReboot + at, bytes[at])) return false;
+  ++reboot_step_;
+  return true;
+}
+
+// ---- telemetry ----
+
+// The module takes the next frame once it has told what became of the last one.
+bool Node::radio_free() {
+  if (sender_.busy()) return false;
+  if (!awaiting_status_) return true;
+  if (clock_.ms() - sent_ms_ < kTransmitStatusMs) return false;
+  awaiting_status_ = false;
+  ++radio_failures_;
+  return true;
+}
+
+// Motion and status are written when they are sent, so they cannot wait in a queue and be dropped;
+// ranges wait in a ring that gives up the oldest.
+bool Node::send_next() {
+  uint8_t* body = frame_ + wire::kHeaderBytes;
+  if (answer_due() && !store_.saving()) {  // acknowledged once it is done for good
+    send(wire::MessageType::kAcknowledgement, fill_answer(body));
+  } else if (period_over(&motion_due_ms_, settings_.report_period_ms)) {
+    send(wire::MessageType::kMotion, fill_motion(body));
+  } else if (ranges_.count() >= wire::kMostRanges || (peer_ == kNoPeer && ranges_.count() > 0)) {
+    send(wire::MessageType::kRanges, fill_ranges(body));
+  } else if (period_over(&status_due_ms_, settings_.status_period_ms)) {
+    send(wire::MessageType::kStatus, fill_status(body));
+  } else if (steps_report_due()) {
+    send(wire::MessageType::kSteps, fill_steps(body));
+  } else {
+    return false;
+  }
+  return true;
+}
+
+void Node::send(wire::MessageType type, uint8_t body_bytes) {
+  if (body_bytes == 0) {  // a value out of its range: nothing is better than something wrong
+    ++radio_failures_;
+    return;
+  }
+  wire::Header header;
+  header.type = type;
+  header.node = id_;
+  header.boot = boot_;
+  header.sequence = sequence_++;
+  const uint8_t length = wire::seal(header, body_bytes, frame_);
+  if (++frame_id_ == 0) frame_id_ = 1;  // 0 would ask for no status
+  awaiting_status_ = true;
+  sent_ms_ = clock_.ms();
+  sender_.start(frame_id_, wire::kCoordinator, frame_, length);
+  sender_.pump(board_);
+}
+
+uint8_t Node::fill_motion(uint8_t* body) {
+  const Displacement& now = dead_reckoning_.displacement();
+  wire::Motion motion = {};
+  totals_.fill(now, &motion);
+  const bool silent = imu_silent();
+  const bool field = field_seen_ && clock_.ms() - last_field_ms_ <= kFieldStaleMs;
+  // The totals end with the last sample, not with this moment.
+  motion.time_ms = sampled_ && !silent ? last_sample_ms_ : clock_.ms();
+  if (field && now.magnetic_heading_valid) {
+    motion.magnetic_heading_100urad =
+        static_cast<int16_t>(lroundf(now.magnetic_heading_rad * 10000.0f));
+    quality_ |= flag(wire::Quality::kMagnetometerValid);
+  }
+  if (silent) quality_ |= flag(wire::Quality::kImuGap);
+  wire::MotionState state = now.moving ? wire::MotionState::kMoving : wire::MotionState::kStanding;
+  if (silent || !now.initialised) state = wire::MotionState::kStarting;
+  motion.state = static_cast<uint8_t>(state);
+  motion.gain_version = settings_.gain_version;
+  motion.quality = quality_;
+  quality_ = 0;
+  return wire::encode(motion, body);
+}
+
+uint8_t Node::fill_ranges(uint8_t* body) {
+  wire::Ranges message;
+  message.time_ms = clock_.ms();
+  message.count = 0;
+  while (ranges_.count() > 0 && message.count < wire::kMostRanges) {
+    const PendingRange pending = ranges_.pop();
+    const uint32_t age_ms = message.time_ms - pending.time_ms;
+    if (age_ms > 0xFFFF) {
+      ++dropped_ranges_;
+      continue;
+    }
+    wire::RangeEntry& entry = message.entries[message.count++];
+    entry.peer = pending.peer;
+    entry.range_mm = pending.range_mm;
+    entry.rss_dbm = pending.rss_dbm;
+    entry.age_ms = static_cast<uint16_t>(age_ms);
+    entry.quality = pending.rss_dbm < kWeakSignalDbm
+                        ? static_cast<uint8_t>(wire::RangeQuality::kWeakSignal)
+                        : 0;
+  }
+  return wire::encode(message, body);
+}
+
+uint8_t Node::fill_status(uint8_t* body) {
+  wire::Status status = {};
+  status.time_ms = clock_.ms();
+  status.firmware_major = kFirmwareMajor;
+  status.firmware_minor = kFirmwareMinor;
+  status.firmware_patch = kFirmwarePatch;
+  status.uptime_s = clock_.ms() / 1000;
+  status.reset_cause = static_cast<uint8_t>(reset_cause_);
+  status.bus_errors = board_.bus_errors();
+  status.ranging_successes = ranging_successes_;
+  status.ranging_failures = ranging_failures_;
+  status.worst_tick_us = worst_tick_us_;
+  status.missed_ticks = missed_ticks_;
+  status.free_stack_bytes = board_.free_stack();
+  status.bad_frames = static_cast<uint16_t>(bad_frames_ + receiver_.bad_frames());
+  status.dropped_ranges = dropped_ranges_;
+  status.radio_failures = radio_failures_;
+  worst_tick_us_ = 0;
+  return wire::encode(status, body);
+}
+
+bool Node::steps_report_due() const {
+  if (steps_.count() == 0) return false;
+  const uint16_t age_ms =
+      static_cast<uint16_t>(static_cast<uint16_t>(clock_.ms()) - steps_.oldest().time_ms);
+  return steps_.count() >= kPendingSteps / 2 || age_ms > kMostStepAgeMs;
+}
+
+uint8_t Node::fill_steps(uint8_t* body) {
+  wire::Steps message;
+  message.time_ms = clock_.ms();
+  message.count = 0;
+  while (steps_.count() > 0 && message.count < wire::kMostSteps) {
+    const PendingStep step = steps_.pop();
+    wire::StepEntry& entry = message.entries[message.count++];
+    entry.age_ms = static_cast<uint16_t>(static_cast<uint16_t>(message.time_ms) - step.time_ms);
+    entry.length_mm = step.length_mm;
+  }
+  return wire::encode(message, body);
+}
+
+uint8_t Node::fill_answer(uint8_t* body) {
+  for (DoneCommand& done : commands_) {
+    if (!done.answer_due) continue;
+    done.answer_due = false;
+    wire::Acknowledgement answer;
+    answer.token = done.token;
+    answer.command = done.command;
+    answer.result = done.result;
+    answer.value = done.value;
+    return wire::encode(answer, body);
+  }
+  return 0;
+}
+
+}  // namespace relpos

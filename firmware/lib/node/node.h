@@ -1,0 +1,142 @@
+// The node: 50 Hz dead reckoning, rounds of ranging, telemetry, commands. Everything happens in
+// poll(), one bounded piece at a time; the time is an argument.
+#pragma once
+
+#include <stdint.h>
+
+#include "board/board.h"
+#include "devices/ak8975.h"
+#include "devices/mpu9150.h"
+#include "devices/pozyx.h"
+#include "devices/xbee.h"
+#include "inertial/dead_reckoning.h"
+#include "node/clock.h"
+#include "node/motion_totals.h"
+#include "node/ring.h"
+#include "node/settings.h"
+#include "wire/frame.h"
+#include "wire/messages.h"
+
+namespace relpos {
+
+class Node {
+ public:
+  explicit Node(Board& board) : board_(board) {}
+
+  // node_id 0: the stored one. Counts the start.
+  void begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id);
+  // One pass of the main loop; returns microseconds until it wants the next (0: at once).
+  uint32_t poll(uint32_t now_us);
+
+  uint8_t id() const { return id_; }
+
+ private:
+  static constexpr uint8_t kRememberedCommands = 4;
+  static constexpr uint8_t kPendingRanges = 8;
+  static constexpr uint8_t kPendingSteps = 6;
+  static constexpr uint8_t kNoPeer = 0;
+
+  struct PendingRange {
+    uint32_t time_ms;
+    uint32_t range_mm;
+    int8_t rss_dbm;
+    uint8_t peer;
+  };
+  struct PendingStep {
+    uint16_t time_ms;  // low bits: it is sent within seconds
+    uint16_t length_mm;
+  };
+  struct DoneCommand {
+    uint16_t token;
+    uint16_t key;  // CRC of the whole command: a token used anew for another command is another one
+    int32_t value;
+    uint8_t command;
+    uint8_t result;
+    bool known;
+    bool answer_due;
+  };
+
+  void run_imu(uint32_t now_us);
+  void tick(uint32_t now_us);
+  void note_step();
+  void run_ranging(uint32_t now_us);
+  void begin_round(uint32_t now_us);
+  void next_peer(uint32_t now_us);
+
+  bool receive();
+  void receive_packet();
+  void obey(const uint8_t* body, uint8_t length);
+  wire::CommandResult apply(uint8_t command, int32_t value, int32_t* in_force);
+  bool set(uint16_t* setting, int32_t value, int32_t low, int32_t high, int32_t* in_force);
+  bool set(uint8_t* setting, int32_t value, int32_t low, int32_t high, int32_t* in_force);
+  void configure_inertial();
+  bool answer_due() const;
+  bool run_reboot();
+
+  bool radio_free();
+  bool send_next();
+  void send(wire::MessageType type, uint8_t body_bytes);
+  uint8_t fill_motion(uint8_t* body);
+  uint8_t fill_ranges(uint8_t* body);
+  uint8_t fill_status(uint8_t* body);
+  uint8_t fill_steps(uint8_t* body);
+  uint8_t fill_answer(uint8_t* body);
+  bool steps_report_due() const;
+  bool period_over(uint32_t* due_ms, uint16_t period_ms);
+  void show_health();
+  bool imu_silent() const;
+  uint32_t wait_us(uint32_t now_us) const;
+
+  Board& board_;
+  NodeClock clock_;
+  Settings settings_;
+  SettingsStore store_;
+
+  Mpu9150 imu_;
+  Ak8975 magnetometer_;
+  DeadReckoning dead_reckoning_;
+  MotionTotals totals_;
+  SampleClock sample_clock_;
+  uint32_t imu_due_us_ = 0;
+  uint32_t last_sample_ms_ = 0;
+  uint32_t last_field_ms_ = 0;
+  uint32_t updates_ = 0;  // of the dead reckoning since its reset
+  uint16_t seen_steps_ = 0;
+  uint16_t missed_ticks_ = 0;
+  uint16_t worst_tick_us_ = 0;
+  uint8_t quality_ = 0;  // gathered since the last motion message
+  bool field_seen_ = false;
+  bool sampled_ = false;  // ever
+
+  Pozyx pozyx_;
+  Ring<PendingRange, kPendingRanges> ranges_;
+  uint32_t pozyx_due_us_ = 0;
+  uint32_t round_due_ms_ = 0;
+  uint16_t ranging_successes_ = 0;
+  uint16_t ranging_failures_ = 0;
+  uint16_t dropped_ranges_ = 0;
+  uint8_t peer_ = kNoPeer;  // kNoPeer: between rounds
+
+  XbeeSender sender_;
+  XbeeReceiver receiver_;
+  Ring<PendingStep, kPendingSteps> steps_;
+  DoneCommand commands_[kRememberedCommands] = {};
+  uint32_t motion_due_ms_ = 0;
+  uint32_t status_due_ms_ = 0;
+  uint32_t sent_ms_ = 0;
+  uint16_t sequence_ = 0;
+  uint16_t bad_frames_ = 0;  // behind a good XBee checksum
+  uint16_t radio_failures_ = 0;
+  uint8_t next_command_ = 0;
+  uint8_t frame_id_ = 0;
+  bool awaiting_status_ = false;
+  uint8_t frame_[wire::kFrameBytes + wire::kAuthenticationBytes];
+
+  wire::ResetCause reset_cause_ = wire::ResetCause::kUnknown;
+  uint8_t id_ = 0;
+  uint8_t boot_ = 0;
+  uint8_t reboot_step_ = 0;  // 0: no reboot asked
+  bool led_ = false;
+};
+
+}  // namespace relpos
