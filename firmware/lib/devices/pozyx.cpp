@@ -6,167 +6,227 @@ namespace {
 enum Register : uint8_t {
   kWhoAmI = 0x00,
   kErrorCode = 0x04,
-  kInterruptStatus = 0x05,  // cleared by reading
+  kInterruptStatus = 0x05,  // reading clears it
   kInterruptMask = 0x10,
-  kNetworkId = 0x1A
+  kNetworkIdLow = 0x1A,
 };
 enum Function : uint8_t { kDoRanging = 0xB5, kGetRangeInfo = 0xC7 };
-enum Interrupt : uint8_t { kInterruptError = 0x01, kInterruptFunction = 0x10 };
+enum Interrupt : uint8_t { kErrorFlag = 0x01, kFunctionFlag = 0x10 };
 
 constexpr uint8_t kIdentity = 0x43;
-constexpr uint8_t kSuccess = 1;
-constexpr uint8_t kRowBytes = 11;  // status, u32 time stamp, u32 distance, i16 signal strength
-constexpr uint32_t kMostRangeMm = 200000;  // above: the garbage that the tag is known to return
-
+constexpr uint32_t kPowerUpUs = 250000;
+constexpr uint32_t kAbsentUs = 1000000;   // between attempts to reach a chip that does not answer
 constexpr uint32_t kPollUs = 1000;
-constexpr uint32_t kBootUs = 250000;      // vendor's library: no access before
-constexpr uint32_t kAbsentUs = 1000000;   // between attempts to reach a tag that does not answer
-constexpr uint32_t kExchangeUs = 100000;  // vendor's library gives up after that
-constexpr uint8_t kMostFailures = 3;
+// After a failed poll: a stuck bus costs a millisecond each time.
+constexpr uint32_t kFailedPollUs = 5000;
+constexpr uint32_t kTimeoutUs = 100000;
+constexpr uint8_t kMostFailures = 5;
+// From here on garbage: chips have been seen to report 167772160 mm.
+constexpr uint32_t kLeastImplausibleMm = 200000;
 
-uint32_t little_endian(const uint8_t* bytes) {
-  uint32_t value = 0;
-  for (uint8_t i = 4; i != 0; --i) value = value << 8 | bytes[i - 1];
-  return value;
+uint16_t little_endian(const uint8_t* bytes) {
+  return static_cast<uint16_t>(bytes[0] |
+                               static_cast<uint16_t>(static_cast<uint16_t>(bytes[1]) << 8));
+}
+
+uint32_t little_endian_long(const uint8_t* bytes) {
+  return little_endian(bytes) | static_cast<uint32_t>(little_endian(bytes + 2)) << 16;
+}
+
+// The Pozyx wants a repeated start with a second write address between register and data.
+bool write_framed(Board& board, uint8_t reg, const uint8_t* data, uint8_t count) {
+  return board.transfer(Pozyx::kAddress, &reg, 1, data, count, nullptr, 0) == BusStatus::kOk;
+}
+
+// The first byte of the answer is the status: 1 success.
+bool call_function(Board& board, Function function, uint16_t peer, uint8_t* answer,
+                   uint8_t count) {
+  const uint8_t bytes[3] = {function, static_cast<uint8_t>(peer),
+                            static_cast<uint8_t>(peer >> 8)};
+  return board.transfer(Pozyx::kAddress, bytes, sizeof bytes, nullptr, 0, answer, count) ==
+         BusStatus::kOk;
+}
+
+bool is_due(uint32_t now_us, uint32_t due_us) {
+  return static_cast<int32_t>(now_us - due_us) >= 0;
 }
 
 }  // namespace
 
-void Pozyx::start(uint8_t peer) {
+void Pozyx::begin(uint16_t network_id) {
+  network_id_ = network_id;
+  state_ = State::kPowerUp;
+}
+
+bool Pozyx::range(uint16_t peer) {
+  if (!ready()) return false;
   peer_ = peer;
-  state_ = State::kCheckId;
+  state_ = State::kClear;
+  return true;
 }
 
-// function, parameters, then the answer behind a repeated start: its first byte is the status.
-bool Pozyx::call(Board& board, uint8_t function, uint8_t* result, uint8_t count) {
-  const uint8_t request[3] = {function, peer_, 0};  // network ids have 16 bits
-  return board.transfer(kAddress, request, sizeof request, nullptr, 0, result, count) ==
-         BusStatus::kOk;
+void Pozyx::fail_set_up(uint32_t now_us, uint32_t* wait_us) {
+  state_ = State::kIdentify;
+  due_us_ = now_us + kAbsentUs;
+  *wait_us = kAbsentUs;
 }
 
-Pozyx::Event Pozyx::fail(uint32_t* wait_us, bool bus) {
-  const bool exchange = state_ > State::kIdle;
-  *wait_us = kPollUs;
-  if (bus && (++failures_ >= kMostFailures || !exchange)) {
-    failures_ = 0;
-    state_ = State::kIdentify;
-    *wait_us = kAbsentUs;
-  } else if (exchange) {
-    state_ = State::kIdle;
-  } else {
-    state_ = State::kIdentify;
-    *wait_us = kAbsentUs;
+void Pozyx::count_failure() {
+  if (failures_ < kMostFailures) ++failures_;
+}
+
+// Ends the exchange; after too many failures the chip has lost its settings or the bus.
+Pozyx::Event Pozyx::done(uint8_t error, uint32_t* wait_us, Result* result) {
+  result->peer = static_cast<uint8_t>(peer_);
+  result->success = error == 0;
+  result->error = error;
+  if (error != 0) {
+    result->range_mm = 0;
+    result->rss_dbm = 0;
   }
-  return exchange ? Event::kFailed : Event::kNothing;
+  if (failures_ >= kMostFailures) {
+    begin(network_id_);
+    *wait_us = 0;
+  } else {
+    state_ = State::kIdle;
+    *wait_us = kIdleUs;
+  }
+  return Event::kDone;
 }
 
-Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, PozyxRange* range, uint32_t* wait_us) {
+Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Result* result) {
   *wait_us = 0;
-  uint8_t bytes[kRowBytes];
   switch (state_) {
-    case State::kBoot:
+    case State::kOff:
+    case State::kIdle:
+      *wait_us = kIdleUs;
+      return Event::kNothing;
+
+    case State::kPowerUp:
       state_ = State::kIdentify;
-      *wait_us = kBootUs;
+      due_us_ = now_us + kPowerUpUs;
+      *wait_us = kPowerUpUs;
       return Event::kNothing;
 
-    case State::kIdentify:
-      if (!board.read_registers(kAddress, kWhoAmI, bytes, 1)) return fail(wait_us, true);
-      if (bytes[0] != kIdentity) return fail(wait_us, false);
-      state_ = State::kSetMask;
-      return Event::kNothing;
-
-    case State::kSetMask:
-    case State::kSetId: {
-      // Unlike other chips the tag wants register and data behind two start conditions.
-      const bool mask = state_ == State::kSetMask;
-      const uint8_t reg = mask ? kInterruptMask : kNetworkId;
-      bytes[0] = mask ? static_cast<uint8_t>(kInterruptError | kInterruptFunction) : network_id_;
-      bytes[1] = 0;
-      const uint8_t count = mask ? 1 : 2;
-      if (board.transfer(kAddress, &reg, 1, bytes, count, nullptr, 0) != BusStatus::kOk) {
-        return fail(wait_us, true);
+    case State::kIdentify: {
+      if (!is_due(now_us, due_us_)) {
+        *wait_us = due_us_ - now_us;
+        return Event::kNothing;
       }
-      state_ = mask ? State::kSetId : State::kIdle;
+      uint8_t identity = 0;
+      if (!board.read_registers(kAddress, kWhoAmI, &identity, 1) || identity != kIdentity) {
+        fail_set_up(now_us, wait_us);
+        return Event::kNothing;
+      }
+      state_ = State::kNetworkId;
+      return Event::kNothing;
+    }
+
+    case State::kNetworkId: {
+      const uint8_t bytes[2] = {static_cast<uint8_t>(network_id_),
+                                static_cast<uint8_t>(network_id_ >> 8)};
+      if (!write_framed(board, kNetworkIdLow, bytes, sizeof bytes)) {
+        fail_set_up(now_us, wait_us);
+        return Event::kNothing;
+      }
+      state_ = State::kMask;
+      return Event::kNothing;
+    }
+
+    case State::kMask: {
+      const uint8_t mask = kErrorFlag | kFunctionFlag;
+      if (!write_framed(board, kInterruptMask, &mask, 1)) {
+        fail_set_up(now_us, wait_us);
+        return Event::kNothing;
+      }
+      state_ = State::kIdle;
+      failures_ = 0;
+      last_ms_ = 0;
+      *wait_us = kIdleUs;
+      return Event::kNothing;
+    }
+
+    case State::kClear: {
+      // A peer's exchange with this Pozyx raises FUNC here too.
+      uint8_t stale = 0;
+      if (!board.read_registers(kAddress, kInterruptStatus, &stale, 1)) {
+        count_failure();
+        return done(kBusFailed, wait_us, result);
+      }
+      state_ = State::kCall;
+      return Event::kNothing;
+    }
+
+    case State::kCall: {
+      uint8_t status = 0;
+      if (!call_function(board, kDoRanging, peer_, &status, 1)) {
+        count_failure();
+        return done(kBusFailed, wait_us, result);
+      }
+      if (status != 1) return done(kRefused, wait_us, result);
+      state_ = State::kPoll;
+      due_us_ = now_us + kTimeoutUs;
       *wait_us = kPollUs;
       return Event::kNothing;
     }
 
-    case State::kIdle:
-      *wait_us = kAbsentUs;
-      return Event::kNothing;
-
-    case State::kCheckId:
-      if (!board.read_registers(kAddress, kNetworkId, bytes, 2)) return fail(wait_us, true);
-      if (bytes[0] != network_id_ || bytes[1] != 0) {  // it restarted: set it up anew
-        state_ = State::kIdentify;
-        return Event::kFailed;
-      }
-      state_ = State::kBaseline;
-      return Event::kNothing;
-
-    case State::kBaseline:
-      if (!call(board, kGetRangeInfo, bytes, kRowBytes)) return fail(wait_us, true);
-      has_baseline_ = bytes[0] == kSuccess;  // a peer never ranged before has no row
-      baseline_ms_ = little_endian(bytes + 1);
-      state_ = State::kClear;
-      return Event::kNothing;
-
-    case State::kClear:
-      // Behind the baseline: a refused call raises the error flag.
-      if (!board.read_registers(kAddress, kInterruptStatus, bytes, 1)) return fail(wait_us, true);
-      state_ = State::kRange;
-      return Event::kNothing;
-
-    case State::kRange:
-      if (!call(board, kDoRanging, bytes, 1)) return fail(wait_us, true);
-      if (bytes[0] != kSuccess) return fail(wait_us, false);
-      started_us_ = now_us;
-      state_ = State::kPoll;
-      *wait_us = kPollUs;
-      return Event::kNothing;
-
-    case State::kPoll:
-      *wait_us = kPollUs;
-      // Strictly behind the deadline, so that a completion at the last poll still counts.
-      if (now_us - started_us_ > kExchangeUs) return fail(wait_us, false);
-      if (!board.read_registers(kAddress, kInterruptStatus, bytes, 1)) return fail(wait_us, true);
-      failures_ = 0;
-      if ((bytes[0] & kInterruptError) != 0) {
+    case State::kPoll: {
+      uint8_t flags = 0;
+      const bool answered = board.read_registers(kAddress, kInterruptStatus, &flags, 1);
+      if (!answered) {
+        count_failure();
+        if (failures_ >= kMostFailures) return done(kBusFailed, wait_us, result);
+      } else if ((flags & kErrorFlag) != 0) {
         state_ = State::kError;
-        *wait_us = 0;
-      } else if ((bytes[0] & kInterruptFunction) != 0) {
+        return Event::kNothing;
+      } else if ((flags & kFunctionFlag) != 0) {
         state_ = State::kFetch;
-        *wait_us = 0;
+        return Event::kNothing;
       }
+      if (is_due(now_us, due_us_)) {
+        // A chip that has restarted with its interrupts masked answers, but never tells.
+        count_failure();
+        return done(kTimedOut, wait_us, result);
+      }
+      *wait_us = answered ? kPollUs : kFailedPollUs;
       return Event::kNothing;
+    }
 
-    case State::kError:
-      // Read, so that the tag forgets it; which one it was, nobody asks yet.
-      if (!board.read_registers(kAddress, kErrorCode, bytes, 1)) return fail(wait_us, true);
-      return fail(wait_us, false);
+    case State::kError: {
+      uint8_t code = 0;
+      if (!board.read_registers(kAddress, kErrorCode, &code, 1)) {
+        count_failure();
+        return done(kBusFailed, wait_us, result);
+      }
+      failures_ = 0;
+      // An error flag with code 0 is still no distance.
+      return done(code != 0 ? code : static_cast<uint8_t>(kRefused), wait_us, result);
+    }
 
     case State::kFetch:
       break;
   }
-  if (!call(board, kGetRangeInfo, bytes, kRowBytes)) return fail(wait_us, true);
-  const uint32_t stamp_ms = little_endian(bytes + 1);
-  if (bytes[0] != kSuccess || (has_baseline_ && stamp_ms == baseline_ms_)) {
-    // Not ours: another tag has ranged with this one. Ours may still come; the deadline decides.
-    state_ = State::kPoll;
-    *wait_us = kPollUs;
-    return Event::kNothing;
+  uint8_t answer[11];  // status, time ms, distance mm, signal strength dBm
+  if (!call_function(board, kGetRangeInfo, peer_, answer, sizeof answer)) {
+    count_failure();
+    return done(kBusFailed, wait_us, result);
   }
-  const uint32_t range_mm = little_endian(bytes + 5);
-  // Not: stamp before the baseline (signed difference, for the clock wraps).
-  if (range_mm == 0 || range_mm >= kMostRangeMm ||
-      (has_baseline_ && static_cast<int32_t>(stamp_ms - baseline_ms_) < 0)) {
-    return fail(wait_us, false);
+  failures_ = 0;
+  if (answer[0] != 1) return done(kRefused, wait_us, result);
+  const uint32_t range_mm = little_endian_long(answer + 5);
+  if (range_mm == 0 || range_mm >= kLeastImplausibleMm) return done(kImplausible, wait_us, result);
+  const uint32_t time_ms = little_endian_long(answer + 1);
+  const int32_t advance_ms = static_cast<int32_t>(time_ms - last_ms_);
+  if (advance_ms <= 0) {
+    // A clock that went back means a restart, which has lost the settings too.
+    if (advance_ms < 0) failures_ = kMostFailures;
+    return done(kStale, wait_us, result);
   }
-  range->range_mm = range_mm;
-  range->rss_dbm = static_cast<int16_t>(bytes[9] | static_cast<uint16_t>(static_cast<uint16_t>(bytes[10]) << 8));
-  state_ = State::kIdle;
-  *wait_us = kPollUs;
-  return Event::kRanged;
+  last_ms_ = time_ms;
+  const int16_t rss_dbm = static_cast<int16_t>(little_endian(answer + 9));
+  result->range_mm = range_mm;
+  result->rss_dbm = static_cast<int8_t>(rss_dbm < -128 ? -128 : rss_dbm > 127 ? 127 : rss_dbm);
+  return done(0, wait_us, result);
 }
 
 }  // namespace relpos

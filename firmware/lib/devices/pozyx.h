@@ -1,4 +1,4 @@
-// Pozyx tag (firmware 1.x): two-way ranging by UWB, without waiting.
+// Pozyx tag or shield (firmware 1.x): distances to other Pozyx by ultra-wideband two-way ranging.
 #pragma once
 
 #include <stdint.h>
@@ -7,60 +7,69 @@
 
 namespace relpos {
 
-struct PozyxRange {
-  uint32_t range_mm;
-  int16_t rss_dbm;
-};
-
-// Each call of step() does at most one transaction and says after how many microseconds it wants
-// the next. An exchange is: note the peer's last row, clear the flags, start, poll each millisecond,
-// fetch the row; it counts only if the row's time stamp has changed, so that a completion that
-// belongs to somebody else's exchange is not taken for ours.
+// Set-up and exchanges without waiting: each call does at most one transaction and says after how
+// many microseconds it wants the next.
 class Pozyx {
  public:
   static constexpr uint8_t kAddress = 0x4B;
+  static constexpr uint32_t kIdleUs = UINT32_MAX;  // *wait_us where only range() gives work
+
+  // Result::error where the fault was not found by the chip, in a gap of the chip's own codes.
+  enum Error : uint8_t {
+    kTimedOut = 0x80,     // neither result nor error within 100 ms
+    kBusFailed = 0x81,
+    kRefused = 0x82,      // a function call was answered with failure, or an error has no code
+    kImplausible = 0x83,  // not a distance
+    kStale = 0x84,        // an older distance
+  };
+
+  struct Result {
+    uint8_t peer;
+    bool success;
+    uint32_t range_mm;  // 0 without success
+    int8_t rss_dbm;     // clamped; 0 without success
+    uint8_t error;      // the chip's code or Error; 0 with success
+  };
 
   enum class Event : uint8_t {
     kNothing,
-    kRanged,  // *range holds the distance asked for
-    kFailed,  // the exchange gave none
+    kDone,  // *result is filled
   };
 
-  void begin(uint8_t network_id) { network_id_ = network_id; }
-  // The tag answers and bears our network id; false while an exchange runs.
-  bool idle() const { return state_ == State::kIdle; }
-  bool present() const { return state_ >= State::kIdle; }
-  // Only when idle. Checks the network id first: a tag that restarted has lost it.
-  void start(uint8_t peer);
-  Event step(Board& board, uint32_t now_us, PozyxRange* range, uint32_t* wait_us);
+  // Sets up anew; an exchange under way is forgotten. Idle until the first call.
+  void begin(uint16_t network_id);
+  bool ready() const { return state_ == State::kIdle; }  // for range()
+  bool running() const { return state_ >= State::kIdle; }
+  // Asks for an exchange, which the following steps make. False where not ready().
+  bool range(uint16_t peer);
+  // Call when due, and at once after begin() and range(). *wait_us: when to call again.
+  Event step(Board& board, uint32_t now_us, uint32_t* wait_us, Result* result);
 
  private:
   enum class State : uint8_t {
-    kBoot,
-    kIdentify,
-    kSetMask,
-    kSetId,
+    kOff,       // begin() was never called
+    kPowerUp,
+    kIdentify,  // from due_us_ on
+    kNetworkId,
+    kMask,
     kIdle,
-    kCheckId,
-    kBaseline,
-    kClear,
-    kRange,
-    kPoll,
-    kFetch,
+    kClear,     // first of an exchange
+    kCall,
+    kPoll,      // until due_us_
     kError,
+    kFetch,
   };
 
-  bool call(Board& board, uint8_t function, uint8_t* result, uint8_t count);
-  bool row(Board& board, uint8_t* row);
-  Event fail(uint32_t* wait_us, bool bus);
+  void fail_set_up(uint32_t now_us, uint32_t* wait_us);
+  Event done(uint8_t error, uint32_t* wait_us, Result* result);
+  void count_failure();
 
-  State state_ = State::kBoot;
-  uint8_t network_id_ = 0;
-  uint8_t peer_ = 0;
-  uint8_t failures_ = 0;  // of the bus, in a row
-  bool has_baseline_ = false;
-  uint32_t baseline_ms_ = 0;  // the tag's clock
-  uint32_t started_us_ = 0;   // also: of the boot
+  uint32_t due_us_ = 0;
+  uint32_t last_ms_ = 0;  // the chip's time of the last distance; 0: none
+  uint16_t network_id_ = 0;
+  uint16_t peer_ = 0;
+  State state_ = State::kOff;
+  uint8_t failures_ = 0;  // bus failures and silences since the chip last ended an exchange
 };
 
 }  // namespace relpos

@@ -3,127 +3,176 @@
 namespace relpos {
 namespace {
 
-enum FrameType : uint8_t { kTransmit16 = 0x01, kReceive16 = 0x81, kTransmitStatus = 0x89 };
-enum Special : uint8_t { kDelimiter = 0x7E, kEscape = 0x7D, kXon = 0x11, kXoff = 0x13 };
+constexpr uint8_t kDelimiter = 0x7E;
+constexpr uint8_t kEscape = 0x7D;
+constexpr uint8_t kEscapeFlip = 0x20;
+constexpr uint8_t kXon = 0x11;
+constexpr uint8_t kXoff = 0x13;
 
-constexpr uint8_t kFlip = 0x20;         // an escaped byte travels xor this
-constexpr uint8_t kLengthBytes = 2;
-constexpr uint8_t kTransmitHeader = 5;  // type, frame id, destination(2), options
-constexpr uint8_t kStatusBytes = 3;
+enum FrameType : uint8_t {
+  kTransmit16 = 0x01,
+  kReceive64 = 0x80,
+  kReceive16 = 0x81,
+  kTransmitStatus = 0x89,
+};
 
-bool special(uint8_t byte) {
+constexpr uint8_t kTransmit16Header = 5;  // type, frame id, destination, options
+constexpr uint8_t kReceive16Header = 5;   // type, source, signal strength, options
+constexpr uint8_t kReceive64Header = 11;
+constexpr uint8_t kTransmitStatusBytes = 3;  // type, frame id, status
+constexpr uint16_t kFirstData = 3 + kTransmit16Header;  // in the outgoing frame
+
+bool needs_escape(uint8_t byte) {
   return byte == kDelimiter || byte == kEscape || byte == kXon || byte == kXoff;
+}
+
+bool is_payload(uint8_t type) { return type == kReceive16 || type == kReceive64; }
+
+uint8_t header_bytes(uint8_t type) {
+  return type == kReceive16 ? kReceive16Header : kReceive64Header;
 }
 
 }  // namespace
 
-void XbeeSender::start(uint8_t frame_id, uint16_t destination, const uint8_t* payload,
-                       uint8_t count) {
-  frame_id_ = frame_id;
+bool Xbee::send(uint16_t destination, const uint8_t* data, uint8_t length) {
+  if (sending_) return false;
+  data_ = data;
+  data_length_ = length;
   destination_ = destination;
-  payload_ = payload;
-  count_ = count;
   position_ = 0;
-  checksum_ = 0xFF;
-  escaped_ = false;
-  stage_ = Stage::kDelimiter;
+  sent_sum_ = 0;
+  sent_escape_ = false;
+  // 0 would ask for no status.
+  if (++frame_id_ == 0) frame_id_ = 1;
+  sending_ = true;
+  unanswered_ = true;
+  return true;
 }
 
-uint8_t XbeeSender::body_byte() const {
+uint8_t Xbee::next_byte() const {
+  if (position_ >= kFirstData) {
+    const uint16_t at = static_cast<uint16_t>(position_ - kFirstData);
+    return at < data_length_ ? data_[at] : static_cast<uint8_t>(0xFF - sent_sum_);
+  }
+  const uint16_t length = static_cast<uint16_t>(kTransmit16Header + data_length_);
   switch (position_) {
-    case 0: return 0;  // frames are shorter than 256 bytes
-    case 1: return static_cast<uint8_t>(kTransmitHeader + count_);
-    case 2: return kTransmit16;
-    case 3: return frame_id_;
-    case 4: return static_cast<uint8_t>(destination_ >> 8);
-    case 5: return static_cast<uint8_t>(destination_);
-    case 6: return 0;  // options: acknowledged
-    default: return payload_[position_ - kLengthBytes - kTransmitHeader];
+    case 0: return kDelimiter;
+    case 1: return static_cast<uint8_t>(length >> 8);
+    case 2: return static_cast<uint8_t>(length);
+    case 3: return kTransmit16;
+    case 4: return frame_id_;
+    case 5: return static_cast<uint8_t>(destination_ >> 8);
+    case 6: return static_cast<uint8_t>(destination_);
+    default: return 0;  // options: acknowledged
   }
 }
 
-void XbeeSender::pump(Board& board) {
-  if (!busy()) return;
-  for (uint8_t space = board.uart_write_space(); space != 0 && busy(); --space) {
-    if (stage_ == Stage::kDelimiter) {
-      board.uart_write(kDelimiter);
-      stage_ = Stage::kBody;
-      continue;
-    }
-    const uint8_t byte = stage_ == Stage::kBody ? body_byte() : checksum_;
-    if (special(byte) && !escaped_) {
+void Xbee::push(Board& board) {
+  uint8_t space = board.uart_write_space();
+  while (sending_ && space > 0) {
+    --space;
+    const uint8_t byte = next_byte();
+    const bool escaped = position_ > 0 && needs_escape(byte);
+    if (escaped && !sent_escape_) {
       board.uart_write(kEscape);
-      escaped_ = true;
+      sent_escape_ = true;
       continue;
     }
-    board.uart_write(escaped_ ? byte ^ kFlip : byte);
-    escaped_ = false;
-    if (stage_ == Stage::kChecksum) {
-      stage_ = Stage::kNone;
-      return;
+    board.uart_write(escaped ? static_cast<uint8_t>(byte ^ kEscapeFlip) : byte);
+    sent_escape_ = false;
+    if (position_ >= 3) sent_sum_ = static_cast<uint8_t>(sent_sum_ + byte);
+    sending_ = position_++ < kFirstData + data_length_;
+  }
+}
+
+bool Xbee::step(Board& board) {
+  push(board);
+  for (;;) {
+    const int16_t byte = board.uart_read();
+    if (byte < 0) return false;
+    if (take(static_cast<uint8_t>(byte))) return true;
+  }
+}
+
+void Xbee::reject() {
+  ++bad_frames_;
+  part_ = Part::kNone;
+}
+
+bool Xbee::take(uint8_t byte) {
+  if (byte == kDelimiter) {  // always a frame's start, here also the end of one broken off
+    if (part_ != Part::kNone) ++bad_frames_;
+    part_ = Part::kLengthHigh;
+    took_escape_ = false;
+    return false;
+  }
+  if (part_ == Part::kNone) return false;
+  if (byte == kEscape) {
+    took_escape_ = true;
+    return false;
+  }
+  if (took_escape_) {
+    byte ^= kEscapeFlip;
+    took_escape_ = false;
+  }
+  switch (part_) {
+    case Part::kNone:
+      break;
+    case Part::kLengthHigh:
+      length_ = static_cast<uint16_t>(static_cast<uint16_t>(byte) << 8);
+      part_ = Part::kLengthLow;
+      break;
+    case Part::kLengthLow:
+      length_ = static_cast<uint16_t>(length_ | byte);
+      index_ = 0;
+      sum_ = 0;
+      payload_length_ = 0;
+      part_ = Part::kData;
+      if (length_ == 0) reject();
+      break;
+    case Part::kData:
+      sum_ = static_cast<uint8_t>(sum_ + byte);
+      take_data(byte);
+      if (part_ == Part::kData && ++index_ == length_) part_ = Part::kChecksum;
+      break;
+    case Part::kChecksum:
+      sum_ = static_cast<uint8_t>(sum_ + byte);
+      return finish();
+  }
+  return false;
+}
+
+void Xbee::take_data(uint8_t byte) {
+  if (index_ == 0) {
+    type_ = byte;
+    const bool too_short = is_payload(byte) && length_ < header_bytes(byte);
+    const uint16_t payload_bytes = static_cast<uint16_t>(length_ - header_bytes(byte));
+    const bool too_long = is_payload(byte) && payload_bytes > kMostPayload;
+    const bool bad_status = byte == kTransmitStatus && length_ != kTransmitStatusBytes;
+    if (too_short || too_long || bad_status) reject();
+  } else if (type_ == kTransmitStatus) {
+    payload_[index_ - 1] = byte;  // frame id, status
+  } else if (is_payload(type_)) {
+    const uint8_t header = header_bytes(type_);
+    if (index_ >= header) {
+      payload_[payload_length_++] = byte;
+    } else if (index_ + 2U < header) {  // the source, the most significant byte first
+      source_ = static_cast<uint16_t>(static_cast<uint16_t>(source_ << 8) | byte);
     }
-    if (position_ >= kLengthBytes) checksum_ = static_cast<uint8_t>(checksum_ - byte);
-    if (++position_ == kLengthBytes + kTransmitHeader + count_) stage_ = Stage::kChecksum;
   }
 }
 
-uint16_t XbeeReceiver::source() const {
-  return static_cast<uint16_t>(static_cast<uint16_t>(static_cast<uint16_t>(data_[1]) << 8) |
-                               data_[2]);
-}
-
-XbeeReceiver::Event XbeeReceiver::feed(uint8_t byte) {
-  if (byte == kDelimiter) {  // unescaped it begins a frame, always
-    if (stage_ != Stage::kDelimiter) ++bad_frames_;
-    stage_ = Stage::kLengthHigh;
-    escape_ = false;
-    return Event::kNothing;
+bool Xbee::finish() {
+  if (sum_ != 0xFF) {
+    reject();
+    return false;
   }
-  if (stage_ == Stage::kDelimiter) return Event::kNothing;
-  if (byte == kEscape && !escape_) {
-    escape_ = true;
-    return Event::kNothing;
+  part_ = Part::kNone;
+  if (type_ == kTransmitStatus) {
+    if (payload_[0] == frame_id_) unanswered_ = false;
+    if (payload_[1] != 0) ++failures_;
   }
-  if (escape_) {
-    byte ^= kFlip;
-    escape_ = false;
-  }
-  switch (stage_) {
-    case Stage::kLengthHigh:
-      length_ = byte;
-      stage_ = Stage::kLengthLow;
-      break;
-    case Stage::kLengthLow:
-      if (length_ != 0 || byte == 0 || byte > sizeof data_) {
-        ++bad_frames_;
-        stage_ = Stage::kDelimiter;
-        break;
-      }
-      length_ = byte;
-      position_ = 0;
-      checksum_ = 0;
-      stage_ = Stage::kData;
-      break;
-    case Stage::kData:
-      data_[position_] = byte;
-      checksum_ = static_cast<uint8_t>(checksum_ + byte);
-      if (++position_ == length_) stage_ = Stage::kChecksum;
-      break;
-    case Stage::kChecksum:
-      stage_ = Stage::kDelimiter;
-      if (static_cast<uint8_t>(checksum_ + byte) == 0xFF) return finish();
-      ++bad_frames_;
-      break;
-    case Stage::kDelimiter:
-      break;
-  }
-  return Event::kNothing;
-}
-
-XbeeReceiver::Event XbeeReceiver::finish() {
-  if (data_[0] == kReceive16 && length_ >= kReceiveHeader) return Event::kPacket;
-  if (data_[0] == kTransmitStatus && length_ == kStatusBytes) return Event::kTransmitStatus;
-  return Event::kNothing;  // modem status, AT responses: not for us
+  return is_payload(type_);
 }
 
 }  // namespace relpos

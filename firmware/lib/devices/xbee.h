@@ -1,66 +1,64 @@
-// XBee module in API mode with escapes (AP=2), 802.15.4 firmware, this node's 16-bit address set.
+// Digi XBee 802.15.4 in API mode with escapes (AP=2), 16-bit addresses.
 #pragma once
 
 #include <stdint.h>
 
 #include "board/board.h"
+#include "wire/frame.h"
 
 namespace relpos {
 
-// Sending: the frame stays with the caller; it is escaped on the fly into the UART as space allows.
-class XbeeSender {
+// Streams without waiting and without a second buffer: the sender's bytes are escaped straight into
+// the UART; of what comes only RF payloads are kept.
+class Xbee {
  public:
-  bool busy() const { return stage_ != Stage::kNone; }
-  // Starts a TX16 request with acknowledgement. The payload must stay until busy() is false.
-  // frame_id 0: no transmit status wanted.
-  void start(uint8_t frame_id, uint16_t destination, const uint8_t* payload, uint8_t count);
-  void pump(Board& board);
+  static constexpr uint8_t kMostPayload = wire::kFrameBytes + wire::kAuthenticationBytes;
+
+  bool busy() const { return sending_; }
+  // Begins a TX16 request. The data must stay unchanged until !busy(). False while busy().
+  bool send(uint16_t destination, const uint8_t* data, uint8_t length);
+  // The module has not told yet what became of the last request.
+  bool unanswered() const { return unanswered_; }
+  // Pushes what fits into the UART and reads what has come, up to the end of the first RF payload.
+  // True where there is one: received(), received_length() and source() hold until the next step.
+  bool step(Board& board);
+  const uint8_t* received() const { return payload_; }
+  uint8_t received_length() const { return payload_length_; }
+  uint16_t source() const { return source_; }            // of a 64-bit address the low part
+  uint16_t bad_frames() const { return bad_frames_; }    // checksum, length, broken off; wraps
+  uint16_t failures() const { return failures_; }        // TX status other than 0; wraps
 
  private:
-  enum class Stage : uint8_t { kNone, kDelimiter, kBody, kChecksum };
+  enum class Part : uint8_t { kNone, kLengthHigh, kLengthLow, kData, kChecksum };
 
-  uint8_t body_byte() const;
+  void push(Board& board);
+  uint8_t next_byte() const;
+  bool take(uint8_t byte);
+  void take_data(uint8_t byte);
+  bool finish();
+  void reject();
 
-  const uint8_t* payload_ = nullptr;
+  const uint8_t* data_ = nullptr;
   uint16_t destination_ = 0;
-  uint8_t count_ = 0;
+  uint16_t position_ = 0;  // in the outgoing frame, delimiter included, escapes not
+  uint8_t data_length_ = 0;
   uint8_t frame_id_ = 0;
-  uint8_t position_ = 0;  // in length and frame data
-  uint8_t checksum_ = 0;
-  bool escaped_ = false;  // the escape byte is out, the byte itself is not
-  Stage stage_ = Stage::kNone;
-};
+  uint8_t sent_sum_ = 0;
+  bool sending_ = false;
+  bool sent_escape_ = false;
+  bool unanswered_ = false;
 
-// Receiving: bytes in, checked packets out; after garbage it finds the next delimiter.
-class XbeeReceiver {
- public:
-  enum class Event : uint8_t { kNothing, kPacket, kTransmitStatus };
-
-  static constexpr uint8_t kMostPayload = 34;  // a command with authentication has 28
-
-  Event feed(uint8_t byte);
-  // Of the last packet (RX16), until the next feed().
-  uint16_t source() const;
-  const uint8_t* payload() const { return data_ + kReceiveHeader; }
-  uint8_t payload_count() const { return static_cast<uint8_t>(length_ - kReceiveHeader); }
-  // Of the last transmit status.
-  uint8_t status_frame_id() const { return data_[1]; }
-  uint8_t status() const { return data_[2]; }
-  uint16_t bad_frames() const { return bad_frames_; }  // cut off, too long or damaged; wraps
-
- private:
-  static constexpr uint8_t kReceiveHeader = 5;  // type, source(2), rssi, options
-  enum class Stage : uint8_t { kDelimiter, kLengthHigh, kLengthLow, kData, kChecksum };
-
-  Event finish();
-
-  uint8_t data_[kReceiveHeader + kMostPayload];
-  uint8_t length_ = 0;
-  uint8_t position_ = 0;
-  uint8_t checksum_ = 0;
-  bool escape_ = false;
-  Stage stage_ = Stage::kDelimiter;
+  Part part_ = Part::kNone;
+  bool took_escape_ = false;
+  uint8_t type_ = 0;
+  uint8_t sum_ = 0;
+  uint8_t payload_length_ = 0;
+  uint16_t length_ = 0;  // of the incoming frame data
+  uint16_t index_ = 0;   // in it
+  uint16_t source_ = 0;
   uint16_t bad_frames_ = 0;
+  uint16_t failures_ = 0;
+  uint8_t payload_[kMostPayload];
 };
 
 }  // namespace relpos

@@ -12,7 +12,6 @@ constexpr uint32_t kSilentMs = 500;        // without a sample for so long there
 constexpr uint32_t kFieldStaleMs = 1000;
 constexpr uint16_t kSilentPollUs = 500;    // two bytes at 38400 baud
 constexpr uint32_t kMostWaitUs = 100000;
-constexpr uint8_t kBytesAPoll = 24;
 // The module answers in some 10 ms, with its own retries in under 100 ms. No answer is a failure.
 constexpr uint32_t kTransmitStatusMs = 200;
 constexpr int16_t kWeakSignalDbm = -95;    // DW1000: close to the sensitivity limit [K]
@@ -87,7 +86,10 @@ void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
 uint32_t Node::poll(uint32_t now_us) {
   board_.watchdog_reset();
   clock_.advance(now_us);
-  sender_.pump(board_);
+  if (xbee_.step(board_)) {
+    receive_packet();
+    return 0;
+  }
   if (reached(now_us, imu_due_us_)) {
     run_imu(now_us);
     return 0;
@@ -100,7 +102,6 @@ uint32_t Node::poll(uint32_t now_us) {
     run_ranging(now_us);
     return 0;
   }
-  if (receive()) return 0;
   store_.step(board_, settings_);
   if (radio_free() && (send_next() || run_reboot())) return 0;
   show_health();
@@ -110,8 +111,8 @@ uint32_t Node::poll(uint32_t now_us) {
 // Microseconds until something is due. Radio and storage in progress are looked after meanwhile.
 uint32_t Node::wait_us(uint32_t now_us) const {
   uint32_t wait = kMostWaitUs;
-  if (sender_.busy() || awaiting_status_ || store_.saving() || reboot_step_ != 0) {
-    wait = sender_.busy() ? kSilentPollUs : 4 * kSilentPollUs;
+  if (xbee_.busy() || awaiting_status_ || store_.saving() || reboot_step_ != 0) {
+    wait = xbee_.busy() ? kSilentPollUs : 4 * kSilentPollUs;
   }
   const uint32_t imu = imu_due_us_ - now_us;
   if (imu < wait) wait = imu;
@@ -140,7 +141,7 @@ void Node::show_health() {
   if (settings_.led == kLedHealth) {
     // Short flash a second: all well. Fast blinking: a sensor is missing.
     const uint16_t ms = static_cast<uint16_t>(clock_.ms());
-    const bool well = !imu_silent() && magnetometer_.running() && pozyx_.present();
+    const bool well = !imu_silent() && magnetometer_.running() && pozyx_.running();
     on = well ? (ms & 1023) < 64 : (ms & 255) < 128;
   }
   if (on != led_) {
@@ -238,34 +239,32 @@ void Node::note_step() {
 // ---- ranging ----
 
 void Node::begin_round(uint32_t now_us) {
-  if (!pozyx_.idle()) return;  // missing: the bus errors tell
+  if (!pozyx_.ready()) return;  // missing: the bus errors tell
   next_peer(now_us);
 }
 
 void Node::next_peer(uint32_t now_us) {
   if (++peer_ == id_) ++peer_;
-  if (peer_ > settings_.team_size || !pozyx_.idle()) {
+  if (peer_ > settings_.team_size || !pozyx_.range(peer_)) {
     peer_ = kNoPeer;
     return;
   }
-  pozyx_.start(peer_);
   pozyx_due_us_ = now_us;
 }
 
 void Node::run_ranging(uint32_t now_us) {
   uint32_t wait = 0;
-  PozyxRange range;
-  const Pozyx::Event event = pozyx_.step(board_, now_us, &range, &wait);
-  pozyx_due_us_ = now_us + wait;
-  if (event == Pozyx::Event::kNothing) return;
-  if (event == Pozyx::Event::kRanged) {
+  Pozyx::Result result;
+  const Pozyx::Event event = pozyx_.step(board_, now_us, &wait, &result);
+  pozyx_due_us_ = now_us + (wait < kMostWaitUs ? wait : kMostWaitUs);
+  if (event != Pozyx::Event::kDone) return;
+  if (result.success) {
     ++ranging_successes_;
     PendingRange pending;
     pending.time_ms = clock_.ms();
-    pending.range_mm = range.range_mm;
-    pending.rss_dbm = static_cast<int8_t>(
-        range.rss_dbm < -128 ? -128 : range.rss_dbm > 127 ? 127 : range.rss_dbm);
-    pending.peer = peer_;
+    pending.range_mm = result.range_mm;
+    pending.rss_dbm = result.rss_dbm;
+    pending.peer = result.peer;
     if (!ranges_.push(pending)) ++dropped_ranges_;
   } else {
     ++ranging_failures_;
@@ -275,30 +274,9 @@ void Node::run_ranging(uint32_t now_us) {
 
 // ---- commands ----
 
-bool Node::receive() {
-  for (uint8_t i = 0; i < kBytesAPoll; ++i) {
-    const int16_t byte = board_.uart_read();
-    if (byte < 0) return false;
-    switch (receiver_.feed(static_cast<uint8_t>(byte))) {
-      case XbeeReceiver::Event::kPacket:
-        receive_packet();
-        return true;
-      case XbeeReceiver::Event::kTransmitStatus:
-        if (awaiting_status_ && receiver_.status_frame_id() == frame_id_) {
-          awaiting_status_ = false;
-          if (receiver_.status() != 0) ++radio_failures_;
-        }
-        return true;
-      case XbeeReceiver::Event::kNothing:
-        break;
-    }
-  }
-  return true;
-}
-
 void Node::receive_packet() {
-  const uint8_t* frame = receiver_.payload();
-  const uint8_t length = receiver_.payload_count();
+  const uint8_t* frame = xbee_.received();
+  const uint8_t length = xbee_.received_length();
   wire::Header header;
   if (wire::open(frame, length, &header) != wire::FrameStatus::kGood) {
     ++bad_frames_;
@@ -450,7 +428,8 @@ bool Node::run_reboot() {
 
 // The module takes the next frame once it has told what became of the last one.
 bool Node::radio_free() {
-  if (sender_.busy()) return false;
+  if (xbee_.busy()) return false;
+  if (!xbee_.unanswered()) awaiting_status_ = false;
   if (!awaiting_status_) return true;
   if (clock_.ms() - sent_ms_ < kTransmitStatusMs) return false;
   awaiting_status_ = false;
@@ -489,11 +468,9 @@ void Node::send(wire::MessageType type, uint8_t body_bytes) {
   header.boot = boot_;
   header.sequence = sequence_++;
   const uint8_t length = wire::seal(header, body_bytes, frame_);
-  if (++frame_id_ == 0) frame_id_ = 1;  // 0 would ask for no status
   awaiting_status_ = true;
   sent_ms_ = clock_.ms();
-  sender_.start(frame_id_, wire::kCoordinator, frame_, length);
-  sender_.pump(board_);
+  xbee_.send(wire::kCoordinator, frame_, length);
 }
 
 uint8_t Node::fill_motion(uint8_t* body) {
@@ -556,9 +533,9 @@ uint8_t Node::fill_status(uint8_t* body) {
   status.worst_tick_us = worst_tick_us_;
   status.missed_ticks = missed_ticks_;
   status.free_stack_bytes = board_.free_stack();
-  status.bad_frames = static_cast<uint16_t>(bad_frames_ + receiver_.bad_frames());
+  status.bad_frames = static_cast<uint16_t>(bad_frames_ + xbee_.bad_frames());
   status.dropped_ranges = dropped_ranges_;
-  status.radio_failures = radio_failures_;
+  status.radio_failures = static_cast<uint16_t>(radio_failures_ + xbee_.failures());
   worst_tick_us_ = 0;
   return wire::encode(status, body);
 }

@@ -63,7 +63,6 @@ class Node {
   void begin_round(uint32_t now_us);
   void next_peer(uint32_t now_us);
 
-  bool receive();
   void receive_packet();
   void obey(const uint8_t* body, uint8_t length);
   wire::CommandResult apply(uint8_t command, int32_t value, int32_t* in_force);
@@ -117,8 +116,7 @@ class Node {
   uint16_t dropped_ranges_ = 0;
   uint8_t peer_ = kNoPeer;  // kNoPeer: between rounds
 
-  XbeeSender sender_;
-  XbeeReceiver receiver_;
+  Xbee xbee_;
   Ring<PendingStep, kPendingSteps> steps_;
   DoneCommand commands_[kRememberedCommands] = {};
   uint32_t motion_due_ms_ = 0;
@@ -126,9 +124,8 @@ class Node {
   uint32_t sent_ms_ = 0;
   uint16_t sequence_ = 0;
   uint16_t bad_frames_ = 0;  // behind a good XBee checksum
-  uint16_t radio_failures_ = 0;
+  uint16_t radio_failures_ = 0;  // besides those that the module reports
   uint8_t next_command_ = 0;
-  uint8_t frame_id_ = 0;
   bool awaiting_status_ = false;
   uint8_t frame_[wire::kFrameBytes + wire::kAuthenticationBytes];
 
