@@ -1,0 +1,106 @@
+#if defined(ARDUINO)
+
+#include "arduino_board.h"
+
+#include <Arduino.h>
+#include <avr/eeprom.h>
+#include <avr/sleep.h>
+#include <avr/wdt.h>
+
+#include "twi.h"
+#include "uart.h"
+
+namespace {
+
+// Set before the C runtime clears the memory, hence not part of it.
+uint8_t reset_flags __attribute__((section(".noinit")));
+
+constexpr uint8_t kPaint = 0xC5;
+// Timer 0 overflows, and wakes the board, every 1.024 ms.
+constexpr uint32_t kWorthSleepingUs = 1100;
+
+}  // namespace
+
+extern "C" {
+
+extern uint8_t __heap_start;  // the end of the static memory
+
+// The watchdog stays armed at 15 ms through the reset it causes: off at once, and the stack painted
+// to see how far it reaches.
+void relpos_before_main(void) __attribute__((naked, used, section(".init3")));
+void relpos_before_main(void) {
+  reset_flags = MCUSR;
+  MCUSR = 0;
+  wdt_disable();
+  for (uint8_t* at = &__heap_start; at <= reinterpret_cast<uint8_t*>(RAMEND); ++at) *at = kPaint;
+}
+
+}  // extern "C"
+
+namespace relpos {
+
+void ArduinoBoard::begin() {
+  wdt_enable(WDTO_500MS);
+  twi::begin();
+  uart::begin();
+  pinMode(LED_BUILTIN, OUTPUT);
+  set_sleep_mode(SLEEP_MODE_IDLE);
+}
+
+wire::ResetCause ArduinoBoard::reset_cause() const {
+  // A brown-out leaves its mark on the way up, too: the weaker causes come first.
+  if ((reset_flags & _BV(WDRF)) != 0) return wire::ResetCause::kWatchdog;
+  if ((reset_flags & _BV(PORF)) != 0) return wire::ResetCause::kPowerOn;
+  if ((reset_flags & _BV(BORF)) != 0) return wire::ResetCause::kBrownOut;
+  if ((reset_flags & _BV(EXTRF)) != 0) return wire::ResetCause::kExternal;
+  return wire::ResetCause::kUnknown;  // a boot loader has cleared it
+}
+
+void ArduinoBoard::idle(uint32_t wait_us) {
+  if (wait_us > kWorthSleepingUs) sleep_mode();
+}
+
+BusStatus ArduinoBoard::i2c_transfer(uint8_t address, const uint8_t* first, uint8_t first_count,
+                                     const uint8_t* second, uint8_t second_count, uint8_t* read,
+                                     uint8_t read_count) {
+  return twi::transfer(address, first, first_count, second, second_count, read, read_count);
+}
+
+uint8_t ArduinoBoard::uart_write_space() { return uart::write_space(); }
+void ArduinoBoard::uart_write(uint8_t byte) { uart::write(byte); }
+int16_t ArduinoBoard::uart_read() { return uart::read(); }
+
+uint8_t ArduinoBoard::storage_read(uint16_t at) {
+  return eeprom_read_byte(reinterpret_cast<const uint8_t*>(at));
+}
+
+// A byte takes 3.4 ms; the loop goes on meanwhile.
+bool ArduinoBoard::storage_write(uint16_t at, uint8_t value) {
+  if (!eeprom_is_ready()) return false;
+  uint8_t* address = reinterpret_cast<uint8_t*>(at);
+  if (eeprom_read_byte(address) != value) eeprom_write_byte(address, value);
+  return true;
+}
+
+uint32_t ArduinoBoard::now_us() { return micros(); }
+void ArduinoBoard::watchdog_reset() { wdt_reset(); }
+void ArduinoBoard::led(bool on) { digitalWrite(LED_BUILTIN, on ? HIGH : LOW); }
+
+void ArduinoBoard::reset() {
+  cli();
+  wdt_enable(WDTO_15MS);
+  for (;;) {
+  }
+}
+
+uint16_t ArduinoBoard::free_stack() {
+  const uint8_t* at = &__heap_start;
+  while (at < reinterpret_cast<const uint8_t*>(SP) && *at == kPaint) ++at;
+  return static_cast<uint16_t>(at - &__heap_start);
+}
+
+void ArduinoBoard::mark(uint8_t value) { GPIOR0 = value; }
+
+}  // namespace relpos
+
+#endif

@@ -1,0 +1,150 @@
+#if defined(ARDUINO)
+
+#include "twi.h"
+
+#include <Arduino.h>
+#include <util/delay.h>
+
+namespace relpos {
+namespace twi {
+namespace {
+
+#if defined(__AVR_ATmega2560__)
+constexpr uint8_t kSda = _BV(PD1);
+constexpr uint8_t kScl = _BV(PD0);
+#define RELPOS_TWI_PORT PORTD
+#define RELPOS_TWI_DDR DDRD
+#define RELPOS_TWI_PIN PIND
+#else
+constexpr uint8_t kSda = _BV(PC4);
+constexpr uint8_t kScl = _BV(PC5);
+#define RELPOS_TWI_PORT PORTC
+#define RELPOS_TWI_DDR DDRC
+#define RELPOS_TWI_PIN PINC
+#endif
+
+constexpr uint32_t kBitRate = 400000;
+// The longest transaction, 14 bytes read, takes 0.44 ms; the Pozyx may stretch its clock besides.
+constexpr uint32_t kMostUs = 1000;
+
+enum Status : uint8_t {  // TWSR without the prescaler
+  kStart = 0x08,
+  kRepeatedStart = 0x10,
+  kAddressWriteAck = 0x18,
+  kAddressWriteNack = 0x20,
+  kDataWriteAck = 0x28,
+  kDataWriteNack = 0x30,
+  kAddressReadAck = 0x40,
+  kAddressReadNack = 0x48,
+  kDataReadAck = 0x50,
+  kDataReadNack = 0x58
+};
+
+// Starts what `control` asks for and waits. 0 (no status of a master) where the deadline passes.
+uint8_t run(uint8_t control, uint32_t start_us) {
+  TWCR = static_cast<uint8_t>(control | _BV(TWINT) | _BV(TWEN));
+  while ((TWCR & _BV(TWINT)) == 0) {
+    if (micros() - start_us > kMostUs) return 0;
+  }
+  return TWSR & 0xF8;
+}
+
+BusStatus open(uint8_t address_and_direction, uint32_t start_us) {
+  const uint8_t started = run(_BV(TWSTA), start_us);
+  if (started != kStart && started != kRepeatedStart) return BusStatus::kTimeout;
+  TWDR = address_and_direction;
+  switch (run(0, start_us)) {
+    case kAddressWriteAck:
+    case kAddressReadAck:
+      return BusStatus::kOk;
+    case kAddressWriteNack:
+    case kAddressReadNack:
+      return BusStatus::kAddressNack;
+    default:  // silence, or arbitration lost to noise: there is no other master
+      return BusStatus::kTimeout;
+  }
+}
+
+BusStatus write(uint8_t address, const uint8_t* bytes, uint8_t count, uint32_t start_us) {
+  const BusStatus opened = open(static_cast<uint8_t>(address << 1), start_us);
+  if (opened != BusStatus::kOk) return opened;
+  for (; count != 0; --count) {
+    TWDR = *bytes++;
+    const uint8_t sent = run(0, start_us);
+    if (sent == kDataWriteNack) return BusStatus::kDataNack;
+    if (sent != kDataWriteAck) return BusStatus::kTimeout;
+  }
+  return BusStatus::kOk;
+}
+
+BusStatus read_bytes(uint8_t address, uint8_t* bytes, uint8_t count, uint32_t start_us) {
+  const BusStatus opened = open(static_cast<uint8_t>(address << 1 | 1), start_us);
+  if (opened != BusStatus::kOk) return opened;
+  for (; count != 0; --count) {
+    const uint8_t got = run(count > 1 ? _BV(TWEA) : 0, start_us);
+    if (got != (count > 1 ? kDataReadAck : kDataReadNack)) return BusStatus::kTimeout;
+    *bytes++ = TWDR;
+  }
+  return BusStatus::kOk;
+}
+
+// A slave that was cut off in the middle of a byte holds SDA until it has clocked it out: nine
+// clocks by hand, then a stop.
+void recover() {
+  TWCR = 0;
+  RELPOS_TWI_PORT |= kSda | kScl;
+  for (uint8_t i = 0; i < 9 && (RELPOS_TWI_PIN & kSda) == 0; ++i) {
+    RELPOS_TWI_PORT &= static_cast<uint8_t>(~kScl);  // without the pull-up, then driven low
+    RELPOS_TWI_DDR |= kScl;
+    _delay_us(5);
+    RELPOS_TWI_DDR &= static_cast<uint8_t>(~kScl);
+    RELPOS_TWI_PORT |= kScl;
+    _delay_us(5);
+  }
+  RELPOS_TWI_PORT &= static_cast<uint8_t>(~kSda);
+  RELPOS_TWI_DDR |= kSda;
+  _delay_us(5);
+  RELPOS_TWI_DDR &= static_cast<uint8_t>(~kSda);  // SDA rises with SCL high: stop
+  RELPOS_TWI_PORT |= kSda;
+  TWCR = _BV(TWEN);
+}
+
+}  // namespace
+
+void begin() {
+  RELPOS_TWI_PORT |= kSda | kScl;
+  TWSR = 0;
+  TWBR = static_cast<uint8_t>((F_CPU / kBitRate - 16) / 2);
+  TWCR = _BV(TWEN);
+}
+
+BusStatus transfer(uint8_t address, const uint8_t* first, uint8_t first_count,
+                   const uint8_t* second, uint8_t second_count, uint8_t* read,
+                   uint8_t read_count) {
+  const uint32_t start_us = micros();
+  BusStatus status = BusStatus::kOk;
+  if (first_count != 0 || read_count == 0) status = write(address, first, first_count, start_us);
+  if (status == BusStatus::kOk && second_count != 0) {
+    status = write(address, second, second_count, start_us);
+  }
+  if (status == BusStatus::kOk && read_count != 0) {
+    status = read_bytes(address, read, read_count, start_us);
+  }
+  if (status == BusStatus::kTimeout) {
+    recover();
+    return status;
+  }
+  TWCR = _BV(TWINT) | _BV(TWEN) | _BV(TWSTO);
+  while ((TWCR & _BV(TWSTO)) != 0) {
+    if (micros() - start_us > kMostUs) {
+      recover();
+      return BusStatus::kTimeout;
+    }
+  }
+  return status;
+}
+
+}  // namespace twi
+}  // namespace relpos
+
+#endif
