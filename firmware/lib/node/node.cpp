@@ -46,7 +46,7 @@ void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
     const uint8_t stored = board_.storage_read(kStoredNodeId);
     const uint8_t complement = board_.storage_read(kStoredNodeIdComplement);
     const bool good = stored != wire::kCoordinator && stored != wire::kBroadcast &&
-                      static_cast<uint8_t>(stored ^ 0xFF) == complement;
+                      static_cast<uint8_t>(stored ^ complement) == 0xFF;
     id_ = good ? stored : kDefaultNodeId;
   }
   store_.load(board_, &settings_);
