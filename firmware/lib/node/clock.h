@@ -24,8 +24,8 @@ class NodeClock {
   uint32_t ms() const { return ms_; }
 
  private:
-  uint32_t last_us_ = 0;
-  uint32_t ms_ = 0;
+  uint32_t last_us_;
+  uint32_t ms_;
 };
 
 // The IMU samples by its own clock, up to 1 % off; integrating with a wrong period would turn every

@@ -1,5 +1,5 @@
 // The motion message's running totals: integers that wrap, and that a restart of the dead reckoning
-// does not set back.
+// does not set back. Zeroed memory is the start: make it as `MotionTotals()`.
 #pragma once
 
 #include <stdint.h>
@@ -23,12 +23,12 @@ class MotionTotals {
  private:
   int32_t heading_100urad(const Displacement& now) const;
 
-  uint32_t x_mm_ = 0, y_mm_ = 0, path_mm_ = 0;
-  uint32_t along_mm2_ = 0, across_mm2_ = 0, heading_100urad2_ = 0;
-  int32_t base_heading_100urad_ = 0;
-  float previous_heading_rad_ = 0.0f;
-  int16_t turns_ = 0;
-  uint16_t steps_ = 0;
+  uint32_t x_mm_, y_mm_, path_mm_;
+  uint32_t along_mm2_, across_mm2_, heading_100urad2_;
+  int32_t base_heading_100urad_;
+  float previous_heading_rad_;
+  int16_t turns_;
+  uint16_t steps_;
 };
 
 }  // namespace relpos

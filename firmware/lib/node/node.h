@@ -19,18 +19,9 @@
 
 namespace relpos {
 
-class Node {
- public:
-  explicit Node(Board& board) : board_(board) {}
-
-  // node_id 0: the stored one. Counts the start.
-  void begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id);
-  // One pass of the main loop; returns microseconds until it wants the next (0: at once).
-  uint32_t poll(uint32_t now_us);
-
-  uint8_t id() const { return id_; }
-
- private:
+// Everything of the node that starts at zero. Cleared as one block: member by member it would cost
+// the Uno a kilobyte of flash.
+struct NodeState {
   static constexpr uint8_t kRememberedCommands = 4;
   static constexpr uint8_t kPendingRanges = 8;
   static constexpr uint8_t kPendingSteps = 6;
@@ -56,6 +47,55 @@ class Node {
     bool answer_due;
   };
 
+  NodeClock clock_;
+  MotionTotals totals_;
+  Ring<PendingRange, kPendingRanges> ranges_;
+  Ring<PendingStep, kPendingSteps> steps_;
+  DoneCommand commands_[kRememberedCommands];
+  uint32_t imu_due_us_;
+  uint32_t last_sample_ms_;
+  uint32_t last_field_ms_;
+  uint32_t updates_;  // of the dead reckoning since its reset
+  uint16_t seen_steps_;
+  uint16_t missed_ticks_;
+  uint16_t worst_tick_us_;
+  uint8_t quality_;  // gathered since the last motion message
+  bool field_seen_;
+  bool sampled_;  // ever
+  uint32_t pozyx_due_us_;
+  uint32_t round_due_ms_;
+  uint16_t ranging_successes_;
+  uint16_t ranging_failures_;
+  uint16_t dropped_ranges_;
+  uint8_t peer_;  // kNoPeer: between rounds
+  uint32_t motion_due_ms_;
+  uint32_t status_due_ms_;
+  uint32_t sent_ms_;
+  uint16_t sequence_;
+  uint16_t bad_frames_;  // behind a good XBee checksum
+  uint16_t radio_failures_;  // besides those that the module reports
+  uint8_t next_command_;
+  bool awaiting_status_;
+  uint8_t frame_[wire::kFrameBytes + wire::kAuthenticationBytes];
+  wire::ResetCause reset_cause_;
+  uint8_t id_;
+  uint8_t boot_;
+  uint8_t reboot_step_;  // 0: no reboot asked
+  bool led_;
+};
+
+class Node : private NodeState {
+ public:
+  explicit Node(Board& board) : NodeState(), board_(board) {}
+
+  // node_id 0: the stored one. Counts the start.
+  void begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id);
+  // One pass of the main loop; returns microseconds until it wants the next (0: at once).
+  uint32_t poll(uint32_t now_us);
+
+  uint8_t id() const { return id_; }
+
+ private:
   void run_imu(uint32_t now_us);
   void tick(uint32_t now_us);
   void note_step();
@@ -87,53 +127,14 @@ class Node {
   uint32_t wait_us(uint32_t now_us) const;
 
   Board& board_;
-  NodeClock clock_;
   Settings settings_;
   SettingsStore store_;
-
   Mpu9150 imu_;
   Ak8975 magnetometer_;
   DeadReckoning dead_reckoning_;
-  MotionTotals totals_;
   SampleClock sample_clock_;
-  uint32_t imu_due_us_ = 0;
-  uint32_t last_sample_ms_ = 0;
-  uint32_t last_field_ms_ = 0;
-  uint32_t updates_ = 0;  // of the dead reckoning since its reset
-  uint16_t seen_steps_ = 0;
-  uint16_t missed_ticks_ = 0;
-  uint16_t worst_tick_us_ = 0;
-  uint8_t quality_ = 0;  // gathered since the last motion message
-  bool field_seen_ = false;
-  bool sampled_ = false;  // ever
-
   Pozyx pozyx_;
-  Ring<PendingRange, kPendingRanges> ranges_;
-  uint32_t pozyx_due_us_ = 0;
-  uint32_t round_due_ms_ = 0;
-  uint16_t ranging_successes_ = 0;
-  uint16_t ranging_failures_ = 0;
-  uint16_t dropped_ranges_ = 0;
-  uint8_t peer_ = kNoPeer;  // kNoPeer: between rounds
-
   Xbee xbee_;
-  Ring<PendingStep, kPendingSteps> steps_;
-  DoneCommand commands_[kRememberedCommands] = {};
-  uint32_t motion_due_ms_ = 0;
-  uint32_t status_due_ms_ = 0;
-  uint32_t sent_ms_ = 0;
-  uint16_t sequence_ = 0;
-  uint16_t bad_frames_ = 0;  // behind a good XBee checksum
-  uint16_t radio_failures_ = 0;  // besides those that the module reports
-  uint8_t next_command_ = 0;
-  bool awaiting_status_ = false;
-  uint8_t frame_[wire::kFrameBytes + wire::kAuthenticationBytes];
-
-  wire::ResetCause reset_cause_ = wire::ResetCause::kUnknown;
-  uint8_t id_ = 0;
-  uint8_t boot_ = 0;
-  uint8_t reboot_step_ = 0;  // 0: no reboot asked
-  bool led_ = false;
 };
 
 }  // namespace relpos

@@ -1,4 +1,5 @@
-// A fixed ring that gives up its oldest entry when it is full, and says so.
+// A fixed ring that gives up its oldest entry when it is full, and says so. Zeroed memory is an
+// empty one: make it as `Ring<..>()`.
 #pragma once
 
 #include <stdint.h>
@@ -29,8 +30,8 @@ class Ring {
 
  private:
   Entry entries_[kSize];
-  uint8_t first_ = 0;
-  uint8_t count_ = 0;
+  uint8_t first_;
+  uint8_t count_;
 };
 
 }  // namespace relpos

@@ -15,6 +15,13 @@ namespace {
 // Set before the C runtime clears the memory, hence not part of it.
 uint8_t reset_flags __attribute__((section(".noinit")));
 
+// The board's LED, of both the same port: digitalWrite and its tables are 350 bytes of flash.
+#if defined(__AVR_ATmega2560__)
+constexpr uint8_t kLed = _BV(PB7);
+#else
+constexpr uint8_t kLed = _BV(PB5);
+#endif
+
 constexpr uint8_t kPaint = 0xC5;
 // Timer 0 overflows, and wakes the board, every 1.024 ms.
 constexpr uint32_t kWorthSleepingUs = 1100;
@@ -43,7 +50,7 @@ void ArduinoBoard::begin() {
   wdt_enable(WDTO_500MS);
   twi::begin();
   uart::begin();
-  pinMode(LED_BUILTIN, OUTPUT);
+  DDRB |= kLed;
   set_sleep_mode(SLEEP_MODE_IDLE);
 }
 
@@ -84,7 +91,13 @@ bool ArduinoBoard::storage_write(uint16_t at, uint8_t value) {
 
 uint32_t ArduinoBoard::now_us() { return micros(); }
 void ArduinoBoard::watchdog_reset() { wdt_reset(); }
-void ArduinoBoard::led(bool on) { digitalWrite(LED_BUILTIN, on ? HIGH : LOW); }
+void ArduinoBoard::led(bool on) {
+  if (on) {
+    PORTB |= kLed;
+  } else {
+    PORTB &= static_cast<uint8_t>(~kLed);
+  }
+}
 
 void ArduinoBoard::reset() {
   cli();
