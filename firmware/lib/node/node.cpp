@@ -438,19 +438,19 @@ bool Node::radio_free() {
 }
 
 // Motion and status are written when they are sent, so they cannot wait in a queue and be dropped;
-// ranges wait in a ring that gives up the oldest.
+// ranges wait in a ring that gives up the oldest. They come last: they alone can fill the air.
 bool Node::send_next() {
   uint8_t* body = frame_ + wire::kHeaderBytes;
   if (answer_due() && !store_.saving()) {  // acknowledged once it is done for good
     send(wire::MessageType::kAcknowledgement, fill_answer(body));
   } else if (period_over(&motion_due_ms_, settings_.report_period_ms)) {
     send(wire::MessageType::kMotion, fill_motion(body));
-  } else if (ranges_.count() >= wire::kMostRanges || (peer_ == kNoPeer && ranges_.count() > 0)) {
-    send(wire::MessageType::kRanges, fill_ranges(body));
   } else if (period_over(&status_due_ms_, settings_.status_period_ms)) {
     send(wire::MessageType::kStatus, fill_status(body));
   } else if (steps_report_due()) {
     send(wire::MessageType::kSteps, fill_steps(body));
+  } else if (ranges_.count() >= wire::kMostRanges || (peer_ == kNoPeer && ranges_.count() > 0)) {
+    send(wire::MessageType::kRanges, fill_ranges(body));
   } else {
     return false;
   }

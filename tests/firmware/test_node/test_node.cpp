@@ -1,0 +1,518 @@
+// The whole node against chips of the simplest kind: what it sends, when, and what no fault changes.
+#include "support/check.h"
+#include "support/fake_board.h"
+
+#include "node/node.h"
+#include "wire/frame.h"
+#include "wire/messages.h"
+
+using relpos::BusStatus;
+using relpos::Node;
+namespace wire = relpos::wire;
+
+namespace {
+
+constexpr uint8_t kId = 3;
+constexpr uint16_t kMostFrames = 400;
+
+struct Sent {
+  uint32_t time_us;
+  wire::Header header;
+  uint8_t body[wire::kFrameBytes];
+  uint8_t length;
+};
+
+// Sensors that always have news, a module that answers every request, an EEPROM.
+struct World : FakeBoard {
+  uint32_t now = 0;
+  uint32_t start = 0;  // the chips' clocks do not wrap with the node's
+  uint8_t eeprom[128];
+  uint16_t writes[128] = {};
+  bool inertial_present = true;
+  bool tag_present = true;
+  bool module_present = true;
+  uint8_t delivery = 0;  // of the transmit status
+  uint8_t line_bytes = 255;  // a poll
+  uint32_t restarts = 0;
+  uint32_t marks = 0;
+
+  Sent frames[kMostFrames];
+  uint16_t count = 0;
+  uint16_t damaged = 0;
+
+  World() {
+    for (uint8_t& byte : eeprom) byte = 0xFF;
+    eeprom[0] = kId;
+    eeprom[1] = kId ^ 0xFF;
+  }
+
+  // -- the UART, with the module behind it --
+  uint8_t uart_write_space() override { return space_; }
+  void uart_write(uint8_t byte) override {
+    --space_;
+    if (byte == 0x7E) {
+      got_ = 0;
+      in_frame_ = true;
+      return;
+    }
+    if (!in_frame_) return;
+    if (byte == 0x7D) {
+      escape_ = true;
+      return;
+    }
+    packet_[got_++] = escape_ ? byte ^ 0x20 : byte;
+    escape_ = false;
+    if (got_ < 3 || got_ < 3 + packet_[1]) return;
+    in_frame_ = false;
+    take_packet();
+  }
+  int16_t uart_read() override {
+    return taken_ < given_ ? static_cast<int16_t>(queue_[taken_++]) : -1;
+  }
+  void begin_poll() {
+    space_ = line_bytes;
+    if (taken_ == given_) taken_ = given_ = 0;
+  }
+  void give(const uint8_t* data, uint8_t length) {  // a whole API frame's data
+    uint8_t sum = 0xFF;
+    queue_[given_++] = 0x7E;
+    escaped(0);
+    escaped(length);
+    for (uint8_t i = 0; i < length; ++i) {
+      escaped(data[i]);
+      sum = static_cast<uint8_t>(sum - data[i]);
+    }
+    escaped(sum);
+  }
+  void command(uint16_t token, uint8_t code, int32_t value, uint8_t node = kId) {
+    uint8_t data[64] = {0x81, 0, 0, 0x28, 0};
+    uint8_t* frame = data + 5;
+    uint8_t* body = frame + wire::kHeaderBytes;
+    const wire::Command request = {token, 0, value};
+    uint8_t length = wire::encode(request, body);
+    body[2] = code;
+    const wire::Header header = {wire::MessageType::kCommand, node, 0, token};
+    length = wire::seal(header, length, frame);
+    give(data, static_cast<uint8_t>(5 + length));
+  }
+
+  uint8_t storage_read(uint16_t at) override { return eeprom[at]; }
+  bool storage_write(uint16_t at, uint8_t value) override {
+    if (eeprom[at] != value) ++writes[at];
+    eeprom[at] = value;
+    return true;
+  }
+  uint32_t now_us() override { return now; }
+  void reset() override { ++restarts; }
+  void mark(uint8_t value) override { marks += value; }
+
+ protected:
+  BusStatus i2c_transfer(uint8_t address, const uint8_t* first, uint8_t first_count,
+                         const uint8_t*, uint8_t, uint8_t* read, uint8_t read_count) override {
+    for (uint8_t i = 0; i < read_count; ++i) read[i] = 0;
+    if (address == 0x68 && inertial_present) {
+      if (first_count == 1 && first[0] == 0x75) read[0] = 0x68;
+      if (first_count == 1 && first[0] == 0x3A && now - start - sampled_us_ >= 20000) {
+        sampled_us_ = now - start;
+        read[0] = 1;
+      }
+      if (first_count == 1 && first[0] == 0x3B) read[0] = 0x20;  // 1 g along x
+      return BusStatus::kOk;
+    }
+    if (address == 0x4B && tag_present) {
+      if (first_count == 1 && first[0] == 0x00) read[0] = 0x43;
+      if (first_count == 1 && first[0] == 0x05) read[0] = 0x10;
+      if (first_count == 3) read[0] = 1;
+      if (first_count == 3 && first[0] == 0xC7) {
+        const uint32_t row[2] = {(now - start) / 1000, 1000u * first[1]};
+        memcpy(read + 1, row, sizeof row);
+        read[9] = 0xB0;  // -80 dBm
+        read[10] = 0xFF;
+      }
+      return BusStatus::kOk;
+    }
+    return BusStatus::kAddressNack;
+  }
+
+ private:
+  void escaped(uint8_t byte) {
+    if (byte == 0x7E || byte == 0x7D || byte == 0x11 || byte == 0x13) {
+      queue_[given_++] = 0x7D;
+      byte ^= 0x20;
+    }
+    queue_[given_++] = byte;
+  }
+  void take_packet() {
+    const uint8_t length = static_cast<uint8_t>(packet_[1] - 5);
+    if (count == kMostFrames) return;
+    Sent& sent = frames[count];
+    sent.time_us = now;
+    if (wire::open(packet_ + 7, length, &sent.header) != wire::FrameStatus::kGood) {
+      ++damaged;
+      return;
+    }
+    sent.length = static_cast<uint8_t>(length - wire::kHeaderBytes - wire::kCrcBytes);
+    memcpy(sent.body, packet_ + 7 + wire::kHeaderBytes, sent.length);
+    ++count;
+    const uint8_t answer[3] = {0x89, packet_[3], delivery};
+    if (module_present) give(answer, 3);
+  }
+
+  uint32_t sampled_us_ = 0;
+  uint8_t packet_[128];
+  uint8_t queue_[2048];
+  uint16_t given_ = 0, taken_ = 0;
+  uint8_t got_ = 0;
+  uint8_t space_ = 0;
+  bool in_frame_ = false, escape_ = false;
+};
+
+struct Team {
+  World world;
+  Node node;
+  explicit Team(uint32_t start_us = 0, wire::ResetCause cause = wire::ResetCause::kPowerOn)
+      : node(world) {
+    world.now = world.start = start_us;
+    node.begin(start_us, cause, 0);
+  }
+  void run_ms(uint32_t ms) { run(node, ms); }
+  void run(Node& which, uint32_t ms) {
+    for (const uint32_t start_us = world.now; world.now - start_us < ms * 1000;) {
+      world.begin_poll();
+      const uint32_t wait_us = which.poll(world.now);
+      world.now += wait_us < 100 ? 100 : wait_us;
+    }
+  }
+  uint16_t sent(wire::MessageType type) const {
+    uint16_t found = 0;
+    for (uint16_t i = 0; i < world.count; ++i) found += world.frames[i].header.type == type;
+    return found;
+  }
+  const Sent* last(wire::MessageType type) const {
+    for (uint16_t i = world.count; i > 0; --i) {
+      if (world.frames[i - 1].header.type == type) return &world.frames[i - 1];
+    }
+    return nullptr;
+  }
+  template <typename Message>
+  bool read(wire::MessageType type, Message* message) const {
+    const Sent* found = last(type);
+    return found != nullptr && wire::decode(found->body, found->length, message);
+  }
+  wire::Acknowledgement answer() const {
+    wire::Acknowledgement message = {};
+    read(wire::MessageType::kAcknowledgement, &message);
+    return message;
+  }
+};
+
+constexpr uint8_t code(wire::CommandCode command) { return static_cast<uint8_t>(command); }
+constexpr uint8_t result(wire::CommandResult value) { return static_cast<uint8_t>(value); }
+
+}  // namespace
+
+TEST(motion_every_second_a_round_every_two_status_every_ten) {
+  Team team;
+  team.run_ms(30500);
+  CHECK(team.sent(wire::MessageType::kMotion) >= 29);
+  CHECK(team.sent(wire::MessageType::kMotion) <= 30);
+  CHECK(team.sent(wire::MessageType::kRanges) >= 13);
+  CHECK(team.sent(wire::MessageType::kRanges) <= 15);
+  CHECK_EQUAL(3, team.sent(wire::MessageType::kStatus));
+  CHECK_EQUAL(0, team.sent(wire::MessageType::kSteps));
+  CHECK_EQUAL(0, team.world.damaged);
+  CHECK(team.world.marks > 1400);  // the tick is marked
+}
+
+TEST(a_round_holds_every_other_node_and_not_the_node_itself) {
+  Team team;
+  team.run_ms(5000);
+  wire::Ranges ranges;
+  CHECK(team.read(wire::MessageType::kRanges, &ranges));
+  CHECK_EQUAL(5, ranges.count);
+  const uint8_t peers[5] = {1, 2, 4, 5, 6};
+  for (uint8_t i = 0; i < 5; ++i) {
+    CHECK_EQUAL(peers[i], ranges.entries[i].peer);
+    CHECK_EQUAL(1000u * peers[i], ranges.entries[i].range_mm);
+    CHECK_EQUAL(-80, ranges.entries[i].rss_dbm);
+  }
+}
+
+TEST(a_team_of_more_than_six_gets_its_ranges_in_several_frames) {
+  Team team;
+  team.world.command(1, code(wire::CommandCode::kSetTeamSize), 13);
+  team.run_ms(2000);
+  const uint16_t before = team.sent(wire::MessageType::kRanges);
+  team.run_ms(20000);
+  const uint16_t frames = static_cast<uint16_t>(team.sent(wire::MessageType::kRanges) - before);
+  CHECK(frames >= 27);  // ten rounds of 12: 5, 5, 2
+  CHECK(frames <= 33);
+}
+
+TEST(nodes_started_together_do_not_range_together) {
+  uint32_t first_us[6];
+  for (uint8_t id = 1; id <= 6; ++id) {
+    Team team;
+    Node node(team.world);
+    node.begin(0, wire::ResetCause::kPowerOn, id);
+    team.run(node, 4500);
+    first_us[id - 1] = team.last(wire::MessageType::kRanges) == nullptr ? 0 : 1;
+    CHECK_EQUAL(1, first_us[id - 1]);
+    for (uint16_t i = team.world.count; i > 0; --i) {
+      if (team.world.frames[i - 1].header.type == wire::MessageType::kRanges) {
+        first_us[id - 1] = team.world.frames[i - 1].time_us;
+      }
+    }
+    for (uint8_t other = 1; other < id; ++other) {
+      const int32_t apart = static_cast<int32_t>(first_us[id - 1] - first_us[other - 1]);
+      CHECK(apart > 200000 || apart < -200000);
+    }
+  }
+}
+
+TEST(the_schedule_does_not_feel_the_wrap_of_the_microseconds) {
+  Team early(0), late(0xFFFFFFFFu - 7000000u);  // wraps after 7 s
+  early.run_ms(21000);
+  late.run_ms(21000);
+  CHECK_EQUAL(early.world.count, late.world.count);
+  for (uint16_t i = 0; i < early.world.count; ++i) {
+    const Sent& a = early.world.frames[i];
+    const Sent& b = late.world.frames[i];
+    CHECK_EQUAL(a.header.type, b.header.type);
+    CHECK_EQUAL(a.time_us, b.time_us - (0xFFFFFFFFu - 7000000u));
+  }
+  wire::Motion motion;
+  CHECK(late.read(wire::MessageType::kMotion, &motion));
+  CHECK(motion.time_ms > 19000 && motion.time_ms < 21000);
+}
+
+TEST(a_lost_frame_changes_nothing_in_the_next_ones) {
+  Team heard, lost;
+  lost.world.delivery = 1;  // no acknowledgement from the coordinator
+  heard.run_ms(12000);
+  lost.run_ms(12000);
+  const Sent* a = heard.last(wire::MessageType::kMotion);
+  const Sent* b = lost.last(wire::MessageType::kMotion);
+  CHECK(a != nullptr && b != nullptr);
+  CHECK_EQUAL(a->header.sequence, b->header.sequence);
+  CHECK_BYTES(a->body, b->body, a->length);
+  wire::Status status;
+  lost.run_ms(10000);
+  CHECK(lost.read(wire::MessageType::kStatus, &status));
+  CHECK(status.radio_failures >= 15);
+}
+
+TEST(without_a_module_s_answer_telemetry_goes_on_and_counts_it) {
+  Team team;
+  team.world.module_present = false;
+  team.run_ms(22000);
+  CHECK(team.sent(wire::MessageType::kMotion) >= 20);
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK(status.radio_failures > 10);
+}
+
+TEST(a_slow_line_drops_the_oldest_ranges_counts_them_and_keeps_the_motion) {
+  Team team;
+  team.world.command(1, code(wire::CommandCode::kSetTeamSize), 20);
+  team.world.command(2, code(wire::CommandCode::kSetRangingPeriodMs), 200);
+  team.run_ms(1500);
+  team.world.module_present = false;  // 5 frames a second at most
+  team.run_ms(30000);
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK(status.dropped_ranges > 0);
+  CHECK(team.sent(wire::MessageType::kMotion) >= 25);
+}
+
+TEST(a_missing_imu_is_told_and_stops_neither_ranges_nor_reports) {
+  Team team;
+  team.world.inertial_present = false;
+  team.run_ms(12000);
+  wire::Motion motion;
+  CHECK(team.read(wire::MessageType::kMotion, &motion));
+  CHECK_EQUAL(static_cast<uint8_t>(wire::MotionState::kStarting), motion.state);
+  CHECK((motion.quality & static_cast<uint8_t>(wire::Quality::kImuGap)) != 0);
+  CHECK(team.sent(wire::MessageType::kRanges) >= 4);
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK(status.bus_errors > 0);
+}
+
+TEST(a_missing_tag_stops_only_the_ranges) {
+  Team team;
+  team.world.tag_present = false;
+  team.run_ms(12000);
+  CHECK_EQUAL(0, team.sent(wire::MessageType::kRanges));
+  CHECK(team.sent(wire::MessageType::kMotion) >= 10);
+}
+
+TEST(an_imu_that_was_away_gives_a_gap_a_reset_and_a_larger_variance) {
+  Team team;
+  team.run_ms(6000);
+  wire::Motion before;
+  CHECK(team.read(wire::MessageType::kMotion, &before));
+  team.world.inertial_present = false;
+  team.run_ms(3000);
+  team.world.inertial_present = true;
+  team.run_ms(2000);
+  bool reset_told = false;
+  wire::Motion motion = {};
+  for (uint16_t i = 0; i < team.world.count; ++i) {
+    const Sent& sent = team.world.frames[i];
+    if (sent.header.type != wire::MessageType::kMotion) continue;
+    CHECK(wire::decode(sent.body, sent.length, &motion));
+    reset_told |= (motion.quality & static_cast<uint8_t>(wire::Quality::kFilterReset)) != 0;
+  }
+  CHECK(reset_told);
+  // At least 3 s at the 1 m/s that a wearer may have walked unseen.
+  CHECK(motion.variance_along_mm2 - before.variance_along_mm2 >= 9000000);
+  team.run_ms(10000);
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK(status.missed_ticks >= 140);
+}
+
+TEST(a_command_is_done_once_however_often_it_comes) {
+  Team team;
+  team.run_ms(500);
+  for (uint8_t i = 0; i < 3; ++i) {
+    team.world.command(7, code(wire::CommandCode::kSetStepGainPermille), 900);
+    team.run_ms(300);
+  }
+  CHECK_EQUAL(3, team.sent(wire::MessageType::kAcknowledgement));
+  CHECK_EQUAL(7, team.answer().token);
+  CHECK_EQUAL(900, team.answer().value);
+  CHECK_EQUAL(result(wire::CommandResult::kDone), team.answer().result);
+  team.run_ms(2000);
+  wire::Motion motion;
+  CHECK(team.read(wire::MessageType::kMotion, &motion));
+  CHECK_EQUAL(1, motion.gain_version);
+}
+
+TEST(a_late_repetition_does_not_undo_a_newer_command) {
+  Team team;
+  team.world.command(7, code(wire::CommandCode::kSetLegLengthMm), 900);
+  team.run_ms(300);
+  team.world.command(8, code(wire::CommandCode::kSetLegLengthMm), 950);
+  team.run_ms(300);
+  team.world.command(7, code(wire::CommandCode::kSetLegLengthMm), 900);
+  team.run_ms(300);
+  CHECK_EQUAL(7, team.answer().token);
+  team.world.command(9, code(wire::CommandCode::kSetLegLengthMm), 5);
+  team.run_ms(300);
+  CHECK_EQUAL(result(wire::CommandResult::kOutOfRange), team.answer().result);
+  CHECK_EQUAL(950, team.answer().value);
+}
+
+TEST(a_command_for_another_node_or_a_damaged_one_does_nothing) {
+  Team team;
+  team.world.command(7, code(wire::CommandCode::kSetLed), 1, kId + 1);
+  team.run_ms(300);
+  const uint8_t garbage[12] = {0x81, 0, 0, 0x28, 0, 0xB5, 1, 16, 3, 0, 0, 0};
+  team.world.give(garbage, sizeof garbage);
+  team.run_ms(300);
+  CHECK_EQUAL(0, team.sent(wire::MessageType::kAcknowledgement));
+  team.run_ms(12000);
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK_EQUAL(1, status.bad_frames);
+}
+
+TEST(an_unknown_command_is_answered_as_unknown) {
+  Team team;
+  team.world.command(7, 200, 1);
+  team.run_ms(300);
+  CHECK_EQUAL(7, team.answer().token);
+  CHECK_EQUAL(200, team.answer().command);
+  CHECK_EQUAL(result(wire::CommandResult::kUnknownCommand), team.answer().result);
+}
+
+TEST(settings_survive_a_restart_and_a_torn_copy) {
+  Team team;
+  team.world.command(7, code(wire::CommandCode::kSetTeamSize), 4);
+  team.run_ms(500);
+  team.world.eeprom[20] ^= 0x40;  // the first copy
+  Node again(team.world);
+  again.begin(team.world.now, wire::ResetCause::kBrownOut, 0);
+  team.run(again, 4500);
+  wire::Ranges ranges;
+  CHECK(team.read(wire::MessageType::kRanges, &ranges));
+  CHECK_EQUAL(3, ranges.count);
+}
+
+TEST(every_start_counts_and_writes_one_byte) {
+  Team team;
+  CHECK_EQUAL(0, team.world.eeprom[relpos::kStoredBootCount]);
+  Node again(team.world);
+  again.begin(0, wire::ResetCause::kBrownOut, 0);
+  uint16_t writes = 0;
+  for (uint16_t count : team.world.writes) writes = static_cast<uint16_t>(writes + count);
+  CHECK_EQUAL(2, writes);
+  CHECK_EQUAL(1, team.world.eeprom[relpos::kStoredBootCount]);
+  team.run(again, 2500);
+  CHECK_EQUAL(1, team.last(wire::MessageType::kMotion)->header.boot);
+}
+
+TEST(a_reboot_is_acknowledged_first_and_not_repeated_by_the_same_command) {
+  Team team;
+  team.world.command(7, code(wire::CommandCode::kReboot), 0);
+  team.run_ms(1000);
+  CHECK_EQUAL(1, team.world.restarts);
+  CHECK_EQUAL(1, team.sent(wire::MessageType::kAcknowledgement));
+  Node again(team.world);
+  again.begin(team.world.now, wire::ResetCause::kWatchdog, 0);
+  team.world.command(7, code(wire::CommandCode::kReboot), 0);  // the answer had been lost
+  team.run(again, 3000);
+  CHECK_EQUAL(1, team.world.restarts);
+  CHECK_EQUAL(2, team.sent(wire::MessageType::kAcknowledgement));
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK_EQUAL(static_cast<uint8_t>(wire::ResetCause::kCommand), status.reset_cause);
+}
+
+TEST(a_uart_with_little_space_carries_the_same_frames) {
+  Team team;
+  team.world.line_bytes = 3;
+  team.run_ms(6000);
+  CHECK_EQUAL(0, team.world.damaged);
+  CHECK(team.sent(wire::MessageType::kMotion) >= 4);
+}
+
+TEST(totals_keep_their_millimetre_and_turn_over) {
+  CHECK_EQUAL(1234, relpos::scaled(1.2344f, 1000));
+  CHECK_EQUAL(-1235, static_cast<int32_t>(relpos::scaled(-1.2346f, 1000)));
+  CHECK_EQUAL(8000001, relpos::scaled(8000.001f, 1000));
+  // 100 rad^2 in 1e-8: more than 32 bits hold, the difference is still right.
+  CHECK_EQUAL(100000000u, relpos::scaled(100.0f, 100000000) - relpos::scaled(99.0f, 100000000));
+}
+
+TEST(whole_turns_count_and_a_reset_of_the_filter_sets_nothing_back) {
+  relpos::MotionTotals totals = relpos::MotionTotals();
+  relpos::Displacement now = relpos::Displacement();
+  for (int16_t degree = 0; degree <= 810; degree += 10) {  // two turns and a quarter, left
+    int16_t within = static_cast<int16_t>(degree % 360);
+    if (within > 180) within = static_cast<int16_t>(within - 360);
+    now.heading_rad = static_cast<float>(within) * 0.01745329f;
+    totals.track(now);
+  }
+  now.x_m = 3.0f;
+  now.y_m = 4.0f;
+  now.steps = 65530;
+  wire::Motion motion;
+  totals.fill(now, &motion);
+  CHECK_NEAR(141372.0f, static_cast<float>(motion.heading_100urad), 2.0f);
+  totals.rebase(now, 0.5f);
+  relpos::Displacement anew = relpos::Displacement();
+  anew.x_m = 2.0f;  // ahead, which is now the old frame's left
+  anew.steps = 10;
+  totals.track(anew);
+  totals.fill(anew, &motion);
+  CHECK_NEAR(3000.0f, static_cast<float>(motion.x_mm), 2.0f);
+  CHECK_NEAR(6000.0f, static_cast<float>(motion.y_mm), 2.0f);
+  CHECK_EQUAL(4, motion.steps);  // wrapped
+  CHECK_NEAR(141372.0f, static_cast<float>(motion.heading_100urad), 2.0f);
+  CHECK_NEAR(250000.0f, static_cast<float>(motion.variance_along_mm2), 1.0f);
+}
+
+RUN_TESTS()
