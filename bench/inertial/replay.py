@@ -127,8 +127,7 @@ def load(folder: Path) -> Recording:
     if (folder / "events.csv").exists():
         with (folder / "events.csv").open() as stream:
             events = [
-                (float(row["time_s"]), row["event"], row["value"])
-                for row in csv.DictReader(stream)
+                (float(row["time_s"]), row["event"], row["value"]) for row in csv.DictReader(stream)
             ]
     time, values = raw[:, 0], raw[:, 2:11]
     rate = 1.0 / float(np.median(np.diff(time)))
@@ -207,7 +206,9 @@ def score_steps(recording: Recording, step_times_s: Array) -> StepScore:
     events = recording.events
     begin = min((t for t, name, _ in events if name == "trial_start"), default=-np.inf)
     end = max((t for t, name, _ in events if name == "trial_end"), default=np.inf)
-    contacts = np.array([t for t, name, _ in events if name == "foot_contact" and begin <= t <= end])
+    contacts = np.array(
+        [t for t, name, _ in events if name == "foot_contact" and begin <= t <= end]
+    )
     best: StepScore | None = None
     for offset in np.arange(-0.5, 0.51, 0.05):
         shifted = step_times_s + offset

@@ -14,7 +14,7 @@ const float kShortStill_s = 0.5f;     // enough for the tilt; the bias then to 0
 const float kMovingStart_s = 1.0f;    // about two steps, over which horizontal force averages out
 const float kTiltStill_rad = 1.0f * kDegree;
 const float kTiltMoving_rad = 6.0f * kDegree;  // half a step's braking left in the average
-const float kBiasStill_rad_s = 0.1f * kDegree;
+const float kBiasStill_rad_s = 0.3f * kDegree;  // a standing body turns 1 deg in 3 s (docs/gait.md)
 const float kBiasMoving_rad_s = 1.0f * kDegree;  // what a warmed-up, once zeroed MPU-9150 keeps
 const float kSpeedUnknown_m_s = 1.0f;
 const float kSpeedFound_m_s = 0.3f;   // step length over interval, at mid-stance
@@ -32,6 +32,8 @@ const float kStepSigma_m = 0.02f;
 const float kFirstStepSigma = 0.3f;   // a walk's first step is anything from half a step
 const float kLateralSigma_m = 0.06f;  // the torso sways 2 to 4 cm and feet are placed as wide
 const float kVerticalSigma_m = 0.02f; // level floor: mid-stance heights repeat within 1 to 2 cm
+const float kLost = 0.5f;             // of the pendulum's length: the inertial motion ran away
+const float kTiltLost_rad = 2.0f * kDegree;  // added then: only a wrong tilt does that
 const float kDoubt = 3.0f;            // sigmas beyond which a step is weighed down
 const float kStraight_rad_s = 5.0f * kDegree;       // slower turns than this count as straight
 const float kStraightSigma_rad_s = 1.5f * kDegree;
@@ -344,9 +346,14 @@ void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
   float direction[kAxes] = {0.0f, 0.0f, 0.0f};
   const Job job = job_;
   job_ = static_cast<Job>(job + 1);
-  // Walking direction in the navigation frame: mean heading plus the forward axis's offset.
+  // Walking direction in the navigation frame: mean heading plus the forward axis's offset. It turns
+  // with the heading's error, so the step's measurements depend on that too: turning heading,
+  // velocity and position together changes neither. Without these terms the filter believed to
+  // observe the heading and lost it (18 deg/min on simulated walks, NEES 74).
   const float ux = step_cosine_ * forward_.cosine() - step_sine_ * forward_.sine();
   const float uy = step_sine_ * forward_.cosine() + step_cosine_ * forward_.sine();
+  const float ahead = ux * stance_position_m_[kX] + uy * stance_position_m_[kY];
+  const float aside = ux * stance_position_m_[kY] - uy * stance_position_m_[kX];
   switch (job) {
     case kFlush:
       predict_attitude(rotation);
@@ -356,8 +363,7 @@ void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
     case kForward: {
       direction[kX] = ux;
       direction[kY] = uy;
-      const float innovation =
-          step_length_m_ - (ux * stance_position_m_[kX] + uy * stance_position_m_[kY]);
+      const float innovation = step_length_m_ - ahead;
       float variance = step_sigma_m_ * step_sigma_m_;
       const float least = innovation * innovation * (1.0f / (kDoubt * kDoubt)) -
                           filter_.along(kPosition, ux, uy);
@@ -366,14 +372,13 @@ void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
         count(&counters_.doubtful_steps);
         hold_doubt_ = kHoldTicks;
       }
-      measure(kPosition, direction, innovation, variance);
+      measure(kPosition, direction, innovation, variance, aside);
       break;
     }
     case kLateral:
       direction[kX] = -uy;
       direction[kY] = ux;
-      measure(kPosition, direction, uy * stance_position_m_[kX] - ux * stance_position_m_[kY],
-              kLateralSigma_m * kLateralSigma_m);
+      measure(kPosition, direction, -aside, kLateralSigma_m * kLateralSigma_m, -ahead);
       break;
     case kVertical:
       direction[kZ] = 1.0f;
@@ -405,9 +410,9 @@ void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
 }
 
 void DeadReckoning::measure(State group, const float direction[kAxes], float innovation,
-                            float variance) {
+                            float variance, float yaw) {
   float correction[kStates];
-  filter_.update(group, direction, innovation, variance, correction);
+  filter_.update(group, direction, yaw, innovation, variance, correction);
   attitude_.correct(correction + kAttitude);
   // During a step's updates the covariance stands at its mid-stance, the state at the present.
   const bool stance = job_ > kFlush && job_ <= kCommit;
@@ -432,10 +437,28 @@ void DeadReckoning::commit_step() {
   float x = step_length_m_ * step_cosine_, y = step_length_m_ * step_sine_;
   float length = step_length_m_;
   float along = step_sigma_m_ * step_sigma_m_, across = kLateralSigma_m * kLateralSigma_m;
+  float inertial_x = x, inertial_y = y;
   if (step_directed_ && velocity_known_) {
-    to_wearer(stance_position_m_, &x, &y);
-    length = x * step_cosine_ + y * step_sine_;
-    if (length < 0.0f) length = 0.0f;
+    to_wearer(stance_position_m_, &inertial_x, &inertial_y);
+    const float ahead = inertial_x * step_cosine_ + inertial_y * step_sine_;
+    // A step half as long again as the pendulum's, or half of one backwards, even after the update:
+    // the velocity starts anew from the pendulum, or a wrong tilt (switched on while walking, a
+    // fall) would carry it away for ever: 423 m in 70 steps of one recording. Shorter steps stand:
+    // shuffling lifts the torso more than it carries it.
+    velocity_known_ = ahead < (1.0f + kLost) * step_length_m_ + step_sigma_m_ &&
+                      ahead > -kLost * step_length_m_ - step_sigma_m_;
+    if (!velocity_known_) {
+      count(&counters_.lost_steps);
+      for (uint8_t i = kAttitude; i < kAttitude + kZ; ++i) {
+        filter_.set_covariance(i, i, filter_.covariance(i, i) + kTiltLost_rad * kTiltLost_rad);
+      }
+    } else {
+      length = ahead;
+    }
+  }
+  if (step_directed_ && velocity_known_) {
+    x = inertial_x;
+    y = inertial_y;
     const float ux = step_cosine_ * forward_.cosine() - step_sine_ * forward_.sine();
     const float uy = step_sine_ * forward_.cosine() + step_cosine_ * forward_.sine();
     along = filter_.along(kPosition, ux, uy);

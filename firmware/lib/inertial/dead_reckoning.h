@@ -40,6 +40,7 @@ struct InertialCounters {
   uint16_t rejected_steps;      // arcs while walking that were no step
   uint16_t doubtful_steps;      // steps whose length contradicted the inertial motion
   uint16_t rejected_magnetic;
+  uint16_t lost_steps;          // steps after which the velocity had to start anew
 };
 
 class DeadReckoning {
@@ -83,7 +84,8 @@ class DeadReckoning {
   void run_job(const float rotation[kAxes * kAxes]);
   void capture_span();
   void predict_attitude(const float rotation[kAxes * kAxes]);
-  void measure(State group, const float direction[kAxes], float innovation, float variance);
+  void measure(State group, const float direction[kAxes], float innovation, float variance,
+               float yaw = 0.0f);
   void commit_step();
   void commit_still();
   void apply_magnetic();

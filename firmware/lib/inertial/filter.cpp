@@ -90,34 +90,40 @@ void ErrorFilter::predict_motion(const float f[kAxes], float dt_s) {
   move_position(0.5f * dt_s);
 }
 
-float ErrorFilter::update(State group, const float direction[kAxes], float innovation,
+float ErrorFilter::update(State group, const float direction[kAxes], float yaw, float innovation,
                           float variance, float correction[kStates]) {
   float ph[kStates];
   for (uint8_t i = 0; i < kStates; ++i) {
-    float sum = 0.0f;
+    float sum = yaw * p_[index(i, kAttitude + kZ)];
     for (uint8_t j = 0; j < kAxes; ++j) {
       if (direction[j] != 0.0f) sum += direction[j] * p_[index(i, group + j)];
     }
     ph[i] = sum;
   }
-  float total = variance;
+  float total = variance + yaw * ph[kAttitude + kZ];
   for (uint8_t j = 0; j < kAxes; ++j) total += direction[j] * ph[group + j];
   const float inverse = 1.0f / total;
-  const float weighed = innovation * inverse;
+  // A torso's velocity and position say nothing of use about its heading or the gyroscope's bias:
+  // a bias of 0.1 deg/s shows as 2 mm/s2 of sideways force, as much as 0.01 deg of tilt. What these
+  // measurements seemed to say was model error, so they only consider heading and bias (Schmidt
+  // 1966): correlations count, the states and their own variances stay.
+  const bool considers = group >= kVelocity;
   float* p = p_;
   for (uint8_t i = 0; i < kStates; ++i) {
+    const bool fixed = considers && i >= kAttitude + kZ && i < kVelocity;
     const float gain = ph[i] * inverse;
     const float floor = kFloor[i / kAxes];
-    if (*p - gain * ph[i] < floor) {
-      if (repairs_ < 65535u && *p > floor) ++repairs_;
-      *p = floor;
-      ++p;
-    } else {
-      *p -= gain * ph[i];
-      ++p;
+    for (uint8_t j = i; j < kStates; ++j, ++p) {
+      if (fixed && j < kVelocity) continue;
+      const float reduced = *p - gain * ph[j];
+      if (j == i && reduced < floor) {
+        if (repairs_ < 65535u && *p > floor) ++repairs_;
+        *p = floor;
+      } else {
+        *p = reduced;
+      }
     }
-    for (uint8_t j = i + 1; j < kStates; ++j) *p++ -= gain * ph[j];
-    correction[i] = ph[i] * weighed;
+    correction[i] = fixed ? 0.0f : gain * innovation;
   }
   return total;
 }

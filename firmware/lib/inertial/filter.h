@@ -30,10 +30,11 @@ class ErrorFilter {
   void reset(float tilt_rad, float heading_rad, float bias_rad_s, float velocity_m_s);
   void predict_attitude(const float rotation[kAxes * kAxes], float dt_s);
   void predict_motion(const float impulse_m_s[kAxes], float dt_s);
-  // Scalar measurement z = direction . x[group .. group+2] with the innovation and variance given;
-  // correction[kStates] is what to add to the nominal state. Returns the innovation variance.
-  float update(State group, const float direction[kAxes], float innovation, float variance,
-               float correction[kStates]);
+  // Scalar measurement z = direction . x[group .. group+2] + yaw x[heading] with the innovation and
+  // variance given; correction[kStates] is what to add to the nominal state. Returns the
+  // innovation variance.
+  float update(State group, const float direction[kAxes], float yaw, float innovation,
+               float variance, float correction[kStates]);
   // A group becomes known exactly (position at a step's end) or anew with the given sigma.
   void restart(State group, float sigma);
 
