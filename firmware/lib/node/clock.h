@@ -29,7 +29,8 @@ class NodeClock {
 };
 
 // The IMU samples by its own clock, up to 1 % off; integrating with a wrong period would turn every
-// angle wrong by as much. The period is measured in blocks by the node's clock.
+// angle wrong by as much. The period is measured in blocks by the node's clock. Zeroed memory is the
+// start.
 class SampleClock {
  public:
   static constexpr uint32_t kNominalUs = 20000;
@@ -40,10 +41,11 @@ class SampleClock {
     const uint32_t gap_us = now_us - last_us_;
     last_us_ = now_us;
     if (!started_ || gap_us > kGapUs) {
+      const bool first = !started_;
+      if (first) period_us_ = kNominalUs;
+      started_ = true;
       block_start_us_ = now_us;
       block_samples_ = 0;
-      const bool first = !started_;
-      started_ = true;
       return first ? kNominalUs : gap_us;
     }
     if (++block_samples_ == kBlockSamples) {
@@ -55,17 +57,15 @@ class SampleClock {
     }
     return period_us_;
   }
-  uint32_t since_us(uint32_t now_us) const { return now_us - last_us_; }
-  void begin(uint32_t now_us) { last_us_ = now_us; }
 
  private:
   static constexpr uint16_t kBlockSamples = 512;  // 10 s
 
-  uint32_t last_us_ = 0;
-  uint32_t block_start_us_ = 0;
-  uint32_t period_us_ = kNominalUs;
-  uint16_t block_samples_ = 0;
-  bool started_ = false;
+  uint32_t last_us_;
+  uint32_t block_start_us_;
+  uint32_t period_us_;
+  uint16_t block_samples_;
+  bool started_;
 };
 
 }  // namespace relpos

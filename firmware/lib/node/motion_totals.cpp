@@ -6,7 +6,7 @@ namespace relpos {
 namespace {
 
 constexpr float kPi = 3.14159265f;
-constexpr float kTurn100urad = 62831.853f;
+constexpr float kTurnRad = 6.2831853f;
 
 // What a wearer may do unseen. A walk of unknown direction at 1 m/s, turning at 0.5 rad/s; the
 // heading is unknown altogether (uniform: pi^2 / 3) after 4 s. The gap is cut at 60 s, where the
@@ -36,8 +36,9 @@ void MotionTotals::track(const Displacement& now) {
 }
 
 int32_t MotionTotals::heading_100urad(const Displacement& now) const {
-  return base_heading_100urad_ + lroundf(now.heading_rad * 10000.0f) +
-         lroundf(static_cast<float>(turns_) * kTurn100urad);
+  return base_heading_100urad_ +
+         static_cast<int32_t>(scaled(now.heading_rad, 10000) +
+                              scaled(static_cast<float>(turns_) * kTurnRad, 10000));
 }
 
 void MotionTotals::fill(const Displacement& now, wire::Motion* motion) const {

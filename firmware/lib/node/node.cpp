@@ -1,7 +1,5 @@
 #include "node/node.h"
 
-#include <math.h>
-
 #include "node/version.h"
 
 namespace relpos {
@@ -10,7 +8,7 @@ namespace {
 constexpr uint32_t kMostStepUs = 200000;   // dead reckoning takes no longer step: it starts anew
 constexpr uint32_t kSilentMs = 500;        // without a sample for so long there is no motion to tell
 constexpr uint32_t kFieldStaleMs = 1000;
-constexpr uint16_t kSilentPollUs = 500;    // two bytes at 38400 baud
+constexpr uint32_t kSilentPollUs = 500;    // two bytes at 38400 baud
 constexpr uint32_t kMostWaitUs = 100000;
 // The module answers in some 10 ms, with its own retries in under 100 ms. No answer is a failure.
 constexpr uint32_t kTransmitStatusMs = 200;
@@ -37,7 +35,6 @@ constexpr uint8_t flag(wire::Quality quality) { return static_cast<uint8_t>(qual
 
 void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
   clock_.begin(now_us);
-  sample_clock_.begin(now_us);
   imu_due_us_ = now_us;
   pozyx_due_us_ = now_us;
 
@@ -110,21 +107,21 @@ uint32_t Node::poll(uint32_t now_us) {
 
 // Microseconds until something is due. Radio and storage in progress are looked after meanwhile.
 uint32_t Node::wait_us(uint32_t now_us) const {
-  uint32_t wait = kMostWaitUs;
-  if (xbee_.busy() || awaiting_status_ || store_.saving() || reboot_step_ != 0) {
-    wait = xbee_.busy() ? kSilentPollUs : 4 * kSilentPollUs;
-  }
-  const uint32_t imu = imu_due_us_ - now_us;
-  if (imu < wait) wait = imu;
-  const uint32_t pozyx = pozyx_due_us_ - now_us;
-  if (pozyx < wait) wait = pozyx;
-  const uint32_t dues_ms[] = {motion_due_ms_, status_due_ms_, round_due_ms_};
-  for (const uint32_t& due_ms : dues_ms) {
-    if (&due_ms == &dues_ms[2] && (peer_ != kNoPeer || settings_.ranging_period_ms == 0)) continue;
-    const uint32_t ms = due_ms - clock_.ms();
-    if (ms < wait / 1000) wait = ms * 1000;
-  }
+  uint32_t wait_ms = kMostWaitUs / 1000;
+  shorten(motion_due_ms_, &wait_ms);
+  shorten(status_due_ms_, &wait_ms);
+  if (settings_.ranging_period_ms != 0) shorten(round_due_ms_, &wait_ms);
+  uint32_t wait = wait_ms * 1000;
+  if (awaiting_status_ || store_.saving() || reboot_step_ != 0) wait = kSilentPollUs;
+  if (imu_due_us_ - now_us < wait) wait = imu_due_us_ - now_us;
+  if (pozyx_due_us_ - now_us < wait) wait = pozyx_due_us_ - now_us;
   return wait;
+}
+
+// What is overdue waits for something else, which is looked after anyway.
+void Node::shorten(uint32_t due_ms, uint32_t* wait_ms) const {
+  const uint32_t ms = due_ms - clock_.ms();
+  if (ms < *wait_ms) *wait_ms = ms;
 }
 
 // Whether a period has ended. Periods that could not be kept are skipped, not made up for.
@@ -214,13 +211,15 @@ void Node::tick(uint32_t now_us) {
   const Displacement& now = dead_reckoning_.displacement();
   totals_.track(now);
   const uint16_t flags = now.quality_flags;
-  if ((flags & kMagneticDisturbed) != 0) quality_ |= flag(wire::Quality::kMagnetometerDisturbed);
-  if ((flags & (kAccelerationSaturated | kAngularRateSaturated)) != 0) {
-    quality_ |= flag(wire::Quality::kSaturated);
+  uint8_t quality = quality_;
+  if (flags & kMagneticDisturbed) quality |= flag(wire::Quality::kMagnetometerDisturbed);
+  if (flags & (kAccelerationSaturated | kAngularRateSaturated)) {
+    quality |= flag(wire::Quality::kSaturated);
   }
-  if ((flags & kForwardUnknown) != 0) quality_ |= flag(wire::Quality::kForwardAxisUnknown);
-  if ((flags & kStepDoubtful) != 0) quality_ |= flag(wire::Quality::kIrregularGait);
-  if ((flags & kBadInput) != 0) quality_ |= flag(wire::Quality::kImuGap);
+  if (flags & kForwardUnknown) quality |= flag(wire::Quality::kForwardAxisUnknown);
+  if (flags & kStepDoubtful) quality |= flag(wire::Quality::kIrregularGait);
+  if (flags & kBadInput) quality |= flag(wire::Quality::kImuGap);
+  quality_ = quality;
   if (now.steps != seen_steps_) note_step();
 }
 
@@ -483,7 +482,7 @@ uint8_t Node::fill_motion(uint8_t* body) {
   motion.time_ms = sampled_ && !silent ? last_sample_ms_ : clock_.ms();
   if (field && now.magnetic_heading_valid) {
     motion.magnetic_heading_100urad =
-        static_cast<int16_t>(lroundf(now.magnetic_heading_rad * 10000.0f));
+        static_cast<int16_t>(scaled(now.magnetic_heading_rad, 10000));
     quality_ |= flag(wire::Quality::kMagnetometerValid);
   }
   if (silent) quality_ |= flag(wire::Quality::kImuGap);

@@ -48,6 +48,8 @@ struct NodeState {
   };
 
   NodeClock clock_;
+  SampleClock sample_clock_;
+  Settings settings_;
   MotionTotals totals_;
   Ring<PendingRange, kPendingRanges> ranges_;
   Ring<PendingStep, kPendingSteps> steps_;
@@ -125,14 +127,13 @@ class Node : private NodeState {
   void show_health();
   bool imu_silent() const;
   uint32_t wait_us(uint32_t now_us) const;
+  void shorten(uint32_t due_ms, uint32_t* wait_ms) const;
 
   Board& board_;
-  Settings settings_;
   SettingsStore store_;
   Mpu9150 imu_;
   Ak8975 magnetometer_;
   DeadReckoning dead_reckoning_;
-  SampleClock sample_clock_;
   Pozyx pozyx_;
   Xbee xbee_;
 };

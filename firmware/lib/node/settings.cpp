@@ -2,6 +2,7 @@
 
 #include <string.h>
 
+#include "devices/flash.h"
 #include "wire/frame.h"
 
 namespace relpos {
@@ -12,6 +13,7 @@ constexpr uint8_t kLayout = 1;  // of Settings; another one is not read
 constexpr uint8_t kRecordBytes = 1 + sizeof(Settings) + 2;
 static_assert(kStoredSettings + kRecordBytes <= kStoredSettingsCopy, "records must not overlap");
 static_assert(kStoredSettingsCopy + kRecordBytes <= kStorageBytes, "records must fit");
+const Settings kDefaults RELPOS_FLASH = {6, 0, kLedHealth, 0, 930, 1250, 1000, 2000, 10000};
 constexpr uint16_t kSeed = 0xFFFF;
 
 uint16_t crc_of(const Settings& settings) {
@@ -37,7 +39,10 @@ bool load_copy(Board& board, uint16_t at, Settings* settings) {
 }  // namespace
 
 void SettingsStore::load(Board& board, Settings* settings) {
-  *settings = Settings();
+  for (uint8_t i = 0; i < sizeof kDefaults; ++i) {
+    reinterpret_cast<uint8_t*>(settings)[i] =
+        flash_byte(reinterpret_cast<const uint8_t*>(&kDefaults) + i);
+  }
   if (!load_copy(board, kStoredSettings, settings)) {
     load_copy(board, kStoredSettingsCopy, settings);
   }

@@ -22,15 +22,15 @@ constexpr uint8_t kDefaultNodeId = 1;  // where none is stored
 enum LedMode : uint8_t { kLedOff = 0, kLedOn = 1, kLedHealth = 2 };
 
 struct Settings {
-  uint8_t team_size = 6;  // node ids 1 to team_size are ranged
-  uint8_t step_reports = 0;
-  uint8_t led = kLedHealth;
-  uint8_t gain_version = 0;  // counts changes of the next two
-  uint16_t leg_length_mm = 930;
-  uint16_t step_gain_permille = 1250;
-  uint16_t report_period_ms = 1000;
-  uint16_t ranging_period_ms = 2000;  // 0: no ranging
-  uint16_t status_period_ms = 10000;
+  uint8_t team_size;  // node ids 1 to team_size are ranged
+  uint8_t step_reports;
+  uint8_t led;
+  uint8_t gain_version;  // counts changes of the next two
+  uint16_t leg_length_mm;
+  uint16_t step_gain_permille;
+  uint16_t report_period_ms;
+  uint16_t ranging_period_ms;  // 0: no ranging
+  uint16_t status_period_ms;
 };
 
 // Two copies with a CRC each: a power cut while one is written leaves the other.
