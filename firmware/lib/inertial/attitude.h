@@ -13,7 +13,7 @@ const float kPi = 3.14159265f;
 float wrap_angle(float angle_rad);  // to (-pi, pi]; for angles within a few turns
 
 struct Attitude {
-  float w, x, y, z;
+  float q[4];  // scalar part, then x, y, z
 
   void set_identity();
   // The shortest rotation that brings the body vector `up` (any length > 0) to the vertical.
@@ -28,7 +28,7 @@ struct Attitude {
   void premultiply(const Attitude& first);
 
  private:
-  void normalise();
+  void take(const float product[4]);  // and normalise
 };
 
 // out = rotation * in, and with the transposed matrix.

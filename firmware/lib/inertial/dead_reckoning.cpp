@@ -1,6 +1,7 @@
 #include "dead_reckoning.h"
 
 #include <math.h>
+#include <string.h>
 
 namespace relpos {
 namespace {
@@ -74,36 +75,18 @@ DeadReckoning::DeadReckoning() { reset(); }
 void DeadReckoning::configure(const InertialConfig& config) { config_ = config; }
 
 void DeadReckoning::reset() {
-  displacement_ = Displacement();
+  // All but the configuration starts at zero, cleared as one block: member by member it would be a
+  // kilobyte of the Uno's flash. Every member is a number, an enum or an array of such.
+  const InertialConfig kept = config_;
+  memset(static_cast<void*>(this), 0, sizeof *this);
+  config_ = kept;
   displacement_.quality_flags = kStarting | kForwardUnknown | kBiasUncertain;
-  counters_ = InertialCounters();
-  totals_.reset();
   filter_.reset(kTiltMoving_rad, 0.0f, kBiasMoving_rad_s, kSpeedUnknown_m_s);
   gait_.reset();
   forward_.reset();
   attitude_.set_identity();
-  clear(bias_rad_s_);
-  clear(velocity_m_s_);
-  clear(position_m_);
-  clear(stance_position_m_);
-  clear(heading_axis_);
-  clear(impulse_m_s_);
-  clear(span_impulse_m_s_);
-  clear(magnetic_reference_ut_);
   gravity_m_s2_ = kStandardGravity_m_s2;
-  elapsed_s_ = span_s_ = 0.0f;
-  heading_sum_rad_ = 0.0f;
-  stance_heading_rad_[0] = stance_heading_rad_[1] = stance_interval_s_ = 0.0f;
-  step_length_m_ = step_sigma_m_ = step_speed_m_s_ = step_rate_rad_s_ = step_sine_ = 0.0f;
   step_cosine_ = 1.0f;
-  magnetic_residual_rad_ = quiet_s_ = mean_force_m_s2_ = 0.0f;
-  ticks_ = 0;
-  step_ticks_ = 0;
-  stances_ = magnetic_count_ = 0;
-  hold_acceleration_ = hold_rate_ = hold_input_ = hold_doubt_ = 0;
-  job_ = kIdle;
-  motion_pending_ = magnetic_pending_ = step_directed_ = step_straight_ = false;
-  velocity_known_ = false;
 }
 
 bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {

@@ -1,7 +1,5 @@
 #include "displacement.h"
 
-#include <math.h>
-
 namespace relpos {
 namespace {
 
@@ -32,10 +30,10 @@ float Totals::y_m() const { return static_cast<float>(y_) * (1.0f / kUnitsPerMet
 float Totals::path_m() const { return static_cast<float>(path_) * (1.0f / kUnitsPerMetre); }
 
 float scale_variance_growth_m2(float path_m, float length_m, float sigma, float correlation_m) {
+  // The share of the scale error that is still the same: x / (1 + x) instead of the exponential's
+  // 1 - exp(-x), which it follows at both ends; the exponential is 450 bytes of the Uno's flash.
   const float middle = path_m + 0.5f * length_m;
-  const float ratio = middle / correlation_m;
-  const float share = ratio > 10.0f ? 1.0f : 1.0f - expf(-ratio);
-  return 2.0f * sigma * sigma * correlation_m * share * length_m;
+  return 2.0f * sigma * sigma * correlation_m * length_m * middle / (middle + correlation_m);
 }
 
 }  // namespace relpos

@@ -1,6 +1,7 @@
 #include "gait.h"
 
 #include <math.h>
+#include <string.h>
 
 #include "attitude.h"
 
@@ -23,11 +24,8 @@ const float kForwardCoherence = 0.06f;
 }  // namespace
 
 void GaitDetector::reset() {
-  mean_m_s2_ = velocity_m_s_ = height_m_ = 0.0f;
-  peak_m_ = 0.0f;
+  memset(static_cast<void*>(this), 0, sizeof *this);
   since_s_ = kPause_s + 1.0f;
-  rejected_ = 0;
-  running_ = false;
   restart_arc();
 }
 
@@ -92,11 +90,8 @@ float pendulum_step_m(float excursion_m, float leg_length_m, float gain) {
 }
 
 void ForwardFinder::reset() {
-  product_x_ = product_y_ = power_a_ = power_v_ = 0.0f;
-  offset_rad_ = sine_ = 0.0f;
+  memset(static_cast<void*>(this), 0, sizeof *this);
   cosine_ = 1.0f;
-  steps_ = 0;
-  found_ = false;
 }
 
 void ForwardFinder::update(float ax, float ay, float vertical_velocity_m_s, float dt_s) {
