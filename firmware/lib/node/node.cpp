@@ -357,8 +357,8 @@ wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_forc
       if (good) motion_due_ms_ = clock_.ms() + s.report_period_ms;
       break;
     case wire::CommandCode::kSetRangingPeriodMs:  // 0: no ranging
-      good = set(&s.ranging_period_ms, value, value == 0 ? 0 : kLeastRangingMs, kMostPeriodMs,
-                 in_force);
+      good = set(&s.ranging_period_ms, value,
+                 value == 0 ? 0 : static_cast<int32_t>(kLeastRangingMs), kMostPeriodMs, in_force);
       if (good) round_due_ms_ = clock_.ms() + s.ranging_period_ms;
       break;
     case wire::CommandCode::kSetStatusPeriodMs:
