@@ -290,6 +290,8 @@ void DeadReckoning::on_stance(const Stance& stance) {
     capture_span();
     forward_.step();
   }
+  walk_x_ = step_cosine_ * forward_.cosine() - step_sine_ * forward_.sine();
+  walk_y_ = step_sine_ * forward_.cosine() + step_cosine_ * forward_.sine();
   job_ = kFlush;
 }
 
@@ -329,14 +331,11 @@ void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
   float direction[kAxes] = {0.0f, 0.0f, 0.0f};
   const Job job = job_;
   job_ = static_cast<Job>(job + 1);
-  // Walking direction in the navigation frame: mean heading plus the forward axis's offset. It turns
-  // with the heading's error, so the step's measurements depend on that too: turning heading,
-  // velocity and position together changes neither. Without these terms the filter believed to
-  // observe the heading and lost it (18 deg/min on simulated walks, NEES 74).
-  const float ux = step_cosine_ * forward_.cosine() - step_sine_ * forward_.sine();
-  const float uy = step_sine_ * forward_.cosine() + step_cosine_ * forward_.sine();
-  const float ahead = ux * stance_position_m_[kX] + uy * stance_position_m_[kY];
-  const float aside = ux * stance_position_m_[kY] - uy * stance_position_m_[kX];
+  // The walking direction turns with the heading's error, so the step's measurements depend on that
+  // too: turning heading, velocity and position together changes neither. Without these terms the
+  // filter believed to observe the heading and lost it (18 deg/min on simulated walks, NEES 74).
+  const float ahead = walk_x_ * stance_position_m_[kX] + walk_y_ * stance_position_m_[kY];
+  const float aside = walk_x_ * stance_position_m_[kY] - walk_y_ * stance_position_m_[kX];
   switch (job) {
     case kFlush:
       predict_attitude(rotation);
@@ -344,12 +343,12 @@ void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
       if (!step_directed_) job_ = kVertical;
       break;
     case kForward: {
-      direction[kX] = ux;
-      direction[kY] = uy;
+      direction[kX] = walk_x_;
+      direction[kY] = walk_y_;
       const float innovation = step_length_m_ - ahead;
       float variance = step_sigma_m_ * step_sigma_m_;
       const float least = innovation * innovation * (1.0f / (kDoubt * kDoubt)) -
-                          filter_.along(kPosition, ux, uy);
+                          filter_.along(kPosition, walk_x_, walk_y_);
       if (least > variance) {  // weighed down to what makes it a three-sigma surprise
         variance = least;
         count(&counters_.doubtful_steps);
@@ -359,8 +358,8 @@ void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
       break;
     }
     case kLateral:
-      direction[kX] = -uy;
-      direction[kY] = ux;
+      direction[kX] = -walk_y_;
+      direction[kY] = walk_x_;
       measure(kPosition, direction, -aside, kLateralSigma_m * kLateralSigma_m, -ahead);
       break;
     case kVertical:
@@ -442,10 +441,8 @@ void DeadReckoning::commit_step() {
   if (step_directed_ && velocity_known_) {
     x = inertial_x;
     y = inertial_y;
-    const float ux = step_cosine_ * forward_.cosine() - step_sine_ * forward_.sine();
-    const float uy = step_sine_ * forward_.cosine() + step_cosine_ * forward_.sine();
-    along = filter_.along(kPosition, ux, uy);
-    across = filter_.along(kPosition, -uy, ux);
+    along = filter_.along(kPosition, walk_x_, walk_y_);
+    across = filter_.along(kPosition, -walk_y_, walk_x_);
   }
   displacement_.variance_along_m2 +=
       along + scale_variance_growth_m2(displacement_.path_m, length, config_.scale_sigma,
@@ -459,10 +456,8 @@ void DeadReckoning::commit_step() {
   filter_.restart(kPosition, 0.0f);
   if (displacement_.initialised && forward_.found() && !velocity_known_) {
     // Switched on while walking: the speed is first known when the forward axis is.
-    velocity_m_s_[kX] =
-        step_speed_m_s_ * (step_cosine_ * forward_.cosine() - step_sine_ * forward_.sine());
-    velocity_m_s_[kY] =
-        step_speed_m_s_ * (step_sine_ * forward_.cosine() + step_cosine_ * forward_.sine());
+    velocity_m_s_[kX] = step_speed_m_s_ * walk_x_;
+    velocity_m_s_[kY] = step_speed_m_s_ * walk_y_;
     velocity_m_s_[kZ] = 0.0f;
     filter_.restart(kVelocity, kSpeedFound_m_s);
     velocity_known_ = true;

@@ -118,6 +118,7 @@ class DeadReckoning {
   float stance_interval_s_;      // between those two
   float step_length_m_, step_sigma_m_, step_speed_m_s_;
   float step_cosine_, step_sine_;  // mean heading over the step
+  float walk_x_, walk_y_;  // walking direction in the navigation frame: heading and forward axis
   float step_rate_rad_s_;          // yaw rate over two steps; NaN-free: see step_straight_
 
   float magnetic_reference_ut_[kAxes];
