@@ -90,29 +90,25 @@ void DeadReckoning::reset() {
 }
 
 bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
-  bool good = dt_s > 0.0f && dt_s <= 0.2f;
+  bool good = dt_s > 0.0f && dt_s <= 0.2f, saturated = false;
   for (uint8_t i = 0; i < kAxes; ++i) {
-    good = good && finite(sample.acceleration_m_s2[i]) && finite(sample.angular_rate_rad_s[i]);
-  }
-  if (good) return false;
-  count(&counters_.refused_samples);
-  hold_input_ = kHoldTicks;
-  return true;
-}
-
-void DeadReckoning::watch_limits(const ImuSample& sample) {
-  bool saturated = false;
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    if (fabsf(sample.acceleration_m_s2[i]) > config_.acceleration_limit_m_s2) {
+    const float force = fabsf(sample.acceleration_m_s2[i]);
+    const float rate = fabsf(sample.angular_rate_rad_s[i]);
+    good = good && finite(force + rate);
+    if (force > config_.acceleration_limit_m_s2) {
       hold_acceleration_ = kHoldTicks;
       saturated = true;
     }
-    if (fabsf(sample.angular_rate_rad_s[i]) > config_.angular_rate_limit_rad_s) {
+    if (rate > config_.angular_rate_limit_rad_s) {
       hold_rate_ = kHoldTicks;
       saturated = true;
     }
   }
   if (saturated) count(&counters_.saturated_samples);
+  if (good) return false;
+  count(&counters_.refused_samples);
+  hold_input_ = kHoldTicks;
+  return true;
 }
 
 void DeadReckoning::watch_quiet(const ImuSample& sample, float dt_s) {
@@ -193,7 +189,6 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
     publish();
     return;
   }
-  watch_limits(sample);
   watch_quiet(sample, dt_s);
 
   float angle[kAxes];
@@ -219,11 +214,9 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   float rotation[kAxes * kAxes], force[kAxes];
   attitude_.matrix(rotation);
   rotate(rotation, sample.acceleration_m_s2, force);
-  displacement_.heading_rad = atan2f(
-      rotation[3] * heading_axis_[kX] + rotation[4] * heading_axis_[kY] +
-          rotation[5] * heading_axis_[kZ],
-      rotation[0] * heading_axis_[kX] + rotation[1] * heading_axis_[kY] +
-          rotation[2] * heading_axis_[kZ]);
+  float ahead[kAxes];  // the heading axis
+  rotate(rotation, heading_axis_, ahead);
+  displacement_.heading_rad = atan2f(ahead[kY], ahead[kX]);
   heading_sum_rad_ += wrap_angle(displacement_.heading_rad - stance_heading_rad_[0]);
   if (step_ticks_ < 65535u) ++step_ticks_;
 
@@ -237,10 +230,11 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   elapsed_s_ += dt_s;
 
   const bool at_stance = gait_.update(force[kZ], dt_s, &stance);
-  // Heading frame: rotate the horizontal force by minus the heading.
-  const float cosine = cosf(displacement_.heading_rad), sine = sinf(displacement_.heading_rad);
-  forward_.update(cosine * force[kX] + sine * force[kY], cosine * force[kY] - sine * force[kX],
-                  gait_.vertical_velocity_m_s(), dt_s);
+  // Into the heading frame. The heading axis is level but for the body's tilt, whose square is all
+  // that is lost by not normalising it: both components alike, which the direction does not see.
+  forward_.update(ahead[kX] * force[kX] + ahead[kY] * force[kY],
+                  ahead[kX] * force[kY] - ahead[kY] * force[kX], gait_.vertical_velocity_m_s(),
+                  dt_s);
   if (at_stance) {
     // A motion stage left over belongs before the mid-stance.
     const bool busy = motion_pending_;
@@ -485,17 +479,14 @@ void DeadReckoning::commit_still() {
 
 void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
   displacement_.magnetic_heading_valid = false;
-  if (!displacement_.initialised || !finite(field_ut[kX] + field_ut[kY] + field_ut[kZ])) {
-    if (displacement_.initialised) count(&counters_.rejected_magnetic);
-    return;
-  }
+  if (!displacement_.initialised) return;
   float rotation[kAxes * kAxes], field[kAxes];
   attitude_.matrix(rotation);
   rotate(rotation, field_ut, field);
-  const float strength = norm(field);
-  bool plausible = strength > kFieldLeast_ut && strength < kFieldMost_ut;
-  float residual = 0.0f;
+  const float strength = norm(field);  // NaN fails every comparison below
   const float azimuth = atan2f(field[kY], field[kX]);
+  bool plausible = strength > kFieldLeast_ut && strength < kFieldMost_ut;
+  bool used = plausible;
   if (plausible && magnetic_count_ < kFieldReadings) {
     ++magnetic_count_;
     const float share = 1.0f / magnetic_count_;
@@ -506,16 +497,14 @@ void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
     const float reference = norm(magnetic_reference_ut_);
     plausible = fabsf(strength - reference) < kFieldNorm * reference &&
                 fabsf(field[kZ] - magnetic_reference_ut_[kZ]) < kFieldVertical * reference;
-    residual = wrap_angle(atan2f(magnetic_reference_ut_[kY], magnetic_reference_ut_[kX]) - azimuth);
-    magnetic_pending_ = plausible && fabsf(residual) < kFieldResidual_rad;
-    magnetic_residual_rad_ = residual;
+    magnetic_residual_rad_ =
+        wrap_angle(atan2f(magnetic_reference_ut_[kY], magnetic_reference_ut_[kX]) - azimuth);
+    used = magnetic_pending_ = plausible && fabsf(magnetic_residual_rad_) < kFieldResidual_rad;
   }
-  const bool used = plausible && fabsf(residual) < kFieldResidual_rad;
   displacement_.magnetic_heading_valid = plausible;
   displacement_.magnetic_heading_rad = wrap_angle(displacement_.heading_rad - azimuth);
-  if (used) {
-    displacement_.quality_flags &= static_cast<uint16_t>(~kMagneticDisturbed);
-  } else {
+  displacement_.quality_flags &= static_cast<uint16_t>(~kMagneticDisturbed);
+  if (!used) {
     displacement_.quality_flags |= kMagneticDisturbed;
     count(&counters_.rejected_magnetic);
   }

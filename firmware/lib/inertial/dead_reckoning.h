@@ -75,7 +75,6 @@ class DeadReckoning {
   };
 
   bool refuse(const ImuSample& sample, float dt_s);
-  void watch_limits(const ImuSample& sample);
   void watch_quiet(const ImuSample& sample, float dt_s);
   void gather(const ImuSample& sample, float dt_s);
   void initialise(bool still);
