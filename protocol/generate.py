@@ -12,6 +12,7 @@ import argparse
 import enum
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -129,42 +130,40 @@ def _range_check(field: Quantity, value: str) -> str | None:
     return " || ".join(checks) if checks else None
 
 
+def _table(name: str, fields: Sequence[Quantity], struct: str) -> list[str]:
+    rows = [
+        f"    {{offsetof({struct}, {f.raw_name}), {f.byte_count}, "
+        f"{4 if f.wire == 'u24' else f.byte_count}}},"
+        for f in fields
+    ]
+    return [f"const Field {name}[] FLASH = {{", *rows, "};", ""]
+
+
+def _checks(fields: Sequence[Quantity], prefix: str, failed: str, indent: str) -> list[str]:
+    checks = [_range_check(f, f"{prefix}{f.raw_name}") for f in fields]
+    return [f"{indent}if ({check}) return {failed};" for check in checks if check]
+
+
 def _codec(message: Message) -> list[str]:
     name = _camel(message.name)
-    out = [f"uint8_t encode(const {name}& message, uint8_t* body) {{", "  uint8_t* out = body;"]
-
-    def put(fields: Any, prefix: str, indent: str) -> list[str]:
-        lines = []
-        for f in fields:
-            value = f"{prefix}{f.raw_name}"
-            check = _range_check(f, value)
-            if check:
-                lines.append(f"{indent}if ({check}) return 0;")
-            cast = "static_cast<uint32_t>(" + value + ")" if f.signed else value
-            lines.append(f"{indent}out = put(out, {cast}, {f.byte_count});")
-        return lines
-
-    def get(fields: Any, prefix: str, indent: str) -> list[str]:
-        lines = []
-        for f in fields:
-            value = f"{prefix}{f.raw_name}"
-            lines.append(
-                f"{indent}{value} = static_cast<{_C_TYPES[f.wire]}>(take(&in, {f.byte_count}));"
-            )
-            check = _range_check(f, value)
-            if check:
-                lines.append(f"{indent}if ({check}) return false;")
-        return lines
-
-    out += put(message.fields, "message.", "  ")
-    if message.entries is not None:
-        entry = _camel(message.entries.singular) + "Entry"
+    entries = message.entries
+    out = _table(f"k{name}", message.fields, name)
+    if entries is not None:
+        entry = _camel(entries.singular) + "Entry"
+        out += _table(f"k{entry}", entries.fields, entry)
+    out += [
+        f"uint8_t encode(const {name}& message, uint8_t* body) {{",
+        *_checks(message.fields, "message.", "0", "  "),
+        f"  uint8_t* out = put(k{name}, {len(message.fields)}, &message, body);",
+    ]
+    if entries is not None:
         out += [
             f"  if (message.count > kMost{name}) return 0;",
             "  *out++ = message.count;",
             "  for (uint8_t i = 0; i < message.count; ++i) {",
             f"    const {entry}& entry = message.entries[i];",
-            *put(message.entries.fields, "entry.", "    "),
+            *_checks(entries.fields, "entry.", "0", "    "),
+            f"    out = put(k{entry}, {len(entries.fields)}, &entry, out);",
             "  }",
         ]
     out += [
@@ -172,25 +171,26 @@ def _codec(message: Message) -> list[str]:
         "}",
         "",
         f"bool decode(const uint8_t* body, uint8_t length, {name}* message) {{",
-        "  const uint8_t* in = body;",
     ]
-    if message.entries is None:
+    if entries is None:
         out += [
             f"  if (length != {message.fixed_size}) return false;",
-            *get(message.fields, "message->", "  "),
+            f"  take(k{name}, {len(message.fields)}, body, message);",
+            *_checks(message.fields, "message->", "false", "  "),
         ]
     else:
-        entry = _camel(message.entries.singular) + "Entry"
         out += [
             f"  if (length < {message.fixed_size}) return false;",
-            *get(message.fields, "message->", "  "),
+            f"  const uint8_t* in = take(k{name}, {len(message.fields)}, body, message);",
+            *_checks(message.fields, "message->", "false", "  "),
             "  message->count = *in++;",
             f"  if (message->count > kMost{name}) return false;",
             f"  if (length != {message.fixed_size} + message->count * {message.entry_size}) "
             "return false;",
             "  for (uint8_t i = 0; i < message->count; ++i) {",
             f"    {entry}& entry = message->entries[i];",
-            *get(message.entries.fields, "entry.", "    "),
+            f"    in = take(k{entry}, {len(entries.fields)}, in, &entry);",
+            *_checks(entries.fields, "entry.", "false", "    "),
             "  }",
         ]
     return [*out, "  return true;", "}", ""]
@@ -202,20 +202,52 @@ def source_text() -> str:
         f"// {_NOTICE}",
         '#include "messages.h"',
         "",
+        "#include <stddef.h>",
+        "",
+        "#if defined(__AVR__)",
+        "#include <avr/pgmspace.h>",
+        "#define FLASH PROGMEM",
+        "#else",
+        "#define FLASH",
+        "#endif",
+        "",
         "namespace relpos {",
         "namespace wire {",
         "namespace {",
         "",
-        "uint8_t* put(uint8_t* out, uint32_t value, uint8_t count) {  // little-endian",
-        "  for (; count != 0; --count, value >>= 8) *out++ = static_cast<uint8_t>(value);",
+        "uint8_t flash(const uint8_t* at) {",
+        "#if defined(__AVR__)",
+        "  return pgm_read_byte(at);",
+        "#else",
+        "  return *at;",
+        "#endif",
+        "}",
+        "",
+        'static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "fields are copied as is");',
+        "",
+        "// Where a field stands in its struct, its bytes on the wire and in memory. A table read",
+        "// by one loop: a call a field would cost the Uno 400 bytes of flash more.",
+        "struct Field {",
+        "  uint8_t offset, wire_bytes, memory_bytes;",
+        "};",
+        "",
+        "uint8_t* put(const Field* fields, uint8_t count, const void* message, uint8_t* out) {",
+        "  for (; count != 0; --count, ++fields) {",
+        "    const uint8_t* value = static_cast<const uint8_t*>(message) + flash(&fields->offset);",
+        "    for (uint8_t left = flash(&fields->wire_bytes); left != 0; --left) *out++ = *value++;",
+        "  }",
         "  return out;",
         "}",
         "",
-        "uint32_t take(const uint8_t** in, uint8_t count) {  // little-endian",
-        "  uint32_t value = 0;",
-        "  for (uint8_t i = count; i != 0; --i) value = value << 8 | (*in)[i - 1];",
-        "  *in += count;",
-        "  return value;",
+        "const uint8_t* take(const Field* fields, uint8_t count, const uint8_t* in,",
+        "                    void* message) {",
+        "  for (; count != 0; --count, ++fields) {",
+        "    uint8_t* value = static_cast<uint8_t*>(message) + flash(&fields->offset);",
+        "    const uint8_t wire_bytes = flash(&fields->wire_bytes);",
+        "    const uint8_t memory_bytes = flash(&fields->memory_bytes);",
+        "    for (uint8_t i = 0; i < memory_bytes; ++i) *value++ = i < wire_bytes ? *in++ : 0;",
+        "  }",
+        "  return in;",
         "}",
         "",
         "}  // namespace",

@@ -23,9 +23,7 @@ void multiply(const float a[4], const float b[4], float out[4]) {
 // Rotation by a small angle. Half-angle sine and cosine to third order: at 500 deg/s and 20 ms the
 // angle is 0.17 rad and the truncation 1e-7.
 void turn(const float angle[kAxes], float out[4]) {
-  float square = 0.0f;
-  for (uint8_t i = 0; i < kAxes; ++i) square += angle[i] * angle[i];
-  square *= 0.25f;
+  const float square = 0.25f * dot(angle, angle);
   const float sine = 0.5f - square * (1.0f / 12.0f);
   out[0] = 1.0f - 0.5f * square + square * square * (1.0f / 24.0f);
   for (uint8_t i = 0; i < kAxes; ++i) out[1 + i] = angle[i] * sine;
@@ -45,7 +43,7 @@ void Attitude::set_identity() {
 }
 
 void Attitude::level(const float up[kAxes]) {
-  const float norm = sqrtf(up[kX] * up[kX] + up[kY] * up[kY] + up[kZ] * up[kZ]);
+  const float norm = sqrtf(dot(up, up));
   const float cosine = up[kZ] / norm;
   q[3] = 0.0f;
   if (cosine < -0.9999f) {  // upside down: any horizontal axis will do
@@ -98,12 +96,12 @@ void Attitude::matrix(float r[kAxes * kAxes]) const {
   }
 }
 
+float dot(const float a[kAxes], const float b[kAxes]) {
+  return a[kX] * b[kX] + a[kY] * b[kY] + a[kZ] * b[kZ];
+}
+
 void rotate(const float r[kAxes * kAxes], const float in[kAxes], float out[kAxes]) {
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    float sum = 0.0f;
-    for (uint8_t j = 0; j < kAxes; ++j) sum += *r++ * in[j];
-    out[i] = sum;
-  }
+  for (uint8_t i = 0; i < kAxes; ++i) out[i] = dot(r + 3 * i, in);
 }
 
 }  // namespace relpos

@@ -31,7 +31,8 @@ struct Attitude {
   void take(const float product[4]);  // and normalise
 };
 
-// out = rotation * in, and with the transposed matrix.
+float dot(const float a[kAxes], const float b[kAxes]);
+// out = rotation * in.
 void rotate(const float rotation[kAxes * kAxes], const float in[kAxes], float out[kAxes]);
 
 }  // namespace relpos

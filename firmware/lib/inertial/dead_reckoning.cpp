@@ -64,9 +64,7 @@ void lower(uint8_t* ticks) {
 
 void clear(float vector[kAxes]) { vector[kX] = vector[kY] = vector[kZ] = 0.0f; }
 
-float norm(const float v[kAxes]) {
-  return sqrtf(v[kX] * v[kX] + v[kY] * v[kY] + v[kZ] * v[kZ]);
-}
+float norm(const float v[kAxes]) { return sqrtf(dot(v, v)); }
 
 }  // namespace
 

@@ -28,27 +28,20 @@ void ErrorFilter::reset(float tilt_rad, float heading_rad, float bias_rad_s, flo
 void ErrorFilter::couple(State to, State from, const float m[kAxes * kAxes]) {
   // First the covariances with every state outside `to`, then the block of `to` itself:
   // P_tt' = P_tt + M P_ft + P_tf' M', where P_tf' is already the new one.
-  float old[kAxes * kAxes];  // P_ft before the change
+  float old[kAxes * kAxes];  // P_tf before the change
   for (uint8_t i = 0; i < kAxes; ++i) {
-    for (uint8_t j = 0; j < kAxes; ++j) old[3 * i + j] = p_[index(from + i, to + j)];
+    for (uint8_t j = 0; j < kAxes; ++j) old[3 * j + i] = p_[index(from + i, to + j)];
   }
+  float row[kAxes];
   for (uint8_t other = 0; other < kStates; ++other) {
     if (other >= to && other < to + kAxes) continue;
-    const float f0 = p_[index(from, other)];
-    const float f1 = p_[index(from + 1, other)];
-    const float f2 = p_[index(from + 2, other)];
-    for (uint8_t i = 0; i < kAxes; ++i) {
-      p_[index(to + i, other)] += m[3 * i] * f0 + m[3 * i + 1] * f1 + m[3 * i + 2] * f2;
-    }
+    for (uint8_t i = 0; i < kAxes; ++i) row[i] = p_[index(from + i, other)];
+    for (uint8_t i = 0; i < kAxes; ++i) p_[index(to + i, other)] += dot(m + 3 * i, row);
   }
   for (uint8_t i = 0; i < kAxes; ++i) {
-    const float t0 = p_[index(to + i, from)];
-    const float t1 = p_[index(to + i, from + 1)];
-    const float t2 = p_[index(to + i, from + 2)];
+    for (uint8_t k = 0; k < kAxes; ++k) row[k] = p_[index(to + i, from + k)];
     for (uint8_t j = i; j < kAxes; ++j) {
-      p_[index(to + i, to + j)] += m[3 * i] * old[j] + m[3 * i + 1] * old[3 + j] +
-                                   m[3 * i + 2] * old[6 + j] + t0 * m[3 * j] + t1 * m[3 * j + 1] +
-                                   t2 * m[3 * j + 2];
+      p_[index(to + i, to + j)] += dot(m + 3 * i, old + 3 * j) + dot(row, m + 3 * j);
     }
   }
 }

@@ -73,10 +73,10 @@ bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance* stance) {
   stance->first = first;
   stance->interval_s = first ? 0.6f : since_s_;
   // The three leaky filters shrink an oscillation of period T by 1/sqrt(1 + (T / 2 pi tau)^2) each.
-  const float leak_ratio = stance->interval_s * (1.0f / (2.0f * kPi * kLeakTime_s));
-  const float mean_ratio = stance->interval_s * (1.0f / (2.0f * kPi * kMeanTime_s));
-  stance->excursion_m =
-      excursion * (1.0f + leak_ratio * leak_ratio) * (1.0f + 0.5f * mean_ratio * mean_ratio);
+  const float ratio = stance->interval_s * (1.0f / (2.0f * kPi * kLeakTime_s));
+  const float square = ratio * ratio;
+  const float mean = 0.5f * (kLeakTime_s / kMeanTime_s) * (kLeakTime_s / kMeanTime_s);
+  stance->excursion_m = excursion * (1.0f + square) * (1.0f + mean * square);
   peak_m_ = height_m_;
   since_s_ = 0.0f;
   restart_arc();

@@ -1,5 +1,8 @@
 #include "node/node.h"
 
+#include <stddef.h>
+
+#include "devices/flash.h"
 #include "node/version.h"
 
 namespace relpos {
@@ -17,16 +20,28 @@ constexpr uint16_t kMotionPhaseMs = 157;   // between the reports of neighbourin
 constexpr uint16_t kMostStepAgeMs = 2000;  // then it is sent without waiting for others
 constexpr uint8_t kRebootBytes = 5;
 
-enum : int32_t {
-  kLeastReportMs = 100,
-  kMostPeriodMs = 60000,
-  kLeastRangingMs = 200,
-  kLeastStatusMs = 1000,
-  kLeastLegMm = 400,
-  kMostLegMm = 1400,
-  kLeastGainPermille = 300,
-  kMostGainPermille = 3000,
-  kMostTeam = 20
+// What a command may set: where it stands in the settings, and its limits.
+struct Choice {
+  uint8_t command, offset, bytes;
+  uint16_t low, high;
+};
+static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "settings are written a byte at a time");
+const Choice kChoices[] RELPOS_FLASH = {
+    {static_cast<uint8_t>(wire::CommandCode::kSetReportPeriodMs),
+     offsetof(Settings, report_period_ms), 2, 100, 60000},
+    {static_cast<uint8_t>(wire::CommandCode::kSetRangingPeriodMs),
+     offsetof(Settings, ranging_period_ms), 2, 200, 60000},
+    {static_cast<uint8_t>(wire::CommandCode::kSetStatusPeriodMs),
+     offsetof(Settings, status_period_ms), 2, 1000, 60000},
+    {static_cast<uint8_t>(wire::CommandCode::kSetLegLengthMm), offsetof(Settings, leg_length_mm), 2,
+     400, 1400},
+    {static_cast<uint8_t>(wire::CommandCode::kSetStepGainPermille),
+     offsetof(Settings, step_gain_permille), 2, 300, 3000},
+    {static_cast<uint8_t>(wire::CommandCode::kSetTeamSize), offsetof(Settings, team_size), 1, 1, 20},
+    {static_cast<uint8_t>(wire::CommandCode::kSetStepReports), offsetof(Settings, step_reports), 1, 0,
+     1},
+    {static_cast<uint8_t>(wire::CommandCode::kSetLed), offsetof(Settings, led), 1, kLedOff,
+     kLedHealth},
 };
 
 constexpr uint8_t flag(wire::Quality quality) { return static_cast<uint8_t>(quality); }
@@ -322,75 +337,43 @@ void Node::obey(const uint8_t* body, uint8_t length) {
   done.answer_due = true;
 }
 
-bool Node::set(uint16_t* setting, int32_t value, int32_t low, int32_t high, int32_t* in_force) {
-  const bool good = value >= low && value <= high;
-  if (good && *setting != value) {
-    *setting = static_cast<uint16_t>(value);
-    store_.save(settings_);
-  }
-  *in_force = *setting;
-  return good;
-}
-
-bool Node::set(uint8_t* setting, int32_t value, int32_t low, int32_t high, int32_t* in_force) {
-  uint16_t wide = *setting;
-  const bool good = value >= low && value <= high;
-  if (good && wide != value) {
-    *setting = static_cast<uint8_t>(value);
-    store_.save(settings_);
-  }
-  *in_force = *setting;
-  return good;
-}
-
 wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_force) {
-  Settings& s = settings_;
-  bool good = true;
-  switch (static_cast<wire::CommandCode>(command)) {
-    case wire::CommandCode::kPing:
-      break;
-    case wire::CommandCode::kReboot:
-      if (reboot_step_ == 0) reboot_step_ = 1;
-      break;
-    case wire::CommandCode::kSetReportPeriodMs:
-      good = set(&s.report_period_ms, value, kLeastReportMs, kMostPeriodMs, in_force);
-      if (good) motion_due_ms_ = clock_.ms() + s.report_period_ms;
-      break;
-    case wire::CommandCode::kSetRangingPeriodMs:  // 0: no ranging
-      good = set(&s.ranging_period_ms, value,
-                 value == 0 ? 0 : static_cast<int32_t>(kLeastRangingMs), kMostPeriodMs, in_force);
-      if (good) round_due_ms_ = clock_.ms() + s.ranging_period_ms;
-      break;
-    case wire::CommandCode::kSetStatusPeriodMs:
-      good = set(&s.status_period_ms, value, kLeastStatusMs, kMostPeriodMs, in_force);
-      if (good) status_due_ms_ = clock_.ms() + s.status_period_ms;
-      break;
-    case wire::CommandCode::kSetLegLengthMm:
-    case wire::CommandCode::kSetStepGainPermille: {
-      const bool leg = static_cast<wire::CommandCode>(command) == wire::CommandCode::kSetLegLengthMm;
-      uint16_t* setting = leg ? &s.leg_length_mm : &s.step_gain_permille;
-      const uint16_t before = *setting;
-      good = set(setting, value, leg ? kLeastLegMm : kLeastGainPermille,
-                 leg ? kMostLegMm : kMostGainPermille, in_force);
-      if (*setting != before) {
-        ++s.gain_version;
-        store_.save(s);
-        configure_inertial();
-      }
-      break;
+  const wire::CommandCode code = static_cast<wire::CommandCode>(command);
+  if (code == wire::CommandCode::kReboot && reboot_step_ == 0) reboot_step_ = 1;
+  const Choice* choice = kChoices;
+  while (flash_byte(&choice->command) != command) {
+    if (++choice == kChoices + sizeof kChoices / sizeof kChoices[0]) {
+      return wire::CommandResult::kDone;  // PING and REBOOT set nothing
     }
-    case wire::CommandCode::kSetTeamSize:
-      good = set(&s.team_size, value, 1, kMostTeam, in_force);
-      break;
-    case wire::CommandCode::kSetStepReports:
-      good = set(&s.step_reports, value, 0, 1, in_force);
-      if (s.step_reports == 0) steps_.clear();
-      break;
-    case wire::CommandCode::kSetLed:
-      good = set(&s.led, value, kLedOff, kLedHealth, in_force);
-      break;
   }
-  return good ? wire::CommandResult::kDone : wire::CommandResult::kOutOfRange;
+  uint8_t* setting = reinterpret_cast<uint8_t*>(&settings_) + flash_byte(&choice->offset);
+  const bool wide = flash_byte(&choice->bytes) == 2;
+  uint16_t before = setting[0];
+  if (wide) before = static_cast<uint16_t>(before | static_cast<uint16_t>(setting[1]) << 8);
+  *in_force = before;
+  // A period of 0 stops the ranging.
+  const bool off = value == 0 && code == wire::CommandCode::kSetRangingPeriodMs;
+  if (!off && (value < flash_word(&choice->low) || value > flash_word(&choice->high))) {
+    return wire::CommandResult::kOutOfRange;
+  }
+  *in_force = value;
+  if (value != before) {
+    setting[0] = static_cast<uint8_t>(value);
+    if (wide) setting[1] = static_cast<uint8_t>(value >> 8);
+    if (code == wire::CommandCode::kSetLegLengthMm ||
+        code == wire::CommandCode::kSetStepGainPermille) {
+      ++settings_.gain_version;
+      configure_inertial();
+    }
+    store_.save(settings_);
+  }
+  // A new period counts from now.
+  const uint32_t due_ms = clock_.ms() + static_cast<uint32_t>(value);
+  if (code == wire::CommandCode::kSetReportPeriodMs) motion_due_ms_ = due_ms;
+  if (code == wire::CommandCode::kSetRangingPeriodMs) round_due_ms_ = due_ms;
+  if (code == wire::CommandCode::kSetStatusPeriodMs) status_due_ms_ = due_ms;
+  if (settings_.step_reports == 0) steps_.clear();
+  return wire::CommandResult::kDone;
 }
 
 bool Node::answer_due() const {

@@ -108,8 +108,6 @@ class Node : private NodeState {
   void receive_packet();
   void obey(const uint8_t* body, uint8_t length);
   wire::CommandResult apply(uint8_t command, int32_t value, int32_t* in_force);
-  bool set(uint16_t* setting, int32_t value, int32_t low, int32_t high, int32_t* in_force);
-  bool set(uint8_t* setting, int32_t value, int32_t low, int32_t high, int32_t* in_force);
   void configure_inertial();
   bool answer_due() const;
   bool run_reboot();
