@@ -58,10 +58,6 @@ void count(uint16_t* counter) {
   if (*counter < 65535u) ++*counter;
 }
 
-void lower(uint8_t* ticks) {
-  if (*ticks > 0) --*ticks;
-}
-
 void clear(float vector[kAxes]) { vector[kX] = vector[kY] = vector[kZ] = 0.0f; }
 
 float norm(const float v[kAxes]) { return sqrtf(dot(v, v)); }
@@ -94,33 +90,27 @@ bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
     const float rate = fabsf(sample.angular_rate_rad_s[i]);
     good = good && finite(force + rate);
     if (force > config_.acceleration_limit_m_s2) {
-      hold_acceleration_ = kHoldTicks;
+      hold_[kHoldAcceleration] = kHoldTicks;
       saturated = true;
     }
     if (rate > config_.angular_rate_limit_rad_s) {
-      hold_rate_ = kHoldTicks;
+      hold_[kHoldRate] = kHoldTicks;
       saturated = true;
     }
   }
   if (saturated) count(&counters_.saturated_samples);
   if (good) return false;
   count(&counters_.refused_samples);
-  hold_input_ = kHoldTicks;
+  hold_[kHoldInput] = kHoldTicks;
   return true;
 }
 
-void DeadReckoning::watch_quiet(const ImuSample& sample, float dt_s) {
-  const float force = norm(sample.acceleration_m_s2);
+void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_s) {
   if (ticks_ == 1) mean_force_m_s2_ = force;
   mean_force_m_s2_ += (force - mean_force_m_s2_) * (dt_s * (1.0f / kForceMean_s));
-  float square = 0.0f;
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    const float rate = sample.angular_rate_rad_s[i] - bias_rad_s_[i];
-    square += rate * rate;
-  }
-  const bool quiet = fabsf(force - mean_force_m_s2_) < kQuietForce_m_s2 &&
-                     square < kQuietRate_rad_s * kQuietRate_rad_s;
-  if (!quiet) {
+  const float most_rad = kQuietRate_rad_s * dt_s;
+  if (fabsf(force - mean_force_m_s2_) >= kQuietForce_m_s2 ||
+      dot(angle, angle) >= most_rad * most_rad) {
     quiet_s_ = 0.0f;
   } else if (quiet_s_ < 1000.0f) {
     quiet_s_ += dt_s;
@@ -129,10 +119,7 @@ void DeadReckoning::watch_quiet(const ImuSample& sample, float dt_s) {
 
 // Start: the attitude of the first sample is found from the mean force while the gyroscope already
 // carries the frame along, so that walking directly after switching on loses nothing.
-void DeadReckoning::gather(const ImuSample& sample, float dt_s) {
-  float rotation[kAxes * kAxes], force[kAxes];
-  attitude_.matrix(rotation);
-  rotate(rotation, sample.acceleration_m_s2, force);
+void DeadReckoning::gather(const ImuSample& sample, const float force[kAxes], float dt_s) {
   // Movement after a quiet beginning ends the gathering before it spoils the mean.
   if (quiet_s_ == 0.0f && elapsed_s_ >= kShortStill_s && span_s_ >= elapsed_s_ - 0.5f * dt_s) {
     initialise(true);
@@ -179,27 +166,29 @@ void DeadReckoning::initialise(bool still) {
 
 void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   ++ticks_;
-  lower(&hold_acceleration_);
-  lower(&hold_rate_);
-  lower(&hold_input_);
-  lower(&hold_doubt_);
+  for (uint8_t i = 0; i < kHolds; ++i) {
+    if (hold_[i] > 0) --hold_[i];
+  }
   if (refuse(sample, dt_s)) {
     publish();
     return;
   }
-  watch_quiet(sample, dt_s);
-
   float angle[kAxes];
   for (uint8_t i = 0; i < kAxes; ++i) {
     angle[i] = (sample.angular_rate_rad_s[i] - bias_rad_s_[i]) * dt_s;
   }
+  const float strength = norm(sample.acceleration_m_s2);
+  watch_quiet(strength, angle, dt_s);
   attitude_.integrate(angle);
+  float rotation[kAxes * kAxes], force[kAxes];
+  attitude_.matrix(rotation);
+  rotate(rotation, sample.acceleration_m_s2, force);
 
   Stance stance;
   if (!displacement_.initialised) {
     // Until the vertical is known the magnitude of the force stands for its vertical part.
-    if (gait_.update(norm(sample.acceleration_m_s2), dt_s, &stance)) on_stance(stance);
-    gather(sample, dt_s);
+    if (gait_.update(strength, dt_s, &stance)) on_stance(stance);
+    gather(sample, force, dt_s);
     if (job_ != kIdle) {  // such a step has nothing to measure against: counted, placed ahead
       job_ = kIdle;
       step_directed_ = false;
@@ -209,9 +198,6 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
     return;
   }
 
-  float rotation[kAxes * kAxes], force[kAxes];
-  attitude_.matrix(rotation);
-  rotate(rotation, sample.acceleration_m_s2, force);
   float ahead[kAxes];  // the heading axis
   rotate(rotation, heading_axis_, ahead);
   displacement_.heading_rad = atan2f(ahead[kY], ahead[kX]);
@@ -344,7 +330,7 @@ void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
       if (least > variance) {  // weighed down to what makes it a three-sigma surprise
         variance = least;
         count(&counters_.doubtful_steps);
-        hold_doubt_ = kHoldTicks;
+        hold_[kHoldDoubt] = kHoldTicks;
       }
       measure(kPosition, direction, innovation, variance, aside);
       break;
@@ -407,6 +393,11 @@ void DeadReckoning::to_wearer(const float n[kAxes], float* x_m, float* y_m) cons
   *y_m = forward_.cosine() * n[kY] - forward_.sine() * n[kX];
 }
 
+void DeadReckoning::widen(float along_m2, float across_m2) {
+  displacement_.variance_along_m2 += along_m2;
+  displacement_.variance_across_m2 += across_m2;
+}
+
 void DeadReckoning::commit_step() {
   float x = step_length_m_ * step_cosine_, y = step_length_m_ * step_sine_;
   float length = step_length_m_;
@@ -436,10 +427,9 @@ void DeadReckoning::commit_step() {
     along = filter_.along(kPosition, walk_x_, walk_y_);
     across = filter_.along(kPosition, -walk_y_, walk_x_);
   }
-  displacement_.variance_along_m2 +=
-      along + scale_variance_growth_m2(displacement_.path_m, length, config_.scale_sigma,
-                                       config_.scale_correlation_m);
-  displacement_.variance_across_m2 += across;
+  widen(along + scale_variance_growth_m2(displacement_.path_m, length, config_.scale_sigma,
+                                         config_.scale_correlation_m),
+        across);
   displacement_.last_step_length_m = length;
   ++displacement_.steps;
   totals_.add(x, y);
@@ -465,11 +455,9 @@ void DeadReckoning::commit_still() {
     to_wearer(position_m_, &x, &y);
     totals_.add(x, y);
     const float variance = filter_.along(kPosition, 0.70710678f, 0.70710678f);
-    displacement_.variance_along_m2 += variance;
-    displacement_.variance_across_m2 += variance;
+    widen(variance, variance);
   } else if (!still) {
-    displacement_.variance_along_m2 += kLooseNoise_m2_s * span_s_;
-    displacement_.variance_across_m2 += kLooseNoise_m2_s * span_s_;
+    widen(kLooseNoise_m2_s * span_s_, kLooseNoise_m2_s * span_s_);
   }
   clear(position_m_);
   filter_.restart(kPosition, 0.0f);
@@ -529,10 +517,10 @@ void DeadReckoning::publish() {
   const uint16_t rejected = gait_.take_rejected();
   if (rejected > 0) count(&counters_.rejected_steps);
   uint16_t flags = d.quality_flags & kMagneticDisturbed;
-  if (hold_acceleration_ > 0) flags |= kAccelerationSaturated;
-  if (hold_rate_ > 0) flags |= kAngularRateSaturated;
-  if (hold_input_ > 0) flags |= kBadInput;
-  if (hold_doubt_ > 0) flags |= kStepDoubtful;
+  if (hold_[kHoldAcceleration] > 0) flags |= kAccelerationSaturated;
+  if (hold_[kHoldRate] > 0) flags |= kAngularRateSaturated;
+  if (hold_[kHoldInput] > 0) flags |= kBadInput;
+  if (hold_[kHoldDoubt] > 0) flags |= kStepDoubtful;
   if (!forward_.found()) flags |= kForwardUnknown;
   if (quiet_s_ >= kQuiet_s) flags |= kStanding;
   if (filter_.repairs() > 0) flags |= kCovarianceRepaired;

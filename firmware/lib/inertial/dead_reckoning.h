@@ -74,9 +74,11 @@ class DeadReckoning {
     kStillCommit
   };
 
+  enum Hold : uint8_t { kHoldAcceleration, kHoldRate, kHoldInput, kHoldDoubt, kHolds };
+
   bool refuse(const ImuSample& sample, float dt_s);
-  void watch_quiet(const ImuSample& sample, float dt_s);
-  void gather(const ImuSample& sample, float dt_s);
+  void watch_quiet(float force_m_s2, const float angle_rad[kAxes], float dt_s);
+  void gather(const ImuSample& sample, const float force_m_s2[kAxes], float dt_s);
   void initialise(bool still);
   void on_stance(const Stance& stance);
   void work(const float rotation[kAxes * kAxes]);
@@ -85,6 +87,7 @@ class DeadReckoning {
   void predict_attitude(const float rotation[kAxes * kAxes]);
   void measure(State group, const float direction[kAxes], float innovation, float variance,
                float yaw = 0.0f);
+  void widen(float along_m2, float across_m2);
   void commit_step();
   void commit_still();
   void apply_magnetic();
@@ -128,7 +131,7 @@ class DeadReckoning {
   uint16_t step_ticks_;
   uint8_t stances_;  // in this walk, saturating
   uint8_t magnetic_count_;
-  uint8_t hold_acceleration_, hold_rate_, hold_input_, hold_doubt_;  // ticks a flag stays up
+  uint8_t hold_[kHolds];  // ticks that a flag stays up
   Job job_;
   bool motion_pending_, magnetic_pending_, step_directed_, step_straight_, velocity_known_;
 };

@@ -1,6 +1,10 @@
 #include "node/motion_totals.h"
 
 #include <math.h>
+#include <stddef.h>
+#include <string.h>
+
+#include "devices/flash.h"
 
 namespace relpos {
 namespace {
@@ -15,6 +19,23 @@ constexpr float kGapSpeedMps = 1.0f;
 constexpr float kGapRateRadS = 0.5f;
 constexpr float kUnknownHeadingRad2 = kPi * kPi / 3.0f;
 constexpr float kMostGapS = 60.0f;
+
+// The totals that are a float of the displacement and 32 bits of the message: from where to where,
+// and how many thousands make the message's unit. A loop over a table: six times the same code
+// would cost the Uno 200 bytes of flash.
+struct Total {
+  uint8_t from, to, thousands;
+};
+enum : uint8_t { kHeadingVariance = 5 };  // the last: a hundred million
+const Total kTable[] RELPOS_FLASH = {
+    {offsetof(Displacement, x_m), offsetof(wire::Motion, x_mm), 1},
+    {offsetof(Displacement, y_m), offsetof(wire::Motion, y_mm), 1},
+    {offsetof(Displacement, path_m), offsetof(wire::Motion, path_mm), 1},
+    {offsetof(Displacement, variance_along_m2), offsetof(wire::Motion, variance_along_mm2), 2},
+    {offsetof(Displacement, variance_across_m2), offsetof(wire::Motion, variance_across_mm2), 2},
+    {offsetof(Displacement, variance_heading_rad2),
+     offsetof(wire::Motion, variance_heading_100urad2), 2},
+};
 
 }  // namespace
 
@@ -42,24 +63,26 @@ int32_t MotionTotals::heading_100urad(const Displacement& now) const {
 }
 
 void MotionTotals::fill(const Displacement& now, wire::Motion* motion) const {
-  float x_m = now.x_m;
-  float y_m = now.y_m;
+  Displacement moved = now;
   if (base_heading_100urad_ != 0) {
     const float base_rad = static_cast<float>(base_heading_100urad_) * 1e-4f;
     const float c = cosf(base_rad);
     const float s = sinf(base_rad);
-    x_m = c * now.x_m - s * now.y_m;
-    y_m = s * now.x_m + c * now.y_m;
+    moved.x_m = c * now.x_m - s * now.y_m;
+    moved.y_m = s * now.x_m + c * now.y_m;
   }
-  motion->x_mm = static_cast<int32_t>(x_mm_ + scaled(x_m, 1000));
-  motion->y_mm = static_cast<int32_t>(y_mm_ + scaled(y_m, 1000));
+  for (uint8_t i = 0; i < kTotals; ++i) {
+    float value;
+    memcpy(&value, reinterpret_cast<const uint8_t*>(&moved) + flash_byte(&kTable[i].from),
+           sizeof value);
+    uint32_t per_unit = 1000;
+    for (uint8_t k = flash_byte(&kTable[i].thousands); k > 1; --k) per_unit *= 1000;
+    if (i == kHeadingVariance) per_unit *= 100;
+    const uint32_t total = base_[i] + scaled(value, per_unit);
+    memcpy(reinterpret_cast<uint8_t*>(motion) + flash_byte(&kTable[i].to), &total, sizeof total);
+  }
   motion->heading_100urad = heading_100urad(now);
-  motion->path_mm = path_mm_ + scaled(now.path_m, 1000);
   motion->steps = static_cast<uint16_t>(steps_ + now.steps);
-  motion->variance_along_mm2 = along_mm2_ + scaled(now.variance_along_m2, 1000000);
-  motion->variance_across_mm2 = across_mm2_ + scaled(now.variance_across_m2, 1000000);
-  motion->variance_heading_100urad2 =
-      heading_100urad2_ + scaled(now.variance_heading_rad2, 100000000);
 }
 
 void MotionTotals::rebase(const Displacement& last, float gap_s) {
@@ -70,14 +93,15 @@ void MotionTotals::rebase(const Displacement& last, float gap_s) {
   const float gap_rad = gap_s * kGapRateRadS;
   float gap_rad2 = gap_rad * gap_rad;
   if (gap_rad2 > kUnknownHeadingRad2) gap_rad2 = kUnknownHeadingRad2;
-  x_mm_ = static_cast<uint32_t>(motion.x_mm);
-  y_mm_ = static_cast<uint32_t>(motion.y_mm);
-  path_mm_ = motion.path_mm;
+  motion.variance_along_mm2 += scaled(gap_m * gap_m, 1000000);
+  motion.variance_across_mm2 += scaled(gap_m * gap_m, 1000000);
+  motion.variance_heading_100urad2 += scaled(gap_rad2, 100000000);
+  for (uint8_t i = 0; i < kTotals; ++i) {
+    memcpy(base_ + i, reinterpret_cast<const uint8_t*>(&motion) + flash_byte(&kTable[i].to),
+           sizeof base_[i]);
+  }
   steps_ = motion.steps;
   base_heading_100urad_ = motion.heading_100urad;
-  along_mm2_ = motion.variance_along_mm2 + scaled(gap_m * gap_m, 1000000);
-  across_mm2_ = motion.variance_across_mm2 + scaled(gap_m * gap_m, 1000000);
-  heading_100urad2_ = motion.variance_heading_100urad2 + scaled(gap_rad2, 100000000);
   turns_ = 0;
   previous_heading_rad_ = 0.0f;
 }

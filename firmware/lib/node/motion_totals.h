@@ -23,8 +23,9 @@ class MotionTotals {
  private:
   int32_t heading_100urad(const Displacement& now) const;
 
-  uint32_t x_mm_, y_mm_, path_mm_;
-  uint32_t along_mm2_, across_mm2_, heading_100urad2_;
+  static constexpr uint8_t kTotals = 6;
+
+  uint32_t base_[kTotals];  // of the message's six totals of a kind, in the order of their table
   int32_t base_heading_100urad_;
   float previous_heading_rad_;
   int16_t turns_;
