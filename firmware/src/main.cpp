@@ -6,6 +6,12 @@
 #include "board/arduino/arduino_board.h"
 #include "node/node.h"
 
+// The node's id, 1 to 254; 0: the one in the EEPROM, else 1. Set it when flashing:
+//   PLATFORMIO_BUILD_FLAGS=-DRELPOS_NODE_ID=3 pio run -e uno -t upload
+#ifndef RELPOS_NODE_ID
+#define RELPOS_NODE_ID 0
+#endif
+
 namespace {
 
 relpos::ArduinoBoard board;
@@ -15,7 +21,7 @@ relpos::Node node(board);
 
 void setup() {
   board.begin();
-  node.begin(board.now_us(), board.reset_cause(), 0);
+  node.begin(board.now_us(), board.reset_cause(), RELPOS_NODE_ID);
 }
 
 void loop() { board.idle(node.poll(board.now_us())); }

@@ -68,6 +68,16 @@ def draw_node_errors(seed: int, node: int) -> NodeErrors:
     )
 
 
+def prepared_eeprom(node: int) -> bytearray:
+    """A board's EEPROM as it is handed out: the node's id and its complement, else blank.
+
+    The layout is ``firmware/lib/node/settings.h``'s StorageAddress.
+    """
+    eeprom = bytearray(b"\xff" * EEPROM_BYTES)
+    eeprom[0:2] = bytes((node, node ^ 0xFF))
+    return eeprom
+
+
 class EmulatedNode:
     """Chips, board and radio module of one node, on a virtual clock.
 
@@ -89,7 +99,7 @@ class EmulatedNode:
         self.node = node
         self.surroundings = surroundings
         self.errors = errors
-        self.eeprom = bytearray(b"\xff" * EEPROM_BYTES) if eeprom is None else eeprom
+        self.eeprom = prepared_eeprom(node) if eeprom is None else eeprom
         self.bus = I2cBus()
         auxiliary: dict[int, ak8975.Ak8975] = {}
         self.mpu = mpu9150.Mpu9150(surroundings, errors.inertial, auxiliary)
