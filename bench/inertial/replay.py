@@ -50,7 +50,7 @@ COUNTERS = (
 
 
 def data_folder() -> Path:
-    """Folder of the real recordings: ``RELPOS_DATA``, else ``../shared/data`` beside the project."""
+    """Folder of the recordings: ``RELPOS_DATA``, else ``../shared/data`` beside the project."""
     return Path(os.environ.get("RELPOS_DATA", ROOT.parent / "shared" / "data"))
 
 

@@ -10,8 +10,13 @@ from relpos.emulator.surroundings import Surroundings
 GRAVITY = 9.80665
 
 
-def constant(force=(0.0, 0.0, GRAVITY), rate=(0.0, 0.0, 0.0), field=(20.0, 5.0, -40.0),
-             pressure=100_000.0, temperature_c=31.0):
+def constant(
+    force=(0.0, 0.0, GRAVITY),
+    rate=(0.0, 0.0, 0.0),
+    field=(20.0, 5.0, -40.0),
+    pressure=100_000.0,
+    temperature_c=31.0,
+):
     return Surroundings(
         rate_hz=200.0,
         specific_force_m_s2=np.tile(np.array(force, dtype=float), (4, 1)),
@@ -82,4 +87,4 @@ class Host:
 
 
 def words(data, order="big"):
-    return [int.from_bytes(data[k:k + 2], order, signed=True) for k in range(0, len(data), 2)]
+    return [int.from_bytes(data[k : k + 2], order, signed=True) for k in range(0, len(data), 2)]

@@ -60,8 +60,11 @@ def test_transactions_are_counted_by_address_and_outcome(host):
     host.transfer(0x51, b"\0", b"", 1)
     host.transfer(0x50, b"\x08x", b"", 0)
     assert host.bus.transactions == 3
-    assert dict(host.bus.counts) == {(0x50, BusStatus.OK): 1, (0x51, BusStatus.ADDRESS_NACK): 1,
-                                     (0x50, BusStatus.DATA_NACK): 1}
+    assert dict(host.bus.counts) == {
+        (0x50, BusStatus.OK): 1,
+        (0x51, BusStatus.ADDRESS_NACK): 1,
+        (0x50, BusStatus.DATA_NACK): 1,
+    }
 
 
 @pytest.mark.parametrize("failure", [BusStatus.ADDRESS_NACK, BusStatus.DATA_NACK])

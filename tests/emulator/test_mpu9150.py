@@ -26,8 +26,14 @@ def board(surroundings=None, errors=None, by_bytes=False):
 
 def configured(host, config=4, divider=19, gyro=1, accel=1, time_us=200_000):
     host.at(time_us)
-    for register, value in ((0x6B, 1), (0x1A, config), (0x19, divider), (0x1B, gyro << 3),
-                            (0x1C, accel << 3), (0x38, 1)):
+    for register, value in (
+        (0x6B, 1),
+        (0x1A, config),
+        (0x19, divider),
+        (0x1B, gyro << 3),
+        (0x1C, accel << 3),
+        (0x38, 1),
+    ):
         host.write(MPU, register, value)
     return host
 
@@ -48,8 +54,14 @@ def test_it_boots_asleep_and_says_who_it_is(by_bytes):
 
 
 def test_a_configured_chip_gives_gravity_rate_and_temperature_in_counts(by_bytes):
-    host = board(constant(force=(GRAVITY, -GRAVITY / 2, 0.0), rate=(100 * DEGREE, 0.0, -DEGREE),
-                          temperature_c=36.0), by_bytes=by_bytes)
+    host = board(
+        constant(
+            force=(GRAVITY, -GRAVITY / 2, 0.0),
+            rate=(100 * DEGREE, 0.0, -DEGREE),
+            temperature_c=36.0,
+        ),
+        by_bytes=by_bytes,
+    )
     configured(host).at(400_000)
     ax, ay, az, temperature, gx, gy, gz = words(host.read(MPU, 0x3B, 14))
     assert (ax, ay, az) == (8192, -4096, 0)  # 8192 LSB/g at 4 g
@@ -57,8 +69,10 @@ def test_a_configured_chip_gives_gravity_rate_and_temperature_in_counts(by_bytes
     assert (gx, gy, gz) == (6550, 0, -66)  # 65.5 LSB/(deg/s) at 500 deg/s; -65.5 rounds to even
 
 
-@pytest.mark.parametrize(("scale", "lsb_per_g", "lsb_per_dps"),
-                         [(0, 16384, 131.0), (1, 8192, 65.5), (2, 4096, 32.8), (3, 2048, 16.4)])
+@pytest.mark.parametrize(
+    ("scale", "lsb_per_g", "lsb_per_dps"),
+    [(0, 16384, 131.0), (1, 8192, 65.5), (2, 4096, 32.8), (3, 2048, 16.4)],
+)
 def test_the_full_scale_bits_choose_the_sensitivity(scale, lsb_per_g, lsb_per_dps):
     host = board(constant(force=(0.5 * GRAVITY, 0, 0), rate=(50 * DEGREE, 0, 0)))
     configured(host, gyro=scale, accel=scale).at(400_000)
@@ -75,9 +89,10 @@ def test_more_than_full_scale_saturates_and_never_wraps():
     assert (data[4], data[5]) == (32767, -32768)
 
 
-@pytest.mark.parametrize(("config", "divider", "period_us"),
-                         [(4, 19, 20_000), (3, 9, 10_000), (1, 0, 1_000), (0, 79, 10_000),
-                          (7, 7, 1_000)])
+@pytest.mark.parametrize(
+    ("config", "divider", "period_us"),
+    [(4, 19, 20_000), (3, 9, 10_000), (1, 0, 1_000), (0, 79, 10_000), (7, 7, 1_000)],
+)
 def test_data_are_ready_once_every_sample_period(config, divider, period_us, by_bytes):
     host = configured(board(by_bytes=by_bytes), config, divider)
     ready = [t for t in range(201_000, 301_000, 100) if host.at(t).byte(MPU, 0x3A) & 1]
@@ -129,20 +144,28 @@ def test_a_read_past_the_registers_of_a_burst_gives_the_next_ones(by_bytes):
     assert host.read(MPU, 0x19, 4) == bytes([19, 4, 8, 8])
 
 
-@pytest.mark.parametrize(("config", "accel_hz", "gyro_hz"),
-                         [(2, 94, 98), (3, 44, 42), (4, 21, 20), (5, 10, 10), (6, 5, 5)])
+@pytest.mark.parametrize(
+    ("config", "accel_hz", "gyro_hz"),
+    [(2, 94, 98), (3, 44, 42), (4, 21, 20), (5, 10, 10), (6, 5, 5)],
+)
 def test_the_low_pass_has_the_stated_bandwidth(config, accel_hz, gyro_hz):
     """A sine at the stated bandwidth comes out 3 dB down, one far below it untouched."""
-    for start, hertz, amplitude, count in ((0, accel_hz, 10.0, 8192 / GRAVITY),
-                                           (8, gyro_hz, 4.0, 65.5 / DEGREE)):
+    for start, hertz, amplitude, count in (
+        (0, accel_hz, 10.0, 8192 / GRAVITY),
+        (8, gyro_hz, 4.0, 65.5 / DEGREE),
+    ):
         gains = []
         for tone in (hertz, hertz / 10.0):
+
             def sine(t, tone=tone, amplitude=amplitude):
                 return amplitude * np.sin(2 * np.pi * tone * t)
+
             surroundings = of_signal(4.0, force=sine, rate=sine, rate_hz=2000.0)
             host = configured(board(surroundings), config=config, divider=0)
-            values = [words(host.at(time_us).read(MPU, 0x3B, 14))[start // 2]
-                      for time_us in range(1_000_000, 3_000_000, 1_000)]
+            values = [
+                words(host.at(time_us).read(MPU, 0x3B, 14))[start // 2]
+                for time_us in range(1_000_000, 3_000_000, 1_000)
+            ]
             gains.append(np.std(values) * np.sqrt(2) / (amplitude * count))
         assert gains[0] == pytest.approx(1 / np.sqrt(2), rel=0.05)
         assert gains[1] == pytest.approx(1.0, rel=0.02)
@@ -159,8 +182,10 @@ def test_the_low_pass_delays_about_as_stated(config, stated_ms):
 def test_noise_bias_and_scale_are_those_of_the_drawn_piece():
     errors = draw_inertial_errors(np.random.default_rng(4))
     host = configured(board(errors=errors, surroundings=constant(rate=(0.2, 0.0, 0.0))))
-    rows = np.array([words(host.at(t).read(MPU, 0x3B, 14))
-                     for t in range(400_000, 40_400_000, 20_000)], dtype=float)
+    rows = np.array(
+        [words(host.at(t).read(MPU, 0x3B, 14)) for t in range(400_000, 40_400_000, 20_000)],
+        dtype=float,
+    )
     accel = rows[:, :3] / 8192 * GRAVITY
     gyro = rows[:, 4:] / 65.5 * DEGREE
     expected = errors.accelerometer_gain @ [0, 0, GRAVITY] + errors.accelerometer_bias_m_s2
@@ -247,9 +272,17 @@ def test_the_magnetometer_answers_only_behind_the_bypass(by_bytes):
 
 def test_its_own_master_fetches_the_magnetometer(by_bytes):
     host = configured(board(constant(field=(30.0, -12.0, 6.0)), by_bytes=by_bytes))
-    for register, value in ((0x24, 0x0D), (0x25, 0x8C), (0x26, 0x02), (0x27, 0x88),
-                            (0x28, 0x0C), (0x29, 0x0A), (0x2A, 0x81), (0x64, 0x01),
-                            (0x6A, 0x20)):
+    for register, value in (
+        (0x24, 0x0D),
+        (0x25, 0x8C),
+        (0x26, 0x02),
+        (0x27, 0x88),
+        (0x28, 0x0C),
+        (0x29, 0x0A),
+        (0x2A, 0x81),
+        (0x64, 0x01),
+        (0x6A, 0x20),
+    ):
         host.write(MPU, register, value)
     host.at(400_000)
     data = host.read(MPU, 0x49, 8)

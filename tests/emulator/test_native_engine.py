@@ -53,8 +53,9 @@ class Node:
         if chip is not None:
             self.bus.attach(0x50, chip)
         self.eeprom = options.pop("eeprom", bytearray(b"\xff" * 256))
-        self.engine = NativeEngine(self.bus, self.eeprom, options.pop("node", 1),
-                                   library=library, **options)
+        self.engine = NativeEngine(
+            self.bus, self.eeprom, options.pop("node", 1), library=library, **options
+        )
         self.sent = []
         self.engine.on_transmit = lambda time_us, data: self.sent.append((time_us, data))
 
@@ -63,7 +64,7 @@ class Node:
         return self
 
     def polls(self):
-        return [int.from_bytes(d[d.index(b"P") + 1:][:4], "little") for _, d in self.sent]
+        return [int.from_bytes(d[d.index(b"P") + 1 :][:4], "little") for _, d in self.sent]
 
     def said(self):
         return b"".join(d for _, d in self.sent)
@@ -97,7 +98,7 @@ def test_a_node_that_wants_to_run_at_once_does_not_stop_the_time(library):
 
 def test_bytes_leave_at_the_speed_of_the_line(library):
     node = Node(library).run(0)
-    (time_us, data), = node.sent
+    ((time_us, data),) = node.sent
     assert len(data) == 8  # B cause eeprom P clock
     assert time_us == pytest.approx(8 * 10 / 38400 * 1e6, abs=1)
 

@@ -17,13 +17,21 @@ class Field:
     """Tags at given x coordinates on one medium."""
 
     def __init__(self, *x_m, by_bytes=False, collisions=True, **channel):
-        options = {"max_range_m": 15.0, "detection_near": 1.0, "detection_far": 1.0,
-                   "noise_sigma_m": 0.0} | channel
+        options = {
+            "max_range_m": 15.0,
+            "detection_near": 1.0,
+            "detection_far": 1.0,
+            "noise_sigma_m": 0.0,
+        } | channel
         self.clock = VirtualClock()
         self.place = {}
-        self.air = UwbAir(self.clock, World(uwb=UwbChannel(**options)),
-                          lambda tag, _: np.array([self.place[tag], 0.0, 0.0]),
-                          np.random.default_rng(1), collisions=collisions)
+        self.air = UwbAir(
+            self.clock,
+            World(uwb=UwbChannel(**options)),
+            lambda tag, _: np.array([self.place[tag], 0.0, 0.0]),
+            np.random.default_rng(1),
+            collisions=collisions,
+        )
         self.hosts = []
         for k, x in enumerate(x_m):
             tag = Pozyx(k + 1, self.air, constant(pressure=98_765.4))
@@ -48,8 +56,12 @@ class Field:
 
     def info(self, k, peer):
         data = self.call(k, 0xC7, peer.to_bytes(2, "little"), 10)
-        return (data[0], int.from_bytes(data[1:5], "little"), int.from_bytes(data[5:9], "little"),
-                int.from_bytes(data[9:11], "little", signed=True))
+        return (
+            data[0],
+            int.from_bytes(data[1:5], "little"),
+            int.from_bytes(data[5:9], "little"),
+            int.from_bytes(data[9:11], "little", signed=True),
+        )
 
     def interrupts(self, k):
         return self.hosts[k].byte(TAG, 0x05)
@@ -126,8 +138,7 @@ def test_an_exchange_ends_with_the_true_distance_at_both_tags(by_bytes):
 def test_an_exchange_takes_between_ten_and_fifty_milliseconds():
     field = Field(0.0, 5.0)
     field.range(0, 2)
-    done = next(t for t in range(0, 100_000, 1_000)
-                if field.at(BOOTED_US + t).interrupts(0) & 0x11)
+    done = next(t for t in range(0, 100_000, 1_000) if field.at(BOOTED_US + t).interrupts(0) & 0x11)
     assert 10_000 <= done <= 50_000
 
 
@@ -209,8 +220,15 @@ def test_pressure_noise_is_that_of_the_piece():
     air = UwbAir(VirtualClock(), World(), None, None)
     errors = PressureErrors(offset_pa=50.0, noise_pa=2.0, seed=1)
     host = Host((TAG, Pozyx(1, air, constant(), errors)))
-    values = np.array([int.from_bytes(host.at(BOOTED_US + 50_000 * k).read(TAG, 0x50, 4), "little")
-                       for k in range(500)]) / 1000.0
+    values = (
+        np.array(
+            [
+                int.from_bytes(host.at(BOOTED_US + 50_000 * k).read(TAG, 0x50, 4), "little")
+                for k in range(500)
+            ]
+        )
+        / 1000.0
+    )
     assert values.mean() == pytest.approx(100_050.0, abs=0.4)
     assert values.std() == pytest.approx(2.0, rel=0.15)
 

@@ -98,7 +98,7 @@ def test_a_reader_that_comes_back_goes_on_reading_whole_frames():
             with serial.Serial(terminal.path, 38_400, timeout=0.05) as port:
                 data = read_all(port, 3000)
             # The first and the last frame may be cut by opening and closing.
-            frames = Parser().feed(data[data.index(b"\x7e"):])
+            frames = Parser().feed(data[data.index(b"\x7e") :])
             seen.append([int.from_bytes(f.data[:4], "big") for f in frames])
         assert all(len(s) > 30 for s in seen)
         assert seen[0][-1] < seen[1][0] < seen[1][-1] < seen[2][0]
@@ -174,8 +174,10 @@ def test_the_port_of_the_same_process_tells_the_exact_arrival_of_every_byte():
         terminal.start()
         while not port.exhausted:
             data = port.read(max(1, min(port.in_waiting, 4096)))
-            arrivals += [(int.from_bytes(f.data[:4], "big"), port.virtual_time_s())
-                         for f in parser.feed(data)]
+            arrivals += [
+                (int.from_bytes(f.data[:4], "big"), port.virtual_time_s())
+                for f in parser.feed(data)
+            ]
         terminal.join()
     assert [a[0] for a in arrivals] == list(range(1, 20_000_000 // 7_000 + 1))
     assert all(at == pytest.approx(number * 0.007, abs=1e-9) for number, at in arrivals)
@@ -185,8 +187,10 @@ def test_the_link_reads_motion_at_virtual_times_through_the_port():
     class Walker(Talker):
         def frame(self, number):
             values = dict.fromkeys(wire.MOTION.field, 0) | {
-                "time_s": 0.01 * number - 0.004, "x_m": 0.02 * number,
-                "state": wire.MotionState.MOVING}
+                "time_s": 0.01 * number - 0.004,
+                "x_m": 0.02 * number,
+                "state": wire.MotionState.MOVING,
+            }
             return encode(Receive16(5, -40, wire.encode(wire.MOTION, 5, 0, number, values)))
 
     link = Link()

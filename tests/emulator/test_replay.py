@@ -20,13 +20,15 @@ def walker():
 
 def recorded(walker, times_s, start_s=0.0, turned=UPRIGHT, magnetic=True):
     """The walker's sensors read at ``times_s``, mounted turned, on a clock from ``start_s``."""
+
     def at(rows):
         columns = [np.interp(times_s, walker.time_s, rows[:, k]) for k in range(3)]
         return np.column_stack(columns) @ turned.T
 
     field = at(walker.magnetic_field_ut) if magnetic else np.full((len(times_s), 3), np.nan)
-    return ImuRecording(times_s + start_s, at(walker.specific_force_m_s2),
-                        at(walker.angular_rate_rad_s), field)
+    return ImuRecording(
+        times_s + start_s, at(walker.specific_force_m_s2), at(walker.angular_rate_rad_s), field
+    )
 
 
 def even(rate_hz, seconds=75.0):
@@ -54,16 +56,19 @@ def test_steps_come_at_their_times_on_the_recordings_clock(walker):
 def test_the_recordings_rate_does_not_matter(walker, rate_hz):
     reference = play(1, recorded(walker, even(RATE_HZ)), Wearer()).distance_m
     assert play(1, recorded(walker, even(rate_hz)), Wearer()).distance_m == pytest.approx(
-        reference, rel=0.06)
+        reference, rel=0.06
+    )
 
 
 def test_uneven_times_and_repeated_samples_do_not_matter(walker):
     rng = np.random.default_rng(1)
-    times_s = np.sort(np.concatenate((even(100.0) + rng.uniform(-0.002, 0.002, 7499),
-                                      [10.0, 10.0, 20.0, 20.0])))
+    times_s = np.sort(
+        np.concatenate((even(100.0) + rng.uniform(-0.002, 0.002, 7499), [10.0, 10.0, 20.0, 20.0]))
+    )
     reference = play(1, recorded(walker, even(100.0)), Wearer()).distance_m
     assert play(1, recorded(walker, times_s), Wearer()).distance_m == pytest.approx(
-        reference, rel=0.04)
+        reference, rel=0.04
+    )
 
 
 def test_any_mounting_gives_the_same_walk(walker):
@@ -72,7 +77,8 @@ def test_any_mounting_gives_the_same_walk(walker):
     turned = play(1, recorded(walker, even(100.0), turned=upside_down), Wearer())
     assert turned.distance_m == pytest.approx(reference.distance_m, rel=0.05)
     assert sum(m.dtheta_rad for m in turned.motions) == pytest.approx(
-        sum(m.dtheta_rad for m in reference.motions), abs=0.1)
+        sum(m.dtheta_rad for m in reference.motions), abs=0.1
+    )
 
 
 def test_a_recording_without_magnetometer_is_played(walker):

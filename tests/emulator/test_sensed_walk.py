@@ -14,13 +14,25 @@ SECONDS = 60.0
 
 def test_its_rates_turn_as_the_torso_turns_and_its_forces_carry_gravity():
     walker = make_team("paper", 1, SECONDS + 1.0, 1)[0][0]
-    chip = Mpu9150(Surroundings(RATE_HZ, walker.specific_force_m_s2, walker.angular_rate_rad_s,
-                                walker.magnetic_field_ut, walker.pressure_pa))
+    chip = Mpu9150(
+        Surroundings(
+            RATE_HZ,
+            walker.specific_force_m_s2,
+            walker.angular_rate_rad_s,
+            walker.magnetic_field_ut,
+            walker.pressure_pa,
+        )
+    )
     host = Host((0x68, chip))
     for register, value in ((0x6B, 1), (0x1A, 4), (0x19, 19), (0x1B, 8), (0x1C, 8), (0x38, 1)):
         host.write(0x68, register, value)
-    rows = np.array([words(host.at(t + 100).read(0x68, 0x3B, 14))
-                     for t in range(20_000, round(SECONDS * 1e6) + 1, 20_000)], dtype=float)
+    rows = np.array(
+        [
+            words(host.at(t + 100).read(0x68, 0x3B, 14))
+            for t in range(20_000, round(SECONDS * 1e6) + 1, 20_000)
+        ],
+        dtype=float,
+    )
     attitude = Rotation.from_matrix(walker.attitude[0])
     up = np.zeros(3)
     for force, rate in zip(rows[:, :3] / 8192 * GRAVITY, rows[:, 4:] / 65.536, strict=True):

@@ -70,8 +70,10 @@ def test_every_node_reports_its_motion_every_second(heard):
 def test_the_same_seed_gives_the_same_bytes_at_the_same_times():
     one, other = serial_output(7, 15.0), serial_output(7, 15.0)
     assert one == other
-    assert hashlib.sha256(repr(serial_output(8, 15.0)).encode()).digest() != hashlib.sha256(
-        repr(one).encode()).digest()
+    assert (
+        hashlib.sha256(repr(serial_output(8, 15.0)).encode()).digest()
+        != hashlib.sha256(repr(one).encode()).digest()
+    )
 
 
 def test_ranges_are_the_true_distances_at_their_times(heard):
@@ -102,7 +104,8 @@ def test_dead_reckoning_goes_where_the_walker_goes(heard):
 def test_what_the_radio_loses_is_what_the_link_misses(heard):
     team, _, link, _ = heard
     assert team.radio.counts["sent"] - team.radio.counts["lost"] == pytest.approx(
-        link.summary()["received"], abs=3)
+        link.summary()["received"], abs=3
+    )
     assert link.summary()["lost"] <= team.radio.counts["lost"]
 
 
@@ -111,8 +114,9 @@ def test_chips_are_driven_without_bus_errors(heard):
     for node in team.nodes.values():
         failed = sum(n for (_, status), n in node.bus.counts.items() if status)
         assert failed < 0.02 * node.bus.transactions
-    errors = {o.node: o.value for o in observations
-              if isinstance(o, Status) and o.name == "bus_errors"}
+    errors = {
+        o.node: o.value for o in observations if isinstance(o, Status) and o.name == "bus_errors"
+    }
     assert all(count < 100 for count in errors.values())
 
 
@@ -143,8 +147,16 @@ def test_an_unknown_scenario_or_fault_is_one_clear_error():
     with pytest.raises(DataError, match="moon"):
         EmulatedTeam("moon", 2, 10.0, 1)
     with pytest.raises(RelposError, match="gremlins"):
-        serve_team(nodes=2, board="native", scenario="paper", speed=1.0, seconds=10.0,
-                   faults=("gremlins",), seed=1, announce=print)
+        serve_team(
+            nodes=2,
+            board="native",
+            scenario="paper",
+            speed=1.0,
+            seconds=10.0,
+            faults=("gremlins",),
+            seed=1,
+            announce=print,
+        )
 
 
 def test_a_recorded_team_is_the_same_run_each_time():
@@ -164,9 +176,19 @@ def test_an_emulated_port_faster_than_real_time_is_read_in_virtual_time(capsys):
         path.append(name)
         opened.set()
 
-    thread = threading.Thread(target=serve_team, kwargs={
-        "nodes": 2, "board": "native", "scenario": "paper", "speed": 0.0, "seconds": 30.0,
-        "faults": (), "seed": 2, "announce": announce})
+    thread = threading.Thread(
+        target=serve_team,
+        kwargs={
+            "nodes": 2,
+            "board": "native",
+            "scenario": "paper",
+            "speed": 0.0,
+            "seconds": 30.0,
+            "faults": (),
+            "seed": 2,
+            "announce": announce,
+        },
+    )
     thread.start()
     assert opened.wait(20.0)
     link, motions = Link(), []

@@ -25,8 +25,13 @@ class Network:
         self.air = RadioAir(self.clock, world, lambda a, b, t: 10.0, np.random.default_rng(2))
         self.out = [[] for _ in range(nodes + 1)]
         self.modules = [
-            XbeeModule(k, 0x40000000 + k, self.air,
-                       lambda t, data, k=k: self.out[k].append((t, data)), baud=baud)
+            XbeeModule(
+                k,
+                0x40000000 + k,
+                self.air,
+                lambda t, data, k=k: self.out[k].append((t, data)),
+                baud=baud,
+            )
             for k in range(nodes + 1)
         ]
         self.air.modules += self.modules
@@ -39,8 +44,9 @@ class Network:
         return self
 
     def frames(self, k):
-        return [build_frame(XBeePacket.unescape_data(bytearray(data)), MODE)
-                for _, data in self.out[k]]
+        return [
+            build_frame(XBeePacket.unescape_data(bytearray(data)), MODE) for _, data in self.out[k]
+        ]
 
 
 def tx16(destination, data, frame_id=1):

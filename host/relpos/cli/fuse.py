@@ -206,15 +206,19 @@ def fuse_recording(
 def _check_usable(run: Run, estimator: EstimatorName) -> None:
     """Refuse a run nothing can be concluded from, before anything is computed."""
     if not run.motions:
-        raise DataError(f"{run.directory or run.name}: no motion in this run (motion.csv): nothing to fuse")
+        raise DataError(
+            f"{run.directory or run.name}: no motion in this run (motion.csv): nothing to fuse"
+        )
     if estimator is EstimatorName.DEADRECKONING:
         return
     if not run.ranges:
-        raise DataError(f"{run.directory or run.name}: no ranges in this run (ranges.csv): nothing to fuse")
+        raise DataError(
+            f"{run.directory or run.name}: no ranges in this run (ranges.csv): nothing to fuse"
+        )
     if all(measured.range_m <= 0.0 for measured in run.ranges):
         raise DataError(
-            f"{run.directory or run.name}: all {len(run.ranges)} ranges are 0, which marks a failed "
-            "measurement: nothing to fuse"
+            f"{run.directory or run.name}: all {len(run.ranges)} ranges are 0, which marks a "
+            "failed measurement: nothing to fuse"
         )
 
 

@@ -188,9 +188,8 @@ class Mpu9150(I2cDevice):
 
     def bypassed(self) -> bool:
         """Whether the host's bus is joined to the auxiliary bus."""
-        return (
-            not self._registers[USER_CTRL] & MASTER_ENABLE
-            and bool(self._registers[INT_PIN_CFG] & BYPASS)
+        return not self._registers[USER_CTRL] & MASTER_ENABLE and bool(
+            self._registers[INT_PIN_CFG] & BYPASS
         )
 
     def power_cycle(self, time_us: int) -> None:
@@ -316,9 +315,7 @@ class Mpu9150(I2cDevice):
         place = 0
         for slave in range(4):
             used = self._slave_read_length(slave)
-            wanted = (
-                enabled >> slave & 1 if slave < 3 else self._registers[I2C_MST_CTRL] >> 5 & 1
-            )
+            wanted = enabled >> slave & 1 if slave < 3 else self._registers[I2C_MST_CTRL] >> 5 & 1
             if wanted:
                 record += self._external[place : place + used]
             place += used

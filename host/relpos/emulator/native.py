@@ -39,9 +39,7 @@ _U32 = ctypes.c_uint32
 _POINTER = ctypes.c_void_p
 
 # Plain addresses instead of POINTER(c_uint8): making pointer objects costs more than the chips do.
-_I2cTransfer = ctypes.CFUNCTYPE(
-    _U8, _POINTER, _U8, _POINTER, _U8, _POINTER, _U8, _POINTER, _U8
-)
+_I2cTransfer = ctypes.CFUNCTYPE(_U8, _POINTER, _U8, _POINTER, _U8, _POINTER, _U8, _POINTER, _U8)
 _UartWrite = ctypes.CFUNCTYPE(None, _POINTER, _POINTER, _U16)
 _Reset = ctypes.CFUNCTYPE(None, _POINTER)
 

@@ -138,9 +138,7 @@ class PseudoTerminal:
             )
             return
         self._drain()
-        print(
-            f"relpos emulate: the walk of {self.team.seconds:g} s is over", file=sys.stderr
-        )
+        print(f"relpos emulate: the walk of {self.team.seconds:g} s is over", file=sys.stderr)
 
     def _serve(self) -> None:
         team = self.team

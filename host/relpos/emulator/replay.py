@@ -217,9 +217,7 @@ def play(
         for motion in recorder.motions
         if motion.time_s > LEAD_S or motion.dx_m or motion.dy_m or motion.dtheta_rad
     )
-    steps = tuple(
-        replace(step, node=node, time_s=step.time_s + shift_s) for step in recorder.steps
-    )
+    steps = tuple(replace(step, node=node, time_s=step.time_s + shift_s) for step in recorder.steps)
     counts = dict(recorder.decoder.counts)
     for track in recorder.decoder.nodes.values():
         counts.update(track.counts)

@@ -228,16 +228,17 @@ def serve_team(
 
     if faults:
         raise RelposError(f"unknown fault '{faults[0]}': this version has none to inject")
-    with EmulatedTeam(
-        scenario, nodes, UNLIMITED_S if seconds is None else seconds, seed, board
-    ) as team, PseudoTerminal(team, speed=speed, mark_time=speed != 1.0) as terminal:
+    with (
+        EmulatedTeam(
+            scenario, nodes, UNLIMITED_S if seconds is None else seconds, seed, board
+        ) as team,
+        PseudoTerminal(team, speed=speed, mark_time=speed != 1.0) as terminal,
+    ):
         announce(terminal.path)
         terminal.serve()
 
 
-def record_team(
-    *, board: str, nodes: int, seconds: float, scenario: str, seed: int
-) -> Run:
+def record_team(*, board: str, nodes: int, seconds: float, scenario: str, seed: int) -> Run:
     """Body of ``relpos demo``'s first half: the team through a real serial port into a Run.
 
     The bytes go through a pseudo-terminal and pyserial as from a real coordinator, as fast as they
