@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from relpos.cli import output
 from relpos.errors import DataError
 
 if TYPE_CHECKING:
@@ -55,8 +56,12 @@ class Port:
         from relpos.link import live
 
         started = time.monotonic()
+        told = 0
         try:
             for batch in live.observe(self._device, self._link):
+                while told < len(self._link.decoder.remarks):
+                    output.remark(self._link.decoder.remarks[told])
+                    told += 1
                 yield from batch
                 if self._seconds is not None and time.monotonic() - started > self._seconds:
                     return

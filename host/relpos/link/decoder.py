@@ -57,6 +57,7 @@ class Acknowledged:
 class Decoder:
     """Frames in, observations out; one instance for the whole team.
 
+    ``remarks`` grows by what the user should be told, once each: nodes of a foreign version.
     ``counts`` holds every rejected frame by its reason, ``nodes`` each node's own counts:
     ``received``, ``lost``, ``duplicate``, ``late_motion``, ``restarts``. Node ids, boots and
     sequences are the sender's claim: without authentication anybody can send them.
@@ -66,6 +67,7 @@ class Decoder:
         self.nodes: dict[int, NodeTrack] = {}
         self.counts: Counter[str] = Counter()
         self.foreign_versions: dict[int, int] = {}
+        self.remarks: list[str] = []
         self.acknowledged: list[Acknowledged] = []
 
     def feed(self, data: bytes, arrival_s: float, rssi_dbm: int | None = None) -> list[Observation]:
@@ -74,8 +76,9 @@ class Decoder:
             frame = wire.decode(data)
         except wire.ForeignVersionError as error:
             self.counts["ForeignVersionError"] += 1
-            if error.node is not None:
+            if error.node is not None and error.node not in self.foreign_versions:
                 self.foreign_versions[error.node] = error.version
+                self.remarks.append(str(error))
             return []
         except wire.FrameError as error:
             self.counts[type(error).__name__] += 1
