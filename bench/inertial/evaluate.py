@@ -31,7 +31,11 @@ def lowerback(gain: float, people: str, verbose: bool) -> None:
         found += score.found
         extra += score.extra
         error = result.distance_m / 20.0 - 1.0
-        turn = abs(np.degrees(result.turn_rad)) - 180.0
+        begin = min((t for t, name, _ in recording.events if name == "trial_start"), default=0.0)
+        end = max((t for t, name, _ in recording.events if name == "trial_end"), default=np.inf)
+        inside = (recording.time_s >= begin) & (recording.time_s <= end)
+        heading = np.unwrap(result.rows["heading_rad"])[inside]
+        turn = abs(np.degrees(heading[-1] - heading[0])) - 180.0
         errors.append(error)
         turns.append(turn)
         by_person[person].append(error)
@@ -51,8 +55,8 @@ def lowerback(gain: float, people: str, verbose: bool) -> None:
         f"{100 * e.mean():+.1f} +- {100 * e.std():.1f} %, mean abs {100 * a.mean():.1f}, median "
         f"{100 * np.median(a):.1f}, worst {100 * a.max():.1f}; within a person sd "
         f"{100 * gains.std():.1f} %; steps {found}/{contacts} ({100 * found / contacts:.1f} %), "
-        f"extra {extra} ({100 * extra / contacts:.1f} %); turn {np.mean(turns):+.1f} mean, "
-        f"{np.mean(np.abs(turns)):.1f} mean abs, worst {np.abs(turns).max():.1f} deg; "
+        f"extra {extra} ({100 * extra / contacts:.1f} %); turn inside the trial "
+        f"{np.median(np.abs(turns)):.1f} median abs, worst {np.abs(turns).max():.1f} deg; "
         f"NEES along {np.mean(nees):.2f}"
     )
 
