@@ -64,7 +64,7 @@ python-tests: $(DEVELOP) | system-avr
 
 firmware: board-builds ## both boards: flash, RAM, cycles of the worst tick, deepest stack
 	$(call title,Budget: cycles and stack on simavr)
-	$(PYTHON) -m relpos.emulator.avr.budget
+	$(PYTHON) -m relpos.emulator.avr.budget --seconds 100
 
 bench: $(DEVELOP) ## what is timed, in bench/
 	@found=; for file in bench/bench_*.py; do \
