@@ -98,7 +98,7 @@ def test_a_byte_order_mark_and_windows_line_ends_do_no_harm(tmp_path: Path) -> N
 def test_a_range_of_zero_is_kept_as_the_failure_it_marks(tmp_path: Path) -> None:
     run = load_run(write(tmp_path, ranges_csv="time_s,node,peer,range_m\n0,1,2,0\n1,1,2,4\n"))
     assert [r.range_m for r in run.ranges] == [0.0, 4.0]
-    assert run.counters["failed_ranges"] == 1
+    assert run.counters["ranges_failed"] == 1
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ class Run:
     """One recording. ``measurements`` are what an estimator may see, sorted by time.
 
     ``truth`` is for evaluation alone. ``counters`` says how many rows of note were met:
-    ``failed_ranges`` (a range of 0 or less, kept as the failure marker it is),
+    ``ranges_failed`` (a range of 0 or less, kept as the failure marker it is),
     ``landmarks_unknown`` (presses of a landmark nobody surveyed) and ``unsorted_rows``.
     """
 
@@ -152,7 +152,7 @@ def load_run(path: Path | str) -> Run:
     measurements = sorted(
         (row for name in _MEASUREMENT_TABLES for row in rows[name]), key=attrgetter("time_s")
     )
-    counters["failed_ranges"] += sum(row.range_m <= 0.0 for row in rows["ranges.csv"])
+    counters["ranges_failed"] += sum(row.range_m <= 0.0 for row in rows["ranges.csv"])
     landmarks = tuple(_read_landmarks(directory))
     truth = rows["truth.csv"]
     if not truth:
