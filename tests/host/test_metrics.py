@@ -212,6 +212,18 @@ def test_a_pair_reported_the_other_way_round_is_the_same_pair() -> None:
     assert evaluate(truth, truth, pairs).nees_distance == pytest.approx(4.0)
 
 
+def test_rows_that_claim_certainty_are_left_out_of_the_nees_and_counted() -> None:
+    truth = {1: still([0.0, 1.0, 9.0], 0.0), 2: still([0.0, 1.0, 9.0], 5.0)}
+    pairs = {
+        (2, 1): PairTrack([0.0, 1.0, 9.0], [5.5, 6.0, 6.0], [0.0, 0.5, math.nan]),
+        (1, 7): PairTrack([0.0], [5.5], [0.0]),
+    }
+    metrics = evaluate(truth, truth, pairs)
+    assert metrics.nees_distance == pytest.approx(4.0)
+    assert metrics.nees_left_out == 1, "unknown is not certain, and node 7 has no truth"
+    assert evaluate(truth, truth).nees_left_out == 0
+
+
 def test_nothing_in_common_is_no_figure_and_no_exception() -> None:
     metrics = evaluate(random_team(1), {})
     assert math.isnan(metrics.relative_distance_rmse_m)

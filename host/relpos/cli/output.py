@@ -139,7 +139,10 @@ def print_metrics(title: str, metrics: Metrics, baseline: Metrics | None = None)
     console.print(f"relative distance RMSE   {metres(metrics.relative_distance_rmse_m)}")
     console.print(f"aligned position RMSE    {metres(metrics.relative_position_rmse_m)}")
     console.print(f"body-frame RMSE          {metres(metrics.body_frame_rmse_m)}")
-    console.print(f"NEES of the distance     {plain(metrics.nees_distance)} (1 is honest)")
+    left_out = f"; {metrics.nees_left_out} rows with sigma 0 left out" * bool(metrics.nees_left_out)
+    console.print(
+        f"NEES of the distance     {plain(metrics.nees_distance)} (1 is honest{left_out})"
+    )
     if baseline is not None:
         factor = baseline.relative_distance_rmse_m / metrics.relative_distance_rmse_m
         console.print(

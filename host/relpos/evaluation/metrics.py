@@ -102,6 +102,8 @@ class Metrics:
     ``time_s`` is (T,): the epochs at which at least one pair, or one node, could be scored. The
     ``*_over_time`` arrays are (T,) and hold the same root mean square (NEES: mean) at one epoch;
     the ``pair_*`` arrays are (T, P) in the order of ``pair_ids``. NaN means undefined there.
+    ``nees_left_out`` counts the rows of the scored pairs whose sigma is 0: no NEES can be had of
+    them.
     """
 
     relative_distance_rmse_m: float
@@ -117,6 +119,7 @@ class Metrics:
     pair_ids: tuple[Pair, ...]
     pair_distance_m: Floats
     pair_true_distance_m: Floats
+    nees_left_out: int = 0
 
     @property
     def epochs(self) -> int:
@@ -284,6 +287,7 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
         pair_ids=pair_ids,
         pair_distance_m=estimated_m[scored],
         pair_true_distance_m=true_m[scored],
+        nees_left_out=sum(_certain_rows(_of_pair(pairs or {}, pair)) for pair in pair_ids),
     )
 
 
@@ -319,15 +323,24 @@ def _turn(vector_m: Floats, angle_rad: Floats) -> Floats:
 
 
 def _pair_nees(pairs: Pairs, pair: Pair, at_s: Floats, true_distance_m: Floats) -> Floats:
-    track = pairs.get(pair) or pairs.get((pair[1], pair[0]))
+    track = _of_pair(pairs, pair)
     if track is None:
         return np.full(at_s.shape, np.nan)
-    # A sigma of zero claims certainty; the quotient would be infinite and say only that.
+    # A sigma of zero claims certainty; the quotient would be infinite and say only that. Such
+    # rows are counted in ``Metrics.nees_left_out``.
     good = track.sigma_distance_m > 0.0
     distance_m = interpolate(track.time_s[good], track.distance_m[good], at_s)
     sigma_m = interpolate(track.time_s[good], track.sigma_distance_m[good], at_s)
     result: Floats = ((distance_m - true_distance_m) / sigma_m) ** 2
     return result
+
+
+def _of_pair(pairs: Pairs, pair: Pair) -> PairTrack | None:
+    return pairs.get(pair) or pairs.get((pair[1], pair[0]))
+
+
+def _certain_rows(track: PairTrack | None) -> int:
+    return 0 if track is None else int((track.sigma_distance_m <= 0.0).sum())
 
 
 def _mean(values: Floats) -> float:

@@ -24,6 +24,7 @@ def as_json(metrics: Metrics) -> dict[str, Any]:
     return {
         **figures(metrics),
         "epochs": metrics.epochs,
+        "nees_left_out": metrics.nees_left_out,
         "pairs": [
             {
                 "node": node,
