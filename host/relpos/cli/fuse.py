@@ -321,8 +321,6 @@ def _fuse_port(job: Job, initial: Initial | None, seconds: float | None, *, as_j
     )
     save_run(received, job.out / "received")
     write_estimates(job.out, outcome.estimates, steps=steps)
-    for words in port.remarks:
-        output.remark(words)
     if outcome.failure is not None:
         if isinstance(outcome.failure, DeviceError):
             raise DeviceError(f"{outcome.failure}; what was received is in {job.out}")

@@ -51,11 +51,6 @@ class Port:
         """Counts of the whole link so far."""
         return self._link.summary()
 
-    @property
-    def remarks(self) -> list[str]:
-        """What the link has met that the user can do something about, a sentence each."""
-        return self._link.remarks()
-
     def __iter__(self) -> Iterator[Observation]:
         """Yield observations until the seconds are over, or for ever."""
         from relpos.link import live

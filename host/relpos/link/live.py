@@ -85,13 +85,6 @@ class Link:
                 figures[name] = figures.get(name, 0) + count
         return figures
 
-    def remarks(self) -> list[str]:
-        """What the user can do something about: nodes of another protocol version."""
-        return [
-            str(wire.ForeignVersionError(version, node))
-            for node, version in sorted(self.decoder.foreign_versions.items())
-        ]
-
 
 def open_port(port: str, baud: int = BAUD) -> serial.Serial:
     """The serial port (or pyserial URL) ``port``. Raises DeviceError with the reason."""
