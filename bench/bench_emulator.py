@@ -1,6 +1,6 @@
 """How much faster than real time an emulated team runs, radio and ranging included.
 
-    python bench/emulator_speed.py [--board native] [--nodes 6] [--seconds 120] [--profile]
+    python bench/bench_emulator.py [--board native] [--nodes 6] [--seconds 120] [--profile]
 
 The setting-up of the walk (a second for ten minutes of six walkers) is shown apart.
 """

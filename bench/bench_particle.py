@@ -1,6 +1,6 @@
 """Time of the particle filter per UWB epoch on the paper's scenario, in microseconds.
 
-    python bench/particle_speed.py [--particles 500]
+    python bench/bench_particle.py [--particles 500]
 
 "correction" is weighing, dual step and resampling of all users; "whole" divides the run's time
 through the public interface, motions and estimates included, by its UWB epochs.
