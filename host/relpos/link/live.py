@@ -91,10 +91,8 @@ def open_port(port: str, baud: int = BAUD) -> serial.Serial:
     try:
         device: serial.Serial = serial.serial_for_url(port, baudrate=baud, timeout=READ_TIMEOUT_S)
     except (serial.SerialException, OSError, ValueError) as error:
-        known = "" if "://" in port or Path(port).exists() else " (no such device)"
-        raise DeviceError(
-            f"{port}: cannot open the serial port{known}: {_reason(error)}"
-        ) from error
+        reason = _reason(error) if "://" in port or Path(port).exists() else "no such device"
+        raise DeviceError(f"{port}: cannot open the serial port: {reason}") from error
     return device
 
 
