@@ -31,16 +31,16 @@ void inertial_configure(DeadReckoning* reckoning, float leg_length_m, float step
 }
 
 // imu: count rows of six (force, rate); field: count rows of three, used every `divider`-th row
-// where divider > 0.
+// where divider > 0; dt_s: count spans, one a sample.
 void inertial_run(DeadReckoning* reckoning, const float* imu, const float* field, uint32_t count,
-                  uint32_t divider, float dt_s, inertial_row* rows) {
+                  uint32_t divider, const float* dt_s, inertial_row* rows) {
   for (uint32_t i = 0; i < count; ++i) {
     relpos::ImuSample sample;
     for (int j = 0; j < 3; ++j) {
       sample.acceleration_m_s2[j] = imu[6 * i + j];
       sample.angular_rate_rad_s[j] = imu[6 * i + 3 + j];
     }
-    reckoning->update(sample, dt_s);
+    reckoning->update(sample, dt_s[i]);
     if (divider > 0 && i % divider == 0) reckoning->magnetometer(field + 3 * i);
     const Displacement& d = reckoning->displacement();
     const inertial_row row = {d.x_m, d.y_m, d.heading_rad, d.variance_along_m2,
@@ -71,7 +71,8 @@ void inertial_counters(const DeadReckoning* reckoning, uint32_t* values) {
   values[2] = c.rejected_steps;
   values[3] = c.doubtful_steps;
   values[4] = c.rejected_magnetic;
-  values[5] = reckoning->filter().repairs();
+  values[5] = c.lost_steps;
+  values[6] = reckoning->filter().repairs();
 }
 
 // P := F P F' + Q over one span, for the check of the Jacobian: matrix is kStates x kStates.

@@ -45,6 +45,7 @@ COUNTERS = (
     "rejected_steps",
     "doubtful_steps",
     "rejected_magnetic",
+    "lost_steps",
     "covariance_repairs",
 )
 
@@ -145,15 +146,19 @@ def reckon(
     *,
     leg_length_m: float = LEG_OF_STATURE * DEFAULT_STATURE_M,
     step_gain: float = 1.25,
-    dt_s: float = 1.0 / RATE_HZ,
+    dt_s: float | Array = 1.0 / RATE_HZ,
 ) -> Reckoning:
-    """Replay samples ``imu`` (n, 6); ``field_ut`` (n, 3) is used at 5 Hz where given."""
+    """Replay samples ``imu`` (n, 6); ``field_ut`` (n, 3) is used at 5 Hz where given.
+
+    ``dt_s`` is one span for all samples or (n,) of them.
+    """
     library = build()
     count = len(imu)
     samples = np.ascontiguousarray(imu, dtype=np.float32)
     magnetic = np.ascontiguousarray(
         field_ut if field_ut is not None else np.zeros((1, 3)), dtype=np.float32
     )
+    spans_s = np.full(count, dt_s, dtype=np.float32)
     rows = np.zeros(count, dtype=ROW)
     handle = ctypes.c_void_p(library.inertial_create())
     try:
@@ -164,7 +169,7 @@ def reckon(
             magnetic.ctypes.data_as(ctypes.c_void_p),
             ctypes.c_uint32(count),
             ctypes.c_uint32(10 if field_ut is not None else 0),
-            ctypes.c_float(dt_s),
+            spans_s.ctypes.data_as(ctypes.c_void_p),
             rows.ctypes.data_as(ctypes.c_void_p),
         )
         covariance = np.zeros((12, 12))

@@ -1,4 +1,4 @@
-"""The emulated AK8975 against hardware.md 1.2."""
+"""The emulated AK8975 against its data sheet."""
 
 import numpy as np
 import pytest

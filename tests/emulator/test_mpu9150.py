@@ -1,4 +1,4 @@
-"""The emulated MPU-9150 against hardware.md 1.1 and 1.3; numbers are the data sheet's."""
+"""The emulated MPU-9150 against its data sheet; numbers are the data sheet's."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The emulated Pozyx tag against hardware.md 2."""
+"""The emulated Pozyx tag against its register map."""
 
 import numpy as np
 import pytest

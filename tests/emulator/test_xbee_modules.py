@@ -1,4 +1,4 @@
-"""The emulated XBee modules against hardware.md 3; frames are made and read by digi-xbee."""
+"""The emulated XBee modules against the API; frames are made and read by digi-xbee."""
 
 import numpy as np
 import pytest

@@ -18,6 +18,7 @@ _spec.loader.exec_module(replay)
 
 RATE_HZ = 50
 BIAS_RAD_S = np.radians(1.0)
+BAD_INPUT = 1 << 6  # quality flag
 
 
 def recorded(walker, seed=0, begin_s=0.0, bias_rad_s=BIAS_RAD_S):
@@ -49,47 +50,61 @@ def random_rotation(rng):
 # --- the filter against independent derivations --------------------------------------------------
 
 
-def transition_by_finite_differences(rotation, impulse_m_s, dt_s):
-    """F of the error state from the nominal motion itself: perturb, move, compare.
+def move(error, rotation, impulse_m_s, dt_s):
+    """The nominal motion over a span, from a state that is off by ``error`` (12,).
 
-    Error state: attitude (navigation), gyro bias, velocity, position. The nominal motion over a
-    span with given impulse (integral of the specific force) is integrated in two halves of the
-    position around the change of velocity, as the filter documents.
+    Error state: attitude (navigation), gyro bias, velocity, position. The position moves half
+    before and half after the velocity's change, as docs/deadreckoning.md says.
     """
+    attitude, bias, velocity, position = error.reshape(4, 3)
+    attitude = attitude - rotation @ bias * dt_s
+    position = position + 0.5 * dt_s * velocity
+    velocity = velocity + np.cross(attitude, impulse_m_s)
+    return np.concatenate([attitude, bias, velocity, position + 0.5 * dt_s * velocity])
 
-    def move(error):
-        attitude, bias, velocity, position = error.reshape(4, 3)
-        turned_attitude = attitude - rotation @ bias * dt_s
-        force = impulse_m_s + np.cross(turned_attitude, impulse_m_s)
-        first = position + 0.5 * dt_s * velocity
-        faster = velocity + force - impulse_m_s
-        return np.concatenate([turned_attitude, bias, faster, first + 0.5 * dt_s * faster])
 
+def jacobian(function):
     step = 1e-4
-    columns = [(move(step * e) - move(-step * e)) / (2 * step) for e in np.eye(12)]
-    return np.stack(columns, axis=1)
+    return np.stack([function(step * e) - function(-step * e) for e in np.eye(12)], 1) / (2 * step)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_covariance_is_predicted_as_f_p_f_plus_q(seed):
     rng = np.random.default_rng(seed)
-    root = rng.standard_normal((12, 12)) * np.repeat([0.05, 0.01, 0.3, 0.1], 3)[:, None]
+    sizes = np.repeat([0.05, 0.01, 0.3, 0.1], 3)
+    root = rng.standard_normal((12, 12)) * sizes[:, None]
     covariance = root @ root.T
-    rotation = random_rotation(rng)
+    rotation, dt_s = random_rotation(rng), 0.1
     impulse = np.array([0.2, -0.1, 0.98]) + 0.2 * rng.standard_normal(3)
-    transition = transition_by_finite_differences(rotation, impulse, 0.1)
-    expected = transition @ covariance @ transition.T
-    none = replay.predict(np.zeros((12, 12)), rotation, impulse, 0.1)
-    got = replay.predict(covariance, rotation, impulse, 0.1) - none
-    assert np.allclose(got, expected, rtol=2e-4, atol=2e-5)
-    assert np.all(np.linalg.eigvalsh(none) > -1e-9)
-    assert none[0, 0] > 0
-    assert none[6, 6] > 0
+    transition = jacobian(lambda e: move(e, rotation, impulse, dt_s))
+    # Attitude and bias noise enter before the velocity's change, velocity noise after it: the first
+    # passes through the motion with no time for the bias, the second through half the position.
+    degree = np.pi / 180
+    first = np.repeat([(0.15 * degree) ** 2, (0.004 * degree) ** 2, 0, 0], 3) * dt_s
+    second = np.repeat([0, 0, 0.25**2, 0], 3) * dt_s
+    motion = jacobian(lambda e: move(e, np.zeros((3, 3)), impulse, dt_s))
+    half = jacobian(lambda e: move(e, np.zeros((3, 3)), np.zeros(3), 0.5 * dt_s))
+    noise = motion @ np.diag(first) @ motion.T + half @ np.diag(second) @ half.T
+    none = replay.predict(np.zeros((12, 12)), rotation, impulse, dt_s)
+    scale = np.sqrt(np.outer(np.diag(noise), np.diag(noise)))
+    assert np.max(np.abs(none - noise) / scale) < 1e-5
+    expected = transition @ covariance @ transition.T + noise
+    got = replay.predict(covariance, rotation, impulse, dt_s)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert np.max(np.abs(got - expected) / scale) < 1e-5
 
 
-def test_the_covariance_stays_positive_over_a_long_walk(team):
-    result = replay.reckon(recorded(team[0]))
-    assert np.all(np.linalg.eigvalsh(result.covariance) > -1e-6)
+def test_the_covariance_stays_positive_definite_over_twenty_minutes(team):
+    imu = np.tile(recorded(team[0]), (7, 1))
+    # Looked at after ever longer walks, at every phase of the step.
+    for count in np.linspace(500, len(imu), 30).astype(int):
+        result = replay.reckon(imu[:count])
+        sigma = np.sqrt(np.diag(result.covariance))
+        live = sigma > 0  # the position is known exactly just after a step
+        assert np.sum(live) >= 9
+        correlation = (result.covariance[live][:, live] / sigma[live]).T / sigma[live]
+        assert np.linalg.eigvalsh(correlation)[0] > 1e-4, count
+        assert result.counters["covariance_repairs"] == 0
 
 
 # --- what a wearer relies on ------------------------------------------------------------------
@@ -153,27 +168,52 @@ def test_heading_drifts_no_faster_than_the_standing_start_explains(team):
     # 3 s of sway at the start leave a bias of some 0.1 to 0.3 deg/s; believing to observe the
     # heading from the steps made it 18 deg a minute, at a NEES of 74.
     assert np.median(late_deg) < 3 * 9.0
+    assert np.median(late_deg) > 3 * 1.0  # better than the gyroscope's start allows: look why
     assert 0.2 < nees < 6.0
 
 
 def test_the_magnetometer_holds_the_heading(team):
-    late_deg, _ = heading_errors(team, magnetic=True)
+    late_deg, nees = heading_errors(team, magnetic=True)
     assert np.median(late_deg) < 5.0
+    # 25 degrees a reading is for fields indoors; the simulated one is undisturbed, so the filter
+    # claims four times what it errs by. Bounds on both sides, so that a change is seen.
+    assert 0.01 < nees < 1.0
 
 
-def test_what_is_no_number_changes_nothing_and_is_counted(team):
+def test_a_refused_sample_is_counted_and_changes_nothing(team):
     imu = recorded(team[0])[: 60 * RATE_HZ]
-    spoilt = np.insert(imu, [1500, 2000, 2500], np.nan, axis=0)
-    result, clean = replay.reckon(spoilt), replay.reckon(imu)
-    assert result.counters["refused_samples"] == 3
-    assert result.distance_m == pytest.approx(clean.distance_m, rel=1e-6)
+    span = 1.0 / RATE_HZ
+    bad = [(0, np.nan, span), (4, np.inf, span), (2, -np.inf, span)]
+    bad += [(0, 9.8, dt) for dt in (0.0, -0.02, 0.21, np.nan)]
+    spoilt, spans = imu, np.full(len(imu), span)
+    for i, (column, value, dt) in enumerate(bad):
+        at = 400 + 371 * i
+        sample = imu[at].copy()
+        sample[column] = value
+        spoilt, spans = np.insert(spoilt, at, sample, axis=0), np.insert(spans, at, dt)
+    result, clean = replay.reckon(spoilt, dt_s=spans), replay.reckon(imu)
+    assert clean.counters["refused_samples"] == 0
+    assert result.counters["refused_samples"] == len(bad)
+    assert np.array_equal(result.covariance, clean.covariance)
+    assert np.array_equal(result.bias_rad_s, clean.bias_rad_s)
+    for name in ("x_m", "y_m", "heading_rad", "path_m", "steps", "variance_along_m2"):
+        assert result.rows[name][-1] == clean.rows[name][-1], name
+    assert np.any(result.rows["flags"] & BAD_INPUT)
+    assert not np.any(clean.rows["flags"] & BAD_INPUT)
 
 
-def test_saturation_is_flagged_and_survived(team):
+@pytest.mark.parametrize(("column", "value", "flag"), [(0, 39.2, 1 << 0), (5, -8.72, 1 << 1)])
+def test_saturation_is_flagged_for_two_seconds_and_survived(team, column, value, flag):
     imu = recorded(team[0])[: 120 * RATE_HZ]
-    imu[3000:3005, 0] = 39.2
-    result, clean = replay.reckon(imu), replay.reckon(recorded(team[0])[: 120 * RATE_HZ])
+    clean = replay.reckon(imu)
+    imu[3000:3005, column] = value
+    result = replay.reckon(imu)
     assert result.counters["saturated_samples"] == 5
+    assert clean.counters["saturated_samples"] == 0
+    flagged = np.flatnonzero(result.rows["flags"] & flag)
+    assert flagged[0] == 3000
+    assert flagged[-1] == pytest.approx(3004 + 2 * RATE_HZ, abs=2)
+    assert not np.any(clean.rows["flags"] & 3)
     assert result.distance_m == pytest.approx(clean.distance_m, rel=0.1)
 
 
@@ -187,16 +227,21 @@ needs_recordings = pytest.mark.skipif(
 
 @needs_recordings
 def test_twenty_metres_are_twenty_metres_from_the_stature_alone():
-    errors, contacts, found, extra = [], 0, 0, 0
+    errors, squares, contacts, found, extra = [], [], 0, 0, 0
     for folder in sorted((replay.data_folder() / "walk_lowerback_20m").iterdir()):
         walk = replay.load(folder)
         result = replay.reckon(walk.imu, leg_length_m=walk.leg_length_m)
         errors.append(abs(result.distance_m / 20.0 - 1.0))
+        squares.append((result.distance_m - 20.0) ** 2 / result.rows["variance_along_m2"][-1])
         score = replay.score_steps(walk, walk.time_s[result.step_ticks])
         contacts, found, extra = contacts + score.contacts, found + score.found, extra + score.extra
     # The prototype of this method had a median of 6.0 %, a worst of 31 % and 95 % of the steps.
     assert 0.04 < np.median(errors) < 0.07
+    assert np.mean(errors) < 0.09
     assert np.max(errors) < 0.35
+    # Over 20 m the root mean square error is up to twice what is claimed (NEES 3.6, not 1): single
+    # people's gains are further off than the 7 % charged. A shortfall on record, not a goal.
+    assert 0.5 < np.mean(squares) < 4.0
     assert found / contacts > 0.94
     assert extra / contacts < 0.025
 

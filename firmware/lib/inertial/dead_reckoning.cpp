@@ -41,7 +41,7 @@ const float kStraightSigma_rad_s = 1.5f * kDegree;
 const float kStillSigma_m_s = 0.1f;   // sway of 2 cm/s that stays the same over several updates
 const float kLooseSigma_m_s = 0.5f;   // moving without steps: shuffling, bending
 const float kLooseNoise_m2_s = 0.1f;  // 0.3 m in a second may go unseen without a step
-const float kPredict_s = 0.09f;       // every fifth tick; no visible loss (inertial.md)
+const float kPredict_s = 0.09f;       // every fifth tick; no visible loss
 
 // Magnetometer.
 const float kFieldLeast_ut = 20.0f, kFieldMost_ut = 75.0f;  // the Earth's: 22 to 67

@@ -4,7 +4,7 @@ namespace relpos {
 namespace {
 
 const float kDegree = kPi / 180.0f;
-// Process noise, as densities (inertial.md's prototype; the velocity one stands for soft tissue
+// Process noise, as densities (a prototype's; the velocity one stands for soft tissue
 // and for accelerometer errors that vary within a step, far above the sensor's own noise).
 const float kAttitudeNoise_rad2_s = (0.15f * kDegree) * (0.15f * kDegree);
 const float kVelocityNoise_m2_s3 = 0.25f * 0.25f;

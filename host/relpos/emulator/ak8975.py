@@ -1,4 +1,4 @@
-"""AKM AK8975 magnetometer as registers, after hardware.md 1.2.
+"""AKM AK8975 magnetometer as registers, after its data sheet (sources: docs/emulator.md).
 
 It sits on the auxiliary bus of the MPU-9150: the host reaches it only while that chip bypasses.
 """

@@ -1,4 +1,4 @@
-"""InvenSense MPU-9150 (the MPU-6050 die) as registers, after hardware.md 1.1 and 1.3.
+"""InvenSense MPU-9150 (the MPU-6050 die) as registers, after its data sheet (docs/emulator.md).
 
 The chip feels :class:`Surroundings` through :class:`InertialErrors`, filters at 1 kHz as CONFIG
 says, samples at its own clock and quantises at the range that is configured at that moment, so
@@ -59,7 +59,7 @@ SLEEP = 0x40
 DEVICE_RESET = 0x80
 FIFO_BYTES = 1024
 RESET_US = 50_000
-"""How long DEVICE_RESET lasts; hardware.md: wait 50 to 100 ms."""
+"""How long DEVICE_RESET lasts; drivers wait 50 to 100 ms."""
 
 ACCELEROMETER_LSB_PER_G = (16384.0, 8192.0, 4096.0, 2048.0)
 GYROSCOPE_LSB_PER_DEG_S = (131.0, 65.5, 32.8, 16.4)

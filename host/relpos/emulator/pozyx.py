@@ -1,4 +1,4 @@
-"""Pozyx tag as registers and functions, after hardware.md 2 (firmware 1.x).
+"""Pozyx tag as registers and functions, firmware 1.x (sources: docs/emulator.md).
 
 Two-way ranging itself happens in a :class:`UwbMedium` that all tags share; the tag only starts an
 exchange and is told its end. What no source states is fixed here and has to be checked on

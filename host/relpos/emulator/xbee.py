@@ -1,7 +1,7 @@
 """XBee 802.15.4 modules (Series 1 / S2C, API mode 2) and the air between them.
 
 A node's module takes bytes from the node's UART, the coordinator's module from the host's serial
-port; both speak the API frames of hardware.md 3. Loss, delay and signal strength are the world's.
+port; both speak the API frames of link/xbee.py. Loss, delay and signal strength are the world's.
 """
 
 from __future__ import annotations
