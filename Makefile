@@ -58,9 +58,10 @@ simulated-tests: $(DEVELOP) | system-avr
 	tools/pio test -e uno_sim
 
 # Last, so that its closing line is the last of `make test`.
+# One BLAS thread a worker: more of them than cores only wait for each other.
 python-tests: $(DEVELOP) | system-avr
 	$(call title,Python tests)
-	$(VENV)/bin/pytest -n auto
+	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist worksteal
 
 firmware: board-builds ## both boards: flash, RAM, cycles of the worst tick, deepest stack
 	$(call title,Budget: cycles and stack on simavr)

@@ -162,6 +162,28 @@ def test_damaged_bytes_let_nothing_wrong_in(team_bytes):
     assert_no_motion_is_lost(ends, whole)
 
 
+def test_what_the_air_damaged_under_a_right_serial_checksum_is_refused(team_bytes):
+    whole, ranges, clean = end_poses(team_bytes)
+    rng, parser, spoilt, damaged = random.Random(6), xbee.Parser(), [], 0
+    for time_s, data in team_bytes:
+        for packet in parser.feed(data):
+            payload = bytearray(packet.data)
+            if time_s < 57.0 and rng.random() < 0.5:
+                # Behind the header's first bytes, so that only the CRC can tell.
+                payload[rng.randrange(4, len(payload))] ^= rng.randrange(1, 256)
+                damaged += 1
+            received = xbee.Receive16(packet.source, packet.rssi_dbm, bytes(payload))
+            spoilt.append((time_s, xbee.encode(received)))
+    ends, ranges_left, link = end_poses(spoilt)
+    counts = link.summary()
+    assert damaged > 100
+    assert counts["bad_checksums"] == 0
+    assert counts["FrameCrcError"] == damaged
+    assert counts["received"] == clean.summary()["received"] - damaged
+    assert not ranges_left - ranges, "a range that nobody measured"
+    assert_no_motion_is_lost(ends, whole)
+
+
 # --- a live port ---------------------------------------------------------------------------------
 
 
