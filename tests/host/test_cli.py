@@ -329,6 +329,8 @@ def test_an_interrupt_ends_listening_and_keeps_what_was_received(tmp_path: Path)
             "--initial", "common", "--out", str(tmp_path),
         ],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        # Where the tests run in the background SIGINT is ignored, and children inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     try:
         assert listening.stderr is not None

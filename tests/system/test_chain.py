@@ -37,8 +37,13 @@ PATIENCE_S = 120
 
 
 def start(*arguments):
+    # Where the tests run in the background SIGINT is ignored, and children inherit that.
     return subprocess.Popen(
-        [*RELPOS, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*RELPOS, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
 
 
