@@ -78,7 +78,7 @@ void inertial_counters(const DeadReckoning* reckoning, uint32_t* values) {
 // P := F P F' + Q over one span, for the check of the Jacobian: matrix is kStates x kStates.
 void inertial_predict(double* matrix, const float* rotation, const float* impulse_m_s, float dt_s) {
   ErrorFilter filter;
-  filter.reset(0.0f, 0.0f, 0.0f, 0.0f);
+  filter.reset(0.0f, 0.0f, 0.0f);
   for (int i = 0; i < relpos::kStates; ++i) {
     for (int j = i; j < relpos::kStates; ++j) {
       filter.set_covariance(i, j, static_cast<float>(matrix[relpos::kStates * i + j]));

@@ -119,6 +119,28 @@ def test_standing_does_not_walk():
     assert abs(result.turn_rad) < np.radians(2.0)
 
 
+def standing(seconds, rate_rad_s):
+    """Force and rate (n, 6) of a sensor at rest but for the yaw rate given (n,) or as a number."""
+    rng = np.random.default_rng(5)
+    imu = np.tile([9.80665, 0, 0, 0, 0, 0.0], (int(seconds * RATE_HZ), 1))
+    imu += rng.standard_normal(imu.shape) * ([0.02] * 3 + [0.001] * 3)
+    imu[:, 3] += rate_rad_s
+    return imu
+
+
+def test_a_bias_on_the_table_is_learned_within_three_seconds():
+    bias = replay.reckon(standing(4, np.radians(2.0))).bias_rad_s
+    assert np.degrees(bias[0]) == pytest.approx(2.0, abs=0.05)
+
+
+def test_getting_ready_is_not_taken_for_bias():
+    # Four degrees to one side within three seconds, at an uneven rate, as people do who have just
+    # pressed the button: walk_chest had turned the whole walk by that much a minute.
+    time_s = np.arange(4 * RATE_HZ) / RATE_HZ
+    bias = replay.reckon(standing(4, np.radians(1.3 + 4.0 * np.sin(2 * np.pi * time_s)))).bias_rad_s
+    assert np.abs(np.degrees(bias[0])) < 0.65
+
+
 def test_distance_is_right_within_the_gain_of_a_person(team):
     errors = [
         replay.reckon(recorded(w, w.node), leg_length_m=w.person.leg_length_m).distance_m
@@ -237,12 +259,12 @@ def test_twenty_metres_are_twenty_metres_from_the_stature_alone():
         contacts, found, extra = contacts + score.contacts, found + score.found, extra + score.extra
     # The prototype of this method had a median of 6.0 %, a worst of 31 % and 95 % of the steps.
     assert 0.04 < np.median(errors) < 0.07
-    assert np.mean(errors) < 0.09
+    assert np.mean(errors) < 0.08
     assert np.max(errors) < 0.35
     # Over 20 m the root mean square error is up to twice what is claimed (NEES 3.6, not 1): single
     # people's gains are further off than the 7 % charged. A shortfall on record, not a goal.
     assert 0.5 < np.mean(squares) < 4.0
-    assert found / contacts > 0.94
+    assert found / contacts > 0.95
     assert extra / contacts < 0.025
 
 
@@ -256,3 +278,20 @@ def test_the_same_corridor_is_as_long_both_ways():
     assert back.distance_m == pytest.approx(there.distance_m, rel=0.03)
     assert 160 <= there.rows["steps"][-1] <= 172
     assert 160 <= back.rows["steps"][-1] <= 172
+
+
+@needs_recordings
+def test_a_right_angle_is_walked_as_one():
+    folder = replay.data_folder() / "walk_chest"
+    names = [
+        *("OnlyHeadingLshapedPath-25-02", "dataset2__stepLenth3-25-000"),
+        *("step-length1LshapedPath-25-02", "step-length2Lshapedpath-25-02"),
+        *("L-shapedPathData1-000", "L-shapedPathData3-000", "LpathStepLength2-24-2"),
+        *("L__Lpath_onlyHeading-24-2", "LpathstepLength1-24-02"),
+    ]
+    walks = [f for f in sorted(folder.iterdir()) if f.name.endswith(tuple(names))]
+    assert len(walks) == len(names)
+    turns = np.degrees([replay.reckon(replay.load(f).imu).turn_rad for f in walks])
+    # Before the start weighed its mean rate, the worst was 78 degrees off.
+    assert np.median(np.abs(turns - 90.0)) < 15.0
+    assert np.max(np.abs(turns - 90.0)) < 45.0

@@ -15,8 +15,9 @@ const float kShortStill_s = 0.5f;     // enough for the tilt; the bias then to 0
 const float kMovingStart_s = 1.0f;    // about two steps, over which horizontal force averages out
 const float kTiltStill_rad = 1.0f * kDegree;
 const float kTiltMoving_rad = 6.0f * kDegree;  // half a step's braking left in the average
-const float kBiasStill_rad_s = 0.3f * kDegree;  // a standing body turns 1 deg in 3 s (docs/gait.md)
-const float kBiasMoving_rad_s = 1.0f * kDegree;  // what a warmed-up, once zeroed MPU-9150 keeps
+const float kBiasUnknown_rad_s = 1.0f * kDegree;  // what a warmed-up, once zeroed MPU-9150 keeps
+const float kBiasLeast_rad_s = 0.05f * kDegree;  // noise and drift: what 3 s on a table leave
+const float kSwayShare = 0.25f;       // of the rate's spread over three axes, left in an axis's mean
 const float kSpeedUnknown_m_s = 1.0f;
 const float kSpeedFound_m_s = 0.3f;   // step length over interval, at mid-stance
 
@@ -75,7 +76,7 @@ void DeadReckoning::reset() {
   memset(static_cast<void*>(this), 0, sizeof *this);
   config_ = kept;
   displacement_.quality_flags = kStarting | kForwardUnknown | kBiasUncertain;
-  filter_.reset(kTiltMoving_rad, 0.0f, kBiasMoving_rad_s, kSpeedUnknown_m_s);
+  filter_.reset(kTiltMoving_rad, kBiasUnknown_rad_s * kBiasUnknown_rad_s, kSpeedUnknown_m_s);
   gait_.reset();
   forward_.reset();
   attitude_.set_identity();
@@ -120,27 +121,38 @@ void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_
 // Start: the attitude of the first sample is found from the mean force while the gyroscope already
 // carries the frame along, so that walking directly after switching on loses nothing.
 void DeadReckoning::gather(const ImuSample& sample, const float force[kAxes], float dt_s) {
-  // Movement after a quiet beginning ends the gathering before it spoils the mean.
-  if (quiet_s_ == 0.0f && elapsed_s_ >= kShortStill_s && span_s_ >= elapsed_s_ - 0.5f * dt_s) {
-    initialise(true);
-    return;
+  if (quiet_s_ == 0.0f) {
+    // Movement after a quiet beginning ends the gathering before it spoils the mean.
+    if (!moved_ && elapsed_s_ >= kShortStill_s) {
+      initialise(true);
+      return;
+    }
+    moved_ = true;
   }
-  if (quiet_s_ > 0.0f) span_s_ += dt_s;  // quiet time within the gathering
   elapsed_s_ += dt_s;
   ++step_ticks_;
   for (uint8_t i = 0; i < kAxes; ++i) {
     velocity_m_s_[i] += force[i];
     position_m_[i] += sample.angular_rate_rad_s[i];
   }
-  const bool still = span_s_ >= elapsed_s_ - 0.5f * dt_s;
-  if (still ? elapsed_s_ >= kStillStart_s : elapsed_s_ >= kMovingStart_s) initialise(still);
+  impulse_m_s_[kX] += dot(sample.angular_rate_rad_s, sample.angular_rate_rad_s);
+  if (elapsed_s_ >= (moved_ ? kMovingStart_s : kStillStart_s)) initialise(!moved_);
 }
 
 void DeadReckoning::initialise(bool still) {
   const float share = 1.0f / step_ticks_;
+  float variance = kBiasUnknown_rad_s * kBiasUnknown_rad_s;
   if (still) {
     gravity_m_s2_ = norm(velocity_m_s_) * share;
-    for (uint8_t i = 0; i < kAxes; ++i) bias_rad_s_[i] = position_m_[i] * share;
+    // The mean rate is bias and what the body turned meanwhile. How much that may be, its spread
+    // tells: 0.03 deg/s on a table, 0.8 standing quietly, 2 to 3 while getting ready, when the mean
+    // was wrong by 1 to 2 deg/s (walk_chest) and turned the whole walk.
+    const float noise =
+        kBiasLeast_rad_s * kBiasLeast_rad_s +
+        (impulse_m_s_[kX] - dot(position_m_, position_m_) * share) * share * kSwayShare;
+    const float weight = variance / (variance + noise);
+    for (uint8_t i = 0; i < kAxes; ++i) bias_rad_s_[i] = position_m_[i] * (share * weight);
+    variance = noise * weight;
   }
   Attitude level;
   level.level(velocity_m_s_);
@@ -158,9 +170,8 @@ void DeadReckoning::initialise(bool still) {
   elapsed_s_ = 0.0f;
   step_ticks_ = 0;
   velocity_known_ = still;
-  filter_.reset(still ? kTiltStill_rad : kTiltMoving_rad, 0.0f,
-                still ? kBiasStill_rad_s : kBiasMoving_rad_s, still ? kStillSigma_m_s
-                                                                    : kSpeedUnknown_m_s);
+  filter_.reset(still ? kTiltStill_rad : kTiltMoving_rad, variance,
+                still ? kStillSigma_m_s : kSpeedUnknown_m_s);
   displacement_.initialised = true;
 }
 

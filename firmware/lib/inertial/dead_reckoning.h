@@ -134,6 +134,7 @@ class DeadReckoning {
   uint8_t hold_[kHolds];  // ticks that a flag stays up
   Job job_;
   bool motion_pending_, magnetic_pending_, step_directed_, step_straight_, velocity_known_;
+  bool moved_;  // not quiet throughout the gathering
 };
 
 }  // namespace relpos

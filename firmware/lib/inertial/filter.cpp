@@ -14,15 +14,15 @@ const float kFloor[kStates / kAxes] = {1e-9f, 1e-12f, 1e-7f, 0.0f};
 
 }  // namespace
 
-void ErrorFilter::reset(float tilt_rad, float heading_rad, float bias_rad_s, float velocity_m_s) {
+void ErrorFilter::reset(float tilt_rad, float bias_rad2_s2, float velocity_m_s) {
   for (uint8_t i = 0; i < kPacked; ++i) p_[i] = 0.0f;
   repairs_ = 0;
   for (uint8_t i = 0; i < kAxes; ++i) {
     p_[index(kAttitude + i, kAttitude + i)] = tilt_rad * tilt_rad;
-    p_[index(kBias + i, kBias + i)] = bias_rad_s * bias_rad_s;
+    p_[index(kBias + i, kBias + i)] = bias_rad2_s2;
     p_[index(kVelocity + i, kVelocity + i)] = velocity_m_s * velocity_m_s;
   }
-  p_[index(kAttitude + kZ, kAttitude + kZ)] = heading_rad * heading_rad;
+  p_[index(kAttitude + kZ, kAttitude + kZ)] = 0.0f;
 }
 
 void ErrorFilter::couple(State to, State from, const float m[kAxes * kAxes]) {

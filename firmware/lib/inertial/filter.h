@@ -26,8 +26,8 @@ class ErrorFilter {
  public:
   static const uint8_t kPacked = kStates * (kStates + 1) / 2;
 
-  // Diagonal start; standard deviations, one a group of three.
-  void reset(float tilt_rad, float heading_rad, float bias_rad_s, float velocity_m_s);
+  // Diagonal start: standard deviations, the bias's variance; the heading starts as known.
+  void reset(float tilt_rad, float bias_rad2_s2, float velocity_m_s);
   void predict_attitude(const float rotation[kAxes * kAxes], float dt_s);
   void predict_motion(const float impulse_m_s[kAxes], float dt_s);
   // Scalar measurement z = direction . x[group .. group+2] + yaw x[heading] with the innovation and
