@@ -23,10 +23,15 @@ DeadReckoning* inertial_create(void) { return new (std::nothrow) DeadReckoning()
 void inertial_destroy(DeadReckoning* reckoning) { delete reckoning; }
 uint32_t inertial_object_size(void) { return sizeof(DeadReckoning); }
 
-void inertial_configure(DeadReckoning* reckoning, float leg_length_m, float step_gain) {
+float inertial_default_gain(void) { return InertialConfig().step_gain; }
+
+// A value that is not positive leaves the library's default.
+void inertial_configure(DeadReckoning* reckoning, float leg_length_m, float step_gain,
+                        float scale_sigma) {
   InertialConfig config;
-  config.leg_length_m = leg_length_m;
-  config.step_gain = step_gain;
+  if (leg_length_m > 0.0f) config.leg_length_m = leg_length_m;
+  if (step_gain > 0.0f) config.step_gain = step_gain;
+  if (scale_sigma > 0.0f) config.scale_sigma = scale_sigma;
   reckoning->configure(config);
 }
 

@@ -73,6 +73,7 @@ def build() -> ctypes.CDLL:
         scratch.replace(target)
     library = ctypes.CDLL(str(target))
     library.inertial_create.restype = ctypes.c_void_p
+    library.inertial_default_gain.restype = ctypes.c_float
     return library
 
 
@@ -91,6 +92,24 @@ class Recording:
     def leg_length_m(self) -> float:
         """From the stature, the population's where it is not known."""
         return LEG_OF_STATURE * float(self.meta.get("stature_m", DEFAULT_STATURE_M))
+
+    def times_of(self, event: str) -> Array:
+        """Times of the events of that name, in order."""
+        return np.array([time for time, name, _ in self.events if name == event])
+
+    @property
+    def trial_s(self) -> tuple[float, float]:
+        """Beginning and end of the trial, cut to the recording."""
+        begins, ends = self.times_of("trial_start"), self.times_of("trial_end")
+        begin = max(float(self.time_s[0]), float(begins.min()) if len(begins) else -np.inf)
+        return begin, min(float(self.time_s[-1]), float(ends.max()) if len(ends) else np.inf)
+
+    @property
+    def contacts_s(self) -> Array:
+        """Foot contacts inside the trial and the recording."""
+        begin, end = self.trial_s
+        contacts = self.times_of("foot_contact")
+        return contacts[(contacts >= begin) & (contacts <= end)]
 
 
 @dataclass
@@ -117,6 +136,13 @@ class Reckoning:
     def turn_rad(self) -> float:
         """Net heading change, unwrapped."""
         return float(np.unwrap(self.rows["heading_rad"])[-1])
+
+    @property
+    def step_lengths_m(self) -> Array:
+        """Length of each step of ``step_ticks``; differences of the path, so that none is lost."""
+        path = self.rows["path_m"]
+        ends = np.append(self.step_ticks[1:], len(path)) - 1
+        return np.diff(path[ends].astype(np.float64), prepend=0.0)
 
 
 def load(folder: Path) -> Recording:
@@ -145,12 +171,14 @@ def reckon(
     field_ut: Array | None = None,
     *,
     leg_length_m: float = LEG_OF_STATURE * DEFAULT_STATURE_M,
-    step_gain: float = 1.25,
+    step_gain: float | None = None,
+    scale_sigma: float | None = None,
     dt_s: float | Array = 1.0 / RATE_HZ,
 ) -> Reckoning:
     """Replay samples ``imu`` (n, 6); ``field_ut`` (n, 3) is used at 5 Hz where given.
 
-    ``dt_s`` is one span for all samples or (n,) of them.
+    ``dt_s`` is one span for all samples or (n,) of them. Gain and scale sigma are the library's
+    own where they are None.
     """
     library = build()
     count = len(imu)
@@ -162,7 +190,12 @@ def reckon(
     rows = np.zeros(count, dtype=ROW)
     handle = ctypes.c_void_p(library.inertial_create())
     try:
-        library.inertial_configure(handle, ctypes.c_float(leg_length_m), ctypes.c_float(step_gain))
+        library.inertial_configure(
+            handle,
+            ctypes.c_float(leg_length_m),
+            ctypes.c_float(step_gain or 0.0),
+            ctypes.c_float(scale_sigma or 0.0),
+        )
         library.inertial_run(
             handle,
             samples.ctypes.data_as(ctypes.c_void_p),
@@ -197,6 +230,24 @@ def predict(covariance: Array, rotation: Array, impulse_m_s: Array, dt_s: float)
     return matrix
 
 
+LONGEST_STEP_S = 1.5
+
+
+def walked_m(step_times_s: Array, lengths_m: Array, at_s: Array) -> Array:
+    """Distance walked at any time: each step spread evenly over the time since the one before.
+
+    A step after a pause of ``LONGEST_STEP_S`` or at the beginning took 0.6 s.
+    """
+    if len(step_times_s) == 0:
+        return np.zeros(len(at_s))
+    since_s = np.diff(step_times_s, prepend=-np.inf)
+    since_s[since_s > LONGEST_STEP_S] = 0.6
+    knots_s = np.stack([step_times_s - since_s, step_times_s], axis=1).ravel()
+    total = np.cumsum(lengths_m)
+    knots_m = np.stack([total - lengths_m, total], axis=1).ravel()
+    return np.interp(at_s, knots_s, knots_m)
+
+
 @dataclass
 class StepScore:
     """Steps against foot contacts, one to one as run-format.md says."""
@@ -204,29 +255,52 @@ class StepScore:
     contacts: int
     found: int
     extra: int
+    offset_s: float
+
+
+def pairs_within(first_s: Array, second_s: Array, tolerance_s: float) -> int:
+    """Most pairs that can be formed one to one between two sorted sets of times.
+
+    With one tolerance for all, pairing the earliest that fit is the best there is.
+    """
+    pairs = i = j = 0
+    while i < len(first_s) and j < len(second_s):
+        gap_s = first_s[i] - second_s[j]
+        if abs(gap_s) <= tolerance_s:
+            pairs, i, j = pairs + 1, i + 1, j + 1
+        elif gap_s < 0.0:
+            i += 1
+        else:
+            j += 1
+    return pairs
 
 
 def score_steps(recording: Recording, step_times_s: Array) -> StepScore:
-    """Match steps to the contacts inside the trial within 0.3 s after one constant offset."""
-    events = recording.events
-    begin = min((t for t, name, _ in events if name == "trial_start"), default=-np.inf)
-    end = max((t for t, name, _ in events if name == "trial_end"), default=np.inf)
-    contacts = np.array(
-        [t for t, name, _ in events if name == "foot_contact" and begin <= t <= end]
-    )
-    best: StepScore | None = None
-    for offset in np.arange(-0.5, 0.51, 0.05):
-        shifted = step_times_s + offset
-        inside = shifted[(shifted >= begin - 0.3) & (shifted <= end + 0.3)]
-        used = np.zeros(len(inside), dtype=bool)
-        found = 0
-        for contact in contacts:
-            gap = np.where(used, np.inf, np.abs(inside - contact))
-            if gap.size and gap.min() <= 0.3:
-                used[int(gap.argmin())] = True
-                found += 1
-        score = StepScore(len(contacts), found, int((~used).sum()))
-        if best is None or score.found - score.extra > best.found - best.extra:
-            best = score
-    assert best is not None
-    return best
+    """Match steps to the contacts inside trial and recording, 0.3 s after one constant offset.
+
+    The offset, up to 0.5 s, is the one with the most steps found less extra. Extra are the steps
+    inside the trial (shifted, 0.3 s around it) that no contact is left for.
+    """
+    tolerance_s = 0.3
+    begin, end = recording.trial_s
+    contacts = recording.contacts_s
+    scores = []
+    for offset_s in np.arange(-0.5, 0.505, 0.02):
+        shifted = step_times_s + offset_s
+        inside = shifted[(shifted >= begin - tolerance_s) & (shifted <= end + tolerance_s)]
+        found = pairs_within(inside, contacts, tolerance_s)
+        scores.append(StepScore(len(contacts), found, len(inside) - found, float(offset_s)))
+    return max(scores, key=lambda score: (score.found - score.extra, -abs(score.offset_s)))
+
+
+def calibrate(recording: Recording, true_distance_m: float) -> float:
+    """Step gain with which the walk comes out at its length; the length is not linear in it."""
+    gain = float(build().inertial_default_gain())
+    for _ in range(6):
+        walked_m = reckon(
+            recording.imu, leg_length_m=recording.leg_length_m, step_gain=gain
+        ).distance_m
+        if abs(walked_m / true_distance_m - 1.0) < 1e-3:
+            break
+        gain *= true_distance_m / walked_m
+    return gain

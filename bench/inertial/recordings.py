@@ -1,0 +1,63 @@
+"""Where the real walks are, and what their truth says."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import replay
+from numpy.typing import NDArray
+from replay import Array, Recording
+
+Track = NDArray[np.complex128]  # places as complex metres
+CORRIDOR = ("Data__test1Data__kar_to_rita", "Data__test2Data__rita_to_kar")  # of walk_chest
+
+
+def folders(data_set: str) -> list[Path]:
+    """Recordings of a data set, in the order of their names' numbers."""
+
+    def numbers(folder: Path) -> list[tuple[int, str]]:
+        return [(int(p), "") if p.isdigit() else (-1, p) for p in folder.name.split("-")]
+
+    return sorted((replay.data_folder() / data_set).iterdir(), key=numbers)
+
+
+def waypoints_of(folder: Path) -> tuple[Array, Track]:
+    """Times (n,) and places (n,) as complex metres of the surveyed waypoints."""
+    keys = ("time_s", "x_m", "y_m")
+    with (folder / "truth.csv").open() as stream:
+        table = np.array(
+            [
+                [float(row[key]) for key in ("time_s", "x_m", "y_m")]
+                for row in csv.DictReader(stream)
+            ]
+        )
+    return table[:, 0], table[:, 1] + 1j * table[:, 2]
+
+
+def at_waypoints(recording: Recording, track: Track, times_s: Array) -> Track:
+    """The track (complex metres) at the waypoints' times.
+
+    A waypoint up to 1 s outside the recording takes its first or last sample; nan further off.
+    """
+    time = recording.time_s
+    out = np.interp(times_s, time, track.real) + 1j * np.interp(times_s, time, track.imag)
+    return np.where((times_s < time[0] - 1.0) | (times_s > time[-1] + 1.0), np.nan, out)
+
+
+def aligned(estimate: Track, places: Track) -> Track:
+    """The estimate, moved to the first waypoint and turned so that the first leg points right.
+
+    Not scaled. A first leg that was not walked at all cannot be turned.
+    """
+    moved = estimate - estimate[0]
+    turn = (places[1] - places[0]) * np.conj(moved[1])
+    return np.asarray(places[0] + moved * (turn / abs(turn) if abs(turn) > 0.0 else 1.0))
+
+
+def fitted(estimate: Track, places: Track) -> Track:
+    """The estimate from the first waypoint, turned to fit all waypoints best."""
+    moved, truth = estimate - estimate[0], places - places[0]
+    turn = np.nansum(truth * np.conj(moved))
+    return np.asarray(places[0] + moved * (turn / abs(turn) if abs(turn) > 0.0 else 1.0))
