@@ -27,12 +27,7 @@ def waypoints_of(folder: Path) -> tuple[Array, Track]:
     """Times (n,) and places (n,) as complex metres of the surveyed waypoints."""
     keys = ("time_s", "x_m", "y_m")
     with (folder / "truth.csv").open() as stream:
-        table = np.array(
-            [
-                [float(row[key]) for key in ("time_s", "x_m", "y_m")]
-                for row in csv.DictReader(stream)
-            ]
-        )
+        table = np.array([[float(row[key]) for key in keys] for row in csv.DictReader(stream)])
     return table[:, 0], table[:, 1] + 1j * table[:, 2]
 
 
