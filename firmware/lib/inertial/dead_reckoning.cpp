@@ -15,7 +15,6 @@ const float kShortStill_s = 0.5f;     // enough for the tilt; the bias then to 0
 const float kMovingStart_s = 1.0f;    // about two steps, over which horizontal force averages out
 const float kTiltStill_rad = 1.0f * kDegree;
 const float kTiltMoving_rad = 6.0f * kDegree;  // half a step's braking left in the average
-const float kBiasUnknown_rad_s = 1.0f * kDegree;  // what a warmed-up, once zeroed MPU-9150 keeps
 const float kBiasLeast_rad_s = 0.05f * kDegree;  // noise and drift: what 3 s on a table leave
 const float kSwayShare = 0.25f;       // of the rate's spread over three axes, left in an axis's mean
 const float kSpeedUnknown_m_s = 1.0f;
@@ -72,11 +71,11 @@ void DeadReckoning::configure(const InertialConfig& config) { config_ = config; 
 void DeadReckoning::reset() {
   // All but the configuration starts at zero, cleared as one block: member by member it would be a
   // kilobyte of the Uno's flash. Every member is a number, an enum or an array of such.
-  const InertialConfig kept = config_;
-  memset(static_cast<void*>(this), 0, sizeof *this);
-  config_ = kept;
+  // The configuration is the first member and stays.
+  memset(reinterpret_cast<uint8_t*>(this) + sizeof config_, 0, sizeof *this - sizeof config_);
   displacement_.quality_flags = kStarting | kForwardUnknown | kBiasUncertain;
-  filter_.reset(kTiltMoving_rad, kBiasUnknown_rad_s * kBiasUnknown_rad_s, kSpeedUnknown_m_s);
+  filter_.reset(kTiltMoving_rad, config_.gyro_bias_sigma_rad_s * config_.gyro_bias_sigma_rad_s,
+                kSpeedUnknown_m_s);
   gait_.reset();
   forward_.reset();
   attitude_.set_identity();
@@ -141,7 +140,7 @@ void DeadReckoning::gather(const ImuSample& sample, const float force[kAxes], fl
 
 void DeadReckoning::initialise(bool still) {
   const float share = 1.0f / step_ticks_;
-  float variance = kBiasUnknown_rad_s * kBiasUnknown_rad_s;
+  float variance = filter_.covariance(kBias, kBias);  // as reset() set it
   if (still) {
     gravity_m_s2_ = norm(velocity_m_s_) * share;
     // The mean rate is bias and what the body turned meanwhile. How much that may be, its spread

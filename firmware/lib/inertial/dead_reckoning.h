@@ -31,6 +31,9 @@ struct InertialConfig {
   float scale_correlation_m = 10.0f;  // path over which the scale error is charged as one
   float acceleration_limit_m_s2 = 39.0f;   // a component beyond it is saturated: just under 4 g
   float angular_rate_limit_rad_s = 8.7f;   // just under 500 deg/s
+  // What is not known of the gyroscope's bias at the start, an axis. 1 deg/s: what a warmed-up, once
+  // zeroed MPU-9150 keeps.
+  float gyro_bias_sigma_rad_s = kPi / 180.0f;
 };
 
 // What was refused, limited or repaired since the reset. Each count stops at its maximum.
