@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import math
 import os
 import pty
 import signal
@@ -253,23 +254,64 @@ def test_deadreckon_without_inertial_data_is_one_clear_line(tmp_path: Path) -> N
     assert "imu.csv" in one_clear_line(relpos("deadreckon", a_run(tmp_path / "r")))
 
 
+IMU_COLUMNS = "ax_m_s2,ay_m_s2,az_m_s2,gx_rad_s,gy_rad_s,gz_rad_s,mx_ut,my_ut,mz_ut"
+
+
 def test_deadreckon_sums_what_the_firmware_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def replayed(*_: object, **__: object) -> tuple[list[Motion], list[Step]]:
-        motions = [Motion(1.0, 4, 0.5, 0.0, 0.25), Motion(2.0, 4, 0.5, 0.0, 0.5)]
-        return motions, [Step(0.5, 4, 0.75), Step(1.5, 4, 0.5)]
+    from relpos.emulator.replay import Played, Replay, Wearer
+
+    def replayed(*_: object, **__: object) -> dict[int, Played]:
+        motions = (Motion(1.0, 4, 0.5, 0.0, 0.5 * math.pi), Motion(2.0, 4, 0.5, 0.25, 0.5))
+        steps = (Step(0.5, 4, 0.75), Step(1.5, 4, 0.5))
+        return {4: Played(Replay(motions, steps, {}, clipped=7), Wearer(0.9, 1300), 100, 2)}
 
     monkeypatch.setattr("relpos.emulator.replay.replay_imu", replayed)
-    columns = "ax_m_s2,ay_m_s2,az_m_s2,gx_rad_s,gy_rad_s,gz_rad_s,mx_ut,my_ut,mz_ut"
-    (tmp_path / "imu.csv").write_text(f"time_s,node,{columns}\n0,4,0,0,9.8,0,0,0,,,\n")
+    (tmp_path / "imu.csv").write_text(f"time_s,node,{IMU_COLUMNS}\n0,4,0,0,9.8,0,0,0,,,\n")
     result = relpos("deadreckon", tmp_path, "--out", tmp_path / "o", "--json")
     assert json.loads(result.stdout) == {
-        "nodes": {"4": {"distance_m": 1.25, "steps": 2, "turn_rad": 0.75}}
+        "nodes": {
+            "4": {
+                "distance_m": 1.25,
+                "steps": 2,
+                "turn_rad": 2.0708,
+                # Half a metre ahead; after a quarter turn to the left half a metre that way and a
+                # quarter backwards.
+                "x_m": 0.25,
+                "y_m": 0.5,
+                "leg_length_m": 0.9,
+                "step_gain_permille": 1300,
+                "samples": 100,
+                "clipped_samples": 7,
+            }
+        }
     }
+    assert "2 of 100 samples repeat a time" in result.stderr
+    assert "7 of 100 samples are beyond the range" in result.stderr
+    assert json.loads((tmp_path / "o" / "summary.json").read_text()) == json.loads(result.stdout)
     written = load_run(tmp_path / "o")
     assert len(written.motions) == 2
     assert len(written.steps) == 2
+
+
+def test_deadreckon_plays_unsorted_gzipped_rows_of_several_nodes_without_magnetometer(
+    tmp_path: Path,
+) -> None:
+    rows = []
+    for k in range(400):
+        # A second and a half of standing and a few bounces of 1.9 a second: no walk to score.
+        force = 9.8 + (2.0 * math.sin(12.0 * (k * 0.02 - 3.0)) if k > 150 else 0.0)
+        rows += [f"{k * 0.02 - 1.0:.3f},{node},0,0,{force:.4f},0,0,0" for node in (7, 300)]
+    columns = IMU_COLUMNS.removesuffix(",mx_ut,my_ut,mz_ut")
+    table = f"time_s,node,{columns}\n" + "\n".join(reversed(rows)) + "\n"
+    (tmp_path / "imu.csv.gz").write_bytes(gzip.compress(table.encode()))
+    result = relpos("deadreckon", tmp_path, "--out", tmp_path / "o", "--json")
+    assert result.exit_code == 0, result.stderr
+    nodes = json.loads(result.stdout)["nodes"]
+    assert nodes["7"] == nodes["300"]
+    assert nodes["7"]["steps"] > 4
+    assert load_run(tmp_path / "o").steps[0].time_s > 1.5  # on the recording's clock
 
 
 def test_dead_reckoning_needs_no_ranges(tmp_path: Path) -> None:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import cmath
 import math
+from json import dumps
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from relpos.cli import output
 from relpos.cli.demo import Board
 from relpos.errors import DataError
+
+if TYPE_CHECKING:
+    from relpos.emulator.replay import Played
 
 
 def deadreckon(
@@ -25,7 +30,8 @@ def deadreckon(
         typer.Option(metavar="RUN2", help="A walk of the same wearer with true_distance_m."),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write motion.csv and steps.csv there.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Write motion.csv, steps.csv and summary.json there."),
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
 ) -> None:
@@ -49,33 +55,65 @@ def deadreckon(
     else:
         walk = None
     with output.working("running the firmware over the recording"):
-        motions, steps = replay_imu(
-            recording, board=str(board), stature_m=stature, calibration=walk
-        )
+        played = replay_imu(recording, board=str(board), stature_m=stature, calibration=walk)
 
-    nodes = {
-        node: {
-            "distance_m": round(sum(s.length_m for s in steps if s.node == node), 4),
-            "steps": sum(s.node == node for s in steps),
-            "turn_rad": round(sum(m.dtheta_rad for m in motions if m.node == node), 5),
-        }
-        for node in sorted({m.node for m in motions} | {s.node for s in steps})
-    }
+    nodes = {str(node): _figures(part) for node, part in sorted(played.items())}
     if out is not None:
-        played = Run(
-            name=recording.name,
-            description=replace(recording.description, source=f"relpos deadreckon {run}"),
-            measurements=tuple(sorted(motions, key=lambda motion: motion.time_s)),
-            steps=tuple(sorted(steps, key=lambda step: step.time_s)),
+        parts = [part.replay for part in played.values()]
+        save_run(
+            Run(
+                name=recording.name,
+                description=replace(recording.description, source=f"relpos deadreckon {run}"),
+                measurements=tuple(
+                    sorted((m for part in parts for m in part.motions), key=lambda m: m.time_s)
+                ),
+                steps=tuple(
+                    sorted((s for part in parts for s in part.steps), key=lambda s: s.time_s)
+                ),
+            ),
+            out,
         )
-        save_run(played, out)
+        document = dumps({"nodes": nodes}, indent=2, allow_nan=False)
+        (out / "summary.json").write_text(document + "\n", encoding="utf-8")
+    for node, part in sorted(played.items()):
+        if part.repeated:
+            output.remark(
+                f"node {node}: {part.repeated} of {part.samples} samples repeat a time: "
+                "the first of each time is played"
+            )
+        if part.replay.clipped:
+            output.remark(
+                f"node {node}: {part.replay.clipped} of {part.samples} samples are beyond the "
+                "range the firmware configures; the chip clips them"
+            )
     if json:
-        output.print_json({"nodes": {str(node): figures for node, figures in nodes.items()}})
+        output.print_json({"nodes": nodes})
         return
-    for node, figures in nodes.items():
+    for name, figures in nodes.items():
         typer.echo(
-            f"node {node}: {figures['distance_m']:.2f} m in {figures['steps']} steps, "
-            f"turned {math.degrees(figures['turn_rad']):.0f} degrees"
+            f"node {name}: {figures['distance_m']:.2f} m in {figures['steps']} steps, "
+            f"turned {math.degrees(figures['turn_rad']):.0f} degrees, "
+            f"ended {figures['x_m']:+.2f} m ahead and {figures['y_m']:+.2f} m to the left"
         )
     if out is not None:
         output.remark(f"written to {out}")
+
+
+def _figures(part: Played) -> dict[str, Any]:
+    """What is printed of one node; the end is in its heading frame at the start."""
+    leg_m = part.wearer.leg_length_m
+    end, heading_rad = 0j, 0.0
+    for motion in part.replay.motions:
+        end += complex(motion.dx_m, motion.dy_m) * cmath.exp(1j * heading_rad)
+        heading_rad += motion.dtheta_rad
+    return {
+        "distance_m": round(part.replay.distance_m, 4),
+        "steps": len(part.replay.steps),
+        "turn_rad": round(heading_rad, 5),
+        "x_m": round(end.real, 3),
+        "y_m": round(end.imag, 3),
+        "leg_length_m": None if leg_m is None else round(leg_m, 4),
+        "step_gain_permille": part.wearer.step_gain_permille,
+        "samples": part.samples,
+        "clipped_samples": part.replay.clipped,
+    }

@@ -209,6 +209,13 @@ class Mpu9150(I2cDevice):
         self._reset_pending = False
         self._reschedule()
 
+    @property
+    def full_scale(self) -> tuple[float, float]:
+        """Largest force (m/s^2) and rate (rad/s) of an axis at the ranges configured now."""
+        force = 32768.0 / ACCELEROMETER_LSB_PER_G[self._registers[ACCEL_CONFIG] >> 3 & 3] * 9.80665
+        rate = 32768.0 / GYROSCOPE_LSB_PER_DEG_S[self._registers[GYRO_CONFIG] >> 3 & 3]
+        return force, rate * np.pi / 180.0
+
     # -- sampling ---------------------------------------------------------------------------
 
     def _ticks_at(self, time_us: int) -> int:

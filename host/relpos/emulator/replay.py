@@ -28,6 +28,9 @@ from .xbee import DELIVERED, XbeeModule
 
 GRID_HZ = 200.0
 """The recording is brought to this uniform rate before the chip's filter feels it."""
+FAST_GRID_HZ = 1000.0
+"""The same for a recording that is faster than the usual grid: the chip's own filter is to take the
+vibration out, which sampling it at 200 Hz would fold into the walk."""
 LEAD_S = 0.3
 """From power-on to the first sample: the board boots, configures its sensor and is told its
 wearer. The first sample is held meanwhile, of which the node sees the last tenth of a second."""
@@ -36,9 +39,10 @@ COMMAND_ATTEMPTS_US = (20_000, 180_000, 500_000, 1_000_000, 2_000_000)
 COMMAND_PERIOD_US = 40_000
 TAIL_S = 2.5
 """Behind the last sample: the report that is then under way still comes out."""
-MOST_S = 86_400.0
+MOST_ROWS = 86_400 * 200
+"""A day at the usual rate: 2.2 GB of memory."""
 GAP_PERIODS = 3.5
-LEAST_GAP_S = 0.05
+LEAST_GAP_S = 0.1
 """Samples further apart than both (in median periods, in seconds) are a gap, not a slow sensor."""
 LEG_OF_STATURE = 0.53
 STANDARD_PRESSURE_PA = 101_325.0
@@ -58,16 +62,31 @@ class Wearer:
 
 @dataclass(frozen=True)
 class Replay:
-    """What one node reported, on the recording's clock; ``counts`` are the frames by name."""
+    """What one node reported, on the recording's clock; ``counts`` are the frames by name.
+
+    ``clipped`` samples of the recording were beyond the range that the firmware had configured.
+    """
 
     motions: tuple[Motion, ...]
     steps: tuple[Step, ...]
     counts: Mapping[str, int]
+    clipped: int = 0
 
     @property
     def distance_m(self) -> float:
         """Sum of the step lengths."""
         return sum(step.length_m for step in self.steps)
+
+
+@dataclass(frozen=True)
+class Played:
+    """One node's part of a run: what it reported and what it was told."""
+
+    replay: Replay
+    wearer: Wearer
+    samples: int
+    repeated: int
+    """Samples at the time of the one before, which were left out."""
 
 
 def surroundings_of(recording: ImuRecording) -> Surroundings:
@@ -79,16 +98,21 @@ def surroundings_of(recording: ImuRecording) -> Surroundings:
     time_s, rows = _increasing(recording)
     if len(time_s) < 2:
         raise DataError("an inertial recording of fewer than two samples cannot be played")
-    if time_s[-1] - time_s[0] > MOST_S:
+    period_s = float(np.median(np.diff(time_s)))
+    grid_hz = GRID_HZ if period_s > 0.9 / GRID_HZ else FAST_GRID_HZ
+    if (time_s[-1] - time_s[0]) * grid_hz > MOST_ROWS:
         raise DataError(
-            f"an inertial recording of {time_s[-1] - time_s[0]:g} s is more than a day: not played"
+            f"an inertial recording of {time_s[-1] - time_s[0]:g} s is more than the "
+            f"{MOST_ROWS / grid_hz:g} s that can be played at its rate"
         )
+    if period_s < 0.9 / FAST_GRID_HZ:
+        time_s, rows = _averaged(time_s, rows, 1.0 / FAST_GRID_HZ)
+        period_s = float(np.median(np.diff(time_s)))
     time_s = time_s - time_s[0] + LEAD_S
-    grid_s = np.arange(int((time_s[-1] + TAIL_S) * GRID_HZ) + 1) / GRID_HZ
+    grid_s = np.arange(int((time_s[-1] + TAIL_S) * grid_hz) + 1) / grid_hz
     inside = np.clip(grid_s, time_s[0], time_s[-1])
     inertial: FloatArray = PchipInterpolator(time_s, rows[:, :6])(inside)
     step_s = np.diff(time_s)
-    period_s = float(np.median(step_s))
     gaps = np.flatnonzero(step_s > max(GAP_PERIODS * period_s, LEAST_GAP_S))
     silent = [(float(time_s[k]) + period_s, float(time_s[k + 1])) for k in gaps]
     silent.append((float(time_s[-1]) + period_s, float(grid_s[-1]) + 3600.0))
@@ -98,7 +122,7 @@ def surroundings_of(recording: ImuRecording) -> Surroundings:
         for axis in range(3):
             magnetic[:, axis] = np.interp(inside, time_s[known], rows[known, 6 + axis])
     return Surroundings(
-        rate_hz=GRID_HZ,
+        rate_hz=grid_hz,
         specific_force_m_s2=inertial[:, :3],
         angular_rate_rad_s=inertial[:, 3:],
         magnetic_field_ut=magnetic,
@@ -119,6 +143,15 @@ def _increasing(recording: ImuRecording) -> tuple[FloatArray, FloatArray]:
         axis=1,
     )
     return recording.time_s[keep], rows[keep]
+
+
+def _averaged(time_s: FloatArray, rows: FloatArray, bin_s: float) -> tuple[FloatArray, FloatArray]:
+    """Means over bins of ``bin_s``; bins without a sample are left out."""
+    bins = np.floor((time_s - time_s[0]) / bin_s)
+    begins = np.flatnonzero(np.diff(bins, prepend=-1.0))
+    counts = np.diff(begins, append=len(time_s))
+    mean_s = np.add.reduceat(time_s, begins) / counts
+    return mean_s, np.add.reduceat(rows, begins, axis=0) / counts[:, None]
 
 
 class _Recorder:
@@ -202,6 +235,7 @@ def play(
                     _unless_answered(emulated, coordinator, recorder, code, value, k + 1),
                 )
         clock.run(round((len(surroundings.pressure_pa) - 1) / surroundings.rate_hz * 1e6))
+        most_force, most_rate = emulated.mpu.full_scale
     finally:
         emulated.close()
     answers = {answer.token: answer for answer in recorder.decoder.acknowledged}
@@ -211,17 +245,24 @@ def play(
             raise DeviceError(f"node {node}: the firmware did not answer {code.name}")
         if answer.result != wire.CommandResult.DONE:
             raise DataError(f"node {node}: the firmware refuses {code.name} {value}")
+    beyond = (np.abs(recording.acceleration_m_s2) > most_force).any(axis=1) | (
+        np.abs(recording.angular_rate_rad_s) > most_rate
+    ).any(axis=1)
     shift_s = float(recording.time_s[0]) - LEAD_S
+
+    def at(time_s: float) -> float:
+        return round(time_s + shift_s, 6)
+
     motions = tuple(
-        replace(motion, node=node, time_s=motion.time_s + shift_s)
+        replace(motion, node=node, time_s=at(motion.time_s))
         for motion in recorder.motions
         if motion.time_s > LEAD_S or motion.dx_m or motion.dy_m or motion.dtheta_rad
     )
-    steps = tuple(replace(step, node=node, time_s=step.time_s + shift_s) for step in recorder.steps)
+    steps = tuple(replace(step, node=node, time_s=at(step.time_s)) for step in recorder.steps)
     counts = dict(recorder.decoder.counts)
     for track in recorder.decoder.nodes.values():
         counts.update(track.counts)
-    return Replay(motions, steps, counts)
+    return Replay(motions, steps, counts, int(beyond.sum()))
 
 
 def calibrate(
@@ -255,7 +296,7 @@ def replay_imu(
     board: BoardKind | str = BoardKind.NATIVE,
     stature_m: float | None = None,
     calibration: Run | None = None,
-) -> tuple[list[Motion], list[Step]]:
+) -> dict[int, Played]:
     """What the firmware reports while the run's ``imu.csv`` is played, for every node in it.
 
     The leg length is the run's own, or 0.53 of ``stature_m`` or of the run's stature. With
@@ -266,8 +307,7 @@ def replay_imu(
     if not recordings:
         raise DataError(f"{run.name}: no inertial data (imu.csv)")
     walks = calibration.load_imu() if calibration is not None else {}
-    motions: list[Motion] = []
-    steps: list[Step] = []
+    played: dict[int, Played] = {}
     for node, recording in recordings.items():
         leg_m = _leg_length_m(run, node, stature_m)
         gain = None
@@ -280,10 +320,12 @@ def replay_imu(
                 )
             # The calibration walk's own leg length would put another gain beside this one.
             gain = calibrate(node, walk, distance_m, leg_m, board)
-        replay = play(node, recording, Wearer(leg_m, gain), board)
-        motions += replay.motions
-        steps += replay.steps
-    return sorted(motions, key=lambda m: m.time_s), sorted(steps, key=lambda s: s.time_s)
+        wearer = Wearer(leg_m, gain)
+        replay = play(node, recording, wearer, board)
+        samples = len(recording.time_s)
+        repeated = samples - len(_increasing(recording)[0])
+        played[node] = Played(replay, wearer, samples, repeated)
+    return played
 
 
 def _leg_length_m(run: Run, node: int, stature_m: float | None) -> float | None:
