@@ -93,6 +93,15 @@ class Spectral:
             spectrum = spectrum * (2j * np.pi * self._frequency)
         return out
 
+    def transmitted(self, signal: FloatArray, resonance_hz: float, damping: float) -> FloatArray:
+        """Motion (n,) of a mass carried on spring and damper by a base that moves as ``signal``."""
+        rise = signal[-1] - signal[0]
+        trend = signal[0] + rise * self._ramp
+        omega, own = 2 * np.pi * self._frequency, 2 * np.pi * resonance_hz
+        carried = own**2 + 2j * damping * own * omega
+        spectrum = fft.rfft((signal - trend) * self._window) * (carried / (carried - omega**2))
+        return np.asarray(trend + fft.irfft(spectrum, self._count), dtype=np.float64)
+
     def shocks(
         self, place: FloatArray, size: FloatArray, resonance_hz: float, damping: float
     ) -> FloatArray:
