@@ -269,6 +269,17 @@ def test_twenty_metres_are_twenty_metres_from_the_stature_alone():
 
 
 @needs_recordings
+def test_no_step_has_a_negative_length():
+    # Where people stand and turn, a step may end behind where it began: reported as unsigned
+    # millimetres, -0.2 m had become 65.3 m.
+    for name in ("031", "058", "070", "072"):
+        walk = replay.load(replay.data_folder() / "walk_handheld_waypoints" / name)
+        rows = replay.reckon(walk.imu, walk.field_ut).rows
+        assert rows["last_step_length_m"].min() >= 0.0
+        assert np.diff(rows["path_m"]).min() >= 0.0
+
+
+@needs_recordings
 def test_the_same_corridor_is_as_long_both_ways():
     folder = replay.data_folder() / "walk_chest"
     there, back = (

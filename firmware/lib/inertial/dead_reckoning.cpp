@@ -420,15 +420,15 @@ void DeadReckoning::commit_step() {
     // the velocity starts anew from the pendulum, or a wrong tilt (switched on while walking, a
     // fall) would carry it away for ever: 423 m in 70 steps of one recording. Shorter steps stand:
     // shuffling lifts the torso more than it carries it.
-    velocity_known_ = ahead < (1.0f + kLost) * step_length_m_ + step_sigma_m_ &&
-                      ahead > -kLost * step_length_m_ - step_sigma_m_;
+    velocity_known_ = fabsf(ahead - 0.5f * step_length_m_) <
+                      (0.5f + kLost) * step_length_m_ + step_sigma_m_;
     if (!velocity_known_) {
       count(&counters_.lost_steps);
       for (uint8_t i = kAttitude; i < kAttitude + kZ; ++i) {
         filter_.set_covariance(i, i, filter_.covariance(i, i) + kTiltLost_rad * kTiltLost_rad);
       }
     } else {
-      length = ahead;
+      length = fabsf(ahead);  // a step back is a way walked, too
     }
   }
   if (step_directed_ && velocity_known_) {
