@@ -378,6 +378,7 @@ def waypoints(verbose: bool) -> Figures:
         "bound_true_distances": [],
         "bound_true_directions": [],
     }
+    squares = []
     for folder in folders("walk_handheld_waypoints"):
         recording = replay.load(folder)
         times_s, places = waypoints_of(folder)
@@ -388,6 +389,8 @@ def waypoints(verbose: bool) -> Figures:
             kinds[name].append((at_waypoints(recording, track, times_s), places))
         heading = gyro_heading_rad(floors.prepare(recording, steps=False))
         way = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(places)))))
+        # Nobody walks shorter than along the waypoints: it is the distance as good as there is.
+        squares.append((plain.distance_m - way[-1]) ** 2 / plain.rows["variance_along_m2"][-1])
         true_m = np.diff(np.interp(recording.time_s, times_s, way), prepend=0.0)
         leg = np.clip(np.searchsorted(times_s, recording.time_s, "right") - 1, 0, len(places) - 2)
         direction = np.angle(np.diff(places))[leg]
@@ -417,11 +420,12 @@ def waypoints(verbose: bool) -> Figures:
                 f"heading {drift:+6.1f} deg off the raw gyroscope, "
                 f"forward {np.degrees(plain.rows['forward_rad'][-1]):+4.0f}"
             )
-    return {
+    out = {
         f"{kind}_{name}" if kind != "plain" else name: value
         for kind, tracks in kinds.items()
         for name, value in waypoint_figures(tracks).items()
     }
+    return out | nees("nees_along", np.array(squares), [str(k) for k in range(len(squares))])
 
 
 # --- main ----------------------------------------------------------------------------------------
