@@ -334,10 +334,12 @@ def chest(verbose: bool) -> Figures:
 def waypoint_figures(tracks: Sequence[tuple[Track, Track]]) -> Figures:
     """Errors from pairs of (estimate, places), both (n,) complex metres at the waypoints.
 
-    The first two waypoints are spent on the alignment. In percent of the distance walked, which is
-    the way along the waypoints: of the whole walk, and until the waypoint.
+    The first two waypoints are spent on the alignment: the figures are of the others, but for those
+    "with second waypoint", where only the scale shows. In percent of the distance walked, which is
+    the way along the waypoints: of the whole walk, and ("so far") until the waypoint. The best turn
+    and scale are fitted to all waypoints: what is left then is no matter of one angle and factor.
     """
-    whole, until, turned, ends, scale = [], [], [], [], []
+    whole, until, turned, scaled, every, ends, scale = [], [], [], [], [], [], []
     for estimate, places in tracks:
         legs = np.abs(np.diff(places))
         way = np.concatenate(([0.0], np.cumsum(legs)))
@@ -345,13 +347,22 @@ def waypoint_figures(tracks: Sequence[tuple[Track, Track]]) -> Figures:
         good = np.isfinite(error) & (np.arange(len(places)) >= 2)
         whole.append(error[good] / way[-1])
         until.append(error[good] / way[good])
+        every.append(error[np.isfinite(error)][1:] / way[-1])
         ends.append(error[good][-1] / way[-1])
         other = np.abs(fitted(estimate, places) - places)
         turned.append(other[np.isfinite(other)][1:] / way[-1])
+        other = np.abs(fitted(estimate, places, scale=True) - places)
+        scaled.append(other[np.isfinite(other)][1:] / way[-1])
         direct = np.nansum(np.abs(np.diff(estimate)))
         scale.append(direct / legs.sum() - 1.0)
     out: Figures = {"walks": len(tracks), "waypoints": sum(map(len, whole))}
-    for name, parts in (("", whole), ("so_far_", until), ("best_turn_", turned)):
+    for name, parts in (
+        ("", whole),
+        ("so_far_", until),
+        ("with_second_waypoint_", every),
+        ("best_turn_", turned),
+        ("best_turn_and_scale_", scaled),
+    ):
         values = percent(np.concatenate(parts))
         out[f"{name}median_percent"] = float(np.median(values))
         out[f"{name}p90_percent"] = float(np.percentile(values, 90))

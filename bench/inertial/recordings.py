@@ -51,8 +51,11 @@ def aligned(estimate: Track, places: Track) -> Track:
     return np.asarray(places[0] + moved * (turn / abs(turn) if abs(turn) > 0.0 else 1.0))
 
 
-def fitted(estimate: Track, places: Track) -> Track:
-    """The estimate from the first waypoint, turned to fit all waypoints best."""
+def fitted(estimate: Track, places: Track, *, scale: bool = False) -> Track:
+    """The estimate from the first waypoint, turned (and scaled) to fit all waypoints best."""
     moved, truth = estimate - estimate[0], places - places[0]
     turn = np.nansum(truth * np.conj(moved))
+    if scale:
+        power = np.nansum(np.abs(moved) ** 2)
+        return np.asarray(places[0] + moved * (turn / power if power > 0.0 else 1.0))
     return np.asarray(places[0] + moved * (turn / abs(turn) if abs(turn) > 0.0 else 1.0))
