@@ -37,13 +37,12 @@ from relpos.emulator.surroundings import (
     draw_magnetic_errors,
 )
 from relpos.simulation.activities import ACTIVITIES, SCRIPTS
+from relpos.simulation.indoor import INDOOR
 from relpos.simulation.motion import WearerTruth
 from relpos.simulation.solo import make_walker
-from relpos.simulation.world import MagneticField, World
 
 Array = NDArray[np.float64]
 
-INDOOR = World(name="indoor", magnetic=MagneticField(disturbance_ut=8.0))
 WINDOW_S = 10.0
 """Motion between two readings this far apart is what the normalised errors are taken of."""
 

@@ -50,7 +50,8 @@ class Activity:
     ``walk``, ``shuffle``, ``carry``: ``distance_m`` of way, turning by ``turn_rad`` in all (left
     positive) evenly over it. ``turn``: on the spot by ``turn_rad``. ``side``: ``distance_m``,
     to the left if positive. ``backward``, ``crawl``: ``distance_m``. ``stairs_up``,
-    ``stairs_down``: ``count`` steps. ``bend``: ``count`` times. ``stand``: ``seconds``.
+    ``stairs_down``: ``count`` steps. ``bend``: ``count`` times. ``stand``: ``seconds``, looking
+    about and reaching ``count`` times.
     ``fall``: falls, lies for ``seconds`` and gets up. ``remount``: the sensor is turned on the
     body, standing; where ``distance_m`` is given, it slips while walking that far.
     """
@@ -162,6 +163,8 @@ class _Planner:
         self.wander = 0.0
         self.drift = 0.0
         self.walk_effect = math.exp(rng.normal(0.0, wearer.rise_walk_sd))
+        # Step length given cadence changes from walk to walk (4.6 % in walk_lowerback_20m).
+        self.walk_ratio = wearer.walk_ratio_m_s * math.exp(rng.normal(0.0, 0.045))
         self.since_stand = 0
         self.out = Itinerary()
 
@@ -220,7 +223,7 @@ class _Planner:
     def rise(self, length: float, cadence: float) -> float:
         """Excursion of a forward step, with what changes from step to step."""
         w = self.wearer
-        self.drift = 0.95 * self.drift + 0.05 * math.sqrt(1 - 0.95**2) * self.rng.standard_normal()
+        self.drift = 0.95 * self.drift + 0.025 * math.sqrt(1 - 0.95**2) * self.rng.standard_normal()
         size = (length / REFERENCE_STEP_M) ** w.rise_by_length
         size *= (cadence / REFERENCE_CADENCE_HZ) ** w.rise_by_cadence
         own = math.exp(self.drift + 0.06 * w.irregularity * self.rng.standard_normal())
@@ -261,7 +264,7 @@ class _Planner:
         while True:
             self.wander = 0.9 * self.wander + 0.04 * math.sqrt(1 - 0.9**2) * rng.standard_normal()
             pace_m_s = speed * (1.0 - slow) * math.exp(self.wander)
-            cadence = math.sqrt(pace_m_s / (w.walk_ratio_m_s * ratio))
+            cadence = math.sqrt(pace_m_s / (self.walk_ratio * ratio))
             side = self.foot
             uneven = w.asymmetry + w.limp
             vary = self.variation(pace_m_s)
@@ -314,15 +317,19 @@ class _Planner:
         self.out.pitch.to(0.0, self.time, 0.8)
 
     def shuffle(self, a: Activity, last: bool) -> None:
-        # Open: short steps whose lift has little to do with their length. The slow bouts of
-        # walk_daily_lowerback have steps of 0.2 to 0.4 m in 0.3 to 2.9 s.
+        # Short steps whose lift has little to do with their length. The slow bouts of
+        # walk_daily_lowerback (one person) have steps of 0.2 to 0.4 m in 0.3 to 2.9 s that lift
+        # the back by 17 to 29 mm with 0.8 to 1.5 m/s2 rms; feet that slide lift it less (open).
         rng, w = self.rng, self.wearer
-        stride = float(rng.uniform(0.08, 0.32))
+        stride = float(rng.uniform(0.08, 0.42))
         cadence = float(rng.uniform(0.9, 2.2))
-        lift = float(rng.uniform(0.003, 0.022))
-        trunk = float(rng.uniform(0.3, 1.5))
+        lift = float(rng.uniform(0.003, 0.032))
+        trunk = float(rng.uniform(0.3, 3.0))
         surge = float(rng.uniform(0.2, 0.9))
-        hesitate = float(rng.uniform(0.0, 0.12))
+        hesitate = float(rng.uniform(0.0, 0.2))
+        uneven = float(rng.uniform(0.1, 0.4))
+        swerve = float(rng.uniform(0.0, 0.2))
+        shock = float(rng.uniform(0.5, 2.0))
         begin = self.planned_way
         end = begin + a.distance_m
         self.planned_way = end
@@ -331,13 +338,15 @@ class _Planner:
         while (left := end - self.way) > 0.5 * stride:
             if rng.random() < hesitate:
                 self.stay(float(rng.uniform(0.2, 1.5)))
-            length = stride * math.exp(0.15 * w.irregularity * rng.standard_normal())
+            length = stride * math.exp(uneven * rng.standard_normal())
             length = min(length, left) if last else length
             self.step(
                 length,
                 math.exp(0.12 * w.irregularity * rng.standard_normal()) / cadence,
                 lift * math.exp(0.25 * rng.standard_normal()),
                 length * cadence / 1.2,
+                turn=swerve * float(rng.standard_normal()),
+                shock=shock,
                 surge=surge,
                 sway=float(rng.uniform(0.6, 1.4)),
                 trunk=trunk,
@@ -470,6 +479,24 @@ class _Planner:
         self.stay(up + 0.6)
         self.planned_way = self.way
 
+    def stand(self, a: Activity) -> None:
+        # Looking about and reaching: turns of the trunk and leans over the feet (open).
+        rng = self.rng
+        end = self.time + (a.seconds or float(rng.uniform(1.5, 5.0)))
+        facing = self.out.twist.final
+        for _ in range(a.count):
+            span = float(rng.uniform(0.5, 1.5))
+            if self.time + 2 * span > end:
+                break
+            aside = math.radians(float(rng.normal(0.0, 25.0)))
+            lean = math.radians(float(rng.normal(5.0, 10.0)))
+            self.out.twist.to(facing + aside, self.time, span)
+            self.out.pitch.to(lean, self.time, span)
+            self.stay(span + float(rng.uniform(0.0, 1.0)))
+        self.out.twist.to(facing, self.time, 0.8)
+        self.out.pitch.to(0.0, self.time, 0.8)
+        self.stay(max(end - self.time, 0.9))
+
     def bend(self, a: Activity) -> None:
         # From a nod at a table to the floor, stooping or squatting (open).
         rng = self.rng
@@ -570,7 +597,10 @@ def make_itinerary(
         if a.kind in FORWARD:
             p.face(0.0)
         if a.kind == "stand":
-            p.stay(a.seconds or float(rng.uniform(1.5, 5.0)))
+            if a.count:
+                p.stand(a)
+            else:
+                p.stay(a.seconds or float(rng.uniform(1.5, 5.0)))
         elif a.kind == "walk":
             p.walk(a, last)
         elif a.kind == "carry":
@@ -636,11 +666,13 @@ def _paper310(rng: np.random.Generator, wearer: Wearer) -> list[Activity]:
 def _paper310_open(rng: np.random.Generator, wearer: Wearer) -> list[Activity]:
     """310 m that do not close: corridors of 8 to 40 m, turns left and right."""
     out, left = [Activity("stand", seconds=5.0)], 310.0
-    while left > 3.0:
-        straight = min(float(rng.uniform(8.0, 40.0)), left)
+    while left > 0.0:
+        straight = float(rng.uniform(8.0, 40.0))
+        if left - straight < wearer.turn_length_m + 2.0:
+            straight = left
         out.append(Activity("walk", straight))
         left -= straight
-        if left > 3.0:
+        if left > 0.0:
             angle = math.radians(float(rng.choice((90.0, 90.0, 45.0, 30.0))) * rng.choice((-1, 1)))
             out.append(Activity("walk", wearer.turn_length_m, float(angle)))
             left -= wearer.turn_length_m
@@ -660,8 +692,8 @@ def _bout(rng: np.random.Generator, wearer: Wearer) -> list[Activity]:
     """A few metres at home: slow, curved, ended by standing or a turn on the spot."""
     length = float(rng.uniform(1.2, 6.0))
     kind = str(rng.choice(("walk", "walk", "shuffle")))
-    turn = float(rng.normal(0.0, 0.6))
-    speed = float(rng.uniform(0.3, 0.8))
+    turn = float(rng.normal(0.0, 0.9))
+    speed = float(rng.uniform(0.3, 1.0))
     return [Activity(kind, length, turn, speed_m_s=speed)]
 
 
@@ -681,7 +713,8 @@ def _daily(rng: np.random.Generator, wearer: Wearer) -> list[Activity]:
         elif kind == "bend":
             out.append(Activity("bend", count=1))
         else:
-            out.append(Activity("stand", seconds=float(rng.uniform(1.0, 12.0))))
+            seconds, looks = float(rng.uniform(1.0, 12.0)), int(rng.integers(0, 5))
+            out.append(Activity("stand", seconds=seconds, count=looks))
     return out
 
 

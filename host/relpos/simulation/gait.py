@@ -103,22 +103,27 @@ class Spectral:
         return np.asarray(trend + fft.irfft(spectrum, self._count), dtype=np.float64)
 
     def shocks(
-        self, place: FloatArray, size: FloatArray, resonance_hz: float, damping: float
+        self,
+        place: FloatArray,
+        size: FloatArray,
+        resonance_hz: float,
+        damping: float,
+        push_s: float = _PUSH_S,
     ) -> FloatArray:
         """Displacement (n,) of a damped resonance pushed at sample positions ``place`` (k,).
 
-        ``size`` (k,) is the peak of the acceleration that each push of `_PUSH_S` would give the
-        free mass.
+        ``size`` (k,) is the peak of the acceleration that each push of standard deviation
+        ``push_s`` in time would give the free mass.
         """
         train = np.zeros(self._count)
         inside = (place >= 0) & (place < self._count - 1)
         low = place[inside].astype(np.int64)
         share = place[inside] - low
-        weight = size[inside] * (_PUSH_S * math.sqrt(2 * np.pi) * RATE_HZ)
+        weight = size[inside] * (push_s * math.sqrt(2 * np.pi) * RATE_HZ)
         np.add.at(train, low, weight * (1.0 - share))
         np.add.at(train, low + 1, weight * share)
         omega, own = 2 * np.pi * self._frequency, 2 * np.pi * resonance_hz
-        response = np.exp(-0.5 * (omega * _PUSH_S) ** 2) / (
+        response = np.exp(-0.5 * (omega * push_s) ** 2) / (
             own**2 - omega**2 + 2j * damping * own * omega
         )
         return np.asarray(fft.irfft(fft.rfft(train) * response, self._count), dtype=np.float64)

@@ -21,6 +21,15 @@ from relpos.simulation.walker import RATE_HZ, StepTruth, WalkerTruth
 from relpos.simulation.wearer import Wearer
 from relpos.simulation.world import GRAVITY_M_S2, FloatArray, World
 
+_PLACE_SHOCKS = {
+    "chest": (1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
+    "upper_back": (1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
+    "side": (0.8, 0.9, 1.0, 1.0, 1.2, 2.0),
+    "lower_back": (0.65, 0.9, 1.0, 1.0, 1.5, 3.0),
+}
+"""Shocks up, fore, side, pitch, yaw, roll against the chest's, by where the sensor sits. The lower
+back's by hand on the harmonics of walk_lowerback_20m; the side lies between (open)."""
+
 
 @dataclass(frozen=True, slots=True)
 class LabelledSteps(StepTruth):
@@ -157,7 +166,8 @@ def move(
     shift = rng.normal(0.0, 0.4, 4)
     lead = rng.uniform(0.0, 0.25)
     yaw = np.interp(t + lead, t, facing) + slow_noise(rng, t, math.radians(1.5), 2.5)
-    yaw += wearer.yaw_rad * tone * np.cos(stride + shift[0])
+    low = 1.5 if wearer.place == "lower_back" else 1.0  # the pelvis turns more than the chest
+    yaw += low * wearer.yaw_rad * tone * np.cos(stride + shift[0])
     roll = -wearer.roll_rad * tone * np.sin(stride + 1.9 + shift[1])
     roll += 0.3 * wearer.limp * going * np.cos(stride + shift[1])
     pitch = wearer.pitch_rad * tone * np.sin(2 * stride + 2.1 + shift[2])
@@ -312,13 +322,21 @@ def _shocks(
     strike_s = strike_s + 0.012 * wearer.irregularity * rng.standard_normal(count)
     spread = np.exp(0.2 * wearer.irregularity * rng.standard_normal((6, count)))
     foot = np.where(whole % 2 == 0, 1.0, -1.0)
+    scale = _PLACE_SHOCKS[wearer.place]
     # The recordings fix the powers between 0.9 and 1.2 m/s only; held beyond 1.6 m/s.
     pace = np.clip(column["pace"], 0.0, 1.35)
     out = []
     for row, (size, power, resonance, damping) in enumerate(kinds):
         sign = np.ones(count) if row in (0, 1, 3) else foot
-        size_k = size * wearer.impact_scale * column["shock"] * pace**power * spread[row] * sign
+        size_k = size * scale[row] * wearer.impact_scale * column["shock"] * pace**power
+        size_k = size_k * spread[row] * sign
         out.append(spectral.shocks((strike_s - t[0]) * RATE_HZ, size_k, resonance, damping))
+    # The jolt of the heel itself, 20 ms before the slower shock.
+    size_k = wearer.jolt_m_s2 * column["shock"] * pace**1.5 * spread[0] ** 2
+    place = (strike_s - 0.02 - t[0]) * RATE_HZ
+    jolt = spectral.shocks(place, size_k, wearer.jolt_hz, 0.25, 0.008)
+    out[0] = out[0] + jolt
+    out[1] = out[1] - 0.5 * jolt
     return out
 
 

@@ -67,11 +67,14 @@ def make_walker(
     state = plan_rng.bit_generator.state
     plan = make_itinerary(plan_rng, wearer, listed)
     if paper:
-        # The speed is set so that the walk ends 3 s before the time is up, standing still.
-        for _ in range(4):
+        # The speed is set so that the walk ends 3 s before the time is up, standing still. A
+        # step more or less changes what is drawn, so it takes a few attempts.
+        for _ in range(25):
+            if abs(plan.end_s - PAPER_SECONDS + 3.0) < 1.5:
+                break
             walked_s = plan.end_s - listed[0].seconds
             share = walked_s / (PAPER_SECONDS - listed[0].seconds - 3.0)
-            wearer = replace(wearer, speed_m_s=wearer.speed_m_s * share)
+            wearer = replace(wearer, speed_m_s=wearer.speed_m_s * share**0.6)
             plan_rng.bit_generator.state = state
             plan = make_itinerary(plan_rng, wearer, listed)
     seconds = PAPER_SECONDS if paper else plan.end_s + _LEAST_TAIL_S
