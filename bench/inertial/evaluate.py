@@ -3,8 +3,9 @@
 Run as ``.venv/bin/python bench/inertial/evaluate.py``: all data sets. ``--only lowerback``,
 ``chest``, ``daily`` or ``waypoints`` takes one of them, ``--floor`` adds what step models reach
 with the foot contacts given, ``--json FILE`` writes the figures for a machine, ``--pictures DIR``
-draws tracks, ``--verbose`` prints every walk. ``--people odd`` or ``even`` shows half the people of
-the lower-back walks: constants are chosen on the odd ones and reported on the even ones.
+draws tracks, ``--table`` prints what was asked for beside its bar, ``--verbose`` every walk.
+``--people odd`` or ``even`` shows half the people of the lower-back walks: constants are chosen on
+the odd ones and reported on the even ones.
 """
 
 from __future__ import annotations
@@ -439,6 +440,81 @@ def waypoints(verbose: bool) -> Figures:
     return out | nees("nees_along", np.array(squares), [str(k) for k in range(len(squares))])
 
 
+# --- what was asked for ---
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A figure and the bounds asked of its absolute value."""
+
+    data_set: str
+    name: str
+    words: str
+    least: float = 0.0
+    most: float = np.inf
+
+    @property
+    def bar(self) -> str:
+        """The bounds in words."""
+        if not np.isfinite(self.most):
+            return f"at least {self.least:g}" if self.least else ""
+        return f"{self.least:g} to {self.most:g}" if self.least else f"at most {self.most:g}"
+
+
+GOALS = [
+    Goal("lowerback", "steps_found_percent", "steps found one to one, %", least=98.0),
+    Goal("lowerback", "steps_extra_percent", "steps extra, %", most=1.0),
+    Goal("lowerback", "distance_error_percent_mean_abs", "stature alone, mean abs %", most=5.0),
+    Goal("lowerback", "distance_error_percent_median_abs", "stature alone, median abs %"),
+    Goal("lowerback", "distance_error_percent_worst", "stature alone, worst %"),
+    Goal(
+        "lowerback",
+        "calibrated_distance_error_percent_mean_abs",
+        "after one calibration walk, mean abs %",
+        most=4.5,
+    ),
+    Goal("lowerback", "turn_error_deg_median_abs", "U-turn, median abs deg", most=5.0),
+    Goal("lowerback", "turn_error_deg_mean_abs", "U-turn, mean abs deg", most=5.0),
+    Goal("lowerback", "nees_along", "NEES along, stature alone", 0.5, 2.0),
+    Goal("lowerback", "calibrated_nees_along", "NEES along, one calibration walk", 0.5, 2.0),
+    Goal("daily", "slow_summed_error_percent", "slow bouts, summed %", most=15.0),
+    Goal("daily", "slow_mean_abs_error_per_bout_percent", "slow, mean abs a bout %", most=25.0),
+    Goal("daily", "slow_outside_m", "slow, claimed outside the bouts, m"),
+    Goal("daily", "straight_summed_error_percent", "straight walks, summed %", most=15.0),
+    Goal("chest", "corridor_ratio_percent", "corridor, back against there, %", most=0.7),
+    Goal("chest", "corridor_there_steps", "corridor, steps there", 164, 169),
+    Goal("chest", "corridor_back_steps", "corridor, steps back", 164, 169),
+    Goal("chest", "K_calibration_worst_from_mean_percent", "repeated walk, worst %", most=3.0),
+    Goal("waypoints", "median_percent", "median, % of the way walked", most=5.0),
+    Goal("waypoints", "p90_percent", "90th percentile, %"),
+    Goal("waypoints", "best_turn_median_percent", "median with the best turn, %"),
+    Goal("waypoints", "magnetometer_median_percent", "with magnetometer, median %", most=5.0),
+    Goal("waypoints", "magnetometer_p90_percent", "with magnetometer, 90th percentile, %"),
+    Goal("waypoints", "bound_true_distances_median_percent", "raw gyro, true distances, median %"),
+]
+
+
+def print_goals(figures: dict[str, Figures]) -> None:
+    """Print what was asked for as a Markdown table."""
+    print("| data | figure | reached | intact walks | bar | |\n|---|---|---|---|---|---|")
+    for goal in GOALS:
+        if goal.data_set not in figures:
+            continue
+        value = figures[goal.data_set][goal.name]
+        intact = figures[goal.data_set].get(f"intact_{goal.name}")
+        met = goal.least <= abs(value) <= goal.most
+        verdict = ("met" if met else "**missed**") if goal.bar else ""
+        cells = [
+            goal.data_set,
+            goal.words,
+            f"{value:.2f}" if value % 1 else f"{value:.0f}",
+            "" if intact is None else f"{intact:.2f}",
+            goal.bar,
+            verdict,
+        ]
+        print("| " + " | ".join(cells) + " |")
+
+
 # --- main ----------------------------------------------------------------------------------------
 
 
@@ -456,6 +532,7 @@ def main() -> None:
     parser.add_argument("--only", choices=["lowerback", "daily", "chest", "waypoints"])
     parser.add_argument("--floor", action="store_true", help="step models with contacts given")
     parser.add_argument("--verbose", action="store_true", help="a line for every walk")
+    parser.add_argument("--table", action="store_true", help="what was asked for, as Markdown")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures there")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="draw tracks into a folder")
     options = parser.parse_args()
@@ -469,11 +546,14 @@ def main() -> None:
     for name, part in parts.items():
         if options.only in (None, name):
             figures[name] = part()
-            show(f"{name}:", figures[name])
+            if not options.table:
+                show(f"{name}:", figures[name])
     if options.floor:
         print("floor:")
         figures["floor"] = floor()
         show("", {k: v for k, v in figures["floor"].items() if ": " not in k})
+    if options.table:
+        print_goals(figures)
     if options.json is not None:
         options.json.write_text(json.dumps(figures, indent=2) + "\n")
     if options.pictures is not None:
