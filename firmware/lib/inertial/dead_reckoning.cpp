@@ -8,15 +8,18 @@ namespace {
 
 const float kDegree = kPi / 180.0f;
 const float kStandardGravity_m_s2 = 9.80665f;
+const float kTicks_s = 50.0f;
 
 // Start.
-const float kStillStart_s = 3.0f;     // bias to 0.02 deg/s with the MPU-9150's noise
+const float kStillStart_s = 10.0f;    // at most; a step ends it before
 const float kShortStill_s = 0.5f;     // enough for the tilt; the bias then to 0.1 deg/s
 const float kMovingStart_s = 1.0f;    // about two steps, over which horizontal force averages out
 const float kTiltStill_rad = 1.0f * kDegree;
 const float kTiltMoving_rad = 6.0f * kDegree;  // half a step's braking left in the average
-const float kBiasLeast_rad_s = 0.05f * kDegree;  // noise and drift: what 3 s on a table leave
-const float kSwayShare = 0.25f;       // of the rate's spread over three axes, left in an axis's mean
+// What a mean rate says of the bias: a body that stands turns to and fro by a degree, whatever the
+// time; one that gets ready spreads its rates, of which a quarter is left in the mean of an axis.
+const float kSway_rad = 0.9f * kDegree;
+const float kSwayShare = 0.25f;
 const float kSpeedUnknown_m_s = 1.0f;
 const float kSpeedFound_m_s = 0.3f;   // step length over interval, at mid-stance
 
@@ -30,25 +33,42 @@ const float kGravityTime_s = 10.0f;   // long against a step, short against warm
 // Measurements.
 const float kStepSigma = 0.08f;       // random part of the pendulum's length, relative
 const float kStepSigma_m = 0.02f;
-const float kFirstStepSigma = 0.3f;   // a walk's first step is anything from half a step
+const float kFirstStep = 0.6f;        // a walk's first step, from both feet to over one of them
+const float kOddStepSigma = 0.3f;     // that one, and what the walk ratio shortened
+const float kTurnSigma_m = 0.2f;      // of a step on the spot
+// Longest step for its time, length times duration: people walk at 0.30 to 0.42 m s at any speed
+// (walk ratio; walk_lowerback_20m, Sekiya and Nagasaki 1998). A long slow arc is bending or lifting.
+const float kWalkRatio_m_s = 0.5f;
+const float kIrregular = 0.7f;        // share left by turning under which a step is flagged
 const float kLateralSigma_m = 0.06f;  // the torso sways 2 to 4 cm and feet are placed as wide
 const float kVerticalSigma_m = 0.02f; // level floor: mid-stance heights repeat within 1 to 2 cm
 const float kLost = 0.5f;             // of the pendulum's length: the inertial motion ran away
 const float kTiltLost_rad = 2.0f * kDegree;  // added then: only a wrong tilt does that
 const float kDoubt = 3.0f;            // sigmas beyond which a step is weighed down
-const float kStraight_rad_s = 5.0f * kDegree;       // slower turns than this count as straight
-const float kStraightSigma_rad_s = 1.5f * kDegree;
+// Straight walking: over eight steps, left and right swings cancel, the heading of a straight walk
+// changes by 3 degrees (walk_lowerback_20m). One measurement, not eight: taken step by step slow
+// curves were learned as bias (70 deg/min on walk_handheld_waypoints).
+// A turn in the two steps behind it or the two before it spoils a stretch: it may have begun inside.
+const uint8_t kStraightFrom = 3, kStraightTo = kStraightFrom + 8, kStraightSure = kStraightTo + 2;
+const float kStraight_rad = 12.0f * kDegree;    // two steps that turn more are a turn
+const float kStraightGate = 9.0f;               // innovation squared over its variance
+const float kStraightSigma_rad_s = 0.5f * kDegree;
+const float kSettled_s = 1.0f, kStill_s = 5.0f;  // standing, of which 5 s make a measurement
 const float kStillSigma_m_s = 0.1f;   // sway of 2 cm/s that stays the same over several updates
 const float kLooseSigma_m_s = 0.5f;   // moving without steps: shuffling, bending
 const float kLooseNoise_m2_s = 0.1f;  // 0.3 m in a second may go unseen without a step
 const float kPredict_s = 0.09f;       // every fifth tick; no visible loss
 
-// Magnetometer.
+// Magnetometer. Indoors the direction is off by 9 degrees in the middle of 70 walks and 15 in a tenth
+// of them (walk_handheld_waypoints against its good gyroscopes), much the same for three seconds: one
+// reading every five steps counts, none while standing. The reference is the direction met so far;
+// it is learned while the heading is known better and corrects the heading when that has drifted.
 const float kFieldLeast_ut = 20.0f, kFieldMost_ut = 75.0f;  // the Earth's: 22 to 67
 const float kFieldNorm = 0.12f, kFieldVertical = 0.10f;     // of the norm
-const float kFieldResidual_rad = 40.0f * kDegree;
-const float kFieldSigma_rad = 25.0f * kDegree;  // indoors, and correlated over metres
-const uint8_t kFieldReadings = 10;    // two seconds make the reference
+const float kFieldSigma_rad = 12.0f * kDegree;
+const float kFieldShare = 0.02f;      // norm and vertical part follow within 10 s
+const uint8_t kFieldReadings = 10;    // two seconds make the first reference
+const uint8_t kFieldSteps = 5;
 
 const uint8_t kHoldTicks = 100;       // two seconds: a flag is seen by a report a second
 
@@ -61,6 +81,9 @@ void count(uint16_t* counter) {
 void clear(float vector[kAxes]) { vector[kX] = vector[kY] = vector[kZ] = 0.0f; }
 
 float norm(const float v[kAxes]) { return sqrtf(dot(v, v)); }
+
+// Variance of a measurement whose errors have long tails: the further off, the less it says.
+float doubted(float sigma, float innovation) { return sigma * sigma + innovation * innovation; }
 
 }  // namespace
 
@@ -147,7 +170,7 @@ void DeadReckoning::initialise(bool still) {
     // tells: 0.03 deg/s on a table, 0.8 standing quietly, 2 to 3 while getting ready, when the mean
     // was wrong by 1 to 2 deg/s (walk_chest) and turned the whole walk.
     const float noise =
-        kBiasLeast_rad_s * kBiasLeast_rad_s +
+        kSway_rad * kSway_rad / (elapsed_s_ * elapsed_s_) +
         (impulse_m_s_[kX] - dot(position_m_, position_m_) * share) * share * kSwayShare;
     const float weight = variance / (variance + noise);
     for (uint8_t i = 0; i < kAxes; ++i) bias_rad_s_[i] = position_m_[i] * (share * weight);
@@ -211,9 +234,18 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   float ahead[kAxes];  // the heading axis
   rotate(rotation, heading_axis_, ahead);
   displacement_.heading_rad = atan2f(ahead[kY], ahead[kX]);
-  heading_sum_rad_ += wrap_angle(displacement_.heading_rad - stance_heading_rad_[0]);
+  heading_sum_rad_ += wrap_angle(displacement_.heading_rad - stance_heading_rad_);
   if (step_ticks_ < 65535u) ++step_ticks_;
 
+  if (quiet_s_ >= kSettled_s) {
+    if (quiet_s_ < kSettled_s + dt_s) begin_straight();
+    straight_s_ += dt_s;
+    if (straight_s_ >= kStill_s) {
+      straight_rate_rad_s_ = wrap_angle(displacement_.heading_rad - straight_heading_rad_) / straight_s_;
+      still_pending_ = true;
+      begin_straight();
+    }
+  }
   gravity_m_s2_ += (force[kZ] - gravity_m_s2_) * (dt_s * (1.0f / kGravityTime_s));
   for (uint8_t i = 0; i < kAxes; ++i) {
     impulse_m_s_[i] += force[i] * dt_s;
@@ -243,32 +275,59 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
 }
 
 void DeadReckoning::on_stance(const Stance& stance) {
-  displacement_.last_step_tick = ticks_;
+  const float age_ticks = stance.age_s * kTicks_s;
+  displacement_.last_step_tick = ticks_ - static_cast<uint16_t>(age_ticks);
+  if (stance.last) {
+    displacement_.last_step_length_m = closing_m_;
+    ++displacement_.steps;
+    return;
+  }
+  closing_m_ = 0.0f;
   const float heading = displacement_.heading_rad;
-  const float mean =
-      step_ticks_ > 0 && !stance.first
-          ? stance_heading_rad_[0] + heading_sum_rad_ / static_cast<float>(step_ticks_)
-          : heading;
+  float mean = heading, turn = 0.0f;
+  if (step_ticks_ > 0 && !stance.first) {
+    mean = stance_heading_rad_ + heading_sum_rad_ / static_cast<float>(step_ticks_);
+    turn = wrap_angle(heading - stance_heading_rad_);
+  }
+  stance_heading_rad_ = heading;
+  heading_sum_rad_ = 0.0f;
   step_cosine_ = cosf(mean);
   step_sine_ = sinf(mean);
-  step_length_m_ = pendulum_step_m(stance.excursion_m, config_.leg_length_m, config_.step_gain);
-  step_sigma_m_ = (stance.first ? kFirstStepSigma : kStepSigma) * step_length_m_ + kStepSigma_m;
-  step_speed_m_s_ = step_length_m_ / stance.interval_s;
-  if (stance.first) stances_ = 0;
-  if (stances_ < 255) ++stances_;
-  // The yaw over two steps: left and right swing of the trunk cancel.
-  step_straight_ = false;
-  if (stances_ > 2) {
-    step_rate_rad_s_ = wrap_angle(heading - stance_heading_rad_[1]) /
-                       (stance.interval_s + stance_interval_s_);
-    step_straight_ = fabsf(step_rate_rad_s_) < kStraight_rad_s;
+
+  const float share = turning_share(turn);
+  step_length_m_ =
+      share * pendulum_step_m(stance.excursion_m, config_.leg_length_m, config_.step_gain);
+  step_sigma_m_ = kStepSigma;
+  if (stance.first) {
+    step_length_m_ *= kFirstStep;
+    step_sigma_m_ = kOddStepSigma;
   }
-  stance_heading_rad_[1] = stance_heading_rad_[0];
-  stance_heading_rad_[0] = heading;
-  stance_interval_s_ = stance.interval_s;
-  heading_sum_rad_ = 0.0f;
+  step_speed_m_s_ = step_length_m_ / stance.interval_s;
+  bool irregular = stance.weak || share < kIrregular;
+  const float most_m = kWalkRatio_m_s / stance.interval_s;
+  if (step_length_m_ > most_m) {
+    step_length_m_ = most_m;
+    step_sigma_m_ = kOddStepSigma;
+    irregular = true;
+  }
+  if (irregular) hold_[kHoldDoubt] = kHoldTicks;
+  step_sigma_m_ = step_sigma_m_ * step_length_m_ + kStepSigma_m + kTurnSigma_m * (1.0f - share);
+
+  if (stance.first || fabsf(turn + turn_rad_) > kStraight_rad) straight_steps_ = 0;
+  turn_rad_ = turn;
+  straight_s_ += stance.interval_s;
+  ++straight_steps_;
+  if (straight_steps_ == kStraightFrom) {
+    begin_straight();
+  } else if (straight_steps_ == kStraightTo) {
+    straight_rate_rad_s_ = wrap_angle(heading - straight_heading_rad_) / straight_s_;
+  }
+  step_straight_ = straight_steps_ == kStraightSure;
+  if (step_straight_) straight_steps_ = 2;
+  if (magnetic_steps_ < 255) ++magnetic_steps_;
   step_ticks_ = displacement_.initialised ? 0 : step_ticks_;
 
+  if (stance.first && !forward_.found()) forward_.reset();  // what came before was no walking
   step_directed_ = forward_.found();
   for (uint8_t i = 0; i < kAxes; ++i) {
     stance_position_m_[i] = position_m_[i];
@@ -293,10 +352,9 @@ void DeadReckoning::capture_span() {
 }
 
 void DeadReckoning::predict_attitude(const float rotation[kAxes * kAxes]) {
-  const float before = filter_.covariance(kAttitude + kZ, kAttitude + kZ);
   filter_.predict_attitude(rotation, span_s_);
-  const float growth = filter_.covariance(kAttitude + kZ, kAttitude + kZ) - before;
-  if (growth > 0.0f) displacement_.variance_heading_rad2 += growth;
+  const float variance = filter_.covariance(kAttitude + kZ, kAttitude + kZ);
+  if (variance > displacement_.variance_heading_rad2) displacement_.variance_heading_rad2 = variance;
   motion_pending_ = true;
 }
 
@@ -307,11 +365,14 @@ void DeadReckoning::work(const float rotation[kAxes * kAxes]) {
     if (job_ == kIdle && (quiet_s_ >= kQuiet_s || !gait_.walking())) job_ = kStillX;
   } else if (job_ != kIdle) {
     run_job(rotation);
+  } else if (still_pending_) {  // before the prediction, or standing would leave it no tick
+    still_pending_ = false;
+    apply_straight(rotation, kSway_rad / kStill_s);
+  } else if (magnetic_pending_) {
+    apply_magnetic();
   } else if (elapsed_s_ >= kPredict_s) {
     capture_span();
     predict_attitude(rotation);
-  } else if (magnetic_pending_) {
-    apply_magnetic();
   }
 }
 
@@ -356,8 +417,7 @@ void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
       if (!step_straight_) job_ = kCommit;
       break;
     case kDrift:
-      for (uint8_t i = 0; i < kAxes; ++i) direction[i] = -rotation[3 * kZ + i];
-      measure(kBias, direction, -step_rate_rad_s_, kStraightSigma_rad_s * kStraightSigma_rad_s);
+      apply_straight(rotation, kStraightSigma_rad_s);
       break;
     case kCommit:
       commit_step();
@@ -381,9 +441,10 @@ void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
 
 void DeadReckoning::measure(State group, const float direction[kAxes], float innovation,
                             float variance, float yaw) {
-  float correction[kStates];
+  float correction[kStates + 1];
   filter_.update(group, direction, yaw, innovation, variance, correction);
   attitude_.correct(correction + kAttitude);
+  if (group <= kBias) magnetic_azimuth_rad_ += correction[kReference];
   // During a step's updates the covariance stands at its mid-stance, the state at the present.
   const bool stance = job_ > kFlush && job_ <= kCommit;
   for (uint8_t i = 0; i < kAxes; ++i) {
@@ -396,6 +457,23 @@ void DeadReckoning::measure(State group, const float direction[kAxes], float inn
       position_m_[i] += correction[kPosition + i];
     }
   }
+}
+
+void DeadReckoning::begin_straight() {
+  straight_heading_rad_ = displacement_.heading_rad;
+  straight_s_ = 0.0f;
+}
+
+void DeadReckoning::apply_straight(const float rotation[kAxes * kAxes], float sigma_rad_s) {
+  float direction[kAxes];
+  float expected = sigma_rad_s * sigma_rad_s;
+  for (uint8_t i = 0; i < kAxes; ++i) {
+    direction[i] = -rotation[3 * kZ + i];
+    expected += direction[i] * direction[i] * filter_.covariance(kBias + i, kBias + i);
+  }
+  const float rate = straight_rate_rad_s_;
+  if (rate * rate > kStraightGate * expected) return;
+  measure(kBias, direction, -rate, doubted(sigma_rad_s, rate));
 }
 
 void DeadReckoning::to_wearer(const float n[kAxes], float* x_m, float* y_m) const {
@@ -464,6 +542,11 @@ void DeadReckoning::commit_still() {
     float x, y;
     to_wearer(position_m_, &x, &y);
     totals_.add(x, y);
+    const float ahead = x * step_cosine_ + y * step_sine_;
+    if (gait_.walking() && ahead > 0.0f) {
+      closing_m_ += ahead;
+      totals_.add_path(ahead);
+    }
     const float variance = filter_.along(kPosition, 0.70710678f, 0.70710678f);
     widen(variance, variance);
   } else if (!still) {
@@ -482,25 +565,25 @@ void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
   const float strength = norm(field);  // NaN fails every comparison below
   const float azimuth = atan2f(field[kY], field[kX]);
   bool plausible = strength > kFieldLeast_ut && strength < kFieldMost_ut;
-  bool used = plausible;
-  if (plausible && magnetic_count_ < kFieldReadings) {
-    ++magnetic_count_;
-    const float share = 1.0f / magnetic_count_;
-    for (uint8_t i = 0; i < kAxes; ++i) {
-      magnetic_reference_ut_[i] += (field[i] - magnetic_reference_ut_[i]) * share;
+  magnetic_residual_rad_ = wrap_angle(magnetic_azimuth_rad_ - azimuth);
+  if (plausible) {
+    float share = kFieldShare;
+    if (magnetic_count_ < kFieldReadings) {
+      share = 1.0f / ++magnetic_count_;
+      magnetic_azimuth_rad_ = wrap_angle(magnetic_azimuth_rad_ - magnetic_residual_rad_ * share);
+      filter_.set_reference(kFieldSigma_rad * kFieldSigma_rad);
+    } else {
+      plausible = fabsf(strength - magnetic_norm_ut_) < kFieldNorm * magnetic_norm_ut_ &&
+                  fabsf(field[kZ] - magnetic_vertical_ut_) < kFieldVertical * magnetic_norm_ut_;
+      magnetic_pending_ = plausible && magnetic_steps_ >= kFieldSteps;
     }
-  } else if (plausible) {
-    const float reference = norm(magnetic_reference_ut_);
-    plausible = fabsf(strength - reference) < kFieldNorm * reference &&
-                fabsf(field[kZ] - magnetic_reference_ut_[kZ]) < kFieldVertical * reference;
-    magnetic_residual_rad_ =
-        wrap_angle(atan2f(magnetic_reference_ut_[kY], magnetic_reference_ut_[kX]) - azimuth);
-    used = magnetic_pending_ = plausible && fabsf(magnetic_residual_rad_) < kFieldResidual_rad;
+    magnetic_norm_ut_ += (strength - magnetic_norm_ut_) * share;
+    magnetic_vertical_ut_ += (field[kZ] - magnetic_vertical_ut_) * share;
   }
   displacement_.magnetic_heading_valid = plausible;
   displacement_.magnetic_heading_rad = wrap_angle(displacement_.heading_rad - azimuth);
   displacement_.quality_flags &= static_cast<uint16_t>(~kMagneticDisturbed);
-  if (!used) {
+  if (!plausible) {
     displacement_.quality_flags |= kMagneticDisturbed;
     count(&counters_.rejected_magnetic);
   }
@@ -508,8 +591,10 @@ void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
 
 void DeadReckoning::apply_magnetic() {
   const float direction[kAxes] = {0.0f, 0.0f, 1.0f};
-  measure(kAttitude, direction, magnetic_residual_rad_, kFieldSigma_rad * kFieldSigma_rad);
+  measure(kAttitude, direction, magnetic_residual_rad_,
+          doubted(kFieldSigma_rad, magnetic_residual_rad_));
   magnetic_pending_ = false;
+  magnetic_steps_ = 0;
 }
 
 void DeadReckoning::publish() {

@@ -26,7 +26,7 @@ struct ImuSample {
 // What is known of the wearer and of the sensor. The defaults are used until configure().
 struct InertialConfig {
   float leg_length_m = 0.93f;  // 0.53 of the stature (Zijlstra and Hof 1997); here of 1.75 m
-  float step_gain = 1.25f;     // k of s = k 2 sqrt(2 l h - h^2), waist-worn literature value
+  float step_gain = 2.1f;      // c of s = c (l^2 h)^(1/3): odd people of walk_lowerback_20m
   float scale_sigma = 0.07f;   // relative, correlated: 0.05 to 0.09 uncalibrated, 0.03 calibrated
   float scale_correlation_m = 10.0f;  // path over which the scale error is charged as one
   float acceleration_limit_m_s2 = 39.0f;   // a component beyond it is saturated: just under 4 g
@@ -94,6 +94,8 @@ class DeadReckoning {
   void commit_step();
   void commit_still();
   void apply_magnetic();
+  void begin_straight();
+  void apply_straight(const float rotation[kAxes * kAxes], float sigma_rad_s);
   void to_wearer(const float navigation[kAxes], float* x_m, float* y_m) const;
   void publish();
 
@@ -119,24 +121,29 @@ class DeadReckoning {
 
   // The step under way and the one whose updates are under way.
   float heading_sum_rad_;
-  float stance_heading_rad_[2];  // at the last mid-stance and the one before
-  float stance_interval_s_;      // between those two
+  float stance_heading_rad_;  // at the last mid-stance
+  float closing_m_;           // way ahead since the last mid-stance, for the footfall that ends a walk
   float step_length_m_, step_sigma_m_, step_speed_m_s_;
   float step_cosine_, step_sine_;  // mean heading over the step
   float walk_x_, walk_y_;  // walking direction in the navigation frame: heading and forward axis
-  float step_rate_rad_s_;          // yaw rate over two steps; NaN-free: see step_straight_
+  float turn_rad_;  // over the last step
+  float straight_heading_rad_, straight_s_;  // of the stretch that may be straight
+  float straight_rate_rad_s_;
 
-  float magnetic_reference_ut_[kAxes];
+  // The field as it was met so far, navigation frame.
+  float magnetic_azimuth_rad_;
+  float magnetic_norm_ut_, magnetic_vertical_ut_;
   float magnetic_residual_rad_;
   float quiet_s_, mean_force_m_s2_;
 
   uint32_t ticks_;
   uint16_t step_ticks_;
-  uint8_t stances_;  // in this walk, saturating
-  uint8_t magnetic_count_;
+  uint8_t straight_steps_;
+  uint8_t magnetic_count_, magnetic_steps_;
   uint8_t hold_[kHolds];  // ticks that a flag stays up
   Job job_;
   bool motion_pending_, magnetic_pending_, step_directed_, step_straight_, velocity_known_;
+  bool still_pending_;
   bool moved_;  // not quiet throughout the gathering
 };
 

@@ -17,6 +17,7 @@ const float kFloor[kStates / kAxes] = {1e-9f, 1e-12f, 1e-7f, 0.0f};
 void ErrorFilter::reset(float tilt_rad, float bias_rad2_s2, float velocity_m_s) {
   for (uint8_t i = 0; i < kPacked; ++i) p_[i] = 0.0f;
   repairs_ = 0;
+  for (uint8_t i = 0; i < kReferenced; ++i) reference_[i] = 0.0f;
   for (uint8_t i = 0; i < kAxes; ++i) {
     p_[index(kAttitude + i, kAttitude + i)] = tilt_rad * tilt_rad;
     p_[index(kBias + i, kBias + i)] = bias_rad2_s2;
@@ -50,6 +51,7 @@ void ErrorFilter::predict_attitude(const float rotation[kAxes * kAxes], float dt
   float m[kAxes * kAxes];
   for (uint8_t i = 0; i < kAxes * kAxes; ++i) m[i] = -dt_s * rotation[i];
   couple(kAttitude, kBias, m);
+  reference_[0] += dot(m + 3 * kZ, reference_ + 1);
   for (uint8_t i = 0; i < kAxes; ++i) {
     p_[index(kAttitude + i, kAttitude + i)] += kAttitudeNoise_rad2_s * dt_s;
     p_[index(kBias + i, kBias + i)] += kBiasNoise_rad2_s3 * dt_s;
@@ -84,7 +86,7 @@ void ErrorFilter::predict_motion(const float f[kAxes], float dt_s) {
 }
 
 float ErrorFilter::update(State group, const float direction[kAxes], float yaw, float innovation,
-                          float variance, float correction[kStates]) {
+                          float variance, float correction[kStates + 1]) {
   float ph[kStates];
   for (uint8_t i = 0; i < kStates; ++i) {
     float sum = yaw * p_[index(i, kAttitude + kZ)];
@@ -92,6 +94,16 @@ float ErrorFilter::update(State group, const float direction[kAxes], float yaw, 
       if (direction[j] != 0.0f) sum += direction[j] * p_[index(i, group + j)];
     }
     ph[i] = sum;
+  }
+  // The reference's share in the measurement: with the heading it is compared, with the bias it is
+  // correlated alone.
+  float shared = 0.0f;
+  if (group == kAttitude) {
+    for (uint8_t i = 0; i < kReferenced; ++i) ph[kAttitude + kZ + i] -= reference_[i];
+    shared = reference_[0] - reference_variance_;
+    variance -= shared;
+  } else if (group == kBias) {
+    shared = dot(direction, reference_ + 1);
   }
   float total = variance + yaw * ph[kAttitude + kZ];
   for (uint8_t j = 0; j < kAxes; ++j) total += direction[j] * ph[group + j];
@@ -117,6 +129,13 @@ float ErrorFilter::update(State group, const float direction[kAxes], float yaw, 
       }
     }
     correction[i] = fixed ? 0.0f : gain * innovation;
+  }
+  if (!considers) {
+    for (uint8_t i = 0; i < kReferenced; ++i) {
+      reference_[i] -= ph[kAttitude + kZ + i] * inverse * shared;
+    }
+    reference_variance_ -= shared * shared * inverse;
+    correction[kStates] = shared * inverse * innovation;
   }
   return total;
 }

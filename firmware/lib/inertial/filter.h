@@ -19,7 +19,8 @@ enum State : uint8_t {
   kBias = 3,
   kVelocity = 6,
   kPosition = 9,   // since the last mid-stance
-  kStates = 12
+  kStates = 12,
+  kReference = 12  // in a correction: the magnetic reference
 };
 
 class ErrorFilter {
@@ -30,11 +31,14 @@ class ErrorFilter {
   void reset(float tilt_rad, float bias_rad2_s2, float velocity_m_s);
   void predict_attitude(const float rotation[kAxes * kAxes], float dt_s);
   void predict_motion(const float impulse_m_s[kAxes], float dt_s);
+  // A reference direction that the heading is compared with (kAttitude's measurement): a thirteenth
+  // state that does not move, of which only the correlations with heading and bias are kept.
+  void set_reference(float variance_rad2) { reference_variance_ = variance_rad2; }
   // Scalar measurement z = direction . x[group .. group+2] + yaw x[heading] with the innovation and
-  // variance given; correction[kStates] is what to add to the nominal state. Returns the
+  // variance given; correction[kStates + 1] is what to add to the nominal state. Returns the
   // innovation variance.
   float update(State group, const float direction[kAxes], float yaw, float innovation,
-               float variance, float correction[kStates]);
+               float variance, float correction[kStates + 1]);
   // A group becomes known exactly (position at a step's end) or anew with the given sigma.
   void restart(State group, float sigma);
 
@@ -56,7 +60,11 @@ class ErrorFilter {
   // x_to += M x_from for two groups, M 3x3; the workhorse of the structured prediction.
   void couple(State to, State from, const float matrix[kAxes * kAxes]);
 
+  static const uint8_t kReferenced = 4;  // heading and the three biases, neighbours in State
+
   float p_[kPacked];
+  float reference_[kReferenced];
+  float reference_variance_;
   uint16_t repairs_;
 };
 

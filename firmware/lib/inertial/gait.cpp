@@ -8,18 +8,26 @@
 namespace relpos {
 namespace {
 
+// All chosen on the people with odd numbers of walk_lowerback_20m, in their walks without lost
+// samples (bench/inertial/evaluate.py), by steps found less steps too many.
 // Mean of the vertical acceleration, and leak of both its integrals: long enough for steps of 0.8 Hz,
-// short enough to be over a start or a turn a step later. Chosen on the people with odd numbers of
-// walk_lowerback_20m: 95.2 % of the steps; 1.5 s and 0.7 s gave 94.1 %, 0.25 s and less no more.
-const float kMeanTime_s = 0.7f;
-const float kLeakTime_s = 0.5f;
+// short enough to be over a start or a turn a step later.
+const float kMeanTime_s = 0.5f;
+const float kLeakTime_s = 0.4f;
 const float kShortestStep_s = 0.28f;   // 3.6 steps/s: faster than anybody walks (running 3.2)
-// Both from a prototype; neither separates alone: before the walks of
-// walk_lowerback_20m people sway by 5 mm and 0.2 m/s2 at their most (medians; a tenth over 33 mm
-// and 1.3 m/s2, which is shifting about).
-const float kSmallestSwing_m = 0.004f;
+const float kSmallestSwing_m = 0.005f;
 const float kSmallestRange_m_s2 = 0.6f;
-const float kPause_s = 1.5f;      // longest time between steps of one walk
+const float kPause_s = 1.5f;       // longest time between steps of one walk
+const float kFirstPeriod_s = 0.6f; // 100 steps a minute, until two steps tell
+const float kPeriodGain = 0.3f;    // the rhythm of the last three steps
+const float kLongestPeriod_s = 1.0f;   // longer is a step that was missed, or hesitation
+const float kEarly = 0.6f;         // of the period: what comes sooner is a shock of the same step
+// A step that comes when it is due needs a push of the foot, but no arc.
+const float kDueFrom = 0.8f, kDueUntil = 1.4f;  // of the period
+const float kDueRange_m_s2 = 1.0f;
+const uint8_t kWalk = 3;           // steps that make a walk, whose end is a footfall
+
+const float kTurn_rad = 0.6f;      // see turning_share
 
 const float kForwardMemory_s = 12.0f;  // about twenty steps: a body-fixed axis, yet free to move
 const uint8_t kForwardSteps = 4;       // two strides: the sway of left and right cancels
@@ -34,6 +42,7 @@ const float kForwardCoherence = 0.06f;
 void GaitDetector::reset() {
   memset(static_cast<void*>(this), 0, sizeof *this);
   since_s_ = kPause_s + 1.0f;
+  period_s_ = kFirstPeriod_s;
   restart_arc();
 }
 
@@ -67,19 +76,42 @@ bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance* stance) {
   if (acceleration < lowest_m_s2_) lowest_m_s2_ = acceleration;
   if (acceleration > highest_m_s2_) highest_m_s2_ = acceleration;
 
+  const bool first = !walking();
+  stance->first = first;
+  stance->age_s = 0.0f;
+  stance->last = first && footfall_due_;
+  if (stance->last) {
+    // Whoever was over one foot and going put down the other one before standing.
+    footfall_due_ = false;
+    stance->age_s = since_s_ - period_s_;
+    return true;
+  }
   if (!(before > 0.0f && velocity_m_s_ <= 0.0f)) return false;
   const float swing = height_m_ - trough_m_;
-  const bool first = !walking();
-  if (since_s_ < kShortestStep_s || swing < kSmallestSwing_m ||
-      highest_m_s2_ - lowest_m_s2_ < kSmallestRange_m_s2) {
-    if (walking() && rejected_ < 255) ++rejected_;
-    if (first) restart_arc();
+  const float range_m_s2 = highest_m_s2_ - lowest_m_s2_;
+  stance->weak = swing < kSmallestSwing_m || since_s_ < kEarly * period_s_ ||
+                 since_s_ < kShortestStep_s || range_m_s2 < kSmallestRange_m_s2;
+  if (stance->weak && (first || range_m_s2 < kDueRange_m_s2 || since_s_ < kDueFrom * period_s_ ||
+                       since_s_ > kDueUntil * period_s_)) {
+    if (first) {
+      restart_arc();
+    } else if (rejected_ < 255) {
+      ++rejected_;
+    }
     return false;
   }
-  float excursion = first ? swing : 0.5f * (height_m_ + peak_m_) - trough_m_;
-  if (excursion < 0.5f * swing) excursion = 0.5f * swing;
-  stance->first = first;
-  stance->interval_s = first ? 0.6f : since_s_;
+  float excursion = swing;
+  stance->interval_s = since_s_;
+  if (first) {
+    steps_ = 0;
+    stance->interval_s = period_s_ = kFirstPeriod_s;
+  } else {
+    if (since_s_ < kLongestPeriod_s) period_s_ += kPeriodGain * (since_s_ - period_s_);
+    excursion = 0.5f * (height_m_ + peak_m_) - trough_m_;
+    if (excursion < 0.5f * swing) excursion = 0.5f * swing;
+  }
+  if (steps_ < 255) ++steps_;
+  footfall_due_ = !stance->weak && steps_ >= kWalk;
   // The three leaky filters shrink an oscillation of period T by 1/sqrt(1 + (T / 2 pi tau)^2) each.
   const float ratio = stance->interval_s * (1.0f / (2.0f * kPi * kLeakTime_s));
   const float square = ratio * ratio;
@@ -92,9 +124,12 @@ bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance* stance) {
 }
 
 float pendulum_step_m(float excursion_m, float leg_length_m, float gain) {
-  // Beyond h = l the arc is past the horizontal: no leg does that, the chord stays at 2 l.
-  const float h = excursion_m < leg_length_m ? excursion_m : leg_length_m;
-  return gain * 2.0f * sqrtf(h * (2.0f * leg_length_m - h));
+  return gain * cbrtf(leg_length_m * leg_length_m * excursion_m);
+}
+
+float turning_share(float yaw_rad) {
+  const float turn = yaw_rad * (1.0f / kTurn_rad);
+  return 1.0f / (1.0f + turn * turn);
 }
 
 void ForwardFinder::reset() {

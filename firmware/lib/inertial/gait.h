@@ -10,11 +10,16 @@ namespace relpos {
 struct Stance {
   float excursion_m;  // height of the torso's arc over this step
   float interval_s;   // since the previous mid-stance
+  float age_s;        // how long ago it was; not 0 for `last` alone
   bool first;         // nothing before it within the pause time: the walk starts here
+  bool last;          // the footfall that ended the walk, inferred: nothing of it was measured
+  bool weak;          // known by its time, not by its size
 };
 
 // Finds mid-stance: the torso at the top of its arc, where its vertical velocity crosses from up
-// to down. Velocity and height are leaky integrals of the vertical acceleration.
+// to down. Velocity and height are leaky integrals of the vertical acceleration. A step is known by
+// the size of its arc, or, smaller, by coming when the rhythm has it due: in a turn and before
+// standing people hardly rise.
 class GaitDetector {
  public:
   void reset();
@@ -30,14 +35,19 @@ class GaitDetector {
   float mean_m_s2_, velocity_m_s_, height_m_;
   float trough_m_, peak_m_;
   float lowest_m_s2_, highest_m_s2_;
-  float since_s_;
-  uint8_t rejected_;
-  bool running_;
+  float since_s_, period_s_;
+  uint8_t rejected_, steps_;  // steps of this walk, saturating
+  bool running_, footfall_due_;
 };
 
-// s = k 2 sqrt(2 l h - h^2): chord of the arc that a leg of length l draws when it lifts the hip
-// by h (Zijlstra and Hof 1997), times the gain k.
+// Length of a step: s = c (l^2 h)^(1/3), h the excursion, l the length of the leg.
+// The chord of the leg's arc, 2 sqrt(2 l h - h^2) (Zijlstra and Hof 1997), has the wrong exponent
+// between people: who rises by 55 mm needs a gain of 1.1, who rises by 28 mm one of 1.28, because
+// the torso also goes forward in double support and the pelvis flattens the arc. See
+// docs/deadreckoning.md.
 float pendulum_step_m(float excursion_m, float leg_length_m, float gain);
+// What turning leaves of a step's length: 1 straight ahead, a half at 0.6 rad a step.
+float turning_share(float yaw_rad);
 
 // Forward axis on the body. The pendulum trades height against speed: the torso gains forward
 // speed while it sinks and loses it while it rises, so horizontal acceleration times downward
