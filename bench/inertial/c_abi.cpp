@@ -78,6 +78,7 @@ void inertial_counters(const DeadReckoning* reckoning, uint32_t* values) {
   values[4] = c.rejected_magnetic;
   values[5] = c.lost_steps;
   values[6] = reckoning->filter().repairs();
+  values[7] = c.turned_sensors;
 }
 
 // P := F P F' + Q over one span, for the check of the Jacobian: matrix is kStates x kStates.

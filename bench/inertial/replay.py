@@ -47,6 +47,7 @@ COUNTERS = (
     "rejected_magnetic",
     "lost_steps",
     "covariance_repairs",
+    "turned_sensors",
 )
 
 

@@ -16,9 +16,9 @@ const float kShortStill_s = 0.5f;     // enough for the tilt; the bias then to 0
 const float kMovingStart_s = 1.0f;    // about two steps, over which horizontal force averages out
 const float kTiltStill_rad = 1.0f * kDegree;
 const float kTiltMoving_rad = 6.0f * kDegree;  // half a step's braking left in the average
-// What a mean rate says of the bias: a body that stands turns to and fro by a degree, whatever the
+// What a mean rate says of the bias: a body that stands turns to and fro by 1.2 degrees, whatever the
 // time; one that gets ready spreads its rates, of which a quarter is left in the mean of an axis.
-const float kSway_rad = 0.9f * kDegree;
+const float kSway_rad = 1.7f * kDegree;
 const float kSwayShare = 0.25f;
 const float kSpeedUnknown_m_s = 1.0f;
 const float kSpeedFound_m_s = 0.3f;   // step length over interval, at mid-stance
@@ -69,6 +69,13 @@ const float kFieldSigma_rad = 12.0f * kDegree;
 const float kFieldShare = 0.02f;      // norm and vertical part follow within 10 s
 const uint8_t kFieldReadings = 10;    // two seconds make the first reference
 const uint8_t kFieldSteps = 5;
+
+// The sensor on the body. An axis that leans so far (sine) shows no heading; and a forward axis that
+// stays elsewhere for so many steps, once it had settled, is a sensor that was turned on the body.
+const float kSteep = 0.85f;
+const uint8_t kSettledSteps = 20, kTurnedSteps = 10;
+const float kTurned_rad = 40.0f * kDegree;
+const float kForwardShare = 1.0f / 32.0f;
 
 const uint8_t kHoldTicks = 100;       // two seconds: a flag is seen by a report a second
 
@@ -220,7 +227,7 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   Stance stance;
   if (!displacement_.initialised) {
     // Until the vertical is known the magnitude of the force stands for its vertical part.
-    if (gait_.update(strength, dt_s, &stance)) on_stance(stance);
+    if (gait_.update(strength, dt_s, &stance)) on_stance(stance, rotation);
     gather(sample, force, dt_s);
     if (job_ != kIdle) {  // such a step has nothing to measure against: counted, placed ahead
       job_ = kIdle;
@@ -233,6 +240,10 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
 
   float ahead[kAxes];  // the heading axis
   rotate(rotation, heading_axis_, ahead);
+  if (fabsf(ahead[kZ]) > kSteep) {  // bent, crawling or lying: another axis takes over
+    aim(rotation, displacement_.heading_rad);
+    rotate(rotation, heading_axis_, ahead);
+  }
   displacement_.heading_rad = atan2f(ahead[kY], ahead[kX]);
   heading_sum_rad_ += wrap_angle(displacement_.heading_rad - stance_heading_rad_);
   if (step_ticks_ < 65535u) ++step_ticks_;
@@ -266,7 +277,7 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
     const bool busy = motion_pending_;
     if (busy) filter_.predict_motion(span_impulse_m_s_, span_s_);
     motion_pending_ = false;
-    on_stance(stance);
+    on_stance(stance, rotation);
     if (!busy) work(rotation);
   } else {
     work(rotation);
@@ -274,7 +285,7 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   publish();
 }
 
-void DeadReckoning::on_stance(const Stance& stance) {
+void DeadReckoning::on_stance(const Stance& stance, const float rotation[kAxes * kAxes]) {
   const float age_ticks = stance.age_s * kTicks_s;
   displacement_.last_step_tick = ticks_ - static_cast<uint16_t>(age_ticks);
   if (stance.last) {
@@ -336,10 +347,40 @@ void DeadReckoning::on_stance(const Stance& stance) {
   if (displacement_.initialised) {
     capture_span();
     forward_.step();
+    watch_mounting(rotation);
   }
   walk_x_ = step_cosine_ * forward_.cosine() - step_sine_ * forward_.sine();
   walk_y_ = step_sine_ * forward_.cosine() + step_cosine_ * forward_.sine();
   job_ = kFlush;
+}
+
+// Makes the body vector that points to `heading_rad` now the heading axis.
+void DeadReckoning::aim(const float rotation[kAxes * kAxes], float heading_rad) {
+  const float cosine = cosf(heading_rad), sine = sinf(heading_rad);
+  for (uint8_t i = 0; i < kAxes; ++i) {
+    heading_axis_[i] = cosine * rotation[i] + sine * rotation[kAxes + i];
+  }
+}
+
+// A sensor turned on the body turns the heading axis one way and the forward axis the other: both are
+// turned back, so that the wearer's heading is what it was.
+void DeadReckoning::watch_mounting(const float rotation[kAxes * kAxes]) {
+  const float turned_rad = wrap_angle(forward_.offset_rad() - mounting_rad_);
+  if (settled_steps_ < kSettledSteps) {
+    if (forward_.found()) ++settled_steps_;
+    mounting_rad_ = forward_.offset_rad();
+  } else if (fabsf(turned_rad) < kTurned_rad) {
+    mounting_rad_ = wrap_angle(mounting_rad_ + kForwardShare * turned_rad);
+    turned_steps_ = 0;
+  } else if (++turned_steps_ == kTurnedSteps) {
+    turned_steps_ = 0;
+    aim(rotation, displacement_.heading_rad + turned_rad);
+    displacement_.heading_rad = wrap_angle(displacement_.heading_rad + turned_rad);
+    stance_heading_rad_ = displacement_.heading_rad;
+    forward_.turn(-turned_rad);
+    straight_steps_ = 0;
+    count(&counters_.turned_sensors);
+  }
 }
 
 void DeadReckoning::capture_span() {
@@ -515,8 +556,7 @@ void DeadReckoning::commit_step() {
     along = filter_.along(kPosition, walk_x_, walk_y_);
     across = filter_.along(kPosition, -walk_y_, walk_x_);
   }
-  widen(along + scale_variance_growth_m2(displacement_.path_m, length, config_.scale_sigma,
-                                         config_.scale_correlation_m),
+  widen(along + scale_variance_growth_m2(displacement_.path_m, length, config_.scale_sigma),
         across);
   displacement_.last_step_length_m = length;
   ++displacement_.steps;

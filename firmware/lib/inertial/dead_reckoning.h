@@ -28,7 +28,6 @@ struct InertialConfig {
   float leg_length_m = 0.93f;  // 0.53 of the stature (Zijlstra and Hof 1997); here of 1.75 m
   float step_gain = 2.1f;      // c of s = c (l^2 h)^(1/3): odd people of walk_lowerback_20m
   float scale_sigma = 0.07f;   // relative, correlated: 0.05 to 0.09 uncalibrated, 0.03 calibrated
-  float scale_correlation_m = 10.0f;  // path over which the scale error is charged as one
   float acceleration_limit_m_s2 = 39.0f;   // a component beyond it is saturated: just under 4 g
   float angular_rate_limit_rad_s = 8.7f;   // just under 500 deg/s
   // What is not known of the gyroscope's bias at the start, an axis. 1 deg/s: what a warmed-up, once
@@ -44,6 +43,7 @@ struct InertialCounters {
   uint16_t doubtful_steps;      // steps whose length contradicted the inertial motion
   uint16_t rejected_magnetic;
   uint16_t lost_steps;          // steps after which the velocity had to start anew
+  uint16_t turned_sensors;      // turns of the sensor on the body that were noticed
 };
 
 class DeadReckoning {
@@ -83,7 +83,9 @@ class DeadReckoning {
   void watch_quiet(float force_m_s2, const float angle_rad[kAxes], float dt_s);
   void gather(const ImuSample& sample, const float force_m_s2[kAxes], float dt_s);
   void initialise(bool still);
-  void on_stance(const Stance& stance);
+  void on_stance(const Stance& stance, const float rotation[kAxes * kAxes]);
+  void aim(const float rotation[kAxes * kAxes], float heading_rad);
+  void watch_mounting(const float rotation[kAxes * kAxes]);
   void work(const float rotation[kAxes * kAxes]);
   void run_job(const float rotation[kAxes * kAxes]);
   void capture_span();
@@ -125,6 +127,7 @@ class DeadReckoning {
   float closing_m_;           // way ahead since the last mid-stance, for the footfall that ends a walk
   float step_length_m_, step_sigma_m_, step_speed_m_s_;
   float step_cosine_, step_sine_;  // mean heading over the step
+  float mounting_rad_;             // where the forward axis has settled, from the heading axis
   float walk_x_, walk_y_;  // walking direction in the navigation frame: heading and forward axis
   float turn_rad_;  // over the last step
   float straight_heading_rad_, straight_s_;  // of the stretch that may be straight
@@ -138,7 +141,7 @@ class DeadReckoning {
 
   uint32_t ticks_;
   uint16_t step_ticks_;
-  uint8_t straight_steps_;
+  uint8_t straight_steps_, settled_steps_, turned_steps_;
   uint8_t magnetic_count_, magnetic_steps_;
   uint8_t hold_[kHolds];  // ticks that a flag stays up
   Job job_;

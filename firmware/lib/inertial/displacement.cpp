@@ -29,11 +29,8 @@ float Totals::x_m() const { return static_cast<float>(x_) * (1.0f / kUnitsPerMet
 float Totals::y_m() const { return static_cast<float>(y_) * (1.0f / kUnitsPerMetre); }
 float Totals::path_m() const { return static_cast<float>(path_) * (1.0f / kUnitsPerMetre); }
 
-float scale_variance_growth_m2(float path_m, float length_m, float sigma, float correlation_m) {
-  // The share of the scale error that is still the same: x / (1 + x) instead of the exponential's
-  // 1 - exp(-x), which it follows at both ends; the exponential is 450 bytes of the Uno's flash.
-  const float middle = path_m + 0.5f * length_m;
-  return 2.0f * sigma * sigma * correlation_m * length_m * middle / (middle + correlation_m);
+float scale_variance_growth_m2(float path_m, float length_m, float sigma) {
+  return sigma * sigma * length_m * (2.0f * path_m + length_m);
 }
 
 }  // namespace relpos

@@ -53,10 +53,9 @@ class Totals {
   uint32_t path_;
 };
 
-// Growth of the along-track variance over one step from a scale error that stays the same over
-// `correlation_m` of path and wanders beyond (first-order Gauss-Markov over the path walked):
-// the total's variance is (sigma D)^2 for D well under the correlation, 2 sigma^2 L D well over it.
-float scale_variance_growth_m2(float path_m, float length_m, float sigma, float correlation_m);
+// Growth of the along-track variance over one step from a scale error that stays the same: a wearer's
+// gain is off by as much at the end as at the start, so the total's variance is (sigma path)^2.
+float scale_variance_growth_m2(float path_m, float length_m, float sigma);
 
 }  // namespace relpos
 

@@ -145,15 +145,25 @@ void ForwardFinder::update(float ax, float ay, float vertical_velocity_m_s, floa
   power_v_ += gain * (vertical_velocity_m_s * vertical_velocity_m_s - power_v_);
 }
 
+void ForwardFinder::turn(float angle_rad) {
+  const float c = cosf(angle_rad), s = sinf(angle_rad), x = product_x_;
+  product_x_ = c * x - s * product_y_;
+  product_y_ = s * x + c * product_y_;
+  point();
+}
+
+void ForwardFinder::point() {
+  offset_rad_ = atan2f(product_y_, product_x_);
+  cosine_ = cosf(offset_rad_);
+  sine_ = sinf(offset_rad_);
+}
+
 void ForwardFinder::step() {
   if (steps_ < 255) ++steps_;
   if (steps_ < kForwardSteps) return;
   const float product = product_x_ * product_x_ + product_y_ * product_y_;
   if (product < kForwardCoherence * power_a_ * power_v_) return;
-  offset_rad_ = atan2f(product_y_, product_x_);
-  const float scale = 1.0f / sqrtf(product);
-  cosine_ = product_x_ * scale;
-  sine_ = product_y_ * scale;
+  point();
   found_ = true;
 }
 
