@@ -130,7 +130,7 @@ def standing(seconds, rate_rad_s):
 
 def test_a_bias_on_the_table_is_learned_within_ten_seconds():
     bias = replay.reckon(standing(10.1, np.radians(2.0))).bias_rad_s
-    assert np.degrees(bias[0]) == pytest.approx(2.0, abs=0.05)
+    assert np.degrees(bias[0]) == pytest.approx(2.0, abs=0.1)
 
 
 def test_standing_on_learns_the_bias_better():
@@ -143,8 +143,8 @@ def test_standing_on_learns_the_bias_better():
         abs(np.degrees(replay.reckon(imu[: seconds * RATE_HZ]).bias_rad_s[0]) - 1.0)
         for seconds in (4, 61)
     ]
-    assert off[0] > 0.15
-    assert off[1] < 0.08
+    assert off[0] > 0.2
+    assert off[1] < 0.12
 
 
 def test_getting_ready_is_not_taken_for_bias():

@@ -73,9 +73,8 @@ const uint8_t kFieldSteps = 5;
 // The sensor on the body. An axis that leans so far (sine) shows no heading; and a forward axis that
 // stays elsewhere for so many steps, once it had settled, is a sensor that was turned on the body.
 const float kSteep = 0.85f;
-const uint8_t kSettledSteps = 20, kTurnedSteps = 10;
-const float kTurned_rad = 40.0f * kDegree;
-const float kForwardShare = 1.0f / 32.0f;
+const uint8_t kSettledSteps = 20, kDoubtedSteps = 8, kTurnedSteps = 22;
+const float kTurned_rad = 35.0f * kDegree;
 
 const uint8_t kHoldTicks = 100;       // two seconds: a flag is seen by a report a second
 
@@ -370,9 +369,10 @@ void DeadReckoning::watch_mounting(const float rotation[kAxes * kAxes]) {
     if (forward_.found()) ++settled_steps_;
     mounting_rad_ = forward_.offset_rad();
   } else if (fabsf(turned_rad) < kTurned_rad) {
-    mounting_rad_ = wrap_angle(mounting_rad_ + kForwardShare * turned_rad);
     turned_steps_ = 0;
-  } else if (++turned_steps_ == kTurnedSteps) {
+  } else if (++turned_steps_ == kDoubtedSteps) {
+    forward_.forget();  // the mean of before and after would be neither
+  } else if (turned_steps_ == kTurnedSteps) {
     turned_steps_ = 0;
     aim(rotation, displacement_.heading_rad + turned_rad);
     displacement_.heading_rad = wrap_angle(displacement_.heading_rad + turned_rad);

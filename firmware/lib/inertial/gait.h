@@ -58,6 +58,7 @@ class ForwardFinder {
   // Horizontal acceleration in the heading frame (x along the heading axis, y left of it).
   void update(float ax_m_s2, float ay_m_s2, float vertical_velocity_m_s, float dt_s);
   void step();  // at every mid-stance: decides, and recomputes the angle
+  void forget() { product_x_ = product_y_ = power_a_ = power_v_ = 0.0f; }  // what is found stays
   void turn(float angle_rad);  // the heading axis was turned the other way
   bool found() const { return found_; }
   float offset_rad() const { return offset_rad_; }      // from heading axis to forward, ccw
