@@ -48,7 +48,8 @@ void inertial_run(DeadReckoning* reckoning, const float* imu, const float* field
     reckoning->update(sample, dt_s[i]);
     if (divider > 0 && i % divider == 0) reckoning->magnetometer(field + 3 * i);
     const Displacement& d = reckoning->displacement();
-    const inertial_row row = {d.x_m, d.y_m, d.heading_rad, d.variance_along_m2,
+    const inertial_row row = {d.x_m, d.y_m, d.heading_rad,
+                              d.variance_along_m2 + d.scale_error_m * d.scale_error_m,
                               d.variance_across_m2, d.variance_heading_rad2, d.path_m,
                               d.last_step_length_m, d.magnetic_heading_rad,
                               reckoning->forward().offset_rad(), d.steps, d.last_step_tick,

@@ -40,6 +40,9 @@ const float kTurnSigma_m = 0.2f;      // of a step on the spot
 // (walk ratio; walk_lowerback_20m, Sekiya and Nagasaki 1998). A long slow arc is bending or lifting.
 const float kWalkRatio_m_s = 0.5f;
 const float kIrregular = 0.7f;        // share left by turning under which a step is flagged
+// Relative scale error of flagged steps: shuffling, turning on the spot, steps aside and lifting look
+// alike on the torso and are a quarter to a whole too long (bench/inertial/simulated.py).
+const float kIrregularScale = 0.4f;
 const float kLateralSigma_m = 0.06f;  // the torso sways 2 to 4 cm and feet are placed as wide
 const float kVerticalSigma_m = 0.02f; // level floor: mid-stance heights repeat within 1 to 2 cm
 const float kLost = 0.5f;             // of the pendulum's length: the inertial motion ran away
@@ -313,14 +316,15 @@ void DeadReckoning::on_stance(const Stance& stance, const float rotation[kAxes *
     step_sigma_m_ = kOddStepSigma;
   }
   step_speed_m_s_ = step_length_m_ / stance.interval_s;
-  bool irregular = stance.weak || share < kIrregular;
+  step_irregular_ =
+      stance.weak || share < kIrregular || stance.excursion_m < kSmallRise_m;
   const float most_m = kWalkRatio_m_s / stance.interval_s;
   if (step_length_m_ > most_m) {
     step_length_m_ = most_m;
     step_sigma_m_ = kOddStepSigma;
-    irregular = true;
+    step_irregular_ = true;
   }
-  if (irregular) hold_[kHoldDoubt] = kHoldTicks;
+  if (step_irregular_) hold_[kHoldDoubt] = kHoldTicks;
   step_sigma_m_ = step_sigma_m_ * step_length_m_ + kStepSigma_m + kTurnSigma_m * (1.0f - share);
 
   if (stance.first || fabsf(turn + turn_rad_) > kStraight_rad) straight_steps_ = 0;
@@ -556,8 +560,8 @@ void DeadReckoning::commit_step() {
     along = filter_.along(kPosition, walk_x_, walk_y_);
     across = filter_.along(kPosition, -walk_y_, walk_x_);
   }
-  widen(along + scale_variance_growth_m2(displacement_.path_m, length, config_.scale_sigma),
-        across);
+  widen(along, across);
+  displacement_.scale_error_m += length * (step_irregular_ ? kIrregularScale : config_.scale_sigma);
   displacement_.last_step_length_m = length;
   ++displacement_.steps;
   totals_.add(x, y);

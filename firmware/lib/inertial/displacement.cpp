@@ -29,8 +29,4 @@ float Totals::x_m() const { return static_cast<float>(x_) * (1.0f / kUnitsPerMet
 float Totals::y_m() const { return static_cast<float>(y_) * (1.0f / kUnitsPerMetre); }
 float Totals::path_m() const { return static_cast<float>(path_) * (1.0f / kUnitsPerMetre); }
 
-float scale_variance_growth_m2(float path_m, float length_m, float sigma) {
-  return sigma * sigma * length_m * (2.0f * path_m + length_m);
-}
-
 }  // namespace relpos

@@ -27,6 +27,8 @@ enum QualityFlag : uint16_t {
 struct Displacement {
   float x_m, y_m, heading_rad;  // heading in (-pi, pi]
   float variance_along_m2, variance_across_m2, variance_heading_rad2;
+  float scale_error_m;          // what all steps err by together: standard deviation of the path from
+                                // the wearer's gain; its square comes on top of variance_along_m2
   float path_m;                 // sum of the step lengths
   uint16_t steps;               // wraps
   uint32_t last_step_tick;      // update() calls since the reset at the last mid-stance
@@ -52,10 +54,6 @@ class Totals {
   int32_t x_, y_;
   uint32_t path_;
 };
-
-// Growth of the along-track variance over one step from a scale error that stays the same: a wearer's
-// gain is off by as much at the end as at the start, so the total's variance is (sigma path)^2.
-float scale_variance_growth_m2(float path_m, float length_m, float sigma);
 
 }  // namespace relpos
 

@@ -44,7 +44,8 @@ class GaitDetector {
 // The chord of the leg's arc, 2 sqrt(2 l h - h^2) (Zijlstra and Hof 1997), has the wrong exponent
 // between people: who rises by 55 mm needs a gain of 1.1, who rises by 28 mm one of 1.28, because
 // the torso also goes forward in double support and the pelvis flattens the arc. See
-// docs/deadreckoning.md.
+// docs/deadreckoning.md. Under kSmallRise_m the rise is sway and bending as much as stepping.
+const float kSmallRise_m = 0.02f;
 float pendulum_step_m(float excursion_m, float leg_length_m, float gain);
 // What turning leaves of a step's length: 1 straight ahead, a half at 0.6 rad a step.
 float turning_share(float yaw_rad);
