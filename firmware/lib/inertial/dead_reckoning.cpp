@@ -55,7 +55,7 @@ const float kDoubt = 3.0f;            // sigmas beyond which a step is weighed d
 const uint8_t kStraightFrom = 3, kStraightTo = kStraightFrom + 8, kStraightSure = kStraightTo + 2;
 const float kStraight_rad = 12.0f * kDegree;    // two steps that turn more are a turn
 const float kStraightGate = 9.0f;               // innovation squared over its variance
-const float kStraightSigma_rad_s = 0.5f * kDegree;
+const float kStraightSigma_rad_s = 0.6f * kDegree;
 const float kSettled_s = 1.0f, kStill_s = 5.0f;  // standing, of which 5 s make a measurement
 const float kStillSigma_m_s = 0.1f;   // sway of 2 cm/s that stays the same over several updates
 const float kLooseSigma_m_s = 0.5f;   // moving without steps: shuffling, bending
@@ -76,7 +76,7 @@ const uint8_t kFieldSteps = 5;
 // The sensor on the body. An axis that leans so far (sine) shows no heading; and a forward axis that
 // stays elsewhere for so many steps, once it had settled, is a sensor that was turned on the body.
 const float kSteep = 0.85f;
-const uint8_t kSettledSteps = 20, kDoubtedSteps = 8, kTurnedSteps = 22;
+const uint8_t kSettledSteps = 10, kDoubtedSteps = 8, kTurnedSteps = 22;
 const float kTurned_rad = 35.0f * kDegree;
 
 const uint8_t kHoldTicks = 100;       // two seconds: a flag is seen by a report a second
