@@ -7,8 +7,6 @@
 namespace relpos {
 namespace {
 
-uint8_t next(uint8_t axis) { return axis == kZ ? static_cast<uint8_t>(kX) : axis + 1; }
-
 // out := a * b, out neither of them.
 void multiply(const float a[4], const float b[4], float out[4]) {
   float scalar = a[0] * b[0];
@@ -94,10 +92,6 @@ void Attitude::matrix(float r[kAxes * kAxes]) const {
     r[3 * i + j] = same - opposite;
     r[3 * j + i] = same + opposite;
   }
-}
-
-float dot(const float a[kAxes], const float b[kAxes]) {
-  return a[kX] * b[kX] + a[kY] * b[kY] + a[kZ] * b[kZ];
 }
 
 void rotate(const float r[kAxes * kAxes], const float in[kAxes], float out[kAxes]) {

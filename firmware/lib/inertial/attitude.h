@@ -4,9 +4,9 @@
 
 #include <stdint.h>
 
-namespace relpos {
+#include "vector.h"
 
-enum Axis : uint8_t { kX = 0, kY = 1, kZ = 2, kAxes = 3 };
+namespace relpos {
 
 const float kPi = 3.14159265f;
 
@@ -31,7 +31,6 @@ struct Attitude {
   void take(const float product[4]);  // and normalise
 };
 
-float dot(const float a[kAxes], const float b[kAxes]);
 // out = rotation * in.
 void rotate(const float rotation[kAxes * kAxes], const float in[kAxes], float out[kAxes]);
 

@@ -87,9 +87,12 @@ void count(uint16_t* counter) {
   if (*counter < 65535u) ++*counter;
 }
 
-void clear(float vector[kAxes]) { vector[kX] = vector[kY] = vector[kZ] = 0.0f; }
+void clear(float vector[kAxes]) { memset(vector, 0, kAxes * sizeof *vector); }
 
-float norm(const float v[kAxes]) { return sqrtf(dot(v, v)); }
+void left_of(const float axis[2], float out[2]) {
+  out[kX] = -axis[kY];
+  out[kY] = axis[kX];
+}
 
 // Variance of a measurement whose errors have long tails: the further off, the less it says.
 float doubted(float sigma, float innovation) { return sigma * sigma + innovation * innovation; }
@@ -112,7 +115,7 @@ void DeadReckoning::reset() {
   forward_.reset();
   attitude_.set_identity();
   gravity_m_s2_ = kStandardGravity_m_s2;
-  step_cosine_ = 1.0f;
+  step_heading_[kX] = 1.0f;
 }
 
 bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
@@ -139,13 +142,13 @@ bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
 
 void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_s) {
   if (ticks_ == 1) mean_force_m_s2_ = force;
-  mean_force_m_s2_ += (force - mean_force_m_s2_) * (dt_s * (1.0f / kForceMean_s));
+  follow(&mean_force_m_s2_, force, dt_s * (1.0f / kForceMean_s));
   const float most_rad = kQuietRate_rad_s * dt_s;
   if (fabsf(force - mean_force_m_s2_) >= kQuietForce_m_s2 ||
       dot(angle, angle) >= most_rad * most_rad) {
     quiet_s_ = 0.0f;
   } else if (quiet_s_ < 1000.0f) {
-    quiet_s_ += dt_s;
+    add(&quiet_s_, dt_s);
   }
 }
 
@@ -154,20 +157,18 @@ void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_
 void DeadReckoning::gather(const ImuSample& sample, const float force[kAxes], float dt_s) {
   if (quiet_s_ == 0.0f) {
     // Movement after a quiet beginning ends the gathering before it spoils the mean.
-    if (!moved_ && elapsed_s_ >= kShortStill_s) {
+    if (!moved_ && since_.time_s >= kShortStill_s) {
       initialise(true);
       return;
     }
     moved_ = true;
   }
-  elapsed_s_ += dt_s;
+  add(&since_.time_s, dt_s);
   ++step_ticks_;
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    velocity_m_s_[i] += force[i];
-    position_m_[i] += sample.angular_rate_rad_s[i];
-  }
-  impulse_m_s_[kX] += dot(sample.angular_rate_rad_s, sample.angular_rate_rad_s);
-  if (elapsed_s_ >= (moved_ ? kMovingStart_s : kStillStart_s)) initialise(!moved_);
+  add_scaled(velocity_m_s_, force, 1.0f, kAxes);
+  add_scaled(position_m_, sample.angular_rate_rad_s, 1.0f, kAxes);
+  add(since_.impulse_m_s, dot(sample.angular_rate_rad_s, sample.angular_rate_rad_s));
+  if (since_.time_s >= (moved_ ? kMovingStart_s : kStillStart_s)) initialise(!moved_);
 }
 
 void DeadReckoning::initialise(bool still) {
@@ -179,10 +180,10 @@ void DeadReckoning::initialise(bool still) {
     // tells: 0.03 deg/s on a table, 0.8 standing quietly, 2 to 3 while getting ready, when the mean
     // was wrong by 1 to 2 deg/s (walk_chest) and turned the whole walk.
     const float noise =
-        kSway_rad * kSway_rad / (elapsed_s_ * elapsed_s_) +
-        (impulse_m_s_[kX] - dot(position_m_, position_m_) * share) * share * kSwayShare;
+        kSway_rad * kSway_rad / (since_.time_s * since_.time_s) +
+        (since_.impulse_m_s[kX] - dot(position_m_, position_m_) * share) * share * kSwayShare;
     const float weight = variance / (variance + noise);
-    for (uint8_t i = 0; i < kAxes; ++i) bias_rad_s_[i] = position_m_[i] * (share * weight);
+    add_scaled(bias_rad_s_, position_m_, share * weight, kAxes);
     variance = noise * weight;
   }
   Attitude level;
@@ -197,8 +198,7 @@ void DeadReckoning::initialise(bool still) {
   }
   clear(velocity_m_s_);
   clear(position_m_);
-  clear(impulse_m_s_);
-  elapsed_s_ = 0.0f;
+  since_ = Span();
   step_ticks_ = 0;
   velocity_known_ = still;
   filter_.reset(still ? kTiltStill_rad : kTiltMoving_rad, variance,
@@ -215,10 +215,9 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
     publish();
     return;
   }
-  float angle[kAxes];
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    angle[i] = (sample.angular_rate_rad_s[i] - bias_rad_s_[i]) * dt_s;
-  }
+  float angle[kAxes] = {0.0f, 0.0f, 0.0f};
+  add_scaled(angle, sample.angular_rate_rad_s, dt_s, kAxes);
+  add_scaled(angle, bias_rad_s_, -dt_s, kAxes);
   const float strength = norm(sample.acceleration_m_s2);
   watch_quiet(strength, angle, dt_s);
   attitude_.integrate(angle);
@@ -247,37 +246,37 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
     rotate(rotation, heading_axis_, ahead);
   }
   displacement_.heading_rad = atan2f(ahead[kY], ahead[kX]);
-  heading_sum_rad_ += wrap_angle(displacement_.heading_rad - stance_heading_rad_);
+  add(&heading_sum_rad_, wrap_angle(displacement_.heading_rad - stance_heading_rad_));
   if (step_ticks_ < 65535u) ++step_ticks_;
 
   if (quiet_s_ >= kSettled_s) {
     if (quiet_s_ < kSettled_s + dt_s) begin_straight();
-    straight_s_ += dt_s;
+    add(&straight_s_, dt_s);
     if (straight_s_ >= kStill_s) {
       straight_rate_rad_s_ = wrap_angle(displacement_.heading_rad - straight_heading_rad_) / straight_s_;
       still_pending_ = true;
       begin_straight();
     }
   }
-  gravity_m_s2_ += (force[kZ] - gravity_m_s2_) * (dt_s * (1.0f / kGravityTime_s));
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    impulse_m_s_[i] += force[i] * dt_s;
-    const float acceleration = i == kZ ? force[kZ] - gravity_m_s2_ : force[i];
-    position_m_[i] += (velocity_m_s_[i] + 0.5f * acceleration * dt_s) * dt_s;
-    velocity_m_s_[i] += acceleration * dt_s;
-  }
-  elapsed_s_ += dt_s;
-
   const bool at_stance = gait_.update(force[kZ], dt_s, &stance);
   // Into the heading frame. The heading axis is level but for the body's tilt, whose square is all
   // that is lost by not normalising it: both components alike, which the direction does not see.
-  forward_.update(ahead[kX] * force[kX] + ahead[kY] * force[kY],
-                  ahead[kX] * force[kY] - ahead[kY] * force[kX], gait_.vertical_velocity_m_s(),
-                  dt_s);
+  float level[2];
+  resolve(ahead, force, level);
+  forward_.update(level, gait_.vertical_velocity_m_s(), dt_s);
+
+  add(&since_.time_s, dt_s);
+  add_scaled(since_.impulse_m_s, force, dt_s, kAxes);
+  follow(&gravity_m_s2_, force[kZ], dt_s * (1.0f / kGravityTime_s));
+  force[kZ] -= gravity_m_s2_;  // from here on the acceleration
+  add_scaled(position_m_, velocity_m_s_, dt_s, kAxes);
+  add_scaled(position_m_, force, 0.5f * dt_s * dt_s, kAxes);
+  add_scaled(velocity_m_s_, force, dt_s, kAxes);
+
   if (at_stance) {
     // A motion stage left over belongs before the mid-stance.
     const bool busy = motion_pending_;
-    if (busy) filter_.predict_motion(span_impulse_m_s_, span_s_);
+    if (busy) filter_.predict_motion(span_.impulse_m_s, span_.time_s);
     motion_pending_ = false;
     on_stance(stance, rotation);
     if (!busy) work(rotation);
@@ -304,8 +303,7 @@ void DeadReckoning::on_stance(const Stance& stance, const float rotation[kAxes *
   }
   stance_heading_rad_ = heading;
   heading_sum_rad_ = 0.0f;
-  step_cosine_ = cosf(mean);
-  step_sine_ = sinf(mean);
+  direct(mean, step_heading_);
 
   const float share = turning_share(turn);
   step_length_m_ =
@@ -329,7 +327,7 @@ void DeadReckoning::on_stance(const Stance& stance, const float rotation[kAxes *
 
   if (stance.first || fabsf(turn + turn_rad_) > kStraight_rad) straight_steps_ = 0;
   turn_rad_ = turn;
-  straight_s_ += stance.interval_s;
+  add(&straight_s_, stance.interval_s);
   ++straight_steps_;
   if (straight_steps_ == kStraightFrom) {
     begin_straight();
@@ -343,26 +341,23 @@ void DeadReckoning::on_stance(const Stance& stance, const float rotation[kAxes *
 
   if (stance.first && !forward_.found()) forward_.reset();  // what came before was no walking
   step_directed_ = forward_.found();
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    stance_position_m_[i] = position_m_[i];
-    if (displacement_.initialised) position_m_[i] = 0.0f;
-  }
+  memcpy(stance_position_m_, position_m_, sizeof stance_position_m_);
   if (displacement_.initialised) {
+    clear(position_m_);
     capture_span();
     forward_.step();
     watch_mounting(rotation);
   }
-  walk_x_ = step_cosine_ * forward_.cosine() - step_sine_ * forward_.sine();
-  walk_y_ = step_sine_ * forward_.cosine() + step_cosine_ * forward_.sine();
+  compose(step_heading_, forward_.axis(), walk_);
   job_ = kFlush;
 }
 
 // Makes the body vector that points to `heading_rad` now the heading axis.
 void DeadReckoning::aim(const float rotation[kAxes * kAxes], float heading_rad) {
-  const float cosine = cosf(heading_rad), sine = sinf(heading_rad);
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    heading_axis_[i] = cosine * rotation[i] + sine * rotation[kAxes + i];
-  }
+  float heading[2];
+  direct(heading_rad, heading);
+  clear(heading_axis_);
+  for (uint8_t i = 0; i < kZ; ++i) add_scaled(heading_axis_, rotation + 3 * i, heading[i], kAxes);
 }
 
 // A sensor turned on the body turns the heading axis one way and the forward axis the other: both are
@@ -388,16 +383,12 @@ void DeadReckoning::watch_mounting(const float rotation[kAxes * kAxes]) {
 }
 
 void DeadReckoning::capture_span() {
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    span_impulse_m_s_[i] = impulse_m_s_[i];
-    impulse_m_s_[i] = 0.0f;
-  }
-  span_s_ = elapsed_s_;
-  elapsed_s_ = 0.0f;
+  span_ = since_;
+  since_ = Span();
 }
 
 void DeadReckoning::predict_attitude(const float rotation[kAxes * kAxes]) {
-  filter_.predict_attitude(rotation, span_s_);
+  filter_.predict_attitude(rotation, span_.time_s);
   const float variance = filter_.covariance(kAttitude + kZ, kAttitude + kZ);
   if (variance > displacement_.variance_heading_rad2) displacement_.variance_heading_rad2 = variance;
   motion_pending_ = true;
@@ -405,7 +396,7 @@ void DeadReckoning::predict_attitude(const float rotation[kAxes * kAxes]) {
 
 void DeadReckoning::work(const float rotation[kAxes * kAxes]) {
   if (motion_pending_) {
-    filter_.predict_motion(span_impulse_m_s_, span_s_);
+    filter_.predict_motion(span_.impulse_m_s, span_.time_s);
     motion_pending_ = false;
     if (job_ == kIdle && (quiet_s_ >= kQuiet_s || !gait_.walking())) job_ = kStillX;
   } else if (job_ != kIdle) {
@@ -415,73 +406,79 @@ void DeadReckoning::work(const float rotation[kAxes * kAxes]) {
     apply_straight(rotation, kSway_rad / kStill_s);
   } else if (magnetic_pending_) {
     apply_magnetic();
-  } else if (elapsed_s_ >= kPredict_s) {
+  } else if (since_.time_s >= kPredict_s) {
     capture_span();
     predict_attitude(rotation);
   }
 }
 
 void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
+  State group = kPosition;
   float direction[kAxes] = {0.0f, 0.0f, 0.0f};
+  float innovation, variance, yaw = 0.0f;
   const Job job = job_;
   job_ = static_cast<Job>(job + 1);
   // The walking direction turns with the heading's error, so the step's measurements depend on that
   // too: turning heading, velocity and position together changes neither. Without these terms the
   // filter believed to observe the heading and lost it (18 deg/min on simulated walks, NEES 74).
-  const float ahead = walk_x_ * stance_position_m_[kX] + walk_y_ * stance_position_m_[kY];
-  const float aside = walk_x_ * stance_position_m_[kY] - walk_y_ * stance_position_m_[kX];
+  float way[2];  // ahead and to the left
+  resolve(walk_, stance_position_m_, way);
   switch (job) {
     case kFlush:
       predict_attitude(rotation);
       if (!velocity_known_) job_ = kVertical;
       if (!step_directed_) job_ = kVertical;
-      break;
+      return;
     case kForward: {
-      direction[kX] = walk_x_;
-      direction[kY] = walk_y_;
-      const float innovation = step_length_m_ - ahead;
-      float variance = step_sigma_m_ * step_sigma_m_;
+      memcpy(direction, walk_, sizeof walk_);
+      yaw = way[kY];
+      innovation = step_length_m_ - way[kX];
+      variance = step_sigma_m_ * step_sigma_m_;
       const float least = innovation * innovation * (1.0f / (kDoubt * kDoubt)) -
-                          filter_.along(kPosition, walk_x_, walk_y_);
+                          filter_.along(kPosition, walk_);
       if (least > variance) {  // weighed down to what makes it a three-sigma surprise
         variance = least;
         count(&counters_.doubtful_steps);
         hold_[kHoldDoubt] = kHoldTicks;
       }
-      measure(kPosition, direction, innovation, variance, aside);
       break;
     }
     case kLateral:
-      direction[kX] = -walk_y_;
-      direction[kY] = walk_x_;
-      measure(kPosition, direction, -aside, kLateralSigma_m * kLateralSigma_m, -ahead);
+      left_of(walk_, direction);
+      yaw = -way[kX];
+      innovation = -way[kY];
+      variance = kLateralSigma_m * kLateralSigma_m;
       break;
     case kVertical:
       direction[kZ] = 1.0f;
-      measure(kPosition, direction, -stance_position_m_[kZ], kVerticalSigma_m * kVerticalSigma_m);
+      innovation = -stance_position_m_[kZ];
+      variance = kVerticalSigma_m * kVerticalSigma_m;
       if (!step_straight_) job_ = kCommit;
       break;
     case kDrift:
       apply_straight(rotation, kStraightSigma_rad_s);
-      break;
+      return;
     case kCommit:
       commit_step();
       job_ = kIdle;
-      break;
+      return;
     case kStillX:
     case kStillY:
     case kStillZ: {
       const uint8_t axis = job - kStillX;
       const float sigma = quiet_s_ >= kQuiet_s ? kStillSigma_m_s : kLooseSigma_m_s;
+      group = kVelocity;
       direction[axis] = 1.0f;
-      measure(kVelocity, direction, -velocity_m_s_[axis], sigma * sigma);
+      innovation = -velocity_m_s_[axis];
+      variance = sigma * sigma;
       break;
     }
     default:
       commit_still();
       job_ = kIdle;
-      break;
+      return;
   }
+  measure(group, direction, innovation, variance, yaw);
 }
 
 void DeadReckoning::measure(State group, const float direction[kAxes], float innovation,
@@ -491,17 +488,14 @@ void DeadReckoning::measure(State group, const float direction[kAxes], float inn
   attitude_.correct(correction + kAttitude);
   if (group <= kBias) magnetic_azimuth_rad_ += correction[kReference];
   // During a step's updates the covariance stands at its mid-stance, the state at the present.
-  const bool stance = job_ > kFlush && job_ <= kCommit;
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    bias_rad_s_[i] += correction[kBias + i];
-    velocity_m_s_[i] += correction[kVelocity + i];
-    if (stance) {
-      stance_position_m_[i] += correction[kPosition + i];
-      position_m_[i] += correction[kVelocity + i] * elapsed_s_;
-    } else {
-      position_m_[i] += correction[kPosition + i];
-    }
+  float* position = position_m_;
+  if (job_ > kFlush && job_ <= kCommit) {
+    position = stance_position_m_;
+    add_scaled(position_m_, correction + kVelocity, since_.time_s, kAxes);
   }
+  add_scaled(position, correction + kPosition, 1.0f, kAxes);
+  add_scaled(velocity_m_s_, correction + kVelocity, 1.0f, kAxes);
+  add_scaled(bias_rad_s_, correction + kBias, 1.0f, kAxes);
 }
 
 void DeadReckoning::begin_straight() {
@@ -521,58 +515,48 @@ void DeadReckoning::apply_straight(const float rotation[kAxes * kAxes], float si
   measure(kBias, direction, -rate, doubted(sigma_rad_s, rate));
 }
 
-void DeadReckoning::to_wearer(const float n[kAxes], float* x_m, float* y_m) const {
-  *x_m = forward_.cosine() * n[kX] + forward_.sine() * n[kY];
-  *y_m = forward_.cosine() * n[kY] - forward_.sine() * n[kX];
-}
-
 void DeadReckoning::widen(float along_m2, float across_m2) {
-  displacement_.variance_along_m2 += along_m2;
-  displacement_.variance_across_m2 += across_m2;
+  add(&displacement_.variance_along_m2, along_m2);
+  add(&displacement_.variance_across_m2, across_m2);
 }
 
 void DeadReckoning::commit_step() {
-  float x = step_length_m_ * step_cosine_, y = step_length_m_ * step_sine_;
   float length = step_length_m_;
+  float way[2] = {0.0f, 0.0f};
+  add_scaled(way, step_heading_, length, 2);
   float along = step_sigma_m_ * step_sigma_m_, across = kLateralSigma_m * kLateralSigma_m;
-  float inertial_x = x, inertial_y = y;
   if (step_directed_ && velocity_known_) {
-    to_wearer(stance_position_m_, &inertial_x, &inertial_y);
-    const float ahead = inertial_x * step_cosine_ + inertial_y * step_sine_;
+    float inertial[2], step[2];
+    resolve(forward_.axis(), stance_position_m_, inertial);
+    resolve(step_heading_, inertial, step);
     // A step half as long again as the pendulum's, or half of one backwards, even after the update:
     // the velocity starts anew from the pendulum, or a wrong tilt (switched on while walking, a
     // fall) would carry it away for ever: 423 m in 70 steps of one recording. Shorter steps stand:
     // shuffling lifts the torso more than it carries it.
-    velocity_known_ = fabsf(ahead - 0.5f * step_length_m_) <
-                      (0.5f + kLost) * step_length_m_ + step_sigma_m_;
+    velocity_known_ =
+        fabsf(step[kX] - 0.5f * length) < (0.5f + kLost) * length + step_sigma_m_;
     if (!velocity_known_) {
       count(&counters_.lost_steps);
-      for (uint8_t i = kAttitude; i < kAttitude + kZ; ++i) {
-        filter_.set_covariance(i, i, filter_.covariance(i, i) + kTiltLost_rad * kTiltLost_rad);
-      }
+      filter_.widen(kAttitude, kTiltLost_rad * kTiltLost_rad, kZ);
     } else {
-      length = fabsf(ahead);  // a step back is a way walked, too
+      length = fabsf(step[kX]);  // a step back is a way walked, too
+      memcpy(way, inertial, sizeof way);
+      along = filter_.along(kPosition, walk_);
+      left_of(walk_, step);
+      across = filter_.along(kPosition, step);
     }
-  }
-  if (step_directed_ && velocity_known_) {
-    x = inertial_x;
-    y = inertial_y;
-    along = filter_.along(kPosition, walk_x_, walk_y_);
-    across = filter_.along(kPosition, -walk_y_, walk_x_);
   }
   widen(along, across);
   displacement_.scale_error_m += length * (step_irregular_ ? kIrregularScale : config_.scale_sigma);
   displacement_.last_step_length_m = length;
   ++displacement_.steps;
-  totals_.add(x, y);
-  totals_.add_path(length);
+  totals_.add(way, length);
   clear(stance_position_m_);
   filter_.restart(kPosition, 0.0f);
   if (displacement_.initialised && forward_.found() && !velocity_known_) {
     // Switched on while walking: the speed is first known when the forward axis is.
-    velocity_m_s_[kX] = step_speed_m_s_ * walk_x_;
-    velocity_m_s_[kY] = step_speed_m_s_ * walk_y_;
-    velocity_m_s_[kZ] = 0.0f;
+    clear(velocity_m_s_);
+    add_scaled(velocity_m_s_, walk_, step_speed_m_s_, 2);
     filter_.restart(kVelocity, kSpeedFound_m_s);
     velocity_known_ = true;
   }
@@ -583,18 +567,18 @@ void DeadReckoning::commit_still() {
   if (still) velocity_known_ = true;
   if (still && forward_.found()) {
     // The half step into standing, as the inertial motion has it.
-    float x, y;
-    to_wearer(position_m_, &x, &y);
-    totals_.add(x, y);
-    const float ahead = x * step_cosine_ + y * step_sine_;
-    if (gait_.walking() && ahead > 0.0f) {
-      closing_m_ += ahead;
-      totals_.add_path(ahead);
-    }
-    const float variance = filter_.along(kPosition, 0.70710678f, 0.70710678f);
+    float way[2], step[2];
+    resolve(forward_.axis(), position_m_, way);
+    resolve(step_heading_, way, step);
+    float ahead = 0.0f;
+    if (gait_.walking() && step[kX] > 0.0f) ahead = step[kX];
+    add(&closing_m_, ahead);
+    totals_.add(way, ahead);
+    const float diagonal[2] = {0.70710678f, 0.70710678f};
+    const float variance = filter_.along(kPosition, diagonal);
     widen(variance, variance);
   } else if (!still) {
-    widen(kLooseNoise_m2_s * span_s_, kLooseNoise_m2_s * span_s_);
+    widen(kLooseNoise_m2_s * span_.time_s, kLooseNoise_m2_s * span_.time_s);
   }
   clear(position_m_);
   filter_.restart(kPosition, 0.0f);
@@ -621,8 +605,8 @@ void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
                   fabsf(field[kZ] - magnetic_vertical_ut_) < kFieldVertical * magnetic_norm_ut_;
       magnetic_pending_ = plausible && magnetic_steps_ >= kFieldSteps;
     }
-    magnetic_norm_ut_ += (strength - magnetic_norm_ut_) * share;
-    magnetic_vertical_ut_ += (field[kZ] - magnetic_vertical_ut_) * share;
+    follow(&magnetic_norm_ut_, strength, share);
+    follow(&magnetic_vertical_ut_, field[kZ], share);
   }
   displacement_.magnetic_heading_valid = plausible;
   displacement_.magnetic_heading_rad = wrap_angle(displacement_.heading_rad - azimuth);
@@ -643,15 +627,16 @@ void DeadReckoning::apply_magnetic() {
 
 void DeadReckoning::publish() {
   Displacement& d = displacement_;
-  float x = 0.0f, y = 0.0f;
+  float way[2] = {0.0f, 0.0f};
   if (d.initialised && velocity_known_ && forward_.found()) {
-    float since[kAxes];
-    for (uint8_t i = 0; i < kAxes; ++i) since[i] = position_m_[i] + stance_position_m_[i];
-    to_wearer(since, &x, &y);
+    float since[2];
+    memcpy(since, position_m_, sizeof since);
+    add_scaled(since, stance_position_m_, 1.0f, 2);
+    resolve(forward_.axis(), since, way);
   }
-  d.x_m = totals_.x_m() + x;
-  d.y_m = totals_.y_m() + y;
-  d.path_m = totals_.path_m();
+  d.x_m = totals_.metres(Totals::kAlongX) + way[kX];
+  d.y_m = totals_.metres(Totals::kAlongY) + way[kY];
+  d.path_m = totals_.metres(Totals::kPath);
   d.moving = gait_.walking();
   const uint16_t rejected = gait_.take_rejected();
   if (rejected > 0) count(&counters_.rejected_steps);

@@ -79,6 +79,10 @@ class DeadReckoning {
 
   enum Hold : uint8_t { kHoldAcceleration, kHoldRate, kHoldInput, kHoldDoubt, kHolds };
 
+  struct Span {
+    float impulse_m_s[kAxes], time_s;
+  };
+
   bool refuse(const ImuSample& sample, float dt_s);
   void watch_quiet(float force_m_s2, const float angle_rad[kAxes], float dt_s);
   void gather(const ImuSample& sample, const float force_m_s2[kAxes], float dt_s);
@@ -98,7 +102,6 @@ class DeadReckoning {
   void apply_magnetic();
   void begin_straight();
   void apply_straight(const float rotation[kAxes * kAxes], float sigma_rad_s);
-  void to_wearer(const float navigation[kAxes], float* x_m, float* y_m) const;
   void publish();
 
   InertialConfig config_;
@@ -118,17 +121,17 @@ class DeadReckoning {
   float gravity_m_s2_;
   float heading_axis_[kAxes];  // body vector that was along x at the start
 
-  float impulse_m_s_[kAxes], elapsed_s_;    // since the covariance's time
-  float span_impulse_m_s_[kAxes], span_s_;  // being predicted
+  Span since_;  // since the covariance's time
+  Span span_;   // being predicted
 
   // The step under way and the one whose updates are under way.
   float heading_sum_rad_;
   float stance_heading_rad_;  // at the last mid-stance
   float closing_m_;           // way ahead since the last mid-stance, for the footfall that ends a walk
   float step_length_m_, step_sigma_m_, step_speed_m_s_;
-  float step_cosine_, step_sine_;  // mean heading over the step
+  float step_heading_[2];          // mean over the step: cosine and sine
   float mounting_rad_;             // where the forward axis has settled, from the heading axis
-  float walk_x_, walk_y_;  // walking direction in the navigation frame: heading and forward axis
+  float walk_[2];   // walking direction in the navigation frame: heading and forward axis
   float turn_rad_;  // over the last step
   float straight_heading_rad_, straight_s_;  // of the stretch that may be straight
   float straight_rate_rad_s_;

@@ -43,16 +43,13 @@ struct Displacement {
 // Totals in units of 2^-16 m: 15 um wherever the walk has led, 32 km before the sign turns over.
 class Totals {
  public:
+  enum Which : uint8_t { kAlongX, kAlongY, kPath, kTotals };
   void reset();
-  void add(float x_m, float y_m);
-  void add_path(float length_m);
-  float x_m() const;
-  float y_m() const;
-  float path_m() const;
+  void add(const float way_m[2], float length_m);
+  float metres(Which which) const;
 
  private:
-  int32_t x_, y_;
-  uint32_t path_;
+  uint32_t units_[kTotals];  // the first two signed; unsigned, as overflow is to wrap
 };
 
 }  // namespace relpos

@@ -1,5 +1,9 @@
 #include "filter.h"
 
+#include <string.h>
+
+#include "vector.h"
+
 namespace relpos {
 namespace {
 
@@ -14,35 +18,47 @@ const float kFloor[kStates / kAxes] = {1e-9f, 1e-12f, 1e-7f, 0.0f};
 
 }  // namespace
 
-void ErrorFilter::reset(float tilt_rad, float bias_rad2_s2, float velocity_m_s) {
-  for (uint8_t i = 0; i < kPacked; ++i) p_[i] = 0.0f;
-  repairs_ = 0;
-  for (uint8_t i = 0; i < kReferenced; ++i) reference_[i] = 0.0f;
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    p_[index(kAttitude + i, kAttitude + i)] = tilt_rad * tilt_rad;
-    p_[index(kBias + i, kBias + i)] = bias_rad2_s2;
-    p_[index(kVelocity + i, kVelocity + i)] = velocity_m_s * velocity_m_s;
+// Packed by rows of the upper triangle.
+RELPOS_SHARED float* ErrorFilter::at(uint8_t i, uint8_t j) {
+  if (i > j) {
+    const uint8_t swap = i;
+    i = j;
+    j = swap;
   }
-  p_[index(kAttitude + kZ, kAttitude + kZ)] = 0.0f;
+  return p_ + static_cast<uint8_t>(static_cast<uint8_t>(i * (2 * kStates - 1 - i)) / 2 + j);
+}
+
+RELPOS_SHARED void ErrorFilter::gather(uint8_t group, uint8_t other, float out[kAxes]) const {
+  for (uint8_t i = 0; i < kAxes; ++i) out[i] = *at(group + i, other);
+}
+
+RELPOS_SHARED void ErrorFilter::widen(uint8_t state, float variance, uint8_t count) {
+  for (; count != 0; --count, ++state) *at(state, state) += variance;
+}
+
+void ErrorFilter::reset(float tilt_rad, float bias_rad2_s2, float velocity_m_s) {
+  memset(static_cast<void*>(this), 0, sizeof *this);
+  widen(kAttitude, tilt_rad * tilt_rad, kZ);
+  widen(kBias, bias_rad2_s2, kAxes);
+  widen(kVelocity, velocity_m_s * velocity_m_s, kAxes);
 }
 
 void ErrorFilter::couple(State to, State from, const float m[kAxes * kAxes]) {
-  // First the covariances with every state outside `to`, then the block of `to` itself:
-  // P_tt' = P_tt + M P_ft + P_tf' M', where P_tf' is already the new one.
-  float old[kAxes * kAxes];  // P_tf before the change
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    for (uint8_t j = 0; j < kAxes; ++j) old[3 * j + i] = p_[index(from + i, to + j)];
-  }
-  float row[kAxes];
-  for (uint8_t other = 0; other < kStates; ++other) {
-    if (other >= to && other < to + kAxes) continue;
-    for (uint8_t i = 0; i < kAxes; ++i) row[i] = p_[index(from + i, other)];
-    for (uint8_t i = 0; i < kAxes; ++i) p_[index(to + i, other)] += dot(m + 3 * i, row);
-  }
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    for (uint8_t k = 0; k < kAxes; ++k) row[k] = p_[index(to + i, from + k)];
-    for (uint8_t j = i; j < kAxes; ++j) {
-      p_[index(to + i, to + j)] += dot(m + 3 * i, old + 3 * j) + dot(row, m + 3 * j);
+  // Every element gets its share of M P_f: the covariances with the states outside `to` once, the
+  // block of `to` itself twice: P_tt' = P_tt + M P_ft + P_tf' M', P_tf' the new one. So its upper
+  // half comes before the others and its lower half, which is the same memory, after them.
+  enum Pass : uint8_t { kUpper, kOutside, kLower, kPasses };
+  for (uint8_t pass = kUpper; pass < kPasses; ++pass) {
+    for (uint8_t other = 0; other < kStates; ++other) {
+      const uint8_t column = other - to;
+      if ((column >= kAxes) != (pass == kOutside)) continue;
+      float row[kAxes];
+      gather(from, other, row);
+      for (uint8_t i = 0; i < kAxes; ++i) {
+        if (pass == kUpper && i > column) continue;
+        if (pass == kLower && i < column) continue;
+        *at(to + i, other) += sparse_dot(m + 3 * i, row);
+      }
     }
   }
 }
@@ -52,61 +68,45 @@ void ErrorFilter::predict_attitude(const float rotation[kAxes * kAxes], float dt
   for (uint8_t i = 0; i < kAxes * kAxes; ++i) m[i] = -dt_s * rotation[i];
   couple(kAttitude, kBias, m);
   reference_[0] += dot(m + 3 * kZ, reference_ + 1);
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    p_[index(kAttitude + i, kAttitude + i)] += kAttitudeNoise_rad2_s * dt_s;
-    p_[index(kBias + i, kBias + i)] += kBiasNoise_rad2_s3 * dt_s;
-  }
-}
-
-void ErrorFilter::move_position(float dt_s) {
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    for (uint8_t j = i; j < kAxes; ++j) {
-      p_[index(kPosition + i, kPosition + j)] +=
-          dt_s * (p_[index(kVelocity + i, kPosition + j)] + p_[index(kVelocity + j, kPosition + i)] +
-                  dt_s * p_[index(kVelocity + i, kVelocity + j)]);
-    }
-  }
-  for (uint8_t j = 0; j < kAxes; ++j) {
-    for (uint8_t other = 0; other < kPosition; ++other) {
-      p_[index(other, kPosition + j)] += dt_s * p_[index(other, kVelocity + j)];
-    }
-  }
+  widen(kAttitude, kAttitudeNoise_rad2_s * dt_s, kAxes);
+  widen(kBias, kBiasNoise_rad2_s3 * dt_s, kAxes);
 }
 
 void ErrorFilter::predict_motion(const float f[kAxes], float dt_s) {
   // Half the position step before the velocity changes and half after it: second-order accurate
   // over a span of five ticks, where a single step would be a tenth of a second off.
-  move_position(0.5f * dt_s);
-  const float m[kAxes * kAxes] = {0.0f, f[kZ], -f[kY], -f[kZ], 0.0f, f[kX], f[kY], -f[kX], 0.0f};
-  couple(kVelocity, kAttitude, m);
+  float move[kAxes * kAxes] = {}, turn[kAxes * kAxes] = {};
   for (uint8_t i = 0; i < kAxes; ++i) {
-    p_[index(kVelocity + i, kVelocity + i)] += kVelocityNoise_m2_s3 * dt_s;
+    const uint8_t j = next(i), k = next(j);
+    move[4 * i] = 0.5f * dt_s;
+    turn[3 * i + j] = f[k];  // -[F x]
+    turn[3 * j + i] = -f[k];
   }
-  move_position(0.5f * dt_s);
+  couple(kPosition, kVelocity, move);
+  couple(kVelocity, kAttitude, turn);
+  widen(kVelocity, kVelocityNoise_m2_s3 * dt_s, kAxes);
+  couple(kPosition, kVelocity, move);
 }
 
 float ErrorFilter::update(State group, const float direction[kAxes], float yaw, float innovation,
                           float variance, float correction[kStates + 1]) {
   float ph[kStates];
   for (uint8_t i = 0; i < kStates; ++i) {
-    float sum = yaw * p_[index(i, kAttitude + kZ)];
-    for (uint8_t j = 0; j < kAxes; ++j) {
-      if (direction[j] != 0.0f) sum += direction[j] * p_[index(i, group + j)];
-    }
-    ph[i] = sum;
+    float row[kAxes];
+    gather(group, i, row);
+    ph[i] = yaw * *at(i, kAttitude + kZ) + sparse_dot(direction, row);
   }
   // The reference's share in the measurement: with the heading it is compared, with the bias it is
   // correlated alone.
   float shared = 0.0f;
   if (group == kAttitude) {
-    for (uint8_t i = 0; i < kReferenced; ++i) ph[kAttitude + kZ + i] -= reference_[i];
+    add_scaled(ph + kAttitude + kZ, reference_, -1.0f, kReferenced);
     shared = reference_[0] - reference_variance_;
     variance -= shared;
   } else if (group == kBias) {
     shared = dot(direction, reference_ + 1);
   }
-  float total = variance + yaw * ph[kAttitude + kZ];
-  for (uint8_t j = 0; j < kAxes; ++j) total += direction[j] * ph[group + j];
+  const float total = variance + yaw * ph[kAttitude + kZ] + sparse_dot(direction, ph + group);
   const float inverse = 1.0f / total;
   // A torso's velocity and position say nothing of use about its heading or the gyroscope's bias:
   // a bias of 0.1 deg/s shows as 2 mm/s2 of sideways force, as much as 0.01 deg of tilt. What these
@@ -131,9 +131,7 @@ float ErrorFilter::update(State group, const float direction[kAxes], float yaw, 
     correction[i] = fixed ? 0.0f : gain * innovation;
   }
   if (!considers) {
-    for (uint8_t i = 0; i < kReferenced; ++i) {
-      reference_[i] -= ph[kAttitude + kZ + i] * inverse * shared;
-    }
+    add_scaled(reference_, ph + kAttitude + kZ, -inverse * shared, kReferenced);
     reference_variance_ -= shared * shared * inverse;
     correction[kStates] = shared * inverse * innovation;
   }
@@ -141,15 +139,21 @@ float ErrorFilter::update(State group, const float direction[kAxes], float yaw, 
 }
 
 void ErrorFilter::restart(State group, float sigma) {
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    for (uint8_t other = 0; other < kStates; ++other) p_[index(group + i, other)] = 0.0f;
+  for (uint8_t i = group; i < group + kAxes; ++i) {
+    for (uint8_t other = 0; other < kStates; ++other) *at(i, other) = 0.0f;
   }
-  for (uint8_t i = 0; i < kAxes; ++i) p_[index(group + i, group + i)] = sigma * sigma;
+  widen(group, sigma * sigma, kAxes);
 }
 
-float ErrorFilter::along(State group, float x, float y) const {
-  return x * x * p_[index(group, group)] + 2.0f * x * y * p_[index(group, group + 1)] +
-         y * y * p_[index(group + 1, group + 1)];
+RELPOS_SHARED float ErrorFilter::along(State group, const float direction[2]) const {
+  const float level[kAxes] = {direction[kX], direction[kY], 0.0f};
+  float sum = 0.0f;
+  for (uint8_t i = 0; i < kZ; ++i) {
+    float row[kAxes];
+    gather(group, group + i, row);
+    sum += direction[i] * dot(level, row);
+  }
+  return sum;
 }
 
 }  // namespace relpos

@@ -42,21 +42,17 @@ class ErrorFilter {
   // A group becomes known exactly (position at a step's end) or anew with the given sigma.
   void restart(State group, float sigma);
 
-  float covariance(uint8_t i, uint8_t j) const { return p_[index(i, j)]; }
-  void set_covariance(uint8_t i, uint8_t j, float value) { p_[index(i, j)] = value; }
-  float along(State group, float x, float y) const;  // variance along a horizontal unit vector
+  float covariance(uint8_t i, uint8_t j) const { return *at(i, j); }
+  void set_covariance(uint8_t i, uint8_t j, float value) { *at(i, j) = value; }
+  void widen(uint8_t state, float variance, uint8_t count);  // adds to as many, from that one on
+  float along(State group, const float direction[2]) const;  // variance along a horizontal unit vector
   uint16_t repairs() const { return repairs_; }      // variances that had to be lifted
 
  private:
-  static uint8_t index(uint8_t i, uint8_t j) {
-    if (i > j) {
-      const uint8_t swap = i;
-      i = j;
-      j = swap;
-    }
-    return static_cast<uint8_t>(static_cast<uint8_t>(i * (2 * kStates - 1 - i)) / 2 + j);
-  }
-  void move_position(float dt_s);
+  float* at(uint8_t i, uint8_t j);
+  const float* at(uint8_t i, uint8_t j) const { return const_cast<ErrorFilter*>(this)->at(i, j); }
+  // The covariances of the three states of a group with another state.
+  void gather(uint8_t group, uint8_t other, float out[kAxes]) const;
   // x_to += M x_from for two groups, M 3x3; the workhorse of the structured prediction.
   void couple(State to, State from, const float matrix[kAxes * kAxes]);
 

@@ -65,13 +65,13 @@ bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance* stance) {
     mean_m_s2_ = vertical_m_s2;
     running_ = true;
   }
-  mean_m_s2_ += (vertical_m_s2 - mean_m_s2_) * (dt_s * (1.0f / kMeanTime_s));
+  follow(&mean_m_s2_, vertical_m_s2, dt_s * (1.0f / kMeanTime_s));
   const float acceleration = vertical_m_s2 - mean_m_s2_;
   const float before = velocity_m_s_;
   const float leak = 1.0f - dt_s * (1.0f / kLeakTime_s);
   velocity_m_s_ = velocity_m_s_ * leak + acceleration * dt_s;
   height_m_ = height_m_ * leak + velocity_m_s_ * dt_s;
-  if (since_s_ < 1000.0f) since_s_ += dt_s;
+  if (since_s_ < 1000.0f) add(&since_s_, dt_s);
   if (height_m_ < trough_m_) trough_m_ = height_m_;
   if (acceleration < lowest_m_s2_) lowest_m_s2_ = acceleration;
   if (acceleration > highest_m_s2_) highest_m_s2_ = acceleration;
@@ -106,7 +106,7 @@ bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance* stance) {
     steps_ = 0;
     stance->interval_s = period_s_ = kFirstPeriod_s;
   } else {
-    if (since_s_ < kLongestPeriod_s) period_s_ += kPeriodGain * (since_s_ - period_s_);
+    if (since_s_ < kLongestPeriod_s) follow(&period_s_, since_s_, kPeriodGain);
     excursion = 0.5f * (height_m_ + peak_m_) - trough_m_;
     if (excursion < 0.5f * swing) excursion = 0.5f * swing;
   }
@@ -135,34 +135,42 @@ float turning_share(float yaw_rad) {
 
 void ForwardFinder::reset() {
   memset(static_cast<void*>(this), 0, sizeof *this);
-  cosine_ = 1.0f;
+  axis_[kX] = 1.0f;
 }
 
-void ForwardFinder::update(float ax, float ay, float vertical_velocity_m_s, float dt_s) {
+void ForwardFinder::forget() {
+  memset(product_, 0, sizeof product_);
+  power_a_ = power_v_ = 0.0f;
+}
+
+void ForwardFinder::update(const float a[2], float vertical_velocity_m_s, float dt_s) {
   const float gain = dt_s * (1.0f / kForwardMemory_s);
-  product_x_ -= gain * (product_x_ + ax * vertical_velocity_m_s);
-  product_y_ -= gain * (product_y_ + ay * vertical_velocity_m_s);
-  power_a_ += gain * (ax * ax + ay * ay - power_a_);
-  power_v_ += gain * (vertical_velocity_m_s * vertical_velocity_m_s - power_v_);
+  float power = 0.0f;
+  for (uint8_t i = 0; i < 2; ++i) {
+    follow(&product_[i], -a[i] * vertical_velocity_m_s, gain);
+    power += a[i] * a[i];
+  }
+  follow(&power_a_, power, gain);
+  follow(&power_v_, vertical_velocity_m_s * vertical_velocity_m_s, gain);
 }
 
 void ForwardFinder::turn(float angle_rad) {
-  const float c = cosf(angle_rad), s = sinf(angle_rad), x = product_x_;
-  product_x_ = c * x - s * product_y_;
-  product_y_ = s * x + c * product_y_;
+  float axis[2], turned[2];
+  direct(angle_rad, axis);
+  compose(axis, product_, turned);
+  memcpy(product_, turned, sizeof product_);
   point();
 }
 
 void ForwardFinder::point() {
-  offset_rad_ = atan2f(product_y_, product_x_);
-  cosine_ = cosf(offset_rad_);
-  sine_ = sinf(offset_rad_);
+  offset_rad_ = atan2f(product_[kY], product_[kX]);
+  direct(offset_rad_, axis_);
 }
 
 void ForwardFinder::step() {
   if (steps_ < 255) ++steps_;
   if (steps_ < kForwardSteps) return;
-  const float product = product_x_ * product_x_ + product_y_ * product_y_;
+  const float product = product_[kX] * product_[kX] + product_[kY] * product_[kY];
   if (product < kForwardCoherence * power_a_ * power_v_) return;
   point();
   found_ = true;

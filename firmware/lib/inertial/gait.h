@@ -57,21 +57,20 @@ class ForwardFinder {
  public:
   void reset();
   // Horizontal acceleration in the heading frame (x along the heading axis, y left of it).
-  void update(float ax_m_s2, float ay_m_s2, float vertical_velocity_m_s, float dt_s);
+  void update(const float acceleration_m_s2[2], float vertical_velocity_m_s, float dt_s);
   void step();  // at every mid-stance: decides, and recomputes the angle
-  void forget() { product_x_ = product_y_ = power_a_ = power_v_ = 0.0f; }  // what is found stays
+  void forget();  // the sums; what is found stays
   void turn(float angle_rad);  // the heading axis was turned the other way
   bool found() const { return found_; }
   float offset_rad() const { return offset_rad_; }      // from heading axis to forward, ccw
-  float cosine() const { return cosine_; }
-  float sine() const { return sine_; }
+  const float* axis() const { return axis_; }           // its cosine and sine
 
  private:
   void point();
 
-  float product_x_, product_y_;  // leaky sums of acceleration times downward velocity
+  float product_[2];             // leaky sums of acceleration times downward velocity
   float power_a_, power_v_;      // leaky sums of their squares, for the coherence
-  float offset_rad_, cosine_, sine_;
+  float offset_rad_, axis_[2];
   uint8_t steps_;
   bool found_;
 };
