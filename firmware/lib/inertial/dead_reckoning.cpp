@@ -42,7 +42,7 @@ const float kWalkRatio_m_s = 0.5f;
 const float kIrregular = 0.7f;        // share left by turning under which a step is flagged
 // Relative scale error of flagged steps: shuffling, turning on the spot, steps aside and lifting look
 // alike on the torso and are a quarter to a whole too long (bench/inertial/simulated.py).
-const float kIrregularScale = 0.4f;
+const float kIrregularScale = 0.35f;
 const float kLateralSigma_m = 0.06f;  // the torso sways 2 to 4 cm and feet are placed as wide
 const float kVerticalSigma_m = 0.02f; // level floor: mid-stance heights repeat within 1 to 2 cm
 const float kLost = 0.5f;             // of the pendulum's length: the inertial motion ran away
