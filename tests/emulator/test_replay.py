@@ -206,3 +206,9 @@ def test_what_cannot_be_played_is_refused(walker):
     still = recorded(walker, np.linspace(0.0, 4.0, 400))
     with pytest.raises(DataError, match="no step"):
         calibrate(1, still, 20.0, None)
+    with pytest.raises(DataError, match="must be positive"):
+        calibrate(1, still, 0.0, None)
+    with pytest.raises(DataError, match=r"memory: node 1: .*LEG_LENGTH"):
+        replay_imu(run_of({1: still}, stature_m=0.1))
+    with pytest.raises(DataError, match="no step gain makes 2000 m"):
+        calibrate(1, recorded(walker, even(100.0, 30.0)), 2000.0, None)

@@ -265,7 +265,7 @@ def test_deadreckon_sums_what_the_firmware_reported(
     def replayed(*_: object, **__: object) -> dict[int, Played]:
         motions = (Motion(1.0, 4, 0.5, 0.0, 0.5 * math.pi), Motion(2.0, 4, 0.5, 0.25, 0.5))
         steps = (Step(0.5, 4, 0.75), Step(1.5, 4, 0.5))
-        return {4: Played(Replay(motions, steps, {}, clipped=7), Wearer(0.9, 1300), 100, 2)}
+        return {4: Played(Replay(motions, steps, {}, clipped=7), Wearer(0.9, 1300), 100, 2, 5.0)}
 
     monkeypatch.setattr("relpos.emulator.replay.replay_imu", replayed)
     (tmp_path / "imu.csv").write_text(f"time_s,node,{IMU_COLUMNS}\n0,4,0,0,9.8,0,0,0,,,\n")
@@ -289,6 +289,7 @@ def test_deadreckon_sums_what_the_firmware_reported(
     }
     assert "2 of 100 samples repeat a time" in result.stderr
     assert "7 of 100 samples are beyond the range" in result.stderr
+    assert "5 samples a second are too few" in result.stderr
     assert json.loads((tmp_path / "o" / "summary.json").read_text()) == json.loads(result.stdout)
     written = load_run(tmp_path / "o")
     assert len(written.motions) == 2

@@ -38,7 +38,7 @@ def deadreckon(
     """Play imu.csv into the emulated sensor chip, run the firmware, print the walked path."""
     from dataclasses import replace
 
-    from relpos.emulator.replay import replay_imu
+    from relpos.emulator.replay import LEAST_RATE_HZ, replay_imu
     from relpos.runs import Run, load_run, save_run
 
     recording = load_run(run)
@@ -80,6 +80,11 @@ def deadreckon(
             output.remark(
                 f"node {node}: {part.repeated} of {part.samples} samples repeat a time: "
                 "the first of each time is played"
+            )
+        if part.rate_hz < LEAST_RATE_HZ:
+            output.remark(
+                f"node {node}: {part.rate_hz:.3g} samples a second are too few to see steps: "
+                f"{LEAST_RATE_HZ:g} are needed"
             )
         if part.replay.clipped:
             output.remark(

@@ -44,10 +44,14 @@ MOST_ROWS = 86_400 * 200
 GAP_PERIODS = 3.5
 LEAST_GAP_S = 0.1
 """Samples further apart than both (in median periods, in seconds) are a gap, not a slow sensor."""
+LEAST_RATE_HZ = 20.0
+"""Of a recording that still shows steps: the strides' harmonics reach 8 Hz."""
 LEG_OF_STATURE = 0.53
 STANDARD_PRESSURE_PA = 101_325.0
 FIRST_GAIN_PERMILLE = 1250
 CALIBRATION_PASSES = 4
+GAINS_PERMILLE = (300, 3000)
+"""What the node takes (``firmware/lib/node/node.cpp``)."""
 CALIBRATED_WITHIN = 0.001
 """The gain is found when the calibration walk comes out this close to its true length."""
 
@@ -87,6 +91,7 @@ class Played:
     samples: int
     repeated: int
     """Samples at the time of the one before, which were left out."""
+    rate_hz: float
 
 
 def surroundings_of(recording: ImuRecording) -> Surroundings:
@@ -97,7 +102,7 @@ def surroundings_of(recording: ImuRecording) -> Surroundings:
     """
     time_s, rows = _increasing(recording)
     if len(time_s) < 2:
-        raise DataError("an inertial recording of fewer than two samples cannot be played")
+        raise DataError("an inertial recording with fewer than two times cannot be played")
     period_s = float(np.median(np.diff(time_s)))
     grid_hz = GRID_HZ if period_s > 0.9 / GRID_HZ else FAST_GRID_HZ
     if (time_s[-1] - time_s[0]) * grid_hz > MOST_ROWS:
@@ -244,7 +249,10 @@ def play(
         if answer is None:
             raise DeviceError(f"node {node}: the firmware did not answer {code.name}")
         if answer.result != wire.CommandResult.DONE:
-            raise DataError(f"node {node}: the firmware refuses {code.name} {value}")
+            raise DataError(
+                f"node {node}: the firmware refuses {code.name} {value}: "
+                "look at stature_m and leg_length_m of the run"
+            )
     beyond = (np.abs(recording.acceleration_m_s2) > most_force).any(axis=1) | (
         np.abs(recording.angular_rate_rad_s) > most_rate
     ).any(axis=1)
@@ -275,10 +283,12 @@ def calibrate(
     """Step gain in permille with which the walk comes out at ``true_distance_m``.
 
     The step length is not quite linear in the gain (the filter weighs it), hence more than one
-    pass. DataError where no step is found or the distance is not positive.
+    pass. DataError where no step is found, the distance is not positive, or no gain leads there.
     """
     if not true_distance_m > 0.0:
-        raise DataError(f"a calibration walk of {true_distance_m:g} m")
+        raise DataError(
+            f"the calibration walk's true_distance_m is {true_distance_m:g}: it must be positive"
+        )
     gain = FIRST_GAIN_PERMILLE
     for _ in range(CALIBRATION_PASSES):
         walked_m = play(node, recording, Wearer(leg_length_m, gain), board).distance_m
@@ -287,6 +297,11 @@ def calibrate(
         if abs(walked_m / true_distance_m - 1.0) < CALIBRATED_WITHIN:
             break
         gain = round(gain * true_distance_m / walked_m)
+        if not GAINS_PERMILLE[0] <= gain <= GAINS_PERMILLE[1]:
+            raise DataError(
+                f"node {node}: the calibration walk comes out as {walked_m:.2f} m and no step gain "
+                f"makes {true_distance_m:g} m of it: is true_distance_m right?"
+            )
     return gain
 
 
@@ -321,10 +336,18 @@ def replay_imu(
             # The calibration walk's own leg length would put another gain beside this one.
             gain = calibrate(node, walk, distance_m, leg_m, board)
         wearer = Wearer(leg_m, gain)
-        replay = play(node, recording, wearer, board)
-        samples = len(recording.time_s)
-        repeated = samples - len(_increasing(recording)[0])
-        played[node] = Played(replay, wearer, samples, repeated)
+        try:
+            replay = play(node, recording, wearer, board)
+        except DataError as error:
+            raise DataError(f"{run.name}: {error}") from error
+        time_s, _ = _increasing(recording)
+        played[node] = Played(
+            replay,
+            wearer,
+            samples=len(recording.time_s),
+            repeated=len(recording.time_s) - len(time_s),
+            rate_hz=float(1.0 / np.median(np.diff(time_s))),
+        )
     return played
 
 

@@ -323,13 +323,13 @@ class _Planner:
         rng, w = self.rng, self.wearer
         stride = float(rng.uniform(0.08, 0.42))
         cadence = float(rng.uniform(0.9, 2.2))
-        lift = float(rng.uniform(0.003, 0.032))
+        lift = float(rng.uniform(0.004, 0.036))
         trunk = float(rng.uniform(0.3, 3.0))
         surge = float(rng.uniform(0.2, 0.9))
         hesitate = float(rng.uniform(0.0, 0.2))
         uneven = float(rng.uniform(0.1, 0.4))
         swerve = float(rng.uniform(0.0, 0.2))
-        shock = float(rng.uniform(0.5, 2.0))
+        shock = float(rng.uniform(0.5, 2.5))
         begin = self.planned_way
         end = begin + a.distance_m
         self.planned_way = end
@@ -691,7 +691,7 @@ def _speeds(rng: np.random.Generator, wearer: Wearer) -> list[Activity]:
 def _bout(rng: np.random.Generator, wearer: Wearer) -> list[Activity]:
     """A few metres at home: slow, curved, ended by standing or a turn on the spot."""
     length = float(rng.uniform(1.2, 6.0))
-    kind = str(rng.choice(("walk", "walk", "shuffle")))
+    kind = str(rng.choice(("walk", "shuffle", "shuffle")))
     turn = float(rng.normal(0.0, 0.9))
     speed = float(rng.uniform(0.3, 1.0))
     return [Activity(kind, length, turn, speed_m_s=speed)]

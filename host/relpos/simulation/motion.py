@@ -334,7 +334,7 @@ def _shocks(
     # The jolt of the heel itself, 20 ms before the slower shock.
     size_k = wearer.jolt_m_s2 * column["shock"] * pace**1.5 * spread[0] ** 2
     place = (strike_s - 0.02 - t[0]) * RATE_HZ
-    jolt = spectral.shocks(place, size_k, wearer.jolt_hz, 0.25, 0.008)
+    jolt = spectral.shocks(place, size_k, wearer.jolt_hz, 0.5, 0.008)
     out[0] = out[0] + jolt
     out[1] = out[1] - 0.5 * jolt
     return out
