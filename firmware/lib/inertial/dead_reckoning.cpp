@@ -66,8 +66,6 @@ float norm(const float v[kAxes]) { return sqrtf(dot(v, v)); }
 
 DeadReckoning::DeadReckoning() { reset(); }
 
-void DeadReckoning::configure(const InertialConfig& config) { config_ = config; }
-
 void DeadReckoning::reset() {
   // All but the configuration starts at zero, cleared as one block: member by member it would be a
   // kilobyte of the Uno's flash. Every member is a number, an enum or an array of such.
