@@ -114,7 +114,24 @@ def header_text() -> str:
             f"bool decode(const uint8_t* body, uint8_t length, {name}* message);",
             "",
         ]
-    return "\n".join([*lines, "}  // namespace wire", "}  // namespace relpos", ""])
+    lines += [
+        "// A calibration: 16-bit words, all zero: none. Where a group begins, and the unit of its",
+        "// words where it is not the common one.",
+        f"constexpr uint8_t kCalibrationWords = {len(wire.CALIBRATION)};",
+        f"constexpr float kCalibrationUnit = 1.0f / {wire.CALIBRATION_PER_UNIT};",
+    ]
+    position = 0
+    for name, words in wire.CALIBRATION_GROUPS.items():
+        first = words[0]
+        lines.append(
+            f"constexpr uint8_t k{_camel(name)} = {position};  // {len(words)}. {first.meaning}"
+        )
+        if first.per_unit != wire.CALIBRATION_PER_UNIT:
+            lines.append(
+                f"constexpr float k{_camel(name)}Unit = 1.0f / {first.per_unit};  // {first.unit}"
+            )
+        position += len(words)
+    return "\n".join([*lines, "", "}  // namespace wire", "}  // namespace relpos", ""])
 
 
 def _range_check(field: Quantity, value: str) -> str | None:
@@ -130,13 +147,42 @@ def _range_check(field: Quantity, value: str) -> str | None:
     return " || ".join(checks) if checks else None
 
 
+def _runs(fields: Sequence[Quantity]) -> list[list[Quantity]]:
+    """Fields that lie behind each other in memory as on the wire, on every board.
+
+    A member of n bytes stands at a multiple of n on the PC and anywhere on the AVR; a struct
+    begins at a multiple of four.
+    """
+    runs: list[list[Quantity]] = []
+    offset = 0
+    whole = False
+    for field in fields:
+        size = 4 if field.wire == "u24" else field.byte_count
+        padded = -offset % size
+        if not whole or padded or field.wire == "u24":
+            runs.append([])
+        runs[-1].append(field)
+        offset += padded + size
+        whole = field.wire != "u24"
+    return runs
+
+
 def _table(name: str, fields: Sequence[Quantity], struct: str) -> list[str]:
-    rows = [
-        f"    {{offsetof({struct}, {f.raw_name}), {f.byte_count}, "
-        f"{4 if f.wire == 'u24' else f.byte_count}}},"
-        for f in fields
-    ]
-    return [f"const Field {name}[] FLASH = {{", *rows, "};", ""]
+    rows, asserts = [], []
+    for run in _runs(fields):
+        bytes_ = sum(f.byte_count for f in run)
+        rows.append(
+            f"    {{offsetof({struct}, {run[0].raw_name}), {bytes_}, "
+            f"{4 if run[0].wire == 'u24' else bytes_}}},"
+        )
+        if len(run) > 1:
+            asserts += [
+                f"static_assert(offsetof({struct}, {run[-1].raw_name}) - "
+                f"offsetof({struct}, {run[0].raw_name}) ==",
+                f"                  {bytes_ - run[-1].byte_count},",
+                '              "no gaps: copied as one");',
+            ]
+    return [f"const Field {name}[] FLASH = {{", *rows, "};", *asserts, ""]
 
 
 def _checks(fields: Sequence[Quantity], prefix: str, failed: str, indent: str) -> list[str]:
@@ -154,7 +200,7 @@ def _codec(message: Message) -> list[str]:
     out += [
         f"uint8_t encode(const {name}& message, uint8_t* body) {{",
         *_checks(message.fields, "message.", "0", "  "),
-        f"  uint8_t* out = put(k{name}, {len(message.fields)}, &message, body);",
+        f"  uint8_t* out = put(k{name}, {len(_runs(message.fields))}, &message, body);",
     ]
     if entries is not None:
         out += [
@@ -163,7 +209,7 @@ def _codec(message: Message) -> list[str]:
             "  for (uint8_t i = 0; i < message.count; ++i) {",
             f"    const {entry}& entry = message.entries[i];",
             *_checks(entries.fields, "entry.", "0", "    "),
-            f"    out = put(k{entry}, {len(entries.fields)}, &entry, out);",
+            f"    out = put(k{entry}, {len(_runs(entries.fields))}, &entry, out);",
             "  }",
         ]
     out += [
@@ -175,13 +221,13 @@ def _codec(message: Message) -> list[str]:
     if entries is None:
         out += [
             f"  if (length != {message.fixed_size}) return false;",
-            f"  take(k{name}, {len(message.fields)}, body, message);",
+            f"  take(k{name}, {len(_runs(message.fields))}, body, message);",
             *_checks(message.fields, "message->", "false", "  "),
         ]
     else:
         out += [
             f"  if (length < {message.fixed_size}) return false;",
-            f"  const uint8_t* in = take(k{name}, {len(message.fields)}, body, message);",
+            f"  const uint8_t* in = take(k{name}, {len(_runs(message.fields))}, body, message);",
             *_checks(message.fields, "message->", "false", "  "),
             "  message->count = *in++;",
             f"  if (message->count > kMost{name}) return false;",
@@ -189,7 +235,7 @@ def _codec(message: Message) -> list[str]:
             "return false;",
             "  for (uint8_t i = 0; i < message->count; ++i) {",
             f"    {entry}& entry = message->entries[i];",
-            f"    in = take(k{entry}, {len(entries.fields)}, in, &entry);",
+            f"    in = take(k{entry}, {len(_runs(entries.fields))}, in, &entry);",
             *_checks(entries.fields, "entry.", "false", "    "),
             "  }",
         ]
@@ -225,8 +271,8 @@ def source_text() -> str:
         "",
         'static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "fields are copied as is");',
         "",
-        "// Where a field stands in its struct, its bytes on the wire and in memory. A table read",
-        "// by one loop: a call a field would cost the Uno 400 bytes of flash more.",
+        "// Where a run of fields stands in its struct, its bytes on the wire and in memory. A table",
+        "// read by one loop: a call a field would cost the Uno 400 bytes of flash more.",
         "struct Field {",
         "  uint8_t offset, wire_bytes, memory_bytes;",
         "};",
@@ -338,6 +384,37 @@ def page_text() -> str:
                 *(_row(f) for f in message.entries.fields),
             ]
         lines.append("")
+    lines += [
+        "## Calibration",
+        "",
+        f"A node's calibration is {len(wire.CALIBRATION)} signed 16-bit words; all zero change "
+        "nothing. `set_calibration` stages one word: value = index x 65536 + the word modulo "
+        "65536. `commit_calibration` stores all staged words at once, answers, and restarts the "
+        "node with them; its value is their CRC (little-endian, seeded like a frame's), and one "
+        "that does not fit comes back as out_of_range and changes nothing. `read_calibration` "
+        "(value = index x 65536) tells a word that is in force. How they are found: "
+        "[calibration.md](calibration.md).",
+        "",
+        "| index | word | unit of the raw value | meaning |",
+        "|---|---|---|---|",
+    ]
+    position = 0
+    for name, words in wire.CALIBRATION_GROUPS.items():
+        first = words[0]
+        last = position + len(words) - 1
+        place = f"{position}" if last == position else f"{position} to {last}"
+        unit = f"1/{first.per_unit} {first.unit}".strip()
+        lines.append(f"| {place} | `{name}` | {unit} | {first.meaning} |")
+        position = last + 1
+    lines += [
+        "",
+        "## Commands that need a word more",
+        "",
+        "`set_raw_reports`: the node sends so many `samples` (0 to 3000: ten minutes; not stored) "
+        "and does not range meanwhile. A setting's value out of its range changes nothing and "
+        "brings the value in force.",
+        "",
+    ]
     return "\n".join(lines)
 
 

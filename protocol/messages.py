@@ -85,6 +85,10 @@ class CommandCode(enum.IntEnum):
     SET_STEP_REPORTS = 7
     SET_LED = 8
     SET_STATUS_PERIOD_MS = 9
+    SET_RAW_REPORTS = 10
+    SET_CALIBRATION = 11
+    COMMIT_CALIBRATION = 12
+    READ_CALIBRATION = 13
 
 
 class CommandResult(enum.IntEnum):
@@ -316,6 +320,51 @@ STEPS = Message(
     ),
 )
 
+SAMPLES = Message(
+    5,
+    "samples",
+    "What the sensors show before any calibration, in the axes of accelerometer and gyroscope; sent "
+    "five times a second while SET_RAW_REPORTS asks for it. The node does not range meanwhile.",
+    (
+        _time("Node clock at the last sample"),
+        *(
+            Quantity(
+                f"acceleration_{axis}_m_s2",
+                "i32",
+                "Sum of the specific force over the samples",
+                raw_name=f"acceleration_{axis}_10um_s2",
+                unit="m/s^2",
+                per_unit=100_000,
+            )
+            for axis in "xyz"
+        ),
+        *(
+            Quantity(
+                f"angular_rate_{axis}_rad_s",
+                "i32",
+                "Sum of the angular rate over the samples",
+                raw_name=f"angular_rate_{axis}_10urad_s",
+                unit="rad/s",
+                per_unit=100_000,
+            )
+            for axis in "xyz"
+        ),
+        *(
+            Quantity(
+                f"field_{axis}_ut",
+                "i32",
+                "Magnetic field, the newest reading since the previous report",
+                raw_name=f"field_{axis}_10pt",
+                unit="uT",
+                per_unit=100_000,
+            )
+            for axis in "xyz"
+        ),
+        Quantity("samples", "u8", "Number of inertial samples since the previous report"),
+        Quantity("field_readings", "u8", "Magnetometer readings since the previous report; 0: none"),
+    ),
+)
+
 COMMAND = Message(
     16,
     "command",
@@ -339,10 +388,77 @@ ACKNOWLEDGEMENT = Message(
     ),
 )
 
-MESSAGES = (MOTION, RANGES, STATUS, STEPS, COMMAND, ACKNOWLEDGEMENT)
+MESSAGES = (MOTION, RANGES, STATUS, STEPS, SAMPLES, COMMAND, ACKNOWLEDGEMENT)
 BY_NUMBER = {message.number: message for message in MESSAGES}
 BY_NAME = {message.name: message for message in MESSAGES}
 ENUMS = (ResetCause, MotionState, Quality, RangeQuality, CommandCode, CommandResult)
+
+
+def _words(
+    label: str, count: int, unit: str, per_unit: int, meaning: str, low: int | None = None
+) -> tuple[Quantity, ...]:
+    return tuple(
+        Quantity(
+            label if count == 1 else f"{label}_{k}",
+            "i16",
+            meaning,
+            unit=unit,
+            per_unit=per_unit,
+            low=low,
+        )
+        for k in range(count)
+    )
+
+
+CALIBRATION_PER_UNIT = 1 << 14
+"""Of every calibration word but the hard iron's: one unit in all spares the Uno flash."""
+CALIBRATION_GROUPS = {
+    "acceleration_bias": _words(
+        "acceleration_bias",
+        3,
+        "m/s^2",
+        CALIBRATION_PER_UNIT,
+        "Subtracted from the specific force, axis by axis",
+    ),
+    "gyro_bias": _words(
+        "gyro_bias",
+        3,
+        "rad/s",
+        CALIBRATION_PER_UNIT,
+        "Subtracted from the angular rate, axis by axis",
+    ),
+    "acceleration_scale": _words(
+        "acceleration_scale",
+        3,
+        "",
+        CALIBRATION_PER_UNIT,
+        "The specific force is then multiplied by 1 + this, axis by axis",
+    ),
+    "field_offset": _words(
+        "field_offset", 3, "uT", 16, "Hard iron: subtracted from the field, axis by axis"
+    ),
+    "field_matrix": _words(
+        "field_matrix",
+        9,
+        "",
+        CALIBRATION_PER_UNIT,
+        "Soft iron: the field is then multiplied by the unit matrix + this (3 x 3, row by row)",
+    ),
+    "gyro_bias_sigma": _words(
+        "gyro_bias_sigma",
+        1,
+        "rad/s",
+        CALIBRATION_PER_UNIT,
+        "Standard deviation of what is left of the gyroscope's bias; 0: not calibrated",
+        0,
+    ),
+}
+"""A node's calibration: 16-bit words in this order, all in the axes of accelerometer and gyroscope.
+All words zero change nothing. SET_CALIBRATION stages one word (value = index x 65536 + the word as
+unsigned), COMMIT_CALIBRATION, whose value is the CRC of all staged words (little-endian, seeded like
+a frame's), stores all of them and restarts the node with them; READ_CALIBRATION (value = index x
+65536) tells a word that is in force."""
+CALIBRATION = tuple(word for group in CALIBRATION_GROUPS.values() for word in group)
 
 
 def layout_text() -> str:
@@ -363,6 +479,7 @@ def layout_text() -> str:
                 f"{message.number} {message.name}[{message.entries.most}] {line(f)}"
                 for f in message.entries.fields
             ]
+    lines += [f"calibration {line(f)}" for f in CALIBRATION]
     for kind in ENUMS:
         lines += [f"{kind.__name__} {member.name} {member.value}" for member in kind]
     return "\n".join(lines) + "\n"

@@ -101,8 +101,6 @@ float doubted(float sigma, float innovation) { return sigma * sigma + innovation
 
 DeadReckoning::DeadReckoning() { reset(); }
 
-void DeadReckoning::configure(const InertialConfig& config) { config_ = config; }
-
 void DeadReckoning::reset() {
   // All but the configuration starts at zero, cleared as one block: member by member it would be a
   // kilobyte of the Uno's flash. Every member is a number, an enum or an array of such.

@@ -49,7 +49,9 @@ struct InertialCounters {
 class DeadReckoning {
  public:
   DeadReckoning();
-  void configure(const InertialConfig& config);  // from the next step on; keeps the totals
+  void configure(const InertialConfig& config) { config_ = config; }
+  // To be changed in place: in force from the next step on, the bias's sigma from the next reset().
+  InertialConfig& config() { return config_; }
   void reset();
   void update(const ImuSample& sample, float dt_s);  // at 50 Hz; dt nominally 0.02 s
   void magnetometer(const float field_ut[kAxes]);    // in the accelerometer's axes, about 5 Hz

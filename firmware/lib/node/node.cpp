@@ -1,8 +1,10 @@
 #include "node/node.h"
 
 #include <stddef.h>
+#include <string.h>
 
 #include "devices/flash.h"
+#include "node/calibration.h"
 #include "node/version.h"
 
 namespace relpos {
@@ -19,6 +21,12 @@ constexpr int16_t kWeakSignalDbm = -95;    // DW1000: close to the sensitivity l
 constexpr uint16_t kMotionPhaseMs = 157;   // between the reports of neighbouring ids, modulo period
 constexpr uint16_t kMostStepAgeMs = 2000;  // then it is sent without waiting for others
 constexpr uint8_t kRebootBytes = 5;
+constexpr uint16_t kRawPeriodMs = 200;     // as often as the magnetometer is read
+constexpr uint16_t kMostRawReports = 3000; // ten minutes: a lost host does not end the ranging
+// Beyond what a sensor at its limit can show once a calibration has moved it: by 80 mg and 3 %, by
+// 20 deg/s (data sheet limits).
+constexpr float kCalibratedLimit_m_s2 = 37.0f;
+constexpr float kCalibratedLimitRadS = 8.35f;
 
 // What a command may set: where it stands in the settings, and its limits.
 struct Choice {
@@ -28,19 +36,19 @@ struct Choice {
 static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "settings are written a byte at a time");
 const Choice kChoices[] RELPOS_FLASH = {
     {static_cast<uint8_t>(wire::CommandCode::kSetReportPeriodMs),
-     offsetof(Settings, report_period_ms), 2, 100, 60000},
+     offsetof(Preferences, report_period_ms), 2, 100, 60000},
     {static_cast<uint8_t>(wire::CommandCode::kSetRangingPeriodMs),
-     offsetof(Settings, ranging_period_ms), 2, 200, 60000},
+     offsetof(Preferences, ranging_period_ms), 2, 200, 60000},
     {static_cast<uint8_t>(wire::CommandCode::kSetStatusPeriodMs),
-     offsetof(Settings, status_period_ms), 2, 1000, 60000},
-    {static_cast<uint8_t>(wire::CommandCode::kSetLegLengthMm), offsetof(Settings, leg_length_mm), 2,
+     offsetof(Preferences, status_period_ms), 2, 1000, 60000},
+    {static_cast<uint8_t>(wire::CommandCode::kSetLegLengthMm), offsetof(Preferences, leg_length_mm), 2,
      400, 1400},
     {static_cast<uint8_t>(wire::CommandCode::kSetStepGainPermille),
-     offsetof(Settings, step_gain_permille), 2, 300, 3000},
-    {static_cast<uint8_t>(wire::CommandCode::kSetTeamSize), offsetof(Settings, team_size), 1, 1, 20},
-    {static_cast<uint8_t>(wire::CommandCode::kSetStepReports), offsetof(Settings, step_reports), 1, 0,
+     offsetof(Preferences, step_gain_permille), 2, 300, 3000},
+    {static_cast<uint8_t>(wire::CommandCode::kSetTeamSize), offsetof(Preferences, team_size), 1, 1, 20},
+    {static_cast<uint8_t>(wire::CommandCode::kSetStepReports), offsetof(Preferences, step_reports), 1, 0,
      1},
-    {static_cast<uint8_t>(wire::CommandCode::kSetLed), offsetof(Settings, led), 1, kLedOff,
+    {static_cast<uint8_t>(wire::CommandCode::kSetLed), offsetof(Preferences, led), 1, kLedOff,
      kLedHealth},
 };
 
@@ -85,6 +93,7 @@ void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
 
   pozyx_.begin(id_);
   configure_inertial();
+  dead_reckoning_.reset();  // the bias begins as well known as it is configured
   // Nodes switched on together do not all speak and range at the same moment.
   motion_due_ms_ = settings_.report_period_ms +
                    static_cast<uint32_t>(id_) * kMotionPhaseMs % settings_.report_period_ms;
@@ -167,10 +176,15 @@ void Node::show_health() {
 bool Node::imu_silent() const { return !sampled_ || clock_.ms() - last_sample_ms_ > kSilentMs; }
 
 void Node::configure_inertial() {
-  InertialConfig config;
+  InertialConfig& config = dead_reckoning_.config();
   config.leg_length_m = static_cast<float>(settings_.leg_length_mm) * 1e-3f;
   config.step_gain = static_cast<float>(settings_.step_gain_permille) * 1e-3f;
-  dead_reckoning_.configure(config);
+  const int16_t sigma = settings_.calibration[wire::kGyroBiasSigma];
+  if (sigma != 0) {
+    config.gyro_bias_sigma_rad_s = sigma * wire::kCalibrationUnit;
+    config.acceleration_limit_m_s2 = kCalibratedLimit_m_s2;
+    config.angular_rate_limit_rad_s = kCalibratedLimitRadS;
+  }
 }
 
 void Node::run_imu(uint32_t now_us) {
@@ -213,11 +227,20 @@ void Node::tick(uint32_t now_us) {
   }
   sampled_ = true;
   last_sample_ms_ = clock_.ms();
+  static_assert(sizeof sample == 6 * sizeof(float), "the two vectors are one of six");
+  correct_inertial(settings_.calibration, reinterpret_cast<float*>(&sample),
+                   raw_reports_ != 0 ? raw_ : nullptr);
+  ++raw_samples_;
   dead_reckoning_.update(sample, static_cast<float>(step_us) * 1e-6f);
   ++updates_;
 
   float field_ut[3];
   if (magnetometer_.step(board_, field_ut)) {
+    if (raw_reports_ != 0) {
+      memcpy(raw_ + 6, field_ut, sizeof field_ut);
+      ++raw_fields_;
+    }
+    correct_field(settings_.calibration, field_ut);
     dead_reckoning_.magnetometer(field_ut);
     last_field_ms_ = clock_.ms();
     field_seen_ = true;
@@ -259,7 +282,7 @@ void Node::begin_round(uint32_t now_us) {
 
 void Node::next_peer(uint32_t now_us) {
   if (++peer_ == id_) ++peer_;
-  if (peer_ > settings_.team_size || !pozyx_.range(peer_)) {
+  if (peer_ > settings_.team_size || raw_reports_ != 0 || !pozyx_.range(peer_)) {
     peer_ = kNoPeer;
     return;
   }
@@ -279,7 +302,7 @@ void Node::run_ranging(uint32_t now_us) {
     pending.range_mm = result.range_mm;
     pending.rss_dbm = result.rss_dbm;
     pending.peer = result.peer;
-    if (!ranges_.push(pending)) ++dropped_ranges_;
+    if (raw_reports_ != 0 || !ranges_.push(pending)) ++dropped_ranges_;
   } else {
     ++ranging_failures_;
   }
@@ -297,7 +320,7 @@ void Node::receive_packet() {
     return;
   }
   if (header.node != id_ && header.node != wire::kBroadcast) return;
-  if (header.type != wire::MessageType::kCommand) return;
+  if (header.type != wire::MessageType::kCommand || reboot_step_ != 0) return;
   obey(frame + wire::kHeaderBytes,
        static_cast<uint8_t>(length - wire::kHeaderBytes - wire::kCrcBytes));
 }
@@ -339,6 +362,9 @@ void Node::obey(const uint8_t* body, uint8_t length) {
 
 wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_force) {
   const wire::CommandCode code = static_cast<wire::CommandCode>(command);
+  // One place holds what is being written: settings, or a staged word.
+  if (store_.staging()) return wire::CommandResult::kBusy;
+  if (code >= wire::CommandCode::kSetRawReports) return apply_calibration(code, value, in_force);
   if (code == wire::CommandCode::kReboot && reboot_step_ == 0) reboot_step_ = 1;
   const Choice* choice = kChoices;
   while (flash_byte(&choice->command) != command) {
@@ -376,6 +402,39 @@ wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_forc
   return wire::CommandResult::kDone;
 }
 
+void Node::report_raw(uint16_t reports) {
+  raw_reports_ = reports;
+  raw_samples_ = raw_fields_ = 0;
+  memset(&ranges_, 0, sizeof ranges_);  // and the sums
+}
+
+wire::CommandResult Node::apply_calibration(wire::CommandCode code, int32_t value,
+                                            int32_t* in_force) {
+  if (code == wire::CommandCode::kSetRawReports) {
+    if (static_cast<uint32_t>(value) > kMostRawReports) return wire::CommandResult::kOutOfRange;
+    report_raw(static_cast<uint16_t>(value));
+    return wire::CommandResult::kDone;
+  }
+  if (store_.saving()) return wire::CommandResult::kBusy;
+  if (code == wire::CommandCode::kCommitCalibration) {
+    if (!store_.commit(board_, &settings_, static_cast<uint16_t>(value))) {
+      return wire::CommandResult::kOutOfRange;
+    }
+    reboot_step_ = 1;  // once it is stored and answered: everything begins with it
+    return wire::CommandResult::kDone;
+  }
+  if (static_cast<uint32_t>(value) >> 16 >= wire::kCalibrationWords) {
+    return wire::CommandResult::kOutOfRange;
+  }
+  const uint8_t index = static_cast<uint8_t>(value >> 16);
+  if (code == wire::CommandCode::kSetCalibration) {
+    store_.stage(index, static_cast<uint16_t>(value));
+  } else {
+    *in_force = settings_.calibration[index];
+  }
+  return wire::CommandResult::kDone;
+}
+
 bool Node::answer_due() const {
   for (const DoneCommand& done : commands_) {
     if (done.answer_due) return true;
@@ -391,12 +450,9 @@ bool Node::run_reboot() {
     reboot_step_ = 0;  // where the board outlives its reset
     return false;
   }
-  const DoneCommand* reboot = &commands_[0];
-  for (const DoneCommand& done : commands_) {
-    if (done.known && done.command == static_cast<uint8_t>(wire::CommandCode::kReboot)) {
-      reboot = &done;
-    }
-  }
+  // The newest: since a restart is asked for, no other is taken.
+  const DoneCommand* reboot =
+      &commands_[(next_command_ == 0 ? kRememberedCommands : next_command_) - 1];
   const uint8_t bytes[kRebootBytes] = {
       boot_, static_cast<uint8_t>(reboot->token), static_cast<uint8_t>(reboot->token >> 8),
       static_cast<uint8_t>(reboot->key), static_cast<uint8_t>(reboot->key >> 8)};
@@ -431,6 +487,9 @@ bool Node::send_next() {
     send(wire::MessageType::kStatus, fill_status(body));
   } else if (steps_report_due()) {
     send(wire::MessageType::kSteps, fill_steps(body));
+  } else if (raw_reports_ != 0) {
+    if (!period_over(&raw_due_ms_, kRawPeriodMs)) return false;
+    send(wire::MessageType::kSamples, fill_samples(body));
   } else if (ranges_.count() >= wire::kMostRanges || (peer_ == kNoPeer && ranges_.count() > 0)) {
     send(wire::MessageType::kRanges, fill_ranges(body));
   } else {
@@ -539,6 +598,20 @@ uint8_t Node::fill_steps(uint8_t* body) {
     entry.age_ms = static_cast<uint16_t>(static_cast<uint16_t>(message.time_ms) - step.time_ms);
     entry.length_mm = step.length_mm;
   }
+  return wire::encode(message, body);
+}
+
+uint8_t Node::fill_samples(uint8_t* body) {
+  wire::Samples message;
+  message.time_ms = last_sample_ms_;
+  message.samples = raw_samples_;
+  message.field_readings = raw_fields_;
+  static_assert(offsetof(wire::Samples, samples) - sizeof raw_ ==
+                    offsetof(wire::Samples, acceleration_x_10um_s2),
+                "nine values in a row");
+  int32_t* out = &message.acceleration_x_10um_s2;
+  for (const float value : raw_) *out++ = static_cast<int32_t>(scaled(value, 100000));
+  report_raw(raw_reports_ - 1);
   return wire::encode(message, body);
 }
 

@@ -51,7 +51,10 @@ struct NodeState {
   SampleClock sample_clock_;
   Settings settings_;
   MotionTotals totals_;
-  Ring<PendingRange, kPendingRanges> ranges_;
+  union {  // a node that reports raw samples does not range
+    Ring<PendingRange, kPendingRanges> ranges_;
+    float raw_[9];  // sums of specific force and angular rate, newest field
+  };
   Ring<PendingStep, kPendingSteps> steps_;
   DoneCommand commands_[kRememberedCommands];
   uint32_t imu_due_us_;
@@ -70,6 +73,10 @@ struct NodeState {
   uint16_t ranging_failures_;
   uint16_t dropped_ranges_;
   uint8_t peer_;  // kNoPeer: between rounds
+  uint32_t raw_due_ms_;
+  uint16_t raw_reports_;  // still to be sent
+  uint8_t raw_samples_;   // in the sums
+  uint8_t raw_fields_;    // since the last report
   uint32_t motion_due_ms_;
   uint32_t status_due_ms_;
   uint32_t sent_ms_;
@@ -108,6 +115,8 @@ class Node : private NodeState {
   void receive_packet();
   void obey(const uint8_t* body, uint8_t length);
   wire::CommandResult apply(uint8_t command, int32_t value, int32_t* in_force);
+  void report_raw(uint16_t reports);
+  wire::CommandResult apply_calibration(wire::CommandCode code, int32_t value, int32_t* in_force);
   void configure_inertial();
   bool answer_due() const;
   bool run_reboot();
@@ -119,6 +128,7 @@ class Node : private NodeState {
   uint8_t fill_ranges(uint8_t* body);
   uint8_t fill_status(uint8_t* body);
   uint8_t fill_steps(uint8_t* body);
+  uint8_t fill_samples(uint8_t* body);
   uint8_t fill_answer(uint8_t* body);
   bool steps_report_due() const;
   bool period_over(uint32_t* due_ms, uint16_t period_ms);

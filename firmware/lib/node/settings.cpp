@@ -8,43 +8,38 @@
 namespace relpos {
 namespace {
 
-static_assert(sizeof(Settings) == 14, "the stored bytes are those of the struct on every board");
-constexpr uint8_t kLayout = 1;  // of Settings; another one is not read
-constexpr uint8_t kRecordBytes = 1 + sizeof(Settings) + 2;
-static_assert(kStoredSettings + kRecordBytes <= kStoredSettingsCopy, "records must not overlap");
-static_assert(kStoredSettingsCopy + kRecordBytes <= kStorageBytes, "records must fit");
-const Settings kDefaults RELPOS_FLASH = {6, 0, kLedHealth, 0, 930, 1250, 1000, 2000, 10000};
-constexpr uint16_t kSeed = 0xFFFF;
+static_assert(sizeof(Preferences) == 14 && sizeof(Settings) == 58,
+              "the stored bytes are those of the struct on every board");
+constexpr uint8_t kLayout = 2;  // of Settings; another one is not read
+const Preferences kDefaults RELPOS_FLASH = {6, 0, kLedHealth, 0, 930, 1250, 1000, 2000, 10000};
+constexpr uint16_t kSeed = 0xFFFF - kLayout;
 
 uint16_t crc_of(const Settings& settings) {
-  return wire::crc16(reinterpret_cast<const uint8_t*>(&settings), sizeof settings,
-                     static_cast<uint16_t>(kSeed - kLayout));
+  return wire::crc16(reinterpret_cast<const uint8_t*>(&settings), sizeof settings, kSeed);
+}
+
+void read(Board& board, uint16_t at, uint8_t count, void* to) {
+  for (uint8_t i = 0; i < count; ++i) static_cast<uint8_t*>(to)[i] = board.storage_read(at++);
 }
 
 bool load_copy(Board& board, uint16_t at, Settings* settings) {
-  if (board.storage_read(at) != kLayout) return false;
-  ++at;
-  Settings read;
-  uint8_t bytes[sizeof read];
-  for (uint8_t i = 0; i < sizeof bytes; ++i) bytes[i] = board.storage_read(at++);
-  memcpy(&read, bytes, sizeof read);
-  const uint8_t low = board.storage_read(at);
-  const uint16_t stored = static_cast<uint16_t>(
-      low | static_cast<uint16_t>(static_cast<uint16_t>(board.storage_read(at + 1)) << 8));
-  if (crc_of(read) != stored) return false;
-  *settings = read;
-  return true;
+  uint16_t crc;
+  read(board, at + 1, sizeof *settings, settings);
+  read(board, at + 1 + sizeof *settings, sizeof crc, &crc);
+  return board.storage_read(at) == kLayout && crc_of(*settings) == crc;
 }
 
 }  // namespace
 
 void SettingsStore::load(Board& board, Settings* settings) {
-  for (uint8_t i = 0; i < sizeof kDefaults; ++i) {
-    reinterpret_cast<uint8_t*>(settings)[i] =
-        flash_byte(reinterpret_cast<const uint8_t*>(&kDefaults) + i);
+  if (load_copy(board, kStoredSettings, settings) ||
+      load_copy(board, kStoredSettings + kRecordBytes, settings)) {
+    return;
   }
-  if (!load_copy(board, kStoredSettings, settings)) {
-    load_copy(board, kStoredSettingsCopy, settings);
+  uint8_t* bytes = reinterpret_cast<uint8_t*>(settings);
+  for (uint8_t i = 0; i < sizeof *settings; ++i) {
+    bytes[i] = i < sizeof kDefaults ? flash_byte(reinterpret_cast<const uint8_t*>(&kDefaults) + i)
+                                    : 0;
   }
 }
 
@@ -53,21 +48,39 @@ void SettingsStore::save(const Settings& settings) {
   position_ = 0;
 }
 
+void SettingsStore::stage(uint8_t index, uint16_t word) {
+  crc_ = word;
+  position_ = static_cast<uint8_t>(kStaging + 2 * index);
+}
+
+bool SettingsStore::commit(Board& board, Settings* settings, uint16_t crc) {
+  uint8_t words[sizeof settings->calibration];
+  read(board, kStoredStaging, sizeof words, words);
+  if (wire::crc16(words, sizeof words) != crc) return false;
+  memcpy(settings->calibration, words, sizeof words);
+  save(*settings);
+  return true;
+}
+
 void SettingsStore::step(Board& board, const Settings& settings) {
   if (!saving()) return;
-  const bool copy = position_ >= kRecordBytes;
-  const uint8_t at = copy ? static_cast<uint8_t>(position_ - kRecordBytes) : position_;
+  uint8_t at = position_;  // in the record; in the staging place: 1 + sizeof settings or one more
+  if (staging()) {
+    at = 1 + sizeof settings + (position_ & 1);
+  } else if (at >= kRecordBytes) {
+    at = static_cast<uint8_t>(at - kRecordBytes);
+  }
   uint8_t value = kLayout;
   if (at > sizeof settings) {
     value = static_cast<uint8_t>(at == kRecordBytes - 1 ? crc_ >> 8 : crc_);
   } else if (at > 0) {
     value = reinterpret_cast<const uint8_t*>(&settings)[at - 1];
   }
-  if (!board.storage_write(static_cast<uint16_t>((copy ? kStoredSettingsCopy : kStoredSettings) + at),
-                           value)) {
-    return;
-  }
-  if (++position_ == 2 * kRecordBytes) position_ = kDone;
+  if (!board.storage_write(kStoredSettings + position_, value)) return;
+  ++position_;
+  // The second copy ends where the staging place begins; a staged word has two bytes.
+  static_assert(kStaging % 2 == 0, "a word begins at an even position");
+  if (position_ >= kStaging && position_ % 2 == 0) position_ = kDone;
 }
 
 }  // namespace relpos

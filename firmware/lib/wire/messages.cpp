@@ -24,8 +24,8 @@ uint8_t flash(const uint8_t* at) {
 
 static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "fields are copied as is");
 
-// Where a field stands in its struct, its bytes on the wire and in memory. A table read
-// by one loop: a call a field would cost the Uno 400 bytes of flash more.
+// Where a run of fields stands in its struct, its bytes on the wire and in memory. A table
+// read by one loop: a call a field would cost the Uno 400 bytes of flash more.
 struct Field {
   uint8_t offset, wire_bytes, memory_bytes;
 };
@@ -52,32 +52,26 @@ const uint8_t* take(const Field* fields, uint8_t count, const uint8_t* in,
 }  // namespace
 
 const Field kMotion[] FLASH = {
-    {offsetof(Motion, time_ms), 4, 4},
-    {offsetof(Motion, x_mm), 4, 4},
-    {offsetof(Motion, y_mm), 4, 4},
-    {offsetof(Motion, heading_100urad), 4, 4},
-    {offsetof(Motion, path_mm), 4, 4},
-    {offsetof(Motion, steps), 2, 2},
-    {offsetof(Motion, variance_along_mm2), 4, 4},
-    {offsetof(Motion, variance_across_mm2), 4, 4},
-    {offsetof(Motion, variance_heading_100urad2), 4, 4},
-    {offsetof(Motion, height_cm), 2, 2},
-    {offsetof(Motion, magnetic_heading_100urad), 2, 2},
-    {offsetof(Motion, state), 1, 1},
-    {offsetof(Motion, gain_version), 1, 1},
-    {offsetof(Motion, quality), 1, 1},
+    {offsetof(Motion, time_ms), 22, 22},
+    {offsetof(Motion, variance_along_mm2), 19, 19},
 };
+static_assert(offsetof(Motion, steps) - offsetof(Motion, time_ms) ==
+                  20,
+              "no gaps: copied as one");
+static_assert(offsetof(Motion, quality) - offsetof(Motion, variance_along_mm2) ==
+                  18,
+              "no gaps: copied as one");
 
 uint8_t encode(const Motion& message, uint8_t* body) {
   if (message.magnetic_heading_100urad < -31416 || message.magnetic_heading_100urad > 31416) return 0;
   if (message.state > 2) return 0;
-  uint8_t* out = put(kMotion, 14, &message, body);
+  uint8_t* out = put(kMotion, 2, &message, body);
   return static_cast<uint8_t>(out - body);
 }
 
 bool decode(const uint8_t* body, uint8_t length, Motion* message) {
   if (length != 41) return false;
-  take(kMotion, 14, body, message);
+  take(kMotion, 2, body, message);
   if (message->magnetic_heading_100urad < -31416 || message->magnetic_heading_100urad > 31416) return false;
   if (message->state > 2) return false;
   return true;
@@ -91,9 +85,11 @@ const Field kRangeEntry[] FLASH = {
     {offsetof(RangeEntry, peer), 1, 1},
     {offsetof(RangeEntry, range_mm), 3, 4},
     {offsetof(RangeEntry, rss_dbm), 1, 1},
-    {offsetof(RangeEntry, age_ms), 2, 2},
-    {offsetof(RangeEntry, quality), 1, 1},
+    {offsetof(RangeEntry, age_ms), 3, 3},
 };
+static_assert(offsetof(RangeEntry, quality) - offsetof(RangeEntry, age_ms) ==
+                  2,
+              "no gaps: copied as one");
 
 uint8_t encode(const Ranges& message, uint8_t* body) {
   uint8_t* out = put(kRanges, 1, &message, body);
@@ -103,7 +99,7 @@ uint8_t encode(const Ranges& message, uint8_t* body) {
     const RangeEntry& entry = message.entries[i];
     if (entry.range_mm < 1 || entry.range_mm > 200000UL) return 0;
     if (entry.quality > 3) return 0;
-    out = put(kRangeEntry, 5, &entry, out);
+    out = put(kRangeEntry, 4, &entry, out);
   }
   return static_cast<uint8_t>(out - body);
 }
@@ -116,7 +112,7 @@ bool decode(const uint8_t* body, uint8_t length, Ranges* message) {
   if (length != 5 + message->count * 8) return false;
   for (uint8_t i = 0; i < message->count; ++i) {
     RangeEntry& entry = message->entries[i];
-    in = take(kRangeEntry, 5, in, &entry);
+    in = take(kRangeEntry, 4, in, &entry);
     if (entry.range_mm < 1 || entry.range_mm > 200000UL) return false;
     if (entry.quality > 3) return false;
   }
@@ -124,33 +120,29 @@ bool decode(const uint8_t* body, uint8_t length, Ranges* message) {
 }
 
 const Field kStatus[] FLASH = {
-    {offsetof(Status, time_ms), 4, 4},
-    {offsetof(Status, firmware_major), 1, 1},
-    {offsetof(Status, firmware_minor), 1, 1},
-    {offsetof(Status, firmware_patch), 1, 1},
-    {offsetof(Status, uptime_s), 4, 4},
-    {offsetof(Status, reset_cause), 1, 1},
-    {offsetof(Status, battery_mv), 2, 2},
-    {offsetof(Status, bus_errors), 2, 2},
-    {offsetof(Status, ranging_successes), 2, 2},
-    {offsetof(Status, ranging_failures), 2, 2},
-    {offsetof(Status, worst_tick_us), 2, 2},
-    {offsetof(Status, missed_ticks), 2, 2},
-    {offsetof(Status, free_stack_bytes), 2, 2},
-    {offsetof(Status, bad_frames), 2, 2},
-    {offsetof(Status, dropped_ranges), 2, 2},
-    {offsetof(Status, radio_failures), 2, 2},
+    {offsetof(Status, time_ms), 7, 7},
+    {offsetof(Status, uptime_s), 5, 5},
+    {offsetof(Status, battery_mv), 20, 20},
 };
+static_assert(offsetof(Status, firmware_patch) - offsetof(Status, time_ms) ==
+                  6,
+              "no gaps: copied as one");
+static_assert(offsetof(Status, reset_cause) - offsetof(Status, uptime_s) ==
+                  4,
+              "no gaps: copied as one");
+static_assert(offsetof(Status, radio_failures) - offsetof(Status, battery_mv) ==
+                  18,
+              "no gaps: copied as one");
 
 uint8_t encode(const Status& message, uint8_t* body) {
   if (message.reset_cause > 5) return 0;
-  uint8_t* out = put(kStatus, 16, &message, body);
+  uint8_t* out = put(kStatus, 3, &message, body);
   return static_cast<uint8_t>(out - body);
 }
 
 bool decode(const uint8_t* body, uint8_t length, Status* message) {
   if (length != 32) return false;
-  take(kStatus, 16, body, message);
+  take(kStatus, 3, body, message);
   if (message->reset_cause > 5) return false;
   return true;
 }
@@ -160,9 +152,11 @@ const Field kSteps[] FLASH = {
 };
 
 const Field kStepEntry[] FLASH = {
-    {offsetof(StepEntry, age_ms), 2, 2},
-    {offsetof(StepEntry, length_mm), 2, 2},
+    {offsetof(StepEntry, age_ms), 4, 4},
 };
+static_assert(offsetof(StepEntry, length_mm) - offsetof(StepEntry, age_ms) ==
+                  2,
+              "no gaps: copied as one");
 
 uint8_t encode(const Steps& message, uint8_t* body) {
   uint8_t* out = put(kSteps, 1, &message, body);
@@ -170,7 +164,7 @@ uint8_t encode(const Steps& message, uint8_t* body) {
   *out++ = message.count;
   for (uint8_t i = 0; i < message.count; ++i) {
     const StepEntry& entry = message.entries[i];
-    out = put(kStepEntry, 2, &entry, out);
+    out = put(kStepEntry, 1, &entry, out);
   }
   return static_cast<uint8_t>(out - body);
 }
@@ -183,46 +177,66 @@ bool decode(const uint8_t* body, uint8_t length, Steps* message) {
   if (length != 5 + message->count * 4) return false;
   for (uint8_t i = 0; i < message->count; ++i) {
     StepEntry& entry = message->entries[i];
-    in = take(kStepEntry, 2, in, &entry);
+    in = take(kStepEntry, 1, in, &entry);
   }
   return true;
 }
 
+const Field kSamples[] FLASH = {
+    {offsetof(Samples, time_ms), 42, 42},
+};
+static_assert(offsetof(Samples, field_readings) - offsetof(Samples, time_ms) ==
+                  41,
+              "no gaps: copied as one");
+
+uint8_t encode(const Samples& message, uint8_t* body) {
+  uint8_t* out = put(kSamples, 1, &message, body);
+  return static_cast<uint8_t>(out - body);
+}
+
+bool decode(const uint8_t* body, uint8_t length, Samples* message) {
+  if (length != 42) return false;
+  take(kSamples, 1, body, message);
+  return true;
+}
+
 const Field kCommand[] FLASH = {
-    {offsetof(Command, token), 2, 2},
-    {offsetof(Command, command), 1, 1},
+    {offsetof(Command, token), 3, 3},
     {offsetof(Command, value), 4, 4},
 };
+static_assert(offsetof(Command, command) - offsetof(Command, token) ==
+                  2,
+              "no gaps: copied as one");
 
 uint8_t encode(const Command& message, uint8_t* body) {
-  if (message.command > 9) return 0;
-  uint8_t* out = put(kCommand, 3, &message, body);
+  if (message.command > 13) return 0;
+  uint8_t* out = put(kCommand, 2, &message, body);
   return static_cast<uint8_t>(out - body);
 }
 
 bool decode(const uint8_t* body, uint8_t length, Command* message) {
   if (length != 7) return false;
-  take(kCommand, 3, body, message);
-  if (message->command > 9) return false;
+  take(kCommand, 2, body, message);
+  if (message->command > 13) return false;
   return true;
 }
 
 const Field kAcknowledgement[] FLASH = {
-    {offsetof(Acknowledgement, token), 2, 2},
-    {offsetof(Acknowledgement, command), 1, 1},
-    {offsetof(Acknowledgement, result), 1, 1},
-    {offsetof(Acknowledgement, value), 4, 4},
+    {offsetof(Acknowledgement, token), 8, 8},
 };
+static_assert(offsetof(Acknowledgement, value) - offsetof(Acknowledgement, token) ==
+                  4,
+              "no gaps: copied as one");
 
 uint8_t encode(const Acknowledgement& message, uint8_t* body) {
   if (message.result > 3) return 0;
-  uint8_t* out = put(kAcknowledgement, 4, &message, body);
+  uint8_t* out = put(kAcknowledgement, 1, &message, body);
   return static_cast<uint8_t>(out - body);
 }
 
 bool decode(const uint8_t* body, uint8_t length, Acknowledgement* message) {
   if (length != 8) return false;
-  take(kAcknowledgement, 4, body, message);
+  take(kAcknowledgement, 1, body, message);
   if (message->result > 3) return false;
   return true;
 }

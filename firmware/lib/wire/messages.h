@@ -9,7 +9,7 @@ namespace wire {
 
 constexpr uint8_t kMagic = 181;
 constexpr uint8_t kProtocolVersion = 1;
-constexpr uint16_t kFingerprint = 6654;  // seed of the CRC
+constexpr uint16_t kFingerprint = 12478;  // seed of the CRC
 constexpr uint8_t kFrameBytes = 54;  // header, body and CRC
 constexpr uint8_t kAuthenticationBytes = 12;  // kept free
 constexpr uint8_t kHeaderBytes = 7;
@@ -22,6 +22,7 @@ enum class MessageType : uint8_t {
   kRanges = 2,
   kStatus = 3,
   kSteps = 4,
+  kSamples = 5,
   kCommand = 16,
   kAcknowledgement = 17,
 };
@@ -73,6 +74,10 @@ enum class CommandCode : uint8_t {
   kSetStepReports = 7,
   kSetLed = 8,
   kSetStatusPeriodMs = 9,
+  kSetRawReports = 10,
+  kSetCalibration = 11,
+  kCommitCalibration = 12,
+  kReadCalibration = 13,
 };
 
 // How a command ended.
@@ -182,6 +187,30 @@ uint8_t encode(const Steps& message, uint8_t* body);
 // False, and the message untouched or half-filled, where length or a value is wrong.
 bool decode(const uint8_t* body, uint8_t length, Steps* message);
 
+// What the sensors show before any calibration, in the axes of accelerometer and gyroscope; sent five times a second while SET_RAW_REPORTS asks for it. The node does not range meanwhile.
+struct Samples {
+  uint32_t time_ms;  // Node clock at the last sample; 1000 = 1 s; wraps
+  int32_t acceleration_x_10um_s2;  // Sum of the specific force over the samples; 100000 = 1 m/s^2
+  int32_t acceleration_y_10um_s2;  // Sum of the specific force over the samples; 100000 = 1 m/s^2
+  int32_t acceleration_z_10um_s2;  // Sum of the specific force over the samples; 100000 = 1 m/s^2
+  int32_t angular_rate_x_10urad_s;  // Sum of the angular rate over the samples; 100000 = 1 rad/s
+  int32_t angular_rate_y_10urad_s;  // Sum of the angular rate over the samples; 100000 = 1 rad/s
+  int32_t angular_rate_z_10urad_s;  // Sum of the angular rate over the samples; 100000 = 1 rad/s
+  int32_t field_x_10pt;  // Magnetic field, the newest reading since the previous report; 100000 = 1 uT
+  int32_t field_y_10pt;  // Magnetic field, the newest reading since the previous report; 100000 = 1 uT
+  int32_t field_z_10pt;  // Magnetic field, the newest reading since the previous report; 100000 = 1 uT
+  uint8_t samples;  // Number of inertial samples since the previous report
+  uint8_t field_readings;  // Magnetometer readings since the previous report; 0: none
+};
+
+constexpr uint8_t kSamplesBytes = 42;  // the longest body
+
+// Writes the body, returns its length; 0 where a value is outside
+// its range; body is then half-written.
+uint8_t encode(const Samples& message, uint8_t* body);
+// False, and the message untouched or half-filled, where length or a value is wrong.
+bool decode(const uint8_t* body, uint8_t length, Samples* message);
+
 // The host asks a node; repeating a token repeats the acknowledgement, not the effect.
 struct Command {
   uint16_t token;  // Chosen by the host, returned in the acknowledgement
@@ -212,6 +241,18 @@ constexpr uint8_t kAcknowledgementBytes = 8;  // the longest body
 uint8_t encode(const Acknowledgement& message, uint8_t* body);
 // False, and the message untouched or half-filled, where length or a value is wrong.
 bool decode(const uint8_t* body, uint8_t length, Acknowledgement* message);
+
+// A calibration: 16-bit words, all zero: none. Where a group begins, and the unit of its
+// words where it is not the common one.
+constexpr uint8_t kCalibrationWords = 22;
+constexpr float kCalibrationUnit = 1.0f / 16384;
+constexpr uint8_t kAccelerationBias = 0;  // 3. Subtracted from the specific force, axis by axis
+constexpr uint8_t kGyroBias = 3;  // 3. Subtracted from the angular rate, axis by axis
+constexpr uint8_t kAccelerationScale = 6;  // 3. The specific force is then multiplied by 1 + this, axis by axis
+constexpr uint8_t kFieldOffset = 9;  // 3. Hard iron: subtracted from the field, axis by axis
+constexpr float kFieldOffsetUnit = 1.0f / 16;  // uT
+constexpr uint8_t kFieldMatrix = 12;  // 9. Soft iron: the field is then multiplied by the unit matrix + this (3 x 3, row by row)
+constexpr uint8_t kGyroBiasSigma = 21;  // 1. Standard deviation of what is left of the gyroscope's bias; 0: not calibrated
 
 }  // namespace wire
 }  // namespace relpos

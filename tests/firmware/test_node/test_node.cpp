@@ -2,6 +2,7 @@
 #include "support/check.h"
 #include "support/fake_board.h"
 
+#include "node/calibration.h"
 #include "node/node.h"
 #include "wire/frame.h"
 #include "wire/messages.h"
@@ -26,10 +27,12 @@ struct Sent {
 struct World : FakeBoard {
   uint32_t now = 0;
   uint32_t start = 0;  // the chips' clocks do not wrap with the node's
-  uint8_t eeprom[128];
-  uint16_t writes[128] = {};
+  uint8_t eeprom[relpos::kStorageBytes];
+  uint16_t writes[relpos::kStorageBytes] = {};
   bool inertial_present = true;
   bool tag_present = true;
+  bool magnetometer_present = false;
+  uint32_t writes_left = 0xFFFFFFFF;  // then the power is cut
   bool module_present = true;
   uint8_t delivery = 0;  // of the transmit status
   uint8_t line_bytes = 255;  // a poll
@@ -98,6 +101,8 @@ struct World : FakeBoard {
 
   uint8_t storage_read(uint16_t at) override { return eeprom[at]; }
   bool storage_write(uint16_t at, uint8_t value) override {
+    if (writes_left == 0) return true;
+    --writes_left;
     if (eeprom[at] != value) ++writes[at];
     eeprom[at] = value;
     return true;
@@ -117,6 +122,15 @@ struct World : FakeBoard {
         read[0] = 1;
       }
       if (first_count == 1 && first[0] == 0x3B) read[0] = 0x20;  // 1 g along x
+      return BusStatus::kOk;
+    }
+    if (address == 0x0C && magnetometer_present) {
+      if (read_count == 1) read[0] = 0x48;
+      if (read_count == 3) read[0] = read[1] = read[2] = 128;
+      if (read_count == 8) {
+        read[0] = 1;
+        read[1] = 100;  // the die's x, the accelerometer's y: 30 uT
+      }
       return BusStatus::kOk;
     }
     if (address == 0x4B && tag_present) {
@@ -206,8 +220,58 @@ struct Team {
   }
 };
 
+int32_t staged(uint8_t index, int16_t word) {
+  return static_cast<int32_t>(static_cast<uint32_t>(index) << 16 | static_cast<uint16_t>(word));
+}
+
 constexpr uint8_t code(wire::CommandCode command) { return static_cast<uint8_t>(command); }
 constexpr uint8_t result(wire::CommandResult value) { return static_cast<uint8_t>(value); }
+
+// One command, and its answer: asked again with a new token while the node is busy.
+wire::Acknowledgement ask(Team& team, Node& node, wire::CommandCode command, int32_t value) {
+  static uint16_t token = 1000;
+  wire::Acknowledgement answer = {};
+  do {
+    team.world.command(++token, code(command), value);
+    for (uint8_t tries = 0; tries < 20 && team.answer().token != token; ++tries) {
+      team.run(node, 20);
+    }
+    answer = team.answer();
+  } while (answer.token == token && answer.result == result(wire::CommandResult::kBusy));
+  return answer;
+}
+
+struct Words {
+  int16_t word[wire::kCalibrationWords];
+  uint16_t crc() const {
+    return wire::crc16(reinterpret_cast<const uint8_t*>(word), sizeof word);
+  }
+};
+
+Words example(int16_t seed) {
+  Words words;
+  for (uint8_t i = 0; i < wire::kCalibrationWords; ++i) {
+    words.word[i] = static_cast<int16_t>(seed * (i + 1) - 700);
+  }
+  words.word[wire::kGyroBiasSigma] = 29;
+  return words;
+}
+
+void stage(Team& team, Node& node, const Words& words) {
+  for (uint8_t i = 0; i < wire::kCalibrationWords; ++i) {
+    ask(team, node, wire::CommandCode::kSetCalibration, staged(i, words.word[i]));
+  }
+}
+
+bool in_force(Team& team, Node& node, const Words& words) {
+  for (uint8_t i = 0; i < wire::kCalibrationWords; ++i) {
+    const wire::Acknowledgement answer =
+        ask(team, node, wire::CommandCode::kReadCalibration, staged(i, 0));
+    if (answer.result != result(wire::CommandResult::kDone)) return false;
+    if (answer.value != words.word[i]) return false;
+  }
+  return true;
+}
 
 }  // namespace
 
@@ -513,6 +577,164 @@ TEST(whole_turns_count_and_a_reset_of_the_filter_sets_nothing_back) {
   CHECK_EQUAL(4, motion.steps);  // wrapped
   CHECK_NEAR(141372.0f, static_cast<float>(motion.heading_100urad), 2.0f);
   CHECK_NEAR(250000.0f, static_cast<float>(motion.variance_along_mm2), 1.0f);
+}
+
+TEST(no_calibration_changes_nothing) {
+  const int16_t none[wire::kCalibrationWords] = {};
+  float sample[6] = {9.8f, -0.3f, 39.2f, 8.7f, -0.001f, 0.0f};
+  float field[3] = {-18.3f, 0.15f, 1228.0f};
+  const float same[6] = {9.8f, -0.3f, 39.2f, 8.7f, -0.001f, 0.0f};
+  relpos::correct_inertial(none, sample, nullptr);
+  relpos::correct_field(none, field);
+  for (uint8_t i = 0; i < 6; ++i) CHECK_NEAR(same[i], sample[i], 0.0f);
+  CHECK_NEAR(-18.3f, field[0], 0.0f);
+  CHECK_NEAR(0.15f, field[1], 0.0f);
+  CHECK_NEAR(1228.0f, field[2], 0.0f);
+}
+
+TEST(a_calibration_undoes_the_errors_that_it_describes) {
+  int16_t words[wire::kCalibrationWords] = {};
+  const float unit = 16384.0f;
+  words[wire::kAccelerationBias + 2] = static_cast<int16_t>(-0.5f * unit);
+  words[wire::kAccelerationScale + 2] = static_cast<int16_t>(0.25f * unit);
+  words[wire::kGyroBias + 1] = static_cast<int16_t>(0.125f * unit);
+  words[wire::kFieldOffset + 0] = 16 * -40;
+  words[wire::kFieldMatrix + 1] = static_cast<int16_t>(0.5f * unit);   // row 0, column 1
+  words[wire::kFieldMatrix + 8] = static_cast<int16_t>(-0.25f * unit);  // row 2, column 2
+  float sample[6] = {1.0f, 2.0f, 3.5f, 0.5f, 0.25f, 0.0f};
+  float sums[6] = {10.0f, 10.0f, 10.0f, 10.0f, 10.0f, 10.0f};
+  relpos::correct_inertial(words, sample, sums);
+  const float corrected[6] = {1.0f, 2.0f, 5.0f, 0.5f, 0.125f, 0.0f};
+  const float summed[6] = {11.0f, 12.0f, 13.5f, 10.5f, 10.25f, 10.0f};  // as they were
+  for (uint8_t i = 0; i < 6; ++i) {
+    CHECK_NEAR(corrected[i], sample[i], 1e-6f);
+    CHECK_NEAR(summed[i], sums[i], 1e-6f);
+  }
+  float field[3] = {-10.0f, 20.0f, 8.0f};
+  relpos::correct_field(words, field);
+  CHECK_NEAR(40.0f, field[0], 1e-5f);  // -10 + 40 + 20 / 2
+  CHECK_NEAR(20.0f, field[1], 1e-5f);
+  CHECK_NEAR(6.0f, field[2], 1e-5f);
+}
+
+TEST(raw_samples_come_five_times_a_second_and_end_by_themselves) {
+  Team team;
+  team.world.magnetometer_present = true;
+  team.run_ms(3000);
+  CHECK_EQUAL(0, team.sent(wire::MessageType::kSamples));
+  CHECK_EQUAL(result(wire::CommandResult::kDone),
+              ask(team, team.node, wire::CommandCode::kSetRawReports, 50).result);
+  team.run_ms(9000);
+  CHECK(team.sent(wire::MessageType::kSamples) >= 43);
+  wire::Samples samples = {};
+  CHECK(team.read(wire::MessageType::kSamples, &samples));
+  CHECK(samples.samples >= 9 && samples.samples <= 11);
+  CHECK_NEAR(9.80665f * 1e5f * samples.samples, static_cast<float>(samples.acceleration_x_10um_s2),
+             100.0f);
+  CHECK_EQUAL(0, samples.angular_rate_z_10urad_s);
+  CHECK_EQUAL(1, samples.field_readings);
+  CHECK_NEAR(30.0f * 1e5f, static_cast<float>(samples.field_y_10pt), 10.0f);
+  CHECK(samples.time_ms > 11000 && samples.time_ms < 12100);
+  team.run_ms(5000);
+  CHECK_EQUAL(50, team.sent(wire::MessageType::kSamples));
+  CHECK(team.sent(wire::MessageType::kMotion) >= 15);  // which goes on
+}
+
+TEST(raw_samples_tell_a_silent_sensor_and_end_all_the_same) {
+  Team team;
+  team.world.inertial_present = false;
+  ask(team, team.node, wire::CommandCode::kSetRawReports, 10);
+  team.run_ms(4000);
+  wire::Samples samples = {};
+  CHECK_EQUAL(10, team.sent(wire::MessageType::kSamples));
+  CHECK(team.read(wire::MessageType::kSamples, &samples));
+  CHECK_EQUAL(0, samples.samples);
+  CHECK_EQUAL(0, samples.field_readings);
+  CHECK_EQUAL(result(wire::CommandResult::kOutOfRange),
+              ask(team, team.node, wire::CommandCode::kSetRawReports, 3001).result);
+  CHECK_EQUAL(result(wire::CommandResult::kOutOfRange),
+              ask(team, team.node, wire::CommandCode::kSetRawReports, -1).result);
+}
+
+TEST(a_node_that_reports_raw_samples_does_not_range_and_then_ranges_again) {
+  Team team;
+  team.run_ms(5000);
+  ask(team, team.node, wire::CommandCode::kSetRawReports, 40);
+  const uint16_t before = team.sent(wire::MessageType::kRanges);
+  team.run_ms(7500);
+  CHECK_EQUAL(before, team.sent(wire::MessageType::kRanges));
+  team.run_ms(6000);
+  CHECK(team.sent(wire::MessageType::kRanges) >= before + 2);
+  wire::Ranges ranges;
+  CHECK(team.read(wire::MessageType::kRanges, &ranges));
+  CHECK_EQUAL(5, ranges.count);
+  for (uint8_t i = 0; i < 5; ++i) CHECK_EQUAL(1000u * ranges.entries[i].peer, ranges.entries[i].range_mm);
+}
+
+TEST(a_calibration_is_in_force_after_its_commit_and_not_a_word_earlier) {
+  Team team;
+  const Words none = {};
+  const Words words = example(91);
+  stage(team, team.node, words);
+  CHECK(in_force(team, team.node, none));
+  CHECK_EQUAL(result(wire::CommandResult::kOutOfRange),
+              ask(team, team.node, wire::CommandCode::kCommitCalibration, words.crc() ^ 1).result);
+  CHECK(in_force(team, team.node, none));
+  CHECK_EQUAL(0, team.world.restarts);
+  const wire::Acknowledgement answer =
+      ask(team, team.node, wire::CommandCode::kCommitCalibration, words.crc());
+  CHECK_EQUAL(result(wire::CommandResult::kDone), answer.result);
+  team.run_ms(1000);
+  CHECK_EQUAL(1, team.world.restarts);
+  Node again(team.world);
+  again.begin(team.world.now, wire::ResetCause::kWatchdog, 0);
+  // The commit repeated, because its answer was lost: answered, not done again.
+  team.world.command(answer.token, code(wire::CommandCode::kCommitCalibration), words.crc());
+  team.run(again, 1000);
+  CHECK_EQUAL(1, team.world.restarts);
+  CHECK_EQUAL(answer.token, team.answer().token);
+  CHECK_EQUAL(result(wire::CommandResult::kDone), team.answer().result);
+  CHECK(in_force(team, again, words));
+  CHECK_EQUAL(result(wire::CommandResult::kOutOfRange),
+              ask(team, again, wire::CommandCode::kReadCalibration, staged(22, 0)).result);
+  CHECK_EQUAL(result(wire::CommandResult::kOutOfRange),
+              ask(team, again, wire::CommandCode::kSetCalibration, staged(22, 0)).result);
+}
+
+TEST(a_power_cut_at_any_byte_leaves_the_old_calibration_or_the_new_one) {
+  const Words before = example(-57), after = example(103);
+  bool old_seen = false, new_seen = false;
+  for (uint32_t cut = 0; cut < 200; cut += 3) {
+    Team team;
+    ask(team, team.node, wire::CommandCode::kSetTeamSize, 9);
+    stage(team, team.node, before);
+    ask(team, team.node, wire::CommandCode::kCommitCalibration, before.crc());
+    team.run_ms(500);
+    Node second(team.world);
+    second.begin(team.world.now, wire::ResetCause::kWatchdog, 0);
+    team.world.writes_left = cut;
+    stage(team, second, after);
+    ask(team, second, wire::CommandCode::kCommitCalibration, after.crc());
+    team.run(second, 500);
+    team.world.writes_left = 0xFFFFFFFF;
+    Node third(team.world);
+    third.begin(team.world.now, wire::ResetCause::kPowerOn, 0);
+    const bool old_one = in_force(team, third, before);
+    CHECK(old_one || in_force(team, third, after));
+    CHECK_EQUAL(9, ask(team, third, wire::CommandCode::kSetTeamSize, 0).value);
+    (old_one ? old_seen : new_seen) = true;
+  }
+  CHECK(old_seen && new_seen);
+}
+
+TEST(while_a_word_or_a_setting_is_being_stored_the_next_one_has_to_wait) {
+  Team team;
+  team.world.command(7, code(wire::CommandCode::kSetTeamSize), 4);
+  team.world.command(8, code(wire::CommandCode::kSetCalibration), staged(0, 5));
+  team.run_ms(300);
+  CHECK_EQUAL(8, team.answer().token);
+  CHECK_EQUAL(result(wire::CommandResult::kBusy), team.answer().result);
+  CHECK_EQUAL(4, ask(team, team.node, wire::CommandCode::kSetTeamSize, 0).value);
 }
 
 RUN_TESTS()

@@ -57,6 +57,17 @@ bool same(const wire::Steps& a, const wire::Steps& b) {
   return true;
 }
 
+bool same(const wire::Samples& a, const wire::Samples& b) {
+  return a.time_ms == b.time_ms && a.acceleration_x_10um_s2 == b.acceleration_x_10um_s2 &&
+         a.acceleration_y_10um_s2 == b.acceleration_y_10um_s2 &&
+         a.acceleration_z_10um_s2 == b.acceleration_z_10um_s2 &&
+         a.angular_rate_x_10urad_s == b.angular_rate_x_10urad_s &&
+         a.angular_rate_y_10urad_s == b.angular_rate_y_10urad_s &&
+         a.angular_rate_z_10urad_s == b.angular_rate_z_10urad_s && a.field_x_10pt == b.field_x_10pt &&
+         a.field_y_10pt == b.field_y_10pt && a.field_z_10pt == b.field_z_10pt && a.samples == b.samples &&
+         a.field_readings == b.field_readings;
+}
+
 bool same(const wire::Command& a, const wire::Command& b) {
   return a.token == b.token && a.command == b.command && a.value == b.value;
 }
@@ -121,6 +132,8 @@ TEST(ranges_frames_are_the_golden_ones) {
 TEST(status_frames_are_the_golden_ones) { BOTH_WAYS(kStatus, kStatus); }
 
 TEST(steps_frames_are_the_golden_ones) { BOTH_WAYS(kSteps, kSteps); }
+
+TEST(samples_frames_are_the_golden_ones) { BOTH_WAYS(kSamples, kSamples); }
 
 TEST(command_frames_are_the_golden_ones) { BOTH_WAYS(kCommand, kCommand); }
 

@@ -20,7 +20,7 @@ extern "C" {
 
 relpos_node* relpos_node_create(const relpos_board_callbacks* board, uint8_t* eeprom, uint16_t size,
                                 uint8_t node_id, uint8_t reset_cause, uint32_t) {
-  if (node_id == 99 || size < 128) return nullptr;
+  if (node_id == 99 || size < 192) return nullptr;
   relpos_node* node = static_cast<relpos_node*>(calloc(1, sizeof(relpos_node)));
   node->board = *board;
   node->eeprom = eeprom;

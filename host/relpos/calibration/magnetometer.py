@@ -1,0 +1,354 @@
+"""Hard and soft iron from readings in many directions.
+
+Where the field is uniform, a perfect magnetometer that is turned draws a sphere. Magnetised iron on
+the node (hard iron) moves its centre, soft iron and the sensor's own errors make it an ellipsoid:
+
+    reading = offset + M^-1 R field,   |M (reading - offset)| = |field|
+
+1. The ellipsoid: algebraic least squares with the constraint 4 J - I^2 > 0, which only ellipsoids
+   (not too flat) fulfil: Q. Li and J. G. Griffiths, "Least squares ellipsoid specific fitting",
+   Geometric Modeling and Processing 2004. The algebraic distance overweights what lies far from the
+   centre, hence a second pass weighted by the inverse gradient (Taubin 1991; Sampson 1982).
+2. Least squares of the first-order geometric distance, (|M d| - r) / |grad|, over centre and
+   symmetric M: maximum likelihood where the sensor's noise is white and alike in all axes. The loss
+   is Huber's, so that a few readings beside a steel leg do not bend it.
+3. The norm alone cannot tell a rotation of M. Gravity can: the dip of the field is the same in
+   every attitude, so up . (Q M d) must be one number for all readings, which gives the rotation Q.
+   This is what makes the *heading* right and not only the sphere round.
+
+det M = 1 keeps the field's norm in microtesla: nothing here knows the true strength, and the mean
+semi-axis is the best that the sensor itself says of it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, optimize
+from scipy.spatial.transform import Rotation
+
+from relpos.errors import DataError
+
+FloatArray = NDArray[np.float64]
+
+DIRECTIONS = 60
+"""Equal patches of the sphere by which coverage is counted: 30 degrees across."""
+LEAST_READINGS = 60
+LEAST_COVERAGE = 0.6
+"""Of the patches. A band around the equator (a node turned about one axis only) fills 30 to 40 %,
+two bands 60 %; the live display asks for more."""
+LEAST_EARTH_UT, MOST_EARTH_UT = 20.0, 75.0
+"""The Earth's field is 22 to 67 uT; the firmware takes no reading outside this."""
+MOST_RESIDUAL = 0.05
+"""RMS distance from the ellipsoid over its radius. Noise makes 1 %, a field that is not uniform
+more: such a fit would move the disturbance of one place into every other."""
+MOST_UNCERTAINTY = 0.02
+"""Of a corrected reading in the worst direction, over the radius: 1 degree of heading."""
+MOST_CONDITION = 3.0
+"""Longest over shortest semi-axis. Worse is a node beside a magnet, or no ellipsoid at all."""
+MOST_MISALIGNMENT_RAD = math.radians(20.0)
+ALIGNED_WITHIN_RAD = math.radians(1.0)
+"""A rotation that is known worse than this (standard deviation) is left at none."""
+QUASI_STATIC = 0.05
+"""Change of |force| from gravity up to which the accelerometer shows where up is."""
+
+
+@dataclass(frozen=True)
+class MagnetometerFit:
+    """``matrix @ (reading - offset_ut)`` is the field, ``radius_ut`` its mean norm.
+
+    ``residual`` is the RMS of norm / radius - 1 after, ``residual_before`` of norm / mean norm - 1
+    without any calibration. ``uncertainty`` is the standard deviation of a corrected reading in the
+    worst direction, over the radius, from the parameters alone. ``dip_rad`` is how far the field
+    points below the horizon and ``turned_rad`` the rotation that gravity found; None where gravity
+    was not given or did not say enough.
+    """
+
+    offset_ut: FloatArray
+    matrix: FloatArray
+    radius_ut: float
+    residual: float
+    residual_before: float
+    uncertainty: float
+    coverage: float
+    readings: int
+    dip_rad: float | None = None
+    turned_rad: float | None = None
+
+    def correct(self, field_ut: FloatArray) -> FloatArray:
+        """Corrected readings (n, 3)."""
+        corrected: FloatArray = (field_ut - self.offset_ut) @ self.matrix.T
+        return corrected
+
+
+def directions(count: int = DIRECTIONS) -> FloatArray:
+    """Unit vectors (count, 3), evenly over the sphere (Fibonacci lattice)."""
+    k = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * k / count
+    angle = np.pi * (1.0 + math.sqrt(5.0)) * k
+    level = np.sqrt(1.0 - z * z)
+    return np.column_stack((level * np.cos(angle), level * np.sin(angle), z))
+
+
+_PATCHES = directions()
+
+
+def visited(vectors: FloatArray) -> NDArray[np.bool_]:
+    """Which patches of the sphere (DIRECTIONS,) hold one of the vectors (n, 3)."""
+    seen = np.zeros(DIRECTIONS, dtype=np.bool_)
+    norms = np.linalg.norm(vectors, axis=1)
+    good = norms > 0.0
+    if good.any():
+        seen[np.argmax(vectors[good] @ _PATCHES.T, axis=1)] = True
+    return seen
+
+
+def coverage(vectors: FloatArray) -> float:
+    """Share of the sphere's patches that hold one of the vectors (n, 3)."""
+    return float(visited(vectors).mean())
+
+
+def centre_guess(field_ut: FloatArray) -> FloatArray:
+    """Centre (3,) for a display while readings still come: of the best sphere, if it is one.
+
+    Least squares of |x|^2 = 2 c . x + const, held to the readings' own box where they are few.
+    """
+    low, high = field_ut.min(axis=0), field_ut.max(axis=0)
+    middle = 0.5 * (low + high)
+    if len(field_ut) < 10:
+        return np.asarray(middle)
+    shifted = field_ut - middle
+    design = np.column_stack((2.0 * shifted, np.ones(len(shifted))))
+    solution = np.linalg.lstsq(design, (shifted**2).sum(axis=1), rcond=1e-3)[0]
+    return np.asarray(np.clip(middle + solution[:3], low, high))
+
+
+def fit(field_ut: FloatArray, up: FloatArray | None = None) -> MagnetometerFit:
+    """Fit readings (n, 3) in microtesla; ``up`` (n, 3) turns the result into gravity's axes.
+
+    ``up`` is the specific force at the same moments in the same axes, NaN where it is unknown.
+    Raises DataError, with what to do, where the readings do not determine an ellipsoid: too few,
+    too much of the sphere unseen, a field that is not uniform, or no Earth's field.
+    """
+    good = np.isfinite(field_ut).all(axis=1)
+    readings = field_ut[good]
+    if len(readings) < LEAST_READINGS:
+        raise DataError(
+            f"{len(readings)} magnetometer readings are too few, at least {LEAST_READINGS} are "
+            "needed: turn the node for a minute"
+        )
+    scale = float(np.linalg.norm(readings - readings.mean(axis=0), axis=1).mean())
+    if scale < 1.0:
+        raise DataError("the magnetometer always shows the same: turn the node in all directions")
+    shift = readings.mean(axis=0)
+    centre, shape = _algebraic((readings - shift) / scale)
+    for _ in range(2):
+        gradient = np.linalg.norm(((readings - shift) / scale - centre) @ shape, axis=1)
+        centre, shape = _algebraic((readings - shift) / scale, 1.0 / np.maximum(gradient, 1e-3))
+    offset, matrix, radius, uncertainty = _geometric(
+        readings, shift + scale * centre, shape / scale**2
+    )
+    corrected = (readings - offset) @ matrix.T
+    norms = np.linalg.norm(corrected, axis=1)
+    raw = np.linalg.norm(readings, axis=1)
+    result = MagnetometerFit(
+        offset_ut=offset,
+        matrix=matrix,
+        radius_ut=radius,
+        residual=float(np.sqrt(np.mean((norms / radius - 1.0) ** 2))),
+        residual_before=float(np.std(raw) / np.mean(raw)),
+        uncertainty=uncertainty,
+        coverage=coverage(corrected),
+        readings=len(readings),
+    )
+    _check(result)
+    if up is None:
+        return result
+    return _aligned(result, readings, up[good])
+
+
+def _check(result: MagnetometerFit) -> None:
+    if result.coverage < LEAST_COVERAGE:
+        raise DataError(
+            f"only {100 * result.coverage:.0f} % of the directions were seen, at least "
+            f"{100 * LEAST_COVERAGE:.0f} % are needed: point each side of the node up, down and "
+            "all around"
+        )
+    axes = np.linalg.svd(result.matrix, compute_uv=False)
+    if axes[0] / axes[-1] > MOST_CONDITION:
+        raise DataError(
+            f"the readings make an ellipsoid {axes[0] / axes[-1]:.1f} times as long as wide: "
+            "iron or a magnet is close to the sensor, or the field changed meanwhile"
+        )
+    if result.residual > MOST_RESIDUAL:
+        raise DataError(
+            f"the readings lie {100 * result.residual:.0f} % of the field off the best ellipsoid, "
+            f"at most {100 * MOST_RESIDUAL:.0f} % are sound: the field is not uniform here; go "
+            "outside or away from steel, and turn the node on the spot"
+        )
+    if result.uncertainty > MOST_UNCERTAINTY:
+        raise DataError(
+            f"a corrected field would still be uncertain by {100 * result.uncertainty:.1f} % in "
+            f"the worst direction, at most {100 * MOST_UNCERTAINTY:.0f} % are sound: turn the node "
+            "longer and in all directions"
+        )
+    if not LEAST_EARTH_UT <= result.radius_ut <= MOST_EARTH_UT:
+        raise DataError(
+            f"the corrected field is {result.radius_ut:.0f} uT strong, the Earth's is 22 to 67: "
+            "something magnetic is close by, or this is not a calibrated sensor's scale"
+        )
+
+
+def _algebraic(
+    points: FloatArray, weights: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Centre (3,) and shape (3, 3) with (x - centre) shape (x - centre) = 1 for points (n, 3)."""
+    x, y, z = points.T
+    one = np.ones(len(points))
+    design = np.column_stack(
+        (x * x, y * y, z * z, 2 * y * z, 2 * x * z, 2 * x * y, 2 * x, 2 * y, 2 * z, one)
+    )
+    if weights is not None:
+        design = design * weights[:, None]
+    scatter = design.T @ design / len(points)
+    # k = 4: every ellipsoid whose short axis is at least half its long one is reached, and what is
+    # found is always an ellipsoid.
+    constraint = np.diag([-1.0, -1.0, -1.0, -4.0, -4.0, -4.0])
+    constraint[:3, :3] += np.ones((3, 3)) - np.eye(3)
+    a, b, d = scatter[:6, :6], scatter[:6, 6:], scatter[6:, 6:]
+    try:
+        lower = linalg.solve(d, b.T, assume_a="sym")
+        values, vectors = linalg.eig(linalg.solve(constraint, a - b @ lower))
+    except (linalg.LinAlgError, ValueError) as error:
+        raise _no_ellipsoid() from error
+    quadric = np.real(vectors[:, int(np.argmax(np.real(values)))])
+    rest = -lower @ quadric
+    form = np.array(
+        [
+            [quadric[0], quadric[5], quadric[4]],
+            [quadric[5], quadric[1], quadric[3]],
+            [quadric[4], quadric[3], quadric[2]],
+        ]
+    )
+    try:
+        centre = -np.linalg.solve(form, rest[:3])
+    except np.linalg.LinAlgError as error:
+        raise _no_ellipsoid() from error
+    level = float(centre @ form @ centre - rest[3])
+    shape = form / level if level != 0.0 else form
+    if not np.all(np.isfinite(shape)) or np.min(np.linalg.eigvalsh(shape)) <= 0.0:
+        raise _no_ellipsoid()
+    return centre, shape
+
+
+def _no_ellipsoid() -> DataError:
+    return DataError(
+        "the readings lie on no ellipsoid: turn the node in all directions, not about one axis"
+    )
+
+
+_SYMMETRIC = np.triu_indices(3)
+
+
+def _symmetric(six: FloatArray) -> FloatArray:
+    matrix = np.zeros((3, 3))
+    matrix[_SYMMETRIC] = six
+    return matrix + np.triu(matrix, 1).T
+
+
+def _geometric(
+    readings: FloatArray, offset: FloatArray, shape: FloatArray
+) -> tuple[FloatArray, FloatArray, float, float]:
+    """Refine; returns offset, matrix of determinant 1, radius and the worst uncertainty."""
+    values, vectors = np.linalg.eigh(shape)
+    root = (vectors * np.sqrt(values)) @ vectors.T  # |root (x - offset)| = 1
+    radius = float(1.0 / np.linalg.det(root) ** (1.0 / 3.0))
+
+    def distances(parameters: FloatArray) -> FloatArray:
+        matrix = _symmetric(parameters[3:])
+        d = (readings - parameters[:3] * radius) / radius
+        u = d @ matrix
+        norm = np.maximum(np.linalg.norm(u, axis=1), 1e-9)
+        gradient = np.maximum(np.linalg.norm(u @ matrix, axis=1) / norm, 1e-9)
+        return np.asarray((norm - 1.0) / gradient)
+
+    start = np.concatenate((offset / radius, (root * radius)[_SYMMETRIC]))
+    spread = float(np.median(np.abs(distances(start)))) * 1.4826
+    solution = optimize.least_squares(
+        distances, start, loss="huber", f_scale=max(2.0 * spread, 1e-4), x_scale="jac"
+    )
+    offset = solution.x[:3] * radius
+    matrix = _symmetric(solution.x[3:])
+    if np.min(np.linalg.eigvalsh(matrix)) <= 0.0:
+        raise _no_ellipsoid()
+    size = float(np.linalg.det(matrix) ** (1.0 / 3.0))
+    # What the parameters' covariance does to a corrected reading, direction by direction.
+    noise = float(np.mean(distances(solution.x) ** 2)) * len(readings) / (len(readings) - 9)
+    info = solution.jac.T @ solution.jac
+    try:
+        covariance = noise * np.linalg.inv(info)
+    except np.linalg.LinAlgError as error:
+        raise _no_ellipsoid() from error
+    worst = 0.0
+    for u in _PATCHES:
+        d = np.linalg.solve(matrix, u)
+        jacobian = np.zeros((3, 9))
+        jacobian[:, :3] = -matrix
+        for k, (i, j) in enumerate(zip(*_SYMMETRIC, strict=True)):
+            jacobian[i, 3 + k] += d[j]
+            if i != j:
+                jacobian[j, 3 + k] += d[i]
+        spread_here = jacobian @ covariance @ jacobian.T
+        worst = max(worst, float(np.max(np.linalg.eigvalsh(spread_here))))
+    return offset, matrix / size, radius / size, math.sqrt(worst)
+
+
+def _aligned(result: MagnetometerFit, readings: FloatArray, up: FloatArray) -> MagnetometerFit:
+    """Turn the fit so that the field's dip is the same in every attitude.
+
+    Unchanged where gravity was not seen from enough sides. DataError where the rotation is no
+    mounting error any more.
+    """
+    norms = np.linalg.norm(up, axis=1)
+    typical = float(np.nanmedian(norms)) if np.isfinite(norms).any() else math.nan
+    still = np.isfinite(norms) & (np.abs(norms - typical) < QUASI_STATIC * typical)
+    if still.sum() < LEAST_READINGS or coverage(up[still]) < LEAST_COVERAGE:
+        return result
+    field = result.correct(readings[still]) / result.radius_ut
+    vertical = up[still] / norms[still, None]
+
+    def misfits(parameters: FloatArray) -> FloatArray:
+        turned = Rotation.from_rotvec(parameters[:3]).apply(field)
+        return np.asarray((turned * vertical).sum(axis=1) - parameters[3])
+
+    start = np.array([0.0, 0.0, 0.0, float(np.median((field * vertical).sum(axis=1)))])
+    solution = optimize.least_squares(misfits, start, loss="huber", f_scale=0.05)
+    noise = float(np.mean(misfits(solution.x) ** 2))
+    try:
+        sigma = np.sqrt(noise * np.diag(np.linalg.inv(solution.jac.T @ solution.jac)))
+    except np.linalg.LinAlgError:
+        return result
+    if float(np.max(sigma[:3])) > ALIGNED_WITHIN_RAD:
+        return result
+    turned_rad = float(np.linalg.norm(solution.x[:3]))
+    if turned_rad > MOST_MISALIGNMENT_RAD:
+        raise DataError(
+            f"magnetometer and accelerometer disagree by {math.degrees(turned_rad):.0f} degrees "
+            "about where things are: their axes are not what the firmware takes them for"
+        )
+    rotation = Rotation.from_rotvec(solution.x[:3]).as_matrix()
+    return MagnetometerFit(
+        offset_ut=result.offset_ut,
+        matrix=rotation @ result.matrix,
+        radius_ut=result.radius_ut,
+        residual=result.residual,
+        residual_before=result.residual_before,
+        uncertainty=result.uncertainty,
+        coverage=result.coverage,
+        readings=result.readings,
+        dip_rad=-math.asin(max(-1.0, min(1.0, float(solution.x[3])))),
+        turned_rad=turned_rad,
+    )
