@@ -271,7 +271,7 @@ def source_text() -> str:
         "",
         'static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "fields are copied as is");',
         "",
-        "// Where a run of fields stands in its struct, its bytes on the wire and in memory. A table",
+        "// Where a run of fields stands in its struct, bytes on the wire and in memory. A table",
         "// read by one loop: a call a field would cost the Uno 400 bytes of flash more.",
         "struct Field {",
         "  uint8_t offset, wire_bytes, memory_bytes;",

@@ -168,7 +168,7 @@ MOTION = Message(
         Quantity(
             "variance_along_m2",
             "u32",
-            "Total variance along the walking direction",
+            "Total variance along the walking direction, without the scale error",
             raw_name="variance_along_mm2",
             unit="m^2",
             per_unit=1_000_000,
@@ -190,6 +190,15 @@ MOTION = Message(
             raw_name="variance_heading_100urad2",
             unit="rad^2",
             per_unit=100_000_000,
+            wraps=True,
+        ),
+        Quantity(
+            "scale_error_m",
+            "u32",
+            "Total standard deviation of the path from what all steps err by together",
+            raw_name="scale_error_mm",
+            unit="m",
+            per_unit=1000,
             wraps=True,
         ),
         Quantity(
@@ -323,7 +332,7 @@ STEPS = Message(
 SAMPLES = Message(
     5,
     "samples",
-    "What the sensors show before any calibration, in the axes of accelerometer and gyroscope; sent "
+    "Sensors before any calibration, in the axes of accelerometer and gyroscope; sent "
     "five times a second while SET_RAW_REPORTS asks for it. The node does not range meanwhile.",
     (
         _time("Node clock at the last sample"),
@@ -361,7 +370,9 @@ SAMPLES = Message(
             for axis in "xyz"
         ),
         Quantity("samples", "u8", "Number of inertial samples since the previous report"),
-        Quantity("field_readings", "u8", "Magnetometer readings since the previous report; 0: none"),
+        Quantity(
+            "field_readings", "u8", "Magnetometer readings since the previous report; 0: none"
+        ),
     ),
 )
 

@@ -17,7 +17,10 @@ class Motion:
 
     ``dx_m`` is forward and ``dy_m`` left in the node's own heading frame at the previous motion
     (paper sect. IV-B reports the same three numbers); ``dtheta_rad`` is counter-clockwise. The
-    sigmas are standard deviations where the source knows them.
+    sigmas are standard deviations where the source knows them: the squares of ``sigma_x_m`` of
+    consecutive motions add up to the variance of the way. What all of a wearer's steps err by
+    together, their scale, makes each share in that sum larger than the motion's own error is;
+    ``sigma_x_alone_m`` is that, for an estimator that corrects the way as it goes.
     """
 
     time_s: float
@@ -30,6 +33,7 @@ class Motion:
     sigma_theta_rad: float | None = None
     gain_version: int | None = None
     moving: bool | None = None
+    sigma_x_alone_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ constexpr float kMostGapS = 60.0f;
 struct Total {
   uint8_t from, to, thousands;
 };
-enum : uint8_t { kHeadingVariance = 5 };  // the last: a hundred million
+enum : uint8_t { kHeadingVariance = 5 };  // a hundred million
 const Total kTable[] RELPOS_FLASH = {
     {offsetof(Displacement, x_m), offsetof(wire::Motion, x_mm), 1},
     {offsetof(Displacement, y_m), offsetof(wire::Motion, y_mm), 1},
@@ -35,6 +35,7 @@ const Total kTable[] RELPOS_FLASH = {
     {offsetof(Displacement, variance_across_m2), offsetof(wire::Motion, variance_across_mm2), 2},
     {offsetof(Displacement, variance_heading_rad2),
      offsetof(wire::Motion, variance_heading_100urad2), 2},
+    {offsetof(Displacement, scale_error_m), offsetof(wire::Motion, scale_error_mm), 1},
 };
 
 }  // namespace

@@ -23,9 +23,9 @@ class MotionTotals {
  private:
   int32_t heading_100urad(const Displacement& now) const;
 
-  static constexpr uint8_t kTotals = 6;
+  static constexpr uint8_t kTotals = 7;
 
-  uint32_t base_[kTotals];  // of the message's six totals of a kind, in the order of their table
+  uint32_t base_[kTotals];  // of the message's seven totals of a kind, in the order of their table
   int32_t base_heading_100urad_;
   float previous_heading_rad_;
   int16_t turns_;

@@ -24,7 +24,7 @@ uint8_t flash(const uint8_t* at) {
 
 static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "fields are copied as is");
 
-// Where a run of fields stands in its struct, its bytes on the wire and in memory. A table
+// Where a run of fields stands in its struct, bytes on the wire and in memory. A table
 // read by one loop: a call a field would cost the Uno 400 bytes of flash more.
 struct Field {
   uint8_t offset, wire_bytes, memory_bytes;
@@ -53,13 +53,13 @@ const uint8_t* take(const Field* fields, uint8_t count, const uint8_t* in,
 
 const Field kMotion[] FLASH = {
     {offsetof(Motion, time_ms), 22, 22},
-    {offsetof(Motion, variance_along_mm2), 19, 19},
+    {offsetof(Motion, variance_along_mm2), 23, 23},
 };
 static_assert(offsetof(Motion, steps) - offsetof(Motion, time_ms) ==
                   20,
               "no gaps: copied as one");
 static_assert(offsetof(Motion, quality) - offsetof(Motion, variance_along_mm2) ==
-                  18,
+                  22,
               "no gaps: copied as one");
 
 uint8_t encode(const Motion& message, uint8_t* body) {
@@ -70,7 +70,7 @@ uint8_t encode(const Motion& message, uint8_t* body) {
 }
 
 bool decode(const uint8_t* body, uint8_t length, Motion* message) {
-  if (length != 41) return false;
+  if (length != 45) return false;
   take(kMotion, 2, body, message);
   if (message->magnetic_heading_100urad < -31416 || message->magnetic_heading_100urad > 31416) return false;
   if (message->state > 2) return false;

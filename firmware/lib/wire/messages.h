@@ -9,7 +9,7 @@ namespace wire {
 
 constexpr uint8_t kMagic = 181;
 constexpr uint8_t kProtocolVersion = 1;
-constexpr uint16_t kFingerprint = 12478;  // seed of the CRC
+constexpr uint16_t kFingerprint = 19641;  // seed of the CRC
 constexpr uint8_t kFrameBytes = 54;  // header, body and CRC
 constexpr uint8_t kAuthenticationBytes = 12;  // kept free
 constexpr uint8_t kHeaderBytes = 7;
@@ -96,9 +96,10 @@ struct Motion {
   int32_t heading_100urad;  // Total turn, counter-clockwise, whole turns included; 10000 = 1 rad; wraps
   uint32_t path_mm;  // Total of the step lengths; 1000 = 1 m; wraps
   uint16_t steps;  // Total number of steps; wraps
-  uint32_t variance_along_mm2;  // Total variance along the walking direction; 1000000 = 1 m^2; wraps
+  uint32_t variance_along_mm2;  // Total variance along the walking direction, without the scale error; 1000000 = 1 m^2; wraps
   uint32_t variance_across_mm2;  // Total variance across the walking direction; 1000000 = 1 m^2; wraps
   uint32_t variance_heading_100urad2;  // Total variance of the heading; 100000000 = 1 rad^2; wraps
+  uint32_t scale_error_mm;  // Total standard deviation of the path from what all steps err by together; 1000 = 1 m; wraps
   int16_t height_cm;  // Height over the start, from pressure; see HEIGHT_VALID; 100 = 1 m
   int16_t magnetic_heading_100urad;  // Heading of the body over magnetic north, counter-clockwise; see MAGNETOMETER_VALID; 10000 = 1 rad
   uint8_t state;  // Standing or moving
@@ -106,7 +107,7 @@ struct Motion {
   uint8_t quality;  // What weakens this motion
 };
 
-constexpr uint8_t kMotionBytes = 41;  // the longest body
+constexpr uint8_t kMotionBytes = 45;  // the longest body
 
 // Writes the body, returns its length; 0 where a value is outside
 // its range; body is then half-written.
@@ -187,7 +188,7 @@ uint8_t encode(const Steps& message, uint8_t* body);
 // False, and the message untouched or half-filled, where length or a value is wrong.
 bool decode(const uint8_t* body, uint8_t length, Steps* message);
 
-// What the sensors show before any calibration, in the axes of accelerometer and gyroscope; sent five times a second while SET_RAW_REPORTS asks for it. The node does not range meanwhile.
+// Sensors before any calibration, in the axes of accelerometer and gyroscope; sent five times a second while SET_RAW_REPORTS asks for it. The node does not range meanwhile.
 struct Samples {
   uint32_t time_ms;  // Node clock at the last sample; 1000 = 1 s; wraps
   int32_t acceleration_x_10um_s2;  // Sum of the specific force over the samples; 100000 = 1 m/s^2

@@ -48,11 +48,13 @@ class MotionNoise:
     def sigmas(self, step: Advance) -> tuple[float, float, float]:
         """Standard deviations of forward (m), left (m) and turn (rad) for one piece."""
         share = max(step.fraction, 1e-9) ** 0.5
+        # Ranges correct the way as it goes: a common scale error does not build up.
+        reported_d = step.sigma_x_m if step.sigma_x_alone_m is None else step.sigma_x_alone_m
         root_s = step.duration_s**0.5
         relative_d, relative_theta = self.sigma_d / share, self.sigma_theta / share
         floor_d, floor_theta = self.floor_d_m * root_s, self.floor_theta_rad * root_s
         return (
-            max(abs(step.dx_m) * relative_d, floor_d, step.sigma_x_m or 0.0),
+            max(abs(step.dx_m) * relative_d, floor_d, reported_d or 0.0),
             max(abs(step.dy_m) * relative_d, floor_d, step.sigma_y_m or 0.0),
             max(abs(step.dtheta_rad) * relative_theta, floor_theta, step.sigma_theta_rad or 0.0),
         )

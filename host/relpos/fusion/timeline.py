@@ -46,6 +46,7 @@ class Advance:
     sigma_x_m: float | None = None
     sigma_y_m: float | None = None
     sigma_theta_rad: float | None = None
+    sigma_x_alone_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -337,4 +338,5 @@ def _piece(
         part(report.sigma_x_m),
         part(report.sigma_y_m),
         part(report.sigma_theta_rad),
+        part(report.sigma_x_alone_m),
     )

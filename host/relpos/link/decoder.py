@@ -195,6 +195,8 @@ class Decoder:
         cosine, sine = math.cos(heading_rad), math.sin(heading_rad)
         dx_m, dy_m = total("x_m"), total("y_m")
         quality = wire.Quality(values["quality"])
+        along_m2 = max(total("variance_along_m2"), 0.0) + (UNSEEN_SPEED_M_S * unseen_s) ** 2
+        scale_m = total("scale_error_m")
         observations: list[Observation] = [
             Motion(
                 time_s,
@@ -202,9 +204,7 @@ class Decoder:
                 cosine * dx_m + sine * dy_m,
                 cosine * dy_m - sine * dx_m,
                 total("heading_rad"),
-                math.sqrt(
-                    max(total("variance_along_m2"), 0.0) + (UNSEEN_SPEED_M_S * unseen_s) ** 2
-                ),
+                math.sqrt(along_m2 + max(scale_m * (scale_m + 2.0 * older["scale_error_m"]), 0.0)),
                 math.sqrt(
                     max(total("variance_across_m2"), 0.0) + (UNSEEN_SPEED_M_S * unseen_s) ** 2
                 ),
@@ -213,6 +213,7 @@ class Decoder:
                 ),
                 values["gain_version"],
                 values["state"] == wire.MotionState.MOVING,
+                math.sqrt(along_m2 + scale_m**2),
             )
         ]
         if quality & wire.Quality.HEIGHT_VALID:

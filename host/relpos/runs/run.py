@@ -293,6 +293,7 @@ _TABLES = (
             Column("sigma_theta_rad", not_negative, optional=True),
             Column("gain_version", whole, optional=True),
             Column("moving", flag, optional=True),
+            Column("sigma_x_alone_m", not_negative, optional=True),
         ),
     ),
     _Table(
