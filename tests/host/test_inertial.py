@@ -201,9 +201,9 @@ def heading_errors(team, magnetic):
 
 def test_heading_drifts_no_faster_than_the_standing_start_explains(team):
     late_deg, nees = heading_errors(team, magnetic=False)
-    # 5 s of sway at the start leave a bias of some 0.2 deg/s; believing to observe the heading from
-    # the steps made it 18 deg a minute, at a NEES of 74. Half a degree a minute would be better than
-    # standing and straight walking allow: look why.
+    # 5 s of sway at the start leave a bias of some 0.2 deg/s; believing to observe heading from
+    # the steps made it 18 deg a minute, at a NEES of 74. Half a degree a minute would be better
+    # than standing and straight walking allow: look why.
     assert 3 * 0.5 < np.median(late_deg) < 3 * 5.0
     assert 0.1 < nees < 2.0
 
