@@ -2,10 +2,11 @@
 
 Run as ``.venv/bin/python bench/inertial/evaluate.py``: all data sets. ``--only lowerback``,
 ``chest``, ``daily`` or ``waypoints`` takes one of them, ``--floor`` adds what step models reach
-with the foot contacts given, ``--json FILE`` writes the figures for a machine, ``--pictures DIR``
-draws tracks, ``--table`` prints what was asked for beside its bar, ``--verbose`` every walk.
-``--people odd`` or ``even`` shows half the people of the lower-back walks: constants are chosen on
-the odd ones and reported on the even ones.
+with the foot contacts given, ``--registers`` the difference when the walks are played into the
+emulated chip (``relpos deadreckon``), ``--json FILE`` writes the figures for a machine,
+``--pictures DIR`` draws tracks, ``--table`` prints what was asked for beside its bar, ``--verbose``
+every walk. ``--people odd`` or ``even`` shows half the people of the lower-back walks: constants
+are chosen on the odd ones and reported on the even ones.
 """
 
 from __future__ import annotations
@@ -294,6 +295,7 @@ def chest(verbose: bool) -> Figures:
     out: Figures = {}
     lengths: dict[str, float] = {}
     repeated = []
+    corners: list[tuple[float, float]] = []
     for folder in folders("walk_chest"):
         recording = replay.load(folder)
         result = replay.reckon(recording.imu)
@@ -307,6 +309,10 @@ def chest(verbose: bool) -> Figures:
         if folder.name in CORRIDOR:
             way = "there" if folder.name == CORRIDOR[0] else "back"
             out[f"corridor_{way}_m"], out[f"corridor_{way}_steps"] = result.distance_m, steps
+        if recording.time_s[-1] > 30.0 and result.distance_m > 5.0:
+            # Corridors meet at right angles: a walk has turned by a multiple of them.
+            turns = np.degrees([result.turn_rad, with_field.turn_rad])
+            corners.append(tuple(np.abs(turns - 90.0 * np.round(turns / 90.0))))
         if "static" in folder.name.lower():
             out[f"{folder.name}_m"] = result.distance_m
         if verbose:
@@ -321,6 +327,8 @@ def chest(verbose: bool) -> Figures:
                 f"{result.counters['lost_steps']} lost"
             )
     out["corridor_ratio_percent"] = 100.0 * (lengths[CORRIDOR[1]] / lengths[CORRIDOR[0]] - 1.0)
+    off = np.median(corners, axis=0)
+    out["right_angle_median_deg"], out["magnetometer_right_angle_median_deg"] = map(float, off)
     middle = float(np.mean(repeated))
     out["K_calibration_worst_from_mean_percent"] = float(
         100.0 * np.abs(np.array(repeated) / middle - 1.0).max()
@@ -440,6 +448,51 @@ def waypoints(verbose: bool) -> Figures:
     return out | nees("nees_along", np.array(squares), [str(k) for k in range(len(squares))])
 
 
+# --- the same walks through the emulated chip ---
+
+
+def registers(verbose: bool) -> Figures:
+    """What `relpos deadreckon` makes of the walks, against the library called directly.
+
+    Between the two lie the chip's filter (causal, with its delay), its range and steps of 0.0012
+    m/s2, the instants at which the firmware reads it, and lengths in whole millimetres.
+    """
+    from relpos.emulator.replay import Wearer, play
+    from relpos.runs import load_run
+
+    distances, turns = [], []
+    same_steps = 0
+    for data_set in ("walk_lowerback_20m", "walk_chest", "walk_handheld_waypoints"):
+        for folder in folders(data_set):
+            recording = replay.load(folder)
+            leg_m = recording.leg_length_m
+            direct = replay.reckon(recording.imu, recording.field_ut, leg_length_m=leg_m)
+            ((node, imu),) = load_run(folder).load_imu().items()
+            played = play(node, imu, Wearer(leg_m))
+            turn = sum(motion.dtheta_rad for motion in played.motions)
+            same_steps += len(played.steps) == int(direct.rows["steps"][-1])
+            turns.append(np.degrees(turn - direct.turn_rad))
+            if direct.distance_m > 1.0:
+                distances.append(played.distance_m / direct.distance_m - 1.0)
+            if verbose:
+                print(
+                    f"  {data_set}/{folder.name[-30:]:30} {direct.distance_m:7.2f} m directly, "
+                    f"{played.distance_m:7.2f} through the chip, steps "
+                    f"{direct.rows['steps'][-1]} and {len(played.steps)}, turn {turns[-1]:+.1f} deg"
+                )
+    size = np.abs(percent(distances))
+    return {
+        "walks": len(turns),
+        "same_steps_percent": 100.0 * same_steps / len(turns),
+        "distance_mean_percent": float(percent(distances).mean()),
+        "distance_median_abs_percent": float(np.median(size)),
+        "distance_p90_abs_percent": float(np.percentile(size, 90)),
+        "distance_worst_percent": float(size.max()),
+        "turn_median_abs_deg": float(np.median(np.abs(turns))),
+        "turn_p90_abs_deg": float(np.percentile(np.abs(turns), 90)),
+    }
+
+
 # --- what was asked for ---
 
 
@@ -532,6 +585,7 @@ def main() -> None:
     parser.add_argument("--only", choices=["lowerback", "daily", "chest", "waypoints"])
     parser.add_argument("--floor", action="store_true", help="step models with contacts given")
     parser.add_argument("--verbose", action="store_true", help="a line for every walk")
+    parser.add_argument("--registers", action="store_true", help="through the emulated chip, too")
     parser.add_argument("--table", action="store_true", help="what was asked for, as Markdown")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures there")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="draw tracks into a folder")
@@ -552,6 +606,9 @@ def main() -> None:
         print("floor:")
         figures["floor"] = floor()
         show("", {k: v for k, v in figures["floor"].items() if ": " not in k})
+    if options.registers:
+        figures["registers"] = registers(options.verbose)
+        show("registers:", figures["registers"])
     if options.table:
         print_goals(figures)
     if options.json is not None:

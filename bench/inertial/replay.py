@@ -125,9 +125,12 @@ class Reckoning:
 
     @property
     def step_ticks(self) -> NDArray[np.int64]:
-        """Sample index of each mid-stance (0-based), in order."""
+        """Sample index of each mid-stance (0-based), in order.
+
+        A step is counted some ticks after its mid-stance: one at the very end is not there yet.
+        """
         ticks = self.rows["last_step_tick"].astype(np.int64)
-        return np.unique(ticks[ticks > 0]) - 1
+        return (np.unique(ticks[ticks > 0]) - 1)[: int(self.rows["steps"][-1])]
 
     @property
     def distance_m(self) -> float:
@@ -142,9 +145,9 @@ class Reckoning:
     @property
     def step_lengths_m(self) -> Array:
         """Length of each step of ``step_ticks``; differences of the path, so that none is lost."""
-        path = self.rows["path_m"]
-        ends = np.append(self.step_ticks[1:], len(path)) - 1
-        return np.diff(path[ends].astype(np.float64), prepend=0.0)
+        path, ticks = self.rows["path_m"].astype(np.float64), self.step_ticks
+        ends = np.append(ticks, len(path))[1:] - 1
+        return np.diff(path[ends], prepend=0.0)
 
 
 def load(folder: Path) -> Recording:

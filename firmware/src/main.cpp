@@ -1,8 +1,6 @@
 // Wiring only: the board, the node on it, the loop.
 #if defined(ARDUINO)
 
-#include <Arduino.h>
-
 #include "board/arduino/arduino_board.h"
 #include "node/node.h"
 
@@ -19,12 +17,12 @@ relpos::Node node(board);
 
 }  // namespace
 
-void setup() {
+// Instead of the Arduino core's, whose timers, analogue input and millis() nothing here uses.
+int main() {
   board.begin();
   node.begin(board.now_us(), board.reset_cause(), RELPOS_NODE_ID);
+  for (;;) board.idle(node.poll(board.now_us()));
 }
-
-void loop() { board.idle(node.poll(board.now_us())); }
 
 #else
 

@@ -8,7 +8,8 @@
 namespace relpos {
 
 // Single measurements without waiting: one transaction a call, called once a 50 Hz tick. A
-// measurement (at most 9 ms) is started in one tick and fetched in the next.
+// measurement (at most 9 ms) is started in one tick and fetched in the next. Zeroed memory is the
+// start: make it as `Ak8975()`.
 class Ak8975 {
  public:
   static constexpr uint8_t kAddress = 0x0C;
@@ -24,11 +25,11 @@ class Ak8975 {
 
   void fail();
 
-  State state_ = State::kIdentify;
-  uint8_t wait_ticks_ = 0;
-  uint8_t failures_ = 0;
-  uint8_t adjustment_[3] = {128, 128, 128};  // ASA; 128: none
-  uint16_t rejected_ = 0;
+  State state_;
+  uint8_t wait_ticks_;
+  uint8_t failures_;
+  uint8_t adjustment_[3];  // ASA
+  uint16_t rejected_;
 };
 
 }  // namespace relpos

@@ -8,7 +8,7 @@
 namespace relpos {
 
 // Set-up and reading without waiting: each call does at most one transaction and says after how
-// many microseconds it wants the next.
+// many microseconds it wants the next. Zeroed memory is the start: make it as `Mpu9150()`.
 class Mpu9150 {
  public:
   static constexpr uint8_t kAddress = 0x68;
@@ -29,9 +29,9 @@ class Mpu9150 {
 
   void restart() { position_ = 0; }
 
-  uint8_t position_ = 0;  // in the set-up, or kRunning
-  uint8_t failures_ = 0;  // transactions in a row
-  uint32_t last_ready_us_ = 0;
+  uint8_t position_;  // in the set-up, or kRunning
+  uint8_t failures_;  // transactions in a row
+  uint32_t last_ready_us_;
 };
 
 }  // namespace relpos

@@ -8,7 +8,7 @@
 namespace relpos {
 
 // Set-up and exchanges without waiting: each call does at most one transaction and says after how
-// many microseconds it wants the next.
+// many microseconds it wants the next. Zeroed memory is the start: make it as `Pozyx()`.
 class Pozyx {
  public:
   static constexpr uint8_t kAddress = 0x4B;
@@ -64,12 +64,12 @@ class Pozyx {
   Event done(uint8_t error, uint32_t* wait_us, Result* result);
   void count_failure();
 
-  uint32_t due_us_ = 0;
-  uint32_t last_ms_ = 0;  // the chip's time of the last distance; 0: none
-  uint16_t network_id_ = 0;
-  uint16_t peer_ = 0;
-  State state_ = State::kOff;
-  uint8_t failures_ = 0;  // bus failures and silences since the chip last ended an exchange
+  uint32_t due_us_;
+  uint32_t last_ms_;  // the chip's time of the last distance; 0: none
+  uint16_t network_id_;
+  uint16_t peer_;
+  State state_;
+  uint8_t failures_;  // bus failures and silences since the chip last ended an exchange
 };
 
 }  // namespace relpos

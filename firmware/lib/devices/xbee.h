@@ -9,7 +9,7 @@
 namespace relpos {
 
 // Streams without waiting and without a second buffer: the sender's bytes are escaped straight into
-// the UART; of what comes only RF payloads are kept.
+// the UART; of what comes only RF payloads are kept. Zeroed memory is the start: make it as `Xbee()`.
 class Xbee {
  public:
   static constexpr uint8_t kMostPayload = wire::kFrameBytes + wire::kAuthenticationBytes;
@@ -38,26 +38,26 @@ class Xbee {
   bool finish();
   void reject();
 
-  const uint8_t* data_ = nullptr;
-  uint16_t destination_ = 0;
-  uint16_t position_ = 0;  // in the outgoing frame, delimiter included, escapes not
-  uint8_t data_length_ = 0;
-  uint8_t frame_id_ = 0;
-  uint8_t sent_sum_ = 0;
-  bool sending_ = false;
-  bool sent_escape_ = false;
-  bool unanswered_ = false;
+  const uint8_t* data_;
+  uint16_t destination_;
+  uint16_t position_;  // in the outgoing frame, delimiter included, escapes not
+  uint8_t data_length_;
+  uint8_t frame_id_;
+  uint8_t sent_sum_;
+  bool sending_;
+  bool sent_escape_;
+  bool unanswered_;
 
-  Part part_ = Part::kNone;
-  bool took_escape_ = false;
-  uint8_t type_ = 0;
-  uint8_t sum_ = 0;
-  uint8_t payload_length_ = 0;
-  uint16_t length_ = 0;  // of the incoming frame data
-  uint16_t index_ = 0;   // in it
-  uint16_t source_ = 0;
-  uint16_t bad_frames_ = 0;
-  uint16_t failures_ = 0;
+  Part part_;
+  bool took_escape_;
+  uint8_t type_;
+  uint8_t sum_;
+  uint8_t payload_length_;
+  uint16_t length_;  // of the incoming frame data
+  uint16_t index_;   // in it
+  uint16_t source_;
+  uint16_t bad_frames_;
+  uint16_t failures_;
   uint8_t payload_[kMostPayload];
 };
 

@@ -85,10 +85,12 @@ void Attitude::premultiply(const Attitude& first) {
 
 void Attitude::matrix(float r[kAxes * kAxes]) const {
   const float* v = q + 1;
+  float twice[kAxes];
+  for (uint8_t i = 0; i < kAxes; ++i) twice[i] = v[i] + v[i];
   for (uint8_t i = 0; i < kAxes; ++i) {
     const uint8_t j = next(i), k = next(j);
-    r[4 * i] = 1.0f - 2.0f * (v[j] * v[j] + v[k] * v[k]);
-    const float same = 2.0f * v[i] * v[j], opposite = 2.0f * q[0] * v[k];
+    r[4 * i] = 1.0f - (v[j] * twice[j] + v[k] * twice[k]);
+    const float same = v[i] * twice[j], opposite = q[0] * twice[k];
     r[3 * i + j] = same - opposite;
     r[3 * j + i] = same + opposite;
   }

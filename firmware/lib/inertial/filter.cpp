@@ -28,10 +28,6 @@ RELPOS_SHARED float* ErrorFilter::at(uint8_t i, uint8_t j) {
   return p_ + static_cast<uint8_t>(static_cast<uint8_t>(i * (2 * kStates - 1 - i)) / 2 + j);
 }
 
-RELPOS_SHARED void ErrorFilter::gather(uint8_t group, uint8_t other, float out[kAxes]) const {
-  for (uint8_t i = 0; i < kAxes; ++i) out[i] = *at(group + i, other);
-}
-
 RELPOS_SHARED void ErrorFilter::widen(uint8_t state, float variance, uint8_t count) {
   for (; count != 0; --count, ++state) *at(state, state) += variance;
 }
@@ -43,59 +39,60 @@ void ErrorFilter::reset(float tilt_rad, float bias_rad2_s2, float velocity_m_s) 
   widen(kVelocity, velocity_m_s * velocity_m_s, kAxes);
 }
 
-void ErrorFilter::couple(State to, State from, const float m[kAxes * kAxes]) {
-  // Every element gets its share of M P_f: the covariances with the states outside `to` once, the
-  // block of `to` itself twice: P_tt' = P_tt + M P_ft + P_tf' M', P_tf' the new one. So its upper
-  // half comes before the others and its lower half, which is the same memory, after them.
-  enum Pass : uint8_t { kUpper, kOutside, kLower, kPasses };
-  for (uint8_t pass = kUpper; pass < kPasses; ++pass) {
-    for (uint8_t other = 0; other < kStates; ++other) {
-      const uint8_t column = other - to;
-      if ((column >= kAxes) != (pass == kOutside)) continue;
-      float row[kAxes];
-      gather(from, other, row);
-      for (uint8_t i = 0; i < kAxes; ++i) {
-        if (pass == kUpper && i > column) continue;
-        if (pass == kLower && i < column) continue;
-        *at(to + i, other) += sparse_dot(m + 3 * i, row);
-      }
-    }
+RELPOS_SHARED void ErrorFilter::mix(uint8_t to, uint8_t from, float factor) {
+  // P' = E P E' with E = 1 + factor e_to e_from'. The variance of `to` gets factor times the
+  // covariance of the two before the change, and again after it.
+  add_scaled(at(to, to), at(to, from), factor, 1);
+  float* a = p_ + to;
+  const float* b = p_ + from;
+  for (uint8_t other = 0; other < kStates; ++other) {
+    if (other != to) *a += factor * *b;
+    a += step(other, to);
+    b += step(other, from);
+  }
+  add_scaled(at(to, to), at(to, from), factor, 1);
+}
+
+RELPOS_SHARED void ErrorFilter::add_column(float out[kStates], uint8_t state, float factor) const {
+  if (factor == 0.0f) return;
+  const float* p = p_ + state;
+  for (uint8_t other = 0; other < kStates; ++other) {
+    *out++ += factor * *p;
+    p += step(other, state);
   }
 }
 
 void ErrorFilter::predict_attitude(const float rotation[kAxes * kAxes], float dt_s) {
-  float m[kAxes * kAxes];
-  for (uint8_t i = 0; i < kAxes * kAxes; ++i) m[i] = -dt_s * rotation[i];
-  couple(kAttitude, kBias, m);
-  reference_[0] += dot(m + 3 * kZ, reference_ + 1);
+  for (uint8_t i = 0; i < kAxes; ++i) {
+    for (uint8_t j = 0; j < kAxes; ++j) mix(kAttitude + i, kBias + j, -dt_s * *rotation++);
+  }
+  reference_[0] -= dt_s * dot(rotation - kAxes, reference_ + 1);
   widen(kAttitude, kAttitudeNoise_rad2_s * dt_s, kAxes);
   widen(kBias, kBiasNoise_rad2_s3 * dt_s, kAxes);
+}
+
+void ErrorFilter::move_position(float dt_s) {
+  for (uint8_t i = 0; i < kAxes; ++i) mix(kPosition + i, kVelocity + i, dt_s);
 }
 
 void ErrorFilter::predict_motion(const float f[kAxes], float dt_s) {
   // Half the position step before the velocity changes and half after it: second-order accurate
   // over a span of five ticks, where a single step would be a tenth of a second off.
-  float move[kAxes * kAxes] = {}, turn[kAxes * kAxes] = {};
+  move_position(0.5f * dt_s);
   for (uint8_t i = 0; i < kAxes; ++i) {
     const uint8_t j = next(i), k = next(j);
-    move[4 * i] = 0.5f * dt_s;
-    turn[3 * i + j] = f[k];  // -[F x]
-    turn[3 * j + i] = -f[k];
+    mix(kVelocity + i, kAttitude + j, f[k]);  // -[F x]
+    mix(kVelocity + j, kAttitude + i, -f[k]);
   }
-  couple(kPosition, kVelocity, move);
-  couple(kVelocity, kAttitude, turn);
   widen(kVelocity, kVelocityNoise_m2_s3 * dt_s, kAxes);
-  couple(kPosition, kVelocity, move);
+  move_position(0.5f * dt_s);
 }
 
 float ErrorFilter::update(State group, const float direction[kAxes], float yaw, float innovation,
                           float variance, float correction[kStates + 1]) {
-  float ph[kStates];
-  for (uint8_t i = 0; i < kStates; ++i) {
-    float row[kAxes];
-    gather(group, i, row);
-    ph[i] = yaw * *at(i, kAttitude + kZ) + sparse_dot(direction, row);
-  }
+  float ph[kStates] = {};
+  add_column(ph, kAttitude + kZ, yaw);
+  for (uint8_t i = 0; i < kAxes; ++i) add_column(ph, group + i, direction[i]);
   // The reference's share in the measurement: with the heading it is compared, with the bias it is
   // correlated alone.
   float shared = 0.0f;
@@ -106,7 +103,7 @@ float ErrorFilter::update(State group, const float direction[kAxes], float yaw, 
   } else if (group == kBias) {
     shared = dot(direction, reference_ + 1);
   }
-  const float total = variance + yaw * ph[kAttitude + kZ] + sparse_dot(direction, ph + group);
+  const float total = variance + yaw * ph[kAttitude + kZ] + dot(direction, ph + group);
   const float inverse = 1.0f / total;
   // A torso's velocity and position say nothing of use about its heading or the gyroscope's bias:
   // a bias of 0.1 deg/s shows as 2 mm/s2 of sideways force, as much as 0.01 deg of tilt. What these
@@ -146,12 +143,9 @@ void ErrorFilter::restart(State group, float sigma) {
 }
 
 RELPOS_SHARED float ErrorFilter::along(State group, const float direction[2]) const {
-  const float level[kAxes] = {direction[kX], direction[kY], 0.0f};
   float sum = 0.0f;
   for (uint8_t i = 0; i < kZ; ++i) {
-    float row[kAxes];
-    gather(group, group + i, row);
-    sum += direction[i] * dot(level, row);
+    for (uint8_t j = 0; j < kZ; ++j) sum += direction[i] * direction[j] * *at(group + i, group + j);
   }
   return sum;
 }

@@ -51,10 +51,15 @@ class ErrorFilter {
  private:
   float* at(uint8_t i, uint8_t j);
   const float* at(uint8_t i, uint8_t j) const { return const_cast<ErrorFilter*>(this)->at(i, j); }
-  // The covariances of the three states of a group with another state.
-  void gather(uint8_t group, uint8_t other, float out[kAxes]) const;
-  // x_to += M x_from for two groups, M 3x3; the workhorse of the structured prediction.
-  void couple(State to, State from, const float matrix[kAxes * kAxes]);
+  // From the element in row `other` of the column `state` to the next one.
+  static uint8_t step(uint8_t other, uint8_t state) {
+    return other < state ? static_cast<uint8_t>(kStates - 1 - other) : 1;
+  }
+  void move_position(float dt_s);
+  // x_to += factor x_from for two states: all that the prediction does.
+  void mix(uint8_t to, uint8_t from, float factor);
+  // out += factor P(:, state).
+  void add_column(float out[kStates], uint8_t state, float factor) const;
 
   static const uint8_t kReferenced = 4;  // heading and the three biases, neighbours in State
 

@@ -10,14 +10,6 @@ RELPOS_SHARED float dot(const float a[kAxes], const float b[kAxes]) {
   return sum;
 }
 
-RELPOS_SHARED float sparse_dot(const float a[kAxes], const float b[kAxes]) {
-  float sum = 0.0f;
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    if (a[i] != 0.0f) sum += a[i] * b[i];
-  }
-  return sum;
-}
-
 RELPOS_SHARED float norm(const float v[kAxes]) { return sqrtf(dot(v, v)); }
 
 RELPOS_SHARED void add(float* to, float value) { *to += value; }

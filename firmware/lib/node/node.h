@@ -47,6 +47,10 @@ struct NodeState {
     bool answer_due;
   };
 
+  Mpu9150 imu_;
+  Ak8975 magnetometer_;
+  Pozyx pozyx_;
+  Xbee xbee_;
   NodeClock clock_;
   SampleClock sample_clock_;
   Settings settings_;
@@ -139,11 +143,7 @@ class Node : private NodeState {
 
   Board& board_;
   SettingsStore store_;
-  Mpu9150 imu_;
-  Ak8975 magnetometer_;
   DeadReckoning dead_reckoning_;
-  Pozyx pozyx_;
-  Xbee xbee_;
 };
 
 }  // namespace relpos

@@ -88,7 +88,7 @@ void set_up(Mpu9150& imu, Chips& chips, uint32_t* now_us) {
 
 TEST(set_up_waits_for_the_chip_and_chooses_50_hz_21_hz_500_dps_4_g_bypass) {
   Chips chips;
-  Mpu9150 imu;
+  Mpu9150 imu = Mpu9150();
   uint32_t now_us = 0;
   set_up(imu, chips, &now_us);
   CHECK(imu.running());
@@ -103,7 +103,7 @@ TEST(set_up_waits_for_the_chip_and_chooses_50_hz_21_hz_500_dps_4_g_bypass) {
 
 TEST(a_sample_comes_in_si_units) {
   Chips chips;
-  Mpu9150 imu;
+  Mpu9150 imu = Mpu9150();
   uint32_t now_us = 0;
   set_up(imu, chips, &now_us);
   const int16_t raw[7] = {8192, -8192, 32767, 0, -32768, 655, 1};
@@ -121,7 +121,7 @@ TEST(a_sample_comes_in_si_units) {
 
 TEST(a_sample_is_not_announced_twice) {
   Chips chips;
-  Mpu9150 imu;
+  Mpu9150 imu = Mpu9150();
   uint32_t now_us = 0;
   set_up(imu, chips, &now_us);
   const int16_t raw[7] = {};
@@ -133,7 +133,7 @@ TEST(a_sample_is_not_announced_twice) {
 TEST(another_chip_at_the_address_is_not_set_up) {
   Chips chips;
   chips.inertial[0x75] = 0x71;  // an MPU-9250
-  Mpu9150 imu;
+  Mpu9150 imu = Mpu9150();
   uint32_t now_us = 0;
   CHECK(!ready(imu, chips, &now_us, 3000000));
   CHECK(!imu.running());
@@ -142,7 +142,7 @@ TEST(another_chip_at_the_address_is_not_set_up) {
 
 TEST(a_chip_that_fell_asleep_is_set_up_anew) {
   Chips chips;
-  Mpu9150 imu;
+  Mpu9150 imu = Mpu9150();
   uint32_t now_us = 0xFFFFFF00u;  // and the clock wraps meanwhile
   set_up(imu, chips, &now_us);
   chips.inertial[0x6B] = 0x40;  // brown-out: defaults, no more samples
@@ -157,7 +157,7 @@ TEST(a_chip_that_fell_asleep_is_set_up_anew) {
 
 TEST(a_stuck_bus_is_asked_rarely_and_counted) {
   Chips chips;
-  Mpu9150 imu;
+  Mpu9150 imu = Mpu9150();
   uint32_t now_us = 0;
   set_up(imu, chips, &now_us);
   chips.stuck = true;
@@ -204,7 +204,7 @@ TEST(the_field_comes_adjusted_and_in_the_accelerometer_s_axes_five_times_a_secon
   chips.asa[0] = 128;
   chips.asa[1] = 0;    // half the gain
   chips.asa[2] = 255;  // 383/256 of it
-  Ak8975 compass;
+  Ak8975 compass = Ak8975();
   find(compass, chips);
   CHECK(compass.running());
   put_field(chips, 100, 200, -300);
@@ -218,7 +218,7 @@ TEST(the_field_comes_adjusted_and_in_the_accelerometer_s_axes_five_times_a_secon
 
 TEST(an_overflow_or_a_data_error_gives_no_field) {
   Chips chips;
-  Ak8975 compass;
+  Ak8975 compass = Ak8975();
   find(compass, chips);
   put_field(chips, 1, 1, 1);
   chips.field[0x09] = 0x08;
@@ -233,7 +233,7 @@ TEST(an_overflow_or_a_data_error_gives_no_field) {
 
 TEST(a_measurement_that_is_not_ready_gives_no_field) {
   Chips chips;
-  Ak8975 compass;
+  Ak8975 compass = Ak8975();
   find(compass, chips);
   put_field(chips, 1, 1, 1);
   chips.field[0x02] = 0;
@@ -244,7 +244,7 @@ TEST(a_measurement_that_is_not_ready_gives_no_field) {
 
 TEST(without_the_bypass_the_magnetometer_is_missing_and_is_found_when_it_opens) {
   Chips chips;
-  Ak8975 compass;
+  Ak8975 compass = Ak8975();
   float field[3];
   CHECK_EQUAL(0, fields_in(compass, chips, 120, field));
   CHECK(!compass.running());

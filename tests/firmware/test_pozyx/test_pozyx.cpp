@@ -83,7 +83,7 @@ struct Chip : FakeBoard {
 // Calls the driver whenever it is due; the clock wraps on the way.
 struct Bench {
   Chip chip;
-  Pozyx pozyx;
+  Pozyx pozyx = Pozyx();
   Pozyx::Result result = {0, false, 0, 0, 0};
   uint32_t now_us = 0xFFFFFF00u;
   uint32_t elapsed_us = 0;

@@ -38,7 +38,7 @@ struct Line : FakeBoard {
 
 struct Bench {
   Line line;
-  Xbee xbee;
+  Xbee xbee = Xbee();
 
   // RF payloads in what comes; the last one stays to be looked at.
   uint8_t receive(const uint8_t* bytes, uint16_t count) {

@@ -1,9 +1,10 @@
-#if defined(ARDUINO)
+#if defined(ARDUINO) && !defined(RELPOS_VIRTUAL_BOARD)
 
 #include "arduino_board.h"
 
-#include <Arduino.h>
 #include <avr/eeprom.h>
+#include <avr/interrupt.h>
+#include <avr/io.h>
 #include <avr/sleep.h>
 #include <avr/wdt.h>
 
@@ -23,8 +24,12 @@ constexpr uint8_t kLed = _BV(PB5);
 #endif
 
 constexpr uint8_t kPaint = 0xC5;
-// Timer 0 overflows, and wakes the board, every 1.024 ms.
-constexpr uint32_t kWorthSleepingUs = 1100;
+// Timer 1 is the clock: 16 bits of 4 us, the high ones counted. Sleeping is worth its while from a
+// millisecond on; at most half a turn, so that the alarm is never behind the counter.
+constexpr uint8_t kMicrosecondsACount = 4;
+constexpr uint32_t kWorthSleepingUs = 1000;
+constexpr uint32_t kMostSleepUs = 100000;
+volatile uint16_t turns;
 
 }  // namespace
 
@@ -48,10 +53,13 @@ namespace relpos {
 
 void ArduinoBoard::begin() {
   wdt_enable(WDTO_500MS);
+  TCCR1B = _BV(CS11) | _BV(CS10);  // 16 MHz / 64
+  TIMSK1 = _BV(TOIE1) | _BV(OCIE1A);
   twi::begin();
   uart::begin();
   DDRB |= kLed;
   set_sleep_mode(SLEEP_MODE_IDLE);
+  sei();
 }
 
 wire::ResetCause ArduinoBoard::reset_cause() const {
@@ -64,34 +72,46 @@ wire::ResetCause ArduinoBoard::reset_cause() const {
 }
 
 void ArduinoBoard::idle(uint32_t wait_us) {
-  if (wait_us > kWorthSleepingUs) sleep_mode();
+  if (wait_us < kWorthSleepingUs) return;
+  if (wait_us > kMostSleepUs) wait_us = kMostSleepUs;
+  OCR1A = static_cast<uint16_t>(TCNT1 + static_cast<uint16_t>(wait_us / kMicrosecondsACount));
+  sleep_mode();
 }
 
-BusStatus ArduinoBoard::i2c_transfer(uint8_t address, const uint8_t* first, uint8_t first_count,
-                                     const uint8_t* second, uint8_t second_count, uint8_t* read,
-                                     uint8_t read_count) {
+BusStatus Board::i2c_transfer(uint8_t address, const uint8_t* first, uint8_t first_count,
+                              const uint8_t* second, uint8_t second_count, uint8_t* read,
+                              uint8_t read_count) {
   return twi::transfer(address, first, first_count, second, second_count, read, read_count);
 }
 
-uint8_t ArduinoBoard::uart_write_space() { return uart::write_space(); }
-void ArduinoBoard::uart_write(uint8_t byte) { uart::write(byte); }
-int16_t ArduinoBoard::uart_read() { return uart::read(); }
+uint8_t Board::uart_write_space() { return uart::write_space(); }
+void Board::uart_write(uint8_t byte) { uart::write(byte); }
+int16_t Board::uart_read() { return uart::read(); }
 
-uint8_t ArduinoBoard::storage_read(uint16_t at) {
+uint8_t Board::storage_read(uint16_t at) {
   return eeprom_read_byte(reinterpret_cast<const uint8_t*>(at));
 }
 
 // A byte takes 3.4 ms; the loop goes on meanwhile.
-bool ArduinoBoard::storage_write(uint16_t at, uint8_t value) {
+bool Board::storage_write(uint16_t at, uint8_t value) {
   if (!eeprom_is_ready()) return false;
   uint8_t* address = reinterpret_cast<uint8_t*>(at);
   if (eeprom_read_byte(address) != value) eeprom_write_byte(address, value);
   return true;
 }
 
-uint32_t ArduinoBoard::now_us() { return micros(); }
-void ArduinoBoard::watchdog_reset() { wdt_reset(); }
-void ArduinoBoard::led(bool on) {
+uint32_t Board::now_us() {
+  const uint8_t flags = SREG;
+  cli();
+  const uint16_t low = TCNT1;
+  uint16_t high = turns;
+  // A turn that has not been counted yet, unless it came after the reading.
+  if ((TIFR1 & _BV(TOV1)) != 0 && low < 0x8000) ++high;
+  SREG = flags;
+  return (static_cast<uint32_t>(high) << 16 | low) * kMicrosecondsACount;
+}
+void Board::watchdog_reset() { wdt_reset(); }
+void Board::led(bool on) {
   if (on) {
     PORTB |= kLed;
   } else {
@@ -99,21 +119,24 @@ void ArduinoBoard::led(bool on) {
   }
 }
 
-void ArduinoBoard::reset() {
+void Board::reset() {
   cli();
   wdt_enable(WDTO_15MS);
   for (;;) {
   }
 }
 
-uint16_t ArduinoBoard::free_stack() {
+uint16_t Board::free_stack() {
   const uint8_t* at = &__heap_start;
   while (at < reinterpret_cast<const uint8_t*>(SP) && *at == kPaint) ++at;
   return static_cast<uint16_t>(at - &__heap_start);
 }
 
-void ArduinoBoard::mark(uint8_t value) { GPIOR0 = value; }
+void Board::mark(uint8_t value) { GPIOR0 = value; }
 
 }  // namespace relpos
+
+ISR(TIMER1_OVF_vect) { ++turns; }
+EMPTY_INTERRUPT(TIMER1_COMPA_vect)  // the alarm's work is done by waking
 
 #endif

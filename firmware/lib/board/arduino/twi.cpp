@@ -2,7 +2,7 @@
 
 #include "twi.h"
 
-#include <Arduino.h>
+#include <avr/io.h>
 #include <util/delay.h>
 
 namespace relpos {
@@ -25,7 +25,7 @@ constexpr uint8_t kScl = _BV(PC5);
 
 constexpr uint32_t kBitRate = 400000;
 // The longest transaction, 14 bytes read, takes 0.44 ms; the Pozyx may stretch its clock besides.
-constexpr uint32_t kMostUs = 1000;
+constexpr uint16_t kMostCounts = 1000 / 4;  // of timer 1, the board's clock
 
 enum Status : uint8_t {  // TWSR without the prescaler
   kStart = 0x08,
@@ -40,20 +40,24 @@ enum Status : uint8_t {  // TWSR without the prescaler
   kDataReadNack = 0x58
 };
 
+uint16_t started;  // the transaction, by the clock
+
+bool late() { return static_cast<uint16_t>(TCNT1 - started) > kMostCounts; }
+
 // Starts what `control` asks for and waits. 0 (no status of a master) where the deadline passes.
-uint8_t run(uint8_t control, uint32_t start_us) {
+uint8_t run(uint8_t control) {
   TWCR = static_cast<uint8_t>(control | _BV(TWINT) | _BV(TWEN));
   while ((TWCR & _BV(TWINT)) == 0) {
-    if (micros() - start_us > kMostUs) return 0;
+    if (late()) return 0;
   }
   return TWSR & 0xF8;
 }
 
-BusStatus open(uint8_t address_and_direction, uint32_t start_us) {
-  const uint8_t started = run(_BV(TWSTA), start_us);
-  if (started != kStart && started != kRepeatedStart) return BusStatus::kTimeout;
+BusStatus open(uint8_t address_and_direction) {
+  const uint8_t begun = run(_BV(TWSTA));
+  if (begun != kStart && begun != kRepeatedStart) return BusStatus::kTimeout;
   TWDR = address_and_direction;
-  switch (run(0, start_us)) {
+  switch (run(0)) {
     case kAddressWriteAck:
     case kAddressReadAck:
       return BusStatus::kOk;
@@ -65,23 +69,23 @@ BusStatus open(uint8_t address_and_direction, uint32_t start_us) {
   }
 }
 
-BusStatus write(uint8_t address, const uint8_t* bytes, uint8_t count, uint32_t start_us) {
-  const BusStatus opened = open(static_cast<uint8_t>(address << 1), start_us);
+BusStatus write(uint8_t address, const uint8_t* bytes, uint8_t count) {
+  const BusStatus opened = open(static_cast<uint8_t>(address << 1));
   if (opened != BusStatus::kOk) return opened;
   for (; count != 0; --count) {
     TWDR = *bytes++;
-    const uint8_t sent = run(0, start_us);
+    const uint8_t sent = run(0);
     if (sent == kDataWriteNack) return BusStatus::kDataNack;
     if (sent != kDataWriteAck) return BusStatus::kTimeout;
   }
   return BusStatus::kOk;
 }
 
-BusStatus read_bytes(uint8_t address, uint8_t* bytes, uint8_t count, uint32_t start_us) {
-  const BusStatus opened = open(static_cast<uint8_t>(address << 1 | 1), start_us);
+BusStatus read_bytes(uint8_t address, uint8_t* bytes, uint8_t count) {
+  const BusStatus opened = open(static_cast<uint8_t>(address << 1 | 1));
   if (opened != BusStatus::kOk) return opened;
   for (; count != 0; --count) {
-    const uint8_t got = run(count > 1 ? _BV(TWEA) : 0, start_us);
+    const uint8_t got = run(count > 1 ? _BV(TWEA) : 0);
     if (got != (count > 1 ? kDataReadAck : kDataReadNack)) return BusStatus::kTimeout;
     *bytes++ = TWDR;
   }
@@ -121,14 +125,14 @@ void begin() {
 BusStatus transfer(uint8_t address, const uint8_t* first, uint8_t first_count,
                    const uint8_t* second, uint8_t second_count, uint8_t* read,
                    uint8_t read_count) {
-  const uint32_t start_us = micros();
+  started = TCNT1;
   BusStatus status = BusStatus::kOk;
-  if (first_count != 0 || read_count == 0) status = write(address, first, first_count, start_us);
+  if (first_count != 0 || read_count == 0) status = write(address, first, first_count);
   if (status == BusStatus::kOk && second_count != 0) {
-    status = write(address, second, second_count, start_us);
+    status = write(address, second, second_count);
   }
   if (status == BusStatus::kOk && read_count != 0) {
-    status = read_bytes(address, read, read_count, start_us);
+    status = read_bytes(address, read, read_count);
   }
   if (status == BusStatus::kTimeout) {
     recover();
@@ -136,7 +140,7 @@ BusStatus transfer(uint8_t address, const uint8_t* first, uint8_t first_count,
   }
   TWCR = _BV(TWINT) | _BV(TWEN) | _BV(TWSTO);
   while ((TWCR & _BV(TWSTO)) != 0) {
-    if (micros() - start_us > kMostUs) {
+    if (late()) {
       recover();
       return BusStatus::kTimeout;
     }
