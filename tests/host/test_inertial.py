@@ -94,11 +94,13 @@ def test_the_covariance_is_predicted_as_f_p_f_plus_q(seed):
     assert np.max(np.abs(got - expected) / scale) < 1e-5
 
 
-def test_the_covariance_stays_positive_definite_over_twenty_minutes(team):
+@pytest.mark.parametrize("magnetic", [False, True])
+def test_the_covariance_stays_positive_definite_over_twenty_minutes(team, magnetic):
     imu = np.tile(recorded(team[0]), (7, 1))
+    field = np.tile(team[0].magnetic_field_ut[::4], (7, 1)) if magnetic else None
     # Looked at after ever longer walks, at every phase of the step.
     for count in np.linspace(500, len(imu), 30).astype(int):
-        result = replay.reckon(imu[:count])
+        result = replay.reckon(imu[:count], None if field is None else field[:count])
         sigma = np.sqrt(np.diag(result.covariance))
         live = sigma > 0  # the position is known exactly just after a step
         assert np.sum(live) >= 9
