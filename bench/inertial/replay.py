@@ -77,11 +77,6 @@ def build() -> ctypes.CDLL:
     return library
 
 
-def default_gain() -> float:
-    """The library's step gain for who was never calibrated."""
-    return float(build().inertial_default_gain())
-
-
 @dataclass
 class Recording:
     """Samples at 50 Hz and what is known about the walk."""
@@ -299,3 +294,16 @@ def score_steps(recording: Recording, step_times_s: Array) -> StepScore:
         found = pairs_within(inside, contacts, tolerance_s)
         scores.append(StepScore(len(contacts), found, len(inside) - found, float(offset_s)))
     return max(scores, key=lambda score: (score.found - score.extra, -abs(score.offset_s)))
+
+
+def calibrate(recording: Recording, true_distance_m: float) -> float:
+    """Step gain with which the walk comes out at its length; the length is not linear in it."""
+    gain = float(build().inertial_default_gain())
+    for _ in range(6):
+        walked_m = reckon(
+            recording.imu, leg_length_m=recording.leg_length_m, step_gain=gain
+        ).distance_m
+        if abs(walked_m / true_distance_m - 1.0) < 1e-3:
+            break
+        gain *= true_distance_m / walked_m
+    return gain

@@ -3,14 +3,7 @@
 import numpy as np
 import pytest
 
-from relpos.emulator.replay import (
-    DEFAULT_GAIN_PERMILLE,
-    Wearer,
-    calibrate,
-    play,
-    replay_imu,
-    surroundings_of,
-)
+from relpos.emulator.replay import Wearer, calibrate, play, replay_imu, surroundings_of
 from relpos.errors import DataError
 from relpos.runs import Description, Run
 from relpos.runs.imu import ImuRecording
@@ -150,35 +143,11 @@ def test_a_gap_is_silence_and_not_motion(walker):
     assert len(replay.steps) > 60
 
 
-def test_a_calibration_walk_sets_the_gain_that_makes_it_come_out_as_weighed(walker):
+def test_a_calibration_walk_sets_the_gain_that_makes_it_come_out(walker):
     recording = recorded(walker, even(100.0))
-    plain_m = play(1, recording, Wearer(0.9)).distance_m
-    found = calibrate(1, [recording], [1.08 * plain_m], 0.9)
-    assert found.measured_m == (plain_m,)
-    assert 1.02 < found.scale.scale < 1.08
-    assert play(1, recording, Wearer(0.9, found.gain_permille)).distance_m == pytest.approx(
-        found.scale.scale * plain_m, rel=0.01
-    )
-    # Ten walks that agree leave little of what the stature said.
-    many = calibrate(1, [recording] * 10, [1.08 * plain_m] * 10, 0.9)
-    assert many.scale.scale == pytest.approx(1.08, abs=0.007)
-    assert many.gain_permille > found.gain_permille
-
-
-def test_calibration_begins_with_the_firmwares_own_gain(walker):
-    recording = recorded(walker, even(100.0, 40.0))
-    told = play(1, recording, Wearer(0.9, DEFAULT_GAIN_PERMILLE))
-    assert [s.length_m for s in told.steps] == [
-        s.length_m for s in play(1, recording, Wearer(0.9)).steps
-    ]
-
-
-def test_a_walk_that_cannot_be_true_sets_no_gain(walker):
-    recording = recorded(walker, even(100.0))
-    plain_m = play(1, recording, Wearer(0.9)).distance_m
-    found = calibrate(1, [recording], [1.3 * plain_m], 0.9)
-    assert found.gain_permille is None
-    assert found.scale.used == (False,)
+    true_m = 1.1 * play(1, recording, Wearer(0.9, 1250)).distance_m
+    gain = calibrate(1, recording, true_m, 0.9)
+    assert play(1, recording, Wearer(0.9, gain)).distance_m == pytest.approx(true_m, rel=0.005)
 
 
 class InertialRun(Run):
@@ -222,10 +191,9 @@ def test_calibration_needs_a_true_distance_and_the_node(walker):
     recording = recorded(walker, even(100.0, 30.0))
     run = run_of({1: recording})
     with pytest.raises(DataError, match="true_distance_m"):
-        replay_imu(run, calibration=[run_of({1: recording})])
-    others = run_of({2: recording, 3: recording}, true_distance_m=20.0)
+        replay_imu(run, calibration=run_of({1: recording}))
     with pytest.raises(DataError, match="node 1"):
-        replay_imu(run, calibration=[others])
+        replay_imu(run, calibration=run_of({2: recording, 3: recording}, true_distance_m=20.0))
 
 
 def test_what_cannot_be_played_is_refused(walker):
@@ -237,10 +205,10 @@ def test_what_cannot_be_played_is_refused(walker):
         replay_imu(run_of({}))
     still = recorded(walker, np.linspace(0.0, 4.0, 400))
     with pytest.raises(DataError, match="no step"):
-        calibrate(1, [still], [20.0], None)
+        calibrate(1, still, 20.0, None)
     with pytest.raises(DataError, match="must be positive"):
-        calibrate(1, [still], [0.0], None)
+        calibrate(1, still, 0.0, None)
     with pytest.raises(DataError, match=r"memory: node 1: .*LEG_LENGTH"):
         replay_imu(run_of({1: still}, stature_m=0.1))
-    with pytest.raises(DataError, match="no step gain makes 4000 m"):
-        calibrate(1, [recorded(walker, even(100.0, 30.0))] * 2, [2000.0] * 2, None)
+    with pytest.raises(DataError, match="no step gain makes 2000 m"):
+        calibrate(1, recorded(walker, even(100.0, 30.0)), 2000.0, None)

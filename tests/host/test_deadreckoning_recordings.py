@@ -122,8 +122,7 @@ def test_twenty_metres_are_twenty_metres_from_the_stature_alone(lowerback):
 def test_one_calibration_walk_brings_a_person_to_scale(lowerback):
     assert lowerback["calibrated_distance_error_percent_mean_abs"] < 7.2
     # Where no samples are lost the pendulum with given contacts reaches 3.4 %.
-    assert lowerback["intact_calibrated_distance_error_percent_mean_abs"] < 5.0
-    assert lowerback["intact_ratio_calibrated_distance_error_percent_mean_abs"] < 4.0
+    assert lowerback["intact_calibrated_distance_error_percent_mean_abs"] < 4.0
 
 
 @needs("walk_lowerback_20m")

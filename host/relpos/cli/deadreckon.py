@@ -26,11 +26,8 @@ def deadreckon(
         typer.Option(metavar="M", min=0.5, max=2.5, help="The wearer's height in metres."),
     ] = None,
     calibrate_from: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="RUN2",
-            help="A walk of the same wearer with true_distance_m; may be given several times.",
-        ),
+        Path | None,
+        typer.Option(metavar="RUN2", help="A walk of the same wearer with true_distance_m."),
     ] = None,
     out: Annotated[
         Path | None,
@@ -47,16 +44,18 @@ def deadreckon(
     recording = load_run(run)
     if not recording.load_imu():
         raise DataError(f"{run}: no inertial data in this run (imu.csv)")
-    walks = []
-    for path in calibrate_from or ():
-        walk = load_run(path)
+    if calibrate_from is not None:
+        walk = load_run(calibrate_from)
         if walk.description.true_distance_m is None:
-            raise DataError(f"{path}: run.toml gives no true_distance_m to calibrate with")
+            raise DataError(
+                f"{calibrate_from}: run.toml gives no true_distance_m to calibrate with"
+            )
         if not walk.load_imu():
-            raise DataError(f"{path}: no inertial data in this run (imu.csv)")
-        walks.append(walk)
+            raise DataError(f"{calibrate_from}: no inertial data in this run (imu.csv)")
+    else:
+        walk = None
     with output.working("running the firmware over the recording"):
-        played = replay_imu(recording, board=str(board), stature_m=stature, calibration=walks)
+        played = replay_imu(recording, board=str(board), stature_m=stature, calibration=walk)
 
     nodes = {str(node): _figures(part) for node, part in sorted(played.items())}
     if out is not None:
@@ -82,15 +81,6 @@ def deadreckon(
                 f"node {node}: {part.repeated} of {part.samples} samples repeat a time: "
                 "the first of each time is played"
             )
-        if part.calibration is not None:
-            for walk, used, measured_m in zip(
-                walks, part.calibration.scale.used, part.calibration.measured_m, strict=True
-            ):
-                if not used:
-                    output.remark(
-                        f"node {node}: {walk.name} comes out as {measured_m:.2f} m, too far from "
-                        f"its {walk.description.true_distance_m:g} m to be believed alone: not used"
-                    )
         if part.rate_hz < LEAST_RATE_HZ:
             output.remark(
                 f"node {node}: {part.rate_hz:.3g} samples a second are too few to see steps: "
@@ -116,7 +106,7 @@ def deadreckon(
 
 def _figures(part: Played) -> dict[str, Any]:
     """What is printed of one node; the end is in its heading frame at the start."""
-    leg_m, calibration = part.wearer.leg_length_m, part.calibration
+    leg_m = part.wearer.leg_length_m
     end, heading_rad = 0j, 0.0
     for motion in part.replay.motions:
         end += complex(motion.dx_m, motion.dy_m) * cmath.exp(1j * heading_rad)
@@ -129,8 +119,6 @@ def _figures(part: Played) -> dict[str, Any]:
         "y_m": round(end.imag, 3),
         "leg_length_m": None if leg_m is None else round(leg_m, 4),
         "step_gain_permille": part.wearer.step_gain_permille,
-        "step_scale": None if calibration is None else round(calibration.scale.scale, 4),
-        "step_scale_sigma": None if calibration is None else round(calibration.scale.sigma, 4),
         "samples": part.samples,
         "clipped_samples": part.replay.clipped,
     }

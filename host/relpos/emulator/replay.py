@@ -7,13 +7,12 @@ the recording's clock. Nothing is taken from the recording but its samples.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from relpos.calibration.walks import StepScale, weigh_walks
 from relpos.errors import DataError, DeviceError
 from relpos.link.decoder import Decoder
 from relpos.measurements import Motion, Step
@@ -49,10 +48,12 @@ LEAST_RATE_HZ = 20.0
 """Of a recording that still shows steps: the strides' harmonics reach 8 Hz."""
 LEG_OF_STATURE = 0.53
 STANDARD_PRESSURE_PA = 101_325.0
-DEFAULT_GAIN_PERMILLE = 1250
-"""The firmware's: what it uses for who was never calibrated."""
+FIRST_GAIN_PERMILLE = 1250
+CALIBRATION_PASSES = 4
 GAINS_PERMILLE = (300, 3000)
 """What the node takes (``firmware/lib/node/node.cpp``)."""
+CALIBRATED_WITHIN = 0.001
+"""The gain is found when the calibration walk comes out this close to its true length."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,6 @@ class Played:
     repeated: int
     """Samples at the time of the one before, which were left out."""
     rate_hz: float
-    calibration: Calibration | None = None
 
 
 def surroundings_of(recording: ImuRecording) -> Surroundings:
@@ -273,48 +273,36 @@ def play(
     return Replay(motions, steps, counts, int(beyond.sum()))
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """A step gain from walks of known length, and what it was made from."""
-
-    gain_permille: int | None
-    """None where no walk could be used: the stature's gain stays."""
-    scale: StepScale
-    measured_m: tuple[float, ...]
-
-
 def calibrate(
     node: int,
-    recordings: Sequence[ImuRecording],
-    true_m: Sequence[float],
+    recording: ImuRecording,
+    true_distance_m: float,
     leg_length_m: float | None,
     board: BoardKind | str = BoardKind.NATIVE,
-) -> Calibration:
-    """Step gain from walks of one wearer, weighed as :func:`weigh_walks` does.
+) -> int:
+    """Step gain in permille with which the walk comes out at ``true_distance_m``.
 
-    A walk's length goes with the gain (a gain 5 % larger makes the recorded walks 5.03 % longer at
-    the median), so one pass tells. DataError where no step is found, a length is not positive, or
-    the node does not take the gain.
+    The step length is not quite linear in the gain (the filter weighs it), hence more than one
+    pass. DataError where no step is found, the distance is not positive, or no gain leads there.
     """
-    for length_m in true_m:
-        if not length_m > 0.0:
-            raise DataError(
-                f"the calibration walk's true_distance_m is {length_m:g}: it must be positive"
-            )
-    wearer = Wearer(leg_length_m, DEFAULT_GAIN_PERMILLE)
-    measured_m = tuple(play(node, part, wearer, board).distance_m for part in recordings)
-    if min(measured_m) <= 0.0:
-        raise DataError(f"node {node}: no step is found in the calibration walk")
-    scale = weigh_walks(measured_m, true_m, stature_known=leg_length_m is not None)
-    if not any(scale.used):
-        return Calibration(None, scale, measured_m)
-    gain = round(DEFAULT_GAIN_PERMILLE * scale.scale)
-    if not GAINS_PERMILLE[0] <= gain <= GAINS_PERMILLE[1]:
+    if not true_distance_m > 0.0:
         raise DataError(
-            f"node {node}: the calibration walks come out as {sum(measured_m):.2f} m and no step "
-            f"gain makes {sum(true_m):g} m of them: is true_distance_m right?"
+            f"the calibration walk's true_distance_m is {true_distance_m:g}: it must be positive"
         )
-    return Calibration(gain, scale, measured_m)
+    gain = FIRST_GAIN_PERMILLE
+    for _ in range(CALIBRATION_PASSES):
+        walked_m = play(node, recording, Wearer(leg_length_m, gain), board).distance_m
+        if walked_m <= 0.0:
+            raise DataError(f"node {node}: no step is found in the calibration walk")
+        if abs(walked_m / true_distance_m - 1.0) < CALIBRATED_WITHIN:
+            break
+        gain = round(gain * true_distance_m / walked_m)
+        if not GAINS_PERMILLE[0] <= gain <= GAINS_PERMILLE[1]:
+            raise DataError(
+                f"node {node}: the calibration walk comes out as {walked_m:.2f} m and no step gain "
+                f"makes {true_distance_m:g} m of it: is true_distance_m right?"
+            )
+    return gain
 
 
 def replay_imu(
@@ -322,36 +310,32 @@ def replay_imu(
     *,
     board: BoardKind | str = BoardKind.NATIVE,
     stature_m: float | None = None,
-    calibration: Sequence[Run] = (),
+    calibration: Run | None = None,
 ) -> dict[int, Played]:
     """What the firmware reports while the run's ``imu.csv`` is played, for every node in it.
 
     The leg length is the run's own, or 0.53 of ``stature_m`` or of the run's stature. With
-    ``calibration``, walks of the same wearer with ``true_distance_m``, the step gain comes from
-    them. DataError or DeviceError where that cannot be done.
+    ``calibration``, a walk of the same wearer with ``true_distance_m``, the step gain comes from
+    it. DataError or DeviceError where that cannot be done.
     """
     recordings = run.load_imu()
     if not recordings:
         raise DataError(f"{run.name}: no inertial data (imu.csv)")
-    walks = [(walk, walk.load_imu()) for walk in calibration]
+    walks = calibration.load_imu() if calibration is not None else {}
     played: dict[int, Played] = {}
     for node, recording in recordings.items():
         leg_m = _leg_length_m(run, node, stature_m)
-        calibrated = None
-        if walks:
-            own, lengths_m = [], []
-            for walk, parts in walks:
-                part = parts.get(node) or (next(iter(parts.values())) if len(parts) == 1 else None)
-                distance_m = walk.description.true_distance_m
-                if part is None or distance_m is None:
-                    raise DataError(
-                        f"{walk.name}: no walk of node {node} with true_distance_m in it"
-                    )
-                own.append(part)
-                lengths_m.append(distance_m)
-            # A calibration walk's own leg length would put another gain beside this one.
-            calibrated = calibrate(node, own, lengths_m, leg_m, board)
-        wearer = Wearer(leg_m, None if calibrated is None else calibrated.gain_permille)
+        gain = None
+        if calibration is not None:
+            walk = walks.get(node) or (next(iter(walks.values())) if len(walks) == 1 else None)
+            distance_m = calibration.description.true_distance_m
+            if walk is None or distance_m is None:
+                raise DataError(
+                    f"{calibration.name}: no walk of node {node} with true_distance_m in it"
+                )
+            # The calibration walk's own leg length would put another gain beside this one.
+            gain = calibrate(node, walk, distance_m, leg_m, board)
+        wearer = Wearer(leg_m, gain)
         try:
             replay = play(node, recording, wearer, board)
         except DataError as error:
@@ -363,7 +347,6 @@ def replay_imu(
             samples=len(recording.time_s),
             repeated=len(recording.time_s) - len(time_s),
             rate_hz=float(1.0 / np.median(np.diff(time_s))),
-            calibration=calibrated,
         )
     return played
 

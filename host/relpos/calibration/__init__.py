@@ -1,1 +1,0 @@
-"""What a node's sensors and its wearer's steps are wrong by, found from what the node tells."""
