@@ -40,6 +40,7 @@ from relpos.simulation.activities import ACTIVITIES, SCRIPTS
 from relpos.simulation.indoor import INDOOR
 from relpos.simulation.motion import WearerTruth
 from relpos.simulation.solo import make_walker
+from relpos.simulation.wearer import PLACES
 
 Array = NDArray[np.float64]
 
@@ -137,6 +138,9 @@ def simulate(
     return *sense(truth, rng, calibrated), truth
 
 
+BROKEN_BY = ("x_m", "y_m", "heading_rad", "variance_along_m2", "variance_heading_rad2")
+
+
 # -- figures ----------------------------------------------------------------------------------
 
 
@@ -144,6 +148,10 @@ def simulate(
 class Walk:
     """What one walk came to. Errors are claimed less true."""
 
+    place: str
+    """Where the sensor sat."""
+    broken: bool
+    """The filter gave something that is no number: in none of the other figures."""
     distance_error: float
     """Relative."""
     drift_deg_min: float
@@ -202,6 +210,8 @@ def judge(imu: Array, field_ut: Array | None, truth: WearerTruth) -> Walk:
     drift = error[-50:].mean() - error[first : first + 50].mean()
     distance = truth.distance_m
     walk = Walk(
+        place=truth.wearer.place,
+        broken=not all(np.isfinite(rows[name]).all() for name in BROKEN_BY),
         distance_error=result.distance_m / distance - 1.0 if distance > 1.0 else float("nan"),
         drift_deg_min=float(np.degrees(drift) / minutes),
         end_error_m=float(np.linalg.norm(claimed[-1] - actual[-1])),
@@ -308,6 +318,7 @@ class Condition:
 
 CONDITIONS = (
     Condition("disturbed magnetometer"),
+    Condition("disturbed magnetometer, calibrated", calibrated=True),
     Condition("no magnetometer", magnetometer=False),
     Condition("no magnetometer, calibrated", magnetometer=False, calibrated=True),
     Condition("started walking, disturbed magnetometer", begin_walking=True),
@@ -327,12 +338,18 @@ def run(kind: str, condition: Condition, seed: int) -> Walk:
 
 def print_papers(walks: dict[tuple[str, str], list[Walk]]) -> None:
     """Print the 310 m walks: heading, distance, end and normalised errors."""
-    for (kind, condition), group in walks.items():
+    for (kind, condition), everybody in walks.items():
+        group = [w for w in everybody if not w.broken]
         drift = np.abs([w.drift_deg_min for w in group])
         distance = 100 * np.array([w.distance_error for w in group])
         end = np.array([w.end_error_m for w in group])
         aligned = np.array([w.aligned_end_error_m for w in group])
-        print(f"{kind}, {condition} ({len(group)} wearers)")
+        lost = (
+            f", {len(everybody) - len(group)} left out: no numbers"
+            if len(group) < len(everybody)
+            else ""
+        )
+        print(f"{kind}, {condition} ({len(everybody)} wearers{lost})")
         print(
             f"  heading drift {np.median(drift):.2f} deg/min median, "
             f"{np.percentile(drift, 90):.2f} p90; distance {distance.mean():+.1f} +- "
@@ -350,10 +367,22 @@ def print_papers(walks: dict[tuple[str, str], list[Walk]]) -> None:
             f"no variance claimed in {sum(w.without_variance for w in group)} of "
             f"{sum(w.windows for w in group)} windows"
         )
+        by_place = {p: [100 * w.distance_error for w in group if w.place == p] for p in PLACES}
+        print(
+            "  distance by place: "
+            + ", ".join(
+                f"{place} {np.mean(e):+.1f} +- {np.std(e):.1f} % ({len(e)})"
+                for place, e in by_place.items()
+                if e
+            )
+        )
 
 
-def print_activities(walks: list[Walk]) -> None:
+def print_activities(everybody: list[Walk]) -> None:
     """Print what was claimed and what was true, by activity."""
+    walks = [w for w in everybody if not w.broken]
+    if len(walks) < len(everybody):
+        print(f"{len(everybody) - len(walks)} walks left out: the filter gave no numbers")
     print(
         f"{'activity':12s} {'true m':>8s} {'claimed':>8s} {'ratio':>6s} {'steps':>6s} "
         f"{'found %':>8s} {'extra %':>8s}  NEES along, across, heading"
