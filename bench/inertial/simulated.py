@@ -171,6 +171,8 @@ class Walk:
     found: dict[str, int] = field(default_factory=dict)
     extra: dict[str, int] = field(default_factory=dict)
     steps: dict[str, int] = field(default_factory=dict)
+    straights: list[tuple[float, float, float]] = field(default_factory=list)
+    """Speed, true and claimed distance of each stretch of walking of more than 8 m."""
     squares: dict[str, list[tuple[float, float, float]]] = field(default_factory=dict)
     """By activity: along, across, heading of windows that lie mostly in it."""
 
@@ -268,16 +270,14 @@ def _by_activity(
     labels: NDArray[np.int8],
 ) -> None:
     step_s = result.step_ticks / 50.0
-    label_of = labels[np.minimum(result.step_ticks, len(labels) - 1)]
     lengths = result.step_lengths_m
     moved = np.diff(path, prepend=path[0])
     # Detection lags the mid-stance by the detector's own filters: one offset for the walk.
     offsets = np.arange(-0.3, 0.31, 0.05)
-    best = max(
-        offsets,
-        key=lambda o: replay.pairs_within(step_s + o, truth.steps.time_s, 0.25),
-        default=0.0,
-    )
+    best = max(offsets, key=lambda o: replay.pairs_within(step_s + o, truth.steps.time_s, 0.25))
+    # A step's way lies before its mid-stance: a quarter of a second keeps it with its activity.
+    place = np.clip(((step_s + best - 0.25) * 50).astype(int), 0, len(labels) - 1)
+    label_of = labels[place]
     for index, name in enumerate(ACTIVITIES):
         inside = labels == index
         if not inside.any():
@@ -290,6 +290,13 @@ def _by_activity(
         walk.extra[name] = max(len(mine) - replay.pairs_within(mine, truth.steps.time_s, 0.25), 0)
         walk.true_m[name] = float(moved[inside].sum())
         walk.claimed_m[name] = float(lengths[label_of == index].sum())
+    for begin, end, kind in truth.intervals:
+        span = slice(int(begin * 50), int(end * 50))
+        true_m = float(moved[span].sum())
+        if kind == "walk" and true_m > 8.0:
+            inside = (place >= span.start) & (place < span.stop)
+            speed = true_m / (end - begin)
+            walk.straights.append((speed, true_m, float(lengths[inside].sum())))
 
 
 def interval(groups: Sequence[Sequence[float]]) -> str:
@@ -410,6 +417,20 @@ def print_activities(everybody: list[Walk]) -> None:
     )
 
 
+def print_speeds(walks: list[Walk]) -> None:
+    """Print the distance's error by walking speed."""
+    rows = np.array([s for w in walks if not w.broken for s in w.straights])
+    print(f"{'walking at':>14s} {'stretches':>9s}  distance error of a stretch")
+    for low, high in pairwise((0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.9)):
+        some = rows[(rows[:, 0] >= low) & (rows[:, 0] < high)]
+        if len(some):
+            error = 100 * (some[:, 2] / some[:, 1] - 1.0)
+            print(
+                f"{low:.1f} to {high:.1f} m/s {len(some):9d}  {error.mean():+.1f} +- "
+                f"{error.std():.1f} %, mean absolute {np.abs(error).mean():.1f} %"
+            )
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
@@ -433,7 +454,10 @@ def main() -> None:
             kinds = [options.kind] if options.kind else ["mixed", "daily", "speeds", "pauses"]
             for kind in kinds:
                 print(f"\nscript {kind}, {options.wearers} wearers, {condition.name}")
-                print_activities(pool.map(partial(run, kind, condition), seeds))
+                walks = pool.map(partial(run, kind, condition), seeds)
+                print_activities(walks)
+                if kind == "speeds":
+                    print_speeds(walks)
 
 
 if __name__ == "__main__":
