@@ -116,7 +116,7 @@ void DeadReckoning::reset() {
   step_heading_[kX] = 1.0f;
 }
 
-bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
+RELPOS_APART bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
   bool good = dt_s > 0.0f && dt_s <= 0.2f, saturated = false;
   for (uint8_t i = 0; i < kAxes; ++i) {
     const float force = fabsf(sample.acceleration_m_s2[i]);
@@ -138,7 +138,7 @@ bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
   return true;
 }
 
-void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_s) {
+RELPOS_APART void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_s) {
   if (ticks_ == 1) mean_force_m_s2_ = force;
   follow(&mean_force_m_s2_, force, dt_s * (1.0f / kForceMean_s));
   const float most_rad = kQuietRate_rad_s * dt_s;
@@ -152,7 +152,7 @@ void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_
 
 // Start: the attitude of the first sample is found from the mean force while the gyroscope already
 // carries the frame along, so that walking directly after switching on loses nothing.
-void DeadReckoning::gather(const ImuSample& sample, const float force[kAxes], float dt_s) {
+RELPOS_APART void DeadReckoning::gather(const ImuSample& sample, const float force[kAxes], float dt_s) {
   if (quiet_s_ == 0.0f) {
     // Movement after a quiet beginning ends the gathering before it spoils the mean.
     if (!moved_ && since_.time_s >= kShortStill_s) {
@@ -204,7 +204,7 @@ void DeadReckoning::initialise(bool still) {
   displacement_.initialised = true;
 }
 
-void DeadReckoning::update(const ImuSample& sample, float dt_s) {
+RELPOS_APART void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   ++ticks_;
   for (uint8_t i = 0; i < kHolds; ++i) {
     if (hold_[i] > 0) --hold_[i];
@@ -360,7 +360,7 @@ void DeadReckoning::aim(const float rotation[kAxes * kAxes], float heading_rad) 
 
 // A sensor turned on the body turns the heading axis one way and the forward axis the other: both are
 // turned back, so that the wearer's heading is what it was.
-void DeadReckoning::watch_mounting(const float rotation[kAxes * kAxes]) {
+RELPOS_APART void DeadReckoning::watch_mounting(const float rotation[kAxes * kAxes]) {
   const float turned_rad = wrap_angle(forward_.offset_rad() - mounting_rad_);
   if (settled_steps_ < kSettledSteps) {
     if (forward_.found()) ++settled_steps_;
@@ -410,7 +410,7 @@ void DeadReckoning::work(const float rotation[kAxes * kAxes]) {
   }
 }
 
-void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
+RELPOS_APART void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
   State group = kPosition;
   float direction[kAxes] = {0.0f, 0.0f, 0.0f};
   float innovation, variance, yaw = 0.0f;
@@ -560,7 +560,7 @@ void DeadReckoning::commit_step() {
   }
 }
 
-void DeadReckoning::commit_still() {
+RELPOS_APART void DeadReckoning::commit_still() {
   const bool still = quiet_s_ >= kQuiet_s;
   if (still) velocity_known_ = true;
   if (still && forward_.found()) {
@@ -582,7 +582,7 @@ void DeadReckoning::commit_still() {
   filter_.restart(kPosition, 0.0f);
 }
 
-void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
+RELPOS_APART void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
   displacement_.magnetic_heading_valid = false;
   if (!displacement_.initialised) return;
   float rotation[kAxes * kAxes], field[kAxes];
