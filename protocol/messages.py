@@ -466,9 +466,9 @@ CALIBRATION_GROUPS = {
 }
 """A node's calibration: 16-bit words in this order, all in the axes of accelerometer and gyroscope.
 All words zero change nothing. SET_CALIBRATION stages one word (value = index x 65536 + the word as
-unsigned), COMMIT_CALIBRATION, whose value is the CRC of all staged words (little-endian, seeded like
-a frame's), stores all of them and restarts the node with them; READ_CALIBRATION (value = index x
-65536) tells a word that is in force."""
+unsigned), COMMIT_CALIBRATION, whose value is the CRC of all staged words (little-endian, seeded
+like a frame's), stores all of them and restarts the node with them; READ_CALIBRATION (value = index
+x 65536) tells a word that is in force."""
 CALIBRATION = tuple(word for group in CALIBRATION_GROUPS.values() for word in group)
 
 

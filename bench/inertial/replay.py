@@ -22,13 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
+from relpos.calibration.steps import LEG_OF_STATURE, believed_scale
+
 Array = NDArray[np.float64]
 
 ROOT = Path(__file__).resolve().parents[2]
 LIBRARY = ROOT / "firmware" / "lib" / "inertial"
 RATE_HZ = 50.0
 BANDWIDTH_HZ = 20.0  # the MPU-9150's DLPF 4: 21 Hz
-LEG_OF_STATURE = 0.53  # Zijlstra and Hof 1997
 DEFAULT_STATURE_M = 1.75
 
 ROW = np.dtype(
@@ -298,8 +299,8 @@ def score_steps(recording: Recording, step_times_s: Array) -> StepScore:
 
 
 def calibrate(recording: Recording, true_distance_m: float) -> float:
-    """Step gain with which the walk comes out at its length; the length is not linear in it."""
-    gain = float(build().inertial_default_gain())
+    """Step gain after a walk of known length, as ``relpos deadreckon --calibrate-from`` has it."""
+    first = gain = float(build().inertial_default_gain())
     for _ in range(6):
         walked_m = reckon(
             recording.imu, leg_length_m=recording.leg_length_m, step_gain=gain
@@ -307,4 +308,4 @@ def calibrate(recording: Recording, true_distance_m: float) -> float:
         if abs(walked_m / true_distance_m - 1.0) < 1e-3:
             break
         gain *= true_distance_m / walked_m
-    return gain
+    return first * believed_scale([gain / first])

@@ -386,9 +386,11 @@ void DeadReckoning::capture_span() {
 }
 
 void DeadReckoning::predict_attitude(const float rotation[kAxes * kAxes]) {
+  // What the heading loses while it turns, never what a compass gives back: totals only grow.
+  const float before = filter_.covariance(kAttitude + kZ, kAttitude + kZ);
   filter_.predict_attitude(rotation, span_.time_s);
-  const float variance = filter_.covariance(kAttitude + kZ, kAttitude + kZ);
-  if (variance > displacement_.variance_heading_rad2) displacement_.variance_heading_rad2 = variance;
+  const float growth = filter_.covariance(kAttitude + kZ, kAttitude + kZ) - before;
+  if (growth > 0.0f) displacement_.variance_heading_rad2 += growth;
   motion_pending_ = true;
 }
 

@@ -16,6 +16,9 @@ const float kBiasNoise_rad2_s3 = (0.004f * kDegree) * (0.004f * kDegree);
 // A variance never falls below these; float32 rounding would otherwise make it negative.
 const float kFloor[kStates / kAxes] = {1e-9f, 1e-12f, 1e-7f, 0.0f};
 
+// Heading and bias.
+bool turning(uint8_t state) { return static_cast<uint8_t>(state - (kAttitude + kZ)) < 4; }
+
 }  // namespace
 
 // Packed by rows of the upper triangle.
@@ -108,15 +111,16 @@ RELPOS_APART float ErrorFilter::update(State group, const float direction[kAxes]
   // A torso's velocity and position say nothing of use about its heading or the gyroscope's bias:
   // a bias of 0.1 deg/s shows as 2 mm/s2 of sideways force, as much as 0.01 deg of tilt. What these
   // measurements seemed to say was model error, so they only consider heading and bias (Schmidt
-  // 1966): correlations count, the states and their own variances stay.
+  // 1966): correlations count, the states and their own variances stay. The other way round a
+  // compass only considers the motion, of whose correlations with its reference nothing is kept.
   const bool considers = group >= kVelocity;
   float* p = p_;
   for (uint8_t i = 0; i < kStates; ++i) {
-    const bool fixed = considers && i >= kAttitude + kZ && i < kVelocity;
+    const bool fixed = group != kBias && turning(i) == considers;
     const float gain = ph[i] * inverse;
     const float floor = kFloor[i / kAxes];
     for (uint8_t j = i; j < kStates; ++j, ++p) {
-      if (fixed && j < kVelocity) continue;
+      if (fixed && turning(j) == considers) continue;
       const float reduced = *p - gain * ph[j];
       if (j == i && reduced < floor) {
         if (repairs_ < 65535u && *p > floor) ++repairs_;

@@ -44,7 +44,7 @@ const Choice kChoices[] RELPOS_FLASH = {
     {static_cast<uint8_t>(wire::CommandCode::kSetLegLengthMm), offsetof(Preferences, leg_length_mm), 2,
      400, 1400},
     {static_cast<uint8_t>(wire::CommandCode::kSetStepGainPermille),
-     offsetof(Preferences, step_gain_permille), 2, 300, 3000},
+     offsetof(Preferences, step_gain_permille), 2, 300, 5000},
     {static_cast<uint8_t>(wire::CommandCode::kSetTeamSize), offsetof(Preferences, team_size), 1, 1, 20},
     {static_cast<uint8_t>(wire::CommandCode::kSetStepReports), offsetof(Preferences, step_reports), 1, 0,
      1},

@@ -11,7 +11,7 @@ namespace {
 static_assert(sizeof(Preferences) == 14 && sizeof(Settings) == 58,
               "the stored bytes are those of the struct on every board");
 constexpr uint8_t kLayout = 2;  // of Settings; another one is not read
-const Preferences kDefaults RELPOS_FLASH = {6, 0, kLedHealth, 0, 930, 1250, 1000, 2000, 10000};
+const Preferences kDefaults RELPOS_FLASH = {6, 0, kLedHealth, 0, 930, 2130, 1000, 2000, 10000};
 constexpr uint16_t kSeed = 0xFFFF - kLayout;
 
 uint16_t crc_of(const Settings& settings) {

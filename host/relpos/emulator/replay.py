@@ -13,6 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from relpos.calibration.steps import (
+    LEAST_GAIN_PERMILLE,
+    LEG_OF_STATURE,
+    MOST_GAIN_PERMILLE,
+    POPULATION_GAIN_PERMILLE,
+    believed_scale,
+    scaled_gain_permille,
+)
 from relpos.errors import DataError, DeviceError
 from relpos.link.decoder import Decoder
 from relpos.measurements import Motion, Step
@@ -46,12 +54,8 @@ LEAST_GAP_S = 0.1
 """Samples further apart than both (in median periods, in seconds) are a gap, not a slow sensor."""
 LEAST_RATE_HZ = 20.0
 """Of a recording that still shows steps: the strides' harmonics reach 8 Hz."""
-LEG_OF_STATURE = 0.53
 STANDARD_PRESSURE_PA = 101_325.0
-FIRST_GAIN_PERMILLE = 1250
 CALIBRATION_PASSES = 4
-GAINS_PERMILLE = (300, 3000)
-"""What the node takes (``firmware/lib/node/node.cpp``)."""
 CALIBRATED_WITHIN = 0.001
 """The gain is found when the calibration walk comes out this close to its true length."""
 
@@ -280,16 +284,17 @@ def calibrate(
     leg_length_m: float | None,
     board: BoardKind | str = BoardKind.NATIVE,
 ) -> int:
-    """Step gain in permille with which the walk comes out at ``true_distance_m``.
+    """Step gain in permille after a walk of ``true_distance_m``, as far as one walk is believed.
 
     The step length is not quite linear in the gain (the filter weighs it), hence more than one
-    pass. DataError where no step is found, the distance is not positive, or no gain leads there.
+    pass to the gain with which the walk comes out right; `steps.believed_scale` says what to make
+    of that. DataError where no step is found, the distance is not positive, or no gain leads there.
     """
     if not true_distance_m > 0.0:
         raise DataError(
             f"the calibration walk's true_distance_m is {true_distance_m:g}: it must be positive"
         )
-    gain = FIRST_GAIN_PERMILLE
+    gain = POPULATION_GAIN_PERMILLE
     for _ in range(CALIBRATION_PASSES):
         walked_m = play(node, recording, Wearer(leg_length_m, gain), board).distance_m
         if walked_m <= 0.0:
@@ -297,12 +302,13 @@ def calibrate(
         if abs(walked_m / true_distance_m - 1.0) < CALIBRATED_WITHIN:
             break
         gain = round(gain * true_distance_m / walked_m)
-        if not GAINS_PERMILLE[0] <= gain <= GAINS_PERMILLE[1]:
+        if not LEAST_GAIN_PERMILLE <= gain <= MOST_GAIN_PERMILLE:
             raise DataError(
                 f"node {node}: the calibration walk comes out as {walked_m:.2f} m and no step gain "
                 f"makes {true_distance_m:g} m of it: is true_distance_m right?"
             )
-    return gain
+    believed = believed_scale([gain / POPULATION_GAIN_PERMILLE])
+    return scaled_gain_permille(POPULATION_GAIN_PERMILLE, believed)
 
 
 def replay_imu(
