@@ -124,7 +124,7 @@ RELPOS_SHARED bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance*
 }
 
 float pendulum_step_m(float excursion_m, float leg_length_m, float gain) {
-  const float length = gain * cbrtf(leg_length_m * leg_length_m * excursion_m);
+  const float length = gain * cube_root(leg_length_m * leg_length_m * excursion_m);
   return excursion_m < kSmallRise_m ? length * sqrtf(excursion_m * (1.0f / kSmallRise_m)) : length;
 }
 
