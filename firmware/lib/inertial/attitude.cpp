@@ -93,16 +93,14 @@ void Attitude::premultiply(const Attitude& first) {
 
 void Attitude::matrix(float r[kAxes * kAxes]) const {
   const float* v = q + 1;
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    const float twice = v[i] + v[i];
-    for (uint8_t j = 0; j < kAxes; ++j) r[3 * j + i] = twice * v[j];
-  }
+  const float twice = q[0] + q[0];
   for (uint8_t i = 0; i < kAxes; ++i) {
     const uint8_t j = next(i), k = next(j);
-    const float twice = q[0] + q[0];
-    r[4 * i] += twice * q[0] - 1.0f;
-    add_scaled(r + 3 * k + j, v + i, twice, 1);
-    add_scaled(r + 3 * j + k, v + i, -twice, 1);
+    const float double_i = v[i] + v[i];
+    const float same = double_i * v[j], opposite = twice * v[k];
+    r[4 * i] = double_i * v[i] + (twice * q[0] - 1.0f);
+    r[3 * i + j] = same - opposite;
+    r[3 * j + i] = same + opposite;
   }
 }
 
