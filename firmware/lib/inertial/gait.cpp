@@ -60,7 +60,7 @@ uint16_t GaitDetector::take_rejected() {
   return count;
 }
 
-bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance* stance) {
+RELPOS_SHARED bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance* stance) {
   if (!running_) {
     mean_m_s2_ = vertical_m_s2;
     running_ = true;
@@ -124,7 +124,7 @@ bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance* stance) {
 }
 
 float pendulum_step_m(float excursion_m, float leg_length_m, float gain) {
-  const float length = gain * cbrtf(leg_length_m * leg_length_m * excursion_m);
+  const float length = gain * cube_root(leg_length_m * leg_length_m * excursion_m);
   return excursion_m < kSmallRise_m ? length * sqrtf(excursion_m * (1.0f / kSmallRise_m)) : length;
 }
 
@@ -143,7 +143,7 @@ void ForwardFinder::forget() {
   power_a_ = power_v_ = 0.0f;
 }
 
-void ForwardFinder::update(const float a[2], float vertical_velocity_m_s, float dt_s) {
+RELPOS_APART void ForwardFinder::update(const float a[2], float vertical_velocity_m_s, float dt_s) {
   const float gain = dt_s * (1.0f / kForwardMemory_s);
   float power = 0.0f;
   for (uint8_t i = 0; i < 2; ++i) {
@@ -167,7 +167,7 @@ void ForwardFinder::point() {
   direct(offset_rad_, axis_);
 }
 
-void ForwardFinder::step() {
+RELPOS_APART void ForwardFinder::step() {
   if (steps_ < 255) ++steps_;
   if (steps_ < kForwardSteps) return;
   const float product = product_[kX] * product_[kX] + product_[kY] * product_[kY];

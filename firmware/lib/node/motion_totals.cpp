@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "devices/flash.h"
+#include "inertial/vector.h"
 
 namespace relpos {
 namespace {
@@ -64,18 +65,21 @@ int32_t MotionTotals::heading_100urad(const Displacement& now) const {
 }
 
 void MotionTotals::fill(const Displacement& now, wire::Motion* motion) const {
-  Displacement moved = now;
-  if (base_heading_100urad_ != 0) {
-    const float base_rad = static_cast<float>(base_heading_100urad_) * 1e-4f;
-    const float c = cosf(base_rad);
-    const float s = sinf(base_rad);
-    moved.x_m = c * now.x_m - s * now.y_m;
-    moved.y_m = s * now.x_m + c * now.y_m;
+  float place_m[2];
+  if (base_heading_100urad_ == 0) {  // to the last bit
+    place_m[kX] = now.x_m;
+    place_m[kY] = now.y_m;
+  } else {
+    float base[2];
+    const float since_m[2] = {now.x_m, now.y_m};
+    direct(static_cast<float>(base_heading_100urad_) * 1e-4f, base);
+    compose(base, since_m, place_m);
   }
   for (uint8_t i = 0; i < kTotals; ++i) {
     float value;
-    memcpy(&value, reinterpret_cast<const uint8_t*>(&moved) + flash_byte(&kTable[i].from),
+    memcpy(&value, reinterpret_cast<const uint8_t*>(&now) + flash_byte(&kTable[i].from),
            sizeof value);
+    if (i <= kY) value = place_m[i];
     uint32_t per_unit = 1000;
     for (uint8_t k = flash_byte(&kTable[i].thousands); k > 1; --k) per_unit *= 1000;
     if (i == kHeadingVariance) per_unit *= 100;
@@ -86,7 +90,7 @@ void MotionTotals::fill(const Displacement& now, wire::Motion* motion) const {
   motion->steps = static_cast<uint16_t>(steps_ + now.steps);
 }
 
-void MotionTotals::rebase(const Displacement& last, float gap_s) {
+RELPOS_APART void MotionTotals::rebase(const Displacement& last, float gap_s) {
   wire::Motion motion;
   fill(last, &motion);
   if (gap_s > kMostGapS) gap_s = kMostGapS;

@@ -3,6 +3,7 @@
 #include <stddef.h>
 #include <string.h>
 
+#include "inertial/calls.h"
 #include "devices/flash.h"
 #include "node/calibration.h"
 #include "node/version.h"
@@ -477,7 +478,7 @@ bool Node::radio_free() {
 
 // Motion and status are written when they are sent, so they cannot wait in a queue and be dropped;
 // ranges wait in a ring that gives up the oldest. They come last: they alone can fill the air.
-bool Node::send_next() {
+RELPOS_APART bool Node::send_next() {
   uint8_t* body = frame_ + wire::kHeaderBytes;
   if (answer_due() && !store_.saving()) {  // acknowledged once it is done for good
     send(wire::MessageType::kAcknowledgement, fill_answer(body));
