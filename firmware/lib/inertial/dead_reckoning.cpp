@@ -259,14 +259,14 @@ RELPOS_APART bool DeadReckoning::advance(const ImuSample& sample, float dt_s, St
     rotate(rotation_, heading_axis_, ahead);
   }
   displacement_.heading_rad = atan2f(ahead[kY], ahead[kX]);
-  add(&heading_sum_rad_, wrap_angle(displacement_.heading_rad - stance_heading_rad_));
+  add(&heading_sum_rad_, turn_between(stance_heading_rad_, displacement_.heading_rad));
   if (step_ticks_ < 65535u) ++step_ticks_;
 
   if (quiet_s_ >= kSettled_s) {
     if (quiet_s_ < kSettled_s + dt_s) begin_straight();
     add(&straight_s_, dt_s);
     if (straight_s_ >= kStill_s) {
-      straight_rate_rad_s_ = wrap_angle(displacement_.heading_rad - straight_heading_rad_) / straight_s_;
+      straight_rate_rad_s_ = turn_between(straight_heading_rad_, displacement_.heading_rad) / straight_s_;
       still_pending_ = true;
       begin_straight();
     }
@@ -302,40 +302,42 @@ void DeadReckoning::on_stance(const Stance& stance) {
   float mean = heading, turn = 0.0f;
   if (step_ticks_ > 0 && !stance.first) {
     mean = stance_heading_rad_ + heading_sum_rad_ / static_cast<float>(step_ticks_);
-    turn = wrap_angle(heading - stance_heading_rad_);
+    turn = turn_between(stance_heading_rad_, displacement_.heading_rad);
   }
   stance_heading_rad_ = heading;
   heading_sum_rad_ = 0.0f;
   direct(mean, step_heading_);
 
   const float share = turning_share(turn);
-  step_length_m_ =
+  const float interval_s = stance.interval_s;
+  float length =
       share * pendulum_step_m(stance.excursion_m, config_.leg_length_m, config_.step_gain);
-  step_sigma_m_ = kStepSigma;
+  float sigma = kStepSigma;
   if (stance.first) {
-    step_length_m_ *= kFirstStep;
-    step_sigma_m_ = kOddStepSigma;
+    length *= kFirstStep;
+    sigma = kOddStepSigma;
   }
-  step_speed_m_s_ = step_length_m_ / stance.interval_s;
-  step_irregular_ =
-      stance.weak || share < kIrregular || stance.excursion_m < kSmallRise_m;
-  const float most_m = kWalkRatio_m_s / stance.interval_s;
-  if (step_length_m_ > most_m) {
-    step_length_m_ = most_m;
-    step_sigma_m_ = kOddStepSigma;
-    step_irregular_ = true;
+  step_speed_m_s_ = length / interval_s;
+  bool irregular = stance.weak || share < kIrregular || stance.excursion_m < kSmallRise_m;
+  const float most_m = kWalkRatio_m_s / interval_s;
+  if (length > most_m) {
+    length = most_m;
+    sigma = kOddStepSigma;
+    irregular = true;
   }
-  if (step_irregular_) hold_[kHoldDoubt] = kHoldTicks;
-  step_sigma_m_ = step_sigma_m_ * step_length_m_ + kStepSigma_m + kTurnSigma_m * (1.0f - share);
+  step_irregular_ = irregular;
+  if (irregular) hold_[kHoldDoubt] = kHoldTicks;
+  step_length_m_ = length;
+  step_sigma_m_ = sigma * length + kStepSigma_m + kTurnSigma_m * (1.0f - share);
 
   if (stance.first || fabsf(turn + turn_rad_) > kStraight_rad) straight_steps_ = 0;
   turn_rad_ = turn;
-  add(&straight_s_, stance.interval_s);
+  add(&straight_s_, interval_s);
   ++straight_steps_;
   if (straight_steps_ == kStraightFrom) {
     begin_straight();
   } else if (straight_steps_ == kStraightTo) {
-    straight_rate_rad_s_ = wrap_angle(heading - straight_heading_rad_) / straight_s_;
+    straight_rate_rad_s_ = turn_between(straight_heading_rad_, displacement_.heading_rad) / straight_s_;
   }
   step_straight_ = straight_steps_ == kStraightSure;
   if (step_straight_) straight_steps_ = 2;
@@ -366,7 +368,7 @@ void DeadReckoning::aim(float heading_rad) {
 // A sensor turned on the body turns the heading axis one way and the forward axis the other: both are
 // turned back, so that the wearer's heading is what it was.
 RELPOS_APART void DeadReckoning::watch_mounting() {
-  const float turned_rad = wrap_angle(forward_.offset_rad() - mounting_rad_);
+  const float turned_rad = turn_between(mounting_rad_, forward_.offset_rad());
   if (settled_steps_ < kSettledSteps) {
     if (forward_.found()) ++settled_steps_;
     mounting_rad_ = forward_.offset_rad();
@@ -403,7 +405,7 @@ void DeadReckoning::work() {
   if (motion_pending_) {
     filter_.predict_motion(span_.impulse_m_s, span_.time_s);
     motion_pending_ = false;
-    if (job_ == kIdle && (quiet_s_ >= kQuiet_s || !gait_.walking())) job_ = kStillX;
+    if (job_ == kIdle && (quiet() || !gait_.walking())) job_ = kStillX;
   } else if (job_ != kIdle) {
     run_job();
   } else if (still_pending_) {  // before the prediction, or standing would leave it no tick
@@ -471,7 +473,7 @@ RELPOS_APART void DeadReckoning::run_job() {
     case kStillY:
     case kStillZ: {
       const uint8_t axis = job - kStillX;
-      const float sigma = quiet_s_ >= kQuiet_s ? kStillSigma_m_s : kLooseSigma_m_s;
+      const float sigma = quiet() ? kStillSigma_m_s : kLooseSigma_m_s;
       group = kVelocity;
       direction[axis] = 1.0f;
       innovation = -velocity_m_s_[axis];
@@ -502,6 +504,8 @@ void DeadReckoning::measure(State group, const float direction[kAxes], float inn
   add_scaled(velocity_m_s_, correction + kVelocity, 1.0f, kAxes);
   add_scaled(bias_rad_s_, correction + kBias, 1.0f, kAxes);
 }
+
+RELPOS_APART bool DeadReckoning::quiet() const { return quiet_s_ >= kQuiet_s; }
 
 void DeadReckoning::begin_straight() {
   straight_heading_rad_ = displacement_.heading_rad;
@@ -568,7 +572,7 @@ void DeadReckoning::commit_step() {
 }
 
 RELPOS_APART void DeadReckoning::commit_still() {
-  const bool still = quiet_s_ >= kQuiet_s;
+  const bool still = quiet();
   if (still) velocity_known_ = true;
   if (still && forward_.found()) {
     // The half step into standing, as the inertial motion has it.
@@ -598,7 +602,7 @@ RELPOS_APART void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
   const float strength = norm(field);  // NaN fails every comparison below
   const float azimuth = atan2f(field[kY], field[kX]);
   bool plausible = strength > kFieldLeast_ut && strength < kFieldMost_ut;
-  magnetic_residual_rad_ = wrap_angle(magnetic_azimuth_rad_ - azimuth);
+  magnetic_residual_rad_ = turn_between(azimuth, magnetic_azimuth_rad_);
   if (plausible) {
     float share = kFieldShare;
     if (magnetic_count_ < kFieldReadings) {
@@ -614,7 +618,7 @@ RELPOS_APART void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
     follow(&magnetic_vertical_ut_, field[kZ], share);
   }
   displacement_.magnetic_heading_valid = plausible;
-  displacement_.magnetic_heading_rad = wrap_angle(displacement_.heading_rad - azimuth);
+  displacement_.magnetic_heading_rad = turn_between(azimuth, displacement_.heading_rad);
   displacement_.quality_flags &= static_cast<uint16_t>(~kMagneticDisturbed);
   if (!plausible) {
     displacement_.quality_flags |= kMagneticDisturbed;
@@ -651,7 +655,7 @@ void DeadReckoning::publish() {
   if (hold_[kHoldInput] > 0) flags |= kBadInput;
   if (hold_[kHoldDoubt] > 0) flags |= kStepDoubtful;
   if (!forward_.found()) flags |= kForwardUnknown;
-  if (quiet_s_ >= kQuiet_s) flags |= kStanding;
+  if (quiet()) flags |= kStanding;
   if (filter_.repairs() > 0) flags |= kCovarianceRepaired;
   if (!d.initialised) flags |= kStarting;
   if (!d.initialised ||

@@ -5,9 +5,9 @@
 
 namespace relpos {
 
-RELPOS_SHARED float dot(const float a[kAxes], const float b[kAxes]) {
+RELPOS_SHARED float dot(const float* a, const float* b, uint8_t count) {
   float sum = 0.0f;
-  for (uint8_t i = 0; i < kAxes; ++i) sum += a[i] * b[i];
+  for (; count != 0; --count) sum += *a++ * *b++;
   return sum;
 }
 
