@@ -116,7 +116,7 @@ void DeadReckoning::reset() {
   step_heading_[kX] = 1.0f;
 }
 
-RELPOS_APART bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
+RELPOS_NEAR bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
   bool good = dt_s > 0.0f && dt_s <= 0.2f, saturated = false;
   for (uint8_t i = 0; i < kAxes; ++i) {
     const float force = fabsf(sample.acceleration_m_s2[i]);
@@ -138,7 +138,7 @@ RELPOS_APART bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
   return true;
 }
 
-RELPOS_APART void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_s) {
+RELPOS_NEAR void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_s) {
   if (ticks_ == 1) mean_force_m_s2_ = force;
   follow(&mean_force_m_s2_, force, dt_s * (1.0f / kForceMean_s));
   const float most_rad = kQuietRate_rad_s * dt_s;
@@ -152,7 +152,7 @@ RELPOS_APART void DeadReckoning::watch_quiet(float force, const float angle[kAxe
 
 // Start: the attitude of the first sample is found from the mean force while the gyroscope already
 // carries the frame along, so that walking directly after switching on loses nothing.
-RELPOS_APART void DeadReckoning::gather(const ImuSample& sample, const float force[kAxes], float dt_s) {
+RELPOS_NEAR void DeadReckoning::gather(const ImuSample& sample, const float force[kAxes], float dt_s) {
   if (quiet_s_ == 0.0f) {
     // Movement after a quiet beginning ends the gathering before it spoils the mean.
     if (!moved_ && since_.time_s >= kShortStill_s) {
@@ -169,7 +169,7 @@ RELPOS_APART void DeadReckoning::gather(const ImuSample& sample, const float for
   if (since_.time_s >= (moved_ ? kMovingStart_s : kStillStart_s)) initialise(!moved_);
 }
 
-void DeadReckoning::initialise(bool still) {
+RELPOS_NEAR void DeadReckoning::initialise(bool still) {
   const float share = 1.0f / step_ticks_;
   float variance = filter_.covariance(kBias, kBias);  // as reset() set it
   if (still) {
@@ -203,7 +203,7 @@ void DeadReckoning::initialise(bool still) {
   displacement_.initialised = true;
 }
 
-RELPOS_APART void DeadReckoning::update(const ImuSample& sample, float dt_s) {
+RELPOS_NEAR void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   ++ticks_;
   for (uint8_t i = 0; i < kHolds; ++i) {
     if (hold_[i] > 0) --hold_[i];
@@ -229,7 +229,7 @@ RELPOS_APART void DeadReckoning::update(const ImuSample& sample, float dt_s) {
 }
 
 // Moves the nominal state by one sample. True at a mid-stance that the filter can use.
-RELPOS_APART bool DeadReckoning::advance(const ImuSample& sample, float dt_s, Stance* stance) {
+RELPOS_NEAR bool DeadReckoning::advance(const ImuSample& sample, float dt_s, Stance* stance) {
   float angle[kAxes] = {0.0f, 0.0f, 0.0f};
   add_scaled(angle, sample.angular_rate_rad_s, dt_s, kAxes);
   add_scaled(angle, bias_rad_s_, -dt_s, kAxes);
@@ -289,7 +289,7 @@ RELPOS_APART bool DeadReckoning::advance(const ImuSample& sample, float dt_s, St
   return at_stance;
 }
 
-void DeadReckoning::on_stance(const Stance& stance) {
+RELPOS_NEAR void DeadReckoning::on_stance(const Stance& stance) {
   const float age_ticks = stance.age_s * kTicks_s;
   displacement_.last_step_tick = ticks_ - static_cast<uint16_t>(age_ticks);
   if (stance.last) {
@@ -367,7 +367,7 @@ void DeadReckoning::aim(float heading_rad) {
 
 // A sensor turned on the body turns the heading axis one way and the forward axis the other: both are
 // turned back, so that the wearer's heading is what it was.
-RELPOS_APART void DeadReckoning::watch_mounting() {
+RELPOS_NEAR void DeadReckoning::watch_mounting() {
   const float turned_rad = turn_between(mounting_rad_, forward_.offset_rad());
   if (settled_steps_ < kSettledSteps) {
     if (forward_.found()) ++settled_steps_;
@@ -392,7 +392,7 @@ void DeadReckoning::capture_span() {
   since_ = Span();
 }
 
-void DeadReckoning::predict_attitude() {
+RELPOS_NEAR void DeadReckoning::predict_attitude() {
   // What the heading loses while it turns, never what a compass gives back: totals only grow.
   const float before = filter_.covariance(kAttitude + kZ, kAttitude + kZ);
   filter_.predict_attitude(rotation_, span_.time_s);
@@ -401,7 +401,7 @@ void DeadReckoning::predict_attitude() {
   motion_pending_ = true;
 }
 
-void DeadReckoning::work() {
+RELPOS_NEAR void DeadReckoning::work() {
   if (motion_pending_) {
     filter_.predict_motion(span_.impulse_m_s, span_.time_s);
     motion_pending_ = false;
@@ -419,7 +419,7 @@ void DeadReckoning::work() {
   }
 }
 
-RELPOS_APART void DeadReckoning::run_job() {
+RELPOS_NEAR void DeadReckoning::run_job() {
   State group = kPosition;
   float direction[kAxes] = {0.0f, 0.0f, 0.0f};
   float innovation, variance, yaw = 0.0f;
@@ -488,7 +488,7 @@ RELPOS_APART void DeadReckoning::run_job() {
   measure(group, direction, innovation, variance, yaw);
 }
 
-void DeadReckoning::measure(State group, const float direction[kAxes], float innovation,
+RELPOS_NEAR void DeadReckoning::measure(State group, const float direction[kAxes], float innovation,
                             float variance, float yaw) {
   float correction[kStates + 1];
   filter_.update(group, direction, yaw, innovation, variance, correction);
@@ -505,14 +505,14 @@ void DeadReckoning::measure(State group, const float direction[kAxes], float inn
   add_scaled(bias_rad_s_, correction + kBias, 1.0f, kAxes);
 }
 
-RELPOS_APART bool DeadReckoning::quiet() const { return quiet_s_ >= kQuiet_s; }
+RELPOS_NEAR bool DeadReckoning::quiet() const { return quiet_s_ >= kQuiet_s; }
 
 void DeadReckoning::begin_straight() {
   straight_heading_rad_ = displacement_.heading_rad;
   straight_s_ = 0.0f;
 }
 
-void DeadReckoning::apply_straight(float sigma_rad_s) {
+RELPOS_NEAR void DeadReckoning::apply_straight(float sigma_rad_s) {
   float direction[kAxes];
   float expected = sigma_rad_s * sigma_rad_s;
   for (uint8_t i = 0; i < kAxes; ++i) {
@@ -529,7 +529,7 @@ void DeadReckoning::widen(float along_m2, float across_m2) {
   add(&displacement_.variance_across_m2, across_m2);
 }
 
-void DeadReckoning::commit_step() {
+RELPOS_NEAR void DeadReckoning::commit_step() {
   float length = step_length_m_;
   float way[2] = {0.0f, 0.0f};
   add_scaled(way, step_heading_, length, 2);
@@ -571,7 +571,7 @@ void DeadReckoning::commit_step() {
   }
 }
 
-RELPOS_APART void DeadReckoning::commit_still() {
+RELPOS_NEAR void DeadReckoning::commit_still() {
   const bool still = quiet();
   if (still) velocity_known_ = true;
   if (still && forward_.found()) {
@@ -593,7 +593,7 @@ RELPOS_APART void DeadReckoning::commit_still() {
   filter_.restart(kPosition, 0.0f);
 }
 
-RELPOS_APART void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
+RELPOS_NEAR void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
   displacement_.magnetic_heading_valid = false;
   if (!displacement_.initialised) return;
   float field[kAxes];
@@ -634,7 +634,7 @@ void DeadReckoning::apply_magnetic() {
   magnetic_steps_ = 0;
 }
 
-void DeadReckoning::publish() {
+RELPOS_NEAR void DeadReckoning::publish() {
   Displacement& d = displacement_;
   float way[2] = {0.0f, 0.0f};
   if (d.initialised && velocity_known_ && forward_.found()) {

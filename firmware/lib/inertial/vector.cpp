@@ -45,6 +45,10 @@ float cube_root(float x) {
   return root;
 }
 
+RELPOS_SHARED int32_t rounded(float x) {
+  return static_cast<int32_t>(x + (x < 0.0f ? -0.5f : 0.5f));
+}
+
 RELPOS_SHARED void direct(float angle_rad, float out[2]) {
   out[kX] = cosf(angle_rad);
   out[kY] = sinf(angle_rad);

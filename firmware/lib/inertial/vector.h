@@ -26,6 +26,7 @@ void resolve(const float axis[2], const float v[2], float out[2]);
 void compose(const float axis[2], const float v[2], float out[2]);
 // Of a number that is not negative, to 1e-6; cbrtf is 420 bytes of the Uno's flash.
 float cube_root(float x);
+int32_t rounded(float x);
 // The unit vector of a direction.
 void direct(float angle_rad, float out[2]);
 
