@@ -87,7 +87,7 @@ class Ak8975(I2cDevice):
         if self._mode == SELF_TEST and self._astc & 0x40:
             chip = np.array(SELF_TEST_UT)
         noise = self._errors.noise_ut * self._rng.standard_normal(3)
-        chip = chip + self._errors.bias_ut + noise
+        chip = self._errors.soft_iron @ chip + self._errors.bias_ut + noise
         if not np.all(np.isfinite(chip)):
             # A recording without magnetometer samples here: the conversion never ends.
             return

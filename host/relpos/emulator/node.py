@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
@@ -66,6 +66,20 @@ def draw_node_errors(seed: int, node: int) -> NodeErrors:
         ),
         power_on_us=int(rng.integers(1_000_000)),
     )
+
+
+def draw_uncalibrated_errors(seed: int, node: int) -> NodeErrors:
+    """One node as it comes from the bench, a battery and screws beside its magnetometer.
+
+    As from the shelf (:func:`draw_node_errors`), and hard iron with sd 25 uT an axis, soft iron and
+    misalignment with sd 7 % an element. Assumed: tens of microtesla beside batteries and speakers
+    are usual for body-worn devices.
+    """
+    errors = draw_node_errors(seed, node)
+    rng = np.random.default_rng([seed, node, 0xCA1])
+    iron = np.eye(3) + 0.07 * rng.standard_normal((3, 3))
+    bias = errors.magnetic.bias_ut + 25.0 * rng.standard_normal(3)
+    return replace(errors, magnetic=replace(errors.magnetic, bias_ut=bias, soft_iron=iron))
 
 
 def prepared_eeprom(node: int) -> bytearray:

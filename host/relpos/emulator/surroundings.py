@@ -97,14 +97,16 @@ class InertialErrors:
 
 @dataclass(frozen=True)
 class MagneticErrors:
-    """How one AK8975 differs from truth, in its own axes.
+    """How one AK8975 differs from truth; ``measured = soft_iron @ true + bias + noise``, own axes.
 
-    ``adjustment`` are the factory's ASA bytes, ``bias_ut`` what a hard-iron calibration would
-    find, ``noise_ut`` the standard deviation of one reading.
+    ``adjustment`` are the factory's ASA bytes, ``bias_ut`` is hard iron, ``soft_iron`` (3, 3) the
+    iron on the node that the field itself magnetises, with scale and alignment of the sensor.
+    ``noise_ut`` is the standard deviation of one reading.
     """
 
     adjustment: tuple[int, int, int] = (128, 128, 128)
     bias_ut: FloatArray = field(default_factory=lambda: np.zeros(3))
+    soft_iron: FloatArray = field(default_factory=lambda: np.eye(3))
     noise_ut: float = 0.0
     seed: int = 0
 

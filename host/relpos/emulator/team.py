@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from relpos.calibration.steps import LEG_OF_STATURE
 from relpos.errors import RelposError
 from relpos.measurements import Prior, Truth
 from relpos.protocol import messages as wire
@@ -19,7 +20,7 @@ from relpos.simulation.walker import RATE_HZ, WalkerTruth
 from relpos.simulation.world import FloatArray
 
 from .air import RadioAir, UwbAir, VirtualClock
-from .node import BoardKind, EmulatedNode, NodeErrors, draw_node_errors
+from .node import BoardKind, EmulatedNode, NodeErrors, draw_node_errors, draw_uncalibrated_errors
 from .pozyx import Pozyx
 from .surroundings import Surroundings
 from .xbee import XbeeModule, line_time_us
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
 
 STEP_US = 20_000
 """How far the clock goes in one step of :meth:`EmulatedTeam.stream`."""
-LEG_OF_STATURE = 0.53
-"""What a wearer who knows only their stature sets as leg length (Winter)."""
 SET_UP_AFTER_US = 1_500_000
 """After power-on: the boards have booted and their tags, too."""
 TRUTH_PERIOD_S = 0.2
@@ -46,7 +45,8 @@ class EmulatedTeam:
 
     ``configured`` nodes know the team's size and their wearer's leg length from the stature, as
     after ``relpos node set``; others run on the firmware's defaults. ``node_errors`` replaces
-    what is drawn by the seed. The truth methods are for evaluation alone.
+    what is drawn by the seed: nodes from the shelf, or in scenario "turntable" such as nobody has
+    calibrated. The truth methods are for evaluation alone.
     """
 
     def __init__(
@@ -59,8 +59,11 @@ class EmulatedTeam:
         *,
         collisions: bool = True,
         configured: bool = True,
-        node_errors: Callable[[int, int], NodeErrors] = draw_node_errors,
+        node_errors: Callable[[int, int], NodeErrors] | None = None,
     ) -> None:
+        if node_errors is None:
+            uncalibrated = scenario == "turntable"
+            node_errors = draw_uncalibrated_errors if uncalibrated else draw_node_errors
         walkers, self.world = make_team(scenario, nodes, seconds, seed)
         self.walkers: dict[int, WalkerTruth] = {walker.node: walker for walker in walkers}
         self.seconds = seconds

@@ -23,6 +23,8 @@ UNSEEN_TURN_RAD_S_SQRT = 0.5
 """What a wearer may have done while the node restarted: brisk walking (Bohannon 1997: 1.3 to
 1.5 m/s), and turning as a random walk that loses the heading after some ten seconds."""
 REMEMBERED_SEQUENCES = 64
+MOST_KEPT = 10_000
+"""Answers and raw samples that nobody fetches are forgotten: half an hour of one node's samples."""
 STALE_BOOT_S = 5.0
 """A frame of an earlier boot this soon after a newer one's was held up on the air."""
 
@@ -54,10 +56,27 @@ class Acknowledged:
     value: int
 
 
+@dataclass(frozen=True, slots=True)
+class RawSample:
+    """What a node's sensors showed before any calibration, over one report.
+
+    Mean specific force and angular rate (x, y, z) over ``samples`` inertial samples that end at
+    ``time_s``, and the newest magnetic field meanwhile; None where a sensor gave nothing.
+    """
+
+    time_s: float
+    node: int
+    samples: int
+    acceleration_m_s2: tuple[float, float, float] | None
+    angular_rate_rad_s: tuple[float, float, float] | None
+    magnetic_field_ut: tuple[float, float, float] | None
+
+
 class Decoder:
     """Frames in, observations out; one instance for the whole team.
 
     ``remarks`` grows by what the user should be told, once each: nodes of a foreign version.
+    ``acknowledged`` and ``raw_samples`` hold the newest answers and raw samples.
     ``counts`` holds every rejected frame by its reason, ``nodes`` each node's own counts:
     ``received``, ``lost``, ``duplicate``, ``late_motion``, ``restarts``. Node ids, boots and
     sequences are the sender's claim: without authentication anybody can send them.
@@ -68,7 +87,8 @@ class Decoder:
         self.counts: Counter[str] = Counter()
         self.foreign_versions: dict[int, int] = {}
         self.remarks: list[str] = []
-        self.acknowledged: list[Acknowledged] = []
+        self.acknowledged: deque[Acknowledged] = deque(maxlen=MOST_KEPT)
+        self.raw_samples: deque[RawSample] = deque(maxlen=MOST_KEPT)
 
     def feed(self, data: bytes, arrival_s: float, rssi_dbm: int | None = None) -> list[Observation]:
         """Observations of one frame that arrived at ``arrival_s`` (host clock, seconds)."""
@@ -127,6 +147,8 @@ class Decoder:
                 if name != "time_s"
             ]
             observations += self._link_status(frame.node, track, time_s)
+        elif frame.message is wire.SAMPLES:
+            self.raw_samples.append(self._raw(frame.node, track, values))
         elif frame.message is wire.STEPS:
             observations += [
                 Step(
@@ -137,6 +159,22 @@ class Decoder:
                 for entry in values["steps"]
             ]
         return observations
+
+    def _raw(self, node: int, track: NodeTrack, values: Mapping[str, Any]) -> RawSample:
+        count = values["samples"]
+
+        def vector(name: str, unit: str, share: float) -> tuple[float, float, float]:
+            x, y, z = (values[f"{name}_{axis}_{unit}"] * share for axis in "xyz")
+            return x, y, z
+
+        return RawSample(
+            track.clock.to_host_s(values["time_s"]),
+            node,
+            count,
+            vector("acceleration", "m_s2", 1.0 / count) if count else None,
+            vector("angular_rate", "rad_s", 1.0 / count) if count else None,
+            vector("field", "ut", 1.0) if values["field_readings"] else None,
+        )
 
     def _track(self, frame: wire.Frame, arrival_s: float) -> NodeTrack | None:
         """The node's track if the frame is new, after booking its sequence; else ``None``."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from relpos.errors import DataError
 from relpos.simulation.gait import make_grid, walk
+from relpos.simulation.turntable import TURNTABLE, turn_by_hand
 from relpos.simulation.walker import Route, WalkerTruth, make_person, make_plan
 from relpos.simulation.world import MagneticField, UwbChannel, World
 
@@ -66,6 +67,16 @@ SCENARIOS = {
             magnetic=MagneticField(disturbance_ut=5.0),
         ),
     ),
+    "straight": Scenario(
+        name="straight",
+        # A wearer who walks a measured length once and stops: for `relpos node calibrate walk`.
+        path_m=(60.0, 20.0),
+        speed_m_s=(0.9, 1.3),
+        spacing_m=4.0,
+        still_s=10.0,
+        distance_limit_m=40.0,
+        world=World(name="straight", size_m=(60.0, 20.0)),
+    ),
 }
 """By name. `paper` with the paper's own pace: replace(SCENARIOS["paper"], speed_m_s=(0.5, 0.5))."""
 
@@ -78,11 +89,9 @@ def make_team(
     ``nodes`` is a count (ids 1 to N) or the ids themselves, 1 to 20 of them. Raises `DataError`
     for an unknown scenario, a number of nodes or a duration that cannot be.
     """
-    if isinstance(scenario, str):
-        if scenario not in SCENARIOS:
-            known = ", ".join(sorted(SCENARIOS))
-            raise DataError(f"unknown scenario {scenario!r}; known are {known}")
-        scenario = SCENARIOS[scenario]
+    known = (*SCENARIOS, TURNTABLE)
+    if isinstance(scenario, str) and scenario not in known:
+        raise DataError(f"unknown scenario {scenario!r}; known are {', '.join(sorted(known))}")
     ids = list(range(1, nodes + 1)) if isinstance(nodes, int) else list(nodes)
     if not 1 <= len(ids) <= MAX_WALKERS or len(set(ids)) != len(ids):
         raise DataError(f"a team has 1 to {MAX_WALKERS} different nodes, not {nodes}")
@@ -91,6 +100,11 @@ def make_team(
     if seed < 0:
         raise DataError(f"a seed is not negative, unlike {seed}")
 
+    if scenario == TURNTABLE:
+        world = World(name=TURNTABLE, size_m=(2.0, 2.0))
+        return [turn_by_hand(node, seconds, seed, world) for node in ids], world
+    if isinstance(scenario, str):
+        scenario = SCENARIOS[scenario]
     world = replace(scenario.world, magnetic=replace(scenario.world.magnetic, seed=seed))
     width, depth = scenario.path_m
     corners = np.array([[0.0, 0.0], [width, 0.0], [width, depth], [0.0, depth]])

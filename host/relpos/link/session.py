@@ -1,0 +1,223 @@
+"""One node in dialogue: commands that are repeated until they are answered, and what it tells.
+
+A command's token makes a repetition harmless: the node answers it again and does nothing twice.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import serial
+
+from relpos.calibration.sensors import SensorCalibration, checksum
+from relpos.calibration.steps import scaled_gain_permille
+from relpos.errors import DeviceError
+from relpos.link.decoder import Acknowledged, RawSample
+from relpos.link.live import Link, observe
+from relpos.protocol import messages as wire
+
+ANSWER_S = 1.0
+"""A full frame each way takes 50 ms, storing the settings on the node 0.4 s."""
+ATTEMPTS = 6
+"""At 2 % loss each way a command fails four times in a row once in half a million."""
+SILENT_S = 6.0
+"""A node that is on reports its motion every second."""
+RAW_REPORTS_PER_S = 5
+MOST_RAW_REPORTS = 3000
+
+
+class Session:
+    """Talks to ``node`` over an open coordinator ``port``.
+
+    ``clock`` is that of :func:`relpos.link.live.observe`. What arrives is taken in while an answer
+    is waited for: raw samples collect in the link's decoder, running totals in its tracks.
+    """
+
+    def __init__(
+        self,
+        port: serial.Serial,
+        node: int,
+        link: Link | None = None,
+        clock: Callable[[], float] | None = None,
+    ) -> None:
+        self.node = node
+        self.link = link or Link()
+        self._port = port
+        self._batches = observe(port, self.link, clock)
+        self._token = int(time.time() * 10) % 0xFF00
+        self._answers: dict[int, Acknowledged] = {}
+
+    def listen(self) -> None:
+        """Take in what has arrived, or wait a moment for it. DeviceError where the port is gone."""
+        next(self._batches)
+        acknowledged = self.link.decoder.acknowledged
+        while acknowledged:
+            answer = acknowledged.popleft()
+            if answer.node == self.node:
+                self._answers[answer.token] = answer
+
+    def totals(self) -> Mapping[str, Any] | None:
+        """Values (SI) of the node's newest motion message; None before the first."""
+        track = self.link.decoder.nodes.get(self.node)
+        return None if track is None else track.totals
+
+    def boot(self) -> int | None:
+        """The node's boot counter; None before its first frame."""
+        track = self.link.decoder.nodes.get(self.node)
+        return None if track is None else track.boot
+
+    def command(self, code: wire.CommandCode, value: int) -> Acknowledged:
+        """Send, repeat until it is answered, return the answer; a busy node is asked again.
+
+        DeviceError where the node does not answer at all.
+        """
+        for _ in range(ATTEMPTS):
+            answer = self._ask(code, value)
+            if answer.result != wire.CommandResult.BUSY:
+                return answer
+        raise DeviceError(f"node {self.node} stays busy and does not take {code.name}")
+
+    def _ask(self, code: wire.CommandCode, value: int) -> Acknowledged:
+        self._token = self._token % 0xFFFF + 1
+        token = self._token
+        for _ in range(ATTEMPTS):
+            _, data = self.link.command(self.node, code, value, token=token)
+            try:
+                self._port.write(data)
+            except (serial.SerialException, OSError) as error:
+                raise DeviceError(f"{self._port.port}: the port vanished") from error
+            until_s = time.monotonic() + ANSWER_S
+            while time.monotonic() < until_s:
+                self.listen()
+                answer = self._answers.pop(token, None)
+                if answer is not None:
+                    return answer
+        raise DeviceError(
+            f"node {self.node} does not answer {code.name}: is it switched on, in reach, and its "
+            f"number {self.node}?" + self._heard()
+        )
+
+    def _heard(self) -> str:
+        others = sorted(set(self.link.decoder.nodes) - {self.node})
+        return f" Heard: node {', '.join(map(str, others))}" if others else ""
+
+    def demand(self, code: wire.CommandCode, value: int) -> int:
+        """Value in force after a command that has to be done. DeviceError where it is not."""
+        answer = self.command(code, value)
+        if answer.result != wire.CommandResult.DONE:
+            raise DeviceError(
+                f"node {self.node} refuses {code.name} {value} "
+                f"({answer.result.name.lower().replace('_', ' ')})"
+            )
+        return answer.value
+
+    def setting(self, code: wire.CommandCode) -> int:
+        """Value of a setting: an impossible one (-1) changes nothing and brings it."""
+        answer = self.command(code, -1)
+        if answer.result != wire.CommandResult.OUT_OF_RANGE:
+            raise DeviceError(f"node {self.node} does not know {code.name}")
+        return answer.value
+
+    # -- raw samples ------------------------------------------------------------------------------
+
+    def raw_samples(self, most_s: float) -> Iterator[RawSample | None]:
+        """Raw samples as they arrive, for at most ``most_s`` of reports; None after each silence.
+
+        Reports stop when the iteration is left or comes to its end. DeviceError where none comes,
+        or the node's sensor is silent.
+        """
+        reports = min(round(most_s * RAW_REPORTS_PER_S), MOST_RAW_REPORTS)
+        self.link.decoder.raw_samples.clear()
+        self.demand(wire.CommandCode.SET_RAW_REPORTS, reports)
+        heard_s = time.monotonic()
+        empty = 0
+        first_s: float | None = None
+        try:
+            while True:
+                self.listen()
+                queue = self.link.decoder.raw_samples
+                if not queue and time.monotonic() - heard_s > SILENT_S:
+                    if first_s is None:
+                        raise DeviceError(
+                            f"node {self.node} answers, but no raw samples arrive from it"
+                        )
+                    return
+                if not queue:
+                    yield None
+                while queue:
+                    sample = queue.popleft()
+                    if sample.node != self.node:
+                        continue
+                    heard_s = time.monotonic()
+                    first_s = sample.time_s if first_s is None else first_s
+                    empty = empty + 1 if sample.acceleration_m_s2 is None else 0
+                    if empty > 2 * RAW_REPORTS_PER_S:
+                        raise DeviceError(
+                            f"node {self.node}: its inertial sensor is silent (wiring, supply)"
+                        )
+                    yield sample
+                    if sample.time_s - first_s >= most_s:
+                        return
+        finally:
+            self.command(wire.CommandCode.SET_RAW_REPORTS, 0)
+
+    # -- calibration ------------------------------------------------------------------------------
+
+    def read_calibration(self) -> SensorCalibration:
+        """What is in force on the node."""
+        return SensorCalibration.from_words(
+            [
+                self.demand(wire.CommandCode.READ_CALIBRATION, index << 16)
+                for index in range(len(wire.CALIBRATION))
+            ]
+        )
+
+    def write_calibration(self, calibration: SensorCalibration) -> None:
+        """Store a calibration, wait until the node has restarted with it, and read it back.
+
+        DataError where it does not fit a node, DeviceError where it does not arrive there whole.
+        """
+        words = calibration.to_words()
+        for index, word in enumerate(words):
+            self.demand(wire.CommandCode.SET_CALIBRATION, index << 16 | word & 0xFFFF)
+        boot = self.boot()
+        self.demand(wire.CommandCode.COMMIT_CALIBRATION, checksum(words))
+        until_s = time.monotonic() + SILENT_S
+        while self.boot() == boot and time.monotonic() < until_s:
+            self.listen()
+        if self.boot() == boot:
+            raise DeviceError(
+                f"node {self.node} took the calibration but was not heard restarting with it: "
+                "switch it off and on"
+            )
+        if self.read_calibration().to_words() != words:
+            raise DeviceError(
+                f"node {self.node} does not show the calibration that it was given: its memory "
+                "may be worn out; calibrate again"
+            )
+
+    # -- steps ------------------------------------------------------------------------------------
+
+    def set_step_gain(self, gain_permille: int) -> None:
+        """Set the step gain and see that it is in force."""
+        in_force = self.demand(wire.CommandCode.SET_STEP_GAIN_PERMILLE, gain_permille)
+        if in_force != gain_permille:
+            raise DeviceError(
+                f"node {self.node} has a step gain of {in_force / 1000:.3f} instead of "
+                f"{gain_permille / 1000:.3f}"
+            )
+
+    def send_step_scale(self, step_scale: float) -> tuple[int, int]:
+        """Make the node's steps ``step_scale`` times as long, as a fusion or a walk has learned.
+
+        ``step_scale`` is true over reported length, of motion reported with the gain in force now
+        (see the motion's gain_version). Returns the gains before and after, in permille. DataError
+        where the scale is impossible, DeviceError where the node does not take it.
+        """
+        before = self.setting(wire.CommandCode.SET_STEP_GAIN_PERMILLE)
+        after = scaled_gain_permille(before, step_scale)
+        if after != before:
+            self.set_step_gain(after)
+        return before, after
