@@ -40,6 +40,7 @@ from relpos.simulation.activities import ACTIVITIES, SCRIPTS
 from relpos.simulation.indoor import INDOOR
 from relpos.simulation.motion import WearerTruth
 from relpos.simulation.solo import make_walker
+from relpos.simulation.wearer import PLACES
 
 Array = NDArray[np.float64]
 
@@ -137,6 +138,9 @@ def simulate(
     return *sense(truth, rng, calibrated), truth
 
 
+BROKEN_BY = ("x_m", "y_m", "heading_rad", "variance_along_m2", "variance_heading_rad2")
+
+
 # -- figures ----------------------------------------------------------------------------------
 
 
@@ -144,6 +148,10 @@ def simulate(
 class Walk:
     """What one walk came to. Errors are claimed less true."""
 
+    place: str
+    """Where the sensor sat."""
+    broken: bool
+    """The filter gave something that is no number: in none of the other figures."""
     distance_error: float
     """Relative."""
     drift_deg_min: float
@@ -163,6 +171,8 @@ class Walk:
     found: dict[str, int] = field(default_factory=dict)
     extra: dict[str, int] = field(default_factory=dict)
     steps: dict[str, int] = field(default_factory=dict)
+    straights: list[tuple[float, float, float]] = field(default_factory=list)
+    """Speed, true and claimed distance of each stretch of walking of more than 8 m."""
     squares: dict[str, list[tuple[float, float, float]]] = field(default_factory=dict)
     """By activity: along, across, heading of windows that lie mostly in it."""
 
@@ -202,6 +212,8 @@ def judge(imu: Array, field_ut: Array | None, truth: WearerTruth) -> Walk:
     drift = error[-50:].mean() - error[first : first + 50].mean()
     distance = truth.distance_m
     walk = Walk(
+        place=truth.wearer.place,
+        broken=not all(np.isfinite(rows[name]).all() for name in BROKEN_BY),
         distance_error=result.distance_m / distance - 1.0 if distance > 1.0 else float("nan"),
         drift_deg_min=float(np.degrees(drift) / minutes),
         end_error_m=float(np.linalg.norm(claimed[-1] - actual[-1])),
@@ -258,16 +270,14 @@ def _by_activity(
     labels: NDArray[np.int8],
 ) -> None:
     step_s = result.step_ticks / 50.0
-    label_of = labels[np.minimum(result.step_ticks, len(labels) - 1)]
     lengths = result.step_lengths_m
     moved = np.diff(path, prepend=path[0])
     # Detection lags the mid-stance by the detector's own filters: one offset for the walk.
     offsets = np.arange(-0.3, 0.31, 0.05)
-    best = max(
-        offsets,
-        key=lambda o: replay.pairs_within(step_s + o, truth.steps.time_s, 0.25),
-        default=0.0,
-    )
+    best = max(offsets, key=lambda o: replay.pairs_within(step_s + o, truth.steps.time_s, 0.25))
+    # A step's way lies before its mid-stance: a quarter of a second keeps it with its activity.
+    place = np.clip(((step_s + best - 0.25) * 50).astype(int), 0, len(labels) - 1)
+    label_of = labels[place]
     for index, name in enumerate(ACTIVITIES):
         inside = labels == index
         if not inside.any():
@@ -280,6 +290,13 @@ def _by_activity(
         walk.extra[name] = max(len(mine) - replay.pairs_within(mine, truth.steps.time_s, 0.25), 0)
         walk.true_m[name] = float(moved[inside].sum())
         walk.claimed_m[name] = float(lengths[label_of == index].sum())
+    for begin, end, kind in truth.intervals:
+        span = slice(int(begin * 50), int(end * 50))
+        true_m = float(moved[span].sum())
+        if kind == "walk" and true_m > 8.0:
+            inside = (place >= span.start) & (place < span.stop)
+            speed = true_m / (end - begin)
+            walk.straights.append((speed, true_m, float(lengths[inside].sum())))
 
 
 def interval(groups: Sequence[Sequence[float]]) -> str:
@@ -308,6 +325,7 @@ class Condition:
 
 CONDITIONS = (
     Condition("disturbed magnetometer"),
+    Condition("disturbed magnetometer, calibrated", calibrated=True),
     Condition("no magnetometer", magnetometer=False),
     Condition("no magnetometer, calibrated", magnetometer=False, calibrated=True),
     Condition("started walking, disturbed magnetometer", begin_walking=True),
@@ -327,12 +345,18 @@ def run(kind: str, condition: Condition, seed: int) -> Walk:
 
 def print_papers(walks: dict[tuple[str, str], list[Walk]]) -> None:
     """Print the 310 m walks: heading, distance, end and normalised errors."""
-    for (kind, condition), group in walks.items():
+    for (kind, condition), everybody in walks.items():
+        group = [w for w in everybody if not w.broken]
         drift = np.abs([w.drift_deg_min for w in group])
         distance = 100 * np.array([w.distance_error for w in group])
         end = np.array([w.end_error_m for w in group])
         aligned = np.array([w.aligned_end_error_m for w in group])
-        print(f"{kind}, {condition} ({len(group)} wearers)")
+        lost = (
+            f", {len(everybody) - len(group)} left out: no numbers"
+            if len(group) < len(everybody)
+            else ""
+        )
+        print(f"{kind}, {condition} ({len(everybody)} wearers{lost})")
         print(
             f"  heading drift {np.median(drift):.2f} deg/min median, "
             f"{np.percentile(drift, 90):.2f} p90; distance {distance.mean():+.1f} +- "
@@ -350,10 +374,22 @@ def print_papers(walks: dict[tuple[str, str], list[Walk]]) -> None:
             f"no variance claimed in {sum(w.without_variance for w in group)} of "
             f"{sum(w.windows for w in group)} windows"
         )
+        by_place = {p: [100 * w.distance_error for w in group if w.place == p] for p in PLACES}
+        print(
+            "  distance by place: "
+            + ", ".join(
+                f"{place} {np.mean(e):+.1f} +- {np.std(e):.1f} % ({len(e)})"
+                for place, e in by_place.items()
+                if e
+            )
+        )
 
 
-def print_activities(walks: list[Walk]) -> None:
+def print_activities(everybody: list[Walk]) -> None:
     """Print what was claimed and what was true, by activity."""
+    walks = [w for w in everybody if not w.broken]
+    if len(walks) < len(everybody):
+        print(f"{len(everybody) - len(walks)} walks left out: the filter gave no numbers")
     print(
         f"{'activity':12s} {'true m':>8s} {'claimed':>8s} {'ratio':>6s} {'steps':>6s} "
         f"{'found %':>8s} {'extra %':>8s}  NEES along, across, heading"
@@ -381,6 +417,20 @@ def print_activities(walks: list[Walk]) -> None:
     )
 
 
+def print_speeds(walks: list[Walk]) -> None:
+    """Print the distance's error by walking speed."""
+    rows = np.array([s for w in walks if not w.broken for s in w.straights])
+    print(f"{'walking at':>14s} {'stretches':>9s}  distance error of a stretch")
+    for low, high in pairwise((0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6, 1.9)):
+        some = rows[(rows[:, 0] >= low) & (rows[:, 0] < high)]
+        if len(some):
+            error = 100 * (some[:, 2] / some[:, 1] - 1.0)
+            print(
+                f"{low:.1f} to {high:.1f} m/s {len(some):9d}  {error.mean():+.1f} +- "
+                f"{error.std():.1f} %, mean absolute {np.abs(error).mean():.1f} %"
+            )
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
@@ -404,7 +454,10 @@ def main() -> None:
             kinds = [options.kind] if options.kind else ["mixed", "daily", "speeds", "pauses"]
             for kind in kinds:
                 print(f"\nscript {kind}, {options.wearers} wearers, {condition.name}")
-                print_activities(pool.map(partial(run, kind, condition), seeds))
+                walks = pool.map(partial(run, kind, condition), seeds)
+                print_activities(walks)
+                if kind == "speeds":
+                    print_speeds(walks)
 
 
 if __name__ == "__main__":

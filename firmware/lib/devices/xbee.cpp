@@ -20,7 +20,7 @@ constexpr uint8_t kTransmit16Header = 5;  // type, frame id, destination, option
 constexpr uint8_t kReceive16Header = 5;   // type, source, signal strength, options
 constexpr uint8_t kReceive64Header = 11;
 constexpr uint8_t kTransmitStatusBytes = 3;  // type, frame id, status
-constexpr uint16_t kFirstData = 3 + kTransmit16Header;  // in the outgoing frame
+constexpr uint8_t kFirstData = 3 + kTransmit16Header;  // in the outgoing frame
 
 bool needs_escape(uint8_t byte) {
   return byte == kDelimiter || byte == kEscape || byte == kXon || byte == kXoff;
@@ -51,14 +51,13 @@ bool Xbee::send(uint16_t destination, const uint8_t* data, uint8_t length) {
 
 uint8_t Xbee::next_byte() const {
   if (position_ >= kFirstData) {
-    const uint16_t at = static_cast<uint16_t>(position_ - kFirstData);
+    const uint8_t at = static_cast<uint8_t>(position_ - kFirstData);
     return at < data_length_ ? data_[at] : static_cast<uint8_t>(0xFF - sent_sum_);
   }
-  const uint16_t length = static_cast<uint16_t>(kTransmit16Header + data_length_);
   switch (position_) {
     case 0: return kDelimiter;
-    case 1: return static_cast<uint8_t>(length >> 8);
-    case 2: return static_cast<uint8_t>(length);
+    case 1: return 0;  // of the length, the high byte
+    case 2: return static_cast<uint8_t>(kTransmit16Header + data_length_);
     case 3: return kTransmit16;
     case 4: return frame_id_;
     case 5: return static_cast<uint8_t>(destination_ >> 8);

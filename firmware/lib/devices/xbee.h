@@ -40,7 +40,7 @@ class Xbee {
 
   const uint8_t* data_;
   uint16_t destination_;
-  uint16_t position_;  // in the outgoing frame, delimiter included, escapes not
+  uint8_t position_;  // in the outgoing frame, delimiter included, escapes not
   uint8_t data_length_;
   uint8_t frame_id_;
   uint8_t sent_sum_;

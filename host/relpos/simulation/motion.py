@@ -163,7 +163,8 @@ def move(
     pace = np.clip(per_step("pace"), 0.0, 1.6)
     tone = going * pace**0.7 * per_step("trunk")
     stride = np.pi * phase
-    shift = rng.normal(0.0, 0.4, 4)
+    shift = rng.normal(0.0, (0.4, 0.4, 0.25, 0.4))
+    shift[2] += wearer.pitch_phase_rad
     lead = rng.uniform(0.0, 0.25)
     yaw = np.interp(t + lead, t, facing) + slow_noise(rng, t, math.radians(1.5), 2.5)
     low = 1.5 if wearer.place == "lower_back" else 1.0  # the pelvis turns more than the chest

@@ -51,6 +51,9 @@ class Wearer(Person):
     """Share by which the steps of one side are shorter, quicker and lower; 0 for none."""
     surge: float
     """Fore-aft fluctuation of the speed within a step at 1.2 m/s, as a share of it."""
+    pitch_phase_rad: float
+    """Decides whether the trunk's pitch adds to the rise before the trunk or takes from it; no
+    recording has chest and back at once, so it is wide."""
     jolt_m_s2: float
     """Size of the short jolt at heel strike that holds what is above 12 Hz."""
     jolt_hz: float
@@ -132,11 +135,12 @@ def make_wearer(
 ) -> Wearer:
     """Draw a wearer; what is given is held.
 
-    Supported: stature (mean 1.70, sd 0.10 over women and men), leg 0.53 of it (Winter); walk
-    ratio 0.34 m/Hz with 12 % between people (walk_lowerback_20m: step length given cadence and
-    stature scatters by 8 %); excursion 38 mm at the reference step with 14 % between people
-    (ditto: 13 % given length, cadence and stature). Without support, hence wide: irregularity,
-    limp, surge, soft tissue, strap, trunk oscillation.
+    Supported: stature (mean 1.70, sd 0.10 over women and men), leg 0.53 of it (Winter). Walk
+    ratio (0.34 m/Hz, 11 % between people), excursion (34.5 mm of the hips at the reference step,
+    7.5 %) and their changes from walk to walk were set so that sensors on the lower back show
+    what walk_lowerback_20m shows: errors of a constant step, of one gain and of a gain a person
+    (docs/gait.md). Without support, hence wide: irregularity, limp, surge, phase of the pitch,
+    soft tissue, strap, trunk oscillation.
     """
     stature = float(np.clip(rng.normal(1.70, 0.10), 1.45, 2.05))
     leg = 0.53 * stature * float(np.clip(rng.normal(1.0, 0.03), 0.92, 1.08))
@@ -171,13 +175,16 @@ def make_wearer(
         place=where,
         arm_m=arm,
         axes=tuple(float(a) for a in _axes(rng, where).ravel()),
-        rise_m=0.036 * math.exp(rng.normal(0.0, 0.09)),
+        rise_m=0.0345 * math.exp(rng.normal(0.0, 0.075)),
         rise_by_length=by_length,
-        rise_by_cadence=float(rng.uniform(1.3, 2.1)) - by_length,
-        rise_walk_sd=0.05,
+        # Orendurff 2004: 27 mm at 0.7 m/s, 48 at 1.6: 1.4 in all at a constant walk ratio;
+        # within people of walk_lowerback_20m 1.7.
+        rise_by_cadence=float(rng.uniform(1.1, 2.0)) - by_length,
+        rise_walk_sd=0.06,
         irregularity=float(rng.uniform(0.7, 2.0)),
         limp=limp,
         surge=float(rng.uniform(0.06, 0.16)),
+        pitch_phase_rad=float(rng.normal(0.0, 1.0)),
         # Recorded: 6 to 8 % of the vertical rms above 15 Hz on chests, 9 to 42 % on backs.
         jolt_m_s2=float(rng.uniform(0.5, 12.0)) * (1.0 if where in ("lower_back", "side") else 0.4),
         jolt_hz=float(rng.uniform(6.0, 18.0)),
