@@ -93,7 +93,9 @@ void ErrorFilter::predict_motion(const float f[kAxes], float dt_s) {
 
 float ErrorFilter::update(State group, const float direction[kAxes], float yaw, float innovation,
                           float variance, float correction[kStates + 1]) {
-  float ph[kStates] = {};
+  // P h first, which becomes the correction row by row, where it is no longer needed.
+  float* const ph = correction;
+  memset(ph, 0, (kStates + 1) * sizeof *ph);
   add_column(ph, kAttitude + kZ, yaw);
   for (uint8_t i = 0; i < kAxes; ++i) add_column(ph, group + i, direction[i]);
   // The reference's share in the measurement: with the heading it is compared, with the bias it is
@@ -114,6 +116,11 @@ float ErrorFilter::update(State group, const float direction[kAxes], float yaw, 
   // 1966): correlations count, the states and their own variances stay. The other way round a
   // compass only considers the motion, of whose correlations with its reference nothing is kept.
   const bool considers = group >= kVelocity;
+  if (!considers) {
+    add_scaled(reference_, ph + kAttitude + kZ, -inverse * shared, kReferenced);
+    reference_variance_ -= shared * shared * inverse;
+    correction[kReference] = shared * inverse * innovation;
+  }
   float* p = p_;
   for (uint8_t i = 0; i < kStates; ++i) {
     const bool fixed = group != kBias && turning(i) == considers;
@@ -130,11 +137,6 @@ float ErrorFilter::update(State group, const float direction[kAxes], float yaw, 
       }
     }
     correction[i] = fixed ? 0.0f : gain * innovation;
-  }
-  if (!considers) {
-    add_scaled(reference_, ph + kAttitude + kZ, -inverse * shared, kReferenced);
-    reference_variance_ -= shared * shared * inverse;
-    correction[kStates] = shared * inverse * innovation;
   }
   return total;
 }
