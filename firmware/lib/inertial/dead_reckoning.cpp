@@ -3,8 +3,24 @@
 #include <math.h>
 #include <string.h>
 
+#if defined(__AVR__)
+#include <avr/pgmspace.h>
+#else
+#define PROGMEM
+#define memcpy_P memcpy
+#endif
+
 namespace relpos {
 namespace {
+
+const float kDefaults[] PROGMEM = {
+    0.93f,          // 0.53 of the stature (Zijlstra and Hof 1997); here of 1.75 m
+    2.13f,          // odd people of walk_lowerback_20m
+    0.07f,          // 0.05 to 0.09 uncalibrated, 0.03 calibrated
+    39.0f,          // just under 4 g
+    8.7f,           // just under 500 deg/s
+    kPi / 180.0f,   // 1 deg/s: what a warmed-up, once zeroed MPU-9150 keeps
+};
 
 const float kDegree = kPi / 180.0f;
 const float kStandardGravity_m_s2 = 9.80665f;
@@ -98,6 +114,11 @@ void left_of(const float axis[2], float out[2]) {
 float doubted(float sigma, float innovation) { return sigma * sigma + innovation * innovation; }
 
 }  // namespace
+
+InertialConfig::InertialConfig() {
+  static_assert(sizeof kDefaults == sizeof *this, "one default a member");
+  memcpy_P(static_cast<void*>(this), kDefaults, sizeof kDefaults);
+}
 
 DeadReckoning::DeadReckoning() { reset(); }
 

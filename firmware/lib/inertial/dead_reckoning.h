@@ -25,14 +25,14 @@ struct ImuSample {
 
 // What is known of the wearer and of the sensor. The defaults are used until configure().
 struct InertialConfig {
-  float leg_length_m = 0.93f;  // 0.53 of the stature (Zijlstra and Hof 1997); here of 1.75 m
-  float step_gain = 2.13f;     // c of s = c (l^2 h)^(1/3): odd people of walk_lowerback_20m
-  float scale_sigma = 0.07f;   // relative, correlated: 0.05 to 0.09 uncalibrated, 0.03 calibrated
-  float acceleration_limit_m_s2 = 39.0f;   // a component beyond it is saturated: just under 4 g
-  float angular_rate_limit_rad_s = 8.7f;   // just under 500 deg/s
-  // What is not known of the gyroscope's bias at the start, an axis. 1 deg/s: what a warmed-up, once
-  // zeroed MPU-9150 keeps.
-  float gyro_bias_sigma_rad_s = kPi / 180.0f;
+  InertialConfig();  // the defaults: kDefaults in dead_reckoning.cpp, in this order
+
+  float leg_length_m;
+  float step_gain;    // c of s = c (l^2 h)^(1/3)
+  float scale_sigma;  // relative, correlated
+  float acceleration_limit_m_s2;   // a component beyond it is saturated
+  float angular_rate_limit_rad_s;
+  float gyro_bias_sigma_rad_s;     // what is not known of the bias at the start, an axis
 };
 
 // What was refused, limited or repaired since the reset. Each count stops at its maximum.

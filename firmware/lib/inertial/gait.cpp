@@ -123,8 +123,20 @@ bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance* stance) {
   return true;
 }
 
+// Newton's method from a third of the exponent, 3 % off: 1e-3 after one step, 1e-6 after two. The
+// library's cbrtf is 420 bytes of the Uno's flash.
+static float cube_root(float value) {
+  uint32_t bits;
+  memcpy(&bits, &value, sizeof bits);
+  bits = bits / 3 + 0x2A5137A0;
+  float root;
+  memcpy(&root, &bits, sizeof root);
+  for (uint8_t i = 0; i < 2; ++i) follow(&root, value / (root * root), 1.0f / 3.0f);
+  return root;
+}
+
 float pendulum_step_m(float excursion_m, float leg_length_m, float gain) {
-  const float length = gain * cbrtf(leg_length_m * leg_length_m * excursion_m);
+  const float length = gain * cube_root(leg_length_m * leg_length_m * excursion_m);
   return excursion_m < kSmallRise_m ? length * sqrtf(excursion_m * (1.0f / kSmallRise_m)) : length;
 }
 
