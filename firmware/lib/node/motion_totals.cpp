@@ -1,10 +1,10 @@
 #include "node/motion_totals.h"
 
-#include <math.h>
 #include <stddef.h>
 #include <string.h>
 
 #include "devices/flash.h"
+#include "inertial/vector.h"
 
 namespace relpos {
 namespace {
@@ -41,10 +41,10 @@ const Total kTable[] RELPOS_FLASH = {
 }  // namespace
 
 uint32_t scaled(float value, uint32_t per_unit) {
-  const float whole = floorf(value);
-  const float rest = (value - whole) * static_cast<float>(per_unit);
-  return static_cast<uint32_t>(static_cast<int32_t>(whole)) * per_unit +
-         static_cast<uint32_t>(rest + 0.5f);
+  int32_t whole = static_cast<int32_t>(value);
+  if (value < 0.0f) --whole;
+  const float rest = (value - static_cast<float>(whole)) * static_cast<float>(per_unit);
+  return static_cast<uint32_t>(whole) * per_unit + static_cast<uint32_t>(rest + 0.5f);
 }
 
 void MotionTotals::track(const Displacement& now) {
@@ -64,18 +64,15 @@ int32_t MotionTotals::heading_100urad(const Displacement& now) const {
 }
 
 void MotionTotals::fill(const Displacement& now, wire::Motion* motion) const {
-  Displacement moved = now;
-  if (base_heading_100urad_ != 0) {
-    const float base_rad = static_cast<float>(base_heading_100urad_) * 1e-4f;
-    const float c = cosf(base_rad);
-    const float s = sinf(base_rad);
-    moved.x_m = c * now.x_m - s * now.y_m;
-    moved.y_m = s * now.x_m + c * now.y_m;
-  }
+  const float way_m[2] = {now.x_m, now.y_m};
+  float base_axis[2], moved_m[2];
+  direct(static_cast<float>(base_heading_100urad_) * 1e-4f, base_axis);
+  compose(base_axis, way_m, moved_m);
   for (uint8_t i = 0; i < kTotals; ++i) {
     float value;
-    memcpy(&value, reinterpret_cast<const uint8_t*>(&moved) + flash_byte(&kTable[i].from),
-           sizeof value);
+    const void* from = reinterpret_cast<const uint8_t*>(&now) + flash_byte(&kTable[i].from);
+    if (i < 2) from = moved_m + i;
+    memcpy(&value, from, sizeof value);
     uint32_t per_unit = 1000;
     for (uint8_t k = flash_byte(&kTable[i].thousands); k > 1; --k) per_unit *= 1000;
     if (i == kHeadingVariance) per_unit *= 100;
