@@ -292,16 +292,9 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   add_scaled(position_m_, force, 0.5f * dt_s * dt_s, kAxes);
   add_scaled(velocity_m_s_, force, dt_s, kAxes);
 
-  if (at_stance) {
-    // A motion stage left over belongs before the mid-stance.
-    const bool busy = motion_pending_;
-    if (busy) filter_.predict_motion(span_.impulse_m_s, span_.time_s);
-    motion_pending_ = false;
-    on_stance(stance, rotation);
-    if (!busy) work(rotation);
-  } else {
-    work(rotation);
-  }
+  // At a mid-stance only a motion stage that is left over: it belongs before.
+  if (!at_stance || motion_pending_) work(rotation);
+  if (at_stance) on_stance(stance, rotation);
   publish();
 }
 
@@ -415,11 +408,13 @@ void DeadReckoning::predict_attitude(const float rotation[kAxes * kAxes]) {
   motion_pending_ = true;
 }
 
-void DeadReckoning::work(const float rotation[kAxes * kAxes]) {
+RELPOS_SHARED void DeadReckoning::work(const float rotation[kAxes * kAxes]) {
   if (motion_pending_) {
     filter_.predict_motion(span_.impulse_m_s, span_.time_s);
     motion_pending_ = false;
     if (job_ == kIdle && (quiet_s_ >= kQuiet_s || !gait_.walking())) job_ = kStillX;
+  } else if ((job_ > kFlush || still_pending_ || magnetic_pending_) && filter_.settle()) {
+    return;  // a piece of its own
   } else if (job_ != kIdle) {
     run_job(rotation);
   } else if (still_pending_) {  // before the prediction, or standing would leave it no tick

@@ -74,21 +74,25 @@ void ErrorFilter::predict_attitude(const float rotation[kAxes * kAxes], float dt
   widen(kBias, kBiasNoise_rad2_s3 * dt_s, kAxes);
 }
 
-void ErrorFilter::move_position(float dt_s) {
-  for (uint8_t i = 0; i < kAxes; ++i) mix(kPosition + i, kVelocity + i, dt_s);
+bool ErrorFilter::settle() {
+  if (owed_s_ == 0.0f) return false;
+  for (uint8_t i = 0; i < kAxes; ++i) mix(kPosition + i, kVelocity + i, owed_s_);
+  owed_s_ = 0.0f;
+  return true;
 }
 
 void ErrorFilter::predict_motion(const float f[kAxes], float dt_s) {
   // Half the position step before the velocity changes and half after it: second-order accurate
   // over a span of five ticks, where a single step would be a tenth of a second off.
-  move_position(0.5f * dt_s);
+  add(&owed_s_, 0.5f * dt_s);
+  settle();
   for (uint8_t i = 0; i < kAxes; ++i) {
     const uint8_t j = next(i), k = next(j);
     mix(kVelocity + i, kAttitude + j, f[k]);  // -[F x]
     mix(kVelocity + j, kAttitude + i, -f[k]);
   }
   widen(kVelocity, kVelocityNoise_m2_s3 * dt_s, kAxes);
-  move_position(0.5f * dt_s);
+  owed_s_ = 0.5f * dt_s;
 }
 
 float ErrorFilter::update(State group, const float direction[kAxes], float yaw, float innovation,
