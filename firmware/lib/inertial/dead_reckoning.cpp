@@ -234,12 +234,14 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
     publish();
     return;
   }
-  float angle[kAxes] = {0.0f, 0.0f, 0.0f};
-  add_scaled(angle, sample.angular_rate_rad_s, dt_s, kAxes);
-  add_scaled(angle, bias_rad_s_, -dt_s, kAxes);
   const float strength = norm(sample.acceleration_m_s2);
-  watch_quiet(strength, angle, dt_s);
-  attitude_.integrate(angle);
+  {
+    float angle[kAxes] = {0.0f, 0.0f, 0.0f};
+    add_scaled(angle, sample.angular_rate_rad_s, dt_s, kAxes);
+    add_scaled(angle, bias_rad_s_, -dt_s, kAxes);
+    watch_quiet(strength, angle, dt_s);
+    attitude_.integrate(angle);
+  }
   float rotation[kAxes * kAxes], force[kAxes];
   attitude_.matrix(rotation);
   rotate(rotation, sample.acceleration_m_s2, force);

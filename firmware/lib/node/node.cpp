@@ -478,7 +478,7 @@ bool Node::radio_free() {
 
 // Motion and status are written when they are sent, so they cannot wait in a queue and be dropped;
 // ranges wait in a ring that gives up the oldest. They come last: they alone can fill the air.
-bool Node::send_next() {
+RELPOS_SHARED bool Node::send_next() {
   uint8_t* body = frame_ + wire::kHeaderBytes;
   if (answer_due() && !store_.saving()) {  // acknowledged once it is done for good
     send(wire::MessageType::kAcknowledgement, fill_answer(body));
