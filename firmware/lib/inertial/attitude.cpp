@@ -29,7 +29,7 @@ void turn(const float angle[kAxes], float out[4]) {
 
 }  // namespace
 
-float wrap_angle(float angle_rad) {
+RELPOS_SHARED float wrap_angle(float angle_rad) {
   while (angle_rad > kPi) angle_rad -= 2.0f * kPi;
   while (angle_rad <= -kPi) angle_rad += 2.0f * kPi;
   return angle_rad;

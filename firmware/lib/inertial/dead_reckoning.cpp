@@ -105,7 +105,7 @@ void count(uint16_t* counter) {
 
 void clear(float vector[kAxes]) { memset(vector, 0, kAxes * sizeof *vector); }
 
-void left_of(const float axis[2], float out[2]) {
+RELPOS_SHARED void left_of(const float axis[2], float out[2]) {
   out[kX] = -axis[kY];
   out[kY] = axis[kX];
 }
@@ -516,7 +516,7 @@ void DeadReckoning::measure(State group, const float direction[kAxes], float inn
   add_scaled(bias_rad_s_, correction + kBias, 1.0f, kAxes);
 }
 
-void DeadReckoning::begin_straight() {
+RELPOS_SHARED void DeadReckoning::begin_straight() {
   straight_heading_rad_ = displacement_.heading_rad;
   straight_s_ = 0.0f;
 }

@@ -46,7 +46,7 @@ void GaitDetector::reset() {
   restart_arc();
 }
 
-void GaitDetector::restart_arc() {
+RELPOS_SHARED void GaitDetector::restart_arc() {
   trough_m_ = height_m_;
   lowest_m_s2_ = 1e6f;
   highest_m_s2_ = -1e6f;
