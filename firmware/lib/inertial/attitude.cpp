@@ -71,7 +71,7 @@ void Attitude::integrate(const float angle[kAxes]) {
   take(product);
 }
 
-void Attitude::correct(const float angle[kAxes]) {
+RELPOS_SHARED void Attitude::correct(const float angle[kAxes]) {
   Attitude small;
   turn(angle, small.q);
   premultiply(small);

@@ -300,7 +300,7 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   publish();
 }
 
-void DeadReckoning::on_stance(const Stance& stance, const float rotation[kAxes * kAxes]) {
+RELPOS_SHARED void DeadReckoning::on_stance(const Stance& stance, const float rotation[kAxes * kAxes]) {
   const float age_ticks = stance.age_s * kTicks_s;
   displacement_.last_step_tick = ticks_ - static_cast<uint16_t>(age_ticks);
   if (stance.last) {
@@ -396,7 +396,7 @@ void DeadReckoning::watch_mounting(const float rotation[kAxes * kAxes]) {
   }
 }
 
-void DeadReckoning::capture_span() {
+RELPOS_SHARED void DeadReckoning::capture_span() {
   span_ = since_;
   since_ = Span();
 }
@@ -499,7 +499,7 @@ void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
   measure(group, direction, innovation, variance, yaw);
 }
 
-void DeadReckoning::measure(State group, const float direction[kAxes], float innovation,
+RELPOS_SHARED void DeadReckoning::measure(State group, const float direction[kAxes], float innovation,
                             float variance, float yaw) {
   float correction[kStates + 1];
   filter_.update(group, direction, yaw, innovation, variance, correction);
@@ -643,7 +643,7 @@ void DeadReckoning::apply_magnetic() {
   magnetic_steps_ = 0;
 }
 
-void DeadReckoning::publish() {
+RELPOS_SHARED void DeadReckoning::publish() {
   Displacement& d = displacement_;
   float way[2] = {0.0f, 0.0f};
   if (d.initialised && velocity_known_ && forward_.found()) {

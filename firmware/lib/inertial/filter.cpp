@@ -95,7 +95,7 @@ void ErrorFilter::predict_motion(const float f[kAxes], float dt_s) {
   owed_s_ = 0.5f * dt_s;
 }
 
-float ErrorFilter::update(State group, const float direction[kAxes], float yaw, float innovation,
+RELPOS_SHARED float ErrorFilter::update(State group, const float direction[kAxes], float yaw, float innovation,
                           float variance, float correction[kStates + 1]) {
   // P h first, which becomes the correction row by row, where it is no longer needed.
   float* const ph = correction;

@@ -39,7 +39,7 @@ const float kForwardCoherence = 0.06f;
 
 }  // namespace
 
-void GaitDetector::reset() {
+RELPOS_SHARED void GaitDetector::reset() {
   memset(static_cast<void*>(this), 0, sizeof *this);
   since_s_ = kPause_s + 1.0f;
   period_s_ = kFirstPeriod_s;
@@ -52,7 +52,7 @@ RELPOS_SHARED void GaitDetector::restart_arc() {
   highest_m_s2_ = -1e6f;
 }
 
-bool GaitDetector::walking() const { return since_s_ < kPause_s; }
+RELPOS_SHARED bool GaitDetector::walking() const { return since_s_ < kPause_s; }
 
 uint16_t GaitDetector::take_rejected() {
   const uint16_t count = rejected_;
@@ -60,7 +60,7 @@ uint16_t GaitDetector::take_rejected() {
   return count;
 }
 
-bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance* stance) {
+RELPOS_SHARED bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance* stance) {
   if (!running_) {
     mean_m_s2_ = vertical_m_s2;
     running_ = true;
@@ -145,7 +145,7 @@ float turning_share(float yaw_rad) {
   return 1.0f / (1.0f + turn * turn);
 }
 
-void ForwardFinder::reset() {
+RELPOS_SHARED void ForwardFinder::reset() {
   memset(static_cast<void*>(this), 0, sizeof *this);
   axis_[kX] = 1.0f;
 }
@@ -174,7 +174,7 @@ void ForwardFinder::turn(float angle_rad) {
   point();
 }
 
-void ForwardFinder::point() {
+RELPOS_SHARED void ForwardFinder::point() {
   offset_rad_ = atan2f(product_[kY], product_[kX]);
   direct(offset_rad_, axis_);
 }

@@ -5,7 +5,8 @@
 
 #include <stdint.h>
 
-// Kept as one copy that is called: inlined or cloned it would undo what it is for.
+// Kept as one copy that is called: inlined or cloned it would undo what it is for. A method so kept
+// reaches its object by a pointer, two bytes an access, not by its address, four. Each was measured.
 #if defined(__AVR__)
 #define RELPOS_SHARED __attribute__((noinline, noclone))
 #else
