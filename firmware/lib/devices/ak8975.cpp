@@ -1,5 +1,7 @@
 #include "devices/ak8975.h"
 
+#include "inertial/calls.h"
+
 namespace relpos {
 namespace {
 
@@ -37,7 +39,7 @@ void Ak8975::fail() {
   wait_ticks_ = kAbsentTicks;
 }
 
-bool Ak8975::step(Board& board, float field_ut[3]) {
+RELPOS_APART bool Ak8975::step(Board& board, float field_ut[3]) {
   if (wait_ticks_ > 0) {
     --wait_ticks_;
     return false;

@@ -1,5 +1,6 @@
 #include "devices/mpu9150.h"
 
+#include "inertial/calls.h"
 #include "devices/flash.h"
 
 namespace relpos {
@@ -104,7 +105,7 @@ Mpu9150::Event Mpu9150::step(Board& board, uint32_t now_us, uint32_t* wait_us) {
   return Event::kReady;
 }
 
-bool Mpu9150::read(Board& board, float acceleration_m_s2[3], float angular_rate_rad_s[3]) {
+RELPOS_APART bool Mpu9150::read(Board& board, float acceleration_m_s2[3], float angular_rate_rad_s[3]) {
   uint8_t raw[kBurst];
   if (!board.read_registers(kAddress, kAccelXHigh, raw, kBurst)) {
     if (++failures_ >= kMostFailures) restart();

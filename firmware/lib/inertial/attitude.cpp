@@ -1,21 +1,27 @@
 #include "attitude.h"
 
 #include <math.h>
+#include <string.h>
 
 // Written in loops: unrolled, each product of quaternions would be 600 bytes of the Uno's flash.
 
 namespace relpos {
 namespace {
 
-// out := a * b, out neither of them.
+// out := a * b, out neither of them. With the units 1, i, j, k numbered 0 to 3, the product of two is
+// the one numbered by their exclusive or, but for its sign.
 void multiply(const float a[4], const float b[4], float out[4]) {
-  float scalar = a[0] * b[0];
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    const uint8_t j = next(i), k = next(j);
-    scalar -= a[1 + i] * b[1 + i];
-    out[1 + i] = a[0] * b[1 + i] + b[0] * a[1 + i] + a[1 + j] * b[1 + k] - a[1 + k] * b[1 + j];
+  // Bit 4 row + column: a[column] b[row ^ column] is subtracted from out[row].
+  uint16_t negative = 1u << 1 | 1u << 2 | 1u << 3 | 1u << 7 | 1u << 9 | 1u << 14;
+  for (uint8_t row = 0; row < 4; ++row) {
+    float sum = 0.0f;
+    for (uint8_t column = 0; column < 4; ++column) {
+      const float product = a[column] * b[row ^ column];
+      sum += (negative & 1) != 0 ? -product : product;
+      negative >>= 1;
+    }
+    out[row] = sum;
   }
-  out[0] = scalar;
 }
 
 // Rotation by a small angle. Half-angle sine and cosine to third order: at 500 deg/s and 20 ms the
@@ -24,7 +30,8 @@ void turn(const float angle[kAxes], float out[4]) {
   const float square = 0.25f * dot(angle, angle);
   const float sine = 0.5f - square * (1.0f / 12.0f);
   out[0] = 1.0f - 0.5f * square + square * square * (1.0f / 24.0f);
-  for (uint8_t i = 0; i < kAxes; ++i) out[1 + i] = angle[i] * sine;
+  out[1] = out[2] = out[3] = 0.0f;
+  add_scaled(out + 1, angle, sine, kAxes);
 }
 
 }  // namespace
@@ -61,10 +68,11 @@ void Attitude::take(const float product[4]) {
   float square = 0.0f;
   for (uint8_t i = 0; i < 4; ++i) square += product[i] * product[i];
   const float scale = 1.5f - 0.5f * square;
-  for (uint8_t i = 0; i < 4; ++i) q[i] = product[i] * scale;
+  memset(q, 0, sizeof q);
+  add_scaled(q, product, scale, 4);
 }
 
-void Attitude::integrate(const float angle[kAxes]) {
+RELPOS_APART void Attitude::integrate(const float angle[kAxes]) {
   float small[4], product[4];
   turn(angle, small);
   multiply(q, small, product);
@@ -85,12 +93,12 @@ void Attitude::premultiply(const Attitude& first) {
 
 void Attitude::matrix(float r[kAxes * kAxes]) const {
   const float* v = q + 1;
-  float twice[kAxes];
-  for (uint8_t i = 0; i < kAxes; ++i) twice[i] = v[i] + v[i];
+  const float twice = q[0] + q[0];
   for (uint8_t i = 0; i < kAxes; ++i) {
     const uint8_t j = next(i), k = next(j);
-    r[4 * i] = 1.0f - (v[j] * twice[j] + v[k] * twice[k]);
-    const float same = v[i] * twice[j], opposite = q[0] * twice[k];
+    const float double_i = v[i] + v[i];
+    const float same = double_i * v[j], opposite = twice * v[k];
+    r[4 * i] = double_i * v[i] + (twice * q[0] - 1.0f);
     r[3 * i + j] = same - opposite;
     r[3 * j + i] = same + opposite;
   }

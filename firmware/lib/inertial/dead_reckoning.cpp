@@ -137,7 +137,7 @@ void DeadReckoning::reset() {
   step_heading_[kX] = 1.0f;
 }
 
-bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
+RELPOS_APART bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
   bool good = dt_s > 0.0f && dt_s <= 0.2f, saturated = false;
   for (uint8_t i = 0; i < kAxes; ++i) {
     const float force = fabsf(sample.acceleration_m_s2[i]);
@@ -159,7 +159,7 @@ bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
   return true;
 }
 
-void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_s) {
+RELPOS_APART void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_s) {
   if (ticks_ == 1) mean_force_m_s2_ = force;
   follow(&mean_force_m_s2_, force, dt_s * (1.0f / kForceMean_s));
   const float most_rad = kQuietRate_rad_s * dt_s;
@@ -173,7 +173,7 @@ void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_
 
 // Start: the attitude of the first sample is found from the mean force while the gyroscope already
 // carries the frame along, so that walking directly after switching on loses nothing.
-void DeadReckoning::gather(const ImuSample& sample, const float force[kAxes], float dt_s) {
+RELPOS_APART void DeadReckoning::gather(const ImuSample& sample, const float force[kAxes], float dt_s) {
   if (quiet_s_ == 0.0f) {
     // Movement after a quiet beginning ends the gathering before it spoils the mean.
     if (!moved_ && since_.time_s >= kShortStill_s) {
@@ -207,9 +207,8 @@ void DeadReckoning::initialise(bool still) {
   }
   Attitude level;
   level.level(velocity_m_s_);
-  float rotation[kAxes * kAxes];
-  level.matrix(rotation);
-  for (uint8_t i = 0; i < kAxes; ++i) heading_axis_[i] = rotation[i];
+  level.matrix(rotation_);
+  memcpy(heading_axis_, rotation_, sizeof heading_axis_);
   if (still) {
     attitude_ = level;  // the turning gathered meanwhile was bias
   } else {
@@ -225,7 +224,7 @@ void DeadReckoning::initialise(bool still) {
   displacement_.initialised = true;
 }
 
-void DeadReckoning::update(const ImuSample& sample, float dt_s) {
+RELPOS_APART void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   ++ticks_;
   for (uint8_t i = 0; i < kHolds; ++i) {
     if (hold_[i] > 0) --hold_[i];
@@ -234,6 +233,19 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
     publish();
     return;
   }
+  const bool reckoning = displacement_.initialised;
+  Stance stance;
+  const bool at_stance = advance(sample, dt_s, &stance);
+  if (reckoning) {
+    // At a mid-stance only a motion stage that is left over: it belongs before.
+    if (!at_stance || motion_pending_) work();
+    if (at_stance) on_stance(stance);
+  }
+  publish();
+}
+
+// Moves the nominal state by one sample. True at a mid-stance that the filter can use.
+RELPOS_APART bool DeadReckoning::advance(const ImuSample& sample, float dt_s, Stance* stance) {
   const float strength = norm(sample.acceleration_m_s2);
   {
     float angle[kAxes] = {0.0f, 0.0f, 0.0f};
@@ -242,29 +254,27 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
     watch_quiet(strength, angle, dt_s);
     attitude_.integrate(angle);
   }
-  float rotation[kAxes * kAxes], force[kAxes];
-  attitude_.matrix(rotation);
-  rotate(rotation, sample.acceleration_m_s2, force);
+  float force[kAxes];
+  attitude_.matrix(rotation_);
+  rotate(rotation_, sample.acceleration_m_s2, force);
 
-  Stance stance;
   if (!displacement_.initialised) {
     // Until the vertical is known the magnitude of the force stands for its vertical part.
-    if (gait_.update(strength, dt_s, &stance)) on_stance(stance, rotation);
+    if (gait_.update(strength, dt_s, stance)) on_stance(*stance);
     gather(sample, force, dt_s);
     if (job_ != kIdle) {  // such a step has nothing to measure against: counted, placed ahead
       job_ = kIdle;
       step_directed_ = false;
       commit_step();
     }
-    publish();
-    return;
+    return false;
   }
 
   float ahead[kAxes];  // the heading axis
-  rotate(rotation, heading_axis_, ahead);
+  rotate(rotation_, heading_axis_, ahead);
   if (fabsf(ahead[kZ]) > kSteep) {  // bent, crawling or lying: another axis takes over
-    aim(rotation, displacement_.heading_rad);
-    rotate(rotation, heading_axis_, ahead);
+    aim(displacement_.heading_rad);
+    rotate(rotation_, heading_axis_, ahead);
   }
   displacement_.heading_rad = atan2f(ahead[kY], ahead[kX]);
   add(&heading_sum_rad_, wrap_angle(displacement_.heading_rad - stance_heading_rad_));
@@ -279,7 +289,7 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
       begin_straight();
     }
   }
-  const bool at_stance = gait_.update(force[kZ], dt_s, &stance);
+  const bool at_stance = gait_.update(force[kZ], dt_s, stance);
   // Into the heading frame. The heading axis is level but for the body's tilt, whose square is all
   // that is lost by not normalising it: both components alike, which the direction does not see.
   float level[2];
@@ -294,13 +304,10 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   add_scaled(position_m_, force, 0.5f * dt_s * dt_s, kAxes);
   add_scaled(velocity_m_s_, force, dt_s, kAxes);
 
-  // At a mid-stance only a motion stage that is left over: it belongs before.
-  if (!at_stance || motion_pending_) work(rotation);
-  if (at_stance) on_stance(stance, rotation);
-  publish();
+  return at_stance;
 }
 
-RELPOS_SHARED void DeadReckoning::on_stance(const Stance& stance, const float rotation[kAxes * kAxes]) {
+RELPOS_SHARED void DeadReckoning::on_stance(const Stance& stance) {
   const float age_ticks = stance.age_s * kTicks_s;
   displacement_.last_step_tick = ticks_ - static_cast<uint16_t>(age_ticks);
   if (stance.last) {
@@ -360,23 +367,23 @@ RELPOS_SHARED void DeadReckoning::on_stance(const Stance& stance, const float ro
     clear(position_m_);
     capture_span();
     forward_.step();
-    watch_mounting(rotation);
+    watch_mounting();
   }
   compose(step_heading_, forward_.axis(), walk_);
   job_ = kFlush;
 }
 
 // Makes the body vector that points to `heading_rad` now the heading axis.
-void DeadReckoning::aim(const float rotation[kAxes * kAxes], float heading_rad) {
+void DeadReckoning::aim(float heading_rad) {
   float heading[2];
   direct(heading_rad, heading);
   clear(heading_axis_);
-  for (uint8_t i = 0; i < kZ; ++i) add_scaled(heading_axis_, rotation + 3 * i, heading[i], kAxes);
+  for (uint8_t i = 0; i < kZ; ++i) add_scaled(heading_axis_, rotation_ + 3 * i, heading[i], kAxes);
 }
 
 // A sensor turned on the body turns the heading axis one way and the forward axis the other: both are
 // turned back, so that the wearer's heading is what it was.
-void DeadReckoning::watch_mounting(const float rotation[kAxes * kAxes]) {
+RELPOS_APART void DeadReckoning::watch_mounting() {
   const float turned_rad = wrap_angle(forward_.offset_rad() - mounting_rad_);
   if (settled_steps_ < kSettledSteps) {
     if (forward_.found()) ++settled_steps_;
@@ -387,7 +394,7 @@ void DeadReckoning::watch_mounting(const float rotation[kAxes * kAxes]) {
     forward_.forget();  // the mean of before and after would be neither
   } else if (turned_steps_ == kTurnedSteps) {
     turned_steps_ = 0;
-    aim(rotation, displacement_.heading_rad + turned_rad);
+    aim(displacement_.heading_rad + turned_rad);
     displacement_.heading_rad = wrap_angle(displacement_.heading_rad + turned_rad);
     stance_heading_rad_ = displacement_.heading_rad;
     forward_.turn(-turned_rad);
@@ -401,16 +408,16 @@ RELPOS_SHARED void DeadReckoning::capture_span() {
   since_ = Span();
 }
 
-void DeadReckoning::predict_attitude(const float rotation[kAxes * kAxes]) {
+void DeadReckoning::predict_attitude() {
   // What the heading loses while it turns, never what a compass gives back: totals only grow.
   const float before = filter_.covariance(kAttitude + kZ, kAttitude + kZ);
-  filter_.predict_attitude(rotation, span_.time_s);
+  filter_.predict_attitude(rotation_, span_.time_s);
   const float growth = filter_.covariance(kAttitude + kZ, kAttitude + kZ) - before;
   if (growth > 0.0f) displacement_.variance_heading_rad2 += growth;
   motion_pending_ = true;
 }
 
-RELPOS_SHARED void DeadReckoning::work(const float rotation[kAxes * kAxes]) {
+RELPOS_SHARED void DeadReckoning::work() {
   if (motion_pending_) {
     filter_.predict_motion(span_.impulse_m_s, span_.time_s);
     motion_pending_ = false;
@@ -418,19 +425,19 @@ RELPOS_SHARED void DeadReckoning::work(const float rotation[kAxes * kAxes]) {
   } else if ((job_ > kFlush || still_pending_ || magnetic_pending_) && filter_.settle()) {
     return;  // a piece of its own
   } else if (job_ != kIdle) {
-    run_job(rotation);
+    run_job();
   } else if (still_pending_) {  // before the prediction, or standing would leave it no tick
     still_pending_ = false;
-    apply_straight(rotation, kSway_rad / kStill_s);
+    apply_straight(kSway_rad / kStill_s);
   } else if (magnetic_pending_) {
     apply_magnetic();
   } else if (since_.time_s >= kPredict_s) {
     capture_span();
-    predict_attitude(rotation);
+    predict_attitude();
   }
 }
 
-void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
+RELPOS_APART void DeadReckoning::run_job() {
   State group = kPosition;
   float direction[kAxes] = {0.0f, 0.0f, 0.0f};
   float innovation, variance, yaw = 0.0f;
@@ -443,7 +450,7 @@ void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
   resolve(walk_, stance_position_m_, way);
   switch (job) {
     case kFlush:
-      predict_attitude(rotation);
+      predict_attitude();
       if (!velocity_known_) job_ = kVertical;
       if (!step_directed_) job_ = kVertical;
       return;
@@ -474,7 +481,7 @@ void DeadReckoning::run_job(const float rotation[kAxes * kAxes]) {
       if (!step_straight_) job_ = kCommit;
       break;
     case kDrift:
-      apply_straight(rotation, kStraightSigma_rad_s);
+      apply_straight(kStraightSigma_rad_s);
       return;
     case kCommit:
       commit_step();
@@ -521,11 +528,11 @@ RELPOS_SHARED void DeadReckoning::begin_straight() {
   straight_s_ = 0.0f;
 }
 
-void DeadReckoning::apply_straight(const float rotation[kAxes * kAxes], float sigma_rad_s) {
+void DeadReckoning::apply_straight(float sigma_rad_s) {
   float direction[kAxes];
   float expected = sigma_rad_s * sigma_rad_s;
   for (uint8_t i = 0; i < kAxes; ++i) {
-    direction[i] = -rotation[3 * kZ + i];
+    direction[i] = -rotation_[3 * kZ + i];
     expected += direction[i] * direction[i] * filter_.covariance(kBias + i, kBias + i);
   }
   const float rate = straight_rate_rad_s_;
@@ -580,7 +587,7 @@ void DeadReckoning::commit_step() {
   }
 }
 
-void DeadReckoning::commit_still() {
+RELPOS_APART void DeadReckoning::commit_still() {
   const bool still = quiet_s_ >= kQuiet_s;
   if (still) velocity_known_ = true;
   if (still && forward_.found()) {
@@ -602,12 +609,12 @@ void DeadReckoning::commit_still() {
   filter_.restart(kPosition, 0.0f);
 }
 
-void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
+RELPOS_APART void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
   displacement_.magnetic_heading_valid = false;
   if (!displacement_.initialised) return;
-  float rotation[kAxes * kAxes], field[kAxes];
-  attitude_.matrix(rotation);
-  rotate(rotation, field_ut, field);
+  float field[kAxes];
+  attitude_.matrix(rotation_);
+  rotate(rotation_, field_ut, field);
   const float strength = norm(field);  // NaN fails every comparison below
   const float azimuth = atan2f(field[kY], field[kX]);
   bool plausible = strength > kFieldLeast_ut && strength < kFieldMost_ut;

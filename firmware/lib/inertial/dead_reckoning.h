@@ -90,13 +90,14 @@ class DeadReckoning {
   void watch_quiet(float force_m_s2, const float angle_rad[kAxes], float dt_s);
   void gather(const ImuSample& sample, const float force_m_s2[kAxes], float dt_s);
   void initialise(bool still);
-  void on_stance(const Stance& stance, const float rotation[kAxes * kAxes]);
-  void aim(const float rotation[kAxes * kAxes], float heading_rad);
-  void watch_mounting(const float rotation[kAxes * kAxes]);
-  void work(const float rotation[kAxes * kAxes]);
-  void run_job(const float rotation[kAxes * kAxes]);
+  bool advance(const ImuSample& sample, float dt_s, Stance* stance);
+  void on_stance(const Stance& stance);
+  void aim(float heading_rad);
+  void watch_mounting();
+  void work();
+  void run_job();
   void capture_span();
-  void predict_attitude(const float rotation[kAxes * kAxes]);
+  void predict_attitude();
   void measure(State group, const float direction[kAxes], float innovation, float variance,
                float yaw = 0.0f);
   void widen(float along_m2, float across_m2);
@@ -104,7 +105,7 @@ class DeadReckoning {
   void commit_still();
   void apply_magnetic();
   void begin_straight();
-  void apply_straight(const float rotation[kAxes * kAxes], float sigma_rad_s);
+  void apply_straight(float sigma_rad_s);
   void publish();
 
   // What is small and often used first: the AVR reaches 64 bytes from a pointer in one instruction.
@@ -134,6 +135,7 @@ class DeadReckoning {
 
   // Nominal state. While gathering, velocity_ and position_ hold the sums of force and rate.
   Attitude attitude_;
+  float rotation_[kAxes * kAxes];  // the attitude as a matrix, as the tick has it at its beginning
   float bias_rad_s_[kAxes];
   float velocity_m_s_[kAxes];
   float position_m_[kAxes];         // since the last mid-stance

@@ -22,7 +22,7 @@ bool turning(uint8_t state) { return static_cast<uint8_t>(state - (kAttitude + k
 }  // namespace
 
 // Packed by rows of the upper triangle.
-RELPOS_SHARED float* ErrorFilter::at(uint8_t i, uint8_t j) {
+RELPOS_APART float* ErrorFilter::at(uint8_t i, uint8_t j) {
   if (i > j) {
     const uint8_t swap = i;
     i = j;
@@ -31,7 +31,7 @@ RELPOS_SHARED float* ErrorFilter::at(uint8_t i, uint8_t j) {
   return p_ + static_cast<uint8_t>(static_cast<uint8_t>(i * (2 * kStates - 1 - i)) / 2 + j);
 }
 
-RELPOS_SHARED void ErrorFilter::widen(uint8_t state, float variance, uint8_t count) {
+RELPOS_APART void ErrorFilter::widen(uint8_t state, float variance, uint8_t count) {
   for (; count != 0; --count, ++state) *at(state, state) += variance;
 }
 
@@ -42,7 +42,7 @@ void ErrorFilter::reset(float tilt_rad, float bias_rad2_s2, float velocity_m_s) 
   widen(kVelocity, velocity_m_s * velocity_m_s, kAxes);
 }
 
-RELPOS_SHARED void ErrorFilter::mix(uint8_t to, uint8_t from, float factor) {
+RELPOS_APART void ErrorFilter::mix(uint8_t to, uint8_t from, float factor) {
   // P' = E P E' with E = 1 + factor e_to e_from'. The variance of `to` gets factor times the
   // covariance of the two before the change, and again after it.
   add_scaled(at(to, to), at(to, from), factor, 1);
@@ -56,7 +56,7 @@ RELPOS_SHARED void ErrorFilter::mix(uint8_t to, uint8_t from, float factor) {
   add_scaled(at(to, to), at(to, from), factor, 1);
 }
 
-RELPOS_SHARED void ErrorFilter::add_column(float out[kStates], uint8_t state, float factor) const {
+RELPOS_APART void ErrorFilter::add_column(float out[kStates], uint8_t state, float factor) const {
   if (factor == 0.0f) return;
   const float* p = p_ + state;
   for (uint8_t other = 0; other < kStates; ++other) {
@@ -152,7 +152,7 @@ void ErrorFilter::restart(State group, float sigma) {
   widen(group, sigma * sigma, kAxes);
 }
 
-RELPOS_SHARED float ErrorFilter::along(State group, const float direction[2]) const {
+RELPOS_APART float ErrorFilter::along(State group, const float direction[2]) const {
   float sum = 0.0f;
   for (uint8_t i = 0; i < kZ; ++i) {
     for (uint8_t j = 0; j < kZ; ++j) sum += direction[i] * direction[j] * *at(group + i, group + j);

@@ -123,18 +123,6 @@ RELPOS_SHARED bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance*
   return true;
 }
 
-// Newton's method from a third of the exponent, 3 % off: 1e-3 after one step, 1e-6 after two. The
-// library's cbrtf is 420 bytes of the Uno's flash.
-static float cube_root(float value) {
-  uint32_t bits;
-  memcpy(&bits, &value, sizeof bits);
-  bits = bits / 3 + 0x2A5137A0;
-  float root;
-  memcpy(&root, &bits, sizeof root);
-  for (uint8_t i = 0; i < 2; ++i) follow(&root, value / (root * root), 1.0f / 3.0f);
-  return root;
-}
-
 float pendulum_step_m(float excursion_m, float leg_length_m, float gain) {
   const float length = gain * cube_root(leg_length_m * leg_length_m * excursion_m);
   return excursion_m < kSmallRise_m ? length * sqrtf(excursion_m * (1.0f / kSmallRise_m)) : length;
@@ -155,7 +143,7 @@ void ForwardFinder::forget() {
   power_a_ = power_v_ = 0.0f;
 }
 
-void ForwardFinder::update(const float a[2], float vertical_velocity_m_s, float dt_s) {
+RELPOS_APART void ForwardFinder::update(const float a[2], float vertical_velocity_m_s, float dt_s) {
   const float gain = dt_s * (1.0f / kForwardMemory_s);
   float power = 0.0f;
   for (uint8_t i = 0; i < 2; ++i) {
@@ -179,7 +167,7 @@ RELPOS_SHARED void ForwardFinder::point() {
   direct(offset_rad_, axis_);
 }
 
-void ForwardFinder::step() {
+RELPOS_APART void ForwardFinder::step() {
   if (steps_ < 255) ++steps_;
   if (steps_ < kForwardSteps) return;
   const float product = product_[kX] * product_[kX] + product_[kY] * product_[kY];

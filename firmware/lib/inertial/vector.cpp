@@ -1,6 +1,7 @@
 #include "vector.h"
 
 #include <math.h>
+#include <string.h>
 
 namespace relpos {
 
@@ -28,8 +29,20 @@ RELPOS_SHARED void resolve(const float axis[2], const float v[2], float out[2]) 
 }
 
 RELPOS_SHARED void compose(const float axis[2], const float v[2], float out[2]) {
-  out[kX] = axis[kX] * v[kX] - axis[kY] * v[kY];
-  out[kY] = axis[kX] * v[kY] + axis[kY] * v[kX];
+  const float mirrored[2] = {axis[kX], -axis[kY]};
+  resolve(mirrored, v, out);
+}
+
+float cube_root(float x) {
+  // Newton's steps, from a third of the exponent: within 4 % at the start, squared each time.
+  static_assert(sizeof(uint32_t) == sizeof x, "a float's bits are taken");
+  uint32_t bits;
+  memcpy(&bits, &x, sizeof bits);
+  bits = bits / 3 + 0x2a514067;
+  float root;
+  memcpy(&root, &bits, sizeof root);
+  for (uint8_t i = 0; i < 3; ++i) root += (x / (root * root) - root) * (1.0f / 3.0f);
+  return root;
 }
 
 RELPOS_SHARED void direct(float angle_rad, float out[2]) {

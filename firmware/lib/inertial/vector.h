@@ -5,13 +5,7 @@
 
 #include <stdint.h>
 
-// Kept as one copy that is called: inlined or cloned it would undo what it is for. A method so kept
-// reaches its object by a pointer, two bytes an access, not by its address, four. Each was measured.
-#if defined(__AVR__)
-#define RELPOS_SHARED __attribute__((noinline, noclone))
-#else
-#define RELPOS_SHARED
-#endif
+#include "calls.h"
 
 namespace relpos {
 
@@ -30,6 +24,8 @@ void follow(float* value, float target, float gain);
 void resolve(const float axis[2], const float v[2], float out[2]);
 // v turned (and stretched) by the axis, undoing resolve; out must not be v or axis.
 void compose(const float axis[2], const float v[2], float out[2]);
+// Of a number that is not negative, to 1e-6; cbrtf is 420 bytes of the Uno's flash.
+float cube_root(float x);
 // The unit vector of a direction.
 void direct(float angle_rad, float out[2]);
 

@@ -83,7 +83,7 @@ void MotionTotals::fill(const Displacement& now, wire::Motion* motion) const {
   motion->steps = static_cast<uint16_t>(steps_ + now.steps);
 }
 
-void MotionTotals::rebase(const Displacement& last, float gap_s) {
+RELPOS_APART void MotionTotals::rebase(const Displacement& last, float gap_s) {
   wire::Motion motion;
   fill(last, &motion);
   if (gap_s > kMostGapS) gap_s = kMostGapS;

@@ -3,6 +3,7 @@
 #include <stddef.h>
 #include <string.h>
 
+#include "inertial/calls.h"
 #include "devices/flash.h"
 #include "node/calibration.h"
 #include "node/version.h"
@@ -173,7 +174,7 @@ void Node::show_health() {
 
 // ---- motion ----
 
-__attribute__((noinline)) bool Node::imu_silent() const { return !sampled_ || clock_.ms() - last_sample_ms_ > kSilentMs; }
+RELPOS_APART bool Node::imu_silent() const { return !sampled_ || clock_.ms() - last_sample_ms_ > kSilentMs; }
 
 void Node::configure_inertial() {
   InertialConfig& config = dead_reckoning_.config();
@@ -326,7 +327,7 @@ void Node::receive_packet() {
        static_cast<uint8_t>(length - wire::kHeaderBytes - wire::kCrcBytes));
 }
 
-__attribute__((noinline)) void Node::obey(const uint8_t* body, uint8_t length) {
+RELPOS_APART void Node::obey(const uint8_t* body, uint8_t length) {
   if (length != wire::kCommandBytes) {
     ++bad_frames_;
     return;
@@ -478,7 +479,7 @@ bool Node::radio_free() {
 
 // Motion and status are written when they are sent, so they cannot wait in a queue and be dropped;
 // ranges wait in a ring that gives up the oldest. They come last: they alone can fill the air.
-__attribute__((noinline)) bool Node::send_next() {
+RELPOS_APART bool Node::send_next() {
   uint8_t* body = frame_ + wire::kHeaderBytes;
   if (answer_due() && !store_.saving()) {  // acknowledged once it is done for good
     send(wire::MessageType::kAcknowledgement, fill_answer(body));
