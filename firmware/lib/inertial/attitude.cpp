@@ -42,32 +42,30 @@ RELPOS_SHARED float wrap_angle(float angle_rad) {
   return angle_rad;
 }
 
+RELPOS_SHARED float turn_between(const float& from_rad, const float& to_rad) {
+  return wrap_angle(to_rad - from_rad);
+}
+
 void Attitude::set_identity() {
   q[0] = 1.0f;
   q[1] = q[2] = q[3] = 0.0f;
 }
 
 void Attitude::level(const float up[kAxes]) {
-  const float norm = sqrtf(dot(up, up));
-  const float cosine = up[kZ] / norm;
-  q[3] = 0.0f;
-  if (cosine < -0.9999f) {  // upside down: any horizontal axis will do
-    q[0] = q[2] = 0.0f;
-    q[1] = 1.0f;
-    return;
+  // q = (|up| + up_z, up x z), normalised
+  const float length = norm(up);
+  float half[4] = {length + up[kZ], up[kY], -up[kX], 0.0f};
+  if (half[0] < 1e-4f * length) {  // upside down: any horizontal axis will do
+    half[0] = half[2] = 0.0f;
+    half[1] = 1.0f;
   }
-  // q = (1 + cos, up x z), normalised
-  const float scale = 1.0f / sqrtf(2.0f * (1.0f + cosine));
-  q[0] = (1.0f + cosine) * scale;
-  q[1] = up[kY] / norm * scale;
-  q[2] = -up[kX] / norm * scale;
+  memset(q, 0, sizeof q);
+  add_scaled(q, half, 1.0f / sqrtf(dot(half, half, 4)), 4);
 }
 
 void Attitude::take(const float product[4]) {
   // One Newton step for 1/sqrt near 1: the norm moves by 1e-7 a tick.
-  float square = 0.0f;
-  for (uint8_t i = 0; i < 4; ++i) square += product[i] * product[i];
-  const float scale = 1.5f - 0.5f * square;
+  const float scale = 1.5f - 0.5f * dot(product, product, 4);
   memset(q, 0, sizeof q);
   add_scaled(q, product, scale, 4);
 }

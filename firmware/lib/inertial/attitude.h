@@ -11,6 +11,7 @@ namespace relpos {
 const float kPi = 3.14159265f;
 
 float wrap_angle(float angle_rad);  // to (-pi, pi]; for angles within a few turns
+float turn_between(const float& from_rad, const float& to_rad);  // in the same interval
 
 struct Attitude {
   float q[4];  // scalar part, then x, y, z

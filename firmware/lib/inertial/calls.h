@@ -5,12 +5,14 @@
 // Kept as one copy that is called: inlined or cloned it would undo what it is for. A method so kept
 // reaches its object by a pointer, two bytes an access, not by its address, four. Each was measured.
 #if defined(__AVR__)
-#define RELPOS_SHARED __attribute__((noinline, noclone))
+#define RELPOS_SHARED __attribute__((noinline, noclone, section(".text.a")))
 // Called from one place, yet not inlined there: its variables are on the stack only while it runs.
 #define RELPOS_APART __attribute__((noinline))
+#define RELPOS_NEAR __attribute__((noinline, section(".text.near")))
 #else
 #define RELPOS_SHARED
 #define RELPOS_APART
+#define RELPOS_NEAR
 #endif
 
 #endif

@@ -137,7 +137,7 @@ void DeadReckoning::reset() {
   step_heading_[kX] = 1.0f;
 }
 
-RELPOS_APART bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
+RELPOS_NEAR bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
   bool good = dt_s > 0.0f && dt_s <= 0.2f, saturated = false;
   for (uint8_t i = 0; i < kAxes; ++i) {
     const float force = fabsf(sample.acceleration_m_s2[i]);
@@ -159,7 +159,7 @@ RELPOS_APART bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
   return true;
 }
 
-RELPOS_APART void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_s) {
+RELPOS_NEAR void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_s) {
   if (ticks_ == 1) mean_force_m_s2_ = force;
   follow(&mean_force_m_s2_, force, dt_s * (1.0f / kForceMean_s));
   const float most_rad = kQuietRate_rad_s * dt_s;
@@ -173,7 +173,7 @@ RELPOS_APART void DeadReckoning::watch_quiet(float force, const float angle[kAxe
 
 // Start: the attitude of the first sample is found from the mean force while the gyroscope already
 // carries the frame along, so that walking directly after switching on loses nothing.
-RELPOS_APART void DeadReckoning::gather(const ImuSample& sample, const float force[kAxes], float dt_s) {
+RELPOS_NEAR void DeadReckoning::gather(const ImuSample& sample, const float force[kAxes], float dt_s) {
   if (quiet_s_ == 0.0f) {
     // Movement after a quiet beginning ends the gathering before it spoils the mean.
     if (!moved_ && since_.time_s >= kShortStill_s) {
@@ -190,7 +190,7 @@ RELPOS_APART void DeadReckoning::gather(const ImuSample& sample, const float for
   if (since_.time_s >= (moved_ ? kMovingStart_s : kStillStart_s)) initialise(!moved_);
 }
 
-void DeadReckoning::initialise(bool still) {
+RELPOS_NEAR void DeadReckoning::initialise(bool still) {
   const float share = 1.0f / step_ticks_;
   float variance = filter_.covariance(kBias, kBias);  // as reset() set it
   if (still) {
@@ -224,7 +224,7 @@ void DeadReckoning::initialise(bool still) {
   displacement_.initialised = true;
 }
 
-RELPOS_APART void DeadReckoning::update(const ImuSample& sample, float dt_s) {
+RELPOS_NEAR void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   ++ticks_;
   for (uint8_t i = 0; i < kHolds; ++i) {
     if (hold_[i] > 0) --hold_[i];
@@ -245,7 +245,7 @@ RELPOS_APART void DeadReckoning::update(const ImuSample& sample, float dt_s) {
 }
 
 // Moves the nominal state by one sample. True at a mid-stance that the filter can use.
-RELPOS_APART bool DeadReckoning::advance(const ImuSample& sample, float dt_s, Stance* stance) {
+RELPOS_NEAR bool DeadReckoning::advance(const ImuSample& sample, float dt_s, Stance* stance) {
   const float strength = norm(sample.acceleration_m_s2);
   {
     float angle[kAxes] = {0.0f, 0.0f, 0.0f};
@@ -277,14 +277,14 @@ RELPOS_APART bool DeadReckoning::advance(const ImuSample& sample, float dt_s, St
     rotate(rotation_, heading_axis_, ahead);
   }
   displacement_.heading_rad = atan2f(ahead[kY], ahead[kX]);
-  add(&heading_sum_rad_, wrap_angle(displacement_.heading_rad - stance_heading_rad_));
+  add(&heading_sum_rad_, turn_between(stance_heading_rad_, displacement_.heading_rad));
   if (step_ticks_ < 65535u) ++step_ticks_;
 
   if (quiet_s_ >= kSettled_s) {
     if (quiet_s_ < kSettled_s + dt_s) begin_straight();
     add(&straight_s_, dt_s);
     if (straight_s_ >= kStill_s) {
-      straight_rate_rad_s_ = wrap_angle(displacement_.heading_rad - straight_heading_rad_) / straight_s_;
+      straight_rate_rad_s_ = turn_between(straight_heading_rad_, displacement_.heading_rad) / straight_s_;
       still_pending_ = true;
       begin_straight();
     }
@@ -307,7 +307,7 @@ RELPOS_APART bool DeadReckoning::advance(const ImuSample& sample, float dt_s, St
   return at_stance;
 }
 
-RELPOS_SHARED void DeadReckoning::on_stance(const Stance& stance) {
+RELPOS_NEAR void DeadReckoning::on_stance(const Stance& stance) {
   const float age_ticks = stance.age_s * kTicks_s;
   displacement_.last_step_tick = ticks_ - static_cast<uint16_t>(age_ticks);
   if (stance.last) {
@@ -320,40 +320,42 @@ RELPOS_SHARED void DeadReckoning::on_stance(const Stance& stance) {
   float mean = heading, turn = 0.0f;
   if (step_ticks_ > 0 && !stance.first) {
     mean = stance_heading_rad_ + heading_sum_rad_ / static_cast<float>(step_ticks_);
-    turn = wrap_angle(heading - stance_heading_rad_);
+    turn = turn_between(stance_heading_rad_, displacement_.heading_rad);
   }
   stance_heading_rad_ = heading;
   heading_sum_rad_ = 0.0f;
   direct(mean, step_heading_);
 
   const float share = turning_share(turn);
-  step_length_m_ =
+  const float interval_s = stance.interval_s;
+  float length =
       share * pendulum_step_m(stance.excursion_m, config_.leg_length_m, config_.step_gain);
-  step_sigma_m_ = kStepSigma;
+  float sigma = kStepSigma;
   if (stance.first) {
-    step_length_m_ *= kFirstStep;
-    step_sigma_m_ = kOddStepSigma;
+    length *= kFirstStep;
+    sigma = kOddStepSigma;
   }
-  step_speed_m_s_ = step_length_m_ / stance.interval_s;
-  step_irregular_ =
-      stance.weak || share < kIrregular || stance.excursion_m < kSmallRise_m;
-  const float most_m = kWalkRatio_m_s / stance.interval_s;
-  if (step_length_m_ > most_m) {
-    step_length_m_ = most_m;
-    step_sigma_m_ = kOddStepSigma;
-    step_irregular_ = true;
+  step_speed_m_s_ = length / interval_s;
+  bool irregular = stance.weak || share < kIrregular || stance.excursion_m < kSmallRise_m;
+  const float most_m = kWalkRatio_m_s / interval_s;
+  if (length > most_m) {
+    length = most_m;
+    sigma = kOddStepSigma;
+    irregular = true;
   }
-  if (step_irregular_) hold_[kHoldDoubt] = kHoldTicks;
-  step_sigma_m_ = step_sigma_m_ * step_length_m_ + kStepSigma_m + kTurnSigma_m * (1.0f - share);
+  step_irregular_ = irregular;
+  if (irregular) hold_[kHoldDoubt] = kHoldTicks;
+  step_length_m_ = length;
+  step_sigma_m_ = sigma * length + kStepSigma_m + kTurnSigma_m * (1.0f - share);
 
   if (stance.first || fabsf(turn + turn_rad_) > kStraight_rad) straight_steps_ = 0;
   turn_rad_ = turn;
-  add(&straight_s_, stance.interval_s);
+  add(&straight_s_, interval_s);
   ++straight_steps_;
   if (straight_steps_ == kStraightFrom) {
     begin_straight();
   } else if (straight_steps_ == kStraightTo) {
-    straight_rate_rad_s_ = wrap_angle(heading - straight_heading_rad_) / straight_s_;
+    straight_rate_rad_s_ = turn_between(straight_heading_rad_, displacement_.heading_rad) / straight_s_;
   }
   step_straight_ = straight_steps_ == kStraightSure;
   if (step_straight_) straight_steps_ = 2;
@@ -383,8 +385,8 @@ void DeadReckoning::aim(float heading_rad) {
 
 // A sensor turned on the body turns the heading axis one way and the forward axis the other: both are
 // turned back, so that the wearer's heading is what it was.
-RELPOS_APART void DeadReckoning::watch_mounting() {
-  const float turned_rad = wrap_angle(forward_.offset_rad() - mounting_rad_);
+RELPOS_NEAR void DeadReckoning::watch_mounting() {
+  const float turned_rad = turn_between(mounting_rad_, forward_.offset_rad());
   if (settled_steps_ < kSettledSteps) {
     if (forward_.found()) ++settled_steps_;
     mounting_rad_ = forward_.offset_rad();
@@ -408,7 +410,7 @@ RELPOS_SHARED void DeadReckoning::capture_span() {
   since_ = Span();
 }
 
-void DeadReckoning::predict_attitude() {
+RELPOS_NEAR void DeadReckoning::predict_attitude() {
   // What the heading loses while it turns, never what a compass gives back: totals only grow.
   const float before = filter_.covariance(kAttitude + kZ, kAttitude + kZ);
   filter_.predict_attitude(rotation_, span_.time_s);
@@ -417,11 +419,11 @@ void DeadReckoning::predict_attitude() {
   motion_pending_ = true;
 }
 
-RELPOS_SHARED void DeadReckoning::work() {
+RELPOS_NEAR void DeadReckoning::work() {
   if (motion_pending_) {
     filter_.predict_motion(span_.impulse_m_s, span_.time_s);
     motion_pending_ = false;
-    if (job_ == kIdle && (quiet_s_ >= kQuiet_s || !gait_.walking())) job_ = kStillX;
+    if (job_ == kIdle && (quiet() || !gait_.walking())) job_ = kStillX;
   } else if ((job_ > kFlush || still_pending_ || magnetic_pending_) && filter_.settle()) {
     return;  // a piece of its own
   } else if (job_ != kIdle) {
@@ -437,7 +439,7 @@ RELPOS_SHARED void DeadReckoning::work() {
   }
 }
 
-RELPOS_APART void DeadReckoning::run_job() {
+RELPOS_NEAR void DeadReckoning::run_job() {
   State group = kPosition;
   float direction[kAxes] = {0.0f, 0.0f, 0.0f};
   float innovation, variance, yaw = 0.0f;
@@ -491,7 +493,7 @@ RELPOS_APART void DeadReckoning::run_job() {
     case kStillY:
     case kStillZ: {
       const uint8_t axis = job - kStillX;
-      const float sigma = quiet_s_ >= kQuiet_s ? kStillSigma_m_s : kLooseSigma_m_s;
+      const float sigma = quiet() ? kStillSigma_m_s : kLooseSigma_m_s;
       group = kVelocity;
       direction[axis] = 1.0f;
       innovation = -velocity_m_s_[axis];
@@ -506,7 +508,7 @@ RELPOS_APART void DeadReckoning::run_job() {
   measure(group, direction, innovation, variance, yaw);
 }
 
-RELPOS_SHARED void DeadReckoning::measure(State group, const float direction[kAxes], float innovation,
+RELPOS_NEAR void DeadReckoning::measure(State group, const float direction[kAxes], float innovation,
                             float variance, float yaw) {
   float correction[kStates + 1];
   filter_.update(group, direction, yaw, innovation, variance, correction);
@@ -523,12 +525,14 @@ RELPOS_SHARED void DeadReckoning::measure(State group, const float direction[kAx
   add_scaled(bias_rad_s_, correction + kBias, 1.0f, kAxes);
 }
 
+RELPOS_NEAR bool DeadReckoning::quiet() const { return quiet_s_ >= kQuiet_s; }
+
 RELPOS_SHARED void DeadReckoning::begin_straight() {
   straight_heading_rad_ = displacement_.heading_rad;
   straight_s_ = 0.0f;
 }
 
-void DeadReckoning::apply_straight(float sigma_rad_s) {
+RELPOS_NEAR void DeadReckoning::apply_straight(float sigma_rad_s) {
   float direction[kAxes];
   float expected = sigma_rad_s * sigma_rad_s;
   for (uint8_t i = 0; i < kAxes; ++i) {
@@ -545,7 +549,7 @@ void DeadReckoning::widen(float along_m2, float across_m2) {
   add(&displacement_.variance_across_m2, across_m2);
 }
 
-void DeadReckoning::commit_step() {
+RELPOS_NEAR void DeadReckoning::commit_step() {
   float length = step_length_m_;
   float way[2] = {0.0f, 0.0f};
   add_scaled(way, step_heading_, length, 2);
@@ -587,8 +591,8 @@ void DeadReckoning::commit_step() {
   }
 }
 
-RELPOS_APART void DeadReckoning::commit_still() {
-  const bool still = quiet_s_ >= kQuiet_s;
+RELPOS_NEAR void DeadReckoning::commit_still() {
+  const bool still = quiet();
   if (still) velocity_known_ = true;
   if (still && forward_.found()) {
     // The half step into standing, as the inertial motion has it.
@@ -609,7 +613,7 @@ RELPOS_APART void DeadReckoning::commit_still() {
   filter_.restart(kPosition, 0.0f);
 }
 
-RELPOS_APART void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
+RELPOS_NEAR void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
   displacement_.magnetic_heading_valid = false;
   if (!displacement_.initialised) return;
   float field[kAxes];
@@ -618,7 +622,7 @@ RELPOS_APART void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
   const float strength = norm(field);  // NaN fails every comparison below
   const float azimuth = atan2f(field[kY], field[kX]);
   bool plausible = strength > kFieldLeast_ut && strength < kFieldMost_ut;
-  magnetic_residual_rad_ = wrap_angle(magnetic_azimuth_rad_ - azimuth);
+  magnetic_residual_rad_ = turn_between(azimuth, magnetic_azimuth_rad_);
   if (plausible) {
     float share = kFieldShare;
     if (magnetic_count_ < kFieldReadings) {
@@ -634,7 +638,7 @@ RELPOS_APART void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
     follow(&magnetic_vertical_ut_, field[kZ], share);
   }
   displacement_.magnetic_heading_valid = plausible;
-  displacement_.magnetic_heading_rad = wrap_angle(displacement_.heading_rad - azimuth);
+  displacement_.magnetic_heading_rad = turn_between(azimuth, displacement_.heading_rad);
   displacement_.quality_flags &= static_cast<uint16_t>(~kMagneticDisturbed);
   if (!plausible) {
     displacement_.quality_flags |= kMagneticDisturbed;
@@ -650,7 +654,7 @@ void DeadReckoning::apply_magnetic() {
   magnetic_steps_ = 0;
 }
 
-RELPOS_SHARED void DeadReckoning::publish() {
+RELPOS_NEAR void DeadReckoning::publish() {
   Displacement& d = displacement_;
   float way[2] = {0.0f, 0.0f};
   if (d.initialised && velocity_known_ && forward_.found()) {
@@ -671,7 +675,7 @@ RELPOS_SHARED void DeadReckoning::publish() {
   if (hold_[kHoldInput] > 0) flags |= kBadInput;
   if (hold_[kHoldDoubt] > 0) flags |= kStepDoubtful;
   if (!forward_.found()) flags |= kForwardUnknown;
-  if (quiet_s_ >= kQuiet_s) flags |= kStanding;
+  if (quiet()) flags |= kStanding;
   if (filter_.repairs() > 0) flags |= kCovarianceRepaired;
   if (!d.initialised) flags |= kStarting;
   if (!d.initialised ||

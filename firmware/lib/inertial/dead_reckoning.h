@@ -105,6 +105,7 @@ class DeadReckoning {
   void commit_still();
   void apply_magnetic();
   void begin_straight();
+  bool quiet() const;
   void apply_straight(float sigma_rad_s);
   void publish();
 

@@ -15,8 +15,7 @@ void Totals::reset() { memset(units_, 0, sizeof units_); }
 
 void Totals::add(const float way_m[2], float length_m) {
   for (uint8_t i = 0; i < kTotals; ++i) {
-    const float units = (i == kPath ? length_m : way_m[i]) * kUnitsPerMetre;
-    units_[i] += static_cast<uint32_t>(static_cast<int32_t>(units < 0.0f ? units - 0.5f : units + 0.5f));
+    units_[i] += static_cast<uint32_t>(rounded((i == kPath ? length_m : way_m[i]) * kUnitsPerMetre));
   }
 }
 

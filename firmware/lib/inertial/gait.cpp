@@ -37,6 +37,10 @@ const uint8_t kForwardSteps = 4;       // two strides: the sway of left and righ
 // reach 0.9, so it means nothing without the steps asked for above.
 const float kForwardCoherence = 0.06f;
 
+RELPOS_SHARED void integrate(float* sum, float rate, float dt_s) {
+  *sum += (rate - *sum * (1.0f / kLeakTime_s)) * dt_s;
+}
+
 }  // namespace
 
 RELPOS_SHARED void GaitDetector::reset() {
@@ -68,9 +72,8 @@ RELPOS_SHARED bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance*
   follow(&mean_m_s2_, vertical_m_s2, dt_s * (1.0f / kMeanTime_s));
   const float acceleration = vertical_m_s2 - mean_m_s2_;
   const float before = velocity_m_s_;
-  const float leak = 1.0f - dt_s * (1.0f / kLeakTime_s);
-  velocity_m_s_ = velocity_m_s_ * leak + acceleration * dt_s;
-  height_m_ = height_m_ * leak + velocity_m_s_ * dt_s;
+  integrate(&velocity_m_s_, acceleration, dt_s);
+  integrate(&height_m_, velocity_m_s_, dt_s);
   if (since_s_ < 1000.0f) add(&since_s_, dt_s);
   if (height_m_ < trough_m_) trough_m_ = height_m_;
   if (acceleration < lowest_m_s2_) lowest_m_s2_ = acceleration;
@@ -89,10 +92,12 @@ RELPOS_SHARED bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance*
   if (!(before > 0.0f && velocity_m_s_ <= 0.0f)) return false;
   const float swing = height_m_ - trough_m_;
   const float range_m_s2 = highest_m_s2_ - lowest_m_s2_;
-  stance->weak = swing < kSmallestSwing_m || since_s_ < kEarly * period_s_ ||
-                 since_s_ < kShortestStep_s || range_m_s2 < kSmallestRange_m_s2;
-  if (stance->weak && (first || range_m_s2 < kDueRange_m_s2 || since_s_ < kDueFrom * period_s_ ||
-                       since_s_ > kDueUntil * period_s_)) {
+  const float since_s = since_s_;
+  const float periods = since_s / period_s_;
+  stance->weak = swing < kSmallestSwing_m || periods < kEarly || since_s < kShortestStep_s ||
+                 range_m_s2 < kSmallestRange_m_s2;
+  if (stance->weak && (first || range_m_s2 < kDueRange_m_s2 || periods < kDueFrom ||
+                       periods > kDueUntil)) {
     if (first) {
       restart_arc();
     } else if (rejected_ < 255) {
@@ -101,19 +106,21 @@ RELPOS_SHARED bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance*
     return false;
   }
   float excursion = swing;
-  stance->interval_s = since_s_;
+  float interval_s = since_s;
   if (first) {
     steps_ = 0;
-    stance->interval_s = period_s_ = kFirstPeriod_s;
+    interval_s = period_s_ = kFirstPeriod_s;
   } else {
-    if (since_s_ < kLongestPeriod_s) follow(&period_s_, since_s_, kPeriodGain);
-    excursion = 0.5f * (height_m_ + peak_m_) - trough_m_;
+    if (since_s < kLongestPeriod_s) follow(&period_s_, since_s, kPeriodGain);
+    // The mean of both sides, at least half of this one.
+    excursion += 0.5f * (peak_m_ - height_m_);
     if (excursion < 0.5f * swing) excursion = 0.5f * swing;
   }
+  stance->interval_s = interval_s;
   if (steps_ < 255) ++steps_;
   footfall_due_ = !stance->weak && steps_ >= kWalk;
   // The three leaky filters shrink an oscillation of period T by 1/sqrt(1 + (T / 2 pi tau)^2) each.
-  const float ratio = stance->interval_s * (1.0f / (2.0f * kPi * kLeakTime_s));
+  const float ratio = interval_s * (1.0f / (2.0f * kPi * kLeakTime_s));
   const float square = ratio * ratio;
   const float mean = 0.5f * (kLeakTime_s / kMeanTime_s) * (kLeakTime_s / kMeanTime_s);
   stance->excursion_m = excursion * (1.0f + square) * (1.0f + mean * square);
@@ -145,12 +152,8 @@ void ForwardFinder::forget() {
 
 RELPOS_APART void ForwardFinder::update(const float a[2], float vertical_velocity_m_s, float dt_s) {
   const float gain = dt_s * (1.0f / kForwardMemory_s);
-  float power = 0.0f;
-  for (uint8_t i = 0; i < 2; ++i) {
-    follow(&product_[i], -a[i] * vertical_velocity_m_s, gain);
-    power += a[i] * a[i];
-  }
-  follow(&power_a_, power, gain);
+  for (uint8_t i = 0; i < 2; ++i) follow(&product_[i], -a[i] * vertical_velocity_m_s, gain);
+  follow(&power_a_, dot(a, a, 2), gain);
   follow(&power_v_, vertical_velocity_m_s * vertical_velocity_m_s, gain);
 }
 
@@ -170,8 +173,7 @@ RELPOS_SHARED void ForwardFinder::point() {
 RELPOS_APART void ForwardFinder::step() {
   if (steps_ < 255) ++steps_;
   if (steps_ < kForwardSteps) return;
-  const float product = product_[kX] * product_[kX] + product_[kY] * product_[kY];
-  if (product < kForwardCoherence * power_a_ * power_v_) return;
+  if (dot(product_, product_, 2) < kForwardCoherence * power_a_ * power_v_) return;
   point();
   found_ = true;
 }

@@ -62,7 +62,7 @@ class ForwardFinder {
   void forget();  // the sums; what is found stays
   void turn(float angle_rad);  // the heading axis was turned the other way
   bool found() const { return found_; }
-  float offset_rad() const { return offset_rad_; }      // from heading axis to forward, ccw
+  const float& offset_rad() const { return offset_rad_; }      // from heading axis to forward, ccw
   const float* axis() const { return axis_; }           // its cosine and sine
 
  private:

@@ -5,9 +5,9 @@
 
 namespace relpos {
 
-RELPOS_SHARED float dot(const float a[kAxes], const float b[kAxes]) {
+RELPOS_SHARED float dot(const float* a, const float* b, uint8_t count) {
   float sum = 0.0f;
-  for (uint8_t i = 0; i < kAxes; ++i) sum += a[i] * b[i];
+  for (; count != 0; --count) sum += *a++ * *b++;
   return sum;
 }
 
@@ -43,6 +43,10 @@ float cube_root(float x) {
   memcpy(&root, &bits, sizeof root);
   for (uint8_t i = 0; i < 3; ++i) root += (x / (root * root) - root) * (1.0f / 3.0f);
   return root;
+}
+
+RELPOS_SHARED int32_t rounded(float x) {
+  return static_cast<int32_t>(x + (x < 0.0f ? -0.5f : 0.5f));
 }
 
 RELPOS_SHARED void direct(float angle_rad, float out[2]) {

@@ -13,7 +13,7 @@ enum Axis : uint8_t { kX = 0, kY = 1, kZ = 2, kAxes = 3 };
 
 inline uint8_t next(uint8_t axis) { return axis == kZ ? static_cast<uint8_t>(kX) : axis + 1; }
 
-float dot(const float a[kAxes], const float b[kAxes]);
+float dot(const float* a, const float* b, uint8_t count = kAxes);
 float norm(const float v[kAxes]);
 void add(float* to, float value);  // to += value
 // to += factor * from.
@@ -26,6 +26,7 @@ void resolve(const float axis[2], const float v[2], float out[2]);
 void compose(const float axis[2], const float v[2], float out[2]);
 // Of a number that is not negative, to 1e-6; cbrtf is 420 bytes of the Uno's flash.
 float cube_root(float x);
+int32_t rounded(float x);
 // The unit vector of a direction.
 void direct(float angle_rad, float out[2]);
 

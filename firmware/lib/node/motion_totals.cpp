@@ -41,10 +41,9 @@ const Total kTable[] RELPOS_FLASH = {
 }  // namespace
 
 uint32_t scaled(float value, uint32_t per_unit) {
-  int32_t whole = static_cast<int32_t>(value);
-  if (value < 0.0f) --whole;
+  const int32_t whole = static_cast<int32_t>(value);  // towards zero
   const float rest = (value - static_cast<float>(whole)) * static_cast<float>(per_unit);
-  return static_cast<uint32_t>(whole) * per_unit + static_cast<uint32_t>(rest + 0.5f);
+  return static_cast<uint32_t>(whole) * per_unit + static_cast<uint32_t>(rounded(rest));
 }
 
 void MotionTotals::track(const Displacement& now) {

@@ -188,7 +188,7 @@ void Node::configure_inertial() {
   }
 }
 
-void Node::run_imu(uint32_t now_us) {
+RELPOS_APART void Node::run_imu(uint32_t now_us) {
   uint32_t wait = 0;
   const bool was_running = imu_.running();
   const Mpu9150::Event event = imu_.step(board_, now_us, &wait);
