@@ -30,8 +30,7 @@ void turn(const float angle[kAxes], float out[4]) {
   const float square = 0.25f * dot(angle, angle);
   const float sine = 0.5f - square * (1.0f / 12.0f);
   out[0] = 1.0f - 0.5f * square + square * square * (1.0f / 24.0f);
-  out[1] = out[2] = out[3] = 0.0f;
-  add_scaled(out + 1, angle, sine, kAxes);
+  for (uint8_t i = 0; i < kAxes; ++i) out[1 + i] = angle[i] * sine;
 }
 
 }  // namespace
@@ -66,8 +65,7 @@ void Attitude::level(const float up[kAxes]) {
 void Attitude::take(const float product[4]) {
   // One Newton step for 1/sqrt near 1: the norm moves by 1e-7 a tick.
   const float scale = 1.5f - 0.5f * dot(product, product, 4);
-  memset(q, 0, sizeof q);
-  add_scaled(q, product, scale, 4);
+  for (uint8_t i = 0; i < 4; ++i) q[i] = product[i] * scale;
 }
 
 RELPOS_APART void Attitude::integrate(const float angle[kAxes]) {
