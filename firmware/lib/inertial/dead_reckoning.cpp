@@ -117,11 +117,12 @@ void DeadReckoning::reset() {
 }
 
 RELPOS_NEAR bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
-  bool good = dt_s > 0.0f && dt_s <= 0.2f, saturated = false;
+  bool saturated = false;
+  float sum = dt_s;  // of numbers not negative: finite if they all are
   for (uint8_t i = 0; i < kAxes; ++i) {
     const float force = fabsf(sample.acceleration_m_s2[i]);
     const float rate = fabsf(sample.angular_rate_rad_s[i]);
-    good = good && finite(force + rate);
+    sum += force + rate;
     if (force > config_.acceleration_limit_m_s2) {
       hold_[kHoldAcceleration] = kHoldTicks;
       saturated = true;
@@ -132,7 +133,7 @@ RELPOS_NEAR bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
     }
   }
   if (saturated) count(&counters_.saturated_samples);
-  if (good) return false;
+  if (finite(sum) && dt_s > 0.0f && dt_s <= 0.2f) return false;
   count(&counters_.refused_samples);
   hold_[kHoldInput] = kHoldTicks;
   return true;
@@ -230,9 +231,10 @@ RELPOS_NEAR void DeadReckoning::update(const ImuSample& sample, float dt_s) {
 
 // Moves the nominal state by one sample. True at a mid-stance that the filter can use.
 RELPOS_NEAR bool DeadReckoning::advance(const ImuSample& sample, float dt_s, Stance* stance) {
-  float angle[kAxes] = {0.0f, 0.0f, 0.0f};
-  add_scaled(angle, sample.angular_rate_rad_s, dt_s, kAxes);
-  add_scaled(angle, bias_rad_s_, -dt_s, kAxes);
+  float angle[kAxes];
+  for (uint8_t i = 0; i < kAxes; ++i) {
+    angle[i] = (sample.angular_rate_rad_s[i] - bias_rad_s_[i]) * dt_s;
+  }
   const float strength = norm(sample.acceleration_m_s2);
   watch_quiet(strength, angle, dt_s);
   attitude_.integrate(angle);
@@ -395,6 +397,7 @@ void DeadReckoning::capture_span() {
 RELPOS_NEAR void DeadReckoning::predict_attitude() {
   // What the heading loses while it turns, never what a compass gives back: totals only grow.
   const float before = filter_.covariance(kAttitude + kZ, kAttitude + kZ);
+  attitude_.normalise();
   filter_.predict_attitude(rotation_, span_.time_s);
   const float growth = filter_.covariance(kAttitude + kZ, kAttitude + kZ) - before;
   if (growth > 0.0f) displacement_.variance_heading_rad2 += growth;

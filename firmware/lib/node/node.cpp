@@ -235,8 +235,10 @@ void Node::tick(uint32_t now_us) {
   dead_reckoning_.update(sample, static_cast<float>(step_us) * 1e-6f);
   ++updates_;
 
+  // A mid-stance is work enough for its tick: the magnetometer then waits for the next.
   float field_ut[3];
-  if (magnetometer_.step(board_, field_ut)) {
+  const Displacement& now = dead_reckoning_.displacement();
+  if (now.last_step_tick != updates_ && magnetometer_.step(board_, field_ut)) {
     if (raw_reports_ != 0) {
       memcpy(raw_ + 6, field_ut, sizeof field_ut);
       ++raw_fields_;
@@ -247,7 +249,6 @@ void Node::tick(uint32_t now_us) {
     field_seen_ = true;
   }
 
-  const Displacement& now = dead_reckoning_.displacement();
   totals_.track(now);
   const uint16_t flags = now.quality_flags;
   uint8_t quality = quality_;
