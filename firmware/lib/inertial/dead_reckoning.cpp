@@ -204,7 +204,7 @@ RELPOS_NEAR void DeadReckoning::initialise(bool still) {
   displacement_.initialised = true;
 }
 
-RELPOS_NEAR void DeadReckoning::update(const ImuSample& sample, float dt_s) {
+void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   ++ticks_;
   for (uint8_t i = 0; i < kHolds; ++i) {
     if (hold_[i] > 0) --hold_[i];
@@ -404,7 +404,7 @@ RELPOS_NEAR void DeadReckoning::predict_attitude() {
   motion_pending_ = true;
 }
 
-RELPOS_NEAR void DeadReckoning::work() {
+void DeadReckoning::work() {
   if (motion_pending_) {
     filter_.predict_motion(span_.impulse_m_s, span_.time_s);
     motion_pending_ = false;
@@ -422,7 +422,7 @@ RELPOS_NEAR void DeadReckoning::work() {
   }
 }
 
-RELPOS_NEAR void DeadReckoning::run_job() {
+void DeadReckoning::run_job() {
   State group = kPosition;
   float direction[kAxes] = {0.0f, 0.0f, 0.0f};
   float innovation, variance, yaw = 0.0f;

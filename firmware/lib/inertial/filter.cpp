@@ -92,7 +92,7 @@ void ErrorFilter::predict_motion(const float f[kAxes], float dt_s) {
   move_position(0.5f * dt_s);
 }
 
-RELPOS_APART float ErrorFilter::update(State group, const float direction[kAxes], float yaw, float innovation,
+float ErrorFilter::update(State group, const float direction[kAxes], float yaw, float innovation,
                           float variance, float correction[kStates + 1]) {
   float* const ph = correction;  // P H' until the gain has been taken of it
   memset(ph, 0, kStates * sizeof *ph);

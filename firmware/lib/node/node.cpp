@@ -362,7 +362,7 @@ void Node::obey(const uint8_t* body, uint8_t length) {
   done.answer_due = true;
 }
 
-wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_force) {
+RELPOS_APART wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_force) {
   const wire::CommandCode code = static_cast<wire::CommandCode>(command);
   // One place holds what is being written: settings, or a staged word.
   if (store_.staging()) return wire::CommandResult::kBusy;
