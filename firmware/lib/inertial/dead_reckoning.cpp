@@ -20,6 +20,9 @@ const float kTiltMoving_rad = 6.0f * kDegree;  // half a step's braking left in 
 // time; one that gets ready spreads its rates, of which a quarter is left in the mean of an axis.
 const float kSway_rad = 1.7f * kDegree;
 const float kSwayShare = 0.25f;
+// Who stands can tell: a chip fresh from the factory is let be off by twice what is configured,
+// of which it specifies 20 deg/s. Who walks at once cannot.
+const float kStandingPrior = 4.0f;
 const float kSpeedUnknown_m_s = 1.0f;
 const float kSpeedFound_m_s = 0.3f;   // step length over interval, at mid-stance
 
@@ -181,6 +184,7 @@ RELPOS_NEAR void DeadReckoning::initialise(bool still) {
     const float noise =
         kSway_rad * kSway_rad / (since_.time_s * since_.time_s) +
         (since_.impulse_m_s[kX] - dot(position_m_, position_m_) * share) * share * kSwayShare;
+    variance *= kStandingPrior;
     const float weight = variance / (variance + noise);
     add_scaled(bias_rad_s_, position_m_, share * weight, kAxes);
     variance = noise * weight;
