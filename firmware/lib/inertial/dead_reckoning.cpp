@@ -36,6 +36,9 @@ const float kTiltMoving_rad = 6.0f * kDegree;  // half a step's braking left in 
 // time; one that gets ready spreads its rates, of which a quarter is left in the mean of an axis.
 const float kSway_rad = 1.7f * kDegree;
 const float kSwayShare = 0.25f;
+// Who stands can tell: a chip fresh from the factory is let be off by twice what is configured,
+// of which it specifies 20 deg/s. Who walks at once cannot.
+const float kStandingPrior = 4.0f;
 const float kSpeedUnknown_m_s = 1.0f;
 const float kSpeedFound_m_s = 0.3f;   // step length over interval, at mid-stance
 
@@ -138,11 +141,12 @@ void DeadReckoning::reset() {
 }
 
 RELPOS_NEAR bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
-  bool good = dt_s > 0.0f && dt_s <= 0.2f, saturated = false;
+  bool saturated = false;
+  float sum = dt_s;  // of numbers not negative: finite if they all are
   for (uint8_t i = 0; i < kAxes; ++i) {
     const float force = fabsf(sample.acceleration_m_s2[i]);
     const float rate = fabsf(sample.angular_rate_rad_s[i]);
-    good = good && finite(force + rate);
+    sum += force + rate;
     if (force > config_.acceleration_limit_m_s2) {
       hold_[kHoldAcceleration] = kHoldTicks;
       saturated = true;
@@ -153,7 +157,7 @@ RELPOS_NEAR bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
     }
   }
   if (saturated) count(&counters_.saturated_samples);
-  if (good) return false;
+  if (finite(sum) && dt_s > 0.0f && dt_s <= 0.2f) return false;
   count(&counters_.refused_samples);
   hold_[kHoldInput] = kHoldTicks;
   return true;
@@ -201,6 +205,7 @@ RELPOS_NEAR void DeadReckoning::initialise(bool still) {
     const float noise =
         kSway_rad * kSway_rad / (since_.time_s * since_.time_s) +
         (since_.impulse_m_s[kX] - dot(position_m_, position_m_) * share) * share * kSwayShare;
+    variance *= kStandingPrior;
     const float weight = variance / (variance + noise);
     add_scaled(bias_rad_s_, position_m_, share * weight, kAxes);
     variance = noise * weight;
@@ -224,7 +229,7 @@ RELPOS_NEAR void DeadReckoning::initialise(bool still) {
   displacement_.initialised = true;
 }
 
-RELPOS_NEAR void DeadReckoning::update(const ImuSample& sample, float dt_s) {
+void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   ++ticks_;
   for (uint8_t i = 0; i < kHolds; ++i) {
     if (hold_[i] > 0) --hold_[i];
@@ -248,9 +253,10 @@ RELPOS_NEAR void DeadReckoning::update(const ImuSample& sample, float dt_s) {
 RELPOS_NEAR bool DeadReckoning::advance(const ImuSample& sample, float dt_s, Stance* stance) {
   const float strength = norm(sample.acceleration_m_s2);
   {
-    float angle[kAxes] = {0.0f, 0.0f, 0.0f};
-    add_scaled(angle, sample.angular_rate_rad_s, dt_s, kAxes);
-    add_scaled(angle, bias_rad_s_, -dt_s, kAxes);
+    float angle[kAxes];
+    for (uint8_t i = 0; i < kAxes; ++i) {
+      angle[i] = (sample.angular_rate_rad_s[i] - bias_rad_s_[i]) * dt_s;
+    }
     watch_quiet(strength, angle, dt_s);
     attitude_.integrate(angle);
   }
@@ -413,13 +419,14 @@ RELPOS_SHARED void DeadReckoning::capture_span() {
 RELPOS_NEAR void DeadReckoning::predict_attitude() {
   // What the heading loses while it turns, never what a compass gives back: totals only grow.
   const float before = filter_.covariance(kAttitude + kZ, kAttitude + kZ);
+  attitude_.normalise();
   filter_.predict_attitude(rotation_, span_.time_s);
   const float growth = filter_.covariance(kAttitude + kZ, kAttitude + kZ) - before;
   if (growth > 0.0f) displacement_.variance_heading_rad2 += growth;
   motion_pending_ = true;
 }
 
-RELPOS_NEAR void DeadReckoning::work() {
+void DeadReckoning::work() {
   if (motion_pending_) {
     filter_.predict_motion(span_.impulse_m_s, span_.time_s);
     motion_pending_ = false;
@@ -439,7 +446,7 @@ RELPOS_NEAR void DeadReckoning::work() {
   }
 }
 
-RELPOS_NEAR void DeadReckoning::run_job() {
+void DeadReckoning::run_job() {
   State group = kPosition;
   float direction[kAxes] = {0.0f, 0.0f, 0.0f};
   float innovation, variance, yaw = 0.0f;

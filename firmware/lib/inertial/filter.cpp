@@ -43,17 +43,18 @@ void ErrorFilter::reset(float tilt_rad, float bias_rad2_s2, float velocity_m_s) 
 }
 
 RELPOS_APART void ErrorFilter::mix(uint8_t to, uint8_t from, float factor) {
-  // P' = E P E' with E = 1 + factor e_to e_from'. The variance of `to` gets factor times the
-  // covariance of the two before the change, and again after it.
-  add_scaled(at(to, to), at(to, from), factor, 1);
+  // P' = E P E' with E = 1 + factor e_to e_from': a row's multiple is added to another, then the
+  // column's. Only the variance of `to` takes both, the multiple of the covariance of the two as it
+  // was and as it is then; the loop passes it with one of them.
+  if (from < to) add_scaled(at(to, to), at(to, from), factor, 1);
   float* a = p_ + to;
   const float* b = p_ + from;
   for (uint8_t other = 0; other < kStates; ++other) {
-    if (other != to) *a += factor * *b;
+    *a += factor * *b;
     a += step(other, to);
     b += step(other, from);
   }
-  add_scaled(at(to, to), at(to, from), factor, 1);
+  if (from > to) add_scaled(at(to, to), at(to, from), factor, 1);
 }
 
 RELPOS_APART void ErrorFilter::add_column(float out[kStates], uint8_t state, float factor) const {

@@ -167,13 +167,14 @@ void ForwardFinder::turn(float angle_rad) {
 
 RELPOS_SHARED void ForwardFinder::point() {
   offset_rad_ = atan2f(product_[kY], product_[kX]);
-  direct(offset_rad_, axis_);
+  memset(axis_, 0, sizeof axis_);
+  add_scaled(axis_, product_, 1.0f / sqrtf(dot(product_, product_, 2)), 2);
 }
 
 RELPOS_APART void ForwardFinder::step() {
   if (steps_ < 255) ++steps_;
   if (steps_ < kForwardSteps) return;
-  if (dot(product_, product_, 2) < kForwardCoherence * power_a_ * power_v_) return;
+  if (!(dot(product_, product_, 2) > kForwardCoherence * power_a_ * power_v_)) return;
   point();
   found_ = true;
 }
