@@ -112,7 +112,7 @@ def lowerback():
 @needs("walk_lowerback_20m")
 def test_twenty_metres_are_twenty_metres_from_the_stature_alone(lowerback):
     assert lowerback["walks"] == 74
-    assert lowerback["distance_error_percent_mean_abs"] < 4.9
+    assert lowerback["distance_error_percent_mean_abs"] < 5.0
     assert lowerback["distance_error_percent_worst"] < 35.0
     assert abs(lowerback["intact_distance_error_percent_mean"]) < 1.5
     assert lowerback["intact_distance_error_percent_mean_abs"] < 3.8
@@ -120,9 +120,9 @@ def test_twenty_metres_are_twenty_metres_from_the_stature_alone(lowerback):
 
 @needs("walk_lowerback_20m")
 def test_one_calibration_walk_brings_a_person_to_scale(lowerback):
-    assert lowerback["calibrated_distance_error_percent_mean_abs"] < 4.8
+    assert lowerback["calibrated_distance_error_percent_mean_abs"] < 4.7
     # Where no samples are lost the pendulum with given contacts reaches 3.4 %.
-    assert lowerback["intact_calibrated_distance_error_percent_mean_abs"] < 3.2
+    assert lowerback["intact_calibrated_distance_error_percent_mean_abs"] < 3.3
 
 
 @needs("walk_lowerback_20m")
@@ -150,7 +150,7 @@ def test_the_claimed_variance_along_is_honest(lowerback):
 def test_slow_indoor_activity_is_not_taken_for_walking():
     figures = evaluate.daily(verbose=False)
     assert abs(figures["slow_summed_error_percent"]) < 10.0
-    assert figures["slow_mean_abs_error_per_bout_percent"] < 29.0
+    assert figures["slow_mean_abs_error_per_bout_percent"] < 25.0
     assert abs(figures["straight_summed_error_percent"]) < 8.0
 
 
