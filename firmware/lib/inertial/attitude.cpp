@@ -25,18 +25,17 @@ void multiply(const float a[4], const float b[4], float out[4]) {
 }
 
 // Rotation by a small angle. Half-angle sine and cosine to third order: at 500 deg/s and 20 ms the
-// angle is 0.17 rad and the truncation 1e-7.
+// angle is 0.17 rad and the truncation 2e-6 of it.
 void turn(const float angle[kAxes], float out[4]) {
   const float square = 0.25f * dot(angle, angle);
   const float sine = 0.5f - square * (1.0f / 12.0f);
-  out[0] = 1.0f - 0.5f * square + square * square * (1.0f / 24.0f);
-  out[1] = out[2] = out[3] = 0.0f;
-  add_scaled(out + 1, angle, sine, kAxes);
+  out[0] = 1.0f - 0.5f * square;
+  for (uint8_t i = 0; i < kAxes; ++i) out[1 + i] = angle[i] * sine;
 }
 
 }  // namespace
 
-float wrap_angle(float angle_rad) {
+RELPOS_SHARED float wrap_angle(float angle_rad) {
   while (angle_rad > kPi) angle_rad -= 2.0f * kPi;
   while (angle_rad <= -kPi) angle_rad += 2.0f * kPi;
   return angle_rad;
@@ -63,31 +62,26 @@ void Attitude::level(const float up[kAxes]) {
   add_scaled(q, half, 1.0f / sqrtf(dot(half, half, 4)), 4);
 }
 
-void Attitude::take(const float product[4]) {
+void Attitude::normalise() {
   // One Newton step for 1/sqrt near 1: the norm moves by 1e-7 a tick.
-  const float scale = 1.5f - 0.5f * dot(product, product, 4);
-  memset(q, 0, sizeof q);
-  add_scaled(q, product, scale, 4);
+  float old[4];
+  memcpy(old, q, sizeof q);
+  add_scaled(q, old, 0.5f - 0.5f * dot(q, q, 4), 4);
 }
 
 RELPOS_APART void Attitude::integrate(const float angle[kAxes]) {
-  float small[4], product[4];
-  turn(angle, small);
-  multiply(q, small, product);
-  take(product);
+  Attitude small;
+  turn(angle, small.q);
+  multiply(Attitude(*this).q, small.q, q);
 }
 
-RELPOS_APART void Attitude::correct(const float angle[kAxes]) {
+RELPOS_SHARED void Attitude::correct(const float angle[kAxes]) {
   Attitude small;
   turn(angle, small.q);
   premultiply(small);
 }
 
-void Attitude::premultiply(const Attitude& first) {
-  float product[4];
-  multiply(first.q, q, product);
-  take(product);
-}
+void Attitude::premultiply(const Attitude& first) { multiply(first.q, Attitude(*this).q, q); }
 
 void Attitude::matrix(float r[kAxes * kAxes]) const {
   const float* v = q + 1;

@@ -17,6 +17,8 @@ struct Attitude {
   float q[4];  // scalar part, then x, y, z
 
   void set_identity();
+  // To length 1 again, from which each change takes it by 1e-7. Now and then.
+  void normalise();
   // The shortest rotation that brings the body vector `up` (any length > 0) to the vertical.
   void level(const float up[kAxes]);
   // Turn by rate * dt, measured in the body frame.
@@ -27,9 +29,6 @@ struct Attitude {
   void matrix(float rotation[kAxes * kAxes]) const;
   // this := first * this, i.e. apply `first` after what is already there.
   void premultiply(const Attitude& first);
-
- private:
-  void take(const float product[4]);  // and normalise
 };
 
 // out = rotation * in.

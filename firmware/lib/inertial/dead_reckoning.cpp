@@ -3,8 +3,24 @@
 #include <math.h>
 #include <string.h>
 
+#if defined(__AVR__)
+#include <avr/pgmspace.h>
+#else
+#define PROGMEM
+#define memcpy_P memcpy
+#endif
+
 namespace relpos {
 namespace {
+
+const float kDefaults[] PROGMEM = {
+    0.93f,          // 0.53 of the stature (Zijlstra and Hof 1997); here of 1.75 m
+    2.13f,          // odd people of walk_lowerback_20m
+    0.07f,          // 0.05 to 0.09 uncalibrated, 0.03 calibrated
+    39.0f,          // just under 4 g
+    8.7f,           // just under 500 deg/s
+    kPi / 180.0f,   // 1 deg/s: what a warmed-up, once zeroed MPU-9150 keeps
+};
 
 const float kDegree = kPi / 180.0f;
 const float kStandardGravity_m_s2 = 9.80665f;
@@ -92,7 +108,7 @@ void count(uint16_t* counter) {
 
 void clear(float vector[kAxes]) { memset(vector, 0, kAxes * sizeof *vector); }
 
-void left_of(const float axis[2], float out[2]) {
+RELPOS_SHARED void left_of(const float axis[2], float out[2]) {
   out[kX] = -axis[kY];
   out[kY] = axis[kX];
 }
@@ -101,6 +117,11 @@ void left_of(const float axis[2], float out[2]) {
 float doubted(float sigma, float innovation) { return sigma * sigma + innovation * innovation; }
 
 }  // namespace
+
+InertialConfig::InertialConfig() {
+  static_assert(sizeof kDefaults == sizeof *this, "one default a member");
+  memcpy_P(static_cast<void*>(this), kDefaults, sizeof kDefaults);
+}
 
 DeadReckoning::DeadReckoning() { reset(); }
 
@@ -120,11 +141,12 @@ void DeadReckoning::reset() {
 }
 
 RELPOS_NEAR bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
-  bool good = dt_s > 0.0f && dt_s <= 0.2f, saturated = false;
+  bool saturated = false;
+  float sum = dt_s;  // of numbers not negative: finite if they all are
   for (uint8_t i = 0; i < kAxes; ++i) {
     const float force = fabsf(sample.acceleration_m_s2[i]);
     const float rate = fabsf(sample.angular_rate_rad_s[i]);
-    good = good && finite(force + rate);
+    sum += force + rate;
     if (force > config_.acceleration_limit_m_s2) {
       hold_[kHoldAcceleration] = kHoldTicks;
       saturated = true;
@@ -135,7 +157,7 @@ RELPOS_NEAR bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
     }
   }
   if (saturated) count(&counters_.saturated_samples);
-  if (good) return false;
+  if (finite(sum) && dt_s > 0.0f && dt_s <= 0.2f) return false;
   count(&counters_.refused_samples);
   hold_[kHoldInput] = kHoldTicks;
   return true;
@@ -207,7 +229,7 @@ RELPOS_NEAR void DeadReckoning::initialise(bool still) {
   displacement_.initialised = true;
 }
 
-RELPOS_NEAR void DeadReckoning::update(const ImuSample& sample, float dt_s) {
+void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   ++ticks_;
   for (uint8_t i = 0; i < kHolds; ++i) {
     if (hold_[i] > 0) --hold_[i];
@@ -220,26 +242,24 @@ RELPOS_NEAR void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   Stance stance;
   const bool at_stance = advance(sample, dt_s, &stance);
   if (reckoning) {
-    // A motion stage left over belongs before the mid-stance.
-    const bool busy = at_stance && motion_pending_;
-    if (busy) {
-      filter_.predict_motion(span_.impulse_m_s, span_.time_s);
-      motion_pending_ = false;
-    }
+    // At a mid-stance only a motion stage that is left over: it belongs before.
+    if (!at_stance || motion_pending_) work();
     if (at_stance) on_stance(stance);
-    if (!busy) work();
   }
   publish();
 }
 
 // Moves the nominal state by one sample. True at a mid-stance that the filter can use.
 RELPOS_NEAR bool DeadReckoning::advance(const ImuSample& sample, float dt_s, Stance* stance) {
-  float angle[kAxes] = {0.0f, 0.0f, 0.0f};
-  add_scaled(angle, sample.angular_rate_rad_s, dt_s, kAxes);
-  add_scaled(angle, bias_rad_s_, -dt_s, kAxes);
   const float strength = norm(sample.acceleration_m_s2);
-  watch_quiet(strength, angle, dt_s);
-  attitude_.integrate(angle);
+  {
+    float angle[kAxes];
+    for (uint8_t i = 0; i < kAxes; ++i) {
+      angle[i] = (sample.angular_rate_rad_s[i] - bias_rad_s_[i]) * dt_s;
+    }
+    watch_quiet(strength, angle, dt_s);
+    attitude_.integrate(angle);
+  }
   float force[kAxes];
   attitude_.matrix(rotation_);
   rotate(rotation_, sample.acceleration_m_s2, force);
@@ -391,7 +411,7 @@ RELPOS_NEAR void DeadReckoning::watch_mounting() {
   }
 }
 
-void DeadReckoning::capture_span() {
+RELPOS_SHARED void DeadReckoning::capture_span() {
   span_ = since_;
   since_ = Span();
 }
@@ -399,17 +419,20 @@ void DeadReckoning::capture_span() {
 RELPOS_NEAR void DeadReckoning::predict_attitude() {
   // What the heading loses while it turns, never what a compass gives back: totals only grow.
   const float before = filter_.covariance(kAttitude + kZ, kAttitude + kZ);
+  attitude_.normalise();
   filter_.predict_attitude(rotation_, span_.time_s);
   const float growth = filter_.covariance(kAttitude + kZ, kAttitude + kZ) - before;
   if (growth > 0.0f) displacement_.variance_heading_rad2 += growth;
   motion_pending_ = true;
 }
 
-RELPOS_NEAR void DeadReckoning::work() {
+void DeadReckoning::work() {
   if (motion_pending_) {
     filter_.predict_motion(span_.impulse_m_s, span_.time_s);
     motion_pending_ = false;
     if (job_ == kIdle && (quiet() || !gait_.walking())) job_ = kStillX;
+  } else if ((job_ > kFlush || still_pending_ || magnetic_pending_) && filter_.settle()) {
+    return;  // a piece of its own
   } else if (job_ != kIdle) {
     run_job();
   } else if (still_pending_) {  // before the prediction, or standing would leave it no tick
@@ -423,7 +446,7 @@ RELPOS_NEAR void DeadReckoning::work() {
   }
 }
 
-RELPOS_NEAR void DeadReckoning::run_job() {
+void DeadReckoning::run_job() {
   State group = kPosition;
   float direction[kAxes] = {0.0f, 0.0f, 0.0f};
   float innovation, variance, yaw = 0.0f;
@@ -511,7 +534,7 @@ RELPOS_NEAR void DeadReckoning::measure(State group, const float direction[kAxes
 
 RELPOS_NEAR bool DeadReckoning::quiet() const { return quiet_s_ >= kQuiet_s; }
 
-void DeadReckoning::begin_straight() {
+RELPOS_SHARED void DeadReckoning::begin_straight() {
   straight_heading_rad_ = displacement_.heading_rad;
   straight_s_ = 0.0f;
 }

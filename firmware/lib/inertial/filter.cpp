@@ -43,17 +43,18 @@ void ErrorFilter::reset(float tilt_rad, float bias_rad2_s2, float velocity_m_s) 
 }
 
 RELPOS_APART void ErrorFilter::mix(uint8_t to, uint8_t from, float factor) {
-  // P' = E P E' with E = 1 + factor e_to e_from'. The variance of `to` gets factor times the
-  // covariance of the two before the change, and again after it.
-  add_scaled(at(to, to), at(to, from), factor, 1);
+  // P' = E P E' with E = 1 + factor e_to e_from': a row's multiple is added to another, then the
+  // column's. Only the variance of `to` takes both, the multiple of the covariance of the two as it
+  // was and as it is then; the loop passes it with one of them.
+  if (from < to) add_scaled(at(to, to), at(to, from), factor, 1);
   float* a = p_ + to;
   const float* b = p_ + from;
   for (uint8_t other = 0; other < kStates; ++other) {
-    if (other != to) *a += factor * *b;
+    *a += factor * *b;
     a += step(other, to);
     b += step(other, from);
   }
-  add_scaled(at(to, to), at(to, from), factor, 1);
+  if (from > to) add_scaled(at(to, to), at(to, from), factor, 1);
 }
 
 RELPOS_APART void ErrorFilter::add_column(float out[kStates], uint8_t state, float factor) const {
@@ -74,27 +75,32 @@ void ErrorFilter::predict_attitude(const float rotation[kAxes * kAxes], float dt
   widen(kBias, kBiasNoise_rad2_s3 * dt_s, kAxes);
 }
 
-void ErrorFilter::move_position(float dt_s) {
-  for (uint8_t i = 0; i < kAxes; ++i) mix(kPosition + i, kVelocity + i, dt_s);
+bool ErrorFilter::settle() {
+  if (owed_s_ == 0.0f) return false;
+  for (uint8_t i = 0; i < kAxes; ++i) mix(kPosition + i, kVelocity + i, owed_s_);
+  owed_s_ = 0.0f;
+  return true;
 }
 
 void ErrorFilter::predict_motion(const float f[kAxes], float dt_s) {
   // Half the position step before the velocity changes and half after it: second-order accurate
   // over a span of five ticks, where a single step would be a tenth of a second off.
-  move_position(0.5f * dt_s);
+  add(&owed_s_, 0.5f * dt_s);
+  settle();
   for (uint8_t i = 0; i < kAxes; ++i) {
     const uint8_t j = next(i), k = next(j);
     mix(kVelocity + i, kAttitude + j, f[k]);  // -[F x]
     mix(kVelocity + j, kAttitude + i, -f[k]);
   }
   widen(kVelocity, kVelocityNoise_m2_s3 * dt_s, kAxes);
-  move_position(0.5f * dt_s);
+  owed_s_ = 0.5f * dt_s;
 }
 
-RELPOS_APART float ErrorFilter::update(State group, const float direction[kAxes], float yaw, float innovation,
+RELPOS_SHARED float ErrorFilter::update(State group, const float direction[kAxes], float yaw, float innovation,
                           float variance, float correction[kStates + 1]) {
-  float* const ph = correction;  // P H' until the gain has been taken of it
-  memset(ph, 0, kStates * sizeof *ph);
+  // P h first, which becomes the correction row by row, where it is no longer needed.
+  float* const ph = correction;
+  memset(ph, 0, (kStates + 1) * sizeof *ph);
   add_column(ph, kAttitude + kZ, yaw);
   for (uint8_t i = 0; i < kAxes; ++i) add_column(ph, group + i, direction[i]);
   // The reference's share in the measurement: with the heading it is compared, with the bias it is
@@ -118,7 +124,7 @@ RELPOS_APART float ErrorFilter::update(State group, const float direction[kAxes]
   if (!considers) {
     add_scaled(reference_, ph + kAttitude + kZ, -inverse * shared, kReferenced);
     reference_variance_ -= shared * shared * inverse;
-    correction[kStates] = shared * inverse * innovation;
+    correction[kReference] = shared * inverse * innovation;
   }
   float* p = p_;
   for (uint8_t i = 0; i < kStates; ++i) {

@@ -43,20 +43,20 @@ RELPOS_SHARED void integrate(float* sum, float rate, float dt_s) {
 
 }  // namespace
 
-void GaitDetector::reset() {
+RELPOS_SHARED void GaitDetector::reset() {
   memset(static_cast<void*>(this), 0, sizeof *this);
   since_s_ = kPause_s + 1.0f;
   period_s_ = kFirstPeriod_s;
   restart_arc();
 }
 
-void GaitDetector::restart_arc() {
+RELPOS_SHARED void GaitDetector::restart_arc() {
   trough_m_ = height_m_;
   lowest_m_s2_ = 1e6f;
   highest_m_s2_ = -1e6f;
 }
 
-bool GaitDetector::walking() const { return since_s_ < kPause_s; }
+RELPOS_SHARED bool GaitDetector::walking() const { return since_s_ < kPause_s; }
 
 uint16_t GaitDetector::take_rejected() {
   const uint16_t count = rejected_;
@@ -94,7 +94,10 @@ RELPOS_SHARED bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance*
   const float range_m_s2 = highest_m_s2_ - lowest_m_s2_;
   const float since_s = since_s_;
   const float periods = since_s / period_s_;
-  stance->weak = swing < kSmallestSwing_m || periods < kEarly || since_s < kShortestStep_s ||
+  // Not of a longer period than at the start: one that grew in a turn would reject every other step
+  // for good (6 s of it in one walk; 16 % of its distance by 2 % of gain).
+  const float early_s = kEarly * (period_s_ < kFirstPeriod_s ? period_s_ : kFirstPeriod_s);
+  stance->weak = swing < kSmallestSwing_m || since_s < early_s || since_s < kShortestStep_s ||
                  range_m_s2 < kSmallestRange_m_s2;
   if (stance->weak && (first || range_m_s2 < kDueRange_m_s2 || periods < kDueFrom ||
                        periods > kDueUntil)) {
@@ -140,7 +143,7 @@ float turning_share(float yaw_rad) {
   return 1.0f / (1.0f + turn * turn);
 }
 
-void ForwardFinder::reset() {
+RELPOS_SHARED void ForwardFinder::reset() {
   memset(static_cast<void*>(this), 0, sizeof *this);
   axis_[kX] = 1.0f;
 }
@@ -165,15 +168,16 @@ void ForwardFinder::turn(float angle_rad) {
   point();
 }
 
-void ForwardFinder::point() {
+RELPOS_SHARED void ForwardFinder::point() {
   offset_rad_ = atan2f(product_[kY], product_[kX]);
-  direct(offset_rad_, axis_);
+  memset(axis_, 0, sizeof axis_);
+  add_scaled(axis_, product_, 1.0f / sqrtf(dot(product_, product_, 2)), 2);
 }
 
 RELPOS_APART void ForwardFinder::step() {
   if (steps_ < 255) ++steps_;
   if (steps_ < kForwardSteps) return;
-  if (dot(product_, product_, 2) < kForwardCoherence * power_a_ * power_v_) return;
+  if (!(dot(product_, product_, 2) > kForwardCoherence * power_a_ * power_v_)) return;
   point();
   found_ = true;
 }

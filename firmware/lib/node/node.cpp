@@ -235,8 +235,10 @@ void Node::tick(uint32_t now_us) {
   dead_reckoning_.update(sample, static_cast<float>(step_us) * 1e-6f);
   ++updates_;
 
+  // A mid-stance is work enough for its tick: the magnetometer then waits for the next.
   float field_ut[3];
-  if (magnetometer_.step(board_, field_ut)) {
+  const Displacement& now = dead_reckoning_.displacement();
+  if (!dead_reckoning_.at_stance() && magnetometer_.step(board_, field_ut)) {
     if (raw_reports_ != 0) {
       memcpy(raw_ + 6, field_ut, sizeof field_ut);
       ++raw_fields_;
@@ -247,7 +249,6 @@ void Node::tick(uint32_t now_us) {
     field_seen_ = true;
   }
 
-  const Displacement& now = dead_reckoning_.displacement();
   totals_.track(now);
   const uint16_t flags = now.quality_flags;
   uint8_t quality = quality_;
@@ -326,7 +327,7 @@ void Node::receive_packet() {
        static_cast<uint8_t>(length - wire::kHeaderBytes - wire::kCrcBytes));
 }
 
-void Node::obey(const uint8_t* body, uint8_t length) {
+RELPOS_APART void Node::obey(const uint8_t* body, uint8_t length) {
   if (length != wire::kCommandBytes) {
     ++bad_frames_;
     return;
@@ -361,7 +362,7 @@ void Node::obey(const uint8_t* body, uint8_t length) {
   done.answer_due = true;
 }
 
-wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_force) {
+RELPOS_APART wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_force) {
   const wire::CommandCode code = static_cast<wire::CommandCode>(command);
   // One place holds what is being written: settings, or a staged word.
   if (store_.staging()) return wire::CommandResult::kBusy;
