@@ -494,7 +494,9 @@ void DeadReckoning::run_job() {
       return;
     case kCommit:
       commit_step();
-      job_ = kIdle;
+      // Until the forward axis is known a step says nothing of the horizontal; that nobody is faster
+      // than people are has to hold the tilt, which ran away with the gyroscope's bias.
+      job_ = forward_.found() ? kIdle : kStillX;
       return;
     case kStillX:
     case kStillY:
