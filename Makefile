@@ -63,9 +63,9 @@ python-tests: $(DEVELOP) | system-avr
 	$(call title,Python tests)
 	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist worksteal
 
-firmware: board-builds ## both boards: flash, RAM, cycles of the worst tick, deepest stack
+firmware: board-builds ## both boards: flash, RAM, cycles, beside Mahony and Madgwick
 	$(call title,Budget: cycles and stack on simavr)
-	$(PYTHON) -m relpos.emulator.avr.budget --seconds 100
+	$(PYTHON) -m relpos.emulator.avr.budget --seconds 100 --filters
 
 bench: $(DEVELOP) ## what is timed, in bench/
 	@found=; for file in bench/bench_*.py; do \

@@ -93,6 +93,7 @@ void inertial_predict(double* matrix, const float* rotation, const float* impuls
   }
   filter.predict_attitude(rotation, dt_s);
   filter.predict_motion(impulse_m_s, dt_s);
+  filter.settle();
   for (int i = 0; i < relpos::kStates; ++i) {
     for (int j = 0; j < relpos::kStates; ++j) {
       matrix[relpos::kStates * i + j] = filter.covariance(i, j);

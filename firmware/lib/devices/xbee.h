@@ -12,7 +12,9 @@ namespace relpos {
 // the UART; of what comes only RF payloads are kept. Zeroed memory is the start: make it as `Xbee()`.
 class Xbee {
  public:
-  static constexpr uint8_t kMostPayload = wire::kFrameBytes + wire::kAuthenticationBytes;
+  // Only commands come down. A whole frame's room would cost 38 bytes of RAM.
+  static constexpr uint8_t kMostPayload = wire::kHeaderBytes + wire::kCommandBytes +
+                                          wire::kCrcBytes + wire::kAuthenticationBytes;
 
   bool busy() const { return sending_; }
   // Begins a TX16 request. The data must stay unchanged until !busy(). False while busy().

@@ -36,7 +36,7 @@ void turn(const float angle[kAxes], float out[4]) {
 
 }  // namespace
 
-float wrap_angle(float angle_rad) {
+RELPOS_SHARED float wrap_angle(float angle_rad) {
   while (angle_rad > kPi) angle_rad -= 2.0f * kPi;
   while (angle_rad <= -kPi) angle_rad += 2.0f * kPi;
   return angle_rad;
@@ -76,7 +76,7 @@ RELPOS_APART void Attitude::integrate(const float angle[kAxes]) {
   multiply(Attitude(*this).q, small.q, q);
 }
 
-RELPOS_APART void Attitude::correct(const float angle[kAxes]) {
+RELPOS_SHARED void Attitude::correct(const float angle[kAxes]) {
   Attitude small;
   turn(angle, small.q);
   premultiply(small);

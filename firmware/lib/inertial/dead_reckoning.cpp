@@ -3,8 +3,24 @@
 #include <math.h>
 #include <string.h>
 
+#if defined(__AVR__)
+#include <avr/pgmspace.h>
+#else
+#define PROGMEM
+#define memcpy_P memcpy
+#endif
+
 namespace relpos {
 namespace {
+
+const float kDefaults[] PROGMEM = {
+    0.93f,          // 0.53 of the stature (Zijlstra and Hof 1997); here of 1.75 m
+    2.13f,          // odd people of walk_lowerback_20m
+    0.07f,          // 0.05 to 0.09 uncalibrated, 0.03 calibrated
+    39.0f,          // just under 4 g
+    8.7f,           // just under 500 deg/s
+    kPi / 180.0f,   // 1 deg/s: what a warmed-up, once zeroed MPU-9150 keeps
+};
 
 const float kDegree = kPi / 180.0f;
 const float kStandardGravity_m_s2 = 9.80665f;
@@ -92,7 +108,7 @@ void count(uint16_t* counter) {
 
 void clear(float vector[kAxes]) { memset(vector, 0, kAxes * sizeof *vector); }
 
-void left_of(const float axis[2], float out[2]) {
+RELPOS_SHARED void left_of(const float axis[2], float out[2]) {
   out[kX] = -axis[kY];
   out[kY] = axis[kX];
 }
@@ -101,6 +117,11 @@ void left_of(const float axis[2], float out[2]) {
 float doubted(float sigma, float innovation) { return sigma * sigma + innovation * innovation; }
 
 }  // namespace
+
+InertialConfig::InertialConfig() {
+  static_assert(sizeof kDefaults == sizeof *this, "one default a member");
+  memcpy_P(static_cast<void*>(this), kDefaults, sizeof kDefaults);
+}
 
 DeadReckoning::DeadReckoning() { reset(); }
 
@@ -221,27 +242,26 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   Stance stance;
   const bool at_stance = advance(sample, dt_s, &stance);
   if (reckoning) {
-    // A motion stage left over belongs before the mid-stance.
-    const bool busy = at_stance && motion_pending_;
-    if (busy) {
-      filter_.predict_motion(span_.impulse_m_s, span_.time_s);
-      motion_pending_ = false;
-    }
+    // A motion stage left over belongs before the mid-stance, and is work enough for this tick.
+    const bool before = at_stance && motion_pending_;
+    if (before) work();
     if (at_stance) on_stance(stance);
-    if (!busy) work();
+    if (!before) work();
   }
   publish();
 }
 
 // Moves the nominal state by one sample. True at a mid-stance that the filter can use.
 RELPOS_NEAR bool DeadReckoning::advance(const ImuSample& sample, float dt_s, Stance* stance) {
-  float angle[kAxes];
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    angle[i] = (sample.angular_rate_rad_s[i] - bias_rad_s_[i]) * dt_s;
-  }
   const float strength = norm(sample.acceleration_m_s2);
-  watch_quiet(strength, angle, dt_s);
-  attitude_.integrate(angle);
+  {
+    float angle[kAxes];
+    for (uint8_t i = 0; i < kAxes; ++i) {
+      angle[i] = (sample.angular_rate_rad_s[i] - bias_rad_s_[i]) * dt_s;
+    }
+    watch_quiet(strength, angle, dt_s);
+    attitude_.integrate(angle);
+  }
   float force[kAxes];
   attitude_.matrix(rotation_);
   rotate(rotation_, sample.acceleration_m_s2, force);
@@ -393,7 +413,7 @@ RELPOS_NEAR void DeadReckoning::watch_mounting() {
   }
 }
 
-void DeadReckoning::capture_span() {
+RELPOS_SHARED void DeadReckoning::capture_span() {
   span_ = since_;
   since_ = Span();
 }
@@ -413,6 +433,7 @@ void DeadReckoning::work() {
     filter_.predict_motion(span_.impulse_m_s, span_.time_s);
     motion_pending_ = false;
     if (job_ == kIdle && (quiet() || !gait_.walking())) job_ = kStillX;
+    if (job_ != kIdle) filter_.settle();  // a measurement is next, which is work enough for its tick
   } else if (job_ != kIdle) {
     run_job();
   } else if (still_pending_) {  // before the prediction, or standing would leave it no tick
@@ -498,6 +519,7 @@ void DeadReckoning::run_job() {
 RELPOS_NEAR void DeadReckoning::measure(State group, const float direction[kAxes], float innovation,
                             float variance, float yaw) {
   float correction[kStates + 1];
+  filter_.settle();
   filter_.update(group, direction, yaw, innovation, variance, correction);
   attitude_.correct(correction + kAttitude);
   if (group <= kBias) magnetic_azimuth_rad_ += correction[kReference];
@@ -514,7 +536,7 @@ RELPOS_NEAR void DeadReckoning::measure(State group, const float direction[kAxes
 
 RELPOS_NEAR bool DeadReckoning::quiet() const { return quiet_s_ >= kQuiet_s; }
 
-void DeadReckoning::begin_straight() {
+RELPOS_SHARED void DeadReckoning::begin_straight() {
   straight_heading_rad_ = displacement_.heading_rad;
   straight_s_ = 0.0f;
 }

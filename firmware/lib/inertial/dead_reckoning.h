@@ -25,14 +25,14 @@ struct ImuSample {
 
 // What is known of the wearer and of the sensor. The defaults are used until configure().
 struct InertialConfig {
-  float leg_length_m = 0.93f;  // 0.53 of the stature (Zijlstra and Hof 1997); here of 1.75 m
-  float step_gain = 2.13f;     // c of s = c (l^2 h)^(1/3): odd people of walk_lowerback_20m
-  float scale_sigma = 0.07f;   // relative, correlated: 0.05 to 0.09 uncalibrated, 0.03 calibrated
-  float acceleration_limit_m_s2 = 39.0f;   // a component beyond it is saturated: just under 4 g
-  float angular_rate_limit_rad_s = 8.7f;   // just under 500 deg/s
-  // What is not known of the gyroscope's bias at the start, an axis. 1 deg/s: what a warmed-up, once
-  // zeroed MPU-9150 keeps.
-  float gyro_bias_sigma_rad_s = kPi / 180.0f;
+  InertialConfig();  // the defaults: kDefaults in dead_reckoning.cpp, in this order
+
+  float leg_length_m;
+  float step_gain;    // c of s = c (l^2 h)^(1/3)
+  float scale_sigma;  // relative, correlated
+  float acceleration_limit_m_s2;   // a component beyond it is saturated
+  float angular_rate_limit_rad_s;
+  float gyro_bias_sigma_rad_s;     // what is not known of the bias at the start, an axis
 };
 
 // What was refused, limited or repaired since the reset. Each count stops at its maximum.
@@ -108,13 +108,30 @@ class DeadReckoning {
   void apply_straight(float sigma_rad_s);
   void publish();
 
+  // What is small and often used first: the AVR reaches 64 bytes from a pointer in one instruction.
   InertialConfig config_;
-  Displacement displacement_;
-  InertialCounters counters_;
-  Totals totals_;
-  ErrorFilter filter_;
-  GaitDetector gait_;
-  ForwardFinder forward_;
+
+  uint32_t ticks_;
+  uint16_t step_ticks_;
+  uint8_t straight_steps_, settled_steps_, turned_steps_;
+  uint8_t magnetic_count_, magnetic_steps_;
+  uint8_t hold_[kHolds];  // ticks that a flag stays up
+  Job job_;
+  bool motion_pending_, magnetic_pending_, step_directed_, step_straight_, velocity_known_;
+  bool still_pending_, step_irregular_;
+  bool moved_;  // not quiet throughout the gathering
+
+  // The step under way and the one whose updates are under way.
+  float heading_sum_rad_;
+  float stance_heading_rad_;  // at the last mid-stance
+  float closing_m_;           // way ahead since the last mid-stance, for the footfall that ends a walk
+  float step_length_m_, step_sigma_m_, step_speed_m_s_;
+  float step_heading_[2];          // mean over the step: cosine and sine
+  float mounting_rad_;             // where the forward axis has settled, from the heading axis
+  float walk_[2];   // walking direction in the navigation frame: heading and forward axis
+  float turn_rad_;  // over the last step
+  float straight_heading_rad_, straight_s_;  // of the stretch that may be straight
+  float straight_rate_rad_s_;
 
   // Nominal state. While gathering, velocity_ and position_ hold the sums of force and rate.
   Attitude attitude_;
@@ -129,33 +146,19 @@ class DeadReckoning {
   Span since_;  // since the covariance's time
   Span span_;   // being predicted
 
-  // The step under way and the one whose updates are under way.
-  float heading_sum_rad_;
-  float stance_heading_rad_;  // at the last mid-stance
-  float closing_m_;           // way ahead since the last mid-stance, for the footfall that ends a walk
-  float step_length_m_, step_sigma_m_, step_speed_m_s_;
-  float step_heading_[2];          // mean over the step: cosine and sine
-  float mounting_rad_;             // where the forward axis has settled, from the heading axis
-  float walk_[2];   // walking direction in the navigation frame: heading and forward axis
-  float turn_rad_;  // over the last step
-  float straight_heading_rad_, straight_s_;  // of the stretch that may be straight
-  float straight_rate_rad_s_;
-
   // The field as it was met so far, navigation frame.
   float magnetic_azimuth_rad_;
   float magnetic_norm_ut_, magnetic_vertical_ut_;
   float magnetic_residual_rad_;
   float quiet_s_, mean_force_m_s2_;
 
-  uint32_t ticks_;
-  uint16_t step_ticks_;
-  uint8_t straight_steps_, settled_steps_, turned_steps_;
-  uint8_t magnetic_count_, magnetic_steps_;
-  uint8_t hold_[kHolds];  // ticks that a flag stays up
-  Job job_;
-  bool motion_pending_, magnetic_pending_, step_directed_, step_straight_, velocity_known_;
-  bool still_pending_, step_irregular_;
-  bool moved_;  // not quiet throughout the gathering
+
+  Displacement displacement_;
+  InertialCounters counters_;
+  Totals totals_;
+  ErrorFilter filter_;
+  GaitDetector gait_;
+  ForwardFinder forward_;
 };
 
 }  // namespace relpos

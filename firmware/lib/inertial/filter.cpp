@@ -75,27 +75,31 @@ void ErrorFilter::predict_attitude(const float rotation[kAxes * kAxes], float dt
   widen(kBias, kBiasNoise_rad2_s3 * dt_s, kAxes);
 }
 
-void ErrorFilter::move_position(float dt_s) {
-  for (uint8_t i = 0; i < kAxes; ++i) mix(kPosition + i, kVelocity + i, dt_s);
+void ErrorFilter::settle() {
+  if (owed_s_ == 0.0f) return;
+  for (uint8_t i = 0; i < kAxes; ++i) mix(kPosition + i, kVelocity + i, owed_s_);
+  owed_s_ = 0.0f;
 }
 
 void ErrorFilter::predict_motion(const float f[kAxes], float dt_s) {
   // Half the position step before the velocity changes and half after it: second-order accurate
   // over a span of five ticks, where a single step would be a tenth of a second off.
-  move_position(0.5f * dt_s);
+  add(&owed_s_, 0.5f * dt_s);
+  settle();
   for (uint8_t i = 0; i < kAxes; ++i) {
     const uint8_t j = next(i), k = next(j);
     mix(kVelocity + i, kAttitude + j, f[k]);  // -[F x]
     mix(kVelocity + j, kAttitude + i, -f[k]);
   }
   widen(kVelocity, kVelocityNoise_m2_s3 * dt_s, kAxes);
-  move_position(0.5f * dt_s);
+  owed_s_ = 0.5f * dt_s;
 }
 
 float ErrorFilter::update(State group, const float direction[kAxes], float yaw, float innovation,
                           float variance, float correction[kStates + 1]) {
-  float* const ph = correction;  // P H' until the gain has been taken of it
-  memset(ph, 0, kStates * sizeof *ph);
+  // P h first, which becomes the correction row by row, where it is no longer needed.
+  float* const ph = correction;
+  memset(ph, 0, (kStates + 1) * sizeof *ph);
   add_column(ph, kAttitude + kZ, yaw);
   for (uint8_t i = 0; i < kAxes; ++i) add_column(ph, group + i, direction[i]);
   // The reference's share in the measurement: with the heading it is compared, with the bias it is
@@ -119,7 +123,7 @@ float ErrorFilter::update(State group, const float direction[kAxes], float yaw, 
   if (!considers) {
     add_scaled(reference_, ph + kAttitude + kZ, -inverse * shared, kReferenced);
     reference_variance_ -= shared * shared * inverse;
-    correction[kStates] = shared * inverse * innovation;
+    correction[kReference] = shared * inverse * innovation;
   }
   float* p = p_;
   for (uint8_t i = 0; i < kStates; ++i) {

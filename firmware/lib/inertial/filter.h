@@ -5,6 +5,8 @@
 //   position' = position + dt velocity
 //
 // The stages may run in different ticks: predict_attitude, then predict_motion over the same span.
+// Half of the position's move comes before the velocity's change and half after it; the second half
+// waits for the next span's first, and is made up for by settle() where a measurement comes first.
 #ifndef RELPOS_INERTIAL_FILTER_H
 #define RELPOS_INERTIAL_FILTER_H
 
@@ -31,6 +33,8 @@ class ErrorFilter {
   void reset(float tilt_rad, float bias_rad2_s2, float velocity_m_s);
   void predict_attitude(const float rotation[kAxes * kAxes], float dt_s);
   void predict_motion(const float impulse_m_s[kAxes], float dt_s);
+  // Before a measurement, a restart or a look at the position's variances.
+  void settle();
   // A reference direction that the heading is compared with (kAttitude's measurement): a thirteenth
   // state that does not move, of which only the correlations with heading and bias are kept.
   void set_reference(float variance_rad2) { reference_variance_ = variance_rad2; }
@@ -55,7 +59,6 @@ class ErrorFilter {
   static uint8_t step(uint8_t other, uint8_t state) {
     return other < state ? static_cast<uint8_t>(kStates - 1 - other) : 1;
   }
-  void move_position(float dt_s);
   // x_to += factor x_from for two states: all that the prediction does.
   void mix(uint8_t to, uint8_t from, float factor);
   // out += factor P(:, state).
@@ -66,6 +69,7 @@ class ErrorFilter {
   float p_[kPacked];
   float reference_[kReferenced];
   float reference_variance_;
+  float owed_s_;  // of the position's move
   uint16_t repairs_;
 };
 

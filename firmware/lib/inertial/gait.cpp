@@ -43,20 +43,20 @@ RELPOS_SHARED void integrate(float* sum, float rate, float dt_s) {
 
 }  // namespace
 
-void GaitDetector::reset() {
+RELPOS_SHARED void GaitDetector::reset() {
   memset(static_cast<void*>(this), 0, sizeof *this);
   since_s_ = kPause_s + 1.0f;
   period_s_ = kFirstPeriod_s;
   restart_arc();
 }
 
-void GaitDetector::restart_arc() {
+RELPOS_SHARED void GaitDetector::restart_arc() {
   trough_m_ = height_m_;
   lowest_m_s2_ = 1e6f;
   highest_m_s2_ = -1e6f;
 }
 
-bool GaitDetector::walking() const { return since_s_ < kPause_s; }
+RELPOS_SHARED bool GaitDetector::walking() const { return since_s_ < kPause_s; }
 
 uint16_t GaitDetector::take_rejected() {
   const uint16_t count = rejected_;
@@ -140,7 +140,7 @@ float turning_share(float yaw_rad) {
   return 1.0f / (1.0f + turn * turn);
 }
 
-void ForwardFinder::reset() {
+RELPOS_SHARED void ForwardFinder::reset() {
   memset(static_cast<void*>(this), 0, sizeof *this);
   axis_[kX] = 1.0f;
 }
@@ -165,7 +165,7 @@ void ForwardFinder::turn(float angle_rad) {
   point();
 }
 
-void ForwardFinder::point() {
+RELPOS_SHARED void ForwardFinder::point() {
   offset_rad_ = atan2f(product_[kY], product_[kX]);
   memset(axis_, 0, sizeof axis_);
   add_scaled(axis_, product_, 1.0f / sqrtf(dot(product_, product_, 2)), 2);

@@ -63,21 +63,15 @@ int32_t MotionTotals::heading_100urad(const Displacement& now) const {
 }
 
 void MotionTotals::fill(const Displacement& now, wire::Motion* motion) const {
-  float place_m[2];
-  if (base_heading_100urad_ == 0) {  // to the last bit
-    place_m[kX] = now.x_m;
-    place_m[kY] = now.y_m;
-  } else {
-    float base[2];
-    const float since_m[2] = {now.x_m, now.y_m};
-    direct(static_cast<float>(base_heading_100urad_) * 1e-4f, base);
-    compose(base, since_m, place_m);
-  }
+  const float way_m[2] = {now.x_m, now.y_m};
+  float base_axis[2], moved_m[2];
+  direct(static_cast<float>(base_heading_100urad_) * 1e-4f, base_axis);
+  compose(base_axis, way_m, moved_m);
   for (uint8_t i = 0; i < kTotals; ++i) {
     float value;
-    memcpy(&value, reinterpret_cast<const uint8_t*>(&now) + flash_byte(&kTable[i].from),
-           sizeof value);
-    if (i <= kY) value = place_m[i];
+    const void* from = reinterpret_cast<const uint8_t*>(&now) + flash_byte(&kTable[i].from);
+    if (i < 2) from = moved_m + i;
+    memcpy(&value, from, sizeof value);
     uint32_t per_unit = 1000;
     for (uint8_t k = flash_byte(&kTable[i].thousands); k > 1; --k) per_unit *= 1000;
     if (i == kHeadingVariance) per_unit *= 100;

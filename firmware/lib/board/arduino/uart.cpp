@@ -17,7 +17,7 @@ constexpr uint16_t kDivisor = (F_CPU / 8 + kBaud / 2) / kBaud - 1;
 // A tick of 9 ms lets 35 bytes arrive.
 constexpr uint8_t kReceiveBytes = 64;
 // Between two passes of the loop at most a tick: what runs dry meanwhile is only a pause.
-constexpr uint8_t kWriteBytes = 32;
+constexpr uint8_t kWriteBytes = 16;
 static_assert((kReceiveBytes & (kReceiveBytes - 1)) == 0, "rings turn over by a mask");
 static_assert((kWriteBytes & (kWriteBytes - 1)) == 0, "rings turn over by a mask");
 
