@@ -298,14 +298,11 @@ def score_steps(recording: Recording, step_times_s: Array) -> StepScore:
     return max(scores, key=lambda score: (score.found - score.extra, -abs(score.offset_s)))
 
 
-def calibrate(recording: Recording, true_distance_m: float) -> float:
-    """Step gain after a walk of known length, as ``relpos deadreckon --calibrate-from`` has it."""
-    first = gain = float(build().inertial_default_gain())
-    for _ in range(6):
-        walked_m = reckon(
-            recording.imu, leg_length_m=recording.leg_length_m, step_gain=gain
-        ).distance_m
-        if abs(walked_m / true_distance_m - 1.0) < 1e-3:
-            break
-        gain *= true_distance_m / walked_m
-    return first * believed_scale([gain / first])
+def calibrate(recording: Recording, true_distance_m: float, *, believed: bool = True) -> float:
+    """Step gain after a walk of known length, as ``relpos deadreckon --calibrate-from`` has it.
+
+    Without ``believed`` the gain is taken as the walk asks for it.
+    """
+    walked_m = reckon(recording.imu, leg_length_m=recording.leg_length_m).distance_m
+    asked = true_distance_m / walked_m
+    return float(build().inertial_default_gain()) * (believed_scale([asked]) if believed else asked)

@@ -147,9 +147,15 @@ def test_a_gap_is_silence_and_not_motion(walker):
 def test_a_calibration_walk_sets_the_gain_as_far_as_one_walk_is_believed(walker):
     recording = recorded(walker, even(100.0))
     before_m = play(1, recording, Wearer(0.9)).distance_m
-    gain = calibrate(1, recording, 1.05 * before_m, 0.9)
-    after_m = play(1, recording, Wearer(0.9, gain)).distance_m
-    assert after_m / before_m == pytest.approx(believed_scale([1.05]), abs=0.005)
+    found = calibrate(1, [recording], [1.05 * before_m], 0.9)
+    # With the gain that the firmware begins with.
+    assert found.measured_m == pytest.approx((before_m,), rel=1e-3)
+    assert found.scale == pytest.approx(believed_scale([1.05]), abs=1e-3)
+    after_m = play(1, recording, Wearer(0.9, found.gain_permille)).distance_m
+    assert after_m / before_m == pytest.approx(found.scale, abs=0.005)
+    # Walks that agree are believed more than one of them.
+    many = calibrate(1, [recording] * 4, [1.05 * before_m] * 4, 0.9)
+    assert found.scale < many.scale < 1.05
 
 
 class InertialRun(Run):
@@ -193,9 +199,10 @@ def test_calibration_needs_a_true_distance_and_the_node(walker):
     recording = recorded(walker, even(100.0, 30.0))
     run = run_of({1: recording})
     with pytest.raises(DataError, match="true_distance_m"):
-        replay_imu(run, calibration=run_of({1: recording}))
+        replay_imu(run, calibration=[run_of({1: recording})])
+    others = run_of({2: recording, 3: recording}, true_distance_m=20.0)
     with pytest.raises(DataError, match="node 1"):
-        replay_imu(run, calibration=run_of({2: recording, 3: recording}, true_distance_m=20.0))
+        replay_imu(run, calibration=[others])
 
 
 def test_what_cannot_be_played_is_refused(walker):
@@ -207,10 +214,10 @@ def test_what_cannot_be_played_is_refused(walker):
         replay_imu(run_of({}))
     still = recorded(walker, np.linspace(0.0, 4.0, 400))
     with pytest.raises(DataError, match="no step"):
-        calibrate(1, still, 20.0, None)
+        calibrate(1, [still], [20.0], None)
     with pytest.raises(DataError, match="must be positive"):
-        calibrate(1, still, 0.0, None)
+        calibrate(1, [still], [0.0], None)
     with pytest.raises(DataError, match=r"memory: node 1: .*LEG_LENGTH"):
         replay_imu(run_of({1: still}, stature_m=0.1))
-    with pytest.raises(DataError, match="no step gain makes 2000 m"):
-        calibrate(1, recorded(walker, even(100.0, 30.0)), 2000.0, None)
+    with pytest.raises(DataError, match="not as 2000 m"):
+        calibrate(1, [recorded(walker, even(100.0, 30.0))], [2000.0], None)

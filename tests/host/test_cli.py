@@ -282,6 +282,7 @@ def test_deadreckon_sums_what_the_firmware_reported(
                 "y_m": 0.5,
                 "leg_length_m": 0.9,
                 "step_gain_permille": 1300,
+                "step_scale": None,
                 "samples": 100,
                 "clipped_samples": 7,
             }

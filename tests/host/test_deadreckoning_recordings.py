@@ -112,56 +112,55 @@ def lowerback():
 @needs("walk_lowerback_20m")
 def test_twenty_metres_are_twenty_metres_from_the_stature_alone(lowerback):
     assert lowerback["walks"] == 74
-    assert lowerback["distance_error_percent_mean_abs"] < 7.6
-    assert lowerback["distance_error_percent_worst"] < 33.0
-    assert abs(lowerback["distance_error_percent_mean"]) < 2.5
-    assert lowerback["intact_distance_error_percent_mean_abs"] < 6.9
+    assert lowerback["distance_error_percent_mean_abs"] < 5.0
+    assert lowerback["distance_error_percent_worst"] < 35.0
+    assert abs(lowerback["intact_distance_error_percent_mean"]) < 1.5
+    assert lowerback["intact_distance_error_percent_mean_abs"] < 3.8
 
 
 @needs("walk_lowerback_20m")
 def test_one_calibration_walk_brings_a_person_to_scale(lowerback):
-    assert lowerback["calibrated_distance_error_percent_mean_abs"] < 7.2
+    assert lowerback["calibrated_distance_error_percent_mean_abs"] < 4.7
     # Where no samples are lost the pendulum with given contacts reaches 3.4 %.
-    assert lowerback["intact_calibrated_distance_error_percent_mean_abs"] < 4.0
+    assert lowerback["intact_calibrated_distance_error_percent_mean_abs"] < 3.3
 
 
 @needs("walk_lowerback_20m")
 def test_steps_are_found_one_to_one(lowerback):
-    assert lowerback["steps_found_percent"] > 95.0
-    assert lowerback["steps_extra_percent"] < 2.2
-    assert lowerback["intact_steps_found_percent"] > 96.6
-    assert lowerback["intact_steps_extra_percent"] < 1.3
+    assert lowerback["steps_found_percent"] > 97.2
+    assert lowerback["steps_extra_percent"] < 2.3
+    assert lowerback["intact_steps_found_percent"] > 98.4
+    assert lowerback["intact_steps_extra_percent"] < 1.4
 
 
 @needs("walk_lowerback_20m")
 def test_a_u_turn_is_half_a_turn(lowerback):
-    assert lowerback["turn_error_deg_median_abs"] < 4.0
-    assert lowerback["intact_turn_error_deg_mean_abs"] < 5.0
-    assert lowerback["legs_error_deg_median_abs"] < 4.5
+    assert lowerback["turn_error_deg_median_abs"] < 2.5
+    assert lowerback["intact_turn_error_deg_mean_abs"] < 3.7
+    assert lowerback["legs_error_deg_median_abs"] < 3.5
 
 
 @needs("walk_lowerback_20m")
 def test_the_claimed_variance_along_is_honest(lowerback):
-    # 0.5 to 2 is the aim.
-    assert 0.5 < lowerback["nees_along"] < 4.0
+    assert 0.5 < lowerback["nees_along"] < 2.0
     assert lowerback["nees_along_low"] < lowerback["nees_along"] < lowerback["nees_along_high"]
 
 
 @needs("walk_daily_lowerback")
 def test_slow_indoor_activity_is_not_taken_for_walking():
     figures = evaluate.daily(verbose=False)
-    assert abs(figures["slow_summed_error_percent"]) < 38.0
-    assert figures["slow_mean_abs_error_per_bout_percent"] < 42.0
-    assert abs(figures["straight_summed_error_percent"]) < 10.0
+    assert abs(figures["slow_summed_error_percent"]) < 10.0
+    assert figures["slow_mean_abs_error_per_bout_percent"] < 25.0
+    assert abs(figures["straight_summed_error_percent"]) < 8.0
 
 
 @needs("walk_chest")
 def test_the_same_corridor_is_as_long_both_ways():
     figures = evaluate.chest(verbose=False)
-    assert abs(figures["corridor_ratio_percent"]) < 2.5
+    assert abs(figures["corridor_ratio_percent"]) < 0.7
     for way in ("there", "back"):
         assert 164 <= figures[f"corridor_{way}_steps"] <= 169
-    assert figures["K_calibration_worst_from_mean_percent"] < 3.0
+    assert figures["K_calibration_worst_from_mean_percent"] < 2.0
     for walk in range(1, 6):
         assert 27 <= figures[f"K_calibration_{walk}_steps"] <= 29
     assert figures["L__staticTestmagnet2_m"] == 0.0
@@ -171,9 +170,9 @@ def test_the_same_corridor_is_as_long_both_ways():
 def test_a_handheld_phone_leads_from_waypoint_to_waypoint():
     figures = evaluate.waypoints(verbose=False)
     assert figures["walks"] == 70
-    assert figures["median_percent"] < 18.0
-    assert figures["best_turn_median_percent"] < 13.0
-    assert figures["magnetometer_median_percent"] < 16.5
+    assert figures["median_percent"] < 9.2
+    assert figures["best_turn_median_percent"] < 6.8
+    assert figures["magnetometer_median_percent"] < 9.2
 
 
 @needs("walk_handheld_waypoints")

@@ -94,7 +94,10 @@ RELPOS_SHARED bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance*
   const float range_m_s2 = highest_m_s2_ - lowest_m_s2_;
   const float since_s = since_s_;
   const float periods = since_s / period_s_;
-  stance->weak = swing < kSmallestSwing_m || periods < kEarly || since_s < kShortestStep_s ||
+  // Not of a longer period than at the start: one that grew in a turn would reject every other step
+  // for good (6 s of it in one walk; 16 % of its distance by 2 % of gain).
+  const float early_s = kEarly * (period_s_ < kFirstPeriod_s ? period_s_ : kFirstPeriod_s);
+  stance->weak = swing < kSmallestSwing_m || since_s < early_s || since_s < kShortestStep_s ||
                  range_m_s2 < kSmallestRange_m_s2;
   if (stance->weak && (first || range_m_s2 < kDueRange_m_s2 || periods < kDueFrom ||
                        periods > kDueUntil)) {

@@ -26,8 +26,11 @@ def deadreckon(
         typer.Option(metavar="M", min=0.5, max=2.5, help="The wearer's height in metres."),
     ] = None,
     calibrate_from: Annotated[
-        Path | None,
-        typer.Option(metavar="RUN2", help="A walk of the same wearer with true_distance_m."),
+        list[Path] | None,
+        typer.Option(
+            metavar="RUN2",
+            help="A walk of the same wearer with true_distance_m; may be given several times.",
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -44,18 +47,16 @@ def deadreckon(
     recording = load_run(run)
     if not recording.load_imu():
         raise DataError(f"{run}: no inertial data in this run (imu.csv)")
-    if calibrate_from is not None:
-        walk = load_run(calibrate_from)
+    walks = []
+    for path in calibrate_from or ():
+        walk = load_run(path)
         if walk.description.true_distance_m is None:
-            raise DataError(
-                f"{calibrate_from}: run.toml gives no true_distance_m to calibrate with"
-            )
+            raise DataError(f"{path}: run.toml gives no true_distance_m to calibrate with")
         if not walk.load_imu():
-            raise DataError(f"{calibrate_from}: no inertial data in this run (imu.csv)")
-    else:
-        walk = None
+            raise DataError(f"{path}: no inertial data in this run (imu.csv)")
+        walks.append(walk)
     with output.working("running the firmware over the recording"):
-        played = replay_imu(recording, board=str(board), stature_m=stature, calibration=walk)
+        played = replay_imu(recording, board=str(board), stature_m=stature, calibration=walks)
 
     nodes = {str(node): _figures(part) for node, part in sorted(played.items())}
     if out is not None:
@@ -80,6 +81,16 @@ def deadreckon(
             output.remark(
                 f"node {node}: {part.repeated} of {part.samples} samples repeat a time: "
                 "the first of each time is played"
+            )
+        if part.calibration is not None:
+            for walk, measured_m in zip(walks, part.calibration.measured_m, strict=True):
+                output.remark(
+                    f"node {node}: {walk.name} of {walk.description.true_distance_m:g} m comes out "
+                    f"as {measured_m:.2f} m before calibration"
+                )
+            output.remark(
+                f"node {node}: steps are taken {part.calibration.scale:.3f} times as long after "
+                "that; one walk is believed in part, one that is far off hardly"
             )
         if part.rate_hz < LEAST_RATE_HZ:
             output.remark(
@@ -119,6 +130,7 @@ def _figures(part: Played) -> dict[str, Any]:
         "y_m": round(end.imag, 3),
         "leg_length_m": None if leg_m is None else round(leg_m, 4),
         "step_gain_permille": part.wearer.step_gain_permille,
+        "step_scale": None if part.calibration is None else round(part.calibration.scale, 4),
         "samples": part.samples,
         "clipped_samples": part.replay.clipped,
     }

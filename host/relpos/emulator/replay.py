@@ -7,16 +7,15 @@ the recording's clock. Nothing is taken from the recording but its samples.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from relpos.calibration.steps import (
-    LEAST_GAIN_PERMILLE,
     LEG_OF_STATURE,
-    MOST_GAIN_PERMILLE,
+    MOST_CHANGE,
     POPULATION_GAIN_PERMILLE,
     believed_scale,
     scaled_gain_permille,
@@ -55,9 +54,6 @@ LEAST_GAP_S = 0.1
 LEAST_RATE_HZ = 20.0
 """Of a recording that still shows steps: the strides' harmonics reach 8 Hz."""
 STANDARD_PRESSURE_PA = 101_325.0
-CALIBRATION_PASSES = 4
-CALIBRATED_WITHIN = 0.001
-"""The gain is found when the calibration walk comes out this close to its true length."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +92,7 @@ class Played:
     repeated: int
     """Samples at the time of the one before, which were left out."""
     rate_hz: float
+    calibration: Calibration | None = None
 
 
 def surroundings_of(recording: ImuRecording) -> Surroundings:
@@ -277,38 +274,47 @@ def play(
     return Replay(motions, steps, counts, int(beyond.sum()))
 
 
+@dataclass(frozen=True)
+class Calibration:
+    """A step gain from walks of known length; ``measured_m`` is what the node made of them."""
+
+    gain_permille: int
+    scale: float
+    measured_m: tuple[float, ...]
+
+
 def calibrate(
     node: int,
-    recording: ImuRecording,
-    true_distance_m: float,
+    recordings: Sequence[ImuRecording],
+    true_m: Sequence[float],
     leg_length_m: float | None,
     board: BoardKind | str = BoardKind.NATIVE,
-) -> int:
-    """Step gain in permille after a walk of ``true_distance_m``, as far as one walk is believed.
+) -> Calibration:
+    """Step gain after walks of one wearer, as far as `steps.believed_scale` believes them.
 
-    The step length is not quite linear in the gain (the filter weighs it), hence more than one
-    pass to the gain with which the walk comes out right; `steps.believed_scale` says what to make
-    of that. DataError where no step is found, the distance is not positive, or no gain leads there.
+    A walk's length goes with the gain: 5 % more of it makes the recorded walks 5.03 % longer at the
+    median. So one pass tells; making the walk come out right by several may run into a step that is
+    found with one gain and not with the next (2.7 for 2.1 in one walk). DataError where no step is
+    found, a distance is not positive, or the walks are not what was told.
     """
-    if not true_distance_m > 0.0:
-        raise DataError(
-            f"the calibration walk's true_distance_m is {true_distance_m:g}: it must be positive"
-        )
-    gain = POPULATION_GAIN_PERMILLE
-    for _ in range(CALIBRATION_PASSES):
-        walked_m = play(node, recording, Wearer(leg_length_m, gain), board).distance_m
-        if walked_m <= 0.0:
-            raise DataError(f"node {node}: no step is found in the calibration walk")
-        if abs(walked_m / true_distance_m - 1.0) < CALIBRATED_WITHIN:
-            break
-        gain = round(gain * true_distance_m / walked_m)
-        if not LEAST_GAIN_PERMILLE <= gain <= MOST_GAIN_PERMILLE:
+    for distance_m in true_m:
+        if not distance_m > 0.0:
             raise DataError(
-                f"node {node}: the calibration walk comes out as {walked_m:.2f} m and no step gain "
-                f"makes {true_distance_m:g} m of it: is true_distance_m right?"
+                f"the calibration walk's true_distance_m is {distance_m:g}: it must be positive"
             )
-    believed = believed_scale([gain / POPULATION_GAIN_PERMILLE])
-    return scaled_gain_permille(POPULATION_GAIN_PERMILLE, believed)
+    wearer = Wearer(leg_length_m, POPULATION_GAIN_PERMILLE)
+    measured_m = tuple(play(node, part, wearer, board).distance_m for part in recordings)
+    if min(measured_m) <= 0.0:
+        raise DataError(f"node {node}: no step is found in the calibration walk")
+    asked = [true / measured for true, measured in zip(true_m, measured_m, strict=True)]
+    for scale, true, measured in zip(asked, true_m, measured_m, strict=True):
+        if not 1.0 / MOST_CHANGE <= scale <= MOST_CHANGE:
+            raise DataError(
+                f"node {node}: the calibration walk comes out as {measured:.2f} m and not as "
+                f"{true:g} m: is true_distance_m right?"
+            )
+    scale = believed_scale(asked)
+    return Calibration(scaled_gain_permille(POPULATION_GAIN_PERMILLE, scale), scale, measured_m)
 
 
 def replay_imu(
@@ -316,32 +322,36 @@ def replay_imu(
     *,
     board: BoardKind | str = BoardKind.NATIVE,
     stature_m: float | None = None,
-    calibration: Run | None = None,
+    calibration: Sequence[Run] = (),
 ) -> dict[int, Played]:
     """What the firmware reports while the run's ``imu.csv`` is played, for every node in it.
 
     The leg length is the run's own, or 0.53 of ``stature_m`` or of the run's stature. With
-    ``calibration``, a walk of the same wearer with ``true_distance_m``, the step gain comes from
-    it. DataError or DeviceError where that cannot be done.
+    ``calibration``, walks of the same wearer with ``true_distance_m``, the step gain comes from
+    them. DataError or DeviceError where that cannot be done.
     """
     recordings = run.load_imu()
     if not recordings:
         raise DataError(f"{run.name}: no inertial data (imu.csv)")
-    walks = calibration.load_imu() if calibration is not None else {}
+    walks = [(walk, walk.load_imu()) for walk in calibration]
     played: dict[int, Played] = {}
     for node, recording in recordings.items():
         leg_m = _leg_length_m(run, node, stature_m)
-        gain = None
-        if calibration is not None:
-            walk = walks.get(node) or (next(iter(walks.values())) if len(walks) == 1 else None)
-            distance_m = calibration.description.true_distance_m
-            if walk is None or distance_m is None:
-                raise DataError(
-                    f"{calibration.name}: no walk of node {node} with true_distance_m in it"
-                )
-            # The calibration walk's own leg length would put another gain beside this one.
-            gain = calibrate(node, walk, distance_m, leg_m, board)
-        wearer = Wearer(leg_m, gain)
+        calibrated = None
+        if walks:
+            own, lengths_m = [], []
+            for walk, parts in walks:
+                part = parts.get(node) or (next(iter(parts.values())) if len(parts) == 1 else None)
+                distance_m = walk.description.true_distance_m
+                if part is None or distance_m is None:
+                    raise DataError(
+                        f"{walk.name}: no walk of node {node} with true_distance_m in it"
+                    )
+                own.append(part)
+                lengths_m.append(distance_m)
+            # A calibration walk's own leg length would put another gain beside this one.
+            calibrated = calibrate(node, own, lengths_m, leg_m, board)
+        wearer = Wearer(leg_m, None if calibrated is None else calibrated.gain_permille)
         try:
             replay = play(node, recording, wearer, board)
         except DataError as error:
@@ -353,6 +363,7 @@ def replay_imu(
             samples=len(recording.time_s),
             repeated=len(recording.time_s) - len(time_s),
             rate_hz=float(1.0 / np.median(np.diff(time_s))),
+            calibration=calibrated,
         )
     return played
 
