@@ -242,9 +242,11 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
   Stance stance;
   const bool at_stance = advance(sample, dt_s, &stance);
   if (reckoning) {
-    // At a mid-stance only a motion stage that is left over: it belongs before.
-    if (!at_stance || motion_pending_) work();
+    // A motion stage left over belongs before the mid-stance, and is work enough for this tick.
+    const bool before = at_stance && motion_pending_;
+    if (before) work();
     if (at_stance) on_stance(stance);
+    if (!before) work();
   }
   publish();
 }
@@ -431,8 +433,7 @@ void DeadReckoning::work() {
     filter_.predict_motion(span_.impulse_m_s, span_.time_s);
     motion_pending_ = false;
     if (job_ == kIdle && (quiet() || !gait_.walking())) job_ = kStillX;
-  } else if ((job_ > kFlush || still_pending_ || magnetic_pending_) && filter_.settle()) {
-    return;  // a piece of its own
+    if (job_ != kIdle) filter_.settle();  // a measurement is next, which is work enough for its tick
   } else if (job_ != kIdle) {
     run_job();
   } else if (still_pending_) {  // before the prediction, or standing would leave it no tick
@@ -520,6 +521,7 @@ void DeadReckoning::run_job() {
 RELPOS_NEAR void DeadReckoning::measure(State group, const float direction[kAxes], float innovation,
                             float variance, float yaw) {
   float correction[kStates + 1];
+  filter_.settle();
   filter_.update(group, direction, yaw, innovation, variance, correction);
   attitude_.correct(correction + kAttitude);
   if (group <= kBias) magnetic_azimuth_rad_ += correction[kReference];

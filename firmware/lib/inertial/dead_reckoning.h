@@ -55,7 +55,6 @@ class DeadReckoning {
   void reset();
   void update(const ImuSample& sample, float dt_s);  // at 50 Hz; dt nominally 0.02 s
   void magnetometer(const float field_ut[kAxes]);    // in the accelerometer's axes, about 5 Hz
-  bool at_stance() const { return job_ == kFlush; }  // the update was a long one
   const Displacement& displacement() const { return displacement_; }
   const InertialCounters& counters() const { return counters_; }
 

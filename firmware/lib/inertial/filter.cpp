@@ -75,11 +75,10 @@ void ErrorFilter::predict_attitude(const float rotation[kAxes * kAxes], float dt
   widen(kBias, kBiasNoise_rad2_s3 * dt_s, kAxes);
 }
 
-bool ErrorFilter::settle() {
-  if (owed_s_ == 0.0f) return false;
+void ErrorFilter::settle() {
+  if (owed_s_ == 0.0f) return;
   for (uint8_t i = 0; i < kAxes; ++i) mix(kPosition + i, kVelocity + i, owed_s_);
   owed_s_ = 0.0f;
-  return true;
 }
 
 void ErrorFilter::predict_motion(const float f[kAxes], float dt_s) {
@@ -96,7 +95,7 @@ void ErrorFilter::predict_motion(const float f[kAxes], float dt_s) {
   owed_s_ = 0.5f * dt_s;
 }
 
-RELPOS_SHARED float ErrorFilter::update(State group, const float direction[kAxes], float yaw, float innovation,
+float ErrorFilter::update(State group, const float direction[kAxes], float yaw, float innovation,
                           float variance, float correction[kStates + 1]) {
   // P h first, which becomes the correction row by row, where it is no longer needed.
   float* const ph = correction;

@@ -33,8 +33,8 @@ class ErrorFilter {
   void reset(float tilt_rad, float bias_rad2_s2, float velocity_m_s);
   void predict_attitude(const float rotation[kAxes * kAxes], float dt_s);
   void predict_motion(const float impulse_m_s[kAxes], float dt_s);
-  // Before a measurement, a restart or a look at the position's variances. False where nothing waited.
-  bool settle();
+  // Before a measurement, a restart or a look at the position's variances.
+  void settle();
   // A reference direction that the heading is compared with (kAttitude's measurement): a thirteenth
   // state that does not move, of which only the correlations with heading and bias are kept.
   void set_reference(float variance_rad2) { reference_variance_ = variance_rad2; }

@@ -235,10 +235,10 @@ void Node::tick(uint32_t now_us) {
   dead_reckoning_.update(sample, static_cast<float>(step_us) * 1e-6f);
   ++updates_;
 
-  // A mid-stance is work enough for its tick: the magnetometer then waits for the next.
   float field_ut[3];
-  const Displacement& now = dead_reckoning_.displacement();
-  if (!dead_reckoning_.at_stance() && magnetometer_.step(board_, field_ut)) {
+  // At a mid-stance a tick later: a reading and its use are 5 % of a tick, and that one is long.
+  if (dead_reckoning_.displacement().last_step_tick != updates_ &&
+      magnetometer_.step(board_, field_ut)) {
     if (raw_reports_ != 0) {
       memcpy(raw_ + 6, field_ut, sizeof field_ut);
       ++raw_fields_;
@@ -249,6 +249,7 @@ void Node::tick(uint32_t now_us) {
     field_seen_ = true;
   }
 
+  const Displacement& now = dead_reckoning_.displacement();
   totals_.track(now);
   const uint16_t flags = now.quality_flags;
   uint8_t quality = quality_;
