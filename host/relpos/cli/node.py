@@ -286,7 +286,7 @@ def _walk(session: Session, distance_m: float, stature_m: float | None, yes: boo
     walked = (newest["steps"] - before["steps"]) % 65536
     fit = steps.fit_walk(gain, walked, newest["path_m"] - before["path_m"], distance_m)
     typer.echo(
-        f"{fit.steps} steps: the node said {fit.measured_m:.2f} m, it were {fit.true_m:g} m "
+        f"{fit.steps} steps: the node said {fit.measured_m:.2f} m, it was {fit.true_m:g} m "
         f"({100 * (fit.scale - 1):+.1f} %)"
     )
     believed = fit.gain_permille / fit.gain_before_permille - 1.0

@@ -1,0 +1,191 @@
+"""Calibration: ellipsoids, biases and gains that are known, found again or refused."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from relpos.calibration import guide, inertial, magnetometer, picture, steps
+from relpos.calibration.sensors import SensorCalibration, checksum
+from relpos.errors import DataError
+from relpos.link.decoder import RawSample
+
+EARTH_UT = np.array([0.0, 20.0, -43.6])  # 48 uT, dipping by 65 degrees
+GRAVITY = np.array([0.0, 0.0, 9.80665])
+
+
+def turned(count, seed, noise_ut=0.3, offset=(40.0, -25.0, 10.0), spread=0.1):
+    """Readings (n, 3), up (n, 3) and the truth of a node that is turned in all directions."""
+    rng = np.random.default_rng(seed)
+    attitudes = Rotation.random(count, random_state=seed).inv()
+    iron = np.eye(3) + spread * rng.standard_normal((3, 3))
+    field = attitudes.apply(EARTH_UT) @ iron.T + offset
+    return field + noise_ut * rng.standard_normal((count, 3)), attitudes.apply(GRAVITY), iron
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_ellipsoid_is_found_and_turned_into_gravitys_axes(seed):
+    field, up, iron = turned(400, seed)
+    fit = magnetometer.fit(field, up)
+    assert np.allclose(fit.offset_ut, (40.0, -25.0, 10.0), atol=0.5)
+    assert fit.residual < 0.01 < fit.residual_before
+    # What is corrected is the field's direction, not only its strength: up to 1 degree.
+    scale = np.linalg.det(iron) ** (1 / 3)
+    clean = (Rotation.random(400, random_state=seed).inv()).apply(EARTH_UT) * scale
+    angle = np.arccos(
+        np.sum(fit.correct(field) * clean, axis=1)
+        / np.linalg.norm(fit.correct(field), axis=1)
+        / np.linalg.norm(clean, axis=1)
+    )
+    assert np.degrees(np.sqrt(np.mean(angle**2))) < 1.0
+
+
+def test_a_few_readings_beside_steel_do_not_bend_the_ellipsoid():
+    field, up, _ = turned(400, 3)
+    field[::40] += [15.0, 0.0, 0.0]
+    fit = magnetometer.fit(field, up)
+    assert np.allclose(fit.offset_ut, (40.0, -25.0, 10.0), atol=1.5)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda f, u: (f[:40], u[:40]), "too few"),
+        (lambda f, u: (np.tile(f[:1], (100, 1)), u[:100]), "always shows the same"),
+        (lambda f, u: (f[f[:, 2] > f[:, 2].mean() + 15.0], None), "directions|uncertain|ellipsoid"),
+        (lambda f, u: (f + np.linspace(0, 60, len(f))[:, None], u), "ellipsoid|uniform"),
+        (lambda f, u: (4.0 * f, u), "Earth"),
+    ],
+)
+def test_readings_that_do_not_determine_it_are_refused_with_what_to_do(spoil, words):
+    field, up, _ = turned(400, 1)
+    with pytest.raises(DataError, match=words):
+        magnetometer.fit(*spoil(field, up))
+
+
+def test_one_axis_alone_is_no_calibration():
+    angle = np.linspace(0, 20 * np.pi, 400)
+    field = np.column_stack((20 * np.cos(angle) + 30, 20 * np.sin(angle), 40 + 0 * angle))
+    field += 0.3 * np.random.default_rng(0).standard_normal(field.shape)
+    with pytest.raises(DataError):
+        magnetometer.fit(field)
+
+
+def samples_of(kind):
+    """Raw samples, five a second, of what a guided calibration asks for, in the order given."""
+    rng = np.random.default_rng(7)
+    bias, gyro = np.array([0.3, -0.2, 0.1]), np.radians([1.0, -2.0, 0.5])
+    out, time_s = [], 0.0
+
+    def add(attitude, rate):
+        nonlocal time_s
+        time_s += 0.2
+        force = attitude.inv().apply(GRAVITY) * 1.01 + bias + 0.003 * rng.standard_normal(3)
+        field = attitude.inv().apply(EARTH_UT) + (30.0, 5.0, -12.0) + 0.3 * rng.standard_normal(3)
+        shown = rate + gyro + 0.0003 * rng.standard_normal(3)
+        out.append(RawSample(time_s, 1, 10, tuple(force), tuple(shown), tuple(field)))
+
+    sides = [(0, 0, 0), (np.pi, 0, 0), (1.57, 0, 0), (-1.57, 0, 0), (0, 1.57, 0), (0, -1.57, 0)]
+    for part in kind:
+        if part == "still":
+            for _ in range(50):
+                add(Rotation.identity(), np.zeros(3))
+        elif part == "sides":
+            for side in sides:
+                add(Rotation.from_rotvec(np.array(side) / 2), np.array([2.0, 0, 0]))
+                for _ in range(15):
+                    add(Rotation.from_rotvec(side), np.zeros(3))
+        else:
+            for k in range(400):
+                add(Rotation.random(random_state=k), np.array([0.0, 1.5, -1.0 + 0.01 * (k % 7)]))
+    return out, bias, gyro
+
+
+@pytest.mark.parametrize("order", [("still", "sides", "turn"), ("turn", "sides", "still")])
+def test_the_order_of_a_calibration_does_not_matter(order):
+    samples, bias, gyro = samples_of(order)
+    assert guide.progress(samples).done(with_magnetometer=True)
+    result = guide.solve(samples)
+    assert np.allclose(result.calibration.gyro_bias_rad_s, gyro, atol=np.radians(0.02))
+    assert np.allclose(result.calibration.acceleration_bias_m_s2, bias, atol=0.02)
+    assert np.allclose(result.calibration.field_offset_ut, (30.0, 5.0, -12.0), atol=0.5)
+    assert 0.0 < np.degrees(result.calibration.gyro_bias_sigma_rad_s) < 0.2
+
+
+def test_without_rest_there_is_no_calibration_and_without_sides_no_accelerometer():
+    with pytest.raises(DataError, match="never lay still"):
+        guide.solve(samples_of(("turn",))[0])
+    result = guide.solve(samples_of(("still", "turn"))[0])
+    assert result.accelerometer is None
+    assert "accelerometer" in result.remarks[0]
+    assert not guide.progress(samples_of(("still", "turn"))[0]).done(with_magnetometer=True)
+
+
+def test_a_node_that_is_held_is_not_lying_still():
+    time_s = np.arange(50) * 0.2
+    swaying = np.radians(2.0) * np.sin(time_s)[:, None] * np.ones(3)
+    with pytest.raises(DataError, match="moved"):
+        inertial.fit_gyro(swaying, np.full(50, 0.2))
+
+
+def test_the_picture_shows_before_and_after(tmp_path):
+    field, up, _ = turned(300, 2)
+    picture.draw(magnetometer.fit(field, up), field, tmp_path / "deep" / "one.png")
+    assert (tmp_path / "deep" / "one.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_calibration_survives_its_way_to_the_node():
+    samples, _, _ = samples_of(("still", "sides", "turn"))
+    calibration = guide.solve(samples).calibration
+    words = calibration.to_words()
+    again = SensorCalibration.from_words(words)
+    assert again.to_words() == words
+    assert checksum(words) != checksum([*words[:-1], words[-1] + 1])
+    assert np.allclose(again.field_matrix, calibration.field_matrix, atol=1e-4)
+    assert SensorCalibration().to_words() == [0] * len(words)
+
+
+def test_a_calibration_that_no_node_can_hold_is_refused():
+    with pytest.raises(DataError, match="does not fit"):
+        SensorCalibration(field_offset_ut=np.array([1e5, 0.0, 0.0])).to_words()
+
+
+# --- steps ---------------------------------------------------------------------------------------
+
+
+def test_one_walk_is_believed_less_the_more_it_asks_for():
+    asked = np.array([1.02, 1.05, 1.10, 1.20, 1.40])
+    shares = [np.log(steps.believed_scale([a])) / np.log(a) for a in asked]
+    assert all(a > b for a, b in itertools.pairwise(shares))
+    assert 0.6 < shares[0] < 0.7
+    assert shares[-1] < 0.05
+    assert steps.believed_scale([1.0]) == 1.0
+
+
+def test_walks_that_agree_are_believed():
+    one, three = steps.believed_scale([1.15]), steps.believed_scale([1.15, 1.14, 1.16])
+    assert 1.0 < one < 1.06
+    assert three > 1.09
+    # One that was not what was told does not carry the others away.
+    assert steps.believed_scale([1.04, 1.05, 1.60]) == steps.believed_scale([1.04, 1.05, 1.055])
+
+
+@pytest.mark.parametrize("scales", [[], [0.0], [-1.0], [float("nan")]])
+def test_a_scale_that_is_none_is_refused(scales):
+    with pytest.raises(DataError):
+        steps.believed_scale(scales)
+
+
+def test_people_scatter_about_the_population_whatever_the_node_was_set_to():
+    fresh = steps.fit_walk(steps.POPULATION_GAIN_PERMILLE, 40, 30.0, 31.0)
+    # A node that was already set 10 % too long reports the same walk 10 % longer.
+    again = steps.fit_walk(round(1.1 * steps.POPULATION_GAIN_PERMILLE), 40, 33.0, 31.0)
+    assert again.gain_permille == pytest.approx(fresh.gain_permille, abs=2)
+
+
+def test_a_walk_that_cannot_be_the_one_that_was_told_is_refused():
+    with pytest.raises(DataError, match="too far apart"):
+        steps.fit_walk(2130, 40, 30.0, 60.0)
+    with pytest.raises(DataError, match="steps"):
+        steps.fit_walk(2130, 3, 2.0, 20.0)

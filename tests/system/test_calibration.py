@@ -1,0 +1,95 @@
+"""A node in somebody's hands, calibrated through the port as a user does it."""
+
+import re
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from relpos.link.live import open_port
+from relpos.link.session import Session
+from relpos.protocol import messages as wire
+
+RELPOS = [sys.executable, "-m", "relpos.cli.main"]
+
+
+@contextmanager
+def emulated(scenario, speed, seconds, seed=3):
+    """Path of the pseudo-terminal behind which the node is."""
+    command = [*RELPOS, "emulate", "--nodes", 1, "--scenario", scenario]
+    command += ["--speed", speed, "--seconds", seconds, "--seed", seed]
+    emulator = subprocess.Popen(
+        [*map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    try:
+        yield re.search(r"/dev/\S+", emulator.stdout.readline())[0]
+    finally:
+        emulator.send_signal(signal.SIGTERM)
+        emulator.wait(30)
+
+
+def calibrate(*arguments):
+    return subprocess.run(
+        [*RELPOS, "node", "calibrate", *map(str, arguments), "--yes"],
+        capture_output=True,
+        text=True,
+        timeout=90,
+        stdin=subprocess.DEVNULL,
+        check=False,
+    )
+
+
+def test_a_guided_calibration_makes_the_field_round_and_is_kept_over_a_restart(tmp_path):
+    with emulated("turntable", 6, 400) as port:
+        done = calibrate(port, "--node", 1, "--out", tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert "stored, restarted and read back" in done.stdout
+        assert imread(tmp_path / "node-1-magnetometer.png").shape[0] > 500
+        device = open_port(port)
+        try:
+            session = Session(device, 1)
+            calibration = session.read_calibration()
+            boot = session.boot()
+            session.command(wire.CommandCode.REBOOT, 0)
+            raw = [s for s in session.raw_samples(60.0) if s is not None]
+            assert session.boot() == (boot + 1) % 256
+            assert session.read_calibration().to_words() == calibration.to_words()
+        finally:
+            device.close()
+    field = np.array([s.magnetic_field_ut for s in raw if s.magnetic_field_ut])
+    before = np.linalg.norm(field, axis=1)
+    after = np.linalg.norm(calibration.correct_field(field), axis=1)
+    assert len(field) > 100
+    assert before.std() / before.mean() > 0.1
+    assert after.std() / after.mean() < 0.02
+    assert 0.05 < np.degrees(calibration.gyro_bias_sigma_rad_s) < 0.3
+
+
+def test_a_walk_of_known_length_sets_the_gain_on_the_node():
+    with emulated("straight", 6, 300) as port:
+        done = calibrate("walk", port, "--node", 1, "--distance", 40)
+        assert done.returncode == 0, done.stderr
+        device = open_port(port)
+        try:
+            gain = Session(device, 1).setting(wire.CommandCode.SET_STEP_GAIN_PERMILLE)
+        finally:
+            device.close()
+    assert f"-> {gain / 1000:.3f}" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("/dev/nowhere",), "cannot open"),
+        (("walk", "/dev/nowhere", "--distance", 20), "cannot open"),
+    ],
+)
+def test_a_port_that_is_none_is_told_in_one_line(arguments, words):
+    done = calibrate(*arguments)
+    assert done.returncode == 1
+    assert words in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
