@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 import recordings
 from recordings import Track
 
-GOOD_WAYPOINTS = "085"  # the longest walk but one: 100 m, 15 waypoints, 89 s
-BAD_WAYPOINTS = "066"
+GOOD_WAYPOINTS = "085"  # 100 m, 15 waypoints, 89 s
+BAD_WAYPOINTS = "072"  # the first leg is taken wrong, and 25 % too long
 LOST_SAMPLES = "5-6"
 SOUND_SAMPLES = "5-4"
 

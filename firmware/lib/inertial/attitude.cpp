@@ -30,8 +30,7 @@ void turn(const float angle[kAxes], float out[4]) {
   const float square = 0.25f * dot(angle, angle);
   const float sine = 0.5f - square * (1.0f / 12.0f);
   out[0] = 1.0f - 0.5f * square;
-  out[1] = out[2] = out[3] = 0.0f;
-  add_scaled(out + 1, angle, sine, kAxes);
+  for (uint8_t i = 0; i < kAxes; ++i) out[1 + i] = angle[i] * sine;
 }
 
 }  // namespace
