@@ -240,7 +240,7 @@ def test_a_refused_sample_is_counted_and_changes_nothing(team):
     assert not np.any(clean.rows["flags"] & BAD_INPUT)
 
 
-@pytest.mark.parametrize(("column", "value", "flag"), [(0, 39.2, 1 << 0), (5, -8.72, 1 << 1)])
+@pytest.mark.parametrize(("column", "value", "flag"), [(0, 39.2, 1 << 0), (5, -17.45, 1 << 1)])
 def test_saturation_is_flagged_for_two_seconds_and_survived(team, column, value, flag):
     imu = recorded(team[0])[: 120 * RATE_HZ]
     clean = replay.reckon(imu)

@@ -18,7 +18,7 @@ const float kDefaults[] PROGMEM = {
     2.13f,          // odd people of walk_lowerback_20m
     0.07f,          // 0.05 to 0.09 uncalibrated, 0.03 calibrated
     39.0f,          // just under 4 g
-    8.7f,           // just under 500 deg/s
+    17.4f,          // just under 1000 deg/s
     kPi / 180.0f,   // 1 deg/s: what a warmed-up, once zeroed MPU-9150 keeps
 };
 

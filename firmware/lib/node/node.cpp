@@ -27,7 +27,7 @@ constexpr uint16_t kMostRawReports = 3000; // ten minutes: a lost host does not 
 // Beyond what a sensor at its limit can show once a calibration has moved it: by 80 mg and 3 %, by
 // 20 deg/s (data sheet limits).
 constexpr float kCalibratedLimit_m_s2 = 37.0f;
-constexpr float kCalibratedLimitRadS = 8.35f;
+constexpr float kCalibratedLimitRadS = 16.5f;
 
 // What a command may set: where it stands in the settings, and its limits.
 struct Choice {

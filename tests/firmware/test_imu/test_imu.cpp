@@ -86,7 +86,7 @@ void set_up(Mpu9150& imu, Chips& chips, uint32_t* now_us) {
 
 }  // namespace
 
-TEST(set_up_waits_for_the_chip_and_chooses_50_hz_21_hz_500_dps_4_g_bypass) {
+TEST(set_up_waits_for_the_chip_and_chooses_50_hz_21_hz_1000_dps_4_g_bypass) {
   Chips chips;
   Mpu9150 imu = Mpu9150();
   uint32_t now_us = 0;
@@ -96,7 +96,7 @@ TEST(set_up_waits_for_the_chip_and_chooses_50_hz_21_hz_500_dps_4_g_bypass) {
   CHECK_EQUAL(0x01, chips.inertial[0x6B]);
   CHECK_EQUAL(19, chips.inertial[0x19]);
   CHECK_EQUAL(4, chips.inertial[0x1A]);
-  CHECK_EQUAL(0x08, chips.inertial[0x1B]);
+  CHECK_EQUAL(0x10, chips.inertial[0x1B]);
   CHECK_EQUAL(0x08, chips.inertial[0x1C]);
   CHECK(chips.bypassed());
 }
@@ -114,9 +114,9 @@ TEST(a_sample_comes_in_si_units) {
   CHECK_NEAR(9.80665f, force[0], 1e-4f);
   CHECK_NEAR(-9.80665f, force[1], 1e-4f);
   CHECK_NEAR(39.2254f, force[2], 1e-3f);
-  CHECK_NEAR(-8.726646f, rate[0], 1e-4f);       // 500 deg/s
-  CHECK_NEAR(0.1744f, rate[1], 1e-3f);          // 10 deg/s
-  CHECK_NEAR(0.000266316f, rate[2], 1e-8f);     // 500 / 32768 deg/s
+  CHECK_NEAR(-17.453293f, rate[0], 1e-4f);      // 1000 deg/s
+  CHECK_NEAR(0.3489f, rate[1], 1e-3f);          // 20 deg/s
+  CHECK_NEAR(0.000532632f, rate[2], 1e-8f);     // 1000 / 32768 deg/s
 }
 
 TEST(a_sample_is_not_announced_twice) {
