@@ -4,6 +4,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from contextlib import contextmanager
 
 import numpy as np
@@ -55,8 +56,11 @@ def test_a_guided_calibration_makes_the_field_round_and_is_kept_over_a_restart(t
             calibration = session.read_calibration()
             boot = session.boot()
             session.command(wire.CommandCode.REBOOT, 0)
-            raw = [s for s in session.raw_samples(60.0) if s is not None]
+            until_s = time.monotonic() + 10.0
+            while session.boot() == boot and time.monotonic() < until_s:
+                session.listen()
             assert session.boot() == (boot + 1) % 256
+            raw = [s for s in session.raw_samples(50.0) if s is not None]
             assert session.read_calibration().to_words() == calibration.to_words()
         finally:
             device.close()
