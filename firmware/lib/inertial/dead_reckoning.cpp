@@ -94,7 +94,8 @@ const uint8_t kFieldSteps = 5;
 
 // The sensor on the body. An axis that leans so far (sine) shows no heading; and a forward axis that
 // stays elsewhere for so many steps, once it had settled, is a sensor that was turned on the body.
-const float kSteep = 0.85f;
+const float kSteep = 0.5f;
+const float kBent_s = 5.0f;  // longer is no bending
 const uint8_t kSettledSteps = 10, kDoubtedSteps = 8, kTurnedSteps = 22;
 const float kTurned_rad = 35.0f * kDegree;
 
@@ -280,11 +281,19 @@ RELPOS_NEAR bool DeadReckoning::advance(const ImuSample& sample, float dt_s, Sta
 
   float ahead[kAxes];  // the heading axis
   rotate(rotation_, heading_axis_, ahead);
-  if (fabsf(ahead[kZ]) > kSteep) {  // bent, crawling or lying: another axis takes over
-    aim(displacement_.heading_rad);
-    rotate(rotation_, heading_axis_, ahead);
+  if (fabsf(ahead[kZ]) > kSteep) {
+    // Bent: the heading goes on by the turn about the vertical, and the axis is as good as before when
+    // it comes up again. Crawling or lying, another axis takes over.
+    add(&steep_s_, dt_s);
+    const float* up = rotation_ + kAxes * kZ;  // in the body
+    const float rate_rad_s = dot(up, sample.angular_rate_rad_s) - dot(up, bias_rad_s_);
+    displacement_.heading_rad = wrap_angle(displacement_.heading_rad + rate_rad_s * dt_s);
+    if (steep_s_ > kBent_s) aim(displacement_.heading_rad);
+    direct(displacement_.heading_rad, ahead);
+  } else {
+    steep_s_ = 0.0f;
+    displacement_.heading_rad = atan2f(ahead[kY], ahead[kX]);
   }
-  displacement_.heading_rad = atan2f(ahead[kY], ahead[kX]);
   add(&heading_sum_rad_, turn_between(stance_heading_rad_, displacement_.heading_rad));
   if (step_ticks_ < 65535u) ++step_ticks_;
 

@@ -127,6 +127,7 @@ class DeadReckoning {
   float closing_m_;           // way ahead since the last mid-stance, for the footfall that ends a walk
   float step_length_m_, step_sigma_m_, step_speed_m_s_;
   float step_heading_[2];          // mean over the step: cosine and sine
+  float steep_s_;                  // for which the heading axis has shown no heading
   float mounting_rad_;             // where the forward axis has settled, from the heading axis
   float walk_[2];   // walking direction in the navigation frame: heading and forward axis
   float turn_rad_;  // over the last step
