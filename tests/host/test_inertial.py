@@ -218,6 +218,21 @@ def test_the_magnetometer_holds_the_heading(team):
     assert nees < 1.0
 
 
+def test_the_heading_grows_uncertain_while_the_field_is_rejected(team):
+    walker = team[2]
+    imu, field = recorded(walker, walker.node), walker.magnetic_field_ut[::4]
+    disturbed = field.copy()
+    disturbed[60 * RATE_HZ :] *= (
+        1.0 + 0.4 * np.sign(np.sin(np.arange(len(field))[60 * RATE_HZ :]))[:, None]
+    )
+    held, lost = replay.reckon(imu, field), replay.reckon(imu, disturbed)
+    assert held.counters["rejected_magnetic"] < 10 < lost.counters["rejected_magnetic"]
+    heading = (2, 2)  # attitude about the vertical
+    assert lost.covariance[heading] > 1.5 * held.covariance[heading]
+    grown = [r.rows["variance_heading_rad2"][-1] for r in (held, lost)]
+    assert grown[1] > grown[0]
+
+
 def test_a_refused_sample_is_counted_and_changes_nothing(team):
     imu = recorded(team[0])[: 60 * RATE_HZ]
     span = 1.0 / RATE_HZ

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy import signal
 
+from relpos.calibration.steps import LEG_OF_STATURE
 from relpos.simulation.activities import Activity
 from relpos.simulation.gait import rotation
 from relpos.simulation.gait_statistics import (
@@ -36,7 +37,6 @@ from relpos.simulation.solo import make_walker
 from relpos.simulation.wearer import make_wearer
 from relpos.simulation.world import FloatArray
 
-LEG_OF_STATURE = 0.53
 LOWER_BACK = "walk_lowerback_20m"
 STAND = Activity("stand", seconds=4.0)
 
