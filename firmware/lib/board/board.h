@@ -59,6 +59,8 @@ class Board {
   RELPOS_VIRTUAL void led(bool on) RELPOS_PURE;
   RELPOS_VIRTUAL void reset() RELPOS_PURE;           // restarts the node
   RELPOS_VIRTUAL uint16_t free_stack() RELPOS_PURE;  // bytes that the stack has never reached
+  // Supply of the microcontroller itself, as measured at the previous call; 0 where it is not measured.
+  RELPOS_VIRTUAL uint16_t supply_mv() RELPOS_PURE;
   // 1 at the start of a tick, 0 at its end: for timing.
   RELPOS_VIRTUAL void mark(uint8_t value) RELPOS_PURE;
 

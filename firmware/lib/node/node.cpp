@@ -571,6 +571,7 @@ uint8_t Node::fill_status(uint8_t* body) {
   status.firmware_patch = kFirmwarePatch;
   status.uptime_s = clock_.ms() / 1000;
   status.reset_cause = static_cast<uint8_t>(reset_cause_);
+  status.battery_mv = board_.supply_mv();
   status.bus_errors = board_.bus_errors();
   status.ranging_successes = ranging_successes_;
   status.ranging_failures = ranging_failures_;

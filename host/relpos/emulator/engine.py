@@ -40,5 +40,8 @@ class Engine(Protocol):
     def receive(self, data: bytes) -> None:
         """Bytes that arrive now at the board's UART."""
 
+    def set_supply(self, supply_mv: int) -> None:
+        """Supply in millivolts that the board measures from now on; 5000 at first."""
+
     def close(self) -> None:
         """Free what the engine holds; it must not be used afterwards."""

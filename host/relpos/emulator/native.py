@@ -132,6 +132,8 @@ def load(path: Path) -> ctypes.CDLL:
     library.relpos_node_destroy.argtypes = [_POINTER]
     library.relpos_node_receive.restype = None
     library.relpos_node_receive.argtypes = [_POINTER, ctypes.c_char_p, _U16]
+    library.relpos_node_set_supply.restype = None
+    library.relpos_node_set_supply.argtypes = [_POINTER, _U16]
     library.relpos_node_poll.restype = _U32
     library.relpos_node_poll.argtypes = [_POINTER, _U32]
     return library
@@ -174,6 +176,7 @@ class NativeEngine:
         self._reset_asked = False
         self._line_free_us = 0
         self._now_us = power_on_us
+        self._supply_mv = 5000
         # Kept alive here: ctypes does not.
         self._callbacks = _Callbacks(
             None, _I2cTransfer(self._transfer), _UartWrite(self._written), _Reset(self._asked)
@@ -192,6 +195,7 @@ class NativeEngine:
         )
         if not self._node:
             raise DeviceError(f"node {self.node_id}: the firmware refuses to start")
+        self._library.relpos_node_set_supply(self._node, self._supply_mv)
 
     def _node_us(self, time_us: int) -> int:
         """Node clock, 32 bits: it begins at the offset when the node is powered on."""
@@ -276,6 +280,12 @@ class NativeEngine:
         self._power_on_us = time_us + RESTART_US
         self.next_due_us = self._power_on_us
         self._create(cause)
+
+    def set_supply(self, supply_mv: int) -> None:
+        """Supply in millivolts that the board measures from now on, over restarts too."""
+        self._supply_mv = supply_mv
+        if self._node:
+            self._library.relpos_node_set_supply(self._node, supply_mv)
 
     def close(self) -> None:
         """Free the node."""

@@ -14,6 +14,7 @@ struct FakeBoard : relpos::Board {
   void led(bool) override {}
   void reset() override {}
   uint16_t free_stack() override { return 0; }
+  uint16_t supply_mv() override { return 5000; }
   void mark(uint8_t) override {}
 
  protected:

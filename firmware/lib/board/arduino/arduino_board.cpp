@@ -23,6 +23,15 @@ constexpr uint8_t kLed = _BV(PB7);
 constexpr uint8_t kLed = _BV(PB5);
 #endif
 
+// The 1.1 V reference measured against the supply: the reading rises as the supply falls.
+#if defined(__AVR_ATmega2560__)
+constexpr uint8_t kMeasureReference = _BV(REFS0) | 0x1E;
+#else
+constexpr uint8_t kMeasureReference = _BV(REFS0) | 0x0E;
+#endif
+constexpr uint8_t kConvert = _BV(ADEN) | _BV(ADSC) | _BV(ADPS2) | _BV(ADPS1) | _BV(ADPS0);
+constexpr uint32_t kReferenceMv = 1100;  // of a piece 1.0 to 1.2 V (data sheet)
+
 constexpr uint8_t kPaint = 0xC5;
 // Timer 1 is the clock: 16 bits of 4 us, the high ones counted. Sleeping is worth its while from a
 // millisecond on; at most half a turn, so that the alarm is never behind the counter.
@@ -57,6 +66,8 @@ void ArduinoBoard::begin() {
   TIMSK1 = _BV(TOIE1) | _BV(OCIE1A);
   twi::begin();
   uart::begin();
+  ADMUX = kMeasureReference;
+  ADCSRA = kConvert;
   DDRB |= kLed;
   set_sleep_mode(SLEEP_MODE_IDLE);
   sei();
@@ -130,6 +141,14 @@ uint16_t Board::free_stack() {
   const uint8_t* at = &__heap_start;
   while (at < reinterpret_cast<const uint8_t*>(SP) && *at == kPaint) ++at;
   return static_cast<uint16_t>(at - &__heap_start);
+}
+
+// Each call fetches the conversion that the previous one began: 0.1 ms need not be waited for, and
+// the reference has long settled.
+uint16_t Board::supply_mv() {
+  const uint16_t reading = ADC;
+  ADCSRA = kConvert;
+  return reading == 0 ? 0 : static_cast<uint16_t>(kReferenceMv * 1024 / reading);
 }
 
 void Board::mark(uint8_t value) { GPIOR0 = value; }

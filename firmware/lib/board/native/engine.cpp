@@ -18,6 +18,7 @@ class NativeBoard final : public Board {
               uint32_t now_us)
       : callbacks_(callbacks), eeprom_(eeprom), eeprom_size_(eeprom_size), now_us_(now_us) {}
 
+  void set_supply(uint16_t supply_mv) { supply_mv_ = supply_mv; }
   void set_now(uint32_t now_us) { now_us_ = now_us; }
   void receive(uint8_t byte) {
     if (received_count_ == kReceiveBytes) return;
@@ -53,6 +54,12 @@ class NativeBoard final : public Board {
   void led(bool) override {}
   void reset() override { callbacks_.reset(callbacks_.context); }
   uint16_t free_stack() override { return 0xFFFF; }  // a PC has enough
+  // Through the boards' 10-bit converter, so that all tell the same.
+  uint16_t supply_mv() override {
+    constexpr uint32_t kReferenceCounts = 1100UL * 1024;
+    const uint32_t reading = supply_mv_ == 0 ? 0 : kReferenceCounts / supply_mv_;
+    return reading == 0 ? 0 : static_cast<uint16_t>(kReferenceCounts / reading);
+  }
   void mark(uint8_t) override {}
 
  protected:
@@ -73,6 +80,7 @@ class NativeBoard final : public Board {
   uint8_t* eeprom_;
   uint16_t eeprom_size_;
   uint32_t now_us_;
+  uint16_t supply_mv_ = 5000;
   uint8_t received_[kReceiveBytes];
   uint16_t received_first_ = 0;
   uint16_t received_count_ = 0;
@@ -113,6 +121,10 @@ void relpos_node_destroy(relpos_node* node) { delete node; }
 
 void relpos_node_receive(relpos_node* node, const uint8_t* bytes, uint16_t count) {
   for (uint16_t i = 0; i < count; ++i) node->board.receive(bytes[i]);
+}
+
+void relpos_node_set_supply(relpos_node* node, uint16_t supply_mv) {
+  node->board.set_supply(supply_mv);
 }
 
 uint32_t relpos_node_poll(relpos_node* node, uint32_t now_us) {

@@ -34,6 +34,8 @@ void relpos_node_destroy(relpos_node* node);
 /* Bytes that arrive at the node's UART; up to 256 wait for the next poll, more are lost, as on the
  * boards. */
 void relpos_node_receive(relpos_node* node, const uint8_t* bytes, uint16_t count);
+/* What the board's supply is from now on; 5000 from the start. */
+void relpos_node_set_supply(relpos_node* node, uint16_t supply_mv);
 /* One pass of the main loop. Returns microseconds until it wants the next one; 0: at once. */
 uint32_t relpos_node_poll(relpos_node* node, uint32_t now_us);
 

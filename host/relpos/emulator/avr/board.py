@@ -215,6 +215,10 @@ class Board:
             )
         self._library.relpos_avr_eeprom_set(self._board, contents, len(contents))
 
+    def set_supply(self, supply_mv: int) -> None:
+        """Supply in millivolts from now on, as the chip's converter sees it; 5000 at first."""
+        self._library.relpos_avr_set_supply(self._alive(), supply_mv)
+
     def data(self, address: int, count: int) -> bytes:
         """Bytes of data memory (registers, I/O, RAM) as they are now."""
         buffer = ctypes.create_string_buffer(count)

@@ -135,6 +135,10 @@ class AvrEngine:
         """Reset the board as by its button, a dip of the supply or a new battery."""
         self.board.reset(cause)
 
+    def set_supply(self, supply_mv: int) -> None:
+        """Supply in millivolts from now on; 5000 at first."""
+        self.board.set_supply(supply_mv)
+
     def close(self) -> None:
         """Free the simulated board."""
         self.board.close()

@@ -96,6 +96,7 @@ def load() -> ctypes.CDLL:
         "eeprom_size": (u32, [board]),
         "eeprom_get": (None, [board, out, u32]),
         "eeprom_set": (None, [board, text, u32]),
+        "set_supply": (None, [board, u32]),
         "data_get": (None, [board, u16, out, u16]),
         "counters": (None, [board, u64s]),
         "clear_statistics": (None, [board]),

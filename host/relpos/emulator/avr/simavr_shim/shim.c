@@ -771,5 +771,10 @@ void relpos_avr_clear_statistics(relpos_avr *e)
 	e->counter[COUNTER_TICK_CYCLES_MAX] = e->counter[COUNTER_TWI_BUSY_CYCLES] = 0;
 }
 
+void relpos_avr_set_supply(relpos_avr *e, uint32_t millivolts)
+{
+	e->avr->vcc = e->avr->avcc = e->avr->aref = millivolts;
+}
+
 uint32_t relpos_avr_ram_end(const relpos_avr *e) { return e->avr->ramend; }
 uint32_t relpos_avr_flash_size(const relpos_avr *e) { return e->avr->flashend + 1; }

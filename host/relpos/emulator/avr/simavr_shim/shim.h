@@ -66,6 +66,8 @@ uint32_t relpos_avr_take_marks(relpos_avr *, uint64_t *cycles, uint8_t *values, 
 uint32_t relpos_avr_eeprom_size(const relpos_avr *);
 void relpos_avr_eeprom_get(const relpos_avr *, uint8_t *out, uint32_t count);
 void relpos_avr_eeprom_set(relpos_avr *, const uint8_t *in, uint32_t count);
+/* Supply of the chip and its converter from now on; 5000 mV from the start. */
+void relpos_avr_set_supply(relpos_avr *, uint32_t millivolts);
 void relpos_avr_data_get(const relpos_avr *, uint16_t address, uint8_t *out, uint16_t count);
 
 void relpos_avr_counters(const relpos_avr *, uint64_t out[COUNTER_COUNT]);

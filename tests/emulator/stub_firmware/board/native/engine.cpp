@@ -35,6 +35,8 @@ void relpos_node_receive(relpos_node* node, const uint8_t* bytes, uint16_t count
     node->inbox[node->count++] = bytes[i];
 }
 
+void relpos_node_set_supply(relpos_node*, uint16_t) {}
+
 uint32_t relpos_node_poll(relpos_node* node, uint32_t now_us) {
   uint8_t out[80];
   uint16_t n = 0;
