@@ -52,9 +52,19 @@ class Link:
         return observations
 
     def command(
-        self, node: int, code: wire.CommandCode, value: int, *, token: int | None = None
+        self,
+        node: int,
+        code: wire.CommandCode,
+        value: int,
+        *,
+        token: int | None = None,
+        broadcast: bool = False,
     ) -> tuple[int, bytes]:
-        """Token and serial bytes of a command; the same token again repeats, not re-does, it."""
+        """Token and serial bytes of a command; the same token again repeats, not re-does, it.
+
+        ``broadcast`` sends it to every radio module, whatever the node's has for an address; only
+        the node obeys.
+        """
         if token is None:
             self._token = self._token % 0xFFFF + 1
             token = self._token
@@ -66,8 +76,14 @@ class Link:
             self._sequence,
             {"token": token, "command": code, "value": value},
         )
-        address = xbee.BROADCAST_16 if node == wire.BROADCAST else node
+        everybody = broadcast or node == wire.BROADCAST
+        address = xbee.BROADCAST_16 if everybody else node
         return token, xbee.encode(xbee.Transmit16(0, address, data), escaped=self._escaped)
+
+    @property
+    def virtual_s(self) -> float | None:
+        """Virtual time of an emulated team that marks it; None for a real one."""
+        return self._virtual_s
 
     def summary(self) -> dict[str, float]:
         """Counts of the whole link, for the user: frames, losses, rejections."""

@@ -22,6 +22,8 @@ ANSWER_S = 1.0
 """A full frame each way takes 50 ms, storing the settings on the node 0.4 s."""
 ATTEMPTS = 6
 """At 2 % loss each way a command fails four times in a row once in half a million."""
+ADDRESSED_ATTEMPTS = 2
+"""Further ones go to everybody and to the node's address in turn."""
 SILENT_S = 6.0
 """A node that is on reports its motion every second."""
 RAW_REPORTS_PER_S = 5
@@ -82,8 +84,11 @@ class Session:
     def _ask(self, code: wire.CommandCode, value: int) -> Acknowledged:
         self._token = self._token % 0xFFFF + 1
         token = self._token
-        for _ in range(ATTEMPTS):
-            _, data = self.link.command(self.node, code, value, token=token)
+        for attempt in range(ATTEMPTS):
+            # To its address the radios try several times themselves; a node whose module has
+            # another address hears only what goes to everybody.
+            broadcast = attempt >= ADDRESSED_ATTEMPTS and attempt % 2 == 0
+            _, data = self.link.command(self.node, code, value, token=token, broadcast=broadcast)
             try:
                 self._port.write(data)
             except (serial.SerialException, OSError) as error:
