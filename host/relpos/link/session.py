@@ -125,6 +125,26 @@ class Session:
             raise DeviceError(f"node {self.node} does not know {code.name}")
         return answer.value
 
+    def restart(self) -> int:
+        """Restart the node and wait for it; returns its new boot counter. DeviceError in vain."""
+        boot = self.boot()
+        self.demand(wire.CommandCode.REBOOT, 0)
+        if not self._restarted(boot):
+            raise DeviceError(
+                f"node {self.node} took the command but was not heard restarting: switch it off "
+                "and on"
+            )
+        new_boot = self.boot()
+        assert new_boot is not None
+        return new_boot
+
+    def _restarted(self, boot: int | None) -> bool:
+        """Wait until the node is heard with another boot; whether it was."""
+        until_s = time.monotonic() + SILENT_S
+        while self.boot() == boot and time.monotonic() < until_s:
+            self.listen()
+        return self.boot() != boot
+
     # -- raw samples ------------------------------------------------------------------------------
 
     def raw_samples(self, most_s: float) -> Iterator[RawSample | None]:
@@ -189,10 +209,7 @@ class Session:
             self.demand(wire.CommandCode.SET_CALIBRATION, index << 16 | word & 0xFFFF)
         boot = self.boot()
         self.demand(wire.CommandCode.COMMIT_CALIBRATION, checksum(words))
-        until_s = time.monotonic() + SILENT_S
-        while self.boot() == boot and time.monotonic() < until_s:
-            self.listen()
-        if self.boot() == boot:
+        if not self._restarted(boot):
             raise DeviceError(
                 f"node {self.node} took the calibration but was not heard restarting with it: "
                 "switch it off and on"
@@ -226,3 +243,26 @@ class Session:
         if after != before:
             self.set_step_gain(after)
         return before, after
+
+
+def open_session(port: serial.Serial, node: int | None) -> Session:
+    """A session with the node that is asked for, or with the only one that is heard.
+
+    DeviceError where that node is not heard, or none or several are and none was asked for.
+    """
+    session = Session(port, node or 0)
+    started_s = time.monotonic()
+    nodes = session.link.decoder.nodes
+    while (waited_s := time.monotonic() - started_s) < SILENT_S:
+        session.listen()
+        if node is not None and node in nodes:
+            return session
+        if node is None and nodes and waited_s > SILENT_S / 2:
+            break
+    heard = ", ".join(map(str, sorted(nodes))) or "nobody"
+    if node is not None:
+        raise DeviceError(f"node {node} is not heard on this port; heard: {heard}")
+    if len(nodes) != 1:
+        raise DeviceError(f"which node? Heard: {heard}. Say it with --node")
+    session.node = next(iter(nodes))
+    return session

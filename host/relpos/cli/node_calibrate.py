@@ -1,0 +1,313 @@
+"""``relpos node calibrate``: a node's sensors, its wearer's steps, two nodes' antennas."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from relpos.cli import output
+from relpos.errors import DataError, DeviceError
+
+if TYPE_CHECKING:
+    from relpos.calibration.guide import Progress, Result
+    from relpos.link.decoder import RawSample
+    from relpos.link.session import Session
+
+HEARD_WITHIN_S = 6.0
+STOOD_S = 5.0
+"""Who has not made a step for so long has arrived."""
+WALK_WITHIN_S = 900.0
+DEFAULT = "sensors"
+_FLAGS = ("--yes", "-y", "--magnetometer", "--no-magnetometer", "--help")
+
+
+class CalibrateGroup(TyperGroup):
+    """`calibrate PORT` is `calibrate sensors PORT`; a command's name may stand behind options."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the command's name, or the default one, in front."""
+        position = self._first_word(args)
+        if position is not None:
+            word = args[position]
+            rest = args[:position] + args[position + 1 :]
+            args = [word, *rest] if word in self.commands else [DEFAULT, *args]
+        return super().parse_args(ctx, args)
+
+    @staticmethod
+    def _first_word(args: list[str]) -> int | None:
+        """Where the first argument stands that is neither an option nor an option's value."""
+        position = 0
+        while position < len(args):
+            word = args[position]
+            if not word.startswith("-"):
+                return position
+            position += 1 if word in _FLAGS or "=" in word else 2
+        return None
+
+
+app = typer.Typer(
+    cls=CalibrateGroup,
+    no_args_is_help=True,
+    help="Calibrate a node and store that on it: its sensors (`calibrate PORT` for short), its "
+    "wearer's steps, the antennas of two nodes.",
+)
+
+Port = Annotated[str, typer.Argument(metavar="PORT", help="The coordinator's port.")]
+Node = Annotated[
+    int | None,
+    typer.Option(min=1, max=254, help="Which node. (default: the only one that is heard)"),
+]
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Store without asking.")]
+
+
+@app.command()
+def sensors(
+    port: Port,
+    node: Node = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write the picture and the figures there.")
+    ] = None,
+    seconds: Annotated[
+        float, typer.Option(min=20.0, max=600.0, help="Longest time for moving the node.")
+    ] = 300.0,
+    magnetometer: Annotated[bool, typer.Option(help="Calibrate the magnetometer, too.")] = True,
+    yes: Yes = False,
+) -> None:
+    """Calibrate gyroscope, accelerometer and magnetometer; `calibrate PORT` for short."""
+    from relpos.link.live import open_port
+    from relpos.link.session import open_session
+
+    with closing(open_port(port)) as device:
+        _sensors(open_session(device, node), seconds, magnetometer, out, yes)
+
+
+@app.command()
+def walk(
+    port: Port,
+    distance: Annotated[
+        float, typer.Option(metavar="M", min=5.0, help="The length that is walked.")
+    ],
+    node: Node = None,
+    stature: Annotated[
+        float | None,
+        typer.Option(metavar="M", min=1.0, max=2.4, help="The wearer's height, if new."),
+    ] = None,
+    yes: Yes = False,
+) -> None:
+    """Set the step gain by a straight walk of known length."""
+    from relpos.link.live import open_port
+    from relpos.link.session import open_session
+
+    with closing(open_port(port)) as device:
+        _walk(open_session(device, node), distance, stature, yes)
+
+
+def _confirmed(yes: bool) -> bool:
+    if yes or not sys.stdin.isatty():
+        return True
+    return typer.confirm("Store this on the node?", default=True)
+
+
+# -- sensors ---------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _shown() -> Iterator[Any]:
+    """A function that shows a Progress, as bars on a terminal, else as lines."""
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn
+    from rich.progress import Progress as Bars
+
+    from relpos.calibration import guide, inertial
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        said_s = time.monotonic()
+
+        def say(now: Progress) -> None:
+            nonlocal said_s
+            if time.monotonic() - said_s > output.PLAIN_PROGRESS_EVERY_S:
+                said_s = time.monotonic()
+                output.remark(
+                    f"still {now.still_s:.0f} s, {now.attitudes} sides, "
+                    f"{100 * now.coverage:.0f} % of the directions"
+                )
+
+        yield say
+        return
+    columns = (
+        TextColumn("{task.description:32}"),
+        BarColumn(),
+        TextColumn("{task.percentage:3.0f} %"),
+    )
+    with Bars(*columns, console=console, transient=True) as bars:
+        still = bars.add_task("lying still", total=guide.STILL_S)
+        sides = bars.add_task("each side down once", total=inertial.POSES_FOR_SCALE)
+        turned = bars.add_task("turned in all directions", total=guide.COVERAGE)
+
+        def show(now: Progress) -> None:
+            bars.update(still, completed=min(now.still_s, guide.STILL_S))
+            bars.update(sides, completed=min(now.attitudes, inertial.POSES_FOR_SCALE))
+            bars.update(
+                turned, completed=min(now.coverage, now.readings / guide.READINGS * guide.COVERAGE)
+            )
+
+        yield show
+
+
+def _sensors(session: Session, seconds: float, magnetic: bool, out: Path | None, yes: bool) -> None:
+    from relpos.calibration import guide
+
+    output.remark(
+        f"node {session.node}: away from steel and from your phone,\n"
+        "  1. lay it on something firm and leave it alone for ten seconds,\n"
+        "  2. lay it on each of its six sides, three seconds each,\n"
+        "  3. turn it slowly on the spot in all directions, until the last bar is full.\n"
+        "In any order; Ctrl-C says that it is enough."
+    )
+    samples: list[RawSample] = []
+    # Ctrl-C says that it is enough; what is missing then is told by the fits.
+    with _shown() as show, suppress(KeyboardInterrupt):
+        for sample in session.raw_samples(seconds):
+            if sample is None:
+                continue
+            samples.append(sample)
+            if len(samples) % 5 == 0:
+                now = guide.progress(samples)
+                show(now)
+                if now.done(with_magnetometer=magnetic):
+                    break
+    before = session.read_calibration()
+    result = guide.solve(samples, with_magnetometer=magnetic)
+    for words in result.remarks:
+        output.remark(words)
+    _print_result(session.node, result)
+    if out is not None:
+        _write(out, session.node, result)
+    if not _confirmed(yes):
+        raise DataError(f"node {session.node} keeps what it had")
+    session.write_calibration(result.calibration)
+    again = "again" if before.gyro_bias_sigma_rad_s > 0.0 else "for the first time"
+    typer.echo(f"node {session.node} is calibrated {again}: stored, restarted and read back")
+
+
+def _triple(values: Any, factor: float = 1.0, digits: int = 2) -> str:
+    return "  ".join(f"{factor * float(v):+.{digits}f}" for v in values)
+
+
+def _rows(result: Result) -> list[tuple[str, str]]:
+    degree = 180.0 / math.pi
+    rows = [
+        ("gyroscope bias / deg/s", _triple(result.gyro.bias_rad_s, degree, 3)),
+        ("  trusted to / deg/s", f"{degree * result.gyro.sigma_rad_s:.2f}"),
+    ]
+    if (a := result.accelerometer) is not None:
+        rows += [
+            ("accelerometer bias / m/s2", _triple(a.bias_m_s2, 1.0, 3)),
+            ("  scale / %", "not observable" if a.partial else _triple(a.scale, 100.0)),
+            (
+                "  |force| - g, before and after / m/s2",
+                f"{a.residual_before_m_s2:.3f}  {a.residual_m_s2:.3f}",
+            ),
+        ]
+    if (m := result.magnetometer) is not None:
+        rows += [
+            ("hard iron / uT", _triple(m.offset_ut, 1.0, 1)),
+            ("  strength of the field / uT", f"{m.radius_ut:.1f}"),
+            (
+                "  its spread, before and after / %",
+                f"{100 * m.residual_before:.1f}  {100 * m.residual:.2f}",
+            ),
+            ("  directions seen / %", f"{100 * m.coverage:.0f}"),
+        ]
+        if m.dip_rad is not None:
+            rows.append(("  dip below the horizon / deg", f"{degree * m.dip_rad:.1f}"))
+    return rows
+
+
+def _print_result(node: int, result: Result) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=f"Node {node}", show_header=False)
+    table.add_column()
+    table.add_column(justify="right")
+    for row in _rows(result):
+        table.add_row(*row)
+    Console().print(table)
+
+
+def _write(out: Path, node: int, result: Result) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    if result.magnetometer is not None:
+        from relpos.calibration.picture import draw
+
+        path = out / f"node-{node}-magnetometer.png"
+        draw(result.magnetometer, result.fields_ut, path)
+        typer.echo(f"picture: {path}")
+    lines = [f"{name.strip()}: {value}\n" for name, value in _rows(result)]
+    (out / f"node-{node}-calibration.txt").write_text("".join(lines), encoding="utf-8")
+
+
+# -- steps -----------------------------------------------------------------------------------------
+
+
+def _walk(session: Session, distance_m: float, stature_m: float | None, yes: bool) -> None:
+    from relpos.calibration import steps
+    from relpos.protocol import messages as wire
+
+    if stature_m is not None:
+        leg_mm = round(1000.0 * steps.leg_length_m(stature_m))
+        session.demand(wire.CommandCode.SET_LEG_LENGTH_MM, leg_mm)
+        typer.echo(f"leg length: {leg_mm / 1000:.3f} m")
+    gain = session.setting(wire.CommandCode.SET_STEP_GAIN_PERMILLE)
+    before = _motion(session)
+    output.remark(
+        f"node {session.node}: walk {distance_m:g} m straight at your usual pace, "
+        f"then stand for {STOOD_S:g} seconds"
+    )
+    newest = before
+    stepped_s = time.monotonic()
+    until_s = stepped_s + WALK_WITHIN_S
+    while time.monotonic() < until_s:
+        session.listen()
+        totals = _motion(session)
+        if totals["steps"] != newest["steps"]:
+            stepped_s = time.monotonic()
+        newest = totals
+        walked = (newest["steps"] - before["steps"]) % 65536
+        if walked >= steps.LEAST_STEPS and time.monotonic() - stepped_s > STOOD_S:
+            break
+    walked = (newest["steps"] - before["steps"]) % 65536
+    fit = steps.fit_walk(gain, walked, newest["path_m"] - before["path_m"], distance_m)
+    typer.echo(
+        f"{fit.steps} steps: the node said {fit.measured_m:.2f} m, it was {fit.true_m:g} m "
+        f"({100 * (fit.scale - 1):+.1f} %)"
+    )
+    believed = fit.gain_permille / fit.gain_before_permille - 1.0
+    typer.echo(
+        f"step gain {fit.gain_before_permille / 1000:.3f} -> {fit.gain_permille / 1000:.3f} "
+        f"({100 * believed:+.1f} %: one walk is believed as far as people differ)"
+    )
+    if not _confirmed(yes):
+        raise DataError(f"node {session.node} keeps its step gain")
+    session.set_step_gain(fit.gain_permille)
+    typer.echo(f"node {session.node} has stored it")
+
+
+def _motion(session: Session) -> dict[str, Any]:
+    """The node's newest running totals, waiting for the first."""
+    until_s = time.monotonic() + HEARD_WITHIN_S
+    while (totals := session.totals()) is None:
+        if time.monotonic() > until_s:
+            raise DeviceError(f"node {session.node} reports no motion")
+        session.listen()
+    return dict(totals)

@@ -1,0 +1,206 @@
+"""``relpos node list`` and ``relpos node monitor``: what the nodes tell of themselves."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from relpos.cli import output
+from relpos.errors import DeviceError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from relpos.nodes.view import TeamView
+
+PLAIN_TABLE_EVERY_S = 5.0
+REFRESH_S = 0.5
+HEALTH = "health"
+_COLOURS = {"green": "green", "yellow": "yellow", "red": "bold red"}
+
+Port = Annotated[str, typer.Argument(metavar="PORT", help="The coordinator's port.")]
+
+
+def list_nodes(
+    port: Port,
+    seconds: Annotated[
+        float, typer.Option(min=1.0, help="How long to listen; a status comes every ten seconds.")
+    ] = 12.0,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
+) -> None:
+    """List the nodes that are heard: id, firmware, uptime, last restart, supply, link, boots."""
+    from rich.console import Console
+
+    with output.working(f"listening for {seconds:g} s"):
+        now_s, view = deque(_watch(port, seconds), maxlen=1)[0]
+    rows = view.rows(now_s)
+    if json:
+        output.print_json({"port": port, "listened_s": seconds, "nodes": rows})
+        return
+    if not rows:
+        raise DeviceError(
+            f"{port}: no node is heard: are they switched on, and is this the coordinator's port?"
+        )
+    Console(width=None if sys.stdout.isatty() else 120).print(_list_table(rows))
+
+
+def monitor(
+    port: Port,
+    seconds: Annotated[
+        float | None, typer.Option(min=1.0, help="End after so long. (default: Ctrl-C ends)")
+    ] = None,
+) -> None:
+    """Watch the nodes: a live table with everyone's health.
+
+    Green: all well. Yellow: works with less than it should have. Red: silent, or of no use. The
+    last column says why; docs/nodes.md has the limits.
+    """
+    from rich.console import Console
+    from rich.live import Live
+
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    if not console.is_terminal:
+        _print_now_and_then(console, port, seconds)
+        return
+    with Live(_monitor_table([]), console=console, auto_refresh=False) as live:
+        shown_s = 0.0
+        try:
+            for now_s, view in _watch(port, seconds):
+                if time.monotonic() - shown_s > REFRESH_S:
+                    shown_s = time.monotonic()
+                    live.update(_monitor_table(view.rows(now_s)), refresh=True)
+        except KeyboardInterrupt:
+            return
+
+
+def _print_now_and_then(console: Any, port: str, seconds: float | None) -> None:
+    said_s = time.monotonic()
+    rows: list[Mapping[str, Any]] = []
+    try:
+        for now_s, view in _watch(port, seconds):
+            rows = view.rows(now_s)
+            if time.monotonic() - said_s >= PLAIN_TABLE_EVERY_S:
+                said_s = time.monotonic()
+                console.print(_monitor_table(rows))
+    except KeyboardInterrupt:
+        return
+    console.print(_monitor_table(rows))
+
+
+def _watch(port: str, seconds: float | None) -> Iterator[tuple[float, TeamView]]:
+    """The team as it is seen, with the present time on the view's clock; until the time is over."""
+    from relpos.link.live import Link, observe, open_port
+    from relpos.nodes.view import TeamView
+
+    link = Link()
+    view = TeamView()
+    told = 0
+    started_s = time.monotonic()
+    with closing(open_port(port)) as device:
+        for batch in observe(device, link):
+            elapsed_s = time.monotonic() - started_s
+            now_s = elapsed_s if link.virtual_s is None else link.virtual_s
+            view.update(now_s, link.decoder, batch)
+            while told < len(link.decoder.remarks):
+                output.remark(link.decoder.remarks[told])
+                told += 1
+            yield now_s, view
+            if seconds is not None and elapsed_s > seconds:
+                return
+
+
+def _list_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    from rich.table import Table
+
+    table = Table()
+    for column in (
+        "node",
+        "firmware",
+        "up",
+        "started by",
+        "boots",
+        "supply",
+        "RSSI",
+        "lost",
+        HEALTH,
+    ):
+        table.add_column(column, justify="left" if column in (HEALTH, "started by") else "right")
+    for row in rows:
+        table.add_row(
+            str(row["node"]),
+            _text(row["firmware"]),
+            _duration(row["uptime_s"]),
+            _text(row["reset_cause"]).replace("_", " "),
+            str(row["boots"]),
+            _volts(row["battery_v"]),
+            _dbm(row["rssi_dbm"]),
+            _percent(row["loss"]),
+            _coloured(row),
+        )
+    return table
+
+
+def _monitor_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    from rich.table import Table
+
+    table = Table(title=None if rows else "no node is heard yet")
+    columns = ("node", "supply", "RSSI", "lost", "seen", "frames", "ranging", "neighbours", HEALTH)
+    for column in columns:
+        table.add_column(column, justify="left" if column == HEALTH else "right")
+    for row in rows:
+        ranging = _percent(row["ranging"])
+        if row["exchanges"]:
+            ranging += f" of {row['exchanges']}"
+        neighbours = _text(row["neighbours"], 0)
+        if row["team"]:
+            neighbours += f" of {row['team'] - 1:.0f}"
+        table.add_row(
+            str(row["node"]),
+            _volts(row["battery_v"]),
+            _dbm(row["rssi_dbm"]),
+            _percent(row["loss"]),
+            f"{row['seen_s']:.1f} s",
+            str(row["received"]),
+            ranging,
+            neighbours,
+            _coloured(row),
+        )
+    return table
+
+
+def _coloured(row: Mapping[str, Any]) -> str:
+    words = row["health"]
+    if row["reasons"]:
+        words += ": " + ", ".join(row["reasons"])
+    return f"[{_COLOURS[row['health']]}]{words}[/]"
+
+
+def _text(value: Any, digits: int | None = None) -> str:
+    if value is None:
+        return "-"
+    return str(value) if digits is None else f"{value:.{digits}f}"
+
+
+def _duration(seconds: float | None) -> str:
+    if seconds is None:
+        return "-"
+    hours, minutes = divmod(int(seconds) // 60, 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {int(seconds) % 60:02d} s"
+
+
+def _volts(value: float | None) -> str:
+    return f"{value:.2f} V" if value else "-"
+
+
+def _dbm(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f} dBm"
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.0f} %"

@@ -1,0 +1,119 @@
+"""Is a node well? One rule in three colours, from what it and its link have told.
+
+Red: what it tells cannot be used, or it is about to fall silent. Yellow: it works, with less than
+it should have. Green: everything else. The limits stand below, each with its reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+
+SILENT_S = 5.0
+"""A node reports its motion every second; five in a row are lost once in 10^8 at 2 % loss."""
+LOSS_YELLOW = 0.10
+"""The totals make up for lost motion, the ranges' evidence is gone: five times the usual 2 %."""
+LOSS_RED = 0.50
+RANGING_YELLOW = 0.50
+"""Behind walls and bodies a third of the exchanges fails; half of them is a wrong place or tag."""
+LEAST_EXCHANGES = 10
+BATTERY_YELLOW_V = 4.5
+"""Under what the Uno's 3.3 V regulator and the boards on it are sure to work from (5 V - 10 %). The
+AVR's reference is 1.0 to 1.2 V, so a single board may tell 9 % too little or too much."""
+BATTERY_RED_V = 4.2
+"""At 16 MHz an ATmega328P is specified down to 3.78 V; a transmission pulls a weak cell further."""
+RSSI_YELLOW_DBM = -86
+"""An XBee Series 1 hears down to -92 dBm (data sheet, from memory: check); a body that turns takes
+more than the 6 dB that are left."""
+FRESH_START_S = 60.0
+"""How long an unwanted restart is worth telling."""
+LEAST_STACK_BYTES = 48
+"""An interrupt with its registers takes 40."""
+
+
+class Health(IntEnum):
+    """The colour; a higher number is worse."""
+
+    GREEN = 0
+    YELLOW = 1
+    RED = 2
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What is known of one node; None where it has not told, or it cannot be known yet.
+
+    ``status`` is whether it has told any of it at all. ``loss`` and ``ranging`` are shares over the last half minute, ``exchanges`` the number that the
+    latter is of. ``missed_ticks`` and ``refused_frames`` count within that time.
+    """
+
+    silent_s: float
+    status: bool = True
+    loss: float | None = None
+    rssi_dbm: float | None = None
+    battery_v: float | None = None
+    ranging: float | None = None
+    exchanges: int = 0
+    neighbours: int | None = None
+    team: int | None = None
+    imu: bool | None = None
+    magnetometer: bool | None = None
+    pozyx: bool | None = None
+    pressure: bool | None = None
+    beacon: bool | None = None
+    uptime_s: float | None = None
+    unwanted_start: str | None = None
+    missed_ticks: int = 0
+    refused_frames: int = 0
+    free_stack_bytes: int | None = None
+
+
+def assess(figures: Figures) -> tuple[Health, list[str]]:
+    """Colour and its reasons, the worst first; a green node has none."""
+    reasons = sorted(_reasons(figures), key=lambda reason: -reason[0])
+    worst = max((colour for colour, _ in reasons), default=Health.GREEN)
+    return worst, [words for _, words in reasons]
+
+
+def _reasons(f: Figures) -> Iterator[tuple[Health, str]]:
+    red, yellow = Health.RED, Health.YELLOW
+    if f.silent_s > SILENT_S:
+        yield red, f"silent for {f.silent_s:.0f} s"
+    elif not f.status:
+        yield yellow, "no status heard yet"
+    if f.imu is False:
+        yield red, "inertial sensor missing"
+    if f.loss is not None and f.loss > LOSS_YELLOW:
+        yield (red if f.loss > LOSS_RED else yellow), f"{100 * f.loss:.0f} % of its frames lost"
+    # 0: this board does not measure it.
+    if f.battery_v and f.battery_v < BATTERY_YELLOW_V:
+        yield (red if f.battery_v < BATTERY_RED_V else yellow), f"supply {f.battery_v:.2f} V"
+    if f.unwanted_start is not None and (f.uptime_s or 0.0) < FRESH_START_S:
+        yield yellow, f"restarted ({f.unwanted_start})"
+    for there, what in (
+        (f.magnetometer, "magnetometer"),
+        (f.pozyx, "Pozyx"),
+        (f.pressure, "pressure sensor"),
+    ):
+        if there is False:
+            yield yellow, f"{what} missing"
+    if f.beacon is False:
+        yield yellow, "hears no beacon"
+    if (
+        f.ranging is not None
+        and f.exchanges >= LEAST_EXCHANGES
+        and f.ranging < RANGING_YELLOW
+        and f.pozyx is not False
+    ):
+        yield yellow, f"{100 * f.ranging:.0f} % of its rangings succeed"
+    if f.neighbours == 0 and (f.team or 0) > 1:
+        yield yellow, "ranges nobody"
+    if f.rssi_dbm is not None and f.rssi_dbm < RSSI_YELLOW_DBM:
+        yield yellow, f"weak radio ({f.rssi_dbm:.0f} dBm)"
+    if f.missed_ticks > 0:
+        yield yellow, f"{f.missed_ticks} ticks missed"
+    if f.refused_frames > 0:
+        yield yellow, f"{f.refused_frames} forged or repeated frames refused"
+    if f.free_stack_bytes is not None and f.free_stack_bytes < LEAST_STACK_BYTES:
+        yield yellow, f"{f.free_stack_bytes} bytes of stack left"

@@ -1,0 +1,201 @@
+"""A team watched: what each node and its link have told, newest and over the last half minute."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from relpos.link.decoder import Decoder
+from relpos.measurements import Observation, Status
+from relpos.nodes.health import Figures, Health, assess
+from relpos.protocol import messages as wire
+
+WINDOW_S = 30.0
+"""Three status reports at their usual period."""
+UNWANTED = {wire.ResetCause.BROWN_OUT: "brown-out", wire.ResetCause.WATCHDOG: "watchdog"}
+_FLAGS = {
+    "imu": "IMU_OK",
+    "magnetometer": "MAGNETOMETER_OK",
+    "pozyx": "POZYX_OK",
+    "pressure": "PRESSURE_OK",
+    "beacon": "BEACON_HEARD",
+}
+
+
+class Counter:
+    """A count that wraps at 16 bits and begins anew with a boot: its growth within the window."""
+
+    def __init__(self, modulus: int = 65536) -> None:
+        self._modulus = modulus
+        self._newest: tuple[int, int] | None = None
+        self._growth: deque[tuple[float, int]] = deque()
+
+    def update(self, time_s: float, boot: int, value: int) -> None:
+        """The count was ``value`` at ``time_s`` in that boot."""
+        if self._newest is not None and self._newest[0] == boot:
+            grown = (value - self._newest[1]) % self._modulus
+        else:
+            # Before its first report nothing is known of a node that runs already; a new boot's
+            # count began at zero.
+            grown = 0 if self._newest is None else value
+        self._newest = (boot, value)
+        self._growth.append((time_s, grown))
+
+    def within(self, now_s: float) -> int:
+        """Growth within the window that ends at ``now_s``."""
+        while self._growth and self._growth[0][0] < now_s - WINDOW_S:
+            self._growth.popleft()
+        return sum(grown for _, grown in self._growth)
+
+
+@dataclass
+class NodeView:
+    """One node as watched."""
+
+    node: int
+    boot: int = 0
+    heard_s: float = 0.0
+    boots_seen: int = 1
+    received: int = 0
+    lost: int = 0
+    rssi_dbm: float | None = None
+    status: dict[str, float] = field(default_factory=dict)
+    _frames: deque[tuple[float, int, int]] = field(default_factory=deque)
+    _counters: dict[str, Counter] = field(default_factory=dict)
+
+    def counted(self, name: str, now_s: float) -> int:
+        """Growth of one of the status's counts within the window."""
+        counter = self._counters.get(name)
+        return 0 if counter is None else counter.within(now_s)
+
+    def firmware(self) -> str | None:
+        """Version of the firmware; None before the first status."""
+        parts = [self.status.get(f"firmware_{part}") for part in ("major", "minor", "patch")]
+        return ".".join(f"{p:.0f}" for p in parts if p is not None) if None not in parts else None
+
+    def reset_cause(self) -> str | None:
+        """Why it started; None before the first status."""
+        cause = self.status.get("reset_cause")
+        return None if cause is None else wire.ResetCause(int(cause)).name.lower()
+
+    def loss(self, now_s: float) -> float | None:
+        """Share of its frames that were lost within the window; None where there were none."""
+        frames = self._frames
+        while len(frames) > 1 and frames[1][0] < now_s - WINDOW_S:
+            frames.popleft()
+        if not frames:
+            return None
+        received, lost = self.received - frames[0][1], self.lost - frames[0][2]
+        return max(lost, 0) / (received + lost) if received + lost > 0 else None
+
+    def ranging(self, now_s: float) -> tuple[float | None, int]:
+        """Share of the ranging exchanges within the window that succeeded, and their number."""
+        good = self.counted("ranging_successes", now_s)
+        tried = good + self.counted("ranging_failures", now_s)
+        return (good / tried if tried else None), tried
+
+    def flag(self, name: str) -> bool | None:
+        """One of the status's health flags; None where the node has not told."""
+        value = self.status.get("health")
+        flags = getattr(wire, "HealthFlag", None)
+        if value is None or flags is None:
+            return None
+        return bool(int(value) & int(flags[name]))
+
+    def figures(self, now_s: float) -> Figures:
+        """What :func:`relpos.nodes.health.assess` judges by."""
+        status = self.status
+        share, tried = self.ranging(now_s)
+        cause = status.get("reset_cause")
+
+        def whole(name: str) -> int | None:
+            return int(status[name]) if name in status else None
+
+        return Figures(
+            silent_s=now_s - self.heard_s,
+            status=bool(status),
+            loss=self.loss(now_s),
+            rssi_dbm=self.rssi_dbm,
+            battery_v=status.get("battery_v"),
+            ranging=share,
+            exchanges=tried,
+            neighbours=whole("neighbours"),
+            team=whole("team"),
+            uptime_s=status.get("uptime_s"),
+            unwanted_start=None if cause is None else UNWANTED.get(wire.ResetCause(int(cause))),
+            missed_ticks=self.counted("missed_ticks", now_s),
+            refused_frames=self.counted("refused_frames", now_s),
+            free_stack_bytes=whole("free_stack_bytes"),
+            **{name: self.flag(flag) for name, flag in _FLAGS.items()},
+        )
+
+    def health(self, now_s: float) -> tuple[Health, list[str]]:
+        """Its colour and why."""
+        return assess(self.figures(now_s))
+
+
+class TeamView:
+    """All nodes that are heard; feed it what the link yields."""
+
+    _COUNTS = ("ranging_successes", "ranging_failures", "missed_ticks", "refused_frames")
+
+    def __init__(self) -> None:
+        self.nodes: dict[int, NodeView] = {}
+
+    def update(self, now_s: float, decoder: Decoder, observations: Iterable[Observation]) -> None:
+        """Take in what has just arrived, at ``now_s`` on the clock of the views."""
+        for node, track in decoder.nodes.items():
+            view = self.nodes.get(node)
+            if view is None:
+                view = self.nodes[node] = NodeView(node, track.boot, now_s)
+            if track.boot != view.boot:
+                view.boot = track.boot
+                view.boots_seen += 1
+            received = track.counts["received"]
+            if received != view.received:
+                view.received = received
+                view.lost = track.counts["lost"]
+                view.heard_s = now_s
+                view._frames.append((now_s, received, view.lost))
+            view.rssi_dbm = None if track.rssi_dbm is None else float(track.rssi_dbm)
+        for observation in observations:
+            if isinstance(observation, Status) and not observation.name.startswith("link_"):
+                self._status(now_s, observation)
+
+    def _status(self, now_s: float, status: Status) -> None:
+        view = self.nodes[status.node]
+        view.status[status.name] = status.value
+        if status.name in self._COUNTS:
+            counter = view._counters.setdefault(status.name, Counter())
+            counter.update(now_s, view.boot, int(status.value))
+
+    def rows(self, now_s: float) -> list[Mapping[str, object]]:
+        """One row a node, by id: plain values for tables and JSON."""
+        rows: list[Mapping[str, object]] = []
+        for node in sorted(self.nodes):
+            view = self.nodes[node]
+            health, reasons = view.health(now_s)
+            share, tried = view.ranging(now_s)
+            rows.append(
+                {
+                    "node": node,
+                    "health": health.name.lower(),
+                    "reasons": reasons,
+                    "firmware": view.firmware(),
+                    "uptime_s": view.status.get("uptime_s"),
+                    "reset_cause": view.reset_cause(),
+                    "boots": view.boot,
+                    "battery_v": view.status.get("battery_v"),
+                    "rssi_dbm": view.rssi_dbm,
+                    "loss": view.loss(now_s),
+                    "received": view.received,
+                    "lost": view.lost,
+                    "seen_s": round(now_s - view.heard_s, 3),
+                    "ranging": share,
+                    "exchanges": tried,
+                    "neighbours": view.status.get("neighbours"),
+                    "team": view.status.get("team"),
+                }
+            )
+        return rows

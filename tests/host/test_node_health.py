@@ -1,0 +1,137 @@
+"""The rule by which a node's health is told, and the figures that it judges by."""
+
+import pytest
+
+from relpos.link.live import Link
+from relpos.measurements import Status
+from relpos.nodes.health import Figures, Health, assess
+from relpos.nodes.view import Counter, TeamView
+from relpos.protocol import messages as wire
+
+WELL = Figures(
+    silent_s=0.8,
+    loss=0.02,
+    rssi_dbm=-70.0,
+    battery_v=5.02,
+    ranging=0.7,
+    exchanges=60,
+    neighbours=5,
+    team=6,
+    imu=True,
+    magnetometer=True,
+    pozyx=True,
+    pressure=True,
+    beacon=True,
+    uptime_s=1000.0,
+    free_stack_bytes=300,
+)
+
+
+def but(**changes):
+    return Figures(**(vars_of(WELL) | changes))
+
+
+def vars_of(figures):
+    return {name: getattr(figures, name) for name in figures.__dataclass_fields__}
+
+
+def test_a_node_with_everything_is_green_and_says_nothing():
+    assert assess(WELL) == (Health.GREEN, [])
+
+
+@pytest.mark.parametrize(
+    ("changes", "health", "words"),
+    [
+        ({"silent_s": 5.1}, Health.RED, "silent for 5 s"),
+        ({"imu": False}, Health.RED, "inertial sensor"),
+        ({"loss": 0.6}, Health.RED, "60 % of its frames"),
+        ({"loss": 0.11}, Health.YELLOW, "11 % of its frames"),
+        ({"battery_v": 4.1}, Health.RED, "4.10 V"),
+        ({"battery_v": 4.4}, Health.YELLOW, "4.40 V"),
+        ({"magnetometer": False}, Health.YELLOW, "magnetometer missing"),
+        ({"pozyx": False}, Health.YELLOW, "Pozyx missing"),
+        ({"pressure": False}, Health.YELLOW, "pressure"),
+        ({"beacon": False}, Health.YELLOW, "beacon"),
+        ({"ranging": 0.4}, Health.YELLOW, "40 % of its rangings"),
+        ({"neighbours": 0}, Health.YELLOW, "ranges nobody"),
+        ({"rssi_dbm": -89.0}, Health.YELLOW, "-89 dBm"),
+        ({"unwanted_start": "watchdog", "uptime_s": 12.0}, Health.YELLOW, "watchdog"),
+        ({"missed_ticks": 3}, Health.YELLOW, "3 ticks"),
+        ({"refused_frames": 2}, Health.YELLOW, "2 forged"),
+        ({"free_stack_bytes": 40}, Health.YELLOW, "40 bytes of stack"),
+        ({"status": False}, Health.YELLOW, "no status"),
+    ],
+)
+def test_each_trouble_has_its_colour_and_its_words(changes, health, words):
+    colour, reasons = assess(but(**changes))
+    assert colour is health
+    assert len(reasons) == 1
+    assert words in reasons[0]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"battery_v": 0.0},  # this board does not measure it
+        {"ranging": 0.0, "exchanges": 9},  # too few to say
+        {"unwanted_start": "watchdog", "uptime_s": 90.0},  # long ago
+        {"neighbours": 0, "team": 1},  # alone
+        {"ranging": None, "neighbours": None, "beacon": None, "imu": None},  # not told
+    ],
+)
+def test_what_is_no_trouble_stays_green(changes):
+    assert assess(but(**changes))[0] is Health.GREEN
+
+
+def test_the_worst_comes_first():
+    colour, reasons = assess(but(silent_s=9.0, pozyx=False))
+    assert colour is Health.RED
+    assert reasons[0].startswith("silent")
+    assert len(reasons) == 2
+
+
+def test_counts_wrap_begin_anew_with_a_boot_and_leave_the_window():
+    counter = Counter()
+    counter.update(0.0, 3, 65530)  # what was before the watch began is not counted
+    counter.update(10.0, 3, 4)
+    assert counter.within(10.0) == 10
+    counter.update(20.0, 4, 7)  # another boot: all seven are new
+    assert counter.within(20.0) == 17
+    assert counter.within(45.0) == 7
+
+
+def test_a_view_tells_loss_silence_and_ranging_of_the_last_half_minute():
+    link, view = Link(), TeamView()
+
+    def hear(time_s, received, lost, successes, failures):
+        track = link.decoder.nodes.setdefault(5, _track())
+        track.counts.update({"received": received, "lost": lost})
+        track.rssi_dbm = -71
+        told = {"ranging_successes": successes, "ranging_failures": failures, "battery_v": 4.9}
+        view.update(
+            time_s,
+            link.decoder,
+            [Status(time_s, 5, name, float(value)) for name, value in told.items()],
+        )
+
+    hear(0.0, 1, 0, 100, 100)
+    hear(10.0, 9, 1, 109, 101)
+    row = view.rows(12.0)[0]
+    assert row["loss"] == pytest.approx(0.1)
+    assert row["seen_s"] == 2.0
+    assert (row["ranging"], row["exchanges"]) == (0.9, 10)
+    assert row["rssi_dbm"] == -71
+    assert row["health"] == "green"
+    assert view.rows(60.0)[0]["health"] == "red"
+
+
+def _track():
+    from relpos.link.decoder import NodeTrack
+
+    return NodeTrack(boot=1)
+
+
+def test_the_unwanted_starts_are_those_of_the_wire():
+    from relpos.nodes.view import UNWANTED
+
+    assert set(UNWANTED) == {wire.ResetCause.BROWN_OUT, wire.ResetCause.WATCHDOG}

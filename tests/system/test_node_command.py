@@ -1,0 +1,131 @@
+"""`relpos node` from outside, through a port behind which an emulated team is."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+
+import pytest
+
+from relpos.emulator.avr.library import missing_parts
+
+RELPOS = [sys.executable, "-m", "relpos.cli.main"]
+
+
+@contextmanager
+def emulated(nodes, board="native", speed=4, seed=3):
+    """Path of the pseudo-terminal behind which the team is."""
+    command = [*RELPOS, "emulate", "--nodes", nodes, "--scenario", "straight", "--board", board]
+    command += ["--speed", speed, "--seconds", 1500, "--seed", seed]
+    emulator = subprocess.Popen(
+        [*map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    try:
+        yield re.search(r"/dev/\S+", emulator.stdout.readline())[0]
+    finally:
+        emulator.send_signal(signal.SIGTERM)
+        emulator.wait(30)
+
+
+@pytest.fixture(scope="module")
+def port():
+    with emulated(3) as path:
+        yield path
+
+
+def node(*arguments):
+    return subprocess.run(
+        [*RELPOS, "node", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=90,
+        stdin=subprocess.DEVNULL,
+        check=False,
+    )
+
+
+def test_list_tells_of_every_node(port):
+    done = node("list", port, "--seconds", 5, "--json")
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(done.stdout)["nodes"]
+    assert [row["node"] for row in rows] == [1, 2, 3]
+    for row in rows:
+        assert re.fullmatch(r"\d+\.\d+\.\d+", row["firmware"])
+        assert row["battery_v"] == pytest.approx(5.0, abs=0.03)
+        assert row["uptime_s"] >= 0
+        assert -100 < row["rssi_dbm"] < -20
+    table = node("list", port, "--seconds", 4).stdout
+    assert "firmware" in table
+    assert "power on" in table
+
+
+def test_monitor_prints_plain_tables_where_there_is_no_terminal(port):
+    done = node("monitor", port, "--seconds", 6)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("neighbours") == 2  # one after five seconds, one at the end
+    assert "\x1b" not in done.stdout
+    assert re.search(r"5\.0\d V", done.stdout)
+
+
+def test_settings_are_shown_before_and_after_and_survive_a_restart(port):
+    done = node("set", port, "--node", 2, "stature", 1.9, "led", "off", "ranging-period=4")
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"led\W+health\W+off", done.stdout)
+    assert re.search(r"ranging-period\W+2 s\W+4 s", done.stdout)
+    rebooted = node("reboot", port, "--node", 2)
+    assert rebooted.returncode == 0, rebooted.stderr
+    assert "has restarted" in rebooted.stdout
+    shown = node("set", port, "--node", 2).stdout
+    assert re.search(r"leg-length\W+1\.007 m", shown)
+    assert re.search(r"led\W+off", shown)
+    assert re.search(r"ranging-period\W+4 s", shown)
+    assert "stature" not in shown
+
+
+@pytest.mark.skipif(missing_parts() is not None, reason=str(missing_parts()))
+def test_the_uno_keeps_its_settings_over_a_restart():
+    with emulated(1, board="uno", speed=2) as path:
+        assert node("set", path, "led", "on", "step-gain", "2.2").returncode == 0
+        rebooted = node("reboot", path)
+        assert rebooted.returncode == 0, rebooted.stderr
+        shown = node("set", path).stdout
+    assert re.search(r"led\W+on", shown)
+    assert re.search(r"step-gain\W+2\.2", shown)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("list", "/dev/nowhere"),
+        ("monitor", "/dev/nowhere"),
+        ("set", "/dev/nowhere", "led", "on"),
+        ("reboot", "/dev/nowhere"),
+    ],
+)
+def test_a_port_that_is_none_is_told_in_one_line(arguments):
+    done = node(*arguments)
+    assert done.returncode == 1
+    assert "cannot open" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_several_nodes_want_a_choice(port):
+    done = node("reboot", port)
+    assert done.returncode == 1
+    assert "Heard: 1, 2, 3" in done.stderr
+
+
+def test_a_value_that_will_not_do_is_wrong_usage(port):
+    done = node("set", port, "--node", 2, "led", "blue")
+    assert done.returncode == 2
+    assert "off, on, health" in done.stderr
+
+
+def test_calibrate_shows_its_forms():
+    help_text = node("calibrate", "--help").stdout
+    for command in ("sensors", "walk"):
+        assert command in help_text
+    assert "--distance" in node("calibrate", "walk", "--help").stdout
+    assert "--magnetometer" in node("calibrate", "/dev/x", "--help").stdout
