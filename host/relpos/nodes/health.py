@@ -44,8 +44,9 @@ class Health(IntEnum):
 class Figures:
     """What is known of one node; None where it has not told, or it cannot be known yet.
 
-    ``status`` is whether it has told any of it at all. ``loss`` and ``ranging`` are shares over the last half minute, ``exchanges`` the number that the
-    latter is of. ``missed_ticks`` and ``refused_frames`` count within that time.
+    ``status`` is whether it has told any at all. ``loss`` and ``ranging`` are shares over the last
+    half minute, ``exchanges`` the number that the latter is of. ``missed_ticks`` and
+    ``refused_frames`` count within that time.
     """
 
     silent_s: float
