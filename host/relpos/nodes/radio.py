@@ -1,0 +1,280 @@
+"""An XBee module on a USB adapter: what it has to be set to, and setting it.
+
+802.15.4 firmware (Series 1, S2C or XBee 3 with 802.15.4). A module from the shelf is transparent at
+9600 baud and is set in command mode ("+++"); one that has been set up before speaks API frames.
+Meaning of the parameters: Digi's 802.15.4 manual, from memory: check.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import serial
+
+from relpos.errors import DeviceError
+from relpos.link import xbee
+from relpos.link.live import BAUD
+
+FACTORY_BAUD = 9600
+BAUD_CODES = {1200: 0, 2400: 1, 4800: 2, 9600: 3, 19200: 4, 38400: 5, 57600: 6, 115200: 7}
+DEFAULT_PAN = 0x3332
+DEFAULT_CHANNEL = 0x0C
+CHANNELS = range(0x0B, 0x1B)
+GUARD_S = 1.1
+"""Silence before and after "+++": GT is one second from the shelf."""
+ANSWER_S = 0.5
+"""A module answers within some 10 ms; writing its memory takes longer."""
+WRITE_S = 2.0
+_STATUS = {1: "error", 2: "unknown command", 3: "bad value"}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One AT parameter and the value it has to have."""
+
+    command: str
+    value: int
+    meaning: str
+
+    def line(self) -> str:
+        """As it is typed in command mode."""
+        return f"AT{self.command}{self.value:X}"
+
+
+def parameters(
+    address: int, pan: int = DEFAULT_PAN, channel: int = DEFAULT_CHANNEL
+) -> list[Parameter]:
+    """Everything a module is set to; ``address`` is the node's id, 0 for the coordinator.
+
+    ``AP`` and ``BD`` come last: they change how one speaks with the module.
+    """
+    whose = "the coordinator" if address == 0 else f"node {address}"
+    return [
+        Parameter("CH", channel, f"channel {channel}, the same for all"),
+        Parameter("ID", pan, "network, the same for all"),
+        Parameter("MY", address, f"16-bit address: {whose}"),
+        Parameter("DH", 0, "destination, high: 16-bit addresses"),
+        Parameter("DL", 0, "destination, low: the coordinator"),
+        Parameter("MM", 0, "MAC mode: acknowledged, repetitions dropped by the receiver"),
+        Parameter("RR", 0, "no retries besides the MAC's three: the next total makes up for it"),
+        Parameter("RN", 3, "random delay before the first attempt: nodes do not collide in step"),
+        Parameter("PL", 4, "full power"),
+        Parameter("CE", 0, "no coordinator in the MAC's sense"),
+        Parameter("A1", 0, "no association"),
+        Parameter("SM", 0, "no sleep"),
+        Parameter("EE", 0, "no encryption: frames carry their own tag"),
+        Parameter("AP", 2, "API frames with escapes"),
+        Parameter("BD", BAUD_CODES[BAUD], f"{BAUD} baud"),
+    ]
+
+
+def command_lines(wanted: Sequence[Parameter]) -> list[tuple[str, str]]:
+    """(line, what it does) for X-CTU's console or any terminal."""
+    return [
+        ("+++", "no Enter, a second of silence before and after; the module says OK"),
+        *((parameter.line(), parameter.meaning) for parameter in wanted),
+        ("ATWR", "keep it all"),
+        ("ATCN", "leave command mode: from here on API frames at the new speed"),
+    ]
+
+
+class Access(Protocol):
+    """A module that answers."""
+
+    device: serial.Serial
+
+    def get(self, command: str) -> int:
+        """A parameter's value. DeviceError where the module does not know it or is silent."""
+
+    def set(self, command: str, value: int) -> None:
+        """Set it. DeviceError where the module refuses or is silent."""
+
+    def keep(self) -> None:
+        """Write everything into the module's memory and let it take effect."""
+
+
+class CommandMode:
+    """Text commands after "+++"."""
+
+    def __init__(self, device: serial.Serial) -> None:
+        self.device = device
+
+    def enter(self) -> bool:
+        """Whether the module answers "+++"."""
+        time.sleep(GUARD_S)
+        self.device.reset_input_buffer()
+        self.device.write(b"+++")
+        return self._answer(GUARD_S + ANSWER_S) == "OK"
+
+    def get(self, command: str) -> int:
+        """See Access."""
+        answer = self._ask(f"AT{command}")
+        try:
+            return int(answer, 16)
+        except ValueError:
+            raise DeviceError(_refused(command, None, answer)) from None
+
+    def set(self, command: str, value: int) -> None:
+        """See Access."""
+        answer = self._ask(f"AT{command}{value:X}")
+        if answer != "OK":
+            raise DeviceError(_refused(command, value, answer))
+
+    def keep(self) -> None:
+        """See Access."""
+        for command in ("ATWR", "ATCN"):
+            if self._ask(command, WRITE_S) != "OK":
+                raise DeviceError(f"the XBee module does not confirm {command}")
+
+    def _ask(self, line: str, wait_s: float = ANSWER_S) -> str:
+        self.device.reset_input_buffer()
+        self.device.write(line.encode() + b"\r")
+        return self._answer(wait_s)
+
+    def _answer(self, wait_s: float) -> str:
+        until_s = time.monotonic() + wait_s
+        answer = bytearray()
+        while time.monotonic() < until_s and not answer.endswith(b"\r"):
+            answer += self.device.read(1)
+        return answer.decode("ascii", errors="replace").strip()
+
+
+class ApiMode:
+    """AT commands in API frames; takes effect at once."""
+
+    def __init__(self, device: serial.Serial, *, escaped: bool = True) -> None:
+        self.device = device
+        self.escaped = escaped
+        self._frame_id = 0
+
+    def answers(self) -> bool:
+        """Whether there is a module that speaks so; learns whether it escapes."""
+        try:
+            # Neither the question (as frame 1) nor the answer holds a byte that would be escaped.
+            self._frame_id = 0
+            self.escaped = self.get("AP") == 2
+        except DeviceError:
+            return False
+        return True
+
+    def get(self, command: str) -> int:
+        """See Access."""
+        return int.from_bytes(self._ask(command, b"").value, "big")
+
+    def set(self, command: str, value: int) -> None:
+        """See Access."""
+        width = max((value.bit_length() + 7) // 8, 1)
+        self._ask(command, value.to_bytes(width, "big"), value)
+
+    def keep(self) -> None:
+        """See Access."""
+        self._ask("WR", b"", wait_s=WRITE_S)
+
+    def _ask(
+        self, command: str, value: bytes, shown: int | None = None, wait_s: float = ANSWER_S
+    ) -> xbee.AtResponse:
+        self._frame_id = self._frame_id % 255 + 1
+        request = xbee.AtCommand(self._frame_id, command.encode(), value)
+        # A module in use also delivers what it hears: only the answer to this frame counts.
+        parser = xbee.Parser(escaped=self.escaped)
+        self.device.reset_input_buffer()
+        self.device.write(xbee.encode(request, escaped=self.escaped))
+        until_s = time.monotonic() + wait_s
+        while time.monotonic() < until_s:
+            for frame in parser.feed(self.device.read(max(1, self.device.in_waiting))):
+                if isinstance(frame, xbee.AtResponse) and frame.frame_id == self._frame_id:
+                    if frame.status != 0:
+                        raise DeviceError(
+                            _refused(command, shown, _STATUS.get(frame.status, "refused"))
+                        )
+                    return frame
+        raise DeviceError(_refused(command, shown, ""))
+
+
+def _refused(command: str, value: int | None, answer: str) -> str:
+    what = f"AT{command}" + ("" if value is None else f"{value:X}")
+    if not answer:
+        return f"the XBee module does not answer {what}"
+    return f"the XBee module refuses {what} ({answer.lower()}): does it have 802.15.4 firmware?"
+
+
+def find_module(open_at: Callable[[int], serial.Serial]) -> Access:
+    """The module behind ``open_at(baud)``, however it is set. DeviceError where none answers.
+
+    Tries what the project sets, then what the shelf has, then everything else.
+    """
+    for baud in dict.fromkeys((BAUD, FACTORY_BAUD, 115200, 57600, 19200, 4800, 2400, 1200)):
+        for access in _attempts(open_at(baud)):
+            return access
+    raise DeviceError(
+        "no XBee module answers on this port: is it in a USB adapter of its own (on a node's "
+        "shield the microcontroller drives the same line)?"
+    )
+
+
+def _attempts(device: serial.Serial) -> Iterator[Access]:
+    """The module as it answers at this speed; nothing, and the device closed, where it does not."""
+    api = ApiMode(device)
+    if api.answers():
+        yield api
+        return
+    text = CommandMode(device)
+    if text.enter():
+        yield text
+        return
+    device.close()
+
+
+@dataclass(frozen=True)
+class Written:
+    """A parameter, and what the module had before."""
+
+    parameter: Parameter
+    before: int
+
+
+def configure(
+    open_at: Callable[[int], serial.Serial], wanted: Sequence[Parameter]
+) -> list[Written]:
+    """Set a module, keep it, and read everything back at the speed it then has.
+
+    DeviceError says what was refused or is not as it was set. What was set before a refusal is not
+    kept: the module has forgotten it once it is unplugged.
+    """
+    access = find_module(open_at)
+    try:
+        written = [Written(parameter, access.get(parameter.command)) for parameter in wanted]
+        for parameter in wanted:
+            access.set(parameter.command, parameter.value)
+            if isinstance(access, ApiMode) and parameter.command == "AP":
+                access.escaped = parameter.value == 2
+            if isinstance(access, ApiMode) and parameter.command == "BD":
+                access = _after_baud(access, open_at, parameter.value)
+        access.keep()
+    finally:
+        access.device.close()
+    device = open_at(BAUD)
+    try:
+        api = ApiMode(device)
+        for parameter in wanted:
+            value = api.get(parameter.command)
+            if value != parameter.value:
+                raise DeviceError(
+                    f"the XBee module has {parameter.command}={value:X} instead of "
+                    f"{parameter.value:X}"
+                )
+    finally:
+        device.close()
+    return written
+
+
+def _after_baud(access: ApiMode, open_at: Callable[[int], serial.Serial], code: int) -> ApiMode:
+    """The same module at its new speed."""
+    baud = next(rate for rate, known in BAUD_CODES.items() if known == code)
+    if access.device.baudrate == baud:
+        return access
+    access.device.close()
+    return ApiMode(open_at(baud), escaped=access.escaped)

@@ -1,0 +1,208 @@
+"""Setting an XBee module on a USB adapter, whatever state it comes in."""
+
+import os
+import re
+import select
+import subprocess
+import sys
+import termios
+import threading
+import tty
+from contextlib import contextmanager
+from functools import partial
+
+import pytest
+
+from relpos.emulator.xbee import XbeeModule
+from relpos.errors import DeviceError
+from relpos.link.live import open_port
+from relpos.nodes import radio
+
+BAUD_OF_SPEED = {getattr(termios, f"B{baud}"): baud for baud in radio.BAUD_CODES}
+
+
+class Adapter(threading.Thread):
+    """A pseudo-terminal with a module behind it, which hears only its own speed."""
+
+    def __init__(self, module):
+        super().__init__(daemon=True)
+        self.module = module
+        self.terminal, self.port = os.openpty()
+        tty.setraw(self.port)
+        self.stop = threading.Event()
+
+    def run(self):
+        while not self.stop.is_set():
+            if not select.select([self.terminal], [], [], 0.02)[0]:
+                continue
+            data = os.read(self.terminal, 4096)
+            speed = BAUD_OF_SPEED[termios.tcgetattr(self.port)[5]]
+            if speed == self.module.baud:
+                answer = self.module.hear(data)
+                if answer:
+                    os.write(self.terminal, answer)
+
+
+class FromTheShelf:
+    """A module as Digi delivers it: transparent at 9600 baud, set by text in command mode.
+
+    Written from the manual's description of command mode, not from what we send.
+    """
+
+    def __init__(self):
+        self.baud = 9600
+        self.values = dict.fromkeys(
+            [
+                "CH",
+                "ID",
+                "MY",
+                "DH",
+                "DL",
+                "MM",
+                "RR",
+                "RN",
+                "PL",
+                "CE",
+                "A1",
+                "SM",
+                "EE",
+                "AP",
+                "BD",
+            ],
+            0,
+        ) | {"CH": 0xC, "ID": 0x3332, "BD": 3, "PL": 4}
+        self.kept = dict(self.values)
+        self.listening = False
+        self.line = b""
+        self.api = None
+
+    def hear(self, data):
+        if self.api is not None:
+            return self.api.hear(data)
+        if not self.listening:
+            self.listening = data == b"+++"
+            return b"OK\r" if self.listening else b""
+        self.line += data
+        answer = b""
+        while b"\r" in self.line:
+            line, _, self.line = self.line.partition(b"\r")
+            answer += self._obey(line.decode()) + b"\r"
+        return answer
+
+    def _obey(self, line):
+        command, value = line[2:4], line[4:]
+        if command == "WR":
+            self.kept = dict(self.values)
+        elif command == "CN":
+            self.listening = False
+            if self.values["AP"] == 2:
+                self.api = Emulated(0x1234)
+                for name, number in self.values.items():
+                    self.api.module._settings[name.encode()] = number.to_bytes(4, "big")
+                self.baud = 38400
+        elif command not in self.values:
+            return b"ERROR"
+        elif value:
+            self.values[command] = int(value, 16)
+        else:
+            return f"{self.values[command]:X}".encode()
+        return b"OK"
+
+
+class Emulated:
+    """The emulator's module, which speaks API frames alone."""
+
+    baud = 38400
+
+    def __init__(self, address, escaped=True):
+        self.sent = b""
+        self.module = XbeeModule(address, 7, None, self._emit, escaped=escaped)
+
+    def _emit(self, _time_us, data):
+        self.sent += data
+
+    def hear(self, data):
+        self.module.from_serial(0, data)
+        sent, self.sent = self.sent, b""
+        return sent
+
+
+@contextmanager
+def adapter(module):
+    thread = Adapter(module)
+    thread.start()
+    try:
+        yield os.ttyname(thread.port)
+    finally:
+        thread.stop.set()
+        thread.join()
+        os.close(thread.terminal)
+        os.close(thread.port)
+
+
+def test_a_module_from_the_shelf_is_set_in_command_mode_and_kept():
+    module = FromTheShelf()
+    with adapter(module) as path:
+        written = radio.configure(partial(open_port, path), radio.parameters(3, 0x4242, 0x0E))
+    assert module.kept["MY"] == 3
+    assert module.kept["ID"] == 0x4242
+    assert module.kept["CH"] == 0x0E
+    assert module.kept["AP"] == 2
+    assert module.kept["BD"] == 5
+    assert {w.parameter.command: w.before for w in written}["BD"] == 3
+
+
+@pytest.mark.parametrize("escaped", [True, False])
+def test_a_module_that_speaks_frames_is_set_by_frames(escaped):
+    module = Emulated(9, escaped=escaped)
+    with adapter(module) as path:
+        radio.configure(partial(open_port, path), radio.parameters(4))
+    assert module.module.address == 4
+    assert module.module._settings[b"AP"] == b"\2"
+    assert module.module._settings[b"RN"] == b"\3"
+
+
+def test_a_port_without_a_module_is_told(monkeypatch):
+    monkeypatch.setattr(radio, "GUARD_S", 0.01)
+    monkeypatch.setattr(radio, "ANSWER_S", 0.02)
+
+    class Deaf:
+        baud = 0
+
+    with adapter(Deaf()) as path, pytest.raises(DeviceError, match="no XBee module answers"):
+        radio.find_module(partial(open_port, path))
+
+
+def test_other_firmware_is_named():
+    module = Emulated(1)
+    del module.module._settings[b"MM"]
+    with adapter(module) as path, pytest.raises(DeviceError, match=r"ATMM.*802\.15\.4 firmware"):
+        radio.configure(partial(open_port, path), radio.parameters(1))
+
+
+def relpos(*arguments):
+    command = [sys.executable, "-m", "relpos.cli.main", "node", "radio", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_without_a_port_the_lines_are_printed():
+    lines = relpos("--node", 18).stdout.splitlines()
+    words = [line.split()[0] for line in lines]
+    assert words[0] == "+++"
+    assert "ATMY12" in words  # hexadecimal
+    assert words[-4:] == ["ATAP2", "ATBD5", "ATWR", "ATCN"]
+    assert "ATMY0" in relpos("--coordinator").stdout
+
+
+def test_the_command_writes_a_module():
+    with adapter(Emulated(9)) as path:
+        done = relpos(path, "--node", 5)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"MY\W+9\W+5", done.stdout)
+
+
+@pytest.mark.parametrize(
+    "arguments", [(), ("--node", 1, "--coordinator"), ("--node", 1, "--channel", "1B")]
+)
+def test_what_it_cannot_mean_is_wrong_usage(arguments):
+    assert relpos(*arguments).returncode == 2
