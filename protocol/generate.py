@@ -77,10 +77,12 @@ def header_text() -> str:
         f"constexpr uint8_t kMagic = {wire.MAGIC};",
         f"constexpr uint8_t kProtocolVersion = {wire.PROTOCOL_VERSION};",
         f"constexpr uint16_t kFingerprint = {wire.FINGERPRINT};  // seed of the CRC",
-        f"constexpr uint8_t kFrameBytes = {wire.FRAME_BYTES};  // header, body and CRC",
-        f"constexpr uint8_t kAuthenticationBytes = {wire.AUTHENTICATION_BYTES};  // kept free",
+        f"constexpr uint8_t kFrameBytes = {wire.FRAME_BYTES};  // the longest frame",
+        f"constexpr uint8_t kMostBody = {wire.MOST_BODY_BYTES};",
         f"constexpr uint8_t kHeaderBytes = {wire.HEADER_BYTES};",
         f"constexpr uint8_t kCrcBytes = {wire.CRC_BYTES};",
+        f"constexpr uint8_t kTagBytes = {wire.TAG_BYTES};",
+        f"constexpr uint8_t kKeyBytes = {wire.KEY_BYTES};",
         f"constexpr uint8_t kCoordinator = {wire.COORDINATOR};",
         f"constexpr uint8_t kBroadcast = {wire.BROADCAST};",
         "",
@@ -325,24 +327,40 @@ def page_text() -> str:
         f"*{_NOTICE}*",
         "",
         "A frame is the payload of one XBee packet, at most "
-        f"{wire.XBEE_PAYLOAD_BYTES} bytes. {wire.AUTHENTICATION_BYTES} of them are kept for the "
-        "authentication (4-byte counter, 8-byte tag) that a later version adds, so header, body "
-        f"and CRC have {wire.FRAME_BYTES}. Integers are little-endian; SI value = raw value x its "
-        "unit. Counters marked *wraps* start again from the other end; the host takes differences "
-        "modulo their width.",
+        f"{wire.FRAME_BYTES} bytes, {wire.MOST_BODY_BYTES} of them its body. Integers are "
+        "little-endian; SI value = raw value x its unit. Counters marked *wraps* start again from "
+        "the other end; the host takes differences modulo their width.",
         "",
         "```",
-        "magic  version  type  node  boot  sequence(2)   body ...   crc(2)",
+        "magic  version  type  node  boot  counter(4)   body ...   crc(2)   tag(8)",
         "```",
         "",
         "**Order of checks.** Magic; version (a foreign one is named to the user, whatever "
-        "follows); length; CRC; type; the length that type and count ask for; each field's range. "
-        "A frame that fails one changes nothing.",
+        "follows); length; CRC; tag; counter; type; the length that type and count ask for; each "
+        "field's range. A frame that fails one changes nothing.",
         "",
         "**CRC.** CRC-16/CCITT over header and body: polynomial 0x1021, most significant bit "
         f"first, no inversion, starting from the layout's fingerprint 0x{wire.FINGERPRINT:04x} "
         "(the first two bytes of SHA-256 over the canonical text of all fields). A peer with "
         "another layout fails the check instead of being misread.",
+        "",
+        "**Tag.** SipHash-2-4, 8 bytes, under the team's 16-byte key, over everything before it. A "
+        "node that was never given a key has one of zeros, which everybody knows: it tells damage, "
+        "not enemies. `relpos node set key` gives it a secret one.",
+        "",
+        "**Counter.** Grows with every frame of a sender and never goes back: a node reserves "
+        "blocks of counts in its EEPROM ahead of their use. The host accepts from each node what "
+        "is newer than all before, or within the last 64 counts and not seen yet (frames overtake "
+        "each other); a node accepts from the host only what is newer. The host's counter is the "
+        "time: eighths of a second since 2024, or the last one plus 1 where that is more, so "
+        "that a host needs no memory. A node keeps the newest counter of a command in the EEPROM; "
+        "that of beacons begins anew with a restart, so an old beacon may be taken until the next "
+        "genuine one, a second later.",
+        "",
+        "**New key.** A `new_key` frame carries it XOR a mask: SipHash-2-4 under the old key over "
+        "the six bytes 0, block number (0, then 1), counter of the frame(4). Who has listened "
+        "since before the old key was secret can read the new one: the first key is given over "
+        "the cable.",
         "",
         "**Lost frames.** Motion travels as running totals since the node's start (`boot` counts "
         "the starts); the difference of any two received frames is the motion between them.",
@@ -428,7 +446,12 @@ def _bless() -> None:
     vectors = read_vectors()
     for v in vectors:
         v["hex"] = wire.encode(
-            wire.BY_NAME[v["message"]], v["node"], v["boot"], v["sequence"], v["values"]
+            wire.BY_NAME[v["message"]],
+            v["node"],
+            v["boot"],
+            v["counter"],
+            v["values"],
+            bytes.fromhex(v["key"]),
         ).hex()
     VECTORS.write_text(json.dumps(vectors, indent=1) + "\n")
 
@@ -450,6 +473,7 @@ def test_header_text() -> str:
         data = bytes.fromhex(v["hex"])
         name = _camel(v["name"])
         array = ", ".join(f"0x{b:02x}" for b in data)
+        key = ", ".join(f"0x{b:02x}" for b in bytes.fromhex(v["key"]))
         values = [str(f.to_raw(v["values"][f.label])) for f in message.fields]
         if message.entries is not None:
             rows = [
@@ -460,7 +484,8 @@ def test_header_text() -> str:
         lines += [
             f"constexpr uint8_t k{name}Node = {v['node']};",
             f"constexpr uint8_t k{name}Boot = {v['boot']};",
-            f"constexpr uint16_t k{name}Sequence = {v['sequence']};",
+            f"constexpr uint32_t k{name}Counter = {v['counter']}u;",
+            f"const uint8_t k{name}Key[] = {{{key}}};",
             f"const uint8_t k{name}Bytes[] = {{{array}}};",
             f"const relpos::wire::{_camel(message.name)} k{name} = {{{', '.join(values)}}};",
             "",

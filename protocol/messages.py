@@ -3,13 +3,15 @@
 ``generate.py`` makes ``firmware/lib/wire/messages.h``, the C++ test vectors and
 ``docs/protocol.md`` from this file. A frame is the payload of one XBee packet:
 
-    magic  version  type  node  boot  sequence(2)   body   crc(2)   [counter(4) tag(8)]
+    magic  version  type  node  boot  counter(4)   body   crc(2)   tag(8)
 
-All integers are little-endian. Of the 66 bytes that every XBee variant carries, 12 are kept for
-the authentication (4-byte counter, 8-byte tag), so header, body and CRC have 54. The first two
-bytes mean the same in every version for ever: a frame of a foreign version can always be named.
-The CRC-16/CCITT starts from the layout's fingerprint, not from a constant, so that a peer with
-another layout fails the check instead of being misread (the habit of MAVLink's CRC_EXTRA).
+All integers are little-endian. A frame has at most the 66 bytes that every XBee variant carries.
+The first two bytes mean the same in every version for ever: a frame of a foreign version can
+always be named. The CRC-16/CCITT starts from the layout's fingerprint, not from a constant, so that
+a peer with another layout fails the check instead of being misread (the habit of MAVLink's
+CRC_EXTRA). The tag is SipHash-2-4 (Aumasson & Bernstein 2012) under the team's key over all that
+stands before it; a sender's counter grows with every frame and never goes back, so that a frame is
+new or is refused.
 """
 
 from __future__ import annotations
@@ -17,18 +19,23 @@ from __future__ import annotations
 import binascii
 import enum
 import hashlib
+import hmac
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import siphash24
+
 from .schema import Entries, Message, OutOfRangeError, Quantity
 
 MAGIC = 0xB5
-PROTOCOL_VERSION = 1
-XBEE_PAYLOAD_BYTES = 66
-AUTHENTICATION_BYTES = 12
-FRAME_BYTES = XBEE_PAYLOAD_BYTES - AUTHENTICATION_BYTES
+PROTOCOL_VERSION = 2
+FRAME_BYTES = 66
 CRC_BYTES = 2
+TAG_BYTES = 8
+KEY_BYTES = 16
+DEFAULT_KEY = bytes(KEY_BYTES)
+"""Of a node that was never given one: everybody knows it, so it keeps nobody out."""
 COORDINATOR = 0
 BROADCAST = 255
 
@@ -72,6 +79,17 @@ class RangeQuality(enum.IntFlag):
     RETRIED = 0x02
 
 
+class Health(enum.IntFlag):
+    """What of a node works."""
+
+    IMU = 0x01
+    MAGNETOMETER = 0x02
+    POZYX = 0x04
+    PRESSURE = 0x08
+    BEACON = 0x10
+    KEY_SET = 0x20
+
+
 class CommandCode(enum.IntEnum):
     """What the host may ask of a node; ``value`` is the command's argument."""
 
@@ -89,6 +107,10 @@ class CommandCode(enum.IntEnum):
     SET_CALIBRATION = 11
     COMMIT_CALIBRATION = 12
     READ_CALIBRATION = 13
+    SET_NODE_ID = 14
+    SET_RANGE_OFFSET_MM = 15
+    RESTORE_DEFAULTS = 16
+    SET_KEY = 17
 
 
 class CommandResult(enum.IntEnum):
@@ -110,7 +132,7 @@ HEADER = (
     Quantity(
         "boot", "u8", "Counts the node's starts; totals and clock begin anew with each", wraps=True
     ),
-    Quantity("sequence", "u16", "Counts the sender's frames", wraps=True),
+    Quantity("counter", "u32", "Grows with every frame of the sender, also over its restarts"),
 )
 HEADER_BYTES = sum(f.byte_count for f in HEADER)
 
@@ -301,6 +323,24 @@ STATUS = Message(
         Quantity(
             "radio_failures", "u16", "Frames that the radio reported as not delivered", wraps=True
         ),
+        Quantity(
+            "refused_frames",
+            "u16",
+            "Received frames with a wrong tag or a counter that was used before",
+            wraps=True,
+        ),
+        Quantity(
+            "range_offset_m",
+            "i16",
+            "This end's share of what its ranges are too long by (antenna delay); the host "
+            "subtracts both ends' shares",
+            raw_name="range_offset_mm",
+            unit="m",
+            per_unit=1000,
+        ),
+        Quantity("neighbours", "u8", "Nodes ranged within the last 10 s"),
+        Quantity("team", "u8", "Nodes in the beacon in force; 0: none is heard"),
+        Quantity("health", "u8", "What works", values=Health),
     ),
 )
 
@@ -399,10 +439,49 @@ ACKNOWLEDGEMENT = Message(
     ),
 )
 
-MESSAGES = (MOTION, RANGES, STATUS, STEPS, SAMPLES, COMMAND, ACKNOWLEDGEMENT)
+BEACON = Message(
+    18,
+    "beacon",
+    "The coordinator tells everybody the team and the time: ids in the order of their slots, and "
+    "how far the superframe is.",
+    (
+        Quantity(
+            "phase_s",
+            "u16",
+            "Since the superframe began, when the frame leaves",
+            raw_name="phase_ms",
+            unit="s",
+            per_unit=1000,
+        ),
+        Quantity(
+            "period_s",
+            "u16",
+            "Length of a superframe",
+            raw_name="period_ms",
+            unit="s",
+            per_unit=1000,
+            low=200,
+            high=60_000,
+        ),
+        Quantity("round", "u8", "Counts the superframes", wraps=True),
+    ),
+    Entries("nodes", "slot", (Quantity("node", "u8", "Its id", low=1, high=254),), most=20),
+)
+
+NEW_KEY = Message(
+    19,
+    "new_key",
+    "A new team key for one node, hidden under the old one; answered like a command SET_KEY.",
+    (
+        Quantity("token", "u16", "Chosen by the host, returned in the acknowledgement"),
+        *(Quantity(f"masked_{k}", "u32", "Key words XOR the mask") for k in range(4)),
+    ),
+)
+
+MESSAGES = (MOTION, RANGES, STATUS, STEPS, SAMPLES, COMMAND, ACKNOWLEDGEMENT, BEACON, NEW_KEY)
 BY_NUMBER = {message.number: message for message in MESSAGES}
 BY_NAME = {message.name: message for message in MESSAGES}
-ENUMS = (ResetCause, MotionState, Quality, RangeQuality, CommandCode, CommandResult)
+ENUMS = (ResetCause, MotionState, Quality, RangeQuality, Health, CommandCode, CommandResult)
 
 
 def _words(
@@ -534,12 +613,29 @@ class FrameCrcError(FrameError):
     """The CRC does not fit: damaged on the way, or another layout."""
 
 
+class FrameTagError(FrameError):
+    """The tag does not fit: sent by somebody without the team's key, or forged."""
+
+
 class UnknownTypeError(FrameError):
     """A type number that this version does not have."""
 
 
 class FrameValueError(FrameError):
     """A field outside its range."""
+
+
+def tag(data: bytes, key: bytes) -> bytes:
+    """SipHash-2-4 of ``data`` under the 16-byte ``key``: 8 bytes."""
+    return bytes(siphash24.siphash24(data, key=key).digest())
+
+
+def key_mask(key: bytes, counter: int) -> bytes:
+    """What a new key is XORed with in a :data:`NEW_KEY` frame of that counter: 16 bytes.
+
+    Two SipHash blocks of the old ``key`` over 0, block number, counter: no frame begins with 0.
+    """
+    return b"".join(tag(bytes((0, k)) + counter.to_bytes(4, "little"), key) for k in (0, 1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -549,60 +645,76 @@ class Frame:
     message: Message
     node: int
     boot: int
-    sequence: int
+    counter: int
     values: Mapping[str, Any]
 
 
 def encode(
-    message: Message, node: int, boot: int, sequence: int, values: Mapping[str, Any]
+    message: Message,
+    node: int,
+    boot: int,
+    counter: int,
+    values: Mapping[str, Any],
+    key: bytes = DEFAULT_KEY,
 ) -> bytes:
-    """The frame's bytes, CRC included. Raises OutOfRangeError where a value does not fit."""
+    """The frame's bytes, CRC and tag included. OutOfRangeError where a value does not fit."""
     header = {
         "magic": MAGIC,
         "version": PROTOCOL_VERSION,
         "type": message.number,
         "node": node,
         "boot": boot,
-        "sequence": sequence,
+        "counter": counter,
     }
     raw = b"".join(
         f.to_raw(header[f.label]).to_bytes(f.byte_count, "little") for f in HEADER
     ) + message.build(values)
-    return raw + crc16(raw).to_bytes(CRC_BYTES, "little")
+    return seal(raw, key)
 
 
-def decode(data: bytes) -> Frame:
-    """Check everything, then read: magic, version, length, CRC, type, layout, ranges.
+def seal(raw: bytes, key: bytes = DEFAULT_KEY) -> bytes:
+    """Header and body with their CRC and tag."""
+    raw += crc16(raw).to_bytes(CRC_BYTES, "little")
+    return raw + tag(raw, key)
+
+
+def decode(data: bytes, key: bytes = DEFAULT_KEY) -> Frame:
+    """Check everything, then read: magic, version, length, CRC, tag, type, layout, ranges.
 
     Raises a subclass of :class:`FrameError` that says what was wrong; nothing of a frame that
-    fails is ever returned.
+    fails is ever returned. Whether the counter is new is the receiver's to check: it needs memory.
     """
     if not data or data[0] != MAGIC:
         raise NotOursError("not a relpos frame: the first byte is not the magic")
     if len(data) >= 2 and data[1] != PROTOCOL_VERSION:
         raise ForeignVersionError(data[1], data[3] if len(data) > 3 else None)
-    if not HEADER_BYTES + CRC_BYTES <= len(data) <= FRAME_BYTES:
+    if not HEADER_BYTES + CRC_BYTES + TAG_BYTES <= len(data) <= FRAME_BYTES:
         raise FrameLengthError(f"a frame of {len(data)} bytes")
-    if crc16(data[:-CRC_BYTES]) != int.from_bytes(data[-CRC_BYTES:], "little"):
+    tagged = data[:-TAG_BYTES]
+    raw = tagged[:-CRC_BYTES]
+    if crc16(raw) != int.from_bytes(tagged[-CRC_BYTES:], "little"):
         raise FrameCrcError("the CRC does not fit")
+    if not hmac.compare_digest(tag(tagged, key), data[-TAG_BYTES:]):
+        raise FrameTagError("the tag does not fit the team's key")
     header: dict[str, int] = {}
     position = 0
     for field in HEADER:
-        header[field.label] = int.from_bytes(data[position : position + field.byte_count], "little")
+        header[field.label] = int.from_bytes(raw[position : position + field.byte_count], "little")
         position += field.byte_count
     message = BY_NUMBER.get(header["type"])
     if message is None:
         raise UnknownTypeError(f"message type {header['type']} is not of this version")
-    body = data[position:-CRC_BYTES]
+    body = raw[position:]
     if not message.length_fits(body):
         raise FrameLengthError(f"a {message.name} body of {len(body)} bytes")
     try:
         values = message.parse(body)
     except OutOfRangeError as error:
         raise FrameValueError(f"{message.name}: {error}") from error
-    return Frame(message, header["node"], header["boot"], header["sequence"], values)
+    return Frame(message, header["node"], header["boot"], header["counter"], values)
 
 
+MOST_BODY_BYTES = FRAME_BYTES - HEADER_BYTES - CRC_BYTES - TAG_BYTES
 for _message in MESSAGES:
-    if HEADER_BYTES + _message.most_bytes + CRC_BYTES > FRAME_BYTES:
+    if _message.most_bytes > MOST_BODY_BYTES:
         raise AssertionError(f"{_message.name} needs {_message.most_bytes} bytes: too long")

@@ -21,13 +21,13 @@ from relpos.protocol import messages as wire
 MOTION_ZERO = dict.fromkeys(wire.MOTION.field, 0)
 
 
-def motion_frame(sequence, node=1, boot=0, **values):
-    return wire.encode(wire.MOTION, node, boot, sequence, MOTION_ZERO | values)
+def motion_frame(counter, node=1, boot=0, **values):
+    return wire.encode(wire.MOTION, node, boot, counter, MOTION_ZERO | values)
 
 
-def ranges_frame(sequence, time_s, peer, range_m, age_s, node=1, boot=0):
+def ranges_frame(counter, time_s, peer, range_m, age_s, node=1, boot=0):
     entry = {"peer": peer, "range_m": range_m, "rss_dbm": -80, "age_s": age_s, "quality": 0}
-    return wire.encode(wire.RANGES, node, boot, sequence, {"time_s": time_s, "ranges": [entry]})
+    return wire.encode(wire.RANGES, node, boot, counter, {"time_s": time_s, "ranges": [entry]})
 
 
 # --- XBee frames against digi-xbee ------------------------------------------------------------
@@ -203,7 +203,9 @@ def test_totals_differ_rightly_over_their_wrap():
     top = 2147483.647
     decoder.feed(motion_frame(65535, time_s=4294967.0, x_m=top, heading_rad=-214748.3648), 5.0)
     (motion,) = motions(
-        decoder.feed(motion_frame(0, time_s=0.704, x_m=-2147483.148, heading_rad=214748.3647), 6.0)
+        decoder.feed(
+            motion_frame(65536, time_s=0.704, x_m=-2147483.148, heading_rad=214748.3647), 6.0
+        )
     )
     # Seen from the heading before the wrap; the distance does not depend on it.
     assert math.hypot(motion.dx_m, motion.dy_m) == pytest.approx(0.501, abs=1e-6)
@@ -226,7 +228,7 @@ def test_late_and_doubled_frames_move_nobody():
 def test_a_restart_begins_new_totals_and_widens_the_next_motion():
     decoder = Decoder()
     decoder.feed(motion_frame(7, boot=4, time_s=100, x_m=50.0), 100.0)
-    (motion,) = motions(decoder.feed(motion_frame(0, boot=5, time_s=1, x_m=0.5), 104.0))
+    (motion,) = motions(decoder.feed(motion_frame(1024, boot=5, time_s=1, x_m=0.5), 104.0))
     assert motion.dx_m == pytest.approx(0.5)
     assert motion.sigma_x_m > 4.0
     assert decoder.nodes[1].counts["restarts"] == 1
@@ -235,7 +237,7 @@ def test_a_restart_begins_new_totals_and_widens_the_next_motion():
 def test_a_frame_held_up_from_before_the_restart_is_refused():
     decoder = Decoder()
     decoder.feed(motion_frame(7, boot=4, time_s=100, x_m=50.0), 100.0)
-    decoder.feed(motion_frame(0, boot=5, time_s=1), 102.0)
+    decoder.feed(motion_frame(40, boot=5, time_s=1), 102.0)
     assert decoder.feed(motion_frame(8, boot=4, time_s=101, x_m=51.0), 102.5) == []
     assert decoder.nodes[1].boot == 5
 
@@ -247,10 +249,19 @@ def test_a_damaged_or_foreign_frame_changes_nothing():
     good = motion_frame(1, time_s=2, x_m=3)
     assert decoder.feed(good[:-1] + bytes((good[-1] ^ 1,)), 2.0) == []
     assert decoder.feed(b"\x00another system", 2.0) == []
-    assert decoder.feed(bytes((wire.MAGIC, 2, 1, 9)), 2.0) == []
+    assert decoder.feed(bytes((wire.MAGIC, 1, 1, 9)), 2.0) == []
+    assert decoder.feed(good[:20] + bytes((good[20] ^ 1,)) + good[21:], 2.0) == []
+    forged = wire.encode(wire.MOTION, 1, 0, 1, MOTION_ZERO | {"time_s": 2}, bytes(range(16)))
+    assert decoder.feed(forged, 2.0) == []
     assert repr(decoder.nodes) == before
-    assert decoder.foreign_versions == {9: 2}
-    assert decoder.counts == {"FrameCrcError": 1, "NotOursError": 1, "ForeignVersionError": 1}
+    assert decoder.foreign_versions == {9: 1}
+    assert decoder.counts == {
+        "FrameTagError": 2,
+        "FrameCrcError": 1,
+        "NotOursError": 1,
+        "ForeignVersionError": 1,
+    }
+    assert len(motions(decoder.feed(good, 2.0))) == 1
 
 
 def test_a_range_is_dated_back_by_its_age():

@@ -15,6 +15,11 @@ VECTORS = json.loads(
     (Path(__file__).parents[2] / "protocol" / "vectors" / "frames.json").read_text()
 )
 BY_NAME = {v["name"]: v for v in VECTORS}
+KEY = bytes(range(16))
+
+
+def decode(vector):
+    return wire.decode(bytes.fromhex(vector["hex"]), bytes.fromhex(vector["key"]))
 
 
 def crc_by_polynomial_division(data: bytes, seed: int) -> int:
@@ -35,20 +40,21 @@ def test_golden_values_encode_to_the_golden_bytes(vector):
         wire.BY_NAME[vector["message"]],
         vector["node"],
         vector["boot"],
-        vector["sequence"],
+        vector["counter"],
         vector["values"],
+        bytes.fromhex(vector["key"]),
     )
     assert encoded.hex() == vector["hex"]
 
 
 @pytest.mark.parametrize("vector", VECTORS, ids=lambda v: v["name"])
 def test_golden_bytes_decode_to_the_golden_values(vector):
-    frame = wire.decode(bytes.fromhex(vector["hex"]))
-    assert (frame.message.name, frame.node, frame.boot, frame.sequence) == (
+    frame = decode(vector)
+    assert (frame.message.name, frame.node, frame.boot, frame.counter) == (
         vector["message"],
         vector["node"],
         vector["boot"],
-        vector["sequence"],
+        vector["counter"],
     )
     assert dict(frame.values) == vector["values"]
 
@@ -56,16 +62,40 @@ def test_golden_bytes_decode_to_the_golden_values(vector):
 def test_the_crc_is_the_published_one():
     assert wire.crc16(b"123456789", 0) == 0x31C3  # CRC-16/XMODEM check value
     assert wire.crc16(b"123456789", 0xFFFF) == 0x29B1  # CRC-16/CCITT-FALSE check value
-    data = bytes.fromhex(BY_NAME["status"]["hex"])
+    data = bytes.fromhex(BY_NAME["status"]["hex"])[: -wire.TAG_BYTES]
     assert crc_by_polynomial_division(data[:-2], wire.FINGERPRINT) == int.from_bytes(
         data[-2:], "little"
     )
 
 
-def test_every_frame_leaves_room_for_the_authentication_in_66_bytes():
+def test_every_frame_fits_the_66_bytes_that_all_radio_modules_carry():
     for message in wire.MESSAGES:
-        longest = wire.HEADER_BYTES + message.most_bytes + wire.CRC_BYTES
-        assert longest + wire.AUTHENTICATION_BYTES <= 66, message.name
+        overhead = wire.HEADER_BYTES + wire.CRC_BYTES + wire.TAG_BYTES
+        assert overhead + message.most_bytes <= 66, message.name
+
+
+def test_the_tag_is_siphash_2_4():
+    # Appendix A of the SipHash paper: key 00..0f, data 00..0e.
+    assert wire.tag(bytes(range(15)), bytes(range(16))) == bytes.fromhex("e545be4961ca29a1")
+
+
+def test_a_frame_under_another_key_is_refused():
+    data = bytes.fromhex(BY_NAME["status"]["hex"])
+    with pytest.raises(wire.FrameTagError):
+        wire.decode(data, bytes(range(1, 17)))
+    with pytest.raises(wire.FrameTagError):
+        wire.decode(data)
+
+
+def test_every_bit_of_a_frame_is_under_its_tag():
+    """A forger may make the CRC fit; the tag he cannot."""
+    data = bytes.fromhex(BY_NAME["command"]["hex"])
+    for bit in range(16, 8 * (len(data) - wire.CRC_BYTES - wire.TAG_BYTES)):
+        raw = bytearray(data[: -wire.CRC_BYTES - wire.TAG_BYTES])
+        raw[bit // 8] ^= 1 << bit % 8
+        forged = bytes(raw) + wire.crc16(bytes(raw)).to_bytes(2, "little")
+        with pytest.raises(wire.FrameTagError):
+            wire.decode(forged + data[-wire.TAG_BYTES :], KEY)
 
 
 def test_every_message_type_has_a_golden_frame():
@@ -79,7 +109,7 @@ def test_a_foreign_version_is_named_even_when_the_rest_is_not_ours():
         wire.decode(bytes((wire.MAGIC, 9, 77, 6)) + b"whatever a later version may hold" * 3)
     assert (caught.value.version, caught.value.node) == (9, 6)
     with pytest.raises(wire.ForeignVersionError, match="a node speaks"):
-        wire.decode(bytes((wire.MAGIC, 2)))
+        wire.decode(bytes((wire.MAGIC, 1)))
 
 
 def test_another_systems_packet_is_not_ours():
@@ -89,10 +119,10 @@ def test_another_systems_packet_is_not_ours():
 
 
 def test_another_layout_fails_the_crc_instead_of_being_misread():
-    data = bytes.fromhex(BY_NAME["motion_walking"]["hex"])[:-2]
-    other = crc_by_polynomial_division(data, wire.FINGERPRINT ^ 1)
+    data = bytes.fromhex(BY_NAME["motion_walking"]["hex"])[:-10]
+    data += crc_by_polynomial_division(data, wire.FINGERPRINT ^ 1).to_bytes(2, "little")
     with pytest.raises(wire.FrameCrcError):
-        wire.decode(data + other.to_bytes(2, "little"))
+        wire.decode(data + wire.tag(data, KEY), KEY)
 
 
 @pytest.mark.parametrize("vector", VECTORS, ids=lambda v: v["name"])
@@ -102,18 +132,18 @@ def test_every_single_bit_error_and_truncation_is_refused(vector):
         damaged = bytearray(data)
         damaged[bit // 8] ^= 1 << bit % 8
         with pytest.raises(wire.FrameError):
-            wire.decode(bytes(damaged))
+            wire.decode(bytes(damaged), bytes.fromhex(vector["key"]))
     for length in range(len(data)):
         with pytest.raises(wire.FrameError):
-            wire.decode(data[:length])
+            wire.decode(data[:length], bytes.fromhex(vector["key"]))
 
 
 def sealed(type_number: int, body: bytes) -> bytes:
-    raw = bytes((wire.MAGIC, wire.PROTOCOL_VERSION, type_number, 1, 0, 0, 0)) + body
-    return raw + wire.crc16(raw).to_bytes(2, "little")
+    header = bytes((wire.MAGIC, wire.PROTOCOL_VERSION, type_number, 1, 0, 0, 0, 0, 0))
+    return wire.seal(header + body)
 
 
-def test_a_count_that_does_not_fit_the_length_is_refused_despite_a_good_crc():
+def test_a_count_that_does_not_fit_the_length_is_refused_despite_a_good_crc_and_tag():
     body = bytes(4) + b"\x02" + bytes(8)
     with pytest.raises(wire.FrameLengthError):
         wire.decode(sealed(wire.RANGES.number, body))
@@ -121,13 +151,13 @@ def test_a_count_that_does_not_fit_the_length_is_refused_despite_a_good_crc():
         wire.decode(sealed(wire.RANGES.number, bytes(4) + b"\xff" + bytes(8)))
 
 
-def test_a_value_out_of_its_range_is_refused_despite_a_good_crc():
+def test_a_value_out_of_its_range_is_refused_despite_a_good_crc_and_tag():
     zero_range = bytes(4) + b"\x01" + b"\x02" + bytes(3) + bytes(4)
     with pytest.raises(wire.FrameValueError, match="range_m"):
         wire.decode(sealed(wire.RANGES.number, zero_range))
 
 
-def test_an_unknown_type_is_refused_despite_a_good_crc():
+def test_an_unknown_type_is_refused_despite_a_good_crc_and_tag():
     with pytest.raises(wire.UnknownTypeError):
         wire.decode(sealed(200, b""))
 

@@ -12,9 +12,10 @@ namespace relpos {
 // the UART; of what comes only RF payloads are kept. Zeroed memory is the start: make it as `Xbee()`.
 class Xbee {
  public:
-  // Only commands come down. A whole frame's room would cost 38 bytes of RAM.
-  static constexpr uint8_t kMostPayload = wire::kHeaderBytes + wire::kCommandBytes +
-                                          wire::kCrcBytes + wire::kAuthenticationBytes;
+  // Of what comes down a beacon is the longest. A whole frame's room would cost 21 bytes of RAM.
+  static constexpr uint8_t kMostPayload = wire::kOverhead + wire::kBeaconBytes;
+  static_assert(wire::kBeaconBytes >= wire::kCommandBytes && wire::kBeaconBytes >= wire::kNewKeyBytes,
+                "the longest");
 
   bool busy() const { return sending_; }
   // Begins a TX16 request. The data must stay unchanged until !busy(). False while busy().

@@ -22,6 +22,10 @@ constexpr int16_t kWeakSignalDbm = -95;    // DW1000: close to the sensitivity l
 constexpr uint16_t kMotionPhaseMs = 157;   // between the reports of neighbouring ids, modulo period
 constexpr uint16_t kMostStepAgeMs = 2000;  // then it is sent without waiting for others
 constexpr uint8_t kRebootBytes = 5;
+// Counters of frames are reserved in blocks of so many: at a frame or two a second the EEPROM is
+// written every ten minutes, and lasts for years. A start wastes what is left of a block.
+constexpr uint16_t kCounterBlock = 1024;
+constexpr uint8_t kCountersLeft = 64;      // then the next block: writing takes 75 ms
 constexpr uint16_t kRawPeriodMs = 200;     // as often as the magnetometer is read
 constexpr uint16_t kMostRawReports = 3000; // ten minutes: a lost host does not end the ranging
 // Beyond what a sensor at its limit can show once a calibration has moved it: by 80 mg and 3 %, by
@@ -51,8 +55,13 @@ const Choice kChoices[] RELPOS_FLASH = {
      1},
     {static_cast<uint8_t>(wire::CommandCode::kSetLed), offsetof(Preferences, led), 1, kLedOff,
      kLedHealth},
+    {static_cast<uint8_t>(wire::CommandCode::kSetNodeId), offsetof(Preferences, node_id), 1, 1, 254},
+    // Low above high: both are signed.
+    {static_cast<uint8_t>(wire::CommandCode::kSetRangeOffsetMm),
+     offsetof(Preferences, range_offset_mm), 2, static_cast<uint16_t>(-5000), 5000},
 };
 
+constexpr uint8_t flag(wire::Health health) { return static_cast<uint8_t>(health); }
 constexpr uint8_t flag(wire::Quality quality) { return static_cast<uint8_t>(quality); }
 
 }  // namespace
@@ -62,7 +71,10 @@ void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
   imu_due_us_ = now_us;
   pozyx_due_us_ = now_us;
 
-  id_ = node_id;
+  store_.load(board_, this);
+  counter_ = marks_.counter_end;
+  reserve_counters();  // stored before the first frame, which is 100 ms away at least
+  id_ = node_id != 0 ? node_id : settings_.node_id;
   if (id_ == 0) {
     const uint8_t stored = board_.storage_read(kStoredNodeId);
     const uint8_t complement = board_.storage_read(kStoredNodeIdComplement);
@@ -70,7 +82,6 @@ void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
                       static_cast<uint8_t>(stored ^ complement) == 0xFF;
     id_ = good ? stored : kDefaultNodeId;
   }
-  store_.load(board_, &settings_);
 
   // A reboot on command is remembered with its token: the host may not have heard the answer, and
   // repeating the command must not reboot the node again.
@@ -90,7 +101,7 @@ void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
     next_command_ = 1;
   }
   boot_ = static_cast<uint8_t>(previous + 1);
-  board_.storage_write(kStoredBootCount, boot_);  // the only write a start
+  board_.storage_write(kStoredBootCount, boot_);
 
   pozyx_.begin(id_);
   configure_inertial();
@@ -124,7 +135,7 @@ uint32_t Node::poll(uint32_t now_us) {
     run_ranging(now_us);
     return 0;
   }
-  store_.step(board_, settings_);
+  store_.step(board_, *this);
   if (radio_free() && (send_next() || run_reboot())) return 0;
   show_health();
   return wait_us(now_us);
@@ -314,31 +325,44 @@ void Node::run_ranging(uint32_t now_us) {
 
 // ---- commands ----
 
+// Verified first: a frame that is damaged, forged, of another team or old touches nothing.
 void Node::receive_packet() {
   const uint8_t* frame = xbee_.received();
   const uint8_t length = xbee_.received_length();
   wire::Header header;
-  if (wire::open(frame, length, &header) != wire::FrameStatus::kGood) {
-    ++bad_frames_;
+  const wire::FrameStatus status = wire::open(frame, length, key_, &header);
+  if (status != wire::FrameStatus::kGood) {
+    ++*(status == wire::FrameStatus::kBadTag ? &refused_frames_ : &bad_frames_);
     return;
   }
   if (header.node != id_ && header.node != wire::kBroadcast) return;
-  if (header.type != wire::MessageType::kCommand || reboot_step_ != 0) return;
-  obey(frame + wire::kHeaderBytes,
-       static_cast<uint8_t>(length - wire::kHeaderBytes - wire::kCrcBytes));
+  const bool beacon = header.type == wire::MessageType::kBeacon;
+  if (!beacon && header.type != wire::MessageType::kCommand &&
+      header.type != wire::MessageType::kNewKey) {
+    return;
+  }
+  uint32_t* mark = beacon ? &beacon_mark_ : &marks_.command;
+  if (header.counter <= *mark) {
+    ++refused_frames_;
+    return;
+  }
+  *mark = header.counter;
+  if (beacon || reboot_step_ != 0) return;
+  obey(header, frame + wire::kHeaderBytes, static_cast<uint8_t>(length - wire::kOverhead));
 }
 
-RELPOS_APART void Node::obey(const uint8_t* body, uint8_t length) {
-  if (length != wire::kCommandBytes) {
+RELPOS_APART void Node::obey(const wire::Header& header, const uint8_t* body, uint8_t length) {
+  const bool new_key = header.type == wire::MessageType::kNewKey;
+  if (length != (new_key ? wire::kNewKeyBytes : wire::kCommandBytes)) {
     ++bad_frames_;
     return;
   }
   wire::Command command;
-  const bool known = wire::decode(body, length, &command);
+  const bool known = !new_key && wire::decode(body, length, &command);
   const uint16_t key = wire::crc16(body, length);
   if (!known) {
     command.token = static_cast<uint16_t>(body[0] | static_cast<uint16_t>(body[1]) << 8);
-    command.command = body[2];
+    command.command = new_key ? static_cast<uint8_t>(wire::CommandCode::kSetKey) : body[2];
     command.value = 0;
   }
   for (DoneCommand& done : commands_) {
@@ -357,18 +381,33 @@ RELPOS_APART void Node::obey(const uint8_t* body, uint8_t length) {
   done.key = key;
   done.command = command.command;
   done.value = command.value;
-  done.result = static_cast<uint8_t>(
-      known ? apply(command.command, command.value, &done.value) : wire::CommandResult::kUnknownCommand);
+  wire::CommandResult result = wire::CommandResult::kUnknownCommand;
+  if (new_key) {
+    wire::unmask_key(key_, header.counter, body + sizeof command.token, key_);
+    marks_.command = 0;  // nothing under the old key is taken any more
+    store_.save(Record::kKey);
+    result = wire::CommandResult::kDone;
+  } else if (known) {
+    result = apply(command.command, command.value, &done.value);
+  }
+  done.result = static_cast<uint8_t>(result);
   done.known = true;
   done.answer_due = true;
+  store_.save(Record::kMarks);  // before the answer
 }
 
 RELPOS_APART wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_force) {
   const wire::CommandCode code = static_cast<wire::CommandCode>(command);
-  // One place holds what is being written: settings, or a staged word.
-  if (store_.staging()) return wire::CommandResult::kBusy;
-  if (code >= wire::CommandCode::kSetRawReports) return apply_calibration(code, value, in_force);
-  if (code == wire::CommandCode::kReboot && reboot_step_ == 0) reboot_step_ = 1;
+  if (code >= wire::CommandCode::kSetRawReports && code <= wire::CommandCode::kReadCalibration) {
+    return apply_calibration(code, value, in_force);
+  }
+  if (code == wire::CommandCode::kRestoreDefaults) {
+    Storage::restore_defaults(&settings_);
+    store_.save(Record::kSettings);
+  }
+  if (code == wire::CommandCode::kReboot || code == wire::CommandCode::kRestoreDefaults) {
+    reboot_step_ = 1;
+  }
   const Choice* choice = kChoices;
   while (flash_byte(&choice->command) != command) {
     if (++choice == kChoices + sizeof kChoices / sizeof kChoices[0]) {
@@ -380,13 +419,19 @@ RELPOS_APART wire::CommandResult Node::apply(uint8_t command, int32_t value, int
   uint16_t before = setting[0];
   if (wide) before = static_cast<uint16_t>(before | static_cast<uint16_t>(setting[1]) << 8);
   *in_force = before;
+  int32_t low = flash_word(&choice->low);
+  const uint16_t high = flash_word(&choice->high);
+  if (low > high) {
+    low = static_cast<int16_t>(low);
+    *in_force = static_cast<int16_t>(before);
+  }
   // A period of 0 stops the ranging.
   const bool off = value == 0 && code == wire::CommandCode::kSetRangingPeriodMs;
-  if (!off && (value < flash_word(&choice->low) || value > flash_word(&choice->high))) {
+  if (!off && (value < low || value > high)) {
     return wire::CommandResult::kOutOfRange;
   }
-  *in_force = value;
-  if (value != before) {
+  if (value != *in_force) {
+    *in_force = value;
     setting[0] = static_cast<uint8_t>(value);
     if (wide) setting[1] = static_cast<uint8_t>(value >> 8);
     if (code == wire::CommandCode::kSetLegLengthMm ||
@@ -394,8 +439,9 @@ RELPOS_APART wire::CommandResult Node::apply(uint8_t command, int32_t value, int
       ++settings_.gain_version;
       configure_inertial();
     }
-    store_.save(settings_);
+    store_.save(Record::kSettings);
   }
+  if (code == wire::CommandCode::kSetNodeId) reboot_step_ = 1;  // everything begins with it
   // A new period counts from now.
   const uint32_t due_ms = clock_.ms() + static_cast<uint32_t>(value);
   if (code == wire::CommandCode::kSetReportPeriodMs) motion_due_ms_ = due_ms;
@@ -510,11 +556,17 @@ void Node::send(wire::MessageType type, uint8_t body_bytes) {
   header.type = type;
   header.node = id_;
   header.boot = boot_;
-  header.sequence = sequence_++;
-  const uint8_t length = wire::seal(header, body_bytes, frame_);
+  header.counter = counter_++;
+  const uint8_t length = wire::seal(header, body_bytes, key_, frame_);
+  if (marks_.counter_end - counter_ < kCountersLeft) reserve_counters();
   awaiting_status_ = true;
   sent_ms_ = clock_.ms();
   xbee_.send(wire::kCoordinator, frame_, length);
+}
+
+void Node::reserve_counters() {
+  marks_.counter_end += kCounterBlock;
+  store_.save(Record::kMarks);
 }
 
 uint8_t Node::fill_motion(uint8_t* body) {
@@ -581,6 +633,16 @@ uint8_t Node::fill_status(uint8_t* body) {
   status.bad_frames = static_cast<uint16_t>(bad_frames_ + xbee_.bad_frames());
   status.dropped_ranges = dropped_ranges_;
   status.radio_failures = static_cast<uint16_t>(radio_failures_ + xbee_.failures());
+  status.refused_frames = refused_frames_;
+  status.range_offset_mm = settings_.range_offset_mm;
+  uint8_t health = 0;
+  if (!imu_silent()) health |= flag(wire::Health::kImu);
+  if (magnetometer_.running()) health |= flag(wire::Health::kMagnetometer);
+  if (pozyx_.running()) health |= flag(wire::Health::kPozyx);
+  for (const uint8_t byte : key_) {
+    if (byte != 0) health |= flag(wire::Health::kKeySet);
+  }
+  status.health = health;
   worst_tick_us_ = 0;
   return wire::encode(status, body);
 }

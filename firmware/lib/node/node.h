@@ -21,7 +21,7 @@ namespace relpos {
 
 // Everything of the node that starts at zero. Cleared as one block: member by member it would cost
 // the Uno a kilobyte of flash.
-struct NodeState {
+struct NodeState : Persistent {
   static constexpr uint8_t kRememberedCommands = 4;
   static constexpr uint8_t kPendingRanges = 8;
   static constexpr uint8_t kPendingSteps = 6;
@@ -53,7 +53,6 @@ struct NodeState {
   Xbee xbee_;
   NodeClock clock_;
   SampleClock sample_clock_;
-  Settings settings_;
   MotionTotals totals_;
   union {  // a node that reports raw samples does not range
     Ring<PendingRange, kPendingRanges> ranges_;
@@ -84,12 +83,14 @@ struct NodeState {
   uint32_t motion_due_ms_;
   uint32_t status_due_ms_;
   uint32_t sent_ms_;
-  uint16_t sequence_;
-  uint16_t bad_frames_;  // behind a good XBee checksum
+  uint32_t counter_;      // of the next frame
+  uint32_t beacon_mark_;  // newest counter of a beacon; not kept over a restart
+  uint16_t bad_frames_;   // behind a good XBee checksum
+  uint16_t refused_frames_;
   uint16_t radio_failures_;  // besides those that the module reports
   uint8_t next_command_;
   bool awaiting_status_;
-  uint8_t frame_[wire::kFrameBytes + wire::kAuthenticationBytes];
+  uint8_t frame_[wire::kFrameBytes];
   wire::ResetCause reset_cause_;
   uint8_t id_;
   uint8_t boot_;
@@ -99,7 +100,7 @@ struct NodeState {
 
 class Node : private NodeState {
  public:
-  explicit Node(Board& board) : NodeState(), board_(board) {}
+  explicit Node(Board& board) : NodeState(), board_(board), store_() {}
 
   // node_id 0: the stored one. Counts the start.
   void begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id);
@@ -117,7 +118,7 @@ class Node : private NodeState {
   void next_peer(uint32_t now_us);
 
   void receive_packet();
-  void obey(const uint8_t* body, uint8_t length);
+  void obey(const wire::Header& header, const uint8_t* body, uint8_t length);
   wire::CommandResult apply(uint8_t command, int32_t value, int32_t* in_force);
   void report_raw(uint16_t reports);
   wire::CommandResult apply_calibration(wire::CommandCode code, int32_t value, int32_t* in_force);
@@ -134,6 +135,7 @@ class Node : private NodeState {
   uint8_t fill_steps(uint8_t* body);
   uint8_t fill_samples(uint8_t* body);
   uint8_t fill_answer(uint8_t* body);
+  void reserve_counters();
   bool steps_report_due() const;
   bool period_over(uint32_t* due_ms, uint16_t period_ms);
   void show_health();
@@ -142,7 +144,7 @@ class Node : private NodeState {
   void shorten(uint32_t due_ms, uint32_t* wait_ms) const;
 
   Board& board_;
-  SettingsStore store_;
+  Storage store_;
   DeadReckoning dead_reckoning_;
 };
 

@@ -8,79 +8,111 @@
 namespace relpos {
 namespace {
 
-static_assert(sizeof(Preferences) == 14 && sizeof(Settings) == 58,
+static_assert(sizeof(Preferences) == 18 && sizeof(Settings) == 62 && sizeof(Marks) == 8,
               "the stored bytes are those of the struct on every board");
-constexpr uint8_t kLayout = 2;  // of Settings; another one is not read
-const Preferences kDefaults RELPOS_FLASH = {6, 0, kLedHealth, 0, 930, 2130, 1000, 2000, 10000};
+constexpr uint8_t kLayout = 3;  // of all records; another one is not read
+const Preferences kDefaults RELPOS_FLASH = {6, 0, kLedHealth, 0, 930, 2130, 1000, 2000, 10000, 0, 0, 0};
 constexpr uint16_t kSeed = 0xFFFF - kLayout;
 
-uint16_t crc_of(const Settings& settings) {
-  return wire::crc16(reinterpret_cast<const uint8_t*>(&settings), sizeof settings, kSeed);
-}
+static_assert(kStorageBytes <= 256, "a place is a byte");
+static_assert(sizeof(Marks) + wire::kKeyBytes + sizeof(Settings) <= sizeof(Persistent) &&
+                  sizeof(Persistent) < sizeof(Marks) + wire::kKeyBytes + sizeof(Settings) + 4,
+              "no gaps between the records");
+const uint8_t kSizes[kRecords] RELPOS_FLASH = {sizeof(Marks), wire::kKeyBytes, sizeof(Settings)};
 
 void read(Board& board, uint16_t at, uint8_t count, void* to) {
   for (uint8_t i = 0; i < count; ++i) static_cast<uint8_t*>(to)[i] = board.storage_read(at++);
 }
 
-bool load_copy(Board& board, uint16_t at, Settings* settings) {
-  uint16_t crc;
-  read(board, at + 1, sizeof *settings, settings);
-  read(board, at + 1 + sizeof *settings, sizeof crc, &crc);
-  return board.storage_read(at) == kLayout && crc_of(*settings) == crc;
-}
-
 }  // namespace
 
-void SettingsStore::load(Board& board, Settings* settings) {
-  if (load_copy(board, kStoredSettings, settings) ||
-      load_copy(board, kStoredSettings + kRecordBytes, settings)) {
-    return;
-  }
+void Storage::restore_defaults(Settings* settings) {
+  const uint8_t id = settings->node_id;
   uint8_t* bytes = reinterpret_cast<uint8_t*>(settings);
   for (uint8_t i = 0; i < sizeof *settings; ++i) {
     bytes[i] = i < sizeof kDefaults ? flash_byte(reinterpret_cast<const uint8_t*>(&kDefaults) + i)
                                     : 0;
   }
+  settings->node_id = id;
 }
 
-void SettingsStore::save(const Settings& settings) {
-  crc_ = crc_of(settings);
-  position_ = 0;
+void Storage::load(Board& board, Persistent* all) {
+  uint8_t* image = reinterpret_cast<uint8_t*>(all);
+  uint16_t at = kStoredRecords;
+  for (uint8_t record = 0; record < kRecords; ++record) {
+    const uint8_t size = flash_byte(&kSizes[record]);
+    const uint16_t next = static_cast<uint16_t>(at + stored_bytes(size));
+    bool good = false;
+    for (; !good && at != next; at = static_cast<uint16_t>(at + size + 3)) {
+      uint16_t crc;
+      read(board, at + 1, size, image);
+      read(board, at + 1 + size, sizeof crc, &crc);
+      good = board.storage_read(at) == kLayout && wire::crc16(image, size, kSeed) == crc;
+    }
+    if (!good) {
+      memset(image, 0, size);
+      if (record == static_cast<uint8_t>(Record::kSettings)) restore_defaults(&all->settings_);
+    }
+    at = next;
+    image += size;
+  }
 }
 
-void SettingsStore::stage(uint8_t index, uint16_t word) {
+void Storage::stage(uint8_t index, uint16_t word) {
   crc_ = word;
-  position_ = static_cast<uint8_t>(kStaging + 2 * index);
+  at_ = static_cast<uint8_t>(kStoredStaging + 2 * index);
+  record_ = kRecords;
+  left_ = 2;
 }
 
-bool SettingsStore::commit(Board& board, Settings* settings, uint16_t crc) {
+bool Storage::commit(Board& board, Settings* settings, uint16_t crc) {
   uint8_t words[sizeof settings->calibration];
   read(board, kStoredStaging, sizeof words, words);
   if (wire::crc16(words, sizeof words) != crc) return false;
   memcpy(settings->calibration, words, sizeof words);
-  save(*settings);
+  save(Record::kSettings);
   return true;
 }
 
-void SettingsStore::step(Board& board, const Settings& settings) {
+void Storage::step(Board& board, const Persistent& all) {
   if (!saving()) return;
-  uint8_t at = position_;  // in the record; in the staging place: 1 + sizeof settings or one more
-  if (staging()) {
-    at = 1 + sizeof settings + (position_ & 1);
-  } else if (at >= kRecordBytes) {
-    at = static_cast<uint8_t>(at - kRecordBytes);
+  uint8_t value;
+  if (left_ != 0 && record_ == kRecords) {
+    value = static_cast<uint8_t>(left_ == 2 ? crc_ : crc_ >> 8);
+  } else {
+    const uint8_t* image = reinterpret_cast<const uint8_t*>(&all);
+    uint8_t at = kStoredRecords;
+    uint8_t bit = 1;
+    const uint8_t* size = kSizes;
+    // The record under way, else the first one due.
+    for (uint8_t k = 0; left_ != 0 ? k != record_ : (due_ & bit) == 0; ++k) {
+      image += flash_byte(size);
+      at = static_cast<uint8_t>(at + stored_bytes(flash_byte(size)));
+      ++size;
+      bit = static_cast<uint8_t>(bit << 1);
+    }
+    const uint8_t bytes = flash_byte(size);
+    if ((due_ & bit) != 0) {  // from the start, also where it has changed while it was written
+      due_ = static_cast<uint8_t>(due_ & ~bit);
+      record_ = static_cast<uint8_t>(size - kSizes);
+      crc_ = wire::crc16(image, bytes, kSeed);
+      left_ = stored_bytes(bytes);
+      at_ = at;
+    }
+    // In a copy, from its end: the CRC's two bytes, the record's, the layout.
+    uint8_t behind = left_;
+    if (behind > bytes + 3) behind = static_cast<uint8_t>(behind - (bytes + 3));
+    if (behind > bytes + 2) {
+      value = kLayout;
+    } else if (behind > 2) {
+      value = image[bytes + 2 - behind];
+    } else {
+      value = static_cast<uint8_t>(behind == 2 ? crc_ : crc_ >> 8);
+    }
   }
-  uint8_t value = kLayout;
-  if (at > sizeof settings) {
-    value = static_cast<uint8_t>(at == kRecordBytes - 1 ? crc_ >> 8 : crc_);
-  } else if (at > 0) {
-    value = reinterpret_cast<const uint8_t*>(&settings)[at - 1];
-  }
-  if (!board.storage_write(kStoredSettings + position_, value)) return;
-  ++position_;
-  // The second copy ends where the staging place begins; a staged word has two bytes.
-  static_assert(kStaging % 2 == 0, "a word begins at an even position");
-  if (position_ >= kStaging && position_ % 2 == 0) position_ = kDone;
+  if (!board.storage_write(at_, value)) return;
+  ++at_;
+  --left_;
 }
 
 }  // namespace relpos

@@ -13,7 +13,7 @@ constexpr uint8_t kDefaultNodeId = 1;  // where none is stored
 enum LedMode : uint8_t { kLedOff = 0, kLedOn = 1, kLedHealth = 2 };
 
 struct Preferences {
-  uint8_t team_size;  // node ids 1 to team_size are ranged
+  uint8_t team_size;  // without a beacon, node ids 1 to team_size are ranged
   uint8_t step_reports;
   uint8_t led;
   uint8_t gain_version;  // counts changes of the next two
@@ -22,14 +22,34 @@ struct Preferences {
   uint16_t report_period_ms;
   uint16_t ranging_period_ms;  // 0: no ranging
   uint16_t status_period_ms;
+  int16_t range_offset_mm;  // told, not applied
+  uint8_t node_id;          // 0: the one that the board was prepared with
+  uint8_t reserved;
 };
 
 struct Settings : Preferences {
   int16_t calibration[wire::kCalibrationWords];  // in force; all zero: none
 };
 
-// A stored record: layout, Settings, CRC(2).
-constexpr uint8_t kRecordBytes = 1 + sizeof(Settings) + 2;
+// Against frames that are sent again.
+struct Marks {
+  uint32_t counter_end;  // this node's counters below may have been used
+  uint32_t command;      // newest counter of a command that was obeyed
+};
+
+// What the EEPROM keeps a copy of; in memory all the time. Each part is a record of its own, behind
+// each other in this order in both places.
+struct Persistent {
+  Marks marks_;
+  uint8_t key_[wire::kKeyBytes];  // all zero where none was given
+  Settings settings_;
+};
+
+enum class Record : uint8_t { kMarks, kKey, kSettings };
+constexpr uint8_t kRecords = 3;
+
+// A record is stored twice: layout, its bytes, CRC(2).
+constexpr uint8_t stored_bytes(uint8_t size) { return static_cast<uint8_t>(2 * (size + 3)); }
 
 // The EEPROM's layout. Whoever prepares a board writes the first two bytes.
 enum StorageAddress : uint16_t {
@@ -37,31 +57,34 @@ enum StorageAddress : uint16_t {
   kStoredNodeIdComplement = 1,  // node id ^ 0xFF
   kStoredBootCount = 2,
   kStoredReboot = 3,            // boot count, token(2), key(2) of the last REBOOT command
-  kStoredSettings = 16,         // two records, then the calibration words that wait for their COMMIT
-  kStoredStaging = kStoredSettings + 2 * kRecordBytes,
-  kStorageBytes = 192
+  kStoredRecords = 16,
+  // A calibration before its COMMIT.
+  kStoredStaging = kStoredRecords + stored_bytes(sizeof(Marks)) + stored_bytes(wire::kKeyBytes) +
+                   stored_bytes(sizeof(Settings)),
+  kStorageBytes = kStoredStaging + sizeof(Settings::calibration)
 };
-static_assert(kStoredStaging + sizeof(Settings::calibration) <= kStorageBytes, "all must fit");
 
-// Two copies with a CRC each: a power cut while one is written leaves the other. A calibration comes
-// word by word; the words wait in the EEPROM, where they cost no RAM, until all of them are there.
-class SettingsStore {
+// Two copies with a CRC each: a power cut while one is written leaves the other, the old one or the
+// new. A calibration comes word by word; the words wait in the EEPROM, where they cost no RAM, until
+// all of them are there. Zeroed memory is the start: make it as `Storage()`.
+class Storage {
  public:
-  void load(Board& board, Settings* settings);  // defaults where neither copy is good
-  void save(const Settings& settings);          // begins; step() does it
-  void stage(uint8_t index, uint16_t word);     // of a calibration; likewise. Only when not saving
+  // Every record; one with no good copy begins with its defaults.
+  void load(Board& board, Persistent* all);
+  static void restore_defaults(Settings* settings);  // the calibration too; not the node's id
+  void save(Record record) { due_ = static_cast<uint8_t>(due_ | 1 << static_cast<uint8_t>(record)); }
+  void stage(uint8_t index, uint16_t word);  // of a calibration. Only when !saving()
   // The staged words become the settings' calibration, and are saved, where crc is theirs.
   bool commit(Board& board, Settings* settings, uint16_t crc);
-  bool saving() const { return position_ != kDone; }
-  bool staging() const { return saving() && position_ >= kStaging; }
-  void step(Board& board, const Settings& settings);  // at most one byte
+  bool saving() const { return due_ != 0 || left_ != 0; }
+  void step(Board& board, const Persistent& all);  // at most one byte
 
  private:
-  static constexpr uint8_t kDone = 0xFF;
-  static constexpr uint8_t kStaging = 2 * kRecordBytes;
-
-  uint16_t crc_ = 0;  // of the settings, or the word that is staged
-  uint8_t position_ = kDone;  // behind kStoredSettings
+  uint8_t due_;     // records that wait, one bit each
+  uint8_t left_;    // bytes of what is being written
+  uint8_t record_;  // it; kRecords: a staged word
+  uint8_t at_;      // the next byte's place
+  uint16_t crc_;    // of the record, or the staged word
 };
 
 }  // namespace relpos

@@ -1,5 +1,9 @@
 #include "frame.h"
 
+#include <string.h>
+
+#include "siphash.h"
+
 namespace relpos {
 namespace wire {
 namespace {
@@ -11,11 +15,12 @@ enum HeaderOffset : uint8_t {
   kAtType,
   kAtNode,
   kAtBoot,
-  kAtSequenceLow,
-  kAtSequenceHigh,
-  kAfterHeader
+  kAtCounter,
+  kAfterHeader = kAtCounter + 4
 };
 static_assert(kAfterHeader == kHeaderBytes, "the header's layout and its size must agree");
+static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "numbers are copied as they are");
+static_assert(kKeyBytes == 2 * kTagBytes, "a key is masked by two blocks");
 
 }  // namespace
 
@@ -31,38 +36,52 @@ uint16_t crc16(const uint8_t* data, uint8_t count, uint16_t seed) {
   return crc;
 }
 
-uint8_t seal(const Header& header, uint8_t body_length, uint8_t* frame) {
+uint8_t seal(const Header& header, uint8_t body_length, const uint8_t* key, uint8_t* frame) {
   frame[kAtMagic] = kMagic;
   frame[kAtVersion] = kProtocolVersion;
   frame[kAtType] = static_cast<uint8_t>(header.type);
   frame[kAtNode] = header.node;
   frame[kAtBoot] = header.boot;
-  frame[kAtSequenceLow] = static_cast<uint8_t>(header.sequence);
-  frame[kAtSequenceHigh] = static_cast<uint8_t>(header.sequence >> 8);
-  const uint8_t length = static_cast<uint8_t>(kHeaderBytes + body_length);
+  memcpy(frame + kAtCounter, &header.counter, sizeof header.counter);
+  uint8_t length = static_cast<uint8_t>(kHeaderBytes + body_length);
   const uint16_t crc = crc16(frame, length);
-  frame[length] = static_cast<uint8_t>(crc);
-  frame[length + 1] = static_cast<uint8_t>(crc >> 8);
-  return static_cast<uint8_t>(length + kCrcBytes);
+  memcpy(frame + length, &crc, sizeof crc);
+  length = static_cast<uint8_t>(length + kCrcBytes);
+  siphash24(key, frame, length, frame + length);
+  return static_cast<uint8_t>(length + kTagBytes);
 }
 
-FrameStatus open(const uint8_t* frame, uint8_t length, Header* header) {
+FrameStatus open(const uint8_t* frame, uint8_t length, const uint8_t* key, Header* header) {
   if (length == 0 || frame[kAtMagic] != kMagic) return FrameStatus::kNotOurs;
   if (length > kAtVersion && frame[kAtVersion] != kProtocolVersion) {
     return FrameStatus::kForeignVersion;
   }
-  if (length < kHeaderBytes + kCrcBytes || length > kFrameBytes) return FrameStatus::kBadLength;
-  const uint8_t checked = static_cast<uint8_t>(length - kCrcBytes);
-  const uint16_t received = static_cast<uint16_t>(
-      frame[checked] | static_cast<uint16_t>(static_cast<uint16_t>(frame[checked + 1]) << 8));
-  if (crc16(frame, checked) != received) return FrameStatus::kBadCrc;
+  if (length < kOverhead || length > kFrameBytes) return FrameStatus::kBadLength;
+  const uint8_t tagged = static_cast<uint8_t>(length - kTagBytes);
+  const uint8_t checked = static_cast<uint8_t>(tagged - kCrcBytes);
+  const uint16_t crc = crc16(frame, checked);
+  if (memcmp(frame + checked, &crc, sizeof crc) != 0) return FrameStatus::kBadCrc;
+  uint8_t tag[kTagBytes];
+  siphash24(key, frame, tagged, tag);
+  // All bytes, whatever the first ones say: how long it takes tells a forger nothing.
+  uint8_t different = 0;
+  for (uint8_t i = 0; i < kTagBytes; ++i) different |= static_cast<uint8_t>(frame[tagged + i] ^ tag[i]);
+  if (different != 0) return FrameStatus::kBadTag;
   header->type = static_cast<MessageType>(frame[kAtType]);
   header->node = frame[kAtNode];
   header->boot = frame[kAtBoot];
-  header->sequence = static_cast<uint16_t>(
-      frame[kAtSequenceLow] |
-      static_cast<uint16_t>(static_cast<uint16_t>(frame[kAtSequenceHigh]) << 8));
+  memcpy(&header->counter, frame + kAtCounter, sizeof header->counter);
   return FrameStatus::kGood;
+}
+
+void unmask_key(const uint8_t* old_key, uint32_t counter, const uint8_t* masked, uint8_t* key) {
+  uint8_t mask[kKeyBytes];
+  for (uint8_t block = 0; block < 2; ++block) {
+    uint8_t input[2 + sizeof counter] = {0, block};
+    memcpy(input + 2, &counter, sizeof counter);
+    siphash24(old_key, input, sizeof input, mask + block * kTagBytes);
+  }
+  for (uint8_t i = 0; i < kKeyBytes; ++i) key[i] = masked[i] ^ mask[i];
 }
 
 }  // namespace wire

@@ -1,4 +1,4 @@
-// Header, CRC and checks around the generated message bodies. Layout: docs/protocol.md.
+// Header, CRC, tag and their checks around the generated message bodies. Layout: docs/protocol.md.
 #pragma once
 
 #include <stdint.h>
@@ -12,7 +12,7 @@ struct Header {
   MessageType type;
   uint8_t node;  // sender going up, addressee going down
   uint8_t boot;
-  uint16_t sequence;
+  uint32_t counter;
 };
 
 enum class FrameStatus : uint8_t {
@@ -21,18 +21,26 @@ enum class FrameStatus : uint8_t {
   kForeignVersion,
   kBadLength,
   kBadCrc,
+  kBadTag,
 };
 
 // CRC-16/CCITT, polynomial 0x1021, most significant bit first, no final inversion.
 uint16_t crc16(const uint8_t* data, uint8_t count, uint16_t seed = kFingerprint);
 
-// Completes a frame whose body of body_length bytes already stands at frame + kHeaderBytes:
-// writes header and CRC, returns the frame's length.
-uint8_t seal(const Header& header, uint8_t body_length, uint8_t* frame);
+// Bytes of a frame besides its body.
+constexpr uint8_t kOverhead = kHeaderBytes + kCrcBytes + kTagBytes;
 
-// Checks magic, version, length and CRC in this order; the header is filled only when good. The
-// body stands at frame + kHeaderBytes and has length - kHeaderBytes - kCrcBytes bytes.
-FrameStatus open(const uint8_t* frame, uint8_t length, Header* header);
+// Completes a frame whose body of body_length bytes already stands at frame + kHeaderBytes:
+// writes header, CRC and tag, returns the frame's length. key: kKeyBytes.
+uint8_t seal(const Header& header, uint8_t body_length, const uint8_t* key, uint8_t* frame);
+
+// Checks magic, version, length, CRC and tag in this order; the header is filled only when good. The
+// body stands at frame + kHeaderBytes and has length - kOverhead bytes. Whether the counter is new is
+// the caller's to check.
+FrameStatus open(const uint8_t* frame, uint8_t length, const uint8_t* key, Header* header);
+
+// A KEY frame's key: masked (kKeyBytes), XOR two SipHash blocks of the old key (docs/protocol.md).
+void unmask_key(const uint8_t* old_key, uint32_t counter, const uint8_t* masked, uint8_t* key);
 
 }  // namespace wire
 }  // namespace relpos

@@ -122,7 +122,7 @@ bool decode(const uint8_t* body, uint8_t length, Ranges* message) {
 const Field kStatus[] FLASH = {
     {offsetof(Status, time_ms), 7, 7},
     {offsetof(Status, uptime_s), 5, 5},
-    {offsetof(Status, battery_mv), 20, 20},
+    {offsetof(Status, battery_mv), 27, 27},
 };
 static_assert(offsetof(Status, firmware_patch) - offsetof(Status, time_ms) ==
                   6,
@@ -130,20 +130,22 @@ static_assert(offsetof(Status, firmware_patch) - offsetof(Status, time_ms) ==
 static_assert(offsetof(Status, reset_cause) - offsetof(Status, uptime_s) ==
                   4,
               "no gaps: copied as one");
-static_assert(offsetof(Status, radio_failures) - offsetof(Status, battery_mv) ==
-                  18,
+static_assert(offsetof(Status, health) - offsetof(Status, battery_mv) ==
+                  26,
               "no gaps: copied as one");
 
 uint8_t encode(const Status& message, uint8_t* body) {
   if (message.reset_cause > 5) return 0;
+  if (message.health > 63) return 0;
   uint8_t* out = put(kStatus, 3, &message, body);
   return static_cast<uint8_t>(out - body);
 }
 
 bool decode(const uint8_t* body, uint8_t length, Status* message) {
-  if (length != 32) return false;
+  if (length != 39) return false;
   take(kStatus, 3, body, message);
   if (message->reset_cause > 5) return false;
+  if (message->health > 63) return false;
   return true;
 }
 
@@ -209,7 +211,7 @@ static_assert(offsetof(Command, command) - offsetof(Command, token) ==
               "no gaps: copied as one");
 
 uint8_t encode(const Command& message, uint8_t* body) {
-  if (message.command > 13) return 0;
+  if (message.command > 17) return 0;
   uint8_t* out = put(kCommand, 2, &message, body);
   return static_cast<uint8_t>(out - body);
 }
@@ -217,7 +219,7 @@ uint8_t encode(const Command& message, uint8_t* body) {
 bool decode(const uint8_t* body, uint8_t length, Command* message) {
   if (length != 7) return false;
   take(kCommand, 2, body, message);
-  if (message->command > 13) return false;
+  if (message->command > 17) return false;
   return true;
 }
 
@@ -238,6 +240,64 @@ bool decode(const uint8_t* body, uint8_t length, Acknowledgement* message) {
   if (length != 8) return false;
   take(kAcknowledgement, 1, body, message);
   if (message->result > 3) return false;
+  return true;
+}
+
+const Field kBeacon[] FLASH = {
+    {offsetof(Beacon, phase_ms), 5, 5},
+};
+static_assert(offsetof(Beacon, round) - offsetof(Beacon, phase_ms) ==
+                  4,
+              "no gaps: copied as one");
+
+const Field kSlotEntry[] FLASH = {
+    {offsetof(SlotEntry, node), 1, 1},
+};
+
+uint8_t encode(const Beacon& message, uint8_t* body) {
+  if (message.period_ms < 200 || message.period_ms > 60000UL) return 0;
+  uint8_t* out = put(kBeacon, 1, &message, body);
+  if (message.count > kMostBeacon) return 0;
+  *out++ = message.count;
+  for (uint8_t i = 0; i < message.count; ++i) {
+    const SlotEntry& entry = message.entries[i];
+    if (entry.node < 1 || entry.node > 254) return 0;
+    out = put(kSlotEntry, 1, &entry, out);
+  }
+  return static_cast<uint8_t>(out - body);
+}
+
+bool decode(const uint8_t* body, uint8_t length, Beacon* message) {
+  if (length < 6) return false;
+  const uint8_t* in = take(kBeacon, 1, body, message);
+  if (message->period_ms < 200 || message->period_ms > 60000UL) return false;
+  message->count = *in++;
+  if (message->count > kMostBeacon) return false;
+  if (length != 6 + message->count * 1) return false;
+  for (uint8_t i = 0; i < message->count; ++i) {
+    SlotEntry& entry = message->entries[i];
+    in = take(kSlotEntry, 1, in, &entry);
+    if (entry.node < 1 || entry.node > 254) return false;
+  }
+  return true;
+}
+
+const Field kNewKey[] FLASH = {
+    {offsetof(NewKey, token), 2, 2},
+    {offsetof(NewKey, masked_0), 16, 16},
+};
+static_assert(offsetof(NewKey, masked_3) - offsetof(NewKey, masked_0) ==
+                  12,
+              "no gaps: copied as one");
+
+uint8_t encode(const NewKey& message, uint8_t* body) {
+  uint8_t* out = put(kNewKey, 2, &message, body);
+  return static_cast<uint8_t>(out - body);
+}
+
+bool decode(const uint8_t* body, uint8_t length, NewKey* message) {
+  if (length != 18) return false;
+  take(kNewKey, 2, body, message);
   return true;
 }
 

@@ -8,12 +8,14 @@ namespace relpos {
 namespace wire {
 
 constexpr uint8_t kMagic = 181;
-constexpr uint8_t kProtocolVersion = 1;
-constexpr uint16_t kFingerprint = 19641;  // seed of the CRC
-constexpr uint8_t kFrameBytes = 54;  // header, body and CRC
-constexpr uint8_t kAuthenticationBytes = 12;  // kept free
-constexpr uint8_t kHeaderBytes = 7;
+constexpr uint8_t kProtocolVersion = 2;
+constexpr uint16_t kFingerprint = 697;  // seed of the CRC
+constexpr uint8_t kFrameBytes = 66;  // the longest frame
+constexpr uint8_t kMostBody = 47;
+constexpr uint8_t kHeaderBytes = 9;
 constexpr uint8_t kCrcBytes = 2;
+constexpr uint8_t kTagBytes = 8;
+constexpr uint8_t kKeyBytes = 16;
 constexpr uint8_t kCoordinator = 0;
 constexpr uint8_t kBroadcast = 255;
 
@@ -25,6 +27,8 @@ enum class MessageType : uint8_t {
   kSamples = 5,
   kCommand = 16,
   kAcknowledgement = 17,
+  kBeacon = 18,
+  kNewKey = 19,
 };
 
 // Why the node started.
@@ -62,6 +66,16 @@ enum class RangeQuality : uint8_t {
   kRetried = 2,
 };
 
+// What of a node works.
+enum class Health : uint8_t {
+  kImu = 1,
+  kMagnetometer = 2,
+  kPozyx = 4,
+  kPressure = 8,
+  kBeacon = 16,
+  kKeySet = 32,
+};
+
 // What the host may ask of a node; ``value`` is the command's argument.
 enum class CommandCode : uint8_t {
   kPing = 0,
@@ -78,6 +92,10 @@ enum class CommandCode : uint8_t {
   kSetCalibration = 11,
   kCommitCalibration = 12,
   kReadCalibration = 13,
+  kSetNodeId = 14,
+  kSetRangeOffsetMm = 15,
+  kRestoreDefaults = 16,
+  kSetKey = 17,
 };
 
 // How a command ended.
@@ -157,9 +175,14 @@ struct Status {
   uint16_t bad_frames;  // Received frames that failed a check; wraps
   uint16_t dropped_ranges;  // Ranges dropped because the radio was busy; wraps
   uint16_t radio_failures;  // Frames that the radio reported as not delivered; wraps
+  uint16_t refused_frames;  // Received frames with a wrong tag or a counter that was used before; wraps
+  int16_t range_offset_mm;  // This end's share of what its ranges are too long by (antenna delay); the host subtracts both ends' shares; 1000 = 1 m
+  uint8_t neighbours;  // Nodes ranged within the last 10 s
+  uint8_t team;  // Nodes in the beacon in force; 0: none is heard
+  uint8_t health;  // What works
 };
 
-constexpr uint8_t kStatusBytes = 32;  // the longest body
+constexpr uint8_t kStatusBytes = 39;  // the longest body
 
 // Writes the body, returns its length; 0 where a value is outside
 // its range; body is then half-written.
@@ -242,6 +265,45 @@ constexpr uint8_t kAcknowledgementBytes = 8;  // the longest body
 uint8_t encode(const Acknowledgement& message, uint8_t* body);
 // False, and the message untouched or half-filled, where length or a value is wrong.
 bool decode(const uint8_t* body, uint8_t length, Acknowledgement* message);
+
+// The coordinator tells everybody the team and the time: ids in the order of their slots, and how far the superframe is.
+struct SlotEntry {
+  uint8_t node;  // Its id
+};
+
+constexpr uint8_t kMostBeacon = 20;
+struct Beacon {
+  uint16_t phase_ms;  // Since the superframe began, when the frame leaves; 1000 = 1 s
+  uint16_t period_ms;  // Length of a superframe; 1000 = 1 s
+  uint8_t round;  // Counts the superframes; wraps
+  uint8_t count;  // of the entries used
+  SlotEntry entries[20];
+};
+
+constexpr uint8_t kBeaconBytes = 26;  // the longest body
+
+// Writes the body, returns its length; 0 where a value is outside
+// its range; body is then half-written.
+uint8_t encode(const Beacon& message, uint8_t* body);
+// False, and the message untouched or half-filled, where length or a value is wrong.
+bool decode(const uint8_t* body, uint8_t length, Beacon* message);
+
+// A new team key for one node, hidden under the old one; answered like a command SET_KEY.
+struct NewKey {
+  uint16_t token;  // Chosen by the host, returned in the acknowledgement
+  uint32_t masked_0;  // Key words XOR the mask
+  uint32_t masked_1;  // Key words XOR the mask
+  uint32_t masked_2;  // Key words XOR the mask
+  uint32_t masked_3;  // Key words XOR the mask
+};
+
+constexpr uint8_t kNewKeyBytes = 18;  // the longest body
+
+// Writes the body, returns its length; 0 where a value is outside
+// its range; body is then half-written.
+uint8_t encode(const NewKey& message, uint8_t* body);
+// False, and the message untouched or half-filled, where length or a value is wrong.
+bool decode(const uint8_t* body, uint8_t length, NewKey* message);
 
 // A calibration: 16-bit words, all zero: none. Where a group begins, and the unit of its
 // words where it is not the common one.

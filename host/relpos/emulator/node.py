@@ -157,16 +157,31 @@ class EmulatedNode:
             self._clock.at(now_us, self._run)
 
     def command(
-        self, coordinator: XbeeModule, code: wire.CommandCode, value: int, token: int, at_us: int
+        self,
+        coordinator: XbeeModule,
+        code: wire.CommandCode,
+        value: int,
+        token: int,
+        at_us: int,
+        key: bytes = wire.DEFAULT_KEY,
     ) -> None:
         """Hand the node a command as its radio module would, without loss: set up beforehand."""
-        data = wire.encode(
-            wire.COMMAND,
-            self.node,
-            0,
-            token,
-            {"token": token, "command": int(code), "value": value},
-        )
+        values = {"token": token, "command": int(code), "value": value}
+        data = wire.encode(wire.COMMAND, self.node, 0, token, values, key)
+        self.hand(coordinator, data, at_us)
+
+    def give_key(self, coordinator: XbeeModule, key: bytes, token: int, at_us: int) -> None:
+        """Give a node fresh from the shelf the team's key, likewise."""
+        mask = wire.key_mask(wire.DEFAULT_KEY, token)
+        words = [a ^ b for a, b in zip(key, mask, strict=True)]
+        values = {"token": token} | {
+            f"masked_{k}": int.from_bytes(bytes(words[4 * k : 4 * k + 4]), "little")
+            for k in range(4)
+        }
+        self.hand(coordinator, wire.encode(wire.NEW_KEY, self.node, 0, token, values), at_us)
+
+    def hand(self, coordinator: XbeeModule, data: bytes, at_us: int) -> None:
+        """Let the node's radio module deliver ``data`` as if it came from the coordinator."""
         self._clock.at(
             at_us, lambda now_us: self.radio.deliver(coordinator, -40, data, False, now_us)
         )

@@ -44,7 +44,8 @@ class EmulatedTeam:
     """Six people, say, and everything they wear.
 
     ``configured`` nodes know the team's size and their wearer's leg length from the stature, as
-    after ``relpos node set``; others run on the firmware's defaults. ``node_errors`` replaces
+    after ``relpos node set``; others run on the firmware's defaults. All are given the team's
+    ``key``. ``node_errors`` replaces
     what is drawn by the seed: nodes from the shelf, or in scenario "turntable" such as nobody has
     calibrated. The truth methods are for evaluation alone.
     """
@@ -60,6 +61,7 @@ class EmulatedTeam:
         collisions: bool = True,
         configured: bool = True,
         node_errors: Callable[[int, int], NodeErrors] | None = None,
+        key: bytes = wire.DEFAULT_KEY,
     ) -> None:
         if node_errors is None:
             uncalibrated = scenario == "turntable"
@@ -67,6 +69,7 @@ class EmulatedTeam:
         walkers, self.world = make_team(scenario, nodes, seconds, seed)
         self.walkers: dict[int, WalkerTruth] = {walker.node: walker for walker in walkers}
         self.seconds = seconds
+        self.key = key
         self.end_us = round(seconds * 1e6)
         self.clock = VirtualClock()
         uwb_rng, radio_rng = (np.random.default_rng([seed, k, 0xA17]) for k in (1, 2))
@@ -107,6 +110,9 @@ class EmulatedTeam:
         self.radio.modules.append(node.radio)
         self._walker_of_tag[node.tag] = walker
         self._walker_of_module[node.radio] = walker
+        if self.key != wire.DEFAULT_KEY:
+            at_us = errors.power_on_us + SET_UP_AFTER_US - 200_000
+            node.give_key(self.coordinator, self.key, 0xFE00, at_us)
         if configured:
             at_us = errors.power_on_us + SET_UP_AFTER_US
             leg_mm = round(LEG_OF_STATURE * walker.person.stature_m * 1000.0)
@@ -115,7 +121,9 @@ class EmulatedTeam:
                 (wire.CommandCode.SET_LEG_LENGTH_MM, leg_mm),
             )
             for k, (code, value) in enumerate(settings):
-                node.command(self.coordinator, code, value, 0xFF00 + k, at_us + 100_000 * k)
+                node.command(
+                    self.coordinator, code, value, 0xFF00 + k, at_us + 100_000 * k, self.key
+                )
 
     # -- the coordinator's serial port ----------------------------------------------------------
 

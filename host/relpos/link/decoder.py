@@ -1,17 +1,18 @@
 """Frames of all nodes to observations: running totals to motion, node clocks to host time.
 
 Sans I/O: bytes and their arrival times go in, observations come out. A frame is verified whole
-(magic, version, length, CRC, layout, ranges) before anything is changed by it.
+(magic, version, length, CRC, tag, layout, ranges, counter) before anything is changed by it.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from relpos.link.authentication import CounterWindow, Verdict
 from relpos.link.clock import NodeClock
 from relpos.measurements import Heading, Height, Motion, Observation, Range, Status, Step
 from relpos.protocol import messages as wire
@@ -22,11 +23,14 @@ UNSEEN_SPEED_M_S = 1.5
 UNSEEN_TURN_RAD_S_SQRT = 0.5
 """What a wearer may have done while the node restarted: brisk walking (Bohannon 1997: 1.3 to
 1.5 m/s), and turning as a random walk that loses the heading after some ten seconds."""
-REMEMBERED_SEQUENCES = 64
 MOST_KEPT = 10_000
 """Answers and raw samples that nobody fetches are forgotten: half an hour of one node's samples."""
-STALE_BOOT_S = 5.0
-"""A frame of an earlier boot this soon after a newer one's was held up on the air."""
+REPLAYS_BEFORE_REMARK = 5
+"""A frame or two of that kind may be an echo; a node that does nothing else has forgotten."""
+
+
+DOWN = (wire.COMMAND, wire.BEACON, wire.NEW_KEY)
+"""What only a host sends."""
 
 
 @dataclass
@@ -35,8 +39,8 @@ class NodeTrack:
 
     boot: int
     clock: NodeClock = field(default_factory=NodeClock)
-    newest_sequence: int | None = None
-    seen: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED_SEQUENCES))
+    window: CounterWindow = field(default_factory=CounterWindow)
+    heard: bool = False
     totals: Mapping[str, Any] | None = None
     motion_s: float | None = None
     arrival_s: float = 0.0
@@ -78,11 +82,23 @@ class Decoder:
     ``remarks`` grows by what the user should be told, once each: nodes of a foreign version.
     ``acknowledged`` and ``raw_samples`` hold the newest answers and raw samples.
     ``counts`` holds every rejected frame by its reason, ``nodes`` each node's own counts:
-    ``received``, ``lost``, ``duplicate``, ``late_motion``, ``restarts``. Node ids, boots and
-    sequences are the sender's claim: without authentication anybody can send them.
+    ``received``, ``lost``, ``duplicate``, ``replayed``, ``late_motion``, ``restarts``.
+
+    ``keys``: a frame is taken whose tag fits one of them (two while a node's key is changed).
+    ``newest_counters``: of each node, from an earlier session; nothing up to it is taken.
+    ``range_offsets_m`` holds each node's share of its ranges' offset as its status tells it; ranges
+    come out without both ends' shares.
     """
 
-    def __init__(self) -> None:
+    def __init__(
+        self,
+        keys: Sequence[bytes] = (wire.DEFAULT_KEY,),
+        newest_counters: Mapping[int, int] | None = None,
+    ) -> None:
+        self.keys = tuple(keys)
+        self.range_offsets_m: dict[int, float] = {}
+        self._newest_counters = dict(newest_counters or {})
+        self._replays: Counter[int] = Counter()
         self.nodes: dict[int, NodeTrack] = {}
         self.counts: Counter[str] = Counter()
         self.foreign_versions: dict[int, int] = {}
@@ -93,7 +109,7 @@ class Decoder:
     def feed(self, data: bytes, arrival_s: float, rssi_dbm: int | None = None) -> list[Observation]:
         """Observations of one frame that arrived at ``arrival_s`` (host clock, seconds)."""
         try:
-            frame = wire.decode(data)
+            frame = self._open(data)
         except wire.ForeignVersionError as error:
             self.counts["ForeignVersionError"] += 1
             if error.node is not None and error.node not in self.foreign_versions:
@@ -103,7 +119,7 @@ class Decoder:
         except wire.FrameError as error:
             self.counts[type(error).__name__] += 1
             return []
-        if frame.node in (wire.COORDINATOR, wire.BROADCAST) or frame.message is wire.COMMAND:
+        if frame.node in (wire.COORDINATOR, wire.BROADCAST) or frame.message in DOWN:
             self.counts["not_from_a_node"] += 1
             return []
         track = self._track(frame, arrival_s)
@@ -129,18 +145,10 @@ class Decoder:
         if frame.message is wire.MOTION:
             observations += self._motion(frame.node, track, values)
         elif frame.message is wire.RANGES:
-            observations += [
-                Range(
-                    track.clock.to_host_s(values["time_s"] - entry["age_s"]),
-                    frame.node,
-                    entry["peer"],
-                    entry["range_m"],
-                    float(entry["rss_dbm"]),
-                )
-                for entry in values["ranges"]
-            ]
+            observations += self._ranges(frame.node, track, values)
         elif frame.message is wire.STATUS:
             time_s = track.clock.to_host_s(values["time_s"])
+            self.range_offsets_m[frame.node] = values["range_offset_m"]
             observations += [
                 Status(time_s, frame.node, name, float(value))
                 for name, value in values.items()
@@ -176,42 +184,75 @@ class Decoder:
             vector("field", "ut", 1.0) if values["field_readings"] else None,
         )
 
+    def _open(self, data: bytes) -> wire.Frame:
+        for key in self.keys[:-1]:
+            try:
+                return wire.decode(data, key)
+            except wire.FrameTagError:
+                continue
+        return wire.decode(data, self.keys[-1])
+
+    def _ranges(self, node: int, track: NodeTrack, values: Mapping[str, Any]) -> list[Observation]:
+        """Ranges without what both ends' antenna delays make them too long."""
+        ranges: list[Observation] = []
+        for entry in values["ranges"]:
+            offset_m = sum(self.range_offsets_m.get(end, 0.0) for end in (node, entry["peer"]))
+            range_m = entry["range_m"] - offset_m
+            if range_m <= 0.0:
+                track.counts["range_below_its_offset"] += 1
+                continue
+            time_s = track.clock.to_host_s(values["time_s"] - entry["age_s"])
+            ranges.append(Range(time_s, node, entry["peer"], range_m, float(entry["rss_dbm"])))
+        return ranges
+
     def _track(self, frame: wire.Frame, arrival_s: float) -> NodeTrack | None:
-        """The node's track if the frame is new, after booking its sequence; else ``None``."""
+        """The node's track if the frame is new, after booking its counter; else ``None``."""
         track = self.nodes.get(frame.node)
         if track is None:
-            track = self.nodes[frame.node] = NodeTrack(frame.boot, arrival_s=arrival_s)
-        if frame.boot != track.boot:
-            earlier = (track.boot - frame.boot) % 256 < 128
-            if earlier and arrival_s - track.arrival_s < STALE_BOOT_S:
-                track.counts["stale_boot"] += 1
-                return None
-            # Totals, clock and sequence of the node begin anew; only counts and pose go on.
+            track = NodeTrack(frame.boot, arrival_s=arrival_s)
+            if frame.node in self._newest_counters:
+                track.window = CounterWindow.after(self._newest_counters[frame.node])
+        window = track.window
+        verdict = window.judge(frame.counter)
+        if verdict in (Verdict.DUPLICATE, Verdict.REPLAYED):
+            self._refuse(frame.node, track, verdict)
+            return None
+        if frame.boot != track.boot and verdict is Verdict.LATE:
+            track.counts["stale_boot"] += 1
+            return None
+        if frame.boot != track.boot and track.heard:
+            # Totals and clock of the node begin anew; only its counter, counts and pose go on.
             unseen_s = arrival_s - track.arrival_s if track.totals is not None else 0.0
-            track = self.nodes[frame.node] = NodeTrack(
+            track = NodeTrack(
                 frame.boot,
+                window=window,
                 counts=track.counts,
                 arrival_s=arrival_s,
                 motion_s=track.motion_s,
                 unseen_s=unseen_s,
             )
             track.counts["restarts"] += 1
-        if frame.sequence in track.seen:
-            track.counts["duplicate"] += 1
-            return None
-        track.seen.append(frame.sequence)
+        elif verdict is Verdict.LATE:
+            track.counts["lost"] -= 1
+            track.counts["reordered"] += 1
+        elif track.heard:
+            track.counts["lost"] += frame.counter - window.newest - 1
+        self.nodes[frame.node] = track
+        track.heard = True
+        window.take(frame.counter)
         track.counts["received"] += 1
-        if track.newest_sequence is None:
-            track.newest_sequence = frame.sequence
-        else:
-            ahead = (frame.sequence - track.newest_sequence) % 65536
-            if ahead < 32768:
-                track.counts["lost"] += ahead - 1
-                track.newest_sequence = frame.sequence
-            else:
-                track.counts["lost"] -= 1
-                track.counts["reordered"] += 1
         return track
+
+    def _refuse(self, node: int, track: NodeTrack, verdict: Verdict) -> None:
+        track.counts[verdict.value] += 1
+        if verdict is not Verdict.REPLAYED:
+            return
+        self._replays[node] += 1
+        if self._replays[node] == REPLAYS_BEFORE_REMARK:
+            self.remarks.append(
+                f"node {node}: old frames are sent again, or its memory was erased (then begin "
+                "anew here: restart, without the key file's .seen)"
+            )
 
     def _motion(self, node: int, track: NodeTrack, values: Mapping[str, Any]) -> list[Observation]:
         fields = wire.MOTION.field

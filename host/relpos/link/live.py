@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import serial
 
 from relpos.errors import DeviceError
 from relpos.link import xbee
+from relpos.link.authentication import HostCounter
 from relpos.link.decoder import Decoder
 from relpos.measurements import Observation
 from relpos.protocol import messages as wire
+from relpos.protocol.schema import Message
 
 BAUD = 38_400
 """0.2 % off on the ATmega at 16 MHz, where 115200 is 2.1 % off; the coordinator uses the same."""
@@ -22,15 +25,31 @@ READ_BYTES = 4096
 
 
 class Link:
-    """XBee bytes to observations, and commands to bytes: no I/O of its own."""
+    """XBee bytes to observations, and commands to bytes: no I/O of its own.
 
-    def __init__(self, *, escaped: bool = True) -> None:
+    ``key`` is the team's. ``counter`` is of what is sent, ``newest_counters`` of what was received
+    in an earlier session (see :mod:`relpos.link.authentication`).
+    """
+
+    def __init__(
+        self,
+        *,
+        key: bytes = wire.DEFAULT_KEY,
+        counter: HostCounter | None = None,
+        newest_counters: Mapping[int, int] | None = None,
+        escaped: bool = True,
+    ) -> None:
         self.parser = xbee.Parser(escaped=escaped)
-        self.decoder = Decoder()
+        self.decoder = Decoder((key,), newest_counters)
+        self.key = key
+        self._counter = counter or HostCounter()
         self._escaped = escaped
-        self._sequence = 0
         self._token = 0
         self._virtual_s: float | None = None
+
+    def newest_counters(self) -> dict[int, int]:
+        """Of each node that was heard, for the next session."""
+        return {n: track.window.newest for n, track in self.decoder.nodes.items() if track.heard}
 
     def feed(self, data: bytes, arrival_s: float) -> list[Observation]:
         """Observations completed by ``data``, whose last byte arrived at ``arrival_s``.
@@ -65,20 +84,45 @@ class Link:
         ``broadcast`` sends it to every radio module, whatever the node's has for an address; only
         the node obeys.
         """
-        if token is None:
-            self._token = self._token % 0xFFFF + 1
-            token = self._token
-        self._sequence = (self._sequence + 1) % 0x10000
-        data = wire.encode(
-            wire.COMMAND,
-            node,
-            0,
-            self._sequence,
-            {"token": token, "command": code, "value": value},
-        )
-        everybody = broadcast or node == wire.BROADCAST
-        address = xbee.BROADCAST_16 if everybody else node
-        return token, xbee.encode(xbee.Transmit16(0, address, data), escaped=self._escaped)
+        token = self._next_token() if token is None else token
+        values = {"token": token, "command": code, "value": value}
+        return token, self.frame(wire.COMMAND, node, values, broadcast=broadcast)
+
+    def new_key(self, node: int, key: bytes, *, token: int | None = None) -> tuple[int, bytes]:
+        """Token and serial bytes that give ``node`` another ``key``, hidden under the present one.
+
+        The node answers under the new key: see :meth:`accept_keys`.
+        """
+        token = self._next_token() if token is None else token
+        counter = self._counter.next()
+        mask = wire.key_mask(self.key, counter)
+        masked = bytes(a ^ b for a, b in zip(key, mask, strict=True))
+        words = {
+            f"masked_{k}": int.from_bytes(masked[4 * k : 4 * k + 4], "little") for k in range(4)
+        }
+        return token, self._sealed(wire.NEW_KEY, node, counter, {"token": token} | words, False)
+
+    def accept_keys(self, *keys: bytes) -> None:
+        """Send under the first key from now on, and take frames under any of them."""
+        self.key = keys[0]
+        self.decoder.keys = keys
+
+    def frame(
+        self, message: Message, node: int, values: Mapping[str, Any], *, broadcast: bool = False
+    ) -> bytes:
+        """Serial bytes of a message down; ``broadcast``: see :meth:`command`."""
+        return self._sealed(message, node, self._counter.next(), values, broadcast)
+
+    def _sealed(
+        self, message: Message, node: int, counter: int, values: Mapping[str, Any], broadcast: bool
+    ) -> bytes:
+        data = wire.encode(message, node, 0, counter, values, self.key)
+        address = xbee.BROADCAST_16 if broadcast or node == wire.BROADCAST else node
+        return xbee.encode(xbee.Transmit16(0, address, data), escaped=self._escaped)
+
+    def _next_token(self) -> int:
+        self._token = self._token % 0xFFFF + 1
+        return self._token
 
     @property
     def virtual_s(self) -> float | None:

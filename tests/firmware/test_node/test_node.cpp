@@ -2,6 +2,8 @@
 #include "support/check.h"
 #include "support/fake_board.h"
 
+#include <initializer_list>
+
 #include "node/calibration.h"
 #include "node/node.h"
 #include "wire/frame.h"
@@ -88,16 +90,25 @@ struct World : FakeBoard {
     escaped(sum);
   }
   void command(uint16_t token, uint8_t code, int32_t value, uint8_t node = kId) {
-    uint8_t data[64] = {0x81, 0, 0, 0x28, 0};
-    uint8_t* frame = data + 5;
-    uint8_t* body = frame + wire::kHeaderBytes;
+    uint8_t body[wire::kCommandBytes];
     const wire::Command request = {token, 0, value};
-    uint8_t length = wire::encode(request, body);
+    wire::encode(request, body);
     body[2] = code;
-    const wire::Header header = {wire::MessageType::kCommand, node, 0, token};
-    length = wire::seal(header, length, frame);
+    down(wire::MessageType::kCommand, body, sizeof body, node, ++host_counter);
+  }
+  // A frame of the host's.
+  void down(wire::MessageType type, const uint8_t* body, uint8_t length, uint8_t node,
+            uint32_t counter) {
+    uint8_t data[80] = {0x81, 0, 0, 0x28, 0};
+    uint8_t* frame = data + 5;
+    memcpy(frame + wire::kHeaderBytes, body, length);
+    const wire::Header header = {type, node == kId ? to : node, 0, counter};
+    length = wire::seal(header, length, key, frame);
     give(data, static_cast<uint8_t>(5 + length));
   }
+  uint8_t key[wire::kKeyBytes] = {};   // the host's, and what the node's frames are opened with
+  uint32_t host_counter = 1000;
+  uint8_t to = kId;  // the node that is meant
 
   uint8_t storage_read(uint16_t at) override { return eeprom[at]; }
   bool storage_write(uint16_t at, uint8_t value) override {
@@ -161,11 +172,11 @@ struct World : FakeBoard {
     if (count == kMostFrames) return;
     Sent& sent = frames[count];
     sent.time_us = now;
-    if (wire::open(packet_ + 7, length, &sent.header) != wire::FrameStatus::kGood) {
+    if (wire::open(packet_ + 7, length, key, &sent.header) != wire::FrameStatus::kGood) {
       ++damaged;
       return;
     }
-    sent.length = static_cast<uint8_t>(length - wire::kHeaderBytes - wire::kCrcBytes);
+    sent.length = static_cast<uint8_t>(length - wire::kOverhead);
     memcpy(sent.body, packet_ + 7 + wire::kHeaderBytes, sent.length);
     ++count;
     const uint8_t answer[3] = {0x89, packet_[3], delivery};
@@ -358,7 +369,7 @@ TEST(a_lost_frame_changes_nothing_in_the_next_ones) {
   const Sent* a = heard.last(wire::MessageType::kMotion);
   const Sent* b = lost.last(wire::MessageType::kMotion);
   CHECK(a != nullptr && b != nullptr);
-  CHECK_EQUAL(a->header.sequence, b->header.sequence);
+  CHECK(a->header.counter == b->header.counter);
   CHECK_BYTES(a->body, b->body, a->length);
   wire::Status status;
   lost.run_ms(10000);
@@ -505,14 +516,11 @@ TEST(settings_survive_a_restart_and_a_torn_copy) {
   CHECK_EQUAL(3, ranges.count);
 }
 
-TEST(every_start_counts_and_writes_one_byte) {
+TEST(every_start_counts) {
   Team team;
   CHECK_EQUAL(0, team.world.eeprom[relpos::kStoredBootCount]);
   Node again(team.world);
   again.begin(0, wire::ResetCause::kBrownOut, 0);
-  uint16_t writes = 0;
-  for (uint16_t count : team.world.writes) writes = static_cast<uint16_t>(writes + count);
-  CHECK_EQUAL(2, writes);
   CHECK_EQUAL(1, team.world.eeprom[relpos::kStoredBootCount]);
   team.run(again, 2500);
   CHECK_EQUAL(1, team.last(wire::MessageType::kMotion)->header.boot);
@@ -704,7 +712,7 @@ TEST(a_calibration_is_in_force_after_its_commit_and_not_a_word_earlier) {
 TEST(a_power_cut_at_any_byte_leaves_the_old_calibration_or_the_new_one) {
   const Words before = example(-57), after = example(103);
   bool old_seen = false, new_seen = false;
-  for (uint32_t cut = 0; cut < 200; cut += 3) {
+  for (uint32_t cut = 0; cut < 800; cut += 11) {
     Team team;
     ask(team, team.node, wire::CommandCode::kSetTeamSize, 9);
     stage(team, team.node, before);
@@ -735,6 +743,210 @@ TEST(while_a_word_or_a_setting_is_being_stored_the_next_one_has_to_wait) {
   CHECK_EQUAL(8, team.answer().token);
   CHECK_EQUAL(result(wire::CommandResult::kBusy), team.answer().result);
   CHECK_EQUAL(4, ask(team, team.node, wire::CommandCode::kSetTeamSize, 0).value);
+}
+
+// ---- authentication ----
+
+TEST(a_replayed_forged_or_foreign_frame_touches_nothing) {
+  Team team;
+  uint8_t body[wire::kCommandBytes];
+  const wire::Command request = {7, code(wire::CommandCode::kSetTeamSize), 9};
+  wire::encode(request, body);
+  const auto down = [&](uint32_t counter) {
+    team.world.down(wire::MessageType::kCommand, body, sizeof body, kId, counter);
+    team.run_ms(300);
+  };
+  down(5000);
+  CHECK_EQUAL(1, team.sent(wire::MessageType::kAcknowledgement));
+  down(5000);  // the same again
+  down(4999);  // an older one
+  team.world.key[3] ^= 1;
+  down(6000);  // another team's
+  team.world.key[3] ^= 1;
+  CHECK_EQUAL(1, team.sent(wire::MessageType::kAcknowledgement));
+  down(5001);  // had the foreign one counted, this would be old
+  CHECK_EQUAL(2, team.sent(wire::MessageType::kAcknowledgement));
+  team.run_ms(12000);
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK_EQUAL(3, status.refused_frames);
+  CHECK_EQUAL(0, status.bad_frames);
+}
+
+TEST(a_command_is_not_obeyed_again_after_a_restart) {
+  Team team;
+  uint8_t body[wire::kCommandBytes];
+  const wire::Command request = {7, code(wire::CommandCode::kSetTeamSize), 9};
+  wire::encode(request, body);
+  team.world.down(wire::MessageType::kCommand, body, sizeof body, kId, 5000);
+  team.run_ms(500);
+  Node again(team.world);
+  again.begin(team.world.now, wire::ResetCause::kPowerOn, 0);
+  team.world.down(wire::MessageType::kCommand, body, sizeof body, kId, 5000);
+  team.run(again, 500);
+  CHECK_EQUAL(1, team.sent(wire::MessageType::kAcknowledgement));
+  team.world.down(wire::MessageType::kCommand, body, sizeof body, kId, 5001);
+  team.run(again, 500);
+  CHECK_EQUAL(2, team.sent(wire::MessageType::kAcknowledgement));
+}
+
+TEST(no_counter_is_used_twice_wherever_the_power_is_cut) {
+  Team team;
+  team.world.command(7, code(wire::CommandCode::kSetReportPeriodMs), 100);
+  team.run_ms(500);
+  uint32_t newest = 0;
+  for (uint32_t cut = 1; cut < 60; ++cut) {
+    team.world.writes_left = 0xFFFFFFFF;
+    Node again(team.world);
+    again.begin(team.world.now, wire::ResetCause::kPowerOn, 0);
+    team.world.writes_left = cut;
+    team.world.count = 0;
+    for (uint16_t ms = 0; ms < 600 && team.world.writes_left > 0; ++ms) team.run(again, 1);
+    for (uint16_t i = 0; i < team.world.count; ++i) {
+      CHECK(team.world.frames[i].header.counter > newest);
+      newest = team.world.frames[i].header.counter;
+    }
+  }
+  CHECK(newest > 1024);
+}
+
+TEST(counters_go_on_in_the_next_block_and_wear_the_storage_little) {
+  Team team;
+  ask(team, team.node, wire::CommandCode::kSetReportPeriodMs, 100);
+  memset(team.world.writes, 0, sizeof team.world.writes);
+  uint32_t newest = 0;
+  for (uint16_t minute = 0; minute < 20; ++minute) {
+    team.world.count = 0;
+    team.run_ms(30000);
+    for (uint16_t i = 0; i < team.world.count; ++i) {
+      CHECK(team.world.frames[i].header.counter > newest);
+      newest = team.world.frames[i].header.counter;
+    }
+  }
+  CHECK(newest > 6000);
+  for (uint16_t count : team.world.writes) CHECK(count <= newest / 1024 + 1);
+}
+
+TEST(a_new_key_is_taken_kept_and_the_old_one_is_dead) {
+  Team team;
+  wire::NewKey message = {7, 0, 0, 0, 0};
+  uint8_t body[wire::kNewKeyBytes], key[wire::kKeyBytes];
+  for (uint8_t i = 0; i < sizeof key; ++i) key[i] = static_cast<uint8_t>(17 * i + 3);
+  uint8_t masked[wire::kKeyBytes];
+  wire::unmask_key(team.world.key, 9000, key, masked);  // XOR both ways
+  memcpy(&message.masked_0, masked, sizeof masked);
+  wire::encode(message, body);
+  team.world.down(wire::MessageType::kNewKey, body, sizeof body, kId, 9000);
+  team.world.begin_poll();
+  uint8_t old_key[wire::kKeyBytes];
+  memcpy(old_key, team.world.key, sizeof old_key);
+  memcpy(team.world.key, key, sizeof key);  // the answer comes under the new one
+  team.run_ms(500);
+  CHECK_EQUAL(1, team.sent(wire::MessageType::kAcknowledgement));
+  CHECK_EQUAL(code(wire::CommandCode::kSetKey), team.answer().command);
+  CHECK_EQUAL(result(wire::CommandResult::kDone), team.answer().result);
+  // A host that begins with the new key counts anew.
+  team.world.command(8, code(wire::CommandCode::kPing), 0);
+  team.run_ms(300);
+  CHECK_EQUAL(2, team.sent(wire::MessageType::kAcknowledgement));
+  Node again(team.world);
+  again.begin(team.world.now, wire::ResetCause::kPowerOn, 0);
+  team.run(again, 300);
+  memcpy(team.world.key, old_key, sizeof key);
+  team.world.command(9, code(wire::CommandCode::kPing), 0);
+  team.run(again, 300);
+  CHECK_EQUAL(2, team.sent(wire::MessageType::kAcknowledgement));
+  memcpy(team.world.key, key, sizeof key);
+  team.world.command(10, code(wire::CommandCode::kPing), 0);
+  team.run(again, 300);
+  CHECK_EQUAL(3, team.sent(wire::MessageType::kAcknowledgement));
+  team.run(again, 12000);
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK(status.health & static_cast<uint8_t>(wire::Health::kKeySet));
+}
+
+TEST(a_power_cut_while_a_key_is_stored_leaves_the_old_key_or_the_new_one) {
+  uint8_t key[wire::kKeyBytes], masked[wire::kKeyBytes];
+  for (uint8_t i = 0; i < sizeof key; ++i) key[i] = static_cast<uint8_t>(17 * i + 3);
+  const uint8_t old_key[wire::kKeyBytes] = {};
+  wire::unmask_key(old_key, 9000, key, masked);
+  wire::NewKey message = {7, 0, 0, 0, 0};
+  memcpy(&message.masked_0, masked, sizeof masked);
+  uint8_t body[wire::kNewKeyBytes];
+  wire::encode(message, body);
+  bool old_seen = false, new_seen = false;
+  for (uint32_t cut = 0; cut < 70; ++cut) {
+    Team team;
+    team.run_ms(500);
+    team.world.writes_left = cut;
+    team.world.down(wire::MessageType::kNewKey, body, sizeof body, kId, 9000);
+    team.run_ms(500);
+    team.world.writes_left = 0xFFFFFFFF;
+    Node again(team.world);
+    again.begin(team.world.now, wire::ResetCause::kPowerOn, 0);
+    team.run(again, 300);
+    team.world.host_counter = 10000;
+    for (uint8_t which = 0; which < 2; ++which) {
+      memcpy(team.world.key, which == 0 ? old_key : key, sizeof key);
+      team.world.count = 0;
+      team.world.command(8, code(wire::CommandCode::kPing), 0);
+      team.run(again, 300);
+      if (team.sent(wire::MessageType::kAcknowledgement) == 1) (which == 0 ? old_seen : new_seen) = true;
+    }
+  }
+  CHECK(old_seen && new_seen);
+}
+
+TEST(a_number_is_changed_with_a_restart_and_kept) {
+  Team team;
+  CHECK_EQUAL(result(wire::CommandResult::kDone),
+              ask(team, team.node, wire::CommandCode::kSetNodeId, 12).result);
+  team.run_ms(500);
+  CHECK_EQUAL(1, team.world.restarts);
+  Node again(team.world);
+  again.begin(team.world.now, wire::ResetCause::kWatchdog, 0);
+  CHECK_EQUAL(12, again.id());
+  team.world.to = 5;
+  Node built_in(team.world);
+  built_in.begin(team.world.now, wire::ResetCause::kPowerOn, 5);
+  CHECK_EQUAL(5, built_in.id());
+  for (int32_t bad : {0, 255, -1, 268}) {
+    CHECK_EQUAL(result(wire::CommandResult::kOutOfRange),
+                ask(team, built_in, wire::CommandCode::kSetNodeId, bad).result);
+  }
+}
+
+TEST(a_range_offset_of_either_sign_is_kept_and_told) {
+  Team team;
+  for (int32_t bad : {-5001, 5001}) {
+    CHECK_EQUAL(result(wire::CommandResult::kOutOfRange),
+                ask(team, team.node, wire::CommandCode::kSetRangeOffsetMm, bad).result);
+  }
+  for (int32_t good : {5000, -5000, -75}) {
+    ask(team, team.node, wire::CommandCode::kSetRangeOffsetMm, good);
+    CHECK_EQUAL(good, ask(team, team.node, wire::CommandCode::kSetRangeOffsetMm, 6000).value);
+  }
+  team.run_ms(12000);
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK_EQUAL(-75, status.range_offset_mm);
+}
+
+TEST(defaults_come_back_without_number_or_key_being_lost) {
+  Team team;
+  ask(team, team.node, wire::CommandCode::kSetLegLengthMm, 800);
+  ask(team, team.node, wire::CommandCode::kSetNodeId, 12);
+  team.run_ms(500);
+  team.world.to = 12;
+  Node again(team.world);
+  again.begin(team.world.now, wire::ResetCause::kWatchdog, 0);
+  ask(team, again, wire::CommandCode::kRestoreDefaults, 0);
+  team.run(again, 500);
+  Node third(team.world);
+  third.begin(team.world.now, wire::ResetCause::kWatchdog, 0);
+  CHECK_EQUAL(12, third.id());
+  CHECK_EQUAL(930, ask(team, third, wire::CommandCode::kSetLegLengthMm, 0).value);
 }
 
 RUN_TESTS()

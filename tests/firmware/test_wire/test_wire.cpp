@@ -43,7 +43,9 @@ bool same(const wire::Status& a, const wire::Status& b) {
          a.ranging_successes == b.ranging_successes && a.ranging_failures == b.ranging_failures &&
          a.worst_tick_us == b.worst_tick_us && a.missed_ticks == b.missed_ticks &&
          a.free_stack_bytes == b.free_stack_bytes && a.bad_frames == b.bad_frames &&
-         a.dropped_ranges == b.dropped_ranges && a.radio_failures == b.radio_failures;
+         a.dropped_ranges == b.dropped_ranges && a.radio_failures == b.radio_failures &&
+         a.refused_frames == b.refused_frames && a.range_offset_mm == b.range_offset_mm &&
+         a.neighbours == b.neighbours && a.team == b.team && a.health == b.health;
 }
 
 bool same(const wire::Steps& a, const wire::Steps& b) {
@@ -77,36 +79,53 @@ bool same(const wire::Acknowledgement& a, const wire::Acknowledgement& b) {
          a.value == b.value;
 }
 
+bool same(const wire::Beacon& a, const wire::Beacon& b) {
+  if (a.phase_ms != b.phase_ms || a.period_ms != b.period_ms || a.round != b.round ||
+      a.count != b.count) {
+    return false;
+  }
+  for (uint8_t i = 0; i < a.count; ++i) {
+    if (a.entries[i].node != b.entries[i].node) return false;
+  }
+  return true;
+}
+
+bool same(const wire::NewKey& a, const wire::NewKey& b) {
+  return a.token == b.token && a.masked_0 == b.masked_0 && a.masked_1 == b.masked_1 &&
+         a.masked_2 == b.masked_2 && a.masked_3 == b.masked_3;
+}
+
 template <typename Message>
-void check_both_ways(wire::MessageType type, uint8_t node, uint8_t boot, uint16_t sequence,
-                     const uint8_t* golden, uint8_t golden_count, const Message& values) {
+void check_both_ways(wire::MessageType type, uint8_t node, uint8_t boot, uint32_t counter,
+                     const uint8_t* key, const uint8_t* golden, uint8_t golden_count,
+                     const Message& values) {
   uint8_t frame[wire::kFrameBytes];
   const uint8_t body_length = wire::encode(values, frame + wire::kHeaderBytes);
-  const Header header = {type, node, boot, sequence};
-  CHECK_EQUAL(golden_count, wire::seal(header, body_length, frame));
+  const Header header = {type, node, boot, counter};
+  CHECK_EQUAL(golden_count, wire::seal(header, body_length, key, frame));
   CHECK_BYTES(golden, frame, golden_count);
 
   Header opened = {wire::MessageType::kMotion, 0, 0, 0};
-  CHECK_EQUAL(FrameStatus::kGood, wire::open(golden, golden_count, &opened));
+  CHECK_EQUAL(FrameStatus::kGood, wire::open(golden, golden_count, key, &opened));
   CHECK_EQUAL(type, opened.type);
   CHECK_EQUAL(node, opened.node);
   CHECK_EQUAL(boot, opened.boot);
-  CHECK_EQUAL(sequence, opened.sequence);
+  CHECK(counter == opened.counter);
   Message decoded = {};
   CHECK(wire::decode(golden + wire::kHeaderBytes,
-                     static_cast<uint8_t>(golden_count - wire::kHeaderBytes - wire::kCrcBytes),
+                     static_cast<uint8_t>(golden_count - wire::kOverhead),
                      &decoded));
   CHECK(same(values, decoded));
 }
 
-void check_damage(const uint8_t* golden, uint8_t count) {
+void check_damage(const uint8_t* golden, uint8_t count, const uint8_t* key) {
   uint8_t frame[wire::kFrameBytes];
   memcpy(frame, golden, count);
   for (uint16_t bit = 0; bit < 8U * count; ++bit) {
     const uint8_t flip = static_cast<uint8_t>(1 << bit % 8);
     frame[bit / 8] ^= flip;
     Header header;
-    CHECK(wire::open(frame, count, &header) != FrameStatus::kGood);
+    CHECK(wire::open(frame, count, key, &header) != FrameStatus::kGood);
     frame[bit / 8] ^= flip;
   }
 }
@@ -115,8 +134,8 @@ void check_damage(const uint8_t* golden, uint8_t count) {
 
 #define BOTH_WAYS(type, name)                                                                  \
   check_both_ways(wire::MessageType::type, vectors::name##Node, vectors::name##Boot,           \
-                  vectors::name##Sequence, vectors::name##Bytes, sizeof vectors::name##Bytes,  \
-                  vectors::name)
+                  vectors::name##Counter, vectors::name##Key, vectors::name##Bytes,            \
+                  sizeof vectors::name##Bytes, vectors::name)
 
 TEST(motion_frames_are_the_golden_ones) {
   BOTH_WAYS(kMotion, kMotionAtStart);
@@ -137,18 +156,25 @@ TEST(samples_frames_are_the_golden_ones) { BOTH_WAYS(kSamples, kSamples); }
 
 TEST(command_frames_are_the_golden_ones) { BOTH_WAYS(kCommand, kCommand); }
 
+TEST(beacon_frames_are_the_golden_ones) {
+  BOTH_WAYS(kBeacon, kBeacon);
+  BOTH_WAYS(kBeacon, kBeaconOfNobody);
+}
+
+TEST(new_key_frames_are_the_golden_ones) { BOTH_WAYS(kNewKey, kNewKey); }
+
 TEST(acknowledgement_frames_are_the_golden_ones) { BOTH_WAYS(kAcknowledgement, kAcknowledgement); }
 
 TEST(no_single_damaged_bit_gets_through) {
-  check_damage(vectors::kMotionWalkingBytes, sizeof vectors::kMotionWalkingBytes);
-  check_damage(vectors::kRangesFiveBytes, sizeof vectors::kRangesFiveBytes);
-  check_damage(vectors::kCommandBytes, sizeof vectors::kCommandBytes);
+  check_damage(vectors::kMotionWalkingBytes, sizeof vectors::kMotionWalkingBytes, vectors::kMotionWalkingKey);
+  check_damage(vectors::kRangesFiveBytes, sizeof vectors::kRangesFiveBytes, vectors::kRangesFiveKey);
+  check_damage(vectors::kCommandBytes, sizeof vectors::kCommandBytes, vectors::kCommandKey);
 }
 
 TEST(a_frame_cut_short_anywhere_is_refused) {
   for (uint8_t count = 0; count < sizeof vectors::kMotionWalkingBytes; ++count) {
     Header header;
-    CHECK(wire::open(vectors::kMotionWalkingBytes, count, &header) != FrameStatus::kGood);
+    CHECK(wire::open(vectors::kMotionWalkingBytes, count, vectors::kMotionWalkingKey, &header) != FrameStatus::kGood);
   }
 }
 
@@ -157,27 +183,61 @@ TEST(a_foreign_version_is_told_from_damage) {
   memcpy(frame, vectors::kCommandBytes, sizeof frame);
   frame[1] = wire::kProtocolVersion + 1;
   Header header;
-  CHECK_EQUAL(FrameStatus::kForeignVersion, wire::open(frame, sizeof frame, &header));
+  CHECK_EQUAL(FrameStatus::kForeignVersion, wire::open(frame, sizeof frame, vectors::kCommandKey, &header));
   // The version tells even where the length is another one.
-  CHECK_EQUAL(FrameStatus::kForeignVersion, wire::open(frame, 3, &header));
+  CHECK_EQUAL(FrameStatus::kForeignVersion, wire::open(frame, 3, vectors::kCommandKey, &header));
   frame[0] ^= 1;
-  CHECK_EQUAL(FrameStatus::kNotOurs, wire::open(frame, sizeof frame, &header));
+  CHECK_EQUAL(FrameStatus::kNotOurs, wire::open(frame, sizeof frame, vectors::kCommandKey, &header));
   frame[0] ^= 1;
   frame[1] = wire::kProtocolVersion;
-  CHECK_EQUAL(FrameStatus::kBadLength, wire::open(frame, 3, &header));
+  CHECK_EQUAL(FrameStatus::kBadLength, wire::open(frame, 3, vectors::kCommandKey, &header));
   frame[4] ^= 1;
-  CHECK_EQUAL(FrameStatus::kBadCrc, wire::open(frame, sizeof frame, &header));
+  CHECK_EQUAL(FrameStatus::kBadCrc, wire::open(frame, sizeof frame, vectors::kCommandKey, &header));
 }
 
 TEST(another_layout_of_the_same_version_is_refused) {
   const uint8_t count = sizeof vectors::kCommandBytes;
   uint8_t frame[count];
   memcpy(frame, vectors::kCommandBytes, count);
-  const uint16_t crc = wire::crc16(frame, count - 2, wire::kFingerprint ^ 1);
-  frame[count - 2] = static_cast<uint8_t>(crc);
-  frame[count - 1] = static_cast<uint8_t>(crc >> 8);
+  const uint16_t crc = wire::crc16(frame, count - 10, wire::kFingerprint ^ 1);
+  frame[count - 10] = static_cast<uint8_t>(crc);
+  frame[count - 9] = static_cast<uint8_t>(crc >> 8);
   Header header;
-  CHECK_EQUAL(FrameStatus::kBadCrc, wire::open(frame, count, &header));
+  CHECK_EQUAL(FrameStatus::kBadCrc, wire::open(frame, count, vectors::kCommandKey, &header));
+}
+
+TEST(a_forged_frame_with_a_good_crc_is_refused) {
+  const uint8_t count = sizeof vectors::kCommandBytes;
+  uint8_t frame[count];
+  for (uint16_t bit = 16; bit < 8U * (count - 10); ++bit) {
+    memcpy(frame, vectors::kCommandBytes, count);
+    frame[bit / 8] ^= static_cast<uint8_t>(1 << bit % 8);
+    const uint16_t crc = wire::crc16(frame, count - 10);
+    frame[count - 10] = static_cast<uint8_t>(crc);
+    frame[count - 9] = static_cast<uint8_t>(crc >> 8);
+    Header header;
+    CHECK_EQUAL(FrameStatus::kBadTag, wire::open(frame, count, vectors::kCommandKey, &header));
+  }
+}
+
+TEST(another_teams_frame_is_refused) {
+  uint8_t key[wire::kKeyBytes];
+  memcpy(key, vectors::kCommandKey, sizeof key);
+  key[15] ^= 1;
+  Header header;
+  CHECK_EQUAL(FrameStatus::kBadTag,
+              wire::open(vectors::kCommandBytes, sizeof vectors::kCommandBytes, key, &header));
+}
+
+// The mask of messages.key_mask(bytes(range(16)), 0x01020304), from PyPI's siphash24.
+TEST(a_new_key_comes_out_from_under_its_mask) {
+  const uint8_t old_key[] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+  const uint8_t mask[] = {0x63, 0xe2, 0xf6, 0xfc, 0x2d, 0xe3, 0xf7, 0x88,
+                          0xe0, 0x55, 0x01, 0xb0, 0x33, 0xc5, 0xf4, 0x32};
+  uint8_t key[wire::kKeyBytes];
+  wire::unmask_key(old_key, 0x01020304, mask, key);
+  const uint8_t zero[wire::kKeyBytes] = {};
+  CHECK_BYTES(zero, key, sizeof key);
 }
 
 // CRC-16/CCITT-FALSE of "123456789" in the catalogue of parametrised CRC algorithms.

@@ -24,7 +24,7 @@ typedef struct {
   void (*reset)(void* context);
 } relpos_board_callbacks;
 
-/* eeprom (at least 192 bytes, 0xFF where never written) stays the caller's and is written in place;
+/* eeprom (at least 250 bytes, 0xFF where never written) stays the caller's and is written in place;
  * it must outlive the node. node_id 0: the one in the EEPROM. reset_cause is the wire's ResetCause.
  * NULL where callbacks, EEPROM or its size will not do. */
 relpos_node* relpos_node_create(const relpos_board_callbacks* callbacks, uint8_t* eeprom,

@@ -89,7 +89,7 @@ class Service:
         self._now_us = 0
         self._seconds = seconds
         self._commands = itertools.cycle(COMMANDS)
-        self._sequence = 0
+        self._counter = 0
         self._at(FIRST_COMMAND_US, self._command)
 
     def _at(self, time_us: int, action: Callable[[int], None]) -> None:
@@ -149,13 +149,13 @@ class Service:
 
     def _command(self, now_us: int) -> None:
         code, value = next(self._commands)
-        self._sequence += 1
+        self._counter += 1
         data = wire.encode(
             wire.COMMAND,
             NODE,
             0,
-            self._sequence,
-            {"token": self._sequence, "command": code, "value": value},
+            self._counter,
+            {"token": self._counter, "command": code, "value": value},
         )
         self.radio.deliver(self.coordinator, -60, data, False, now_us)
         self._at(now_us + COMMAND_PERIOD_US, self._command)
@@ -187,7 +187,7 @@ class Service:
         words = (
             f"{kinds['motion']} motions ({path_m:.1f} m walked, truly {true_m:.1f} m), "
             f"{ranges} ranges of {self.counts['exchanges']} exchanges, {kinds['status']} status, "
-            f"{kinds['steps']} step reports, {kinds['acknowledgement']} of {self._sequence} "
+            f"{kinds['steps']} step reports, {kinds['acknowledgement']} of {self._counter} "
             f"commands acknowledged"
         )
         wanted = [
@@ -195,7 +195,7 @@ class Service:
             (0.5 * true_m <= path_m <= 1.5 * true_m, f"it saw {path_m:.1f} of {true_m:.1f} m"),
             (ranges >= 0.2 * (self._seconds - 5.0), "it reported too few ranges"),
             (kinds["status"] >= int((self._seconds - 3.0) / 10.0), "it sent too few status"),
-            (kinds["acknowledgement"] >= self._sequence - 1, "it left commands unacknowledged"),
+            (kinds["acknowledgement"] >= self._counter - 1, "it left commands unacknowledged"),
             (refused == 0, f"{refused} of its frames were refused"),
             (counters.resets == 0, f"it was reset {counters.resets} times"),
             (counters.uart_overruns == 0, f"it lost {counters.uart_overruns} received bytes"),

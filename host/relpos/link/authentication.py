@@ -1,0 +1,176 @@
+"""The team key, and counters that tell a new frame from one that is sent again.
+
+What a frame's tag and counter mean: docs/protocol.md. Nothing here changes state before a frame has
+been verified by :func:`relpos.protocol.messages.decode`.
+"""
+
+from __future__ import annotations
+
+import enum
+import json
+import os
+import secrets
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from relpos.errors import DataError
+from relpos.protocol import messages as wire
+
+EPOCH_UNIX_S = 1_704_067_200
+"""2024-01-01 UTC: where the host's counter begins."""
+COUNTS_PER_S = 8
+"""A host may send so many frames a second for ever; 32 bits last until 2041."""
+WINDOW = 64
+"""How far a frame may be behind the newest and still be taken, once."""
+KEY_ENVIRONMENT = "RELPOS_KEY_FILE"
+
+
+class HostCounter:
+    """Counters of what the host sends: the time in eighths of a second, or the last one plus 1.
+
+    ``clock`` gives Unix time in seconds; two hosts of a team, or one that was restarted, need no
+    common memory as long as their clocks are right to a few seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.time) -> None:
+        self._clock = clock
+        self._last = 0
+
+    def next(self) -> int:
+        """The next frame's counter."""
+        now = int((self._clock() - EPOCH_UNIX_S) * COUNTS_PER_S)
+        self._last = max(now, self._last + 1)
+        return self._last
+
+
+class Verdict(enum.Enum):
+    """What a frame's counter says."""
+
+    NEW = "new"
+    LATE = "late"
+    DUPLICATE = "duplicate"
+    REPLAYED = "replayed"
+
+
+@dataclass(slots=True)
+class CounterWindow:
+    """The counters seen from one sender: ``newest``, and which of the :data:`WINDOW` up to it."""
+
+    newest: int = -1
+    _seen: int = 0
+
+    def judge(self, counter: int) -> Verdict:
+        """Whether a frame of that counter may be taken; changes nothing."""
+        if counter > self.newest:
+            return Verdict.NEW
+        behind = self.newest - counter
+        if behind >= WINDOW:
+            return Verdict.REPLAYED
+        return Verdict.DUPLICATE if self._seen >> behind & 1 else Verdict.LATE
+
+    def take(self, counter: int) -> None:
+        """Remember the counter of a frame that was taken."""
+        if counter > self.newest:
+            ahead = counter - self.newest
+            self._seen = (self._seen << min(ahead, WINDOW) | 1) & ((1 << WINDOW) - 1)
+            self.newest = counter
+        else:
+            self._seen |= 1 << (self.newest - counter)
+
+    @classmethod
+    def after(cls, newest: int) -> CounterWindow:
+        """A window in which everything up to ``newest`` has been seen."""
+        return cls(newest, (1 << WINDOW) - 1)
+
+
+# -- key files -------------------------------------------------------------------------------------
+
+
+def write_new_key(path: Path) -> bytes:
+    """Make a random key, readable by the owner alone. DataError where the file exists already."""
+    key = secrets.token_bytes(wire.KEY_BYTES)
+    try:
+        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError as error:
+        raise DataError(f"{path} exists already: a key is not overwritten") from error
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written: {error.strerror}") from error
+    with os.fdopen(handle, "w", encoding="ascii") as file:
+        file.write(key.hex() + "\n")
+    return key
+
+
+def read_key(path: Path) -> bytes:
+    """The key in a file: 32 hexadecimal digits. DataError, which never quotes it, where not."""
+    try:
+        text = path.read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise DataError(f"{path}: no key can be read: {reason}") from error
+    try:
+        key = bytes.fromhex(text)
+    except ValueError as error:
+        raise DataError(
+            f"{path}: a key file holds 32 hexadecimal digits and nothing else"
+        ) from error
+    if len(key) != wire.KEY_BYTES:
+        raise DataError(f"{path}: a key has 32 hexadecimal digits, this one {2 * len(key)}")
+    return key
+
+
+def team_key(path: Path | None) -> bytes:
+    """The key of ``path``, else of the file that RELPOS_KEY_FILE names, else the one of zeros."""
+    named = os.environ.get(KEY_ENVIRONMENT)
+    if path is None and named:
+        path = Path(named)
+    return wire.DEFAULT_KEY if path is None else read_key(path)
+
+
+class SeenCounters:
+    """Each node's newest counter in a file beside the key, so that a restarted host knows them.
+
+    Without it, what was recorded before could be sent again to a host that has just begun.
+    """
+
+    EVERY_S = 5.0
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._saved_s = -self.EVERY_S
+        self._saved: dict[int, int] = {}
+
+    @classmethod
+    def beside(cls, key_file: Path) -> SeenCounters:
+        """The one that belongs to a key file."""
+        return cls(key_file.with_name(key_file.name + ".seen"))
+
+    def load(self) -> dict[int, int]:
+        """Node to newest counter; nothing where there is no file. DataError where it is damaged."""
+        try:
+            values = json.loads(self.path.read_text(encoding="ascii"))
+            self._saved = {int(node): int(counter) for node, counter in values.items()}
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError, AttributeError, TypeError) as error:
+            raise DataError(
+                f"{self.path}: not the counters of a team: delete it, and old frames can be sent "
+                "again until each node has been heard"
+            ) from error
+        return dict(self._saved)
+
+    def save(self, newest: Mapping[int, int], now_s: float, *, at_once: bool = False) -> None:
+        """Write what has grown, at most every few seconds. DataError where that fails."""
+        if newest == self._saved or not (at_once or now_s - self._saved_s >= self.EVERY_S):
+            return
+        merged = dict(self._saved)
+        for node, counter in newest.items():
+            merged[node] = max(counter, merged.get(node, -1))
+        temporary = self.path.with_name(self.path.name + ".new")
+        try:
+            temporary.write_text(json.dumps(merged), encoding="ascii")
+            temporary.replace(self.path)
+        except OSError as error:
+            raise DataError(f"{self.path}: cannot be written: {error.strerror}") from error
+        self._saved, self._saved_s = merged, now_s
