@@ -19,11 +19,32 @@ class Board(StrEnum):
     MEGA = "mega"
 
 
+def check_faults(faults: list[str] | None, nodes: int) -> tuple[str, ...]:
+    """The SPECs as they were given; a line and exit status 2 where one makes no sense."""
+    from relpos.emulator.faults import FaultError, parse_faults
+
+    try:
+        parse_faults(faults or (), range(1, nodes + 1))
+    except FaultError as error:
+        typer.echo(f"relpos: {error}", err=True)
+        raise typer.Exit(2) from None
+    return tuple(faults or ())
+
+
+Faults = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--fault", metavar="SPEC", help="Something to go wrong; repeatable. See the list below."
+    ),
+]
+
+
 def demo(
     board: Annotated[Board, typer.Option(help="What runs the firmware.")] = Board.NATIVE,
     nodes: Annotated[int, typer.Option(min=2, max=20, help="How many people.")] = 6,
     seconds: Annotated[float, typer.Option(min=10.0, help="How long they walk.")] = 300.0,
     scenario: Annotated[str, typer.Option(metavar="NAME", help="Where they walk.")] = "paper",
+    fault: Faults = None,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same walk.")] = 0,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where the report goes.")] = Path(
         "out/demo"
@@ -34,9 +55,15 @@ def demo(
     from relpos.emulator.team import record_team
     from relpos.runs import save_run
 
+    faults = check_faults(fault, nodes)
     with output.working(f"emulating {nodes} nodes for {seconds:g} s"):
         run = record_team(
-            board=str(board), nodes=nodes, seconds=seconds, scenario=scenario, seed=seed
+            board=str(board),
+            nodes=nodes,
+            seconds=seconds,
+            scenario=scenario,
+            seed=seed,
+            faults=faults,
         )
     save_run(run, out / "run")
     job = fuse.Job(str(out / "run"), fuse.EstimatorName.PARTICLE, {}, seed, out)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from relpos.cli.demo import Board
+from relpos.cli.demo import Board, Faults, check_faults
 
 
 def emulate(
@@ -19,9 +19,7 @@ def emulate(
     seconds: Annotated[
         float | None, typer.Option(min=1.0, help="End after so long. (default: Ctrl-C ends)")
     ] = None,
-    fault: Annotated[
-        list[str] | None, typer.Option(metavar="SPEC", help="A fault to inject; repeatable.")
-    ] = None,
+    fault: Faults = None,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same bytes.")] = 0,
 ) -> None:
     """Offer an emulated team on a pseudo-terminal that speaks as an XBee coordinator.
@@ -36,7 +34,7 @@ def emulate(
         scenario=scenario,
         speed=speed,
         seconds=seconds,
-        faults=tuple(fault or ()),
+        faults=check_faults(fault, nodes),
         seed=seed,
         announce=typer.echo,
     )

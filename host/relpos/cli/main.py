@@ -16,6 +16,7 @@ from typer.core import TyperGroup
 
 from relpos import __version__
 from relpos.cli import deadreckon, demo, emulate, evaluate, fuse, node, simulate
+from relpos.emulator.faults import help_text
 from relpos.errors import RelposError
 
 
@@ -68,8 +69,8 @@ def main(
     """Where everybody is, relative to each other: IMU and UWB, no anchors, no map."""
 
 
-app.command("demo")(demo.demo)
-app.command("emulate")(emulate.emulate)
+app.command("demo", epilog=help_text())(demo.demo)
+app.command("emulate", epilog=help_text())(emulate.emulate)
 app.command("fuse", cls=fuse.FuseCommand)(fuse.fuse)
 app.command("simulate")(simulate.simulate)
 app.command("evaluate")(evaluate.evaluate)

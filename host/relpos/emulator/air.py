@@ -87,6 +87,9 @@ class UwbAir:
         self._rng = rng
         self._collisions = collisions
         self._under_way: list[_Exchange] = []
+        self.spoil: Callable[[Pozyx, float | None, int], tuple[float | None, bool]] | None = None
+        """Fault: (initiator, what would be measured in metres, end of the exchange) -> what is
+        measured instead, and whether a stranger's exchange spoils it."""
 
     def begin_exchange(self, initiator: Pozyx, destination: int, time_us: int) -> None:
         """See :class:`relpos.emulator.pozyx.UwbMedium`."""
@@ -102,8 +105,11 @@ class UwbAir:
             )
             if measured is None:
                 self.counts["undetected"] += 1
+        spoilt = False
+        if self.spoil is not None:
+            measured, spoilt = self.spoil(initiator, measured, time_us + EXCHANGE_US)
         duration_us = FAILED_EXCHANGE_US if measured is None else EXCHANGE_US
-        exchange = _Exchange(time_us + duration_us, (initiator, responder))
+        exchange = _Exchange(time_us + duration_us, (initiator, responder), spoilt)
         self._under_way = [e for e in self._under_way if e.end_us > time_us]
         if self._collisions:
             for other in self._under_way:
@@ -171,6 +177,11 @@ class RadioAir:
         self._distance_m = distance_m
         self._rng = rng
         self._last_us: dict[int, int] = {}
+        self.spoil: (
+            Callable[[XbeeModule, XbeeModule, bytes, int], list[tuple[int, bytes]]] | None
+        ) = None
+        """Fault: (sender, receiver, data, arrival) -> (arrival, data) of what comes instead;
+        nothing: lost."""
 
     def send(
         self,
@@ -198,12 +209,19 @@ class RadioAir:
             if delay_s is None:
                 self.counts["lost"] += 1
                 continue
-            heard = True
             arrival_us = max(
                 time_us + round(delay_s * 1e6), self._last_us.get(sender.serial_number, 0) + 1
             )
+            arrivals = [(arrival_us, data)]
+            if self.spoil is not None:
+                arrivals = self.spoil(sender, receiver, data, arrival_us)
+                if not arrivals:
+                    self.counts["lost"] += 1
+                    continue
+            heard = True
             done_us = max(done_us, arrival_us)
-            self._clock.at(arrival_us, self._arrival(sender, receiver, data, broadcast))
+            for at_us, came in arrivals:
+                self._clock.at(at_us, self._arrival(sender, receiver, came, broadcast))
         if broadcast or heard:
             status = DELIVERED
         else:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from .bus import I2cDevice
-from .surroundings import MagneticErrors, Surroundings
+from .surroundings import FloatArray, MagneticErrors, Surroundings
 
 ADDRESS = 0x0C
 WIA = 0x00
@@ -57,9 +57,20 @@ class Ak8975(I2cDevice):
         self._errors = errors or MagneticErrors()
         self._reachable = reachable
         self._rng = np.random.default_rng([self._errors.seed, 3])
-        self._disabled = False
         self.time_us = 0
         self.refused_modes = 0
+        self.conversion_us = CONVERSION_US
+        self.spoil: Callable[[FloatArray], FloatArray] | None = None
+        """Fault: field (3,) in the chip's axes, microtesla -> what is measured instead."""
+        self._begin()
+
+    def power_cycle(self, time_us: int) -> None:
+        """Supply off and on again (brown-out) at ``time_us``."""
+        self.time_us = max(self.time_us, time_us)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._disabled = False
         self._mode = POWER_DOWN
         self._done_us: int | None = None
         self._data = bytes(6)
@@ -77,7 +88,7 @@ class Ak8975(I2cDevice):
         """Finish a conversion that is due."""
         self.time_us = max(self.time_us, time_us)
         if self._done_us is not None and self.time_us >= self._done_us:
-            self._convert(self._done_us - CONVERSION_US // 2)
+            self._convert(self._done_us - self.conversion_us // 2)
             self._done_us = None
             self._mode = POWER_DOWN
 
@@ -91,6 +102,8 @@ class Ak8975(I2cDevice):
         if not np.all(np.isfinite(chip)):
             # A recording without magnetometer samples here: the conversion never ends.
             return
+        if self.spoil is not None:
+            chip = self.spoil(chip)
         gain = (np.array(self._errors.adjustment) + 128.0) / 256.0
         raw = np.clip(np.rint(chip / (UT_PER_LSB * gain)), -MOST_RAW - 1, MOST_RAW)
         self._data = raw.astype("<i2").tobytes()
@@ -108,7 +121,7 @@ class Ak8975(I2cDevice):
             self._mode = mode
             if mode != FUSE_ROM:
                 self._st1 = 0
-                self._done_us = self.time_us + CONVERSION_US
+                self._done_us = self.time_us + self.conversion_us
 
     def _read_register(self, address: int) -> int:
         if address == WIA:

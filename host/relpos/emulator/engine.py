@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from relpos.protocol.messages import ResetCause
+
 NEVER_US = 1 << 62
 """A due time that does not come."""
 
@@ -42,6 +44,12 @@ class Engine(Protocol):
 
     def set_supply(self, supply_mv: int) -> None:
         """Supply in millivolts that the board measures from now on; 5000 at first."""
+
+    def reset(self, time_us: int, cause: ResetCause) -> None:
+        """Restart the board at ``time_us``: its RAM is lost, EEPROM and chips keep their state."""
+
+    def stall(self, time_us: int, until_us: int) -> None:
+        """The oscillator stands from ``time_us`` to ``until_us``: nothing executes or counts."""
 
     def close(self) -> None:
         """Free what the engine holds; it must not be used afterwards."""

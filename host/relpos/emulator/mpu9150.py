@@ -13,7 +13,7 @@ DLPF_CFG 1 to 6: 2.0/2.2, 3.0/3.4, 4.9/5.1, 8.5/10.7, 13.8/22.5, 19.0/45).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 
 import numpy as np
@@ -176,6 +176,8 @@ class Mpu9150(I2cDevice):
         self._errors = errors or InertialErrors()
         self._pipeline = _Pipeline(surroundings, self._errors)
         self.auxiliary: Mapping[int, I2cDevice] = {} if auxiliary is None else auxiliary
+        self.spoil: Callable[[bytes, int], bytes | None] | None = None
+        """Fault: (a sample's 14 bytes, its time) -> what is shown for it; None: no new sample."""
         self.time_us = 0
         self._registers = bytearray(128)
         self._pointer = 0
@@ -277,7 +279,13 @@ class Mpu9150(I2cDevice):
         if not 0 <= index < len(self._table):
             self._fill(sample)
             index = sample - self._table_first
-        self._data = self._table[index]
+        data = self._table[index]
+        if self.spoil is not None:
+            shown = self.spoil(data, self._time_of(sample))
+            if shown is None:
+                return
+            data = shown
+        self._data = data
         self._status |= DATA_READY
 
     def _fill(self, sample: int) -> None:

@@ -42,6 +42,7 @@ _POINTER = ctypes.c_void_p
 _I2cTransfer = ctypes.CFUNCTYPE(_U8, _POINTER, _U8, _POINTER, _U8, _POINTER, _U8, _POINTER, _U8)
 _UartWrite = ctypes.CFUNCTYPE(None, _POINTER, _POINTER, _U16)
 _Reset = ctypes.CFUNCTYPE(None, _POINTER)
+_StorageWrite = ctypes.CFUNCTYPE(None, _POINTER, _U16, _U8)
 
 
 class _Callbacks(ctypes.Structure):
@@ -50,6 +51,7 @@ class _Callbacks(ctypes.Structure):
         ("i2c_transfer", _I2cTransfer),
         ("uart_write", _UartWrite),
         ("reset", _Reset),
+        ("storage_write", _StorageWrite),
     )
 
 
@@ -166,6 +168,8 @@ class NativeEngine:
         self.on_transmit: Callable[[int, bytes], None] = _nowhere
         self.next_due_us = power_on_us
         self.resets = 0
+        self.store: Callable[[int, int], None] = self._eeprom_write
+        """Called with (address, value) of every byte that is written to the EEPROM."""
         self._clock = clock or NodeClockError()
         self._power_on_us = power_on_us
         self._rate = 1.0 + self._clock.drift_ppm * 1e-6
@@ -179,7 +183,11 @@ class NativeEngine:
         self._supply_mv = 5000
         # Kept alive here: ctypes does not.
         self._callbacks = _Callbacks(
-            None, _I2cTransfer(self._transfer), _UartWrite(self._written), _Reset(self._asked)
+            None,
+            _I2cTransfer(self._transfer),
+            _UartWrite(self._written),
+            _Reset(self._asked),
+            _StorageWrite(self._stored),
         )
         self._node: int | None = None
         self._create(reset_cause)
@@ -241,6 +249,15 @@ class NativeEngine:
     def _asked(self, _context: int | None) -> None:
         self._reset_asked = True
 
+    def _stored(self, _context: int | None, at: int, value: int) -> None:
+        try:
+            self.store(at, value)
+        except BaseException as error:
+            self._error = error
+
+    def _eeprom_write(self, at: int, value: int) -> None:
+        self._eeprom[at] = value
+
     # -- Engine -----------------------------------------------------------------------------------
 
     def run(self, until_us: int) -> None:
@@ -267,6 +284,10 @@ class NativeEngine:
             since_us += 1
         self.next_due_us = self._power_on_us + since_us
 
+    def executes(self, time_us: int) -> bool:
+        """Whether the start-up after the last reset is over."""
+        return time_us >= self._power_on_us
+
     def receive(self, data: bytes) -> None:
         """Bytes that have arrived at the UART; the node runs again at once."""
         if self._node:
@@ -286,6 +307,11 @@ class NativeEngine:
         self._supply_mv = supply_mv
         if self._node:
             self._library.relpos_node_set_supply(self._node, supply_mv)
+
+    def stall(self, time_us: int, until_us: int) -> None:
+        """The oscillator stands from ``time_us`` to ``until_us``: nothing executes or counts."""
+        self._power_on_us += until_us - time_us
+        self.next_due_us = max(self.next_due_us, time_us) + until_us - time_us
 
     def close(self) -> None:
         """Free the node."""

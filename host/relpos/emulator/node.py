@@ -127,7 +127,12 @@ class EmulatedNode:
         self.bus.attach(pozyx.ADDRESS, self.tag)
         self.radio = XbeeModule(node, 0x40000000 + node, air, self._from_radio)
         self.engine = make_engine(BoardKind(board), self.bus, self.eeprom, node, errors)
-        self.engine.on_transmit = self.radio.from_serial
+        self.engine.on_transmit = self._to_radio
+        self.hold_frames = False
+        """Whether bytes of the native board go to the radio as they leave, so that a restart can
+        cut a frame; else whole."""
+        self._leaving: list[tuple[int, bytes]] = []
+        self._stopped_until_us = 0
         self._paced_by_engine = BoardKind(board) is not BoardKind.NATIVE
         self._clock = clock
         self._due_us = max(self.engine.next_due_us, clock.now_us)
@@ -148,8 +153,35 @@ class EmulatedNode:
             begin_us if self._paced_by_engine else left_us, lambda now_us: self._hear(data, now_us)
         )
 
+    def _to_radio(self, left_us: int, data: bytes) -> None:
+        if not self.hold_frames or self._paced_by_engine:
+            self.radio.from_serial(left_us, data)
+            return
+        self._leaving.append((left_us, data))
+        self._clock.at(left_us, self._left)
+
+    def _left(self, now_us: int) -> None:
+        while self._leaving and self._leaving[0][0] <= now_us:
+            self.radio.from_serial(*self._leaving.pop(0))
+
+    def restart(self, now_us: int, cause: wire.ResetCause) -> None:
+        """Reset the board: its RAM is lost, of a frame being sent the rest does not leave."""
+        for left_us, data in self._leaving:
+            missing = -(-(left_us - now_us) * self.radio.baud // 10_000_000)
+            if missing < len(data):
+                self.radio.from_serial(now_us, data[: len(data) - missing])
+        self._leaving.clear()
+        self.engine.reset(now_us, cause)
+
+    def stop(self, now_us: int, until_us: int) -> None:
+        """The board executes nothing and hears nothing from now until then."""
+        self.engine.stall(now_us, until_us)
+        self._stopped_until_us = until_us
+
     def _hear(self, data: bytes, now_us: int) -> None:
-        if now_us < self.errors.power_on_us:
+        if now_us < max(self.errors.power_on_us, self._stopped_until_us):
+            return
+        if isinstance(self.engine, NativeEngine) and not self.engine.executes(now_us):
             return
         self.engine.receive(data)
         if not self._paced_by_engine and now_us < self._due_us:

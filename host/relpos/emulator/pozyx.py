@@ -8,6 +8,7 @@ hardware: the time of an exchange, the default UWB settings, the clock stretchin
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -137,6 +138,9 @@ class Pozyx(I2cDevice):
         self._pressure_next_us = 0
         self.ranging = False
         """Whether an exchange that this tag started is on the air."""
+        self.intercept: Callable[[int, RangeResult | None, int, int], None] | None = None
+        """Fault: takes (peer, result, error, time) of an exchange that this tag started, and sees
+        to its :meth:`complete`."""
         self._begin()
 
     def power_cycle(self, time_us: int) -> None:
@@ -183,16 +187,33 @@ class Pozyx(I2cDevice):
         if started:
             if not self.ranging:
                 return  # reset in between
+            if self.intercept is not None:
+                self.intercept(peer, result, error, time_us)
+                return
             self.ranging = False
-        if result is None:
-            self._fail(error)
-            return
-        stamp_ms = (time_us - self._power_on_us) // 1000
-        self._ranges[peer] = struct.pack(
-            "<IIh", stamp_ms & 0xFFFFFFFF, result.distance_mm, result.rss_dbm
-        )
-        self._registers[ERRORCODE] = ERROR_NONE
-        self._status |= INT_FUNC
+        self.complete(peer, result, error, time_us)
+
+    def complete(
+        self,
+        peer: int,
+        result: RangeResult | None,
+        error: int,
+        time_us: int,
+        *,
+        store: bool = True,
+        inverted: bool = False,
+    ) -> None:
+        """Store what an exchange gave and raise its flag; faults leave out or invert that."""
+        if result is not None and store:
+            stamp_ms = (time_us - self._power_on_us) // 1000
+            self._ranges[peer] = struct.pack(
+                "<IIh", stamp_ms & 0xFFFFFFFF, result.distance_mm, result.rss_dbm
+            )
+        if (result is None) != inverted:
+            self._fail(error or ERROR_RANGING)
+        else:
+            self._registers[ERRORCODE] = ERROR_NONE
+            self._status |= INT_FUNC
 
     def _fail(self, error: int) -> None:
         self._registers[ERRORCODE] = error

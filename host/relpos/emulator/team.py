@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from relpos.calibration.steps import LEG_OF_STATURE
-from relpos.errors import RelposError
 from relpos.measurements import Prior, Truth
 from relpos.protocol import messages as wire
 from relpos.simulation.team import Scenario, make_team
@@ -20,6 +19,8 @@ from relpos.simulation.walker import RATE_HZ, WalkerTruth
 from relpos.simulation.world import FloatArray
 
 from .air import RadioAir, UwbAir, VirtualClock
+from .faults import FaultSpec, parse_faults
+from .faults_injection import FaultInjector, prepare_errors
 from .node import BoardKind, EmulatedNode, NodeErrors, draw_node_errors, draw_uncalibrated_errors
 from .pozyx import Pozyx
 from .surroundings import Surroundings
@@ -47,7 +48,8 @@ class EmulatedTeam:
     after ``relpos node set``; others run on the firmware's defaults. All are given the team's
     ``key``. ``node_errors`` replaces
     what is drawn by the seed: nodes from the shelf, or in scenario "turntable" such as nobody has
-    calibrated. The truth methods are for evaluation alone.
+    calibrated. ``faults`` are SPECs of :mod:`relpos.emulator.faults`; FaultError where one makes
+    no sense. The truth methods are for evaluation alone.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class EmulatedTeam:
         configured: bool = True,
         node_errors: Callable[[int, int], NodeErrors] | None = None,
         key: bytes = wire.DEFAULT_KEY,
+        faults: Sequence[str | FaultSpec] = (),
     ) -> None:
         if node_errors is None:
             uncalibrated = scenario == "turntable"
@@ -78,6 +81,8 @@ class EmulatedTeam:
         )
         self.radio = RadioAir(self.clock, self.world, self._module_distance_m, radio_rng)
         self._output: list[tuple[int, bytes]] = []
+        self.host_fault: Callable[[int], int | None] | None = None
+        """Fault: time at which something leaves the port -> when the host gets it, None: never."""
         self.coordinator = XbeeModule(
             wire.COORDINATOR, 0x40000000, self.radio, self._from_coordinator
         )
@@ -85,9 +90,13 @@ class EmulatedTeam:
         self.nodes: dict[int, EmulatedNode] = {}
         self._walker_of_tag: dict[Pozyx, WalkerTruth] = {}
         self._walker_of_module: dict[XbeeModule, WalkerTruth] = {}
+        specs = parse_faults(faults, list(self.walkers))
         try:
             for walker in walkers:
-                self._add(walker, board, node_errors(seed, walker.node), configured)
+                errors = prepare_errors(node_errors(seed, walker.node), walker.node, specs)
+                self._add(walker, board, errors, configured)
+            if specs:
+                FaultInjector(self, specs, seed)
         except BaseException:
             self.close()
             raise
@@ -140,6 +149,8 @@ class EmulatedTeam:
 
     def send(self, data: bytes) -> None:
         """Bytes from the host begin to arrive now at the coordinator's serial port."""
+        if not self.host_listens(self.clock.now_us):
+            return
         arrived_us = self.clock.now_us + line_time_us(len(data), self.coordinator.baud)
         self.clock.at(arrived_us, lambda now_us: self.coordinator.from_serial(now_us, data))
 
@@ -149,7 +160,18 @@ class EmulatedTeam:
             yield from self.run(min(self.clock.now_us + STEP_US, self.end_us))
 
     def _from_coordinator(self, left_us: int, data: bytes) -> None:
-        self.clock.at(left_us, lambda now_us: self._output.append((now_us, data)))
+        self.clock.at(left_us, lambda now_us: self._to_host(now_us, data))
+
+    def _to_host(self, now_us: int, data: bytes) -> None:
+        at_us = now_us if self.host_fault is None else self.host_fault(now_us)
+        if at_us == now_us:
+            self._output.append((now_us, data))
+        elif at_us is not None:
+            self.clock.at(at_us, lambda later_us: self._output.append((later_us, data)))
+
+    def host_listens(self, time_us: int) -> bool:
+        """Whether a host is at the port: what it would send then is sent."""
+        return self.host_fault is None or self.host_fault(time_us) == time_us
 
     def close(self) -> None:
         """Free the boards."""
@@ -237,11 +259,14 @@ def serve_team(
     """
     from .pty import PseudoTerminal
 
-    if faults:
-        raise RelposError(f"unknown fault '{faults[0]}': this version has none to inject")
     with (
         EmulatedTeam(
-            scenario, nodes, UNLIMITED_S if seconds is None else seconds, seed, board
+            scenario,
+            nodes,
+            UNLIMITED_S if seconds is None else seconds,
+            seed,
+            board,
+            faults=faults,
         ) as team,
         PseudoTerminal(team, speed=speed, mark_time=speed != 1.0) as terminal,
     ):
@@ -249,7 +274,15 @@ def serve_team(
         terminal.serve()
 
 
-def record_team(*, board: str, nodes: int, seconds: float, scenario: str, seed: int) -> Run:
+def record_team(
+    *,
+    board: str,
+    nodes: int,
+    seconds: float,
+    scenario: str,
+    seed: int,
+    faults: Sequence[str] = (),
+) -> Run:
     """Body of ``relpos demo``'s first half: the team through a real serial port into a Run.
 
     The bytes go through a pseudo-terminal and pyserial as from a real coordinator, as fast as they
@@ -266,7 +299,7 @@ def record_team(*, board: str, nodes: int, seconds: float, scenario: str, seed: 
     measurements: list[Motion | Range | Height | Heading] = []
     statuses: list[Status] = []
     steps: list[Step] = []
-    with EmulatedTeam(scenario, nodes, seconds, seed, board) as team:
+    with EmulatedTeam(scenario, nodes, seconds, seed, board, faults=faults) as team:
         with PseudoTerminal(team, speed=0.0) as terminal, terminal.open_port() as port:
             terminal.start()
             for batch in observe(port, link, port.virtual_time_s):
@@ -285,7 +318,8 @@ def record_team(*, board: str, nodes: int, seconds: float, scenario: str, seed: 
             name=f"{scenario}-{board}-{seed}",
             description=Description(
                 source=f"relpos demo --board {board} --scenario {scenario} --nodes {nodes} "
-                f"--seconds {seconds:g} --seed {seed}",
+                f"--seconds {seconds:g} --seed {seed}"
+                + "".join(f" --fault {fault}" for fault in faults),
                 heading_known=True,
                 priors=tuple(priors),
                 nodes={

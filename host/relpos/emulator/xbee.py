@@ -35,6 +35,8 @@ SERIAL_HIGH = 0x0013A200
 PAN_BROADCAST = 0x04
 ADDRESS_BROADCAST_OPTION = 0x02
 TRANSMIT_64 = 0x00
+MODEM_STATUS = 0x8A
+HARDWARE_RESET = 0
 
 AT_OK = 0
 AT_BAD_COMMAND = 2
@@ -83,7 +85,9 @@ class XbeeModule:
         self.baud = baud
         self.on_serial = on_serial
         self.counts: Counter[str] = Counter()
-        self._air = air
+        self.air = air
+        self.line_fault: Callable[[bytes, bool], bytes] | None = None
+        """Fault: (bytes, whether they go to the module) -> what arrives of them."""
         self._escaped = escaped
         self._parser = Parser(escaped=escaped)
         self._line_free_us = 0
@@ -121,8 +125,16 @@ class XbeeModule:
 
     def from_serial(self, time_us: int, data: bytes) -> None:
         """Bytes that have arrived on the module's UART by ``time_us``."""
+        if self.line_fault is not None:
+            data = self.line_fault(data, True)
         for frame in self._parser.feed(data):
             self._handle(frame, time_us)
+
+    def restart(self, time_us: int) -> None:
+        """Supply off and on again: what has come of a frame is lost; the reset is told."""
+        self._parser = Parser(escaped=self._escaped)
+        self._line_free_us = time_us
+        self._emit(time_us, UnknownFrame(MODEM_STATUS, bytes((HARDWARE_RESET,))))
 
     def _handle(self, frame: ApiFrame, time_us: int) -> None:
         if isinstance(frame, Transmit16):
@@ -156,7 +168,7 @@ class XbeeModule:
         if len(data) > MOST_PAYLOAD:
             report(time_us, TOO_LARGE)
             return
-        self._air.send(self, destination, long, data, time_us, report)
+        self.air.send(self, destination, long, data, time_us, report)
 
     def _at(self, frame: AtCommand, time_us: int) -> None:
         command = frame.command.upper()
@@ -211,6 +223,10 @@ class XbeeModule:
 
     def _emit(self, time_us: int, frame: ApiFrame) -> None:
         data = encode(frame, escaped=self._escaped)
+        if self.line_fault is not None:
+            data = self.line_fault(data, False)
+            if not data:
+                return
         begin = max(time_us, self._line_free_us)
         self._line_free_us = begin + line_time_us(len(data), self.baud)
         self.on_serial(self._line_free_us, data)

@@ -46,7 +46,12 @@ class NativeBoard final : public Board {
   }
   uint8_t storage_read(uint16_t at) override { return at < eeprom_size_ ? eeprom_[at] : 0xFF; }
   bool storage_write(uint16_t at, uint8_t value) override {
-    if (at < eeprom_size_) eeprom_[at] = value;
+    if (at >= eeprom_size_) return true;
+    if (callbacks_.storage_write != nullptr) {
+      callbacks_.storage_write(callbacks_.context, at, value);
+    } else {
+      eeprom_[at] = value;
+    }
     return true;
   }
   uint32_t now_us() override { return now_us_; }

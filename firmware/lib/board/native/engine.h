@@ -22,6 +22,8 @@ typedef struct {
   /* The node asked to reboot: destroy it after the poll has returned and create it anew with reset
    * cause 4 (watchdog) or 5 (command). */
   void (*reset)(void* context);
+  /* Instead of a write to eeprom, which is then the caller's to do; NULL: written in place. */
+  void (*storage_write)(void* context, uint16_t at, uint8_t value);
 } relpos_board_callbacks;
 
 /* eeprom (at least 250 bytes, 0xFF where never written) stays the caller's and is written in place;

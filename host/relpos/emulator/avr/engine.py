@@ -14,11 +14,21 @@ from relpos.emulator.avr.board import (
 from relpos.emulator.avr.elf import Firmware
 from relpos.emulator.avr.library import SimulatorError
 from relpos.emulator.bus import I2cBus
+from relpos.protocol import messages as wire
 
 QUANTUM_US = 1000
 """How far a board may run ahead of the others: one frame of 3 bytes at 38400 baud takes as long."""
 
 XBEE_BAUD = 38400
+
+_FLAGS = {
+    wire.ResetCause.UNKNOWN: ResetCause.EXTERNAL,
+    wire.ResetCause.POWER_ON: ResetCause.POWER_ON,
+    wire.ResetCause.EXTERNAL: ResetCause.EXTERNAL,
+    wire.ResetCause.BROWN_OUT: ResetCause.BROWN_OUT,
+    wire.ResetCause.WATCHDOG: ResetCause.WATCHDOG,
+    wire.ResetCause.COMMAND: ResetCause.WATCHDOG,
+}
 
 
 class BusBridge:
@@ -131,9 +141,25 @@ class AvrEngine:
         else:
             self.lost_before_power_on += len(data)
 
-    def reset(self, cause: ResetCause) -> None:
-        """Reset the board as by its button, a dip of the supply or a new battery."""
-        self.board.reset(cause)
+    def reset(self, time_us: int, cause: wire.ResetCause) -> None:
+        """Reset the board at ``time_us``: by its button, a dip of the supply or a new battery."""
+        self.run(time_us)
+        self.board.reset(_FLAGS[cause])
+
+    @property
+    def eeprom_writing(self) -> bool:
+        """Whether a byte is being written at this moment (EEPE in EECR, at 0x3F on both boards)."""
+        return bool(self.board.data(0x3F, 1)[0] & 0x02)
+
+    @property
+    def eeprom_writes(self) -> int:
+        """Bytes written since power-on."""
+        return self.board.counters().eeprom_writes
+
+    def stall(self, time_us: int, until_us: int) -> None:
+        """The oscillator stands from ``time_us`` to ``until_us``: nothing executes or counts."""
+        self.run(time_us)
+        self._power_on_us += until_us - time_us
 
     def set_supply(self, supply_mv: int) -> None:
         """Supply in millivolts from now on; 5000 at first."""
