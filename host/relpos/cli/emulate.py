@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from relpos.cli.demo import Board, Faults, check_faults
+from relpos.cli.keys import KeyFile, team_key
 
 
 def emulate(
@@ -21,6 +22,7 @@ def emulate(
     ] = None,
     fault: Faults = None,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same bytes.")] = 0,
+    key_file: KeyFile = None,
 ) -> None:
     """Offer an emulated team on a pseudo-terminal that speaks as an XBee coordinator.
 
@@ -37,4 +39,5 @@ def emulate(
         faults=check_faults(fault, nodes),
         seed=seed,
         announce=typer.echo,
+        key=team_key(key_file),
     )

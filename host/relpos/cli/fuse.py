@@ -13,6 +13,7 @@ from typer.core import TyperCommand
 
 from relpos.cli import output
 from relpos.cli import source as sources
+from relpos.cli.keys import KeyFile
 from relpos.errors import DataError, DeviceError, RelposError
 
 if TYPE_CHECKING:
@@ -86,6 +87,7 @@ def fuse(
     seconds: Annotated[
         float | None, typer.Option(min=0.0, help="Listen to a port this long, then end.")
     ] = None,
+    key_file: KeyFile = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
     report: Annotated[
         bool | None,
@@ -109,7 +111,7 @@ def fuse(
         raise output.not_built_yet("the estimator bank")
     job = Job(source, estimator, chosen, seed, out or Path("out") / _base_name(source))
     if sources.is_port(source):
-        _fuse_port(job, initial, seconds, as_json=json)
+        _fuse_port(job, initial, seconds, key_file, as_json=json)
     else:
         _fuse_run(job, initial, as_json=json, report=not json if report is None else report)
 
@@ -290,13 +292,20 @@ def _score(
     )
 
 
-def _fuse_port(job: Job, initial: Initial | None, seconds: float | None, *, as_json: bool) -> None:
+def _fuse_port(
+    job: Job,
+    initial: Initial | None,
+    seconds: float | None,
+    key_file: Path | None,
+    *,
+    as_json: bool,
+) -> None:
     from relpos.measurements import Event, Heading, Height, Motion, Prior, Range, Status, Step
     from relpos.runs import Run, save_run, write_estimates
 
     if initial is Initial.TRUTH:
         raise DataError(f"{job.source}: a port brings no truth to start from")
-    port = sources.Port(job.source, seconds)
+    port = sources.Port(job.source, seconds, key_file)
     if not as_json:
         output.remark(f"listening to {job.source}; Ctrl-C ends")
     stream = iter(output.with_progress(port, None, "received"))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from relpos.cli import output
+from relpos.cli.keys import make_link
 from relpos.errors import DataError
 
 if TYPE_CHECKING:
@@ -39,10 +40,12 @@ class Port:
     says that the port does not exist or has vanished; what came before has been yielded.
     """
 
-    def __init__(self, port: str, seconds: float | None = None) -> None:
+    def __init__(
+        self, port: str, seconds: float | None = None, key_file: Path | None = None
+    ) -> None:
         from relpos.link import live
 
-        self._link = live.Link()
+        self._link, self._seen = make_link(key_file)
         self._device = live.open_port(port)
         self._seconds = seconds
 
@@ -62,8 +65,12 @@ class Port:
                 while told < len(self._link.decoder.remarks):
                     output.remark(self._link.decoder.remarks[told])
                     told += 1
+                if self._seen is not None:
+                    self._seen.save(self._link.newest_counters(), time.monotonic())
                 yield from batch
                 if self._seconds is not None and time.monotonic() - started > self._seconds:
                     return
         finally:
             self._device.close()
+            if self._seen is not None:
+                self._seen.save(self._link.newest_counters(), time.monotonic(), at_once=True)

@@ -251,6 +251,7 @@ def serve_team(
     faults: Sequence[str],
     seed: int,
     announce: Callable[[str], None],
+    key: bytes = wire.DEFAULT_KEY,
 ) -> None:
     """Body of ``relpos emulate``: the team behind a pseudo-terminal until its walk ends or Ctrl-C.
 
@@ -267,6 +268,7 @@ def serve_team(
             seed,
             board,
             faults=faults,
+            key=key,
         ) as team,
         PseudoTerminal(team, speed=speed, mark_time=speed != 1.0) as terminal,
     ):

@@ -24,7 +24,6 @@ COUNTS_PER_S = 8
 """A host may send so many frames a second for ever; 32 bits last until 2041."""
 WINDOW = 64
 """How far a frame may be behind the newest and still be taken, once."""
-KEY_ENVIRONMENT = "RELPOS_KEY_FILE"
 
 
 class HostCounter:
@@ -118,14 +117,6 @@ def read_key(path: Path) -> bytes:
     if len(key) != wire.KEY_BYTES:
         raise DataError(f"{path}: a key has 32 hexadecimal digits, this one {2 * len(key)}")
     return key
-
-
-def team_key(path: Path | None) -> bytes:
-    """The key of ``path``, else of the file that RELPOS_KEY_FILE names, else the one of zeros."""
-    named = os.environ.get(KEY_ENVIRONMENT)
-    if path is None and named:
-        path = Path(named)
-    return wire.DEFAULT_KEY if path is None else read_key(path)
 
 
 class SeenCounters:
