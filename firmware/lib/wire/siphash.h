@@ -1,4 +1,5 @@
-// SipHash-2-4 with an 8-byte tag (Aumasson & Bernstein 2012).
+// SipHash-2-4 with an 8-byte tag (Aumasson and Bernstein, "SipHash: a fast short-input PRF",
+// INDOCRYPT 2012).
 #pragma once
 
 #include <stdint.h>
@@ -6,8 +7,9 @@
 namespace relpos {
 namespace wire {
 
-// key: 16 bytes. The tag may stand right behind the data.
-void siphash24(const uint8_t* key, const uint8_t* data, uint8_t count, uint8_t* tag);
+// At most 127 bytes of data. The tag is in the paper's order, least significant byte first; it may
+// stand right behind the data, or over data or key, which have been read by then.
+void siphash24(const uint8_t key[16], const uint8_t* data, uint8_t count, uint8_t tag[8]);
 
 }  // namespace wire
 }  // namespace relpos
