@@ -15,11 +15,12 @@ enum Mode : uint8_t { kPowerDownMode = 0x00, kSingleMode = 0x01, kFuseRomMode = 
 
 constexpr uint8_t kIdentity = 0x48;
 constexpr uint8_t kDataReady = 0x01;     // ST1
-constexpr uint8_t kDataError = 0x04;     // ST2
-constexpr uint8_t kOverflow = 0x08;      // ST2
 constexpr uint8_t kPeriodTicks = 10;     // 5 Hz
 constexpr uint8_t kAbsentTicks = 50;     // between attempts to reach a chip that does not answer
 constexpr uint8_t kMostFailures = 3;     // in a row, then set up anew
+// Readings in a row that a chip may repeat: while its wearer walks it never repeats one, and while he
+// stands no heading is needed.
+constexpr uint8_t kMostRepeats = 5;
 constexpr float kUnit = 0.3f / 256.0f;   // 0.3 uT a count, adjusted by (ASA + 128) / 256
 
 int16_t little_endian(const uint8_t* bytes) {
@@ -89,15 +90,23 @@ RELPOS_APART bool Ak8975::step(Board& board, float field_ut[3]) {
     fail();
     return false;
   }
-  if ((raw[0] & kDataReady) == 0) {
+  bool changed = false;
+  for (uint8_t axis = 0; axis < 3; ++axis) {
+    changed |= raw[1 + 2 * axis] != last_low_[axis];
+    last_low_[axis] = raw[1 + 2 * axis];
+  }
+  if (changed) repeats_ = 0;
+  // All other bits of ST1 read as 0.
+  if (raw[0] != kDataReady || repeats_ >= kMostRepeats) {
     ++rejected_;
     fail();
     return false;
   }
+  ++repeats_;
   state_ = State::kIdle;
   wait_ticks_ = kPeriodTicks - 2;
   failures_ = 0;
-  if ((raw[7] & (kDataError | kOverflow)) != 0) {
+  if (raw[7] != 0) {  // data error, overflow; all other bits of ST2 read as 0
     ++rejected_;
     return false;
   }

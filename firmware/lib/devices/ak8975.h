@@ -18,7 +18,7 @@ class Ak8975 {
   bool step(Board& board, float field_ut[3]);
   bool running() const { return state_ >= State::kIdle; }
   void restart() { state_ = State::kIdentify; wait_ticks_ = 0; }
-  uint16_t rejected() const { return rejected_; }  // overflows, data errors, late results; wraps
+  uint16_t rejected() const { return rejected_; }  // overflows, data errors, late or repeated results; wraps
 
  private:
   enum class State : uint8_t { kIdentify, kPowerDown, kFuseMode, kFuseRead, kLeaveFuse, kIdle, kFetch };
@@ -29,6 +29,8 @@ class Ak8975 {
   uint8_t wait_ticks_;
   uint8_t failures_;
   uint8_t adjustment_[3];  // ASA
+  uint8_t last_low_[3];    // of the last reading
+  uint8_t repeats_;
   uint16_t rejected_;
 };
 

@@ -23,7 +23,11 @@ enum Register : uint8_t {
 constexpr uint8_t kIdentity = 0x34;       // bits 6:1 of WHO_AM_I; the others are not specified
 constexpr uint8_t kIdentityMask = 0x7E;
 constexpr uint8_t kDataReady = 0x01;
-constexpr uint8_t kBurst = 14;
+// Read with every sample: INT_PIN_CFG, INT_ENABLE, two more, then the sample. That the first two are
+// as they were set tells a chip that has lost its set-up, and 0xFF, zeros or noise on the bus.
+constexpr uint8_t kPinConfig = 0x22;  // latched until INT_STATUS is read; bypass
+constexpr uint8_t kBefore = kAccelXHigh - kIntPinConfig;
+constexpr uint8_t kBurst = kBefore + 14;
 
 // DLPF 4 (21 Hz, 8.5 ms): under the 25 Hz that 50 Hz sampling carries, above the harmonics of a
 // walk's vertical motion (2 Hz and multiples). 4 g: heel strikes clip at 2 g.
@@ -41,7 +45,7 @@ const Setting kSetup[] RELPOS_FLASH = {
     {kSampleRateDivider, 19, 1},     // 1 kHz / (1 + 19)
     {kGyroConfig, 0x10, 1},          // 1000 deg/s
     {kAccelConfig, 0x08, 1},         // 4 g
-    {kIntPinConfig, 0x22, 1},        // latched until INT_STATUS is read; bypass
+    {kIntPinConfig, kPinConfig, 1},
     {kIntEnable, kDataReady, 1},
 };
 constexpr uint8_t kSetupCount = sizeof kSetup / sizeof kSetup[0];
@@ -50,10 +54,14 @@ constexpr uint8_t kSetupCount = sizeof kSetup / sizeof kSetup[0];
 // looking 0.3 ms early follows every sample; one look in three then comes too early.
 constexpr uint32_t kAfterSampleUs = 19700;
 constexpr uint32_t kRetryUs = 1000;         // between looks for a sample that is not there yet
+// A bus that fails is asked again a little later: a stuck one costs a millisecond each time.
+constexpr uint32_t kFailedUs = 5000;
 constexpr uint32_t kAbsentUs = 1000000;     // between attempts to set up a chip that does not answer
 // Without a sample for so long the chip has lost its settings (brown-out: it sleeps).
 constexpr uint32_t kSilentUs = 120000;
-constexpr uint8_t kMostFailures = 5;        // transactions in a row, then set up anew
+// Transactions in a row, then set up anew: 0.1 s of a dead bus. With a loose contact that spoils a
+// third of them 5 would be met every second, and 20 hardly ever.
+constexpr uint8_t kMostFailures = 20;
 
 constexpr float kAccelerationUnit = 9.80665f / 8192.0f;                   // 4 g range
 constexpr float kAngularRateUnit = 3.14159265f / 180.0f * 1000.0f / 32768.0f;  // 1000 deg/s range
@@ -75,7 +83,7 @@ Mpu9150::Event Mpu9150::step(Board& board, uint32_t now_us, uint32_t* wait_us) {
       if ((identity & kIdentityMask) >> 1 != kIdentity) return Event::kNothing;
     }
     if (!board.write_register(kAddress, reg, flash_byte(&kSetup[position_].value))) {
-      restart();
+      if (!fail()) *wait_us = kFailedUs;
       return Event::kNothing;
     }
     *wait_us = 1000UL * flash_byte(&kSetup[position_].wait_ms);
@@ -92,9 +100,8 @@ Mpu9150::Event Mpu9150::step(Board& board, uint32_t now_us, uint32_t* wait_us) {
   *wait_us = kRetryUs;
   uint8_t status = 0;
   if (!board.read_registers(kAddress, kIntStatus, &status, 1)) {
-    // A bus that fails is asked again a little later: a stuck one costs a millisecond each time.
-    *wait_us = 5 * kRetryUs;
-    if (++failures_ >= kMostFailures) restart();
+    *wait_us = kFailedUs;
+    fail();
     return Event::kNothing;
   }
   if ((status & kDataReady) == 0) {
@@ -108,15 +115,30 @@ Mpu9150::Event Mpu9150::step(Board& board, uint32_t now_us, uint32_t* wait_us) {
 
 RELPOS_APART bool Mpu9150::read(Board& board, float acceleration_m_s2[3], float angular_rate_rad_s[3]) {
   uint8_t raw[kBurst];
-  if (!board.read_registers(kAddress, kAccelXHigh, raw, kBurst)) {
-    if (++failures_ >= kMostFailures) restart();
-    return false;
+  bool good = false;
+  if (board.read_registers(kAddress, kIntPinConfig, raw, kBurst)) {
+    for (uint8_t axis = 0; axis < 3; ++axis) {
+      const uint8_t* sample = raw + kBefore + 2 * axis;
+      acceleration_m_s2[axis] = big_endian(sample) * kAccelerationUnit;
+      angular_rate_rad_s[axis] = big_endian(sample + 8) * kAngularRateUnit;
+      good |= sample[1] != last_low_[axis];
+      last_low_[axis] = sample[1];
+    }
+    good = good && raw[0] == kPinConfig && raw[1] == kDataReady;
   }
+  if (good) {
+    failures_ = 0;
+  } else {
+    fail();
+  }
+  return good;
+}
+
+// Whether that was once too often: then everything begins anew.
+RELPOS_APART bool Mpu9150::fail() {
+  if (++failures_ < kMostFailures) return false;
   failures_ = 0;
-  for (uint8_t axis = 0; axis < 3; ++axis) {
-    acceleration_m_s2[axis] = big_endian(raw + 2 * axis) * kAccelerationUnit;
-    angular_rate_rad_s[axis] = big_endian(raw + 8 + 2 * axis) * kAngularRateUnit;
-  }
+  restart();
   return true;
 }
 

@@ -472,6 +472,12 @@ class Mpu9150(I2cDevice):
                 if clear:
                     self._status = 0
                 return BusStatus.OK, self._data[:read_count]
+            if register == INT_PIN_CFG and read_count == 18:
+                status = self._status & self._registers[INT_ENABLE]
+                self._status = 0
+                self._pointer = register + read_count
+                head = self._registers[INT_PIN_CFG:INT_STATUS]
+                return BusStatus.OK, bytes((*head, status)) + self._data
             if register == INT_STATUS and 1 <= read_count <= 15:
                 status = self._status & self._registers[INT_ENABLE]
                 self._status = 0

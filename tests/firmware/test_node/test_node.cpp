@@ -132,7 +132,12 @@ struct World : FakeBoard {
         sampled_us_ = now - start;
         read[0] = 1;
       }
-      if (first_count == 1 && first[0] == 0x3B) read[0] = 0x20;  // 1 g along x
+      if (first_count == 1 && first[0] == 0x37) {  // set up, then the sample
+        read[0] = 0x22;
+        read[1] = 0x01;
+        read[4] = 0x20;  // 1 g along x
+        read[7] = ++noise_ & 1;  // along y: no sample is quite the one before
+      }
       return BusStatus::kOk;
     }
     if (address == 0x0C && magnetometer_present) {
@@ -140,7 +145,8 @@ struct World : FakeBoard {
       if (read_count == 3) read[0] = read[1] = read[2] = 128;
       if (read_count == 8) {
         read[0] = 1;
-        read[1] = 100;  // the die's x, the accelerometer's y: 30 uT
+        read[1] = 100;                 // the die's x, the accelerometer's y: 30 uT
+        read[3] = ++field_noise_ & 1;  // no reading is quite the one before
       }
       return BusStatus::kOk;
     }
@@ -184,6 +190,7 @@ struct World : FakeBoard {
   }
 
   uint32_t sampled_us_ = 0;
+  uint8_t noise_ = 0, field_noise_ = 0;
   uint8_t packet_[128];
   uint8_t queue_[2048];
   uint16_t given_ = 0, taken_ = 0;
