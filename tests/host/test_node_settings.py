@@ -51,10 +51,13 @@ def test_what_cannot_be_set_is_told(words, complaint):
 def test_limits_are_those_of_the_firmware():
     source = (ROOT / "firmware/lib/node/node.cpp").read_text()
     table = source[source.index("kChoices[]") :]
-    found = re.findall(r"CommandCode::k(\w+)\),[^,]*,[^,]*,\s*\d,\s*(\w+),\s*(\w+)\}", table)
+    number = r"(?:static_cast<uint16_t>\()?(-?\w+)\)?"
+    entry = rf"CommandCode::k(\w+)\),[^,]*,[^,]*,\s*\d,\s*{number},\s*{number}\}}"
     words = {"kLedOff": 0, "kLedHealth": 2}
-    limits = {name: [words.get(x) if x in words else int(x) for x in low_high]
-              for name, *low_high in found}  # fmt: skip
+    limits = {
+        name: [words[x] if x in words else int(x) for x in low_high]
+        for name, *low_high in re.findall(entry, table)
+    }
     for setting in SETTINGS:
         name = "".join(part.title() for part in CommandCode(setting.code).name.split("_"))
         high = len(setting.words) - 1 if setting.words else setting.high * setting.per_unit

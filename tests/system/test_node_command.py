@@ -84,6 +84,52 @@ def test_settings_are_shown_before_and_after_and_survive_a_restart(port):
     assert "stature" not in shown
 
 
+def test_a_number_is_changed_over_the_air_though_the_radio_keeps_its_address():
+    with emulated(2, speed=8) as path:
+        done = node("set", path, "--node", 2, "id", 7, "led=off")
+        assert done.returncode == 0, done.stderr
+        assert re.search(r"id\W+2\W+7", done.stdout)
+        assert "relpos node radio --node 7" in done.stdout
+        shown = node("set", path, "--node", 7)
+        assert shown.returncode == 0, shown.stderr
+        assert re.search(r"led\W+off", shown.stdout)
+        taken = node("set", path, "--node", 7, "id", 1)
+        assert taken.returncode == 1
+        assert "there is a node 1 already" in taken.stderr
+
+
+def test_a_new_key_is_made_given_and_asked_for(tmp_path):
+    file = tmp_path / "team.key"
+    with emulated(1) as path:
+        done = node("set", path, "key", "--key-file", file, "--new")
+        assert done.returncode == 0, done.stderr
+        assert file.stat().st_mode & 0o777 == 0o600
+        assert "answers under it" in done.stdout
+        again = node("set", path, "key", "--key-file", file)
+        assert "already" in again.stdout
+        stranger = node("set", path, "--node", 1)
+        assert stranger.returncode == 1
+        assert "--key-file" in stranger.stderr
+        shown = node("set", path, "--key-file", file)
+        assert shown.returncode == 0, shown.stderr
+        assert "leg-length" in shown.stdout
+        assert file.read_text().strip() not in done.stdout + done.stderr
+        listed = node("list", path, "--seconds", 5, "--key-file", file, "--json")
+        assert json.loads(listed.stdout)["nodes"][0]["key_set"] is True
+        overwritten = node("set", path, "key", "--key-file", file, "--new")
+        assert overwritten.returncode == 1
+        assert "not overwritten" in overwritten.stderr
+
+
+def test_defaults_leave_number_and_key():
+    with emulated(1) as path:
+        assert node("set", path, "step-gain", 2.5, "range-offset=-0.25").returncode == 0
+        done = node("set", path, "defaults")
+        assert done.returncode == 0, done.stderr
+        assert re.search(r"step-gain\W+2\.5\W+2\.13", done.stdout)
+        assert re.search(r"range-offset\W+-0\.25 m\W+0 m", done.stdout)
+
+
 @pytest.mark.skipif(missing_parts() is not None, reason=str(missing_parts()))
 def test_the_uno_keeps_its_settings_over_a_restart():
     with emulated(1, board="uno", speed=2) as path:

@@ -6,7 +6,7 @@ import math
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,6 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from relpos.cli import output
+from relpos.cli.node_session import KeyFile, Node, Port, dialogue
 from relpos.errors import DataError, DeviceError
 
 if TYPE_CHECKING:
@@ -60,11 +61,6 @@ app = typer.Typer(
     "wearer's steps, the antennas of two nodes.",
 )
 
-Port = Annotated[str, typer.Argument(metavar="PORT", help="The coordinator's port.")]
-Node = Annotated[
-    int | None,
-    typer.Option(min=1, max=254, help="Which node. (default: the only one that is heard)"),
-]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Store without asking.")]
 
 
@@ -80,13 +76,11 @@ def sensors(
     ] = 300.0,
     magnetometer: Annotated[bool, typer.Option(help="Calibrate the magnetometer, too.")] = True,
     yes: Yes = False,
+    key_file: KeyFile = None,
 ) -> None:
     """Calibrate gyroscope, accelerometer and magnetometer; `calibrate PORT` for short."""
-    from relpos.link.live import open_port
-    from relpos.link.session import open_session
-
-    with closing(open_port(port)) as device:
-        _sensors(open_session(device, node), seconds, magnetometer, out, yes)
+    with dialogue(port, node, key_file) as session:
+        _sensors(session, seconds, magnetometer, out, yes)
 
 
 @app.command()
@@ -101,13 +95,11 @@ def walk(
         typer.Option(metavar="M", min=1.0, max=2.4, help="The wearer's height, if new."),
     ] = None,
     yes: Yes = False,
+    key_file: KeyFile = None,
 ) -> None:
     """Set the step gain by a straight walk of known length."""
-    from relpos.link.live import open_port
-    from relpos.link.session import open_session
-
-    with closing(open_port(port)) as device:
-        _walk(open_session(device, node), distance, stature, yes)
+    with dialogue(port, node, key_file) as session:
+        _walk(session, distance, stature, yes)
 
 
 def _confirmed(yes: bool) -> bool:

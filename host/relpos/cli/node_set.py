@@ -5,22 +5,19 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import closing
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from relpos.cli.node_session import Cable, KeyFile, Node, Port, dialogue
 from relpos.errors import DeviceError
 
 if TYPE_CHECKING:
     from relpos.link.session import Session
     from relpos.nodes.settings import Change
 
-Port = Annotated[str, typer.Argument(metavar="PORT", help="The coordinator's port.")]
-Node = Annotated[
-    int | None,
-    typer.Option(min=1, max=254, help="Which node. (default: the only one that is heard)"),
-]
+KEY, ID, DEFAULTS = "key", "id", "defaults"
 
 
 def set_node(
@@ -29,38 +26,95 @@ def set_node(
         list[str] | None,
         typer.Argument(
             metavar="[NAME VALUE]...",
-            help="What to set; without any, what is set is shown. Names: report-period, "
-            "ranging-period, status-period (s), leg-length, stature (m), step-gain, team-size, "
-            "step-reports (off, on), led (off, on, health).",
+            help="What to set; without any, what is set is shown. Names: id, report-period, "
+            "ranging-period, status-period (s), leg-length, stature, range-offset (m), step-gain, "
+            "team-size, step-reports (off, on), led (off, on, health); without a value: key, "
+            "defaults.",
         ),
     ] = None,
     node: Node = None,
+    key_file: KeyFile = None,
+    new: Annotated[
+        bool, typer.Option("--new", help="key: make a new random key in FILE first.")
+    ] = False,
+    old_key_file: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="key: the one that the node has. (default: the key of zeros)"
+        ),
+    ] = None,
+    cable: Cable = False,
 ) -> None:
     """Show or change a node's settings, without reflashing it.
 
     `relpos node set PORT --node 3 stature 1.78 led off`
-    """
-    from relpos.link.live import open_port
-    from relpos.link.session import open_session
-    from relpos.nodes.settings import SETTINGS, parse_changes
 
+    `relpos node set PORT --node 3 key --key-file team.key --new`
+    """
+    from relpos.nodes.settings import parse_changes
+
+    rest = list(words or [])
+    if rest[:1] == [KEY]:
+        if rest[1:] or key_file is None:
+            raise typer.BadParameter("give the key's file, and nothing else", param_hint=KEY)
+        _set_key(port, node, key_file, new, old_key_file, cable)
+        return
+    if new or old_key_file is not None:
+        raise typer.BadParameter("only with `key`", param_hint="--new, --old-key-file")
     try:
-        changes = parse_changes(words or [])
+        number = _take_id(rest)
+        defaults = DEFAULTS in rest
+        if defaults:
+            rest.remove(DEFAULTS)
+        changes = parse_changes(rest)
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="NAME VALUE") from None
-    with closing(open_port(port)) as device:
-        session = open_session(device, node)
-        if not changes:
-            rows = []
-            for setting in SETTINGS:
-                value = setting.shown(session.setting(setting.code))
-                rows.append((setting.name, value, setting.meaning))
-            _print(f"Node {session.node}", ("setting", "value", "meaning"), rows)
+    with dialogue(port, node, key_file, cable=cable) as session:
+        if not changes and number is None and not defaults:
+            _show(session)
             return
-        _apply(session, changes)
+        rows = _restore(session) if defaults else []
+        rows += _apply(session, changes)
+        if number is not None:
+            before = session.node
+            session.set_node_id(number)
+            rows.append((ID, str(before), str(session.node)))
+        _print(f"Node {session.node}", ("setting", "before", "now"), rows)
+        if number is not None and not cable:
+            typer.echo(
+                f"its XBee module still has the address of its old number: relpos node radio "
+                f"--node {number}"
+            )
 
 
-def _apply(session: Session, changes: Sequence[Change]) -> None:
+def _take_id(words: list[str]) -> int | None:
+    """Take ``id N`` or ``id=N`` out of the words. ValueError where it is no node's number."""
+    for position, word in enumerate(words):
+        name, equals, value = word.partition("=")
+        if name.lower() != ID:
+            continue
+        if not equals:
+            if position + 1 == len(words):
+                raise ValueError(f"{ID}: no value given")
+            value = words.pop(position + 1)
+        words.pop(position)
+        if not (value.isascii() and value.isdigit() and 1 <= int(value) <= 254):
+            raise ValueError(f"{ID} '{value}': between 1 and 254")
+        return int(value)
+    return None
+
+
+def _show(session: Session) -> None:
+    from relpos.nodes.settings import SETTINGS
+
+    rows = [
+        (setting.name, setting.shown(session.setting(setting.code)), setting.meaning)
+        for setting in SETTINGS
+    ]
+    _print(f"Node {session.node}", ("setting", "value", "meaning"), rows)
+
+
+def _apply(session: Session, changes: Sequence[Change]) -> list[tuple[str, str, str]]:
     rows = []
     for change in changes:
         setting = change.setting
@@ -74,19 +128,56 @@ def _apply(session: Session, changes: Sequence[Change]) -> None:
                 f"{setting.shown(change.raw)}"
             )
         rows.append((setting.name, setting.shown(before), setting.shown(after)))
-    _print(f"Node {session.node}", ("setting", "before", "now"), rows)
+    return rows
 
 
-def reboot(
-    port: Port,
-    node: Node = None,
+def _restore(session: Session) -> list[tuple[str, str, str]]:
+    from relpos.nodes.settings import SETTINGS
+
+    before = [session.setting(setting.code) for setting in SETTINGS]
+    session.restore_defaults()
+    after = [session.setting(setting.code) for setting in SETTINGS]
+    return [
+        (setting.name, setting.shown(old), setting.shown(new))
+        for setting, old, new in zip(SETTINGS, before, after, strict=True)
+    ]
+
+
+def _set_key(
+    port: str,
+    node: int | None,
+    key_file: Path,
+    new: bool,
+    old_key_file: Path | None,
+    cable: bool,
 ) -> None:
-    """Restart a node, and wait until it is heard again."""
-    from relpos.link.live import open_port
+    from relpos.link.authentication import read_key, write_new_key
+    from relpos.link.live import Link
     from relpos.link.session import open_session
+    from relpos.protocol import messages as wire
 
-    with closing(open_port(port)) as device:
-        session = open_session(device, node)
+    from relpos.cli.node_session import open_device  # isort: skip
+
+    old = wire.DEFAULT_KEY if old_key_file is None else read_key(old_key_file)
+    device = open_device(port, cable)
+    try:
+        key = write_new_key(key_file) if new else read_key(key_file)
+        link = Link(key=old)
+        # A node that has the new key already is heard, too.
+        link.accept_keys(old, key)
+        session = open_session(device, node, link)
+        changed = session.set_key(key)
+        typer.echo(
+            f"node {session.node} {'now has' if changed else 'had'} the key of {key_file}"
+            + (" and answers under it" if changed else " already")
+        )
+    finally:
+        device.close()
+
+
+def reboot(port: Port, node: Node = None, key_file: KeyFile = None) -> None:
+    """Restart a node, and wait until it is heard again."""
+    with dialogue(port, node, key_file) as session:
         started_s = time.monotonic()
         boot = session.restart()
         typer.echo(

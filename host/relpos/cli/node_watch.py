@@ -7,11 +7,13 @@ import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from relpos.cli import output
+from relpos.cli.node_session import KeyFile, Port, link_of
 from relpos.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -24,21 +26,20 @@ REFRESH_S = 0.5
 HEALTH = "health"
 _COLOURS = {"green": "green", "yellow": "yellow", "red": "bold red"}
 
-Port = Annotated[str, typer.Argument(metavar="PORT", help="The coordinator's port.")]
-
 
 def list_nodes(
     port: Port,
     seconds: Annotated[
         float, typer.Option(min=1.0, help="How long to listen; a status comes every ten seconds.")
     ] = 12.0,
+    key_file: KeyFile = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
 ) -> None:
     """List the nodes that are heard: id, firmware, uptime, last restart, supply, link, boots."""
     from rich.console import Console
 
     with output.working(f"listening for {seconds:g} s"):
-        now_s, view = deque(_watch(port, seconds), maxlen=1)[0]
+        now_s, view = deque(_watch(port, seconds, key_file), maxlen=1)[0]
     rows = view.rows(now_s)
     if json:
         output.print_json({"port": port, "listened_s": seconds, "nodes": rows})
@@ -55,6 +56,7 @@ def monitor(
     seconds: Annotated[
         float | None, typer.Option(min=1.0, help="End after so long. (default: Ctrl-C ends)")
     ] = None,
+    key_file: KeyFile = None,
 ) -> None:
     """Watch the nodes: a live table with everyone's health.
 
@@ -66,12 +68,12 @@ def monitor(
 
     console = Console(width=None if sys.stdout.isatty() else 140)
     if not console.is_terminal:
-        _print_now_and_then(console, port, seconds)
+        _print_now_and_then(console, port, seconds, key_file)
         return
     with Live(_monitor_table([]), console=console, auto_refresh=False) as live:
         shown_s = 0.0
         try:
-            for now_s, view in _watch(port, seconds):
+            for now_s, view in _watch(port, seconds, key_file):
                 if time.monotonic() - shown_s > REFRESH_S:
                     shown_s = time.monotonic()
                     live.update(_monitor_table(view.rows(now_s)), refresh=True)
@@ -79,11 +81,13 @@ def monitor(
             return
 
 
-def _print_now_and_then(console: Any, port: str, seconds: float | None) -> None:
+def _print_now_and_then(
+    console: Any, port: str, seconds: float | None, key_file: Path | None
+) -> None:
     said_s = time.monotonic()
     rows: list[Mapping[str, Any]] = []
     try:
-        for now_s, view in _watch(port, seconds):
+        for now_s, view in _watch(port, seconds, key_file):
             rows = view.rows(now_s)
             if time.monotonic() - said_s >= PLAIN_TABLE_EVERY_S:
                 said_s = time.monotonic()
@@ -93,16 +97,17 @@ def _print_now_and_then(console: Any, port: str, seconds: float | None) -> None:
     console.print(_monitor_table(rows))
 
 
-def _watch(port: str, seconds: float | None) -> Iterator[tuple[float, TeamView]]:
+def _watch(
+    port: str, seconds: float | None, key_file: Path | None
+) -> Iterator[tuple[float, TeamView]]:
     """The team as it is seen, with the present time on the view's clock; until the time is over."""
-    from relpos.link.live import Link, observe, open_port
+    from relpos.link.live import observe, open_port
     from relpos.nodes.view import TeamView
 
-    link = Link()
     view = TeamView()
     told = 0
     started_s = time.monotonic()
-    with closing(open_port(port)) as device:
+    with link_of(key_file) as link, closing(open_port(port)) as device:
         for batch in observe(device, link):
             elapsed_s = time.monotonic() - started_s
             now_s = elapsed_s if link.virtual_s is None else link.virtual_s

@@ -149,7 +149,8 @@ class NativeEngine:
     """One node of the native library: an Engine.
 
     ``eeprom`` is written in place and survives resets, as does the chips' state. ``resets``
-    counts the reboots that the node asked for.
+    counts the reboots that the node asked for. ``stored_id``: the node takes its number from the
+    EEPROM, as a board does, and ``node_id`` only names it in errors.
     """
 
     def __init__(
@@ -162,8 +163,10 @@ class NativeEngine:
         power_on_us: int = 0,
         reset_cause: ResetCause = ResetCause.POWER_ON,
         library: Path | None = None,
+        stored_id: bool = False,
     ) -> None:
         self.node_id = node_id
+        self._given_id = 0 if stored_id else node_id
         self.bus = bus
         self.on_transmit: Callable[[int, bytes], None] = _nowhere
         self.next_due_us = power_on_us
@@ -197,7 +200,7 @@ class NativeEngine:
             ctypes.byref(self._callbacks),
             ctypes.addressof(self._eeprom),
             len(self._eeprom),
-            self.node_id,
+            self._given_id,
             int(cause),
             self._node_us(self._power_on_us),
         )

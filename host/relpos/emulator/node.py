@@ -228,7 +228,14 @@ def make_engine(
 ) -> Engine:
     """Return the board; DeviceError or SimulatorError where what it needs is not there."""
     if board is BoardKind.NATIVE:
-        return NativeEngine(bus, eeprom, node, clock=errors.clock, power_on_us=errors.power_on_us)
+        return NativeEngine(
+            bus,
+            eeprom,
+            node,
+            clock=errors.clock,
+            power_on_us=errors.power_on_us,
+            stored_id=True,
+        )
     if errors.clock.offset_us:
         raise DeviceError("a simulated AVR's clock begins at 0: it takes no offset")
     # Only here: the simulator's library is not needed by anybody else.

@@ -26,6 +26,8 @@ ADDRESSED_ATTEMPTS = 2
 """Further ones go to everybody and to the node's address in turn."""
 SILENT_S = 6.0
 """A node that is on reports its motion every second."""
+IMPOSSIBLE = -(2**31)
+"""Out of every setting's range."""
 RAW_REPORTS_PER_S = 5
 MOST_RAW_REPORTS = 3000
 
@@ -82,27 +84,37 @@ class Session:
         raise DeviceError(f"node {self.node} stays busy and does not take {code.name}")
 
     def _ask(self, code: wire.CommandCode, value: int) -> Acknowledged:
-        self._token = self._token % 0xFFFF + 1
-        token = self._token
+        token = self._next_token()
         for attempt in range(ATTEMPTS):
             # To its address the radios try several times themselves; a node whose module has
             # another address hears only what goes to everybody.
             broadcast = attempt >= ADDRESSED_ATTEMPTS and attempt % 2 == 0
             _, data = self.link.command(self.node, code, value, token=token, broadcast=broadcast)
-            try:
-                self._port.write(data)
-            except (serial.SerialException, OSError) as error:
-                raise DeviceError(f"{self._port.port}: the port vanished") from error
-            until_s = time.monotonic() + ANSWER_S
-            while time.monotonic() < until_s:
-                self.listen()
-                answer = self._answers.pop(token, None)
-                if answer is not None:
-                    return answer
+            answer = self._send(token, data)
+            if answer is not None:
+                return answer
         raise DeviceError(
-            f"node {self.node} does not answer {code.name}: is it switched on, in reach, and its "
-            f"number {self.node}?" + self._heard()
+            f"node {self.node} does not answer {code.name}: is it switched on, in reach, its "
+            f"number {self.node}, and this its key?" + self._heard()
         )
+
+    def _next_token(self) -> int:
+        self._token = self._token % 0xFFFF + 1
+        return self._token
+
+    def _send(self, token: int, data: bytes) -> Acknowledged | None:
+        """Send once; the answer, or None where none comes in time."""
+        try:
+            self._port.write(data)
+        except (serial.SerialException, OSError) as error:
+            raise DeviceError(f"{self._port.port}: the port vanished") from error
+        until_s = time.monotonic() + ANSWER_S
+        while time.monotonic() < until_s:
+            self.listen()
+            answer = self._answers.pop(token, None)
+            if answer is not None:
+                return answer
+        return None
 
     def _heard(self) -> str:
         others = sorted(set(self.link.decoder.nodes) - {self.node})
@@ -119,8 +131,8 @@ class Session:
         return answer.value
 
     def setting(self, code: wire.CommandCode) -> int:
-        """Value of a setting: an impossible one (-1) changes nothing and brings it."""
-        answer = self.command(code, -1)
+        """Value of a setting: an impossible one changes nothing and brings it."""
+        answer = self.command(code, IMPOSSIBLE)
         if answer.result != wire.CommandResult.OUT_OF_RANGE:
             raise DeviceError(f"node {self.node} does not know {code.name}")
         return answer.value
@@ -137,6 +149,77 @@ class Session:
         new_boot = self.boot()
         assert new_boot is not None
         return new_boot
+
+    # -- who it is, and whose ---------------------------------------------------------------------
+
+    def set_node_id(self, node: int) -> None:
+        """Give the node another number; it restarts with it, and the session goes on with it.
+
+        DeviceError where that number is heard already, or the node is not heard by it.
+        """
+        if node == self.node:
+            return
+        if node in self.link.decoder.nodes or self._somebody_is(node):
+            raise DeviceError(
+                f"there is a node {node} already: two of one number confuse everybody"
+            )
+        self.demand(wire.CommandCode.SET_NODE_ID, node)
+        before, self.node = self.node, node
+        until_s = time.monotonic() + SILENT_S
+        while self.boot() is None and time.monotonic() < until_s:
+            self.listen()
+        if self.boot() is None:
+            raise DeviceError(
+                f"node {before} took the number {node} but was not heard with it: switch it off "
+                "and on"
+            )
+
+    def _somebody_is(self, node: int) -> bool:
+        """Whether a node of that number answers."""
+        own, self.node = self.node, node
+        try:
+            return any(self._answers_under_present_key() for _ in range(ADDRESSED_ATTEMPTS))
+        finally:
+            self.node = own
+
+    def restore_defaults(self) -> None:
+        """Everything but number and key as in a new node; it restarts. DeviceError in vain."""
+        boot = self.boot()
+        self.demand(wire.CommandCode.RESTORE_DEFAULTS, 0)
+        if not self._restarted(boot):
+            raise DeviceError(f"node {self.node} was not heard restarting: switch it off and on")
+
+    def set_key(self, key: bytes) -> bool:
+        """Give the node this key in place of the session's; False where it had it already.
+
+        From then on the session speaks under the new key. DeviceError where the node answers under
+        neither.
+        """
+        old = self.link.key
+        self.link.accept_keys(key, old)
+        if self._answers_under_present_key():
+            return False
+        token = self._next_token()
+        for _ in range(ATTEMPTS):
+            self.link.accept_keys(old, key)
+            _, data = self.link.new_key(self.node, key, token=token)
+            answer = self._send(token, data)
+            # It answers under the new key; where that answer is lost, the old key is gone for good.
+            self.link.accept_keys(key, old)
+            if answer is not None or self._answers_under_present_key():
+                return True
+        self.link.accept_keys(old)
+        raise DeviceError(
+            f"node {self.node} does not answer: neither under the key that it should have nor "
+            "under the new one"
+        )
+
+    def _answers_under_present_key(self) -> bool:
+        token = self._next_token()
+        _, data = self.link.command(
+            self.node, wire.CommandCode.PING, 0, token=token, broadcast=True
+        )
+        return self._send(token, data) is not None
 
     def _restarted(self, boot: int | None) -> bool:
         """Wait until the node is heard with another boot; whether it was."""
@@ -245,24 +328,27 @@ class Session:
         return before, after
 
 
-def open_session(port: serial.Serial, node: int | None) -> Session:
+def open_session(port: serial.Serial, node: int | None, link: Link | None = None) -> Session:
     """A session with the node that is asked for, or with the only one that is heard.
 
     DeviceError where that node is not heard, or none or several are and none was asked for.
     """
-    session = Session(port, node or 0)
+    session = Session(port, node or 0, link)
     started_s = time.monotonic()
-    nodes = session.link.decoder.nodes
+    decoder = session.link.decoder
     while (waited_s := time.monotonic() - started_s) < SILENT_S:
         session.listen()
-        if node is not None and node in nodes:
+        if node is not None and node in decoder.nodes:
             return session
-        if node is None and nodes and waited_s > SILENT_S / 2:
+        if node is None and decoder.nodes and waited_s > SILENT_S / 2:
             break
-    heard = ", ".join(map(str, sorted(nodes))) or "nobody"
+    heard = ", ".join(map(str, sorted(decoder.nodes))) or "nobody"
+    foreign = decoder.counts["FrameTagError"]
+    if foreign:
+        heard += f", and {foreign} frames under another key (give the team's with --key-file)"
     if node is not None:
         raise DeviceError(f"node {node} is not heard on this port; heard: {heard}")
-    if len(nodes) != 1:
+    if len(decoder.nodes) != 1:
         raise DeviceError(f"which node? Heard: {heard}. Say it with --node")
-    session.node = next(iter(nodes))
+    session.node = next(iter(decoder.nodes))
     return session

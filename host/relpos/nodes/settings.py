@@ -113,6 +113,12 @@ SETTINGS: tuple[Setting, ...] = (
         "what the board's LED shows",
         words=("off", "on", "health"),
     ),
+    Setting(
+        "range-offset",
+        CommandCode.SET_RANGE_OFFSET_MM,
+        "its share of what its ranges are too long by; the host subtracts it",
+        "m", 1000, -5.0, 5.0,
+    ),
 )  # fmt: skip
 BY_NAME = {setting.name: setting for setting in SETTINGS}
 STATURE_M = (1.0, 2.4)

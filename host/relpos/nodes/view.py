@@ -15,11 +15,11 @@ WINDOW_S = 30.0
 """Three status reports at their usual period."""
 UNWANTED = {wire.ResetCause.BROWN_OUT: "brown-out", wire.ResetCause.WATCHDOG: "watchdog"}
 _FLAGS = {
-    "imu": "IMU_OK",
-    "magnetometer": "MAGNETOMETER_OK",
-    "pozyx": "POZYX_OK",
-    "pressure": "PRESSURE_OK",
-    "beacon": "BEACON_HEARD",
+    "imu": wire.Health.IMU,
+    "magnetometer": wire.Health.MAGNETOMETER,
+    "pozyx": wire.Health.POZYX,
+    "pressure": wire.Health.PRESSURE,
+    "beacon": wire.Health.BEACON,
 }
 
 
@@ -95,13 +95,10 @@ class NodeView:
         tried = good + self.counted("ranging_failures", now_s)
         return (good / tried if tried else None), tried
 
-    def flag(self, name: str) -> bool | None:
+    def flag(self, flag: wire.Health) -> bool | None:
         """One of the status's health flags; None where the node has not told."""
         value = self.status.get("health")
-        flags = getattr(wire, "HealthFlag", None)
-        if value is None or flags is None:
-            return None
-        return bool(int(value) & int(flags[name]))
+        return None if value is None else bool(int(value) & flag)
 
     def figures(self, now_s: float) -> Figures:
         """What :func:`relpos.nodes.health.assess` judges by."""
@@ -194,6 +191,8 @@ class TeamView:
                     "seen_s": round(now_s - view.heard_s, 3),
                     "ranging": share,
                     "exchanges": tried,
+                    "key_set": view.flag(wire.Health.KEY_SET),
+                    "range_offset_m": view.status.get("range_offset_m"),
                     "neighbours": view.status.get("neighbours"),
                     "team": view.status.get("team"),
                 }

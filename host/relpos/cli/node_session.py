@@ -1,0 +1,76 @@
+"""What the node commands have in common: options, and a dialogue with one node."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from relpos.link.live import Link
+    from relpos.link.session import Session
+
+Port = Annotated[str, typer.Argument(metavar="PORT", help="The coordinator's port.")]
+Node = Annotated[
+    int | None,
+    typer.Option(min=1, max=254, help="Which node. (default: the only one that is heard)"),
+]
+KeyFile = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="The team's key. (default: the file that RELPOS_KEY_FILE names, else the key of zeros "
+        "that nodes come with)",
+    ),
+]
+Cable = Annotated[
+    bool,
+    typer.Option("--cable", help="PORT is the node's own USB cable, its switch in position USB."),
+]
+
+
+@contextmanager
+def link_of(key_file: Path | None) -> Iterator[Link]:
+    """A link under that key which refuses what earlier ones have seen already."""
+    from relpos.link.authentication import SeenCounters, team_key
+    from relpos.link.live import Link
+
+    key = team_key(key_file)
+    if key_file is None:
+        yield Link(key=key)
+        return
+    seen = SeenCounters.beside(key_file)
+    link = Link(key=key, newest_counters=seen.load())
+    try:
+        yield link
+    finally:
+        seen.save(link.newest_counters(), 0.0, at_once=True)
+
+
+def open_device(port: str, cable: bool) -> Any:
+    """The coordinator's port, or a node's cable in its place."""
+    if cable:
+        from relpos.nodes.cable import CablePort
+
+        return CablePort(port)
+    from relpos.link.live import open_port
+
+    return open_port(port)
+
+
+@contextmanager
+def dialogue(
+    port: str, node: int | None, key_file: Path | None = None, *, cable: bool = False
+) -> Iterator[Session]:
+    """A session with the node, or with the only one that is heard."""
+    from relpos.link.session import open_session
+
+    with link_of(key_file) as link:
+        device = open_device(port, cable)
+        try:
+            yield open_session(device, node, link)
+        finally:
+            device.close()

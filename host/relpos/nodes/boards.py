@@ -1,0 +1,212 @@
+"""Arduinos on USB: which ports may be one, and which board answers there."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Protocol
+
+import serial
+
+from relpos.errors import DeviceError
+
+BOOT_BAUD = 115_200
+"""Optiboot on the Uno, Arduino's STK500v2 on the Mega."""
+RESET_S = 0.25
+"""As long as avrdude holds DTR: the capacitor at the reset line has to discharge."""
+BOOT_S = 0.05
+SYNC_S = 0.2
+SYNC_ATTEMPTS = 5
+"""Optiboot waits for a second."""
+SWITCH = (
+    "put the XBee shield's switch to USB (SparkFun: DLINE; Arduino: USB), or take the XBee out of "
+    "its socket, and try again"
+)
+
+
+@dataclass(frozen=True)
+class Board:
+    """A board that the firmware is built for."""
+
+    name: str
+    environment: str
+    """PlatformIO's."""
+    chip: str
+    signature: bytes
+
+
+BOARDS = {
+    "uno": Board("uno", "uno", "ATmega328P", b"\x1e\x95\x0f"),
+    "mega": Board("mega", "megaatmega2560", "ATmega2560", b"\x1e\x98\x01"),
+}
+
+_ARDUINO = (0x2341, 0x2A03)
+_PRODUCTS = {0x0043: "Uno", 0x0001: "Uno", 0x0243: "Uno", 0x0010: "Mega", 0x0042: "Mega",
+             0x0242: "Mega"}  # fmt: skip
+_BRIDGES = {
+    (0x1A86, 0x7523): "CH340 (many copies)",
+    (0x1A86, 0x5523): "CH341 (many copies)",
+    (0x0403, 0x6001): "FTDI (older boards, XBee adapters)",
+    (0x0403, 0x6015): "FTDI (XBee adapters)",
+    (0x10C4, 0xEA60): "CP2102 (copies)",
+}
+
+
+class UsbPort(Protocol):
+    """What pyserial's list_ports tells of a port."""
+
+    device: str
+    vid: int | None
+    pid: int | None
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A port behind which a board may be; ``sure`` where its USB id is Arduino's own."""
+
+    port: str
+    what: str
+    sure: bool
+
+
+def candidates(ports: Iterable[UsbPort]) -> list[Candidate]:
+    """Ports that may be boards, by name."""
+    found = []
+    for port in ports:
+        if port.vid is None or port.pid is None:
+            continue
+        if port.vid in _ARDUINO:
+            name = _PRODUCTS.get(port.pid, "board")
+            found.append(Candidate(port.device, f"Arduino {name}", True))
+        elif (bridge := _BRIDGES.get((port.vid, port.pid))) is not None:
+            found.append(Candidate(port.device, bridge, False))
+    return sorted(found, key=lambda candidate: candidate.port)
+
+
+def choose(ports: Iterable[UsbPort]) -> str:
+    """The port of the only board. DeviceError in one line where there is none, or a choice."""
+    found = candidates(ports)
+    sure = [candidate for candidate in found if candidate.sure] or found
+    if not sure:
+        raise DeviceError("no Arduino is found on USB: plug it in, or name its port")
+    if len(sure) > 1:
+        names = ", ".join(f"{candidate.port} ({candidate.what})" for candidate in sure)
+        raise DeviceError(f"several boards are plugged in: {names}. Name the port of one")
+    return sure[0].port
+
+
+def find_port() -> str:
+    """The port of the only board that is plugged in; DeviceError as :func:`choose`."""
+    from serial.tools.list_ports import comports
+
+    return choose(comports())
+
+
+def identify(device: serial.Serial) -> bytes:
+    """The chip's signature as its boot loader tells it; ``device`` is open at BOOT_BAUD.
+
+    DeviceError where no boot loader answers.
+    """
+    for ask in (_stk500_signature, _stk500v2_signature):
+        _reset(device)
+        signature = ask(device)
+        if signature is not None:
+            return signature
+    raise DeviceError(f"{device.port}: no board answers: {SWITCH}")
+
+
+def check(device: serial.Serial, wanted: str | None) -> Board:
+    """The board that answers; DeviceError where it is another one than ``wanted``, or unknown."""
+    signature = identify(device)
+    for board in BOARDS.values():
+        if board.signature == signature:
+            if wanted is not None and wanted != board.name:
+                raise DeviceError(
+                    f"{device.port}: this is an Arduino {board.name} ({board.chip}), not a "
+                    f"{wanted}: nothing was written"
+                )
+            return board
+    raise DeviceError(
+        f"{device.port}: a chip with signature {signature.hex(' ')}, neither Uno nor Mega: nothing "
+        "was written"
+    )
+
+
+def _reset(device: serial.Serial) -> None:
+    """Restart the board through its USB chip; ports without modem lines restart on their own."""
+    with suppress(OSError, serial.SerialException):
+        device.dtr = device.rts = False
+        time.sleep(RESET_S)
+        device.dtr = device.rts = True
+        time.sleep(BOOT_S)
+
+
+def _stk500_signature(device: serial.Serial) -> bytes | None:
+    """Signature from an STK500 boot loader (Uno: optiboot). None where none answers.
+
+    Atmel AVR061: 0x30 0x20 asks for sync, 0x75 0x20 for the signature; answers stand between 0x14
+    and 0x10.
+    """
+    if not _ask(device, lambda: _exchange(device, b"\x30\x20", 2) == b"\x14\x10"):
+        return None
+    answer = _exchange(device, b"\x75\x20", 5)
+    if len(answer) == 5 and answer[0] == 0x14 and answer[4] == 0x10:
+        return answer[1:4]
+    return None
+
+
+def _ask(device: serial.Serial, answered: Callable[[], bool]) -> bool:
+    return any(answered() for _ in range(SYNC_ATTEMPTS))
+
+
+def _exchange(device: serial.Serial, request: bytes, answer_bytes: int) -> bytes:
+    device.reset_input_buffer()
+    device.write(request)
+    answer = b""
+    until_s = time.monotonic() + SYNC_S
+    while len(answer) < answer_bytes and time.monotonic() < until_s:
+        answer += device.read(answer_bytes - len(answer))
+    return answer
+
+
+def _stk500v2_signature(device: serial.Serial) -> bytes | None:
+    """Signature from an STK500v2 boot loader (Mega). None where none answers.
+
+    Atmel AVR068: 0x1B, sequence, length (2), 0x0E, message, xor of all. 0x01 signs on, 0x1B reads a
+    byte of the signature by an ISP command (0x30 0 n 0).
+    """
+    sequence = 0
+
+    def talk(message: bytes, answer_bytes: int) -> bytes | None:
+        nonlocal sequence
+        sequence = sequence % 255 + 1
+        frame = bytes((0x1B, sequence, 0, len(message), 0x0E)) + message
+        answer = _exchange(device, frame + bytes((_xor(frame),)), 6 + answer_bytes)
+        good = (
+            len(answer) == 6 + answer_bytes
+            and answer[:2] == frame[:2]
+            and _xor(answer) == 0
+            and answer[5:7] == bytes((message[0], 0))
+        )
+        return answer[5:-1] if good else None
+
+    # "AVRISP_2" and its length: eleven bytes of answer.
+    if not _ask(device, lambda: talk(b"\x01", 11) is not None):
+        return None
+    signature = bytearray()
+    for position in range(3):
+        # Command, status, the byte, status.
+        answer = talk(bytes((0x1B, 4, 0x30, 0, position, 0)), 4)
+        if answer is None:
+            return None
+        signature.append(answer[2])
+    return bytes(signature)
+
+
+def _xor(data: bytes) -> int:
+    value = 0
+    for byte in data:
+        value ^= byte
+    return value
