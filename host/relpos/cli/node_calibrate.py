@@ -14,7 +14,8 @@ import typer
 from typer.core import TyperGroup
 
 from relpos.cli import output
-from relpos.cli.node_session import KeyFile, Node, Port, dialogue
+from relpos.cli.keys import KeyFile
+from relpos.cli.node_session import Node, Port, dialogue
 from relpos.errors import DataError, DeviceError
 
 if TYPE_CHECKING:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from relpos.cli.keys import make_link
+
 if TYPE_CHECKING:
     from relpos.link.live import Link
     from relpos.link.session import Session
@@ -17,14 +19,6 @@ Port = Annotated[str, typer.Argument(metavar="PORT", help="The coordinator's por
 Node = Annotated[
     int | None,
     typer.Option(min=1, max=254, help="Which node. (default: the only one that is heard)"),
-]
-KeyFile = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="The team's key. (default: the file that RELPOS_KEY_FILE names, else the key of zeros "
-        "that nodes come with)",
-    ),
 ]
 Cable = Annotated[
     bool,
@@ -35,19 +29,12 @@ Cable = Annotated[
 @contextmanager
 def link_of(key_file: Path | None) -> Iterator[Link]:
     """A link under that key which refuses what earlier ones have seen already."""
-    from relpos.link.authentication import SeenCounters, team_key
-    from relpos.link.live import Link
-
-    key = team_key(key_file)
-    if key_file is None:
-        yield Link(key=key)
-        return
-    seen = SeenCounters.beside(key_file)
-    link = Link(key=key, newest_counters=seen.load())
+    link, seen = make_link(key_file)
     try:
         yield link
     finally:
-        seen.save(link.newest_counters(), 0.0, at_once=True)
+        if seen is not None:
+            seen.save(link.newest_counters(), 0.0, at_once=True)
 
 
 def open_device(port: str, cable: bool) -> Any:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from relpos.cli.node_session import Cable, KeyFile, Node, Port, dialogue
+from relpos.cli.keys import KeyFile
+from relpos.cli.node_session import Cable, Node, Port, dialogue
 from relpos.errors import DeviceError
 
 if TYPE_CHECKING:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from relpos.cli import output
-from relpos.cli.node_session import KeyFile, Port, link_of
+from relpos.cli.keys import KeyFile
+from relpos.cli.node_session import Port, link_of
 from relpos.errors import DeviceError
 
 if TYPE_CHECKING:
