@@ -2,49 +2,16 @@
 
 import os
 import select
-import shutil
 import subprocess
 import threading
 import tty
-from pathlib import Path
 
 import pytest
+from boot_loaders import ROOT, build_optiboot, needs
 
 from relpos.emulator.avr.board import BOARDS, Board, ResetCause
-from relpos.emulator.avr.elf import Firmware, read_firmware
-from relpos.emulator.avr.library import missing_parts
 
-ROOT = Path(__file__).resolve().parents[2]
-OPTIBOOT = Path("/usr/share/arduino/hardware/arduino/avr/bootloaders/optiboot/optiboot.c")
-# The Uno's bootloader: 512 bytes at the end of flash, started by a fuse instead of address 0.
-BOOT_ADDRESS = 0x7E00
-JUMP_TO_BOOT = bytes.fromhex("0c94003f")
 MILLISECOND_CYCLES = 16_000
-
-
-def needs() -> str | None:
-    for command in ("avr-gcc", "avrdude"):
-        if shutil.which(command) is None:
-            return f"{command} is not installed"
-    if not OPTIBOOT.is_file():
-        return "arduino-core-avr is not installed"
-    if not (ROOT / ".venv" / "bin" / "platformio").is_file():
-        return "PlatformIO is not in .venv"
-    return missing_parts()
-
-
-def build_bootloader(folder: Path) -> Firmware:
-    # Built, because the image that Debian ships reaches beyond the end of flash.
-    elf = folder / "optiboot.elf"
-    options = "-w -Os -fno-inline-small-functions -fno-split-wide-types -mshort-calls -mrelax"
-    chip = "-mmcu=atmega328p -nostartfiles -DF_CPU=16000000L"
-    settings = "-DLED_START_FLASHES=0 -DBAUD_RATE=115200"
-    places = f"-Wl,--section-start=.text={BOOT_ADDRESS:#x} -Wl,--section-start=.version=0x7ffe"
-    arguments = f"{options} {chip} {settings} {places}".split()
-    subprocess.run(["avr-gcc", *arguments, str(OPTIBOOT), "-o", str(elf)], check=True)
-    image = bytearray(read_firmware(elf).flash)
-    image[: len(JUMP_TO_BOOT)] = JUMP_TO_BOOT
-    return Firmware(bytes(image), 0, 0x100, b"")
 
 
 class SerialBoard(threading.Thread):
@@ -82,7 +49,7 @@ def test_upload_writes_and_verifies_the_firmware_through_the_bootloader(tmp_path
     tty.setraw(port)
     with Board(
         BOARDS["uno"],
-        build_bootloader(tmp_path),
+        build_optiboot(tmp_path),
         line_baud=115200,
         reset_cause=ResetCause.EXTERNAL,
     ) as board:

@@ -14,7 +14,7 @@ import typer
 
 from relpos.cli import output
 from relpos.cli.keys import KeyFile
-from relpos.cli.node_session import Port, link_of
+from relpos.cli.node_session import Cable, Port, link_of, open_device
 from relpos.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -34,13 +34,14 @@ def list_nodes(
         float, typer.Option(min=1.0, help="How long to listen; a status comes every ten seconds.")
     ] = 12.0,
     key_file: KeyFile = None,
+    cable: Cable = False,
     json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
 ) -> None:
     """List the nodes that are heard: id, firmware, uptime, last restart, supply, link, boots."""
     from rich.console import Console
 
     with output.working(f"listening for {seconds:g} s"):
-        now_s, view = deque(_watch(port, seconds, key_file), maxlen=1)[0]
+        now_s, view = deque(_watch(port, seconds, key_file, cable), maxlen=1)[0]
     rows = view.rows(now_s)
     if json:
         output.print_json({"port": port, "listened_s": seconds, "nodes": rows})
@@ -58,6 +59,7 @@ def monitor(
         float | None, typer.Option(min=1.0, help="End after so long. (default: Ctrl-C ends)")
     ] = None,
     key_file: KeyFile = None,
+    cable: Cable = False,
 ) -> None:
     """Watch the nodes: a live table with everyone's health.
 
@@ -69,12 +71,12 @@ def monitor(
 
     console = Console(width=None if sys.stdout.isatty() else 140)
     if not console.is_terminal:
-        _print_now_and_then(console, port, seconds, key_file)
+        _print_now_and_then(console, port, seconds, key_file, cable)
         return
     with Live(_monitor_table([]), console=console, auto_refresh=False) as live:
         shown_s = 0.0
         try:
-            for now_s, view in _watch(port, seconds, key_file):
+            for now_s, view in _watch(port, seconds, key_file, cable):
                 if time.monotonic() - shown_s > REFRESH_S:
                     shown_s = time.monotonic()
                     live.update(_monitor_table(view.rows(now_s)), refresh=True)
@@ -83,12 +85,12 @@ def monitor(
 
 
 def _print_now_and_then(
-    console: Any, port: str, seconds: float | None, key_file: Path | None
+    console: Any, port: str, seconds: float | None, key_file: Path | None, cable: bool
 ) -> None:
     said_s = time.monotonic()
     rows: list[Mapping[str, Any]] = []
     try:
-        for now_s, view in _watch(port, seconds, key_file):
+        for now_s, view in _watch(port, seconds, key_file, cable):
             rows = view.rows(now_s)
             if time.monotonic() - said_s >= PLAIN_TABLE_EVERY_S:
                 said_s = time.monotonic()
@@ -99,16 +101,16 @@ def _print_now_and_then(
 
 
 def _watch(
-    port: str, seconds: float | None, key_file: Path | None
+    port: str, seconds: float | None, key_file: Path | None, cable: bool
 ) -> Iterator[tuple[float, TeamView]]:
     """The team as it is seen, with the present time on the view's clock; until the time is over."""
-    from relpos.link.live import observe, open_port
+    from relpos.link.live import observe
     from relpos.nodes.view import TeamView
 
     view = TeamView()
     told = 0
     started_s = time.monotonic()
-    with link_of(key_file) as link, closing(open_port(port)) as device:
+    with link_of(key_file) as link, closing(open_device(port, cable)) as device:
         for batch in observe(device, link):
             elapsed_s = time.monotonic() - started_s
             now_s = elapsed_s if link.virtual_s is None else link.virtual_s

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import serial
 
@@ -22,6 +22,24 @@ BAUD = 38_400
 READ_TIMEOUT_S = 0.05
 """Longest wait for bytes: bounds how late silence is noticed."""
 READ_BYTES = 4096
+
+
+class Line(Protocol):
+    """What is needed of a port: pyserial's, or a node's cable in its place."""
+
+    @property
+    def port(self) -> str | None:
+        """Its name."""
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that are there."""
+
+    def read(self, size: int = 1) -> bytes:
+        """At most ``size`` bytes; fewer after a timeout."""
+
+    def write(self, data: bytes) -> int | None:
+        """Send."""
 
 
 class Link:
@@ -163,7 +181,7 @@ def _reason(error: Exception) -> str:
 
 
 def observe(
-    device: serial.Serial,
+    device: Line,
     link: Link,
     clock: Callable[[], float] | None = None,
 ) -> Iterator[list[Observation]]:

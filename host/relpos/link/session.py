@@ -15,7 +15,7 @@ from relpos.calibration.sensors import SensorCalibration, checksum
 from relpos.calibration.steps import scaled_gain_permille
 from relpos.errors import DeviceError
 from relpos.link.decoder import Acknowledged, RawSample
-from relpos.link.live import Link, observe
+from relpos.link.live import Line, Link, observe
 from relpos.protocol import messages as wire
 
 ANSWER_S = 1.0
@@ -41,7 +41,7 @@ class Session:
 
     def __init__(
         self,
-        port: serial.Serial,
+        port: Line,
         node: int,
         link: Link | None = None,
         clock: Callable[[], float] | None = None,
@@ -328,7 +328,7 @@ class Session:
         return before, after
 
 
-def open_session(port: serial.Serial, node: int | None, link: Link | None = None) -> Session:
+def open_session(port: Line, node: int | None, link: Link | None = None) -> Session:
     """A session with the node that is asked for, or with the only one that is heard.
 
     DeviceError where that node is not heard, or none or several are and none was asked for.

@@ -1,0 +1,118 @@
+"""``relpos node flash``: a board on USB becomes a node."""
+
+from __future__ import annotations
+
+import time
+from contextlib import closing
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from relpos.cli import output
+from relpos.cli.keys import KeyFile
+from relpos.errors import DeviceError
+
+if TYPE_CHECKING:
+    from relpos.link.session import Session
+    from relpos.nodes.cable import CablePort
+
+HEARD_WITHIN_S = 20.0
+"""An Arduino restarts when its port is opened, the boot loader waits two seconds at most, and the
+first report comes a report period later."""
+
+
+class BoardName(StrEnum):
+    """A board that the firmware is built for."""
+
+    UNO = "uno"
+    MEGA = "mega"
+
+
+def flash(
+    port: Annotated[
+        str | None,
+        typer.Argument(metavar="[PORT]", help="The board's. (default: the only board on USB)"),
+    ] = None,
+    board: Annotated[
+        BoardName | None, typer.Option(help="Refuse any other. (default: the one that answers)")
+    ] = None,
+    node_id: Annotated[
+        int | None,
+        typer.Option("--id", min=1, max=254, help="The node's number. (default: as it was)"),
+    ] = None,
+    key_file: KeyFile = None,
+    old_key_file: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="The key that the node has. (default: the new or the default one)"
+        ),
+    ] = None,
+) -> None:
+    """Write the firmware into a board, give it its number and key, and hear it answer.
+
+    The XBee shield's switch in position USB (or the XBee out of its socket) until it is done.
+    """
+    from relpos.link.live import open_port
+    from relpos.nodes import boards, upload
+
+    found = port or boards.find_port()
+    with closing(open_port(found, boards.BOOT_BAUD)) as device:
+        kind = boards.check(device, None if board is None else str(board))
+    typer.echo(f"{found}: Arduino {kind.name} ({kind.chip})")
+    with output.working("building and writing the firmware"):
+        size = upload.upload(kind, found)
+    typer.echo(f"firmware written and verified ({size} bytes)")
+    _set_up(found, node_id, key_file, old_key_file)
+
+
+def _set_up(
+    port: str, node_id: int | None, key_file: Path | None, old_key_file: Path | None
+) -> None:
+    """Hear the node over its cable; give it key and number."""
+    from relpos.link.authentication import read_key
+    from relpos.link.live import Link
+    from relpos.link.session import Session
+    from relpos.nodes.cable import CablePort
+    from relpos.protocol import messages as wire
+
+    key = wire.DEFAULT_KEY if key_file is None else read_key(key_file)
+    old = wire.DEFAULT_KEY if old_key_file is None else read_key(old_key_file)
+    with closing(CablePort(port)) as cable:
+        link = Link(key=old)
+        link.accept_keys(old, key)
+        session = Session(cable, 0, link)
+        with output.working("waiting for the node"):
+            _hear(session, cable, port)
+        if key_file is not None or old_key_file is not None:
+            changed = session.set_key(key)
+            words = "has been given the key" if changed else "had the key already"
+            typer.echo(f"node {session.node} {words}")
+        if node_id is not None and node_id != session.node:
+            before = session.node
+            session.set_node_id(node_id)
+            typer.echo(f"node {before} is node {session.node} now")
+        session.demand(wire.CommandCode.PING, 0)
+        typer.echo(
+            f"node {session.node} answers over the cable. Now set the switch back to XBEE; its "
+            f"module: relpos node radio --node {session.node}"
+        )
+
+
+def _hear(session: Session, cable: CablePort, port: str) -> None:
+    """Wait for the node; its number is the session's from then on."""
+    from relpos.nodes.boards import SWITCH
+
+    decoder = session.link.decoder
+    until_s = time.monotonic() + HEARD_WITHIN_S
+    while not decoder.nodes:
+        session.listen()
+        if time.monotonic() > until_s:
+            if cable.heard:
+                raise DeviceError(
+                    f"{port}: the firmware is written and runs, but speaks under another key: give "
+                    "the one that the node has with --old-key-file"
+                )
+            raise DeviceError(f"{port}: the firmware is written, but nothing is heard: {SWITCH}")
+    session.node = next(iter(decoder.nodes))

@@ -1,0 +1,58 @@
+"""Boot loaders that simulated boards start with, as programs for simavr."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+from relpos.emulator.avr.elf import Firmware, read_firmware
+from relpos.emulator.avr.library import missing_parts
+
+ROOT = Path(__file__).resolve().parents[2]
+LOADERS = Path("/usr/share/arduino/hardware/arduino/avr/bootloaders")
+OPTIBOOT = LOADERS / "optiboot/optiboot.c"
+MEGA_LOADER = LOADERS / "stk500v2/stk500boot_v2_mega2560.hex"
+# A fuse starts the loader at the end of flash instead of address 0; here a jump does it, which
+# the upload overwrites.
+OPTIBOOT_ADDRESS = 0x7E00
+JUMP_TO_OPTIBOOT = bytes.fromhex("0c94003f")
+MEGA_ADDRESS = 0x3E000
+JUMP_TO_MEGA_LOADER = bytes.fromhex("0d9400f0")
+
+
+def needs() -> str | None:
+    """What is missing for an upload into a simulated board."""
+    for command in ("avr-gcc", "avr-objcopy", "avrdude"):
+        if shutil.which(command) is None:
+            return f"{command} is not installed"
+    if not OPTIBOOT.is_file():
+        return "arduino-core-avr is not installed"
+    if not (ROOT / ".venv" / "bin" / "platformio").is_file():
+        return "PlatformIO is not in .venv"
+    return missing_parts()
+
+
+def build_optiboot(folder: Path) -> Firmware:
+    """The Uno's."""
+    # Built, because the image that Debian ships reaches beyond the end of flash.
+    elf = folder / "optiboot.elf"
+    options = "-w -Os -fno-inline-small-functions -fno-split-wide-types -mshort-calls -mrelax"
+    chip = "-mmcu=atmega328p -nostartfiles -DF_CPU=16000000L"
+    settings = "-DLED_START_FLASHES=0 -DBAUD_RATE=115200"
+    places = f"-Wl,--section-start=.text={OPTIBOOT_ADDRESS:#x} -Wl,--section-start=.version=0x7ffe"
+    arguments = f"{options} {chip} {settings} {places}".split()
+    subprocess.run(["avr-gcc", *arguments, str(OPTIBOOT), "-o", str(elf)], check=True)
+    image = bytearray(read_firmware(elf).flash)
+    image[: len(JUMP_TO_OPTIBOOT)] = JUMP_TO_OPTIBOOT
+    return Firmware(bytes(image), 0, 0x100, b"")
+
+
+def mega_loader(folder: Path) -> Firmware:
+    """The Mega's, as Debian ships it."""
+    binary = folder / "mega.bin"
+    convert = ["avr-objcopy", "-I", "ihex", "-O", "binary", "--gap-fill", "0xff"]
+    subprocess.run([*convert, str(MEGA_LOADER), str(binary)], check=True)
+    loader = binary.read_bytes()
+    image = bytearray(b"\xff" * 0x40000)
+    image[: len(JUMP_TO_MEGA_LOADER)] = JUMP_TO_MEGA_LOADER
+    image[MEGA_ADDRESS : MEGA_ADDRESS + len(loader)] = loader
+    return Firmware(bytes(image), 0, 0x200, b"")

@@ -1,0 +1,218 @@
+"""`relpos node flash`, end to end: a simulated Uno on USB becomes a node and answers by cable."""
+
+import os
+import re
+import select
+import subprocess
+import sys
+import termios
+import threading
+import tty
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+
+import pytest
+from boot_loaders import MEGA_LOADER, build_optiboot, mega_loader, needs
+
+from relpos.emulator.avr.board import BOARDS as SIMULATED
+from relpos.emulator.avr.board import Board, ResetCause
+from relpos.errors import DeviceError
+from relpos.link.live import open_port
+from relpos.nodes import boards, upload
+
+MILLISECOND_CYCLES = 16_000
+UCSR0A, UBRR0, U2X0 = 0xC0, 0xC4, 0x02
+SPEEDS = {getattr(termios, f"B{baud}"): baud for baud in (9600, 38400, 115200)}
+
+
+pytestmark = pytest.mark.skipif(needs() is not None, reason=str(needs()))
+
+
+@pytest.fixture(scope="module")
+def optiboot(tmp_path_factory):
+    return build_optiboot(tmp_path_factory.mktemp("boot"))
+
+
+class Arduino(threading.Thread):
+    """A board behind a pseudo-terminal that restarts whenever its port is opened, as DTR does it.
+
+    ``connected``: the shield's switch gives the UART to the USB cable, not to the XBee.
+    """
+
+    def __init__(self, board, terminal, connected):
+        super().__init__(daemon=True)
+        self.board = board
+        self.terminal = terminal
+        self.connected = connected
+        self.stop = threading.Event()
+        self.failure = None
+        self.poll = select.poll()
+        self.poll.register(terminal, select.POLLIN | select.POLLHUP)
+
+    def understands(self):
+        """Whether the cable reaches the UART, and both ends have the same speed to 3 %."""
+        control, divisor = self.board.data(UCSR0A, 1)[0], self.board.data(UBRR0, 2)
+        bit_cycles = (8 if control & U2X0 else 16) * (int.from_bytes(divisor, "little") + 1)
+        host = SPEEDS[termios.tcgetattr(self.terminal)[5]]
+        return self.connected and 0.97 < self.board.frequency_hz / bit_cycles / host < 1.03
+
+    def run(self):
+        try:
+            was_open = False
+            while not self.stop.wait(0.0005):
+                events = dict(self.poll.poll(0)).get(self.terminal, 0)
+                is_open = not events & select.POLLHUP
+                if is_open and not was_open:
+                    self.board.reset(ResetCause.EXTERNAL)
+                was_open = is_open
+                if events & select.POLLIN:
+                    data = os.read(self.terminal, 4096)
+                    if self.understands():
+                        self.board.receive(data, self.board.cycle)
+                if not is_open:
+                    continue
+                self.board.run(self.board.cycle + MILLISECOND_CYCLES)
+                sent = bytes(value for _, value in self.board.take_sent())
+                if sent and self.understands():
+                    os.write(self.terminal, sent)
+        except OSError:
+            pass
+        except BaseException as error:
+            self.failure = error
+
+
+@dataclass
+class Plugged:
+    path: str
+    board: Board
+
+
+@contextmanager
+def plugged(kind, firmware, *, connected=True):
+    """A board on USB."""
+    terminal, port = os.openpty()
+    tty.setraw(port)
+    path = os.ttyname(port)
+    os.close(port)
+    with Board(SIMULATED[kind], firmware, reset_cause=ResetCause.EXTERNAL) as board:
+        arduino = Arduino(board, terminal, connected)
+        arduino.start()
+        try:
+            yield Plugged(path, board)
+        finally:
+            arduino.stop.set()
+            arduino.join()
+            os.close(terminal)
+        if arduino.failure is not None:
+            raise arduino.failure
+
+
+def relpos_node(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "relpos.cli.main", "node", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+
+
+def test_a_board_becomes_a_node_and_answers_over_its_cable(optiboot, tmp_path):
+    key = tmp_path / "team.key"
+    key.write_text("00112233445566778899aabbccddeeff\n")
+    with plugged("uno", optiboot) as uno:
+        done = relpos_node("flash", uno.path, "--board", "uno", "--id", 9, "--key-file", key)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert re.search(r"written and verified \([1-9]\d{4} bytes\)", done.stdout)
+        assert "has been given the key" in done.stdout
+        assert "node 1 is node 9 now" in done.stdout
+        assert "node 9 answers over the cable" in done.stdout
+        # And goes on doing so, under its key alone.
+        shown = relpos_node("set", uno.path, "--cable", "--key-file", key, "led", "on")
+        assert shown.returncode == 0, shown.stderr
+        assert "Node 9" in shown.stdout
+        stranger = relpos_node("set", uno.path, "--cable")
+        assert stranger.returncode == 1
+        assert "under another key" in stranger.stderr
+
+
+def test_the_wrong_board_is_refused_before_anything_is_written(optiboot):
+    with plugged("uno", optiboot) as uno:
+        done = relpos_node("flash", uno.path, "--board", "mega")
+        assert done.returncode == 1
+        assert len(done.stderr.strip().splitlines()) == 1
+        assert "this is an Arduino uno (ATmega328P), not a mega" in done.stderr
+        assert uno.board.counters().eeprom_writes == 0
+
+
+@pytest.mark.skipif(not MEGA_LOADER.is_file(), reason="no boot loader of the Mega is installed")
+def test_a_mega_is_known_by_its_own_boot_loader(tmp_path):
+    with (
+        plugged("mega", mega_loader(tmp_path)) as mega,
+        closing(open_port(mega.path, 115200)) as device,
+    ):
+        assert boards.check(device, None).name == "mega"
+        with pytest.raises(DeviceError, match="not a uno"):
+            boards.check(device, "uno")
+
+
+def test_the_shields_switch_in_the_wrong_position_is_told(optiboot):
+    with plugged("uno", optiboot, connected=False) as uno:
+        done = relpos_node("flash", uno.path)
+    assert done.returncode == 1
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "no board answers" in done.stderr
+    assert "switch to USB" in done.stderr
+
+
+@dataclass
+class UsbPort:
+    device: str
+    vid: int | None = None
+    pid: int | None = None
+
+
+def test_the_only_board_is_found_by_its_usb_id():
+    ports = [UsbPort("/dev/ttyS0"), UsbPort("/dev/ttyUSB1", 0x1A86, 0x7523)]
+    assert boards.choose(ports) == "/dev/ttyUSB1"
+    # Arduino's own id is surer than a bridge chip, which an XBee adapter may have.
+    ports += [UsbPort("/dev/ttyACM0", 0x2341, 0x0043), UsbPort("/dev/ttyUSB0", 0x0403, 0x6001)]
+    assert boards.choose(ports) == "/dev/ttyACM0"
+
+
+def test_several_boards_want_a_choice_and_none_is_told():
+    several = [UsbPort("/dev/ttyACM0", 0x2341, 0x0043), UsbPort("/dev/ttyACM1", 0x2341, 0x0042)]
+    with pytest.raises(
+        DeviceError, match=r"ttyACM0 \(Arduino Uno\), /dev/ttyACM1 \(Arduino Mega\)"
+    ):
+        boards.choose(several)
+    with pytest.raises(DeviceError, match="no Arduino"):
+        boards.choose([UsbPort("/dev/ttyS0"), UsbPort("/dev/ttyX", 0x1234, 0x1)])
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        ("avrdude: stk500_getsync() attempt 10 of 10: not in sync: resp=0x00", "switch to USB"),
+        (
+            'avrdude: ser_open(): can\'t open device "/dev/x": Device or resource busy',
+            "port cannot",
+        ),
+        ("node.cpp:12:3: error: 'x' was not declared\n*** [node.o] Error 1", "does not build"),
+        ("avrdude: verification error; content mismatch", "read back"),
+        ("Something else\n\n", "Something else"),
+        ("", "no reason"),
+    ],
+)
+def test_a_failed_upload_is_told_by_its_cause(told, words):
+    assert words in upload.why(told)
+    assert "\n" not in upload.why(told)
+
+
+def test_without_platformio_it_is_told(tmp_path, monkeypatch):
+    with pytest.raises(DeviceError, match="repository"):
+        upload.platformio(tmp_path)
+    (tmp_path / "platformio.ini").touch()
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(DeviceError, match="PlatformIO is missing"):
+        upload.platformio(tmp_path)
