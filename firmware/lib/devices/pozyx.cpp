@@ -61,7 +61,7 @@ void Pozyx::begin(uint16_t network_id) {
 bool Pozyx::range(uint16_t peer) {
   if (!ready()) return false;
   peer_ = peer;
-  state_ = State::kClear;
+  state_ = State::kBefore;
   return true;
 }
 
@@ -146,6 +146,19 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
       return Event::kNothing;
     }
 
+    case State::kBefore: {
+      // What the chip has of this peer by now is no answer to the exchange: after a failure with
+      // inverted flags, or another's exchange that ends meanwhile, it would be told as one.
+      uint8_t answer[5] = {};
+      if (!call_function(board, kGetRangeInfo, peer_, answer, sizeof answer)) {
+        count_failure();
+        return done(kBusFailed, wait_us, result);
+      }
+      before_ms_ = little_endian_long(answer + 1);  // 0 where it has nothing
+      state_ = State::kClear;
+      return Event::kNothing;
+    }
+
     case State::kClear: {
       // A peer's exchange with this Pozyx raises FUNC here too.
       uint8_t stale = 0;
@@ -217,7 +230,7 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
   if (range_mm == 0 || range_mm >= kLeastImplausibleMm) return done(kImplausible, wait_us, result);
   const uint32_t time_ms = little_endian_long(answer + 1);
   const int32_t advance_ms = static_cast<int32_t>(time_ms - last_ms_);
-  if (advance_ms <= 0) {
+  if (advance_ms <= 0 || time_ms == before_ms_) {
     // A clock that went back means a restart, which has lost the settings too.
     if (advance_ms < 0) failures_ = kMostFailures;
     return done(kStale, wait_us, result);

@@ -53,7 +53,8 @@ class Pozyx {
     kNetworkId,
     kMask,
     kIdle,
-    kClear,     // first of an exchange
+    kBefore,    // first of an exchange
+    kClear,
     kCall,
     kPoll,      // until due_us_
     kError,
@@ -66,6 +67,7 @@ class Pozyx {
 
   uint32_t due_us_;
   uint32_t last_ms_;  // the chip's time of the last distance; 0: none
+  uint32_t before_ms_;  // likewise, of the peer's row before the exchange
   uint16_t network_id_;
   uint16_t peer_;
   State state_;

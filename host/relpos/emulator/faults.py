@@ -343,6 +343,18 @@ FAULTS: tuple[Fault, ...] = (
         "refused, counted; no motion, range or command twice",
         (_SHARE, _s("later by", 20.0)),
     ),
+    Fault(
+        "radio",
+        "foreign",
+        "a stranger sends motion, ranges, commands and beacons in everybody's name",
+        "with another key: refused and counted by node and host, nothing changes. "
+        "With the team's key: only the stranger's own id appears besides",
+        (
+            Key("key", "whose", "wrong", choices=("wrong", "right")),
+            Key("rate", "frames a second", 5.0, "1/s", 0.1, 20.0),
+        ),
+        team=True,
+    ),
     Fault("radio", "delayed", "frames are held", f"times stay true; {_RADIO}", (_s("for", 2.0),)),
     Fault(
         "uwb",

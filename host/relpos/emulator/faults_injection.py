@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from relpos.protocol import messages as wire
 from relpos.protocol.messages import ResetCause
 from relpos.simulation.world import FloatArray
 
@@ -24,7 +25,7 @@ from .engine import NodeClockError
 from .faults import FaultError, FaultSpec
 from .native import NativeEngine
 from .pozyx import Pozyx, RangeResult
-from .xbee import DELIVERED, NO_ACKNOWLEDGEMENT, Air, XbeeModule
+from .xbee import BROADCAST, DELIVERED, NO_ACKNOWLEDGEMENT, Air, XbeeModule
 
 if TYPE_CHECKING:
     from .air import VirtualClock
@@ -35,6 +36,8 @@ NEVER_US = 1 << 50
 WATCHDOG_US = 500_000
 RESTART_XBEE_US = 100_000
 STRANGERS_EXCHANGE_US = 20_000
+STRANGERS_ADDRESS = 0x5A5A
+STRANGERS_ID = 200
 
 Draw = np.random.Generator
 LineFault = Callable[[bytes, bool], bytes]
@@ -388,6 +391,9 @@ class FaultInjector:
         )
 
     def _radio_on(self, spec: FaultSpec, rng: Draw) -> None:
+        if spec.fault.behaviour == "foreign":
+            self._stranger(spec, rng)
+            return
         damage = _air_damage(spec, rng)
 
         def spoil(
@@ -399,6 +405,27 @@ class FaultInjector:
             return [(arrival_us, data)]
 
         self._spoil_radio(spoil)
+
+    def _stranger(self, spec: FaultSpec, rng: Draw) -> None:
+        """A module of nobody's in the middle. With the team's key it is a node left switched on."""
+        team = self._team
+        module = XbeeModule(
+            STRANGERS_ADDRESS, 0x40000000 + STRANGERS_ADDRESS, team.radio, lambda _time, _data: None
+        )
+        right = spec.choice("key") == "right"
+        key = team.key if right else rng.bytes(wire.KEY_BYTES)
+        sent = [0]
+
+        def send(now_us: int) -> None:
+            if spec.to_us is not None and now_us >= spec.to_us:
+                return
+            ids = [STRANGERS_ID] if right else list(team.nodes)
+            data = _strangers_frame(sent[0], ids[sent[0] % len(ids)], now_us, right, key)
+            sent[0] += 1
+            team.radio.send(module, BROADCAST, False, data, now_us, lambda _time, _status: None)
+            self._clock.at(now_us + round(1e6 / spec.number("rate")), send)
+
+        self._clock.at(spec.from_us, send)
 
     def _uwb_on(self, spec: FaultSpec, rng: Draw) -> None:
         before = self._team.uwb.spoil
@@ -537,6 +564,28 @@ class FaultInjector:
             _cut_native(node, node.engine, self._clock, spec.from_us, wanted, remains)
         else:
             _cut_avr(node, self._clock, spec.from_us, wanted, remains)
+
+
+def _strangers_frame(count: int, node: int, now_us: int, right: bool, key: bytes) -> bytes:
+    """One after the other of what would do harm if it were believed."""
+    time_s = now_us * 1e-6
+    far = dict.fromkeys(wire.MOTION.field, 0) | {
+        "time_s": time_s, "x_m": 50.0 * count, "path_m": 50.0 * count, "state": 2,
+    }  # fmt: skip
+    entry = {"peer": 1 + node % 3, "range_m": 0.5, "rss_dbm": -80, "age_s": 0.0, "quality": 0}
+    up = (
+        (wire.MOTION, node, far),
+        (wire.RANGES, node, {"time_s": time_s, "ranges": [entry]}),
+    )
+    command = {"token": 0x7000 + count % 0x1000, "command": wire.CommandCode.REBOOT, "value": 0}
+    beacon = {"phase_s": 0.5, "period_s": 0.3, "round": 7, "nodes": [{"node": 77}]}
+    down = (
+        (wire.COMMAND, wire.BROADCAST, command),
+        (wire.BEACON, wire.BROADCAST, beacon),
+    )
+    choices = up if right else up + down
+    message, about, values = choices[count % len(choices)]
+    return wire.encode(message, about, 0, 0x40000000 + count, values, key)
 
 
 _POZYX = 0x4B

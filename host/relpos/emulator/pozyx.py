@@ -141,6 +141,8 @@ class Pozyx(I2cDevice):
         self.intercept: Callable[[int, RangeResult | None, int, int], None] | None = None
         """Fault: takes (peer, result, error, time) of an exchange that this tag started, and sees
         to its :meth:`complete`."""
+        self.frozen: Callable[[int], bool] | None = None
+        """Fault: (time) -> whether what exchanges give is not stored, though told as done."""
         self._begin()
 
     def power_cycle(self, time_us: int) -> None:
@@ -200,11 +202,10 @@ class Pozyx(I2cDevice):
         error: int,
         time_us: int,
         *,
-        store: bool = True,
         inverted: bool = False,
     ) -> None:
-        """Store what an exchange gave and raise its flag; faults leave out or invert that."""
-        if result is not None and store:
+        """Store what an exchange gave and raise its flag; a fault inverts that."""
+        if result is not None and not (self.frozen is not None and self.frozen(time_us)):
             stamp_ms = (time_us - self._power_on_us) // 1000
             self._ranges[peer] = struct.pack(
                 "<IIh", stamp_ms & 0xFFFFFFFF, result.distance_mm, result.rss_dbm

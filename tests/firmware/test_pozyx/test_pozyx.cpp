@@ -21,7 +21,8 @@ struct Chip : FakeBoard {
   uint8_t polls = 3;           // looks at INT_STATUS until it ends
   uint8_t call_status = 1;
   uint8_t info_status = 1;
-  uint32_t time_ms = 1000;
+  uint32_t time_ms = 1000;     // of the exchange that ends
+  uint32_t stored_ms = 0;      // in the row; 0: there is none
   uint32_t range_mm = 5432;
   int16_t rss_dbm = -83;
 
@@ -42,7 +43,10 @@ struct Chip : FakeBoard {
       if (first[0] == 0x00) return give(read, identity);
       if (first[0] == 0x04) return give(read, code);
       if (first[0] == 0x05) {
-        if (polls_left > 0 && --polls_left == 0 && !silent) flags |= code != 0 ? 0x01 : 0x10;
+        if (polls_left > 0 && --polls_left == 0 && !silent) {
+          flags |= code != 0 ? 0x01 : 0x10;
+          if (code == 0) stored_ms = time_ms;
+        }
         const uint8_t now = flags;
         flags = 0;
         return give(read, now);
@@ -58,9 +62,14 @@ struct Chip : FakeBoard {
       ++exchanges;
       polls_left = polls;
       return give(read, call_status);
+    } else if (first_count == 3 && second_count == 0 && read_count == 5 && first[0] == 0xC7) {
+      read[0] = stored_ms != 0;
+      put(read + 1, stored_ms, 4);
+      return BusStatus::kOk;
     } else if (first_count == 3 && second_count == 0 && read_count == 11 && first[0] == 0xC7) {
       fetched_peer = static_cast<uint16_t>(first[1] | first[2] << 8);
       read[0] = info_status;
+      const uint32_t time_ms = stored_ms;
       put(read + 1, time_ms, 4);
       put(read + 5, range_mm, 4);
       put(read + 9, static_cast<uint16_t>(rss_dbm), 2);
@@ -283,6 +292,7 @@ TEST(garbage_is_not_a_distance) {
     CHECK_EQUAL(0, bench.result.range_mm);
   }
   bench.chip.range_mm = 199999;
+  bench.chip.time_ms += 50;
   CHECK(bench.exchange(3));
   CHECK(bench.result.success);
 }
@@ -297,6 +307,23 @@ TEST(a_distance_is_not_given_twice) {
   CHECK_EQUAL(Pozyx::kStale, bench.result.error);
   CHECK(bench.pozyx.ready());
   bench.chip.time_ms += 1;
+  CHECK(bench.exchange(3));
+  CHECK(bench.result.success);
+}
+
+TEST(an_older_distance_told_as_new_by_inverted_flags_is_refused) {
+  Bench bench;
+  bench.set_up();
+  bench.chip.code = 0x12;
+  CHECK(bench.exchange(3));
+  CHECK(!bench.result.success);
+  bench.chip.stored_ms = 1500;  // another's exchange with this chip
+  bench.chip.code = 0;
+  bench.chip.time_ms = 1500;    // of this one nothing is stored, but FUNC raised
+  CHECK(bench.exchange(3));
+  CHECK(!bench.result.success);
+  CHECK_EQUAL(Pozyx::kStale, bench.result.error);
+  bench.chip.time_ms = 1600;
   CHECK(bench.exchange(3));
   CHECK(bench.result.success);
 }
@@ -345,7 +372,7 @@ TEST(a_chip_that_drops_off_the_bus_is_set_up_anew_and_counted) {
   bench.set_up();
   CHECK(bench.pozyx.range(4));
   uint32_t wait_us = 0;
-  for (uint8_t i = 0; i < 2; ++i) {
+  for (uint8_t i = 0; i < 3; ++i) {  // the exchange is under way
     bench.pozyx.step(bench.chip, bench.now_us, &wait_us, &bench.result);
   }
   bench.chip.present = false;
@@ -368,8 +395,8 @@ TEST(one_failed_poll_loses_no_distance) {
   bench.set_up();
   CHECK(bench.pozyx.range(4));
   uint32_t wait_us = 0;
-  for (uint8_t i = 0; i < 3; ++i) {
-    bench.chip.present = i < 2;
+  for (uint8_t i = 0; i < 4; ++i) {
+    bench.chip.present = i < 3;
     bench.pozyx.step(bench.chip, bench.now_us, &wait_us, &bench.result);
   }
   bench.chip.present = true;
