@@ -73,6 +73,7 @@ bench: $(DEVELOP) ## what is timed, in bench/
 	done; [ -n "$$found" ] || { echo "make bench: there is no bench/bench_*.py yet" >&2; exit 1; }
 
 docs: wire ## regenerate the pages that come from the sources
+	$(PYTHON) bench/reliability.py
 
 clean: ## remove what was built; .venv stays
 	rm -rf .build .pio out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

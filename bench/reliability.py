@@ -38,12 +38,19 @@ lost. What lasts, lasts from {reliability.BEGIN_S:g} to {reliability.END_S:g} s 
   radio, ranging and host lose none: running totals.
 - **worst range**: largest error of a range that the host was given, anywhere in the team
   (noise alone: {{noise:.2f}} m).
-- **seen**: what tells of the fault, as more than without it: counters in the node's status, flags in
-  its reports, counts of the host's link.
+- **seen**: what tells of the fault, as more than without it: counters in the node's status, flags
+  in its reports, counts of the host's link.
 
-| fault | what goes wrong | what node and host do | time to recover | motion lost | worst range | seen |
-|---|---|---|---|---|---|---|
 """
+COLUMNS = (
+    "fault",
+    "what goes wrong",
+    "what node and host do",
+    "time to recover",
+    "motion lost",
+    "worst range",
+    "seen",
+)
 
 
 def row(fault: Fault, outcome: Outcome) -> str:
@@ -63,7 +70,12 @@ def row(fault: Fault, outcome: Outcome) -> str:
         f"{outcome.worst_range_error_m:.2f} m",
         ", ".join(outcome.seen()) or "-",
     )
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
+    return table_line(cells)
+
+
+def table_line(cells: tuple[str, ...]) -> str:
+    """Cells between bars."""
+    return "| " + " | ".join(cells) + " |\n"
 
 
 def tail() -> str:
@@ -79,7 +91,7 @@ def page() -> str:
     """All of it."""
     specs = reliability.specs()
     noise_m = max(map(abs, reliability.undisturbed().range_errors_m()))
-    text = HEAD.format(noise=noise_m)
+    text = HEAD.format(noise=noise_m) + table_line(COLUMNS) + "|---" * len(COLUMNS) + "|\n"
     for target in TARGETS:
         text += "".join(row(f, compare(spec)) for f, spec in specs if f.target == target)
     return text + tail()

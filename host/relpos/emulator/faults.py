@@ -90,7 +90,7 @@ def _s(meaning: str, default: float) -> Key:
     return Key("value", meaning, default, "s", 0.0, 600.0)
 
 
-_FLAGGED = "IMU_GAP flagged, nothing integrated, the gap charged as variance; back within 2 s"
+_FLAGGED = "IMU_GAP flagged, nothing integrated, the gap charged as variance; back within 3 s"
 _GYRO_ONLY = "dead reckoning goes on by the gyroscope, no magnetic heading is reported"
 _NO_RANGES = "motion unharmed; failures counted, no wrong range; ranges again within two periods"
 _RADIO = "0 motion lost: the running totals of the next frame that arrives hold all"

@@ -301,6 +301,9 @@ class FaultInjector:
             return
         if self._simple_chip(spec, rng, node, _POZYX):
             return
+        if behaviour == "stuck":
+            tag.frozen = spec.active
+            return
         before = tag.intercept or _finish(tag)
 
         def intercept(peer: int, result: RangeResult | None, error: int, time_us: int) -> None:
@@ -324,10 +327,7 @@ class FaultInjector:
                 before(peer, result, error, time_us)
             else:
                 tag.ranging = False
-                tag.complete(
-                    peer, result, error, time_us,
-                    store=behaviour != "stuck", inverted=behaviour == "inverted",
-                )  # fmt: skip
+                tag.complete(peer, result, error, time_us, inverted=True)
 
         tag.intercept = intercept
 
