@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from relpos.emulator.node import draw_uncalibrated_errors
 from relpos.link.live import open_port
 from relpos.link.session import Session
 from relpos.protocol import messages as wire
@@ -19,9 +20,9 @@ RELPOS = [sys.executable, "-m", "relpos.cli.main"]
 
 
 @contextmanager
-def emulated(scenario, speed, seconds, seed=3):
+def emulated(scenario, speed, seconds, seed=3, nodes=1):
     """Path of the pseudo-terminal behind which the node is."""
-    command = [*RELPOS, "emulate", "--nodes", 1, "--scenario", scenario]
+    command = [*RELPOS, "emulate", "--nodes", nodes, "--scenario", scenario]
     command += ["--speed", speed, "--seconds", seconds, "--seed", seed]
     emulator = subprocess.Popen(
         [*map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
@@ -85,10 +86,39 @@ def test_a_walk_of_known_length_sets_the_gain_on_the_node():
     assert f"-> {gain / 1000:.3f}" in done.stdout
 
 
+def test_two_antennas_are_calibrated_at_a_known_distance():
+    with emulated("bench", 6, 900, nodes=3) as port:
+        done = calibrate("antenna", port, "--nodes", "1,2", "--distance", 5)
+        assert done.returncode == 0, done.stderr
+        before, after = (float(x) for x in re.findall(r"ranges, ([+-][\d.]+) m off", done.stdout))
+        # What the two nodes' tags really add.
+        delay_m = sum(draw_uncalibrated_errors(3, node).antenna_delay_m for node in (1, 2))
+        assert before == pytest.approx(delay_m, abs=0.03)
+        assert abs(after) < 0.03
+        # A third against the first, which keeps what it has.
+        device = open_port(port)
+        try:
+            session = Session(device, 1)
+            first_mm = session.setting(wire.CommandCode.SET_RANGE_OFFSET_MM)
+            period_ms = session.setting(wire.CommandCode.SET_RANGING_PERIOD_MS)
+        finally:
+            device.close()
+        assert first_mm == pytest.approx(500 * delay_m, abs=20)
+        assert period_ms == 2000
+        done = calibrate(
+            "antenna", port, "--nodes", "1,3", "--distance", 10, "--reference", 1, "--ranges", 60
+        )
+        assert done.returncode == 0, done.stderr
+        assert (
+            f"node 1: range offset {first_mm / 1000:+.3f} -> {first_mm / 1000:+.3f}" in done.stdout
+        )
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (("/dev/nowhere",), "cannot open"),
+        (("antenna", "/dev/nowhere", "--nodes", "1,2", "--distance", 5), "cannot open"),
         (("walk", "/dev/nowhere", "--distance", 20), "cannot open"),
     ],
 )

@@ -171,7 +171,7 @@ def test_a_value_that_will_not_do_is_wrong_usage(port):
 
 def test_calibrate_shows_its_forms():
     help_text = node("calibrate", "--help").stdout
-    for command in ("sensors", "walk"):
+    for command in ("sensors", "walk", "antenna"):
         assert command in help_text
     assert "--distance" in node("calibrate", "walk", "--help").stdout
     assert "--magnetometer" in node("calibrate", "/dev/x", "--help").stdout

@@ -19,6 +19,7 @@ from relpos.cli.node_session import Node, Port, dialogue
 from relpos.errors import DataError, DeviceError
 
 if TYPE_CHECKING:
+    from relpos.calibration.antenna import RangeFit
     from relpos.calibration.guide import Progress, Result
     from relpos.link.decoder import RawSample
     from relpos.link.session import Session
@@ -101,6 +102,36 @@ def walk(
     """Set the step gain by a straight walk of known length."""
     with dialogue(port, node, key_file) as session:
         _walk(session, distance, stature, yes)
+
+
+@app.command()
+def antenna(
+    port: Port,
+    nodes: Annotated[
+        str, typer.Option(metavar="A,B", help="The two nodes; they lie still, in sight.")
+    ],
+    distance: Annotated[
+        float, typer.Option(metavar="M", min=1.0, max=100.0, help="Between their tags.")
+    ],
+    reference: Annotated[
+        int | None,
+        typer.Option(metavar="A", help="This one keeps its share, the other takes all."),
+    ] = None,
+    ranges: Annotated[int, typer.Option(min=20, max=2000, help="How many to measure.")] = 100,
+    yes: Yes = False,
+    key_file: KeyFile = None,
+) -> None:
+    """Calibrate the antenna delays of two nodes at a known distance."""
+    try:
+        first, second = (int(word) for word in nodes.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"'{nodes}' is not A,B", param_hint="--nodes") from None
+    if not (1 <= first <= 254 and 1 <= second <= 254 and first != second):
+        raise typer.BadParameter("two different nodes, 1 to 254", param_hint="--nodes")
+    if reference not in (None, first, second):
+        raise typer.BadParameter("one of the two nodes", param_hint="--reference")
+    with dialogue(port, first, key_file) as session:
+        _antenna(session, (first, second), distance, reference, ranges, yes)
 
 
 def _confirmed(yes: bool) -> bool:
@@ -304,3 +335,58 @@ def _motion(session: Session) -> dict[str, Any]:
             raise DeviceError(f"node {session.node} reports no motion")
         session.listen()
     return dict(totals)
+
+
+# -- antennas --------------------------------------------------------------------------------------
+
+
+def _antenna(
+    session: Session,
+    pair: tuple[int, int],
+    distance_m: float,
+    reference: int | None,
+    count: int,
+    yes: bool,
+) -> None:
+    from relpos.calibration import antenna as fits
+    from relpos.nodes import antenna as measuring
+
+    shares_mm = measuring.read_shares_mm(session, pair)
+    output.remark(
+        f"nodes {pair[0]} and {pair[1]}: leave them alone, {distance_m:g} m apart and in sight of "
+        f"each other, until {count} ranges are in"
+    )
+    with measuring.ranging_fast(session, pair):
+        found = fits.fit_ranges(_ranges(session, pair, count), distance_m)
+        _tell_ranges("before", found)
+        new_mm = fits.new_shares_mm(
+            found.bias_m, shares_mm, None if reference is None else pair.index(reference)
+        )
+        if not _confirmed(yes):
+            raise DataError(f"nodes {pair[0]} and {pair[1]} keep their range offsets")
+        measuring.store_shares_mm(session, pair, new_mm)
+        for node, old, new in zip(pair, shares_mm, new_mm, strict=True):
+            typer.echo(f"node {node}: range offset {old / 1000:+.3f} -> {new / 1000:+.3f} m")
+        left = fits.fit_ranges(_ranges(session, pair, count), distance_m)
+    _tell_ranges("after", left)
+    # Both fits err; three times the deviation of their difference, and a millimetre of rounding.
+    most_m = 3.0 * math.hypot(found.sigma_m, left.sigma_m) + 0.001
+    if abs(left.bias_m) > most_m:
+        raise DeviceError(
+            f"stored, but the ranges are still {left.bias_m:+.3f} m off, more than {most_m:.3f} m: "
+            "has something moved? Calibrate again"
+        )
+    typer.echo(f"nodes {pair[0]} and {pair[1]} have stored it; measured again: it holds")
+
+
+def _tell_ranges(when: str, fit: RangeFit) -> None:
+    typer.echo(
+        f"{when}: {fit.count} ranges, {fit.bias_m:+.3f} m off (+-{fit.sigma_m:.3f}), "
+        f"each spreads by {fit.spread_m:.3f} m"
+    )
+
+
+def _ranges(session: Session, pair: tuple[int, int], count: int) -> list[float]:
+    from relpos.nodes.antenna import collect
+
+    return list(output.with_progress(collect(session, pair, count), count, "ranges"))

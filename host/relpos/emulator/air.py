@@ -105,6 +105,9 @@ class UwbAir:
             )
             if measured is None:
                 self.counts["undetected"] += 1
+            else:
+                delays_m = initiator.antenna_delay_m + responder.antenna_delay_m
+                measured = max(measured + delays_m, 0.0)
         spoilt = False
         if self.spoil is not None:
             measured, spoilt = self.spoil(initiator, measured, time_us + EXCHANGE_US)

@@ -43,6 +43,8 @@ class NodeErrors:
     pressure: PressureErrors = field(default_factory=PressureErrors)
     clock: NodeClockError = field(default_factory=NodeClockError)
     power_on_us: int = 0
+    antenna_delay_m: float = 0.0
+    """What this node's tag makes every range too long by."""
 
 
 def draw_node_errors(seed: int, node: int) -> NodeErrors:
@@ -73,13 +75,17 @@ def draw_uncalibrated_errors(seed: int, node: int) -> NodeErrors:
 
     As from the shelf (:func:`draw_node_errors`), and hard iron with sd 25 uT an axis, soft iron and
     misalignment with sd 7 % an element. Assumed: tens of microtesla beside batteries and speakers
-    are usual for body-worn devices.
+    are usual for body-worn devices. Antenna delay with sd 0.2 m (uncalibrated DW1000 modules are
+    off by some decimetres).
     """
     errors = draw_node_errors(seed, node)
     rng = np.random.default_rng([seed, node, 0xCA1])
     iron = np.eye(3) + 0.07 * rng.standard_normal((3, 3))
     bias = errors.magnetic.bias_ut + 25.0 * rng.standard_normal(3)
-    return replace(errors, magnetic=replace(errors.magnetic, bias_ut=bias, soft_iron=iron))
+    magnetic = replace(errors.magnetic, bias_ut=bias, soft_iron=iron)
+    return replace(
+        errors, magnetic=magnetic, antenna_delay_m=0.1 + 0.2 * float(rng.standard_normal())
+    )
 
 
 def prepared_eeprom(node: int) -> bytearray:
@@ -122,6 +128,7 @@ class EmulatedNode:
         self.tag = pozyx.Pozyx(
             node, medium, surroundings, errors.pressure, power_on_us=errors.power_on_us
         )
+        self.tag.antenna_delay_m = errors.antenna_delay_m
         self.bus.attach(mpu9150.ADDRESS, self.mpu)
         self.bus.attach(ak8975.ADDRESS, self.magnetometer.host_side())
         self.bus.attach(pozyx.ADDRESS, self.tag)

@@ -136,6 +136,8 @@ class Pozyx(I2cDevice):
         self._power_on_us = power_on_us
         self._silent_until_us = power_on_us + BOOT_US
         self._pressure_next_us = 0
+        self.antenna_delay_m = 0.0
+        """What it makes every range too long by."""
         self.ranging = False
         """Whether an exchange that this tag started is on the air."""
         self.intercept: Callable[[int, RangeResult | None, int, int], None] | None = None

@@ -46,8 +46,8 @@ class EmulatedTeam:
 
     ``configured`` nodes know the team's size and their wearer's leg length from the stature, as
     after ``relpos node set``; others run on the firmware's defaults. All are given the team's
-    ``key``. ``node_errors`` replaces
-    what is drawn by the seed: nodes from the shelf, or in scenario "turntable" such as nobody has
+    ``key``. ``node_errors`` replaces what is drawn by the seed: nodes from the shelf, or in
+    scenarios "turntable" and "bench" such as nobody has
     calibrated. ``faults`` are SPECs of :mod:`relpos.emulator.faults`; FaultError where one makes
     no sense. The truth methods are for evaluation alone.
     """
@@ -67,7 +67,7 @@ class EmulatedTeam:
         faults: Sequence[str | FaultSpec] = (),
     ) -> None:
         if node_errors is None:
-            uncalibrated = scenario == "turntable"
+            uncalibrated = scenario in ("turntable", "bench")
             node_errors = draw_uncalibrated_errors if uncalibrated else draw_node_errors
         walkers, self.world = make_team(scenario, nodes, seconds, seed)
         self.walkers: dict[int, WalkerTruth] = {walker.node: walker for walker in walkers}

@@ -6,6 +6,7 @@ A command's token makes a repetition harmless: the node answers it again and doe
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -14,8 +15,9 @@ import serial
 from relpos.calibration.sensors import SensorCalibration, checksum
 from relpos.calibration.steps import scaled_gain_permille
 from relpos.errors import DeviceError
-from relpos.link.decoder import Acknowledged, RawSample
+from relpos.link.decoder import MOST_KEPT, Acknowledged, RawSample
 from relpos.link.live import Line, Link, observe
+from relpos.measurements import Observation
 from relpos.protocol import messages as wire
 
 ANSWER_S = 1.0
@@ -52,10 +54,12 @@ class Session:
         self._batches = observe(port, self.link, clock)
         self._token = int(time.time() * 10) % 0xFF00
         self._answers: dict[int, Acknowledged] = {}
+        self.observations: deque[Observation] = deque(maxlen=MOST_KEPT)
+        """The newest of all nodes, for who is interested; nobody has to fetch them."""
 
     def listen(self) -> None:
         """Take in what has arrived, or wait a moment for it. DeviceError where the port is gone."""
-        next(self._batches)
+        self.observations.extend(next(self._batches))
         acknowledged = self.link.decoder.acknowledged
         while acknowledged:
             answer = acknowledged.popleft()

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from relpos.errors import DataError
+from relpos.simulation.bench import BENCH, SPACING_M, lie_still
 from relpos.simulation.gait import make_grid, walk
 from relpos.simulation.turntable import TURNTABLE, turn_by_hand
 from relpos.simulation.walker import Route, WalkerTruth, make_person, make_plan
@@ -89,7 +90,7 @@ def make_team(
     ``nodes`` is a count (ids 1 to N) or the ids themselves, 1 to 20 of them. Raises `DataError`
     for an unknown scenario, a number of nodes or a duration that cannot be.
     """
-    known = (*SCENARIOS, TURNTABLE)
+    known = (*SCENARIOS, TURNTABLE, BENCH)
     if isinstance(scenario, str) and scenario not in known:
         raise DataError(f"unknown scenario {scenario!r}; known are {', '.join(sorted(known))}")
     ids = list(range(1, nodes + 1)) if isinstance(nodes, int) else list(nodes)
@@ -103,6 +104,13 @@ def make_team(
     if scenario == TURNTABLE:
         world = World(name=TURNTABLE, size_m=(2.0, 2.0))
         return [turn_by_hand(node, seconds, seed, world) for node in ids], world
+    if scenario == BENCH:
+        world = World(
+            name=BENCH,
+            size_m=(SPACING_M * len(ids), SPACING_M),
+            uwb=UwbChannel(detection_near=0.98, detection_far=0.5, nlos_probability=0.0),
+        )
+        return [lie_still(node, k, seconds, seed, world) for k, node in enumerate(ids)], world
     if isinstance(scenario, str):
         scenario = SCENARIOS[scenario]
     world = replace(scenario.world, magnetic=replace(scenario.world.magnetic, seed=seed))
