@@ -141,7 +141,7 @@ void DeadReckoning::reset() {
   step_heading_[kX] = 1.0f;
 }
 
-RELPOS_NEAR bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
+RELPOS_APART bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
   bool saturated = false;
   float sum = dt_s;  // of numbers not negative: finite if they all are
   for (uint8_t i = 0; i < kAxes; ++i) {
@@ -164,7 +164,7 @@ RELPOS_NEAR bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
   return true;
 }
 
-RELPOS_NEAR void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_s) {
+RELPOS_APART void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_s) {
   if (ticks_ == 1) mean_force_m_s2_ = force;
   follow(&mean_force_m_s2_, force, dt_s * (1.0f / kForceMean_s));
   const float most_rad = kQuietRate_rad_s * dt_s;
@@ -178,7 +178,7 @@ RELPOS_NEAR void DeadReckoning::watch_quiet(float force, const float angle[kAxes
 
 // Start: the attitude of the first sample is found from the mean force while the gyroscope already
 // carries the frame along, so that walking directly after switching on loses nothing.
-RELPOS_NEAR void DeadReckoning::gather(const ImuSample& sample, const float force[kAxes], float dt_s) {
+RELPOS_APART void DeadReckoning::gather(const ImuSample& sample, const float force[kAxes], float dt_s) {
   if (quiet_s_ == 0.0f) {
     // Movement after a quiet beginning ends the gathering before it spoils the mean.
     if (!moved_ && since_.time_s >= kShortStill_s) {
@@ -195,7 +195,7 @@ RELPOS_NEAR void DeadReckoning::gather(const ImuSample& sample, const float forc
   if (since_.time_s >= (moved_ ? kMovingStart_s : kStillStart_s)) initialise(!moved_);
 }
 
-RELPOS_NEAR void DeadReckoning::initialise(bool still) {
+RELPOS_APART void DeadReckoning::initialise(bool still) {
   const float share = 1.0f / step_ticks_;
   float variance = filter_.covariance(kBias, kBias);  // as reset() set it
   if (still) {
@@ -253,7 +253,7 @@ void DeadReckoning::update(const ImuSample& sample, float dt_s) {
 }
 
 // Moves the nominal state by one sample. True at a mid-stance that the filter can use.
-RELPOS_NEAR bool DeadReckoning::advance(const ImuSample& sample, float dt_s, Stance* stance) {
+RELPOS_APART bool DeadReckoning::advance(const ImuSample& sample, float dt_s, Stance* stance) {
   const float strength = norm(sample.acceleration_m_s2);
   {
     float angle[kAxes];
@@ -324,7 +324,7 @@ RELPOS_NEAR bool DeadReckoning::advance(const ImuSample& sample, float dt_s, Sta
   return at_stance;
 }
 
-RELPOS_NEAR void DeadReckoning::on_stance(const Stance& stance) {
+RELPOS_APART void DeadReckoning::on_stance(const Stance& stance) {
   const float age_ticks = stance.age_s * kTicks_s;
   displacement_.last_step_tick = ticks_ - static_cast<uint16_t>(age_ticks);
   if (stance.last) {
@@ -402,7 +402,7 @@ void DeadReckoning::aim(float heading_rad) {
 
 // A sensor turned on the body turns the heading axis one way and the forward axis the other: both are
 // turned back, so that the wearer's heading is what it was.
-RELPOS_NEAR void DeadReckoning::watch_mounting() {
+RELPOS_APART void DeadReckoning::watch_mounting() {
   const float turned_rad = turn_between(mounting_rad_, forward_.offset_rad());
   if (settled_steps_ < kSettledSteps) {
     if (forward_.found()) ++settled_steps_;
@@ -427,7 +427,7 @@ RELPOS_SHARED void DeadReckoning::capture_span() {
   since_ = Span();
 }
 
-RELPOS_NEAR void DeadReckoning::predict_attitude() {
+RELPOS_APART void DeadReckoning::predict_attitude() {
   // What the heading loses while it turns, never what a compass gives back: totals only grow.
   const float before = filter_.covariance(kAttitude + kZ, kAttitude + kZ);
   attitude_.normalise();
@@ -527,7 +527,7 @@ void DeadReckoning::run_job() {
   measure(group, direction, innovation, variance, yaw);
 }
 
-RELPOS_NEAR void DeadReckoning::measure(State group, const float direction[kAxes], float innovation,
+RELPOS_APART void DeadReckoning::measure(State group, const float direction[kAxes], float innovation,
                             float variance, float yaw) {
   float correction[kStates + 1];
   filter_.settle();
@@ -545,14 +545,14 @@ RELPOS_NEAR void DeadReckoning::measure(State group, const float direction[kAxes
   add_scaled(bias_rad_s_, correction + kBias, 1.0f, kAxes);
 }
 
-RELPOS_NEAR bool DeadReckoning::quiet() const { return quiet_s_ >= kQuiet_s; }
+RELPOS_APART bool DeadReckoning::quiet() const { return quiet_s_ >= kQuiet_s; }
 
 RELPOS_SHARED void DeadReckoning::begin_straight() {
   straight_heading_rad_ = displacement_.heading_rad;
   straight_s_ = 0.0f;
 }
 
-RELPOS_NEAR void DeadReckoning::apply_straight(float sigma_rad_s) {
+RELPOS_APART void DeadReckoning::apply_straight(float sigma_rad_s) {
   float direction[kAxes];
   float expected = sigma_rad_s * sigma_rad_s;
   for (uint8_t i = 0; i < kAxes; ++i) {
@@ -569,7 +569,7 @@ void DeadReckoning::widen(float along_m2, float across_m2) {
   add(&displacement_.variance_across_m2, across_m2);
 }
 
-RELPOS_NEAR void DeadReckoning::commit_step() {
+RELPOS_APART void DeadReckoning::commit_step() {
   float length = step_length_m_;
   float way[2] = {0.0f, 0.0f};
   add_scaled(way, step_heading_, length, 2);
@@ -611,7 +611,7 @@ RELPOS_NEAR void DeadReckoning::commit_step() {
   }
 }
 
-RELPOS_NEAR void DeadReckoning::commit_still() {
+RELPOS_APART void DeadReckoning::commit_still() {
   const bool still = quiet();
   if (still) velocity_known_ = true;
   if (still && forward_.found()) {
@@ -633,7 +633,7 @@ RELPOS_NEAR void DeadReckoning::commit_still() {
   filter_.restart(kPosition, 0.0f);
 }
 
-RELPOS_NEAR void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
+RELPOS_APART void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
   displacement_.magnetic_heading_valid = false;
   if (!displacement_.initialised) return;
   float field[kAxes];
@@ -674,7 +674,7 @@ void DeadReckoning::apply_magnetic() {
   magnetic_steps_ = 0;
 }
 
-RELPOS_NEAR void DeadReckoning::publish() {
+RELPOS_APART void DeadReckoning::publish() {
   Displacement& d = displacement_;
   float way[2] = {0.0f, 0.0f};
   if (d.initialised && velocity_known_ && forward_.found()) {
