@@ -135,6 +135,53 @@ def test_a_command_reaches_its_node_and_is_acknowledged():
     assert all(a.result == wire.CommandResult.DONE for a in answers)
 
 
+def beacons_of(team, node, seconds):
+    """Arrival times and values of the beacons that come out of a node's radio module."""
+    heard, parser = [], Parser()
+    inner = team.nodes[node].radio.on_serial
+
+    def tap(left_us, data):
+        heard.extend(
+            (left_us * 1e-6, wire.decode(frame.data, team.key))
+            for frame in parser.feed(data)
+            if isinstance(frame, Receive16) and frame.data[2] == wire.BEACON.number
+        )
+        inner(left_us, data)
+
+    team.nodes[node].radio.on_serial = tap
+    team.run(round(seconds * 1e6))
+    return heard
+
+
+def test_a_team_that_sends_beacons_itself_tells_its_virtual_time():
+    key = bytes(range(16))
+    with EmulatedTeam("paper", 3, 30.0, 3, key=key, beacons=True) as team:
+        heard = beacons_of(team, 2, 30.0)
+    assert 23 <= len(heard) <= 26
+    counters = [frame.counter for _, frame in heard]
+    assert counters == sorted(set(counters))
+    for time_s, frame in heard:
+        assert [entry["node"] for entry in frame.values["nodes"]] == [1, 2, 3]
+        told_s = frame.values["round"] * 2.0 + frame.values["phase_s"]
+        # Two lines of 38400 baud and the air lie between.
+        assert 0.02 < time_s - told_s < 0.12
+
+
+def test_who_hears_a_beacon_hears_it_at_the_same_moment_as_the_others():
+    with EmulatedTeam("paper", 2, 20.0, 3, beacons=True) as team:
+        one = beacons_of(team, 1, 20.0)
+    with EmulatedTeam("paper", 2, 20.0, 3, beacons=True) as team:
+        other = {frame.counter: time_s for time_s, frame in beacons_of(team, 2, 20.0)}
+    both = [(time_s, other[frame.counter]) for time_s, frame in one if frame.counter in other]
+    assert len(both) > 10
+    assert all(a == pytest.approx(b, abs=1e-3) for a, b in both)
+
+
+def test_a_team_sends_no_beacons_unless_it_is_asked_to():
+    with EmulatedTeam("paper", 2, 10.0, 3) as team:
+        assert beacons_of(team, 1, 10.0) == []
+
+
 def test_collisions_can_be_switched_off():
     with EmulatedTeam("paper", 4, 20.0, 3, collisions=False) as team:
         for _ in team.stream():

@@ -103,16 +103,27 @@ def _print_now_and_then(
 def _watch(
     port: str, seconds: float | None, key_file: Path | None, cable: bool
 ) -> Iterator[tuple[float, TeamView]]:
-    """The team as it is seen, with the present time on the view's clock; until the time is over."""
-    from relpos.link.live import observe
+    """The team as it is seen, with the present time on the view's clock; until the time is over.
+
+    Beacons are sent meanwhile, so that what is seen is how the team works with a host.
+    """
+    from relpos.link.beacon import HostBeacons
+    from relpos.link.live import observe, send
     from relpos.nodes.view import TeamView
 
     view = TeamView()
     told = 0
     started_s = time.monotonic()
+
+    def clock() -> float:
+        return time.monotonic() - started_s
+
     with link_of(key_file) as link, closing(open_device(port, cable)) as device:
-        for batch in observe(device, link):
-            elapsed_s = time.monotonic() - started_s
+        beacons = HostBeacons(link)
+        for batch in observe(device, link, clock):
+            elapsed_s = clock()
+            if not cable:  # which would reach one node alone
+                send(device, beacons.due(elapsed_s))
             now_s = elapsed_s if link.virtual_s is None else link.virtual_s
             view.update(now_s, link.decoder, batch)
             while told < len(link.decoder.remarks):

@@ -34,7 +34,7 @@ def check_recording(source: str) -> Path:
 
 
 class Port:
-    """A live team behind a serial port, as one stream of observations.
+    """A live team behind a serial port, as one stream of observations; it is sent beacons.
 
     ``counters`` are the link's: frames, losses, rejections. ``DeviceError`` from the iteration
     says that the port does not exist or has vanished; what came before has been yielded.
@@ -57,18 +57,25 @@ class Port:
     def __iter__(self) -> Iterator[Observation]:
         """Yield observations until the seconds are over, or for ever."""
         from relpos.link import live
+        from relpos.link.beacon import HostBeacons
 
         started = time.monotonic()
+        beacons = HostBeacons(self._link)
         told = 0
+
+        def clock() -> float:
+            return time.monotonic() - started
+
         try:
-            for batch in live.observe(self._device, self._link):
+            for batch in live.observe(self._device, self._link, clock):
+                live.send(self._device, beacons.due(clock()))
                 while told < len(self._link.decoder.remarks):
                     output.remark(self._link.decoder.remarks[told])
                     told += 1
                 if self._seen is not None:
                     self._seen.save(self._link.newest_counters(), time.monotonic())
                 yield from batch
-                if self._seconds is not None and time.monotonic() - started > self._seconds:
+                if self._seconds is not None and clock() > self._seconds:
                     return
         finally:
             self._device.close()

@@ -164,7 +164,10 @@ def _uwb_rss_dbm(distance_m: float) -> int:
 
 
 class RadioAir:
-    """802.15.4 between the modules: the world's loss and delay, in order from each sender."""
+    """802.15.4 between the modules: the world's loss and delay, in order from each sender.
+
+    A broadcast leaves once: who hears it hears it at the same moment.
+    """
 
     def __init__(
         self,
@@ -207,11 +210,14 @@ class RadioAir:
             receivers = [m for m in others if m.address == destination]
         heard = False
         done_us = time_us
+        common_s: float | None = None
         for receiver in receivers:
             delay_s = self._world.transmit(self._rng)
             if delay_s is None:
                 self.counts["lost"] += 1
                 continue
+            if broadcast:
+                common_s = delay_s = delay_s if common_s is None else common_s
             arrival_us = max(
                 time_us + round(delay_s * 1e6), self._last_us.get(sender.serial_number, 0) + 1
             )

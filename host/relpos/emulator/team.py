@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from relpos.calibration.steps import LEG_OF_STATURE
+from relpos.link import xbee as api
+from relpos.link.beacon import BEACON_PERIOD_S, BeaconSchedule
 from relpos.measurements import Prior, Truth
 from relpos.protocol import messages as wire
 from relpos.simulation.team import Scenario, make_team
@@ -33,6 +35,8 @@ STEP_US = 20_000
 """How far the clock goes in one step of :meth:`EmulatedTeam.stream`."""
 SET_UP_AFTER_US = 1_500_000
 """After power-on: the boards have booted and their tags, too."""
+BEACONS_FROM_US = 4_000_000
+"""Everybody has been switched on and set up: a beacon under a key not known yet is refused."""
 TRUTH_PERIOD_S = 0.2
 PRIOR_SIGMA_M = 0.1
 PRIOR_SIGMA_RAD = 0.1
@@ -49,7 +53,8 @@ class EmulatedTeam:
     ``key``. ``node_errors`` replaces what is drawn by the seed: nodes from the shelf, or in
     scenarios "turntable" and "bench" such as nobody has
     calibrated. ``faults`` are SPECs of :mod:`relpos.emulator.faults`; FaultError where one makes
-    no sense. The truth methods are for evaluation alone.
+    no sense. ``beacons``: the coordinator sends them by itself, as a host would in real time. The
+    truth methods are for evaluation alone.
     """
 
     def __init__(
@@ -65,6 +70,7 @@ class EmulatedTeam:
         node_errors: Callable[[int, int], NodeErrors] | None = None,
         key: bytes = wire.DEFAULT_KEY,
         faults: Sequence[str | FaultSpec] = (),
+        beacons: bool = False,
     ) -> None:
         if node_errors is None:
             uncalibrated = scenario in ("turntable", "bench")
@@ -97,6 +103,10 @@ class EmulatedTeam:
                 self._add(walker, board, errors, configured)
             if specs:
                 FaultInjector(self, specs, seed)
+            if beacons:
+                self._beacons = BeaconSchedule(self.walkers)
+                self._beacon_counter = 0
+                self.clock.at(BEACONS_FROM_US, self._send_beacon)
         except BaseException:
             self.close()
             raise
@@ -153,6 +163,14 @@ class EmulatedTeam:
             return
         arrived_us = self.clock.now_us + line_time_us(len(data), self.coordinator.baud)
         self.clock.at(arrived_us, lambda now_us: self.coordinator.from_serial(now_us, data))
+
+    def _send_beacon(self, now_us: int) -> None:
+        """Send one as a host would, with counters of their own: no command is disturbed by them."""
+        self.clock.at(now_us + round(BEACON_PERIOD_S * 1e6), self._send_beacon)
+        self._beacon_counter += 1
+        values = self._beacons.values(now_us * 1e-6)
+        data = wire.encode(wire.BEACON, wire.BROADCAST, 0, self._beacon_counter, values, self.key)
+        self.send(api.encode(api.Transmit16(0, api.BROADCAST_16, data)))
 
     def stream(self) -> Iterator[tuple[int, bytes]]:
         """Everything that leaves the serial port until the walk ends; ``send`` in between."""
@@ -256,7 +274,8 @@ def serve_team(
     """Body of ``relpos emulate``: the team behind a pseudo-terminal until its walk ends or Ctrl-C.
 
     ``announce(path)`` is called once the pseudo-terminal is there. ``speed`` 0 is as fast as the
-    reader takes it; other than 1, time frames mark the virtual time (see ``pty``).
+    reader takes it; other than 1, time frames mark the virtual time (see ``pty``) and the team
+    sends its beacons itself, which a host cannot time.
     """
     from .pty import PseudoTerminal
 
@@ -269,6 +288,7 @@ def serve_team(
             board,
             faults=faults,
             key=key,
+            beacons=speed != 1.0,
         ) as team,
         PseudoTerminal(team, speed=speed, mark_time=speed != 1.0) as terminal,
     ):
@@ -301,7 +321,7 @@ def record_team(
     measurements: list[Motion | Range | Height | Heading] = []
     statuses: list[Status] = []
     steps: list[Step] = []
-    with EmulatedTeam(scenario, nodes, seconds, seed, board, faults=faults) as team:
+    with EmulatedTeam(scenario, nodes, seconds, seed, board, faults=faults, beacons=True) as team:
         with PseudoTerminal(team, speed=0.0) as terminal, terminal.open_port() as port:
             terminal.start()
             for batch in observe(port, link, port.virtual_time_s):

@@ -174,6 +174,16 @@ def open_port(port: str, baud: int = BAUD) -> serial.Serial:
     return device
 
 
+def send(device: Line, data: bytes) -> None:
+    """Write ``data``, if there is any. DeviceError when the port has vanished."""
+    if not data:
+        return
+    try:
+        device.write(data)
+    except (serial.SerialException, OSError, TypeError) as error:
+        raise DeviceError(f"{device.port}: the port vanished: {_reason(error)}") from error
+
+
 def _reason(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror

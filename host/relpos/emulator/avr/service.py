@@ -30,6 +30,7 @@ from relpos.emulator.surroundings import (
     draw_magnetic_errors,
 )
 from relpos.emulator.xbee import DELIVERED, XbeeModule, line_time_us
+from relpos.link.beacon import BEACON_PERIOD_S, BeaconSchedule
 from relpos.protocol import messages as wire
 from relpos.simulation.team import make_team
 from relpos.simulation.walker import RATE_HZ
@@ -50,6 +51,7 @@ COMMANDS: tuple[tuple[wire.CommandCode, int], ...] = (
 )
 """Sent in turn, so that every kind of work (storing, step reports) is part of what is measured."""
 FIRST_COMMAND_US = 3_000_000
+FIRST_BEACON_US = 2_500_000
 COMMAND_PERIOD_US = 4_000_000
 
 
@@ -90,7 +92,10 @@ class Service:
         self._seconds = seconds
         self._commands = itertools.cycle(COMMANDS)
         self._counter = 0
+        self._beacons = BeaconSchedule(range(1, TEAM + 1))
+        self._beacon_counter = 0
         self._at(FIRST_COMMAND_US, self._command)
+        self._at(FIRST_BEACON_US, self._beacon)
 
     def _at(self, time_us: int, action: Callable[[int], None]) -> None:
         heapq.heappush(self._events, (max(time_us, self._now_us), next(self._order), action))
@@ -159,6 +164,18 @@ class Service:
         )
         self.radio.deliver(self.coordinator, -60, data, False, now_us)
         self._at(now_us + COMMAND_PERIOD_US, self._command)
+
+    def _beacon(self, now_us: int) -> None:
+        self._beacon_counter += 1
+        data = wire.encode(
+            wire.BEACON,
+            wire.BROADCAST,
+            0,
+            self._beacon_counter,
+            self._beacons.values(now_us * 1e-6),
+        )
+        self.radio.deliver(self.coordinator, -60, data, True, now_us)
+        self._at(now_us + round(BEACON_PERIOD_S * 1e6), self._beacon)
 
     def _to_board(self, left_us: int, data: bytes) -> None:
         # The engine paces the bytes itself, from the first one on.

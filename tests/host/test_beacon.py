@@ -1,0 +1,141 @@
+"""The beacon: who is in it, in which order, and what time it tells."""
+
+import pytest
+
+from relpos.errors import DataError
+from relpos.link import xbee
+from relpos.link.authentication import HostCounter
+from relpos.link.beacon import FORGET_S, MOST_NODES, BeaconSchedule, HostBeacons
+from relpos.link.live import Link
+from relpos.protocol import messages as wire
+
+
+def ids(beacon):
+    return [entry["node"] for entry in beacon["nodes"]]
+
+
+def heard(schedule, nodes, time_s):
+    for node in nodes:
+        schedule.heard(node, time_s)
+
+
+def test_a_beacon_leaves_once_a_second_and_tells_the_time_in_the_superframe():
+    schedule = BeaconSchedule([1, 2])
+    sent = []
+    for k in range(1000):  # looked at every 10 ms
+        values = schedule.due(k * 0.01)
+        if values is not None:
+            sent.append((k * 0.01, values))
+    assert len(sent) == 10
+    for time_s, values in sent:
+        assert values["period_s"] == 2.0
+        assert values["round"] * 2.0 + values["phase_s"] == pytest.approx(time_s, abs=1e-3)
+
+
+def test_a_beacon_that_leaves_late_tells_the_time_at_which_it_leaves():
+    schedule = BeaconSchedule([1])
+    assert schedule.due(0.0)["phase_s"] == 0.0
+    assert schedule.due(0.9) is None
+    late = schedule.due(5.123)
+    assert late["phase_s"] == pytest.approx(1.123)
+    assert late["round"] == 2
+    assert schedule.due(5.2) is None, "missed beacons are not made up for"
+
+
+def test_the_round_wraps_after_256_superframes():
+    schedule = BeaconSchedule([1])
+    assert schedule.due(511.0)["round"] == 255
+    assert schedule.due(512.0)["round"] == 0
+
+
+def test_nobody_is_told_while_there_is_nobody():
+    schedule = BeaconSchedule()
+    assert schedule.due(0.0) is None
+    schedule.heard(4, 0.5)
+    assert ids(schedule.due(0.6)) == [4]
+
+
+def test_who_is_there_keeps_the_order_and_newcomers_follow_sorted():
+    schedule = BeaconSchedule()
+    heard(schedule, (5, 9), 0.0)
+    assert schedule.team(0.0) == (5, 9)
+    heard(schedule, (7, 1, 5, 9), 1.0)
+    assert schedule.team(1.0) == (5, 9, 1, 7)
+    heard(schedule, (5, 1, 7), 20.0)
+    assert schedule.team(1.0 + FORGET_S) == (5, 9, 1, 7)
+    assert schedule.team(1.1 + FORGET_S) == (5, 1, 7), "9 was not heard for too long"
+    heard(schedule, (9,), 32.0)
+    assert schedule.team(32.0) == (5, 1, 7, 9)
+
+
+def test_those_given_stay_whether_they_are_heard_or_not():
+    schedule = BeaconSchedule([3, 2])
+    heard(schedule, (1,), 0.0)
+    assert schedule.team(0.0) == (2, 3, 1)
+    assert schedule.team(100.0) == (2, 3)
+
+
+def test_the_twenty_first_node_is_left_out_and_named():
+    schedule = BeaconSchedule()
+    heard(schedule, range(10, 10 + MOST_NODES), 0.0)
+    schedule.team(0.0)
+    heard(schedule, range(10, 10 + MOST_NODES), 1.0)
+    heard(schedule, (1,), 1.0)
+    assert len(schedule.team(1.0)) == MOST_NODES
+    assert 1 not in schedule.team(1.0)
+    assert schedule.left_out == (1,)
+
+
+@pytest.mark.parametrize("nodes", [[0], [255], [1, 1], range(1, MOST_NODES + 2)])
+def test_a_team_that_cannot_be_is_refused(nodes):
+    with pytest.raises(DataError):
+        BeaconSchedule(nodes)
+
+
+def test_every_beacon_fits_the_wire():
+    schedule = BeaconSchedule(range(1, MOST_NODES + 1))
+    for k in range(5000):
+        values = schedule.values(k * 0.1234567)
+        assert 0.0 <= values["phase_s"] < values["period_s"]
+        frame = wire.decode(wire.encode(wire.BEACON, wire.BROADCAST, 0, k + 1, values))
+        assert ids(frame.values) == list(range(1, MOST_NODES + 1))
+
+
+# --- of a host -----------------------------------------------------------------------------------
+
+
+def motion(node, counter):
+    values = dict.fromkeys(wire.MOTION.field, 0)
+    data = wire.encode(wire.MOTION, node, 0, counter, values)
+    return xbee.encode(xbee.Receive16(node, -60, data))
+
+
+def test_a_host_tells_the_nodes_that_it_hears():
+    link = Link(counter=HostCounter(lambda: 2e9))
+    beacons = HostBeacons(link)
+    assert beacons.due(0.0) == b""
+    link.feed(motion(6, 1) + motion(2, 1), 0.5)
+    (request,) = xbee.Parser().feed(beacons.due(3.25))
+    assert request.destination == xbee.BROADCAST_16
+    frame = wire.decode(request.data)
+    assert (frame.message, frame.node) == (wire.BEACON, wire.BROADCAST)
+    assert ids(frame.values) == [2, 6]
+    assert frame.values["phase_s"] == pytest.approx(1.25)
+    assert beacons.due(3.3) == b""
+    (later,) = xbee.Parser().feed(beacons.due(4.25))
+    assert wire.decode(later.data).counter > frame.counter
+
+
+def test_a_host_sends_none_to_an_emulated_team_that_marks_its_own_time():
+    link = Link()
+    beacons = HostBeacons(link)
+    link.feed(xbee.encode(xbee.UnknownFrame(xbee.VIRTUAL_TIME, (10**6).to_bytes(8, "big"))), 0.0)
+    link.feed(motion(6, 1), 0.5)
+    assert beacons.due(1.0) == b""
+
+
+def test_a_forged_frame_brings_nobody_into_the_team():
+    link = Link(key=bytes(range(16)))
+    beacons = HostBeacons(link)
+    link.feed(motion(6, 1), 0.5)
+    assert beacons.due(1.0) == b""
