@@ -74,6 +74,7 @@ bench: $(DEVELOP) ## what is timed, in bench/
 
 docs: wire ## regenerate the pages that come from the sources
 	$(PYTHON) bench/reliability.py
+	$(PYTHON) bench/hardware.py
 
 clean: ## remove what was built; .venv stays
 	rm -rf .build .pio out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

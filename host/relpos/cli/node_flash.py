@@ -43,6 +43,9 @@ def flash(
         typer.Option("--id", min=1, max=254, help="The node's number. (default: as it was)"),
     ] = None,
     key_file: KeyFile = None,
+    new: Annotated[
+        bool, typer.Option("--new", help="Make a new random key in the key's file first.")
+    ] = False,
     old_key_file: Annotated[
         Path | None,
         typer.Option(
@@ -54,9 +57,12 @@ def flash(
 
     The XBee shield's switch in position USB (or the XBee out of its socket) until it is done.
     """
+    from relpos.link.authentication import write_new_key
     from relpos.link.live import open_port
     from relpos.nodes import boards, upload
 
+    if new and key_file is None:
+        raise typer.BadParameter("say where: --key-file FILE", param_hint="--new")
     found = port or boards.find_port()
     with closing(open_port(found, boards.BOOT_BAUD)) as device:
         kind = boards.check(device, None if board is None else str(board))
@@ -64,6 +70,8 @@ def flash(
     with output.working("building and writing the firmware"):
         size = upload.upload(kind, found)
     typer.echo(f"firmware written and verified ({size} bytes)")
+    if new and key_file is not None:
+        write_new_key(key_file)
     _set_up(found, node_id, key_file, old_key_file)
 
 

@@ -1,0 +1,105 @@
+"""What a team sends: bytes on the serial lines, time on the air; and which baud rates fit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from relpos.link.live import BAUD
+from relpos.protocol import messages as wire
+
+BITS_A_BYTE = 10
+FRAME_BYTES = 9
+"""Delimiter, length, type, 16-bit source, signal strength, options, checksum of a 0x81 frame."""
+ESCAPED_SHARE = 4 / 256
+"""0x7E, 0x7D, 0x11 and 0x13 take two bytes each; tag and counters are as good as random."""
+EXCHANGE_S = 0.030
+"""A ranging exchange with its margin, as the firmware plans its slots."""
+AIR_BIT_S = 1 / 250_000
+AIR_OVERHEAD_BYTES = 6 + 11 + 2 + 11
+"""802.15.4: preamble and length, MAC header and check, Digi's header (MM=0), acknowledgement."""
+AIR_WAIT_S = 0.0025
+"""Mean back-off of the first attempt (7 slots of 0.32 ms), sensing, two turn-rounds."""
+
+
+@dataclass(frozen=True)
+class Periods:
+    """Seconds between a node's reports; the defaults are a new node's."""
+
+    motion_s: float = 1.0
+    ranging_s: float = 2.0
+    status_s: float = 10.0
+
+
+def packet_bytes(body_bytes: int) -> int:
+    """Payload of an XBee packet: header, body, CRC, tag."""
+    return wire.HEADER_BYTES + body_bytes + wire.CRC_BYTES + wire.TAG_BYTES
+
+
+def serial_bytes(body_bytes: int) -> float:
+    """Mean bytes of a received frame on the coordinator's serial line, escapes included."""
+    plain = packet_bytes(body_bytes) + FRAME_BYTES
+    return plain * (1.0 + ESCAPED_SHARE)
+
+
+def air_s(body_bytes: int) -> float:
+    """Time that a packet occupies the channel, its acknowledgement included."""
+    return (packet_bytes(body_bytes) + AIR_OVERHEAD_BYTES) * 8 * AIR_BIT_S + AIR_WAIT_S
+
+
+def reports(ranges_a_round: int, periods: Periods = Periods()) -> list[tuple[int, float]]:
+    """(body bytes, times a second) of everything that a node sends by itself."""
+    frames: list[tuple[int, float]] = [
+        (wire.MOTION.fixed_size, 1.0 / periods.motion_s),
+        (wire.STATUS.fixed_size, 1.0 / periods.status_s),
+    ]
+    assert wire.RANGES.entries is not None
+    most = wire.RANGES.entries.most
+    left = ranges_a_round
+    while left > 0:
+        count = min(left, most)
+        size = wire.RANGES.fixed_size + count * wire.RANGES.entry_size
+        frames.append((size, 1.0 / periods.ranging_s))
+        left -= count
+    return frames
+
+
+@dataclass(frozen=True)
+class Load:
+    """A team's load: bytes a second at the coordinator, share of its line, share of the channel."""
+
+    nodes: int
+    ranges_a_round: int
+    bytes_s: float
+    line_share: float
+    air_share: float
+
+
+def load(nodes: int, ranges_a_round: int, baud: int = BAUD) -> Load:
+    """Load of a team whose nodes get so many ranges a round, without losses."""
+    frames = reports(ranges_a_round)
+    bytes_s = nodes * sum(serial_bytes(size) * rate for size, rate in frames)
+    air = nodes * sum(air_s(size) * rate for size, rate in frames)
+    return Load(nodes, ranges_a_round, bytes_s, bytes_s * BITS_A_BYTE / baud, air)
+
+
+def baud_error(baud: int, clock_hz: int = 16_000_000) -> float:
+    """Relative error of the AVR's UART at double speed (U2X) with its best divisor."""
+    divisor = max(round(clock_hz / (8 * baud)), 1)
+    return clock_hz / (8 * divisor) / baud - 1.0
+
+
+def line_ms(baud: int) -> float:
+    """Milliseconds that a motion report takes on a serial line."""
+    return math.ceil(serial_bytes(wire.MOTION.fixed_size)) * BITS_A_BYTE / baud * 1000.0
+
+
+def ranges_a_round(nodes: int, period_s: float = 2.0) -> int:
+    """Ranges that each node gets in a round: all, or as many exchanges as its slot has room for."""
+    return min(nodes - 1, int(period_s / nodes / EXCHANGE_S))
+
+
+def beacon_bytes(nodes: int) -> float:
+    """Bytes of a beacon on the coordinator's serial line, as a transmit request."""
+    assert wire.BEACON.entries is not None
+    return serial_bytes(wire.BEACON.fixed_size + nodes * wire.BEACON.entry_size)
