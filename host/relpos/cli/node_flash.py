@@ -12,7 +12,7 @@ import typer
 
 from relpos.cli import output
 from relpos.cli.keys import KeyFile
-from relpos.errors import DeviceError
+from relpos.errors import DataError, DeviceError
 
 if TYPE_CHECKING:
     from relpos.link.session import Session
@@ -63,6 +63,8 @@ def flash(
 
     if new and key_file is None:
         raise typer.BadParameter("say where: --key-file FILE", param_hint="--new")
+    if new and key_file is not None and key_file.exists():
+        raise DataError(f"{key_file} exists already: a key is not overwritten")
     found = port or boards.find_port()
     with closing(open_port(found, boards.BOOT_BAUD)) as device:
         kind = boards.check(device, None if board is None else str(board))
