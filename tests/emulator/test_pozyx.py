@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from chips import Host, constant
 
-from relpos.emulator.air import UwbAir, VirtualClock
+from relpos.emulator.air import Outcome, UwbAir, UwbModel, VirtualClock
 from relpos.emulator.bus import BusStatus
 from relpos.emulator.pozyx import Pozyx, PressureErrors
 from relpos.simulation.world import UwbChannel, World
@@ -30,7 +30,7 @@ class Field:
             World(uwb=UwbChannel(**options)),
             lambda tag, _: np.array([self.place[tag], 0.0, 0.0]),
             np.random.default_rng(1),
-            collisions=collisions,
+            UwbModel(collisions=collisions),
         )
         self.hosts = []
         for k, x in enumerate(x_m):
@@ -45,6 +45,9 @@ class Field:
         for host in self.hosts:
             host.at(time_us)
         return self
+
+    def tag(self, k):
+        return self.air.tags[k]
 
     def call(self, k, function, parameters=b"", count=0):
         status, data = self.hosts[k].transfer(TAG, bytes([function]) + parameters, b"", 1 + count)
@@ -133,6 +136,40 @@ def test_an_exchange_ends_with_the_true_distance_at_both_tags(by_bytes):
     # The responder stores it too and raises FUNC by itself.
     assert field.interrupts(1) == 0x10
     assert field.info(1, 1)[2] == 7321
+
+
+def test_the_air_tells_of_each_exchange_when_it_is_over():
+    field = Field(0.0, 5.0, 9.0, 40.0, 44.0)
+    records = []
+    field.air.on_end = records.append
+    field.range(0, 2)
+    field.at(BOOTED_US + 10_000)
+    field.range(2, 2)  # meets the first
+    field.range(3, 5)  # out of reach of them
+    field.at(BOOTED_US + 50_000)
+    field.range(3, 77)
+    field.at(BOOTED_US + 100_000)
+    told = [(r.initiator, r.destination, r.outcome) for r in records]
+    assert told == [
+        (1, 2, Outcome.COLLIDED),
+        (3, 2, Outcome.COLLIDED),
+        (4, 5, Outcome.RANGED),
+        (4, 77, Outcome.ABSENT),
+    ]
+    assert all(
+        r.end_us - r.begin_us in (field.air.model.exchange_us, field.air.model.failed_us)
+        for r in records
+    )
+
+
+def test_a_tag_that_restarts_while_it_answers_knows_nothing_of_it():
+    field = Field(0.0, 5.0)
+    field.range(0, 2)
+    field.at(BOOTED_US + 5_000)
+    field.tag(1).power_cycle(BOOTED_US + 5_000)
+    field.at(BOOTED_US + 400_000)
+    assert field.interrupts(1) == 0
+    assert field.info(1, 1)[0] == 0
 
 
 def test_an_exchange_takes_between_ten_and_fifty_milliseconds():

@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
@@ -22,11 +23,6 @@ from .xbee import BROADCAST, DELIVERED, NO_ACKNOWLEDGEMENT, XbeeModule
 
 Action = Callable[[int], None]
 
-EXCHANGE_US = 20_000
-"""One two-way ranging at 110 kbit/s and a preamble of 1024 symbols (assumed: pypozyx first
-allowed 25 ms for all of it)."""
-FAILED_EXCHANGE_US = 30_000
-"""Until the initiator gives up on an answer (assumed)."""
 NO_ACKNOWLEDGEMENT_US = 40_000
 """Until an XBee gives up: four attempts of 802.15.4 with carrier sensing (assumed)."""
 
@@ -55,6 +51,48 @@ class VirtualClock:
         self.now_us = max(self.now_us, until_us)
 
 
+@dataclass(frozen=True, slots=True)
+class UwbModel:
+    """What ranging takes, and what happens where two exchanges meet. Assumed, not measured.
+
+    At 110 kbit/s, a PRF of 64 MHz and a preamble of 1024 symbols of 1.018 us, a frame of 20 bytes
+    takes 3.0 ms on the air: preamble 1.04 ms, start delimiter 0.07 ms, header 0.17 ms (21 bits of
+    8.2 us), data 1.7 ms (160 bits and 48 of its Reed-Solomon code; IEEE 802.15.4a).
+    """
+
+    exchange_us: int = 20_000
+    """From the call to its end. Four such frames (poll, answer, final, report) are 12 ms, and
+    three replies of one to two milliseconds and the microcontrollers' work come on top. pypozyx
+    first allowed 25 ms for all of it."""
+    failed_us: int = 30_000
+    """Until the initiator gives up on an answer: pypozyx's 25 ms and some margin."""
+    collisions: bool = True
+    """Two exchanges that overlap in time, with a tag of the one in reach of a tag of the other,
+    both fail: nobody hears through another's preamble, and no tag is in two exchanges at once.
+    Harder than the air is: a strong frame may survive a weak one, and an initiator that waits in
+    vain disturbs nobody."""
+
+
+class Outcome(StrEnum):
+    """What became of an exchange, as :attr:`UwbAir.counts` names it."""
+
+    RANGED = "ranges"
+    UNDETECTED = "undetected"
+    COLLIDED = "collisions"
+    ABSENT = "absent"
+
+
+@dataclass(frozen=True, slots=True)
+class ExchangeRecord:
+    """One exchange that is over."""
+
+    begin_us: int
+    end_us: int
+    initiator: int
+    destination: int
+    outcome: Outcome
+
+
 @dataclass(slots=True)
 class _Exchange:
     end_us: int
@@ -65,9 +103,8 @@ class _Exchange:
 class UwbAir:
     """Ranging between tags at their true positions.
 
-    Two exchanges that overlap in time, with a tag of the one in reach of a tag of the other, both
-    fail (switched off by ``collisions=False``). ``counts``: attempts, ranges, undetected,
-    collisions, absent.
+    ``counts``: attempts, ranges, undetected, collisions, absent; an undetected exchange that also
+    collides is counted in both.
     """
 
     def __init__(
@@ -76,17 +113,18 @@ class UwbAir:
         world: World,
         position_m: Callable[[Pozyx, int], FloatArray],
         rng: np.random.Generator,
-        *,
-        collisions: bool = True,
+        model: UwbModel | None = None,
     ) -> None:
+        self.model = model or UwbModel()
         self.tags: list[Pozyx] = []
         self.counts: Counter[str] = Counter()
         self._clock = clock
         self._world = world
         self._position_m = position_m
         self._rng = rng
-        self._collisions = collisions
         self._under_way: list[_Exchange] = []
+        self.on_end: Callable[[ExchangeRecord], None] | None = None
+        """Told of each exchange when it is over: for measurements and tests."""
         self.spoil: Callable[[Pozyx, float | None, int], tuple[float | None, bool]] | None = None
         """Fault: (initiator, what would be measured in metres, end of the exchange) -> what is
         measured instead, and whether a stranger's exchange spoils it."""
@@ -95,6 +133,7 @@ class UwbAir:
         """See :class:`relpos.emulator.pozyx.UwbMedium`."""
         self.counts["attempts"] += 1
         responder = self._find(initiator, destination, time_us)
+        initiator_id = initiator.network_id
         # Drawn at once, so that the order of draws is that of the attempts.
         measured = None
         if responder is None:
@@ -110,11 +149,11 @@ class UwbAir:
                 measured = max(measured + delays_m, 0.0)
         spoilt = False
         if self.spoil is not None:
-            measured, spoilt = self.spoil(initiator, measured, time_us + EXCHANGE_US)
-        duration_us = FAILED_EXCHANGE_US if measured is None else EXCHANGE_US
+            measured, spoilt = self.spoil(initiator, measured, time_us + self.model.exchange_us)
+        duration_us = self.model.failed_us if measured is None else self.model.exchange_us
         exchange = _Exchange(time_us + duration_us, (initiator, responder), spoilt)
         self._under_way = [e for e in self._under_way if e.end_us > time_us]
-        if self._collisions:
+        if self.model.collisions:
             for other in self._under_way:
                 if self._in_reach(exchange, other, time_us):
                     other.collided = exchange.collided = True
@@ -122,14 +161,19 @@ class UwbAir:
 
         def end(now_us: int) -> None:
             result, error = None, ERROR_RESPONSE_TIMEOUT_1
+            outcome = Outcome.UNDETECTED if responder is not None else Outcome.ABSENT
             if exchange.collided:
-                self.counts["collisions"] += 1
+                outcome = Outcome.COLLIDED
+                self.counts[outcome] += 1
                 error = ERROR_RESPONSE_TIMEOUT_2
             elif measured is not None and responder is not None:
-                self.counts["ranges"] += 1
+                outcome = Outcome.RANGED
+                self.counts[outcome] += 1
                 result = RangeResult(round(measured * 1000.0), _uwb_rss_dbm(measured))
                 responder.finish_ranging(initiator.network_id, result, 0, now_us, started=False)
             initiator.finish_ranging(destination, result, error, now_us, started=True)
+            if self.on_end is not None:
+                self.on_end(ExchangeRecord(time_us, now_us, initiator_id, destination, outcome))
 
         self._clock.at(exchange.end_us, end)
 

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 NEVER_US = 1 << 50
 WATCHDOG_US = 500_000
 RESTART_XBEE_US = 100_000
-STRANGERS_EXCHANGE_US = 20_000
 STRANGERS_ADDRESS = 0x5A5A
 STRANGERS_ID = 200
 
@@ -429,6 +428,7 @@ class FaultInjector:
 
     def _uwb_on(self, spec: FaultSpec, rng: Draw) -> None:
         before = self._team.uwb.spoil
+        exchange_us = self._team.uwb.model.exchange_us  # of strangers too
         strangers: deque[int] = deque()
         next_us = [float(spec.from_us)]
         rate = spec.number("rate")
@@ -438,7 +438,7 @@ class FaultInjector:
             while next_us[0] < end_us and rate > 0.0:
                 strangers.append(round(next_us[0]))
                 next_us[0] += 1e6 * float(rng.exponential(1.0 / rate))
-            while strangers and strangers[0] + STRANGERS_EXCHANGE_US <= begin_us:
+            while strangers and strangers[0] + exchange_us <= begin_us:
                 strangers.popleft()
             return bool(strangers) and strangers[0] < end_us
 

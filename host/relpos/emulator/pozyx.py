@@ -195,6 +195,8 @@ class Pozyx(I2cDevice):
                 self.intercept(peer, result, error, time_us)
                 return
             self.ranging = False
+        elif not self.awake(time_us):
+            return  # restarted in between
         self.complete(peer, result, error, time_us)
 
     def complete(

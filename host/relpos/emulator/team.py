@@ -20,7 +20,7 @@ from relpos.simulation.team import Scenario, make_team
 from relpos.simulation.walker import RATE_HZ, WalkerTruth
 from relpos.simulation.world import FloatArray
 
-from .air import RadioAir, UwbAir, VirtualClock
+from .air import RadioAir, UwbAir, UwbModel, VirtualClock
 from .faults import FaultSpec, parse_faults
 from .faults_injection import FaultInjector, prepare_errors
 from .node import BoardKind, EmulatedNode, NodeErrors, draw_node_errors, draw_uncalibrated_errors
@@ -83,7 +83,11 @@ class EmulatedTeam:
         self.clock = VirtualClock()
         uwb_rng, radio_rng = (np.random.default_rng([seed, k, 0xA17]) for k in (1, 2))
         self.uwb = UwbAir(
-            self.clock, self.world, self._tag_position_m, uwb_rng, collisions=collisions
+            self.clock,
+            self.world,
+            self._tag_position_m,
+            uwb_rng,
+            UwbModel(collisions=collisions),
         )
         self.radio = RadioAir(self.clock, self.world, self._module_distance_m, radio_rng)
         self._output: list[tuple[int, bytes]] = []

@@ -15,6 +15,7 @@ from typing import Self
 
 import numpy as np
 
+from relpos.emulator.air import UwbModel
 from relpos.emulator.ak8975 import ADDRESS as AK8975_ADDRESS
 from relpos.emulator.ak8975 import Ak8975
 from relpos.emulator.avr.board import BoardKind
@@ -38,7 +39,6 @@ from relpos.simulation.walker import RATE_HZ
 POZYX_ADDRESS = 0x4B
 NODE = 1
 TEAM = 6
-EXCHANGE_US = 20_000
 AIR_US = 15_000
 RSS_DBM = -82
 UWB_TIMEOUT_ERROR = 0x12
@@ -128,7 +128,7 @@ class Service:
             self.counts["exchanges"] += 1
             initiator.finish_ranging(destination, result, UWB_TIMEOUT_ERROR, now_us, started=True)
 
-        self._at(time_us + EXCHANGE_US, end)
+        self._at(time_us + UwbModel().exchange_us, end)
 
     # -- the radio (Air) ------------------------------------------------------------------------
 
