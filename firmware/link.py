@@ -2,7 +2,8 @@
 
 from SCons.Script import DefaultEnvironment
 
-DefaultEnvironment().Append(
+env = DefaultEnvironment()
+env.Append(
     LINKFLAGS=[
         # A section a function also where the link compiles: the order below is of sections.
         "-ffunction-sections",
@@ -10,3 +11,4 @@ DefaultEnvironment().Append(
         "-Wl,-Map,$BUILD_DIR/firmware.map",  # read by tools/flash_order.py
     ]
 )
+env.Depends("$BUILD_DIR/firmware.elf", "$PROJECT_DIR/firmware/order.ld")

@@ -4,6 +4,8 @@
 
 #include <stdint.h>
 
+#include "inertial/calls.h"
+
 namespace relpos {
 
 // How an I2C transaction ended. The numbers are part of native/engine.h.
@@ -30,7 +32,7 @@ class Board {
   // One transaction, every part but the address optional:
   //   S address+W first.. [Sr address+W second..] [Sr address+R read..] P
   // Blocks until the end, at most about 1 ms. Failures are counted.
-  BusStatus transfer(uint8_t address, const uint8_t* first, uint8_t first_count,
+  RELPOS_APART BusStatus transfer(uint8_t address, const uint8_t* first, uint8_t first_count,
                      const uint8_t* second, uint8_t second_count, uint8_t* read,
                      uint8_t read_count) {
     const BusStatus status =

@@ -101,7 +101,13 @@ const float kTurned_rad = 35.0f * kDegree;
 
 const uint8_t kHoldTicks = 100;       // two seconds: a flag is seen by a report a second
 
-bool finite(float value) { return value - value == 0.0f; }
+// By its bits: the boards' compiler is told that there is no other number (-ffinite-math-only), so
+// what comes from outside is looked at first.
+bool finite(float value) {
+  uint32_t bits;
+  memcpy(&bits, &value, sizeof bits);
+  return (bits & 0x7f800000) != 0x7f800000;
+}
 
 void count(uint16_t* counter) {
   if (*counter < 65535u) ++*counter;
@@ -639,7 +645,11 @@ RELPOS_APART void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
   float field[kAxes];
   attitude_.matrix(rotation_);
   rotate(rotation_, field_ut, field);
-  const float strength = norm(field);  // NaN fails every comparison below
+  float strength = norm(field);
+  if (!finite(strength)) {
+    clear(field);
+    strength = 0.0f;
+  }
   const float azimuth = atan2f(field[kY], field[kX]);
   bool plausible = strength > kFieldLeast_ut && strength < kFieldMost_ut;
   magnetic_residual_rad_ = turn_between(azimuth, magnetic_azimuth_rad_);

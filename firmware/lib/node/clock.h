@@ -3,6 +3,8 @@
 
 #include <stdint.h>
 
+#include "inertial/calls.h"
+
 namespace relpos {
 
 // Whether `now` has reached `due`, on any counter that wraps, as long as they are less than half
@@ -21,7 +23,7 @@ class NodeClock {
     ms_ += whole;
     last_us_ += whole * 1000;
   }
-  uint32_t ms() const { return ms_; }
+  RELPOS_APART uint32_t ms() const { return ms_; }
 
  private:
   uint32_t last_us_;
