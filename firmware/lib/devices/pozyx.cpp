@@ -9,6 +9,7 @@ enum Register : uint8_t {
   kInterruptStatus = 0x05,  // reading clears it
   kInterruptMask = 0x10,
   kNetworkIdLow = 0x1A,
+  kPressure = 0x50,
 };
 enum Function : uint8_t { kDoRanging = 0xB5, kGetRangeInfo = 0xC7 };
 enum Interrupt : uint8_t { kErrorFlag = 0x01, kFunctionFlag = 0x10 };
@@ -63,6 +64,21 @@ bool Pozyx::range(uint16_t peer) {
   peer_ = peer;
   state_ = State::kBefore;
   return true;
+}
+
+bool Pozyx::look(Board& board, uint32_t* pressure_mpa) {
+  const bool identity = (++looks_ & 7) == 0;
+  uint8_t bytes[4];
+  const bool answered =
+      board.read_registers(kAddress, identity ? kNetworkIdLow : kPressure, bytes, identity ? 2 : 4);
+  if (!answered) count_failure();
+  if (failures_ >= kMostFailures ||
+      (answered && identity && little_endian(bytes) != network_id_)) {
+    begin(network_id_);
+    return false;
+  }
+  *pressure_mpa = little_endian_long(bytes);
+  return answered && !identity;
 }
 
 void Pozyx::fail_set_up(uint32_t now_us, uint32_t* wait_us) {
@@ -141,7 +157,6 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
       }
       state_ = State::kIdle;
       failures_ = 0;
-      last_ms_ = 0;
       *wait_us = kIdleUs;
       return Event::kNothing;
     }
@@ -225,17 +240,15 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
     return done(kBusFailed, wait_us, result);
   }
   failures_ = 0;
-  if (answer[0] != 1) return done(kRefused, wait_us, result);
+  const int32_t advance_ms = static_cast<int32_t>(little_endian_long(answer + 1) - before_ms_);
+  if (answer[0] != 1 || (before_ms_ != 0 && advance_ms <= 0)) {
+    // No row or the one from before: it was another exchange that ended, where this chip answered.
+    state_ = State::kPoll;
+    *wait_us = kPollUs;
+    return Event::kNothing;
+  }
   const uint32_t range_mm = little_endian_long(answer + 5);
   if (range_mm == 0 || range_mm >= kLeastImplausibleMm) return done(kImplausible, wait_us, result);
-  const uint32_t time_ms = little_endian_long(answer + 1);
-  const int32_t advance_ms = static_cast<int32_t>(time_ms - last_ms_);
-  if (advance_ms <= 0 || time_ms == before_ms_) {
-    // A clock that went back means a restart, which has lost the settings too.
-    if (advance_ms < 0) failures_ = kMostFailures;
-    return done(kStale, wait_us, result);
-  }
-  last_ms_ = time_ms;
   const int16_t rss_dbm = static_cast<int16_t>(little_endian(answer + 9));
   result->range_mm = range_mm;
   result->rss_dbm = static_cast<int8_t>(rss_dbm < -128 ? -128 : rss_dbm > 127 ? 127 : rss_dbm);

@@ -20,7 +20,6 @@ class Pozyx {
     kBusFailed = 0x81,
     kRefused = 0x82,      // a function call was answered with failure, or an error has no code
     kImplausible = 0x83,  // not a distance
-    kStale = 0x84,        // an older distance
   };
 
   struct Result {
@@ -42,6 +41,9 @@ class Pozyx {
   bool running() const { return state_ >= State::kIdle; }
   // Asks for an exchange, which the following steps make. False where not ready().
   bool range(uint16_t peer);
+  // Between exchanges, while ready(): reads the air pressure, or every eighth time looks whether the
+  // chip still has its network id, and sets it up anew where not. True with a pressure.
+  bool look(Board& board, uint32_t* pressure_mpa);
   // Call when due, and at once after begin() and range(). *wait_us: when to call again.
   Event step(Board& board, uint32_t now_us, uint32_t* wait_us, Result* result);
 
@@ -66,11 +68,11 @@ class Pozyx {
   void count_failure();
 
   uint32_t due_us_;
-  uint32_t last_ms_;  // the chip's time of the last distance; 0: none
-  uint32_t before_ms_;  // likewise, of the peer's row before the exchange
+  uint32_t before_ms_;  // the chip's time of the peer's row before the exchange; 0: none
   uint16_t network_id_;
   uint16_t peer_;
   State state_;
+  uint8_t looks_;
   uint8_t failures_;  // bus failures and silences since the chip last ended an exchange
 };
 

@@ -26,6 +26,7 @@ constexpr uint8_t kRebootBytes = 5;
 // written every ten minutes, and lasts for years. A start wastes what is left of a block.
 constexpr uint16_t kCounterBlock = 1024;
 constexpr uint8_t kCountersLeft = 64;      // then the next block: writing takes 75 ms
+constexpr uint16_t kLookPeriodMs = 250;    // at the Pozyx's pressure
 constexpr uint16_t kRawPeriodMs = 200;     // as often as the magnetometer is read
 constexpr uint16_t kMostRawReports = 3000; // ten minutes: a lost host does not end the ranging
 // Beyond what a sensor at its limit can show once a calibration has moved it: by 80 mg and 3 %, by
@@ -109,9 +110,7 @@ void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
   // Nodes switched on together do not all speak and range at the same moment.
   motion_due_ms_ = settings_.report_period_ms +
                    static_cast<uint32_t>(id_) * kMotionPhaseMs % settings_.report_period_ms;
-  round_due_ms_ = settings_.ranging_period_ms +
-                  static_cast<uint32_t>(id_ - 1) % settings_.team_size *
-                      settings_.ranging_period_ms / settings_.team_size;
+  plan_.begin(0, static_cast<uint16_t>(id_ * 257 + counter_));
   status_due_ms_ = motion_due_ms_;  // the first one tells who is there, and why
   show_health();
 }
@@ -126,10 +125,6 @@ uint32_t Node::poll(uint32_t now_us) {
   if (reached(now_us, imu_due_us_)) {
     run_imu(now_us);
     return 0;
-  }
-  if (peer_ == kNoPeer && settings_.ranging_period_ms != 0 &&
-      period_over(&round_due_ms_, settings_.ranging_period_ms)) {
-    begin_round(now_us);
   }
   if (reached(now_us, pozyx_due_us_)) {
     run_ranging(now_us);
@@ -146,7 +141,6 @@ uint32_t Node::wait_us(uint32_t now_us) const {
   uint32_t wait_ms = kMostWaitUs / 1000;
   shorten(motion_due_ms_, &wait_ms);
   shorten(status_due_ms_, &wait_ms);
-  if (settings_.ranging_period_ms != 0) shorten(round_due_ms_, &wait_ms);
   uint32_t wait = wait_ms * 1000;
   if (awaiting_status_ || store_.saving() || reboot_step_ != 0) wait = kSilentPollUs;
   if (imu_due_us_ - now_us < wait) wait = imu_due_us_ - now_us;
@@ -289,38 +283,48 @@ void Node::note_step() {
 
 // ---- ranging ----
 
-void Node::begin_round(uint32_t now_us) {
-  if (!pozyx_.ready()) return;  // missing: the bus errors tell
-  next_peer(now_us);
-}
-
-void Node::next_peer(uint32_t now_us) {
-  if (++peer_ == id_) ++peer_;
-  if (peer_ > settings_.team_size || raw_reports_ != 0 || !pozyx_.range(peer_)) {
-    peer_ = kNoPeer;
-    return;
-  }
-  pozyx_due_us_ = now_us;
-}
-
 void Node::run_ranging(uint32_t now_us) {
   uint32_t wait = 0;
   Pozyx::Result result;
-  const Pozyx::Event event = pozyx_.step(board_, now_us, &wait, &result);
-  pozyx_due_us_ = now_us + (wait < kMostWaitUs ? wait : kMostWaitUs);
-  if (event != Pozyx::Event::kDone) return;
-  if (result.success) {
-    ++ranging_successes_;
-    PendingRange pending;
-    pending.time_ms = clock_.ms();
-    pending.range_mm = result.range_mm;
-    pending.rss_dbm = result.rss_dbm;
-    pending.peer = result.peer;
-    if (raw_reports_ != 0 || !ranges_.push(pending)) ++dropped_ranges_;
-  } else {
-    ++ranging_failures_;
+  if (pozyx_.ready()) {
+    wait = between_exchanges();
+  } else if (pozyx_.step(board_, now_us, &wait, &result) == Pozyx::Event::kDone) {
+    plan_.done(static_cast<uint16_t>(clock_.ms()), result.success);
+    if (result.success) {
+      ++ranging_successes_;
+      PendingRange pending;
+      pending.time_ms = clock_.ms();
+      pending.range_mm = result.range_mm;
+      pending.rss_dbm = result.rss_dbm;
+      pending.peer = result.peer;
+      if (raw_reports_ != 0 || !ranges_.push(pending)) ++dropped_ranges_;
+    } else {
+      ++ranging_failures_;
+    }
+    wait = 0;
   }
-  next_peer(now_us);
+  pozyx_due_us_ = now_us + (wait < kMostWaitUs ? wait : kMostWaitUs);
+}
+
+// The next exchange where it is time for one, else a look at pressure or identity. Microseconds
+// until it has to be asked again.
+uint32_t Node::between_exchanges() {
+  const uint16_t now_ms = static_cast<uint16_t>(clock_.ms());
+  uint16_t wait_ms = kLookPeriodMs;
+  if (settings_.ranging_period_ms != 0 && raw_reports_ == 0) {
+    const uint8_t peer =
+        plan_.next(now_ms, id_, settings_.team_size, settings_.ranging_period_ms, &wait_ms);
+    if (peer != 0) {
+      pozyx_.range(peer);
+      return 0;
+    }
+  }
+  if (static_cast<uint16_t>(now_ms - looked_ms_) >= kLookPeriodMs) {
+    looked_ms_ = now_ms;
+    uint32_t pressure_mpa;
+    if (pozyx_.look(board_, &pressure_mpa)) barometer_.add(pressure_mpa);
+  }
+  return wait_ms * 1000UL;
 }
 
 // ---- commands ----
@@ -347,8 +351,15 @@ void Node::receive_packet() {
     return;
   }
   *mark = header.counter;
-  if (beacon || reboot_step_ != 0) return;
-  obey(header, frame + wire::kHeaderBytes, static_cast<uint8_t>(length - wire::kOverhead));
+  const uint8_t* body = frame + wire::kHeaderBytes;
+  const uint8_t body_bytes = static_cast<uint8_t>(length - wire::kOverhead);
+  if (beacon) {
+    wire::Beacon message;
+    if (wire::decode(body, body_bytes, &message)) plan_.beacon(static_cast<uint16_t>(clock_.ms()), message, id_);
+    pozyx_due_us_ = board_.now_us();
+  } else if (reboot_step_ == 0) {
+    obey(header, body, body_bytes);
+  }
 }
 
 RELPOS_APART void Node::obey(const wire::Header& header, const uint8_t* body, uint8_t length) {
@@ -445,7 +456,6 @@ RELPOS_APART wire::CommandResult Node::apply(uint8_t command, int32_t value, int
   // A new period counts from now.
   const uint32_t due_ms = clock_.ms() + static_cast<uint32_t>(value);
   if (code == wire::CommandCode::kSetReportPeriodMs) motion_due_ms_ = due_ms;
-  if (code == wire::CommandCode::kSetRangingPeriodMs) round_due_ms_ = due_ms;
   if (code == wire::CommandCode::kSetStatusPeriodMs) status_due_ms_ = due_ms;
   if (settings_.step_reports == 0) steps_.clear();
   return wire::CommandResult::kDone;
@@ -539,7 +549,7 @@ RELPOS_APART bool Node::send_next() {
   } else if (raw_reports_ != 0) {
     if (!period_over(&raw_due_ms_, kRawPeriodMs)) return false;
     send(wire::MessageType::kSamples, fill_samples(body));
-  } else if (ranges_.count() >= wire::kMostRanges || (peer_ == kNoPeer && ranges_.count() > 0)) {
+  } else if (ranges_.count() >= wire::kMostRanges || (ranges_.count() > 0 && (plan_.resting() || !pozyx_.running()))) {
     send(wire::MessageType::kRanges, fill_ranges(body));
   } else {
     return false;
@@ -581,6 +591,10 @@ uint8_t Node::fill_motion(uint8_t* body) {
     motion.magnetic_heading_100urad =
         static_cast<int16_t>(scaled(now.magnetic_heading_rad, 10000));
     quality_ |= flag(wire::Quality::kMagnetometerValid);
+  }
+  if (pozyx_.running() && barometer_.ready()) {
+    motion.height_cm = static_cast<int16_t>(scaled(barometer_.height_m(), 100));
+    quality_ |= flag(wire::Quality::kHeightValid);
   }
   if (silent) quality_ |= flag(wire::Quality::kImuGap);
   wire::MotionState state = now.moving ? wire::MotionState::kMoving : wire::MotionState::kStanding;
@@ -639,6 +653,10 @@ uint8_t Node::fill_status(uint8_t* body) {
   if (!imu_silent()) health |= flag(wire::Health::kImu);
   if (magnetometer_.running()) health |= flag(wire::Health::kMagnetometer);
   if (pozyx_.running()) health |= flag(wire::Health::kPozyx);
+  if (pozyx_.running() && barometer_.ready()) health |= flag(wire::Health::kPressure);
+  status.neighbours = plan_.neighbours();
+  status.team = plan_.team();
+  if (status.team != 0) health |= flag(wire::Health::kBeacon);
   for (const uint8_t byte : key_) {
     if (byte != 0) health |= flag(wire::Health::kKeySet);
   }

@@ -10,8 +10,10 @@
 #include "devices/pozyx.h"
 #include "devices/xbee.h"
 #include "inertial/dead_reckoning.h"
+#include "node/barometer.h"
 #include "node/clock.h"
 #include "node/motion_totals.h"
+#include "node/ranging.h"
 #include "node/ring.h"
 #include "node/settings.h"
 #include "wire/frame.h"
@@ -25,7 +27,6 @@ struct NodeState : Persistent {
   static constexpr uint8_t kRememberedCommands = 4;
   static constexpr uint8_t kPendingRanges = 8;
   static constexpr uint8_t kPendingSteps = 6;
-  static constexpr uint8_t kNoPeer = 0;
 
   struct PendingRange {
     uint32_t time_ms;
@@ -71,11 +72,12 @@ struct NodeState : Persistent {
   bool field_seen_;
   bool sampled_;  // ever
   uint32_t pozyx_due_us_;
-  uint32_t round_due_ms_;
+  RangingPlan plan_;
+  Barometer barometer_;
+  uint16_t looked_ms_;  // at the Pozyx between exchanges
   uint16_t ranging_successes_;
   uint16_t ranging_failures_;
   uint16_t dropped_ranges_;
-  uint8_t peer_;  // kNoPeer: between rounds
   uint32_t raw_due_ms_;
   uint16_t raw_reports_;  // still to be sent
   uint8_t raw_samples_;   // in the sums
@@ -114,8 +116,7 @@ class Node : private NodeState {
   void tick(uint32_t now_us);
   void note_step();
   void run_ranging(uint32_t now_us);
-  void begin_round(uint32_t now_us);
-  void next_peer(uint32_t now_us);
+  uint32_t between_exchanges();
 
   void receive_packet();
   void obey(const wire::Header& header, const uint8_t* body, uint8_t length);

@@ -1,0 +1,120 @@
+#include "node/ranging.h"
+
+#include <string.h>
+
+namespace relpos {
+
+void RangingPlan::begin(uint16_t now_ms, uint16_t seed) {
+  origin_ms_ = now_ms;
+  random_ = seed;
+}
+
+void RangingPlan::beacon(uint16_t now_ms, const wire::Beacon& beacon, uint8_t id) {
+  if (count_ == 0 || round_ != beacon.round) tried_ = 0;
+  count_ = 0;
+  for (uint8_t i = 0; i < beacon.count; ++i) {
+    ids_[i] = beacon.entries[i].node;
+    if (ids_[i] == id) {
+      place_ = i;
+      count_ = beacon.count;
+    }
+  }
+  planned_ = false;
+  if (count_ == 0) return;
+  heard_ms_ = now_ms;
+  origin_ms_ = static_cast<uint16_t>(now_ms - beacon.phase_ms);
+  period_ms_ = beacon.period_ms;
+  round_ = beacon.round;
+}
+
+uint8_t RangingPlan::next(uint16_t now_ms, uint8_t id, uint8_t team_size, uint16_t period_ms,
+                          uint16_t* wait_ms) {
+  const uint8_t epoch = static_cast<uint8_t>(now_ms >> 13);
+  if (epoch != epoch_) {
+    epoch_ = epoch;
+    memcpy(before_, ranged_, sizeof before_);
+    memset(ranged_, 0, sizeof ranged_);
+  }
+  if (count_ != 0 && static_cast<uint16_t>(now_ms - heard_ms_) >= kBeaconHoldMs) {
+    count_ = 0;
+    planned_ = false;
+  }
+  uint8_t count = team_size;
+  uint8_t place = static_cast<uint8_t>(id - 1);
+  if (count_ != 0) {
+    period_ms = period_ms_;
+    count = count_;
+    place = place_;
+  } else if (place >= count) {
+    place = count++;  // one more than the team, at its end
+  }
+
+  uint16_t at_ms = static_cast<uint16_t>(now_ms - origin_ms_);
+  if (at_ms >= period_ms) {
+    at_ms = static_cast<uint16_t>(at_ms - period_ms);
+    if (at_ms >= period_ms) at_ms = 0;  // after a pause
+    origin_ms_ = static_cast<uint16_t>(now_ms - at_ms);
+    ++round_;
+    tried_ = 0;
+    planned_ = false;
+  }
+  if (!planned_) {
+    planned_ = true;
+    if (count_ != 0) {
+      const uint16_t window_ms = period_ms / count;
+      begin_ms_ = place * window_ms;
+      end_ms_ = static_cast<uint16_t>(begin_ms_ + window_ms - (kExchangeMs + kGuardMs));
+    } else {
+      // Knuth, The Art of Computer Programming 2, 3.2.1: a linear congruence of full period, whose
+      // high bits are the better ones.
+      random_ = static_cast<uint16_t>(random_ * 25173u + 13849u);
+      begin_ms_ = static_cast<uint16_t>((random_ >> 11) * (period_ms / 64));
+      end_ms_ = period_ms;
+    }
+  }
+
+  resting_ = tried_ == 0;  // else it backs off
+  if (at_ms < begin_ms_) {
+    *wait_ms = static_cast<uint16_t>(begin_ms_ - at_ms);
+    return 0;
+  }
+  const uint8_t most = static_cast<uint8_t>(count > kAllInARound ? count / 2 : count - 1);
+  while (at_ms <= end_ms_ && tried_ < most) {
+    ++tried_;
+    if (++step_ > most) step_ = 1;
+    uint8_t index = static_cast<uint8_t>(place + step_);
+    if (index >= count) index = static_cast<uint8_t>(index - count);
+    index_ = index;
+    resting_ = false;
+    if (count_ != 0) return ids_[index];
+    const uint8_t bits = ranged_[index / 8] | before_[index / 8];
+    if ((bits >> (index & 7) & 1) != 0 || round_ < kSilentRounds ||
+        ((round_ + index) & (kSilentRounds - 1)) == 0) {
+      return static_cast<uint8_t>(index + 1);
+    }
+  }
+  resting_ = true;
+  *wait_ms = static_cast<uint16_t>(period_ms - at_ms);
+  return 0;
+}
+
+void RangingPlan::done(uint16_t now_ms, bool success) {
+  if (success) {
+    ranged_[index_ / 8] |= static_cast<uint8_t>(1 << (index_ & 7));
+  } else if (count_ == 0) {
+    begin_ms_ = static_cast<uint16_t>(now_ms - origin_ms_ + (random_ & kMostBackOffMs));
+    random_ = static_cast<uint16_t>(random_ + now_ms);
+  }
+}
+
+uint8_t RangingPlan::neighbours() const {
+  uint8_t count = 0;
+  for (uint8_t i = 0; i < kBitBytes; ++i) {
+    for (uint8_t bits = ranged_[i] | before_[i]; bits != 0; bits &= static_cast<uint8_t>(bits - 1)) {
+      ++count;
+    }
+  }
+  return count;
+}
+
+}  // namespace relpos

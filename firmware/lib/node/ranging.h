@@ -1,0 +1,69 @@
+// Whom to range when. With the coordinator's beacon: in this node's own window of the superframe, so
+// that exchanges do not collide. Without: at random times. How it works: docs/ranging.md.
+#pragma once
+
+#include <stdint.h>
+
+#include "wire/messages.h"
+
+namespace relpos {
+
+// One exchange with all that belongs to it, also one without an answer, which takes longest: 30 ms
+// (assumed, see docs/emulator.md) and the steps around it.
+constexpr uint8_t kExchangeMs = 33;
+// Between the windows of two nodes. A beacon is seen up to a tick (9 ms) late, and not by all alike;
+// clocks of 0.5 % drift by 5 ms in a second apart.
+constexpr uint8_t kGuardMs = 10;
+// A beacon holds so long: of one a second, five in a row are lost every half minute at 50 % loss,
+// and by then two clocks may be 25 ms apart.
+constexpr uint16_t kBeaconHoldMs = 5000;
+// Up to so many nodes everybody ranges everybody in every round. Of more, each ranges the half of the
+// ring that comes after it, as many in a round as its window takes: 10 of 20 in four rounds.
+constexpr uint8_t kAllInARound = 7;
+// Without a beacon: a round begins within the first half of its period at random, and after a failure
+// up to so much later, so that two nodes do not collide again and again.
+constexpr uint8_t kMostBackOffMs = 63;  // one less than a power of two
+// Without a beacon ids are tried that may not exist: after the first so many rounds, a silent one in
+// every so many.
+constexpr uint8_t kSilentRounds = 4;
+
+// Zeroed memory is the start: make it as `RangingPlan()`. Times are the low 16 bits of milliseconds;
+// next() is to be asked at least every few seconds.
+class RangingPlan {
+ public:
+  void begin(uint16_t now_ms, uint16_t seed);
+  void beacon(uint16_t now_ms, const wire::Beacon& beacon, uint8_t id);
+  // The node to range now, or 0. Then *wait_ms until it may be another one's turn. Without a beacon:
+  // one round a period_ms, over ids 1 to team_size.
+  uint8_t next(uint16_t now_ms, uint8_t id, uint8_t team_size, uint16_t period_ms,
+               uint16_t* wait_ms);
+  void done(uint16_t now_ms, bool success);  // of what next() returned last
+
+  bool resting() const { return resting_; }  // nothing more in this round
+  uint8_t team() const { return count_; }    // in the beacon in force; 0: none, or without this node
+  uint8_t neighbours() const;                // ranged in the last 8 to 16 s
+
+ private:
+  static constexpr uint8_t kBitBytes = (wire::kMostBeacon + 8) / 8;  // and a node more
+
+  uint16_t origin_ms_;  // of the superframe
+  uint16_t heard_ms_;   // the beacon
+  uint16_t begin_ms_;   // of this node's window, or of its round, in the superframe
+  uint16_t end_ms_;     // no exchange begins after it
+  uint16_t period_ms_;  // of the beacon
+  uint16_t random_;
+  uint8_t ranged_[kBitBytes];  // one bit a place: since epoch_ began
+  uint8_t before_[kBitBytes];  // and in the one before
+  uint8_t ids_[wire::kMostBeacon];
+  uint8_t count_;
+  uint8_t place_;
+  uint8_t round_;
+  uint8_t step_;    // last place ranged, from this node's on
+  uint8_t tried_;   // in this round
+  uint8_t index_;   // of the exchange under way
+  uint8_t epoch_;
+  bool planned_;    // begin_ms_ and end_ms_ are those of this superframe
+  bool resting_;
+};
+
+}  // namespace relpos
