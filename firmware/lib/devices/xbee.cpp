@@ -1,4 +1,5 @@
 #include "devices/xbee.h"
+#include "inertial/calls.h"
 
 namespace relpos {
 namespace {
@@ -98,7 +99,7 @@ void Xbee::reject() {
   part_ = Part::kNone;
 }
 
-bool Xbee::take(uint8_t byte) {
+RELPOS_SHARED bool Xbee::take(uint8_t byte) {
   if (byte == kDelimiter) {  // always a frame's start, here also the end of one broken off
     if (part_ != Part::kNone) ++bad_frames_;
     part_ = Part::kLengthHigh;
@@ -141,7 +142,7 @@ bool Xbee::take(uint8_t byte) {
   return false;
 }
 
-void Xbee::take_data(uint8_t byte) {
+RELPOS_SHARED void Xbee::take_data(uint8_t byte) {
   if (index_ == 0) {
     type_ = byte;
     const bool too_short = is_payload(byte) && length_ < header_bytes(byte);

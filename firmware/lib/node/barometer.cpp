@@ -1,4 +1,5 @@
 #include "node/barometer.h"
+#include "inertial/calls.h"
 
 namespace relpos {
 namespace {
@@ -18,7 +19,7 @@ constexpr float kSecondOrder = 0.40487f;
 
 }  // namespace
 
-void Barometer::add(uint32_t pressure_mpa) {
+RELPOS_SHARED void Barometer::add(uint32_t pressure_mpa) {
   if (pressure_mpa < kLeastMpa || pressure_mpa > kMostMpa) return;
   if (readings_ == 0) start_mpa_ = pressure_mpa;
   const int32_t news = static_cast<int32_t>(start_mpa_ - pressure_mpa) - fall_mpa_;

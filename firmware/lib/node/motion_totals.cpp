@@ -1,4 +1,5 @@
 #include "node/motion_totals.h"
+#include "inertial/calls.h"
 
 #include <stddef.h>
 #include <string.h>
@@ -82,7 +83,7 @@ void MotionTotals::fill(const Displacement& now, wire::Motion* motion) const {
   motion->steps = static_cast<uint16_t>(steps_ + now.steps);
 }
 
-RELPOS_APART void MotionTotals::rebase(const Displacement& last, float gap_s) {
+RELPOS_APART RELPOS_SHARED void MotionTotals::rebase(const Displacement& last, float gap_s) {
   wire::Motion motion;
   fill(last, &motion);
   if (gap_s > kMostGapS) gap_s = kMostGapS;

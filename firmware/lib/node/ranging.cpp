@@ -1,4 +1,5 @@
 #include "node/ranging.h"
+#include "inertial/calls.h"
 
 #include <string.h>
 
@@ -27,7 +28,7 @@ void RangingPlan::beacon(uint16_t now_ms, const wire::Beacon& beacon, uint8_t id
   round_ = beacon.round;
 }
 
-uint8_t RangingPlan::next(uint16_t now_ms, uint8_t id, uint8_t team_size, uint16_t period_ms,
+RELPOS_SHARED uint8_t RangingPlan::next(uint16_t now_ms, uint8_t id, uint8_t team_size, uint16_t period_ms,
                           uint16_t* wait_ms) {
   const uint8_t epoch = static_cast<uint8_t>(now_ms >> 13);
   if (epoch != epoch_) {
