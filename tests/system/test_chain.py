@@ -306,7 +306,7 @@ def test_an_emulated_team_is_fused_live_by_another_process(tmp_path):
     # 4 s at 20 times real time, less what a busy machine cannot keep up with.
     assert 20.0 < received.measurements[-1].time_s < 100.0
     assert {m.node for m in received.motions} == {1, 2, 3}
-    with EmulatedTeam("paper", 3, 300.0, 4) as team:
+    with EmulatedTeam("paper", 3, 300.0, 4, beacons=True) as team:
         sent = end_poses((t * 1e-6, data) for t, data in team.run(100_000_000))[1]
     heard = Counter((r.node, r.peer, round(r.range_m, 3)) for r in received.ranges)
     assert heard.total() > 20
