@@ -85,14 +85,19 @@ void Attitude::premultiply(const Attitude& first) { multiply(first.q, Attitude(*
 
 void Attitude::matrix(float r[kAxes * kAxes]) const {
   const float* v = q + 1;
-  const float twice = q[0] + q[0];
+  float* out = r;
   for (uint8_t i = 0; i < kAxes; ++i) {
-    const uint8_t j = next(i), k = next(j);
-    const float double_i = v[i] + v[i];
-    const float same = double_i * v[j], opposite = twice * v[k];
-    r[4 * i] = double_i * v[i] + (twice * q[0] - 1.0f);
-    r[3 * i + j] = same - opposite;
-    r[3 * j + i] = same + opposite;
+    const float twice = v[i] + v[i];
+    for (uint8_t j = 0; j < kAxes; ++j) *out++ = twice * v[j];
+  }
+  const float twice = q[0] + q[0];
+  const float diagonal = twice * q[0] - 1.0f;
+  for (uint8_t i = 0; i < kAxes; ++i) {
+    const uint8_t j = next(i);
+    const float turned = twice * v[next(j)];
+    add(r + 4 * i, diagonal);
+    add(r + 3 * i + j, -turned);
+    add(r + 3 * j + i, turned);
   }
 }
 

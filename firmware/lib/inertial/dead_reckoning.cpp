@@ -177,7 +177,7 @@ RELPOS_APART void DeadReckoning::watch_quiet(float force, const float angle[kAxe
   if (fabsf(force - mean_force_m_s2_) >= kQuietForce_m_s2 ||
       dot(angle, angle) >= most_rad * most_rad) {
     quiet_s_ = 0.0f;
-  } else if (quiet_s_ < 1000.0f) {
+  } else {
     add(&quiet_s_, dt_s);
   }
 }

@@ -41,6 +41,10 @@ RELPOS_SHARED void integrate(float* sum, float rate, float dt_s) {
   *sum += (rate - *sum * (1.0f / kLeakTime_s)) * dt_s;
 }
 
+RELPOS_SHARED void lower(float* least, float value) {
+  if (value < *least) *least = value;
+}
+
 }  // namespace
 
 RELPOS_SHARED void GaitDetector::reset() {
@@ -52,8 +56,7 @@ RELPOS_SHARED void GaitDetector::reset() {
 
 RELPOS_SHARED void GaitDetector::restart_arc() {
   trough_m_ = height_m_;
-  lowest_m_s2_ = 1e6f;
-  highest_m_s2_ = -1e6f;
+  lowest_m_s2_ = minus_highest_m_s2_ = 1e6f;
 }
 
 RELPOS_SHARED bool GaitDetector::walking() const { return since_s_ < kPause_s; }
@@ -74,10 +77,10 @@ RELPOS_SHARED bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance*
   const float before = velocity_m_s_;
   integrate(&velocity_m_s_, acceleration, dt_s);
   integrate(&height_m_, velocity_m_s_, dt_s);
-  if (since_s_ < 1000.0f) add(&since_s_, dt_s);
-  if (height_m_ < trough_m_) trough_m_ = height_m_;
-  if (acceleration < lowest_m_s2_) lowest_m_s2_ = acceleration;
-  if (acceleration > highest_m_s2_) highest_m_s2_ = acceleration;
+  add(&since_s_, dt_s);  // within a week it grows no more: a float of 5e5
+  lower(&trough_m_, height_m_);
+  lower(&lowest_m_s2_, acceleration);
+  lower(&minus_highest_m_s2_, -acceleration);
 
   const bool first = !walking();
   stance->first = first;
@@ -91,7 +94,7 @@ RELPOS_SHARED bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance*
   }
   if (!(before > 0.0f && velocity_m_s_ <= 0.0f)) return false;
   const float swing = height_m_ - trough_m_;
-  const float range_m_s2 = highest_m_s2_ - lowest_m_s2_;
+  const float range_m_s2 = -minus_highest_m_s2_ - lowest_m_s2_;
   const float since_s = since_s_;
   const float periods = since_s / period_s_;
   // Not of a longer period than at the start: one that grew in a turn would reject every other step

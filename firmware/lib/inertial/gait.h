@@ -34,7 +34,7 @@ class GaitDetector {
   void restart_arc();
   float mean_m_s2_, velocity_m_s_, height_m_;
   float trough_m_, peak_m_;
-  float lowest_m_s2_, highest_m_s2_;
+  float lowest_m_s2_, minus_highest_m_s2_;
   float since_s_, period_s_;
   uint8_t rejected_, steps_;  // steps of this walk, saturating
   bool running_, footfall_due_;
