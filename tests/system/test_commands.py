@@ -1,19 +1,21 @@
 """Commands from the host to emulated nodes whose radio is not as it should be."""
 
 from contextlib import contextmanager
+from dataclasses import replace
 
 from relpos.emulator.pty import PseudoTerminal
 from relpos.emulator.team import EmulatedTeam
 from relpos.link import xbee
 from relpos.link.session import Session
 from relpos.protocol import messages as wire
+from relpos.simulation.team import SCENARIOS
 
 
 @contextmanager
-def team_at_port(nodes=1, seed=1):
+def team_at_port(nodes=1, seed=1, scenario="straight"):
     """A team and the port behind which it is, at eight times real time."""
     with (
-        EmulatedTeam("straight", nodes, 900.0, seed) as team,
+        EmulatedTeam(scenario, nodes, 900.0, seed) as team,
         PseudoTerminal(team, speed=8.0) as terminal,
         terminal.open_port() as port,
     ):
@@ -28,3 +30,31 @@ def test_a_node_whose_radio_has_another_address_is_reached():
         session = Session(port, 1, clock=port.virtual_time_s)
         assert session.demand(wire.CommandCode.SET_LEG_LENGTH_MM, 901) == 901
         assert session.setting(wire.CommandCode.SET_LEG_LENGTH_MM) == 901
+
+
+def test_commands_are_done_once_though_half_of_all_frames_are_lost():
+    straight = SCENARIOS["straight"]
+    lossy = replace(straight.world, radio=replace(straight.world.radio, loss_probability=0.5))
+    with team_at_port(seed=4, scenario=replace(straight, world=lossy)) as (team, port):
+        session = Session(port, 1, clock=port.virtual_time_s)
+        before = gain_version(session)
+        for gain in (1900, 2000, 2100):
+            assert session.demand(wire.CommandCode.SET_STEP_GAIN_PERMILLE, gain) == gain
+        assert (gain_version(session) - before) % 256 == 3
+        boot = session.boot()
+        session.restart()
+        assert session.boot() == (boot + 1) % 256
+        assert team.nodes[1].engine.resets == 1
+        key = bytes(range(16))
+        assert session.set_key(key)
+        assert session.setting(wire.CommandCode.SET_STEP_GAIN_PERMILLE) == 2100
+        assert not session.set_key(key)
+    assert team.radio.counts["lost"] > 5
+
+
+def gain_version(session):
+    """Of a report that comes from now on."""
+    newest = session.totals()
+    while session.totals() in (None, newest):
+        session.listen()
+    return session.totals()["gain_version"]

@@ -1,11 +1,12 @@
 """`relpos node` from outside, through a port behind which an emulated team is."""
 
 import json
+import os
 import re
 import signal
 import subprocess
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import pytest
 
@@ -69,6 +70,30 @@ def test_monitor_prints_plain_tables_where_there_is_no_terminal(port):
     assert re.search(r"5\.0\d V", done.stdout)
 
 
+def test_monitor_is_a_live_table_on_a_terminal(port):
+    screen, terminal = os.openpty()
+    try:
+        done = subprocess.Popen(
+            [*RELPOS, "node", "monitor", port, "--seconds", "4"],
+            stdout=terminal,
+            stderr=subprocess.PIPE,
+            env={**os.environ, "TERM": "xterm", "COLUMNS": "120"},
+        )
+        os.close(terminal)
+        shown = bytearray()
+        with suppress(OSError):  # the terminal's end
+            while data := os.read(screen, 4096):
+                shown += data
+        assert done.wait(30) == 0, done.stderr.read()
+    finally:
+        os.close(screen)
+        done.stderr.close()
+    text = shown.decode(errors="replace")
+    assert text.count("neighbours") > 3  # drawn again and again
+    assert "\x1b[" in text
+    assert re.search(r"5\.0\d V", text)
+
+
 def test_settings_are_shown_before_and_after_and_survive_a_restart(port):
     done = node("set", port, "--node", 2, "stature", 1.9, "led", "off", "ranging-period=4")
     assert done.returncode == 0, done.stderr
@@ -113,6 +138,9 @@ def test_a_new_key_is_made_given_and_asked_for(tmp_path):
         shown = node("set", path, "--key-file", file)
         assert shown.returncode == 0, shown.stderr
         assert "leg-length" in shown.stdout
+        unheard = node("list", path, "--seconds", 3)
+        assert unheard.returncode == 1
+        assert "under another key" in unheard.stderr
         assert file.read_text().strip() not in done.stdout + done.stderr
         listed = node("list", path, "--seconds", 5, "--key-file", file, "--json")
         assert json.loads(listed.stdout)["nodes"][0]["key_set"] is True
@@ -133,6 +161,9 @@ def test_defaults_leave_number_and_key():
 @pytest.mark.skipif(missing_parts() is not None, reason=str(missing_parts()))
 def test_the_uno_keeps_its_settings_over_a_restart():
     with emulated(1, board="uno", speed=2) as path:
+        listed = json.loads(node("list", path, "--seconds", 6, "--json").stdout)["nodes"]
+        assert [row["node"] for row in listed] == [1]
+        assert listed[0]["battery_v"] == pytest.approx(5.0, abs=0.03)
         assert node("set", path, "led", "on", "step-gain", "2.2").returncode == 0
         rebooted = node("reboot", path)
         assert rebooted.returncode == 0, rebooted.stderr

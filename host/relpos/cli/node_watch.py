@@ -48,8 +48,11 @@ def list_nodes(
         return
     if not rows:
         raise DeviceError(
-            f"{port}: no node is heard: are they switched on, and is this the coordinator's port?"
+            f"{port}: no node is heard"
+            + (_foreign(view) or ": are they switched on, and is this the coordinator's port?")
         )
+    if view.foreign_frames:
+        output.remark(f"not all are shown{_foreign(view)}")
     Console(width=None if sys.stdout.isatty() else 120).print(_list_table(rows))
 
 
@@ -73,13 +76,13 @@ def monitor(
     if not console.is_terminal:
         _print_now_and_then(console, port, seconds, key_file, cable)
         return
-    with Live(_monitor_table([]), console=console, auto_refresh=False) as live:
+    with Live(_monitor_table([], ""), console=console, auto_refresh=False) as live:
         shown_s = 0.0
         try:
             for now_s, view in _watch(port, seconds, key_file, cable):
                 if time.monotonic() - shown_s > REFRESH_S:
                     shown_s = time.monotonic()
-                    live.update(_monitor_table(view.rows(now_s)), refresh=True)
+                    live.update(_monitor_table(view.rows(now_s), _foreign(view)), refresh=True)
         except KeyboardInterrupt:
             return
 
@@ -88,16 +91,16 @@ def _print_now_and_then(
     console: Any, port: str, seconds: float | None, key_file: Path | None, cable: bool
 ) -> None:
     said_s = time.monotonic()
-    rows: list[Mapping[str, Any]] = []
+    table = _monitor_table([], "")
     try:
         for now_s, view in _watch(port, seconds, key_file, cable):
-            rows = view.rows(now_s)
+            table = _monitor_table(view.rows(now_s), _foreign(view))
             if time.monotonic() - said_s >= PLAIN_TABLE_EVERY_S:
                 said_s = time.monotonic()
-                console.print(_monitor_table(rows))
+                console.print(table)
     except KeyboardInterrupt:
         return
-    console.print(_monitor_table(rows))
+    console.print(table)
 
 
 def _watch(
@@ -134,6 +137,13 @@ def _watch(
                 return
 
 
+def _foreign(view: TeamView) -> str:
+    """What to say of frames under another key; nothing where there are none."""
+    if not view.foreign_frames:
+        return ""
+    return f": {view.foreign_frames} frames came under another key (give the team's: --key-file)"
+
+
 def _list_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     from rich.table import Table
 
@@ -165,10 +175,11 @@ def _list_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
-def _monitor_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+def _monitor_table(rows: Sequence[Mapping[str, Any]], foreign: str) -> Table:
     from rich.table import Table
 
-    table = Table(title=None if rows else "no node is heard yet")
+    title = None if rows else "no node is heard yet"
+    table = Table(title=title, caption=foreign.removeprefix(": ") or None)
     columns = ("node", "supply", "RSSI", "lost", "seen", "frames", "ranging", "neighbours", HEALTH)
     for column in columns:
         table.add_column(column, justify="left" if column == HEALTH else "right")

@@ -22,10 +22,13 @@ from relpos.protocol import messages as wire
 
 ANSWER_S = 1.0
 """A full frame each way takes 50 ms, storing the settings on the node 0.4 s."""
-ATTEMPTS = 6
-"""At 2 % loss each way a command fails four times in a row once in half a million."""
 ADDRESSED_ATTEMPTS = 2
-"""Further ones go to everybody and to the node's address in turn."""
+"""To the node's radio address alone, whose module repeats by itself. At 2 % loss each way both fail
+once in 600 times."""
+FURTHER_ATTEMPTS = 12
+"""To that address and to everybody, twice as often: a node whose module has another address hears
+only the latter. Where half of all frames are lost, all of them fail once in a thousand times."""
+BUSY_ATTEMPTS = 6
 SILENT_S = 6.0
 """A node that is on reports its motion every second."""
 IMPOSSIBLE = -(2**31)
@@ -81,7 +84,7 @@ class Session:
 
         DeviceError where the node does not answer at all.
         """
-        for _ in range(ATTEMPTS):
+        for _ in range(BUSY_ATTEMPTS):
             answer = self._ask(code, value)
             if answer.result != wire.CommandResult.BUSY:
                 return answer
@@ -89,12 +92,12 @@ class Session:
 
     def _ask(self, code: wire.CommandCode, value: int) -> Acknowledged:
         token = self._next_token()
-        for attempt in range(ATTEMPTS):
-            # To its address the radios try several times themselves; a node whose module has
-            # another address hears only what goes to everybody.
-            broadcast = attempt >= ADDRESSED_ATTEMPTS and attempt % 2 == 0
-            _, data = self.link.command(self.node, code, value, token=token, broadcast=broadcast)
-            answer = self._send(token, data)
+        for attempt in range(ADDRESSED_ATTEMPTS + FURTHER_ATTEMPTS):
+            further = attempt >= ADDRESSED_ATTEMPTS
+            _, data = self.link.command(self.node, code, value, token=token)
+            if further:
+                data += self.link.command(self.node, code, value, token=token, broadcast=True)[1]
+            answer = self._send(token, data, ANSWER_S / 2 if further else ANSWER_S)
             if answer is not None:
                 return answer
         raise DeviceError(
@@ -106,13 +109,13 @@ class Session:
         self._token = self._token % 0xFFFF + 1
         return self._token
 
-    def _send(self, token: int, data: bytes) -> Acknowledged | None:
+    def _send(self, token: int, data: bytes, wait_s: float = ANSWER_S) -> Acknowledged | None:
         """Send once; the answer, or None where none comes in time."""
         try:
             self._port.write(data)
         except (serial.SerialException, OSError) as error:
             raise DeviceError(f"{self._port.port}: the port vanished") from error
-        until_s = time.monotonic() + ANSWER_S
+        until_s = time.monotonic() + wait_s
         while time.monotonic() < until_s:
             self.listen()
             answer = self._answers.pop(token, None)
@@ -202,15 +205,17 @@ class Session:
         old = self.link.key
         self.link.accept_keys(key, old)
         if self._answers_under_present_key():
+            self.link.accept_keys(key)
             return False
         token = self._next_token()
-        for _ in range(ATTEMPTS):
+        for _ in range(FURTHER_ATTEMPTS):
             self.link.accept_keys(old, key)
             _, data = self.link.new_key(self.node, key, token=token)
             answer = self._send(token, data)
             # It answers under the new key; where that answer is lost, the old key is gone for good.
             self.link.accept_keys(key, old)
             if answer is not None or self._answers_under_present_key():
+                self.link.accept_keys(key)
                 return True
         self.link.accept_keys(old)
         raise DeviceError(

@@ -139,9 +139,12 @@ class TeamView:
 
     def __init__(self) -> None:
         self.nodes: dict[int, NodeView] = {}
+        self.foreign_frames = 0
+        """Frames under another key than ours."""
 
     def update(self, now_s: float, decoder: Decoder, observations: Iterable[Observation]) -> None:
         """Take in what has just arrived, at ``now_s`` on the clock of the views."""
+        self.foreign_frames = decoder.counts["FrameTagError"]
         for node, track in decoder.nodes.items():
             view = self.nodes.get(node)
             if view is None:
