@@ -203,6 +203,9 @@ class Session:
         neither.
         """
         old = self.link.key
+        if key == old:
+            self.demand(wire.CommandCode.PING, 0)
+            return False
         self.link.accept_keys(key, old)
         if self._answers_under_present_key():
             self.link.accept_keys(key)
