@@ -359,6 +359,7 @@ void Node::receive_packet() {
     pozyx_due_us_ = board_.now_us();
   } else if (reboot_step_ == 0) {
     obey(header, body, body_bytes);
+    store_.save(Record::kMarks);  // before the answer, also to a repetition
   }
 }
 
@@ -404,7 +405,6 @@ RELPOS_APART void Node::obey(const wire::Header& header, const uint8_t* body, ui
   done.result = static_cast<uint8_t>(result);
   done.known = true;
   done.answer_due = true;
-  store_.save(Record::kMarks);  // before the answer
 }
 
 RELPOS_APART wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_force) {

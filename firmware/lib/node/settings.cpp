@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "devices/flash.h"
+#include "inertial/calls.h"
 #include "wire/frame.h"
 
 namespace relpos {
@@ -20,8 +21,21 @@ static_assert(sizeof(Marks) + wire::kKeyBytes + sizeof(Settings) <= sizeof(Persi
               "no gaps between the records");
 const uint8_t kSizes[kRecords] RELPOS_FLASH = {sizeof(Marks), wire::kKeyBytes, sizeof(Settings)};
 
-void read(Board& board, uint16_t at, uint8_t count, void* to) {
+void read(Board& board, uint8_t at, uint8_t count, void* to) {
   for (uint8_t i = 0; i < count; ++i) static_cast<uint8_t*>(to)[i] = board.storage_read(at++);
+}
+
+// A copy of a record: layout, its bytes, CRC.
+RELPOS_APART bool intact(Board& board, uint8_t at, uint8_t size) {
+  if (board.storage_read(at) != kLayout) return false;
+  uint16_t crc = kSeed;
+  for (; size != 0; --size) {
+    const uint8_t byte = board.storage_read(++at);
+    crc = wire::crc16(&byte, sizeof byte, crc);
+  }
+  uint16_t stored;
+  read(board, ++at, sizeof stored, &stored);
+  return stored == crc;
 }
 
 }  // namespace
@@ -38,16 +52,14 @@ void Storage::restore_defaults(Settings* settings) {
 
 void Storage::load(Board& board, Persistent* all) {
   uint8_t* image = reinterpret_cast<uint8_t*>(all);
-  uint16_t at = kStoredRecords;
+  uint8_t at = kStoredRecords;
   for (uint8_t record = 0; record < kRecords; ++record) {
     const uint8_t size = flash_byte(&kSizes[record]);
-    const uint16_t next = static_cast<uint16_t>(at + stored_bytes(size));
+    const uint8_t next = static_cast<uint8_t>(at + stored_bytes(size));
     bool good = false;
-    for (; !good && at != next; at = static_cast<uint16_t>(at + size + 3)) {
-      uint16_t crc;
-      read(board, at + 1, size, image);
-      read(board, at + 1 + size, sizeof crc, &crc);
-      good = board.storage_read(at) == kLayout && wire::crc16(image, size, kSeed) == crc;
+    for (; !good && at != next; at = static_cast<uint8_t>(at + size + 3)) {
+      good = intact(board, at, size);
+      if (good) read(board, static_cast<uint8_t>(at + 1), size, image);
     }
     if (!good) {
       memset(image, 0, size);
@@ -77,6 +89,7 @@ bool Storage::commit(Board& board, Settings* settings, uint16_t crc) {
 void Storage::step(Board& board, const Persistent& all) {
   if (!saving()) return;
   uint8_t value;
+  uint8_t end = 0;
   if (left_ != 0 && record_ == kRecords) {
     value = static_cast<uint8_t>(left_ == 2 ? crc_ : crc_ >> 8);
   } else {
@@ -97,8 +110,11 @@ void Storage::step(Board& board, const Persistent& all) {
       record_ = static_cast<uint8_t>(size - kSizes);
       crc_ = wire::crc16(image, bytes, kSeed);
       left_ = stored_bytes(bytes);
+      // Never over the only good copy: power cuts before may have left one.
       at_ = at;
+      if (intact(board, at, bytes)) at_ = static_cast<uint8_t>(at + bytes + 3);
     }
+    end = static_cast<uint8_t>(at + stored_bytes(bytes));
     // In a copy, from its end: the CRC's two bytes, the record's, the layout.
     uint8_t behind = left_;
     if (behind > bytes + 3) behind = static_cast<uint8_t>(behind - (bytes + 3));
@@ -111,8 +127,8 @@ void Storage::step(Board& board, const Persistent& all) {
     }
   }
   if (!board.storage_write(at_, value)) return;
-  ++at_;
   --left_;
+  if (++at_ == end) at_ = static_cast<uint8_t>(end - 2 * left_);  // the other copy, or done
 }
 
 }  // namespace relpos

@@ -1036,6 +1036,49 @@ TEST(no_counter_is_used_twice_wherever_the_power_is_cut) {
   CHECK(newest > 1024);
 }
 
+TEST(power_cuts_in_a_row_never_take_the_last_good_copy) {
+  Team team;
+  ask(team, team.node, wire::CommandCode::kPing, 0);
+  uint8_t stored[sizeof team.world.eeprom];
+  memcpy(stored, team.world.eeprom, sizeof stored);
+  const uint32_t obeyed = team.world.host_counter;
+  for (uint32_t first = 1; first < 30; ++first) {
+    for (uint32_t second = 1; second < 30; ++second) {
+      memcpy(team.world.eeprom, stored, sizeof stored);
+      for (const uint32_t cut : {first, second}) {  // while a start reserves its counters
+        Node hurt(team.world);
+        hurt.begin(team.world.now, wire::ResetCause::kPowerOn, 0);
+        team.world.writes_left = cut;
+        for (uint8_t ms = 0; ms < 200 && team.world.writes_left > 0; ++ms) team.run(hurt, 1);
+        team.world.writes_left = 0xFFFFFFFF;
+      }
+      Node again(team.world);
+      again.begin(team.world.now, wire::ResetCause::kPowerOn, 0);
+      team.world.count = 0;
+      team.world.host_counter = obeyed - 1;  // the command is sent again
+      team.world.command(77, code(wire::CommandCode::kPing), 0);
+      team.run(again, 20);
+      CHECK_EQUAL(0, team.sent(wire::MessageType::kAcknowledgement));
+    }
+  }
+}
+
+TEST(a_repetition_that_was_answered_is_not_obeyed_after_a_restart) {
+  Team team;
+  for (uint8_t time = 0; time < 2; ++time) {  // the host missed the first answer
+    team.world.command(7, code(wire::CommandCode::kSetTeamSize), 4);
+    team.run_ms(300);
+  }
+  CHECK_EQUAL(2, team.sent(wire::MessageType::kAcknowledgement));
+  Node again(team.world);
+  again.begin(team.world.now, wire::ResetCause::kPowerOn, 0);
+  team.world.count = 0;
+  --team.world.host_counter;  // somebody sends the repetition once more
+  team.world.command(7, code(wire::CommandCode::kSetTeamSize), 4);
+  team.run(again, 300);
+  CHECK_EQUAL(0, team.sent(wire::MessageType::kAcknowledgement));
+}
+
 TEST(counters_go_on_in_the_next_block_and_wear_the_storage_little) {
   Team team;
   ask(team, team.node, wire::CommandCode::kSetReportPeriodMs, 100);
