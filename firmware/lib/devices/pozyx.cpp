@@ -1,5 +1,7 @@
 #include "devices/pozyx.h"
 
+#include "devices/flash.h"
+
 namespace relpos {
 namespace {
 
@@ -11,6 +13,7 @@ enum Register : uint8_t {
   kNetworkIdLow = 0x1A,
   kPressure = 0x50,
 };
+constexpr uint8_t kFirstFunction = 0xB0;
 enum Function : uint8_t { kDoRanging = 0xB5, kGetRangeInfo = 0xC7 };
 enum Interrupt : uint8_t { kErrorFlag = 0x01, kFunctionFlag = 0x10 };
 
@@ -34,19 +37,28 @@ uint32_t little_endian_long(const uint8_t* bytes) {
   return little_endian(bytes) | static_cast<uint32_t>(little_endian(bytes + 2)) << 16;
 }
 
-// The Pozyx wants a repeated start with a second write address between register and data.
-bool write_framed(Board& board, uint8_t reg, const uint8_t* data, uint8_t count) {
-  return board.transfer(Pozyx::kAddress, &reg, 1, data, count, nullptr, 0) == BusStatus::kOk;
-}
+// One transaction: a register or function, how many bytes it answers, how many are written to it.
+// A function takes the peer; the first byte of its answer is the status, 1 success. What is written
+// to a register goes behind a repeated start with a second write address.
+struct Exchange {
+  uint8_t code, answer_bytes, written;
+};
 
-// The first byte of the answer is the status: 1 success.
-bool call_function(Board& board, Function function, uint16_t peer, uint8_t* answer,
-                   uint8_t count) {
-  const uint8_t bytes[3] = {function, static_cast<uint8_t>(peer),
-                            static_cast<uint8_t>(peer >> 8)};
-  return board.transfer(Pozyx::kAddress, bytes, sizeof bytes, nullptr, 0, answer, count) ==
-         BusStatus::kOk;
-}
+// Of the states from kIdentify on. A table and one call: nine calls would cost the Uno 400 bytes.
+const Exchange kExchanges[] RELPOS_FLASH = {
+    {kWhoAmI, 1, 0},
+    {kNetworkIdLow, 0, 2},
+    {kInterruptMask, 0, 1},
+    {kPressure, 4, 0},        // idle
+    {kGetRangeInfo, 5, 0},    // before the exchange: status and time
+    {kInterruptStatus, 1, 0},
+    {kDoRanging, 1, 0},
+    {kInterruptStatus, 1, 0},
+    {kErrorCode, 1, 0},
+    {kGetRangeInfo, 11, 0},   // status, time ms, distance mm, signal strength dBm
+    {kNetworkIdLow, 2, 0},    // idle, now and then
+};
+constexpr uint8_t kMostAnswer = 11;
 
 bool is_due(uint32_t now_us, uint32_t due_us) {
   return static_cast<int32_t>(now_us - due_us) >= 0;
@@ -66,25 +78,32 @@ bool Pozyx::range(uint16_t peer) {
   return true;
 }
 
+bool Pozyx::transact(Board& board, State state, uint8_t* answer) {
+  const Exchange* exchange =
+      kExchanges + (static_cast<uint8_t>(state) - static_cast<uint8_t>(State::kIdentify));
+  const uint8_t code = flash_byte(&exchange->code);
+  const uint8_t first[3] = {code, static_cast<uint8_t>(peer_), static_cast<uint8_t>(peer_ >> 8)};
+  uint8_t second[2] = {kErrorFlag | kFunctionFlag, 0};  // the mask
+  if (state == State::kNetworkId) {
+    second[0] = static_cast<uint8_t>(network_id_);
+    second[1] = static_cast<uint8_t>(network_id_ >> 8);
+  }
+  return board.transfer(kAddress, first, code >= kFirstFunction ? sizeof first : 1, second,
+                        flash_byte(&exchange->written), answer,
+                        flash_byte(&exchange->answer_bytes)) == BusStatus::kOk;
+}
+
 bool Pozyx::look(Board& board, uint32_t* pressure_mpa) {
   const bool identity = (++looks_ & 7) == 0;
-  uint8_t bytes[4];
-  const bool answered =
-      board.read_registers(kAddress, identity ? kNetworkIdLow : kPressure, bytes, identity ? 2 : 4);
+  uint8_t answer[4];
+  const bool answered = transact(board, identity ? State::kWatch : State::kIdle, answer);
   if (!answered) count_failure();
-  if (failures_ >= kMostFailures ||
-      (answered && identity && little_endian(bytes) != network_id_)) {
+  if (failures_ >= kMostFailures || (answered && identity && little_endian(answer) != network_id_)) {
     begin(network_id_);
     return false;
   }
-  *pressure_mpa = little_endian_long(bytes);
+  *pressure_mpa = little_endian_long(answer);
   return answered && !identity;
-}
-
-void Pozyx::fail_set_up(uint32_t now_us, uint32_t* wait_us) {
-  state_ = State::kIdentify;
-  due_us_ = now_us + kAbsentUs;
-  *wait_us = kAbsentUs;
 }
 
 void Pozyx::count_failure() {
@@ -112,102 +131,68 @@ Pozyx::Event Pozyx::done(uint8_t error, uint32_t* wait_us, Result* result) {
 
 Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Result* result) {
   *wait_us = 0;
-  switch (state_) {
-    case State::kOff:
-    case State::kIdle:
-      *wait_us = kIdleUs;
-      return Event::kNothing;
+  if (state_ == State::kPowerUp) {
+    state_ = State::kIdentify;
+    due_us_ = now_us + kPowerUpUs;
+  }
+  if (state_ == State::kOff || state_ == State::kIdle) {
+    *wait_us = kIdleUs;
+    return Event::kNothing;
+  }
+  if (state_ == State::kIdentify && !is_due(now_us, due_us_)) {
+    *wait_us = due_us_ - now_us;
+    return Event::kNothing;
+  }
+  uint8_t answer[kMostAnswer] = {};
+  const bool answered = transact(board, state_, answer);
 
-    case State::kPowerUp:
+  if (state_ < State::kIdle) {  // set-up
+    if (!answered || (state_ == State::kIdentify && answer[0] != kIdentity)) {
       state_ = State::kIdentify;
-      due_us_ = now_us + kPowerUpUs;
-      *wait_us = kPowerUpUs;
-      return Event::kNothing;
-
-    case State::kIdentify: {
-      if (!is_due(now_us, due_us_)) {
-        *wait_us = due_us_ - now_us;
-        return Event::kNothing;
-      }
-      uint8_t identity = 0;
-      if (!board.read_registers(kAddress, kWhoAmI, &identity, 1) || identity != kIdentity) {
-        fail_set_up(now_us, wait_us);
-        return Event::kNothing;
-      }
-      state_ = State::kNetworkId;
+      due_us_ = now_us + kAbsentUs;
+      *wait_us = kAbsentUs;
       return Event::kNothing;
     }
-
-    case State::kNetworkId: {
-      const uint8_t bytes[2] = {static_cast<uint8_t>(network_id_),
-                                static_cast<uint8_t>(network_id_ >> 8)};
-      if (!write_framed(board, kNetworkIdLow, bytes, sizeof bytes)) {
-        fail_set_up(now_us, wait_us);
-        return Event::kNothing;
-      }
-      state_ = State::kMask;
-      return Event::kNothing;
-    }
-
-    case State::kMask: {
-      const uint8_t mask = kErrorFlag | kFunctionFlag;
-      if (!write_framed(board, kInterruptMask, &mask, 1)) {
-        fail_set_up(now_us, wait_us);
-        return Event::kNothing;
-      }
-      state_ = State::kIdle;
+    advance();
+    if (state_ == State::kIdle) {
       failures_ = 0;
       *wait_us = kIdleUs;
-      return Event::kNothing;
     }
+    return Event::kNothing;
+  }
 
-    case State::kBefore: {
+  if (!answered) {
+    count_failure();
+    // While the exchange runs one may be lost.
+    if (state_ != State::kPoll || failures_ >= kMostFailures) {
+      return done(kBusFailed, wait_us, result);
+    }
+  }
+  switch (state_) {
+    case State::kBefore:
       // What the chip has of this peer by now is no answer to the exchange: after a failure with
       // inverted flags, or another's exchange that ends meanwhile, it would be told as one.
-      uint8_t answer[5] = {};
-      if (!call_function(board, kGetRangeInfo, peer_, answer, sizeof answer)) {
-        count_failure();
-        return done(kBusFailed, wait_us, result);
-      }
       before_ms_ = little_endian_long(answer + 1);  // 0 where it has nothing
-      state_ = State::kClear;
+      advance();
       return Event::kNothing;
-    }
 
-    case State::kClear: {
-      // A peer's exchange with this Pozyx raises FUNC here too.
-      uint8_t stale = 0;
-      if (!board.read_registers(kAddress, kInterruptStatus, &stale, 1)) {
-        count_failure();
-        return done(kBusFailed, wait_us, result);
-      }
-      state_ = State::kCall;
+    case State::kClear:  // a peer's exchange with this Pozyx raises FUNC here too
+      advance();
       return Event::kNothing;
-    }
 
-    case State::kCall: {
-      uint8_t status = 0;
-      if (!call_function(board, kDoRanging, peer_, &status, 1)) {
-        count_failure();
-        return done(kBusFailed, wait_us, result);
-      }
-      if (status != 1) return done(kRefused, wait_us, result);
-      state_ = State::kPoll;
+    case State::kCall:
+      if (answer[0] != 1) return done(kRefused, wait_us, result);
+      advance();
       due_us_ = now_us + kTimeoutUs;
       *wait_us = kPollUs;
       return Event::kNothing;
-    }
 
-    case State::kPoll: {
-      uint8_t flags = 0;
-      const bool answered = board.read_registers(kAddress, kInterruptStatus, &flags, 1);
-      if (!answered) {
-        count_failure();
-        if (failures_ >= kMostFailures) return done(kBusFailed, wait_us, result);
-      } else if ((flags & kErrorFlag) != 0) {
+    case State::kPoll:
+      if ((answer[0] & kErrorFlag) != 0) {
         state_ = State::kError;
         return Event::kNothing;
-      } else if ((flags & kFunctionFlag) != 0) {
+      }
+      if ((answer[0] & kFunctionFlag) != 0) {
         state_ = State::kFetch;
         return Event::kNothing;
       }
@@ -218,26 +203,14 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
       }
       *wait_us = answered ? kPollUs : kFailedPollUs;
       return Event::kNothing;
-    }
 
-    case State::kError: {
-      uint8_t code = 0;
-      if (!board.read_registers(kAddress, kErrorCode, &code, 1)) {
-        count_failure();
-        return done(kBusFailed, wait_us, result);
-      }
+    case State::kError:
       failures_ = 0;
       // An error flag with code 0 is still no distance.
-      return done(code != 0 ? code : static_cast<uint8_t>(kRefused), wait_us, result);
-    }
+      return done(answer[0] != 0 ? answer[0] : static_cast<uint8_t>(kRefused), wait_us, result);
 
-    case State::kFetch:
+    default:
       break;
-  }
-  uint8_t answer[11];  // status, time ms, distance mm, signal strength dBm
-  if (!call_function(board, kGetRangeInfo, peer_, answer, sizeof answer)) {
-    count_failure();
-    return done(kBusFailed, wait_us, result);
   }
   failures_ = 0;
   const int32_t advance_ms = static_cast<int32_t>(little_endian_long(answer + 1) - before_ms_);

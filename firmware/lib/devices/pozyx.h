@@ -61,9 +61,11 @@ class Pozyx {
     kPoll,      // until due_us_
     kError,
     kFetch,
+    kWatch,     // no state: the transaction of look()
   };
 
-  void fail_set_up(uint32_t now_us, uint32_t* wait_us);
+  bool transact(Board& board, State state, uint8_t* answer);  // that of the state; false: the bus failed
+  void advance() { state_ = static_cast<State>(static_cast<uint8_t>(state_) + 1); }
   Event done(uint8_t error, uint32_t* wait_us, Result* result);
   void count_failure();
 
