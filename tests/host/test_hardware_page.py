@@ -1,5 +1,6 @@
 """The computed figures of the hardware pages, derived anew, and the pages held to them."""
 
+import re
 import runpy
 from pathlib import Path
 
@@ -36,6 +37,13 @@ def test_twenty_nodes_fit_the_coordinators_line_and_the_channel():
     assert load.line_share < 0.75
     assert load.air_share < 0.35
     assert load.bytes_s == pytest.approx(load.line_share * 3840)
+
+
+def test_the_plan_of_the_slots_is_the_firmwares():
+    header = (ROOT / "firmware/lib/node/ranging.h").read_text()
+    constants = dict(re.findall(r"constexpr \w+ (k\w+) = (\d+);", header))
+    assert round(1000 * traffic.EXCHANGE_S) == int(constants["kExchangeMs"])
+    assert int(constants["kAllInARound"]) == traffic.ALL_IN_A_ROUND
 
 
 def test_a_battery_lasts_by_its_energy_or_by_its_charge():

@@ -22,6 +22,8 @@ constexpr int16_t kWeakSignalDbm = -95;    // DW1000: close to the sensitivity l
 constexpr uint16_t kMotionPhaseMs = 157;   // between the reports of neighbouring ids, modulo period
 constexpr uint16_t kMostStepAgeMs = 2000;  // then it is sent without waiting for others
 constexpr uint8_t kRebootBytes = 5;
+// 5 V - 10 %: what the boards' 3.3 V regulators and the Pozyx are sure to work from.
+constexpr uint16_t kSupplyLowMv = 4500;
 // Counters of frames are reserved in blocks of so many: at a frame or two a second the EEPROM is
 // written every ten minutes, and lasts for years. A start wastes what is left of a block.
 constexpr uint16_t kCounterBlock = 1024;
@@ -166,10 +168,18 @@ bool Node::period_over(uint32_t* due_ms, uint16_t period_ms) {
 void Node::show_health() {
   bool on = settings_.led == kLedOn;
   if (settings_.led == kLedHealth) {
-    // Short flash a second: all well. Fast blinking: a sensor is missing.
-    const uint16_t ms = static_cast<uint16_t>(clock_.ms());
-    const bool well = !imu_silent() && magnetometer_.running() && pozyx_.running();
-    on = well ? (ms & 1023) < 64 : (ms & 255) < 128;
+    // The worst shows (docs/hardware.md): fast blinking, a sensor is missing; long on and short off,
+    // the supply is low; two flashes a second, no beacon is heard; one, all well.
+    uint16_t turn = 1023, lit = 64;
+    if (imu_silent() || !magnetometer_.running() || !pozyx_.running()) {
+      turn = 255;
+      lit = 128;
+    } else if (supply_low_) {
+      lit = 768;
+    } else if (plan_.team() == 0) {
+      turn = 1023 - 256;
+    }
+    on = (static_cast<uint16_t>(clock_.ms()) & turn) < lit;
   }
   if (on != led_) {
     led_ = on;
@@ -638,6 +648,7 @@ uint8_t Node::fill_status(uint8_t* body) {
   status.uptime_s = clock_.ms() / 1000;
   status.reset_cause = static_cast<uint8_t>(reset_cause_);
   status.battery_mv = board_.supply_mv();
+  supply_low_ = static_cast<uint16_t>(status.battery_mv - 1) < kSupplyLowMv - 1;  // 0: not measured
   status.bus_errors = board_.bus_errors();
   status.ranging_successes = ranging_successes_;
   status.ranging_failures = ranging_failures_;

@@ -97,6 +97,7 @@ struct NodeState : Persistent {
   uint8_t id_;
   uint8_t boot_;
   uint8_t reboot_step_;  // 0: no reboot asked
+  bool supply_low_;
   bool led_;
 };
 

@@ -13,8 +13,9 @@ FRAME_BYTES = 9
 """Delimiter, length, type, 16-bit source, signal strength, options, checksum of a 0x81 frame."""
 ESCAPED_SHARE = 4 / 256
 """0x7E, 0x7D, 0x11 and 0x13 take two bytes each; tag and counters are as good as random."""
-EXCHANGE_S = 0.030
-"""A ranging exchange with its margin, as the firmware plans its slots."""
+EXCHANGE_S = 0.033
+ALL_IN_A_ROUND = 7
+"""How the firmware plans its slots (firmware/lib/node/ranging.h)."""
 AIR_BIT_S = 1 / 250_000
 AIR_OVERHEAD_BYTES = 6 + 11 + 2 + 11
 """802.15.4: preamble and length, MAC header and check, Digi's header (MM=0), acknowledgement."""
@@ -95,8 +96,9 @@ def line_ms(baud: int) -> float:
 
 
 def ranges_a_round(nodes: int, period_s: float = 2.0) -> int:
-    """Ranges that each node gets in a round: all, or as many exchanges as its slot has room for."""
-    return min(nodes - 1, int(period_s / nodes / EXCHANGE_S))
+    """Ranges that a node begins in a round: all others, or the next half as its slot has room."""
+    wanted = nodes - 1 if nodes <= ALL_IN_A_ROUND else nodes // 2
+    return min(wanted, int(period_s / nodes / EXCHANGE_S))
 
 
 def beacon_bytes(nodes: int) -> float:

@@ -42,6 +42,9 @@ struct World : FakeBoard {
   uint8_t line_bytes = 255;  // a poll
   uint32_t restarts = 0;
   uint32_t marks = 0;
+  uint16_t supply = 5000;
+  uint16_t flashes = 0;
+  uint32_t lit_us = 0;
 
   Sent frames[kMostFrames];
   uint16_t count = 0;
@@ -51,6 +54,16 @@ struct World : FakeBoard {
     for (uint8_t& byte : eeprom) byte = 0xFF;
     eeprom[0] = kId;
     eeprom[1] = kId ^ 0xFF;
+  }
+
+  uint16_t supply_mv() override { return supply; }
+  void led(bool on) override {
+    if (on) {
+      ++flashes;
+      lit_since_us_ = now;
+    } else {
+      lit_us += now - lit_since_us_;
+    }
   }
 
   // -- the UART, with the module behind it --
@@ -203,6 +216,7 @@ struct World : FakeBoard {
     if (module_present) give(answer, 3);
   }
 
+  uint32_t lit_since_us_ = 0;
   uint32_t sampled_us_ = 0;
   uint32_t exchanged_us_ = 0;
   uint8_t tag_id_ = 0;
@@ -429,6 +443,33 @@ TEST(twenty_nodes_get_every_pair_within_ten_seconds) {
       const uint32_t last = last_ms[a][b] > last_ms[b][a] ? last_ms[a][b] : last_ms[b][a];
       CHECK(last > 50000);
     }
+  }
+}
+
+TEST(the_led_tells_the_states_apart) {
+  enum State { kWell, kNoBeacon, kSupplyLow, kSensorMissing };
+  // Flashes in 4.096 s, and the share of the time that it is lit, in per cent.
+  const uint8_t flashes[] = {4, 8, 4, 16}, lit[] = {6, 12, 75, 50};
+  for (uint8_t state = kWell; state <= kSensorMissing; ++state) {
+    Team team;
+    team.world.magnetometer_present = true;
+    team.world.inertial_present = state != kSensorMissing;
+    team.world.supply = state >= kSupplyLow ? 4400 : 5000;
+    uint16_t before = 0;
+    uint32_t lit_before_us = 0;
+    for (uint8_t part = 0; part < 12; ++part) {
+      if (state == kWell) Slots::hear(team, 0, part, 4);
+      if (part == 8) {
+        before = team.world.flashes;
+        lit_before_us = team.world.lit_us;
+      }
+      team.run_ms(1024);
+    }
+    const int16_t more = static_cast<int16_t>(team.world.flashes - before - flashes[state]);
+    CHECK(more >= -1 && more <= 1);
+    // Without samples the loop sleeps for up to 100 ms.
+    CHECK_NEAR(lit[state], (team.world.lit_us - lit_before_us) / 40960.0f,
+               state == kSensorMissing ? 15 : 3);
   }
 }
 
