@@ -30,7 +30,7 @@ int16_t little_endian(const uint8_t* bytes) {
 
 }  // namespace
 
-void Ak8975::fail() {
+RELPOS_UNCLONED void Ak8975::fail() {
   if (state_ >= State::kIdle && ++failures_ < kMostFailures) {
     state_ = State::kIdle;
     wait_ticks_ = kPeriodTicks - 1;
@@ -40,7 +40,7 @@ void Ak8975::fail() {
   wait_ticks_ = kAbsentTicks;
 }
 
-RELPOS_APART bool Ak8975::step(Board& board, float field_ut[3]) {
+bool Ak8975::step(Board& board, float field_ut[3]) {
   if (wait_ticks_ > 0) {
     --wait_ticks_;
     return false;

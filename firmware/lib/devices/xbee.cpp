@@ -94,7 +94,7 @@ bool Xbee::step(Board& board) {
   }
 }
 
-void Xbee::reject() {
+RELPOS_APART void Xbee::reject() {
   ++bad_frames_;
   part_ = Part::kNone;
 }
@@ -162,7 +162,7 @@ RELPOS_SHARED void Xbee::take_data(uint8_t byte) {
   }
 }
 
-bool Xbee::finish() {
+RELPOS_UNCLONED bool Xbee::finish() {
   if (sum_ != 0xFF) {
     reject();
     return false;

@@ -1,4 +1,5 @@
 #include "attitude.h"
+#include "inertial/calls.h"
 
 #include <math.h>
 #include <string.h>
@@ -45,7 +46,7 @@ RELPOS_SHARED float turn_between(const float& from_rad, const float& to_rad) {
   return wrap_angle(to_rad - from_rad);
 }
 
-void Attitude::set_identity() {
+RELPOS_SHARED void Attitude::set_identity() {
   q[0] = 1.0f;
   q[1] = q[2] = q[3] = 0.0f;
 }
@@ -69,13 +70,13 @@ void Attitude::normalise() {
   add_scaled(q, old, 0.5f - 0.5f * dot(q, q, 4), 4);
 }
 
-RELPOS_APART void Attitude::integrate(const float angle[kAxes]) {
+void Attitude::integrate(const float angle[kAxes]) {
   Attitude small;
   turn(angle, small.q);
   multiply(Attitude(*this).q, small.q, q);
 }
 
-RELPOS_SHARED void Attitude::correct(const float angle[kAxes]) {
+RELPOS_APART void Attitude::correct(const float angle[kAxes]) {
   Attitude small;
   turn(angle, small.q);
   premultiply(small);

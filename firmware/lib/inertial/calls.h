@@ -8,9 +8,12 @@
 #define RELPOS_SHARED __attribute__((noinline, noclone))
 // Called from one place, yet not inlined there: its variables are on the stack only while it runs.
 #define RELPOS_APART __attribute__((noinline))
+// May be inlined, but has no copies for the values that it is called with.
+#define RELPOS_UNCLONED __attribute__((noclone))
 #else
 #define RELPOS_SHARED
 #define RELPOS_APART
+#define RELPOS_UNCLONED
 #endif
 
 #endif

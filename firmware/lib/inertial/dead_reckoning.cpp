@@ -1,4 +1,5 @@
 #include "dead_reckoning.h"
+#include "inertial/calls.h"
 
 #include <math.h>
 #include <string.h>
@@ -170,7 +171,7 @@ RELPOS_APART bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
   return true;
 }
 
-RELPOS_APART void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_s) {
+void DeadReckoning::watch_quiet(float force, const float angle[kAxes], float dt_s) {
   if (ticks_ == 1) mean_force_m_s2_ = force;
   follow(&mean_force_m_s2_, force, dt_s * (1.0f / kForceMean_s));
   const float most_rad = kQuietRate_rad_s * dt_s;
@@ -184,7 +185,7 @@ RELPOS_APART void DeadReckoning::watch_quiet(float force, const float angle[kAxe
 
 // Start: the attitude of the first sample is found from the mean force while the gyroscope already
 // carries the frame along, so that walking directly after switching on loses nothing.
-RELPOS_APART void DeadReckoning::gather(const ImuSample& sample, const float force[kAxes], float dt_s) {
+void DeadReckoning::gather(const ImuSample& sample, const float force[kAxes], float dt_s) {
   if (quiet_s_ == 0.0f) {
     // Movement after a quiet beginning ends the gathering before it spoils the mean.
     if (!moved_ && since_.time_s >= kShortStill_s) {
@@ -408,7 +409,7 @@ void DeadReckoning::aim(float heading_rad) {
 
 // A sensor turned on the body turns the heading axis one way and the forward axis the other: both are
 // turned back, so that the wearer's heading is what it was.
-RELPOS_APART void DeadReckoning::watch_mounting() {
+void DeadReckoning::watch_mounting() {
   const float turned_rad = turn_between(mounting_rad_, forward_.offset_rad());
   if (settled_steps_ < kSettledSteps) {
     if (forward_.found()) ++settled_steps_;
@@ -428,7 +429,7 @@ RELPOS_APART void DeadReckoning::watch_mounting() {
   }
 }
 
-RELPOS_SHARED void DeadReckoning::capture_span() {
+RELPOS_APART void DeadReckoning::capture_span() {
   span_ = since_;
   since_ = Span();
 }
@@ -449,25 +450,32 @@ void DeadReckoning::work() {
     motion_pending_ = false;
     if (job_ == kIdle && (quiet() || !gait_.walking())) job_ = kStillX;
     if (job_ != kIdle) filter_.settle();  // a measurement is next, which is work enough for its tick
-  } else if (job_ != kIdle) {
-    run_job();
+    return;
+  }
+  Job job = job_;
+  if (job != kIdle) {
+    job_ = static_cast<Job>(job + 1);
   } else if (still_pending_) {  // before the prediction, or standing would leave it no tick
     still_pending_ = false;
-    apply_straight(kSway_rad / kStill_s);
+    job = kStood;
   } else if (magnetic_pending_) {
-    apply_magnetic();
-  } else if (since_.time_s >= kPredict_s) {
-    capture_span();
-    predict_attitude();
+    magnetic_pending_ = false;
+    magnetic_steps_ = 0;
+    job = kMagnetic;
+  } else {
+    if (since_.time_s >= kPredict_s) {
+      capture_span();
+      predict_attitude();
+    }
+    return;
   }
+  run(job);
 }
 
-void DeadReckoning::run_job() {
+void DeadReckoning::run(Job job) {
   State group = kPosition;
   float direction[kAxes] = {0.0f, 0.0f, 0.0f};
   float innovation, variance, yaw = 0.0f;
-  const Job job = job_;
-  job_ = static_cast<Job>(job + 1);
   // The walking direction turns with the heading's error, so the step's measurements depend on that
   // too: turning heading, velocity and position together changes neither. Without these terms the
   // filter believed to observe the heading and lost it (18 deg/min on simulated walks, NEES 74).
@@ -506,8 +514,20 @@ void DeadReckoning::run_job() {
       if (!step_straight_) job_ = kCommit;
       break;
     case kDrift:
-      apply_straight(kStraightSigma_rad_s);
-      return;
+    case kStood: {
+      const float sigma_rad_s = job == kDrift ? kStraightSigma_rad_s : kSway_rad / kStill_s;
+      innovation = -straight_rate_rad_s_;
+      if (innovation * innovation > kStraightGate * rate_variance(sigma_rad_s, direction)) return;
+      group = kBias;
+      variance = doubted(sigma_rad_s, innovation);
+      break;
+    }
+    case kMagnetic:
+      group = kAttitude;
+      direction[kZ] = 1.0f;
+      innovation = magnetic_residual_rad_;
+      variance = doubted(kFieldSigma_rad, innovation);
+      break;
     case kCommit:
       commit_step();
       // Until the forward axis is known a step says nothing of the horizontal; that nobody is faster
@@ -553,24 +573,22 @@ RELPOS_APART void DeadReckoning::measure(State group, const float direction[kAxe
 
 RELPOS_APART bool DeadReckoning::quiet() const { return quiet_s_ >= kQuiet_s; }
 
-RELPOS_SHARED void DeadReckoning::begin_straight() {
+RELPOS_APART void DeadReckoning::begin_straight() {
   straight_heading_rad_ = displacement_.heading_rad;
   straight_s_ = 0.0f;
 }
 
-RELPOS_APART void DeadReckoning::apply_straight(float sigma_rad_s) {
-  float direction[kAxes];
+// Of a measured rate about the vertical, whose direction is filled in.
+float DeadReckoning::rate_variance(float sigma_rad_s, float direction[kAxes]) {
   float expected = sigma_rad_s * sigma_rad_s;
   for (uint8_t i = 0; i < kAxes; ++i) {
     direction[i] = -rotation_[3 * kZ + i];
     expected += direction[i] * direction[i] * filter_.covariance(kBias + i, kBias + i);
   }
-  const float rate = straight_rate_rad_s_;
-  if (rate * rate > kStraightGate * expected) return;
-  measure(kBias, direction, -rate, doubted(sigma_rad_s, rate));
+  return expected;
 }
 
-void DeadReckoning::widen(float along_m2, float across_m2) {
+RELPOS_SHARED void DeadReckoning::widen(float along_m2, float across_m2) {
   add(&displacement_.variance_along_m2, along_m2);
   add(&displacement_.variance_across_m2, across_m2);
 }
@@ -674,14 +692,6 @@ RELPOS_APART void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
     displacement_.quality_flags |= kMagneticDisturbed;
     count(&counters_.rejected_magnetic);
   }
-}
-
-void DeadReckoning::apply_magnetic() {
-  const float direction[kAxes] = {0.0f, 0.0f, 1.0f};
-  measure(kAttitude, direction, magnetic_residual_rad_,
-          doubted(kFieldSigma_rad, magnetic_residual_rad_));
-  magnetic_pending_ = false;
-  magnetic_steps_ = 0;
 }
 
 RELPOS_APART void DeadReckoning::publish() {

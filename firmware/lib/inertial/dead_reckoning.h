@@ -76,7 +76,10 @@ class DeadReckoning {
     kStillX,
     kStillY,
     kStillZ,
-    kStillCommit
+    kStillCommit,
+    // On their own, at other times.
+    kStood,
+    kMagnetic
   };
 
   enum Hold : uint8_t { kHoldAcceleration, kHoldRate, kHoldInput, kHoldDoubt, kHolds };
@@ -94,7 +97,7 @@ class DeadReckoning {
   void aim(float heading_rad);
   void watch_mounting();
   void work();
-  void run_job();
+  void run(Job job);
   void capture_span();
   void predict_attitude();
   void measure(State group, const float direction[kAxes], float innovation, float variance,
@@ -102,10 +105,9 @@ class DeadReckoning {
   void widen(float along_m2, float across_m2);
   void commit_step();
   void commit_still();
-  void apply_magnetic();
   void begin_straight();
   bool quiet() const;
-  void apply_straight(float sigma_rad_s);
+  float rate_variance(float sigma_rad_s, float direction[kAxes]);
   void publish();
 
   // What is small and often used first: the AVR reaches 64 bytes from a pointer in one instruction.

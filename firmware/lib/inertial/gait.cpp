@@ -4,6 +4,7 @@
 #include <string.h>
 
 #include "attitude.h"
+#include "inertial/calls.h"
 
 namespace relpos {
 namespace {
@@ -59,7 +60,7 @@ RELPOS_SHARED void GaitDetector::restart_arc() {
   lowest_m_s2_ = minus_highest_m_s2_ = 1e6f;
 }
 
-RELPOS_SHARED bool GaitDetector::walking() const { return since_s_ < kPause_s; }
+RELPOS_APART bool GaitDetector::walking() const { return since_s_ < kPause_s; }
 
 uint16_t GaitDetector::take_rejected() {
   const uint16_t count = rejected_;
@@ -141,7 +142,7 @@ float pendulum_step_m(float excursion_m, float leg_length_m, float gain) {
   return excursion_m < kSmallRise_m ? length * sqrtf(excursion_m * (1.0f / kSmallRise_m)) : length;
 }
 
-float turning_share(float yaw_rad) {
+RELPOS_APART float turning_share(float yaw_rad) {
   const float turn = yaw_rad * (1.0f / kTurn_rad);
   return 1.0f / (1.0f + turn * turn);
 }
@@ -151,12 +152,12 @@ RELPOS_SHARED void ForwardFinder::reset() {
   axis_[kX] = 1.0f;
 }
 
-void ForwardFinder::forget() {
+RELPOS_SHARED void ForwardFinder::forget() {
   memset(product_, 0, sizeof product_);
   power_a_ = power_v_ = 0.0f;
 }
 
-RELPOS_APART void ForwardFinder::update(const float a[2], float vertical_velocity_m_s, float dt_s) {
+void ForwardFinder::update(const float a[2], float vertical_velocity_m_s, float dt_s) {
   const float gain = dt_s * (1.0f / kForwardMemory_s);
   for (uint8_t i = 0; i < 2; ++i) follow(&product_[i], -a[i] * vertical_velocity_m_s, gain);
   follow(&power_a_, dot(a, a, 2), gain);
@@ -177,7 +178,7 @@ RELPOS_SHARED void ForwardFinder::point() {
   add_scaled(axis_, product_, 1.0f / sqrtf(dot(product_, product_, 2)), 2);
 }
 
-RELPOS_APART void ForwardFinder::step() {
+void ForwardFinder::step() {
   if (steps_ < 255) ++steps_;
   if (steps_ < kForwardSteps) return;
   if (!(dot(product_, product_, 2) > kForwardCoherence * power_a_ * power_v_)) return;

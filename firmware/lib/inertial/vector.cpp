@@ -1,4 +1,5 @@
 #include "vector.h"
+#include "inertial/calls.h"
 
 #include <math.h>
 #include <string.h>
@@ -45,7 +46,7 @@ float cube_root(float x) {
   return root;
 }
 
-RELPOS_SHARED int32_t rounded(float x) {
+int32_t rounded(float x) {
   return static_cast<int32_t>(x + (x < 0.0f ? -0.5f : 0.5f));
 }
 

@@ -191,7 +191,7 @@ void Node::show_health() {
 
 RELPOS_APART bool Node::imu_silent() const { return !sampled_ || clock_.ms() - last_sample_ms_ > kSilentMs; }
 
-void Node::configure_inertial() {
+RELPOS_UNCLONED void Node::configure_inertial() {
   InertialConfig& config = dead_reckoning_.config();
   config.leg_length_m = static_cast<float>(settings_.leg_length_mm) * 1e-3f;
   config.step_gain = static_cast<float>(settings_.step_gain_permille) * 1e-3f;
@@ -293,7 +293,7 @@ void Node::note_step() {
 
 // ---- ranging ----
 
-void Node::run_ranging(uint32_t now_us) {
+RELPOS_SHARED void Node::run_ranging(uint32_t now_us) {
   uint32_t wait = 0;
   Pozyx::Result result;
   if (pozyx_.ready()) {
@@ -340,7 +340,7 @@ uint32_t Node::between_exchanges() {
 // ---- commands ----
 
 // Verified first: a frame that is damaged, forged, of another team or old touches nothing.
-void Node::receive_packet() {
+RELPOS_APART void Node::receive_packet() {
   const uint8_t* frame = xbee_.received();
   const uint8_t length = xbee_.received_length();
   wire::Header header;
@@ -373,7 +373,7 @@ void Node::receive_packet() {
   }
 }
 
-RELPOS_APART void Node::obey(const wire::Header& header, const uint8_t* body, uint8_t length) {
+void Node::obey(const wire::Header& header, const uint8_t* body, uint8_t length) {
   const bool new_key = header.type == wire::MessageType::kNewKey;
   if (length != (new_key ? wire::kNewKeyBytes : wire::kCommandBytes)) {
     ++bad_frames_;
@@ -471,7 +471,7 @@ RELPOS_APART wire::CommandResult Node::apply(uint8_t command, int32_t value, int
   return wire::CommandResult::kDone;
 }
 
-void Node::report_raw(uint16_t reports) {
+RELPOS_APART void Node::report_raw(uint16_t reports) {
   raw_reports_ = reports;
   raw_samples_ = raw_fields_ = 0;
   memset(&ranges_, 0, sizeof ranges_);  // and the sums
@@ -584,7 +584,7 @@ void Node::send(wire::MessageType type, uint8_t body_bytes) {
   xbee_.send(wire::kCoordinator, frame_, length);
 }
 
-void Node::reserve_counters() {
+RELPOS_APART void Node::reserve_counters() {
   marks_.counter_end += kCounterBlock;
   store_.save(Record::kMarks);
 }

@@ -99,7 +99,7 @@ RELPOS_SHARED uint8_t RangingPlan::next(uint16_t now_ms, uint8_t id, uint8_t tea
   return 0;
 }
 
-void RangingPlan::done(uint16_t now_ms, bool success) {
+RELPOS_UNCLONED void RangingPlan::done(uint16_t now_ms, bool success) {
   if (success) {
     ranged_[index_ / 8] |= static_cast<uint8_t>(1 << (index_ & 7));
   } else if (count_ == 0) {

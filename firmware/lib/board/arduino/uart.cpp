@@ -1,6 +1,7 @@
 #if defined(ARDUINO)
 
 #include "uart.h"
+#include "inertial/calls.h"
 
 #include <avr/interrupt.h>
 #include <avr/io.h>
@@ -39,7 +40,7 @@ uint8_t write_space() {
   return static_cast<uint8_t>(written_tail - written_head - 1) & (kWriteBytes - 1);
 }
 
-void write(uint8_t byte) {
+RELPOS_APART void write(uint8_t byte) {
   const uint8_t head = written_head;
   written[head] = byte;
   written_head = static_cast<uint8_t>(head + 1) & (kWriteBytes - 1);
