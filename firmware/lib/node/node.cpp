@@ -17,7 +17,7 @@ constexpr uint32_t kFieldStaleMs = 1000;
 constexpr uint32_t kSilentPollUs = 500;    // two bytes at 38400 baud
 constexpr uint32_t kMostWaitUs = 100000;
 // The module answers in some 10 ms, with its own retries in under 100 ms. No answer is a failure.
-constexpr uint32_t kTransmitStatusMs = 200;
+constexpr uint16_t kTransmitStatusMs = 200;
 constexpr int16_t kWeakSignalDbm = -95;    // DW1000: close to the sensitivity limit [K]
 constexpr uint16_t kMotionPhaseMs = 157;   // between the reports of neighbouring ids, modulo period
 constexpr uint16_t kMostStepAgeMs = 2000;  // then it is sent without waiting for others
@@ -76,7 +76,7 @@ void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
 
   store_.load(board_, this);
   counter_ = marks_.counter_end;
-  reserve_counters();  // stored before the first frame, which is 100 ms away at least
+  reserve_counters();
   id_ = node_id != 0 ? node_id : settings_.node_id;
   if (id_ == 0) {
     const uint8_t stored = board_.storage_read(kStoredNodeId);
@@ -110,10 +110,11 @@ void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
   configure_inertial();
   dead_reckoning_.reset();  // the bias begins as well known as it is configured
   // Nodes switched on together do not all speak and range at the same moment.
-  motion_due_ms_ = settings_.report_period_ms +
-                   static_cast<uint32_t>(id_) * kMotionPhaseMs % settings_.report_period_ms;
-  plan_.begin(0, static_cast<uint16_t>(id_ * 257 + counter_));
-  status_due_ms_ = motion_due_ms_;  // the first one tells who is there, and why
+  motion_ms_ = static_cast<uint16_t>(
+      static_cast<uint16_t>(id_ * kMotionPhaseMs) % settings_.report_period_ms -
+      settings_.report_period_ms);
+  // The first status follows the first motion: it tells who is there, and why.
+  status_ms_ = static_cast<uint16_t>(motion_ms_ + settings_.report_period_ms - settings_.status_period_ms);
   show_health();
 }
 
@@ -133,17 +134,18 @@ uint32_t Node::poll(uint32_t now_us) {
     return 0;
   }
   store_.step(board_, *this);
-  if (radio_free() && (send_next() || run_reboot())) return 0;
+  if (!store_.saving()) speaking_ = true;  // the counters of this start are stored
+  if (speaking_ && radio_free() && (send_next() || run_reboot())) return 0;
   show_health();
   return wait_us(now_us);
 }
 
 // Microseconds until something is due. Radio and storage in progress are looked after meanwhile.
 uint32_t Node::wait_us(uint32_t now_us) const {
-  uint32_t wait_ms = kMostWaitUs / 1000;
-  shorten(motion_due_ms_, &wait_ms);
-  shorten(status_due_ms_, &wait_ms);
-  uint32_t wait = wait_ms * 1000;
+  uint16_t wait_ms = kMostWaitUs / 1000;
+  shorten(motion_ms_, settings_.report_period_ms, &wait_ms);
+  shorten(status_ms_, settings_.status_period_ms, &wait_ms);
+  uint32_t wait = wait_ms * 1000UL;
   if (awaiting_status_ || store_.saving() || reboot_step_ != 0) wait = kSilentPollUs;
   if (imu_due_us_ - now_us < wait) wait = imu_due_us_ - now_us;
   if (pozyx_due_us_ - now_us < wait) wait = pozyx_due_us_ - now_us;
@@ -151,17 +153,19 @@ uint32_t Node::wait_us(uint32_t now_us) const {
 }
 
 // What is overdue waits for something else, which is looked after anyway.
-void Node::shorten(uint32_t due_ms, uint32_t* wait_ms) const {
-  const uint32_t ms = due_ms - clock_.ms();
-  if (ms < *wait_ms) *wait_ms = ms;
+void Node::shorten(uint16_t last_ms, uint16_t period_ms, uint16_t* wait_ms) const {
+  const uint16_t left_ms = static_cast<uint16_t>(period_ms - static_cast<uint16_t>(now_ms() - last_ms));
+  if (left_ms < *wait_ms) *wait_ms = left_ms;
 }
 
-// Whether a period has ended. Periods that could not be kept are skipped, not made up for.
-bool Node::period_over(uint32_t* due_ms, uint16_t period_ms) {
-  const uint32_t now_ms = clock_.ms();
-  if (!reached(now_ms, *due_ms)) return false;
-  *due_ms += period_ms;
-  if (reached(now_ms, *due_ms)) *due_ms = now_ms + period_ms;
+// Whether a period has ended. Periods that could not be kept are skipped, not made up for. None is
+// longer than 60 s, and this is asked more than once in the 5 s that 16 bits have left.
+bool Node::period_over(uint16_t* last_ms, uint16_t period_ms) {
+  uint16_t past_ms = static_cast<uint16_t>(now_ms() - *last_ms);
+  if (past_ms < period_ms) return false;
+  past_ms = static_cast<uint16_t>(past_ms - period_ms);
+  if (past_ms >= period_ms) past_ms = 0;
+  *last_ms = static_cast<uint16_t>(now_ms() - past_ms);
   return true;
 }
 
@@ -299,7 +303,7 @@ RELPOS_SHARED void Node::run_ranging(uint32_t now_us) {
   if (pozyx_.ready()) {
     wait = between_exchanges();
   } else if (pozyx_.step(board_, now_us, &wait, &result) == Pozyx::Event::kDone) {
-    plan_.done(static_cast<uint16_t>(clock_.ms()), result.success);
+    plan_.done(now_ms(), result.success);
     if (result.success) {
       ++ranging_successes_;
       PendingRange pending;
@@ -319,18 +323,17 @@ RELPOS_SHARED void Node::run_ranging(uint32_t now_us) {
 // The next exchange where it is time for one, else a look at pressure or identity. Microseconds
 // until it has to be asked again.
 uint32_t Node::between_exchanges() {
-  const uint16_t now_ms = static_cast<uint16_t>(clock_.ms());
   uint16_t wait_ms = kLookPeriodMs;
   if (settings_.ranging_period_ms != 0 && raw_reports_ == 0) {
     const uint8_t peer =
-        plan_.next(now_ms, id_, settings_.team_size, settings_.ranging_period_ms, &wait_ms);
+        plan_.next(now_ms(), id_, settings_.team_size, settings_.ranging_period_ms, &wait_ms);
     if (peer != 0) {
       pozyx_.range(peer);
       return 0;
     }
   }
-  if (static_cast<uint16_t>(now_ms - looked_ms_) >= kLookPeriodMs) {
-    looked_ms_ = now_ms;
+  if (static_cast<uint16_t>(now_ms() - looked_ms_) >= kLookPeriodMs) {
+    looked_ms_ = now_ms();
     uint32_t pressure_mpa;
     if (pozyx_.look(board_, &pressure_mpa)) barometer_.add(pressure_mpa);
   }
@@ -365,7 +368,7 @@ RELPOS_APART void Node::receive_packet() {
   const uint8_t body_bytes = static_cast<uint8_t>(length - wire::kOverhead);
   if (beacon) {
     wire::Beacon message;
-    if (wire::decode(body, body_bytes, &message)) plan_.beacon(static_cast<uint16_t>(clock_.ms()), message, id_);
+    if (wire::decode(body, body_bytes, &message)) plan_.beacon(now_ms(), message, id_);
     pozyx_due_us_ = board_.now_us();
   } else if (reboot_step_ == 0) {
     obey(header, body, body_bytes);
@@ -464,9 +467,8 @@ RELPOS_APART wire::CommandResult Node::apply(uint8_t command, int32_t value, int
   }
   if (code == wire::CommandCode::kSetNodeId) reboot_step_ = 1;  // everything begins with it
   // A new period counts from now.
-  const uint32_t due_ms = clock_.ms() + static_cast<uint32_t>(value);
-  if (code == wire::CommandCode::kSetReportPeriodMs) motion_due_ms_ = due_ms;
-  if (code == wire::CommandCode::kSetStatusPeriodMs) status_due_ms_ = due_ms;
+  if (code == wire::CommandCode::kSetReportPeriodMs) motion_ms_ = now_ms();
+  if (code == wire::CommandCode::kSetStatusPeriodMs) status_ms_ = now_ms();
   if (settings_.step_reports == 0) steps_.clear();
   return wire::CommandResult::kDone;
 }
@@ -538,7 +540,7 @@ bool Node::radio_free() {
   if (xbee_.busy()) return false;
   if (!xbee_.unanswered()) awaiting_status_ = false;
   if (!awaiting_status_) return true;
-  if (clock_.ms() - sent_ms_ < kTransmitStatusMs) return false;
+  if (static_cast<uint16_t>(now_ms() - sent_ms_) < kTransmitStatusMs) return false;
   awaiting_status_ = false;
   ++radio_failures_;
   return true;
@@ -550,14 +552,14 @@ RELPOS_APART bool Node::send_next() {
   uint8_t* body = frame_ + wire::kHeaderBytes;
   if (answer_due() && !store_.saving()) {  // acknowledged once it is done for good
     send(wire::MessageType::kAcknowledgement, fill_answer(body));
-  } else if (period_over(&motion_due_ms_, settings_.report_period_ms)) {
+  } else if (period_over(&motion_ms_, settings_.report_period_ms)) {
     send(wire::MessageType::kMotion, fill_motion(body));
-  } else if (period_over(&status_due_ms_, settings_.status_period_ms)) {
+  } else if (period_over(&status_ms_, settings_.status_period_ms)) {
     send(wire::MessageType::kStatus, fill_status(body));
   } else if (steps_report_due()) {
     send(wire::MessageType::kSteps, fill_steps(body));
   } else if (raw_reports_ != 0) {
-    if (!period_over(&raw_due_ms_, kRawPeriodMs)) return false;
+    if (!period_over(&raw_ms_, kRawPeriodMs)) return false;
     send(wire::MessageType::kSamples, fill_samples(body));
   } else if (ranges_.count() >= wire::kMostRanges || (ranges_.count() > 0 && (plan_.resting() || !pozyx_.running()))) {
     send(wire::MessageType::kRanges, fill_ranges(body));
@@ -580,7 +582,7 @@ void Node::send(wire::MessageType type, uint8_t body_bytes) {
   const uint8_t length = wire::seal(header, body_bytes, key_, frame_);
   if (marks_.counter_end - counter_ < kCountersLeft) reserve_counters();
   awaiting_status_ = true;
-  sent_ms_ = clock_.ms();
+  sent_ms_ = now_ms();
   xbee_.send(wire::kCoordinator, frame_, length);
 }
 

@@ -78,13 +78,13 @@ struct NodeState : Persistent {
   uint16_t ranging_successes_;
   uint16_t ranging_failures_;
   uint16_t dropped_ranges_;
-  uint32_t raw_due_ms_;
+  uint16_t raw_ms_;  // of the last report, low bits as in the next ones
   uint16_t raw_reports_;  // still to be sent
   uint8_t raw_samples_;   // in the sums
   uint8_t raw_fields_;    // since the last report
-  uint32_t motion_due_ms_;
-  uint32_t status_due_ms_;
-  uint32_t sent_ms_;
+  uint16_t motion_ms_;
+  uint16_t status_ms_;
+  uint16_t sent_ms_;
   uint32_t counter_;      // of the next frame
   uint32_t beacon_mark_;  // newest counter of a beacon; not kept over a restart
   uint16_t bad_frames_;   // behind a good XBee checksum
@@ -99,6 +99,7 @@ struct NodeState : Persistent {
   uint8_t reboot_step_;  // 0: no reboot asked
   bool supply_low_;
   bool led_;
+  bool speaking_;
 };
 
 class Node : private NodeState {
@@ -139,11 +140,12 @@ class Node : private NodeState {
   uint8_t fill_answer(uint8_t* body);
   void reserve_counters();
   bool steps_report_due() const;
-  bool period_over(uint32_t* due_ms, uint16_t period_ms);
+  uint16_t now_ms() const { return static_cast<uint16_t>(clock_.ms()); }
+  bool period_over(uint16_t* last_ms, uint16_t period_ms);
   void show_health();
   bool imu_silent() const;
   uint32_t wait_us(uint32_t now_us) const;
-  void shorten(uint32_t due_ms, uint32_t* wait_ms) const;
+  void shorten(uint16_t last_ms, uint16_t period_ms, uint16_t* wait_ms) const;
 
   Board& board_;
   Storage store_;

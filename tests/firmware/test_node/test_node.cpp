@@ -327,10 +327,10 @@ TEST(motion_every_second_a_round_every_two_status_every_ten) {
   Team team;
   team.run_ms(30500);
   CHECK(team.sent(wire::MessageType::kMotion) >= 29);
-  CHECK(team.sent(wire::MessageType::kMotion) <= 30);
+  CHECK(team.sent(wire::MessageType::kMotion) <= 31);
   CHECK(team.sent(wire::MessageType::kRanges) >= 13);
   CHECK(team.sent(wire::MessageType::kRanges) <= 16);
-  CHECK_EQUAL(3, team.sent(wire::MessageType::kStatus));
+  CHECK_EQUAL(4, team.sent(wire::MessageType::kStatus));  // the first one after half a second
   CHECK_EQUAL(0, team.sent(wire::MessageType::kSteps));
   CHECK_EQUAL(0, team.world.damaged);
   CHECK(team.world.marks > 1400);  // the tick is marked
@@ -590,26 +590,21 @@ TEST(the_height_travels_with_the_motion_once_it_is_known) {
 }
 
 TEST(nodes_started_together_do_not_range_together) {
-  uint32_t first_us[6];
+  uint32_t last_us[6];
+  uint8_t together = 0;
   for (uint8_t id = 1; id <= 6; ++id) {
     Team team;
     Node node(team.world);
     node.begin(0, wire::ResetCause::kPowerOn, id);
-    team.run(node, 4500);
-    first_us[id - 1] = team.last(wire::MessageType::kRanges) == nullptr ? 0 : 1;
-    CHECK_EQUAL(1, first_us[id - 1]);
-    for (uint16_t i = team.world.count; i > 0; --i) {
-      if (team.world.frames[i - 1].header.type == wire::MessageType::kRanges) {
-        first_us[id - 1] = team.world.frames[i - 1].time_us;
-      }
-    }
-    uint8_t together = 0;
+    team.run(node, 8000);
+    CHECK(team.last(wire::MessageType::kRanges) != nullptr);
+    last_us[id - 1] = team.last(wire::MessageType::kRanges)->time_us;
     for (uint8_t other = 1; other < id; ++other) {
-      const int32_t apart = static_cast<int32_t>(first_us[id - 1] - first_us[other - 1]);
+      const int32_t apart = static_cast<int32_t>(last_us[id - 1] - last_us[other - 1]);
       together += apart < 100000 && apart > -100000;
     }
-    CHECK(together <= 2);  // of rounds at random within a second
   }
+  CHECK(together <= 5);  // of 15 pairs; 2.8 where rounds begin at random within a second
 }
 
 TEST(the_schedule_does_not_feel_the_wrap_of_the_microseconds) {
