@@ -113,6 +113,7 @@ void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
   motion_ms_ = static_cast<uint16_t>(
       static_cast<uint16_t>(id_ * kMotionPhaseMs) % settings_.report_period_ms -
       settings_.report_period_ms);
+  plan_.begin(now_ms(), static_cast<uint16_t>(id_ * 257 + counter_));
   // The first status follows the first motion: it tells who is there, and why.
   status_ms_ = static_cast<uint16_t>(motion_ms_ + settings_.report_period_ms - settings_.status_period_ms);
   show_health();

@@ -7,7 +7,7 @@ namespace relpos {
 
 void RangingPlan::begin(uint16_t now_ms, uint16_t seed) {
   origin_ms_ = now_ms;
-  random_ = seed;
+  random_ = seed | 1;  // not 0, where it would stay
 }
 
 void RangingPlan::beacon(uint16_t now_ms, const wire::Beacon& beacon, uint8_t id) {
@@ -66,10 +66,12 @@ RELPOS_SHARED uint8_t RangingPlan::next(uint16_t now_ms, uint8_t id, uint8_t tea
       begin_ms_ = place * window_ms;
       end_ms_ = static_cast<uint16_t>(begin_ms_ + window_ms - (kExchangeMs + kGuardMs));
     } else {
-      // Knuth, The Art of Computer Programming 2, 3.2.1: a linear congruence of full period, whose
-      // high bits are the better ones.
-      random_ = static_cast<uint16_t>(random_ * 25173u + 13849u);
-      begin_ms_ = static_cast<uint16_t>((random_ >> 11) * (period_ms / 64));
+      // Marsaglia 2003, for 16 bits: of full period. A linear congruence would keep nodes with
+      // neighbouring ids evenly apart, sometimes next to each other.
+      random_ ^= static_cast<uint16_t>(random_ << 7);
+      random_ ^= random_ >> 9;
+      random_ ^= static_cast<uint16_t>(random_ << 8);
+      begin_ms_ = static_cast<uint16_t>((random_ & 31) * (period_ms / 64));
       end_ms_ = period_ms;
     }
   }
@@ -103,8 +105,8 @@ RELPOS_UNCLONED void RangingPlan::done(uint16_t now_ms, bool success) {
   if (success) {
     ranged_[index_ / 8] |= static_cast<uint8_t>(1 << (index_ & 7));
   } else if (count_ == 0) {
-    begin_ms_ = static_cast<uint16_t>(now_ms - origin_ms_ + (random_ & kMostBackOffMs));
-    random_ = static_cast<uint16_t>(random_ + now_ms);
+    const uint8_t at = static_cast<uint8_t>(now_ms >> 2);
+    begin_ms_ = static_cast<uint16_t>(now_ms - origin_ms_ + ((random_ ^ at) & kMostBackOffMs));
   }
 }
 
