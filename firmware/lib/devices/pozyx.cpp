@@ -213,15 +213,18 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
       break;
   }
   failures_ = 0;
-  const int32_t advance_ms = static_cast<int32_t>(little_endian_long(answer + 1) - before_ms_);
-  if (answer[0] != 1 || (before_ms_ != 0 && advance_ms <= 0)) {
+  const uint32_t time_ms = little_endian_long(answer + 1);
+  const int32_t advance_ms = static_cast<int32_t>(time_ms - before_ms_);
+  if (answer[0] != 1 || (before_ms_ != 0 && advance_ms <= 0) || time_ms == last_ms_) {
     // No row or the one from before: it was another exchange that ended, where this chip answered.
+    // Or the one of another peer, which chips have been seen to tell twice.
     state_ = State::kPoll;
     *wait_us = kPollUs;
     return Event::kNothing;
   }
   const uint32_t range_mm = little_endian_long(answer + 5);
   if (range_mm == 0 || range_mm >= kLeastImplausibleMm) return done(kImplausible, wait_us, result);
+  last_ms_ = time_ms;
   const int16_t rss_dbm = static_cast<int16_t>(little_endian(answer + 9));
   result->range_mm = range_mm;
   result->rss_dbm = static_cast<int8_t>(rss_dbm < -128 ? -128 : rss_dbm > 127 ? 127 : rss_dbm);

@@ -71,6 +71,7 @@ class Pozyx {
 
   uint32_t due_us_;
   uint32_t before_ms_;  // the chip's time of the peer's row before the exchange; 0: none
+  uint32_t last_ms_;    // likewise of the last distance
   uint16_t network_id_;
   uint16_t peer_;
   State state_;

@@ -10,7 +10,6 @@ constexpr uint32_t kMostMpa = 120000000;
 // More than 12 m in a quarter of a second is a fault; so many of them are a new truth (a fan, a
 // pressurised staircase) that starts at the height where it was met.
 constexpr int32_t kStrangeMpa = 150000;
-constexpr uint8_t kMostStrange = 8;
 // Follows a climb with 0.75 s of delay; leaves 2 Pa of noise 0.8 Pa: 0.06 m.
 constexpr int32_t kSmoothing = 4;
 // Standard atmosphere (ISO 2533): 288.15 K / 0.0065 K/m x 0.190263, and (1 - 0.190263) / 2.
@@ -20,11 +19,12 @@ constexpr float kSecondOrder = 0.40487f;
 }  // namespace
 
 RELPOS_SHARED void Barometer::add(uint32_t pressure_mpa) {
-  if (pressure_mpa < kLeastMpa || pressure_mpa > kMostMpa) return;
   if (readings_ == 0) start_mpa_ = pressure_mpa;
   const int32_t news = static_cast<int32_t>(start_mpa_ - pressure_mpa) - fall_mpa_;
-  if ((news < 0 ? -news : news) > kStrangeMpa && ++strange_ < kMostStrange) return;
-  if (strange_ >= kMostStrange) {
+  const bool garbage = pressure_mpa < kLeastMpa || pressure_mpa > kMostMpa;
+  if (garbage || (news < 0 ? -news : news) > kStrangeMpa) {
+    if (strange_ != kMostStrange) ++strange_;
+    if (garbage || strange_ != kMostStrange) return;
     start_mpa_ -= static_cast<uint32_t>(news);
   } else if (readings_ < kStartReadings) {
     ++readings_;

@@ -606,8 +606,9 @@ uint8_t Node::fill_motion(uint8_t* body) {
     quality_ |= flag(wire::Quality::kMagnetometerValid);
   }
   if (pozyx_.running() && barometer_.ready()) {
-    motion.height_cm = static_cast<int16_t>(scaled(barometer_.height_m(), 100));
-    quality_ |= flag(wire::Quality::kHeightValid);
+    const int32_t height_cm = static_cast<int32_t>(scaled(barometer_.height_m(), 100));
+    motion.height_cm = static_cast<int16_t>(height_cm);
+    if (motion.height_cm == height_cm) quality_ |= flag(wire::Quality::kHeightValid);
   }
   if (silent) quality_ |= flag(wire::Quality::kImuGap);
   wire::MotionState state = now.moving ? wire::MotionState::kMoving : wire::MotionState::kStanding;
@@ -668,6 +669,7 @@ uint8_t Node::fill_status(uint8_t* body) {
   if (magnetometer_.running()) health |= flag(wire::Health::kMagnetometer);
   if (pozyx_.running()) health |= flag(wire::Health::kPozyx);
   if (pozyx_.running() && barometer_.ready()) health |= flag(wire::Health::kPressure);
+  plan_.age(static_cast<uint16_t>(clock_.ms()));
   status.neighbours = plan_.neighbours();
   status.team = plan_.team();
   if (status.team != 0) health |= flag(wire::Health::kBeacon);

@@ -28,8 +28,7 @@ void RangingPlan::beacon(uint16_t now_ms, const wire::Beacon& beacon, uint8_t id
   round_ = beacon.round;
 }
 
-RELPOS_SHARED uint8_t RangingPlan::next(uint16_t now_ms, uint8_t id, uint8_t team_size, uint16_t period_ms,
-                          uint16_t* wait_ms) {
+RELPOS_SHARED void RangingPlan::age(uint16_t now_ms) {
   const uint8_t epoch = static_cast<uint8_t>(now_ms >> 13);
   if (epoch != epoch_) {
     epoch_ = epoch;
@@ -40,6 +39,11 @@ RELPOS_SHARED uint8_t RangingPlan::next(uint16_t now_ms, uint8_t id, uint8_t tea
     count_ = 0;
     planned_ = false;
   }
+}
+
+RELPOS_SHARED uint8_t RangingPlan::next(uint16_t now_ms, uint8_t id, uint8_t team_size, uint16_t period_ms,
+                          uint16_t* wait_ms) {
+  age(now_ms);
   uint8_t count = team_size;
   uint8_t place = static_cast<uint8_t>(id - 1);
   if (count_ != 0) {

@@ -40,6 +40,7 @@ class RangingPlan {
   void done(uint16_t now_ms, bool success);  // of what next() returned last
 
   bool resting() const { return resting_; }  // nothing more in this round
+  void age(uint16_t now_ms);                 // before the next two are read
   uint8_t team() const { return count_; }    // in the beacon in force; 0: none, or without this node
   uint8_t neighbours() const;                // ranged in the last 8 to 16 s
 

@@ -510,6 +510,24 @@ TEST(a_node_that_is_not_in_the_beacon_ranges_by_itself) {
   CHECK_EQUAL(5, status.neighbours);
 }
 
+TEST(without_its_pozyx_a_node_tells_no_neighbours_and_no_team_of_old) {
+  Team team;
+  for (uint8_t second = 0; second < 12; ++second) {
+    Slots::hear(team, 0, second, 5);
+    team.run_ms(1000);
+  }
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK_EQUAL(5, status.team);
+  CHECK_EQUAL(4, status.neighbours);
+  team.world.tag_present = false;
+  team.run_ms(31000);
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK_EQUAL(0, status.team);
+  CHECK_EQUAL(0, status.neighbours);
+  CHECK(!(status.health & static_cast<uint8_t>(wire::Health::kBeacon)));
+}
+
 TEST(a_replayed_beacon_moves_no_slot) {
   Team team;
   Slots::hear(team, 0, 9, 7);
@@ -569,6 +587,29 @@ TEST(garbage_pressure_is_no_height_and_a_new_level_is_no_climb) {
   }
   for (uint8_t i = 0; i < 40; ++i) barometer.add(101025000);  // a door: 300 Pa for good
   CHECK_NEAR(0.0f, barometer.height_m(), 0.01f);
+}
+
+TEST(a_pressure_sensor_that_tells_nonsense_leaves_no_old_height) {
+  relpos::Barometer barometer = relpos::Barometer();
+  for (uint8_t i = 0; i < 20; ++i) barometer.add(101325000);
+  CHECK(barometer.ready());
+  for (uint8_t i = 0; i < 8; ++i) barometer.add(0);
+  CHECK(!barometer.ready());
+  for (uint8_t i = 0; i < 40; ++i) barometer.add(101325000 - 36000);
+  CHECK(barometer.ready());
+  CHECK_NEAR(3.0f, barometer.height_m(), 0.05f);
+}
+
+TEST(a_height_beyond_the_message_is_not_told) {
+  Team team;
+  team.run_ms(10000);
+  for (uint32_t i = 0; i < 85; ++i) {  // a lift of 4 m/s, up to 360 m
+    team.world.pressure_mpa -= 50000;
+    team.run_ms(1000);
+  }
+  wire::Motion motion;
+  CHECK(team.read(wire::MessageType::kMotion, &motion));
+  CHECK(!(motion.quality & static_cast<uint8_t>(wire::Quality::kHeightValid)));
 }
 
 TEST(the_height_travels_with_the_motion_once_it_is_known) {

@@ -25,6 +25,7 @@ struct Chip : FakeBoard {
   uint8_t info_status = 1;
   uint32_t time_ms = 1000;     // of the exchange that ends
   uint32_t stored_ms = 0;      // in the row; 0: there is none
+  uint32_t before_ms = 0;      // in the row as long as no exchange has begun; 0: stored_ms
   uint32_t range_mm = 5432;
   int16_t rss_dbm = -83;
 
@@ -75,8 +76,9 @@ struct Chip : FakeBoard {
       polls_left = polls;
       return give(read, call_status);
     } else if (first_count == 3 && second_count == 0 && read_count == 5 && first[0] == 0xC7) {
-      read[0] = stored_ms != 0;
-      put(read + 1, stored_ms, 4);
+      const uint32_t now_ms = before_ms != 0 ? before_ms : stored_ms;
+      read[0] = now_ms != 0;
+      put(read + 1, now_ms, 4);
       return BusStatus::kOk;
     } else if (first_count == 3 && second_count == 0 && read_count == 11 && first[0] == 0xC7) {
       fetched_peer = static_cast<uint16_t>(first[1] | first[2] << 8);
@@ -383,6 +385,20 @@ TEST(an_older_distance_told_as_new_by_inverted_flags_is_refused) {
   CHECK_EQUAL(Pozyx::kTimedOut, bench.result.error);
   bench.chip.time_ms = 1600;
   CHECK(bench.exchange(3));
+  CHECK(bench.result.success);
+}
+
+TEST(the_row_of_another_peer_is_no_distance_to_this_one) {
+  Bench bench;
+  bench.set_up();
+  bench.chip.time_ms = 5000;
+  CHECK(bench.exchange(3));
+  CHECK(bench.result.success);
+  bench.chip.before_ms = 2000;  // that of peer 4
+  CHECK(bench.exchange(4));     // FUNC, then 3's row again, seen in the field
+  CHECK(!bench.result.success);
+  bench.chip.time_ms = 5050;
+  CHECK(bench.exchange(4));
   CHECK(bench.result.success);
 }
 
