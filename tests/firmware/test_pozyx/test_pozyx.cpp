@@ -3,8 +3,6 @@
 #include "support/check.h"
 #include "support/fake_board.h"
 
-#include <initializer_list>
-
 #include "devices/pozyx.h"
 
 using relpos::BusStatus;
@@ -312,7 +310,8 @@ TEST(garbage_is_not_a_distance) {
 }
 
 TEST(another_s_exchange_that_this_chip_answers_meanwhile_costs_nothing) {
-  for (uint32_t stored_ms : {uint32_t{0}, uint32_t{900}}) {
+  const uint32_t rows_ms[] = {0, 900};
+  for (const uint32_t stored_ms : rows_ms) {
     Bench bench;
     bench.set_up();
     bench.chip.stored_ms = stored_ms;
