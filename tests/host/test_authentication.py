@@ -105,6 +105,8 @@ def test_without_the_key_nothing_is_taken_and_nothing_remembered():
         assert decoder.feed(motion(n, 1.0 + n), 1.0) == []
     assert decoder.nodes == {}
     assert decoder.counts == {"FrameTagError": 20}
+    assert [line for line in decoder.remarks if "--key-file" in line] == decoder.remarks
+    assert len(decoder.remarks) == 1
     assert decoder.feed(motion(0, 1.0, key=KEY), 1.0) != [] or decoder.nodes[1].heard
 
 

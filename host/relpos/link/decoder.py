@@ -25,6 +25,8 @@ UNSEEN_TURN_RAD_S_SQRT = 0.5
 1.5 m/s), and turning as a random walk that loses the heading after some ten seconds."""
 MOST_KEPT = 10_000
 """Answers and raw samples that nobody fetches are forgotten: half an hour of one node's samples."""
+FOREIGN_BEFORE_REMARK = 5
+"""Frames under another key before it is told, where none is heard under this one."""
 REPLAYS_BEFORE_REMARK = 5
 """A frame or two of that kind may be an echo; a node that does nothing else has forgotten."""
 
@@ -118,6 +120,12 @@ class Decoder:
             return []
         except wire.FrameError as error:
             self.counts[type(error).__name__] += 1
+            foreign = isinstance(error, wire.FrameTagError) and not self.nodes
+            if foreign and self.counts["FrameTagError"] == FOREIGN_BEFORE_REMARK:
+                self.remarks.append(
+                    "frames under another key are refused: give the team's with --key-file, or "
+                    "they are another team's"
+                )
             return []
         if frame.node in (wire.COORDINATOR, wire.BROADCAST) or frame.message in DOWN:
             self.counts["not_from_a_node"] += 1
