@@ -46,7 +46,7 @@ bool Xbee::send(uint16_t destination, const uint8_t* data, uint8_t length) {
   // 0 would ask for no status.
   if (++frame_id_ == 0) frame_id_ = 1;
   sending_ = true;
-  unanswered_ = true;
+  undelivered_ = true;
   return true;
 }
 
@@ -169,8 +169,7 @@ RELPOS_UNCLONED bool Xbee::finish() {
   }
   part_ = Part::kNone;
   if (type_ == kTransmitStatus) {
-    if (payload_[0] == frame_id_) unanswered_ = false;
-    if (payload_[1] != 0) ++failures_;
+    if (payload_[0] == frame_id_ && payload_[1] == 0) undelivered_ = false;
   }
   return is_payload(type_);
 }

@@ -20,8 +20,8 @@ class Xbee {
   bool busy() const { return sending_; }
   // Begins a TX16 request. The data must stay unchanged until !busy(). False while busy().
   bool send(uint16_t destination, const uint8_t* data, uint8_t length);
-  // The module has not told yet what became of the last request.
-  bool unanswered() const { return unanswered_; }
+  // The module has not told that the last request was delivered.
+  bool undelivered() const { return undelivered_; }
   // Pushes what fits into the UART and reads what has come, up to the end of the first RF payload.
   // True where there is one: received(), received_length() and source() hold until the next step.
   bool step(Board& board);
@@ -29,7 +29,6 @@ class Xbee {
   uint8_t received_length() const { return payload_length_; }
   uint16_t source() const { return source_; }            // of a 64-bit address the low part
   uint16_t bad_frames() const { return bad_frames_; }    // checksum, length, broken off; wraps
-  uint16_t failures() const { return failures_; }        // TX status other than 0; wraps
 
  private:
   enum class Part : uint8_t { kNone, kLengthHigh, kLengthLow, kData, kChecksum };
@@ -49,7 +48,7 @@ class Xbee {
   uint8_t sent_sum_;
   bool sending_;
   bool sent_escape_;
-  bool unanswered_;
+  bool undelivered_;
 
   Part part_;
   bool took_escape_;
@@ -60,7 +59,6 @@ class Xbee {
   uint16_t index_;   // in it
   uint16_t source_;
   uint16_t bad_frames_;
-  uint16_t failures_;
   uint8_t payload_[kMostPayload];
 };
 

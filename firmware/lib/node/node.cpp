@@ -16,7 +16,8 @@ constexpr uint32_t kSilentMs = 500;        // without a sample for so long there
 constexpr uint32_t kFieldStaleMs = 1000;
 constexpr uint32_t kSilentPollUs = 500;    // two bytes at 38400 baud
 constexpr uint32_t kMostWaitUs = 100000;
-// The module answers in some 10 ms, with its own retries in under 100 ms. No answer is a failure.
+// From one frame to the next where it is not told as delivered: the module answers in some 10 ms, with
+// its own retries in under 100 ms.
 constexpr uint16_t kTransmitStatusMs = 200;
 constexpr int16_t kWeakSignalDbm = -95;    // DW1000: close to the sensitivity limit [K]
 constexpr uint16_t kMotionPhaseMs = 157;   // between the reports of neighbouring ids, modulo period
@@ -536,10 +537,11 @@ bool Node::run_reboot() {
 
 // ---- telemetry ----
 
-// The module takes the next frame once it has told what became of the last one.
+// The module takes the next frame once the last one was delivered. After one that was not, or of which
+// nothing is told, it is left alone for a while: where the air is full, more would make it fuller.
 bool Node::radio_free() {
   if (xbee_.busy()) return false;
-  if (!xbee_.unanswered()) awaiting_status_ = false;
+  if (!xbee_.undelivered()) awaiting_status_ = false;
   if (!awaiting_status_) return true;
   if (static_cast<uint16_t>(now_ms() - sent_ms_) < kTransmitStatusMs) return false;
   awaiting_status_ = false;
@@ -661,7 +663,7 @@ uint8_t Node::fill_status(uint8_t* body) {
   status.free_stack_bytes = board_.free_stack();
   status.bad_frames = static_cast<uint16_t>(bad_frames_ + xbee_.bad_frames());
   status.dropped_ranges = dropped_ranges_;
-  status.radio_failures = static_cast<uint16_t>(radio_failures_ + xbee_.failures());
+  status.radio_failures = radio_failures_;
   status.refused_frames = refused_frames_;
   status.range_offset_mm = settings_.range_offset_mm;
   uint8_t health = 0;

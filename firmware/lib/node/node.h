@@ -89,7 +89,7 @@ struct NodeState : Persistent {
   uint32_t beacon_mark_;  // newest counter of a beacon; not kept over a restart
   uint16_t bad_frames_;   // behind a good XBee checksum
   uint16_t refused_frames_;
-  uint16_t radio_failures_;  // besides those that the module reports
+  uint16_t radio_failures_;
   uint8_t next_command_;
   bool awaiting_status_;
   uint8_t frame_[wire::kFrameBytes];
