@@ -52,7 +52,7 @@ def test_a_node_with_everything_is_green_and_says_nothing():
         ({"pozyx": False}, Health.YELLOW, "Pozyx missing"),
         ({"pressure": False}, Health.YELLOW, "pressure"),
         ({"beacon": False}, Health.YELLOW, "beacon"),
-        ({"ranging": 0.4}, Health.YELLOW, "40 % of its rangings"),
+        ({"ranging": 0.35}, Health.YELLOW, "35 % of its rangings"),
         ({"neighbours": 0}, Health.YELLOW, "ranges nobody"),
         ({"rssi_dbm": -89.0}, Health.YELLOW, "-89 dBm"),
         ({"unwanted_start": "watchdog", "uptime_s": 12.0}, Health.YELLOW, "watchdog"),
@@ -73,7 +73,7 @@ def test_each_trouble_has_its_colour_and_its_words(changes, health, words):
     "changes",
     [
         {"battery_v": 0.0},  # this board does not measure it
-        {"ranging": 0.0, "exchanges": 9},  # too few to say
+        {"ranging": 0.0, "exchanges": 11},  # too few to say
         {"unwanted_start": "watchdog", "uptime_s": 90.0},  # long ago
         {"neighbours": 0, "team": 1},  # alone
         {"ranging": None, "neighbours": None, "beacon": None, "imu": None},  # not told

@@ -87,7 +87,7 @@ def test_a_walk_of_known_length_sets_the_gain_on_the_node():
 
 
 def test_two_antennas_are_calibrated_at_a_known_distance():
-    with emulated("bench", 6, 900, nodes=3) as port:
+    with emulated("bench", 20, 3000, nodes=3) as port:
         done = calibrate("antenna", port, "--nodes", "1,2", "--distance", 5)
         assert done.returncode == 0, done.stderr
         before, after = (float(x) for x in re.findall(r"ranges, ([+-][\d.]+) m off", done.stdout))

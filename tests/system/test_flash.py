@@ -156,6 +156,15 @@ def test_a_mega_is_known_by_its_own_boot_loader(tmp_path):
             boards.check(device, "uno")
 
 
+@pytest.mark.skipif(not MEGA_LOADER.is_file(), reason="no boot loader of the Mega is installed")
+def test_a_mega_becomes_a_node_as_well(tmp_path):
+    with plugged("mega", mega_loader(tmp_path)) as mega:
+        done = relpos_node("flash", mega.path, "--id", 5)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "Arduino mega (ATmega2560)" in done.stdout
+    assert "node 5 answers over the cable" in done.stdout
+
+
 def test_the_shields_switch_in_the_wrong_position_is_told(optiboot):
     with plugged("uno", optiboot, connected=False) as uno:
         done = relpos_node("flash", uno.path)

@@ -19,7 +19,7 @@ RELPOS = [sys.executable, "-m", "relpos.cli.main"]
 def emulated(nodes, board="native", speed=4, seed=3):
     """Path of the pseudo-terminal behind which the team is."""
     command = [*RELPOS, "emulate", "--nodes", nodes, "--scenario", "straight", "--board", board]
-    command += ["--speed", speed, "--seconds", 1500, "--seed", seed]
+    command += ["--speed", speed, "--seconds", 600, "--seed", seed]
     emulator = subprocess.Popen(
         [*map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
