@@ -1,7 +1,13 @@
 """The beacon: who is in it, in which order, and what time it tells."""
 
+import os
+import pty
+import tty
+
 import pytest
 
+from relpos.cli import source as sources
+from relpos.cli.node_watch import _watch
 from relpos.errors import DataError
 from relpos.link import xbee
 from relpos.link.authentication import HostCounter
@@ -139,3 +145,35 @@ def test_a_forged_frame_brings_nobody_into_the_team():
     beacons = HostBeacons(link)
     link.feed(motion(6, 1), 0.5)
     assert beacons.due(1.0) == b""
+
+
+def test_the_user_is_told_once_of_a_node_too_many():
+    link = Link()
+    beacons = HostBeacons(link)
+    link.feed(b"".join(motion(node, 1) for node in range(1, MOST_NODES + 2)), 0.5)
+    for time_s in (1.0, 2.0, 3.0):
+        assert beacons.due(time_s)
+    assert len(link.decoder.remarks) == 1
+    assert "node 21:" in link.decoder.remarks[0]
+
+
+@pytest.mark.parametrize("command", ["fuse", "monitor"])
+def test_a_command_that_listens_sends_beacons_to_whom_it_hears(command):
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    os.set_blocking(master, False)
+    path = os.ttyname(slave)
+    try:
+        if command == "fuse":
+            stream = iter(sources.Port(path, seconds=1.0))
+        else:
+            stream = _watch(path, 1.0, None, False)
+            next(stream)
+        os.write(master, motion(3, 1))  # opening a port empties it
+        for _ in stream:
+            pass
+        request, *_ = xbee.Parser().feed(os.read(master, 4096))
+    finally:
+        os.close(master)
+        os.close(slave)
+    assert ids(wire.decode(request.data).values) == [3]

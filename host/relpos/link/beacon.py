@@ -94,12 +94,14 @@ class BeaconSchedule:
 class HostBeacons:
     """Beacons of a host: to the nodes that ``link`` hears, unless an emulated team sends its own.
 
-    Such a team marks virtual time, which a host cannot follow.
+    Such a team marks virtual time, which a host cannot follow. Whom there is no slot for is told
+    in the decoder's remarks, once.
     """
 
     def __init__(self, link: Link, schedule: BeaconSchedule | None = None) -> None:
         self._link = link
         self.schedule = schedule or BeaconSchedule()
+        self._told: set[int] = set()
 
     def due(self, now_s: float) -> bytes:
         """Bytes for the coordinator's port now; none where no beacon is due.
@@ -114,4 +116,11 @@ class HostBeacons:
         values = self.schedule.due(now_s)
         if values is None:
             return b""
+        new = set(self.schedule.left_out) - self._told
+        if new:
+            self._told |= new
+            self._link.decoder.remarks.append(
+                f"node {', '.join(map(str, sorted(new)))}: heard, but a team has slots for "
+                f"{MOST_NODES}: without one it disturbs the others; switch it off"
+            )
         return self._link.frame(wire.BEACON, wire.BROADCAST, values)
