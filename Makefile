@@ -12,12 +12,13 @@ PYTHON := $(VENV)/bin/python
 # A stamp stands for what pip put into .venv, and goes with it.
 RUN := $(VENV)/.relpos-run
 DEVELOP := $(VENV)/.relpos-develop
+FUZZ := $(VENV)/.relpos-fuzz
 
 PIP := $(PYTHON) -m pip --disable-pip-version-check install --progress-bar on
 title = @printf '\n\033[1m== %s\033[0m\n' "$(1)"
 
-.PHONY: help setup demo test lint bench firmware docs wire clean \
-        system-demo system-avr native-tests board-builds simulated-tests python-tests
+.PHONY: help setup demo test lint bench firmware docs wire clean soak \
+        system-demo system-avr system-soak native-tests board-builds simulated-tests python-tests
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -63,6 +64,10 @@ python-tests: $(DEVELOP) | system-avr
 	$(call title,Python tests)
 	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist worksteal
 
+soak: $(DEVELOP) $(FUZZ) | system-avr system-soak ## fuzzing and whatever else takes long: an hour
+	$(call title,Long runs)
+	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist worksteal -m soak -rP
+
 firmware: board-builds ## both boards: flash, RAM, cycles, beside Mahony and Madgwick
 	$(call title,Budget: cycles and stack on simavr)
 	$(PYTHON) -m relpos.emulator.avr.budget --seconds 100 --filters
@@ -93,8 +98,16 @@ $(DEVELOP): pyproject.toml | $(PYTHON)
 	$(PIP) --editable '.[test,lint,firmware]'
 	@touch $@ $(RUN)
 
+$(FUZZ): $(DEVELOP)
+	$(call title,Installing the fuzzer for Python)
+	$(PIP) --editable '.[fuzz]'
+	@touch $@
+
 system-demo:
 	@tools/system_packages.sh demo
+
+system-soak:
+	@tools/system_packages.sh soak
 
 system-avr:
 	@tools/system_packages.sh avr

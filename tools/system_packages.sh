@@ -3,6 +3,7 @@
 # else prints the one line that does and ends with status 1.
 #   tools/system_packages.sh demo    Python's venv, C++ compiler, make
 #   tools/system_packages.sh avr     AVR compiler, Arduino core, simulator, uploader
+#   tools/system_packages.sh soak    clang with libFuzzer
 set -u
 
 here=$(dirname "$0")
@@ -63,8 +64,14 @@ find_missing() { # GROUP
             want_package libsimavr-dev /usr/include/simavr/sim_avr.h
             want_package libelf-dev /usr/include/libelf.h
             ;;
+        soak)
+            want_command clang++ clang
+            # Its libFuzzer is a package of its own where that is known; else in clang's.
+            ls "$(clang++ -print-runtime-dir 2>/dev/null)"/libclang_rt.fuzzer* >/dev/null 2>&1 ||
+                { apt-cache show libclang-rt-dev >/dev/null 2>&1 && missing="$missing libclang-rt-dev"; }
+            ;;
         *)
-            echo "usage: tools/system_packages.sh demo|avr" >&2
+            echo "usage: tools/system_packages.sh demo|avr|soak" >&2
             exit 2
             ;;
     esac
