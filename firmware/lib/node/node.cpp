@@ -305,7 +305,7 @@ RELPOS_SHARED void Node::run_ranging(uint32_t now_us) {
   if (pozyx_.ready()) {
     wait = between_exchanges();
   } else if (pozyx_.step(board_, now_us, &wait, &result) == Pozyx::Event::kDone) {
-    plan_.done(now_ms(), result.success);
+    plan_.done(result.success);
     if (result.success) {
       ++ranging_successes_;
       PendingRange pending;

@@ -8,6 +8,7 @@ namespace relpos {
 void RangingPlan::begin(uint16_t now_ms, uint16_t seed) {
   origin_ms_ = now_ms;
   random_ = seed | 1;  // not 0, where it would stay
+  probing_ = true;
 }
 
 void RangingPlan::beacon(uint16_t now_ms, const wire::Beacon& beacon, uint8_t id) {
@@ -65,19 +66,21 @@ RELPOS_SHARED uint8_t RangingPlan::next(uint16_t now_ms, uint8_t id, uint8_t tea
   }
   if (!planned_) {
     planned_ = true;
-    if (count_ != 0) {
-      const uint16_t window_ms = period_ms / count;
-      begin_ms_ = place * window_ms;
-      end_ms_ = static_cast<uint16_t>(begin_ms_ + window_ms - (kExchangeMs + kGuardMs));
-    } else {
+    const uint16_t window_ms = period_ms / count;
+    begin_ms_ = place * window_ms;
+    if (count_ == 0) {
       // Marsaglia 2003, for 16 bits: of full period. A linear congruence would keep nodes with
       // neighbouring ids evenly apart, sometimes next to each other.
       random_ ^= static_cast<uint16_t>(random_ << 7);
       random_ ^= random_ >> 9;
       random_ ^= static_cast<uint16_t>(random_ << 8);
-      begin_ms_ = static_cast<uint16_t>((random_ & 31) * (period_ms / 64));
-      end_ms_ = period_ms;
+      begin_ms_ = static_cast<uint16_t>((random_ & 127) * ((period_ms - window_ms) / 128));
     }
+    // Where the window takes no exchange whole, one is begun all the same: ranges that collide now and
+    // then are better than none.
+    const uint16_t least_ms = kExchangeMs + 2 * kGuardMs;
+    end_ms_ = static_cast<uint16_t>(begin_ms_ + (window_ms > least_ms ? window_ms : least_ms) -
+                                    (kExchangeMs + kGuardMs));
   }
 
   resting_ = tried_ == 0;  // else it backs off
@@ -88,29 +91,28 @@ RELPOS_SHARED uint8_t RangingPlan::next(uint16_t now_ms, uint8_t id, uint8_t tea
   const uint8_t most = static_cast<uint8_t>(count > kAllInARound ? count / 2 : count - 1);
   while (at_ms <= end_ms_ && tried_ < most) {
     ++tried_;
-    if (++step_ > most) step_ = 1;
+    if (++step_ > most) {
+      step_ = 1;
+      const uint8_t now = static_cast<uint8_t>(now_ms / kProbeMs);
+      probing_ = now != probed_;
+      probed_ = now;
+    }
     uint8_t index = static_cast<uint8_t>(place + step_);
     if (index >= count) index = static_cast<uint8_t>(index - count);
     index_ = index;
     resting_ = false;
     if (count_ != 0) return ids_[index];
     const uint8_t bits = ranged_[index / 8] | before_[index / 8];
-    if ((bits >> (index & 7) & 1) != 0 || round_ < kSilentRounds ||
-        ((round_ + index) & (kSilentRounds - 1)) == 0) {
-      return static_cast<uint8_t>(index + 1);
-    }
+    if (probing_ || (bits >> (index & 7) & 1) != 0) return static_cast<uint8_t>(index + 1);
   }
   resting_ = true;
   *wait_ms = static_cast<uint16_t>(period_ms - at_ms);
   return 0;
 }
 
-RELPOS_UNCLONED void RangingPlan::done(uint16_t now_ms, bool success) {
+RELPOS_UNCLONED void RangingPlan::done(bool success) {
   if (success) {
     ranged_[index_ / 8] |= static_cast<uint8_t>(1 << (index_ & 7));
-  } else if (count_ == 0) {
-    const uint8_t at = static_cast<uint8_t>(now_ms >> 2);
-    begin_ms_ = static_cast<uint16_t>(now_ms - origin_ms_ + ((random_ ^ at) & kMostBackOffMs));
   }
 }
 

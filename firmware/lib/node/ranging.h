@@ -20,12 +20,13 @@ constexpr uint16_t kBeaconHoldMs = 5000;
 // Up to so many nodes everybody ranges everybody in every round. Of more, each ranges the half of the
 // ring that comes after it, as many in a round as its window takes: 10 of 20 in four rounds.
 constexpr uint8_t kAllInARound = 7;
-// Without a beacon: a round begins within the first half of its period at random, and after a failure
-// up to so much later, so that two nodes do not collide again and again.
-constexpr uint8_t kMostBackOffMs = 63;  // one less than a power of two
-// Without a beacon ids are tried that may not exist: after the first so many rounds, a silent one in
-// every so many.
-constexpr uint8_t kSilentRounds = 4;
+// Without a beacon a window is as long as it would be with one, and begins at random in each round: so
+// the nodes ask no more of the air than it has, and two do not collide again and again. (Whole rounds
+// with a pause after each failure left 20 nodes 16 % of their exchanges and some nodes none; this, 42 %:
+// bench/ranging/slots.py.)
+// Without a beacon ids are tried that may not exist: the silent ones only in the first pass over all
+// that begins in each so many ms. A pass takes at most five rounds: nobody waits longer than 10 s.
+constexpr uint16_t kProbeMs = 4096;
 
 // Zeroed memory is the start: make it as `RangingPlan()`. Times are the low 16 bits of milliseconds;
 // next() is to be asked at least every few seconds.
@@ -37,7 +38,7 @@ class RangingPlan {
   // one round a period_ms, over ids 1 to team_size.
   uint8_t next(uint16_t now_ms, uint8_t id, uint8_t team_size, uint16_t period_ms,
                uint16_t* wait_ms);
-  void done(uint16_t now_ms, bool success);  // of what next() returned last
+  void done(bool success);  // of what next() returned last
 
   bool resting() const { return resting_; }  // nothing more in this round
   void age(uint16_t now_ms);                 // before the next two are read
@@ -63,6 +64,8 @@ class RangingPlan {
   uint8_t tried_;   // in this round
   uint8_t index_;   // of the exchange under way
   uint8_t epoch_;
+  uint8_t probed_;  // when a pass did last
+  bool probing_;    // the silent ones, too, in this pass
   bool planned_;    // begin_ms_ and end_ms_ are those of this superframe
   bool resting_;
 };

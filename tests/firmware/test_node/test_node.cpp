@@ -365,10 +365,10 @@ TEST(of_more_than_seven_each_ranges_the_half_that_comes_after_it) {
 
 struct Slots {
   static void hear(Team& team, uint16_t phase_ms, uint8_t round, uint8_t count,
-                   uint8_t first_id = 1) {
+                   uint8_t first_id = 1, uint16_t period_ms = 2000) {
     wire::Beacon beacon;
     beacon.phase_ms = phase_ms;
-    beacon.period_ms = 2000;
+    beacon.period_ms = period_ms;
     beacon.round = round;
     beacon.count = count;
     for (uint8_t i = 0; i < count; ++i) beacon.entries[i].node = static_cast<uint8_t>(first_id + i);
@@ -430,7 +430,7 @@ TEST(twenty_nodes_get_every_pair_within_ten_seconds) {
       const uint8_t peer = plan.next(static_cast<uint16_t>(now_ms), id, 6, 2000, &wait_ms);
       if (peer == 0) continue;
       CHECK(peer != id && peer <= 20);
-      plan.done(static_cast<uint16_t>(now_ms + 23), true);
+      plan.done(true);
       busy_until_ms = now_ms + 23;
       const uint32_t gap_ms = now_ms - last_ms[id][peer];
       if (gap_ms > longest_ms) longest_ms = gap_ms;
@@ -470,6 +470,39 @@ TEST(the_led_tells_the_states_apart) {
     // Without samples the loop sleeps for up to 100 ms.
     CHECK_NEAR(lit[state], (team.world.lit_us - lit_before_us) / 40960.0f,
                state == kSensorMissing ? 15 : 3);
+  }
+}
+
+TEST(without_a_beacon_a_silent_node_is_asked_again_within_ten_seconds_and_not_all_the_time) {
+  for (uint8_t team_size = 3; team_size <= 20; ++team_size) {
+    for (uint8_t silent_share = 2; silent_share <= 4; ++silent_share) {  // one in so many
+      relpos::RangingPlan plan = relpos::RangingPlan();
+      plan.begin(0, 1234);
+      uint32_t asked_ms[21] = {};
+      uint8_t asked[21] = {};
+      uint32_t longest_ms = 0, busy_until_ms = 0;
+      for (uint32_t now_ms = 0; now_ms < 120000; ++now_ms) {
+        if (now_ms < busy_until_ms) continue;
+        uint16_t wait_ms = 0;
+        const uint8_t peer = plan.next(static_cast<uint16_t>(now_ms), 2, team_size, 2000, &wait_ms);
+        if (peer == 0) continue;
+        const bool silent = peer % silent_share == 0;
+        plan.done(!silent);
+        busy_until_ms = now_ms + (silent ? 33 : 23);
+        ++asked[peer];
+        if (silent) CHECK(asked[peer] <= 31);  // of 60 rounds
+        const uint32_t gap_ms = now_ms - asked_ms[peer];
+        if (asked_ms[peer] != 0 && gap_ms > longest_ms) longest_ms = gap_ms;
+        asked_ms[peer] = now_ms;
+      }
+      CHECK(longest_ms <= 10000);
+      uint8_t late = 0;
+      for (uint8_t peer = 1; peer <= team_size; ++peer) {
+        late = static_cast<uint8_t>(late + (asked_ms[peer] < 110000));
+      }
+      // This node, and of more than seven the half of the ring that asks it.
+      CHECK_EQUAL(team_size <= 7 ? 1 : team_size - team_size / 2, late);
+    }
   }
 }
 
@@ -526,6 +559,23 @@ TEST(without_its_pozyx_a_node_tells_no_neighbours_and_no_team_of_old) {
   CHECK_EQUAL(0, status.team);
   CHECK_EQUAL(0, status.neighbours);
   CHECK(!(status.health & static_cast<uint8_t>(wire::Health::kBeacon)));
+}
+
+TEST(a_period_too_short_for_everybody_s_window_still_gives_ranges) {
+  for (const bool beacon : {false, true}) {
+    Team team;
+    team.world.exchange_us = 20000;
+    team.world.command(1, static_cast<uint8_t>(wire::CommandCode::kSetRangingPeriodMs), 200);
+    for (uint8_t second = 0; second < 12; ++second) {
+      if (beacon) Slots::hear(team, 0, static_cast<uint8_t>(5 * second), 6, 1, 200);
+      team.run_ms(1000);
+    }
+    wire::Status status;
+    CHECK(team.read(wire::MessageType::kStatus, &status));
+    CHECK(status.ranging_successes > 20);
+    CHECK(status.ranging_successes < 80);
+    CHECK_EQUAL(5, status.neighbours);
+  }
 }
 
 TEST(a_replayed_beacon_moves_no_slot) {
