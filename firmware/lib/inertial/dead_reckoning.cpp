@@ -100,6 +100,16 @@ const float kBent_s = 5.0f;  // longer is no bending
 const uint8_t kSettledSteps = 10, kDoubtedSteps = 8, kTurnedSteps = 22;
 const float kTurned_rad = 35.0f * kDegree;
 
+// Of the measurements, by what is measured.
+enum Sigma : uint8_t {
+  kOfLateral, kOfVertical, kOfStraight, kOfStood, kOfField, kOfStill, kOfLoose,
+  kOfStep  // a step's own
+};
+const float kSigmas[] PROGMEM = {
+    kLateralSigma_m,  kVerticalSigma_m, kStraightSigma_rad_s, kSway_rad / kStill_s,
+    kFieldSigma_rad,  kStillSigma_m_s,  kLooseSigma_m_s,
+};
+
 const uint8_t kHoldTicks = 100;       // two seconds: a flag is seen by a report a second
 
 // By its bits: the boards' compiler is told that there is no other number (-ffinite-math-only), so
@@ -120,9 +130,6 @@ RELPOS_SHARED void left_of(const float axis[2], float out[2]) {
   out[kX] = -axis[kY];
   out[kY] = axis[kX];
 }
-
-// Variance of a measurement whose errors have long tails: the further off, the less it says.
-float doubted(float sigma, float innovation) { return sigma * sigma + innovation * innovation; }
 
 }  // namespace
 
@@ -474,8 +481,13 @@ void DeadReckoning::work() {
 
 void DeadReckoning::run(Job job) {
   State group = kPosition;
+  uint8_t axis = kZ;
+  if (job >= kStillX && job <= kStillZ) axis = static_cast<uint8_t>(job - kStillX);
   float direction[kAxes] = {0.0f, 0.0f, 0.0f};
-  float innovation, variance, yaw = 0.0f;
+  direction[axis] = 1.0f;
+  const float* state;  // what is measured, less what it should be
+  uint8_t which = kOfStep;
+  float yaw = 0.0f;
   // The walking direction turns with the heading's error, so the step's measurements depend on that
   // too: turning heading, velocity and position together changes neither. Without these terms the
   // filter believed to observe the heading and lost it (18 deg/min on simulated walks, NEES 74).
@@ -487,46 +499,35 @@ void DeadReckoning::run(Job job) {
       if (!velocity_known_) job_ = kVertical;
       if (!step_directed_) job_ = kVertical;
       return;
-    case kForward: {
+    case kForward:
       memcpy(direction, walk_, sizeof walk_);
+      direction[kZ] = 0.0f;
       yaw = way[kY];
-      innovation = step_length_m_ - way[kX];
-      variance = step_sigma_m_ * step_sigma_m_;
-      const float least = innovation * innovation * (1.0f / (kDoubt * kDoubt)) -
-                          filter_.along(kPosition, walk_);
-      if (least > variance) {  // weighed down to what makes it a three-sigma surprise
-        variance = least;
-        count(&counters_.doubtful_steps);
-        hold_[kHoldDoubt] = kHoldTicks;
-      }
+      add(&way[kX], -step_length_m_);
+      state = &way[kX];
       break;
-    }
     case kLateral:
       left_of(walk_, direction);
+      direction[kZ] = 0.0f;
       yaw = -way[kX];
-      innovation = -way[kY];
-      variance = kLateralSigma_m * kLateralSigma_m;
+      state = &way[kY];
+      which = kOfLateral;
       break;
     case kVertical:
-      direction[kZ] = 1.0f;
-      innovation = -stance_position_m_[kZ];
-      variance = kVerticalSigma_m * kVerticalSigma_m;
+      state = &stance_position_m_[kZ];
+      which = kOfVertical;
       if (!step_straight_) job_ = kCommit;
       break;
     case kDrift:
-    case kStood: {
-      const float sigma_rad_s = job == kDrift ? kStraightSigma_rad_s : kSway_rad / kStill_s;
-      innovation = -straight_rate_rad_s_;
-      if (innovation * innovation > kStraightGate * rate_variance(sigma_rad_s, direction)) return;
+    case kStood:
+      state = &straight_rate_rad_s_;
+      which = job == kDrift ? kOfStraight : kOfStood;
       group = kBias;
-      variance = doubted(sigma_rad_s, innovation);
       break;
-    }
     case kMagnetic:
+      state = &magnetic_excess_rad_;
+      which = kOfField;
       group = kAttitude;
-      direction[kZ] = 1.0f;
-      innovation = magnetic_residual_rad_;
-      variance = doubted(kFieldSigma_rad, innovation);
       break;
     case kCommit:
       commit_step();
@@ -536,21 +537,37 @@ void DeadReckoning::run(Job job) {
       return;
     case kStillX:
     case kStillY:
-    case kStillZ: {
-      const uint8_t axis = job - kStillX;
-      const float sigma = quiet() ? kStillSigma_m_s : kLooseSigma_m_s;
+    case kStillZ:
+      state = &velocity_m_s_[axis];
+      which = quiet() ? kOfStill : kOfLoose;
       group = kVelocity;
-      direction[axis] = 1.0f;
-      innovation = -velocity_m_s_[axis];
-      variance = sigma * sigma;
       break;
-    }
     default:
       commit_still();
       job_ = kIdle;
       return;
   }
-  measure(group, direction, innovation, variance, yaw);
+  const float excess = *state;
+  const float square = excess * excess;
+  float sigma;
+  if (which == kOfStep) {
+    sigma = step_sigma_m_;
+  } else {
+    memcpy_P(&sigma, &kSigmas[which], sizeof sigma);
+  }
+  float variance = sigma * sigma;
+  if (group == kBias && square > kStraightGate * rate_variance(variance, direction)) return;
+  // Errors of rate and field have long tails: the further off, the less a reading says.
+  if (group <= kBias) variance += square;
+  if (job == kForward) {
+    const float least = square * (1.0f / (kDoubt * kDoubt)) - filter_.along(kPosition, walk_);
+    if (least > variance) {  // weighed down to what makes it a three-sigma surprise
+      variance = least;
+      count(&counters_.doubtful_steps);
+      hold_[kHoldDoubt] = kHoldTicks;
+    }
+  }
+  measure(group, direction, -excess, variance, yaw);
 }
 
 RELPOS_APART void DeadReckoning::measure(State group, const float direction[kAxes], float innovation,
@@ -578,9 +595,9 @@ RELPOS_APART void DeadReckoning::begin_straight() {
   straight_s_ = 0.0f;
 }
 
-// Of a measured rate about the vertical, whose direction is filled in.
-float DeadReckoning::rate_variance(float sigma_rad_s, float direction[kAxes]) {
-  float expected = sigma_rad_s * sigma_rad_s;
+// What is expected of a rate measured about the vertical with that variance; fills in its direction.
+float DeadReckoning::rate_variance(float variance, float direction[kAxes]) {
+  float expected = variance;
   for (uint8_t i = 0; i < kAxes; ++i) {
     direction[i] = -rotation_[3 * kZ + i];
     expected += direction[i] * direction[i] * filter_.covariance(kBias + i, kBias + i);
@@ -670,12 +687,12 @@ RELPOS_APART void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
   }
   const float azimuth = atan2f(field[kY], field[kX]);
   bool plausible = strength > kFieldLeast_ut && strength < kFieldMost_ut;
-  magnetic_residual_rad_ = turn_between(azimuth, magnetic_azimuth_rad_);
+  magnetic_excess_rad_ = turn_between(magnetic_azimuth_rad_, azimuth);
   if (plausible) {
     float share = kFieldShare;
     if (magnetic_count_ < kFieldReadings) {
       share = 1.0f / ++magnetic_count_;
-      magnetic_azimuth_rad_ = wrap_angle(magnetic_azimuth_rad_ - magnetic_residual_rad_ * share);
+      magnetic_azimuth_rad_ = wrap_angle(magnetic_azimuth_rad_ + magnetic_excess_rad_ * share);
       filter_.set_reference(kFieldSigma_rad * kFieldSigma_rad);
     } else {
       plausible = fabsf(strength - magnetic_norm_ut_) < kFieldNorm * magnetic_norm_ut_ &&

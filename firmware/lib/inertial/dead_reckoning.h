@@ -107,7 +107,7 @@ class DeadReckoning {
   void commit_still();
   void begin_straight();
   bool quiet() const;
-  float rate_variance(float sigma_rad_s, float direction[kAxes]);
+  float rate_variance(float variance, float direction[kAxes]);
   void publish();
 
   // What is small and often used first: the AVR reaches 64 bytes from a pointer in one instruction.
@@ -152,7 +152,7 @@ class DeadReckoning {
   // The field as it was met so far, navigation frame.
   float magnetic_azimuth_rad_;
   float magnetic_norm_ut_, magnetic_vertical_ut_;
-  float magnetic_residual_rad_;
+  float magnetic_excess_rad_;
   float quiet_s_, mean_force_m_s2_;
 
 
