@@ -17,6 +17,7 @@ from avr_programs import MISSING, Builder
 from relpos.emulator.avr import BOARDS, AvrEngine, Board, Firmware, SimulatorError, read_firmware
 from relpos.emulator.avr.board import BUS_HANGS, BusOperation, ResetCause
 from relpos.emulator.bus import I2cBus, I2cDevice
+from relpos.emulator.engine import NodeClockError
 
 pytestmark = pytest.mark.skipif(MISSING is not None, reason=f"{MISSING} is not installed")
 
@@ -524,6 +525,41 @@ int main(void) { uart(51); for (uint8_t i = 0; i < 64; i++) put(kept[i]); for (;
         assert len(set(sent(board))) > 30
 
 
+@pytest.mark.parametrize("cause", list(ResetCause))
+def test_ram_outlives_a_reset_and_not_a_loss_of_supply(build: Builder, cause: ResetCause) -> None:
+    program = r"""
+uint8_t kept[64] __attribute__((section(".noinit")));
+int main(void) {
+  uart(51);
+  for (uint8_t i = 0; i < 64; i++) { put(kept[i]); kept[i] = i; }
+  for (;;);
+}
+"""
+    with Board(BOARDS["uno"], build(program)) as board:
+        board.run(16_000 * 20)
+        sent(board)
+        board.reset(cause)
+        board.run(16_000 * 40)
+        found = sent(board)
+    if cause in (ResetCause.POWER_ON, ResetCause.BROWN_OUT):
+        assert sum(a == b for a, b in zip(found, range(64), strict=True)) < 10
+    else:
+        assert found == bytes(range(64))
+
+
+def test_a_crystal_that_changes_its_rate_makes_no_jump_of_the_clock(build: Builder) -> None:
+    firmware = build("int main(void) { for (;;) { GPIOR0 = 1; _delay_ms(10); GPIOR0 = 0; } }")
+    board = AvrEngine(BOARDS["uno"], firmware, I2cBus(), bytearray(1024), 1)
+    board.run(1_000_000)
+    board.set_drift(1_000_000, 5000.0)
+    board.run(2_000_000)
+    assert board.board.cycle == pytest.approx(16e6 * (1.0 + 1.005), abs=4)
+    board.set_drift(2_000_000, 0.0)
+    board.run(3_000_000)
+    assert board.board.cycle == pytest.approx(16e6 * (2.0 + 1.005), abs=4)
+    board.close()
+
+
 def test_static_ram_and_flash_agree_with_avr_size(build: Builder, tmp_path: Path) -> None:
     program = r"""
 volatile uint8_t zeroed[100]; volatile uint16_t set[10] = {1, 2, 3};
@@ -552,7 +588,9 @@ def test_a_drifting_crystal_stretches_the_nodes_time(build: Builder) -> None:
     firmware = build("int main(void) { for (;;) { GPIOR0 = 1; _delay_ms(10); GPIOR0 = 0; } }")
     cycles = []
     for ppm in (0.0, 50.0):
-        board = AvrEngine(BOARDS["uno"], firmware, I2cBus(), bytearray(1024), 1, drift_ppm=ppm)
+        board = AvrEngine(
+            BOARDS["uno"], firmware, I2cBus(), bytearray(1024), 1, clock=NodeClockError(ppm)
+        )
         board.run(1_000_000)
         cycles.append(board.board.cycle)
         board.close()
@@ -605,7 +643,7 @@ def test_what_comes_before_power_on_is_lost_and_counted(build: Builder) -> None:
     board.receive(b"!")
     board.run(70_000)
     board.close()
-    assert board.lost_before_power_on == 5
+    assert board.lost_while_off == 5
     assert [data for _, data in heard] == [b"!"]
     assert heard[0][0] == pytest.approx(60_000 + 2 * 260, abs=10)
 

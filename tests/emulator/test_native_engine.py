@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -138,6 +139,15 @@ def test_a_reset_starts_the_firmware_anew_and_keeps_the_eeprom(library):
     assert boot[:3] == bytes((ord("B"), ResetCause.COMMAND, 0x42))
     assert int.from_bytes(boot[4:8], "little") == 0  # the clock, too, begins anew
     assert node.engine.resets == 1
+
+
+def test_a_clock_that_changes_its_rate_makes_no_jump(library):
+    node = Node(library).run(1_000_000)
+    node.engine.set_drift(1_005_000, 5000.0)
+    node.run(11_005_000)
+    times = node.polls()
+    assert all(10_000 <= b - a < 10_100 for a, b in pairwise(times))
+    assert times[-1] == pytest.approx(11_055_000, abs=12_000)
 
 
 def test_a_firmware_that_refuses_to_start_is_an_error(library):

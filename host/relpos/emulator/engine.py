@@ -8,6 +8,12 @@ from typing import Protocol
 
 from relpos.protocol.messages import ResetCause
 
+RESTART_US = 70_000
+"""From a reset to the first pass: 65 ms start-up of the ATmega's fuses, then the C runtime."""
+EEPROM_WRITE_US = 3_400
+"""A byte of the ATmega's EEPROM erased and written (ATmega328P data sheet, EEPROM timing)."""
+POWER_LOSS = frozenset((ResetCause.POWER_ON, ResetCause.BROWN_OUT))
+"""Causes of a reset with the supply gone meanwhile."""
 NEVER_US = 1 << 62
 """A due time that does not come."""
 
@@ -39,6 +45,9 @@ class Engine(Protocol):
     def run(self, until_us: int) -> None:
         """Advance the board to virtual time ``until_us``."""
 
+    def executes(self, time_us: int) -> bool:
+        """Whether it is powered and the start-up after the last reset is over at ``time_us``."""
+
     def receive(self, data: bytes) -> None:
         """Bytes that arrive now at the board's UART."""
 
@@ -46,7 +55,16 @@ class Engine(Protocol):
         """Supply in millivolts that the board measures from now on; 5000 at first."""
 
     def reset(self, time_us: int, cause: ResetCause) -> None:
-        """Restart the board at ``time_us``: its RAM is lost, EEPROM and chips keep their state."""
+        """Restart the board at ``time_us``; it executes again RESTART_US later.
+
+        The firmware is told the cause as that board tells it (MCUSR on an AVR). EEPROM and chips
+        keep their state, but where the supply was lost (power-on, brown-out) the EEPROM byte being
+        written is left erased. The firmware of an AVR finds in its RAM what was there, or after a
+        loss of supply garbage.
+        """
+
+    def set_drift(self, time_us: int, drift_ppm: float) -> None:
+        """From ``time_us`` on the oscillator is off by ``drift_ppm``; the clock does not jump."""
 
     def stall(self, time_us: int, until_us: int) -> None:
         """The oscillator stands from ``time_us`` to ``until_us``: nothing executes or counts."""

@@ -20,7 +20,7 @@ from relpos.errors import DeviceError
 from relpos.protocol.messages import ResetCause
 
 from .bus import BusStatus, I2cBus
-from .engine import NodeClockError
+from .engine import EEPROM_WRITE_US, POWER_LOSS, RESTART_US, NodeClockError
 from .xbee import line_time_us
 
 _COMPILE = ("-std=gnu++11", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
@@ -30,8 +30,6 @@ LOOP_US = 200
 what the Uno needs for an idle pass with its interrupts. Without it virtual time would stand."""
 EEPROM_BYTES = 1024
 UART_BAUD = 38_400
-RESTART_US = 70_000
-"""From a reset to the first pass: 65 ms start-up of the ATmega's fuses, then the C runtime."""
 
 _U8 = ctypes.c_uint8
 _U16 = ctypes.c_uint16
@@ -176,6 +174,11 @@ class NativeEngine:
         self._clock = clock or NodeClockError()
         self._power_on_us = power_on_us
         self._rate = 1.0 + self._clock.drift_ppm * 1e-6
+        self._written_at = 0
+        self._written_until_us = 0
+        # The node's clock as a line through its newest bend: a restart or another drift.
+        self._bend_us = power_on_us
+        self._bend_node_us = self._clock.offset_us
         self._library = load(library or build())
         self._poll = self._library.relpos_node_poll
         self._eeprom = (_U8 * len(eeprom)).from_buffer(eeprom)
@@ -209,9 +212,9 @@ class NativeEngine:
         self._library.relpos_node_set_supply(self._node, self._supply_mv)
 
     def _node_us(self, time_us: int) -> int:
-        """Node clock, 32 bits: it begins at the offset when the node is powered on."""
-        since_us = int((time_us - self._power_on_us) * self._rate)
-        return (since_us + self._clock.offset_us) & 0xFFFFFFFF
+        """Node clock, 32 bits: from the offset at power-on, from 0 after a reset."""
+        since_us = int((time_us - self._bend_us) * self._rate)
+        return (since_us + self._bend_node_us) & 0xFFFFFFFF
 
     # -- called by the firmware -----------------------------------------------------------------
 
@@ -255,6 +258,10 @@ class NativeEngine:
     def _stored(self, _context: int | None, at: int, value: int) -> None:
         try:
             self.store(at, value)
+            self._written_at = at
+            # A fault that stores something else has cut the supply itself.
+            intact = self._eeprom[at] == value
+            self._written_until_us = self._now_us + EEPROM_WRITE_US if intact else 0
         except BaseException as error:
             self._error = error
 
@@ -281,14 +288,14 @@ class NativeEngine:
             self.next_due_us = time_us + LOOP_US
             return
         # First virtual microsecond at which the node's clock, cut to whole ones, shows that time.
-        due_node_us = int((time_us - self._power_on_us) * self._rate) + wait_us
+        due_node_us = int((time_us - self._bend_us) * self._rate) + wait_us
         since_us = int(due_node_us / self._rate)
         while int(since_us * self._rate) < due_node_us:
             since_us += 1
-        self.next_due_us = self._power_on_us + since_us
+        self.next_due_us = self._bend_us + since_us
 
     def executes(self, time_us: int) -> bool:
-        """Whether the start-up after the last reset is over."""
+        """Whether it is powered and the start-up after the last reset is over at ``time_us``."""
         return time_us >= self._power_on_us
 
     def receive(self, data: bytes) -> None:
@@ -297,13 +304,27 @@ class NativeEngine:
             self._library.relpos_node_receive(self._node, data, len(data))
 
     def reset(self, time_us: int, cause: ResetCause) -> None:
-        """Restart the firmware: its RAM is lost, EEPROM and chips keep their state."""
+        """Restart the firmware: its RAM is lost, EEPROM and chips keep their state.
+
+        A byte being written to the EEPROM is left erased where the supply was lost.
+        """
         self._reset_asked = False
+        if cause in POWER_LOSS and time_us < self._written_until_us:
+            self._eeprom[self._written_at] = 0xFF
+        self._written_until_us = 0
         self.resets += 1
         self._library.relpos_node_destroy(self._node)
-        self._power_on_us = time_us + RESTART_US
+        self._power_on_us = self._bend_us = time_us + RESTART_US
+        self._bend_node_us = 0
         self.next_due_us = self._power_on_us
         self._create(cause)
+
+    def set_drift(self, time_us: int, drift_ppm: float) -> None:
+        """From ``time_us`` on the oscillator is off by ``drift_ppm``; the clock does not jump."""
+        if time_us > self._bend_us:
+            self._bend_node_us += int((time_us - self._bend_us) * self._rate)
+            self._bend_us = time_us
+        self._rate = 1.0 + drift_ppm * 1e-6
 
     def set_supply(self, supply_mv: int) -> None:
         """Supply in millivolts that the board measures from now on, over restarts too."""
@@ -314,6 +335,7 @@ class NativeEngine:
     def stall(self, time_us: int, until_us: int) -> None:
         """The oscillator stands from ``time_us`` to ``until_us``: nothing executes or counts."""
         self._power_on_us += until_us - time_us
+        self._bend_us += until_us - time_us
         self.next_due_us = max(self.next_due_us, time_us) + until_us - time_us
 
     def close(self) -> None:

@@ -7,7 +7,6 @@ from enum import StrEnum
 
 import numpy as np
 
-from relpos.errors import DeviceError
 from relpos.protocol import messages as wire
 
 from . import ak8975, mpu9150, pozyx
@@ -188,7 +187,7 @@ class EmulatedNode:
     def _hear(self, data: bytes, now_us: int) -> None:
         if now_us < max(self.errors.power_on_us, self._stopped_until_us):
             return
-        if isinstance(self.engine, NativeEngine) and not self.engine.executes(now_us):
+        if not self.engine.executes(now_us):
             return
         self.engine.receive(data)
         if not self._paced_by_engine and now_us < self._due_us:
@@ -243,8 +242,6 @@ def make_engine(
             power_on_us=errors.power_on_us,
             stored_id=True,
         )
-    if errors.clock.offset_us:
-        raise DeviceError("a simulated AVR's clock begins at 0: it takes no offset")
     # Only here: the simulator's library is not needed by anybody else.
     from .avr import BOARDS, AvrEngine, read_firmware
     from .avr.budget import default_build_folder, find_firmware
@@ -256,6 +253,6 @@ def make_engine(
         bus,
         eeprom,
         node,
-        drift_ppm=errors.clock.drift_ppm,
+        clock=errors.clock,
         power_on_us=errors.power_on_us,
     )

@@ -46,7 +46,11 @@ class NativeBoard final : public Board {
   }
   uint8_t storage_read(uint16_t at) override { return at < eeprom_size_ ? eeprom_[at] : 0xFF; }
   bool storage_write(uint16_t at, uint8_t value) override {
-    if (at >= eeprom_size_) return true;
+    if (writing_ && now_us_ - writing_since_us_ < kStorageWriteUs) return false;
+    writing_ = false;
+    if (at >= eeprom_size_ || eeprom_[at] == value) return true;
+    writing_ = true;
+    writing_since_us_ = now_us_;
     if (callbacks_.storage_write != nullptr) {
       callbacks_.storage_write(callbacks_.context, at, value);
     } else {
@@ -80,10 +84,13 @@ class NativeBoard final : public Board {
  private:
   static constexpr uint16_t kReceiveBytes = 256;
   static constexpr uint8_t kWriteBytes = 255;
+  static constexpr uint32_t kStorageWriteUs = 3400;  // a byte (ATmega328P data sheet, EEPROM timing)
 
   relpos_board_callbacks callbacks_;
   uint8_t* eeprom_;
   uint16_t eeprom_size_;
+  bool writing_ = false;
+  uint32_t writing_since_us_ = 0;
   uint32_t now_us_;
   uint16_t supply_mv_ = 5000;
   uint8_t received_[kReceiveBytes];

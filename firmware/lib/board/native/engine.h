@@ -22,7 +22,8 @@ typedef struct {
   /* The node asked to reboot: destroy it after the poll has returned and create it anew with reset
    * cause 4 (watchdog) or 5 (command). */
   void (*reset)(void* context);
-  /* Instead of a write to eeprom, which is then the caller's to do; NULL: written in place. */
+  /* A byte begins to be written to eeprom, which is the caller's to do; NULL: written in place. For
+   * 3.4 ms the node gets no further one written. What already stands there is not written again. */
   void (*storage_write)(void* context, uint16_t at, uint8_t value);
 } relpos_board_callbacks;
 

@@ -152,7 +152,11 @@ class Board:
             raise SimulatorError(f"{self.kind.name}: {message}")
 
     def reset(self, cause: ResetCause = ResetCause.EXTERNAL) -> None:
-        """Reset from outside; RAM and EEPROM keep their contents."""
+        """Reset from outside; EEPROM and RAM keep their contents.
+
+        But after POWER_ON and BROWN_OUT the EEPROM byte being written is erased and the RAM holds
+        garbage.
+        """
         self._library.relpos_avr_reset(self._alive(), int(cause))
 
     def receive(self, data: bytes, cycle: int = 0) -> None:
@@ -218,6 +222,15 @@ class Board:
     def set_supply(self, supply_mv: int) -> None:
         """Supply in millivolts from now on, as the chip's converter sees it; 5000 at first."""
         self._library.relpos_avr_set_supply(self._alive(), supply_mv)
+
+    def set_frequency(self, frequency_hz: int) -> None:
+        """Clock of the board from now on; the cycle counter goes on."""
+        self.frequency_hz = frequency_hz
+        self._library.relpos_avr_set_frequency(self._alive(), frequency_hz)
+
+    def store(self, address: int, value: int) -> None:
+        """Store a byte in data memory as the program would: registers react."""
+        self._library.relpos_avr_data_set(self._alive(), address, value)
 
     def data(self, address: int, count: int) -> bytes:
         """Bytes of data memory (registers, I/O, RAM) as they are now."""

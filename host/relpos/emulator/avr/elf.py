@@ -7,6 +7,7 @@ avr-ld keeps the three address spaces apart by offsets: data memory from 0x80000
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,8 @@ _FUSES = 0x820000
 _MACHINE_AVR = 83
 _ALLOCATED = 2
 _LOAD = 1
+_SYMBOLS = 2
+_VARIABLE = 1
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,8 @@ class Firmware:
     """First data address that no variable occupies; the stack may grow down to here."""
     eeprom: bytes
     """Start values of the EEPROM from address 0, often empty."""
+    variables: Mapping[str, int]
+    """Data address of every variable in RAM, by its name as the linker knows it."""
 
     @property
     def flash_bytes(self) -> int:
@@ -87,7 +92,19 @@ def _parse(raw: bytes) -> Firmware:
         if kind and in_data and size:
             static_bytes += size
             static_end = max(static_end, address + size - _DATA)
-    return Firmware(bytes(flash), static_bytes, static_end, bytes(eeprom))
+    variables = {}
+    for i in range(section_count):
+        fields = struct.unpack_from("<IIIIIII", raw, section_offset + i * section_size)
+        _, kind, _, _, offset, size, strings = fields
+        if kind != _SYMBOLS:
+            continue
+        (names,) = struct.unpack_from("<I", raw, section_offset + strings * section_size + 16)
+        for at in range(offset, offset + size, 16):
+            name, value, _, info = struct.unpack_from("<IIIB", raw, at)
+            if info & 0xF == _VARIABLE and _DATA <= value < _EEPROM:
+                end = raw.index(b"\0", names + name)
+                variables[raw[names + name : end].decode("ascii")] = value - _DATA
+    return Firmware(bytes(flash), static_bytes, static_end, bytes(eeprom), variables)
 
 
 def _place(image: bytearray, at: int, content: bytes) -> None:

@@ -10,7 +10,8 @@
  *    receive buffer plus shift register, and overruns that lose bytes and are counted.
  *  - EEPROM: writes complete at once.  Replaced by 3.4 ms, during which EEPE stays set.
  *  - Entering an interrupt takes no time.  The data sheet's 4 (ATmega2560: 5) cycles are added.
- *  - RAM is zero at power-on.  Replaced by a fixed pseudo-random pattern.
+ *  - RAM is zero at power-on and kept by any reset.  Replaced by a fixed pseudo-random pattern at
+ *    power-on, and by its continuation after a reset with loss of supply.
  *  - Invalid opcodes are only printed.  Any message of simavr at error level stops the run.
  *  - sleep() slows the host down.  Replaced by nothing.
  */
@@ -79,6 +80,7 @@ struct relpos_avr {
 	uint16_t write_address;
 	uint8_t write_value;
 	int writing;
+	uint32_t noise; /* state of the generator of what RAM holds without supply */
 };
 
 static __thread relpos_avr *current; /* for the logger, which gets only the avr_t */
@@ -588,6 +590,17 @@ static void on_reset(avr_io_t *io)
 	avr->run_cycle_limit = 1u << 20; /* run in bursts up to the next timer */
 }
 
+static void scramble(relpos_avr *e)
+{
+	avr_t *avr = e->avr;
+	uint32_t noise = e->noise;
+	for (uint32_t a = avr->ioend + 1; a <= avr->ramend; a++) {
+		noise ^= noise << 13; noise ^= noise >> 17; noise ^= noise << 5;
+		avr->data[a] = (uint8_t)noise;
+	}
+	e->noise = noise;
+}
+
 int32_t relpos_avr_run(relpos_avr *e, uint64_t cycle)
 {
 	avr_t *avr = e->avr;
@@ -649,11 +662,8 @@ relpos_avr *relpos_avr_create(const char *mmcu, const uint8_t *flash, uint32_t f
 		uint32_t none = 0; /* neither slow the host down when polled nor print */
 		avr_ioctl(avr, AVR_IOCTL_UART_SET_FLAGS(name), &none);
 	}
-	uint32_t noise = 0x2545f491;
-	for (uint32_t a = avr->ioend + 1; a <= avr->ramend; a++) {
-		noise ^= noise << 13; noise ^= noise >> 17; noise ^= noise << 5;
-		avr->data[a] = (uint8_t)noise;
-	}
+	e->noise = 0x2545f491;
+	scramble(e);
 	avr_twi_t *twi = avr->io[AVR_DATA_TO_IO(A_TWCR)].w.param;
 	avr_uart_t *uart = avr->io[AVR_DATA_TO_IO(A_UDR)].w.param;
 	e->eeprom = avr->io[AVR_DATA_TO_IO(A_EECR)].w.param;
@@ -713,6 +723,7 @@ void relpos_avr_reset(relpos_avr *e, uint8_t cause)
 	current = e;
 	e->next_cause = cause;
 	avr_reset(e->avr);
+	if (cause & (PORF | BORF)) scramble(e);
 }
 
 const char *relpos_avr_error(const relpos_avr *e) { return e->error; }
@@ -755,6 +766,23 @@ void relpos_avr_data_get(const relpos_avr *e, uint16_t address, uint8_t *out, ui
 {
 	for (uint32_t i = 0; i < count; i++)
 		out[i] = address + i <= e->avr->ramend ? e->avr->data[address + i] : 0;
+}
+
+void relpos_avr_data_set(relpos_avr *e, uint16_t address, uint8_t value)
+{
+	avr_t *avr = e->avr;
+	current = e;
+	if (address > avr->ramend) return;
+	if (address >= 32 && address <= avr->ioend && avr->io[AVR_DATA_TO_IO(address)].w.c)
+		avr->io[AVR_DATA_TO_IO(address)].w.c(avr, address, value,
+				avr->io[AVR_DATA_TO_IO(address)].w.param);
+	else
+		avr->data[address] = value;
+}
+
+void relpos_avr_set_frequency(relpos_avr *e, uint32_t frequency_hz)
+{
+	e->avr->frequency = frequency_hz;
 }
 
 void relpos_avr_counters(const relpos_avr *e, uint64_t out[COUNTER_COUNT])

@@ -53,7 +53,8 @@ void relpos_avr_destroy(relpos_avr *);
 /* Run until the cycle counter reaches `cycle`; ends at most one instruction later. */
 int32_t relpos_avr_run(relpos_avr *, uint64_t cycle);
 const char *relpos_avr_error(const relpos_avr *);
-/* Reset from outside; RAM and EEPROM keep their contents.  cause becomes MCUSR. */
+/* Reset from outside; cause becomes MCUSR.  EEPROM and RAM keep their contents, but after a loss of
+ * supply (power-on, brown-out) the EEPROM byte being written is erased and the RAM holds garbage. */
 void relpos_avr_reset(relpos_avr *, uint8_t cause);
 
 /* Queue bytes for the receiver; the first begins on the wire at `cycle` or when the wire is free. */
@@ -68,7 +69,11 @@ void relpos_avr_eeprom_get(const relpos_avr *, uint8_t *out, uint32_t count);
 void relpos_avr_eeprom_set(relpos_avr *, const uint8_t *in, uint32_t count);
 /* Supply of the chip and its converter from now on; 5000 mV from the start. */
 void relpos_avr_set_supply(relpos_avr *, uint32_t millivolts);
+/* Clock of the board from now on; the cycle counter goes on. */
+void relpos_avr_set_frequency(relpos_avr *, uint32_t frequency_hz);
 void relpos_avr_data_get(const relpos_avr *, uint16_t address, uint8_t *out, uint16_t count);
+/* As if the program stored it: what a write to a register does, happens. */
+void relpos_avr_data_set(relpos_avr *, uint16_t address, uint8_t value);
 
 void relpos_avr_counters(const relpos_avr *, uint64_t out[COUNTER_COUNT]);
 void relpos_avr_clear_statistics(relpos_avr *);
