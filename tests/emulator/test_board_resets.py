@@ -39,15 +39,22 @@ class Listener:
         self.frames = []
         self.node = team.nodes[1]
         pass_on = self.node.engine.on_transmit
-        self.node.engine.on_transmit = lambda at_us, data: (self._hear(data), pass_on(at_us, data))
+        self.node.engine.on_transmit = lambda at_us, data: (
+            self._hear(data, at_us),
+            pass_on(at_us, data),
+        )
 
-    def _hear(self, data):
+    def _hear(self, data, at_us):
         for request in self.parser.feed(data):
             if isinstance(request, xbee.Transmit16):
-                self.frames.append(wire.decode(request.data))
+                self.frames.append((wire.decode(request.data), at_us * 1e-6))
 
     def until(self, time_us):
         """The frames up to then since the last call."""
+        return [frame for frame, _ in self.timed(time_us)]
+
+    def timed(self, time_us):
+        """The same, each with when it left, in seconds."""
         self.team.run(time_us)
         frames, self.frames = self.frames, []
         return frames
@@ -174,10 +181,15 @@ def test_the_wrap_of_a_boards_clock_loses_no_motion(board):
 def test_times_follow_a_clock_that_changes_its_rate(board):
     with straight(board, 30.0) as team:
         listener = Listener(team)
-        first = [f for f in listener.until(10_000_000) if f.message is wire.MOTION]
-        listener.node.engine.set_drift(10_000_000, 100_000.0)
-        later = [f for f in listener.until(30_000_000) if f.message is wire.MOTION]
-    # A report a second by the node's clock: in 20 s at 10 % more there are 22.
-    assert len(later) == 22
-    spans = [b.values["time_s"] - a.values["time_s"] for a, b in pairwise(first[-1:] + later)]
-    assert spans == pytest.approx([1.0] * 22, abs=0.06)
+        rates = []
+        for drift_ppm in (0.0, 20_000.0):
+            listener.node.engine.set_drift(team.clock.now_us, drift_ppm)
+            told = [
+                (frame.values["time_s"], left_s)
+                for frame, left_s in listener.timed(team.clock.now_us + 12_000_000)
+                if frame.message is wire.MOTION
+            ]
+            rates.append((told[-1][0] - told[0][0]) / (told[-1][1] - told[0][1]))
+        # A report leaves within 40 ms of its time.
+        assert rates == pytest.approx([1.0, 1.02], abs=0.004)
+        assert 0.0 < told[0][0] - 12.0 < 1.1  # no jump in between
