@@ -20,7 +20,8 @@ constexpr uint32_t kMostWaitUs = 100000;
 // its own retries in under 100 ms.
 constexpr uint16_t kTransmitStatusMs = 200;
 constexpr int16_t kWeakSignalDbm = -95;    // DW1000: close to the sensitivity limit [K]
-constexpr uint16_t kMotionPhaseMs = 157;   // between the reports of neighbouring ids, modulo period
+constexpr uint16_t kMotionPhaseMs = 157;   // between the reports of neighbouring ids, up to
+constexpr uint16_t kMostMotionPhaseMs = 1023;
 constexpr uint16_t kMostStepAgeMs = 2000;  // then it is sent without waiting for others
 constexpr uint8_t kRebootBytes = 5;
 // 5 V - 10 %: what the boards' 3.3 V regulators and the Pozyx are sure to work from.
@@ -112,8 +113,7 @@ void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
   dead_reckoning_.reset();  // the bias begins as well known as it is configured
   // Nodes switched on together do not all speak and range at the same moment.
   motion_ms_ = static_cast<uint16_t>(
-      static_cast<uint16_t>(id_ * kMotionPhaseMs) % settings_.report_period_ms -
-      settings_.report_period_ms);
+      (static_cast<uint16_t>(id_ * kMotionPhaseMs) & kMostMotionPhaseMs) - settings_.report_period_ms);
   plan_.begin(now_ms(), static_cast<uint16_t>(id_ * 257 + counter_));
   // The first status follows the first motion: it tells who is there, and why.
   status_ms_ = static_cast<uint16_t>(motion_ms_ + settings_.report_period_ms - settings_.status_period_ms);

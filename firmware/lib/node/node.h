@@ -55,6 +55,7 @@ struct NodeState : Persistent {
   NodeClock clock_;
   SampleClock sample_clock_;
   MotionTotals totals_;
+  Storage store_;
   union {  // a node that reports raw samples does not range
     Ring<PendingRange, kPendingRanges> ranges_;
     float raw_[9];  // sums of specific force and angular rate, newest field
@@ -104,7 +105,7 @@ struct NodeState : Persistent {
 
 class Node : private NodeState {
  public:
-  explicit Node(Board& board) : NodeState(), board_(board), store_() {}
+  explicit Node(Board& board) : NodeState(), board_(board) {}
 
   // node_id 0: the stored one. Counts the start.
   void begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id);
@@ -148,7 +149,6 @@ class Node : private NodeState {
   void shorten(uint16_t last_ms, uint16_t period_ms, uint16_t* wait_ms) const;
 
   Board& board_;
-  Storage store_;
   DeadReckoning dead_reckoning_;
 };
 

@@ -66,7 +66,8 @@ RELPOS_SHARED uint8_t RangingPlan::next(uint16_t now_ms, uint8_t id, uint8_t tea
   }
   if (!planned_) {
     planned_ = true;
-    const uint16_t window_ms = period_ms / count;
+    // In 32 bits, because that division is in the program anyway.
+    const uint16_t window_ms = static_cast<uint16_t>(static_cast<uint32_t>(period_ms) / count);
     begin_ms_ = place * window_ms;
     if (count_ == 0) {
       // Marsaglia 2003, for 16 bits: of full period. A linear congruence would keep nodes with
