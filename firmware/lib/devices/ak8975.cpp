@@ -1,5 +1,8 @@
 #include "devices/ak8975.h"
 
+#include <string.h>
+
+#include "devices/flash.h"
 #include "inertial/calls.h"
 
 namespace relpos {
@@ -23,6 +26,22 @@ constexpr uint8_t kMostFailures = 3;     // in a row, then set up anew
 constexpr uint8_t kMostRepeats = 5;
 constexpr float kUnit = 0.3f / 256.0f;   // 0.3 uT a count, adjusted by (ASA + 128) / 256
 
+// Each state's transaction: a register, and what is written to it or how many bytes are read. A table
+// and one call: a call a state would cost the Uno 140 bytes. From mode to mode only through power-down,
+// with at least 100 us between: a tick.
+struct Transaction {
+  uint8_t reg, value, read;
+};
+const Transaction kTransactions[] RELPOS_FLASH = {
+    {kWhoAmI, 0, 1},
+    {kControl, kPowerDownMode, 0},
+    {kControl, kFuseRomMode, 0},
+    {kAdjustment, 0, 3},
+    {kControl, kPowerDownMode, 0},
+    {kControl, kSingleMode, 0},
+    {kStatus1, 0, 8},
+};
+
 int16_t little_endian(const uint8_t* bytes) {
   return static_cast<int16_t>(static_cast<uint16_t>(static_cast<uint16_t>(bytes[1]) << 8) |
                               bytes[0]);
@@ -45,49 +64,19 @@ bool Ak8975::step(Board& board, float field_ut[3]) {
     --wait_ticks_;
     return false;
   }
-  switch (state_) {
-    case State::kIdentify: {
-      uint8_t identity = 0;
-      if (!board.read_registers(kAddress, kWhoAmI, &identity, 1) || identity != kIdentity) {
-        fail();
-        return false;
-      }
-      state_ = State::kPowerDown;
-      return false;
-    }
-    case State::kPowerDown:
-    case State::kFuseMode:
-    case State::kLeaveFuse: {
-      // From mode to mode only through power-down, with at least 100 us between: a tick.
-      const uint8_t mode = state_ == State::kFuseMode ? kFuseRomMode : kPowerDownMode;
-      if (!board.write_register(kAddress, kControl, mode)) {
-        fail();
-        return false;
-      }
-      failures_ = 0;
-      state_ = static_cast<State>(static_cast<uint8_t>(state_) + 1);
-      return false;
-    }
-    case State::kFuseRead:
-      if (!board.read_registers(kAddress, kAdjustment, adjustment_, 3)) {
-        fail();
-        return false;
-      }
-      state_ = State::kLeaveFuse;
-      return false;
-    case State::kIdle:
-      if (!board.write_register(kAddress, kControl, kSingleMode)) {
-        fail();
-        return false;
-      }
-      state_ = State::kFetch;
-      return false;
-    case State::kFetch:
-      break;
-  }
-  uint8_t raw[8];  // ST1, X, Y, Z, ST2
-  if (!board.read_registers(kAddress, kStatus1, raw, sizeof raw)) {
+  const Transaction* transaction = &kTransactions[static_cast<uint8_t>(state_)];
+  const uint8_t bytes[2] = {flash_byte(&transaction->reg), flash_byte(&transaction->value)};
+  const uint8_t read = flash_byte(&transaction->read);
+  uint8_t raw[8];  // of a measurement: ST1, X, Y, Z, ST2
+  if (board.transfer(kAddress, bytes, read != 0 ? 1 : 2, nullptr, 0, raw, read) != BusStatus::kOk ||
+      (state_ == State::kIdentify && raw[0] != kIdentity)) {
     fail();
+    return false;
+  }
+  if (state_ == State::kFuseRead) memcpy(adjustment_, raw, sizeof adjustment_);
+  if (state_ < State::kIdle) failures_ = 0;
+  if (state_ != State::kFetch) {
+    state_ = static_cast<State>(static_cast<uint8_t>(state_) + 1);
     return false;
   }
   bool changed = false;
