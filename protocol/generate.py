@@ -28,7 +28,7 @@ _C_TYPES = {
     "i8": "int8_t",
     "u16": "uint16_t",
     "i16": "int16_t",
-    "u24": "uint32_t",
+    "u24": "Uint24",
     "u32": "uint32_t",
     "i32": "int32_t",
 }
@@ -85,6 +85,12 @@ def header_text() -> str:
         f"constexpr uint8_t kKeyBytes = {wire.KEY_BYTES};",
         f"constexpr uint8_t kCoordinator = {wire.COORDINATOR};",
         f"constexpr uint8_t kBroadcast = {wire.BROADCAST};",
+        "",
+        "#if defined(__AVR__)",
+        "typedef __uint24 Uint24;  // as long as on the wire",
+        "#else",
+        "typedef uint32_t Uint24;",
+        "#endif",
         "",
         "enum class MessageType : uint8_t {",
         *(f"  k{_camel(m.name)} = {m.number}," for m in wire.MESSAGES),
@@ -184,7 +190,7 @@ def _table(name: str, fields: Sequence[Quantity], struct: str) -> list[str]:
                 f"                  {bytes_ - run[-1].byte_count},",
                 '              "no gaps: copied as one");',
             ]
-    return [f"const Field {name}[] FLASH = {{", *rows, "};", *asserts, ""]
+    return [f"const Field {name}[] = {{", *rows, "};", *asserts, ""]
 
 
 def _checks(fields: Sequence[Quantity], prefix: str, failed: str, indent: str) -> list[str]:
@@ -195,50 +201,79 @@ def _checks(fields: Sequence[Quantity], prefix: str, failed: str, indent: str) -
 def _codec(message: Message) -> list[str]:
     name = _camel(message.name)
     entries = message.entries
-    out = _table(f"k{name}", message.fields, name)
+    out = ["#if !defined(__AVR__)", *_table(f"k{name}", message.fields, name)]
+    length = f"{message.fixed_size}"
+    entry_loop: list[str] = []
     if entries is not None:
         entry = _camel(entries.singular) + "Entry"
+        length += f" + message.count * {message.entry_size}"
         out += _table(f"k{entry}", entries.fields, entry)
+    out += ["#endif", f"uint8_t encode(const {name}& message, uint8_t* body) {{"]
+    out += _checks(message.fields, "message.", "0", "  ")
+    if entries is not None:
+        out.append(f"  if (message.count > kMost{name}) return 0;")
+        entry_loop = _checks(entries.fields, "entry.", "0", "    ")
+        if entry_loop:
+            out += [
+                "  for (uint8_t i = 0; i < message.count; ++i) {",
+                f"    const {entry}& entry = message.entries[i];",
+                *entry_loop,
+                "  }",
+            ]
     out += [
-        f"uint8_t encode(const {name}& message, uint8_t* body) {{",
-        *_checks(message.fields, "message.", "0", "  "),
+        f"  const uint8_t length = static_cast<uint8_t>({length});",
+        "#if defined(__AVR__)",
+        f'  static_assert(sizeof message == {message.most_bytes}, "as on the wire");',
+        "  memcpy(body, &message, length);",
+        "#else",
         f"  uint8_t* out = put(k{name}, {len(_runs(message.fields))}, &message, body);",
     ]
-    if entries is not None:
+    if entries is None:
+        out.append("  (void)out;")
+    else:
         out += [
-            f"  if (message.count > kMost{name}) return 0;",
             "  *out++ = message.count;",
             "  for (uint8_t i = 0; i < message.count; ++i) {",
-            f"    const {entry}& entry = message.entries[i];",
-            *_checks(entries.fields, "entry.", "0", "    "),
-            f"    out = put(k{entry}, {len(_runs(entries.fields))}, &entry, out);",
+            f"    out = put(k{entry}, {len(_runs(entries.fields))}, &message.entries[i], out);",
             "  }",
         ]
     out += [
-        "  return static_cast<uint8_t>(out - body);",
+        "#endif",
+        "  return length;",
         "}",
         "",
         f"bool decode(const uint8_t* body, uint8_t length, {name}* message) {{",
     ]
     if entries is None:
+        out.append(f"  if (length != {message.fixed_size}) return false;")
+    else:
+        at = message.fixed_size - 1
         out += [
-            f"  if (length != {message.fixed_size}) return false;",
-            f"  take(k{name}, {len(_runs(message.fields))}, body, message);",
-            *_checks(message.fields, "message->", "false", "  "),
+            f"  if (length < {message.fixed_size} || body[{at}] > kMost{name}) return false;",
+            f"  if (length != {message.fixed_size} + body[{at}] * {message.entry_size}) "
+            "return false;",
         ]
+    out += [
+        "#if defined(__AVR__)",
+        "  memcpy(message, body, length);",
+        "#else",
+        f"  const uint8_t* in = take(k{name}, {len(_runs(message.fields))}, body, message);",
+    ]
+    if entries is None:
+        out.append("  (void)in;")
     else:
         out += [
-            f"  if (length < {message.fixed_size}) return false;",
-            f"  const uint8_t* in = take(k{name}, {len(_runs(message.fields))}, body, message);",
-            *_checks(message.fields, "message->", "false", "  "),
             "  message->count = *in++;",
-            f"  if (message->count > kMost{name}) return false;",
-            f"  if (length != {message.fixed_size} + message->count * {message.entry_size}) "
-            "return false;",
             "  for (uint8_t i = 0; i < message->count; ++i) {",
-            f"    {entry}& entry = message->entries[i];",
-            f"    in = take(k{entry}, {len(_runs(entries.fields))}, in, &entry);",
-            *_checks(entries.fields, "entry.", "false", "    "),
+            f"    in = take(k{entry}, {len(_runs(entries.fields))}, in, &message->entries[i]);",
+            "  }",
+        ]
+    out += ["#endif", *_checks(message.fields, "message->", "false", "  ")]
+    if entry_loop:
+        out += [
+            "  for (uint8_t i = 0; i < message->count; ++i) {",
+            f"    const {entry}& entry = message->entries[i];",
+            *(line.replace("return 0", "return false") for line in entry_loop),
             "  }",
         ]
     return [*out, "  return true;", "}", ""]
@@ -251,38 +286,27 @@ def source_text() -> str:
         '#include "messages.h"',
         "",
         "#include <stddef.h>",
-        "",
-        "#if defined(__AVR__)",
-        "#include <avr/pgmspace.h>",
-        "#define FLASH PROGMEM",
-        "#else",
-        "#define FLASH",
-        "#endif",
+        "#include <string.h>",
         "",
         "namespace relpos {",
         "namespace wire {",
-        "namespace {",
-        "",
-        "uint8_t flash(const uint8_t* at) {",
-        "#if defined(__AVR__)",
-        "  return pgm_read_byte(at);",
-        "#else",
-        "  return *at;",
-        "#endif",
-        "}",
         "",
         'static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "fields are copied as is");',
         "",
-        "// Where a run of fields stands in its struct, bytes on the wire and in memory. A table",
-        "// read by one loop: a call a field would cost the Uno 400 bytes of flash more.",
+        "// On the AVR nothing is padded: a message in memory is its body on the wire.",
+        "#if !defined(__AVR__)",
+        "namespace {",
+        "",
+        "// Where a run of fields stands in its struct, bytes on the wire and in memory.",
         "struct Field {",
         "  uint8_t offset, wire_bytes, memory_bytes;",
         "};",
         "",
         "uint8_t* put(const Field* fields, uint8_t count, const void* message, uint8_t* out) {",
         "  for (; count != 0; --count, ++fields) {",
-        "    const uint8_t* value = static_cast<const uint8_t*>(message) + flash(&fields->offset);",
-        "    for (uint8_t left = flash(&fields->wire_bytes); left != 0; --left) *out++ = *value++;",
+        "    const uint8_t* value = static_cast<const uint8_t*>(message) + fields->offset;",
+        "    memcpy(out, value, fields->wire_bytes);",
+        "    out += fields->wire_bytes;",
         "  }",
         "  return out;",
         "}",
@@ -290,15 +314,16 @@ def source_text() -> str:
         "const uint8_t* take(const Field* fields, uint8_t count, const uint8_t* in,",
         "                    void* message) {",
         "  for (; count != 0; --count, ++fields) {",
-        "    uint8_t* value = static_cast<uint8_t*>(message) + flash(&fields->offset);",
-        "    const uint8_t wire_bytes = flash(&fields->wire_bytes);",
-        "    const uint8_t memory_bytes = flash(&fields->memory_bytes);",
-        "    for (uint8_t i = 0; i < memory_bytes; ++i) *value++ = i < wire_bytes ? *in++ : 0;",
+        "    uint8_t* value = static_cast<uint8_t*>(message) + fields->offset;",
+        "    memset(value, 0, fields->memory_bytes);",
+        "    memcpy(value, in, fields->wire_bytes);",
+        "    in += fields->wire_bytes;",
         "  }",
         "  return in;",
         "}",
         "",
         "}  // namespace",
+        "#endif",
         "",
     ]
     for message in wire.MESSAGES:

@@ -2,38 +2,27 @@
 #include "messages.h"
 
 #include <stddef.h>
-
-#if defined(__AVR__)
-#include <avr/pgmspace.h>
-#define FLASH PROGMEM
-#else
-#define FLASH
-#endif
+#include <string.h>
 
 namespace relpos {
 namespace wire {
-namespace {
-
-uint8_t flash(const uint8_t* at) {
-#if defined(__AVR__)
-  return pgm_read_byte(at);
-#else
-  return *at;
-#endif
-}
 
 static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "fields are copied as is");
 
-// Where a run of fields stands in its struct, bytes on the wire and in memory. A table
-// read by one loop: a call a field would cost the Uno 400 bytes of flash more.
+// On the AVR nothing is padded: a message in memory is its body on the wire.
+#if !defined(__AVR__)
+namespace {
+
+// Where a run of fields stands in its struct, bytes on the wire and in memory.
 struct Field {
   uint8_t offset, wire_bytes, memory_bytes;
 };
 
 uint8_t* put(const Field* fields, uint8_t count, const void* message, uint8_t* out) {
   for (; count != 0; --count, ++fields) {
-    const uint8_t* value = static_cast<const uint8_t*>(message) + flash(&fields->offset);
-    for (uint8_t left = flash(&fields->wire_bytes); left != 0; --left) *out++ = *value++;
+    const uint8_t* value = static_cast<const uint8_t*>(message) + fields->offset;
+    memcpy(out, value, fields->wire_bytes);
+    out += fields->wire_bytes;
   }
   return out;
 }
@@ -41,17 +30,19 @@ uint8_t* put(const Field* fields, uint8_t count, const void* message, uint8_t* o
 const uint8_t* take(const Field* fields, uint8_t count, const uint8_t* in,
                     void* message) {
   for (; count != 0; --count, ++fields) {
-    uint8_t* value = static_cast<uint8_t*>(message) + flash(&fields->offset);
-    const uint8_t wire_bytes = flash(&fields->wire_bytes);
-    const uint8_t memory_bytes = flash(&fields->memory_bytes);
-    for (uint8_t i = 0; i < memory_bytes; ++i) *value++ = i < wire_bytes ? *in++ : 0;
+    uint8_t* value = static_cast<uint8_t*>(message) + fields->offset;
+    memset(value, 0, fields->memory_bytes);
+    memcpy(value, in, fields->wire_bytes);
+    in += fields->wire_bytes;
   }
   return in;
 }
 
 }  // namespace
+#endif
 
-const Field kMotion[] FLASH = {
+#if !defined(__AVR__)
+const Field kMotion[] = {
     {offsetof(Motion, time_ms), 22, 22},
     {offsetof(Motion, variance_along_mm2), 23, 23},
 };
@@ -62,26 +53,40 @@ static_assert(offsetof(Motion, quality) - offsetof(Motion, variance_along_mm2) =
                   22,
               "no gaps: copied as one");
 
+#endif
 uint8_t encode(const Motion& message, uint8_t* body) {
   if (message.magnetic_heading_100urad < -31416 || message.magnetic_heading_100urad > 31416) return 0;
   if (message.state > 2) return 0;
+  const uint8_t length = static_cast<uint8_t>(45);
+#if defined(__AVR__)
+  static_assert(sizeof message == 45, "as on the wire");
+  memcpy(body, &message, length);
+#else
   uint8_t* out = put(kMotion, 2, &message, body);
-  return static_cast<uint8_t>(out - body);
+  (void)out;
+#endif
+  return length;
 }
 
 bool decode(const uint8_t* body, uint8_t length, Motion* message) {
   if (length != 45) return false;
-  take(kMotion, 2, body, message);
+#if defined(__AVR__)
+  memcpy(message, body, length);
+#else
+  const uint8_t* in = take(kMotion, 2, body, message);
+  (void)in;
+#endif
   if (message->magnetic_heading_100urad < -31416 || message->magnetic_heading_100urad > 31416) return false;
   if (message->state > 2) return false;
   return true;
 }
 
-const Field kRanges[] FLASH = {
+#if !defined(__AVR__)
+const Field kRanges[] = {
     {offsetof(Ranges, time_ms), 4, 4},
 };
 
-const Field kRangeEntry[] FLASH = {
+const Field kRangeEntry[] = {
     {offsetof(RangeEntry, peer), 1, 1},
     {offsetof(RangeEntry, range_mm), 3, 4},
     {offsetof(RangeEntry, rss_dbm), 1, 1},
@@ -91,35 +96,50 @@ static_assert(offsetof(RangeEntry, quality) - offsetof(RangeEntry, age_ms) ==
                   2,
               "no gaps: copied as one");
 
+#endif
 uint8_t encode(const Ranges& message, uint8_t* body) {
-  uint8_t* out = put(kRanges, 1, &message, body);
   if (message.count > kMostRanges) return 0;
-  *out++ = message.count;
   for (uint8_t i = 0; i < message.count; ++i) {
     const RangeEntry& entry = message.entries[i];
     if (entry.range_mm < 1 || entry.range_mm > 200000UL) return 0;
     if (entry.quality > 3) return 0;
-    out = put(kRangeEntry, 4, &entry, out);
   }
-  return static_cast<uint8_t>(out - body);
+  const uint8_t length = static_cast<uint8_t>(5 + message.count * 8);
+#if defined(__AVR__)
+  static_assert(sizeof message == 45, "as on the wire");
+  memcpy(body, &message, length);
+#else
+  uint8_t* out = put(kRanges, 1, &message, body);
+  *out++ = message.count;
+  for (uint8_t i = 0; i < message.count; ++i) {
+    out = put(kRangeEntry, 4, &message.entries[i], out);
+  }
+#endif
+  return length;
 }
 
 bool decode(const uint8_t* body, uint8_t length, Ranges* message) {
-  if (length < 5) return false;
+  if (length < 5 || body[4] > kMostRanges) return false;
+  if (length != 5 + body[4] * 8) return false;
+#if defined(__AVR__)
+  memcpy(message, body, length);
+#else
   const uint8_t* in = take(kRanges, 1, body, message);
   message->count = *in++;
-  if (message->count > kMostRanges) return false;
-  if (length != 5 + message->count * 8) return false;
   for (uint8_t i = 0; i < message->count; ++i) {
-    RangeEntry& entry = message->entries[i];
-    in = take(kRangeEntry, 4, in, &entry);
+    in = take(kRangeEntry, 4, in, &message->entries[i]);
+  }
+#endif
+  for (uint8_t i = 0; i < message->count; ++i) {
+    const RangeEntry& entry = message->entries[i];
     if (entry.range_mm < 1 || entry.range_mm > 200000UL) return false;
     if (entry.quality > 3) return false;
   }
   return true;
 }
 
-const Field kStatus[] FLASH = {
+#if !defined(__AVR__)
+const Field kStatus[] = {
     {offsetof(Status, time_ms), 7, 7},
     {offsetof(Status, uptime_s), 5, 5},
     {offsetof(Status, battery_mv), 27, 27},
@@ -134,75 +154,112 @@ static_assert(offsetof(Status, health) - offsetof(Status, battery_mv) ==
                   26,
               "no gaps: copied as one");
 
+#endif
 uint8_t encode(const Status& message, uint8_t* body) {
   if (message.reset_cause > 5) return 0;
   if (message.health > 63) return 0;
+  const uint8_t length = static_cast<uint8_t>(39);
+#if defined(__AVR__)
+  static_assert(sizeof message == 39, "as on the wire");
+  memcpy(body, &message, length);
+#else
   uint8_t* out = put(kStatus, 3, &message, body);
-  return static_cast<uint8_t>(out - body);
+  (void)out;
+#endif
+  return length;
 }
 
 bool decode(const uint8_t* body, uint8_t length, Status* message) {
   if (length != 39) return false;
-  take(kStatus, 3, body, message);
+#if defined(__AVR__)
+  memcpy(message, body, length);
+#else
+  const uint8_t* in = take(kStatus, 3, body, message);
+  (void)in;
+#endif
   if (message->reset_cause > 5) return false;
   if (message->health > 63) return false;
   return true;
 }
 
-const Field kSteps[] FLASH = {
+#if !defined(__AVR__)
+const Field kSteps[] = {
     {offsetof(Steps, time_ms), 4, 4},
 };
 
-const Field kStepEntry[] FLASH = {
+const Field kStepEntry[] = {
     {offsetof(StepEntry, age_ms), 4, 4},
 };
 static_assert(offsetof(StepEntry, length_mm) - offsetof(StepEntry, age_ms) ==
                   2,
               "no gaps: copied as one");
 
+#endif
 uint8_t encode(const Steps& message, uint8_t* body) {
-  uint8_t* out = put(kSteps, 1, &message, body);
   if (message.count > kMostSteps) return 0;
+  const uint8_t length = static_cast<uint8_t>(5 + message.count * 4);
+#if defined(__AVR__)
+  static_assert(sizeof message == 45, "as on the wire");
+  memcpy(body, &message, length);
+#else
+  uint8_t* out = put(kSteps, 1, &message, body);
   *out++ = message.count;
   for (uint8_t i = 0; i < message.count; ++i) {
-    const StepEntry& entry = message.entries[i];
-    out = put(kStepEntry, 1, &entry, out);
+    out = put(kStepEntry, 1, &message.entries[i], out);
   }
-  return static_cast<uint8_t>(out - body);
+#endif
+  return length;
 }
 
 bool decode(const uint8_t* body, uint8_t length, Steps* message) {
-  if (length < 5) return false;
+  if (length < 5 || body[4] > kMostSteps) return false;
+  if (length != 5 + body[4] * 4) return false;
+#if defined(__AVR__)
+  memcpy(message, body, length);
+#else
   const uint8_t* in = take(kSteps, 1, body, message);
   message->count = *in++;
-  if (message->count > kMostSteps) return false;
-  if (length != 5 + message->count * 4) return false;
   for (uint8_t i = 0; i < message->count; ++i) {
-    StepEntry& entry = message->entries[i];
-    in = take(kStepEntry, 1, in, &entry);
+    in = take(kStepEntry, 1, in, &message->entries[i]);
   }
+#endif
   return true;
 }
 
-const Field kSamples[] FLASH = {
+#if !defined(__AVR__)
+const Field kSamples[] = {
     {offsetof(Samples, time_ms), 42, 42},
 };
 static_assert(offsetof(Samples, field_readings) - offsetof(Samples, time_ms) ==
                   41,
               "no gaps: copied as one");
 
+#endif
 uint8_t encode(const Samples& message, uint8_t* body) {
+  const uint8_t length = static_cast<uint8_t>(42);
+#if defined(__AVR__)
+  static_assert(sizeof message == 42, "as on the wire");
+  memcpy(body, &message, length);
+#else
   uint8_t* out = put(kSamples, 1, &message, body);
-  return static_cast<uint8_t>(out - body);
+  (void)out;
+#endif
+  return length;
 }
 
 bool decode(const uint8_t* body, uint8_t length, Samples* message) {
   if (length != 42) return false;
-  take(kSamples, 1, body, message);
+#if defined(__AVR__)
+  memcpy(message, body, length);
+#else
+  const uint8_t* in = take(kSamples, 1, body, message);
+  (void)in;
+#endif
   return true;
 }
 
-const Field kCommand[] FLASH = {
+#if !defined(__AVR__)
+const Field kCommand[] = {
     {offsetof(Command, token), 3, 3},
     {offsetof(Command, value), 4, 4},
 };
@@ -210,79 +267,122 @@ static_assert(offsetof(Command, command) - offsetof(Command, token) ==
                   2,
               "no gaps: copied as one");
 
+#endif
 uint8_t encode(const Command& message, uint8_t* body) {
   if (message.command > 17) return 0;
+  const uint8_t length = static_cast<uint8_t>(7);
+#if defined(__AVR__)
+  static_assert(sizeof message == 7, "as on the wire");
+  memcpy(body, &message, length);
+#else
   uint8_t* out = put(kCommand, 2, &message, body);
-  return static_cast<uint8_t>(out - body);
+  (void)out;
+#endif
+  return length;
 }
 
 bool decode(const uint8_t* body, uint8_t length, Command* message) {
   if (length != 7) return false;
-  take(kCommand, 2, body, message);
+#if defined(__AVR__)
+  memcpy(message, body, length);
+#else
+  const uint8_t* in = take(kCommand, 2, body, message);
+  (void)in;
+#endif
   if (message->command > 17) return false;
   return true;
 }
 
-const Field kAcknowledgement[] FLASH = {
+#if !defined(__AVR__)
+const Field kAcknowledgement[] = {
     {offsetof(Acknowledgement, token), 8, 8},
 };
 static_assert(offsetof(Acknowledgement, value) - offsetof(Acknowledgement, token) ==
                   4,
               "no gaps: copied as one");
 
+#endif
 uint8_t encode(const Acknowledgement& message, uint8_t* body) {
   if (message.result > 3) return 0;
+  const uint8_t length = static_cast<uint8_t>(8);
+#if defined(__AVR__)
+  static_assert(sizeof message == 8, "as on the wire");
+  memcpy(body, &message, length);
+#else
   uint8_t* out = put(kAcknowledgement, 1, &message, body);
-  return static_cast<uint8_t>(out - body);
+  (void)out;
+#endif
+  return length;
 }
 
 bool decode(const uint8_t* body, uint8_t length, Acknowledgement* message) {
   if (length != 8) return false;
-  take(kAcknowledgement, 1, body, message);
+#if defined(__AVR__)
+  memcpy(message, body, length);
+#else
+  const uint8_t* in = take(kAcknowledgement, 1, body, message);
+  (void)in;
+#endif
   if (message->result > 3) return false;
   return true;
 }
 
-const Field kBeacon[] FLASH = {
+#if !defined(__AVR__)
+const Field kBeacon[] = {
     {offsetof(Beacon, phase_ms), 5, 5},
 };
 static_assert(offsetof(Beacon, round) - offsetof(Beacon, phase_ms) ==
                   4,
               "no gaps: copied as one");
 
-const Field kSlotEntry[] FLASH = {
+const Field kSlotEntry[] = {
     {offsetof(SlotEntry, node), 1, 1},
 };
 
+#endif
 uint8_t encode(const Beacon& message, uint8_t* body) {
   if (message.period_ms < 200 || message.period_ms > 60000UL) return 0;
-  uint8_t* out = put(kBeacon, 1, &message, body);
   if (message.count > kMostBeacon) return 0;
-  *out++ = message.count;
   for (uint8_t i = 0; i < message.count; ++i) {
     const SlotEntry& entry = message.entries[i];
     if (entry.node < 1 || entry.node > 254) return 0;
-    out = put(kSlotEntry, 1, &entry, out);
   }
-  return static_cast<uint8_t>(out - body);
+  const uint8_t length = static_cast<uint8_t>(6 + message.count * 1);
+#if defined(__AVR__)
+  static_assert(sizeof message == 26, "as on the wire");
+  memcpy(body, &message, length);
+#else
+  uint8_t* out = put(kBeacon, 1, &message, body);
+  *out++ = message.count;
+  for (uint8_t i = 0; i < message.count; ++i) {
+    out = put(kSlotEntry, 1, &message.entries[i], out);
+  }
+#endif
+  return length;
 }
 
 bool decode(const uint8_t* body, uint8_t length, Beacon* message) {
-  if (length < 6) return false;
+  if (length < 6 || body[5] > kMostBeacon) return false;
+  if (length != 6 + body[5] * 1) return false;
+#if defined(__AVR__)
+  memcpy(message, body, length);
+#else
   const uint8_t* in = take(kBeacon, 1, body, message);
-  if (message->period_ms < 200 || message->period_ms > 60000UL) return false;
   message->count = *in++;
-  if (message->count > kMostBeacon) return false;
-  if (length != 6 + message->count * 1) return false;
   for (uint8_t i = 0; i < message->count; ++i) {
-    SlotEntry& entry = message->entries[i];
-    in = take(kSlotEntry, 1, in, &entry);
+    in = take(kSlotEntry, 1, in, &message->entries[i]);
+  }
+#endif
+  if (message->period_ms < 200 || message->period_ms > 60000UL) return false;
+  for (uint8_t i = 0; i < message->count; ++i) {
+    const SlotEntry& entry = message->entries[i];
     if (entry.node < 1 || entry.node > 254) return false;
   }
   return true;
 }
 
-const Field kNewKey[] FLASH = {
+#if !defined(__AVR__)
+const Field kNewKey[] = {
     {offsetof(NewKey, token), 2, 2},
     {offsetof(NewKey, masked_0), 16, 16},
 };
@@ -290,14 +390,27 @@ static_assert(offsetof(NewKey, masked_3) - offsetof(NewKey, masked_0) ==
                   12,
               "no gaps: copied as one");
 
+#endif
 uint8_t encode(const NewKey& message, uint8_t* body) {
+  const uint8_t length = static_cast<uint8_t>(18);
+#if defined(__AVR__)
+  static_assert(sizeof message == 18, "as on the wire");
+  memcpy(body, &message, length);
+#else
   uint8_t* out = put(kNewKey, 2, &message, body);
-  return static_cast<uint8_t>(out - body);
+  (void)out;
+#endif
+  return length;
 }
 
 bool decode(const uint8_t* body, uint8_t length, NewKey* message) {
   if (length != 18) return false;
-  take(kNewKey, 2, body, message);
+#if defined(__AVR__)
+  memcpy(message, body, length);
+#else
+  const uint8_t* in = take(kNewKey, 2, body, message);
+  (void)in;
+#endif
   return true;
 }
 

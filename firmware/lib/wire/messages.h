@@ -19,6 +19,12 @@ constexpr uint8_t kKeyBytes = 16;
 constexpr uint8_t kCoordinator = 0;
 constexpr uint8_t kBroadcast = 255;
 
+#if defined(__AVR__)
+typedef __uint24 Uint24;  // as long as on the wire
+#else
+typedef uint32_t Uint24;
+#endif
+
 enum class MessageType : uint8_t {
   kMotion = 1,
   kRanges = 2,
@@ -136,7 +142,7 @@ bool decode(const uint8_t* body, uint8_t length, Motion* message);
 // Distances to other nodes by UWB two-way ranging; failures are counted in the status.
 struct RangeEntry {
   uint8_t peer;  // The other node
-  uint32_t range_mm;  // Distance; 1000 = 1 m
+  Uint24 range_mm;  // Distance; 1000 = 1 m
   int8_t rss_dbm;  // Signal strength; dBm
   uint16_t age_ms;  // How long before the frame's time it was measured; 1000 = 1 s
   uint8_t quality;  // What weakens this range
