@@ -47,12 +47,14 @@ def list_nodes(
         output.print_json({"port": port, "listened_s": seconds, "nodes": rows})
         return
     if not rows:
+        # Frames under another key have been told by the link.
+        why = " under this key" if view.foreign_frames else ""
         raise DeviceError(
-            f"{port}: no node is heard"
-            + (_foreign(view) or ": are they switched on, and is this the coordinator's port?")
+            f"{port}: no node is heard{why}: are they switched on, and is this the coordinator's "
+            "port?"
         )
     if view.foreign_frames:
-        output.remark(f"not all are shown{_foreign(view)}")
+        output.remark(f"not all are shown: {_foreign(view)}")
     Console(width=None if sys.stdout.isatty() else 120).print(_list_table(rows))
 
 
@@ -141,7 +143,7 @@ def _foreign(view: TeamView) -> str:
     """What to say of frames under another key; nothing where there are none."""
     if not view.foreign_frames:
         return ""
-    return f": {view.foreign_frames} frames came under another key (give the team's: --key-file)"
+    return f"{view.foreign_frames} frames came under another key (give the team's: --key-file)"
 
 
 def _list_table(rows: Sequence[Mapping[str, Any]]) -> Table:
@@ -179,7 +181,7 @@ def _monitor_table(rows: Sequence[Mapping[str, Any]], foreign: str) -> Table:
     from rich.table import Table
 
     title = None if rows else "no node is heard yet"
-    table = Table(title=title, caption=foreign.removeprefix(": ") or None)
+    table = Table(title=title, caption=foreign or None)
     columns = ("node", "supply", "RSSI", "lost", "seen", "frames", "ranging", "neighbours", HEALTH)
     for column in columns:
         table.add_column(column, justify="left" if column == HEALTH else "right")
