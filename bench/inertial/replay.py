@@ -70,7 +70,15 @@ def build() -> ctypes.CDLL:
     if not target.exists():
         target.parent.mkdir(parents=True, exist_ok=True)
         scratch = target.with_suffix(f".{os.getpid()}")
-        command = ["g++", *flags, f"-I{LIBRARY}", f"-I{LIBRARY.parent}", *map(str, sources), "-o", str(scratch)]
+        command = [
+            "g++",
+            *flags,
+            f"-I{LIBRARY}",
+            f"-I{LIBRARY.parent}",
+            *map(str, sources),
+            "-o",
+            str(scratch),
+        ]
         subprocess.run(command, check=True)
         scratch.replace(target)
     library = ctypes.CDLL(str(target))
