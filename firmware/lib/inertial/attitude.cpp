@@ -31,7 +31,8 @@ void turn(const float angle[kAxes], float out[4]) {
   const float square = 0.25f * dot(angle, angle);
   const float sine = 0.5f - square * (1.0f / 12.0f);
   out[0] = 1.0f - 0.5f * square;
-  for (uint8_t i = 0; i < kAxes; ++i) out[1 + i] = angle[i] * sine;
+  memset(out + 1, 0, kAxes * sizeof *out);
+  add_scaled(out + 1, angle, sine, kAxes);
 }
 
 }  // namespace
@@ -84,26 +85,34 @@ RELPOS_APART void Attitude::correct(const float angle[kAxes]) {
 
 void Attitude::premultiply(const Attitude& first) { multiply(first.q, Attitude(*this).q, q); }
 
+// Two opposite elements of a matrix and the axis between them.
+RELPOS_SHARED void shift(float* plus, float* minus, float by) {
+  add(plus, by);
+  add(minus, -by);
+}
+
 void Attitude::matrix(float r[kAxes * kAxes]) const {
-  const float* v = q + 1;
+  const float* const v = q + 1;
+  const float* const end = v + kAxes;
   float* out = r;
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    const float twice = v[i] + v[i];
-    for (uint8_t j = 0; j < kAxes; ++j) *out++ = twice * v[j];
+  for (const float* i = v; i != end; ++i) {
+    const float twice = *i + *i;
+    for (const float* j = v; j != end; ++j) *out++ = twice * *j;
   }
   const float twice = q[0] + q[0];
   const float diagonal = twice * q[0] - 1.0f;
-  for (uint8_t i = 0; i < kAxes; ++i) {
-    const uint8_t j = next(i);
-    const float turned = twice * v[next(j)];
-    add(r + 4 * i, diagonal);
-    add(r + 3 * i + j, -turned);
-    add(r + 3 * j + i, turned);
+  for (uint8_t i = kAxes; i != 0; --i) {
+    --out;
+    add(out, diagonal);
+    out -= kAxes;
   }
+  shift(r + 3, r + 1, twice * v[kZ]);
+  shift(r + 2, r + 6, twice * v[kY]);
+  shift(r + 7, r + 5, twice * v[kX]);
 }
 
 void rotate(const float r[kAxes * kAxes], const float in[kAxes], float out[kAxes]) {
-  for (uint8_t i = 0; i < kAxes; ++i) out[i] = dot(r + 3 * i, in);
+  for (uint8_t i = 0; i < kAxes; ++i, r += kAxes) *out++ = dot(r, in);
 }
 
 }  // namespace relpos

@@ -126,11 +126,6 @@ void count(uint16_t* counter) {
 
 void clear(float vector[kAxes]) { memset(vector, 0, kAxes * sizeof *vector); }
 
-RELPOS_SHARED void left_of(const float axis[2], float out[2]) {
-  out[kX] = -axis[kY];
-  out[kY] = axis[kX];
-}
-
 }  // namespace
 
 InertialConfig::InertialConfig() {
@@ -146,8 +141,9 @@ void DeadReckoning::reset() {
   // The configuration is the first member and stays.
   memset(reinterpret_cast<uint8_t*>(this) + sizeof config_, 0, sizeof *this - sizeof config_);
   displacement_.quality_flags = kStarting | kForwardUnknown | kBiasUncertain;
-  filter_.reset(kTiltMoving_rad, config_.gyro_bias_sigma_rad_s * config_.gyro_bias_sigma_rad_s,
-                kSpeedUnknown_m_s);
+  filter_.reset(kTiltMoving_rad * kTiltMoving_rad,
+                config_.gyro_bias_sigma_rad_s * config_.gyro_bias_sigma_rad_s,
+                kSpeedUnknown_m_s * kSpeedUnknown_m_s);
   gait_.reset();
   forward_.reset();
   attitude_.set_identity();
@@ -229,18 +225,15 @@ RELPOS_APART void DeadReckoning::initialise(bool still) {
   level.level(velocity_m_s_);
   level.matrix(rotation_);
   memcpy(heading_axis_, rotation_, sizeof heading_axis_);
-  if (still) {
-    attitude_ = level;  // the turning gathered meanwhile was bias
-  } else {
-    attitude_.premultiply(level);
-  }
+  if (still) attitude_.set_identity();  // the turning gathered meanwhile was bias
+  attitude_.premultiply(level);
   clear(velocity_m_s_);
   clear(position_m_);
   since_ = Span();
   step_ticks_ = 0;
   velocity_known_ = still;
-  filter_.reset(still ? kTiltStill_rad : kTiltMoving_rad, variance,
-                still ? kStillSigma_m_s : kSpeedUnknown_m_s);
+  filter_.reset(still ? kTiltStill_rad * kTiltStill_rad : kTiltMoving_rad * kTiltMoving_rad, variance,
+                still ? kStillSigma_m_s * kStillSigma_m_s : kSpeedUnknown_m_s * kSpeedUnknown_m_s);
   displacement_.initialised = true;
 }
 
@@ -647,7 +640,7 @@ RELPOS_APART void DeadReckoning::commit_step() {
     // Switched on while walking: the speed is first known when the forward axis is.
     clear(velocity_m_s_);
     add_scaled(velocity_m_s_, walk_, step_speed_m_s_, 2);
-    filter_.restart(kVelocity, kSpeedFound_m_s);
+    filter_.restart(kVelocity, kSpeedFound_m_s * kSpeedFound_m_s);
     velocity_known_ = true;
   }
 }

@@ -35,11 +35,11 @@ RELPOS_APART void ErrorFilter::widen(uint8_t state, float variance, uint8_t coun
   for (; count != 0; --count, ++state) *at(state, state) += variance;
 }
 
-void ErrorFilter::reset(float tilt_rad, float bias_rad2_s2, float velocity_m_s) {
+void ErrorFilter::reset(float tilt_rad2, float bias_rad2_s2, float velocity_m2_s2) {
   memset(static_cast<void*>(this), 0, sizeof *this);
-  widen(kAttitude, tilt_rad * tilt_rad, kZ);
+  widen(kAttitude, tilt_rad2, kZ);
   widen(kBias, bias_rad2_s2, kAxes);
-  widen(kVelocity, velocity_m_s * velocity_m_s, kAxes);
+  widen(kVelocity, velocity_m2_s2, kAxes);
 }
 
 RELPOS_APART void ErrorFilter::mix(uint8_t to, uint8_t from, float factor) {
@@ -145,11 +145,11 @@ float ErrorFilter::update(State group, const float direction[kAxes], float yaw, 
   return total;
 }
 
-void ErrorFilter::restart(State group, float sigma) {
+void ErrorFilter::restart(State group, float variance) {
   for (uint8_t i = group; i < group + kAxes; ++i) {
     for (uint8_t other = 0; other < kStates; ++other) *at(i, other) = 0.0f;
   }
-  widen(group, sigma * sigma, kAxes);
+  widen(group, variance, kAxes);
 }
 
 RELPOS_APART float ErrorFilter::along(State group, const float direction[2]) const {

@@ -29,8 +29,8 @@ class ErrorFilter {
  public:
   static const uint8_t kPacked = kStates * (kStates + 1) / 2;
 
-  // Diagonal start: standard deviations, the bias's variance; the heading starts as known.
-  void reset(float tilt_rad, float bias_rad2_s2, float velocity_m_s);
+  // Diagonal start, from variances; the heading starts as known.
+  void reset(float tilt_rad2, float bias_rad2_s2, float velocity_m2_s2);
   void predict_attitude(const float rotation[kAxes * kAxes], float dt_s);
   void predict_motion(const float impulse_m_s[kAxes], float dt_s);
   // Before a measurement, a restart or a look at the position's variances.
@@ -43,8 +43,8 @@ class ErrorFilter {
   // innovation variance.
   float update(State group, const float direction[kAxes], float yaw, float innovation,
                float variance, float correction[kStates + 1]);
-  // A group becomes known exactly (position at a step's end) or anew with the given sigma.
-  void restart(State group, float sigma);
+  // A group becomes known exactly (position at a step's end) or anew with the given variance.
+  void restart(State group, float variance);
 
   float covariance(uint8_t i, uint8_t j) const { return *at(i, j); }
   void set_covariance(uint8_t i, uint8_t j, float value) { *at(i, j) = value; }

@@ -24,9 +24,16 @@ RELPOS_SHARED void follow(float* value, float target, float gain) {
   *value += (target - *value) * gain;
 }
 
+RELPOS_SHARED void left_of(const float axis[2], float out[2]) {
+  out[kX] = -axis[kY];
+  out[kY] = axis[kX];
+}
+
 RELPOS_SHARED void resolve(const float axis[2], const float v[2], float out[2]) {
-  out[kX] = axis[kX] * v[kX] + axis[kY] * v[kY];
-  out[kY] = axis[kX] * v[kY] - axis[kY] * v[kX];
+  float left[2];
+  left_of(axis, left);
+  out[kX] = dot(axis, v, 2);
+  out[kY] = dot(left, v, 2);
 }
 
 RELPOS_SHARED void compose(const float axis[2], const float v[2], float out[2]) {

@@ -20,6 +20,8 @@ void add(float* to, float value);  // to += value
 void add_scaled(float* to, const float* from, float factor, uint8_t count);
 // A low-pass: moves value towards target by the share `gain`.
 void follow(float* value, float target, float gain);
+// The axis a quarter turn to the left; out must not be axis.
+void left_of(const float axis[2], float out[2]);
 // v seen along the plane's axis (any length) and to the left of it; out must not be v.
 void resolve(const float axis[2], const float v[2], float out[2]);
 // v turned (and stretched) by the axis, undoing resolve; out must not be v or axis.
