@@ -7,10 +7,10 @@ namespace {
 // What people can be in; a chip that is not ready tells 0.
 constexpr uint32_t kLeastMpa = 30000000;
 constexpr uint32_t kMostMpa = 120000000;
-// More than 12 m in a quarter of a second is a fault; so many of them are a new truth (a fan, a
+// More than 12 m in a tenth of a second is a fault; so many of them are a new truth (a fan, a
 // pressurised staircase) that starts at the height where it was met.
 constexpr int32_t kStrangeMpa = 150000;
-// Follows a climb with 0.75 s of delay; leaves 2 Pa of noise 0.8 Pa: 0.06 m.
+// Follows a climb with 0.4 s of delay; leaves 2 Pa of noise 0.8 Pa: 0.06 m.
 constexpr uint8_t kSmoothingBits = 2;  // a quarter of the news; a shift keeps the sign with both compilers
 // Standard atmosphere (ISO 2533): 288.15 K / 0.0065 K/m x 0.190263, and (1 - 0.190263) / 2.
 constexpr float kScaleHeightM = 8434.5f;

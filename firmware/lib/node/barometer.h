@@ -8,7 +8,7 @@ namespace relpos {
 // Zeroed memory is the start: make it as `Barometer()`.
 class Barometer {
  public:
-  void add(uint32_t pressure_mpa);  // four times a second
+  void add(uint32_t pressure_mpa);  // ten times a second
   bool ready() const { return readings_ == kStartReadings && strange_ != kMostStrange; }
   // Metres over where the first readings led. The barometric formula of the standard atmosphere to
   // the second order: 0.1 m of error at 300 m. It counts in metres of air at 15 degrees: at T
@@ -16,8 +16,8 @@ class Barometer {
   float height_m() const;
 
  private:
-  static constexpr uint8_t kStartReadings = 16;  // 4 s
-  static constexpr uint8_t kMostStrange = 8;     // 2 s: no height, or a new start
+  static constexpr uint8_t kStartReadings = 16;  // 1.6 s
+  static constexpr uint8_t kMostStrange = 8;     // 0.8 s: no height, or a new start
 
   uint32_t start_mpa_;
   int32_t fall_mpa_;  // of the pressure since then, smoothed

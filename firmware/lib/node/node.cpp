@@ -30,7 +30,7 @@ constexpr uint16_t kSupplyLowMv = 4500;
 // written every ten minutes, and lasts for years. A start wastes what is left of a block.
 constexpr uint16_t kCounterBlock = 1024;
 constexpr uint8_t kCountersLeft = 64;      // then the next block: writing takes 75 ms
-constexpr uint16_t kLookPeriodMs = 250;    // at the Pozyx's pressure
+constexpr uint16_t kLookPeriodMs = 100;    // at the Pozyx's pressure
 constexpr uint16_t kRawPeriodMs = 200;     // as often as the magnetometer is read
 constexpr uint16_t kMostRawReports = 3000; // ten minutes: a lost host does not end the ranging
 // Beyond what a sensor at its limit can show once a calibration has moved it: by 80 mg and 3 %, by

@@ -664,7 +664,7 @@ TEST(a_height_beyond_the_message_is_not_told) {
 
 TEST(the_height_travels_with_the_motion_once_it_is_known) {
   Team team;
-  team.run_ms(2500);
+  team.run_ms(1600);
   wire::Motion motion;
   CHECK(team.read(wire::MessageType::kMotion, &motion));
   CHECK(!(motion.quality & static_cast<uint8_t>(wire::Quality::kHeightValid)));
