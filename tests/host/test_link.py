@@ -15,7 +15,7 @@ from relpos.errors import DeviceError
 from relpos.link import live, xbee
 from relpos.link.clock import NodeClock
 from relpos.link.decoder import Decoder
-from relpos.measurements import Motion, Range, Status
+from relpos.measurements import Height, Motion, Range, Status
 from relpos.protocol import messages as wire
 
 MOTION_ZERO = dict.fromkeys(wire.MOTION.field, 0)
@@ -232,6 +232,22 @@ def test_a_restart_begins_new_totals_and_widens_the_next_motion():
     assert motion.dx_m == pytest.approx(0.5)
     assert motion.sigma_x_m > 4.0
     assert decoder.nodes[1].counts["restarts"] == 1
+
+
+def test_a_restart_on_the_second_floor_leaves_the_node_there():
+    decoder = Decoder()
+    valid = wire.Quality.HEIGHT_VALID
+
+    def height(counter, boot, **values):
+        frame = motion_frame(counter, boot=boot, **values)
+        return [o.height_m for o in decoder.feed(frame, 100.0 + counter) if isinstance(o, Height)]
+
+    assert height(1, 4, time_s=100, height_m=6.1, quality=valid) == [6.1]
+    assert height(2, 5, time_s=1) == []
+    assert height(3, 5, time_s=4, height_m=-0.1, quality=valid) == pytest.approx([6.0])
+    assert height(4, 6, time_s=1) == []
+    assert height(5, 6, time_s=5, height_m=-3.0, quality=valid) == pytest.approx([3.0])
+    assert height(6, 6, time_s=6, height_m=-6.0, quality=valid) == pytest.approx([0.0])
 
 
 def test_a_frame_held_up_from_before_the_restart_is_refused():

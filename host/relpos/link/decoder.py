@@ -48,6 +48,9 @@ class NodeTrack:
     arrival_s: float = 0.0
     rssi_dbm: int | None = None
     unseen_s: float = 0.0
+    height_m: float = 0.0
+    """Told last, over where the node was first heard of: a restart begins at 0 again."""
+    restart_height_m: float = 0.0
     counts: Counter[str] = field(default_factory=Counter)
 
 
@@ -229,7 +232,8 @@ class Decoder:
             track.counts["stale_boot"] += 1
             return None
         if frame.boot != track.boot and track.heard:
-            # Totals and clock of the node begin anew; only its counter, counts and pose go on.
+            # Totals, clock and height of the node begin anew; only its counter, counts and pose
+            # go on, and its height from the last one told: people do not fly while it restarts.
             unseen_s = arrival_s - track.arrival_s if track.totals is not None else 0.0
             track = NodeTrack(
                 frame.boot,
@@ -238,6 +242,8 @@ class Decoder:
                 arrival_s=arrival_s,
                 motion_s=track.motion_s,
                 unseen_s=unseen_s,
+                height_m=track.height_m,
+                restart_height_m=track.height_m,
             )
             track.counts["restarts"] += 1
         elif verdict is Verdict.LATE:
@@ -304,7 +310,8 @@ class Decoder:
             )
         ]
         if quality & wire.Quality.HEIGHT_VALID:
-            observations.append(Height(time_s, node, values["height_m"]))
+            track.height_m = track.restart_height_m + values["height_m"]
+            observations.append(Height(time_s, node, track.height_m))
         if quality & wire.Quality.MAGNETOMETER_VALID:
             observations.append(
                 Heading(
