@@ -7,9 +7,13 @@
 namespace relpos {
 
 RELPOS_SHARED float dot(const float* a, const float* b, uint8_t count) {
-  float sum = 0.0f;
-  for (; count != 0; --count) sum += *a++ * *b++;
-  return sum;
+  float sum;
+  for (bool first = true;; first = false) {  // not from zero: an addition is 100 cycles
+    float product = *a++ * *b++;
+    if (!first) product += sum;
+    sum = product;
+    if (--count == 0) return sum;
+  }
 }
 
 RELPOS_SHARED float norm(const float v[kAxes]) { return sqrtf(dot(v, v)); }
