@@ -77,10 +77,10 @@ void Attitude::integrate(const float angle[kAxes]) {
   multiply(Attitude(*this).q, small.q, q);
 }
 
-RELPOS_APART void Attitude::correct(const float angle[kAxes]) {
-  Attitude small;
-  turn(angle, small.q);
-  premultiply(small);
+RELPOS_APART void Attitude::correct(const float angle[kAxes], float scratch[8]) {
+  turn(angle, scratch);
+  memcpy(scratch + 4, q, sizeof q);
+  multiply(scratch, scratch + 4, q);
 }
 
 void Attitude::premultiply(const Attitude& first) { multiply(first.q, Attitude(*this).q, q); }

@@ -23,8 +23,9 @@ struct Attitude {
   void level(const float up[kAxes]);
   // Turn by rate * dt, measured in the body frame.
   void integrate(const float angle_body_rad[kAxes]);
-  // Turn by a small angle given in the navigation frame (a filter correction).
-  void correct(const float angle_navigation_rad[kAxes]);
+  // Turn by a small angle given in the navigation frame (a filter correction). The scratch floats are
+  // the caller's, for the stack is deepest here.
+  void correct(const float angle_navigation_rad[kAxes], float scratch[8]);
   // Rotation matrix body to navigation, row by row.
   void matrix(float rotation[kAxes * kAxes]) const;
   // this := first * this, i.e. apply `first` after what is already there.
