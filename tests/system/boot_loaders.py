@@ -43,7 +43,7 @@ def build_optiboot(folder: Path) -> Firmware:
     subprocess.run(["avr-gcc", *arguments, str(OPTIBOOT), "-o", str(elf)], check=True)
     image = bytearray(read_firmware(elf).flash)
     image[: len(JUMP_TO_OPTIBOOT)] = JUMP_TO_OPTIBOOT
-    return Firmware(bytes(image), 0, 0x100, b"")
+    return Firmware(bytes(image), 0, 0x100, b"", {})
 
 
 def mega_loader(folder: Path) -> Firmware:
@@ -55,4 +55,4 @@ def mega_loader(folder: Path) -> Firmware:
     image = bytearray(b"\xff" * 0x40000)
     image[: len(JUMP_TO_MEGA_LOADER)] = JUMP_TO_MEGA_LOADER
     image[MEGA_ADDRESS : MEGA_ADDRESS + len(loader)] = loader
-    return Firmware(bytes(image), 0, 0x200, b"")
+    return Firmware(bytes(image), 0, 0x200, b"", {})

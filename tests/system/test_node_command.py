@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 import pytest
 
 from relpos.emulator.avr.library import missing_parts
+from relpos.link.live import open_port
 
 RELPOS = [sys.executable, "-m", "relpos.cli.main"]
 
@@ -185,6 +186,17 @@ def test_a_port_that_is_none_is_told_in_one_line(arguments):
     done = node(*arguments)
     assert done.returncode == 1
     assert "cannot open" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_port_that_another_program_has_is_told(port):
+    first = open_port(port)
+    try:
+        done = node("list", port)
+    finally:
+        first.close()
+    assert done.returncode == 1
+    assert "another program has it open" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 
 

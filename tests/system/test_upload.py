@@ -41,6 +41,7 @@ class SerialBoard(threading.Thread):
                 # The bootloader hands over to the sketch by letting the watchdog bite.
                 if self.board.counters().watchdog_resets:
                     self.handed_over.set()
+                    return  # the sketch speaks at another speed
 
 
 @pytest.mark.skipif(needs() is not None, reason=str(needs()))

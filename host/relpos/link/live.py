@@ -165,9 +165,15 @@ class Link:
 
 
 def open_port(port: str, baud: int = BAUD) -> serial.Serial:
-    """The serial port (or pyserial URL) ``port``. Raises DeviceError with the reason."""
+    """The serial port (or pyserial URL) ``port``, for this program alone.
+
+    Raises DeviceError with the reason.
+    """
     try:
-        device: serial.Serial = serial.serial_for_url(port, baudrate=baud, timeout=READ_TIMEOUT_S)
+        # Two programs at one port would each get some of the bytes, and neither would know.
+        device: serial.Serial = serial.serial_for_url(
+            port, baudrate=baud, timeout=READ_TIMEOUT_S, exclusive=True
+        )
     except (serial.SerialException, OSError, ValueError) as error:
         reason = _reason(error) if "://" in port or Path(port).exists() else "no such device"
         raise DeviceError(f"{port}: cannot open the serial port: {reason}") from error
@@ -185,6 +191,8 @@ def send(device: Line, data: bytes) -> None:
 
 
 def _reason(error: Exception) -> str:
+    if isinstance(error, BlockingIOError) or "exclusively lock" in str(error):
+        return "another program has it open"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return str(error).splitlines()[0]
