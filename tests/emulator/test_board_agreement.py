@@ -1,12 +1,15 @@
 """Native, Uno and Mega send the same numbers about the same walk, and each the same bytes twice.
 
-For the comparison to be fair, what differs by a board's pace alone is taken out of its surroundings:
-an Uno needs milliseconds more to set its chips up and finds a sample up to a millisecond later. So
-the inertial chip samples on a grid of virtual time, the field stands still between its samples, the
-tags stand still for a superframe, the air adds neither noise nor chance, and the clocks are exact.
+For the comparison to be fair, what differs by a board's pace alone is taken out of its
+surroundings: a computer's clock starts with its power, an Uno's 2 ms and a Mega's 6 ms later; they
+take milliseconds more to set their chips up, and find a sample up to a millisecond later. So they
+are switched on that much apart, the inertial chip samples on a grid of virtual time that leaves the
+reports between two samples, the field stands still from sample to sample and the tags for a
+superframe, the air adds neither noise nor chance, and the clocks are exact.
 """
 
 import dataclasses
+import functools
 import shutil
 from collections import defaultdict
 
@@ -22,13 +25,20 @@ from relpos.link import xbee
 from relpos.protocol import messages as wire
 
 SAMPLE_US = 20_000
+PHASE_US = 8_000
+"""Samples lie so far behind multiples of their period: 5 ms and more from nodes 1 and 2's reports,
+at 157 and 314 ms of every second of their own clocks."""
 SUPERFRAME_US = 2_000_000
 BLOCK_S = 512 * SAMPLE_US * 1e-6
-"""After so many samples a node integrates with the sample period that it has measured instead of the
-nominal one (SampleClock in firmware/lib/node/clock.h)."""
+"""After so many samples a node integrates with the sample period that it has measured instead of
+the nominal one (SampleClock in firmware/lib/node/clock.h)."""
+POWER_ON_US = {"native": 6000, "uno": 4000, "mega": 0}
+"""So that the three clocks begin together, to a millisecond."""
 SEEN_S = 0.006
-"""How far two boards' times of one sample, or of one report, may be apart: a sample is looked for
-every millisecond, and a report waits for the tick before it (the Uno's longest is 9 ms a second)."""
+"""How far two boards' times of one sample may be apart: it is looked for every millisecond."""
+SENT_S = 0.07
+"""And those of the other messages, which tell when they were written: once the radio is free, and
+an exchange of ranges is over."""
 OWN = {"free_stack_bytes", "worst_tick_s"}
 """What is the board's own: a computer has all the stack it wants and no tick that takes time."""
 
@@ -38,18 +48,20 @@ needs_avr = pytest.mark.skipif(
 
 
 class GridMpu(mpu9150.Mpu9150):
-    """Samples at multiples of its period since power-on, whenever it was set up."""
+    """Samples on the grid, whenever it was set up."""
 
     def _reschedule(self):
         super()._reschedule()
         if self._running:
-            self._epoch = -(-self._epoch // self._period) * self._period
+            phase = PHASE_US * 8 // 1000  # the chip counts in eighths of a millisecond
+            periods = -(-(self._epoch - phase) // self._period)
+            self._epoch = periods * self._period + phase
             self._due_us = self._time_of(1)
 
 
 class StandingField(Surroundings):
     def magnetic_field_at(self, time_us):
-        return super().magnetic_field_at(time_us // SAMPLE_US * SAMPLE_US)
+        return super().magnetic_field_at((time_us - PHASE_US) // SAMPLE_US * SAMPLE_US)
 
     def pressure_at(self, time_us):
         return super().pressure_at(time_us // 1_000_000 * 1_000_000)
@@ -66,11 +78,11 @@ class QuietWorld:
         return 0.005
 
 
-def exact_clocks(seed, node):
+def exact_clocks(seed, node, power_on_us):
     errors = draw_node_errors(seed, node)
     return dataclasses.replace(
         errors,
-        power_on_us=0,
+        power_on_us=power_on_us,
         clock=NodeClockError(),
         inertial=dataclasses.replace(errors.inertial, sample_clock_ppm=0.0),
         pressure=dataclasses.replace(errors.pressure, noise_pa=0.0),
@@ -86,7 +98,8 @@ def frames(board, seconds):
     """Every frame of two walkers by (node, message)."""
     found = defaultdict(list)
     parser = xbee.Parser()
-    options = {"collisions": False, "node_errors": exact_clocks, "beacons": True}
+    errors = functools.partial(exact_clocks, power_on_us=POWER_ON_US[board])
+    options = {"collisions": False, "node_errors": errors, "beacons": True}
     with EmulatedTeam("paper", 2, seconds, 4, board, **options) as team:
         for node in team.nodes.values():
             node.mpu.__class__ = GridMpu
@@ -135,7 +148,7 @@ def differences(ours, theirs):
         assert len(mine) == len(others), f"{key}: {len(mine)} frames and {len(others)}"
         for one, other in zip(mine, others, strict=True):
             age_s = abs(time_s(one) - time_s(other))
-            assert age_s <= (0.07 if key[1] == "ranges" else SEEN_S), (key, time_s(one))
+            assert age_s <= (SEEN_S if key[1] == "motion" else SENT_S), (key, time_s(one))
             for (name, a, per_unit), (_, b, _) in zip(values(one), values(other), strict=True):
                 if name in OWN or name.startswith(("time_s", "age_s")):
                     continue
@@ -169,10 +182,21 @@ def assert_only_the_measured_period_differs(found):
 @needs_avr
 @pytest.mark.soak
 @pytest.mark.parametrize("board", ["uno", "mega"])
-def test_two_minutes_of_every_board_agree_but_for_the_sample_period_that_each_has_measured(board):
+def test_two_minutes_of_every_board_end_at_the_same_place(board):
+    """Another microsecond of sample period can turn a decision at a threshold once in a minute: one
+    step is counted a tick later or as an irregular one, and its length, variance and place differ
+    from then on."""
     firmware_is_built(board)
-    ours, theirs = frames("native", 120.0), frames(board, 120.0)
-    assert_only_the_measured_period_differs(differences(ours, theirs))
+    found = list(differences(frames("native", 120.0), frames(board, 120.0)))
+    assert [each for each in found if each[2] <= BLOCK_S + 0.4] == []
+    worst = defaultdict(float)
+    for _, name, _, a, b in found:
+        worst[name] = max(worst[name], abs(a - b))
+    print(dict(worst))
+    assert all(worst[name] < 1.0 for name in ("x_m", "y_m", "path_m"))
+    assert worst["heading_rad"] < 0.01
+    assert worst["steps"] <= 1
+    assert {name for name in worst if "range" in name or name in ("state", "peer", "team")} == set()
 
 
 @needs_avr

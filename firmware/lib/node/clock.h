@@ -52,8 +52,9 @@ class SampleClock {
     }
     if (++block_samples_ == kBlockSamples) {
       // Seen with up to 1 ms of jitter: 1e-4 of a block. Half of each block's news is taken.
-      const uint32_t measured_us = (now_us - block_start_us_) / kBlockSamples;
-      period_us_ = (period_us_ + measured_us) / 2;
+      // To the nearest, or every block would pull it down by half a microsecond.
+      const uint32_t measured_us = (now_us - block_start_us_ + kBlockSamples / 2) / kBlockSamples;
+      period_us_ = (period_us_ + measured_us + 1) / 2;
       block_start_us_ = now_us;
       block_samples_ = 0;
     }
