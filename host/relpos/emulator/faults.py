@@ -297,7 +297,7 @@ FAULTS: tuple[Fault, ...] = (
         "clock",
         "intermittent",
         "stands for a moment every second",
-        "missed ticks counted and flagged, no reset",
+        "as much is lost as it stands, of motion and of the node's time; no hang, no reset",
         (_ms("each time", 60.0),),
     ),
     Fault(
