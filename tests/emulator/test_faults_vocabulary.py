@@ -1,9 +1,12 @@
 """The vocabulary of faults: what is understood, what is refused and in which words."""
 
+from pathlib import Path
+
 import pytest
 from typer.testing import CliRunner
 
 from relpos.cli import main
+from relpos.emulator import reliability
 from relpos.emulator.faults import FAULTS, REFUSED, TARGETS, FaultError, help_text, parse_fault
 from relpos.emulator.team import EmulatedTeam
 
@@ -109,3 +112,21 @@ def test_the_same_faults_and_seed_give_the_same_bytes():
     assert runs[0] == runs[1]
     with EmulatedTeam("paper", 2, 10.0, 3) as team:
         assert list(team.stream()) != runs[0]
+
+
+def test_the_table_of_reliability_has_a_row_for_every_fault():
+    page = Path(__file__).parents[2] / "docs" / "reliability.md"
+    rows = [line for line in page.read_text().splitlines() if line.startswith("| `")]
+    told = [row.split("`")[1] for row in rows]
+    assert told == [spec for target in TARGETS for f, spec in reliability.specs()
+                    if f.target == target]  # fmt: skip
+    for row, (fault, _) in zip(rows, sorted(
+        reliability.specs(), key=lambda pair: list(TARGETS).index(pair[0].target)
+    ), strict=True):  # fmt: skip
+        cells = [cell.strip() for cell in row.strip("|").split(" | ")]
+        assert len(cells) == 7
+        assert cells[1] == fault.meaning
+        assert cells[2] == fault.must
+        assert cells[3].endswith(" s"), "recovers"
+        if fault.target in ("radio", "xbee", "uwb", "pozyx", "host"):
+            assert cells[4] == "0.00 m"

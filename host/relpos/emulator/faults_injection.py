@@ -561,7 +561,7 @@ class FaultInjector:
             return {"erased": 0xFF, "old": old, "garbage": int(rng.integers(256))}[left]
 
         if isinstance(node.engine, NativeEngine):
-            _cut_native(node, node.engine, self._clock, spec.from_us, wanted, remains)
+            cut_native(node, node.engine, self._clock, spec.from_us, wanted, remains)
         else:
             _cut_avr(node, self._clock, spec.from_us, wanted, remains)
 
@@ -708,7 +708,7 @@ def _air_damage(spec: FaultSpec, rng: Draw) -> Callable[[bytes, int], list[tuple
     return damage
 
 
-def _cut_native(
+def cut_native(
     node: EmulatedNode,
     engine: NativeEngine,
     clock: VirtualClock,

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -32,7 +31,7 @@ from .team import EmulatedTeam
 NODES = 3
 NODE = 2
 """Whom faults of one node happen to."""
-SECONDS = 80.0
+SECONDS = 65.0
 BEGIN_S = 25.0
 END_S = 45.0
 SEED = 1
@@ -58,10 +57,13 @@ class Record:
 
     faults: tuple[str, ...]
     walkers: Mapping[int, WalkerTruth]
+    power_on_s: Mapping[int, float]
+    clock_rates: Mapping[int, float]
     frames: list[tuple[float, wire.Frame]] = field(default_factory=list)
     observations: list[tuple[float, Observation]] = field(default_factory=list)
     counts: dict[str, float] = field(default_factory=dict)
-    air: Counter[str] = field(default_factory=Counter)
+    dated: list[tuple[int, float, float]] = field(default_factory=list)
+    """(node, its own time, the host's time) of every motion that was taken."""
 
     def of(self, message: Message, node: int) -> list[tuple[float, wire.Frame]]:
         """A node's frames of one kind that were taken, with their arrivals."""
@@ -106,6 +108,14 @@ class Record:
             and frame.values["state"] != wire.MotionState.STARTING
         ]
 
+    def unwell(self, node: int, begin_s: float, end_s: float) -> wire.Health:
+        """What a node's status told at some time in between not to work."""
+        missing = wire.Health(0)
+        for t, value in self.statuses(node, "health"):
+            if begin_s <= t < end_s:
+                missing |= ~wire.Health(int(value))
+        return missing
+
     def flagged(self, node: int, quality: wire.Quality) -> int:
         """How many motion reports carry that flag."""
         return sum(bool(f.values["quality"] & quality) for _, f in self.of(wire.MOTION, node))
@@ -114,6 +124,14 @@ class Record:
         """Between two tags at a time."""
         a, b = (self.walkers[n].position_at(time_s) for n in (one, other))
         return math.dist(a, b)
+
+    def date_errors_s(self, node: int) -> list[float]:
+        """The host's time of each motion less the true one, by the clock of a node's first boot."""
+        return [
+            time_s - self.power_on_s[node] - node_s / self.clock_rates[node]
+            for number, node_s, time_s in self.dated
+            if number == node
+        ]
 
     def range_errors_m(self) -> list[float]:
         """Every range less the true distance at its time, whoever measured it."""
@@ -184,17 +202,29 @@ def record(
     board: str = "native",
 ) -> Record:
     """Let a team walk with those faults; the same arguments give the same record."""
-    with EmulatedTeam(GOOD_CONDITIONS, nodes, seconds, seed, board, faults=faults) as team:
+    with EmulatedTeam(
+        GOOD_CONDITIONS, nodes, seconds, seed, board, faults=faults, beacons=True
+    ) as team:
         tap = _Tap(team.key)
-        kept = Record(tuple(str(f) for f in faults), team.walkers)
+        errors = {number: node.errors for number, node in team.nodes.items()}
+        kept = Record(
+            tuple(str(f) for f in faults),
+            team.walkers,
+            {number: e.power_on_us * 1e-6 for number, e in errors.items()},
+            {number: 1.0 + e.clock.drift_ppm * 1e-6 for number, e in errors.items()},
+        )
         for time_us, data in team.stream():
             arrival_s = time_us * 1e-6
             for observations, frame in tap.feed(data, arrival_s):
                 kept.observations += [(arrival_s, o) for o in observations]
                 if frame is not None:
                     kept.frames.append((arrival_s, frame))
+                    kept.dated += [
+                        (o.node, frame.values["time_s"], o.time_s)
+                        for o in observations
+                        if isinstance(o, Motion)
+                    ]
         kept.counts = tap.link.summary()
-        kept.air = team.uwb.counts
     return kept
 
 
@@ -294,6 +324,9 @@ class Outcome:
             more = self.run.grown(NODE, name) - self.clean.grown(NODE, name)
             if more > 0.5:
                 words.append(f"{name} +{more:.0f}")
+        window = (self.begin_s + 1.0, max(self.end_s, self.begin_s + 10.0))
+        gone = self.run.unwell(NODE, *window) & ~self.clean.unwell(NODE, *window)
+        words += [f"no {flag.name}" for flag in wire.Health if flag in gone]
         for flag in (
             wire.Quality.IMU_GAP,
             wire.Quality.FILTER_RESET,
