@@ -47,8 +47,8 @@ wire-check: $(DEVELOP)
 	$(PYTHON) protocol/generate.py --check
 
 native-tests: $(DEVELOP) | system-demo
-	$(call title,Firmware suites on this computer)
-	tools/pio test -e native
+	$(call title,Firmware suites on this computer, plain and under sanitizers)
+	tools/pio test -e native -e native_sanitized
 
 board-builds: $(DEVELOP) | system-avr
 	$(call title,Firmware for both boards)
