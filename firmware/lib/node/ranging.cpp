@@ -112,9 +112,17 @@ RELPOS_SHARED uint8_t RangingPlan::next(uint16_t now_ms, uint8_t id, uint8_t tea
 }
 
 RELPOS_UNCLONED void RangingPlan::done(bool success) {
+  const uint8_t byte = index_ / 8;
+  const uint8_t bit = static_cast<uint8_t>(1 << (index_ & 7));
+  const uint8_t lately = (ranged_[byte] | before_[byte]) & bit;
   if (success) {
-    ranged_[index_ / 8] |= static_cast<uint8_t>(1 << (index_ & 7));
+    ranged_[byte] |= bit;
+  } else if (count_ != 0 && lately != 0 && ++again_ <= kRetries) {
+    --step_;
+    --tried_;
+    return;
   }
+  again_ = 0;
 }
 
 uint8_t RangingPlan::neighbours() const {

@@ -403,7 +403,7 @@ TEST(with_a_beacon_every_exchange_lies_in_the_node_s_own_window) {
       }
     }
     // Eleven rounds: all others up to seven; else half of them, or what 100 ms take.
-    const uint16_t a_round = count <= 7 ? count - 1 : count == 12 ? 6 : 3;
+    const uint16_t a_round = count <= 7 ? count - 1 : count == 12 ? 6 : 4;
     CHECK(heard >= 10 * a_round && heard <= 12 * a_round);
   }
 }
@@ -444,6 +444,41 @@ TEST(twenty_nodes_get_every_pair_within_ten_seconds) {
       CHECK(last > 50000);
     }
   }
+}
+
+TEST(in_its_window_a_node_asks_again_whom_it_ranged_lately_and_nobody_else) {
+  wire::Beacon beacon;
+  beacon.period_ms = 2000;
+  beacon.count = 6;
+  for (uint8_t i = 0; i < 6; ++i) beacon.entries[i].node = static_cast<uint8_t>(i + 1);
+  relpos::RangingPlan plan = relpos::RangingPlan();
+  plan.begin(0, 1);
+  uint16_t others = 0, in_a_row = 0, most_in_a_row = 0, most_later = 0;
+  uint16_t busy_until_ms = 0;
+  uint8_t previous = 0;
+  for (uint16_t now_ms = 0; now_ms < 60000; ++now_ms) {
+    if (now_ms % 1000 == 0) {
+      beacon.phase_ms = now_ms % 2000;
+      beacon.round = static_cast<uint8_t>(now_ms / 2000);
+      plan.beacon(now_ms, beacon, 1);
+    }
+    if (now_ms < busy_until_ms) continue;
+    uint16_t wait_ms = 0;
+    const uint8_t peer = plan.next(now_ms, 1, 6, 2000, &wait_ms);
+    if (peer == 0) continue;
+    in_a_row = peer == previous ? in_a_row + 1 : 1;
+    previous = peer;
+    const bool gone = peer == 3 || (peer == 4 && now_ms >= 20000);  // 3 was never there
+    if (peer == 3) CHECK_EQUAL(1, in_a_row);
+    if (peer == 4 && in_a_row > most_in_a_row) most_in_a_row = in_a_row;
+    if (peer == 4 && now_ms >= 37000 && in_a_row > most_later) most_later = in_a_row;
+    others = static_cast<uint16_t>(others + (peer == 2 || peer > 4));
+    plan.done(!gone);
+    busy_until_ms = static_cast<uint16_t>(now_ms + 23);
+  }
+  CHECK_EQUAL(1 + relpos::kRetries, most_in_a_row);
+  CHECK_EQUAL(1, most_later);  // not ranged for 16 s
+  CHECK(others >= 3 * 29);     // thirty rounds, the gone one takes nothing from the others
 }
 
 TEST(the_led_tells_the_states_apart) {
