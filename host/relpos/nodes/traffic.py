@@ -13,7 +13,7 @@ FRAME_BYTES = 9
 """Delimiter, length, type, 16-bit source, signal strength, options, checksum of a 0x81 frame."""
 ESCAPED_SHARE = 4 / 256
 """0x7E, 0x7D, 0x11 and 0x13 take two bytes each; tag and counters are as good as random."""
-EXCHANGE_S = 0.033
+EXCHANGE_S = 0.024
 ALL_IN_A_ROUND = 7
 """How the firmware plans its slots (firmware/lib/node/ranging.h)."""
 AIR_BIT_S = 1 / 250_000
