@@ -17,8 +17,8 @@ void multiply(const float a[4], const float b[4], float out[4]) {
   for (uint8_t row = 0; row < 4; ++row) {
     float sum = 0.0f;
     for (uint8_t column = 0; column < 4; ++column) {
-      const float product = a[column] * b[row ^ column];
-      sum += (negative & 1) != 0 ? -product : product;
+      const float factor = a[column];
+      sum = multiply_add((negative & 1) != 0 ? -factor : factor, b[row ^ column], sum);
       negative >>= 1;
     }
     out[row] = sum;

@@ -50,7 +50,7 @@ RELPOS_APART void ErrorFilter::mix(uint8_t to, uint8_t from, float factor) {
   float* a = p_ + to;
   const float* b = p_ + from;
   for (uint8_t other = 0; other < kStates; ++other) {
-    *a += factor * *b;
+    *a = multiply_add(*b, factor, *a);
     a += step(other, to);
     b += step(other, from);
   }
@@ -61,7 +61,8 @@ RELPOS_APART void ErrorFilter::add_column(float out[kStates], uint8_t state, flo
   if (factor == 0.0f) return;
   const float* p = p_ + state;
   for (uint8_t other = 0; other < kStates; ++other) {
-    *out++ += factor * *p;
+    *out = multiply_add(*p, factor, *out);
+    ++out;
     p += step(other, state);
   }
 }

@@ -39,7 +39,7 @@ const uint8_t kForwardSteps = 4;       // two strides: the sway of left and righ
 const float kForwardCoherence = 0.06f;
 
 RELPOS_SHARED void integrate(float* sum, float rate, float dt_s) {
-  *sum += (rate - *sum * (1.0f / kLeakTime_s)) * dt_s;
+  *sum = multiply_add(multiply_add(*sum, -1.0f / kLeakTime_s, rate), dt_s, *sum);
 }
 
 RELPOS_SHARED void lower(float* least, float value) {

@@ -6,14 +6,24 @@
 
 namespace relpos {
 
+#if defined(__AVR__)
+// What avr-libc's __mulsf3 and __addsf3 are made of: __mulsf3x leaves its result with eight bits more
+// (r27), __addsf3x takes them so and those of the other number in r26.
+__attribute__((naked, noinline)) float multiply_add(float, float, float) {
+  asm volatile(
+      "call __mulsf3x\n"
+      "movw r18, r14\n"
+      "movw r20, r16\n"
+      "clr r26\n"
+      "call __addsf3x\n"
+      "jmp __fp_round\n");
+}
+#endif
+
 RELPOS_SHARED float dot(const float* a, const float* b, uint8_t count) {
-  float sum;
-  for (bool first = true;; first = false) {  // not from zero: an addition is 100 cycles
-    float product = *a++ * *b++;
-    if (!first) product += sum;
-    sum = product;
-    if (--count == 0) return sum;
-  }
+  float sum = *a * *b;
+  while (--count != 0) sum = multiply_add(*++a, *++b, sum);
+  return sum;
 }
 
 RELPOS_SHARED float norm(const float v[kAxes]) { return sqrtf(dot(v, v)); }
@@ -21,11 +31,11 @@ RELPOS_SHARED float norm(const float v[kAxes]) { return sqrtf(dot(v, v)); }
 RELPOS_SHARED void add(float* to, float value) { *to += value; }
 
 RELPOS_SHARED void add_scaled(float* to, const float* from, float factor, uint8_t count) {
-  for (; count != 0; --count) *to++ += factor * *from++;
+  for (; count != 0; --count, ++to) *to = multiply_add(*from++, factor, *to);
 }
 
 RELPOS_SHARED void follow(float* value, float target, float gain) {
-  *value += (target - *value) * gain;
+  *value = multiply_add(target - *value, gain, *value);
 }
 
 RELPOS_SHARED void left_of(const float axis[2], float out[2]) {

@@ -13,6 +13,13 @@ enum Axis : uint8_t { kX = 0, kY = 1, kZ = 2, kAxes = 3 };
 
 inline uint8_t next(uint8_t axis) { return axis == kZ ? static_cast<uint8_t>(kX) : axis + 1; }
 
+// a b + c. On the AVR the product is not rounded before the sum, which is 40 of 300 cycles less and
+// the result nearer the true one by up to half a unit in its last place.
+#if defined(__AVR__)
+float multiply_add(float a, float b, float c) __attribute__((const));
+#else
+inline float multiply_add(float a, float b, float c) { return a * b + c; }
+#endif
 float dot(const float* a, const float* b, uint8_t count = kAxes);
 float norm(const float v[kAxes]);
 void add(float* to, float value);  // to += value
