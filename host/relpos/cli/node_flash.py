@@ -71,7 +71,7 @@ def flash(
     typer.echo(f"{found}: Arduino {kind.name} ({kind.chip})")
     with output.working("building and writing the firmware"):
         size = upload.upload(kind, found)
-    typer.echo(f"firmware written and verified ({size} bytes)")
+    typer.echo("firmware written and verified" + (f" ({size} bytes)" if size else ""))
     if new and key_file is not None:
         write_new_key(key_file)
     _set_up(found, node_id, key_file, old_key_file)

@@ -32,8 +32,11 @@ def platformio(root: Path = ROOT) -> list[str]:
     raise DeviceError("PlatformIO is missing: `make firmware` sets it up, or see platformio.org")
 
 
-def upload(board: Board, port: str, root: Path = ROOT) -> int:
-    """Build, write and verify; returns the bytes that were verified. DeviceError says why not."""
+def upload(board: Board, port: str, root: Path = ROOT) -> int | None:
+    """Build, write and verify; DeviceError says why not.
+
+    Returns the bytes that were verified, or None where the uploader has not told them.
+    """
     command = [*platformio(root), "run", "-e", board.environment, "-t", "upload"]
     try:
         done = subprocess.run(
@@ -50,7 +53,7 @@ def upload(board: Board, port: str, root: Path = ROOT) -> int:
     if done.returncode != 0:
         raise DeviceError(f"{port}: {why(told)}")
     verified = re.search(r"(\d+) bytes of flash verified", told)
-    return int(verified[1]) if verified else 0
+    return int(verified[1]) if verified else None
 
 
 def why(told: str) -> str:

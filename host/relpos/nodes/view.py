@@ -56,7 +56,6 @@ class NodeView:
     node: int
     boot: int = 0
     heard_s: float = 0.0
-    boots_seen: int = 1
     received: int = 0
     lost: int = 0
     rssi_dbm: float | None = None
@@ -149,9 +148,7 @@ class TeamView:
             view = self.nodes.get(node)
             if view is None:
                 view = self.nodes[node] = NodeView(node, track.boot, now_s)
-            if track.boot != view.boot:
-                view.boot = track.boot
-                view.boots_seen += 1
+            view.boot = track.boot
             received = track.counts["received"]
             if received != view.received:
                 view.received = received
