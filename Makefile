@@ -64,7 +64,7 @@ python-tests: $(DEVELOP) | system-avr
 	$(call title,Python tests)
 	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist worksteal
 
-soak: $(DEVELOP) $(FUZZ) | system-avr system-soak ## fuzzing and whatever else takes long: an hour
+soak: board-builds $(FUZZ) | system-soak ## fuzzing and whatever else takes long: an hour
 	$(call title,Long runs)
 	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist worksteal -m soak -rP
 

@@ -16,7 +16,6 @@ from collections import defaultdict
 import pytest
 
 from relpos.emulator import mpu9150
-from relpos.emulator.avr.budget import default_build_folder, find_firmware
 from relpos.emulator.engine import NodeClockError
 from relpos.emulator.node import draw_node_errors
 from relpos.emulator.surroundings import Surroundings
@@ -89,11 +88,6 @@ def exact_clocks(seed, node, power_on_us):
     )
 
 
-def firmware_is_built(board):
-    if not find_firmware(board, default_build_folder()).is_file():
-        pytest.fail(f"no firmware for the {board}: run `make firmware` first")
-
-
 def frames(board, seconds):
     """Every frame of two walkers by (node, message)."""
     found = defaultdict(list)
@@ -164,7 +158,6 @@ def native_frames():
 @needs_avr
 @pytest.mark.parametrize("board", ["uno", "mega"])
 def test_every_field_of_every_message_agrees_to_its_last_digit(board, native_frames):
-    firmware_is_built(board)
     found = list(differences(native_frames, frames(board, 16.0)))
     assert {key[1] for key in native_frames} >= {"motion", "ranges", "status", "acknowledgement"}
     assert native_frames[1, "motion"][-1].values["path_m"] > 8.0
@@ -186,7 +179,6 @@ def test_two_minutes_of_every_board_end_at_the_same_place(board):
     """Another microsecond of sample period can turn a decision at a threshold once in a minute: one
     step is counted a tick later or as an irregular one, and its length, variance and place differ
     from then on."""
-    firmware_is_built(board)
     found = list(differences(frames("native", 120.0), frames(board, 120.0)))
     assert [each for each in found if each[2] <= BLOCK_S + 0.4] == []
     worst = defaultdict(float)
@@ -201,8 +193,6 @@ def test_two_minutes_of_every_board_end_at_the_same_place(board):
 
 @needs_avr
 def test_the_same_seed_gives_the_same_bytes_of_simulated_boards_too():
-    firmware_is_built("uno")
-
     def stream():
         with EmulatedTeam("paper", 2, 6.0, 7, "uno", beacons=True) as team:
             return list(team.stream())
