@@ -95,6 +95,7 @@ def test_a_session_knows_what_an_earlier_one_has_heard():
         assert second.decoder.feed(frame, 1.0) == []
     assert second.decoder.nodes == {}
     assert second.newest_counters() == {}
+    assert ["node 1: old frames" in line for line in second.decoder.remarks] == [True]
     second.decoder.feed(motion(10, 11.0), 2.0)
     assert second.decoder.nodes[1].counts["lost"] == 0
 

@@ -259,7 +259,8 @@ class Decoder:
 
     def _refuse(self, node: int, track: NodeTrack, verdict: Verdict) -> None:
         track.counts[verdict.value] += 1
-        if verdict is not Verdict.REPLAYED:
+        # Of a node that was not heard since the start a "duplicate" is one of an earlier session.
+        if verdict is Verdict.DUPLICATE and track.heard:
             return
         self._replays[node] += 1
         if self._replays[node] == REPLAYS_BEFORE_REMARK:
