@@ -275,12 +275,17 @@ class NativeEngine:
         while self.next_due_us <= until_us:
             self._pass(self.next_due_us)
 
-    def _pass(self, time_us: int) -> None:
+    def poll(self, time_us: int, node_us: int) -> int:
+        """One pass of the main loop with the node's clock at ``node_us``; what it returns."""
         self._now_us = self.bus.time_us = time_us
-        wait_us = self._poll(self._node, self._node_us(time_us))
+        wait_us: int = self._poll(self._node, node_us)
         if self._error is not None:
             error, self._error = self._error, None
             raise error
+        return wait_us
+
+    def _pass(self, time_us: int) -> None:
+        wait_us = self.poll(time_us, self._node_us(time_us))
         if self._reset_asked:
             self.reset(time_us, ResetCause.COMMAND)
             return

@@ -171,6 +171,18 @@ class Board:
         """Values written to GPIOR0 since the last call, as (cycle, value)."""
         return self._take(self._library.relpos_avr_take_marks)
 
+    def trace(self) -> None:
+        """From now on keep what take_looks and take_heard give; they have to be called."""
+        self._library.relpos_avr_trace(self._alive())
+
+    def take_looks(self) -> list[tuple[int, int]]:
+        """Looks of the program at timer 1's overflow flag, as (cycle, low byte of the timer read)."""
+        return self._take(self._library.relpos_avr_take_looks)
+
+    def take_heard(self) -> list[tuple[int, int]]:
+        """Bytes that the program fetched from the receiver, as (cycle, byte)."""
+        return self._take(self._library.relpos_avr_take_heard)
+
     def _take(self, function: Callable[..., int]) -> list[tuple[int, int]]:
         taken: list[tuple[int, int]] = []
         while True:

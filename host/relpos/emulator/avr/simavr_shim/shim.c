@@ -31,7 +31,7 @@
 
 /* Data addresses, the same on the ATmega328P and the ATmega2560. */
 enum {
-	A_DDRC = 0x27, A_DDRD = 0x2a, /* the port register follows its direction register */
+	A_TIFR1 = 0x36, A_TCNT1L = 0x84, A_DDRC = 0x27, A_DDRD = 0x2a, /* the port register follows its direction register */
 	A_GPIOR0 = 0x3e, A_EECR = 0x3f, A_EEDR = 0x40, A_EEARL = 0x41, A_EEARH = 0x42, A_MCUSR = 0x54,
 	A_TWBR = 0xb8, A_TWSR = 0xb9, A_TWDR = 0xbb, A_TWCR = 0xbc,
 	A_UCSRA = 0xc0, A_UCSRB = 0xc1, A_UCSRC = 0xc2, A_UBRRL = 0xc4, A_UBRRH = 0xc5, A_UDR = 0xc6
@@ -58,7 +58,8 @@ struct relpos_avr {
 	uint64_t counter[COUNTER_COUNT];
 	uint32_t static_end, lowest_sp;
 	uint64_t tick_began;
-	record_list marks, sent;
+	record_list marks, sent, looks, heard;
+	int tracing;
 	/* TWI */
 	avr_int_vector_t *twi_vector;
 	twi_phase phase;
@@ -369,6 +370,7 @@ static uint8_t udr_read(avr_t *avr, avr_io_addr_t address, void *param)
 	}
 	if (!e->received_count) avr->data[A_UCSRA] &= (uint8_t)~RXC;
 	avr->data[A_UCSRA] &= (uint8_t)~DOR;
+	if (e->tracing) append(e, &e->heard, avr->cycle, v);
 	levels(e);
 	return avr->data[address] = v;
 }
@@ -515,6 +517,13 @@ static void mark_write(avr_t *avr, avr_io_addr_t address, uint8_t v, void *param
 			e->counter[COUNTER_WORST_TICK_AT] = e->tick_began;
 		}
 	}
+}
+
+static uint8_t tifr1_read(avr_t *avr, avr_io_addr_t address, void *param)
+{
+	relpos_avr *e = param;
+	append(e, &e->looks, avr->cycle, avr->data[A_TCNT1L]);
+	return avr->data[address];
 }
 
 static inline void look_at_stack(relpos_avr *e)
@@ -712,6 +721,8 @@ void relpos_avr_destroy(relpos_avr *e)
 		if (io->next == &e->io) io->next = NULL;
 	avr_terminate(e->avr);
 	free(e->avr);
+	free(e->looks.items);
+	free(e->heard.items);
 	free(e->marks.items);
 	free(e->sent.items);
 	free(e->queue);
@@ -748,6 +759,22 @@ uint32_t relpos_avr_take_sent(relpos_avr *e, uint64_t *cycles, uint8_t *bytes, u
 uint32_t relpos_avr_take_marks(relpos_avr *e, uint64_t *cycles, uint8_t *values, uint32_t room)
 {
 	return take(&e->marks, cycles, values, room);
+}
+
+void relpos_avr_trace(relpos_avr *e)
+{
+	e->tracing = 1;
+	hook_read(e, A_TIFR1, tifr1_read);
+}
+
+uint32_t relpos_avr_take_looks(relpos_avr *e, uint64_t *cycles, uint8_t *values, uint32_t room)
+{
+	return take(&e->looks, cycles, values, room);
+}
+
+uint32_t relpos_avr_take_heard(relpos_avr *e, uint64_t *cycles, uint8_t *values, uint32_t room)
+{
+	return take(&e->heard, cycles, values, room);
 }
 
 uint32_t relpos_avr_eeprom_size(const relpos_avr *e) { return e->eeprom->size; }

@@ -64,6 +64,13 @@ uint32_t relpos_avr_take_sent(relpos_avr *, uint64_t *cycles, uint8_t *bytes, ui
 /* Take up to `room` values written to GPIOR0 and the cycles of the writes. */
 uint32_t relpos_avr_take_marks(relpos_avr *, uint64_t *cycles, uint8_t *values, uint32_t room);
 
+/* From now on keep what relpos_avr_take_looks() and relpos_avr_take_heard() give. */
+void relpos_avr_trace(relpos_avr *);
+/* Take up to `room` reads of TIFR1 and the low byte of timer 1 as the program read it last. */
+uint32_t relpos_avr_take_looks(relpos_avr *, uint64_t *cycles, uint8_t *values, uint32_t room);
+/* Take up to `room` bytes that the program fetched from the receiver. */
+uint32_t relpos_avr_take_heard(relpos_avr *, uint64_t *cycles, uint8_t *values, uint32_t room);
+
 uint32_t relpos_avr_eeprom_size(const relpos_avr *);
 void relpos_avr_eeprom_get(const relpos_avr *, uint8_t *out, uint32_t count);
 void relpos_avr_eeprom_set(relpos_avr *, const uint8_t *in, uint32_t count);
