@@ -176,8 +176,10 @@ class Board:
         self._library.relpos_avr_trace(self._alive())
 
     def take_looks(self) -> list[tuple[int, int]]:
-        """Looks of the program at timer 1's overflow flag, as (cycle, low byte of the timer read)."""
-        return self._take(self._library.relpos_avr_take_looks)
+        """Looks at timer 1's overflow flag, as (cycle, timer as the program read it last)."""
+        taken = self._take(self._library.relpos_avr_take_looks)
+        pairs = zip(taken[::2], taken[1::2], strict=True)
+        return [(cycle, low | high << 8) for (cycle, low), (_, high) in pairs]
 
     def take_heard(self) -> list[tuple[int, int]]:
         """Bytes that the program fetched from the receiver, as (cycle, byte)."""

@@ -523,6 +523,7 @@ static uint8_t tifr1_read(avr_t *avr, avr_io_addr_t address, void *param)
 {
 	relpos_avr *e = param;
 	append(e, &e->looks, avr->cycle, avr->data[A_TCNT1L]);
+	append(e, &e->looks, avr->cycle, avr->data[A_TCNT1L + 1]);
 	return avr->data[address];
 }
 
