@@ -13,14 +13,11 @@ from relpos.link import xbee
 from relpos.protocol import messages as wire
 
 NEEDS = missing_parts()
+needs_avr = pytest.mark.skipif(NEEDS is not None, reason=str(NEEDS))
 BOARDS = [
-    pytest.param(
-        board,
-        marks=pytest.mark.skipif(
-            board is not BoardKind.NATIVE and NEEDS is not None, reason=str(NEEDS)
-        ),
-    )
-    for board in BoardKind
+    BoardKind.NATIVE,
+    pytest.param(BoardKind.UNO, marks=needs_avr),
+    pytest.param(BoardKind.MEGA, marks=[needs_avr, pytest.mark.soak]),
 ]
 
 
@@ -145,7 +142,7 @@ def test_a_byte_of_the_native_eeprom_takes_its_time_and_is_erased_by_a_cut():
         node.command(team.coordinator, wire.CommandCode.SET_LEG_LENGTH_MM, 888, 2, 4_000_000)
         count = len(stored)
         time_us = 4_000_000
-        while len(stored) < count + 20:
+        while len(stored) < count + 3:
             time_us += 1_000
             team.run(time_us)
         _, at = stored[-1]

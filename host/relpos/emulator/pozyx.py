@@ -85,8 +85,12 @@ _DEFAULTS = {
 }
 
 
-def _within(address: int, spans: tuple[tuple[int, int], ...]) -> bool:
-    return any(low <= address <= high for low, high in spans)
+def _addresses(spans: tuple[tuple[int, int], ...]) -> frozenset[int]:
+    return frozenset(address for low, high in spans for address in range(low, high + 1))
+
+
+_READABLE_ADDRESSES = _addresses(_READABLE)
+_WRITABLE_ADDRESSES = _addresses(_WRITABLE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,7 +299,7 @@ class Pozyx(I2cDevice):
     # -- registers ----------------------------------------------------------------------------
 
     def _read_register(self, address: int) -> int:
-        if not _within(address, _READABLE):
+        if address not in _READABLE_ADDRESSES:
             return 0
         if address == INT_STATUS:
             value, self._status = self._status, 0
@@ -319,7 +323,7 @@ class Pozyx(I2cDevice):
         self._registers[PRESSURE : PRESSURE + 4] = word.to_bytes(4, "little")
 
     def _write_register(self, address: int, value: int) -> None:
-        if not _within(address, _WRITABLE):
+        if address not in _WRITABLE_ADDRESSES:
             self._fail(ERROR_I2C_WRITE)
             return
         self._registers[address] = value
