@@ -708,16 +708,17 @@ RELPOS_APART void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
 
 RELPOS_APART void DeadReckoning::publish() {
   Displacement& d = displacement_;
-  float way[2] = {0.0f, 0.0f};
+  totals_.tell(Totals::kAlongX, &d.x_m);
+  totals_.tell(Totals::kAlongY, &d.y_m);
+  totals_.tell(Totals::kPath, &d.path_m);
   if (d.initialised && velocity_known_ && forward_.found()) {
-    float since[2];
+    float since[2], way[2];
     memcpy(since, position_m_, sizeof since);
     add_scaled(since, stance_position_m_, 1.0f, 2);
     resolve(forward_.axis(), since, way);
+    add(&d.x_m, way[kX]);
+    add(&d.y_m, way[kY]);
   }
-  d.x_m = totals_.metres(Totals::kAlongX) + way[kX];
-  d.y_m = totals_.metres(Totals::kAlongY) + way[kY];
-  d.path_m = totals_.metres(Totals::kPath);
   d.moving = gait_.walking();
   const uint16_t rejected = gait_.take_rejected();
   if (rejected > 0) count(&counters_.rejected_steps);

@@ -19,10 +19,10 @@ void Totals::add(const float way_m[2], float length_m) {
   }
 }
 
-RELPOS_APART float Totals::metres(Which which) const {
+RELPOS_APART void Totals::tell(Which which, float* metres) const {
   const float units = which == kPath ? static_cast<float>(units_[which])
                                      : static_cast<float>(static_cast<int32_t>(units_[which]));
-  return units * (1.0f / kUnitsPerMetre);
+  *metres = units * (1.0f / kUnitsPerMetre);
 }
 
 }  // namespace relpos

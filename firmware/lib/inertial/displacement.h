@@ -46,7 +46,7 @@ class Totals {
   enum Which : uint8_t { kAlongX, kAlongY, kPath, kTotals };
   void reset();
   void add(const float way_m[2], float length_m);
-  float metres(Which which) const;
+  void tell(Which which, float* metres) const;
 
  private:
   uint32_t units_[kTotals];  // the first two signed; unsigned, as overflow is to wrap
