@@ -17,9 +17,9 @@ constexpr uint8_t kExchangeMs = 24;
 constexpr uint8_t kGuardMs = 10;
 // In its window a node asks one again that failed but was ranged lately: so often, then the next. One
 // exchange in six fails at the distances of a room (docs/ranging.md): of 20, pairs that are ranged at
-// least every 10 s were 28 % without, 88 % with this and four exchanges in a window.
+// least every 10 s were 28 % without, 91 % with this and four exchanges in a window.
 constexpr uint8_t kRetries = 2;
-// A beacon holds so long: of one a second, five in a row are lost every half minute at 50 % loss,
+// A beacon holds so long: of one a second, five in a row are lost once a minute at 50 % loss,
 // and by then two clocks may be 25 ms apart.
 constexpr uint16_t kBeaconHoldMs = 5000;
 // Up to so many nodes everybody ranges everybody in every round. Of more, each ranges the half of the
