@@ -43,16 +43,23 @@ def _script(seconds: float, rng: np.random.Generator) -> list[tuple[float, float
     """(duration of the turn, of the rest behind it, attitude then, in the hands?) in order."""
     tilt = Rotation.from_rotvec(0.03 * rng.standard_normal(3))
     moves = [(0.0, LYING_S, tilt, False)]
-    for side in SIDES[1:]:
-        attitude = Rotation.from_rotvec(side) * Rotation.from_rotvec(0.03 * rng.standard_normal(3))
-        moves.append((SIDE_TURN_S, SIDE_HOLD_S, attitude, False))
+
+    def lay_on_each_side() -> None:
+        for side in SIDES[1:]:
+            slant = Rotation.from_rotvec(0.03 * rng.standard_normal(3))
+            moves.append((SIDE_TURN_S, SIDE_HOLD_S, Rotation.from_rotvec(side) * slant, False))
+
+    lay_on_each_side()
     spent_s = 0.0
     while spent_s < TUMBLE_S:
         turn_s = float(rng.uniform(*TUMBLE_TURN_S))
         moves.append((turn_s, 0.1, Rotation.random(random_state=rng), True))
         spent_s += turn_s + 0.1
+    # Once more, for a program that was not listening yet at the first time.
+    moves.append((SIDE_TURN_S, LYING_S, tilt, False))
+    lay_on_each_side()
     heading = 0.0
-    spent_s += LYING_S + (len(SIDES) - 1) * (SIDE_TURN_S + SIDE_HOLD_S)
+    spent_s += SIDE_TURN_S + 2 * (LYING_S + (len(SIDES) - 1) * (SIDE_TURN_S + SIDE_HOLD_S))
     while spent_s < seconds:
         attitude = Rotation.from_rotvec([0.0, 0.0, heading]) * Rotation.from_matrix(WORN)
         moves.append((UPRIGHT_TURN_S, UPRIGHT_HOLD_S, attitude, False))
