@@ -50,7 +50,7 @@ bool Xbee::send(uint16_t destination, const uint8_t* data, uint8_t length) {
   return true;
 }
 
-uint8_t Xbee::next_byte() const {
+RELPOS_SHARED uint8_t Xbee::next_byte() const {
   if (position_ >= kFirstData) {
     const uint8_t at = static_cast<uint8_t>(position_ - kFirstData);
     return at < data_length_ ? data_[at] : static_cast<uint8_t>(0xFF - sent_sum_);

@@ -77,7 +77,7 @@ void Attitude::integrate(const float angle[kAxes]) {
   multiply(Attitude(*this).q, small.q, q);
 }
 
-RELPOS_APART void Attitude::correct(const float angle[kAxes], float scratch[8]) {
+void Attitude::correct(const float angle[kAxes], float scratch[8]) {
   turn(angle, scratch);
   memcpy(scratch + 4, q, sizeof q);
   multiply(scratch, scratch + 4, q);

@@ -16,7 +16,7 @@ static_assert(wire::kAccelerationBias == 0 && wire::kGyroBias == 3 &&
                   wire::kFieldMatrix == 12,
               "the words are taken in this order");
 
-RELPOS_APART void correct_inertial(const int16_t* words, float* sample, float* sums) {
+void correct_inertial(const int16_t* words, float* sample, float* sums) {
   for (uint8_t i = 6; i != 0; --i) {
     if (sums != nullptr) *sums++ += *sample;
     *sample++ -= number(*words++);

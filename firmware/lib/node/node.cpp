@@ -209,7 +209,7 @@ RELPOS_UNCLONED void Node::configure_inertial() {
   }
 }
 
-RELPOS_APART void Node::run_imu(uint32_t now_us) {
+void Node::run_imu(uint32_t now_us) {
   uint32_t wait = 0;
   const bool was_running = imu_.running();
   const Mpu9150::Event event = imu_.step(board_, now_us, &wait);
@@ -228,7 +228,7 @@ RELPOS_APART void Node::run_imu(uint32_t now_us) {
   if (was_running && !imu_.running()) magnetometer_.restart();
 }
 
-void Node::tick(uint32_t now_us) {
+RELPOS_APART void Node::tick(uint32_t now_us) {
   ImuSample sample;
   if (!imu_.read(board_, sample.acceleration_m_s2, sample.angular_rate_rad_s)) {
     return;  // the next sample's time shows the gap
@@ -422,7 +422,7 @@ void Node::obey(const wire::Header& header, const uint8_t* body, uint8_t length)
   done.answer_due = true;
 }
 
-RELPOS_APART wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_force) {
+wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_force) {
   const wire::CommandCode code = static_cast<wire::CommandCode>(command);
   if (code >= wire::CommandCode::kSetRawReports && code <= wire::CommandCode::kReadCalibration) {
     return apply_calibration(code, value, in_force);
