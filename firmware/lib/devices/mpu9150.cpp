@@ -59,9 +59,10 @@ constexpr uint32_t kFailedUs = 5000;
 constexpr uint32_t kAbsentUs = 1000000;     // between attempts to set up a chip that does not answer
 // Without a sample for so long the chip has lost its settings (brown-out: it sleeps).
 constexpr uint32_t kSilentUs = 120000;
-// Transactions in a row, then set up anew: 0.1 s of a dead bus. With a loose contact that spoils a
-// third of them 5 would be met every second, and 20 hardly ever.
-constexpr uint8_t kMostFailures = 20;
+// Transactions in a row, then set up anew: 0.175 s of a dead bus, less than what makes the dead
+// reckoning start anew. With a loose contact that spoils a third of them 5 would be met every second,
+// and 20 hardly ever.
+constexpr uint8_t kMostFailures = 35;
 
 constexpr float kAccelerationUnit = 9.80665f / 8192.0f;                   // 4 g range
 constexpr float kAngularRateUnit = 3.14159265f / 180.0f * 1000.0f / 32768.0f;  // 1000 deg/s range

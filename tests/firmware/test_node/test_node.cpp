@@ -972,7 +972,7 @@ TEST(whole_turns_count_and_a_reset_of_the_filter_sets_nothing_back) {
   CHECK_NEAR(6000.0f, static_cast<float>(motion.y_mm), 2.0f);
   CHECK_EQUAL(4, motion.steps);  // wrapped
   CHECK_NEAR(141372.0f, static_cast<float>(motion.heading_100urad), 2.0f);
-  CHECK_NEAR(250000.0f, static_cast<float>(motion.variance_along_mm2), 1.0f);
+  CHECK_NEAR(2250000.0f, static_cast<float>(motion.variance_along_mm2), 1.0f);
 }
 
 TEST(no_calibration_changes_nothing) {

@@ -67,6 +67,9 @@ struct relpos_avr {
 	uint8_t twi_status;
 	uint16_t scl_direction; /* address of the direction register of SCL's port */
 	uint8_t scl_mask, scl_was_low, scl_clocks;
+	uint8_t sda_mask, sda_held; /* by a slave, while the bus hangs */
+	avr_io_read_t pin_read; /* simavr's own, of the port that SDA is in */
+	void *pin_param;
 	int twi_data; /* byte that appears in TWDR when the operation completes, or -1 */
 	/* UART */
 	avr_int_vector_t *rxc_vector, *txc_vector, *udre_vector;
@@ -245,7 +248,10 @@ static void twi_begin(relpos_avr *e)
 		break;
 	}
 	e->twi_busy = 1;
-	if (result < 0) return; /* the bus hangs: no completion until TWEN is cleared */
+	if (result < 0) { /* the bus hangs: no completion until TWEN is cleared */
+		e->sda_held = 1;
+		return;
+	}
 	e->counter[COUNTER_TWI_BUSY_CYCLES] += cycles + stretch;
 	avr_cycle_timer_register(avr, cycles + stretch, twi_done, e);
 }
@@ -281,9 +287,19 @@ static void scl_moved(struct avr_irq_t *irq, uint32_t value, void *param)
 	if (d[A_TWCR] & TWEN) e->scl_clocks = 0;
 	else if (e->scl_was_low && !low && ++e->scl_clocks == 9) {
 		e->scl_clocks = 0;
+		e->sda_held = 0;
 		twi_call(e, BUS_RELEASE, 0, &unused);
 	}
 	e->scl_was_low = low;
+}
+
+/* The firmware sees by SDA whether somebody has to be clocked free. */
+static uint8_t sda_read(avr_t *avr, avr_io_addr_t address, void *param)
+{
+	relpos_avr *e = param;
+	uint8_t v = e->pin_read ? e->pin_read(avr, address, e->pin_param) : avr->data[address];
+	if (e->sda_held) v &= (uint8_t)~e->sda_mask;
+	return avr->data[address] = v;
 }
 
 static void twsr_write(avr_t *avr, avr_io_addr_t address, uint8_t v, void *param)
@@ -700,6 +716,12 @@ relpos_avr *relpos_avr_create(const char *mmcu, const uint8_t *flash, uint32_t f
 	const int mega = avr->ramend > 0x8ff;
 	e->scl_direction = mega ? A_DDRD : A_DDRC; /* PD0 on the Mega, PC5 on the Uno */
 	e->scl_mask = mega ? 0x01 : 0x20;
+	e->sda_mask = mega ? 0x02 : 0x10; /* PD1, PC4 */
+	const avr_io_addr_t pin = AVR_DATA_TO_IO(e->scl_direction - 1);
+	e->pin_read = avr->io[pin].r.c;
+	e->pin_param = avr->io[pin].r.param;
+	avr->io[pin].r.c = sda_read;
+	avr->io[pin].r.param = e;
 	for (uint16_t a = e->scl_direction; a <= e->scl_direction + 1; a++)
 		avr_irq_register_notify(avr_iomem_getirq(avr, a, NULL, AVR_IOMEM_IRQ_ALL), scl_moved, e);
 	e->io.kind = "relpos";
