@@ -21,6 +21,8 @@ from relpos.link.live import open_port
 from relpos.nodes import boards, upload
 
 MILLISECOND_CYCLES = 16_000
+ANSWER_MS = 20
+"""What a boot loader answers, it answers within about so long: a page of flash takes 4.5 ms."""
 UCSR0A, UBRR0, U2X0 = 0xC0, 0xC4, 0x02
 SPEEDS = {getattr(termios, f"B{baud}"): baud for baud in (9600, 38400, 115200)}
 
@@ -71,10 +73,13 @@ class Arduino(threading.Thread):
                         self.board.receive(data, self.board.cycle)
                 if not is_open:
                     continue
-                self.board.run(self.board.cycle + MILLISECOND_CYCLES)
-                sent = bytes(value for _, value in self.board.take_sent())
-                if sent and self.understands():
-                    os.write(self.terminal, sent)
+                # Slow to run out of patience, quick to answer, however busy this computer is.
+                for _ in range(ANSWER_MS if events & select.POLLIN else 1):
+                    self.board.run(self.board.cycle + MILLISECOND_CYCLES)
+                    sent = bytes(value for _, value in self.board.take_sent())
+                    if sent and self.understands():
+                        os.write(self.terminal, sent)
+                        break
         except OSError:
             pass
         except BaseException as error:
