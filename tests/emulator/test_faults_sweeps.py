@@ -157,7 +157,7 @@ def assert_no_more_than_lost(bench, gap_s, board="native", seconds=SECONDS, astr
     # A gap of samples costs the way of that time (1.5 m/s at most) and, where it hides the end
     # of a step, that one: 0.8 m. It turns nobody by more than one turns in it (2 rad/s).
     assert apart_m < 0.8 * astray + 1.5 * gap_s
-    assert abs(ours["path_m"] - theirs["path_m"]) < 0.8 + 1.5 * gap_s
+    assert abs(ours["path_m"] - theirs["path_m"]) < 0.8 * astray + 1.5 * gap_s
     assert abs(ours["heading_rad"] - theirs["heading_rad"]) < 0.05 + 2.0 * gap_s
 
 
