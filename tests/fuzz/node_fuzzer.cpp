@@ -531,8 +531,9 @@ class Script {
     if (memcmp(before.key_, state().key_, sizeof before.key_) != 0) {
       memcpy(former_key_, before.key_, sizeof former_key_);
       answered_ = 0;
-      pending_.clear();
-    } else if (command && payload.size() == wire::kOverhead + wire::kCommandBytes) {
+      for (Asked& each : pending_) each.counter = 0;  // still to be answered, under the old key
+    } else if (command && before.reboot_step_ == 0 &&
+               payload.size() == wire::kOverhead + wire::kCommandBytes) {
       const uint8_t* body = payload.data() + wire::kHeaderBytes;
       pending_.push_back({header.counter, static_cast<uint16_t>(body[0] | body[1] << 8), body[2]});
     }
