@@ -19,7 +19,7 @@ static_assert(kStorageBytes <= 256, "a place is a byte");
 static_assert(sizeof(Marks) + wire::kKeyBytes + sizeof(Settings) <= sizeof(Persistent) &&
                   sizeof(Persistent) < sizeof(Marks) + wire::kKeyBytes + sizeof(Settings) + 4,
               "no gaps between the records");
-const uint8_t kSizes[kRecords] RELPOS_FLASH = {sizeof(Marks), wire::kKeyBytes, sizeof(Settings)};
+const uint8_t kSizes[kRecords] RELPOS_FLASH = {wire::kKeyBytes, sizeof(Marks), sizeof(Settings)};
 
 void read(Board& board, uint8_t at, uint8_t count, void* to) {
   for (uint8_t i = 0; i < count; ++i) static_cast<uint8_t*>(to)[i] = board.storage_read(at++);

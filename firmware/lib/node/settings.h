@@ -40,12 +40,12 @@ struct Marks {
 // What the EEPROM keeps a copy of; in memory all the time. Each part is a record of its own, behind
 // each other in this order in both places.
 struct Persistent {
-  Marks marks_;
   uint8_t key_[wire::kKeyBytes];  // all zero where none was given
+  Marks marks_;  // behind the key: begun anew under a new one, and never kept under the old one
   Settings settings_;
 };
 
-enum class Record : uint8_t { kMarks, kKey, kSettings };
+enum class Record : uint8_t { kKey, kMarks, kSettings };
 constexpr uint8_t kRecords = 3;
 
 // A record is stored twice: layout, its bytes, CRC(2).

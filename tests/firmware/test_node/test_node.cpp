@@ -1306,9 +1306,13 @@ TEST(a_power_cut_while_a_key_is_stored_leaves_the_old_key_or_the_new_one) {
   memcpy(&message.masked_0, masked, sizeof masked);
   uint8_t body[wire::kNewKeyBytes];
   wire::encode(message, body);
+  uint8_t command[wire::kCommandBytes];
+  const wire::Command request = {6, code(wire::CommandCode::kSetTeamSize), 9};
+  wire::encode(request, command);
   bool old_seen = false, new_seen = false;
   for (uint32_t cut = 0; cut < 70; ++cut) {
     Team team;
+    team.world.down(wire::MessageType::kCommand, command, sizeof command, kId, 8000);
     team.run_ms(500);
     team.world.writes_left = cut;
     team.world.down(wire::MessageType::kNewKey, body, sizeof body, kId, 9000);
@@ -1317,6 +1321,12 @@ TEST(a_power_cut_while_a_key_is_stored_leaves_the_old_key_or_the_new_one) {
     Node again(team.world);
     again.begin(team.world.now, wire::ResetCause::kPowerOn, 0);
     team.run(again, 300);
+    // What was obeyed before is not obeyed again, whichever key is in force.
+    memcpy(team.world.key, old_key, sizeof key);
+    team.world.count = 0;
+    team.world.down(wire::MessageType::kCommand, command, sizeof command, kId, 8000);
+    team.run(again, 300);
+    CHECK_EQUAL(0, team.sent(wire::MessageType::kAcknowledgement));
     team.world.host_counter = 10000;
     for (uint8_t which = 0; which < 2; ++which) {
       memcpy(team.world.key, which == 0 ? old_key : key, sizeof key);
