@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +14,17 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from relpos.errors import DataError
-from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, PairEstimate
+from relpos.fusion.estimator import (
+    Alternative,
+    Estimate,
+    NodeEstimate,
+    NodeStatus,
+    PairEstimate,
+    Parameter,
+)
 from relpos.measurements import Heading, Height, Motion, Prior, Range, Step
 from relpos.runs import (
     InitialPose,
-    Parameter,
     load_run,
     read_estimates,
     save_run,
@@ -372,22 +379,37 @@ def test_estimates_read_back_as_they_were_written(tmp_path: Path) -> None:
 
 
 def test_the_output_files_have_the_columns_of_the_run_format(tmp_path: Path) -> None:
-    write_estimates(
-        tmp_path,
-        [an_estimate()],
-        parameters=[Parameter(1.5, 1, 2, "range_bias_m", 0.3, 0.1)],
-        steps=[Step(1.0, 1, 0.7)],
+    estimate = replace(
+        an_estimate(),
+        alternatives=(Alternative(1.5, 0, 1.0, 1, 1.0, 2.0, 0.5, 0.3, 0.2, 0.1),),
+        parameters=(Parameter(1.5, 1, 2, "range_bias_m", 0.3, 0.1),),
     )
+    write_estimates(tmp_path, [estimate], steps=[Step(1.0, 1, 0.7)])
     headers = {p.name: p.read_text().splitlines()[0] for p in tmp_path.iterdir()}
     assert headers == {
         "estimate.csv": "time_s,node,x_m,y_m,z_m,heading_rad,sigma_major_m,sigma_minor_m,"
         "sigma_angle_rad,sigma_z_m,sigma_heading_rad,status",
         "pairs.csv": "time_s,node,peer,distance_m,sigma_distance_m,bearing_rad,sigma_bearing_rad",
+        "alternatives.csv": "time_s,alternative,probability,node,x_m,y_m,heading_rad,"
+        "sigma_major_m,sigma_minor_m,sigma_angle_rad,shape",
         "parameters.csv": "time_s,node,peer,name,value,sigma",
         "steps.csv": "time_s,node,length_m",
     }
     write_estimates(tmp_path, [])
+    assert not (tmp_path / "alternatives.csv").exists(), "an earlier run's"
     assert not (tmp_path / "steps.csv").exists(), "an earlier run's steps are not this one's"
+
+
+def test_parameters_are_written_where_they_change(tmp_path: Path) -> None:
+    same = Parameter(1.5, 1, None, "step_scale", 1.1, 0.05)
+    estimates = [
+        replace(an_estimate(), parameters=(same,)),
+        replace(an_estimate(), time_s=2.5, parameters=(replace(same, time_s=2.5),)),
+        replace(an_estimate(), time_s=3.5, parameters=(replace(same, time_s=3.5, value=1.2),)),
+    ]
+    write_estimates(tmp_path, estimates)
+    rows = (tmp_path / "parameters.csv").read_text().splitlines()[1:]
+    assert rows == ["1.5,1,,step_scale,1.1,0.05", "3.5,1,,step_scale,1.2,0.05"]
 
 
 def test_somebody_elses_estimate_needs_positions_alone(tmp_path: Path) -> None:

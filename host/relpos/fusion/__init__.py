@@ -6,7 +6,16 @@ from collections.abc import Mapping, Sequence
 
 from relpos.errors import RelposError
 from relpos.fusion.deadreckoning import DeadReckoning, DeadReckoningSettings
-from relpos.fusion.estimator import Estimate, Estimator, NodeEstimate, NodeStatus, PairEstimate
+from relpos.fusion.estimator import (
+    Alternative,
+    Estimate,
+    Estimator,
+    NodeEstimate,
+    NodeStatus,
+    PairEstimate,
+    Parameter,
+    Shape,
+)
 from relpos.fusion.particle import ParticleFilter, ParticleSettings
 from relpos.fusion.settings import SettingInfo, describe, parse
 from relpos.measurements import Prior
@@ -47,12 +56,15 @@ def settings_of(name: str) -> list[SettingInfo]:
 
 __all__ = [
     "SETTINGS",
+    "Alternative",
     "Estimate",
     "Estimator",
     "NodeEstimate",
     "NodeStatus",
     "PairEstimate",
+    "Parameter",
     "SettingInfo",
+    "Shape",
     "make",
     "settings_of",
 ]

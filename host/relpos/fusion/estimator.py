@@ -80,18 +80,67 @@ class PairEstimate:
     sigma_bearing_rad: float
 
 
+class Shape(StrEnum):
+    """What region an alternative gives a node; the words of ``alternatives.csv``."""
+
+    ELLIPSE = "ellipse"
+    RING = "ring"
+
+
+@dataclass(frozen=True, slots=True)
+class Alternative:
+    """One node in one of the possible pictures of the team while anything is ambiguous.
+
+    The rows of one ``alternative`` (0, 1, ... from the most probable on, at most
+    ``MAX_ALTERNATIVES``) at one time are one picture of the whole team and share its
+    ``probability``; those of all pictures sum to 1. Of a ring, x, y is the centre,
+    ``sigma_major_m`` the radius and ``sigma_minor_m`` the width.
+    """
+
+    time_s: float
+    alternative: int
+    probability: float
+    node: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    sigma_major_m: float
+    sigma_minor_m: float
+    sigma_angle_rad: float
+    shape: Shape = Shape.ELLIPSE
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One learned constant; ``peer`` is given where it belongs to a pair.
+
+    Names: ``step_scale`` (true over reported length), ``heading_drift_rad_s``,
+    ``range_bias_m``, ``detection_range_m``.
+    """
+
+    time_s: float
+    node: int
+    peer: int | None
+    name: str
+    value: float
+    sigma: float
+
+
 @dataclass(frozen=True, slots=True)
 class Estimate:
     """All nodes at one time in one common frame.
 
     The frame is that of the priors where there are any, else the pose of the first located node
     at the start. ``nodes`` is ordered by node id, ``pairs`` holds node < peer of every two
-    located nodes.
+    located nodes. ``alternatives`` is empty unless something is ambiguous; ``parameters`` is
+    what has been learned so far.
     """
 
     time_s: float
     nodes: tuple[NodeEstimate, ...]
     pairs: tuple[PairEstimate, ...]
+    alternatives: tuple[Alternative, ...] = ()
+    parameters: tuple[Parameter, ...] = ()
 
 
 @runtime_checkable
@@ -107,6 +156,9 @@ class Estimator(Protocol):
     def counters(self) -> Mapping[str, int]:
         """Name -> how often: everything dropped, rejected, clamped, reset or resampled."""
 
+
+MAX_ALTERNATIVES = 16
+"""At most so many pictures are listed (run format, ``alternatives.csv``)."""
 
 STALE_EPOCHS = 3
 LOST_EPOCHS = 10

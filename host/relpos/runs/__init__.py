@@ -1,18 +1,16 @@
 """Run directories: how a recording comes in and an estimate goes out."""
 
 from relpos.runs.description import Description, InitialPose, NodeInfo
-from relpos.runs.estimates import Alternative, Parameter, read_estimates, write_estimates
+from relpos.runs.estimates import read_estimates, write_estimates
 from relpos.runs.imu import ImuRecording
 from relpos.runs.run import Landmark, Run, load_run, save_run
 
 __all__ = [
-    "Alternative",
     "Description",
     "ImuRecording",
     "InitialPose",
     "Landmark",
     "NodeInfo",
-    "Parameter",
     "Run",
     "load_run",
     "read_estimates",

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from relpos.errors import DataError
-from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, PairEstimate
+from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, PairEstimate, Parameter
 from relpos.measurements import Step
 from relpos.runs.run import write_rows
 from relpos.runs.table import Column, find_table, node_id, not_negative, number, read_rows
@@ -63,54 +62,23 @@ _DECIMALS = 6
 """Micrometres and microradians: far below any sensor here, and files a third the size."""
 
 
-@dataclass(frozen=True, slots=True)
-class Alternative:
-    """One node in one of the possible pictures of the team while anything is ambiguous.
-
-    ``shape`` is ``ellipse`` or ``ring``; of a ring x, y is the centre, ``sigma_major_m`` the
-    radius and ``sigma_minor_m`` the width.
-    """
-
-    time_s: float
-    alternative: int
-    probability: float
-    node: int
-    x_m: float
-    y_m: float
-    heading_rad: float
-    sigma_major_m: float
-    sigma_minor_m: float
-    sigma_angle_rad: float
-    shape: str = "ellipse"
-
-
-@dataclass(frozen=True, slots=True)
-class Parameter:
-    """One learned constant: ``step_scale``, ``heading_drift_rad_s``, ``range_bias_m`` and so on."""
-
-    time_s: float
-    node: int
-    peer: int | None
-    name: str
-    value: float
-    sigma: float
-
-
 def write_estimates(
     directory: Path | str,
     estimates: Sequence[Estimate],
     *,
-    alternatives: Sequence[Alternative] = (),
-    parameters: Sequence[Parameter] = (),
     steps: Sequence[Step] = (),
 ) -> list[Path]:
     """Write ``estimate.csv``, ``pairs.csv`` and ``parameters.csv``, the others when any.
+
+    ``parameters.csv`` holds a row where a learned value or its sigma has changed.
 
     An ``alternatives.csv`` or ``steps.csv`` that an earlier run left here and this one has
     nothing for is removed, lest it be taken for this one's. Returns the files written.
     """
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
+    alternatives = [row for estimate in estimates for row in estimate.alternatives]
+    parameters = _changed(row for estimate in estimates for row in estimate.parameters)
     tables: list[tuple[str, Sequence[str], Iterable[Sequence[object]], bool]] = [
         ("estimate.csv", ESTIMATE_COLUMNS, _estimate_rows(estimates), True),
         ("pairs.csv", PAIR_COLUMNS, _pair_rows(estimates), True),
@@ -185,6 +153,18 @@ def _pair_rows(estimates: Iterable[Estimate]) -> Iterable[Sequence[object]]:
     for estimate in estimates:
         for pair in estimate.pairs:
             yield (estimate.time_s, *(getattr(pair, name) for name in PAIR_COLUMNS[1:]))
+
+
+def _changed(parameters: Iterable[Parameter]) -> list[Parameter]:
+    """Leave out what repeats the same parameter's last row."""
+    last: dict[tuple[str, int, int | None], tuple[float, float]] = {}
+    kept: list[Parameter] = []
+    for row in parameters:
+        key, figures = (row.name, row.node, row.peer), (row.value, row.sigma)
+        if last.get(key) != figures:
+            last[key] = figures
+            kept.append(row)
+    return kept
 
 
 def _attribute_rows(rows: Iterable[object], names: Sequence[str]) -> Iterable[Sequence[object]]:

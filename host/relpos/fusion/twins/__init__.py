@@ -1,0 +1,1 @@
+"""Readable NumPy twins of the compiled kernels: the oracles of their tests."""
