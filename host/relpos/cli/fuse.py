@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -87,6 +87,13 @@ def fuse(
     seconds: Annotated[
         float | None, typer.Option(min=0.0, help="Listen to a port this long, then end.")
     ] = None,
+    teach: Annotated[
+        bool,
+        typer.Option(
+            "--teach/--no-teach",
+            help="Send the step lengths that the ranges teach to the nodes of a port.",
+        ),
+    ] = True,
     key_file: KeyFile = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
     report: Annotated[
@@ -111,7 +118,7 @@ def fuse(
         raise output.not_built_yet("the estimator bank")
     job = Job(source, estimator, chosen, seed, out or Path("out") / _base_name(source))
     if sources.is_port(source):
-        _fuse_port(job, initial, seconds, key_file, as_json=json)
+        _fuse_port(job, initial, seconds, key_file, teach=teach, as_json=json)
     else:
         _fuse_run(job, initial, as_json=json, report=not json if report is None else report)
 
@@ -152,8 +159,12 @@ def _pass_through(
     observations: Iterable[Observation],
     *,
     keep: bool = False,
+    tell: Callable[[Estimate], None] | None = None,
 ) -> _Outcome:
-    """Give the estimator everything it can use; a failure or Ctrl-C keeps what came before."""
+    """Give the estimator everything it can use; a failure or Ctrl-C keeps what came before.
+
+    ``tell`` is called with the newest estimate whenever there is one.
+    """
     from relpos.measurements import Heading, Height, Motion, Range
 
     outcome = _Outcome()
@@ -162,7 +173,10 @@ def _pass_through(
             if keep:
                 outcome.received.append(observation)
             if isinstance(observation, Motion | Range | Height | Heading):
-                outcome.estimates += estimator.process(observation)
+                new = estimator.process(observation)
+                outcome.estimates += new
+                if new and tell is not None:
+                    tell(new[-1])
     except KeyboardInterrupt:
         outcome.interrupted = True
     except RelposError as error:
@@ -298,6 +312,7 @@ def _fuse_port(
     seconds: float | None,
     key_file: Path | None,
     *,
+    teach: bool,
     as_json: bool,
 ) -> None:
     from relpos.measurements import Event, Heading, Height, Motion, Prior, Range, Status, Step
@@ -305,7 +320,7 @@ def _fuse_port(
 
     if initial is Initial.TRUTH:
         raise DataError(f"{job.source}: a port brings no truth to start from")
-    port = sources.Port(job.source, seconds, key_file)
+    port = sources.Port(job.source, seconds, key_file, teach=teach)
     if not as_json:
         output.remark(f"listening to {job.source}; Ctrl-C ends")
     stream = iter(output.with_progress(port, None, "received"))
@@ -314,7 +329,7 @@ def _fuse_port(
         stream, nodes = _who_is_there(stream)
         priors = [Prior(node, 0.0, 0.0, 0.0) for node in nodes]
     estimator = job.make(priors)
-    outcome = _pass_through(estimator, stream, keep=True)
+    outcome = _pass_through(estimator, stream, keep=True, tell=port.learn)
     steps = [o for o in outcome.received if isinstance(o, Step)]
     received = Run(
         name=_base_name(job.source),

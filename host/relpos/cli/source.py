@@ -12,6 +12,7 @@ from relpos.cli.keys import make_link
 from relpos.errors import DataError
 
 if TYPE_CHECKING:
+    from relpos.fusion.estimator import Estimate
     from relpos.measurements import Observation
 
 
@@ -36,23 +37,41 @@ def check_recording(source: str) -> Path:
 class Port:
     """A live team behind a serial port, as one stream of observations; it is sent beacons.
 
+    What an estimator learns of the wearers' steps goes back to the nodes by ``learn``, unless
+    ``teach`` is off.
+
     ``counters`` are the link's: frames, losses, rejections. ``DeviceError`` from the iteration
     says that the port does not exist or has vanished; what came before has been yielded.
     """
 
     def __init__(
-        self, port: str, seconds: float | None = None, key_file: Path | None = None
+        self,
+        port: str,
+        seconds: float | None = None,
+        key_file: Path | None = None,
+        *,
+        teach: bool = True,
     ) -> None:
         from relpos.link import live
+        from relpos.link.step_scale import StepScaleSender
 
         self._link, self._seen = make_link(key_file)
         self._device = live.open_port(port)
         self._seconds = seconds
+        self._scales = StepScaleSender(self._link) if teach else None
 
     @property
     def counters(self) -> Mapping[str, float]:
         """Counts of the whole link so far."""
-        return self._link.summary()
+        sent = {"step_scales_sent": self._scales.sent} if self._scales else {}
+        return {**self._link.summary(), **sent}
+
+    def learn(self, estimate: Estimate) -> None:
+        """Tell the nodes what the newest estimate has learned of their wearers' steps."""
+        if self._scales is not None:
+            for p in estimate.parameters:
+                if p.name == "step_scale":
+                    self._scales.learn(p.node, p.value, p.sigma, p.time_s)
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield observations until the seconds are over, or for ever."""
@@ -69,6 +88,7 @@ class Port:
         try:
             for batch in live.observe(self._device, self._link, clock):
                 live.send(self._device, beacons.due(clock()))
+                self._talk_of_steps(clock())
                 while told < len(self._link.decoder.remarks):
                     output.remark(self._link.decoder.remarks[told])
                     told += 1
@@ -81,3 +101,15 @@ class Port:
             self._device.close()
             if self._seen is not None:
                 self._seen.save(self._link.newest_counters(), time.monotonic(), at_once=True)
+
+    def _talk_of_steps(self, now_s: float) -> None:
+        from relpos.link import live
+
+        if self._scales is None:
+            return
+        answers = self._link.decoder.acknowledged
+        while answers:
+            self._scales.take(answers.popleft())
+        live.send(self._device, self._scales.due(now_s))
+        self._link.decoder.remarks += self._scales.remarks
+        self._scales.remarks.clear()

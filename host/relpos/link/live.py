@@ -102,7 +102,7 @@ class Link:
         ``broadcast`` sends it to every radio module, whatever the node's has for an address; only
         the node obeys.
         """
-        token = self._next_token() if token is None else token
+        token = self.next_token() if token is None else token
         values = {"token": token, "command": code, "value": value}
         return token, self.frame(wire.COMMAND, node, values, broadcast=broadcast)
 
@@ -111,7 +111,7 @@ class Link:
 
         The node answers under the new key: see :meth:`accept_keys`.
         """
-        token = self._next_token() if token is None else token
+        token = self.next_token() if token is None else token
         counter = self._counter.next()
         mask = wire.key_mask(self.key, counter)
         masked = bytes(a ^ b for a, b in zip(key, mask, strict=True))
@@ -138,7 +138,8 @@ class Link:
         address = xbee.BROADCAST_16 if broadcast or node == wire.BROADCAST else node
         return xbee.encode(xbee.Transmit16(0, address, data), escaped=self._escaped)
 
-    def _next_token(self) -> int:
+    def next_token(self) -> int:
+        """A token that the last 65,534 commands did not have."""
         self._token = self._token % 0xFFFF + 1
         return self._token
 

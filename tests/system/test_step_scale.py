@@ -1,0 +1,92 @@
+"""Learned step scales on their way back to the nodes."""
+
+from dataclasses import replace
+
+import pytest
+
+from relpos.emulator.team import EmulatedTeam
+from relpos.link.live import Link
+from relpos.link.step_scale import ATTEMPTS, KNOWN_WELL, StepScaleSender
+from relpos.measurements import Motion
+from relpos.simulation.team import SCENARIOS
+
+
+class Conversation:
+    """A team in memory with a sender at its port; keeps the newest motion of each node."""
+
+    def __init__(self, team):
+        self.team, self.link = team, Link()
+        self.sender = StepScaleSender(self.link)
+        self.motions = {}
+
+    def run(self, until_s, step_us=50_000):
+        while self.team.time_us < until_s * 1e6:
+            for _, data in self.team.run(self.team.time_us + step_us):
+                for observation in self.link.feed(data, self.team.time_us * 1e-6):
+                    if isinstance(observation, Motion):
+                        self.motions[observation.node] = observation
+            while self.link.decoder.acknowledged:
+                self.sender.take(self.link.decoder.acknowledged.popleft())
+            data = self.sender.due(self.team.time_us * 1e-6)
+            if data:
+                self.team.send(data)
+
+    def learn(self, node, scale, sigma=0.01):
+        self.sender.learn(node, scale, sigma, self.team.time_us * 1e-6)
+
+
+@pytest.fixture
+def conversation():
+    with EmulatedTeam("straight", 2, 900.0, 3) as team:
+        yield Conversation(team)
+
+
+def test_a_learned_scale_becomes_the_nodes_gain_and_a_new_gain_version(conversation):
+    conversation.run(3.0)
+    before = conversation.motions[1].gain_version
+    conversation.learn(1, 1.10)
+    conversation.run(8.0)
+    (remark,) = conversation.sender.remarks
+    assert "node 1: steps are taken 1.100 times as long" in remark
+    assert "2.343" in remark, "the gain of a new node is 2.130"
+    assert conversation.sender.sent == 1
+    assert conversation.motions[1].gain_version == (before + 1) % 256
+    assert conversation.motions[2].gain_version == before
+
+
+@pytest.mark.parametrize(
+    ("scale", "sigma"), [(1.02, 0.005), (1.10, 2.0 * KNOWN_WELL), (2.0, 0.01), (0.3, 0.01)]
+)
+def test_what_is_small_uncertain_or_impossible_is_not_sent(conversation, scale, sigma):
+    conversation.learn(1, scale, sigma)
+    assert conversation.sender.due(0.0) == b""
+
+
+def test_a_node_is_left_alone_until_the_estimator_has_learned_anew(conversation):
+    conversation.run(3.0)
+    conversation.learn(1, 1.10)
+    conversation.run(8.0)
+    conversation.learn(1, 1.10)
+    assert conversation.sender.due(conversation.team.time_us * 1e-6) == b""
+
+
+def test_a_node_that_does_not_answer_is_told_and_nothing_waits_for_it(conversation):
+    conversation.learn(77, 1.10)
+    conversation.run(ATTEMPTS + 3.0)
+    assert conversation.sender.sent == 0
+    assert any("node 77 does not answer" in r for r in conversation.sender.remarks)
+    assert conversation.motions[1].time_s > ATTEMPTS
+
+
+def test_the_gain_arrives_once_though_half_of_all_frames_are_lost():
+    straight = SCENARIOS["straight"]
+    lossy = replace(straight.world, radio=replace(straight.world.radio, loss_probability=0.5))
+    with EmulatedTeam(replace(straight, world=lossy), 1, 900.0, 4) as team:
+        conversation = Conversation(team)
+        conversation.run(5.0)
+        before = conversation.motions[1].gain_version
+        conversation.learn(1, 0.9)
+        conversation.run(40.0)
+        assert conversation.sender.sent == 1
+        assert (conversation.motions[1].gain_version - before) % 256 == 1
+        assert team.radio.counts["lost"] > 5
