@@ -110,6 +110,132 @@ def test_a_wrong_scenario_or_setting_is_named() -> None:
         simulate_paper("paper", 0, {"seconds": "long"})
 
 
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({"kidnap_m": "-1"}, "kidnap_m: -1 is not within"),
+        ({"kidnap_m": "5", "seconds": "200"}, "kidnap_s: 300 is past the end at 200 s"),
+        ({"noisy_user": "7"}, "no user 7 of 6"),
+        ({"noisy_user": "1.5"}, "not a whole number"),
+        ({"noisy_factor": "1000"}, "not within"),
+        ({"scale_error": "-0.1"}, "not within"),
+        ({"heading_drift_deg_s": "100"}, "not within"),
+        ({"drift_while_waiting": "2"}, "not within"),
+        ({"start": "nowhere"}, "'nowhere' is not one of known, position, heading, unknown"),
+    ],
+)
+def test_a_variant_out_of_its_bounds_is_refused(overrides: dict[str, str], words: str) -> None:
+    with pytest.raises(RelposError, match=words):
+        simulate_paper("paper", 0, overrides)
+
+
+def test_hidden_dice_leave_the_runs_of_a_seed_as_they_were() -> None:
+    """The first rows of seed 5 as they were before there were any variants."""
+    run = simulate_paper("paper", 5)
+    motions = [m for m in run.measurements if isinstance(m, Motion)]
+    ranges = [m for m in run.measurements if isinstance(m, Range)]
+    assert len(ranges) == 1610
+    assert motions[0].dx_m == pytest.approx(0.4960596914199723, rel=1e-12)
+    assert ranges[-1].range_m == pytest.approx(10.287671826436346, rel=1e-12)
+    assert set(run.hidden.step_scale.values()) == {1.0}
+    assert set(run.hidden.heading_drift_rad_s.values()) == {0.0}
+
+
+def test_a_kidnapped_user_is_displaced_once_and_its_odometry_does_not_say_so() -> None:
+    plain = simulate_paper("paper", 5, QUIET)
+    taken = simulate_paper("paper", 5, {**QUIET, "kidnap_m": 5, "kidnap_s": 301})
+    assert [m for m in plain.measurements if isinstance(m, Motion)] == [
+        m for m in taken.measurements if isinstance(m, Motion)
+    ]
+    before, after = positions(plain), positions(taken)
+    node = taken.hidden.kidnapped_node
+    shifts = {after[t, node] - before[t, node] for t in np.arange(301.0, 601.0) if node}
+    assert max(abs(s) for s in shifts) == pytest.approx(5.0)
+    assert max(abs(s - min(shifts, key=abs)) for s in shifts) < 1e-9
+    assert all(before[key] == after[key] for key in before if key[1] != node or key[0] < 301.0)
+    for m in taken.measurements:
+        if isinstance(m, Range):
+            distance = abs(after[m.time_s, m.node] - after[m.time_s, m.peer])
+            assert m.range_m == pytest.approx(distance, abs=1e-9)
+    assert {simulate_paper("paper", s, {"kidnap_m": 5}).hidden.kidnapped_node
+            for s in range(40)} == {1, 2, 3, 4, 5, 6}  # fmt: skip
+
+
+def test_a_noisy_user_errs_by_its_factor_and_the_others_as_before() -> None:
+    plain = simulate_paper("paper", 7)
+    noisy = simulate_paper("paper", 7, {"noisy_factor": 3, "noisy_user": 2})
+    true_step_m = 0.5
+    for a, b in zip(plain.measurements, noisy.measurements, strict=True):
+        if isinstance(a, Motion) and isinstance(b, Motion):
+            if a.node == 2 and a.dx_m > 0.0 and b.dx_m > 0.0 and a.dtheta_rad == 0.0:
+                assert b.dx_m - true_step_m == pytest.approx(3.0 * (a.dx_m - true_step_m))
+            elif a.node != 2:
+                assert a == b
+        else:
+            assert a == b
+    assert noisy.hidden.noisy_node == 2
+    drawn = [simulate_paper("paper", s, {"noisy_factor": 3}).hidden.noisy_node for s in range(40)]
+    assert set(drawn) == {1, 2, 3, 4, 5, 6}
+
+
+def test_hidden_scale_and_drift_are_what_the_run_says_of_itself() -> None:
+    variant = {**QUIET, "scale_error": 0.1, "heading_drift_deg_s": 0.5}
+    run = simulate_paper("paper", 9, variant)
+    truth = {(t.time_s, t.node): t for t in run.truth}
+    for m in run.measurements:
+        if isinstance(m, Motion):
+            before, after = truth[m.time_s - 1.0, m.node], truth[m.time_s, m.node]
+            length = math.hypot(after.x_m - before.x_m, after.y_m - before.y_m)
+            reported = math.hypot(m.dx_m, m.dy_m)
+            assert reported * run.hidden.step_scale[m.node] == pytest.approx(length, abs=1e-9)
+            assert after.heading_rad is not None
+            assert before.heading_rad is not None
+            turned = math.remainder(after.heading_rad - before.heading_rad, 2.0 * math.pi)
+            drift = run.hidden.heading_drift_rad_s[m.node] if length > 0.0 else 0.0
+            assert m.dtheta_rad - turned == pytest.approx(drift, abs=1e-9)
+    many = [simulate_paper("paper", s, {**variant, "seconds": 2}).hidden for s in range(300)]
+    logs = [math.log(s) for h in many for s in h.step_scale.values()]
+    drifts = [math.degrees(d) for h in many for d in h.heading_drift_rad_s.values()]
+    assert np.std(logs) == pytest.approx(0.1, rel=0.05)
+    assert np.std(drifts) == pytest.approx(0.5, rel=0.05)
+    assert abs(np.mean(logs)) < 0.01
+    assert abs(np.mean(drifts)) < 0.05
+
+
+def test_waiting_users_drift_only_where_that_is_asked_for() -> None:
+    for waits in (0, 1):
+        run = simulate_paper(
+            "paper", 9, {"heading_drift_deg_s": 0.5, "drift_while_waiting": waits, "seconds": 20}
+        )
+        last = [m for m in run.measurements if isinstance(m, Motion) and m.node == 6]
+        assert all((m.dtheta_rad != 0.0) == bool(waits) for m in last)
+        assert all(m.dx_m == 0.0 for m in last)
+
+
+def test_an_unknown_start_gives_no_prior_or_half_of_one() -> None:
+    known = simulate_paper("paper-p1", 3)
+    assert simulate_paper("paper-p1", 3, {"start": "unknown"}).priors == ()
+    for start, sigmas in (("heading", (math.inf, 0.0)), ("position", (0.0, math.inf))):
+        half = simulate_paper("paper-p1", 3, {"start": start})
+        assert half.measurements == known.measurements
+        assert [(p.sigma_m, p.sigma_rad) for p in half.priors] == [sigmas] * 6
+
+
+def test_late_ranges_are_listed_for_the_evaluation() -> None:
+    plain = simulate_paper("paper-p1", 4)
+    late = simulate_paper("paper-p1", 4, {"nlos_probability": 0.2})
+    assert plain.hidden.late_ranges == frozenset()
+    excess = 0
+    for a, b in zip(plain.measurements, late.measurements, strict=True):
+        if isinstance(a, Range) and isinstance(b, Range):
+            listed = (b.time_s, b.node, b.peer) in late.hidden.late_ranges
+            assert (b.range_m - a.range_m > 1.0) == listed
+            excess += listed
+    assert excess / sum(isinstance(m, Range) for m in late.measurements) == pytest.approx(
+        0.2, abs=0.03
+    )
+
+
 SEEDS = range(100, 108)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -34,7 +35,7 @@ def simulate(
         source=f"relpos simulate --scenario {scenario} --seed {seed}"
         + "".join(f" --set {key}={value}" for key, value in chosen.items()),
         # Everybody's heading at the start is given in the one frame of the rectangle.
-        heading_known=True,
+        heading_known=any(math.isfinite(p.sigma_rad) for p in simulated.priors),
         priors=simulated.priors,
     )
     run = Run(

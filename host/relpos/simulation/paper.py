@@ -12,6 +12,11 @@ paper-h      A with ranges under 10 m only
 paper-h2     H with detection 0.5 and sigma 0.3 m
 ===========  ==========================================================================
 
+What a team does not know of itself is switched on by settings: wrong or unknown starts, ranges
+that are too long, a user who is carried off, one whose odometry is worse than the others', step
+lengths and headings that are wrong by a constant. What was drawn for them is in
+:class:`Hidden`, for evaluation alone.
+
 Everything is a pure function of the settings and the seed.
 """
 
@@ -19,7 +24,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
+from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
@@ -36,15 +42,36 @@ HEADING_PATTERN = (1.0, 2.0, 4.0, 2.0, 3.0, 2.0)
 """User i's heading noise relative to user 1's (mean 2.33)."""
 
 
+class Start(StrEnum):
+    """What an estimator is told of the pose every user starts with."""
+
+    KNOWN = "known"
+    POSITION = "position"
+    """The position alone: any heading."""
+    HEADING = "heading"
+    """The heading alone: any position."""
+    UNKNOWN = "unknown"
+    """Nothing: there are no priors."""
+
+
 @dataclass(frozen=True, slots=True)
 class PaperSettings:
     """What ``--set`` may change; the defaults are scenario P.
 
     Users repeat the six noise levels when there are more of them. ``turn_noise`` is the mean
     over the six users of the relative error of a turn; ``heading_noise_deg`` the white error a
-    step of user 1 (the others by ``HEADING_PATTERN``). ``start_shift_m`` moves every user's
-    prior, untold, by this distance into a random direction. ``nlos_probability`` of the ranges
-    are too long by ``nlos_min_m`` to ``nlos_max_m``. ``max_range_m`` 0 means unlimited.
+    step of user 1 (the others by ``HEADING_PATTERN``). ``start`` is what is known of the starts
+    (:class:`Start`); ``start_shift_m`` moves every user's prior, untold, by this distance into a
+    random direction. ``nlos_probability`` of the ranges are too long by ``nlos_min_m`` to
+    ``nlos_max_m``. ``max_range_m`` 0 means unlimited.
+
+    At ``kidnap_s`` one user (drawn) is carried ``kidnap_m`` into a random direction without any
+    odometry of it, and walks on from there on a rectangle that is shifted by as much. The motion
+    noise of ``noisy_user`` (0: one is drawn) is multiplied by ``noisy_factor``, untold.
+
+    Hidden constants, one draw a user: the true length of every step is exp(N(0, scale_error))
+    times the reported one, and headings drift by N(0, heading_drift_deg_s) while the user walks
+    (one who waits has zero increments; with ``drift_while_waiting`` 1 they drift then, too).
     """
 
     nodes: int = 6
@@ -65,6 +92,14 @@ class PaperSettings:
     nlos_probability: float = 0.0
     nlos_min_m: float = 2.0
     nlos_max_m: float = 6.0
+    start: Start = Start.KNOWN
+    kidnap_m: float = 0.0
+    kidnap_s: float = 300.0
+    noisy_user: int = 0
+    noisy_factor: float = 1.0
+    scale_error: float = 0.0
+    heading_drift_deg_s: float = 0.0
+    drift_while_waiting: int = 0
 
 
 _BOUNDS: Mapping[str, tuple[float, float]] = {
@@ -78,7 +113,14 @@ _BOUNDS: Mapping[str, tuple[float, float]] = {
     "range_period_s": (0.01, 60.0),
     "detection": (0.0, 1.0),
     "nlos_probability": (0.0, 1.0),
+    "kidnap_m": (0.0, 1e4),
+    "noisy_user": (0, 1000),
+    "noisy_factor": (0.0, 100.0),
+    "scale_error": (0.0, 1.0),
+    "heading_drift_deg_s": (0.0, 90.0),
+    "drift_while_waiting": (0, 1),
 }
+_WHOLE = ("nodes", "noisy_user", "drift_while_waiting")
 
 _WHITE_HEADING: Mapping[str, float] = {
     "turn_noise": 0.0,
@@ -99,6 +141,29 @@ SCENARIOS: Mapping[str, Mapping[str, float]] = {
 
 
 @dataclass(frozen=True, slots=True)
+class Hidden:
+    """What no estimator is told, for evaluation alone; every mapping has all nodes.
+
+    ``step_scale`` is true over reported length, ``heading_drift_rad_s`` what the reported
+    heading gains over the true one (the constants of the same names in ``parameters.csv``).
+    ``distance_noise`` and ``turn_noise`` are the relative standard deviations of a step's length
+    and of a turn, ``white_heading_rad`` that of a step's heading, as they were drawn from: with
+    the noisy user's factor. ``late_ranges`` are the (time, node, peer) of ranges that are too
+    long.
+    """
+
+    step_scale: Mapping[int, float] = field(default_factory=dict)
+    heading_drift_rad_s: Mapping[int, float] = field(default_factory=dict)
+    distance_noise: Mapping[int, float] = field(default_factory=dict)
+    turn_noise: Mapping[int, float] = field(default_factory=dict)
+    white_heading_rad: Mapping[int, float] = field(default_factory=dict)
+    noisy_node: int | None = None
+    kidnapped_node: int | None = None
+    kidnapped_s: float | None = None
+    late_ranges: frozenset[tuple[float, int, int]] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
 class SimulatedRun:
     """A run without a folder: measurements sorted by time, priors, and the truth apart."""
 
@@ -106,6 +171,7 @@ class SimulatedRun:
     measurements: tuple[Measurement, ...]
     priors: tuple[Prior, ...]
     truth: tuple[Truth, ...]
+    hidden: Hidden = field(default_factory=Hidden)
 
 
 def settings_of(scenario: str, overrides: Mapping[str, str | float] | None = None) -> PaperSettings:
@@ -115,13 +181,18 @@ def settings_of(scenario: str, overrides: Mapping[str, str | float] | None = Non
     """
     if scenario not in SCENARIOS:
         raise RelposError(f"unknown scenario '{scenario}': one of {', '.join(SCENARIOS)}")
-    changes: dict[str, float | int] = dict(SCENARIOS[scenario])
+    changes: dict[str, float | int | Start] = dict(SCENARIOS[scenario])
     known = {f.name for f in fields(PaperSettings)}
     for key, text in (overrides or {}).items():
         if key not in known:
             raise RelposError(
                 f"scenario {scenario} has no setting '{key}': one of {', '.join(sorted(known))}"
             )
+        if key == "start":
+            if text not in list(Start):
+                raise RelposError(f"setting start: '{text}' is not one of {', '.join(Start)}")
+            changes[key] = Start(str(text))
+            continue
         try:
             value = float(text)
         except ValueError:
@@ -129,12 +200,20 @@ def settings_of(scenario: str, overrides: Mapping[str, str | float] | None = Non
         low, high = _BOUNDS.get(key, (0.0, 1e6))
         if not low <= value <= high:
             raise RelposError(f"setting {key}: {text} is not within {low:g} to {high:g}")
-        if key == "nodes" and value != int(value):
-            raise RelposError(f"setting nodes: {text} is not a whole number")
-        changes[key] = int(value) if key == "nodes" else value
+        if key in _WHOLE and value != int(value):
+            raise RelposError(f"setting {key}: {text} is not a whole number")
+        changes[key] = int(value) if key in _WHOLE else value
     settings = replace(PaperSettings(), **changes)  # type: ignore[arg-type]
     if settings.nlos_max_m < settings.nlos_min_m:
         raise RelposError("setting nlos_max_m is less than nlos_min_m")
+    if settings.noisy_user > settings.nodes:
+        raise RelposError(
+            f"setting noisy_user: there is no user {settings.noisy_user} of {settings.nodes}"
+        )
+    if settings.kidnap_m > 0.0 and settings.kidnap_s >= settings.seconds:
+        raise RelposError(
+            f"setting kidnap_s: {settings.kidnap_s:g} is past the end at {settings.seconds:g} s"
+        )
     return settings
 
 
@@ -163,17 +242,53 @@ def true_poses(settings: PaperSettings) -> tuple[Floats, Floats, Floats]:
     return times, positions, heading
 
 
+@dataclass(frozen=True, slots=True)
+class _Drawn:
+    """The hidden side of a run as arrays by user, (N,)."""
+
+    step_scale: Floats
+    drift_rad_s: Floats
+    distance_noise: Floats
+    turn_noise: Floats
+    white_rad: Floats
+    noisy: int
+    kidnapped: int
+    carried_m: Floats
+    """Where the kidnapped user is put, relative to where it was, (2,)."""
+
+
+def _draw(settings: PaperSettings, rng: np.random.Generator) -> _Drawn:
+    # Everything is drawn whether it is used or not: one setting does not change another's dice.
+    count = settings.nodes
+    scale, drift = rng.standard_normal(count), rng.standard_normal(count)
+    noisy = int(rng.integers(count))
+    kidnapped = int(rng.integers(count))
+    direction = rng.uniform(0.0, 2.0 * math.pi)
+    if settings.noisy_user > 0:
+        noisy = settings.noisy_user - 1
+    pattern = np.resize(np.array(HEADING_PATTERN), count)
+    factor = np.ones(count)
+    factor[noisy] = settings.noisy_factor
+    return _Drawn(
+        np.exp(settings.scale_error * scale),
+        math.radians(settings.heading_drift_deg_s) * drift,
+        np.resize(np.array(DISTANCE_NOISE), count) * settings.distance_noise_scale * factor,
+        settings.turn_noise * pattern / 2.33 * factor,
+        math.radians(settings.heading_noise_deg) * pattern * factor,
+        noisy,
+        kidnapped,
+        settings.kidnap_m * np.array([math.cos(direction), math.sin(direction)]),
+    )
+
+
 def _motions(
     settings: PaperSettings,
+    drawn: _Drawn,
     times: Floats,
     positions: Floats,
     heading: Floats,
     rng: np.random.Generator,
 ) -> list[Motion]:
-    pattern = np.resize(np.array(HEADING_PATTERN), settings.nodes)
-    spread = np.resize(np.array(DISTANCE_NOISE), settings.nodes) * settings.distance_noise_scale
-    turn_spread = settings.turn_noise * pattern / 2.33
-    white_rad = math.radians(settings.heading_noise_deg) * pattern
     chord = np.diff(positions, axis=1)
     turn = np.diff(heading, axis=1)
     distance = np.linalg.norm(chord, axis=-1)
@@ -183,9 +298,12 @@ def _motions(
         distance > 0.0, np.arctan2(chord[..., 1], chord[..., 0]) - heading[:, 1:], 0.0
     )
     shape = distance.shape
-    measured = distance * (1.0 + spread[:, None] * rng.standard_normal(shape))
-    turned = turn * (1.0 + turn_spread[:, None] * rng.standard_normal(shape))
-    turned += white_rad[:, None] * rng.standard_normal(shape) * (distance > 0.0)
+    measured = distance * (1.0 + drawn.distance_noise[:, None] * rng.standard_normal(shape))
+    measured /= drawn.step_scale[:, None]
+    turned = turn * (1.0 + drawn.turn_noise[:, None] * rng.standard_normal(shape))
+    turned += drawn.white_rad[:, None] * rng.standard_normal(shape) * (distance > 0.0)
+    drifts = (distance > 0.0) | bool(settings.drift_while_waiting)
+    turned += drawn.drift_rad_s[:, None] * settings.motion_period_s * drifts
     dx, dy = measured * np.cos(turned + direction), measured * np.sin(turned + direction)
     return [
         Motion(float(times[k + 1]), i + 1, float(dx[i, k]), float(dy[i, k]), float(turned[i, k]))
@@ -195,8 +313,13 @@ def _motions(
 
 
 def _ranges(
-    settings: PaperSettings, times: Floats, positions: Floats, rng: np.random.Generator
-) -> list[Range]:
+    settings: PaperSettings,
+    drawn: _Drawn,
+    times: Floats,
+    positions: Floats,
+    rng: np.random.Generator,
+) -> tuple[list[Range], frozenset[tuple[float, int, int]]]:
+    """Give the ranges and which of them are too long; ``positions`` are without kidnapping."""
     first, second = np.triu_indices(settings.nodes, 1)
     instants = np.arange(
         settings.range_period_s, times[-1] + 1e-9, settings.range_period_s, dtype=float
@@ -207,6 +330,7 @@ def _ranges(
             for i in range(settings.nodes)
         ]
     )
+    at[drawn.kidnapped] += drawn.carried_m[:, None] * (instants >= settings.kidnap_s)
     distance = np.hypot(*(at[first] - at[second]).transpose(1, 0, 2))
     noise = settings.sigma_range_m * rng.standard_normal(distance.shape)
     heard = rng.random(distance.shape) < settings.detection
@@ -216,10 +340,34 @@ def _ranges(
         heard &= distance < settings.max_range_m
     # A ranging chip reports no negative distance; it matters only where two stand together.
     value = np.abs(distance + noise + late * excess)
-    return [
-        Range(float(instants[k]), int(first[p]) + 1, int(second[p]) + 1, float(value[p, k]))
-        for k, p in zip(*np.nonzero(heard.T), strict=True)
-    ]
+    made, too_long = [], []
+    for k, p in zip(*np.nonzero(heard.T), strict=True):
+        key = (float(instants[k]), int(first[p]) + 1, int(second[p]) + 1)
+        made.append(Range(*key, float(value[p, k])))
+        if late[p, k]:
+            too_long.append(key)
+    return made, frozenset(too_long)
+
+
+def _priors(
+    settings: PaperSettings, positions: Floats, heading: Floats, rng: np.random.Generator
+) -> tuple[Prior, ...]:
+    shift = rng.uniform(0.0, 2.0 * math.pi, settings.nodes)
+    if settings.start is Start.UNKNOWN:
+        return ()
+    sigma_m = math.inf if settings.start is Start.HEADING else 0.0
+    sigma_rad = math.inf if settings.start is Start.POSITION else 0.0
+    return tuple(
+        Prior(
+            i + 1,
+            float(positions[i, 0, 0] + settings.start_shift_m * math.cos(shift[i])),
+            float(positions[i, 0, 1] + settings.start_shift_m * math.sin(shift[i])),
+            float(heading[i, 0]),
+            sigma_m,
+            sigma_rad,
+        )
+        for i in range(settings.nodes)
+    )
 
 
 def simulate_paper(
@@ -227,22 +375,16 @@ def simulate_paper(
 ) -> SimulatedRun:
     """Measurements, priors and truth of one run; the same arguments give the same run."""
     settings = settings_of(scenario, overrides)
-    motion_rng, range_rng, shift_rng = (
-        np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3)
+    # A later stream does not change the ones before it: old seeds keep giving the same runs.
+    motion_rng, range_rng, shift_rng, hidden_rng = (
+        np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)
     )
+    drawn = _draw(settings, hidden_rng)
     times, positions, heading = true_poses(settings)
-    motions = _motions(settings, times, positions, heading, motion_rng)
-    ranges = _ranges(settings, times, positions, range_rng)
-    shift = shift_rng.uniform(0.0, 2.0 * math.pi, settings.nodes)
-    priors = tuple(
-        Prior(
-            i + 1,
-            float(positions[i, 0, 0] + settings.start_shift_m * math.cos(shift[i])),
-            float(positions[i, 0, 1] + settings.start_shift_m * math.sin(shift[i])),
-            float(heading[i, 0]),
-        )
-        for i in range(settings.nodes)
-    )
+    motions = _motions(settings, drawn, times, positions, heading, motion_rng)
+    ranges, too_long = _ranges(settings, drawn, times, positions, range_rng)
+    priors = _priors(settings, positions, heading, shift_rng)
+    positions[drawn.kidnapped] += drawn.carried_m * (times >= settings.kidnap_s)[:, None]
     measurements: list[Measurement] = sorted([*motions, *ranges], key=lambda m: m.time_s)
     truth = tuple(
         Truth(float(t), i + 1, float(positions[i, k, 0]), float(positions[i, k, 1]),
@@ -250,4 +392,25 @@ def simulate_paper(
         for k, t in enumerate(times)
         for i in range(settings.nodes)
     )  # fmt: skip
-    return SimulatedRun(scenario, tuple(measurements), priors, truth)
+    return SimulatedRun(scenario, tuple(measurements), priors, truth,
+                        _hidden(settings, drawn, too_long))  # fmt: skip
+
+
+def _hidden(
+    settings: PaperSettings, drawn: _Drawn, too_long: frozenset[tuple[float, int, int]]
+) -> Hidden:
+    def by_node(values: Floats) -> dict[int, float]:
+        return {k + 1: float(value) for k, value in enumerate(values)}
+
+    kidnapped = settings.kidnap_m > 0.0
+    return Hidden(
+        by_node(drawn.step_scale),
+        by_node(drawn.drift_rad_s),
+        by_node(drawn.distance_noise),
+        by_node(drawn.turn_noise),
+        by_node(drawn.white_rad),
+        drawn.noisy + 1 if settings.noisy_factor != 1.0 else None,
+        drawn.kidnapped + 1 if kidnapped else None,
+        settings.kidnap_s if kidnapped else None,
+        too_long,
+    )
