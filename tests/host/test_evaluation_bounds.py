@@ -11,7 +11,6 @@ import pytest
 from scipy.optimize import least_squares
 
 from relpos.evaluation import bounds
-from relpos.measurements import Range
 from relpos.simulation.paper import settings_of, simulate_paper
 
 Floats = npt.NDArray[np.float64]
@@ -49,6 +48,10 @@ def _scene(
         drift_rad_s=np.array([0.01, 0.0, 0.02]) * constants,
         log_scale=np.array([0.0, 0.1, 0.1]) * constants,
     )
+
+
+def _paper_scene(name: str, seed: int, overrides: dict[str, float | str]) -> bounds.Scene:
+    return bounds.paper_scene(settings_of(name, overrides), simulate_paper(name, seed, overrides))
 
 
 class _Dense:
@@ -207,11 +210,12 @@ def test_the_best_estimator_scatters_as_the_bound_says() -> None:
 
 
 def test_more_ranges_never_raise_the_bound() -> None:
-    settings = settings_of("paper-h2", {"seconds": 120})
-    ranges = [m for m in simulate_paper("paper-h2", 3, {"seconds": 120}).measurements
-              if isinstance(m, Range)]  # fmt: skip
-    everything = bounds.of_run(settings, ranges)
-    half = bounds.of_run(settings, ranges[::2])
+    scene = _paper_scene("paper-h2", 3, {"seconds": 120})
+    fewer = {
+        name: getattr(scene, name)[::2]
+        for name in ("range_time_s", "range_nodes", "range_information")
+    }
+    everything, half = bounds.of_scene(scene), bounds.of_scene(replace(scene, **fewer))
     slack = 1e-9
     assert (half.filtering_pair_m >= everything.filtering_pair_m - slack).all()
     assert (half.smoothing_pair_m >= everything.smoothing_pair_m - slack).all()
@@ -258,13 +262,9 @@ def test_who_waits_at_a_known_place_is_known_there() -> None:
 
 
 def test_an_unknown_start_is_found_and_the_frame_does_not_matter() -> None:
-    settings = settings_of("paper-p1", {"spacing_s": 0.0, "nodes": 3, "seconds": 200})
-    scene = bounds.paper_scene(
-        settings,
-        [m for m in simulate_paper("paper-p1", 0, {"nodes": 3, "seconds": 200}).measurements
-         if isinstance(m, Range)],
-        known_start=False,
-    )  # fmt: skip
+    scene = _paper_scene(
+        "paper-p1", 0, {"spacing_s": 0.0, "nodes": 3, "seconds": 200, "start": "unknown"}
+    )
     away = scene.position_m + np.array([[[0.0, 0.0]], [[4.0, 1.0]], [[1.0, 5.0]]])
     unknown = replace(scene, position_m=away)
     turned = replace(unknown, **_reordered(unknown, [2, 0, 1]))
@@ -280,7 +280,10 @@ def test_an_unknown_start_is_found_and_the_frame_does_not_matter() -> None:
 
 def _reordered(scene: bounds.Scene, order: list[int]) -> dict[str, npt.NDArray[np.generic]]:
     place = np.argsort(order)
-    fields = ("position_m", "along", "turn_rad", "sigma_m", "start_m", "start_rad")
+    fields = (
+        "position_m", "along", "turn_rad", "sigma_m", "start_m", "start_rad", "walked_m",
+        "drifting_s",
+    )  # fmt: skip
     return {name: getattr(scene, name)[order] for name in fields} | {
         "range_nodes": place[scene.range_nodes]
     }
@@ -294,3 +297,30 @@ def test_ranges_that_are_sometimes_too_long_tell_less() -> None:
         clean.filtering_distance_m / math.sqrt(0.8), rel=0.08
     )
     assert late.filtering_distance_m > clean.filtering_distance_m
+
+
+def test_what_is_hidden_costs_what_it_has_to_be_learned_with() -> None:
+    """Scale and drift raise the bound, and are themselves known the better the later."""
+    plain = bounds.of_paper("paper-p1", 2, {"seconds": 200})
+    hidden = {"seconds": 200, "scale_error": 0.1, "heading_drift_deg_s": 0.1}
+    bound = bounds.of_paper("paper-p1", 2, hidden)
+    assert (bound.filtering_pair_m >= plain.filtering_pair_m - 1e-9).all()
+    assert bound.totals().filtering_distance_m > 1.02 * plain.totals().filtering_distance_m
+    drift, scale = bound.filtering_constants.T
+    assert (drift < math.radians(0.1)).all()
+    assert (scale < 0.06).all()
+
+
+def test_a_kidnapped_user_is_lost_until_it_is_seen_again() -> None:
+    options = {"seconds": 200, "kidnap_m": 5.0, "kidnap_s": 150.0}
+    run = simulate_paper("paper-p1", 1, options)
+    who = (run.hidden.kidnapped_node or 0) - 1
+    bound = bounds.of_paper("paper-p1", 1, options)
+    plain = bounds.of_paper("paper-p1", 1, {"seconds": 200})
+    first, second = np.triu_indices(6, 1)
+    others = (first != who) & (second != who)
+    before = bound.time_s < 150.0
+    assert bound.filtering_pair_m[before] == pytest.approx(plain.filtering_pair_m[before])
+    at = int(np.flatnonzero(bound.time_s == 150.0)[0])
+    assert bound.filtering_pair_m[at, ~others].max() > 0.2
+    assert bound.filtering_pair_m[at, others].max() < bound.filtering_pair_m[at, ~others].max()

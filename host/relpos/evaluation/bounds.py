@@ -28,7 +28,7 @@ covariance: users who wait at a known place have neither.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -37,9 +37,9 @@ import numpy.typing as npt
 
 from relpos.measurements import Range
 from relpos.simulation.paper import (
-    DISTANCE_NOISE,
-    HEADING_PATTERN,
     PaperSettings,
+    SimulatedRun,
+    Start,
     settings_of,
     simulate_paper,
     true_poses,
@@ -89,6 +89,11 @@ class Scene:
     """(N,) spread of the hidden constant error of the reported turn rate; 0 where there is none."""
     log_scale: Floats = field(default_factory=lambda: np.zeros(0))
     """(N,) spread of the hidden constant logarithm of true over reported length."""
+    walked_m: Floats = field(default_factory=lambda: np.zeros(0))
+    """(N, K, 2) true chords that the reports are of, in world axes; without it, the differences
+    of the positions."""
+    drifting_s: Floats = field(default_factory=lambda: np.zeros(0))
+    """(N, K) how long of each chord the drift acts; without it, the chord's duration."""
 
     def __post_init__(self) -> None:
         """Fill in what was not given with zeros and check the shapes."""
@@ -100,6 +105,15 @@ class Scene:
             if value.shape != (count,):
                 raise ValueError(f"{name} needs one value a node, not the shape {value.shape}")
             object.__setattr__(self, name, value)
+        if not self.walked_m.size:
+            object.__setattr__(self, "walked_m", np.diff(self.position_m, axis=1))
+        if not self.drifting_s.size:
+            lasting = np.broadcast_to(np.diff(self.time_s), self.along.shape)
+            object.__setattr__(self, "drifting_s", lasting)
+        if self.walked_m.shape != (count, times - 1, 2):
+            raise ValueError(f"walked_m needs the shape {(count, times - 1, 2)}")
+        if self.drifting_s.shape != (count, times - 1):
+            raise ValueError(f"drifting_s needs the shape {(count, times - 1)}")
         shapes = {self.along.shape, self.turn_rad.shape, self.sigma_m.shape}
         if shapes != {(count, times - 1)}:
             raise ValueError(f"the motion noise needs the shape {(count, times - 1)}, not {shapes}")
@@ -187,44 +201,57 @@ def of_paper(
     scenario: str = "paper", seed: int = 0, overrides: Mapping[str, str | float] | None = None
 ) -> Bound:
     """Compute the bound of one simulated run, given the ranges that were measured in it."""
-    settings = settings_of(scenario, overrides)
     run = simulate_paper(scenario, seed, overrides)
-    return of_run(settings, [m for m in run.measurements if isinstance(m, Range)])
+    return of_scene(paper_scene(settings_of(scenario, overrides), run))
 
 
-def of_run(settings: PaperSettings, ranges: Sequence[Range], *, known_start: bool = True) -> Bound:
-    """Compute the bound of a run that was simulated with ``settings`` and gave ``ranges``."""
-    return of_scene(paper_scene(settings, ranges, known_start=known_start))
-
-
-def paper_scene(
-    settings: PaperSettings, ranges: Sequence[Range], *, known_start: bool = True
-) -> Scene:
+def paper_scene(settings: PaperSettings, run: SimulatedRun) -> Scene:
     """Describe a run of the paper's simulation as its bound sees it: nodes are numbered from 1.
 
-    What only some runs have is taken at its true spread: a shifted start is known to
-    ``start_shift_m / sqrt(2)`` in x and y, and a range of which a share is too long has the
+    What only some runs have is taken at its true spread, as if it had been told: a shifted start
+    is known to ``start_shift_m / sqrt(2)`` in x and y, a kidnapped user to as much of the way
+    carried, the noisy user is known as such, and a range of which a share is too long has the
     information of that mixture.
     """
-    times, positions, heading = true_poses(settings)
-    turn = np.diff(heading, axis=1)
-    moving = np.linalg.norm(np.diff(positions, axis=1), axis=-1) > 0.0
-    pattern = np.resize(np.array(HEADING_PATTERN), settings.nodes)[:, None]
-    along = np.resize(np.array(DISTANCE_NOISE), settings.nodes)[:, None]
-    white_rad = math.radians(settings.heading_noise_deg) * pattern * moving
-    kept = [r for r in ranges if 0.0 < r.time_s <= times[-1]]
+    times, walked, heading = true_poses(settings)
+    turn, chord = np.diff(heading, axis=1), np.diff(walked, axis=1)
+    moving = np.linalg.norm(chord, axis=-1) > 0.0
     everyone = np.ones(settings.nodes)
+    hidden, positions, sigma_m = run.hidden, walked.copy(), np.zeros(moving.shape)
+    if hidden.kidnapped_node is not None:
+        row, when = hidden.kidnapped_node - 1, int(np.searchsorted(times, settings.kidnap_s - 1e-9))
+        positions[row] = [(t.x_m, t.y_m) for t in run.truth if t.node == hidden.kidnapped_node]
+        sigma_m[row, max(when, 1) - 1] = settings.kidnap_m / math.sqrt(2.0)
+
+    def of_user(values: Mapping[int, float]) -> Floats:
+        return np.array([values[node + 1] for node in range(settings.nodes)])[:, None]
+
+    drifts = settings.heading_drift_deg_s > 0.0
+    if drifts and not settings.drift_while_waiting:
+        duration_s = np.diff(times) * moving
+    else:
+        duration_s = np.diff(times) * np.ones(moving.shape)
+    position_known = settings.start in (Start.KNOWN, Start.POSITION)
+    heading_known = settings.start in (Start.KNOWN, Start.HEADING)
+    kept = [m for m in run.measurements if isinstance(m, Range) and 0.0 < m.time_s <= times[-1]]
     return Scene(
         times,
         positions,
-        along * settings.distance_noise_scale * moving,
-        np.hypot(turn * settings.turn_noise * pattern / 2.33, white_rad),
-        np.zeros(moving.shape),
+        of_user(hidden.distance_noise) * moving,
+        np.hypot(
+            turn * of_user(hidden.turn_noise),
+            of_user(hidden.white_heading_rad) * moving,
+        ),
+        sigma_m,
         np.array([r.time_s for r in kept]),
         np.array([(r.node - 1, r.peer - 1) for r in kept], dtype=np.int64).reshape(-1, 2),
         np.full(len(kept), _range_information(settings)),
-        start_m=everyone * (settings.start_shift_m / math.sqrt(2.0) if known_start else math.inf),
-        start_rad=everyone * (0.0 if known_start else math.inf),
+        start_m=everyone * (settings.start_shift_m / math.sqrt(2.0) if position_known else np.inf),
+        start_rad=everyone * (0.0 if heading_known else np.inf),
+        drift_rad_s=everyone * math.radians(settings.heading_drift_deg_s),
+        log_scale=everyone * settings.scale_error,
+        walked_m=chord,
+        drifting_s=duration_s,
     )
 
 
@@ -337,7 +364,7 @@ class _System:
         wanted[:, _OLD_X:] = bool((self._share < 1.0).any())
         self._column = np.where(wanted, np.cumsum(wanted).reshape(wanted.shape) - 1, -1)
         self._size = int(wanted.sum())
-        self._chords = np.diff(scene.position_m, axis=1)
+        self._chords = scene.walked_m
         self._order = np.argsort(self._chord, kind="stable")
         self._first = np.searchsorted(self._chord[self._order], np.arange(self.steps + 1))
 
@@ -366,8 +393,10 @@ class _System:
     def transition(self, step: int) -> Floats:
         """Return how the errors at the beginning of a chord become those at its end."""
         matrix = np.eye(self._size)
-        duration_s = float(self._scene.time_s[step + 1] - self._scene.time_s[step])
-        for column, chord in zip(self._column, self._chords[:, step], strict=True):
+        durations = self._scene.drifting_s[:, step]
+        for column, chord, duration_s in zip(
+            self._column, self._chords[:, step], durations, strict=True
+        ):
             x, y, heading, drift, scale, old_x, old_y = column
             matrix[x, heading], matrix[y, heading] = -chord[1], chord[0]
             if drift >= 0:
