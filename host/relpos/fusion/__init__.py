@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from relpos.errors import RelposError
+from relpos.fusion.bank_settings import BankSettings
 from relpos.fusion.deadreckoning import DeadReckoning, DeadReckoningSettings
 from relpos.fusion.estimator import (
     Alternative,
@@ -21,6 +22,7 @@ from relpos.fusion.settings import SettingInfo, describe, parse
 from relpos.measurements import Prior
 
 SETTINGS: Mapping[str, type] = {
+    "bank": BankSettings,
     "particle": ParticleSettings,
     "deadreckoning": DeadReckoningSettings,
 }
@@ -40,6 +42,11 @@ def make(
     """
     given = settings or {}
     match str(name):
+        case "bank":
+            # Kernels are only loaded where they are used: help texts stay quick.
+            from relpos.fusion.bank import Bank
+
+            return Bank(priors, parse(BankSettings, given, "bank"), seed)
         case "particle":
             return ParticleFilter(priors, parse(ParticleSettings, given, "particle"), seed)
         case "deadreckoning":

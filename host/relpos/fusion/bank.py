@@ -1,0 +1,581 @@
+"""A bank of joint error-state filters: the default estimator.
+
+Every hypothesis is one possible history: a joint filter over all users
+(:mod:`relpos.fusion.joint`), levels of noise (:mod:`relpos.fusion.noise`) and a weight.
+:class:`BankCore` holds them as arrays and knows neither measurements nor node ids;
+:class:`Bank` is the :class:`~relpos.fusion.estimator.Estimator` around it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.errors import RelposError
+from relpos.fusion import joint, noise
+from relpos.fusion.bank_settings import BankSettings
+from relpos.fusion.detection import Detection, log_silence
+from relpos.fusion.estimator import (
+    LOST_EPOCHS,
+    STALE_EPOCHS,
+    Estimate,
+    NodeEstimate,
+    NodeStatus,
+    PairEstimate,
+    Parameter,
+)
+from relpos.fusion.joint import PER_NODE, Of
+from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
+from relpos.measurements import Heading, Height, Measurement, Prior, Range
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+_ANY_ANGLE_RAD = math.pi / math.sqrt(3.0)
+_TWO_PI = 2.0 * math.pi
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """Everything a core needs to go back: array copies and the generator's state."""
+
+    arrays: tuple[Floats, ...]
+    random: Mapping[str, object]
+    numbers: tuple[float, ...]
+
+
+class BankCore:
+    """K hypotheses about N users, as arrays. Nothing here knows node ids or wall time.
+
+    Users are *rows* 0 ... N-1 in the order of ``add_node``. ``x`` (K, D) and ``p`` (K, D, D)
+    are the hypotheses' means and covariances, ``log_weight`` (K,) their unnormalised
+    log weights; D = 5 N + extra, see :class:`~relpos.fusion.joint.Of`.
+
+    The order of work in one epoch: ``advance`` (once or more), ``update`` (all ranges of one
+    instant), ``log_weight +=`` whatever else is known (silence, ...), then ``settle`` (jumps,
+    resampling). ``moments`` gives the mixture's mean and full covariance at any time.
+    ``snapshot`` and ``restore`` bring everything back exactly, randomness included, so that what
+    came late can be put in its place and the rest be repeated.
+    """
+
+    def __init__(self, settings: BankSettings, seed: int = 0) -> None:
+        """Start with no users and ``settings.hypotheses`` equal hypotheses."""
+        self.settings = settings
+        self.rng = np.random.default_rng(seed)
+        self.counters: Counter[str] = Counter()
+        count = settings.hypotheses
+        self.nodes = 0
+        self.x: Floats = np.zeros((count, 0))
+        self.p: Floats = np.zeros((count, 0, 0))
+        self.log_weight: Floats = np.zeros(count)
+        self.team, self.log_sigma2 = noise.draw_team(count, self.rng)
+        self.log_level: Floats = np.zeros((count, 0, noise.LEVELS))
+        self.level: Floats = np.exp(self.log_level)
+        self.sigma2: Floats = np.exp(self.log_sigma2)
+        self.has_constants: Floats = (
+            self.rng.permutation(count) < round(settings.constants * count)
+        ).astype(np.float64)
+        self.surprise: Floats = np.zeros(0)
+        self.outlier_counts: Floats = np.array([settings.outliers, 1.0 - settings.outliers]) * 20.0
+
+    # -- users ---------------------------------------------------------------------------------
+
+    @property
+    def count(self) -> int:
+        """K, the number of hypotheses."""
+        return int(self.x.shape[0])
+
+    def add_node(
+        self, x_m: float, y_m: float, heading_rad: float, sigma_m: float, sigma_rad: float
+    ) -> int:
+        """Add a user with a Gaussian prior, independent of the others; return its row."""
+        count, old = self.x.shape
+        row = self.nodes
+        at = PER_NODE * row
+        x = np.zeros((count, old + PER_NODE))
+        p = np.zeros((count, old + PER_NODE, old + PER_NODE))
+        keep = np.r_[0:at, at + PER_NODE : old + PER_NODE]
+        x[:, keep] = self.x
+        p[np.ix_(np.arange(count), keep, keep)] = self.p
+        x[:, at : at + 3] = (x_m, y_m, heading_rad)
+        for entry, sigma in ((Of.X, sigma_m), (Of.Y, sigma_m), (Of.HEADING, sigma_rad)):
+            p[:, at + entry, at + entry] = sigma**2
+        p[:, at + Of.DRIFT, at + Of.DRIFT] = self.has_constants * self.settings.drift_rad_s**2
+        p[:, at + Of.SCALE, at + Of.SCALE] = self.has_constants * self.settings.scale**2
+        self.x, self.p = x, p
+        self.nodes += 1
+        added = noise.draw_node(self.team, self.rng)
+        self.log_level = np.concatenate([self.log_level, added[:, None]], axis=1)
+        self.level = np.exp(self.log_level)
+        self.surprise = np.append(self.surprise, 0.0)
+        return row
+
+    def remove(self, row: int) -> None:
+        """Forget a user; the rows above it move down by one."""
+        at = PER_NODE * row
+        keep = np.r_[0:at, at + PER_NODE : self.x.shape[1]]
+        self.x = np.ascontiguousarray(self.x[:, keep])
+        self.p = np.ascontiguousarray(self.p[:, keep][:, :, keep])
+        self.log_level = np.delete(self.log_level, row, axis=1)
+        self.level = np.exp(self.log_level)
+        self.surprise = np.delete(self.surprise, row)
+        self.nodes -= 1
+
+    def seed_hypotheses(self, poses: Floats, covariances: Floats, log_weights: Floats) -> None:
+        """Replace all users' poses by start hypotheses.
+
+        ``poses`` (H, N, 3), ``covariances`` (H, 3 N, 3 N) in the order x, y, heading of user 0,
+        of user 1, ...; ``log_weights`` (H,). The K hypotheses (levels of noise, constants) are
+        dealt out over them by weight, each H at least once where H <= K.
+        """
+        share = np.exp(log_weights - log_weights.max())
+        share /= share.sum()
+        given = len(share)
+        chosen = systematic(share, max(self.count - given, 0), self.rng)
+        if given <= self.count:
+            chosen = np.concatenate([np.arange(given), chosen])
+        else:
+            chosen = systematic(share, self.count, self.rng)
+        times = np.bincount(chosen, minlength=given)
+        order = self.rng.permutation(self.count)
+        self.x, self.p = self.x[order], self.p[order]
+        self._permute_parameters(order)
+        pose = (PER_NODE * np.arange(self.nodes)[:, None] + np.arange(3)).ravel()
+        self.x[:, pose] = poses.reshape(given, -1)[chosen]
+        self.p[:, pose, :] = 0.0
+        self.p[:, :, pose] = 0.0
+        self.p[np.ix_(np.arange(self.count), pose, pose)] = covariances[chosen]
+        self.log_weight = np.log(share[chosen] / times[chosen])
+
+    # -- one epoch -----------------------------------------------------------------------------
+
+    def advance(
+        self,
+        rows: Indices,
+        dx_m: Floats,
+        dy_m: Floats,
+        dtheta_rad: Floats,
+        duration_s: Floats,
+        sigmas: Floats | None = None,
+    ) -> None:
+        """Move users ``rows`` (M,), in this order; a user may come several times.
+
+        ``sigmas`` (M, 3) are the pieces' own standard deviations (forward and left m, turn rad)
+        where the reports bring any, else NaN.
+        """
+        if not len(rows):
+            return
+        told = np.full((len(rows), 3), np.nan) if sigmas is None else sigmas
+        motion = np.empty((len(rows), 7))
+        motion[:, 0], motion[:, 1], motion[:, 2], motion[:, 3] = dx_m, dy_m, dtheta_rad, duration_s
+        motion[:, 4:] = noise.motion_variances(dx_m, dy_m, dtheta_rad, duration_s, told)
+        share = self.settings.sampled if self.count > 1 else 0.0
+        drawn = self.rng.standard_normal((self.count, len(rows)))
+        joint.advance(self.x, self.p, self.level, rows, motion, drawn, share, CROSS)
+
+    def update(self, first: Indices, second: Indices, range_m: Floats, dz_m: Floats) -> Floats:
+        """Work in the ranges (R,) of one instant; return each one's probability to be good."""
+        bias = np.full(len(first), -1, dtype=np.int64)
+        stats = np.empty((self.count, len(first), 3))
+        outlier = np.array([self.outlier_share, self.settings.outlier_m**2,
+                            self.settings.outliers_short])  # fmt: skip
+        joint.update(
+            self.x, self.p, self.log_weight, self.sigma2, first, second, bias, range_m, dz_m,
+            outlier, stats,
+        )  # fmt: skip
+        weight = self.weights()
+        good: Floats = weight @ stats[:, :, 0]
+        self.outlier_counts *= 0.998 ** len(first)
+        self.outlier_counts += (float((1.0 - good).sum()), float(good.sum()))
+        for row, peer, trust in zip(first, second, good, strict=True):
+            for one in (row, peer):
+                self.surprise[one] += 0.2 * (1.0 - trust - self.surprise[one])
+        return good
+
+    @property
+    def outlier_share(self) -> float:
+        """What share of the ranges are outliers, as far as is known."""
+        wrong, right = self.outlier_counts
+        return float(min(max(wrong / (wrong + right), 0.005), 0.5))
+
+    def heading(self, row: int, heading_rad: float, sigma_rad: float) -> None:
+        """Work in an absolute heading of a user."""
+        joint.update_heading(
+            self.x, self.p, self.log_weight, row, heading_rad, sigma_rad**2,
+            HEADING_OUTLIERS, HEADING_OUTLIER_RAD**2,
+        )  # fmt: skip
+
+    def predicted_ranges(
+        self, first: Indices, second: Indices, dz_m: Floats
+    ) -> tuple[Floats, Floats]:
+        """Give means and standard deviations (K, U) of slant distances in every hypothesis."""
+        return joint.predicted_ranges(self.x, self.p, first, second, dz_m)
+
+    def settle(self) -> None:
+        """Close an epoch: jumps, and resampling where the weights have become uneven."""
+        weight = self.weights()
+        if 1.0 / float(weight @ weight) < 0.5 * self.count:
+            self.resample(weight)
+        self._jump()
+
+    def weights(self) -> Floats:
+        """Normalised weights (K,); the log weights are shifted so that their greatest is 0."""
+        self.log_weight -= self.log_weight.max()
+        weight: Floats = np.exp(self.log_weight)
+        weight /= weight.sum()
+        return weight
+
+    def resample(self, weight: Floats) -> None:
+        """Draw hypotheses anew by their weights; levels of noise are jittered (Liu, West)."""
+        chosen = systematic(weight, self.count, self.rng)
+        self.x, self.p = self.x[chosen], self.p[chosen]
+        spread_level = _spread(self.log_level, weight)
+        spread_sigma2 = _spread(self.log_sigma2, weight)
+        self._permute_parameters(chosen)
+        shape = self.log_level.shape
+        absent = self.log_level <= noise.ABSENT_LOG
+        jitter = JITTER * spread_level * self.rng.standard_normal(shape)
+        self.log_level = np.where(absent, self.log_level, self.log_level + jitter)
+        self.log_sigma2 = self.log_sigma2 + JITTER * spread_sigma2 * self.rng.standard_normal(
+            shape[0]
+        )
+        self.level, self.sigma2 = np.exp(self.log_level), np.exp(self.log_sigma2)
+        self.log_weight = np.zeros(self.count)
+        self.counters["resampled"] += 1
+
+    def _permute_parameters(self, chosen: Indices) -> None:
+        self.team, self.log_level = self.team[chosen], self.log_level[chosen]
+        self.log_sigma2 = self.log_sigma2[chosen]
+        self.has_constants = self.has_constants[chosen]
+        self.level, self.sigma2 = np.exp(self.log_level), np.exp(self.log_sigma2)
+
+    def _jump(self) -> None:
+        """Let some hypotheses doubt a user's pose; the more, the worse its ranges fit."""
+        s = self.settings
+        if not self.nodes or self.count < 2:
+            return
+        doubt = np.clip((self.surprise - 0.15) / 0.35, 0.0, 1.0)
+        rate = s.jumps / self.nodes + (s.jumps_most - s.jumps / self.nodes) * doubt
+        total = float(rate.sum())
+        which = np.flatnonzero(self.rng.random(self.count) < total)
+        for k in which:
+            row = int(self.rng.choice(self.nodes, p=rate / total))
+            at = PER_NODE * row
+            offset = self.rng.standard_normal(3) * (s.jump_m, s.jump_m, s.jump_rad)
+            self.x[k, at : at + 3] += math.sqrt(0.5) * offset
+            for entry, sigma in ((0, s.jump_m), (1, s.jump_m), (2, s.jump_rad)):
+                self.p[k, at + entry, at + entry] += 0.5 * sigma**2
+        self.counters["jumps"] += len(which)
+
+    # -- what is known -------------------------------------------------------------------------
+
+    def moments(self) -> tuple[Floats, Floats]:
+        """Give the mixture's mean (D,) and full covariance (D, D)."""
+        angles = PER_NODE * np.arange(self.nodes, dtype=np.int64) + Of.HEADING
+        return joint.moments(self.x, self.p, self.weights(), angles)
+
+    def snapshot(self) -> Snapshot:
+        """Copy everything."""
+        return Snapshot(
+            tuple(a.copy() for a in (
+                self.x, self.p, self.log_weight, self.team, self.log_level, self.log_sigma2,
+                self.has_constants, self.surprise, self.outlier_counts,
+            )),
+            self.rng.bit_generator.state,
+            (self.nodes,),
+        )  # fmt: skip
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Go back to a snapshot of this core; it can be restored again."""
+        (
+            self.x, self.p, self.log_weight, self.team, self.log_level, self.log_sigma2,
+            self.has_constants, self.surprise, self.outlier_counts,
+        ) = (a.copy() for a in snapshot.arrays)  # fmt: skip
+        self.level, self.sigma2 = np.exp(self.log_level), np.exp(self.log_sigma2)
+        self.rng.bit_generator.state = dict(snapshot.random)
+        self.nodes = int(snapshot.numbers[0])
+
+
+CROSS = 0.04
+"""Variance across the way relative to along it: steps err in length, turns err apart from that."""
+
+JITTER = 0.1
+"""Standard deviation of the levels' jitter at resampling, in units of their spread."""
+
+HEADING_OUTLIERS = 0.1
+HEADING_OUTLIER_RAD = 1.0
+HEADING_SIGMA_RAD = 0.17
+"""Of an absolute heading that brings no sigma: magnetic ones indoors are 10 degrees off."""
+
+
+def _spread(values: Floats, weight: Floats) -> Floats:
+    mean = np.tensordot(weight, values, 1)
+    spread: Floats = np.sqrt(np.tensordot(weight, (values - mean) ** 2, 1))
+    return spread
+
+
+def systematic(weight: Floats, count: int, rng: np.random.Generator) -> Indices:
+    """Draw ``count`` indices by ``weight`` (K,) with the least variance; sorted."""
+    edges = np.cumsum(weight)
+    comb = (np.arange(count) + rng.random()) / max(count, 1) * edges[-1]
+    index = np.searchsorted(edges, comb, side="right")
+    chosen: Indices = np.minimum(index, len(weight) - 1).astype(np.int64)
+    return chosen
+
+
+@dataclass(slots=True)
+class _Known:
+    """What is kept of a node beside its hypotheses."""
+
+    height_m: float = 0.0
+    sigma_height_m: float = 0.0
+    news_s: float = -math.inf
+    silent_epochs: int = 0
+
+
+@dataclass(slots=True)
+class Bank:
+    """The bank as an :class:`~relpos.fusion.estimator.Estimator`, from known starts."""
+
+    priors: Sequence[Prior] = ()
+    settings: BankSettings = field(default_factory=BankSettings)
+    seed: int = 0
+    core: BankCore = field(init=False)
+    detection: Detection = field(default_factory=Detection)
+    _timeline: Timeline = field(init=False)
+    _row: dict[int, int] = field(default_factory=dict)
+    _known: dict[int, _Known] = field(default_factory=dict)
+    _pending: list[Advance] = field(default_factory=list)
+    _own: Counter[str] = field(default_factory=Counter)
+    _moved: bool = False
+    _ranges_used: int = 0
+    _epoch_s: float = -math.inf
+
+    def __post_init__(self) -> None:
+        s = self.settings
+        self.core = BankCore(s, self.seed)
+        self._timeline = Timeline(
+            [p.node for p in self.priors], reorder_s=s.reorder_s, max_lag_s=s.max_lag_s
+        )
+        for p in sorted(self.priors, key=lambda p: p.node):
+            if p.node in self._known:
+                raise RelposError(f"node {p.node} has two initial poses")
+            self._known[p.node] = _Known()
+            if math.isfinite(p.sigma_m) and math.isfinite(p.sigma_rad):
+                self._row[p.node] = self.core.add_node(
+                    p.x_m, p.y_m, p.heading_rad, p.sigma_m, p.sigma_rad
+                )
+
+    # -- the estimator's interface -------------------------------------------------------------
+
+    def process(self, measurement: Measurement) -> list[Estimate]:
+        """Take one measurement; return the estimates it completes."""
+        if measurement.node not in self._known:
+            self._known[measurement.node] = _Known()
+        if isinstance(measurement, Range) and measurement.peer not in self._known:
+            self._known[measurement.peer] = _Known()
+        return self._work_off(self._timeline.push(measurement))
+
+    def finish(self) -> list[Estimate]:
+        """Work off what waits; RelposError where the run cannot give relative positions."""
+        estimates = self._work_off(self._timeline.finish())
+        if not self._moved:
+            raise RelposError("no motion was received: nothing can be estimated")
+        if not self._ranges_used:
+            failed = self._timeline.counters["ranges_failed"]
+            raise RelposError(
+                f"no usable range ({failed} failed ones): relative positions cannot be fused; "
+                "from known starts --estimator deadreckoning still works"
+            )
+        return estimates
+
+    def counters(self) -> Mapping[str, int]:
+        """Count everything dropped, late, reset or resampled."""
+        return dict(self._timeline.counters + self._own + self.core.counters)
+
+    # -- steps ---------------------------------------------------------------------------------
+
+    def _work_off(self, steps: Iterable[Step]) -> list[Estimate]:
+        estimates = []
+        for step in steps:
+            match step:
+                case Advance():
+                    self._moved = True
+                    known = self._known[step.node]
+                    known.news_s = max(known.news_s, step.time_s)
+                    if step.node in self._row:
+                        self._pending.append(step)
+                case Ranging():
+                    self._advance()
+                    self._range(step)
+                case Sensed():
+                    self._sense(step)
+                case Epoch():
+                    self._advance()
+                    estimates.append(self._estimate(step.time_s))
+        return estimates
+
+    def _advance(self) -> None:
+        """Work off the displacements since the last time."""
+        steps = self._pending
+        if not steps:
+            return
+        self._pending = []
+        rows = np.array([self._row[a.node] for a in steps], dtype=np.int64)
+        moves = np.array([(a.dx_m, a.dy_m, a.dtheta_rad, a.duration_s) for a in steps])
+        told = None
+        if any(a.sigma_x_m is not None or a.sigma_theta_rad is not None for a in steps):
+            told = np.array([_told(a) for a in steps])
+        self.core.advance(rows, moves[:, 0], moves[:, 1], moves[:, 2], moves[:, 3], told)
+
+    def _range(self, step: Ranging) -> None:
+        for r in step.ranges:
+            for node in (r.node, r.peer):
+                known = self._known[node]
+                known.news_s = max(known.news_s, step.time_s)
+        ranges = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
+        self._own["ranges_of_unlocated"] += len(step.ranges) - len(ranges)
+        silence = self._silence(step)
+        if ranges:
+            first, second, dz = self._pairs([(r.node, r.peer) for r in ranges])
+            self.core.update(first, second, np.array([r.range_m for r in ranges]), dz)
+            self._ranges_used += len(ranges)
+        if silence is not None:
+            self.core.log_weight += silence
+        self.core.settle()
+
+    def _pairs(self, pairs: Sequence[tuple[int, int]]) -> tuple[Indices, Indices, Floats]:
+        first = np.array([self._row[a] for a, _ in pairs], dtype=np.int64)
+        second = np.array([self._row[b] for _, b in pairs], dtype=np.int64)
+        dz = np.array([self._known[b].height_m - self._known[a].height_m for a, b in pairs])
+        return first, second, dz
+
+    def _silence(self, step: Ranging) -> Floats | None:
+        """Learn who is heard how far; give the hypotheses' log P(the silent pairs are silent)."""
+        total: Floats | None = None
+        ranges = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
+        for done in self.detection.rounds.take(step.time_s, ranges, self._timeline.reported_s):
+            pairs = done.heard + done.silent
+            mean, sigma = self.core.predicted_ranges(*self._pairs(pairs))
+            weight = self.core.weights()
+            middle = weight @ mean
+            spread = np.sqrt(weight @ (sigma**2 + (mean - middle) ** 2))
+            heard = len(done.heard)
+            tried = self.detection.learn(
+                done, middle[:heard], spread[:heard], middle[heard:], spread[heard:]
+            )
+            if total is None:
+                total = np.zeros(self.core.count)
+            log_silence(
+                np.ascontiguousarray(mean[:, heard:]), np.ascontiguousarray(sigma[:, heard:]),
+                tried, self.detection.weight, self.detection.curve, total,
+            )  # fmt: skip
+        return total
+
+    def _sense(self, step: Sensed) -> None:
+        measured = step.measurement
+        if isinstance(measured, Height):
+            known = self._known[measured.node]
+            known.height_m = measured.height_m
+            known.sigma_height_m = measured.sigma_m or 0.0
+        elif isinstance(measured, Heading) and measured.node in self._row:
+            self._advance()
+            sigma = measured.sigma_rad or HEADING_SIGMA_RAD
+            self.core.heading(self._row[measured.node], measured.heading_rad, sigma)
+        else:
+            self._own["headings_unused"] += 1
+
+    # -- estimates -----------------------------------------------------------------------------
+
+    def _estimate(self, time_s: float) -> Estimate:
+        for known in self._known.values():
+            known.silent_epochs = 0 if known.news_s > self._epoch_s else known.silent_epochs + 1
+        self._epoch_s = time_s
+        mean, covariance = self.core.moments()
+        nodes, parameters = [], []
+        for node in sorted(self._known):
+            known = self._known[node]
+            row = self._row.get(node)
+            if row is None:
+                nodes.append(
+                    NodeEstimate(
+                        node, 0.0, 0.0, 0.0, math.inf, math.inf, 0.0, _ANY_ANGLE_RAD,
+                        NodeStatus.UNLOCATED, known.height_m, known.sigma_height_m,
+                    )
+                )  # fmt: skip
+                continue
+            at = PER_NODE * row
+            pose = [float(v) for v in mean[at : at + PER_NODE]]
+            own = covariance[at : at + PER_NODE, at : at + PER_NODE]
+            nodes.append(
+                NodeEstimate(
+                    node, pose[0], pose[1], math.remainder(pose[2], _TWO_PI),
+                    float(own[0, 0]), float(own[1, 1]), float(own[0, 1]),
+                    min(math.sqrt(float(own[2, 2])), _ANY_ANGLE_RAD), _status(known),
+                    known.height_m, known.sigma_height_m,
+                )
+            )  # fmt: skip
+            drift = float(math.sqrt(max(own[Of.DRIFT, Of.DRIFT], 0.0)))
+            scale = float(math.sqrt(max(own[Of.SCALE, Of.SCALE], 0.0)))
+            grow = math.exp(pose[Of.SCALE])
+            parameters += [
+                Parameter(time_s, node, None, "step_scale", grow, grow * scale),
+                Parameter(time_s, node, None, "heading_drift_rad_s", pose[Of.DRIFT], drift),
+            ]
+        return Estimate(
+            time_s, tuple(nodes), self._pair_estimates(mean, covariance), (), tuple(parameters)
+        )
+
+    def _pair_estimates(self, mean: Floats, covariance: Floats) -> tuple[PairEstimate, ...]:
+        located = sorted(self._row)
+        pairs = []
+        for n, a in enumerate(located):
+            for b in located[n + 1 :]:
+                i, j = PER_NODE * self._row[a], PER_NODE * self._row[b]
+                dx, dy = float(mean[j] - mean[i]), float(mean[j + 1] - mean[i + 1])
+                xx = float(covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j])
+                yy = float(
+                    covariance[i + 1, i + 1]
+                    + covariance[j + 1, j + 1]
+                    - 2.0 * covariance[i + 1, j + 1]
+                )
+                xy = float(
+                    covariance[i, i + 1]
+                    + covariance[j, j + 1]
+                    - covariance[i, j + 1]
+                    - covariance[i + 1, j]
+                )
+                distance = math.hypot(dx, dy)
+                if distance > 0.0:
+                    c, s = dx / distance, dy / distance
+                    along = c * c * xx + 2.0 * c * s * xy + s * s * yy
+                    across = xx + yy - along
+                    bearing = min(math.sqrt(max(across, 0.0)) / distance, _ANY_ANGLE_RAD)
+                else:
+                    along, bearing = 0.5 * (xx + yy), _ANY_ANGLE_RAD
+                pairs.append(
+                    PairEstimate(
+                        a, b, distance, math.sqrt(max(along, 0.0)), math.atan2(dy, dx), bearing
+                    )
+                )
+        return tuple(pairs)
+
+
+def _told(step: Advance) -> tuple[float, float, float]:
+    alone = step.sigma_x_m if step.sigma_x_alone_m is None else step.sigma_x_alone_m
+    return (
+        math.nan if alone is None else alone,
+        math.nan if step.sigma_y_m is None else step.sigma_y_m,
+        math.nan if step.sigma_theta_rad is None else step.sigma_theta_rad,
+    )
+
+
+def _status(known: _Known) -> NodeStatus:
+    if known.silent_epochs >= LOST_EPOCHS:
+        return NodeStatus.LOST
+    return NodeStatus.STALE if known.silent_epochs >= STALE_EPOCHS else NodeStatus.OK

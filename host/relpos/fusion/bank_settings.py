@@ -1,0 +1,27 @@
+"""What ``--set`` may change of the estimator ``bank``; apart, so that help needs no kernels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from relpos.fusion.settings import setting
+
+
+@dataclass(frozen=True, slots=True)
+class BankSettings:
+    """What ``--set`` may change; one set for all scenarios and recordings."""
+
+    hypotheses: int = setting(200, "at most so many hypotheses (K)", 1, 100_000)
+    sampled: float = setting(0.5, "share of the heading noise that is drawn", 0.0, 1.0)
+    outliers: float = setting(0.05, "share of ranges that are outliers, beforehand", 0.0, 0.9)
+    outlier_m: float = setting(3.0, "how far outliers are off", 0.1, 100.0)
+    outliers_short: float = setting(0.1, "share of the outliers that are too short", 0.0, 1.0)
+    jumps: float = setting(0.002, "share of jump hypotheses an epoch, in quiet", 0.0, 1.0)
+    jumps_most: float = setting(0.05, "share of jump hypotheses an epoch, at most", 0.0, 1.0)
+    jump_m: float = setting(3.0, "how far a jump may lead", 0.0, 100.0)
+    jump_rad: float = setting(0.3, "how far a jump may turn", 0.0, 3.2)
+    scale: float = setting(0.1, "prior standard deviation of the step scale", 0.0, 1.0)
+    drift_rad_s: float = setting(0.005, "prior standard deviation of heading drift", 0.0, 1.0)
+    constants: float = setting(0.5, "share of hypotheses with scale and drift", 0.0, 1.0)
+    max_lag_s: float = setting(5.0, "how long a silent node is waited for", 0.0, 60.0)
+    reorder_s: float = setting(0.5, "how long measurements may be out of order", 0.0, 60.0)
