@@ -12,6 +12,9 @@ The timeline holds each chord back until its end is known, cuts it where somethi
 Waiting is bounded: a node that does not report for ``max_lag_s`` is no longer waited for, and
 its displacement is handed out whole when it comes after all. What arrives too late to be put in
 its place is counted and, where it is not a displacement, dropped; a displacement is never lost.
+(:mod:`relpos.fusion.rewind` goes back for it instead.)
+
+What shares one instant is handed out in the order of the nodes, however it arrived.
 """
 
 from __future__ import annotations
@@ -19,8 +22,9 @@ from __future__ import annotations
 import heapq
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
-from math import cos, inf, isfinite, sin, sqrt
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from math import cos, inf, isfinite, nextafter, sin, sqrt
 
 from relpos.errors import DataError
 from relpos.measurements import Heading, Height, Measurement, Motion, Range
@@ -115,6 +119,56 @@ class _Track:
     heard: bool = False
     chords: deque[_Chord] = field(default_factory=deque)
 
+    def copy(self) -> _Track:
+        chords = deque(_Chord(c.end_s, c.left, c.share, c.report) for c in self.chords)
+        return _Track(self.reported_s, self.reached_s, self.heard, chords)
+
+
+def refusal(measurement: Measurement) -> str | None:
+    """Say why no estimator can use a measurement, as a counter's name; None where it can.
+
+    DataError where a number is not finite: that is no failure of a sensor but of the source.
+    """
+    numbers: tuple[float, ...]
+    match measurement:
+        case Motion():
+            numbers = (measurement.dx_m, measurement.dy_m, measurement.dtheta_rad)
+        case Range():
+            numbers = (measurement.range_m,)
+        case Height():
+            numbers = (measurement.height_m,)
+        case Heading():
+            numbers = (measurement.heading_rad,)
+    if not isfinite(measurement.time_s) or not all(map(isfinite, numbers)):
+        raise DataError(f"a measurement is not a finite number: {measurement}")
+    if isinstance(measurement, Range):
+        if measurement.range_m <= 0.0:
+            return "ranges_failed"
+        if measurement.node == measurement.peer:
+            return "ranges_to_itself"
+    return None
+
+
+def _range_order(measured: Range) -> tuple[int, int, float]:
+    return measured.node, measured.peer, measured.range_m
+
+
+def _sensed_order(measured: Height | Heading) -> tuple[int, bool, float]:
+    if isinstance(measured, Height):
+        return measured.node, False, measured.height_m
+    return measured.node, True, measured.heading_rad
+
+
+@dataclass(frozen=True, slots=True)
+class Late:
+    """Something at ``time_s`` behind the frontier; it should have been known at ``since_s``.
+
+    A displacement belongs to its whole chord; ``since_s`` is -inf where its begin is unknown.
+    """
+
+    since_s: float
+    time_s: float
+
 
 @dataclass(slots=True)
 class Timeline:
@@ -124,13 +178,14 @@ class Timeline:
     time from which a node's first motion counts; ``reorder_s`` is how long everything is held
     back for what is still under way (in measurement time, so that a recording pays nothing for
     it); ``max_lag_s`` is how long a silent node is waited for. ``counters`` tells what was
-    dropped or came late, by name.
+    dropped or came late, by name; with ``keep_late`` ``take_late`` tells when.
     """
 
     nodes: Iterable[int] = ()
     start_s: float = 0.0
     reorder_s: float = 0.5
     max_lag_s: float = 5.0
+    keep_late: bool = False
     counters: Counter[str] = field(default_factory=Counter)
     _tracks: dict[int, _Track] = field(default_factory=dict)
     _arrived: list[tuple[float, int, Measurement]] = field(default_factory=list)
@@ -141,6 +196,7 @@ class Timeline:
     _ranged: set[tuple[int, int]] = field(default_factory=set)
     _reported: set[int] = field(default_factory=set)
     _epoch_s: float = -inf
+    _late: list[Late] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         for node in self.nodes:
@@ -151,60 +207,84 @@ class Timeline:
         track = self._tracks.get(node)
         return track.reported_s if track is not None and track.heard else -inf
 
+    @property
+    def frontier_s(self) -> float:
+        """Everything up to here has been handed out; ``-inf`` before the first step."""
+        return self._frontier_s
+
+    @property
+    def newest_s(self) -> float:
+        """Time of the newest measurement."""
+        return self._newest_s
+
     def push(self, measurement: Measurement) -> list[Step]:
         """Take one measurement; return what has become certain, in order."""
-        if not self._usable(measurement):
+        reason = refusal(measurement)
+        if reason is not None:
+            self.counters[reason] += 1
             return []
-        self._pushed += 1
-        heapq.heappush(self._arrived, (measurement.time_s, self._pushed, measurement))
-        self._newest_s = max(self._newest_s, measurement.time_s)
-        self._sort_in(self._newest_s - self.reorder_s)
-        return list(self._release(final=False))
+        return list(self.push_all((measurement,)))
+
+    def push_all(
+        self, measurements: Iterable[Measurement], *, final: bool = False
+    ) -> Iterator[Step]:
+        """Take usable measurements at once (see ``refusal``), then hand out what is certain.
+
+        With ``final`` that is everything. The steps are made as they are asked for; after each
+        :class:`Epoch`, and at the end, the timeline may be copied with ``snapshot``.
+        """
+        for measurement in measurements:
+            self._track(measurement.node)
+            if isinstance(measurement, Range):
+                self._track(measurement.peer)
+            self._pushed += 1
+            heapq.heappush(self._arrived, (measurement.time_s, self._pushed, measurement))
+            self._newest_s = max(self._newest_s, measurement.time_s)
+        self._sort_in(inf if final else self._newest_s - self.reorder_s)
+        return (
+            chain(self._release(final=True), self._end()) if final else self._release(final=False)
+        )
+
+    def take_late(self) -> list[Late]:
+        """Give, once, what came behind the frontier since it was last asked for.
+
+        Kept only where ``keep_late``.
+        """
+        late, self._late = self._late, []
+        return late
+
+    def snapshot(self) -> Timeline:
+        """Give a copy that goes on by itself."""
+        return replace(
+            self,
+            counters=self.counters.copy(),
+            _tracks={node: track.copy() for node, track in self._tracks.items()},
+            _arrived=self._arrived[:],
+            _ordered=self._ordered[:],
+            _ranged=self._ranged.copy(),
+            _reported=self._reported.copy(),
+            _late=self._late[:],
+        )
 
     def finish(self) -> list[Step]:
         """Work off everything that still waits; a last epoch closes the run."""
-        self._sort_in(inf)
-        steps = list(self._release(final=True))
+        return list(self.push_all((), final=True))
+
+    def _end(self) -> Iterator[Step]:
         last = max((t.reported_s for t in self._tracks.values() if t.heard), default=-inf)
         last = max(last, self._frontier_s)
         # A displacement that came late may still lie behind the frontier.
         rest = list(self._advance_all(last))
-        steps += rest
+        yield from rest
         if self._epoch_s > -inf and (rest or last > self._epoch_s):
-            steps.append(Epoch(last))
             self._epoch_s = last
-        return steps
+            yield Epoch(last)
 
     def _track(self, node: int) -> _Track:
         track = self._tracks.get(node)
         if track is None:
             track = self._tracks[node] = _Track(self.start_s, self.start_s)
         return track
-
-    def _usable(self, measurement: Measurement) -> bool:
-        """Refuse what no estimator can use: failures and repetitions are counted, not fatal."""
-        numbers: tuple[float, ...]
-        match measurement:
-            case Motion():
-                numbers = (measurement.dx_m, measurement.dy_m, measurement.dtheta_rad)
-            case Range():
-                numbers = (measurement.range_m,)
-            case Height():
-                numbers = (measurement.height_m,)
-            case Heading():
-                numbers = (measurement.heading_rad,)
-        if not isfinite(measurement.time_s) or not all(map(isfinite, numbers)):
-            raise DataError(f"a measurement is not a finite number: {measurement}")
-        if isinstance(measurement, Range):
-            if measurement.range_m <= 0.0:
-                self.counters["ranges_failed"] += 1
-                return False
-            if measurement.node == measurement.peer:
-                self.counters["ranges_to_itself"] += 1
-                return False
-            self._track(measurement.peer)
-        self._track(measurement.node)
-        return True
 
     def _sort_in(self, until_s: float) -> None:
         """Give up waiting for anything older than ``until_s``."""
@@ -213,7 +293,10 @@ class Timeline:
             time_s, _, measurement = entry
             if isinstance(measurement, Motion):
                 self._take_motion(measurement)
-            elif time_s < self._frontier_s:
+            elif time_s <= self._frontier_s and self.keep_late:
+                # Behind the frontier or at it: the rest of its instant was handed out.
+                self._late.append(Late(nextafter(time_s, -inf), time_s))
+            if not isinstance(measurement, Motion) and time_s < self._frontier_s:
                 name = "ranges" if isinstance(measurement, Range) else "sensed"
                 self.counters[f"{name}_late"] += 1
                 continue
@@ -224,9 +307,23 @@ class Timeline:
         chord = _Chord(
             motion.time_s, Displacement(motion.dx_m, motion.dy_m, motion.dtheta_rad), 1.0, motion
         )
-        track.chords.append(chord)
-        if motion.time_s < self._frontier_s or (track.heard and motion.time_s <= track.reported_s):
+        chords = track.chords
+        begin_s = chords[-1].end_s if chords else track.reached_s
+        if begin_s < chord.end_s:
+            placed = True
+            chords.append(chord)
+        else:
+            # Its successor came first: before it, unless that was begun already.
+            place = sum(waiting.end_s < chord.end_s for waiting in chords)
+            placed = bool(chords) and chords[place].share == 1.0 and motion.time_s > track.reached_s
+            chords.insert(place if placed else len(chords), chord)
+            begin_s = chords[place - 1].end_s if placed and place else track.reached_s
+            if not placed:
+                begin_s = -inf
+        if motion.time_s < self._frontier_s or not placed:
             self.counters["motions_late"] += 1
+        if begin_s < self._frontier_s and self.keep_late:
+            self._late.append(Late(begin_s, motion.time_s))
         if not track.heard:
             # A run may begin a little before zero: then nothing is known before the first motion.
             track.reached_s = min(track.reached_s, motion.time_s)
@@ -250,14 +347,11 @@ class Timeline:
                     case Motion():
                         motions.add(measurement.node)
                     case Range():
-                        key = (measurement.node, measurement.peer)
-                        if key in self._ranged:
-                            self.counters["ranges_duplicate"] += 1
-                        else:
-                            self._ranged.add(key)
-                            ranges.append(measurement)
+                        ranges.append(measurement)
                     case _:
                         sensed.append(measurement)
+            ranges = self._new(ranges)
+            sensed.sort(key=_sensed_order)
             closes = self._closes_epoch(time_s, motions)
             if ranges or sensed or closes:
                 time_s = max(time_s, self._frontier_s)
@@ -270,9 +364,24 @@ class Timeline:
                 self._epoch_s = time_s
                 yield Epoch(time_s)
 
+    def _new(self, ranges: list[Range]) -> list[Range]:
+        """Sort ranges of one instant; leave out what repeats one."""
+        ranges.sort(key=_range_order)
+        kept = []
+        for measured in ranges:
+            key = (measured.node, measured.peer)
+            if key in self._ranged:
+                self.counters["ranges_duplicate"] += 1
+            else:
+                self._ranged.add(key)
+                kept.append(measured)
+        return kept
+
     def _waits_for(self, time_s: float) -> bool:
+        # Nothing newer than this has been sorted in, of the node waited for neither.
+        sorted_s = self._newest_s - self.reorder_s
         return any(
-            track.reported_s < time_s and self._newest_s - track.reported_s <= self.max_lag_s
+            track.reported_s < time_s and sorted_s - track.reported_s <= self.max_lag_s
             for track in self._tracks.values()
         )
 

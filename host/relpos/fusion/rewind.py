@@ -1,0 +1,176 @@
+"""Late and out-of-order measurements are put in their place: the estimator goes back and on.
+
+Over radio a report may come seconds late, and the estimate cannot wait for it. So the estimator
+goes on without (a node that is silent for ``Timeline.max_lag_s`` is not waited for), copies of
+its whole state are kept for the last ``window_s``, and when the late one comes, the state before
+its time is taken up again and everything since is worked off anew, in order. Afterwards the state
+is, to the last bit, the one that sorted data would have given: the copies contain the random
+generator, and what shares an instant has a fixed order.
+
+A displacement is late, too, where steps behind the *beginning* of its chord have been handed out:
+the node was taken to stand there.
+
+What it costs is bounded: a burst of late reports is worked off in one go, at most one every
+``every_s`` of measurement time, and none goes back farther than ``window_s``, one report
+(``max_lag_s``) and one spacing of the copies. Counted are ``rewinds``, the steps repeated
+(``rewound_steps``), and what came later than the window (the timeline's ``ranges_late`` and
+``motions_late``; ``motions_beyond_window`` whose chord began before it).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from relpos.fusion.estimator import Estimate
+from relpos.fusion.timeline import Epoch, Step, Timeline, refusal
+from relpos.measurements import Measurement
+
+
+class Core(Protocol):
+    """An estimator behind a timeline, whose state can be copied and taken up again.
+
+    Nothing but ``take`` may change what ``snapshot`` copies.
+    """
+
+    def take(self, step: Step) -> Estimate | None:
+        """Work off one step; an estimate at the end of an epoch."""
+
+    def snapshot(self) -> Any:
+        """Copy everything that ``take`` changes, random generators and counters included."""
+
+    def restore(self, snapshot: Any) -> None:
+        """Be as at the time of the snapshot, which may be restored again later."""
+
+
+@dataclass(slots=True)
+class _Copy:
+    """The state after everything up to ``frontier_s``; it has seen ``pushed`` measurements."""
+
+    frontier_s: float
+    timeline: Timeline
+    core: Any
+    pushed: int
+
+
+@dataclass(slots=True)
+class Rewinder:
+    """Feeds ``core`` from ``timeline``: measurements in, estimates out, each time only once.
+
+    ``window_s`` is how late a measurement may be, ``spacing_s`` how far apart copies are,
+    ``every_s`` how often it may go back. A replay does not repeat estimates that were given
+    already, and those given go on in time.
+    """
+
+    core: Core
+    timeline: Timeline
+    window_s: float = 5.0
+    spacing_s: float = 1.0
+    every_s: float = 0.25
+    _own: Counter[str] = field(default_factory=Counter)
+    _copies: list[_Copy] = field(default_factory=list)
+    _history: list[Measurement] = field(default_factory=list)
+    """What came since the oldest copy, in the order of arrival."""
+    _forgotten: int = 0
+    """Measurements before ``_history``."""
+    _newest_s: float = -math.inf
+    _emitted_s: float = -math.inf
+    _back_to_s: float = math.inf
+    _steps: int = 0
+    _rewound_s: float = -math.inf
+
+    def __post_init__(self) -> None:
+        self.timeline.keep_late = True
+
+    def process(self, measurement: Measurement) -> list[Estimate]:
+        """Take one measurement; return the estimates it completes."""
+        reason = refusal(measurement)
+        if reason is not None:
+            self._own[reason] += 1
+            return []
+        if not self._copies:
+            self._copy()
+        self._history.append(measurement)
+        news = measurement.time_s > self._newest_s
+        self._newest_s = max(self._newest_s, measurement.time_s)
+        steps = self.timeline.push_all((measurement,))
+        self._note_late()
+        if self._back_to_s == math.inf:
+            return list(self._work_off(steps))
+        # Until it has gone back, the timeline only sorts in. A burst of late ones is put in its
+        # place together, when the next thing of now comes.
+        if news and self._newest_s >= self._rewound_s + self.every_s:
+            return list(self._rewind(final=False))
+        return []
+
+    def finish(self) -> list[Estimate]:
+        """Work off everything that still waits."""
+        steps = self.timeline.push_all((), final=True)
+        self._note_late()
+        if self._copies and self._back_to_s < math.inf:
+            return list(self._rewind(final=True))
+        return list(self._work_off(steps))
+
+    def counters(self) -> Counter[str]:
+        """What was refused, late, and gone back for; the core's own counters are its own."""
+        return self.timeline.counters + self._own
+
+    def _note_late(self) -> None:
+        """Tell whether, and to what time, to go back."""
+        for late in self.timeline.take_late():
+            oldest_s = self._copies[0].frontier_s
+            if late.time_s <= oldest_s:
+                continue  # too late for all of it
+            if late.since_s < oldest_s:
+                self._own["motions_beyond_window"] += 1
+            self._back_to_s = min(self._back_to_s, max(late.since_s, oldest_s))
+
+    def _rewind(self, *, final: bool) -> Iterator[Estimate]:
+        """Go back to the newest copy at or before ``_back_to_s`` and work off all since."""
+        while len(self._copies) > 1 and self._copies[-1].frontier_s > self._back_to_s:
+            self._copies.pop()
+        copy = self._copies[-1]
+        self._back_to_s = math.inf
+        self._rewound_s = self._newest_s
+        self._own["rewinds"] += 1
+        self.timeline = copy.timeline.snapshot()
+        self.core.restore(copy.core)
+        since = self._history[copy.pushed - self._forgotten :]
+        steps = self.timeline.push_all(since, final=final)
+        self.timeline.take_late()  # what the copy cannot help either
+        before = self._steps
+        yield from self._work_off(steps)
+        self._own["rewound_steps"] += self._steps - before
+
+    def _work_off(self, steps: Iterator[Step]) -> Iterator[Estimate]:
+        for step in steps:
+            self._steps += 1
+            estimate = self.core.take(step)
+            if estimate is not None and estimate.time_s > self._emitted_s:
+                self._emitted_s = estimate.time_s
+                yield estimate
+            if isinstance(step, Epoch):
+                self._copy_if_due(self.spacing_s)
+        # Without motion there are no epochs, but what is kept has to be bounded all the same.
+        self._copy_if_due(2.0 * self.spacing_s)
+
+    def _copy_if_due(self, spacing_s: float) -> None:
+        if self.timeline.frontier_s >= self._copies[-1].frontier_s + spacing_s:
+            self._copy()
+
+    def _copy(self) -> None:
+        pushed = self._forgotten + len(self._history)
+        self._copies.append(
+            _Copy(self.timeline.frontier_s, self.timeline.snapshot(), self.core.snapshot(), pushed)
+        )
+        # What is late by the window may belong to a chord that began a report earlier.
+        horizon_s = self._newest_s - self.window_s - self.timeline.max_lag_s
+        while len(self._copies) > 1 and self._copies[1].frontier_s < horizon_s:
+            del self._copies[0]
+        old = self._copies[0].pushed - self._forgotten
+        if old > 0:
+            del self._history[:old]
+            self._forgotten += old

@@ -1,0 +1,177 @@
+"""What comes late is put in its place, and nobody has to wait for it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from relpos.fusion.estimator import Estimate
+from relpos.fusion.rewind import Rewinder
+from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
+from relpos.measurements import Height, Measurement, Motion, Range
+
+
+@dataclass
+class Log:
+    """An estimator's state of the simplest kind: what it was given, and some dice."""
+
+    steps: list[Step] = field(default_factory=list)
+    dice: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+    thrown: list[float] = field(default_factory=list)
+    taken: int = 0
+
+    def take(self, step: Step) -> Estimate | None:
+        self.taken += 1
+        self.steps.append(step)
+        self.thrown.append(self.dice.random())
+        return Estimate(step.time_s, (), ()) if isinstance(step, Epoch) else None
+
+    def snapshot(self) -> tuple[list[Step], dict[str, object], list[float]]:
+        return self.steps[:], dict(self.dice.bit_generator.state), self.thrown[:]
+
+    def restore(self, snapshot: tuple[list[Step], dict[str, object], list[float]]) -> None:
+        self.steps, self.thrown = snapshot[0][:], snapshot[2][:]
+        self.dice.bit_generator.state = snapshot[1]
+
+
+def rewinder() -> tuple[Log, Rewinder]:
+    log = Log()
+    return log, Rewinder(log, Timeline([1, 2, 3], reorder_s=0.3, max_lag_s=1.5))
+
+
+def feed(rewinder: Rewinder, measurements: Iterable[Measurement]) -> list[Estimate]:
+    return [e for m in measurements for e in rewinder.process(m)] + rewinder.finish()
+
+
+def team(seconds: int = 40, slow: Sequence[int] = ()) -> list[Measurement]:
+    """Three nodes with phases of their own, ranges and heights between their reports.
+
+    Nodes in ``slow`` report every 3 s.
+    """
+    given: list[Measurement] = []
+    for k in range(1, seconds):
+        for node in (1, 2, 3):
+            period = 3 if node in slow else 1
+            if k % period == 0:
+                given.append(Motion(k + 0.27 * (node - 1), node, 0.5 * period, 0.01 * k, 0.1))
+        given += [Range(k + 0.5, 1, 2, 3.0 + k), Range(k + 0.5, 2, 3, 4.0), Range(k + 0.8, 1, 3, k)]
+        given.append(Height(k + 0.9, 2, 0.1 * k))
+    return sorted(given, key=lambda m: m.time_s)
+
+
+def delayed(
+    measurements: Sequence[Measurement], share: float, seed: int, most_s: float = 4.9
+) -> list[Measurement]:
+    """Put a share of them up to ``most_s`` later among the others."""
+    rng = np.random.default_rng(seed)
+    late = rng.random(len(measurements)) < share
+    arrival = [m.time_s for m in measurements] + late * rng.uniform(0.0, most_s, len(measurements))
+    return [measurements[k] for k in np.argsort(arrival, kind="stable")]
+
+
+@pytest.mark.parametrize(("share", "seed"), [(0.05, 1), (0.05, 2), (0.4, 3), (1.0, 4), (1.0, 5)])
+def test_after_the_replay_all_is_as_if_nothing_had_been_late(share: float, seed: int) -> None:
+    straight, mixed = rewinder(), rewinder()
+    ordered = team()
+    feed(straight[1], ordered)
+    shuffled = delayed(ordered, share, seed)
+    assert shuffled != ordered
+    feed(mixed[1], shuffled)
+    assert mixed[0].steps == straight[0].steps
+    assert mixed[0].thrown == straight[0].thrown
+    assert mixed[1].counters()["rewinds"] > 0
+    assert straight[1].counters()["rewinds"] == 0
+    assert not any("late" in name for name in mixed[1].counters())
+
+
+def test_the_steps_are_those_of_a_timeline_that_waits_long_enough() -> None:
+    log, quick = rewinder()
+    ordered = team(slow=[2])
+    feed(quick, delayed(ordered, 0.3, 7, most_s=1.5))
+    patient = Timeline([1, 2, 3], reorder_s=0.3, max_lag_s=5.0)
+    steps = [s for m in ordered for s in patient.push(m)] + patient.finish()
+    assert log.steps == steps
+
+
+def test_estimates_do_not_wait_for_what_is_late_and_come_only_once() -> None:
+    _, quick = rewinder()
+    lags, times = [], []
+    newest = 0.0
+    for m in delayed(team(), 0.3, 8):
+        newest = max(newest, m.time_s)
+        for estimate in quick.process(m):
+            times.append(estimate.time_s)
+            lags.append(newest - estimate.time_s)
+    assert max(lags) < 3.0
+    assert float(np.median(lags)) < 1.5
+    assert times == sorted(set(times))
+    assert len(times) > 30
+
+
+def test_a_node_that_falls_silent_holds_nobody_up_and_its_way_is_not_lost() -> None:
+    ordered = [m for m in team() if not (isinstance(m, Motion) and m.node == 3 and m.time_s > 10)]
+    log, quick = rewinder()
+    lags = []
+    for m in ordered:
+        lags += [m.time_s - e.time_s for e in quick.process(m)]
+    assert max(lags) < 2.5
+    # It comes back after 20 s with one long displacement.
+    back = Motion(39.9, 3, 7.0, 0.0, 0.0)
+    feed(quick, [back])
+    way = [s for s in log.steps if isinstance(s, Advance) and s.node == 3]
+    assert sum(s.fraction for s in way) == pytest.approx(9 + 1)
+    # What lies within the window is spread over its time, the rest handed out at its beginning.
+    last = [s for s in way if s.time_s > 11.0]
+    assert last[0].time_s < 34.5
+    assert len(last) > 5
+    assert quick.counters()["motions_beyond_window"] == 1
+
+
+def test_ranges_later_than_the_window_are_dropped_and_counted() -> None:
+    log, quick = rewinder()
+    feed(quick, [*team(), Range(20.2, 1, 2, 99.0)])
+    assert not any(isinstance(s, Ranging) and s.ranges[0].range_m == 99.0 for s in log.steps)
+    assert quick.counters()["ranges_late"] == 1
+
+
+def test_a_late_height_is_put_in_its_place() -> None:
+    log, quick = rewinder()
+    ordered = team()
+    at = next(k for k, m in enumerate(ordered) if m.time_s > 24.0)
+    feed(quick, [*ordered[:at], Height(20.2, 1, 7.5), *ordered[at:]])
+    sensed = [s for s in log.steps if isinstance(s, Sensed)]
+    assert [s.time_s for s in sensed] == sorted(s.time_s for s in sensed)
+    assert any(s.measurement == Height(20.2, 1, 7.5) for s in sensed)
+
+
+def test_refused_ranges_are_counted_once_whatever_is_replayed() -> None:
+    _, quick = rewinder()
+    ordered = team()
+    broken = [Range(10.2, 1, 2, 0.0), Range(20.2, 2, 2, 1.0)]
+    feed(quick, delayed(sorted([*ordered, *broken], key=lambda m: m.time_s), 0.5, 9))
+    counted = quick.counters()
+    assert (counted["ranges_failed"], counted["ranges_to_itself"]) == (1, 1)
+
+
+def test_a_burst_of_late_reports_costs_one_replay() -> None:
+    ordered = team()
+    late = [m for m in ordered if isinstance(m, Range) and 20.0 < m.time_s < 23.0]
+    assert len(late) == 9
+    rest = [m for m in ordered if m not in late]
+    at = next(k for k, m in enumerate(rest) if m.time_s > 24.0)
+    log, quick = rewinder()
+    feed(quick, [*rest[:at], *late, *rest[at:]])
+    assert quick.counters()["rewinds"] == 1
+    # At most the window, a report and a second between copies.
+    assert 0 < quick.counters()["rewound_steps"] < 8.0 * len(log.steps) / 40
+
+
+def test_what_is_kept_stays_bounded_without_any_motion() -> None:
+    quick = Rewinder(Log(), Timeline(reorder_s=0.3, max_lag_s=1.5))
+    for k in range(2000):
+        quick.process(Range(0.1 * k, 1, 2, 3.0))
+    assert len(quick._history) < 100
+    assert len(quick._copies) < 10
