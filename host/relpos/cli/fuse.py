@@ -64,7 +64,7 @@ def fuse(
         str, typer.Argument(metavar="SOURCE", help="Run directory, serial port or pyserial URL.")
     ],
     estimator: Annotated[
-        EstimatorName, typer.Option(help="Which estimator; bank is not built yet.")
+        EstimatorName, typer.Option(help="Which estimator.")
     ] = EstimatorName.PARTICLE,
     settings: Annotated[
         list[str] | None,
@@ -114,8 +114,6 @@ def fuse(
     for wanted, name in ((smooth, "--smooth"), (record, "--record"), (view, "--view")):
         if wanted:
             raise output.not_built_yet(name)
-    if estimator is EstimatorName.BANK:
-        raise output.not_built_yet("the estimator bank")
     job = Job(source, estimator, chosen, seed, out or Path("out") / _base_name(source))
     if sources.is_port(source):
         _fuse_port(job, initial, seconds, key_file, teach=teach, as_json=json)

@@ -178,6 +178,14 @@ def print_last_pairs(title: str, estimates: Sequence[Estimate]) -> None:
     states = [f"{node.node} {node.status}" for node in last.nodes if node.status != "ok"]
     if states:
         console.print(f"not located for sure: {', '.join(states)}")
+    if last.alternatives:
+        shares = {a.alternative: a.probability for a in last.alternatives}
+        rings = sorted({a.node for a in last.alternatives if a.shape == "ring"})
+        console.print(
+            f"{len(shares)} possible pictures (alternatives.csv): "
+            + ", ".join(f"{100.0 * share:.0f} %" for share in shares.values())
+            + (f"; somewhere on a ring: {', '.join(map(str, rings))}" if rings else "")
+        )
 
 
 def _print_over_time(console: Any, metrics: Metrics) -> None:
