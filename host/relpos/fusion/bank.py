@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -47,6 +47,7 @@ class Snapshot:
     arrays: tuple[Floats, ...]
     random: Mapping[str, object]
     numbers: tuple[float, ...]
+    biases: Mapping[tuple[int, int], int]
 
 
 class BankCore:
@@ -54,7 +55,8 @@ class BankCore:
 
     Users are *rows* 0 ... N-1 in the order of ``add_node``. ``x`` (K, D) and ``p`` (K, D, D)
     are the hypotheses' means and covariances, ``log_weight`` (K,) their unnormalised
-    log weights; D = 5 N + extra, see :class:`~relpos.fusion.joint.Of`.
+    log weights; D = 5 N + 1 + pairs: five entries a user, see :class:`~relpos.fusion.joint.Of`,
+    then the range bias that all pairs share, then that of each pair as it is first heard.
 
     The order of work in one epoch: ``advance`` (once or more), ``update`` (all ranges of one
     instant), ``log_weight +=`` whatever else is known (silence, ...), then ``settle`` (jumps,
@@ -70,8 +72,8 @@ class BankCore:
         self.counters: Counter[str] = Counter()
         count = settings.hypotheses
         self.nodes = 0
-        self.x: Floats = np.zeros((count, 0))
-        self.p: Floats = np.zeros((count, 0, 0))
+        self.x: Floats = np.zeros((count, 1))
+        self.p: Floats = np.zeros((count, 1, 1))
         self.log_weight: Floats = np.zeros(count)
         self.team, self.log_sigma2 = noise.draw_team(count, self.rng)
         self.log_level: Floats = np.zeros((count, 0, noise.LEVELS))
@@ -80,6 +82,12 @@ class BankCore:
         self.has_constants: Floats = (
             self.rng.permutation(count) < round(settings.constants * count)
         ).astype(np.float64)
+        self.has_bias: Floats = (
+            self.rng.permutation(count) < round(settings.biased * count)
+        ).astype(np.float64)
+        self.p[:, 0, 0] = self.has_bias * settings.bias_m**2
+        self.biases: dict[tuple[int, int], int] = {}
+        """Pair of rows, the lower first -> place of its range bias in the state."""
         self.surprise: Floats = np.zeros(0)
         self.outlier_counts: Floats = np.array([settings.outliers, 1.0 - settings.outliers]) * 20.0
 
@@ -109,6 +117,7 @@ class BankCore:
         p[:, at + Of.SCALE, at + Of.SCALE] = self.has_constants * self.settings.scale**2
         self.x, self.p = x, p
         self.nodes += 1
+        self.biases = {pair: place + PER_NODE for pair, place in self.biases.items()}
         added = noise.draw_node(self.team, self.rng)
         self.log_level = np.concatenate([self.log_level, added[:, None]], axis=1)
         self.level = np.exp(self.log_level)
@@ -118,9 +127,16 @@ class BankCore:
     def remove(self, row: int) -> None:
         """Forget a user; the rows above it move down by one."""
         at = PER_NODE * row
-        keep = np.r_[0:at, at + PER_NODE : self.x.shape[1]]
+        gone = [*range(at, at + PER_NODE), *(e for pair, e in self.biases.items() if row in pair)]
+        keep = np.delete(np.arange(self.x.shape[1]), gone)
         self.x = np.ascontiguousarray(self.x[:, keep])
         self.p = np.ascontiguousarray(self.p[:, keep][:, :, keep])
+        place = {int(old): new for new, old in enumerate(keep)}
+        self.biases = {
+            (a - (a > row), b - (b > row)): place[e]
+            for (a, b), e in self.biases.items()
+            if row not in (a, b)
+        }
         self.log_level = np.delete(self.log_level, row, axis=1)
         self.level = np.exp(self.log_level)
         self.surprise = np.delete(self.surprise, row)
@@ -180,13 +196,13 @@ class BankCore:
 
     def update(self, first: Indices, second: Indices, range_m: Floats, dz_m: Floats) -> Floats:
         """Work in the ranges (R,) of one instant; return each one's probability to be good."""
-        bias = np.full(len(first), -1, dtype=np.int64)
+        bias = self._bias_places(first, second)
         stats = np.empty((self.count, len(first), 3))
         outlier = np.array([self.outlier_share, self.settings.outlier_m**2,
                             self.settings.outliers_short])  # fmt: skip
         joint.update(
             self.x, self.p, self.log_weight, self.sigma2, first, second, bias, range_m, dz_m,
-            outlier, stats,
+            outlier, PER_NODE * self.nodes, stats,
         )  # fmt: skip
         weight = self.weights()
         good: Floats = weight @ stats[:, :, 0]
@@ -196,6 +212,36 @@ class BankCore:
             for one in (row, peer):
                 self.surprise[one] += 0.2 * (1.0 - trust - self.surprise[one])
         return good
+
+    def _bias_places(self, first: Indices, second: Indices) -> Indices:
+        """Where in the state the biases of ranges are; those of new pairs are added.
+
+        A pair's bias is the common one plus its own part, so a new pair starts from what is known
+        of the common one. Where there are too many pairs, only the common one is modelled.
+        """
+        common = PER_NODE * self.nodes
+        places = np.empty(len(first), dtype=np.int64)
+        for r, (a, b) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
+            pair = (a, b) if a < b else (b, a)
+            place = self.biases.get(pair)
+            if place is None and self.nodes <= PAIR_BIASES and self.has_bias.any():
+                place = self._add_bias(pair)
+            places[r] = common if place is None else place
+        return places
+
+    def _add_bias(self, pair: tuple[int, int]) -> int:
+        count, size = self.count, int(self.x.shape[1])
+        common = PER_NODE * self.nodes
+        x = np.empty((count, size + 1))
+        p = np.empty((count, size + 1, size + 1))
+        x[:, :size], x[:, size] = self.x, self.x[:, common]
+        p[:, :size, :size] = self.p
+        p[:, size, :size] = self.p[:, common]
+        p[:, :size, size] = self.p[:, :, common]
+        p[:, size, size] = self.p[:, common, common] + self.has_bias * self.settings.pair_bias_m**2
+        self.x, self.p = x, p
+        self.biases[pair] = size
+        return size
 
     @property
     def outlier_share(self) -> float:
@@ -251,7 +297,7 @@ class BankCore:
     def _permute_parameters(self, chosen: Indices) -> None:
         self.team, self.log_level = self.team[chosen], self.log_level[chosen]
         self.log_sigma2 = self.log_sigma2[chosen]
-        self.has_constants = self.has_constants[chosen]
+        self.has_constants, self.has_bias = self.has_constants[chosen], self.has_bias[chosen]
         self.level, self.sigma2 = np.exp(self.log_level), np.exp(self.log_sigma2)
 
     def _jump(self) -> None:
@@ -284,22 +330,28 @@ class BankCore:
         return Snapshot(
             tuple(a.copy() for a in (
                 self.x, self.p, self.log_weight, self.team, self.log_level, self.log_sigma2,
-                self.has_constants, self.surprise, self.outlier_counts,
+                self.has_constants, self.has_bias, self.surprise, self.outlier_counts,
             )),
             self.rng.bit_generator.state,
             (self.nodes,),
+            dict(self.biases),
         )  # fmt: skip
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot of this core; it can be restored again."""
         (
             self.x, self.p, self.log_weight, self.team, self.log_level, self.log_sigma2,
-            self.has_constants, self.surprise, self.outlier_counts,
+            self.has_constants, self.has_bias, self.surprise, self.outlier_counts,
         ) = (a.copy() for a in snapshot.arrays)  # fmt: skip
         self.level, self.sigma2 = np.exp(self.log_level), np.exp(self.log_sigma2)
         self.rng.bit_generator.state = dict(snapshot.random)
         self.nodes = int(snapshot.numbers[0])
+        self.biases = dict(snapshot.biases)
 
+
+PAIR_BIASES = 6
+"""Up to so many users each pair has a bias of its own in the state: 15 of them double its size.
+Of more, the common one is modelled."""
 
 CROSS = 0.04
 """Variance across the way relative to along it: steps err in length, turns err apart from that."""
@@ -527,9 +579,19 @@ class Bank:
                 Parameter(time_s, node, None, "step_scale", grow, grow * scale),
                 Parameter(time_s, node, None, "heading_drift_rad_s", pose[Of.DRIFT], drift),
             ]
+        parameters += self._bias_parameters(time_s, mean, covariance)
         return Estimate(
             time_s, tuple(nodes), self._pair_estimates(mean, covariance), (), tuple(parameters)
         )
+
+    def _bias_parameters(
+        self, time_s: float, mean: Floats, covariance: Floats
+    ) -> Iterator[Parameter]:
+        named = {row: node for node, row in self._row.items()}
+        for (a, b), place in sorted(self.core.biases.items()):
+            node, peer = sorted((named[a], named[b]))
+            sigma = math.sqrt(max(float(covariance[place, place]), 0.0))
+            yield Parameter(time_s, node, peer, "range_bias_m", float(mean[place]), sigma)
 
     def _pair_estimates(self, mean: Floats, covariance: Floats) -> tuple[PairEstimate, ...]:
         located = sorted(self._row)

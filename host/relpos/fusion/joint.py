@@ -49,6 +49,8 @@ PER_NODE = len(Of)
 _X, _Y, _H, _W, _S = (int(v) for v in Of)
 _N = PER_NODE
 _TINY = 1e-12
+_FAR = 9.0
+"""Squared distance, in range variances, from which on noise of either sign is seen alike."""
 
 
 @compiled
@@ -71,9 +73,13 @@ def advance(
     way relative to that along it.
     """
     count, size = x.shape
+    poses = _N * level.shape[1]
     for k in range(count):
         xk = x[k]
         pk = p[k]
+        size = x.shape[1]
+        if size > poses and pk[poses, poses] == 0.0:
+            size = poses
         for m in range(rows.shape[0]):
             row = rows[m]
             b = _N * row
@@ -152,12 +158,15 @@ def update(
     measured: Floats,
     dz: Floats,
     outlier: Floats,
+    poses: int,
     stats: Floats,
 ) -> None:
     """Work in ranges (R,) one after another; each hypothesis' log weight gets their evidence.
 
-    ``first``, ``second`` (R,) are users' rows, ``bias`` the state of a range's bias or -1,
-    ``sigma2`` (K,) each hypothesis' range variance. ``outlier`` is the share, the variance
+    ``first``, ``second`` (R,) are users' rows, ``bias`` the state of a range's bias or -1;
+    biases come after the first ``poses`` entries of the state, their common part first, and a
+    hypothesis whose common part has no variance has none. ``sigma2`` (K,) is each hypothesis'
+    range variance. ``outlier`` is the share, the variance
     (m^2) and the share of these that are too short. An innovation that may be an outlier's is
     used by its probability r of being none (probabilistic data association): the mean moves by
     r K nu, the covariance keeps the spread between used and not used. ``stats`` (K, R, 3)
@@ -170,11 +179,16 @@ def update(
         xk = x[k]
         pk = p[k]
         total = 0.0
+        size = x.shape[1]
+        biased = size > poses and pk[poses, poses] > 0.0
+        if not biased:
+            size = poses
         for r in range(first.shape[0]):
-            bi, bj, e = _N * first[r], _N * second[r], bias[r]
+            bi, bj, e = _N * first[r], _N * second[r], bias[r] if biased else -1
             m, v, gx, gy = _predict_range(xk, pk, bi, bj, dz[r])
             innovation = measured[r] - m
-            if e >= 0:
+            # No range is negative: between two who stand together noise alone looks like a bias.
+            if e >= 0 and m * m > _FAR * sigma2[k]:
                 innovation -= xk[e]
                 for q in range(size):
                     g[q] = (
