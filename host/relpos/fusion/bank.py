@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,8 +31,9 @@ from relpos.fusion.estimator import (
     Parameter,
 )
 from relpos.fusion.joint import PER_NODE, Of
+from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
-from relpos.measurements import Heading, Height, Measurement, Prior, Range
+from relpos.measurements import Heading, Height, Measurement, Prior
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -48,6 +50,7 @@ class Snapshot:
     random: Mapping[str, object]
     numbers: tuple[float, ...]
     biases: Mapping[tuple[int, int], int]
+    counters: Mapping[str, int]
 
 
 class BankCore:
@@ -335,6 +338,7 @@ class BankCore:
             self.rng.bit_generator.state,
             (self.nodes,),
             dict(self.biases),
+            dict(self.counters),
         )  # fmt: skip
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -347,6 +351,7 @@ class BankCore:
         self.rng.bit_generator.state = dict(snapshot.random)
         self.nodes = int(snapshot.numbers[0])
         self.biases = dict(snapshot.biases)
+        self.counters = Counter(snapshot.counters)
 
 
 PAIR_BIASES = 6
@@ -390,6 +395,21 @@ class _Known:
     silent_epochs: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class _State:
+    """What :class:`Bank` is at one time, to go back to."""
+
+    core: Snapshot
+    detection: Detection
+    row: dict[int, int]
+    known: dict[int, _Known]
+    pending: list[Advance]
+    own: Counter[str]
+    moved: bool
+    ranges_used: int
+    epoch_s: float
+
+
 @dataclass(slots=True)
 class Bank:
     """The bank as an :class:`~relpos.fusion.estimator.Estimator`, from known starts."""
@@ -399,7 +419,7 @@ class Bank:
     seed: int = 0
     core: BankCore = field(init=False)
     detection: Detection = field(default_factory=Detection)
-    _timeline: Timeline = field(init=False)
+    _feed: Rewinder = field(init=False)
     _row: dict[int, int] = field(default_factory=dict)
     _known: dict[int, _Known] = field(default_factory=dict)
     _pending: list[Advance] = field(default_factory=list)
@@ -411,9 +431,10 @@ class Bank:
     def __post_init__(self) -> None:
         s = self.settings
         self.core = BankCore(s, self.seed)
-        self._timeline = Timeline(
+        timeline = Timeline(
             [p.node for p in self.priors], reorder_s=s.reorder_s, max_lag_s=s.max_lag_s
         )
+        self._feed = Rewinder(self, timeline, s.late_s)
         for p in sorted(self.priors, key=lambda p: p.node):
             if p.node in self._known:
                 raise RelposError(f"node {p.node} has two initial poses")
@@ -427,19 +448,15 @@ class Bank:
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         """Take one measurement; return the estimates it completes."""
-        if measurement.node not in self._known:
-            self._known[measurement.node] = _Known()
-        if isinstance(measurement, Range) and measurement.peer not in self._known:
-            self._known[measurement.peer] = _Known()
-        return self._work_off(self._timeline.push(measurement))
+        return self._feed.process(measurement)
 
     def finish(self) -> list[Estimate]:
         """Work off what waits; RelposError where the run cannot give relative positions."""
-        estimates = self._work_off(self._timeline.finish())
+        estimates = self._feed.finish()
         if not self._moved:
             raise RelposError("no motion was received: nothing can be estimated")
         if not self._ranges_used:
-            failed = self._timeline.counters["ranges_failed"]
+            failed = self._feed.counters()["ranges_failed"]
             raise RelposError(
                 f"no usable range ({failed} failed ones): relative positions cannot be fused; "
                 "from known starts --estimator deadreckoning still works"
@@ -448,29 +465,53 @@ class Bank:
 
     def counters(self) -> Mapping[str, int]:
         """Count everything dropped, late, reset or resampled."""
-        return dict(self._timeline.counters + self._own + self.core.counters)
+        return dict(self._feed.counters() + self._own + self.core.counters)
 
     # -- steps ---------------------------------------------------------------------------------
 
-    def _work_off(self, steps: Iterable[Step]) -> list[Estimate]:
-        estimates = []
-        for step in steps:
-            match step:
-                case Advance():
-                    self._moved = True
-                    known = self._known[step.node]
-                    known.news_s = max(known.news_s, step.time_s)
-                    if step.node in self._row:
-                        self._pending.append(step)
-                case Ranging():
-                    self._advance()
-                    self._range(step)
-                case Sensed():
-                    self._sense(step)
-                case Epoch():
-                    self._advance()
-                    estimates.append(self._estimate(step.time_s))
-        return estimates
+    def take(self, step: Step) -> Estimate | None:
+        """Work off one step of the timeline (:class:`~relpos.fusion.rewind.Core`)."""
+        match step:
+            case Advance():
+                self._moved = True
+                known = self._meet(step.node)
+                known.news_s = max(known.news_s, step.time_s)
+                if step.node in self._row:
+                    self._pending.append(step)
+            case Ranging():
+                self._advance()
+                self._range(step)
+            case Sensed():
+                self._meet(step.measurement.node)
+                self._sense(step)
+            case Epoch():
+                self._advance()
+                return self._estimate(step.time_s)
+        return None
+
+    def snapshot(self) -> _State:
+        """Copy everything that ``take`` changes."""
+        return _State(
+            self.core.snapshot(), self.detection.snapshot(), self._row.copy(),
+            {node: copy(known) for node, known in self._known.items()}, self._pending[:],
+            self._own.copy(), self._moved, self._ranges_used, self._epoch_s,
+        )  # fmt: skip
+
+    def restore(self, snapshot: _State) -> None:
+        """Be as at the time of the snapshot."""
+        self.core.restore(snapshot.core)
+        self.detection = snapshot.detection.snapshot()
+        self._row = snapshot.row.copy()
+        self._known = {node: copy(known) for node, known in snapshot.known.items()}
+        self._pending, self._own = snapshot.pending[:], snapshot.own.copy()
+        self._moved, self._ranges_used = snapshot.moved, snapshot.ranges_used
+        self._epoch_s = snapshot.epoch_s
+
+    def _meet(self, node: int) -> _Known:
+        known = self._known.get(node)
+        if known is None:
+            known = self._known[node] = _Known()
+        return known
 
     def _advance(self) -> None:
         """Work off the displacements since the last time."""
@@ -488,7 +529,7 @@ class Bank:
     def _range(self, step: Ranging) -> None:
         for r in step.ranges:
             for node in (r.node, r.peer):
-                known = self._known[node]
+                known = self._meet(node)
                 known.news_s = max(known.news_s, step.time_s)
         ranges = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
         self._own["ranges_of_unlocated"] += len(step.ranges) - len(ranges)
@@ -511,7 +552,7 @@ class Bank:
         """Learn who is heard how far; give the hypotheses' log P(the silent pairs are silent)."""
         total: Floats | None = None
         ranges = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
-        for done in self.detection.rounds.take(step.time_s, ranges, self._timeline.reported_s):
+        for done in self.detection.rounds.take(step.time_s, ranges, self._feed.timeline.reported_s):
             pairs = done.heard + done.silent
             mean, sigma = self.core.predicted_ranges(*self._pairs(pairs))
             weight = self.core.weights()

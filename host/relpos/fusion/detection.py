@@ -31,8 +31,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -206,7 +205,20 @@ class Detection:
 
     def snapshot(self) -> Detection:
         """Give a copy that later learning leaves alone."""
-        return deepcopy(self)
+        rounds = replace(
+            self.rounds,
+            heard_ever=self.rounds.heard_ever.copy(),
+            _partners={node: peers.copy() for node, peers in self.rounds._partners.items()},
+            _open=self.rounds._open.copy(),
+            _directed=self.rounds._directed.copy(),
+        )
+        # A refit makes a new curve and leaves the old one alone.
+        copy = object.__new__(Detection)
+        for one in fields(self):
+            setattr(copy, one.name, getattr(self, one.name))
+        copy.rounds, copy._counts = rounds, self._counts.copy()
+        copy._working, copy._surprise = self._working.copy(), self._surprise.copy()
+        return copy
 
     def probability(self, distance_m: Floats, sigma_m: Floats | float = 0.0) -> Floats:
         """P(heard) over distances (K,), averaged over their error."""

@@ -29,6 +29,9 @@ from relpos.fusion.estimator import Estimate
 from relpos.fusion.timeline import Epoch, Step, Timeline, refusal
 from relpos.measurements import Measurement
 
+QUIET_S = 30.0
+"""After so long without anything late, copies are made more rarely."""
+
 
 class Core(Protocol):
     """An estimator behind a timeline, whose state can be copied and taken up again.
@@ -60,9 +63,10 @@ class _Copy:
 class Rewinder:
     """Feeds ``core`` from ``timeline``: measurements in, estimates out, each time only once.
 
-    ``window_s`` is how late a measurement may be, ``spacing_s`` how far apart copies are,
-    ``every_s`` how often it may go back. A replay does not repeat estimates that were given
-    already, and those given go on in time.
+    ``window_s`` is how late a measurement may be, ``spacing_s`` how far apart copies are where
+    things come late now and then (four times as far where nothing has for half a minute, because
+    copies cost, too), ``every_s`` how often it may go back. A replay does not repeat estimates
+    that were given already, and those given go on in time.
     """
 
     core: Core
@@ -158,7 +162,9 @@ class Rewinder:
         self._copy_if_due(2.0 * self.spacing_s)
 
     def _copy_if_due(self, spacing_s: float) -> None:
-        if self.timeline.frontier_s >= self._copies[-1].frontier_s + spacing_s:
+        if self._newest_s - self._rewound_s > QUIET_S:
+            spacing_s *= 4.0
+        if self._copies and self.timeline.frontier_s >= self._copies[-1].frontier_s + spacing_s:
             self._copy()
 
     def _copy(self) -> None:
