@@ -19,11 +19,13 @@ import numpy.typing as npt
 
 from relpos.errors import RelposError
 from relpos.fusion import joint, noise
+from relpos.fusion.ambiguity import believe, pictures
 from relpos.fusion.bank_settings import BankSettings
 from relpos.fusion.detection import Detection, log_silence
 from relpos.fusion.estimator import (
     LOST_EPOCHS,
     STALE_EPOCHS,
+    Alternative,
     Estimate,
     NodeEstimate,
     NodeStatus,
@@ -32,6 +34,7 @@ from relpos.fusion.estimator import (
 )
 from relpos.fusion.joint import PER_NODE, Of
 from relpos.fusion.rewind import Rewinder
+from relpos.fusion.starts import Found, Mixture, Starts
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.measurements import Heading, Height, Measurement, Prior
 
@@ -170,6 +173,25 @@ class BankCore:
         self.p[:, :, pose] = 0.0
         self.p[np.ix_(np.arange(self.count), pose, pose)] = covariances[chosen]
         self.log_weight = np.log(share[chosen] / times[chosen])
+
+    def place(self, rows: Indices, poses: Floats, covariances: Floats, log_weights: Floats) -> None:
+        """Put users ``rows`` (M,) at start hypotheses, and leave everybody else where he is.
+
+        ``poses`` (H, M, 3), ``covariances`` (H, 3 M, 3 M), ``log_weights`` (H,); the hypotheses
+        are dealt out by weight, independently of what they say of the others.
+        """
+        share = np.exp(log_weights - log_weights.max())
+        share /= share.sum()
+        chosen = self.rng.permutation(systematic(share, self.count, self.rng))
+        pose = (PER_NODE * rows[:, None] + np.arange(3)).ravel()
+        self.x[:, pose] = poses.reshape(len(share), -1)[chosen]
+        self.p[:, pose, :] = 0.0
+        self.p[:, :, pose] = 0.0
+        self.p[np.ix_(np.arange(self.count), pose, pose)] = covariances[chosen]
+
+    def set_scale(self, row: int, scale: float) -> None:
+        """Start a user's step scale (true over reported) where it is modelled."""
+        self.x[:, PER_NODE * row + Of.SCALE] = self.has_constants * math.log(scale)
 
     # -- one epoch -----------------------------------------------------------------------------
 
@@ -408,11 +430,16 @@ class _State:
     moved: bool
     ranges_used: int
     epoch_s: float
+    starts: Starts
 
 
 @dataclass(slots=True)
 class Bank:
-    """The bank as an :class:`~relpos.fusion.estimator.Estimator`, from known starts."""
+    """The bank as an :class:`~relpos.fusion.estimator.Estimator`.
+
+    Whose start is unknown is sought by :mod:`relpos.fusion.starts` until it is found, and joins
+    the core then.
+    """
 
     priors: Sequence[Prior] = ()
     settings: BankSettings = field(default_factory=BankSettings)
@@ -420,6 +447,7 @@ class Bank:
     core: BankCore = field(init=False)
     detection: Detection = field(default_factory=Detection)
     _feed: Rewinder = field(init=False)
+    starts: Starts = field(init=False)
     _row: dict[int, int] = field(default_factory=dict)
     _known: dict[int, _Known] = field(default_factory=dict)
     _pending: list[Advance] = field(default_factory=list)
@@ -431,6 +459,7 @@ class Bank:
     def __post_init__(self) -> None:
         s = self.settings
         self.core = BankCore(s, self.seed)
+        self.starts = Starts(seed=self.seed)
         timeline = Timeline(
             [p.node for p in self.priors], reorder_s=s.reorder_s, max_lag_s=s.max_lag_s
         )
@@ -442,6 +471,10 @@ class Bank:
             if math.isfinite(p.sigma_m) and math.isfinite(p.sigma_rad):
                 self._row[p.node] = self.core.add_node(
                     p.x_m, p.y_m, p.heading_rad, p.sigma_m, p.sigma_rad
+                )
+            else:
+                self.starts.meet(
+                    p.node, (p.x_m, p.y_m, p.heading_rad), (p.sigma_m, p.sigma_m, p.sigma_rad)
                 )
 
     # -- the estimator's interface -------------------------------------------------------------
@@ -465,7 +498,8 @@ class Bank:
 
     def counters(self) -> Mapping[str, int]:
         """Count everything dropped, late, reset or resampled."""
-        return dict(self._feed.counters() + self._own + self.core.counters)
+        own = self._own + self.core.counters + self.starts.counters
+        return dict(self._feed.counters() + own)
 
     # -- steps ---------------------------------------------------------------------------------
 
@@ -478,6 +512,9 @@ class Bank:
                 known.news_s = max(known.news_s, step.time_s)
                 if step.node in self._row:
                     self._pending.append(step)
+                else:
+                    self._seek(step.node)
+                    self.starts.advance(step)
             case Ranging():
                 self._advance()
                 self._range(step)
@@ -486,6 +523,7 @@ class Bank:
                 self._sense(step)
             case Epoch():
                 self._advance()
+                self._admit(self.starts.epoch())
                 return self._estimate(step.time_s)
         return None
 
@@ -495,6 +533,7 @@ class Bank:
             self.core.snapshot(), self.detection.snapshot(), self._row.copy(),
             {node: copy(known) for node, known in self._known.items()}, self._pending[:],
             self._own.copy(), self._moved, self._ranges_used, self._epoch_s,
+            self.starts.snapshot(),
         )  # fmt: skip
 
     def restore(self, snapshot: _State) -> None:
@@ -506,6 +545,7 @@ class Bank:
         self._pending, self._own = snapshot.pending[:], snapshot.own.copy()
         self._moved, self._ranges_used = snapshot.moved, snapshot.ranges_used
         self._epoch_s = snapshot.epoch_s
+        self.starts = snapshot.starts.snapshot()
 
     def _meet(self, node: int) -> _Known:
         known = self._known.get(node)
@@ -531,8 +571,14 @@ class Bank:
             for node in (r.node, r.peer):
                 known = self._meet(node)
                 known.news_s = max(known.news_s, step.time_s)
+                if node not in self._row:
+                    self._seek(node)
+        if self.starts:
+            heights = {n: k.height_m for n, k in self._known.items()}
+            self.starts.ranging(step.time_s, step.ranges, self._places(), heights)
+            # A search may be long; finding nobody in it is no fault of the data.
+            self._ranges_used += len(step.ranges)
         ranges = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
-        self._own["ranges_of_unlocated"] += len(step.ranges) - len(ranges)
         silence = self._silence(step)
         if ranges:
             first, second, dz = self._pairs([(r.node, r.peer) for r in ranges])
@@ -541,6 +587,36 @@ class Bank:
         if silence is not None:
             self.core.log_weight += silence
         self.core.settle()
+
+    def _seek(self, node: int) -> None:
+        if node not in self.starts:
+            self.starts.meet(node)
+
+    def _places(self) -> dict[int, tuple[float, float, float]]:
+        """Everybody in the core: x, y (m) and the variance (m^2) of a distance to him."""
+        if not self._row:
+            return {}
+        mean, covariance = self.core.moments()
+        places = {}
+        for node, row in self._row.items():
+            at = PER_NODE * row
+            variance = 0.5 * float(covariance[at, at] + covariance[at + 1, at + 1])
+            places[node] = (float(mean[at]), float(mean[at + 1]), variance)
+        return places
+
+    def _admit(self, found: Found | None) -> None:
+        """Let those whose start has been found join the core."""
+        if found is None:
+            return
+        mixture = found.mixture
+        rows = [self.core.add_node(0.0, 0.0, 0.0, 1.0, 1.0) for _ in mixture.nodes]
+        self._row.update(zip(mixture.nodes, rows, strict=True))
+        self.core.place(
+            np.array(rows, dtype=np.int64), mixture.poses, mixture.covariances,
+            np.log(np.maximum(mixture.weights, 1e-300)),
+        )  # fmt: skip
+        for row, scale in zip(rows, mixture.scales, strict=True):
+            self.core.set_scale(row, float(scale))
 
     def _pairs(self, pairs: Sequence[tuple[int, int]]) -> tuple[Indices, Indices, Floats]:
         first = np.array([self._row[a] for a, _ in pairs], dtype=np.int64)
@@ -590,17 +666,13 @@ class Bank:
             known.silent_epochs = 0 if known.news_s > self._epoch_s else known.silent_epochs + 1
         self._epoch_s = time_s
         mean, covariance = self.core.moments()
+        mixture = self.starts.mixture
         nodes, parameters = [], []
         for node in sorted(self._known):
             known = self._known[node]
             row = self._row.get(node)
             if row is None:
-                nodes.append(
-                    NodeEstimate(
-                        node, 0.0, 0.0, 0.0, math.inf, math.inf, 0.0, _ANY_ANGLE_RAD,
-                        NodeStatus.UNLOCATED, known.height_m, known.sigma_height_m,
-                    )
-                )  # fmt: skip
+                nodes.append(self._sought(node, known, mixture))
                 continue
             at = PER_NODE * row
             pose = [float(v) for v in mean[at : at + PER_NODE]]
@@ -621,9 +693,81 @@ class Bank:
                 Parameter(time_s, node, None, "heading_drift_rad_s", pose[Of.DRIFT], drift),
             ]
         parameters += self._bias_parameters(time_s, mean, covariance)
-        return Estimate(
-            time_s, tuple(nodes), self._pair_estimates(mean, covariance), (), tuple(parameters)
-        )
+        pairs = self._pair_estimates(mean, covariance)
+        alternatives: tuple[Alternative, ...] = ()
+        if mixture is not None:
+            pairs += self._sought_pairs(mixture, mean, covariance)
+            alternatives = self._alternatives(time_s, mixture, mean, covariance)
+        return Estimate(time_s, tuple(nodes), pairs, alternatives, tuple(parameters))
+
+    def _sought(self, node: int, known: _Known, mixture: Mixture | None) -> NodeEstimate:
+        """Say of a node whose start is unknown what the search says."""
+        if mixture is None or node not in mixture.nodes:
+            return NodeEstimate(
+                node, 0.0, 0.0, 0.0, math.inf, math.inf, 0.0, _ANY_ANGLE_RAD,
+                NodeStatus.UNLOCATED, known.height_m, known.sigma_height_m,
+            )  # fmt: skip
+        n = mixture.nodes.index(node)
+        own = slice(3 * n, 3 * n + 3)
+        belief = believe(mixture.weights, mixture.poses[:, n], mixture.covariances[:, own, own])
+        status = _status(known)
+        if status is NodeStatus.OK and node != self.starts.search.frame:
+            status = NodeStatus.AMBIGUOUS
+        spread = belief.covariance_m2
+        return NodeEstimate(
+            node, belief.x_m, belief.y_m, belief.heading_rad, float(spread[0, 0]),
+            float(spread[1, 1]), float(spread[0, 1]), belief.sigma_heading_rad, status,
+            known.height_m, known.sigma_height_m,
+        )  # fmt: skip
+
+    def _sought_pairs(
+        self, mixture: Mixture, mean: Floats, covariance: Floats
+    ) -> tuple[PairEstimate, ...]:
+        """Pairs with at least one node whose start is unknown: moments over all pictures."""
+        places = {n: mixture.poses[:, i, :2] for i, n in enumerate(mixture.nodes)}
+        columns = {n: slice(3 * i, 3 * i + 2) for i, n in enumerate(mixture.nodes)}
+        pairs = []
+        everybody = sorted([*self._row, *mixture.nodes])
+        for k, a in enumerate(everybody):
+            for b in everybody[k + 1 :]:
+                if a in self._row and b in self._row:
+                    continue
+                total: Floats = np.zeros((len(mixture.weights), 2, 2))
+                ends = []
+                for node in (a, b):
+                    if node in self._row:
+                        at = PER_NODE * self._row[node]
+                        ends.append(mean[None, at : at + 2])
+                        total = total + covariance[at : at + 2, at : at + 2]
+                    else:
+                        own = columns[node]
+                        ends.append(places[node])
+                        total = total + mixture.covariances[:, own, own]
+                if a in columns and b in columns:
+                    cross = mixture.covariances[:, columns[a], columns[b]]
+                    total = total - cross - cross.transpose(0, 2, 1)
+                pairs.append(_pair_of_pictures(a, b, mixture.weights, ends[1] - ends[0], total))
+        return tuple(pairs)
+
+    def _alternatives(
+        self, time_s: float, mixture: Mixture, mean: Floats, covariance: Floats
+    ) -> tuple[Alternative, ...]:
+        """List the possible pictures of the whole team while somebody's start is unknown."""
+        if set(mixture.nodes) == {self.starts.search.frame}:
+            return ()
+        count, sought = len(mixture.weights), len(mixture.nodes)
+        located = sorted(self._row)
+        nodes = [*mixture.nodes, *located]
+        poses = np.zeros((count, len(nodes), 3))
+        spread = np.zeros((count, len(nodes), 2, 2))
+        poses[:, :sought] = mixture.poses
+        for i in range(sought):
+            spread[:, i] = mixture.covariances[:, 3 * i : 3 * i + 2, 3 * i : 3 * i + 2]
+        for i, node in enumerate(located):
+            at = PER_NODE * self._row[node]
+            poses[:, sought + i] = mean[at : at + 3]
+            spread[:, sought + i] = covariance[at : at + 2, at : at + 2]
+        return pictures(time_s, nodes, mixture.weights, poses, spread)
 
     def _bias_parameters(
         self, time_s: float, mean: Floats, covariance: Floats
@@ -667,6 +811,29 @@ class Bank:
                     )
                 )
         return tuple(pairs)
+
+
+def _pair_of_pictures(
+    node: int, peer: int, weights: Floats, off: Floats, spread: Floats
+) -> PairEstimate:
+    """Distance and bearing of a pair whose difference is a mixture: (K, 2), (K, 2, 2)."""
+    distance = np.hypot(off[:, 0], off[:, 1])
+    unit = off / np.maximum(distance, 1e-9)[:, None]
+    along = np.einsum("ka,kab,kb->k", unit, spread, unit)
+    across = np.trace(spread, axis1=1, axis2=2) - along
+    # To second order, as the joint filter's range: E d^2 = |off|^2 + across.
+    distance = np.sqrt(distance**2 + across)
+    middle = float(weights @ distance)
+    variance = float(weights @ (along + (distance - middle) ** 2))
+    together = complex((weights * (unit[:, 0] + 1j * unit[:, 1])).sum())
+    length = min(max(abs(together), 1e-3), 1.0)
+    bearing_sd = math.sqrt(
+        -2.0 * math.log(length) + float(weights @ across) / max(middle, 1e-3) ** 2
+    )
+    return PairEstimate(
+        node, peer, middle, math.sqrt(max(variance, 0.0)), float(np.angle(together)),
+        min(bearing_sd, _ANY_ANGLE_RAD),
+    )  # fmt: skip
 
 
 def _told(step: Advance) -> tuple[float, float, float]:

@@ -1,0 +1,323 @@
+"""What may be said of weighted hypotheses: pictures with probabilities, rings, regions.
+
+Hypotheses about a team (weights, poses, position covariances) become at most
+``MAX_ALTERNATIVES`` pictures: hypotheses that put everybody at about the same place are one. A
+node that is spread round a whole circle is given as a ring. The other way round,
+:class:`Region` is the smallest region that holds a wanted share of what the alternatives say of a
+node, its area, and whether a place lies in it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.estimator import MAX_ALTERNATIVES, Alternative, Shape
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
+
+_TWO_PI = 2.0 * math.pi
+
+ONE_PLACE_M = 0.7
+"""Hypotheses that differ by less are one picture; the first tried, then wider ones."""
+
+RING_SECTORS = 8
+RING_FULLEST = 0.4
+RING_WIDTH = 0.35
+"""A circle: no sector of eight empty, none with more than this share, the width at most this
+share of the radius."""
+
+_LEAST_SIGMA_M = 0.01
+"""An ellipse's axis or a ring's width below this would make densities of points that no
+measurement can tell apart differ."""
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """What a mixture says of one node: the best picture's pose, the mixture's spread about it.
+
+    ``share`` is the probability that the node is within ``ONE_PLACE_M`` (or two standard
+    deviations) of where the best picture has it; ``sigma_here_m`` the picture's own spread.
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+    covariance_m2: Floats
+    sigma_heading_rad: float
+    share: float
+    sigma_here_m: float
+    sigma_heading_here_rad: float
+
+
+def pictures(
+    time_s: float,
+    nodes: Sequence[int],
+    weights: Floats,
+    poses: Floats,
+    covariances: Floats,
+    most: int = MAX_ALTERNATIVES,
+) -> tuple[Alternative, ...]:
+    """Give weights (K,), poses (K, N, 3), position covariances (K, N, 2, 2) as alternatives.
+
+    The most probable comes first; probabilities sum to one.
+    """
+    ringed = [
+        _circle(weights, poses[:, n, :2], covariances[:, n]) is not None for n in range(len(nodes))
+    ]
+    told = np.flatnonzero(~np.array(ringed, dtype=bool))
+    group = _groups(weights, poses[:, told, :2], covariances[:, told], most)
+    probability = np.bincount(group, weights=weights)
+    rows = []
+    for rank, g in enumerate(np.argsort(-probability, kind="stable")):
+        of = group == g
+        share = weights[of] / probability[g]
+        for n, node in enumerate(nodes):
+            places, covariance = poses[of, n, :2], covariances[of, n]
+            heading = float(
+                np.angle((share * np.exp(1j * poses[of, n, 2])).sum())
+            )  # A mean that weighs every direction the same has none: any will do.
+            circle = _circle(share, places, covariance) if ringed[n] else None
+            shape = Shape.ELLIPSE
+            if circle is not None:
+                x, y, major, minor = circle
+                angle, shape = 0.0, Shape.RING
+            else:
+                mean, spread = _moments(share, places, covariance)
+                x, y = mean
+                major, minor, angle = _axes(spread)
+            rows.append(
+                Alternative(
+                    time_s, rank, float(probability[g]), node, float(x), float(y), heading,
+                    float(major), float(minor), float(angle), shape,
+                )
+            )  # fmt: skip
+    return tuple(rows)
+
+
+def believe(weights: Floats, poses: Floats, covariances: Floats) -> Belief:
+    """Say where one node is: weights (K,), poses (K, 3), covariances (K, 3, 3).
+
+    The place is that of the mode with the most weight within ``ONE_PLACE_M``.
+    """
+    places = poses[:, :2]
+    variance = covariances[:, 0, 0] + covariances[:, 1, 1]
+    # The mode: the hypothesis with the most weight about it, not the one with the most itself.
+    leaders = np.argsort(-weights)[:32]
+    off = places[leaders, None, :] - places[None, :, :]
+    apart = (off * off).sum(axis=2)
+    near = apart < np.maximum(ONE_PLACE_M**2, 2.0 * variance)
+    share = near @ weights
+    best = int(np.argmax(share))
+    here = near[best]
+    own = weights[here] / weights[here].sum()
+    mean, spread = _moments(own, places[here], covariances[here, :2, :2])
+    total = np.einsum("k,kab->ab", weights, covariances[:, :2, :2])
+    all_off = places - mean
+    total += np.einsum("k,ka,kb->ab", weights, all_off, all_off)
+    heading, sigma_here = _heading(own, poses[here, 2], covariances[here, 2, 2])
+    _, sigma = _heading(weights, poses[:, 2], covariances[:, 2, 2])
+    return Belief(
+        float(mean[0]), float(mean[1]), heading, total, sigma, float(share[best]),
+        float(_axes(spread)[0]), sigma_here,
+    )  # fmt: skip
+
+
+def seen_from(poses: Floats, covariances: Floats, first: int, second: int) -> tuple[Floats, Floats]:
+    """Give the pose (K, 3) of node ``second`` in the body frame of ``first``, and (K, 3, 3).
+
+    poses (K, N, 3), covariances (K, 3 N, 3 N).
+    """
+    heading = poses[:, first, 2]
+    c, s = np.cos(heading), np.sin(heading)
+    off = poses[:, second] - poses[:, first]
+    seen = np.column_stack(
+        (c * off[:, 0] + s * off[:, 1], c * off[:, 1] - s * off[:, 0], off[:, 2])
+    )
+    slope = np.zeros((len(poses), 3, 6))
+    slope[:, 0, 3], slope[:, 0, 4], slope[:, 1, 3], slope[:, 1, 4] = c, s, -s, c
+    slope[:, :2, :2] = -slope[:, :2, 3:5]
+    slope[:, 0, 2], slope[:, 1, 2] = seen[:, 1], -seen[:, 0]
+    slope[:, 2, 5], slope[:, 2, 2] = 1.0, -1.0
+    both = np.r_[3 * first : 3 * first + 3, 3 * second : 3 * second + 3]
+    own = covariances[:, both][:, :, both]
+    return seen, np.einsum("kab,kbc,kdc->kad", slope, own, slope)
+
+
+def _heading(weights: Floats, heading: Floats, variance: Floats) -> tuple[float, float]:
+    """Circular mean and standard deviation (at most that of a uniform direction)."""
+    # E exp(i theta) of normals; wide ones count less.
+    together = (weights * np.exp(1j * heading - 0.5 * variance)).sum()
+    length = min(abs(together), 1.0)
+    sigma = math.sqrt(-2.0 * math.log(length)) if length > 1e-3 else math.inf
+    return float(np.angle(together)), min(sigma, math.pi / math.sqrt(3.0))
+
+
+def _moments(weights: Floats, places: Floats, covariances: Floats) -> tuple[Floats, Floats]:
+    mean = weights @ places
+    off = places - mean
+    spread = np.einsum("k,kab->ab", weights, covariances)
+    spread += np.einsum("k,ka,kb->ab", weights, off, off)
+    return mean, spread
+
+
+def _axes(covariance: Floats) -> tuple[float, float, float]:
+    """Standard deviations along the long and the short axis, and the long one's direction."""
+    xx, yy, xy = covariance[0, 0], covariance[1, 1], covariance[0, 1]
+    middle, radius = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+    major = math.sqrt(max(middle + radius, 0.0))
+    minor = math.sqrt(max(middle - radius, 0.0))
+    return major, minor, 0.5 * math.atan2(2.0 * xy, xx - yy)
+
+
+def _circle(
+    weights: Floats, places: Floats, covariances: Floats
+) -> tuple[float, float, float, float] | None:
+    """Centre, radius and width of the circle that the places lie on; None where they do not.
+
+    Algebraic fit (Kasa 1976): |p|^2 = 2 c . p + (r^2 - |c|^2), linear in c and the rest.
+    """
+    if weights.size < RING_SECTORS:
+        return None
+    middle = weights @ places
+    off = places - middle
+    root = np.sqrt(weights)
+    design = np.column_stack((2.0 * off, np.ones(weights.size))) * root[:, None]
+    squares = (off * off).sum(axis=1)
+    solution, _, rank, _ = np.linalg.lstsq(design, squares * root, rcond=1e-9)
+    if rank < 3:
+        return None
+    centre = solution[:2]
+    radius2 = solution[2] + centre @ centre
+    if radius2 <= 0.0:
+        return None
+    radius = math.sqrt(radius2)
+    from_centre = off - centre
+    distance = np.hypot(from_centre[:, 0], from_centre[:, 1])
+    unit = from_centre / np.maximum(distance, 1e-9)[:, None]
+    radial = np.einsum("ka,kab,kb->k", unit, covariances, unit)
+    # A tangent leaves its circle outwards by half the square over the radius: not width.
+    width = math.sqrt(float(weights @ ((distance - radius) ** 2 + radial)))
+    if width > RING_WIDTH * radius:
+        return None
+    sector = (np.arctan2(from_centre[:, 1], from_centre[:, 0]) / _TWO_PI * RING_SECTORS) % (
+        RING_SECTORS
+    )
+    share = np.bincount(sector.astype(np.intp) % RING_SECTORS, weights, RING_SECTORS)
+    if share.max() > RING_FULLEST or share.min() <= 0.2 / RING_SECTORS:
+        return None
+    return float(middle[0] + centre[0]), float(middle[1] + centre[1]), radius, width
+
+
+def _groups(weights: Floats, places: Floats, covariances: Floats, most: int) -> Indices:
+    """Number hypotheses (K,) by picture: places (K, N, 2), covariances (K, N, 2, 2)."""
+    count = weights.size
+    if places.shape[1] == 0 or count == 1:
+        return np.zeros(count, dtype=np.intp)
+    reach2 = np.maximum(ONE_PLACE_M**2, covariances[:, :, 0, 0] + covariances[:, :, 1, 1])
+    order = np.argsort(-weights, kind="stable")
+    widen = 1.0
+    while True:
+        group = np.full(count, -1, dtype=np.intp)
+        leaders: list[int] = []
+        for k in order:
+            if group[k] >= 0:
+                continue
+            if len(leaders) == most:
+                break
+            off = places - places[k]
+            near = ((off * off).sum(axis=2) < widen * reach2[k]).all(axis=1)
+            group[near & (group < 0)] = len(leaders)
+            leaders.append(int(k))
+        left = group < 0
+        if float(weights[left].sum()) < 0.02:
+            break
+        widen *= 2.0
+    if left.any():
+        off = places[left, None] - places[None, leaders]
+        group[left] = (off * off).sum(axis=(2, 3)).argmin(axis=1)
+    return group
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """The smallest region that holds ``share`` of a mixture of ellipses and rings.
+
+    ``rows`` (A, 7): probability, x, y, major, minor, angle, 1 for a ring. ``level`` is the
+    density (1/m^2) at its border, ``area_m2`` its area.
+    """
+
+    rows: Floats
+    level: float
+    area_m2: float
+
+    @staticmethod
+    def of(alternatives: Iterable[Alternative], share: float = 0.9, draws: int = 4000) -> Region:
+        """Build the region of one node's alternatives of one time.
+
+        The level is a quantile of the density at points of the mixture itself; the area is the
+        mean of 1/density over those that lie inside. Both from ``draws`` fixed random points:
+        an area to about 2 %.
+        """
+        rows = np.array(
+            [
+                (
+                    a.probability, a.x_m, a.y_m, max(a.sigma_major_m, _LEAST_SIGMA_M),
+                    max(a.sigma_minor_m, _LEAST_SIGMA_M), a.sigma_angle_rad,
+                    float(a.shape is Shape.RING),
+                )
+                for a in alternatives
+            ]
+        )  # fmt: skip
+        rng = np.random.default_rng(0)
+        share_of = rows[:, 0] / rows[:, 0].sum()
+        one = rng.choice(len(rows), size=draws, p=share_of)
+        normal = rng.standard_normal((draws, 2))
+        turn = _TWO_PI * rng.random(draws)
+        _, x, y, major, minor, angle, ring = rows[one].T
+        c, s = np.cos(angle), np.sin(angle)
+        along, across = major * normal[:, 0], minor * normal[:, 1]
+        distance = major + minor * normal[:, 0]
+        is_ring = ring > 0.0
+        points = np.column_stack(
+            (
+                x + np.where(is_ring, distance * np.cos(turn), c * along - s * across),
+                y + np.where(is_ring, distance * np.sin(turn), s * along + c * across),
+            )
+        )
+        density = _density(rows, points)
+        level = float(np.quantile(density, 1.0 - share))
+        inside = density >= level
+        return Region(rows, level, float((inside / density).mean()))
+
+    def contains(self, x_m: float, y_m: float) -> bool:
+        """Tell whether a place lies inside."""
+        return bool(_density(self.rows, np.array([[x_m, y_m]]))[0] >= self.level)
+
+
+def _density(rows: Floats, points: Floats) -> Floats:
+    """Density (1/m^2) of a mixture (A, 7) at points (P, 2)."""
+    total = np.zeros(len(points))
+    for probability, x, y, major, minor, angle, ring in rows:
+        dx, dy = points[:, 0] - x, points[:, 1] - y
+        if ring > 0.0:
+            # Normal across, even round; the circumference of each distance keeps it a density.
+            distance = np.hypot(dx, dy)
+            scaled = (distance - major) / minor
+            total += (
+                probability * np.exp(-0.5 * scaled * scaled)
+                / (math.sqrt(_TWO_PI) * minor * _TWO_PI * np.maximum(distance, minor))
+            )  # fmt: skip
+        else:
+            c, s = math.cos(angle), math.sin(angle)
+            along, across = (c * dx + s * dy) / major, (c * dy - s * dx) / minor
+            total += (
+                probability * np.exp(-0.5 * (along * along + across * across))
+                / (_TWO_PI * major * minor)
+            )  # fmt: skip
+    return total
