@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,6 +17,7 @@ from relpos.cli.keys import KeyFile
 from relpos.errors import DataError, DeviceError, RelposError
 
 if TYPE_CHECKING:
+    from relpos.evaluation.bounds import Totals
     from relpos.evaluation.metrics import Metrics
     from relpos.fusion.estimator import Estimate, Estimator
     from relpos.measurements import Observation, Prior
@@ -106,15 +107,19 @@ def fuse(
 ) -> None:
     """Fuse motion and ranges into relative positions; score them where there is truth.
 
+    With --smooth the estimates come when all is over, each from the whole run: the best track.
+
     Writes estimate.csv, pairs.csv and parameters.csv, and index.html with pictures where the
     source has truth. From a port, what was received is kept too, as a run directory under
     received/; Ctrl-C ends it.
     """
     chosen = output.parse_settings(settings or [])
-    for wanted, name in ((smooth, "--smooth"), (record, "--record"), (view, "--view")):
+    for wanted, name in ((record, "--record"), (view, "--view")):
         if wanted:
             raise output.not_built_yet(name)
-    job = Job(source, estimator, chosen, seed, out or Path("out") / _base_name(source))
+    job = Job(
+        source, estimator, chosen, seed, out or Path("out") / _base_name(source), smooth=smooth
+    )
     if sources.is_port(source):
         _fuse_port(job, initial, seconds, key_file, teach=teach, as_json=json)
     else:
@@ -130,11 +135,14 @@ class Job:
     settings: dict[str, str]
     seed: int
     out: Path
+    smooth: bool = False
 
     def make(self, priors: Sequence[Prior]) -> Estimator:
         """Make the wanted estimator; RelposError where a setting does not fit it."""
         from relpos import fusion
 
+        if self.smooth:
+            return fusion.make_smoother(self.estimator, priors, self.settings, self.seed)
         return fusion.make(self.estimator, priors, self.settings, self.seed)
 
 
@@ -180,7 +188,8 @@ def _pass_through(
     except RelposError as error:
         outcome.failure = error
     try:
-        outcome.estimates += estimator.finish()
+        with output.working("finishing"):
+            outcome.estimates += estimator.finish()
     except RelposError as error:
         outcome.failure = outcome.failure or error
     return outcome
@@ -257,6 +266,8 @@ class _Scored:
     baseline: Metrics
     baseline_estimates: list[Estimate]
     baseline_start: str
+    bound: Totals | None = None
+    """The least possible errors, where the source is simulated and says how."""
 
     def write_report(self, job: Job, run: Run, estimates: Sequence[Estimate]) -> None:
         from relpos.evaluation import report, tracks
@@ -300,8 +311,23 @@ def _score(
     plain = fusion.make(EstimatorName.DEADRECKONING, priors, {}, job.seed)
     baseline = _pass_through(plain, run.measurements).estimates
     return _Scored(
-        score, metrics.evaluate(tracks.estimated_tracks(baseline), truth), baseline, start
+        score,
+        metrics.evaluate(tracks.estimated_tracks(baseline), truth),
+        baseline,
+        start,
+        _bound(run),
     )
+
+
+def _bound(run: Run) -> Totals | None:
+    """Compute the Cramer-Rao bound of a simulated run; None where it cannot be told."""
+    from relpos.evaluation import bounds
+    from relpos.simulation.paper import SCENARIOS
+
+    made = run.description.simulated
+    if made is None or made.scenario not in SCENARIOS:
+        return None
+    return bounds.of_paper(made.scenario, made.seed, made.settings).totals()
 
 
 def _fuse_port(
@@ -405,12 +431,15 @@ def _tell(
                 "counters": counters,
                 **(summary.as_json(scored.metrics) if scored else summary.no_metrics()),
                 "dead_reckoning": summary.figures(scored.baseline) if scored else None,
+                "bound": asdict(scored.bound) if scored and scored.bound else None,
             }
         )
         return
     output.print_last_pairs(f"{name}: {job.estimator}", estimates)
     if scored is not None:
         output.print_metrics(f"{name}: scored", scored.metrics, scored.baseline)
+        if scored.bound is not None:
+            output.print_bound(scored.bound)
     noted = {key: value for key, value in counters.items() if value}
     if noted:
         output.remark("counted: " + ", ".join(f"{k} {v:g}" for k, v in sorted(noted.items())))

@@ -17,6 +17,7 @@ import typer
 from relpos.errors import RelposError
 
 if TYPE_CHECKING:
+    from relpos.evaluation.bounds import Totals
     from relpos.evaluation.metrics import Metrics
     from relpos.fusion.estimator import Estimate
 
@@ -150,6 +151,20 @@ def print_metrics(title: str, metrics: Metrics, baseline: Metrics | None = None)
             f"distance RMSE, {plain(factor)} times the fusion's"
         )
     _print_over_time(console, metrics)
+
+
+def print_bound(bound: Totals) -> None:
+    """Print the least root mean square errors that any estimator could reach in this run."""
+    from rich.console import Console
+
+    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+    for what, distance, position in (
+        ("on line", bound.filtering_distance_m, bound.filtering_position_m),
+        ("smoothed", bound.smoothing_distance_m, bound.smoothing_position_m),
+    ):
+        console.print(
+            f"bound {what:<18} {metres(distance)} relative distance, {metres(position)} aligned"
+        )
 
 
 def print_last_pairs(title: str, estimates: Sequence[Estimate]) -> None:

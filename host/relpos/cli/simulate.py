@@ -27,7 +27,7 @@ def simulate(
     chosen = output.parse_settings(settings or [])
     if scenario == "lab":
         raise output.not_built_yet("the scenario lab")
-    from relpos.runs import Description, Run, save_run
+    from relpos.runs import Description, Run, Simulated, save_run
     from relpos.simulation.paper import simulate_paper
 
     simulated = simulate_paper(scenario, seed, chosen)
@@ -37,6 +37,7 @@ def simulate(
         # Everybody's heading at the start is given in the one frame of the rectangle.
         heading_known=any(math.isfinite(p.sigma_rad) for p in simulated.priors),
         priors=simulated.priors,
+        simulated=Simulated(scenario, seed, chosen),
     )
     run = Run(
         name=f"{scenario}-{seed}",

@@ -54,6 +54,29 @@ def make(
     raise RelposError(f"unknown estimator '{name}': one of {', '.join(SETTINGS)}")
 
 
+def make_smoother(
+    name: str,
+    priors: Sequence[Prior] = (),
+    settings: Mapping[str, object] | None = None,
+    seed: int = 0,
+) -> Estimator:
+    """Make a smoother of the whole run that begins from the online estimator ``name``.
+
+    It gives all its estimates at the end. An estimator whose estimates depend on the seed is run
+    ``SMOOTHER_ATTEMPTS`` times, so that one wrong turn of it does not decide.
+    """
+    from relpos.fusion.smoothing import Smoother
+
+    attempts = 1 if name == "deadreckoning" else SMOOTHER_ATTEMPTS
+    # The others' dice are far from what a user would choose as the next seed.
+    seeds = [seed + k * 1_000_003 for k in range(attempts)]
+    online, *others = (make(name, priors, settings, one) for one in seeds)
+    return Smoother(online, others, priors)
+
+
+SMOOTHER_ATTEMPTS = 4
+
+
 def settings_of(name: str) -> list[SettingInfo]:
     """List an estimator's settings, with defaults and bounds, for a help text."""
     if name not in SETTINGS:
@@ -73,5 +96,6 @@ __all__ = [
     "SettingInfo",
     "Shape",
     "make",
+    "make_smoother",
     "settings_of",
 ]

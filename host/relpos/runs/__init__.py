@@ -1,6 +1,6 @@
 """Run directories: how a recording comes in and an estimate goes out."""
 
-from relpos.runs.description import Description, InitialPose, NodeInfo
+from relpos.runs.description import Description, InitialPose, NodeInfo, Simulated
 from relpos.runs.estimates import read_estimates, write_estimates
 from relpos.runs.imu import ImuRecording
 from relpos.runs.run import Landmark, Run, load_run, save_run
@@ -12,6 +12,7 @@ __all__ = [
     "Landmark",
     "NodeInfo",
     "Run",
+    "Simulated",
     "load_run",
     "read_estimates",
     "save_run",

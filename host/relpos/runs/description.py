@@ -36,6 +36,15 @@ class NodeInfo:
 
 
 @dataclass(frozen=True)
+class Simulated:
+    """What made a simulated run: its scenario, seed and settings. For evaluation alone."""
+
+    scenario: str
+    seed: int
+    settings: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Description:
     """The content of ``run.toml``; ``priors`` are its ``[initial.NODE]`` tables."""
 
@@ -50,6 +59,8 @@ class Description:
     mount: str | None = None
     true_distance_m: float | None = None
     true_turn_deg: float | None = None
+    simulated: Simulated | None = None
+    """The ``[simulated]`` table: the bound of such a run can be computed."""
 
 
 _PLAIN_NUMBERS = ("stature_m", "sensor_height_m", "true_distance_m", "true_turn_deg")
@@ -102,6 +113,7 @@ def read_description(path: Path) -> Description:
         priors=tuple(sorted(priors, key=lambda prior: prior.node)),
         nodes=nodes,
         mount=reader.text(document, "mount"),
+        simulated=reader.simulated(document),
         **{key: reader.number(document, key) for key in _PLAIN_NUMBERS},
     )
 
@@ -125,6 +137,11 @@ def write_description(path: Path, description: Description) -> None:
             value = getattr(info, key)
             if value is not None:
                 lines.append(f"{key} = {_toml(value)}")
+    if description.simulated is not None:
+        made = description.simulated
+        lines += ["", "[simulated]", f"scenario = {_toml(made.scenario)}", f"seed = {made.seed}"]
+        lines += ["", "[simulated.settings]"] * bool(made.settings)
+        lines += [f"{key} = {_toml(value)}" for key, value in made.settings.items()]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -191,6 +208,22 @@ class _Reader:
             raise self._fail(where, key, value, "is not [forward, left]")
         forward, left = (self.needed_number({key: part}, key, where) for part in value)
         return forward, left
+
+    def simulated(self, document: Mapping[str, Any]) -> Simulated | None:
+        table = document.get("simulated")
+        if table is None:
+            return None
+        if not isinstance(table, dict):
+            raise self._fail("", "simulated", table, "is not a table")
+        scenario, seed = self.text(table, "scenario", "simulated."), table.get("seed")
+        if scenario is None:
+            raise DataError(f"{self._path}: key simulated.scenario is missing")
+        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+            raise self._fail("simulated.", "seed", seed, "is not a seed")
+        settings = table.get("settings", {})
+        if not isinstance(settings, dict):
+            raise self._fail("simulated.", "settings", settings, "is not a table")
+        return Simulated(scenario, seed, {key: str(value) for key, value in settings.items()})
 
     def tables(
         self, document: Mapping[str, Any], key: str
