@@ -81,10 +81,10 @@ class BankCore:
         self.x: Floats = np.zeros((count, 1))
         self.p: Floats = np.zeros((count, 1, 1))
         self.log_weight: Floats = np.zeros(count)
-        self.team, self.log_sigma2 = noise.draw_team(count, self.rng)
-        self.log_level: Floats = np.zeros((count, 0, noise.LEVELS))
-        self.level: Floats = np.exp(self.log_level)
-        self.sigma2: Floats = np.exp(self.log_sigma2)
+        self.levels = noise.Levels()
+        self.draw: Floats = self.rng.standard_normal((count, 1))
+        self.sens: Floats = np.zeros((count, 0, noise.LEVELS, 6))
+        self._spread_levels()
         self.has_constants: Floats = (
             self.rng.permutation(count) < round(settings.constants * count)
         ).astype(np.float64)
@@ -95,6 +95,7 @@ class BankCore:
         self.biases: dict[tuple[int, int], int] = {}
         """Pair of rows, the lower first -> place of its range bias in the state."""
         self.surprise: Floats = np.zeros(0)
+        self.doubtful: Floats = np.zeros(count)
         self.outlier_counts: Floats = np.array([settings.outliers, 1.0 - settings.outliers]) * 20.0
 
     # -- users ---------------------------------------------------------------------------------
@@ -124,15 +125,18 @@ class BankCore:
         self.x, self.p = x, p
         self.nodes += 1
         self.biases = {pair: place + PER_NODE for pair, place in self.biases.items()}
-        added = noise.draw_node(self.team, self.rng)
-        self.log_level = np.concatenate([self.log_level, added[:, None]], axis=1)
-        self.level = np.exp(self.log_level)
+        self.levels.add_node()
+        drawn = self.rng.standard_normal((count, noise.LEVELS))
+        self.draw = np.concatenate([self.draw[:, :-1], drawn, self.draw[:, -1:]], axis=1)
+        self.sens = np.concatenate([self.sens, np.zeros((count, 1, noise.LEVELS, 6))], axis=1)
+        self._spread_levels()
         self.surprise = np.append(self.surprise, 0.0)
         return row
 
     def remove(self, row: int) -> None:
         """Forget a user; the rows above it move down by one."""
         at = PER_NODE * row
+        self.nodes -= 1
         gone = [*range(at, at + PER_NODE), *(e for pair, e in self.biases.items() if row in pair)]
         keep = np.delete(np.arange(self.x.shape[1]), gone)
         self.x = np.ascontiguousarray(self.x[:, keep])
@@ -143,10 +147,11 @@ class BankCore:
             for (a, b), e in self.biases.items()
             if row not in (a, b)
         }
-        self.log_level = np.delete(self.log_level, row, axis=1)
-        self.level = np.exp(self.log_level)
+        self.levels.remove(row)
+        self.draw = np.delete(self.draw, noise.LEVELS * row + np.arange(noise.LEVELS), axis=1)
+        self.sens = np.ascontiguousarray(np.delete(self.sens, row, axis=1))
+        self._spread_levels()
         self.surprise = np.delete(self.surprise, row)
-        self.nodes -= 1
 
     def seed_hypotheses(self, poses: Floats, covariances: Floats, log_weights: Floats) -> None:
         """Replace all users' poses by start hypotheses.
@@ -214,23 +219,31 @@ class BankCore:
         told = np.full((len(rows), 3), np.nan) if sigmas is None else sigmas
         motion = np.empty((len(rows), 7))
         motion[:, 0], motion[:, 1], motion[:, 2], motion[:, 3] = dx_m, dy_m, dtheta_rad, duration_s
+        # Who reports nothing at all stands: no time passes for the heading.
+        motion[(motion[:, :3] == 0.0).all(axis=1), 3] = 0.0
         motion[:, 4:] = noise.motion_variances(dx_m, dy_m, dtheta_rad, duration_s, told)
         share = self.settings.sampled if self.count > 1 else 0.0
         drawn = self.rng.standard_normal((self.count, len(rows)))
-        joint.advance(self.x, self.p, self.level, rows, motion, drawn, share, CROSS)
+        joint.advance(self.x, self.p, self.level, self.sens, rows, motion, drawn, share, CROSS)
 
     def update(self, first: Indices, second: Indices, range_m: Floats, dz_m: Floats) -> Floats:
         """Work in the ranges (R,) of one instant; return each one's probability to be good."""
         bias = self._bias_places(first, second)
-        stats = np.empty((self.count, len(first), 3))
+        stats = np.empty((self.count, len(first), 11))
+        before = self.log_weight.copy()
         outlier = np.array([self.outlier_share, self.settings.outlier_m**2,
                             self.settings.outliers_short])  # fmt: skip
         joint.update(
-            self.x, self.p, self.log_weight, self.sigma2, first, second, bias, range_m, dz_m,
-            outlier, PER_NODE * self.nodes, stats,
+            self.x, self.p, self.log_weight, self.sigma2, self.sens, first, second, bias,
+            range_m, dz_m, outlier, PER_NODE * self.nodes, stats,
         )  # fmt: skip
         weight = self.weights()
-        good: Floats = weight @ stats[:, :, 0]
+        good: Floats = weight @ stats[:, :, 3]
+        self.counters["levels_clamped"] += self.levels.learn(
+            first, second, range_m, stats, before, (self.doubtful <= 0.0).astype(np.float64)
+        )
+        self.doubtful -= 1.0
+        self._spread_levels()
         self.outlier_counts *= 0.998 ** len(first)
         self.outlier_counts += (float((1.0 - good).sum()), float(good.sum()))
         for row, peer, trust in zip(first, second, good, strict=True):
@@ -305,25 +318,29 @@ class BankCore:
         """Draw hypotheses anew by their weights; levels of noise are jittered (Liu, West)."""
         chosen = systematic(weight, self.count, self.rng)
         self.x, self.p = self.x[chosen], self.p[chosen]
-        spread_level = _spread(self.log_level, weight)
-        spread_sigma2 = _spread(self.log_sigma2, weight)
         self._permute_parameters(chosen)
-        shape = self.log_level.shape
-        absent = self.log_level <= noise.ABSENT_LOG
-        jitter = JITTER * spread_level * self.rng.standard_normal(shape)
-        self.log_level = np.where(absent, self.log_level, self.log_level + jitter)
-        self.log_sigma2 = self.log_sigma2 + JITTER * spread_sigma2 * self.rng.standard_normal(
-            shape[0]
-        )
-        self.level, self.sigma2 = np.exp(self.log_level), np.exp(self.log_sigma2)
+        # Children of one parent part in their levels, too (Liu, West).
+        self.draw *= math.sqrt(1.0 - JITTER**2)
+        self.draw += JITTER * self.rng.standard_normal(self.draw.shape)
+        self._spread_levels()
         self.log_weight = np.zeros(self.count)
         self.counters["resampled"] += 1
 
     def _permute_parameters(self, chosen: Indices) -> None:
-        self.team, self.log_level = self.team[chosen], self.log_level[chosen]
-        self.log_sigma2 = self.log_sigma2[chosen]
+        self.draw, self.sens = self.draw[chosen], self.sens[chosen]
         self.has_constants, self.has_bias = self.has_constants[chosen], self.has_bias[chosen]
-        self.level, self.sigma2 = np.exp(self.log_level), np.exp(self.log_sigma2)
+        self.doubtful = self.doubtful[chosen]
+        self._spread_levels()
+
+    def _spread_levels(self) -> None:
+        """Give every hypothesis its draw of what is known of the levels."""
+        s = self.settings
+        sd = s.spread * np.sqrt(self.levels.covariance.diagonal())
+        log = self.levels.mean + np.minimum(sd, noise.SPREAD_MOST) * self.draw
+        every = np.exp(log)
+        self.level = every[:, :-1].reshape(self.count, self.nodes, noise.LEVELS)
+        self.level = np.ascontiguousarray(self.level)
+        self.sigma2 = np.ascontiguousarray(every[:, -1])
 
     def _jump(self) -> None:
         """Let some hypotheses doubt a user's pose; the more, the worse its ranges fit."""
@@ -334,6 +351,7 @@ class BankCore:
         rate = s.jumps / self.nodes + (s.jumps_most - s.jumps / self.nodes) * doubt
         total = float(rate.sum())
         which = np.flatnonzero(self.rng.random(self.count) < total)
+        self.doubtful[which] = DOUBT_UPDATES
         for k in which:
             row = int(self.rng.choice(self.nodes, p=rate / total))
             at = PER_NODE * row
@@ -354,8 +372,9 @@ class BankCore:
         """Copy everything."""
         return Snapshot(
             tuple(a.copy() for a in (
-                self.x, self.p, self.log_weight, self.team, self.log_level, self.log_sigma2,
-                self.has_constants, self.has_bias, self.surprise, self.outlier_counts,
+                self.x, self.p, self.log_weight, self.levels.mean, self.levels.covariance,
+                self.draw, self.sens, self.has_constants, self.has_bias, self.surprise,
+                self.outlier_counts, self.doubtful,
             )),
             self.rng.bit_generator.state,
             (self.nodes,),
@@ -366,14 +385,15 @@ class BankCore:
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot of this core; it can be restored again."""
         (
-            self.x, self.p, self.log_weight, self.team, self.log_level, self.log_sigma2,
-            self.has_constants, self.has_bias, self.surprise, self.outlier_counts,
+            self.x, self.p, self.log_weight, self.levels.mean, self.levels.covariance,
+            self.draw, self.sens, self.has_constants, self.has_bias, self.surprise,
+            self.outlier_counts, self.doubtful,
         ) = (a.copy() for a in snapshot.arrays)  # fmt: skip
-        self.level, self.sigma2 = np.exp(self.log_level), np.exp(self.log_sigma2)
         self.rng.bit_generator.state = dict(snapshot.random)
-        self.nodes = int(snapshot.numbers[0])
+        self.nodes = self.levels.nodes = int(snapshot.numbers[0])
         self.biases = dict(snapshot.biases)
         self.counters = Counter(snapshot.counters)
+        self._spread_levels()
 
 
 PAIR_BIASES = 6
@@ -386,16 +406,13 @@ CROSS = 0.04
 JITTER = 0.1
 """Standard deviation of the levels' jitter at resampling, in units of their spread."""
 
+DOUBT_UPDATES = 5.0
+"""For so many instants of ranges a hypothesis that has jumped teaches nothing about noise."""
+
 HEADING_OUTLIERS = 0.1
 HEADING_OUTLIER_RAD = 1.0
 HEADING_SIGMA_RAD = 0.17
 """Of an absolute heading that brings no sigma: magnetic ones indoors are 10 degrees off."""
-
-
-def _spread(values: Floats, weight: Floats) -> Floats:
-    mean = np.tensordot(weight, values, 1)
-    spread: Floats = np.sqrt(np.tensordot(weight, (values - mean) ** 2, 1))
-    return spread
 
 
 def systematic(weight: Floats, count: int, rng: np.random.Generator) -> Indices:

@@ -8,8 +8,8 @@ kernels work in place on arrays whose first axis is the hypothesis; their twins 
 Motion, with the heading's noise entering first (people turn, then move; a wearer's turn is
 measured before the step that it directs):
 
-    theta' = theta + w + drift dt/2,   p <- p + exp(scale) R(theta') (dx, dy),
-    theta  <- theta + w + dtheta + drift dt
+    theta' = theta + w - drift dt/2,   p <- p + exp(scale) R(theta') (dx, dy),
+    theta  <- theta + w + dtheta - drift dt
 
 Range, to second order. With rho^2 = |p_j - p_i|^2 + dz^2 and the relative covariance's parts
 along (a) and across (c) the line of sight, the moments of rho^2 give, without any clamp,
@@ -36,7 +36,12 @@ Indices = npt.NDArray[np.int64]
 
 
 class Of(IntEnum):
-    """A user's entries in the joint state: world metres, radians, rad/s, log(true/reported)."""
+    """A user's entries in the joint state: world metres, radians, and two constants.
+
+    ``DRIFT`` (rad/s) is what the reported heading gains over the true one while moving (a node
+    that reports nothing at all stands, and its heading with it), ``SCALE`` the logarithm of the
+    true over the reported length.
+    """
 
     X = 0
     Y = 1
@@ -53,11 +58,39 @@ _FAR = 9.0
 """Squared distance, in range variances, from which on noise of either sign is seen alike."""
 
 
+@inlined
+def _turn_sensitivity(t: Floats, east: float, north: float) -> None:
+    """Carry one 3 x 3 sensitivity (xx, xy, yy, xh, yh, hh) over a displacement."""
+    xh, yh, hh = t[3], t[4], t[5]
+    t[0] += north * (north * hh - 2.0 * xh)
+    t[1] += east * xh - north * yh - east * north * hh
+    t[2] += east * (east * hh + 2.0 * yh)
+    t[3] -= north * hh
+    t[4] += east * hh
+
+
+@inlined
+def _correct_sensitivity(t: Floats, hx: float, hy: float, kx: float, ky: float, kh: float) -> float:
+    """Carry one sensitivity over a range's update; return what it adds to the innovation's."""
+    ax = t[0] * hx + t[1] * hy
+    ay = t[1] * hx + t[2] * hy
+    ah = t[3] * hx + t[4] * hy
+    s: float = hx * ax + hy * ay
+    t[0] += kx * (s * kx - 2.0 * ax)
+    t[1] += s * kx * ky - kx * ay - ky * ax
+    t[2] += ky * (s * ky - 2.0 * ay)
+    t[3] += s * kx * kh - kx * ah - kh * ax
+    t[4] += s * ky * kh - ky * ah - kh * ay
+    t[5] += kh * (s * kh - 2.0 * ah)
+    return s
+
+
 @compiled
 def advance(
     x: Floats,
     p: Floats,
     level: Floats,
+    sens: Floats,
     rows: Indices,
     motion: Floats,
     sampled: Floats,
@@ -68,7 +101,9 @@ def advance(
 
     ``motion`` is dx, dy, dtheta, duration, and the variances' bases: along the way (m^2), of
     the turn (rad^2) and white in heading (rad^2); ``level`` (K, N, 3) multiplies these three
-    for each user. ``sampled`` (K, M) are standard normals: the share ``share`` of the heading's
+    for each user. ``sens`` (K, N, 3, 6) is how each user's own pose covariance (xx, xy, yy, xh,
+    yh, hh) changes with the logarithm of each of its levels; what leaks to others is left out.
+    ``sampled`` (K, M) are standard normals: the share ``share`` of the heading's
     variance is drawn, the rest goes into the covariance. ``cross`` is the variance across the
     way relative to that along it.
     """
@@ -85,12 +120,16 @@ def advance(
             b = _N * row
             bx, by, bh, bw, bs = b + _X, b + _Y, b + _H, b + _W, b + _S
             dx, dy, dt = motion[m, 0], motion[m, 1], motion[m, 3]
-            noise = motion[m, 5] * level[k, row, 1] + motion[m, 6] * level[k, row, 2]
+            turn = motion[m, 5] * level[k, row, 1]
+            white = motion[m, 6] * level[k, row, 2]
+            noise = turn + white
             if noise > 0.0:
+                sens[k, row, 1, 5] += turn
+                sens[k, row, 2, 5] += white
                 xk[bh] += sampled[k, m] * math.sqrt(share * noise)
                 pk[bh, bh] += (1.0 - share) * noise
             if dx != 0.0 or dy != 0.0:
-                at = xk[bh] + 0.5 * dt * xk[bw]
+                at = xk[bh] - 0.5 * dt * xk[bw]
                 c, s = math.cos(at), math.sin(at)
                 grow = math.exp(xk[bs])
                 east, north = grow * (c * dx - s * dy), grow * (s * dx + c * dy)
@@ -98,13 +137,15 @@ def advance(
                 xk[bx] += east
                 xk[by] += north
                 for q in range(size):
-                    turned = pk[bh, q] + half * pk[bw, q]
+                    turned = pk[bh, q] - half * pk[bw, q]
                     pk[bx, q] += east * pk[bs, q] - north * turned
                     pk[by, q] += north * pk[bs, q] + east * turned
                 for q in range(size):
-                    turned = pk[q, bh] + half * pk[q, bw]
+                    turned = pk[q, bh] - half * pk[q, bw]
                     pk[q, bx] += east * pk[q, bs] - north * turned
                     pk[q, by] += north * pk[q, bs] + east * turned
+                for part in range(3):
+                    _turn_sensitivity(sens[k, row, part], east, north)
                 square = east * east + north * north
                 along = motion[m, 4] * level[k, row, 0]
                 if square > _TINY:
@@ -113,12 +154,15 @@ def advance(
                     pk[by, by] += along * (nn + cross * ee)
                     pk[bx, by] += along * (1.0 - cross) * en
                     pk[by, bx] += along * (1.0 - cross) * en
-            xk[bh] += motion[m, 2] + dt * xk[bw]
-            if pk[bw, bw] > 0.0:
+                    sens[k, row, 0, 0] += along * (ee + cross * nn)
+                    sens[k, row, 0, 1] += along * (1.0 - cross) * en
+                    sens[k, row, 0, 2] += along * (nn + cross * ee)
+            xk[bh] += motion[m, 2] - dt * xk[bw]
+            if dt > 0.0 and pk[bw, bw] > 0.0:
                 for q in range(size):
-                    pk[bh, q] += dt * pk[bw, q]
+                    pk[bh, q] -= dt * pk[bw, q]
                 for q in range(size):
-                    pk[q, bh] += dt * pk[q, bw]
+                    pk[q, bh] -= dt * pk[q, bw]
 
 
 @inlined
@@ -152,6 +196,7 @@ def update(
     p: Floats,
     log_weight: Floats,
     sigma2: Floats,
+    sens: Floats,
     first: Indices,
     second: Indices,
     bias: Indices,
@@ -169,8 +214,9 @@ def update(
     range variance. ``outlier`` is the share, the variance
     (m^2) and the share of these that are too short. An innovation that may be an outlier's is
     used by its probability r of being none (probabilistic data association): the mean moves by
-    r K nu, the covariance keeps the spread between used and not used. ``stats`` (K, R, 3)
-    receives r, nu^2/S and the range's log evidence.
+    r K nu, the covariance keeps the spread between used and not used. ``stats`` (K, R, 11)
+    receives m, S, the range's log evidence, r, and by how much S grows with the logarithms of
+    the three levels of the first and of the second user and of the range variance (``sens``).
     """
     count, size = x.shape
     g = np.empty(size)
@@ -216,9 +262,19 @@ def update(
                 f = shrink * g[o]
                 for q in range(size):
                     pk[o, q] -= f * g[q]
-            stats[k, r, 0] = trust
-            stats[k, r, 1] = square / s
+            stats[k, r, 0] = measured[r] - innovation
+            stats[k, r, 1] = s
             stats[k, r, 2] = math.log(both)
+            stats[k, r, 3] = trust
+            kf = trust / s
+            for part in range(3):
+                stats[k, r, 4 + part] = _correct_sensitivity(
+                    sens[k, first[r], part], -gx, -gy, kf * g[bi], kf * g[bi + 1], kf * g[bi + 2]
+                )
+                stats[k, r, 7 + part] = _correct_sensitivity(
+                    sens[k, second[r], part], gx, gy, kf * g[bj], kf * g[bj + 1], kf * g[bj + 2]
+                )
+            stats[k, r, 10] = sigma2[k]
         log_weight[k] += total
 
 

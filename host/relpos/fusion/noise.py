@@ -2,9 +2,8 @@
 
 Noise has to be generic and is learned on line. A wearer's variances are three bases times three
 levels: along the way (m^2 per metre), of turns (rad^2 per radian turned) and white in heading
-(rad^2 per second of moving). Every hypothesis carries its own levels, drawn from a broad prior,
-and its own range sigma; the evidence of the ranges selects them (see ``bank.py``). A sort of
-heading noise may be absent altogether, so the prior has a spike there, shared by the team.
+(rad^2 per second of moving). :class:`Levels` learns them, and the range sigma, from the
+innovations; every hypothesis carries a draw of what is known of them.
 """
 
 from __future__ import annotations
@@ -14,47 +13,221 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion.compiled import compiled
+
 Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 
 ALONG_M2_M = 0.004
 """7 % of half a metre at each half metre; people and sensors spread over 3 to 25 %."""
 
-TURN_RAD2_RAD = 0.04
+TURN_RAD2_RAD = 0.05
 """15 degrees at a right angle."""
 
 WHITE_RAD2_S = math.radians(3.0) ** 2
 """3 degrees in a second's walking."""
 
+SLOW_RAD_S = 0.5
+"""Turning at this rate counts half as a turn."""
+
 LEVELS = 3
 ALONG, TURN, WHITE = range(LEVELS)
 
-TEAM_SD = np.array([0.6, 0.8, 0.8])
-OWN_SD = np.array([1.0, 0.8, 0.8])
-"""Standard deviations of log variance: common to the team, and each wearer's own."""
+PRIOR = np.array([0.0, 0.0, -1.0])
+TEAM_SD = np.array([0.6, 1.2, 1.5])
+OWN_SD = np.array([0.9, 0.9, 0.9])
+"""Prior of log variances: mean, and standard deviations of what is common to the team and of
+what is each wearer's own."""
 
-ABSENT = np.array([0.0, 0.3, 0.5])
-"""Probability that the team has none of a sort of noise."""
+RANGE_SIGMA_M = 0.3
+RANGE_SD = 1.2
+"""Prior of the range sigma, and the standard deviation of its log variance."""
 
-ABSENT_LOG = -6.0
-"""What "none" means: a twentieth of the standard deviation."""
+SPREAD_MOST = 0.7
+"""Hypotheses' log levels are drawn at most so far apart."""
 
-RANGE_SIGMA_M = (0.05, 1.5)
-"""The range sigma's prior is log-uniform between these."""
+LOWEST, HIGHEST = -8.0, 6.0
+"""Log levels are kept within these (counted): a fiftieth to twenty times the base."""
+
+RANDOM_WALK = 1e-4
+"""Variance by which a log level may change in an epoch: a third of an sd in an hour."""
+
+OUTLYING = 1e-3
+"""Likelihood of an innovation that fits nothing, relative to one that fits exactly."""
+
+LEAST_SHARE = 0.1
+"""Innovations teach only where the levels explain at least this share of their variance."""
+
+POINTS, REACH = 15, 3.5
+"""The posterior along one direction is integrated at so many points over so many deviations."""
+
+REST_VARIANCE = 25.0
+"""What no level explains of S (unknown constants, starts, jumps) is known this badly (log)."""
 
 
-def draw_team(count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Give log levels (count, 3) common to the team and log range variances (count,)."""
-    levels = rng.standard_normal((count, LEVELS)) * TEAM_SD
-    levels[rng.random((count, LEVELS)) < ABSENT] = ABSENT_LOG
-    low, high = (2.0 * math.log(s) for s in RANGE_SIGMA_M)
-    place = (rng.permutation(count) + rng.random(count)) / count
-    return levels, low + (high - low) * place
+class Levels:
+    """What is known of all log levels together: a Gaussian, learned from innovations.
+
+    The levels theta of N users and the log range variance, ``mean`` (3 N + 1,) with
+    ``covariance``, the range variance last. A range's innovation nu is Gaussian with the
+    mixture's variance S, whose sensitivities r = dlog S / dtheta ``joint.update`` carries along.
+    Only r . theta is touched by it: the posterior of this one number is integrated and the rest
+    follows by regression (assumed density filtering). An expansion to first order
+    (E[nu^2/S - 1] = r . (theta_true - theta), with variance 2) is overconfident after a few
+    small innovations and then stays where it is.
+    """
+
+    def __init__(self) -> None:
+        self.nodes = 0
+        self.mean: Floats = np.array([2.0 * math.log(RANGE_SIGMA_M)])
+        self.covariance: Floats = np.array([[RANGE_SD**2]])
+
+    def add_node(self) -> None:
+        """Add a user: correlated with the others by what is common to the team."""
+        old = LEVELS * self.nodes
+        keep = np.r_[0:old, old + LEVELS]
+        covariance = np.zeros((old + LEVELS + 1, old + LEVELS + 1))
+        mean = np.empty(old + LEVELS + 1)
+        covariance[np.ix_(keep, keep)] = self.covariance
+        mean[keep] = self.mean
+        for level in range(LEVELS):
+            at = old + level
+            mean[at] = PRIOR[level]
+            share = TEAM_SD[level] ** 2 / (TEAM_SD[level] ** 2 + OWN_SD[level] ** 2)
+            others = np.arange(level, old, LEVELS)
+            if others.size:
+                # The new one is like the others' common part: a regression on their mean.
+                weight = share / (1.0 - share + share * others.size)
+                row = weight * covariance[others].sum(axis=0)
+                mean[at] += weight * float((mean[others] - PRIOR[level]).sum())
+                rest = TEAM_SD[level] ** 2 * (1.0 - weight * others.size) + OWN_SD[level] ** 2
+                covariance[at] += row
+                covariance[:, at] += row
+                covariance[at, at] = weight * float(row[others].sum()) + rest
+            else:
+                covariance[at, at] = TEAM_SD[level] ** 2 + OWN_SD[level] ** 2
+        self.mean, self.covariance = mean, covariance
+        self.nodes += 1
+
+    def remove(self, row: int) -> None:
+        """Forget a user."""
+        gone = LEVELS * row + np.arange(LEVELS)
+        self.mean = np.delete(self.mean, gone)
+        self.covariance = np.delete(np.delete(self.covariance, gone, 0), gone, 1)
+        self.nodes -= 1
+
+    def learn(self, first: Indices, second: Indices, measured: Floats, stats: Floats,
+              log_weight: Floats, quiet: Floats) -> int:  # fmt: skip
+        """Learn from ranges (R,); return how many levels had to be clamped.
+
+        ``stats`` (K, R, 11) are of ``joint.update``, ``log_weight`` (K,) from before it;
+        hypotheses with ``quiet`` (K,) 0 have jumped of late and do not count.
+        """
+        return learn(self.mean, self.covariance, first, second, measured, stats, log_weight, quiet)
 
 
-def draw_node(team: Floats, rng: np.random.Generator) -> Floats:
-    """Give one more node's log levels (K, 3), from its team's (K, 3)."""
-    own = team + rng.standard_normal(team.shape) * OWN_SD
-    return np.where(team <= ABSENT_LOG, team, own)
+@compiled
+def learn(
+    mean: Floats,
+    covariance: Floats,
+    first: Indices,
+    second: Indices,
+    measured: Floats,
+    stats: Floats,
+    log_weight: Floats,
+    quiet: Floats,
+) -> int:
+    """See :meth:`Levels.learn`; works in place."""
+    count = stats.shape[0]
+    size = mean.shape[0]
+    weight = np.exp(log_weight - log_weight.max()) * quiet
+    if weight.sum() <= 0.0:
+        return 0
+    weight /= weight.sum()
+    slope = np.empty(7)
+    place = np.empty(7, dtype=np.int64)
+    gain = np.empty(size)
+    for q in range(size):
+        covariance[q, q] += RANDOM_WALK
+    for n in range(measured.shape[0]):
+        middle = 0.0
+        for k in range(count):
+            middle += weight[k] * stats[k, n, 0]
+        variance = 0.0
+        trust = 0.0
+        total = 0.0
+        peak = -np.inf
+        slope[:] = 0.0
+        for k in range(count):
+            off = stats[k, n, 0] - middle
+            variance += weight[k] * (stats[k, n, 1] + off * off)
+            for q in range(7):
+                slope[q] += weight[k] * stats[k, n, 4 + q]
+            if weight[k] > 0.0:
+                peak = max(peak, stats[k, n, 2])
+        for k in range(count):
+            weight[k] *= math.exp(stats[k, n, 2] - peak)
+            total += weight[k]
+        if total <= 0.0:
+            return 0
+        for k in range(count):
+            weight[k] /= total
+            trust += weight[k] * stats[k, n, 3]
+        # S is homogeneous in all variances, so its sensitivities cannot sum to more than it is;
+        # they may, where knowledge leaked from users that ``sens`` does not follow.
+        explained = 0.0
+        for q in range(6):
+            explained += slope[q]
+        if explained > variance - slope[6]:
+            for q in range(6):
+                slope[q] *= (variance - slope[6]) / explained
+            explained = variance - slope[6]
+        innovation = measured[n] - middle
+        for q in range(3):
+            place[q] = LEVELS * first[n] + q
+            place[3 + q] = LEVELS * second[n] + q
+        place[6] = size - 1
+        own = (explained + slope[6]) / variance
+        if own < LEAST_SHARE:
+            continue
+        rest = max(1.0 - own, 0.0)
+        power = trust / (1.0 + 0.5 * REST_VARIANCE * rest * rest)
+        # theta moves along C r; t is its common shift, S(t) = S ((1 - own) + own exp t).
+        before = 0.0
+        for o in range(size):
+            gain[o] = 0.0
+            for q in range(7):
+                gain[o] += covariance[o, place[q]] * slope[q] / variance
+        for q in range(7):
+            before += slope[q] / variance * gain[place[q]]
+        sd = math.sqrt(before) / own
+        square = innovation * innovation / variance
+        mass = 0.0
+        shift = 0.0
+        second_moment = 0.0
+        for q in range(POINTS):
+            z = REACH * (2.0 * q / (POINTS - 1.0) - 1.0)
+            ratio = rest + own * math.exp(z * sd)
+            log = math.log(math.exp(-0.5 * square / ratio) / math.sqrt(ratio) + OUTLYING)
+            density = math.exp(power * log - 0.5 * z * z)
+            mass += density
+            shift += density * z
+            second_moment += density * z * z
+        shift /= mass
+        # Of a unit variance in z; an update that would widen it leaves it (multimodal posterior).
+        after = min(second_moment / mass - shift * shift, 1.0)
+        scale = shift * sd * own / before
+        shrink = (1.0 - after) / before
+        for o in range(size):
+            mean[o] += gain[o] * scale
+            for q in range(size):
+                covariance[o, q] -= shrink * gain[o] * gain[q]
+    clamped = 0
+    for o in range(size):
+        bounded = min(max(mean[o], LOWEST), HIGHEST)
+        clamped += bounded != mean[o]
+        mean[o] = bounded
+    return clamped
 
 
 def motion_variances(
@@ -69,7 +242,9 @@ def motion_variances(
     moving = (way > 0.0) | (dtheta != 0.0)
     base = np.empty((len(way), LEVELS))
     base[:, ALONG] = ALONG_M2_M * way
-    base[:, TURN] = TURN_RAD2_RAD * np.abs(dtheta)
+    # A turn is what turns fast: slow changes of the heading are mostly its white noise.
+    size = np.abs(dtheta)
+    base[:, TURN] = TURN_RAD2_RAD * size * size / (size + SLOW_RAD_S * duration + 1e-12)
     base[:, WHITE] = WHITE_RAD2_S * duration * moving
     told = ~np.isnan(sigmas)
     if told.any():
