@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from relpos.evaluation.metrics import Metrics
     from relpos.fusion.estimator import Estimate, Estimator
     from relpos.measurements import Observation, Prior
-    from relpos.runs import Run
+    from relpos.runs import NodeInfo, Run
 
 
 GATHER_S = 3.0
@@ -137,13 +137,15 @@ class Job:
     out: Path
     smooth: bool = False
 
-    def make(self, priors: Sequence[Prior]) -> Estimator:
+    def make(
+        self, priors: Sequence[Prior], nodes: Mapping[int, NodeInfo] | None = None
+    ) -> Estimator:
         """Make the wanted estimator; RelposError where a setting does not fit it."""
         from relpos import fusion
 
         if self.smooth:
-            return fusion.make_smoother(self.estimator, priors, self.settings, self.seed)
-        return fusion.make(self.estimator, priors, self.settings, self.seed)
+            return fusion.make_smoother(self.estimator, priors, self.settings, self.seed, nodes)
+        return fusion.make(self.estimator, priors, self.settings, self.seed, nodes)
 
 
 @dataclass
@@ -209,7 +211,7 @@ def fuse_recording(
     from relpos.runs import write_estimates
 
     _check_usable(run, job.estimator)
-    estimator = job.make(priors)
+    estimator = job.make(priors, run.nodes)
     outcome = _pass_through(
         estimator, output.with_progress(run.measurements, len(run.measurements), "fusing")
     )

@@ -18,6 +18,7 @@ from relpos.fusion.estimator import (
     Shape,
 )
 from relpos.fusion.particle import ParticleFilter, ParticleSettings
+from relpos.fusion.ranging_model import Mounting
 from relpos.fusion.settings import SettingInfo, describe, parse
 from relpos.measurements import Prior
 
@@ -34,11 +35,13 @@ def make(
     priors: Sequence[Prior] = (),
     settings: Mapping[str, object] | None = None,
     seed: int = 0,
+    nodes: Mapping[int, Mounting] | None = None,
 ) -> Estimator:
     """Make an estimator by its name, from ``--set`` keys and values.
 
-    Nodes without a prior start unknown. RelposError for an unknown name or key and for a value
-    that is out of range.
+    Nodes without a prior start unknown. ``nodes`` tells how each is worn (``run.nodes``): the
+    bank uses heights and antenna offsets, the other two are as the paper has them. RelposError
+    for an unknown name or key and for a value that is out of range.
     """
     given = settings or {}
     match str(name):
@@ -46,7 +49,7 @@ def make(
             # Kernels are only loaded where they are used: help texts stay quick.
             from relpos.fusion.bank import Bank
 
-            return Bank(priors, parse(BankSettings, given, "bank"), seed)
+            return Bank(priors, parse(BankSettings, given, "bank"), seed, nodes or {})
         case "particle":
             return ParticleFilter(priors, parse(ParticleSettings, given, "particle"), seed)
         case "deadreckoning":
@@ -59,6 +62,7 @@ def make_smoother(
     priors: Sequence[Prior] = (),
     settings: Mapping[str, object] | None = None,
     seed: int = 0,
+    nodes: Mapping[int, Mounting] | None = None,
 ) -> Estimator:
     """Make a smoother of the whole run that begins from the online estimator ``name``.
 
@@ -70,7 +74,7 @@ def make_smoother(
     attempts = 1 if name == "deadreckoning" else SMOOTHER_ATTEMPTS
     # The others' dice are far from what a user would choose as the next seed.
     seeds = [seed + k * 1_000_003 for k in range(attempts)]
-    online, *others = (make(name, priors, settings, one) for one in seeds)
+    online, *others = (make(name, priors, settings, one, nodes) for one in seeds)
     return Smoother(online, others, priors)
 
 

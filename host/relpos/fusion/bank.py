@@ -33,6 +33,7 @@ from relpos.fusion.estimator import (
     Parameter,
 )
 from relpos.fusion.joint import PER_NODE, Of
+from relpos.fusion.ranging_model import Mounting, Repetition
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.starts import Found, Mixture, Starts
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
@@ -78,6 +79,8 @@ class BankCore:
         self.counters: Counter[str] = Counter()
         count = settings.hypotheses
         self.nodes = 0
+        self.arm: Floats = np.zeros((0, 2))
+        """Each user's antenna, (forward, left) of its pose, metres."""
         self.x: Floats = np.zeros((count, 1))
         self.p: Floats = np.zeros((count, 1, 1))
         self.log_weight: Floats = np.zeros(count)
@@ -106,9 +109,16 @@ class BankCore:
         return int(self.x.shape[0])
 
     def add_node(
-        self, x_m: float, y_m: float, heading_rad: float, sigma_m: float, sigma_rad: float
+        self,
+        x_m: float,
+        y_m: float,
+        heading_rad: float,
+        sigma_m: float,
+        sigma_rad: float,
+        arm_m: tuple[float, float] = (0.0, 0.0),
     ) -> int:
         """Add a user with a Gaussian prior, independent of the others; return its row."""
+        self.arm = np.concatenate([self.arm, np.array([arm_m])])
         count, old = self.x.shape
         row = self.nodes
         at = PER_NODE * row
@@ -152,6 +162,7 @@ class BankCore:
         self.sens = np.ascontiguousarray(np.delete(self.sens, row, axis=1))
         self._spread_levels()
         self.surprise = np.delete(self.surprise, row)
+        self.arm = np.delete(self.arm, row, axis=0)
 
     def seed_hypotheses(self, poses: Floats, covariances: Floats, log_weights: Floats) -> None:
         """Replace all users' poses by start hypotheses.
@@ -226,21 +237,36 @@ class BankCore:
         drawn = self.rng.standard_normal((self.count, len(rows)))
         joint.advance(self.x, self.p, self.level, self.sens, rows, motion, drawn, share, CROSS)
 
-    def update(self, first: Indices, second: Indices, range_m: Floats, dz_m: Floats) -> Floats:
-        """Work in the ranges (R,) of one instant; return each one's probability to be good."""
+    def update(
+        self,
+        first: Indices,
+        second: Indices,
+        range_m: Floats,
+        dz_m: Floats,
+        dz_variance_m2: Floats | None = None,
+        worth: Floats | None = None,
+    ) -> Floats:
+        """Work in the ranges (R,) of one instant; return each one's probability to be good.
+
+        ``dz_m`` are the antennas' differences of height, ``dz_variance_m2`` their variances (0
+        by default), ``worth`` how many independent ranges each is worth (1 by default).
+        """
         bias = self._bias_places(first, second)
+        worth = np.ones(len(first)) if worth is None else worth
         stats = np.empty((self.count, len(first), 11))
         before = self.log_weight.copy()
         outlier = np.array([self.outlier_share, self.settings.outlier_m**2,
                             self.settings.outliers_short])  # fmt: skip
         joint.update(
             self.x, self.p, self.log_weight, self.sigma2, self.sens, first, second, bias,
-            range_m, dz_m, outlier, PER_NODE * self.nodes, stats,
+            range_m, dz_m, outlier, PER_NODE * self.nodes, worth,
+            np.zeros(len(first)) if dz_variance_m2 is None else dz_variance_m2,
+            self.arm if self.arm.any() else self.arm[:0], stats,
         )  # fmt: skip
         weight = self.weights()
         good: Floats = weight @ stats[:, :, 3]
         self.counters["levels_clamped"] += self.levels.learn(
-            first, second, range_m, stats, before, (self.doubtful <= 0.0).astype(np.float64)
+            first, second, range_m, stats, before, (self.doubtful <= 0.0).astype(np.float64), worth
         )
         self.doubtful -= 1.0
         self._spread_levels()
@@ -374,7 +400,7 @@ class BankCore:
             tuple(a.copy() for a in (
                 self.x, self.p, self.log_weight, self.levels.mean, self.levels.covariance,
                 self.draw, self.sens, self.has_constants, self.has_bias, self.surprise,
-                self.outlier_counts, self.doubtful,
+                self.outlier_counts, self.doubtful, self.arm,
             )),
             self.rng.bit_generator.state,
             (self.nodes,),
@@ -387,7 +413,7 @@ class BankCore:
         (
             self.x, self.p, self.log_weight, self.levels.mean, self.levels.covariance,
             self.draw, self.sens, self.has_constants, self.has_bias, self.surprise,
-            self.outlier_counts, self.doubtful,
+            self.outlier_counts, self.doubtful, self.arm,
         ) = (a.copy() for a in snapshot.arrays)  # fmt: skip
         self.rng.bit_generator.state = dict(snapshot.random)
         self.nodes = self.levels.nodes = int(snapshot.numbers[0])
@@ -428,6 +454,8 @@ def systematic(weight: Floats, count: int, rng: np.random.Generator) -> Indices:
 class _Known:
     """What is kept of a node beside its hypotheses."""
 
+    worn_m: float = 0.0
+    """Height of the tag over the floor at the start."""
     height_m: float = 0.0
     sigma_height_m: float = 0.0
     news_s: float = -math.inf
@@ -440,6 +468,7 @@ class _State:
 
     core: Snapshot
     detection: Detection
+    repetition: Repetition
     row: dict[int, int]
     known: dict[int, _Known]
     pending: list[Advance]
@@ -461,8 +490,10 @@ class Bank:
     priors: Sequence[Prior] = ()
     settings: BankSettings = field(default_factory=BankSettings)
     seed: int = 0
+    mounting: Mapping[int, Mounting] = field(default_factory=dict)
     core: BankCore = field(init=False)
     detection: Detection = field(default_factory=Detection)
+    repetition: Repetition = field(default_factory=Repetition)
     _feed: Rewinder = field(init=False)
     starts: Starts = field(init=False)
     _row: dict[int, int] = field(default_factory=dict)
@@ -484,10 +515,10 @@ class Bank:
         for p in sorted(self.priors, key=lambda p: p.node):
             if p.node in self._known:
                 raise RelposError(f"node {p.node} has two initial poses")
-            self._known[p.node] = _Known()
+            self._meet(p.node)
             if math.isfinite(p.sigma_m) and math.isfinite(p.sigma_rad):
                 self._row[p.node] = self.core.add_node(
-                    p.x_m, p.y_m, p.heading_rad, p.sigma_m, p.sigma_rad
+                    p.x_m, p.y_m, p.heading_rad, p.sigma_m, p.sigma_rad, self._arm(p.node)
                 )
             else:
                 self.starts.meet(
@@ -527,6 +558,7 @@ class Bank:
                 self._moved = True
                 known = self._meet(step.node)
                 known.news_s = max(known.news_s, step.time_s)
+                self.repetition.move(step.node, step.dx_m, step.dy_m, step.dtheta_rad)
                 if step.node in self._row:
                     self._pending.append(step)
                 else:
@@ -547,7 +579,8 @@ class Bank:
     def snapshot(self) -> _State:
         """Copy everything that ``take`` changes."""
         return _State(
-            self.core.snapshot(), self.detection.snapshot(), self._row.copy(),
+            self.core.snapshot(), self.detection.snapshot(), self.repetition.snapshot(),
+            self._row.copy(),
             {node: copy(known) for node, known in self._known.items()}, self._pending[:],
             self._own.copy(), self._moved, self._ranges_used, self._epoch_s,
             self.starts.snapshot(),
@@ -557,6 +590,7 @@ class Bank:
         """Be as at the time of the snapshot."""
         self.core.restore(snapshot.core)
         self.detection = snapshot.detection.snapshot()
+        self.repetition = snapshot.repetition.snapshot()
         self._row = snapshot.row.copy()
         self._known = {node: copy(known) for node, known in snapshot.known.items()}
         self._pending, self._own = snapshot.pending[:], snapshot.own.copy()
@@ -568,7 +602,14 @@ class Bank:
         known = self._known.get(node)
         if known is None:
             known = self._known[node] = _Known()
+            worn = self.mounting.get(node)
+            if worn is not None and worn.height_m is not None:
+                known.worn_m = known.height_m = worn.height_m
         return known
+
+    def _arm(self, node: int) -> tuple[float, float]:
+        worn = self.mounting.get(node)
+        return (0.0, 0.0) if worn is None else worn.antenna_offset_m or (0.0, 0.0)
 
     def _advance(self) -> None:
         """Work off the displacements since the last time."""
@@ -598,8 +639,17 @@ class Bank:
         ranges = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
         silence = self._silence(step)
         if ranges:
-            first, second, dz = self._pairs([(r.node, r.peer) for r in ranges])
-            self.core.update(first, second, np.array([r.range_m for r in ranges]), dz)
+            pairs = [(r.node, r.peer) for r in ranges]
+            variance = np.array(
+                [
+                    self._known[a].sigma_height_m ** 2 + self._known[b].sigma_height_m ** 2
+                    for a, b in pairs
+                ]
+            )
+            first, second, dz = self._pairs(pairs)
+            measured = np.array([r.range_m for r in ranges])
+            worth = self.repetition.worth(pairs)
+            self.core.update(first, second, measured, dz, variance, worth)
             self._ranges_used += len(ranges)
         if silence is not None:
             self.core.log_weight += silence
@@ -667,7 +717,7 @@ class Bank:
         measured = step.measurement
         if isinstance(measured, Height):
             known = self._known[measured.node]
-            known.height_m = measured.height_m
+            known.height_m = known.worn_m + measured.height_m
             known.sigma_height_m = measured.sigma_m or 0.0
         elif isinstance(measured, Heading) and measured.node in self._row:
             self._advance()

@@ -191,6 +191,54 @@ def _predict_range(
 
 
 @compiled
+def _range_by_arms(
+    xk: Floats,
+    pk: Floats,
+    bi: int,
+    bj: int,
+    dz: float,
+    arm_i: Floats,
+    arm_j: Floats,
+    size: int,
+    east: Floats,
+    north: Floats,
+    g: Floats,
+) -> tuple[float, float, float, float]:
+    """As ``_predict_range`` between antennas off their poses; ``g`` (D,) gets P h.
+
+    An antenna at o = R(theta) arm moves by (-o_y, o_x) per radian of heading, so the heading has
+    a share in the line of sight. ``east`` and ``north`` (D,) are working space.
+    """
+    ci, si = math.cos(xk[bi + _H]), math.sin(xk[bi + _H])
+    cj, sj = math.cos(xk[bj + _H]), math.sin(xk[bj + _H])
+    xi, yi = ci * arm_i[0] - si * arm_i[1], si * arm_i[0] + ci * arm_i[1]
+    xj, yj = cj * arm_j[0] - sj * arm_j[1], sj * arm_j[0] + cj * arm_j[1]
+    ux = xk[bj] + xj - xk[bi] - xi
+    uy = xk[bj + 1] + yj - xk[bi + 1] - yi
+    hi, hj = bi + _H, bj + _H
+    for q in range(size):
+        east[q] = pk[bj, q] - pk[bi, q] - yj * pk[hj, q] + yi * pk[hi, q]
+        north[q] = pk[bj + 1, q] - pk[bi + 1, q] + xj * pk[hj, q] - xi * pk[hi, q]
+    xx = east[bj] - east[bi] - yj * east[hj] + yi * east[hi]
+    yy = north[bj + 1] - north[bi + 1] + xj * north[hj] - xi * north[hi]
+    xy = north[bj] - north[bi] - yj * north[hj] + yi * north[hi]
+    flat2 = ux * ux + uy * uy
+    a = (
+        (ux * ux * xx + 2.0 * ux * uy * xy + uy * uy * yy) / flat2
+        if flat2 > _TINY
+        else 0.5 * (xx + yy)
+    )
+    c = xx + yy - a
+    tilt = dz * dz / (flat2 + dz * dz + _TINY)
+    m2 = flat2 + dz * dz + c + tilt * a
+    m = math.sqrt(m2) + _TINY
+    v = (a * flat2 + 0.5 * (c * c + tilt * tilt * a * a)) / (m2 + _TINY)
+    for q in range(size):
+        g[q] = (ux * east[q] + uy * north[q]) / m
+    return m, v, ux / m, uy / m
+
+
+@compiled
 def update(
     x: Floats,
     p: Floats,
@@ -204,6 +252,9 @@ def update(
     dz: Floats,
     outlier: Floats,
     poses: int,
+    worth: Floats,
+    dz_variance: Floats,
+    arms: Floats,
     stats: Floats,
 ) -> None:
     """Work in ranges (R,) one after another; each hypothesis' log weight gets their evidence.
@@ -214,12 +265,20 @@ def update(
     range variance. ``outlier`` is the share, the variance
     (m^2) and the share of these that are too short. An innovation that may be an outlier's is
     used by its probability r of being none (probabilistic data association): the mean moves by
-    r K nu, the covariance keeps the spread between used and not used. ``stats`` (K, R, 11)
-    receives m, S, the range's log evidence, r, and by how much S grows with the logarithms of
-    the three levels of the first and of the second user and of the range variance (``sens``).
+    r K nu, the covariance keeps the spread between used and not used.
+
+    ``worth`` (R,) is how many independent ranges one is worth: the variance that the gain sees is
+    divided by it, the evidence multiplied. ``dz_variance`` (R,) is the variance of ``dz``.
+    ``arms`` (N, 2) are the antennas' places (forward, left) of the poses, or empty (0, 2) where
+    all are zero. ``stats`` (K, R, 11) receives m, S, the range's log evidence, r, and by how much
+    S grows with the logarithms of the three levels of the first and of the second user and of the
+    range variance (``sens``).
     """
     count, size = x.shape
     g = np.empty(size)
+    east = np.empty(size)
+    north = np.empty(size)
+    lever = arms.shape[0] > 0
     share, wide, short = outlier[0], outlier[1], outlier[2]
     for k in range(count):
         xk = x[k]
@@ -231,19 +290,22 @@ def update(
             size = poses
         for r in range(first.shape[0]):
             bi, bj, e = _N * first[r], _N * second[r], bias[r] if biased else -1
-            m, v, gx, gy = _predict_range(xk, pk, bi, bj, dz[r])
+            if lever:
+                m, v, gx, gy = _range_by_arms(
+                    xk, pk, bi, bj, dz[r], arms[first[r]], arms[second[r]], size, east, north, g
+                )
+            else:
+                m, v, gx, gy = _predict_range(xk, pk, bi, bj, dz[r])
+                for q in range(size):
+                    g[q] = gx * (pk[bj, q] - pk[bi, q]) + gy * (pk[bj + 1, q] - pk[bi + 1, q])
+            v += dz[r] * dz[r] / (m * m) * dz_variance[r]
             innovation = measured[r] - m
             # No range is negative: between two who stand together noise alone looks like a bias.
             if e >= 0 and m * m > _FAR * sigma2[k]:
                 innovation -= xk[e]
+                v += 2.0 * g[e] + pk[e, e]
                 for q in range(size):
-                    g[q] = (
-                        gx * (pk[bj, q] - pk[bi, q]) + gy * (pk[bj + 1, q] - pk[bi + 1, q])
-                    ) + pk[e, q]
-                v += g[e] + gx * (pk[bj, e] - pk[bi, e]) + gy * (pk[bj + 1, e] - pk[bi + 1, e])
-            else:
-                for q in range(size):
-                    g[q] = gx * (pk[bj, q] - pk[bi, q]) + gy * (pk[bj + 1, q] - pk[bi + 1, q])
+                    g[q] += pk[e, q]
             s = v + sigma2[k]
             square = innovation * innovation
             good = (1.0 - share) * math.exp(-0.5 * square / s) / math.sqrt(s)
@@ -253,9 +315,10 @@ def update(
             # Where both vanish, it is certainly no good one.
             both = good + bad + 1e-300
             trust = good / both
-            total += math.log(both)
-            scaled = trust * innovation / s
-            shrink = trust / s * (1.0 - (1.0 - trust) * square / s)
+            total += worth[r] * math.log(both)
+            heavy = v + sigma2[k] / worth[r]
+            scaled = trust * innovation / heavy
+            shrink = trust / heavy * (1.0 - (1.0 - trust) * square / heavy)
             for q in range(size):
                 xk[q] += scaled * g[q]
             for o in range(size):
@@ -266,7 +329,7 @@ def update(
             stats[k, r, 1] = s
             stats[k, r, 2] = math.log(both)
             stats[k, r, 3] = trust
-            kf = trust / s
+            kf = trust / heavy
             for part in range(3):
                 stats[k, r, 4 + part] = _correct_sensitivity(
                     sens[k, first[r], part], -gx, -gy, kf * g[bi], kf * g[bi + 1], kf * g[bi + 2]

@@ -117,13 +117,16 @@ class Levels:
         self.nodes -= 1
 
     def learn(self, first: Indices, second: Indices, measured: Floats, stats: Floats,
-              log_weight: Floats, quiet: Floats) -> int:  # fmt: skip
+              log_weight: Floats, quiet: Floats, worth: Floats) -> int:  # fmt: skip
         """Learn from ranges (R,); return how many levels had to be clamped.
 
         ``stats`` (K, R, 11) are of ``joint.update``, ``log_weight`` (K,) from before it;
-        hypotheses with ``quiet`` (K,) 0 have jumped of late and do not count.
+        hypotheses with ``quiet`` (K,) 0 have jumped of late and do not count. ``worth`` (R,) is
+        how many independent ranges each is worth.
         """
-        return learn(self.mean, self.covariance, first, second, measured, stats, log_weight, quiet)
+        return learn(
+            self.mean, self.covariance, first, second, measured, stats, log_weight, quiet, worth
+        )  # fmt: skip
 
 
 @compiled
@@ -136,6 +139,7 @@ def learn(
     stats: Floats,
     log_weight: Floats,
     quiet: Floats,
+    worth: Floats,
 ) -> int:
     """See :meth:`Levels.learn`; works in place."""
     count = stats.shape[0]
@@ -191,7 +195,7 @@ def learn(
         if own < LEAST_SHARE:
             continue
         rest = max(1.0 - own, 0.0)
-        power = trust / (1.0 + 0.5 * REST_VARIANCE * rest * rest)
+        power = worth[n] * trust / (1.0 + 0.5 * REST_VARIANCE * rest * rest)
         # theta moves along C r; t is its common shift, S(t) = S ((1 - own) + own exp t).
         before = 0.0
         for o in range(size):
