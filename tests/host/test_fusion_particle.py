@@ -3,32 +3,69 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from relpos import fusion
 from relpos.errors import RelposError
+from relpos.fusion import particle_kernels as kernels
 from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.fusion.motion_model import MotionNoise, predict
-from relpos.fusion.particle import (
-    Sight,
-    correct,
-    dual_step,
-    effective_size,
-    log_density,
-    multinomial,
-    systematic,
-)
+from relpos.fusion.particle import effective_size, systematic
 from relpos.fusion.ranging_model import RangeNoise
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Measurement, Motion, Prior, Range
 from relpos.simulation.paper import simulate_paper
 
 
-def sight_of(edges: list[tuple[int, float, float, float]]) -> Sight:
-    looks, x, y, z = (np.array(column) for column in zip(*edges, strict=True))
-    return Sight.of(looks.astype(np.intp), np.stack([x, y]), np.zeros(len(z)), z)
+@dataclass(frozen=True)
+class Sight:
+    """Who sees what from where: edges sorted by the row that looks, as the kernels take them."""
+
+    centres: np.ndarray
+    offset: np.ndarray
+    other: np.ndarray
+    range_m: np.ndarray
+
+    def correct(self, poses: np.ndarray, weights: np.ndarray, noise: RangeNoise) -> np.ndarray:
+        result = np.empty_like(weights)
+        kernels.correct(
+            poses, weights, self.centres, self.offset, self.other, self.range_m,
+            np.zeros(len(self.range_m)), noise.sigma_r_m, noise.flat_over_peak, result,
+        )  # fmt: skip
+        return result
+
+    def dual_step(
+        self, poses: np.ndarray, predicted: np.ndarray, corrected: np.ndarray, noise: RangeNoise,
+        alpha: float, dice: np.ndarray,
+    ) -> None:  # fmt: skip
+        kernels.dual_step(
+            poses, predicted, corrected, self.centres, self.offset, self.other, self.range_m,
+            np.zeros(len(self.range_m)), noise.sigma_r_m, noise.flat_over_peak, alpha, dice,
+        )  # fmt: skip
+
+
+def sight_of(edges: list[tuple[int, float, float, float]], rows: int) -> Sight:
+    """Edges (looking row, the neighbour's x, y, range)."""
+    ordered = sorted(range(len(edges)), key=lambda e: edges[e][0])
+    looks = np.array([edges[e][0] for e in ordered])
+    offset = np.searchsorted(looks, np.arange(rows + 1))
+    places = np.array([(e[1], e[2]) for e in edges]).T
+    return Sight(
+        np.ascontiguousarray(places), offset, np.array(ordered),
+        np.array([edges[e][3] for e in ordered]),
+    )  # fmt: skip
+
+
+def multinomial(weights: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """As many draws as there are weights, read off poses that name their particle."""
+    rows, size = weights.shape
+    poses = np.zeros((3, rows, size))
+    poses[0] = np.arange(size)
+    kernels.resample(poses, weights.copy(), np.arange(rows), rng.random((rows, size + 1)))
+    return poses[0].astype(int)
 
 
 def belief(rng: np.random.Generator, rows: int, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -41,8 +78,8 @@ def test_weights_are_the_product_of_the_ranges_gaussian_densities() -> None:
     rng = np.random.default_rng(1)
     poses, weights = belief(rng, 3, 20)
     edges = [(2, 4.0, 1.0, 3.5), (0, -2.0, 2.0, 1.0), (2, 0.0, 5.0, 6.0), (0, 3.0, 3.0, 4.2)]
-    new = correct(poses, weights, sight_of(edges), RangeNoise(0.8))
-    for row, user in enumerate((0, 2)):
+    new = sight_of(edges, 3).correct(poses, weights, RangeNoise(0.8))
+    for user in (0, 2):
         direct = [
             weights[user, k]
             * math.prod(
@@ -53,13 +90,14 @@ def test_weights_are_the_product_of_the_ranges_gaussian_densities() -> None:
             )
             for k in range(20)
         ]
-        assert new[row] == pytest.approx(np.array(direct) / sum(direct), rel=1e-9)
+        assert new[user] == pytest.approx(np.array(direct) / sum(direct), rel=1e-9)
+    assert np.array_equal(new[1], weights[1])
 
 
 def test_ranges_no_particle_can_explain_leave_finite_weights() -> None:
     rng = np.random.default_rng(2)
     poses, weights = belief(rng, 1, 30)
-    new = correct(poses, weights, sight_of([(0, 0.0, 0.0, 1e4)]), RangeNoise(0.01))
+    new = sight_of([(0, 0.0, 0.0, 1e4)], 1).correct(poses, weights, RangeNoise(0.01))
     assert new.sum() == pytest.approx(1.0)
 
 
@@ -67,9 +105,9 @@ def test_an_outlier_share_bounds_what_one_range_can_do() -> None:
     poses = np.zeros((3, 1, 2))
     poses[0, 0] = (1.0, 9.0)
     weights = np.array([[0.99, 0.01]])
-    sight = sight_of([(0, 0.0, 0.0, 9.0)])
-    trusting = correct(poses, weights, sight, RangeNoise(0.3))
-    wary = correct(poses, weights, sight, RangeNoise(0.3, outliers=0.5))
+    sight = sight_of([(0, 0.0, 0.0, 9.0)], 1)
+    trusting = sight.correct(poses, weights, RangeNoise(0.3))
+    wary = sight.correct(poses, weights, RangeNoise(0.3, outliers=0.5))
     assert trusting[0, 0] < 1e-9 < 0.5 < wary[0, 0]
 
 
@@ -80,13 +118,17 @@ def test_resampling_is_unbiased(resample: object) -> None:
     times = np.zeros((2, 5))
     repeats = 4000
     for _ in range(repeats):
-        index = resample(weights, 7, rng)  # type: ignore[operator]
+        index = resample(weights, 5, rng)  # type: ignore[operator]
         for row in (0, 1):
             times[row] += np.bincount(index[row], minlength=5)
-    share = times / (7 * repeats)
-    # Multinomial: standard error at most sqrt(.25 / 28000) = .003.
+    share = times / (5 * repeats)
+    # Multinomial: standard error at most sqrt(.25 / 20000) = .0035.
     assert share == pytest.approx(weights, abs=0.012)
     assert not share[weights == 0.0].any()
+
+
+def dice(rng: np.random.Generator, rows: int, fresh: float) -> np.ndarray:
+    return rng.random((rows, kernels.DUAL_DRAWS * round(fresh) + 1))
 
 
 def test_the_dual_particles_mass_is_alpha_and_they_lie_on_the_ring() -> None:
@@ -97,8 +139,10 @@ def test_the_dual_particles_mass_is_alpha_and_they_lie_on_the_ring() -> None:
         predicted = np.full((2, 1000), 1e-3)
         before = poses.copy()
         corrected = predicted.copy()
-        sight = sight_of([(0, 30.0, 0.0, 29.0), (1, 0.0, 40.0, 41.0)])
-        dual_step(poses, predicted, corrected, sight, RangeNoise(0.1), alpha, rng)
+        sight = sight_of([(0, 30.0, 0.0, 29.0), (1, 0.0, 40.0, 41.0)], 2)
+        sight.dual_step(
+            poses, predicted, corrected, RangeNoise(0.1), alpha, dice(rng, 2, alpha * 1000)
+        )
         fresh = (poses != before).any(axis=0)
         assert fresh.sum(axis=1).tolist() == [round(alpha * 1000)] * 2
         assert corrected.sum(axis=1) == pytest.approx(1.0)
@@ -115,13 +159,13 @@ def test_dual_particles_weigh_by_predicted_density_and_the_other_ranges() -> Non
     poses = np.zeros((3, 1, size))
     poses[:2, 0] = np.array([[10.0], [0.0]]) + rng.normal(0.0, 1.0, (2, size))
     predicted = np.full((1, size), 1.0 / size)
-    sight = sight_of([(0, 0.0, 0.0, 10.0), (0, 14.0, 0.0, 4.0)])
+    sight = sight_of([(0, 0.0, 0.0, 10.0), (0, 14.0, 0.0, 4.0)], 1)
     before, corrected = poses.copy(), predicted.copy()
     noise = RangeNoise(0.5)
-    dual_step(poses, predicted, corrected, sight, noise, 0.1, rng)
+    sight.dual_step(poses, predicted, corrected, noise, 0.1, dice(rng, 1, 0.1 * size))
     fresh = (poses != before).any(axis=0)[0]
     points, weight = poses[:2, 0, fresh], corrected[0, fresh]
-    density = np.exp(log_density(points[:, None, :], before, predicted)[0])
+    density = np.exp(log_density(points, before[:2, 0], predicted[0], BINNED))
     to_first = np.exp(-0.5 * ((10.0 - np.hypot(*points)) / 0.5) ** 2)
     to_second = np.exp(-0.5 * ((4.0 - np.hypot(points[0] - 14.0, points[1])) / 0.5) ** 2)
     # A point was drawn on either ring; its weight must follow the other one's likelihood.
@@ -138,12 +182,24 @@ def test_dual_particles_weigh_by_predicted_density_and_the_other_ranges() -> Non
     assert all(matches)
 
 
-def test_the_density_integrates_to_one() -> None:
+PLAIN, BINNED = 0, kernels.CELLS
+
+
+def log_density(
+    points: np.ndarray, positions: np.ndarray, weights: np.ndarray, cells: int
+) -> np.ndarray:
+    result = np.empty(points.shape[1])
+    kernels.log_density(*points, *positions, weights, np.empty((cells, cells)), result)
+    return result
+
+
+@pytest.mark.parametrize("cells", [PLAIN, BINNED])
+def test_the_density_integrates_to_one(cells: int) -> None:
     rng = np.random.default_rng(6)
     poses, weights = belief(rng, 1, 200)
     axis = np.linspace(-7.0, 7.0, 141)
-    grid = np.stack(np.meshgrid(axis, axis)).reshape(2, 1, -1)
-    total = np.exp(log_density(grid, poses, weights)).sum() * 0.1**2
+    grid = np.stack(np.meshgrid(axis, axis)).reshape(2, -1)
+    total = np.exp(log_density(grid, poses[:2, 0], weights[0], cells)).sum() * 0.1**2
     assert total == pytest.approx(1.0, abs=0.01)
 
 
@@ -182,8 +238,8 @@ def test_users_are_corrected_with_the_same_old_picture_whatever_their_order() ->
     rng = np.random.default_rng(8)
     poses, weights = belief(rng, 3, 50)
     edges = [(0, 1.0, 2.0, 2.0), (1, 0.0, 0.0, 1.5), (2, 3.0, 1.0, 2.5), (0, 0.0, 0.0, 1.0)]
-    forward = correct(poses, weights, sight_of(edges), RangeNoise(1.0))
-    backward = correct(poses, weights, sight_of(edges[::-1]), RangeNoise(1.0))
+    forward = sight_of(edges, 3).correct(poses, weights, RangeNoise(1.0))
+    backward = sight_of(edges[::-1], 3).correct(poses, weights, RangeNoise(1.0))
     assert forward == pytest.approx(backward, rel=1e-12)
 
 

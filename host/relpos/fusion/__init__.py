@@ -17,7 +17,7 @@ from relpos.fusion.estimator import (
     Parameter,
     Shape,
 )
-from relpos.fusion.particle import ParticleFilter, ParticleSettings
+from relpos.fusion.particle_settings import ParticleSettings
 from relpos.fusion.ranging_model import Mounting
 from relpos.fusion.settings import SettingInfo, describe, parse
 from relpos.measurements import Prior
@@ -51,6 +51,8 @@ def make(
 
             return Bank(priors, parse(BankSettings, given, "bank"), seed, nodes or {})
         case "particle":
+            from relpos.fusion.particle import ParticleFilter
+
             return ParticleFilter(priors, parse(ParticleSettings, given, "particle"), seed)
         case "deadreckoning":
             return DeadReckoning(priors, parse(DeadReckoningSettings, given, "deadreckoning"), seed)

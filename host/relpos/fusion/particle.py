@@ -33,6 +33,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import RelposError
+from relpos.fusion import particle_kernels as kernels
 from relpos.fusion.estimator import (
     LOST_EPOCHS,
     STALE_EPOCHS,
@@ -42,81 +43,25 @@ from relpos.fusion.estimator import (
     pairs_of,
 )
 from relpos.fusion.motion_model import MotionNoise, predict
-from relpos.fusion.ranging_model import RangeNoise, log_likelihood, predicted_range
-from relpos.fusion.settings import setting
+from relpos.fusion.particle_settings import ParticleSettings
+from relpos.fusion.ranging_model import RangeNoise
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.measurements import Height, Measurement, Prior, Range
 
 Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
+Indices = npt.NDArray[np.int64]
 
 _TWO_PI = 2.0 * math.pi
-_MIN_BANDWIDTH_M = 1e-3
-"""A belief of identical particles has no spread; its density is then one of a millimetre."""
-
-_FAR_OUT = math.log(1e4)
-"""Where all kernels underflow, the nearest counts as one particle of very many."""
 
 
-@dataclass(frozen=True, slots=True)
-class ParticleSettings:
-    """What ``--set`` may change; the defaults are the paper's."""
-
-    particles: int = setting(500, "particles per node (M)", 10, 1_000_000)
-    alpha: float = setting(0.01, "share of dual particles; 0 switches the dual step off", 0.0, 0.9)
-    sigma_r_m: float = setting(2.0, "standard deviation of a range", 1e-3, 100.0)
-    sigma_d: float = setting(0.2, "relative standard deviation of a displacement", 0.0, 10.0)
-    sigma_theta: float = setting(0.1, "relative standard deviation of a turn", 0.0, 10.0)
-    floor_d_m: float = setting(0.0, "least displacement noise, m/sqrt(s)", 0.0, 10.0)
-    floor_theta_rad: float = setting(0.0, "least heading noise, rad/sqrt(s)", 0.0, 10.0)
-    outliers: float = setting(0.0, "share of ranges that tell nothing", 0.0, 0.9)
-    start_particles: int = setting(
-        20_000, "particles of a node whose start is unknown", 100, 10_000_000
-    )
-    start_sigma_r_m: float = setting(
-        0.5, "standard deviation of a range while a start is unknown", 1e-3, 100.0
-    )
-    start_outliers: float = setting(0.05, "outlier share while a start is unknown", 0.0, 0.9)
-    start_sigma_d: float = setting(
-        0.2, "relative displacement noise while a start is unknown", 0.0, 10.0
-    )
-    start_sigma_theta: float = setting(
-        0.1, "relative turn noise while a start is unknown", 0.0, 10.0
-    )
-    start_floor_d_m: float = setting(
-        0.02, "least displacement noise while a start is unknown, m/sqrt(s)", 0.0, 10.0
-    )
-    start_floor_theta_rad: float = setting(
-        0.0175, "least heading noise while a start is unknown, rad/sqrt(s)", 0.0, 10.0
-    )
-    resolved_m: float = setting(
-        0.7, "a start counts as found when its spread is less, m", 1e-3, 100.0
-    )
-    resolved_rad: float = setting(
-        0.5, "a start counts as found when its heading's spread is less, rad", 1e-3, 3.0
-    )
-    resolved_epochs: int = setting(5, "for so many epochs in a row", 1, 1000)
-    max_lag_s: float = setting(5.0, "how long a silent node is waited for", 0.0, 60.0)
-    reorder_s: float = setting(0.5, "how long measurements may be out of order", 0.0, 60.0)
+_AT_ONCE = 8192
+"""Particles that are moved in one go."""
 
 
 def effective_size(weights: Floats) -> Floats:
     """Give 1 / sum w^2 of each row of weights (K, M) that sum to one."""
     size: Floats = 1.0 / np.einsum("km,km->k", weights, weights)
     return size
-
-
-def multinomial(weights: Floats, count: int, rng: np.random.Generator) -> Indices:
-    """Draw ``count`` indices from each row of weights (K, M), independently; sorted by row."""
-    edges = np.cumsum(weights, axis=1)
-    drawn = rng.random((weights.shape[0], count))
-    drawn.sort(axis=1)
-    drawn *= edges[:, -1:]
-    index = np.empty(drawn.shape, dtype=np.intp)
-    for row, (edge, wanted) in enumerate(zip(edges, drawn, strict=True)):
-        index[row] = np.searchsorted(edge, wanted, side="right")
-    np.minimum(index, weights.shape[1] - 1, out=index)
-    return index
 
 
 def systematic(weights: Floats, count: int, rng: np.random.Generator) -> Indices:
@@ -134,137 +79,120 @@ def systematic(weights: Floats, count: int, rng: np.random.Generator) -> Indices
     return index
 
 
-def weighted_means(poses: Floats, weights: Floats) -> Floats:
-    """Positions' means, (2, K), of particles (3, K, M) with weights (K, M)."""
-    means: Floats = np.einsum("ckm,km->ck", poses[:2], weights)
-    return means
+@dataclass(slots=True)
+class Clouds:
+    """Beliefs of K located users as particles: the filter itself, on arrays.
 
-
-@dataclass(frozen=True, slots=True)
-class Sight:
-    """Ranges of one instant as directed edges, sorted by the row that looks.
-
-    ``looks`` (E,) is the row, ``at_m`` (2, E) the neighbour's position, ``height_m`` (E,) the
-    difference of height, ``measured_m`` (E,) the range; ``rows`` (U,) are the rows that look at
-    all, ``first`` and ``count`` (U,) their edges.
+    ``poses`` (3, K, M) are x, y (m) and heading (rad), ``weights`` (K, M); every row sums to one.
+    Users are told apart by their row. ``advance`` and ``range`` are all there is to an epoch.
     """
 
-    looks: Indices
-    at_m: Floats
-    height_m: Floats
-    measured_m: Floats
-    rows: Indices
-    first: Indices
-    count: Indices
+    size: int
+    alpha: float
+    noise: RangeNoise
+    rng: np.random.Generator
+    poses: Floats = field(init=False)
+    weights: Floats = field(init=False)
+    resampled: int = 0
+    _dice: Floats = field(default_factory=lambda: np.empty(0))
+    _corrected: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
-    @staticmethod
-    def of(looks: Indices, at_m: Floats, height_m: Floats, measured_m: Floats) -> Sight:
-        """Sort edges by the row that looks."""
-        order = np.argsort(looks, kind="stable")
-        looks = looks[order]
-        rows, first, count = np.unique(looks, return_index=True, return_counts=True)
-        return Sight(looks, at_m[:, order], height_m[order], measured_m[order], rows, first, count)
+    def __post_init__(self) -> None:
+        self.poses = np.empty((3, 0, self.size))
+        self.weights = np.empty((0, self.size))
+
+    def add(self, poses: Floats) -> int:
+        """Take in one more user, (3, M) equally likely poses; return its row."""
+        self.poses = np.concatenate([self.poses, poses[:, None, :]], axis=1)
+        self.weights = np.concatenate([self.weights, np.full((1, self.size), 1.0 / self.size)])
+        self._corrected = np.empty_like(self.weights)
+        return len(self.weights) - 1
+
+    def advance(self, rows: Indices, mean: Floats, sigma: Floats) -> None:
+        """Move users ``rows`` (R,) by displacements ``mean`` (R, 3), body frame, with ``sigma``.
+
+        Each row once: a user's second displacement is a second call.
+        """
+        # A few rows at a time: their dice are still in the cache when they are used.
+        some = max(_AT_ONCE // self.size, 1)
+        for k in range(0, len(rows), some):
+            spread = sigma[k : k + some]
+            wanted = self.size * max(int(np.count_nonzero(spread)), 1)
+            bits = self.rng.bit_generator.random_raw((wanted + 1) // 2)
+            noise = self._buffer(2 * len(bits))
+            kernels.normals(bits, noise)
+            kernels.advance(self.poses, rows[k : k + some], mean[k : k + some], spread, noise)
+
+    def range(
+        self,
+        first: Indices,
+        second: Indices,
+        range_m: Floats,
+        height_m: Floats,
+        others_m: Floats | None = None,
+    ) -> int:
+        """Correct by all ranges of one instant; return how many looks there were.
+
+        ``first`` and ``second`` (R,) are the two nodes' rows; K + c stands for a place that is
+        seen and does not look, the columns of ``others_m`` (2, C). ``height_m`` (R,) are the
+        differences of height.
+        """
+        rows = len(self.weights)
+        # Means before the correction: all users look at the same old picture.
+        centres = np.empty((2, rows + (0 if others_m is None else others_m.shape[1])))
+        kernels.means(self.poses, self.weights, centres)
+        if others_m is not None:
+            centres[:, rows:] = others_m
+        offset, other, which = kernels.directed(first, second, rows)
+        edges = offset, other, range_m[which], height_m[which]
+        noise, corrected = self.noise, self._corrected
+        floor = noise.flat_over_peak
+        kernels.correct(
+            self.poses, self.weights, centres, *edges, noise.sigma_r_m, floor, corrected
+        )
+        if self.alpha > 0.0:
+            fresh = max(1, round(self.alpha * self.size))
+            dice = self._draw(rows * (kernels.DUAL_DRAWS * fresh + 1)).reshape(rows, -1)
+            kernels.dual_step(
+                self.poses, self.weights, corrected, centres, *edges, noise.sigma_r_m, floor,
+                self.alpha, dice,
+            )  # fmt: skip
+        self.weights, self._corrected = corrected, self.weights
+        sizes = np.empty(rows)
+        kernels.effective_sizes(corrected, sizes)
+        low = np.flatnonzero(sizes < 0.5 * self.size)
+        if low.size:
+            dice = self._draw(low.size * (self.size + 1)).reshape(low.size, -1)
+            kernels.resample(self.poses, self.weights, low, dice)
+            self.resampled += int(low.size)
+        return len(other)
+
+    def _draw(self, count: int) -> Floats:
+        """Uniforms in [0, 1) in a buffer that is kept: fresh memory costs more than the dice."""
+        return self.rng.random(out=self._buffer(count))
+
+    def _buffer(self, count: int) -> Floats:
+        if self._dice.size < count:
+            self._dice = np.empty(count)
+        return self._dice[:count]
 
 
-def correct(poses: Floats, weights: Floats, sight: Sight, noise: RangeNoise) -> Floats:
-    """Weigh by eq. (6): new weights (U, M) of ``sight.rows``, each row summing to one."""
-    particles = poses[:2, sight.looks]
-    distance = predicted_range(
-        particles[0] - sight.at_m[0][:, None],
-        particles[1] - sight.at_m[1][:, None],
-        sight.height_m[:, None],
-    )
-    each = log_likelihood(sight.measured_m[:, None], distance, noise)
-    total = np.add.reduceat(each, sight.first, axis=0)
-    # Only particles that still have weight may set the scale, or all of them could underflow.
-    prior = weights[sight.rows]
-    total -= np.where(prior > 0.0, total, -np.inf).max(axis=1, keepdims=True)
-    np.exp(total, out=total)
-    total *= prior
-    total /= total.sum(axis=1, keepdims=True)
-    return total
-
-
-def log_density(points_m: Floats, poses: Floats, weights: Floats) -> Floats:
-    """Give the log density, (U, D), of beliefs (3, U, M), weights (U, M) at points (2, U, D).
-
-    A Gaussian kernel with Silverman's bandwidth for two dimensions, per axis, from the
-    effective sample size.
-    """
-    at = poses[:2].transpose(1, 0, 2)
-    points = points_m.transpose(1, 2, 0)
-    mean = np.einsum("um,uam->ua", weights, at)
-    off = at - mean[:, :, None]
-    variance = np.einsum("um,uam->ua", weights, off * off)
-    shrink = effective_size(weights) ** (-1.0 / 6.0)
-    width = np.maximum(np.sqrt(variance) * shrink[:, None], _MIN_BANDWIDTH_M)
-    off /= width[:, :, None]
-    seen = (points - mean[:, None, :]) / width[:, None, :]
-    # -|p - q|^2 / 2 by way of p.q: one matrix product instead of four passes over (U, D, M).
-    exponent: Floats = seen @ off
-    exponent -= 0.5 * np.einsum("uam,uam->um", off, off)[:, None, :]
-    exponent -= 0.5 * np.einsum("uda,uda->ud", seen, seen)[:, :, None]
-    # A point very far out has density zero in every kernel: its nearest one keeps it comparable.
-    peak = np.minimum(exponent.max(axis=2), 0.0)
-    np.exp(exponent, out=exponent)
-    total: Floats = np.einsum("udm,um->ud", exponent, weights)
-    with np.errstate(divide="ignore"):
-        result: Floats = np.where(total > 0.0, np.log(total), peak - _FAR_OUT)
-    result -= np.log(_TWO_PI * width.prod(axis=1))[:, None]
-    return result
-
-
-def dual_step(
+def weigh(
     poses: Floats,
-    predicted: Floats,
-    corrected: Floats,
-    sight: Sight,
+    weights: Floats,
+    at_m: Floats,
+    range_m: Floats,
+    height_m: Floats,
     noise: RangeNoise,
-    alpha: float,
-    rng: np.random.Generator,
-) -> None:
-    """Redraw a share alpha of the particles from the ranges, in place (eq. (7)).
-
-    ``poses`` (3, U, M) are the particles of ``sight.rows``, ``predicted`` and ``corrected``
-    (U, M) their weights before and after the ranges; ``corrected`` becomes the mixture's.
-    """
-    users, size = corrected.shape
-    count = max(1, round(alpha * size))
-    # On whose ring? Any of the user's neighbours, the same chance each.
-    edge = sight.first[:, None] + (rng.random((users, count)) * sight.count[:, None]).astype(
-        np.intp
-    )
-    radius = sight.measured_m[edge] + noise.sigma_r_m * rng.standard_normal((users, count))
-    angle = _TWO_PI * rng.random((users, count))
-    points = sight.at_m[:, edge] + radius * np.stack([np.cos(angle), np.sin(angle)])
-
-    log_weight = log_density(points, poses, predicted)
-    # Every edge of every user against that user's points; a point's own ring is left out.
-    owner = np.repeat(np.arange(users), sight.count)
-    distance = predicted_range(
-        points[0, owner] - sight.at_m[0][:, None],
-        points[1, owner] - sight.at_m[1][:, None],
-        sight.height_m[:, None],
-    )
-    each = log_likelihood(sight.measured_m[:, None], distance, noise)
-    each[edge[owner] == np.arange(len(owner))[:, None]] = 0.0
-    log_weight += np.add.reduceat(each, sight.first, axis=0)
-    peak = log_weight.max(axis=1, keepdims=True)
-    weight = np.exp(log_weight - np.where(np.isfinite(peak), peak, 0.0))
-    total = weight.sum(axis=1, keepdims=True)
-    weight = np.where(total > 0.0, weight / np.where(total > 0.0, total, 1.0), 1.0 / count)
-
-    heading = np.take_along_axis(poses[2], multinomial(predicted, count, rng), axis=1)
-    rng.permuted(heading, axis=1, out=heading)
-    # An evenly spaced comb with a random start: every particle is as likely to be replaced.
-    slot = ((rng.random((users, 1)) + np.arange(count)) * (size / count)).astype(np.intp) % size
-    np.put_along_axis(corrected, slot, 0.0, axis=1)
-    rest = corrected.sum(axis=1, keepdims=True)
-    corrected *= np.where(rest > 0.0, (1.0 - alpha) / np.where(rest > 0.0, rest, 1.0), 0.0)
-    np.put_along_axis(corrected, slot, alpha * weight, axis=1)
-    corrected /= corrected.sum(axis=1, keepdims=True)
-    for axis, values in enumerate((points[0], points[1], heading)):
-        np.put_along_axis(poses[axis], slot, values, axis=1)
+) -> Floats:
+    """Weigh one user's particles (3, 1, M), (1, M) by ranges (E,) to places (2, E): eq. (6)."""
+    result = np.empty_like(weights)
+    count = len(range_m)
+    kernels.correct(
+        poses, weights, at_m, np.array([0, count]), np.arange(count), range_m, height_m,
+        noise.sigma_r_m, noise.flat_over_peak, result,
+    )  # fmt: skip
+    return result
 
 
 @dataclass(slots=True)
@@ -304,16 +232,13 @@ class ParticleFilter:
     seed: int = 0
     _timeline: Timeline = field(init=False)
     _rng: np.random.Generator = field(init=False)
-    _nodes: list[int] = field(default_factory=list)
     _row: dict[int, int] = field(default_factory=dict)
-    _poses: Floats = field(init=False)
-    _weights: Floats = field(init=False)
+    _clouds: Clouds = field(init=False)
     _starts: dict[int, _Start] = field(default_factory=dict)
     _known: dict[int, _Known] = field(default_factory=dict)
     _pending: dict[int, list[Advance]] = field(default_factory=dict)
     _own: Counter[str] = field(default_factory=Counter)
     _motion_noise: MotionNoise = field(init=False)
-    _range_noise: RangeNoise = field(init=False)
     _start_motion_noise: MotionNoise = field(init=False)
     _start_range_noise: RangeNoise = field(init=False)
     _moved: bool = False
@@ -324,7 +249,6 @@ class ParticleFilter:
         s = self.settings
         self._rng = np.random.default_rng(self.seed)
         self._motion_noise = MotionNoise(s.sigma_d, s.sigma_theta, s.floor_d_m, s.floor_theta_rad)
-        self._range_noise = RangeNoise(s.sigma_r_m, s.outliers)
         self._start_motion_noise = MotionNoise(
             s.start_sigma_d,
             s.start_sigma_theta,
@@ -332,8 +256,7 @@ class ParticleFilter:
             max(s.floor_theta_rad, s.start_floor_theta_rad),
         )
         self._start_range_noise = RangeNoise(s.start_sigma_r_m, s.start_outliers)
-        self._poses = np.empty((3, 0, s.particles))
-        self._weights = np.empty((0, s.particles))
+        self._clouds = Clouds(s.particles, s.alpha, RangeNoise(s.sigma_r_m, s.outliers), self._rng)
         self._timeline = Timeline(
             [p.node for p in self.priors], reorder_s=s.reorder_s, max_lag_s=s.max_lag_s
         )
@@ -373,7 +296,8 @@ class ParticleFilter:
 
     def counters(self) -> Mapping[str, int]:
         """Count everything dropped, late, reset or resampled."""
-        return dict(self._timeline.counters + self._own)
+        own = self._own + Counter(resampled=self._clouds.resampled)
+        return dict(self._timeline.counters + own)
 
     # -- bookkeeping ---------------------------------------------------------------------------
 
@@ -390,11 +314,7 @@ class ParticleFilter:
         return _Start(np.zeros((3, 1, 1)), np.ones((1, 1)), heading_known)
 
     def _add_row(self, node: int, poses: Floats) -> None:
-        count = self.settings.particles
-        self._row[node] = len(self._nodes)
-        self._nodes.append(node)
-        self._poses = np.concatenate([self._poses, poses[:, None, :]], axis=1)
-        self._weights = np.concatenate([self._weights, np.full((1, count), 1.0 / count)])
+        self._row[node] = self._clouds.add(poses)
 
     def _work_off(self, steps: Iterable[Step]) -> list[Estimate]:
         estimates = []
@@ -437,19 +357,14 @@ class ParticleFilter:
             for step in steps:
                 predict(start.poses, [step], noise, self._rng)
         self._pending = {}
-        located.sort(key=lambda pair: pair[0])
-        turn = 0
-        while located:
-            rows = [row for row, _ in located]
-            steps = [steps[turn] for _, steps in located]
-            if len(rows) == len(self._nodes):
-                predict(self._poses, steps, self._motion_noise, self._rng)
-            else:
-                some = self._poses[:, rows]
-                predict(some, steps, self._motion_noise, self._rng)
-                self._poses[:, rows] = some
-            turn += 1
-            located = [(row, steps) for row, steps in located if len(steps) > turn]
+        # The k-th displacement of every node at once.
+        for turn in range(max((len(steps) for _, steps in located), default=0)):
+            now = [(row, steps[turn]) for row, steps in located if len(steps) > turn]
+            self._clouds.advance(
+                np.array([row for row, _ in now]),
+                np.array([(a.dx_m, a.dy_m, a.dtheta_rad) for _, a in now]),
+                np.array([self._motion_noise.sigmas(a) for _, a in now]),
+            )
 
     # -- ranges --------------------------------------------------------------------------------
 
@@ -458,53 +373,41 @@ class ParticleFilter:
             for node in (measured.node, measured.peer):
                 known = self._known[node]
                 known.news_s = max(known.news_s, step.time_s)
-        if not self._nodes:
+        if not self._row:
             self._found_frame(step.ranges)
-        column, means = self._references()
-        self._range_starts(step.ranges, column, means)
-        looks, seen, height, measured_m = [], [], [], []
-        for measured in step.ranges:
-            dz = self._known[measured.node].height_m - self._known[measured.peer].height_m
-            for node, peer in ((measured.node, measured.peer), (measured.peer, measured.node)):
-                if node in self._row and peer in column:
-                    looks.append(self._row[node])
-                    seen.append(column[peer])
-                    height.append(dz)
-                    measured_m.append(measured.range_m)
-        self._ranges_used += len(looks)
-        if looks:
-            self._correct(
-                Sight.of(np.array(looks), means[:, seen], np.array(height), np.array(measured_m))
+        column, placed_m = self._row, None
+        if self._starts:
+            # Positions before this correction, of everybody.
+            column, means = self._references()
+            self._range_starts(step.ranges, column, means)
+            placed_m = means[:, len(self._row) :]
+        used = [
+            (column[m.node], column[m.peer], m.range_m,
+             self._known[m.node].height_m - self._known[m.peer].height_m)
+            for m in step.ranges
+            if m.node in column and m.peer in column
+            and (m.node in self._row or m.peer in self._row)
+        ]  # fmt: skip
+        if used:
+            first, second, range_m, height_m = zip(*used, strict=True)
+            self._ranges_used += self._clouds.range(
+                np.array(first),
+                np.array(second),
+                np.array(range_m),
+                np.array(height_m),
+                placed_m,
             )
 
     def _references(self) -> tuple[dict[int, int], Floats]:
         """Positions that ranges may refer to: node -> column of the means (2, C)."""
-        column = dict(self._row)
-        means = [weighted_means(self._poses, self._weights)]
-        for node, start in self._starts.items():
-            if start.placed:
-                column[node] = len(column)
-                means.append(weighted_means(start.poses, start.weights))
-        return column, np.concatenate(means, axis=1)
-
-    def _correct(self, sight: Sight) -> None:
-        s = self.settings
-        corrected = correct(self._poses, self._weights, sight, self._range_noise)
-        if s.alpha > 0.0:
-            poses = self._poses[:, sight.rows]
-            dual_step(
-                poses, self._weights[sight.rows], corrected, sight, self._range_noise, s.alpha,
-                self._rng,
-            )  # fmt: skip
-            self._poses[:, sight.rows] = poses
-        self._weights[sight.rows] = corrected
-        low = np.flatnonzero(effective_size(corrected) < 0.5 * s.particles)
-        if low.size:
-            rows = sight.rows[low]
-            index = multinomial(corrected[low], s.particles, self._rng)
-            self._poses[:, rows] = np.take_along_axis(self._poses[:, rows], index[None], axis=2)
-            self._weights[rows] = 1.0 / s.particles
-            self._own["resampled"] += int(low.size)
+        clouds, column = self._clouds, dict(self._row)
+        placed = [(node, start) for node, start in self._starts.items() if start.placed]
+        means = np.empty((2, len(column) + len(placed)))
+        kernels.means(clouds.poses, clouds.weights, means)
+        for node, start in placed:
+            means[:, len(column)] = start.poses[:2, 0] @ start.weights[0]
+            column[node] = len(column)
+        return column, means
 
     # -- unknown starts ------------------------------------------------------------------------
 
@@ -540,9 +443,7 @@ class ParticleFilter:
                 self._draw_start(start, at, measured_m)
                 at, measured_m, height = at[:, 1:], measured_m[1:], height[1:]
             if measured_m.size:
-                self._weigh_start(start, Sight.of(
-                    np.zeros(measured_m.size, dtype=np.intp), at, height, measured_m
-                ))  # fmt: skip
+                self._weigh_start(start, at, measured_m, height)
 
     def _draw_start(self, start: _Start, at: Floats, measured_m: Floats) -> None:
         """Spread a cloud over the ring of the first range, with any heading."""
@@ -561,8 +462,10 @@ class ParticleFilter:
         start.drawn = True
         self._own["starts_drawn"] += 1
 
-    def _weigh_start(self, start: _Start, sight: Sight) -> None:
-        start.weights = correct(start.poses, start.weights, sight, self._start_range_noise)
+    def _weigh_start(self, start: _Start, at_m: Floats, range_m: Floats, height_m: Floats) -> None:
+        start.weights = weigh(
+            start.poses, start.weights, at_m, range_m, height_m, self._start_range_noise
+        )
         if effective_size(start.weights)[0] < 0.5 * start.weights.shape[1]:
             index = systematic(start.weights, start.weights.shape[1], self._rng)[0]
             start.poses = start.poses[:, :, index]
@@ -598,29 +501,38 @@ class ParticleFilter:
         for known in self._known.values():
             known.silent_epochs = 0 if known.news_s > self._epoch_s else known.silent_epochs + 1
         self._epoch_s = time_s
+        located = np.empty((len(self._row), 7))
+        kernels.moments(self._clouds.poses, self._clouds.weights, located)
+        figures = located.tolist()
         nodes = []
         for node in sorted(self._known):
             status = self._status(node)
             cloud = self._starts.get(node)
             if cloud is None:
-                row = self._row[node]
-                poses, weights = self._poses[:, row], self._weights[row]
+                x_m, y_m, xx, yy, xy, c, s = figures[self._row[node]]
+                heading, sigma_heading = math.atan2(s, c), _spread_rad(math.hypot(c, s))
             else:
-                poses, weights = cloud.poses[:, 0], cloud.weights[0]
-            about = None if cloud is None or not cloud.drawn else _mode(poses, weights, self._rng)
-            mean, covariance, heading, sigma_heading = _moments(poses, weights, about)
+                x_m, y_m, xx, yy, xy, heading, sigma_heading = self._moments_of(cloud)
             if status is NodeStatus.UNLOCATED:
-                covariance = np.full((2, 2), math.inf)
-                sigma_heading = math.pi / math.sqrt(3.0)
+                xx, yy, xy, sigma_heading = math.inf, math.inf, math.inf, _ANY_HEADING_RAD
             known = self._known[node]
             nodes.append(
                 NodeEstimate(
-                    node, float(mean[0]), float(mean[1]), heading,
-                    float(covariance[0, 0]), float(covariance[1, 1]), float(covariance[0, 1]),
-                    sigma_heading, status, known.height_m, known.sigma_height_m,
+                    node, x_m, y_m, heading, xx, yy, xy, sigma_heading, status,
+                    known.height_m, known.sigma_height_m,
                 )
             )  # fmt: skip
         return Estimate(time_s, tuple(nodes), pairs_of(nodes))
+
+    def _moments_of(self, start: _Start) -> tuple[float, float, float, float, float, float, float]:
+        poses, weights = start.poses[:, 0], start.weights[0]
+        about = _mode(poses, weights, self._rng) if start.drawn else None
+        mean, covariance, heading, sigma_heading = _moments(poses, weights, about)
+        return (
+            float(mean[0]), float(mean[1]),
+            float(covariance[0, 0]), float(covariance[1, 1]), float(covariance[0, 1]),
+            heading, sigma_heading,
+        )  # fmt: skip
 
     def _status(self, node: int) -> NodeStatus:
         start = self._starts.get(node)
@@ -675,5 +587,13 @@ def _moments(
     off = poses[:2] - centre[:, None]
     covariance = (off * weights) @ off.T
     resultant = c * math.cos(heading) + s * math.sin(heading)
-    spread = math.sqrt(2.0 * max(1.0 - resultant, 0.0))
-    return centre, covariance, heading, min(spread, math.pi / math.sqrt(3.0))
+    return centre, covariance, heading, _spread_rad(resultant)
+
+
+_ANY_HEADING_RAD = math.pi / math.sqrt(3.0)
+"""Standard deviation of a heading of which nothing is known."""
+
+
+def _spread_rad(resultant: float) -> float:
+    """Circular standard deviation from the mean of the cosines about the mean heading."""
+    return min(math.sqrt(2.0 * max(1.0 - resultant, 0.0)), _ANY_HEADING_RAD)

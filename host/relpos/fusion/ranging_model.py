@@ -43,6 +43,14 @@ class RangeNoise:
     outliers: float = 0.0
     outlier_span_m: float = 30.0
 
+    @property
+    def flat_over_peak(self) -> float:
+        """Density of an outlier relative to the peak of all other ranges'; 0 without outliers."""
+        if self.outliers <= 0.0:
+            return 0.0
+        peak = (1.0 - self.outliers) / (math.sqrt(2.0 * math.pi) * self.sigma_r_m)
+        return self.outliers / self.outlier_span_m / peak
+
 
 def predicted_range(dx_m: Floats, dy_m: Floats, dz_m: Floats | float = 0.0) -> Floats:
     """Slant distance over the given differences."""
@@ -58,9 +66,7 @@ def log_likelihood(measured_m: Floats, predicted_m: Floats, noise: RangeNoise) -
     exponent: Floats = -0.5 * scaled * scaled
     if noise.outliers <= 0.0:
         return exponent
-    peak = (1.0 - noise.outliers) / (math.sqrt(2.0 * math.pi) * noise.sigma_r_m)
-    flat = noise.outliers / noise.outlier_span_m
-    mixed: Floats = np.logaddexp(exponent, math.log(flat / peak))
+    mixed: Floats = np.logaddexp(exponent, math.log(noise.flat_over_peak))
     return mixed
 
 
