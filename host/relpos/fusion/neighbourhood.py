@@ -30,7 +30,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -54,13 +54,14 @@ SLACK = 0.3
 """A node may stand out of its strip by this share of the strip's width before it is moved over."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class RangeModel:
-    """Of all ranges: standard deviation (m), outlier share, and the span (m) outliers fill."""
+    """Of all ranges: standard deviation (m); outliers' share, spread (m), share of short ones."""
 
     sigma_m: float = 0.1
     outliers: float = 0.0
-    outlier_span_m: float = 20.0
+    outlier_m: float = 3.0
+    outliers_short: float = 0.1
 
 
 @dataclass(slots=True)
@@ -164,6 +165,7 @@ class NeighbourhoodFilter:
     model: RangeModel = field(default_factory=RangeModel)
     pose: Floats = field(default_factory=lambda: np.empty((0, 3)))
     counters: Counter[str] = field(default_factory=Counter)
+    """How often nodes changed strips, and strips were laid out anew or widened."""
     _lever: Floats = field(default_factory=lambda: np.empty((0, 2)))
     _noise: Floats = field(default_factory=lambda: np.empty((0, 6)))
     _variance: Floats = field(default_factory=lambda: np.empty(0))
@@ -173,6 +175,23 @@ class NeighbourhoodFilter:
     _layout: _Layout = field(init=False)
     _covariance: Floats = field(default_factory=lambda: np.empty(0))
     _cell: Indices = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    def copy(self) -> NeighbourhoodFilter:
+        """Give a copy that goes on by itself."""
+        other = replace(
+            self,
+            model=replace(self.model),
+            pose=self.pose.copy(),
+            counters=self.counters.copy(),
+            _lever=self._lever.copy(),
+            _noise=self._noise.copy(),
+            _variance=self._variance.copy(),
+            _covariance=self._covariance.copy(),
+            _cell=self._cell.copy(),
+        )
+        if self.pose.size:
+            other._layout = self._layout  # replaced as a whole, never changed
+        return other
 
     # -- nodes ---------------------------------------------------------------------------------
 
@@ -272,14 +291,15 @@ class NeighbourhoodFilter:
         """
         self._catch_up()
         self._move_over(node, peer)
-        layout = self._layout
+        layout, model = self._layout, self.model
         spread = self.spread(node, peer)
         information, push = np.empty(layout.total_p), np.empty(2 * self.pose.shape[0])
         weight, surprise = np.empty(node.size), np.empty(node.size)
         kernels.gather(
-            spread, node, peer, measured_m, np.full(node.size, self.model.sigma_m**2),
-            self.model.outliers, self.model.outlier_span_m, layout.strip, layout.slot, layout.sizes,
-            layout.at_diagonal_p, layout.at_next_p, information, push, weight, surprise,
+            spread, node, peer, measured_m, np.full(node.size, model.sigma_m**2),
+            np.array([model.outliers, model.outlier_m**2, model.outliers_short]), layout.strip,
+            layout.slot, layout.sizes, layout.at_diagonal_p, layout.at_next_p, information, push,
+            weight, surprise,
         )  # fmt: skip
         self._solve(information, push)
         return weight, surprise
@@ -378,7 +398,28 @@ class NeighbourhoodFilter:
             layout.slot, self.pose, node, peer,
         )  # fmt: skip
 
+    def marginals(self) -> Floats:
+        """Of every node the variances xx, yy, the covariance xy, and the heading's: (N, 4)."""
+        self._catch_up()
+        layout = self._layout
+        return kernels.marginals(
+            self._covariance, layout.at_diagonal, layout.sizes, layout.strip, layout.slot
+        )
+
+    def doubt(self, nodes: Indices, sigma_m: float, sigma_rad: float) -> None:
+        """Let nodes be anywhere so far from where they were thought to be."""
+        self._noise[nodes, 0] += sigma_m**2
+        self._noise[nodes, 2] += sigma_m**2
+        self._noise[nodes, 5] += sigma_rad**2
+        self._behind = True
+
     # -- strips --------------------------------------------------------------------------------
+
+    def widen(self, width_m: float) -> None:
+        """Lay strips of another width, (m); infinite: all users in one."""
+        self.width_m = width_m
+        if self.pose.size:
+            self._lay_out(self._dense())
 
     def _move_over(self, node: Indices, peer: Indices) -> None:
         """Move nodes to the strip that they walked into; lay all out anew where that must be."""
@@ -397,9 +438,8 @@ class NeighbourhoodFilter:
         apart = np.abs(self._layout.strip[node] - self._layout.strip[peer]) > 1
         if apart.any():
             # Somebody is ranged from further off than a strip is wide.
-            place = self.pose[:, :2] @ self._axis
-            self.width_m = float(np.abs(place[node] - place[peer]).max()) + MARGIN_M
-            self._lay_out(self._dense())
+            off = self.pose[node, :2] - self.pose[peer, :2]
+            self.widen(float(np.hypot(off[:, 0], off[:, 1]).max()) + MARGIN_M)
             self.counters["strips_widened"] += 1
 
     def _move(self, movers: Indices, direction: int) -> bool:

@@ -163,21 +163,20 @@ def pair_spread(
 @compiled
 def gather(
     spread: Floats, node: Indices, peer: Indices, measured: Floats, variance: Floats,
-    outliers: float, span: float, strip: Indices, slot: Indices, sizes: Indices,
-    at_diagonal: Indices, at_next: Indices, information: Floats, push: Floats, weight: Floats,
-    surprise: Floats,
+    outlier: Floats, strip: Indices, slot: Indices, sizes: Indices, at_diagonal: Indices,
+    at_next: Indices, information: Floats, push: Floats, weight: Floats, surprise: Floats,
 ) -> None:  # fmt: skip
     """Put the ranges of one instant into information about positions, linear at the present poses.
 
     ``spread`` is :func:`pair_spread`'s, ``measured`` and ``variance`` (E,) are m and m^2.
     ``information`` holds blocks as the covariance's, but of positions alone (2n states);
     ``push`` (2N,) the right-hand side, strip by strip as the blocks' rows (both are set to zero
-    first). ``weight`` (E,) is each range's share that is believed, ``surprise`` (E,) its squared
-    innovation over the expected variance.
+    first). ``weight`` (E,) is each range's probability to be good, by which its information is
+    multiplied, ``surprise`` (E,) its squared innovation over the expected variance.
 
     Second order: the mean of a distance whose vector varies by p across its line is d + p / 2d,
-    its variance grows by p^2 / 2d^2. A range is too long or nonsense with probability
-    ``outliers``, then anywhere within ``span`` metres.
+    its variance grows by p^2 / 2d^2. ``outlier`` holds the share of outliers, their variance (m^2)
+    and the share of these that are too short.
     """
     information[:] = 0.0
     push[:] = 0.0
@@ -192,11 +191,12 @@ def gather(
         doubt = variance[e] + 0.5 * bend * bend
         expected = along + doubt
         surprise[e] = innovation * innovation / expected
-        believed = 1.0
-        if outliers > 0.0:
-            usual = (1.0 - outliers) * math.exp(-0.5 * surprise[e])
-            usual /= math.sqrt(2.0 * math.pi * expected)
-            believed = usual / (usual + outliers / span)
+        wide = expected + outlier[1]
+        side = 2.0 * (1.0 - outlier[2]) if innovation > 0.0 else 2.0 * outlier[2]
+        usual = (1.0 - outlier[0]) * math.exp(-0.5 * surprise[e]) / math.sqrt(expected)
+        odd = outlier[0] * side * math.exp(-0.5 * innovation * innovation / wide) / math.sqrt(wide)
+        # Where both vanish, it is certainly no good one.
+        believed = usual / (usual + odd + 1e-300)
         weight[e] = believed
         if believed < 1e-3 or abs(strip[i] - strip[j]) > 1:
             continue
@@ -309,3 +309,19 @@ def mirror(covariance: Floats, at_diagonal: Indices, sizes: Indices) -> None:
         for column in range(m):
             for row in range(column + 1, m):
                 block[row, column] = block[column, row]
+
+
+@compiled
+def marginals(covariance: Floats, at_diagonal: Indices, sizes: Indices, strip: Indices,
+              slot: Indices) -> Floats:  # fmt: skip
+    """Of every node xx, yy, xy and heading variance: (N, 4)."""
+    result = np.empty((len(strip), 4))
+    for i in range(len(strip)):
+        n = sizes[strip[i]]
+        m = 3 * n
+        at = at_diagonal[strip[i]] + slot[i] * (m + 1)
+        result[i, 0] = covariance[at]
+        result[i, 1] = covariance[at + n * (m + 1)]
+        result[i, 2] = covariance[at + n]
+        result[i, 3] = covariance[at + 2 * n * (m + 1)]
+    return result
