@@ -47,9 +47,9 @@ def make(
     match str(name):
         case "bank":
             # Kernels are only loaded where they are used: help texts stay quick.
-            from relpos.fusion.bank import Bank
+            from relpos.fusion.growing import GrowingTeam
 
-            return Bank(priors, parse(BankSettings, given, "bank"), seed, nodes or {})
+            return GrowingTeam(priors, parse(BankSettings, given, "bank"), seed, nodes or {})
         case "particle":
             from relpos.fusion.particle import ParticleFilter
 

@@ -32,6 +32,7 @@ from relpos.fusion.estimator import (
 )
 from relpos.fusion.joining import Joining
 from relpos.fusion.neighbourhood import NeighbourhoodFilter, RangeModel
+from relpos.fusion.ranging_model import Mounting
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.measurements import Height, Measurement, Prior, Range
@@ -76,6 +77,8 @@ class LargeTeam:
     priors: Sequence[Prior] = ()
     settings: BankSettings = field(default_factory=BankSettings)
     seed: int = 0
+    mountings: Mapping[int, Mounting] = field(default_factory=dict)
+    start_s: float = 0.0
     filter: NeighbourhoodFilter = field(init=False)
     _feed: Rewinder = field(init=False)
     _nodes: list[int] = field(default_factory=list)
@@ -97,9 +100,12 @@ class LargeTeam:
         model = RangeModel(SIGMA_R_M, s.outliers, s.outlier_m, s.outliers_short)
         self.filter = NeighbourhoodFilter(math.inf, model)
         timeline = Timeline(
-            [p.node for p in self.priors], reorder_s=s.reorder_s, max_lag_s=s.max_lag_s
+            [p.node for p in self.priors],
+            start_s=self.start_s,
+            reorder_s=s.reorder_s,
+            max_lag_s=s.max_lag_s,
         )
-        self._feed = Rewinder(self, timeline)
+        self._feed = Rewinder(self, timeline, s.late_s)
         known: list[Prior] = []
         for p in sorted(self.priors, key=lambda p: p.node):
             if p.node in self._known:
@@ -187,6 +193,9 @@ class LargeTeam:
         for node in nodes:
             self._row[node] = len(self._nodes)
             self._nodes.append(node)
+            worn = self.mountings.get(node)
+            if worn is not None and worn.antenna_offset_m is not None:
+                self.filter.antenna_m[self._row[node]] = worn.antenna_offset_m
         self._odd = np.append(self._odd, np.zeros(len(nodes)))
         self._level = np.concatenate([self._level, np.ones((len(nodes), noise.LEVELS))])
 
@@ -241,9 +250,7 @@ class LargeTeam:
         node = np.array([self._row[r.node] for r in ranges], dtype=np.int64)
         peer = np.array([self._row[r.peer] for r in ranges], dtype=np.int64)
         measured = np.array([r.range_m for r in ranges])
-        rise = np.array(
-            [self._known[r.peer].height_m - self._known[r.node].height_m for r in ranges]
-        )
+        rise = np.array([self._height(r.peer) - self._height(r.node) for r in ranges])
         flat = np.sqrt(np.maximum(measured**2 - rise**2, 0.0))
         self._ranges_used += len(ranges)
         f = self.filter
@@ -260,7 +267,7 @@ class LargeTeam:
 
         E |z - d|^2 after the ranges is the residual's square and what is still unsure of d.
         """
-        spread = self.filter.spread(node, peer)
+        spread = self.filter.antenna_spread(node, peer)
         bend = 0.5 * spread[2] / np.maximum(spread[0], 0.1)
         square = (measured - spread[0] - bend) ** 2 + spread[1]
         total, model = float(trust.sum()), self.filter.model
@@ -281,6 +288,11 @@ class LargeTeam:
             self._odd[doubted] = 0.0
             self._own["jumps"] += int(doubted.size)
 
+    def _height(self, node: int) -> float:
+        worn = self.mountings.get(node)
+        tag_m = 0.0 if worn is None or worn.height_m is None else worn.height_m
+        return tag_m + self._known[node].height_m
+
     # -- joining -------------------------------------------------------------------------------
 
     def _found_frame(self, ranges: Sequence[Range]) -> None:
@@ -297,7 +309,7 @@ class LargeTeam:
         for r in ranges:
             for node, peer in ((r.node, r.peer), (r.peer, r.node)):
                 if node not in self._row and peer in self._row:
-                    rise = self._known[node].height_m - self._known[peer].height_m
+                    rise = self._height(node) - self._height(peer)
                     flat = math.sqrt(max(r.range_m**2 - rise**2, 0.0))
                     heard.append((node, self._row[peer], flat))
         if not heard:

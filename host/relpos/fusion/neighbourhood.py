@@ -164,6 +164,8 @@ class NeighbourhoodFilter:
     width_m: float
     model: RangeModel = field(default_factory=RangeModel)
     pose: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    antenna_m: Floats = field(default_factory=lambda: np.empty((0, 2)))
+    """Of every node, where its antenna is: forward and left of the point that moves, (N, 2)."""
     counters: Counter[str] = field(default_factory=Counter)
     """How often nodes changed strips, and strips were laid out anew or widened."""
     _lever: Floats = field(default_factory=lambda: np.empty((0, 2)))
@@ -182,6 +184,7 @@ class NeighbourhoodFilter:
             self,
             model=replace(self.model),
             pose=self.pose.copy(),
+            antenna_m=self.antenna_m.copy(),
             counters=self.counters.copy(),
             _lever=self._lever.copy(),
             _noise=self._noise.copy(),
@@ -201,6 +204,7 @@ class NeighbourhoodFilter:
         full = self._dense() if count else np.empty((0, 0))
         self.pose = np.concatenate([self.pose, pose])
         more = pose.shape[0]
+        self.antenna_m = np.concatenate([self.antenna_m, np.zeros((more, 2))])
         self._lever = np.zeros((count + more, 2))
         self._noise = np.zeros((count + more, 6))
         self._variance = np.zeros(count + more)
@@ -292,7 +296,7 @@ class NeighbourhoodFilter:
         self._catch_up()
         self._move_over(node, peer)
         layout, model = self._layout, self.model
-        spread = self.spread(node, peer)
+        spread = self.antenna_spread(node, peer)
         information, push = np.empty(layout.total_p), np.empty(2 * self.pose.shape[0])
         weight, surprise = np.empty(node.size), np.empty(node.size)
         kernels.gather(
@@ -396,6 +400,20 @@ class NeighbourhoodFilter:
         return kernels.pair_spread(
             self._covariance, layout.at_diagonal, layout.at_next, layout.sizes, layout.strip,
             layout.slot, self.pose, node, peer,
+        )  # fmt: skip
+
+    def antenna_spread(self, node: Indices, peer: Indices) -> Floats:
+        """:meth:`spread` between antennas, whose offsets turn with the headings as believed."""
+        if not self.antenna_m.any():
+            return self.spread(node, peer)
+        self._catch_up()
+        layout, pose = self._layout, self.pose.copy()
+        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+        pose[:, 0] += c * self.antenna_m[:, 0] - s * self.antenna_m[:, 1]
+        pose[:, 1] += s * self.antenna_m[:, 0] + c * self.antenna_m[:, 1]
+        return kernels.pair_spread(
+            self._covariance, layout.at_diagonal, layout.at_next, layout.sizes, layout.strip,
+            layout.slot, pose, node, peer,
         )  # fmt: skip
 
     def marginals(self) -> Floats:
