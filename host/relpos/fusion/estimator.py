@@ -132,8 +132,8 @@ class Estimate:
 
     The frame is that of the priors where there are any, else the pose of the first located node
     at the start. ``nodes`` is ordered by node id, ``pairs`` holds node < peer of every two
-    located nodes (of large teams: of those within reach of each other). ``alternatives`` is empty unless something is ambiguous; ``parameters`` is
-    what has been learned so far.
+    located nodes (of large teams: of those within reach of each other). ``alternatives`` is
+    empty unless something is ambiguous; ``parameters`` is what has been learned so far.
     """
 
     time_s: float
