@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from relpos import fusion
-from relpos.fusion import Estimate, NodeStatus
-from relpos.fusion.growing import LARGE_TEAM
+from relpos.fusion import Estimate, NodeStatus, growing
 from relpos.measurements import Measurement, Prior, Range
 from relpos.simulation.crowd import Crowd, CrowdSettings, simulate_crowd
 
@@ -116,15 +115,18 @@ def test_what_comes_late_is_put_in_its_place(crowd: Crowd) -> None:
         assert a.x_m == pytest.approx(b.x_m, abs=1e-9)
 
 
-def test_a_team_that_grows_large_goes_on_from_where_everybody_was() -> None:
-    crowd = simulate_crowd(CrowdSettings(nodes=LARGE_TEAM + 4, seconds=16), 3)
-    few = 6  # the bank works on hypotheses of all of them: few keep the test short
+def test_a_team_that_grows_large_goes_on_from_where_everybody_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(growing, "LARGE_TEAM", 8)
+    crowd = simulate_crowd(CrowdSettings(nodes=12, neighbours=9, seconds=24), 3)
+    few = 6
     measurements = [
         m
         for m in crowd.measurements()
-        if m.time_s > 6.0 or (m.node <= few and (not isinstance(m, Range) or m.peer <= few))
+        if m.time_s > 8.0 or (m.node <= few and (not isinstance(m, Range) or m.peer <= few))
     ]
-    made = fusion.make("bank", crowd.priors()[:few], {"hypotheses": 5}, 0)
+    made = fusion.make("bank", crowd.priors()[:few], {"hypotheses": 20}, 0)
     estimates = [e for m in measurements for e in made.process(m)] + made.finish()
     times = [e.time_s for e in estimates]
     assert times == sorted(set(times))
