@@ -35,7 +35,7 @@ from relpos.fusion.estimator import (
 from relpos.fusion.joint import PER_NODE, Of
 from relpos.fusion.ranging_model import Mounting, Repetition
 from relpos.fusion.rewind import Rewinder
-from relpos.fusion.starts import Found, Mixture, Starts
+from relpos.fusion.starts import SETTLED_HEADING_RAD, Found, Mixture, Starts
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.measurements import Heading, Height, Measurement, Prior
 
@@ -190,11 +190,19 @@ class BankCore:
         self.p[np.ix_(np.arange(self.count), pose, pose)] = covariances[chosen]
         self.log_weight = np.log(share[chosen] / times[chosen])
 
-    def place(self, rows: Indices, poses: Floats, covariances: Floats, log_weights: Floats) -> None:
+    def place(
+        self,
+        rows: Indices,
+        poses: Floats,
+        covariances: Floats,
+        log_weights: Floats,
+        beside: int | None = None,
+    ) -> None:
         """Put users ``rows`` (M,) at start hypotheses, and leave everybody else where he is.
 
         ``poses`` (H, M, 3), ``covariances`` (H, 3 M, 3 M), ``log_weights`` (H,); the hypotheses
-        are dealt out by weight, independently of what they say of the others.
+        are dealt out by weight, independently of what they say of the others. Where the places
+        were found relative to the others, their errors have the error of user ``beside`` in them.
         """
         share = np.exp(log_weights - log_weights.max())
         share /= share.sum()
@@ -203,7 +211,34 @@ class BankCore:
         self.x[:, pose] = poses.reshape(len(share), -1)[chosen]
         self.p[:, pose, :] = 0.0
         self.p[:, :, pose] = 0.0
-        self.p[np.ix_(np.arange(self.count), pose, pose)] = covariances[chosen]
+        if beside is not None:
+            leader = PER_NODE * beside
+            for row in rows:
+                for axis in (Of.X, Of.Y):
+                    at = PER_NODE * int(row) + axis
+                    self.p[:, at, :] = self.p[:, leader + axis, :]
+                    self.p[:, :, at] = self.p[:, :, leader + axis]
+            common = self.p[:, leader : leader + 2, leader : leader + 2]
+            for a in rows:
+                for b in rows:
+                    i, j = PER_NODE * int(a), PER_NODE * int(b)
+                    self.p[:, i : i + 2, j : j + 2] = common
+        self.p[np.ix_(np.arange(self.count), pose, pose)] += covariances[chosen]
+
+    def split_heading(self, row: int, moved_m: float) -> None:
+        """Give each hypothesis another direction of a user of whose heading nothing is known.
+
+        ``moved_m`` is how far the user has gone without one.
+        """
+        order = self.rng.permutation(self.count)
+        at = PER_NODE * row
+        width = _TWO_PI / self.count
+        self.x[:, at + Of.HEADING] = width * (order + self.rng.random(self.count))
+        self.p[:, at + Of.HEADING, :] = 0.0
+        self.p[:, :, at + Of.HEADING] = 0.0
+        self.p[:, at + Of.HEADING, at + Of.HEADING] = max(1.5 * width, 0.12) ** 2
+        for entry in (Of.X, Of.Y):
+            self.p[:, at + entry, at + entry] += 0.5 * moved_m**2
 
     def set_scale(self, row: int, scale: float) -> None:
         """Start a user's step scale (true over reported) where it is modelled."""
@@ -426,6 +461,9 @@ PAIR_BIASES = 6
 """Up to so many users each pair has a bias of its own in the state: 15 of them double its size.
 Of more, the common one is modelled."""
 
+SET_OFF_M = 0.3
+"""A node without a heading has set off when it is this far from where it stood."""
+
 CROSS = 0.04
 """Variance across the way relative to along it: steps err in length, turns err apart from that."""
 
@@ -477,6 +515,8 @@ class _State:
     ranges_used: int
     epoch_s: float
     starts: Starts
+    standing: dict[int, complex]
+    facing: dict[int, complex]
 
 
 @dataclass(slots=True)
@@ -498,6 +538,9 @@ class Bank:
     starts: Starts = field(init=False)
     _row: dict[int, int] = field(default_factory=dict)
     _known: dict[int, _Known] = field(default_factory=dict)
+    _standing: dict[int, complex] = field(default_factory=dict)
+    """Located nodes without a heading: how far they have gone since, in their own first frame."""
+    _facing: dict[int, complex] = field(default_factory=dict)
     _pending: list[Advance] = field(default_factory=list)
     _own: Counter[str] = field(default_factory=Counter)
     _moved: bool = False
@@ -561,6 +604,8 @@ class Bank:
                 self.repetition.move(step.node, step.dx_m, step.dy_m, step.dtheta_rad)
                 if step.node in self._row:
                     self._pending.append(step)
+                    if step.node in self._standing:
+                        self._set_off(step)
                 else:
                     self._seek(step.node)
                     self.starts.advance(step)
@@ -572,7 +617,7 @@ class Bank:
                 self._sense(step)
             case Epoch():
                 self._advance()
-                self._admit(self.starts.epoch())
+                self._admit(self.starts.epoch(step.time_s))
                 return self._estimate(step.time_s)
         return None
 
@@ -583,7 +628,7 @@ class Bank:
             self._row.copy(),
             {node: copy(known) for node, known in self._known.items()}, self._pending[:],
             self._own.copy(), self._moved, self._ranges_used, self._epoch_s,
-            self.starts.snapshot(),
+            self.starts.snapshot(), self._standing.copy(), self._facing.copy(),
         )  # fmt: skip
 
     def restore(self, snapshot: _State) -> None:
@@ -597,6 +642,7 @@ class Bank:
         self._moved, self._ranges_used = snapshot.moved, snapshot.ranges_used
         self._epoch_s = snapshot.epoch_s
         self.starts = snapshot.starts.snapshot()
+        self._standing, self._facing = snapshot.standing.copy(), snapshot.facing.copy()
 
     def _meet(self, node: int) -> _Known:
         known = self._known.get(node)
@@ -660,30 +706,63 @@ class Bank:
             self.starts.meet(node)
 
     def _places(self) -> dict[int, tuple[float, float, float]]:
-        """Everybody in the core: x, y (m) and the variance (m^2) of a distance to him."""
+        """Everybody in the core: x, y (m), and the variance (m^2) relative to his nearest.
+
+        What the team's places have in common is no error of a place found relative to them.
+        """
         if not self._row:
             return {}
         mean, covariance = self.core.moments()
-        places = {}
-        for node, row in self._row.items():
-            at = PER_NODE * row
-            variance = 0.5 * float(covariance[at, at] + covariance[at + 1, at + 1])
-            places[node] = (float(mean[at]), float(mean[at + 1]), variance)
-        return places
+        at = PER_NODE * np.array(list(self._row.values()))
+        own = 0.5 * (covariance[at, at] + covariance[at + 1, at + 1])
+        cross = 0.5 * (covariance[np.ix_(at, at)] + covariance[np.ix_(at + 1, at + 1)])
+        apart = own[:, None] + own[None, :] - 2.0 * cross
+        np.fill_diagonal(apart, np.inf)
+        variance = 0.5 * np.maximum(apart.min(axis=1), 0.0) if len(at) > 1 else np.zeros(1)
+        return {
+            node: (float(mean[i]), float(mean[i + 1]), float(v))
+            for node, i, v in zip(self._row, at, variance, strict=True)
+        }
 
     def _admit(self, found: Found | None) -> None:
         """Let those whose start has been found join the core."""
         if found is None:
             return
         mixture = found.mixture
+        beside = self._nearest(mixture) if self._row else None
         rows = [self.core.add_node(0.0, 0.0, 0.0, 1.0, 1.0) for _ in mixture.nodes]
         self._row.update(zip(mixture.nodes, rows, strict=True))
         self.core.place(
             np.array(rows, dtype=np.int64), mixture.poses, mixture.covariances,
-            np.log(np.maximum(mixture.weights, 1e-300)),
+            np.log(np.maximum(mixture.weights, 1e-300)), beside,
         )  # fmt: skip
-        for row, scale in zip(rows, mixture.scales, strict=True):
-            self.core.set_scale(row, float(scale))
+        for n, (node, row) in enumerate(zip(mixture.nodes, rows, strict=True)):
+            self.core.set_scale(row, float(mixture.scales[n]))
+            if mixture.heading_sigma_rad(n) > SETTLED_HEADING_RAD:
+                self._standing[node] = complex(0.0)
+
+    def _nearest(self, mixture: Mixture) -> int:
+        """Row of the user of the core who is nearest to those who have been found."""
+        mean, _ = self.core.moments()
+        middle = mixture.poses[0, :, :2].mean(axis=0)
+        rows = list(self._row.values())
+        off = [np.hypot(*(mean[PER_NODE * r : PER_NODE * r + 2] - middle)) for r in rows]
+        return rows[int(np.argmin(off))]
+
+    def _set_off(self, step: Advance) -> None:
+        """Watch a node that stands without a heading: where it goes, its ranges will tell."""
+        gone = self._standing[step.node]
+        gone += complex(step.dx_m, step.dy_m) * self._facing.get(step.node, 1.0)
+        self._standing[step.node] = gone
+        self._facing[step.node] = self._facing.get(step.node, 1.0) * complex(
+            math.cos(step.dtheta_rad), math.sin(step.dtheta_rad)
+        )
+        if abs(gone) < SET_OFF_M:
+            return
+        self._advance()
+        del self._standing[step.node], self._facing[step.node]
+        self.core.split_heading(self._row[step.node], abs(gone))
+        self._own["headings_sought"] += 1
 
     def _pairs(self, pairs: Sequence[tuple[int, int]]) -> tuple[Indices, Indices, Floats]:
         first = np.array([self._row[a] for a, _ in pairs], dtype=np.int64)
@@ -778,7 +857,7 @@ class Bank:
         own = slice(3 * n, 3 * n + 3)
         belief = believe(mixture.weights, mixture.poses[:, n], mixture.covariances[:, own, own])
         status = _status(known)
-        if status is NodeStatus.OK and node != self.starts.search.frame:
+        if status is NodeStatus.OK and node not in self.starts.settled:
             status = NodeStatus.AMBIGUOUS
         spread = belief.covariance_m2
         return NodeEstimate(
@@ -820,7 +899,7 @@ class Bank:
         self, time_s: float, mixture: Mixture, mean: Floats, covariance: Floats
     ) -> tuple[Alternative, ...]:
         """List the possible pictures of the whole team while somebody's start is unknown."""
-        if set(mixture.nodes) == {self.starts.search.frame}:
+        if set(mixture.nodes) <= self.starts.settled:
             return ()
         count, sought = len(mixture.weights), len(mixture.nodes)
         located = sorted(self._row)

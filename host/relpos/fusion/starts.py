@@ -138,6 +138,13 @@ class Mixture:
     scales: Floats
     """True over reported length (N,), of the best picture."""
 
+    def heading_sigma_rad(self, index: int) -> float:
+        """How well the heading of a node is known."""
+        own = slice(POSE * index, POSE * (index + 1))
+        return believe(
+            self.weights, self.poses[:, index], self.covariances[:, own, own]
+        ).sigma_heading_rad
+
 
 @dataclass(slots=True)
 class Search:
@@ -406,7 +413,8 @@ class Search:
         else:
             self._fit(3, data)
         old = self._pictures
-        fresh = self._propose(settings.fresh, data)
+        few = len(self.nodes) <= 3
+        fresh = self._propose(settings.fresh * (3 if few else 1), data)
         if fresh.shape[0]:
             self._pictures = fresh
             self._fit(8, data)
@@ -896,6 +904,9 @@ class Starts:
     _wanderers: dict[int, _Wanderer] = field(default_factory=dict)
     _agreed: Counter[int] = field(default_factory=Counter)
     _framed: bool = False
+    settled: set[int] = field(default_factory=set)
+    _standing: set[int] = field(default_factory=set)
+    _quiet_since_s: float = -math.inf
 
     def __post_init__(self) -> None:
         self.search = Search(self.settings, self.seed, self.counters)
@@ -972,21 +983,39 @@ class Starts:
         self.search.frame = node
         self._framed = True
 
-    def epoch(self) -> Found | None:
-        """Search on; return who has been agreed on for ``AGREED_EPOCHS``."""
+    def epoch(self, time_s: float) -> Found | None:
+        """Search on; return who can be handed over.
+
+        ``settled`` are those whose place has been agreed on for ``AGREED_EPOCHS``. Who starts
+        together is handed over together, once all of them are settled.
+        """
         if not self.search.nodes:
             return None
-        self.search.solve()
-        agreed = self.search.resolve(AGREED)
+        search = self.search
+        search.solve()
+        agreed = search.resolve(AGREED)
         self._agreed = Counter({n: self._agreed[n] + 1 for n in agreed})
-        found = [n for n in agreed if self._agreed[n] >= AGREED_EPOCHS]
-        if not found:
+        settled = {n for n in agreed if self._agreed[n] >= AGREED_EPOCHS}
+        if search.frame is not None:
+            settled.add(search.frame)
+        news = settled != self.settled or any(search.extent_m(n) > STOOD_M for n in self._standing)
+        self.settled = settled
+        self._standing = {n for n in settled if search.extent_m(n) <= STOOD_M}
+        if news:
+            self._quiet_since_s = time_s
+        if search.frame is not None and (len(settled) < 2 or settled != search.active):
             return None
-        self.counters["starts_found"] += len(found)
-        frame = self.search.frame
-        if frame is not None:
-            found.insert(0, frame)
-        return Found(self.search.release(found), frame is not None)
+        if self._standing - {search.frame} and not self._wanderers:
+            # Somebody who stands has no heading yet. The search finds it best, with all others.
+            quiet = time_s - self._quiet_since_s >= QUIET_S
+            if len(self._standing - {search.frame}) > MOST_STANDING or not quiet:
+                settled = settled - self._standing if search.frame is None else set()
+        if not settled:
+            return None
+        self.counters["starts_found"] += len(settled)
+        found = sorted(settled, key=lambda n: (n != search.frame, n))
+        self.settled = self.settled - settled
+        return Found(search.release(found), search.frame is not None)
 
     @property
     def mixture(self) -> Mixture | None:
@@ -1009,6 +1038,7 @@ class Starts:
         """Copy everything that changes."""
         other = copy.copy(self)
         other.counters, other._agreed = self.counters.copy(), self._agreed.copy()
+        other.settled, other._standing = self.settled.copy(), self._standing.copy()
         other._wanderers = copy.deepcopy(self._wanderers)
         other.search = self.search.snapshot(other.counters)
         return other
@@ -1019,3 +1049,8 @@ MOST_SOUGHT = 8
 
 AGREED = 0.99
 AGREED_EPOCHS = 3
+
+MOST_STANDING = 2
+QUIET_S = 30.0
+"""Up to so many of those who stand are handed over without a heading, when nobody has set off or
+been settled for so long: people set off one after another."""
