@@ -13,11 +13,14 @@ PYTHON := $(VENV)/bin/python
 RUN := $(VENV)/.relpos-run
 DEVELOP := $(VENV)/.relpos-develop
 FUZZ := $(VENV)/.relpos-fuzz
+# The peers pin numpy below 2: an environment of their own, lest they take ours back.
+BENCH_VENV := .venv-bench
+PEERS := $(BENCH_VENV)/.relpos-bench
 
 PIP := $(PYTHON) -m pip --disable-pip-version-check install --progress-bar on
 title = @printf '\n\033[1m== %s\033[0m\n' "$(1)"
 
-.PHONY: help setup demo test lint bench firmware docs wire clean soak \
+.PHONY: help setup demo test lint bench bench-chain firmware docs wire clean soak \
         system-demo system-avr system-soak native-tests board-builds simulated-tests python-tests
 
 help: ## this list
@@ -72,10 +75,12 @@ firmware: board-builds ## both boards: flash, RAM, cycles, beside Mahony and Mad
 	$(call title,Budget: cycles and stack on simavr)
 	$(PYTHON) -m relpos.emulator.avr.budget --seconds 100 --filters
 
-bench: $(DEVELOP) ## what is timed, in bench/
-	@found=; for file in bench/bench_*.py; do \
-	    [ -e "$$file" ] || continue; found=1; echo "== $$file"; $(PYTHON) "$$file"; \
-	done; [ -n "$$found" ] || { echo "make bench: there is no bench/bench_*.py yet" >&2; exit 1; }
+bench: $(PEERS) ## relpos beside filterpy, Stone Soup, particles, pfilter, GTSAM; BENCH=--quick or --full
+	$(call title,Relpos and its peers: the same measurements, time and error)
+	NUMBA_CACHE_DIR=$(BENCH_VENV)/numba $(BENCH_VENV)/bin/python bench/peers/compare.py $(BENCH) --out out/bench
+
+bench-chain: board-builds ## how fast boards and teams are emulated, and the particle filter through its interface
+	@for file in bench/bench_*.py; do echo "== $$file"; $(PYTHON) "$$file"; done
 
 docs: wire ## regenerate the pages that come from the sources
 	$(PYTHON) bench/reliability.py
@@ -101,6 +106,12 @@ $(DEVELOP): pyproject.toml | $(PYTHON)
 $(FUZZ): $(DEVELOP)
 	$(call title,Installing the fuzzer for Python)
 	$(PIP) --editable '.[fuzz]'
+	@touch $@
+
+$(PEERS): pyproject.toml | system-demo
+	$(call title,Installing relpos and its peers in $(BENCH_VENV))
+	[ -x $(BENCH_VENV)/bin/python ] || "$$(tools/find_python.sh)" -m venv $(BENCH_VENV)
+	$(BENCH_VENV)/bin/python -m pip --disable-pip-version-check install --progress-bar on --editable '.[bench]'
 	@touch $@
 
 system-demo:

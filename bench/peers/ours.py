@@ -1,0 +1,159 @@
+"""relpos' own contenders, arrays in and out, and through its public interface."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from case import Case, Floats, Instant, Score, score
+from relpos import fusion
+
+
+class Joint:
+    """The bank's joint filter with a single hypothesis: 5 states a user, noise told."""
+
+    def __init__(self, case: Case, seed: int) -> None:
+        from relpos.fusion.bank import BankCore
+        from relpos.fusion.bank_settings import BankSettings
+
+        self.core = BankCore(BankSettings(hypotheses=1, constants=0.0, outliers=0.0), seed)
+        for pose in case.truth[0]:
+            self.core.add_node(*map(float, pose), 1e-3, 1e-3)
+        self.told = case.sigma_range_m
+        self.rows = np.arange(case.nodes)
+        self.ones = np.ones(case.nodes)
+
+    def predict(self, motion: Floats, sigma: Floats) -> None:
+        """Move everybody by told noise."""
+        self.core.level[:] = 1.0
+        self.core.advance(self.rows, motion[:, 0], motion[:, 1], motion[:, 2], self.ones, sigma)
+
+    def update(self, ranges: Instant) -> None:
+        """Ranges one after another, to second order."""
+        self.core.sigma2[:] = self.told**2
+        self.core.update(ranges.node, ranges.peer, ranges.range_m, np.zeros(ranges.node.size))
+
+    def positions(self) -> Floats:
+        """Means."""
+        pose: Floats = self.core.x[0, : 5 * len(self.rows)].reshape(-1, 5)[:, :2]
+        return pose
+
+
+class Strips:
+    """The filter for large teams: 3 states a user, noise told."""
+
+    def __init__(self, case: Case, seed: int) -> None:
+        from relpos.fusion.neighbourhood import NeighbourhoodFilter, RangeModel
+
+        longest = max(float(r.range_m.max()) for r in case.ranges if r is not None)
+        self.filter = NeighbourhoodFilter(1.05 * longest, RangeModel(case.sigma_range_m))
+        self.filter.add(case.truth[0].copy(), np.zeros((case.nodes, 3, 3)))
+        self.rows = np.arange(case.nodes)
+
+    def predict(self, motion: Floats, sigma: Floats) -> None:
+        """Move everybody."""
+        # Noise along the way and across it, as the axes of the body see them.
+        way = np.maximum(np.hypot(motion[:, 0], motion[:, 1]), 1e-9)
+        share = motion[:, :2] / way[:, None]
+        seen = np.hypot(share * sigma[:, :1], share[:, ::-1] * sigma[:, 1:2])
+        self.filter.predict(self.rows, np.concatenate([motion, seen, sigma[:, 2:]], axis=1))
+
+    def update(self, ranges: Instant) -> None:
+        """All ranges of the instant at once."""
+        self.filter.update(ranges.node, ranges.peer, ranges.range_m)
+
+    def positions(self) -> Floats:
+        """Means."""
+        return self.filter.pose[:, :2]
+
+
+class Particles:
+    """The paper's filter: 3 states a particle, M particles for each user."""
+
+    def __init__(self, case: Case, seed: int, size: int, alpha: float) -> None:
+        from relpos.fusion.particle import Clouds
+        from relpos.fusion.ranging_model import RangeNoise
+
+        noise = RangeNoise(particle_sigma(case))
+        self.clouds = Clouds(size, alpha, noise, np.random.default_rng(seed))
+        for pose in case.truth[0]:
+            self.clouds.add(np.repeat(pose[:, None], size, axis=1))
+        self.rows = np.arange(case.nodes)
+
+    def predict(self, motion: Floats, sigma: Floats) -> None:
+        """Move every particle with its own noise."""
+        self.clouds.advance(self.rows, motion, particle_motion(sigma))
+
+    def update(self, ranges: Instant) -> None:
+        """Weigh by the neighbours' means, resample."""
+        self.clouds.range(ranges.node, ranges.peer, ranges.range_m, np.zeros(ranges.node.size))
+
+    def positions(self) -> Floats:
+        """Weighted means."""
+        at: Floats = np.einsum("akm,km->ka", self.clouds.poses[:2], self.clouds.weights)
+        return at
+
+
+def particle_sigma(case: Case) -> float:
+    """Range sigma that filters are told which take their neighbours' means as places.
+
+    The paper's own: what the means err by is in it.
+    """
+    return max(2.0 * case.sigma_range_m, 0.5)
+
+
+def particle_motion(sigma: Floats) -> Floats:
+    """Noise for particles: 2 cm and a degree more than told, lest the clouds collapse."""
+    return np.hypot(sigma, [0.02, 0.02, 0.0175])
+
+
+def through_interface(case: Case, name: str, settings: dict[str, object], seed: int) -> Score:
+    """Measurement by measurement, estimates included; noise is not told."""
+    made = fusion.make(name, case.priors, settings, seed)
+    estimated = case.truth[1:, :, :2].copy()
+    begin = time.process_time()
+    estimates = [e for m in case.measurements for e in made.process(m)]
+    estimates += made.finish()
+    spent = time.process_time() - begin
+    for e in estimates:
+        t = round(e.time_s) - 1
+        if 0 <= t < len(estimated):
+            estimated[t] = [(n.x_m, n.y_m) for n in e.nodes]
+    return score(case, estimated, 1e6 * spent / case.epochs)
+
+
+def begin_of(case: Case) -> Floats:
+    """Poses (T + 1, N, 3) that the smoothers begin from: the joint filter's own run."""
+    filter_ = Joint(case, 0)
+    poses = [case.truth[0]]
+    for motion, sigma, ranges in case.instants():
+        filter_.predict(motion, sigma)
+        if ranges is not None:
+            filter_.update(ranges)
+        poses.append(filter_.core.x[0, : 5 * case.nodes].reshape(-1, 5)[:, :3].copy())
+    return np.stack(poses)
+
+
+def smoother(case: Case, begin_m: Floats) -> Score:
+    """The smoother's optimiser on the whole run, noise told, from the given poses (T + 1, N, 3)."""
+    from relpos.fusion.smoother import Problem, Weights
+    from relpos.fusion.smoother_graph import build_graph
+
+    def solve() -> tuple[Floats, float]:
+        started = time.process_time()
+        graph, _ = build_graph(case.measurements, case.priors)
+        problem = Problem(graph, constants=False)
+        sigma = case.sigmas[:, :, [0, 1, 2]]
+        weights = Weights(
+            1.0 / sigma**2,
+            np.full(graph.range_m.size, 1.0 / case.sigma_range_m**2),
+            np.ones(problem.constants),
+        )
+        unwrapped = begin_m.copy()
+        state, _ = problem.optimise(problem.first_state(unwrapped), weights, steps=100)
+        return state.poses, time.process_time() - started
+
+    solve()  # compiles
+    poses, spent = solve()
+    return score(case, poses[1:, :, :2], 1e6 * spent / case.epochs)
