@@ -35,6 +35,7 @@ from relpos.fusion.estimator import (
 from relpos.fusion.joint import PER_NODE, Of
 from relpos.fusion.ranging_model import Mounting, Repetition
 from relpos.fusion.rewind import Rewinder
+from relpos.fusion.slips import BELIEVING, HYPOTHESES, Habit, Watch, doubts
 from relpos.fusion.starts import SETTLED_HEADING_RAD, Found, Mixture, Starts
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.measurements import Heading, Height, Measurement, Prior
@@ -99,6 +100,10 @@ class BankCore:
         """Pair of rows, the lower first -> place of its range bias in the state."""
         self.surprise: Floats = np.zeros(0)
         self.doubtful: Floats = np.zeros(count)
+        self.watch = Watch()
+        self.slipped: set[int] = set()
+        """Rows whose odometry has slipped and that are not found again yet."""
+        self._alarm: tuple[int, Indices, Indices, Floats] | None = None
         self.outlier_counts: Floats = np.array([settings.outliers, 1.0 - settings.outliers]) * 20.0
 
     # -- users ---------------------------------------------------------------------------------
@@ -141,6 +146,7 @@ class BankCore:
         self.sens = np.concatenate([self.sens, np.zeros((count, 1, noise.LEVELS, 6))], axis=1)
         self._spread_levels()
         self.surprise = np.append(self.surprise, 0.0)
+        self.watch.add_node()
         return row
 
     def remove(self, row: int) -> None:
@@ -162,6 +168,8 @@ class BankCore:
         self.sens = np.ascontiguousarray(np.delete(self.sens, row, axis=1))
         self._spread_levels()
         self.surprise = np.delete(self.surprise, row)
+        self.watch.remove(row)
+        self.slipped = {r - (r > row) for r in self.slipped if r != row}
         self.arm = np.delete(self.arm, row, axis=0)
 
     def seed_hypotheses(self, poses: Floats, covariances: Floats, log_weights: Floats) -> None:
@@ -298,6 +306,14 @@ class BankCore:
             np.zeros(len(first)) if dz_variance_m2 is None else dz_variance_m2,
             self.arm if self.arm.any() else self.arm[:0], stats,
         )  # fmt: skip
+        # Those who have just jumped would make any innovation look usual.
+        prior = np.exp(before - before.max()) * np.where(self.doubtful > 0.0, 1e-3, 1.0)
+        prior /= prior.sum()
+        middle = prior @ stats[:, :, 0]
+        variance = prior @ (stats[:, :, 1] + (stats[:, :, 0] - middle) ** 2)
+        slipped = self.watch.look(
+            first, second, (range_m - middle) ** 2 / variance, worth, self.outlier_share
+        )
         weight = self.weights()
         good: Floats = weight @ stats[:, :, 3]
         self.counters["levels_clamped"] += self.levels.learn(
@@ -310,7 +326,63 @@ class BankCore:
         for row, peer, trust in zip(first, second, good, strict=True):
             for one in (row, peer):
                 self.surprise[one] += 0.2 * (1.0 - trust - self.surprise[one])
+        if slipped is not None and self.count > 1:
+            self._alarm = (slipped, first, second, range_m)
         return good
+
+    def _doubt(self, row: int, first: Indices, second: Indices, range_m: Floats) -> None:
+        """Let most hypotheses doubt a user that has slipped (:mod:`relpos.fusion.slips`)."""
+        self.counters["slips"] += 1
+        # Of two alone either may be the one: what is between them is doubted in the same way.
+        self.slipped.update([row] if self.nodes > 2 else range(self.nodes))
+        self.resample(self.weights(), max(self.count, HYPOTHESES))
+        which = self.rng.permutation(self.count)[round(BELIEVING * self.count) :]
+        sights = np.flatnonzero((first == row) | (second == row))
+        sight = sights[np.arange(len(which)) % len(sights)]
+        peer = PER_NODE * np.where(first[sight] == row, second[sight], first[sight])
+        at = PER_NODE * row
+        peers = np.stack([self.x[which, peer], self.x[which, peer + 1]], axis=1)
+        made = doubts(
+            self.x[which, at : at + 3], peers, range_m[sight], self.settings.jump_m, self.rng
+        )
+        self.x[which, at : at + 3] = made.poses
+        # What was lost has nothing to do any more with what else is known.
+        for lost, part in ((~made.kept[:, 0], (0, 1)), (~made.kept[:, 1], (2,))):
+            some = which[lost]
+            for entry in part:
+                self.p[some, at + entry, :] = 0.0
+                self.p[some, :, at + entry] = 0.0
+            for a in part:
+                for b in part:
+                    self.p[some, at + a, at + b] = made.covariances[lost, a, b]
+        # Neither those who doubt nor those who ought to tell how noisy anybody is.
+        self.doubtful[:] = SLIP_UPDATES
+
+    def find_slipped(self, covariance: Floats) -> None:
+        """Forget slips of those who are found again, by the mixture's covariance (D, D)."""
+        for row in list(self.slipped):
+            at = PER_NODE * row
+            others = PER_NODE * np.delete(np.arange(self.nodes), row)
+            spread = [
+                covariance[at + e, at + e] + covariance[others + e, others + e]
+                - 2.0 * covariance[at + e, others + e]
+                for e in (Of.X, Of.Y)
+            ]  # fmt: skip
+            near = float(np.min(spread[0] + spread[1], initial=math.inf))
+            heading = float(covariance[at + Of.HEADING, at + Of.HEADING])
+            if near < FOUND_M**2 and heading < FOUND_RAD**2:
+                self.slipped.discard(row)
+
+    def doubt_motion(self, row: int, east_m: Floats, north_m: Floats) -> None:
+        """Let half the hypotheses leave out a displacement (K,) just made, world axes."""
+        at = PER_NODE * row
+        skip = np.arange(self.count) % 2 == 0
+        self.x[skip, at] -= east_m[skip]
+        self.x[skip, at + 1] -= north_m[skip]
+        for entry in (Of.X, Of.Y):
+            self.p[:, at + entry, at + entry] += ODD_M**2
+        self.doubtful[:] = SLIP_UPDATES
+        self.counters["motions_doubted"] += 1
 
     def _bias_places(self, first: Indices, second: Indices) -> Indices:
         """Where in the state the biases of ranges are; those of new pairs are added.
@@ -364,7 +436,12 @@ class BankCore:
     def settle(self) -> None:
         """Close an epoch: jumps, and resampling where the weights have become uneven."""
         weight = self.weights()
-        if 1.0 / float(weight @ weight) < 0.5 * self.count:
+        if self._alarm is not None:
+            self._doubt(*self._alarm)
+            self._alarm = None
+        elif self.count > self.settings.hypotheses and not self.slipped:
+            self.resample(weight, self.settings.hypotheses)
+        elif 1.0 / float(weight @ weight) < 0.5 * self.count:
             self.resample(weight)
         self._jump()
 
@@ -375,9 +452,9 @@ class BankCore:
         weight /= weight.sum()
         return weight
 
-    def resample(self, weight: Floats) -> None:
+    def resample(self, weight: Floats, count: int | None = None) -> None:
         """Draw hypotheses anew by their weights; levels of noise are jittered (Liu, West)."""
-        chosen = systematic(weight, self.count, self.rng)
+        chosen = systematic(weight, self.count if count is None else count, self.rng)
         self.x, self.p = self.x[chosen], self.p[chosen]
         self._permute_parameters(chosen)
         # Children of one parent part in their levels, too (Liu, West).
@@ -435,10 +512,11 @@ class BankCore:
             tuple(a.copy() for a in (
                 self.x, self.p, self.log_weight, self.levels.mean, self.levels.covariance,
                 self.draw, self.sens, self.has_constants, self.has_bias, self.surprise,
-                self.outlier_counts, self.doubtful, self.arm,
+                self.outlier_counts, self.doubtful, self.arm, self.watch.sums,
+                self.watch.base,
             )),
             self.rng.bit_generator.state,
-            (self.nodes,),
+            (self.nodes, *self.slipped),
             dict(self.biases),
             dict(self.counters),
         )  # fmt: skip
@@ -448,10 +526,12 @@ class BankCore:
         (
             self.x, self.p, self.log_weight, self.levels.mean, self.levels.covariance,
             self.draw, self.sens, self.has_constants, self.has_bias, self.surprise,
-            self.outlier_counts, self.doubtful, self.arm,
+            self.outlier_counts, self.doubtful, self.arm, self.watch.sums,
+            self.watch.base,
         ) = (a.copy() for a in snapshot.arrays)  # fmt: skip
         self.rng.bit_generator.state = dict(snapshot.random)
         self.nodes = self.levels.nodes = int(snapshot.numbers[0])
+        self.slipped = {int(row) for row in snapshot.numbers[1:]}
         self.biases = dict(snapshot.biases)
         self.counters = Counter(snapshot.counters)
         self._spread_levels()
@@ -469,6 +549,18 @@ CROSS = 0.04
 
 JITTER = 0.1
 """Standard deviation of the levels' jitter at resampling, in units of their spread."""
+
+MOST_LISTED = 200
+"""Hypotheses that alternatives are made of after a slip."""
+
+FOUND_M, FOUND_RAD = 1.0, 0.4
+"""Who slipped is found when his place as seen from somebody, and his heading, are known so well."""
+
+ODD_M = 0.3
+"""How far a displacement may be off that was doubted, whether it is left out or not."""
+
+SLIP_UPDATES = 10.0
+"""As ``DOUBT_UPDATES``, of all hypotheses after a slip."""
 
 DOUBT_UPDATES = 5.0
 """For so many instants of ranges a hypothesis that has jumped teaches nothing about noise."""
@@ -507,6 +599,7 @@ class _State:
     core: Snapshot
     detection: Detection
     repetition: Repetition
+    habit: Habit
     row: dict[int, int]
     known: dict[int, _Known]
     pending: list[Advance]
@@ -534,6 +627,7 @@ class Bank:
     core: BankCore = field(init=False)
     detection: Detection = field(default_factory=Detection)
     repetition: Repetition = field(default_factory=Repetition)
+    habit: Habit = field(default_factory=Habit)
     _feed: Rewinder = field(init=False)
     starts: Starts = field(init=False)
     _row: dict[int, int] = field(default_factory=dict)
@@ -625,7 +719,7 @@ class Bank:
         """Copy everything that ``take`` changes."""
         return _State(
             self.core.snapshot(), self.detection.snapshot(), self.repetition.snapshot(),
-            self._row.copy(),
+            self.habit.snapshot(), self._row.copy(),
             {node: copy(known) for node, known in self._known.items()}, self._pending[:],
             self._own.copy(), self._moved, self._ranges_used, self._epoch_s,
             self.starts.snapshot(), self._standing.copy(), self._facing.copy(),
@@ -636,6 +730,7 @@ class Bank:
         self.core.restore(snapshot.core)
         self.detection = snapshot.detection.snapshot()
         self.repetition = snapshot.repetition.snapshot()
+        self.habit = snapshot.habit.snapshot()
         self._row = snapshot.row.copy()
         self._known = {node: copy(known) for node, known in snapshot.known.items()}
         self._pending, self._own = snapshot.pending[:], snapshot.own.copy()
@@ -668,7 +763,25 @@ class Bank:
         told = None
         if any(a.sigma_x_m is not None or a.sigma_theta_rad is not None for a in steps):
             told = np.array([_told(a) for a in steps])
-        self.core.advance(rows, moves[:, 0], moves[:, 1], moves[:, 2], moves[:, 3], told)
+        begin = 0
+        for k, a in enumerate(steps):
+            if self.habit.is_odd(a.node, math.hypot(a.dx_m, a.dy_m), a.duration_s):
+                self._make(rows, moves, told, slice(begin, k))
+                at = PER_NODE * int(rows[k])
+                east, north = self.core.x[:, at].copy(), self.core.x[:, at + 1].copy()
+                self._make(rows, moves, told, slice(k, k + 1))
+                self.core.doubt_motion(
+                    int(rows[k]), self.core.x[:, at] - east, self.core.x[:, at + 1] - north
+                )
+                begin = k + 1
+        self._make(rows, moves, told, slice(begin, len(steps)))
+
+    def _make(self, rows: Indices, moves: Floats, told: Floats | None, some: slice) -> None:
+        """Make some of the displacements ``rows`` (M,), ``moves`` (M, 4)."""
+        dx, dy, dtheta, duration = moves[some].T
+        self.core.advance(
+            rows[some], dx, dy, dtheta, duration, None if told is None else told[some]
+        )
 
     def _range(self, step: Ranging) -> None:
         for r in step.ranges:
@@ -812,6 +925,7 @@ class Bank:
             known.silent_epochs = 0 if known.news_s > self._epoch_s else known.silent_epochs + 1
         self._epoch_s = time_s
         mean, covariance = self.core.moments()
+        self.core.find_slipped(covariance)
         mixture = self.starts.mixture
         nodes, parameters = [], []
         for node in sorted(self._known):
@@ -823,11 +937,14 @@ class Bank:
             at = PER_NODE * row
             pose = [float(v) for v in mean[at : at + PER_NODE]]
             own = covariance[at : at + PER_NODE, at : at + PER_NODE]
+            if row in self.core.slipped:
+                self._tell_mode(row, pose, own)
             nodes.append(
                 NodeEstimate(
                     node, pose[0], pose[1], math.remainder(pose[2], _TWO_PI),
                     float(own[0, 0]), float(own[1, 1]), float(own[0, 1]),
-                    min(math.sqrt(float(own[2, 2])), _ANY_ANGLE_RAD), _status(known),
+                    min(math.sqrt(float(own[2, 2])), _ANY_ANGLE_RAD),
+                    self._status(known, row),
                     known.height_m, known.sigma_height_m,
                 )
             )  # fmt: skip
@@ -844,7 +961,39 @@ class Bank:
         if mixture is not None:
             pairs += self._sought_pairs(mixture, mean, covariance)
             alternatives = self._alternatives(time_s, mixture, mean, covariance)
+        elif self.core.slipped:
+            alternatives = self._slip_alternatives(time_s)
         return Estimate(time_s, tuple(nodes), pairs, alternatives, tuple(parameters))
+
+    def _tell_mode(self, row: int, pose: list[float], own: Floats) -> None:
+        """Put the most likely place for the mean of a slipped user's places, in place."""
+        at = PER_NODE * row
+        belief = believe(
+            self.core.weights(), self.core.x[:, at : at + 3],
+            self.core.p[:, at : at + 3, at : at + 3],
+        )  # fmt: skip
+        pose[:3] = belief.x_m, belief.y_m, belief.heading_rad
+        own[:2, :2] = belief.covariance_m2
+        own[2, 2] = belief.sigma_heading_rad**2
+
+    def _slip_alternatives(self, time_s: float) -> tuple[Alternative, ...]:
+        """List the possible pictures of the team after a slip: those of the likeliest."""
+        weight = self.core.weights()
+        likely = np.argsort(-weight, kind="stable")[:MOST_LISTED]
+        nodes = sorted(self._row)
+        at = PER_NODE * np.array([self._row[n] for n in nodes])
+        places = at[:, None] + np.arange(2)
+        return pictures(
+            time_s, nodes, weight[likely] / weight[likely].sum(),
+            self.core.x[likely][:, at[:, None] + np.arange(3)],
+            self.core.p[likely][:, places[:, :, None], places[:, None, :]],
+        )  # fmt: skip
+
+    def _status(self, known: _Known, row: int) -> NodeStatus:
+        status = _status(known)
+        if status is NodeStatus.OK and row in self.core.slipped:
+            return NodeStatus.AMBIGUOUS
+        return status
 
     def _sought(self, node: int, known: _Known, mixture: Mixture | None) -> NodeEstimate:
         """Say of a node whose start is unknown what the search says."""
@@ -930,6 +1079,9 @@ class Bank:
         for n, a in enumerate(located):
             for b in located[n + 1 :]:
                 i, j = PER_NODE * self._row[a], PER_NODE * self._row[b]
+                if {self._row[a], self._row[b]} & self.core.slipped:
+                    pairs.append(self._pair_of_hypotheses(a, b, i, j))
+                    continue
                 dx, dy = float(mean[j] - mean[i]), float(mean[j + 1] - mean[i + 1])
                 xx = float(covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j])
                 yy = float(
@@ -957,6 +1109,17 @@ class Bank:
                     )
                 )
         return tuple(pairs)
+
+    def _pair_of_hypotheses(self, node: int, peer: int, i: int, j: int) -> PairEstimate:
+        """Distance and bearing of a pair where the mean of the places says nothing."""
+        x, p = self.core.x, self.core.p
+        spread = (
+            p[:, i : i + 2, i : i + 2] + p[:, j : j + 2, j : j + 2]
+            - p[:, i : i + 2, j : j + 2] - p[:, j : j + 2, i : i + 2]
+        )  # fmt: skip
+        return _pair_of_pictures(
+            node, peer, self.core.weights(), x[:, j : j + 2] - x[:, i : i + 2], spread
+        )
 
 
 def _pair_of_pictures(

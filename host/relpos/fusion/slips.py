@@ -1,0 +1,185 @@
+"""Odometry that slips: noticed by what the ranges say, answered by many hypotheses for a while.
+
+Dead reckoning fails in ways that no noise level describes: a visual odometry loses its place and
+reports metres that nobody went, a wearer is carried, a heading is off by a right angle after a
+blow. The ranges of that one node then fit nothing for a while. Noise that adapts to it would
+hide it, and hypotheses that doubt everything all the time cost accuracy, so:
+
+* **Noticed** is a slip by the ranges' innovations under the whole mixture *before* each update.
+  With e = nu^2 / S, relative to what it has been for this team, the log likelihood ratio of "four
+  times the variance" to "as ever",
+
+      delta = (e (1 - 1/4) - log 4) / 2,
+
+  is summed up as long as it is positive (Page's cumulative sum, 1954). A node's is the median
+  over its ranges of one instant, so one that fits none of several peers is told from the peers
+  that fit all others; each is clipped, so that outliers need company.
+
+* **Answered** is an alarm by many hypotheses that doubt this node: its place (on the ring of
+  somebody who ranged it), its heading (anywhere round the circle), or both. The ranges then
+  choose, and the node is ``ambiguous`` until they have. An alarm may be raised again while the
+  slip goes on.
+
+* A displacement that is far out of a node's own habit (``FAR_FASTER`` times its usual speed and
+  more) needs no ranges to be doubted: half the hypotheses leave it out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+CLIP = 3.0
+"""One innovation counts at most so much: an outlier of 3 m would otherwise be a slip by itself."""
+
+GROWN = 4.0
+"""What a slip makes of the innovations' variance, for the ratio's sake."""
+
+ALARM = 8.0
+"""At least three instants; by chance alone once in e^8 = 3000 ranges of a lone pair. The price is
+half the hypotheses for a few seconds."""
+
+BASE_SHARE = 0.01
+BASE_LEAST, BASE_MOST = 0.3, 1.0
+"""The usual nu^2/S is averaged over a hundred ranges and kept within these: 1 for a consistent
+filter, less for a cautious one."""
+
+USUAL_M_S = 1.3
+"""Speed that a node is taken to have before it has shown its own (brisk walking)."""
+
+FAR_FASTER = 4.0
+HASTE_M_S = 1.5
+"""A displacement is doubted beyond ``FAR_FASTER`` times the usual speed, and beyond this: whoever
+stood may walk."""
+
+MOVING_M_S = 0.05
+HABIT = 0.05
+"""Least share of a new moving speed in the usual one."""
+
+PRIOR_STEPS = 3
+"""``USUAL_M_S`` counts as so many displacements."""
+
+
+@dataclass(slots=True)
+class Watch:
+    """The cumulative sums of N users (rows), fed with the ranges of each instant."""
+
+    sums: Floats = field(default_factory=lambda: np.zeros(0))
+    base: Floats = field(default_factory=lambda: np.ones(1))
+    """The usual nu^2/S."""
+
+    def add_node(self) -> None:
+        """Watch one more."""
+        self.sums = np.append(self.sums, 0.0)
+
+    def remove(self, row: int) -> None:
+        """Forget one."""
+        self.sums = np.delete(self.sums, row)
+
+    def look(
+        self, first: Indices, second: Indices, square: Floats, worth: Floats, outliers: float
+    ) -> int | None:
+        """Take the ranges (R,) of one instant; return the row that slipped, if any.
+
+        Of two alone either may be meant: what is between them is doubted in the same way.
+
+        ``square`` is nu^2/S of the mixture before the update, ``worth`` how independent the range
+        is, ``outliers`` the share of outliers as far as is known.
+        """
+        ratio = square / min(max(float(self.base[0]), BASE_LEAST), BASE_MOST)
+        delta = 0.5 * (ratio * (1.0 - 1.0 / GROWN) - math.log(GROWN))
+        delta = np.minimum(delta, CLIP) * worth - CLIP * outliers
+        if self.sums.max(initial=0.0) < 0.25 * ALARM:
+            for one in square.tolist():
+                self.base[0] += BASE_SHARE * (min(one, 4.0) - self.base[0])
+        for row in np.union1d(first, second).tolist():
+            own = delta[(first == row) | (second == row)]
+            self.sums[row] = max(self.sums[row] + float(np.median(own)), 0.0)
+        high = float(self.sums.max(initial=0.0))
+        if high < ALARM:
+            return None
+        slipped = int(self.sums.argmax())
+        # Who ranged with it has been drawn along; all begin anew.
+        self.sums[:] = 0.0
+        return slipped
+
+
+@dataclass(slots=True)
+class Habit:
+    """How fast each node usually is."""
+
+    usual_m_s: dict[int, float] = field(default_factory=dict)
+    _steps: dict[int, int] = field(default_factory=dict)
+
+    def is_odd(self, node: int, way_m: float, duration_s: float) -> bool:
+        """Whether a displacement is far out of the node's habit; it is taken note of."""
+        if way_m <= MOVING_M_S * duration_s or duration_s <= 0.0:
+            return False
+        speed = way_m / duration_s
+        usual = self.usual_m_s.get(node, USUAL_M_S)
+        most = max(FAR_FASTER * usual, HASTE_M_S)
+        seen = self._steps[node] = self._steps.get(node, PRIOR_STEPS) + 1
+        # An odd one counts as the fastest that would not have been: habits may change.
+        self.usual_m_s[node] = usual + max(HABIT, 1.0 / seen) * (min(speed, most) - usual)
+        return speed > most
+
+    def snapshot(self) -> Habit:
+        """Give a copy that goes on by itself."""
+        return Habit(self.usual_m_s.copy(), self._steps.copy())
+
+
+@dataclass(frozen=True, slots=True)
+class Doubts:
+    """Poses (M, 3) of one user that might be, with covariances (M, 3, 3).
+
+    ``kept`` (M, 2) tells whether the place and whether the heading is still the old one.
+    """
+
+    poses: Floats
+    covariances: Floats
+    kept: npt.NDArray[np.bool_]
+
+
+def doubts(
+    old: Floats, peers: Floats, range_m: Floats, place_m: float, rng: np.random.Generator
+) -> Doubts:
+    """Make a doubt of each of a slipped user's poses ``old`` (M, 3).
+
+    ``peers`` (M, 2) is where each hypothesis has somebody who has just ranged it, ``range_m``
+    (M,) how far away. Of six, one keeps the place, one the heading. A new place is up to some
+    ``place_m`` away from the old one and on the peer's ring; new headings are drawn evenly round
+    the circle, so that each has to be right only to its share of it.
+    """
+    count = len(old)
+    kind = rng.permutation(count) % 6
+    keeps = np.stack([kind == 0, kind == 1], axis=1)
+    poses = old.copy()
+    off = old[:, :2] + place_m * rng.standard_normal((count, 2)) - peers
+    distance = np.maximum(np.hypot(off[:, 0], off[:, 1]), 1e-6)
+    unit = off / distance[:, None]
+    poses[:, :2] = np.where(keeps[:, :1], old[:, :2], peers + range_m[:, None] * unit)
+    comb = 2.0 * math.pi * (rng.permutation(count) + rng.random()) / count
+    poses[:, 2] = np.where(keeps[:, 1], old[:, 2], comb)
+    covariances = np.zeros((count, 3, 3))
+    outer = unit[:, :, None] * unit[:, None, :]
+    covariances[:, :2, :2] = ARC_M**2 * np.eye(2) + (RING_M**2 - ARC_M**2) * outer
+    covariances[:, 2, 2] = HEADING_CELL_RAD**2
+    return Doubts(poses, covariances, keeps)
+
+
+HEADING_CELL_RAD = 0.3
+ARC_M, RING_M = 0.7, 0.2
+"""What a joint filter follows well enough: a new pose's deviation of heading, along the ring and
+across it. A ring of 3 m and the circle of headings are covered by some six hundred."""
+
+HYPOTHESES = 800
+"""A bank that was smaller grows to so many while a slip is open."""
+
+BELIEVING = 0.25
+"""Share of the hypotheses that take the alarm for false."""
