@@ -324,12 +324,12 @@ def _score(
 def _bound(run: Run) -> Totals | None:
     """Compute the Cramer-Rao bound of a simulated run; None where it cannot be told."""
     from relpos.evaluation import bounds
-    from relpos.simulation.paper import SCENARIOS
+    from relpos.simulation.scenarios import NAMES
 
     made = run.description.simulated
-    if made is None or made.scenario not in SCENARIOS:
+    if made is None or made.scenario not in NAMES:
         return None
-    return bounds.of_paper(made.scenario, made.seed, made.settings).totals()
+    return bounds.of_simulated(made.scenario, made.seed, made.settings).totals()
 
 
 def _fuse_port(

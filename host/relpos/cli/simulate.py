@@ -25,12 +25,11 @@ def simulate(
 ) -> None:
     """Simulate a team and write its measurements, priors and truth as a run directory."""
     chosen = output.parse_settings(settings or [])
-    if scenario == "lab":
-        raise output.not_built_yet("the scenario lab")
     from relpos.runs import Description, Run, Simulated, save_run
-    from relpos.simulation.paper import simulate_paper
+    from relpos.runs.run import Landmark
+    from relpos.simulation import scenarios
 
-    simulated = simulate_paper(scenario, seed, chosen)
+    simulated = scenarios.simulate(scenario, seed, chosen)
     description = Description(
         source=f"relpos simulate --scenario {scenario} --seed {seed}"
         + "".join(f" --set {key}={value}" for key, value in chosen.items()),
@@ -43,6 +42,8 @@ def simulate(
         name=f"{scenario}-{seed}",
         description=description,
         measurements=simulated.measurements,
+        events=simulated.events,
+        landmarks=tuple(Landmark(name, x, y) for name, (x, y) in simulated.landmarks.items()),
         truth=simulated.truth,
     )
     save_run(run, out)

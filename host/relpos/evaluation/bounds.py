@@ -35,7 +35,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion.settings import parse
 from relpos.measurements import Range
+from relpos.simulation.lab import LabSettings, simulate_lab
 from relpos.simulation.paper import (
     PaperSettings,
     SimulatedRun,
@@ -44,6 +46,7 @@ from relpos.simulation.paper import (
     simulate_paper,
     true_poses,
 )
+from relpos.simulation.scenarios import LAB
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -197,6 +200,15 @@ def over_seeds(totals: Iterable[Totals]) -> Totals:
     return Totals(*(float(value) for value in _rms(rows, axis=0)))
 
 
+def of_simulated(
+    scenario: str, seed: int = 0, overrides: Mapping[str, str | float] | None = None
+) -> Bound:
+    """Compute the bound of one run of any scenario of :mod:`relpos.simulation.scenarios`."""
+    if scenario == LAB:
+        return of_scene(lab_scene(seed, overrides))
+    return of_paper(scenario, seed, overrides)
+
+
 def of_paper(
     scenario: str = "paper", seed: int = 0, overrides: Mapping[str, str | float] | None = None
 ) -> Bound:
@@ -252,6 +264,58 @@ def paper_scene(settings: PaperSettings, run: SimulatedRun) -> Scene:
         log_scale=everyone * settings.scale_error,
         walked_m=chord,
         drifting_s=duration_s,
+    )
+
+
+def lab_scene(seed: int, overrides: Mapping[str, str | float] | None = None) -> Scene:
+    """Describe a run of the laboratory as its bound sees it.
+
+    What is in the way of each range is told; how long the delays and which ranges are
+    reflections, not: those have the information of that mixture, the delays' spread counted as
+    noise. Steps' scale and headings' drift are known to their spread.
+    """
+    run = simulate_lab(seed, overrides)
+    settings = parse(LabSettings, overrides or {}, "scenario lab")
+    nodes = range(1, settings.nodes + 1)
+    rows = {n: [t for t in run.truth if t.node == n] for n in nodes}
+    positions = np.array([[(t.x_m, t.y_m) for t in rows[n]] for n in nodes])
+    heading = np.unwrap([[t.heading_rad or 0.0 for t in rows[n]] for n in nodes], axis=1)
+    moving = np.linalg.norm(np.diff(positions, axis=1), axis=-1) > 0.0
+
+    def of_user(values: Mapping[int, float]) -> Floats:
+        return np.array([values[n] for n in nodes])[:, None]
+
+    hidden, everyone = run.hidden, np.ones(settings.nodes)
+    clear = 1.0 / settings.sigma_range_m**2
+    delays = (
+        settings.wall_delay_max_m - settings.wall_delay_min_m,
+        settings.body_delay_max_m - settings.body_delay_min_m,
+    )
+    blocked = _range_information(
+        PaperSettings(
+            sigma_range_m=math.hypot(settings.sigma_range_m, *(d / math.sqrt(12) for d in delays)),
+            nlos_probability=settings.reflection,
+            nlos_min_m=settings.reflection_min_m,
+            nlos_max_m=settings.reflection_max_m,
+        )
+    )
+    kept = [m for m in run.measurements if isinstance(m, Range)]
+    late = [(r.time_s, r.node, r.peer) in hidden.late_ranges for r in kept]
+    return Scene(
+        np.array([t.time_s for t in rows[1]]),
+        positions,
+        of_user(hidden.distance_noise) * moving,
+        np.hypot(
+            np.diff(heading, axis=1) * of_user(hidden.turn_noise),
+            of_user(hidden.white_heading_rad) * moving,
+        ),
+        np.zeros(moving.shape),
+        np.array([r.time_s for r in kept]),
+        np.array([(r.node - 1, r.peer - 1) for r in kept], dtype=np.int64).reshape(-1, 2),
+        np.where(late, blocked, clear),
+        drift_rad_s=everyone * math.radians(settings.noise_scale * settings.heading_drift_deg_s),
+        log_scale=everyone * settings.noise_scale * settings.scale_error,
+        drifting_s=1.0 * moving,
     )
 
 

@@ -21,7 +21,7 @@ from relpos import fusion
 from relpos.errors import RelposError
 from relpos.evaluation import bounds, metrics, tracks
 from relpos.evaluation.executors import run_all
-from relpos.simulation.paper import simulate_paper
+from relpos.simulation.scenarios import simulate
 
 Floats = npt.NDArray[np.float64]
 
@@ -67,7 +67,7 @@ class Score:
 
 def score(case: Case, seed: int) -> Score:
     """Run one case on one seed."""
-    run = simulate_paper(case.scenario, seed, case.overrides)
+    run = simulate(case.scenario, seed, case.overrides)
     estimator = fusion.make(case.estimator, run.priors, case.settings, seed + ESTIMATOR_SEED)
     started = time.perf_counter()
     failure = ""
@@ -177,7 +177,7 @@ def run(
 
 def bound(case: Case, seed: int) -> bounds.Bound:
     """Compute the bound of one run of a case's scenario."""
-    return bounds.of_paper(case.scenario, seed, case.overrides)
+    return bounds.of_simulated(case.scenario, seed, case.overrides)
 
 
 def totals(case: Case, seed: int) -> bounds.Totals:

@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import RelposError
-from relpos.measurements import Measurement, Motion, Prior, Range, Truth
+from relpos.measurements import Event, Measurement, Motion, Prior, Range, Truth
 
 Floats = npt.NDArray[np.float64]
 
@@ -172,6 +172,9 @@ class SimulatedRun:
     priors: tuple[Prior, ...]
     truth: tuple[Truth, ...]
     hidden: Hidden = field(default_factory=Hidden)
+    events: tuple[Event, ...] = ()
+    landmarks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Surveyed places by their ids, (x, y) in metres."""
 
 
 def settings_of(scenario: str, overrides: Mapping[str, str | float] | None = None) -> PaperSettings:
@@ -217,9 +220,8 @@ def settings_of(scenario: str, overrides: Mapping[str, str | float] | None = Non
     return settings
 
 
-def _corners(settings: PaperSettings) -> tuple[Floats, Floats]:
+def _corners(length: float, width: float) -> tuple[Floats, Floats]:
     """Path length at each corner of one lap, (5,), and the corners' positions, (5, 2)."""
-    length, width = settings.length_m, settings.width_m
     corners = np.array([[0, 0], [length, 0], [length, width], [0, width], [0, 0]], dtype=float)
     return np.cumsum([0.0, length, width, length, width]), corners
 
@@ -233,31 +235,40 @@ def true_poses(settings: PaperSettings) -> tuple[Floats, Floats, Floats]:
     times = np.arange(count + 1, dtype=np.float64) * settings.motion_period_s
     starts = settings.spacing_s * np.arange(settings.nodes)
     path: Floats = settings.speed_m_s * np.maximum(times[None, :] - starts[:, None], 0.0)
-    arcs, corners = _corners(settings)
-    lap, along = np.divmod(path, arcs[-1])
+    return times, *round_rectangle(path, settings.length_m, settings.width_m)
+
+
+def round_rectangle(path_m: Floats, length: float, width: float) -> tuple[Floats, Floats]:
+    """Positions (..., 2) and unwrapped headings after ways along a rectangle's sides."""
+    arcs, corners = _corners(length, width)
+    lap, along = np.divmod(path_m, arcs[-1])
     # Rounding must not put somebody who has just reached a corner behind or beyond it.
     positions: Floats = np.stack([np.interp(along, arcs, corners[:, k]) for k in (0, 1)], axis=-1)
     side = np.clip(np.searchsorted(arcs, along - 1e-9, side="left") - 1, -1, 3)
     heading: Floats = np.maximum((4.0 * lap + side) * (math.pi / 2.0), 0.0)
-    return times, positions, heading
+    return positions, heading
 
 
 @dataclass(frozen=True, slots=True)
-class _Drawn:
-    """The hidden side of a run as arrays by user, (N,)."""
+class Drawn:
+    """The hidden side of a run's odometry as arrays by user, (N,); see :class:`Hidden`."""
 
     step_scale: Floats
     drift_rad_s: Floats
     distance_noise: Floats
     turn_noise: Floats
     white_rad: Floats
-    noisy: int
-    kidnapped: int
-    carried_m: Floats
+    noisy: int = 0
+    kidnapped: int = 0
+    carried_m: Floats = field(default_factory=lambda: np.zeros(2))
     """Where the kidnapped user is put, relative to where it was, (2,)."""
 
+    def by_node(self, name: str) -> dict[int, float]:
+        """One of the arrays with the nodes' ids, from 1 on."""
+        return {k + 1: float(value) for k, value in enumerate(getattr(self, name))}
 
-def _draw(settings: PaperSettings, rng: np.random.Generator) -> _Drawn:
+
+def _draw(settings: PaperSettings, rng: np.random.Generator) -> Drawn:
     # Everything is drawn whether it is used or not: one setting does not change another's dice.
     count = settings.nodes
     scale, drift = rng.standard_normal(count), rng.standard_normal(count)
@@ -269,7 +280,7 @@ def _draw(settings: PaperSettings, rng: np.random.Generator) -> _Drawn:
     pattern = np.resize(np.array(HEADING_PATTERN), count)
     factor = np.ones(count)
     factor[noisy] = settings.noisy_factor
-    return _Drawn(
+    return Drawn(
         np.exp(settings.scale_error * scale),
         math.radians(settings.heading_drift_deg_s) * drift,
         np.resize(np.array(DISTANCE_NOISE), count) * settings.distance_noise_scale * factor,
@@ -281,14 +292,16 @@ def _draw(settings: PaperSettings, rng: np.random.Generator) -> _Drawn:
     )
 
 
-def _motions(
-    settings: PaperSettings,
-    drawn: _Drawn,
+def report_motions(
+    drawn: Drawn,
     times: Floats,
     positions: Floats,
     heading: Floats,
     rng: np.random.Generator,
+    *,
+    drift_while_waiting: bool = False,
 ) -> list[Motion]:
+    """Make every user's odometry of true poses (T,), (N, T, 2), (N, T): turn, then move."""
     chord = np.diff(positions, axis=1)
     turn = np.diff(heading, axis=1)
     distance = np.linalg.norm(chord, axis=-1)
@@ -302,19 +315,19 @@ def _motions(
     measured /= drawn.step_scale[:, None]
     turned = turn * (1.0 + drawn.turn_noise[:, None] * rng.standard_normal(shape))
     turned += drawn.white_rad[:, None] * rng.standard_normal(shape) * (distance > 0.0)
-    drifts = (distance > 0.0) | bool(settings.drift_while_waiting)
-    turned += drawn.drift_rad_s[:, None] * settings.motion_period_s * drifts
+    drifts = (distance > 0.0) | drift_while_waiting
+    turned += drawn.drift_rad_s[:, None] * np.diff(times) * drifts
     dx, dy = measured * np.cos(turned + direction), measured * np.sin(turned + direction)
     return [
         Motion(float(times[k + 1]), i + 1, float(dx[i, k]), float(dy[i, k]), float(turned[i, k]))
         for k in range(shape[1])
-        for i in range(settings.nodes)
+        for i in range(shape[0])
     ]
 
 
 def _ranges(
     settings: PaperSettings,
-    drawn: _Drawn,
+    drawn: Drawn,
     times: Floats,
     positions: Floats,
     rng: np.random.Generator,
@@ -381,34 +394,39 @@ def simulate_paper(
     )
     drawn = _draw(settings, hidden_rng)
     times, positions, heading = true_poses(settings)
-    motions = _motions(settings, drawn, times, positions, heading, motion_rng)
+    motions = report_motions(
+        drawn, times, positions, heading, motion_rng,
+        drift_while_waiting=bool(settings.drift_while_waiting),
+    )  # fmt: skip
     ranges, too_long = _ranges(settings, drawn, times, positions, range_rng)
     priors = _priors(settings, positions, heading, shift_rng)
     positions[drawn.kidnapped] += drawn.carried_m * (times >= settings.kidnap_s)[:, None]
     measurements: list[Measurement] = sorted([*motions, *ranges], key=lambda m: m.time_s)
-    truth = tuple(
-        Truth(float(t), i + 1, float(positions[i, k, 0]), float(positions[i, k, 1]),
-              math.remainder(float(heading[i, k]), 2.0 * math.pi))
-        for k, t in enumerate(times)
-        for i in range(settings.nodes)
-    )  # fmt: skip
+    truth = true_rows(times, positions, heading)
     return SimulatedRun(scenario, tuple(measurements), priors, truth,
                         _hidden(settings, drawn, too_long))  # fmt: skip
 
 
-def _hidden(
-    settings: PaperSettings, drawn: _Drawn, too_long: frozenset[tuple[float, int, int]]
-) -> Hidden:
-    def by_node(values: Floats) -> dict[int, float]:
-        return {k + 1: float(value) for k, value in enumerate(values)}
+def true_rows(times: Floats, positions: Floats, heading: Floats) -> tuple[Truth, ...]:
+    """Rows of ``truth.csv`` of poses (T,), (N, T, 2), (N, T)."""
+    return tuple(
+        Truth(float(t), i + 1, float(positions[i, k, 0]), float(positions[i, k, 1]),
+              math.remainder(float(heading[i, k]), 2.0 * math.pi))
+        for k, t in enumerate(times)
+        for i in range(len(positions))
+    )  # fmt: skip
 
+
+def _hidden(
+    settings: PaperSettings, drawn: Drawn, too_long: frozenset[tuple[float, int, int]]
+) -> Hidden:
     kidnapped = settings.kidnap_m > 0.0
     return Hidden(
-        by_node(drawn.step_scale),
-        by_node(drawn.drift_rad_s),
-        by_node(drawn.distance_noise),
-        by_node(drawn.turn_noise),
-        by_node(drawn.white_rad),
+        drawn.by_node("step_scale"),
+        drawn.by_node("drift_rad_s"),
+        drawn.by_node("distance_noise"),
+        drawn.by_node("turn_noise"),
+        drawn.by_node("white_rad"),
         drawn.noisy + 1 if settings.noisy_factor != 1.0 else None,
         drawn.kidnapped + 1 if kidnapped else None,
         settings.kidnap_s if kidnapped else None,
