@@ -300,7 +300,8 @@ def presses(settings: LabSettings, truth: Walk, rng: np.random.Generator) -> lis
     spacing_m = 2.0 * sum(_TEAM.path_m) / LANDMARKS
     events = []
     for row, path in enumerate(truth.path_m):
-        walking = np.append(True, np.diff(path) > 0.0)
+        moving = np.diff(path) > 0.0
+        walking = np.append(moving, False) | np.append(False, moving)
         time_s, way_m = truth.time_s[walking], path[walking]
         passed = np.arange(math.floor(way_m[0] / spacing_m) + 1, way_m[-1] // spacing_m + 1)
         last_s = -math.inf
