@@ -100,21 +100,38 @@ def pictures(
     return tuple(rows)
 
 
-def believe(weights: Floats, poses: Floats, covariances: Floats) -> Belief:
+def leader(weights: Floats, poses: Floats, covariances: Floats) -> int:
+    """Name the hypothesis about which the most weight lies: (K,), (K, N, 3), (K, N, 2, 2).
+
+    All nodes' best places are taken from one picture; each node's own likeliest place could
+    belong to different ones, and together they would be none.
+    """
+    leaders = np.argsort(-weights, kind="stable")[:32]
+    near = np.ones((len(leaders), len(weights)), dtype=bool)
+    for n in range(poses.shape[1]):
+        near &= _near(poses[:, n, :2], covariances[:, n], leaders)
+    return int(leaders[int(np.argmax(near @ weights))])
+
+
+def _near(places: Floats, covariances: Floats, of: Indices) -> npt.NDArray[np.bool_]:
+    """Tell which places (K, 2) are one with those of hypotheses ``of`` (L,): (L, K)."""
+    off = places[of, None, :] - places[None, :, :]
+    reach2 = np.maximum(ONE_PLACE_M**2, 2.0 * np.trace(covariances, axis1=1, axis2=2))
+    near: npt.NDArray[np.bool_] = (off * off).sum(axis=2) < reach2
+    return near
+
+
+def believe(weights: Floats, poses: Floats, covariances: Floats, best: int | None = None) -> Belief:
     """Say where one node is: weights (K,), poses (K, 3), covariances (K, 3, 3).
 
-    The place is that of the mode with the most weight within ``ONE_PLACE_M``.
+    The place is that of hypothesis ``best`` and those that are one with it; without it, of the
+    place with the most weight.
     """
     places = poses[:, :2]
-    variance = covariances[:, 0, 0] + covariances[:, 1, 1]
-    # The mode: the hypothesis with the most weight about it, not the one with the most itself.
-    leaders = np.argsort(-weights)[:32]
-    off = places[leaders, None, :] - places[None, :, :]
-    apart = (off * off).sum(axis=2)
-    near = apart < np.maximum(ONE_PLACE_M**2, 2.0 * variance)
-    share = near @ weights
-    best = int(np.argmax(share))
-    here = near[best]
+    if best is None:
+        best = leader(weights, poses[:, None], covariances[:, None, :2, :2])
+    here = _near(places, covariances[:, :2, :2], np.array([best]))[0]
+    share = float(weights[here].sum())
     own = weights[here] / weights[here].sum()
     mean, spread = _moments(own, places[here], covariances[here, :2, :2])
     total = np.einsum("k,kab->ab", weights, covariances[:, :2, :2])
@@ -123,7 +140,7 @@ def believe(weights: Floats, poses: Floats, covariances: Floats) -> Belief:
     heading, sigma_here = _heading(own, poses[here, 2], covariances[here, 2, 2])
     _, sigma = _heading(weights, poses[:, 2], covariances[:, 2, 2])
     return Belief(
-        float(mean[0]), float(mean[1]), heading, total, sigma, float(share[best]),
+        float(mean[0]), float(mean[1]), heading, total, sigma, share,
         float(_axes(spread)[0]), sigma_here,
     )  # fmt: skip
 

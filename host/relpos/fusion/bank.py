@@ -1004,7 +1004,9 @@ class Bank:
             )  # fmt: skip
         n = mixture.nodes.index(node)
         own = slice(3 * n, 3 * n + 3)
-        belief = believe(mixture.weights, mixture.poses[:, n], mixture.covariances[:, own, own])
+        belief = believe(
+            mixture.weights, mixture.poses[:, n], mixture.covariances[:, own, own], mixture.best
+        )
         status = _status(known)
         if status is NodeStatus.OK and node not in self.starts.settled:
             status = NodeStatus.AMBIGUOUS

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import copy
 import math
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,7 +24,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.ambiguity import believe, seen_from
+from relpos.fusion.ambiguity import believe, leader, seen_from
 from relpos.fusion.starts_kernels import FIXED, POSE, fit
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Range
@@ -57,7 +58,7 @@ class SearchSettings:
 
 
 _MOST_KNOTS = 5
-_FIRST_KNOT_RAD = 0.09
+_KNOT_RAD = 0.09
 """A knot is set when the heading may have gone wrong by so much (5 degrees) since the last."""
 
 _MOST_EVENTS = 260
@@ -86,7 +87,6 @@ class _Track:
     path_m: float = 0.0
     turn_variance: float = 0.0
     since_knot: float = 0.0
-    quantum: float = _FIRST_KNOT_RAD**2
     knots: list[tuple[float, float, float, float]] = field(default_factory=list)
     """x, y, heading variance, time of each knot; the newest last."""
     samples: list[tuple[float, float, float, float]] = field(default_factory=list)
@@ -137,6 +137,8 @@ class Mixture:
     covariances: Floats
     scales: Floats
     """True over reported length (N,), of the best picture."""
+    best: int = 0
+    """The picture to be shown: that about which the most weight lies."""
 
     def heading_sigma_rad(self, index: int) -> float:
         """How well the heading of a node is known."""
@@ -226,7 +228,7 @@ class Search:
                 1.0, (length + 0.3 * abs(step.dtheta_rad)) / (0.05 * step.duration_s + 1e-9)
             )
             track.since_knot += variance
-            if track.since_knot > track.quantum:
+            if track.since_knot > _KNOT_RAD**2:
                 self._set_knot(step.node, track)
 
     def _set_knot(self, node: int, track: _Track) -> None:
@@ -243,7 +245,7 @@ class Search:
             turns[:, 1:] = turns[:, :-1].copy()
             turns[:, 0] = 0.0
         if len(track.knots) > _MOST_KNOTS:
-            self._thin_knots(column, track)
+            self._thin_knots(node, track)
 
     def _widen(self) -> None:
         """Give every node one more turn."""
@@ -258,22 +260,25 @@ class Search:
             wide[:, -1] = self._pictures[:, -1]
             self._pictures = wide
 
-    def _thin_knots(self, column: int, track: _Track) -> None:
-        """Put two and two knots into one, the newest ones first; the next are set half as often."""
-        track.quantum *= 2.0
-        newest_first = track.knots[::-1]
-        merged = []
-        each = FIXED + self._knot_columns
-        turns = self._pictures[:, column * each + FIXED : (column + 1) * each].copy()
-        summed = np.zeros_like(turns)
-        for k in range(0, len(newest_first), 2):
-            both = newest_first[k : k + 2]
-            place = both[-1]
-            merged.append((place[0], place[1], sum(b[2] for b in both), place[3]))
-            summed[:, k // 2] = turns[:, k : k + 2].sum(axis=1)
-        track.knots = merged[::-1]
+    def _thin_knots(self, node: int, track: _Track) -> None:
+        """Put the two oldest knots into one, and forget the node's ranges from before them.
+
+        With fewer knots than heading errors old ranges would bend the picture.
+        """
+        older, newer = track.knots[:2]
+        track.knots[:2] = [(newer[0], newer[1], older[2] + newer[2], newer[3])]
         if self._pictures.shape[0]:
-            self._pictures[:, column * each + FIXED : (column + 1) * each] = summed
+            each = FIXED + self._knot_columns
+            column = self.nodes.index(node)
+            turns = self._pictures[:, column * each + FIXED : (column + 1) * each]
+            last = len(track.knots)
+            turns[:, last - 1] += turns[:, last]
+            turns[:, last] = 0.0
+        kept = [
+            e for e in self._events if node not in (e.node, e.peer) or e.time >= int(newer[3])
+        ]  # fmt: skip
+        self.counters["start_ranges_forgotten"] += len(self._events) - len(kept)
+        self._events = kept
 
     def ranging(
         self,
@@ -329,7 +334,12 @@ class Search:
             self._newest[first, second] = event
             self._events.append(event)
             self._news = True
-        if len(self._events) > _MOST_EVENTS:
+        old = sum(self._times[e.time] < time_s - self.settings.memory_s for e in self._events)
+        if old > 20:
+            self._events = self._events[old:]
+            self.counters["start_ranges_forgotten"] += old
+            self._compact()
+        elif len(self._events) > _MOST_EVENTS:
             self._thin_events()
 
     def _tick(self, time_s: float) -> int:
@@ -343,7 +353,6 @@ class Search:
 
     def _thin_events(self) -> None:
         """Drop every other of the older half, pair by pair; the older, the sparser."""
-        self.counters["start_ranges_thinned"] += 1
         half = self._events[len(self._events) // 2].time
         seen: Counter[tuple[int, int]] = Counter()
         kept = []
@@ -352,7 +361,26 @@ class Search:
             seen[pair] += 1
             if event.time >= half or seen[pair] % 2 or self._newest.get(pair) is event:
                 kept.append(event)
+        self.counters["start_ranges_thinned"] += len(self._events) - len(kept)
         self._events = kept
+        self._compact()
+
+    def _compact(self) -> None:
+        """Forget the times that nothing refers to any more."""
+        referred = {e.time for e in self._events} | {p[0] for p in self._priors.values()}
+        referred |= {e.time for e in self._newest.values()} | {len(self._times) - 1}
+        used = sorted(referred)
+        index = {old: new for new, old in enumerate(used)}
+        self._times = [self._times[t] for t in used]
+        for track in self._tracks.values():
+            track.samples = [track.samples[t] for t in used]
+            track.knots = [
+                (x, y, variance, float(bisect_left(used, time)))
+                for x, y, variance, time in track.knots
+            ]
+        for event in {id(e): e for e in [*self._events, *self._newest.values()]}.values():
+            event.time = index[event.time]
+        self._priors = {n: (index[t], m, p) for n, (t, m, p) in self._priors.items()}
 
     def snapshot(self, counters: Counter[str]) -> Search:
         """Copy everything that changes; the copy counts in ``counters``."""
@@ -718,7 +746,7 @@ class Search:
         movable = [
             i
             for i, n in enumerate(self.nodes)
-            if n in self._active and not data.prior[1, i, :2].any()
+            if n in self._active and not data.prior[1, i, ::2].all()
         ]
         if not movable or count == 0:
             return self._pictures[:0]
@@ -727,18 +755,43 @@ class Search:
             if self._weights.size == self._pictures.shape[0]
             else self._rng.integers(self._pictures.shape[0], size=count)
         ].copy()
-        if len(movable) == 1:
+        if len(movable) == 1 and not self._free_to_turn(data):
             self._place(base, movable[0], set(range(len(self.nodes))) - {movable[0]}, data)
             return base
         whole = count // 3
         parts = [self._place_all(whole, data)] if whole else []
         rest = base[whole:]
+        if self._free_to_turn(data):
+            half = len(rest) // 2
+            parts.append(self._turned(rest[:half]))
+            rest = rest[half:]
         for k, i in enumerate(self._rng.permutation(movable)[:3]):
             part = rest[k::3].copy()
             others = {j for j, n in enumerate(self.nodes) if n in self._active and j != i}
             if part.shape[0] and self._place(part, int(i), others, data):
                 parts.append(part)
         return np.concatenate(parts) if parts else self._pictures[:0]
+
+    def _free_to_turn(self, data: _Data) -> bool:
+        """Whether nothing but chance may have told the directions: no heading, nobody located."""
+        if (data.ends < 0).any():
+            return False
+        told = data.prior[1, :, 2] > 1.0
+        return all(self.extent_m(self.nodes[i]) < STOOD_M for i in np.flatnonzero(told))
+
+    def _turned(self, pictures: Floats) -> Floats:
+        """Turn whole pictures about the frame's node, or the middle of what is known of places."""
+        known = [i for i, n in enumerate(self.nodes) if self._priors[n][2][:2].any()]
+        pivot = np.mean([self._priors[self.nodes[i]][1][:2] for i in known], axis=0)
+        turned = pictures.copy()
+        blocks = turned[:, :-1].reshape(len(turned), len(self.nodes), -1)
+        angle = _TWO_PI * self._rng.random(len(turned))
+        moved = [i for i, n in enumerate(self.nodes) if n != self.frame]
+        place = blocks[:, moved, 0] + 1j * blocks[:, moved, 1] - complex(*pivot)
+        place = complex(*pivot) + place * np.exp(1j * angle)[:, None]
+        blocks[:, moved, 0], blocks[:, moved, 1] = place.real, place.imag
+        blocks[:, moved, 2] += angle[:, None]
+        return turned
 
     def _draw_prior(self, pictures: Floats, i: int, data: _Data) -> None:
         each = FIXED + self._knot_columns
@@ -784,7 +837,8 @@ class Search:
                 anchor[:, e, 0] = pose[:, 0] + c * seen[0] - s * seen[1]
                 anchor[:, e, 1] = pose[:, 1] + s * seen[0] + c * seen[1]
         measured = data.measured[mine]
-        chosen = self._rng.integers(mine.size, size=(count, choices))
+        x_shape = (count, choices)
+        chosen = self._rng.integers(mine.size, size=x_shape)
         bearing = _TWO_PI * self._rng.random((count, choices))
         heading = _TWO_PI * self._rng.random((count, choices))
         prior = data.prior[1, i]
@@ -794,11 +848,17 @@ class Search:
         own = data.tracks[then, i]
         c, s = np.cos(heading), np.sin(heading)
         rows = np.arange(count)[:, None]
-        radius = measured[chosen, 0]
-        x = anchor[rows, chosen, 0] + radius * np.cos(bearing)
-        y = anchor[rows, chosen, 1] + radius * np.sin(bearing)
-        x -= c * own[chosen, 0] - s * own[chosen, 1]
-        y -= s * own[chosen, 0] + c * own[chosen, 1]
+        if prior[0] > 0.0:
+            x = data.prior[0, i, 0] + self._rng.standard_normal(x_shape) / math.sqrt(prior[0])
+            y = data.prior[0, i, 1] + self._rng.standard_normal(x_shape) / math.sqrt(prior[1])
+            then_x, then_y = data.tracks[data.prior_at[i], i, :2]
+        else:
+            radius = measured[chosen, 0]
+            x = anchor[rows, chosen, 0] + radius * np.cos(bearing)
+            y = anchor[rows, chosen, 1] + radius * np.sin(bearing)
+            then_x, then_y = own[chosen, 0], own[chosen, 1]
+        x -= c * then_x - s * then_y
+        y -= s * then_x + c * then_y
         px = x[:, :, None] + c[:, :, None] * own[:, 0] - s[:, :, None] * own[:, 1]
         py = y[:, :, None] + s[:, :, None] * own[:, 0] + c[:, :, None] * own[:, 1]
         distance = np.sqrt(
@@ -863,6 +923,8 @@ class _Wanderer:
     def move(self, step: Advance) -> None:
         """Compose a displacement; a heading of which nothing is known leaves only its length."""
         c, s = math.cos(self.mean[2]), math.sin(self.mean[2])
+        if math.isinf(self.sigma[2]) and math.isfinite(self.sigma[0]):
+            c, s = 0.0, 0.0  # which way, nobody knows: the spread says how far
         self.mean += (c * step.dx_m - s * step.dy_m, s * step.dx_m + c * step.dy_m, step.dtheta_rad)
         length = math.hypot(step.dx_m, step.dy_m)
         self.travelled_m += length
@@ -940,6 +1002,13 @@ class Starts:
     def advance(self, step: Advance) -> None:
         """Move a node, if it is one of these."""
         wanderer = self._wanderers.get(step.node)
+        if wanderer is not None and math.isfinite(wanderer.sigma[0]):
+            # Its place is known: where it goes from there counts from now on.
+            if len(self.search.nodes) < MOST_SOUGHT:
+                began_s = step.time_s - step.duration_s
+                del self._wanderers[step.node]
+                self.search.add(step.node, began_s, wanderer.mean, wanderer.spread())
+                wanderer = None
         if wanderer is not None:
             wanderer.move(step)
         else:
@@ -1026,12 +1095,16 @@ class Starts:
         if not active or not whole.weights.size or whole.weights.size != len(whole.poses):
             return None
         columns = (np.array(active)[:, None] * POSE + np.arange(POSE)).ravel()
+        spread = np.stack(
+            [whole.covariances[:, 3 * i : 3 * i + 2, 3 * i : 3 * i + 2] for i in active], axis=1
+        )
         return Mixture(
             tuple(search.nodes[i] for i in active),
             whole.weights,
             whole.poses[:, active],
             whole.covariances[:, columns][:, :, columns],
             whole.scales[active],
+            leader(whole.weights, whole.poses[:, active], spread),
         )
 
     def snapshot(self) -> Starts:
