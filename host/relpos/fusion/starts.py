@@ -20,6 +20,7 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -60,6 +61,9 @@ class SearchSettings:
 _MOST_KNOTS = 5
 _KNOT_RAD = 0.09
 """A knot is set when the heading may have gone wrong by so much (5 degrees) since the last."""
+
+_WIDEST_KNOT_RAD = 0.2
+"""Two knots with more heading error than this between them do not become one."""
 
 _MOST_EVENTS = 260
 _STOOD_M = 0.1
@@ -261,24 +265,35 @@ class Search:
             self._pictures = wide
 
     def _thin_knots(self, node: int, track: _Track) -> None:
-        """Put the two oldest knots into one, and forget the node's ranges from before them.
+        """Put two knots into one: the neighbours with the least error between them.
 
-        With fewer knots than heading errors old ranges would bend the picture.
+        Where even they are too different (two corners, say), it is the two oldest, and the node's
+        ranges from before them are forgotten: with fewer knots than errors they would bend the
+        picture.
         """
-        older, newer = track.knots[:2]
-        track.knots[:2] = [(newer[0], newer[1], older[2] + newer[2], newer[3])]
+        knots = track.knots
+        sums = [first[2] + second[2] for first, second in pairwise(knots)]
+        k = int(np.argmin(sums))
+        forget = sums[k] > _WIDEST_KNOT_RAD**2
+        if forget:
+            k = 0
+        older, newer = knots[k : k + 2]
+        knots[k : k + 2] = [(newer[0], newer[1], older[2] + newer[2], newer[3])]
         if self._pictures.shape[0]:
             each = FIXED + self._knot_columns
             column = self.nodes.index(node)
             turns = self._pictures[:, column * each + FIXED : (column + 1) * each]
-            last = len(track.knots)
-            turns[:, last - 1] += turns[:, last]
+            last = len(knots)
+            # Columns count back from the newest; the two are at last - k - 1 and last - k.
+            turns[:, last - k - 1] += turns[:, last - k]
+            turns[:, last - k : last] = turns[:, last - k + 1 : last + 1].copy()
             turns[:, last] = 0.0
-        kept = [
-            e for e in self._events if node not in (e.node, e.peer) or e.time >= int(newer[3])
-        ]  # fmt: skip
-        self.counters["start_ranges_forgotten"] += len(self._events) - len(kept)
-        self._events = kept
+        if forget:
+            kept = [
+                e for e in self._events if node not in (e.node, e.peer) or e.time >= int(newer[3])
+            ]
+            self.counters["start_ranges_forgotten"] += len(self._events) - len(kept)
+            self._events = kept
 
     def ranging(
         self,
@@ -1002,13 +1017,13 @@ class Starts:
     def advance(self, step: Advance) -> None:
         """Move a node, if it is one of these."""
         wanderer = self._wanderers.get(step.node)
-        if wanderer is not None and math.isfinite(wanderer.sigma[0]):
+        free = len(self.search.nodes) < MOST_SOUGHT
+        if wanderer is not None and free and math.isfinite(wanderer.sigma[0]):
             # Its place is known: where it goes from there counts from now on.
-            if len(self.search.nodes) < MOST_SOUGHT:
-                began_s = step.time_s - step.duration_s
-                del self._wanderers[step.node]
-                self.search.add(step.node, began_s, wanderer.mean, wanderer.spread())
-                wanderer = None
+            began_s = step.time_s - step.duration_s
+            del self._wanderers[step.node]
+            self.search.add(step.node, began_s, wanderer.mean, wanderer.spread())
+            wanderer = None
         if wanderer is not None:
             wanderer.move(step)
         else:
