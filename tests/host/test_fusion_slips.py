@@ -9,7 +9,7 @@ import pytest
 
 from relpos import fusion
 from relpos.fusion.estimator import Estimate, NodeStatus
-from relpos.fusion.slips import ALARM, Habit, Watch, doubts
+from relpos.fusion.slips import ALARM, Habit, Stillness, Watch, doubts
 from relpos.measurements import Measurement, Motion, Prior, Range
 
 PAIRS = [(a, b) for a in range(4) for b in range(a + 1, 4)]
@@ -142,3 +142,28 @@ def test_a_heading_that_slips_is_said_and_found_again(seed: int) -> None:
     after = [body_error_m(e, truth, 3) for e in whole if e.time_s >= 100]
     assert np.median(before) < 0.6
     assert np.median(after) < 1.0
+
+
+def test_noise_of_a_standing_sensor_is_told_from_slow_motion() -> None:
+    rng = np.random.default_rng(2)
+    still, creeping = Stillness(), Stillness()
+    stood = [still.is_still(1, *rng.normal(0.0, 0.01, 3), 1.0, 1.0) for _ in range(200)]
+    crept = [
+        creeping.is_still(1, 0.03 + rng.normal(0.0, 0.01), rng.normal(0.0, 0.01), 0.0, 1.0, 1.0)
+        for _ in range(200)
+    ]
+    assert np.mean(stood) > 0.5
+    assert not any(crept)
+    assert not still.is_still(1, 0.5, 0.0, 0.0, 1.0, 1.0)
+    assert not still.is_still(1, 0.0, 0.0, 0.0, 1.0, 1.0)  # it has just moved
+
+
+def test_a_report_in_pieces_is_one_report() -> None:
+    rng = np.random.default_rng(3)
+    whole, pieces = Stillness(), Stillness()
+    for _ in range(50):
+        dx, dy, turn = rng.normal(0.0, 0.01, 3)
+        told = whole.is_still(1, dx, dy, turn, 1.0, 1.0)
+        for part in (0.25, 0.75):
+            last = pieces.is_still(1, part * dx, part * dy, part * turn, part, part)
+        assert told == last

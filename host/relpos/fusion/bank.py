@@ -35,7 +35,7 @@ from relpos.fusion.estimator import (
 from relpos.fusion.joint import PER_NODE, Of
 from relpos.fusion.ranging_model import Mounting, Repetition
 from relpos.fusion.rewind import Rewinder
-from relpos.fusion.slips import BELIEVING, HYPOTHESES, Habit, Watch, doubts
+from relpos.fusion.slips import BELIEVING, HYPOTHESES, Habit, Stillness, Watch, doubts
 from relpos.fusion.starts import SETTLED_HEADING_RAD, Found, Mixture, Starts
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.measurements import Heading, Height, Measurement, Prior
@@ -103,6 +103,8 @@ class BankCore:
         self.watch = Watch()
         self.slipped: set[int] = set()
         """Rows whose odometry has slipped and that are not found again yet."""
+        self.since_slip = 0
+        """Instants of ranges since the last alarm."""
         self._alarm: tuple[int, Indices, Indices, Floats] | None = None
         self.outlier_counts: Floats = np.array([settings.outliers, 1.0 - settings.outliers]) * 20.0
 
@@ -333,6 +335,7 @@ class BankCore:
     def _doubt(self, row: int, first: Indices, second: Indices, range_m: Floats) -> None:
         """Let most hypotheses doubt a user that has slipped (:mod:`relpos.fusion.slips`)."""
         self.counters["slips"] += 1
+        self.since_slip = 0
         # Of two alone either may be the one: what is between them is doubted in the same way.
         self.slipped.update([row] if self.nodes > 2 else range(self.nodes))
         self.resample(self.weights(), max(self.count, HYPOTHESES))
@@ -436,10 +439,12 @@ class BankCore:
     def settle(self) -> None:
         """Close an epoch: jumps, and resampling where the weights have become uneven."""
         weight = self.weights()
+        self.since_slip += 1
+        closed = not self.slipped or self.since_slip > OPEN_UPDATES
         if self._alarm is not None:
             self._doubt(*self._alarm)
             self._alarm = None
-        elif self.count > self.settings.hypotheses and not self.slipped:
+        elif self.count > self.settings.hypotheses and closed:
             self.resample(weight, self.settings.hypotheses)
         elif 1.0 / float(weight @ weight) < 0.5 * self.count:
             self.resample(weight)
@@ -516,7 +521,7 @@ class BankCore:
                 self.watch.base,
             )),
             self.rng.bit_generator.state,
-            (self.nodes, *self.slipped),
+            (self.nodes, self.since_slip, *self.slipped),
             dict(self.biases),
             dict(self.counters),
         )  # fmt: skip
@@ -531,7 +536,8 @@ class BankCore:
         ) = (a.copy() for a in snapshot.arrays)  # fmt: skip
         self.rng.bit_generator.state = dict(snapshot.random)
         self.nodes = self.levels.nodes = int(snapshot.numbers[0])
-        self.slipped = {int(row) for row in snapshot.numbers[1:]}
+        self.slipped = {int(row) for row in snapshot.numbers[2:]}
+        self.since_slip = int(snapshot.numbers[1])
         self.biases = dict(snapshot.biases)
         self.counters = Counter(snapshot.counters)
         self._spread_levels()
@@ -549,6 +555,10 @@ CROSS = 0.04
 
 JITTER = 0.1
 """Standard deviation of the levels' jitter at resampling, in units of their spread."""
+
+OPEN_UPDATES = 60
+"""Many hypotheses are kept for so many instants of ranges at most: what has not told where
+somebody is by then (few peers, standing) will not soon."""
 
 MOST_LISTED = 200
 """Hypotheses that alternatives are made of after a slip."""
@@ -600,6 +610,7 @@ class _State:
     detection: Detection
     repetition: Repetition
     habit: Habit
+    stillness: Stillness
     row: dict[int, int]
     known: dict[int, _Known]
     pending: list[Advance]
@@ -628,6 +639,7 @@ class Bank:
     detection: Detection = field(default_factory=Detection)
     repetition: Repetition = field(default_factory=Repetition)
     habit: Habit = field(default_factory=Habit)
+    stillness: Stillness = field(default_factory=Stillness)
     _feed: Rewinder = field(init=False)
     starts: Starts = field(init=False)
     _row: dict[int, int] = field(default_factory=dict)
@@ -719,7 +731,7 @@ class Bank:
         """Copy everything that ``take`` changes."""
         return _State(
             self.core.snapshot(), self.detection.snapshot(), self.repetition.snapshot(),
-            self.habit.snapshot(), self._row.copy(),
+            self.habit.snapshot(), self.stillness.snapshot(), self._row.copy(),
             {node: copy(known) for node, known in self._known.items()}, self._pending[:],
             self._own.copy(), self._moved, self._ranges_used, self._epoch_s,
             self.starts.snapshot(), self._standing.copy(), self._facing.copy(),
@@ -731,6 +743,7 @@ class Bank:
         self.detection = snapshot.detection.snapshot()
         self.repetition = snapshot.repetition.snapshot()
         self.habit = snapshot.habit.snapshot()
+        self.stillness = snapshot.stillness.snapshot()
         self._row = snapshot.row.copy()
         self._known = {node: copy(known) for node, known in snapshot.known.items()}
         self._pending, self._own = snapshot.pending[:], snapshot.own.copy()
@@ -765,6 +778,12 @@ class Bank:
             told = np.array([_told(a) for a in steps])
         begin = 0
         for k, a in enumerate(steps):
+            if self.stillness.is_still(
+                a.node, a.dx_m, a.dy_m, a.dtheta_rad, a.duration_s, a.fraction
+            ):
+                self._own["motions_still"] += a.dx_m != 0.0 or a.dtheta_rad != 0.0
+                moves[k, :3] = 0.0
+                continue
             if self.habit.is_odd(a.node, math.hypot(a.dx_m, a.dy_m), a.duration_s):
                 self._make(rows, moves, told, slice(begin, k))
                 at = PER_NODE * int(rows[k])

@@ -70,7 +70,7 @@ def log_likelihood(measured_m: Floats, predicted_m: Floats, noise: RangeNoise) -
     return mixed
 
 
-DECORRELATION_M = 0.3
+DECORRELATION_M = 0.45
 """Way of both nodes together over which a range's error changes. Most of it is multipath, which
 is the place's and not the moment's: in the recordings of robots, consecutive errors of one pair
 correlate by 0.5 at 0.3 m and 0.2 to 0.4 at 0.35 m of common way, by 0.9 and more at a standstill.

@@ -134,6 +134,66 @@ class Habit:
         return Habit(self.usual_m_s.copy(), self._steps.copy())
 
 
+STILL_M_S, STILL_RAD_S = 0.05, 0.05
+"""Whoever reports to be faster does not stand."""
+
+STILL_REPORTS = 6
+STILL_RATIO = 0.6
+"""So many reports in a row whose sum is shorter than this share of what it would be, were they
+all in one direction, are noise: of six random ones the sum is 0.4 on average, and one in seven
+times longer than 0.6; of the slowest walk it is 1."""
+
+
+@dataclass(slots=True)
+class Stillness:
+    """Tells standing from slow motion, by how reports of one node add up.
+
+    The noise of a standing sensor would make its node wander off by centimetres a minute. What
+    moves slowly moves somewhere; noise goes nowhere.
+    """
+
+    _open: dict[int, tuple[float, float, float, float]] = field(default_factory=dict)
+    _recent: dict[int, tuple[tuple[float, float, float], ...]] = field(default_factory=dict)
+
+    def is_still(
+        self,
+        node: int,
+        dx_m: float,
+        dy_m: float,
+        dtheta_rad: float,
+        duration_s: float,
+        share: float,
+    ) -> bool:
+        """Take a piece of a report (``share`` of it) and tell whether the node stands there."""
+        slow = (
+            math.hypot(dx_m, dy_m) <= STILL_M_S * duration_s
+            and abs(dtheta_rad) <= STILL_RAD_S * duration_s
+        )
+        if not slow:
+            self._open.pop(node, None)
+            self._recent.pop(node, None)
+            return False
+        x, y, turn, done = self._open.pop(node, (0.0, 0.0, 0.0, 0.0))
+        x, y, turn, done = x + dx_m, y + dy_m, turn + dtheta_rad, done + share
+        recent = self._recent.get(node, ())
+        if done > 0.999:
+            recent = self._recent[node] = (*recent[1 - STILL_REPORTS :], (x, y, turn))
+        else:
+            self._open[node] = (x, y, turn, done)
+        if len(recent) < STILL_REPORTS:
+            return False
+        way = sum(math.hypot(x, y) for x, y, _ in recent)
+        turned = sum(abs(turn) for _, _, turn in recent)
+        net = math.hypot(sum(x for x, _, _ in recent), sum(y for _, y, _ in recent))
+        return net <= STILL_RATIO * way and abs(sum(t for _, _, t in recent)) <= (
+            STILL_RATIO * turned
+        )
+
+    def snapshot(self) -> Stillness:
+        """Give a copy that goes on by itself."""
+        return Stillness(self._open.copy(), self._recent.copy())
+
+
 @dataclass(frozen=True, slots=True)
 class Doubts:
     """Poses (M, 3) of one user that might be, with covariances (M, 3, 3).
