@@ -6,7 +6,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from threading import Timer
@@ -78,6 +78,29 @@ def with_progress(items: Iterable[T], total: int | None, label: str) -> Iterator
     finally:
         if bar is not None:
             bar.stop()
+
+
+@contextmanager
+def counting(label: str) -> Iterator[Callable[[int, int], None]]:
+    """Give what is to be called after every job with how many are done of how many."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    if console.is_terminal:
+        with Progress(console=console, transient=True) as bar:
+            task = bar.add_task(label, total=None)
+            yield lambda done, total: bar.update(task, completed=done, total=total)
+        return
+    last_said = time.monotonic()
+
+    def say(done: int, total: int) -> None:
+        nonlocal last_said
+        if time.monotonic() - last_said > PLAIN_PROGRESS_EVERY_S:
+            last_said = time.monotonic()
+            print(f"{label}: {done} of {total}", file=sys.stderr, flush=True)
+
+    yield say
 
 
 @contextmanager

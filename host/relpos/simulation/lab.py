@@ -250,12 +250,21 @@ def attempt(settings: LabSettings, truth: Walk, rng: np.random.Generator) -> Att
 _MOST_OBSTACLES = 4
 
 
+def _streams(seed: int) -> list[np.random.Generator]:
+    """Dice of the walk, the odometry's constants, its noise, the ranges and the presses."""
+    return [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(5)]
+
+
+def attempts_of(settings: LabSettings, seed: int) -> Attempts:
+    """Give the attempts at ranging of the run of this seed."""
+    walk_rng, _, _, range_rng, _ = _streams(seed)
+    return attempt(settings, walk(settings, walk_rng), range_rng)
+
+
 def simulate_lab(seed: int = 0, overrides: Mapping[str, str | float] | None = None) -> SimulatedRun:
     """Measurements, priors, truth and presses of one run; the same arguments, the same run."""
     settings = parse(LabSettings, overrides or {}, "scenario lab")
-    walk_rng, hidden_rng, motion_rng, range_rng, press_rng = (
-        np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(5)
-    )
+    walk_rng, hidden_rng, motion_rng, range_rng, press_rng = _streams(seed)
     truth = walk(settings, walk_rng)
     drawn = odometry(settings, hidden_rng)
     attempts = attempt(settings, truth, range_rng)

@@ -1,0 +1,65 @@
+"""``relpos figures``: the paper's figures and tables, computed anew over many seeds."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from relpos.cli import output
+
+NAMES = (
+    "tracks-simulation, range-noise, over-time-simulation, particles, wrong-start, running-time, "
+    "tracks-lab, over-time-lab, detection"
+)
+
+
+def figures(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to write them.")],
+    figure: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help=f"One of {NAMES}; all without it. May be repeated."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=2, help="Runs behind every point.")] = 24,
+    first: Annotated[int, typer.Option(min=0, help="The first seed.")] = 0,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes; all cores without it.")
+    ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="A Dask scheduler, e.g. tcp://host:8786."),
+    ] = None,
+) -> None:
+    """Draw every figure of the paper's evaluation as SVG, PNG and CSV, and one page of them all."""
+    from relpos.evaluation.executors import executor
+    from relpos.evaluation.figures import FIGURES, Work, page, save
+
+    wanted = list(dict.fromkeys(figure or FIGURES))
+    for name in wanted:
+        if name not in FIGURES:
+            raise typer.BadParameter(f"'{name}' is none of {NAMES}", param_hint="--figure")
+    out.mkdir(parents=True, exist_ok=True)
+    sheets, pictures = [], []
+    started = time.monotonic()
+    with executor(cluster, workers) as pool:
+        work = Work(range(first, first + seeds), pool)
+        for name in wanted:
+            with output.counting(name) as work.on_done:
+                sheet = FIGURES[name](work)
+            svg, _, _ = save(sheet, out)
+            sheets.append(sheet)
+            pictures.append(svg)
+            output.remark(f"{svg}  ({time.monotonic() - started:.0f} s)")
+    again = "".join(f" --figure {name}" for name in figure or [])
+    where = out / "index.html"
+    page.write(
+        sheets,
+        pictures,
+        where,
+        f"relpos figures{again} --seeds {seeds} --first {first}: means over {seeds} seeds "
+        "with 95 % confidence intervals. The bound is the posterior Cramer-Rao bound of "
+        "filtering, computed at the true path with the true noise levels.",
+    )
+    output.remark(f"all of them: {where}")

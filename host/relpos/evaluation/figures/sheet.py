@@ -1,0 +1,193 @@
+"""What every figure is made of: numbers, a picture, and the paper's values beside ours."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.evaluation import bounds, study
+from relpos.evaluation.executors import run_all
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats = npt.NDArray[np.float64]
+T = TypeVar("T")
+Cell = str | float | int
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+"""Distinguishable with any colour vision (Okabe and Ito 2008), darkest first."""
+
+INK, GREY = "#222222", "#8C8C8C"
+MARKERS = ("o", "s", "^", "D", "v", "P")
+DASHES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1, 1, 1)), (0, (1, 1)))
+"""Curves differ in mark and line, too: not by colour alone."""
+
+STYLE: dict[Any, Any] = {
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#DDDDDD",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.6,
+    "lines.markersize": 5,
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+    "axes.titlesize": 11,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "relpos",
+    "figure.dpi": 100,
+}
+
+IMU_SCALES = ((0.0, 0.0), (0.1, 0.05), (0.2, 0.1), (0.4, 0.2), (0.8, 0.4))
+"""The paper's five scales of IMU noise, (sigma_d, sigma_theta) (sect. V-B)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Beside:
+    """A value that the paper prints, and ours: mean and half of its 95 % interval."""
+
+    what: str
+    paper: str
+    ours: float
+    half_width: float = math.nan
+    unit: str = "m"
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """One figure: its numbers as rows under ``columns``, how to draw them, and what they say."""
+
+    name: str
+    title: str
+    caption: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    draw: Callable[[Figure], None]
+    beside: Sequence[Beside] = ()
+    size_in: tuple[float, float] = (6.4, 4.2)
+
+
+@dataclass
+class Work:
+    """Where and on how many seeds figures are computed; ``on_done`` hears of every job."""
+
+    seeds: Sequence[int]
+    pool: Executor
+    on_done: Callable[[int, int], None] | None = None
+    _bounds: dict[tuple[Any, ...], bounds.Totals] = field(default_factory=dict)
+    _outcomes: dict[tuple[Any, ...], study.Outcome] = field(default_factory=dict)
+
+    def outcomes(self, cases: Sequence[study.Case]) -> list[study.Outcome]:
+        """Score cases on all seeds; what two figures share is computed once."""
+        fresh = {key(case): case for case in cases if key(case) not in self._outcomes}
+        made = study.run(list(fresh.values()), self.seeds, self.pool, self.on_done)
+        self._outcomes.update(zip(fresh, made, strict=True))
+        return [self._outcomes[key(case)] for case in cases]
+
+    def bounds(self, cases: Sequence[study.Case]) -> list[bounds.Totals]:
+        """Give the bound of each case's scenario over all seeds."""
+        fresh = {key(case)[:2]: case for case in cases if key(case)[:2] not in self._bounds}
+        made = study.bounds_of(list(fresh.values()), self.seeds, self.pool, self.on_done)
+        self._bounds.update(zip(fresh, made, strict=True))
+        return [self._bounds[key(case)[:2]] for case in cases]
+
+    def each(self, function: Callable[..., T], jobs: Sequence[tuple[Any, ...]]) -> list[T]:
+        """Run any jobs."""
+        return run_all(self.pool, function, jobs, self.on_done)
+
+
+def key(case: study.Case) -> tuple[Any, ...]:
+    """Tell cases apart by what is computed, whatever they are called."""
+    return (
+        case.scenario,
+        tuple(sorted(case.overrides.items())),
+        case.estimator,
+        tuple(sorted((k, str(v)) for k, v in case.settings.items())),
+    )
+
+
+def beside(what: str, paper: str, figure: study.Figure) -> Beside:
+    """Put a figure over seeds beside a printed value."""
+    return Beside(what, paper, figure.mean, figure.half_width)
+
+
+def curve(
+    axes: Axes, place: int, x: Sequence[float], figures: Sequence[study.Figure], label: str
+) -> None:
+    """Draw means over seeds with their 95 % intervals."""
+    mean = np.array([f.mean for f in figures])
+    half = np.nan_to_num(np.array([f.half_width for f in figures]))
+    axes.errorbar(
+        x, mean, half, color=COLOURS[place], marker=MARKERS[place], linestyle=DASHES[place],
+        capsize=2.5, elinewidth=1.0, label=label,
+    )  # fmt: skip
+
+
+def level(axes: Axes, figure: study.Figure, label: str, color: str, dash: Any = "-") -> None:
+    """Draw a mean over seeds that depends on nothing along x, with its 95 % interval."""
+    axes.axhline(figure.mean, color=color, linestyle=dash, label=label)
+    half = 0.0 if math.isnan(figure.half_width) else figure.half_width
+    axes.axhspan(figure.mean - half, figure.mean + half, color=color, alpha=0.15, linewidth=0)
+
+
+def bound_level(axes: Axes, value_m: float) -> None:
+    """Draw the Cramer-Rao bound of filtering."""
+    axes.axhline(
+        value_m, color=INK, linestyle=(0, (2, 2)), linewidth=1.2, label="bound (filtering)"
+    )
+
+
+def printed(axes: Axes, x: Sequence[float], y: Sequence[float]) -> None:
+    """Mark values that the paper prints."""
+    axes.plot(
+        x, y, linestyle="none", marker="*", markersize=12, markerfacecolor="white",
+        markeredgecolor=INK, markeredgewidth=1.2, label="printed in the paper", zorder=5,
+    )  # fmt: skip
+
+
+def legend_beside(axes: Axes, title: str | None = None) -> None:
+    """Put the legend to the right of the axes, where it covers nothing."""
+    from matplotlib.lines import Line2D
+
+    handles, labels = axes.get_legend_handles_labels()
+    # Curves before levels and marks, each kind in the order it was drawn.
+    order = sorted(range(len(labels)), key=lambda k: isinstance(handles[k], Line2D))
+    axes.legend(
+        [handles[k] for k in order], [labels[k] for k in order],
+        loc="center left", bbox_to_anchor=(1.01, 0.5), title=title,
+    )  # fmt: skip
+
+
+def save(sheet: Sheet, directory: Path) -> tuple[Path, Path, Path]:
+    """Write NAME.svg, NAME.png and NAME.csv; return their paths in this order."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    svg, png, table = (directory / f"{sheet.name}.{kind}" for kind in ("svg", "png", "csv"))
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=sheet.size_in, layout="constrained")
+        sheet.draw(figure)
+        figure.savefig(svg, metadata={"Date": None})
+        figure.savefig(png, dpi=130)
+    with table.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(sheet.columns)
+        writer.writerows([[_cell(cell) for cell in row] for row in sheet.rows])
+    return svg, png, table
+
+
+def _cell(cell: Cell) -> str:
+    if isinstance(cell, float):
+        return f"{cell:.6g}" if math.isfinite(cell) else ""
+    return str(cell)
