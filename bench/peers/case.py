@@ -65,11 +65,14 @@ class Case:
         return zip(self.motions, self.sigmas, self.ranges, strict=True)
 
 
-def _sigmas(motions: Floats, distance_noise: Floats, turn_noise: Floats) -> Floats:
-    way = np.hypot(motions[..., 0], motions[..., 1])
+def _sigmas(truth: Floats, distance_noise: Floats, turn_noise: Floats) -> Floats:
+    """Noise follows the true step and turn: one measured as next to nothing is not exact."""
+    way = np.linalg.norm(np.diff(truth[..., :2], axis=0), axis=-1)
+    turn = np.abs((np.diff(truth[..., 2], axis=0) + math.pi) % (2.0 * math.pi) - math.pi)
     forward = np.hypot(way * distance_noise, FLOOR_M)
-    turn = np.hypot(motions[..., 2] * turn_noise, FLOOR_RAD)
-    return np.stack([forward, np.full_like(way, FLOOR_M), turn], axis=-1)
+    return np.stack(
+        [forward, np.full_like(way, FLOOR_M), np.hypot(turn * turn_noise, FLOOR_RAD)], axis=-1
+    )
 
 
 def paper_case(scenario: str, seed: int, seconds: int) -> Case:
@@ -122,7 +125,14 @@ def crowd_case(nodes: int, seed: int, seconds: int) -> Case:
     return Case(
         f"crowd-{nodes}",
         crowd.motions,
-        _sigmas(crowd.motions, crowd.distance_noise, crowd.turn_noise),
+        np.stack(
+            [
+                np.hypot(np.hypot(crowd.sigmas[..., 0], crowd.sigmas[..., 1]), FLOOR_M),
+                np.full(crowd.sigmas.shape[:2], FLOOR_M),
+                np.hypot(crowd.sigmas[..., 2], FLOOR_RAD),
+            ],
+            axis=-1,
+        ),
         tuple(ranges),
         crowd.poses,
         settings.sigma_range_m,

@@ -125,8 +125,7 @@ def play(crowd: Crowd, *, with_dense: bool) -> dict[str, float]:
     squares: dict[str, list[float]] = {"filter": [], "dense": [], "nees": [], "nees_all": []}
     one, two = np.triu_indices(count, 1)
     for t, motion in enumerate(crowd.motions, 1):
-        levels = np.stack([crowd.distance_noise, crowd.distance_noise, crowd.turn_noise], axis=1)
-        moved = np.concatenate([motion, np.abs(motion) * levels], axis=1)
+        moved = np.concatenate([motion, crowd.sigmas[t - 1]], axis=1)
         made.predict(everybody, moved)
         if with_dense:
             dense.advance(pose, covariance, everybody, moved)

@@ -268,8 +268,8 @@ class LargeTeam:
         E |z - d|^2 after the ranges is the residual's square and what is still unsure of d.
         """
         spread = self.filter.antenna_spread(node, peer)
-        bend = 0.5 * spread[2] / np.maximum(spread[0], 0.1)
-        square = (measured - spread[0] - bend) ** 2 + spread[1]
+        middle = np.sqrt(spread[0] ** 2 + spread[2])
+        square = (measured - middle) ** 2 + spread[1]
         total, model = float(trust.sum()), self.filter.model
         summed = model.sigma_m**2 * self._sigma_worth + float((trust * square).sum())
         model.sigma_m = max(math.sqrt(summed / (self._sigma_worth + total)), 0.01)

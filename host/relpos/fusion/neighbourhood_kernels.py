@@ -174,8 +174,9 @@ def gather(
     first). ``weight`` (E,) is each range's probability to be good, by which its information is
     multiplied, ``surprise`` (E,) its squared innovation over the expected variance.
 
-    Second order: the mean of a distance whose vector varies by p across its line is d + p / 2d,
-    its variance grows by p^2 / 2d^2. ``outlier`` holds the share of outliers, their variance (m^2)
+    Second order, finite where two meet (:mod:`relpos.fusion.joint`): with c the variance across,
+    m^2 = d^2 + c, the range's variance is a d^2 / m^2 + c^2 / 2m^2 and its slope d / m.
+    ``outlier`` holds the share of outliers, their variance (m^2)
     and the share of these that are too short.
     """
     information[:] = 0.0
@@ -185,11 +186,13 @@ def gather(
         starts[k + 1] = starts[k] + 2 * sizes[k]
     for e in range(len(node)):
         i, j = node[e], peer[e]
-        distance, along, across = max(spread[0, e], NEAREST_M), spread[1, e], spread[2, e]
-        bend = across / distance
-        innovation = measured[e] - spread[0, e] - 0.5 * bend
-        doubt = variance[e] + 0.5 * bend * bend
-        expected = along + doubt
+        distance, along, across = spread[0, e], spread[1, e], spread[2, e]
+        square = distance * distance + across + NEAREST_M * NEAREST_M
+        middle = math.sqrt(square)
+        innovation = measured[e] - middle
+        doubt = variance[e] + 0.5 * across * across / square
+        slope = distance / middle
+        expected = slope * slope * along + doubt
         surprise[e] = innovation * innovation / expected
         wide = expected + outlier[1]
         side = 2.0 * (1.0 - outlier[2]) if innovation > 0.0 else 2.0 * outlier[2]
@@ -202,7 +205,7 @@ def gather(
             continue
         each = believed / doubt
         bearing = spread[3, e]
-        ux, uy = math.cos(bearing), math.sin(bearing)
+        ux, uy = slope * math.cos(bearing), slope * math.sin(bearing)
         # The range grows with the peer along u and with the node against it.
         pushed = each * innovation
         for who, sign in ((i, -1.0), (j, 1.0)):

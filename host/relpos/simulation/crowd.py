@@ -54,8 +54,10 @@ class Crowd:
 
     ``poses`` (T + 1, N, 3) is the truth, ``motions`` (T, N, 3) forward, left, turn as measured.
     The ranges of all instants stand one after the other, those of instant k from ``first[k]`` to
-    ``first[k + 1]``: ``node`` and ``peer`` (E,) count from 0, ``range_m`` (E,).
-    ``distance_noise`` and ``turn_noise`` (N,) are the levels in force.
+    ``first[k + 1]``: ``node`` and ``peer`` (E,) count from 0, ``range_m`` (E,). ``sigmas``
+    (T, N, 3) are the motions' standard deviations, for who is to be told: forward and left
+    (the step's own along its direction), turn. They follow from the truth: a turn that was
+    measured as next to nothing is not exact.
     """
 
     settings: CrowdSettings
@@ -66,8 +68,7 @@ class Crowd:
     node: Indices
     peer: Indices
     range_m: Floats
-    distance_noise: Floats
-    turn_noise: Floats
+    sigmas: Floats
 
     def priors(self) -> tuple[Prior, ...]:
         """Everybody's start, exactly; node ids count from 1."""
@@ -127,9 +128,13 @@ def simulate_crowd(settings: CrowdSettings, seed: int = 0) -> Crowd:
     turn_noise = settings.turn_noise * (pattern / pattern.mean())[levels]
     turn = np.diff(poses[:, :, 2], axis=0)
     distance = np.linalg.norm(np.diff(poses[:, :, :2], axis=0), axis=2)
+    spread = np.stack([distance * distance_noise, np.abs(turn) * turn_noise])
     distance *= 1.0 + distance_noise * noise_rng.standard_normal(distance.shape)
     turn *= 1.0 + turn_noise * noise_rng.standard_normal(turn.shape)
     motions = np.stack([distance * np.cos(turn), distance * np.sin(turn), turn], axis=2)
+    sigmas = np.stack(
+        [np.abs(np.cos(turn)) * spread[0], np.abs(np.sin(turn)) * spread[0], spread[1]], axis=2
+    )
 
     first = [0]
     nodes: list[Indices] = []
@@ -149,8 +154,7 @@ def simulate_crowd(settings: CrowdSettings, seed: int = 0) -> Crowd:
     none = np.empty(0, dtype=np.intp)
     return Crowd(
         settings, side, poses, motions, np.array(first), np.concatenate([none, *nodes]),
-        np.concatenate([none, *peers]), np.concatenate([np.empty(0), *ranges]), distance_noise,
-        turn_noise,
+        np.concatenate([none, *peers]), np.concatenate([np.empty(0), *ranges]), sigmas,
     )  # fmt: skip
 
 

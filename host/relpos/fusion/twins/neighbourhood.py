@@ -14,6 +14,9 @@ import numpy.typing as npt
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
+NEAREST_M = 1e-3
+"""As in the kernels: it keeps divisions finite."""
+
 
 def advance(pose: Floats, covariance: Floats, node: Indices, moved: Floats) -> None:
     """Move nodes by displacements and sigmas (E, 6) in place, one after the other."""
@@ -56,12 +59,14 @@ def update(
 ) -> None:
     """Work in ranges (E,) in place: the textbook's gain for all of them at once."""
     distance, _, across, bearing = spread(pose, covariance, node, peer)
+    middle = np.sqrt(distance**2 + across + NEAREST_M**2)
+    slope = distance / middle
     h = np.zeros((len(node), covariance.shape[0]))
     e = np.arange(len(node))
     for place, sign in ((node, -1.0), (peer, 1.0)):
-        h[e, 3 * place] += sign * np.cos(bearing)
-        h[e, 3 * place + 1] += sign * np.sin(bearing)
-    noise = sigma_m**2 + 0.5 * (across / distance) ** 2
+        h[e, 3 * place] += sign * slope * np.cos(bearing)
+        h[e, 3 * place + 1] += sign * slope * np.sin(bearing)
+    noise = sigma_m**2 + 0.5 * (across / middle) ** 2
     gain = np.linalg.solve(h @ covariance @ h.T + np.diag(noise), h @ covariance).T
-    pose += (gain @ (measured - distance - 0.5 * across / distance)).reshape(pose.shape)
+    pose += (gain @ (measured - middle)).reshape(pose.shape)
     covariance -= gain @ h @ covariance
