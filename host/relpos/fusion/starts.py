@@ -62,6 +62,9 @@ _MOST_KNOTS = 5
 _KNOT_RAD = 0.09
 """A knot is set when the heading may have gone wrong by so much (5 degrees) since the last."""
 
+_FIT = 0.4
+SIGMA_RANGE_M = (0.12, 2.0)
+
 _WIDEST_KNOT_RAD = 0.2
 """Two knots with more heading error than this between them do not become one."""
 
@@ -469,6 +472,18 @@ class Search:
             self._volume = np.concatenate([self._volume, volume])
             self._covariances = np.concatenate([self._covariances, cov])
         self._merge(settings.pictures)
+        self._learn_sigma(len(data.measured))
+
+    def _learn_sigma(self, count: int) -> None:
+        """Let the ranges' error follow what the best picture leaves unexplained, slowly.
+
+        Twice the error that is seen counts (a cost of ``_FIT`` a range): evidence is a product
+        over ranges whose errors repeat themselves, and a mode is soon believed too much.
+        """
+        seen = (float(self._costs[0]) + _FIT * 20.0) / (count + 20.0)
+        low, high = SIGMA_RANGE_M
+        self.sigma_m *= min(max(seen / _FIT, 0.3), 4.0) ** 0.05
+        self.sigma_m = min(max(self.sigma_m, low), high)
 
     _costs: Floats = field(default_factory=lambda: np.zeros(0))
     _volume: Floats = field(default_factory=lambda: np.zeros(0))
