@@ -278,9 +278,15 @@ class BankCore:
         # Who reports nothing at all stands: no time passes for the heading.
         motion[(motion[:, :3] == 0.0).all(axis=1), 3] = 0.0
         motion[:, 4:] = noise.motion_variances(dx_m, dy_m, dtheta_rad, duration_s, told)
-        share = self.settings.sampled if self.count > 1 else 0.0
         drawn = self.rng.standard_normal((self.count, len(rows)))
-        joint.advance(self.x, self.p, self.level, self.sens, rows, motion, drawn, share, CROSS)
+        joint.advance(
+            self.x, self.p, self.level, self.sens, rows, motion, drawn, self._sampled, CROSS
+        )
+
+    @property
+    def _sampled(self) -> float:
+        """Share of the heading noise that is drawn; one hypothesis alone draws none."""
+        return min(self.settings.sampled, 0.9) if self.count > 1 else 0.0
 
     def update(
         self,
@@ -301,7 +307,7 @@ class BankCore:
         stats = np.empty((self.count, len(first), 11))
         before = self.log_weight.copy()
         outlier = np.array([self.outlier_share, self.settings.outlier_m**2,
-                            self.settings.outliers_short])  # fmt: skip
+                            self.settings.outliers_short, 1.0 / (1.0 - self._sampled)])  # fmt: skip
         joint.update(
             self.x, self.p, self.log_weight, self.sigma2, self.sens, first, second, bias,
             range_m, dz_m, outlier, PER_NODE * self.nodes, worth,

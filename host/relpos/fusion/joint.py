@@ -85,6 +85,25 @@ def _correct_sensitivity(t: Floats, hx: float, hy: float, kx: float, ky: float, 
     return s
 
 
+@inlined
+def _bound_sensitivity(levels: Floats, pk: Floats, b: int, most: float) -> None:
+    """Keep what the levels explain of a covariance below ``most`` times the covariance.
+
+    It is homogeneous in all variances, so that a true derivative obeys it with ``most`` 1.
+    """
+    ratio = 1.0
+    for entry in range(3):
+        at = 2 * entry + (entry == 2)
+        explained = 0.0
+        for part in range(3):
+            explained += levels[part, at]
+        ratio = max(ratio, explained / (most * pk[b + entry, b + entry] + _TINY))
+    if ratio > 1.0:
+        for part in range(3):
+            for at in range(6):
+                levels[part, at] /= ratio
+
+
 @compiled
 def advance(
     x: Floats,
@@ -131,7 +150,11 @@ def advance(
             if dx != 0.0 or dy != 0.0:
                 at = xk[bh] - 0.5 * dt * xk[bw]
                 c, s = math.cos(at), math.sin(at)
-                grow = math.exp(xk[bs])
+                # E R(theta) of an uncertain heading is shorter by exp(-var/2); what that leaves
+                # of the spread along and across the way is noise (statistical linearisation).
+                vary = max(pk[bh, bh] - dt * pk[bh, bw], 0.0)
+                shorter = math.exp(-vary)
+                grow = math.exp(xk[bs]) * math.sqrt(shorter)
                 east, north = grow * (c * dx - s * dy), grow * (s * dx + c * dy)
                 half = 0.5 * dt
                 xk[bx] += east
@@ -150,10 +173,14 @@ def advance(
                 along = motion[m, 4] * level[k, row, 0]
                 if square > _TINY:
                     ee, nn, en = east * east / square, north * north / square, east * north / square
-                    pk[bx, bx] += along * (ee + cross * nn)
-                    pk[by, by] += along * (nn + cross * ee)
-                    pk[bx, by] += along * (1.0 - cross) * en
-                    pk[by, bx] += along * (1.0 - cross) * en
+                    lost = 0.5 * square * (1.0 - shorter) * (1.0 - shorter) / shorter
+                    swept = square * max(0.5 / shorter - 0.5 * shorter - vary, 0.0)
+                    length = along + lost
+                    width = along * cross + swept
+                    pk[bx, bx] += length * ee + width * nn
+                    pk[by, by] += length * nn + width * ee
+                    pk[bx, by] += (length - width) * en
+                    pk[by, bx] += (length - width) * en
                     sens[k, row, 0, 0] += along * (ee + cross * nn)
                     sens[k, row, 0, 1] += along * (1.0 - cross) * en
                     sens[k, row, 0, 2] += along * (nn + cross * ee)
@@ -263,7 +290,8 @@ def update(
     biases come after the first ``poses`` entries of the state, their common part first, and a
     hypothesis whose common part has no variance has none. ``sigma2`` (K,) is each hypothesis'
     range variance. ``outlier`` is the share, the variance
-    (m^2) and the share of these that are too short. An innovation that may be an outlier's is
+    (m^2), the share of these that are too short, and the whole motion noise over what of it is
+    in the covariances. An innovation that may be an outlier's is
     used by its probability r of being none (probabilistic data association): the mean moves by
     r K nu, the covariance keeps the spread between used and not used.
 
@@ -279,7 +307,7 @@ def update(
     east = np.empty(size)
     north = np.empty(size)
     lever = arms.shape[0] > 0
-    share, wide, short = outlier[0], outlier[1], outlier[2]
+    share, wide, short, most = outlier[0], outlier[1], outlier[2], outlier[3]
     for k in range(count):
         xk = x[k]
         pk = p[k]
@@ -337,6 +365,8 @@ def update(
                 stats[k, r, 7 + part] = _correct_sensitivity(
                     sens[k, second[r], part], gx, gy, kf * g[bj], kf * g[bj + 1], kf * g[bj + 2]
                 )
+            _bound_sensitivity(sens[k, first[r]], pk, bi, most)
+            _bound_sensitivity(sens[k, second[r]], pk, bj, most)
             stats[k, r, 10] = sigma2[k]
         log_weight[k] += total
 

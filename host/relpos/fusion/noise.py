@@ -21,7 +21,7 @@ Indices = npt.NDArray[np.int64]
 ALONG_M2_M = 0.004
 """7 % of half a metre at each half metre; people and sensors spread over 3 to 25 %."""
 
-TURN_RAD2_RAD = 0.05
+TURN_RAD2_RAD = 0.04
 """15 degrees at a right angle."""
 
 WHITE_RAD2_S = math.radians(3.0) ** 2
@@ -248,7 +248,8 @@ def motion_variances(
     base[:, ALONG] = ALONG_M2_M * way
     # A turn is what turns fast: slow changes of the heading are mostly its white noise.
     size = np.abs(dtheta)
-    base[:, TURN] = TURN_RAD2_RAD * size * size / (size + SLOW_RAD_S * duration + 1e-12)
+    fourth = size**4
+    base[:, TURN] = TURN_RAD2_RAD * size * fourth / (fourth + (SLOW_RAD_S * duration) ** 4 + 1e-300)
     base[:, WHITE] = WHITE_RAD2_S * duration * moving
     told = ~np.isnan(sigmas)
     if told.any():
