@@ -147,7 +147,8 @@ def test_the_covariance_blocks_are_those_of_the_dense_inverse() -> None:
 
 
 def _smoothed(run: SimulatedRun, online: str = "bank") -> list[Estimate]:
-    smoother = fusion.make_smoother(online, run.priors, {}, seed=1)
+    settings = {"hypotheses": 50} if online == "bank" else {}
+    smoother = fusion.make_smoother(online, run.priors, settings, seed=1)
     estimates = [e for m in run.measurements for e in smoother.process(m)]
     assert estimates == []
     return list(smoother.finish())

@@ -77,7 +77,18 @@ def make_smoother(
     # The others' dice are far from what a user would choose as the next seed.
     seeds = [seed + k * 1_000_003 for k in range(attempts)]
     online, *others = (make(name, priors, settings, one, nodes) for one in seeds)
-    return Smoother(online, others, priors)
+    worn = nodes or {}
+    return Smoother(
+        online,
+        others,
+        priors,
+        {node: info.height_m for node, info in worn.items() if info.height_m is not None},
+        {
+            node: info.antenna_offset_m
+            for node, info in worn.items()
+            if info.antenna_offset_m is not None
+        },
+    )
 
 
 SMOOTHER_ATTEMPTS = 4

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from relpos.errors import RelposError
 from relpos.fusion import smoother_kernels as kernels
+from relpos.fusion.detection import Detection
 from relpos.fusion.smoother_graph import STILL_M, Graph
 
 Floats = npt.NDArray[np.float64]
@@ -49,15 +50,23 @@ class Levels:
 
 
 FIRST_MOTION = np.array(
-    [0.1**2, 0.02**2, 0.02**2, 0.02**2, 0.1**2, math.radians(1.0) ** 2, math.radians(0.5) ** 2]
+    [0.1**2, 0.01**2, 0.007**2, 0.007**2, 0.03**2, math.radians(1.0) ** 2, math.radians(0.2) ** 2]
 )
 """Levels to begin with: between a good robot's odometry and a bad pedestrian's."""
 
 LEAST_MOTION = np.array([0.005**2, 0.001**2, 0.002**2, 0.001**2, 0.005**2, 2e-4**2, 1e-4**2])
 """No level is believed to be less; far below all sensors, and no trouble for the digits."""
 
-COUNT_MOTION = np.array([2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0])
-"""How many chords' worth of evidence the first levels count for."""
+COUNT_FIRST = 1.0
+COUNT_TEAM = 2.0
+"""How many chords' worth of evidence the first levels count for, for the team, and the team's
+mean level, for each of its nodes: they carry the same device."""
+
+UNREST = 2.0
+"""Standard deviations of a stride's turn beyond which it is a turn."""
+
+HEARING_BLUR_M = 0.5
+"""How well a distance is known when it is learned from."""
 
 FIRST_SCALE = 0.1**2
 FIRST_DRIFT = math.radians(0.05) ** 2
@@ -125,7 +134,7 @@ class Weights:
 
 
 class Problem:
-    """A graph with what is computed from it once."""
+    """A graph with what is computed from it once, and what has been learned of its ranging."""
 
     def __init__(self, graph: Graph, *, constants: bool = True) -> None:
         self.graph = graph
@@ -141,6 +150,11 @@ class Problem:
         )  # fmt: skip
         self.range_m = graph.range_m.copy()
         """The measured ranges with the signs they are believed to have had; see ``unfold``."""
+        self._tries = (
+            graph.tries.slot, graph.tries.pair, graph.tries.share, graph.tries.bend,
+            graph.antenna_m, graph.tries.rise_m,
+        )  # fmt: skip
+        self._no_bias = np.full(graph.tries.slot.size, -1, dtype=np.int64)
         self._walks = graph.length_m > STILL_M
         self._way = _usual_length(graph.length_m, self._walks)
 
@@ -160,7 +174,7 @@ class Problem:
         """Begin at these poses, constants zero."""
         return State(poses.copy(), np.zeros(self.constants))
 
-    def bases(self, state: State) -> Floats:
+    def bases(self, state: State, levels: Levels) -> Floats:
         """What the levels are multiplied by, (K - 1, N, 7); turns as they now are believed."""
         duration = np.broadcast_to(self.graph.duration_s[:, None], self._walks.shape)
         # A turn that was reported too small is not more certain for it; but one that was not
@@ -168,6 +182,10 @@ class Problem:
         turn = np.abs(np.diff(state.poses[..., 2], axis=0))
         reported = np.abs(self.graph.turn_rad)
         turn = np.clip(turn, 0.5 * reported, 2.0 * reported)
+        # What is no more than a stride's own unrest is no turn, or unrest that happens to be
+        # great would explain itself.
+        unrest = np.sqrt(levels.motion[:, TURN_WAY] * duration * self._walks)
+        turn = np.maximum(turn - UNREST * unrest, 0.0)
         square = self._way**2
         return np.stack(
             [square, duration, square, duration, turn**2, duration * self._walks, duration], axis=-1
@@ -210,6 +228,13 @@ class Problem:
         distance = self.range_residuals(state) + self.range_m
         measured = self.graph.range_m
         self.range_m = measured * np.tanh(measured * np.maximum(distance, 0.0) / variance_m2)
+
+    def tried_distances(self, state: State) -> Floats:
+        """Distance of every attempt, (Q,)."""
+        nothing = np.zeros(self._no_bias.size)
+        return kernels.range_residuals(
+            state.poses, np.zeros(1), *self._tries, nothing, self._no_bias
+        )
 
     def start_residuals(self, state: State) -> Floats:
         """Difference from the prior poses, (N, 3)."""
@@ -437,14 +462,14 @@ def smooth(
     state = state.copy()
     solved = 0
     inliers = np.ones(problem.graph.range_m.size)
-    bases = problem.bases(state)
+    bases = problem.bases(state, levels)
     for turn in range(passes):
         wide = widen_m[turn] if turn < len(widen_m) else 0.0
         problem.unfold(state, levels.range_m2)
         weights = weigh(problem, levels, bases, inliers, wide)
         state, count = problem.optimise(state, weights, steps=12, tolerance=1e-4)
         solved += count
-        bases = problem.bases(state)
+        bases = problem.bases(state, levels)
         if turn >= 1:
             inliers = judge(problem, state, levels, wide)
         if learn and turn >= len(widen_m) - 1:
@@ -464,6 +489,30 @@ def smooth(
         inliers,
         solved + count,
     )
+
+
+def hearing_cost(problem: Problem, state: State, sigma_m: float = HEARING_BLUR_M) -> float:
+    """Minus the log probability of who was heard and who was tried in vain.
+
+    Over which distance who is heard is learned from these very distances, which are known to
+    ``sigma_m``. It tells wrong modes, in which people stand near each other unheard. The
+    optimisation itself does not use it: where all is well it adds nothing to the ranges.
+    """
+    tries = problem.graph.tries
+    detection = Detection()
+    distance = problem.tried_distances(state)
+    weight = np.zeros(distance.size)
+    for k, done in enumerate(tries.rounds):
+        first, last = tries.first[k], tries.first[k + 1]
+        middle = first + len(done.heard)
+        heard, silent = distance[first:middle], distance[middle:last]
+        weight[first:middle] = done.witnessed
+        weight[middle:last] = detection.learn(
+            done, heard, np.full(heard.size, sigma_m), silent, np.full(silent.size, sigma_m)
+        )
+    chance = detection.probability(distance, sigma_m)
+    outcome = np.where(tries.silent, np.log1p(-chance), np.log(chance))
+    return -float(detection.weight * np.sum(weight * outcome))
 
 
 def weigh(
@@ -528,11 +577,16 @@ def learn_levels(
         free = inverse * np.maximum(1.0 - posterior[..., axis] * inverse, 0.0)
         for column in columns:
             u = bases[..., column] * problem.graph.news
-            old = levels.motion[:, column]
-            count = COUNT_MOTION[column]
-            up = np.sum(u * square, axis=0) + count * FIRST_MOTION[column] / old**2
-            down = np.sum(u * free, axis=0) + count / old
-            new = np.maximum(old * np.clip(up / down, 0.1, 10.0), LEAST_MOTION[column])
+            old = levels.motion[:, column].copy()
+            # Of all the squares, and of their effective number, what belongs to this level.
+            squares, number = old**2 * np.sum(u * square, axis=0), old * np.sum(u * free, axis=0)
+            first = FIRST_MOTION[column]
+            team = math.exp(
+                (np.sum(number * np.log(old)) + COUNT_FIRST * math.log(first))
+                / (number.sum() + COUNT_FIRST)
+            )
+            new = (squares + COUNT_TEAM * team) / (number + COUNT_TEAM)
+            new = np.maximum(np.clip(new, 0.1 * old, 10.0 * old), LEAST_MOTION[column])
             important = np.sum(u * old * inverse, axis=0) > 1.0
             change = max(change, float(np.max(np.abs(np.log(new / old)) * important, initial=0.0)))
             levels.motion[:, column] = new
@@ -540,7 +594,9 @@ def learn_levels(
         residual_m = problem.range_residuals(state)
         posterior_m = problem.range_variances(state, covariance)
         v = levels.range_m2
-        up = float(np.sum(inliers * residual_m**2)) + COUNT_RANGES * FIRST_RANGE
+        # A sign that is not known adds to the error what it may have turned round.
+        unsigned = problem.graph.range_m**2 - problem.range_m**2
+        up = float(np.sum(inliers * (residual_m**2 + unsigned))) + COUNT_RANGES * FIRST_RANGE
         down = float(np.sum(inliers * np.maximum(1.0 - posterior_m * inliers / v, 0.0)))
         new_v = max(float(np.clip(up / (down + COUNT_RANGES), 0.1 * v, 10.0 * v)), 0.01**2)
         change = max(change, abs(math.log(new_v / v)))
@@ -619,6 +675,7 @@ def evidence(
     prior = problem.constant_weights(levels)
     if problem.estimate_constants:
         total += 0.5 * np.sum(prior * state.constants**2 - np.log(prior))
+    total += hearing_cost(problem, state)
     start = problem.graph.start_weight
     total += 0.5 * np.sum(start * problem.start_residuals(state) ** 2)
     return float(total + 0.5 * covariance.log_determinant)

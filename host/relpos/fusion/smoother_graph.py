@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import RelposError
+from relpos.fusion.detection import Round, Rounds
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Timeline
-from relpos.measurements import Heading, Height, Measurement, Prior, Range
+from relpos.measurements import Heading, Height, Measurement, Prior
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -28,6 +29,24 @@ STILL_M = 0.02
 UNKNOWN_M = 1e3
 UNKNOWN_RAD = 10.0
 """No knowledge of a start: far above what a run tells, and no trouble for the digits."""
+
+
+@dataclass(frozen=True)
+class Tries:
+    """Attempts to range, one round after another: Q attempts in ``rounds``.
+
+    ``slot``, ``share``, ``bend``, ``pair``, ``rise_m`` as of ranges. ``first`` (rounds + 1,) is
+    where each round begins; in a round the heard come first, then the silent.
+    """
+
+    rounds: tuple[Round, ...]
+    first: Integers
+    slot: Integers
+    share: Floats
+    bend: Floats
+    pair: Integers
+    rise_m: Floats
+    silent: npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -69,6 +88,8 @@ class Graph:
     antenna_m: Floats
     start: Floats
     start_weight: Floats
+    tries: Tries
+    """Who tried to range whom, and whether in vain."""
     height_m: Floats
     """(K, N) height of every node over its own start, 0 where none is told."""
 
@@ -89,6 +110,10 @@ class Graph:
         return poses
 
 
+_Entry = tuple[int, float, int, int, float, float, tuple[float, ...]]
+"""Slot, time, node, peer, range, rise, and where both were in their chords."""
+
+
 @dataclass
 class _Builder:
     """Runs the steps of a timeline into lists."""
@@ -100,13 +125,15 @@ class _Builder:
     chords: list[dict[int, list[float]]] = field(default_factory=list)
     heights_at: list[dict[int, float]] = field(default_factory=list)
     times: list[float] = field(default_factory=list)
-    ranges: list[tuple[int, float, int, int, float, float, tuple[float, ...]]] = field(
-        default_factory=list
-    )
+    ranges: list[_Entry] = field(default_factory=list)
+    rounds: Rounds = field(default_factory=Rounds)
+    tried: list[
+        tuple[Round, list[tuple[int, float, int, int, float, float, tuple[float, ...]]]]
+    ] = field(default_factory=list)
     seen: set[int] = field(default_factory=set)
     unused_headings: int = 0
 
-    def take(self, step: object) -> None:
+    def take(self, step: object, reported_s: Callable[[int], float]) -> None:
         match step:
             case Advance():
                 self.seen.add(step.node)
@@ -120,7 +147,14 @@ class _Builder:
                 part[4] += (step.sigma_theta_rad or 0.0) ** 2
             case Ranging():
                 for one in step.ranges:
-                    self._take_range(step.time_s, one)
+                    self.seen |= {one.node, one.peer}
+                    self.ranges.append(self._entry(step.time_s, one.node, one.peer, one.range_m))
+                for done in self.rounds.take(step.time_s, step.ranges, reported_s):
+                    entries = [
+                        self._entry(step.time_s, node, peer, 0.0)
+                        for node, peer in done.heard + done.silent
+                    ]
+                    self.tried.append((done, entries))
             case Sensed(measurement=Height() as height):
                 self.height_now[height.node] = height.height_m
             case Sensed(measurement=Heading()):
@@ -131,15 +165,12 @@ class _Builder:
                 self.heights_at.append(dict(self.height_now))
                 self.partial = {}
 
-    def _take_range(self, time_s: float, one: Range) -> None:
-        self.seen |= {one.node, one.peer}
+    def _entry(self, time_s: float, node: int, peer: int, range_m: float) -> _Entry:
         places: list[float] = []
-        for node in (one.node, one.peer):
-            places += self.partial.get(node, [0.0, 0.0])[:2]
-        rise = self._height(one.node) - self._height(one.peer)
-        self.ranges.append(
-            (len(self.times), time_s, one.node, one.peer, one.range_m, rise, tuple(places))
-        )
+        for one in (node, peer):
+            places += self.partial.get(one, [0.0, 0.0])[:2]
+        rise = self._height(node) - self._height(peer)
+        return len(self.times), time_s, node, peer, range_m, rise, tuple(places)
 
     def _height(self, node: int) -> float:
         return self.heights.get(node, 0.0) + self.height_now.get(node, 0.0)
@@ -163,9 +194,9 @@ def build_graph(
     builder = _Builder(dict(heights_m or {}))
     for measurement in measurements:
         for step in timeline.push(measurement):
-            builder.take(step)
+            builder.take(step, timeline.reported_s)
     for step in timeline.finish():
-        builder.take(step)
+        builder.take(step, timeline.reported_s)
     counters = Counter(timeline.counters)
     if builder.unused_headings:
         counters["headings_unused"] += builder.unused_headings
@@ -199,12 +230,18 @@ def _finished(
     kept = [entry for entry in builder.ranges if entry[0] < slots]
     counters["ranges_after_the_last_motion"] += len(builder.ranges) - len(kept)
 
-    slot = np.array([entry[0] for entry in kept], dtype=np.int64)
-    at_s = np.array([entry[1] for entry in kept])
-    pair = np.array([(row[e[2]], row[e[3]]) for e in kept], dtype=np.int64).reshape(-1, 2)
-    share = np.clip((at_s - time_s[slot]) / (time_s[slot + 1] - time_s[slot]), 0.0, 1.0)
-    places = np.array([entry[6] for entry in kept]).reshape(-1, 4)
-    ends = np.concatenate((chord[slot, pair[:, 0], :2], chord[slot, pair[:, 1], :2]), axis=1)
+    slot, share, bend, pair, rise = _placed(kept, row, time_s, chord)
+    tried = [one for one in builder.tried if all(entry[0] < slots for entry in one[1])]
+    attempts = [entry for _, entries in tried for entry in entries]
+    tries = Tries(
+        tuple(done for done, _ in tried),
+        np.cumsum([0, *(len(entries) for _, entries in tried)]),
+        *_placed(attempts, row, time_s, chord),
+        np.array(
+            [k >= len(done.heard) for done, entries in tried for k in range(len(entries))],
+            dtype=bool,
+        ),
+    )
     ordered = np.sort(pair, axis=1)
     pairs, pair_index = (
         np.unique(ordered, axis=0, return_inverse=True) if len(kept) else (ordered, slot)
@@ -228,17 +265,35 @@ def _finished(
         _follow(length, direction, chord[..., 2]),
         slot,
         share,
-        places - share[:, None] * ends,
+        bend,
         pair,
         np.asarray(pair_index, dtype=np.int64).ravel(),
         pairs,
-        np.array([entry[5] for entry in kept]),
+        rise,
         np.array([entry[4] for entry in kept]),
         antenna,
         start,
         weight,
+        tries,
         height,
     )
+
+
+def _placed(
+    entries: Sequence[_Entry],
+    row: Mapping[int, int],
+    time_s: Floats,
+    chord: Floats,
+) -> tuple[Integers, Floats, Floats, Integers, Floats]:
+    """Give slot, share, bend, pair and rise of ranges or attempts."""
+    slot = np.array([entry[0] for entry in entries], dtype=np.int64)
+    at_s = np.array([entry[1] for entry in entries])
+    pair = np.array([(row[e[2]], row[e[3]]) for e in entries], dtype=np.int64).reshape(-1, 2)
+    share = np.clip((at_s - time_s[slot]) / (time_s[slot + 1] - time_s[slot]), 0.0, 1.0)
+    places = np.array([entry[6] for entry in entries]).reshape(-1, 4)
+    ends = np.concatenate((chord[slot, pair[:, 0], :2], chord[slot, pair[:, 1], :2]), axis=1)
+    bend = places - share[:, None] * ends
+    return slot, share, bend, pair, np.array([entry[5] for entry in entries])
 
 
 def _start(priors: Sequence[Prior], row: Mapping[int, int]) -> tuple[Floats, Floats]:

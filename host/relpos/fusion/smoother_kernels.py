@@ -216,7 +216,10 @@ def range_residuals(
     range_m: Floats,
     pair_index: Integers,
 ) -> Floats:
-    """Predicted minus measured ranges, (M,); ``bias_m`` is the common one, then one a pair."""
+    """Predicted minus measured ranges, (M,); ``bias_m`` is the common one, then one a pair.
+
+    A negative ``pair_index`` stands for a distance without any bias.
+    """
     result = np.empty(range_m.size)
     row = np.empty(12)
     for m in range(range_m.size):
@@ -224,7 +227,9 @@ def range_residuals(
             poses, slots[m], pairs[m, 0], pairs[m, 1], shares[m], bends[m], antenna_m, rise_m[m],
             row,
         )  # fmt: skip
-        result[m] = distance + bias_m[0] + bias_m[1 + pair_index[m]] - range_m[m]
+        result[m] = distance - range_m[m]
+        if pair_index[m] >= 0:
+            result[m] += bias_m[0] + bias_m[1 + pair_index[m]]
     return result
 
 
@@ -263,7 +268,10 @@ def add_ranges(
             poses, k, pairs[m, 0], pairs[m, 1], f, bends[m], antenna_m, rise_m[m], row
         )
         common, own = 2 * nodes, 2 * nodes + 1 + pair_index[m]
-        r = distance + bias_m[0] + bias_m[1 + pair_index[m]] - range_m[m]
+        biased = pair_index[m] >= 0
+        r = distance - range_m[m]
+        if biased:
+            r += bias_m[0] + bias_m[1 + pair_index[m]]
         for p in range(12):
             value = w * row[p]
             if value == 0.0:
@@ -271,8 +279,9 @@ def add_ranges(
             late_p = (p // 3) % 2
             at_p = 3 * pairs[m, p // 6] + p % 3
             gradient[k + late_p, at_p] += value * r
-            border[k + late_p, at_p, common] += value
-            border[k + late_p, at_p, own] += value
+            if biased:
+                border[k + late_p, at_p, common] += value
+                border[k + late_p, at_p, own] += value
             for q in range(12):
                 late_q = (q // 3) % 2
                 at_q = 3 * pairs[m, q // 6] + q % 3
@@ -280,6 +289,8 @@ def add_ranges(
                     a[k + late_p, at_p, at_q] += value * row[q]
                 elif late_p == 1:
                     e[k, at_p, at_q] += value * row[q]
+        if not biased:
+            continue
         corner[common, common] += w
         corner[own, own] += w
         corner[common, own] += w
