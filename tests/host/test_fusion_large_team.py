@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from relpos import fusion
-from relpos.fusion import Estimate, NodeStatus, growing
+from relpos.fusion import Estimate, NodeStatus, growing, noise
+from relpos.fusion.large_team import LargeTeam
 from relpos.measurements import Measurement, Prior, Range
 from relpos.simulation.crowd import Crowd, CrowdSettings, simulate_crowd
 
@@ -142,3 +143,18 @@ def test_the_same_measurements_give_the_same_estimates(crowd: Crowd) -> None:
     one, _ = estimates_of(crowd.priors(), measurements)
     two, _ = estimates_of(crowd.priors(), measurements)
     assert one == two
+
+
+def test_who_steps_unevenly_is_found_out(crowd: Crowd) -> None:
+    made = fusion.make("bank", crowd.priors(), {}, 0)
+    for m in crowd.measurements():
+        made.process(m)
+    assert isinstance(made, growing.GrowingTeam)
+    assert isinstance(made.estimator, LargeTeam)
+    level = made.estimator._levels.level
+    # The crowd's six levels of step noise are 5 10 20 10 15 10 % in turn, 9 % is the base's.
+    steady, uneven = np.median(level[0::6, noise.ALONG]), np.median(level[2::6, noise.ALONG])
+    assert uneven > 2.0 * steady
+    assert uneven > 1.3
+    # Nobody's heading wanders on a straight walk here.
+    assert np.median(level[:, noise.WHITE]) < 0.2

@@ -34,6 +34,7 @@ from relpos.fusion.joining import Joining
 from relpos.fusion.neighbourhood import NeighbourhoodFilter, RangeModel
 from relpos.fusion.ranging_model import Mounting
 from relpos.fusion.rewind import Rewinder
+from relpos.fusion.team_levels import TeamLevels
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.measurements import Height, Measurement, Prior, Range
 
@@ -88,7 +89,7 @@ class LargeTeam:
     _joining: Joining = field(default_factory=Joining)
     _own: Counter[str] = field(default_factory=Counter)
     _odd: Floats = field(default_factory=lambda: np.empty(0))
-    _level: Floats = field(default_factory=lambda: np.empty((0, noise.LEVELS)))
+    _levels: TeamLevels = field(default_factory=TeamLevels)
     _sigma_worth: float = SIGMA_R_WORTH
     _reach_m: float = 0.0
     _moved: bool = False
@@ -168,7 +169,7 @@ class LargeTeam:
             self.filter.copy(), self._nodes[:], dict(self._row),
             {node: replace(known) for node, known in self._known.items()},
             self._pending[:], self._joining.copy(), self._own.copy(), self._odd.copy(),
-            self._level.copy(), self._sigma_worth, self._reach_m, self._moved, self._ranges_used,
+            self._levels.copy(), self._sigma_worth, self._reach_m, self._moved, self._ranges_used,
             self._epoch_s,
         )  # fmt: skip
 
@@ -197,7 +198,7 @@ class LargeTeam:
             if worn is not None and worn.antenna_offset_m is not None:
                 self.filter.antenna_m[self._row[node]] = worn.antenna_offset_m
         self._odd = np.append(self._odd, np.zeros(len(nodes)))
-        self._level = np.concatenate([self._level, np.ones((len(nodes), noise.LEVELS))])
+        self._levels.add(poses)
 
     # -- motion --------------------------------------------------------------------------------
 
@@ -220,10 +221,11 @@ class LargeTeam:
     def _with_noise(self, rows: Indices, moves: Floats, told: Floats) -> Floats:
         """Displacements and their sigmas (E, 6) from bases of noise times the nodes' levels."""
         dx, dy, turn, duration = moves.T
-        variance = noise.motion_variances(dx, dy, turn, duration, told) * self._level[rows]
+        variance = noise.motion_variances(dx, dy, turn, duration, told) * self._levels.level[rows]
         result = np.empty((len(rows), 6))
         result[:, :3] = moves[:, :3]
         # Along the way, and a tenth of that across: both as the frame of the body sees them.
+        self._levels.turn(rows, turn)
         way = np.maximum(dx * dx + dy * dy, 1e-12)
         along = variance[:, noise.ALONG]
         result[:, 3] = np.sqrt(along * (dx * dx + ACROSS * dy * dy) / way)
@@ -257,7 +259,9 @@ class LargeTeam:
         if not math.isfinite(f.width_m):
             f.widen(float(measured.max()) * REACH_SLACK)
         self._reach_m = max(self._reach_m * REACH_FADE, float(measured.max()))
+        before, prior = f.pose.copy(), f.marginals()
         trust, _ = f.update(node, peer, flat)
+        self._levels.learn(before, prior, f.pose, f.marginals(), np.concatenate([node, peer]))
         self._own["ranges_distrusted"] += int((trust < 0.5).sum())
         self._learn_sigma(node, peer, flat, trust)
         self._doubt(node, peer, trust)
@@ -394,7 +398,7 @@ LEAST_REACH_M = 5.0
 """Who is nearer than this is listed, however short the ranges are."""
 
 _STATE = (
-    "filter", "_nodes", "_row", "_known", "_pending", "_joining", "_own", "_odd", "_level",
+    "filter", "_nodes", "_row", "_known", "_pending", "_joining", "_own", "_odd", "_levels",
     "_sigma_worth", "_reach_m", "_moved", "_ranges_used", "_epoch_s",
 )  # fmt: skip
 
