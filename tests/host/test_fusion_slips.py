@@ -87,7 +87,10 @@ def test_doubts_lie_on_the_peers_ring_with_headings_all_round() -> None:
 def slipping_run(
     slip_s: float, seconds: int, seed: int
 ) -> tuple[list[Measurement], list[Prior], dict[int, list[tuple[complex, float]]]]:
-    """Three walkers in a room; node 3's heading slips by 130 degrees at ``slip_s``, unreported."""
+    """Three walkers in a room; node 3's heading slips by 130 degrees at ``slip_s``, unreported.
+
+    With a ``slip_s`` of inf nothing slips.
+    """
     rng = np.random.default_rng(seed)
     measurements: list[Measurement] = []
     at = {1: (0j, 0.0), 2: (4 + 0j, 1.5), 3: (2 + 4j, 3.0)}
@@ -99,7 +102,7 @@ def slipping_run(
             z, h = z + 0.6 * np.exp(1j * h), h + turn
             at[n] = (z, h)
             truth[n].append((z, h))
-            odd = 2.27 if n == 3 and t == round(slip_s) else 0.0
+            odd = 2.27 if n == 3 and t == slip_s else 0.0
             measurements.append(
                 Motion(float(t), n, 0.6 * (1 + 0.04 * rng.normal()), 0.0,
                        turn + odd + 0.015 * rng.normal())
@@ -167,3 +170,52 @@ def test_a_report_in_pieces_is_one_report() -> None:
         for part in (0.25, 0.75):
             last = pieces.is_still(1, part * dx, part * dy, part * turn, part, part)
         assert told == last
+
+
+def compose(motions: list[Motion]) -> tuple[float, float, float]:
+    place, heading = 0j, 0.0
+    for m in motions:
+        place += complex(m.dx_m, m.dy_m) * np.exp(1j * heading)
+        heading += m.dtheta_rad
+    return place.real, place.imag, heading
+
+
+@pytest.mark.parametrize(("off", "restarts"), [(True, False), (True, True), (False, False)])
+def test_a_node_that_was_away_for_half_a_minute_is_located_again(off: bool, restarts: bool) -> None:
+    """Off, or only its motion missing; it comes back with all it went, or with nothing."""
+    measurements, priors, truth = slipping_run(math.inf, 150, 5)
+    gap = [m for m in measurements if isinstance(m, Motion) and m.node == 3 and 60 < m.time_s <= 90]
+    gone = set(gap)
+    if off:
+        gone |= {
+            m
+            for m in measurements
+            if isinstance(m, Range) and 3 in (m.node, m.peer) and 60 < m.time_s <= 90
+        }
+    away = 30.0
+    back = (
+        Motion(90.0, 3, 0.0, 0.0, 0.0, 1.5 * away, 1.5 * away, 0.5 * math.sqrt(away))
+        if restarts
+        else Motion(90.0, 3, *compose(gap))
+    )
+    told = [m for m in measurements if m not in gone]
+    at = next(k for k, m in enumerate(told) if m.time_s >= 90.0)
+    told.insert(at, back)
+    bank = fusion.make("bank", priors, {}, 1)
+    estimates = [e for m in told for e in bank.process(m)] + bank.finish()
+    absent = [e for e in estimates if 75.0 < e.time_s < 88.0]
+    others = [body_error_m(e, truth, 2) for e in absent if e.time_s == round(e.time_s)]
+    assert np.median(others) < 0.6  # the others go on
+    if off:
+        state = {n.status for e in absent for n in e.nodes if n.node == 3}
+        assert state <= {NodeStatus.STALE, NodeStatus.LOST}
+    later = [
+        body_error_m(e, truth, 3)
+        for e in estimates
+        if 120.0 <= e.time_s < 149.0 and e.time_s == round(e.time_s)
+    ]
+    assert np.median(later) < 0.7
+    if restarts:
+        assert bank.counters()["nodes_sought_again"] >= 1
+    if not off:
+        assert bank.counters()["ranges_of_silent"] > 0

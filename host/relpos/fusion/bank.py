@@ -35,10 +35,21 @@ from relpos.fusion.estimator import (
 from relpos.fusion.joint import PER_NODE, Of
 from relpos.fusion.ranging_model import Mounting, Repetition
 from relpos.fusion.rewind import Rewinder
-from relpos.fusion.slips import BELIEVING, HYPOTHESES, Habit, Stillness, Watch, doubts
+from relpos.fusion.slips import (
+    BELIEVING,
+    HEADING_CELL_RAD,
+    HYPOTHESES,
+    LOST_M,
+    LOST_RAD,
+    VAGUE_M,
+    Habit,
+    Stillness,
+    Watch,
+    doubts,
+)
 from relpos.fusion.starts import SETTLED_HEADING_RAD, Found, Mixture, Starts
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
-from relpos.measurements import Heading, Height, Measurement, Prior
+from relpos.measurements import Heading, Height, Measurement, Prior, Range
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -56,6 +67,7 @@ class Snapshot:
     numbers: tuple[float, ...]
     biases: Mapping[tuple[int, int], int]
     counters: Mapping[str, int]
+    unplaced: Mapping[int, tuple[float, float]]
 
 
 class BankCore:
@@ -103,6 +115,8 @@ class BankCore:
         self.watch = Watch()
         self.slipped: set[int] = set()
         """Rows whose odometry has slipped and that are not found again yet."""
+        self.unplaced: dict[int, tuple[float, float]] = {}
+        """Row -> how badly its place (m) and heading (rad) are known, till it is ranged."""
         self.since_slip = 0
         """Instants of ranges since the last alarm."""
         self._alarm: tuple[int, Indices, Indices, Floats] | None = None
@@ -172,6 +186,7 @@ class BankCore:
         self.surprise = np.delete(self.surprise, row)
         self.watch.remove(row)
         self.slipped = {r - (r > row) for r in self.slipped if r != row}
+        self.unplaced = {r - (r > row): s for r, s in self.unplaced.items() if r != row}
         self.arm = np.delete(self.arm, row, axis=0)
 
     def seed_hypotheses(self, poses: Floats, covariances: Floats, log_weights: Floats) -> None:
@@ -338,32 +353,71 @@ class BankCore:
             self._alarm = (slipped, first, second, range_m)
         return good
 
-    def _doubt(self, row: int, first: Indices, second: Indices, range_m: Floats) -> None:
-        """Let most hypotheses doubt a user that has slipped (:mod:`relpos.fusion.slips`)."""
-        self.counters["slips"] += 1
+    def lose(self, row: int, sigma_m: float, sigma_rad: float) -> None:
+        """Know less of a user: isotropic in place (m), and in heading (rad).
+
+        What is lost altogether (:mod:`relpos.fusion.slips`) is sought when it is ranged next.
+        """
+        at = PER_NODE * row
+        self.x[:, at : at + 2] += (
+            math.sqrt(0.5) * sigma_m * self.rng.standard_normal((self.count, 2))
+        )
+        kept = min(0.5 * sigma_rad**2, HEADING_CELL_RAD**2)
+        turned = math.sqrt(sigma_rad**2 - kept) * self.rng.standard_normal(self.count)
+        self.x[:, at + Of.HEADING] += turned
+        for entry, variance in ((0, 0.5 * sigma_m**2), (1, 0.5 * sigma_m**2), (2, kept)):
+            self.p[:, at + entry, at + entry] += variance
+        self.doubtful[:] = SLIP_UPDATES
+        before = self.unplaced.get(row, (0.0, 0.0))
+        total = math.hypot(sigma_m, before[0]), math.hypot(sigma_rad, before[1])
+        if self.count > 1 and (total[0] > LOST_M or total[1] > LOST_RAD):
+            self.unplaced[row] = total
+            self.slipped.add(row)
+
+    def sight(self, first: Indices, second: Indices, range_m: Floats) -> None:
+        """Place users that were lost on the rings of the ranges (R,) that are to be worked in."""
+        for row, (sigma_m, sigma_rad) in sorted(self.unplaced.items()):
+            if (first == row).any() or (second == row).any():
+                del self.unplaced[row]
+                self.counters["nodes_sought_again"] += 1
+                lost = (sigma_m > LOST_M, sigma_rad > LOST_RAD)
+                self._doubt(row, first, second, range_m, sigma_m, lost)
+
+    def _doubt(
+        self,
+        row: int,
+        first: Indices,
+        second: Indices,
+        range_m: Floats,
+        place_m: float,
+        lost: tuple[bool, bool] | None = None,
+    ) -> None:
+        """Let most hypotheses doubt a user that has slipped (:mod:`relpos.fusion.slips`).
+
+        All of them, where place or heading or both are known to be ``lost``.
+        """
         self.since_slip = 0
         # Of two alone either may be the one: what is between them is doubted in the same way.
-        self.slipped.update([row] if self.nodes > 2 else range(self.nodes))
+        self.slipped.update([row] if self.nodes > 2 or lost else range(self.nodes))
         self.resample(self.weights(), max(self.count, HYPOTHESES))
-        which = self.rng.permutation(self.count)[round(BELIEVING * self.count) :]
+        believing = BELIEVING if lost is None else 0.0
+        which = self.rng.permutation(self.count)[round(believing * self.count) :]
         sights = np.flatnonzero((first == row) | (second == row))
         sight = sights[np.arange(len(which)) % len(sights)]
         peer = PER_NODE * np.where(first[sight] == row, second[sight], first[sight])
         at = PER_NODE * row
         peers = np.stack([self.x[which, peer], self.x[which, peer + 1]], axis=1)
-        made = doubts(
-            self.x[which, at : at + 3], peers, range_m[sight], self.settings.jump_m, self.rng
-        )
+        made = doubts(self.x[which, at : at + 3], peers, range_m[sight], place_m, self.rng, lost)
         self.x[which, at : at + 3] = made.poses
         # What was lost has nothing to do any more with what else is known.
-        for lost, part in ((~made.kept[:, 0], (0, 1)), (~made.kept[:, 1], (2,))):
-            some = which[lost]
+        for anew, part in ((~made.kept[:, 0], (0, 1)), (~made.kept[:, 1], (2,))):
+            some = which[anew]
             for entry in part:
                 self.p[some, at + entry, :] = 0.0
                 self.p[some, :, at + entry] = 0.0
             for a in part:
                 for b in part:
-                    self.p[some, at + a, at + b] = made.covariances[lost, a, b]
+                    self.p[some, at + a, at + b] = made.covariances[anew, a, b]
         # Neither those who doubt nor those who ought to tell how noisy anybody is.
         self.doubtful[:] = SLIP_UPDATES
 
@@ -448,7 +502,8 @@ class BankCore:
         self.since_slip += 1
         closed = not self.slipped or self.since_slip > OPEN_UPDATES
         if self._alarm is not None:
-            self._doubt(*self._alarm)
+            self.counters["slips"] += 1
+            self._doubt(*self._alarm, self.settings.jump_m)
             self._alarm = None
         elif self.count > self.settings.hypotheses and closed:
             self.resample(weight, self.settings.hypotheses)
@@ -530,6 +585,7 @@ class BankCore:
             (self.nodes, self.since_slip, *self.slipped),
             dict(self.biases),
             dict(self.counters),
+            dict(self.unplaced),
         )  # fmt: skip
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -546,6 +602,7 @@ class BankCore:
         self.since_slip = int(snapshot.numbers[1])
         self.biases = dict(snapshot.biases)
         self.counters = Counter(snapshot.counters)
+        self.unplaced = dict(snapshot.unplaced)
         self._spread_levels()
 
 
@@ -561,6 +618,12 @@ CROSS = 0.04
 
 JITTER = 0.1
 """Standard deviation of the levels' jitter at resampling, in units of their spread."""
+
+SILENT_S = 10.0
+"""A node whose motion is missing for longer is tracked by its ranges alone."""
+
+WANDER_M = 0.7
+"""Random walk of a person who is not heard of, m per root second: there and back in a room."""
 
 OPEN_UPDATES = 60
 """Many hypotheses are kept for so many instants of ranges at most: what has not told where
@@ -606,6 +669,8 @@ class _Known:
     sigma_height_m: float = 0.0
     news_s: float = -math.inf
     silent_epochs: int = 0
+    drifted_s: float = -math.inf
+    """Until then it was tracked by ranges alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -784,6 +849,15 @@ class Bank:
             told = np.array([_told(a) for a in steps])
         begin = 0
         for k, a in enumerate(steps):
+            drifted_s = self._known[a.node].drifted_s
+            if drifted_s > a.time_s - a.duration_s:
+                # Ranges have moved it so far already; how it turned they cannot say.
+                moves[k, :2] *= max(a.time_s - drifted_s, 0.0) / max(a.duration_s, 1e-9)
+            vague = _vagueness(a)
+            if vague is not None:
+                assert told is not None
+                told[k] = math.nan
+                self.core.lose(int(rows[k]), *vague)
             if self.stillness.is_still(
                 a.node, a.dx_m, a.dy_m, a.dtheta_rad, a.duration_s, a.fraction
             ):
@@ -821,6 +895,10 @@ class Bank:
             # A search may be long; finding nobody in it is no fault of the data.
             self._ranges_used += len(step.ranges)
         ranges = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
+        ranges = self._heard_moving(step.time_s, ranges)
+        if self.core.unplaced and ranges:
+            first, second, _ = self._pairs([(r.node, r.peer) for r in ranges])
+            self.core.sight(first, second, np.array([r.range_m for r in ranges]))
         silence = self._silence(step)
         if ranges:
             pairs = [(r.node, r.peer) for r in ranges]
@@ -838,6 +916,33 @@ class Bank:
         if silence is not None:
             self.core.log_weight += silence
         self.core.settle()
+
+    def _heard_moving(self, time_s: float, ranges: list[Range]) -> list[Range]:
+        """Leave out ranges of nodes whose motion is missing; let those drift who miss it long.
+
+        A node without motion may be anywhere that it can have walked to. For a while its motion
+        may still come (then the ranges are worked in after all, in their place); after
+        ``SILENT_S`` it is tracked by ranges alone, as somebody who wanders.
+        """
+        silent = set()
+        for node in {n for r in ranges for n in (r.node, r.peer)}:
+            reported_s = self._feed.timeline.reported_s(node)
+            if -math.inf < reported_s < time_s:
+                silent.add(node)
+        if not silent:
+            return ranges
+        for node in sorted(silent):
+            known = self._known[node]
+            reported_s = self._feed.timeline.reported_s(node)
+            if time_s - reported_s > SILENT_S:
+                since_s = max(known.drifted_s, reported_s)
+                self.core.lose(self._row[node], WANDER_M * math.sqrt(time_s - since_s), 0.0)
+                known.drifted_s = time_s
+                self._own["drifts"] += 1
+                silent.discard(node)
+        kept = [r for r in ranges if r.node not in silent and r.peer not in silent]
+        self._own["ranges_of_silent"] += len(ranges) - len(kept)
+        return kept
 
     def _seek(self, node: int) -> None:
         if node not in self.starts:
@@ -1170,6 +1275,16 @@ def _pair_of_pictures(
         node, peer, middle, math.sqrt(max(variance, 0.0)), float(np.angle(together)),
         min(bearing_sd, _ANY_ANGLE_RAD),
     )  # fmt: skip
+
+
+def _vagueness(step: Advance) -> tuple[float, float] | None:
+    """Standard deviations (m, rad) of a piece whose report says to know next to nothing."""
+    sigma_m, _, sigma_rad = (0.0 if math.isnan(s) else s for s in _told(step))
+    sigma_m = min(sigma_m, step.sigma_y_m or 0.0)
+    whole = math.sqrt(max(step.fraction, 1e-9))
+    if sigma_m / whole > VAGUE_M or sigma_rad / whole > LOST_RAD:
+        return sigma_m, sigma_rad
+    return None
 
 
 def _told(step: Advance) -> tuple[float, float, float]:

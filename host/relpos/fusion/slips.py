@@ -207,7 +207,12 @@ class Doubts:
 
 
 def doubts(
-    old: Floats, peers: Floats, range_m: Floats, place_m: float, rng: np.random.Generator
+    old: Floats,
+    peers: Floats,
+    range_m: Floats,
+    place_m: float,
+    rng: np.random.Generator,
+    lost: tuple[bool, bool] | None = None,
 ) -> Doubts:
     """Make a doubt of each of a slipped user's poses ``old`` (M, 3).
 
@@ -237,6 +242,13 @@ HEADING_CELL_RAD = 0.3
 ARC_M, RING_M = 0.7, 0.2
 """What a joint filter follows well enough: a new pose's deviation of heading, along the ring and
 across it. A ring of 3 m and the circle of headings are covered by some six hundred."""
+
+LOST_M, LOST_RAD = 2.0, 0.7
+"""A report that is as vague as this (a node that restarted after seconds) places nobody: joint
+filters would take a ring for a line. The node is sought on the ring of its next range."""
+
+VAGUE_M = 0.5
+"""A report that says of itself to be so far off is not off along its way, but in any direction."""
 
 HYPOTHESES = 800
 """A bank that was smaller grows to so many while a slip is open."""
