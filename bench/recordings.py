@@ -1,10 +1,12 @@
-"""The particle filter on the real recordings, against dead reckoning from the true start.
+"""An estimator on the real recordings, against dead reckoning from the true start.
 
-    python bench/recordings.py [--seeds 4] [--set KEY=VALUE ...] [--after 0]
+    python bench/recordings.py [--estimator bank] [--seeds 4] [--set KEY=VALUE ...]
+                               [--after 0] [--only known] [--biases]
 
 For every run of two_robots_vio and four_robots_uwb: distance, aligned and body-frame RMSE (m,
-mean over seeds) from known and from unknown starts, and when unknown starts were resolved.
-``--after`` leaves the first seconds out of the score.
+mean over seeds) from known and from unknown starts, distance NEES, and when unknown starts were
+resolved. ``--after`` leaves the first seconds out of the score. ``--biases`` prints, from known
+starts, each pair's learned range bias beside the median residual against the truth.
 """
 
 from __future__ import annotations
@@ -20,8 +22,8 @@ import numpy as np
 
 from relpos import fusion
 from relpos.evaluation import metrics, tracks
-from relpos.fusion import NodeStatus
-from relpos.runs import InitialPose, load_run
+from relpos.fusion import Estimate, NodeStatus
+from relpos.runs import InitialPose, Run, load_run
 
 DATA = Path(
     os.environ.get("RELPOS_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -35,6 +37,44 @@ RUNS = (
 )
 
 
+def fuse(
+    name: str, estimator: str, initial: InitialPose, settings: Mapping[str, str], seed: int
+) -> tuple[Run, list[Estimate]]:
+    """Fuse one recording."""
+    run = load_run(DATA / name)
+    made = fusion.make(estimator, run.priors_for(initial), settings, seed, run.nodes)
+    return run, [e for m in run.measurements for e in made.process(m)] + made.finish()
+
+
+def true_biases(run: Run) -> dict[tuple[int, int], float]:
+    """Give the median of each pair's ranges less the true distance, m."""
+    truth = tracks.true_tracks(run.truth)
+    residuals: dict[tuple[int, int], list[float]] = {}
+    for r in run.ranges:
+        if r.range_m > 0.0:
+            ends = [
+                np.array([np.interp(r.time_s, t.time_s, axis) for axis in (t.x_m, t.y_m)])
+                for t in (truth[r.node], truth[r.peer])
+            ]
+            pair = (min(r.node, r.peer), max(r.node, r.peer))
+            residuals.setdefault(pair, []).append(r.range_m - float(np.hypot(*(ends[1] - ends[0]))))
+    return {pair: float(np.median(of)) for pair, of in sorted(residuals.items())}
+
+
+def print_biases(seeds: int, settings: Mapping[str, str]) -> None:
+    """Print the learned biases of every run at its end, seed by seed."""
+    for name in RUNS:
+        found: dict[tuple[int, int], list[str]] = {}
+        for seed in range(seeds):
+            run, estimates = fuse(name, "bank", InitialPose.FROM_TRUTH, settings, seed)
+            for p in estimates[-1].parameters:
+                if p.name == "range_bias_m" and p.peer is not None:
+                    text = f"{p.value:.2f}+-{p.sigma:.2f}"
+                    found.setdefault((p.node, p.peer), []).append(text)
+        for pair, true_m in true_biases(run).items():
+            print(f"{name:34}{pair[0]}-{pair[1]}{true_m:7.2f}  {' '.join(found.get(pair, []))}")
+
+
 def score(
     name: str,
     estimator: str,
@@ -44,9 +84,7 @@ def score(
     after_s: float,
 ) -> tuple[float, float, float, float, float]:
     """Give distance, aligned, body-frame RMSE (m), distance NEES and the resolving time (s)."""
-    run = load_run(DATA / name)
-    made = fusion.make(estimator, run.priors_for(initial), settings, seed)
-    estimates = [e for m in run.measurements for e in made.process(m)] + made.finish()
+    run, estimates = fuse(name, estimator, initial, settings, seed)
     vague = [
         e.time_s
         for e in estimates
@@ -71,12 +109,17 @@ def main() -> None:
     parser.add_argument("--after", type=float, default=0.0)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", default="", help="known or unknown starts alone")
+    parser.add_argument("--estimator", default="bank")
+    parser.add_argument("--biases", action="store_true")
     given = parser.parse_args()
     settings = dict(item.split("=", 1) for item in given.set)
+    if given.biases:
+        print_biases(given.seeds, settings)
+        return
     cases = (
         ("dead reckoning", "deadreckoning", InitialPose.FROM_TRUTH, {}, 1),
-        ("known start", "particle", InitialPose.FROM_TRUTH, settings, given.seeds),
-        ("unknown start", "particle", InitialPose.UNKNOWN, settings, given.seeds),
+        ("known start", given.estimator, InitialPose.FROM_TRUTH, settings, given.seeds),
+        ("unknown start", given.estimator, InitialPose.UNKNOWN, settings, given.seeds),
     )
     print(f"{'':34}{'':15}{'dist':>6}{'align':>7}{'body':>7}{'NEES':>7}  resolved at s")
     with ProcessPoolExecutor(given.workers) as pool:

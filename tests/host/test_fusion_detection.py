@@ -9,6 +9,7 @@ from itertools import groupby, permutations
 import numpy as np
 import pytest
 
+from relpos import fusion
 from relpos.fusion import detection
 from relpos.fusion.detection import Detection, Round, Rounds
 from relpos.fusion.twins import detection as twin
@@ -181,3 +182,13 @@ def test_what_was_learned_after_a_snapshot_does_not_change_it() -> None:
         learn(learner, one)
     assert (kept.curve == before).all()
     assert not np.allclose(learner.curve, before)
+
+
+def test_the_bank_reports_how_far_the_team_hears() -> None:
+    run = simulate_paper("paper-h2", 2, {"seconds": 200.0})
+    bank = fusion.make("bank", run.priors, {}, 1)
+    estimates = [e for m in run.measurements for e in bank.process(m)] + bank.finish()
+    found = [p for p in estimates[-1].parameters if p.name == "detection_range_m"]
+    assert {p.node for p in found} == {1, 2, 3, 4, 5, 6}
+    assert found[0].value == pytest.approx(10.0, abs=1.5)
+    assert found[0].sigma < 1.5

@@ -1086,6 +1086,15 @@ class Bank:
                 Parameter(time_s, node, None, "heading_drift_rad_s", pose[Of.DRIFT], drift),
             ]
         parameters += self._bias_parameters(time_s, mean, covariance)
+        if self.detection.known:
+            # One curve for the team; every node has it.
+            parameters += [
+                Parameter(
+                    time_s, node, None, "detection_range_m",
+                    self.detection.range_m, self.detection.range_sigma_m,
+                )
+                for node in sorted(self._row)
+            ]  # fmt: skip
         pairs = self._pair_estimates(mean, covariance)
         alternatives: tuple[Alternative, ...] = ()
         if mixture is not None:
