@@ -335,8 +335,9 @@ class BankCore:
         middle = prior @ stats[:, :, 0]
         variance = prior @ (stats[:, :, 1] + (stats[:, :, 0] - middle) ** 2)
         slipped = self.watch.look(
-            first, second, (range_m - middle) ** 2 / variance, worth, self.outlier_share
-        )
+            first, second, (range_m - middle) ** 2 / variance, worth, self.outlier_share,
+            wary=self.counters["slips"] > 0 and self.since_slip <= OPEN_UPDATES,
+        )  # fmt: skip
         weight = self.weights()
         good: Floats = weight @ stats[:, :, 3]
         self.counters["levels_clamped"] += self.levels.learn(

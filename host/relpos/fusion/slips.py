@@ -45,6 +45,9 @@ ALARM = 8.0
 """At least three instants; by chance alone once in e^8 = 3000 ranges of a lone pair. The price is
 half the hypotheses for a few seconds."""
 
+WARY = 0.6
+"""Share of ``ALARM`` that is enough soon after a slip."""
+
 BASE_SHARE = 0.01
 BASE_LEAST, BASE_MOST = 0.3, 1.0
 """The usual nu^2/S is averaged over a hundred ranges and kept within these: 1 for a consistent
@@ -83,18 +86,27 @@ class Watch:
         self.sums = np.delete(self.sums, row)
 
     def look(
-        self, first: Indices, second: Indices, square: Floats, worth: Floats, outliers: float
+        self,
+        first: Indices,
+        second: Indices,
+        square: Floats,
+        worth: Floats,
+        outliers: float,
+        *,
+        wary: bool = False,
     ) -> int | None:
         """Take the ranges (R,) of one instant; return the row that slipped, if any.
 
         Of two alone either may be meant: what is between them is doubted in the same way.
 
         ``square`` is nu^2/S of the mixture before the update, ``worth`` how independent the range
-        is, ``outliers`` the share of outliers as far as is known.
+        is, ``outliers`` the share of outliers as far as is known. Be ``wary`` for a while after a
+        slip: what was found then may have been the wrong place.
         """
         ratio = square / min(max(float(self.base[0]), BASE_LEAST), BASE_MOST)
         delta = 0.5 * (ratio * (1.0 - 1.0 / GROWN) - math.log(GROWN))
-        delta = np.minimum(delta, CLIP) * worth - CLIP * outliers
+        # The filter whitens what repeats itself but for those who stand.
+        delta = np.minimum(delta, CLIP) * np.minimum(3.0 * worth, 1.0) - CLIP * outliers
         if self.sums.max(initial=0.0) < 0.25 * ALARM:
             for one in square.tolist():
                 self.base[0] += BASE_SHARE * (min(one, 4.0) - self.base[0])
@@ -102,7 +114,7 @@ class Watch:
             own = delta[(first == row) | (second == row)]
             self.sums[row] = max(self.sums[row] + float(np.median(own)), 0.0)
         high = float(self.sums.max(initial=0.0))
-        if high < ALARM:
+        if high < (WARY if wary else 1.0) * ALARM:
             return None
         slipped = int(self.sums.argmax())
         # Who ranged with it has been drawn along; all begin anew.
