@@ -164,7 +164,10 @@ class Rewinder:
     def _copy_if_due(self, spacing_s: float) -> None:
         if self._newest_s - self._rewound_s > QUIET_S:
             spacing_s *= 4.0
-        if self._copies and self.timeline.frontier_s >= self._copies[-1].frontier_s + spacing_s:
+        frontier_s = self.timeline.frontier_s
+        if frontier_s == -math.inf:  # nothing was handed out yet: there is nothing to go back to
+            return
+        if self._copies and frontier_s >= self._copies[-1].frontier_s + spacing_s:
             self._copy()
 
     def _copy(self) -> None:
