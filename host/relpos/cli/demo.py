@@ -66,5 +66,5 @@ def demo(
             faults=faults,
         )
     save_run(run, out / "run")
-    job = fuse.Job(str(out / "run"), fuse.EstimatorName.PARTICLE, {}, seed, out)
+    job = fuse.Job(str(out / "run"), fuse.EstimatorName.BANK, {}, seed, out)
     fuse.fuse_recording(job, run, run.priors, as_json=json, report=True)

@@ -64,9 +64,7 @@ def fuse(
     source: Annotated[
         str, typer.Argument(metavar="SOURCE", help="Run directory, serial port or pyserial URL.")
     ],
-    estimator: Annotated[
-        EstimatorName, typer.Option(help="Which estimator.")
-    ] = EstimatorName.PARTICLE,
+    estimator: Annotated[EstimatorName, typer.Option(help="Which estimator.")] = EstimatorName.BANK,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="A setting of the estimator; see below."),
@@ -143,9 +141,17 @@ class Job:
         """Make the wanted estimator; RelposError where a setting does not fit it."""
         from relpos import fusion
 
+        self.prepare()
         if self.smooth:
             return fusion.make_smoother(self.estimator, priors, self.settings, self.seed, nodes)
         return fusion.make(self.estimator, priors, self.settings, self.seed, nodes)
+
+    def prepare(self) -> None:
+        """Have the estimator's kernels compiled, telling it the first time, when it takes long."""
+        from relpos import fusion
+
+        with output.working("compiling the estimator, once after the installation"):
+            fusion.warm_up(self.estimator)
 
 
 @dataclass
@@ -346,6 +352,8 @@ def _fuse_port(
 
     if initial is Initial.TRUTH:
         raise DataError(f"{job.source}: a port brings no truth to start from")
+    # Before the port is open: nobody takes in what arrives meanwhile.
+    job.prepare()
     port = sources.Port(job.source, seconds, key_file, teach=teach)
     if not as_json:
         output.remark(f"listening to {job.source}; Ctrl-C ends")
