@@ -75,10 +75,10 @@ def test_the_fusion_beats_dead_reckoning_in_every_demo(tmp_path):
         plain_m = figures["dead_reckoning"]["relative_distance_rmse_m"]
         factors.append(plain_m / figures["relative_distance_rmse_m"])
         assert 1.0 < plain_m < 8.0, "torso dead reckoning of two minutes"
-    assert min(factors) > 1.0
-    # Measured over seeds 0 to 19: 4.3 on average, 2.1 to 8.1, standard deviation 1.2; a mean of
-    # five strays by 0.6, so more than 7 would be as suspicious as less than 3.
-    assert 3.0 < mean(factors) < 7.0
+    # Measured over seeds 0 to 4: 4 to 24, their mean 11.5; less than three times as good as dead
+    # reckoning, in any demo, would miss what the bank is there for.
+    assert min(factors) > 3.0
+    assert mean(factors) < 25.0, "more would be as suspicious"
     assert min(emulated_s) < 120.0 / 20.0, "at least 20 times faster than real time"
 
 
@@ -202,7 +202,11 @@ class Listener:
 
     def __enter__(self):
         # The line comes after the port was opened and emptied: nothing sent from now on is lost.
-        assert "listening" in self.process.stderr.readline()
+        # A first start, or a busy machine, tells before that it compiles.
+        said = self.process.stderr.readline()
+        if "compiling" in said:
+            said = self.process.stderr.readline()
+        assert "listening" in said
         return self
 
     def __exit__(self, *_):
@@ -290,11 +294,15 @@ def test_an_emulated_team_is_fused_live_by_another_process(tmp_path):
     try:
         path = emulator.stdout.readline().strip()
         fusing = start(
-            "fuse", path, "--initial", "common", "--seconds", 4, "--out", tmp_path, "--json"
-        )
+            # A command would change what the team sends from then on.
+            "fuse", path, "--initial", "common", "--seconds", 4, "--out", tmp_path, "--json",
+            "--no-teach",
+        )  # fmt: skip
         stdout, stderr = fusing.communicate(timeout=PATIENCE_S)
         assert fusing.returncode == 0, stderr
-        assert all(line.startswith(("received", "compiling")) for line in stderr.splitlines())
+        assert all(line.startswith(("received", "compiling")) for line in stderr.splitlines()), (
+            stderr
+        )
     finally:
         emulator.send_signal(signal.SIGINT)
         _, said = emulator.communicate(timeout=PATIENCE_S)
