@@ -94,7 +94,7 @@ def paper_case(scenario: str, seed: int, seconds: int) -> Case:
     return Case(
         scenario,
         motions,
-        _sigmas(motions, np.array(DISTANCE_NOISE), settings.turn_noise * pattern / pattern.mean()),
+        _sigmas(truth, np.array(DISTANCE_NOISE), settings.turn_noise * pattern / pattern.mean()),
         tuple(_instant(heard.get(t)) for t in range(seconds)),
         truth,
         settings.sigma_range_m,

@@ -19,8 +19,8 @@ def evaluate(
 ) -> None:
     """Print the metrics of an estimate: for the team, per pair and over time."""
     from relpos.cli import output
+    from relpos.evaluation import consistency, summary, tracks
     from relpos.evaluation import metrics as scoring
-    from relpos.evaluation import summary, tracks
     from relpos.runs import load_run, read_estimates
 
     recording = load_run(run)
@@ -34,7 +34,19 @@ def evaluate(
     )
     if not metrics.epochs:
         raise DataError(f"{estimate}: no two nodes have an estimate and a truth at the same time")
+    # Absolute poses can only be held against the truth where the run gave the starts.
+    known = {prior.node for prior in recording.priors}
+    poses = None
+    if known >= {motion.node for motion in recording.motions}:
+        squares = consistency.of_poses(estimates, tracks.true_tracks(recording.truth))
+        poses = [consistency.nees([one]) for one in squares]
     if json:
-        output.print_json({"run": recording.name, **summary.as_json(metrics)})
+        extra = {
+            f"nees_{name}": summary.nees_as_json(poses[k]) if poses else None
+            for k, name in enumerate(("position", "heading"))
+        }
+        output.print_json({"run": recording.name, **summary.as_json(metrics), **extra})
     else:
         output.print_metrics(recording.name, metrics)
+        if poses:
+            output.print_nees(*poses)

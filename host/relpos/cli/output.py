@@ -18,6 +18,7 @@ from relpos.errors import RelposError
 
 if TYPE_CHECKING:
     from relpos.evaluation.bounds import Totals
+    from relpos.evaluation.consistency import Nees
     from relpos.evaluation.metrics import Metrics
     from relpos.fusion.estimator import Estimate
 
@@ -163,9 +164,13 @@ def print_metrics(title: str, metrics: Metrics, baseline: Metrics | None = None)
     console.print(f"relative distance RMSE   {metres(metrics.relative_distance_rmse_m)}")
     console.print(f"aligned position RMSE    {metres(metrics.relative_position_rmse_m)}")
     console.print(f"body-frame RMSE          {metres(metrics.body_frame_rmse_m)}")
+    from relpos.evaluation import consistency
+
+    chance = consistency.of_distances([metrics])
     left_out = f"; {metrics.nees_left_out} rows with sigma 0 left out" * bool(metrics.nees_left_out)
     console.print(
-        f"NEES of the distance     {plain(metrics.nees_distance)} (1 is honest{left_out})"
+        f"NEES of the distance     {plain(metrics.nees_distance)} (1 is honest, "
+        f"{plain(chance.low)} to {plain(chance.high)} by chance{left_out})"
     )
     if baseline is not None:
         factor = baseline.relative_distance_rmse_m / metrics.relative_distance_rmse_m
@@ -174,6 +179,18 @@ def print_metrics(title: str, metrics: Metrics, baseline: Metrics | None = None)
             f"distance RMSE, {plain(factor)} times the fusion's"
         )
     _print_over_time(console, metrics)
+
+
+def print_nees(position: Nees, heading: Nees) -> None:
+    """Print how honest the absolute poses are, where estimate and truth share a frame."""
+    from rich.console import Console
+
+    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+    for what, nees in (("positions", position), ("headings", heading)):
+        console.print(
+            f"NEES of the {what:<12} {plain(nees.mean)} "
+            f"({plain(nees.low)} to {plain(nees.high)} by chance)"
+        )
 
 
 def print_bound(bound: Totals) -> None:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
+from relpos.evaluation import consistency
 from relpos.evaluation.metrics import Metrics
 
 FIGURES = (
@@ -23,6 +24,7 @@ def as_json(metrics: Metrics) -> dict[str, Any]:
     """
     return {
         **figures(metrics),
+        "nees_distance_interval": _interval(consistency.of_distances([metrics])),
         "epochs": metrics.epochs,
         "nees_left_out": metrics.nees_left_out,
         "pairs": [
@@ -51,6 +53,19 @@ def as_json(metrics: Metrics) -> dict[str, Any]:
 def figures(metrics: Metrics) -> dict[str, float | None]:
     """Return the four figures of the team alone."""
     return {name: _figure(getattr(metrics, name)) for name in FIGURES}
+
+
+def nees_as_json(nees: consistency.Nees) -> dict[str, Any]:
+    """Return a NEES with the interval of an honest one and what it is worth."""
+    return {
+        "mean": _figure(nees.mean),
+        "interval": _interval(nees),
+        "effective": _figure(nees.effective),
+    }
+
+
+def _interval(nees: consistency.Nees) -> list[float | None]:
+    return [_figure(nees.low), _figure(nees.high)]
 
 
 def no_metrics() -> dict[str, None]:
