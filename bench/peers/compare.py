@@ -61,7 +61,7 @@ JOINT, CLOUD = "joint filter", "particle filter, M 500, no dual step"
 SMOOTHER, WHOLE = "smoother", "relpos through its interface, noise not told"
 
 CONTENDERS = (
-    Contender(JOINT, "relpos joint (bank, one hypothesis)", "5 N: x, y, heading, drift, scale",
+    Contender(JOINT, "relpos joint (bank, one hypothesis)", "5 N + 1, of which 3 N live",
               _filter(ours.Joint), True),
     Contender(JOINT, "relpos strips (large teams)", "3 N: x, y, heading",
               _filter(ours.Strips), True),

@@ -11,33 +11,54 @@ from relpos import fusion
 
 
 class Joint:
-    """The bank's joint filter with a single hypothesis: 5 states a user, noise told."""
+    """One hypothesis of the bank, noise told: its kernels on its arrays."""
 
     def __init__(self, case: Case, seed: int) -> None:
-        from relpos.fusion.bank import BankCore
-        from relpos.fusion.bank_settings import BankSettings
+        from relpos.fusion import joint, noise
 
-        self.core = BankCore(BankSettings(hypotheses=1, constants=0.0, outliers=0.0), seed)
-        for pose in case.truth[0]:
-            self.core.add_node(*map(float, pose), 1e-3, 1e-3)
-        self.told = case.sigma_range_m
-        self.rows = np.arange(case.nodes)
-        self.ones = np.ones(case.nodes)
+        self.kernels, self.base = joint, noise.motion_variances
+        count = case.nodes
+        self.per = joint.PER_NODE
+        self.x = np.zeros((1, self.per * count + 1))
+        self.pose()[:] = case.truth[0]
+        self.p = np.zeros((1, self.x.size, self.x.size))
+        for entry in range(3):
+            at = self.per * np.arange(count) + entry
+            self.p[0, at, at] = 1e-6
+        self.level = np.ones((1, count, noise.LEVELS))
+        self.sens = np.zeros((1, count, noise.LEVELS, 6))
+        self.log_weight = np.zeros(1)
+        self.sigma2 = np.full(1, case.sigma_range_m**2)
+        self.outlier = np.array([1e-9, 9.0, 0.1, 1.0])
+        self.rows, self.ones = np.arange(count), np.ones(count)
+        self.drawn, self.arm = np.zeros((1, count)), np.zeros((0, 2))
+
+    def pose(self) -> Floats:
+        """Poses (N, 3), a view."""
+        at: Floats = self.x[0, :-1].reshape(-1, self.per)[:, :3]
+        return at
 
     def predict(self, motion: Floats, sigma: Floats) -> None:
         """Move everybody by told noise."""
-        self.core.level[:] = 1.0
-        self.core.advance(self.rows, motion[:, 0], motion[:, 1], motion[:, 2], self.ones, sigma)
+        moved = np.empty((len(motion), 7))
+        moved[:, :3], moved[:, 3] = motion, self.ones
+        moved[:, 4:] = self.base(*motion.T, self.ones, sigma)
+        self.kernels.advance(
+            self.x, self.p, self.level, self.sens, self.rows, moved, self.drawn, 0.0, 0.0
+        )
 
     def update(self, ranges: Instant) -> None:
         """Ranges one after another, to second order."""
-        self.core.sigma2[:] = self.told**2
-        self.core.update(ranges.node, ranges.peer, ranges.range_m, np.zeros(ranges.node.size))
+        count = ranges.node.size
+        self.kernels.update(
+            self.x, self.p, self.log_weight, self.sigma2, self.sens, ranges.node, ranges.peer,
+            np.full(count, -1), ranges.range_m, np.zeros(count), self.outlier, self.x.size - 1,
+            np.ones(count), np.zeros(count), self.arm, np.empty((1, count, 11)),
+        )  # fmt: skip
 
     def positions(self) -> Floats:
         """Means."""
-        pose: Floats = self.core.x[0, : 5 * len(self.rows)].reshape(-1, 5)[:, :2]
-        return pose
+        return self.pose()[:, :2]
 
 
 class Strips:
@@ -131,7 +152,7 @@ def begin_of(case: Case) -> Floats:
         filter_.predict(motion, sigma)
         if ranges is not None:
             filter_.update(ranges)
-        poses.append(filter_.core.x[0, : 5 * case.nodes].reshape(-1, 5)[:, :3].copy())
+        poses.append(filter_.pose().copy())
     return np.stack(poses)
 
 
