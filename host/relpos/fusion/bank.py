@@ -21,7 +21,7 @@ from relpos.errors import RelposError
 from relpos.fusion import joint, noise
 from relpos.fusion.ambiguity import believe, pictures
 from relpos.fusion.bank_settings import BankSettings
-from relpos.fusion.detection import Detection, log_silence
+from relpos.fusion.detection import STEP_M, Detection, Round
 from relpos.fusion.estimator import (
     LOST_EPOCHS,
     STALE_EPOCHS,
@@ -319,7 +319,7 @@ class BankCore:
         """
         bias = self._bias_places(first, second)
         worth = np.ones(len(first)) if worth is None else worth
-        stats = np.empty((self.count, len(first), 11))
+        stats = np.empty((self.count, len(first), 12))
         before = self.log_weight.copy()
         outlier = np.array([self.outlier_share, self.settings.outlier_m**2,
                             self.settings.outliers_short, 1.0 / (1.0 - self._sampled)])  # fmt: skip
@@ -489,6 +489,24 @@ class BankCore:
         joint.update_heading(
             self.x, self.p, self.log_weight, row, heading_rad, sigma_rad**2,
             HEADING_OUTLIERS, HEADING_OUTLIER_RAD**2,
+        )  # fmt: skip
+
+    def hearing(
+        self,
+        first: Indices,
+        second: Indices,
+        dz_m: Floats,
+        heard: npt.NDArray[np.bool_],
+        tried: Floats,
+        detection: Detection,
+    ) -> None:
+        """Work in which of the pairs (U,) that were tried, with probability ``tried``, were heard.
+
+        After their ranges: it is the distances after them that decide what this tells.
+        """
+        joint.hearing(
+            self.x, self.p, self.log_weight, first, second, dz_m, heard, tried,
+            detection.weight, detection.curve, STEP_M,
         )  # fmt: skip
 
     def predicted_ranges(
@@ -900,7 +918,7 @@ class Bank:
         if self.core.unplaced and ranges:
             first, second, _ = self._pairs([(r.node, r.peer) for r in ranges])
             self.core.sight(first, second, np.array([r.range_m for r in ranges]))
-        silence = self._silence(step)
+        rounds = self._hear(step)
         if ranges:
             pairs = [(r.node, r.peer) for r in ranges]
             variance = np.array(
@@ -914,8 +932,10 @@ class Bank:
             worth = self.repetition.worth(pairs)
             self.core.update(first, second, measured, dz, variance, worth)
             self._ranges_used += len(ranges)
-        if silence is not None:
-            self.core.log_weight += silence
+        for done, tried in rounds:
+            heard = np.arange(len(done.heard) + len(done.silent)) < len(done.heard)
+            surely = np.concatenate([np.ones(len(done.heard)), tried])
+            self.core.hearing(*self._pairs(done.heard + done.silent), heard, surely, self.detection)
         self.core.settle()
 
     def _heard_moving(self, time_s: float, ranges: list[Range]) -> list[Range]:
@@ -1014,9 +1034,9 @@ class Bank:
         dz = np.array([self._known[b].height_m - self._known[a].height_m for a, b in pairs])
         return first, second, dz
 
-    def _silence(self, step: Ranging) -> Floats | None:
-        """Learn who is heard how far; give the hypotheses' log P(the silent pairs are silent)."""
-        total: Floats | None = None
+    def _hear(self, step: Ranging) -> list[tuple[Round, Floats]]:
+        """Learn who is heard how far; give the rounds, and how surely the silent were tried."""
+        rounds: list[tuple[Round, Floats]] = []
         ranges = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
         for done in self.detection.rounds.take(step.time_s, ranges, self._feed.timeline.reported_s):
             pairs = done.heard + done.silent
@@ -1028,13 +1048,8 @@ class Bank:
             tried = self.detection.learn(
                 done, middle[:heard], spread[:heard], middle[heard:], spread[heard:]
             )
-            if total is None:
-                total = np.zeros(self.core.count)
-            log_silence(
-                np.ascontiguousarray(mean[:, heard:]), np.ascontiguousarray(sigma[:, heard:]),
-                tried, self.detection.weight, self.detection.curve, total,
-            )  # fmt: skip
-        return total
+            rounds.append((done, tried))
+        return rounds
 
     def _sense(self, step: Sensed) -> None:
         measured = step.measurement

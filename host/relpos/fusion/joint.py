@@ -54,6 +54,11 @@ PER_NODE = len(Of)
 _X, _Y, _H, _W, _S = (int(v) for v in Of)
 _N = PER_NODE
 _TINY = 1e-12
+_POINTS = 11
+_ASIDE = 2.5
+"""P(heard) is averaged over so many points, out to so many standard deviations."""
+_Z = _ASIDE * np.linspace(-1.0, 1.0, _POINTS)
+_RULE_VARIANCE = float((_Z**2 * np.exp(-0.5 * _Z**2)).sum() / np.exp(-0.5 * _Z**2).sum())
 _FAR = 9.0
 """Squared distance, in range variances, from which on noise of either sign is seen alike."""
 
@@ -298,9 +303,9 @@ def update(
     ``worth`` (R,) is how many independent ranges one is worth: the variance that the gain sees is
     divided by it, the evidence multiplied. ``dz_variance`` (R,) is the variance of ``dz``.
     ``arms`` (N, 2) are the antennas' places (forward, left) of the poses, or empty (0, 2) where
-    all are zero. ``stats`` (K, R, 11) receives m, S, the range's log evidence, r, and by how much
+    all are zero. ``stats`` (K, R, 12) receives m, S, the range's log evidence, r, and by how much
     S grows with the logarithms of the three levels of the first and of the second user and of the
-    range variance (``sens``).
+    range variance (``sens``), and what of S is due to curvature.
     """
     count, size = x.shape
     g = np.empty(size)
@@ -326,6 +331,7 @@ def update(
                 m, v, gx, gy = _predict_range(xk, pk, bi, bj, dz[r])
                 for q in range(size):
                     g[q] = gx * (pk[bj, q] - pk[bi, q]) + gy * (pk[bj + 1, q] - pk[bi + 1, q])
+            bent = v - gx * (g[bj] - g[bi]) - gy * (g[bj + 1] - g[bi + 1])
             v += dz[r] * dz[r] / (m * m) * dz_variance[r]
             innovation = measured[r] - m
             # No range is negative: between two who stand together noise alone looks like a bias.
@@ -368,6 +374,7 @@ def update(
             _bound_sensitivity(sens[k, first[r]], pk, bi, most)
             _bound_sensitivity(sens[k, second[r]], pk, bj, most)
             stats[k, r, 10] = sigma2[k]
+            stats[k, r, 11] = bent
         log_weight[k] += total
 
 
@@ -406,6 +413,91 @@ def update_heading(
             for q in range(size):
                 pk[o, q] -= shrink * g[o] * g[q]
         log_weight[k] += math.log(both)
+
+
+@inlined
+def _outcome(
+    at_m: float, heard: bool, tried: float, weight: float, curve: Floats, step_m: float
+) -> float:
+    """Probability that a pair at a distance is heard, or is silent, counted ``weight`` times."""
+    last = curve.shape[0] - 2
+    place = min(max(at_m / step_m, 0.0), last + 1.0)
+    index = min(int(place), last)
+    chance = curve[index] + (place - index) * (curve[index + 1] - curve[index])
+    if not heard:
+        chance = 1.0 - tried * chance
+    counted: float = math.exp(weight * math.log(chance))
+    return counted
+
+
+@compiled
+def hearing(
+    x: Floats,
+    p: Floats,
+    log_weight: Floats,
+    first: Indices,
+    second: Indices,
+    dz: Floats,
+    heard: npt.NDArray[np.bool_],
+    tried: Floats,
+    weight: float,
+    curve: Floats,
+    step_m: float,
+) -> None:
+    """Work in which pairs (U,) of those tried were ``heard`` (U,), after their ranges.
+
+    A range near the edge of hearing is more likely too long than one beyond the edge is heard:
+    without the heard ones' share the silent ones would drive everybody apart. ``curve`` is
+    P(heard | distance) at multiples of ``step_m``, ``tried`` (U,) the probability that a pair
+    was tried at all, ``weight`` what one outcome counts (``detection.py``). The distance's
+    Gaussian m, v times P(outcome | distance) has mass Z, mean m' and variance v'; Z weighs the
+    hypothesis, and where that tells anything within it (an edge lies within the spread) the
+    moments go to the state along g = Cov(x, distance):
+
+        x += g (m' - m)/v,   P -= g g^T (v - v')/v^2
+    """
+    count, size = x.shape
+    g = np.empty(size)
+    for k in range(count):
+        xk = x[k]
+        pk = p[k]
+        total = 0.0
+        for u in range(first.shape[0]):
+            bi, bj = _N * first[u], _N * second[u]
+            m, v, gx, gy = _predict_range(xk, pk, bi, bj, dz[u])
+            sd = math.sqrt(max(v, 0.0))
+            middle = _outcome(m, heard[u], tried[u], weight, curve, step_m)
+            near = _outcome(m - _ASIDE * sd, heard[u], tried[u], weight, curve, step_m)
+            far = _outcome(m + _ASIDE * sd, heard[u], tried[u], weight, curve, step_m)
+            if max(abs(near - middle), abs(far - middle)) < 0.03 * middle:
+                total += math.log(middle)
+                continue
+            mass = 0.0
+            shift = 0.0
+            square = 0.0
+            norm = 0.0
+            for q in range(_POINTS):
+                z = _ASIDE * (2.0 * q / (_POINTS - 1.0) - 1.0)
+                density = math.exp(-0.5 * z * z)
+                norm += density
+                density *= _outcome(m + z * sd, heard[u], tried[u], weight, curve, step_m)
+                mass += density
+                shift += density * z
+                square += density * z * z
+            total += math.log(mass / norm)
+            shift /= mass
+            # The rule's own variance is a little under 1: a flat curve must change nothing.
+            after = min((square / mass - shift * shift) / _RULE_VARIANCE, 1.0)
+            for q in range(size):
+                g[q] = gx * (pk[bj, q] - pk[bi, q]) + gy * (pk[bj + 1, q] - pk[bi + 1, q])
+            # g g^T / v never exceeds P: v also holds the curvature's part.
+            move, shrink = shift / sd, (1.0 - after) / v
+            for q in range(size):
+                xk[q] += move * g[q]
+            for o in range(size):
+                for q in range(size):
+                    pk[o, q] -= shrink * g[o] * g[q]
+        log_weight[k] += total
 
 
 @compiled
