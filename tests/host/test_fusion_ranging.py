@@ -40,8 +40,8 @@ def updated(
     joint.update(
         xs, ps, np.zeros(1), np.full(1, sigma**2), np.zeros((1, 2, 3, 6)),
         np.array([0]), np.array([1]), np.array([-1]),
-        np.array([measured]), np.array([dz]), np.array([1e-9, 9.0, 0.1]), 2 * PER_NODE,
-        np.ones(1), np.zeros(1), arms, np.empty((1, 1, 11)),
+        np.array([measured]), np.array([dz]), np.array([1e-9, 9.0, 0.1, 1.0]), 2 * PER_NODE,
+        np.ones(1), np.zeros(1), arms, np.empty((1, 1, 12)),
     )  # fmt: skip
     return xs[0], ps[0]
 

@@ -159,8 +159,11 @@ def advance(
                 # of the spread along and across the way is noise (statistical linearisation).
                 vary = max(pk[bh, bh] - dt * pk[bh, bw], 0.0)
                 shorter = math.exp(-vary)
-                grow = math.exp(xk[bs]) * math.sqrt(shorter)
-                east, north = grow * (c * dx - s * dy), grow * (s * dx + c * dy)
+                grow = math.exp(xk[bs])
+                full = grow * grow * (dx * dx + dy * dy)
+                grow *= math.exp(-0.5 * vary)
+                ahead, aside = c * dx - s * dy, s * dx + c * dy
+                east, north = grow * ahead, grow * aside
                 half = 0.5 * dt
                 xk[bx] += east
                 xk[by] += north
@@ -174,12 +177,12 @@ def advance(
                     pk[q, by] += north * pk[q, bs] + east * turned
                 for part in range(3):
                     _turn_sensitivity(sens[k, row, part], east, north)
-                square = east * east + north * north
                 along = motion[m, 4] * level[k, row, 0]
-                if square > _TINY:
-                    ee, nn, en = east * east / square, north * north / square, east * north / square
-                    lost = 0.5 * square * (1.0 - shorter) * (1.0 - shorter) / shorter
-                    swept = square * max(0.5 / shorter - 0.5 * shorter - vary, 0.0)
+                if full > _TINY:
+                    unit = 1.0 / (dx * dx + dy * dy)
+                    ee, nn, en = ahead * ahead * unit, aside * aside * unit, ahead * aside * unit
+                    lost = 0.5 * full * (1.0 - shorter) * (1.0 - shorter)
+                    swept = full * max(0.5 - 0.5 * shorter * shorter - vary * shorter, 0.0)
                     length = along + lost
                     width = along * cross + swept
                     pk[bx, bx] += length * ee + width * nn
@@ -209,12 +212,12 @@ def _predict_range(
     xy = pk[bi, bi + 1] + pk[bj, bj + 1] - pk[bi, bj + 1] - pk[bi + 1, bj]
     flat2 = ux * ux + uy * uy
     if flat2 > _TINY:
-        # Along and across the line of sight, both without a square root.
-        a = (ux * ux * xx + 2.0 * ux * uy * xy + uy * uy * yy) / flat2
-        c = xx + yy - a
+        # Along the line of sight, without a square root.
+        a = max((ux * ux * xx + 2.0 * ux * uy * xy + uy * uy * yy) / flat2, 0.0)
     else:
         a = 0.5 * (xx + yy)
-        c = a
+    # Across it; rounding may leave a trace of nothing on the wrong side.
+    c = max(xx + yy - a, 0.0)
     tilt = dz * dz / (flat2 + dz * dz + _TINY)
     m2 = flat2 + dz * dz + c + tilt * a
     m = math.sqrt(m2) + _TINY
@@ -260,7 +263,7 @@ def _range_by_arms(
         if flat2 > _TINY
         else 0.5 * (xx + yy)
     )
-    c = xx + yy - a
+    a, c = max(a, 0.0), max(xx + yy - a, 0.0)
     tilt = dz * dz / (flat2 + dz * dz + _TINY)
     m2 = flat2 + dz * dz + c + tilt * a
     m = math.sqrt(m2) + _TINY
