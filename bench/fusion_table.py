@@ -67,6 +67,7 @@ ROWS = (
     Row("P1, scale 10 %, .5 deg/s", "paper-p1", _hidden(0.5), distance_m=0.20),
     Row("H, scale 10 %, .1 deg/s", "paper-h", _hidden(0.1), distance_m=1.15),
     Row("H, scale 10 %, .5 deg/s", "paper-h", _hidden(0.5), distance_m=1.4),
+    Row("lab", "lab", {}, distance_m=1.0),
 )
 
 NEES = (0.8, 1.3)
@@ -104,14 +105,14 @@ def main() -> None:
     parser.add_argument("--estimator", default="bank")
     parser.add_argument("--only", default="", help="rows whose name has this text")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--seconds", type=float, default=None, help="length of every run")
     parser.add_argument("--workers", type=int, default=None)
     parser.add_argument("--cluster", default=None, metavar="ADDRESS")
     given = parser.parse_args()
     settings = dict(pair.split("=", 1) for pair in given.set)
     seeds = range(given.first, given.first + given.seeds)
     print(
-        f"{given.estimator}, {given.seconds:g} s, seeds {seeds[0]} to {seeds[-1]}; m, mean +- "
+        f"{given.estimator}, seeds {seeds[0]} to {seeds[-1]}; m, mean +- "
         "standard error; ratios to the filtering bound, of distance / aligned"
     )
     print(
@@ -122,7 +123,9 @@ def main() -> None:
         for row in ROWS:
             if given.only not in row.label:
                 continue
-            overrides = {"seconds": given.seconds, **row.overrides}
+            overrides = dict(row.overrides)
+            if given.seconds is not None:
+                overrides["seconds"] = given.seconds
             case = study.Case(row.label, row.scenario, overrides, given.estimator, settings)
             [outcome] = study.run([case], seeds, pool)
             [bound] = study.bounds_of([case], seeds, pool)

@@ -77,8 +77,8 @@ def test_detection_and_delays_are_those_stated() -> None:
         np.concatenate([getattr(a, name) for a in attempts])
         for name in ("walls", "bodies", "distance_m", "heard", "range_m")
     )
-    for many_walls, many_bodies, factor, delay in ((0, 0, 1.0, 0.0), (0, 1, 0.3, 0.25),
-                                                   (2, 1, 0.048, 0.55)):  # fmt: skip
+    for many_walls, many_bodies, factor, delay in ((0, 0, 1.0, 0.0), (0, 1, 0.5, 0.25),
+                                                   (2, 1, 0.125, 0.55)):  # fmt: skip
         these = (walls == many_walls) & (bodies == many_bodies)
         assert these.sum() > 300
         near = 0.9 - 0.4 * distance[these] / 30.0
@@ -86,7 +86,7 @@ def test_detection_and_delays_are_those_stated() -> None:
         excess = (measured - distance)[these]
         assert np.median(excess[excess < 1.9]) == pytest.approx(delay, abs=0.1)
         reflected = (excess > 1.9).mean()
-        assert reflected == pytest.approx(0.3 if many_walls + many_bodies else 0.0, abs=0.05)
+        assert reflected == pytest.approx(0.35 if many_walls + many_bodies else 0.0, abs=0.05)
     # Even close ones are often not heard, as in the paper.
     assert 0.2 < heard[distance < 5.0].mean() < 0.6
 
@@ -121,13 +121,13 @@ def test_presses_name_the_landmark_that_was_passed(tmp_path: Path) -> None:
 
 
 def test_dead_reckoning_errs_by_the_papers_3_m_and_ranges_help() -> None:
-    """40 seeds of dead reckoning, 8 of the filter: within three standard errors of the paper's."""
+    """40 seeds of dead reckoning, within three standard errors of the paper's; 8 of the filter."""
     reckoned = study.run(
         [Case("", "lab", estimator="deadreckoning")], range(40), executors.Serial()
     )[0].distance_m
     assert abs(reckoned.mean - 3.0) < 3.0 * reckoned.error
     assert reckoned.error < 0.2
     fused = study.run([Case("", "lab")], range(8), executors.Serial())[0].distance_m
-    assert abs(fused.mean - 2.2) < 3.0 * fused.error
+    assert fused.mean == pytest.approx(2.2, rel=0.25)
     least = study.bounds_of([Case("", "lab")], range(2), executors.Serial())[0]
-    assert 0.1 < least.filtering_distance_m < fused.mean
+    assert 0.1 < least.filtering_distance_m < 0.5 * fused.mean

@@ -25,10 +25,16 @@ probability shows.
 the ranges are those of a reflection, whose detour in a room of this size is 2 to 6 m.
 
 **Odometry.** Relative white noise of the step length, relative noise of the turns, white heading
-noise, a constant step scale and a constant heading drift a wearer. Wearers differ by the paper's
-patterns. ``noise_scale`` multiplies all of them. It is set so that the distance RMSE of dead
-reckoning is the paper's 3.0 m: 2.48, 2.70 and 2.93 m at 0.5, 0.55 and 0.6 (300 seeds, standard
-error 0.05).
+noise, a constant step scale and a constant heading drift a wearer; most of the error comes from
+the heading (sect. IV-B: "the heading is highly influenced by the irregular movements and the local
+magnetic field"). Wearers differ by the paper's patterns. ``noise_scale`` multiplies all of them.
+It is set so that the distance RMSE of dead reckoning is the paper's 3.0 m: 3.25 +- 0.07 m at 1 and
+3.02 +- 0.07 m at 0.92 (200 seeds, standard errors).
+
+What the paper does not print, the transmissions and the share of reflections, was chosen within
+what is plausible such that few attempts succeed even among close people and that ranges are bad
+enough for the paper's own result: its filter errs by 1.96 +- 0.05 m (24 seeds) where the paper
+has 2.2 m.
 
 **Landmarks.** 112 on the walls, evenly along the way; a wearer who passes presses a button, at
 most every ``press_every_s`` and up to a quarter of a second wrong. What is surveyed is the spot on
@@ -101,13 +107,13 @@ class LabSettings:
     nodes: int = setting(3, "people", 2, 20)
     seconds: float = setting(380.0, "length of the run", 1.0, 1e5)
     spacing_m: float = setting(8.0, "way between two at the start", 0.0, 1e3)
-    noise_scale: float = setting(0.615, "factor on all errors of the odometry", 0.0, 100.0)
-    distance_noise: float = setting(1.0, "factor on the step length's white noise", 0.0, 100.0)
-    turn_noise: float = setting(0.05, "mean relative error of a turn", 0.0, 10.0)
+    noise_scale: float = setting(0.92, "factor on all errors of the odometry", 0.0, 100.0)
+    distance_noise: float = setting(0.15, "factor on the step length's white noise", 0.0, 100.0)
+    turn_noise: float = setting(0.035, "mean relative error of a turn", 0.0, 10.0)
     heading_noise_deg: float = setting(
-        0.5, "mean white heading noise a second of walking", 0.0, 90.0
+        0.17, "mean white heading noise a second of walking", 0.0, 90.0
     )
-    scale_error: float = setting(0.03, "spread of the hidden step scale", 0.0, 1.0)
+    scale_error: float = setting(0.01, "spread of the hidden step scale", 0.0, 1.0)
     heading_drift_deg_s: float = setting(0.05, "spread of the hidden heading drift", 0.0, 90.0)
     sigma_range_m: float = setting(
         _TEAM.world.uwb.noise_sigma_m, "standard deviation of a range", 0.0, 100.0
@@ -119,14 +125,14 @@ class LabSettings:
     detection_far: float = setting(
         _TEAM.world.uwb.detection_far, "detection in line of sight at the reading range", 0.0, 1.0
     )
-    wall_transmission: float = setting(0.4, "factor on detection for every wall", 0.0, 1.0)
-    body_transmission: float = setting(0.3, "factor on detection for every body", 0.0, 1.0)
+    wall_transmission: float = setting(0.5, "factor on detection for every wall", 0.0, 1.0)
+    body_transmission: float = setting(0.5, "factor on detection for every body", 0.0, 1.0)
     wall_delay_min_m: float = setting(0.0, "least delay of a wall", 0.0, 100.0)
     wall_delay_max_m: float = setting(0.3, "greatest delay of a wall", 0.0, 100.0)
     body_delay_min_m: float = setting(0.0, "least delay of a body", 0.0, 100.0)
     body_delay_max_m: float = setting(0.5, "greatest delay of a body", 0.0, 100.0)
     reflection: float = setting(
-        0.3, "share of ranges with anything in the way that are a reflection's", 0.0, 1.0
+        0.35, "share of ranges with anything in the way that are a reflection's", 0.0, 1.0
     )
     reflection_min_m: float = setting(2.0, "least detour of a reflection", 0.0, 100.0)
     reflection_max_m: float = setting(6.0, "greatest detour of a reflection", 0.0, 100.0)
