@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from statistics import median
 
 import numpy as np
 import numpy.typing as npt
@@ -115,9 +116,12 @@ class Watch:
         if self.sums.max(initial=0.0) < 0.25 * ALARM:
             for one in square.tolist():
                 self.base[0] += BASE_SHARE * (min(one, 4.0) - self.base[0])
-        for row in np.union1d(first, second).tolist():
-            own = delta[(first == row) | (second == row)]
-            self.sums[row] = max(self.sums[row] + float(np.median(own)), 0.0)
+        own: dict[int, list[float]] = {}
+        for row, peer, one in zip(first.tolist(), second.tolist(), delta.tolist(), strict=True):
+            own.setdefault(row, []).append(one)
+            own.setdefault(peer, []).append(one)
+        for row, those in own.items():
+            self.sums[row] = max(self.sums[row] + median(those), 0.0)
         high = float(self.sums.max(initial=0.0))
         alarm = ALARM if len(self.sums) < 3 else TEAM_ALARM
         if high < (WARY if wary else 1.0) * alarm:
