@@ -804,7 +804,10 @@ class Bank:
                         self._set_off(step)
                 else:
                     self._seek(step.node)
-                    self.starts.advance(step)
+                    way_m = math.hypot(step.dx_m, step.dy_m)
+                    odd = self.habit.is_odd(step.node, way_m, step.duration_s)
+                    self._own["motions_doubted"] += odd
+                    self.starts.advance(step, odd=odd)
             case Ranging():
                 self._advance()
                 self._range(step)

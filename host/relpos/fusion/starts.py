@@ -19,7 +19,7 @@ import math
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -63,7 +63,7 @@ _KNOT_RAD = 0.09
 """A knot is set when the heading may have gone wrong by so much (5 degrees) since the last."""
 
 _FIT = 0.4
-SIGMA_RANGE_M = (0.12, 2.0)
+SIGMA_RANGE_M = (0.18, 2.0)
 
 _WIDEST_KNOT_RAD = 0.2
 """Two knots with more heading error than this between them do not become one."""
@@ -84,6 +84,9 @@ STOOD_M = 0.5
 """A node that has not been farther from its start has no heading to be known."""
 
 RELEASED_M = 0.3
+
+ODD_M = 0.3
+"""How far a node may have gone while its odometry said something out of its habit."""
 
 
 @dataclass(slots=True)
@@ -213,11 +216,18 @@ class Search:
             self._pictures = np.concatenate([self._pictures[:, :-1], block, bias], axis=1)
         self._news = True
 
-    def advance(self, step: Advance) -> None:
-        """Move a sought node's dead reckoning; others are ignored."""
+    def advance(self, step: Advance, *, odd: bool = False) -> None:
+        """Move a sought node's dead reckoning; others are ignored.
+
+        An ``odd`` displacement, out of the node's habit, is a fault of the odometry: only its
+        turn counts, and the way becomes as uncertain as ``ODD_M``.
+        """
         track = self._tracks.get(step.node)
         if track is None:
             return
+        if odd:
+            track.path_m += ODD_M**2 / self.settings.path_variance_m
+            step = replace(step, dx_m=0.0, dy_m=0.0)
         length = math.hypot(step.dx_m, step.dy_m)
         c, s = math.cos(track.pose[2]), math.sin(track.pose[2])
         track.pose[0] += c * step.dx_m - s * step.dy_m
@@ -1029,8 +1039,8 @@ class Starts:
         if node in self.search.nodes:
             self.search.release([node])
 
-    def advance(self, step: Advance) -> None:
-        """Move a node, if it is one of these."""
+    def advance(self, step: Advance, *, odd: bool = False) -> None:
+        """Move a node, if it is one of these; an ``odd`` displacement counts as its turn alone."""
         wanderer = self._wanderers.get(step.node)
         free = len(self.search.nodes) < MOST_SOUGHT
         if wanderer is not None and free and math.isfinite(wanderer.sigma[0]):
@@ -1042,7 +1052,7 @@ class Starts:
         if wanderer is not None:
             wanderer.move(step)
         else:
-            self.search.advance(step)
+            self.search.advance(step, odd=odd)
 
     def ranging(
         self,
@@ -1132,7 +1142,7 @@ class Starts:
             tuple(search.nodes[i] for i in active),
             whole.weights,
             whole.poses[:, active],
-            whole.covariances[:, columns][:, :, columns],
+            WIDTH * whole.covariances[:, columns][:, :, columns],
             whole.scales[active],
             leader(whole.weights, whole.poses[:, active], spread),
         )
@@ -1146,6 +1156,11 @@ class Starts:
         other.search = self.search.snapshot(other.counters)
         return other
 
+
+WIDTH = 0.8
+"""Variances of what is told, relative to the search's own, whose range errors are taken too wide so
+that no mode is believed too soon. Measured: in P1 (12 seeds) the 90 % region held the truth in
+98.4, 96.6 and 94.2 % of the epochs with 1, 0.6 and 0.4; with two robots in 86, 79 and 74 %."""
 
 MOST_SOUGHT = 8
 """So many are sought together; the others wait: the search grows with the cube of their number."""
