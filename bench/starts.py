@@ -25,9 +25,8 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos import fusion
-from relpos.evaluation import metrics, tracks
-from relpos.fusion.ambiguity import Region
-from relpos.fusion.estimator import Estimate, NodeStatus, Shape
+from relpos.evaluation import metrics, regions, tracks
+from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.measurements import Measurement, Prior, Range, Truth
 from relpos.runs import load_run
 from relpos.simulation.paper import simulate_paper
@@ -82,38 +81,18 @@ def tell(
         for e in new:
             located = [n.node for n in e.nodes if n.status is NodeStatus.OK]
             if frame is None and located:
-                frame = _frame(true, located[0], bool(priors))
-            inside, area, ring = [], [], []
-            for n in e.nodes:
-                own = [a for a in e.alternatives if a.node == n.node]
-                if n.status is not NodeStatus.AMBIGUOUS or not own:
-                    continue
-                region = Region.of(own, draws=1500)
-                place = complex(*(np.interp(e.time_s, true[n.node].time_s, v) for v in (
-                    true[n.node].x_m, true[n.node].y_m)))  # fmt: skip
-                origin, heading = frame or (0j, 0.0)
-                seen = (place - origin) * np.exp(-1j * heading)
-                inside.append(region.contains(seen.real, seen.imag))
-                area.append(region.area_m2)
-                ring.append(own[0].shape is Shape.RING)
-            mean = [float(np.mean(v)) if v else math.nan for v in (inside, area, ring)]
-            blind = 0.9 * math.pi * longest_m**2
+                frame = regions.Frame() if priors else regions.frame_of([e], true)
+            looks = regions.look(e, true, frame or regions.Frame())
+            mean = [math.nan] * 3
+            if looks:
+                mean = np.mean([(q.holds, q.area_m2, q.ring) for q in looks], axis=0).tolist()
+            blind = regions.SHARE * math.pi * longest_m**2
             rows.append((e.time_s, len(located) / len(e.nodes), *mean, blind, spent / len(new)))
         if new:
             started = time.perf_counter()
         estimates += new
     time_s, located_share, inside_, area_, ring_, blind_, cost = np.array(rows).T
     return Told(time_s, located_share, inside_, area_, blind_, ring_, cost, estimates, truth)
-
-
-def _frame(true: dict[int, metrics.Track], node: int, told: bool) -> tuple[complex, float]:
-    """Origin and heading of the estimate's frame in the truth's."""
-    if told:
-        return 0j, 0.0
-    track = true[node]
-    place = (np.interp(0.0, track.time_s, v) for v in (track.x_m, track.y_m))
-    heading = np.interp(0.0, track.time_s, np.unwrap(track.heading_rad))
-    return complex(*place), float(heading)
 
 
 def paper(seeds: range) -> None:

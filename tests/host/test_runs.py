@@ -21,6 +21,7 @@ from relpos.fusion.estimator import (
     NodeStatus,
     PairEstimate,
     Parameter,
+    Shape,
 )
 from relpos.measurements import Heading, Height, Motion, Prior, Range, Step
 from relpos.runs import (
@@ -376,6 +377,19 @@ def test_estimates_read_back_as_they_were_written(tmp_path: Path) -> None:
             "covariance_xy_m2", "sigma_heading_rad", "sigma_z_m",
         ):  # fmt: skip
             assert getattr(now, name) == pytest.approx(getattr(was, name), abs=1e-5), name
+
+
+def test_alternatives_read_back_as_they_were_written(tmp_path: Path) -> None:
+    ellipse = Alternative(1.5, 0, 0.75, 1, 1.0, 2.0, 0.5, 0.3, 0.2, 0.1)
+    ring = Alternative(1.5, 1, 0.25, 2, 0.0, 0.0, 0.0, 4.0, 0.3, 0.0, Shape.RING)
+    write_estimates(tmp_path, [replace(an_estimate(), alternatives=(ellipse, ring))])
+    (back,) = read_estimates(tmp_path)
+    assert back.alternatives == (ellipse, ring)
+    (tmp_path / "alternatives.csv").write_text(
+        (tmp_path / "alternatives.csv").read_text().replace("ring", "circle")
+    )
+    with pytest.raises(DataError, match=r"alternatives\.csv.*shape.*none of ellipse, ring"):
+        read_estimates(tmp_path)
 
 
 def test_the_output_files_have_the_columns_of_the_run_format(tmp_path: Path) -> None:

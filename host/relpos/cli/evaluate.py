@@ -19,7 +19,7 @@ def evaluate(
 ) -> None:
     """Print the metrics of an estimate: for the team, per pair and over time."""
     from relpos.cli import output
-    from relpos.evaluation import consistency, summary, tracks
+    from relpos.evaluation import consistency, regions, summary, tracks
     from relpos.evaluation import metrics as scoring
     from relpos.runs import load_run, read_estimates
 
@@ -40,13 +40,22 @@ def evaluate(
     if known >= {motion.node for motion in recording.motions}:
         squares = consistency.of_poses(estimates, tracks.true_tracks(recording.truth))
         poses = [consistency.nees([one]) for one in squares]
+    ambiguity = regions.summarise(
+        estimates,
+        tracks.true_tracks(recording.truth),
+        recording.ranges,
+        starts_known=bool(recording.priors),
+    )
     if json:
-        extra = {
+        extra: dict[str, object] = {
             f"nees_{name}": summary.nees_as_json(poses[k]) if poses else None
             for k, name in enumerate(("position", "heading"))
         }
+        extra["alternatives"] = summary.ambiguity_as_json(ambiguity)
         output.print_json({"run": recording.name, **summary.as_json(metrics), **extra})
     else:
         output.print_metrics(recording.name, metrics)
         if poses:
             output.print_nees(*poses)
+        if ambiguity is not None:
+            output.print_ambiguity(ambiguity)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from relpos.evaluation.bounds import Totals
     from relpos.evaluation.consistency import Nees
     from relpos.evaluation.metrics import Metrics
+    from relpos.evaluation.regions import Ambiguity
     from relpos.fusion.estimator import Estimate
 
 T = TypeVar("T")
@@ -205,6 +206,16 @@ def print_bound(bound: Totals) -> None:
         console.print(
             f"bound {what:<18} {metres(distance)} relative distance, {metres(position)} aligned"
         )
+
+
+def print_ambiguity(ambiguity: Ambiguity) -> None:
+    """Print whether the regions of ambiguous nodes held the truth, and what they were worth."""
+    held = ambiguity.coverage
+    typer.echo(
+        f"while ambiguous          the 90 % region held the truth in {100.0 * held.share:.0f} % "
+        f"of {ambiguity.looks} looks ({100.0 * held.low:.0f} to {100.0 * held.high:.0f} %); "
+        f"{ambiguity.area_m2:.0f} m2 on average, a blind guess {ambiguity.blind_m2:.0f} m2"
+    )
 
 
 def print_last_pairs(title: str, estimates: Sequence[Estimate]) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from relpos.evaluation import consistency
 from relpos.evaluation.metrics import Metrics
+from relpos.evaluation.regions import Ambiguity
 
 FIGURES = (
     "relative_distance_rmse_m",
@@ -61,6 +62,21 @@ def nees_as_json(nees: consistency.Nees) -> dict[str, Any]:
         "mean": _figure(nees.mean),
         "interval": _interval(nees),
         "effective": _figure(nees.effective),
+    }
+
+
+def ambiguity_as_json(ambiguity: Ambiguity | None) -> dict[str, Any] | None:
+    """Return how honest and how large the regions of ambiguous nodes were; None without any."""
+    if ambiguity is None:
+        return None
+    held = ambiguity.coverage
+    return {
+        "looks": ambiguity.looks,
+        "region_90_holds_truth": _figure(held.share),
+        "interval": [_figure(held.low), _figure(held.high)],
+        "area_m2": _figure(ambiguity.area_m2),
+        "blind_area_m2": _figure(ambiguity.blind_m2),
+        "rings": _figure(ambiguity.rings),
     }
 
 

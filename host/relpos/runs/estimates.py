@@ -8,7 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from relpos.errors import DataError
-from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, PairEstimate, Parameter
+from relpos.fusion.estimator import (
+    Alternative,
+    Estimate,
+    NodeEstimate,
+    NodeStatus,
+    PairEstimate,
+    Parameter,
+    Shape,
+)
 from relpos.measurements import Step
 from relpos.runs.run import write_rows
 from relpos.runs.table import Column, find_table, node_id, not_negative, number, read_rows
@@ -108,7 +116,7 @@ def write_estimates(
 
 
 def read_estimates(directory: Path | str) -> list[Estimate]:
-    """Read ``estimate.csv`` and ``pairs.csv`` back, ordered by time.
+    """Read ``estimate.csv``, ``pairs.csv`` and ``alternatives.csv`` back, ordered by time.
 
     Somebody else's estimate may hold times, nodes and positions alone: what is missing becomes
     NaN, a missing status ``ok``. DataError where there is no ``estimate.csv``.
@@ -133,8 +141,18 @@ def read_estimates(directory: Path | str) -> list[Estimate]:
             pairs.setdefault(time_s, []).append(
                 PairEstimate(node, peer, *(_nan_if_none(figure) for figure in figures))
             )
+    alternatives: dict[float, list[Alternative]] = {}
+    alternatives_path = find_table(directory, "alternatives.csv")
+    if alternatives_path is not None:
+        for row in read_rows(alternatives_path, _ALTERNATIVE_TABLE):
+            alternatives.setdefault(row[0], []).append(Alternative(*row))
     return [
-        Estimate(time_s, tuple(nodes.get(time_s, ())), tuple(pairs.get(time_s, ())))
+        Estimate(
+            time_s,
+            tuple(nodes.get(time_s, ())),
+            tuple(pairs.get(time_s, ())),
+            tuple(alternatives.get(time_s, ())),
+        )
         for time_s in sorted(nodes.keys() | pairs.keys())
     ]
 
@@ -205,6 +223,35 @@ _PAIR_TABLE = (
     Column("sigma_distance_m", not_negative, optional=True),
     Column("bearing_rad", number, optional=True),
     Column("sigma_bearing_rad", not_negative, optional=True),
+)
+
+
+def _whole(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise ValueError("is negative")
+    return value
+
+
+def _shape(text: str) -> Shape:
+    try:
+        return Shape(text)
+    except ValueError:
+        raise ValueError(f"is none of {', '.join(Shape)}") from None
+
+
+_ALTERNATIVE_TABLE = (
+    Column("time_s", number),
+    Column("alternative", _whole),
+    Column("probability", not_negative),
+    Column("node", node_id),
+    Column("x_m", number),
+    Column("y_m", number),
+    Column("heading_rad", number),
+    Column("sigma_major_m", not_negative),
+    Column("sigma_minor_m", not_negative),
+    Column("sigma_angle_rad", number),
+    Column("shape", _shape),
 )
 
 

@@ -1,0 +1,87 @@
+"""Regions of ambiguous nodes, held against the truth."""
+
+import math
+
+import numpy as np
+import pytest
+
+from relpos.evaluation import regions
+from relpos.evaluation.metrics import Track
+from relpos.fusion.estimator import Alternative, Estimate, NodeEstimate, NodeStatus, Shape
+from relpos.measurements import Range
+
+SECONDS = np.arange(400.0)
+
+
+def still(x_m, y_m, heading_rad=0.0):
+    ones = np.ones(SECONDS.size)
+    return Track(SECONDS, x_m * ones, y_m * ones, heading_rad * ones)
+
+
+def located(node):
+    return NodeEstimate(node, 0.0, 0.0, 0.0, 0.01, 0.01, 0.0, 0.1, NodeStatus.OK)
+
+
+def ambiguous(node):
+    return NodeEstimate(node, 0.0, 0.0, 0.0, 9.0, 9.0, 0.0, 1.0, NodeStatus.AMBIGUOUS)
+
+
+def estimates(alternatives_at):
+    return [
+        Estimate(t, (located(1), ambiguous(2)), (), tuple(alternatives_at(t))) for t in SECONDS[1:]
+    ]
+
+
+def ellipse(time_s, rank, probability, x_m, y_m, sigma_m):
+    return Alternative(time_s, rank, probability, 2, x_m, y_m, 0.0, sigma_m, sigma_m, 0.0)
+
+
+RANGES = [Range(1.0, 1, 2, 10.0)]
+
+
+def test_a_region_of_drawn_places_holds_the_truth_in_nine_of_ten():
+    rng = np.random.default_rng(4)
+    truth = {1: still(0.0, 0.0), 2: still(6.0, 3.0)}
+
+    def drawn(t):
+        side = 1.0 if rng.random() < 0.7 else -1.0
+        # The picture is the other way about with the probability that it says.
+        off = rng.standard_normal(2)
+        yield ellipse(t, 0, 0.7, 6.0 + off[0], side * (3.0 + off[1]), 1.0)
+        yield ellipse(t, 1, 0.3, 6.0 + off[0], -side * (3.0 + off[1]), 1.0)
+
+    told = regions.summarise(estimates(drawn), truth, RANGES, starts_known=True)
+    assert told is not None
+    assert told.looks == 399
+    assert told.coverage.low < 0.9 < told.coverage.high
+    assert told.blind_m2 == pytest.approx(0.9 * math.pi * 100.0)
+    # Two Gaussians that do not touch: each up to the density where 0.9 of both is inside.
+    assert told.area_m2 < 2.0 * 2.0 * math.pi * math.log(10.0) * 1.05
+
+
+def test_without_priors_the_frame_is_the_first_located_nodes_pose():
+    truth = {1: still(5.0, 5.0, math.pi / 2), 2: still(5.0, 8.0)}
+    ahead = estimates(lambda t: [ellipse(t, 0, 1.0, 3.0, 0.0, 0.2)])
+    behind = estimates(lambda t: [ellipse(t, 0, 1.0, -3.0, 0.0, 0.2)])
+    for told, share in ((ahead, 1.0), (behind, 0.0)):
+        summary = regions.summarise(told, truth, RANGES, starts_known=False)
+        assert summary is not None
+        assert summary.coverage.share == share
+
+
+def test_a_rings_region_is_its_circumference_times_its_width():
+    truth = {1: still(0.0, 0.0), 2: still(0.0, -5.0)}
+    ring = estimates(
+        lambda t: [Alternative(t, 0, 1.0, 2, 0.0, 0.0, 0.0, 5.0, 0.1, 0.0, Shape.RING)]
+    )
+    told = regions.summarise(ring[:3], truth, RANGES, starts_known=True)
+    assert told is not None
+    assert told.rings == 1.0
+    assert told.coverage.share == 1.0
+    assert told.area_m2 == pytest.approx(2.0 * math.pi * 5.0 * 2.0 * 1.645 * 0.1, rel=0.05)
+
+
+def test_nothing_ambiguous_is_nothing_to_tell():
+    told = [Estimate(t, (located(1), located(2)), ()) for t in SECONDS]
+    truth = {1: still(0.0, 0.0), 2: still(0.0, -5.0)}
+    assert regions.summarise(told, truth, RANGES, starts_known=True) is None
