@@ -26,7 +26,7 @@ def _run(scenario: str, seed: int, overrides: dict[str, float] | None = None) ->
     )
 
 
-@pytest.mark.parametrize(("scenario", "limit_m"), [("paper", 0.85), ("paper-p1", 0.25)])
+@pytest.mark.parametrize(("scenario", "limit_m"), [("paper", 0.8), ("paper-p1", 0.21)])
 def test_the_bank_is_near_the_bound_without_being_told_the_noise(
     scenario: str, limit_m: float
 ) -> None:

@@ -1,0 +1,235 @@
+"""The bank's kernels against their NumPy twins, finite differences and sampled truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from relpos.fusion import joint, noise
+from relpos.fusion.joint import PER_NODE, Of
+from relpos.fusion.twins import joint as twins
+
+Floats = np.ndarray
+NODES = 3
+SIZE = PER_NODE * NODES + 1
+CROSS, SHARE = 0.04, 0.5
+OUTLIER = (0.05, 9.0, 0.1)
+
+
+def states(count: int, seed: int) -> tuple[Floats, Floats]:
+    """Random means (K, D) a few metres apart, and full-rank covariances (K, D, D)."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(count, SIZE)) * 0.1
+    for node in range(NODES):
+        x[:, PER_NODE * node : PER_NODE * node + 2] += rng.normal(size=(count, 2)) * 5.0
+    root = rng.normal(size=(count, SIZE, SIZE)) * 0.1
+    p = root @ root.transpose(0, 2, 1)
+    p[:, -1, :] = p[:, :, -1] = 0.0
+    return x, p
+
+
+def sensitivities(count: int) -> Floats:
+    return np.zeros((count, NODES, noise.LEVELS, 6))
+
+
+def advanced(x: Floats, p: Floats, motion: Floats, level: Floats, drawn: Floats) -> None:
+    rows = np.arange(len(motion), dtype=np.int64) % NODES
+    joint.advance(x, p, level, sensitivities(len(x)), rows, motion, drawn, SHARE, CROSS)
+
+
+def updated(x: Floats, p: Floats, measured: float, dz: float, outlier: tuple[float, ...]) -> Floats:
+    log_weight = np.zeros(len(x))
+    joint.update(
+        x, p, log_weight, np.full(len(x), 0.04), sensitivities(len(x)), np.array([0]),
+        np.array([2]), np.array([-1]), np.array([measured]), np.array([dz]),
+        np.array([*outlier, 1.0]), PER_NODE * NODES, np.ones(1), np.zeros(1), np.zeros((0, 2)),
+        np.empty((len(x), 1, 12)),
+    )  # fmt: skip
+    return log_weight
+
+
+def test_a_displacement_is_the_twins() -> None:
+    rng = np.random.default_rng(1)
+    x, p = states(4, 2)
+    motion = np.abs(rng.normal(size=(5, 7))) * 0.3
+    level, drawn = rng.uniform(0.5, 2.0, (4, NODES, 3)), rng.normal(size=(4, 5))
+    expected = [(x[k], p[k]) for k in range(4)]
+    for m in range(5):
+        expected = [
+            twins.advance(
+                a, b, m % NODES, motion[m], level[k, m % NODES], drawn[k, m], SHARE, CROSS
+            )
+            for k, (a, b) in enumerate(expected)
+        ]
+    advanced(x, p, motion, level, drawn)
+    assert x == pytest.approx(np.array([a for a, _ in expected]), abs=1e-12)
+    assert p == pytest.approx(np.array([b for _, b in expected]), abs=1e-12)
+
+
+@pytest.mark.parametrize(("measured", "dz"), [(4.0, 0.0), (6.5, 1.2), (30.0, 0.0)])
+def test_a_range_is_the_twins(measured: float, dz: float) -> None:
+    x, p = states(6, 3)
+    expected = [
+        twins.update(a, b, 0, 2, measured, dz, 0.04, OUTLIER) for a, b in zip(x, p, strict=True)
+    ]
+    evidence = updated(x, p, measured, dz, OUTLIER)
+    assert x == pytest.approx(np.array([e[0] for e in expected]), abs=1e-10)
+    assert p == pytest.approx(np.array([e[1] for e in expected]), abs=1e-10)
+    assert evidence == pytest.approx(np.array([e[2] for e in expected]), abs=1e-9)
+
+
+def test_the_mixtures_moments_are_the_twins() -> None:
+    x, p = states(7, 4)
+    weight = np.random.default_rng(5).dirichlet(np.ones(7))
+    angles = PER_NODE * np.arange(NODES, dtype=np.int64) + Of.HEADING
+    mean, covariance = joint.moments(x, p, weight, angles)
+    expected = twins.moments(x, p, weight)
+    assert mean == pytest.approx(expected[0], abs=1e-12)
+    assert covariance == pytest.approx(expected[1], abs=1e-12)
+
+
+def test_headings_are_averaged_round_the_circle() -> None:
+    x, p = np.zeros((2, SIZE)), np.zeros((2, SIZE, SIZE))
+    x[:, Of.HEADING] = (np.pi - 0.1, -np.pi + 0.1)
+    mean, covariance = joint.moments(x, p, np.array([0.5, 0.5]), np.array([2], dtype=np.int64))
+    assert np.cos(mean[Of.HEADING]) == pytest.approx(-1.0)
+    assert covariance[Of.HEADING, Of.HEADING] == pytest.approx(0.01)
+
+
+def test_the_motions_jacobian_is_that_of_finite_differences() -> None:
+    x, _ = states(1, 6)
+    p = np.zeros((1, SIZE, SIZE))
+    motion = np.array([[0.6, 0.1, 0.3, 2.0, 0.0, 0.0, 0.0]])
+    level, drawn = np.ones((1, NODES, 3)), np.zeros((1, 1))
+    step = 1e-6
+    jacobian = np.empty((PER_NODE, PER_NODE))
+    for column in range(PER_NODE):
+        ends = []
+        for sign in (-1.0, 1.0):
+            moved = x.copy()
+            moved[0, column] += sign * step
+            advanced(moved, p.copy(), motion, level, drawn)
+            ends.append(moved[0, :PER_NODE])
+        jacobian[:, column] = (ends[1] - ends[0]) / (2.0 * step)
+    p[0, :PER_NODE, :PER_NODE] = 1e-8 * np.eye(PER_NODE)
+    advanced(x, p, motion, level, drawn)
+    p[0, Of.DRIFT, Of.DRIFT] -= joint.DRIFT_WALK * motion[0, 3]
+    p[0, Of.SCALE, Of.SCALE] -= joint.SCALE_WALK * motion[0, 3]
+    assert 1e8 * p[0, :PER_NODE, :PER_NODE] == pytest.approx(jacobian @ jacobian.T, abs=1e-5)
+
+
+def test_what_an_uncertain_heading_walks_has_the_moments_of_sampled_walks() -> None:
+    sigma = 0.5
+    x, p = np.zeros((1, SIZE)), np.zeros((1, SIZE, SIZE))
+    p[0, Of.HEADING, Of.HEADING] = sigma**2
+    advanced(x, p, np.array([[3.0, 0, 0, 0, 0, 0, 0]]), np.ones((1, NODES, 3)), np.zeros((1, 1)))
+    heading = sigma * np.random.default_rng(7).standard_normal(400_000)
+    walked = 3.0 * np.stack([np.cos(heading), np.sin(heading)])
+    assert x[0, :2] == pytest.approx(walked.mean(axis=1), abs=0.01)
+    assert p[0, :2, :2] == pytest.approx(np.cov(walked), abs=0.02)
+
+
+@pytest.mark.parametrize("distance", [1.5, 4.0, 12.0])
+def test_a_ranges_predicted_moments_are_those_of_sampled_places(distance: float) -> None:
+    x, p = np.zeros((1, SIZE)), np.zeros((1, SIZE, SIZE))
+    x[0, 2 * PER_NODE] = distance
+    spread = np.array([[0.09, 0.03], [0.03, 0.25]])
+    p[0, :2, :2] = spread
+    places = np.random.default_rng(8).multivariate_normal([0.0, 0.0], spread, 400_000)
+    sampled = np.hypot(distance - places[:, 0], places[:, 1])
+    mean, sigma = joint.predicted_ranges(x, p, np.array([0]), np.array([2]), np.zeros(1))
+    assert mean[0, 0] == pytest.approx(sampled.mean(), abs=0.02)
+    assert sigma[0, 0] == pytest.approx(sampled.std(), abs=0.02)
+
+
+def test_two_who_meet_break_nothing() -> None:
+    x, p = np.zeros((1, SIZE)), np.zeros((1, SIZE, SIZE))
+    p[0, 0, 0] = p[0, 1, 1] = 0.5
+    updated(x, p, 0.3, 0.0, OUTLIER)
+    assert np.isfinite(x).all()
+    assert np.isfinite(p).all()
+    assert np.linalg.eigvalsh(p[0]).min() > -1e-12
+
+
+def test_covariances_stay_symmetric_and_positive_over_a_long_run() -> None:
+    rng = np.random.default_rng(9)
+    x, p = states(3, 10)
+    level = np.ones((3, NODES, 3))
+    for _ in range(300):
+        motion = np.abs(rng.normal(size=(NODES, 7))) * 0.1
+        advanced(x, p, motion, level, rng.normal(size=(3, NODES)))
+        mean, _ = joint.predicted_ranges(x, p, np.array([0]), np.array([2]), np.zeros(1))
+        updated(x, p, float(mean.mean() + rng.normal()), 0.0, OUTLIER)
+    assert p == pytest.approx(p.transpose(0, 2, 1), abs=1e-9)
+    assert np.linalg.eigvalsh(p).min() > -1e-9
+
+
+def hearing(x: Floats, p: Floats, heard: bool, edge_m: float) -> Floats:
+    curve = np.where(np.arange(201) * 0.5 < edge_m, 0.98, 0.002)
+    log_weight = np.zeros(len(x))
+    joint.hearing(
+        x, p, log_weight, np.array([0]), np.array([2]), np.zeros(1), np.array([heard]),
+        np.ones(1), 1.0, curve, 0.5,
+    )  # fmt: skip
+    return log_weight
+
+
+def apart(distance: float, sigma: float) -> tuple[Floats, Floats]:
+    x, p = np.zeros((1, SIZE)), np.zeros((1, SIZE, SIZE))
+    x[0, 2 * PER_NODE] = distance
+    p[0, 0, 0] = sigma**2
+    return x, p
+
+
+def test_silence_is_likelier_of_those_who_are_far_apart() -> None:
+    near, far = hearing(*apart(4.0, 0.5), False, 10.0), hearing(*apart(14.0, 0.5), False, 10.0)
+    assert far[0] == pytest.approx(0.0, abs=0.01)
+    assert near[0] < -3.0
+
+
+@pytest.mark.parametrize(("heard", "sign"), [(False, 1.0), (True, -1.0)])
+def test_an_edge_within_the_spread_moves_the_two_as_sampled_places_say(
+    heard: bool, sign: float
+) -> None:
+    x, p = apart(10.0, 1.0)
+    hearing(x, p, heard, 10.0)
+    # Half of a Gaussian: mean sqrt(2/pi), variance 1 - 2/pi; the curve's edge is half a metre wide.
+    assert -x[0, 0] == pytest.approx(sign * np.sqrt(2.0 / np.pi), abs=0.25)
+    assert p[0, 0, 0] == pytest.approx(1.0 - 2.0 / np.pi, abs=0.12)
+
+
+def test_what_is_far_from_any_edge_changes_nothing_but_the_weight() -> None:
+    x, p = apart(4.0, 0.3)
+    before = x.copy(), p.copy()
+    hearing(x, p, True, 10.0)
+    assert (x == before[0]).all()
+    assert (p == before[1]).all()
+
+
+def test_levels_of_noise_are_learned_from_innovations_and_their_uncertainty_is_honest() -> None:
+    errors, sigmas = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        levels = noise.Levels()
+        levels.add_node()
+        levels.add_node()
+        truth = np.array([1.0, 0.0, -0.5, -0.4, 0.0, 0.5, -2.0])
+        for _ in range(500):
+            # Innovations whose variance is a random mixture of the sorts of noise.
+            parts = rng.dirichlet(np.full(7, 0.4))
+            scale = np.exp(levels.mean)
+            stats = np.zeros((1, 1, 12))
+            stats[0, 0, 4:11] = parts * scale
+            stats[0, 0, 1] = stats[0, 0, 4:11].sum()
+            stats[0, 0, 3] = 1.0
+            measured = rng.normal() * np.sqrt((parts * np.exp(truth)).sum())
+            levels.learn(
+                np.array([0]), np.array([1]), np.array([measured]), stats, np.zeros(1), np.ones(1),
+                np.ones(1),
+            )  # fmt: skip
+        errors.append(levels.mean - truth)
+        sigmas.append(np.sqrt(levels.covariance.diagonal()))
+    ratio = np.sqrt(np.mean(np.square(np.array(errors) / np.array(sigmas))))
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.6
+    assert np.mean(sigmas) < 0.5
+    assert 0.6 < ratio < 1.6
