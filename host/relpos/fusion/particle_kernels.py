@@ -434,13 +434,17 @@ def resample(poses: Floats, weights: Floats, rows: Indices, uniforms: Floats) ->
         for m in range(count):
             mass += w[m]
         scale = mass / total
-        at, edge, wanted = 0, w[0], 0.0
-        for m in range(count):
-            wanted += spacing[m] * scale
-            while edge <= wanted and at < count - 1:
-                at += 1
-                edge += w[at]
+        # Either the draw or the particle goes one on: no branch that nobody could predict.
+        at, m = 0, 0
+        edge, wanted = w[0], spacing[0] * scale
+        while m < count and at < count - 1:
             source[m] = at
+            here = wanted < edge
+            m += 1 if here else 0
+            at += 0 if here else 1
+            wanted += spacing[m] * scale if here else 0.0
+            edge += 0.0 if here else w[at]
+        source[m:] = count - 1
         for axis in range(3):
             values = poses[axis, k]
             old[:] = values
