@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from relpos import fusion
+from relpos.evaluation import metrics
 from relpos.fusion import Estimate, NodeStatus, growing, noise
 from relpos.fusion.large_team import LargeTeam
 from relpos.measurements import Measurement, Prior, Range
@@ -158,3 +159,16 @@ def test_who_steps_unevenly_is_found_out(crowd: Crowd) -> None:
     assert uneven > 1.3
     # Nobody's heading wanders on a straight walk here.
     assert np.median(level[:, noise.WHITE]) < 0.2
+
+
+def test_a_large_team_of_whom_nobody_is_located_finds_itself() -> None:
+    crowd = simulate_crowd(CrowdSettings(nodes=60, seconds=90), 6)
+    estimates, made = estimates_of([], crowd.measurements())
+    assert len(estimates[9].nodes) == 60  # who is not found yet is listed as such
+    last = estimates[-1]
+    located = [n for n in last.nodes if n.status is NodeStatus.OK]
+    assert len(located) >= 55
+    found = np.array([(n.x_m, n.y_m) for n in located])
+    truth = crowd.poses[-1][[n.node - 1 for n in located], :2]
+    assert np.sqrt(metrics.aligned_squared_distances(found, truth).mean()) < 0.5
+    assert made.counters()["joined"] >= 49

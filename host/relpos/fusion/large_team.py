@@ -349,12 +349,7 @@ class LargeTeam:
             known = self._known[node]
             row = self._row.get(node)
             if row is None:
-                nodes.append(
-                    NodeEstimate(
-                        node, 0.0, 0.0, 0.0, math.inf, math.inf, 0.0, _ANY_ANGLE_RAD,
-                        NodeStatus.UNLOCATED, known.height_m, known.sigma_height_m,
-                    )
-                )  # fmt: skip
+                nodes.append(unlocated(node, known.height_m, known.sigma_height_m))
                 continue
             xx, yy, xy, hh = own[row]
             x, y, heading = pose[row]
@@ -401,6 +396,14 @@ _STATE = (
     "filter", "_nodes", "_row", "_known", "_pending", "_joining", "_own", "_odd", "_levels",
     "_sigma_worth", "_reach_m", "_moved", "_ranges_used", "_epoch_s",
 )  # fmt: skip
+
+
+def unlocated(node: int, height_m: float = 0.0, sigma_height_m: float = 0.0) -> NodeEstimate:
+    """Estimate of a node of which nothing but its height is known."""
+    return NodeEstimate(
+        node, 0.0, 0.0, 0.0, math.inf, math.inf, 0.0, _ANY_ANGLE_RAD, NodeStatus.UNLOCATED,
+        height_m, sigma_height_m,
+    )  # fmt: skip
 
 
 def _told(step: Advance) -> tuple[float, float, float]:
