@@ -377,7 +377,7 @@ def test_an_interrupt_ends_listening_and_keeps_what_was_received(tmp_path: Path)
     try:
         assert listening.stderr is not None
         said = listening.stderr.readline()
-        if "compiling" in said:
+        if "preparing" in said:
             said = listening.stderr.readline()
         assert "listening" in said
         for second in range(1, 13):

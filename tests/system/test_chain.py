@@ -202,9 +202,9 @@ class Listener:
 
     def __enter__(self):
         # The line comes after the port was opened and emptied: nothing sent from now on is lost.
-        # A first start, or a busy machine, tells before that it compiles.
+        # A first start, or a busy machine, tells before that it prepares.
         said = self.process.stderr.readline()
-        if "compiling" in said:
+        if "preparing" in said:
             said = self.process.stderr.readline()
         assert "listening" in said
         return self
@@ -300,7 +300,7 @@ def test_an_emulated_team_is_fused_live_by_another_process(tmp_path):
         )  # fmt: skip
         stdout, stderr = fusing.communicate(timeout=PATIENCE_S)
         assert fusing.returncode == 0, stderr
-        assert all(line.startswith(("received", "compiling")) for line in stderr.splitlines()), (
+        assert all(line.startswith(("received", "preparing")) for line in stderr.splitlines()), (
             stderr
         )
     finally:

@@ -150,7 +150,7 @@ class Job:
         """Have the estimator's kernels compiled, telling it the first time, when it takes long."""
         from relpos import fusion
 
-        with output.working("compiling the estimator, once after the installation"):
+        with output.working("preparing the estimator (compiled at the first start)"):
             fusion.warm_up(self.estimator)
 
 
