@@ -50,7 +50,7 @@ class Levels:
 
 
 FIRST_MOTION = np.array(
-    [0.1**2, 0.01**2, 0.007**2, 0.007**2, 0.03**2, math.radians(1.0) ** 2, math.radians(0.2) ** 2]
+    [0.1**2, 0.005**2, 0.002**2, 0.003**2, 0.02**2, math.radians(1.0) ** 2, math.radians(0.1) ** 2]
 )
 """Levels to begin with: between a good robot's odometry and a bad pedestrian's."""
 
@@ -58,7 +58,7 @@ LEAST_MOTION = np.array([0.005**2, 0.001**2, 0.002**2, 0.001**2, 0.005**2, 2e-4*
 """No level is believed to be less; far below all sensors, and no trouble for the digits."""
 
 COUNT_FIRST = 1.0
-COUNT_TEAM = 2.0
+COUNT_TEAM = 1.0
 """How many chords' worth of evidence the first levels count for, for the team, and the team's
 mean level, for each of its nodes: they carry the same device."""
 
