@@ -111,7 +111,11 @@ class BankCore:
         self.biases: dict[tuple[int, int], int] = {}
         """Pair of rows, the lower first -> place of its range bias in the state."""
         self.surprise: Floats = np.zeros(0)
-        self.doubtful: Floats = np.zeros(count)
+        # Whoever says where people start may be wrong of all of them at once.
+        self.wrong_start: Floats = (
+            self.rng.permutation(count) < int(settings.wrong_starts * count)
+        ).astype(np.float64)
+        self.doubtful: Floats = DOUBT_UPDATES * self.wrong_start
         self.watch = Watch()
         self.slipped: set[int] = set()
         """Rows whose odometry has slipped and that are not found again yet."""
@@ -151,6 +155,12 @@ class BankCore:
         x[:, at : at + 3] = (x_m, y_m, heading_rad)
         for entry, sigma in ((Of.X, sigma_m), (Of.Y, sigma_m), (Of.HEADING, sigma_rad)):
             p[:, at + entry, at + entry] = sigma**2
+        wrong = self.wrong_start > 0.0
+        x[wrong, at : at + 2] += (
+            math.sqrt(0.5) * self.settings.jump_m * self.rng.standard_normal((wrong.sum(), 2))
+        )
+        for entry in (Of.X, Of.Y):
+            p[wrong, at + entry, at + entry] += 0.5 * self.settings.jump_m**2
         p[:, at + Of.DRIFT, at + Of.DRIFT] = self.has_constants * self.settings.drift_rad_s**2
         p[:, at + Of.SCALE, at + Of.SCALE] = self.has_constants * self.settings.scale**2
         self.x, self.p = x, p
@@ -553,6 +563,7 @@ class BankCore:
         self.draw, self.sens = self.draw[chosen], self.sens[chosen]
         self.has_constants, self.has_bias = self.has_constants[chosen], self.has_bias[chosen]
         self.doubtful = self.doubtful[chosen]
+        self.wrong_start = self.wrong_start[chosen]
         self._spread_levels()
 
     def _spread_levels(self) -> None:
@@ -597,7 +608,7 @@ class BankCore:
             tuple(a.copy() for a in (
                 self.x, self.p, self.log_weight, self.levels.mean, self.levels.covariance,
                 self.draw, self.sens, self.has_constants, self.has_bias, self.surprise,
-                self.outlier_counts, self.doubtful, self.arm, self.watch.sums,
+                self.outlier_counts, self.doubtful, self.wrong_start, self.arm, self.watch.sums,
                 self.watch.base,
             )),
             self.rng.bit_generator.state,
@@ -612,7 +623,7 @@ class BankCore:
         (
             self.x, self.p, self.log_weight, self.levels.mean, self.levels.covariance,
             self.draw, self.sens, self.has_constants, self.has_bias, self.surprise,
-            self.outlier_counts, self.doubtful, self.arm, self.watch.sums,
+            self.outlier_counts, self.doubtful, self.wrong_start, self.arm, self.watch.sums,
             self.watch.base,
         ) = (a.copy() for a in snapshot.arrays)  # fmt: skip
         self.rng.bit_generator.state = dict(snapshot.random)

@@ -20,6 +20,7 @@ class BankSettings:
     jumps_most: float = setting(0.05, "share of jump hypotheses an epoch, at most", 0.0, 1.0)
     jump_m: float = setting(3.0, "how far a jump may lead", 0.0, 100.0)
     jump_rad: float = setting(0.3, "how far a jump may turn", 0.0, 3.2)
+    wrong_starts: float = setting(0.1, "share of hypotheses that doubt the given starts", 0.0, 0.9)
     scale: float = setting(0.1, "prior standard deviation of the step scale", 0.0, 1.0)
     drift_rad_s: float = setting(0.005, "prior standard deviation of heading drift", 0.0, 1.0)
     constants: float = setting(0.5, "share of hypotheses with scale and drift", 0.0, 1.0)
