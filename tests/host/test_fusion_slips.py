@@ -61,6 +61,7 @@ def test_a_displacement_far_out_of_habit_is_odd_and_walking_after_standing_is_no
     assert habit.is_odd(1, 1.9, 1.0)
     assert not habit.is_odd(1, 1.4, 1.0)
     assert not habit.is_odd(2, 1.3, 1.0)  # a newcomer may walk at once
+    assert not habit.is_odd(1, 0.3, 0.0005)  # two clocks have crossed
     # Whoever runs from now on is believed after some seconds.
     assert sum(habit.is_odd(1, 3.0, 1.0) for _ in range(40)) < 15
 

@@ -816,7 +816,7 @@ class Bank:
                 else:
                     self._seek(step.node)
                     way_m = math.hypot(step.dx_m, step.dy_m)
-                    odd = self.habit.is_odd(step.node, way_m, step.duration_s)
+                    odd = self.habit.is_odd(step.node, way_m, step.duration_s, step.fraction)
                     self._own["motions_doubted"] += odd
                     self.starts.advance(step, odd=odd)
             case Ranging():
@@ -897,7 +897,7 @@ class Bank:
                 self._own["motions_still"] += a.dx_m != 0.0 or a.dtheta_rad != 0.0
                 moves[k, :3] = 0.0
                 continue
-            if self.habit.is_odd(a.node, math.hypot(a.dx_m, a.dy_m), a.duration_s):
+            if self.habit.is_odd(a.node, math.hypot(a.dx_m, a.dy_m), a.duration_s, a.fraction):
                 self._make(rows, moves, told, slice(begin, k))
                 at = PER_NODE * int(rows[k])
                 east, north = self.core.x[:, at].copy(), self.core.x[:, at + 1].copy()

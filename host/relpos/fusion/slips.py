@@ -67,6 +67,9 @@ HASTE_M_S = 1.5
 """A displacement is doubted beyond ``FAR_FASTER`` times the usual speed, and beyond this: whoever
 stood may walk."""
 
+LEAST_S = 0.5
+"""A report is taken to be of at least so long a time."""
+
 MOVING_M_S = 0.05
 HABIT = 0.05
 """Least share of a new moving speed in the usual one."""
@@ -139,11 +142,15 @@ class Habit:
     usual_m_s: dict[int, float] = field(default_factory=dict)
     _steps: dict[int, int] = field(default_factory=dict)
 
-    def is_odd(self, node: int, way_m: float, duration_s: float) -> bool:
-        """Whether a displacement is far out of the node's habit; it is taken note of."""
+    def is_odd(self, node: int, way_m: float, duration_s: float, share: float = 1.0) -> bool:
+        """Whether a displacement is far out of the node's habit; it is taken note of.
+
+        Of a piece of a report, ``share`` is how much of it.
+        """
         if way_m <= MOVING_M_S * duration_s or duration_s <= 0.0:
             return False
-        speed = way_m / duration_s
+        # Two reports whose clocks cross may be a millisecond apart.
+        speed = way_m / max(duration_s, LEAST_S * share)
         usual = self.usual_m_s.get(node, USUAL_M_S)
         most = max(FAR_FASTER * usual, HASTE_M_S)
         seen = self._steps[node] = self._steps.get(node, PRIOR_STEPS) + 1
