@@ -290,32 +290,13 @@ def fit(
     step = np.zeros(dimension)
     trial = np.zeros(dimension)
     for m in range(pictures.shape[0]):
-        cost = normal_equations(
-            pictures[m], tracks, segments, knots, turn_variance, prior_at, prior, scale_variance,
-            bias_variance, ends, at, measured, places, hessian, gradient,
-        )  # fmt: skip
         damping = 1e-3
-        for _ in range(iterations):
-            if not _factor(hessian, damping, factor):
-                damping = max(damping * 10.0, 1e-6)
-                continue
+        cost = math.inf
+        step[:] = 0.0
+        # The first round only looks where it stands. (One call alone: it is compiled into here.)
+        for rounds in range(iterations + 1):
             for i in range(dimension):
-                total = gradient[i]
-                for k in range(i):
-                    total -= factor[i, k] * step[k]
-                step[i] = total / factor[i, i]
-            for i in range(dimension - 1, -1, -1):
-                total = step[i]
-                for k in range(i + 1, dimension):
-                    total -= factor[k, i] * step[k]
-                step[i] = total / factor[i, i]
-            # A turn of more than this leaves the neighbourhood the system was made for.
-            largest = 0.0
-            for i in range(nodes):
-                largest = max(largest, abs(step[i * each + 2]), 2.0 * abs(step[i * each + 3]))
-            shrink = min(1.0, 0.7 / (largest + _FEW))
-            for i in range(dimension):
-                trial[i] = pictures[m, i] + shrink * step[i]
+                trial[i] = pictures[m, i] + step[i]
             trial_cost = normal_equations(
                 trial, tracks, segments, knots, turn_variance, prior_at, prior, scale_variance,
                 bias_variance, ends, at, measured, places, trial_hessian, trial_gradient,
@@ -326,13 +307,24 @@ def fit(
                 pictures[m] = trial
                 hessian, trial_hessian = trial_hessian, hessian
                 gradient, trial_gradient = trial_gradient, gradient
-                damping = max(0.2 * damping, 1e-6)
+                if rounds > 0:
+                    damping = max(0.2 * damping, 1e-6)
                 if gain < 0.01:
                     break
             else:
                 damping *= 8.0
                 if damping > 1e6:
                     break
+            while not _factor(hessian, damping, factor) and damping < 1e9:
+                damping = max(damping * 10.0, 1e-6)
+            _solve(factor, gradient, step)
+            # A turn of more than this leaves the neighbourhood the system was made for.
+            largest = 0.0
+            for i in range(nodes):
+                largest = max(largest, abs(step[i * each + 2]), 2.0 * abs(step[i * each + 3]))
+            shrink = min(1.0, 0.7 / (largest + _FEW))
+            for i in range(dimension):
+                step[i] *= shrink
         costs[m] = cost
         for i in range(nodes):
             for a in range(POSE):
@@ -344,20 +336,28 @@ def fit(
         for i in range(dimension):
             total -= math.log(factor[i, i])
         log_volume[m] = total
-        # Columns of the inverse that belong to poses: L L^T c = e.
+        # Columns of the inverse that belong to poses.
         for i in range(nodes):
             for a in range(POSE):
-                wanted = i * each + a
-                for r in range(dimension):
-                    value = 1.0 if r == wanted else 0.0
-                    for k in range(r):
-                        value -= factor[r, k] * step[k]
-                    step[r] = value / factor[r, r]
-                for r in range(dimension - 1, -1, -1):
-                    value = step[r]
-                    for k in range(r + 1, dimension):
-                        value -= factor[k, r] * step[k]
-                    step[r] = value / factor[r, r]
+                trial[:] = 0.0
+                trial[i * each + a] = 1.0
+                _solve(factor, trial, step)
                 for j in range(nodes):
                     for b in range(POSE):
                         covariances[m, i * POSE + a, j * POSE + b] = step[j * each + b]
+
+
+@compiled
+def _solve(factor: Floats, right: Floats, solution: Floats) -> None:
+    """Solve L L^T x = b."""
+    size = right.size
+    for i in range(size):
+        total = right[i]
+        for k in range(i):
+            total -= factor[i, k] * solution[k]
+        solution[i] = total / factor[i, i]
+    for i in range(size - 1, -1, -1):
+        total = solution[i]
+        for k in range(i + 1, size):
+            total -= factor[k, i] * solution[k]
+        solution[i] = total / factor[i, i]
