@@ -581,7 +581,9 @@ class BankCore:
         s = self.settings
         if not self.nodes or self.count < 2:
             return
-        doubt = np.clip((self.surprise - 0.15) / 0.35, 0.0, 1.0)
+        # Where outliers are common, it takes more of them to doubt a user.
+        usual = max(0.15, 2.2 * self.outlier_share)
+        doubt = np.clip((self.surprise - usual) / 0.35, 0.0, 1.0)
         rate = s.jumps / self.nodes + (s.jumps_most - s.jumps / self.nodes) * doubt
         total = float(rate.sum())
         which = np.flatnonzero(self.rng.random(self.count) < total)
