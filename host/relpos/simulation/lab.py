@@ -33,8 +33,8 @@ It is set so that the distance RMSE of dead reckoning is the paper's 3.0 m: 3.25
 
 What the paper does not print, the transmissions and the share of reflections, was chosen within
 what is plausible such that few attempts succeed even among close people and that ranges are bad
-enough for the paper's own result: its filter errs by 1.96 +- 0.05 m (24 seeds) where the paper
-has 2.2 m.
+enough for the paper's own result: its filter errs by 1.96 +- 0.05 m (seeds 0 to 23) and 2.21 +-
+0.08 m (seeds 100 to 147) where the paper has 2.2 m.
 
 **Landmarks.** 112 on the walls, evenly along the way; a wearer who passes presses a button, at
 most every ``press_every_s`` and up to a quarter of a second wrong. What is surveyed is the spot on
