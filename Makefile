@@ -76,7 +76,7 @@ firmware: board-builds ## both boards: flash, RAM, cycles, beside Mahony and Mad
 	$(PYTHON) -m relpos.emulator.avr.budget --seconds 100 --filters
 
 bench: $(PEERS) ## relpos beside filterpy, Stone Soup, particles, pfilter, GTSAM; BENCH=--quick or --full
-	$(call title,Relpos and its peers: the same measurements, time and error)
+	$(call title,Relpos and its peers on the same measurements)
 	NUMBA_CACHE_DIR=$(BENCH_VENV)/numba $(BENCH_VENV)/bin/python bench/peers/compare.py $(BENCH) --out out/bench
 
 bench-chain: board-builds ## how fast boards and teams are emulated, and the particle filter through its interface

@@ -61,7 +61,9 @@ JOINT, CLOUD = "joint filter", "particle filter, M 500, no dual step"
 SMOOTHER, WHOLE = "smoother", "relpos through its interface, noise not told"
 
 CONTENDERS = (
-    Contender(JOINT, "relpos joint (bank, one hypothesis)", "5 N + 1, of which 3 N live",
+    Contender(JOINT, "relpos joint (one hypothesis)", "5 N + 1, of which 3 N live",
+              _filter(ours.JointAlone), True),
+    Contender(JOINT, "relpos joint, watching and learning", "5 N + 1, of which 3 N live",
               _filter(ours.Joint), True),
     Contender(JOINT, "relpos strips (large teams)", "3 N: x, y, heading",
               _filter(ours.Strips), True),
@@ -242,7 +244,7 @@ def over_nodes(sizes: Sequence[int], seconds: int, budget_s: float) -> list[Poin
 
     series: dict[str, Callable[[int], Run]] = {
         "relpos strips (large teams)": lambda _: _filter(ours.Strips),
-        "relpos joint (bank, one hypothesis)": lambda _: _filter(ours.Joint),
+        "relpos joint (one hypothesis)": lambda _: _filter(ours.JointAlone),
         "relpos bank, through its interface": lambda _: _interface("bank"),
         "filterpy EKF": lambda _: _filter(kalman_peers.FilterpyEKF),
         "Stone Soup EKF": lambda _: _filter(kalman_peers.StoneSoupEKF),

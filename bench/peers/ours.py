@@ -11,54 +11,69 @@ from relpos import fusion
 
 
 class Joint:
-    """One hypothesis of the bank, noise told: its kernels on its arrays."""
+    """The bank's core with a single hypothesis, noise told; it goes on watching and learning."""
 
     def __init__(self, case: Case, seed: int) -> None:
-        from relpos.fusion import joint, noise
+        from relpos.fusion.bank import PER_NODE, BankCore
+        from relpos.fusion.bank_settings import BankSettings
 
-        self.kernels, self.base = joint, noise.motion_variances
-        count = case.nodes
-        self.per = joint.PER_NODE
-        self.x = np.zeros((1, self.per * count + 1))
-        self.pose()[:] = case.truth[0]
-        self.p = np.zeros((1, self.x.size, self.x.size))
-        for entry in range(3):
-            at = self.per * np.arange(count) + entry
-            self.p[0, at, at] = 1e-6
-        self.level = np.ones((1, count, noise.LEVELS))
-        self.sens = np.zeros((1, count, noise.LEVELS, 6))
-        self.log_weight = np.zeros(1)
-        self.sigma2 = np.full(1, case.sigma_range_m**2)
-        self.outlier = np.array([1e-9, 9.0, 0.1, 1.0])
-        self.rows, self.ones = np.arange(count), np.ones(count)
-        self.drawn, self.arm = np.zeros((1, count)), np.zeros((0, 2))
+        alone = BankSettings(hypotheses=1, constants=0.0, outliers=0.0, biased=0.0)
+        self.core, self.per = BankCore(alone, seed), PER_NODE
+        for pose in case.truth[0]:
+            self.core.add_node(*map(float, pose), 1e-3, 1e-3)
+        self.variance = case.sigma_range_m**2
+        self.rows, self.ones = np.arange(case.nodes), np.ones(case.nodes)
 
     def pose(self) -> Floats:
         """Poses (N, 3), a view."""
-        at: Floats = self.x[0, :-1].reshape(-1, self.per)[:, :3]
+        at: Floats = self.core.x[0, : self.per * len(self.rows)].reshape(-1, self.per)[:, :3]
         return at
+
+    def predict(self, motion: Floats, sigma: Floats) -> None:
+        """Move everybody by told noise."""
+        self.core.level[:] = 1.0
+        self.core.advance(self.rows, motion[:, 0], motion[:, 1], motion[:, 2], self.ones, sigma)
+
+    def update(self, ranges: Instant) -> None:
+        """Ranges one after another, to second order."""
+        self.core.sigma2[:] = self.variance
+        self.core.update(ranges.node, ranges.peer, ranges.range_m, np.zeros(ranges.node.size))
+
+    def positions(self) -> Floats:
+        """Means."""
+        return self.pose()[:, :2]
+
+
+class JointAlone(Joint):
+    """The same filter without watching for slips and learning of noise: its kernels alone."""
+
+    def __init__(self, case: Case, seed: int) -> None:
+        super().__init__(case, seed)
+        from relpos.fusion import joint, noise
+
+        self.kernels, self.base = joint, noise.motion_variances
+        self.core.level[:], self.core.sigma2[:] = 1.0, self.variance
+        self.outlier = np.array([1e-9, 9.0, 0.1, 1.0])
+        self.drawn, self.arm = np.zeros((1, case.nodes)), np.zeros((0, 2))
 
     def predict(self, motion: Floats, sigma: Floats) -> None:
         """Move everybody by told noise."""
         moved = np.empty((len(motion), 7))
         moved[:, :3], moved[:, 3] = motion, self.ones
         moved[:, 4:] = self.base(*motion.T, self.ones, sigma)
-        self.kernels.advance(
-            self.x, self.p, self.level, self.sens, self.rows, moved, self.drawn, 0.0, 0.0
-        )
+        c = self.core
+        self.kernels.advance(c.x, c.p, c.level, c.sens, self.rows, moved, self.drawn, 0.0, 0.0)
 
     def update(self, ranges: Instant) -> None:
         """Ranges one after another, to second order."""
-        count = ranges.node.size
+        count, c = ranges.node.size, self.core
+        # More columns of statistics than the kernel fills: what it fills is not used here.
         self.kernels.update(
-            self.x, self.p, self.log_weight, self.sigma2, self.sens, ranges.node, ranges.peer,
-            np.full(count, -1), ranges.range_m, np.zeros(count), self.outlier, self.x.size - 1,
-            np.ones(count), np.zeros(count), self.arm, np.empty((1, count, 11)),
+            c.x, c.p, c.log_weight, c.sigma2, c.sens, ranges.node, ranges.peer,
+            np.full(count, -1), ranges.range_m, np.zeros(count), self.outlier,
+            self.per * c.nodes, np.ones(count), np.zeros(count), self.arm,
+            np.empty((1, count, 64)),
         )  # fmt: skip
-
-    def positions(self) -> Floats:
-        """Means."""
-        return self.pose()[:, :2]
 
 
 class Strips:
@@ -146,7 +161,7 @@ def through_interface(case: Case, name: str, settings: dict[str, object], seed: 
 
 def begin_of(case: Case) -> Floats:
     """Poses (T + 1, N, 3) that the smoothers begin from: the joint filter's own run."""
-    filter_ = Joint(case, 0)
+    filter_ = JointAlone(case, 0)
     poses = [case.truth[0]]
     for motion, sigma, ranges in case.instants():
         filter_.predict(motion, sigma)
