@@ -35,6 +35,25 @@ def test_the_bank_is_near_the_bound_without_being_told_the_noise(
     assert 0.5 < np.mean([f.nees_distance for f in figures]) < 1.6
 
 
+@pytest.mark.parametrize(
+    ("overrides", "limit_m"),
+    [
+        ({"nlos_probability": 0.2}, 0.4),
+        ({"start_shift_m": 4.0}, 0.6),
+        ({"noisy_factor": 3.0}, 0.55),
+        ({"scale_error": 0.1, "heading_drift_deg_s": 0.5}, 0.25),
+    ],
+)
+def test_what_nobody_told_is_lived_with(overrides: dict[str, float], limit_m: float) -> None:
+    assert _run("paper-p1", 0, overrides).relative_distance_rmse_m < limit_m
+
+
+def test_white_heading_noise_and_a_short_reach_leave_the_team_in_shape() -> None:
+    figures = _run("paper-h", 1)
+    assert figures.relative_distance_rmse_m < 1.27
+    assert figures.nees_distance < 2.5
+
+
 def test_the_same_seed_gives_the_same_estimates() -> None:
     first, second = (_run("paper", 3, {"seconds": 60.0}) for _ in range(2))
     assert first.relative_distance_rmse_m == second.relative_distance_rmse_m
