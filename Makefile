@@ -18,6 +18,9 @@ BENCH_VENV := .venv-bench
 PEERS := $(BENCH_VENV)/.relpos-bench
 
 PIP := $(PYTHON) -m pip --disable-pip-version-check install --progress-bar on
+# Part of the installation, so that no first start, and no test, waits for it.
+compile-kernels = @printf '%s\n' 'compiling the estimators, once'; \
+	$(PYTHON) -c 'from relpos import fusion; [fusion.warm_up(n) for n in fusion.SETTINGS]'
 title = @printf '\n\033[1m== %s\033[0m\n' "$(1)"
 
 .PHONY: help setup demo test lint bench bench-chain firmware docs wire clean soak \
@@ -96,11 +99,13 @@ $(PYTHON): | system-demo
 $(RUN): pyproject.toml | $(PYTHON)
 	$(call title,Installing relpos and its libraries)
 	$(PIP) --editable .
+	$(compile-kernels)
 	@touch $@
 
 $(DEVELOP): pyproject.toml | $(PYTHON)
 	$(call title,Installing the tools for tests and firmware)
 	$(PIP) --editable '.[test,lint,firmware]'
+	$(compile-kernels)
 	@touch $@ $(RUN)
 
 $(FUZZ): $(DEVELOP)
