@@ -54,6 +54,7 @@ from relpos.measurements import Heading, Height, Measurement, Prior, Range
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
+_DRIFT, _SCALE = int(Of.DRIFT), int(Of.SCALE)
 _ANY_ANGLE_RAD = math.pi / math.sqrt(3.0)
 _TWO_PI = 2.0 * math.pi
 
@@ -1087,8 +1088,10 @@ class Bank:
             known.silent_epochs = 0 if known.news_s > self._epoch_s else known.silent_epochs + 1
         self._epoch_s = time_s
         mean, covariance = self.core.moments()
-        self.core.find_slipped(covariance)
+        if self.core.slipped:
+            self.core.find_slipped(covariance)
         mixture = self.starts.mixture
+        means, variances = mean.tolist(), covariance.diagonal().tolist()
         nodes, parameters = [], []
         for node in sorted(self._known):
             known = self._known[node]
@@ -1097,27 +1100,28 @@ class Bank:
                 nodes.append(self._sought(node, known, mixture))
                 continue
             at = PER_NODE * row
-            pose = [float(v) for v in mean[at : at + PER_NODE]]
-            own = covariance[at : at + PER_NODE, at : at + PER_NODE]
+            pose = means[at : at + PER_NODE]
             if row in self.core.slipped:
+                own = covariance[at : at + PER_NODE, at : at + PER_NODE]
                 self._tell_mode(row, pose, own)
+                variances[at : at + PER_NODE] = own.diagonal().tolist()
             nodes.append(
                 NodeEstimate(
                     node, pose[0], pose[1], math.remainder(pose[2], _TWO_PI),
-                    float(own[0, 0]), float(own[1, 1]), float(own[0, 1]),
-                    min(math.sqrt(float(own[2, 2])), _ANY_ANGLE_RAD),
+                    variances[at], variances[at + 1], float(covariance[at, at + 1]),
+                    min(math.sqrt(variances[at + 2]), _ANY_ANGLE_RAD),
                     self._status(known, row),
                     known.height_m, known.sigma_height_m,
                 )
             )  # fmt: skip
-            drift = float(math.sqrt(max(own[Of.DRIFT, Of.DRIFT], 0.0)))
-            scale = float(math.sqrt(max(own[Of.SCALE, Of.SCALE], 0.0)))
-            grow = math.exp(pose[Of.SCALE])
+            drift = math.sqrt(max(variances[at + _DRIFT], 0.0))
+            scale = math.sqrt(max(variances[at + _SCALE], 0.0))
+            grow = math.exp(pose[_SCALE])
             parameters += [
                 Parameter(time_s, node, None, "step_scale", grow, grow * scale),
-                Parameter(time_s, node, None, "heading_drift_rad_s", pose[Of.DRIFT], drift),
+                Parameter(time_s, node, None, "heading_drift_rad_s", pose[_DRIFT], drift),
             ]
-        parameters += self._bias_parameters(time_s, mean, covariance)
+        parameters += self._bias_parameters(time_s, means, variances)
         if self.detection.known:
             # One curve for the team; every node has it.
             parameters += [
@@ -1238,36 +1242,41 @@ class Bank:
         return pictures(time_s, nodes, mixture.weights, poses, spread)
 
     def _bias_parameters(
-        self, time_s: float, mean: Floats, covariance: Floats
+        self, time_s: float, means: list[float], variances: list[float]
     ) -> Iterator[Parameter]:
         named = {row: node for node, row in self._row.items()}
         for (a, b), place in sorted(self.core.biases.items()):
-            node, peer = sorted((named[a], named[b]))
-            sigma = math.sqrt(max(float(covariance[place, place]), 0.0))
-            yield Parameter(time_s, node, peer, "range_bias_m", float(mean[place]), sigma)
+            node, peer = named[a], named[b]
+            if node > peer:
+                node, peer = peer, node
+            sigma = math.sqrt(max(variances[place], 0.0))
+            yield Parameter(time_s, node, peer, "range_bias_m", means[place], sigma)
 
     def _pair_estimates(self, mean: Floats, covariance: Floats) -> tuple[PairEstimate, ...]:
         located = sorted(self._row)
+        rows = [self._row[node] for node in located]
+        places = PER_NODE * np.repeat(np.array(rows, dtype=np.int64), 2)
+        places[1::2] += Of.Y
+        # Plain numbers: single entries of an array cost several times as much.
+        at = mean[places].tolist()
+        spread = covariance[places[:, None], places].tolist()
+        slipped = self.core.slipped
         pairs = []
         for n, a in enumerate(located):
-            for b in located[n + 1 :]:
-                i, j = PER_NODE * self._row[a], PER_NODE * self._row[b]
-                if {self._row[a], self._row[b]} & self.core.slipped:
-                    pairs.append(self._pair_of_hypotheses(a, b, i, j))
+            i = 2 * n
+            x, y = at[i], at[i + 1]
+            of_x, of_y = spread[i], spread[i + 1]
+            for m in range(n + 1, len(located)):
+                b, j = located[m], 2 * m
+                if slipped and (rows[n] in slipped or rows[m] in slipped):
+                    pairs.append(
+                        self._pair_of_hypotheses(a, b, PER_NODE * rows[n], PER_NODE * rows[m])
+                    )
                     continue
-                dx, dy = float(mean[j] - mean[i]), float(mean[j + 1] - mean[i + 1])
-                xx = float(covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j])
-                yy = float(
-                    covariance[i + 1, i + 1]
-                    + covariance[j + 1, j + 1]
-                    - 2.0 * covariance[i + 1, j + 1]
-                )
-                xy = float(
-                    covariance[i, i + 1]
-                    + covariance[j, j + 1]
-                    - covariance[i, j + 1]
-                    - covariance[i + 1, j]
-                )
+                dx, dy = at[j] - x, at[j + 1] - y
+                xx = of_x[i] + spread[j][j] - 2.0 * of_x[j]
+                yy = of_y[i + 1] + spread[j + 1][j + 1] - 2.0 * of_y[j + 1]
+                xy = of_x[i + 1] + spread[j][j + 1] - of_x[j + 1] - of_y[j]
                 distance = math.hypot(dx, dy)
                 if distance > 0.0:
                     c, s = dx / distance, dy / distance

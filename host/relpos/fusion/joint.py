@@ -429,18 +429,13 @@ def update_heading(
 
 
 @inlined
-def _outcome(
-    at_m: float, heard: bool, tried: float, weight: float, curve: Floats, step_m: float
-) -> float:
-    """Probability that a pair at a distance is heard, or is silent, counted ``weight`` times."""
+def _outcome(place: float, heard: bool, tried: float, curve: Floats) -> float:
+    """Probability that a pair is heard, or is silent, at a multiple of the curve's step."""
     last = curve.shape[0] - 2
-    place = min(max(at_m / step_m, 0.0), last + 1.0)
+    place = min(max(place, 0.0), last + 1.0)
     index = min(int(place), last)
-    chance = curve[index] + (place - index) * (curve[index + 1] - curve[index])
-    if not heard:
-        chance = 1.0 - tried * chance
-    counted: float = math.exp(weight * math.log(chance))
-    return counted
+    chance: float = curve[index] + (place - index) * (curve[index + 1] - curve[index])
+    return chance if heard else 1.0 - tried * chance
 
 
 @compiled
@@ -471,19 +466,38 @@ def hearing(
     """
     count, size = x.shape
     g = np.empty(size)
+    bell = np.empty(_POINTS)
+    for q in range(_POINTS):
+        bell[q] = math.exp(-0.5 * (_ASIDE * (2.0 * q / (_POINTS - 1.0) - 1.0)) ** 2)
+    per_step = 1.0 / step_m
+    log_least, log_most = math.log(0.97), math.log(1.03)
     for k in range(count):
         xk = x[k]
         pk = p[k]
         total = 0.0
+        product = 1.0
         for u in range(first.shape[0]):
             bi, bj = _N * first[u], _N * second[u]
             m, v, gx, gy = _predict_range(xk, pk, bi, bj, dz[u])
             sd = math.sqrt(max(v, 0.0))
-            middle = _outcome(m, heard[u], tried[u], weight, curve, step_m)
-            near = _outcome(m - _ASIDE * sd, heard[u], tried[u], weight, curve, step_m)
-            far = _outcome(m + _ASIDE * sd, heard[u], tried[u], weight, curve, step_m)
-            if max(abs(near - middle), abs(far - middle)) < 0.03 * middle:
-                total += math.log(middle)
+            place, aside = per_step * m, per_step * sd
+            middle = _outcome(place, heard[u], tried[u], curve)
+            near = _outcome(place - _ASIDE * aside, heard[u], tried[u], curve)
+            far = _outcome(place + _ASIDE * aside, heard[u], tried[u], curve)
+            lowest, highest = min(near, far), max(near, far)
+            # Almost everywhere the curve is flat. Roots differ by less than what they are of
+            # (``weight`` is at most 1), so logarithms are only taken where that does not settle it.
+            flat = lowest > 0.97 * middle and highest < 1.03 * middle
+            if not flat:
+                flat = (
+                    weight * math.log(lowest / middle) > log_least
+                    and weight * math.log(highest / middle) < log_most
+                )
+            if flat:
+                product *= middle
+                if product < 1e-250:
+                    total += weight * math.log(product)
+                    product = 1.0
                 continue
             mass = 0.0
             shift = 0.0
@@ -491,9 +505,9 @@ def hearing(
             norm = 0.0
             for q in range(_POINTS):
                 z = _ASIDE * (2.0 * q / (_POINTS - 1.0) - 1.0)
-                density = math.exp(-0.5 * z * z)
-                norm += density
-                density *= _outcome(m + z * sd, heard[u], tried[u], weight, curve, step_m)
+                norm += bell[q]
+                chance = _outcome(place + z * aside, heard[u], tried[u], curve)
+                density = bell[q] * math.exp(weight * math.log(chance))
                 mass += density
                 shift += density * z
                 square += density * z * z
@@ -510,7 +524,7 @@ def hearing(
             for o in range(size):
                 for q in range(size):
                     pk[o, q] -= shrink * g[o] * g[q]
-        log_weight[k] += total
+        log_weight[k] += total + weight * math.log(product)
 
 
 @compiled

@@ -19,7 +19,7 @@ import math
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -227,7 +227,7 @@ class Search:
             return
         if odd:
             track.path_m += ODD_M**2 / self.settings.path_variance_m
-            step = replace(step, dx_m=0.0, dy_m=0.0)
+            step = step._replace(dx_m=0.0, dy_m=0.0)
         length = math.hypot(step.dx_m, step.dy_m)
         c, s = math.cos(track.pose[2]), math.sin(track.pose[2])
         track.pose[0] += c * step.dx_m - s * step.dy_m
@@ -1009,6 +1009,8 @@ class Starts:
     settled: set[int] = field(default_factory=set)
     _standing: set[int] = field(default_factory=set)
     _quiet_since_s: float = -math.inf
+    _shared: bool = False
+    """Whether ``search``, in which nobody is, may be a snapshot's, too."""
 
     def __post_init__(self) -> None:
         self.search = Search(self.settings, self.seed, self.counters)
@@ -1029,6 +1031,7 @@ class Starts:
         sigma: Sequence[float] = (math.inf, math.inf, math.inf),
     ) -> None:  # fmt: skip
         """Take a node up, with what is known of its pose (``sigma`` inf: nothing)."""
+        self._part()
         self._wanderers[node] = _Wanderer(np.array(mean, float), np.array(sigma, float))
         if math.isfinite(sigma[0]):
             self._framed = True
@@ -1041,6 +1044,7 @@ class Starts:
 
     def advance(self, step: Advance, *, odd: bool = False) -> None:
         """Move a node, if it is one of these; an ``odd`` displacement counts as its turn alone."""
+        self._part()
         wanderer = self._wanderers.get(step.node)
         free = len(self.search.nodes) < MOST_SOUGHT
         if wanderer is not None and free and math.isfinite(wanderer.sigma[0]):
@@ -1062,6 +1066,7 @@ class Starts:
         heights: Mapping[int, float] | None = None,
     ) -> None:
         """Take all ranges of an instant; ``located`` as for :meth:`Search.ranging`."""
+        self._part()
         self._framed |= bool(located)
         if not self._framed and ranges:
             self._choose_frame(time_s, ranges)
@@ -1130,6 +1135,8 @@ class Starts:
     def mixture(self) -> Mixture | None:
         """The pictures of those who are sought and tied to something known; None where none is."""
         search = self.search
+        if not search.nodes:
+            return None
         active = [i for i, n in enumerate(search.nodes) if n in search.active]
         whole = search.mixture
         if not active or not whole.weights.size or whole.weights.size != len(whole.poses):
@@ -1152,9 +1159,19 @@ class Starts:
         other = copy.copy(self)
         other.counters, other._agreed = self.counters.copy(), self._agreed.copy()
         other.settled, other._standing = self.settled.copy(), self._standing.copy()
-        other._wanderers = copy.deepcopy(self._wanderers)
-        other.search = self.search.snapshot(other.counters)
+        other._wanderers = copy.deepcopy(self._wanderers) if self._wanderers else {}
+        if self.search.nodes:
+            other.search = self.search.snapshot(other.counters)
+        else:
+            # Nothing in it changes before somebody is met: until then the two share it.
+            self._shared = other._shared = True
         return other
+
+    def _part(self) -> None:
+        """Take a search of one's own before it changes."""
+        if self._shared:
+            self.search = self.search.snapshot(self.counters)
+            self._shared = False
 
 
 WIDTH = 0.7

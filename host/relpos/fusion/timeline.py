@@ -25,13 +25,13 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from math import cos, inf, isfinite, nextafter, sin, sqrt
+from typing import NamedTuple
 
 from relpos.errors import DataError
 from relpos.measurements import Heading, Height, Measurement, Motion, Range
 
 
-@dataclass(frozen=True, slots=True)
-class Advance:
+class Advance(NamedTuple):
     """A node's displacement over ``duration_s`` up to ``time_s``.
 
     ``dx_m``, ``dy_m`` are in the node's heading frame at the beginning of this piece;
@@ -433,19 +433,14 @@ def _advance(track: _Track, node: int, until_s: float) -> Iterator[Advance]:
 def _piece(
     time_s: float, node: int, duration_s: float, piece: Displacement, share: float, report: Motion
 ) -> Advance:
-    def part(sigma: float | None) -> float | None:
-        return None if sigma is None else sigma * sqrt(share)
+    moved = time_s, node, duration_s, piece.dx_m, piece.dy_m, piece.dtheta_rad, share
+    sigmas = (
+        report.sigma_x_m, report.sigma_y_m, report.sigma_theta_rad, report.sigma_x_alone_m,
+    )  # fmt: skip
+    if sigmas == _UNTOLD:
+        return Advance(*moved)
+    part = sqrt(share)
+    return Advance(*moved, *(None if sigma is None else sigma * part for sigma in sigmas))
 
-    return Advance(
-        time_s,
-        node,
-        duration_s,
-        piece.dx_m,
-        piece.dy_m,
-        piece.dtheta_rad,
-        share,
-        part(report.sigma_x_m),
-        part(report.sigma_y_m),
-        part(report.sigma_theta_rad),
-        part(report.sigma_x_alone_m),
-    )
+
+_UNTOLD = (None, None, None, None)
