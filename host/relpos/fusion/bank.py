@@ -305,9 +305,27 @@ class BankCore:
         motion[(motion[:, :3] == 0.0).all(axis=1), 3] = 0.0
         motion[:, 4:] = noise.motion_variances(dx_m, dy_m, dtheta_rad, duration_s, told)
         drawn = self.rng.standard_normal((self.count, len(rows)))
+        self._misjudge_turns(rows, motion, told)
         joint.advance(
             self.x, self.p, self.level, self.sens, rows, motion, drawn, self._sampled, CROSS
         )
+
+    def _misjudge_turns(self, rows: Indices, motion: Floats, told: Floats) -> None:
+        """Let a few hypotheses take a reported turn for one of any size.
+
+        A turn's noise grows with the turn, of which only the report is known: one of a right
+        angle that was reported as next to nothing would pass for exact. Only what sticks out of
+        the wearer's white heading noise is a turn, and only reports that bring no sigma need it.
+        """
+        if self.count < 2:
+            return
+        white = motion[:, 6] * self.level[:, rows, noise.WHITE].mean(axis=0)
+        turn = motion[:, 2] ** 2 > LEAST_TURN_RAD**2 + TURN_STANDS_OUT**2 * white
+        for m in np.flatnonzero(turn & np.isnan(told[:, 2])):
+            some = np.flatnonzero(self.rng.random(self.count) < MISJUDGED)
+            self.x[some, PER_NODE * rows[m] + Of.HEADING] += (
+                MISJUDGED_RAD * self.rng.standard_normal(some.size)
+            )
 
     @property
     def _sampled(self) -> float:
@@ -676,6 +694,14 @@ SLIP_UPDATES = 10.0
 
 DOUBT_UPDATES = 5.0
 """For so many instants of ranges a hypothesis that has jumped teaches nothing about noise."""
+
+LEAST_TURN_RAD, TURN_STANDS_OUT = 0.05, 3.5
+"""A change of heading is a turn beyond both: so much, and so many deviations of white noise."""
+MISJUDGED, MISJUDGED_RAD = 0.1, 1.0
+"""Share of hypotheses that misjudge a turn, and by how much. In P1 one right angle in some hundred
+is reported as less than 20 degrees, and cost 0.5 m for a minute: seeds 1000 to 1009 0.206 m
+without, 0.214 with a share of 0.05, 0.195 with 0.1 (worst 0.27, 0.38, 0.24); seeds 500 to 515,
+where it does not happen, 0.192 and 0.195."""
 
 HEADING_OUTLIERS = 0.1
 HEADING_OUTLIER_RAD = 1.0
