@@ -29,6 +29,7 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion import vectormath
 from relpos.fusion.compiled import compiled, inlined
 
 Floats = npt.NDArray[np.float64]
@@ -54,6 +55,13 @@ PER_NODE = len(Of)
 _X, _Y, _H, _W, _S = (int(v) for v in Of)
 _N = PER_NODE
 _TINY = 1e-12
+
+STATS = 12
+"""Columns of what :func:`update` tells of each range."""
+
+_LANES = 32
+"""Loops over a whole number of these are vector instructions only (four of eight doubles); 30 a
+row would all be done one by one, which takes three times as long."""
 
 DRIFT_WALK = 3e-9
 SCALE_WALK = 3e-7
@@ -137,18 +145,21 @@ def advance(
     variance is drawn, the rest goes into the covariance. ``cross`` is the variance across the
     way relative to that along it.
     """
-    count, size = x.shape
-    poses = _N * level.shape[1]
-    for k in range(count):
+    nodes = level.shape[1]
+    poses = _N * nodes
+    # What a user's displacements did to x and y per heading, drift and scale, and to the heading.
+    moved = np.empty((nodes, 5))
+    for k in range(x.shape[0]):
         xk = x[k]
         pk = p[k]
         size = x.shape[1]
         if size > poses and pk[poses, poses] == 0.0:
             size = poses
+        moved[:] = 0.0
         for m in range(rows.shape[0]):
             row = rows[m]
             b = _N * row
-            bx, by, bh, bw, bs = b + _X, b + _Y, b + _H, b + _W, b + _S
+            bh, bw, bs = b + _H, b + _W, b + _S
             dx, dy, dt = motion[m, 0], motion[m, 1], motion[m, 3]
             turn = motion[m, 5] * level[k, row, 1]
             white = motion[m, 6] * level[k, row, 2]
@@ -158,29 +169,27 @@ def advance(
                 sens[k, row, 2, 5] += white
                 xk[bh] += sampled[k, m] * math.sqrt(share * noise)
                 pk[bh, bh] += (1.0 - share) * noise
+            constant = pk[bw, bw] > 0.0 or pk[bs, bs] > 0.0
             if dx != 0.0 or dy != 0.0:
-                at = xk[bh] - 0.5 * dt * xk[bw]
-                c, s = math.cos(at), math.sin(at)
+                c, s = vectormath.cos_sin(xk[bh] - 0.5 * dt * xk[bw])
                 # E R(theta) of an uncertain heading is shorter by exp(-var/2); what that leaves
                 # of the spread along and across the way is noise (statistical linearisation).
                 vary = max(pk[bh, bh] - dt * pk[bh, bw], 0.0)
-                shorter = math.exp(-vary)
-                grow = math.exp(xk[bs])
+                short = math.exp(-0.5 * vary)
+                shorter = short * short
+                grow = math.exp(xk[bs]) if xk[bs] != 0.0 else 1.0
                 full = grow * grow * (dx * dx + dy * dy)
-                grow *= math.exp(-0.5 * vary)
                 ahead, aside = c * dx - s * dy, s * dx + c * dy
-                east, north = grow * ahead, grow * aside
-                half = 0.5 * dt
-                xk[bx] += east
-                xk[by] += north
-                for q in range(size):
-                    turned = pk[bh, q] - half * pk[bw, q]
-                    pk[bx, q] += east * pk[bs, q] - north * turned
-                    pk[by, q] += north * pk[bs, q] + east * turned
-                for q in range(size):
-                    turned = pk[q, bh] - half * pk[q, bw]
-                    pk[q, bx] += east * pk[q, bs] - north * turned
-                    pk[q, by] += north * pk[q, bs] + east * turned
+                east, north = grow * short * ahead, grow * short * aside
+                xk[b] += east
+                xk[b + 1] += north
+                _move_own(pk, b, east, north, 0.5 * dt, constant)
+                moved[row, 0] += east
+                moved[row, 1] += north
+                # The heading that this displacement follows has itself drifted since.
+                lag = moved[row, 4] + 0.5 * dt
+                moved[row, 2] += north * lag
+                moved[row, 3] -= east * lag
                 for part in range(3):
                     _turn_sensitivity(sens[k, row, part], east, north)
                 along = motion[m, 4] * level[k, row, 0]
@@ -191,23 +200,95 @@ def advance(
                     swept = full * max(0.5 - 0.5 * shorter * shorter - vary * shorter, 0.0)
                     length = along + lost
                     width = along * cross + swept
-                    pk[bx, bx] += length * ee + width * nn
-                    pk[by, by] += length * nn + width * ee
-                    pk[bx, by] += (length - width) * en
-                    pk[by, bx] += (length - width) * en
+                    pk[b, b] += length * ee + width * nn
+                    pk[b + 1, b + 1] += length * nn + width * ee
+                    pk[b, b + 1] += (length - width) * en
+                    pk[b + 1, b] += (length - width) * en
                     sens[k, row, 0, 0] += along * (ee + cross * nn)
                     sens[k, row, 0, 1] += along * (1.0 - cross) * en
                     sens[k, row, 0, 2] += along * (nn + cross * ee)
             xk[bh] += motion[m, 2] - dt * xk[bw]
-            if dt > 0.0 and pk[bw, bw] > 0.0:
-                for q in range(size):
-                    pk[bh, q] -= dt * pk[bw, q]
-                for q in range(size):
-                    pk[q, bh] -= dt * pk[q, bw]
-            if pk[bw, bw] > 0.0:
-                pk[bw, bw] += DRIFT_WALK * dt
-            if pk[bs, bs] > 0.0:
-                pk[bs, bs] += SCALE_WALK * dt
+            if constant:
+                if dt > 0.0 and pk[bw, bw] > 0.0:
+                    moved[row, 4] += dt
+                    for q in range(b, b + _N):
+                        pk[bh, q] -= dt * pk[bw, q]
+                    for q in range(b, b + _N):
+                        pk[q, bh] -= dt * pk[q, bw]
+                    pk[bw, bw] += DRIFT_WALK * dt
+                if pk[bs, bs] > 0.0:
+                    pk[bs, bs] += SCALE_WALK * dt
+        for row in range(nodes):
+            if moved[row, 0] != 0.0 or moved[row, 1] != 0.0 or moved[row, 4] != 0.0:
+                _move_others(pk, _N * row, moved[row], poses, size)
+
+
+@compiled
+def _move_own(pk: Floats, b: int, east: float, north: float, half: float, constant: bool) -> None:
+    """Carry a user's own block (5, 5) at ``b`` over a displacement."""
+    bx, by, bh, bw, bs = b + _X, b + _Y, b + _H, b + _W, b + _S
+    if constant:
+        for q in range(b, b + _N):
+            turned = pk[bh, q] - half * pk[bw, q]
+            pk[bx, q] += east * pk[bs, q] - north * turned
+            pk[by, q] += north * pk[bs, q] + east * turned
+        for q in range(b, b + _N):
+            turned = pk[q, bh] - half * pk[q, bw]
+            pk[q, bx] += east * pk[q, bs] - north * turned
+            pk[q, by] += north * pk[q, bs] + east * turned
+        return
+    xh, yh, hh = pk[bx, bh], pk[by, bh], pk[bh, bh]
+    pk[bx, bx] += north * (north * hh - 2.0 * xh)
+    pk[by, by] += east * (east * hh + 2.0 * yh)
+    xy = pk[bx, by] + east * xh - north * yh - east * north * hh
+    pk[bx, by] = xy
+    pk[by, bx] = xy
+    pk[bx, bh] = xh - north * hh
+    pk[bh, bx] = xh - north * hh
+    pk[by, bh] = yh + east * hh
+    pk[bh, by] = yh + east * hh
+
+
+@compiled
+def _move_others(pk: Floats, b: int, moved: Floats, poses: int, size: int) -> None:
+    """Carry a user's covariance with everything else over all its displacements at once.
+
+    ``moved`` (5,) is east and north (m), what a unit of drift does to x and to y, and the time
+    (s). Own constants that have no variance have no covariance either.
+    """
+    bx, by, bh, bw, bs = b + _X, b + _Y, b + _H, b + _W, b + _S
+    east, north, drift_x, drift_y, time = moved[0], moved[1], moved[2], moved[3], moved[4]
+    constant = pk[bw, bw] > 0.0 or pk[bs, bs] > 0.0
+    o = 0
+    while o < size:
+        if o == b:
+            o += _N
+            continue
+        stop = size if o >= poses else o + _N
+        if o < poses and pk[o + _W, o + _W] == 0.0 and pk[o + _S, o + _S] == 0.0:
+            stop = o + 3
+        if constant:
+            for q in range(o, stop):
+                h, w, s = pk[bh, q], pk[bw, q], pk[bs, q]
+                at_x = pk[bx, q] + east * s - north * h + drift_x * w
+                at_y = pk[by, q] + north * s + east * h + drift_y * w
+                h -= time * w
+                pk[bx, q] = at_x
+                pk[by, q] = at_y
+                pk[bh, q] = h
+                pk[q, bx] = at_x
+                pk[q, by] = at_y
+                pk[q, bh] = h
+        else:
+            for q in range(o, stop):
+                h = pk[bh, q]
+                at_x = pk[bx, q] - north * h
+                at_y = pk[by, q] + east * h
+                pk[bx, q] = at_x
+                pk[by, q] = at_y
+                pk[q, bx] = at_x
+                pk[q, by] = at_y
+        o = size if o >= poses else o + _N
 
 
 @inlined
@@ -284,6 +365,68 @@ def _range_by_arms(
 
 
 @compiled
+def _lines(space: Floats, size: int) -> Floats:
+    """Lay out a (size, padded) covariance in working space, each row on cache lines of its own.
+
+    The loops below run to ``shape[1]``, which numba knows not to be negative: to any other
+    bound they are not made into vector instructions.
+    """
+    stride = (size + _LANES - 1) // _LANES * _LANES
+    off = (-(space.ctypes.data // 8)) % 8
+    return space[off : off + size * stride].reshape(size, stride)
+
+
+@compiled
+def _load(pk: Floats, of: Floats) -> None:
+    """Copy the first rows and columns of ``of`` (D, D) into ``pk`` (size, padded).
+
+    Whole vectors: what is beyond a row's end is of the next ones, finite and of no account.
+    """
+    size, stride = pk.shape
+    wide = of.shape[1]
+    for o in range(size):
+        if o * wide + stride <= wide * wide:
+            for q in range(pk.shape[1]):
+                pk[o, q] = of[o, q]
+        else:
+            for q in range(stride):
+                pk[o, q] = of[o, q] if q < size else 0.0
+
+
+@compiled
+def _store(to: Floats, pk: Floats) -> None:
+    """Copy ``pk`` (size, padded) back: what a row overwrites of the next ones, those put right."""
+    size, stride = pk.shape
+    wide = to.shape[1]
+    for o in range(size):
+        if o * wide + stride <= wide * wide:
+            for q in range(pk.shape[1]):
+                to[o, q] = pk[o, q]
+        else:
+            for q in range(size):
+                to[o, q] = pk[o, q]
+
+
+@compiled
+def _gain(pk: Floats, bi: int, bj: int, gx: float, gy: float, g: Floats) -> None:
+    """Write P h of a range into ``g`` (padded with zeros)."""
+    for q in range(pk.shape[1]):
+        g[q] = gx * (pk[bj, q] - pk[bi, q]) + gy * (pk[bj + 1, q] - pk[bi + 1, q])
+    for q in range(pk.shape[0], pk.shape[1]):
+        g[q] = 0.0
+
+
+@compiled
+def _take_away(pk: Floats, g: Floats, shrink: float) -> None:
+    """Take ``shrink`` g g^T from a covariance; where ``g`` is 0 (no constants) there is nothing."""
+    for o in range(pk.shape[0]):
+        f = shrink * g[o]
+        if f != 0.0:
+            for q in range(pk.shape[1]):
+                pk[o, q] -= f * g[q]
+
+
+@compiled
 def update(
     x: Floats,
     p: Floats,
@@ -316,24 +459,27 @@ def update(
     ``worth`` (R,) is how many independent ranges one is worth: the variance that the gain sees is
     divided by it, the evidence multiplied. ``dz_variance`` (R,) is the variance of ``dz``.
     ``arms`` (N, 2) are the antennas' places (forward, left) of the poses, or empty (0, 2) where
-    all are zero. ``stats`` (K, R, 12) receives m, S, the range's log evidence, r, and by how much
-    S grows with the logarithms of the three levels of the first and of the second user and of the
-    range variance (``sens``), and what of S is due to curvature.
+    all are zero. ``stats`` (K, R, STATS) receives m, S, the range's log evidence, r, and by how
+    much S grows with the logarithms of the three levels of the first and of the second user and of
+    the range variance (``sens``), and what of S is due to curvature.
     """
     count, size = x.shape
-    g = np.empty(size)
+    space = np.empty(size * (size + _LANES) + 8)
+    g = np.empty(size + _LANES)
     east = np.empty(size)
     north = np.empty(size)
     lever = arms.shape[0] > 0
     share, wide, short, most = outlier[0], outlier[1], outlier[2], outlier[3]
     for k in range(count):
         xk = x[k]
-        pk = p[k]
         total = 0.0
         size = x.shape[1]
-        biased = size > poses and pk[poses, poses] > 0.0
+        biased = size > poses and p[k, poses, poses] > 0.0
         if not biased:
             size = poses
+        pk = _lines(space, size)
+        g[:] = 0.0
+        _load(pk, p[k])
         for r in range(first.shape[0]):
             bi, bj, e = _N * first[r], _N * second[r], bias[r] if biased else -1
             if lever:
@@ -342,8 +488,7 @@ def update(
                 )
             else:
                 m, v, gx, gy = _predict_range(xk, pk, bi, bj, dz[r])
-                for q in range(size):
-                    g[q] = gx * (pk[bj, q] - pk[bi, q]) + gy * (pk[bj + 1, q] - pk[bi + 1, q])
+                _gain(pk, bi, bj, gx, gy, g)
             bent = v - gx * (g[bj] - g[bi]) - gy * (g[bj + 1] - g[bi + 1])
             v += dz[r] * dz[r] / (m * m) * dz_variance[r]
             innovation = measured[r] - m
@@ -355,26 +500,24 @@ def update(
                     g[q] += pk[e, q]
             s = v + sigma2[k]
             square = innovation * innovation
-            good = (1.0 - share) * math.exp(-0.5 * square / s) / math.sqrt(s)
+            good = (1.0 - share) * vectormath.exp(-0.5 * square / s) / math.sqrt(s)
             spread = s + wide
             side = 2.0 * (1.0 - short) if innovation > 0.0 else 2.0 * short
-            bad = share * side * math.exp(-0.5 * square / spread) / math.sqrt(spread)
+            bad = share * side * vectormath.exp(-0.5 * square / spread) / math.sqrt(spread)
             # Where both vanish, it is certainly no good one.
             both = good + bad + 1e-300
             trust = good / both
-            total += worth[r] * math.log(both)
+            evidence = vectormath.log(both)
+            total += worth[r] * evidence
             heavy = v + sigma2[k] / worth[r]
             scaled = trust * innovation / heavy
             shrink = trust / heavy * (1.0 - (1.0 - trust) * square / heavy)
             for q in range(size):
                 xk[q] += scaled * g[q]
-            for o in range(size):
-                f = shrink * g[o]
-                for q in range(size):
-                    pk[o, q] -= f * g[q]
+            _take_away(pk, g, shrink)
             stats[k, r, 0] = measured[r] - innovation
             stats[k, r, 1] = s
-            stats[k, r, 2] = math.log(both)
+            stats[k, r, 2] = evidence
             stats[k, r, 3] = trust
             kf = trust / heavy
             for part in range(3):
@@ -388,6 +531,7 @@ def update(
             _bound_sensitivity(sens[k, second[r]], pk, bj, most)
             stats[k, r, 10] = sigma2[k]
             stats[k, r, 11] = bent
+        _store(p[k], pk)
         log_weight[k] += total
 
 
