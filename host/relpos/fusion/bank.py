@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -1280,42 +1281,45 @@ class Bank:
 
     def _pair_estimates(self, mean: Floats, covariance: Floats) -> tuple[PairEstimate, ...]:
         located = sorted(self._row)
-        rows = [self._row[node] for node in located]
-        places = PER_NODE * np.repeat(np.array(rows, dtype=np.int64), 2)
-        places[1::2] += Of.Y
-        # Plain numbers: single entries of an array cost several times as much.
-        at = mean[places].tolist()
-        spread = covariance[places[:, None], places].tolist()
-        slipped = self.core.slipped
-        pairs = []
-        for n, a in enumerate(located):
-            i = 2 * n
-            x, y = at[i], at[i + 1]
-            of_x, of_y = spread[i], spread[i + 1]
-            for m in range(n + 1, len(located)):
-                b, j = located[m], 2 * m
-                if slipped and (rows[n] in slipped or rows[m] in slipped):
-                    pairs.append(
-                        self._pair_of_hypotheses(a, b, PER_NODE * rows[n], PER_NODE * rows[m])
+        rows = np.array([self._row[node] for node in located], dtype=np.int64)
+        lower, upper = _every_two(len(rows))
+        i, j = PER_NODE * rows[lower], PER_NODE * rows[upper]
+        off_x, off_y = mean[j] - mean[i], mean[j + 1] - mean[i + 1]
+        own = covariance.diagonal()
+        xx = own[i] + own[j] - 2.0 * covariance[i, j]
+        yy = own[i + 1] + own[j + 1] - 2.0 * covariance[i + 1, j + 1]
+        across_axes = covariance[:, 1:].diagonal()
+        xy = across_axes[i] + across_axes[j] - covariance[i, j + 1] - covariance[i + 1, j]
+        distance = np.hypot(off_x, off_y)
+        apart = distance > 0.0
+        squared = np.where(apart, distance * distance, 1.0)
+        along = np.where(
+            apart,
+            (off_x * off_x * xx + 2.0 * off_x * off_y * xy + off_y * off_y * yy) / squared,
+            0.5 * (xx + yy),
+        )
+        sideways = np.sqrt(np.maximum(xx + yy - along, 0.0) / squared)
+        bearing = np.where(apart, np.minimum(sideways, _ANY_ANGLE_RAD), _ANY_ANGLE_RAD)
+        pairs = list(
+            map(
+                PairEstimate,
+                [located[n] for n in lower.tolist()],
+                [located[n] for n in upper.tolist()],
+                distance.tolist(),
+                np.sqrt(np.maximum(along, 0.0)).tolist(),
+                np.arctan2(off_y, off_x).tolist(),
+                bearing.tolist(),
+            )
+        )
+        if self.core.slipped:
+            # Of these the mean of the places says nothing.
+            for n, (a, b) in enumerate(
+                zip(rows[lower].tolist(), rows[upper].tolist(), strict=True)
+            ):
+                if a in self.core.slipped or b in self.core.slipped:
+                    pairs[n] = self._pair_of_hypotheses(
+                        pairs[n].node, pairs[n].peer, PER_NODE * a, PER_NODE * b
                     )
-                    continue
-                dx, dy = at[j] - x, at[j + 1] - y
-                xx = of_x[i] + spread[j][j] - 2.0 * of_x[j]
-                yy = of_y[i + 1] + spread[j + 1][j + 1] - 2.0 * of_y[j + 1]
-                xy = of_x[i + 1] + spread[j][j + 1] - of_x[j + 1] - of_y[j]
-                distance = math.hypot(dx, dy)
-                if distance > 0.0:
-                    c, s = dx / distance, dy / distance
-                    along = c * c * xx + 2.0 * c * s * xy + s * s * yy
-                    across = xx + yy - along
-                    bearing = min(math.sqrt(max(across, 0.0)) / distance, _ANY_ANGLE_RAD)
-                else:
-                    along, bearing = 0.5 * (xx + yy), _ANY_ANGLE_RAD
-                pairs.append(
-                    PairEstimate(
-                        a, b, distance, math.sqrt(max(along, 0.0)), math.atan2(dy, dx), bearing
-                    )
-                )
         return tuple(pairs)
 
     def _pair_of_hypotheses(self, node: int, peer: int, i: int, j: int) -> PairEstimate:
@@ -1328,6 +1332,13 @@ class Bank:
         return _pair_of_pictures(
             node, peer, self.core.weights(), x[:, j : j + 2] - x[:, i : i + 2], spread
         )
+
+
+@lru_cache(maxsize=32)
+def _every_two(count: int) -> tuple[Indices, Indices]:
+    """Indices (P,), (P,) of every two of so many, the lower first."""
+    lower, upper = np.triu_indices(count, 1)
+    return lower.astype(np.int64), upper.astype(np.int64)
 
 
 def _pair_of_pictures(

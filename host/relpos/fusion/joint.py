@@ -717,8 +717,11 @@ def moments(x: Floats, p: Floats, weight: Floats, angles: Indices) -> tuple[Floa
                 off[k, q] -= mean[q]
             for o in range(size):
                 f = w * off[k, o]
-                for q in range(size):
+                # What is symmetric is read and summed but once: this is bound by memory.
+                for q in range(o + 1):
                     cov[o, q] += w * p[k, o, q] + f * off[k, q]
     for q in range(size):
         mean[q] += x[best, q]
+        for o in range(q):
+            cov[o, q] = cov[q, o]
     return mean, cov

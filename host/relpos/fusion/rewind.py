@@ -64,7 +64,7 @@ class Rewinder:
     """Feeds ``core`` from ``timeline``: measurements in, estimates out, each time only once.
 
     ``window_s`` is how late a measurement may be, ``spacing_s`` how far apart copies are where
-    things come late now and then (four times as far where nothing has for half a minute, because
+    things come late now and then (eight times as far where nothing has for half a minute, because
     copies cost, too), ``every_s`` how often it may go back. A replay does not repeat estimates
     that were given already, and those given go on in time.
     """
@@ -150,20 +150,21 @@ class Rewinder:
         self._own["rewound_steps"] += self._steps - before
 
     def _work_off(self, steps: Iterator[Step]) -> Iterator[Estimate]:
+        take = self.core.take
         for step in steps:
             self._steps += 1
-            estimate = self.core.take(step)
+            estimate = take(step)
             if estimate is not None and estimate.time_s > self._emitted_s:
                 self._emitted_s = estimate.time_s
                 yield estimate
             if isinstance(step, Epoch):
-                self._copy_if_due(self.spacing_s)
+                self._copy_if_due()
         # Without motion there are no epochs, but what is kept has to be bounded all the same.
-        self._copy_if_due(2.0 * self.spacing_s)
+        self._copy_if_due(overdue_s=self.spacing_s)
 
-    def _copy_if_due(self, spacing_s: float) -> None:
-        if self._newest_s - self._rewound_s > QUIET_S:
-            spacing_s *= 4.0
+    def _copy_if_due(self, overdue_s: float = 0.0) -> None:
+        quiet = self._newest_s - self._rewound_s > QUIET_S
+        spacing_s = self.spacing_s * (8.0 if quiet else 1.0) + overdue_s
         frontier_s = self.timeline.frontier_s
         if frontier_s == -math.inf:  # nothing was handed out yet: there is nothing to go back to
             return

@@ -129,17 +129,16 @@ def refusal(measurement: Measurement) -> str | None:
 
     DataError where a number is not finite: that is no failure of a sensor but of the source.
     """
-    numbers: tuple[float, ...]
-    match measurement:
-        case Motion():
-            numbers = (measurement.dx_m, measurement.dy_m, measurement.dtheta_rad)
-        case Range():
-            numbers = (measurement.range_m,)
-        case Height():
-            numbers = (measurement.height_m,)
-        case Heading():
-            numbers = (measurement.heading_rad,)
-    if not isfinite(measurement.time_s) or not all(map(isfinite, numbers)):
+    # A sum is finite where everything in it is, but for what overflows: that is no measurement.
+    if isinstance(measurement, Motion):
+        total = measurement.dx_m + measurement.dy_m + measurement.dtheta_rad
+    elif isinstance(measurement, Range):
+        total = measurement.range_m
+    elif isinstance(measurement, Height):
+        total = measurement.height_m
+    else:
+        total = measurement.heading_rad
+    if not isfinite(measurement.time_s + total):
         raise DataError(f"a measurement is not a finite number: {measurement}")
     if isinstance(measurement, Range):
         if measurement.range_m <= 0.0:
@@ -380,10 +379,10 @@ class Timeline:
     def _waits_for(self, time_s: float) -> bool:
         # Nothing newer than this has been sorted in, of the node waited for neither.
         sorted_s = self._newest_s - self.reorder_s
-        return any(
-            track.reported_s < time_s and sorted_s - track.reported_s <= self.max_lag_s
-            for track in self._tracks.values()
-        )
+        for track in self._tracks.values():
+            if track.reported_s < time_s and sorted_s - track.reported_s <= self.max_lag_s:
+                return True
+        return False
 
     def _closes_epoch(self, time_s: float, motions: set[int]) -> bool:
         """Whether a round of reports is complete: somebody of this round reports again."""
