@@ -665,9 +665,7 @@ def hearing(
             move, shrink = shift / sd, (1.0 - after) / v
             for q in range(size):
                 xk[q] += move * g[q]
-            for o in range(size):
-                for q in range(size):
-                    pk[o, q] -= shrink * g[o] * g[q]
+            _take_away(pk, g, shrink)
         log_weight[k] += total + weight * math.log(product)
 
 
