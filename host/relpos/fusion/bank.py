@@ -299,6 +299,7 @@ class BankCore:
         """
         if not len(rows):
             return
+        _check_rows(self.nodes, rows, rows, dx_m, dy_m, dtheta_rad, duration_s)
         told = np.full((len(rows), 3), np.nan) if sigmas is None else sigmas
         motion = np.empty((len(rows), 7))
         motion[:, 0], motion[:, 1], motion[:, 2], motion[:, 3] = dx_m, dy_m, dtheta_rad, duration_s
@@ -347,16 +348,17 @@ class BankCore:
         ``dz_m`` are the antennas' differences of height, ``dz_variance_m2`` their variances (0
         by default), ``worth`` how many independent ranges each is worth (1 by default).
         """
-        bias = self._bias_places(first, second)
         worth = np.ones(len(first)) if worth is None else worth
-        stats = np.empty((self.count, len(first), 12))
+        dz_variance_m2 = np.zeros(len(first)) if dz_variance_m2 is None else dz_variance_m2
+        _check_rows(self.nodes, first, second, range_m, dz_m, dz_variance_m2, worth)
+        bias = self._bias_places(first, second)
+        stats = np.empty((self.count, len(first), joint.STATS))
         before = self.log_weight.copy()
         outlier = np.array([self.outlier_share, self.settings.outlier_m**2,
                             self.settings.outliers_short, 1.0 / (1.0 - self._sampled)])  # fmt: skip
         joint.update(
             self.x, self.p, self.log_weight, self.sigma2, self.sens, first, second, bias,
-            range_m, dz_m, outlier, PER_NODE * self.nodes, worth,
-            np.zeros(len(first)) if dz_variance_m2 is None else dz_variance_m2,
+            range_m, dz_m, outlier, PER_NODE * self.nodes, worth, dz_variance_m2,
             self.arm if self.arm.any() else self.arm[:0], stats,
         )  # fmt: skip
         # Those who have just jumped would make any innovation look usual.
@@ -377,9 +379,11 @@ class BankCore:
         self._spread_levels()
         self.outlier_counts *= 0.998 ** len(first)
         self.outlier_counts += (float((1.0 - good).sum()), float(good.sum()))
-        for row, peer, trust in zip(first, second, good, strict=True):
+        surprise = self.surprise.tolist()
+        for row, peer, trust in zip(first.tolist(), second.tolist(), good.tolist(), strict=True):
             for one in (row, peer):
-                self.surprise[one] += 0.2 * (1.0 - trust - self.surprise[one])
+                surprise[one] += 0.2 * (1.0 - trust - surprise[one])
+        self.surprise[:] = surprise
         if slipped is not None and self.count > 1:
             self._alarm = (slipped, first, second, range_m)
         return good
@@ -485,13 +489,16 @@ class BankCore:
         of the common one. Where there are too many pairs, only the common one is modelled.
         """
         common = PER_NODE * self.nodes
-        places = np.empty(len(first), dtype=np.int64)
+        places = np.full(len(first), common, dtype=np.int64)
+        if not self.has_bias.any():
+            return places
         for r, (a, b) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
             pair = (a, b) if a < b else (b, a)
             place = self.biases.get(pair)
-            if place is None and self.nodes <= PAIR_BIASES and self.has_bias.any():
+            if place is None and self.nodes <= PAIR_BIASES:
                 place = self._add_bias(pair)
-            places[r] = common if place is None else place
+            if place is not None:
+                places[r] = place
         return places
 
     def _add_bias(self, pair: tuple[int, int]) -> int:
@@ -708,6 +715,16 @@ HEADING_OUTLIERS = 0.1
 HEADING_OUTLIER_RAD = 1.0
 HEADING_SIGMA_RAD = 0.17
 """Of an absolute heading that brings no sigma: magnetic ones indoors are 10 degrees off."""
+
+
+def _check_rows(nodes: int, first: Indices, second: Indices, *values: Floats) -> None:
+    """Raise ``IndexError`` or ``ValueError``: kernels look at no bounds."""
+    for rows in (first, second):
+        if rows.size and (min(rows.tolist()) < 0 or max(rows.tolist()) >= nodes):
+            raise IndexError(f"rows {rows.tolist()} of a bank of {nodes} users")
+    for array in (second, *values):
+        if array.shape != first.shape:
+            raise ValueError(f"array of shape {array.shape} for {len(first)} rows")
 
 
 def systematic(weight: Floats, count: int, rng: np.random.Generator) -> Indices:

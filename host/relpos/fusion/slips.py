@@ -112,15 +112,18 @@ class Watch:
         is, ``outliers`` the share of outliers as far as is known. Be ``wary`` for a while after a
         slip: what was found then may have been the wrong place.
         """
-        ratio = square / min(max(float(self.base[0]), BASE_LEAST), BASE_MOST)
-        delta = 0.5 * (ratio * (1.0 - 1.0 / GROWN) - math.log(GROWN))
+        usual = min(max(float(self.base[0]), BASE_LEAST), BASE_MOST)
+        rise, fall = 0.5 * (1.0 - 1.0 / GROWN) / usual, 0.5 * math.log(GROWN)
         # The filter whitens what repeats itself but for those who stand.
-        delta = np.minimum(delta, CLIP) * np.minimum(3.0 * worth, 1.0) - CLIP * outliers
+        delta = [
+            min(rise * one - fall, CLIP) * min(3.0 * weight, 1.0) - CLIP * outliers
+            for one, weight in zip(square.tolist(), worth.tolist(), strict=True)
+        ]
         if self.sums.max(initial=0.0) < 0.25 * ALARM:
             for one in square.tolist():
                 self.base[0] += BASE_SHARE * (min(one, 4.0) - self.base[0])
         own: dict[int, list[float]] = {}
-        for row, peer, one in zip(first.tolist(), second.tolist(), delta.tolist(), strict=True):
+        for row, peer, one in zip(first.tolist(), second.tolist(), delta, strict=True):
             own.setdefault(row, []).append(one)
             own.setdefault(peer, []).append(one)
         for row, those in own.items():
