@@ -8,6 +8,8 @@ import pytest
 from relpos import fusion
 from relpos.errors import RelposError
 from relpos.evaluation import metrics, tracks
+from relpos.fusion.bank import BankCore
+from relpos.fusion.bank_settings import BankSettings
 from relpos.fusion.estimator import Estimate
 from relpos.simulation.paper import simulate_paper
 
@@ -62,3 +64,16 @@ def test_the_same_seed_gives_the_same_estimates() -> None:
 def test_a_run_without_motion_is_refused() -> None:
     with pytest.raises(RelposError, match="no motion"):
         fusion.make("bank").finish()
+
+
+def test_arrays_that_do_not_fit_are_refused_before_a_kernel_reads_them() -> None:
+    core = BankCore(BankSettings(hypotheses=2), 0)
+    for x_m in (0.0, 3.0):
+        core.add_node(x_m, 0.0, 0.0, 0.1, 0.1)
+    one, two = np.ones(1), np.ones(2)
+    with pytest.raises(ValueError, match="shape"):
+        core.update(np.array([0]), np.array([1]), one, two)
+    with pytest.raises(IndexError, match="2 users"):
+        core.update(np.array([0]), np.array([2]), one, one)
+    with pytest.raises(IndexError, match="2 users"):
+        core.advance(np.array([-1]), one, one, one, one)
