@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import RelposError
-from relpos.fusion import joint, noise
+from relpos.fusion import hypotheses, joint, noise
 from relpos.fusion.ambiguity import believe, pictures
 from relpos.fusion.bank_settings import BankSettings
 from relpos.fusion.detection import STEP_M, Detection, Round
@@ -127,6 +127,8 @@ class BankCore:
         """Row -> how badly its place (m) and heading (rad) are known, till it is ranged."""
         self.since_slip = 0
         """Instants of ranges since the last alarm."""
+        self.unambiguous = 0
+        """For so many instants of ranges the picture has been so."""
         self._alarm: tuple[int, Indices, Indices, Floats] | None = None
         self.outlier_counts: Floats = np.array([settings.outliers, 1.0 - settings.outliers]) * 20.0
 
@@ -212,6 +214,7 @@ class BankCore:
         of user 1, ...; ``log_weights`` (H,). The K hypotheses (levels of noise, constants) are
         dealt out over them by weight, each H at least once where H <= K.
         """
+        self.grow()
         share = np.exp(log_weights - log_weights.max())
         share /= share.sum()
         given = len(share)
@@ -245,6 +248,7 @@ class BankCore:
         are dealt out by weight, independently of what they say of the others. Where the places
         were found relative to the others, their errors have the error of user ``beside`` in them.
         """
+        self.grow()
         share = np.exp(log_weights - log_weights.max())
         share /= share.sum()
         chosen = self.rng.permutation(systematic(share, self.count, self.rng))
@@ -271,6 +275,7 @@ class BankCore:
 
         ``moved_m`` is how far the user has gone without one.
         """
+        self.grow()
         order = self.rng.permutation(self.count)
         at = PER_NODE * row
         width = _TWO_PI / self.count
@@ -339,11 +344,14 @@ class BankCore:
             self.x[some, PER_NODE * row + Of.HEADING] += MISJUDGED_RAD * self.rng.standard_normal(
                 some.size
             )
+            # They would make any innovation look usual, and any picture ambiguous.
+            self.doubtful[some] = DOUBT_UPDATES
 
     @property
     def _sampled(self) -> float:
         """Share of the heading noise that is drawn; one hypothesis alone draws none."""
-        return min(self.settings.sampled, 0.9) if self.count > 1 else 0.0
+        s = self.settings
+        return hypotheses.sampled_share(s.sampled, self.count, s.hypotheses)
 
     def update(
         self,
@@ -395,7 +403,7 @@ class BankCore:
             for one in (row, peer):
                 surprise[one] += 0.2 * (1.0 - trust - surprise[one])
         self.surprise[:] = surprise
-        if slipped is not None and self.count > 1:
+        if slipped is not None and self.settings.hypotheses > 1:
             self._alarm = (slipped, first, second, range_m)
         return good
 
@@ -404,6 +412,7 @@ class BankCore:
 
         What is lost altogether (:mod:`relpos.fusion.slips`) is sought when it is ranged next.
         """
+        self.grow()
         at = PER_NODE * row
         self.x[:, at : at + 2] += (
             math.sqrt(0.5) * sigma_m * self.rng.standard_normal((self.count, 2))
@@ -416,7 +425,7 @@ class BankCore:
         self.doubtful[:] = SLIP_UPDATES
         before = self.unplaced.get(row, (0.0, 0.0))
         total = math.hypot(sigma_m, before[0]), math.hypot(sigma_rad, before[1])
-        if self.count > 1 and (total[0] > LOST_M or total[1] > LOST_RAD):
+        if self.settings.hypotheses > 1 and (total[0] > LOST_M or total[1] > LOST_RAD):
             self.unplaced[row] = total
             self.slipped.add(row)
 
@@ -443,6 +452,7 @@ class BankCore:
         All of them, where place or heading or both are known to be ``lost``.
         """
         self.since_slip = 0
+        self.grow()
         # Of two alone either may be the one: what is between them is doubted in the same way.
         self.slipped.update([row] if self.nodes > 2 or lost else range(self.nodes))
         self.resample(self.weights(), max(self.count, HYPOTHESES))
@@ -565,6 +575,7 @@ class BankCore:
 
     def settle(self) -> None:
         """Close an epoch: jumps, and resampling where the weights have become uneven."""
+        self._resize()
         weight = self.weights()
         self.since_slip += 1
         closed = not self.slipped or self.since_slip > OPEN_UPDATES
@@ -614,14 +625,114 @@ class BankCore:
         self.level = np.ascontiguousarray(self.level)
         self.sigma2 = np.ascontiguousarray(every[:, -1])
 
+    @property
+    def _usual_surprise(self) -> float:
+        # Where outliers are common, it takes more of them to doubt a user.
+        return max(0.15, 2.2 * self.outlier_share)
+
+    # -- how many (relpos.fusion.hypotheses) ---------------------------------------------------
+
+    def _resize(self) -> None:
+        """Shrink where the picture has been unambiguous for a while; grow where it is not."""
+        if self.settings.hypotheses == 1 or not self.nodes:
+            return
+        mean, covariance = self._undoubted_moments()
+        sigmas = np.exp(0.5 * self.levels.mean)
+        metre = math.sqrt(noise.ALONG_M2_M) * sigmas[noise.ALONG : -1 : noise.LEVELS]
+        bend = hypotheses.bend(mean, covariance, float(sigmas[-1]), metre)
+        open_ = bool(
+            self._alarm or self.slipped or self.unplaced
+            or self.surprise.max(initial=0.0) > self._usual_surprise
+        )  # fmt: skip
+        if open_ or bend > hypotheses.BENT:
+            self.unambiguous = 0
+            self.grow()
+        elif bend > hypotheses.FLAT or not self._is_even(covariance):
+            self.unambiguous = 0
+        else:
+            self.unambiguous += 1
+            fewer = [n for n in hypotheses.STEPS if n < self.count]
+            if fewer and self.unambiguous >= hypotheses.HELD:
+                self.unambiguous = 0
+                self._shrink(fewer[0])
+
+    def _is_even(self, covariance: Floats) -> bool:
+        """Whether the hypotheses are one cloud: no few of them count, and none lie far apart."""
+        if self.count == 1:
+            return True
+        weight = self.weights()
+        if 1.0 / float(weight @ weight) < hypotheses.EVEN * self.count:
+            return False
+        if float(weight @ (self.doubtful > 0.0)) > hypotheses.DOUBTED:
+            return False
+        for has in (self.has_constants, self.has_bias):
+            share = float(weight @ has)
+            if min(share, 1.0 - share) > hypotheses.UNDECIDED:
+                return False
+        if float(self.levels.covariance[-1, -1]) > hypotheses.KNOWN**2:
+            return False
+        poses = PER_NODE * np.arange(self.nodes)[:, None] + np.arange(3)
+        weight = weight * np.where(self.doubtful > 0.0, math.exp(-DOUBTERS), 1.0)
+        weight /= weight.sum()
+        within = weight @ self.p.diagonal(axis1=1, axis2=2)[:, poses.ravel()]
+        between = covariance.diagonal()[poses.ravel()] - within
+        drawn = self._sampled / (1.0 - self._sampled)
+        return bool((between <= hypotheses.APART * drawn * within + 1e-6).all())
+
+    def _undoubted_moments(self) -> tuple[Floats, Floats]:
+        """As ``moments``, without those who doubt: they are no part of the picture."""
+        log_weight = self.log_weight - np.where(self.doubtful > 0.0, DOUBTERS, 0.0)
+        weight: Floats = np.exp(log_weight - log_weight.max())
+        angles = PER_NODE * np.arange(self.nodes, dtype=np.int64) + Of.HEADING
+        return joint.moments(self.x, self.p, weight / weight.sum(), angles)
+
+    def grow(self) -> None:
+        """Have as many hypotheses as may be: fewer are copied, and their headings drawn."""
+        most = self.settings.hypotheses
+        if self.count >= most:
+            return
+        share = hypotheses.sampled_share(self.settings.sampled, most, most) - self._sampled
+        self.resample(self.weights(), most)
+        self.draw = self.rng.standard_normal(self.draw.shape)
+        self._spread_levels()
+        angles = PER_NODE * np.arange(self.nodes, dtype=np.int64) + Of.HEADING
+        self.x, self.p = hypotheses.parted(self.x, self.p, angles, share, self.rng)
+        self.counters["hypotheses_grown"] += 1
+
+    def _shrink(self, count: int) -> None:
+        """Go on with fewer hypotheses, the mixture's moments unchanged."""
+        mean, covariance = self._undoubted_moments()
+        self.log_weight -= np.where(self.doubtful > 0.0, DOUBTERS, 0.0)
+        angles = PER_NODE * np.arange(self.nodes, dtype=np.int64) + Of.HEADING
+        before, weight = self._sampled, self.weights()
+        sens = np.tensordot(weight, self.sens, axes=1)
+        chosen = systematic(weight, count, self.rng)
+        x = self.x
+        self.x = x[:count]
+        after = self._sampled
+        self.x, p = hypotheses.thinned(
+            x, mean, covariance, chosen, angles, after / before if before else 0.0
+        )
+        self.p = np.repeat(p[None], count, axis=0)
+        constants, bias = self.has_constants.any(), self.has_bias.any()
+        self._permute_parameters(chosen)
+        self.sens = np.repeat(sens[None], count, axis=0)
+        self.doubtful = np.zeros(count)
+        # The moments have something of the constants wherever any hypothesis has.
+        self.has_constants = np.full(count, float(constants))
+        self.has_bias = np.full(count, float(bias))
+        if count == 1:
+            self.draw = np.zeros_like(self.draw)
+        self._spread_levels()
+        self.log_weight = np.zeros(count)
+        self.counters["hypotheses_shrunk"] += 1
+
     def _jump(self) -> None:
         """Let some hypotheses doubt a user's pose; the more, the worse its ranges fit."""
         s = self.settings
         if not self.nodes or self.count < 2:
             return
-        # Where outliers are common, it takes more of them to doubt a user.
-        usual = max(0.15, 2.2 * self.outlier_share)
-        doubt = np.clip((self.surprise - usual) / 0.35, 0.0, 1.0)
+        doubt = np.clip((self.surprise - self._usual_surprise) / 0.35, 0.0, 1.0)
         rate = s.jumps / self.nodes + (s.jumps_most - s.jumps / self.nodes) * doubt
         total = float(rate.sum())
         which = np.flatnonzero(self.rng.random(self.count) < total)
@@ -653,7 +764,7 @@ class BankCore:
                 self.watch.base,
             )),
             self.rng.bit_generator.state,
-            (self.nodes, self.since_slip, *self.slipped),
+            (self.nodes, self.since_slip, self.unambiguous, *self.slipped),
             dict(self.biases),
             dict(self.counters),
             dict(self.unplaced),
@@ -670,8 +781,9 @@ class BankCore:
         ) = (a.copy() for a in snapshot.arrays)  # fmt: skip
         self.rng.bit_generator.state = dict(snapshot.random)
         self.nodes = self.levels.nodes = int(snapshot.numbers[0])
-        self.slipped = {int(row) for row in snapshot.numbers[2:]}
+        self.slipped = {int(row) for row in snapshot.numbers[3:]}
         self.since_slip = int(snapshot.numbers[1])
+        self.unambiguous = int(snapshot.numbers[2])
         self.biases = dict(snapshot.biases)
         self.counters = Counter(snapshot.counters)
         self.unplaced = dict(snapshot.unplaced)
@@ -727,6 +839,9 @@ where it does not happen, 0.192 and 0.195."""
 STRAIGHT_S = 10.0
 """After going straight for so long. Without it, robots that turn every second (exp3, exp4 of
 `two_robots_vio`) lost 0.08 and 0.10 m of 0.15."""
+
+DOUBTERS = 20.0
+"""Log likelihood that is taken from those who doubt where they do not count."""
 
 HEADING_OUTLIERS = 0.1
 HEADING_OUTLIER_RAD = 1.0
@@ -963,6 +1078,7 @@ class Bank:
                 continue
             if self.habit.is_odd(a.node, math.hypot(a.dx_m, a.dy_m), a.duration_s, a.fraction):
                 self._make(rows, moves, told, slice(begin, k))
+                self.core.grow()
                 at = PER_NODE * int(rows[k])
                 east, north = self.core.x[:, at].copy(), self.core.x[:, at + 1].copy()
                 self._make(rows, moves, told, slice(k, k + 1))

@@ -1,0 +1,143 @@
+"""How many hypotheses the bank carries: one where one is enough, more where it is not."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from relpos.evaluation import metrics, tracks
+from relpos.fusion import hypotheses
+from relpos.fusion.bank import Bank, BankCore
+from relpos.fusion.bank_settings import BankSettings
+from relpos.fusion.estimator import Estimate
+from relpos.fusion.joint import PER_NODE, Of
+from relpos.simulation.paper import simulate_paper
+
+GOOD = {"heading_noise_deg": 0.3, "turn_noise": 0.0, "distance_noise_scale": 0.16}
+"""Turn noise 0.3 deg a second, 2 % of the way; ranges of 0.1 m in ``paper-p1``."""
+
+
+def _run(
+    scenario: str, overrides: dict[str, float], seed: int = 0
+) -> tuple[list[Estimate], list[int], Bank, metrics.Metrics]:
+    run = simulate_paper(scenario, seed, overrides)
+    bank = Bank(run.priors, seed=seed)
+    estimates: list[Estimate] = []
+    counts = []
+    for measurement in run.measurements:
+        made = bank.process(measurement)
+        counts += [bank.core.count] * len(made)
+        estimates += made
+    estimates += bank.finish()
+    figures = metrics.evaluate(
+        tracks.estimated_tracks(estimates),
+        tracks.true_tracks(run.truth),
+        tracks.estimated_pairs(estimates),
+    )
+    return estimates, counts, bank, figures
+
+
+def test_a_good_team_is_followed_by_one_hypothesis_and_as_well() -> None:
+    estimates, counts, bank, figures = _run("paper-p1", {**GOOD, "seconds": 400.0})
+    assert counts[-1] == 1
+    assert np.mean(np.array(counts) == 1) > 0.15
+    assert bank.counters()["hypotheses_shrunk"] >= len(hypotheses.STEPS)
+    # 0.109 m with 200 throughout (600 s).
+    assert figures.relative_distance_rmse_m < 0.125
+    again, _, _, _ = _run("paper-p1", {**GOOD, "seconds": 400.0})
+    assert [e.nodes for e in again] == [e.nodes for e in estimates]
+
+
+def test_a_team_whose_headings_are_poor_keeps_all_of_them() -> None:
+    _, counts, bank, _ = _run("paper-h", {"seconds": 200.0})
+    assert min(counts) == BankSettings().hypotheses
+    assert bank.counters().get("hypotheses_shrunk", 0) == 0
+
+
+def test_one_hypothesis_becomes_many_when_somebody_is_carried_off() -> None:
+    _, counts, bank, figures = _run(
+        "paper-p1", {**GOOD, "seconds": 500.0, "kidnap_m": 5.0, "kidnap_s": 380.0}
+    )
+    assert counts[375] == 1
+    assert max(counts[380:400]) >= BankSettings().hypotheses
+    assert bank.counters()["hypotheses_grown"] >= 1
+    assert figures.relative_distance_rmse_m < 0.35
+
+
+def test_fewer_hypotheses_have_the_moments_that_the_many_had() -> None:
+    rng = np.random.default_rng(1)
+    x = rng.standard_normal((200, 6))
+    x[:, 2] += 3.1  # a heading across the cut
+    mean = x.mean(axis=0)
+    covariance = np.eye(6) + np.cov(x.T, bias=True)
+    for count, kept in ((50, 0.7), (10, 0.3), (1, 0.0)):
+        chosen = np.arange(count) * (200 // count)
+        fewer, p = hypotheses.thinned(x, mean, covariance, chosen, np.array([2]), kept)
+        assert len(fewer) == count
+        np.testing.assert_allclose(fewer.mean(axis=0), mean, atol=1e-9)
+        np.testing.assert_allclose(p + np.cov(fewer.T, bias=True), covariance, atol=1e-9)
+        assert np.linalg.eigvalsh(p)[0] > 0.0
+
+
+def test_drawn_headings_take_their_part_out_of_the_covariance() -> None:
+    rng = np.random.default_rng(2)
+    root = rng.standard_normal((6, 6))
+    covariance = root @ root.T
+    x, p = hypotheses.parted(
+        np.zeros((200, 6)), np.repeat(covariance[None], 200, axis=0), np.array([2, 5]), 0.5, rng
+    )
+    np.testing.assert_allclose(p[0] + np.cov(x.T, bias=True), covariance, atol=1e-6)
+    np.testing.assert_allclose(p[0][[2, 5]], 0.5 * covariance[[2, 5]], atol=1e-6)
+
+
+def test_the_bend_of_an_arc_is_its_sagitta() -> None:
+    # Two users 2 m apart, the second's place 0.4 m uncertain across: 0.4^2 / 4 = 0.04 m.
+    mean = np.zeros(2 * PER_NODE)
+    mean[PER_NODE] = 2.0
+    covariance = np.zeros((2 * PER_NODE, 2 * PER_NODE))
+    covariance[PER_NODE + Of.Y, PER_NODE + Of.Y] = 0.4**2
+    metre = np.full(2, 0.06)
+    assert np.isclose(hypotheses.bend(mean, covariance, 0.1, metre), 0.4)
+    # A metre at a heading 0.3 rad uncertain is 0.045 m shorter.
+    covariance[Of.HEADING, Of.HEADING] = 0.09
+    assert np.isclose(hypotheses.bend(mean, covariance, 1.0, metre), 0.75)
+
+
+def _epochs(core: BankCore, first: int, count: int) -> None:
+    """Three who walk in parallel and range each other."""
+    pair = np.array([0, 0, 1]), np.array([1, 2, 2])
+    places = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 3.0]])
+    distance = np.hypot(*(places[pair[0]] - places[pair[1]]).T)
+    noise_m = 0.1 * np.random.default_rng(9).standard_normal((first + count, 3))
+    for k in range(first, first + count):
+        turned = 0.6 * float(np.sin(0.3 * k))
+        core.advance(
+            np.arange(3), np.full(3, 0.5), np.zeros(3), np.full(3, turned), np.ones(3),
+            np.tile([0.02, 0.02, 0.005], (3, 1)),
+        )  # fmt: skip
+        core.update(*pair, distance + noise_m[k], np.zeros(3))
+        core.settle()
+
+
+def test_a_snapshot_is_exact_across_a_change_of_number() -> None:
+    core = BankCore(BankSettings(), seed=4)
+    for x_m, y_m in ((0.0, 0.0), (4.0, 0.0), (0.0, 3.0)):
+        core.add_node(x_m, y_m, 0.0, 0.01, 0.01)
+    many = core.snapshot()
+    _epochs(core, 0, 200)
+    assert core.count == 1
+    few, expected = core.snapshot(), core.moments()
+    core.restore(many)
+    assert core.count == 200
+    _epochs(core, 0, 200)
+    for got, wanted in zip(core.moments(), expected, strict=True):
+        np.testing.assert_array_equal(got, wanted)
+    core.grow()
+    assert core.count == 200
+    grown = core.moments()
+    for got, wanted in zip(grown, expected, strict=True):
+        np.testing.assert_allclose(got, wanted, atol=1e-5)
+    core.restore(few)
+    assert core.count == 1
+    core.grow()
+    for got, wanted in zip(core.moments(), grown, strict=True):
+        np.testing.assert_array_equal(got, wanted)
