@@ -125,9 +125,29 @@ def body_error_m(e: Estimate, truth: dict[int, list[tuple[complex, float]]], nod
     return float(abs(seen - (its - mine) * np.exp(-1j * heading)))
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_heading_that_slips_is_said_and_found_again(seed: int) -> None:
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_a_heading_that_slips_is_found_again_within_twenty_seconds(seed: int) -> None:
     measurements, priors, truth = slipping_run(60.0, 140, seed)
+    bank = fusion.make("bank", priors, {}, seed)
+    estimates = [e for m in measurements for e in bank.process(m)] + bank.finish()
+    whole = [e for e in estimates if e.time_s == round(e.time_s) and e.time_s < 139]
+    before = [body_error_m(e, truth, 3) for e in whole if 30 <= e.time_s < 60]
+    after = [body_error_m(e, truth, 3) for e in whole if e.time_s >= 80]
+    assert np.median(before) < 0.6
+    assert np.median(after) < 1.0
+    # Hypotheses that took the slip for a turn may find the heading before any alarm.
+    doubted = [
+        e.time_s
+        for e in estimates
+        for n in e.nodes
+        if n.node == 3 and n.status is NodeStatus.AMBIGUOUS
+    ]
+    assert bool(doubted) == (bank.counters().get("slips", 0) > 0)
+
+
+@pytest.mark.parametrize("seed", [1, 4])
+def test_a_heading_slip_that_no_hypothesis_foresaw_is_said(seed: int) -> None:
+    measurements, priors, _ = slipping_run(60.0, 140, seed)
     bank = fusion.make("bank", priors, {}, seed)
     estimates = [e for m in measurements for e in bank.process(m)] + bank.finish()
     assert bank.counters()["slips"] >= 1
@@ -137,15 +157,9 @@ def test_a_heading_that_slips_is_said_and_found_again(seed: int) -> None:
         for n in e.nodes
         if n.node == 3 and n.status is NodeStatus.AMBIGUOUS
     ]
-    assert doubted
     assert 60.0 <= doubted[0] < 80.0
     listed = next(e for e in estimates if e.time_s == doubted[0]).alternatives
     assert sum(a.probability for a in listed if a.node == 3) == pytest.approx(1.0)
-    whole = [e for e in estimates if e.time_s == round(e.time_s) and e.time_s < 139]
-    before = [body_error_m(e, truth, 3) for e in whole if 30 <= e.time_s < 60]
-    after = [body_error_m(e, truth, 3) for e in whole if e.time_s >= 100]
-    assert np.median(before) < 0.6
-    assert np.median(after) < 1.0
 
 
 def test_noise_of_a_standing_sensor_is_told_from_slow_motion() -> None:
