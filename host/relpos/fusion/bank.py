@@ -24,16 +24,18 @@ from relpos.fusion.ambiguity import believe, pictures
 from relpos.fusion.bank_settings import BankSettings
 from relpos.fusion.detection import STEP_M, Detection, Round
 from relpos.fusion.estimator import (
-    LOST_EPOCHS,
-    STALE_EPOCHS,
     Alternative,
     Estimate,
     NodeEstimate,
     NodeStatus,
     PairEstimate,
     Parameter,
+    Presence,
+    refuse_unmoved,
+    refuse_unranged,
 )
 from relpos.fusion.joint import PER_NODE, Of
+from relpos.fusion.motion_model import told_sigmas
 from relpos.fusion.ranging_model import Mounting, Repetition
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.slips import (
@@ -869,15 +871,11 @@ def systematic(weight: Floats, count: int, rng: np.random.Generator) -> Indices:
 
 
 @dataclass(slots=True)
-class _Known:
+class _Known(Presence):
     """What is kept of a node beside its hypotheses."""
 
     worn_m: float = 0.0
     """Height of the tag over the floor at the start."""
-    height_m: float = 0.0
-    sigma_height_m: float = 0.0
-    news_s: float = -math.inf
-    silent_epochs: int = 0
     drifted_s: float = -math.inf
     """Until then it was tracked by ranges alone."""
 
@@ -963,14 +961,8 @@ class Bank:
     def finish(self) -> list[Estimate]:
         """Work off what waits; RelposError where the run cannot give relative positions."""
         estimates = self._feed.finish()
-        if not self._moved:
-            raise RelposError("no motion was received: nothing can be estimated")
-        if not self._ranges_used:
-            failed = self._feed.counters()["ranges_failed"]
-            raise RelposError(
-                f"no usable range ({failed} failed ones): relative positions cannot be fused; "
-                "from known starts --estimator deadreckoning still works"
-            )
+        refuse_unmoved(self._moved)
+        refuse_unranged(self._ranges_used, self._feed.counters())
         return estimates
 
     def counters(self) -> Mapping[str, int]:
@@ -986,7 +978,7 @@ class Bank:
             case Advance():
                 self._moved = True
                 known = self._meet(step.node)
-                known.news_s = max(known.news_s, step.time_s)
+                known.heard(step.time_s)
                 self.repetition.move(step.node, step.dx_m, step.dy_m, step.dtheta_rad)
                 if step.node in self._row:
                     self._pending.append(step)
@@ -1058,7 +1050,7 @@ class Bank:
         moves = np.array([(a.dx_m, a.dy_m, a.dtheta_rad, a.duration_s) for a in steps])
         told = None
         if any(a.sigma_x_m is not None or a.sigma_theta_rad is not None for a in steps):
-            told = np.array([_told(a) for a in steps])
+            told = np.array([told_sigmas(a) for a in steps])
         begin = 0
         for k, a in enumerate(steps):
             drifted_s = self._known[a.node].drifted_s
@@ -1099,7 +1091,7 @@ class Bank:
         for r in step.ranges:
             for node in (r.node, r.peer):
                 known = self._meet(node)
-                known.news_s = max(known.news_s, step.time_s)
+                known.heard(step.time_s)
                 if node not in self._row:
                     self._seek(node)
         if self.starts:
@@ -1262,7 +1254,7 @@ class Bank:
 
     def _estimate(self, time_s: float) -> Estimate:
         for known in self._known.values():
-            known.silent_epochs = 0 if known.news_s > self._epoch_s else known.silent_epochs + 1
+            known.close_epoch(self._epoch_s)
         self._epoch_s = time_s
         mean, covariance = self.core.moments()
         if self.core.slipped:
@@ -1342,7 +1334,7 @@ class Bank:
         )  # fmt: skip
 
     def _status(self, known: _Known, row: int) -> NodeStatus:
-        status = _status(known)
+        status = known.status
         if status is NodeStatus.OK and row in self.core.slipped:
             return NodeStatus.AMBIGUOUS
         return status
@@ -1359,7 +1351,7 @@ class Bank:
         belief = believe(
             mixture.weights, mixture.poses[:, n], mixture.covariances[:, own, own], mixture.best
         )
-        status = _status(known)
+        status = known.status
         if status is NodeStatus.OK and node not in self.starts.settled:
             status = NodeStatus.AMBIGUOUS
         spread = belief.covariance_m2
@@ -1516,24 +1508,9 @@ def _pair_of_pictures(
 
 def _vagueness(step: Advance) -> tuple[float, float] | None:
     """Standard deviations (m, rad) of a piece whose report says to know next to nothing."""
-    sigma_m, _, sigma_rad = (0.0 if math.isnan(s) else s for s in _told(step))
+    sigma_m, _, sigma_rad = (0.0 if math.isnan(s) else s for s in told_sigmas(step))
     sigma_m = min(sigma_m, step.sigma_y_m or 0.0)
     whole = math.sqrt(max(step.fraction, 1e-9))
     if sigma_m / whole > VAGUE_M or sigma_rad / whole > LOST_RAD:
         return sigma_m, sigma_rad
     return None
-
-
-def _told(step: Advance) -> tuple[float, float, float]:
-    alone = step.sigma_x_m if step.sigma_x_alone_m is None else step.sigma_x_alone_m
-    return (
-        math.nan if alone is None else alone,
-        math.nan if step.sigma_y_m is None else step.sigma_y_m,
-        math.nan if step.sigma_theta_rad is None else step.sigma_theta_rad,
-    )
-
-
-def _status(known: _Known) -> NodeStatus:
-    if known.silent_epochs >= LOST_EPOCHS:
-        return NodeStatus.LOST
-    return NodeStatus.STALE if known.silent_epochs >= STALE_EPOCHS else NodeStatus.OK

@@ -17,12 +17,12 @@ import numpy.typing as npt
 
 from relpos.errors import RelposError
 from relpos.fusion.estimator import (
-    LOST_EPOCHS,
-    STALE_EPOCHS,
     Estimate,
     NodeEstimate,
     NodeStatus,
+    Presence,
     pairs_of,
+    refuse_unmoved,
 )
 from relpos.fusion.settings import setting
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Timeline
@@ -46,10 +46,7 @@ class _Node:
     heading_rad: float
     covariance: Floats
     placed: bool
-    height_m: float = 0.0
-    sigma_height_m: float = 0.0
-    news_s: float = -math.inf
-    silent_epochs: int = 0
+    presence: Presence = field(default_factory=Presence)
 
     def move(self, step: Advance) -> None:
         c, s = math.cos(self.heading_rad), math.sin(self.heading_rad)
@@ -105,8 +102,7 @@ class DeadReckoning:
     def finish(self) -> list[Estimate]:
         """Work off what waits; RelposError where not two nodes have a place."""
         estimates = self._work_off(self._timeline.finish())
-        if not self._moved:
-            raise RelposError("no motion was received: nothing can be estimated")
+        refuse_unmoved(self._moved)
         if len(self._nodes) > 1 and not any(node.placed for node in self._nodes.values()):
             raise RelposError(
                 "dead reckoning alone cannot tell relative positions from unknown starts: "
@@ -129,13 +125,13 @@ class DeadReckoning:
                 case Advance():
                     self._moved = True
                     node = self._nodes[step.node]
-                    node.news_s = max(node.news_s, step.time_s)
+                    node.presence.heard(step.time_s)
                     node.move(step)
                 case Ranging():
                     self._own["ranges_unused"] += len(step.ranges)
                 case Sensed(measurement=Height() as height):
-                    self._nodes[height.node].height_m = height.height_m
-                    self._nodes[height.node].sigma_height_m = height.sigma_m or 0.0
+                    self._nodes[height.node].presence.height_m = height.height_m
+                    self._nodes[height.node].presence.sigma_height_m = height.sigma_m or 0.0
                 case Sensed():
                     self._own["headings_unused"] += 1
                 case Epoch():
@@ -146,22 +142,15 @@ class DeadReckoning:
         nodes = []
         for name in sorted(self._nodes):
             node = self._nodes[name]
-            node.silent_epochs = 0 if node.news_s > self._epoch_s else node.silent_epochs + 1
+            node.presence.close_epoch(self._epoch_s)
             p = node.covariance
             nodes.append(
                 NodeEstimate(
                     name, node.x_m, node.y_m, math.remainder(node.heading_rad, 2.0 * math.pi),
                     float(p[0, 0]), float(p[1, 1]), float(p[0, 1]), math.sqrt(float(p[2, 2])),
-                    _status(node), node.height_m, node.sigma_height_m,
+                    node.presence.status if node.placed else NodeStatus.UNLOCATED,
+                    node.presence.height_m, node.presence.sigma_height_m,
                 )
             )  # fmt: skip
         self._epoch_s = time_s
         return Estimate(time_s, tuple(nodes), pairs_of(nodes))
-
-
-def _status(node: _Node) -> NodeStatus:
-    if not node.placed:
-        return NodeStatus.UNLOCATED
-    if node.silent_epochs >= LOST_EPOCHS:
-        return NodeStatus.LOST
-    return NodeStatus.STALE if node.silent_epochs >= STALE_EPOCHS else NodeStatus.OK

@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from math import atan2, hypot, pi, sqrt
+from math import atan2, hypot, inf, pi, sqrt
 from typing import Protocol, runtime_checkable
 
+from relpos.errors import RelposError
 from relpos.measurements import Measurement
 
 
@@ -163,6 +164,46 @@ MAX_ALTERNATIVES = 16
 STALE_EPOCHS = 3
 LOST_EPOCHS = 10
 """Without news for so many epochs a node is ``stale``, then ``lost`` (run format, "Out")."""
+
+
+@dataclass(slots=True)
+class Presence:
+    """What every estimator keeps of a node beside its pose: its height, and when it was heard."""
+
+    height_m: float = 0.0
+    sigma_height_m: float = 0.0
+    news_s: float = -inf
+    silent_epochs: int = 0
+
+    def heard(self, time_s: float) -> None:
+        """Note that the node reported motion up to ``time_s``."""
+        self.news_s = max(self.news_s, time_s)
+
+    def close_epoch(self, epoch_s: float) -> None:
+        """Count the epoch as silent where nothing came since the one before, at ``epoch_s``."""
+        self.silent_epochs = 0 if self.news_s > epoch_s else self.silent_epochs + 1
+
+    @property
+    def status(self) -> NodeStatus:
+        """``ok``, ``stale`` or ``lost``, by silence alone."""
+        if self.silent_epochs >= LOST_EPOCHS:
+            return NodeStatus.LOST
+        return NodeStatus.STALE if self.silent_epochs >= STALE_EPOCHS else NodeStatus.OK
+
+
+def refuse_unmoved(moved: bool) -> None:
+    """Raise RelposError where a run brought no motion."""
+    if not moved:
+        raise RelposError("no motion was received: nothing can be estimated")
+
+
+def refuse_unranged(ranges_used: int, counters: Mapping[str, int]) -> None:
+    """Raise RelposError where a run brought no range that could be used."""
+    if not ranges_used:
+        raise RelposError(
+            f"no usable range ({counters['ranges_failed']} failed ones): relative positions "
+            "cannot be fused; from known starts --estimator deadreckoning still works"
+        )
 
 
 def pairs_of(nodes: Sequence[NodeEstimate]) -> tuple[PairEstimate, ...]:

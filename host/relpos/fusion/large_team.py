@@ -23,14 +23,16 @@ from relpos.errors import RelposError
 from relpos.fusion import noise
 from relpos.fusion.bank_settings import BankSettings
 from relpos.fusion.estimator import (
-    LOST_EPOCHS,
-    STALE_EPOCHS,
     Estimate,
     NodeEstimate,
     NodeStatus,
     PairEstimate,
+    Presence,
+    refuse_unmoved,
+    refuse_unranged,
 )
 from relpos.fusion.joining import Joining
+from relpos.fusion.motion_model import told_sigmas
 from relpos.fusion.neighbourhood import NeighbourhoodFilter, RangeModel
 from relpos.fusion.ranging_model import Mounting
 from relpos.fusion.rewind import Rewinder
@@ -66,16 +68,6 @@ _TWO_PI = 2.0 * math.pi
 
 
 @dataclass(slots=True)
-class _Known:
-    """What is kept of a node beside its pose."""
-
-    height_m: float = 0.0
-    sigma_height_m: float = 0.0
-    news_s: float = -math.inf
-    silent_epochs: int = 0
-
-
-@dataclass(slots=True)
 class LargeTeam:
     """An :class:`~relpos.fusion.estimator.Estimator` for dozens to thousands of users."""
 
@@ -88,7 +80,7 @@ class LargeTeam:
     _feed: Rewinder = field(init=False)
     _nodes: list[int] = field(default_factory=list)
     _row: dict[int, int] = field(default_factory=dict)
-    _known: dict[int, _Known] = field(default_factory=dict)
+    _known: dict[int, Presence] = field(default_factory=dict)
     _pending: list[Advance] = field(default_factory=list)
     _joining: Joining = field(default_factory=Joining)
     _own: Counter[str] = field(default_factory=Counter)
@@ -115,7 +107,7 @@ class LargeTeam:
         for p in sorted(self.priors, key=lambda p: p.node):
             if p.node in self._known:
                 raise RelposError(f"node {p.node} has two initial poses")
-            self._known[p.node] = _Known()
+            self._known[p.node] = Presence()
             if math.isfinite(p.sigma_m) and math.isfinite(p.sigma_rad):
                 known.append(p)
         poses = np.array([(p.x_m, p.y_m, p.heading_rad) for p in known]).reshape(-1, 3)
@@ -131,14 +123,8 @@ class LargeTeam:
     def finish(self) -> list[Estimate]:
         """Work off what waits; RelposError where the run cannot give relative positions."""
         estimates = self._feed.finish()
-        if not self._moved:
-            raise RelposError("no motion was received: nothing can be estimated")
-        if not self._ranges_used:
-            failed = self._feed.counters()["ranges_failed"]
-            raise RelposError(
-                f"no usable range ({failed} failed ones): relative positions cannot be fused; "
-                "from known starts --estimator deadreckoning still works"
-            )
+        refuse_unmoved(self._moved)
+        refuse_unranged(self._ranges_used, self._feed.counters())
         return estimates
 
     def counters(self) -> Mapping[str, int]:
@@ -155,7 +141,7 @@ class LargeTeam:
                 self._moved = True
                 self._meet(step.node)
                 known = self._known[step.node]
-                known.news_s = max(known.news_s, step.time_s)
+                known.heard(step.time_s)
                 self._pending.append(step)
             case Ranging():
                 self._advance()
@@ -189,7 +175,7 @@ class LargeTeam:
 
     def _meet(self, node: int) -> None:
         if node not in self._known:
-            self._known[node] = _Known()
+            self._known[node] = Presence()
 
     def _add(self, nodes: Sequence[int], poses: Floats, covariances: Floats) -> None:
         if not len(nodes):
@@ -219,7 +205,7 @@ class LargeTeam:
             return
         rows = np.array([self._row[a.node] for a in steps], dtype=np.int64)
         moves = np.array([(a.dx_m, a.dy_m, a.dtheta_rad, a.duration_s) for a in steps])
-        told = np.array([_told(a) for a in steps])
+        told = np.array([told_sigmas(a) for a in steps])
         self.filter.predict(rows, self._with_noise(rows, moves, told))
 
     def _with_noise(self, rows: Indices, moves: Floats, told: Floats) -> Floats:
@@ -244,7 +230,7 @@ class LargeTeam:
             for node in (r.node, r.peer):
                 self._meet(node)
                 known = self._known[node]
-                known.news_s = max(known.news_s, step.time_s)
+                known.heard(step.time_s)
         if not self._row:
             self._found_frame(step.ranges)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
@@ -344,7 +330,7 @@ class LargeTeam:
 
     def _estimate(self, time_s: float) -> Estimate:
         for known in self._known.values():
-            known.silent_epochs = 0 if known.news_s > self._epoch_s else known.silent_epochs + 1
+            known.close_epoch(self._epoch_s)
         self._epoch_s = time_s
         own = self.filter.marginals().tolist() if self._row else []
         pose = self.filter.pose.tolist()
@@ -360,7 +346,7 @@ class LargeTeam:
             nodes.append(
                 NodeEstimate(
                     node, x, y, math.remainder(heading, _TWO_PI), xx, yy, xy,
-                    min(math.sqrt(hh), _ANY_ANGLE_RAD), _status(known), known.height_m,
+                    min(math.sqrt(hh), _ANY_ANGLE_RAD), known.status, known.height_m,
                     known.sigma_height_m,
                 )
             )  # fmt: skip
@@ -408,18 +394,3 @@ def unlocated(node: int, height_m: float = 0.0, sigma_height_m: float = 0.0) -> 
         node, 0.0, 0.0, 0.0, math.inf, math.inf, 0.0, _ANY_ANGLE_RAD, NodeStatus.UNLOCATED,
         height_m, sigma_height_m,
     )  # fmt: skip
-
-
-def _told(step: Advance) -> tuple[float, float, float]:
-    alone = step.sigma_x_m if step.sigma_x_alone_m is None else step.sigma_x_alone_m
-    return (
-        math.nan if alone is None else alone,
-        math.nan if step.sigma_y_m is None else step.sigma_y_m,
-        math.nan if step.sigma_theta_rad is None else step.sigma_theta_rad,
-    )
-
-
-def _status(known: _Known) -> NodeStatus:
-    if known.silent_epochs >= LOST_EPOCHS:
-        return NodeStatus.LOST
-    return NodeStatus.STALE if known.silent_epochs >= STALE_EPOCHS else NodeStatus.OK

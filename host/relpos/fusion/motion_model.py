@@ -22,6 +22,7 @@ divided by sqrt(f) the pieces' variances add up to the whole report's.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,20 @@ import numpy.typing as npt
 from relpos.fusion.timeline import Advance
 
 Floats = npt.NDArray[np.float64]
+
+
+def told_sigmas(step: Advance) -> tuple[float, float, float]:
+    """Give a piece's own deviations of forward (m), left (m), turn (rad); NaN where untold.
+
+    Ranges correct the way as it goes: a common scale error does not build up, so that the
+    motion's error alone counts where it is told.
+    """
+    along = step.sigma_x_m if step.sigma_x_alone_m is None else step.sigma_x_alone_m
+    return (
+        math.nan if along is None else along,
+        math.nan if step.sigma_y_m is None else step.sigma_y_m,
+        math.nan if step.sigma_theta_rad is None else step.sigma_theta_rad,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,15 +63,14 @@ class MotionNoise:
     def sigmas(self, step: Advance) -> tuple[float, float, float]:
         """Standard deviations of forward (m), left (m) and turn (rad) for one piece."""
         share = max(step.fraction, 1e-9) ** 0.5
-        # Ranges correct the way as it goes: a common scale error does not build up.
-        reported_d = step.sigma_x_m if step.sigma_x_alone_m is None else step.sigma_x_alone_m
+        along, left, turn = (0.0 if math.isnan(s) else s for s in told_sigmas(step))
         root_s = step.duration_s**0.5
         relative_d, relative_theta = self.sigma_d / share, self.sigma_theta / share
         floor_d, floor_theta = self.floor_d_m * root_s, self.floor_theta_rad * root_s
         return (
-            max(abs(step.dx_m) * relative_d, floor_d, reported_d or 0.0),
-            max(abs(step.dy_m) * relative_d, floor_d, step.sigma_y_m or 0.0),
-            max(abs(step.dtheta_rad) * relative_theta, floor_theta, step.sigma_theta_rad or 0.0),
+            max(abs(step.dx_m) * relative_d, floor_d, along),
+            max(abs(step.dy_m) * relative_d, floor_d, left),
+            max(abs(step.dtheta_rad) * relative_theta, floor_theta, turn),
         )
 
 

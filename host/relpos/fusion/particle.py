@@ -35,12 +35,13 @@ import numpy.typing as npt
 from relpos.errors import RelposError
 from relpos.fusion import particle_kernels as kernels
 from relpos.fusion.estimator import (
-    LOST_EPOCHS,
-    STALE_EPOCHS,
     Estimate,
     NodeEstimate,
     NodeStatus,
+    Presence,
     pairs_of,
+    refuse_unmoved,
+    refuse_unranged,
 )
 from relpos.fusion.motion_model import MotionNoise, predict
 from relpos.fusion.particle_settings import ParticleSettings
@@ -210,16 +211,6 @@ class _Start:
 
 
 @dataclass(slots=True)
-class _Known:
-    """What is kept of a node beside its particles."""
-
-    height_m: float = 0.0
-    sigma_height_m: float = 0.0
-    news_s: float = -math.inf
-    silent_epochs: int = 0
-
-
-@dataclass(slots=True)
 class ParticleFilter:
     """The paper's filter as an :class:`~relpos.fusion.estimator.Estimator`.
 
@@ -235,7 +226,7 @@ class ParticleFilter:
     _row: dict[int, int] = field(default_factory=dict)
     _clouds: Clouds = field(init=False)
     _starts: dict[int, _Start] = field(default_factory=dict)
-    _known: dict[int, _Known] = field(default_factory=dict)
+    _known: dict[int, Presence] = field(default_factory=dict)
     _pending: dict[int, list[Advance]] = field(default_factory=dict)
     _own: Counter[str] = field(default_factory=Counter)
     _motion_noise: MotionNoise = field(init=False)
@@ -263,7 +254,7 @@ class ParticleFilter:
         for prior in sorted(self.priors, key=lambda p: p.node):
             if prior.node in self._known:
                 raise RelposError(f"node {prior.node} has two initial poses")
-            self._known[prior.node] = _Known()
+            self._known[prior.node] = Presence()
             if math.isfinite(prior.sigma_m) and math.isfinite(prior.sigma_rad):
                 pose = np.array([prior.x_m, prior.y_m, prior.heading_rad])[:, None]
                 sigma = np.array([prior.sigma_m, prior.sigma_m, prior.sigma_rad])[:, None]
@@ -284,14 +275,8 @@ class ParticleFilter:
     def finish(self) -> list[Estimate]:
         """Work off what waits; RelposError where the run cannot give relative positions."""
         estimates = self._work_off(self._timeline.finish())
-        if not self._moved:
-            raise RelposError("no motion was received: nothing can be estimated")
-        if not self._ranges_used:
-            failed = self._timeline.counters["ranges_failed"]
-            raise RelposError(
-                f"no usable range ({failed} failed ones): relative positions cannot be fused; "
-                "from known starts --estimator deadreckoning still works"
-            )
+        refuse_unmoved(self._moved)
+        refuse_unranged(self._ranges_used, self._timeline.counters)
         return estimates
 
     def counters(self) -> Mapping[str, int]:
@@ -307,7 +292,7 @@ class ParticleFilter:
             nodes.append(measurement.peer)
         for node in nodes:
             if node not in self._known:
-                self._known[node] = _Known()
+                self._known[node] = Presence()
                 self._starts[node] = self._blank(heading_known=False)
 
     def _blank(self, *, heading_known: bool) -> _Start:
@@ -323,7 +308,7 @@ class ParticleFilter:
                 case Advance():
                     self._moved = True
                     known = self._known[step.node]
-                    known.news_s = max(known.news_s, step.time_s)
+                    known.heard(step.time_s)
                     self._pending.setdefault(step.node, []).append(step)
                 case Ranging():
                     self._predict()
@@ -372,7 +357,7 @@ class ParticleFilter:
         for measured in step.ranges:
             for node in (measured.node, measured.peer):
                 known = self._known[node]
-                known.news_s = max(known.news_s, step.time_s)
+                known.heard(step.time_s)
         if not self._row:
             self._found_frame(step.ranges)
         column, placed_m = self._row, None
@@ -499,7 +484,7 @@ class ParticleFilter:
         for node, start in list(self._starts.items()):
             self._settle(node, start)
         for known in self._known.values():
-            known.silent_epochs = 0 if known.news_s > self._epoch_s else known.silent_epochs + 1
+            known.close_epoch(self._epoch_s)
         self._epoch_s = time_s
         located = np.empty((len(self._row), 7))
         kernels.moments(self._clouds.poses, self._clouds.weights, located)
@@ -538,12 +523,10 @@ class ParticleFilter:
         start = self._starts.get(node)
         if start is not None and not start.drawn:
             return NodeStatus.UNLOCATED
-        silent = self._known[node].silent_epochs
-        if silent >= LOST_EPOCHS:
-            return NodeStatus.LOST
-        if silent >= STALE_EPOCHS:
-            return NodeStatus.STALE
-        return NodeStatus.OK if start is None or start.placed else NodeStatus.AMBIGUOUS
+        status = self._known[node].status
+        if status is NodeStatus.OK and start is not None and not start.placed:
+            return NodeStatus.AMBIGUOUS
+        return status
 
 
 _NOISELESS = MotionNoise(0.0, 0.0)
