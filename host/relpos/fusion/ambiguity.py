@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.estimator import MAX_ALTERNATIVES, Alternative, Shape
+from relpos.fusion.estimator import ANY_ANGLE_RAD, MAX_ALTERNATIVES, Alternative, Shape
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
@@ -172,7 +172,7 @@ def _heading(weights: Floats, heading: Floats, variance: Floats) -> tuple[float,
     together = (weights * np.exp(1j * heading - 0.5 * variance)).sum()
     length = min(abs(together), 1.0)
     sigma = math.sqrt(-2.0 * math.log(length)) if length > 1e-3 else math.inf
-    return float(np.angle(together)), min(sigma, math.pi / math.sqrt(3.0))
+    return float(np.angle(together)), min(sigma, ANY_ANGLE_RAD)
 
 
 def _moments(weights: Floats, places: Floats, covariances: Floats) -> tuple[Floats, Floats]:

@@ -24,6 +24,7 @@ from relpos.fusion.ambiguity import believe, pictures
 from relpos.fusion.bank_settings import BankSettings
 from relpos.fusion.detection import STEP_M, Detection, Round
 from relpos.fusion.estimator import (
+    ANY_ANGLE_RAD,
     Alternative,
     Estimate,
     NodeEstimate,
@@ -58,7 +59,6 @@ Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 _DRIFT, _SCALE = int(Of.DRIFT), int(Of.SCALE)
-_ANY_ANGLE_RAD = math.pi / math.sqrt(3.0)
 _TWO_PI = 2.0 * math.pi
 
 
@@ -1278,7 +1278,7 @@ class Bank:
                 NodeEstimate(
                     node, pose[0], pose[1], math.remainder(pose[2], _TWO_PI),
                     variances[at], variances[at + 1], float(covariance[at, at + 1]),
-                    min(math.sqrt(variances[at + 2]), _ANY_ANGLE_RAD),
+                    min(math.sqrt(variances[at + 2]), ANY_ANGLE_RAD),
                     self._status(known, row),
                     known.height_m, known.sigma_height_m,
                 )
@@ -1343,7 +1343,7 @@ class Bank:
         """Say of a node whose start is unknown what the search says."""
         if mixture is None or node not in mixture.nodes:
             return NodeEstimate(
-                node, 0.0, 0.0, 0.0, math.inf, math.inf, 0.0, _ANY_ANGLE_RAD,
+                node, 0.0, 0.0, 0.0, math.inf, math.inf, 0.0, ANY_ANGLE_RAD,
                 NodeStatus.UNLOCATED, known.height_m, known.sigma_height_m,
             )  # fmt: skip
         n = mixture.nodes.index(node)
@@ -1441,7 +1441,7 @@ class Bank:
             0.5 * (xx + yy),
         )
         sideways = np.sqrt(np.maximum(xx + yy - along, 0.0) / squared)
-        bearing = np.where(apart, np.minimum(sideways, _ANY_ANGLE_RAD), _ANY_ANGLE_RAD)
+        bearing = np.where(apart, np.minimum(sideways, ANY_ANGLE_RAD), ANY_ANGLE_RAD)
         pairs = list(
             map(
                 PairEstimate,
@@ -1502,7 +1502,7 @@ def _pair_of_pictures(
     )
     return PairEstimate(
         node, peer, middle, math.sqrt(max(variance, 0.0)), float(np.angle(together)),
-        min(bearing_sd, _ANY_ANGLE_RAD),
+        min(bearing_sd, ANY_ANGLE_RAD),
     )  # fmt: skip
 
 

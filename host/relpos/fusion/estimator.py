@@ -158,6 +158,9 @@ class Estimator(Protocol):
         """Name -> how often: everything dropped, rejected, clamped, reset or resampled."""
 
 
+ANY_ANGLE_RAD = pi / sqrt(3.0)
+"""Standard deviation of a heading or bearing of which nothing is known."""
+
 MAX_ALTERNATIVES = 16
 """At most so many pictures are listed (run format, ``alternatives.csv``)."""
 
@@ -226,13 +229,9 @@ def _pair(node: NodeEstimate, peer: NodeEstimate) -> PairEstimate:
         c, s = dx / distance, dy / distance
         along = c * c * xx + 2.0 * c * s * xy + s * s * yy
         across = s * s * xx - 2.0 * c * s * xy + c * c * yy
-        bearing_sd = min(sqrt(max(across, 0.0)) / distance, _ANY_BEARING_RAD)
+        bearing_sd = min(sqrt(max(across, 0.0)) / distance, ANY_ANGLE_RAD)
     else:
-        along, bearing_sd = 0.5 * (xx + yy), _ANY_BEARING_RAD
+        along, bearing_sd = 0.5 * (xx + yy), ANY_ANGLE_RAD
     return PairEstimate(
         node.node, peer.node, distance, sqrt(max(along, 0.0)), atan2(dy, dx), bearing_sd
     )
-
-
-_ANY_BEARING_RAD = pi / sqrt(3.0)
-"""Standard deviation of a bearing of which nothing is known."""

@@ -23,6 +23,7 @@ from relpos.errors import RelposError
 from relpos.fusion import noise
 from relpos.fusion.bank_settings import BankSettings
 from relpos.fusion.estimator import (
+    ANY_ANGLE_RAD,
     Estimate,
     NodeEstimate,
     NodeStatus,
@@ -63,7 +64,6 @@ DOUBTED = 0.5
 FORGET = 0.3
 """Weight of an instant in that share: at a range every 2 s, three instants or so."""
 
-_ANY_ANGLE_RAD = math.pi / math.sqrt(3.0)
 _TWO_PI = 2.0 * math.pi
 
 
@@ -346,7 +346,7 @@ class LargeTeam:
             nodes.append(
                 NodeEstimate(
                     node, x, y, math.remainder(heading, _TWO_PI), xx, yy, xy,
-                    min(math.sqrt(hh), _ANY_ANGLE_RAD), known.status, known.height_m,
+                    min(math.sqrt(hh), ANY_ANGLE_RAD), known.status, known.height_m,
                     known.sigma_height_m,
                 )
             )  # fmt: skip
@@ -365,7 +365,7 @@ class LargeTeam:
         near = near[np.lexsort((ids[near[:, 1]], ids[near[:, 0]]))]
         spread = self.filter.spread(near[:, 0].astype(np.int64), near[:, 1].astype(np.int64))
         distance, along, across, bearing = spread
-        sigma_bearing = np.minimum(np.sqrt(across) / np.maximum(distance, 1e-9), _ANY_ANGLE_RAD)
+        sigma_bearing = np.minimum(np.sqrt(across) / np.maximum(distance, 1e-9), ANY_ANGLE_RAD)
         rows = zip(
             ids[near[:, 0]].tolist(), ids[near[:, 1]].tolist(), distance.tolist(),
             np.sqrt(along).tolist(), bearing.tolist(), sigma_bearing.tolist(), strict=True,
@@ -391,6 +391,6 @@ _STATE = (
 def unlocated(node: int, height_m: float = 0.0, sigma_height_m: float = 0.0) -> NodeEstimate:
     """Estimate of a node of which nothing but its height is known."""
     return NodeEstimate(
-        node, 0.0, 0.0, 0.0, math.inf, math.inf, 0.0, _ANY_ANGLE_RAD, NodeStatus.UNLOCATED,
+        node, 0.0, 0.0, 0.0, math.inf, math.inf, 0.0, ANY_ANGLE_RAD, NodeStatus.UNLOCATED,
         height_m, sigma_height_m,
     )  # fmt: skip

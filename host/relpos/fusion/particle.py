@@ -35,6 +35,7 @@ import numpy.typing as npt
 from relpos.errors import RelposError
 from relpos.fusion import particle_kernels as kernels
 from relpos.fusion.estimator import (
+    ANY_ANGLE_RAD,
     Estimate,
     NodeEstimate,
     NodeStatus,
@@ -499,7 +500,7 @@ class ParticleFilter:
             else:
                 x_m, y_m, xx, yy, xy, heading, sigma_heading = self._moments_of(cloud)
             if status is NodeStatus.UNLOCATED:
-                xx, yy, xy, sigma_heading = math.inf, math.inf, math.inf, _ANY_HEADING_RAD
+                xx, yy, xy, sigma_heading = math.inf, math.inf, math.inf, ANY_ANGLE_RAD
             known = self._known[node]
             nodes.append(
                 NodeEstimate(
@@ -573,10 +574,6 @@ def _moments(
     return centre, covariance, heading, _spread_rad(resultant)
 
 
-_ANY_HEADING_RAD = math.pi / math.sqrt(3.0)
-"""Standard deviation of a heading of which nothing is known."""
-
-
 def _spread_rad(resultant: float) -> float:
     """Circular standard deviation from the mean of the cosines about the mean heading."""
-    return min(math.sqrt(2.0 * max(1.0 - resultant, 0.0)), _ANY_HEADING_RAD)
+    return min(math.sqrt(2.0 * max(1.0 - resultant, 0.0)), ANY_ANGLE_RAD)

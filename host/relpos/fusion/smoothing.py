@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.estimator import (
+    ANY_ANGLE_RAD,
     LOST_EPOCHS,
     STALE_EPOCHS,
     Estimate,
@@ -30,9 +31,6 @@ from relpos.fusion.smoother_graph import Graph, build_graph
 from relpos.measurements import Measurement, Prior
 
 Floats = npt.NDArray[np.float64]
-
-ANY_ANGLE_RAD = math.pi / math.sqrt(3.0)
-"""Standard deviation of an angle of which nothing is known."""
 
 SURE_M = 1.0
 """A node that the online estimator left ambiguous, and that smoothing does not place within
