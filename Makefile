@@ -24,7 +24,7 @@ compile-kernels = @printf '%s\n' 'compiling the estimators, once'; \
 title = @printf '\n\033[1m== %s\033[0m\n' "$(1)"
 
 .PHONY: help setup demo test lint bench bench-chain firmware docs wire clean soak \
-        system-demo system-avr system-soak native-tests board-builds simulated-tests python-tests
+        system-demo system-avr system-browser system-soak native-tests board-builds simulated-tests python-tests
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -66,7 +66,7 @@ simulated-tests: $(DEVELOP) | system-avr
 
 # Last, so that its closing line is the last of `make test`.
 # One BLAS thread a worker: more of them than cores only wait for each other.
-python-tests: $(DEVELOP) | system-avr
+python-tests: $(DEVELOP) | system-avr system-browser
 	$(call title,Python tests)
 	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist worksteal
 
@@ -98,13 +98,13 @@ $(PYTHON): | system-demo
 
 $(RUN): pyproject.toml | $(PYTHON)
 	$(call title,Installing relpos and its libraries)
-	$(PIP) --editable .
+	$(PIP) --editable '.[view,recording]'
 	$(compile-kernels)
 	@touch $@
 
 $(DEVELOP): pyproject.toml | $(PYTHON)
 	$(call title,Installing the tools for tests and firmware)
-	$(PIP) --editable '.[test,lint,firmware]'
+	$(PIP) --editable '.[view,recording,exchange,docs,test,lint,firmware]'
 	$(compile-kernels)
 	@touch $@ $(RUN)
 
@@ -124,6 +124,9 @@ system-demo:
 
 system-soak:
 	@tools/system_packages.sh soak
+
+system-browser:
+	@tools/system_packages.sh browser
 
 system-avr:
 	@tools/system_packages.sh avr

@@ -3,6 +3,7 @@
 # else prints the one line that does and ends with status 1.
 #   tools/system_packages.sh demo    Python's venv, C++ compiler, make
 #   tools/system_packages.sh avr     AVR compiler, Arduino core, simulator, uploader
+#   tools/system_packages.sh browser Chromium, where the system has it as a package
 #   tools/system_packages.sh soak    clang with libFuzzer
 set -u
 
@@ -64,6 +65,15 @@ find_missing() { # GROUP
             want_package libsimavr-dev /usr/include/simavr/sim_avr.h
             want_package libelf-dev /usr/include/libelf.h
             ;;
+        browser)
+            # Ubuntu's is a snap behind an empty package; the tests that need one skip and say so.
+            if ! command -v chromium >/dev/null 2>&1 && ! command -v google-chrome >/dev/null 2>&1; then
+                case $(apt-cache policy chromium 2>/dev/null | sed -n 's/^ *Candidate: *//p') in
+                    '' | '(none)' | *snap*) ;;
+                    *) missing="$missing chromium" ;;
+                esac
+            fi
+            ;;
         soak)
             want_command clang++ clang
             # Its libFuzzer is a package of its own where that is known; else in clang's.
@@ -71,7 +81,7 @@ find_missing() { # GROUP
                 { apt-cache show libclang-rt-dev >/dev/null 2>&1 && missing="$missing libclang-rt-dev"; }
             ;;
         *)
-            echo "usage: tools/system_packages.sh demo|avr|soak" >&2
+            echo "usage: tools/system_packages.sh demo|avr|browser|soak" >&2
             exit 2
             ;;
     esac
