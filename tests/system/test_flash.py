@@ -224,9 +224,6 @@ def test_a_failed_upload_is_told_by_its_cause(told, words):
 
 
 def test_without_platformio_it_is_told(tmp_path, monkeypatch):
-    with pytest.raises(DeviceError, match="repository"):
-        upload.platformio(tmp_path)
-    (tmp_path / "platformio.ini").touch()
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(DeviceError, match="PlatformIO is missing"):
         upload.platformio(tmp_path)

@@ -48,7 +48,6 @@ def _fail(words: str) -> None:
 app = typer.Typer(
     cls=Commands,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     help="Where everybody is, relative to each other: IMU and UWB, no anchors, no map.",
 )

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
+from relpos import places
 from relpos.errors import DeviceError
 from relpos.protocol.messages import ResetCause
 
@@ -53,14 +54,6 @@ class _Callbacks(ctypes.Structure):
     )
 
 
-def repository_root() -> Path:
-    """The repository that this package lies in. DeviceError where it was installed without one."""
-    root = Path(__file__).resolve().parents[3]
-    if not (root / "firmware" / "lib").is_dir():
-        raise DeviceError("the firmware's sources are not here: run relpos from its repository")
-    return root
-
-
 def _sources(library: Path) -> list[Path]:
     """Everything that can end up in the native library, sorted; the Arduino board is not in it."""
     return sorted(
@@ -75,8 +68,8 @@ def build(library: Path | None = None, output: Path | None = None) -> Path:
 
     Raises DeviceError where the compiler is missing, or with its first complaint.
     """
-    library = library or repository_root() / "firmware" / "lib"
-    output = output or repository_root() / ".build" / "native"
+    library = library or places.firmware_project() / "firmware" / "lib"
+    output = output or places.build_folder() / "native"
     sources = _sources(library)
     units = [path for path in sources if path.suffix != ".h"]
     if not any(path.parent.name == "native" for path in units):

@@ -2,46 +2,52 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
 from pathlib import Path
 
+from relpos import places
 from relpos.errors import DeviceError
 from relpos.nodes.boards import SWITCH, Board
 
-ROOT = Path(__file__).resolve().parents[3]
 UPLOAD_WITHIN_S = 600.0
 """Online, PlatformIO fetches its compiler the first time."""
 _SILENT = ("not in sync", "not responding", "timeout", "getsync", "no response")
 
 
-def platformio(root: Path = ROOT) -> list[str]:
+def platformio(root: Path) -> list[str]:
     """The command to run: ``tools/pio`` where the system's AVR tools are, else PlatformIO itself.
 
-    DeviceError in one line where there is neither, or no firmware to build.
+    ``root`` is the firmware's project. DeviceError in one line where there is neither.
     """
-    if not (root / "platformio.ini").is_file():
-        raise DeviceError("the firmware's sources are not here: run relpos from its repository")
     offline = (root / ".venv" / "bin" / "platformio").exists()
     if offline and shutil.which("avr-gcc") and shutil.which("avrdude"):
         return [str(root / "tools" / "pio")]
     for name in ("pio", "platformio"):
         if (found := shutil.which(name)) is not None:
             return [found]
-    raise DeviceError("PlatformIO is missing: `make firmware` sets it up, or see platformio.org")
+    raise DeviceError(
+        "PlatformIO is missing: `pipx install platformio` brings it (in the repository "
+        "`make firmware` does)"
+    )
 
 
-def upload(board: Board, port: str, root: Path = ROOT) -> int | None:
+def upload(board: Board, port: str, root: Path | None = None) -> int | None:
     """Build, write and verify; DeviceError says why not.
+
+    ``root`` is the firmware's project (default: the one that came with this package).
 
     Returns the bytes that were verified, or None where the uploader has not told them.
     """
+    root = root or places.firmware_project()
     command = [*platformio(root), "run", "-e", board.environment, "-t", "upload"]
     try:
         done = subprocess.run(
             [*command, "--upload-port", port],
             cwd=root,
+            env={**os.environ, **_environment(root)},
             capture_output=True,
             text=True,
             timeout=UPLOAD_WITHIN_S,
@@ -54,6 +60,13 @@ def upload(board: Board, port: str, root: Path = ROOT) -> int | None:
         raise DeviceError(f"{port}: {why(told)}")
     verified = re.search(r"(\d+) bytes of flash verified", told)
     return int(verified[1]) if verified else None
+
+
+def _environment(root: Path) -> dict[str, str]:
+    """Where PlatformIO puts what it builds: in a repository as ever, else in the user's cache."""
+    if root == places.repository():
+        return {}
+    return {"PLATFORMIO_WORKSPACE_DIR": str(places.build_folder() / "platformio")}
 
 
 def why(told: str) -> str:

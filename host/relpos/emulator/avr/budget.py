@@ -22,10 +22,11 @@ from rich.console import Console
 from rich.progress import Progress, TimeElapsedColumn
 from rich.table import Table
 
+from relpos import places
 from relpos.emulator.avr import filters
 from relpos.emulator.avr.board import BOARDS
 from relpos.emulator.avr.elf import read_firmware
-from relpos.emulator.avr.library import SimulatorError
+from relpos.emulator.avr.library import NOT_INSTALLED, SimulatorError
 from relpos.emulator.avr.service import Service
 from relpos.errors import RelposError
 
@@ -89,9 +90,14 @@ class Cost:
 
 
 def default_build_folder() -> Path:
-    """Where PlatformIO builds: tools/pio into .build/pio, a user's own pio into .pio."""
-    root = Path(__file__).resolve().parents[4]
-    ours = root / ".build" / "pio" / "build"
+    """Where PlatformIO builds: tools/pio into .build/pio, a user's own pio into .pio.
+
+    SimulatorError in an installed package, which has neither.
+    """
+    root = places.repository()
+    if root is None:
+        raise SimulatorError(NOT_INSTALLED)
+    ours = places.build_folder() / "pio" / "build"
     return ours if ours.is_dir() else root / ".pio" / "build"
 
 

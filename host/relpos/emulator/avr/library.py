@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
-import os
 import shutil
 import subprocess
 import tempfile
 from functools import cache
 from pathlib import Path
 
+from relpos import places
 from relpos.errors import RelposError
 
 _SHIM = Path(__file__).parent / "simavr_shim"
 _COMPILE = ["-std=gnu11", "-O2", "-fPIC", "-shared", "-Wall", "-Wextra"]
 _HEADER = Path("/usr/include/simavr/sim_avr.h")
+
+
+NOT_INSTALLED = (
+    "simulated boards are in relpos's repository alone, not in the installed package: take "
+    "--board native, or clone the repository"
+)
+"""The shim is under the GPL and stays out of the wheel, which is under the MIT licence."""
 
 
 class SimulatorError(RelposError):
@@ -25,15 +32,6 @@ class SimulatorError(RelposError):
 BusCallback = ctypes.CFUNCTYPE(
     ctypes.c_int32, ctypes.c_void_p, ctypes.c_int32, ctypes.c_int32, ctypes.c_uint64
 )
-
-
-def build_folder() -> Path:
-    """Folder for compiled things: .build in the repository, else one in the user's cache."""
-    root = Path(__file__).resolve().parents[4]
-    if (root / "pyproject.toml").is_file():
-        return root / ".build" / "avr"
-    cache_home = os.environ.get("XDG_CACHE_HOME")
-    return (Path(cache_home) if cache_home else Path.home() / ".cache") / "relpos" / "avr"
 
 
 def missing_parts() -> str | None:
@@ -46,11 +44,13 @@ def missing_parts() -> str | None:
 
 
 def _build() -> Path:
+    if not _SHIM.is_dir():
+        raise SimulatorError(NOT_INSTALLED)
     sources = [_SHIM / "shim.c", _SHIM / "shim.h"]
     digest = hashlib.sha256(" ".join(_COMPILE).encode())
     for source in sources:
         digest.update(source.read_bytes())
-    target = build_folder() / f"simavr_shim-{digest.hexdigest()[:16]}.so"
+    target = places.build_folder() / "avr" / f"simavr_shim-{digest.hexdigest()[:16]}.so"
     if target.is_file():
         return target
     missing = missing_parts()

@@ -1,0 +1,75 @@
+"""How light the command is at its start, and that a shell completes it."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+HEAVY = ("numba", "numpy", "scipy", "matplotlib", "starlette", "uvicorn", "mcap", "foxglove",
+         "pandas", "serial", "construct")  # fmt: skip
+PATIENCE_S = 60
+
+
+@pytest.fixture
+def shell_environment(tmp_path):
+    """A new user's: an empty home, the command on the path."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    return os.environ | {
+        "HOME": str(tmp_path), "PATH": path, "PYTHONPATH": str(ROOT / "host"), "SHELL": "/bin/bash",
+    }  # fmt: skip
+
+
+def bash(script: str, environment: dict[str, str]) -> str:
+    done = subprocess.run(
+        ["bash", "--norc", "-c", script],
+        env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("arguments", ["--help", "--version", "node --help"])
+def test_help_imports_nothing_heavy(arguments):
+    program = (
+        "import sys\nfrom relpos.cli.main import app\n"
+        "try:\n    app(sys.argv[1:])\nfinally:\n"
+        f"    print('HEAVY', sorted(set({HEAVY!r}) & set(sys.modules)))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments.split()],
+        env=os.environ | {"PYTHONPATH": str(ROOT / "host")},
+        capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "HEAVY []"
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [
+        ("relpos dead", ["deadreckon"]),
+        ("relpos node fla", ["flash"]),
+        ("relpos fuse --estimator ba", ["bank"]),
+        ("relpos node calibrate ant", ["antenna"]),
+    ],
+)
+def test_bash_completes_commands_and_values(words, completed, shell_environment):
+    count = len(words.split())
+    script = (
+        'eval "$(relpos --show-completion)"\n'
+        f"COMP_WORDS=({words})\nCOMP_CWORD={count - 1}\n"
+        "_relpos_completion relpos\nprintf '%s\\n' \"${COMPREPLY[@]}\"\n"
+    )
+    assert bash(script, shell_environment).split() == completed
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+def test_installed_completion_is_there_in_the_next_bash(shell_environment):
+    bash("relpos --install-completion; true", shell_environment)
+    script = '. "$HOME/.bashrc"\ncomplete -p relpos\n'
+    assert "_relpos_completion" in bash(script, shell_environment)
