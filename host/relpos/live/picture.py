@@ -1,0 +1,214 @@
+"""The picture of the team at one moment, as people and programs are shown it.
+
+Frames and units as everywhere: metres, radians counter-clockwise from the common frame's x axis,
+seconds of the session's arrival clock; ``unix_s`` for who needs a date. None where unknown, which
+JSON has as null. The JSON is the page's protocol, version 1.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from typing import Any
+
+PROTOCOL = 1
+STILL_WARNING_S = 20.0
+STILL_ALARM_S = 30.0
+"""As PASS devices do (NFPA 1982: pre-alarm after 20 s without motion, alarm after 30 s)."""
+
+
+class Level(StrEnum):
+    """How urgent a notice is."""
+
+    INFO = "info"
+    WARNING = "warning"
+    ALARM = "alarm"
+
+
+class Alert(StrEnum):
+    """What is wrong with a person."""
+
+    STILL_WARNING = "still_warning"
+    STILL_ALARM = "still_alarm"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """Something that everybody has to know, of the session as a whole."""
+
+    id: str
+    level: Level
+    text: str
+    since_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Person:
+    """One node's wearer.
+
+    The pose is the newest there is (nowcast): it contains all motion up to ``motion_s``. ``status``
+    is one of ``ok``, ``ambiguous``, ``unlocated``, ``stale``, ``lost``. ``loss`` and ``ranging``
+    are shares. ``acknowledged``: the alert has been seen by somebody.
+    """
+
+    node: int
+    name: str
+    x_m: float | None = None
+    y_m: float | None = None
+    z_m: float | None = None
+    heading_rad: float | None = None
+    sigma_major_m: float | None = None
+    sigma_minor_m: float | None = None
+    sigma_angle_rad: float | None = None
+    sigma_heading_rad: float | None = None
+    status: str = "unlocated"
+    motion_s: float | None = None
+    seen_s: float | None = None
+    moving: bool | None = None
+    still_s: float = 0.0
+    alert: Alert | None = None
+    acknowledged: bool = False
+    health: str = "green"
+    reasons: tuple[str, ...] = ()
+    battery_v: float | None = None
+    rssi_dbm: float | None = None
+    loss: float | None = None
+    ranging: float | None = None
+    neighbours: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """``peer`` as seen from ``node``; the bearing is in the common frame."""
+
+    node: int
+    peer: int
+    distance_m: float
+    sigma_distance_m: float
+    bearing_rad: float
+    sigma_bearing_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredRange:
+    """The newest range of two nodes, and how long ago it was measured."""
+
+    node: int
+    peer: int
+    range_m: float
+    age_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class GhostPerson:
+    """A person in an alternative; of a ring, x and y are the centre, sigma_major_m the radius."""
+
+    node: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    sigma_major_m: float
+    sigma_minor_m: float
+    sigma_angle_rad: float
+    shape: str
+
+
+@dataclass(frozen=True, slots=True)
+class Ghosts:
+    """One of the possible pictures of the team while anything is ambiguous."""
+
+    probability: float
+    people: tuple[GhostPerson, ...]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Everybody at ``time_s``.
+
+    ``arrived_unix_s`` is when the newest packet in it arrived; ``fused_s`` the time of the newest
+    fused estimate. Pairs have node < peer, of those who are located.
+    """
+
+    seq: int
+    time_s: float
+    unix_s: float
+    arrived_unix_s: float | None = None
+    fused_s: float | None = None
+    ambiguous: bool = False
+    notices: tuple[Notice, ...] = ()
+    people: tuple[Person, ...] = ()
+    pairs: tuple[Pair, ...] = ()
+    ranges: tuple[MeasuredRange, ...] = ()
+    alternatives: tuple[Ghosts, ...] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, numbers rounded to what a picture needs."""
+        return {
+            "type": "picture",
+            "seq": self.seq,
+            "time_s": _plain(self.time_s),
+            "unix_s": _plain(self.unix_s),
+            "arrived_unix_s": _plain(self.arrived_unix_s),
+            "fused_s": _plain(self.fused_s),
+            "ambiguous": self.ambiguous,
+            "notices": [_fields(notice) for notice in self.notices],
+            "people": [_fields(person) for person in self.people],
+            "pairs": [list(_fields(pair).values()) for pair in self.pairs],
+            "ranges": [list(_fields(measured).values()) for measured in self.ranges],
+            "alternatives": [
+                {
+                    "probability": _plain(ghosts.probability),
+                    "people": [_fields(person) for person in ghosts.people],
+                }
+                for ghosts in self.alternatives
+            ],
+        }
+
+    def to_json(self) -> str:
+        """The message ``picture`` of the page's protocol."""
+        return to_json(self.as_dict())
+
+
+@dataclass(frozen=True)
+class Hello:
+    """What a page is told first."""
+
+    name: str
+    source: str
+    estimator: str
+    started_unix_s: float
+    emulated: bool = False
+    limits: Mapping[str, float] = field(
+        default_factory=lambda: {
+            "still_warning_s": STILL_WARNING_S,
+            "still_alarm_s": STILL_ALARM_S,
+        }
+    )
+
+    def to_json(self) -> str:
+        """The message ``hello`` of the page's protocol."""
+        session = asdict(self)
+        limits = session.pop("limits")
+        return to_json(
+            {"type": "hello", "protocol": PROTOCOL, "session": session, "limits": limits}
+        )
+
+
+def to_json(document: Mapping[str, Any]) -> str:
+    """Compact, and without the NaN that no browser reads."""
+    return json.dumps(document, separators=(",", ":"), allow_nan=False)
+
+
+def _fields(row: Any) -> dict[str, Any]:
+    return {name: _plain(getattr(row, name)) for name in row.__slots__}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float):
+        # A tenth of a millimetre and of a milliradian: files and pages need no more.
+        return round(value, 4) if math.isfinite(value) else None
+    return list(value) if isinstance(value, tuple) else value

@@ -1,0 +1,172 @@
+"""Who may see the live page: the session's token, its cookie, addresses, a certificate."""
+
+from __future__ import annotations
+
+import ipaddress
+import secrets
+import socket
+from dataclasses import dataclass, field
+from urllib.parse import urlencode
+
+from relpos.errors import DeviceError, RelposError
+
+DEFAULT_HOST = "127.0.0.1"
+DEFAULT_PORT = 8460
+TOKEN_BYTES = 16
+"""128 bits: nobody guesses them, and the QR code stays coarse enough for a wet screen."""
+
+
+def missing_extra(package: str, extra: str) -> RelposError:
+    """Say how to install what an option needs."""
+    return RelposError(f"{package} is not installed: pip install 'relpos[{extra}]'")
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """A key and its chain, as PEM."""
+
+    key_pem: bytes
+    chain_pem: bytes
+
+
+@dataclass(frozen=True)
+class Access:
+    """Address and token of one session's pages; ``hosts`` are the names it is reached by."""
+
+    port: int
+    hosts: tuple[str, ...]
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(TOKEN_BYTES))
+    certificate: Certificate | None = None
+
+    @property
+    def cookie(self) -> str:
+        """Name of the cookie: cookies are shared by all ports of a host, sessions are not."""
+        return f"relpos-{self.port}"
+
+    @property
+    def reachable(self) -> bool:
+        """Whether anybody but this computer can reach it."""
+        return not _is_loopback(self.hosts[0])
+
+    def url(self, path: str = "/", host: str | None = None) -> str:
+        """Address of a page, token included."""
+        scheme = "http" if self.certificate is None else "https"
+        host = host or self.hosts[0]
+        host = f"[{host}]" if ":" in host else host
+        return f"{scheme}://{host}:{self.port}{path}?{urlencode({'token': self.token})}"
+
+    def fits(self, token: str | None) -> bool:
+        """Whether it is this session's; takes the same time whatever it is."""
+        return token is not None and secrets.compare_digest(token.encode(), self.token.encode())
+
+
+def parse_listen(address: str) -> tuple[str, int]:
+    """Split HOST:PORT, HOST or :PORT; RelposError where it is none of them."""
+    host, colon, port = address.rpartition(":")
+    if not colon or (port and not port.isdigit()):
+        host, port = address, ""
+    host = host.strip("[]") or DEFAULT_HOST
+    number = int(port) if port else DEFAULT_PORT
+    if not 0 <= number <= 65535 or any(c.isspace() or c == "/" for c in host):
+        raise RelposError(f"--view-listen {address}: not HOST:PORT, like 0.0.0.0:{DEFAULT_PORT}")
+    return host, number
+
+
+def listen(address: str | None) -> tuple[socket.socket, Access]:
+    """Listen at HOST:PORT, or on this computer alone where none is given.
+
+    A port that was asked for and is taken is a DeviceError; the usual one taken gives another.
+    """
+    host, port = parse_listen(address) if address is not None else (DEFAULT_HOST, DEFAULT_PORT)
+    try:
+        family, _, _, _, where = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+    except OSError as error:
+        raise DeviceError(f"{host}: cannot listen there: {error.strerror or error}") from None
+    try:
+        door = _bind(family, where)
+    except OSError as error:
+        if address is not None:
+            raise DeviceError(
+                f"{host}:{port}: cannot listen there: {error.strerror or error}"
+            ) from None
+        door = _bind(family, (where[0], 0, *where[2:]))
+    return door, Access(int(door.getsockname()[1]), _hosts(host))
+
+
+def _bind(family: int, where: tuple[object, ...]) -> socket.socket:
+    door = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        # A session that was just ended leaves connections waiting to die.
+        door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        door.bind(where)
+        door.listen(128)
+    except OSError:
+        door.close()
+        raise
+    return door
+
+
+def _hosts(host: str) -> tuple[str, ...]:
+    """Names that lead here, the one to print first."""
+    if host not in ("0.0.0.0", "::", ""):
+        return (host,)
+    own = own_address()
+    return tuple(
+        dict.fromkeys((*(() if own is None else (own,)), socket.gethostname(), "localhost"))
+    )
+
+
+def own_address() -> str | None:
+    """This computer's address in the network it would reach others by; None without any."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            # Of a range for documentation; a datagram socket that connects sends nothing.
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            return None
+        address: str = probe.getsockname()[0]
+    return None if _is_loopback(address) else address
+
+
+def make_certificate(hosts: tuple[str, ...]) -> Certificate:
+    """A certificate made on the spot: browsers warn once, phones then give their compass."""
+    try:
+        import trustme
+    except ImportError:
+        raise missing_extra("trustme", "view") from None
+    made = trustme.CA().issue_cert(*dict.fromkeys((*hosts, "localhost", "127.0.0.1")))
+    chain = b"".join(blob.bytes() for blob in made.cert_chain_pems)
+    return Certificate(made.private_key_pem.bytes(), chain)
+
+
+def qr_svg(text: str) -> str:
+    """A QR code as an SVG image."""
+    import io
+
+    import segno
+
+    image = io.BytesIO()
+    segno.make(text, error="m").save(image, kind="svg", scale=8, border=4, light="#fff")
+    return image.getvalue().decode()
+
+
+def qr_terminal(text: str) -> str:
+    """A QR code in block characters."""
+    import io
+
+    import segno
+
+    drawing = io.StringIO()
+    segno.make(text, error="l").terminal(drawing, compact=True, border=2)
+    return drawing.getvalue()
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

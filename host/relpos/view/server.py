@@ -1,0 +1,505 @@
+"""The page's server, in a process of its own.
+
+Between it and the session is one socket with a JSON document a line. What comes: ``hello``,
+``tracks`` (all of them, once), ``points`` (newest of each track), ``names``, ``picture`` and
+``answer``. What goes: what browsers and phones ask for, numbered; the session answers each.
+Pictures are handed on as they come, unparsed; a browser that is slow misses some, and no
+browser slows anything but itself.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import math
+import signal
+import socket
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qsl, urlencode, urlsplit
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.datastructures import MutableHeaders
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import (
+    FileResponse,
+    HTMLResponse,
+    JSONResponse,
+    PlainTextResponse,
+    RedirectResponse,
+    Response,
+)
+from starlette.routing import Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from relpos.live.picture import to_json
+from relpos.live.tracks import Tracks
+from relpos.view.access import Access, qr_svg
+
+STATIC = Path(__file__).parent / "static"
+PING_S = 2.0
+ANSWER_S = 5.0
+"""A session that does not answer a request for so long is told to the phone, which asks again."""
+MOST_LINE_BYTES = 1 << 26
+MOST_BODY_BYTES = 1 << 20
+MOST_ITEMS = 2000
+"""Presses, or headings, of one request."""
+COOKIE_S = 7 * 24 * 3600
+
+REFUSED = """<!doctype html><html lang="en"><meta charset="utf-8">
+<meta name="viewport" content="width=device-width"><title>relpos</title>
+<h1>This address needs the session's token</h1>
+<p>The whole address, with the token, is printed in the terminal in which
+<code>relpos</code> runs, and shown as a QR code there and on the team's page. Each session has
+its own token.</p></html>"""
+
+CONTENT_POLICY = (
+    "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
+    "connect-src 'self' ws: wss:; frame-ancestors 'none'"
+)
+
+
+class Session:
+    """The session as this process sees it: what it said last, and what it is asked."""
+
+    def __init__(self, lines: asyncio.StreamReader, out: asyncio.StreamWriter) -> None:
+        self._lines = lines
+        self._out = out
+        self._asked = 0
+        self._answers: dict[int, asyncio.Future[dict[str, Any]]] = {}
+        self.hello: str | None = None
+        self.picture: str | None = None
+        self.tracks = Tracks()
+        self.names: dict[str, str] = {}
+        self._news = asyncio.Event()
+        self.over = False
+
+    async def listen(self) -> None:
+        """Take what the session says until it ends."""
+        with contextlib.suppress(ConnectionError):
+            while line := await self._lines.readline():
+                self._take(line.decode())
+        self.over = True
+        self._tell()
+
+    def _take(self, line: str) -> None:
+        if line.startswith('{"type":"picture"'):
+            self.picture = line.rstrip("\n")
+            self._tell()
+            return
+        message = json.loads(line)
+        match message["type"]:
+            case "hello":
+                self.hello = line.rstrip("\n")
+                self._tell()
+            case "tracks":
+                self.tracks = Tracks.from_message(message)
+            case "points":
+                for node, point in message["points"].items():
+                    self.tracks.add(int(node), *point)
+            case "names":
+                self.names = message["names"]
+            case "answer":
+                waiting = self._answers.pop(message["id"], None)
+                if waiting is not None and not waiting.done():
+                    waiting.set_result(message)
+
+    def _tell(self) -> None:
+        self._news.set()
+        self._news = asyncio.Event()
+
+    async def news(self, seen: str | None, within_s: float) -> str | None:
+        """The newest picture, once it is another than ``seen``; None where none comes in time."""
+        if self.picture is not None and self.picture is not seen:
+            return self.picture
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
+                while not self.over:
+                    await self._news.wait()
+                    if self.picture is not None and self.picture is not seen:
+                        return self.picture
+        return None
+
+    async def until_hello(self) -> str | None:
+        """The session's greeting; None where it ended before."""
+        while self.hello is None and not self.over:
+            await self._news.wait()
+        return self.hello
+
+    async def ask(self, kind: str, body: Mapping[str, Any]) -> dict[str, Any] | None:
+        """Hand a request on; the session's answer, None where none comes in time."""
+        self._asked += 1
+        number = self._asked
+        answer: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
+        self._answers[number] = answer
+        line = to_json({"id": number, "kind": kind, "unix_s": time.time(), "body": body})
+        try:
+            async with asyncio.timeout(ANSWER_S):
+                self._out.write(line.encode() + b"\n")
+                await self._out.drain()
+                return await answer
+        except (TimeoutError, ConnectionError):
+            return None
+        finally:
+            self._answers.pop(number, None)
+
+
+class Guard:
+    """Lets nobody in without the token: in the address once, in a cookie from then on."""
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self._app = app
+        self._access = access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let it in, refuse it, or give it the cookie and send it on."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        asking = HTTPConnection(scope)
+        given = asking.query_params.get("token")
+        by_address = self._access.fits(given)
+        allowed = by_address or self._access.fits(asking.cookies.get(self._access.cookie))
+        allowed = allowed and _own_page(asking)
+        if scope["type"] == "websocket":
+            if allowed:
+                await self._app(scope, receive, send)
+            else:
+                # Before it is accepted: the server answers 403.
+                await send({"type": "websocket.close", "code": 4401})
+            return
+        if not allowed:
+            response: Response = HTMLResponse(REFUSED, 401)
+        elif by_address and scope["path"] in ("/", "/phone"):
+            # What stays in the address bar, in histories and in screenshots is without the token.
+            rest = [(k, v) for k, v in parse_qsl(asking.url.query) if k != "token"]
+            response = RedirectResponse(scope["path"] + ("?" + urlencode(rest)) * bool(rest), 303)
+        else:
+            await self._app(scope, receive, _with_headers(send))
+            return
+        if allowed:
+            response.set_cookie(
+                self._access.cookie,
+                self._access.token,
+                max_age=COOKIE_S,
+                httponly=True,
+                samesite="lax",
+                secure=self._access.certificate is not None,
+            )
+        await response(scope, receive, _with_headers(send))
+
+
+def _own_page(asking: HTTPConnection) -> bool:
+    """Whether no other site's page asks: a browser tells whose page it is."""
+    origin = asking.headers.get("origin")
+    return origin is None or urlsplit(origin).netloc == asking.headers.get("host")
+
+
+def _with_headers(send: Send) -> Send:
+    async def sending(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            headers["Content-Security-Policy"] = CONTENT_POLICY
+            headers["X-Content-Type-Options"] = "nosniff"
+            headers["Referrer-Policy"] = "no-referrer"
+            headers.setdefault("Cache-Control", "no-cache")
+        await send(message)
+
+    return sending
+
+
+class BadRequestError(Exception):
+    """A request that makes no sense, in words."""
+
+
+class Pages:
+    """What is served, of one session."""
+
+    def __init__(self, session: Session, access: Access) -> None:
+        self.session = session
+        self._access = access
+        self._code: str | None = None
+
+    def app(self) -> ASGIApp:
+        """The whole application behind its guard."""
+        api = [
+            Route("/api/picture", self.picture),
+            Route("/api/time", self.time),
+            Route("/api/wearers", self.wearers),
+            Route("/api/name", self.name, methods=["POST"]),
+            Route("/api/presses", self.presses, methods=["POST"]),
+            Route("/api/headings", self.headings, methods=["POST"]),
+            Route("/api/acknowledge", self.acknowledge, methods=["POST"]),
+        ]
+        app = Starlette(
+            routes=[
+                Route("/", self.page("index.html")),
+                Route("/phone", self.page("phone.html")),
+                Route("/qr.svg", self.qr),
+                *api,
+                WebSocketRoute("/ws", self.follow),
+                Mount("/static", StaticFiles(directory=STATIC)),
+            ],
+            exception_handlers={BadRequestError: _refuse},
+        )
+        return Guard(app, self._access)
+
+    @staticmethod
+    def page(name: str) -> Any:
+        """A page of ``static``."""
+
+        async def serve(_: Request) -> Response:
+            return FileResponse(STATIC / name)
+
+        return serve
+
+    async def qr(self, _: Request) -> Response:
+        """The phone page's address, token included, as a QR code."""
+        if not self._access.reachable:
+            return PlainTextResponse(
+                "No phone can reach this session: it listens on this computer alone. "
+                "Start it with --view-listen 0.0.0.0 for others to see it.",
+                404,
+            )
+        if self._code is None:
+            self._code = qr_svg(self._access.url("/phone"))
+        return Response(self._code, media_type="image/svg+xml")
+
+    async def follow(self, socket: WebSocket) -> None:
+        """Hello, the tracks, then every picture, or as many as the browser takes."""
+        await socket.accept()
+        gone = asyncio.create_task(_until_gone(socket))
+        try:
+            hello = await self.session.until_hello()
+            if hello is None:
+                return
+            await socket.send_text(hello)
+            await socket.send_text(self.session.tracks.to_json())
+            seen: str | None = None
+            while not gone.done() and not self.session.over:
+                newest = await self.session.news(seen, PING_S)
+                await socket.send_text(newest if newest is not None else '{"type":"ping"}')
+                seen = newest if newest is not None else seen
+        except (WebSocketDisconnect, RuntimeError):
+            pass
+        finally:
+            gone.cancel()
+            with contextlib.suppress(RuntimeError, WebSocketDisconnect):
+                await socket.close(1001)
+
+    async def picture(self, _: Request) -> Response:
+        """The newest picture."""
+        if self.session.picture is None:
+            return JSONResponse({"error": "no picture yet"}, 503)
+        return Response(self.session.picture, media_type="application/json")
+
+    async def time(self, _: Request) -> Response:
+        """The server's clock, to which a phone refers its own."""
+        now_s = time.time()
+        session_s = None
+        if self.session.picture is not None:
+            newest = json.loads(self.session.picture)
+            session_s = newest["time_s"] + now_s - newest["unix_s"]
+        return JSONResponse({"unix_ms": now_s * 1000.0, "session_s": session_s})
+
+    async def wearers(self, _: Request) -> Response:
+        """Who is there, and who has a phone already."""
+        people = [] if self.session.picture is None else json.loads(self.session.picture)["people"]
+        return JSONResponse(
+            [
+                {
+                    "node": person["node"],
+                    "name": person["name"],
+                    "taken": str(person["node"]) in self.session.names,
+                }
+                for person in people
+            ]
+        )
+
+    async def name(self, request: Request) -> Response:
+        """Call a node by its wearer's name."""
+        body = await _body(request)
+        name = body.get("name")
+        if not isinstance(name, str) or not 0 < len(name.strip()) <= 40:
+            raise BadRequestError("name: not 1 to 40 characters")
+        return await self._ask("name", {"node": _node(body), "name": " ".join(name.split())})
+
+    async def presses(self, request: Request) -> Response:
+        """Landmark presses of a phone; those accepted need not be sent again."""
+        body = await _body(request)
+        presses = [
+            {
+                "id": _text(press, "id", 64),
+                "landmark": _text(press, "landmark", 64),
+                "unix_ms": _number(press, "unix_ms"),
+            }
+            for press in _items(body, "presses")
+        ]
+        return await self._ask("presses", {**_clocks(body), "presses": presses})
+
+    async def headings(self, request: Request) -> Response:
+        """Compass headings of a phone, already in the common convention (counter-clockwise)."""
+        body = await _body(request)
+        headings = [
+            {
+                "unix_ms": _number(row, "unix_ms"),
+                "heading_rad": _number(row, "heading_rad"),
+                "sigma_rad": _sigma(row),
+            }
+            for row in _items(body, "headings")
+        ]
+        return await self._ask("headings", {**_clocks(body), "headings": headings})
+
+    async def acknowledge(self, request: Request) -> Response:
+        """Silence somebody's alarm until its reason has gone."""
+        return await self._ask("acknowledge", {"node": _node(await _body(request))})
+
+    async def _ask(self, kind: str, body: Mapping[str, Any]) -> Response:
+        answer = await self.session.ask(kind, body)
+        if answer is None:
+            return JSONResponse({"error": "the session does not answer; try again"}, 503)
+        return JSONResponse(answer["reply"], answer.get("status", 200))
+
+
+async def _until_gone(socket: WebSocket) -> None:
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+        while True:
+            await socket.receive_text()
+
+
+async def _refuse(_: Request, error: Exception) -> Response:
+    return JSONResponse({"error": str(error)}, 400)
+
+
+async def _body(request: Request) -> dict[str, Any]:
+    data = b""
+    async for part in request.stream():
+        data += part
+        if len(data) > MOST_BODY_BYTES:
+            raise BadRequestError(f"more than {MOST_BODY_BYTES} bytes")
+    try:
+        body = json.loads(data)
+    except ValueError:
+        raise BadRequestError("not JSON") from None
+    if not isinstance(body, dict):
+        raise BadRequestError("not a JSON object")
+    return body
+
+
+def _node(body: Mapping[str, Any]) -> int:
+    node = body.get("node")
+    if not isinstance(node, int) or isinstance(node, bool) or not 0 < node < 255:
+        raise BadRequestError("node: not a number from 1 to 254")
+    return node
+
+
+def _number(row: Mapping[str, Any], name: str) -> float:
+    value = row.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise BadRequestError(f"{name}: not a number")
+    return float(value)
+
+
+def _sigma(row: Mapping[str, Any]) -> float | None:
+    if row.get("sigma_rad") is None:
+        return None
+    sigma_rad = _number(row, "sigma_rad")
+    if sigma_rad <= 0.0:
+        raise BadRequestError("sigma_rad: not above 0")
+    return sigma_rad
+
+
+def _text(row: Mapping[str, Any], name: str, most: int) -> str:
+    value = row.get(name)
+    if not isinstance(value, str) or not 0 < len(value) <= most or not value.isprintable():
+        raise BadRequestError(f"{name}: not 1 to {most} characters")
+    return value
+
+
+def _items(body: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
+    items = body.get(name)
+    if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
+        raise BadRequestError(f"{name}: not a list of objects")
+    if len(items) > MOST_ITEMS:
+        raise BadRequestError(f"{name}: more than {MOST_ITEMS} at once")
+    return items
+
+
+def _clocks(body: Mapping[str, Any]) -> dict[str, Any]:
+    sent = None if body.get("sent_unix_ms") is None else _number(body, "sent_unix_ms")
+    return {
+        "node": _node(body),
+        "clock_offset_ms": _number(body, "clock_offset_ms"),
+        "sent_unix_ms": sent,
+    }
+
+
+@dataclass(frozen=True)
+class Premises:
+    """What a serving process is started with."""
+
+    door: socket.socket
+    """Listens already: browsers that come while it is restarted wait."""
+    wire: socket.socket
+    access: Access
+
+
+def run(premises: Premises) -> None:
+    """Serve until the session ends. The body of the process."""
+    # Ctrl-C in the terminal reaches this process, too; the session decides when it is over.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    asyncio.run(_serve(premises))
+
+
+async def _serve(premises: Premises) -> None:
+    lines, out = await asyncio.open_connection(sock=premises.wire, limit=MOST_LINE_BYTES)
+    session = Session(lines, out)
+    with _certificate_files(premises.access) as files:
+        config = uvicorn.Config(
+            Pages(session, premises.access).app(),
+            log_level="warning",
+            access_log=False,
+            lifespan="off",
+            ws="auto",
+            # A picture a twentieth of a second: compressing it would cost more than sending it.
+            ws_per_message_deflate=False,
+            ws_ping_interval=20.0,
+            timeout_graceful_shutdown=1,
+            **files,
+        )
+        config.load()
+    server = _Server(config)
+    serving = asyncio.create_task(server.serve(sockets=[premises.door]))
+    await session.listen()
+    server.should_exit = True
+    await serving
+
+
+class _Server(uvicorn.Server):
+    """Without handlers of its own for signals: the session's end ends it."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Any:
+        yield
+
+
+@contextlib.contextmanager
+def _certificate_files(access: Access) -> Any:
+    """The certificate as the files that the TLS library reads, gone as soon as it has."""
+    if access.certificate is None:
+        yield {}
+        return
+    with tempfile.TemporaryDirectory(prefix="relpos-") as directory:
+        key, chain = Path(directory) / "key.pem", Path(directory) / "chain.pem"
+        key.touch(mode=0o600)
+        key.write_bytes(access.certificate.key_pem)
+        chain.write_bytes(access.certificate.chain_pem)
+        yield {"ssl_keyfile": str(key), "ssl_certfile": str(chain)}

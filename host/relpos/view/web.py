@@ -1,0 +1,208 @@
+"""The live page, as the session sees it: a sink that feeds a serving process, and its visitors.
+
+The serving process cannot hold up the session: what it does not take at once waits here, of the
+pictures the newest alone. Where it dies, it is started again behind the same door.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import multiprocessing
+import socket
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from relpos.fusion.estimator import NodeStatus
+from relpos.live.picture import Hello, Picture, to_json
+from relpos.live.sinks import QuietSink
+from relpos.live.tracks import Tracks
+from relpos.live.visitors import Ask
+from relpos.view.access import Access, missing_extra
+
+if TYPE_CHECKING:
+    from multiprocessing.context import SpawnProcess
+
+    from relpos.fusion.estimator import Estimate
+
+RESTART_AFTER_S = 1.0
+MOST_WAITING_BYTES = 1 << 24
+"""A serving process that leaves so much unread is stuck, and started again."""
+SHOWN_STATUSES = (NodeStatus.OK, NodeStatus.STALE)
+"""Only what is believed leaves a track."""
+
+
+class WebView(QuietSink):
+    """Serves the session's pages at ``access`` from the listening socket ``door``.
+
+    RelposError where the libraries for it are not installed.
+    """
+
+    def __init__(self, door: socket.socket, access: Access, hello: Hello) -> None:
+        try:
+            import starlette  # noqa: F401
+            import uvicorn  # noqa: F401
+            import websockets  # noqa: F401
+        except ImportError as error:
+            raise missing_extra(error.name or "starlette", "view") from None
+        self.access = access
+        self.hello = hello
+        self.restarts = 0
+        self._door = door
+        self._tracks = Tracks()
+        self._names: dict[int, str] = {}
+        self._newest: bytes | None = None
+        self._out: deque[bytes] = deque()
+        self._out_bytes = 0
+        self._in = b""
+        self._process: SpawnProcess | None = None
+        self._wire: socket.socket | None = None
+        self._started_s = 0.0
+        self._start()
+
+    def fileno(self) -> int:
+        """For who waits for visitors."""
+        return -1 if self._wire is None else self._wire.fileno()
+
+    # -- as a sink --------------------------------------------------------------------------------
+
+    def estimated(self, estimate: Estimate) -> None:
+        """Lengthen the tracks."""
+        points = {
+            str(n.node): (round(estimate.time_s, 2), round(n.x_m, 2), round(n.y_m, 2))
+            for n in estimate.nodes
+            if n.status in SHOWN_STATUSES
+            and self._tracks.add(n.node, estimate.time_s, n.x_m, n.y_m)
+        }
+        if points:
+            self._say(to_json({"type": "points", "points": points}))
+
+    def pictured(self, picture: Picture) -> None:
+        """Send it on, or keep it until the one before has left."""
+        self._newest = picture.to_json().encode() + b"\n"
+        self._work()
+
+    def trouble(self) -> str | None:
+        """Say that the page was away."""
+        if self.restarts and time.monotonic() - self._started_s < 30.0:
+            return "the page's server had died and was started again"
+        return None
+
+    def close(self) -> None:
+        """Let browsers know that it is over."""
+        wire, self._wire = self._wire, None
+        if wire is not None:
+            wire.setblocking(True)
+            wire.settimeout(1.0)
+            with contextlib.suppress(OSError):
+                wire.sendall(b"".join(self._out) + (self._newest or b""))
+            wire.close()
+        if self._process is not None:
+            self._process.join(3.0)
+            if self._process.is_alive():
+                self._process.kill()
+                self._process.join()
+        self._door.close()
+
+    # -- visitors ---------------------------------------------------------------------------------
+
+    def asks(self) -> Sequence[Ask]:
+        """What browsers and phones have asked for since the last call."""
+        self._work()
+        *lines, self._in = self._in.split(b"\n")
+        asks = []
+        for line in lines:
+            ask = json.loads(line)
+            asks.append(Ask(ask["id"], ask["kind"], ask["unix_s"], ask["body"]))
+        return asks
+
+    def answer(self, ask: Ask, reply: dict[str, Any], status: int = 200) -> None:
+        """Answer one of them."""
+        self._say(to_json({"type": "answer", "id": ask.id, "reply": reply, "status": status}))
+
+    def named(self, names: dict[int, str]) -> None:
+        """Tell which nodes have been named by a phone."""
+        self._names = dict(names)
+        self._say(_names_message(self._names))
+
+    # -- the serving process ----------------------------------------------------------------------
+
+    def _start(self) -> None:
+        from relpos.view import server
+
+        if self._wire is not None:
+            self._wire.close()
+        ours, theirs = socket.socketpair()
+        ours.setblocking(False)
+        self._started_s = time.monotonic()
+        self._process = multiprocessing.get_context("spawn").Process(
+            target=server.run,
+            args=(server.Premises(self._door, theirs, self.access),),
+            name="relpos view",
+            daemon=True,
+        )
+        self._process.start()
+        theirs.close()
+        self._wire = ours
+        self._in = b""
+        self._out.clear()
+        self._out_bytes = 0
+        for line in (self.hello.to_json(), self._tracks.to_json(), _names_message(self._names)):
+            self._say(line)
+
+    def _say(self, line: str) -> None:
+        data = line.encode() + b"\n"
+        self._out.append(data)
+        self._out_bytes += len(data)
+        self._work()
+
+    def _work(self) -> None:
+        """Move what can be moved without waiting; start anew what has died."""
+        if self._wire is None:
+            return
+        try:
+            self._send()
+            self._receive()
+            stuck = self._out_bytes > MOST_WAITING_BYTES
+        except OSError:
+            stuck = True
+        if stuck and time.monotonic() > self._started_s + RESTART_AFTER_S:
+            if self._process is not None:
+                self._process.kill()
+                self._process.join()
+            self.restarts += 1
+            self._start()
+
+    def _send(self) -> None:
+        assert self._wire is not None
+        while self._out or self._newest is not None:
+            if not self._out and self._newest is not None:
+                self._out.append(self._newest)
+                self._out_bytes += len(self._newest)
+                self._newest = None
+            data = self._out.popleft()
+            try:
+                sent = self._wire.send(data)
+            except BlockingIOError:
+                sent = 0
+            self._out_bytes -= sent
+            if sent < len(data):
+                self._out.appendleft(data[sent:])
+                return
+
+    def _receive(self) -> None:
+        assert self._wire is not None
+        while True:
+            try:
+                data = self._wire.recv(65536)
+            except BlockingIOError:
+                return
+            if not data:
+                raise ConnectionResetError
+            self._in += data
+
+
+def _names_message(names: dict[int, str]) -> str:
+    return to_json({"type": "names", "names": {str(node): name for node, name in names.items()}})
