@@ -19,8 +19,10 @@ from relpos.errors import RelposError
 if TYPE_CHECKING:
     from relpos.evaluation.bounds import Totals
     from relpos.evaluation.consistency import Nees
+    from relpos.evaluation.iso18305 import Assessment
     from relpos.evaluation.metrics import Metrics
     from relpos.evaluation.regions import Ambiguity
+    from relpos.evaluation.scoring import Evaluation
     from relpos.fusion.estimator import Estimate
 
 T = TypeVar("T")
@@ -123,6 +125,53 @@ def working(label: str) -> Iterator[None]:
         yield
     finally:
         late.cancel()
+
+
+def print_evaluation(score: Evaluation) -> None:
+    """Print everything that is known of one estimate."""
+    print_metrics(score.run, score.metrics)
+    if score.nees_position is not None and score.nees_heading is not None:
+        print_nees(score.nees_position, score.nees_heading)
+    if score.ambiguity is not None:
+        print_ambiguity(score.ambiguity)
+    print_iso(score.iso)
+    if score.bound is not None:
+        print_bound(score.bound)
+
+
+FRAMES = {
+    "as_given": "as given, in the truth's frame",
+    "per_run": "one motion of the plane for the run",
+    "per_epoch": "one motion of the plane a second",
+}
+"""How the estimate was brought onto the truth, in the words of tables."""
+
+
+def print_iso(iso: Assessment) -> None:
+    """Print the metrics of ISO/IEC 18305, a row for each way of alignment."""
+    from rich.console import Console
+    from rich.table import Table
+
+    if not iso.known:
+        return
+    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+    table = Table(title="ISO/IEC 18305", caption=f"coverage {100.0 * iso.coverage:.1f} %")
+    table.add_column("aligned by")
+    columns = ["mean", "RMS", "CE50", "CE95", "VE50", "VE95", "SE50", "SE95"]
+    for column in columns:
+        table.add_column(column, justify="right")
+    for frame, one in iso.frames.items():
+        flat = one.horizontal
+        table.add_row(
+            FRAMES[frame],
+            *(metres(v) for v in (flat.mean_m, flat.rms_m, flat.e50_m, flat.e95_m)),
+            *(
+                metres(v)
+                for kind in (one.vertical, one.spherical)
+                for v in (kind.e50_m, kind.e95_m)
+            ),
+        )
+    console.print(table)
 
 
 def print_metrics(title: str, metrics: Metrics, baseline: Metrics | None = None) -> None:

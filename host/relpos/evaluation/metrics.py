@@ -39,21 +39,24 @@ class Track:
     """Where one node was, or was believed to be: equally long arrays, NaN where not known.
 
     Rows may come in any order; of rows at the same time the last one counts. A row without a
-    position (NaN) is no row.
+    position (NaN) is no row. ``z_m`` is the height, where anything tells it.
     """
 
     time_s: Floats
     x_m: Floats
     y_m: Floats
     heading_rad: Floats = field(default_factory=lambda: np.empty(0))
+    z_m: Floats = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         """Make float arrays of equal length of whatever sequences were given."""
-        for name in ("time_s", "x_m", "y_m", "heading_rad"):
+        for name in ("time_s", "x_m", "y_m", "heading_rad", "z_m"):
             object.__setattr__(self, name, _floats(getattr(self, name)))
-        if self.heading_rad.size == 0:
-            object.__setattr__(self, "heading_rad", np.full(self.time_s.shape, np.nan))
-        shapes = {a.shape for a in (self.time_s, self.x_m, self.y_m, self.heading_rad)}
+        for name in ("heading_rad", "z_m"):
+            if getattr(self, name).size == 0:
+                object.__setattr__(self, name, np.full(self.time_s.shape, np.nan))
+        columns = (self.time_s, self.x_m, self.y_m, self.heading_rad, self.z_m)
+        shapes = {a.shape for a in columns}
         if len(shapes) != 1 or self.time_s.ndim != 1:
             raise ValueError(f"a track needs arrays of one dimension and one length, not {shapes}")
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from relpos.evaluation import consistency
+from relpos.evaluation.iso18305 import Accuracy, Assessment, Frame, Latency, Magnitudes
 from relpos.evaluation.metrics import Metrics
 from relpos.evaluation.regions import Ambiguity
 
@@ -77,6 +78,46 @@ def ambiguity_as_json(ambiguity: Ambiguity | None) -> dict[str, Any] | None:
         "area_m2": _figure(ambiguity.area_m2),
         "blind_area_m2": _figure(ambiguity.blind_m2),
         "rings": _figure(ambiguity.rings),
+    }
+
+
+def iso_as_json(iso: Assessment) -> dict[str, Any]:
+    """Return the metrics of ISO/IEC 18305 in every frame, per node in the headline's."""
+    return {
+        "headline": None if iso.headline is None else str(iso.headline),
+        "frames": {
+            str(frame): _accuracy(iso.frames[frame]) if frame in iso.frames else None
+            for frame in Frame
+        },
+        "nodes": [{"node": node, **_accuracy(one)} for node, one in iso.nodes.items()],
+        "relative": _magnitudes(iso.relative),
+        "coverage": _figure(iso.coverage),
+        "latency": latency_as_json(iso.latency),
+    }
+
+
+def latency_as_json(latency: Latency | None) -> dict[str, float | None] | None:
+    """Return what an estimator waited and computed; None where that was not seen."""
+    if latency is None:
+        return None
+    return {name: _figure(getattr(latency, name)) for name in latency.__slots__}
+
+
+def _accuracy(accuracy: Accuracy) -> dict[str, Any]:
+    return {
+        "mean_error_m": _series(accuracy.mean_error_m.tolist()),
+        "absolute_mean_m": _figure(accuracy.absolute_mean_m),
+        "covariance_m2": [_series(row) for row in accuracy.covariance_m2.tolist()],
+        "horizontal": _magnitudes(accuracy.horizontal),
+        "vertical": _magnitudes(accuracy.vertical),
+        "spherical": _magnitudes(accuracy.spherical),
+    }
+
+
+def _magnitudes(kind: Magnitudes) -> dict[str, float | None]:
+    return {
+        "count": kind.count,
+        **{name: _figure(getattr(kind, name)) for name in kind.__slots__[1:]},
     }
 
 

@@ -8,16 +8,19 @@ from collections.abc import Iterable
 import numpy as np
 
 from relpos.evaluation.metrics import Pair, PairTrack, Track
-from relpos.fusion.estimator import Estimate, NodeStatus
+from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
 from relpos.measurements import Truth
+
+Row = tuple[float, float, float, float, float]
 
 
 def estimated_tracks(estimates: Iterable[Estimate]) -> dict[int, Track]:
     """Return the track of every node, whatever its status: a guess is scored as one."""
-    rows: dict[int, list[tuple[float, float, float, float]]] = defaultdict(list)
+    rows: dict[int, list[Row]] = defaultdict(list)
     for estimate in estimates:
         for node in estimate.nodes:
-            rows[node.node].append((estimate.time_s, node.x_m, node.y_m, node.heading_rad))
+            pose = (node.x_m, node.y_m, node.heading_rad)
+            rows[node.node].append((estimate.time_s, *pose, _height(node)))
     return {node: Track(*np.array(rows[node]).T) for node in sorted(rows)}
 
 
@@ -27,13 +30,13 @@ def located_tracks(estimates: Iterable[Estimate]) -> dict[int, Track]:
     The mean of what is possible jumps between the possibilities; a line through it says nothing.
     """
     nowhere = (NodeStatus.AMBIGUOUS, NodeStatus.UNLOCATED)
-    rows: dict[int, list[tuple[float, float, float, float]]] = defaultdict(list)
+    rows: dict[int, list[Row]] = defaultdict(list)
     for estimate in estimates:
         for node in estimate.nodes:
             pose = (node.x_m, node.y_m, node.heading_rad)
             if node.status in nowhere:
                 pose = (np.nan, np.nan, np.nan)
-            rows[node.node].append((estimate.time_s, *pose))
+            rows[node.node].append((estimate.time_s, *pose, _height(node)))
     return {node: Track(*np.array(rows[node]).T) for node in sorted(rows)}
 
 
@@ -49,9 +52,15 @@ def estimated_pairs(estimates: Iterable[Estimate]) -> dict[Pair, PairTrack]:
 
 
 def true_tracks(truth: Iterable[Truth]) -> dict[int, Track]:
-    """Return the true track of every node; a heading that was not recorded is NaN."""
-    rows: dict[int, list[tuple[float, float, float, float]]] = defaultdict(list)
+    """Return the true track of every node; what was not recorded is NaN."""
+    rows: dict[int, list[Row]] = defaultdict(list)
     for row in truth:
         heading_rad = np.nan if row.heading_rad is None else row.heading_rad
-        rows[row.node].append((row.time_s, row.x_m, row.y_m, heading_rad))
+        z_m = np.nan if row.z_m is None else row.z_m
+        rows[row.node].append((row.time_s, row.x_m, row.y_m, heading_rad, z_m))
     return {node: Track(*np.array(rows[node]).T) for node in sorted(rows)}
+
+
+def _height(node: NodeEstimate) -> float:
+    """Return the height over the start; 0 without any uncertainty is what nothing told."""
+    return node.z_m if node.z_m or node.sigma_z_m else np.nan

@@ -1,0 +1,156 @@
+"""One estimate of one run, scored in every way there is: what ``evaluate`` and reports tell."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from relpos.errors import DataError
+from relpos.evaluation import consistency, iso18305, metrics, regions, summary, tracks
+
+if TYPE_CHECKING:
+    from relpos.evaluation.bounds import Bound, Totals
+    from relpos.fusion.estimator import Estimate
+    from relpos.measurements import Prior
+    from relpos.runs import Run
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Every figure of one estimate against a run's truth; ``print`` shows the main ones.
+
+    ``metrics`` are the run format's four, per pair and over time; ``iso`` those of ISO/IEC 18305.
+    ``nees_position`` and ``nees_heading`` are there where the run gave every start, so that
+    absolute poses can be held against the truth; ``ambiguity`` where anything was ambiguous;
+    ``bound`` where the run was simulated and its Cramer-Rao bound was asked for.
+    """
+
+    run: str
+    metrics: metrics.Metrics
+    nees_distance: consistency.Nees
+    iso: iso18305.Assessment
+    nees_position: consistency.Nees | None = None
+    nees_heading: consistency.Nees | None = None
+    ambiguity: regions.Ambiguity | None = None
+    bound: Totals | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what ``relpos evaluate --json`` prints; None where nothing can be said."""
+        return {
+            "run": self.run,
+            **summary.as_json(self.metrics),
+            "nees_position": _nees(self.nees_position),
+            "nees_heading": _nees(self.nees_heading),
+            "alternatives": summary.ambiguity_as_json(self.ambiguity),
+            "iso_18305": summary.iso_as_json(self.iso),
+            "bound": None if self.bound is None else asdict(self.bound),
+        }
+
+    def __str__(self) -> str:
+        """Give the main figures, one a line."""
+        m, chance = self.metrics, self.nees_distance
+        lines = [
+            f"{self.run}: {m.epochs} whole seconds scored",
+            f"  relative distance RMSE  {_metres(m.relative_distance_rmse_m)}",
+            f"  aligned position RMSE   {_metres(m.relative_position_rmse_m)}",
+            f"  body-frame RMSE         {_metres(m.body_frame_rmse_m)}",
+            f"  NEES of the distance    {m.nees_distance:.2f} (1 is honest, {chance.low:.2f} to "
+            f"{chance.high:.2f} by chance)",
+        ]
+        for frame, one in self.iso.frames.items():
+            flat = one.horizontal
+            words = f"  horizontal error        mean {_metres(flat.mean_m)}, RMS "
+            words += f"{_metres(flat.rms_m)}, CE50 {_metres(flat.e50_m)}, CE95 "
+            lines.append(words + f"{_metres(flat.e95_m)} ({frame.replace('_', ' ')})")
+        if self.bound is not None:
+            lines.append(
+                f"  bound, on line          {_metres(self.bound.filtering_distance_m)} relative "
+                f"distance, {_metres(self.bound.filtering_position_m)} aligned"
+            )
+        return "\n".join(lines)
+
+
+def evaluate(
+    run: Run,
+    estimates: Sequence[Estimate],
+    priors: Sequence[Prior] | None = None,
+    *,
+    latency: iso18305.Latency | None = None,
+    bound: Totals | None = None,
+) -> Evaluation:
+    """Score estimates against the truth of their run.
+
+    ``priors`` are the starts that the estimator was given; without them, those of the run.
+    DataError where there is no truth, or none at a time of which there is an estimate.
+    """
+    need_truth(run)
+    priors = run.priors if priors is None else priors
+    truth = tracks.true_tracks(run.truth)
+    estimated = tracks.estimated_tracks(estimates)
+    score = metrics.evaluate(estimated, truth, tracks.estimated_pairs(estimates))
+    poses = None
+    # Absolute poses can only be held against the truth where every start was given.
+    starts_known = bool(priors) and starts_given(run, priors)
+    if starts_known:
+        poses = [consistency.nees([one]) for one in consistency.of_poses(estimates, truth)]
+    iso = iso18305.assess(
+        estimated,
+        truth,
+        common_frame=starts_known,
+        located=tracks.located_tracks(estimates),
+        latency=latency,
+    )
+    if not score.epochs and not iso.known:
+        raise DataError(f"{run.name}: no node has an estimate and a truth at the same time")
+    return Evaluation(
+        run.name,
+        score,
+        consistency.of_distances([score]),
+        iso,
+        poses[0] if poses else None,
+        poses[1] if poses else None,
+        regions.summarise(
+            estimates, truth, run.ranges, starts_known=bool(priors) and not _common(run, priors)
+        ),
+        bound,
+    )
+
+
+def need_truth(run: Run) -> None:
+    """Raise DataError where a run has no truth."""
+    if not run.truth:
+        raise DataError(f"{run.directory or run.name}: the run has no truth to score against")
+
+
+def starts_given(run: Run, priors: Sequence[Prior]) -> bool:
+    """Whether the start of every node that moves was given, in the truth's frame."""
+    moving = {motion.node for motion in run.motions}
+    return {prior.node for prior in priors} >= moving and not _common(run, priors)
+
+
+def _common(run: Run, priors: Sequence[Prior]) -> bool:
+    """Whether the priors only say that all start alike: their frame is nobody's but their own."""
+    from relpos.runs import InitialPose
+
+    return tuple(priors) == run.priors_for(InitialPose.COMMON)
+
+
+def bound_of(run: Run) -> Bound | None:
+    """Compute the Cramer-Rao bound of a simulated run; None where it cannot be told."""
+    from relpos.evaluation import bounds
+    from relpos.simulation.scenarios import NAMES
+
+    made = run.description.simulated
+    if made is None or made.scenario not in NAMES:
+        return None
+    return bounds.of_simulated(made.scenario, made.seed, made.settings)
+
+
+def _nees(nees: consistency.Nees | None) -> dict[str, Any] | None:
+    return None if nees is None else summary.nees_as_json(nees)
+
+
+def _metres(value: float) -> str:
+    return f"{value:.2f} m" if math.isfinite(value) else "-"
