@@ -1128,7 +1128,7 @@ class Starts:
             return None
         self.counters["starts_found"] += len(settled)
         found = sorted(settled, key=lambda n: (n != search.frame, n))
-        self.settled = self.settled - settled
+        self.settled, self._standing = self.settled - settled, self._standing - settled
         return Found(search.release(found), search.frame is not None)
 
     @property
