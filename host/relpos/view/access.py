@@ -9,16 +9,12 @@ from dataclasses import dataclass, field
 from urllib.parse import urlencode
 
 from relpos.errors import DeviceError, RelposError
+from relpos.extras import missing_extra
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8460
 TOKEN_BYTES = 16
 """128 bits: nobody guesses them, and the QR code stays coarse enough for a wet screen."""
-
-
-def missing_extra(package: str, extra: str) -> RelposError:
-    """Say how to install what an option needs."""
-    return RelposError(f"{package} is not installed: pip install 'relpos[{extra}]'")
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,13 @@ from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from relpos.extras import missing_extra
 from relpos.fusion.estimator import NodeStatus
 from relpos.live.picture import Hello, Picture, to_json
 from relpos.live.sinks import QuietSink
 from relpos.live.tracks import Tracks
 from relpos.live.visitors import Ask
-from relpos.view.access import Access, missing_extra
+from relpos.view.access import Access
 
 if TYPE_CHECKING:
     from multiprocessing.context import SpawnProcess

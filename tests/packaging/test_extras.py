@@ -1,0 +1,68 @@
+"""Optional libraries: what is missing, and the line that installs it."""
+
+import shlex
+import sys
+import tomllib
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from relpos import extras
+
+PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())
+OPTIONAL = PROJECT["project"]["optional-dependencies"]
+
+
+@pytest.fixture(autouse=True)
+def fresh():
+    extras.requirements.cache_clear()
+    yield
+    extras.requirements.cache_clear()
+
+
+@pytest.fixture
+def metadata_of_the_project(monkeypatch):
+    """As an installation from this tree would have it."""
+    lines = [f'{r} ; extra == "{e}"' for e, named in OPTIONAL.items() for r in named]
+    monkeypatch.setattr(
+        metadata, "requires", lambda _: [*PROJECT["project"]["dependencies"], *lines]
+    )
+
+
+@pytest.mark.usefixtures("metadata_of_the_project")
+@pytest.mark.parametrize("extra", list(extras.PURPOSES))
+def test_an_extra_has_what_the_project_names(extra):
+    assert sorted(extras.requirements(extra)) == sorted(OPTIONAL[extra])
+
+
+def test_all_is_every_extra_that_has_a_purpose():
+    assert OPTIONAL["all"] == [f"relpos[{','.join(extras.PURPOSES)}]"]
+
+
+def test_what_is_not_installed_is_missing(monkeypatch):
+    lines = ['nobody-has-this>=2; extra == "view"', "pytest ; extra == 'view'", "nor-this>=1"]
+    monkeypatch.setattr(metadata, "requires", lambda _: lines)
+    assert extras.missing("view") == ["nobody-has-this>=2"]
+    told = str(extras.missing_extra("nobody", "view"))
+    assert "\n" not in told
+    assert "'nobody-has-this>=2'" in told
+    assert "nor-this" not in told
+
+
+@pytest.mark.parametrize(
+    ("prefix", "line"),
+    [
+        ("/home/a/.local/share/pipx/venvs/relpos", "pipx inject relpos 'mcap>=1'"),
+        ("/home/a/.local/share/uv/tools/relpos",
+         "uv pip install --python /home/a/.local/share/uv/tools/relpos 'mcap>=1'"),
+    ],
+)  # fmt: skip
+def test_the_line_installs_beside_this_very_relpos(prefix, line, monkeypatch):
+    monkeypatch.setattr(sys, "prefix", prefix)
+    assert extras.install_line(["mcap>=1"]) == line
+
+
+def test_elsewhere_the_line_names_the_python_that_runs():
+    words = shlex.split(extras.install_line(["mcap>=1"]))
+    assert words == [sys.executable, "-m", "pip", "install", "mcap>=1"]
