@@ -15,7 +15,7 @@ import typer
 from typer.core import TyperGroup
 
 from relpos import __version__
-from relpos.cli import deadreckon, demo, emulate, evaluate, figures, fuse, node, simulate
+from relpos.cli import convert, deadreckon, demo, emulate, evaluate, figures, fuse, node, simulate
 from relpos.emulator.faults import help_text
 from relpos.errors import RelposError
 
@@ -73,6 +73,7 @@ app.command("emulate", epilog=help_text())(emulate.emulate)
 app.command("fuse", cls=fuse.FuseCommand)(fuse.fuse)
 app.command("simulate")(simulate.simulate)
 app.command("evaluate")(evaluate.evaluate)
+app.command("convert")(convert.convert)
 app.command("figures")(figures.figures)
 app.command("deadreckon")(deadreckon.deadreckon)
 app.add_typer(node.app, name="node")

@@ -25,8 +25,7 @@ def simulate(
 ) -> None:
     """Simulate a team and write its measurements, priors and truth as a run directory."""
     chosen = output.parse_settings(settings or [])
-    from relpos.runs import Description, Run, Simulated, save_run
-    from relpos.runs.run import Landmark
+    from relpos.runs import Description, Landmark, Run, Simulated, save_run
     from relpos.simulation import scenarios
 
     simulated = scenarios.simulate(scenario, seed, chosen)

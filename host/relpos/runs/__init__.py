@@ -3,7 +3,8 @@
 from relpos.runs.description import Description, InitialPose, NodeInfo, Simulated
 from relpos.runs.estimates import read_estimates, write_estimates
 from relpos.runs.imu import ImuRecording
-from relpos.runs.run import Landmark, Run, load_run, save_run
+from relpos.runs.landmarks import Landmark
+from relpos.runs.run import Run, load_run, save_run
 
 __all__ = [
     "Description",

@@ -116,7 +116,7 @@ def write_estimates(
 
 
 def read_estimates(directory: Path | str) -> list[Estimate]:
-    """Read ``estimate.csv``, ``pairs.csv`` and ``alternatives.csv`` back, ordered by time.
+    """Read what :func:`write_estimates` wrote, but for the steps, back, ordered by time.
 
     Somebody else's estimate may hold times, nodes and positions alone: what is missing becomes
     NaN, a missing status ``ok``. DataError where there is no ``estimate.csv``.
@@ -146,14 +146,23 @@ def read_estimates(directory: Path | str) -> list[Estimate]:
     if alternatives_path is not None:
         for row in read_rows(alternatives_path, _ALTERNATIVE_TABLE):
             alternatives.setdefault(row[0], []).append(Alternative(*row))
+    parameters: dict[float, list[Parameter]] = {}
+    parameters_path = find_table(directory, "parameters.csv")
+    if parameters_path is not None:
+        for row in read_rows(parameters_path, _PARAMETER_TABLE):
+            time_s, node, peer, name, value, sigma = row
+            learned = Parameter(time_s, node, peer, name, value, _nan_if_none(sigma))
+            parameters.setdefault(time_s, []).append(learned)
+    tables = (nodes, pairs, alternatives, parameters)
     return [
         Estimate(
             time_s,
             tuple(nodes.get(time_s, ())),
             tuple(pairs.get(time_s, ())),
             tuple(alternatives.get(time_s, ())),
+            tuple(parameters.get(time_s, ())),
         )
-        for time_s in sorted(nodes.keys() | pairs.keys())
+        for time_s in sorted(set[float]().union(*tables))
     ]
 
 
@@ -252,6 +261,14 @@ _ALTERNATIVE_TABLE = (
     Column("sigma_minor_m", not_negative),
     Column("sigma_angle_rad", number),
     Column("shape", _shape),
+)
+_PARAMETER_TABLE = (
+    Column("time_s", number),
+    Column("node", node_id),
+    Column("peer", node_id, optional=True),
+    Column("name", str),
+    Column("value", number),
+    Column("sigma", not_negative, optional=True),
 )
 
 

@@ -35,6 +35,7 @@ from relpos.runs.description import (
     write_description,
 )
 from relpos.runs.imu import ImuRecording, read_imu
+from relpos.runs.landmarks import Landmark, read_landmarks, truth_from_presses
 from relpos.runs.table import (
     Column,
     find_table,
@@ -55,23 +56,15 @@ PRIOR_FROM_TRUTH_WITHIN_S = 2.0
 2 s as the metrics allow between two rows that are interpolated."""
 
 
-@dataclass(frozen=True, slots=True)
-class Landmark:
-    """A surveyed place a wearer can press a button at."""
-
-    landmark: str
-    x_m: float
-    y_m: float
-    z_m: float | None = None
-
-
 @dataclass(frozen=True)
 class Run:
     """One recording. ``measurements`` are what an estimator may see, sorted by time.
 
     ``truth`` is for evaluation alone. ``counters`` says how many rows of note were met:
     ``ranges_failed`` (a range of 0 or less, kept as the failure marker it is),
-    ``landmarks_unknown`` (presses of a landmark nobody surveyed) and ``unsorted_rows``.
+    ``landmarks_unknown`` (presses of a landmark nobody surveyed), ``landmarks_repeated`` (pressed
+    twice in passing), ``landmarks_of_strangers`` (by nodes of whom nothing else is known) and
+    ``unsorted_rows``.
     """
 
     name: str
@@ -153,11 +146,9 @@ def load_run(path: Path | str) -> Run:
         (row for name in _MEASUREMENT_TABLES for row in rows[name]), key=attrgetter("time_s")
     )
     counters["ranges_failed"] += sum(row.range_m <= 0.0 for row in rows["ranges.csv"])
-    landmarks = tuple(_read_landmarks(directory))
-    truth = rows["truth.csv"]
-    if not truth:
-        truth = _truth_from_landmarks(landmarks, rows["events.csv"], counters)
-    return Run(
+    surveyed = find_table(directory, "landmarks.csv")
+    landmarks = tuple(read_landmarks(surveyed)) if surveyed is not None else ()
+    run = Run(
         name=description.name or directory.resolve().name,
         description=description,
         measurements=tuple(measurements),
@@ -165,10 +156,14 @@ def load_run(path: Path | str) -> Run:
         statuses=tuple(rows["status.csv"]),
         steps=tuple(rows["steps.csv"]),
         landmarks=landmarks,
-        truth=tuple(truth),
+        truth=tuple(rows["truth.csv"]),
         directory=directory,
-        counters=dict(+counters),
     )
+    if not run.truth:
+        presses = truth_from_presses(landmarks, run.events, run.node_ids)
+        counters.update(presses.counters())
+        run = replace(run, truth=presses.truth)
+    return replace(run, counters=dict(+counters))
 
 
 def save_run(run: Run, path: Path | str) -> None:
@@ -348,44 +343,10 @@ _TABLES = (
         ),
     ),
 )
+TABLE_NAMES = tuple(table.name for table in _TABLES)
+"""The files of a run directory that hold rows by time and node."""
+
 _MEASUREMENT_TABLES = ("motion.csv", "ranges.csv", "height.csv", "heading.csv")
-
-
-def _read_landmarks(directory: Path) -> list[Landmark]:
-    path = find_table(directory, "landmarks.csv")
-    if path is None:
-        return []
-    columns = (
-        Column("id", str),
-        Column("x_m", number),
-        Column("y_m", number),
-        Column("z_m", number, optional=True),
-    )
-    landmarks: dict[str, Landmark] = {}
-    for line, cells in numbered_rows(path, read_text(path), columns):
-        landmark = Landmark(*cells)
-        if landmark.landmark in landmarks:
-            raise DataError(f"{path}: line {line}: column id: {landmark.landmark!r} is there twice")
-        landmarks[landmark.landmark] = landmark
-    return list(landmarks.values())
-
-
-def _truth_from_landmarks(
-    landmarks: Sequence[Landmark], events: Sequence[Event], counters: Counter[str]
-) -> list[Truth]:
-    places = {landmark.landmark: landmark for landmark in landmarks}
-    truth: list[Truth] = []
-    for event in events:
-        if event.event != "landmark" or not places:
-            continue
-        place = places.get(event.value)
-        if place is None:
-            counters["landmarks_unknown"] += 1
-            continue
-        truth.append(
-            Truth(event.time_s, event.node, place.x_m, place.y_m, heading_rad=None, z_m=place.z_m)
-        )
-    return truth
 
 
 def _priors_from_truth(run: Run) -> dict[int, Prior]:

@@ -1,0 +1,125 @@
+"""``relpos convert``: recordings and estimates from one format to another."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from relpos.errors import DataError
+
+
+class FormatName(StrEnum):
+    """The formats by the names people's scripts rely on."""
+
+    RUN = "run"
+    MCAP = "mcap"
+    TUM = "tum"
+    GEOJSON = "geojson"
+    GPX = "gpx"
+    CSV = "csv"
+
+
+class KindName(StrEnum):
+    """What a trajectory from another tool is."""
+
+    TRUTH = "truth"
+    ESTIMATE = "estimate"
+
+
+PINS = "LAT,LON[,BEARING[,ALTITUDE]][@POINT]"
+PIN_HELP = (
+    "A known place: latitude, longitude, the compass bearing that world x points to, the altitude "
+    "of z = 0 over WGS84. POINT is what lies there: X,Y or NODE or NODE:TIME (default 0,0). "
+)
+
+
+def convert(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SOURCE",
+            help="Run or estimate directory, recording (.mcap), trajectories (.tum, .gpx, "
+            ".geojson) or a directory of them.",
+        ),
+    ],
+    to: Annotated[FormatName, typer.Option("--to", help="The wanted format.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="PATH", help="Where it goes: a file for mcap, geojson, gpx; else a directory."
+        ),
+    ],
+    source_format: Annotated[
+        FormatName | None, typer.Option("--from", help="What SOURCE is, if its name does not say.")
+    ] = None,
+    run: Annotated[
+        Path | None,
+        typer.Option(metavar="RUN", help="The recording that SOURCE belongs to: names, truth."),
+    ] = None,
+    landmarks: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Surveyed landmarks (CSV: id,x_m,y_m[,z_m]; or .geojson, .gpx): presses become "
+            "truth.",
+        ),
+    ] = None,
+    pins: Annotated[
+        list[str] | None,
+        typer.Option("--pin", metavar=PINS, help=PIN_HELP + "Two or more give the bearing."),
+    ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option(metavar="TIME", help="When the run's second 0 was: 2026-05-04T09:30:00Z."),
+    ] = None,
+    kind: Annotated[
+        KindName | None, typer.Option("--as", help="What another tool's trajectories are.")
+    ] = None,
+    node: Annotated[
+        int | None, typer.Option(min=0, help="Whose trajectory it is, if its name does not say.")
+    ] = None,
+    located: Annotated[
+        bool, typer.Option("--located", help="Leave out guesses at nodes not located.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
+) -> None:
+    """Convert a recording or an estimate: MCAP, TUM (evo), GeoJSON, GPX, CSV with names.
+
+    With --landmarks, the wearers' landmark presses and a table of surveyed places become the
+    run's truth. docs/exchange.md tells what each format holds.
+    """
+    from relpos.cli import output
+    from relpos.geodesy import parse_pin
+    from relpos.runs.formats import convert as formats
+    from relpos.runs.formats.content import Kind
+    from relpos.runs.formats.times import unix_of
+
+    wanted = formats.Format(to)
+    placed = tuple(parse_pin(pin) for pin in pins or ())
+    if wanted in (formats.Format.GEOJSON, formats.Format.GPX) and not placed:
+        raise typer.BadParameter(
+            f"{to} is a map's: say where one position lies ({PINS})", param_hint="--pin"
+        )
+    if out.resolve() == source.resolve():
+        raise DataError(f"{out}: that is SOURCE itself; name another place (--out)")
+    hints = formats.Hints(
+        format=formats.Format(source_format) if source_format else None,
+        run=run,
+        kind=Kind(kind) if kind else None,
+        node=node,
+        start_unix_s=unix_of(start, "--start") if start else None,
+        pins=placed,
+    )
+    content = formats.read(source, hints)
+    if landmarks is not None:
+        content = formats.with_landmarks(content, landmarks, placed)
+    if located:
+        content = formats.located_alone(content)
+    files, remarks = formats.write(content, wanted, out, pins=placed, overwrite=overwrite)
+    for words in (*content.remarks, *remarks):
+        output.remark(words)
+    for path in files:
+        typer.echo(str(path))

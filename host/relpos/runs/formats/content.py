@@ -1,0 +1,171 @@
+"""What a source holds, whatever its format: a run, estimates, and when its clock began."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from relpos.errors import DataError
+from relpos.evaluation import tracks
+from relpos.evaluation.metrics import Track, sample
+from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
+from relpos.geodesy import Locate
+from relpos.measurements import Truth
+from relpos.runs.run import Run
+
+
+class Kind(StrEnum):
+    """What a trajectory is."""
+
+    ESTIMATE = "estimate"
+    TRUTH = "truth"
+
+
+PLACED = (NodeStatus.OK, NodeStatus.STALE, NodeStatus.LOST)
+"""With any other status the numbers are the mean of what is possible, and no position."""
+
+
+@dataclass(frozen=True)
+class Content:
+    """A run and the estimates that belong to it, either of which may be empty.
+
+    ``start_unix_s`` is the Unix time of the run's second 0, None where nobody knows it.
+    ``remarks`` is what there is to tell the user about how it was read.
+    """
+
+    run: Run
+    estimates: tuple[Estimate, ...] = ()
+    start_unix_s: float | None = None
+    remarks: tuple[str, ...] = field(default=())
+
+    @property
+    def node_ids(self) -> tuple[int, ...]:
+        """Every node that anything is known of, in order."""
+        ids = set(self.run.node_ids) | {row.node for row in self.run.truth}
+        return tuple(sorted(ids.union(n.node for e in self.estimates for n in e.nodes)))
+
+    def name_of(self, node: int) -> str:
+        """Return the wearer's name, or the node's number in words."""
+        return name_of(node, self.names)
+
+    @property
+    def names(self) -> dict[int, str]:
+        """The wearers' names, where there are any."""
+        infos = self.run.description.nodes
+        return {node: info.name for node, info in infos.items() if info.name}
+
+    def tracks_of(self, kind: Kind) -> dict[int, Track]:
+        """Return each node's trajectory; a guess at a node not located yet is part of it."""
+        if kind is Kind.TRUTH:
+            return tracks.true_tracks(self.run.truth)
+        return tracks.estimated_tracks(self.estimates)
+
+    def locate(self, kind: Kind) -> Locate:
+        """Return where a node was at a time, or first, for a pin that is stuck to a node."""
+        found = (
+            self.tracks_of(kind) if kind is Kind.TRUTH else tracks.located_tracks(self.estimates)
+        )
+
+        def at(node: int, time_s: float | None) -> tuple[float, float] | None:
+            track = found.get(node)
+            if track is None:
+                return None
+            if time_s is None:
+                there = np.isfinite(track.x_m) & np.isfinite(track.y_m)
+                if not there.any():
+                    return None
+                first = int(np.argmax(there))
+                return float(track.x_m[first]), float(track.y_m[first])
+            x_m, y_m = sample([track], np.array([time_s]))[0][0, 0]
+            return (float(x_m), float(y_m)) if math.isfinite(x_m + y_m) else None
+
+        return at
+
+    @property
+    def one_frame(self) -> bool:
+        """Whether estimates and truth share a frame: where the starts were given, they do."""
+        return bool(self.run.description.priors) or self.run.description.initial_pose != "unknown"
+
+
+def name_of(node: int, names: Mapping[int, str]) -> str:
+    """Return the wearer's name, or the node's number in words."""
+    return names.get(node) or f"node {node}"
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One pose of a trajectory; NaN where a figure is not known."""
+
+    time_s: float
+    node: int
+    x_m: float
+    y_m: float
+    z_m: float = math.nan
+    heading_rad: float = math.nan
+
+
+def points_of(content: Content, kind: Kind) -> dict[int, list[Point]]:
+    """Return every node's rows by time, guesses too; rows without a position are left out."""
+    return {node: [p for piece in pieces for p in piece] for node, pieces in _pieces(content, kind)}
+
+
+def stretches_of(content: Content, kind: Kind) -> dict[int, list[list[Point]]]:
+    """Return every node's rows that are positions, cut where it was not located in between."""
+    return {node: [p for p in pieces if p] for node, pieces in _pieces(content, kind, placed=True)}
+
+
+def _pieces(
+    content: Content, kind: Kind, *, placed: bool = False
+) -> Iterator[tuple[int, list[list[Point]]]]:
+    pieces: dict[int, list[list[Point]]] = {}
+    if kind is Kind.TRUTH:
+        for row in sorted(content.run.truth, key=lambda row: row.time_s):
+            z_m = math.nan if row.z_m is None else row.z_m
+            heading_rad = math.nan if row.heading_rad is None else row.heading_rad
+            pieces.setdefault(row.node, [[]])[-1].append(
+                Point(row.time_s, row.node, row.x_m, row.y_m, z_m, heading_rad)
+            )
+    else:
+        for estimate in content.estimates:
+            for n in estimate.nodes:
+                cut = pieces.setdefault(n.node, [[]])
+                if placed and n.status not in PLACED:
+                    cut.append([])
+                elif math.isfinite(n.x_m + n.y_m):
+                    cut[-1].append(
+                        Point(estimate.time_s, n.node, n.x_m, n.y_m, n.z_m, n.heading_rad)
+                    )
+    return ((node, pieces[node]) for node in sorted(pieces))
+
+
+def as_truth(points: Iterable[Point]) -> tuple[Truth, ...]:
+    """Return poses as ground truth, by time."""
+
+    def known(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    return tuple(
+        Truth(p.time_s, p.node, p.x_m, p.y_m, known(p.heading_rad), known(p.z_m))
+        for p in sorted(points, key=lambda p: (p.time_s, p.node))
+    )
+
+
+def as_estimates(points: Iterable[Point]) -> tuple[Estimate, ...]:
+    """Return poses as estimates; what such a trajectory does not say, its sigmas, is NaN."""
+    nan = math.nan
+    by_time: dict[float, dict[int, NodeEstimate]] = {}
+    for p in points:
+        there = by_time.setdefault(p.time_s, {})
+        if p.node in there:
+            raise DataError(f"node {p.node} has two positions at {p.time_s:g} s")
+        there[p.node] = NodeEstimate(
+            p.node, p.x_m, p.y_m, p.heading_rad, nan, nan, nan, nan, NodeStatus.OK, p.z_m, nan
+        )
+    return tuple(
+        Estimate(time_s, tuple(nodes[node] for node in sorted(nodes)), ())
+        for time_s, nodes in sorted(by_time.items())
+    )

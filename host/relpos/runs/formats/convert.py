@@ -1,0 +1,389 @@
+"""From a path to what it holds, and from there to another format's files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+
+from relpos.errors import DataError, RelposError
+from relpos.geodesy import MapFrame, Pin, place
+from relpos.runs.estimates import read_estimates, write_estimates
+from relpos.runs.formats.content import (
+    PLACED,
+    Content,
+    Kind,
+    Point,
+    as_estimates,
+    as_truth,
+    points_of,
+)
+from relpos.runs.landmarks import PRESS, Landmark, read_landmarks, truth_from_presses
+from relpos.runs.run import TABLE_NAMES, Run, load_run, save_run
+from relpos.runs.table import find_table
+
+
+class Format(StrEnum):
+    """The formats by the names people's scripts rely on."""
+
+    RUN = "run"
+    MCAP = "mcap"
+    TUM = "tum"
+    GEOJSON = "geojson"
+    GPX = "gpx"
+    CSV = "csv"
+
+
+RECEIVED = "received"
+"""Where ``relpos fuse PORT`` keeps the run that its estimates are of."""
+
+_ESTIMATE_TABLES = (
+    "estimate.csv",
+    "pairs.csv",
+    "alternatives.csv",
+    "parameters.csv",
+    "summary.json",
+)
+_SUFFIXES = {
+    ".mcap": Format.MCAP,
+    ".tum": Format.TUM,
+    ".geojson": Format.GEOJSON,
+    ".json": Format.GEOJSON,
+    ".gpx": Format.GPX,
+}
+_FILES = (Format.MCAP, Format.GEOJSON, Format.GPX)
+"""Formats that are one file; the others are directories."""
+
+
+@dataclass(frozen=True)
+class Hints:
+    """What the user says that the source does not.
+
+    ``run`` is the recording that the source belongs to; ``format``, ``kind`` and ``node`` say
+    what a trajectory is; ``start_unix_s`` when the run's second 0 was.
+    """
+
+    format: Format | None = None
+    run: Path | None = None
+    kind: Kind | None = None
+    node: int | None = None
+    start_unix_s: float | None = None
+    pins: tuple[Pin, ...] = ()
+
+
+def read(source: Path, hints: Hints) -> Content:
+    """Read whatever ``source`` is; DataError where it is nothing that is known."""
+    form = hints.format or _format_of(source)
+    if form is Format.MCAP:
+        return _started(_read_mcap(source), hints)
+    if form in (Format.RUN, Format.CSV):
+        return _started(_read_directory(source, hints), hints)
+    return _read_tracks(source, form, _started(_base(source, hints), hints), hints)
+
+
+def _format_of(source: Path) -> Format:
+    if not source.exists():
+        raise DataError(f"{source}: no such file or directory")
+    if source.is_dir():
+        if any(find_table(source, name) for name in ("estimate.csv", *TABLE_NAMES)) or (
+            (source / "run.toml").exists()
+        ):
+            return Format.RUN
+        if any(source.glob("*.tum")):
+            return Format.TUM
+        raise DataError(f"{source}: neither a run nor an estimate nor TUM trajectories in there")
+    try:
+        return _SUFFIXES[source.suffix.lower()]
+    except KeyError:
+        raise DataError(f"{source}: of what format is it? (--from {', '.join(Format)})") from None
+
+
+def _base(source: Path, hints: Hints) -> Content:
+    """Return the recording that the source belongs to; an empty one where nobody says which."""
+    if hints.run is None:
+        return Content(Run(name=source.resolve().stem))
+    form = _format_of(hints.run)
+    if form is Format.MCAP:
+        return _read_mcap(hints.run)
+    if form is not Format.RUN:
+        raise DataError(f"{hints.run}: neither a run directory nor a recording")
+    run = load_run(hints.run)
+    return Content(run, remarks=_press_remarks(run))
+
+
+def _read_directory(source: Path, hints: Hints) -> Content:
+    estimates = tuple(read_estimates(source)) if find_table(source, "estimate.csv") else ()
+    if hints.run is not None:
+        base = _base(source, hints)
+        return replace(base, estimates=estimates or base.estimates)
+    received = source / RECEIVED
+    if estimates and received.is_dir():
+        run = load_run(received)
+        return Content(replace(run, name=source.resolve().name), estimates)
+    run = load_run(source)
+    return Content(run, estimates, remarks=_press_remarks(run))
+
+
+def _press_remarks(run: Run) -> tuple[str, ...]:
+    presses = truth_from_presses(run.landmarks, run.events, run.node_ids)
+    return tuple(presses.remarks()) if presses.truth == run.truth else ()
+
+
+def _started(content: Content, hints: Hints) -> Content:
+    if hints.start_unix_s is None:
+        return content
+    return replace(content, start_unix_s=hints.start_unix_s)
+
+
+def _read_mcap(source: Path) -> Content:
+    raise RelposError(f"{source}: MCAP is not built yet")
+
+
+def _read_tracks(source: Path, form: Format, base: Content, hints: Hints) -> Content:
+    """Lay the trajectories of the source over the recording that they belong to."""
+    if not source.exists():
+        raise DataError(f"{source}: no such file or directory")
+    remarks: list[str] = list(base.remarks)
+    start_unix_s = base.start_unix_s
+    points: dict[Kind, list[Point]]
+    landmarks: Sequence[Landmark] = ()
+    if form is Format.TUM:
+        from relpos.runs.formats import tum
+
+        files = tum.find_files(source)
+        if not files:
+            raise DataError(f"{source}: no trajectories (*.tum) in there")
+        points = tum.read_files(files, hints.node, hints.kind, start_unix_s)
+    else:
+        frame, told = frame_of(base, hints.pins, Kind.TRUTH if base.run.truth else Kind.ESTIMATE)
+        remarks += told
+        if form is Format.GPX:
+            from relpos.runs.formats import gpx
+            from relpos.runs.formats.times import iso_of
+
+            first_s = gpx.first_time(source)
+            if start_unix_s is None and first_s is not None:
+                start_unix_s = first_s
+                remarks.append(
+                    f"second 0 is {iso_of(first_s)}, the file's first time (--start says otherwise)"
+                )
+            points = gpx.read_gpx(
+                source, frame, start_unix_s or 0.0, node=hints.node, kind=hints.kind
+            )
+            landmarks = gpx.read_landmarks(source, frame)
+        else:
+            from relpos.runs.formats import geojson
+
+            points = geojson.read_geojson(
+                source, frame, node=hints.node, kind=hints.kind, start_unix_s=start_unix_s
+            )
+            landmarks = geojson.read_landmarks(source, frame)
+    if not points and not landmarks:
+        raise DataError(f"{source}: neither tracks nor landmarks in it")
+    run, estimates = base.run, base.estimates
+    if points.get(Kind.TRUTH):
+        run = replace(run, truth=as_truth(points[Kind.TRUTH]))
+    if landmarks:
+        run = replace(run, landmarks=tuple(landmarks))
+    if points.get(Kind.ESTIMATE):
+        try:
+            estimates = as_estimates(points[Kind.ESTIMATE])
+        except DataError as error:
+            raise DataError(f"{source}: {error}") from None
+    return Content(run, estimates, start_unix_s, tuple(remarks))
+
+
+def frame_of(content: Content, pins: Sequence[Pin], kind: Kind) -> tuple[MapFrame, tuple[str, ...]]:
+    """Return where on the map the content lies, pinned nodes looked up in its tracks."""
+    placing = place(pins, content.locate(kind))
+    return placing.frame, placing.remarks
+
+
+def with_landmarks(content: Content, path: Path, pins: Sequence[Pin]) -> Content:
+    """Turn the run's landmark presses into its truth, by a table of surveyed landmarks.
+
+    DataError where the run has another truth already, no presses, or none that counts.
+    """
+    run = content.run
+    own = truth_from_presses(run.landmarks, run.events, run.node_ids)
+    if run.truth and own.truth != run.truth:
+        raise DataError(
+            f"{run.name}: has a truth of its own (truth.csv) already; move it away to have the "
+            "presses' instead"
+        )
+    suffix = _SUFFIXES.get(path.suffix.lower())
+    remarks: tuple[str, ...] = tuple(r for r in content.remarks if r not in own.remarks())
+    if suffix in (Format.GEOJSON, Format.GPX):
+        frame, told = frame_of(content, pins, Kind.TRUTH)
+        remarks += told
+        if suffix is Format.GPX:
+            from relpos.runs.formats import gpx
+
+            landmarks = gpx.read_landmarks(path, frame)
+        else:
+            from relpos.runs.formats import geojson
+
+            landmarks = geojson.read_landmarks(path, frame)
+    else:
+        landmarks = read_landmarks(path)
+    if not landmarks:
+        raise DataError(f"{path}: no landmark in it")
+    pressed = sum(event.event == PRESS for event in run.events)
+    if not pressed:
+        raise DataError(f"{run.name}: no landmark was pressed (event 'landmark' in events.csv)")
+    presses = truth_from_presses(landmarks, run.events, run.node_ids)
+    if not presses.truth:
+        raise DataError(f"{run.name}: no press counts: {'; '.join(presses.remarks())}")
+    run = replace(run, landmarks=tuple(landmarks), truth=presses.truth)
+    told_of = f"truth from {len(presses.truth)} of {pressed} landmark presses"
+    return replace(content, run=run, remarks=(*remarks, told_of, *presses.remarks()))
+
+
+def located_alone(content: Content) -> Content:
+    """Leave out of the estimates what is no position: nodes ambiguous or not located."""
+    return replace(
+        content,
+        estimates=tuple(
+            replace(e, nodes=tuple(n for n in e.nodes if n.status in PLACED))
+            for e in content.estimates
+        ),
+    )
+
+
+def write(
+    content: Content, form: Format, out: Path, *, pins: Sequence[Pin] = (), overwrite: bool = False
+) -> tuple[list[Path], list[str]]:
+    """Write the content to ``out``; return the files and what there is to tell about them.
+
+    What is there already is left alone unless ``overwrite``; then what an earlier conversion to
+    the same format left is removed, lest it be taken for part of this one.
+    """
+    writer = _WRITERS[form]
+    _make_room(out, form, overwrite=overwrite)
+    if form in _FILES:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    else:
+        out.mkdir(parents=True, exist_ok=True)
+    return writer(content, out, pins)
+
+
+def _make_room(out: Path, form: Format, *, overwrite: bool) -> None:
+    if form in _FILES:
+        if out.is_dir():
+            raise DataError(f"{out}: a directory; {form} is one file")
+        if out.exists() and not overwrite:
+            raise DataError(f"{out}: is there already (--overwrite replaces it)")
+        return
+    if out.exists() and not out.is_dir():
+        raise DataError(f"{out}: a file; {form} is a directory")
+    if not out.is_dir() or not any(out.iterdir()):
+        return
+    if not overwrite:
+        raise DataError(f"{out}: is there already and not empty (--overwrite replaces it)")
+    old = list(out.glob("*.tum")) if form is Format.TUM else []
+    if form in (Format.RUN, Format.CSV):
+        names = ("run.toml", "imu.csv", "landmarks.csv", *TABLE_NAMES, *_ESTIMATE_TABLES)
+        old = [out / f"{name}{packed}" for name in names for packed in ("", ".gz")]
+    for path in old:
+        path.unlink(missing_ok=True)
+
+
+_Written = tuple[list[Path], list[str]]
+
+
+def _write_run(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
+    save_run(content.run, out)
+    if content.estimates:
+        write_estimates(out, content.estimates, steps=content.run.steps)
+    return sorted(path for path in out.iterdir() if path.is_file()), []
+
+
+def _write_csv(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
+    from relpos.runs.formats.tables import write_tables
+
+    return write_tables(content, out), []
+
+
+def _write_mcap(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
+    raise RelposError(f"{out}: MCAP is not built yet")
+
+
+def _write_tum(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
+    from relpos.runs.formats.tum import file_name, write_tum
+
+    files: list[Path] = []
+    remarks: list[str] = []
+    for kind in Kind:
+        headless: list[int] = []
+        for node, points in points_of(content, kind).items():
+            files.append(out / file_name(kind, node))
+            write_tum(files[-1], points)
+            if any(math.isnan(p.heading_rad) for p in points):
+                headless.append(node)
+        if headless:
+            remarks.append(
+                f"the {kind} has poses without a heading, written as heading 0 (node "
+                f"{', '.join(map(str, headless))}): compare positions, not angles"
+            )
+    if not files:
+        raise DataError(f"{content.run.name}: neither estimates nor truth: fuse it first")
+    guesses = sum(n.status not in PLACED for e in content.estimates for n in e.nodes)
+    if guesses:
+        remarks.append(
+            f"{guesses} poses are guesses at nodes not located (--located leaves them out)"
+        )
+    return files, remarks
+
+
+def _write_map(
+    content: Content,
+    out: Path,
+    pins: Sequence[Pin],
+    write_file: Callable[[Path, Content, Sequence[Kind], MapFrame], None],
+) -> _Written:
+    kinds = [Kind.ESTIMATE] if content.estimates else []
+    remarks: list[str] = []
+    if content.run.truth:
+        if not kinds or content.one_frame:
+            kinds.append(Kind.TRUTH)
+        else:
+            remarks.append(
+                "the truth is left out: the starts were not known, so the estimate has a frame of "
+                "its own"
+            )
+    if not kinds and not content.run.landmarks:
+        raise DataError(f"{content.run.name}: neither estimates nor truth: fuse it first")
+    frame, told = frame_of(content, pins, kinds[0] if kinds else Kind.TRUTH)
+    if content.run.landmarks and Kind.TRUTH not in kinds and content.estimates:
+        # They are surveyed in the truth's frame.
+        content = replace(content, run=replace(content.run, landmarks=()))
+        remarks.append("so are the landmarks, which are surveyed in the truth's")
+    write_file(out, content, kinds, frame)
+    return [out], [*told, *remarks]
+
+
+def _write_geojson(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
+    from relpos.runs.formats.geojson import write_geojson
+
+    return _write_map(content, out, pins, write_geojson)
+
+
+def _write_gpx(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
+    from relpos.runs.formats.gpx import write_gpx
+
+    files, remarks = _write_map(content, out, pins, write_gpx)
+    if content.start_unix_s is None:
+        remarks.append("the points have no times: say when the run's second 0 was (--start)")
+    return files, remarks
+
+
+_WRITERS: dict[Format, Callable[[Content, Path, Sequence[Pin]], _Written]] = {
+    Format.RUN: _write_run,
+    Format.MCAP: _write_mcap,
+    Format.TUM: _write_tum,
+    Format.GEOJSON: _write_geojson,
+    Format.GPX: _write_gpx,
+    Format.CSV: _write_csv,
+}

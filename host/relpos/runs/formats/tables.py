@@ -1,0 +1,82 @@
+"""Tables for pandas: the run format's files with the wearers' names and true distances beside.
+
+What is added are columns, which every reader of the run format ignores: the tables are a run
+directory and an estimate directory still.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from relpos.evaluation.metrics import Track, sample
+from relpos.runs.estimates import write_estimates
+from relpos.runs.formats.content import Content, Kind
+from relpos.runs.run import save_run, write_rows
+
+_OF_PAIRS = ("pairs.csv", "ranges.csv")
+_AS_THEY_ARE = ("landmarks.csv", "imu.csv")
+"""Without a node, or without end: names would double raw inertial data."""
+
+_Rows = list[dict[str, str]]
+
+
+def write_tables(content: Content, directory: Path) -> list[Path]:
+    """Write every table there is something for, one header line each; return them."""
+    directory.mkdir(parents=True, exist_ok=True)
+    save_run(content.run, directory)
+    if content.estimates:
+        write_estimates(directory, content.estimates, steps=content.run.steps)
+    paths = sorted(directory.glob("*.csv"))
+    true = content.tracks_of(Kind.TRUTH)
+    for path in paths:
+        if path.name not in _AS_THEY_ARE:
+            _extend(path, content, true)
+    return paths
+
+
+def _extend(path: Path, content: Content, true: Mapping[int, Track]) -> None:
+    names = {str(node): content.name_of(node) for node in content.node_ids} | {"": ""}
+    with path.open(encoding="utf-8", newline="") as file:
+        reader = csv.DictReader(file)
+        header = list(reader.fieldnames or [])
+        rows: _Rows = list(reader)
+    columns: dict[str, Sequence[object]] = {
+        f"{who}_name": [names.get(row[who], f"node {row[who]}") for row in rows]
+        for who in ("node", "peer")
+        if who in header
+    }
+    if path.name in _OF_PAIRS and true:
+        columns["true_distance_m"] = _true_distances(rows, true)
+    if content.start_unix_s is not None:
+        start_unix_s = content.start_unix_s
+        columns["unix_s"] = [f"{start_unix_s + float(row['time_s']):.6f}" for row in rows]
+    write_rows(
+        path,
+        [*header, *columns],
+        ([*row.values(), *more] for row, more in zip(rows, _transposed(columns), strict=True)),
+    )
+
+
+def _transposed(columns: Mapping[str, Sequence[object]]) -> Iterable[Sequence[object]]:
+    return zip(*columns.values(), strict=True)
+
+
+def _true_distances(rows: _Rows, true: Mapping[int, Track]) -> list[object]:
+    """Give the true distance of each row's two nodes at its time; empty where nobody knows."""
+    of_pair: dict[tuple[int, int], list[int]] = {}
+    for k, row in enumerate(rows):
+        of_pair.setdefault((int(row["node"]), int(row["peer"])), []).append(k)
+    distances: list[object] = [""] * len(rows)
+    for (node, peer), places in of_pair.items():
+        if node not in true or peer not in true:
+            continue
+        at_s = np.array([float(rows[k]["time_s"]) for k in places])
+        position_m, _ = sample([true[node], true[peer]], at_s)
+        distance_m = np.hypot(*(position_m[:, 1] - position_m[:, 0]).T)
+        for k, value in zip(places, distance_m.tolist(), strict=True):
+            distances[k] = round(value, 4)
+    return distances
