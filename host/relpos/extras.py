@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 import shlex
 import sys
+import tomllib
 from collections.abc import Sequence
 from functools import cache
 from importlib import metadata
 
+from relpos import places
 from relpos.errors import RelposError
 
 PURPOSES = {
@@ -21,10 +23,12 @@ PURPOSES = {
 
 @cache
 def requirements(extra: str) -> tuple[str, ...]:
-    """What pyproject.toml names for the extra, as pip takes it (``starlette>=0.40``).
-
-    Nothing where relpos runs from a folder and is not installed.
-    """
+    """What pyproject.toml names for the extra, as pip takes it (``starlette>=0.40``)."""
+    root = places.repository()
+    if root is not None:
+        # What an editable installation remembers is as old as that installation.
+        project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+        return tuple(project["optional-dependencies"].get(extra, ()))
     try:
         named = metadata.requires("relpos") or []
     except metadata.PackageNotFoundError:

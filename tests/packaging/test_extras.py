@@ -10,15 +10,23 @@ import pytest
 
 from relpos import extras
 
-PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())
+ROOT = Path(__file__).resolve().parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 OPTIONAL = PROJECT["project"]["optional-dependencies"]
 
 
 @pytest.fixture(autouse=True)
-def fresh():
+def installed(monkeypatch):
+    """Not in a repository, which knows its extras from the project's file."""
+    monkeypatch.setattr("relpos.places.repository", lambda: None)
     extras.requirements.cache_clear()
     yield
     extras.requirements.cache_clear()
+
+
+def test_a_repository_knows_its_extras_itself(monkeypatch):
+    monkeypatch.setattr("relpos.places.repository", lambda: ROOT)
+    assert extras.requirements("view") == tuple(OPTIONAL["view"])
 
 
 @pytest.fixture

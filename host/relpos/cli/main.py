@@ -15,7 +15,18 @@ import typer
 from typer.core import TyperGroup
 
 from relpos import __version__
-from relpos.cli import convert, deadreckon, demo, emulate, evaluate, figures, fuse, node, simulate
+from relpos.cli import (
+    convert,
+    deadreckon,
+    demo,
+    doctor,
+    emulate,
+    evaluate,
+    figures,
+    fuse,
+    node,
+    simulate,
+)
 from relpos.emulator.faults import help_text
 from relpos.errors import RelposError
 
@@ -76,6 +87,7 @@ app.command("evaluate")(evaluate.evaluate)
 app.command("convert")(convert.convert)
 app.command("figures")(figures.figures)
 app.command("deadreckon")(deadreckon.deadreckon)
+app.command("doctor")(doctor.doctor)
 app.add_typer(node.app, name="node")
 
 

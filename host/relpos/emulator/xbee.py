@@ -92,6 +92,7 @@ class XbeeModule:
         self._parser = Parser(escaped=escaped)
         self._line_free_us = 0
         self._last_rssi = 0
+        # As `relpos node radio` sets a module up.
         self._settings: dict[bytes, bytes] = {
             b"MY": address.to_bytes(2, "big"),
             b"ID": b"\x33\x32",
@@ -100,13 +101,13 @@ class XbeeModule:
             b"SL": serial_number.to_bytes(4, "big"),
             b"AP": b"\2" if escaped else b"\1",
             b"BD": bytes((_BAUD_RATES.get(baud, 3),)),
-            b"CE": b"\1" if address == 0 else b"\0",
+            b"CE": b"\0",
             b"EE": b"\0",
             b"DH": bytes(4),
             b"DL": bytes(4),
             b"MM": b"\0",
             b"RR": b"\0",
-            b"RN": b"\0",
+            b"RN": b"\3",
             b"A1": b"\0",
             b"SM": b"\0",
             b"NI": f"NODE{address}".encode(),

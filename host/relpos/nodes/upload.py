@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 from relpos import places
@@ -17,16 +18,16 @@ UPLOAD_WITHIN_S = 600.0
 _SILENT = ("not in sync", "not responding", "timeout", "getsync", "no response")
 
 
-def platformio(root: Path) -> list[str]:
+def platformio(root: Path, which: Callable[[str], str | None] = shutil.which) -> list[str]:
     """The command to run: ``tools/pio`` where the system's AVR tools are, else PlatformIO itself.
 
     ``root`` is the firmware's project. DeviceError in one line where there is neither.
     """
     offline = (root / ".venv" / "bin" / "platformio").exists()
-    if offline and shutil.which("avr-gcc") and shutil.which("avrdude"):
+    if offline and which("avr-gcc") and which("avrdude"):
         return [str(root / "tools" / "pio")]
     for name in ("pio", "platformio"):
-        if (found := shutil.which(name)) is not None:
+        if (found := which(name)) is not None:
             return [found]
     raise DeviceError(
         "PlatformIO is missing: `pipx install platformio` brings it (in the repository "

@@ -1,0 +1,130 @@
+"""What the checks ask of the computer: the one place that touches it, so that tests can pretend."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import shutil
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+COMMAND_WITHIN_S = 10.0
+
+
+@dataclass
+class SerialPort:
+    """A port as the system lists it; ids are None where it is none on USB."""
+
+    device: str
+    description: str
+    vid: int | None
+    pid: int | None
+
+
+class Computer:
+    """This computer."""
+
+    platform = sys.platform
+
+    def which(self, name: str) -> str | None:
+        """Where a command lies, or None."""
+        return shutil.which(name)
+
+    def told(self, *command: str) -> str:
+        """What a command prints, "" where it is missing, fails or does not end."""
+        try:
+            done = subprocess.run(
+                command, capture_output=True, text=True, timeout=COMMAND_WITHIN_S, check=False
+            )
+        except (OSError, subprocess.TimeoutExpired):
+            return ""
+        return done.stdout if done.returncode == 0 else ""
+
+    def processes(self) -> dict[int, str]:
+        """Process ids and names; nothing where the system has no /proc."""
+        found = {}
+        for folder in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):  # it may have ended meanwhile
+                found[int(folder.name)] = (folder / "comm").read_text().strip()
+        return found
+
+    def holders(self, device: str) -> list[str]:
+        """Processes that have the device open, as `name (id)`, as far as we may see."""
+        try:
+            wanted = os.path.realpath(device)
+        except OSError:
+            return []
+        found = []
+        for pid, name in self.processes().items():
+            with suppress(OSError):
+                for link in Path(f"/proc/{pid}/fd").iterdir():
+                    if str(link.readlink()) == wanted:
+                        found.append(f"{name} ({pid})")
+                        break
+        return found
+
+    def ports(self) -> list[SerialPort]:
+        """The serial ports that the system lists."""
+        from serial.tools.list_ports import comports
+
+        return [SerialPort(p.device, p.description or "", p.vid, p.pid) for p in comports()]
+
+    def exists(self, device: str) -> bool:
+        """Whether a device is there."""
+        return Path(device).exists()
+
+    def may_use(self, device: str) -> bool:
+        """Whether this user may read and write a device."""
+        return os.access(device, os.R_OK | os.W_OK)
+
+    def group_of(self, device: str) -> str:
+        """The group that a device belongs to; "" where there are none."""
+        try:
+            return Path(device).group()
+        except (OSError, KeyError, NotImplementedError):
+            return ""
+
+    def has_group_after_login(self, group: str) -> bool:
+        """Whether the system's lists have the user in a group, whatever this session knows."""
+        try:
+            import grp
+
+            return getpass.getuser() in grp.getgrnam(group).gr_mem
+        except (ImportError, KeyError, OSError):
+            return False
+
+    def user(self) -> str:
+        """The user's name."""
+        try:
+            return getpass.getuser()
+        except (OSError, KeyError):
+            return "$USER"
+
+    def free_bytes(self, folder: Path) -> int:
+        """Room for this user on the disk that ``folder`` is, or will be, on."""
+        while not folder.exists() and folder != folder.parent:
+            folder = folder.parent
+        return shutil.disk_usage(folder).free
+
+    def may_write(self, folder: Path) -> bool:
+        """Whether files can be made in the folder, or in the one that it would be made in."""
+        while not folder.exists() and folder != folder.parent:
+            folder = folder.parent
+        return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
+
+    def now(self) -> datetime:
+        """The clock, in the computer's time zone."""
+        return datetime.now().astimezone()
+
+    def sleeps_on(self) -> bool:
+        """Whether there is a clock that goes on while the computer sleeps."""
+        return hasattr(time, "CLOCK_BOOTTIME")
+
+    def environment(self, name: str) -> str:
+        """An environment variable, or ""."""
+        return os.environ.get(name, "")

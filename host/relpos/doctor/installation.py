@@ -1,0 +1,243 @@
+"""Whether relpos itself is complete, and the computer ready for it."""
+
+from __future__ import annotations
+
+import platform
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from relpos import __version__, extras, places
+from relpos.doctor.computer import Computer
+from relpos.doctor.finding import Finding, hint, well, wrong
+from relpos.errors import RelposError
+
+KERNELS = ("joint", "noise", "particle_kernels", "starts_kernels")
+"""Modules whose kernels every session needs; the smoother and large teams compile when used."""
+MEGABYTE = 1_000_000
+ROOM_TOO_LITTLE = 200 * MEGABYTE
+ROOM_LITTLE = 2000 * MEGABYTE
+COUNTERS_BEGIN = 2024
+COUNTERS_END = 2041
+"""Frames to the nodes are counted by the time (docs/protocol.md)."""
+BROWSERS = (
+    "firefox", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable",
+    "microsoft-edge", "brave-browser",
+)  # fmt: skip
+APT = "sudo apt-get install -y"
+
+
+def look(computer: Computer, key_file: Path | None, out: Path) -> Iterator[Finding]:
+    """Everything but the ports. ``out`` is the folder where recordings go."""
+    yield _python()
+    yield from _extras()
+    yield _kernels(computer)
+    yield from _tools(computer)
+    yield _key(key_file)
+    yield _room(computer, out)
+    yield _browser(computer)
+    yield from _clock(computer)
+
+
+def _python() -> Finding:
+    where = places.repository()
+    version = platform.python_version()
+    words = f"relpos {__version__}, {f'in {where}' if where else 'installed'}; Python {version}"
+    if sys.maxsize < 2**32:
+        return wrong("python", f"{words}, 32 bit", "install a 64-bit Python: numba has no other")
+    return well("python", words)
+
+
+def _extras() -> Iterator[Finding]:
+    for extra, purpose in extras.PURPOSES.items():
+        needed, lacking = extras.requirements(extra), extras.missing(extra)
+        name = f"extra {extra}"
+        if lacking:
+            words = f"not installed: {', '.join(lacking)}; without it there is no {purpose}"
+            yield hint(name, words, extras.install_line(lacking))
+        elif needed:
+            yield well(name, f"installed: {purpose}")
+        else:
+            yield hint(name, "what it needs is not known: this relpos is not installed")
+
+
+# -- compiled kernels ------------------------------------------------------------------------------
+
+
+def _kernels(computer: Computer) -> Finding:
+    from relpos import fusion
+
+    sources = Path(fusion.__file__).parent
+    name = "estimators"
+    pattern = f"py{sys.version_info.major}{sys.version_info.minor}"
+    folders = _kernel_folders(computer, sources)
+    if not any(computer.may_write(folder) for folder in folders):
+        return wrong(
+            name,
+            f"what is compiled cannot be kept ({folders[0]}): every start waits half a minute",
+            "name a folder that can be written: export NUMBA_CACHE_DIR=$HOME/.cache/numba",
+        )
+    for module in KERNELS:
+        source = (sources / f"{module}.py").stat().st_mtime
+        files = (f for folder in folders for f in folder.rglob(f"{module}.*.{pattern}.nbi"))
+        if not any(f.stat().st_mtime >= source for f in files):
+            return hint(
+                name,
+                "not compiled yet: the first start takes half a minute longer",
+                "relpos doctor --prepare",
+            )
+    return well(name, "compiled, a session starts at once")
+
+
+def _kernel_folders(computer: Computer, sources: Path) -> list[Path]:
+    """Where numba keeps machine code: as it is told, beside the source, else the user's cache."""
+    told = computer.environment("NUMBA_CACHE_DIR")
+    if told:
+        return [Path(told)]
+    from platformdirs import user_cache_path
+
+    return [sources / "__pycache__", user_cache_path("numba", appauthor=False)]
+
+
+def prepare() -> None:
+    """Compile every estimator's kernels, so that no session waits for it."""
+    from relpos import fusion
+
+    for name in fusion.SETTINGS:
+        fusion.warm_up(name)
+
+
+# -- tools -----------------------------------------------------------------------------------------
+
+
+def _tools(computer: Computer) -> Iterator[Finding]:
+    compiler = computer.environment("CXX") or "g++"
+    if computer.which(compiler):
+        yield well("g++", _version(computer, compiler))
+    else:
+        yield hint(
+            "g++",
+            f"{compiler} is missing: no emulated nodes (`relpos demo`, `emulate`, `deadreckon`)",
+            f"{APT} g++",
+        )
+    yield _platformio(computer)
+    for command, package, purpose in (
+        ("avr-gcc", "gcc-avr avr-libc arduino-core-avr", "compiler of the boards' firmware"),
+        ("avrdude", "avrdude", "writes the firmware into a board"),
+    ):
+        if computer.which(command):
+            yield well(command, _version(computer, command))
+        else:
+            yield hint(
+                command,
+                f"missing ({purpose}): PlatformIO fetches its own, online",
+                f"{APT} {package}",
+            )
+
+
+def _version(computer: Computer, command: str) -> str:
+    # avrdude tells its version with its help alone, and on stderr.
+    lines = computer.told(command, "--version").splitlines() if command != "avrdude" else []
+    return lines[0] if lines else "there"
+
+
+def _platformio(computer: Computer) -> Finding:
+    from relpos.nodes import upload
+
+    name = "PlatformIO"
+    try:
+        project = places.firmware_project()
+    except RelposError as error:
+        return wrong(name, str(error), "reinstall relpos from its wheel or its repository")
+    try:
+        command = upload.platformio(project, computer.which)
+    except RelposError:
+        return hint(
+            name,
+            "missing: no `relpos node flash` from this computer",
+            "pipx install platformio",
+        )
+    return well(name, command[0])
+
+
+# -- the rest --------------------------------------------------------------------------------------
+
+
+def _key(key_file: Path | None) -> Finding:
+    from relpos.link.authentication import SeenCounters, read_key
+
+    name = "team's key"
+    if key_file is None:
+        return hint(
+            name,
+            "none is named: nodes are spoken to under the key that every new node has, which "
+            "keeps nobody out",
+            "relpos node flash --key-file team.key --new, then export "
+            "RELPOS_KEY_FILE=$PWD/team.key",
+        )
+    try:
+        read_key(key_file)
+        SeenCounters.beside(key_file).load()
+    except RelposError as error:
+        return wrong(
+            name, str(error), "name the file that the nodes were given their key from: --key-file"
+        )
+    if sys.platform != "win32" and key_file.stat().st_mode & 0o077:
+        return wrong(name, f"{key_file}: others can read it", f"chmod 600 {key_file}")
+    return well(name, f"{key_file}, readable by you alone")
+
+
+def _room(computer: Computer, out: Path) -> Finding:
+    name = "room for recordings"
+    where = out.resolve()
+    if not computer.may_write(where):
+        return wrong(
+            name, f"{where} cannot be written", "go to a folder of your own, or name one with --out"
+        )
+    free = computer.free_bytes(where)
+    words = f"{free / 1e9:.1f} GB free for {where}"
+    remedy = "delete what is not needed, or record to another disk: --out DIR"
+    if free < ROOM_TOO_LITTLE:
+        return wrong(name, words, remedy)
+    return hint(name, words, remedy) if free < ROOM_LITTLE else well(name, words)
+
+
+def _browser(computer: Computer) -> Finding:
+    name = "browser"
+    found = next((b for b in BROWSERS if computer.which(b)), None)
+    elsewhere = "`--view-listen 0.0.0.0:8600` shows the page on other devices, `--terminal` here"
+    if computer.platform in ("win32", "darwin"):
+        return well(name, "the system's")
+    if found is None:
+        return hint(name, f"none is found here; {elsewhere}", f"{APT} firefox-esr")
+    if not (computer.environment("DISPLAY") or computer.environment("WAYLAND_DISPLAY")):
+        return hint(name, f"{found}, but this session has no screen; {elsewhere}")
+    return well(name, found)
+
+
+def _clock(computer: Computer) -> Iterator[Finding]:
+    now = computer.now()
+    offset = now.strftime("%z")
+    words = f"{now:%Y-%m-%d %H:%M:%S}, {now.tzname()} (UTC{offset[:3]}:{offset[3:]})"
+    if not COUNTERS_BEGIN <= now.year < COUNTERS_END:
+        yield wrong(
+            "clock",
+            f"{words}: nodes take the time as the frames' counter, and refuse this one",
+            "set date and time, best by a time server: sudo timedatectl set-ntp true",
+        )
+    elif computer.told("timedatectl", "show", "--property=NTPSynchronized").strip().endswith("=no"):
+        yield hint(
+            "clock",
+            f"{words}, not set by a time server: a clock that goes back lets nodes refuse "
+            "commands until it has caught up",
+            "sudo timedatectl set-ntp true, before you go where there is no network",
+        )
+    else:
+        yield well("clock", words)
+    if not computer.sleeps_on():
+        yield hint(
+            "sleep",
+            "this system has no clock that goes on while it sleeps: a session that was asleep "
+            "has to be started again",
+            "keep the laptop awake during a mission",
+        )
