@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from relpos.cli import fuse, output
+from relpos.cli.estimators import BANK
 
 
 class Board(StrEnum):
@@ -66,5 +67,5 @@ def demo(
             faults=faults,
         )
     save_run(run, out / "run")
-    job = fuse.Job(str(out / "run"), fuse.EstimatorName.BANK, {}, seed, out)
+    job = fuse.Job(str(out / "run"), BANK, {}, seed, out)
     fuse.fuse_recording(job, run, run.priors, as_json=json, report=True)

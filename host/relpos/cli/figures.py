@@ -22,6 +22,14 @@ def figures(
         list[str] | None,
         typer.Option(metavar="NAME", help=f"One of {NAMES}; all without it. May be repeated."),
     ] = None,
+    estimator: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Draw this estimator of yours too: MODULE:CLASS, FILE.py:CLASS, or a name that a "
+            "package registers. May be repeated.",
+        ),
+    ] = None,
     seeds: Annotated[int, typer.Option(min=2, help="Runs behind every point.")] = 24,
     first: Annotated[int, typer.Option(min=0, help="The first seed.")] = 0,
     workers: Annotated[
@@ -35,7 +43,15 @@ def figures(
     """Draw every figure of the paper's evaluation as SVG, PNG and CSV, and one page of them all."""
     from relpos.evaluation.executors import executor
     from relpos.evaluation.figures import FIGURES, Work, page, save
+    from relpos.fusion import own
 
+    for name in estimator or []:
+        if not own.is_own(name):
+            raise typer.BadParameter(
+                f"'{name}' is not MODULE:CLASS; ours are drawn anyway", param_hint="--estimator"
+            )
+        # A name that leads nowhere is told before anything is computed.
+        own.factory(name)
     wanted = list(dict.fromkeys(figure or FIGURES))
     for name in wanted:
         if name not in FIGURES:
@@ -44,7 +60,7 @@ def figures(
     sheets, pictures = [], []
     started = time.monotonic()
     with executor(cluster, workers) as pool:
-        work = Work(range(first, first + seeds), pool)
+        work = Work(range(first, first + seeds), pool, own=tuple(estimator or ()))
         for name in wanted:
             with output.counting(name) as work.on_done:
                 sheet = FIGURES[name](work)
@@ -53,6 +69,7 @@ def figures(
             pictures.append(svg)
             output.remark(f"{svg}  ({time.monotonic() - started:.0f} s)")
     again = "".join(f" --figure {name}" for name in figure or [])
+    again += "".join(f" --estimator {name}" for name in estimator or [])
     where = out / "index.html"
     page.write(
         sheets,

@@ -13,6 +13,7 @@ from typer.core import TyperCommand
 
 from relpos.cli import output
 from relpos.cli import source as sources
+from relpos.cli.estimators import BANK, DEADRECKONING, EstimatorName
 from relpos.cli.keys import KeyFile
 from relpos.errors import DataError, DeviceError, RelposError
 
@@ -26,14 +27,6 @@ if TYPE_CHECKING:
 
 GATHER_S = 3.0
 """A node reports its motion every second; with two losses in a row it has still been heard."""
-
-
-class EstimatorName(StrEnum):
-    """The estimators by the names people's scripts rely on."""
-
-    BANK = "bank"
-    PARTICLE = "particle"
-    DEADRECKONING = "deadreckoning"
 
 
 class Initial(StrEnum):
@@ -64,7 +57,7 @@ def fuse(
     source: Annotated[
         str, typer.Argument(metavar="SOURCE", help="Run directory, serial port or pyserial URL.")
     ],
-    estimator: Annotated[EstimatorName, typer.Option(help="Which estimator.")] = EstimatorName.BANK,
+    estimator: EstimatorName = BANK,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="A setting of the estimator; see below."),
@@ -129,7 +122,7 @@ class Job:
     """What is to be done, as the command line said it."""
 
     source: str
-    estimator: EstimatorName
+    estimator: str
     settings: dict[str, str]
     seed: int
     out: Path
@@ -234,13 +227,13 @@ def fuse_recording(
     _tell(job, run.name, counters, outcome.estimates, scored, as_json=as_json)
 
 
-def _check_usable(run: Run, estimator: EstimatorName) -> None:
+def _check_usable(run: Run, estimator: str) -> None:
     """Refuse a run nothing can be concluded from, before anything is computed."""
     if not run.motions:
         raise DataError(
             f"{run.directory or run.name}: no motion in this run (motion.csv): nothing to fuse"
         )
-    if estimator is EstimatorName.DEADRECKONING:
+    if estimator == DEADRECKONING:
         return
     if not run.ranges:
         raise DataError(
@@ -316,7 +309,7 @@ def _score(
     if not moving <= {prior.node for prior in priors}:
         priors = run.priors_for(InitialPose.FROM_TRUTH)
         start = "dead reckoning from the true start"
-    plain = fusion.make(EstimatorName.DEADRECKONING, priors, {}, job.seed)
+    plain = fusion.make(DEADRECKONING, priors, {}, job.seed)
     baseline = _pass_through(plain, run.measurements).estimates
     return _Scored(
         score,
@@ -434,7 +427,7 @@ def _tell(
         output.print_json(
             {
                 "run": name,
-                "estimator": str(job.estimator),
+                "estimator": job.estimator,
                 "seed": job.seed,
                 "out": str(job.out),
                 "estimates": len(estimates),

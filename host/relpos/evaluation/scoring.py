@@ -134,7 +134,10 @@ def _common(run: Run, priors: Sequence[Prior]) -> bool:
     """Whether the priors only say that all start alike: their frame is nobody's but their own."""
     from relpos.runs import InitialPose
 
-    return tuple(priors) == run.priors_for(InitialPose.COMMON)
+    given = tuple(priors)
+    if given != run.priors_for(InitialPose.COMMON) or given == run.description.priors:
+        return False
+    return not run.truth or given != run.priors_for(InitialPose.FROM_TRUTH)
 
 
 def bound_of(run: Run) -> Bound | None:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from relpos.errors import RelposError
+from relpos.fusion import own
 from relpos.fusion.bank_settings import BankSettings
 from relpos.fusion.deadreckoning import DeadReckoning, DeadReckoningSettings
 from relpos.fusion.estimator import (
@@ -41,7 +42,8 @@ def make(
     """Make an estimator by its name, from ``--set`` keys and values.
 
     Nodes without a prior start unknown. ``nodes`` tells how each is worn (``run.nodes``): the
-    bank uses heights and antenna offsets, the other two are as the paper has them. RelposError
+    bank uses heights and antenna offsets, the other two are as the paper has them. Estimators of
+    others go by ``module:Class`` or by a registered name (:mod:`relpos.fusion.own`). RelposError
     for an unknown name or key and for a value that is out of range.
     """
     given = settings or {}
@@ -57,7 +59,21 @@ def make(
             return ParticleFilter(priors, parse(ParticleSettings, given, "particle"), seed)
         case "deadreckoning":
             return DeadReckoning(priors, parse(DeadReckoningSettings, given, "deadreckoning"), seed)
-    raise RelposError(f"unknown estimator '{name}': one of {', '.join(SETTINGS)}")
+    check_name(name)
+    return own.make(name, own.factory(name), priors, given, seed, nodes)
+
+
+def names() -> tuple[str, ...]:
+    """Return the names of all estimators: ours, then what installed packages register."""
+    return *SETTINGS, *sorted(set(own.registered()) - set(SETTINGS))
+
+
+def check_name(name: str) -> None:
+    """Raise RelposError where a name can be no estimator's."""
+    if name not in SETTINGS and not own.is_own(name):
+        raise RelposError(
+            f"unknown estimator '{name}': one of {', '.join(names())}, or MODULE:CLASS"
+        )
 
 
 def make_smoother(
@@ -99,8 +115,10 @@ def warm_up(name: str) -> None:
     """Make everything compiled ready, on a made-up team of three, one of them unknown.
 
     The very first time after an installation this takes about ten seconds; from then on the
-    machine code is read from disk.
+    machine code is read from disk. What an estimator of somebody else's needs is its own affair.
     """
+    if name not in SETTINGS:
+        return
     team = {1: (0.0, 0.0), 2: (6.0, 0.0), 3: (2.0, 5.0)}
     estimator = make(name, [Prior(node, *team[node], 0.0, 0.1, 0.1) for node in (1, 2)])
     for k in range(1, WARM_UP_S):
@@ -120,7 +138,7 @@ WARM_UP_S = 8
 
 
 def settings_of(name: str) -> list[SettingInfo]:
-    """List an estimator's settings, with defaults and bounds, for a help text."""
+    """List the settings of one of our estimators, with defaults and bounds, for a help text."""
     if name not in SETTINGS:
         raise RelposError(f"unknown estimator '{name}': one of {', '.join(SETTINGS)}")
     return describe(SETTINGS[name])
@@ -137,8 +155,10 @@ __all__ = [
     "Parameter",
     "SettingInfo",
     "Shape",
+    "check_name",
     "make",
     "make_smoother",
+    "names",
     "settings_of",
     "warm_up",
 ]

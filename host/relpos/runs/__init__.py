@@ -1,7 +1,7 @@
 """Run directories: how a recording comes in and an estimate goes out."""
 
 from relpos.runs.description import Description, InitialPose, NodeInfo, Simulated
-from relpos.runs.estimates import read_estimates, write_estimates
+from relpos.runs.estimates import read_estimates, read_parameters, write_estimates
 from relpos.runs.imu import ImuRecording
 from relpos.runs.landmarks import Landmark
 from relpos.runs.run import Run, load_run, save_run
@@ -16,6 +16,7 @@ __all__ = [
     "Simulated",
     "load_run",
     "read_estimates",
+    "read_parameters",
     "save_run",
     "write_estimates",
 ]

@@ -86,7 +86,7 @@ def write_estimates(
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
     alternatives = [row for estimate in estimates for row in estimate.alternatives]
-    parameters = _changed(row for estimate in estimates for row in estimate.parameters)
+    parameters = changes(row for estimate in estimates for row in estimate.parameters)
     tables: list[tuple[str, Sequence[str], Iterable[Sequence[object]], bool]] = [
         ("estimate.csv", ESTIMATE_COLUMNS, _estimate_rows(estimates), True),
         ("pairs.csv", PAIR_COLUMNS, _pair_rows(estimates), True),
@@ -166,6 +166,27 @@ def read_estimates(directory: Path | str) -> list[Estimate]:
     ]
 
 
+def read_parameters(directory: Path | str) -> list[Parameter]:
+    """Read ``parameters.csv`` back, ordered by time; empty where there is none."""
+    path = find_table(Path(directory), "parameters.csv")
+    if path is None:
+        return []
+    rows = [Parameter(*row) for row in read_rows(path, _PARAMETER_TABLE)]
+    return sorted(rows, key=lambda row: row.time_s)
+
+
+def changes(parameters: Iterable[Parameter]) -> list[Parameter]:
+    """Leave out what repeats the same parameter's last row."""
+    last: dict[tuple[str, int, int | None], tuple[float, float]] = {}
+    kept: list[Parameter] = []
+    for row in parameters:
+        key, figures = (row.name, row.node, row.peer), (row.value, row.sigma)
+        if last.get(key) != figures:
+            last[key] = figures
+            kept.append(row)
+    return kept
+
+
 def _estimate_rows(estimates: Iterable[Estimate]) -> Iterable[Sequence[object]]:
     for estimate in estimates:
         for node in estimate.nodes:
@@ -180,18 +201,6 @@ def _pair_rows(estimates: Iterable[Estimate]) -> Iterable[Sequence[object]]:
     for estimate in estimates:
         for pair in estimate.pairs:
             yield (estimate.time_s, *(getattr(pair, name) for name in PAIR_COLUMNS[1:]))
-
-
-def _changed(parameters: Iterable[Parameter]) -> list[Parameter]:
-    """Leave out what repeats the same parameter's last row."""
-    last: dict[tuple[str, int, int | None], tuple[float, float]] = {}
-    kept: list[Parameter] = []
-    for row in parameters:
-        key, figures = (row.name, row.node, row.peer), (row.value, row.sigma)
-        if last.get(key) != figures:
-            last[key] = figures
-            kept.append(row)
-    return kept
 
 
 def _attribute_rows(rows: Iterable[object], names: Sequence[str]) -> Iterable[Sequence[object]]:
@@ -269,6 +278,16 @@ _PARAMETER_TABLE = (
     Column("name", str),
     Column("value", number),
     Column("sigma", not_negative, optional=True),
+)
+
+
+_PARAMETER_TABLE = (
+    Column("time_s", number),
+    Column("node", node_id),
+    Column("peer", node_id, optional=True),
+    Column("name", str),
+    Column("value", number),
+    Column("sigma", not_negative),
 )
 
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from relpos.errors import RelposError
 from relpos.simulation import paper
 from relpos.simulation.lab import simulate_lab
+
+if TYPE_CHECKING:
+    from relpos.runs import Run
 
 LAB = "lab"
 
@@ -22,3 +27,28 @@ def simulate(
     if scenario == LAB:
         return simulate_lab(seed, overrides)
     return paper.simulate_paper(scenario, seed, overrides)
+
+
+def simulate_run(
+    scenario: str, seed: int = 0, overrides: Mapping[str, str | float] | None = None
+) -> Run:
+    """Simulate a run as :func:`relpos.runs.load_run` would read it, with how it was made."""
+    from relpos.runs import Description, Landmark, Run, Simulated
+
+    chosen = {key: str(value) for key, value in (overrides or {}).items()}
+    simulated = simulate(scenario, seed, chosen)
+    return Run(
+        name=f"{scenario}-{seed}",
+        description=Description(
+            source=f"relpos simulate --scenario {scenario} --seed {seed}"
+            + "".join(f" --set {key}={value}" for key, value in chosen.items()),
+            # Everybody's heading at the start is given in the one frame of the rectangle.
+            heading_known=any(math.isfinite(p.sigma_rad) for p in simulated.priors),
+            priors=simulated.priors,
+            simulated=Simulated(scenario, seed, chosen),
+        ),
+        measurements=simulated.measurements,
+        events=simulated.events,
+        landmarks=tuple(Landmark(name, x, y) for name, (x, y) in simulated.landmarks.items()),
+        truth=simulated.truth,
+    )

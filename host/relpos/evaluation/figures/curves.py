@@ -16,6 +16,7 @@ from relpos.evaluation.figures.sheet import (
     curve,
     legend_beside,
     level,
+    own_colour,
     printed,
 )
 from relpos.evaluation.study import Case, Figure
@@ -46,7 +47,8 @@ def range_noise(work: Work) -> Sheet:
         for d, t in scales
         for r in SIGMA_R_M
     ]
-    *swept, reckoned, bank = work.outcomes([*cases, RECKONED, BANK])
+    outcomes = work.outcomes([*cases, RECKONED, BANK, *work.own_cases()])
+    swept, (reckoned, bank, *own) = outcomes[: len(cases)], outcomes[len(cases) :]
     [bound] = work.bounds([RECKONED])
     by_scale = {
         scale: swept[k * len(SIGMA_R_M) : (k + 1) * len(SIGMA_R_M)]
@@ -60,6 +62,7 @@ def range_noise(work: Work) -> Sheet:
     rows += [
         ("IMU alone", 0.0, 0.0, "", *_numbers(reckoned.distance_m, reckoned.aligned_m)),
         ("bank", "", "", "", *_numbers(bank.distance_m, bank.aligned_m)),
+        *((o.case.label, "", "", "", *_numbers(o.distance_m, o.aligned_m)) for o in own),
         ("bound", "", "", "", bound.filtering_distance_m, "", bound.filtering_position_m, ""),
     ]
 
@@ -70,6 +73,8 @@ def range_noise(work: Work) -> Sheet:
             label = f"{scale[0]:g}, {scale[1]:g}"
             curve(axes, k, SIGMA_R_M, [o.distance_m for o in outcomes], label)
         level(axes, bank.distance_m, "bank", COLOURS[5])
+        for k, o in enumerate(own):
+            level(axes, o.distance_m, o.case.label, own_colour(k), "--")
         bound_level(axes, bound.filtering_distance_m)
         printed(axes, [2.0, 2.0], [2.1, 10.0])
         _log_ticks(axes, SIGMA_R_M)
@@ -99,7 +104,8 @@ def particles(work: Work) -> Sheet:
     cases = [
         Case("", settings={"particles": m, "alpha": alpha}) for alpha in ALPHAS for m in PARTICLES
     ]
-    *swept, bank = work.outcomes([*cases, BANK])
+    outcomes = work.outcomes([*cases, BANK, *work.own_cases()])
+    swept, (bank, *own) = outcomes[: len(cases)], outcomes[len(cases) :]
     [bound] = work.bounds([BANK])
     by_alpha = {
         alpha: swept[k * len(PARTICLES) : (k + 1) * len(PARTICLES)]
@@ -112,6 +118,7 @@ def particles(work: Work) -> Sheet:
     ]
     rows += [
         ("bank", "", "", *_numbers(bank.distance_m, bank.aligned_m)),
+        *((o.case.label, "", "", *_numbers(o.distance_m, o.aligned_m)) for o in own),
         ("bound", "", "", bound.filtering_distance_m, "", bound.filtering_position_m, ""),
     ]
 
@@ -120,6 +127,8 @@ def particles(work: Work) -> Sheet:
         for k, (alpha, outcomes) in enumerate(by_alpha.items()):
             curve(axes, k, PARTICLES, [o.distance_m for o in outcomes], f"{alpha:g}")
         level(axes, bank.distance_m, "bank", COLOURS[5])
+        for k, o in enumerate(own):
+            level(axes, o.distance_m, o.case.label, own_colour(k), "--")
         bound_level(axes, bound.filtering_distance_m)
         printed(axes, [500.0, 500.0], [1.8, 2.0])
         _log_ticks(axes, PARTICLES)
@@ -149,6 +158,7 @@ def wrong_start(work: Work) -> Sheet:
         r"particle, $\alpha$ 0": Case("", settings={"alpha": 0}),
         r"particle, $\alpha$ .01": Case(""),
         "bank": BANK,
+        **{case.label: case for case in work.own_cases()},
     }
     cases = [
         Case("", "paper", {"start_shift_m": shift}, kind.estimator, kind.settings)
@@ -187,7 +197,7 @@ def wrong_start(work: Work) -> Sheet:
         legend_beside(axes)
 
     at_4 = SHIFTS_M.index(4.0)
-    without, with_dual = list(by_kind.values())[:2]
+    without, with_dual, *_ = by_kind.values()
     return Sheet(
         "wrong-start",
         "Error against a wrong start, with and without dual particles",

@@ -19,6 +19,7 @@ from relpos.evaluation.figures.sheet import (
     Work,
     beside,
     legend_beside,
+    own_colour,
 )
 from relpos.evaluation.study import CONFIDENCE_95, Case, Outcome
 from relpos.simulation.scenarios import LAB
@@ -61,6 +62,8 @@ def _over_time(work: Work, scenario: str, seconds: float, known: Sequence[str]) 
         for d, t in IMU_SCALES[1:]
     ]
     cases.append(Case("bank", scenario, estimator="bank"))
+    ours = len(cases)
+    cases += work.own_cases(scenario)
     outcomes = work.outcomes(cases)
     at_s = np.arange(MARK_EVERY_S, seconds + 1e-9, MARK_EVERY_S)
     series = [_series(outcome, at_s) for outcome in outcomes]
@@ -75,7 +78,8 @@ def _over_time(work: Work, scenario: str, seconds: float, known: Sequence[str]) 
 
     def draw(canvas: Canvas) -> None:
         axes = canvas.add_subplot()
-        colours = (GREY, *COLOURS[:4], COLOURS[5])
+        colours = [GREY, *COLOURS[:4], COLOURS[5]]
+        colours += [own_colour(k) for k in range(len(cases) - ours)]
         for k, (case, (mean, half)) in enumerate(zip(cases, series, strict=True)):
             axes.plot(at_s, mean, color=colours[k], linestyle=DASHES[k % 4 if k < 5 else 0],
                       label=case.label)  # fmt: skip

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from relpos.errors import RelposError
 from relpos.evaluation import bounds, study
 from relpos.evaluation.executors import run_all
 
@@ -28,6 +29,9 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Distinguishable with any colour vision (Okabe and Ito 2008), darkest first."""
 
 INK, GREY = "#222222", "#8C8C8C"
+OWN_COLOURS = ("#6A3D9A", "#8C510A", "#01665E")
+"""Of the estimators that somebody adds to ours."""
+
 MARKERS = ("o", "s", "^", "D", "v", "P")
 DASHES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1, 1, 1)), (0, (1, 1)))
 """Curves differ in mark and line, too: not by colour alone."""
@@ -80,11 +84,15 @@ class Sheet:
 
 @dataclass
 class Work:
-    """Where and on how many seeds figures are computed; ``on_done`` hears of every job."""
+    """Where and on how many seeds figures are computed; ``on_done`` hears of every job.
+
+    ``own`` are estimators of somebody else's, drawn beside ours wherever estimators are compared.
+    """
 
     seeds: Sequence[int]
     pool: Executor
     on_done: Callable[[int, int], None] | None = None
+    own: Sequence[str] = ()
     _bounds: dict[tuple[Any, ...], bounds.Totals] = field(default_factory=dict)
     _outcomes: dict[tuple[Any, ...], study.Outcome] = field(default_factory=dict)
 
@@ -92,6 +100,10 @@ class Work:
         """Score cases on all seeds; what two figures share is computed once."""
         fresh = {key(case): case for case in cases if key(case) not in self._outcomes}
         made = study.run(list(fresh.values()), self.seeds, self.pool, self.on_done)
+        for outcome in made:
+            # Ours may give up on a run, which is a result; of somebody else's it is a fault.
+            if outcome.case.estimator in self.own and outcome.failures:
+                raise RelposError(outcome.failures[0])
         self._outcomes.update(zip(fresh, made, strict=True))
         return [self._outcomes[key(case)] for case in cases]
 
@@ -102,9 +114,23 @@ class Work:
         self._bounds.update(zip(fresh, made, strict=True))
         return [self._bounds[key(case)[:2]] for case in cases]
 
+    def own_cases(self, scenario: str = "paper") -> list[study.Case]:
+        """Give a case for each estimator of somebody else's."""
+        return [study.Case(short(name), scenario, estimator=name) for name in self.own]
+
     def each(self, function: Callable[..., T], jobs: Sequence[tuple[Any, ...]]) -> list[T]:
         """Run any jobs."""
         return run_all(self.pool, function, jobs, self.on_done)
+
+
+def short(name: str) -> str:
+    """Call ``path/to/module:Class`` just Class."""
+    return name.rpartition(":")[2]
+
+
+def own_colour(place: int) -> str:
+    """Colour of the somebody else's estimator at that place."""
+    return OWN_COLOURS[place % len(OWN_COLOURS)]
 
 
 def key(case: study.Case) -> tuple[Any, ...]:
@@ -129,7 +155,8 @@ def curve(
     mean = np.array([f.mean for f in figures])
     half = np.nan_to_num(np.array([f.half_width for f in figures]))
     axes.errorbar(
-        x, mean, half, color=COLOURS[place], marker=MARKERS[place], linestyle=DASHES[place],
+        x, mean, half, color=COLOURS[place % 6], marker=MARKERS[place % 6],
+        linestyle=DASHES[place % 6],
         capsize=2.5, elinewidth=1.0, label=label,
     )  # fmt: skip
 

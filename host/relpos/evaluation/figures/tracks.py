@@ -9,7 +9,15 @@ import numpy as np
 
 from relpos import fusion
 from relpos.evaluation import metrics, tracks
-from relpos.evaluation.figures.sheet import COLOURS, DASHES, Beside, Floats, Sheet, Work
+from relpos.evaluation.figures.sheet import (
+    COLOURS,
+    DASHES,
+    Beside,
+    Floats,
+    Sheet,
+    Work,
+    short,
+)
 from relpos.evaluation.study import ESTIMATOR_SEED
 from relpos.simulation.lab import MARGIN_M, WALLS
 from relpos.simulation.scenarios import LAB, simulate
@@ -37,20 +45,21 @@ def one_run(scenario: str, estimator: str, seed: int) -> tuple[float, dict[int, 
 
 
 def _tracks(work: Work, scenario: str, seed: int) -> Sheet:
-    made = work.each(one_run, [(scenario, estimator, seed) for estimator, _ in PANELS])
+    panels = (*PANELS, *((name, f"IMU and UWB, {short(name)}") for name in work.own))
+    made = work.each(one_run, [(scenario, estimator, seed) for estimator, _ in panels])
     run = simulate(scenario, seed)
     way = np.array([(t.x_m, t.y_m) for t in run.truth if t.node == 1])
     rows: list[Sequence[float | int | str]] = [
         (estimator, node, *(float(v) for v in row))
-        for (estimator, _), (_, found) in zip(PANELS, made, strict=True)
+        for (estimator, _), (_, found) in zip(panels, made, strict=True)
         for node, track in found.items()
         for row in track.T
     ]
     lab = scenario == LAB
 
     def draw(canvas: Canvas) -> None:
-        grid = canvas.subplots(1, len(PANELS), sharex=True, sharey=True)
-        for axes, (_, title), (error_m, found) in zip(grid, PANELS, made, strict=True):
+        grid = canvas.subplots(1, len(panels), sharex=True, sharey=True)
+        for axes, (_, title), (error_m, found) in zip(grid, panels, made, strict=True):
             if lab:
                 _room(axes)
             for k, (node, (_, x, y)) in enumerate(found.items()):
@@ -75,9 +84,9 @@ def _tracks(work: Work, scenario: str, seed: int) -> Sheet:
         draw,
         tuple(
             Beside(f"this run, {title}", "-", error)
-            for (_, title), (error, _) in zip(PANELS, made, strict=True)
+            for (_, title), (error, _) in zip(panels, made, strict=True)
         ),
-        (11.0, 4.1),
+        (3.7 * len(panels), 4.1),
     )
 
 

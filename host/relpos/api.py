@@ -1,0 +1,216 @@
+"""The Python interface for research: load or simulate a run, estimate, evaluate, plot.
+
+    import relpos
+
+    run = relpos.load("recordings/basement")
+    result = relpos.fuse(run, estimator="bank", seed=0)
+    print(relpos.evaluate(result, run))
+    relpos.plot(result, run).savefig("tracks.svg")
+
+Everything here is also an attribute of :mod:`relpos`, loaded when it is first used. Units are SI
+(m, rad, s), frames and signs those of the run format: world x east-like, y north-like, z up,
+angles counter-clockwise; times are seconds from the run's start. Whatever is wrong with data,
+settings or an estimator is a :class:`relpos.RelposError` of one line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from relpos.errors import RelposError
+from relpos.evaluation.result import Passage, Result, pass_through, read_result
+from relpos.evaluation.scoring import Evaluation
+from relpos.fusion.estimator import Estimate, Estimator
+from relpos.measurements import Measurement, Prior
+from relpos.runs import InitialPose, Run, load_run, save_run
+
+if TYPE_CHECKING:
+    from relpos.evaluation.bounds import Bound
+
+Given = str | Estimator | Callable[..., Estimator]
+"""An estimator as ``fuse`` takes it: a name, an object, or a class or function that makes one."""
+
+
+def load(path: Path | str) -> Run:
+    """Read a run: a run directory (docs/run-format.md) or a recording.
+
+    DataError names the file, line and column of the first fault.
+    """
+    return load_run(path)
+
+
+def save(run: Run, path: Path | str) -> None:
+    """Write a run as a run directory that :func:`load` reads back to the same run."""
+    save_run(run, path)
+
+
+def simulate(scenario: str = "paper", seed: int = 0, **settings: float | str) -> Run:
+    """Simulate a run with its truth; the same arguments give the same run.
+
+    ``scenario`` is one of ``relpos simulate`` (paper, paper-p1, paper-a, paper-h, paper-h2, lab),
+    ``settings`` its keys. RelposError for an unknown one, or for a value out of range.
+    """
+    from relpos.simulation.scenarios import simulate_run
+
+    return simulate_run(scenario, seed, settings)
+
+
+def fuse(
+    run: Run,
+    estimator: Given = "bank",
+    *,
+    seed: int = 0,
+    settings: Mapping[str, object] | None = None,
+    smooth: bool = False,
+    initial: str | Sequence[Prior] | None = None,
+) -> Result:
+    """Run an estimator over a whole run.
+
+    ``estimator`` is ``"bank"``, ``"particle"``, ``"deadreckoning"``, a name that an installed
+    package registers, ``"module:Class"`` or ``"file.py:Class"``; a class or function that makes
+    an estimator (with those of ``priors``, ``seed``, ``nodes`` and ``settings`` that it names);
+    or an object that is one. ``settings`` are what ``--set`` takes. ``smooth`` estimates from the
+    whole run, when all is over. ``initial`` overrules what the run says of its start:
+    ``"unknown"``, ``"common"`` (all at one place, facing alike), ``"truth"``, or priors.
+
+    RelposError where the run has no motion, where the estimator gives up, and where one that is
+    not ours fails or breaks the interface (its own error is the cause, ``__cause__``).
+    """
+    priors = run.priors if initial is None else _priors(run, initial)
+    name = name_of(estimator)
+    made = _make(estimator, name, run, priors, settings, seed, smooth=smooth)
+    passage = pass_through(made, run.measurements)
+    if passage.failure is not None:
+        raise passage.failure
+    if passage.interrupted:
+        raise KeyboardInterrupt
+    return result_of(name, passage, seed=seed, settings=settings, priors=priors, smoothed=smooth)
+
+
+def evaluate(
+    result: Result | Sequence[Estimate] | Path | str, run: Run, *, bound: bool = True
+) -> Evaluation:
+    """Score a result (or estimates, or a directory with ``estimate.csv``) against a run's truth.
+
+    ``bound`` computes the Cramer-Rao bound of a simulated run beside it. DataError where the run
+    has no truth, or none at a time of which there is an estimate.
+    """
+    from relpos.evaluation import scoring
+
+    scoring.need_truth(run)
+    result = _result(result)
+    least = scoring.bound_of(run) if bound else None
+    return scoring.evaluate(
+        run,
+        result.estimates,
+        result.priors,
+        latency=result.latency,
+        bound=None if least is None else least.totals(),
+    )
+
+
+def bound(run: Run) -> Bound | None:
+    """Compute the Cramer-Rao bound of a simulated run, over time; None of a recorded one."""
+    from relpos.evaluation import scoring
+
+    return scoring.bound_of(run)
+
+
+def result_of(
+    name: str,
+    passage: Passage,
+    *,
+    seed: int | None = None,
+    settings: Mapping[str, object] | None = None,
+    priors: Sequence[Prior] | None = None,
+    smoothed: bool = False,
+    counters: Mapping[str, float] | None = None,
+) -> Result:
+    """Put what an estimator gave together as a result."""
+    from relpos.runs.estimates import changes
+
+    return Result(
+        name,
+        passage.estimates,
+        tuple(changes(row for estimate in passage.estimates for row in estimate.parameters)),
+        passage.counters if counters is None else counters,
+        seed,
+        dict(settings or {}),
+        None if priors is None else tuple(priors),
+        smoothed,
+        passage,
+    )
+
+
+def name_of(estimator: Given) -> str:
+    """Return what an estimator is called in tables: its name, or that of its class."""
+    if isinstance(estimator, str):
+        return estimator
+    return getattr(estimator, "__name__", type(estimator).__name__)
+
+
+def _make(
+    estimator: Given,
+    name: str,
+    run: Run,
+    priors: Sequence[Prior],
+    settings: Mapping[str, object] | None,
+    seed: int,
+    *,
+    smooth: bool,
+) -> Estimator:
+    from relpos import fusion
+    from relpos.fusion import own
+
+    if isinstance(estimator, str):
+        make = fusion.make_smoother if smooth else fusion.make
+        return make(estimator, priors, settings, seed, run.nodes)
+    if smooth:
+        raise RelposError(
+            f"{name}: smoothing begins from an estimator that is named, as 'module:Class'"
+        )
+    if isinstance(estimator, type) or not hasattr(estimator, "process"):
+        assert callable(estimator)
+        return own.make(name, estimator, priors, settings, seed, run.nodes)
+    if settings:
+        raise RelposError(f"{name}: settings belong to a name or a class, not to an object")
+    return own.guard(name, estimator)
+
+
+def _priors(run: Run, initial: str | Sequence[Prior]) -> tuple[Prior, ...]:
+    if not isinstance(initial, str):
+        return tuple(initial)
+    words = {
+        "unknown": InitialPose.UNKNOWN,
+        "common": InitialPose.COMMON,
+        "truth": InitialPose.FROM_TRUTH,
+    }
+    if initial not in words:
+        raise RelposError(f"initial: '{initial}' is none of {', '.join(words)}")
+    return run.priors_for(words[initial])
+
+
+def _result(given: Result | Sequence[Estimate] | Path | str) -> Result:
+    if isinstance(given, Result):
+        return given
+    if isinstance(given, str | Path):
+        return read_result(given)
+    return Result("estimates", tuple(given))
+
+
+__all__ = [
+    "Estimate",
+    "Estimator",
+    "Evaluation",
+    "Measurement",
+    "Result",
+    "Run",
+    "bound",
+    "evaluate",
+    "fuse",
+    "load",
+    "save",
+    "simulate",
+]

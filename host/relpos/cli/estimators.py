@@ -1,0 +1,33 @@
+"""``--estimator``: ours by name, anybody's by ``MODULE:CLASS``."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from relpos.errors import RelposError
+
+BANK, DEADRECKONING = "bank", "deadreckoning"
+"""The default, and the one that needs no ranges."""
+
+HELP = (
+    "bank, particle, deadreckoning, a name that a package registers, or MODULE:CLASS "
+    "(also FILE.py:CLASS) of your own."
+)
+
+
+def check(name: str | None) -> str | None:
+    """Pass a name on that may be an estimator's; wrong usage otherwise."""
+    from relpos import fusion
+
+    if name is not None:
+        try:
+            fusion.check_name(name)
+        except RelposError as error:
+            raise typer.BadParameter(str(error)) from None
+    return name
+
+
+EstimatorName = Annotated[str, typer.Option(metavar="NAME", help=HELP, callback=check)]
+"""The ``--estimator`` option of every command that takes one."""
