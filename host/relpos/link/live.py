@@ -188,7 +188,12 @@ def send(device: Line, data: bytes) -> None:
     try:
         device.write(data)
     except (serial.SerialException, OSError, TypeError) as error:
-        raise DeviceError(f"{device.port}: the port vanished: {_reason(error)}") from error
+        raise vanished(device, error) from error
+
+
+def vanished(device: Line, error: Exception) -> DeviceError:
+    """What to raise where a port that was open fails."""
+    return DeviceError(f"{device.port}: the port vanished: {_reason(error)}")
 
 
 def _reason(error: Exception) -> str:
@@ -217,5 +222,5 @@ def observe(
             data = device.read(max(1, min(device.in_waiting, READ_BYTES)))
         except (serial.SerialException, OSError, TypeError) as error:
             # pyserial raises TypeError when the port is closed under a waiting read.
-            raise DeviceError(f"{device.port}: the port vanished: {_reason(error)}") from error
+            raise vanished(device, error) from error
         yield link.feed(data, clock()) if data else []

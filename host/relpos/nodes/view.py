@@ -156,6 +156,19 @@ class TeamView:
                 view.heard_s = now_s
                 view._frames.append((now_s, received, view.lost))
             view.rssi_dbm = None if track.rssi_dbm is None else float(track.rssi_dbm)
+        self._statuses(now_s, observations)
+
+    def hear(self, now_s: float, observations: Iterable[Observation]) -> None:
+        """Like :meth:`update` where only observations were kept: of the link nothing is known."""
+        observations = list(observations)
+        for observation in observations:
+            view = self.nodes.get(observation.node)
+            if view is None:
+                view = self.nodes[observation.node] = NodeView(observation.node)
+            view.heard_s = now_s
+        self._statuses(now_s, observations)
+
+    def _statuses(self, now_s: float, observations: Iterable[Observation]) -> None:
         for observation in observations:
             if isinstance(observation, Status) and not observation.name.startswith("link_"):
                 self._status(now_s, observation)

@@ -18,7 +18,7 @@ from relpos.fusion.estimator import (
     Shape,
 )
 from relpos.measurements import Step
-from relpos.runs.run import write_rows
+from relpos.runs.appending import AppendedTable, close_all
 from relpos.runs.table import Column, find_table, node_id, not_negative, number, read_rows
 
 ESTIMATE_COLUMNS = [
@@ -65,6 +65,7 @@ PARAMETER_COLUMNS = (
     "value",
     "sigma",
 )
+STEP_COLUMNS = ("time_s", "node", "length_m")
 
 _DECIMALS = 6
 """Micrometres and microradians: far below any sensor here, and files a third the size."""
@@ -72,7 +73,7 @@ _DECIMALS = 6
 
 def write_estimates(
     directory: Path | str,
-    estimates: Sequence[Estimate],
+    estimates: Iterable[Estimate],
     *,
     steps: Sequence[Step] = (),
 ) -> list[Path]:
@@ -83,36 +84,73 @@ def write_estimates(
     An ``alternatives.csv`` or ``steps.csv`` that an earlier run left here and this one has
     nothing for is removed, lest it be taken for this one's. Returns the files written.
     """
-    directory = Path(directory)
-    directory.mkdir(parents=True, exist_ok=True)
-    alternatives = [row for estimate in estimates for row in estimate.alternatives]
-    parameters = changes(row for estimate in estimates for row in estimate.parameters)
-    tables: list[tuple[str, Sequence[str], Iterable[Sequence[object]], bool]] = [
-        ("estimate.csv", ESTIMATE_COLUMNS, _estimate_rows(estimates), True),
-        ("pairs.csv", PAIR_COLUMNS, _pair_rows(estimates), True),
-        (
-            "alternatives.csv",
-            ALTERNATIVE_COLUMNS,
-            _attribute_rows(alternatives, ALTERNATIVE_COLUMNS),
-            bool(alternatives),
-        ),
-        ("parameters.csv", PARAMETER_COLUMNS, _attribute_rows(parameters, PARAMETER_COLUMNS), True),
-        (
-            "steps.csv",
-            ("time_s", "node", "length_m"),
-            _attribute_rows(steps, ("time_s", "node", "length_m")),
-            bool(steps),
-        ),
-    ]
-    written: list[Path] = []
-    for name, header, rows, wanted in tables:
-        path = directory / name
-        if wanted:
-            write_rows(path, header, ([_rounded(cell) for cell in row] for row in rows))
-            written.append(path)
-        else:
-            path.unlink(missing_ok=True)
-    return written
+    with EstimateFiles(directory) as files:
+        for estimate in estimates:
+            files.write(estimate)
+        files.write_steps(steps)
+    return files.written
+
+
+class EstimateFiles:
+    """The files of :func:`write_estimates`, written as the estimates come.
+
+    What cannot be written for now (a full disk) waits: see :mod:`relpos.runs.appending`.
+    """
+
+    def __init__(self, directory: Path | str) -> None:
+        directory = Path(directory)
+        directory.mkdir(parents=True, exist_ok=True)
+        self._estimates = AppendedTable(directory / "estimate.csv", ESTIMATE_COLUMNS)
+        self._pairs = AppendedTable(directory / "pairs.csv", PAIR_COLUMNS)
+        self._parameters = AppendedTable(directory / "parameters.csv", PARAMETER_COLUMNS)
+        self._alternatives = AppendedTable(
+            directory / "alternatives.csv", ALTERNATIVE_COLUMNS, wanted=False
+        )
+        self._steps = AppendedTable(directory / "steps.csv", STEP_COLUMNS, wanted=False)
+        self._last: dict[tuple[str, int, int | None], tuple[float, float]] = {}
+
+    def __enter__(self) -> EstimateFiles:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def write(self, estimate: Estimate) -> None:
+        """Append one estimate; of its parameters those that have changed."""
+        self._estimates.add(map(_rounded_row, _estimate_rows((estimate,))))
+        self._pairs.add(map(_rounded_row, _pair_rows((estimate,))))
+        self._parameters.add(
+            map(_rounded_row, _attribute_rows(changes(estimate.parameters, self._last), PARAMETER_COLUMNS))
+        )
+        if estimate.alternatives:
+            self._alternatives.add(
+                map(_rounded_row, _attribute_rows(estimate.alternatives, ALTERNATIVE_COLUMNS))
+            )
+
+    def write_steps(self, steps: Sequence[Step]) -> None:
+        """Append steps."""
+        if steps:
+            self._steps.add(map(_rounded_row, _attribute_rows(steps, STEP_COLUMNS)))
+
+    @property
+    def tables(self) -> tuple[AppendedTable, ...]:
+        """The files."""
+        return (
+            self._estimates,
+            self._pairs,
+            self._alternatives,
+            self._parameters,
+            self._steps,
+        )
+
+    @property
+    def written(self) -> list[Path]:
+        """The files that are there."""
+        return [table.path for table in self.tables if table.exists]
+
+    def close(self) -> None:
+        """Finish them; OSError where something could not be written."""
+        close_all(self.tables)
 
 
 def read_estimates(directory: Path | str) -> list[Estimate]:
@@ -175,9 +213,12 @@ def read_parameters(directory: Path | str) -> list[Parameter]:
     return sorted(rows, key=lambda row: row.time_s)
 
 
-def changes(parameters: Iterable[Parameter]) -> list[Parameter]:
-    """Leave out what repeats the same parameter's last row."""
-    last: dict[tuple[str, int, int | None], tuple[float, float]] = {}
+def changes(
+    parameters: Iterable[Parameter],
+    last: dict[tuple[str, int, int | None], tuple[float, float]] | None = None,
+) -> list[Parameter]:
+    """Leave out what repeats the same parameter's last row; ``last`` remembers it between calls."""
+    last = {} if last is None else last
     kept: list[Parameter] = []
     for row in parameters:
         key, figures = (row.name, row.node, row.peer), (row.value, row.sigma)
@@ -205,6 +246,10 @@ def _pair_rows(estimates: Iterable[Estimate]) -> Iterable[Sequence[object]]:
 
 def _attribute_rows(rows: Iterable[object], names: Sequence[str]) -> Iterable[Sequence[object]]:
     return ([getattr(row, name) for name in names] for row in rows)
+
+
+def _rounded_row(row: Iterable[object]) -> list[object]:
+    return [_rounded(cell) for cell in row]
 
 
 def _rounded(value: object) -> object:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import csv
+import heapq
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -21,12 +21,14 @@ from relpos.measurements import (
     Height,
     Measurement,
     Motion,
+    Observation,
     Prior,
     Range,
     Status,
     Step,
     Truth,
 )
+from relpos.runs.appending import AppendedTable, close_all, write_rows
 from relpos.runs.description import (
     Description,
     InitialPose,
@@ -188,11 +190,10 @@ def save_run(run: Run, path: Path | str) -> None:
     }
     for table in _TABLES:
         if content[table.name]:
-            names = [column.name for column in table.columns]
             write_rows(
                 directory / table.name,
-                names,
-                ([getattr(row, name) for name in names] for row in content[table.name]),
+                table.names,
+                ([getattr(row, name) for name in table.names] for row in content[table.name]),
             )
     if run.landmarks:
         write_rows(
@@ -228,20 +229,64 @@ def write_imu(directory: Path, recordings: Mapping[int, ImuRecording]) -> None:
     )
 
 
-def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write one CSV file; None and NaN become empty cells, a bool 0 or 1, floats in full."""
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows([_cell(value) for value in row] for row in rows)
+class RunFiles:
+    """A run directory that grows as observations come, for sessions of any length.
+
+    Each table is held back by :data:`REORDER_S` and written in the order of time; what comes later
+    than that is appended where it came. Tables that an earlier run left here are removed. ``Run``
+    directories of it load like any other.
+    """
+
+    def __init__(self, path: Path | str, description: Description) -> None:
+        self._directory = Path(path)
+        self._directory.mkdir(parents=True, exist_ok=True)
+        for table in _TABLES:
+            for name in (table.name, f"{table.name}.gz"):
+                (self._directory / name).unlink(missing_ok=True)
+        self.describe(description)
+        self._files = {
+            table.make_class: (
+                AppendedTable(self._directory / table.name, table.names, wanted=False),
+                table.names,
+            )
+            for table in _TABLES
+            if table.make_class is not Truth
+        }
+        self._waiting: list[tuple[float, int, Observation]] = []
+        self._count = 0
+        self._newest_s = -math.inf
+
+    def describe(self, description: Description) -> None:
+        """Write what the run says of itself, in place of what it said before."""
+        write_description(self._directory / "run.toml", description)
+
+    def write(self, observations: Iterable[Observation]) -> None:
+        """Take observations, in the order of their arrival."""
+        for observation in observations:
+            self._count += 1
+            heapq.heappush(self._waiting, (observation.time_s, self._count, observation))
+            self._newest_s = max(self._newest_s, observation.time_s)
+        self._release(self._newest_s - REORDER_S)
+
+    @property
+    def tables(self) -> tuple[AppendedTable, ...]:
+        """The files."""
+        return tuple(table for table, _ in self._files.values())
+
+    def close(self) -> None:
+        """Write what waits; OSError where something could not be written."""
+        self._release(math.inf)
+        close_all(self.tables)
+
+    def _release(self, until_s: float) -> None:
+        while self._waiting and self._waiting[0][0] <= until_s:
+            observation = heapq.heappop(self._waiting)[2]
+            table, names = self._files[type(observation)]
+            table.add(([getattr(observation, name) for name in names],))
 
 
-def _cell(value: object) -> object:
-    if isinstance(value, bool):
-        return int(value)
-    if value is None or (isinstance(value, float) and math.isnan(value)):
-        return ""
-    return value
+REORDER_S = 5.0
+"""Ranges are told up to two seconds after they were measured."""
 
 
 @dataclass(frozen=True)
@@ -251,6 +296,16 @@ class _Table:
     name: str
     make: Callable[..., Any]
     columns: tuple[Column, ...]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the columns, which are those of the class's fields."""
+        return [column.name for column in self.columns]
+
+    @property
+    def make_class(self) -> type:
+        """The class of its rows."""
+        return self.make if isinstance(self.make, type) else Event
 
     def read(self, directory: Path, counters: Counter[str]) -> list[Any]:
         """Rows sorted by time, rows at the same time in the order of the file."""

@@ -1,0 +1,235 @@
+"""From what was received and concluded to the picture that is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
+from relpos.live.alarms import Alarms, Condition
+from relpos.live.nowcast import Nowcast
+from relpos.live.picture import (
+    Alert,
+    GhostPerson,
+    Ghosts,
+    MeasuredRange,
+    Notice,
+    Pair,
+    Person,
+    Picture,
+)
+from relpos.measurements import Motion, Observation, Range
+from relpos.nodes.view import NodeView, TeamView
+
+if TYPE_CHECKING:
+    from relpos.link.decoder import Decoder
+
+RANGE_AGE_S = 10.0
+"""A range older than this is no link any more."""
+STALE_S = 3.0
+"""Silence after which somebody is shown as stale, as after three epochs in an estimator."""
+
+
+class Composer:
+    """Feed it everything that happens, in order; ask for the picture at any moment.
+
+    ``names`` are shown in place of numbers and may be changed at any time.
+    """
+
+    def __init__(self, names: Mapping[int, str] | None = None, start_s: float = 0.0) -> None:
+        self.names: dict[int, str] = dict(names or {})
+        self.alarms = Alarms()
+        self.nowcast = Nowcast(start_s)
+        self.team = TeamView()
+        self._ranges: dict[tuple[int, int], Range] = {}
+        self._given = 0
+        self._seq = 0
+        self._newest_s: float | None = None
+
+    @property
+    def given(self) -> int:
+        """How many observations have been taken; estimates refer to this count."""
+        return self._given
+
+    @property
+    def newest_s(self) -> float | None:
+        """Time of the newest motion or range."""
+        return self._newest_s
+
+    def observed(
+        self, now_s: float, observations: Sequence[Observation], decoder: Decoder | None
+    ) -> None:
+        """Take what has just been decoded."""
+        if decoder is None:
+            self.team.hear(now_s, observations)
+        else:
+            self._count_heard(now_s, decoder, observations)
+        for observation in observations:
+            self._given += 1
+            if isinstance(observation, Motion):
+                self.nowcast.take(observation, self._given)
+                self.alarms.take(observation)
+                self._newer(observation.time_s)
+            elif isinstance(observation, Range):
+                self._range(observation)
+                self._newer(observation.time_s)
+            if decoder is None:
+                self.alarms.heard(observation.node)
+
+    def told(self, observations: Sequence[Observation]) -> None:
+        """Take what phones told: the fusion is given it, but no node was heard by it."""
+        self._given += len(observations)
+
+    def estimated(self, estimate: Estimate, given: int) -> None:
+        """Take an estimate that came out when ``given`` observations had been worked off."""
+        self.nowcast.fused(estimate, given)
+
+    def picture(
+        self,
+        now_s: float,
+        unix_s: float,
+        arrived_unix_s: float | None = None,
+        notices: Iterable[Notice] = (),
+    ) -> Picture:
+        """Give the picture of this moment."""
+        self._seq += 1
+        estimate = self.nowcast.estimate
+        placed = {} if estimate is None else {n.node: n for n in estimate.nodes}
+        people = sorted(self.team.nodes.keys() | placed.keys())
+        return Picture(
+            seq=self._seq,
+            time_s=now_s,
+            unix_s=unix_s,
+            arrived_unix_s=arrived_unix_s,
+            fused_s=None if estimate is None else estimate.time_s,
+            ambiguous=estimate is not None and bool(estimate.alternatives),
+            notices=tuple(notices),
+            people=tuple(self._person(node, now_s) for node in people),
+            pairs=() if estimate is None else self._pairs(estimate),
+            ranges=self._measured(now_s),
+            alternatives=() if estimate is None else _ghosts(estimate),
+        )
+
+    def _count_heard(
+        self, now_s: float, decoder: Decoder, observations: Sequence[Observation]
+    ) -> None:
+        before = {node: view.received for node, view in self.team.nodes.items()}
+        self.team.update(now_s, decoder, observations)
+        for node, view in self.team.nodes.items():
+            if view.received != before.get(node):
+                self.alarms.heard(node)
+
+    def _newer(self, time_s: float) -> None:
+        self._newest_s = time_s if self._newest_s is None else max(self._newest_s, time_s)
+
+    def _range(self, measured: Range) -> None:
+        if measured.range_m <= 0.0:
+            return
+        pair = (min(measured.node, measured.peer), max(measured.node, measured.peer))
+        before = self._ranges.get(pair)
+        if before is None or before.time_s <= measured.time_s:
+            self._ranges[pair] = measured
+
+    def _measured(self, now_s: float) -> tuple[MeasuredRange, ...]:
+        old = [p for p, measured in self._ranges.items() if now_s - measured.time_s > RANGE_AGE_S]
+        for pair in old:
+            del self._ranges[pair]
+        return tuple(
+            MeasuredRange(m.node, m.peer, m.range_m, max(now_s - m.time_s, 0.0))
+            for m in self._ranges.values()
+        )
+
+    def _pairs(self, estimate: Estimate) -> tuple[Pair, ...]:
+        pairs = []
+        for fused in estimate.pairs:
+            p = self.nowcast.pair(fused)
+            pairs.append(
+                Pair(
+                    p.node,
+                    p.peer,
+                    p.distance_m,
+                    p.sigma_distance_m,
+                    p.bearing_rad,
+                    p.sigma_bearing_rad,
+                )
+            )
+        return tuple(pairs)
+
+    def _person(self, node: int, now_s: float) -> Person:
+        view = self.team.nodes.get(node) or NodeView(node)
+        condition = self.alarms.of(node)
+        seen_s = now_s - view.heard_s if node in self.team.nodes else None
+        at = self.nowcast.node(node)
+        colour, reasons = view.health(now_s)
+        ranging, _ = view.ranging(now_s)
+        neighbours = view.status.get("neighbours")
+        return Person(
+            node=node,
+            name=self.names.get(node, f"Node {node}"),
+            status=_status(at, seen_s, condition),
+            motion_s=self.nowcast.newest_s(node),
+            seen_s=seen_s,
+            moving=condition.moving,
+            still_s=condition.still_s,
+            alert=condition.alert,
+            acknowledged=condition.acknowledged,
+            health=colour.name.lower(),
+            reasons=tuple(reasons),
+            # 0: this board does not measure it.
+            battery_v=view.status.get("battery_v") or None,
+            rssi_dbm=view.rssi_dbm,
+            loss=view.loss(now_s),
+            ranging=ranging,
+            neighbours=None if neighbours is None else int(neighbours),
+            **({} if at is None else _pose(at)),
+        )
+
+
+def _pose(at: NodeEstimate) -> dict[str, float]:
+    return {
+        "x_m": at.x_m,
+        "y_m": at.y_m,
+        "z_m": at.z_m,
+        "heading_rad": at.heading_rad,
+        "sigma_major_m": at.sigma_major_m,
+        "sigma_minor_m": at.sigma_minor_m,
+        "sigma_angle_rad": at.sigma_angle_rad,
+        "sigma_heading_rad": at.sigma_heading_rad,
+    }
+
+
+def _status(at: NodeEstimate | None, seen_s: float | None, condition: Condition) -> str:
+    """What the estimator says of the position, unless silence says more.
+
+    An estimate is of a moment ago, or of a minute ago where the fusion is behind: whether somebody
+    is heard is known better here.
+    """
+    if condition.alert is Alert.LOST:
+        return NodeStatus.LOST
+    located = NodeStatus.UNLOCATED if at is None else at.status
+    if located in (NodeStatus.UNLOCATED, NodeStatus.AMBIGUOUS):
+        return located
+    if seen_s is None or seen_s > STALE_S or located is NodeStatus.LOST:
+        return NodeStatus.STALE
+    return located
+
+
+def _ghosts(estimate: Estimate) -> tuple[Ghosts, ...]:
+    """The alternatives, by probability; of the fused moment, for they are not moved on."""
+    rows: dict[int, list[GhostPerson]] = {}
+    shares: dict[int, float] = {}
+    for a in estimate.alternatives:
+        shares[a.alternative] = a.probability
+        rows.setdefault(a.alternative, []).append(
+            GhostPerson(
+                a.node,
+                a.x_m,
+                a.y_m,
+                a.heading_rad,
+                a.sigma_major_m,
+                a.sigma_minor_m,
+                a.sigma_angle_rad,
+                str(a.shape),
+            )
+        )
+    return tuple(Ghosts(shares[k], tuple(rows[k])) for k in sorted(rows))

@@ -1,0 +1,64 @@
+"""What a session leaves on disk: the run format's files, written as it goes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from relpos.fusion.estimator import Estimate
+from relpos.live.sinks import QuietSink
+from relpos.measurements import Observation, Step
+from relpos.runs import Description, EstimateFiles, NodeInfo, RunFiles
+
+
+class FileSink(QuietSink):
+    """Estimates into ``directory``, and what was received into its ``received/``.
+
+    A disk that is full is told; what it does not take is kept and written when it does.
+    """
+
+    def __init__(
+        self, directory: Path, description: Description, *, keep_received: bool = True
+    ) -> None:
+        self._description = description
+        self._estimates = EstimateFiles(directory)
+        self._received = RunFiles(directory / "received", description) if keep_received else None
+
+    def named(self, names: Mapping[int, str]) -> None:
+        """Keep the wearers' names."""
+        if self._received is None:
+            return
+        nodes = dict(self._description.nodes)
+        for node, name in names.items():
+            nodes[node] = replace(nodes.get(node, NodeInfo()), name=name)
+        self._description = replace(self._description, nodes=nodes)
+        self._received.describe(self._description)
+
+    def observed(self, arrival_s: float, observations: Sequence[Observation]) -> None:
+        """Write them."""
+        self._estimates.write_steps([o for o in observations if isinstance(o, Step)])
+        if self._received is not None:
+            self._received.write(observations)
+
+    def estimated(self, estimate: Estimate) -> None:
+        """Write it."""
+        self._estimates.write(estimate)
+
+    def trouble(self) -> str | None:
+        """The first file that cannot be written."""
+        received = () if self._received is None else self._received.tables
+        for table in (*self._estimates.tables, *received):
+            if table.error is not None:
+                why = table.error.strerror or str(table.error)
+                lost = f"; {table.lost_rows} rows are lost" * bool(table.lost_rows)
+                return f"{table.path}: {why}: what it should hold waits in memory{lost}"
+        return None
+
+    def close(self) -> None:
+        """Finish the files; OSError where one could not be written."""
+        try:
+            if self._received is not None:
+                self._received.close()
+        finally:
+            self._estimates.close()

@@ -1,0 +1,116 @@
+"""CSV files: written whole, or line by line while a session runs.
+
+An appended file keeps in memory what the disk does not take (it is full, or was pulled out) and
+tries again, so that nothing is missing once there is room. Lines are written whole: whoever reads
+along, or after a crash, finds none that is broken but perhaps the last.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import BinaryIO
+
+WRITE_EVERY_S = 1.0
+MOST_WAITING_BYTES = 64 << 20
+"""Half an hour of twenty nodes. What comes while so much waits is lost, and counted."""
+
+
+def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write one CSV file; None and NaN become empty cells, a bool 0 or 1, floats in full."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows([_cell(value) for value in row] for row in rows)
+
+
+class AppendedTable:
+    """A CSV file that grows; one that is not ``wanted`` is there once it has a row.
+
+    Making it begins the file anew, or raises OSError. Later failures are in ``error``.
+    """
+
+    def __init__(self, path: Path, header: Sequence[str], *, wanted: bool = True) -> None:
+        self.path = path
+        self.error: OSError | None = None
+        self.lost_rows = 0
+        self._file: BinaryIO | None = None
+        self._text = io.StringIO()
+        self._writer = csv.writer(self._text, lineterminator="\n")
+        self._writer.writerow(header)
+        self._waiting = b""
+        self._tried_s = -math.inf
+        self._wanted = wanted
+        path.unlink(missing_ok=True)
+        if wanted:
+            self.flush()
+            if self.error is not None:
+                raise self.error
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is such a file."""
+        return self._file is not None
+
+    def add(self, rows: Iterable[Iterable[object]]) -> None:
+        """Append rows; on disk within a second or so, or when the next ones come."""
+        for row in rows:
+            if len(self._waiting) > MOST_WAITING_BYTES:
+                self.lost_rows += 1
+                continue
+            self._writer.writerow([_cell(value) for value in row])
+            self._wanted = True
+        if time.monotonic() >= self._tried_s + WRITE_EVERY_S:
+            self.flush()
+
+    def flush(self) -> None:
+        """Try to write what waits; ``error`` says why it does not go, None where it does."""
+        if not self._wanted:
+            return
+        self._tried_s = time.monotonic()
+        self._waiting += self._text.getvalue().encode()
+        self._text.seek(0)
+        self._text.truncate()
+        try:
+            if self._file is None:
+                self._file = self.path.open("wb", buffering=0)
+            while self._waiting:
+                # A disk that is nearly full takes a part.
+                self._waiting = self._waiting[self._file.write(self._waiting) or 0 :]
+        except OSError as error:
+            error.filename = error.filename or str(self.path)
+            self.error = error
+            return
+        self.error = None
+
+    def close(self) -> None:
+        """Write what waits and end; OSError where it does not go."""
+        self.flush()
+        if self._file is not None:
+            self._file.close()
+        if self.error is not None:
+            raise self.error
+
+
+def close_all(tables: Iterable[AppendedTable]) -> None:
+    """Close every one, then raise the first OSError there was."""
+    failed: OSError | None = None
+    for table in tables:
+        try:
+            table.close()
+        except OSError as error:
+            failed = failed or error
+    if failed is not None:
+        raise failed
+
+
+def _cell(value: object) -> object:
+    if isinstance(value, bool):
+        return int(value)
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return ""
+    return value
