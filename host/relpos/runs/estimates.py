@@ -120,7 +120,10 @@ class EstimateFiles:
         self._estimates.add(map(_rounded_row, _estimate_rows((estimate,))))
         self._pairs.add(map(_rounded_row, _pair_rows((estimate,))))
         self._parameters.add(
-            map(_rounded_row, _attribute_rows(changes(estimate.parameters, self._last), PARAMETER_COLUMNS))
+            map(
+                _rounded_row,
+                _attribute_rows(changes(estimate.parameters, self._last), PARAMETER_COLUMNS),
+            )
         )
         if estimate.alternatives:
             self._alternatives.add(
