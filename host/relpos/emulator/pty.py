@@ -137,7 +137,7 @@ class PseudoTerminal:
                 file=sys.stderr,
             )
             return
-        self._drain()
+        self.drain()
         print(f"relpos emulate: the walk of {self.team.seconds:g} s is over", file=sys.stderr)
 
     def _serve(self) -> None:
@@ -212,7 +212,7 @@ class PseudoTerminal:
                 return
             self.team.send(data)
 
-    def _drain(self) -> None:
+    def drain(self) -> None:
         """Give a reader the time to take what is left: closing would throw it away."""
         deadline_s = time.monotonic() + DRAIN_S
         quiet = 0
