@@ -23,7 +23,7 @@ compile-kernels = @printf '%s\n' 'compiling the estimators, once'; \
 	$(PYTHON) -c 'from relpos import fusion; [fusion.warm_up(n) for n in fusion.SETTINGS]'
 title = @printf '\n\033[1m== %s\033[0m\n' "$(1)"
 
-.PHONY: help setup demo test lint bench bench-chain firmware docs wire clean soak \
+.PHONY: help setup demo test lint bench bench-chain firmware docs pages wire clean soak \
         system-demo system-avr system-browser system-soak native-tests board-builds simulated-tests python-tests
 
 help: ## this list
@@ -85,7 +85,12 @@ bench: $(PEERS) ## relpos beside filterpy, Stone Soup, particles, pfilter, GTSAM
 bench-chain: board-builds ## how fast boards and teams are emulated, and the particle filter through its interface
 	@for file in bench/bench_*.py; do echo "== $$file"; $(PYTHON) "$$file"; done
 
-docs: wire ## regenerate the pages that come from the sources
+docs: $(DEVELOP) ## the documentation as a site, in out/docs
+	$(call title,Documentation)
+	$(PYTHON) -m sphinx -W --keep-going -q -b html -d .build/docs docs out/docs
+	@echo 'open out/docs/index.html'
+
+pages: wire ## regenerate the pages that come from the sources
 	$(PYTHON) bench/reliability.py
 	$(PYTHON) bench/hardware.py
 

@@ -184,7 +184,7 @@ def main() -> None:
         if new == old:
             continue
         if arguments.check:
-            sys.exit(f"docs/{page} is out of date: make docs")
+            sys.exit(f"docs/{page} is out of date: make pages")
         (DOCS / page).write_text(new, encoding="utf-8")
 
 

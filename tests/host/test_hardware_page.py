@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_a_page_shows_what_is_computed(page):
     render = runpy.run_path(str(ROOT / "bench" / "hardware.py"))["render"]
     text = (ROOT / "docs" / page).read_text(encoding="utf-8")
-    assert render(page, text) == text, "make docs"
+    assert render(page, text) == text, "make pages"
 
 
 def test_baud_errors_are_those_of_the_dividers():

@@ -1,0 +1,64 @@
+"""Sphinx's configuration: `make docs` builds a site that asks nobody else for anything."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "host"))
+
+from relpos import __version__  # noqa: E402
+
+project = "relpos"
+release = version = __version__
+author = "relpos contributors"
+copyright = "relpos contributors, MIT licence"  # noqa: A001
+
+extensions = ["myst_parser", "sphinx.ext.autodoc"]
+highlight_language = "text"
+language = "en"
+
+myst_heading_anchors = 4
+myst_enable_extensions = ["colon_fence"]
+
+autodoc_default_options = {"members": True, "member-order": "bysource"}
+autodoc_typehints = "signature"
+python_use_unqualified_type_names = True
+
+html_theme = "furo"
+html_title = f"relpos {version}"
+html_copy_source = False
+html_show_sphinx = False
+html_theme_options = {"navigation_with_keys": True}
+
+
+def _commands(_: Any, document: str, source: list[str]) -> None:
+    """Fill the page of all commands with what they say of themselves."""
+    if document == "commands":
+        told = subprocess.run(
+            [sys.executable, "-m", "typer", "relpos.cli.main", "utils", "docs", "--name", "relpos"],
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout
+        _, _, body = told.partition("\n## ")
+        source[0] = source[0].replace("<!-- commands -->", "## " + body)
+
+
+def _coming(_: Any, document: str, source: list[str]) -> None:
+    """Leave out of the contents what is not there yet: a pattern without a page."""
+    if document == "index":
+        docs = Path(__file__).parent
+        kept = [
+            line
+            for line in source[0].splitlines()
+            if not line.endswith("*") or any(docs.glob(f"{line}.md"))
+        ]
+        source[0] = "\n".join(kept) + "\n"
+
+
+def setup(app: Any) -> None:
+    """Called by Sphinx."""
+    app.connect("source-read", _commands)
+    app.connect("source-read", _coming)
