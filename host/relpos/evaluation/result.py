@@ -208,13 +208,12 @@ class Result:
 
 def read_result(directory: Path | str) -> Result:
     """Read an estimate's files back, whoever wrote them; DataError where they are faulty."""
-    from relpos.runs import read_estimates, read_parameters
+    from relpos.runs import read_estimates
+    from relpos.runs.estimates import changes
 
-    return Result(
-        f"estimate of {Path(directory)}",
-        tuple(read_estimates(directory)),
-        tuple(read_parameters(directory)),
-    )
+    estimates = read_estimates(directory)
+    learned = changes(row for estimate in estimates for row in estimate.parameters)
+    return Result(Path(directory).name, tuple(estimates), tuple(learned))
 
 
 def _columns(table: str) -> tuple[str, ...]:

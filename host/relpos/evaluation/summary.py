@@ -34,11 +34,11 @@ def as_json(metrics: Metrics) -> dict[str, Any]:
                 "node": node,
                 "peer": peer,
                 "epochs": pair.epochs,
-                "distance_rmse_m": _figure(pair.distance_rmse_m),
-                "distance_error_mean_m": _figure(pair.distance_error_mean_m),
-                "distance_error_max_m": _figure(pair.distance_error_max_m),
-                "body_frame_rmse_m": _figure(pair.body_frame_rmse_m),
-                "nees_distance": _figure(pair.nees_distance),
+                "distance_rmse_m": figure(pair.distance_rmse_m),
+                "distance_error_mean_m": figure(pair.distance_error_mean_m),
+                "distance_error_max_m": figure(pair.distance_error_max_m),
+                "body_frame_rmse_m": figure(pair.body_frame_rmse_m),
+                "nees_distance": figure(pair.nees_distance),
             }
             for (node, peer), pair in metrics.pairs.items()
         ],
@@ -54,15 +54,15 @@ def as_json(metrics: Metrics) -> dict[str, Any]:
 
 def figures(metrics: Metrics) -> dict[str, float | None]:
     """Return the four figures of the team alone."""
-    return {name: _figure(getattr(metrics, name)) for name in FIGURES}
+    return {name: figure(getattr(metrics, name)) for name in FIGURES}
 
 
 def nees_as_json(nees: consistency.Nees) -> dict[str, Any]:
     """Return a NEES with the interval of an honest one and what it is worth."""
     return {
-        "mean": _figure(nees.mean),
+        "mean": figure(nees.mean),
         "interval": _interval(nees),
-        "effective": _figure(nees.effective),
+        "effective": figure(nees.effective),
     }
 
 
@@ -73,11 +73,11 @@ def ambiguity_as_json(ambiguity: Ambiguity | None) -> dict[str, Any] | None:
     held = ambiguity.coverage
     return {
         "looks": ambiguity.looks,
-        "region_90_holds_truth": _figure(held.share),
-        "interval": [_figure(held.low), _figure(held.high)],
-        "area_m2": _figure(ambiguity.area_m2),
-        "blind_area_m2": _figure(ambiguity.blind_m2),
-        "rings": _figure(ambiguity.rings),
+        "region_90_holds_truth": figure(held.share),
+        "interval": [figure(held.low), figure(held.high)],
+        "area_m2": figure(ambiguity.area_m2),
+        "blind_area_m2": figure(ambiguity.blind_m2),
+        "rings": figure(ambiguity.rings),
     }
 
 
@@ -91,7 +91,7 @@ def iso_as_json(iso: Assessment) -> dict[str, Any]:
         },
         "nodes": [{"node": node, **_accuracy(one)} for node, one in iso.nodes.items()],
         "relative": _magnitudes(iso.relative),
-        "coverage": _figure(iso.coverage),
+        "coverage": figure(iso.coverage),
         "latency": latency_as_json(iso.latency),
     }
 
@@ -100,13 +100,13 @@ def latency_as_json(latency: Latency | None) -> dict[str, float | None] | None:
     """Return what an estimator waited and computed; None where that was not seen."""
     if latency is None:
         return None
-    return {name: _figure(getattr(latency, name)) for name in latency.__slots__}
+    return {name: figure(getattr(latency, name)) for name in latency.__slots__}
 
 
 def _accuracy(accuracy: Accuracy) -> dict[str, Any]:
     return {
         "mean_error_m": _series(accuracy.mean_error_m.tolist()),
-        "absolute_mean_m": _figure(accuracy.absolute_mean_m),
+        "absolute_mean_m": figure(accuracy.absolute_mean_m),
         "covariance_m2": [_series(row) for row in accuracy.covariance_m2.tolist()],
         "horizontal": _magnitudes(accuracy.horizontal),
         "vertical": _magnitudes(accuracy.vertical),
@@ -117,12 +117,12 @@ def _accuracy(accuracy: Accuracy) -> dict[str, Any]:
 def _magnitudes(kind: Magnitudes) -> dict[str, float | None]:
     return {
         "count": kind.count,
-        **{name: _figure(getattr(kind, name)) for name in kind.__slots__[1:]},
+        **{name: figure(getattr(kind, name)) for name in kind.__slots__[1:]},
     }
 
 
 def _interval(nees: consistency.Nees) -> list[float | None]:
-    return [_figure(nees.low), _figure(nees.high)]
+    return [figure(nees.low), figure(nees.high)]
 
 
 def no_metrics() -> dict[str, None]:
@@ -130,9 +130,10 @@ def no_metrics() -> dict[str, None]:
     return dict.fromkeys(FIGURES)
 
 
-def _figure(value: float) -> float | None:
+def figure(value: float) -> float | None:
+    """Round a figure to six decimals; None where it is not finite."""
     return round(value, 6) if math.isfinite(value) else None
 
 
 def _series(values: Iterable[float]) -> list[float | None]:
-    return [_figure(value) for value in values]
+    return [figure(value) for value in values]

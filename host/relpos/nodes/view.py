@@ -13,6 +13,7 @@ from relpos.protocol import messages as wire
 
 WINDOW_S = 30.0
 """Three status reports at their usual period."""
+_COUNTS = ("ranging_successes", "ranging_failures", "missed_ticks", "refused_frames")
 UNWANTED = {wire.ResetCause.BROWN_OUT: "brown-out", wire.ResetCause.WATCHDOG: "watchdog"}
 _FLAGS = {
     "imu": wire.Health.IMU,
@@ -67,6 +68,19 @@ class NodeView:
         """Growth of one of the status's counts within the window."""
         counter = self._counters.get(name)
         return 0 if counter is None else counter.within(now_s)
+
+    def told(self, now_s: float, name: str, value: float) -> None:
+        """Take in one figure of a status report."""
+        self.status[name] = value
+        if name in _COUNTS:
+            counter = self._counters.setdefault(name, Counter())
+            counter.update(now_s, self.boot, int(value))
+
+    def link(self, now_s: float, received: int, lost: int) -> None:
+        """Take in how many frames of it have come and how many were lost, since the beginning."""
+        self.received, self.lost = received, lost
+        self.heard_s = now_s
+        self._frames.append((now_s, received, lost))
 
     def firmware(self) -> str | None:
         """Version of the firmware; None before the first status."""
@@ -134,8 +148,6 @@ class NodeView:
 class TeamView:
     """All nodes that are heard; feed it what the link yields."""
 
-    _COUNTS = ("ranging_successes", "ranging_failures", "missed_ticks", "refused_frames")
-
     def __init__(self) -> None:
         self.nodes: dict[int, NodeView] = {}
         self.foreign_frames = 0
@@ -151,10 +163,7 @@ class TeamView:
             view.boot = track.boot
             received = track.counts["received"]
             if received != view.received:
-                view.received = received
-                view.lost = track.counts["lost"]
-                view.heard_s = now_s
-                view._frames.append((now_s, received, view.lost))
+                view.link(now_s, received, track.counts["lost"])
             view.rssi_dbm = None if track.rssi_dbm is None else float(track.rssi_dbm)
         self._statuses(now_s, observations)
 
@@ -171,14 +180,7 @@ class TeamView:
     def _statuses(self, now_s: float, observations: Iterable[Observation]) -> None:
         for observation in observations:
             if isinstance(observation, Status) and not observation.name.startswith("link_"):
-                self._status(now_s, observation)
-
-    def _status(self, now_s: float, status: Status) -> None:
-        view = self.nodes[status.node]
-        view.status[status.name] = status.value
-        if status.name in self._COUNTS:
-            counter = view._counters.setdefault(status.name, Counter())
-            counter.update(now_s, view.boot, int(status.value))
+                self.nodes[observation.node].told(now_s, observation.name, observation.value)
 
     def rows(self, now_s: float) -> list[Mapping[str, object]]:
         """One row a node, by id: plain values for tables and JSON."""

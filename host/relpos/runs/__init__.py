@@ -4,7 +4,6 @@ from relpos.runs.description import Description, InitialPose, NodeInfo, Simulate
 from relpos.runs.estimates import (
     EstimateFiles,
     read_estimates,
-    read_parameters,
     write_estimates,
 )
 from relpos.runs.imu import ImuRecording
@@ -23,7 +22,6 @@ __all__ = [
     "Simulated",
     "load_run",
     "read_estimates",
-    "read_parameters",
     "save_run",
     "write_estimates",
 ]

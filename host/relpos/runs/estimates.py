@@ -207,15 +207,6 @@ def read_estimates(directory: Path | str) -> list[Estimate]:
     ]
 
 
-def read_parameters(directory: Path | str) -> list[Parameter]:
-    """Read ``parameters.csv`` back, ordered by time; empty where there is none."""
-    path = find_table(Path(directory), "parameters.csv")
-    if path is None:
-        return []
-    rows = [Parameter(*row) for row in read_rows(path, _PARAMETER_TABLE)]
-    return sorted(rows, key=lambda row: row.time_s)
-
-
 def changes(
     parameters: Iterable[Parameter],
     last: dict[tuple[str, int, int | None], tuple[float, float]] | None = None,
@@ -326,16 +317,6 @@ _PARAMETER_TABLE = (
     Column("name", str),
     Column("value", number),
     Column("sigma", not_negative, optional=True),
-)
-
-
-_PARAMETER_TABLE = (
-    Column("time_s", number),
-    Column("node", node_id),
-    Column("peer", node_id, optional=True),
-    Column("name", str),
-    Column("value", number),
-    Column("sigma", not_negative),
 )
 
 

@@ -1,0 +1,218 @@
+"""What the ranges of a run were worth: residuals a pair, and who was heard over which distance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.evaluation.metrics import Pair, PairTrack, Track, Tracks, interpolate
+from relpos.fusion.detection import LENGTH, STEP_M, Detection, Round
+from relpos.measurements import Measurement, Motion, Range
+
+Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a Gaussian over its median absolute deviation."""
+
+
+@dataclass(frozen=True)
+class PairRanges:
+    """The ranges of one pair, lower id first: n good ones, and how many failed.
+
+    ``estimated_m`` and ``true_m`` (n,) are the distances at the times of the ranges, from the
+    estimate and the truth, NaN where there is none; with heights where both nodes' are known,
+    because a range is slant.
+    """
+
+    pair: Pair
+    time_s: Floats
+    range_m: Floats
+    estimated_m: Floats
+    true_m: Floats
+    failed: int
+
+    @property
+    def residual_m(self) -> Floats:
+        """Range less estimated distance, (n,)."""
+        return self.range_m - self.estimated_m
+
+    @property
+    def error_m(self) -> Floats:
+        """Range less true distance, (n,)."""
+        return self.range_m - self.true_m
+
+
+def by_pair(ranges: Sequence[Range], estimate: Tracks, truth: Tracks) -> list[PairRanges]:
+    """Sort ranges by pair and put the distances beside them, in the order of the ids."""
+    kept: dict[Pair, list[Range]] = {}
+    for one in ranges:
+        kept.setdefault((min(one.node, one.peer), max(one.node, one.peer)), []).append(one)
+    found = []
+    for pair, rows in sorted(kept.items()):
+        good = [r for r in rows if r.range_m > 0.0]
+        time_s = np.array([r.time_s for r in good])
+        found.append(
+            PairRanges(
+                pair,
+                time_s,
+                np.array([r.range_m for r in good]),
+                distance_at(estimate, pair, time_s),
+                distance_at(truth, pair, time_s),
+                len(rows) - len(good),
+            )
+        )
+    return found
+
+
+def distance_at(tracks: Tracks, pair: Pair, at_s: Floats) -> Floats:
+    """Distance of two nodes at some times, (m,) -> (m,); NaN where one is not known."""
+    if pair[0] not in tracks or pair[1] not in tracks:
+        return np.full(at_s.shape, np.nan)
+    a, b = (_at(tracks[node], at_s) for node in pair)
+    apart = a - b
+    # Without both heights it is horizontal, which is what positions are.
+    apart[:, 2] = np.where(np.isfinite(apart[:, 2]), apart[:, 2], 0.0)
+    result: Floats = np.linalg.norm(apart, axis=1)
+    return result
+
+
+def _at(track: Track, at_s: Floats) -> Floats:
+    return np.column_stack(
+        [interpolate(track.time_s, v, at_s) for v in (track.x_m, track.y_m, track.z_m)]
+    )
+
+
+def median(values: Floats) -> float:
+    """Median of what is finite; NaN of nothing."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else math.nan
+
+
+def spread(values: Floats) -> float:
+    """Standard deviation from the median absolute deviation: outliers do not count."""
+    finite = values[np.isfinite(values)]
+    return MAD_TO_SIGMA * median(np.abs(finite - median(finite))) if finite.size else math.nan
+
+
+@dataclass(frozen=True)
+class Heard:
+    """Who was heard over which distance.
+
+    ``distance_m`` and ``heard`` (n,) are attempts whose outcome counts
+    (:mod:`relpos.fusion.detection` says which) and the distance at that time: the true one where
+    ``true`` says so, else the estimated one. ``curve_m`` (K,) and ``curve`` (K,) are the
+    probability learned from the estimated distances, as an estimator does it on line; ``edge_m``
+    with ``edge_sigma_m`` is the distance of half the near value, NaN where no edge was seen.
+    """
+
+    distance_m: Floats
+    heard: Bools
+    true: bool
+    curve_m: Floats
+    curve: Floats
+    edge_m: float
+    edge_sigma_m: float
+
+
+def heard(
+    measurements: Sequence[Measurement],
+    estimate: Tracks,
+    truth: Tracks,
+    pairs: Mapping[Pair, PairTrack],
+) -> Heard | None:
+    """Find the attempts of a run and learn the curve; None where no attempt can be placed."""
+    detection = Detection()
+    rounds = list(_rounds(measurements, detection))
+    every = sorted({pair for one in rounds for pair in one.heard + one.silent})
+    at_s = np.array([one.time_s for one in rounds])
+    estimated = {pair: distance_at(estimate, pair, at_s) for pair in every}
+    true = {pair: distance_at(truth, pair, at_s) for pair in every}
+    sigma = {pair: _sigma_at(pairs, pair, at_s) for pair in every}
+    use_truth = any(np.isfinite(row).any() for row in true.values())
+    distances: list[float] = []
+    outcomes: list[bool] = []
+    for k, one in enumerate(rounds):
+        known = [
+            (pair, sure) for pair, sure in zip(one.heard, one.witnessed, strict=True)
+            if np.isfinite(estimated[pair][k])
+        ]  # fmt: skip
+        silent = [pair for pair in one.silent if np.isfinite(estimated[pair][k])]
+        told = Round(
+            one.time_s,
+            tuple(pair for pair, _ in known),
+            tuple(silent),
+            tuple(sure for _, sure in known),
+        )
+        detection.learn(
+            told,
+            np.array([estimated[pair][k] for pair, _ in known]),
+            np.array([sigma[pair][k] for pair, _ in known]),
+            np.array([estimated[pair][k] for pair in silent]),
+            np.array([sigma[pair][k] for pair in silent]),
+        )
+        where = true if use_truth else estimated
+        counted = [pair for pair, sure in zip(one.heard, one.witnessed, strict=True) if sure]
+        for pairs_of, outcome in ((counted, True), (one.silent, False)):
+            for pair in pairs_of:
+                if np.isfinite(where[pair][k]):
+                    distances.append(float(where[pair][k]))
+                    outcomes.append(outcome)
+    if not distances:
+        return None
+    return Heard(
+        np.array(distances),
+        np.array(outcomes, dtype=bool),
+        use_truth,
+        np.arange(LENGTH, dtype=np.float64) * STEP_M,
+        detection.curve,
+        detection.range_m if detection.known else math.nan,
+        detection.range_sigma_m if detection.known else math.nan,
+    )
+
+
+def _rounds(measurements: Sequence[Measurement], detection: Detection) -> Iterator[Round]:
+    reported: dict[int, float] = {}
+
+    def reported_s(node: int) -> float:
+        return reported.get(node, -math.inf)
+
+    for time_s, group in groupby(measurements, key=lambda m: m.time_s):
+        at_once = list(group)
+        for one in at_once:
+            if isinstance(one, Motion):
+                reported[one.node] = time_s
+        ranges = [m for m in at_once if isinstance(m, Range) and m.range_m > 0.0]
+        if ranges:
+            yield from detection.rounds.take(time_s, ranges, reported_s)
+
+
+def _sigma_at(pairs: Mapping[Pair, PairTrack], pair: Pair, at_s: Floats) -> Floats:
+    track = pairs.get(pair) or pairs.get((pair[1], pair[0]))
+    if track is None:
+        return np.zeros(at_s.shape)
+    return np.nan_to_num(interpolate(track.time_s, track.sigma_distance_m, at_s))
+
+
+def shares(values: Heard, edges_m: Floats) -> tuple[Floats, Floats, Floats, npt.NDArray[np.int64]]:
+    """Share heard in each bin (B,), its 95 % interval (Wilson) and the attempts there.
+
+    The interval takes attempts as independent; those of one pair a second apart are not, so it is
+    rather too narrow.
+    """
+    place = np.digitize(values.distance_m, edges_m) - 1
+    inside = (place >= 0) & (place < edges_m.size - 1)
+    tried = np.bincount(place[inside], minlength=edges_m.size - 1)
+    found = np.bincount(place[inside & values.heard], minlength=edges_m.size - 1)
+    z2 = 1.96**2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = np.where(tried > 0, found / tried, np.nan)
+        middle = (share + 0.5 * z2 / tried) / (1.0 + z2 / tried)
+        half = np.sqrt(z2 * (share * (1.0 - share) / tried + 0.25 * z2 / tried**2))
+        half = half / (1.0 + z2 / tried)
+    return share, middle - half, middle + half, tried.astype(np.int64)
