@@ -1,0 +1,360 @@
+"""The team on TAK's screens: a sink that sends every member as Cursor-on-Target, through pytak.
+
+It works in a thread of its own with an event loop; the session only leaves the newest picture
+here. What a slow network does not take is not sent later: of a position only the newest counts.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import platform
+import threading
+import time
+import uuid
+import warnings
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+from urllib.parse import urlparse
+
+from relpos.errors import DataError
+from relpos.extras import missing_extra
+from relpos.fusion.estimator import Estimate
+from relpos.geodesy import MapFrame, Pin, place
+from relpos.live.cot_events import Callsigns, Moved, emergency, member, serialized
+from relpos.live.picture import Alert, Person, Picture
+from relpos.live.sinks import QuietSink
+
+EVERY_S = 1.0
+"""Each member is sent at most this often."""
+LOST_EVERY_S = 10.0
+"""Somebody who is not heard any more: often enough for a screen that has just joined."""
+ALARM_EVERY_S = 10.0
+TICK_S = 0.2
+CONNECT_WITHIN_S = 10.0
+SEND_WITHIN_S = 5.0
+RETRY_FIRST_S = 1.0
+RETRY_LAST_S = 15.0
+SETTLED_S = 1.5
+"""That nobody listens to a UDP port is heard only after something was sent there."""
+
+SCHEMES = ("udp", "udp+broadcast", "tcp", "tls", "ssl")
+
+
+def check_url(url: str) -> str:
+    """Return the URL as pytak wants it to send alone; DataError where it is none.
+
+    ``udp`` would listen at the same address as well, and refuse where something does already.
+    """
+    try:
+        parsed = urlparse(url)
+        host, port = parsed.hostname, parsed.port
+    except ValueError as error:
+        raise DataError(f"--cot {url}: {error}") from None
+    scheme = parsed.scheme.lower().removesuffix("+wo")
+    if scheme not in SCHEMES:
+        raise DataError(f"--cot {url}: begins with none of {', '.join(f'{s}://' for s in SCHEMES)}")
+    if not host or not port:
+        raise DataError(f"--cot {url}: host and port are wanted, as in {scheme}://HOST:PORT")
+    return f"{scheme}+wo://{parsed.netloc.rpartition('@')[2]}"
+
+
+def default_prefix() -> str:
+    """Return what this computer's teams are called: the same in every session, here alone."""
+    hardware = uuid.getnode()
+    # A random number in place of a hardware address has this bit set, and changes.
+    name = platform.node() if hardware & (1 << 40) else f"{hardware:012x}"
+    return f"relpos-{uuid.uuid5(uuid.NAMESPACE_OID, name).hex[:8]}"
+
+
+class Schedule:
+    """Which events are due: pure, but for what was sent before."""
+
+    def __init__(self, calls: Callsigns, *, emulated: bool = False) -> None:
+        self._calls = calls
+        self._emulated = emulated
+        self._sent_s: dict[int, float] = {}
+        self._alarm_sent_s: dict[int, float] = {}
+        self._moved: dict[int, Moved] = {}
+        self._seen_seq: dict[int, int] = {}
+
+    def due(
+        self,
+        picture: Picture,
+        frame: MapFrame,
+        now_s: float,
+        sigma_z_m: Mapping[int, float],
+    ) -> Iterator[ET.Element]:
+        """Yield what is to be sent at ``now_s``: at most one event a second of each member."""
+        for person in picture.people:
+            if now_s - self._sent_s.get(person.node, -EVERY_S) < EVERY_S:
+                continue
+            event = self._event(person, picture, frame, now_s, sigma_z_m.get(person.node))
+            if event is not None:
+                self._sent_s[person.node] = now_s
+                yield event
+
+    def _event(
+        self,
+        person: Person,
+        picture: Picture,
+        frame: MapFrame,
+        now_s: float,
+        sigma_z_m: float | None,
+    ) -> ET.Element | None:
+        node = person.node
+        told_s = self._alarm_sent_s.get(node)
+        # Who lay still and is not heard any more has not got up.
+        lies = person.alert is Alert.STILL_ALARM or (
+            told_s is not None and person.alert is Alert.LOST
+        )
+        if lies and (told_s is None or now_s - told_s >= ALARM_EVERY_S):
+            self._alarm_sent_s[node] = now_s
+            return self._emergency(person, picture, frame, sigma_z_m, over=False)
+        if not lies and told_s is not None:
+            del self._alarm_sent_s[node]
+            return self._emergency(person, picture, frame, sigma_z_m, over=True)
+        if self._seen_seq.get(node) == picture.seq:
+            return None
+        if person.status == "lost" and now_s - self._sent_s.get(node, -1e9) < LOST_EVERY_S:
+            return None
+        event = member(
+            person,
+            picture,
+            frame,
+            self._calls,
+            sigma_z_m=sigma_z_m,
+            before=self._moved.get(node),
+            emulated=self._emulated,
+        )
+        if event is not None:
+            self._seen_seq[node] = picture.seq
+            if person.motion_s is not None and person.x_m is not None and person.y_m is not None:
+                self._moved[node] = Moved(person.motion_s, person.x_m, person.y_m)
+        return event
+
+    def _emergency(
+        self,
+        person: Person,
+        picture: Picture,
+        frame: MapFrame,
+        sigma_z_m: float | None,
+        *,
+        over: bool,
+    ) -> ET.Element:
+        return emergency(
+            person,
+            picture,
+            frame,
+            self._calls,
+            over=over,
+            sigma_z_m=sigma_z_m,
+            emulated=self._emulated,
+        )
+
+
+class PinnedFrame:
+    """The map frame of a running session: pins stuck to nodes wait until those are located."""
+
+    def __init__(self, pins: Sequence[Pin]) -> None:
+        if not pins:
+            raise DataError("--cot needs --pin LAT,LON,BEARING: where on the map the picture lies")
+        self._pins = pins
+        self._places: dict[int, tuple[float, float]] = {}
+        self.frame: MapFrame | None = None
+        self.remarks: tuple[str, ...] = ()
+        self.trouble: str | None = None
+        if all(pin.node is None for pin in pins):
+            self._place()
+
+    def update(self, picture: Picture) -> MapFrame | None:
+        """Return the frame once every pin's place is known."""
+        if self.frame is not None or self.trouble is not None:
+            return self.frame
+        people = {p.node: p for p in picture.people if p.status == "ok"}
+        for k, pin in enumerate(self._pins):
+            there = people.get(pin.node) if pin.node is not None else None
+            if (
+                k not in self._places
+                and there is not None
+                and there.x_m is not None
+                and there.y_m is not None
+                and (pin.time_s is None or picture.time_s >= pin.time_s)
+            ):
+                self._places[k] = there.x_m, there.y_m
+        if all(pin.node is None or k in self._places for k, pin in enumerate(self._pins)):
+            self._place()
+        return self.frame
+
+    def waits_for(self) -> str | None:
+        """Say which nodes are not located yet that pins are stuck to."""
+        if self.trouble is not None or self.frame is not None:
+            return self.trouble
+        waiting = [
+            str(pin.node)
+            for k, pin in enumerate(self._pins)
+            if pin.node is not None and k not in self._places
+        ]
+        return f"no map yet: the pinned node {', '.join(waiting)} is not located"
+
+    def _place(self) -> None:
+        pins = [
+            Pin(
+                pin.latitude_deg,
+                pin.longitude_deg,
+                pin.bearing_rad,
+                pin.altitude_m,
+                self._places.get(k, pin.place_m),
+            )
+            for k, pin in enumerate(self._pins)
+        ]
+        try:
+            placing = place(pins, lambda node, time_s: None)
+        except DataError as error:
+            if not self._places:
+                raise
+            self.trouble = str(error)
+            return
+        self.frame, self.remarks = placing.frame, placing.remarks
+
+
+class CotSender(QuietSink):
+    """Sends pictures as Cursor-on-Target to a TAK server, a multicast group or one screen."""
+
+    def __init__(
+        self,
+        url: str,
+        pins: Sequence[Pin],
+        *,
+        prefix: str | None = None,
+        emulated: bool = False,
+    ) -> None:
+        """Begin to connect; DataError or RelposError where that can never work."""
+        self._shown = url
+        self._url = check_url(url)
+        self._map = PinnedFrame(pins)
+        try:
+            with warnings.catch_warnings():
+                # Of what only enrolling with a TAK server needs.
+                warnings.simplefilter("ignore")
+                import pytak  # noqa: F401
+        except ImportError:
+            raise missing_extra("pytak", "exchange") from None
+        # Its loggers write to stderr by themselves; what is wrong is told by trouble().
+        for name in ("pytak.classes", "pytak.client_functions", "pytak"):
+            logging.getLogger(name).disabled = True
+        self._schedule = Schedule(Callsigns(prefix or default_prefix()), emulated=emulated)
+        self._picture: Picture | None = None
+        self._sigma_z_m: dict[int, float] = {}
+        self._trouble: str | None = f"{url}: not connected yet"
+        self.sent = 0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="cot", daemon=True)
+        self._thread.start()
+
+    def estimated(self, estimate: Estimate) -> None:
+        """Note how well heights are known; pictures do not say."""
+        for node in estimate.nodes:
+            self._sigma_z_m[node.node] = node.sigma_z_m
+
+    def pictured(self, picture: Picture) -> None:
+        """Leave the newest picture for the sender."""
+        self._picture = picture
+
+    def trouble(self) -> str | None:
+        """Say why nothing arrives there; None when all is well."""
+        said = self._trouble or self._map.waits_for()
+        return f"Cursor-on-Target: {said}" if said else None
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What there is to say of where the map lies."""
+        return self._map.remarks
+
+    def close(self) -> None:
+        """End the connection."""
+        self._stop.set()
+        self._thread.join(SEND_WITHIN_S)
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._work())
+        except Exception as error:  # the session goes on, and says that this does not
+            self._trouble = f"{self._shown}: ended: {_words(error)}"
+
+    async def _work(self) -> None:
+        wait_s = RETRY_FIRST_S
+        while not self._stop.is_set():
+            began_s = time.monotonic()
+            try:
+                await self._connected()
+            except (OSError, SyntaxError, ValueError, asyncio.IncompleteReadError) as error:
+                self._trouble = f"{self._shown}: {_words(error)}; trying again"
+            except Exception as error:
+                # pytak's own exceptions have no common base.
+                self._trouble = f"{self._shown}: {_words(error)}; trying again"
+            if time.monotonic() - began_s > RETRY_LAST_S:
+                wait_s = RETRY_FIRST_S
+            until_s = time.monotonic() + wait_s
+            while not self._stop.is_set() and time.monotonic() < until_s:
+                await asyncio.sleep(TICK_S)
+            wait_s = min(2.0 * wait_s, RETRY_LAST_S)
+
+    async def _connected(self) -> None:
+        """Send until it breaks (raising) or is over."""
+        import pytak
+
+        tls = {key: value for key, value in os.environ.items() if key.startswith("PYTAK_")}
+        config: Any = {**tls, "COT_URL": self._url}
+        reader, writer = await asyncio.wait_for(pytak.protocol_factory(config), CONNECT_WITHIN_S)
+        worker = pytak.TXWorker(asyncio.Queue(), config, writer)
+        drained = asyncio.create_task(_drain(reader)) if reader is not None else None
+        began_s = time.monotonic()
+        settled_s = 0.0 if drained is not None else SETTLED_S
+        try:
+            while not self._stop.is_set():
+                if drained is not None and drained.done():
+                    raise ConnectionError("the server has closed the connection")
+                for data in self._due():
+                    await asyncio.wait_for(worker.send_data(data), SEND_WITHIN_S)
+                    self.sent += 1
+                if time.monotonic() - began_s >= settled_s:
+                    self._trouble = None
+                await asyncio.sleep(TICK_S)
+        finally:
+            if drained is not None:
+                drained.cancel()
+            writer.close()
+
+    def _due(self) -> list[bytes]:
+        picture = self._picture
+        if picture is None:
+            return []
+        frame = self._map.update(picture)
+        if frame is None:
+            return []
+        now_s = time.monotonic()
+        return [
+            serialized(event)
+            for event in self._schedule.due(picture, frame, now_s, self._sigma_z_m)
+        ]
+
+
+async def _drain(reader: Any) -> None:
+    """Read away what the server says, lest it stops taking; return when it has gone."""
+    try:
+        while await reader.read(65536):
+            pass
+    except OSError:
+        return
+
+
+def _words(error: BaseException) -> str:
+    if isinstance(error, TimeoutError):
+        return "no answer"
+    if isinstance(error, OSError) and error.errno is not None and error.errno > 0:
+        # asyncio's own words repeat the address and leave out the reason.
+        return os.strerror(error.errno)
+    return " ".join(str(error).split()) or type(error).__name__

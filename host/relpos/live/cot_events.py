@@ -1,0 +1,243 @@
+"""Members of the team as Cursor-on-Target events, the language of ATAK, WinTAK and TAK servers.
+
+What goes where in an event (base schema 2.0), and what this project puts there:
+
+- ``uid`` names the member for good, an emergency's is the member's with ``-9-1-1``, as ATAK's own;
+- ``type`` a-f-G-U-C, a friendly unit on the ground; b-a-o-tbl an emergency, b-a-o-can its end;
+- ``how`` m-g while the position is measured and fresh: what TAK's clients know as a moving member.
+  h-e, estimated, where it is ambiguous, or of somebody who is not heard any more;
+- ``start`` is when the member was last heard, ``stale`` ``STALE_S`` later: then clients grey it;
+- ``ce`` and ``le`` are the radius, and the height up and down, that hold the member with 90 %
+  probability (CE90 and LE90, as TAK's clients take them), of the picture alone: by how much the
+  pin is wrong comes on top;
+- ``hae`` is known where the pin has an altitude, 9999999 stands for unknown as everywhere in TAK.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.geodesy import MapFrame
+from relpos.live.picture import Alert, Person, Picture
+
+STALE_S = 15.0
+"""Nodes report every second and count as lost after ten: then TAK's clients grey the member."""
+ALARM_STALE_S = 600.0
+"""An emergency is not forgotten because the link to the server broke."""
+MEMBER = "a-f-G-U-C"
+EMERGENCY = "b-a-o-tbl"
+EMERGENCY_OVER = "b-a-o-can"
+UNKNOWN = "9999999.0"
+DECIMALS = 8
+"""Of latitude and longitude: millimetres. pytak's own default, four, is eleven metres."""
+
+_NORMAL_90 = 1.6448536269514722
+"""Two-sided 90 % of a normal distribution, in standard deviations."""
+_NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+@dataclass(frozen=True)
+class Callsigns:
+    """What members are called on TAK: ``prefix`` keeps teams on one server apart."""
+
+    prefix: str
+
+    def uid(self, node: int) -> str:
+        """Return the member's uid, the same in every session of this team."""
+        return f"{self.prefix}.{node}"
+
+
+@dataclass(frozen=True)
+class Moved:
+    """Where a member was at an earlier event, from which its speed follows."""
+
+    time_s: float
+    x_m: float
+    y_m: float
+
+
+def member(
+    person: Person,
+    picture: Picture,
+    frame: MapFrame,
+    calls: Callsigns,
+    *,
+    sigma_z_m: float | None = None,
+    before: Moved | None = None,
+    emulated: bool = False,
+) -> ET.Element | None:
+    """Return the event of one member; None of whom no position or sign of life is known."""
+    if person.seen_s is None or not _placed(person):
+        return None
+    import pytak
+
+    fresh = person.status == "ok"
+    seen_unix_s = picture.unix_s - person.seen_s
+    details = [
+        ET.Element("contact", callsign=text(person.name)),
+        ET.Element("uid", Droid=text(person.name)),
+        ET.Element("__group", name="Red", role="Team Member"),
+        _remarks(person, emulated),
+    ]
+    if person.heading_rad is not None and fresh:
+        course_deg = frame.course_deg(person.heading_rad)
+        speed_m_s = _speed(person, before)
+        details.append(ET.Element("track", course=f"{course_deg:.1f}", speed=f"{speed_m_s:.2f}"))
+    event: ET.Element = pytak.cot_event(
+        uid=calls.uid(person.node),
+        cot_type=MEMBER,
+        how="m-s" if emulated else "m-g" if fresh else "h-e",
+        point=_point(person, frame, sigma_z_m),
+        detail=pytak.cot_detail(*details, flow_tag=False),
+    )
+    return _timed(event, picture.unix_s, seen_unix_s, seen_unix_s + STALE_S)
+
+
+def emergency(
+    person: Person,
+    picture: Picture,
+    frame: MapFrame,
+    calls: Callsigns,
+    *,
+    over: bool = False,
+    sigma_z_m: float | None = None,
+    emulated: bool = False,
+) -> ET.Element:
+    """Return the event that somebody lies still, or does no longer.
+
+    It is sent of members whose place is unknown, too: at the pin, with an unknown error.
+    """
+    import pytak
+
+    name = text(person.name)
+    link = ET.Element("link", uid=calls.uid(person.node), type=MEMBER, relation="p-p")
+    said = ET.Element("emergency", {"cancel": "true"} if over else {"type": "911 Alert"})
+    said.text = name
+    event: ET.Element = pytak.cot_event(
+        uid=f"{calls.uid(person.node)}-9-1-1",
+        cot_type=EMERGENCY_OVER if over else EMERGENCY,
+        how="m-s" if emulated else "m-g" if person.status == "ok" else "h-e",
+        point=_point(person, frame, sigma_z_m),
+        detail=pytak.cot_detail(
+            link,
+            ET.Element("contact", callsign=f"{name}-Alert"),
+            said,
+            _remarks(person, emulated),
+            flow_tag=False,
+        ),
+    )
+    now_s = picture.unix_s
+    return _timed(event, now_s, now_s, now_s + (STALE_S if over else ALARM_STALE_S))
+
+
+def serialized(event: ET.Element) -> bytes:
+    """Return the event as it goes over the wire."""
+    import pytak
+
+    data: bytes = pytak.serialize_cot(event, trailing_newline=True)
+    return data
+
+
+def circle_90_m(sigma_major_m: float, sigma_minor_m: float) -> float:
+    """Return the radius around the centre of a normal distribution that holds 90 % of it."""
+    if sigma_major_m <= 0.0:
+        return 0.0
+    ratios, radii = _circles()
+    return sigma_major_m * float(np.interp(sigma_minor_m / sigma_major_m, ratios, radii))
+
+
+@cache
+def _circles() -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """The radius for a long axis of 1 by the ratio of the axes, (n,), (n,)."""
+    ratios = np.linspace(0.0, 1.0, 41)
+    radii = np.full(ratios.shape, _NORMAL_90)
+    angles = (np.arange(4000) + 0.5) * (0.5 * math.pi / 4000)
+    c2, s2 = np.cos(angles) ** 2, np.sin(angles) ** 2
+    for k, ratio in enumerate(ratios[1:], start=1):
+        # In a direction the distribution is Rayleigh with this width, and of this density.
+        width = c2 + s2 / ratio**2
+        low, high = _NORMAL_90, 2.2
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            inside = 1.0 - float(np.mean(np.exp(-0.5 * middle**2 * width) / (ratio * width)))
+            low, high = (middle, high) if inside < 0.9 else (low, middle)
+        radii[k] = low
+    return ratios, radii
+
+
+def text(value: str) -> str:
+    """Return a name without the characters that XML cannot hold."""
+    return _NOT_XML.sub("", value)
+
+
+def _placed(person: Person) -> bool:
+    return person.x_m is not None and person.y_m is not None and person.status != "unlocated"
+
+
+def _point(person: Person, frame: MapFrame, sigma_z_m: float | None) -> ET.Element:
+    import pytak
+
+    if not _placed(person):
+        point: ET.Element = pytak.cot_point(
+            frame.latitude_deg, frame.longitude_deg, precision=DECIMALS
+        )
+        return point
+    latitude, longitude = frame.to_map(person.x_m, person.y_m)
+    height_m = frame.altitude_of(math.nan if person.z_m is None else person.z_m)
+    known: Mapping[str, Any] = {
+        "ce": None
+        if person.sigma_major_m is None or person.sigma_minor_m is None
+        else f"{max(circle_90_m(person.sigma_major_m, person.sigma_minor_m), 0.1):.1f}",
+        "hae": None if height_m is None else f"{height_m:.1f}",
+        "le": None
+        if height_m is None or sigma_z_m is None or not math.isfinite(sigma_z_m)
+        else f"{max(_NORMAL_90 * sigma_z_m, 0.1):.1f}",
+    }
+    there: ET.Element = pytak.cot_point(
+        float(latitude), float(longitude), **known, precision=DECIMALS
+    )
+    return there
+
+
+def _remarks(person: Person, emulated: bool) -> ET.Element:
+    """Say in words what the symbol cannot."""
+    words = []
+    if emulated:
+        words.append("EMULATED")
+    if person.alert is Alert.STILL_ALARM:
+        words.append(f"LIES STILL for {person.still_s:.0f} s")
+    if not _placed(person):
+        words.append("position unknown")
+    elif person.status == "ambiguous":
+        words.append("position ambiguous")
+    elif person.status in ("stale", "lost"):
+        words.append(f"{person.status}: last heard {person.seen_s or 0.0:.0f} s ago")
+    remarks = ET.Element("remarks")
+    remarks.text = text("; ".join([*words, *person.reasons]))
+    return remarks
+
+
+def _speed(person: Person, before: Moved | None) -> float:
+    if not person.moving or before is None or person.motion_s is None:
+        return 0.0
+    passed_s = person.motion_s - before.time_s
+    if passed_s <= 0.0 or person.x_m is None or person.y_m is None:
+        return 0.0
+    return math.hypot(person.x_m - before.x_m, person.y_m - before.y_m) / passed_s
+
+
+def _timed(event: ET.Element, now_s: float, start_s: float, stale_s: float) -> ET.Element:
+    for name, unix_s in (("time", now_s), ("start", start_s), ("stale", stale_s)):
+        at = datetime.fromtimestamp(unix_s, UTC)
+        event.set(name, at.strftime("%Y-%m-%dT%H:%M:%S.%fZ"))
+    return event

@@ -1,0 +1,410 @@
+"""Cursor-on-Target: what members look like on TAK's screens, and how they get there."""
+
+from __future__ import annotations
+
+import math
+import re
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
+from dataclasses import replace
+from datetime import datetime
+from typing import Any
+from xml.dom.minidom import Element, parseString
+
+import numpy as np
+import pytest
+from geographiclib.geodesic import Geodesic
+from pictures import NAMES, PLACES, UNIX_S, picture
+
+from relpos.errors import DataError
+from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
+from relpos.geodesy import MapFrame, Pin
+from relpos.live.cot import CotSender, PinnedFrame, Schedule, check_url, default_prefix
+from relpos.live.cot_events import Callsigns, circle_90_m
+from relpos.live.picture import Alert, Picture
+
+PIN = Pin(48.1, 11.5, math.radians(90.0), 520.0)
+FRAME = MapFrame(48.1, 11.5, math.radians(90.0), 520.0)
+UNKNOWN = 9999999.0
+
+
+class Received:
+    """One event, parsed by another parser than it was written by, and held against the schema."""
+
+    def __init__(self, data: bytes) -> None:
+        event = parseString(data).documentElement
+        assert event.tagName == "event"
+        assert event.getAttribute("version") == "2.0"
+        self.uid = event.getAttribute("uid")
+        self.type = event.getAttribute("type")
+        self.how = event.getAttribute("how")
+        assert self.uid
+        assert re.fullmatch(r"\w+(-\w+)*(;[^;]*)?", self.type)
+        assert re.fullmatch(r"\w(-\w+)*", self.how)
+        self.time_s, self.start_s, self.stale_s = (
+            self._moment(event.getAttribute(name)) for name in ("time", "start", "stale")
+        )
+        assert self.start_s <= self.time_s
+        assert self.start_s < self.stale_s
+        children = [c.tagName for c in event.childNodes if isinstance(c, Element)]
+        assert sorted(children) == ["detail", "point"]
+        (point,) = event.getElementsByTagName("point")
+        assert sorted(point.attributes.keys()) == ["ce", "hae", "lat", "le", "lon"]
+        self.lat, self.lon, self.hae, self.ce, self.le = (
+            float(point.getAttribute(name)) for name in ("lat", "lon", "hae", "ce", "le")
+        )
+        assert -90.0 <= self.lat <= 90.0
+        assert -180.0 <= self.lon <= 180.0
+        assert self.ce > 0.0
+        assert self.le > 0.0
+        self.detail = event.getElementsByTagName("detail")[0]
+
+    @staticmethod
+    def _moment(text: str) -> float:
+        assert text.endswith("Z")
+        return datetime.fromisoformat(text).timestamp()
+
+    def attributes(self, tag: str) -> dict[str, str]:
+        found = self.detail.getElementsByTagName(tag)
+        return dict(found[0].attributes.items()) if found else {}
+
+    def words(self, tag: str) -> str:
+        (found,) = self.detail.getElementsByTagName(tag)
+        return "".join(child.data for child in found.childNodes)
+
+    def metres_from(self, x_m: float, y_m: float) -> float:
+        """How far the event is from a place in the picture, x being east of the pin."""
+        bearing, far_m = 90.0 - math.degrees(math.atan2(y_m, x_m)), math.hypot(x_m, y_m)
+        there = Geodesic.WGS84.Direct(PIN.latitude_deg, PIN.longitude_deg, bearing, far_m)
+        return float(
+            Geodesic.WGS84.Inverse(there["lat2"], there["lon2"], self.lat, self.lon)["s12"]
+        )
+
+
+def due(schedule: Schedule, shown: Picture, now_s: float) -> dict[str, Received]:
+    from relpos.live.cot_events import serialized
+
+    events = [Received(serialized(e)) for e in schedule.due(shown, FRAME, now_s, {1: 0.5})]
+    assert len({event.uid for event in events}) == len(events)
+    return {event.uid: event for event in events}
+
+
+@pytest.fixture
+def schedule() -> Schedule:
+    return Schedule(Callsigns("test"))
+
+
+def test_a_member_is_a_friendly_unit_where_it_is(schedule: Schedule) -> None:
+    events = due(schedule, picture(), 0.0)
+    assert set(events) == {f"test.{node}" for node in PLACES}
+    for node, (x_m, y_m) in PLACES.items():
+        event = events[f"test.{node}"]
+        assert (event.type, event.how) == ("a-f-G-U-C", "m-g")
+        assert event.attributes("contact")["callsign"] == NAMES[node]
+        assert event.metres_from(x_m, y_m) < 0.01
+        assert event.hae == pytest.approx(520.0 + 0.5 * node)
+        assert event.time_s == pytest.approx(UNIX_S + 11.0)
+        assert event.start_s == pytest.approx(UNIX_S + 10.75)
+        # A compass goes clockwise from north, a heading counter-clockwise from x.
+        expected = (90.0 - math.degrees(0.5 * math.pi * node - math.pi)) % 360.0
+        course = float(event.attributes("track")["course"])
+        assert math.remainder(course - expected, 360.0) == pytest.approx(0.0, abs=0.06)
+    assert events["test.1"].le == pytest.approx(1.645 * 0.5, abs=0.06)
+    assert events["test.2"].le == UNKNOWN
+
+
+def test_the_circle_holds_ninety_per_cent() -> None:
+    noise = np.random.default_rng(1).normal(size=(400_000, 2))
+    for major_m, minor_m in ((1.0, 1.0), (2.0, 0.9), (3.0, 0.2), (0.5, 0.0)):
+        off_m = np.hypot(*(noise * [major_m, minor_m]).T)
+        assert circle_90_m(major_m, minor_m) == pytest.approx(np.quantile(off_m, 0.9), rel=0.01)
+    assert circle_90_m(0.0, 0.0) == 0.0
+
+
+def test_the_error_is_the_circles_radius(schedule: Schedule) -> None:
+    event = due(schedule, picture(), 0.0)["test.1"]
+    assert event.ce == pytest.approx(circle_90_m(0.8, 0.4), abs=0.06)
+
+
+def test_nobody_is_sent_twice_a_second(schedule: Schedule) -> None:
+    times: dict[str, list[float]] = {}
+    for tick in range(60):
+        now_s = 0.1 * tick
+        changes: dict[int, Any] = {3: {"alert": Alert.STILL_ALARM}} if 20 < tick < 40 else {}
+        for uid in due(schedule, picture(tick, changes=changes), now_s):
+            times.setdefault(uid.removesuffix("-9-1-1"), []).append(now_s)
+    for sent_s in times.values():
+        assert min(np.diff(sent_s)) >= 1.0 - 1e-9
+        assert len(sent_s) >= 5
+
+
+def test_a_picture_that_does_not_move_on_is_not_sent_again(schedule: Schedule) -> None:
+    assert due(schedule, picture(1), 0.0)
+    assert not due(schedule, picture(1), 5.0)
+    assert due(schedule, picture(2), 6.0)
+
+
+def test_speed_is_that_of_the_way_between_two_events(schedule: Schedule) -> None:
+    due(schedule, picture(1), 0.0)
+    moved = {"x_m": 3.0, "y_m": 4.0, "motion_s": 14.0}
+    events = due(schedule, picture(2, changes={1: moved, 2: {"moving": False}}), 4.0)
+    assert float(events["test.1"].attributes("track")["speed"]) == pytest.approx(1.25)
+    assert float(events["test.2"].attributes("track")["speed"]) == 0.0
+
+
+def test_who_is_not_heard_goes_stale_by_the_time_last_heard(schedule: Schedule) -> None:
+    gone = {"status": "lost", "seen_s": 40.0, "alert": Alert.LOST}
+    event = due(schedule, picture(1, changes={2: gone}), 0.0)["test.2"]
+    assert event.how == "h-e"
+    assert event.stale_s < event.time_s
+    assert event.start_s == pytest.approx(event.time_s - 40.0)
+    assert not event.attributes("track")
+    assert "last heard 40 s ago" in event.words("remarks")
+    # Now and then, for whoever joins late.
+    assert "test.2" not in due(schedule, picture(2, changes={2: gone}), 3.0)
+    assert "test.2" in due(schedule, picture(3, changes={2: gone}), 11.0)
+
+
+def test_an_ambiguous_position_is_called_an_estimate(schedule: Schedule) -> None:
+    unsure = {"status": "ambiguous", "sigma_major_m": 9.0, "sigma_minor_m": 9.0}
+    event = due(schedule, picture(1, changes={2: unsure}), 0.0)["test.2"]
+    assert event.how == "h-e"
+    assert event.ce == pytest.approx(9.0 * 2.146, abs=0.1)
+    assert "ambiguous" in event.words("remarks")
+
+
+def test_who_is_nowhere_is_not_put_anywhere(schedule: Schedule) -> None:
+    changes: dict[int, dict[str, Any]] = {
+        1: {"status": "unlocated"},
+        2: {"x_m": None, "y_m": None},
+        3: {"seen_s": None},
+    }
+    assert set(due(schedule, picture(1, changes=changes), 0.0)) == {"test.4"}
+
+
+def test_who_lies_still_is_an_emergency_until_it_is_over(schedule: Schedule) -> None:
+    still = {"alert": Alert.STILL_ALARM, "still_s": 31.0, "moving": False}
+    alarm = due(schedule, picture(1, changes={3: still}), 0.0)["test.3-9-1-1"]
+    assert alarm.type == "b-a-o-tbl"
+    assert alarm.attributes("emergency") == {"type": "911 Alert"}
+    assert alarm.words("emergency") == NAMES[3]
+    assert alarm.attributes("link")["uid"] == "test.3"
+    assert alarm.metres_from(*PLACES[3]) < 0.01
+    assert "LIES STILL for 31 s" in alarm.words("remarks")
+    # The member itself goes on beside it, and the emergency is repeated.
+    assert due(schedule, picture(2, changes={3: still}), 1.0)["test.3"].type == "a-f-G-U-C"
+    assert "test.3-9-1-1" in due(schedule, picture(3, changes={3: still}), 11.0)
+    # Silence is no sign of having got up.
+    silent = {"alert": Alert.LOST, "status": "lost", "seen_s": 12.0}
+    later = due(schedule, picture(4, changes={3: silent}), 22.0)["test.3-9-1-1"]
+    assert later.type == "b-a-o-tbl"
+    over = due(schedule, picture(5), 24.0)["test.3-9-1-1"]
+    assert over.type == "b-a-o-can"
+    assert over.attributes("emergency") == {"cancel": "true"}
+    assert "test.3-9-1-1" not in due(schedule, picture(6), 26.0)
+
+
+def test_an_emergency_needs_no_position(schedule: Schedule) -> None:
+    still = {"alert": Alert.STILL_ALARM, "status": "unlocated", "x_m": None, "y_m": None}
+    alarm = due(schedule, picture(1, changes={3: still}), 0.0)["test.3-9-1-1"]
+    assert alarm.ce == UNKNOWN
+    assert alarm.metres_from(0.0, 0.0) < 0.01
+    assert "position unknown" in alarm.words("remarks")
+
+
+def test_an_emulated_team_says_so() -> None:
+    events = due(Schedule(Callsigns("test"), emulated=True), picture(), 0.0)
+    assert {event.how for event in events.values()} == {"m-s"}
+    assert all("EMULATED" in event.words("remarks") for event in events.values())
+
+
+def test_a_name_that_xml_cannot_hold_is_sent_without_the_rest(schedule: Schedule) -> None:
+    event = due(schedule, picture(1, changes={1: {"name": "A\x00\x1b\ud800b"}}), 0.0)["test.1"]
+    assert event.attributes("contact")["callsign"] == "Ab"
+
+
+def test_a_teams_uids_are_the_same_in_every_session() -> None:
+    assert default_prefix() == default_prefix()
+    assert re.fullmatch(r"relpos-[0-9a-f]{8}", default_prefix())
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("239.2.3.1:6969", "begins with none of udp://"),
+        ("http://tak.example:80", "begins with none of"),
+        ("udp://239.2.3.1", "host and port are wanted"),
+        ("tcp://:8087", "host and port are wanted"),
+        ("tcp://tak.example:high", "--cot tcp://tak.example:high: "),
+    ],
+)
+def test_an_address_that_cannot_work_is_told_at_once(url: str, words: str) -> None:
+    with pytest.raises(DataError, match=re.escape(words)):
+        check_url(url)
+    with pytest.raises(DataError):
+        CotSender(url, [PIN])
+
+
+def test_without_a_pin_nothing_is_sent() -> None:
+    with pytest.raises(DataError, match="--pin LAT,LON"):
+        CotSender("udp://127.0.0.1:9", [])
+
+
+def test_a_pin_on_a_node_waits_for_it() -> None:
+    pinned = PinnedFrame([Pin(48.0, 11.0, 0.0, node=2, time_s=15.0)])
+    assert pinned.update(picture(1)) is None
+    assert pinned.update(picture(6, changes={2: {"status": "ambiguous"}})) is None
+    assert "node 2 is not located" in str(pinned.waits_for())
+    frame = pinned.update(picture(7))
+    assert frame is not None
+    assert frame.place_m == PLACES[2]
+    assert pinned.waits_for() is None
+    # It stays where it was put.
+    moved = {2: {"x_m": 99.0}}
+    assert pinned.update(picture(8, changes=moved)) is frame
+
+
+def until(condition: Callable[[], Any], what: str) -> None:
+    deadline = time.monotonic() + 30.0
+    while not condition():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.02)
+
+
+class Server:
+    """A TAK server as far as taking events goes; can hang up and come back."""
+
+    def __init__(self, port: int = 0) -> None:
+        self.received: list[Received] = []
+        self._listener = socket.create_server(("127.0.0.1", port), reuse_port=False)
+        self.port: int = self._listener.getsockname()[1]
+        self._connections: list[socket.socket] = []
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:
+                return
+            self._connections.append(connection)
+            threading.Thread(target=self._read, args=(connection,), daemon=True).start()
+
+    def _read(self, connection: socket.socket) -> None:
+        pending = b""
+        # A server talks back: its own events must not stop the sender.
+        connection.sendall(b"<event/>" * 100)
+        while True:
+            try:
+                data = connection.recv(65536)
+            except OSError:
+                return
+            if not data:
+                return
+            pending += data
+            while b"</event>" in pending:
+                event, pending = pending.split(b"</event>", 1)
+                self.received.append(Received(event.strip() + b"</event>"))
+
+    def close(self) -> None:
+        # What another thread waits for is not freed by closing it.
+        for used in (self._listener, *self._connections):
+            with suppress(OSError):
+                used.shutdown(socket.SHUT_RDWR)
+            used.close()
+
+
+class Feeding:
+    """A session's receive thread: pictures at the usual rate."""
+
+    def __init__(self, sender: CotSender) -> None:
+        self._sender = sender
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        self._sender.estimated(
+            Estimate(
+                1.0,
+                (NodeEstimate(1, 0, 0, 0, 1, 1, 0, 0.1, NodeStatus.OK, 0.5, 0.5),),
+                (),
+            )
+        )
+        seq = 0
+        while not self._stop.wait(0.05):
+            seq += 1
+            self._sender.pictured(replace(picture(seq), unix_s=time.time()))
+
+    def __enter__(self) -> Feeding:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+@pytest.fixture
+def udp_port() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(30.0)
+        yield listener
+
+
+def test_every_member_arrives_by_udp(udp_port: socket.socket) -> None:
+    sender = CotSender(f"udp://127.0.0.1:{udp_port.getsockname()[1]}", [PIN])
+    events: dict[str, Received] = {}
+    with closing(sender), Feeding(sender):
+        while len(events) < len(PLACES):
+            event = Received(udp_port.recv(65536))
+            events[event.attributes("contact")["callsign"]] = event
+        until(lambda: sender.trouble() is None, "the trouble is told for ever")
+    assert set(events) == set(NAMES.values())
+    for node, place in PLACES.items():
+        assert events[NAMES[node]].metres_from(*place) < 0.01
+
+
+def test_a_udp_port_where_nobody_listens_is_told() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
+        held.bind(("127.0.0.1", 0))
+        port = held.getsockname()[1]
+    sender = CotSender(f"udp://127.0.0.1:{port}", [PIN])
+    with closing(sender), Feeding(sender):
+        until(lambda: "Connection refused" in str(sender.trouble()), "the refusal is not told")
+
+
+def test_every_member_arrives_by_tcp_also_after_the_server_was_away() -> None:
+    server = Server()
+    port = server.port
+    sender = CotSender(f"tcp://127.0.0.1:{port}", [PIN])
+    with closing(sender), Feeding(sender):
+        until(
+            lambda: (
+                {e.attributes("contact")["callsign"] for e in list(server.received)}
+                == set(NAMES.values())
+            ),
+            "not every member arrives",
+        )
+        assert sender.trouble() is None
+        server.close()
+        until(lambda: f"tcp://127.0.0.1:{port}" in str(sender.trouble()), "the loss is not told")
+        back = Server(port)
+        until(lambda: len(back.received) >= len(PLACES), "it does not come back")
+        until(lambda: sender.trouble() is None, "the trouble is told for ever")
+        back.close()
+
+
+def test_a_server_that_is_not_there_does_not_hold_up_the_session() -> None:
+    server = Server()
+    server.close()
+    sender = CotSender(f"tcp://127.0.0.1:{server.port}", [PIN])
+    with closing(sender), Feeding(sender):
+        until(lambda: "refused" in str(sender.trouble()), "the refusal is not told")
+        before_s = time.thread_time()
+        for seq in range(1000):
+            sender.pictured(picture(1_000 + seq))
+        assert time.thread_time() - before_s < 5.0
