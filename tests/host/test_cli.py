@@ -161,7 +161,6 @@ def test_wrong_usage_is_exit_status_two(arguments: tuple[str, ...]) -> None:
     assert relpos(*arguments).exit_code == 2
 
 
-@pytest.mark.parametrize("option", [("--record", "f"), ("--view",)])
 def test_what_is_not_built_yet_is_said(simulated: Path, option: tuple[str, ...]) -> None:
     assert "not built yet" in one_clear_line(relpos("fuse", simulated, *option))
 

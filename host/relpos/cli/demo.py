@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from relpos.cli import fuse, output
+from relpos.cli import fuse, live, output
 from relpos.cli.estimators import BANK
+
+if TYPE_CHECKING:
+    from relpos.emulator.rehearsal import Cast
 
 
 class Board(StrEnum):
@@ -50,13 +53,27 @@ def demo(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where the report goes.")] = Path(
         "out/demo"
     ),
+    view: live.View = False,
+    view_listen: live.ViewListen = None,
+    https: live.Https = False,
+    open_browser: live.OpenBrowser = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
 ) -> None:
-    """Run the production firmware of an emulated team and show who was where."""
+    """Run the production firmware of an emulated team and show who was where.
+
+    With --view the team walks in real time behind the live page; Ctrl-C ends it.
+    """
     from relpos.emulator.team import record_team
     from relpos.runs import save_run
 
     faults = check_faults(fault, nodes)
+    job = fuse.Job("emulated" if view else str(out / "run"), BANK, {}, seed, out)
+    if view:
+        from relpos.emulator.rehearsal import Cast
+
+        cast = Cast(nodes, seconds, scenario, seed, str(board), faults)
+        _perform(cast, job, live.Options(view, view_listen, https, open_browser), as_json=json)
+        return
     with output.working(f"emulating {nodes} nodes for {seconds:g} s"):
         run = record_team(
             board=str(board),
@@ -67,5 +84,28 @@ def demo(
             faults=faults,
         )
     save_run(run, out / "run")
-    job = fuse.Job(str(out / "run"), BANK, {}, seed, out)
     fuse.fuse_recording(job, run, run.priors, as_json=json, report=True)
+
+
+def _perform(cast: Cast, job: fuse.Job, options: live.Options, *, as_json: bool) -> None:
+    """Let an emulated team walk in real time, its port listened to as a real one's."""
+    from relpos.emulator.rehearsal import Rehearsal
+    from relpos.runs import Description
+
+    with output.working(f"preparing the walk of {cast.nodes} people"):
+        rehearsal = Rehearsal(cast)
+    with rehearsal:
+        job.prepare()
+        fuse.fuse_live(
+            job,
+            live.open_port(rehearsal.port, None, teach=True, reopen=False),
+            options,
+            description=Description(
+                name=f"{cast.scenario}-{cast.board}-{cast.seed}",
+                source=f"relpos demo --view --nodes {cast.nodes} --seed {cast.seed}",
+                priors=rehearsal.priors,
+            ),
+            priors=rehearsal.priors,
+            as_json=as_json,
+            emulated=rehearsal.over,
+        )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from relpos.cli import output
+from relpos.cli import live, output
 from relpos.cli import source as sources
 from relpos.cli.estimators import BANK, DEADRECKONING, EstimatorName
 from relpos.cli.keys import KeyFile
@@ -21,12 +21,9 @@ if TYPE_CHECKING:
     from relpos.evaluation.bounds import Totals
     from relpos.evaluation.metrics import Metrics
     from relpos.fusion.estimator import Estimate, Estimator
-    from relpos.measurements import Observation, Prior
-    from relpos.runs import NodeInfo, Run
-
-
-GATHER_S = 3.0
-"""A node reports its motion every second; with two losses in a row it has still been heard."""
+    from relpos.live.inputs import Input
+    from relpos.measurements import Measurement, Prior
+    from relpos.runs import Description, NodeInfo, Run
 
 
 class Initial(StrEnum):
@@ -75,10 +72,18 @@ def fuse(
     record: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Record what is received.")
     ] = None,
-    view: Annotated[bool, typer.Option("--view", help="Show the live page.")] = False,
+    view: live.View = False,
+    view_listen: live.ViewListen = None,
+    https: live.Https = False,
+    open_browser: live.OpenBrowser = None,
     seconds: Annotated[
-        float | None, typer.Option(min=0.0, help="Listen to a port this long, then end.")
+        float | None,
+        typer.Option(min=0.0, help="Listen to a port, or show a recording, this long, then end."),
     ] = None,
+    speed: Annotated[
+        float,
+        typer.Option(min=0.0, help="Of a recording that is shown: 2 is twice as fast as it was."),
+    ] = 1.0,
     teach: Annotated[
         bool,
         typer.Option(
@@ -102,17 +107,20 @@ def fuse(
 
     Writes estimate.csv, pairs.csv and parameters.csv, and index.html with pictures where the
     source has truth. From a port, what was received is kept too, as a run directory under
-    received/; Ctrl-C ends it.
+    received/; Ctrl-C ends it. With --view, or anything else that shows or records it, a port that
+    vanishes is waited for, and a recording is played at the pace at which it was made (--speed).
     """
     chosen = output.parse_settings(settings or [])
-    for wanted, name in ((record, "--record"), (view, "--view")):
-        if wanted:
-            raise output.not_built_yet(name)
+    if record:
+        raise output.not_built_yet("--record")
+    options = live.Options(view, view_listen, https, open_browser, seconds, speed)
     job = Job(
         source, estimator, chosen, seed, out or Path("out") / _base_name(source), smooth=smooth
     )
     if sources.is_port(source):
-        _fuse_port(job, initial, seconds, key_file, teach=teach, as_json=json)
+        _fuse_port(job, initial, options, key_file, teach=teach, as_json=json)
+    elif options.shown:
+        _replay_run(job, initial, options, as_json=json)
     else:
         _fuse_run(job, initial, as_json=json, report=not json if report is None else report)
 
@@ -152,7 +160,6 @@ class _Outcome:
     """What a pass over a source gave, also where it broke off."""
 
     estimates: list[Estimate] = field(default_factory=list)
-    received: list[Observation] = field(default_factory=list)
     interrupted: bool = False
     failure: RelposError | None = None
 
@@ -161,29 +168,12 @@ def _base_name(source: str) -> str:
     return Path(source).resolve().name or "run" if "://" not in source else "live"
 
 
-def _pass_through(
-    estimator: Estimator,
-    observations: Iterable[Observation],
-    *,
-    keep: bool = False,
-    tell: Callable[[Estimate], None] | None = None,
-) -> _Outcome:
-    """Give the estimator everything it can use; a failure or Ctrl-C keeps what came before.
-
-    ``tell`` is called with the newest estimate whenever there is one.
-    """
-    from relpos.measurements import Heading, Height, Motion, Range
-
+def _pass_through(estimator: Estimator, measurements: Iterable[Measurement]) -> _Outcome:
+    """Give the estimator everything; a failure or Ctrl-C keeps what came before."""
     outcome = _Outcome()
     try:
-        for observation in observations:
-            if keep:
-                outcome.received.append(observation)
-            if isinstance(observation, Motion | Range | Height | Heading):
-                new = estimator.process(observation)
-                outcome.estimates += new
-                if new and tell is not None:
-                    tell(new[-1])
+        for measurement in measurements:
+            outcome.estimates += estimator.process(measurement)
     except KeyboardInterrupt:
         outcome.interrupted = True
     except RelposError as error:
@@ -201,6 +191,25 @@ def _fuse_run(job: Job, initial: Initial | None, *, as_json: bool, report: bool)
 
     run = load_run(sources.check_recording(job.source))
     fuse_recording(job, run, _priors(run, initial), as_json=as_json, report=report)
+
+
+def _replay_run(job: Job, initial: Initial | None, options: live.Options, *, as_json: bool) -> None:
+    """Show a run directory as if it happened now."""
+    from relpos.live.inputs import PacedInput, run_items
+    from relpos.runs import load_run
+
+    run = load_run(sources.check_recording(job.source))
+    _check_usable(run, job.estimator)
+    priors = _priors(run, initial)
+    job.prepare()
+    fuse_live(
+        job,
+        PacedInput(job.source, run_items(run), speed=options.speed),
+        options,
+        description=run.description,
+        priors=priors,
+        as_json=as_json,
+    )
 
 
 def fuse_recording(
@@ -334,93 +343,72 @@ def _bound(run: Run) -> Totals | None:
 def _fuse_port(
     job: Job,
     initial: Initial | None,
-    seconds: float | None,
+    options: live.Options,
     key_file: Path | None,
     *,
     teach: bool,
     as_json: bool,
 ) -> None:
-    from relpos.measurements import Event, Heading, Height, Motion, Prior, Range, Status, Step
-    from relpos.runs import Run, save_run, write_estimates
-
     if initial is Initial.TRUTH:
         raise DataError(f"{job.source}: a port brings no truth to start from")
     # Before the port is open: nobody takes in what arrives meanwhile.
     job.prepare()
-    port = sources.Port(job.source, seconds, key_file, teach=teach)
+    port = live.open_port(job.source, key_file, teach=teach, reopen=options.shown)
     if not as_json:
         output.remark(f"listening to {job.source}; Ctrl-C ends")
-    stream = iter(output.with_progress(port, None, "received"))
-    priors: list[Prior] = []
-    if initial is Initial.COMMON:
-        stream, nodes = _who_is_there(stream)
-        priors = [Prior(node, 0.0, 0.0, 0.0) for node in nodes]
-    estimator = job.make(priors)
-    outcome = _pass_through(estimator, stream, keep=True, tell=port.learn)
-    steps = [o for o in outcome.received if isinstance(o, Step)]
-    received = Run(
-        name=_base_name(job.source),
-        measurements=tuple(
-            sorted(
-                (o for o in outcome.received if isinstance(o, Motion | Range | Height | Heading)),
-                key=lambda o: o.time_s,
-            )
-        ),
-        events=tuple(o for o in outcome.received if isinstance(o, Event)),
-        statuses=tuple(o for o in outcome.received if isinstance(o, Status)),
-        steps=tuple(steps),
-    )
-    save_run(received, job.out / "received")
-    write_estimates(job.out, outcome.estimates, steps=steps)
-    if outcome.failure is not None:
-        if isinstance(outcome.failure, DeviceError):
-            raise DeviceError(f"{outcome.failure}; what was received is in {job.out}")
-        raise outcome.failure
-    counters = {**port.counters, **estimator.counters()}
-    _tell(job, received.name, counters, outcome.estimates, None, as_json=as_json)
+    fuse_live(job, port, options, common=initial is Initial.COMMON, as_json=as_json)
 
 
-def _who_is_there(stream: Iterator[Observation]) -> tuple[Iterator[Observation], list[int]]:
-    """Listen until every node that is on has had time to report.
+def fuse_live(
+    job: Job,
+    source: Input,
+    options: live.Options,
+    *,
+    description: Description | None = None,
+    priors: Sequence[Prior] = (),
+    common: bool = False,
+    as_json: bool,
+    emulated: Callable[[], bool] | None = None,
+) -> None:
+    """Fuse what comes from ``source`` as it comes; write, show, and tell the result.
 
-    Returns the whole stream again, from its beginning, and the nodes. Where it breaks off
-    already here, it breaks off in the same way when it is read again.
+    ``emulated`` tells of an emulated team whether its walk is over, which ends its port.
     """
-    from relpos.measurements import Motion, Range
+    from relpos.live.fusing import Fusing
+    from relpos.runs import Description
 
-    came: list[Observation] = []
-    nodes: set[int] = set()
-    broke: BaseException | None = None
-    try:
-        for observation in stream:
-            came.append(observation)
-            if isinstance(observation, Motion | Range):
-                nodes.add(observation.node)
-            if isinstance(observation, Range):
-                nodes.add(observation.peer)
-            if observation.time_s - came[0].time_s > GATHER_S:
-                break
-    except (KeyboardInterrupt, RelposError) as error:
-        broke = error
-
-    def again() -> Iterator[Observation]:
-        yield from came
-        if broke is not None:
-            raise broke
-        yield from stream
-
-    return again(), sorted(nodes)
+    description = description or Description(name=_base_name(job.source))
+    name = description.name or _base_name(job.source)
+    outcome = live.run(
+        source,
+        Fusing(lambda known: job.make(known, description.nodes), priors, common=common),
+        options,
+        name=name,
+        estimator=str(job.estimator),
+        out=job.out,
+        description=description,
+        keep_received=source.is_now,
+        emulated=emulated is not None,
+    )
+    failure = outcome.failure
+    walk_is_over = emulated is not None and emulated() and isinstance(failure, DeviceError)
+    if failure is not None and not walk_is_over:
+        raise live.told(failure, job.out)
+    last = [outcome.last] if outcome.last is not None else []
+    _tell(job, name, outcome.counters, last, None, as_json=as_json, count=outcome.estimates)
 
 
 def _tell(
     job: Job,
     name: str,
-    counters: dict[str, Any],
+    counters: Mapping[str, Any],
     estimates: Sequence[Estimate],
     scored: _Scored | None,
     *,
     as_json: bool,
+    count: int | None = None,
 ) -> None:
+    """Print the result; ``count`` where ``estimates`` are not all there were."""
     from relpos.evaluation import summary
 
     if as_json:
@@ -430,7 +418,7 @@ def _tell(
                 "estimator": job.estimator,
                 "seed": job.seed,
                 "out": str(job.out),
-                "estimates": len(estimates),
+                "estimates": len(estimates) if count is None else count,
                 "counters": counters,
                 **(summary.as_json(scored.metrics) if scored else summary.no_metrics()),
                 "dead_reckoning": summary.figures(scored.baseline) if scored else None,

@@ -65,9 +65,9 @@ class Rehearsal:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    @property
     def over(self) -> bool:
-        """Whether the walk has ended."""
+        """Whether the walk has ended; where its port has vanished, that is not yet the answer."""
+        self._process.join(ENDING_S)
         return not self._process.is_alive()
 
     def close(self) -> None:

@@ -43,10 +43,12 @@ class Input(Protocol):
     """See the module's text."""
 
     name: str
-    link: Link | None
-    """Counts, clocks and radio figures of the nodes; None where only observations were kept."""
     is_now: bool
     """Whether it happens now, so that what phones tell belongs to it."""
+
+    @property
+    def link(self) -> Link | None:
+        """Counts, clocks and radio figures of the nodes; None where only observations were kept."""
 
     def read(self, timeout_s: float) -> Received | None:
         """What has arrived; None where nothing does in time. DeviceError where it ended so."""

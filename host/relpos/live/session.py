@@ -24,7 +24,7 @@ from relpos.live.composer import Composer
 from relpos.live.fusing import Fusing
 from relpos.live.inputs import Input, Received
 from relpos.live.picture import Level, Notice, Picture
-from relpos.live.sinks import Sink
+from relpos.live.sinks import QuietSink, Sink
 from relpos.live.visitors import Ask, Desk, Visitors
 from relpos.measurements import Observation
 
@@ -63,9 +63,10 @@ class Outcome:
 class Session:
     """One session over ``source``; see the module's text.
 
-    ``sinks`` are fed; ``visitors`` are asked for what browsers and phones want. ``seconds`` ends it
-    (of the wall clock), and so does the end of a recording, unless it ``stays``: then the last
-    picture is shown until it is stopped. ``remark`` is told what a user should read, once each.
+    ``sinks`` are fed; ``visitors`` are asked for what browsers and phones want. ``seconds`` end it
+    (of the wall clock). The end of a recording and the failure of the fusion do, unless it
+    ``lasts``: then receiving, and showing the last picture, go on until it is stopped. ``remark``
+    is told what a user should read, once each.
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class Session:
         visitors: Visitors | None = None,
         namings: Sequence[Named] = (),
         seconds: float | None = None,
-        stays: bool = False,
+        lasts: bool = False,
         remark: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.outcome = Outcome()
@@ -89,7 +90,7 @@ class Session:
         self._visitors = visitors
         self._namings = list(namings)
         self._seconds = seconds
-        self._stays = stays
+        self._lasts = lasts
         self._remark = remark
         self._desk = Desk(lambda unix_s: source.now_s() - (time.time() - unix_s))
         self._stopped = threading.Event()
@@ -101,7 +102,9 @@ class Session:
         self._news = False
         self._looked_s: float | None = None
         self._connected = True
-        self._told_failure = False
+        # Where nobody looks, no picture is composed.
+        self._pictures = any(type(s).pictured is not QuietSink.pictured for s in self._sinks)
+        self._finishing = False
 
     def stop(self) -> None:
         """End it soon; from any thread or signal handler."""
@@ -127,7 +130,7 @@ class Session:
                     self._look()
                     if self._seconds is not None and time.monotonic() - started_s > self._seconds:
                         return
-                    if self._source.over() and not self._stays:
+                    if not self._lasts and (self._source.over() or self._fusing.failure):
                         return
         except RelposError as error:
             self.outcome.failure = error
@@ -141,13 +144,14 @@ class Session:
         """
         if abandon:
             self._fusing.abandon()
-        else:
+        elif not self._finishing:
             self._fusing.finish()
         while not self._fusing.join(WAIT_S):
             self._take_estimates()
             self._picture_if_due()
         self._take_estimates()
-        self._picture(self._source.now_s())
+        if self._pictures:
+            self._picture(self._source.now_s())
         self._source.close()
         self.outcome.failure = self.outcome.failure or self._fusing.failure
         for sink in self._sinks:
@@ -238,8 +242,10 @@ class Session:
         self._note_or_clear(
             "port", Level.ALARM, None if gone is None else f"{gone}; tried again each second"
         )
-        over = self._source.over() and "the recording is over: this is its last picture"
-        self._note_or_clear("over", Level.INFO, over or None)
+        if self._source.over() and not self._finishing:
+            self._finishing = True
+            self._fusing.finish()
+            self._note("over", Level.INFO, "the recording is over: this is its last picture")
         self._watch_fusion()
         nobody = not self._composer.team.nodes and gone is None
         self._note_or_clear(
@@ -286,6 +292,9 @@ class Session:
     # -- pictures ---------------------------------------------------------------------------------
 
     def _picture_if_due(self) -> None:
+        if not self._pictures:
+            self._news = False
+            return
         since_s = time.monotonic() - self._pictured_s
         if since_s >= (PICTURE_S if self._news else IDLE_PICTURE_S):
             self._picture(self._source.now_s())

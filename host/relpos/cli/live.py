@@ -1,0 +1,178 @@
+"""What the commands that run live have in common: a session, its sinks, and what is printed."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from relpos.cli import output
+from relpos.cli.keys import make_link
+from relpos.errors import DeviceError
+
+if TYPE_CHECKING:
+    from relpos.live.composer import Composer
+    from relpos.live.fusing import Fusing
+    from relpos.live.inputs import Input
+    from relpos.live.picture import Hello
+    from relpos.live.session import Named, Outcome
+    from relpos.live.sinks import Sink
+    from relpos.live.visitors import Visitors
+    from relpos.runs import Description
+    from relpos.view.web import WebView
+
+View = Annotated[bool, typer.Option("--view", help="Serve the live page, for browsers.")]
+ViewListen = Annotated[
+    str | None,
+    typer.Option(
+        metavar="HOST:PORT",
+        help="Where the page is served: 0.0.0.0 for phones and others. (default: here alone)",
+    ),
+]
+Https = Annotated[
+    bool,
+    typer.Option(
+        "--https", help="With a certificate made on the spot: phones share their compass."
+    ),
+]
+OpenBrowser = Annotated[
+    bool | None,
+    typer.Option(
+        "--open/--no-open", help="Open the page here. (default: where there is a desktop)"
+    ),
+]
+
+MakeSink = Callable[["Hello"], "Sink"]
+"""Makes a sink once the session's name, source and start are known."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a session is shown and kept, as the command line said it.
+
+    ``sinks`` make whatever else is to be fed; each may also be ``Visitors``. With any of them, or
+    the page, the session outlives its port: it is opened again when it is there again.
+    """
+
+    view: bool = False
+    view_listen: str | None = None
+    https: bool = False
+    open_browser: bool | None = None
+    seconds: float | None = None
+    speed: float = 1.0
+    sinks: Sequence[MakeSink] = field(default_factory=tuple)
+
+    @property
+    def shown(self) -> bool:
+        """Whether somebody looks at it, or records it, while it runs."""
+        return self.view or bool(self.sinks)
+
+
+def open_port(port: str, key_file: Path | None, *, teach: bool, reopen: bool) -> Input:
+    """The team behind a serial port, under the team's key."""
+    from relpos.live.inputs import PortInput
+
+    link, seen = make_link(key_file)
+    return PortInput(port, link, seen, teach=teach, reopen=reopen)
+
+
+def run(
+    source: Input,
+    fusing: Fusing,
+    options: Options,
+    *,
+    name: str,
+    estimator: str,
+    out: Path,
+    description: Description,
+    keep_received: bool,
+    emulated: bool = False,
+) -> Outcome:
+    """Run a session until it ends; what it leaves is in ``out``. Ctrl-C ends it, and is no error.
+
+    Its failure, if any, is in the outcome: what came before has been kept.
+    """
+    from relpos.live.composer import Composer
+    from relpos.live.files import FileSink
+    from relpos.live.picture import Hello
+    from relpos.live.session import Session
+
+    hello = Hello(name, source.name, estimator, time.time() - source.now_s(), emulated)
+    files = FileSink(out, description, keep_received=keep_received)
+    composer: Composer = Composer(
+        {node: info.name for node, info in description.nodes.items() if info.name}
+    )
+    sinks: list[Sink] = [files]
+    namings: list[Named] = [files]
+    visitors: Visitors | None = None
+    if options.view:
+        page = _open_page(options, hello)
+        sinks.append(page)
+        namings.append(page)
+        visitors = page
+    sinks += [make(hello) for make in options.sinks]
+    session = Session(
+        source,
+        fusing,
+        composer,
+        sinks,
+        visitors=visitors,
+        namings=namings,
+        seconds=options.seconds,
+        lasts=options.shown,
+        remark=output.remark,
+    )
+    for _ in output.with_progress(session.run(), None, "received"):
+        pass
+    try:
+        with output.working("finishing"):
+            return session.finish()
+    except KeyboardInterrupt:
+        return session.finish(abandon=True)
+
+
+def _open_page(options: Options, hello: Hello) -> WebView:
+    """Serve the page, tell its address, open it where there is a desktop."""
+    from dataclasses import replace
+
+    from relpos.view import access as doors
+    from relpos.view.web import WebView
+
+    door, access = doors.listen(options.view_listen)
+    if options.https:
+        access = replace(access, certificate=doors.make_certificate(access.hosts))
+    page = WebView(door, access, hello)
+    output.remark(f"the team's page: {access.url()}")
+    if access.reachable:
+        output.remark(f"the wearers' page, for their phones: {access.url('/phone')}")
+        output.remark(doors.qr_terminal(access.url("/phone")))
+    else:
+        output.remark("for phones and other computers: --view-listen 0.0.0.0")
+    wanted = options.open_browser
+    if wanted or (wanted is None and _has_desktop()):
+        import webbrowser
+
+        webbrowser.open(access.url())
+    return page
+
+
+def _has_desktop() -> bool:
+    """Whether a browser would appear before the user's eyes."""
+    if os.environ.get("SSH_CONNECTION"):
+        return False
+    if sys.platform in ("darwin", "win32"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def told(failure: Exception, out: Path) -> Exception:
+    """The failure with where to find what came before it."""
+    if isinstance(failure, DeviceError):
+        return DeviceError(f"{failure}; what was received is in {out}")
+    return failure
