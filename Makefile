@@ -23,7 +23,7 @@ compile-kernels = @printf '%s\n' 'compiling the estimators, once'; \
 	$(PYTHON) -c 'from relpos import fusion; [fusion.warm_up(n) for n in fusion.SETTINGS]'
 title = @printf '\n\033[1m== %s\033[0m\n' "$(1)"
 
-.PHONY: help setup demo test lint bench bench-chain firmware docs pages wire clean soak \
+.PHONY: help setup demo live test lint bench bench-chain firmware docs pages wire clean soak \
         system-demo system-avr system-browser system-soak native-tests board-builds simulated-tests python-tests
 
 help: ## this list
@@ -33,6 +33,9 @@ setup: $(DEVELOP) ## everything Python in .venv; the command is then .venv/bin/r
 
 demo: $(RUN) | system-demo ## six emulated nodes through a serial port into the fusion, shown; report in out/demo
 	$(VENV)/bin/relpos demo --out out/demo
+
+live: $(RUN) | system-demo ## the same team in real time behind the live page; LIVE="--seconds 600 --nodes 20"
+	$(VENV)/bin/relpos demo --view --seconds 1800 --out out/live $(LIVE)
 
 test: lint wire-check native-tests board-builds simulated-tests python-tests ## every check; pytest last
 

@@ -161,8 +161,8 @@ def test_wrong_usage_is_exit_status_two(arguments: tuple[str, ...]) -> None:
     assert relpos(*arguments).exit_code == 2
 
 
-def test_what_is_not_built_yet_is_said(simulated: Path, option: tuple[str, ...]) -> None:
-    assert "not built yet" in one_clear_line(relpos("fuse", simulated, *option))
+def test_what_is_not_built_yet_is_said(simulated: Path) -> None:
+    assert "not built yet" in one_clear_line(relpos("fuse", simulated, "--record", "f"))
 
 
 def test_an_unknown_setting_is_one_clear_line(simulated: Path) -> None:
