@@ -1,0 +1,69 @@
+// Who is in trouble, and what of it has been acknowledged.
+
+const KINDS = {
+  still_warning: { kind: "still", level: "warning" },
+  still_alarm: { kind: "still", level: "alarm" },
+  lost: { kind: "lost", level: "alarm" },
+};
+
+/**
+ * Keeps the alarms between pictures. `update` returns what has changed, so that it can be told
+ * once: {raised, cleared}. A warning that has become an alarm is raised anew, and has to be
+ * acknowledged anew.
+ */
+export class Alarms {
+  constructor() {
+    this.active = new Map();
+  }
+
+  update(people) {
+    const raised = [];
+    const cleared = [];
+    const seen = new Set();
+    for (const person of people) {
+      const of = KINDS[person.alert];
+      if (!of) continue;
+      seen.add(person.node);
+      const before = this.active.get(person.node);
+      const same = before && before.kind === of.kind && before.level === of.level;
+      const alarm = {
+        node: person.node,
+        name: person.name,
+        ...of,
+        seconds: of.kind === "lost" ? person.seen_s : person.still_s,
+        // Acknowledged here at once; at every other page by the server's word.
+        acknowledged: person.acknowledged === true || (same ? before.acknowledged : false),
+      };
+      this.active.set(person.node, alarm);
+      if (!same && !alarm.acknowledged) raised.push(alarm);
+    }
+    for (const [node, alarm] of this.active) {
+      if (seen.has(node)) continue;
+      this.active.delete(node);
+      cleared.push(alarm);
+    }
+    return { raised, cleared };
+  }
+
+  acknowledge(node) {
+    const alarm = this.active.get(node);
+    if (alarm) this.active.set(node, { ...alarm, acknowledged: true });
+  }
+
+  /** The worst first: unacknowledged before acknowledged, alarms before warnings. */
+  list() {
+    const rank = (a) => (a.acknowledged ? 2 : 0) + (a.level === "alarm" ? 0 : 1);
+    return [...this.active.values()].sort((a, b) => rank(a) - rank(b) || b.seconds - a.seconds);
+  }
+
+  /** What has to be heard: "alarm", "warning" or null. */
+  get sounding() {
+    const open = this.list().filter((alarm) => !alarm.acknowledged);
+    if (open.length === 0) return null;
+    return open.some((alarm) => alarm.level === "alarm") ? "alarm" : "warning";
+  }
+
+  clear() {
+    this.active.clear();
+  }
+}

@@ -1,0 +1,47 @@
+// Angles as the Picture has them: radians, counter-clockwise, bearings from the map's x axis.
+// What people are told is clockwise: the clock's hours and the compass.
+
+export const TAU = 2 * Math.PI;
+
+/** The same angle in (-pi, pi]. */
+export function wrap(rad) {
+  const turned = ((rad % TAU) + TAU) % TAU;
+  return turned > Math.PI ? turned - TAU : turned;
+}
+
+/** A bearing as somebody with that heading has it: 0 ahead, positive to the left. */
+export function relative(bearingRad, headingRad) {
+  return wrap(bearingRad - headingRad);
+}
+
+/** Hour of the clock, 12 straight ahead, 3 to the right, for an angle from `relative`. */
+export function clockHour(relativeRad) {
+  const hour = Math.round(-relativeRad / (TAU / 12));
+  return ((hour % 12) + 12) % 12 || 12;
+}
+
+const POINTS = [
+  ["N", "north"],
+  ["NE", "north-east"],
+  ["E", "east"],
+  ["SE", "south-east"],
+  ["S", "south"],
+  ["SW", "south-west"],
+  ["W", "west"],
+  ["NW", "north-west"],
+];
+
+/** The nearest of eight compass points: {short: "NE", words: "north-east"}; y is north. */
+export function compassPoint(bearingRad) {
+  const eighth = Math.round((Math.PI / 2 - bearingRad) / (TAU / 8));
+  const [short, words] = POINTS[((eighth % 8) + 8) % 8];
+  return { short, words };
+}
+
+export function degrees(rad) {
+  return (rad * 180) / Math.PI;
+}
+
+export function radians(deg) {
+  return (deg * Math.PI) / 180;
+}

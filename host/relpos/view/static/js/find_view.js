@@ -1,0 +1,155 @@
+// Finding somebody: arrow, distance and what to do, big enough for gloves and smoke.
+
+import { degrees } from "./angles.js";
+import { arrow, make, setAttribute, setText } from "./dom.js";
+import { Announcer, guidance, spoken, Trend, TREND_WORDS } from "./finding.js";
+import { ago, distance, plusMinus, probability } from "./words.js";
+
+const TREND_SIGNS = { warmer: "▲", colder: "▼", same: "=" };
+
+/**
+ * `actions`: close(), next(by) for the next target, swap() (absent on a phone: there the seeker is
+ * its wearer).
+ */
+export class FindView {
+  constructor(section, actions) {
+    this.section = section;
+    this.from = null;
+    this.to = null;
+    this.trend = new Trend();
+    this.announcer = new Announcer();
+    this.previous = null;
+    this.aloud = false;
+    this.title = make("h2", { id: "find-title", tabindex: "-1" });
+    this.arrow = arrow("big-arrow");
+    this.distance = make("p", { class: "distance" });
+    this.order = make("p", { class: "order" });
+    this.trendSign = make("span", { "aria-hidden": "true" });
+    this.trendWords = make("span");
+    this.trendLine = make("p", { class: "trend", "data-trend": "none" }, this.trendSign, this.trendWords);
+    this.sure = make("p", { class: "sure" });
+    this.doubt = make("p", { class: "doubt" });
+    this.voice = make("p", { class: "unseen", role: "status", "aria-live": "polite", "aria-atomic": "true" });
+    const button = (text, action, attributes = {}) => {
+      const element = make("button", { type: "button", text, ...attributes });
+      element.addEventListener("click", action);
+      return element;
+    };
+    this.aloudButton = button("Read aloud", () => this.setAloud(!this.aloud), { "aria-pressed": "false" });
+    this.aloudButton.hidden = !("speechSynthesis" in globalThis);
+    const buttons = [
+      button("Close", actions.close, { class: "main" }),
+      button("Next person", () => actions.next(1)),
+      ...(actions.swap ? [button("Swap", actions.swap, { "aria-label": "Swap who seeks and who is sought" })] : []),
+      this.aloudButton,
+    ];
+    section.append(
+      this.title, this.arrow.element, this.distance, this.order, this.trendLine, this.sure,
+      this.doubt, make("div", { class: "actions" }, ...buttons), this.voice,
+    );
+    section.addEventListener("keydown", (event) => {
+      if (event.key === "Escape") actions.close();
+    });
+  }
+
+  get open() {
+    return this.to !== null;
+  }
+
+  start(from, to, { focus = true } = {}) {
+    this.from = from;
+    this.to = to;
+    this.trend = new Trend();
+    this.announcer = new Announcer();
+    this.previous = null;
+    this.section.hidden = false;
+    document.body.classList.add("finding");
+    if (focus) this.title.focus();
+  }
+
+  stop() {
+    this.from = this.to = null;
+    this.section.hidden = true;
+    document.body.classList.remove("finding");
+    setText(this.voice, "");
+    if (this.aloud) globalThis.speechSynthesis?.cancel();
+  }
+
+  setAloud(aloud) {
+    this.aloud = aloud;
+    setAttribute(this.aloudButton, "aria-pressed", String(aloud));
+    this.announcer = new Announcer();
+    if (!aloud) globalThis.speechSynthesis?.cancel();
+  }
+
+  update(team, { connected = true } = {}) {
+    if (!this.open) return;
+    const [seeker, target] = [team.person(this.from), team.person(this.to)];
+    const name = (person, node) => person?.name ?? `Node ${node}`;
+    const targetName = name(target, this.to);
+    setText(this.title, `${name(seeker, this.from)} → ${targetName}`);
+    setAttribute(this.title, "aria-label", `Leading ${name(seeker, this.from)} to ${targetName}`);
+    const relation = team.relation(this.from, this.to);
+    const guide = guidance(relation, this.previous);
+    this.previous = guide.key;
+    this.arrow.point(guide.arrowRad);
+    setText(this.distance, relation ? distance(relation.distanceM, relation.sigmaM) : "?");
+    setText(this.order, guide.words);
+    if (relation && team.timeS !== null) this.trend.add(team.timeS, relation.distanceM);
+    const trend = this.trend.direction;
+    setAttribute(this.trendLine, "data-trend", trend ?? "none");
+    setText(this.trendSign, TREND_SIGNS[trend] ?? "");
+    setText(this.trendWords, TREND_WORDS[trend] ?? "warmer or colder: walk to find out");
+    setText(this.sure, sureness(seeker, target, relation));
+    const doubt = doubts(team, seeker, target, connected);
+    setText(this.doubt, doubt);
+    this.doubt.hidden = doubt === "";
+    const key = `${guide.key} ${doubt.replace(/\d+/g, "")}`;
+    if (this.announcer.due(Date.now(), { key, distanceM: relation?.distanceM ?? 0, trend })) {
+      this.say(`${spoken(targetName, relation, guide, trend)} ${doubt}`.trim());
+    }
+  }
+
+  say(text) {
+    setText(this.voice, text);
+    if (!this.aloud) return;
+    const synthesis = globalThis.speechSynthesis;
+    // Voices of the device alone: others would be fetched from somewhere.
+    const voice = synthesis.getVoices().find((v) => v.localService && v.lang.startsWith("en"));
+    if (!voice) return;
+    const words = new SpeechSynthesisUtterance(text);
+    words.voice = voice;
+    synthesis.cancel();
+    synthesis.speak(words);
+  }
+}
+
+/** How sure all this is: of the distance, the direction, and each of the two. */
+export function sureness(seeker, target, relation) {
+  if (!relation) return "";
+  const parts = [`distance ${plusMinus(relation.sigmaM)}`];
+  if (relation.relativeRad !== null) parts.push(`direction ±${Math.round(degrees(relation.sigmaRad))}°`);
+  for (const person of [seeker, target]) {
+    if (Number.isFinite(person.sigma_major_m)) parts.push(`${person.name} ${plusMinus(person.sigma_major_m)}`);
+  }
+  return parts.join(" · ");
+}
+
+/** Why not to trust it blindly; empty where there is no reason. */
+export function doubts(team, seeker, target, connected) {
+  const words = [];
+  if (!connected) words.push("No connection: this is an old picture.");
+  for (const person of [target, seeker]) {
+    if (!person) continue;
+    if (person.status === "unlocated") words.push(`${person.name} is not located.`);
+    else if (person.status === "lost" || person.status === "stale") {
+      words.push(`${person.name}: last heard ${ago(person.seen_s)}; led to where that was.`);
+    } else if (person.status === "ambiguous") {
+      const { shown } = team.otherPictures();
+      words.push(shown
+        ? `${person.name} may be elsewhere: ${probability(shown.probability)} where shown.`
+        : `${person.name} may be elsewhere.`);
+    }
+  }
+  return words.join(" ");
+}

@@ -1,0 +1,133 @@
+// Leading one person to another: which way to turn, and whether it gets warmer.
+
+import { side, spokenDistance } from "./words.js";
+
+const AHEAD_RAD = (25 * Math.PI) / 180;
+const BEAR_RAD = (60 * Math.PI) / 180;
+const AROUND_RAD = (140 * Math.PI) / 180;
+// An instruction holds until the direction is this far beyond its border, lest it flutters.
+const HOLD_RAD = (7 * Math.PI) / 180;
+
+const ORDERS = {
+  ahead: "go straight ahead",
+  "bear left": "bear left",
+  "bear right": "bear right",
+  left: "turn left",
+  right: "turn right",
+  around: "turn around",
+};
+
+function order(relativeRad, slack) {
+  const size = Math.abs(relativeRad) - slack;
+  const hand = relativeRad > 0 ? "left" : "right";
+  if (size <= AHEAD_RAD) return "ahead";
+  if (size <= BEAR_RAD) return `bear ${hand}`;
+  if (size <= AROUND_RAD) return hand;
+  return "around";
+}
+
+/** Which way to turn; `previous` is what was said before. */
+export function turnOrder(relativeRad, previous = null) {
+  const now = order(relativeRad, 0);
+  if (previous && previous !== now) {
+    const near = [order(relativeRad, HOLD_RAD), order(relativeRad, -HOLD_RAD)];
+    if (near.includes(previous)) return previous;
+  }
+  return now;
+}
+
+/** At that distance one is there: within reach of a hand, or as near as can be told. */
+export function isThere(relation) {
+  return relation.distanceM < Math.max(1.5, 1.5 * relation.sigmaM);
+}
+
+/** What the seeker is to do: {key, words, arrowRad}; `arrowRad` null while nobody can say. */
+export function guidance(relation, previous = null) {
+  if (!relation) return { key: "unknown", words: "position unknown", arrowRad: null };
+  if (isThere(relation)) {
+    return { key: "there", words: "within reach: search here", arrowRad: relation.relativeRad };
+  }
+  if (relation.relativeRad === null) {
+    const words = relation.headingKnown
+      ? "direction unknown: keep moving"
+      : "walk a few steps straight on: your direction is not known yet";
+    return { key: "vague", words, arrowRad: null };
+  }
+  const key = turnOrder(relation.relativeRad, previous);
+  return { key, words: ORDERS[key], arrowRad: relation.relativeRad };
+}
+
+const TREND_S = 6;
+const LEAST_SPAN_S = 2.5;
+const LEAST_SPEED_M_S = 0.15;
+const LEAST_CHANGE_M = 0.6;
+
+/** Warmer or colder, by the slope of the distance over the last seconds. */
+export class Trend {
+  constructor() {
+    this.samples = [];
+  }
+
+  add(timeS, distanceM) {
+    const last = this.samples[this.samples.length - 1];
+    if (last && timeS <= last[0]) return;
+    this.samples.push([timeS, distanceM]);
+    while (this.samples[0][0] < timeS - TREND_S) this.samples.shift();
+  }
+
+  /** "warmer", "colder", "same", or null while too little is known. */
+  get direction() {
+    const n = this.samples.length;
+    if (n < 3) return null;
+    const [first, last] = [this.samples[0][0], this.samples[n - 1][0]];
+    if (last - first < LEAST_SPAN_S) return null;
+    let [st, sd, stt, std] = [0, 0, 0, 0];
+    for (const [t, d] of this.samples) {
+      st += t - first;
+      sd += d;
+      stt += (t - first) ** 2;
+      std += (t - first) * d;
+    }
+    const slope = (n * std - st * sd) / (n * stt - st * st);
+    if (Math.abs(slope) < LEAST_SPEED_M_S || Math.abs(slope) * (last - first) < LEAST_CHANGE_M) {
+      return "same";
+    }
+    return slope < 0 ? "warmer" : "colder";
+  }
+}
+
+export const TREND_WORDS = {
+  warmer: "warmer: getting closer",
+  colder: "colder: getting farther away",
+  same: "distance unchanged",
+};
+
+/** What is read aloud. */
+export function spoken(targetName, relation, guide, trend) {
+  if (!relation) return `${targetName}: position unknown.`;
+  const parts = [`${targetName}, ${spokenDistance(relation.distanceM)}`];
+  parts.push(guide.arrowRad === null || guide.key === "there"
+    ? guide.words
+    : `${side(guide.arrowRad)}: ${guide.words}`);
+  if (trend === "warmer") parts.push("getting closer");
+  if (trend === "colder") parts.push("getting farther away");
+  return `${parts.join(", ")}.`;
+}
+
+const SAY_EVERY_MS = 4000;
+
+/** Is it time to say it? Something must have changed, and the last word be a while ago. */
+export class Announcer {
+  constructor() {
+    this.last = null;
+  }
+
+  due(nowMs, { key, distanceM, trend }) {
+    const last = this.last;
+    const changed = !last || last.key !== key || last.trend !== trend ||
+      Math.abs(distanceM - last.distanceM) >= Math.max(1, 0.1 * last.distanceM);
+    if (!changed || (last && nowMs - last.atMs < SAY_EVERY_MS)) return false;
+    this.last = { key, distanceM, trend, atMs: nowMs };
+    return true;
+  }
+}

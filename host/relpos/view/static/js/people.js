@@ -1,0 +1,208 @@
+// The people beside the map: who, where from me, how well; and the map as a table.
+
+import { inkOn } from "./colours.js";
+import { arrow, healthSign, make, setAttribute, setText } from "./dom.js";
+import { isPlaced, VAGUE_RAD } from "./relation.js";
+import {
+  ago, clock, compass, compassShort, dbm, distance, HEALTH_WORDS, percent, plusMinus, probability, seconds,
+  STATUS_WORDS, UNKNOWN, volts, whereabouts,
+} from "./words.js";
+
+/** What somebody does, in words; empty where all is well and nothing need be said. */
+export function stateWords(person, alarm, shown) {
+  const words = [];
+  if (alarm?.kind === "lost" || person.status === "lost") words.push(`Lost: last heard ${ago(person.seen_s)}`);
+  else if (person.status === "stale") words.push(`No news: last heard ${ago(person.seen_s)}`);
+  else if (person.status === "unlocated") words.push("Not located yet");
+  else if (person.status === "ambiguous") {
+    words.push(shown ? `Ambiguous: ${probability(shown.probability)} where shown` : "Ambiguous");
+  }
+  if (alarm?.kind === "still") words.push(`Has not moved for ${seconds(person.still_s)}`);
+  else if (person.moving === false && person.still_s >= 3 && person.status !== "lost") {
+    words.push(`Stands still, ${seconds(person.still_s)}`);
+  }
+  return words.join(" · ");
+}
+
+class Card {
+  constructor(node, actions) {
+    this.node = node;
+    this.disc = make("span", { class: "disc" });
+    this.label = make("span", { class: "label" });
+    this.name = make("button", { type: "button", class: "name", "aria-pressed": "false" }, this.disc, this.label);
+    this.sign = healthSign();
+    this.health = make("span");
+    this.arrow = arrow("small-arrow");
+    this.far = make("span", { class: "far" });
+    this.sigma = make("span", { class: "sigma" });
+    this.direction = make("span", { class: "direction" });
+    this.compass = make("span", { class: "compass" });
+    this.where = make("div", { class: "where" }, this.arrow.element,
+      make("p", {}, this.far, " ", this.sigma), make("p", {}, this.direction, " ", this.compass));
+    this.spacer = make("span", { class: "spacer soft" });
+    this.state = make("p", { class: "state" });
+    this.facts = {};
+    const facts = ["Seen", "Supply", "Radio", "Loss", "Ranging", "Hears"].map((word) => {
+      const value = make("dd");
+      this.facts[word] = value;
+      return make("div", {}, make("dt", { text: word }), value);
+    });
+    this.reasons = make("p", { class: "reasons" });
+    this.followButton = make("button", { type: "button", "aria-pressed": "false", text: "Follow" });
+    this.findButton = make("button", { type: "button", text: "Find" });
+    this.name.addEventListener("click", () => actions.select(node));
+    this.followButton.addEventListener("click", () => actions.follow(node));
+    this.findButton.addEventListener("click", () => actions.find(node));
+    this.element = make("li", { class: "person", "data-node": node },
+      make("div", { class: "who" }, this.name, make("span", { class: "health" }, this.sign.element, this.health)),
+      make("div", { class: "middle" }, this.where, this.spacer, this.findButton, this.followButton),
+      this.state, make("dl", { class: "facts" }, ...facts), this.reasons);
+  }
+
+  show(person, { colour, me, meName, relation, northKnown, alarm, shown, selected, followed }) {
+    const { element } = this;
+    setAttribute(element, "data-status", person.status);
+    setAttribute(element, "data-health", person.health);
+    setAttribute(element, "data-alert", alarm?.level ?? null);
+    setAttribute(element, "data-selected", String(selected));
+    if (this.colour !== colour) {
+      this.colour = colour;
+      this.disc.style.background = colour;
+      this.disc.style.color = inkOn(colour);
+    }
+    setText(this.disc, String(person.node));
+    setText(this.label, me ? `${person.name} (me)` : person.name);
+    setAttribute(this.name, "aria-pressed", String(selected));
+    this.sign.show(person.health);
+    setText(this.health, HEALTH_WORDS[person.health] ?? person.health);
+    this.where.hidden = me || meName === null;
+    this.spacer.hidden = !this.where.hidden;
+    setText(this.spacer, me ? "the others are seen from here" : "");
+    if (!this.where.hidden) {
+      this.arrow.point(relation?.relativeRad ?? null);
+      setText(this.far, relation ? distance(relation.distanceM, relation.sigmaM) : UNKNOWN);
+      setText(this.sigma, relation ? plusMinus(relation.sigmaM) : "");
+      setText(this.direction, !relation ? "position unknown"
+        : relation.relativeRad === null ? "which way? " : clock(relation.relativeRad));
+      setText(this.compass, relation ? compassShort(relation.bearingRad, northKnown) : "");
+    }
+    setText(this.state, stateWords(person, alarm, shown));
+    const facts = {
+      Seen: ago(person.seen_s), Supply: volts(person.battery_v), Radio: dbm(person.rssi_dbm),
+      Loss: percent(person.loss), Ranging: percent(person.ranging),
+      Hears: Number.isFinite(person.neighbours) ? String(person.neighbours) : UNKNOWN,
+    };
+    for (const [word, value] of Object.entries(facts)) setText(this.facts[word], value);
+    setText(this.reasons, (person.reasons ?? []).join("; "));
+    setAttribute(this.followButton, "aria-pressed", String(followed));
+    setAttribute(this.followButton, "aria-label", `Follow ${person.name}`);
+    setAttribute(this.findButton, "aria-label", `Find ${person.name}`);
+  }
+}
+
+export class PeopleList {
+  constructor(list, actions) {
+    this.list = list;
+    this.actions = actions;
+    this.cards = new Map();
+  }
+
+  /** `look` is {colourOf, me, selected, followed, alarms}. */
+  update(team, look) {
+    const { shown } = team.otherPictures();
+    const people = [...team.list()].sort((a, b) => trouble(look.alarms, b) - trouble(look.alarms, a) || a.node - b.node);
+    for (const [node, card] of this.cards) {
+      if (!team.people.has(node)) {
+        card.element.remove();
+        this.cards.delete(node);
+      }
+    }
+    people.forEach((person, place) => {
+      let card = this.cards.get(person.node);
+      if (!card) {
+        card = new Card(person.node, this.actions);
+        this.cards.set(person.node, card);
+      }
+      // Moving an element takes the focus from it: only what is out of place is moved.
+      if (this.list.children[place] !== card.element) {
+        const focused = card.element.contains(document.activeElement) ? document.activeElement : null;
+        this.list.insertBefore(card.element, this.list.children[place] ?? null);
+        focused?.focus();
+      }
+      card.show(person, {
+        colour: look.colourOf(person.node),
+        me: person.node === look.me,
+        meName: team.person(look.me)?.name ?? null,
+        relation: look.me === null ? null : team.relation(look.me, person.node),
+        northKnown: team.northKnown,
+        alarm: look.alarms.active.get(person.node),
+        shown,
+        selected: person.node === look.selected,
+        followed: person.node === look.followed,
+      });
+    });
+  }
+}
+
+function trouble(alarms, person) {
+  const alarm = alarms.active.get(person.node);
+  return alarm ? (alarm.level === "alarm" ? 2 : 1) : 0;
+}
+
+const number = (value) => (Number.isFinite(value) ? value.toFixed(1) : UNKNOWN);
+
+/** The cells of one person's row: what the map draws, in words. */
+export function tableRow(team, person, me) {
+  const ranges = team.ranges
+    .filter(([node, peer]) => node === person.node || peer === person.node)
+    .map(([node, peer, rangeM]) => {
+      const other = team.person(node === person.node ? peer : node);
+      return `${other?.name ?? "?"} ${rangeM.toFixed(1)}`;
+    });
+  const faces = Number.isFinite(person.heading_rad) && (person.sigma_heading_rad ?? 0) < VAGUE_RAD;
+  const placed = isPlaced(person);
+  return [
+    person.name,
+    [STATUS_WORDS[person.status] ?? person.status, person.moving === false ? `still ${seconds(person.still_s)}` : "",
+      `node ${HEALTH_WORDS[person.health] ?? ""}`].filter(Boolean).join(", "),
+    placed ? number(person.x_m) : UNKNOWN,
+    placed ? number(person.y_m) : UNKNOWN,
+    placed ? number(person.sigma_major_m) : UNKNOWN,
+    placed && faces ? compass(person.heading_rad, team.northKnown) : UNKNOWN,
+    me === null ? UNKNOWN : me === person.node ? "me" : whereabouts(team.relation(me, person.node), team.northKnown),
+    ranges.join(", ") || UNKNOWN,
+  ];
+}
+
+export function updateTable(body, team, me) {
+  const rows = team.list().map((person) => tableRow(team, person, me));
+  while (body.rows.length > rows.length) body.deleteRow(-1);
+  rows.forEach((cells, k) => {
+    let row = body.rows[k];
+    if (!row) {
+      row = body.insertRow();
+      row.append(make("th", { scope: "row" }), ...cells.slice(1).map(() => make("td")));
+    }
+    cells.forEach((text, c) => setText(row.cells[c], text));
+  });
+}
+
+/** The alternatives in words; empty while nothing is ambiguous. */
+export function alternativeWords(team) {
+  const { shown, ghosts, rings } = team.otherPictures();
+  const words = rings.map((ring) => `${team.person(ring.node)?.name ?? `Node ${ring.node}`} is somewhere on a ring of ${distance(ring.sigma_major_m)} about x ${number(ring.x_m)}, y ${number(ring.y_m)}.`);
+  if (ghosts.length) {
+    words.push(`The picture shown has a probability of ${probability(shown?.probability)}.`);
+    for (const ghost of ghosts) {
+      const moved = ghost.people.filter((p) => {
+        const person = team.person(p.node);
+        return p.shape !== "ring" && person && Math.hypot(person.x_m - p.x_m, person.y_m - p.y_m) >= 0.7;
+      });
+      if (!moved.length) continue;
+      const places = moved.map((p) => `${team.person(p.node).name} at x ${number(p.x_m)}, y ${number(p.y_m)}`);
+      words.push(`With ${probability(ghost.probability)}: ${places.join("; ")}.`);
+    }
+  }
+  return words.join(" ");
+}
+

@@ -1,0 +1,146 @@
+// The newest Picture, and what follows from it; fed by the server's messages (protocol 1).
+
+import { pairKey, relation } from "./relation.js";
+import { Track } from "./tracks.js";
+
+export const PROTOCOL = 1;
+
+export class Team {
+  constructor() {
+    this.session = null;
+    this.limits = { still_warning_s: 20, still_alarm_s: 30 };
+    this.clear();
+  }
+
+  clear() {
+    this.people = new Map();
+    this.pairs = new Map();
+    this.ranges = [];
+    this.alternatives = [];
+    this.notices = [];
+    this.tracks = new Map();
+    this.ambiguous = false;
+    this.timeS = null;
+    this.unixS = null;
+    this.arrivedUnixS = null;
+    this.seq = null;
+    this.order = [];
+    this.pictures = 0;
+  }
+
+  /** Take a message; returns its type, or "unknown" for one that this page cannot read. */
+  take(message) {
+    switch (message?.type) {
+      case "hello": {
+        const other = message.session?.started_unix_s !== this.session?.started_unix_s;
+        if (other) this.clear();
+        this.session = message.session ?? {};
+        this.limits = { ...this.limits, ...message.limits };
+        return message.protocol === PROTOCOL ? "hello" : "unknown";
+      }
+      case "tracks":
+        for (const [node, points] of Object.entries(message.tracks)) {
+          this.trackOf(Number(node)).restore(points);
+        }
+        return "tracks";
+      case "picture":
+        this.takePicture(message);
+        return "picture";
+      case "ping":
+        return "ping";
+      default:
+        return "unknown";
+    }
+  }
+
+  takePicture(picture) {
+    this.seq = picture.seq;
+    this.timeS = picture.time_s;
+    this.unixS = picture.unix_s;
+    this.arrivedUnixS = picture.arrived_unix_s;
+    this.ambiguous = Boolean(picture.ambiguous);
+    this.notices = picture.notices ?? [];
+    this.ranges = picture.ranges ?? [];
+    this.alternatives = picture.alternatives ?? [];
+    this.people = new Map((picture.people ?? []).map((person) => [person.node, named(person)]));
+    this.pairs = new Map((picture.pairs ?? []).map((pair) => [pairKey(pair[0], pair[1]), pair]));
+    this.order = [...this.people.keys()].sort((a, b) => a - b);
+    this.pictures += 1;
+    for (const person of this.people.values()) {
+      // Only what is believed leaves a track.
+      if (person.status === "ok" || person.status === "stale") {
+        this.trackOf(person.node).add(picture.time_s, person.x_m, person.y_m);
+      }
+    }
+  }
+
+  trackOf(node) {
+    let track = this.tracks.get(node);
+    if (!track) {
+      track = new Track();
+      this.tracks.set(node, track);
+    }
+    return track;
+  }
+
+  /** Everybody, by number. */
+  list() {
+    return this.order.map((node) => this.people.get(node));
+  }
+
+  person(node) {
+    return this.people.get(node) ?? null;
+  }
+
+  /** A person's place in the order by number: what its colour goes by. */
+  placeOf(node) {
+    return Math.max(this.order.indexOf(node), 0);
+  }
+
+  /** How `from` sees `to` (numbers); null where either is unknown. */
+  relation(from, to) {
+    return relation(this.person(from), this.person(to), this.pairs.get(pairKey(from, to)) ?? null);
+  }
+
+  /** Does the map's y axis point north? */
+  get northKnown() {
+    return this.session?.north_known === true;
+  }
+
+  /**
+   * The other pictures of the team while it is ambiguous, the most probable first, and the shown
+   * one's own probability: {shown: p | null, ghosts: [...], rings: [...]}.
+   *
+   * The server lists the shown picture among the alternatives: it is the one nearest to what is
+   * shown. Whatever it has as a ring is a ring in the shown picture, too.
+   */
+  otherPictures() {
+    const alternatives = [...this.alternatives].sort((a, b) => b.probability - a.probability);
+    let shown = null;
+    let least = Infinity;
+    for (const alternative of alternatives) {
+      const off = this.distanceFromShown(alternative);
+      if (off < least) [shown, least] = [alternative, off];
+    }
+    return {
+      shown,
+      ghosts: alternatives.filter((a) => a !== shown),
+      rings: shown ? shown.people.filter((p) => p.shape === "ring") : [],
+    };
+  }
+
+  distanceFromShown(alternative) {
+    let [sum, count] = [0, 0];
+    for (const ghost of alternative.people) {
+      const person = this.person(ghost.node);
+      if (!person || ghost.shape === "ring" || !Number.isFinite(person.x_m)) continue;
+      sum += Math.hypot(ghost.x_m - person.x_m, ghost.y_m - person.y_m);
+      count += 1;
+    }
+    return count ? sum / count : Number.MAX_VALUE;
+  }
+}
+
+function named(person) {
+  return person.name ? person : { ...person, name: `Node ${person.node}` };
+}

@@ -1,0 +1,310 @@
+// The team's page: puts the pieces together.
+
+import { Alarms } from "./alarms.js";
+import { AlarmBanner, showNotices } from "./banner.js";
+import { Connection } from "./connection.js";
+import { byId, make, postJson, setAttribute, setText, storage } from "./dom.js";
+import { FindView } from "./find_view.js";
+import { TeamMap } from "./map.js";
+import { alternativeWords, PeopleList, updateTable } from "./people.js";
+import { Siren } from "./sound.js";
+import { connectionWords, dataAgeS, showConnection } from "./status_line.js";
+import { Team } from "./team.js";
+import { isDark, themeSwitch } from "./theme_switch.js";
+import { alarmText } from "./words.js";
+
+const LIST_MS = 200; // the list is read by eyes: five times a second will do
+const TABLE_MS = 1000; // and the table by screen readers
+
+const kept = storage();
+const team = new Team();
+const alarms = new Alarms();
+let receivedMs = null;
+let listMs = 0;
+let listTimer = null;
+let tableMs = 0;
+let trouble = null;
+
+const siren = new Siren(showSound);
+const map = new TeamMap(byId("map"), team, { onPick: select, onCamera: showCamera });
+map.covers = [byId("map-tools")];
+const banner = new AlarmBanner(byId("alarms"), { acknowledge, show: find });
+const list = new PeopleList(byId("people"), { select, follow, find });
+const findView = new FindView(byId("find"), {
+  close: stopFinding,
+  next: (by) => find(neighbour(findView.to, by, findView.from)),
+  swap: () => startFinding(findView.to, findView.from),
+});
+const connection = new Connection({ onMessage: take, onState: () => refresh(true) });
+
+// -- what comes ------------------------------------------------------------------------------------
+
+function take(message) {
+  const kind = team.take(message);
+  if (kind === "hello") {
+    receivedMs = null;
+    trouble = null;
+    alarms.clear();
+    setText(byId("session"), [team.session.name, team.session.emulated ? "(emulated)" : ""].join(" "));
+    document.title = `${team.session.name ?? "team"} · relpos live`;
+    setText(byId("limit-warning"), String(team.limits.still_warning_s));
+    setText(byId("limit-alarm"), String(team.limits.still_alarm_s));
+    map.layer.forget();
+  } else if (kind === "tracks") {
+    map.layer.forget();
+  } else if (kind === "picture") {
+    receivedMs = Date.now();
+    takeAlarms();
+    map.alarms = alarms.active;
+    findView.update(team, { connected: true });
+  } else if (kind === "unknown") {
+    trouble = { level: "warning", text: "The server speaks another language than this page: reload it." };
+  }
+  if (kind !== "ping") map.invalidate();
+  refresh(kind === "hello");
+}
+
+function takeAlarms() {
+  const { raised, cleared } = alarms.update(team.list());
+  if (raised.length) setText(byId("alarm-voice"), raised.map((a) => `${a.level}: ${alarmText(a)}`).join(". "));
+  if (cleared.length) {
+    setText(byId("news-voice"), cleared
+      .map((a) => `${a.name} ${a.kind === "lost" ? "is heard again" : "moves again"}`).join(". "));
+  }
+  siren.sound(alarms.sounding);
+  banner.update(alarms);
+}
+
+// -- what is shown ---------------------------------------------------------------------------------
+
+/** Bring the text up to date, now or within a fifth of a second. */
+function refresh(now = false) {
+  const wait = listMs + LIST_MS - performance.now();
+  if (now || wait <= 0) {
+    clearTimeout(listTimer);
+    listTimer = null;
+    show();
+  } else if (listTimer === null) {
+    listTimer = setTimeout(() => {
+      listTimer = null;
+      show();
+    }, wait);
+  }
+}
+
+function show() {
+  listMs = performance.now();
+  showAge();
+  byId("waiting").hidden = team.pictures > 0;
+  const notices = [...team.notices];
+  if (trouble) notices.unshift(trouble);
+  if (connection.unreadable) {
+    notices.unshift({ level: "warning", text: `${connection.unreadable} messages of the server could not be read.` });
+  }
+  showNotices(byId("notices"), notices);
+  setText(byId("count"), team.people.size ? `(${team.people.size})` : "");
+  fillMe();
+  list.update(team, {
+    colourOf: (node) => map.colourOf(node),
+    me: map.me,
+    selected: map.selected,
+    followed: map.camera.mode === "follow" ? map.camera.node : null,
+    alarms,
+  });
+  showCamera();
+  const missing = team.list().filter((p) => p.status === "unlocated").map((p) => p.name);
+  setText(byId("map-hint"), missing.length ? `Not located yet: ${missing.join(", ")}` : "");
+  if (performance.now() - tableMs > TABLE_MS) showTable();
+}
+
+function showTable() {
+  tableMs = performance.now();
+  setText(byId("map-words"), map.describe());
+  if (byId("table-view").hidden) return;
+  updateTable(byId("table"), team, map.me);
+  const from = team.person(map.me)?.name;
+  setText(byId("from-title"), from ? `From ${from}` : "From me");
+  setText(byId("table-caption"), map.describe());
+  setText(byId("table-alternatives"), alternativeWords(team));
+}
+
+function age() {
+  return dataAgeS({ unixS: team.unixS, arrivedUnixS: team.arrivedUnixS, receivedMs, nowMs: Date.now() });
+}
+
+function showAge() {
+  const told = connectionWords(connection.state, age(), connection.retryS);
+  showConnection(
+    { line: byId("connection"), words: byId("connection-words"), age: byId("age"), retry: byId("retry") },
+    told,
+  );
+  document.body.dataset.connection = told.state;
+  if (connection.state !== "live" && connection.state !== "silent" && team.pictures) {
+    findView.update(team, { connected: false });
+  }
+}
+
+function showCamera() {
+  const { mode, node } = map.camera;
+  setAttribute(byId("fit"), "aria-pressed", String(mode === "fit"));
+  const follow = byId("follow");
+  const name = team.person(mode === "follow" ? node : map.selected ?? map.me)?.name;
+  setAttribute(follow, "aria-pressed", String(mode === "follow"));
+  setText(follow, name ? `Follow ${name}` : "Follow");
+  follow.disabled = !name;
+  const up = byId("heading-up");
+  setAttribute(up, "aria-pressed", String(map.up === "heading"));
+}
+
+function showSound() {
+  const button = byId("sound");
+  const words = { on: "Sound on", muted: "Sound off", locked: "Enable sound" };
+  setText(button, words[siren.state]);
+  setAttribute(button, "aria-pressed", String(siren.state === "on"));
+}
+
+function fillMe() {
+  const select = byId("me");
+  const wanted = ["", ...team.list().map((p) => `${p.node} ${p.name}`)].join("\n");
+  if (select.dataset.people !== wanted) {
+    select.dataset.people = wanted;
+    select.replaceChildren(make("option", { value: "", text: "nobody" }),
+      ...team.list().map((p) => make("option", { value: p.node, text: p.name })));
+  }
+  // Until somebody chooses, directions are seen from the first person.
+  if (map.me === null && kept.getItem("relpos.me") === null) map.me = team.order[0] ?? null;
+  const value = map.me === null ? "" : String(map.me);
+  if (select.value !== value) select.value = value;
+}
+
+// -- what is done ----------------------------------------------------------------------------------
+
+function select(node) {
+  map.selected = node === map.selected ? null : node;
+  map.invalidate();
+  refresh(true);
+  if (node !== null) list.cards.get(node)?.element.scrollIntoView({ block: "nearest" });
+}
+
+function follow(node) {
+  if (map.camera.mode === "follow" && map.camera.node === node) map.setCamera("fit");
+  else map.setCamera("follow", node);
+  refresh(true);
+}
+
+function setMe(node) {
+  map.me = node;
+  kept.setItem("relpos.me", node === null ? "" : String(node));
+  map.invalidate();
+  refresh(true);
+}
+
+/** Who comes after `node` by number, but for `but`. */
+function neighbour(node, by, but) {
+  const others = team.order.filter((n) => n !== but);
+  const at = others.indexOf(node);
+  return others[(at + by + others.length) % others.length] ?? node;
+}
+
+function find(node) {
+  const seeker = findView.open && findView.from !== node ? findView.from : map.me;
+  startFinding(seeker !== null && seeker !== node ? seeker : nearest(node), node);
+}
+
+/** Whoever is nearest goes, where nobody is chosen. */
+function nearest(node) {
+  const near = team.order
+    .filter((n) => n !== node)
+    .map((n) => [n, team.relation(n, node)?.distanceM ?? Infinity])
+    .sort((a, b) => a[1] - b[1]);
+  return near[0]?.[0] ?? node;
+}
+
+function startFinding(from, to) {
+  map.find = { from, to };
+  findView.start(from, to);
+  findView.update(team, { connected: connection.state === "live" });
+  map.invalidate();
+}
+
+function stopFinding() {
+  const { to } = findView;
+  map.find = null;
+  findView.stop();
+  list.cards.get(to)?.findButton.focus();
+  map.invalidate();
+}
+
+async function acknowledge(node) {
+  alarms.acknowledge(node);
+  siren.sound(alarms.sounding);
+  banner.update(alarms);
+  map.invalidate();
+  byId("alarms").querySelector("button:not([hidden])")?.focus();
+  try {
+    await postJson("/api/acknowledge", { node });
+  } catch (error) {
+    trouble = { level: "warning", text: `Acknowledged on this page alone: ${error.message}` };
+    refresh(true);
+  }
+}
+
+// -- controls --------------------------------------------------------------------------------------
+
+byId("zoom-in").addEventListener("click", () => map.zoom(1.4));
+byId("zoom-out").addEventListener("click", () => map.zoom(1 / 1.4));
+byId("fit").addEventListener("click", () => map.setCamera("fit"));
+byId("follow").addEventListener("click", () => {
+  if (map.camera.mode === "follow") map.setCamera("fit");
+  else follow(map.selected ?? map.me);
+});
+byId("heading-up").addEventListener("click", () => map.setUp(map.up === "heading" ? "north" : "heading"));
+byId("me").addEventListener("change", (event) => setMe(event.target.value ? Number(event.target.value) : null));
+byId("retry").addEventListener("click", () => connection.wake());
+for (const layer of ["tracks", "ranges"]) {
+  const select = byId(layer);
+  const value = kept.getItem(`relpos.${layer}`);
+  if ([...select.options].some((option) => option.value === value)) select.value = value;
+  map.layers[layer] = select.value;
+  select.addEventListener("change", () => {
+    map.layers[layer] = select.value;
+    kept.setItem(`relpos.${layer}`, select.value);
+    map.invalidate();
+  });
+}
+byId("sound").addEventListener("click", () => {
+  if (siren.state === "locked") siren.unlock();
+  else siren.mute(!siren.muted);
+});
+byId("help").addEventListener("click", () => byId("help-dialog").showModal());
+byId("phones").addEventListener("click", async () => {
+  byId("phones-dialog").showModal();
+  const answer = await fetch("/qr.svg").catch(() => null);
+  const image = byId("qr");
+  const told = byId("qr-trouble");
+  image.hidden = !answer?.ok;
+  told.hidden = Boolean(answer?.ok);
+  if (answer?.ok) image.src = "/qr.svg";
+  else setText(told, answer ? await answer.text() : "The server does not answer.");
+});
+byId("as-table").addEventListener("click", () => {
+  const view = byId("table-view");
+  view.hidden = !view.hidden;
+  setAttribute(byId("as-table"), "aria-pressed", String(!view.hidden));
+  showTable();
+});
+themeSwitch(byId("theme"), () => {
+  map.readTheme(isDark());
+  listMs = 0;
+  refresh(true);
+});
+
+const savedMe = kept.getItem("relpos.me");
+map.me = savedMe ? Number(savedMe) : null;
+showSound();
+setInterval(() => {
+  showAge();
+  // Seconds go on while nothing comes.
+  if (connection.state !== "live") map.invalidate();
+}, 1000);
+connection.start();

@@ -1,0 +1,58 @@
+// Where people have been: points thinned as they come, so that hours stay light.
+
+const LEAST_STEP_M = 0.3; // less is the position's own jitter
+const FASTEST_M_S = 5; // faster than that the picture has changed its mind, not the person its place
+const LEAST_JUMP_M = 3;
+export const MOST_POINTS = 3000;
+
+/** The track of one person: `points` of [time_s, x_m, y_m, starts], the last `starts` a line. */
+export class Track {
+  constructor() {
+    this.points = [];
+    /** Grows whenever points that were there have changed: then a drawing must begin anew. */
+    this.redrawn = 0;
+  }
+
+  /** Take what the server kept: [[t, x, y], ...], in time order. */
+  restore(points) {
+    this.points = [];
+    this.redrawn += 1;
+    for (const [t, x, y] of points) this.add(t, x, y);
+  }
+
+  /** Go on to a point; false where it is too near to be one. */
+  add(t, x, y) {
+    if (!Number.isFinite(x) || !Number.isFinite(y)) return false;
+    const last = this.points[this.points.length - 1];
+    let starts = true;
+    if (last) {
+      if (t < last[0]) return false;
+      const step = Math.hypot(x - last[1], y - last[2]);
+      if (step < LEAST_STEP_M) return false;
+      // A gap in time is drawn through: somebody who was lost has walked there, by whichever way.
+      starts = step > Math.max(LEAST_JUMP_M, FASTEST_M_S * (t - last[0]));
+    }
+    this.points.push([t, x, y, starts]);
+    if (this.points.length > MOST_POINTS) this.thin();
+    return true;
+  }
+
+  /** Every second point of the older half goes. */
+  thin() {
+    const half = this.points.length / 2;
+    this.points = this.points.filter((point, k) => k > half || k % 2 === 0 || point[3]);
+    this.redrawn += 1;
+  }
+
+  /** Index of the first point that is not older than `time_s`. */
+  since(timeS) {
+    let low = 0;
+    let high = this.points.length;
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (this.points[middle][0] < timeS) low = middle + 1;
+      else high = middle;
+    }
+    return low;
+  }
+}

@@ -1,0 +1,143 @@
+// Numbers and directions as people read and hear them.
+
+import { clockHour, compassPoint } from "./angles.js";
+
+export const UNKNOWN = "–";
+const NBSP = "\u00a0"; // a figure and its unit stay on one line
+
+/** "4.2 m", "17 m"; tenths only where they are near and mean something. */
+export function distance(m, sigmaM = 0) {
+  if (!Number.isFinite(m)) return UNKNOWN;
+  return m < 9.95 && !(sigmaM >= 1) ? `${m.toFixed(1)}${NBSP}m` : `${Math.round(m)}${NBSP}m`;
+}
+
+/** "±0.4 m": one standard deviation. */
+export function plusMinus(sigmaM) {
+  if (!Number.isFinite(sigmaM)) return "";
+  return `±${Math.max(sigmaM, 0.1).toFixed(sigmaM < 9.95 ? 1 : 0)}${NBSP}m`;
+}
+
+/** For the ear: "4 metres", "half a metre"; nobody hears tenths. */
+export function spokenDistance(m) {
+  if (!Number.isFinite(m)) return "distance unknown";
+  if (m < 0.75) return "half a metre";
+  if (m < 1.5) return "1 metre";
+  return `${Math.round(m)} metres`;
+}
+
+/** "0.4 s", "12 s", "3:05 min", "1:02 h". */
+export function duration(s) {
+  if (!Number.isFinite(s)) return UNKNOWN;
+  const whole = Math.max(0, s);
+  if (whole < 9.95) return `${whole.toFixed(whole < 0.95 ? 1 : 0)} s`;
+  if (whole < 120) return `${Math.round(whole)} s`;
+  const minutes = Math.floor(whole / 60);
+  if (minutes < 120) return `${minutes}:${two(whole % 60)} min`;
+  return `${Math.floor(minutes / 60)}:${two(minutes % 60)} h`;
+}
+
+function two(n) {
+  return String(Math.floor(n)).padStart(2, "0");
+}
+
+/** Whole seconds: a figure that is not to flicker. */
+export function seconds(s) {
+  if (!Number.isFinite(s)) return UNKNOWN;
+  return s < 120 ? `${Math.floor(Math.max(s, 0))} s` : duration(s);
+}
+
+/** How long ago somebody was heard: "now" within two reports. */
+export function ago(s) {
+  if (!Number.isFinite(s)) return UNKNOWN;
+  return s < 2 ? "now" : `${seconds(s)} ago`;
+}
+
+export function volts(v) {
+  return Number.isFinite(v) && v > 0 ? `${v.toFixed(2)} V` : UNKNOWN;
+}
+
+export function dbm(v) {
+  return Number.isFinite(v) ? `${Math.round(v)} dBm`.replace("-", "−") : UNKNOWN;
+}
+
+export function percent(share) {
+  if (!Number.isFinite(share)) return UNKNOWN;
+  return `${Math.round(100 * share)} %`;
+}
+
+/** A probability: never told as certain or impossible while it is neither. */
+export function probability(p) {
+  if (!Number.isFinite(p)) return UNKNOWN;
+  if (p > 0 && p < 0.01) return "<1 %";
+  if (p < 1 && p > 0.99) return ">99 %";
+  return percent(p);
+}
+
+/** "2 o'clock"; for an angle from `relative`. */
+export function clock(relativeRad) {
+  return `${clockHour(relativeRad)} o'clock`;
+}
+
+const EIGHTHS = [
+  "ahead",
+  "ahead right",
+  "right",
+  "behind right",
+  "behind",
+  "behind left",
+  "left",
+  "ahead left",
+];
+
+/** Where something lies, as seen by somebody: "ahead left". */
+export function side(relativeRad) {
+  const eighth = Math.round(-relativeRad / (Math.PI / 4));
+  return EIGHTHS[((eighth % 8) + 8) % 8];
+}
+
+/** "north-east"; on a map whose y axis is nobody's north, "map north-east". */
+export function compass(bearingRad, northKnown) {
+  const { words } = compassPoint(bearingRad);
+  return northKnown ? words : `map ${words}`;
+}
+
+/** "NE", or "map NE". */
+export function compassShort(bearingRad, northKnown) {
+  const { short } = compassPoint(bearingRad);
+  return northKnown ? short : `map ${short}`;
+}
+
+/** One line of where somebody is, for lists and for screen readers. */
+export function whereabouts(relation, northKnown) {
+  if (!relation) return "position unknown";
+  const parts = [`${distance(relation.distanceM, relation.sigmaM)} ${plusMinus(relation.sigmaM)}`.trim()];
+  if (relation.relativeRad !== null) {
+    parts.push(`${clock(relation.relativeRad)}, ${side(relation.relativeRad)}`);
+  } else {
+    parts.push("direction not known yet");
+  }
+  parts.push(compass(relation.bearingRad, northKnown));
+  return parts.join(" · ");
+}
+
+export const HEALTH_WORDS = { green: "well", yellow: "weak", red: "failing" };
+
+export const STATUS_WORDS = {
+  ok: "located",
+  ambiguous: "ambiguous",
+  unlocated: "not located",
+  stale: "no news",
+  lost: "lost",
+};
+
+/** What an alarm says. `alarm` is from `alarms.js`. */
+export function alarmText(alarm) {
+  if (alarm.kind === "lost") return `${alarm.name} is lost: not heard for ${seconds(alarm.seconds)}`;
+  return `${alarm.name} has not moved for ${seconds(alarm.seconds)}`;
+}
+
+/** Time of day, "14:03:22". */
+export function timeOfDay(unixMs) {
+  const at = new Date(unixMs);
+  return [at.getHours(), at.getMinutes(), at.getSeconds()].map(two).join(":");
+}

@@ -1,0 +1,147 @@
+"""The real page server with a team of these tests behind it, and a browser in front."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from playwright.sync_api import Browser, Page, Playwright, sync_playwright
+from walking_team import WalkingTeam
+
+from relpos.live.picture import Hello
+from relpos.live.visitors import Desk
+from relpos.measurements import Event, Heading, Observation
+from relpos.view.access import Access, listen
+from relpos.view.web import WebView
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+NO_BROWSER = "no Chromium is installed: `apt-get install chromium`"
+
+
+def chromium() -> str | None:
+    """Path of the system's Chromium."""
+    return next((path for name in BROWSERS if (path := shutil.which(name))), None)
+
+
+@contextmanager
+def browser_of(playwright: Playwright) -> Iterator[Browser]:
+    """Start the system's Chromium, without a window."""
+    # Chromium refuses its sandbox to root.
+    arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
+    browser = playwright.chromium.launch(
+        executable_path=chromium(), args=[*arguments, "--autoplay-policy=no-user-gesture-required"]
+    )
+    try:
+        yield browser
+    finally:
+        browser.close()
+
+
+class Stage:
+    """A session that plays ``team``: its own clock, its pictures, and what visitors asked for.
+
+    Its time goes on by itself at ``rate_hz`` pictures a second; ``at_s`` may be moved forward.
+    """
+
+    def __init__(self, team: WalkingTeam, port: int = 0, token: str | None = None) -> None:
+        self.team = team
+        self.rate_hz = 10.0
+        self.at_s = 40.0
+        self.frozen = False
+        self.mute = False
+        """The server is connected, but not a word comes."""
+        self.observed: list[Observation] = []
+        self.acknowledged: list[int] = []
+        self.started_unix_s = time.time() - self.at_s
+        self._door_port = port
+        self._token = token
+        self._seq = 0
+        self._desk = Desk(lambda unix_s: unix_s - self.started_unix_s)
+        self._lock = threading.Lock()
+        self._over = threading.Event()
+        self.open()
+        self._thread = threading.Thread(target=self._play, daemon=True)
+        self._thread.start()
+
+    def open(self) -> None:
+        """Start serving, at the same address as before."""
+        door, access = listen(f"127.0.0.1:{self._door_port}")
+        self._door_port = access.port
+        if self._token is not None:
+            access = Access(access.port, access.hosts, self._token)
+        self._token = access.token
+        self.access = access
+        hello = Hello("Drill at the old mill", "/dev/ttyUSB0", "bank", self.started_unix_s)
+        self.web: WebView | None = WebView(door, access, hello)
+
+    def shut(self) -> None:
+        """Stop serving; the team goes on."""
+        with self._lock:
+            web, self.web = self.web, None
+        if web is not None:
+            web.close()
+
+    def close(self) -> None:
+        """End it all."""
+        self._over.set()
+        self._thread.join()
+        self.shut()
+
+    def url(self, path: str = "/") -> str:
+        """Address of a page, with the token."""
+        return self.access.url(path)
+
+    @property
+    def presses(self) -> list[Event]:
+        """Landmark presses, as the session has them."""
+        return [o for o in self.observed if isinstance(o, Event)]
+
+    @property
+    def headings(self) -> list[Heading]:
+        """Headings from phones."""
+        return [o for o in self.observed if isinstance(o, Heading)]
+
+    def _play(self) -> None:
+        before = time.monotonic()
+        while not self._over.wait(1.0 / self.rate_hz):
+            now = time.monotonic()
+            if not self.frozen:
+                self.at_s += now - before
+            before = now
+            with self._lock:
+                if self.web is not None and not self.mute:
+                    self._seq += 1
+                    self.web.pictured(self.team.picture(self._seq, self.at_s, time.time()))
+                    self._serve(self.web)
+
+    def _serve(self, web: WebView) -> None:
+        for ask in web.asks():
+            reply: dict[str, object] = {}
+            if ask.kind == "presses":
+                reply, new = self._desk.presses(ask)
+                self.observed += new
+            elif ask.kind == "headings":
+                reply, new = self._desk.headings(ask)
+                self.observed += new
+            elif ask.kind == "name":
+                self.team.names[ask.body["node"]] = ask.body["name"]
+                web.named(self.team.names)
+            elif ask.kind == "acknowledge":
+                self.acknowledged.append(ask.body["node"])
+                self.team.acknowledged.add(ask.body["node"])
+            web.answer(ask, reply)
+
+
+def wait_for(condition: Callable[[], bool], within_s: float = 20.0) -> None:
+    """Wait until it holds; AssertionError where it does not in time."""
+    end = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < end, "it did not come about in time"
+        time.sleep(0.05)
+
+
+__all__ = ["Browser", "Page", "Stage", "browser_of", "chromium", "sync_playwright", "wait_for"]
