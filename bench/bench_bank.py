@@ -15,7 +15,7 @@ import time
 import numpy as np
 
 from relpos import fusion
-from relpos.fusion.bank import BankCore
+from relpos.fusion.bank_core import BankCore
 from relpos.fusion.bank_settings import BankSettings
 from relpos.measurements import Motion, Range
 from relpos.simulation.paper import SimulatedRun, simulate_paper

@@ -14,7 +14,7 @@ class Joint:
     """The bank's core with a single hypothesis, noise told; it goes on watching and learning."""
 
     def __init__(self, case: Case, seed: int) -> None:
-        from relpos.fusion.bank import PER_NODE, BankCore
+        from relpos.fusion.bank_core import PER_NODE, BankCore
         from relpos.fusion.bank_settings import BankSettings
 
         alone = BankSettings(hypotheses=1, constants=0.0, outliers=0.0, biased=0.0)
@@ -25,7 +25,7 @@ class Joint:
         self.rows, self.ones = np.arange(case.nodes), np.ones(case.nodes)
 
     def pose(self) -> Floats:
-        """Poses (N, 3), a view."""
+        """Poses (N, 3)."""
         at: Floats = self.core.x[0, : self.per * len(self.rows)].reshape(-1, self.per)[:, :3]
         return at
 
@@ -53,6 +53,7 @@ class JointAlone(Joint):
 
         self.kernels, self.base = joint, noise.motion_variances
         self.core.level[:], self.core.sigma2[:] = 1.0, self.variance
+        self.state = self.core.lines
         self.outlier = np.array([1e-9, 9.0, 0.1, 1.0])
         self.drawn, self.arm = np.zeros((1, case.nodes)), np.zeros((0, 2))
 
@@ -61,18 +62,18 @@ class JointAlone(Joint):
         moved = np.empty((len(motion), 7))
         moved[:, :3], moved[:, 3] = motion, self.ones
         moved[:, 4:] = self.base(*motion.T, self.ones, sigma)
-        c = self.core
-        self.kernels.advance(c.x, c.p, c.level, c.sens, self.rows, moved, self.drawn, 0.0, 0.0)
+        self.kernels.advance(
+            *self.state[:2], self.core.level, self.state[3], self.rows, moved, self.drawn, 0.0, 0.0
+        )
 
     def update(self, ranges: Instant) -> None:
         """Ranges one after another, to second order."""
-        count, c = ranges.node.size, self.core
+        count = ranges.node.size
         # More columns of statistics than the kernel fills: what it fills is not used here.
         self.kernels.update(
-            c.x, c.p, c.log_weight, c.sigma2, c.sens, ranges.node, ranges.peer,
+            *self.state[:3], self.core.sigma2, self.state[3], ranges.node, ranges.peer,
             np.full(count, -1), ranges.range_m, np.zeros(count), self.outlier,
-            self.per * c.nodes, np.ones(count), np.zeros(count), self.arm,
-            np.empty((1, count, 64)),
+            np.ones(count), np.zeros(count), self.arm, np.empty((count, 64, 1, 8)),
         )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import pytest
 from relpos import fusion
 from relpos.errors import RelposError
 from relpos.evaluation import metrics, tracks
-from relpos.fusion.bank import BankCore
+from relpos.fusion.bank_core import BankCore
 from relpos.fusion.bank_settings import BankSettings
 from relpos.fusion.estimator import Estimate
 from relpos.simulation.paper import simulate_paper

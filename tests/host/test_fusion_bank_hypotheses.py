@@ -6,7 +6,8 @@ import numpy as np
 
 from relpos.evaluation import metrics, tracks
 from relpos.fusion import hypotheses
-from relpos.fusion.bank import Bank, BankCore
+from relpos.fusion.bank import Bank
+from relpos.fusion.bank_core import BankCore
 from relpos.fusion.bank_settings import BankSettings
 from relpos.fusion.estimator import Estimate
 from relpos.fusion.joint import PER_NODE, Of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from relpos.fusion import joint, noise
+from relpos.fusion import joint, lanes, noise
 from relpos.fusion.joint import PER_NODE, Of
 from relpos.fusion.twins import joint as twins
 
@@ -28,24 +28,78 @@ def states(count: int, seed: int) -> tuple[Floats, Floats]:
     return x, p
 
 
-def sensitivities(count: int) -> Floats:
-    return np.zeros((count, NODES, noise.LEVELS, 6))
+class Packed:
+    """Means (K, D) and covariances (K, D, D) as the kernels take them; back at the end."""
+
+    def __init__(self, x: Floats, p: Floats) -> None:
+        self.dense, self.count = (x, p), len(x)
+
+    def __enter__(self) -> tuple[Floats, Floats, Floats]:
+        self.x, self.p = joint.pack(*self.dense, NODES)
+        sens = lanes.empty_lines(len(self.x), NODES, noise.LEVELS, 6)
+        sens[...] = 0.0
+        return self.x, self.p, sens
+
+    def __exit__(self, *_: object) -> None:
+        for mine, now in zip(
+            self.dense, joint.unpack(self.x, self.p, NODES, self.count), strict=True
+        ):
+            mine[...] = now
+
+
+def in_lanes(values: Floats) -> Floats:
+    """Numbers (K, ...) as (B, ..., LANES); what is left of a block is 0."""
+    laid = np.zeros((lanes.blocks_of(len(values)) * lanes.LANES, *values.shape[1:]))
+    laid[: len(values)] = values
+    return np.ascontiguousarray(
+        np.moveaxis(laid.reshape(-1, lanes.LANES, *values.shape[1:]), 1, -1)
+    )
+
+
+def out_of_lanes(laid: Floats, count: int) -> Floats:
+    return laid.reshape(-1)[:count]
 
 
 def advanced(x: Floats, p: Floats, motion: Floats, level: Floats, drawn: Floats) -> None:
     rows = np.arange(len(motion), dtype=np.int64) % NODES
-    joint.advance(x, p, level, sensitivities(len(x)), rows, motion, drawn, SHARE, CROSS)
+    with Packed(x, p) as (px, pp, sens):
+        joint.advance(px, pp, in_lanes(level), sens, rows, motion, drawn, SHARE, CROSS)
 
 
 def updated(x: Floats, p: Floats, measured: float, dz: float, outlier: tuple[float, ...]) -> Floats:
-    log_weight = np.zeros(len(x))
-    joint.update(
-        x, p, log_weight, np.full(len(x), 0.04), sensitivities(len(x)), np.array([0]),
-        np.array([2]), np.array([-1]), np.array([measured]), np.array([dz]),
-        np.array([*outlier, 1.0]), PER_NODE * NODES, np.ones(1), np.zeros(1), np.zeros((0, 2)),
-        np.empty((len(x), 1, 12)),
-    )  # fmt: skip
-    return log_weight
+    log_weight = in_lanes(np.zeros(len(x)))
+    with Packed(x, p) as (px, pp, sens):
+        joint.update(
+            px, pp, log_weight, in_lanes(np.full(len(x), 0.04)), sens, np.array([0]), np.array([2]),
+            np.array([-1]), np.array([measured]), np.array([dz]), np.array([*outlier, 1.0]),
+            np.ones(1), np.zeros(1), np.zeros((0, 2)),
+            lanes.empty_lines(1, joint.STATS, len(px)),
+        )  # fmt: skip
+    return out_of_lanes(log_weight, len(x))
+
+
+def mixture(x: Floats, p: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    px, pp = joint.pack(x, p, NODES)
+    return joint.moments(px, pp, in_lanes(weight), NODES, joint.order(NODES, SIZE))
+
+
+def predicted(x: Floats, p: Floats) -> tuple[float, float]:
+    px, pp = joint.pack(x, p, NODES)
+    weight = in_lanes(np.full(len(x), 1.0 / len(x)))
+    mean, sigma = joint.predicted_ranges(px, pp, weight, np.array([0]), np.array([2]), np.zeros(1))
+    return float(mean[0]), float(sigma[0])
+
+
+def test_what_is_packed_comes_out_as_it_was() -> None:
+    x, p = states(11, 12)
+    px, pp = joint.pack(x, p, NODES)
+    for mine, back in zip((x, p), joint.unpack(px, pp, NODES, 11), strict=True):
+        assert (mine == back).all()
+    assert (joint.means(px, NODES, 11) == x).all()
+    chosen = np.array([3, 3, 10, 0], dtype=np.int64)
+    taken = joint.unpack(joint.take(px, chosen), joint.take(pp, chosen), NODES, 4)
+    assert (taken[0] == x[chosen]).all()
+    assert (taken[1] == p[chosen]).all()
 
 
 def test_a_displacement_is_the_twins() -> None:
@@ -81,8 +135,7 @@ def test_a_range_is_the_twins(measured: float, dz: float) -> None:
 def test_the_mixtures_moments_are_the_twins() -> None:
     x, p = states(7, 4)
     weight = np.random.default_rng(5).dirichlet(np.ones(7))
-    angles = PER_NODE * np.arange(NODES, dtype=np.int64) + Of.HEADING
-    mean, covariance = joint.moments(x, p, weight, angles)
+    mean, covariance = mixture(x, p, weight)
     expected = twins.moments(x, p, weight)
     assert mean == pytest.approx(expected[0], abs=1e-12)
     assert covariance == pytest.approx(expected[1], abs=1e-12)
@@ -91,7 +144,7 @@ def test_the_mixtures_moments_are_the_twins() -> None:
 def test_headings_are_averaged_round_the_circle() -> None:
     x, p = np.zeros((2, SIZE)), np.zeros((2, SIZE, SIZE))
     x[:, Of.HEADING] = (np.pi - 0.1, -np.pi + 0.1)
-    mean, covariance = joint.moments(x, p, np.array([0.5, 0.5]), np.array([2], dtype=np.int64))
+    mean, covariance = mixture(x, p, np.array([0.5, 0.5]))
     assert np.cos(mean[Of.HEADING]) == pytest.approx(-1.0)
     assert covariance[Of.HEADING, Of.HEADING] == pytest.approx(0.01)
 
@@ -99,6 +152,8 @@ def test_headings_are_averaged_round_the_circle() -> None:
 def test_the_motions_jacobian_is_that_of_finite_differences() -> None:
     x, _ = states(1, 6)
     p = np.zeros((1, SIZE, SIZE))
+    # What has no variance is not modelled.
+    p[0, Of.DRIFT, Of.DRIFT] = p[0, Of.SCALE, Of.SCALE] = 1e-30
     motion = np.array([[0.6, 0.1, 0.3, 2.0, 0.0, 0.0, 0.0]])
     level, drawn = np.ones((1, NODES, 3)), np.zeros((1, 1))
     step = 1e-6
@@ -137,9 +192,9 @@ def test_a_ranges_predicted_moments_are_those_of_sampled_places(distance: float)
     p[0, :2, :2] = spread
     places = np.random.default_rng(8).multivariate_normal([0.0, 0.0], spread, 400_000)
     sampled = np.hypot(distance - places[:, 0], places[:, 1])
-    mean, sigma = joint.predicted_ranges(x, p, np.array([0]), np.array([2]), np.zeros(1))
-    assert mean[0, 0] == pytest.approx(sampled.mean(), abs=0.02)
-    assert sigma[0, 0] == pytest.approx(sampled.std(), abs=0.02)
+    mean, sigma = predicted(x, p)
+    assert mean == pytest.approx(sampled.mean(), abs=0.02)
+    assert sigma == pytest.approx(sampled.std(), abs=0.02)
 
 
 def test_two_who_meet_break_nothing() -> None:
@@ -158,20 +213,20 @@ def test_covariances_stay_symmetric_and_positive_over_a_long_run() -> None:
     for _ in range(300):
         motion = np.abs(rng.normal(size=(NODES, 7))) * 0.1
         advanced(x, p, motion, level, rng.normal(size=(3, NODES)))
-        mean, _ = joint.predicted_ranges(x, p, np.array([0]), np.array([2]), np.zeros(1))
-        updated(x, p, float(mean.mean() + rng.normal()), 0.0, OUTLIER)
+        updated(x, p, predicted(x, p)[0] + float(rng.normal()), 0.0, OUTLIER)
     assert p == pytest.approx(p.transpose(0, 2, 1), abs=1e-9)
     assert np.linalg.eigvalsh(p).min() > -1e-9
 
 
 def hearing(x: Floats, p: Floats, heard: bool, edge_m: float) -> Floats:
     curve = np.where(np.arange(201) * 0.5 < edge_m, 0.98, 0.002)
-    log_weight = np.zeros(len(x))
-    joint.hearing(
-        x, p, log_weight, np.array([0]), np.array([2]), np.zeros(1), np.array([heard]),
-        np.ones(1), 1.0, curve, 0.5,
-    )  # fmt: skip
-    return log_weight
+    log_weight = in_lanes(np.zeros(len(x)))
+    with Packed(x, p) as (px, pp, _):
+        joint.hearing(
+            px, pp, log_weight, NODES, np.array([0]), np.array([2]), np.zeros(1),
+            np.array([heard]), np.ones(1), 1.0, curve, 0.5,
+        )  # fmt: skip
+    return out_of_lanes(log_weight, len(x))
 
 
 def apart(distance: float, sigma: float) -> tuple[Floats, Floats]:
@@ -218,10 +273,10 @@ def test_levels_of_noise_are_learned_from_innovations_and_their_uncertainty_is_h
             # Innovations whose variance is a random mixture of the sorts of noise.
             parts = rng.dirichlet(np.full(7, 0.4))
             scale = np.exp(levels.mean)
-            stats = np.zeros((1, 1, 12))
-            stats[0, 0, 4:11] = parts * scale
-            stats[0, 0, 1] = stats[0, 0, 4:11].sum()
-            stats[0, 0, 3] = 1.0
+            stats = np.zeros((1, joint.STATS, 1))
+            stats[0, joint.SHARES : joint.BENT, 0] = parts * scale
+            stats[0, joint.VARIANCE] = (parts * scale).sum()
+            stats[0, joint.TRUST] = 1.0
             measured = rng.normal() * np.sqrt((parts * np.exp(truth)).sum())
             levels.learn(
                 np.array([0]), np.array([1]), np.array([measured]), stats, np.zeros(1), np.ones(1),

@@ -10,7 +10,7 @@ import pytest
 
 from relpos import fusion
 from relpos.evaluation import metrics, tracks
-from relpos.fusion import joint
+from relpos.fusion import joint, lanes
 from relpos.fusion.estimator import Estimate
 from relpos.fusion.joint import PER_NODE
 from relpos.fusion.ranging_model import Repetition
@@ -36,14 +36,16 @@ def slant(x: np.ndarray, arms: np.ndarray, dz: float) -> float:
 def updated(
     x: np.ndarray, p: np.ndarray, arms: np.ndarray, dz: float, measured: float, sigma: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    xs, ps = x[None].copy(), p[None].copy()
+    xs, ps = joint.pack(x[None], p[None], 2)
+    sens = np.zeros((1, 2, 3, 6, lanes.LANES))
     joint.update(
-        xs, ps, np.zeros(1), np.full(1, sigma**2), np.zeros((1, 2, 3, 6)),
+        xs, ps, np.zeros((1, lanes.LANES)), np.full((1, lanes.LANES), sigma**2), sens,
         np.array([0]), np.array([1]), np.array([-1]),
-        np.array([measured]), np.array([dz]), np.array([1e-9, 9.0, 0.1, 1.0]), 2 * PER_NODE,
-        np.ones(1), np.zeros(1), arms, np.empty((1, 1, 12)),
+        np.array([measured]), np.array([dz]), np.array([1e-9, 9.0, 0.1, 1.0]),
+        np.ones(1), np.zeros(1), arms, lanes.empty_lines(1, joint.STATS, 1),
     )  # fmt: skip
-    return xs[0], ps[0]
+    after = joint.unpack(xs, ps, 2, 1)
+    return after[0][0], after[1][0]
 
 
 @pytest.mark.parametrize("seed", range(4))

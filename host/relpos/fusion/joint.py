@@ -1,9 +1,12 @@
 """Kernels of the joint error-state filter over all users, for many hypotheses at once.
 
-One hypothesis k is a mean ``x[k]`` (D,) and a covariance ``p[k]`` (D, D) over all users:
-five entries a user in the order of :class:`Of`, then (where modelled) the range biases. All
-kernels work in place on arrays whose first axis is the hypothesis; their twins are in
-:mod:`relpos.fusion.twins.joint`.
+One hypothesis is a mean (D,) and a covariance (D, D) over all users: five entries a user in the
+order of :class:`Of`, then (where modelled) the range biases. Kernels work in place, eight
+hypotheses at a time (:mod:`relpos.fusion.lanes`): ``x`` (B, D, LANES) and ``p`` (B, D (D + 1) / 2,
+LANES) are B blocks of eight, of a covariance the lower triangle alone, row by row. In this
+storage all users' poses (x, y, heading) come first, then all constants (drift, scale), then the
+biases, so that what a block does not model is at its end; :func:`pack` and :func:`unpack` convert.
+Their twins are in :mod:`relpos.fusion.twins.joint`.
 
 Motion, with the heading's noise entering first (people turn, then move; a wearer's turn is
 measured before the step that it directs):
@@ -25,12 +28,14 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion import vectormath
+from relpos.fusion import lanes
 from relpos.fusion.compiled import compiled, inlined
+from relpos.fusion.lanes import LANES, Lanes, fill, greater, lesser, load, select, some, store
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -52,16 +57,13 @@ class Of(IntEnum):
 
 
 PER_NODE = len(Of)
-_X, _Y, _H, _W, _S = (int(v) for v in Of)
-_N = PER_NODE
+_POSE = 3
+_CONSTANTS = 2
 _TINY = 1e-12
 
 STATS = 12
-"""Columns of what :func:`update` tells of each range."""
-
-_LANES = 32
-"""Loops over a whole number of these are vector instructions only (four of eight doubles); 30 a
-row would all be done one by one, which takes three times as long."""
+MEAN, VARIANCE, EVIDENCE, TRUST, SHARES, RANGE_SHARE, BENT = 0, 1, 2, 3, 4, 10, 11
+"""Columns of what :func:`update` tells of each range; of ``SHARES`` there are six."""
 
 DRIFT_WALK = 3e-9
 SCALE_WALK = 3e-7
@@ -72,55 +74,142 @@ _POINTS = 11
 _ASIDE = 2.5
 """P(heard) is averaged over so many points, out to so many standard deviations."""
 _Z = _ASIDE * np.linspace(-1.0, 1.0, _POINTS)
-_RULE_VARIANCE = float((_Z**2 * np.exp(-0.5 * _Z**2)).sum() / np.exp(-0.5 * _Z**2).sum())
+_BELL = np.exp(-0.5 * _Z**2)
+_RULE_VARIANCE = float((_Z**2 * _BELL).sum() / _BELL.sum())
+_NORM = float(_BELL.sum())
 _FAR = 9.0
 """Squared distance, in range variances, from which on noise of either sign is seen alike."""
 
 
-@inlined
-def _turn_sensitivity(t: Floats, east: float, north: float) -> None:
-    """Carry one 3 x 3 sensitivity (xx, xy, yy, xh, yh, hh) over a displacement."""
-    xh, yh, hh = t[3], t[4], t[5]
-    t[0] += north * (north * hh - 2.0 * xh)
-    t[1] += east * xh - north * yh - east * north * hh
-    t[2] += east * (east * hh + 2.0 * yh)
-    t[3] -= north * hh
-    t[4] += east * hh
+# -- storage ---------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=64)
+def order(nodes: int, size: int) -> Indices:
+    """Give the state's entry (D,) that each place of the storage holds."""
+    user = PER_NODE * np.arange(nodes)[:, None]
+    poses, constants = user + np.arange(_POSE), user + _POSE + np.arange(_CONSTANTS)
+    return np.concatenate(
+        [poses.ravel(), constants.ravel(), np.arange(PER_NODE * nodes, size)]
+    ).astype(np.int64)
+
+
+def place_of(entry: int, nodes: int) -> int:
+    """Give the storage's place of an entry of the state."""
+    user, part = divmod(entry, PER_NODE)
+    if user >= nodes:
+        return entry
+    if part < _POSE:
+        return _POSE * user + part
+    return _POSE * nodes + _CONSTANTS * user + part - _POSE
+
+
+def pack(x: Floats, p: Floats, nodes: int) -> tuple[Floats, Floats]:
+    """Store means (K, D) and covariances (K, D, D); what is left of a block repeats the first."""
+    count, size = x.shape
+    blocks = lanes.blocks_of(count)
+    stored = lanes.empty_lines(blocks, size), lanes.empty_lines(blocks, size * (size + 1) // 2)
+    _pack(np.ascontiguousarray(x), np.ascontiguousarray(p), order(nodes, size), *stored)
+    return stored
+
+
+def unpack(x: Floats, p: Floats, nodes: int, count: int) -> tuple[Floats, Floats]:
+    """Give means (K, D) and covariances (K, D, D) as they are stored."""
+    size = x.shape[1]
+    given = np.empty((count, size)), np.empty((count, size, size))
+    _unpack(x, p, order(nodes, size), *given)
+    return given
+
+
+def means(x: Floats, nodes: int, count: int) -> Floats:
+    """Give the means (K, D) alone."""
+    flat = x.transpose(0, 2, 1).reshape(-1, x.shape[1])[:count]
+    given = np.empty_like(flat)
+    given[:, order(nodes, x.shape[1])] = flat
+    return given
+
+
+def triangle_place(i: int, j: int) -> int:
+    """Give the place of a covariance in the triangle."""
+    return i * (i + 1) // 2 + j if i >= j else j * (j + 1) // 2 + i
+
+
+def take(of: Floats, chosen: Indices) -> Floats:
+    """Give the hypotheses ``chosen`` (M,) of an array (B, ..., LANES) as another."""
+    taken = lanes.empty_lines(lanes.blocks_of(len(chosen)), of.shape[1])
+    _take(of, chosen, taken)
+    return taken
+
+
+@compiled
+def _pack(x: Floats, p: Floats, of: Indices, to_x: Floats, to_p: Floats) -> None:
+    count, size = x.shape
+    for b in range(to_x.shape[0]):
+        for lane in range(LANES):
+            k = b * LANES + lane
+            if k >= count:
+                k = 0
+            t = 0
+            for i in range(size):
+                to_x[b, i, lane] = x[k, of[i]]
+                for j in range(i + 1):
+                    to_p[b, t, lane] = p[k, of[i], of[j]]
+                    t += 1
+
+
+@compiled
+def _unpack(x: Floats, p: Floats, of: Indices, to_x: Floats, to_p: Floats) -> None:
+    count, size = to_x.shape
+    for k in range(count):
+        b, lane = k // LANES, k % LANES
+        t = 0
+        for i in range(size):
+            to_x[k, of[i]] = x[b, i, lane]
+            for j in range(i + 1):
+                to_p[k, of[i], of[j]] = p[b, t, lane]
+                to_p[k, of[j], of[i]] = p[b, t, lane]
+                t += 1
+
+
+@compiled
+def _take(of: Floats, chosen: Indices, to: Floats) -> None:
+    count = chosen.shape[0]
+    block = np.empty(LANES, dtype=np.int64)
+    lane = np.empty(LANES, dtype=np.int64)
+    for b in range(to.shape[0]):
+        for at in range(LANES):
+            k = chosen[min(b * LANES + at, count - 1)]
+            block[at], lane[at] = k // LANES, k % LANES
+        for t in range(of.shape[1]):
+            for at in range(LANES):
+                to[b, t, at] = of[block[at], t, lane[at]]
 
 
 @inlined
-def _correct_sensitivity(t: Floats, hx: float, hy: float, kx: float, ky: float, kh: float) -> float:
-    """Carry one sensitivity over a range's update; return what it adds to the innovation's."""
-    ax = t[0] * hx + t[1] * hy
-    ay = t[1] * hx + t[2] * hy
-    ah = t[3] * hx + t[4] * hy
-    s: float = hx * ax + hy * ay
-    t[0] += kx * (s * kx - 2.0 * ax)
-    t[1] += s * kx * ky - kx * ay - ky * ax
-    t[2] += ky * (s * ky - 2.0 * ay)
-    t[3] += s * kx * kh - kx * ah - kh * ax
-    t[4] += s * ky * kh - ky * ah - kh * ay
-    t[5] += kh * (s * kh - 2.0 * ah)
-    return s
+def _row(i: int) -> int:
+    """Where a row of the triangle begins."""
+    return (i * (i + 1)) >> 1
 
 
 @inlined
-def _bound_sensitivity(levels: Floats, pk: Floats, b: int, most: float) -> None:
-    """Keep what the levels explain of a covariance below ``most`` times the covariance.
+def _at(i: int, j: int) -> int:
+    """Place of an entry in the triangle."""
+    return ((i * (i + 1)) >> 1) + j if i >= j else ((j * (j + 1)) >> 1) + i
 
-    It is homogeneous in all variances, so that a true derivative obeys it with ``most`` 1.
-    """
-    ratio = 1.0
-    for entry in range(3):
-        at = 2 * entry + (entry == 2)
-        explained = 0.0
-        for part in range(3):
-            explained += levels[part, at]
-        ratio = max(ratio, explained / (most * pk[b + entry, b + entry] + _TINY))
-    if ratio > 1.0:
-        for part in range(3):
-            for at in range(6):
-                levels[part, at] /= ratio
+
+@compiled
+def _extent(p: Floats, base: int, nodes: int, size: int) -> int:
+    """Give how many entries of the state vary in a block: poses, and constants, and biases."""
+    poses = PER_NODE * nodes
+    if size > poses and some(load(p, base + _at(poses, poses)) > 0.0):
+        return size
+    for i in range(_POSE * nodes, poses):
+        if some(load(p, base + _at(i, i)) > 0.0):
+            return poses
+    return _POSE * nodes
+
+
+# -- motion ----------------------------------------------------------------------------------------
 
 
 @compiled
@@ -138,292 +227,358 @@ def advance(
     """Move users ``rows`` (M,) by ``motion`` (M, 7) in every hypothesis.
 
     ``motion`` is dx, dy, dtheta, duration, and the variances' bases: along the way (m^2), of
-    the turn (rad^2) and white in heading (rad^2); ``level`` (K, N, 3) multiplies these three
-    for each user. ``sens`` (K, N, 3, 6) is how each user's own pose covariance (xx, xy, yy, xh,
-    yh, hh) changes with the logarithm of each of its levels; what leaks to others is left out.
-    ``sampled`` (K, M) are standard normals: the share ``share`` of the heading's
+    the turn (rad^2) and white in heading (rad^2); ``level`` (B, N, 3, LANES) multiplies these
+    three for each user. ``sens`` (B, N, 3, 6, LANES) is how each user's own pose covariance (xx,
+    xy, yy, xh, yh, hh) changes with the logarithm of each of its levels; what leaks to others is
+    left out. ``sampled`` (K, M) are standard normals: the share ``share`` of the heading's
     variance is drawn, the rest goes into the covariance. ``cross`` is the variance across the
     way relative to that along it.
     """
     nodes = level.shape[1]
-    poses = _N * nodes
+    size = x.shape[1]
+    count = sampled.shape[0]
     # What a user's displacements did to x and y per heading, drift and scale, and to the heading.
-    moved = np.empty((nodes, 5))
-    for k in range(x.shape[0]):
-        xk = x[k]
-        pk = p[k]
-        size = x.shape[1]
-        if size > poses and pk[poses, poses] == 0.0:
-            size = poses
+    moved = lanes.working_lines(PER_NODE * nodes)
+    normals = lanes.working_lines(rows.shape[0])
+    touched = np.zeros(nodes, dtype=np.bool_)
+    for b in range(x.shape[0]):
+        for lane in range(LANES):
+            k = min(b * LANES + lane, count - 1)
+            for m in range(rows.shape[0]):
+                normals[m, lane] = sampled[k, m]
         moved[:] = 0.0
+        touched[:] = False
+        base = b * p.shape[1]
+        active = _extent(p, base, nodes, size)
+        constant = active > _POSE * nodes
         for m in range(rows.shape[0]):
             row = rows[m]
-            b = _N * row
-            bh, bw, bs = b + _H, b + _W, b + _S
-            dx, dy, dt = motion[m, 0], motion[m, 1], motion[m, 3]
-            turn = motion[m, 5] * level[k, row, 1]
-            white = motion[m, 6] * level[k, row, 2]
-            noise = turn + white
-            if noise > 0.0:
-                sens[k, row, 1, 5] += turn
-                sens[k, row, 2, 5] += white
-                xk[bh] += sampled[k, m] * math.sqrt(share * noise)
-                pk[bh, bh] += (1.0 - share) * noise
-            constant = pk[bw, bw] > 0.0 or pk[bs, bs] > 0.0
-            if dx != 0.0 or dy != 0.0:
-                c, s = vectormath.cos_sin(xk[bh] - 0.5 * dt * xk[bw])
-                # E R(theta) of an uncertain heading is shorter by exp(-var/2); what that leaves
-                # of the spread along and across the way is noise (statistical linearisation).
-                vary = max(pk[bh, bh] - dt * pk[bh, bw], 0.0)
-                short = math.exp(-0.5 * vary)
-                shorter = short * short
-                grow = math.exp(xk[bs]) if xk[bs] != 0.0 else 1.0
-                full = grow * grow * (dx * dx + dy * dy)
-                ahead, aside = c * dx - s * dy, s * dx + c * dy
-                east, north = grow * short * ahead, grow * short * aside
-                xk[b] += east
-                xk[b + 1] += north
-                _move_own(pk, b, east, north, 0.5 * dt, constant)
-                moved[row, 0] += east
-                moved[row, 1] += north
-                # The heading that this displacement follows has itself drifted since.
-                lag = moved[row, 4] + 0.5 * dt
-                moved[row, 2] += north * lag
-                moved[row, 3] -= east * lag
-                for part in range(3):
-                    _turn_sensitivity(sens[k, row, part], east, north)
-                along = motion[m, 4] * level[k, row, 0]
-                if full > _TINY:
-                    unit = 1.0 / (dx * dx + dy * dy)
-                    ee, nn, en = ahead * ahead * unit, aside * aside * unit, ahead * aside * unit
-                    lost = 0.5 * full * (1.0 - shorter) * (1.0 - shorter)
-                    swept = full * max(0.5 - 0.5 * shorter * shorter - vary * shorter, 0.0)
-                    length = along + lost
-                    width = along * cross + swept
-                    pk[b, b] += length * ee + width * nn
-                    pk[b + 1, b + 1] += length * nn + width * ee
-                    pk[b, b + 1] += (length - width) * en
-                    pk[b + 1, b] += (length - width) * en
-                    sens[k, row, 0, 0] += along * (ee + cross * nn)
-                    sens[k, row, 0, 1] += along * (1.0 - cross) * en
-                    sens[k, row, 0, 2] += along * (nn + cross * ee)
-            xk[bh] += motion[m, 2] - dt * xk[bw]
-            if constant:
-                if dt > 0.0 and pk[bw, bw] > 0.0:
-                    moved[row, 4] += dt
-                    for q in range(b, b + _N):
-                        pk[bh, q] -= dt * pk[bw, q]
-                    for q in range(b, b + _N):
-                        pk[q, bh] -= dt * pk[q, bw]
-                    pk[bw, bw] += DRIFT_WALK * dt
-                if pk[bs, bs] > 0.0:
-                    pk[bs, bs] += SCALE_WALK * dt
+            moves = motion[m, 0] != 0.0 or motion[m, 1] != 0.0
+            touched[row] |= moves or (constant and motion[m, 3] > 0.0)
+            _move(
+                x, p, level, sens, moved, b * size, base, b * nodes, nodes, row, motion[m],
+                load(normals, m), share, cross, moves, constant,
+            )  # fmt: skip
         for row in range(nodes):
-            if moved[row, 0] != 0.0 or moved[row, 1] != 0.0 or moved[row, 4] != 0.0:
-                _move_others(pk, _N * row, moved[row], poses, size)
+            if touched[row]:
+                _move_others(p, base, moved, nodes, row, active)
 
 
 @compiled
-def _move_own(pk: Floats, b: int, east: float, north: float, half: float, constant: bool) -> None:
-    """Carry a user's own block (5, 5) at ``b`` over a displacement."""
-    bx, by, bh, bw, bs = b + _X, b + _Y, b + _H, b + _W, b + _S
+def _move(
+    x: Floats, p: Floats, level: Floats, sens: Floats, moved: Floats, at_x: int, base: int,
+    at_user: int, nodes: int, row: int, motion: Floats, normal: Lanes, share: float, cross: float,
+    moves: bool, constant: bool,
+) -> None:  # fmt: skip
+    """Make one displacement of one user in one block: its own poses and covariances."""
+    px, py, ph = _POSE * row, _POSE * row + 1, _POSE * row + 2
+    pw = _POSE * nodes + _CONSTANTS * row
+    i_xx, i_xy, i_yy = base + _row(px) + px, base + _row(py) + px, base + _row(py) + py
+    i_xh = base + _row(ph) + px
+    i_yh, i_hh = i_xh + 1, i_xh + 2
+    i_xw, i_xs = base + _row(pw) + px, base + _row(pw + 1) + px
+    i_ww, i_ws = base + _row(pw) + pw, base + _row(pw + 1) + pw
+    dx, dy, dt = motion[0], motion[1], motion[3]
+    user = (at_user + row) * 3
+    t = user * 6
+    turn = motion[5] * load(level, user + 1)
+    white = motion[6] * load(level, user + 2)
+    noise = turn + white
+    store(sens, t + 11, load(sens, t + 11) + turn)
+    store(sens, t + 17, load(sens, t + 17) + white)
+    heading = load(x, at_x + ph) + normal * lanes.sqrt(share * noise)
+    hh = load(p, i_hh) + (1.0 - share) * noise
+    nought = fill(0.0)
+    drift, hw, ww = nought, nought, nought
     if constant:
-        for q in range(b, b + _N):
-            turned = pk[bh, q] - half * pk[bw, q]
-            pk[bx, q] += east * pk[bs, q] - north * turned
-            pk[by, q] += north * pk[bs, q] + east * turned
-        for q in range(b, b + _N):
-            turned = pk[q, bh] - half * pk[q, bw]
-            pk[q, bx] += east * pk[q, bs] - north * turned
-            pk[q, by] += north * pk[q, bs] + east * turned
-        return
-    xh, yh, hh = pk[bx, bh], pk[by, bh], pk[bh, bh]
-    pk[bx, bx] += north * (north * hh - 2.0 * xh)
-    pk[by, by] += east * (east * hh + 2.0 * yh)
-    xy = pk[bx, by] + east * xh - north * yh - east * north * hh
-    pk[bx, by] = xy
-    pk[by, bx] = xy
-    pk[bx, bh] = xh - north * hh
-    pk[bh, bx] = xh - north * hh
-    pk[by, bh] = yh + east * hh
-    pk[bh, by] = yh + east * hh
+        drift, hw, ww = load(x, at_x + pw), load(p, i_xw + 2), load(p, i_ww)
+    if moves:
+        c, s = lanes.cos_sin(heading - (0.5 * dt) * drift)
+        # E R(theta) of an uncertain heading is shorter by exp(-var/2); what that leaves
+        # of the spread along and across the way is noise (statistical linearisation).
+        vary = greater(hh - dt * hw, nought)
+        short = lanes.exp(-0.5 * vary)
+        shorter = short * short
+        grow = fill(1.0)
+        if constant:
+            grow = lanes.exp(load(x, at_x + pw + 1))
+        way2 = dx * dx + dy * dy
+        full = grow * grow * way2
+        ahead, aside = c * dx - s * dy, s * dx + c * dy
+        east, north = grow * short * ahead, grow * short * aside
+        store(x, at_x + px, load(x, at_x + px) + east)
+        store(x, at_x + py, load(x, at_x + py) + north)
+        xx, xy, yy = load(p, i_xx), load(p, i_xy), load(p, i_yy)
+        xh, yh = load(p, i_xh), load(p, i_yh)
+        if constant:
+            half = 0.5 * dt
+            xw, yw = load(p, i_xw), load(p, i_xw + 1)
+            xs, ys, hs = load(p, i_xs), load(p, i_xs + 1), load(p, i_xs + 2)
+            ws, ss = load(p, i_ws), load(p, i_ws + 1)
+            th, tw, ts = hh - half * hw, hw - half * ww, hs - half * ws
+            tx, ty = xh - half * xw, yh - half * yw
+            x_x, x_y = xx - north * tx + east * xs, xy - north * ty + east * ys
+            y_y = yy + east * ty + north * ys
+            xh, yh = xh - north * th + east * hs, yh + east * th + north * hs
+            xw, yw = xw - north * tw + east * ws, yw + east * tw + north * ws
+            xs, ys = xs - north * ts + east * ss, ys + east * ts + north * ss
+            tx, ty = xh - half * xw, yh - half * yw
+            xx, xy = x_x - north * tx + east * xs, x_y + east * tx + north * xs
+            yy = y_y + east * ty + north * ys
+            store(p, i_xw, xw)
+            store(p, i_xw + 1, yw)
+            store(p, i_xs, xs)
+            store(p, i_xs + 1, ys)
+        else:
+            xx = xx + north * (north * hh - 2.0 * xh)
+            yy = yy + east * (east * hh + 2.0 * yh)
+            xy = xy + east * xh - north * yh - east * north * hh
+            xh, yh = xh - north * hh, yh + east * hh
+        # The heading that this displacement follows has itself drifted since.
+        lag = load(moved, PER_NODE * row + 4) + 0.5 * dt
+        for entry, much in enumerate((east, north, north * lag, 0.0 - east * lag)):
+            at = PER_NODE * row + entry
+            store(moved, at, load(moved, at) + much)
+        for part in range(3):
+            _turn_sensitivity(sens, t + 6 * part, east, north)
+        along = motion[4] * load(level, user)
+        if way2 > _TINY:
+            unit = 1.0 / way2
+            ee, nn, en = ahead * ahead * unit, aside * aside * unit, ahead * aside * unit
+            lost = 0.5 * full * (1.0 - shorter) * (1.0 - shorter)
+            swept = full * greater(0.5 - 0.5 * shorter * shorter - vary * shorter, nought)
+            length = along + lost
+            width = along * cross + swept
+            xx = xx + length * ee + width * nn
+            yy = yy + length * nn + width * ee
+            xy = xy + (length - width) * en
+            store(sens, t, load(sens, t) + along * (ee + cross * nn))
+            store(sens, t + 1, load(sens, t + 1) + along * (1.0 - cross) * en)
+            store(sens, t + 2, load(sens, t + 2) + along * (nn + cross * ee))
+        store(p, i_xx, xx)
+        store(p, i_xy, xy)
+        store(p, i_yy, yy)
+        store(p, i_xh, xh)
+        store(p, i_yh, yh)
+    heading = heading + (motion[2] - dt * drift)
+    store(x, at_x + ph, heading)
+    if constant and dt > 0.0:
+        store(moved, PER_NODE * row + 4, load(moved, PER_NODE * row + 4) + dt)
+        store(p, i_xh, load(p, i_xh) - dt * load(p, i_xw))
+        store(p, i_yh, load(p, i_yh) - dt * load(p, i_xw + 1))
+        hh = hh - dt * (2.0 * hw - dt * ww)
+        store(p, i_xw + 2, hw - dt * ww)
+        store(p, i_xs + 2, load(p, i_xs + 2) - dt * load(p, i_ws))
+        store(p, i_ww, select(ww > 0.0, ww + DRIFT_WALK * dt, ww))
+        ss = load(p, i_ws + 1)
+        store(p, i_ws + 1, select(ss > 0.0, ss + SCALE_WALK * dt, ss))
+    store(p, i_hh, hh)
 
 
 @compiled
-def _move_others(pk: Floats, b: int, moved: Floats, poses: int, size: int) -> None:
+def _turn_sensitivity(sens: Floats, t: int, east: Lanes, north: Lanes) -> None:
+    """Carry one sensitivity (xx, xy, yy, xh, yh, hh) at ``t`` over a displacement."""
+    xh, yh, hh = load(sens, t + 3), load(sens, t + 4), load(sens, t + 5)
+    store(sens, t, load(sens, t) + north * (north * hh - 2.0 * xh))
+    store(sens, t + 1, load(sens, t + 1) + east * xh - north * yh - east * north * hh)
+    store(sens, t + 2, load(sens, t + 2) + east * (east * hh + 2.0 * yh))
+    store(sens, t + 3, xh - north * hh)
+    store(sens, t + 4, yh + east * hh)
+
+
+@compiled
+def _move_others(p: Floats, base: int, moved: Floats, nodes: int, row: int, active: int) -> None:
     """Carry a user's covariance with everything else over all its displacements at once.
 
-    ``moved`` (5,) is east and north (m), what a unit of drift does to x and to y, and the time
-    (s). Own constants that have no variance have no covariance either.
+    ``moved`` (5 N, LANES) is for each user east and north (m), what a unit of drift does to x and
+    to y, and the time (s).
     """
-    bx, by, bh, bw, bs = b + _X, b + _Y, b + _H, b + _W, b + _S
-    east, north, drift_x, drift_y, time = moved[0], moved[1], moved[2], moved[3], moved[4]
-    constant = pk[bw, bw] > 0.0 or pk[bs, bs] > 0.0
-    o = 0
-    while o < size:
-        if o == b:
-            o += _N
+    px, pw = _POSE * row, _POSE * nodes + _CONSTANTS * row
+    m = PER_NODE * row
+    east, north, time = load(moved, m), load(moved, m + 1), load(moved, m + 4)
+    drift_x, drift_y = load(moved, m + 2), load(moved, m + 3)
+    r_x, r_y, r_h = base + _row(px), base + _row(px + 1), base + _row(px + 2)
+    if active == _POSE * nodes:
+        for q in range(px):
+            h = load(p, r_h + q)
+            store(p, r_x + q, load(p, r_x + q) - north * h)
+            store(p, r_y + q, load(p, r_y + q) + east * h)
+        for q in range(px + _POSE, active):
+            at = base + _row(q) + px
+            h = load(p, at + 2)
+            store(p, at, load(p, at) - north * h)
+            store(p, at + 1, load(p, at + 1) + east * h)
+        return
+    r_w, r_s = base + _row(pw), base + _row(pw + 1)
+    for q in range(active):
+        if px <= q < px + _POSE or pw <= q <= pw + 1:
             continue
-        stop = size if o >= poses else o + _N
-        if o < poses and pk[o + _W, o + _W] == 0.0 and pk[o + _S, o + _S] == 0.0:
-            stop = o + 3
-        if constant:
-            for q in range(o, stop):
-                h, w, s = pk[bh, q], pk[bw, q], pk[bs, q]
-                at_x = pk[bx, q] + east * s - north * h + drift_x * w
-                at_y = pk[by, q] + north * s + east * h + drift_y * w
-                h -= time * w
-                pk[bx, q] = at_x
-                pk[by, q] = at_y
-                pk[bh, q] = h
-                pk[q, bx] = at_x
-                pk[q, by] = at_y
-                pk[q, bh] = h
-        else:
-            for q in range(o, stop):
-                h = pk[bh, q]
-                at_x = pk[bx, q] - north * h
-                at_y = pk[by, q] + east * h
-                pk[bx, q] = at_x
-                pk[by, q] = at_y
-                pk[q, bx] = at_x
-                pk[q, by] = at_y
-        o = size if o >= poses else o + _N
+        at = base + _row(q)
+        i_x, i_y, i_h = at + px, at + px + 1, at + px + 2
+        i_w, i_s = at + pw, at + pw + 1
+        if q < px:
+            i_x, i_y, i_h = r_x + q, r_y + q, r_h + q
+        if q < pw:
+            i_w, i_s = r_w + q, r_s + q
+        h, w, s = load(p, i_h), load(p, i_w), load(p, i_s)
+        store(p, i_x, load(p, i_x) + east * s - north * h + drift_x * w)
+        store(p, i_y, load(p, i_y) + north * s + east * h + drift_y * w)
+        store(p, i_h, h - time * w)
 
 
-@inlined
-def _predict_range(
-    xk: Floats, pk: Floats, bi: int, bj: int, dz: float
-) -> tuple[float, float, float, float]:
-    """Give the range's mean m, variance v, and the two gains' factors gx, gy."""
-    ux = xk[bj] - xk[bi]
-    uy = xk[bj + 1] - xk[bi + 1]
-    xx = pk[bi, bi] + pk[bj, bj] - 2.0 * pk[bi, bj]
-    yy = pk[bi + 1, bi + 1] + pk[bj + 1, bj + 1] - 2.0 * pk[bi + 1, bj + 1]
-    xy = pk[bi, bi + 1] + pk[bj, bj + 1] - pk[bi, bj + 1] - pk[bi + 1, bj]
+# -- ranges ----------------------------------------------------------------------------------------
+
+
+@compiled
+def _second_order(
+    ux: Lanes, uy: Lanes, xx: Lanes, xy: Lanes, yy: Lanes, dz: float
+) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+    """Give a range's mean m, variance v, and the two gains' factors gx, gy."""
     flat2 = ux * ux + uy * uy
-    if flat2 > _TINY:
-        # Along the line of sight, without a square root.
-        a = max((ux * ux * xx + 2.0 * ux * uy * xy + uy * uy * yy) / flat2, 0.0)
-    else:
-        a = 0.5 * (xx + yy)
+    # Along the line of sight, without a square root.
+    along = (ux * ux * xx + 2.0 * ux * uy * xy + uy * uy * yy) / greater(flat2, fill(_TINY))
+    nought = fill(0.0)
+    a = greater(select(flat2 > _TINY, along, 0.5 * (xx + yy)), nought)
     # Across it; rounding may leave a trace of nothing on the wrong side.
-    c = max(xx + yy - a, 0.0)
-    tilt = dz * dz / (flat2 + dz * dz + _TINY)
+    c = greater(xx + yy - a, nought)
+    tilt = (dz * dz) / (flat2 + (dz * dz + _TINY))
     m2 = flat2 + dz * dz + c + tilt * a
-    m = math.sqrt(m2) + _TINY
+    m = lanes.sqrt(m2) + _TINY
     v = (a * flat2 + 0.5 * (c * c + tilt * tilt * a * a)) / (m2 + _TINY)
     return m, v, ux / m, uy / m
+
+
+@compiled
+def _predict_range(
+    x: Floats, p: Floats, at_x: int, base: int, i: int, j: int, dz: float
+) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+    """As ``_second_order``, between users whose poses begin at ``i`` and ``j``."""
+    ux = load(x, at_x + j) - load(x, at_x + i)
+    uy = load(x, at_x + j + 1) - load(x, at_x + i + 1)
+    i_x, i_y = base + _row(i) + i, base + _row(i + 1) + i
+    j_x, j_y = base + _row(j) + j, base + _row(j + 1) + j
+    xx = load(p, i_x) + load(p, j_x) - 2.0 * load(p, base + _at(i, j))
+    yy = load(p, i_y + 1) + load(p, j_y + 1) - 2.0 * load(p, base + _at(i + 1, j + 1))
+    xy = load(p, i_y) + load(p, j_y)
+    xy = xy - load(p, base + _at(i, j + 1)) - load(p, base + _at(i + 1, j))
+    return _second_order(ux, uy, xx, xy, yy, dz)
 
 
 @compiled
 def _range_by_arms(
-    xk: Floats,
-    pk: Floats,
-    bi: int,
-    bj: int,
-    dz: float,
-    arm_i: Floats,
-    arm_j: Floats,
-    size: int,
-    east: Floats,
-    north: Floats,
-    g: Floats,
-) -> tuple[float, float, float, float]:
-    """As ``_predict_range`` between antennas off their poses; ``g`` (D,) gets P h.
+    x: Floats, p: Floats, at_x: int, base: int, i: int, j: int, dz: float, arm_i: Floats,
+    arm_j: Floats, active: int, east: Floats, north: Floats, g: Floats,
+) -> tuple[Lanes, Lanes, Lanes, Lanes]:  # fmt: skip
+    """As ``_predict_range`` between antennas off their poses; ``g`` (D, LANES) gets P h.
 
     An antenna at o = R(theta) arm moves by (-o_y, o_x) per radian of heading, so the heading has
-    a share in the line of sight. ``east`` and ``north`` (D,) are working space.
+    a share in the line of sight. ``east`` and ``north`` (D, LANES) are working space.
     """
-    ci, si = math.cos(xk[bi + _H]), math.sin(xk[bi + _H])
-    cj, sj = math.cos(xk[bj + _H]), math.sin(xk[bj + _H])
+    ci, si = lanes.cos_sin(load(x, at_x + i + 2))
+    cj, sj = lanes.cos_sin(load(x, at_x + j + 2))
     xi, yi = ci * arm_i[0] - si * arm_i[1], si * arm_i[0] + ci * arm_i[1]
     xj, yj = cj * arm_j[0] - sj * arm_j[1], sj * arm_j[0] + cj * arm_j[1]
-    ux = xk[bj] + xj - xk[bi] - xi
-    uy = xk[bj + 1] + yj - xk[bi + 1] - yi
-    hi, hj = bi + _H, bj + _H
-    for q in range(size):
-        east[q] = pk[bj, q] - pk[bi, q] - yj * pk[hj, q] + yi * pk[hi, q]
-        north[q] = pk[bj + 1, q] - pk[bi + 1, q] + xj * pk[hj, q] - xi * pk[hi, q]
-    xx = east[bj] - east[bi] - yj * east[hj] + yi * east[hi]
-    yy = north[bj + 1] - north[bi + 1] + xj * north[hj] - xi * north[hi]
-    xy = north[bj] - north[bi] - yj * north[hj] + yi * north[hi]
-    flat2 = ux * ux + uy * uy
-    a = (
-        (ux * ux * xx + 2.0 * ux * uy * xy + uy * uy * yy) / flat2
-        if flat2 > _TINY
-        else 0.5 * (xx + yy)
-    )
-    a, c = max(a, 0.0), max(xx + yy - a, 0.0)
-    tilt = dz * dz / (flat2 + dz * dz + _TINY)
-    m2 = flat2 + dz * dz + c + tilt * a
-    m = math.sqrt(m2) + _TINY
-    v = (a * flat2 + 0.5 * (c * c + tilt * tilt * a * a)) / (m2 + _TINY)
-    for q in range(size):
-        g[q] = (ux * east[q] + uy * north[q]) / m
-    return m, v, ux / m, uy / m
+    ux = load(x, at_x + j) + xj - load(x, at_x + i) - xi
+    uy = load(x, at_x + j + 1) + yj - load(x, at_x + i + 1) - yi
+    for q in range(active):
+        hi, hj = load(p, base + _at(i + 2, q)), load(p, base + _at(j + 2, q))
+        off = load(p, base + _at(j, q)) - load(p, base + _at(i, q))
+        store(east, q, off - yj * hj + yi * hi)
+        off = load(p, base + _at(j + 1, q)) - load(p, base + _at(i + 1, q))
+        store(north, q, off + xj * hj - xi * hi)
+    xx = load(east, j) - load(east, i) - yj * load(east, j + 2) + yi * load(east, i + 2)
+    xy = load(north, j) - load(north, i) - yj * load(north, j + 2) + yi * load(north, i + 2)
+    yy = load(north, j + 1) - load(north, i + 1)
+    yy = yy + xj * load(north, j + 2) - xi * load(north, i + 2)
+    m, v, gx, gy = _second_order(ux, uy, xx, xy, yy, dz)
+    for q in range(active):
+        store(g, q, gx * load(east, q) + gy * load(north, q))
+    return m, v, gx, gy
 
 
 @compiled
-def _lines(space: Floats, size: int) -> Floats:
-    """Lay out a (size, padded) covariance in working space, each row on cache lines of its own.
+def _gain(
+    p: Floats, base: int, i: int, j: int, gx: Lanes, gy: Lanes, active: int, g: Floats
+) -> None:
+    """Write P h of a range into ``g`` (D, LANES)."""
+    if i > j:
+        i, j, gx, gy = j, i, 0.0 - gx, 0.0 - gy
+    i_x, i_y, j_x, j_y = (base + _row(i), base + _row(i + 1), base + _row(j), base + _row(j + 1))
+    for q in range(i):
+        off_x = load(p, j_x + q) - load(p, i_x + q)
+        off_y = load(p, j_y + q) - load(p, i_y + q)
+        store(g, q, gx * off_x + gy * off_y)
+    for q in range(i, i + 2):
+        off_x = load(p, j_x + q) - load(p, base + _at(q, i))
+        off_y = load(p, j_y + q) - load(p, base + _at(q, i + 1))
+        store(g, q, gx * off_x + gy * off_y)
+    for q in range(i + 2, j):
+        at = base + _row(q) + i
+        off_x = load(p, j_x + q) - load(p, at)
+        off_y = load(p, j_y + q) - load(p, at + 1)
+        store(g, q, gx * off_x + gy * off_y)
+    for q in range(j, j + 2):
+        at = base + _row(q) + i
+        off_x = load(p, base + _at(q, j)) - load(p, at)
+        off_y = load(p, base + _at(q, j + 1)) - load(p, at + 1)
+        store(g, q, gx * off_x + gy * off_y)
+    for q in range(j + 2, active):
+        at = base + _row(q)
+        off_x = load(p, at + j) - load(p, at + i)
+        off_y = load(p, at + j + 1) - load(p, at + i + 1)
+        store(g, q, gx * off_x + gy * off_y)
 
-    The loops below run to ``shape[1]``, which numba knows not to be negative: to any other
-    bound they are not made into vector instructions.
+
+@compiled
+def _correct(
+    x: Floats, p: Floats, at_x: int, base: int, g: Floats, move: Lanes, shrink: Lanes, active: int
+) -> None:
+    """Add ``move`` g to a block's means and take ``shrink`` g g^T from its covariances."""
+    t = base
+    for o in range(active):
+        own = load(g, o)
+        store(x, at_x + o, load(x, at_x + o) + move * own)
+        f = shrink * own
+        for q in range(o + 1):
+            store(p, t + q, load(p, t + q) - f * load(g, q))
+        t += o + 1
+
+
+@compiled
+def _correct_sensitivity(
+    sens: Floats, t: int, hx: Lanes, hy: Lanes, kx: Lanes, ky: Lanes, kh: Lanes
+) -> Lanes:
+    """Carry one sensitivity over a range's update; return what it adds to the innovation's."""
+    xx, xy, yy = load(sens, t), load(sens, t + 1), load(sens, t + 2)
+    xh, yh = load(sens, t + 3), load(sens, t + 4)
+    ax = xx * hx + xy * hy
+    ay = xy * hx + yy * hy
+    ah = xh * hx + yh * hy
+    s = hx * ax + hy * ay
+    store(sens, t, xx + kx * (s * kx - 2.0 * ax))
+    store(sens, t + 1, xy + s * kx * ky - kx * ay - ky * ax)
+    store(sens, t + 2, yy + ky * (s * ky - 2.0 * ay))
+    store(sens, t + 3, xh + s * kx * kh - kx * ah - kh * ax)
+    store(sens, t + 4, yh + s * ky * kh - ky * ah - kh * ay)
+    store(sens, t + 5, load(sens, t + 5) + kh * (s * kh - 2.0 * ah))
+    return s
+
+
+@compiled
+def _bound_sensitivity(sens: Floats, t: int, p: Floats, base: int, b: int, most: float) -> None:
+    """Keep what the levels explain of a covariance below ``most`` times the covariance.
+
+    It is homogeneous in all variances, so that a true derivative obeys it with ``most`` 1.
     """
-    stride = (size + _LANES - 1) // _LANES * _LANES
-    off = (-(space.ctypes.data // 8)) % 8
-    return space[off : off + size * stride].reshape(size, stride)
-
-
-@compiled
-def _load(pk: Floats, of: Floats) -> None:
-    """Copy the first rows and columns of ``of`` (D, D) into ``pk`` (size, padded).
-
-    Whole vectors: what is beyond a row's end is of the next ones, finite and of no account.
-    """
-    size, stride = pk.shape
-    wide = of.shape[1]
-    for o in range(size):
-        if o * wide + stride <= wide * wide:
-            for q in range(pk.shape[1]):
-                pk[o, q] = of[o, q]
-        else:
-            for q in range(stride):
-                pk[o, q] = of[o, q] if q < size else 0.0
-
-
-@compiled
-def _store(to: Floats, pk: Floats) -> None:
-    """Copy ``pk`` (size, padded) back: what a row overwrites of the next ones, those put right."""
-    size, stride = pk.shape
-    wide = to.shape[1]
-    for o in range(size):
-        if o * wide + stride <= wide * wide:
-            for q in range(pk.shape[1]):
-                to[o, q] = pk[o, q]
-        else:
-            for q in range(size):
-                to[o, q] = pk[o, q]
-
-
-@compiled
-def _gain(pk: Floats, bi: int, bj: int, gx: float, gy: float, g: Floats) -> None:
-    """Write P h of a range into ``g`` (padded with zeros)."""
-    for q in range(pk.shape[1]):
-        g[q] = gx * (pk[bj, q] - pk[bi, q]) + gy * (pk[bj + 1, q] - pk[bi + 1, q])
-    for q in range(pk.shape[0], pk.shape[1]):
-        g[q] = 0.0
-
-
-@compiled
-def _take_away(pk: Floats, g: Floats, shrink: float) -> None:
-    """Take ``shrink`` g g^T from a covariance; where ``g`` is 0 (no constants) there is nothing."""
-    for o in range(pk.shape[0]):
-        f = shrink * g[o]
-        if f != 0.0:
-            for q in range(pk.shape[1]):
-                pk[o, q] -= f * g[q]
+    ratio = fill(1.0)
+    for entry in range(3):
+        at = t + 2 * entry + (entry == 2)
+        explained = load(sens, at) + load(sens, at + 6) + load(sens, at + 12)
+        own = load(p, base + _at(b + entry, b + entry))
+        ratio = greater(ratio, explained / (most * own + _TINY))
+    if some(ratio > 1.0):
+        for at in range(t, t + 18):
+            store(sens, at, load(sens, at) / ratio)
 
 
 @compiled
@@ -439,7 +594,6 @@ def update(
     measured: Floats,
     dz: Floats,
     outlier: Floats,
-    poses: int,
     worth: Floats,
     dz_variance: Floats,
     arms: Floats,
@@ -447,10 +601,10 @@ def update(
 ) -> None:
     """Work in ranges (R,) one after another; each hypothesis' log weight gets their evidence.
 
-    ``first``, ``second`` (R,) are users' rows, ``bias`` the state of a range's bias or -1;
-    biases come after the first ``poses`` entries of the state, their common part first, and a
-    hypothesis whose common part has no variance has none. ``sigma2`` (K,) is each hypothesis'
-    range variance. ``outlier`` is the share, the variance
+    ``first``, ``second`` (R,) are users' rows, ``bias`` the place of a range's bias or -1;
+    biases come last in the state, their common part first, and a
+    hypothesis whose common part has no variance has none. ``log_weight`` and ``sigma2`` (B, LANES)
+    are each hypothesis' log weight and range variance. ``outlier`` is the share, the variance
     (m^2), the share of these that are too short, and the whole motion noise over what of it is
     in the covariances. An innovation that may be an outlier's is
     used by its probability r of being none (probabilistic data association): the mean moves by
@@ -459,80 +613,80 @@ def update(
     ``worth`` (R,) is how many independent ranges one is worth: the variance that the gain sees is
     divided by it, the evidence multiplied. ``dz_variance`` (R,) is the variance of ``dz``.
     ``arms`` (N, 2) are the antennas' places (forward, left) of the poses, or empty (0, 2) where
-    all are zero. ``stats`` (K, R, STATS) receives m, S, the range's log evidence, r, and by how
-    much S grows with the logarithms of the three levels of the first and of the second user and of
-    the range variance (``sens``), and what of S is due to curvature.
+    all are zero. ``stats`` (R, STATS, B, LANES) receives m, S, the range's log evidence, r, and by
+    how much S grows with the logarithms of the three levels of the first and of the second user
+    and of the range variance (``sens``), and what of S is due to curvature.
     """
-    count, size = x.shape
-    space = np.empty(size * (size + _LANES) + 8)
-    g = np.empty(size + _LANES)
-    east = np.empty(size)
-    north = np.empty(size)
-    lever = arms.shape[0] > 0
+    blocks, size = x.shape[0], x.shape[1]
+    nodes = sens.shape[1]
+    g, east, north = (
+        lanes.working_lines(size), lanes.working_lines(size), lanes.working_lines(size),
+    )  # fmt: skip
     share, wide, short, most = outlier[0], outlier[1], outlier[2], outlier[3]
-    for k in range(count):
-        xk = x[k]
-        total = 0.0
-        size = x.shape[1]
-        biased = size > poses and p[k, poses, poses] > 0.0
-        if not biased:
-            size = poses
-        pk = _lines(space, size)
-        g[:] = 0.0
-        _load(pk, p[k])
+    for b in range(blocks):
+        at_x, base = b * size, b * p.shape[1]
+        active = _extent(p, base, nodes, size)
+        biased = active > PER_NODE * nodes
+        variance = load(sigma2, b)
+        total = fill(0.0)
         for r in range(first.shape[0]):
-            bi, bj, e = _N * first[r], _N * second[r], bias[r] if biased else -1
-            if lever:
+            i, j = _POSE * first[r], _POSE * second[r]
+            if arms.shape[0] > 0:
                 m, v, gx, gy = _range_by_arms(
-                    xk, pk, bi, bj, dz[r], arms[first[r]], arms[second[r]], size, east, north, g
-                )
+                    x, p, at_x, base, i, j, dz[r], arms[first[r]], arms[second[r]], active,
+                    east, north, g,
+                )  # fmt: skip
             else:
-                m, v, gx, gy = _predict_range(xk, pk, bi, bj, dz[r])
-                _gain(pk, bi, bj, gx, gy, g)
-            bent = v - gx * (g[bj] - g[bi]) - gy * (g[bj + 1] - g[bi + 1])
-            v += dz[r] * dz[r] / (m * m) * dz_variance[r]
+                m, v, gx, gy = _predict_range(x, p, at_x, base, i, j, dz[r])
+                _gain(p, base, i, j, gx, gy, active, g)
+            bent = v - gx * (load(g, j) - load(g, i)) - gy * (load(g, j + 1) - load(g, i + 1))
+            v = v + (dz[r] * dz[r] * dz_variance[r]) / (m * m)
             innovation = measured[r] - m
-            # No range is negative: between two who stand together noise alone looks like a bias.
-            if e >= 0 and m * m > _FAR * sigma2[k]:
-                innovation -= xk[e]
-                v += 2.0 * g[e] + pk[e, e]
-                for q in range(size):
-                    g[q] += pk[e, q]
-            s = v + sigma2[k]
+            if biased and bias[r] >= 0:
+                # No range is negative: between two who stand together noise alone looks like
+                # a bias.
+                e = bias[r]
+                far = m * m > _FAR * variance
+                nought, one = fill(0.0), fill(1.0)
+                seen = select(far, one, nought)
+                innovation = innovation - seen * load(x, at_x + e)
+                v = v + seen * (2.0 * load(g, e) + load(p, base + _row(e) + e))
+                for q in range(active):
+                    store(g, q, load(g, q) + seen * load(p, base + _at(e, q)))
+            s = v + variance
             square = innovation * innovation
-            good = (1.0 - share) * vectormath.exp(-0.5 * square / s) / math.sqrt(s)
+            good = (1.0 - share) * lanes.exp(-0.5 * square / s) / lanes.sqrt(s)
             spread = s + wide
-            side = 2.0 * (1.0 - short) if innovation > 0.0 else 2.0 * short
-            bad = share * side * vectormath.exp(-0.5 * square / spread) / math.sqrt(spread)
+            side = select(innovation > 0.0, fill(2.0 * (1.0 - short)), fill(2.0 * short))
+            bad = share * side * lanes.exp(-0.5 * square / spread) / lanes.sqrt(spread)
             # Where both vanish, it is certainly no good one.
             both = good + bad + 1e-300
             trust = good / both
-            evidence = vectormath.log(both)
-            total += worth[r] * evidence
-            heavy = v + sigma2[k] / worth[r]
-            scaled = trust * innovation / heavy
-            shrink = trust / heavy * (1.0 - (1.0 - trust) * square / heavy)
-            for q in range(size):
-                xk[q] += scaled * g[q]
-            _take_away(pk, g, shrink)
-            stats[k, r, 0] = measured[r] - innovation
-            stats[k, r, 1] = s
-            stats[k, r, 2] = evidence
-            stats[k, r, 3] = trust
+            evidence = lanes.log(both)
+            total = total + worth[r] * evidence
+            heavy = v + variance * (1.0 / worth[r])
             kf = trust / heavy
+            shrink = kf * (1.0 - (1.0 - trust) * square / heavy)
+            _correct(x, p, at_x, base, g, kf * innovation, shrink, active)
+            at = r * STATS * blocks + b
+            store(stats, at, measured[r] - innovation)
+            store(stats, at + VARIANCE * blocks, s)
+            store(stats, at + EVIDENCE * blocks, evidence)
+            store(stats, at + TRUST * blocks, trust)
+            store(stats, at + RANGE_SHARE * blocks, variance)
+            store(stats, at + BENT * blocks, bent)
+            back_x, back_y = 0.0 - gx, 0.0 - gy
+            user_i, user_j = (b * nodes + first[r]) * 18, (b * nodes + second[r]) * 18
+            ix, iy, ih = kf * load(g, i), kf * load(g, i + 1), kf * load(g, i + 2)
+            jx, jy, jh = kf * load(g, j), kf * load(g, j + 1), kf * load(g, j + 2)
             for part in range(3):
-                stats[k, r, 4 + part] = _correct_sensitivity(
-                    sens[k, first[r], part], -gx, -gy, kf * g[bi], kf * g[bi + 1], kf * g[bi + 2]
-                )
-                stats[k, r, 7 + part] = _correct_sensitivity(
-                    sens[k, second[r], part], gx, gy, kf * g[bj], kf * g[bj + 1], kf * g[bj + 2]
-                )
-            _bound_sensitivity(sens[k, first[r]], pk, bi, most)
-            _bound_sensitivity(sens[k, second[r]], pk, bj, most)
-            stats[k, r, 10] = sigma2[k]
-            stats[k, r, 11] = bent
-        _store(p[k], pk)
-        log_weight[k] += total
+                grown = _correct_sensitivity(sens, user_i + 6 * part, back_x, back_y, ix, iy, ih)
+                store(stats, at + (SHARES + part) * blocks, grown)
+                grown = _correct_sensitivity(sens, user_j + 6 * part, gx, gy, jx, jy, jh)
+                store(stats, at + (SHARES + 3 + part) * blocks, grown)
+            _bound_sensitivity(sens, user_i, p, base, i, most)
+            _bound_sensitivity(sens, user_j, p, base, j, most)
+        store(log_weight, b, load(log_weight, b) + total)
 
 
 @compiled
@@ -540,6 +694,7 @@ def update_heading(
     x: Floats,
     p: Floats,
     log_weight: Floats,
+    nodes: int,
     row: int,
     measured: float,
     sigma2: float,
@@ -547,38 +702,41 @@ def update_heading(
     wide: float,
 ) -> None:
     """Work in one absolute heading of a user; outliers as in :func:`update`, both signs alike."""
-    count, size = x.shape
-    g = np.empty(size)
-    b = _N * row + _H
-    for k in range(count):
-        xk = x[k]
-        pk = p[k]
-        innovation = measured - xk[b]
-        innovation -= 2.0 * math.pi * np.rint(innovation / (2.0 * math.pi))
-        for q in range(size):
-            g[q] = pk[b, q]
-        s = g[b] + sigma2
+    size = x.shape[1]
+    g = lanes.working_lines(size)
+    h = _POSE * row + 2
+    turn = 2.0 * math.pi
+    for b in range(x.shape[0]):
+        at_x, base = b * size, b * p.shape[1]
+        active = _extent(p, base, nodes, size)
+        innovation = measured - load(x, at_x + h)
+        innovation = innovation - turn * lanes.floor(innovation * (1.0 / turn) + 0.5)
+        for q in range(active):
+            store(g, q, load(p, base + _at(h, q)))
+        s = load(g, h) + sigma2
         square = innovation * innovation
-        good = (1.0 - share) * math.exp(-0.5 * square / s) / math.sqrt(s)
-        bad = share * math.exp(-0.5 * square / (s + wide)) / math.sqrt(s + wide)
+        good = (1.0 - share) * lanes.exp(-0.5 * square / s) / lanes.sqrt(s)
+        bad = share * lanes.exp(-0.5 * square / (s + wide)) / lanes.sqrt(s + wide)
         both = good + bad + 1e-300
         trust = good / both
-        shrink = trust / s * (1.0 - (1.0 - trust) * square / s)
-        for q in range(size):
-            xk[q] += trust * innovation / s * g[q]
-        for o in range(size):
-            for q in range(size):
-                pk[o, q] -= shrink * g[o] * g[q]
-        log_weight[k] += math.log(both)
+        kf = trust / s
+        _correct(
+            x, p, at_x, base, g, kf * innovation, kf * (1.0 - (1.0 - trust) * square / s), active
+        )
+        store(log_weight, b, load(log_weight, b) + lanes.log(both))
 
 
-@inlined
-def _outcome(place: float, heard: bool, tried: float, curve: Floats) -> float:
+# -- who is heard ----------------------------------------------------------------------------------
+
+
+@compiled
+def _outcome(place: Lanes, heard: bool, tried: float, curve: Floats) -> Lanes:
     """Probability that a pair is heard, or is silent, at a multiple of the curve's step."""
-    last = curve.shape[0] - 2
-    place = min(max(place, 0.0), last + 1.0)
-    index = min(int(place), last)
-    chance: float = curve[index] + (place - index) * (curve[index + 1] - curve[index])
+    last = curve.shape[0] - 2.0
+    kept = lesser(greater(place, fill(0.0)), fill(last + 1.0))
+    index = lesser(lanes.floor(kept), fill(last))
+    here = lanes.look_up(curve, index)
+    chance = here + (kept - index) * (lanes.look_up(curve, index + 1.0) - here)
     return chance if heard else 1.0 - tried * chance
 
 
@@ -587,6 +745,7 @@ def hearing(
     x: Floats,
     p: Floats,
     log_weight: Floats,
+    nodes: int,
     first: Indices,
     second: Indices,
     dz: Floats,
@@ -608,118 +767,137 @@ def hearing(
 
         x += g (m' - m)/v,   P -= g g^T (v - v')/v^2
     """
-    count, size = x.shape
-    g = np.empty(size)
-    bell = np.empty(_POINTS)
-    for q in range(_POINTS):
-        bell[q] = math.exp(-0.5 * (_ASIDE * (2.0 * q / (_POINTS - 1.0) - 1.0)) ** 2)
+    size = x.shape[1]
+    g = lanes.working_lines(size)
     per_step = 1.0 / step_m
-    log_least, log_most = math.log(0.97), math.log(1.03)
-    for k in range(count):
-        xk = x[k]
-        pk = p[k]
-        total = 0.0
-        product = 1.0
+    nought, one = fill(0.0), fill(1.0)
+    for b in range(x.shape[0]):
+        at_x, base = b * size, b * p.shape[1]
+        active = _extent(p, base, nodes, size)
+        total, product = nought, one
         for u in range(first.shape[0]):
-            bi, bj = _N * first[u], _N * second[u]
-            m, v, gx, gy = _predict_range(xk, pk, bi, bj, dz[u])
-            sd = math.sqrt(max(v, 0.0))
+            i, j = _POSE * first[u], _POSE * second[u]
+            m, v, gx, gy = _predict_range(x, p, at_x, base, i, j, dz[u])
+            sd = lanes.sqrt(greater(v, nought))
             place, aside = per_step * m, per_step * sd
             middle = _outcome(place, heard[u], tried[u], curve)
             near = _outcome(place - _ASIDE * aside, heard[u], tried[u], curve)
             far = _outcome(place + _ASIDE * aside, heard[u], tried[u], curve)
-            lowest, highest = min(near, far), max(near, far)
             # Almost everywhere the curve is flat. Roots differ by less than what they are of
             # (``weight`` is at most 1), so logarithms are only taken where that does not settle it.
-            flat = lowest > 0.97 * middle and highest < 1.03 * middle
-            if not flat:
-                flat = (
-                    weight * math.log(lowest / middle) > log_least
-                    and weight * math.log(highest / middle) < log_most
+            low, high = lesser(near, far) / middle, greater(near, far) / middle
+            steep = greater(0.97 - low, high - 1.03)
+            if some(steep > 0.0):
+                low, high = weight * lanes.log(low), weight * lanes.log(high)
+                steep = select(
+                    steep > 0.0, greater(math.log(0.97) - low, high - math.log(1.03)), steep
                 )
-            if flat:
-                product *= middle
-                if product < 1e-250:
-                    total += weight * math.log(product)
-                    product = 1.0
+            product = product * select(steep > 0.0, one, middle)
+            if some(product < 1e-200):
+                total = total + weight * lanes.log(product)
+                product = one
+            if not some(steep > 0.0):
                 continue
-            mass = 0.0
-            shift = 0.0
-            square = 0.0
-            norm = 0.0
+            mass, shift, square = nought, nought, nought
             for q in range(_POINTS):
-                z = _ASIDE * (2.0 * q / (_POINTS - 1.0) - 1.0)
-                norm += bell[q]
+                z, bell = _Z[q], _BELL[q]
                 chance = _outcome(place + z * aside, heard[u], tried[u], curve)
-                density = bell[q] * math.exp(weight * math.log(chance))
-                mass += density
-                shift += density * z
-                square += density * z * z
-            total += math.log(mass / norm)
-            shift /= mass
+                density = bell * lanes.exp(weight * lanes.log(chance))
+                mass = mass + density
+                shift = shift + density * z
+                square = square + density * (z * z)
+            shift = shift / mass
             # The rule's own variance is a little under 1: a flat curve must change nothing.
-            after = min((square / mass - shift * shift) / _RULE_VARIANCE, 1.0)
-            for q in range(size):
-                g[q] = gx * (pk[bj, q] - pk[bi, q]) + gy * (pk[bj + 1, q] - pk[bi + 1, q])
+            after = lesser((square / mass - shift * shift) / _RULE_VARIANCE, one)
+            _gain(p, base, i, j, gx, gy, active, g)
             # g g^T / v never exceeds P: v also holds the curvature's part.
-            move, shrink = shift / sd, (1.0 - after) / v
-            for q in range(size):
-                xk[q] += move * g[q]
-            _take_away(pk, g, shrink)
-        log_weight[k] += total + weight * math.log(product)
+            move = select(steep > 0.0, shift / sd, nought)
+            shrink = select(steep > 0.0, (1.0 - after) / v, nought)
+            total = total + select(steep > 0.0, lanes.log(mass * (1.0 / _NORM)), nought)
+            _correct(x, p, at_x, base, g, move, shrink, active)
+        store(log_weight, b, load(log_weight, b) + total + weight * lanes.log(product))
+
+
+# -- what is known ---------------------------------------------------------------------------------
 
 
 @compiled
 def predicted_ranges(
-    x: Floats, p: Floats, first: Indices, second: Indices, dz: Floats
+    x: Floats, p: Floats, weight: Floats, first: Indices, second: Indices, dz: Floats
 ) -> tuple[Floats, Floats]:
-    """Give mean and standard deviation (K, U) of pairs' slant distances in every hypothesis."""
-    count, pairs = x.shape[0], first.shape[0]
-    mean = np.empty((count, pairs))
-    sigma = np.empty((count, pairs))
-    for k in range(count):
-        for u in range(pairs):
-            m, v, _, _ = _predict_range(x[k], p[k], _N * first[u], _N * second[u], dz[u])
-            mean[k, u] = m
-            sigma[k, u] = math.sqrt(max(v, 0.0))
+    """Give mean and standard deviation (U,) of pairs' slant distances over all hypotheses.
+
+    ``weight`` (B, LANES) are the normalised weights, 0 where a block has no hypothesis.
+    """
+    blocks, size = x.shape[0], x.shape[1]
+    mean = np.empty(first.shape[0])
+    sigma = np.empty(first.shape[0])
+    ranges, variances = lanes.working_lines(blocks), lanes.working_lines(blocks)
+    for u in range(first.shape[0]):
+        middle = fill(0.0)
+        for b in range(blocks):
+            m, v, _, _ = _predict_range(
+                x, p, b * size, b * p.shape[1], _POSE * first[u], _POSE * second[u], dz[u]
+            )
+            store(ranges, b, m)
+            store(variances, b, v)
+            middle = middle + load(weight, b) * m
+        mean[u] = lanes.total(middle)
+        spread = fill(0.0)
+        for b in range(blocks):
+            off = load(ranges, b) - mean[u]
+            spread = spread + load(weight, b) * (greater(load(variances, b), fill(0.0)) + off * off)
+        sigma[u] = math.sqrt(lanes.total(spread))
     return mean, sigma
 
 
 @compiled
-def moments(x: Floats, p: Floats, weight: Floats, angles: Indices) -> tuple[Floats, Floats]:
-    """Give the mixture's mean (D,) and full covariance (D, D).
+def moments(x: Floats, p: Floats, weight: Floats, nodes: int, of: Indices) -> tuple[Floats, Floats]:
+    """Give the mixture's mean (D,) and full covariance (D, D), in the state's order.
 
-    ``angles`` (N,) are the headings' places: they are averaged round the circle, about the
-    heaviest hypothesis' value.
+    ``weight`` (B, LANES) as for ``predicted_ranges``, ``of`` (D,) is ``order``. Headings are
+    averaged round the circle, about the heaviest hypothesis' value.
     """
-    count, size = x.shape
+    blocks, size, triangle = x.shape[0], x.shape[1], p.shape[1]
+    best, best_lane = 0, 0
+    for b in range(blocks):
+        for lane in range(LANES):
+            if weight[b, lane] > weight[best, best_lane]:
+                best, best_lane = b, lane
     mean = np.zeros(size)
     cov = np.zeros((size, size))
-    best = 0
-    for k in range(count):
-        if weight[k] > weight[best]:
-            best = k
     turn = 2.0 * math.pi
-    off = np.empty((count, size))
-    for k in range(count):
-        for q in range(size):
-            off[k, q] = x[k, q] - x[best, q]
-        for n in range(angles.shape[0]):
-            off[k, angles[n]] -= turn * np.rint(off[k, angles[n]] / turn)
-        for q in range(size):
-            mean[q] += weight[k] * off[k, q]
-    for k in range(count):
-        w = weight[k]
-        if w > 0.0:
-            for q in range(size):
-                off[k, q] -= mean[q]
-            for o in range(size):
-                f = w * off[k, o]
-                # What is symmetric is read and summed but once: this is bound by memory.
-                for q in range(o + 1):
-                    cov[o, q] += w * p[k, o, q] + f * off[k, q]
-    for q in range(size):
-        mean[q] += x[best, q]
-        for o in range(q):
-            cov[o, q] = cov[q, o]
+    off = lanes.working_lines(blocks * size)
+    for i in range(size):
+        about = x[best, i, best_lane]
+        angle = i < _POSE * nodes and i % _POSE == 2
+        middle = fill(0.0)
+        for b in range(blocks):
+            away = load(x, b * size + i) - about
+            if angle:
+                away = away - turn * lanes.floor(away * (1.0 / turn) + 0.5)
+            store(off, b * size + i, away)
+            middle = middle + load(weight, b) * away
+        away_from = lanes.total(middle)
+        mean[of[i]] = about + away_from
+        for b in range(blocks):
+            store(off, b * size + i, load(off, b * size + i) - away_from)
+    sums = lanes.working_lines(triangle)
+    sums[:] = 0.0
+    for b in range(blocks):
+        w = load(weight, b)
+        base, at_x = b * triangle, b * size
+        t = 0
+        for i in range(size):
+            f = w * load(off, at_x + i)
+            for j in range(i + 1):
+                term = w * load(p, base + t + j) + f * load(off, at_x + j)
+                store(sums, t + j, load(sums, t + j) + term)
+            t += i + 1
+    t = 0
+    for i in range(size):
+        for j in range(i + 1):
+            cov[of[i], of[j]] = lanes.total(load(sums, t))
+            cov[of[j], of[i]] = cov[of[i], of[j]]
+            t += 1
     return mean, cov

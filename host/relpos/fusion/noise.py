@@ -13,7 +13,9 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion import vectormath
 from relpos.fusion.compiled import compiled
+from relpos.fusion.joint import BENT, EVIDENCE, MEAN, SHARES, TRUST, VARIANCE
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -127,7 +129,7 @@ class Levels:
               log_weight: Floats, quiet: Floats, worth: Floats) -> int:  # fmt: skip
         """Learn from ranges (R,); return how many levels had to be clamped.
 
-        ``stats`` (K, R, 12) are of ``joint.update``, ``log_weight`` (K,) from before it;
+        ``stats`` (R, STATS, K) are of ``joint.update``, ``log_weight`` (K,) from before it;
         hypotheses with ``quiet`` (K,) 0 have jumped of late and do not count. ``worth`` (R,) is
         how many independent ranges each is worth.
         """
@@ -149,7 +151,7 @@ def learn(
     worth: Floats,
 ) -> int:
     """See :meth:`Levels.learn`; works in place."""
-    count = stats.shape[0]
+    count = stats.shape[2]
     size = mean.shape[0]
     weight = np.exp(log_weight - log_weight.max()) * quiet
     if weight.sum() <= 0.0:
@@ -161,31 +163,36 @@ def learn(
     for q in range(size):
         covariance[q, q] += RANDOM_WALK
     for n in range(measured.shape[0]):
+        means, variances, bents = stats[n, MEAN], stats[n, VARIANCE], stats[n, BENT]
+        evidence, trusts = stats[n, EVIDENCE], stats[n, TRUST]
         middle = 0.0
         for k in range(count):
-            middle += weight[k] * stats[k, n, 0]
+            middle += weight[k] * means[k]
         variance = 0.0
         bent = 0.0
         trust = 0.0
         total = 0.0
         peak = -np.inf
-        slope[:] = 0.0
         for k in range(count):
-            off = stats[k, n, 0] - middle
-            variance += weight[k] * (stats[k, n, 1] - stats[k, n, 11] + off * off)
-            bent += weight[k] * stats[k, n, 11]
-            for q in range(7):
-                slope[q] += weight[k] * stats[k, n, 4 + q]
+            off = means[k] - middle
+            variance += weight[k] * (variances[k] - bents[k] + off * off)
+            bent += weight[k] * bents[k]
+        for q in range(7):
+            slope[q] = 0.0
+            share = stats[n, SHARES + q]
+            for k in range(count):
+                slope[q] += weight[k] * share[k]
+        for k in range(count):
             if weight[k] > 0.0:
-                peak = max(peak, stats[k, n, 2])
+                peak = max(peak, evidence[k])
         for k in range(count):
-            weight[k] *= math.exp(stats[k, n, 2] - peak)
+            weight[k] *= vectormath.exp(min(evidence[k] - peak, 0.0))
             total += weight[k]
         if total <= 0.0:
             return 0
         for k in range(count):
             weight[k] /= total
-            trust += weight[k] * stats[k, n, 3]
+            trust += weight[k] * trusts[k]
         # S is homogeneous in all variances, so its sensitivities cannot sum to more than it is;
         # they may, where knowledge leaked from users that ``sens`` does not follow.
         explained = 0.0
