@@ -1,0 +1,190 @@
+"""Every command of README and the pages works as it stands there."""
+
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+from collections import defaultdict
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from doc_commands import (
+    OTHERS,
+    PAGES,
+    PARSED,
+    PORTS,
+    SHORTER,
+    commands,
+    mentions,
+    program,
+    shortened,
+    subcommand,
+    unknown_options,
+    why_only_parsed,
+)
+from typer.testing import CliRunner
+
+from relpos.cli import main
+from relpos.emulator.pty import PseudoTerminal
+from relpos.simulation.team import make_team
+from relpos.simulation.walker import RATE_HZ
+
+PATIENCE_S = 120
+PLACES = defaultdict(list)
+for _page in PAGES:
+    for _command in commands(_page):
+        PLACES[_command.words].append(_command)
+SHOWN = [found[0] for found in PLACES.values()]
+OURS = [c for c in SHOWN if program(c.words) == "relpos"]
+RUN = [c for c in OURS if why_only_parsed(c.words) is None]
+THEIRS = [c for c in SHOWN if program(c.words) != "relpos"]
+MENTIONED = sorted({c.words: c for page in PAGES for c in mentions(page)}.values(), key=str)
+
+
+def relpos(*arguments):
+    return CliRunner().invoke(main.app, [str(a) for a in arguments], catch_exceptions=False)
+
+
+@contextmanager
+def emulated(*arguments):
+    """The port that `relpos emulate` prints."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "relpos.cli.main", "emulate", *arguments],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    try:
+        told = re.search(r"/dev/\S+", process.stdout.readline())
+        assert told, process.stderr.read()
+        yield told[0]
+        process.send_signal(signal.SIGINT)
+        process.wait(PATIENCE_S)
+    finally:
+        process.kill()
+
+
+@pytest.fixture(scope="module")
+def port():
+    """An emulated team behind it, at several times real time."""
+    with emulated("--nodes", "6", "--speed", "5", "--seed", "1") as path:
+        yield path
+
+
+@pytest.fixture(scope="module")
+def radio():
+    """A coordinator's module that may be set up anew."""
+    with emulated("--nodes", "1") as path:
+        yield path
+
+
+@pytest.fixture(scope="module")
+def belongings(tmp_path_factory):
+    """What a reader has: a run with truth, an estimate of it, a recorded walk, a key."""
+    folder = tmp_path_factory.mktemp("belongings")
+    made = relpos("simulate", "--scenario", "paper", "--seed", 1, "--out", folder / "RUN",
+                  "--set", "seconds=20", "--set", "nodes=3")  # fmt: skip
+    assert made.exit_code == 0, made.output
+    fused = relpos("fuse", folder / "RUN", "--out", folder / "DIR", "--no-report")
+    assert fused.exit_code == 0, fused.output
+    walker = make_team("paper", 1, 20.0, 1)[0][0]
+    times_s = np.arange(20 * RATE_HZ) / RATE_HZ
+    columns = (walker.specific_force_m_s2, walker.angular_rate_rad_s, walker.magnetic_field_ut)
+    (folder / "WALK").mkdir()
+    write_imu(folder / "WALK", times_s, [c[: len(times_s)] for c in columns])
+    key = folder / "team.key"
+    key.write_text("00" * 16 + "\n")
+    key.chmod(0o600)
+    return folder
+
+
+def write_imu(folder, times_s, columns):
+    header = "time_s,node,ax_m_s2,ay_m_s2,az_m_s2,gx_rad_s,gy_rad_s,gz_rad_s,mx_ut,my_ut,mz_ut"
+    rows = np.column_stack([times_s, np.ones_like(times_s), *columns])
+    np.savetxt(folder / "imu.csv", rows, delimiter=",", header=header, comments="", fmt="%.9g")
+
+
+@pytest.fixture
+def scratch(belongings, tmp_path, monkeypatch):
+    """A directory of its own to run a command in, with everything that commands name."""
+    for thing in belongings.iterdir():
+        copy = shutil.copytree if thing.is_dir() else shutil.copy2
+        copy(thing, tmp_path / thing.name)
+    monkeypatch.chdir(tmp_path)
+    for name in ("NO_COLOR", "RELPOS_KEY_FILE"):
+        monkeypatch.delenv(name, raising=False)
+    return tmp_path
+
+
+STANDS_FOR = (
+    (re.compile(r"^(path/to|\.\./shared/data)/(two_robots_vio|four_robots_uwb)/\w+$"), "RUN"),
+    (re.compile(r"^path/to/walk$"), "WALK"),
+    (re.compile(r"^out/exp1_los$"), "DIR"),
+)
+
+
+def with_things(words, port):
+    """The command with what the reader has in place of its names for it."""
+    given = []
+    for word in words:
+        if PORTS.match(word):
+            word = port
+        for pattern, name in STANDS_FOR:
+            word = pattern.sub(name, word)
+        given.append(word)
+    return given
+
+
+def test_there_are_commands_to_check():
+    assert len(OURS) > 30
+    assert len(RUN) > 15
+    assert len(THEIRS) > 5
+
+
+@pytest.mark.parametrize("command", SHOWN, ids=str)
+def test_a_shown_command_is_in_a_class(command):
+    name = program(command.words)
+    assert name == "relpos" or name in OTHERS, (
+        f"{command}: say in tests/docs/doc_commands.py what is done with `{name}`"
+    )
+
+
+@pytest.mark.parametrize("command", OURS, ids=str)
+def test_a_shown_command_is_understood_by_the_command_line(command):
+    name, parsed, rest = subcommand(with_things(command.words, "/dev/ttyUSB0"))
+    assert name or rest, command
+    if not name or "--help" in rest:
+        return
+    with parsed.make_context(f"relpos {name}", rest, resilient_parsing=False) as context:
+        assert context.params
+
+
+@pytest.mark.parametrize("command", [*SHOWN, *MENTIONED], ids=str)
+def test_every_option_exists(command):
+    if program(command.words) == "relpos":
+        assert not unknown_options(command.words), command
+
+
+@pytest.mark.parametrize("command", THEIRS, ids=str)
+def test_commands_of_other_programs_name_what_is_there(command):
+    _, check = OTHERS[program(command.words)]
+    assert check(command.words), command
+
+
+@pytest.mark.parametrize("command", RUN, ids=str)
+@pytest.mark.usefixtures("scratch")
+def test_a_shown_command_runs(command, port, radio, monkeypatch):
+    name, _, _ = subcommand(command.words)
+    if name == "emulate":  # serves until Ctrl-C, as the one behind `port` does
+        monkeypatch.setattr(PseudoTerminal, "serve", lambda _: None)
+    words = with_things(shortened(command.words), radio if name == "node radio" else port)
+    done = relpos(*words[1:])
+    assert done.exit_code == 0, f"{shlex.join(words)}\n{done.output}"
+
+
+def test_every_exception_is_still_needed():
+    names = [subcommand(c.words)[0] for c in OURS]
+    assert not [known for known in PARSED if not any(n.startswith(known) for n in names)]
+    assert not [known for known in SHORTER if known.split(" PORT")[0] not in names]
