@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
@@ -28,6 +29,20 @@ RANGE_AGE_S = 10.0
 """A range older than this is no link any more."""
 STALE_S = 3.0
 """Silence after which somebody is shown as stale, as after three epochs in an estimator."""
+HEALTH_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class _Health:
+    """What a node told of itself, judged at ``looked_s``."""
+
+    looked_s: float
+    colour: str
+    reasons: tuple[str, ...]
+    battery_v: float | None
+    loss: float | None
+    ranging: float | None
+    neighbours: int | None
 
 
 class Composer:
@@ -42,6 +57,8 @@ class Composer:
         self.nowcast = Nowcast(start_s)
         self.team = TeamView()
         self._ranges: dict[tuple[int, int], Range] = {}
+        self._paired: dict[tuple[int, int], tuple[tuple[int, int], Pair]] = {}
+        self._healths: dict[int, _Health] = {}
         self._given = 0
         self._seq = 0
         self._newest_s: float | None = None
@@ -140,29 +157,53 @@ class Composer:
         )
 
     def _pairs(self, estimate: Estimate) -> tuple[Pair, ...]:
-        pairs = []
+        """Everybody's distances; those anew of whom something is new."""
+        versions = {node.node: self.nowcast.version(node.node) for node in estimate.nodes}
+        before, self._paired = self._paired, {}
         for fused in estimate.pairs:
-            p = self.nowcast.pair(fused)
-            pairs.append(
-                Pair(
-                    p.node,
-                    p.peer,
-                    p.distance_m,
-                    p.sigma_distance_m,
-                    p.bearing_rad,
-                    p.sigma_bearing_rad,
+            ends = fused.node, fused.peer
+            version = versions[ends[0]], versions[ends[1]]
+            known = before.get(ends)
+            if known is None or known[0] != version:
+                p = self.nowcast.pair(fused)
+                known = (
+                    version,
+                    Pair(
+                        *ends,
+                        p.distance_m,
+                        p.sigma_distance_m,
+                        p.bearing_rad,
+                        p.sigma_bearing_rad,
+                    ),
                 )
+            self._paired[ends] = known
+        return tuple(pair for _, pair in self._paired.values())
+
+    def _health(self, node: int, now_s: float) -> _Health:
+        """How the node itself is; looked at now and then, for it goes by half minutes."""
+        known = self._healths.get(node)
+        if known is None or now_s - known.looked_s > HEALTH_S or now_s < known.looked_s:
+            view = self.team.nodes.get(node) or NodeView(node)
+            colour, reasons = view.health(now_s)
+            neighbours = view.status.get("neighbours")
+            known = self._healths[node] = _Health(
+                now_s,
+                colour.name.lower(),
+                tuple(reasons),
+                # 0: this board does not measure it.
+                view.status.get("battery_v") or None,
+                view.loss(now_s),
+                view.ranging(now_s)[0],
+                None if neighbours is None else int(neighbours),
             )
-        return tuple(pairs)
+        return known
 
     def _person(self, node: int, now_s: float) -> Person:
-        view = self.team.nodes.get(node) or NodeView(node)
+        view = self.team.nodes.get(node)
         condition = self.alarms.of(node)
-        seen_s = now_s - view.heard_s if node in self.team.nodes else None
+        seen_s = None if view is None else now_s - view.heard_s
         at = self.nowcast.node(node)
-        colour, reasons = view.health(now_s)
-        ranging, _ = view.ranging(now_s)
-        neighbours = view.status.get("neighbours")
+        health = self._health(node, now_s)
         return Person(
             node=node,
             name=self.names.get(node, f"Node {node}"),
@@ -173,14 +214,13 @@ class Composer:
             still_s=condition.still_s,
             alert=condition.alert,
             acknowledged=condition.acknowledged,
-            health=colour.name.lower(),
-            reasons=tuple(reasons),
-            # 0: this board does not measure it.
-            battery_v=view.status.get("battery_v") or None,
-            rssi_dbm=view.rssi_dbm,
-            loss=view.loss(now_s),
-            ranging=ranging,
-            neighbours=None if neighbours is None else int(neighbours),
+            health=health.colour,
+            reasons=health.reasons,
+            battery_v=health.battery_v,
+            rssi_dbm=None if view is None else view.rssi_dbm,
+            loss=health.loss,
+            ranging=health.ranging,
+            neighbours=health.neighbours,
             **({} if at is None else _pose(at)),
         )
 

@@ -86,6 +86,7 @@ class _Track:
     chords: deque[_Chord] = field(default_factory=lambda: deque(maxlen=MOST_CHORDS))
     fused: NodeEstimate | None = None
     pose: _Pose | None = None
+    version: int = 0
 
 
 class Nowcast:
@@ -109,6 +110,7 @@ class Nowcast:
         chord = _Chord(track.reported_s, motion, number)
         track.reported_s = max(track.reported_s, motion.time_s)
         track.chords.append(chord)
+        track.version += 1
         if track.pose is not None:
             self._compose(track.pose, chord, -math.inf, known=False)
 
@@ -120,6 +122,7 @@ class Nowcast:
             if track is None:
                 track = self._tracks[node.node] = _Track(self._start_s)
             track.fused = node
+            track.version += 1
             chords = track.chords
             while chords and chords[0].number <= given:
                 if chords[0].motion.time_s > estimate.time_s:
@@ -158,6 +161,11 @@ class Nowcast:
             for sigma, alone in zip(told, untold, strict=True)
         )
         return x, y, turn
+
+    def version(self, node: int) -> int:
+        """Another number after everything that moved the node."""
+        track = self._tracks.get(node)
+        return 0 if track is None else track.version
 
     def newest_s(self, node: int) -> float | None:
         """Time up to which the node's pose contains its motion; None where it never reported."""

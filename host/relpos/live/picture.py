@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
+from functools import lru_cache
 from typing import Any
 
 PROTOCOL = 1
@@ -147,7 +148,12 @@ class Picture:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, numbers rounded to what a picture needs."""
-        return {
+        document: dict[str, Any] = json.loads(self.to_json())
+        return document
+
+    def to_json(self) -> str:
+        """The message ``picture`` of the page's protocol."""
+        document = {
             "type": "picture",
             "seq": self.seq,
             "time_s": _plain(self.time_s),
@@ -157,8 +163,7 @@ class Picture:
             "ambiguous": self.ambiguous,
             "notices": [_fields(notice) for notice in self.notices],
             "people": [_fields(person) for person in self.people],
-            "pairs": [list(_fields(pair).values()) for pair in self.pairs],
-            "ranges": [list(_fields(measured).values()) for measured in self.ranges],
+            "ranges": [(m.node, m.peer, _plain(m.range_m), round(m.age_s, 2)) for m in self.ranges],
             "alternatives": [
                 {
                     "probability": _plain(ghosts.probability),
@@ -167,10 +172,14 @@ class Picture:
                 for ghosts in self.alternatives
             ],
         }
+        # Twenty people make 190 pairs, of which few have changed since the last picture.
+        pairs = ",".join(map(_pair_json, self.pairs))
+        return f'{to_json(document)[:-1]},"pairs":[{pairs}]}}'
 
-    def to_json(self) -> str:
-        """The message ``picture`` of the page's protocol."""
-        return to_json(self.as_dict())
+
+@lru_cache(maxsize=4096)
+def _pair_json(pair: Pair) -> str:
+    return _ENCODE([_plain(getattr(pair, name)) for name in Pair.__slots__])
 
 
 @dataclass(frozen=True)
@@ -198,9 +207,12 @@ class Hello:
         )
 
 
+_ENCODE = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
+
+
 def to_json(document: Mapping[str, Any]) -> str:
     """Compact, and without the NaN that no browser reads."""
-    return json.dumps(document, separators=(",", ":"), allow_nan=False)
+    return _ENCODE(document)
 
 
 def _fields(row: Any) -> dict[str, Any]:
@@ -208,7 +220,7 @@ def _fields(row: Any) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, float):
-        # A tenth of a millimetre and of a milliradian: files and pages need no more.
+    if type(value) is float:
+        # A tenth of a millimetre and of a milliradian: nobody needs more.
         return round(value, 4) if math.isfinite(value) else None
-    return list(value) if isinstance(value, tuple) else value
+    return value
