@@ -405,3 +405,19 @@ def test_an_interrupt_ends_listening_and_keeps_what_was_received(tmp_path: Path)
 
 def test_settings_are_split_at_their_first_equals_sign() -> None:
     assert output.parse_settings(["a=1", " b = x=y "]) == {"a": "1", "b": "x=y"}
+
+
+def test_a_session_at_a_port_never_overwrites_the_one_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    master, slave = pty.openpty()
+    try:
+        for _ in range(2):
+            before = set(tmp_path.glob("out/*"))
+            done = relpos("fuse", os.ttyname(slave), "--seconds", 1.1)
+            assert "Traceback" not in done.output
+            assert len(set(tmp_path.glob("out/*")) - before) == 1
+    finally:
+        os.close(master)
+        os.close(slave)

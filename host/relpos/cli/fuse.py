@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -67,7 +68,10 @@ def fuse(
     smooth: Annotated[bool, typer.Option("--smooth", help="Smooth over the whole run.")] = False,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Where the output goes. (default: out/NAME)"),
+        typer.Option(
+            metavar="DIR",
+            help="Where the output goes. (default: out/NAME, of a port with the time)",
+        ),
     ] = None,
     record: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Record what is received.")
@@ -114,9 +118,7 @@ def fuse(
     if record:
         raise output.not_built_yet("--record")
     options = live.Options(view, view_listen, https, open_browser, seconds, speed)
-    job = Job(
-        source, estimator, chosen, seed, out or Path("out") / _base_name(source), smooth=smooth
-    )
+    job = Job(source, estimator, chosen, seed, out or _default_out(source), smooth=smooth)
     if sources.is_port(source):
         _fuse_port(job, initial, options, key_file, teach=teach, as_json=json)
     elif options.shown:
@@ -162,6 +164,14 @@ class _Outcome:
     estimates: list[Estimate] = field(default_factory=list)
     interrupted: bool = False
     failure: RelposError | None = None
+
+
+def _default_out(source: str) -> Path:
+    """Of a port a new folder each time: a mission must not overwrite the one before."""
+    name = _base_name(source)
+    if sources.is_port(source):
+        name += f"-{datetime.now().astimezone():%Y-%m-%d-%H%M%S}"
+    return Path("out") / name
 
 
 def _base_name(source: str) -> str:

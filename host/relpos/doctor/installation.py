@@ -205,7 +205,7 @@ def _room(computer: Computer, out: Path) -> Finding:
 def _browser(computer: Computer) -> Finding:
     name = "browser"
     found = next((b for b in BROWSERS if computer.which(b)), None)
-    elsewhere = "`--view-listen 0.0.0.0:8600` shows the page on other devices, `--terminal` here"
+    elsewhere = "`--view-listen 0.0.0.0` shows the page on other devices, `--terminal` here"
     if computer.platform in ("win32", "darwin"):
         return well(name, "the system's")
     if found is None:
