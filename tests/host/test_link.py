@@ -15,7 +15,7 @@ from relpos.errors import DeviceError
 from relpos.link import live, xbee
 from relpos.link.clock import NodeClock
 from relpos.link.decoder import Decoder
-from relpos.measurements import Height, Motion, Range, Status
+from relpos.measurements import Heading, Height, Motion, Range, Status
 from relpos.protocol import messages as wire
 
 MOTION_ZERO = dict.fromkeys(wire.MOTION.field, 0)
@@ -141,6 +141,26 @@ def test_a_broken_frame_costs_only_itself_when_escaped():
 
 
 # --- totals to motion --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("over_north_rad", "from_east_rad"),
+    [(0.0, math.pi / 2), (-math.pi / 2, 0.0), (math.pi / 2, math.pi), (math.pi, -math.pi / 2)],
+)
+def test_a_heading_over_magnetic_north_is_told_from_the_worlds_x_axis(
+    over_north_rad, from_east_rad
+):
+    decoder = Decoder()
+    decoder.feed(motion_frame(0, time_s=1), 1.0)
+    told = {
+        "time_s": 2,
+        "magnetic_heading_rad": round(over_north_rad, 4),
+        "quality": wire.Quality.MAGNETOMETER_VALID,
+    }
+    (heading,) = (o for o in decoder.feed(motion_frame(1, **told), 2.0) if isinstance(o, Heading))
+    assert math.remainder(heading.heading_rad - from_east_rad, math.tau) == pytest.approx(
+        0.0, abs=1e-3
+    )
 
 
 def walk(count):

@@ -316,7 +316,12 @@ class Decoder:
         if quality & wire.Quality.MAGNETOMETER_VALID:
             observations.append(
                 Heading(
-                    time_s, node, values["magnetic_heading_rad"], MAGNETIC_SIGMA_RAD, "magnetic"
+                    time_s,
+                    node,
+                    # A node counts from north; everybody else from x, which is east.
+                    math.remainder(values["magnetic_heading_rad"] + 0.5 * math.pi, math.tau),
+                    MAGNETIC_SIGMA_RAD,
+                    "magnetic",
                 )
             )
         track.totals = dict(values)
