@@ -67,6 +67,16 @@ class Stage:
         self._thread = threading.Thread(target=self._play, daemon=True)
         self._thread.start()
 
+    def reset(self, team: WalkingTeam) -> None:
+        """Begin anew with a team that is well."""
+        with self._lock:
+            self.team = team
+            self.frozen = self.mute = False
+            self.observed.clear()
+            self.acknowledged.clear()
+        if self.web is None:
+            self.open()
+
     def open(self) -> None:
         """Start serving, at the same address as before."""
         door, access = listen(f"127.0.0.1:{self._door_port}")

@@ -4,8 +4,8 @@ import { inkOn } from "./colours.js";
 import { arrow, healthSign, make, setAttribute, setText } from "./dom.js";
 import { isPlaced, VAGUE_RAD } from "./relation.js";
 import {
-  ago, clock, compass, compassShort, dbm, distance, HEALTH_WORDS, percent, plusMinus, probability, seconds,
-  STATUS_WORDS, UNKNOWN, volts, whereabouts,
+  ago, compass, compassShort, dbm, distance, HEALTH_WORDS, percent, plusMinus, probability, seconds,
+  STATUS_WORDS, UNKNOWN, volts, whereabouts, whichWay,
 } from "./words.js";
 
 /** What somebody does, in words; empty where all is well and nothing need be said. */
@@ -83,7 +83,7 @@ class Card {
       setText(this.far, relation ? distance(relation.distanceM, relation.sigmaM) : UNKNOWN);
       setText(this.sigma, relation ? plusMinus(relation.sigmaM) : "");
       setText(this.direction, !relation ? "position unknown"
-        : relation.relativeRad === null ? "which way? " : clock(relation.relativeRad));
+        : whichWay(relation));
       setText(this.compass, relation ? compassShort(relation.bearingRad, northKnown) : "");
     }
     setText(this.state, stateWords(person, alarm, shown));

@@ -16,7 +16,7 @@ import { connectionWords, dataAgeS, showConnection } from "./status_line.js";
 import { Team } from "./team.js";
 import { isDark, themeSwitch } from "./theme_switch.js";
 import { ScreenLock } from "./wake_lock.js";
-import { alarmText, clock, compass, distance, plusMinus, side, timeOfDay } from "./words.js";
+import { alarmText, clock, compass, distance, plusMinus, side, timeOfDay, whichWay } from "./words.js";
 
 const CLOCK_EVERY_MS = 60_000;
 const LIST_MS = 250;
@@ -126,7 +126,8 @@ function showTeam() {
     setText(row.far, relation ? `${distance(relation.distanceM, relation.sigmaM)} ` : "–");
     setText(row.sigma, relation ? plusMinus(relation.sigmaM) : "");
     setText(row.where, !relation ? (me ? "position unknown" : "say who you are first")
-      : relation.relativeRad === null ? `direction not known yet · ${compass(relation.bearingRad, team.northKnown)}`
+      : relation.relativeRad === null
+        ? `${whichWay(relation)} · ${compass(relation.bearingRad, team.northKnown)}`
         : `${clock(relation.relativeRad)}, ${side(relation.relativeRad)}`);
     setText(row.state, stateWords(person, alarm, shown));
     row.find.disabled = !me;

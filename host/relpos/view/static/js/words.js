@@ -107,6 +107,12 @@ export function compassShort(bearingRad, northKnown) {
   return northKnown ? short : `map ${short}`;
 }
 
+/** The direction in short: "2 o'clock"; where it is too vague, why that is or does not matter. */
+export function whichWay(relation) {
+  if (relation.relativeRad !== null) return clock(relation.relativeRad);
+  return relation.distanceM < Math.max(1, 2 * relation.sigmaM) ? "close by" : "direction unknown";
+}
+
 /** One line of where somebody is, for lists and for screen readers. */
 export function whereabouts(relation, northKnown) {
   if (!relation) return "position unknown";
@@ -114,7 +120,7 @@ export function whereabouts(relation, northKnown) {
   if (relation.relativeRad !== null) {
     parts.push(`${clock(relation.relativeRad)}, ${side(relation.relativeRad)}`);
   } else {
-    parts.push("direction not known yet");
+    parts.push(whichWay(relation));
   }
   parts.push(compass(relation.bearingRad, northKnown));
   return parts.join(" · ");

@@ -1,0 +1,180 @@
+import { Alarms } from "/static/js/alarms.js";
+import { delayS, judge } from "/static/js/backoff.js";
+import { overlap, placeLabels, placeWhereFree } from "/static/js/labels.js";
+import { Team } from "/static/js/team.js";
+import { MOST_POINTS, Track } from "/static/js/tracks.js";
+import { equal, near, ok, test } from "./check.js";
+
+test("twenty labels in a crowd do not cover each other or a marker", () => {
+  const items = [];
+  for (let k = 0; k < 20; k += 1) {
+    items.push({ id: k, x: 300 + 37 * (k % 5), y: 250 + 31 * Math.floor(k / 5), radius: 15, width: 70, height: 18 });
+  }
+  const placed = placeLabels(items, [800, 600]);
+  equal(placed.size, 20);
+  const boxes = [...placed.values()].map((p) => p.box);
+  boxes.forEach((a, k) => {
+    for (const b of boxes.slice(k + 1)) near(overlap(a, b), 0);
+    for (const item of items) {
+      near(overlap(a, [item.x - 15, item.y - 15, 30, 30]), 0);
+    }
+    ok(a[0] >= 0 && a[1] >= 0 && a[0] + a[2] <= 800 && a[1] + a[3] <= 600);
+  });
+});
+
+test("a label stays on its side as long as there is room", () => {
+  const item = { id: 1, x: 100, y: 100, radius: 10, width: 50, height: 20 };
+  const left = placeLabels([item], [400, 400], new Map([[1, 1]])).get(1);
+  equal(left.candidate, 1);
+  ok(left.box[0] + left.box[2] < 100);
+  // On the border there is none on that side.
+  const moved = placeLabels([{ ...item, x: 20 }], [400, 400], new Map([[1, 1]])).get(1);
+  equal(moved.candidate, 0);
+});
+
+test("what finds no room is left out rather than drawn over", () => {
+  const box = [10, 10, 30, 10];
+  const found = placeWhereFree([{ id: "a", places: [box] }, { id: "b", places: [box, [60, 10, 30, 10]] },
+    { id: "c", places: [box] }], [200, 100], []);
+  equal([...found.keys()], ["a", "b"]);
+  equal(found.get("b"), [60, 10, 30, 10]);
+});
+
+test("a track keeps steps, not jitter", () => {
+  const track = new Track();
+  ok(track.add(0, 0, 0));
+  ok(!track.add(1, 0.1, 0.1));
+  ok(track.add(2, 1, 0));
+  ok(!track.add(1.5, 5, 0), "time does not run backwards");
+  ok(!track.add(3, NaN, 0));
+  equal(track.points.length, 2);
+});
+
+test("a picture that changes its mind leaves no line", () => {
+  const track = new Track();
+  track.add(0, 0, 0);
+  track.add(1, 1.2, 0);
+  track.add(2, 20, 0);
+  track.add(3, 21.2, 0);
+  equal(track.points.map((p) => p[3]), [true, false, true, false]);
+});
+
+test("hours of walking stay bounded and keep their newest part whole", () => {
+  const track = new Track();
+  for (let k = 0; k < 20000; k += 1) track.add(k, k, 0);
+  ok(track.points.length <= MOST_POINTS, String(track.points.length));
+  const newest = track.points.slice(-500).map((p) => p[0]);
+  equal(newest, Array.from({ length: 500 }, (_, k) => 19500 + k));
+  ok(track.redrawn > 0);
+  near(track.points[0][0], 0);
+});
+
+test("the part of a track since a time is found", () => {
+  const track = new Track();
+  for (let k = 0; k < 10; k += 1) track.add(k, k, 0);
+  equal([track.since(-1), track.since(4), track.since(4.5), track.since(99)], [0, 4, 5, 10]);
+});
+
+const still = (node, alert, still_s, more = {}) => ({ node, name: `N${node}`, alert, still_s, seen_s: 1, ...more });
+
+test("a warning that becomes an alarm has to be acknowledged anew", () => {
+  const alarms = new Alarms();
+  equal(alarms.update([still(1, "still_warning", 20)]).raised.length, 1);
+  equal(alarms.sounding, "warning");
+  equal(alarms.update([still(1, "still_warning", 21)]).raised.length, 0);
+  alarms.acknowledge(1);
+  equal(alarms.sounding, null);
+  equal(alarms.update([still(1, "still_warning", 22)]).raised.length, 0);
+  equal(alarms.update([still(1, "still_alarm", 30)]).raised.length, 1);
+  equal(alarms.sounding, "alarm");
+  equal(alarms.list()[0].seconds, 30);
+});
+
+test("what somebody else has acknowledged is silent here", () => {
+  const alarms = new Alarms();
+  equal(alarms.update([still(1, "lost", 0, { acknowledged: true })]).raised.length, 0);
+  equal(alarms.sounding, null);
+  equal(alarms.list().length, 1);
+});
+
+test("whoever moves again is told once", () => {
+  const alarms = new Alarms();
+  alarms.update([still(1, "still_alarm", 40), still(2, "lost", 0)]);
+  const { cleared } = alarms.update([still(1, null, 0), still(2, "lost", 0)]);
+  equal(cleared.map((a) => a.node), [1]);
+  equal(alarms.update([still(1, null, 0), still(2, "lost", 0)]).cleared.length, 0);
+  equal(alarms.list().map((a) => a.node), [2]);
+});
+
+test("the worst alarm comes first", () => {
+  const alarms = new Alarms();
+  alarms.update([still(1, "still_warning", 25), still(2, "still_alarm", 31), still(3, "still_alarm", 90)]);
+  alarms.acknowledge(3);
+  equal(alarms.list().map((a) => a.node), [2, 1, 3]);
+});
+
+const HELLO = { type: "hello", protocol: 1, session: { name: "a", started_unix_s: 5 }, limits: {} };
+const person = (node, x_m, more = {}) => ({ node, name: `N${node}`, x_m, y_m: 0, status: "ok", ...more });
+
+test("another session begins with an empty map, a reconnection does not", () => {
+  const team = new Team();
+  team.take(HELLO);
+  team.take({ type: "picture", seq: 1, time_s: 1, people: [person(1, 0)] });
+  team.take(HELLO);
+  equal(team.people.size, 1);
+  team.take({ ...HELLO, session: { name: "b", started_unix_s: 6 } });
+  equal(team.people.size, 0);
+  equal(team.tracks.size, 0);
+});
+
+test("a server of another protocol, or an unknown message, is noticed", () => {
+  const team = new Team();
+  equal(team.take({ ...HELLO, protocol: 2 }), "unknown");
+  equal(team.take({ type: "surprise" }), "unknown");
+  equal(team.take(null), "unknown");
+  equal(team.take({ type: "ping" }), "ping");
+});
+
+test("only what is believed leaves a track", () => {
+  const team = new Team();
+  team.take(HELLO);
+  ["ok", "ambiguous", "lost", "unlocated", "stale"].forEach((status, k) => {
+    team.take({ type: "picture", seq: k, time_s: k, people: [person(1, k, { status })] });
+  });
+  equal(team.tracks.get(1).points.map((p) => p[1]), [0, 4]);
+});
+
+test("the shown picture is told from the other possible ones", () => {
+  const team = new Team();
+  team.take(HELLO);
+  const ghost = (node, x_m, shape = "ellipse") => ({ node, x_m, y_m: 0, shape, sigma_major_m: 3, sigma_minor_m: 0.2 });
+  team.take({
+    type: "picture", seq: 1, time_s: 1, ambiguous: true,
+    people: [person(1, 0), person(2, 10), person(3, null, { status: "unlocated" })],
+    alternatives: [
+      { probability: 0.3, people: [ghost(1, 0), ghost(2, -10), ghost(3, 1, "ring")] },
+      { probability: 0.7, people: [ghost(1, 0), ghost(2, 10), ghost(3, 5, "ring")] },
+    ],
+  });
+  const { shown, ghosts, rings } = team.otherPictures();
+  near(shown.probability, 0.7);
+  equal(ghosts.map((g) => g.probability), [0.3]);
+  equal(rings.map((r) => [r.node, r.x_m]), [[3, 5]]);
+});
+
+test("somebody without a name is called by his number", () => {
+  const team = new Team();
+  team.take({ type: "picture", seq: 1, time_s: 1, people: [person(4, 0, { name: "" })] });
+  equal(team.person(4).name, "Node 4");
+});
+
+test("attempts become rarer, never rarer than twelve seconds", () => {
+  const delays = [0, 1, 2, 3, 4, 5, 50].map((n) => delayS(n, 0.5));
+  equal(delays, [0.5, 1, 2, 4, 8, 10, 10]);
+  ok(delayS(50, 0.999) < 12);
+  ok(delayS(0, 0) > 0.3);
+});
+
+test("silence is told from loss", () => {
+  equal([0, 2.1, 5, 9.9, 10].map(judge), ["live", "live", "silent", "silent", "dead"]);
+});
