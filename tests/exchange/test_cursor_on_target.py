@@ -215,10 +215,10 @@ def test_an_emergency_needs_no_position(schedule: Schedule) -> None:
     assert "position unknown" in alarm.words("remarks")
 
 
-def test_an_emulated_team_says_so() -> None:
-    events = due(Schedule(Callsigns("test"), emulated=True), picture(), 0.0)
+def test_an_emulated_or_replayed_team_says_so() -> None:
+    events = due(Schedule(Callsigns("test"), exercise=True), picture(), 0.0)
     assert {event.how for event in events.values()} == {"m-s"}
-    assert all("EMULATED" in event.words("remarks") for event in events.values())
+    assert all("EXERCISE" in event.words("remarks") for event in events.values())
 
 
 def test_a_name_that_xml_cannot_hold_is_sent_without_the_rest(schedule: Schedule) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from relpos.cli import live
 from relpos.errors import DataError
 
 
@@ -27,13 +28,6 @@ class KindName(StrEnum):
 
     TRUTH = "truth"
     ESTIMATE = "estimate"
-
-
-PINS = "LAT,LON[,BEARING[,ALTITUDE]][@POINT]"
-PIN_HELP = (
-    "A known place: latitude, longitude, the compass bearing that world x points to, the altitude "
-    "of z = 0 over WGS84. POINT is what lies there: X,Y or NODE or NODE:TIME (default 0,0). "
-)
 
 
 def convert(
@@ -67,10 +61,7 @@ def convert(
             "truth.",
         ),
     ] = None,
-    pins: Annotated[
-        list[str] | None,
-        typer.Option("--pin", metavar=PINS, help=PIN_HELP + "Two or more give the bearing."),
-    ] = None,
+    pins: live.Pins = None,
     start: Annotated[
         str | None,
         typer.Option(metavar="TIME", help="When the run's second 0 was: 2026-05-04T09:30:00Z."),
@@ -101,7 +92,7 @@ def convert(
     placed = tuple(parse_pin(pin) for pin in pins or ())
     if wanted in (formats.Format.GEOJSON, formats.Format.GPX) and not placed:
         raise typer.BadParameter(
-            f"{to} is a map's: say where one position lies ({PINS})", param_hint="--pin"
+            f"{to} is a map's: say where one position lies ({live.PINS})", param_hint="--pin"
         )
     if out.resolve() == source.resolve():
         raise DataError(f"{out}: that is SOURCE itself; name another place (--out)")

@@ -57,22 +57,33 @@ def demo(
     view_listen: live.ViewListen = None,
     https: live.Https = False,
     open_browser: live.OpenBrowser = None,
+    terminal: live.Terminal = False,
     json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
 ) -> None:
     """Run the production firmware of an emulated team and show who was where.
 
-    With --view the team walks in real time behind the live page; Ctrl-C ends it.
+    With --view the team walks in real time behind the live page, with --terminal in this
+    terminal; Ctrl-C ends it.
     """
     from relpos.emulator.team import record_team
     from relpos.runs import save_run
 
     faults = check_faults(fault, nodes)
-    job = fuse.Job("emulated" if view else str(out / "run"), BANK, {}, seed, out)
-    if view:
+    shown = view or terminal
+    job = fuse.Job("emulated" if shown else str(out / "run"), BANK, {}, seed, out)
+    if shown:
         from relpos.emulator.rehearsal import Cast
 
         cast = Cast(nodes, seconds, scenario, seed, str(board), faults)
-        _perform(cast, job, live.Options(view, view_listen, https, open_browser), as_json=json)
+        options = live.Options(
+            view,
+            view_listen,
+            https,
+            open_browser,
+            sinks=[live.terminal_sink(None)] if terminal else [],
+            screen=terminal,
+        )
+        _perform(cast, job, options, as_json=json)
         return
     with output.working(f"emulating {nodes} nodes for {seconds:g} s"):
         run = record_team(

@@ -80,6 +80,10 @@ def fuse(
     view_listen: live.ViewListen = None,
     https: live.Https = False,
     open_browser: live.OpenBrowser = None,
+    terminal: live.Terminal = False,
+    me: live.Me = None,
+    cot: live.Cot = None,
+    pins: live.Pins = None,
     seconds: Annotated[
         float | None,
         typer.Option(min=0.0, help="Listen to a port, or show a recording, this long, then end."),
@@ -117,7 +121,15 @@ def fuse(
     chosen = output.parse_settings(settings or [])
     if record:
         raise output.not_built_yet("--record")
-    options = live.Options(view, view_listen, https, open_browser, seconds, speed)
+    sinks: list[live.MakeSink] = []
+    if terminal:
+        sinks.append(live.terminal_sink(me))
+    if cot is not None:
+        replayed = not sources.is_port(source)
+        sinks.append(live.cot_sink(cot, pins or (), replayed=replayed))
+    options = live.Options(
+        view, view_listen, https, open_browser, seconds, speed, sinks, screen=terminal
+    )
     job = Job(source, estimator, chosen, seed, out or _default_out(source), smooth=smooth)
     if sources.is_port(source):
         _fuse_port(job, initial, options, key_file, teach=teach, as_json=json)

@@ -6,6 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -48,6 +49,31 @@ OpenBrowser = Annotated[
     ),
 ]
 
+Terminal = Annotated[
+    bool, typer.Option("--terminal", help="Show table and map in this terminal, also over ssh.")
+]
+Me = Annotated[
+    int | None,
+    typer.Option(
+        metavar="NODE", help="From whom --terminal measures at first. (default: the first)"
+    ),
+]
+Cot = Annotated[
+    str | None,
+    typer.Option(
+        metavar="URL",
+        help="Send the team as Cursor-on-Target, to ATAK, WinTAK or a server: "
+        "udp://239.2.3.1:6969, tcp://HOST:PORT or tls://HOST:PORT; needs --pin.",
+    ),
+]
+PINS = "LAT,LON[,BEARING[,ALTITUDE]][@POINT]"
+PIN_HELP = (
+    "A known place: latitude, longitude, the compass bearing that world x points to, the altitude "
+    "of z = 0 over WGS84. POINT is what lies there: X,Y or NODE or NODE:TIME (default 0,0). Two or "
+    "more pins give the bearing."
+)
+Pins = Annotated[list[str] | None, typer.Option("--pin", metavar=PINS, help=PIN_HELP)]
+
 MakeSink = Callable[["Hello"], "Sink"]
 """Makes a sink once the session's name, source and start are known."""
 
@@ -67,6 +93,8 @@ class Options:
     seconds: float | None = None
     speed: float = 1.0
     sinks: Sequence[MakeSink] = field(default_factory=tuple)
+    screen: bool = False
+    """The terminal is drawn upon: nothing else may be printed until the session is over."""
 
     @property
     def shown(self) -> bool:
@@ -117,6 +145,7 @@ def run(
         namings.append(page)
         visitors = page
     sinks += [make(hello) for make in options.sinks]
+    later: list[str] = []
     session = Session(
         source,
         fusing,
@@ -126,15 +155,48 @@ def run(
         namings=namings,
         seconds=options.seconds,
         lasts=options.shown,
-        remark=output.remark,
+        remark=later.append if options.screen else output.remark,
     )
-    for _ in output.with_progress(session.run(), None, "received"):
+    observations = session.run()
+    for _ in (
+        observations if options.screen else output.with_progress(observations, None, "received")
+    ):
         pass
     try:
-        with output.working("finishing"):
+        with nullcontext() if options.screen else output.working("finishing"):
             return session.finish()
     except KeyboardInterrupt:
         return session.finish(abandon=True)
+    finally:
+        for words in dict.fromkeys(later):
+            output.remark(words)
+
+
+def terminal_sink(me: int | None) -> MakeSink:
+    """Draw table and map on stdout."""
+
+    def make(hello: Hello) -> Sink:
+        from relpos.view.terminal import TerminalView
+
+        return TerminalView(me, title=f"relpos {hello.source}")
+
+    return make
+
+
+def cot_sink(url: str, pins: Sequence[str], *, replayed: bool) -> MakeSink:
+    """Send to TAK's screens; DataError at once where URL or pins cannot work."""
+    from relpos.geodesy import parse_pin
+    from relpos.live.cot import CotSender, PinnedFrame, check_url
+
+    check_url(url)
+    placed = [parse_pin(pin) for pin in pins]
+    for words in PinnedFrame(placed).remarks:
+        output.remark(words)
+
+    def make(hello: Hello) -> Sink:
+        return CotSender(url, placed, exercise=hello.emulated or replayed)
+
+    return make
 
 
 def _open_page(options: Options, hello: Hello) -> WebView:

@@ -72,9 +72,9 @@ def default_prefix() -> str:
 class Schedule:
     """Which events are due: pure, but for what was sent before."""
 
-    def __init__(self, calls: Callsigns, *, emulated: bool = False) -> None:
+    def __init__(self, calls: Callsigns, *, exercise: bool = False) -> None:
         self._calls = calls
-        self._emulated = emulated
+        self._exercise = exercise
         self._sent_s: dict[int, float] = {}
         self._alarm_sent_s: dict[int, float] = {}
         self._moved: dict[int, Moved] = {}
@@ -127,7 +127,7 @@ class Schedule:
             self._calls,
             sigma_z_m=sigma_z_m,
             before=self._moved.get(node),
-            emulated=self._emulated,
+            exercise=self._exercise,
         )
         if event is not None:
             self._seen_seq[node] = picture.seq
@@ -151,7 +151,7 @@ class Schedule:
             self._calls,
             over=over,
             sigma_z_m=sigma_z_m,
-            emulated=self._emulated,
+            exercise=self._exercise,
         )
 
 
@@ -229,7 +229,7 @@ class CotSender(QuietSink):
         pins: Sequence[Pin],
         *,
         prefix: str | None = None,
-        emulated: bool = False,
+        exercise: bool = False,
     ) -> None:
         """Begin to connect; DataError or RelposError where that can never work."""
         self._shown = url
@@ -245,7 +245,7 @@ class CotSender(QuietSink):
         # Its loggers write to stderr by themselves; what is wrong is told by trouble().
         for name in ("pytak.classes", "pytak.client_functions", "pytak"):
             logging.getLogger(name).disabled = True
-        self._schedule = Schedule(Callsigns(prefix or default_prefix()), emulated=emulated)
+        self._schedule = Schedule(Callsigns(prefix or default_prefix()), exercise=exercise)
         self._picture: Picture | None = None
         self._sigma_z_m: dict[int, float] = {}
         self._trouble: str | None = f"{url}: not connected yet"

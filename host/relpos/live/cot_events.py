@@ -5,7 +5,8 @@ What goes where in an event (base schema 2.0), and what this project puts there:
 - ``uid`` names the member for good, an emergency's is the member's with ``-9-1-1``, as ATAK's own;
 - ``type`` a-f-G-U-C, a friendly unit on the ground; b-a-o-tbl an emergency, b-a-o-can its end;
 - ``how`` m-g while the position is measured and fresh: what TAK's clients know as a moving member.
-  h-e, estimated, where it is ambiguous, or of somebody who is not heard any more;
+  h-e, estimated, where it is ambiguous, or of somebody who is not heard any more. m-s, simulated,
+  and EXERCISE in the remarks, of teams that are emulated or replayed;
 - ``start`` is when the member was last heard, ``stale`` ``STALE_S`` later: then clients grey it;
 - ``ce`` and ``le`` are the radius, and the height up and down, that hold the member with 90 %
   probability (CE90 and LE90, as TAK's clients take them), of the picture alone: by how much the
@@ -74,7 +75,7 @@ def member(
     *,
     sigma_z_m: float | None = None,
     before: Moved | None = None,
-    emulated: bool = False,
+    exercise: bool = False,
 ) -> ET.Element | None:
     """Return the event of one member; None of whom no position or sign of life is known."""
     if person.seen_s is None or not _placed(person):
@@ -87,7 +88,7 @@ def member(
         ET.Element("contact", callsign=text(person.name)),
         ET.Element("uid", Droid=text(person.name)),
         ET.Element("__group", name="Red", role="Team Member"),
-        _remarks(person, emulated),
+        _remarks(person, exercise),
     ]
     if person.heading_rad is not None and fresh:
         course_deg = frame.course_deg(person.heading_rad)
@@ -96,7 +97,7 @@ def member(
     event: ET.Element = pytak.cot_event(
         uid=calls.uid(person.node),
         cot_type=MEMBER,
-        how="m-s" if emulated else "m-g" if fresh else "h-e",
+        how="m-s" if exercise else "m-g" if fresh else "h-e",
         point=_point(person, frame, sigma_z_m),
         detail=pytak.cot_detail(*details, flow_tag=False),
     )
@@ -111,7 +112,7 @@ def emergency(
     *,
     over: bool = False,
     sigma_z_m: float | None = None,
-    emulated: bool = False,
+    exercise: bool = False,
 ) -> ET.Element:
     """Return the event that somebody lies still, or does no longer.
 
@@ -126,13 +127,13 @@ def emergency(
     event: ET.Element = pytak.cot_event(
         uid=f"{calls.uid(person.node)}-9-1-1",
         cot_type=EMERGENCY_OVER if over else EMERGENCY,
-        how="m-s" if emulated else "m-g" if person.status == "ok" else "h-e",
+        how="m-s" if exercise else "m-g" if person.status == "ok" else "h-e",
         point=_point(person, frame, sigma_z_m),
         detail=pytak.cot_detail(
             link,
             ET.Element("contact", callsign=f"{name}-Alert"),
             said,
-            _remarks(person, emulated),
+            _remarks(person, exercise),
             flow_tag=False,
         ),
     )
@@ -209,11 +210,11 @@ def _point(person: Person, frame: MapFrame, sigma_z_m: float | None) -> ET.Eleme
     return there
 
 
-def _remarks(person: Person, emulated: bool) -> ET.Element:
+def _remarks(person: Person, exercise: bool) -> ET.Element:
     """Say in words what the symbol cannot."""
     words = []
-    if emulated:
-        words.append("EMULATED")
+    if exercise:
+        words.append("EXERCISE")
     if person.alert is Alert.STILL_ALARM:
         words.append(f"LIES STILL for {person.still_s:.0f} s")
     if not _placed(person):

@@ -107,10 +107,12 @@ class TerminalView(QuietSink):
         from rich.console import Console
 
         self._follow(picture)
+        columns, rows = 100, len(picture.people) + 26
+        if self._screen:
+            columns, rows = os.get_terminal_size(self._stream.fileno())
         console = Console(
             file=self._stream, force_terminal=self._screen or None, legacy_windows=False
         )
-        columns, rows = console.size if self._screen else (100, len(picture.people) + 26)
         looks = replace(self._looks, columns=columns, rows=rows, trails=self._trails)
         lines = page(picture, looks)
         bell = self._bell(picture) if self._screen else ""
@@ -129,7 +131,7 @@ class TerminalView(QuietSink):
             bell += "\x1b[2J"
         before = self._drawn or [""] * len(drawn)
         changed = "".join(
-            f"\x1b[{row};1H{line}\x1b[K"
+            f"\x1b[{row};1H\x1b[K{line}"
             for row, (line, old) in enumerate(zip(drawn, before, strict=True), start=1)
             if line != old
         )

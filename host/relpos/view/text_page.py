@@ -384,15 +384,16 @@ class Canvas:
             cell = (column // 2, row // 4)
             self._dots[cell] = self._dots.get(cell, 0) | bit
 
-    def write(self, x: float, y: float, words: str) -> bool:
-        """Write words with their first character at a dot; whether that is in the field."""
-        column, row = math.floor(x / 2), math.floor(y / 4)
-        inside = 0 <= column < self.columns and 0 <= row < self.rows
-        column = min(max(column, 0), self.columns - len(words))
-        row = min(max(row, 0), self.rows - 1)
-        for k, letter in enumerate(words):
-            self._words[column + k, row] = letter
-        return inside
+    def write(self, x: float, y: float, words: str, *, over: bool = True) -> None:
+        """Write words with their first character at a dot; at the border what is beyond it.
+
+        Where there are words already, ``over`` says whether these replace them.
+        """
+        column = min(max(math.floor(x / 2), 0), self.columns - len(words))
+        row = min(max(math.floor(y / 4), 0), self.rows - 1)
+        places = [(column + k, row) for k in range(len(words))]
+        if over or not any(place in self._words for place in places):
+            self._words.update(zip(places, words, strict=True))
 
     def lines(self) -> list[str]:
         """Return the rows of characters."""
@@ -412,8 +413,8 @@ class Canvas:
 
 
 def _map(picture: Picture, me: Person | None, looks: Looks, columns: int, rows: int) -> list[Text]:
-    """Return the map: me in the middle, y (or where I face) up, a scale at the lower left."""
-    canvas = Canvas(columns, rows, utf8=looks.utf8)
+    """Return the map: me in the middle, y (or where I face) up, a scale below."""
+    canvas = Canvas(columns, rows - 1, utf8=looks.utf8)
     middle = _xy(me) if me is not None else None
     places = {p.node: xy for p in picture.people if (xy := _xy(p)) is not None}
     if middle is None and places:
@@ -452,14 +453,13 @@ def _map(picture: Picture, me: Person | None, looks: Looks, columns: int, rows: 
     for ghosts in picture.alternatives[:4]:
         for ghost in ghosts.people:
             if ghost.shape != "ring" and _is_ambiguous(ghost.node, picture):
-                canvas.write(*_label(at(ghost.x_m, ghost.y_m), f"{ghost.node}?"))
+                canvas.write(*_label(at(ghost.x_m, ghost.y_m), f"{ghost.node}?"), over=False)
     for person in sorted(picture.people, key=_urgency, reverse=True):
         if person.node in places and not (person.status == "ambiguous" and picture.alternatives):
             mark = {0: "!", 1: "!", 2: "!"}.get(_urgency(person), "")
             words = f"{person.node}{mark}" + _faces(person, turn, looks)
             canvas.write(*_label(at(*places[person.node]), words))
-    _scale(canvas, dots_per_m, looks)
-    return [_line(line, looks) for line in canvas.lines()]
+    return [_line(line, looks) for line in (*canvas.lines(), _scale(canvas, dots_per_m, looks))]
 
 
 def _label(at: tuple[float, float], words: str) -> tuple[float, float, str]:
@@ -515,16 +515,15 @@ def _faces(person: Person, turn: float, looks: Looks) -> str:
     return _arrow(_wrapped(person.heading_rad + turn - 0.5 * math.pi), looks)
 
 
-def _scale(canvas: Canvas, dots_per_m: float, looks: Looks) -> None:
-    """Draw a scale bar of 1, 2 or 5 times a power of ten, at most a quarter of the width."""
+def _scale(canvas: Canvas, dots_per_m: float, looks: Looks) -> str:
+    """Return a scale bar of 1, 2 or 5 times a power of ten, at most a quarter of the width."""
     most_m = 0.25 * canvas.width / dots_per_m
     power = 10.0 ** math.floor(math.log10(most_m))
     length_m = next(f * power for f in (5.0, 2.0, 1.0) if f * power <= most_m)
     cells = max(round(length_m * dots_per_m / 2.0), 2)
     ends, line = ("├┤", "─") if looks.utf8 else ("||", "-")
     up = "up: where I face" if looks.heading_up else "up: y"
-    words = f"{ends[0]}{line * (cells - 2)}{ends[1]} {length_m:g} m  {up}"
-    canvas.write(0, canvas.height - 1, words[: canvas.columns])
+    return f"{ends[0]}{line * (cells - 2)}{ends[1]} {length_m:g} m  {up}"
 
 
 def _line(words: str, looks: Looks, style: str = "") -> Text:
