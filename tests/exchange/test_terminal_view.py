@@ -151,7 +151,7 @@ def test_my_face_is_up_when_it_is_wanted() -> None:
     # I face x; who is ahead of me, at larger x, is above me then.
     shown = picture(changes={1: {"heading_rad": 0.0}})
     drawn = lines(shown, me=1, rows=40, table=False, heading_up=True)
-    rows = {int(m[1]): k for k, line in enumerate(drawn) for m in re.finditer(r"([12])[↑-↙]", line)}
+    rows = {int(m[1]): k for k, line in enumerate(drawn) for m in re.finditer(r"([12])[←-↙]", line)}
     assert rows[2] < rows[1]
     assert any("up: where I face" in line for line in drawn)
 
@@ -162,7 +162,7 @@ def test_zoom_changes_the_scale_and_loses_nobody() -> None:
     scale = [float(re.findall(r"┤ ([\d.]+) m", text)[0]) for text in (wide, near)]
     assert scale[0] > scale[1]
     # Who is beyond the border stands at it.
-    assert all(re.search(rf"(?m){node}[↑-↙]", near) for node in (1, 2, 3, 4))
+    assert all(re.search(rf"(?m){node}[←-↙]", near) for node in (1, 2, 3, 4))
 
 
 def test_where_not_everybody_fits_those_in_need_stay_and_the_rest_turns() -> None:
