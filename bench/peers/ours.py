@@ -61,7 +61,7 @@ class JointAlone(Joint):
         """Move everybody by told noise."""
         moved = np.empty((len(motion), 7))
         moved[:, :3], moved[:, 3] = motion, self.ones
-        moved[:, 4:] = self.base(*motion.T, self.ones, sigma)
+        moved[:, 4:] = self.base(np.ascontiguousarray(moved[:, :4]), sigma)
         self.kernels.advance(
             *self.state[:2], self.core.level, self.state[3], self.rows, moved, self.drawn, 0.0, 0.0
         )

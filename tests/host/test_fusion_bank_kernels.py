@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from relpos.fusion import joint, lanes, noise
+from relpos.fusion import bank_kernels, hypotheses, joint, lanes, noise, slips
 from relpos.fusion.joint import PER_NODE, Of
+from relpos.fusion.twins import bank as small
 from relpos.fusion.twins import joint as twins
 
 Floats = np.ndarray
@@ -288,3 +289,78 @@ def test_levels_of_noise_are_learned_from_innovations_and_their_uncertainty_is_h
     assert np.abs(np.mean(errors, axis=0)).max() < 0.6
     assert np.mean(sigmas) < 0.5
     assert 0.6 < ratio < 1.6
+
+
+# -- the small ones --------------------------------------------------------------------------------
+
+
+def test_bases_of_noise_are_the_twins() -> None:
+    rng = np.random.default_rng(20)
+    moves = rng.normal(size=(40, 4)) * (0.5, 0.5, 1.0, 1.0)
+    moves[:, 3] = np.abs(moves[:, 3])
+    moves[0] = 0.0
+    told = np.where(rng.random((40, 3)) < 0.5, np.nan, np.abs(rng.normal(size=(40, 3))))
+    expected = small.motion_variances(*moves.T, told)
+    assert noise.motion_variances(moves, told) == pytest.approx(expected, rel=1e-12)
+    untold = small.motion_variances(*moves.T, np.full((40, 3), np.nan))
+    assert noise.motion_variances(moves, np.empty((0, 3))) == pytest.approx(untold, rel=1e-12)
+
+
+@pytest.mark.parametrize("nodes", [1, 2, 7])
+def test_a_pictures_bend_is_the_twins(nodes: int) -> None:
+    rng = np.random.default_rng(nodes)
+    root = rng.normal(size=(5 * nodes, 5 * nodes)) * 0.2
+    mean, covariance = rng.normal(size=5 * nodes) * 4.0, root @ root.T
+    metre = rng.uniform(0.05, 0.5, nodes)
+    assert hypotheses.bend(mean, covariance, 0.2, metre) == pytest.approx(
+        small.bend(mean, covariance, 0.2, metre), rel=1e-12
+    )
+
+
+def test_cumulative_sums_are_the_twins_until_and_after_an_alarm() -> None:
+    rng = np.random.default_rng(22)
+    watch = slips.Watch()
+    for _ in range(5):
+        watch.add_node()
+    sums, base, alarms = [0.0] * 5, 1.0, 0
+    for instant in range(300):
+        pairs = [(0, 1), (1, 2), (3, 1), (2, 4), (0, 3)][: rng.integers(1, 6)]
+        grown = np.array([8.0 if instant % 100 > 80 and 1 in pair else 1.0 for pair in pairs])
+        square, worth = rng.chisquare(1, len(pairs)) * grown, rng.uniform(0.1, 1.0, len(pairs))
+        ends = np.array(pairs)
+        slipped = watch.look(
+            np.ascontiguousarray(ends[:, 0]), np.ascontiguousarray(ends[:, 1]), square, worth, 0.02
+        )
+        sums, base, expected = small.look(
+            sums, base, pairs, square.tolist(), worth.tolist(), 0.02, slips.TEAM_ALARM
+        )
+        assert slipped == (None if expected < 0 else expected)
+        assert watch.sums == pytest.approx(sums)
+        assert float(watch.base[0]) == pytest.approx(base)
+        alarms += expected >= 0
+    assert alarms > 1
+
+
+def test_weights_sum_to_one_and_count_nothing_beyond_the_last_hypothesis() -> None:
+    logs = np.random.default_rng(23).normal(size=(2, lanes.LANES)) * 3.0 - 400.0
+    expected = np.exp(logs.ravel()[:11] - logs.ravel()[:11].max())
+    expected /= expected.sum()
+    weight = np.empty_like(logs)
+    effective = bank_kernels.normalise(logs, 11, weight)
+    assert weight.ravel()[:11] == pytest.approx(expected)
+    assert (weight.ravel()[11:] == 0.0).all()
+    assert effective == pytest.approx(1.0 / (expected @ expected))
+    assert logs.ravel()[:11].max() == 0.0
+
+
+def test_levels_are_drawn_by_what_is_known_of_them() -> None:
+    rng = np.random.default_rng(24)
+    draw, mean, root = rng.normal(size=(11, 7)), rng.normal(size=7), rng.normal(size=(7, 7))
+    covariance = root @ root.T
+    level, sigma2 = lanes.empty_lines(2, 2, noise.LEVELS), lanes.empty_lines(2)
+    bank_kernels.spread_levels(draw, mean, covariance, 0.5, level, sigma2)
+    sd = np.minimum(0.5 * np.sqrt(covariance.diagonal()), noise.SPREAD_MOST)
+    expected = np.exp(mean + sd * draw)
+    back = level.reshape(2, 6, lanes.LANES).transpose(0, 2, 1).reshape(-1, 6)[:11]
+    assert back == pytest.approx(expected[:, :-1])
+    assert sigma2.ravel()[:11] == pytest.approx(expected[:, -1])

@@ -279,10 +279,7 @@ class Bank:
 
     def _make(self, rows: Indices, moves: Floats, told: Floats | None, some: slice) -> None:
         """Make some of the displacements ``rows`` (M,), ``moves`` (M, 4)."""
-        dx, dy, dtheta, duration = moves[some].T
-        self.core.advance(
-            rows[some], dx, dy, dtheta, duration, None if told is None else told[some]
-        )
+        self.core.move(rows[some], moves[some], None if told is None else told[some])
 
     def _range(self, step: Ranging) -> None:
         for r in step.ranges:

@@ -6,11 +6,12 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion import hypotheses, joint, lanes, noise
+from relpos.fusion import bank_kernels, hypotheses, joint, lanes, noise
 from relpos.fusion.bank_settings import BankSettings
 from relpos.fusion.detection import STEP_M, Detection
 from relpos.fusion.joint import PER_NODE, Of
@@ -29,6 +30,7 @@ Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 _TWO_PI = 2.0 * math.pi
+_UNTOLD: Floats = np.empty((0, 3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +69,7 @@ class BankCore:
         self.counters: Counter[str] = Counter()
         count = settings.hypotheses
         self.nodes = 0
-        self.arm: Floats = np.zeros((0, 2))
-        """Each user's antenna, (forward, left) of its pose, metres."""
+        self._set_arms(np.zeros((0, 2)))
         self.count = count
         """K, the number of hypotheses."""
         self._x, self._p = joint.pack(np.zeros((count, 1)), np.zeros((count, 1, 1)), 0)
@@ -76,6 +77,10 @@ class BankCore:
         self.levels = noise.Levels()
         self.draw: Floats = self.rng.standard_normal((count, 1))
         self._sens: Floats = lanes.empty_lines(lanes.blocks_of(count), 0, noise.LEVELS, 6)
+        self.level = lanes.empty_lines(0, 0, noise.LEVELS)
+        """How much noisier each user is than the bases of noise (B, N, 3, LANES)."""
+        self.sigma2 = lanes.empty_lines(0)
+        """Variance of a range (B, LANES), m^2."""
         self._spread_levels()
         self.has_constants: Floats = (
             self.rng.permutation(count) < round(settings.constants * count)
@@ -83,6 +88,7 @@ class BankCore:
         self.has_bias: Floats = (
             self.rng.permutation(count) < round(settings.biased * count)
         ).astype(np.float64)
+        self._some_biased = bool(self.has_bias.any())
         self._p[:, 0] = self._in_lanes(self.has_bias) * settings.bias_m**2
         self.biases: dict[tuple[int, int], int] = {}
         """Pair of rows, the lower first -> place of its range bias in the state."""
@@ -104,6 +110,7 @@ class BankCore:
         self.unambiguous = 0
         """For so many instants of ranges the picture has been so."""
         self._alarm: tuple[int, Indices, Indices, Floats] | None = None
+        self._outlier = np.array([0.0, settings.outlier_m**2, settings.outliers_short, 0.0])
         self.outlier_counts: Floats = np.array([settings.outliers, 1.0 - settings.outliers]) * 20.0
 
     # -- users ---------------------------------------------------------------------------------
@@ -127,6 +134,15 @@ class BankCore:
     def lines(self) -> tuple[Floats, Floats, Floats, Floats]:
         """Means, covariances, log weights and sensitivities as kernels take them, to work in."""
         return self._x, self._p, self._log_weight, self._sens
+
+    def _check(self, first: Indices, second: Indices, *values: Floats) -> None:
+        """Raise ``IndexError`` or ``ValueError``: kernels look at no bounds."""
+        for array in (second, *values):
+            if array.shape != first.shape:
+                raise ValueError(f"array of shape {array.shape} for {len(first)} rows")
+        for rows in (first, second) if second is not first else (first,):
+            if not bank_kernels.within(rows, self.nodes):
+                raise IndexError(f"rows {rows.tolist()} of a bank of {self.nodes} users")
 
     def _put(self, x: Floats, p: Floats) -> None:
         """Take means (K, D) and covariances (K, D, D) of ``nodes`` users for the present ones."""
@@ -185,7 +201,7 @@ class BankCore:
         arm_m: tuple[float, float] = (0.0, 0.0),
     ) -> int:
         """Add a user with a Gaussian prior, independent of the others; return its row."""
-        self.arm = np.concatenate([self.arm, np.array([arm_m])])
+        self._set_arms(np.concatenate([self.arm, np.array([arm_m])]))
         before, spread = joint.unpack(self._x, self._p, self.nodes, self.count)
         count, old = before.shape
         row = self.nodes
@@ -244,7 +260,13 @@ class BankCore:
         self.watch.remove(row)
         self.slipped = {r - (r > row) for r in self.slipped if r != row}
         self.unplaced = {r - (r > row): s for r, s in self.unplaced.items() if r != row}
-        self.arm = np.delete(self.arm, row, axis=0)
+        self._set_arms(np.delete(self.arm, row, axis=0))
+
+    def _set_arms(self, arm: Floats) -> None:
+        self.arm = arm
+        """Each user's antenna, (forward, left) of its pose, metres."""
+        # Where all are on their wearers' axes kernels take the shorter way.
+        self._arms = arm if arm.any() else arm[:0]
 
     def seed_hypotheses(self, poses: Floats, covariances: Floats, log_weights: Floats) -> None:
         """Replace all users' poses by start hypotheses.
@@ -265,6 +287,7 @@ class BankCore:
         times = np.bincount(chosen, minlength=given)
         order = self.rng.permutation(self.count)
         self._keep(order)
+        self._spread_levels()
         x, p = joint.unpack(self._x, self._p, self.nodes, self.count)
         pose = (PER_NODE * np.arange(self.nodes)[:, None] + np.arange(3)).ravel()
         x[:, pose] = poses.reshape(given, -1)[chosen]
@@ -348,51 +371,40 @@ class BankCore:
         ``sigmas`` (M, 3) are the pieces' own standard deviations (forward and left m, turn rad)
         where the reports bring any, else NaN.
         """
-        if not len(rows):
+        moves = np.array([dx_m, dy_m, dtheta_rad, duration_s])
+        self.move(rows, np.ascontiguousarray(moves.T), sigmas)
+
+    def move(self, rows: Indices, moves: Floats, sigmas: Floats | None = None) -> None:
+        """As ``advance``, of displacements (M, 4): dx, dy (m), dtheta (rad), duration (s)."""
+        several = len(rows)
+        if not several:
             return
-        _check_rows(self.nodes, rows, rows, dx_m, dy_m, dtheta_rad, duration_s)
-        told = np.full((len(rows), 3), np.nan) if sigmas is None else sigmas
-        motion = np.empty((len(rows), 7))
-        motion[:, 0], motion[:, 1], motion[:, 2], motion[:, 3] = dx_m, dy_m, dtheta_rad, duration_s
-        # Who reports nothing at all stands: no time passes for the heading.
-        motion[(motion[:, :3] == 0.0).all(axis=1), 3] = 0.0
-        motion[:, 4:] = noise.motion_variances(dx_m, dy_m, dtheta_rad, duration_s, told)
-        drawn = self.rng.standard_normal((self.count, len(rows)))
-        self._misjudge_turns(rows, motion, told)
+        told = _UNTOLD if sigmas is None else sigmas
+        self._check(rows, rows)
+        if moves.shape != (several, 4) or len(told) not in (0, several):
+            raise ValueError(f"displacements of shape {moves.shape} for {several} rows")
+        motion, misjudged = np.empty((several, 7)), np.empty(several)
+        turns = bank_kernels.prepare_motion(
+            rows, moves, told, self.level, self.count, self.since_turn_s, motion, misjudged
+        )
+        if self.count == 1:
+            drawn = np.zeros((1, several))
+        else:
+            drawn = self.rng.standard_normal((self.count, several))
+        if turns:
+            self._misjudge_turns(rows, misjudged)
         joint.advance(
             self._x, self._p, self.level, self._sens, rows, motion, drawn, self._sampled, CROSS
         )
 
-    def _misjudge_turns(self, rows: Indices, motion: Floats, told: Floats) -> None:
-        """Let a few hypotheses take a reported turn for one of any size.
-
-        A turn's noise grows with the turn, of which only the report is known: one of a right
-        angle that was reported as next to nothing would pass for exact. Only what sticks out of
-        the wearer's white heading noise is a turn, and only reports that bring no sigma need it;
-        who turns all the time is judged by the next turn, and is left alone.
-        """
-        if self.count < 2:
-            return
-        white = motion[:, 6] * self._mean_level(rows, noise.WHITE)
-        turn = motion[:, 2] ** 2 > LEAST_TURN_RAD**2 + TURN_STANDS_OUT**2 * white
-        turn &= np.isnan(told[:, 2])
-        for m, row in enumerate(rows):
-            if not turn[m]:
-                self.since_turn_s[row] += motion[m, 3]
-                continue
-            share = MISJUDGED * min(float(self.since_turn_s[row]) / STRAIGHT_S, 1.0) ** 2
-            self.since_turn_s[row] = 0.0
-            some = np.flatnonzero(self.rng.random(self.count) < share)
-            much = MISJUDGED_RAD * self.rng.standard_normal(some.size)
-            self._shift(int(row), Of.HEADING, much, some)
+    def _misjudge_turns(self, rows: Indices, share: Floats) -> None:
+        """Let a few hypotheses take a reported turn for one of any size (``prepare_motion``)."""
+        for m in np.flatnonzero(share >= 0.0):
+            some = np.flatnonzero(self.rng.random(self.count) < share[m])
+            much = bank_kernels.MISJUDGED_RAD * self.rng.standard_normal(some.size)
+            self._shift(int(rows[m]), Of.HEADING, much, some)
             # They would make any innovation look usual, and any picture ambiguous.
             self.doubtful[some] = DOUBT_UPDATES
-
-    def _mean_level(self, rows: Indices, which: int) -> Floats:
-        """Mean over the hypotheses of one level of users (M,)."""
-        each = self.level[:, rows, which].transpose(1, 0, 2).reshape(len(rows), -1)
-        mean: Floats = each[:, : self.count].mean(axis=1)
-        return mean
 
     @property
     def _sampled(self) -> float:
@@ -414,45 +426,26 @@ class BankCore:
         ``dz_m`` are the antennas' differences of height, ``dz_variance_m2`` their variances (0
         by default), ``worth`` how many independent ranges each is worth (1 by default).
         """
-        worth = np.ones(len(first)) if worth is None else worth
-        dz_variance_m2 = np.zeros(len(first)) if dz_variance_m2 is None else dz_variance_m2
-        _check_rows(self.nodes, first, second, range_m, dz_m, dz_variance_m2, worth)
+        several = len(first)
+        worth = np.ones(several) if worth is None else worth
+        dz_variance_m2 = np.zeros(several) if dz_variance_m2 is None else dz_variance_m2
+        self._check(first, second, range_m, dz_m, dz_variance_m2, worth)
         bias = self._bias_places(first, second)
-        stats = lanes.empty_lines(len(first), joint.STATS, len(self._x))
-        before = self.log_weight.copy()
-        outlier = np.array([self.outlier_share, self.settings.outlier_m**2,
-                            self.settings.outliers_short, 1.0 / (1.0 - self._sampled)])  # fmt: skip
-        joint.update(
+        s = self.settings
+        outlier = self._outlier
+        outlier[0], outlier[3] = self.outlier_share, 1.0 / (1.0 - self._sampled)
+        good = np.empty(several)
+        slipped, clamped = bank_kernels.take_ranges(
             self._x, self._p, self._log_weight, self.sigma2, self._sens, first, second, bias,
-            range_m, dz_m, outlier, worth, dz_variance_m2,
-            self.arm if self.arm.any() else self.arm[:0], stats,
+            range_m, dz_m, outlier, worth, dz_variance_m2, self._arms, self.doubtful,
+            self.levels.mean, self.levels.covariance, self.outlier_counts, self.surprise,
+            self.watch.sums, self.watch.base,
+            self.since_slip <= OPEN_UPDATES and self.counters["slips"] > 0,
+            self.draw, s.spread, self.level, good,
         )  # fmt: skip
-        stats = stats.reshape(len(first), joint.STATS, -1)[:, :, : self.count]
-        # Those who have just jumped would make any innovation look usual.
-        prior = np.exp(before - before.max()) * np.where(self.doubtful > 0.0, 1e-3, 1.0)
-        prior /= prior.sum()
-        mean = stats[:, joint.MEAN]
-        middle = mean @ prior
-        variance = (stats[:, joint.VARIANCE] + (mean - middle[:, None]) ** 2) @ prior
-        slipped = self.watch.look(
-            first, second, (range_m - middle) ** 2 / variance, worth, self.outlier_share,
-            wary=self.counters["slips"] > 0 and self.since_slip <= OPEN_UPDATES,
-        )  # fmt: skip
-        weight = self.weights()
-        good: Floats = stats[:, joint.TRUST] @ weight
-        self.counters["levels_clamped"] += self.levels.learn(
-            first, second, range_m, stats, before, (self.doubtful <= 0.0).astype(np.float64), worth
-        )
-        self.doubtful -= 1.0
-        self._spread_levels()
-        self.outlier_counts *= 0.998 ** len(first)
-        self.outlier_counts += (float((1.0 - good).sum()), float(good.sum()))
-        surprise = self.surprise.tolist()
-        for row, peer, trust in zip(first.tolist(), second.tolist(), good.tolist(), strict=True):
-            for one in (row, peer):
-                surprise[one] += 0.2 * (1.0 - trust - surprise[one])
-        self.surprise[:] = surprise
-        if slipped is not None and self.settings.hypotheses > 1:
+        if clamped:
+            self.counters["levels_clamped"] += clamped
+        if slipped >= 0 and s.hypotheses > 1:
             self._alarm = (slipped, first, second, range_m)
         return good
 
@@ -586,10 +579,10 @@ class BankCore:
         A pair's bias is the common one plus its own part, so a new pair starts from what is known
         of the common one. Where there are too many pairs, only the common one is modelled.
         """
+        if not self._some_biased:
+            return _no_places(len(first))
         common = PER_NODE * self.nodes
         places = np.full(len(first), common, dtype=np.int64)
-        if not self.has_bias.any():
-            return places
         for r, (a, b) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
             pair = (a, b) if a < b else (b, a)
             place = self.biases.get(pair)
@@ -616,7 +609,7 @@ class BankCore:
     @property
     def outlier_share(self) -> float:
         """What share of the ranges are outliers, as far as is known."""
-        wrong, right = self.outlier_counts
+        wrong, right = self.outlier_counts.tolist()
         return float(min(max(wrong / (wrong + right), 0.005), 0.5))
 
     def heading(self, row: int, heading_rad: float, sigma_rad: float) -> None:
@@ -648,13 +641,13 @@ class BankCore:
         self, first: Indices, second: Indices, dz_m: Floats
     ) -> tuple[Floats, Floats]:
         """Give means and standard deviations (U,) of slant distances over all hypotheses."""
-        weight = self._weight_lines(self.weights())
-        return joint.predicted_ranges(self._x, self._p, weight, first, second, dz_m)
+        self._normalise()
+        return joint.predicted_ranges(self._x, self._p, self._weight, first, second, dz_m)
 
     def settle(self) -> None:
         """Close an epoch: jumps, and resampling where the weights have become uneven."""
         self._resize()
-        weight = self.weights()
+        effective = self._normalise()
         self.since_slip += 1
         closed = not self.slipped or self.since_slip > OPEN_UPDATES
         if self._alarm is not None:
@@ -662,17 +655,21 @@ class BankCore:
             self._doubt(*self._alarm, self.settings.jump_m)
             self._alarm = None
         elif self.count > self.settings.hypotheses and closed:
-            self.resample(weight, self.settings.hypotheses)
-        elif 1.0 / float(weight @ weight) < 0.5 * self.count:
-            self.resample(weight)
-        self._jump()
+            self.resample(self.weights(), self.settings.hypotheses)
+        elif effective < 0.5 * self.count:
+            self.resample(self.weights())
+        if self.count > 1:
+            self._jump()
 
     def weights(self) -> Floats:
         """Normalised weights (K,); the log weights are shifted so that their greatest is 0."""
-        self._log_weight -= self.log_weight.max()
-        weight: Floats = np.exp(self.log_weight)
-        weight /= weight.sum()
-        return weight
+        self._normalise()
+        return self._weight.reshape(-1)[: self.count]
+
+    def _normalise(self) -> float:
+        """Bring ``_weight`` (B, LANES) up to the log weights; return the effective size."""
+        self._weight = np.empty_like(self._log_weight)
+        return float(bank_kernels.normalise(self._log_weight, self.count, self._weight))
 
     def resample(self, weight: Floats, count: int | None = None) -> None:
         """Draw hypotheses anew by their weights; levels of noise are jittered (Liu, West)."""
@@ -697,19 +694,18 @@ class BankCore:
         self.has_constants, self.has_bias = self.has_constants[chosen], self.has_bias[chosen]
         self.doubtful = self.doubtful[chosen]
         self.wrong_start = self.wrong_start[chosen]
-        self._spread_levels()
+        self._some_biased = bool(self.has_bias.any())
 
     def _spread_levels(self) -> None:
         """Give every hypothesis its draw of what is known of the levels."""
         s = self.settings
-        sd = s.spread * np.sqrt(self.levels.covariance.diagonal())
-        log = self.levels.mean + np.minimum(sd, noise.SPREAD_MOST) * self.draw
-        every = np.ones((lanes.blocks_of(self.count) * LANES, log.shape[1]))
-        every[: self.count] = np.exp(log)
-        laid = every.reshape(-1, LANES, log.shape[1]).transpose(0, 2, 1)
-        self.level = lanes.empty_lines(len(laid), self.nodes, noise.LEVELS)
-        self.level[...] = laid[:, :-1].reshape(self.level.shape)
-        self.sigma2 = np.ascontiguousarray(laid[:, -1])
+        blocks = lanes.blocks_of(self.count)
+        if self.level.shape[:2] != (blocks, self.nodes):
+            self.level = lanes.empty_lines(blocks, self.nodes, noise.LEVELS)
+            self.sigma2 = lanes.empty_lines(blocks)
+        bank_kernels.spread_levels(
+            self.draw, self.levels.mean, self.levels.covariance, s.spread, self.level, self.sigma2
+        )
 
     @property
     def _usual_surprise(self) -> float:
@@ -722,14 +718,17 @@ class BankCore:
         """Shrink where the picture has been unambiguous for a while; grow where it is not."""
         if self.settings.hypotheses == 1 or not self.nodes:
             return
+        open_ = bool(
+            self._alarm or self.slipped or self.unplaced
+            or max(self.surprise.tolist()) > self._usual_surprise
+        )  # fmt: skip
+        if self.count >= self.settings.hypotheses and (open_ or not self._may_be_flat()):
+            self.unambiguous = 0
+            return
         mean, covariance = self._undoubted_moments()
         sigmas = np.exp(0.5 * self.levels.mean)
         metre = math.sqrt(noise.ALONG_M2_M) * sigmas[noise.ALONG : -1 : noise.LEVELS]
         bend = hypotheses.bend(mean, covariance, float(sigmas[-1]), metre)
-        open_ = bool(
-            self._alarm or self.slipped or self.unplaced
-            or self.surprise.max(initial=0.0) > self._usual_surprise
-        )  # fmt: skip
         if open_ or bend > hypotheses.BENT:
             self.unambiguous = 0
             self.grow()
@@ -742,21 +741,39 @@ class BankCore:
                 self.unambiguous = 0
                 self._shrink(fewer[0])
 
-    def _is_even(self, covariance: Floats) -> bool:
-        """Whether the hypotheses are one cloud: no few of them count, and none lie far apart."""
-        if self.count == 1:
-            return True
-        weight = self.weights()
-        if 1.0 / float(weight @ weight) < hypotheses.EVEN * self.count:
+    def _may_be_flat(self) -> bool:
+        """Whether what is quickly told speaks against no unambiguous picture."""
+        if not self._is_decided():
             return False
+        weight = self._weight_lines(self._undoubted_weights())
+        metre = math.sqrt(noise.ALONG_M2_M) * np.exp(
+            0.5 * self.levels.mean[noise.ALONG : -1 : noise.LEVELS]
+        )
+        heading = bank_kernels.heading_variances(self._x, self._p, weight, self.nodes)
+        return float((0.5 * heading / metre).max()) <= hypotheses.FLAT
+
+    def _is_decided(self) -> bool:
+        """Whether no few hypotheses count, and all model the same, with a known range sigma."""
+        if float(self.levels.covariance[-1, -1]) > hypotheses.KNOWN**2:
+            return False
+        if self._normalise() < hypotheses.EVEN * self.count:
+            return False
+        weight = self._weight.reshape(-1)[: self.count]
         if float(weight @ (self.doubtful > 0.0)) > hypotheses.DOUBTED:
             return False
         for has in (self.has_constants, self.has_bias):
             share = float(weight @ has)
             if min(share, 1.0 - share) > hypotheses.UNDECIDED:
                 return False
-        if float(self.levels.covariance[-1, -1]) > hypotheses.KNOWN**2:
+        return True
+
+    def _is_even(self, covariance: Floats) -> bool:
+        """Whether the hypotheses are one cloud: no few of them count, and none lie far apart."""
+        if self.count == 1:
+            return True
+        if not self._is_decided():
             return False
+        weight = self._weight.reshape(-1)[: self.count]
         poses = (PER_NODE * np.arange(self.nodes)[:, None] + np.arange(3)).ravel()
         weight = weight * np.where(self.doubtful > 0.0, math.exp(-DOUBTERS), 1.0)
         weight /= weight.sum()
@@ -768,13 +785,17 @@ class BankCore:
 
     def _undoubted_moments(self) -> tuple[Floats, Floats]:
         """As ``moments``, without those who doubt: they are no part of the picture."""
+        return self._moments(self._weight_lines(self._undoubted_weights()))
+
+    def _undoubted_weights(self) -> Floats:
         log_weight = self.log_weight - np.where(self.doubtful > 0.0, DOUBTERS, 0.0)
         weight: Floats = np.exp(log_weight - log_weight.max())
-        return self._moments(weight / weight.sum())
+        weight /= weight.sum()
+        return weight
 
     def _moments(self, weight: Floats) -> tuple[Floats, Floats]:
         of = joint.order(self.nodes, self._x.shape[1])
-        return joint.moments(self._x, self._p, self._weight_lines(weight), self.nodes, of)
+        return joint.moments(self._x, self._p, weight, self.nodes, of)
 
     def _weight_lines(self, weight: Floats) -> Floats:
         """Weights (K,) as (B, LANES): what fills up the last block counts nothing."""
@@ -817,6 +838,7 @@ class BankCore:
         # The moments have something of the constants wherever any hypothesis has.
         self.has_constants = np.full(count, float(constants))
         self.has_bias = np.full(count, float(bias))
+        self._some_biased = bool(bias)
         if count == 1:
             self.draw = np.zeros_like(self.draw)
         self._spread_levels()
@@ -828,10 +850,17 @@ class BankCore:
         s = self.settings
         if not self.nodes or self.count < 2:
             return
-        doubt = np.clip((self.surprise - self._usual_surprise) / 0.35, 0.0, 1.0)
-        rate = s.jumps / self.nodes + (s.jumps_most - s.jumps / self.nodes) * doubt
+        usual, quiet = self._usual_surprise, s.jumps / self.nodes
+        rate = np.array(
+            [
+                quiet + (s.jumps_most - quiet) * min(max((much - usual) / 0.35, 0.0), 1.0)
+                for much in self.surprise.tolist()
+            ]
+        )
         total = float(rate.sum())
         which = np.flatnonzero(self.rng.random(self.count) < total)
+        if not which.size:
+            return
         self.doubtful[which] = DOUBT_UPDATES
         for k in which:
             row = int(self.rng.choice(self.nodes, p=rate / total))
@@ -846,7 +875,8 @@ class BankCore:
 
     def moments(self) -> tuple[Floats, Floats]:
         """Give the mixture's mean (D,) and full covariance (D, D)."""
-        return self._moments(self.weights())
+        self._normalise()
+        return self._moments(self._weight)
 
     def snapshot(self) -> Snapshot:
         """Copy everything."""
@@ -875,6 +905,8 @@ class BankCore:
             self.wrong_start, self.arm, self.watch.sums, self.watch.base,
         ) = (a.copy() for a in snapshot.arrays)  # fmt: skip
         self.count = len(self.doubtful)
+        self._some_biased = bool(self.has_bias.any())
+        self._set_arms(self.arm)
         self.rng.bit_generator.state = dict(snapshot.random)
         self.nodes = self.levels.nodes = int(snapshot.numbers[0])
         self.slipped = {int(row) for row in snapshot.numbers[3:]}
@@ -915,18 +947,6 @@ SLIP_UPDATES = 10.0
 DOUBT_UPDATES = 5.0
 """For so many instants of ranges a hypothesis that has jumped teaches nothing about noise."""
 
-LEAST_TURN_RAD, TURN_STANDS_OUT = 0.05, 3.5
-"""A change of heading is a turn beyond both: so much, and so many deviations of white noise."""
-MISJUDGED, MISJUDGED_RAD = 0.1, 1.0
-"""Share of hypotheses that misjudge a turn, and by how much. In P1 one right angle in some hundred
-is reported as less than 20 degrees, and cost 0.5 m for a minute: seeds 1000 to 1009 0.206 m
-without, 0.214 with a share of 0.05, 0.195 with 0.1 (worst 0.27, 0.38, 0.24); seeds 500 to 515,
-where it does not happen, 0.192 and 0.195."""
-
-STRAIGHT_S = 10.0
-"""After going straight for so long. Without it, robots that turn every second (exp3, exp4 of
-`two_robots_vio`) lost 0.08 and 0.10 m of 0.15."""
-
 DOUBTERS = 20.0
 """Log likelihood that is taken from those who doubt where they do not count."""
 
@@ -934,14 +954,11 @@ HEADING_OUTLIERS = 0.1
 HEADING_OUTLIER_RAD = 1.0
 
 
-def _check_rows(nodes: int, first: Indices, second: Indices, *values: Floats) -> None:
-    """Raise ``IndexError`` or ``ValueError``: kernels look at no bounds."""
-    for rows in (first, second):
-        if rows.size and (min(rows.tolist()) < 0 or max(rows.tolist()) >= nodes):
-            raise IndexError(f"rows {rows.tolist()} of a bank of {nodes} users")
-    for array in (second, *values):
-        if array.shape != first.shape:
-            raise ValueError(f"array of shape {array.shape} for {len(first)} rows")
+@lru_cache(maxsize=64)
+def _no_places(count: int) -> Indices:
+    places = np.full(count, -1, dtype=np.int64)
+    places.flags.writeable = False
+    return places
 
 
 def systematic(weight: Floats, count: int, rng: np.random.Generator) -> Indices:

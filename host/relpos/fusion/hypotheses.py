@@ -24,7 +24,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.joint import PER_NODE, Of
+from relpos.fusion.compiled import compiled
+from relpos.fusion.joint import PER_NODE
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -70,38 +71,36 @@ def sampled_share(share: float, count: int, most: int) -> float:
     return min(share, 0.9) * min(math.log(count) / math.log(most), 1.0)
 
 
+@compiled
 def bend(mean: Floats, covariance: Floats, sigma_range_m: float, sigma_metre_m: Floats) -> float:
     """Give the picture's bend by the mixture's moments (D,) and (D, D).
 
     ``sigma_metre_m`` (N,) is how noisy the length of a metre is that each user walks.
     """
-    nodes = len(sigma_metre_m)
-    at = PER_NODE * np.arange(nodes)
-    heading = np.maximum(covariance[at + Of.HEADING, at + Of.HEADING], 0.0)
-    shorter = float((0.5 * heading / sigma_metre_m).max(initial=0.0))
-    if nodes < 2:
-        return shorter
-    a, b = np.triu_indices(nodes, 1)
-    i, j = at[a], at[b]
-
-    def apart(r: int, s: int) -> Floats:
-        off: Floats = (
-            covariance[i + r, i + s] + covariance[j + r, j + s]
-            - covariance[i + r, j + s] - covariance[j + r, i + s]
-        )  # fmt: skip
-        return off
-
-    xx, yy, xy = apart(0, 0), apart(1, 1), apart(0, 1)
-    ux, uy = mean[j] - mean[i], mean[j + 1] - mean[i + 1]
-    distance2 = np.maximum(ux * ux + uy * uy, 1e-6)
-    across = (uy * uy * xx - 2.0 * ux * uy * xy + ux * ux * yy) / distance2
-    arcs = np.maximum(across, 0.0) / (2.0 * np.sqrt(distance2))
+    nodes = sigma_metre_m.shape[0]
+    greatest, shorter = 0.0, 0.0
     nearest = np.full(nodes, np.inf)
-    place = np.maximum(xx + yy, 0.0)
-    np.minimum.at(nearest, a, place)
-    np.minimum.at(nearest, b, place)
-    ways = 0.5 * np.sqrt(nearest * heading)
-    return max(float(max(arcs.max(), ways.max())) / sigma_range_m, shorter)
+    for a in range(nodes):
+        i = PER_NODE * a
+        for b in range(a + 1, nodes):
+            j = PER_NODE * b
+            xx = covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j]
+            yy = covariance[i + 1, i + 1] + covariance[j + 1, j + 1]
+            yy -= 2.0 * covariance[i + 1, j + 1]
+            xy = covariance[i, i + 1] + covariance[j, j + 1]
+            xy -= covariance[i, j + 1] + covariance[j, i + 1]
+            ux, uy = mean[j] - mean[i], mean[j + 1] - mean[i + 1]
+            distance2 = max(ux * ux + uy * uy, 1e-6)
+            across = (uy * uy * xx - 2.0 * ux * uy * xy + ux * ux * yy) / distance2
+            greatest = max(greatest, max(across, 0.0) / (2.0 * math.sqrt(distance2)))
+            place = max(xx + yy, 0.0)
+            nearest[a], nearest[b] = min(nearest[a], place), min(nearest[b], place)
+    for a in range(nodes):
+        heading = max(covariance[PER_NODE * a + 2, PER_NODE * a + 2], 0.0)
+        shorter = max(shorter, 0.5 * heading / sigma_metre_m[a])
+        if nodes > 1:
+            greatest = max(greatest, 0.5 * math.sqrt(nearest[a] * heading))
+    return max(greatest / sigma_range_m, shorter)
 
 
 def thinned(

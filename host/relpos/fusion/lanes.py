@@ -14,6 +14,7 @@ from the array's beginning; no index is checked. A comparison gives a mask for `
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable
 from typing import Any, cast
@@ -48,15 +49,20 @@ def blocks_of(count: int) -> int:
     return -(-count // LANES)
 
 
-def empty_lines(*shape: int) -> Floats:
-    """Give an empty array (..., LANES) that begins at a line of the cache.
+@compiled
+def working_lines(rows: int) -> Floats:
+    """Give an empty array (rows, LANES) that begins at a line of the cache.
 
     Every vector that lies across two lines costs two accesses.
     """
-    size = int(np.prod(shape)) * LANES
-    space = np.empty(size + LANES)
+    space = np.empty((rows + 1) * LANES)
     off = (-(space.ctypes.data // 8)) % LANES
-    return space[off : off + size].reshape(*shape, LANES)
+    return space[off : off + rows * LANES].reshape(rows, LANES)
+
+
+def empty_lines(*shape: int) -> Floats:
+    """As ``working_lines``, of any shape (..., LANES)."""
+    return working_lines(math.prod(shape)).reshape(*shape, LANES)
 
 
 def copy_lines(array: Floats) -> Floats:
@@ -64,14 +70,6 @@ def copy_lines(array: Floats) -> Floats:
     copy = empty_lines(*array.shape[:-1])
     copy[...] = array
     return copy
-
-
-@compiled
-def working_lines(rows: int) -> Floats:
-    """As ``empty_lines``, within a kernel."""
-    space = np.empty((rows + 1) * LANES)
-    off = (-(space.ctypes.data // 8)) % LANES
-    return space[off : off + rows * LANES].reshape(rows, LANES)
 
 
 # -- the two types ---------------------------------------------------------------------------------

@@ -210,8 +210,8 @@ class LargeTeam:
 
     def _with_noise(self, rows: Indices, moves: Floats, told: Floats) -> Floats:
         """Displacements and their sigmas (E, 6) from bases of noise times the nodes' levels."""
-        dx, dy, turn, duration = moves.T
-        variance = noise.motion_variances(dx, dy, turn, duration, told) * self._levels.level[rows]
+        dx, dy, turn, _ = moves.T
+        variance = noise.motion_variances(moves, told) * self._levels.level[rows]
         result = np.empty((len(rows), 6))
         result[:, :3] = moves[:, :3]
         # Along the way, and a tenth of that across: both as the frame of the body sees them.

@@ -129,7 +129,8 @@ class Levels:
               log_weight: Floats, quiet: Floats, worth: Floats) -> int:  # fmt: skip
         """Learn from ranges (R,); return how many levels had to be clamped.
 
-        ``stats`` (R, STATS, K) are of ``joint.update``, ``log_weight`` (K,) from before it;
+        ``stats`` (R, STATS, K) are of ``joint.update`` (more than K columns
+        do no harm), ``log_weight`` (K,) from before it;
         hypotheses with ``quiet`` (K,) 0 have jumped of late and do not count. ``worth`` (R,) is
         how many independent ranges each is worth.
         """
@@ -151,7 +152,7 @@ def learn(
     worth: Floats,
 ) -> int:
     """See :meth:`Levels.learn`; works in place."""
-    count = stats.shape[2]
+    count = log_weight.shape[0]
     size = mean.shape[0]
     weight = np.exp(log_weight - log_weight.max()) * quiet
     if weight.sum() <= 0.0:
@@ -251,27 +252,30 @@ def learn(
     return clamped
 
 
-def motion_variances(
-    dx: Floats, dy: Floats, dtheta: Floats, duration: Floats, sigmas: Floats
-) -> Floats:
-    """Give the bases (M, 3) of displacements (M,): along (m^2), turn and white (rad^2).
+@compiled
+def motion_variances(moves: Floats, told: Floats) -> Floats:
+    """Give the bases (M, 3) of displacements (M, 4): along (m^2), turn and white (rad^2).
 
-    ``sigmas`` (M, 3) are the report's own (forward, left, turn), NaN where it brings none; they
-    take the bases' place.
+    ``moves`` are dx, dy (m), dtheta (rad) and duration (s). ``told`` (M, 3), or (0, 3), are the
+    reports' own deviations (forward, left, turn), NaN where one brings none; they take the bases'
+    place.
     """
-    way = np.hypot(dx, dy)
-    moving = (way > 0.0) | (dtheta != 0.0)
-    base = np.empty((len(way), LEVELS))
-    base[:, ALONG] = ALONG_M2_M * way
-    # A turn is what turns fast: slow changes of the heading are mostly its white noise.
-    size = np.abs(dtheta)
-    fourth = size**4
-    base[:, TURN] = TURN_RAD2_RAD * size * fourth / (fourth + (SLOW_RAD_S * duration) ** 4 + 1e-300)
-    base[:, WHITE] = WHITE_RAD2_S * duration * moving
-    told = ~np.isnan(sigmas)
-    if told.any():
-        own = np.where(told, sigmas, 0.0) ** 2
-        base[:, ALONG] = np.where(told[:, 0], np.maximum(own[:, 0], own[:, 1]), base[:, ALONG])
-        base[:, TURN] = np.where(told[:, 2], 0.0, base[:, TURN])
-        base[:, WHITE] = np.where(told[:, 2], own[:, 2], base[:, WHITE])
+    base = np.empty((moves.shape[0], LEVELS))
+    for m in range(moves.shape[0]):
+        way = math.sqrt(moves[m, 0] * moves[m, 0] + moves[m, 1] * moves[m, 1])
+        size = abs(moves[m, 2])
+        # A turn is what turns fast: slow changes of the heading are mostly its white noise.
+        fourth = size**4
+        slow = fourth + (SLOW_RAD_S * moves[m, 3]) ** 4 + 1e-300
+        base[m, ALONG] = ALONG_M2_M * way
+        base[m, TURN] = TURN_RAD2_RAD * size * fourth / slow
+        base[m, WHITE] = WHITE_RAD2_S * moves[m, 3] if way > 0.0 or size != 0.0 else 0.0
+        if told.shape[0] == 0:
+            continue
+        if not math.isnan(told[m, 0]):
+            left = 0.0 if math.isnan(told[m, 1]) else told[m, 1] ** 2
+            base[m, ALONG] = max(told[m, 0] ** 2, left)
+        if not math.isnan(told[m, 2]):
+            base[m, TURN] = 0.0
+            base[m, WHITE] = told[m, 2] ** 2
     return base

@@ -28,10 +28,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from statistics import median
 
 import numpy as np
 import numpy.typing as npt
+
+from relpos.fusion.compiled import compiled
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -112,30 +113,61 @@ class Watch:
         is, ``outliers`` the share of outliers as far as is known. Be ``wary`` for a while after a
         slip: what was found then may have been the wrong place.
         """
-        usual = min(max(float(self.base[0]), BASE_LEAST), BASE_MOST)
-        rise, fall = 0.5 * (1.0 - 1.0 / GROWN) / usual, 0.5 * math.log(GROWN)
-        # The filter whitens what repeats itself but for those who stand.
-        delta = [
-            min(rise * one - fall, CLIP) * min(3.0 * weight, 1.0) - CLIP * outliers
-            for one, weight in zip(square.tolist(), worth.tolist(), strict=True)
-        ]
-        if self.sums.max(initial=0.0) < 0.25 * ALARM:
-            for one in square.tolist():
-                self.base[0] += BASE_SHARE * (min(one, 4.0) - self.base[0])
-        own: dict[int, list[float]] = {}
-        for row, peer, one in zip(first.tolist(), second.tolist(), delta, strict=True):
-            own.setdefault(row, []).append(one)
-            own.setdefault(peer, []).append(one)
-        for row, those in own.items():
-            self.sums[row] = max(self.sums[row] + median(those), 0.0)
-        high = float(self.sums.max(initial=0.0))
-        alarm = ALARM if len(self.sums) < 3 else TEAM_ALARM
-        if high < (WARY if wary else 1.0) * alarm:
-            return None
-        slipped = int(self.sums.argmax())
-        # Who ranged with it has been drawn along; all begin anew.
-        self.sums[:] = 0.0
-        return slipped
+        slipped = look(self.sums, self.base, first, second, square, worth, outliers, wary)
+        return None if slipped < 0 else int(slipped)
+
+
+@compiled
+def look(
+    sums: Floats,
+    base: Floats,
+    first: Indices,
+    second: Indices,
+    square: Floats,
+    worth: Floats,
+    outliers: float,
+    wary: bool,
+) -> int:
+    """See :meth:`Watch.look`; works in place, -1 for nobody."""
+    usual = min(max(base[0], BASE_LEAST), BASE_MOST)
+    rise, fall = 0.5 * (1.0 - 1.0 / GROWN) / usual, 0.5 * math.log(GROWN)
+    ranges = first.shape[0]
+    # The filter whitens what repeats itself but for those who stand.
+    delta = np.empty(ranges)
+    for r in range(ranges):
+        told = min(rise * square[r] - fall, CLIP) * min(3.0 * worth[r], 1.0)
+        delta[r] = told - CLIP * outliers
+    high = 0.0
+    for row in range(sums.shape[0]):
+        high = max(high, sums[row])
+    if high < 0.25 * ALARM:
+        for r in range(ranges):
+            base[0] += BASE_SHARE * (min(square[r], 4.0) - base[0])
+    own = np.empty(2 * ranges)
+    highest, slipped = 0.0, 0
+    for row in range(sums.shape[0]):
+        several = 0
+        for r in range(ranges):
+            for end in (first[r], second[r]):
+                if end == row:
+                    # Sorted in, for the median.
+                    at = several
+                    while at > 0 and own[at - 1] > delta[r]:
+                        own[at] = own[at - 1]
+                        at -= 1
+                    own[at] = delta[r]
+                    several += 1
+        if several:
+            median = 0.5 * (own[(several - 1) // 2] + own[several // 2])
+            sums[row] = max(sums[row] + median, 0.0)
+        if sums[row] > highest:
+            highest, slipped = sums[row], row
+    alarm = ALARM if sums.shape[0] < 3 else TEAM_ALARM
+    if highest < (WARY if wary else 1.0) * alarm:
+        return -1
+    # Who ranged with it has been drawn along; all begin anew.
+    sums[:] = 0.0
+    return slipped
 
 
 @dataclass(slots=True)
