@@ -35,7 +35,7 @@ PARSED = {
 """Subcommands that are parsed alone, and why."""
 
 SHORTER = {
-    "demo": ("--seconds 20", "--nodes 3"),
+    "demo": ("--seconds 10", "--nodes 3"),
     "simulate": ("--set seconds=20",),
     "fuse PORT": ("--seconds 2",),
     "node list": ("--seconds 3",),

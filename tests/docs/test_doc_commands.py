@@ -94,6 +94,7 @@ def belongings(tmp_path_factory):
     columns = (walker.specific_force_m_s2, walker.angular_rate_rad_s, walker.magnetic_field_ut)
     (folder / "WALK").mkdir()
     write_imu(folder / "WALK", times_s, [c[: len(times_s)] for c in columns])
+    shutil.copytree(folder / "RUN", folder / "walk")
     key = folder / "team.key"
     key.write_text("00" * 16 + "\n")
     key.chmod(0o600)
@@ -122,6 +123,8 @@ STANDS_FOR = (
     (re.compile(r"^(path/to|\.\./shared/data)/(two_robots_vio|four_robots_uwb)/\w+$"), "RUN"),
     (re.compile(r"^path/to/walk$"), "WALK"),
     (re.compile(r"^out/exp1_los$"), "DIR"),
+    # The usual port may be another session's.
+    (re.compile(r"^(0\.0\.0\.0|127\.0\.0\.1)(:\d+)?$"), r"\1:0"),
 )
 
 
