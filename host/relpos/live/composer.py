@@ -61,17 +61,15 @@ class Composer:
         self._healths: dict[int, _Health] = {}
         self._given = 0
         self._seq = 0
-        self._newest_s: float | None = None
+        self.first_s: float | None = None
+        """Time of the first motion or range that came."""
+        self.newest_s: float | None = None
+        """Time of the newest motion or range."""
 
     @property
     def given(self) -> int:
         """How many observations have been taken; estimates refer to this count."""
         return self._given
-
-    @property
-    def newest_s(self) -> float | None:
-        """Time of the newest motion or range."""
-        return self._newest_s
 
     def observed(
         self, now_s: float, observations: Sequence[Observation], decoder: Decoder | None
@@ -137,7 +135,8 @@ class Composer:
                 self.alarms.heard(node)
 
     def _newer(self, time_s: float) -> None:
-        self._newest_s = time_s if self._newest_s is None else max(self._newest_s, time_s)
+        self.first_s = time_s if self.first_s is None else self.first_s
+        self.newest_s = time_s if self.newest_s is None else max(self.newest_s, time_s)
 
     def _range(self, measured: Range) -> None:
         if measured.range_m <= 0.0:

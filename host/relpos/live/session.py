@@ -263,9 +263,9 @@ class Session:
         if failure is not None:
             self._note("fusion", Level.ALARM, f"the fusion has ended: {failure}; receiving goes on")
             return
-        newest_s, behind_s = self._composer.newest_s, 0.0
-        if newest_s is not None and math.isfinite(self._fusing.newest_s):
-            behind_s = newest_s - self._fusing.newest_s
+        newest_s, first_s, behind_s = self._composer.newest_s, self._composer.first_s, 0.0
+        if newest_s is not None and first_s is not None:
+            behind_s = newest_s - max(self._fusing.newest_s, first_s)
         self._note_or_clear(
             "fusion",
             Level.WARNING,

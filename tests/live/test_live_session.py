@@ -1,0 +1,310 @@
+"""A session over an emulated team, in virtual time: what is shown, kept and survived."""
+
+import json
+import math
+import threading
+
+import pytest
+from team_input import TeamInput, make_session, run_through
+
+from relpos import fusion
+from relpos.emulator.team import EmulatedTeam
+from relpos.link.live import Link
+from relpos.live.inputs import PacedInput, Received
+from relpos.live.picture import Alert
+from relpos.live.sinks import QuietSink
+from relpos.live.visitors import Ask
+from relpos.measurements import Event, Heading, Height, Motion, Range
+
+
+def deadreckoning(priors):
+    return fusion.make("deadreckoning", priors)
+
+
+@pytest.fixture(scope="module")
+def walk():
+    """Forty seconds of three people through a session with the default estimator."""
+    with EmulatedTeam("paper", 3, 40.0, 3, beacons=True) as team:
+        priors = team.priors()
+        session, album = make_session(
+            TeamInput(team), lambda p: fusion.make("bank", p), priors=priors, paced=True
+        )
+        yield run_through(session), album, priors
+
+
+def test_everybody_is_in_the_picture_with_all_that_is_known(walk):
+    _, album, _ = walk
+    last = album.pictures[-1]
+    assert [person.node for person in last.people] == [1, 2, 3]
+    for person in last.people:
+        assert person.status == "ok"
+        assert person.x_m is not None
+        assert person.sigma_major_m > person.sigma_minor_m > 0.0
+        assert (person.health == "green") == (not person.reasons)
+        assert person.battery_v > 4.0
+        assert person.neighbours == 2
+    assert len(last.pairs) == 3
+    assert last.ranges
+    message = json.loads(last.to_json())
+    assert message["type"] == "picture"
+    assert len(message["people"]) == len(message["pairs"]) == 3
+    assert message["pairs"][0][:2] == [1, 2]
+
+
+def test_the_picture_runs_ahead_of_the_fused_estimate(walk):
+    _, album, _ = walk
+    later = [p for p in album.pictures if p.time_s > 20.0][:-1]
+    assert all(p.fused_s < p.time_s for p in later)
+    # Motion comes once a second; the fusion waits for the slowest node.
+    assert all(p.time_s - person.motion_s < 2.0 for p in later for person in p.people)
+    assert max(p.time_s - p.fused_s for p in later) > 1.0
+
+
+def test_replaying_the_recorded_bytes_gives_the_same_estimates_to_the_last_bit(walk):
+    outcome, album, priors = walk
+    assert outcome.estimates == len(album.estimates) > 30
+    link, estimator, again = Link(), fusion.make("bank", priors), []
+    for arrival_s, data in album.bytes:
+        for o in link.feed(data, arrival_s):
+            if isinstance(o, Motion | Range | Height | Heading):
+                again += estimator.process(o)
+    again += estimator.finish()
+    assert again == album.estimates
+
+
+def test_what_is_recorded_is_what_was_decoded_in_its_order(walk):
+    _, album, _ = walk
+    link = Link()
+    decoded = [o for arrival_s, data in album.bytes for o in link.feed(data, arrival_s)]
+    assert [o for _, o in album.observations] == decoded
+    assert album.closed
+
+
+def test_somebody_who_falls_silent_is_stale_then_lost():
+    with EmulatedTeam(
+        "straight", 3, 60.0, 3, beacons=True, faults=["node:off:node=2,from=25,to=100"]
+    ) as team:
+        session, album = make_session(TeamInput(team), deadreckoning, priors=team.priors())
+        run_through(session)
+    states = {}
+    for picture in album.pictures:
+        for person in picture.people:
+            if person.node == 2:
+                states.setdefault((person.status, person.alert), picture.time_s)
+            else:
+                assert person.alert is not Alert.LOST
+    assert ("stale", None) in states
+    assert 25.0 + 9.0 < states["lost", Alert.LOST] < 25.0 + 14.0
+
+
+def asleep(seconds, at_s=30.0, until_s=120.0):
+    with EmulatedTeam("paper", 3, until_s, 5, beacons=True) as team:
+        source = TeamInput(team)
+        source.sleep(at_s, seconds)
+        # The team's clock is the session's; a virtual one would be told by the link.
+        session, album = make_session(source, deadreckoning, priors=team.priors())
+        run_through(session)
+        return source, album
+
+
+def test_a_laptop_that_slept_for_a_minute_raises_no_alarm_and_says_that_it_slept():
+    source, album = asleep(60.0)
+    after = [p for p in album.pictures if p.time_s > 90.0]
+    assert any("slept for 60 s" in n.text for p in after for n in p.notices)
+    assert not [person for p in after for person in p.people if person.alert is not None]
+    assert {person.status for person in album.pictures[-1].people} == {"ok"}
+    # The nodes' clocks are as right as before: motions lie where they were made.
+    for node, track in source.link.decoder.nodes.items():
+        late = [o.time_s - t for t, o in album.observations if isinstance(o, Motion) and t > 92.0
+                and o.node == node]  # fmt: skip
+        assert late
+        assert all(-0.15 < lag_s <= 0.0 for lag_s in late)
+        assert abs(track.clock.drift) < 0.006
+
+
+def test_a_port_that_is_gone_is_told_and_nobody_is_lost_by_it():
+    with EmulatedTeam("paper", 3, 90.0, 5, beacons=True) as team:
+        source = TeamInput(team)
+        source.unplug(30.0, 30.0)
+        session, album = make_session(source, deadreckoning, priors=team.priors())
+        run_through(session)
+    gone = [p for p in album.pictures if 32.0 < p.time_s < 59.0]
+    assert all(any("port vanished" in n.text for n in p.notices) for p in gone)
+    assert gone[-1].people[0].status == "stale"
+    back = [p for p in album.pictures if p.time_s > 64.0]
+    assert not any("port vanished" in n.text for p in back for n in p.notices)
+    everyone = [person for p in album.pictures for person in p.people]
+    assert not [person for person in everyone if person.alert is Alert.LOST]
+    assert {person.status for person in back[-1].people} == {"ok"}
+
+
+class Slow:
+    """An estimator that is held up until it is let go."""
+
+    def __init__(self, priors):
+        self._own = deadreckoning(priors)
+        self.go = threading.Event()
+
+    def process(self, measurement):
+        self.go.wait(60.0)
+        return self._own.process(measurement)
+
+    def finish(self):
+        return self._own.finish()
+
+    def counters(self):
+        return self._own.counters()
+
+
+def test_a_fusion_that_falls_behind_holds_up_nothing_and_loses_nothing():
+    made = []
+
+    def make(priors):
+        made.append(Slow(priors))
+        return made[0]
+
+    with EmulatedTeam("straight", 3, 40.0, 3, beacons=True) as team:
+        session, album = make_session(TeamInput(team), make, priors=team.priors())
+        for _ in session.run():
+            pass
+        shown = album.pictures[-1]
+        behind = [n.text for n in shown.notices if n.id == "fusion"]
+        made[0].go.set()
+        outcome = session.finish()
+    assert shown.time_s > 35.0
+    assert all(person.motion_s > 35.0 for person in shown.people)
+    assert not album.estimates or shown.fused_s is None
+    assert "s behind" in behind[0]
+    motions = sum(isinstance(o, Motion) for _, o in album.observations)
+    assert outcome.last.time_s > 37.0
+    assert outcome.failure is None
+    assert motions > 100
+
+
+class Broken(QuietSink):
+    def pictured(self, picture):
+        raise RuntimeError("no ink")
+
+
+class Troubled(QuietSink):
+    def trouble(self):
+        return "disk full: 12 s wait in memory"
+
+
+def test_a_sink_that_fails_is_told_and_the_others_go_on():
+    with EmulatedTeam("straight", 2, 8.0, 3, beacons=True) as team:
+        session, album = make_session(
+            TeamInput(team), deadreckoning, Broken(), Troubled(), priors=team.priors()
+        )
+        outcome = run_through(session)
+    texts = [n.text for n in album.pictures[-1].notices]
+    assert any("Broken has failed" in text and "no ink" in text for text in texts)
+    assert "disk full: 12 s wait in memory" in texts
+    assert outcome.failure is None
+
+
+class Failing(Slow):
+    def process(self, measurement):
+        if measurement.time_s > 5.0:
+            raise RuntimeError("matrix is not what it was")
+        return self._own.process(measurement)
+
+
+def test_a_fusion_that_dies_is_told_and_receiving_goes_on():
+    with EmulatedTeam("straight", 2, 20.0, 3, beacons=True) as team:
+        source = TeamInput(team, until_s=15.0)
+        session, album = make_session(source, Failing, priors=team.priors(), lasts=True)
+        for _ in session.run():
+            if source.now_s() > 14.0:
+                session.stop()
+        outcome = session.finish()
+    assert "matrix is not what it was" in str(outcome.failure)
+    told = [n for n in album.pictures[-1].notices if n.id == "fusion"]
+    assert told[0].level == "alarm"
+    assert album.pictures[-1].people[0].motion_s > 12.0
+
+
+class Phones:
+    """Visitors whose requests lie ready, each from a moment of the session on."""
+
+    def __init__(self, source, *asks):
+        self._source = source
+        self._asks = list(asks)
+        self.answers = []
+
+    def asks(self):
+        due = [ask for at_s, ask in self._asks if self._source.now_s() >= at_s]
+        self._asks = [(at_s, ask) for at_s, ask in self._asks if self._source.now_s() < at_s]
+        return due
+
+    def answer(self, ask, reply, status=200):
+        self.answers.append((ask.id, reply, status))
+
+    def named(self, names):
+        self.names = names
+
+
+def press(number, unix_s, name="a"):
+    body = {
+        "node": 1,
+        "clock_offset_ms": 0.0,
+        "sent_unix_ms": None,
+        "presses": [{"id": name, "landmark": "17", "unix_ms": unix_s * 1000.0}],
+    }
+    return Ask(number, "presses", unix_s, body)
+
+
+def test_presses_names_and_acknowledgements_reach_record_and_picture(monkeypatch):
+    with EmulatedTeam("straight", 2, 20.0, 3, beacons=True) as team:
+        source = TeamInput(team)
+        # The wall clock as the team's, from a date on.
+        monkeypatch.setattr("relpos.live.session.time.time", lambda: 1.7e9 + source.now_s())
+        phones = Phones(
+            source,
+            (10.0, press(1, 1.7e9 + 9.5)),
+            (11.0, press(2, 1.7e9 + 9.5)),
+            (12.0, Ask(3, "name", 1.7e9 + 12.0, {"node": 2, "name": "Kim"})),
+            (13.0, Ask(4, "acknowledge", 1.7e9 + 13.0, {"node": 2})),
+        )
+        session, album = make_session(source, deadreckoning, visitors=phones)
+        run_through(session)
+    (event,) = [o for _, o in album.observations if isinstance(o, Event)]
+    assert event == Event(pytest.approx(9.5, abs=0.05), 1, "landmark", "17")
+    assert [(i, status) for i, _, status in phones.answers] == [
+        (1, 200),
+        (2, 200),
+        (3, 200),
+        (4, 200),
+    ]
+    assert phones.answers[1][1] == {"accepted": ["a"]}
+    assert phones.answers[3][1] == {"acknowledged": False}, "there was no alarm"
+    assert [person.name for person in album.pictures[-1].people] == ["Node 1", "Kim"]
+
+
+def test_a_recording_is_played_and_takes_no_presses():
+    motions = [Motion(float(t), node, 1.0, 0.0, 0.1) for t in range(1, 30) for node in (1, 2)]
+    source = PacedInput("a run", [Received(m.time_s, b"", (m,)) for m in motions], speed=0.0)
+    phones = Phones(source, (5.0, press(1, 0.0)))
+    session, album = make_session(source, deadreckoning, visitors=phones)
+    outcome = run_through(session)
+    assert outcome.received == len(motions)
+    assert phones.answers[0][2] == 409
+    last = album.pictures[-1]
+    assert last.people[1].motion_s == 29.0
+    # Nothing is known of a link, and nothing made up.
+    assert last.people[1].rssi_dbm is None
+    assert math.isfinite(last.time_s)
+
+
+def test_who_is_heard_first_starts_from_one_place_where_that_was_said():
+    with EmulatedTeam("straight", 3, 15.0, 3, beacons=True) as team:
+        given = []
+
+        def make(priors):
+            given.extend(priors)
+            return deadreckoning(priors)
+
+        session, album = make_session(TeamInput(team), make, common=True)
+        run_through(session)
+    assert [prior.node for prior in given] == [1, 2, 3]
+    assert album.estimates
