@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
@@ -15,8 +15,9 @@ from typer.core import TyperCommand
 from relpos.cli import live, output
 from relpos.cli import source as sources
 from relpos.cli.estimators import BANK, DEADRECKONING, EstimatorName
-from relpos.cli.keys import KeyFile
+from relpos.cli.keys import KeyFile, team_key
 from relpos.errors import DataError, DeviceError, RelposError
+from relpos.recording import is_recording
 
 if TYPE_CHECKING:
     from relpos.evaluation.bounds import Totals
@@ -38,6 +39,10 @@ class Initial(StrEnum):
 class FuseCommand(TyperCommand):
     """The command with the estimators' settings below its help, read from the estimators."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Let --foxglove stand without a value, too, which Typer's options cannot."""
+        return super().parse_args(ctx, live.with_default_address(args))
+
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help, then every key of ``--set`` with its default."""
         super().format_help(ctx, formatter)
@@ -52,8 +57,12 @@ class FuseCommand(TyperCommand):
 
 
 def fuse(
+    context: typer.Context,
     source: Annotated[
-        str, typer.Argument(metavar="SOURCE", help="Run directory, serial port or pyserial URL.")
+        str,
+        typer.Argument(
+            metavar="SOURCE", help="Run directory, recording (.mcap), serial port or pyserial URL."
+        ),
     ],
     estimator: EstimatorName = BANK,
     settings: Annotated[
@@ -73,9 +82,8 @@ def fuse(
             help="Where the output goes. (default: out/NAME, of a port with the time)",
         ),
     ] = None,
-    record: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Record what is received.")
-    ] = None,
+    record: live.Record = None,
+    foxglove: live.Foxglove = None,
     view: live.View = False,
     view_listen: live.ViewListen = None,
     https: live.Https = False,
@@ -119,8 +127,6 @@ def fuse(
     vanishes is waited for, and a recording is played at the pace at which it was made (--speed).
     """
     chosen = output.parse_settings(settings or [])
-    if record:
-        raise output.not_built_yet("--record")
     sinks: list[live.MakeSink] = []
     if terminal:
         sinks.append(live.terminal_sink(me))
@@ -128,11 +134,25 @@ def fuse(
         replayed = not sources.is_port(source)
         sinks.append(live.cot_sink(cot, pins or (), replayed=replayed))
     options = live.Options(
-        view, view_listen, https, open_browser, seconds, speed, sinks, screen=terminal
+        view,
+        view_listen,
+        https,
+        open_browser,
+        seconds,
+        speed,
+        sinks,
+        screen=terminal,
+        record=record,
+        foxglove=foxglove,
     )
+    options.check()
     job = Job(source, estimator, chosen, seed, out or _default_out(source), smooth=smooth)
     if sources.is_port(source):
         _fuse_port(job, initial, options, key_file, teach=teach, as_json=json)
+    elif is_recording(source):
+        sources_of = {name: context.get_parameter_source(name) for name in context.params}
+        given = {name for name, how in sources_of.items() if how and how.name != "DEFAULT"}
+        _fuse_mcap(job, given, initial, options, key_file, as_json=json, report=report)
     elif options.shown:
         _replay_run(job, initial, options, as_json=json)
     else:
@@ -234,17 +254,82 @@ def _replay_run(job: Job, initial: Initial | None, options: live.Options, *, as_
     )
 
 
-def fuse_recording(
-    job: Job, run: Run, priors: Sequence[Prior], *, as_json: bool, report: bool
+def _fuse_mcap(
+    job: Job,
+    given: Set[str],
+    initial: Initial | None,
+    options: live.Options,
+    key_file: Path | None,
+    *,
+    as_json: bool,
+    report: bool | None,
 ) -> None:
-    """Fuse a whole run, write the output files and the report, print the result."""
+    """Repeat a recorded session, with its own settings where the command line gives none."""
+    from relpos.live.fusing import common_start
+    from relpos.live.inputs import PacedInput
+    from relpos.measurements import Heading, Height, Motion, Range
+    from relpos.recording import open_recording
+    from relpos.recording.replay import Replay
+
+    recording = open_recording(job.source)
+    about = recording.about
+    if about is not None:
+        estimator = job.estimator if "estimator" in given else about.estimator
+        recorded = about.settings if estimator == about.estimator else {}
+        job = replace(
+            job,
+            estimator=estimator,
+            settings={**recorded, **job.settings},
+            seed=job.seed if "seed" in given else about.seed,
+        )
+    has_key = key_file is not None or about is None or not about.own_key
+    key = team_key(key_file) if has_key else None
+    replay = Replay(recording, key)
+    for words in (*recording.remarks, *replay.remarks):
+        output.remark(words)
+    observations = replay.observations()
+    run = recording.run_of(observations)
+    _check_usable(run, job.estimator)
+    if initial is None and about is not None and about.initial == Initial.COMMON:
+        priors: Sequence[Prior] = common_start(observations)
+    else:
+        priors = _priors(run, initial)
+    if options.shown:
+        job.prepare()
+        again = Replay(recording, key)
+        source = PacedInput(job.source, again, speed=options.speed, link=again.link)
+        fuse_live(job, source, options, description=run.description, priors=priors, as_json=as_json)
+        return
+    counted = {name: round(count) for name, count in replay.counters().items()}
+    fuse_recording(
+        job,
+        replace(run, counters={**run.counters, **counted}),
+        priors,
+        as_json=as_json,
+        report=not as_json if report is None else report,
+        measurements=[o for o in observations if isinstance(o, Motion | Range | Height | Heading)],
+    )
+
+
+def fuse_recording(
+    job: Job,
+    run: Run,
+    priors: Sequence[Prior],
+    *,
+    as_json: bool,
+    report: bool,
+    measurements: Sequence[Measurement] | None = None,
+) -> None:
+    """Fuse a whole run, write the output files and the report, print the result.
+
+    ``measurements``: those of the run in the order in which they came, if not by time.
+    """
     from relpos.runs import write_estimates
 
     _check_usable(run, job.estimator)
     estimator = job.make(priors, run.nodes)
-    outcome = _pass_through(
-        estimator, output.with_progress(run.measurements, len(run.measurements), "fusing")
-    )
+    given = run.measurements if measurements is None else measurements
+    outcome = _pass_through(estimator, output.with_progress(given, len(given), "fusing"))
     write_estimates(job.out, outcome.estimates, steps=run.steps)
     if outcome.failure is not None:
         raise outcome.failure
@@ -401,12 +486,13 @@ def fuse_live(
 
     description = description or Description(name=_base_name(job.source))
     name = description.name or _base_name(job.source)
+    fused = live.Fused(str(job.estimator), job.settings, job.seed, tuple(priors), common=common)
     outcome = live.run(
         source,
         Fusing(lambda known: job.make(known, description.nodes), priors, common=common),
         options,
         name=name,
-        estimator=str(job.estimator),
+        fused=fused,
         out=job.out,
         description=description,
         keep_received=source.is_now,

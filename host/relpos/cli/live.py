@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
     from relpos.live.session import Named, Outcome
     from relpos.live.sinks import Sink
     from relpos.live.visitors import Visitors
+    from relpos.measurements import Prior
+    from relpos.recording.about import About
+    from relpos.recording.recorder import Recorder
+    from relpos.recording.viewer import FoxgloveServer
     from relpos.runs import Description
     from relpos.view.web import WebView
 
@@ -74,6 +79,32 @@ PIN_HELP = (
 )
 Pins = Annotated[list[str] | None, typer.Option("--pin", metavar=PINS, help=PIN_HELP)]
 
+Record = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.mcap", help="Record all that is received, for replay and Foxglove."),
+]
+Foxglove = Annotated[
+    str | None,
+    typer.Option(
+        metavar="[HOST:PORT]",
+        help="Serve the session to Foxglove's viewer, at 127.0.0.1:8765 if nothing else is said.",
+    ),
+]
+FOXGLOVE_AT = "127.0.0.1:8765"
+"""Where its viewer looks first; on this computer alone, for its protocol knows no password."""
+ADDRESS = re.compile(r"[\w.\-\[\]:]*:\d+|\d+")
+
+
+def with_default_address(arguments: Sequence[str]) -> list[str]:
+    """The command line with an address behind each --foxglove that has none."""
+    full: list[str] = []
+    for k, word in enumerate(arguments):
+        full.append(word)
+        if word == "--foxglove" and not ADDRESS.fullmatch((*arguments, "")[k + 1]):
+            full.append(FOXGLOVE_AT)
+    return full
+
+
 MakeSink = Callable[["Hello"], "Sink"]
 """Makes a sink once the session's name, source and start are known."""
 
@@ -95,11 +126,63 @@ class Options:
     sinks: Sequence[MakeSink] = field(default_factory=tuple)
     screen: bool = False
     """The terminal is drawn upon: nothing else may be printed until the session is over."""
+    record: Path | None = None
+    foxglove: str | None = None
 
     @property
     def shown(self) -> bool:
         """Whether somebody looks at it, or records it, while it runs."""
-        return self.view or bool(self.sinks)
+        wanted = (self.record, self.foxglove)
+        return self.view or bool(self.sinks) or any(w is not None for w in wanted)
+
+    @property
+    def pace(self) -> float:
+        """How fast a recording is played; where nobody looks, as fast as it goes."""
+        watched = self.view or self.sinks or self.foxglove is not None
+        return self.speed if watched else 0.0
+
+    def check(self) -> None:
+        """Refuse what cannot be done before anything else is: DataError, RelposError."""
+        if self.record is not None or self.foxglove is not None:
+            from relpos import recording
+
+            recording.check(self.record)
+
+
+@dataclass(frozen=True)
+class Fused:
+    """How a session is fused, as a recording has to know it."""
+
+    estimator: str
+    settings: Mapping[str, str]
+    seed: int
+    priors: Sequence[Prior] = ()
+    common: bool = False
+
+    def about(self, source: Input, description: Description, started_unix_s: float) -> About:
+        """All that a replay needs beside what is received, but for the key."""
+        from relpos.protocol import messages as wire
+        from relpos.recording.about import About
+        from relpos.runs import InitialPose
+
+        link = source.link
+        return About(
+            round(started_unix_s * 1e9),
+            source=source.name,
+            estimator=self.estimator,
+            settings=self.settings,
+            seed=self.seed,
+            initial="common" if self.common else None,
+            own_key=link is not None and link.key != wire.DEFAULT_KEY,
+            newest_counters={} if link is None else link.counters_before,
+            # Of a port it is the port's name: the recording has its own.
+            description=replace(
+                description,
+                name=None if source.is_now else description.name,
+                priors=tuple(self.priors),
+                initial_pose=InitialPose.UNKNOWN,
+            ),
+        )
 
 
 def open_port(port: str, key_file: Path | None, *, teach: bool, reopen: bool) -> Input:
@@ -116,7 +199,7 @@ def run(
     options: Options,
     *,
     name: str,
-    estimator: str,
+    fused: Fused,
     out: Path,
     description: Description,
     keep_received: bool,
@@ -131,7 +214,7 @@ def run(
     from relpos.live.picture import Hello
     from relpos.live.session import Session
 
-    hello = Hello(name, source.name, estimator, time.time() - source.now_s(), emulated)
+    hello = Hello(name, source.name, fused.estimator, time.time() - source.now_s(), emulated)
     files = FileSink(out, description, keep_received=keep_received)
     composer: Composer = Composer(
         {node: info.name for node, info in description.nodes.items() if info.name}
@@ -145,6 +228,9 @@ def run(
         namings.append(page)
         visitors = page
     sinks += [make(hello) for make in options.sinks]
+    keepers = _keepers(options, fused.about(source, description, hello.started_unix_s))
+    sinks += keepers
+    namings += keepers
     later: list[str] = []
     session = Session(
         source,
@@ -168,8 +254,24 @@ def run(
     except KeyboardInterrupt:
         return session.finish(abandon=True)
     finally:
-        for words in dict.fromkeys(later):
+        # What a recording could not take at its end no page shows any more.
+        troubles = [words for keeper in keepers if (words := keeper.trouble()) is not None]
+        for words in dict.fromkeys([*later, *troubles]):
             output.remark(words)
+
+
+def _keepers(options: Options, about: About) -> list[Recorder | FoxgloveServer]:
+    """Make whatever keeps the session or shows it elsewhere."""
+    from relpos import recording
+
+    made: list[Recorder | FoxgloveServer] = []
+    if options.record is not None:
+        made.append(recording.make_recorder(options.record, about))
+    if options.foxglove is not None:
+        server = recording.serve_foxglove(options.foxglove, about)
+        output.remark(f"Foxglove: open connection {server.address}")
+        made.append(server)
+    return made
 
 
 def terminal_sink(me: int | None) -> MakeSink:
@@ -201,8 +303,6 @@ def cot_sink(url: str, pins: Sequence[str], *, replayed: bool) -> MakeSink:
 
 def _open_page(options: Options, hello: Hello) -> WebView:
     """Serve the page, tell its address, open it where there is a desktop."""
-    from dataclasses import replace
-
     from relpos.view import access as doors
     from relpos.view.web import WebView
 

@@ -21,5 +21,5 @@ def check_recording(source: str) -> Path:
     if path.is_dir():
         return path
     if path.exists():
-        raise DataError(f"{source}: a file; recordings other than run directories are not read yet")
+        raise DataError(f"{source}: neither a run directory nor a recording (.mcap)")
     raise DataError(f"{source}: no such run directory or port")

@@ -60,6 +60,7 @@ class Link:
         self.parser = xbee.Parser(escaped=escaped)
         self.decoder = Decoder((key,), newest_counters)
         self.key = key
+        self.counters_before = dict(newest_counters or {})
         self._counter = counter or HostCounter()
         self._escaped = escaped
         self._token = 0

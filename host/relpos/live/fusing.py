@@ -40,6 +40,19 @@ class Fused:
     given: int
 
 
+def common_start(observations: Sequence[Observation]) -> list[Prior]:
+    """One place and heading for everybody who is heard within :data:`GATHER_S` of the first."""
+    nodes: set[int] = set()
+    for o in observations:
+        if isinstance(o, Motion | Range):
+            nodes.add(o.node)
+        if isinstance(o, Range):
+            nodes.add(o.peer)
+        if o.time_s - observations[0].time_s > GATHER_S:
+            break
+    return [Prior(node, 0.0, 0.0, 0.0) for node in sorted(nodes)]
+
+
 class Fusing:
     """``make(priors)`` makes the estimator, in the thread.
 
@@ -129,10 +142,8 @@ class Fusing:
             self._begin(came)
 
     def _begin(self, came: Sequence[Observation]) -> None:
-        nodes = {o.node for o in came if isinstance(o, Motion | Range)}
-        nodes |= {o.peer for o in came if isinstance(o, Range)}
         self._gathering = None
-        self._estimator = self._make([Prior(node, 0.0, 0.0, 0.0) for node in sorted(nodes)])
+        self._estimator = self._make(common_start(came))
         for observation in came:
             self._process(observation)
 

@@ -71,11 +71,18 @@ def read_description(path: Path) -> Description:
     if not path.exists():
         return Description()
     try:
-        document = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+        text = path.read_bytes().decode("utf-8-sig")
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
     except UnicodeDecodeError:
         raise DataError(f"{path}: not UTF-8 text") from None
+    return parse_description(path, text)
+
+
+def parse_description(path: Path | str, text: str) -> Description:
+    """Read the text of a ``run.toml`` that is found at ``path``. DataError names key or line."""
+    try:
+        document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise DataError(f"{path}: not TOML: {error}") from None
     reader = _Reader(path)
@@ -120,6 +127,11 @@ def read_description(path: Path) -> Description:
 
 def write_description(path: Path, description: Description) -> None:
     """Write ``run.toml`` so that reading it gives the same description."""
+    path.write_text(description_text(description), encoding="utf-8")
+
+
+def description_text(description: Description) -> str:
+    """The text of the ``run.toml`` that says the same."""
     lines: list[str] = []
     for key in ("name", "source", "initial_pose", "heading_known", "mount", *_PLAIN_NUMBERS):
         value = getattr(description, key)
@@ -142,7 +154,7 @@ def write_description(path: Path, description: Description) -> None:
         lines += ["", "[simulated]", f"scenario = {_toml(made.scenario)}", f"seed = {made.seed}"]
         lines += ["", "[simulated.settings]"] * bool(made.settings)
         lines += [f"{key} = {_toml(value)}" for key, value in made.settings.items()]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return "\n".join(lines) + "\n"
 
 
 def _toml(value: object) -> str:
@@ -159,7 +171,7 @@ def _toml(value: object) -> str:
 class _Reader:
     """Typed access to a TOML document; every complaint names the file and the key."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path | str) -> None:
         self._path = path
 
     def _fail(self, where: str, key: str, value: object, words: str) -> DataError:

@@ -135,37 +135,67 @@ class Run:
 
 
 def load_run(path: Path | str) -> Run:
-    """Read a run directory; DataError names the file, line and column of the first fault."""
+    """Read a run directory, or a recording (MCAP).
+
+    DataError names the file, line and column of the first fault.
+    """
     directory = Path(path)
     if not directory.exists():
         raise DataError(f"{directory}: no such run directory")
     if not directory.is_dir():
+        from relpos import recording
+
+        if recording.is_recording(directory):
+            return recording.open_recording(directory).run
         raise DataError(f"{directory}: not a directory")
     description = read_description(directory / "run.toml")
     counters: Counter[str] = Counter()
-    rows = {table.name: table.read(directory, counters) for table in _TABLES}
-    measurements = sorted(
-        (row for name in _MEASUREMENT_TABLES for row in rows[name]), key=attrgetter("time_s")
-    )
-    counters["ranges_failed"] += sum(row.range_m <= 0.0 for row in rows["ranges.csv"])
+    rows = [row for table in _TABLES for row in table.read(directory, counters)]
     surveyed = find_table(directory, "landmarks.csv")
     landmarks = tuple(read_landmarks(surveyed)) if surveyed is not None else ()
+    name = description.name or directory.resolve().name
+    return assemble(name, description, rows, landmarks, directory=directory, counters=counters)
+
+
+def assemble(
+    name: str,
+    description: Description,
+    rows: Iterable[Observation | Truth],
+    landmarks: Sequence[Landmark] = (),
+    *,
+    directory: Path | None = None,
+    counters: Mapping[str, int] | None = None,
+) -> Run:
+    """Make a run of rows in any order; of those at one time, motion comes first, then ranges.
+
+    Presses at surveyed ``landmarks`` make the truth where the rows hold none.
+    """
+    by_kind: dict[type, list[Any]] = {kind: [] for kind in _KINDS}
+    for row in rows:
+        by_kind[type(row)].append(row)
+    for same in by_kind.values():
+        same.sort(key=attrgetter("time_s"))
+    counted = Counter(counters or {})
+    measurements = sorted(
+        (row for kind in _KINDS[:4] for row in by_kind[kind]), key=attrgetter("time_s")
+    )
+    counted["ranges_failed"] += sum(row.range_m <= 0.0 for row in by_kind[Range])
     run = Run(
-        name=description.name or directory.resolve().name,
+        name=name,
         description=description,
         measurements=tuple(measurements),
-        events=tuple(rows["events.csv"]),
-        statuses=tuple(rows["status.csv"]),
-        steps=tuple(rows["steps.csv"]),
-        landmarks=landmarks,
-        truth=tuple(rows["truth.csv"]),
+        events=tuple(by_kind[Event]),
+        statuses=tuple(by_kind[Status]),
+        steps=tuple(by_kind[Step]),
+        landmarks=tuple(landmarks),
+        truth=tuple(by_kind[Truth]),
         directory=directory,
     )
     if not run.truth:
         presses = truth_from_presses(landmarks, run.events, run.node_ids)
-        counters.update(presses.counters())
+        counted.update(presses.counters())
         run = replace(run, truth=presses.truth)
-    return replace(run, counters=dict(+counters))
+    return replace(run, counters=dict(+counted))
 
 
 def save_run(run: Run, path: Path | str) -> None:
@@ -401,7 +431,8 @@ _TABLES = (
 TABLE_NAMES = tuple(table.name for table in _TABLES)
 """The files of a run directory that hold rows by time and node."""
 
-_MEASUREMENT_TABLES = ("motion.csv", "ranges.csv", "height.csv", "heading.csv")
+_KINDS = (Motion, Range, Height, Heading, Event, Status, Step, Truth)
+"""The first four are measurements; at one time they come in this order."""
 
 
 def _priors_from_truth(run: Run) -> dict[int, Prior]:

@@ -1,0 +1,396 @@
+"""MCAP on disk, so that a file that ends anywhere can be read up to there.
+
+A file is written in whole *blocks*, each a chunk of messages and the index of its messages, behind
+schemas, channels and metadata that stand at its beginning. Nothing that was written is touched
+again, and nothing is kept in memory for the end: the summary that viewers seek by is made by
+reading the file's own blocks, when it is closed, or later when it was not (:func:`finish`). The
+records themselves are those of the library ``mcap``, whose writer holds the index of the whole
+file in memory and cannot take back half a chunk that a full disk refused.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    Message,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.stream_reader import get_chunk_data_stream
+
+from relpos.recording.topics import Topic
+
+MAGIC = b"\x89MCAP0\r\n"
+HEAD_BYTES = 9
+"""Of each record: one byte says what it is, eight how long."""
+_CHUNK_HEAD = struct.Struct("<QQQI")
+CONTENT = (
+    Opcode.HEADER,
+    Opcode.SCHEMA,
+    Opcode.CHANNEL,
+    Opcode.MESSAGE,
+    Opcode.CHUNK,
+    Opcode.MESSAGE_INDEX,
+    Opcode.METADATA,
+    Opcode.ATTACHMENT,
+)
+"""What may stand before the end of the data; anything else at its place is damage."""
+
+
+def _bytes_of(builder: RecordBuilder) -> bytes:
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return data
+
+
+# -- writing ---------------------------------------------------------------------------------------
+
+
+def beginning(
+    library: str, metadata: Mapping[str, Mapping[str, str]], topics: Iterable[Topic]
+) -> bytes:
+    """Everything before the first block."""
+    builder = RecordBuilder()
+    builder.write(MAGIC)
+    Header("", library).write(builder)
+    for name, values in metadata.items():
+        Metadata(name, dict(values)).write(builder)
+    builder.write(channel_records(numbered(topics), topics))
+    return _bytes_of(builder)
+
+
+def numbered(topics: Iterable[Topic]) -> dict[str, int]:
+    """Topic -> channel, as every file of ours has them."""
+    return {topic.name: number for number, topic in enumerate(topics, 1)}
+
+
+def channel_records(numbers: Mapping[str, int], topics: Iterable[Topic]) -> bytes:
+    """Schemas and channels; each schema has its channel's number."""
+    builder = RecordBuilder()
+    for topic in topics:
+        number = numbers[topic.name]
+        Schema(number, topic.schema, topic.schema_encoding, topic.schema_name).write(builder)
+        Channel(number, topic.name, topic.encoding, {}, number).write(builder)
+    return _bytes_of(builder)
+
+
+def metadata_record(name: str, values: Mapping[str, str]) -> bytes:
+    """A metadata record by itself, for between two blocks."""
+    builder = RecordBuilder()
+    Metadata(name, dict(values)).write(builder)
+    return _bytes_of(builder)
+
+
+class Block:
+    """Messages that go to disk together; ``numbers``: topic -> channel."""
+
+    def __init__(self, numbers: Mapping[str, int]) -> None:
+        self._numbers = numbers
+        self._messages = bytearray()
+        self._index: dict[int, list[tuple[int, int]]] = {}
+
+    def __len__(self) -> int:
+        return len(self._messages)
+
+    def add(self, topic: str, log_ns: int, publish_ns: int, sequence: int, data: bytes) -> None:
+        """Add a message; times are nanoseconds of Unix time."""
+        number = self._numbers[topic]
+        self._index.setdefault(number, []).append((log_ns, len(self._messages)))
+        self._messages += _MESSAGE.pack(
+            Opcode.MESSAGE, 22 + len(data), number, sequence & 0xFFFFFFFF, log_ns, publish_ns
+        )
+        self._messages += data
+
+    def take(self) -> bytes:
+        """The block's bytes; it is empty afterwards."""
+        raw = bytes(self._messages)
+        times = [time_ns for entries in self._index.values() for time_ns, _ in entries]
+        builder = RecordBuilder()
+        Chunk(
+            compression="zstd",
+            data=zstandard.compress(raw),
+            message_end_time=max(times),
+            message_start_time=min(times),
+            uncompressed_crc=zlib.crc32(raw),
+            uncompressed_size=len(raw),
+        ).write(builder)
+        for number, entries in sorted(self._index.items()):
+            MessageIndex(number, entries).write(builder)
+        self._messages = bytearray()
+        self._index = {}
+        return _bytes_of(builder)
+
+
+_MESSAGE = struct.Struct("<BQHIQQ")
+MESSAGE_HEAD = struct.Struct("<HIQQ")
+
+
+# -- reading ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """One record in a file: where, what, how long (with its head)."""
+
+    offset: int
+    opcode: int
+    length: int
+
+
+class Walk:
+    """The records of a file one after the other, as far as they are whole.
+
+    Afterwards ``end`` is where the last whole record before the end of the data ends, and
+    ``complete`` whether the file was closed: it has its summary and its closing magic.
+    """
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self.file = file
+        self.size = file.seek(0, os.SEEK_END)
+        self.end = 0
+        self.complete = False
+
+    def __iter__(self) -> Iterator[Piece]:
+        """Yield what stands before the end of the data; nothing where it is no MCAP at all."""
+        self.file.seek(0)
+        if self.file.read(len(MAGIC)) != MAGIC:
+            return
+        self.end = len(MAGIC)
+        while self.end + HEAD_BYTES <= self.size:
+            self.file.seek(self.end)
+            opcode, length = struct.unpack("<BQ", self.file.read(HEAD_BYTES))
+            if opcode == Opcode.DATA_END:
+                self.file.seek(self.size - len(MAGIC))
+                self.complete = self.file.read() == MAGIC
+                return
+            after = self.end + HEAD_BYTES + length
+            # A block that a crash left full of zeros, or half written.
+            if opcode not in CONTENT or after > self.size:
+                return
+            piece = Piece(self.end, opcode, HEAD_BYTES + length)
+            self.end = after
+            yield piece
+
+    def payload(self, piece: Piece, most: int | None = None) -> bytes:
+        """Content of a record, or its first ``most`` bytes."""
+        self.file.seek(piece.offset + HEAD_BYTES)
+        length = piece.length - HEAD_BYTES
+        return self.file.read(length if most is None else min(length, most))
+
+
+def parse(kind: Any, payload: bytes) -> Any:
+    """A record of that class; ValueError where it does not hold what it says."""
+    stream = ReadDataStream(io.BytesIO(payload))
+    try:
+        return kind.read(stream, len(payload)) if kind is Message else kind.read(stream)
+    except Exception as error:  # The library's own, struct's and Unicode's alike.
+        raise ValueError(f"not a {kind.__name__.lower()}: {error}") from None
+
+
+def unpack(chunk: Chunk) -> bytes:
+    """The messages of a chunk; ValueError where they are not what was written."""
+    try:
+        stream, length = get_chunk_data_stream(chunk, validate_crc=True)
+        raw: bytes = stream.read(length)
+    except Exception as error:  # Each compression has errors of its own.
+        raise ValueError(f"damaged: {error}") from None
+    if len(raw) != chunk.uncompressed_size:
+        raise ValueError(f"damaged: {len(raw)} bytes instead of {chunk.uncompressed_size}")
+    return raw
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A message as it stands in a file."""
+
+    topic: str
+    log_ns: int
+    publish_ns: int
+    sequence: int
+    data: bytes
+
+
+def records_in(raw: bytes) -> Iterator[tuple[int, memoryview]]:
+    """Opcode and content of each record inside a chunk; ValueError where one is cut off."""
+    view, at = memoryview(raw), 0
+    while at < len(raw):
+        if at + HEAD_BYTES > len(raw):
+            raise ValueError("damaged: a record is cut off")
+        opcode, length = struct.unpack_from("<BQ", raw, at)
+        at += HEAD_BYTES + length
+        if at > len(raw):
+            raise ValueError("damaged: a record is cut off")
+        yield opcode, view[at - length : at]
+
+
+# -- the end ---------------------------------------------------------------------------------------
+
+
+@dataclass
+class _Summary:
+    """What the records before it say of the whole file."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    chunks: list[ChunkIndex] = field(default_factory=list)
+    metadata: list[MetadataIndex] = field(default_factory=list)
+    counts: Counter[int] = field(default_factory=Counter)
+
+    def read(self, walk: Walk) -> None:
+        """Take in every whole block."""
+        open_chunk: ChunkIndex | None = None
+        for piece in walk:
+            if piece.opcode == Opcode.CHUNK:
+                open_chunk = self._chunk(walk, piece)
+            elif piece.opcode == Opcode.MESSAGE_INDEX and open_chunk is not None:
+                index = parse(MessageIndex, walk.payload(piece))
+                open_chunk.message_index_offsets[index.channel_id] = piece.offset
+                open_chunk.message_index_length += piece.length
+                self.counts[index.channel_id] += len(index.records)
+            elif piece.opcode == Opcode.SCHEMA:
+                schema = parse(Schema, walk.payload(piece))
+                self.schemas[schema.id] = schema
+            elif piece.opcode == Opcode.CHANNEL:
+                channel = parse(Channel, walk.payload(piece))
+                self.channels[channel.id] = channel
+            elif piece.opcode == Opcode.METADATA:
+                name = parse(Metadata, walk.payload(piece)).name
+                self.metadata.append(MetadataIndex(piece.offset, piece.length, name))
+
+    def _chunk(self, walk: Walk, piece: Piece) -> ChunkIndex:
+        head = walk.payload(piece, _CHUNK_HEAD.size + 64)
+        first_ns, last_ns, raw_bytes, _ = _CHUNK_HEAD.unpack_from(head)
+        (letters,) = struct.unpack_from("<I", head, _CHUNK_HEAD.size)
+        at = _CHUNK_HEAD.size + 4
+        index = ChunkIndex(
+            chunk_length=piece.length,
+            chunk_start_offset=piece.offset,
+            compression=head[at : at + letters].decode(),
+            compressed_size=piece.length - HEAD_BYTES - at - letters - 8,
+            message_end_time=last_ns,
+            message_index_length=0,
+            message_index_offsets={},
+            message_start_time=first_ns,
+            uncompressed_size=raw_bytes,
+        )
+        self.chunks.append(index)
+        return index
+
+    def encode(self, start: int) -> bytes:
+        """Data end, summary, footer and magic for the place ``start``."""
+        builder = RecordBuilder()
+        DataEnd(0).write(builder)
+        summary_start = start + builder.count
+        data_end = _bytes_of(builder)
+        offsets: list[SummaryOffset] = []
+        groups: list[tuple[Opcode, list[Any]]] = [
+            (Opcode.SCHEMA, list(self.schemas.values())),
+            (Opcode.CHANNEL, list(self.channels.values())),
+            (Opcode.STATISTICS, [self._statistics()]),
+            (Opcode.CHUNK_INDEX, list(self.chunks)),
+            (Opcode.METADATA_INDEX, list(self.metadata)),
+        ]
+        builder = RecordBuilder()
+        for opcode, records in groups:
+            begun = builder.count
+            for record in records:
+                record.write(builder)
+            if records:
+                offsets.append(SummaryOffset(opcode, summary_start + begun, builder.count - begun))
+        offset_start = summary_start + builder.count
+        for offset in offsets:
+            offset.write(builder)
+        summary = _bytes_of(builder)
+        head = struct.pack("<BQQQ", Opcode.FOOTER, 20, summary_start, offset_start)
+        builder = RecordBuilder()
+        Footer(summary_start, offset_start, zlib.crc32(head, zlib.crc32(summary))).write(builder)
+        return data_end + summary + _bytes_of(builder) + MAGIC
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=0,
+            channel_count=len(self.channels),
+            channel_message_counts=dict(self.counts),
+            chunk_count=len(self.chunks),
+            message_count=sum(self.counts.values()),
+            metadata_count=len(self.metadata),
+            message_start_time=min((c.message_start_time for c in self.chunks), default=0),
+            message_end_time=max((c.message_end_time for c in self.chunks), default=0),
+            schema_count=len(self.schemas),
+        )
+
+
+def finish(path: Path) -> None:
+    """Give a file that was not closed its summary, behind its last whole record. OSError."""
+    with path.open("r+b") as file:
+        walk = Walk(file)
+        summary = _Summary()
+        summary.read(walk)
+        if walk.complete or walk.end == 0:
+            return
+        tail = summary.encode(walk.end)
+        file.seek(walk.end)
+        file.write(tail)
+        file.truncate()
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def copy_blocks(source: IO[bytes], out: IO[bytes], *, beginning: bool) -> int:
+    """Copy every record that can be read; returns how many bytes cannot.
+
+    A block whose checksum does not fit is left out; the index of a block's messages is made anew,
+    for it may be what was cut off. Without ``beginning`` the blocks alone are copied.
+    """
+    lost = 0
+    walk = Walk(source)
+    for piece in walk:
+        if piece.opcode == Opcode.MESSAGE_INDEX:
+            continue
+        if not beginning and piece.opcode in (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL):
+            continue
+        payload = walk.payload(piece)
+        indexes = b""
+        if piece.opcode == Opcode.CHUNK:
+            try:
+                indexes = _message_indexes(unpack(parse(Chunk, payload)))
+            except ValueError:
+                lost += piece.length
+                continue
+        out.write(struct.pack("<BQ", piece.opcode, piece.length - HEAD_BYTES) + payload + indexes)
+    return lost + (0 if walk.complete else walk.size - walk.end)
+
+
+def _message_indexes(raw: bytes) -> bytes:
+    entries: dict[int, list[tuple[int, int]]] = {}
+    at = 0
+    for opcode, content in records_in(raw):
+        if opcode == Opcode.MESSAGE:
+            number, _, log_ns, _ = MESSAGE_HEAD.unpack_from(content)
+            entries.setdefault(number, []).append((log_ns, at))
+        at += HEAD_BYTES + len(content)
+    builder = RecordBuilder()
+    for number, places in sorted(entries.items()):
+        MessageIndex(number, places).write(builder)
+    return _bytes_of(builder)

@@ -1,0 +1,80 @@
+"""What a session hands over becomes messages: the same for a file and for Foxglove's viewer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from relpos.fusion.estimator import Estimate
+from relpos.measurements import Observation, Range
+from relpos.recording import topics
+from relpos.recording.scene import Scene, log_message
+from relpos.runs.description import Description
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message: when the session had it and what time it speaks of, in Unix time."""
+
+    topic: str
+    log_ns: int
+    publish_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line for the log; ``level`` is info, warning or alarm."""
+
+    level: str
+    text: str
+
+
+Item = topics.Serial | topics.Gap | Line | Estimate | Sequence[Observation]
+
+
+class Encoder:
+    """Turns items into messages; ``names``: node -> what its wearer is called."""
+
+    def __init__(self, started_unix_ns: int, names: Mapping[int, str]) -> None:
+        self._started_unix_ns = started_unix_ns
+        self._scene = Scene(started_unix_ns, dict(names))
+
+    def rename(self, names: Mapping[int, str]) -> None:
+        """Call the wearers so from now on."""
+        self._scene.names = dict(names)
+
+    def messages(self, at_s: float, item: Item) -> Iterator[Message]:
+        """Messages of an item that the session had at ``at_s``."""
+        match item:
+            case topics.Serial():
+                yield self._message(topics.SERIAL, at_s, at_s, topics.encode_serial(item))
+            case topics.Gap():
+                topic, data = topics.encode_row(item)
+                yield self._message(topic, at_s, item.from_s, data)
+            case Line():
+                unix_ns = self._unix_ns(at_s)
+                data = log_message(unix_ns, item.level, item.text)
+                yield Message(topics.LOG, unix_ns, unix_ns, data)
+            case Estimate():
+                for topic, data in (*topics.encode_estimate(item), *self._scene.draw(item)):
+                    yield self._message(topic, at_s, item.time_s, data)
+            case _:
+                for observation in item:
+                    if isinstance(observation, Range):
+                        self._scene.range(observation)
+                    topic, data = topics.encode_row(observation)
+                    # A landmark has no time.
+                    of_s = getattr(observation, "time_s", at_s)
+                    yield self._message(topic, at_s, of_s, data)
+
+    def _message(self, topic: str, at_s: float, of_s: float, data: bytes) -> Message:
+        return Message(topic, self._unix_ns(at_s), self._unix_ns(of_s), data)
+
+    def _unix_ns(self, time_s: float) -> int:
+        return max(self._started_unix_ns + round(time_s * 1e9), 0)
+
+
+def names_of(description: Description) -> dict[int, str]:
+    """What each wearer is called, where it is known."""
+    return {node: info.name for node, info in description.nodes.items() if info.name}

@@ -1,0 +1,296 @@
+"""A recording read back: as a run, or as the very inputs of its session."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Metadata
+
+from relpos.errors import DataError
+from relpos.fusion.estimator import Estimate, NodeEstimate
+from relpos.measurements import Observation
+from relpos.recording import topics
+from relpos.recording.about import About
+from relpos.recording.container import MAGIC, MESSAGE_HEAD, Entry, Walk, parse, records_in, unpack
+from relpos.recording.output import part_path
+from relpos.runs.landmarks import Landmark
+from relpos.runs.run import Run, assemble
+
+
+@dataclass
+class _File:
+    """One part: what it says of itself, and how whole it is."""
+
+    path: Path
+    metadata: dict[str, dict[str, str]]
+    channels: dict[int, Channel]
+    unread: int
+    """Bytes behind the last whole record."""
+    damaged: int
+    """Chunks whose content is not what was written."""
+    closed: bool
+    first_ns: int | None
+    last_ns: int | None
+
+
+@dataclass
+class Recording:
+    """An MCAP file and its further parts; what is in there is read when it is asked for.
+
+    ``about`` is what the recording says of its session, None where it is another program's.
+    ``remarks`` says in a line each what the reader should know: an end that is missing, gaps.
+    """
+
+    path: Path
+    about: About | None
+    files: list[_File]
+
+    @classmethod
+    def open(cls, path: Path) -> Recording:
+        """Look through the file; DataError where it is no recording or cannot be read."""
+        files: list[_File] = []
+        about: About | None = None
+        while True:
+            part = part_path(path, len(files) + 1)
+            if files and not part.exists():
+                break
+            found = _look_through(part)
+            its = About.read(str(part), found.metadata)
+            if files and (
+                about is None or its is None or its.started_unix_ns != about.started_unix_ns
+            ):
+                break
+            if its is not None:
+                about = its if about is None else replace(its, part=about.part)
+            files.append(found)
+        known = {topic.name for topic in topics.all_topics()}
+        there = {channel.topic for file in files for channel in file.channels.values()}
+        if about is None and files[0].channels and not known & there:
+            raise DataError(f"{path}: an MCAP file, but no recording of relpos: none of its topics")
+        return cls(path, about, files)
+
+    @property
+    def started_unix_ns(self) -> int | None:
+        """Unix time of the session's second 0; None where the recording does not say."""
+        if self.about is None:
+            return None
+        return self.about.started_unix_ns or None
+
+    @property
+    def has_serial(self) -> bool:
+        """Whether the bytes of the serial port are there, and not a converted run alone."""
+        return any(True for _ in self.entries({topics.SERIAL}))
+
+    @property
+    def closed(self) -> bool:
+        """Whether the recorder came to its end in every part."""
+        return all(file.closed for file in self.files)
+
+    @cached_property
+    def remarks(self) -> tuple[str, ...]:
+        """What to know of it."""
+        said: list[str] = []
+        for file in self.files:
+            if file.damaged:
+                said.append(f"{file.path}: {file.damaged} damaged blocks are left out")
+            if not file.closed:
+                cut = f", {file.unread} bytes of a last block are cut off" if file.unread else ""
+                said.append(f"{file.path}: was not closed{cut}; read up to {self._end(file)}")
+        said.extend(
+            f"{self.path}: not recorded between {gap.from_s:.1f} and {gap.to_s:.1f} s: "
+            f"{gap.inputs} reads of the port, {gap.others} estimates"
+            for gap in self._rows({topics.GAP})
+        )
+        return tuple(said)
+
+    def _end(self, file: _File) -> str:
+        if file.last_ns is None:
+            return "its beginning: nothing had been received"
+        start_ns = self.about.started_unix_ns if self.about else file.first_ns or 0
+        return f"second {(file.last_ns - start_ns) * 1e-9:.1f}"
+
+    # -- content ----------------------------------------------------------------------------------
+
+    def entries(self, wanted: Collection[str] | None = None) -> Iterator[Entry]:
+        """Messages of the wanted topics in the order in which the session had them."""
+        newest = -1
+        for file in self.files:
+            names = {number: channel.topic for number, channel in file.channels.items()}
+            with _opened(file.path) as stream:
+                walk = Walk(stream)
+                for piece in walk:
+                    if piece.opcode == Opcode.CHUNK:
+                        try:
+                            raw = unpack(parse(Chunk, walk.payload(piece)))
+                        except ValueError:
+                            continue  # Counted when the file was looked through.
+                    elif piece.opcode == Opcode.MESSAGE:
+                        raw = struct.pack("<BQ", piece.opcode, piece.length - 9)
+                        raw += walk.payload(piece)
+                    else:
+                        continue
+                    for opcode, content in records_in(raw):
+                        if opcode != Opcode.MESSAGE:
+                            continue
+                        number, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(content)
+                        # A part begins with what the one before may hold as well.
+                        again = file is not self.files[0] and sequence <= newest
+                        newest = max(newest, sequence)
+                        topic = names.get(number)
+                        if again or topic is None or (wanted is not None and topic not in wanted):
+                            continue
+                        data = bytes(content[MESSAGE_HEAD.size :])
+                        yield Entry(topic, log_ns, publish_ns, sequence, data)
+
+    def inputs(self) -> Iterator[tuple[float, topics.Serial | Observation]]:
+        """What entered the session, in its order: reads of the port, and what phones sent.
+
+        With each the session's time at which it did, in seconds.
+        """
+        for entry in self.entries({topics.SERIAL, *_PHONE}):
+            if entry.topic == topics.SERIAL:
+                serial = self._decoded(entry, lambda e: topics.decode_serial(e.data))
+                yield serial.arrival_s, serial
+            else:
+                row: Observation = self._decoded(entry, _row)
+                if topics.is_input(row):
+                    yield self._session_s(entry), row
+
+    def observations(self) -> Iterator[Observation]:
+        """What was decoded, and what phones sent, in the order of the session."""
+        return self._rows(_OBSERVED)
+
+    def observations_by_arrival(self) -> Iterator[tuple[float, Observation]]:
+        """The same, each with the session's time at which it was there."""
+        for entry in self.entries(_OBSERVED):
+            yield self._session_s(entry), self._decoded(entry, _row)
+
+    def _session_s(self, entry: Entry) -> float:
+        return (entry.log_ns - (self.about.started_unix_ns if self.about else 0)) * 1e-9
+
+    def _rows(self, wanted: Collection[str]) -> Iterator[Any]:
+        for entry in self.entries(wanted):
+            yield self._decoded(entry, _row)
+
+    def _decoded(self, entry: Entry, decode: Any) -> Any:
+        try:
+            return decode(entry)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise DataError(
+                f"{self.path}: message {entry.sequence} on {entry.topic}: not what it should be "
+                f"({error!r})"
+            ) from None
+
+    def estimates(self) -> Iterator[Estimate]:
+        """The recorded estimates, one after the other."""
+        estimate: Estimate | None = None
+        for entry in self.entries(set(topics.LISTS.values())):
+            found = self._decoded(entry, lambda e: topics.decode_list(e.topic, e.data))
+            time_s, kind, rows = found
+            if kind is NodeEstimate:
+                if estimate is not None:
+                    yield estimate
+                estimate = Estimate(time_s, rows, ())
+            elif estimate is not None and estimate.time_s == time_s:
+                estimate = replace(estimate, **{topics.LIST_NAMES[kind]: rows})
+        if estimate is not None:
+            yield estimate
+
+    @cached_property
+    def run(self) -> Run:
+        """The recording as a run, of its decoded measurements; truth where it was converted in."""
+        return self.run_of(self.observations())
+
+    def run_of(self, observations: Iterable[Observation]) -> Run:
+        """The recording as a run of these observations: truth, landmarks and names are its own."""
+        landmarks: dict[str, Landmark] = {}
+        truth: dict[tuple[float, int], Any] = {}
+        for row in self._rows({topics.TRUTH, topics.LANDMARK}):
+            if isinstance(row, Landmark):
+                landmarks[row.landmark] = row
+            else:
+                truth[row.time_s, row.node] = row
+        counters = {
+            "recording_not_closed": sum(not file.closed for file in self.files),
+            "recording_blocks_damaged": sum(file.damaged for file in self.files),
+            "recording_gaps": sum(1 for _ in self.entries({topics.GAP})),
+        }
+        from relpos.runs.description import Description
+
+        description = self.about.description if self.about else Description()
+        return assemble(
+            description.name or self.path.stem,
+            description,
+            (*observations, *truth.values()),
+            tuple(landmarks.values()),
+            counters={name: count for name, count in counters.items() if count},
+        )
+
+
+_OBSERVED = {
+    name
+    for kind, name in topics.ROWS.items()
+    if name not in (topics.TRUTH, topics.LANDMARK, topics.GAP)
+}
+_PHONE = {topics.ROWS[kind] for kind in topics.PHONE_KINDS}
+
+
+def _row(entry: Entry) -> Any:
+    return topics.decode_row(entry.topic, entry.data)
+
+
+def _opened(path: Path) -> Any:
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def _look_through(path: Path) -> _File:
+    found = _File(path, {}, {}, 0, 0, closed=False, first_ns=None, last_ns=None)
+    with _opened(path) as stream:
+        start = stream.read(len(MAGIC))
+        if start != MAGIC[: len(start)]:
+            raise DataError(f"{path}: no MCAP file")
+        walk = Walk(stream)
+        for piece in walk:
+            if piece.opcode == Opcode.METADATA:
+                record = _parsed(path, Metadata, walk.payload(piece))
+                found.metadata[record.name] = record.metadata
+            elif piece.opcode == Opcode.CHANNEL:
+                channel = _parsed(path, Channel, walk.payload(piece))
+                found.channels[channel.id] = channel
+            elif piece.opcode == Opcode.CHUNK:
+                _look_into(found, walk.payload(piece))
+        found.unread = 0 if walk.complete else walk.size - walk.end
+        found.closed = walk.complete
+    return found
+
+
+def _look_into(found: _File, payload: bytes) -> None:
+    try:
+        chunk = parse(Chunk, payload)
+        raw = unpack(chunk)
+        for opcode, content in records_in(raw):
+            if opcode == Opcode.CHANNEL:
+                channel = parse(Channel, bytes(content))
+                found.channels[channel.id] = channel
+    except ValueError:
+        found.damaged += 1
+        return
+    if found.first_ns is None:
+        found.first_ns = chunk.message_start_time
+    found.last_ns = max(chunk.message_end_time, found.last_ns or 0)
+
+
+def _parsed(path: Path, kind: Any, payload: bytes) -> Any:
+    try:
+        return parse(kind, payload)
+    except ValueError as error:
+        raise DataError(f"{path}: damaged: {error}") from None

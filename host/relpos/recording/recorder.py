@@ -1,0 +1,293 @@
+"""The sink that writes a session to an MCAP file, whatever the disk does.
+
+The session only puts things into a queue. A thread of the recorder's own encodes them, closes a
+block each half a second and has the disk confirm it. While the disk does not take it (slow, full,
+gone) the queue grows up to a bound; beyond that things are left out, estimates first. What is lost
+is counted, told by :meth:`Recorder.trouble` and written into the recording (topic ``/gap``).
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Event, Lock, Thread
+from typing import TYPE_CHECKING
+
+from relpos.fusion.estimator import Estimate
+from relpos.measurements import Observation
+from relpos.recording import container, topics
+from relpos.recording.about import DESCRIPTION, About
+from relpos.recording.encoder import Encoder, Item, Line, names_of
+from relpos.recording.output import NO_ROOM, Disk, Output
+from relpos.runs.description import NodeInfo, description_text
+
+if TYPE_CHECKING:
+    from relpos.live.picture import Picture
+
+TICK_S = 0.1
+BLOCK_S = 0.5
+"""A block is closed that often: with the disk's own time, less than a second is ever at stake."""
+BLOCK_BYTES = 1 << 20
+RETRY_S = 0.5
+CLOSE_WITHIN_S = 10.0
+"""How long the end of a session waits for a disk that takes nothing."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """How much may wait for the disk, in bytes of memory, roughly.
+
+    ``inputs``: of everything; a team of 20 fills it in an hour. ``others``: beyond it estimates are
+    left out, which a replay gives again; a few minutes.
+    """
+
+    inputs: int = 96 << 20
+    others: int = 32 << 20
+
+
+@dataclass(frozen=True)
+class _Names:
+    """What the wearers are called from now on."""
+
+    names: Mapping[int, str]
+
+
+class Recorder:
+    """Writes a session to ``path``: a sink of the live session; see the module.
+
+    DataError where the file exists already or cannot be made.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        about: About,
+        *,
+        disk: Disk | None = None,
+        bounds: Bounds | None = None,
+    ) -> None:
+        self._about = about
+        self._bounds = bounds or Bounds()
+        self._encoder = Encoder(about.started_unix_ns, names_of(about.description))
+        self._topics = topics.all_topics()
+        self._block = container.Block(container.numbered(self._topics))
+        self._block_began_s = 0.0
+        self._sequence = 0
+        self._queue: deque[tuple[int, float, Item | _Names]] = deque()
+        self._lock = Lock()
+        self._queued = 0
+        self._gap: topics.Gap | None = None
+        self._lost = (0, 0)
+        self._arrival_s = 0.0
+        self._notices: dict[str, str] = {}
+        self._trouble: str | None = None
+        self._refused_since_s: float | None = None
+        self._retry_s = 0.0
+        self._output = Output(Path(path), self._beginning, disk or Disk())
+        self._stop = Event()
+        self._thread = Thread(target=self._run, name="recorder", daemon=True)
+        self._thread.start()
+
+    # -- what a session calls: quick, and never an error ------------------------------------------
+
+    def received(self, arrival_s: float, data: bytes) -> None:
+        """Take bytes of the serial port, as they were read."""
+        self._arrival_s = arrival_s
+        self._put(arrival_s, topics.Serial(arrival_s, bytes(data)), 200 + len(data))
+
+    def observed(self, arrival_s: float, observations: Sequence[Observation]) -> None:
+        """Take what the bytes said, and what phones sent."""
+        self._arrival_s = max(arrival_s, self._arrival_s)
+        if observations:
+            self._put(arrival_s, tuple(observations), 300 * len(observations))
+
+    def estimated(self, estimate: Estimate) -> None:
+        """Take an estimate."""
+        rows = len(estimate.nodes) + len(estimate.pairs) + len(estimate.alternatives)
+        weight = 400 * (rows + len(estimate.parameters))
+        self._put(self._arrival_s, estimate, weight, is_input=False)
+
+    def pictured(self, picture: Picture) -> None:
+        """Take what the page tells everybody into the log."""
+        for notice in picture.notices:
+            if self._notices.get(notice.id) != notice.text:
+                self._notices[notice.id] = notice.text
+                self.log(str(notice.level), notice.text)
+
+    def named(self, names: Mapping[int, str]) -> None:
+        """Take the wearers' names."""
+        self._put(self._arrival_s, _Names(dict(names)), 200 * len(names))
+
+    def log(self, level: str, text: str) -> None:
+        """Take a line for the log; ``level`` is info, warning or alarm."""
+        self._put(self._arrival_s, Line(level, text), 200 + len(text))
+
+    def trouble(self) -> str | None:
+        """Say what is wrong with the recording now; None while it is well."""
+        return self._trouble
+
+    @property
+    def lost(self) -> tuple[int, int]:
+        """How many inputs and how many estimates had to be left out."""
+        return self._lost
+
+    @property
+    def path(self) -> Path:
+        """The file that is being written."""
+        return self._output.path
+
+    def close(self) -> None:
+        """Write what waits and close the file; gives up on a disk that takes nothing."""
+        self._stop.set()
+        self._thread.join()
+
+    def _put(self, at_s: float, item: Item | _Names, weight: int, *, is_input: bool = True) -> None:
+        bound = self._bounds.inputs if is_input else self._bounds.others
+        with self._lock:
+            if self._queued + weight > bound:
+                gap = self._gap or topics.Gap(at_s, at_s, 0, 0)
+                self._gap = topics.Gap(
+                    gap.from_s, at_s, gap.inputs + is_input, gap.others + (not is_input)
+                )
+                self._lost = (self._lost[0] + is_input, self._lost[1] + (not is_input))
+                return
+            self._queued += weight
+            self._queue.append((weight, at_s, item))
+
+    # -- the recorder's thread --------------------------------------------------------------------
+
+    def _beginning(self, part: int) -> bytes:
+        from relpos import __version__
+
+        records = replace(self._about, part=part).metadata()
+        return container.beginning(f"relpos {__version__}", records, self._topics)
+
+    def _run(self) -> None:
+        give_up_s: float | None = None
+        while True:
+            if self._stop.wait(TICK_S if give_up_s is None else 0.0):
+                if give_up_s is None:
+                    give_up_s = time.monotonic() + CLOSE_WITHIN_S
+                else:
+                    time.sleep(TICK_S)
+            try:
+                done = self._work(closing=give_up_s is not None)
+            except Exception as error:
+                # A fault of ours must neither end the session nor go unseen.
+                self._trouble = f"{self.path}: recording has failed: {error!r}"
+                break
+            if give_up_s is not None and (done or time.monotonic() > give_up_s):
+                break
+        self._end()
+
+    def _end(self) -> None:
+        closed = self._output.close()
+        with self._lock:
+            left = len(self._queue)
+            self._bounds = Bounds(0, 0)
+        if left or self._output.waiting:
+            self._trouble = (
+                f"{self._trouble or self.path}; the end of the session is not recorded: "
+                f"{left} reads and estimates, and what came in the half second before"
+            )
+        elif not closed and self._trouble is None:
+            self._trouble = (
+                f"{self.path}: no room for the summary that viewers seek by; everything is in "
+                "there, and `relpos convert` adds it"
+            )
+
+    def _work(self, *, closing: bool) -> bool:
+        """Encode and write what there is; whether nothing waits any more."""
+        while True:
+            if self._output.waiting and not self._flushed():
+                return False
+            while self._queue and len(self._block) < BLOCK_BYTES and not self._output.waiting:
+                self._encode_next()
+            if not self._queue:
+                self._encode_gap()
+            full = len(self._block) >= BLOCK_BYTES
+            old = time.monotonic() - self._block_began_s >= BLOCK_S
+            if len(self._block) and (full or old or closing):
+                self._output.put(self._block.take())
+            if not self._output.waiting and not self._queue:
+                return True
+
+    def _flushed(self) -> bool:
+        """Have the disk take what waits, or tell why it does not."""
+        now_s = time.monotonic()
+        if self._refused_since_s is not None and now_s < self._retry_s:
+            return False
+        part = self._output.part
+        try:
+            self._output.flush()
+        except OSError as error:
+            self._retry_s = now_s + RETRY_S
+            if self._refused_since_s is None:
+                self._refused_since_s = now_s
+            self._tell(error, now_s - self._refused_since_s)
+            return False
+        if self._output.part != part:
+            self.log("warning", f"the recording goes on in {self._output.path.name}")
+        if self._refused_since_s is not None:
+            waited_s = now_s - self._refused_since_s
+            self._trouble = self._refused_since_s = None
+            self.log("info", f"the disk takes the recording again after {waited_s:.0f} s")
+        return True
+
+    def _tell(self, error: OSError, since_s: float) -> None:
+        reason = "disk full" if error.errno in NO_ROOM else error.strerror or str(error)
+        inputs, others = self._lost
+        lost = (
+            f"{inputs} reads of the port and {others} estimates are lost"
+            if inputs or others
+            else "nothing is lost yet"
+        )
+        self._trouble = (
+            f"{reason}: the recording {self.path} waits for room since {since_s:.0f} s; {lost}"
+        )
+
+    def _encode_next(self) -> None:
+        weight, at_s, item = self._queue.popleft()
+        with self._lock:
+            self._queued -= weight
+        if isinstance(item, _Names):
+            self._rename(item.names)
+        else:
+            self._add(at_s, item)
+
+    def _encode_gap(self) -> None:
+        with self._lock:
+            gap, self._gap = self._gap, None
+        if gap is None:
+            return
+        self._add(gap.to_s, gap)
+        words = (
+            f"not recorded between {gap.from_s:.1f} s and {gap.to_s:.1f} s: "
+            f"{gap.inputs} reads of the port, {gap.others} estimates"
+        )
+        self._add(gap.to_s, Line("warning", words))
+
+    def _add(self, at_s: float, item: Item) -> None:
+        if not len(self._block):
+            self._block_began_s = time.monotonic()
+        for message in self._encoder.messages(at_s, item):
+            self._sequence += 1
+            self._block.add(
+                message.topic, message.log_ns, message.publish_ns, self._sequence, message.data
+            )
+
+    def _rename(self, names: Mapping[int, str]) -> None:
+        """Write names as metadata between two blocks, where the newest counts."""
+        if len(self._block):
+            self._output.put(self._block.take())
+        nodes = dict(self._about.description.nodes)
+        for node, name in names.items():
+            nodes[node] = replace(nodes.get(node, NodeInfo()), name=name)
+        description = replace(self._about.description, nodes=nodes)
+        self._about = replace(self._about, description=description)
+        self._encoder.rename(names_of(description))
+        text = {"text": description_text(description)}
+        self._output.put(container.metadata_record(DESCRIPTION, text))

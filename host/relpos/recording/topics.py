@@ -1,0 +1,314 @@
+"""The topics of a recording: what each is called, how it is encoded, and back again.
+
+The same topics go into an MCAP file and to Foxglove's viewer. What people's scripts read is JSON
+with a schema, one message a row of the run format, its fields named as the columns are; what
+Foxglove draws by itself (:mod:`relpos.recording.scene`) is in Foxglove's own protobuf schemas.
+Numbers survive exactly: JSON holds every float in full. A value that is not known, or is not a
+finite number, is left out.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import types
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from functools import cache
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+from relpos.fusion.estimator import (
+    Alternative,
+    Estimate,
+    NodeEstimate,
+    NodeStatus,
+    PairEstimate,
+    Parameter,
+)
+from relpos.measurements import (
+    Event,
+    Heading,
+    Height,
+    Motion,
+    Observation,
+    Range,
+    Status,
+    Step,
+    Truth,
+)
+from relpos.runs.landmarks import Landmark
+
+SERIAL = "/serial"
+LANDMARK = "/landmark"
+TRUTH = "/truth"
+GAP = "/gap"
+TEAM = "/team"
+TRANSFORMS = "/tf"
+LOG = "/log"
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One topic: its name, how its messages are encoded and the schema that says so."""
+
+    name: str
+    encoding: str
+    schema_name: str
+    schema_encoding: str
+    schema: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Serial:
+    """Bytes of the serial port as they were read, at ``arrival_s`` of the session."""
+
+    arrival_s: float
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """What could not be recorded between two times of the session, because the disk was not there.
+
+    ``inputs``: reads of the serial port and what phones sent; ``others``: messages that a replay of
+    the inputs gives again.
+    """
+
+    from_s: float
+    to_s: float
+    inputs: int
+    others: int
+
+
+Row = Observation | Truth | Landmark | Gap
+
+ROWS: Mapping[type, str] = {
+    Motion: "/motion",
+    Range: "/range",
+    Height: "/height",
+    Heading: "/heading",
+    Status: "/status",
+    Event: "/event",
+    Step: "/step",
+    Truth: TRUTH,
+    Landmark: LANDMARK,
+    Gap: GAP,
+}
+"""Class -> topic of what has a message each."""
+
+LISTS: Mapping[type, str] = {
+    NodeEstimate: "/estimate",
+    PairEstimate: "/pairs",
+    Alternative: "/alternatives",
+    Parameter: "/parameters",
+}
+"""Class -> topic of what an estimate has many of: one message an estimate, ``time_s`` beside."""
+
+LIST_NAMES: Mapping[type, str] = {
+    NodeEstimate: "nodes",
+    PairEstimate: "pairs",
+    Alternative: "alternatives",
+    Parameter: "parameters",
+}
+
+ELLIPSE = ("sigma_major_m", "sigma_minor_m", "sigma_angle_rad")
+"""Follow from the covariance and are there for plots; not read back."""
+
+
+PHONE_KINDS = (Event, Heading)
+"""What phones send."""
+
+
+def is_input(observation: Observation) -> bool:
+    """Tell whether it entered the session by itself, from a phone, and not by the serial port."""
+    return isinstance(observation, Event) or (
+        isinstance(observation, Heading) and observation.source == "phone"
+    )
+
+
+# -- to messages -----------------------------------------------------------------------------------
+
+
+def encode_serial(serial: Serial) -> bytes:
+    """One read of the port."""
+    return _json(
+        {"arrival_s": serial.arrival_s, "data": base64.b64encode(serial.data).decode("ascii")}
+    )
+
+
+def encode_row(row: Row) -> tuple[str, bytes]:
+    """Topic and message of an observation, a truth, a landmark or a gap."""
+    kind: type = type(row)
+    return ROWS[kind], _json(_object(row, _names(kind)))
+
+
+def encode_estimate(estimate: Estimate) -> Iterable[tuple[str, bytes]]:
+    """Topics and messages of an estimate; what it has nothing of is left out."""
+    for kind, rows in (
+        (NodeEstimate, estimate.nodes),
+        (PairEstimate, estimate.pairs),
+        (Alternative, estimate.alternatives),
+        (Parameter, estimate.parameters),
+    ):
+        if rows or kind is NodeEstimate:
+            names = _list_names(kind)
+            document = {
+                "time_s": estimate.time_s,
+                LIST_NAMES[kind]: [_object(row, names) for row in rows],
+            }
+            yield LISTS[kind], _json(document)
+
+
+def _object(row: Any, names: Iterable[str]) -> dict[str, Any]:
+    values = {name: getattr(row, name) for name in names}
+    return {name: value for name, value in values.items() if _is_known(value)}
+
+
+def _is_known(value: object) -> bool:
+    return value is not None and not (isinstance(value, float) and not math.isfinite(value))
+
+
+def _json(document: Mapping[str, Any]) -> bytes:
+    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+
+
+@cache
+def _names(kind: type) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(kind))
+
+
+@cache
+def _list_names(kind: type) -> tuple[str, ...]:
+    """What one entry of a list holds; its time stands beside the list."""
+    names = tuple(name for name in _names(kind) if name != "time_s")
+    return (*names, *ELLIPSE) if kind is NodeEstimate else names
+
+
+# -- and back --------------------------------------------------------------------------------------
+
+_KIND_OF_TOPIC = {topic: kind for kind, topic in ROWS.items()}
+_LIST_OF_TOPIC = {topic: kind for kind, topic in LISTS.items()}
+
+
+def decode_serial(data: bytes) -> Serial:
+    """Undo :func:`encode_serial`; ValueError or KeyError where it is none."""
+    document = json.loads(data)
+    return Serial(float(document["arrival_s"]), base64.b64decode(document["data"], validate=True))
+
+
+def decode_row(topic: str, data: bytes) -> Any:
+    """The row that a message holds; None where the topic has no rows, TypeError where it is none.
+
+    What a later version has added is passed over.
+    """
+    kind = _KIND_OF_TOPIC.get(topic)
+    return None if kind is None else _build(kind, json.loads(data))
+
+
+def decode_list(topic: str, data: bytes) -> tuple[float, type, tuple[Any, ...]] | None:
+    """Time, class and entries of an estimate's message; None where the topic has none."""
+    kind = _LIST_OF_TOPIC.get(topic)
+    if kind is None:
+        return None
+    document = json.loads(data)
+    time_s = float(document["time_s"])
+    entries = document[LIST_NAMES[kind]]
+    for entry in entries:
+        if "time_s" in _names(kind):
+            entry["time_s"] = time_s
+        # Of whom nothing is known the variance is infinite, which JSON cannot say.
+        if entry.get("status") == NodeStatus.UNLOCATED:
+            entry.setdefault("variance_x_m2", math.inf)
+            entry.setdefault("variance_y_m2", math.inf)
+    return time_s, kind, tuple(_build(kind, entry) for entry in entries)
+
+
+def _build(kind: type, values: Mapping[str, Any]) -> Any:
+    known: dict[str, Any] = {}
+    for name, (make, missing) in _makers(kind).items():
+        # KeyError for what has to be there and is not.
+        known[name] = make(values[name]) if name in values or missing is ... else missing
+    return kind(**known)
+
+
+@cache
+def _makers(kind: type) -> dict[str, tuple[Any, Any]]:
+    """How each field is made of what JSON has, and what stands for one that is missing."""
+    makers: dict[str, tuple[Any, Any]] = {}
+    for name, hint in get_type_hints(kind).items():
+        optional, plain = _plain(hint)
+        missing = None if optional else math.nan if plain is float else ...
+        makers[name] = (plain, missing)
+    return makers
+
+
+def _plain(hint: Any) -> tuple[bool, Any]:
+    """Whether None is allowed, and the type beside it."""
+    if get_origin(hint) in (Union, types.UnionType):
+        return True, next(part for part in get_args(hint) if part is not type(None))
+    return False, hint
+
+
+# -- schemas ---------------------------------------------------------------------------------------
+
+
+def _schema_of(kind: type, names: Iterable[str]) -> dict[str, Any]:
+    hints = get_type_hints(kind)
+    properties: dict[str, Any] = {}
+    required: list[str] = []
+    for name in names:
+        optional, plain = _plain(hints.get(name, float))
+        word = {bool: "boolean", int: "integer", float: "number"}.get(plain, "string")
+        properties[name] = {"type": word}
+        # A float may be none at all (NaN), and is left out then.
+        if not optional and plain is not float:
+            required.append(name)
+    return {"type": "object", "properties": properties, "required": required}
+
+
+def _topic(name: str, title: str, schema: Mapping[str, Any]) -> Topic:
+    document = json.dumps({"title": title, **schema}).encode()
+    return Topic(name, "json", title, "jsonschema", document)
+
+
+@cache
+def all_topics() -> tuple[Topic, ...]:
+    """Every topic of a recording, always in the same order."""
+    from relpos.recording import scene
+
+    serial = {
+        "type": "object",
+        "properties": {
+            "arrival_s": {"type": "number"},
+            "data": {"type": "string", "contentEncoding": "base64"},
+        },
+        "required": ["arrival_s", "data"],
+    }
+    rows = [
+        _topic(name, f"relpos.{kind.__name__}", _schema_of(kind, _names(kind)))
+        for kind, name in ROWS.items()
+    ]
+    lists = [
+        _topic(
+            name,
+            f"relpos.{kind.__name__}s",
+            {
+                "type": "object",
+                "properties": {
+                    "time_s": {"type": "number"},
+                    LIST_NAMES[kind]: {
+                        "type": "array",
+                        "items": _schema_of(kind, _list_names(kind)),
+                    },
+                },
+                "required": ["time_s", LIST_NAMES[kind]],
+            },
+        )
+        for kind, name in LISTS.items()
+    ]
+    drawn = [
+        Topic(name, "protobuf", schema.name, schema.encoding, schema.data)
+        for name, schema in scene.schemas().items()
+    ]
+    return (_topic(SERIAL, "relpos.Serial", serial), *rows, *lists, *drawn)

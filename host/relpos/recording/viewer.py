@@ -1,0 +1,122 @@
+"""A running session in Foxglove's own viewer: the topics of a recording, over its WebSocket."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from threading import Event, Thread
+from typing import TYPE_CHECKING
+
+from relpos.errors import DataError, DeviceError
+from relpos.fusion.estimator import Estimate
+from relpos.measurements import Observation
+from relpos.recording import topics
+from relpos.recording.about import About
+from relpos.recording.encoder import Encoder, Item, Line, names_of
+
+if TYPE_CHECKING:
+    from relpos.live.picture import Picture
+
+TICK_S = 0.05
+MOST_WAITING = 2000
+"""Items; beyond it the oldest go. A viewer shows what is now."""
+
+
+class FoxgloveServer:
+    """A sink of the live session that Foxglove connects to. DeviceError where it cannot listen."""
+
+    def __init__(self, listen: str, about: About) -> None:
+        import foxglove
+
+        host, port = parse_listen(listen)
+        self._encoder = Encoder(about.started_unix_ns, names_of(about.description))
+        self._context = foxglove.Context()
+        self._channels = {
+            topic.name: foxglove.Channel(
+                topic.name,
+                message_encoding=topic.encoding,
+                schema=foxglove.Schema(
+                    name=topic.schema_name, encoding=topic.schema_encoding, data=topic.schema
+                ),
+                context=self._context,
+            )
+            for topic in topics.all_topics()
+        }
+        try:
+            self._server = foxglove.start_server(
+                name=f"relpos {about.source}",
+                host=host,
+                port=port,
+                context=self._context,
+                session_id=str(about.started_unix_ns),
+            )
+        except Exception as error:
+            raise DeviceError(f"{host}:{port}: cannot serve Foxglove there: {error}") from None
+        self.address = f"ws://{host}:{self._server.port}"
+        self._queue: deque[tuple[float, Item]] = deque(maxlen=MOST_WAITING)
+        self._arrival_s = 0.0
+        self._notices: dict[str, str] = {}
+        self._trouble: str | None = None
+        self._stop = Event()
+        self._thread = Thread(target=self._run, name="foxglove", daemon=True)
+        self._thread.start()
+
+    def received(self, arrival_s: float, data: bytes) -> None:
+        """Take bytes of the serial port, as they were read."""
+        self._arrival_s = arrival_s
+        self._queue.append((arrival_s, topics.Serial(arrival_s, bytes(data))))
+
+    def observed(self, arrival_s: float, observations: Sequence[Observation]) -> None:
+        """Take what the bytes said, and what phones sent."""
+        self._arrival_s = max(arrival_s, self._arrival_s)
+        if observations:
+            self._queue.append((arrival_s, tuple(observations)))
+
+    def estimated(self, estimate: Estimate) -> None:
+        """Take an estimate."""
+        self._queue.append((self._arrival_s, estimate))
+
+    def pictured(self, picture: Picture) -> None:
+        """Take what the page tells everybody into the log."""
+        for notice in picture.notices:
+            if self._notices.get(notice.id) != notice.text:
+                self._notices[notice.id] = notice.text
+                self._queue.append((self._arrival_s, Line(str(notice.level), notice.text)))
+
+    def named(self, names: Mapping[int, str]) -> None:
+        """Take the wearers' names."""
+        self._encoder.rename(names)
+
+    def trouble(self) -> str | None:
+        """Say what is wrong; None while it is well."""
+        return self._trouble
+
+    def close(self) -> None:
+        """Send what waits and stop listening."""
+        self._stop.set()
+        self._thread.join()
+        self._server.stop()
+
+    def _run(self) -> None:
+        stopping = False
+        while not stopping:
+            stopping = self._stop.wait(TICK_S)
+            try:
+                while self._queue:
+                    self._send(*self._queue.popleft())
+            except Exception as error:
+                # A fault of ours must neither end the session nor go unseen.
+                self._trouble = f"Foxglove is not served any more: {error!r}"
+                return
+
+    def _send(self, at_s: float, item: Item) -> None:
+        for message in self._encoder.messages(at_s, item):
+            self._channels[message.topic].log(message.data, log_time=message.log_ns)
+
+
+def parse_listen(listen: str) -> tuple[str, int]:
+    """Host and port of ``HOST:PORT`` or ``PORT`` (on this computer); DataError where it is none."""
+    host, _, port = listen.rpartition(":")
+    if not port.isdigit() or int(port) > 65535:
+        raise DataError(f"{listen}: not HOST:PORT")
+    return host.strip("[]") or "127.0.0.1", int(port)

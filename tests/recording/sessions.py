@@ -1,0 +1,50 @@
+"""A small emulated session, and what a sink is told of it: for the tests of recordings."""
+
+from functools import cache
+
+from relpos.emulator.team import EmulatedTeam
+from relpos.fusion import make
+from relpos.link.live import Link
+from relpos.measurements import Heading, Height, Motion, Range
+from relpos.recording.about import About
+
+START_NS = 1_790_000_000_123_456_789
+
+
+@cache
+def serial_bytes(nodes=3, seconds=40.0, seed=2, key=None):
+    """What leaves the coordinator's port of an emulated team: (virtual seconds, bytes)."""
+    with EmulatedTeam(
+        "paper", nodes, seconds, seed, beacons=True, **({"key": key} if key else {})
+    ) as team:
+        return tuple((time_us * 1e-6, data) for time_us, data in team.stream())
+
+
+@cache
+def session(nodes=3, seconds=40.0, seed=2):
+    """(arrival, bytes, observations, estimates) in the order of a session; starts are unknown."""
+    link, estimator = Link(), make("bank")
+    steps = []
+    for arrival_s, data in serial_bytes(nodes, seconds, seed):
+        observations = link.feed(data, arrival_s)
+        estimates = [
+            estimate
+            for o in observations
+            if isinstance(o, Motion | Range | Height | Heading)
+            for estimate in estimator.process(o)
+        ]
+        steps.append((arrival_s, data, tuple(observations), tuple(estimates)))
+    return tuple(steps)
+
+
+def about(**changes):
+    return About(START_NS, source="/dev/ttyUSB0", **changes)
+
+
+def play(sink, steps):
+    """Tell a sink a session."""
+    for arrival_s, data, observations, estimates in steps:
+        sink.received(arrival_s, data)
+        sink.observed(arrival_s, observations)
+        for estimate in estimates:
+            sink.estimated(estimate)

@@ -1,0 +1,227 @@
+"""What is in a recording: for relpos, and for a reader that knows nothing of relpos."""
+
+import dataclasses
+import json
+import math
+
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from sessions import START_NS, about, play, serial_bytes, session
+
+from relpos.errors import DataError
+from relpos.link.live import Link
+from relpos.live.picture import Level, Notice, Picture
+from relpos.measurements import Event, Heading, Motion, Truth
+from relpos.protocol.messages import DEFAULT_KEY
+from relpos.recording import is_recording, make_recorder, open_recording, save_recording
+from relpos.recording.replay import Replay
+from relpos.recording.topics import all_topics
+from relpos.runs import Description, NodeInfo, Run, load_run, save_run
+from relpos.runs.landmarks import Landmark
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A session with a press, a phone's heading, names and a notice in the middle."""
+    path = tmp_path_factory.mktemp("content") / "walk.mcap"
+    names = {1: "Ada Lovelace"}
+    recorder = make_recorder(
+        path,
+        about(
+            settings={"outliers": "0.03"},
+            seed=7,
+            initial="common",
+            newest_counters={1: 5},
+            description=Description(nodes={2: NodeInfo(name="Grace", height_m=1.1)}),
+        ),
+    )
+    steps = session()
+    middle = len(steps) // 2
+    play(recorder, steps[:middle])
+    at_s = steps[middle][0]
+    recorder.observed(at_s, [Event(at_s - 3.25, 2, "landmark", "17")])
+    recorder.observed(at_s, [Heading(at_s - 0.5, 2, 1.5, 0.3, "phone")])
+    recorder.named(names)
+    recorder.pictured(
+        Picture(1, at_s, 0.0, notices=(Notice("port", Level.ALARM, "the port vanished", at_s),))
+    )
+    play(recorder, steps[middle:])
+    recorder.close()
+    assert recorder.trouble() is None
+    return path
+
+
+def messages(path, **options):
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=(DecoderFactory(), Json()))
+        return [
+            (m.channel.topic, m.schema, m.message, m.decoded_message)
+            for m in reader.iter_decoded_messages(**options)
+        ]
+
+
+class Json:
+    """The library's JSON decoder is as simple."""
+
+    def decoder_for(self, message_encoding, schema):
+        return json.loads if message_encoding == "json" else None
+
+
+def test_foxglove_s_reader_decodes_every_topic(recorded):
+    found = messages(recorded)
+    topics = {topic for topic, *_ in found}
+    # Whether steps are reported, something is learned or ambiguous is the walk's affair.
+    may = {"/truth", "/landmark", "/gap", "/step", "/parameters", "/alternatives"}
+    assert topics >= {topic.name for topic in all_topics()} - may
+    for topic, schema, message, decoded in found:
+        if message is not None and schema.encoding == "jsonschema":
+            conforms(decoded, json.loads(schema.data), topic)
+
+
+def conforms(value, schema, where):
+    """What our schemas use of JSON Schema."""
+    kinds = {"number": (int, float), "integer": int, "string": str, "boolean": bool,
+             "array": list, "object": dict}  # fmt: skip
+    assert isinstance(value, kinds[schema["type"]]), where
+    if schema["type"] == "object":
+        assert set(schema["required"]) <= set(value) <= set(schema["properties"]), where
+        for name, inner in value.items():
+            conforms(inner, schema["properties"][name], f"{where}.{name}")
+    if schema["type"] == "array":
+        for inner in value:
+            conforms(inner, schema["items"], where)
+
+
+def test_the_team_is_drawn_where_it_was_estimated(recorded):
+    last = [e for *_, estimates in session() for e in estimates][-1]
+    update = [d for topic, _, _, d in messages(recorded) if topic == "/team"][-1]
+    frames = [d for topic, _, _, d in messages(recorded) if topic == "/tf"][-1]
+    drawn = {entity.id: entity for entity in update.entities}
+    assert {f"node {n.node}" for n in last.nodes} <= drawn.keys()
+    assert drawn["node 1"].texts[0].text.startswith("Ada Lovelace")
+    assert drawn["node 2"].texts[0].text.startswith("Grace")
+    for node in last.nodes:
+        ellipse = drawn[f"node {node.node}"].cylinders[0]
+        assert ellipse.pose.position.x == pytest.approx(node.x_m, abs=0.01)
+        # Half the long axis of the ellipse that holds 90 %: 2.146 sigmas.
+        assert ellipse.size.x / 2 == pytest.approx(2.146 * node.sigma_major_m, abs=0.01)
+        (frame,) = (t for t in frames.transforms if t.child_frame_id == f"node {node.node}")
+        assert frame.translation.y == pytest.approx(node.y_m, abs=0.01)
+        heading = 2 * math.atan2(frame.rotation.z, frame.rotation.w)
+        assert math.remainder(heading - node.heading_rad, 2 * math.pi) == pytest.approx(0, abs=1e-9)
+
+
+def test_messages_tell_when_they_arrived_and_what_time_they_are_of(recorded):
+    for topic, _, message, decoded in messages(recorded):
+        if topic == "/serial":
+            assert message.log_time == START_NS + round(decoded["arrival_s"] * 1e9)
+        if topic == "/event":
+            assert message.publish_time == START_NS + round(decoded["time_s"] * 1e9)
+            assert message.log_time - message.publish_time == pytest.approx(3.25e9, abs=2)
+
+
+def test_notices_are_in_the_log(recorded):
+    lines = [d.message for topic, _, _, d in messages(recorded) if topic == "/log"]
+    assert "the port vanished" in lines
+
+
+def test_what_was_received_and_decoded_comes_back_exactly_and_in_order(recorded):
+    recording = open_recording(recorded)
+    steps = session()
+    middle = len(steps) // 2
+    decoded = [[o for step in part for o in step[2]] for part in (steps[:middle], steps[middle:])]
+    at_s = steps[middle][0]
+    phone = [Event(at_s - 3.25, 2, "landmark", "17"), Heading(at_s - 0.5, 2, 1.5, 0.3, "phone")]
+    assert list(recording.observations()) == [*decoded[0], *phone, *decoded[1]]
+    assert Replay(recording, None).observations() == (*decoded[0], *phone, *decoded[1])
+    assert list(recording.estimates()) == [e for *_, estimates in steps for e in estimates]
+    assert recording.closed
+    assert recording.remarks == ()
+
+
+def test_the_bytes_through_the_link_give_the_same_once_more(recorded):
+    recording = open_recording(recorded)
+    # Counters up to 5 of node 1 had been seen before; the session here was not told so.
+    recording.about = dataclasses.replace(recording.about, newest_counters={})
+    again = Replay(recording, DEFAULT_KEY)
+    assert again.observations() == tuple(recording.observations())
+    assert again.counters()["received"] > 100
+
+
+def test_the_session_is_told_of_and_the_key_is_not(recorded):
+    told = open_recording(recorded).about
+    assert (told.started_unix_ns, told.seed, told.initial) == (START_NS, 7, "common")
+    assert told.settings == {"outliers": "0.03"}
+    assert told.newest_counters == {1: 5}
+    assert told.protocol == 2
+    nodes = told.description.nodes
+    assert {node: info.name for node, info in nodes.items()} == {1: "Ada Lovelace", 2: "Grace"}
+    assert nodes[2].height_m == 1.1
+    assert DEFAULT_KEY not in recorded.read_bytes()
+    assert DEFAULT_KEY.hex().encode() not in recorded.read_bytes()
+
+
+def test_a_recording_is_a_run_like_the_directory_of_the_same_session(recorded, tmp_path):
+    run = load_run(recorded)
+    save_run(run, tmp_path / "run")
+    directory = load_run(tmp_path / "run")
+    assert is_recording(recorded)
+    assert run.motions
+    for name in ("measurements", "events", "statuses", "steps", "truth", "description"):
+        ours, theirs = getattr(run, name), getattr(directory, name)
+        if name == "description":
+            theirs = dataclasses.replace(theirs, name=ours.name)
+        assert ours == theirs, name
+
+
+def test_a_run_with_truth_becomes_a_recording_and_a_run_again(tmp_path):
+    run = Run(
+        "corridor",
+        Description(name="corridor", heading_known=True),
+        measurements=(Motion(1.0, 1, 0.5, 0.0, 0.1, gain_version=3, moving=True),),
+        landmarks=(Landmark("17", 1.0, 2.0),),
+        truth=(Truth(0.0, 1, 0.0, 0.0, 0.5), Truth(1.0, 1, 0.5, 0.0)),
+    )
+    assert save_recording(tmp_path / "a.mcap", run, started_unix_ns=START_NS) == []
+    again = load_run(tmp_path / "a.mcap")
+    assert dataclasses.replace(again, directory=None) == run
+    assert open_recording(tmp_path / "a.mcap").started_unix_ns == START_NS
+    with pytest.raises(DataError, match="exists already"):
+        save_recording(tmp_path / "a.mcap", run)
+
+
+def test_a_recording_is_not_overwritten(recorded):
+    before = recorded.read_bytes()
+    with pytest.raises(DataError, match="exists already: a recording is not overwritten"):
+        make_recorder(recorded, about())
+    assert recorded.read_bytes() == before
+
+
+def test_what_is_no_recording_is_one_clear_line(tmp_path):
+    path = tmp_path / "x.mcap"
+    path.write_bytes(b"time_s,node\n0.1,3\n")
+    with pytest.raises(DataError, match=r"x\.mcap: no MCAP file$"):
+        open_recording(path)
+    path.unlink()
+    with pytest.raises(DataError, match="no such run directory"):
+        load_run(path)
+
+
+def test_without_the_key_the_decoded_measurements_are_taken_and_that_is_said(tmp_path):
+    key = bytes(range(16))
+    path = tmp_path / "secret.mcap"
+    recorder = make_recorder(path, about(own_key=True))
+    link = Link(key=key)
+    for arrival_s, data in serial_bytes(2, 15.0, 1, key):
+        recorder.received(arrival_s, data)
+        recorder.observed(arrival_s, link.feed(data, arrival_s))
+    recorder.close()
+    recording = open_recording(path)
+    without, with_key = Replay(recording, None), Replay(recording, key)
+    assert "key of its own (--key-file)" in without.remarks[0]
+    assert with_key.remarks == ()
+    assert with_key.observations() == without.observations() != ()
+    with pytest.raises(DataError, match="recorded under another key"):
+        Replay(recording, DEFAULT_KEY).observations()
+    assert key not in path.read_bytes()
