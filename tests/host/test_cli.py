@@ -161,8 +161,10 @@ def test_wrong_usage_is_exit_status_two(arguments: tuple[str, ...]) -> None:
     assert relpos(*arguments).exit_code == 2
 
 
-def test_what_is_not_built_yet_is_said(simulated: Path) -> None:
-    assert "not built yet" in one_clear_line(relpos("fuse", simulated, "--record", "f"))
+def test_a_recording_that_is_there_is_refused_at_once(simulated: Path, tmp_path: Path) -> None:
+    (tmp_path / "f.mcap").write_bytes(b"")
+    told = one_clear_line(relpos("fuse", simulated, "--record", tmp_path / "f.mcap"))
+    assert "exists already: a recording is not overwritten" in told
 
 
 def test_an_unknown_setting_is_one_clear_line(simulated: Path) -> None:

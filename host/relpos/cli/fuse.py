@@ -246,7 +246,7 @@ def _replay_run(job: Job, initial: Initial | None, options: live.Options, *, as_
     job.prepare()
     fuse_live(
         job,
-        PacedInput(job.source, run_items(run), speed=options.speed),
+        PacedInput(job.source, run_items(run), speed=options.pace),
         options,
         description=run.description,
         priors=priors,
@@ -297,7 +297,7 @@ def _fuse_mcap(
     if options.shown:
         job.prepare()
         again = Replay(recording, key)
-        source = PacedInput(job.source, again, speed=options.speed, link=again.link)
+        source = PacedInput(job.source, again, speed=options.pace, link=again.link)
         fuse_live(job, source, options, description=run.description, priors=priors, as_json=as_json)
         return
     counted = {name: round(count) for name, count in replay.counters().items()}
