@@ -264,9 +264,15 @@ def write(
     _make_room(out, form, overwrite=overwrite)
     if form in _FILES:
         out.parent.mkdir(parents=True, exist_ok=True)
-    else:
-        out.mkdir(parents=True, exist_ok=True)
-    return writer(content, out, pins)
+        return writer(content, out, pins)
+    new = not out.exists()
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        return writer(content, out, pins)
+    except RelposError:
+        if new and not any(out.iterdir()):
+            out.rmdir()
+        raise
 
 
 def _make_room(out: Path, form: Format, *, overwrite: bool) -> None:
