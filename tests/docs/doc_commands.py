@@ -211,6 +211,7 @@ OTHERS: dict[str, tuple[str, Callable[[Sequence[str]], bool]]] = {
     "uv": ("see pip", _extras_exist),
     "export": ("the shell's own", _nothing_to_check),
     "cd": ("the shell's own", _nothing_to_check),
+    "evo_ape": ("another's program; tests/exchange/test_convert.py calls it", _nothing_to_check),
     "git": ("another's program, from the net", _nothing_to_check),
     "sudo": ("changes the computer", _nothing_to_check),
     "xdg-open": ("opens a window", _nothing_to_check),

@@ -95,10 +95,31 @@ def belongings(tmp_path_factory):
     (folder / "WALK").mkdir()
     write_imu(folder / "WALK", times_s, [c[: len(times_s)] for c in columns])
     shutil.copytree(folder / "RUN", folder / "walk")
+    write_others_files(folder)
     key = folder / "team.key"
     key.write_text("00" * 16 + "\n")
     key.chmod(0o600)
     return folder
+
+
+def write_others_files(folder):
+    """Trajectories of another tool, a watch's track, presses and surveyed landmarks."""
+    pin = ("--pin", "48.13713,11.57538,90", "--start", "2026-05-04T09:30:00Z")
+    for words in (
+        ("DIR", "--to", "tum", "--out", "slam"),
+        ("RUN", "--to", "gpx", *pin, "--out", "watch.gpx"),
+    ):
+        source, *options, out = words
+        made = relpos("convert", folder / source, *options, folder / out)
+        assert made.exit_code == 0, made.output
+    watch = (folder / "watch.gpx").read_text()
+    first, *_, last = watch.split("<trk>")
+    (folder / "watch.gpx").write_text(f"{first}<trk>{last}")
+    shutil.copy(folder / "slam" / "estimate_2.tum", folder / "mocap.tum")
+    shutil.copytree(folder / "RUN", folder / "PRESSED")
+    (folder / "PRESSED" / "truth.csv").unlink()
+    (folder / "PRESSED" / "events.csv").write_text("time_s,node,event,value\n5,1,landmark,17\n")
+    (folder / "landmarks.csv").write_text("id,x_m,y_m\n17,3.5,0\n")
 
 
 def write_imu(folder, times_s, columns):
