@@ -18,7 +18,10 @@ export class Siren {
     this.muted = false;
     this.kind = null;
     this.timer = null;
-    const unlock = () => this.unlock();
+    // The sound's own button decides for itself.
+    const unlock = (event) => {
+      if (!event.target.closest?.("[data-sound]")) this.unlock();
+    };
     addEventListener("pointerdown", unlock);
     addEventListener("keydown", unlock);
   }
