@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import re
 import secrets
 import socket
 from dataclasses import dataclass, field
@@ -58,14 +59,11 @@ class Access:
 
 def parse_listen(address: str) -> tuple[str, int]:
     """Split HOST:PORT, HOST or :PORT; RelposError where it is none of them."""
-    host, colon, port = address.rpartition(":")
-    if not colon or (port and not port.isdigit()):
-        host, port = address, ""
-    host = host.strip("[]") or DEFAULT_HOST
-    number = int(port) if port else DEFAULT_PORT
-    if not 0 <= number <= 65535 or any(c.isspace() or c == "/" for c in host):
+    found = re.fullmatch(r"(?:\[([0-9a-fA-F:.]+)\]|([^:\s/\[\]]*))(?::(\d{1,5}))?", address)
+    number = DEFAULT_PORT if found is None or found[3] is None else int(found[3])
+    if found is None or number > 65535:
         raise RelposError(f"--view-listen {address}: not HOST:PORT, like 0.0.0.0:{DEFAULT_PORT}")
-    return host, number
+    return found[1] or found[2] or DEFAULT_HOST, number
 
 
 def listen(address: str | None) -> tuple[socket.socket, Access]:

@@ -1,0 +1,288 @@
+"""The page's server from outside: who is let in, what is served, what it survives."""
+
+import contextlib
+import json
+import ssl
+import threading
+import time
+
+import httpx
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from relpos.errors import DeviceError, RelposError
+from relpos.live.picture import Hello, Notice, Person, Picture
+from relpos.view.access import listen, make_certificate, own_address, parse_listen
+from relpos.view.web import WebView
+
+PATIENCE_S = 60.0
+
+
+class Stage:
+    """A page without a session behind it: this feeds pictures and answers visitors."""
+
+    def __init__(self, *, https=False, people=2):
+        door, access = listen("127.0.0.1:0")
+        if https:
+            object.__setattr__(access, "certificate", make_certificate(access.hosts))
+        self.page = WebView(door, access, Hello("test", "nowhere", "bank", time.time()))
+        self.access = access
+        self.people = people
+        self.asked = []
+        self.answering = True
+        self.seq = 0
+        self._over = threading.Event()
+        self._lock = threading.Lock()
+        self._thread = threading.Thread(target=self._feed)
+        self._thread.start()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._over.set()
+        self._thread.join()
+        self.page.close()
+
+    def _feed(self):
+        while not self._over.wait(0.02):
+            self.seq += 1
+            people = tuple(Person(n, f"Node {n}", 1.0 * n, 2.0) for n in range(1, self.people + 1))
+            self.page.pictured(Picture(self.seq, 0.02 * self.seq, time.time(), people=people))
+            for ask in self.page.asks():
+                self.asked.append(ask)
+                if self.answering:
+                    self.page.answer(ask, {"accepted": ["a"]})
+
+    @property
+    def base(self):
+        return self.access.url("").split("?")[0]
+
+    def client(self, *, token=True, **options):
+        cookies = {self.access.cookie: self.access.token} if token else {}
+        return httpx.Client(base_url=self.base, timeout=PATIENCE_S, cookies=cookies, **options)
+
+    def socket(self, **options):
+        address = self.access.url("/ws").replace("http", "ws", 1)
+        return connect(address, open_timeout=PATIENCE_S, **options)
+
+
+@pytest.fixture(scope="module")
+def stage():
+    with Stage() as stage:
+        yield stage
+
+
+def pictures(socket):
+    while True:
+        message = json.loads(socket.recv(timeout=PATIENCE_S))
+        if message["type"] == "picture":
+            yield message
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/phone", "/qr.svg", "/api/picture", "/api/time", "/static/"]
+)
+@pytest.mark.parametrize("token", [None, "", "wrong"])
+def test_without_the_token_nothing_is_shown(stage, path, token):
+    params = {} if token is None else {"token": token}
+    with stage.client(token=False) as client:
+        answer = client.get(path, params=params)
+    assert answer.status_code == 401
+    assert "printed in the terminal" in answer.text
+    assert "set-cookie" not in answer.headers
+
+
+def test_without_the_token_nothing_is_taken(stage):
+    with stage.client(token=False) as client:
+        before = len(stage.asked)
+        assert client.post("/api/acknowledge", json={"node": 1}).status_code == 401
+    address = stage.access.url("/ws").replace("http", "ws", 1).split("?")[0]
+    with pytest.raises(InvalidStatus), connect(address, open_timeout=PATIENCE_S):
+        pass
+    assert len(stage.asked) == before
+
+
+def test_the_token_becomes_a_cookie_and_leaves_the_address(stage):
+    with stage.client(token=False) as client:
+        answer = client.get("/phone", params={"token": stage.access.token, "node": "3"})
+        assert answer.status_code == 303
+        assert answer.headers["location"] == "/phone?node=3"
+        cookie = answer.headers["set-cookie"].lower()
+        assert "httponly" in cookie
+        assert "samesite=lax" in cookie
+        assert client.get("/phone").status_code == 200
+        assert "script-src" not in answer.headers["content-security-policy"]
+        assert "default-src 'self'" in client.get("/").headers["content-security-policy"]
+
+
+def test_another_sites_page_cannot_use_the_cookie(stage):
+    with stage.client() as client:
+        elsewhere = {"Origin": "http://elsewhere.example"}
+        answer = client.post("/api/acknowledge", json={"node": 1}, headers=elsewhere)
+        assert answer.status_code == 401
+        own = {"Origin": stage.base.rstrip("/")}
+        assert client.post("/api/acknowledge", json={"node": 1}, headers=own).status_code == 200
+
+
+def test_a_browser_gets_hello_tracks_and_then_pictures(stage):
+    with stage.socket() as socket:
+        hello = json.loads(socket.recv(timeout=PATIENCE_S))
+        assert (hello["type"], hello["protocol"]) == ("hello", 1)
+        assert hello["limits"] == {"still_warning_s": 20.0, "still_alarm_s": 30.0}
+        assert json.loads(socket.recv(timeout=PATIENCE_S))["type"] == "tracks"
+        first = next(pictures(socket))
+    assert [person["node"] for person in first["people"]] == [1, 2]
+    assert first["people"][0]["heading_rad"] is None
+
+
+def test_time_and_wearers_are_told(stage):
+    with stage.client() as client:
+        told = client.get("/api/time").json()
+        assert told["unix_ms"] / 1000.0 == pytest.approx(time.time(), abs=30.0)
+        assert told["session_s"] > 0.0
+        wearers = client.get("/api/wearers").json()
+        assert wearers[1] == {"node": 2, "name": "Node 2", "taken": False}
+        stage.page.named({2: "Kim"})
+        until_s = time.monotonic() + PATIENCE_S
+        while not client.get("/api/wearers").json()[1]["taken"]:
+            assert time.monotonic() < until_s
+
+
+PRESS = {"id": "a", "landmark": "17", "unix_ms": 1.7e12}
+
+
+def test_a_press_is_accepted_when_the_session_has_it(stage):
+    with stage.client() as client:
+        body = {"node": 1, "presses": [PRESS], "clock_offset_ms": 3.5, "sent_unix_ms": 1.7e12}
+        answer = client.post("/api/presses", json=body)
+    assert answer.json() == {"accepted": ["a"]}
+    assert stage.asked[-1].kind == "presses"
+    assert stage.asked[-1].body == body
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "why"),
+    [
+        ("presses", b"{", "not JSON"),
+        ("presses", b"[]", "not a JSON object"),
+        ("presses", {"node": 0, "presses": [], "clock_offset_ms": 0}, "node"),
+        ("presses", {"node": 1, "presses": [{}], "clock_offset_ms": 0}, "id"),
+        ("presses", {"node": 1, "presses": [PRESS]}, "clock_offset_ms"),
+        ("presses", {"node": 1, "presses": [PRESS | {"landmark": "1\n2"}], "clock_offset_ms": 0},
+         "landmark"),
+        ("presses", {"node": 1, "presses": [PRESS] * 2001, "clock_offset_ms": 0}, "more than"),
+        ("presses", b'{"node": 1, "presses": [], "clock_offset_ms": NaN}', "clock_offset_ms"),
+        ("headings", {"node": 1, "clock_offset_ms": 0, "headings": [
+            {"unix_ms": 1, "heading_rad": 1, "sigma_rad": 0}]}, "sigma_rad"),
+        ("name", {"node": 1, "name": "x" * 41}, "name"),
+        ("acknowledge", {"node": True}, "node"),
+        ("acknowledge", b"x" * (1 << 20) + b"x", "bytes"),
+    ],
+)  # fmt: skip
+def test_what_makes_no_sense_is_refused_in_words(stage, path, body, why):
+    with stage.client() as client:
+        content = body if isinstance(body, bytes) else json.dumps(body).encode()
+        answer = client.post(f"/api/{path}", content=content)
+    assert answer.status_code == 400
+    assert why in answer.json()["error"]
+
+
+def test_no_qr_code_leads_phones_to_an_address_that_they_cannot_reach(stage):
+    with stage.client() as client:
+        answer = client.get("/qr.svg")
+    assert answer.status_code == 404
+    assert "--view-listen" in answer.text
+
+
+def test_a_session_that_does_not_answer_is_told_to_the_phone(stage, monkeypatch):
+    stage.answering = False
+    try:
+        with stage.client() as client:
+            answer = client.post("/api/acknowledge", json={"node": 1})
+    finally:
+        stage.answering = True
+    assert answer.status_code == 503
+
+
+def test_ten_browsers_each_get_the_newest_picture_and_one_that_sleeps_holds_up_nobody(stage):
+    with contextlib.ExitStack() as stack:
+        # This one never reads.
+        stack.enter_context(stage.socket(max_queue=1))
+        sockets = [stack.enter_context(stage.socket()) for _ in range(10)]
+        readers = [pictures(socket) for socket in sockets]
+        for reader in readers:
+            first = next(reader)["seq"]
+            while next(reader)["seq"] < first + 20:
+                pass
+        newest = [next(reader)["seq"] for reader in readers]
+    assert min(newest) > 20
+
+
+def test_a_server_that_dies_is_started_again_behind_the_same_address(stage):
+    with stage.socket() as socket:
+        next(pictures(socket))
+        stage.page._process.kill()
+        with pytest.raises(ConnectionClosed):
+            for _ in pictures(socket):
+                pass
+    # As a browser does: again and again, with the token that it had.
+    until_s = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            with stage.socket() as socket:
+                next(pictures(socket))
+            break
+        except (OSError, ConnectionClosed):
+            assert time.monotonic() < until_s
+            time.sleep(0.1)
+    assert stage.page.restarts == 1
+    assert "started again" in stage.page.trouble()
+    with stage.client() as client:
+        # Whom a phone has named is known to the new one, too.
+        assert client.get("/api/wearers").status_code == 200
+
+
+def test_over_https_the_cookie_is_for_https_alone():
+    with Stage(https=True) as stage:
+        context = ssl.create_default_context()
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_NONE
+        with stage.client(token=False, verify=context) as client:
+            answer = client.get("/", params={"token": stage.access.token})
+            assert "secure" in answer.headers["set-cookie"].lower()
+            assert client.get("/").status_code == 200
+        with stage.socket(ssl=context) as socket:
+            next(pictures(socket))
+
+
+def test_addresses_are_understood_or_refused_in_one_line():
+    assert parse_listen("0.0.0.0:80") == ("0.0.0.0", 80)
+    assert parse_listen("0.0.0.0")[0] == "0.0.0.0"
+    assert parse_listen(":9000")[1] == 9000
+    assert parse_listen("[::1]:9000") == ("::1", 9000)
+    with pytest.raises(RelposError, match="HOST:PORT"):
+        parse_listen("0.0.0.0:http")
+    door, access = listen("127.0.0.1:0")
+    with door, pytest.raises(DeviceError, match="cannot listen"):
+        listen(f"127.0.0.1:{access.port}")
+
+
+def test_what_is_told_to_phones_is_an_address_that_others_can_reach():
+    door, access = listen("0.0.0.0:0")
+    with door:
+        if own_address() is not None:
+            assert access.reachable
+            assert access.hosts[0] == own_address()
+        assert access.token in access.url("/phone")
+
+
+def test_notices_and_names_of_any_kind_are_plain_json():
+    picture = Picture(
+        1, 2.0, 3.0, notices=(Notice("x", "alarm", 'a "quoted" <b> \u2028 line\n', 1.0),),
+        people=(Person(1, "Zoë </script>", 1.0, float("nan")),),
+    )  # fmt: skip
+    text = picture.to_json()
+    assert "\n" not in text
+    assert json.loads(text)["people"][0]["y_m"] is None
