@@ -1,0 +1,122 @@
+"""What a session leaves on disk, also while the disk is full."""
+
+import errno
+import io
+from pathlib import Path
+
+import pytest
+
+from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, Parameter
+from relpos.live.files import FileSink
+from relpos.measurements import Event, Heading, Height, Motion, Range, Status, Step
+from relpos.runs import Description, load_run, read_estimates, write_estimates
+from relpos.runs.appending import AppendedTable
+
+OBSERVATIONS = [
+    Motion(1.0, 1, 0.5, 0.0, 0.1, 0.1, 0.1, 0.1, 2, True, 0.05),
+    Range(1.6, 1, 2, 3.25, -80.0),
+    Height(1.0, 1, 0.5),
+    # Told two seconds after it was measured, as ranges are.
+    Range(0.4, 2, 1, 3.5, None),
+    Heading(1.5, 2, 0.7, 0.2, "phone"),
+    Status(1.2, 1, "battery_v", 4.9),
+    Event(1.1, 2, "landmark", "17"),
+    Step(1.3, 1, 0.7),
+]
+
+
+def an_estimate(time_s, scale=1.0):
+    node = NodeEstimate(1, time_s, 0.0, 0.1, 0.1, 0.1, 0.0, 0.1, NodeStatus.OK)
+    parameters = (Parameter(time_s, 1, None, "step_scale", scale, 0.1),)
+    return Estimate(time_s, (node,), (), (), parameters)
+
+
+def test_what_was_received_loads_as_a_run_in_the_order_of_time(tmp_path):
+    files = FileSink(tmp_path, Description(name="walk"))
+    files.observed(2.0, OBSERVATIONS)
+    files.estimated(an_estimate(1.0))
+    files.named({2: "Kim"})
+    files.close()
+    run = load_run(tmp_path / "received")
+    assert run.name == "walk"
+    assert run.nodes[2].name == "Kim"
+    assert [o.time_s for o in run.ranges] == [0.4, 1.6]
+    kept = [*run.measurements, *run.events, *run.statuses, *run.steps]
+    assert sorted(map(repr, kept)) == sorted(map(repr, OBSERVATIONS))
+    assert "unsorted_rows" not in run.counters
+
+
+def test_files_of_an_earlier_session_are_not_taken_for_this_ones(tmp_path):
+    for session in range(2):
+        files = FileSink(tmp_path, Description(name="walk"))
+        files.observed(2.0, OBSERVATIONS if session == 0 else OBSERVATIONS[:1])
+        files.close()
+    run = load_run(tmp_path / "received")
+    assert not run.ranges
+    assert not run.events
+    assert not (tmp_path / "steps.csv").exists()
+
+
+def test_appended_estimates_are_those_that_are_written_at_once(tmp_path):
+    estimates = [an_estimate(float(t), 1.0 + (t > 3)) for t in range(6)]
+    files = FileSink(tmp_path / "a", Description(), keep_received=False)
+    for estimate in estimates:
+        files.estimated(estimate)
+    files.close()
+    write_estimates(tmp_path / "b", estimates)
+    for path in (tmp_path / "b").iterdir():
+        assert (tmp_path / "a" / path.name).read_bytes() == path.read_bytes()
+    assert len(read_estimates(tmp_path / "a")) == 6
+    assert (tmp_path / "a" / "parameters.csv").read_text().count("step_scale") == 2
+
+
+class FullDisk(io.RawIOBase):
+    """Takes ``room`` bytes in all."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.room, self.taken = path, 40, b""
+
+    def write(self, data) -> int:
+        part = bytes(data)[: self.room - len(self.taken)]
+        if not part:
+            raise OSError(errno.ENOSPC, "No space left on device", str(self.path))
+        self.taken += part
+        return len(part)
+
+
+def test_a_full_disk_is_told_and_nothing_is_missing_once_there_is_room(tmp_path, monkeypatch):
+    disk = FullDisk(tmp_path / "table.csv")
+    monkeypatch.setattr(Path, "open", lambda *_, **__: disk)
+    table = AppendedTable(tmp_path / "table.csv", ["time_s", "node"])
+    for k in range(50):
+        table.add([(k, 1)])
+        table.flush()
+    assert table.error is not None
+    assert table.error.strerror == "No space left on device"
+    disk.room = 10_000
+    table.add([(50, 1)])
+    table.flush()
+    assert table.error is None
+    table.close()
+    expected = "time_s,node\n" + "".join(f"{k},1\n" for k in range(51))
+    assert disk.taken.decode() == expected
+
+
+def test_a_disk_that_stays_full_is_an_error_at_the_end(tmp_path, monkeypatch):
+    disk = FullDisk(tmp_path / "table.csv")
+    monkeypatch.setattr(Path, "open", lambda *_, **__: disk)
+    table = AppendedTable(tmp_path / "table.csv", ["time_s", "node"])
+    table.add((k, 1) for k in range(50))
+    with pytest.raises(OSError, match="No space left"):
+        table.close()
+
+
+def test_what_nothing_can_hold_any_more_is_counted(tmp_path, monkeypatch):
+    disk = FullDisk(tmp_path / "table.csv")
+    monkeypatch.setattr(Path, "open", lambda *_, **__: disk)
+    monkeypatch.setattr("relpos.runs.appending.MOST_WAITING_BYTES", 100)
+    table = AppendedTable(tmp_path / "table.csv", ["time_s", "node"])
+    for k in range(100):
+        table.add([(k, 1)])
+        table.flush()
+    assert table.lost_rows > 50

@@ -1,0 +1,137 @@
+"""A session at a real serial line: a pseudo-terminal that is pulled out and put back."""
+
+import itertools
+import os
+import pty
+import tty
+from pathlib import Path
+
+import pytest
+from team_input import make_session
+
+from relpos import fusion
+from relpos.emulator.team import EmulatedTeam
+from relpos.errors import DeviceError
+from relpos.link import xbee
+from relpos.link.live import Link
+from relpos.live.inputs import PortInput
+from relpos.measurements import Motion
+
+
+class Socket:
+    """Where the coordinator is plugged in: a name that leads to a terminal, or to none."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._ours = self._theirs = -1
+
+    def plug(self) -> None:
+        self._ours, self._theirs = pty.openpty()
+        tty.setraw(self._theirs)
+        self.path.symlink_to(os.ttyname(self._theirs))
+
+    def pull(self) -> None:
+        self.path.unlink()
+        os.close(self._ours)
+        os.close(self._theirs)
+
+    def write(self, data: bytes) -> None:
+        os.write(self._ours, data)
+
+
+@pytest.fixture
+def socket(tmp_path):
+    socket = Socket(tmp_path / "ttyUSB0")
+    socket.plug()
+    yield socket
+    if socket.path.exists():
+        socket.pull()
+
+
+@pytest.fixture(scope="module")
+def stream():
+    """Eight seconds of two nodes, each piece marked with its virtual time."""
+    with EmulatedTeam("straight", 2, 20.0, 3, beacons=True) as team:
+        marks = []
+        for time_us, data in team.stream():
+            mark = xbee.UnknownFrame(xbee.VIRTUAL_TIME, time_us.to_bytes(8, "big"))
+            marks.append(xbee.encode(mark) + data)
+        yield marks, team.priors()
+
+
+def deadreckoning(priors):
+    return fusion.make("deadreckoning", priors)
+
+
+def motions_of(pieces):
+    link = Link()
+    return [o for p in pieces for o in link.feed(p, 0.0) if isinstance(o, Motion)]
+
+
+def test_a_port_that_is_pulled_out_is_told_waited_for_and_read_on_from(socket, stream):
+    pieces, priors = stream
+    half = len(pieces) // 2
+    source = PortInput(str(socket.path), Link(), teach=False, reopen=True)
+    session, album = make_session(source, deadreckoning, priors=priors, lasts=True)
+    socket.write(b"".join(pieces[:half]))
+    wanted = len(motions_of(pieces)) - 2
+    first = len(motions_of(pieces[:half]))
+
+    def motions():
+        return sum(isinstance(o, Motion) for _, o in album.observations)
+
+    def told():
+        return [n for n in album.pictures[-1].notices if n.id == "port"] if album.pictures else []
+
+    stages = iter(("read", "gone", "back"))
+    stage = next(stages)
+    looks = itertools.count()
+    original = source.read
+
+    def read(timeout_s):
+        """Let things happen while the session looks."""
+        nonlocal stage
+        assert next(looks) < 20_000
+        received = original(timeout_s)
+        if stage == "read" and motions() >= first:
+            socket.pull()
+            stage = next(stages)
+        elif stage == "gone" and told():
+            assert told()[0].level == "alarm"
+            assert "vanished" in told()[0].text or "cannot open" in told()[0].text
+            socket.plug()
+            stage = next(stages)
+        elif stage == "back" and source.trouble() is None and motions() == first:
+            socket.write(b"".join(pieces[half:]))
+            stage = "written"
+        elif stage == "written" and motions() >= wanted and not told():
+            session.stop()
+        return received
+
+    source.read = read
+    for _ in session.run():
+        pass
+    outcome = session.finish()
+    assert outcome.failure is None
+    assert motions() >= wanted
+    assert not told()
+
+
+def test_a_port_that_is_not_to_be_opened_again_ends_the_session(socket, stream):
+    pieces, priors = stream
+    source = PortInput(str(socket.path), Link(), teach=False)
+    session, album = make_session(source, deadreckoning, priors=priors)
+    socket.write(b"".join(pieces))
+    for k, _ in enumerate(session.run()):
+        if k == 20:
+            socket.pull()
+    outcome = session.finish()
+    assert isinstance(outcome.failure, DeviceError)
+    assert "vanished" in str(outcome.failure)
+    assert outcome.received > 20
+    assert album.closed
+
+
+def test_a_port_that_is_not_there_is_said_before_anything_begins(tmp_path):
+    with pytest.raises(DeviceError, match="no such device"):
+        PortInput(str(tmp_path / "ttyUSB9"), Link(), reopen=True)
