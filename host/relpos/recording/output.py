@@ -1,9 +1,9 @@
 """The file that a recorder writes, and what becomes of it where the disk refuses.
 
-Blocks are handed over whole and kept until the disk has confirmed them. A full disk is asked again:
-the file goes on at the byte where it stopped. A file that cannot go on at all (its size limit, a
-disk that was unplugged and is back) is followed by another part, FILE.part2.mcap, which begins with
-the blocks that were not confirmed.
+Blocks are handed over whole, written at once, and kept until the disk has confirmed them. A full
+disk is asked again: the file goes on at the byte where it stopped. A file that cannot go on at all
+(its size limit, a disk that was unplugged and is back) is followed by another part,
+FILE.part2.mcap, which begins with the blocks that were not confirmed.
 """
 
 from __future__ import annotations
@@ -11,13 +11,17 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import time
 from collections.abc import Callable
 from pathlib import Path
+from threading import Condition, Thread
 
 from relpos.errors import DataError
 from relpos.recording import container
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+MOST_UNCONFIRMED = 64 << 20
+"""Bytes written that the disk has not confirmed: beyond, the recorder's queue grows instead."""
 
 
 class Disk:
@@ -37,6 +41,85 @@ def part_path(path: Path, part: int) -> Path:
     return path if part == 1 else path.with_name(f"{path.stem}.part{part}{path.suffix}")
 
 
+class _Syncer:
+    """Has the disk confirm a file, in a thread: a write never waits for the disk to be done.
+
+    Without it a slow disk would keep from the file what a killed process could have left there.
+    """
+
+    def __init__(self, disk: Disk, handle: int, size: int) -> None:
+        self.handle = handle
+        self._disk = disk
+        self._wanted = size
+        self._confirmed = size
+        self._since_s: float | None = None
+        self._error: OSError | None = None
+        self._ended = False
+        self._changed = Condition()
+        Thread(target=self._run, name="disk", daemon=True).start()
+
+    def ask(self, size: int) -> None:
+        """Have it confirm the file up to ``size``."""
+        with self._changed:
+            self._wanted = size
+            if self._since_s is None and size > self._confirmed:
+                self._since_s = time.monotonic()
+            self._changed.notify_all()
+
+    def confirmed(self) -> int:
+        """Size that was confirmed. OSError, once, where the disk has refused since."""
+        with self._changed:
+            error, self._error = self._error, None
+            if error is not None:
+                raise error
+            return self._confirmed
+
+    def late_s(self) -> float:
+        """How long the oldest that is not confirmed waits."""
+        with self._changed:
+            return 0.0 if self._since_s is None else time.monotonic() - self._since_s
+
+    def wait(self, size: int, timeout_s: float) -> bool:
+        """Wait until it has confirmed ``size``; whether it has."""
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._confirmed >= size or self._error is not None, timeout_s
+            )
+            return self._confirmed >= size
+
+    def end(self) -> None:
+        """Close the file once nothing is being confirmed any more."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._ended or self._wanted > self._confirmed)
+                if self._ended:
+                    break
+                wanted = self._wanted
+            error: OSError | None = None
+            asked_s = time.monotonic()
+            try:
+                self._disk.sync(self.handle)
+            except OSError as refused:
+                error = refused
+            with self._changed:
+                if error is None:
+                    self._confirmed = wanted
+                    self._since_s = asked_s if self._wanted > wanted else None
+                else:
+                    # What the system held may be gone with this: it is written again.
+                    self._error = error
+                    self._wanted = self._confirmed
+                    self._since_s = None
+                self._changed.notify_all()
+        with contextlib.suppress(OSError):
+            os.close(self.handle)
+
+
 class Output:
     """Whole blocks to a file and its further parts.
 
@@ -49,19 +132,16 @@ class Output:
         self._beginning = beginning
         self._disk = disk
         self.part = 0
-        self._handle = -1
         self._blocks: list[bytes] = []
-        """Not confirmed yet."""
+        """Not confirmed yet, the first of them at ``_start`` of the file."""
+        self._start = 0
         self._written = 0
-        """Bytes of them that the disk has taken."""
-        self._confirmed = 0
-        """Size of the file up to the last confirmed block."""
+        """Bytes of them that the system has taken."""
         second = part_path(path, 2)
         try:
             if second.exists():
                 raise FileExistsError(errno.EEXIST, "", str(second))
             self._begin(1)
-            self.flush()
         except FileExistsError as error:
             raise DataError(
                 f"{error.filename} exists already: a recording is not overwritten"
@@ -76,32 +156,46 @@ class Output:
 
     @property
     def waiting(self) -> bool:
-        """Whether the disk has still to confirm something."""
-        return bool(self._blocks)
+        """Whether something is not written yet, or too much not confirmed."""
+        size = sum(map(len, self._blocks))
+        return size > self._written or size > MOST_UNCONFIRMED
+
+    def late_s(self) -> float:
+        """How long what was written waits for the disk to confirm it."""
+        return self._syncer.late_s()
 
     def put(self, block: bytes) -> None:
         """Hand over a block; it is written by :meth:`flush`."""
         self._blocks.append(block)
 
     def flush(self) -> None:
-        """Have the disk take and confirm everything. OSError where it does not, for now."""
+        """Write everything, and have it confirmed by and by. OSError where it cannot be, now."""
         try:
-            self._flush()
+            self._write()
         except OSError as error:
-            if error.errno in NO_ROOM or not self._confirmed:
+            if error.errno in NO_ROOM:
                 raise
             self._begin(self.part + 1)
-            self._flush()
+            self._write()
 
-    def _flush(self) -> None:
-        if not self._blocks:
-            return
-        data = memoryview(b"".join(self._blocks))
-        while self._written < len(data):
-            self._written += self._disk.write(self._handle, data[self._written :])
-        self._disk.sync(self._handle)
-        self._confirmed += len(data)
-        self._blocks, self._written = [], 0
+    def _write(self) -> None:
+        handle = self._syncer.handle
+        try:
+            confirmed = self._syncer.confirmed()
+        except OSError:
+            os.lseek(handle, self._start, os.SEEK_SET)
+            self._written = 0
+            raise
+        while self._blocks and self._start + len(self._blocks[0]) <= confirmed:
+            size = len(self._blocks.pop(0))
+            self._start += size
+            self._written -= size
+        before = 0
+        for block in self._blocks:
+            while (at := self._written - before) < len(block):
+                self._written += self._disk.write(handle, memoryview(block)[at:])
+            before += len(block)
+        self._syncer.ask(self._start + self._written)
 
     def _begin(self, part: int) -> None:
         """Begin a part; what is not confirmed goes there. OSError, and nothing has changed."""
@@ -120,29 +214,40 @@ class Output:
             path.unlink(missing_ok=True)
             raise
         if part > 1:
-            self._leave()
-        self.part, self._handle, self._written = part, handle, 0
-        self._confirmed = len(start)
+            self._cut()
+            self._syncer.end()
+        self.part, self._start, self._written = part, len(start), 0
+        self._syncer = _Syncer(self._disk, handle, len(start))
 
-    def _leave(self) -> None:
-        """Close the present part as well as the disk allows; what is there stays readable."""
+    def _cut(self) -> None:
+        """Let the present part end with its last confirmed block."""
         with contextlib.suppress(OSError):
-            os.ftruncate(self._handle, self._confirmed)
-        with contextlib.suppress(OSError):
-            os.close(self._handle)
-        with contextlib.suppress(OSError, ValueError):
-            container.finish(self.path)
+            os.ftruncate(self._syncer.handle, self._start)
 
-    def close(self) -> bool:
-        """Close the file, with the summary that viewers seek by; whether there was room for it."""
+    def close(self, timeout_s: float) -> bool:
+        """Close the file, with the summary that viewers seek by; whether all of it is on the disk.
+
+        Only what the disk confirms in time counts; of a block half of which is there, nothing.
+        """
         with contextlib.suppress(OSError):
-            os.ftruncate(self._handle, self._confirmed)
-        os.close(self._handle)
+            self.flush()
+        whole = self._start
+        for block in self._blocks:
+            if self._written < whole - self._start + len(block):
+                break
+            whole += len(block)
+        with contextlib.suppress(OSError):
+            os.ftruncate(self._syncer.handle, whole)
+        confirmed = self._syncer.wait(whole, timeout_s)
+        complete = not self.waiting and confirmed
+        self._syncer.end()
+        if not confirmed:
+            return False
         try:
             container.finish(self.path)
         except OSError:
             return False
-        return not self._blocks
+        return complete
 
 
 def _sync_directory(directory: Path) -> None:

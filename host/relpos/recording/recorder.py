@@ -32,6 +32,8 @@ BLOCK_S = 0.5
 """A block is closed that often: with the disk's own time, less than a second is ever at stake."""
 BLOCK_BYTES = 1 << 20
 RETRY_S = 0.5
+LATE_S = 3.0
+"""A disk that confirms nothing for so long is told of."""
 CLOSE_WITHIN_S = 10.0
 """How long the end of a session waits for a disk that takes nothing."""
 
@@ -181,10 +183,11 @@ class Recorder:
                 break
             if give_up_s is not None and (done or time.monotonic() > give_up_s):
                 break
-        self._end()
+        left_s = CLOSE_WITHIN_S if give_up_s is None else max(give_up_s - time.monotonic(), 1.0)
+        self._end(left_s)
 
-    def _end(self) -> None:
-        closed = self._output.close()
+    def _end(self, left_s: float) -> None:
+        closed = self._output.close(left_s)
         with self._lock:
             left = len(self._queue)
             self._bounds = Bounds(0, 0)
@@ -195,14 +198,14 @@ class Recorder:
             )
         elif not closed and self._trouble is None:
             self._trouble = (
-                f"{self.path}: no room for the summary that viewers seek by; everything is in "
-                "there, and `relpos convert` adds it"
+                f"{self.path}: no room for the summary that viewers seek by, or the disk did not "
+                "confirm it; everything else is in there, and `relpos convert` makes it whole"
             )
 
     def _work(self, *, closing: bool) -> bool:
         """Encode and write what there is; whether nothing waits any more."""
         while True:
-            if self._output.waiting and not self._flushed():
+            if self._output.waiting and (not self._flushed() or self._output.waiting):
                 return False
             while self._queue and len(self._block) < BLOCK_BYTES and not self._output.waiting:
                 self._encode_next()
@@ -233,8 +236,15 @@ class Recorder:
             self.log("warning", f"the recording goes on in {self._output.path.name}")
         if self._refused_since_s is not None:
             waited_s = now_s - self._refused_since_s
-            self._trouble = self._refused_since_s = None
+            self._refused_since_s = None
             self.log("info", f"the disk takes the recording again after {waited_s:.0f} s")
+        late_s = self._output.late_s()
+        self._trouble = (
+            f"the disk has not confirmed the recording {self.path} for {late_s:.0f} s: a power "
+            "failure now would lose as much"
+            if late_s > LATE_S
+            else None
+        )
         return True
 
     def _tell(self, error: OSError, since_s: float) -> None:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from pathlib import Path
 
 import numpy as np
 
@@ -34,13 +35,15 @@ class Content:
     """A run and the estimates that belong to it, either of which may be empty.
 
     ``start_unix_s`` is the Unix time of the run's second 0, None where nobody knows it.
-    ``remarks`` is what there is to tell the user about how it was read.
+    ``remarks`` is what there is to tell the user about how it was read. ``recording`` is the
+    MCAP file that all of it but truth and landmarks is from: what was received is only in there.
     """
 
     run: Run
     estimates: tuple[Estimate, ...] = ()
     start_unix_s: float | None = None
     remarks: tuple[str, ...] = field(default=())
+    recording: Path | None = None
 
     @property
     def node_ids(self) -> tuple[int, ...]:

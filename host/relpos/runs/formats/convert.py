@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
-from relpos.errors import DataError, RelposError
+from relpos.errors import DataError
 from relpos.geodesy import MapFrame, Pin, place
 from relpos.runs.estimates import read_estimates, write_estimates
 from relpos.runs.formats.content import (
@@ -117,7 +117,7 @@ def _read_directory(source: Path, hints: Hints) -> Content:
     estimates = tuple(read_estimates(source)) if find_table(source, "estimate.csv") else ()
     if hints.run is not None:
         base = _base(source, hints)
-        return replace(base, estimates=estimates or base.estimates)
+        return replace(base, estimates=estimates, recording=None) if estimates else base
     received = source / RECEIVED
     if estimates and received.is_dir():
         run = load_run(received)
@@ -138,7 +138,17 @@ def _started(content: Content, hints: Hints) -> Content:
 
 
 def _read_mcap(source: Path) -> Content:
-    raise RelposError(f"{source}: MCAP is not built yet")
+    from relpos.recording import open_recording
+
+    recording = open_recording(source)
+    start_ns = recording.started_unix_ns
+    return Content(
+        recording.run,
+        tuple(recording.estimates()),
+        None if start_ns is None else start_ns * 1e-9,
+        (*recording.remarks, *_press_remarks(recording.run)),
+        recording=source,
+    )
 
 
 def _read_tracks(source: Path, form: Format, base: Content, hints: Hints) -> Content:
@@ -249,6 +259,7 @@ def located_alone(content: Content) -> Content:
             replace(e, nodes=tuple(n for n in e.nodes if n.status in PLACED))
             for e in content.estimates
         ),
+        recording=None,
     )
 
 
@@ -313,7 +324,18 @@ def _write_csv(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
 
 
 def _write_mcap(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
-    raise RelposError(f"{out}: MCAP is not built yet")
+    from relpos.recording import open_recording, save_recording
+
+    source = None if content.recording is None else open_recording(content.recording)
+    out.unlink(missing_ok=True)  # That it may be replaced has been asked.
+    remarks = save_recording(
+        out,
+        content.run,
+        content.estimates,
+        started_unix_ns=round((content.start_unix_s or 0.0) * 1e9),
+        source=source,
+    )
+    return [out], remarks
 
 
 def _write_tum(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
