@@ -132,6 +132,7 @@ class Output:
         self._beginning = beginning
         self._disk = disk
         self.part = 0
+        self._syncer: _Syncer
         self._blocks: list[bytes] = []
         """Not confirmed yet, the first of them at ``_start`` of the file."""
         self._start = 0

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
-from relpos.errors import DataError
+from relpos.errors import DataError, RelposError
 from relpos.geodesy import MapFrame, Pin, place
 from relpos.runs.estimates import read_estimates, write_estimates
 from relpos.runs.formats.content import (
