@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from relpos.api import bound, evaluate, fuse, load, save, simulate
+    from relpos.api import bound, evaluate, fuse, load, plot, report, save, simulate
     from relpos.errors import DataError, DeviceError, RelposError
     from relpos.evaluation.result import Result
     from relpos.evaluation.scoring import Evaluation
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from relpos.runs import Run
 
 _LAZY = {
-    "relpos.api": ("bound", "evaluate", "fuse", "load", "save", "simulate"),
+    "relpos.api": ("bound", "evaluate", "fuse", "load", "plot", "report", "save", "simulate"),
     "relpos.errors": ("DataError", "DeviceError", "RelposError"),
     "relpos.evaluation.result": ("Result",),
     "relpos.evaluation.scoring": ("Evaluation",),
@@ -84,6 +84,8 @@ __all__ = [
     "fuse",
     "load",
     "pairs_of",
+    "plot",
+    "report",
     "save",
     "simulate",
 ]

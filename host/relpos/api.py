@@ -20,13 +20,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from relpos.errors import RelposError
-from relpos.evaluation.result import Passage, Result, pass_through, read_result
+from relpos.evaluation.result import Result, pass_through, read_result, result_of
 from relpos.evaluation.scoring import Evaluation
 from relpos.fusion.estimator import Estimate, Estimator
 from relpos.measurements import Measurement, Prior
 from relpos.runs import InitialPose, Run, load_run, save_run
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from relpos.evaluation.bounds import Bound
 
 Given = str | Estimator | Callable[..., Estimator]
@@ -111,37 +113,40 @@ def evaluate(
     )
 
 
+def plot(
+    result: Result | Sequence[Estimate] | Path | str, run: Run, figure: str = "tracks"
+) -> Figure:
+    """Draw one of the report's figures, as a Matplotlib figure (``savefig`` writes it).
+
+    ``figure`` is one of tracks, error, error-distribution, distances, consistency, status,
+    detection, residuals, parameters, height and health. RelposError for another name, and where
+    the run has nothing for it.
+    """
+    from relpos.evaluation import report as reports
+
+    return reports.draw(reports.gather(run, _result(result)), figure)
+
+
+def report(
+    result: Result | Sequence[Estimate] | Path | str,
+    run: Run,
+    out: Path | str,
+    figures: Path | str | None = None,
+) -> Path:
+    """Write the page that ``relpos report`` writes; return its path.
+
+    ``figures`` is a folder for every figure as SVG and PNG.
+    """
+    from relpos.evaluation import report as reports
+
+    return reports.write(reports.gather(run, _result(result)), out, figures)
+
+
 def bound(run: Run) -> Bound | None:
     """Compute the Cramer-Rao bound of a simulated run, over time; None of a recorded one."""
     from relpos.evaluation import scoring
 
     return scoring.bound_of(run)
-
-
-def result_of(
-    name: str,
-    passage: Passage,
-    *,
-    seed: int | None = None,
-    settings: Mapping[str, object] | None = None,
-    priors: Sequence[Prior] | None = None,
-    smoothed: bool = False,
-    counters: Mapping[str, float] | None = None,
-) -> Result:
-    """Put what an estimator gave together as a result."""
-    from relpos.runs.estimates import changes
-
-    return Result(
-        name,
-        passage.estimates,
-        tuple(changes(row for estimate in passage.estimates for row in estimate.parameters)),
-        passage.counters if counters is None else counters,
-        seed,
-        dict(settings or {}),
-        None if priors is None else tuple(priors),
-        smoothed,
-        passage,
-    )
 
 
 def name_of(estimator: Given) -> str:
@@ -211,6 +216,8 @@ __all__ = [
     "evaluate",
     "fuse",
     "load",
+    "plot",
+    "report",
     "save",
     "simulate",
 ]

@@ -109,10 +109,10 @@ def test_fuse_writes_estimates_and_scores_them(simulated: Path, tmp_path: Path) 
     assert "1 - 2" in result.stdout
     assert "relative distance RMSE" in result.stdout
     assert read_estimates(out)
-    for name in ("pairs.csv", "parameters.csv", "tracks.png", "error.png", "distances.png"):
+    for name in ("pairs.csv", "parameters.csv"):
         assert (out / name).stat().st_size > 0, name
     page = (out / "index.html").read_text()
-    assert page.count("data:image/png;base64,") == 3
+    assert page.count('role="img"') >= 7
     assert "http" not in page, "the page is to work without a network"
 
 

@@ -1,16 +1,22 @@
-"""The report: what its pictures show, looked at through the figures they are drawn from."""
+"""The report: what its figures show, looked at through the figures they are drawn from."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from relpos.evaluation import report, tracks
-from relpos.evaluation.metrics import Track, evaluate
-from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
+from relpos.evaluation.metrics import Track
+from relpos.evaluation.result import Result
+from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, pairs_of
+from relpos.measurements import Motion, Range, Truth
+from relpos.runs import Description, NodeInfo, Run
 
 TIMES = np.arange(0.0, 21.0)
 
@@ -20,38 +26,80 @@ def circle(radius_m: float, angle_rad: float = 0.0, shift_m: float = 0.0) -> Tra
     return Track(TIMES, radius_m * np.cos(turn) + shift_m, radius_m * np.sin(turn), turn)
 
 
-def content(fused: dict[int, Track], truth: dict[int, Track]) -> report.Content:
-    return report.Content(
-        title="a <walk>",
-        subtitle="made up",
-        truth=truth,
-        fused=fused,
-        metrics=evaluate(fused, truth),
-        dead_reckoning=fused,
-        baseline=evaluate(fused, truth),
+def truth_of(ways: dict[int, Track]) -> tuple[Truth, ...]:
+    return tuple(
+        Truth(*row[:1], node, *row[1:])
+        for node, way in ways.items()
+        for row in zip(
+            way.time_s.tolist(), way.x_m.tolist(), way.y_m.tolist(), way.heading_rad.tolist(),
+            strict=True,
+        )
+    )  # fmt: skip
+
+
+def estimates_of(
+    ways: dict[int, Track], status: NodeStatus = NodeStatus.OK
+) -> tuple[Estimate, ...]:
+    found = []
+    for time_s in TIMES.tolist():
+        nodes = []
+        for node, way in ways.items():
+            at = way.time_s == time_s
+            if at.any():
+                pose = float(way.x_m[at][0]), float(way.y_m[at][0]), float(way.heading_rad[at][0])
+                nodes.append(NodeEstimate(node, *pose, 0.01, 0.01, 0.0, 0.1, status))
+        found.append(Estimate(time_s, tuple(nodes), pairs_of(nodes)))
+    return tuple(found)
+
+
+def content(
+    fused: dict[int, Track], truth: dict[int, Track], names: dict[int, str] | None = None
+) -> report.Content:
+    motions = [Motion(t, node, 0.1, 0.0, 0.0) for t in TIMES.tolist() for node in fused]
+    ranges = [
+        Range(t, a, b, 2.0 + 0.01 * t)
+        for t in TIMES.tolist()
+        for a in fused
+        for b in fused
+        if a < b
+    ]
+    named = {node: NodeInfo(name=name) for node, name in (names or {}).items()}
+    run = Run(
+        "a <walk>",
+        Description(nodes=named),
+        tuple(sorted((*motions, *ranges), key=lambda m: m.time_s)),
+        truth=truth_of(truth),
     )
+    return report.gather(run, Result("ours", estimates_of(fused)))
+
+
+def lines(figure: Figure, panel: int) -> dict[str, np.ndarray]:
+    return {
+        str(line.get_label()): np.asarray(line.get_data(), dtype=float)
+        for line in figure.axes[panel].get_lines()
+    }
 
 
 def test_tracks_are_drawn_on_the_truth_whatever_their_frame() -> None:
     truth = {1: circle(3.0), 2: circle(5.0)}
     fused = {1: circle(3.0, 1.0, 40.0), 2: circle(5.0, 1.0, 40.0)}
-    axes = report.draw_tracks(content(fused, truth)).axes[1]
-    lines = {line.get_label(): line for line in axes.get_lines()}
+    figure = report.draw(content(fused, truth), "tracks")
     for node, true in truth.items():
-        x_m, y_m = lines[f"node {node}"].get_data()
+        x_m, y_m = lines(figure, 1)[f"node {node}"]
         np.testing.assert_allclose(x_m, true.x_m, atol=1e-9)
         np.testing.assert_allclose(y_m, true.y_m, atol=1e-9)
-    assert axes.get_aspect() == 1.0
-    assert axes.get_xlabel() == "x (m)"
+    assert figure.axes[1].get_aspect() == 1.0
+    assert figure.axes[1].get_xlabel() == "x (m)"
 
 
 def test_no_line_joins_rows_across_a_gap() -> None:
     truth = {1: circle(3.0), 2: circle(5.0)}
     there = (TIMES < 5) | (TIMES > 12)
-    holey = Track(TIMES[there], truth[1].x_m[there], truth[1].y_m[there])
-    axes = report.draw_tracks(content({1: holey, 2: truth[2]}, truth)).axes[1]
-    line = next(line for line in axes.get_lines() if line.get_label() == "node 1")
-    assert np.isnan(np.asarray(line.get_xdata(), dtype=float)).sum() == 1
+    holey = Track(
+        TIMES[there], truth[1].x_m[there], truth[1].y_m[there], truth[1].heading_rad[there]
+    )
+    figure = report.draw(content({1: holey, 2: truth[2]}, truth), "tracks")
+    assert np.isnan(lines(figure, 1)["node 1"][0]).sum() == 1
 
 
 def test_a_node_that_was_not_located_is_no_track() -> None:
@@ -64,16 +112,52 @@ def test_a_node_that_was_not_located_is_no_track() -> None:
     assert np.isnan(track.x_m).tolist() == [True, True, False]
 
 
+class Rows(HTMLParser):
+    """Counts the rows of each table by its caption."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rows: dict[str, int] = {}
+        self._caption: str | None = None
+        self._inside = self._body = False
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        if tag == "caption":
+            self._inside = True
+        if tag == "tr" and self._caption is not None and self._body:
+            self.rows[self._caption] += 1
+        self._body = tag == "tbody" or (self._body and tag != "table")
+
+    def handle_data(self, data: str) -> None:
+        if self._inside:
+            self._caption = data
+            self.rows[data] = 0
+            self._inside = False
+
+
 @pytest.mark.parametrize("nodes", [2, 3, 8])
 def test_the_page_holds_everything_for_teams_of_any_size(tmp_path: Path, nodes: int) -> None:
-    truth = {n: circle(1.0 + n) for n in range(1, nodes + 1)}
-    page = report.write_report(tmp_path, content(truth, truth)).read_text()
+    ways = {n: circle(1.0 + n) for n in range(1, nodes + 1)}
+    page = report.write(content(ways, ways, {1: "Kim <3"}), tmp_path / "r.html").read_text()
     assert "a &lt;walk&gt;" in page
-    assert page.count("data:image/png;base64,") == 3
-    assert page.count("<tr>") == 5 + 1 + math.comb(nodes, 2)
+    assert "Kim &lt;3 (1)" in page
+    rows = Rows()
+    rows.feed(page)
+    assert rows.rows["Each pair"] == rows.rows["Ranges of each pair"] == math.comb(nodes, 2)
+    assert rows.rows["At the end (20.0 s)"] == nodes
+    assert page.count('role="img"') >= 6
 
 
 def test_a_team_without_a_common_second_still_gets_its_page(tmp_path: Path) -> None:
     truth = {1: circle(3.0), 2: circle(4.0)}
-    nowhere = {n: Track(TIMES, TIMES * np.nan, TIMES * np.nan) for n in truth}
-    assert report.write_report(tmp_path, content(nowhere, truth)).exists()
+    late = {n: Track(TIMES + 100.0, way.x_m, way.y_m, way.heading_rad) for n, way in truth.items()}
+    given = content(truth, late)
+    assert given.evaluation is None
+    page = report.write(given, tmp_path / "r.html").read_text()
+    assert "no truth at a time of which there is an estimate" in page
+
+
+def test_an_estimate_of_nothing_still_gets_its_page(tmp_path: Path) -> None:
+    given = content({1: circle(3.0), 2: circle(4.0)}, {1: circle(3.0)})
+    empty = report.gather(replace(given.run, truth=()), Result("ours", ()))
+    assert "Nothing could be estimated." in report.write(empty, tmp_path / "r.html").read_text()

@@ -19,7 +19,6 @@ from pathlib import Path
 from statistics import mean
 
 import pytest
-from matplotlib.image import imread
 from typer.testing import CliRunner
 
 from relpos.cli import main
@@ -91,11 +90,9 @@ def test_the_demo_draws_its_report_and_repeats_itself(tmp_path):
     assert json.loads(stdout) | {"out": ""} == second | {"out": ""}
     for name in ("estimate.csv", "pairs.csv", "run/motion.csv", "run/ranges.csv"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
-    for name in ("tracks.png", "error.png", "distances.png"):
-        picture = imread(tmp_path / "a" / name)
-        assert min(picture.shape[:2]) > 200, name
-        assert picture[..., :3].std() > 0.02, f"{name} is blank"
-    assert (tmp_path / "a" / "index.html").read_text().count("data:image/png;base64,") == 3
+    page = (tmp_path / "a" / "index.html").read_text()
+    for name in ("tracks", "error", "distances", "consistency", "residuals", "height", "health"):
+        assert f'id="figure-{name}"' in page
 
 
 # --- bytes through the link ----------------------------------------------------------------------

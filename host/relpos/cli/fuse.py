@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
@@ -20,8 +20,10 @@ from relpos.errors import DataError, DeviceError, RelposError
 from relpos.recording import is_recording
 
 if TYPE_CHECKING:
-    from relpos.evaluation.bounds import Totals
-    from relpos.evaluation.metrics import Metrics
+    from relpos.evaluation.bounds import Bound
+    from relpos.evaluation.report import Baseline
+    from relpos.evaluation.result import Passage, Result
+    from relpos.evaluation.scoring import Evaluation
     from relpos.fusion.estimator import Estimate, Estimator
     from relpos.live.inputs import Input
     from relpos.measurements import Measurement, Prior
@@ -113,7 +115,7 @@ def fuse(
         bool | None,
         typer.Option(
             "--report/--no-report",
-            help="Draw pictures where the run has truth. (default: unless --json)",
+            help="Write the page index.html with pictures and numbers. (default: unless --json)",
         ),
     ] = None,
 ) -> None:
@@ -121,10 +123,11 @@ def fuse(
 
     With --smooth the estimates come when all is over, each from the whole run: the best track.
 
-    Writes estimate.csv, pairs.csv and parameters.csv, and index.html with pictures where the
-    source has truth. From a port, what was received is kept too, as a run directory under
-    received/; Ctrl-C ends it. With --view, or anything else that shows or records it, a port that
-    vanishes is waited for, and a recording is played at the pace at which it was made (--speed).
+    Writes estimate.csv, pairs.csv and parameters.csv, and of a run the page index.html with its
+    pictures (`relpos report` makes it of anything). From a port, what was received is kept too, as
+    a run directory under received/; Ctrl-C ends it. With --view, or anything else that shows or
+    records it, a port that vanishes is waited for, and a recording is played at the pace at which
+    it was made (--speed).
     """
     chosen = output.parse_settings(settings or [])
     sinks: list[live.MakeSink] = []
@@ -176,10 +179,11 @@ class Job:
         """Make the wanted estimator; RelposError where a setting does not fit it."""
         from relpos import fusion
 
+        make = fusion.make_smoother if self.smooth else fusion.make
+        # First, so that a setting that does not fit is told at once.
+        made = make(self.estimator, priors, self.settings, self.seed, nodes)
         self.prepare()
-        if self.smooth:
-            return fusion.make_smoother(self.estimator, priors, self.settings, self.seed, nodes)
-        return fusion.make(self.estimator, priors, self.settings, self.seed, nodes)
+        return made
 
     def prepare(self) -> None:
         """Have the estimator's kernels compiled, telling it the first time, when it takes long."""
@@ -187,15 +191,6 @@ class Job:
 
         with output.working("preparing the estimator (compiled at the first start)"):
             fusion.warm_up(self.estimator)
-
-
-@dataclass
-class _Outcome:
-    """What a pass over a source gave, also where it broke off."""
-
-    estimates: list[Estimate] = field(default_factory=list)
-    interrupted: bool = False
-    failure: RelposError | None = None
 
 
 def _default_out(source: str) -> Path:
@@ -208,24 +203,6 @@ def _default_out(source: str) -> Path:
 
 def _base_name(source: str) -> str:
     return Path(source).resolve().name or "run" if "://" not in source else "live"
-
-
-def _pass_through(estimator: Estimator, measurements: Iterable[Measurement]) -> _Outcome:
-    """Give the estimator everything; a failure or Ctrl-C keeps what came before."""
-    outcome = _Outcome()
-    try:
-        for measurement in measurements:
-            outcome.estimates += estimator.process(measurement)
-    except KeyboardInterrupt:
-        outcome.interrupted = True
-    except RelposError as error:
-        outcome.failure = error
-    try:
-        with output.working("finishing"):
-            outcome.estimates += estimator.finish()
-    except RelposError as error:
-        outcome.failure = outcome.failure or error
-    return outcome
 
 
 def _fuse_run(job: Job, initial: Initial | None, *, as_json: bool, report: bool) -> None:
@@ -275,6 +252,11 @@ def _fuse_mcap(
     about = recording.about
     if about is not None:
         estimator = job.estimator if "estimator" in given else about.estimator
+        if "estimator" not in given and ":" in estimator:
+            # A file must not choose what code is run.
+            raise RelposError(
+                f"{job.source}: recorded with the estimator {estimator}: give it by --estimator"
+            )
         recorded = about.settings if estimator == about.estimator else {}
         job = replace(
             job,
@@ -326,21 +308,60 @@ def fuse_recording(
     """
     from relpos.runs import write_estimates
 
-    _check_usable(run, job.estimator)
-    estimator = job.make(priors, run.nodes)
-    given = run.measurements if measurements is None else measurements
-    outcome = _pass_through(estimator, output.with_progress(given, len(given), "fusing"))
-    write_estimates(job.out, outcome.estimates, steps=run.steps)
-    if outcome.failure is not None:
-        raise outcome.failure
-    if outcome.interrupted:
+    passage = _pass_through(job, run, priors, measurements)
+    write_estimates(job.out, passage.estimates, steps=run.steps)
+    if passage.failure is not None:
+        raise passage.failure
+    if passage.interrupted:
         raise RelposError(f"interrupted; the estimates so far are in {job.out}")
+    result = _result(job, passage, priors)
+    scored = _score(run, result) if run.truth else None
+    if report:
+        with output.working("drawing"):
+            write_page(run, result, job.out / "index.html", scored)
+    counters = {**run.counters, **result.counters}
+    _tell(job, run.name, counters, result.estimates, scored, as_json=as_json)
 
-    counters = {**run.counters, **estimator.counters()}
-    scored = _score(job, run, priors, outcome.estimates) if run.truth else None
-    if report and scored is not None:
-        scored.write_report(job, run, outcome.estimates)
-    _tell(job, run.name, counters, outcome.estimates, scored, as_json=as_json)
+
+def fused(run: Run, estimator: str, settings: dict[str, str], seed: int, *, smooth: bool) -> Result:
+    """Fuse a whole run as ``relpos fuse`` does, and write nothing."""
+    job = Job(run.name, estimator, settings, seed, Path(), smooth=smooth)
+    passage = _pass_through(job, run, run.priors)
+    if passage.failure is not None:
+        raise passage.failure
+    if passage.interrupted:
+        raise KeyboardInterrupt
+    return _result(job, passage, run.priors)
+
+
+def _pass_through(
+    job: Job,
+    run: Run,
+    priors: Sequence[Prior],
+    measurements: Sequence[Measurement] | None = None,
+) -> Passage:
+    from relpos.evaluation.result import pass_through
+
+    _check_usable(run, job.estimator)
+    given = run.measurements if measurements is None else measurements
+    return pass_through(
+        job.make(priors, run.nodes),
+        output.with_progress(given, len(given), "fusing"),
+        output.working("finishing"),
+    )
+
+
+def _result(job: Job, passage: Passage, priors: Sequence[Prior]) -> Result:
+    from relpos.evaluation.result import result_of
+
+    return result_of(
+        job.estimator,
+        passage,
+        seed=job.seed,
+        settings=job.settings,
+        priors=priors,
+        smoothed=job.smooth,
+    )
 
 
 def _check_usable(run: Run, estimator: str) -> None:
@@ -379,72 +400,41 @@ def _priors(run: Run, initial: Initial | None) -> tuple[Prior, ...]:
 class _Scored:
     """The fusion's score, beside that of dead reckoning over the same run."""
 
-    metrics: Metrics
-    baseline: Metrics
-    baseline_estimates: list[Estimate]
-    baseline_start: str
-    bound: Totals | None = None
-    """The least possible errors, where the source is simulated and says how."""
+    evaluation: Evaluation
+    baseline: Baseline | None
+    bound: Bound | None
 
-    def write_report(self, job: Job, run: Run, estimates: Sequence[Estimate]) -> None:
-        from relpos.evaluation import report, tracks
 
-        report.write_report(
-            job.out,
-            report.Content(
-                title=run.name,
-                subtitle=f"estimator {job.estimator}, seed {job.seed}; {self.baseline_start}",
-                truth=tracks.true_tracks(run.truth),
-                fused=tracks.located_tracks(estimates),
-                dead_reckoning=tracks.estimated_tracks(self.baseline_estimates),
-                pairs=tracks.estimated_pairs(estimates),
-                ranges=run.ranges,
-                metrics=self.metrics,
-                baseline=self.baseline,
-            ),
+def _score(run: Run, result: Result) -> _Scored | None:
+    from relpos.evaluation import report, scoring
+
+    bound = scoring.bound_of(run)
+    try:
+        evaluation = scoring.evaluate(
+            run,
+            result.estimates,
+            result.priors,
+            latency=result.latency,
+            bound=None if bound is None else bound.totals(),
         )
-
-
-def _score(
-    job: Job, run: Run, priors: Sequence[Prior], estimates: Sequence[Estimate]
-) -> _Scored | None:
-    from relpos import fusion
-    from relpos.evaluation import metrics, tracks
-    from relpos.runs import InitialPose
-
-    truth = tracks.true_tracks(run.truth)
-    score = metrics.evaluate(
-        tracks.estimated_tracks(estimates), truth, tracks.estimated_pairs(estimates)
-    )
-    if not score.epochs:
+    except DataError:
+        # Nothing was estimated at a time of which the truth is known.
         return None
-    # Dead reckoning can place nobody by itself: without priors it is given the true start,
-    # which is more than the fusion had.
-    start = "dead reckoning from the same start"
-    moving = {motion.node for motion in run.motions}
-    if not moving <= {prior.node for prior in priors}:
-        priors = run.priors_for(InitialPose.FROM_TRUTH)
-        start = "dead reckoning from the true start"
-    plain = fusion.make(DEADRECKONING, priors, {}, job.seed)
-    baseline = _pass_through(plain, run.measurements).estimates
-    return _Scored(
-        score,
-        metrics.evaluate(tracks.estimated_tracks(baseline), truth),
-        baseline,
-        start,
-        _bound(run),
+    return _Scored(evaluation, report.reckon(run, result), bound)
+
+
+def write_page(run: Run, result: Result, path: Path, scored: _Scored | None = None) -> None:
+    """Write the report of a run."""
+    from relpos.evaluation import report
+
+    content = report.gather(
+        run,
+        result,
+        evaluation=None if scored is None else scored.evaluation,
+        bound=None if scored is None else scored.bound,
+        baseline=None if scored is None else scored.baseline,
     )
-
-
-def _bound(run: Run) -> Totals | None:
-    """Compute the Cramer-Rao bound of a simulated run; None where it cannot be told."""
-    from relpos.evaluation import bounds
-    from relpos.simulation.scenarios import NAMES
-
-    made = run.description.simulated
-    if made is None or made.scenario not in NAMES:
-        return None
-    return bounds.of_simulated(made.scenario, made.seed, made.settings).totals()
+    report.write(content, path)
 
 
 def _fuse_port(
@@ -519,6 +509,8 @@ def _tell(
     """Print the result; ``count`` where ``estimates`` are not all there were."""
     from relpos.evaluation import summary
 
+    baseline = scored.baseline.metrics if scored and scored.baseline else None
+    bound = scored.evaluation.bound if scored else None
     if as_json:
         output.print_json(
             {
@@ -528,17 +520,19 @@ def _tell(
                 "out": str(job.out),
                 "estimates": len(estimates) if count is None else count,
                 "counters": counters,
-                **(summary.as_json(scored.metrics) if scored else summary.no_metrics()),
-                "dead_reckoning": summary.figures(scored.baseline) if scored else None,
-                "bound": asdict(scored.bound) if scored and scored.bound else None,
+                **(summary.as_json(scored.evaluation.metrics) if scored else summary.no_metrics()),
+                "iso_18305": summary.iso_as_json(scored.evaluation.iso) if scored else None,
+                "dead_reckoning": summary.figures(baseline) if baseline else None,
+                "bound": asdict(bound) if bound else None,
             }
         )
         return
     output.print_last_pairs(f"{name}: {job.estimator}", estimates)
     if scored is not None:
-        output.print_metrics(f"{name}: scored", scored.metrics, scored.baseline)
-        if scored.bound is not None:
-            output.print_bound(scored.bound)
+        output.print_metrics(f"{name}: scored", scored.evaluation.metrics, baseline)
+        output.print_iso(scored.evaluation.iso)
+        if bound is not None:
+            output.print_bound(bound)
     noted = {key: value for key, value in counters.items() if value}
     if noted:
         output.remark("counted: " + ", ".join(f"{k} {v:g}" for k, v in sorted(noted.items())))

@@ -25,6 +25,7 @@ from relpos.cli import (
     figures,
     fuse,
     node,
+    report,
     simulate,
 )
 from relpos.emulator.faults import help_text
@@ -86,6 +87,7 @@ app.command("simulate")(simulate.simulate)
 app.command("evaluate")(evaluate.evaluate)
 app.command("convert")(convert.convert)
 app.command("figures")(figures.figures)
+app.command("report")(report.report)
 app.command("deadreckon")(deadreckon.deadreckon)
 app.command("doctor")(doctor.doctor)
 app.add_typer(node.app, name="node")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -81,8 +82,12 @@ class Passage:
         )
 
 
-def pass_through(estimator: Estimator, measurements: Iterable[Measurement]) -> Passage:
-    """Give an estimator every measurement in order, and let it finish.
+def pass_through(
+    estimator: Estimator,
+    measurements: Iterable[Measurement],
+    finishing: AbstractContextManager[None] | None = None,
+) -> Passage:
+    """Give an estimator every measurement in order, and let it finish within ``finishing``.
 
     A RelposError of it, or Ctrl-C, ends the passage and is kept in it; any other error is a fault
     of the program and goes through.
@@ -107,7 +112,8 @@ def pass_through(estimator: Estimator, measurements: Iterable[Measurement]) -> P
         failure = error
     try:
         started = time.perf_counter()
-        new = estimator.finish()
+        with finishing or nullcontext():
+            new = estimator.finish()
         computing += time.perf_counter() - started
         estimates += new
         emitted += len(new) * [now_s]
@@ -206,14 +212,41 @@ class Result:
         return f"<relpos.Result {self}>"
 
 
+def result_of(
+    estimator: str,
+    passage: Passage,
+    *,
+    seed: int | None = None,
+    settings: Mapping[str, object] | None = None,
+    priors: Sequence[Prior] | None = None,
+    smoothed: bool = False,
+) -> Result:
+    """Put what an estimator gave together as a result."""
+    return Result(
+        estimator,
+        passage.estimates,
+        _learned(passage.estimates),
+        passage.counters,
+        seed,
+        dict(settings or {}),
+        None if priors is None else tuple(priors),
+        smoothed,
+        passage,
+    )
+
+
 def read_result(directory: Path | str) -> Result:
     """Read an estimate's files back, whoever wrote them; DataError where they are faulty."""
     from relpos.runs import read_estimates
+
+    estimates = tuple(read_estimates(directory))
+    return Result("estimate", estimates, _learned(estimates))
+
+
+def _learned(estimates: Sequence[Estimate]) -> tuple[Parameter, ...]:
     from relpos.runs.estimates import changes
 
-    estimates = read_estimates(directory)
-    learned = changes(row for estimate in estimates for row in estimate.parameters)
-    return Result(Path(directory).name, tuple(estimates), tuple(learned))
+    return tuple(changes(row for estimate in estimates for row in estimate.parameters))
 
 
 def _columns(table: str) -> tuple[str, ...]:

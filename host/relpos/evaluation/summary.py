@@ -97,10 +97,15 @@ def iso_as_json(iso: Assessment) -> dict[str, Any]:
 
 
 def latency_as_json(latency: Latency | None) -> dict[str, float | None] | None:
-    """Return what an estimator waited and computed; None where that was not seen."""
+    """Return what an estimator waited; None where that was not seen.
+
+    What it computed is left out: the same run and seed give the same numbers on every computer.
+    """
     if latency is None:
         return None
-    return {name: figure(getattr(latency, name)) for name in latency.__slots__}
+    return {
+        name: figure(getattr(latency, name)) for name in latency.__slots__ if name != "computing_s"
+    }
 
 
 def _accuracy(accuracy: Accuracy) -> dict[str, Any]:

@@ -16,6 +16,12 @@ import numpy.typing as npt
 from relpos.errors import RelposError
 from relpos.evaluation import bounds, study
 from relpos.evaluation.executors import run_all
+from relpos.evaluation.style import COLOURS as COLOURS
+from relpos.evaluation.style import DASHES as DASHES
+from relpos.evaluation.style import GREY as GREY
+from relpos.evaluation.style import INK as INK
+from relpos.evaluation.style import MARKERS as MARKERS
+from relpos.evaluation.style import STYLE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,33 +31,8 @@ Floats = npt.NDArray[np.float64]
 T = TypeVar("T")
 Cell = str | float | int
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""Distinguishable with any colour vision (Okabe and Ito 2008), darkest first."""
-
-INK, GREY = "#222222", "#8C8C8C"
 OWN_COLOURS = ("#6A3D9A", "#8C510A", "#01665E")
 """Of the estimators that somebody adds to ours."""
-
-MARKERS = ("o", "s", "^", "D", "v", "P")
-DASHES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1, 1, 1)), (0, (1, 1)))
-"""Curves differ in mark and line, too: not by colour alone."""
-
-STYLE: dict[Any, Any] = {
-    "font.size": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#DDDDDD",
-    "grid.linewidth": 0.6,
-    "lines.linewidth": 1.6,
-    "lines.markersize": 5,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "axes.titlesize": 11,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "relpos",
-    "figure.dpi": 100,
-}
 
 IMU_SCALES = ((0.0, 0.0), (0.1, 0.05), (0.2, 0.1), (0.4, 0.2), (0.8, 0.4))
 """The paper's five scales of IMU noise, (sigma_d, sigma_theta) (sect. V-B)."""

@@ -1,0 +1,152 @@
+"""From something that draws to SVG for a page, and to files."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.evaluation.metrics import MAX_GAP_S
+from relpos.evaluation.style import DARK, STYLE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats = npt.NDArray[np.float64]
+
+MANY_DOTS = 3000
+"""More dots than this become pixels: a page of a long session stays a few megabytes."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One figure: what it is called and says, how to draw it, and what it shows in words."""
+
+    name: str
+    title: str
+    caption: str
+    alt: str
+    draw: Callable[[Figure], None]
+    size_in: tuple[float, float]
+
+    def figure(self) -> Figure:
+        """Draw it."""
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+
+        # The Figure class alone, without pyplot: no display, no global state.
+        with mpl.rc_context(STYLE):
+            made = Figure(figsize=self.size_in, layout="constrained")
+            self.draw(made)
+        return made
+
+
+def svg(figure: Figure) -> str:
+    """Give a figure as an SVG document; the same figure is the same text."""
+    import matplotlib as mpl
+
+    written = io.StringIO()
+    with mpl.rc_context(STYLE):
+        figure.savefig(written, format="svg", metadata={"Date": None, "Creator": None})
+    # Laid out once: what is drawn of it after this is the same, and quicker.
+    figure.set_layout_engine("none")
+    return _shorter(written.getvalue())
+
+
+def save(figure: Figure, document: str, directory: Path, name: str) -> list[Path]:
+    """Write NAME.svg and NAME.png; return their paths."""
+    import matplotlib as mpl
+
+    paths = [directory / f"{name}.svg", directory / f"{name}.png"]
+    paths[0].write_text(document, encoding="utf-8")
+    with mpl.rc_context(STYLE):
+        # Without a date in it the same report is the same file.
+        figure.savefig(paths[1], dpi=130, metadata={"Software": None})
+    return paths
+
+
+def inline(document: str, name: str, title: str, alt: str) -> str:
+    """Make an SVG document part of a page: its own ids, the page's colours, a title and a text.
+
+    Nothing in it refers to anything outside of the page.
+    """
+    text = document[document.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r"<style type=\"text/css\">.*?</style>", "", text, flags=re.DOTALL)
+    box = re.search(r'viewBox="([^"]+)"', text)
+    assert box is not None
+    text = text[text.index(">") + 1 :]
+    text = text.replace("xlink:href=", "href=")
+    text = re.sub(r'\bid="', f'id="{name}-', text)
+    text = text.replace('href="#', f'href="#{name}-').replace("url(#", f"url(#{name}-")
+    text = re.sub(r"#[0-9a-f]{6}\b", lambda m: _VARIABLES.get(m[0].lower(), m[0]), text)
+    head = (
+        f'<svg viewBox="{box[1]}" role="img" aria-labelledby="{name}-title {name}-alt">'
+        f'<title id="{name}-title">{escape(title)}</title>'
+        f'<desc id="{name}-alt">{escape(alt)}</desc>'
+    )
+    return head + text.strip()
+
+
+def _variable(colour: str) -> str:
+    return f"--c{colour.lower().lstrip('#')}"
+
+
+_VARIABLES = {c.lower(): f"var({_variable(c)},{c.lower()})" for c in DARK}
+
+
+def colours() -> tuple[str, str]:
+    """Return the style sheet's declarations of the figures' colours, for light and for dark."""
+    light = "".join(f"{_variable(c)}:{c.lower()};" for c in DARK)
+    return light, "".join(f"{_variable(c)}:{d.lower()};" for c, d in DARK.items())
+
+
+def _shorter(document: str) -> str:
+    """Hundredths of a point are finer than any screen."""
+    return re.sub(
+        r' (d|x|y|transform|points)="([^"]*)"',
+        lambda m: f' {m[1]}="' + re.sub(r"(\d\.\d{2})\d+", r"\1", m[2]) + '"',
+        document,
+    )
+
+
+def broken_at_gaps(time_s: Floats, *values: Floats) -> tuple[Floats, ...]:
+    """Insert NaN where rows are too far apart to be joined by a line.
+
+    Returns the time and the one signal, or only the signals where there are two of them (a
+    track's x and y).
+    """
+    order = np.argsort(time_s, kind="stable")
+    after = np.flatnonzero(np.diff(time_s[order]) > MAX_GAP_S + 1e-6) + 1
+    broken = tuple(np.insert(v[order].astype(float), after, np.nan) for v in (time_s, *values))
+    return broken if len(values) == 1 else broken[1:]
+
+
+def dots(axes: Axes, x: Floats, y: Floats, colour: str, **more: Any) -> None:
+    """Draw dots; many of them as pixels."""
+    given: dict[str, Any] = {"markersize": 3.0, "alpha": 0.7, "zorder": 1.5, **more}
+    axes.plot(x, y, ".", color=colour, markeredgewidth=0.0, rasterized=x.size > MANY_DOTS, **given)
+
+
+def grid(figure: Figure, count: int, columns: int, *, sharey: bool = True) -> Sequence[Axes]:
+    """Give ``count`` panels in rows of at most ``columns``, those of a column with one time axis.
+
+    The labels of the time axis stand under the lowest panel of each column.
+    """
+    columns = min(columns, max(count, 1))
+    rows = max(1, -(-count // columns))
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=sharey).ravel()
+    for k, axes in enumerate(panels):
+        axes.set_visible(k < count)
+        if k + columns >= count:
+            axes.set_xlabel("time (s)")
+            axes.xaxis.set_tick_params(labelbottom=True)
+    return list(panels[:count])
