@@ -254,6 +254,71 @@ def test_what_a_live_session_left_is_taken_with_its_recording(tmp_path: Path) ->
     assert load_run(tmp_path / "tables").motions == run().motions
 
 
+# -- recordings ------------------------------------------------------------------------------------
+
+
+def test_a_run_and_its_estimate_come_back_from_a_recording(tmp_path: Path) -> None:
+    yard, fused = written(tmp_path)
+    path = tmp_path / "walk.mcap"
+    convert(fused, "--run", yard, "--start", START, "--to", "mcap", "--out", path)
+    told = convert(path, "--to", "csv", "--out", tmp_path / "tables")
+    assert not told.remarks
+    back, was = load_run(tmp_path / "tables"), load_run(yard)
+    assert back.measurements == was.measurements
+    assert back.truth == was.truth
+    assert back.description == was.description
+    assert repr(read_estimates(tmp_path / "tables")) == repr(read_estimates(fused))
+    first = (tmp_path / "tables" / "estimate.csv").read_text("utf-8").splitlines()[1]
+    assert float(first.split(",")[-1]) == START_UNIX_S + 1.0
+    # The start is in the recording: a map has its times without being told.
+    words = ("--pin", PIN, "--to", "geojson", "--out", tmp_path / "map.geojson")
+    convert(path, *words)
+    track = features(tmp_path / "map.geojson", kind="track", node=2, of="estimate")[0]
+    assert track["properties"]["coordTimes"][0] == "2026-05-04T09:30:01.000Z"
+
+
+def test_a_recording_without_a_start_says_when_its_clock_begins(tmp_path: Path) -> None:
+    yard, _ = written(tmp_path)
+    told = convert(yard, "--to", "mcap", "--out", tmp_path / "walk.mcap")
+    assert any("begins in 1970" in line for line in told.remarks)
+    convert(tmp_path / "walk.mcap", "--to", "run", "--out", tmp_path / "back")
+    assert load_run(tmp_path / "back").measurements == load_run(yard).measurements
+
+
+def test_presses_become_the_truth_of_a_recording(tmp_path: Path, pressed: Path) -> None:
+    words = ("--start", START, "--to", "mcap", "--out")
+    convert(pressed, *words, tmp_path / "walk.mcap")
+    marks = ("--landmarks", tmp_path / "surveyed.csv")
+    told = convert(tmp_path / "walk.mcap", *marks, *words, tmp_path / "scored.mcap")
+    assert any("truth from 3 of 6" in line for line in told.remarks)
+    convert(tmp_path / "scored.mcap", "--to", "run", "--out", tmp_path / "back")
+    check_truth(tmp_path / "back")
+
+
+def test_a_recording_that_broke_off_is_read_and_told(tmp_path: Path) -> None:
+    yard, fused = written(tmp_path)
+    path = tmp_path / "walk.mcap"
+    convert(fused, "--run", yard, "--start", START, "--to", "mcap", "--out", path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-200])
+    told = convert(path, "--to", "run", "--out", tmp_path / "back")
+    assert any("was not closed" in line for line in told.remarks)
+    (tmp_path / "broken.mcap").write_bytes(b"not at all")
+    line = refused(tmp_path / "broken.mcap", "--to", "run", "--out", tmp_path / "no")
+    assert "no MCAP file" in line
+
+
+def test_a_recording_is_not_left_half_written(tmp_path: Path) -> None:
+    yard, _ = written(tmp_path)
+    path = tmp_path / "walk.mcap"
+    convert(yard, "--start", START, "--to", "mcap", "--out", path)
+    before = path.read_bytes()
+    assert "--overwrite" in refused(yard, "--to", "mcap", "--out", path)
+    convert(yard, "--start", START, "--to", "mcap", "--out", path, "--overwrite")
+    assert len(path.read_bytes()) == len(before)
+    assert not list(tmp_path.glob("*.part"))
+
+
 # -- maps ------------------------------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from dataclasses import replace
 from datetime import datetime
+from pathlib import Path
 from typing import Any
 from xml.dom.minidom import Element, parseString
 
@@ -18,13 +19,17 @@ import numpy as np
 import pytest
 from geographiclib.geodesic import Geodesic
 from pictures import NAMES, PLACES, UNIX_S, picture
+from typer.testing import CliRunner
 
+from relpos.cli.main import app
 from relpos.errors import DataError
+from relpos.evaluation.tracks import estimated_tracks
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
 from relpos.geodesy import MapFrame, Pin
 from relpos.live.cot import CotSender, PinnedFrame, Schedule, check_url, default_prefix
 from relpos.live.cot_events import Callsigns, circle_90_m
 from relpos.live.picture import Alert, Picture
+from relpos.runs import read_estimates
 
 PIN = Pin(48.1, 11.5, math.radians(90.0), 520.0)
 FRAME = MapFrame(48.1, 11.5, math.radians(90.0), 520.0)
@@ -366,6 +371,38 @@ def test_every_member_arrives_by_udp(udp_port: socket.socket) -> None:
     assert set(events) == set(NAMES.values())
     for node, place in PLACES.items():
         assert events[NAMES[node]].metres_from(*place) < 0.01
+
+
+def test_a_session_sends_every_member(tmp_path: Path, udp_port: socket.socket) -> None:
+    """The whole way: a walk through the command line, its fusion and its pictures."""
+    words = ["simulate", "--scenario", "paper", "--seed", "1", "--out", str(tmp_path / "walk")]
+    made = CliRunner().invoke(app, [*words, "--set", "seconds=20", "--set", "nodes=4"])
+    assert made.exit_code == 0, made.output
+    events: dict[str, Received] = {}
+
+    def receive() -> None:
+        with suppress(TimeoutError, OSError):
+            while True:
+                event = Received(udp_port.recv(65536))
+                events.setdefault(event.attributes("contact")["callsign"], event)
+
+    receiver = threading.Thread(target=receive, daemon=True)
+    receiver.start()
+    url = f"udp://127.0.0.1:{udp_port.getsockname()[1]}"
+    words = ["fuse", str(tmp_path / "walk"), "--cot", url, "--pin", "48.1,11.5,90"]
+    more = ["--speed", "4", "--out", str(tmp_path / "out"), "--seconds", "8", "--json"]
+    done = CliRunner().invoke(app, [*words, *more])
+    assert done.exit_code == 0, done.output
+    until(lambda: len(events) >= 4, f"only {sorted(events)} arrived")
+    # It walked some time ago: nobody shall be sent out for it.
+    assert {event.how for event in events.values()} == {"m-s"}
+    tracks = estimated_tracks(read_estimates(tmp_path / "out"))
+    for event in events.values():
+        assert event.type == "a-f-G-U-C"
+        track = tracks[int(event.uid.rpartition(".")[2])]
+        # A picture is between two estimates, a step's length apart.
+        places = zip(track.x_m, track.y_m, strict=True)
+        assert min(event.metres_from(x_m, y_m) for x_m, y_m in places) < 1.0
 
 
 def test_a_udp_port_where_nobody_listens_is_told() -> None:

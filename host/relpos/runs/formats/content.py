@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
 from relpos.geodesy import Locate
 from relpos.measurements import Truth
 from relpos.runs.run import Run
+
+if TYPE_CHECKING:
+    from relpos.recording.reader import Recording
 
 
 class Kind(StrEnum):
@@ -35,15 +38,15 @@ class Content:
     """A run and the estimates that belong to it, either of which may be empty.
 
     ``start_unix_s`` is the Unix time of the run's second 0, None where nobody knows it.
-    ``remarks`` is what there is to tell the user about how it was read. ``recording`` is the
-    MCAP file that all of it but truth and landmarks is from: what was received is only in there.
+    ``remarks`` is what there is to tell the user about how it was read. ``recording`` is the MCAP
+    file that the run, and all estimates, were read from, with whatever else it holds.
     """
 
     run: Run
     estimates: tuple[Estimate, ...] = ()
     start_unix_s: float | None = None
-    remarks: tuple[str, ...] = field(default=())
-    recording: Path | None = None
+    remarks: tuple[str, ...] = ()
+    recording: Recording | None = None
 
     @property
     def node_ids(self) -> tuple[int, ...]:

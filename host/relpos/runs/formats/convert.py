@@ -84,6 +84,8 @@ def read(source: Path, hints: Hints) -> Content:
 
 
 def _format_of(source: Path) -> Format:
+    from relpos.recording import is_recording
+
     if not source.exists():
         raise DataError(f"{source}: no such file or directory")
     if source.is_dir():
@@ -94,6 +96,8 @@ def _format_of(source: Path) -> Format:
         if any(source.glob("*.tum")):
             return Format.TUM
         raise DataError(f"{source}: neither a run nor an estimate nor TUM trajectories in there")
+    if is_recording(source):
+        return Format.MCAP
     try:
         return _SUFFIXES[source.suffix.lower()]
     except KeyError:
@@ -138,17 +142,13 @@ def _started(content: Content, hints: Hints) -> Content:
 
 
 def _read_mcap(source: Path) -> Content:
-    from relpos.recording import open_recording
+    from relpos import recording
 
-    recording = open_recording(source)
-    start_ns = recording.started_unix_ns
-    return Content(
-        recording.run,
-        tuple(recording.estimates()),
-        None if start_ns is None else start_ns * 1e-9,
-        (*recording.remarks, *_press_remarks(recording.run)),
-        recording=source,
-    )
+    opened = recording.open_recording(source)
+    run = opened.run
+    start_unix_s = None if opened.started_unix_ns is None else opened.started_unix_ns * 1e-9
+    remarks = (*opened.remarks, *_press_remarks(run))
+    return Content(run, tuple(opened.estimates()), start_unix_s, remarks, opened)
 
 
 def _read_tracks(source: Path, form: Format, base: Content, hints: Hints) -> Content:
@@ -202,7 +202,8 @@ def _read_tracks(source: Path, form: Format, base: Content, hints: Hints) -> Con
             estimates = as_estimates(points[Kind.ESTIMATE])
         except DataError as error:
             raise DataError(f"{source}: {error}") from None
-    return Content(run, estimates, start_unix_s, tuple(remarks))
+    untouched = base.recording if not points.get(Kind.ESTIMATE) else None
+    return Content(run, estimates, start_unix_s, tuple(remarks), untouched)
 
 
 def frame_of(content: Content, pins: Sequence[Pin], kind: Kind) -> tuple[MapFrame, tuple[str, ...]]:
@@ -255,11 +256,11 @@ def located_alone(content: Content) -> Content:
     """Leave out of the estimates what is no position: nodes ambiguous or not located."""
     return replace(
         content,
+        recording=None,
         estimates=tuple(
             replace(e, nodes=tuple(n for n in e.nodes if n.status in PLACED))
             for e in content.estimates
         ),
-        recording=None,
     )
 
 
@@ -324,17 +325,25 @@ def _write_csv(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
 
 
 def _write_mcap(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
-    from relpos.recording import open_recording, save_recording
+    from relpos.recording import save_recording
 
-    source = None if content.recording is None else open_recording(content.recording)
-    out.unlink(missing_ok=True)  # That it may be replaced has been asked.
-    remarks = save_recording(
-        out,
-        content.run,
-        content.estimates,
-        started_unix_ns=round((content.start_unix_s or 0.0) * 1e9),
-        source=source,
-    )
+    start_ns = 0 if content.start_unix_s is None else round(content.start_unix_s * 1e9)
+    # Under its own name only when it is whole.
+    part = out.with_name(f"{out.name}.part")
+    part.unlink(missing_ok=True)
+    try:
+        remarks = save_recording(
+            part,
+            content.run,
+            content.estimates,
+            started_unix_ns=start_ns,
+            source=content.recording,
+        )
+        part.replace(out)
+    finally:
+        part.unlink(missing_ok=True)
+    if content.start_unix_s is None:
+        remarks.append("its clock begins in 1970: say when the run's second 0 was (--start)")
     return [out], remarks
 
 
