@@ -36,6 +36,7 @@ PARSED = {
 
 SHORTER = {
     "demo": ("--seconds 10", "--nodes 3"),
+    "emulate": ("--seconds 10",),
     "simulate": ("--set seconds=20",),
     "fuse PORT": ("--seconds 2",),
     "node list": ("--seconds 3",),

@@ -69,14 +69,14 @@ def emulated(*arguments):
 @pytest.fixture(scope="module")
 def port():
     """An emulated team behind it, at several times real time."""
-    with emulated("--nodes", "6", "--speed", "5", "--seed", "1") as path:
+    with emulated("--nodes", "3", "--speed", "3", "--seconds", "600") as path:
         yield path
 
 
 @pytest.fixture(scope="module")
 def radio():
     """A coordinator's module that may be set up anew."""
-    with emulated("--nodes", "1") as path:
+    with emulated("--nodes", "1", "--seconds", "600") as path:
         yield path
 
 

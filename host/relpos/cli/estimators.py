@@ -29,5 +29,14 @@ def check(name: str | None) -> str | None:
     return name
 
 
-EstimatorName = Annotated[str, typer.Option(metavar="NAME", help=HELP, callback=check)]
+def _begun(incomplete: str) -> list[str]:
+    """Names that the shell may complete."""
+    from relpos import fusion
+
+    return [name for name in fusion.names() if name.startswith(incomplete)]
+
+
+EstimatorName = Annotated[
+    str, typer.Option(metavar="NAME", help=HELP, callback=check, autocompletion=_begun)
+]
 """The ``--estimator`` option of every command that takes one."""
