@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import socket
+import ssl
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -282,7 +283,8 @@ def until(condition: Callable[[], Any], what: str) -> None:
 class Server:
     """A TAK server as far as taking events goes; can hang up and come back."""
 
-    def __init__(self, port: int = 0) -> None:
+    def __init__(self, port: int = 0, context: ssl.SSLContext | None = None) -> None:
+        self._context = context
         self.received: list[Received] = []
         self._listener = socket.create_server(("127.0.0.1", port), reuse_port=False)
         self.port: int = self._listener.getsockname()[1]
@@ -296,6 +298,12 @@ class Server:
             except OSError:
                 return
             self._connections.append(connection)
+            if self._context is not None:
+                try:
+                    connection = self._context.wrap_socket(connection, server_side=True)
+                except OSError:
+                    continue
+                self._connections[-1] = connection
             threading.Thread(target=self._read, args=(connection,), daemon=True).start()
 
     def _read(self, connection: socket.socket) -> None:
@@ -433,6 +441,38 @@ def test_every_member_arrives_by_tcp_also_after_the_server_was_away() -> None:
         until(lambda: len(back.received) >= len(PLACES), "it does not come back")
         until(lambda: sender.trouble() is None, "the trouble is told for ever")
         back.close()
+
+
+def test_every_member_arrives_by_tls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    import trustme
+
+    authority = trustme.CA()
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    authority.issue_cert("localhost", "127.0.0.1").configure_cert(context)
+    authority.cert_pem.write_to_path(str(tmp_path / "ca.pem"))
+    client = authority.issue_cert("team@example.org")
+    client.private_key_and_cert_chain_pem.write_to_path(str(tmp_path / "client.pem"))
+    server = Server(context=context)
+    sender = CotSender(f"tls://localhost:{server.port}", [PIN])
+    with closing(sender), Feeding(sender):
+        until(lambda: "PYTAK_TLS_CLIENT_CERT" in str(sender.trouble()), "what lacks is not told")
+    for name in ("CERT", "KEY"):
+        monkeypatch.setenv(f"PYTAK_TLS_CLIENT_{name}", str(tmp_path / "client.pem"))
+    sender = CotSender(f"tls://localhost:{server.port}", [PIN])
+    with closing(sender), Feeding(sender):
+        until(lambda: "Could not verify" in str(sender.trouble()), "an unknown server is trusted")
+    assert not server.received
+    monkeypatch.setenv("PYTAK_TLS_CLIENT_CAFILE", str(tmp_path / "ca.pem"))
+    sender = CotSender(f"tls://localhost:{server.port}", [PIN])
+    with closing(sender), Feeding(sender):
+        until(
+            lambda: (
+                {e.attributes("contact")["callsign"] for e in list(server.received)}
+                == set(NAMES.values())
+            ),
+            f"not every member arrives: {sender.trouble()}",
+        )
+    server.close()
 
 
 def test_a_server_that_is_not_there_does_not_hold_up_the_session() -> None:

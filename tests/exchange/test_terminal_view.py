@@ -296,6 +296,28 @@ def test_the_bell_rings_when_an_alarm_begins_and_not_when_it_is_muted(
     assert screen.received.count("\a") == rung
 
 
+def test_the_bell_goes_on_for_a_person_and_not_for_a_cable(
+    screen: Screen, view: TerminalView, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("relpos.view.terminal.BELL_S", 0.0)
+    monkeypatch.setattr("relpos.view.terminal.DRAW_S", 0.02)
+    cable = (Notice("port", Level.ALARM, "the port has vanished", 0.0),)
+    view.pictured(picture(notices=cable))
+    until(lambda: "\a" in screen.received, "the bell does not ring")
+    seen = screen.received.count("time")
+    for seq in range(20):
+        view.pictured(picture(seq, notices=cable))
+        time.sleep(0.03)
+    assert screen.received.count("\a") == 1 + seen
+    view.pictured(picture(changes={3: STILL}))
+    until(lambda: screen.received.count("\a") >= 5, "it does not go on")
+    view.pictured(picture(changes={3: {**STILL, "acknowledged": True}}))
+    until(lambda: "(seen to)" in "".join(screen.rows()), "it is not shown as seen to")
+    rung = screen.received.count("\a")
+    time.sleep(0.2)
+    assert screen.received.count("\a") == rung
+
+
 def test_keys_change_whose_view_it_is(screen: Screen, view: TerminalView) -> None:
     view.pictured(picture())
     until(lambda: "me" in row_of("Kim", ["#", *screen.rows()]), "nothing is drawn")

@@ -131,6 +131,8 @@ def fuse(
     """
     chosen = output.parse_settings(settings or [])
     sinks: list[live.MakeSink] = []
+    if terminal and json:
+        raise typer.BadParameter("draws where --json prints", param_hint="--terminal")
     if terminal:
         sinks.append(live.terminal_sink(me))
     if cot is not None:

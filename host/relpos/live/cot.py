@@ -248,7 +248,7 @@ class CotSender(QuietSink):
         self._schedule = Schedule(Callsigns(prefix or default_prefix()), exercise=exercise)
         self._picture: Picture | None = None
         self._sigma_z_m: dict[int, float] = {}
-        self._trouble: str | None = f"{url}: not connected yet"
+        self._trouble: str | None = None
         self.sent = 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="cot", daemon=True)

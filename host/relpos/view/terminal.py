@@ -6,6 +6,7 @@ nobody. Only lines that have changed are sent.
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
@@ -53,7 +54,7 @@ class TerminalView(QuietSink):
         self._drawn: list[str] = []
         self._painted_s = 0.0
         self._size = (0, 0)
-        self._rung: frozenset[str] = frozenset()
+        self._rung: frozenset[str | int] = frozenset()
         self._rung_s = 0.0
         self._trouble: str | None = None
         self._wake = threading.Event()
@@ -62,6 +63,8 @@ class TerminalView(QuietSink):
         self._threads = [threading.Thread(target=self._draw_until_stopped, daemon=True)]
         if self._screen and keys and sys.stdin.isatty():
             self._threads.append(threading.Thread(target=self._read_keys, daemon=True))
+        # Whatever ends the program, the terminal is given back.
+        atexit.register(self.close)
         for thread in self._threads:
             thread.start()
 
@@ -77,6 +80,7 @@ class TerminalView(QuietSink):
 
     def close(self) -> None:
         """Give the terminal back as it was."""
+        atexit.unregister(self.close)
         self._stop.set()
         self._wake.set()
         for thread in self._threads:
@@ -152,11 +156,16 @@ class TerminalView(QuietSink):
                 trail.append((person.x_m, person.y_m))
 
     def _bell(self, picture: Picture) -> str:
-        """Ring for a new alarm, and again as long as there is one nobody has seen to."""
+        """Ring for a new alarm, and again as long as there is somebody nobody has seen to.
+
+        What is wrong with the session rings once: a bell that goes on for a cable is not heard
+        any more when it is for a person.
+        """
         alarms = alarming(picture)
         new = alarms - self._rung
         now_s = time.monotonic()
-        again = bool(alarms) and now_s - self._rung_s >= BELL_S
+        somebody = any(isinstance(alarm, int) for alarm in alarms)
+        again = somebody and now_s - self._rung_s >= BELL_S
         self._rung = alarms
         if self._looks.muted or not (new or again):
             return ""

@@ -101,10 +101,10 @@ def page(picture: Picture, looks: Looks) -> list[Text]:
     return lines
 
 
-def alarming(picture: Picture) -> frozenset[str]:
-    """Return what rings the bell: who lies still or is lost, what the session calls an alarm."""
-    people = {
-        f"{person.alert} {person.node}"
+def alarming(picture: Picture) -> frozenset[str | int]:
+    """Return what rings the bell: nodes that lie still or are lost, ids of the session's alarms."""
+    people: set[str | int] = {
+        person.node
         for person in picture.people
         if person.alert in (Alert.STILL_ALARM, Alert.LOST) and not person.acknowledged
     }
