@@ -89,6 +89,19 @@ def test_whoever_needs_help_is_on_top_in_words() -> None:
     assert seen[2].endswith("(seen to)")
 
 
+def test_who_moves_again_is_not_said_to_lie() -> None:
+    shown = lines(picture(changes={3: {**STILL, "moving": True, "still_s": 0.0}}), me=2)
+    assert shown[1].startswith("!! Li & Söhne lay still, moves again")
+    assert "moving" in row_of("Li & Söhne", shown)
+
+
+def test_more_alarms_than_there_is_room_for_are_counted() -> None:
+    notices = tuple(Notice(f"n{k}", Level.WARNING, f"notice {k}", 0.0) for k in range(9))
+    shown = lines(picture(changes={3: STILL}, notices=notices), me=2)
+    assert "LIES STILL" in shown[1]
+    assert shown[6] == "... and 5 more"
+
+
 def test_what_is_wrong_with_the_session_and_with_a_node_is_told() -> None:
     notices = (Notice("port", Level.ALARM, "the port has vanished", 0.0),)
     ill = {"health": "yellow", "reasons": ("supply 4.40 V",)}
@@ -121,7 +134,7 @@ def test_an_ambiguous_picture_shows_the_possibilities() -> None:
     assert "ambiguous" in row
     drawn = "\n".join(shown)
     assert drawn.count("3?") == 2
-    assert "ahead or l" in row_of("Li & Sohne", lines(ambiguous(), me=2, utf8=False))
+    assert "ahead or " in row_of("Li & Sohne", lines(ambiguous(), me=2, utf8=False))
 
 
 def test_the_map_shows_who_is_where() -> None:

@@ -33,7 +33,7 @@ STOREY_M = 1.5
 
 _STYLES = {Level.ALARM: "bold reverse red", Level.WARNING: "bold yellow", Level.INFO: ""}
 _HEALTH_STYLES = {"green": "", "yellow": "yellow", "red": "bold red"}
-_WIDTHS = (3, 11, 11, 12, 6, 11, 5, 80)
+_WIDTHS = (3, 10, 12, 12, 6, 11, 5, 80)
 _ARROWS = "↑↖←↙↓↘→↗"
 _NO_STYLE = ""
 
@@ -73,7 +73,7 @@ class _Seen:
 
 def page(picture: Picture, looks: Looks) -> list[Text]:
     """Return exactly ``rows`` lines of at most ``columns`` characters."""
-    lines = [_title(picture, looks), *_alarms(picture, looks)[: max(1, looks.rows // 4)]]
+    lines = [_title(picture, looks), *_alarms(picture, looks, max(1, looks.rows // 4))]
     me = find_me(picture, looks.me)
     left = looks.rows - len(lines) - 1
     beside = looks.table and looks.map and looks.columns >= BESIDE_COLUMNS
@@ -130,8 +130,8 @@ def _title(picture: Picture, looks: Looks) -> Text:
     return _line(words, looks, "bold")
 
 
-def _alarms(picture: Picture, looks: Looks) -> list[Text]:
-    """Return what has to be read first, the worst on top."""
+def _alarms(picture: Picture, looks: Looks, most: int) -> list[Text]:
+    """Return at most so many lines of what has to be read first, the worst on top."""
     said: list[tuple[int, str, str]] = []
     me = find_me(picture, looks.me)
     for person in picture.people:
@@ -139,7 +139,8 @@ def _alarms(picture: Picture, looks: Looks) -> list[Text]:
         seen = " (seen to)" if person.acknowledged else ""
         match person.alert:
             case Alert.STILL_ALARM:
-                words = f"!! {person.name} LIES STILL for {person.still_s:.0f} s{where}{seen}"
+                lies = "lay still, moves again" if person.moving else _still(person)
+                words = f"!! {person.name} {lies}{where}{seen}"
                 said.append((0 if not seen else 2, words, _STYLES[Level.ALARM]))
             case Alert.LOST:
                 words = f"!! {person.name} is LOST: silent for {_ago(person.seen_s)}{where}{seen}"
@@ -158,7 +159,15 @@ def _alarms(picture: Picture, looks: Looks) -> list[Text]:
         shares += f" and {more} more" * (more > 0)
         words = f"? ambiguous: {len(picture.alternatives)} possible pictures ({shares})"
         said.append((5, words, _STYLES[Level.WARNING]))
-    return [_line(words, looks, style) for _, words, style in sorted(said, key=lambda row: row[0])]
+    said.sort(key=lambda row: row[0])
+    if len(said) > most:
+        left_out = len(said) - most + 1
+        said[most - 1 :] = [(9, f"... and {left_out} more", "bold")]
+    return [_line(words, looks, style) for _, words, style in said]
+
+
+def _still(person: Person) -> str:
+    return f"LIES STILL for {person.still_s:.0f} s"
 
 
 def _where(person: Person, me: Person | None, picture: Picture, looks: Looks) -> str:
@@ -242,7 +251,7 @@ def _urgency(person: Person) -> int:
 def _state(person: Person) -> str:
     if person.alert is Alert.LOST or person.status == "lost":
         return "LOST"
-    if person.alert is Alert.STILL_ALARM:
+    if person.alert is Alert.STILL_ALARM and not person.moving:
         return f"STILL {person.still_s:.0f} s"
     if person.status == "unlocated":
         return "not located"
