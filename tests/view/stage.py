@@ -54,6 +54,8 @@ class Stage:
         self.frozen = False
         self.mute = False
         """The server is connected, but not a word comes."""
+        self.sent: dict[int, float] = {}
+        """When each picture was sent, in Unix time."""
         self.observed: list[Observation] = []
         self.acknowledged: list[int] = []
         self.started_unix_s = time.time() - self.at_s
@@ -125,7 +127,8 @@ class Stage:
             with self._lock:
                 if self.web is not None and not self.mute:
                     self._seq += 1
-                    self.web.pictured(self.team.picture(self._seq, self.at_s, time.time()))
+                    self.sent[self._seq] = time.time()
+                    self.web.pictured(self.team.picture(self._seq, self.at_s, self.sent[self._seq]))
                     self._serve(self.web)
 
     def _serve(self, web: WebView) -> None:

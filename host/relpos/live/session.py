@@ -206,7 +206,7 @@ class Session:
             self._remark(words)
             self._remarks += 1
             name = f"remark-{self._remarks}"
-            self._note(name, Level.WARNING, words)
+            self._note(name, Level.INFO, words)
             self._expiring[name] = now_s + REMARK_S
         self._watch(now_s)
         self._picture_if_due()

@@ -53,11 +53,15 @@ export class AlarmBanner {
 
 const KINDS = { info: "Note", warning: "Warning", alarm: "Alarm" };
 
+/** Warnings and alarms a line each; mere notes share one, the newest first. */
 export function showNotices(section, notices) {
   const key = JSON.stringify(notices.map((n) => [n.level, n.text]));
   if (section.dataset.shown === key) return;
   section.dataset.shown = key;
-  section.replaceChildren(...notices.map((notice) => make("p", { "data-level": notice.level },
+  const notes = notices.filter((notice) => notice.level === "info").map((notice) => notice.text);
+  const lines = notices.filter((notice) => notice.level !== "info");
+  if (notes.length) lines.push({ level: "info", text: notes.reverse().join(" · ") });
+  section.replaceChildren(...lines.map((notice) => make("p", { "data-level": notice.level },
     make("span", { class: "kind", text: KINDS[notice.level] ?? notice.level }),
-    make("span", { text: notice.text }))));
+    make("span", { class: "text", text: notice.text }))));
 }

@@ -488,7 +488,7 @@ export class TeamMap {
     context.textBaseline = "middle";
     context.fillText(String(person.node), px, py + 0.5 * unit);
     if (person.health !== "green") {
-      this.drawSign(person.health, px + 0.75 * radius, py - 0.75 * radius, 6.5 * unit);
+      this.drawSign(person.health, px + 0.95 * radius, py - 0.95 * radius, 6.5 * unit);
     }
   }
 
