@@ -167,7 +167,13 @@ def shortened(words: Sequence[str]) -> list[str]:
 
 def _rule_exists(words: Sequence[str]) -> bool:
     rules = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
-    return {word for word in words[1:] if "=" not in word} <= rules
+    for word in words[1:]:
+        name, equals, value = word.partition("=")
+        if name == "LIVE":
+            assert not unknown_options(["relpos", "demo", *split(value)]), word
+        elif not equals and name not in rules:
+            return False
+    return True
 
 
 def _script_knows_its_options(words: Sequence[str]) -> bool:

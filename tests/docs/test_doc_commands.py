@@ -33,13 +33,41 @@ from relpos.simulation.team import make_team
 from relpos.simulation.walker import RATE_HZ
 
 PATIENCE_S = 120
+STANDS_FOR = (
+    (re.compile(r"^(path/to|\.\./shared/data)/(two_robots_vio|four_robots_uwb)/\w+$"), "RUN"),
+    (re.compile(r"^path/to/walk$"), "WALK"),
+    (re.compile(r"^out/exp1_los$"), "DIR"),
+    # The usual port may be another session's.
+    (re.compile(r"^(0\.0\.0\.0|127\.0\.0\.1)(:\d+)?$"), r"\1:0"),
+)
+
+
+def with_things(words, port):
+    """The command with what the reader has in place of its names for it."""
+    given = []
+    for word in words:
+        if PORTS.match(word):
+            word = port
+        for pattern, name in STANDS_FOR:
+            word = pattern.sub(name, word)
+        given.append(word)
+    return given
+
+
 PLACES = defaultdict(list)
 for _page in PAGES:
     for _command in commands(_page):
         PLACES[_command.words].append(_command)
 SHOWN = [found[0] for found in PLACES.values()]
 OURS = [c for c in SHOWN if program(c.words) == "relpos"]
-RUN = [c for c in OURS if why_only_parsed(c.words) is None]
+# Once, however the port and the recording are called.
+RUN = list(
+    {
+        tuple(with_things(c.words[1:], "PORT")): c
+        for c in reversed(OURS)
+        if why_only_parsed(c.words) is None
+    }.values()
+)[::-1]
 THEIRS = [c for c in SHOWN if program(c.words) != "relpos"]
 MENTIONED = sorted({c.words: c for page in PAGES for c in mentions(page)}.values(), key=str)
 
@@ -138,27 +166,6 @@ def scratch(belongings, tmp_path, monkeypatch):
     for name in ("NO_COLOR", "RELPOS_KEY_FILE"):
         monkeypatch.delenv(name, raising=False)
     return tmp_path
-
-
-STANDS_FOR = (
-    (re.compile(r"^(path/to|\.\./shared/data)/(two_robots_vio|four_robots_uwb)/\w+$"), "RUN"),
-    (re.compile(r"^path/to/walk$"), "WALK"),
-    (re.compile(r"^out/exp1_los$"), "DIR"),
-    # The usual port may be another session's.
-    (re.compile(r"^(0\.0\.0\.0|127\.0\.0\.1)(:\d+)?$"), r"\1:0"),
-)
-
-
-def with_things(words, port):
-    """The command with what the reader has in place of its names for it."""
-    given = []
-    for word in words:
-        if PORTS.match(word):
-            word = port
-        for pattern, name in STANDS_FOR:
-            word = pattern.sub(name, word)
-        given.append(word)
-    return given
 
 
 def test_there_are_commands_to_check():
