@@ -16,6 +16,7 @@ from doc_commands import (
     PAGES,
     PARSED,
     PORTS,
+    ROOT,
     SHORTER,
     commands,
     mentions,
@@ -124,6 +125,7 @@ def belongings(tmp_path_factory):
     write_imu(folder / "WALK", times_s, [c[: len(times_s)] for c in columns])
     shutil.copytree(folder / "RUN", folder / "walk")
     write_others_files(folder)
+    shutil.copytree(ROOT / "docs" / "examples", folder / "docs" / "examples")
     key = folder / "team.key"
     key.write_text("00" * 16 + "\n")
     key.chmod(0o600)
