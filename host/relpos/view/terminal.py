@@ -61,7 +61,7 @@ class TerminalView(QuietSink):
         self._stop = threading.Event()
         self._screen = self._stream.isatty()
         self._threads = [threading.Thread(target=self._draw_until_stopped, daemon=True)]
-        if self._screen and keys and sys.stdin.isatty():
+        if self._screen and keys and _has_keys():
             self._threads.append(threading.Thread(target=self._read_keys, daemon=True))
         # Whatever ends the program, the terminal is given back.
         atexit.register(self.close)
@@ -230,6 +230,18 @@ def takes_utf8(stream: TextIO) -> bool:
     encoding = (getattr(stream, "encoding", None) or "").lower().replace("-", "")
     # The kernel's own console has 512 glyphs, braille not among them.
     return encoding == "utf8" and os.environ.get("TERM") not in ("linux", "dumb", "vt100", "vt220")
+
+
+def _has_keys() -> bool:
+    """Return whether keys come here: not to a program in the background, whom asking would stop."""
+    if not sys.stdin.isatty():
+        return False
+    if sys.platform == "win32":
+        return True
+    try:
+        return os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
+    except OSError:
+        return False
 
 
 def _raw_keys() -> tuple[Callable[[float], str], Callable[[], None]]:
