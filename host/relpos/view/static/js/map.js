@@ -16,6 +16,8 @@ const PULSE_STEP_MS = 100;
 const GLIDE_MS = 140;
 /** More people than that have too many ranges to be drawn all. */
 const MANY = 8;
+/** Fewer points are drawn each time: without a graphics card that costs less than their bitmap. */
+const DIRECT_POINTS = 6000;
 /** Ellipses hold two standard deviations: the person is inside 86 times in a hundred. */
 const ELLIPSE_SIGMAS = 2;
 
@@ -283,7 +285,17 @@ export class TeamMap {
     let again = false;
     if (this.layers.tracks === "all") {
       context.globalAlpha = this.team.order.length > 8 ? 0.28 : 0.4;
-      again = this.layer.draw(context, view, this.ratio, tracks, 1.5 * unit);
+      const points = tracks.reduce((sum, [, track]) => sum + track.points.length, 0);
+      if (points < DIRECT_POINTS) {
+        context.lineWidth = 1.5 * unit;
+        for (const [, track, colour] of tracks) {
+          this.pathTrack(track, 0);
+          context.strokeStyle = colour;
+          context.stroke();
+        }
+      } else {
+        again = this.layer.draw(context, view, this.ratio, tracks, 1.5 * unit);
+      }
       context.globalAlpha = 1;
     }
     // The newest stretch stands out: it says where somebody has just come from.
@@ -297,13 +309,7 @@ export class TeamMap {
       const first = track.since((this.team.timeS ?? 0) - tailS);
       if (first >= track.points.length) continue;
       context.strokeStyle = colour;
-      context.beginPath();
-      for (let k = first; k < track.points.length; k += 1) {
-        const [, x, y, starts] = track.points[k];
-        const [px, py] = toScreen(view, x, y);
-        if (k === first || starts) context.moveTo(px, py);
-        else context.lineTo(px, py);
-      }
+      this.pathTrack(track, first);
       if (isPlaced(person) && person.status === "ok") {
         context.lineTo(...toScreen(view, person.x_m, person.y_m));
       }
@@ -311,6 +317,18 @@ export class TeamMap {
     }
     context.globalAlpha = 1;
     return again;
+  }
+
+  /** The track from its point `first` on as the current path. */
+  pathTrack(track, first) {
+    const { context, view } = this;
+    context.beginPath();
+    for (let k = first; k < track.points.length; k += 1) {
+      const [, x, y, starts] = track.points[k];
+      const [px, py] = toScreen(view, x, y);
+      if (k === first || starts) context.moveTo(px, py);
+      else context.lineTo(px, py);
+    }
   }
 
   drawGhost(ghost, unit) {
