@@ -23,7 +23,7 @@ from relpos.errors import RelposError
 from relpos.evaluation.result import Result, pass_through, read_result, result_of
 from relpos.evaluation.scoring import Evaluation
 from relpos.fusion.estimator import Estimate, Estimator
-from relpos.measurements import Measurement, Prior
+from relpos.measurements import Prior
 from relpos.runs import InitialPose, Run, load_run, save_run
 
 if TYPE_CHECKING:
@@ -205,19 +205,4 @@ def _result(given: Result | Sequence[Estimate] | Path | str) -> Result:
     return Result("estimates", tuple(given))
 
 
-__all__ = [
-    "Estimate",
-    "Estimator",
-    "Evaluation",
-    "Measurement",
-    "Result",
-    "Run",
-    "bound",
-    "evaluate",
-    "fuse",
-    "load",
-    "plot",
-    "report",
-    "save",
-    "simulate",
-]
+__all__ = ["bound", "evaluate", "fuse", "load", "plot", "report", "save", "simulate"]

@@ -2,8 +2,8 @@
 
 Of its clause 8, in our words. An error vector e = (e_x, e_y, e_z) is estimate minus truth at one
 test point; here a test point is one node at one whole second where both are known (and at the
-time of a truth row that stands alone, as a landmark press does). With the horizontal, vertical
-and spherical magnitudes h = |(e_x, e_y)|, v = |e_z| and s = |e|:
+time of a truth row that stands alone, as a landmark press does). Its horizontal magnitude h is the
+length of (e_x, e_y), its vertical one v that of e_z, its spherical one s that of e:
 
 * means of the error vector and of the magnitudes (8.4), covariance of the vector (8.5), variances
   of the magnitudes (8.6), root mean squares (8.7), the length of the mean error vector (8.8);
