@@ -77,7 +77,7 @@ def test_an_emulated_team_is_seen_walking_lost_found_and_pressing_a_landmark(
     picture = page.evaluate("fetch('/api/picture').then((answer) => answer.json())")
     began = picture["unix_s"] - picture["time_s"]
 
-    alarm = page.locator("#alarms .alarm[data-node='4']")
+    alarm = page.locator("#alarms [data-node='4']")
     expect(alarm).to_contain_text("Node 4 is lost", timeout=60_000)
     expect(alarm).to_have_count(0, timeout=60_000)
     expect(page.locator("#news-voice")).to_contain_text("Node 4 is heard again")

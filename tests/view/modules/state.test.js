@@ -144,22 +144,53 @@ test("only what is believed leaves a track", () => {
   equal(team.tracks.get(1).points.map((p) => p[1]), [0, 4]);
 });
 
-test("the shown picture is told from the other possible ones", () => {
+const ghost = (node, x_m, shape = "ellipse", sigma = 0.2) => (
+  { node, x_m, y_m: 0, shape, sigma_major_m: shape === "ring" ? 3 : sigma, sigma_minor_m: 0.2 });
+
+function ambiguous(alternatives) {
   const team = new Team();
   team.take(HELLO);
-  const ghost = (node, x_m, shape = "ellipse") => ({ node, x_m, y_m: 0, shape, sigma_major_m: 3, sigma_minor_m: 0.2 });
   team.take({
-    type: "picture", seq: 1, time_s: 1, ambiguous: true,
+    type: "picture", seq: 1, time_s: 1, ambiguous: true, alternatives,
     people: [person(1, 0), person(2, 10), person(3, null, { status: "unlocated" })],
-    alternatives: [
-      { probability: 0.3, people: [ghost(1, 0), ghost(2, -10), ghost(3, 1, "ring")] },
-      { probability: 0.7, people: [ghost(1, 0), ghost(2, 10), ghost(3, 5, "ring")] },
-    ],
   });
-  const { shown, ghosts, rings } = team.otherPictures();
-  near(shown.probability, 0.7);
-  equal(ghosts.map((g) => g.probability), [0.3]);
+  return team.possible();
+}
+
+test("the shown picture is told from the other possible ones", () => {
+  const { shown, places, rings } = ambiguous([
+    { probability: 0.3, people: [ghost(1, 0), ghost(2, -10), ghost(3, 5, "ring")] },
+    { probability: 0.7, people: [ghost(1, 0), ghost(2, 10), ghost(3, 5, "ring")] },
+  ]);
+  equal(shown.probability, 0.7);
+  equal(places.map((p) => [p.node, p.x_m, p.probability]), [[2, -10, 0.3]]);
   equal(rings.map((r) => [r.node, r.x_m]), [[3, 5]]);
+});
+
+test("what several pictures say of one person's place adds up", () => {
+  const { here, places } = ambiguous([
+    { probability: 0.4, people: [ghost(1, 0), ghost(2, 10)] },
+    { probability: 0.3, people: [ghost(1, 6), ghost(2, 10.2)] },
+    { probability: 0.2, people: [ghost(1, 6.1), ghost(2, -4)] },
+    { probability: 0.1, people: [ghost(1, 0.1), ghost(2, -4.1)] },
+  ]);
+  const round = (p) => Math.round(100 * p);
+  equal([round(here.get(1)), round(here.get(2))], [50, 70]);
+  equal(places.map((p) => [p.node, p.x_m, round(p.probability)]), [[1, 6, 50], [2, -4, 30]]);
+});
+
+test("places that hardly anything speaks for are left out", () => {
+  const { places } = ambiguous([
+    { probability: 0.98, people: [ghost(1, 0), ghost(2, 10)] },
+    { probability: 0.02, people: [ghost(1, 8), ghost(2, 10)] },
+  ]);
+  equal(places, []);
+});
+
+test("places are one where the shown one is known no better than that", () => {
+  const far = { probability: 0.4, people: [ghost(1, 2)] };
+  equal(ambiguous([{ probability: 0.6, people: [ghost(1, 0, "ellipse", 2)] }, far]).places, []);
+  equal(ambiguous([{ probability: 0.6, people: [ghost(1, 0)] }, far]).places.length, 1);
 });
 
 test("somebody without a name is called by his number", () => {

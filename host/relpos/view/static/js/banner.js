@@ -3,38 +3,65 @@
 import { make, setAttribute, setText } from "./dom.js";
 import { alarmText } from "./words.js";
 
-/** One row an alarm, kept while it lasts, so that its button can be hit. */
+const MOST_ROWS = 4;
+
+/**
+ * One row an alarm, kept while it lasts, so that its button can be hit; at most four, the worst
+ * ones. The others, and those that somebody has acknowledged, share a line each.
+ */
 export class AlarmBanner {
   constructor(section, { acknowledge, show }) {
     this.section = section;
     this.acknowledge = acknowledge;
     this.show = show;
     this.rows = new Map();
+    this.list = make("div", { class: "rows" });
+    this.more = make("p", { class: "alarm more", "data-level": "warning", "data-acknowledged": "false" });
+    this.moreText = make("span", { class: "text" });
+    this.all = make("button", { type: "button", text: "Acknowledge all" });
+    this.all.addEventListener("click", () => {
+      for (const node of this.open) acknowledge(node);
+    });
+    this.more.append(this.moreText, make("span", { class: "buttons" }, this.all));
+    this.known = make("p", { class: "alarm known", "data-acknowledged": "true" });
+    this.known.append(make("span", { class: "kind", text: "known" }));
+    this.knownText = make("span", { class: "text" });
+    this.known.append(this.knownText);
+    this.open = [];
+    section.replaceChildren(this.list, this.more, this.known);
   }
 
   update(alarms) {
     const list = alarms.list();
+    const open = list.filter((alarm) => !alarm.acknowledged);
+    const known = list.filter((alarm) => alarm.acknowledged);
+    this.open = open.map((alarm) => alarm.node);
+    const shown = open.slice(0, MOST_ROWS);
+    const others = open.slice(MOST_ROWS);
     for (const [node, row] of this.rows) {
-      if (!alarms.active.has(node)) {
+      if (!shown.some((alarm) => alarm.node === node)) {
         row.element.remove();
         this.rows.delete(node);
       }
     }
-    for (const alarm of list) {
+    for (const alarm of shown) {
       let row = this.rows.get(alarm.node);
       if (!row) {
         row = this.make(alarm.node);
         this.rows.set(alarm.node, row);
-        this.section.append(row.element);
+        this.list.append(row.element);
       }
       setAttribute(row.element, "data-level", alarm.level);
-      setAttribute(row.element, "data-acknowledged", String(alarm.acknowledged));
       setText(row.kind, alarm.level);
       setText(row.text, alarmText(alarm));
-      row.button.hidden = alarm.acknowledged;
       setAttribute(row.button, "aria-label", `Acknowledge: ${alarm.name}`);
       setAttribute(row.find, "aria-label", `Find ${alarm.name}`);
     }
+    this.more.hidden = open.length < 2;
+    setAttribute(this.more, "data-level", others.some((a) => a.level === "alarm") ? "alarm" : "warning");
+    setText(this.moreText, others.length ? `and ${others.length} more: ${others.map((a) => a.name).join(", ")}` : "");
+    this.known.hidden = known.length === 0;
+    setText(this.knownText, known.map(alarmText).join(" · "));
     this.section.hidden = list.length === 0;
   }
 
@@ -43,10 +70,10 @@ export class AlarmBanner {
     const text = make("span", { class: "text" });
     const button = make("button", { type: "button", text: "Acknowledge" });
     button.addEventListener("click", () => this.acknowledge(node));
-    const element = make("div", { class: "alarm", "data-node": node }, kind, text);
     const find = make("button", { type: "button", text: "Find" });
     find.addEventListener("click", () => this.show(node));
-    element.append(make("span", { class: "buttons" }, find, button));
+    const element = make("div", { class: "alarm", "data-node": node, "data-acknowledged": "false" },
+      kind, text, make("span", { class: "buttons" }, find, button));
     return { element, kind, text, button, find };
   }
 }

@@ -145,10 +145,10 @@ export function doubts(team, seeker, target, connected) {
     else if (person.status === "lost" || person.status === "stale") {
       words.push(`${person.name}: last heard ${ago(person.seen_s)}; led to where that was.`);
     } else if (person.status === "ambiguous") {
-      const { shown } = team.otherPictures();
-      words.push(shown
-        ? `${person.name} may be elsewhere: ${probability(shown.probability)} where shown.`
-        : `${person.name} may be elsewhere.`);
+      const here = team.possible().here.get(person.node);
+      words.push(here < 0.97
+        ? `${person.name} may be elsewhere: ${probability(here)} where shown.`
+        : `${person.name} is not sure yet.`);
     }
   }
   return words.join(" ");

@@ -7,7 +7,7 @@ import { TrackLayer } from "./track_layer.js";
 import {
   clampScale, fit, gridStep, headingUp, isLoose, pan, scaleBar, toMap, toScreen, zoomAt,
 } from "./transform.js";
-import { distance, probability, seconds } from "./words.js";
+import { distance, probability, seconds, sureHere } from "./words.js";
 
 const TAIL_S = 30;
 const MINUTE_S = 60;
@@ -142,13 +142,10 @@ export class TeamMap {
         points.push([track.points[k][1], track.points[k][2]]);
       }
     }
-    const { ghosts, rings } = this.team.otherPictures();
+    const { places, rings } = this.team.possible();
     for (const ring of rings) points.push(...around(ring));
-    for (const ghost of ghosts) {
-      if (ghost.probability < 0.05) continue;
-      for (const p of ghost.people) {
-        if (p.shape !== "ring") points.push([p.x_m, p.y_m]);
-      }
+    for (const place of places) {
+      if (place.shape !== "ring" && place.probability >= 0.05) points.push([place.x_m, place.y_m]);
     }
     return points;
   }
@@ -220,9 +217,9 @@ export class TeamMap {
     context.fillRect(0, 0, view.width, view.height);
     this.drawGrid();
     const again = this.drawTracks();
-    const { shown, ghosts, rings } = this.team.otherPictures();
+    const { here, places, rings } = this.team.possible();
     const people = this.team.list().filter(isPlaced);
-    for (const ghost of ghosts) this.drawGhost(ghost, unit);
+    for (const place of places) this.drawGhost(place);
     for (const ring of rings) this.drawRing(ring, 1);
     const links = this.drawLinks();
     for (const person of people) this.drawEllipse(person);
@@ -230,7 +227,7 @@ export class TeamMap {
     // Who is in trouble is drawn last, on top.
     const ordered = [...people].sort((a, b) => this.rank(a) - this.rank(b));
     for (const person of ordered) this.drawMarker(person, now);
-    this.drawLabels(ordered.reverse(), links, ghosts, shown, rings);
+    this.drawLabels(ordered.reverse(), links, places, here, rings);
     this.drawScale();
     this.drawNorth();
     if (gliding) this.invalidate();
@@ -331,36 +328,32 @@ export class TeamMap {
     }
   }
 
-  drawGhost(ghost, unit) {
-    const { context, view } = this;
-    context.globalAlpha = Math.min(0.95, 0.6 + 0.5 * ghost.probability);
-    for (const p of ghost.people) {
-      const colour = this.colourOf(p.node);
-      if (p.shape === "ring") {
-        this.drawRing(p, 0.5);
-        continue;
-      }
-      const person = this.team.person(p.node);
-      if (isPlaced(person) && Math.hypot(person.x_m - p.x_m, person.y_m - p.y_m) < 0.7) continue;
-      const [px, py] = toScreen(view, p.x_m, p.y_m);
-      context.strokeStyle = colour;
-      context.setLineDash([4 * unit, 3 * unit]);
-      context.lineWidth = 1.5 * unit;
-      this.pathEllipse(p);
-      context.stroke();
-      context.beginPath();
-      context.arc(px, py, 9 * unit, 0, 2 * Math.PI);
-      context.fillStyle = this.colours.ground;
-      context.fill();
-      context.lineWidth = 2 * unit;
-      context.stroke();
-      context.setLineDash([]);
-      context.fillStyle = this.colours.ink;
-      context.font = this.font(11, true);
-      context.textAlign = "center";
-      context.textBaseline = "middle";
-      context.fillText(String(p.node), px, py + 0.5 * unit);
+  /** A place where somebody may be instead. */
+  drawGhost(place) {
+    const { context, view, unit } = this;
+    if (place.shape === "ring") {
+      this.drawRing(place, 0.5);
+      return;
     }
+    const [px, py] = toScreen(view, place.x_m, place.y_m);
+    context.globalAlpha = Math.min(0.95, 0.6 + 0.5 * place.probability);
+    context.strokeStyle = this.colourOf(place.node);
+    context.setLineDash([4 * unit, 3 * unit]);
+    context.lineWidth = 1.5 * unit;
+    this.pathEllipse(place);
+    context.stroke();
+    context.beginPath();
+    context.arc(px, py, 9 * unit, 0, 2 * Math.PI);
+    context.fillStyle = this.colours.ground;
+    context.fill();
+    context.lineWidth = 2 * unit;
+    context.stroke();
+    context.setLineDash([]);
+    context.fillStyle = this.colours.ink;
+    context.font = this.font(11, true);
+    context.textAlign = "center";
+    context.textBaseline = "middle";
+    context.fillText(String(place.node), px, py + 0.5 * unit);
     context.globalAlpha = 1;
   }
 
@@ -565,22 +558,22 @@ export class TeamMap {
     context.fillText("!", px, py + size * 0.12);
   }
 
-  stateOf(person, shown) {
+  stateOf(person, here) {
     const alarm = this.alarms.get(person.node);
     if (alarm) return alarm.kind === "lost"
       ? `lost ${seconds(person.seen_s)}` : `still ${seconds(person.still_s)}`;
     if (person.status === "lost") return `lost ${seconds(person.seen_s)}`;
     if (person.status === "stale") return `no news ${seconds(person.seen_s)}`;
-    if (person.status === "ambiguous") return shown ? `${probability(shown.probability)} here` : "?";
+    if (person.status === "ambiguous") return sureHere(here.get(person.node));
     return "";
   }
 
-  drawLabels(people, links, ghosts, shown, rings) {
+  drawLabels(people, links, places, here, rings) {
     const { context, view, colours, unit } = this;
     const items = people.map((person) => {
       const [x, y] = toScreen(view, person.x_m, person.y_m);
       const name = shorten(person.node === this.me ? `${person.name} (me)` : person.name, 18);
-      const state = this.stateOf(person, shown);
+      const state = this.stateOf(person, here);
       const width = Math.max(this.width(name, 13.5, true), this.width(state, 12, true)) + 4 * unit;
       return {
         id: person.node, x, y, radius: 15 * unit, width, height: (state ? 32 : 18) * unit,
@@ -611,24 +604,21 @@ export class TeamMap {
     }
     // Probabilities of ghosts, then ranges, where there is room.
     const wanted = [];
-    for (const ghost of ghosts) {
-      for (const p of ghost.people) {
-        const person = this.team.person(p.node);
-        const near = isPlaced(person) && Math.hypot(person.x_m - p.x_m, person.y_m - p.y_m) < 0.7;
-        if (p.shape === "ring" || near) continue;
-        const [x, y] = toScreen(view, p.x_m, p.y_m);
-        const text = `${shorten(person?.name ?? `Node ${p.node}`, 12)} ${probability(ghost.probability)}?`;
-        const [w, h] = [this.width(text, 12, true) + 4 * unit, 15 * unit];
-        const gap = 12 * unit;
-        wanted.push({
-          id: `${ghost.probability} ${p.node} ${x}`, text, size: 12, bold: true,
-          places: [
-            [x + gap, y - h / 2, w, h], [x - gap - w, y - h / 2, w, h],
-            [x - w / 2, y - gap - h, w, h], [x - w / 2, y + gap, w, h],
-          ],
-        });
-        boxes.push([x - 9 * unit, y - 9 * unit, 18 * unit, 18 * unit]);
-      }
+    for (const place of places) {
+      if (place.shape === "ring") continue;
+      const [x, y] = toScreen(view, place.x_m, place.y_m);
+      const name = this.team.person(place.node)?.name ?? `Node ${place.node}`;
+      const text = `${shorten(name, 12)} ${probability(place.probability)}?`;
+      const [w, h] = [this.width(text, 12, true) + 4 * unit, 15 * unit];
+      const gap = 12 * unit;
+      wanted.push({
+        id: `place ${place.node} ${place.x_m} ${place.y_m}`, text, size: 12, bold: true,
+        places: [
+          [x + gap, y - h / 2, w, h], [x - gap - w, y - h / 2, w, h],
+          [x - w / 2, y - gap - h, w, h], [x - w / 2, y + gap, w, h],
+        ],
+      });
+      boxes.push([x - 9 * unit, y - 9 * unit, 18 * unit, 18 * unit]);
     }
     for (const ring of rings) {
       const person = this.team.person(ring.node);

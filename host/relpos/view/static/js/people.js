@@ -9,13 +9,13 @@ import {
 } from "./words.js";
 
 /** What somebody does, in words; empty where all is well and nothing need be said. */
-export function stateWords(person, alarm, shown) {
+export function stateWords(person, alarm, here) {
   const words = [];
   if (alarm?.kind === "lost" || person.status === "lost") words.push(`Lost: last heard ${ago(person.seen_s)}`);
   else if (person.status === "stale") words.push(`No news: last heard ${ago(person.seen_s)}`);
   else if (person.status === "unlocated") words.push("Not located yet");
   else if (person.status === "ambiguous") {
-    words.push(shown ? `Ambiguous: ${probability(shown.probability)} where shown` : "Ambiguous");
+    words.push(here < 0.97 ? `Ambiguous: ${probability(here)} where shown` : "Ambiguous");
   }
   if (alarm?.kind === "still") words.push(`Has not moved for ${seconds(person.still_s)}`);
   else if (person.moving === false && person.still_s >= 3 && person.status !== "lost") {
@@ -59,7 +59,7 @@ class Card {
       this.state, make("dl", { class: "facts" }, ...facts), this.reasons);
   }
 
-  show(person, { colour, me, meName, relation, northKnown, alarm, shown, selected, followed }) {
+  show(person, { colour, me, meName, relation, northKnown, alarm, here, selected, followed }) {
     const { element } = this;
     setAttribute(element, "data-status", person.status);
     setAttribute(element, "data-health", person.health);
@@ -86,7 +86,7 @@ class Card {
         : whichWay(relation));
       setText(this.compass, relation ? compassShort(relation.bearingRad, northKnown) : "");
     }
-    setText(this.state, stateWords(person, alarm, shown));
+    setText(this.state, stateWords(person, alarm, here));
     const facts = {
       Seen: ago(person.seen_s), Supply: volts(person.battery_v), Radio: dbm(person.rssi_dbm),
       Loss: percent(person.loss), Ranging: percent(person.ranging),
@@ -109,7 +109,7 @@ export class PeopleList {
 
   /** `look` is {colourOf, me, selected, followed, alarms}. */
   update(team, look) {
-    const { shown } = team.otherPictures();
+    const { here } = team.possible();
     const people = [...team.list()].sort((a, b) => trouble(look.alarms, b) - trouble(look.alarms, a) || a.node - b.node);
     for (const [node, card] of this.cards) {
       if (!team.people.has(node)) {
@@ -136,7 +136,7 @@ export class PeopleList {
         relation: look.me === null ? null : team.relation(look.me, person.node),
         northKnown: team.northKnown,
         alarm: look.alarms.active.get(person.node),
-        shown,
+        here: here.get(person.node),
         selected: person.node === look.selected,
         followed: person.node === look.followed,
       });
@@ -187,22 +187,20 @@ export function updateTable(body, team, me) {
   });
 }
 
-/** The alternatives in words; empty while nothing is ambiguous. */
+/** The other possible places in words; empty while nothing is ambiguous. */
 export function alternativeWords(team) {
-  const { shown, ghosts, rings } = team.otherPictures();
-  const words = rings.map((ring) => `${team.person(ring.node)?.name ?? `Node ${ring.node}`} is somewhere on a ring of ${distance(ring.sigma_major_m)} about x ${number(ring.x_m)}, y ${number(ring.y_m)}.`);
-  if (ghosts.length) {
-    words.push(`The picture shown has a probability of ${probability(shown?.probability)}.`);
-    for (const ghost of ghosts) {
-      const moved = ghost.people.filter((p) => {
-        const person = team.person(p.node);
-        return p.shape !== "ring" && person && Math.hypot(person.x_m - p.x_m, person.y_m - p.y_m) >= 0.7;
-      });
-      if (!moved.length) continue;
-      const places = moved.map((p) => `${team.person(p.node).name} at x ${number(p.x_m)}, y ${number(p.y_m)}`);
-      words.push(`With ${probability(ghost.probability)}: ${places.join("; ")}.`);
+  const { here, places, rings } = team.possible();
+  const name = (node) => team.person(node)?.name ?? `Node ${node}`;
+  const words = rings.map((ring) => `${name(ring.node)} is somewhere on a ring of ${distance(ring.sigma_major_m)} about x ${number(ring.x_m)}, y ${number(ring.y_m)}.`);
+  const told = new Set();
+  for (const place of places) {
+    if (!told.has(place.node) && here.has(place.node)) {
+      words.push(`${name(place.node)} is where shown with ${probability(here.get(place.node))}.`);
     }
+    told.add(place.node);
+    words.push(place.shape === "ring"
+      ? `With ${probability(place.probability)} ${name(place.node)} is on a ring of ${distance(place.sigma_major_m)} about x ${number(place.x_m)}, y ${number(place.y_m)}.`
+      : `With ${probability(place.probability)} ${name(place.node)} is at x ${number(place.x_m)}, y ${number(place.y_m)}.`);
   }
   return words.join(" ");
 }
-

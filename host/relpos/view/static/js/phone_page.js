@@ -109,7 +109,7 @@ function showTeam() {
       others.delete(node);
     }
   }
-  const { shown } = team.otherPictures();
+  const { here } = team.possible();
   list.forEach(({ person, relation }) => {
     let row = others.get(person.node);
     if (!row) {
@@ -129,7 +129,7 @@ function showTeam() {
       : relation.relativeRad === null
         ? `${whichWay(relation)} · ${compass(relation.bearingRad, team.northKnown)}`
         : `${clock(relation.relativeRad)}, ${side(relation.relativeRad)}`);
-    setText(row.state, stateWords(person, alarm, shown));
+    setText(row.state, stateWords(person, alarm, here.get(person.node)));
     row.find.disabled = !me;
     setAttribute(row.find, "aria-label", `Find ${person.name}`);
   });

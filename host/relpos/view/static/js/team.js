@@ -5,6 +5,10 @@ import { Track } from "./tracks.js";
 
 export const PROTOCOL = 1;
 
+/** Places with less would be clutter; they are too little to send anybody to. */
+const LEAST_PROBABILITY = 0.03;
+const ONE_PLACE_M = 0.7; // as the host's ambiguity.py has it
+
 export class Team {
   constructor() {
     this.session = null;
@@ -17,6 +21,7 @@ export class Team {
     this.pairs = new Map();
     this.ranges = [];
     this.alternatives = [];
+    this.possibleOf = null;
     this.notices = [];
     this.tracks = new Map();
     this.ambiguous = false;
@@ -108,13 +113,16 @@ export class Team {
   }
 
   /**
-   * The other pictures of the team while it is ambiguous, the most probable first, and the shown
-   * one's own probability: {shown: p | null, ghosts: [...], rings: [...]}.
+   * Where people may be while the team is ambiguous: {shown, places, rings, here}.
    *
-   * The server lists the shown picture among the alternatives: it is the one nearest to what is
-   * shown. Whatever it has as a ring is a ring in the shown picture, too.
+   * The server lists whole pictures of the team with their probabilities, the shown one among them
+   * (the one nearest to what is shown). What concerns one person are his places: those of several
+   * pictures that are one place add up. `here` (node -> probability) is what speaks for where he is
+   * shown, `places` are the other ones of everybody, the likeliest first, `rings` are those who are
+   * shown as somewhere on a ring.
    */
-  otherPictures() {
+  possible() {
+    if (this.possibleOf === this.alternatives) return this.possibleNow;
     const alternatives = [...this.alternatives].sort((a, b) => b.probability - a.probability);
     let shown = null;
     let least = Infinity;
@@ -122,11 +130,33 @@ export class Team {
       const off = this.distanceFromShown(alternative);
       if (off < least) [shown, least] = [alternative, off];
     }
-    return {
+    const homes = new Map((shown?.people ?? []).map((p) => [p.node, p]));
+    const here = new Map();
+    const found = new Map();
+    for (const { probability, people } of alternatives) {
+      for (const ghost of people) {
+        const home = homes.get(ghost.node);
+        if (home && isSamePlace(ghost, home)) {
+          here.set(ghost.node, (here.get(ghost.node) ?? 0) + probability);
+          continue;
+        }
+        const places = found.get(ghost.node) ?? [];
+        const known = places.find((place) => isSamePlace(ghost, place));
+        if (known) known.probability += probability;
+        else places.push({ ...ghost, probability });
+        found.set(ghost.node, places);
+      }
+    }
+    this.possibleOf = this.alternatives;
+    this.possibleNow = {
       shown,
-      ghosts: alternatives.filter((a) => a !== shown),
-      rings: shown ? shown.people.filter((p) => p.shape === "ring") : [],
+      here,
+      places: [...found.values()].flat()
+        .filter((place) => place.probability >= LEAST_PROBABILITY)
+        .sort((a, b) => b.probability - a.probability),
+      rings: [...homes.values()].filter((p) => p.shape === "ring"),
     };
+    return this.possibleNow;
   }
 
   distanceFromShown(alternative) {
@@ -139,6 +169,15 @@ export class Team {
     }
     return count ? sum / count : Number.MAX_VALUE;
   }
+}
+
+/** Are two places of a person one, beside how well the second is known? */
+function isSamePlace(a, b) {
+  if (a.shape !== b.shape) return false;
+  const off = Math.hypot(a.x_m - b.x_m, a.y_m - b.y_m);
+  if (a.shape === "ring") return off + Math.abs(a.sigma_major_m - b.sigma_major_m) < 1;
+  const spread2 = 2 * ((b.sigma_major_m ?? 0) ** 2 + (b.sigma_minor_m ?? 0) ** 2);
+  return off ** 2 < Math.max(ONE_PLACE_M ** 2, spread2);
 }
 
 function named(person) {

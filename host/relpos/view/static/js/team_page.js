@@ -240,7 +240,8 @@ async function acknowledge(node) {
   siren.sound(alarms.sounding);
   banner.update(alarms);
   map.invalidate();
-  byId("alarms").querySelector("button:not([hidden])")?.focus();
+  // The button is gone: on to the next alarm's, or back to the map.
+  (byId("alarms").querySelector(".rows .buttons button:last-child") ?? byId("map")).focus();
   try {
     await postJson("/api/acknowledge", { node });
   } catch (error) {

@@ -126,6 +126,11 @@ export function whereabouts(relation, northKnown) {
   return parts.join(" · ");
 }
 
+/** How sure it is that an ambiguous person is where he is shown: "62 % here". */
+export function sureHere(p) {
+  return Number.isFinite(p) && p < 0.97 ? `${probability(p)} here` : "ambiguous";
+}
+
 export const HEALTH_WORDS = { green: "well", yellow: "weak", red: "failing" };
 
 export const STATUS_WORDS = {
