@@ -21,8 +21,9 @@ import sys
 import time
 from pathlib import Path
 
-from relpos.recording import make_recorder
 from relpos.recording.about import About
+from relpos.recording.recorder import Recorder
+from relpos.recording.topics import all_topics
 
 PAGE = struct.Struct("<Qd")
 LONGEST_S = 4.0
@@ -30,7 +31,7 @@ LONGEST_S = 4.0
 
 def record(path, steps, page):
     started_ns, started_s = time.time_ns(), time.monotonic()
-    recorder = make_recorder(path, About(started_ns))
+    recorder = Recorder(path, About(started_ns))
     for number in itertools.count(1):
         _, data, observations, estimates = steps[number % len(steps)]
         arrival_s = time.monotonic() - started_s
@@ -45,6 +46,7 @@ def record(path, steps, page):
 def main():
     steps_file, folder, kills, seed = sys.argv[1:]
     steps = pickle.loads(Path(steps_file).read_bytes())
+    all_topics()  # Loads Foxglove's schemas.
     dice = random.Random(int(seed))
     for k in range(int(kills)):
         path = Path(folder) / f"{k}.mcap"

@@ -1,6 +1,8 @@
 """A small emulated session, and what a sink is told of it: for the tests of recordings."""
 
+from dataclasses import fields, is_dataclass
 from functools import cache
+from math import isclose
 
 from relpos.emulator.team import EmulatedTeam
 from relpos.fusion import make
@@ -48,3 +50,14 @@ def play(sink, steps):
         sink.observed(arrival_s, observations)
         for estimate in estimates:
             sink.estimated(estimate)
+
+
+def alike(ours, theirs):
+    """Whether two estimates are the same but for the digits that a recording leaves out."""
+    if isinstance(ours, float):
+        return isclose(ours, theirs, rel_tol=1e-8, abs_tol=1e-12) or ours == theirs
+    if isinstance(ours, list | tuple):
+        return len(ours) == len(theirs) and all(map(alike, ours, theirs))
+    if is_dataclass(ours):
+        return all(alike(getattr(ours, f.name), getattr(theirs, f.name)) for f in fields(ours))
+    return ours == theirs

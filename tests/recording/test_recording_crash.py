@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
-from sessions import about, play, session
+from sessions import about, alike, play, session
 
 from relpos.recording import make_recorder, open_recording, save_recording
 from relpos.recording.output import Disk
@@ -97,10 +97,8 @@ def test_a_killed_recorder_leaves_all_but_the_last_second(tmp_path):
 @pytest.mark.soak
 def test_two_hundred_killed_recorders_leave_all_but_the_last_second(tmp_path):
     lost_s = kill_recorders(tmp_path, 200, 2)
-    print(
-        f"{len(lost_s)} recordings, seconds lost: mean {sum(lost_s) / len(lost_s):.2f}, "
-        f"most {max(lost_s):.2f}"
-    )
+    most = ", ".join(f"{s:.2f}" for s in sorted(lost_s)[-8:])
+    print(f"{len(lost_s)} recordings; seconds lost, mean {sum(lost_s) / len(lost_s):.2f}, {most}")
     assert len(lost_s) > 150
     assert max(lost_s) <= 1.0
 
@@ -198,7 +196,7 @@ def test_a_full_disk_is_told_and_gone_on_from_without_losing_anything(tmp_path):
     assert recording.remarks == ()
     assert [s.arrival_s for s in serials(path)] == [arrival_s for arrival_s, *_ in steps]
     assert list(recording.observations()) == [o for step in steps for o in step[2]]
-    assert list(recording.estimates()) == [e for step in steps for e in step[3]]
+    assert alike(list(recording.estimates()), [e for step in steps for e in step[3]])
     log = [e.data for e in recording.entries({"/log"})]
     assert any(b"the disk takes the recording again" in line for line in log)
 
