@@ -132,14 +132,17 @@ class Options:
     @property
     def shown(self) -> bool:
         """Whether somebody looks at it, or records it, while it runs."""
-        wanted = (self.record, self.foxglove)
-        return self.view or bool(self.sinks) or any(w is not None for w in wanted)
+        return self.watched or self.record is not None
 
     @property
     def pace(self) -> float:
         """How fast a recording is played; where nobody looks, as fast as it goes."""
-        watched = self.view or self.sinks or self.foxglove is not None
-        return self.speed if watched else 0.0
+        return self.speed if self.watched else 0.0
+
+    @property
+    def watched(self) -> bool:
+        """Whether somebody looks at it while it runs: its last picture stays, then."""
+        return self.view or bool(self.sinks) or self.foxglove is not None
 
     def check(self) -> None:
         """Refuse what cannot be done before anything else is: DataError, RelposError."""
@@ -240,7 +243,7 @@ def run(
         visitors=visitors,
         namings=namings,
         seconds=options.seconds,
-        lasts=options.shown,
+        lasts=options.watched or (options.shown and source.is_now),
         remark=later.append if options.screen else output.remark,
     )
     observations = session.run()

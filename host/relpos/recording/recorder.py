@@ -28,8 +28,9 @@ if TYPE_CHECKING:
     from relpos.live.picture import Picture
 
 TICK_S = 0.1
-BLOCK_S = 0.5
-"""A block is closed that often: with the disk's own time, less than a second is ever at stake."""
+BLOCK_S = 0.4
+"""A block is closed that often: a tick more is at stake, and half a second is left for a computer
+that is too busy to let us."""
 BLOCK_BYTES = 1 << 20
 RETRY_S = 0.5
 LATE_S = 3.0
@@ -76,7 +77,7 @@ class Recorder:
         self._encoder = Encoder(about.started_unix_ns, names_of(about.description))
         self._topics = topics.all_topics()
         self._block = container.Block(container.numbered(self._topics))
-        self._block_began_s = 0.0
+        self._looked_s = self._block_began_s = time.monotonic()
         self._sequence = 0
         self._queue: deque[tuple[int, float, Item | _Names]] = deque()
         self._lock = Lock()
@@ -88,6 +89,8 @@ class Recorder:
         self._trouble: str | None = None
         self._refused_since_s: float | None = None
         self._retry_s = 0.0
+        # The first of everything takes a while in Python; nobody waits for it now.
+        self._encoder.rehearse()
         self._output = Output(Path(path), self._beginning, disk or Disk())
         self._stop = Event()
         self._thread = Thread(target=self._run, name="recorder", daemon=True)
@@ -204,6 +207,10 @@ class Recorder:
 
     def _work(self, *, closing: bool) -> bool:
         """Encode and write what there is; whether nothing waits any more."""
+        looked_s, self._looked_s = self._looked_s, time.monotonic()
+        if not len(self._block):
+            # What is in the queue may have waited there since the last look.
+            self._block_began_s = looked_s
         while True:
             if self._output.waiting and (not self._flushed() or self._output.waiting):
                 return False
@@ -215,6 +222,7 @@ class Recorder:
             old = time.monotonic() - self._block_began_s >= BLOCK_S
             if len(self._block) and (full or old or closing):
                 self._output.put(self._block.take())
+                self._block_began_s = time.monotonic()
             if not self._output.waiting and not self._queue:
                 return True
 
@@ -281,8 +289,6 @@ class Recorder:
         self._add(gap.to_s, Line("warning", words))
 
     def _add(self, at_s: float, item: Item) -> None:
-        if not len(self._block):
-            self._block_began_s = time.monotonic()
         for message in self._encoder.messages(at_s, item):
             self._sequence += 1
             self._block.add(
