@@ -81,7 +81,7 @@ def updated(x: Floats, p: Floats, measured: float, dz: float, outlier: tuple[flo
 
 def mixture(x: Floats, p: Floats, weight: Floats) -> tuple[Floats, Floats]:
     px, pp = joint.pack(x, p, NODES)
-    return joint.moments(px, pp, in_lanes(weight), NODES, joint.order(NODES, SIZE))
+    return joint.moments(px, pp, in_lanes(weight), NODES, joint.order(NODES, SIZE), SIZE)
 
 
 def predicted(x: Floats, p: Floats) -> tuple[float, float]:
@@ -260,6 +260,25 @@ def test_what_is_far_from_any_edge_changes_nothing_but_the_weight() -> None:
     hearing(x, p, True, 10.0)
     assert (x == before[0]).all()
     assert (p == before[1]).all()
+
+
+@pytest.mark.parametrize(("heard", "weight"), [(True, 1.0), (False, 1.0), (False, 0.6)])
+def test_who_is_heard_is_the_twins(heard: bool, weight: float) -> None:
+    curve = 0.002 + 0.97 / (1.0 + np.exp((np.arange(201) * 0.5 - 7.0) / 1.5))
+    x, p = states(16, 30)
+    expected = [
+        twins.hearing(a, b, 0, 2, heard, 0.9, weight, curve, 0.5) for a, b in zip(x, p, strict=True)
+    ]
+    log_weight = in_lanes(np.zeros(16))
+    with Packed(x, p) as (px, pp, _):
+        joint.hearing(
+            px, pp, log_weight, NODES, np.array([0]), np.array([2]), np.zeros(1),
+            np.array([heard]), np.array([0.9]), weight, curve, 0.5,
+        )  # fmt: skip
+    assert log_weight.ravel() == pytest.approx(np.array([e[2] for e in expected]), abs=1e-9)
+    assert x == pytest.approx(np.array([e[0] for e in expected]), abs=1e-9)
+    assert p == pytest.approx(np.array([e[1] for e in expected]), abs=1e-9)
+    assert len({e[0].tobytes() for e in expected} - {s.tobytes() for s in states(16, 30)[0]}) > 2
 
 
 def test_levels_of_noise_are_learned_from_innovations_and_their_uncertainty_is_honest() -> None:

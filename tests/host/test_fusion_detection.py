@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from relpos import fusion
-from relpos.fusion import detection
 from relpos.fusion.detection import Detection, Round, Rounds
-from relpos.fusion.twins import detection as twin
 from relpos.measurements import Range
 from relpos.simulation.paper import simulate_paper
 
@@ -59,12 +57,9 @@ def test_the_learned_curve_is_the_simulated_one(scenario: str, near: float, edge
 
 
 def test_before_anything_is_learned_silence_says_little() -> None:
-    out = np.zeros(2)
     learner = Detection()
-    detection.log_silence(
-        np.array([[2.0], [30.0]]), np.zeros((2, 1)), np.ones(1), 1.0, learner.curve, out
-    )
-    assert 0.0 < out[1] - out[0] < 1.0
+    near, far = np.log1p(-learner.probability(np.array([2.0, 30.0])))
+    assert 0.0 < far - near < 1.0
     assert not learner.known
 
 
@@ -158,19 +153,6 @@ def test_silences_that_follow_each_other_count_less_than_independent_ones() -> N
             learn(learner, Round(float(t), heard, silent, (True,) * len(heard)))
     assert blocked.weight < 0.25
     assert free.weight > 0.8
-
-
-def test_the_kernel_of_silence_is_its_twin() -> None:
-    rng = np.random.default_rng(3)
-    learner = Detection()
-    for pairs, spread in ((1, 0.0), (7, 2.0), (300, 1.0)):
-        distance = rng.uniform(0.0, 120.0, (5, pairs))
-        sigma = spread * rng.random((5, pairs))
-        tried = rng.random(pairs)
-        out = np.ones(5)
-        detection.log_silence(distance, sigma, tried, 0.7, learner.curve, out)
-        expected = 1.0 + twin.log_silence(distance, sigma, tried, 0.7, learner.curve)
-        assert out == pytest.approx(expected, rel=1e-9)
 
 
 def test_what_was_learned_after_a_snapshot_does_not_change_it() -> None:

@@ -31,6 +31,9 @@ class Log:
         self.thrown.append(self.dice.random())
         return Estimate(step.time_s, (), ()) if isinstance(step, Epoch) else None
 
+    def cost_s(self, step: Step) -> float:
+        return 1e-5
+
     def snapshot(self) -> tuple[list[Step], dict[str, object], list[float]]:
         return self.steps[:], dict(self.dice.bit_generator.state), self.thrown[:]
 
@@ -169,6 +172,27 @@ def test_a_burst_of_late_reports_costs_one_replay() -> None:
     assert quick.counters()["rewinds"] == 1
     # At most the window, a report and a second between copies.
     assert 0 < quick.counters()["rewound_steps"] < 8.0 * len(log.steps) / 40
+
+
+def test_a_call_works_off_a_bounded_share_of_a_replay_and_the_next_ones_the_rest() -> None:
+    ordered = team()
+    at = next(k for k, m in enumerate(ordered) if m.time_s > 24.0)
+    late = [*ordered[:at], Height(20.2, 1, 7.5), *ordered[at:]]
+    log, quick = rewinder()
+    quick.most_s = 1e-4
+    most, estimates = 0, []
+    for m in late:
+        before = log.taken
+        estimates += quick.process(m)
+        most = max(most, log.taken - before)
+    estimates += quick.finish()
+    assert most <= 11
+    assert quick.counters()["rewound_steps"] > 3 * most
+    straight = rewinder()
+    whole = feed(straight[1], sorted(late, key=lambda m: m.time_s))
+    assert log.steps == straight[0].steps
+    assert log.thrown == straight[0].thrown
+    assert [e.time_s for e in estimates] == [e.time_s for e in whole]
 
 
 def test_what_is_kept_stays_bounded_without_any_motion() -> None:

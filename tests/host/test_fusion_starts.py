@@ -15,8 +15,8 @@ from relpos import fusion
 from relpos.evaluation import metrics, tracks
 from relpos.fusion.ambiguity import Region
 from relpos.fusion.estimator import Estimate, NodeStatus, Shape
-from relpos.fusion.starts import Search
 from relpos.fusion.starts_kernels import fit, normal_equations
+from relpos.fusion.starts_search import Search
 from relpos.fusion.timeline import Advance
 from relpos.fusion.twins import starts as twin
 from relpos.measurements import Measurement, Motion, Prior, Range

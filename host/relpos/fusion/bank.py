@@ -41,7 +41,8 @@ from relpos.fusion.motion_model import told_sigmas
 from relpos.fusion.ranging_model import Mounting, Repetition
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.slips import LOST_RAD, VAGUE_M, Habit, Stillness
-from relpos.fusion.starts import SETTLED_HEADING_RAD, Found, Mixture, Starts
+from relpos.fusion.starts import Found, Starts
+from relpos.fusion.starts_search import SETTLED_HEADING_RAD, Mixture
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.measurements import Heading, Height, Measurement, Prior, Range
 
@@ -134,8 +135,9 @@ class Bank:
         self.core = BankCore(s, self.seed)
         self.starts = Starts(seed=self.seed)
         timeline = Timeline(
-            [p.node for p in self.priors], reorder_s=s.reorder_s, max_lag_s=s.max_lag_s
-        )
+            [p.node for p in self.priors],
+            reorder_s=s.reorder_s, max_lag_s=s.max_lag_s, sparing=True,
+        )  # fmt: skip
         self._feed = Rewinder(self, timeline, s.late_s)
         for p in sorted(self.priors, key=lambda p: p.node):
             if p.node in self._known:
@@ -199,6 +201,16 @@ class Bank:
                 self._admit(self.starts.epoch(step.time_s))
                 return self._estimate(step.time_s)
         return None
+
+    def cost_s(self, step: Step) -> float:
+        """About how many seconds of a processor ``take`` needs for a step."""
+        match step:
+            case Ranging():
+                return 3e-4 + 3e-10 * self.core.entries
+            case Epoch():
+                search_s = 3e-4 * len(self.starts.search.nodes) ** 2
+                return 1e-3 + 1e-9 * self.core.entries + search_s
+        return 3e-5
 
     def snapshot(self) -> _State:
         """Copy everything that ``take`` changes."""
@@ -288,7 +300,10 @@ class Bank:
                 known.heard(step.time_s)
                 if node not in self._row:
                     self._seek(node)
-        if self.starts:
+        if (
+            self.starts
+            and not {n for r in step.ranges for n in (r.node, r.peer)} <= self._row.keys()
+        ):
             heights = {n: k.height_m for n, k in self._known.items()}
             self.starts.ranging(step.time_s, step.ranges, self._places(), heights)
             # A search may be long; finding nobody in it is no fault of the data.
@@ -356,7 +371,7 @@ class Bank:
         """
         if not self._row:
             return {}
-        mean, covariance = self.core.moments()
+        mean, covariance = self.core.moments(poses_alone=True)
         at = PER_NODE * np.array(list(self._row.values()))
         own = 0.5 * (covariance[at, at] + covariance[at + 1, at + 1])
         cross = 0.5 * (covariance[np.ix_(at, at)] + covariance[np.ix_(at + 1, at + 1)])
@@ -387,7 +402,7 @@ class Bank:
 
     def _nearest(self, mixture: Mixture) -> int:
         """Row of the user of the core who is nearest to those who have been found."""
-        mean, _ = self.core.moments()
+        mean, _ = self.core.moments(poses_alone=True)
         middle = mixture.poses[0, :, :2].mean(axis=0)
         rows = list(self._row.values())
         off = [np.hypot(*(mean[PER_NODE * r : PER_NODE * r + 2] - middle)) for r in rows]
@@ -420,6 +435,9 @@ class Bank:
         ranges = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
         for done in self.detection.rounds.take(step.time_s, ranges, self._feed.timeline.reported_s):
             pairs = done.heard + done.silent
+            for late in self._feed.timeline.catch_up({n for p in pairs for n in p}, step.time_s):
+                self.take(late)
+            self._advance()
             middle, spread = self.core.predicted_ranges(*self._pairs(pairs))
             heard = len(done.heard)
             tried = self.detection.learn(

@@ -131,6 +131,11 @@ class BankCore:
         return self._log_weight.reshape(-1)[: self.count]
 
     @property
+    def entries(self) -> int:
+        """How many numbers all covariances have."""
+        return self.count * int(self._x.shape[1]) ** 2
+
+    @property
     def lines(self) -> tuple[Floats, Floats, Floats, Floats]:
         """Means, covariances, log weights and sensitivities as kernels take them, to work in."""
         return self._x, self._p, self._log_weight, self._sens
@@ -725,7 +730,7 @@ class BankCore:
         if self.count >= self.settings.hypotheses and (open_ or not self._may_be_flat()):
             self.unambiguous = 0
             return
-        mean, covariance = self._undoubted_moments()
+        mean, covariance = self._undoubted_moments(poses_alone=True)
         sigmas = np.exp(0.5 * self.levels.mean)
         metre = math.sqrt(noise.ALONG_M2_M) * sigmas[noise.ALONG : -1 : noise.LEVELS]
         bend = hypotheses.bend(mean, covariance, float(sigmas[-1]), metre)
@@ -783,9 +788,9 @@ class BankCore:
         drawn = self._sampled / (1.0 - self._sampled)
         return bool((between <= hypotheses.APART * drawn * within + 1e-6).all())
 
-    def _undoubted_moments(self) -> tuple[Floats, Floats]:
+    def _undoubted_moments(self, *, poses_alone: bool) -> tuple[Floats, Floats]:
         """As ``moments``, without those who doubt: they are no part of the picture."""
-        return self._moments(self._weight_lines(self._undoubted_weights()))
+        return self._moments(self._weight_lines(self._undoubted_weights()), poses_alone)
 
     def _undoubted_weights(self) -> Floats:
         log_weight = self.log_weight - np.where(self.doubtful > 0.0, DOUBTERS, 0.0)
@@ -793,9 +798,11 @@ class BankCore:
         weight /= weight.sum()
         return weight
 
-    def _moments(self, weight: Floats) -> tuple[Floats, Floats]:
-        of = joint.order(self.nodes, self._x.shape[1])
-        return joint.moments(self._x, self._p, weight, self.nodes, of)
+    def _moments(self, weight: Floats, poses_alone: bool) -> tuple[Floats, Floats]:
+        size = self._x.shape[1]
+        of = joint.order(self.nodes, size)
+        places = _POSE_PLACE * self.nodes if poses_alone else size
+        return joint.moments(self._x, self._p, weight, self.nodes, of, places)
 
     def _weight_lines(self, weight: Floats) -> Floats:
         """Weights (K,) as (B, LANES): what fills up the last block counts nothing."""
@@ -819,7 +826,7 @@ class BankCore:
 
     def _shrink(self, count: int) -> None:
         """Go on with fewer hypotheses, the mixture's moments unchanged."""
-        mean, covariance = self._undoubted_moments()
+        mean, covariance = self._undoubted_moments(poses_alone=False)
         self.log_weight[:] -= np.where(self.doubtful > 0.0, DOUBTERS, 0.0)
         angles = PER_NODE * np.arange(self.nodes, dtype=np.int64) + Of.HEADING
         before, weight = self._sampled, self.weights()
@@ -873,10 +880,10 @@ class BankCore:
 
     # -- what is known -------------------------------------------------------------------------
 
-    def moments(self) -> tuple[Floats, Floats]:
-        """Give the mixture's mean (D,) and full covariance (D, D)."""
+    def moments(self, *, poses_alone: bool = False) -> tuple[Floats, Floats]:
+        """Give the mixture's mean (D,) and full covariance (D, D), constants as 0 if so wished."""
         self._normalise()
-        return self._moments(self._weight)
+        return self._moments(self._weight, poses_alone)
 
     def snapshot(self) -> Snapshot:
         """Copy everything."""

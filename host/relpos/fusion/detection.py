@@ -36,7 +36,6 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.compiled import compiled
 from relpos.measurements import Range
 
 Floats = npt.NDArray[np.float64]
@@ -236,7 +235,7 @@ class Detection:
 
         Distances and their standard deviations as predicted before the round, in the order of
         ``of.heard`` and ``of.silent``. Returns (len(of.silent),): the probability that both
-        nodes' UWB worked, for ``log_silence``.
+        nodes' UWB worked.
         """
         heard = len(of.heard)
         distance_m = np.concatenate([heard_m, silent_m])
@@ -321,32 +320,3 @@ def expected(curve: Floats, distance_m: Floats, sigma_m: Floats | float = 0.0) -
 
 
 _GRID_M = np.arange(LENGTH) * STEP_M
-
-
-@compiled
-def log_silence(
-    distance_m: Floats, sigma_m: Floats, tried: Floats, weight: float, curve: Floats, out: Floats
-) -> None:
-    """Add each hypothesis' log P(these pairs are silent) to ``out`` (H,).
-
-    ``distance_m`` and ``sigma_m`` (H, K) are a pair's distance in a hypothesis and its standard
-    deviation, ``tried`` (K,) the probability that it was tried at all, ``weight`` what one
-    silence counts, ``curve`` the learned P(heard | distance). NumPy twin: ``twins/detection.py``.
-    """
-    last = curve.shape[0] - 2
-    for h in range(distance_m.shape[0]):
-        total = 0.0
-        chance = 1.0
-        for k in range(distance_m.shape[1]):
-            p = 0.0
-            for side in range(3):
-                at = (distance_m[h, k] + (side - 1) * 1.7320508075688772 * sigma_m[h, k]) / 0.5
-                at = min(max(at, 0.0), last + 1.0)
-                index = min(int(at), last)
-                value = curve[index] + (at - index) * (curve[index + 1] - curve[index])
-                p += value * (2.0 / 3.0 if side == 1 else 1.0 / 6.0)
-            chance *= 1.0 - tried[k] * p
-            if chance < 1e-200:
-                total += math.log(chance)
-                chance = 1.0
-        out[h] += weight * (total + math.log(chance))

@@ -852,11 +852,14 @@ def predicted_ranges(
 
 
 @compiled
-def moments(x: Floats, p: Floats, weight: Floats, nodes: int, of: Indices) -> tuple[Floats, Floats]:
+def moments(
+    x: Floats, p: Floats, weight: Floats, nodes: int, of: Indices, places: int
+) -> tuple[Floats, Floats]:
     """Give the mixture's mean (D,) and full covariance (D, D), in the state's order.
 
-    ``weight`` (B, LANES) as for ``predicted_ranges``, ``of`` (D,) is ``order``. Headings are
-    averaged round the circle, about the heaviest hypothesis' value.
+    ``weight`` (B, LANES) as for ``predicted_ranges``, ``of`` (D,) is ``order``. Only the first
+    ``places`` of the storage are looked at, the rest is given as 0. Headings are averaged round
+    the circle, about the heaviest hypothesis' value.
     """
     blocks, size, triangle = x.shape[0], x.shape[1], p.shape[1]
     best, best_lane = 0, 0
@@ -868,7 +871,7 @@ def moments(x: Floats, p: Floats, weight: Floats, nodes: int, of: Indices) -> tu
     cov = np.zeros((size, size))
     turn = 2.0 * math.pi
     off = lanes.working_lines(blocks * size)
-    for i in range(size):
+    for i in range(places):
         about = x[best, i, best_lane]
         angle = i < _POSE * nodes and i % _POSE == 2
         middle = fill(0.0)
@@ -882,20 +885,20 @@ def moments(x: Floats, p: Floats, weight: Floats, nodes: int, of: Indices) -> tu
         mean[of[i]] = about + away_from
         for b in range(blocks):
             store(off, b * size + i, load(off, b * size + i) - away_from)
-    sums = lanes.working_lines(triangle)
+    sums = lanes.working_lines(_row(places))
     sums[:] = 0.0
     for b in range(blocks):
         w = load(weight, b)
         base, at_x = b * triangle, b * size
         t = 0
-        for i in range(size):
+        for i in range(places):
             f = w * load(off, at_x + i)
             for j in range(i + 1):
                 term = w * load(p, base + t + j) + f * load(off, at_x + j)
                 store(sums, t + j, load(sums, t + j) + term)
             t += i + 1
     t = 0
-    for i in range(size):
+    for i in range(places):
         for j in range(i + 1):
             cov[of[i], of[j]] = lanes.total(load(sums, t))
             cov[of[j], of[i]] = cov[of[i], of[j]]

@@ -153,6 +153,10 @@ class LargeTeam:
                 return self._estimate(step.time_s)
         return None
 
+    def cost_s(self, step: Step) -> float:
+        """About how many seconds of a processor ``take`` needs for a step."""
+        return 2e-5 if isinstance(step, Advance) else 5e-5 * len(self._nodes)
+
     def snapshot(self) -> tuple[object, ...]:
         """Copy everything that ``take`` changes."""
         return (

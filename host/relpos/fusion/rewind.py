@@ -10,6 +10,11 @@ generator, and what shares an instant has a fixed order.
 A displacement is late, too, where steps behind the *beginning* of its chord have been handed out:
 the node was taken to stand there.
 
+Nobody waits for it long either: a call of ``process`` works off at most ``most_s`` of what the
+core reckons its steps to cost, and the rest is worked off in the next calls. Estimates pause for
+so long. What a step costs is reckoned and not measured, so that the same measurements in the same
+order always give the same estimates.
+
 What it costs is bounded: a burst of late reports is worked off in one go, at most one every
 ``every_s`` of measurement time, and none goes back farther than ``window_s``, one report
 (``max_lag_s``) and one spacing of the copies. Counted are ``rewinds``, the steps repeated
@@ -23,6 +28,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any, Protocol
 
 from relpos.fusion.estimator import Estimate
@@ -41,6 +47,9 @@ class Core(Protocol):
 
     def take(self, step: Step) -> Estimate | None:
         """Work off one step; an estimate at the end of an epoch."""
+
+    def cost_s(self, step: Step) -> float:
+        """About how many seconds of a processor ``take`` needs for a step."""
 
     def snapshot(self) -> Any:
         """Copy everything that ``take`` changes, random generators and counters included."""
@@ -65,7 +74,8 @@ class Rewinder:
 
     ``window_s`` is how late a measurement may be, ``spacing_s`` how far apart copies are where
     things come late now and then (eight times as far where nothing has for half a minute, because
-    copies cost, too), ``every_s`` how often it may go back. A replay does not repeat estimates
+    copies cost, too), ``every_s`` how often it may go back, ``most_s`` how much is worked off in a
+    call. A replay does not repeat estimates
     that were given already, and those given go on in time.
     """
 
@@ -74,6 +84,7 @@ class Rewinder:
     window_s: float = 5.0
     spacing_s: float = 1.0
     every_s: float = 0.25
+    most_s: float = 0.02
     _own: Counter[str] = field(default_factory=Counter)
     _copies: list[_Copy] = field(default_factory=list)
     _history: list[Measurement] = field(default_factory=list)
@@ -83,8 +94,10 @@ class Rewinder:
     _newest_s: float = -math.inf
     _emitted_s: float = -math.inf
     _back_to_s: float = math.inf
-    _steps: int = 0
     _rewound_s: float = -math.inf
+    _rest: Iterator[Step] | None = None
+    """Steps that the last call has left."""
+    _replaying: bool = False
 
     def __post_init__(self) -> None:
         self.timeline.keep_late = True
@@ -103,7 +116,8 @@ class Rewinder:
         steps = self.timeline.push_all((measurement,))
         self._note_late()
         if self._back_to_s == math.inf:
-            return list(self._work_off(steps))
+            # What is left goes on with what has been sorted in since.
+            return list(self._work_off(self._rest or steps))
         # Until it has gone back, the timeline only sorts in. A burst of late ones is put in its
         # place together, when the next thing of now comes.
         if news and self._newest_s >= self._rewound_s + self.every_s:
@@ -116,7 +130,7 @@ class Rewinder:
         self._note_late()
         if self._copies and self._back_to_s < math.inf:
             return list(self._rewind(final=True))
-        return list(self._work_off(steps))
+        return list(self._work_off(chain(self._rest or (), steps), math.inf))
 
     def counters(self) -> Counter[str]:
         """What was refused, late, and gone back for; the core's own counters are its own."""
@@ -145,20 +159,24 @@ class Rewinder:
         since = self._history[copy.pushed - self._forgotten :]
         steps = self.timeline.push_all(since, final=final)
         self.timeline.take_late()  # what the copy cannot help either
-        before = self._steps
-        yield from self._work_off(steps)
-        self._own["rewound_steps"] += self._steps - before
+        self._replaying = True
+        yield from self._work_off(steps, math.inf if final else self.most_s)
 
-    def _work_off(self, steps: Iterator[Step]) -> Iterator[Estimate]:
-        take = self.core.take
+    def _work_off(self, steps: Iterator[Step], most_s: float | None = None) -> Iterator[Estimate]:
+        take, left_s = self.core.take, self.most_s if most_s is None else most_s
+        self._rest = steps
         for step in steps:
-            self._steps += 1
+            left_s -= self.core.cost_s(step)
+            self._own["rewound_steps"] += self._replaying
             estimate = take(step)
             if estimate is not None and estimate.time_s > self._emitted_s:
                 self._emitted_s = estimate.time_s
                 yield estimate
             if isinstance(step, Epoch):
                 self._copy_if_due()
+            if left_s < 0.0:
+                return
+        self._rest, self._replaying = None, False
         # Without motion there are no epochs, but what is kept has to be bounded all the same.
         self._copy_if_due(overdue_s=self.spacing_s)
 

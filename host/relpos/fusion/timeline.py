@@ -15,6 +15,10 @@ its place is counted and, where it is not a displacement, dropped; a displacemen
 (:mod:`relpos.fusion.rewind` goes back for it instead.)
 
 What shares one instant is handed out in the order of the nodes, however it arrived.
+
+A ``sparing`` timeline advances between epochs only those whom a measurement concerns: of twenty
+who range in turns, two in place of twenty at every range. The others' pieces come when they are
+needed, at the latest at the next epoch; ``catch_up`` asks for them.
 """
 
 from __future__ import annotations
@@ -176,8 +180,9 @@ class Timeline:
     ``nodes`` are those known beforehand (they are waited for from the start); ``start_s`` is the
     time from which a node's first motion counts; ``reorder_s`` is how long everything is held
     back for what is still under way (in measurement time, so that a recording pays nothing for
-    it); ``max_lag_s`` is how long a silent node is waited for. ``counters`` tells what was
-    dropped or came late, by name; with ``keep_late`` ``take_late`` tells when.
+    it); ``max_lag_s`` is how long a silent node is waited for; ``sparing`` see above.
+    ``counters`` tells what was dropped or came late, by name; with ``keep_late`` ``take_late``
+    tells when.
     """
 
     nodes: Iterable[int] = ()
@@ -185,6 +190,7 @@ class Timeline:
     reorder_s: float = 0.5
     max_lag_s: float = 5.0
     keep_late: bool = False
+    sparing: bool = False
     counters: Counter[str] = field(default_factory=Counter)
     _tracks: dict[int, _Track] = field(default_factory=dict)
     _arrived: list[tuple[float, int, Measurement]] = field(default_factory=list)
@@ -354,7 +360,14 @@ class Timeline:
             closes = self._closes_epoch(time_s, motions)
             if ranges or sensed or closes:
                 time_s = max(time_s, self._frontier_s)
-                yield from self._advance_all(time_s)
+                if closes or not self.sparing:
+                    yield from self._advance_all(time_s)
+                else:
+                    self._frontier_s = time_s
+                    concerned = {n for r in ranges for n in (r.node, r.peer)}
+                    # A height says nothing of where anybody is.
+                    concerned |= {m.node for m in sensed if isinstance(m, Heading)}
+                    yield from self.catch_up(concerned, time_s)
             for one in sensed:
                 yield Sensed(time_s, one)
             if ranges:
@@ -393,6 +406,13 @@ class Timeline:
             return True
         self._reported |= motions
         return False
+
+    def catch_up(self, nodes: Iterable[int], time_s: float) -> Iterator[Advance]:
+        """Advance some nodes to ``time_s``, at most as far as everything has been handed out."""
+        for node in sorted(nodes):
+            track = self._tracks.get(node)
+            if track is not None:
+                yield from _advance(track, node, min(time_s, self._frontier_s))
 
     def _advance_all(self, time_s: float) -> Iterator[Advance]:
         self._frontier_s = max(self._frontier_s, time_s)

@@ -104,6 +104,42 @@ def update(
     return x, p, float(np.log(good + bad))
 
 
+def hearing(
+    x: Floats,
+    p: Floats,
+    first: int,
+    second: int,
+    heard: bool,
+    tried: float,
+    weight: float,
+    curve: Floats,
+    step_m: float,
+) -> tuple[Floats, Floats, float]:
+    """Whether one pair was heard; gives the state and what it adds to the log weight."""
+    mean, variance, gain = predict_range(x, p, first, second, 0.0)
+    sd = np.sqrt(variance)
+
+    def chance(z: Floats) -> Floats:
+        at = np.interp(mean + z * sd, np.arange(len(curve)) * step_m, curve)
+        outcome: Floats = np.power(at if heard else 1.0 - tried * at, weight)
+        return outcome
+
+    middle, *edges = chance(np.array([0.0, -2.5, 2.5]))
+    if all(0.97 < edge / middle < 1.03 for edge in edges):
+        return x, p, float(np.log(middle))
+    z = np.linspace(-2.5, 2.5, 11)
+    bell = np.exp(-0.5 * z**2)
+    bell /= bell.sum()
+    density = bell * chance(z)
+    mass = density.sum()
+    shift = (density * z).sum() / mass
+    # Relative to the rule's own variance, which is a little under 1.
+    after = min(((density * z**2).sum() / mass - shift**2) / (bell * z**2).sum(), 1.0)
+    x = x + gain * shift / sd
+    p = p - np.outer(gain, gain) * (1.0 - after) / variance
+    return x, p, float(np.log(mass))
+
+
 def moments(x: Floats, p: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """Mean and full covariance of a mixture whose headings are close together."""
     mean = weight @ x
