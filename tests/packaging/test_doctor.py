@@ -1,6 +1,9 @@
 """`relpos doctor`: what it says of a computer and a port that are not as they should be."""
 
 import json
+import os
+import subprocess
+import sys
 from datetime import UTC, datetime
 from functools import partial
 
@@ -137,9 +140,19 @@ def test_kernels_are_ready_once_their_machine_code_is_newer_than_they(tmp_path):
     assert (state, remedy) == ("hint", "relpos doctor --prepare")
     (tmp_path / "numba").mkdir()
     for module in installation.KERNELS:
-        version = "".join(map(str, __import__("sys").version_info[:2]))
+        version = "".join(map(str, sys.version_info[:2]))
         (tmp_path / "numba" / f"{module}.f-1.py{version}.nbi").touch()
     assert said(installed(tmp_path, variables=environment), "estimators")[0] == "well"
+
+
+@pytest.mark.soak
+def test_the_kernels_that_are_looked_for_are_those_that_are_prepared(tmp_path):
+    program = "from relpos.doctor import installation; installation.prepare()"
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", program], env=environment, check=True, timeout=900)
+    prepared = {path.name.split(".")[0] for path in tmp_path.rglob("*.nbi")}
+    assert set(installation.KERNELS) <= prepared
+    assert prepared - set(installation.KERNELS) <= {"slips", "hypotheses", "detection"}
 
 
 def test_kernels_that_cannot_be_kept_are_wrong(tmp_path):

@@ -12,8 +12,8 @@ from relpos.doctor.computer import Computer
 from relpos.doctor.finding import Finding, hint, well, wrong
 from relpos.errors import RelposError
 
-KERNELS = ("joint", "noise", "particle_kernels", "starts_kernels")
-"""Modules whose kernels every session needs; the smoother and large teams compile when used."""
+KERNELS = ("bank_kernels", "joint", "lanes", "noise", "particle_kernels", "starts_kernels")
+"""Modules with kernels that sessions need (fusion.warm_up); others compile when they are used."""
 MEGABYTE = 1_000_000
 ROOM_TOO_LITTLE = 200 * MEGABYTE
 ROOM_LITTLE = 2000 * MEGABYTE
