@@ -22,7 +22,7 @@ language = "en"
 myst_heading_anchors = 4
 myst_enable_extensions = ["colon_fence"]
 
-autodoc_default_options = {"members": True, "member-order": "bysource"}
+autodoc_default_options = {"member-order": "bysource"}
 autodoc_typehints = "signature"
 python_use_unqualified_type_names = True
 

@@ -9,7 +9,7 @@ import venv
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-PATIENCE_S = 600
+PATIENCE_S = 1800
 
 
 def run(*command: object, **options: object) -> subprocess.CompletedProcess[str]:
