@@ -135,3 +135,31 @@ def test_a_port_that_is_not_to_be_opened_again_ends_the_session(socket, stream):
 def test_a_port_that_is_not_there_is_said_before_anything_begins(tmp_path):
     with pytest.raises(DeviceError, match="no such device"):
         PortInput(str(tmp_path / "ttyUSB9"), Link(), reopen=True)
+
+
+def test_a_port_by_its_url_is_read_like_a_device(stream):
+    pieces, _ = stream
+    # Its queue holds 4096 bytes.
+    some = pieces[: len(pieces) // 8]
+    assert sum(map(len, some)) < 4000
+    source = PortInput("loop://", Link(), teach=False)
+    source._device.write(b"".join(some))
+    got = []
+    for _ in range(200):
+        received = source.read(0.01)
+        got += [] if received is None else received.observations
+        if not source._device.in_waiting:
+            break
+    assert sum(isinstance(o, Motion) for o in got) == len(motions_of(some)) > 0
+    assert source.trouble() is None
+    assert source.read(0.01) is None, "silence is no fault"
+    source.close()
+
+
+def test_what_comes_at_once_is_received_at_once(socket, stream):
+    pieces, _ = stream
+    source = PortInput(str(socket.path), Link(), teach=False)
+    socket.write(b"".join(pieces[:5]))
+    received = source.read(1.0)
+    source.close()
+    assert received.data == b"".join(pieces[:5]), "not a byte first, and the rest later"

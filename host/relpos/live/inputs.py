@@ -7,6 +7,7 @@ An input is read by the session's receive thread alone. All that it gives is sta
 from __future__ import annotations
 
 import select
+import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -104,6 +105,7 @@ class PortInput:
         self._beacons = HostBeacons(link)
         self._told = 0
         self._device: serial.Serial | None = live.open_port(port)
+        self._waits_on = _descriptor(self._device)
         self._gone: str | None = None
         self._try_at_s = 0.0
 
@@ -179,9 +181,9 @@ class PortInput:
         assert device is not None
         try:
             waiting = device.in_waiting
-            if not waiting and timeout_s < live.READ_TIMEOUT_S and hasattr(device, "fileno"):
-                # pyserial's own timeout is a setting of the port; a shorter wait is made here.
-                if not select.select([device.fileno()], [], [], max(timeout_s, 0.0))[0]:
+            if not waiting and self._waits_on is not None:
+                # pyserial's own wait is a setting of the port, and ends with the first byte.
+                if not select.select([self._waits_on], [], [], max(timeout_s, 0.0))[0]:
                     return b""
                 waiting = device.in_waiting
             data: bytes = device.read(max(1, min(waiting, READ_BYTES)))
@@ -220,8 +222,19 @@ class PortInput:
             self._gone = str(error)
             self._try_at_s = time.monotonic() + REOPEN_S
             return False
+        self._waits_on = _descriptor(self._device)
         self._gone = None
         return True
+
+
+def _descriptor(device: serial.Serial) -> int | None:
+    """What can be waited on; None of ports that are none of the operating system's files."""
+    if sys.platform == "win32":
+        return None
+    try:
+        return int(device.fileno())
+    except (AttributeError, OSError, TypeError, ValueError):
+        return None
 
 
 class PacedInput:
