@@ -7,14 +7,12 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-
-pytest.importorskip("playwright", reason="playwright is not installed: pip install 'relpos[test]'")
-
 from playwright.sync_api import expect
 from stage import NO_BROWSER, Browser, Page, Stage, browser_of, chromium, sync_playwright
 from walking_team import WalkingTeam
 
-expect.set_options(timeout=20_000)
+# Generous: other tests run beside these.
+expect.set_options(timeout=60_000)
 
 
 @pytest.fixture(scope="session")
@@ -58,7 +56,7 @@ def visit(browser: Browser, stage: Stage) -> Iterator[OpenPage]:
             context = browser.new_context(**options)
             contexts.append(context)
         page: Page = context.new_page()
-        page.set_default_timeout(20_000)
+        page.set_default_timeout(60_000)
         if init:
             page.add_init_script(init)
 

@@ -79,6 +79,13 @@ class Stage:
         if self.web is None:
             self.open()
 
+    def begin_another_session(self) -> None:
+        """As if relpos had been started anew behind the same address."""
+        self.shut()
+        self.team.names.clear()
+        self.started_unix_s += 1.0
+        self.open()
+
     def open(self) -> None:
         """Start serving, at the same address as before."""
         door, access = listen(f"127.0.0.1:{self._door_port}")
@@ -149,7 +156,7 @@ class Stage:
             web.answer(ask, reply)
 
 
-def wait_for(condition: Callable[[], bool], within_s: float = 20.0) -> None:
+def wait_for(condition: Callable[[], bool], within_s: float = 60.0) -> None:
     """Wait until it holds; AssertionError where it does not in time."""
     end = time.monotonic() + within_s
     while not condition():

@@ -19,11 +19,11 @@ from stage import Browser, wait_for
 
 @pytest.fixture
 def session(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A live session of a minute in which node 4's radio is off for twenty seconds."""
+    """A live session in which node 4's radio is off for sixteen seconds."""
     command = [
         Path(sys.executable).with_name("relpos"), "demo", "--view", "--no-open", "--nodes", "6",
-        "--view-listen", "127.0.0.1:0", "--seconds", "60", "--out", tmp_path / "out",
-        "--fault", "xbee:off:node=4,from=10,to=30",
+        "--view-listen", "127.0.0.1:0", "--seconds", "300", "--out", tmp_path / "out",
+        "--fault", "xbee:off:node=4,from=20,to=36",
     ]  # fmt: skip
     running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
@@ -36,6 +36,17 @@ def session(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
         if running.poll() is None:
             running.kill()
         running.communicate()
+
+
+# Everything that the page has told screen readers, however late this test looks.
+LISTEN = """addEventListener("DOMContentLoaded", () => {
+    window.told = [];
+    new MutationObserver((changes) => {
+        for (const { target } of changes) {
+            if (/-voice$/.test(target.id ?? "")) window.told.push(target.textContent);
+        }
+    }).observe(document.body, { subtree: true, childList: true });
+})"""
 
 
 def positions(page: Page) -> dict[str, tuple[float, float]]:
@@ -56,6 +67,7 @@ def test_an_emulated_team_is_seen_walking_lost_found_and_pressing_a_landmark(
         opened.on("request", lambda request: hosts.add(urlsplit(request.url).netloc))
         opened.on("pageerror", lambda error: complaints.append(str(error)))
         opened.on("console", lambda m: complaints.append(m.text) if m.type == "error" else None)
+    page.add_init_script(LISTEN)
     page.goto(address)
     expect(page.locator("#people li")).to_have_count(6)
     page.get_by_role("button", name="Table").click()
@@ -77,11 +89,12 @@ def test_an_emulated_team_is_seen_walking_lost_found_and_pressing_a_landmark(
     picture = page.evaluate("fetch('/api/picture').then((answer) => answer.json())")
     began = picture["unix_s"] - picture["time_s"]
 
-    alarm = page.locator("#alarms [data-node='4']")
-    expect(alarm).to_contain_text("Node 4 is lost", timeout=60_000)
-    expect(alarm).to_have_count(0, timeout=60_000)
-    expect(page.locator("#news-voice")).to_contain_text("Node 4 is heard again")
-    page.wait_for_timeout(1500)
+    def told(words: str) -> bool:
+        return any(words in text for text in page.evaluate("window.told"))
+
+    wait_for(lambda: told("Node 4 is lost: not heard for"), 120.0)
+    wait_for(lambda: told("Node 4 is heard again"), 120.0)
+    expect(page.locator("#alarms [data-node='4']")).to_have_count(0)
     after = positions(page)
     moved = [name for name in before if name in after and before[name] != after[name]]
     assert "Node 1" in moved
@@ -96,4 +109,4 @@ def test_an_emulated_team_is_seen_walking_lost_found_and_pressing_a_landmark(
     with events.open() as file:
         presses = [row for row in csv.DictReader(file) if row["event"] == "landmark"]
     assert [(row["node"], row["value"]) for row in presses] == [("2", "17")]
-    assert earliest - began - 0.1 <= float(presses[0]["time_s"]) <= latest - began + 0.1
+    assert earliest - began - 0.3 <= float(presses[0]["time_s"]) <= latest - began + 0.3

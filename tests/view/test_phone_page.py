@@ -59,7 +59,7 @@ def test_a_press_is_recorded_with_its_node_and_time_whatever_the_phones_clock(
     wait_for(lambda: len(stage.presses) == 1)
     event = stage.presses[0]
     assert (event.node, event.event, event.value) == (2, "landmark", "17")
-    assert before_s - 0.05 <= event.time_s <= after_s + 0.05
+    assert before_s - 0.25 <= event.time_s <= after_s + 0.25
     expect(page.locator("#queue")).to_have_text("1 press received by the laptop")
 
 
@@ -86,7 +86,7 @@ def test_presses_made_offline_are_sent_later_with_their_own_time(visit, stage: S
     wait_for(lambda: len(stage.presses) == 2)
     for event, landmark, (before_s, after_s) in zip(stage.presses, ("4", "52"), times, strict=True):
         assert (event.node, event.value) == (3, landmark)
-        assert before_s - 0.05 <= event.time_s <= after_s + 0.05
+        assert before_s - 0.25 <= event.time_s <= after_s + 0.25
     expect(page.locator("#queue")).to_contain_text("2 presses received by the laptop")
     expect(page.locator("#my-name")).to_have_text("Chloé")
 
@@ -113,6 +113,15 @@ def test_a_name_given_on_the_phone_is_everybodys(visit, stage: Stage):
     second = visit("/phone", **PHONE)
     expect(second.locator("#wearers")).to_contain_text("has a phone")
     page.reload()
+    expect(page.locator("#my-name")).to_have_text("Dmitri the Tall")
+
+
+def test_a_new_session_is_told_the_name_by_the_phone(visit, stage: Stage):
+    page = visit("/phone", expect_gone=True, **PHONE)
+    choose(page, "Dmitri", "Dmitri the Tall")
+    wait_for(lambda: stage.team.names.get(4) == "Dmitri the Tall")
+    stage.begin_another_session()
+    wait_for(lambda: stage.team.names.get(4) == "Dmitri the Tall")
     expect(page.locator("#my-name")).to_have_text("Dmitri the Tall")
 
 
@@ -156,10 +165,10 @@ def test_a_shared_compass_is_a_heading_from_east_counter_clockwise(visit, stage:
     assert (heading.node, heading.source) == (2, "phone")
     assert heading.heading_rad == pytest.approx(math.radians(150), abs=0.01)
     assert heading.sigma_rad == pytest.approx(math.radians(15), abs=0.01)
-    assert before_s - 0.1 <= heading.time_s <= session_s(stage) + 0.1
+    assert before_s - 1.5 <= heading.time_s <= session_s(stage) + 0.25
     expect(page.locator("#compass-told")).to_contain_text("Heading 300° from magnetic north")
     page.get_by_role("button", name="Sharing compass").click()
-    page.wait_for_timeout(1500)
+    page.wait_for_timeout(2500)
     count = len(stage.headings)
     page.wait_for_timeout(1500)
     assert len(stage.headings) == count

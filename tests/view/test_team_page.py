@@ -169,7 +169,7 @@ def test_nothing_is_drawn_while_nothing_changes(visit, stage: Stage):
     page.evaluate(COUNT_FRAMES)
     wait_for(lambda: page.evaluate("window.frames_drawn") > 3)
     stage.mute = True
-    page.wait_for_timeout(800)
+    page.wait_for_timeout(1500)
     before = page.evaluate("window.frames_drawn")
     page.wait_for_timeout(1200)
     assert page.evaluate("window.frames_drawn") == before
@@ -617,7 +617,7 @@ def test_nothing_moves_for_whoever_wants_less_motion(visit, stage: Stage):
     expect(page.locator("#alarms .rows .alarm")).to_be_visible()
     assert page.evaluate("document.getAnimations().length") == 0
     stage.mute = True
-    page.wait_for_timeout(500)
+    page.wait_for_timeout(1500)
     page.evaluate(COUNT_FRAMES)
     page.wait_for_timeout(700)
     assert page.evaluate("window.frames_drawn") == 0

@@ -10,10 +10,10 @@ const DARK = [
   "#6db7ff", "#ff9a5c", "#4fd6a4", "#f09bd0", "#f2c14e", "#5fd9e8", "#b5a3ff", "#d9a77f", "#b4c2d6",
 ];
 
-/** Colour of the person at that place in the team's order. */
-export function personColour(place, dark) {
+/** Colour of whoever wears that node: it stays, whoever joins. */
+export function personColour(node, dark) {
   const palette = dark ? DARK : LIGHT;
-  return palette[place % palette.length];
+  return palette[(node - 1) % palette.length];
 }
 
 export function palette(dark) {

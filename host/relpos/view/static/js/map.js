@@ -99,7 +99,7 @@ export class TeamMap {
   }
 
   colourOf(node) {
-    return personColour(this.team.placeOf(node), this.dark);
+    return personColour(node, this.dark);
   }
 
   // -- where the camera is -----------------------------------------------------------------------

@@ -74,6 +74,7 @@ function take(message) {
   if (kind === "hello") {
     alarms.clear();
     trouble = null;
+    introduce();
     document.title = `${team.session.name ?? "team"} · wearer`;
   } else if (kind === "picture") {
     receivedMs = Date.now();
@@ -149,7 +150,7 @@ function makeOther(node) {
 }
 
 function colourOf(node) {
-  return personColour(team.placeOf(node), isDark());
+  return personColour(node, isDark());
 }
 
 function showMe() {
@@ -343,6 +344,23 @@ async function compareClocks(now = false) {
   }
 }
 
+/** Another session does not know my name yet. */
+async function introduce() {
+  const session = team.session.started_unix_s ?? null;
+  if (!me || me.session === session) return;
+  try {
+    await postJson("/api/name", { node: me.node, name: me.name });
+    rememberMe({ ...me, session });
+  } catch {
+    // Told with the next connection.
+  }
+}
+
+function rememberMe(now) {
+  me = now;
+  kept.setItem("relpos.wearer", JSON.stringify(me));
+}
+
 // -- who I am --------------------------------------------------------------------------------------
 
 let chosen = me?.node ?? null;
@@ -362,7 +380,7 @@ async function fetchWearers() {
   const focused = document.activeElement?.dataset?.wearer;
   list.replaceChildren(...wearers.map((wearer) => {
     const disc = make("span", { class: "disc", text: String(wearer.node), "aria-hidden": "true" });
-    const colour = personColour(wearers.indexOf(wearer), isDark());
+    const colour = personColour(wearer.node, isDark());
     disc.style.background = colour;
     disc.style.color = inkOn(colour);
     const text = make("span", {}, wearer.name);
@@ -388,12 +406,12 @@ function choose(wearer) {
 byId("name-form").addEventListener("submit", async (event) => {
   event.preventDefault();
   const name = byId("name").value.trim() || `Node ${chosen}`;
-  me = { node: chosen, name };
-  kept.setItem("relpos.wearer", JSON.stringify(me));
+  rememberMe({ node: chosen, name, session: null });
   showPress();
   showMe();
   try {
-    await postJson("/api/name", me);
+    await postJson("/api/name", { node: chosen, name });
+    rememberMe({ ...me, session: team.session?.started_unix_s ?? null });
     setText(byId("name-told"), `You are ${name}, node ${me.node}.`);
     open("landmarks");
   } catch (error) {

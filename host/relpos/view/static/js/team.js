@@ -97,11 +97,6 @@ export class Team {
     return this.people.get(node) ?? null;
   }
 
-  /** A person's place in the order by number: what its colour goes by. */
-  placeOf(node) {
-    return Math.max(this.order.indexOf(node), 0);
-  }
-
   /** How `from` sees `to` (numbers); null where either is unknown. */
   relation(from, to) {
     return relation(this.person(from), this.person(to), this.pairs.get(pairKey(from, to)) ?? null);
