@@ -138,6 +138,7 @@ def write_others_files(folder):
     for words in (
         ("DIR", "--to", "tum", "--out", "slam"),
         ("RUN", "--to", "gpx", *pin, "--out", "watch.gpx"),
+        ("RUN", "--to", "mcap", "--out", "FILE.mcap"),
     ):
         source, *options, out = words
         made = relpos("convert", folder / source, *options, folder / out)

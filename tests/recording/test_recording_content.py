@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import math
+import re
+from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
@@ -12,7 +14,7 @@ from sessions import START_NS, about, alike, play, serial_bytes, session
 from relpos.errors import DataError
 from relpos.link.live import Link
 from relpos.live.picture import Level, Notice, Picture
-from relpos.measurements import Event, Heading, Motion, Truth
+from relpos.measurements import Event, Heading, Motion, Range, Truth
 from relpos.protocol.messages import DEFAULT_KEY
 from relpos.recording import is_recording, make_recorder, open_recording, save_recording
 from relpos.recording.replay import Replay
@@ -226,3 +228,15 @@ def test_without_the_key_the_decoded_measurements_are_taken_and_that_is_said(tmp
     with pytest.raises(DataError, match="recorded under another key"):
         Replay(recording, DEFAULT_KEY).observations()
     assert key not in path.read_bytes()
+
+
+def test_the_lines_of_python_in_the_page_read_it(recorded, tmp_path, monkeypatch, capsys):
+    page = Path(__file__).parents[2] / "docs" / "recording.md"
+    (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
+    (tmp_path / "walk.mcap").write_bytes(recorded.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, str(page), "exec"), {})
+    told = capsys.readouterr().out
+    ranges = [o for *_, found, _ in session() for o in found if isinstance(o, Range)]
+    assert "mean" in told
+    assert str(min((o.node, o.peer) for o in ranges)[0]) in told
