@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 from team_input import make_session
+from typer.testing import CliRunner
 
 from relpos import fusion
+from relpos.cli import main
 from relpos.emulator.team import EmulatedTeam
 from relpos.errors import DeviceError
 from relpos.link import xbee
@@ -163,3 +165,11 @@ def test_what_comes_at_once_is_received_at_once(socket, stream):
     received = source.read(1.0)
     source.close()
     assert received.data == b"".join(pieces[:5]), "not a byte first, and the rest later"
+
+
+def test_a_setting_that_does_not_fit_is_said_before_the_port_is_opened(socket):
+    asked = ["fuse", str(socket.path), "--view", "--no-open", "--set", "bogus=1"]
+    result = CliRunner().invoke(main.app, asked, catch_exceptions=False)
+    assert result.exit_code == 1
+    assert "no setting 'bogus'" in result.stderr
+    assert "page" not in result.stderr

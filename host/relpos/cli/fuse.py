@@ -182,15 +182,16 @@ class Job:
         from relpos import fusion
 
         make = fusion.make_smoother if self.smooth else fusion.make
-        # First, so that a setting that does not fit is told at once.
-        made = make(self.estimator, priors, self.settings, self.seed, nodes)
-        self.prepare()
-        return made
+        return make(self.estimator, priors, self.settings, self.seed, nodes)
 
     def prepare(self) -> None:
-        """Have the estimator's kernels compiled, telling it the first time, when it takes long."""
+        """Have the estimator's kernels compiled, telling it the first time, when it takes long.
+
+        RelposError, at once, where a setting does not fit it.
+        """
         from relpos import fusion
 
+        self.make(())
         with output.working("preparing the estimator (compiled at the first start)"):
             fusion.warm_up(self.estimator)
 
@@ -346,6 +347,7 @@ def _pass_through(
 
     _check_usable(run, job.estimator)
     given = run.measurements if measurements is None else measurements
+    job.prepare()
     return pass_through(
         job.make(priors, run.nodes),
         output.with_progress(given, len(given), "fusing"),
