@@ -56,7 +56,7 @@ def test_a_team_whose_headings_are_poor_keeps_all_of_them() -> None:
 
 def test_one_hypothesis_becomes_many_when_somebody_is_carried_off() -> None:
     _, counts, bank, figures = _run(
-        "paper-p1", {**GOOD, "seconds": 500.0, "kidnap_m": 5.0, "kidnap_s": 380.0}
+        "paper-p1", {**GOOD, "seconds": 500.0, "kidnap_m": 5.0, "kidnap_s": 380.0}, seed=2
     )
     assert counts[375] == 1
     assert max(counts[380:400]) >= BankSettings().hypotheses

@@ -145,7 +145,7 @@ def test_a_heading_that_slips_is_found_again_within_twenty_seconds(seed: int) ->
     assert bool(doubted) == (bank.counters().get("slips", 0) > 0)
 
 
-@pytest.mark.parametrize("seed", [1, 4])
+@pytest.mark.parametrize("seed", [2, 4])
 def test_a_heading_slip_that_no_hypothesis_foresaw_is_said(seed: int) -> None:
     measurements, priors, _ = slipping_run(60.0, 140, seed)
     bank = fusion.make("bank", priors, {}, seed)

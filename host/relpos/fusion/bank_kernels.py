@@ -165,8 +165,9 @@ def digest(
     """Learn from the innovations of an instant's ranges (R,) what they say of the sensors.
 
     ``stats`` (R, STATS, >= K) are of ``joint.update``, ``before`` (K,) the log weights from
-    before it. ``good`` (R,) receives each range's probability to be no outlier. Returns the row
-    that has slipped, or -1, and how many levels had to be clamped.
+    before it. ``good`` (R,) receives each range's probability to be no outlier. ``outlier_counts``
+    are of outliers, of others, and the sum of the outliers' squares (m^2). Returns the row that
+    has slipped, or -1, and how many levels had to be clamped.
     """
     count, ranges = before.shape[0], first.shape[0]
     prior = np.empty(count)
@@ -176,7 +177,7 @@ def digest(
         prior[k] = math.exp(before[k] - most) * (DOUBTED if doubtful[k] > 0.0 else 1.0)
         total += prior[k]
     prior /= total
-    square = np.empty(ranges)
+    square, excess = np.empty(ranges), np.empty(ranges)
     for r in range(ranges):
         mean, variance = stats[r, MEAN], stats[r, VARIANCE]
         middle = 0.0
@@ -186,7 +187,9 @@ def digest(
         for k in range(count):
             off = mean[k] - middle
             spread += prior[k] * (variance[k] + off * off)
-        square[r] = (measured[r] - middle) ** 2 / spread
+        off = measured[r] - middle
+        square[r] = off * off / spread
+        excess[r] = max(off * off - spread, 0.0)
     slipped = slips.look(sums, base, first, second, square, worth, outlier_share, wary)
     weight = np.empty_like(log_weight)
     normalise(log_weight, count, weight)
@@ -206,6 +209,7 @@ def digest(
     for r in range(ranges):
         outlier_counts[0] += 1.0 - good[r]
         outlier_counts[1] += good[r]
+        outlier_counts[2] += (1.0 - good[r]) * excess[r]
         for row in (first[r], second[r]):
             surprise[row] += 0.2 * (1.0 - good[r] - surprise[row])
     return slipped, clamped

@@ -13,8 +13,8 @@ class BankSettings:
 
     hypotheses: int = setting(200, "at most so many hypotheses (K)", 1, 100_000)
     sampled: float = setting(0.5, "share of the heading noise that is drawn", 0.0, 1.0)
-    outliers: float = setting(0.01, "share of ranges that are outliers, beforehand", 0.0, 0.9)
-    outlier_m: float = setting(3.0, "how far outliers are off", 0.1, 100.0)
+    outliers: float = setting(0.1, "share of ranges that are outliers, beforehand", 0.0, 0.9)
+    outlier_m: float = setting(3.0, "how far outliers are off, beforehand", 0.1, 100.0)
     outliers_short: float = setting(0.1, "share of the outliers that are too short", 0.0, 1.0)
     jumps: float = setting(0.002, "share of jump hypotheses an epoch, in quiet", 0.0, 1.0)
     jumps_most: float = setting(0.05, "share of jump hypotheses an epoch, at most", 0.0, 1.0)
