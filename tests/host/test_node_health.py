@@ -52,7 +52,7 @@ def test_a_node_with_everything_is_green_and_says_nothing():
         ({"pozyx": False}, Health.YELLOW, "Pozyx missing"),
         ({"pressure": False}, Health.YELLOW, "pressure"),
         ({"beacon": False}, Health.YELLOW, "beacon"),
-        ({"ranging": 0.35}, Health.YELLOW, "35 % of its rangings"),
+        ({"ranging": 0.15}, Health.YELLOW, "15 % of its rangings"),
         ({"neighbours": 0}, Health.YELLOW, "ranges nobody"),
         ({"rssi_dbm": -89.0}, Health.YELLOW, "-89 dBm"),
         ({"unwanted_start": "watchdog", "uptime_s": 12.0}, Health.YELLOW, "watchdog"),

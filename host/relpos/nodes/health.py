@@ -15,10 +15,12 @@ SILENT_S = 5.0
 LOSS_YELLOW = 0.10
 """The totals make up for lost motion, the ranges' evidence is gone: five times the usual 2 %."""
 LOSS_RED = 0.50
-RANGING_YELLOW = 0.40
-LEAST_EXCHANGES = 12
-"""Behind walls and bodies a third of the exchanges fails. Of twelve at that rate under two fifths
-succeed once in a hundred times by chance; more often it is a tag covered, or out of reach."""
+RANGING_YELLOW = 0.20
+LEAST_EXCHANGES = 15
+"""Whom it cannot reach counts as failed, so a team that spreads over a floor is at 30 to 50 % and
+well. Of fifteen exchanges at 40 % under a fifth succeed three times in a hundred by chance; more
+often the tag is covered, or all the others are out of reach, both worth knowing. Two nodes make
+fifteen in half a minute."""
 BATTERY_YELLOW_V = 4.5
 """Under what the Uno's 3.3 V regulator and the boards on it are sure to work from (5 V - 10 %). The
 AVR's reference is 1.0 to 1.2 V, so a single board may tell 9 % too little or too much."""
