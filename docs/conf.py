@@ -46,19 +46,6 @@ def _commands(_: Any, document: str, source: list[str]) -> None:
         source[0] = source[0].replace("<!-- commands -->", "## " + body)
 
 
-def _coming(_: Any, document: str, source: list[str]) -> None:
-    """Leave out of the contents what is not there yet: a pattern without a page."""
-    if document == "index":
-        docs = Path(__file__).parent
-        kept = [
-            line
-            for line in source[0].splitlines()
-            if not line.endswith("*") or any(docs.glob(f"{line}.md"))
-        ]
-        source[0] = "\n".join(kept) + "\n"
-
-
 def setup(app: Any) -> None:
     """Called by Sphinx."""
     app.connect("source-read", _commands)
-    app.connect("source-read", _coming)

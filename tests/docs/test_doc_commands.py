@@ -133,10 +133,11 @@ def belongings(tmp_path_factory):
 
 
 def write_others_files(folder):
-    """Trajectories of another tool, a watch's track, presses and surveyed landmarks."""
+    """Another tool's trajectories, a recording, a watch's track, presses, surveyed landmarks."""
     pin = ("--pin", "48.13713,11.57538,90", "--start", "2026-05-04T09:30:00Z")
     for words in (
         ("DIR", "--to", "tum", "--out", "slam"),
+        ("RUN", "--to", "mcap", "--start", "2026-05-04T09:30:00Z", "--out", "FILE.mcap"),
         ("RUN", "--to", "gpx", *pin, "--out", "watch.gpx"),
         ("RUN", "--to", "mcap", "--out", "FILE.mcap"),
     ):
