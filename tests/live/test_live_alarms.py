@@ -84,10 +84,12 @@ def test_any_movement_ends_the_warning(watching, move):
 def test_a_twitch_does_not_end_the_alarm_but_getting_up_does(watching):
     watching.report(still, 35)
     watching.report(bend, 1)
+    assert watching.alarms.of(1).still_s > 30.0, "the count goes on, too"
     watching.report(still, 3)
     assert watching.alarms.of(1).alert is Alert.STILL_ALARM
     watching.report(bend, 4)
     assert watching.alarms.of(1).alert is None
+    assert watching.alarms.of(1).still_s == 0.0
 
 
 def test_who_works_on_the_spot_is_not_alarmed_of(watching):

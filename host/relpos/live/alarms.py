@@ -52,7 +52,7 @@ class _Watch:
 
     def still_s(self) -> float:
         """How long without movement, as far as it is known."""
-        if self.report_s is None or self.moving:
+        if self.report_s is None or (self.moving and self.still_since_s == self.report_s):
             return 0.0
         return self.report_s - self.still_since_s + min(self.since_report_s, REPORT_S)
 
@@ -106,7 +106,9 @@ class Alarms:
         watch.moving = bool(motion.moving) if first else moved(motion, covered_s)
         if watch.moving:
             watch.awake += 1
-            watch.still_since_s = motion.time_s
+            # A twitch ends neither the alarm nor its count.
+            if watch.alert is not Alert.STILL_ALARM or watch.awake >= AWAKE_REPORTS:
+                watch.still_since_s = motion.time_s
         else:
             watch.awake = 0
             if first or (covered_s > GAP_S and watch.alert is not Alert.STILL_ALARM):
@@ -142,8 +144,7 @@ class Alarms:
     def _judge(watch: _Watch) -> None:
         still_s = watch.still_s()
         alert: Alert | None = None
-        asleep = watch.alert is Alert.STILL_ALARM and watch.awake < AWAKE_REPORTS
-        if still_s >= STILL_ALARM_S or asleep:
+        if still_s >= STILL_ALARM_S:
             alert = Alert.STILL_ALARM
         elif watch.silent_s >= LOST_S:
             alert = Alert.LOST
