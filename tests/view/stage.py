@@ -49,7 +49,7 @@ class Stage:
 
     def __init__(self, team: WalkingTeam, port: int = 0, token: str | None = None) -> None:
         self.team = team
-        self.rate_hz = 10.0
+        self.rate_hz = 5.0
         self.at_s = 40.0
         self.frozen = False
         self.mute = False

@@ -165,7 +165,7 @@ def test_a_shared_compass_is_a_heading_from_east_counter_clockwise(visit, stage:
     assert (heading.node, heading.source) == (2, "phone")
     assert heading.heading_rad == pytest.approx(math.radians(150), abs=0.01)
     assert heading.sigma_rad == pytest.approx(math.radians(15), abs=0.01)
-    assert before_s - 1.5 <= heading.time_s <= session_s(stage) + 0.25
+    assert before_s - 0.25 <= heading.time_s <= session_s(stage) + 0.25
     expect(page.locator("#compass-told")).to_contain_text("Heading 300° from magnetic north")
     page.get_by_role("button", name="Sharing compass").click()
     page.wait_for_timeout(2500)

@@ -67,7 +67,7 @@ export class CompassSharing {
 
   take(event) {
     const reading = headingOfEvent(event, screen.orientation?.angle ?? 0);
-    if (reading) this.readings.push(reading);
+    if (reading) this.readings.push({ ...reading, ms: Date.now() });
   }
 
   /** Once a second: the mean of what was read. */
@@ -78,7 +78,9 @@ export class CompassSharing {
     if (heading === null) return;
     this.newest = { heading_rad: heading, sigma_rad: readings[0].sigma_rad };
     this.told = "";
-    this.kept.push({ unix_ms: Date.now(), ...this.newest });
+    // The mean of a second belongs to the middle of it.
+    const unixMs = readings.reduce((sum, r) => sum + r.ms, 0) / readings.length;
+    this.kept.push({ unix_ms: unixMs, ...this.newest });
     if (this.kept.length > MOST_KEPT) {
       this.kept.shift();
       this.dropped += 1;
