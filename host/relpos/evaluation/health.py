@@ -129,6 +129,15 @@ def _node(
     )
 
 
+_SHARES = (
+    ("% of its rangings succeed", "few of its rangings succeed"),
+    ("% of its", "many of its"),
+)
+
+
 def _kind(words: str) -> str:
     """A reason without its numbers, so that equal ones can be counted."""
-    return " ".join(w for w in words.split() if not any(c.isdigit() for c in w))
+    kind = " ".join(w for w in words.split() if not any(c.isdigit() for c in w))
+    for share, instead in _SHARES:
+        kind = kind.replace(share, instead)
+    return kind

@@ -58,7 +58,7 @@ def svg(figure: Figure) -> str:
         figure.savefig(written, format="svg", metadata={"Date": None, "Creator": None})
     # Laid out once: what is drawn of it after this is the same, and quicker.
     figure.set_layout_engine("none")
-    return _shorter(written.getvalue())
+    return _numbered(_shorter(written.getvalue()))
 
 
 def save(figure: Figure, document: str, directory: Path, name: str) -> list[Path]:
@@ -107,6 +107,18 @@ def colours() -> tuple[str, str]:
     """Return the style sheet's declarations of the figures' colours, for light and for dark."""
     light = "".join(f"{_variable(c)}:{c.lower()};" for c in DARK)
     return light, "".join(f"{_variable(c)}:{d.lower()};" for c, d in DARK.items())
+
+
+def _numbered(document: str) -> str:
+    """Number what Matplotlib names by hashes, some of them of addresses in memory."""
+    names: dict[str, str] = {}
+    for name in re.findall(r'\bid="([a-z][0-9a-f]{10})"', document):
+        names.setdefault(name, f"{name[0]}{len(names)}")
+    return re.sub(
+        r'(id="|url\(#|href="#)([a-z][0-9a-f]{10})\b',
+        lambda m: m[1] + names.get(m[2], m[2]),
+        document,
+    )
 
 
 def _shorter(document: str) -> str:

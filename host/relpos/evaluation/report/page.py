@@ -26,7 +26,7 @@ SECTIONS: Sequence[tuple[str, str, tuple[str, ...], tuple[str, ...]]] = (
     ("ranging", "Ranging", ("detection", "residuals"), ("ranges",)),
     ("learned", "Learned on the way", ("parameters",), ("learned",)),
     ("height", "Height", ("height",), ()),
-    ("health", "Links and nodes", ("health",), ("health", "counters")),
+    ("health", "Links and nodes", ("health",), ("health", "reasons", "counters")),
 )
 """Sections of the page: id, title, pictures, tables. Empty ones are left out."""
 
@@ -43,6 +43,7 @@ def page(content: Content, drawn: Mapping[str, tuple[Picture, str]]) -> str:
         "ranges": tables.ranges(content),
         "learned": tables.learned(content),
         "health": tables.health(content),
+        "reasons": tables.reasons(content),
         "counters": tables.counters(content),
         "located": tables.located(content),
     }
@@ -193,7 +194,7 @@ def _in_short(content: Content) -> list[str]:
                 else "are larger than its errors"
             )
             words.append(
-                f"The reported uncertainties of the distances {verdict}: NEES {nees.mean:.2f}, "
+                f"The reported uncertainties of the distances {verdict}: NEES {_short(nees.mean)}, "
                 f"{nees.low:.2f} to {nees.high:.2f} where honest."
             )
     elif scored is None:
@@ -203,6 +204,10 @@ def _in_short(content: Content) -> list[str]:
             + ": what is told here is what the estimate and the measurements say of themselves."
         )
     return words
+
+
+def _short(number: float) -> str:
+    return f"{number:.2f}" if number < tables.HUGE else f"{number:.2g}"
 
 
 def _facts(content: Content) -> str:

@@ -419,7 +419,7 @@ def consistency(content: Content) -> Picture | None:
         left.plot(x, y, color=FUSED, label="mean of 30 s")
         left.axhline(
             chance.mean, color=DEAD_RECKONING, linestyle="--", linewidth=1.2,
-            label=f"whole run: {chance.mean:.2f}",
+            label=f"whole run: {chance.mean:.3g}",
         )  # fmt: skip
         good = nees[nees > 1e-12]
         _logarithmic(left, max(float(np.quantile(good, 0.02)), 1e-3))
@@ -443,7 +443,7 @@ def consistency(content: Content) -> Picture | None:
         "band holds an honest estimator's mean over the whole run in 95 of 100 cases. Right: how "
         "many errors lie within the reported uncertainty, against a Gaussian's shares; above the "
         f"line is too modest, below too sure. Within 1.96 sigma: {inside:.0f} %.",
-        f"NEES {chance.mean:.2f} over the whole run, {chance.low:.2f} to {chance.high:.2f} by "
+        f"NEES {chance.mean:.3g} over the whole run, {chance.low:.2f} to {chance.high:.2f} by "
         f"chance; {inside:.0f} % of the errors within 1.96 sigma.",
         draw,
         (10.4, 4.0),

@@ -7,6 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 
+import numpy as np
+import numpy.typing as npt
+
 from relpos.evaluation import ranging
 from relpos.evaluation.iso18305 import Accuracy, Frame, Magnitudes
 from relpos.evaluation.metrics import PairMetrics
@@ -25,6 +28,10 @@ LONG = 30
 """Tables of more rows than this are folded."""
 
 
+HUGE = 1e7
+"""Figures from here on say only that something is far off: two digits of them are enough."""
+
+
 @dataclass(frozen=True)
 class Table:
     """One table: what it is of, the heads of its columns, and rows whose first cell is a head."""
@@ -38,10 +45,8 @@ class Table:
         """Give it as HTML, in a region of its own that scrolls where it is too wide."""
         head = "".join(f'<th scope="col">{escape(c)}</th>' for c in self.columns)
         body = "\n".join(
-            f'<tr><th scope="row">{row[0]}</th>'
-            + "".join(f"<td>{c}</td>" for c in row[1:])
-            + "</tr>"
-            for row in self.rows
+            f'<tr><th scope="row">{first}</th>{"".join(map(_cell, rest))}</tr>'
+            for first, *rest in self.rows
         )
         words = escape(self.caption)
         made = (
@@ -65,6 +70,8 @@ def value(number: float | None, unit: str = "", digits: int = 2, *, sign: bool =
     if number is None or not math.isfinite(number):
         return '<span aria-label="not known">-</span>'
     words = f"{number:+.{digits}f}" if sign else f"{number:.{digits}f}"
+    if abs(number) >= HUGE:
+        words = f"{number:.2g}"
     return f'<data value="{figure(number)!r}">{words}</data>{" " + unit if unit else ""}'
 
 
@@ -372,13 +379,6 @@ def learned(content: Content) -> Table | None:
     return Table("Learned, at the end", ["", "value", "sigma"], rows) if rows else None
 
 
-_COLOURS: Mapping[Health, str] = {
-    Health.GREEN: "green",
-    Health.YELLOW: "yellow",
-    Health.RED: "red",
-}
-
-
 def health(content: Content) -> Table | None:
     """Tell how each node and its link fared."""
     if not any(one.time_s.size or one.motions for one in content.health.values()):
@@ -392,46 +392,56 @@ def health(content: Content) -> Table | None:
             value(len(one.silences), "", 0),
         ]
         if told:
-            battery = one.series["battery_v"]
-            radio = one.series["rssi_dbm"]
-            ranging_share = one.series["ranging"]
-            counts = [int((one.colour == int(c)).sum()) for c in Health]
-            total = max(sum(counts), 1)
+            total = one.colour.size
             row += [
-                value(float(_least(battery)), "V"),
-                value(ranging.median(radio), "dBm", 0),
+                value(_least(one.series["battery_v"]), "V"),
+                value(ranging.median(one.series["rssi_dbm"]), "dBm", 0),
                 _share(one.loss),
-                _share(ranging.median(ranging_share)),
+                _share(ranging.median(one.series["ranging"])),
                 value(len(one.restarts), "", 0),
-                "-" if not one.time_s.size else ", ".join(
-                    f"{100 * count / total:.0f} % {_COLOURS[colour]}"
-                    for colour, count in zip(Health, counts, strict=True)
-                    if count
+                *(
+                    _share(float((one.colour == int(c)).sum() / total) if total else math.nan)
+                    for c in Health
                 ),
-                escape("; ".join(f"{why} ({n})" for why, n in sorted(
-                    one.reasons.items(), key=lambda item: -item[1]
-                )[:4])) or "-",
-            ]  # fmt: skip
+            ]
         rows.append(row)
+    heads = ["node", "motions", "silences"]
+    if told:
+        heads += ["lowest supply", "radio", "frames lost", "ranging", "restarts"]
+        heads += ["green", "yellow", "red"]
     return Table(
         "Links and nodes",
-        ["node", "motions", "silences over 5 s"]
-        + (
-            ["lowest supply", "radio (median)", "frames lost", "rangings that succeed", "restarts",
-             "of its reports", "why (reports)"]
-            if told
-            else []
-        ),
+        heads,
         rows,
-        "" if told else "This run carries no status reports (status.csv).",
-    )  # fmt: skip
+        "Silences: longer than 5 s without a motion heard. Radio and ranging: medians over the "
+        "node's reports, of the signal and of the share of its exchanges that succeed. Colours: "
+        "share of its reports, by the rules of the live table."
+        if told
+        else "Silences: longer than 5 s without a motion heard. This run carries no status reports "
+        "(status.csv).",
+    )
 
 
-def _least(values: object) -> float:
-    import numpy as np
+def reasons(content: Content) -> Table | None:
+    """Tell why nodes were not green."""
+    rows = [
+        [
+            escape(content.name(node)),
+            escape("; ".join(f"{why} ({n})" for why, n in most_first(one.reasons))),
+        ]
+        for node, one in content.health.items()
+        if one.reasons
+    ]
+    return Table("Why not green (reports)", ["node", "reasons"], rows) if rows else None
 
-    array = np.asarray(values, dtype=np.float64)
-    finite = array[np.isfinite(array)]
+
+def most_first(counts: Mapping[str, int]) -> list[tuple[str, int]]:
+    """Sort counted words by how often they were."""
+    return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+
+
+def _least(values: npt.NDArray[np.float64]) -> float:
+    finite = values[np.isfinite(values)]
     return float(finite.min()) if finite.size else math.nan
 
 
