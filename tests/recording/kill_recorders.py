@@ -26,6 +26,7 @@ from relpos.recording.recorder import Recorder
 from relpos.recording.topics import all_topics
 
 PAGE = struct.Struct("<Qd")
+EVERY_S = 0.02
 LONGEST_S = 4.0
 
 
@@ -40,7 +41,7 @@ def record(path, steps, page):
         recorder.observed(arrival_s, observations)
         for estimate in estimates:
             recorder.estimated(estimate)
-        time.sleep(0.02)
+        time.sleep(EVERY_S)
 
 
 def main():

@@ -22,6 +22,8 @@ from relpos.recording.recorder import Bounds, Recorder
 from relpos.recording.topics import Serial
 
 PATIENCE_S = 120.0
+A_SECOND = 50
+"""Reads of the port, one each 20 ms."""
 
 
 def wait_for(condition):
@@ -39,7 +41,10 @@ def serials(path):
 
 
 def kill_recorders(tmp_path, kills, seed):
-    """For each kill, the seconds that had been handed over and are not in the recording."""
+    """For each kill, the reads of the port that had been handed over and are not in the recording.
+
+    Fifty of them are a second of the session, also where a busy computer lets it run too rarely.
+    """
     steps = tmp_path / "steps.pickle"
     steps.write_bytes(pickle.dumps(session()))
     script = Path(__file__).with_name("kill_recorders.py")
@@ -48,7 +53,7 @@ def kill_recorders(tmp_path, kills, seed):
         [sys.executable, str(script), *arguments], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    lost_s = []
+    lost = []
     for line in done.stdout.splitlines():
         end = json.loads(line)
         path = Path(end["path"])
@@ -57,14 +62,13 @@ def kill_recorders(tmp_path, kills, seed):
         found = serials(path)
         numbers = [struct.unpack_from("<Q", serial.data)[0] for serial in found]
         assert numbers == list(range(1, len(found) + 1)), f"{path}: a hole, or another order"
-        last_s = found[-1].arrival_s if found else 0.0
-        lost_s.append(end["arrival_s"] - last_s)
+        lost.append(end["number"] - len(found))
         recording = open_recording(path)
         assert not recording.closed
         assert "was not closed" in recording.remarks[0]
         assert len(recording.run.measurements) >= len(found) // 4
         readable_by_others_once_repaired(path, tmp_path / "repaired.mcap", len(found))
-    return lost_s
+    return lost
 
 
 def readable_by_others_once_repaired(path, repaired, count):
@@ -91,16 +95,19 @@ def readable_by_others_once_repaired(path, repaired, count):
 
 
 def test_a_killed_recorder_leaves_all_but_the_last_second(tmp_path):
-    assert max(kill_recorders(tmp_path, 5, 1)) <= 1.0
+    assert max(kill_recorders(tmp_path, 5, 1)) <= A_SECOND
 
 
 @pytest.mark.soak
 def test_two_hundred_killed_recorders_leave_all_but_the_last_second(tmp_path):
-    lost_s = kill_recorders(tmp_path, 200, 2)
-    most = ", ".join(f"{s:.2f}" for s in sorted(lost_s)[-8:])
-    print(f"{len(lost_s)} recordings; seconds lost, mean {sum(lost_s) / len(lost_s):.2f}, {most}")
-    assert len(lost_s) > 150
-    assert max(lost_s) <= 1.0
+    lost = kill_recorders(tmp_path, 200, 2)
+    lost_s = sorted(count / A_SECOND for count in lost)
+    most = ", ".join(f"{s:.2f}" for s in lost_s[-8:])
+    print(
+        f"{len(lost)} recordings; seconds lost, mean {sum(lost_s) / len(lost_s):.2f}, most {most}"
+    )
+    assert len(lost) > 100
+    assert max(lost) <= A_SECOND
 
 
 @pytest.fixture(scope="module")
@@ -257,12 +264,14 @@ def test_a_file_that_may_not_grow_is_followed_by_another_part(tmp_path):
         size = sum(file.stat().st_size for file in tmp_path.iterdir())
         wait_for(lambda n=size: sum(file.stat().st_size for file in tmp_path.iterdir()) > n)
     recorder.close()
-    parts = sorted(file.name for file in tmp_path.iterdir())
-    assert parts[:2] == ["fat.mcap", "fat.part2.mcap"]
+    parts = {file.name for file in tmp_path.iterdir()}
+    assert {"fat.mcap", "fat.part2.mcap"} <= parts
+    assert len(parts) < 8, "most of a part is what was there before"
     recording = open_recording(path)
     assert [s.arrival_s for s in serials(path)] == [arrival_s for arrival_s, *_ in steps]
     assert list(recording.observations()) == [o for step in steps for o in step[2]]
     assert recorder.trouble() is None
+    assert recording.remarks == ()
     save_recording(tmp_path / "one.mcap", recording.run, source=recording)
     assert len(serials(tmp_path / "one.mcap")) == len(steps)
 

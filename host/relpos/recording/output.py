@@ -20,6 +20,7 @@ from relpos.errors import DataError
 from relpos.recording import container
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+SYNC_EVERY_S = 0.4
 MOST_UNCONFIRMED = 64 << 20
 """Bytes written that the disk has not confirmed: beyond, the recorder's queue grows instead."""
 
@@ -54,7 +55,7 @@ class _Syncer:
         self._confirmed = size
         self._since_s: float | None = None
         self._error: OSError | None = None
-        self._ended = False
+        self._ended = self._hurry = False
         self._changed = Condition()
         Thread(target=self._run, name="disk", daemon=True).start()
 
@@ -82,6 +83,8 @@ class _Syncer:
     def wait(self, size: int, timeout_s: float) -> bool:
         """Wait until it has confirmed ``size``; whether it has."""
         with self._changed:
+            self._hurry = True
+            self._changed.notify_all()
             self._changed.wait_for(
                 lambda: self._confirmed >= size or self._error is not None, timeout_s
             )
@@ -96,6 +99,8 @@ class _Syncer:
     def _run(self) -> None:
         while True:
             with self._changed:
+                # In between others may use the disk, and flash memory lasts longer.
+                self._changed.wait_for(lambda: self._ended or self._hurry, SYNC_EVERY_S)
                 self._changed.wait_for(lambda: self._ended or self._wanted > self._confirmed)
                 if self._ended:
                     break
@@ -176,6 +181,8 @@ class Output:
         except OSError as error:
             if error.errno in NO_ROOM:
                 raise
+            if error.errno == errno.EFBIG:
+                self._keep_whole()
             self._begin(self.part + 1)
             self._write()
 
@@ -220,6 +227,28 @@ class Output:
         self.part, self._start, self._written = part, len(start), 0
         self._syncer = _Syncer(self._disk, handle, len(start))
 
+    def _whole(self) -> int:
+        """How many blocks are written whole."""
+        size = count = 0
+        for block in self._blocks:
+            size += len(block)
+            if size > self._written:
+                break
+            count += 1
+        return count
+
+    def _keep_whole(self) -> None:
+        """Leave in a file that may not grow what is whole in it, if the disk confirms it."""
+        count = self._whole()
+        size = sum(map(len, self._blocks[:count]))
+        with contextlib.suppress(OSError):
+            os.ftruncate(self._syncer.handle, self._start + size)
+            self._disk.sync(self._syncer.handle)
+            os.lseek(self._syncer.handle, self._start + size, os.SEEK_SET)
+            self._start += size
+            self._written = 0
+            del self._blocks[:count]
+
     def _cut(self) -> None:
         """Let the present part end with its last confirmed block."""
         with contextlib.suppress(OSError):
@@ -232,11 +261,7 @@ class Output:
         """
         with contextlib.suppress(OSError):
             self.flush()
-        whole = self._start
-        for block in self._blocks:
-            if self._written < whole - self._start + len(block):
-                break
-            whole += len(block)
+        whole = self._start + sum(map(len, self._blocks[: self._whole()]))
         with contextlib.suppress(OSError):
             os.ftruncate(self._syncer.handle, whole)
         confirmed = self._syncer.wait(whole, timeout_s)

@@ -99,7 +99,7 @@ class Recording:
         for file in self.files:
             if file.damaged:
                 said.append(f"{file.path}: {file.damaged} damaged blocks are left out")
-            if not file.closed:
+            if file in self._cut_off:
                 cut = f", {file.unread} bytes of a last block are cut off" if file.unread else ""
                 said.append(f"{file.path}: was not closed{cut}; read up to {self._end(file)}")
         said.extend(
@@ -108,6 +108,11 @@ class Recording:
             for gap in self._rows({topics.GAP})
         )
         return tuple(said)
+
+    @property
+    def _cut_off(self) -> list[_File]:
+        """Files that end too early; one that another part follows may lack a summary."""
+        return [f for f in self.files if not f.closed and (f is self.files[-1] or f.unread)]
 
     def _end(self, file: _File) -> str:
         if file.last_ns is None:
@@ -217,7 +222,7 @@ class Recording:
             else:
                 truth[row.time_s, row.node] = row
         counters = {
-            "recording_not_closed": sum(not file.closed for file in self.files),
+            "recording_not_closed": len(self._cut_off),
             "recording_blocks_damaged": sum(file.damaged for file in self.files),
             "recording_gaps": sum(1 for _ in self.entries({topics.GAP})),
         }

@@ -1,7 +1,7 @@
 """The sink that writes a session to an MCAP file, whatever the disk does.
 
 The session only puts things into a queue. A thread of the recorder's own encodes them, closes a
-block each half a second and has the disk confirm it. While the disk does not take it (slow, full,
+block four times a second and has the disk confirm it. While the disk does not take it (slow, full,
 gone) the queue grows up to a bound; beyond that things are left out, estimates first. What is lost
 is counted, told by :meth:`Recorder.trouble` and written into the recording (topic ``/gap``).
 """
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from relpos.live.picture import Picture
 
 TICK_S = 0.1
-BLOCK_S = 0.4
-"""A block is closed that often: a tick more is at stake, and half a second is left for a computer
-that is too busy to let us."""
+BLOCK_S = 0.25
+"""A block is closed that often: a tick more is at stake, and most of a second is left for a
+computer that is too busy to let us."""
 BLOCK_BYTES = 1 << 20
 RETRY_S = 0.5
 LATE_S = 3.0
@@ -197,7 +197,7 @@ class Recorder:
         if left or self._output.waiting:
             self._trouble = (
                 f"{self._trouble or self.path}; the end of the session is not recorded: "
-                f"{left} reads and estimates, and what came in the half second before"
+                f"{left} reads and estimates, and what came in the moment before"
             )
         elif not closed and self._trouble is None:
             self._trouble = (
