@@ -74,7 +74,7 @@ def _kernels(computer: Computer) -> Finding:
     if not any(computer.may_write(folder) for folder in folders):
         return wrong(
             name,
-            f"what is compiled cannot be kept ({folders[0]}): every start waits half a minute",
+            f"what is compiled cannot be kept ({folders[0]}): every start waits a minute",
             "name a folder that can be written: export NUMBA_CACHE_DIR=$HOME/.cache/numba",
         )
     for module in KERNELS:
@@ -83,7 +83,7 @@ def _kernels(computer: Computer) -> Finding:
         if not any(f.stat().st_mtime >= source for f in files):
             return hint(
                 name,
-                "not compiled yet: the first start takes half a minute longer",
+                "not compiled yet: the first start takes a minute longer",
                 "relpos doctor --prepare",
             )
     return well(name, "compiled, a session starts at once")
