@@ -2,6 +2,7 @@
 
 import gc
 import itertools
+import json
 import math
 import subprocess
 import sys
@@ -88,6 +89,9 @@ def test_tracks_of_hours_stay_small_and_evenly_spaced():
     assert points[-1][0] > 19_900.0
     gaps = [b[0] - a[0] for a, b in itertools.pairwise(points)]
     assert max(gaps) <= 2.0 * min(gaps)
+    again = Tracks.from_message(json.loads(tracks.to_json()))
+    assert again.of(1) == points
+    assert not again.add(1, points[-1][0] + 0.5 * min(gaps), 0.0, 0.0), "as coarse as before"
 
 
 @pytest.mark.soak

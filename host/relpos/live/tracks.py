@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,40 +20,41 @@ class Tracks:
     """
 
     def __init__(self) -> None:
-        self._points: dict[int, list[tuple[float, float, float]]] = {}
+        # Flat, three numbers a point: a sixth of the memory that tuples take.
+        self._points: dict[int, array[float]] = {}
         self._spacing_s: dict[int, float] = {}
 
     def add(self, node: int, time_s: float, x_m: float, y_m: float) -> bool:
         """Take a point, unless one as near in time is there; whether it was taken."""
-        points = self._points.setdefault(node, [])
+        points = self._points.setdefault(node, array("d"))
         spacing_s = self._spacing_s.get(node, FIRST_SPACING_S)
-        if points and time_s < points[-1][0] + spacing_s:
+        if points and time_s < points[-3] + spacing_s:
             return False
-        points.append((round(time_s, 2), round(x_m, 2), round(y_m, 2)))
-        if len(points) > MOST_POINTS:
-            del points[1::2]
+        points.extend((round(time_s, 2), round(x_m, 2), round(y_m, 2)))
+        if len(points) > 3 * MOST_POINTS:
+            kept = array("d")
+            for k in range(0, len(points), 6):
+                kept.extend(points[k : k + 3])
+            self._points[node] = kept
             self._spacing_s[node] = 2.0 * spacing_s
         return True
 
     def of(self, node: int) -> list[tuple[float, float, float]]:
         """The node's points, by time."""
-        return list(self._points.get(node, ()))
+        points = self._points.get(node, array("d"))
+        return list(zip(points[::3], points[1::3], points[2::3], strict=True))
 
     def to_json(self) -> str:
         """The message ``tracks`` of the page's protocol."""
-        return to_json(
-            {
-                "type": "tracks",
-                "tracks": {str(n): points for n, points in sorted(self._points.items())},
-            }
-        )
+        tracks = {str(node): self.of(node) for node in sorted(self._points)}
+        return to_json({"type": "tracks", "tracks": tracks})
 
     @classmethod
     def from_message(cls, message: Mapping[str, Any]) -> Tracks:
         """Take a ``tracks`` message's points as they are."""
         tracks = cls()
         for node, points in message["tracks"].items():
-            tracks._points[int(node)] = [(t, x, y) for t, x, y in points]
+            tracks._points[int(node)] = array("d", (value for point in points for value in point))
             if len(points) > 2:
                 mean_s = (points[-1][0] - points[0][0]) / (len(points) - 1)
                 tracks._spacing_s[int(node)] = max(FIRST_SPACING_S, 0.75 * mean_s)
