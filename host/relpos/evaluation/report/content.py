@@ -181,7 +181,7 @@ def reckon(run: Run, result: Result) -> Baseline | None:
     from relpos import fusion
     from relpos.runs import InitialPose
 
-    if not run.motions or result.estimator == "deadreckoning":
+    if not run.motions or (result.estimator == "deadreckoning" and not result.smoothed):
         return None
     priors: Sequence[Prior] = run.priors if result.priors is None else result.priors
     words = "dead reckoning from the same start"

@@ -87,12 +87,15 @@ def _figure(picture: Picture, svg: str) -> str:
 def _subtitle(content: Content) -> str:
     result, run = content.result, content.run
     parts = [f"estimator {result.estimator}" + (", smoothed" if result.smoothed else "")]
+    if result.passage is None:
+        parts = ["an estimate that was read"]
     if result.seed is not None:
         parts.append(f"seed {result.seed}")
     parts += [f"{key} {value}" for key, value in result.settings.items()]
     if run.measurements:
         seconds = run.measurements[-1].time_s - run.measurements[0].time_s
-        parts.append(f"{len(content.nodes)} nodes over {_duration(seconds)}")
+        many = "s" * (len(content.nodes) != 1)
+        parts.append(f"{len(content.nodes)} node{many} over {_duration(seconds)}")
     return escape("; ".join(parts))
 
 

@@ -82,7 +82,9 @@ def tracks(content: Content) -> Picture | None:
     fused = {node: t for node, t in content.guessed.items() if np.isfinite(t.x_m).any()}
     if not fused:
         return None
-    shown: list[tuple[str, Tracks]] = [(content.result.estimator, content.fused)]
+    located = any(np.isfinite(t.x_m).any() for t in content.fused.values())
+    ours = content.fused if located else content.guessed
+    shown: list[tuple[str, Tracks]] = [(content.result.estimator, ours)]
     if content.baseline is not None:
         shown.insert(0, ("dead reckoning", content.baseline.tracks))
     true = bool(content.truth)
@@ -92,7 +94,9 @@ def tracks(content: Content) -> Picture | None:
     share = max(size for _, size in extent.values()) < 3.0 * min(
         size for _, size in extent.values()
     )
-    width_in = min(max(5.2 * float(np.median([w for w, _ in extent.values()])), 3.8), 6.4)
+    aspect = float(np.median([ratio for ratio, _ in extent.values()]))
+    width_in = min(max(5.0 * aspect, 3.8), 6.4)
+    height_in = min(max(width_in / aspect, 2.2), 5.0) + 0.9
 
     def draw(figure: Figure) -> None:
         panels = figure.subplots(1, len(shown), squeeze=False, sharex=share, sharey=share)[0]
@@ -116,12 +120,17 @@ def tracks(content: Content) -> Picture | None:
         "tracks",
         "Tracks",
         f"{frame} Dots mark the end, rings the true end, ellipses two sigmas of it relative to the "
-        "frame. A node is left out while it was not located.",
+        "frame. "
+        + (
+            "A node is left out while it was not located."
+            if located
+            else "Nobody was located: each way is from where it began."
+        ),
         f"Map of the ways of {nodes}"
         + (", dead reckoning beside the fusion" if len(shown) > 1 else "")
         + (", on the true ways." if true else "."),
         draw,
-        (width_in * len(shown) + 0.4, 5.6),
+        (width_in * len(shown) + 0.4, height_in),
     )
 
 
