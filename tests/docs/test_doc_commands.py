@@ -139,7 +139,6 @@ def write_others_files(folder):
         ("DIR", "--to", "tum", "--out", "slam"),
         ("RUN", "--to", "mcap", "--start", "2026-05-04T09:30:00Z", "--out", "FILE.mcap"),
         ("RUN", "--to", "gpx", *pin, "--out", "watch.gpx"),
-        ("RUN", "--to", "mcap", "--out", "FILE.mcap"),
     ):
         source, *options, out = words
         made = relpos("convert", folder / source, *options, folder / out)

@@ -106,7 +106,7 @@ def _perform(cast: Cast, job: fuse.Job, options: live.Options, *, as_json: bool)
     with output.working(f"preparing the walk of {cast.nodes} people"):
         rehearsal = Rehearsal(cast)
     with rehearsal:
-        job.prepare()
+        job.prepare(rehearsal.priors)
         fuse.fuse_live(
             job,
             live.open_port(rehearsal.port, None, teach=True, reopen=False),

@@ -184,14 +184,14 @@ class Job:
         make = fusion.make_smoother if self.smooth else fusion.make
         return make(self.estimator, priors, self.settings, self.seed, nodes)
 
-    def prepare(self) -> None:
+    def prepare(self, priors: Sequence[Prior] = ()) -> None:
         """Have the estimator's kernels compiled, telling it the first time, when it takes long.
 
-        RelposError, at once, where a setting does not fit it.
+        RelposError, at once, where a setting does not fit it, or it cannot start from such priors.
         """
         from relpos import fusion
 
-        self.make(())
+        self.make(priors)
         with output.working("preparing the estimator (compiled at the first start)"):
             fusion.warm_up(self.estimator)
 
@@ -223,7 +223,7 @@ def _replay_run(job: Job, initial: Initial | None, options: live.Options, *, as_
     run = load_run(sources.check_recording(job.source))
     _check_usable(run, job.estimator)
     priors = _priors(run, initial)
-    job.prepare()
+    job.prepare(priors)
     fuse_live(
         job,
         PacedInput(job.source, run_items(run), speed=options.pace),
@@ -280,7 +280,7 @@ def _fuse_mcap(
     else:
         priors = _priors(run, initial)
     if options.shown:
-        job.prepare()
+        job.prepare(priors)
         again = Replay(recording, key)
         source = PacedInput(job.source, again, speed=options.pace, link=again.link)
         fuse_live(job, source, options, description=run.description, priors=priors, as_json=as_json)
@@ -347,7 +347,7 @@ def _pass_through(
 
     _check_usable(run, job.estimator)
     given = run.measurements if measurements is None else measurements
-    job.prepare()
+    job.prepare(priors)
     return pass_through(
         job.make(priors, run.nodes),
         output.with_progress(given, len(given), "fusing"),
@@ -450,10 +450,14 @@ def _fuse_port(
     teach: bool,
     as_json: bool,
 ) -> None:
+    from relpos.measurements import Prior
+
     if initial is Initial.TRUTH:
         raise DataError(f"{job.source}: a port brings no truth to start from")
-    # Before the port is open: nobody takes in what arrives meanwhile.
-    job.prepare()
+    # Before the port is open: nobody takes in what arrives meanwhile. Who starts from one place is
+    # heard later; that some do is known.
+    some = [Prior(node, 0.0, 0.0, 0.0) for node in (1, 2)]
+    job.prepare(some if initial is Initial.COMMON else ())
     port = live.open_port(job.source, key_file, teach=teach, reopen=options.shown)
     if not as_json:
         output.remark(f"listening to {job.source}; Ctrl-C ends")
