@@ -137,7 +137,6 @@ def write_others_files(folder):
     pin = ("--pin", "48.13713,11.57538,90", "--start", "2026-05-04T09:30:00Z")
     for words in (
         ("DIR", "--to", "tum", "--out", "slam"),
-        ("RUN", "--to", "mcap", "--start", "2026-05-04T09:30:00Z", "--out", "FILE.mcap"),
         ("RUN", "--to", "gpx", *pin, "--out", "watch.gpx"),
     ):
         source, *options, out = words
