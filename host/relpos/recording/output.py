@@ -19,8 +19,9 @@ from threading import Condition, Thread
 from relpos.errors import DataError
 from relpos.recording import container
 
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+NO_ROOM = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 SYNC_EVERY_S = 0.4
+CLOSE_RETRY_S = 0.1
 MOST_UNCONFIRMED = 64 << 20
 """Bytes written that the disk has not confirmed: beyond, the recorder's queue grows instead."""
 
@@ -259,12 +260,22 @@ class Output:
 
         Only what the disk confirms in time counts; of a block half of which is there, nothing.
         """
-        with contextlib.suppress(OSError):
-            self.flush()
-        whole = self._start + sum(map(len, self._blocks[: self._whole()]))
+        until_s = time.monotonic() + timeout_s
+        confirmed = False
+        while not confirmed:
+            # Once more also where the disk has refused to confirm: it is written again, then.
+            with contextlib.suppress(OSError):
+                self.flush()
+            whole = self._start + sum(map(len, self._blocks[: self._whole()]))
+            left_s = until_s - time.monotonic()
+            confirmed = not self.waiting and self._syncer.wait(whole, max(left_s, 0.0))
+            if left_s <= 0.0:
+                break
+            if not confirmed:
+                time.sleep(min(left_s, CLOSE_RETRY_S))
         with contextlib.suppress(OSError):
             os.ftruncate(self._syncer.handle, whole)
-        confirmed = self._syncer.wait(whole, timeout_s)
+            confirmed = confirmed or self._syncer.wait(whole, 0.0)
         complete = not self.waiting and confirmed
         self._syncer.end()
         if not confirmed:
