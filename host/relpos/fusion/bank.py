@@ -38,6 +38,7 @@ from relpos.fusion.estimator import (
 )
 from relpos.fusion.joint import PER_NODE, Of
 from relpos.fusion.motion_model import told_sigmas
+from relpos.fusion.north import North
 from relpos.fusion.ranging_model import Mounting, Repetition
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.slips import LOST_RAD, VAGUE_M, Habit, Stillness
@@ -65,6 +66,8 @@ WANDER_M = 0.7
 MOST_LISTED = 200
 """Hypotheses that alternatives are made of after a slip."""
 
+NORTH_KNOWN_RAD = 0.5
+"""From so well on headings are used; before, they only teach how the frame lies to north."""
 HEADING_SIGMA_RAD = 0.17
 """Of an absolute heading that brings no sigma: magnetic ones indoors are 10 degrees off."""
 
@@ -98,6 +101,7 @@ class _State:
     starts: Starts
     standing: dict[int, complex]
     facing: dict[int, complex]
+    north: North
 
 
 @dataclass(slots=True)
@@ -117,6 +121,7 @@ class Bank:
     repetition: Repetition = field(default_factory=Repetition)
     habit: Habit = field(default_factory=Habit)
     stillness: Stillness = field(default_factory=Stillness)
+    north: North = field(default_factory=North)
     _feed: Rewinder = field(init=False)
     starts: Starts = field(init=False)
     _row: dict[int, int] = field(default_factory=dict)
@@ -220,6 +225,7 @@ class Bank:
             {node: copy(known) for node, known in self._known.items()}, self._pending[:],
             self._own.copy(), self._moved, self._ranges_used, self._epoch_s,
             self.starts.snapshot(), self._standing.copy(), self._facing.copy(),
+            self.north.snapshot(),
         )  # fmt: skip
 
     def restore(self, snapshot: _State) -> None:
@@ -236,6 +242,7 @@ class Bank:
         self._epoch_s = snapshot.epoch_s
         self.starts = snapshot.starts.snapshot()
         self._standing, self._facing = snapshot.standing.copy(), snapshot.facing.copy()
+        self.north = snapshot.north.snapshot()
 
     def _meet(self, node: int) -> _Known:
         known = self._known.get(node)
@@ -454,10 +461,24 @@ class Bank:
             known.sigma_height_m = measured.sigma_m or 0.0
         elif isinstance(measured, Heading) and measured.node in self._row:
             self._advance()
-            sigma = measured.sigma_rad or HEADING_SIGMA_RAD
-            self.core.heading(self._row[measured.node], measured.heading_rad, sigma)
+            self._turn(step.time_s, measured, self._row[measured.node])
         else:
             self._own["headings_unused"] += 1
+
+    def _turn(self, time_s: float, measured: Heading, row: int) -> None:
+        """Work in an absolute heading, as far as it is known how the frame lies to it."""
+        north = self.north
+        told = measured.sigma_rad or HEADING_SIGMA_RAD
+        sigma = north.alone_sigma_rad(measured.node, time_s, told)
+        mean, covariance = self.core.moments(poses_alone=True)
+        place = PER_NODE * row + Of.HEADING
+        own, variance = float(mean[place]), float(covariance[place, place])
+        if north.sigma_rad < NORTH_KNOWN_RAD:
+            self.core.heading(
+                row, measured.heading_rad - north.angle_rad, math.hypot(sigma, north.sigma_rad)
+            )
+        if not north.learn(measured.heading_rad, sigma, own, variance):
+            self._own["headings_doubted"] += 1
 
     # -- estimates -----------------------------------------------------------------------------
 
