@@ -649,10 +649,12 @@ class BankCore:
 
         After their ranges: it is the distances after them that decide what this tells.
         """
+        before = self.log_weight.copy()
         joint.hearing(
             self._x, self._p, self._log_weight, self.nodes, first, second, dz_m, heard, tried,
             detection.weight, detection.curve, STEP_M,
         )  # fmt: skip
+        bank_kernels.temper(self._log_weight, before)
 
     def predicted_ranges(
         self, first: Indices, second: Indices, dz_m: Floats
