@@ -137,6 +137,7 @@ def write_others_files(folder):
     pin = ("--pin", "48.13713,11.57538,90", "--start", "2026-05-04T09:30:00Z")
     for words in (
         ("DIR", "--to", "tum", "--out", "slam"),
+        ("RUN", "--to", "mcap", "--out", "FILE.mcap"),
         ("RUN", "--to", "gpx", *pin, "--out", "watch.gpx"),
     ):
         source, *options, out = words
