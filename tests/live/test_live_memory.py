@@ -52,7 +52,9 @@ class Scale(QuietSink):
             self.bytes.append(tracemalloc.get_traced_memory()[0])
 
 
-def test_twice_the_session_is_not_more_memory(tmp_path):
+def test_twice_the_session_is_not_more_memory(tmp_path, monkeypatch):
+    # What waits a second for the disk is more here, where a second holds minutes.
+    monkeypatch.setattr("relpos.runs.appending.WRITE_EVERY_S", 0.0)
     scale = Scale(400.0, 800.0)
     items = (Received(o.time_s, b"", (o,)) for o in team(810))
     source = PacedInput("synthetic", items, speed=0.0)
@@ -76,7 +78,8 @@ def test_twice_the_session_is_not_more_memory(tmp_path):
     assert outcome.failure is None
     assert outcome.estimates > 700
     half, whole = scale.bytes
-    assert whole < 1.05 * half + 50_000, f"{half} bytes after half the session, {whole} at its end"
+    # Keeping what came in between, of its observations alone, would be a megabyte.
+    assert whole < 1.05 * half + 100_000, f"{half} bytes after half the session, {whole} at its end"
 
 
 def test_tracks_of_hours_stay_small_and_evenly_spaced():
