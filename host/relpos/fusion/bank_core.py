@@ -764,27 +764,24 @@ class BankCore:
         """Whether what is quickly told speaks against no unambiguous picture."""
         if not self._is_decided():
             return False
-        weight = self._weight_lines(self._undoubted_weights())
         metre = math.sqrt(noise.ALONG_M2_M) * np.exp(
             0.5 * self.levels.mean[noise.ALONG : -1 : noise.LEVELS]
         )
-        heading = bank_kernels.heading_variances(self._x, self._p, weight, self.nodes)
+        heading = bank_kernels.heading_variances(
+            self._x, self._p, self._undoubted_weights(), self.nodes
+        )
         return float((0.5 * heading / metre).max()) <= hypotheses.FLAT
 
     def _is_decided(self) -> bool:
         """Whether no few hypotheses count, and all model the same, with a known range sigma."""
         if float(self.levels.covariance[-1, -1]) > hypotheses.KNOWN**2:
             return False
-        if self._normalise() < hypotheses.EVEN * self.count:
-            return False
-        weight = self._weight.reshape(-1)[: self.count]
-        if float(weight @ (self.doubtful > 0.0)) > hypotheses.DOUBTED:
-            return False
-        for has in (self.has_constants, self.has_bias):
-            share = float(weight @ has)
-            if min(share, 1.0 - share) > hypotheses.UNDECIDED:
-                return False
-        return True
+        self._weight = np.empty_like(self._log_weight)
+        return bool(
+            bank_kernels.is_decided(
+                self._log_weight, self.doubtful, self.has_constants, self.has_bias, self._weight
+            )
+        )
 
     def _is_even(self, covariance: Floats) -> bool:
         """Whether the hypotheses are one cloud: no few of them count, and none lie far apart."""
@@ -792,24 +789,20 @@ class BankCore:
             return True
         if not self._is_decided():
             return False
-        weight = self._weight.reshape(-1)[: self.count]
-        poses = (PER_NODE * np.arange(self.nodes)[:, None] + np.arange(3)).ravel()
-        weight = weight * np.where(self.doubtful > 0.0, math.exp(-DOUBTERS), 1.0)
-        weight /= weight.sum()
-        own = self._p[:, [joint.triangle_place(q, q) for q in range(len(poses))]]
-        within = np.einsum("bl,bpl->p", self._weight_lines(weight), own)
+        poses = joint.order(self.nodes, self._x.shape[1])[: _POSE_PLACE * self.nodes]
+        within = bank_kernels.variances_within(self._p, self._undoubted_weights(), len(poses))
         between = covariance.diagonal()[poses] - within
         drawn = self._sampled / (1.0 - self._sampled)
         return bool((between <= hypotheses.APART * drawn * within + 1e-6).all())
 
     def _undoubted_moments(self, *, poses_alone: bool) -> tuple[Floats, Floats]:
         """As ``moments``, without those who doubt: they are no part of the picture."""
-        return self._moments(self._weight_lines(self._undoubted_weights()), poses_alone)
+        return self._moments(self._undoubted_weights(), poses_alone)
 
     def _undoubted_weights(self) -> Floats:
-        log_weight = self.log_weight - np.where(self.doubtful > 0.0, DOUBTERS, 0.0)
-        weight: Floats = np.exp(log_weight - log_weight.max())
-        weight /= weight.sum()
+        """Weights (B, LANES) with next to nothing for those who doubt."""
+        weight = np.empty_like(self._log_weight)
+        bank_kernels.undoubted_weights(self._log_weight, self.doubtful, weight)
         return weight
 
     def _moments(self, weight: Floats, poses_alone: bool) -> tuple[Floats, Floats]:
@@ -841,7 +834,7 @@ class BankCore:
     def _shrink(self, count: int) -> None:
         """Go on with fewer hypotheses, the mixture's moments unchanged."""
         mean, covariance = self._undoubted_moments(poses_alone=False)
-        self.log_weight[:] -= np.where(self.doubtful > 0.0, DOUBTERS, 0.0)
+        self.log_weight[:] -= np.where(self.doubtful > 0.0, bank_kernels.DOUBTERS, 0.0)
         angles = PER_NODE * np.arange(self.nodes, dtype=np.int64) + Of.HEADING
         before, weight = self._sampled, self.weights()
         sens = np.einsum("bl,b...l->...", self._weight_lines(weight), self._sens)
@@ -883,8 +876,10 @@ class BankCore:
         if not which.size:
             return
         self.doubtful[which] = DOUBT_UPDATES
+        edges = rate.cumsum() / total
+        edges[-1] = 1.0
         for k in which:
-            row = int(self.rng.choice(self.nodes, p=rate / total))
+            row = int(np.searchsorted(edges, self.rng.random(), side="right"))
             offset = self.rng.standard_normal(3) * (s.jump_m, s.jump_m, s.jump_rad)
             block, lane = divmod(int(k), LANES)
             for entry, sigma in ((0, s.jump_m), (1, s.jump_m), (2, s.jump_rad)):
@@ -975,9 +970,6 @@ are reflections that has to be known before they have moved anybody (``lab``, se
 
 OUTLIERS_EXPECTED = 3.0
 """How far outliers are expected to be off beforehand is worth so many of them."""
-
-DOUBTERS = 20.0
-"""Log likelihood that is taken from those who doubt where they do not count."""
 
 HEADING_OUTLIERS = 0.1
 HEADING_OUTLIER_RAD = 1.0

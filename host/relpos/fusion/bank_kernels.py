@@ -11,7 +11,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion import lanes, noise, slips
+from relpos.fusion import hypotheses, lanes, noise, slips
 from relpos.fusion.compiled import compiled
 from relpos.fusion.joint import MEAN, STATS, TRUST, VARIANCE, update
 from relpos.fusion.lanes import LANES, fill, load, store
@@ -30,6 +30,9 @@ where it does not happen, 0.192 and 0.195."""
 STRAIGHT_S = 10.0
 """After going straight for so long. Without it, robots that turn every second (exp3, exp4 of
 `two_robots_vio`) lost 0.08 and 0.10 m of 0.15."""
+
+DOUBTERS = 20.0
+"""Log likelihood that is taken from those who doubt where they do not count."""
 
 DOUBTED = 1e-3
 """Weight of those who have just jumped in what was expected of a range: to them any is usual."""
@@ -74,6 +77,49 @@ def normalise(log_weight: Floats, count: int, weight: Floats) -> float:
         weights[k] /= total
         squares += weights[k] * weights[k]
     return 1.0 / squares
+
+
+@compiled
+def undoubted_weights(log_weight: Floats, doubtful: Floats, weight: Floats) -> None:
+    """As ``normalise``, with next to nothing for those who doubt (``doubtful`` (K,) above 0)."""
+    count = doubtful.shape[0]
+    logs = log_weight.copy()
+    flat = logs.reshape(-1)
+    for k in range(count):
+        if doubtful[k] > 0.0:
+            flat[k] -= DOUBTERS
+    normalise(logs, count, weight)
+
+
+@compiled
+def is_decided(
+    log_weight: Floats, doubtful: Floats, has_constants: Floats, has_bias: Floats, weight: Floats
+) -> bool:
+    """Tell whether no few hypotheses count and all model the same; brings weights up to date."""
+    count = doubtful.shape[0]
+    if normalise(log_weight, count, weight) < hypotheses.EVEN * count:
+        return False
+    flat = weight.reshape(-1)
+    doubting, constants, biased = 0.0, 0.0, 0.0
+    for k in range(count):
+        doubting += flat[k] if doubtful[k] > 0.0 else 0.0
+        constants += flat[k] * has_constants[k]
+        biased += flat[k] * has_bias[k]
+    least = max(min(constants, 1.0 - constants), min(biased, 1.0 - biased))
+    return doubting <= hypotheses.DOUBTED and least <= hypotheses.UNDECIDED
+
+
+@compiled
+def variances_within(p: Floats, weight: Floats, places: int) -> Floats:
+    """Give the mean (places,) of the hypotheses' own variances, by ``weight`` (B, LANES)."""
+    given = np.empty(places)
+    for i in range(places):
+        sums = fill(0.0)
+        for b in range(p.shape[0]):
+            at = b * p.shape[1] + (i * (i + 1)) // 2 + i
+            sums = sums + load(weight, b) * load(p, at)
+        given[i] = lanes.total(sums)
+    return given
 
 
 @compiled
