@@ -224,12 +224,14 @@ def digest(
     """
     count, ranges = before.shape[0], first.shape[0]
     prior = np.empty(count)
-    most = before.max()
-    total = 0.0
+    most, total = -np.inf, 0.0
+    for k in range(count):
+        most = max(most, before[k])
     for k in range(count):
         prior[k] = math.exp(before[k] - most) * (DOUBTED if doubtful[k] > 0.0 else 1.0)
         total += prior[k]
-    prior /= total
+    for k in range(count):
+        prior[k] /= total
     square, excess = np.empty(ranges), np.empty(ranges)
     for r in range(ranges):
         mean, variance = stats[r, MEAN], stats[r, VARIANCE]
@@ -258,7 +260,8 @@ def digest(
         doubtful[k] -= 1.0
     clamped = noise.learn(levels, covariance, first, second, measured, stats, before, quiet, worth)
     fade = 0.998**ranges
-    outlier_counts *= fade
+    outlier_counts[0] *= fade
+    outlier_counts[1] *= fade
     for r in range(ranges):
         outlier_counts[0] += 1.0 - good[r]
         outlier_counts[1] += good[r]

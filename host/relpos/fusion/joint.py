@@ -34,7 +34,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion import lanes
-from relpos.fusion.compiled import compiled, inlined
+from relpos.fusion.compiled import compiled
 from relpos.fusion.lanes import LANES, Lanes, fill, greater, lesser, load, select, some, store
 
 Floats = npt.NDArray[np.float64]
@@ -185,13 +185,13 @@ def _take(of: Floats, chosen: Indices, to: Floats) -> None:
                 to[b, t, at] = of[block[at], t, lane[at]]
 
 
-@inlined
+@compiled
 def _row(i: int) -> int:
     """Where a row of the triangle begins."""
     return (i * (i + 1)) >> 1
 
 
-@inlined
+@compiled
 def _at(i: int, j: int) -> int:
     """Place of an entry in the triangle."""
     return ((i * (i + 1)) >> 1) + j if i >= j else ((j * (j + 1)) >> 1) + i
@@ -240,14 +240,16 @@ def advance(
     # What a user's displacements did to x and y per heading, drift and scale, and to the heading.
     moved = lanes.working_lines(PER_NODE * nodes)
     normals = lanes.working_lines(rows.shape[0])
-    touched = np.zeros(nodes, dtype=np.bool_)
+    touched = np.empty(nodes, dtype=np.bool_)
     for b in range(x.shape[0]):
         for lane in range(LANES):
             k = min(b * LANES + lane, count - 1)
             for m in range(rows.shape[0]):
                 normals[m, lane] = sampled[k, m]
-        moved[:] = 0.0
-        touched[:] = False
+        for row in range(nodes):
+            touched[row] = False
+            for entry in range(PER_NODE):
+                store(moved, PER_NODE * row + entry, fill(0.0))
         base = b * p.shape[1]
         active = _extent(p, base, nodes, size)
         constant = active > _POSE * nodes
@@ -886,7 +888,8 @@ def moments(
         for b in range(blocks):
             store(off, b * size + i, load(off, b * size + i) - away_from)
     sums = lanes.working_lines(_row(places))
-    sums[:] = 0.0
+    for t in range(_row(places)):
+        store(sums, t, fill(0.0))
     for b in range(blocks):
         w = load(weight, b)
         base, at_x = b * triangle, b * size

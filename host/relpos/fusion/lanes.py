@@ -27,7 +27,7 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
 from relpos.fusion import vectormath
-from relpos.fusion.compiled import compiled, inlined
+from relpos.fusion.compiled import compiled
 
 Floats = npt.NDArray[np.float64]
 
@@ -263,16 +263,23 @@ def floor(typing: Any, x: Any) -> Any:
     return _lanes(_lanes), _function("floor")
 
 
-@inlined
-def greater(x: Lanes, y: Lanes) -> Lanes:
+def _extreme(sign: str) -> Any:
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.select(builder.fcmp_ordered(sign, *args), *args)
+
+    return emit
+
+
+@_intrinsic
+def greater(typing: Any, x: Any, y: Any) -> Any:
     """The greater of each two."""
-    return select(x > y, x, y)
+    return _lanes(_lanes, _lanes), _extreme(">")
 
 
-@inlined
-def lesser(x: Lanes, y: Lanes) -> Lanes:
+@_intrinsic
+def lesser(typing: Any, x: Any, y: Any) -> Any:
     """The lesser of each two."""
-    return select(x < y, x, y)
+    return _lanes(_lanes, _lanes), _extreme("<")
 
 
 @_intrinsic

@@ -154,10 +154,18 @@ def learn(
     """See :meth:`Levels.learn`; works in place."""
     count = log_weight.shape[0]
     size = mean.shape[0]
-    weight = np.exp(log_weight - log_weight.max()) * quiet
-    if weight.sum() <= 0.0:
+    # Loops in place of expressions of arrays, which take the compiler seconds.
+    weight = np.empty(count)
+    most, whole = -np.inf, 0.0
+    for k in range(count):
+        most = max(most, log_weight[k])
+    for k in range(count):
+        weight[k] = vectormath.exp(log_weight[k] - most) * quiet[k]
+        whole += weight[k]
+    if whole <= 0.0:
         return 0
-    weight /= weight.sum()
+    for k in range(count):
+        weight[k] /= whole
     slope = np.empty(7)
     place = np.empty(7, dtype=np.int64)
     gain = np.empty(size)

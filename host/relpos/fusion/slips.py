@@ -166,7 +166,8 @@ def look(
     if highest < (WARY if wary else 1.0) * alarm:
         return -1
     # Who ranged with it has been drawn along; all begin anew.
-    sums[:] = 0.0
+    for row in range(sums.shape[0]):
+        sums[row] = 0.0
     return slipped
 
 
