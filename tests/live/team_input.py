@@ -118,7 +118,9 @@ def make_session(source, make, *sinks, priors=(), common=False, paced=False, **o
     album = Album()
     fusing = Fusing(make, priors, common=common)
     source.paced_by = fusing if paced else None
-    return Session(source, fusing, Composer(), [album, *sinks], **options), album
+    # As many pictures a second of the team's time as a session makes in real time.
+    pace = source.now_s if isinstance(source, TeamInput) else time.monotonic
+    return Session(source, fusing, Composer(), [album, *sinks], pace=pace, **options), album
 
 
 def run_through(session):

@@ -66,7 +66,8 @@ class Session:
     ``sinks`` are fed; ``visitors`` are asked for what browsers and phones want. ``seconds`` end it
     (of the wall clock). The end of a recording and the failure of the fusion do, unless it
     ``lasts``: then receiving, and showing the last picture, go on until it is stopped. ``remark``
-    is told what a user should read, once each.
+    is told what a user should read, once each. ``pace`` is the clock that pictures and ``seconds``
+    go by.
     """
 
     def __init__(
@@ -81,6 +82,7 @@ class Session:
         seconds: float | None = None,
         lasts: bool = False,
         remark: Callable[[str], None] = lambda _: None,
+        pace: Callable[[], float] = time.monotonic,
     ) -> None:
         self.outcome = Outcome()
         self._source = source
@@ -92,6 +94,7 @@ class Session:
         self._seconds = seconds
         self._lasts = lasts
         self._remark = remark
+        self._pace = pace
         self._desk = Desk(lambda unix_s: source.now_s() - (time.time() - unix_s))
         self._stopped = threading.Event()
         self._notices: dict[str, Notice] = {}
@@ -117,7 +120,7 @@ class Session:
 
         Ctrl-C ends it. DeviceError where the port vanishes and is not to be opened again.
         """
-        started_s = time.monotonic()
+        started_s = self._pace()
         before_s = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
         try:
@@ -128,7 +131,7 @@ class Session:
                         self._take(received)
                         yield from received.observations
                     self._look()
-                    if self._seconds is not None and time.monotonic() - started_s > self._seconds:
+                    if self._seconds is not None and self._pace() - started_s > self._seconds:
                         return
                     if not self._lasts and (self._source.over() or self._fusing.failure):
                         return
@@ -166,7 +169,7 @@ class Session:
         """How long to wait for bytes: until a picture with news in it is due."""
         if not self._news:
             return WAIT_S
-        return min(max(self._pictured_s + PICTURE_S - time.monotonic(), 0.0), WAIT_S)
+        return min(max(self._pictured_s + PICTURE_S - self._pace(), 0.0), WAIT_S)
 
     def _take(self, received: Received) -> None:
         now_s = self._source.now_s()
@@ -295,13 +298,13 @@ class Session:
         if not self._pictures:
             self._news = False
             return
-        since_s = time.monotonic() - self._pictured_s
+        since_s = self._pace() - self._pictured_s
         if since_s >= (PICTURE_S if self._news else IDLE_PICTURE_S):
             self._picture(self._source.now_s())
 
     def _picture(self, now_s: float) -> Picture:
         self._news = False
-        self._pictured_s = time.monotonic()
+        self._pictured_s = self._pace()
         picture = self._composer.picture(
             now_s, time.time(), self._arrived_unix_s, self._notices.values()
         )
