@@ -367,3 +367,22 @@ def test_two_robots_of_which_one_stands_are_never_said_to_be_located() -> None:
     assert len(inside) > 80
     assert np.mean(inside) > 0.97
     assert rings > 0.9 * len(inside)
+
+
+def test_who_stand_on_one_spot_are_not_told_closer_than_their_ranges_can_say() -> None:
+    rng = np.random.default_rng(4)
+    nodes = (1, 2, 3, 4)
+    measurements: list[Measurement] = []
+    for second in range(1, 7):
+        measurements += [
+            Range(second - 0.5, a, b, max(abs(rng.normal(0.0, 0.1)), 0.01))
+            for a in nodes
+            for b in nodes
+            if a < b
+        ]
+        measurements += [Motion(float(second), n, 0.0, 0.0, 0.0) for n in nodes]
+    estimator = fusion.make("bank", (), {}, 0)
+    estimates = [e for m in measurements for e in estimator.process(m)]
+    sigmas = [p.sigma_distance_m for e in estimates for p in e.pairs]
+    assert sigmas
+    assert min(sigmas) > 0.02

@@ -700,9 +700,12 @@ def _pair_of_pictures(
 ) -> PairEstimate:
     """Distance and bearing of a pair whose difference is a mixture: (K, 2), (K, 2, 2)."""
     distance = np.hypot(off[:, 0], off[:, 1])
-    unit = off / np.maximum(distance, 1e-9)[:, None]
-    along = np.einsum("ka,kab,kb->k", unit, spread, unit)
-    across = np.trace(spread, axis1=1, axis2=2) - along
+    both = np.trace(spread, axis1=1, axis2=2)
+    # On the same spot no direction is along; one is as good as the other.
+    apart = distance > 1e-3 * np.sqrt(both)
+    unit = np.where(apart[:, None], off / np.where(apart, distance, 1.0)[:, None], 0.0)
+    along = np.where(apart, np.einsum("ka,kab,kb->k", unit, spread, unit), 0.5 * both)
+    across = both - along
     # To second order, as the joint filter's range: E d^2 = |off|^2 + across.
     distance = np.sqrt(distance**2 + across)
     middle = float(weights @ distance)
