@@ -18,6 +18,7 @@ from relpos.emulator.pty import PseudoTerminal
 from relpos.emulator.team import EmulatedTeam
 from relpos.emulator.xbee import XbeeModule
 from relpos.errors import DeviceError
+from relpos.fusion import machine_code
 from relpos.link import xbee
 from relpos.link.authentication import write_new_key
 
@@ -139,7 +140,7 @@ def test_kernels_are_ready_once_their_machine_code_is_newer_than_they(tmp_path):
     state, _, remedy = said(installed(tmp_path, variables=environment), "estimators")
     assert (state, remedy) == ("hint", "relpos doctor --prepare")
     (tmp_path / "numba").mkdir()
-    for module in installation.KERNELS:
+    for module in machine_code.KERNELS:
         version = "".join(map(str, sys.version_info[:2]))
         (tmp_path / "numba" / f"{module}.f-1.py{version}.nbi").touch()
     assert said(installed(tmp_path, variables=environment), "estimators")[0] == "well"
@@ -151,8 +152,8 @@ def test_the_kernels_that_are_looked_for_are_those_that_are_prepared(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     subprocess.run([sys.executable, "-c", program], env=environment, check=True, timeout=900)
     prepared = {path.name.split(".")[0] for path in tmp_path.rglob("*.nbi")}
-    assert set(installation.KERNELS) <= prepared
-    assert prepared - set(installation.KERNELS) <= {"slips", "hypotheses", "detection"}
+    assert set(machine_code.KERNELS) <= prepared
+    assert prepared - set(machine_code.KERNELS) <= {"slips", "hypotheses", "detection"}
 
 
 def test_kernels_that_cannot_be_kept_are_wrong(tmp_path):

@@ -40,9 +40,6 @@ def recorded(tmp_path_factory):
 
     The bytes come as fast as they are taken; frames of virtual time say when they arrived.
     """
-    # The process that compiles the kernels may add up in another order than those that find them.
-    compile_first = "from relpos.fusion import warm_up; warm_up('bank')"
-    subprocess.run([sys.executable, "-c", compile_first], check=True)
     folder = tmp_path_factory.mktemp("replay")
     path, out = folder / "walk.mcap", folder / "live"
     stream = [

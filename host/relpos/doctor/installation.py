@@ -12,8 +12,6 @@ from relpos.doctor.computer import Computer
 from relpos.doctor.finding import Finding, hint, well, wrong
 from relpos.errors import RelposError
 
-KERNELS = ("bank_kernels", "joint", "lanes", "noise", "particle_kernels", "starts_kernels")
-"""Modules with kernels that sessions need (fusion.warm_up); others compile when they are used."""
 MEGABYTE = 1_000_000
 ROOM_TOO_LITTLE = 200 * MEGABYTE
 ROOM_LITTLE = 2000 * MEGABYTE
@@ -65,38 +63,23 @@ def _extras() -> Iterator[Finding]:
 
 
 def _kernels(computer: Computer) -> Finding:
-    from relpos import fusion
+    from relpos.fusion import machine_code
 
-    sources = Path(fusion.__file__).parent
     name = "estimators"
-    pattern = f"py{sys.version_info.major}{sys.version_info.minor}"
-    folders = _kernel_folders(computer, sources)
+    folders = machine_code.folders(computer.environment("NUMBA_CACHE_DIR"))
     if not any(computer.may_write(folder) for folder in folders):
         return wrong(
             name,
             f"what is compiled cannot be kept ({folders[0]}): every start waits a minute",
             "name a folder that can be written: export NUMBA_CACHE_DIR=$HOME/.cache/numba",
         )
-    for module in KERNELS:
-        source = (sources / f"{module}.py").stat().st_mtime
-        files = (f for folder in folders for f in folder.rglob(f"{module}.*.{pattern}.nbi"))
-        if not any(f.stat().st_mtime >= source for f in files):
-            return hint(
-                name,
-                "not compiled yet: the first start takes a minute longer",
-                "relpos doctor --prepare",
-            )
+    if not machine_code.is_kept(folders):
+        return hint(
+            name,
+            "not compiled yet: the first start takes a minute longer",
+            "relpos doctor --prepare",
+        )
     return well(name, "compiled, a session starts at once")
-
-
-def _kernel_folders(computer: Computer, sources: Path) -> list[Path]:
-    """Where numba keeps machine code: as it is told, beside the source, else the user's cache."""
-    told = computer.environment("NUMBA_CACHE_DIR")
-    if told:
-        return [Path(told)]
-    from platformdirs import user_cache_path
-
-    return [sources / "__pycache__", user_cache_path("numba", appauthor=False)]
 
 
 def prepare() -> None:

@@ -19,6 +19,7 @@ from relpos.fusion.estimator import (
     Parameter,
     Shape,
 )
+from relpos.fusion.machine_code import compile_apart
 from relpos.fusion.particle_settings import ParticleSettings
 from relpos.fusion.ranging_model import Mounting
 from relpos.fusion.settings import SettingInfo, describe, parse
@@ -112,13 +113,19 @@ SMOOTHER_ATTEMPTS = 4
 
 
 def warm_up(name: str) -> None:
-    """Make everything compiled ready, on a made-up team of three, one of them unknown.
+    """Make everything compiled ready.
 
-    The very first time after an installation this takes about ten seconds; from then on the
-    machine code is read from disk. What an estimator of somebody else's needs is its own affair.
+    The very first time after an installation this takes up to a minute, in a process of its own
+    (:mod:`relpos.fusion.machine_code` says why); from then on the machine code is read from disk.
+    What an estimator of somebody else's needs is its own affair.
     """
-    if name not in SETTINGS:
-        return
+    if name in SETTINGS:
+        compile_apart()
+        rehearse(name)
+
+
+def rehearse(name: str) -> None:
+    """Call every kernel once, on a made-up team of three, one of them unknown."""
     team = {1: (0.0, 0.0), 2: (6.0, 0.0), 3: (2.0, 5.0)}
     estimator = make(name, [Prior(node, *team[node], 0.0, 0.1, 0.1) for node in (1, 2)])
     for k in range(1, WARM_UP_S):
