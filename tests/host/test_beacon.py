@@ -6,13 +6,13 @@ import tty
 
 import pytest
 
-from relpos.cli import source as sources
 from relpos.cli.node_watch import _watch
 from relpos.errors import DataError
 from relpos.link import xbee
 from relpos.link.authentication import HostCounter
 from relpos.link.beacon import FORGET_S, MOST_NODES, BeaconSchedule, HostBeacons
 from relpos.link.live import Link
+from relpos.live.inputs import PortInput
 from relpos.protocol import messages as wire
 
 
@@ -165,7 +165,8 @@ def test_a_command_that_listens_sends_beacons_to_whom_it_hears(command):
     path = os.ttyname(slave)
     try:
         if command == "fuse":
-            stream = iter(sources.Port(path, seconds=1.0))
+            live = PortInput(path, Link())
+            stream = (live.read(0.05) for _ in range(20))
         else:
             stream = _watch(path, 1.0, None, False)
             next(stream)

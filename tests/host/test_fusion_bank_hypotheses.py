@@ -38,14 +38,22 @@ def _run(
 
 
 def test_a_good_team_is_followed_by_one_hypothesis_and_as_well() -> None:
-    estimates, counts, bank, figures = _run("paper-p1", {**GOOD, "seconds": 400.0})
-    assert counts[-1] == 1
-    assert np.mean(np.array(counts) == 1) > 0.15
-    assert bank.counters()["hypotheses_shrunk"] >= len(hypotheses.STEPS)
-    # 0.109 m with 200 throughout (600 s).
-    assert figures.relative_distance_rmse_m < 0.125
-    again, _, _, _ = _run("paper-p1", {**GOOD, "seconds": 400.0})
-    assert [e.nodes for e in again] == [e.nodes for e in estimates]
+    alone = []
+    for seed in (0, 2):
+        _, counts, bank, figures = _run("paper-p1", {**GOOD, "seconds": 400.0}, seed)
+        assert counts[-1] == 1
+        alone.append(np.mean(np.array(counts) == 1))
+        assert bank.counters()["hypotheses_shrunk"] >= len(hypotheses.STEPS)
+        # 0.109 m with 200 throughout (600 s, seed 0).
+        assert figures.relative_distance_rmse_m < 0.125
+    # When that is certain differs: after 197 to 393 s on four seeds.
+    assert np.mean(alone) > 0.15
+
+
+def test_the_dice_of_shrinking_and_growing_are_those_of_the_seed() -> None:
+    first, again = (_run("paper-p1", {**GOOD, "seconds": 250.0}, 2) for _ in range(2))
+    assert min(first[1]) < BankSettings().hypotheses
+    assert [e.nodes for e in again[0]] == [e.nodes for e in first[0]]
 
 
 def test_a_team_whose_headings_are_poor_keeps_all_of_them() -> None:
