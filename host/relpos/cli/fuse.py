@@ -413,16 +413,8 @@ def _score(run: Run, result: Result) -> _Scored | None:
     from relpos.evaluation import report, scoring
 
     bound = scoring.bound_of(run)
-    try:
-        evaluation = scoring.evaluate(
-            run,
-            result.estimates,
-            result.priors,
-            latency=result.latency,
-            bound=None if bound is None else bound.totals(),
-        )
-    except DataError:
-        # Nothing was estimated at a time of which the truth is known.
+    evaluation = scoring.evaluate_result(run, result, bound)
+    if evaluation is None:
         return None
     return _Scored(evaluation, report.reckon(run, result), bound)
 

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from relpos.errors import RelposError
 from relpos.evaluation.iso18305 import Latency
+from relpos.runs.estimates import PAIR_COLUMNS, PARAMETER_COLUMNS
 
 if TYPE_CHECKING:
     from relpos.fusion.estimator import Estimate, Estimator, Parameter
@@ -37,16 +38,6 @@ POSE_COLUMNS = (
     "sigma_heading_rad",
     "status",
 )
-PAIR_COLUMNS = (
-    "time_s",
-    "node",
-    "peer",
-    "distance_m",
-    "sigma_distance_m",
-    "bearing_rad",
-    "sigma_bearing_rad",
-)
-PARAMETER_COLUMNS = ("time_s", "node", "peer", "name", "value", "sigma")
 _TABLES = {"poses": POSE_COLUMNS, "pairs": PAIR_COLUMNS, "parameters": PARAMETER_COLUMNS}
 
 

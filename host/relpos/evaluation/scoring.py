@@ -12,6 +12,7 @@ from relpos.evaluation import consistency, iso18305, metrics, regions, summary, 
 
 if TYPE_CHECKING:
     from relpos.evaluation.bounds import Bound, Totals
+    from relpos.evaluation.result import Result
     from relpos.fusion.estimator import Estimate
     from relpos.measurements import Prior
     from relpos.runs import Run
@@ -116,6 +117,20 @@ def evaluate(
         ),
         bound,
     )
+
+
+def evaluate_result(run: Run, result: Result, bound: Bound | None = None) -> Evaluation | None:
+    """Score a result; None where nothing was estimated at a time of which the truth is known."""
+    try:
+        return evaluate(
+            run,
+            result.estimates,
+            result.priors,
+            latency=result.latency,
+            bound=None if bound is None else bound.totals(),
+        )
+    except DataError:
+        return None
 
 
 def need_truth(run: Run) -> None:

@@ -35,7 +35,7 @@ ESTIMATE_COLUMNS = [
     "sigma_heading_rad",
     "status",
 ]
-PAIR_COLUMNS = [
+PAIR_COLUMNS = (
     "time_s",
     "node",
     "peer",
@@ -43,7 +43,7 @@ PAIR_COLUMNS = [
     "sigma_distance_m",
     "bearing_rad",
     "sigma_bearing_rad",
-]
+)
 ALTERNATIVE_COLUMNS = [
     "time_s",
     "alternative",

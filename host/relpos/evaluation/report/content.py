@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from relpos.errors import DataError, RelposError
+from relpos.errors import RelposError
 from relpos.evaluation import health, metrics, ranging, scoring, summary, tracks
 from relpos.evaluation.metrics import (
     Alignment,
@@ -142,16 +142,7 @@ def gather(
     """
     bound = bound or scoring.bound_of(run)
     if evaluation is None and run.truth:
-        try:
-            evaluation = scoring.evaluate(
-                run,
-                result.estimates,
-                result.priors,
-                latency=result.latency,
-                bound=None if bound is None else bound.totals(),
-            )
-        except DataError:
-            evaluation = None
+        evaluation = scoring.evaluate_result(run, result, bound)
     truth = tracks.true_tracks(run.truth)
     fused = tracks.located_tracks(result.estimates)
     pairs = tracks.estimated_pairs(result.estimates)
