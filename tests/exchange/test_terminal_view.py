@@ -151,6 +151,20 @@ def test_the_map_shows_who_is_where() -> None:
     assert places[3][0] < places[1][0] < places[4][0]
 
 
+def test_the_map_has_north_up_once_that_is_known() -> None:
+    shown = lines(picture(north_rad=0.0), me=1, columns=100, rows=40, table=False)
+    places = {
+        int(found[1]): (found.start(), row)
+        for row, line in enumerate(shown)
+        for found in re.finditer(r"(?<![\d?])([1-4])[↑↖←↙↓↘→↗]", line)
+    }
+    # North lies along x: what was to the right is up, and what was up is to the left.
+    assert places[2][1] < places[1][1]
+    assert places[3][0] < places[1][0] < places[4][0]
+    assert any("up: magnetic north" in line for line in shown)
+    assert any("up: y" in line for line in lines(picture(), me=1, columns=100, rows=40))
+
+
 def test_the_scale_is_true() -> None:
     shown = lines(picture(), me=1, columns=100, rows=40, table=False)
     bar = next(re.search(r"├─*┤ (\d+) m", line) for line in shown if "├" in line)

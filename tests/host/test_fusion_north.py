@@ -9,6 +9,7 @@ import pytest
 
 from relpos import fusion
 from relpos.evaluation import metrics, tracks
+from relpos.fusion.estimator import Estimate
 from relpos.fusion.north import North
 from relpos.measurements import Heading, Measurement
 from relpos.simulation.paper import simulate_paper
@@ -16,8 +17,8 @@ from relpos.simulation.paper import simulate_paper
 SIGMA_RAD = math.radians(15.0)
 
 
-def score(north_rad: float | None) -> metrics.Metrics:
-    """Two minutes of scenario P1 with a compass each, whose east lies so in the frame."""
+def score(north_rad: float | None) -> tuple[metrics.Metrics, Estimate]:
+    """Two minutes of P1 with a compass each, whose east lies so in the frame; the last estimate."""
     run = simulate_paper("paper-p1", 3, {"seconds": 120.0})
     measurements: list[Measurement] = list(run.measurements)
     if north_rad is not None:
@@ -36,23 +37,30 @@ def score(north_rad: float | None) -> metrics.Metrics:
         measurements.sort(key=lambda m: m.time_s)
     estimator = fusion.make("bank", run.priors, {}, 0)
     estimates = [e for m in measurements for e in estimator.process(m)] + estimator.finish()
-    return metrics.evaluate(
+    figures = metrics.evaluate(
         tracks.estimated_tracks(estimates),
         tracks.true_tracks(run.truth),
         tracks.estimated_pairs(estimates),
     )
+    return figures, estimates[-1]
 
 
 @pytest.fixture(scope="module")
 def without() -> metrics.Metrics:
-    return score(None)
+    figures, last = score(None)
+    assert last.north is None
+    return figures
 
 
 @pytest.mark.parametrize("north_rad", [0.0, 2.2, -3.1])
 def test_however_the_frame_lies_to_north_compasses_do_no_harm(
     north_rad: float, without: metrics.Metrics
 ) -> None:
-    figures = score(north_rad)
+    figures, last = score(north_rad)
+    assert last.north is not None
+    # A heading is told from magnetic east: north is a right angle on.
+    off_rad = math.remainder(last.north.bearing_rad - (math.pi / 2 - north_rad), math.tau)
+    assert abs(off_rad) < 3.0 * last.north.sigma_rad < math.radians(20.0)
     assert figures.relative_distance_rmse_m < 1.2 * without.relative_distance_rmse_m
     assert figures.body_frame_rmse_m < 1.1 * without.body_frame_rmse_m
 

@@ -94,6 +94,28 @@ def test_heading_up_points_the_followed_persons_marker_upwards_on_every_side(vis
     del behind
 
 
+def test_north_is_up_and_named_once_compasses_have_told_it(visit, stage: Stage):
+    stage.frozen = True
+    page = visit()
+    wait_live(page)
+    page.get_by_role("button", name="Follow Anna").first.click()
+    anna = colour_of(page, 1)
+    heading = stage.team.pose(1, stage.at_s)[2]
+    # The marker's point is told from its disc by what lies 16 pixels from its middle.
+    assert "map north up" in page.locator("#map-words").inner_text()
+    for north in (heading, heading - math.pi / 2):
+        stage.team.north_rad = north
+        point = [0, -16] if north == heading else [-16, 0]
+        wait_for(lambda at=point: page.evaluate(PIXELS, [at]) == [anna])
+    wait_for(lambda: "magnetic north up ±6°" in page.locator("#map-words").inner_text())
+    page.locator("#me").select_option("1")
+    x, y, _ = stage.team.pose(1, stage.at_s)
+    ox, oy, _ = stage.team.pose(4, stage.at_s)
+    clockwise = (stage.team.north_rad - math.atan2(oy - y, ox - x)) % math.tau
+    point = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")[round(clockwise / math.tau * 8) % 8]
+    expect(card(page, 4).locator(".compass")).to_have_text(point)
+
+
 def test_the_map_zooms_by_wheel_buttons_keys_and_two_fingers(visit, stage: Stage):
     page = visit(has_touch=True)
     wait_live(page)

@@ -45,6 +45,7 @@ class WalkingTeam:
     ring: int | None = None
     health: dict[int, tuple[str, tuple[str, ...]]] = field(default_factory=dict)
     notices: tuple[Notice, ...] = ()
+    north_rad: float | None = None
 
     def name(self, node: int) -> str:
         """Name of a node's wearer."""
@@ -126,6 +127,7 @@ class WalkingTeam:
                     ranges.append(MeasuredRange(a.node, b.node, distance_m + error_m, age_s))
         return Picture(
             seq, time_s, unix_s, unix_s - 0.02, time_s - 1.2,
+            self.north_rad, None if self.north_rad is None else 0.1,
             ambiguous=self.ambiguous is not None or self.ring is not None,
             notices=self.notices, people=people, pairs=tuple(pairs), ranges=tuple(ranges),
             alternatives=self.alternatives(people),

@@ -537,7 +537,9 @@ class Bank:
             alternatives = self._alternatives(time_s, mixture, mean, covariance)
         elif self.core.slipped:
             alternatives = self._slip_alternatives(time_s)
-        return Estimate(time_s, tuple(nodes), pairs, alternatives, tuple(parameters))
+        return Estimate(
+            time_s, tuple(nodes), pairs, alternatives, tuple(parameters), self.north.known()
+        )
 
     def _tell_mode(self, row: int, pose: list[float], own: Floats) -> None:
         """Put the most likely place for the mean of a slipped user's places, in place."""

@@ -128,13 +128,22 @@ class Parameter:
 
 
 @dataclass(frozen=True, slots=True)
+class MagneticNorth:
+    """Where magnetic north lies in the common frame, as compasses have told."""
+
+    bearing_rad: float
+    sigma_rad: float
+
+
+@dataclass(frozen=True, slots=True)
 class Estimate:
     """All nodes at one time in one common frame.
 
     The frame is that of the priors where there are any, else the pose of the first located node
     at the start. ``nodes`` is ordered by node id, ``pairs`` holds node < peer of every two
     located nodes (of large teams: of those within reach of each other). ``alternatives`` is
-    empty unless something is ambiguous; ``parameters`` is what has been learned so far.
+    empty unless something is ambiguous; ``parameters`` is what has been learned so far; ``north``
+    is None where no compass has told anything of it.
     """
 
     time_s: float
@@ -142,6 +151,7 @@ class Estimate:
     pairs: tuple[PairEstimate, ...]
     alternatives: tuple[Alternative, ...] = ()
     parameters: tuple[Parameter, ...] = ()
+    north: MagneticNorth | None = None
 
 
 @runtime_checkable

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-from relpos.fusion.estimator import ANY_ANGLE_RAD
+from relpos.fusion.estimator import ANY_ANGLE_RAD, MagneticNorth
 
 CORRELATED_S = 10.0
 """Iron in a building disturbs over 3 to 10 m, some ten seconds of walking."""
@@ -35,6 +35,15 @@ class North:
     def snapshot(self) -> North:
         """Give a copy that goes on by itself."""
         return replace(self, _told_s=self._told_s.copy())
+
+    def known(self) -> MagneticNorth | None:
+        """Where north lies; None while nothing has been told."""
+        if self.sigma_rad >= ANY_ANGLE_RAD:
+            return None
+        # A heading of pi/2 from magnetic east is north, and the frame's own is less the angle.
+        return MagneticNorth(
+            math.remainder(0.5 * math.pi - self.angle_rad, math.tau), self.sigma_rad
+        )
 
     def alone_sigma_rad(self, node: int, time_s: float, sigma_rad: float) -> float:
         """Deviation of a reading such that its node's readings may be taken as independent."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
+from relpos.fusion.estimator import Estimate, MagneticNorth, NodeEstimate, NodeStatus
 from relpos.live.alarms import Alarms, Condition
 from relpos.live.nowcast import Nowcast
 from relpos.live.picture import (
@@ -30,6 +31,10 @@ RANGE_AGE_S = 10.0
 STALE_S = 3.0
 """Silence after which somebody is shown as stale, as after three epochs in an estimator."""
 HEALTH_S = 0.5
+NORTH_KNOWN_RAD = math.radians(15.0)
+"""With a larger deviation one in seven would be sent to the wrong one of eight compass points."""
+NORTH_MOVES_RAD = math.radians(4.0)
+"""A map that turned with every reading could not be read; less than this nobody can tell."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +64,7 @@ class Composer:
         self._ranges: dict[tuple[int, int], Range] = {}
         self._paired: dict[tuple[int, int], tuple[tuple[int, int], Pair]] = {}
         self._healths: dict[int, _Health] = {}
+        self._north: MagneticNorth | None = None
         self._given = 0
         self._seq = 0
         self.first_s: float | None = None
@@ -98,6 +104,7 @@ class Composer:
     def estimated(self, estimate: Estimate, given: int) -> None:
         """Take an estimate that came out when ``given`` observations had been worked off."""
         self.nowcast.fused(estimate, given)
+        self._north = _shown_north(self._north, estimate.north)
 
     def picture(
         self,
@@ -117,6 +124,8 @@ class Composer:
             unix_s=unix_s,
             arrived_unix_s=arrived_unix_s,
             fused_s=None if estimate is None else estimate.time_s,
+            north_rad=None if self._north is None else self._north.bearing_rad,
+            sigma_north_rad=None if self._north is None else self._north.sigma_rad,
             ambiguous=estimate is not None and bool(estimate.alternatives),
             notices=tuple(notices),
             people=tuple(self._person(node, now_s) for node in people),
@@ -222,6 +231,18 @@ class Composer:
             neighbours=health.neighbours,
             **({} if at is None else _pose(at)),
         )
+
+
+def _shown_north(shown: MagneticNorth | None, known: MagneticNorth | None) -> MagneticNorth | None:
+    """Return what is to be shown of north: what is, as long as that is near enough."""
+    if known is None or known.sigma_rad > NORTH_KNOWN_RAD:
+        return None
+    moved_rad = math.inf
+    if shown is not None:
+        moved_rad = abs(math.remainder(known.bearing_rad - shown.bearing_rad, math.tau))
+    if shown is None or moved_rad > NORTH_MOVES_RAD:
+        return known
+    return MagneticNorth(shown.bearing_rad, known.sigma_rad)
 
 
 def _pose(at: NodeEstimate) -> dict[str, float]:

@@ -131,7 +131,8 @@ class Picture:
     """Everybody at ``time_s``.
 
     ``arrived_unix_s`` is when the newest packet in it arrived; ``fused_s`` the time of the newest
-    fused estimate. Pairs have node < peer, of those who are located.
+    fused estimate. Pairs have node < peer, of those who are located. ``north_rad`` is the bearing
+    of magnetic north in the common frame, None while that is not known well enough to go by.
     """
 
     seq: int
@@ -139,6 +140,8 @@ class Picture:
     unix_s: float
     arrived_unix_s: float | None = None
     fused_s: float | None = None
+    north_rad: float | None = None
+    sigma_north_rad: float | None = None
     ambiguous: bool = False
     notices: tuple[Notice, ...] = ()
     people: tuple[Person, ...] = ()
@@ -160,6 +163,8 @@ class Picture:
             "unix_s": _plain(self.unix_s),
             "arrived_unix_s": _plain(self.arrived_unix_s),
             "fused_s": _plain(self.fused_s),
+            "north_rad": _plain(self.north_rad),
+            "sigma_north_rad": _plain(self.sigma_north_rad),
             "ambiguous": self.ambiguous,
             "notices": [_fields(notice) for notice in self.notices],
             "people": [_fields(person) for person in self.people],

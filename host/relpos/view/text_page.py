@@ -369,7 +369,7 @@ def _arrow(bearing_rad: float | None, looks: Looks) -> str:
 
 
 def _keys(looks: Looks) -> Text:
-    up = "y up" if looks.heading_up else "face up"
+    up = "map up" if looks.heading_up else "face up"
     bell = "bell on" if looks.muted else "bell off"
     words = f"m/M other me  +/- zoom  0 all  u {up}  t table  c chart  b {bell}  q quit"
     return _line(words, looks, "dim")
@@ -422,7 +422,7 @@ class Canvas:
 
 
 def _map(picture: Picture, me: Person | None, looks: Looks, columns: int, rows: int) -> list[Text]:
-    """Return the map: me in the middle, y (or where I face) up, a scale below."""
+    """Return the map: me in the middle, north (unknown: y) or where I face up, a scale below."""
     canvas = Canvas(columns, rows - 1, utf8=looks.utf8)
     middle = _xy(me) if me is not None else None
     places = {p.node: xy for p in picture.people if (xy := _xy(p)) is not None}
@@ -434,7 +434,7 @@ def _map(picture: Picture, me: Person | None, looks: Looks, columns: int, rows: 
     if middle is None:
         return [_line("    (nobody is located yet)", looks, "dim")]
     x0, y0 = middle
-    turn = 0.0
+    turn = 0.0 if picture.north_rad is None else 0.5 * math.pi - picture.north_rad
     if looks.heading_up and me is not None and me.heading_rad is not None:
         turn = 0.5 * math.pi - me.heading_rad
     c, s = math.cos(turn), math.sin(turn)
@@ -468,7 +468,9 @@ def _map(picture: Picture, me: Person | None, looks: Looks, columns: int, rows: 
             mark = {0: "!", 1: "!", 2: "!"}.get(_urgency(person), "")
             words = f"{person.node}{mark}" + _faces(person, turn, looks)
             canvas.write(*_label(at(*places[person.node]), words))
-    return [_line(line, looks) for line in (*canvas.lines(), _scale(canvas, dots_per_m, looks))]
+    return [
+        _line(line, looks) for line in (*canvas.lines(), _scale(canvas, dots_per_m, looks, picture))
+    ]
 
 
 def _label(at: tuple[float, float], words: str) -> tuple[float, float, str]:
@@ -524,14 +526,15 @@ def _faces(person: Person, turn: float, looks: Looks) -> str:
     return _arrow(_wrapped(person.heading_rad + turn - 0.5 * math.pi), looks)
 
 
-def _scale(canvas: Canvas, dots_per_m: float, looks: Looks) -> str:
+def _scale(canvas: Canvas, dots_per_m: float, looks: Looks, picture: Picture) -> str:
     """Return a scale bar of 1, 2 or 5 times a power of ten, at most a quarter of the width."""
     most_m = 0.25 * canvas.width / dots_per_m
     power = 10.0 ** math.floor(math.log10(most_m))
     length_m = next(f * power for f in (5.0, 2.0, 1.0) if f * power <= most_m)
     cells = max(round(length_m * dots_per_m / 2.0), 2)
     ends, line = ("├┤", "─") if looks.utf8 else ("||", "-")
-    up = "up: where I face" if looks.heading_up else "up: y"
+    unturned = "y" if picture.north_rad is None else "magnetic north"
+    up = "up: where I face" if looks.heading_up else f"up: {unturned}"
     return f"{ends[0]}{line * (cells - 2)}{ends[1]} {length_m:g} m  {up}"
 
 

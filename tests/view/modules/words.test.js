@@ -1,7 +1,7 @@
 import { contrast, inkOn, palette, personColour } from "/static/js/colours.js";
 import { connectionWords, dataAgeS } from "/static/js/status_line.js";
 import {
-  ago, alarmText, compass, dbm, distance, duration, percent, plusMinus, probability, seconds, side,
+  ago, alarmText, compass, compassShort, dbm, distance, duration, percent, plusMinus, probability, seconds, side,
   spokenDistance, volts, whereabouts, whichWay,
 } from "/static/js/words.js";
 import { equal, near, ok, test } from "./check.js";
@@ -41,12 +41,14 @@ test("sides are those of the body", () => {
 });
 
 test("compass words say whose north it is", () => {
-  equal([compass(0, true), compass(0, false)], ["east", "map east"]);
+  equal([compass(0, Math.PI / 2), compass(0, null)], ["east", "map east"]);
+  // North lies along the map's x axis: what is up on it is west.
+  equal([compass(Math.PI / 2, 0), compassShort(0, 0)], ["west", "N"]);
 });
 
 test("whereabouts are one line for the ear", () => {
   const relation = { distanceM: 12.3, sigmaM: 0.42, relativeRad: -1.05, bearingRad: 0.8 };
-  equal(plain(whereabouts(relation, false)), "12 m ±0.4 m · 2 o'clock, ahead right · map north-east");
+  equal(plain(whereabouts(relation, null)), "12 m ±0.4 m · 2 o'clock, ahead right · map north-east");
   equal(whereabouts(null, true), "position unknown");
 });
 

@@ -31,9 +31,9 @@ const POINTS = [
   ["NW", "north-west"],
 ];
 
-/** The nearest of eight compass points: {short: "NE", words: "north-east"}; y is north. */
-export function compassPoint(bearingRad) {
-  const eighth = Math.round((Math.PI / 2 - bearingRad) / (TAU / 8));
+/** The nearest of eight compass points: {short: "NE", words: "north-east"}. */
+export function compassPoint(bearingRad, northRad = Math.PI / 2) {
+  const eighth = Math.round((northRad - bearingRad) / (TAU / 8));
   const [short, words] = POINTS[((eighth % 8) + 8) % 8];
   return { short, words };
 }

@@ -7,7 +7,7 @@ import { TrackLayer } from "./track_layer.js";
 import {
   clampScale, fit, gridStep, headingUp, isLoose, pan, scaleBar, toMap, toScreen, zoomAt,
 } from "./transform.js";
-import { distance, probability, seconds, sureHere } from "./words.js";
+import { distance, plusMinusDegrees, probability, seconds, sureHere } from "./words.js";
 
 const TAIL_S = 30;
 const MINUTE_S = 60;
@@ -161,7 +161,7 @@ export class TeamMap {
     const person = this.headingPerson();
     const turned = this.up === "heading" && person && Number.isFinite(person.heading_rad) &&
       (person.sigma_heading_rad ?? 0) < VAGUE_RAD;
-    const rotation = turned ? headingUp(person.heading_rad) : 0;
+    const rotation = headingUp(turned ? person.heading_rad : this.team.northRad ?? Math.PI / 2);
     // Without a heading to turn by, the map stays as it was turned last.
     if (this.up === "north" || turned) this.view = { ...this.view, rotation };
     if (this.camera.mode === "follow") {
@@ -723,7 +723,8 @@ export class TeamMap {
     const [x, y] = [view.width - 30 * unit, 34 * unit];
     context.save();
     context.translate(x, y);
-    context.rotate(-view.rotation);
+    const northRad = this.team.northRad ?? Math.PI / 2;
+    context.rotate(headingUp(northRad) - view.rotation);
     context.beginPath();
     context.moveTo(0, -20 * unit);
     context.lineTo(8 * unit, 8 * unit);
@@ -736,7 +737,7 @@ export class TeamMap {
     context.stroke();
     context.fill();
     context.restore();
-    const text = this.team.northKnown ? "N" : "map N";
+    const text = this.team.northRad === null ? "map N" : "N";
     this.write(text, x - this.width(text, 12, true) / 2, y + 22 * unit, 12, true, colours.ink);
   }
 
@@ -847,7 +848,8 @@ export class TeamMap {
     if (this.camera.mode === "follow") {
       parts.push(`following ${this.team.person(this.camera.node)?.name ?? "nobody"}`);
     }
-    parts.push(this.up === "heading" ? `${this.headingPerson()?.name ?? "heading"} up` : "map north up");
+    parts.push(this.up === "heading" ? `${this.headingPerson()?.name ?? "heading"} up`
+      : this.team.northRad === null ? "map north up" : `magnetic north up ${plusMinusDegrees(this.team.sigmaNorthRad)}`);
     parts.push(`about ${distance(this.view.width / this.view.scale, 1)} across`);
     return `${parts.join(", ")}.`;
   }

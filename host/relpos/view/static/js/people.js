@@ -59,7 +59,7 @@ class Card {
       this.state, make("dl", { class: "facts" }, ...facts), this.reasons);
   }
 
-  show(person, { colour, me, meName, relation, northKnown, alarm, here, selected, followed }) {
+  show(person, { colour, me, meName, relation, northRad, alarm, here, selected, followed }) {
     const { element } = this;
     setAttribute(element, "data-status", person.status);
     setAttribute(element, "data-health", person.health);
@@ -84,7 +84,7 @@ class Card {
       setText(this.sigma, relation ? plusMinus(relation.sigmaM) : "");
       setText(this.direction, !relation ? "position unknown"
         : whichWay(relation));
-      setText(this.compass, relation ? compassShort(relation.bearingRad, northKnown) : "");
+      setText(this.compass, relation ? compassShort(relation.bearingRad, northRad) : "");
     }
     setText(this.state, stateWords(person, alarm, here));
     const facts = {
@@ -134,7 +134,7 @@ export class PeopleList {
         me: person.node === look.me,
         meName: team.person(look.me)?.name ?? null,
         relation: look.me === null ? null : team.relation(look.me, person.node),
-        northKnown: team.northKnown,
+        northRad: team.northRad,
         alarm: look.alarms.active.get(person.node),
         here: here.get(person.node),
         selected: person.node === look.selected,
@@ -168,8 +168,8 @@ export function tableRow(team, person, me) {
     placed ? number(person.x_m) : UNKNOWN,
     placed ? number(person.y_m) : UNKNOWN,
     placed ? number(person.sigma_major_m) : UNKNOWN,
-    placed && faces ? compass(person.heading_rad, team.northKnown) : UNKNOWN,
-    me === null ? UNKNOWN : me === person.node ? "me" : whereabouts(team.relation(me, person.node), team.northKnown),
+    placed && faces ? compass(person.heading_rad, team.northRad) : UNKNOWN,
+    me === null ? UNKNOWN : me === person.node ? "me" : whereabouts(team.relation(me, person.node), team.northRad),
     ranges.join(", ") || UNKNOWN,
   ];
 }

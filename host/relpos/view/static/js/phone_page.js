@@ -128,7 +128,7 @@ function showTeam() {
     setText(row.sigma, relation ? plusMinus(relation.sigmaM) : "");
     setText(row.where, !relation ? (me ? "position unknown" : "say who you are first")
       : relation.relativeRad === null
-        ? `${whichWay(relation)} · ${compass(relation.bearingRad, team.northKnown)}`
+        ? `${whichWay(relation)} · ${compass(relation.bearingRad, team.northRad)}`
         : `${clock(relation.relativeRad)}, ${side(relation.relativeRad)}`);
     setText(row.state, stateWords(person, alarm, here.get(person.node)));
     row.find.disabled = !me;

@@ -25,6 +25,9 @@ export class Team {
     this.notices = [];
     this.tracks = new Map();
     this.ambiguous = false;
+    /** Bearing of magnetic north in the common frame; null while unknown. */
+    this.northRad = null;
+    this.sigmaNorthRad = null;
     this.timeS = null;
     this.unixS = null;
     this.arrivedUnixS = null;
@@ -64,6 +67,8 @@ export class Team {
     this.unixS = picture.unix_s;
     this.arrivedUnixS = picture.arrived_unix_s;
     this.ambiguous = Boolean(picture.ambiguous);
+    this.northRad = picture.north_rad ?? null;
+    this.sigmaNorthRad = picture.sigma_north_rad ?? null;
     this.notices = picture.notices ?? [];
     this.ranges = picture.ranges ?? [];
     this.alternatives = picture.alternatives ?? [];
@@ -100,11 +105,6 @@ export class Team {
   /** How `from` sees `to` (numbers); null where either is unknown. */
   relation(from, to) {
     return relation(this.person(from), this.person(to), this.pairs.get(pairKey(from, to)) ?? null);
-  }
-
-  /** Does the map's y axis point north? */
-  get northKnown() {
-    return this.session?.north_known === true;
   }
 
   /**

@@ -1,6 +1,6 @@
 // Numbers and directions as people read and hear them.
 
-import { clockHour, compassPoint } from "./angles.js";
+import { clockHour, compassPoint, degrees } from "./angles.js";
 
 export const UNKNOWN = "–";
 const NBSP = "\u00a0"; // a figure and its unit stay on one line
@@ -15,6 +15,11 @@ export function distance(m, sigmaM = 0) {
 export function plusMinus(sigmaM) {
   if (!Number.isFinite(sigmaM)) return "";
   return `±${Math.max(sigmaM, 0.1).toFixed(sigmaM < 9.95 ? 1 : 0)}${NBSP}m`;
+}
+
+/** "±8°": one standard deviation; none below half a degree. */
+export function plusMinusDegrees(sigmaRad) {
+  return Number.isFinite(sigmaRad) ? `±${Math.max(degrees(sigmaRad), 1).toFixed(0)}°` : "";
 }
 
 /** For the ear: "4 metres", "half a metre"; nobody hears tenths. */
@@ -95,16 +100,14 @@ export function side(relativeRad) {
   return EIGHTHS[((eighth % 8) + 8) % 8];
 }
 
-/** "north-east"; on a map whose y axis is nobody's north, "map north-east". */
-export function compass(bearingRad, northKnown) {
-  const { words } = compassPoint(bearingRad);
-  return northKnown ? words : `map ${words}`;
+/** "north-east"; where north is unknown (null) "map north-east", the map's y axis being its north. */
+export function compass(bearingRad, northRad) {
+  return northRad === null ? `map ${compassPoint(bearingRad).words}` : compassPoint(bearingRad, northRad).words;
 }
 
 /** "NE", or "map NE". */
-export function compassShort(bearingRad, northKnown) {
-  const { short } = compassPoint(bearingRad);
-  return northKnown ? short : `map ${short}`;
+export function compassShort(bearingRad, northRad) {
+  return northRad === null ? `map ${compassPoint(bearingRad).short}` : compassPoint(bearingRad, northRad).short;
 }
 
 /** The direction in short: "2 o'clock"; where it is too vague, why that is or does not matter. */
@@ -114,7 +117,7 @@ export function whichWay(relation) {
 }
 
 /** One line of where somebody is, for lists and for screen readers. */
-export function whereabouts(relation, northKnown) {
+export function whereabouts(relation, northRad) {
   if (!relation) return "position unknown";
   const parts = [`${distance(relation.distanceM, relation.sigmaM)} ${plusMinus(relation.sigmaM)}`.trim()];
   if (relation.relativeRad !== null) {
@@ -122,7 +125,7 @@ export function whereabouts(relation, northKnown) {
   } else {
     parts.push(whichWay(relation));
   }
-  parts.push(compass(relation.bearingRad, northKnown));
+  parts.push(compass(relation.bearingRad, northRad));
   return parts.join(" · ");
 }
 
