@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, pairs_of
+from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, Parameter, pairs_of
 from relpos.live.nowcast import Nowcast
 from relpos.measurements import Motion
 
@@ -88,6 +88,15 @@ def test_a_newer_estimate_takes_the_place_of_what_was_composed():
     moved = node_estimate(x_m=-4.0, y_m=0.5, heading_rad=-1.0)
     nowcast.fused(estimate(2.0, moved), 2)
     assert_pose(nowcast.node(1), (-4.0, 0.5, -1.0))
+
+
+def test_steps_are_as_long_as_the_estimator_has_learned():
+    nowcast = Nowcast()
+    nowcast.take(motion(1.0), 1)
+    learned = Parameter(1.0, 1, None, "step_scale", 0.8, 0.02)
+    nowcast.fused(replace(estimate(1.0), parameters=(learned,)), 1)
+    nowcast.take(motion(2.0, 1.0, -0.5, 0.3), 2)
+    assert_pose(nowcast.node(1), composed((2.0, 1.0, 0.5), (0.8, -0.4, 0.3)))
 
 
 def test_the_covariance_grows_as_a_filters_prediction():

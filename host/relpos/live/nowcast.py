@@ -2,9 +2,9 @@
 
 The fused estimate is a second or two old, because it waits for every node; a motion is known as
 soon as its packet is there. So the motions that an estimate does not contain are composed onto
-it, the chord that it ends in cut as the estimator cuts it (:mod:`relpos.fusion.timeline`), and
-the covariance grows by what the motions bring with them. Every figure comes from what was
-measured; nothing is extrapolated.
+it, the chord that it ends in cut as the estimator cuts it (:mod:`relpos.fusion.timeline`), their
+lengths as the estimator has learned them (``step_scale``), and the covariance grows by what the
+motions bring with them. Every figure comes from what was measured; nothing is extrapolated.
 """
 
 from __future__ import annotations
@@ -86,6 +86,7 @@ class _Track:
     chords: deque[_Chord] = field(default_factory=lambda: deque(maxlen=MOST_CHORDS))
     fused: NodeEstimate | None = None
     pose: _Pose | None = None
+    step_scale: float = 1.0
     version: int = 0
 
 
@@ -112,16 +113,18 @@ class Nowcast:
         track.chords.append(chord)
         track.version += 1
         if track.pose is not None:
-            self._compose(track.pose, chord, -math.inf, known=False)
+            self._compose(track, track.pose, chord, -math.inf, known=False)
 
     def fused(self, estimate: Estimate, given: int) -> None:
         """Take an estimate that came out when the fusion had worked off ``given`` things."""
         self.estimate = estimate
+        scales = {p.node: p.value for p in estimate.parameters if p.name == "step_scale"}
         for node in estimate.nodes:
             track = self._tracks.get(node.node)
             if track is None:
                 track = self._tracks[node.node] = _Track(self._start_s)
             track.fused = node
+            track.step_scale = scales.get(node.node, 1.0)
             track.version += 1
             chords = track.chords
             while chords and chords[0].number <= given:
@@ -138,11 +141,16 @@ class Nowcast:
                 node.covariance_xy_m2,
             )
             for chord in chords:
-                self._compose(track.pose, chord, estimate.time_s, known=chord.number <= given)
+                known = chord.number <= given
+                self._compose(track, track.pose, chord, estimate.time_s, known=known)
 
-    def _compose(self, pose: _Pose, chord: _Chord, since_s: float, *, known: bool) -> None:
+    def _compose(
+        self, track: _Track, pose: _Pose, chord: _Chord, since_s: float, *, known: bool
+    ) -> None:
         moved, share = chord.after(since_s, known=known)
-        pose.move(moved, self._sigmas(chord, moved, share))
+        sigmas = self._sigmas(chord, moved, share)
+        scale = track.step_scale
+        pose.move(Displacement(scale * moved.dx_m, scale * moved.dy_m, moved.dtheta_rad), sigmas)
 
     def _sigmas(
         self, chord: _Chord, moved: Displacement, share: float
