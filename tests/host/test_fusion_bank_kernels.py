@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from relpos.fusion import bank_kernels, hypotheses, joint, lanes, noise, slips
+from relpos.fusion.detection import LENGTH, Detection, teach
 from relpos.fusion.joint import PER_NODE, Of
 from relpos.fusion.twins import bank as small
 from relpos.fusion.twins import joint as twins
@@ -334,6 +335,36 @@ def test_a_pictures_bend_is_the_twins(nodes: int) -> None:
     assert hypotheses.bend(mean, covariance, 0.2, metre) == pytest.approx(
         small.bend(mean, covariance, 0.2, metre), rel=1e-12
     )
+
+
+@pytest.mark.parametrize("on_one_spot", [False, True])
+def test_what_an_estimate_says_of_pairs_is_the_twins(on_one_spot: bool) -> None:
+    x, p = states(1, 8)
+    if on_one_spot:
+        x[0, 5:7] = x[0, 0:2]
+    rows = list(range(NODES))
+    got = bank_kernels.pairs(x[0], p[0], np.array(rows))
+    assert got == pytest.approx(small.pairs(x[0], p[0], rows), rel=1e-9, abs=1e-12)
+
+
+def test_what_a_round_teaches_of_hearing_is_the_twins() -> None:
+    rng = np.random.default_rng(2)
+    pairs = np.array([(a, b) for a in range(5) for b in range(a + 1, 5)])
+    learned = [
+        (np.ones(5), np.full((5, 5), np.nan), np.zeros((2, LENGTH)), np.array([0.0, 25.0, 0.0]))
+        for _ in range(2)
+    ]
+    curve = Detection().curve
+    for heard in (10, 4, 0, 6, 1):
+        some = rng.permutation(pairs)
+        first, second = some[:, 0].copy(), some[:, 1].copy()
+        distance, sigma = rng.uniform(0.0, 130.0, 10), rng.uniform(0.0, 2.0, 10)
+        witnessed = rng.integers(0, 2, heard).astype(float)
+        given = first, second, heard, witnessed, distance, sigma, curve
+        tried = bank_kernels.teach(*given, *learned[0])
+        assert tried == pytest.approx(teach(*given, *learned[1]), abs=1e-12)
+        for got, expected in zip(*learned, strict=True):
+            assert got == pytest.approx(expected, abs=1e-9, nan_ok=True)
 
 
 def test_cumulative_sums_are_the_twins_until_and_after_an_alarm() -> None:

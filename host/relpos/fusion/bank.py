@@ -11,15 +11,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field
-from functools import lru_cache
+from dataclasses import dataclass, field, replace
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import RelposError
+from relpos.fusion import bank_kernels
 from relpos.fusion.ambiguity import believe, pictures
 from relpos.fusion.bank_core import BankCore, Snapshot
 from relpos.fusion.bank_settings import BankSettings
@@ -33,6 +34,7 @@ from relpos.fusion.estimator import (
     PairEstimate,
     Parameter,
     Presence,
+    Rows,
     refuse_unmoved,
     refuse_unranged,
 )
@@ -117,7 +119,7 @@ class Bank:
     seed: int = 0
     mounting: Mapping[int, Mounting] = field(default_factory=dict)
     core: BankCore = field(init=False)
-    detection: Detection = field(default_factory=Detection)
+    detection: Detection = field(default_factory=lambda: Detection(teach=bank_kernels.teach))
     repetition: Repetition = field(default_factory=Repetition)
     habit: Habit = field(default_factory=Habit)
     stillness: Stillness = field(default_factory=Stillness)
@@ -486,67 +488,67 @@ class Bank:
         for known in self._known.values():
             known.close_epoch(self._epoch_s)
         self._epoch_s = time_s
-        mean, covariance = self.core.moments()
+        mean, covariance = self.core.moments(poses_alone=True)
         if self.core.slipped:
             self.core.find_slipped(covariance)
-        mixture = self.starts.mixture
-        means, variances = mean.tolist(), covariance.diagonal().tolist()
-        nodes, parameters = [], []
-        for node in sorted(self._known):
+        slipped = self.core.slipped
+        told = []
+        for node, row in sorted(self._row.items()):
             known = self._known[node]
-            row = self._row.get(node)
-            if row is None:
-                nodes.append(self._sought(node, known, mixture))
-                continue
-            at = PER_NODE * row
-            pose = means[at : at + PER_NODE]
-            if row in self.core.slipped:
-                own = covariance[at : at + PER_NODE, at : at + PER_NODE]
-                self._tell_mode(row, pose, own)
-                variances[at : at + PER_NODE] = own.diagonal().tolist()
-            nodes.append(
-                NodeEstimate(
-                    node, pose[0], pose[1], math.remainder(pose[2], _TWO_PI),
-                    variances[at], variances[at + 1], float(covariance[at, at + 1]),
-                    min(math.sqrt(variances[at + 2]), ANY_ANGLE_RAD),
-                    self._status(known, row),
-                    known.height_m, known.sigma_height_m,
-                )
-            )  # fmt: skip
-            drift = math.sqrt(max(variances[at + _DRIFT], 0.0))
-            scale = math.sqrt(max(variances[at + _SCALE], 0.0))
-            grow = math.exp(pose[_SCALE])
-            parameters += [
-                Parameter(time_s, node, None, "step_scale", grow, grow * scale),
-                Parameter(time_s, node, None, "heading_drift_rad_s", pose[_DRIFT], drift),
-            ]
-        parameters += self._bias_parameters(time_s, means, variances)
-        if self.detection.known:
-            # One curve for the team; every node has it.
-            parameters += [
-                Parameter(
-                    time_s, node, None, "detection_range_m",
-                    self.detection.range_m, self.detection.range_sigma_m,
-                )
-                for node in sorted(self._row)
-            ]  # fmt: skip
-        pairs = self._pair_estimates(mean, covariance)
-        alternatives: tuple[Alternative, ...] = ()
+            status = self._status(known, row)
+            told.append((node, row, status, known.height_m, known.sigma_height_m))
+        picture = _Picture(
+            time_s, told, mean, covariance, self.core.biases.copy(),
+            (self.detection.range_m, self.detection.range_sigma_m)
+            if self.detection.known else None,
+        )  # fmt: skip
+        mixture = self.starts.mixture
+        sought = [
+            self._sought(node, known, mixture)
+            for node, known in self._known.items()
+            if node not in self._row
+        ]
+        if not slipped and not sought and mixture is None:
+            return Estimate.later(time_s, picture.rows, self.north.known())
+        nodes, pairs, alternatives, parameters = picture.rows()
+        if slipped:
+            nodes = tuple(self._tell_mode(n) if self._row[n.node] in slipped else n for n in nodes)
+            pairs = self._slipped_pairs(pairs)
         if mixture is not None:
             pairs += self._sought_pairs(mixture, mean, covariance)
             alternatives = self._alternatives(time_s, mixture, mean, covariance)
-        elif self.core.slipped:
+        elif slipped:
             alternatives = self._slip_alternatives(time_s)
+        together = sorted([*nodes, *sought], key=lambda n: n.node)
         return Estimate(
-            time_s, tuple(nodes), pairs, alternatives, tuple(parameters), self.north.known()
+            time_s, tuple(together), pairs, alternatives, parameters, self.north.known()
         )
 
-    def _tell_mode(self, row: int, pose: list[float], own: Floats) -> None:
-        """Put the most likely place for the mean of a slipped user's places, in place."""
-        belief = believe(self.core.weights(), *self.core.poses_of(row))
-        pose[:3] = belief.x_m, belief.y_m, belief.heading_rad
-        own[:2, :2] = belief.covariance_m2
-        own[2, 2] = belief.sigma_heading_rad**2
+    def _tell_mode(self, told: NodeEstimate) -> NodeEstimate:
+        """Put the most likely place for the mean of a slipped user's places."""
+        belief = believe(self.core.weights(), *self.core.poses_of(self._row[told.node]))
+        spread = belief.covariance_m2
+        return replace(
+            told, x_m=belief.x_m, y_m=belief.y_m,
+            heading_rad=math.remainder(belief.heading_rad, _TWO_PI),
+            variance_x_m2=float(spread[0, 0]), variance_y_m2=float(spread[1, 1]),
+            covariance_xy_m2=float(spread[0, 1]),
+            sigma_heading_rad=min(belief.sigma_heading_rad, ANY_ANGLE_RAD),
+        )  # fmt: skip
+
+    def _slipped_pairs(self, pairs: Sequence[PairEstimate]) -> tuple[PairEstimate, ...]:
+        """Of pairs with one who has slipped the mean of the places says nothing."""
+        weights, slipped = self.core.weights(), self.core.slipped
+        told = []
+        for pair in pairs:
+            a, b = self._row[pair.node], self._row[pair.peer]
+            if a in slipped or b in slipped:
+                told.append(
+                    _pair_of_pictures(pair.node, pair.peer, weights, *self.core.apart(a, b))
+                )
+            else:
+                told.append(pair)
+        return tuple(told)
 
     def _slip_alternatives(self, time_s: float) -> tuple[Alternative, ...]:
         """List the possible pictures of the team after a slip: those of the likeliest."""
@@ -635,66 +637,58 @@ class Bank:
             spread[:, sought + i] = covariance[at : at + 2, at : at + 2]
         return pictures(time_s, nodes, mixture.weights, poses, spread)
 
-    def _bias_parameters(
-        self, time_s: float, means: list[float], variances: list[float]
-    ) -> Iterator[Parameter]:
-        named = {row: node for node, row in self._row.items()}
-        for (a, b), place in sorted(self.core.biases.items()):
-            node, peer = named[a], named[b]
-            if node > peer:
-                node, peer = peer, node
+
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    """What is said of the located at one time, as numbers; ``rows`` makes objects of them."""
+
+    time_s: float
+    told: list[tuple[int, int, NodeStatus, float, float]]
+    """Node, row, status, height and its deviation (m), by node."""
+    mean: Floats
+    covariance: Floats
+    biases: Mapping[tuple[int, int], int]
+    hearing: tuple[float, float] | None
+    """How far one is heard, and its deviation, m."""
+
+    def rows(self) -> Rows:
+        means, variances = self.mean.tolist(), self.covariance.diagonal().tolist()
+        time_s, nodes, parameters = self.time_s, [], []
+        for node, row, status, height_m, sigma_height_m in self.told:
+            at = PER_NODE * row
+            nodes.append(
+                NodeEstimate(
+                    node, means[at], means[at + 1], math.remainder(means[at + 2], _TWO_PI),
+                    variances[at], variances[at + 1], float(self.covariance[at, at + 1]),
+                    min(math.sqrt(variances[at + 2]), ANY_ANGLE_RAD),
+                    status, height_m, sigma_height_m,
+                )
+            )  # fmt: skip
+            drift = math.sqrt(max(variances[at + _DRIFT], 0.0))
+            scale = math.sqrt(max(variances[at + _SCALE], 0.0))
+            grow = math.exp(means[at + _SCALE])
+            parameters += [
+                Parameter(time_s, node, None, "step_scale", grow, grow * scale),
+                Parameter(time_s, node, None, "heading_drift_rad_s", means[at + _DRIFT], drift),
+            ]
+        named = {row: node for node, row, *_ in self.told}
+        for (a, b), place in sorted(self.biases.items()):
+            node, peer = sorted((named[a], named[b]))
             sigma = math.sqrt(max(variances[place], 0.0))
-            yield Parameter(time_s, node, peer, "range_bias_m", means[place], sigma)
+            parameters.append(Parameter(time_s, node, peer, "range_bias_m", means[place], sigma))
+        if self.hearing is not None:
+            # One curve for the team; every node has it.
+            parameters += [
+                Parameter(time_s, node, None, "detection_range_m", *self.hearing)
+                for node, *_ in self.told
+            ]
+        return tuple(nodes), self._pairs(), (), tuple(parameters)
 
-    def _pair_estimates(self, mean: Floats, covariance: Floats) -> tuple[PairEstimate, ...]:
-        located = sorted(self._row)
-        rows = np.array([self._row[node] for node in located], dtype=np.int64)
-        lower, upper = _every_two(len(rows))
-        i, j = PER_NODE * rows[lower], PER_NODE * rows[upper]
-        off_x, off_y = mean[j] - mean[i], mean[j + 1] - mean[i + 1]
-        own = covariance.diagonal()
-        xx = own[i] + own[j] - 2.0 * covariance[i, j]
-        yy = own[i + 1] + own[j + 1] - 2.0 * covariance[i + 1, j + 1]
-        across_axes = covariance[:, 1:].diagonal()
-        xy = across_axes[i] + across_axes[j] - covariance[i, j + 1] - covariance[i + 1, j]
-        distance = np.hypot(off_x, off_y)
-        apart = distance > 0.0
-        squared = np.where(apart, distance * distance, 1.0)
-        along = np.where(
-            apart,
-            (off_x * off_x * xx + 2.0 * off_x * off_y * xy + off_y * off_y * yy) / squared,
-            0.5 * (xx + yy),
-        )
-        sideways = np.sqrt(np.maximum(xx + yy - along, 0.0) / squared)
-        bearing = np.where(apart, np.minimum(sideways, ANY_ANGLE_RAD), ANY_ANGLE_RAD)
-        pairs = list(
-            map(
-                PairEstimate,
-                [located[n] for n in lower.tolist()],
-                [located[n] for n in upper.tolist()],
-                distance.tolist(),
-                np.sqrt(np.maximum(along, 0.0)).tolist(),
-                np.arctan2(off_y, off_x).tolist(),
-                bearing.tolist(),
-            )
-        )
-        if self.core.slipped:
-            # Of these the mean of the places says nothing.
-            for n, (a, b) in enumerate(
-                zip(rows[lower].tolist(), rows[upper].tolist(), strict=True)
-            ):
-                if a in self.core.slipped or b in self.core.slipped:
-                    pairs[n] = _pair_of_pictures(
-                        pairs[n].node, pairs[n].peer, self.core.weights(), *self.core.apart(a, b)
-                    )
-        return tuple(pairs)
-
-
-@lru_cache(maxsize=32)
-def _every_two(count: int) -> tuple[Indices, Indices]:
-    """Indices (P,), (P,) of every two of so many, the lower first."""
-    lower, upper = np.triu_indices(count, 1)
-    return lower.astype(np.int64), upper.astype(np.int64)
+    def _pairs(self) -> tuple[PairEstimate, ...]:
+        rows = np.array([row for _, row, *_ in self.told], dtype=np.int64)
+        figures = bank_kernels.pairs(self.mean, self.covariance, rows).tolist()
+        every = combinations([node for node, *_ in self.told], 2)
+        return tuple(PairEstimate(*two, *own) for two, own in zip(every, figures, strict=True))
 
 
 def _pair_of_pictures(

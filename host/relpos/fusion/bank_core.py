@@ -890,7 +890,10 @@ class BankCore:
     # -- what is known -------------------------------------------------------------------------
 
     def moments(self, *, poses_alone: bool = False) -> tuple[Floats, Floats]:
-        """Give the mixture's mean (D,) and full covariance (D, D), constants as 0 if so wished."""
+        """Give the mixture's mean (D,) and full covariance (D, D).
+
+        With ``poses_alone`` constants and biases have variances, and covariances of 0.
+        """
         self._normalise()
         return self._moments(self._weight, poses_alone)
 

@@ -13,7 +13,9 @@ import numpy.typing as npt
 
 from relpos.fusion import hypotheses, lanes, noise, slips
 from relpos.fusion.compiled import compiled
-from relpos.fusion.joint import MEAN, STATS, TRUST, VARIANCE, update
+from relpos.fusion.detection import FAILS, LENGTH, STEP_M, TRUSTED_M
+from relpos.fusion.estimator import ANY_ANGLE_RAD
+from relpos.fusion.joint import MEAN, PER_NODE, STATS, TRUST, VARIANCE, update
 from relpos.fusion.lanes import LANES, fill, load, store
 
 Floats = npt.NDArray[np.float64]
@@ -327,3 +329,96 @@ def take_ranges(
     temper(log_weight, before)
     spread_levels(draw, levels, covariance, spread, level, sigma2)
     return slipped, clamped
+
+
+@compiled
+def pairs(mean: Floats, covariance: Floats, rows: Indices) -> Floats:
+    """Give (P, 4) of every two of the users ``rows`` (N,), by the mixture's moments (D,), (D, D).
+
+    Distance and its standard deviation (m), bearing and its (rad), to first order; of two on one
+    spot no direction is along the line of sight, and any bearing is as likely.
+    """
+    several = rows.shape[0]
+    told = np.empty((several * (several - 1) // 2, 4))
+    n = 0
+    for a in range(several):
+        i = PER_NODE * rows[a]
+        for b in range(a + 1, several):
+            j = PER_NODE * rows[b]
+            east, north = mean[j] - mean[i], mean[j + 1] - mean[i + 1]
+            xx = covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j]
+            yy = covariance[i + 1, i + 1] + covariance[j + 1, j + 1]
+            yy -= 2.0 * covariance[i + 1, j + 1]
+            xy = covariance[i, i + 1] + covariance[j, j + 1]
+            xy -= covariance[i, j + 1] + covariance[i + 1, j]
+            square = east * east + north * north
+            along, sideways = 0.5 * (xx + yy), ANY_ANGLE_RAD
+            if square > 0.0:
+                along = east * east * xx + 2.0 * east * north * xy + north * north * yy
+                along /= square
+                sideways = min(math.sqrt(max(xx + yy - along, 0.0) / square), ANY_ANGLE_RAD)
+            told[n, 0], told[n, 1] = math.sqrt(square), math.sqrt(max(along, 0.0))
+            told[n, 2], told[n, 3] = math.atan2(north, east), sideways
+            n += 1
+    return told
+
+
+@compiled
+def teach(
+    first: Indices, second: Indices, heard: int, witnessed: Floats, distance_m: Floats,
+    sigma_m: Floats, curve: Floats, working: Floats, surprise: Floats, counts: Floats,
+    sums: Floats,
+) -> Floats:  # fmt: skip
+    """See :class:`relpos.fusion.detection.Teach`."""
+    several, slots = first.shape[0], working.shape[0]
+    chance, tried = np.empty(several), np.empty(several - heard)
+    busy = np.zeros(slots, dtype=np.bool_)
+    silence = np.full(slots, -1.0)
+    root = math.sqrt(3.0)
+    for u in range(several):
+        # Three-point Gauss-Hermite rule over the distance's error; one mass of its shares is 1.
+        chance[u] = 0.0
+        for q in range(3):
+            place = (distance_m[u] + (q - 1) * root * sigma_m[u]) / STEP_M
+            place = min(max(place, 0.0), LENGTH - 1.0)
+            index = min(int(place), LENGTH - 2)
+            here = curve[index] + (place - index) * (curve[index + 1] - curve[index])
+            chance[u] += here * (4.0 if q == 1 else 1.0) / 6.0
+        if u < heard:
+            busy[first[u]] = busy[second[u]] = True
+            continue
+        for slot in (first[u], second[u]):
+            if not busy[slot]:
+                silence[slot] = abs(silence[slot]) * (1.0 - chance[u])
+    for slot in range(slots):
+        if busy[slot]:
+            working[slot] = 1.0
+        elif silence[slot] >= 0.0:
+            up = working[slot] * (1.0 - FAILS)
+            working[slot] = up * silence[slot] / (up * silence[slot] + 1.0 - up)
+    for u in range(several):
+        a, b = first[u], second[u]
+        weight = 1.0 / (1.0 + (sigma_m[u] / TRUSTED_M) ** 2)
+        now = -chance[u]
+        outcome = 0
+        if u < heard:
+            weight *= witnessed[u]
+            now += 1.0
+            outcome = 1
+        else:
+            tried[u - heard] = working[a] * working[b]
+            weight *= tried[u - heard]
+        before = surprise[a, b]
+        if not math.isnan(before):
+            sums[0] += weight * before * now
+            sums[1] += weight * 0.5 * (before * before + now * now)
+        surprise[a, b] = now
+        for q in range(3):
+            place = (distance_m[u] + (q - 1) * root * sigma_m[u]) / STEP_M
+            place = min(max(place, 0.0), LENGTH - 1.001)
+            index = int(place)
+            share = weight * (4.0 if q == 1 else 1.0) / 6.0
+            counts[outcome, index] += share * (1.0 - (place - index))
+            counts[outcome, index + 1] += share * (place - index)
+        sums[2] += weight
+    return tried

@@ -31,7 +31,9 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
+from functools import cache
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +41,7 @@ import numpy.typing as npt
 from relpos.measurements import Range
 
 Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 Pair = tuple[int, int]
 
 STEP_M = 0.5
@@ -76,22 +79,39 @@ _OFFSETS = math.sqrt(3.0) * np.array([[-1.0], [0.0], [1.0]])
 _SHARES = np.array([[1.0], [4.0], [1.0]]) / 6.0
 """Three-point Gauss-Hermite rule: offsets in standard deviations, and their shares."""
 
-_FAMILY: list[npt.NDArray[np.float32]] = []
+LONG_SHOT = 28.0
+"""Curves whose log posterior is so far below the best one's do not count: 1e-12 each."""
 
 
-def _family() -> list[npt.NDArray[np.float32]]:
-    """All curves, (P0 * R * W, LENGTH), and the logarithms of heard and of silent.
+@dataclass(frozen=True, slots=True)
+class _Family:
+    """All curves, F = P0 * R * W of them."""
 
-    Made when first needed, then shared by all teams of this process.
-    """
-    if not _FAMILY:
-        distance = np.arange(LENGTH) * STEP_M
-        near, edge, soft = np.meshgrid(_NEAR, _EDGE_M, _SOFTNESS, indexing="ij")
-        exponent = (distance - edge.reshape(-1, 1)) / (soft * edge).reshape(-1, 1)
-        curves = near.reshape(-1, 1) / (1.0 + np.exp(np.clip(exponent, -60.0, 60.0)))
-        curves = FLOOR + (1.0 - 2.0 * FLOOR) * curves
-        _FAMILY.extend(x.astype(np.float32) for x in (curves, np.log(curves), np.log1p(-curves)))
-    return _FAMILY
+    curves: npt.NDArray[np.float32]
+    """(F, LENGTH)."""
+    log_silent: npt.NDArray[np.float32]
+    log_heard: npt.NDArray[np.float32]
+    """(LENGTH, F): attempts lie at some distances only, whose rows are then one after another."""
+    edge_m: Floats
+
+
+@cache
+def _family() -> _Family:
+    """Make all curves, when first needed; all teams of this process share them."""
+    distance = np.arange(LENGTH) * STEP_M
+    near, edge, soft = (
+        grid.reshape(-1, 1) for grid in np.meshgrid(_NEAR, _EDGE_M, _SOFTNESS, indexing="ij")
+    )
+    exponent = (distance - edge) / (soft * edge)
+    curves = near / (1.0 + np.exp(np.clip(exponent, -60.0, 60.0)))
+    curves = FLOOR + (1.0 - 2.0 * FLOOR) * curves
+    single = np.float32
+    return _Family(
+        curves.astype(single),
+        np.ascontiguousarray(np.log1p(-curves).T.astype(single)),
+        np.ascontiguousarray(np.log(curves).T.astype(single)),
+        edge.ravel(),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +162,13 @@ class Rounds:
             rounds.append(self._close(time_s, reported_s))
         return rounds
 
+    def snapshot(self) -> Rounds:
+        """Give a copy that goes on by itself."""
+        partners = {node: peers.copy() for node, peers in self._partners.items()}
+        return Rounds(
+            self.heard_ever.copy(), partners, self._turns, self._open.copy(), self._directed.copy()
+        )
+
     def _close(self, time_s: float, reported_s: Callable[[int], float]) -> Round:
         heard = self._open
         for node, peer in heard - self.heard_ever:
@@ -166,6 +193,66 @@ class Rounds:
         return Round(time_s, ordered, tuple(sorted(silent)), witnessed)
 
 
+class Teach(Protocol):
+    """Learn from one round, in place, and tell what its silences are worth.
+
+    Pairs (U,) of slots ``first`` and ``second``, the ``heard`` ones first, with their predicted
+    distances and standard deviations (m) and whether the heard ones were ``witnessed`` (1 or 0).
+    ``working`` (S,), ``surprise`` (S, S), ``counts`` (2, LENGTH) and ``sums`` (together, apart,
+    seen) are of :class:`Detection`. Returns (U - heard,): the probability that both nodes' UWB
+    worked.
+    """
+
+    def __call__(
+        self, first: Indices, second: Indices, heard: int, witnessed: Floats, distance_m: Floats,
+        sigma_m: Floats, curve: Floats, working: Floats, surprise: Floats, counts: Floats,
+        sums: Floats,
+    ) -> Floats:  # fmt: skip
+        """Learn; see the class's text."""
+
+
+def teach(
+    first: Indices, second: Indices, heard: int, witnessed: Floats, distance_m: Floats,
+    sigma_m: Floats, curve: Floats, working: Floats, surprise: Floats, counts: Floats,
+    sums: Floats,
+) -> Floats:  # fmt: skip
+    """See :class:`Teach`; the bank uses a compiled twin (``bank_kernels.teach``)."""
+    chance = expected(curve, distance_m, sigma_m)
+    # Each node's probability that its UWB works, from whether anybody hears it.
+    busy = {int(slot) for slot in (*first[:heard], *second[:heard])}
+    unheard: dict[int, float] = {}
+    for a, b, p in zip(first[heard:], second[heard:], chance[heard:], strict=True):
+        for slot in (int(a), int(b)):
+            if slot not in busy:
+                unheard[slot] = unheard.get(slot, 1.0) * (1.0 - float(p))
+    working[list(busy)] = 1.0
+    for slot, silence in unheard.items():
+        up = working[slot] * (1.0 - FAILS)
+        working[slot] = up * silence / (up * silence + 1.0 - up)
+    tried: Floats = working[first[heard:]] * working[second[heard:]]
+    weight = 1.0 / (1.0 + (sigma_m / TRUSTED_M) ** 2)
+    weight[:heard] *= witnessed
+    weight[heard:] *= tried
+    # Each pair's surprise beside its last one.
+    now = (np.arange(len(first)) < heard) - chance
+    before = surprise[first, second]
+    again = ~np.isnan(before)
+    w, then, since = weight[again], before[again], now[again]
+    sums[0] += float((w * then * since).sum())
+    sums[1] += float((w * 0.5 * (then**2 + since**2)).sum())
+    surprise[first, second] = now
+    # Attempts are spread over the two nearest entries of three places each.
+    place = np.clip((distance_m + _OFFSETS * sigma_m) / STEP_M, 0.0, LENGTH - 1.001)
+    index = place.astype(np.intp)
+    beyond = place - index
+    share = _SHARES * weight
+    for outcome, some in ((1, slice(None, heard)), (0, slice(heard, None))):
+        np.add.at(counts[outcome], index[:, some], (share * (1.0 - beyond))[:, some])
+        np.add.at(counts[outcome], index[:, some] + 1, (share * beyond)[:, some])
+    sums[2] += float(weight.sum())
+    return tried
+
+
 @dataclass(slots=True)
 class Detection:
     """The learned curve of one team.
@@ -176,17 +263,21 @@ class Detection:
     """
 
     rounds: Rounds = field(default_factory=Rounds)
+    teach: Teach = teach
     curve: Floats = field(init=False)
     range_m: float = field(init=False)
     range_sigma_m: float = field(init=False)
     _counts: Floats = field(default_factory=lambda: np.zeros((2, LENGTH)))
     """Attempts by outcome (silent, heard) and distance."""
-    _seen: float = 0.0
+    _sums: Floats = field(default_factory=lambda: np.array([0.0, 25.0, 0.0]))
+    """Of products of consecutive surprises, of their mean squares, and of attempts."""
     _refit_at: float = 0.0
-    _working: dict[int, float] = field(default_factory=dict)
-    _surprise: dict[Pair, float] = field(default_factory=dict)
-    _together: float = 0.0
-    _apart: float = 25.0
+    _slot: dict[int, int] = field(default_factory=dict)
+    """Where in the arrays below a node is."""
+    _working: Floats = field(default_factory=lambda: np.ones(0))
+    """Probability that each node's UWB works (S,)."""
+    _surprise: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    """Last outcome less its probability, of each pair (S, S); NaN before the first."""
 
     def __post_init__(self) -> None:
         self._refit()
@@ -194,8 +285,9 @@ class Detection:
     @property
     def weight(self) -> float:
         """How many independent silences one is worth."""
-        rho = min(max(self._together / self._apart, 0.0), 0.9)
-        return (1.0 - rho) / (1.0 + rho)
+        together, apart, _ = self._sums.tolist()
+        rho = min(max(together / apart, 0.0), 0.9)
+        return float((1.0 - rho) / (1.0 + rho))
 
     @property
     def known(self) -> bool:
@@ -204,18 +296,12 @@ class Detection:
 
     def snapshot(self) -> Detection:
         """Give a copy that later learning leaves alone."""
-        rounds = replace(
-            self.rounds,
-            heard_ever=self.rounds.heard_ever.copy(),
-            _partners={node: peers.copy() for node, peers in self.rounds._partners.items()},
-            _open=self.rounds._open.copy(),
-            _directed=self.rounds._directed.copy(),
-        )
         # A refit makes a new curve and leaves the old one alone.
         copy = object.__new__(Detection)
-        for one in fields(self):
-            setattr(copy, one.name, getattr(self, one.name))
-        copy.rounds, copy._counts = rounds, self._counts.copy()
+        for name in _FIELDS:
+            setattr(copy, name, getattr(self, name))
+        copy.rounds, copy._slot = self.rounds.snapshot(), self._slot.copy()
+        copy._counts, copy._sums = self._counts.copy(), self._sums.copy()
         copy._working, copy._surprise = self._working.copy(), self._surprise.copy()
         return copy
 
@@ -238,78 +324,58 @@ class Detection:
         nodes' UWB worked.
         """
         heard = len(of.heard)
-        distance_m = np.concatenate([heard_m, silent_m])
-        sigma_m = np.concatenate([heard_sigma_m, silent_sigma_m])
-        if not distance_m.size:
+        pairs = of.heard + of.silent
+        if not pairs:
             return np.empty(0)
-        chance = self.probability(distance_m, sigma_m)
-        tried = self._work(of, chance[heard:])
-        weight = 1.0 / (1.0 + (sigma_m / TRUSTED_M) ** 2)
-        weight[:heard] *= of.witnessed
-        weight[heard:] *= tried
-        self._correlate(of, chance, weight)
-        self._deposit(distance_m, sigma_m, weight, heard)
-        self._seen += float(weight.sum())
-        if self._seen >= self._refit_at:
+        slot = self._slot
+        if not slot.keys() >= {node for pair in pairs for node in pair}:
+            self._add(pairs)
+        first = np.array([slot[a] for a, _ in pairs], dtype=np.int64)
+        second = np.array([slot[b] for _, b in pairs], dtype=np.int64)
+        tried = self.teach(
+            first, second, heard, np.array(of.witnessed, dtype=np.float64),
+            np.concatenate([heard_m, silent_m]), np.concatenate([heard_sigma_m, silent_sigma_m]),
+            self.curve, self._working, self._surprise, self._counts, self._sums,
+        )  # fmt: skip
+        if self._sums[2] >= self._refit_at:
             self._refit()
         return tried
 
-    def _work(self, of: Round, silent_p: Floats) -> Floats:
-        """Each node's probability that its UWB works, from whether anybody hears it."""
-        working = self._working
-        busy = {node for pair in of.heard for node in pair}
-        unheard: dict[int, float] = {}
-        for (a, b), p in zip(of.silent, silent_p, strict=True):
-            for node in (a, b):
-                if node not in busy:
-                    unheard[node] = unheard.get(node, 1.0) * (1.0 - float(p))
-        for node in busy:
-            working[node] = 1.0
-        for node, chance in unheard.items():
-            up = working.get(node, 1.0) * (1.0 - FAILS)
-            working[node] = up * chance / (up * chance + 1.0 - up)
-        return np.array([working.get(a, 1.0) * working.get(b, 1.0) for a, b in of.silent])
-
-    def _correlate(self, of: Round, chance: Floats, weight: Floats) -> None:
-        """Compare each pair's surprise with its last one."""
-        surprise = self._surprise
-        outcome = np.zeros(len(chance))
-        outcome[: len(of.heard)] = 1.0
-        surprises = (outcome - chance).tolist()
-        for pair, now, w in zip(of.heard + of.silent, surprises, weight.tolist(), strict=True):
-            before = surprise.get(pair)
-            if before is not None:
-                self._together += w * before * now
-                self._apart += w * 0.5 * (before * before + now * now)
-            surprise[pair] = now
-
-    def _deposit(self, distance_m: Floats, sigma_m: Floats, weight: Floats, heard: int) -> None:
-        """Spread attempts over the two nearest entries of three places each."""
-        place = np.clip((distance_m + _OFFSETS * sigma_m) / STEP_M, 0.0, LENGTH - 1.001)
-        index = place.astype(np.intp)
-        beyond = place - index
-        share = _SHARES * weight
-        index[:, :heard] += LENGTH
-        flat = np.concatenate([index.ravel(), index.ravel() + 1])
-        parts = np.concatenate([(share * (1.0 - beyond)).ravel(), (share * beyond).ravel()])
-        self._counts += np.bincount(flat, parts, 2 * LENGTH).reshape(2, LENGTH)
+    def _add(self, pairs: Sequence[Pair]) -> None:
+        """Make room for nodes that were not met before."""
+        for node in sorted({node for pair in pairs for node in pair} - self._slot.keys()):
+            self._slot[node] = len(self._slot)
+        more = len(self._slot) - len(self._working)
+        self._working = np.pad(self._working, (0, more), constant_values=1.0)
+        self._surprise = np.pad(self._surprise, (0, more), constant_values=np.nan)
 
     def _refit(self) -> None:
-        curves, log_heard, log_silent = _family()
-        if self._seen > MEMORY:
-            self._counts *= MEMORY / self._seen
-            self._seen = MEMORY
+        family = _family()
+        if self._sums[2] > MEMORY:
+            self._counts *= MEMORY / self._sums[2]
+            self._sums[2] = MEMORY
         counts = self._counts.astype(np.float32)
-        log_posterior = (log_silent @ counts[0] + log_heard @ counts[1]).astype(np.float64)
-        posterior = np.exp(log_posterior - log_posterior.max())
+        log_posterior = np.zeros(len(family.curves), dtype=np.float32)
+        for outcome, logs in enumerate((family.log_silent, family.log_heard)):
+            there = np.flatnonzero(counts[outcome])
+            if there.size:
+                some = slice(int(there[0]), int(there[-1]) + 1)
+                log_posterior += counts[outcome, some] @ logs[some]
+        log_posterior -= log_posterior.max()
+        likely = np.flatnonzero(log_posterior > -LONG_SHOT)
+        posterior = np.exp(log_posterior[likely].astype(np.float64))
         posterior /= posterior.sum()
-        self.curve = (posterior.astype(np.float32) @ curves).astype(np.float64)
-        by_edge = posterior.reshape(len(_NEAR), len(_EDGE_M), -1).sum(axis=(0, 2))
-        self.range_m = float(by_edge @ _EDGE_M)
-        spread = float(by_edge @ (_EDGE_M - self.range_m) ** 2)
+        self.curve = (posterior.astype(np.float32) @ family.curves[likely]).astype(np.float64)
+        edge_m = family.edge_m[likely]
+        self.range_m = float(posterior @ edge_m)
+        spread = float(posterior @ (edge_m - self.range_m) ** 2)
         self.range_sigma_m = math.sqrt(spread + (SHAPE * self.range_m) ** 2 + STEP_M**2 / 12.0)
         # Later evidence changes little: the cost of refitting stays a small share of the whole.
-        self._refit_at = min(self._seen * 1.15, self._seen + 1000.0) + 10.0
+        seen = float(self._sums[2])
+        self._refit_at = min(seen * 1.15, seen + 1000.0) + 10.0
+
+
+_FIELDS = tuple(one.name for one in fields(Detection))
 
 
 def expected(curve: Floats, distance_m: Floats, sigma_m: Floats | float = 0.0) -> Floats:

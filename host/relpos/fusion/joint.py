@@ -859,9 +859,9 @@ def moments(
 ) -> tuple[Floats, Floats]:
     """Give the mixture's mean (D,) and full covariance (D, D), in the state's order.
 
-    ``weight`` (B, LANES) as for ``predicted_ranges``, ``of`` (D,) is ``order``. Only the first
-    ``places`` of the storage are looked at, the rest is given as 0. Headings are averaged round
-    the circle, about the heaviest hypothesis' value.
+    ``weight`` (B, LANES) as for ``predicted_ranges``, ``of`` (D,) is ``order``. Of the storage
+    beyond the first ``places`` only means and variances are given, its covariances as 0. Headings
+    are averaged round the circle, about the heaviest hypothesis' value.
     """
     blocks, size, triangle = x.shape[0], x.shape[1], p.shape[1]
     best, best_lane = 0, 0
@@ -873,7 +873,7 @@ def moments(
     cov = np.zeros((size, size))
     turn = 2.0 * math.pi
     off = lanes.working_lines(blocks * size)
-    for i in range(places):
+    for i in range(size):
         about = x[best, i, best_lane]
         angle = i < _POSE * nodes and i % _POSE == 2
         middle = fill(0.0)
@@ -906,4 +906,11 @@ def moments(
             cov[of[i], of[j]] = lanes.total(load(sums, t))
             cov[of[j], of[i]] = cov[of[i], of[j]]
             t += 1
+    for i in range(places, size):
+        variance = fill(0.0)
+        for b in range(blocks):
+            away = load(off, b * size + i)
+            own = load(p, b * triangle + _row(i) + i)
+            variance = variance + load(weight, b) * (own + away * away)
+        cov[of[i], of[i]] = lanes.total(variance)
     return mean, cov

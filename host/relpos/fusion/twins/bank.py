@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion import noise, slips
+from relpos.fusion.estimator import ANY_ANGLE_RAD
 
 Floats = npt.NDArray[np.float64]
 
@@ -101,3 +102,25 @@ def look(
     if max(after) < alarm:
         return after, base, -1
     return [0.0] * len(sums), base, after.index(max(after))
+
+
+def pairs(mean: Floats, covariance: Floats, rows: list[int]) -> Floats:
+    """Distance, bearing and their deviations (P, 4) of every two users, by rotation."""
+    told = []
+    for n, a in enumerate(rows):
+        for b in rows[n + 1 :]:
+            i, j = PER_NODE * a, PER_NODE * b
+            off = mean[j : j + 2] - mean[i : i + 2]
+            own = covariance[i : i + 2, i : i + 2] + covariance[j : j + 2, j : j + 2]
+            spread = own - covariance[i : i + 2, j : j + 2] - covariance[j : j + 2, i : i + 2]
+            distance = float(np.hypot(*off))
+            if distance == 0.0:
+                told.append((0.0, math.sqrt(0.5 * np.trace(spread)), 0.0, ANY_ANGLE_RAD))
+                continue
+            along, aside = off / distance, np.array([-off[1], off[0]]) / distance
+            bearing_sd = math.sqrt(aside @ spread @ aside) / distance
+            told.append((
+                distance, math.sqrt(along @ spread @ along),
+                math.atan2(off[1], off[0]), min(bearing_sd, ANY_ANGLE_RAD),
+            ))  # fmt: skip
+    return np.array(told).reshape(-1, 4)
