@@ -301,7 +301,7 @@ def test_the_terminal_shows_the_newest_picture_and_comes_back_as_it_was(
     view.pictured(picture(changes={2: {"name": "Robin"}}))
     until(lambda: "Robin" in "".join(screen.rows()), "the next picture is not drawn")
     assert "Kim" not in "".join(screen.rows())
-    assert screen.rows()[-1].startswith("m/M other me")
+    assert screen.rows()[-1].startswith("a seen to")
     assert view.trouble() is None
     view.close()
     until(lambda: screen.received.endswith("\x1b[?7h\x1b[?25h\x1b[?1049l"), "it is left drawn on")
@@ -343,6 +343,20 @@ def test_the_bell_goes_on_for_a_person_and_not_for_a_cable(
     rung = screen.received.count("\a")
     time.sleep(0.2)
     assert screen.received.count("\a") == rung
+
+
+def test_a_key_says_that_the_worst_alarm_is_seen_to(screen: Screen, view: TerminalView) -> None:
+    lost = {"alert": Alert.LOST, "status": "lost"}
+    view.pictured(picture(changes={1: lost, 3: STILL}))
+    until(lambda: "LOST" in "".join(screen.rows()), "nothing is drawn")
+    for node, others in ((3, {1: lost, 3: {**STILL, "acknowledged": True}}), (1, {1: lost})):
+        view.press("a")
+        (ask,) = view.asks()
+        assert (ask.kind, ask.body) == ("acknowledge", {"node": node})
+        view.pictured(picture(changes=others))
+    view.pictured(picture())
+    view.press("a")
+    assert view.asks() == []
 
 
 def test_keys_change_whose_view_it_is(screen: Screen, view: TerminalView) -> None:

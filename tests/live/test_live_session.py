@@ -266,7 +266,7 @@ def test_presses_names_and_acknowledgements_reach_record_and_picture(monkeypatch
             (12.0, Ask(3, "name", 1.7e9 + 12.0, {"node": 2, "name": "Kim"})),
             (13.0, Ask(4, "acknowledge", 1.7e9 + 13.0, {"node": 2})),
         )
-        session, album = make_session(source, deadreckoning, visitors=phones)
+        session, album = make_session(source, deadreckoning, visitors=[phones])
         run_through(session)
     (event,) = [o for _, o in album.observations if isinstance(o, Event)]
     assert event == Event(pytest.approx(9.5, abs=0.05), 1, "landmark", "17")
@@ -285,7 +285,7 @@ def test_a_recording_is_played_and_takes_no_presses():
     motions = [Motion(float(t), node, 1.0, 0.0, 0.1) for t in range(1, 30) for node in (1, 2)]
     source = PacedInput("a run", [Received(m.time_s, b"", (m,)) for m in motions], speed=0.0)
     phones = Phones(source, (5.0, press(1, 0.0)))
-    session, album = make_session(source, deadreckoning, visitors=phones)
+    session, album = make_session(source, deadreckoning, visitors=[phones])
     outcome = run_through(session)
     assert outcome.received == len(motions)
     assert phones.answers[0][2] == 409

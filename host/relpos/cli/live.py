@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from relpos.live.picture import Hello
     from relpos.live.session import Named, Outcome
     from relpos.live.sinks import Sink
-    from relpos.live.visitors import Visitors
     from relpos.measurements import Prior
     from relpos.recording.about import About
     from relpos.recording.recorder import Recorder
@@ -216,6 +215,7 @@ def run(
     from relpos.live.files import FileSink
     from relpos.live.picture import Hello
     from relpos.live.session import Session
+    from relpos.live.visitors import Visitors
 
     hello = Hello(name, source.name, fused.estimator, time.time() - source.now_s(), emulated)
     files = FileSink(out, description, keep_received=keep_received)
@@ -224,12 +224,10 @@ def run(
     )
     sinks: list[Sink] = [files]
     namings: list[Named] = [files]
-    visitors: Visitors | None = None
     if options.view:
         page = _open_page(options, hello)
         sinks.append(page)
         namings.append(page)
-        visitors = page
     sinks += [make(hello) for make in options.sinks]
     keepers = _keepers(options, fused.about(source, description, hello.started_unix_s))
     sinks += keepers
@@ -240,7 +238,7 @@ def run(
         fusing,
         composer,
         sinks,
-        visitors=visitors,
+        visitors=[sink for sink in sinks if isinstance(sink, Visitors)],
         namings=namings,
         seconds=options.seconds,
         lasts=options.watched or (options.shown and source.is_now),

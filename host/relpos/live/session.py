@@ -63,7 +63,7 @@ class Outcome:
 class Session:
     """One session over ``source``; see the module's text.
 
-    ``sinks`` are fed; ``visitors`` are asked for what browsers and phones want. ``seconds`` end it
+    ``sinks`` are fed; ``visitors`` are asked for what people want to change. ``seconds`` end it
     (of the wall clock). The end of a recording and the failure of the fusion do, unless it
     ``lasts``: then receiving, and showing the last picture, go on until it is stopped. ``remark``
     is told what a user should read, once each. ``pace`` is the clock that pictures and ``seconds``
@@ -77,7 +77,7 @@ class Session:
         composer: Composer,
         sinks: Sequence[Sink] = (),
         *,
-        visitors: Visitors | None = None,
+        visitors: Sequence[Visitors] = (),
         namings: Sequence[Named] = (),
         seconds: float | None = None,
         lasts: bool = False,
@@ -89,7 +89,7 @@ class Session:
         self._fusing = fusing
         self._composer = composer
         self._sinks = list(sinks)
-        self._visitors = visitors
+        self._visitors = list(visitors)
         self._namings = list(namings)
         self._seconds = seconds
         self._lasts = lasts
@@ -314,12 +314,11 @@ class Session:
     # -- visitors ---------------------------------------------------------------------------------
 
     def _serve(self) -> None:
-        if self._visitors is None:
-            return
-        for ask in self._visitors.asks():
-            reply, status = self._reply(ask)
-            self._visitors.answer(ask, reply, status)
-            self._news = True
+        for visitors in self._visitors:
+            for ask in visitors.asks():
+                reply, status = self._reply(ask)
+                visitors.answer(ask, reply, status)
+                self._news = True
 
     def _reply(self, ask: Ask) -> tuple[dict[str, object], int]:
         match ask.kind:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from relpos.measurements import Event, Heading, Observation
 
@@ -31,17 +31,15 @@ class Ask:
     body: dict[str, Any]
 
 
+@runtime_checkable
 class Visitors(Protocol):
-    """Where requests come from."""
+    """Where requests come from: the page's server, the keys of a terminal."""
 
     def asks(self) -> Sequence[Ask]:
         """Requests since the last call; never waits."""
 
     def answer(self, ask: Ask, reply: dict[str, Any], status: int = 200) -> None:
         """Answer one."""
-
-    def named(self, names: dict[int, str]) -> None:
-        """Tell which nodes have a name that a phone gave."""
 
 
 class Desk:

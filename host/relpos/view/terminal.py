@@ -20,7 +20,8 @@ from typing import Any, TextIO
 
 from relpos.live.picture import Picture
 from relpos.live.sinks import QuietSink
-from relpos.view.text_page import Looks, alarming, page
+from relpos.live.visitors import Ask
+from relpos.view.text_page import Looks, alarming, page, unattended
 
 DRAW_S = 0.5
 """Two pages a second: as fast as anybody reads, a few hundred bytes each."""
@@ -57,6 +58,8 @@ class TerminalView(QuietSink):
         self._rung: frozenset[str | int] = frozenset()
         self._rung_s = 0.0
         self._trouble: str | None = None
+        self._asks: deque[Ask] = deque()
+        self._asked = 0
         self._wake = threading.Event()
         self._stop = threading.Event()
         self._screen = self._stream.isatty()
@@ -77,6 +80,13 @@ class TerminalView(QuietSink):
     def trouble(self) -> str | None:
         """Say that the terminal is gone; None when all is well."""
         return self._trouble
+
+    def asks(self) -> list[Ask]:
+        """What was asked for by keys since the last call."""
+        return [self._asks.popleft() for _ in range(len(self._asks))]
+
+    def answer(self, ask: Ask, reply: dict[str, Any], status: int = 200) -> None:
+        """Nothing to do: the next picture shows it."""
 
     def close(self) -> None:
         """Give the terminal back as it was."""
@@ -182,6 +192,8 @@ class TerminalView(QuietSink):
         """Do what a key stands for."""
         looks = self._looks
         match key:
+            case "a":
+                self._see_to()
             case "m" | "M":
                 self._looks = replace(looks, me=self._other(1 if key == "m" else -1))
             case "+" | "=":
@@ -204,6 +216,14 @@ class TerminalView(QuietSink):
             case _:
                 return
         self._wake.set()
+
+    def _see_to(self) -> None:
+        """Tell everybody that the alarm on top is seen to; the next press is for the next one."""
+        if self._picture is None:
+            return
+        for person in unattended(self._picture)[:1]:
+            self._asked += 1
+            self._asks.append(Ask(self._asked, "acknowledge", time.time(), {"node": person.node}))
 
     def _other(self, step: int) -> int | None:
         picture = self._picture

@@ -103,12 +103,15 @@ def page(picture: Picture, looks: Looks) -> list[Text]:
 
 def alarming(picture: Picture) -> frozenset[str | int]:
     """Return what rings the bell: nodes that lie still or are lost, ids of the session's alarms."""
-    people: set[str | int] = {
-        person.node
-        for person in picture.people
-        if person.alert in (Alert.STILL_ALARM, Alert.LOST) and not person.acknowledged
-    }
+    people: set[str | int] = {person.node for person in unattended(picture)}
     return frozenset(people | {n.id for n in picture.notices if n.level is Level.ALARM})
+
+
+def unattended(picture: Picture) -> list[Person]:
+    """Return whose alarm nobody has seen to, in the order in which the page has them."""
+    ranks = (Alert.STILL_ALARM, Alert.LOST)
+    waiting = [p for p in picture.people if p.alert in ranks and not p.acknowledged]
+    return sorted(waiting, key=lambda person: ranks.index(person.alert))
 
 
 def find_me(picture: Picture, wanted: int | None) -> Person | None:
@@ -371,7 +374,7 @@ def _arrow(bearing_rad: float | None, looks: Looks) -> str:
 def _keys(looks: Looks) -> Text:
     up = "map up" if looks.heading_up else "face up"
     bell = "bell on" if looks.muted else "bell off"
-    words = f"m/M other me  +/- zoom  0 all  u {up}  t table  c chart  b {bell}  q quit"
+    words = f"a seen to  m/M me  +/-/0 zoom  u {up}  t table  c chart  b {bell}  q quit"
     return _line(words, looks, "dim")
 
 
