@@ -2,11 +2,9 @@
 
 import { setAttribute, setText, storage } from "./dom.js";
 
-const system = matchMedia("(prefers-color-scheme: dark)");
-
+/** Which theme is shown; theme.js has set it. */
 export function isDark() {
-  const chosen = document.documentElement.dataset.theme;
-  return chosen ? chosen === "dark" : system.matches;
+  return document.documentElement.dataset.theme === "dark";
 }
 
 /** Make `button` switch; `changed` is called after every change, the system's too. */
@@ -24,6 +22,6 @@ export function themeSwitch(button, changed) {
     kept.setItem("relpos.theme", theme);
     show();
   });
-  system.addEventListener("change", show);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", show);
   show();
 }
