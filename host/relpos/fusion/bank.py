@@ -168,7 +168,7 @@ class Bank:
     def finish(self) -> list[Estimate]:
         """Work off what waits; RelposError where the run cannot give relative positions."""
         estimates = self._feed.finish()
-        refuse_unmoved(self._moved)
+        refuse_unmoved(self._moved or bool(self._pending))
         refuse_unranged(self._ranges_used, self._feed.counters())
         return estimates
 
@@ -181,42 +181,44 @@ class Bank:
 
     def take(self, step: Step) -> Estimate | None:
         """Work off one step of the timeline (:class:`~relpos.fusion.rewind.Core`)."""
-        match step:
-            case Advance():
-                self._moved = True
-                known = self._meet(step.node)
-                known.heard(step.time_s)
-                self.repetition.move(step.node, step.dx_m, step.dy_m, step.dtheta_rad)
-                if step.node in self._row:
-                    self._pending.append(step)
-                    if step.node in self._standing:
-                        self._set_off(step)
-                else:
-                    self._seek(step.node)
-                    way_m = math.hypot(step.dx_m, step.dy_m)
-                    odd = self.habit.is_odd(step.node, way_m, step.duration_s, step.fraction)
-                    self._own["motions_doubted"] += odd
-                    self.starts.advance(step, odd=odd)
-            case Ranging():
-                self._advance()
-                self._range(step)
-            case Sensed():
-                self._meet(step.measurement.node)
-                self._sense(step)
-            case Epoch():
-                self._advance()
-                self._admit(self.starts.epoch(step.time_s))
-                return self._estimate(step.time_s)
+        if isinstance(step, Advance):
+            if step.node in self._row:
+                # Most of it waits until somebody needs to know, or the epoch ends.
+                self._pending.append(step)
+                if step.node in self._standing:
+                    self._set_off(step)
+                return None
+            self._note(step)
+            self._seek(step.node)
+            way_m = math.hypot(step.dx_m, step.dy_m)
+            odd = self.habit.is_odd(step.node, way_m, step.duration_s, step.fraction)
+            self._own["motions_doubted"] += odd
+            self.starts.advance(step, odd=odd)
+        elif isinstance(step, Ranging):
+            self._advance()
+            self._range(step)
+        elif isinstance(step, Sensed):
+            self._meet(step.measurement.node)
+            self._sense(step)
+        else:
+            self._advance()
+            self._admit(self.starts.epoch(step.time_s))
+            return self._estimate(step.time_s)
         return None
+
+    def _note(self, step: Advance) -> None:
+        """Take note of a displacement's time and way."""
+        self._moved = True
+        self._meet(step.node).heard(step.time_s)
+        self.repetition.move(step.node, step.dx_m, step.dy_m, step.dtheta_rad)
 
     def cost_s(self, step: Step) -> float:
         """About how many seconds of a processor ``take`` needs for a step."""
-        match step:
-            case Ranging():
-                return 3e-4 + 3e-10 * self.core.entries
-            case Epoch():
-                search_s = 3e-4 * len(self.starts.search.nodes) ** 2
-                return 1e-3 + 1e-9 * self.core.entries + search_s
+        if isinstance(step, Ranging):
+            return 3e-4 + 3e-10 * self.core.entries
+        if isinstance(step, Epoch):
+            search_s = 3e-4 * len(self.starts.search.nodes) ** 2
+            return 1e-3 + 1e-9 * self.core.entries + search_s
         return 3e-5
 
     def snapshot(self) -> _State:
@@ -272,13 +274,13 @@ class Bank:
             told = np.array([told_sigmas(a) for a in steps])
         begin = 0
         for k, a in enumerate(steps):
+            self._note(a)
             drifted_s = self._known[a.node].drifted_s
             if drifted_s > a.time_s - a.duration_s:
                 # Ranges have moved it so far already; how it turned they cannot say.
                 moves[k, :2] *= max(a.time_s - drifted_s, 0.0) / max(a.duration_s, 1e-9)
-            vague = _vagueness(a)
-            if vague is not None:
-                assert told is not None
+            vague = None if told is None else _vagueness(a)
+            if told is not None and vague is not None:
                 told[k] = math.nan
                 self.core.lose(int(rows[k]), *vague)
             if self.stillness.is_still(

@@ -112,12 +112,17 @@ class Rewinder:
             self._copy()
         self._history.append(measurement)
         news = measurement.time_s > self._newest_s
-        self._newest_s = max(self._newest_s, measurement.time_s)
-        steps = self.timeline.push_all((measurement,))
-        self._note_late()
+        if news:
+            self._newest_s = measurement.time_s
+        timeline = self.timeline
+        certain = timeline.take_in(measurement)
+        if timeline.is_late:
+            self._note_late()
         if self._back_to_s == math.inf:
+            if not certain and self._rest is None:
+                return []
             # What is left goes on with what has been sorted in since.
-            return list(self._work_off(self._rest or steps))
+            return list(self._work_off(self._rest or timeline.push_all(())))
         # Until it has gone back, the timeline only sorts in. A burst of late ones is put in its
         # place together, when the next thing of now comes.
         if news and self._newest_s >= self._rewound_s + self.every_s:
@@ -163,11 +168,13 @@ class Rewinder:
         yield from self._work_off(steps, math.inf if final else self.most_s)
 
     def _work_off(self, steps: Iterator[Step], most_s: float | None = None) -> Iterator[Estimate]:
-        take, left_s = self.core.take, self.most_s if most_s is None else most_s
+        take, cost_s = self.core.take, self.core.cost_s
+        left_s = self.most_s if most_s is None else most_s
         self._rest = steps
         for step in steps:
-            left_s -= self.core.cost_s(step)
-            self._own["rewound_steps"] += self._replaying
+            left_s -= cost_s(step)
+            if self._replaying:
+                self._own["rewound_steps"] += 1
             estimate = take(step)
             if estimate is not None and estimate.time_s > self._emitted_s:
                 self._emitted_s = estimate.time_s

@@ -23,12 +23,13 @@ needed, at the latest at the next epoch; ``catch_up`` asks for them.
 
 from __future__ import annotations
 
-import heapq
+from bisect import bisect_right, insort
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from math import cos, inf, isfinite, nextafter, sin, sqrt
+from operator import attrgetter, itemgetter
 from typing import NamedTuple
 
 from relpos.errors import DataError
@@ -105,27 +106,19 @@ class Displacement:
 
 
 @dataclass(slots=True)
-class _Chord:
-    """What is left of one report: from the node's reached time to ``end_s``."""
-
-    end_s: float
-    left: Displacement
-    share: float
-    report: Motion
-
-
-@dataclass(slots=True)
 class _Track:
     """How far one node has reported, and how far it has been advanced."""
 
     reported_s: float
     reached_s: float
     heard: bool = False
-    chords: deque[_Chord] = field(default_factory=deque)
+    chords: deque[Motion] = field(default_factory=deque)
+    """Reports that wait, from the node's reached time on."""
+    left: tuple[Displacement, float] | None = None
+    """What is left of the first one, and its share of it; None where that is all."""
 
     def copy(self) -> _Track:
-        chords = deque(_Chord(c.end_s, c.left, c.share, c.report) for c in self.chords)
-        return _Track(self.reported_s, self.reached_s, self.heard, chords)
+        return _Track(self.reported_s, self.reached_s, self.heard, self.chords.copy(), self.left)
 
 
 def refusal(measurement: Measurement) -> str | None:
@@ -152,8 +145,7 @@ def refusal(measurement: Measurement) -> str | None:
     return None
 
 
-def _range_order(measured: Range) -> tuple[int, int, float]:
-    return measured.node, measured.peer, measured.range_m
+_range_order = attrgetter("node", "peer", "range_m")
 
 
 def _sensed_order(measured: Height | Heading) -> tuple[int, bool, float]:
@@ -194,7 +186,11 @@ class Timeline:
     counters: Counter[str] = field(default_factory=Counter)
     _tracks: dict[int, _Track] = field(default_factory=dict)
     _arrived: list[tuple[float, int, Measurement]] = field(default_factory=list)
+    """What is not sorted in yet, as it came."""
+    _first_s: float = inf
+    """The oldest of it."""
     _ordered: list[tuple[float, int, Measurement]] = field(default_factory=list)
+    """What is, in order of time."""
     _pushed: int = 0
     _newest_s: float = -inf
     _frontier_s: float = -inf
@@ -202,6 +198,9 @@ class Timeline:
     _reported: set[int] = field(default_factory=set)
     _epoch_s: float = -inf
     _late: list[Late] = field(default_factory=list)
+    _slowest: _Track | None = None
+    """Who was waited for last."""
+    _sorted_nodes: list[int] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         for node in self.nodes:
@@ -239,16 +238,43 @@ class Timeline:
         :class:`Epoch`, and at the end, the timeline may be copied with ``snapshot``.
         """
         for measurement in measurements:
-            self._track(measurement.node)
-            if isinstance(measurement, Range):
-                self._track(measurement.peer)
-            self._pushed += 1
-            heapq.heappush(self._arrived, (measurement.time_s, self._pushed, measurement))
-            self._newest_s = max(self._newest_s, measurement.time_s)
+            self._add(measurement)
         self._sort_in(inf if final else self._newest_s - self.reorder_s)
         return (
             chain(self._release(final=True), self._end()) if final else self._release(final=False)
         )
+
+    def take_in(self, measurement: Measurement) -> bool:
+        """Take one usable measurement; tell whether ``push_all(())`` may have anything by it.
+
+        Most measurements come within the time that everything is held back for.
+        """
+        before_s = self._newest_s
+        self._add(measurement)
+        until_s = self._newest_s - self.reorder_s
+        if self._first_s <= until_s:
+            self._sort_in(until_s)
+        elif self._newest_s == before_s:
+            return False
+        return bool(self._ordered) and not self._waits_for(self._ordered[0][0])
+
+    def _add(self, measurement: Measurement) -> None:
+        tracks, time_s = self._tracks, measurement.time_s
+        if measurement.node not in tracks:
+            self._track(measurement.node)
+        if isinstance(measurement, Range) and measurement.peer not in tracks:
+            self._track(measurement.peer)
+        self._pushed += 1
+        self._arrived.append((time_s, self._pushed, measurement))
+        if time_s < self._first_s:
+            self._first_s = time_s
+        if time_s > self._newest_s:
+            self._newest_s = time_s
+
+    @property
+    def is_late(self) -> bool:
+        """Whether ``take_late`` has anything to give."""
+        return bool(self._late)
 
     def take_late(self) -> list[Late]:
         """Give, once, what came behind the frontier since it was last asked for.
@@ -264,6 +290,8 @@ class Timeline:
             self,
             counters=self.counters.copy(),
             _tracks={node: track.copy() for node, track in self._tracks.items()},
+            _sorted_nodes=self._sorted_nodes[:],
+            _slowest=None,
             _arrived=self._arrived[:],
             _ordered=self._ordered[:],
             _ranged=self._ranged.copy(),
@@ -289,40 +317,50 @@ class Timeline:
         track = self._tracks.get(node)
         if track is None:
             track = self._tracks[node] = _Track(self.start_s, self.start_s)
+            insort(self._sorted_nodes, node)
         return track
 
     def _sort_in(self, until_s: float) -> None:
         """Give up waiting for anything older than ``until_s``."""
-        while self._arrived and self._arrived[0][0] <= until_s:
-            entry = heapq.heappop(self._arrived)
+        arrived, ordered = self._arrived, self._ordered
+        if self._first_s > until_s:
+            return
+        # What came in order costs a comparison each.
+        arrived.sort()
+        count = bisect_right(arrived, until_s, key=_time_of)
+        for entry in arrived[:count]:
             time_s, _, measurement = entry
             if isinstance(measurement, Motion):
                 self._take_motion(measurement)
-            elif time_s <= self._frontier_s and self.keep_late:
-                # Behind the frontier or at it: the rest of its instant was handed out.
-                self._late.append(Late(nextafter(time_s, -inf), time_s))
-            if not isinstance(measurement, Motion) and time_s < self._frontier_s:
-                name = "ranges" if isinstance(measurement, Range) else "sensed"
-                self.counters[f"{name}_late"] += 1
-                continue
-            heapq.heappush(self._ordered, entry)
+            elif time_s <= self._frontier_s:
+                if self.keep_late:
+                    # Behind the frontier or at it: the rest of its instant was handed out.
+                    self._late.append(Late(nextafter(time_s, -inf), time_s))
+                if time_s < self._frontier_s:
+                    name = "ranges" if isinstance(measurement, Range) else "sensed"
+                    self.counters[f"{name}_late"] += 1
+                    continue
+            if ordered and entry < ordered[-1]:
+                insort(ordered, entry)
+            else:
+                ordered.append(entry)
+        del arrived[:count]
+        self._first_s = arrived[0][0] if arrived else inf
 
     def _take_motion(self, motion: Motion) -> None:
-        track = self._track(motion.node)
-        chord = _Chord(
-            motion.time_s, Displacement(motion.dx_m, motion.dy_m, motion.dtheta_rad), 1.0, motion
-        )
+        track = self._tracks[motion.node]
         chords = track.chords
-        begin_s = chords[-1].end_s if chords else track.reached_s
-        if begin_s < chord.end_s:
-            placed = True
-            chords.append(chord)
+        begin_s = chords[-1].time_s if chords else track.reached_s
+        placed = True
+        if begin_s < motion.time_s:
+            chords.append(motion)
         else:
             # Its successor came first: before it, unless that was begun already.
-            place = sum(waiting.end_s < chord.end_s for waiting in chords)
-            placed = bool(chords) and chords[place].share == 1.0 and motion.time_s > track.reached_s
-            chords.insert(place if placed else len(chords), chord)
-            begin_s = chords[place - 1].end_s if placed and place else track.reached_s
+            place = sum(waiting.time_s < motion.time_s for waiting in chords)
+            begun = place == 0 and track.left is not None
+            placed = bool(chords) and not begun and motion.time_s > track.reached_s
+            chords.insert(place if placed else len(chords), motion)
+            begin_s = chords[place - 1].time_s if placed and place else track.reached_s
             if not placed:
                 begin_s = -inf
         if motion.time_s < self._frontier_s or not placed:
@@ -334,11 +372,13 @@ class Timeline:
             track.reached_s = min(track.reached_s, motion.time_s)
             track.reported_s = track.reached_s
             track.heard = True
-        track.reported_s = max(track.reported_s, motion.time_s)
+        if motion.time_s > track.reported_s:
+            track.reported_s = motion.time_s
 
     def _release(self, *, final: bool) -> Iterator[Step]:
-        while self._ordered:
-            time_s = self._ordered[0][0]
+        ordered = self._ordered
+        while ordered:
+            time_s = ordered[0][0]
             if not final and self._waits_for(time_s):
                 return
             motions: set[int] = set()
@@ -346,17 +386,22 @@ class Timeline:
             sensed: list[Height | Heading] = []
             if time_s > self._frontier_s:
                 self._ranged.clear()
-            while self._ordered and self._ordered[0][0] == time_s:
-                measurement = heapq.heappop(self._ordered)[2]
-                match measurement:
-                    case Motion():
-                        motions.add(measurement.node)
-                    case Range():
-                        ranges.append(measurement)
-                    case _:
-                        sensed.append(measurement)
-            ranges = self._new(ranges)
-            sensed.sort(key=_sensed_order)
+            count = 0
+            for entry_s, _, measurement in ordered:
+                if entry_s != time_s:
+                    break
+                count += 1
+                if isinstance(measurement, Motion):
+                    motions.add(measurement.node)
+                elif isinstance(measurement, Range):
+                    ranges.append(measurement)
+                else:
+                    sensed.append(measurement)
+            del ordered[:count]
+            if ranges:
+                ranges = self._new(ranges)
+            if sensed:
+                sensed.sort(key=_sensed_order)
             closes = self._closes_epoch(time_s, motions)
             if ranges or sensed or closes:
                 time_s = max(time_s, self._frontier_s)
@@ -391,9 +436,17 @@ class Timeline:
 
     def _waits_for(self, time_s: float) -> bool:
         # Nothing newer than this has been sorted in, of the node waited for neither.
-        sorted_s = self._newest_s - self.reorder_s
+        sorted_s, lag_s = self._newest_s - self.reorder_s, self.max_lag_s
+        slowest = self._slowest
+        if (
+            slowest is not None
+            and slowest.reported_s < time_s
+            and sorted_s - slowest.reported_s <= lag_s
+        ):
+            return True
         for track in self._tracks.values():
-            if track.reported_s < time_s and sorted_s - track.reported_s <= self.max_lag_s:
+            if track.reported_s < time_s and sorted_s - track.reported_s <= lag_s:
+                self._slowest = track
                 return True
         return False
 
@@ -407,59 +460,75 @@ class Timeline:
         self._reported |= motions
         return False
 
-    def catch_up(self, nodes: Iterable[int], time_s: float) -> Iterator[Advance]:
+    def catch_up(self, nodes: Iterable[int], time_s: float) -> list[Advance]:
         """Advance some nodes to ``time_s``, at most as far as everything has been handed out."""
+        steps: list[Advance] = []
         for node in sorted(nodes):
             track = self._tracks.get(node)
             if track is not None:
-                yield from _advance(track, node, min(time_s, self._frontier_s))
+                _advance(track, node, min(time_s, self._frontier_s), steps)
+        return steps
 
-    def _advance_all(self, time_s: float) -> Iterator[Advance]:
+    def _advance_all(self, time_s: float) -> list[Advance]:
         self._frontier_s = max(self._frontier_s, time_s)
-        for node in sorted(self._tracks):
-            yield from _advance(self._tracks[node], node, time_s)
+        steps: list[Advance] = []
+        for node in self._sorted_nodes:
+            _advance(self._tracks[node], node, time_s, steps)
+        return steps
 
 
-def _advance(track: _Track, node: int, until_s: float) -> Iterator[Advance]:
-    while track.chords:
-        chord = track.chords[0]
-        length_s = chord.end_s - track.reached_s
-        if chord.end_s <= until_s:
-            track.chords.popleft()
-            piece, share = chord.left, chord.share
+def _advance(track: _Track, node: int, until_s: float, steps: list[Advance]) -> None:
+    """Hand out a node's pieces up to a time."""
+    chords = track.chords
+    while chords:
+        chord = chords[0]
+        end_s, reached_s = chord.time_s, track.reached_s
+        left = track.left
+        if end_s <= until_s:
+            chords.popleft()
+            track.left = None
             # A motion that comes after its successor has no time left of its own: only its
             # displacement counts.
-            duration_s, track.reached_s = max(length_s, 0.0), max(track.reached_s, chord.end_s)
-        elif until_s <= track.reached_s:
+            duration_s = max(end_s - reached_s, 0.0)
+            track.reached_s = max(reached_s, end_s)
+        elif until_s <= reached_s:
             return
         else:
-            duration_s = until_s - track.reached_s
-            cut = duration_s / length_s
-            piece, chord.left = chord.left.split(cut)
-            share = cut * chord.share
-            chord.share -= share
+            end_s, duration_s = until_s, until_s - reached_s
+            cut = duration_s / (chord.time_s - reached_s)
+            whole, whole_share = left or (_whole(chord), 1.0)
+            piece, rest = whole.split(cut)
+            share = cut * whole_share
+            left = piece, share
+            track.left = rest, whole_share - share
             track.reached_s = until_s
-        yield _piece(
-            until_s if chord.end_s > until_s else chord.end_s,
-            node,
-            duration_s,
-            piece,
-            share,
-            chord.report,
-        )
+        if left is None:
+            moved = chord.dx_m, chord.dy_m, chord.dtheta_rad, 1.0
+        else:
+            moved = left[0].dx_m, left[0].dy_m, left[0].dtheta_rad, left[1]
+        if (
+            chord.sigma_x_m is chord.sigma_y_m is chord.sigma_theta_rad is None
+            and chord.sigma_x_alone_m is None
+        ):
+            steps.append(_new(Advance, (end_s, node, duration_s, *moved, *_UNTOLD)))
+            continue
+        part = sqrt(moved[3])
+        sigmas = (
+            None if sigma is None else sigma * part
+            for sigma in (
+                chord.sigma_x_m, chord.sigma_y_m, chord.sigma_theta_rad, chord.sigma_x_alone_m,
+            )
+        )  # fmt: skip
+        steps.append(_new(Advance, (end_s, node, duration_s, *moved, *sigmas)))
 
 
-def _piece(
-    time_s: float, node: int, duration_s: float, piece: Displacement, share: float, report: Motion
-) -> Advance:
-    moved = time_s, node, duration_s, piece.dx_m, piece.dy_m, piece.dtheta_rad, share
-    sigmas = (
-        report.sigma_x_m, report.sigma_y_m, report.sigma_theta_rad, report.sigma_x_alone_m,
-    )  # fmt: skip
-    if sigmas == _UNTOLD:
-        return Advance(*moved)
-    part = sqrt(share)
-    return Advance(*moved, *(None if sigma is None else sigma * part for sigma in sigmas))
+def _whole(report: Motion) -> Displacement:
+    return Displacement(report.dx_m, report.dy_m, report.dtheta_rad)
 
+
+_new = tuple.__new__
+"""Makes a named tuple in half the time that its own constructor takes."""
 
 _UNTOLD = (None, None, None, None)
+
+_time_of = itemgetter(0)
