@@ -206,6 +206,12 @@ def test_an_unknown_scenario_or_fault_is_one_clear_error():
         )
 
 
+def test_a_walk_that_does_not_fit_into_memory_is_refused_before_it_is_prepared(monkeypatch):
+    monkeypatch.setattr("relpos.emulator.team.physical_memory_gb", lambda: 8.0)
+    with pytest.raises(DataError, match=r"20 people for 7200 s takes 8.1 GB .* of 8.0 GB here"):
+        EmulatedTeam("paper", 20, 7200.0)
+
+
 def test_a_recorded_team_is_the_same_run_each_time():
     arguments = {"board": "native", "nodes": 2, "seconds": 15.0, "scenario": "paper", "seed": 4}
     one, other = record_team(**arguments), record_team(**arguments)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from relpos.errors import DeviceError
+from relpos.errors import DeviceError, RelposError
 from relpos.measurements import Prior
 
 if TYPE_CHECKING:
@@ -109,5 +109,7 @@ def _play(cast: Cast, pipe: Connection) -> None:
             terminal.join()
     except (EOFError, BrokenPipeError):
         return
+    except RelposError as error:
+        pipe.send(str(error))
     except Exception as error:
         pipe.send(f"{type(error).__name__}: {error}")

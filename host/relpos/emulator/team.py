@@ -6,12 +6,14 @@ The same arguments give the same bytes at the coordinator's serial port, at the 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from relpos.calibration.steps import LEG_OF_STATURE
+from relpos.errors import DataError
 from relpos.link import xbee as api
 from relpos.link.beacon import BEACON_PERIOD_S, BeaconSchedule
 from relpos.measurements import Prior, Truth
@@ -42,7 +44,9 @@ PRIOR_SIGMA_M = 0.1
 PRIOR_SIGMA_RAD = 0.1
 """How well the start is known where a scenario has a common one: feet on a mark, facing a wall."""
 UNLIMITED_S = 1800.0
-"""Walk prepared where none was asked for: for six walkers half an hour takes 6 s and 0.5 GB."""
+"""Walk prepared where none was asked for: for six walkers half an hour takes 6 s and 0.6 GB."""
+BYTES_PER_SAMPLE = 280.0
+"""Of a prepared walk (27 numbers of truth, 6 once more for the chip); measured, 20 walkers, 2 h."""
 
 
 class EmulatedTeam:
@@ -53,8 +57,8 @@ class EmulatedTeam:
     ``key``. ``node_errors`` replaces what is drawn by the seed: nodes from the shelf, or in
     scenarios "turntable" and "bench" such as nobody has
     calibrated. ``faults`` are SPECs of :mod:`relpos.emulator.faults`; FaultError where one makes
-    no sense. ``beacons``: the coordinator sends them by itself, as a host would in real time. The
-    truth methods are for evaluation alone.
+    no sense, DataError where the walk does not fit into memory. ``beacons``: the coordinator
+    sends them by itself, as a host would in real time. The truth methods are for evaluation alone.
     """
 
     def __init__(
@@ -75,6 +79,7 @@ class EmulatedTeam:
         if node_errors is None:
             uncalibrated = scenario in ("turntable", "bench")
             node_errors = draw_uncalibrated_errors if uncalibrated else draw_node_errors
+        _check_memory(nodes if isinstance(nodes, int) else len(nodes), seconds)
         walkers, self.world = make_team(scenario, nodes, seconds, seed)
         self.walkers: dict[int, WalkerTruth] = {walker.node: walker for walker in walkers}
         self.seconds = seconds
@@ -261,6 +266,25 @@ class EmulatedTeam:
         if walker is None:  # the coordinator lies on a table in the middle
             return np.array((self.world.size_m[0] / 2.0, self.world.size_m[1] / 2.0, 1.0))
         return walker.position_at(time_us * 1e-6)
+
+
+def _check_memory(nodes: int, seconds: float) -> None:
+    """Refuse what would end in swapping: the whole walk is prepared beforehand."""
+    needed_gb = 1e-9 * BYTES_PER_SAMPLE * RATE_HZ * nodes * seconds
+    here_gb = physical_memory_gb()
+    if needed_gb > 0.8 * here_gb:
+        raise DataError(
+            f"a walk of {nodes} people for {seconds:g} s takes {needed_gb:.1f} GB of memory, "
+            f"of {here_gb:.1f} GB here: fewer people or seconds"
+        )
+
+
+def physical_memory_gb() -> float:
+    """Size of this computer's memory; infinite where it does not tell."""
+    try:
+        return 1e-9 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return math.inf
 
 
 def serve_team(
