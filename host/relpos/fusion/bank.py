@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -24,7 +23,7 @@ from relpos.fusion import bank_kernels
 from relpos.fusion.ambiguity import believe, pictures
 from relpos.fusion.bank_core import BankCore, Snapshot
 from relpos.fusion.bank_settings import BankSettings
-from relpos.fusion.detection import Detection, Round
+from relpos.fusion.detection import Detection
 from relpos.fusion.estimator import (
     ANY_ANGLE_RAD,
     Alternative,
@@ -51,6 +50,7 @@ from relpos.measurements import Heading, Height, Measurement, Prior, Range
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
 
 _DRIFT, _SCALE = int(Of.DRIFT), int(Of.SCALE)
 _TWO_PI = 2.0 * math.pi
@@ -82,6 +82,12 @@ class _Known(Presence):
     """Height of the tag over the floor at the start."""
     drifted_s: float = -math.inf
     """Until then it was tracked by ranges alone."""
+
+    def copy(self) -> _Known:
+        return _Known(
+            self.height_m, self.sigma_height_m, self.news_s, self.silent_epochs, self.worn_m,
+            self.drifted_s,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +140,8 @@ class Bank:
     _pending: list[Advance] = field(default_factory=list)
     _own: Counter[str] = field(default_factory=Counter)
     _moved: bool = False
+    _heights: bool = False
+    """Whether anybody's height is known; all are 0 else."""
     _ranges_used: int = 0
     _epoch_s: float = -math.inf
 
@@ -226,7 +234,7 @@ class Bank:
         return _State(
             self.core.snapshot(), self.detection.snapshot(), self.repetition.snapshot(),
             self.habit.snapshot(), self.stillness.snapshot(), self._row.copy(),
-            {node: copy(known) for node, known in self._known.items()}, self._pending[:],
+            {node: known.copy() for node, known in self._known.items()}, self._pending[:],
             self._own.copy(), self._moved, self._ranges_used, self._epoch_s,
             self.starts.snapshot(), self._standing.copy(), self._facing.copy(),
             self.north.snapshot(),
@@ -240,7 +248,7 @@ class Bank:
         self.habit = snapshot.habit.snapshot()
         self.stillness = snapshot.stillness.snapshot()
         self._row = snapshot.row.copy()
-        self._known = {node: copy(known) for node, known in snapshot.known.items()}
+        self._known = {node: known.copy() for node, known in snapshot.known.items()}
         self._pending, self._own = snapshot.pending[:], snapshot.own.copy()
         self._moved, self._ranges_used = snapshot.moved, snapshot.ranges_used
         self._epoch_s = snapshot.epoch_s
@@ -255,6 +263,7 @@ class Bank:
             worn = self.mounting.get(node)
             if worn is not None and worn.height_m is not None:
                 known.worn_m = known.height_m = worn.height_m
+                self._heights = True
         return known
 
     def _arm(self, node: int) -> tuple[float, float]:
@@ -305,57 +314,52 @@ class Bank:
         self.core.move(rows[some], moves[some], None if told is None else told[some])
 
     def _range(self, step: Ranging) -> None:
-        for r in step.ranges:
-            for node in (r.node, r.peer):
-                known = self._meet(node)
-                known.heard(step.time_s)
-                if node not in self._row:
-                    self._seek(node)
-        if (
-            self.starts
-            and not {n for r in step.ranges for n in (r.node, r.peer)} <= self._row.keys()
-        ):
+        located, time_s = self._row, step.time_s
+        everybody = {n for r in step.ranges for n in (r.node, r.peer)}
+        for node in everybody:
+            self._meet(node).heard(time_s)
+        ranges: Sequence[Range] = step.ranges
+        if not everybody <= located.keys():
+            for node in sorted(everybody - located.keys()):
+                self._seek(node)
             heights = {n: k.height_m for n, k in self._known.items()}
-            self.starts.ranging(step.time_s, step.ranges, self._places(), heights)
+            self.starts.ranging(time_s, step.ranges, self._places(), heights)
             # A search may be long; finding nobody in it is no fault of the data.
             self._ranges_used += len(step.ranges)
-        ranges = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
-        ranges = self._heard_moving(step.time_s, ranges)
+            ranges = [r for r in step.ranges if r.node in located and r.peer in located]
+        tried = ranges
+        ranges = self._heard_moving(time_s, ranges)
+        measured = np.array([r.range_m for r in ranges])
+        pairs = [(r.node, r.peer) for r in ranges]
+        first, second, dz = self._pairs(pairs)
         if self.core.unplaced and ranges:
-            first, second, _ = self._pairs([(r.node, r.peer) for r in ranges])
-            self.core.sight(first, second, np.array([r.range_m for r in ranges]))
-        rounds = self._hear(step)
+            self.core.sight(first, second, measured)
+        rounds = self._hear(time_s, tried)
         if ranges:
-            pairs = [(r.node, r.peer) for r in ranges]
+            known = self._known
             variance = np.array(
-                [
-                    self._known[a].sigma_height_m ** 2 + self._known[b].sigma_height_m ** 2
-                    for a, b in pairs
-                ]
+                [known[a].sigma_height_m ** 2 + known[b].sigma_height_m ** 2 for a, b in pairs]
             )
-            first, second, dz = self._pairs(pairs)
-            measured = np.array([r.range_m for r in ranges])
             worth = self.repetition.worth(pairs)
             self.core.update(first, second, measured, dz, variance, worth)
             self._ranges_used += len(ranges)
-        for done, tried in rounds:
-            heard = np.arange(len(done.heard) + len(done.silent)) < len(done.heard)
-            surely = np.concatenate([np.ones(len(done.heard)), tried])
-            self.core.hearing(*self._pairs(done.heard + done.silent), heard, surely, self.detection)
+        for who, heard, surely in rounds:
+            self.core.hearing(*who, heard, surely, self.detection)
         self.core.settle()
 
-    def _heard_moving(self, time_s: float, ranges: list[Range]) -> list[Range]:
+    def _heard_moving(self, time_s: float, ranges: Sequence[Range]) -> Sequence[Range]:
         """Leave out ranges of nodes whose motion is missing; let those drift who miss it long.
 
         A node without motion may be anywhere that it can have walked to. For a while its motion
         may still come (then the ranges are worked in after all, in their place); after
         ``SILENT_S`` it is tracked by ranges alone, as somebody who wanders.
         """
-        silent = set()
-        for node in {n for r in ranges for n in (r.node, r.peer)}:
-            reported_s = self._feed.timeline.reported_s(node)
-            if -math.inf < reported_s < time_s:
-                silent.add(node)
+        reported = self._feed.timeline.reported_s
+        silent = {
+            node
+            for node in {n for r in ranges for n in (r.node, r.peer)}
+            if -math.inf < reported(node) < time_s
+        }
         if not silent:
             return ranges
         for node in sorted(silent):
@@ -435,32 +439,43 @@ class Bank:
         self._own["headings_sought"] += 1
 
     def _pairs(self, pairs: Sequence[tuple[int, int]]) -> tuple[Indices, Indices, Floats]:
-        first = np.array([self._row[a] for a, _ in pairs], dtype=np.int64)
-        second = np.array([self._row[b] for _, b in pairs], dtype=np.int64)
-        dz = np.array([self._known[b].height_m - self._known[a].height_m for a, b in pairs])
+        row, known = self._row, self._known
+        rows = np.array([(row[a], row[b]) for a, b in pairs], dtype=np.int64).reshape(-1, 2)
+        first, second = np.ascontiguousarray(rows.T)
+        if not self._heights:
+            return first, second, np.zeros(len(rows))
+        dz = np.array([known[b].height_m - known[a].height_m for a, b in pairs])
         return first, second, dz
 
-    def _hear(self, step: Ranging) -> list[tuple[Round, Floats]]:
-        """Learn who is heard how far; give the rounds, and how surely the silent were tried."""
-        rounds: list[tuple[Round, Floats]] = []
-        ranges = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
-        for done in self.detection.rounds.take(step.time_s, ranges, self._feed.timeline.reported_s):
+    def _hear(
+        self, time_s: float, ranges: Sequence[Range]
+    ) -> list[tuple[tuple[Indices, Indices, Floats], Bools, Floats]]:
+        """Learn who is heard how far.
+
+        Give, of each round, the pairs tried, which of them were heard, and how surely all were
+        tried.
+        """
+        rounds = []
+        timeline = self._feed.timeline
+        for done in self.detection.rounds.take(time_s, ranges, timeline.reported_s):
             pairs = done.heard + done.silent
-            for late in self._feed.timeline.catch_up({n for p in pairs for n in p}, step.time_s):
+            for late in timeline.catch_up({n for p in pairs for n in p}, time_s):
                 self.take(late)
             self._advance()
-            middle, spread = self.core.predicted_ranges(*self._pairs(pairs))
-            heard = len(done.heard)
-            tried = self.detection.learn(
-                done, middle[:heard], spread[:heard], middle[heard:], spread[heard:]
+            who = self._pairs(pairs)
+            heard = np.arange(len(pairs)) < len(done.heard)
+            surely = np.ones(len(pairs))
+            surely[len(done.heard) :] = self.detection.learn_all(
+                done, *self.core.predicted_ranges(*who)
             )
-            rounds.append((done, tried))
+            rounds.append((who, heard, surely))
         return rounds
 
     def _sense(self, step: Sensed) -> None:
         measured = step.measurement
         if isinstance(measured, Height):
             known = self._known[measured.node]
+            self._heights = True
             known.height_m = known.worn_m + measured.height_m
             known.sigma_height_m = measured.sigma_m or 0.0
         elif isinstance(measured, Heading) and measured.node in self._row:

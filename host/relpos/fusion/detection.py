@@ -33,6 +33,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache
+from itertools import chain
 from typing import Protocol
 
 import numpy as np
@@ -136,7 +137,6 @@ class Rounds:
     """
 
     heard_ever: set[Pair] = field(default_factory=set)
-    _partners: dict[int, set[int]] = field(default_factory=dict)
     _turns: float | None = None
     """Running share of instants in which one node alone initiated: near 1 where in turns."""
     _open: set[Pair] = field(default_factory=set)
@@ -154,43 +154,35 @@ class Rounds:
         in_turns = float(len({r.node for r in ranges}) == 1)
         turns = in_turns if self._turns is None else self._turns
         self._turns = turns + 0.1 * (in_turns - turns)
-        if self._open and (directed & self._directed or self._turns < 0.5):
+        if self._open and (self._turns < 0.5 or not directed.isdisjoint(self._directed)):
             rounds.append(self._close(time_s, reported_s))
         self._directed |= directed
-        self._open |= {(min(r.node, r.peer), max(r.node, r.peer)) for r in ranges}
+        self._open |= {pair if pair[0] < pair[1] else pair[::-1] for pair in directed}
         if self._turns < 0.5:
             rounds.append(self._close(time_s, reported_s))
         return rounds
 
     def snapshot(self) -> Rounds:
         """Give a copy that goes on by itself."""
-        partners = {node: peers.copy() for node, peers in self._partners.items()}
-        return Rounds(
-            self.heard_ever.copy(), partners, self._turns, self._open.copy(), self._directed.copy()
-        )
+        return Rounds(self.heard_ever.copy(), self._turns, self._open.copy(), self._directed.copy())
 
     def _close(self, time_s: float, reported_s: Callable[[int], float]) -> Round:
         heard = self._open
-        for node, peer in heard - self.heard_ever:
-            self._partners.setdefault(node, set()).add(peer)
-            self._partners.setdefault(peer, set()).add(node)
         self.heard_ever |= heard
-        busy = Counter(node for pair in heard for node in pair)
-        alive: dict[int, bool] = {}
-        silent = set()
-        for node in busy:
-            for peer in self._partners.get(node, ()):
-                pair = (node, peer) if node < peer else (peer, node)
-                if pair in heard or pair in silent:
-                    continue
-                if peer not in alive:
-                    alive[peer] = peer in busy or reported_s(peer) >= time_s - ALIVE_S
-                if alive[peer]:
-                    silent.add(pair)
+        busy = Counter(chain.from_iterable(heard))
+        silent = []
+        for pair in self.heard_ever - heard:
+            there = (pair[0] in busy) + (pair[1] in busy)
+            if there == 1:
+                other = pair[1] if pair[0] in busy else pair[0]
+                there += reported_s(other) >= time_s - ALIVE_S
+            if there == 2:
+                silent.append(pair)
+        silent.sort()
         self._open, self._directed = set(), set()
         ordered = tuple(sorted(heard))
-        witnessed = tuple(busy[a] > 1 or busy[b] > 1 for a, b in ordered)
-        return Round(time_s, ordered, tuple(sorted(silent)), witnessed)
+        witnessed = tuple([busy[a] > 1 or busy[b] > 1 for a, b in ordered])
+        return Round(time_s, ordered, tuple(silent), witnessed)
 
 
 class Teach(Protocol):
@@ -323,19 +315,25 @@ class Detection:
         ``of.heard`` and ``of.silent``. Returns (len(of.silent),): the probability that both
         nodes' UWB worked.
         """
-        heard = len(of.heard)
+        return self.learn_all(
+            of, np.concatenate([heard_m, silent_m]), np.concatenate([heard_sigma_m, silent_sigma_m])
+        )
+
+    def learn_all(self, of: Round, distance_m: Floats, sigma_m: Floats) -> Floats:
+        """As ``learn``, of the heard and the silent pairs in one array each."""
         pairs = of.heard + of.silent
         if not pairs:
             return np.empty(0)
         slot = self._slot
-        if not slot.keys() >= {node for pair in pairs for node in pair}:
+        try:
+            slots = np.array([(slot[a], slot[b]) for a, b in pairs], dtype=np.int64)
+        except KeyError:
             self._add(pairs)
-        first = np.array([slot[a] for a, _ in pairs], dtype=np.int64)
-        second = np.array([slot[b] for _, b in pairs], dtype=np.int64)
+            return self.learn_all(of, distance_m, sigma_m)
+        first, second = np.ascontiguousarray(slots.T)
         tried = self.teach(
-            first, second, heard, np.array(of.witnessed, dtype=np.float64),
-            np.concatenate([heard_m, silent_m]), np.concatenate([heard_sigma_m, silent_sigma_m]),
-            self.curve, self._working, self._surprise, self._counts, self._sums,
+            first, second, len(of.heard), np.array(of.witnessed, dtype=np.float64), distance_m,
+            sigma_m, self.curve, self._working, self._surprise, self._counts, self._sums,
         )  # fmt: skip
         if self._sums[2] >= self._refit_at:
             self._refit()
