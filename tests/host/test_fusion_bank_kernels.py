@@ -82,7 +82,7 @@ def updated(x: Floats, p: Floats, measured: float, dz: float, outlier: tuple[flo
 
 def mixture(x: Floats, p: Floats, weight: Floats) -> tuple[Floats, Floats]:
     px, pp = joint.pack(x, p, NODES)
-    return joint.moments(px, pp, in_lanes(weight), NODES, joint.order(NODES, SIZE), SIZE)
+    return joint.moments(px, pp, in_lanes(weight), NODES, joint.order(NODES, SIZE), SIZE, SIZE)
 
 
 def predicted(x: Floats, p: Floats) -> tuple[float, float]:
@@ -408,7 +408,9 @@ def test_levels_are_drawn_by_what_is_known_of_them() -> None:
     draw, mean, root = rng.normal(size=(11, 7)), rng.normal(size=7), rng.normal(size=(7, 7))
     covariance = root @ root.T
     level, sigma2 = lanes.empty_lines(2, 2, noise.LEVELS), lanes.empty_lines(2)
-    bank_kernels.spread_levels(draw, mean, covariance, 0.5, level, sigma2)
+    laid = lanes.empty_lines(2, 7)
+    laid[...] = np.resize(draw, (16, 7)).reshape(2, lanes.LANES, 7).transpose(0, 2, 1)
+    bank_kernels.spread_levels(laid, mean, covariance, 0.5, level, sigma2)
     sd = np.minimum(0.5 * np.sqrt(covariance.diagonal()), noise.SPREAD_MOST)
     expected = np.exp(mean + sd * draw)
     back = level.reshape(2, 6, lanes.LANES).transpose(0, 2, 1).reshape(-1, 6)[:11]

@@ -450,7 +450,7 @@ class BankCore:
             self.levels.mean, self.levels.covariance, self.outlier_counts, self.surprise,
             self.watch.sums, self.watch.base,
             self.since_slip <= OPEN_UPDATES and self.counters["slips"] > 0,
-            self.draw, s.spread, self.level, good,
+            self._draw, s.spread, self.level, good,
         )  # fmt: skip
         if clamped:
             self.counters["levels_clamped"] += clamped
@@ -722,8 +722,10 @@ class BankCore:
         if self.level.shape[:2] != (blocks, self.nodes):
             self.level = lanes.empty_lines(blocks, self.nodes, noise.LEVELS)
             self.sigma2 = lanes.empty_lines(blocks)
+        laid = np.concatenate([self.draw, self.draw[[-1] * (blocks * LANES - self.count)]])
+        self._draw = lanes.copy_lines(laid.reshape(blocks, LANES, -1).transpose(0, 2, 1))
         bank_kernels.spread_levels(
-            self.draw, self.levels.mean, self.levels.covariance, s.spread, self.level, self.sigma2
+            self._draw, self.levels.mean, self.levels.covariance, s.spread, self.level, self.sigma2
         )
 
     @property
@@ -741,17 +743,25 @@ class BankCore:
             self._alarm or self.slipped or self.unplaced
             or max(self.surprise.tolist()) > self._usual_surprise
         )  # fmt: skip
-        if self.count >= self.settings.hypotheses and (open_ or not self._may_be_flat()):
+        most = self.count >= self.settings.hypotheses
+        if most and open_:
             self.unambiguous = 0
             return
-        mean, covariance = self._undoubted_moments(poses_alone=True)
+        step_bend = self._step_bend()
+        if most and step_bend > hypotheses.FLAT:
+            self.unambiguous = 0
+            return
+        poses = joint.order(self.nodes, self._x.shape[1])[: _POSE_PLACE * self.nodes]
+        mean, covariance = joint.moments(
+            self._x, self._p, self._undoubted, self.nodes, poses, len(poses), len(poses)
+        )
         sigmas = np.exp(0.5 * self.levels.mean)
         metre = math.sqrt(noise.ALONG_M2_M) * sigmas[noise.ALONG : -1 : noise.LEVELS]
         bend = hypotheses.bend(mean, covariance, float(sigmas[-1]), metre)
         if open_ or bend > hypotheses.BENT:
             self.unambiguous = 0
             self.grow()
-        elif bend > hypotheses.FLAT or not self._is_even(covariance):
+        elif bend > hypotheses.FLAT or not self._is_even(covariance, poses, step_bend):
             self.unambiguous = 0
         else:
             self.unambiguous += 1
@@ -760,56 +770,34 @@ class BankCore:
                 self.unambiguous = 0
                 self._shrink(fewer[0])
 
-    def _may_be_flat(self) -> bool:
-        """Whether what is quickly told speaks against no unambiguous picture."""
-        if not self._is_decided():
-            return False
-        metre = math.sqrt(noise.ALONG_M2_M) * np.exp(
-            0.5 * self.levels.mean[noise.ALONG : -1 : noise.LEVELS]
-        )
-        heading = bank_kernels.heading_variances(
-            self._x, self._p, self._undoubted_weights(), self.nodes
-        )
-        return float((0.5 * heading / metre).max()) <= hypotheses.FLAT
-
-    def _is_decided(self) -> bool:
-        """Whether no few hypotheses count, and all model the same, with a known range sigma."""
+    def _step_bend(self) -> float:
+        """Bend of the next metre, inf where the hypotheses are undecided; undoubted weights."""
+        self._undoubted = np.empty_like(self._log_weight)
         if float(self.levels.covariance[-1, -1]) > hypotheses.KNOWN**2:
-            return False
+            bank_kernels.undoubted_weights(self._log_weight, self.doubtful, self._undoubted)
+            return math.inf
         self._weight = np.empty_like(self._log_weight)
-        return bool(
-            bank_kernels.is_decided(
-                self._log_weight, self.doubtful, self.has_constants, self.has_bias, self._weight
+        return float(
+            bank_kernels.step_bend(
+                self._x, self._p, self._log_weight, self.doubtful, self.has_constants,
+                self.has_bias, self.levels.mean, self.nodes, self._weight, self._undoubted,
             )
-        )
+        )  # fmt: skip
 
-    def _is_even(self, covariance: Floats) -> bool:
+    def _is_even(self, covariance: Floats, poses: Indices, step_bend: float) -> bool:
         """Whether the hypotheses are one cloud: no few of them count, and none lie far apart."""
         if self.count == 1:
             return True
-        if not self._is_decided():
-            return False
-        poses = joint.order(self.nodes, self._x.shape[1])[: _POSE_PLACE * self.nodes]
-        within = bank_kernels.variances_within(self._p, self._undoubted_weights(), len(poses))
-        between = covariance.diagonal()[poses] - within
         drawn = self._sampled / (1.0 - self._sampled)
-        return bool((between <= hypotheses.APART * drawn * within + 1e-6).all())
-
-    def _undoubted_moments(self, *, poses_alone: bool) -> tuple[Floats, Floats]:
-        """As ``moments``, without those who doubt: they are no part of the picture."""
-        return self._moments(self._undoubted_weights(), poses_alone)
-
-    def _undoubted_weights(self) -> Floats:
-        """Weights (B, LANES) with next to nothing for those who doubt."""
-        weight = np.empty_like(self._log_weight)
-        bank_kernels.undoubted_weights(self._log_weight, self.doubtful, weight)
-        return weight
+        return step_bend < math.inf and bool(
+            bank_kernels.is_even(self._p, self._undoubted, covariance, poses, len(poses), drawn)
+        )
 
     def _moments(self, weight: Floats, poses_alone: bool) -> tuple[Floats, Floats]:
         size = self._x.shape[1]
         of = joint.order(self.nodes, size)
         places = _POSE_PLACE * self.nodes if poses_alone else size
-        return joint.moments(self._x, self._p, weight, self.nodes, of, places)
+        return joint.moments(self._x, self._p, weight, self.nodes, of, places, size)
 
     def _weight_lines(self, weight: Floats) -> Floats:
         """Weights (K,) as (B, LANES): what fills up the last block counts nothing."""
@@ -833,7 +821,8 @@ class BankCore:
 
     def _shrink(self, count: int) -> None:
         """Go on with fewer hypotheses, the mixture's moments unchanged."""
-        mean, covariance = self._undoubted_moments(poses_alone=False)
+        self._step_bend()
+        mean, covariance = self._moments(self._undoubted, poses_alone=False)
         self.log_weight[:] -= np.where(self.doubtful > 0.0, bank_kernels.DOUBTERS, 0.0)
         angles = PER_NODE * np.arange(self.nodes, dtype=np.int64) + Of.HEADING
         before, weight = self._sampled, self.weights()
@@ -865,25 +854,25 @@ class BankCore:
         if not self.nodes or self.count < 2:
             return
         usual, quiet = self._usual_surprise, s.jumps / self.nodes
-        rate = np.array(
-            [
-                quiet + (s.jumps_most - quiet) * min(max((much - usual) / 0.35, 0.0), 1.0)
-                for much in self.surprise.tolist()
-            ]
-        )
-        total = float(rate.sum())
+        rate = [
+            quiet + (s.jumps_most - quiet) * min(max((much - usual) / 0.35, 0.0), 1.0)
+            for much in self.surprise.tolist()
+        ]
+        total = sum(rate)
         which = np.flatnonzero(self.rng.random(self.count) < total)
         if not which.size:
             return
         self.doubtful[which] = DOUBT_UPDATES
-        edges = rate.cumsum() / total
+        edges = np.cumsum(rate) / total
         edges[-1] = 1.0
-        for k in which:
+        for k in which.tolist():
             row = int(np.searchsorted(edges, self.rng.random(), side="right"))
-            offset = self.rng.standard_normal(3) * (s.jump_m, s.jump_m, s.jump_rad)
-            block, lane = divmod(int(k), LANES)
-            for entry, sigma in ((0, s.jump_m), (1, s.jump_m), (2, s.jump_rad)):
-                self._x[block, self._place(row, entry), lane] += math.sqrt(0.5) * offset[entry]
+            offset = self.rng.standard_normal(3).tolist()
+            block, lane = divmod(k, LANES)
+            for entry, sigma in enumerate((s.jump_m, s.jump_m, s.jump_rad)):
+                self._x[block, self._place(row, entry), lane] += (
+                    math.sqrt(0.5) * offset[entry] * sigma
+                )
                 self._p[block, self._variance_place(row, entry), lane] += 0.5 * sigma**2
         self.counters["jumps"] += len(which)
 

@@ -112,34 +112,60 @@ def is_decided(
 
 
 @compiled
-def variances_within(p: Floats, weight: Floats, places: int) -> Floats:
-    """Give the mean (places,) of the hypotheses' own variances, by ``weight`` (B, LANES)."""
-    given = np.empty(places)
+def is_even(
+    p: Floats, weight: Floats, covariance: Floats, of: Indices, places: int, drawn: float
+) -> bool:
+    """Tell whether the hypotheses, by ``weight`` (B, LANES), are one cloud.
+
+    That is where the variances between them, the rest of the mixture's ``covariance`` (D, D), are
+    what ``drawn``, the drawn over the kept share of the noise, accounts for.
+    """
     for i in range(places):
         sums = fill(0.0)
         for b in range(p.shape[0]):
             at = b * p.shape[1] + (i * (i + 1)) // 2 + i
             sums = sums + load(weight, b) * load(p, at)
-        given[i] = lanes.total(sums)
-    return given
+        within = lanes.total(sums)
+        between = covariance[of[i], of[i]] - within
+        if between > hypotheses.APART * drawn * within + 1e-6:
+            return False
+    return True
+
+
+@compiled
+def step_bend(
+    x: Floats, p: Floats, log_weight: Floats, doubtful: Floats, has_constants: Floats,
+    has_bias: Floats, levels: Floats, nodes: int, weight: Floats, undoubted: Floats,
+) -> float:  # fmt: skip
+    """Give the bend of everybody's next metre (:mod:`relpos.fusion.hypotheses`); inf where open.
+
+    That is where few hypotheses count, or they model different things. ``weight`` and
+    ``undoubted`` (B, LANES) receive the weights, and those of who does not doubt.
+    """
+    undoubted_weights(log_weight, doubtful, undoubted)
+    if not is_decided(log_weight, doubtful, has_constants, has_bias, weight):
+        return np.inf
+    heading = heading_variances(x, p, undoubted, nodes)
+    worst = 0.0
+    for n in range(nodes):
+        metre = math.sqrt(noise.ALONG_M2_M) * math.exp(0.5 * levels[noise.LEVELS * n + noise.ALONG])
+        worst = max(worst, 0.5 * heading[n] / metre)
+    return worst
 
 
 @compiled
 def spread_levels(
     draw: Floats, mean: Floats, covariance: Floats, spread: float, level: Floats, sigma2: Floats
 ) -> None:
-    """Give every hypothesis its draw ``draw`` (K, L) of what is known of the log levels (L,).
+    """Give every hypothesis its draw ``draw`` (B, L, LANES) of what is known of log levels (L,).
 
     ``level`` (B, N, 3, LANES) and ``sigma2`` (B, LANES) receive them.
     """
-    count, several = draw.shape
-    one = np.empty((1, LANES))
+    blocks, several = draw.shape[0], draw.shape[1]
     for c in range(several):
         sd = min(spread * math.sqrt(covariance[c, c]), noise.SPREAD_MOST)
-        for b in range(sigma2.shape[0]):
-            for lane in range(LANES):
-                one[0, lane] = draw[min(b * LANES + lane, count - 1), c]
-            value = lanes.exp(mean[c] + sd * load(one, 0))
+        for b in range(blocks):
+            value = lanes.exp(mean[c] + sd * load(draw, b * several + c))
             if c == several - 1:
                 store(sigma2, b, value)
             else:
