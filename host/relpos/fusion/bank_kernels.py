@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion import hypotheses, lanes, noise, slips
-from relpos.fusion.compiled import compiled
+from relpos.fusion.compiled import compiled, inlined
 from relpos.fusion.detection import FAILS, LENGTH, STEP_M, TRUSTED_M
 from relpos.fusion.estimator import ANY_ANGLE_RAD
 from relpos.fusion.joint import MEAN, PER_NODE, STATS, TRUST, VARIANCE, update
@@ -223,7 +223,7 @@ def prepare_motion(
     return anybody
 
 
-@compiled
+@inlined
 def digest(
     stats: Floats,
     before: Floats,

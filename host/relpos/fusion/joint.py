@@ -34,7 +34,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion import lanes
-from relpos.fusion.compiled import compiled
+from relpos.fusion.compiled import compiled, inner
 from relpos.fusion.lanes import LANES, Lanes, fill, greater, lesser, load, select, some, store
 
 Floats = npt.NDArray[np.float64]
@@ -196,19 +196,19 @@ def _take(of: Floats, chosen: Indices, to: Floats) -> None:
             given[own + np.uintp(7)] = taken[b7 + line]
 
 
-@compiled
+@inner
 def _row(i: int) -> int:
     """Where a row of the triangle begins."""
     return (i * (i + 1)) >> 1
 
 
-@compiled
+@inner
 def _at(i: int, j: int) -> int:
     """Place of an entry in the triangle."""
     return ((i * (i + 1)) >> 1) + j if i >= j else ((j * (j + 1)) >> 1) + i
 
 
-@compiled
+@inner
 def _extent(p: Floats, base: int, nodes: int, size: int) -> int:
     """Give how many entries of the state vary in a block: poses, and constants, and biases."""
     poses = PER_NODE * nodes
@@ -277,7 +277,7 @@ def advance(
                 _move_others(p, base, moved, nodes, row, active)
 
 
-@compiled
+@inner
 def _move(
     x: Floats, p: Floats, level: Floats, sens: Floats, moved: Floats, at_x: int, base: int,
     at_user: int, nodes: int, row: int, motion: Floats, normal: Lanes, share: float, cross: float,
@@ -388,7 +388,7 @@ def _move(
     store(p, i_hh, hh)
 
 
-@compiled
+@inner
 def _turn_sensitivity(sens: Floats, t: int, east: Lanes, north: Lanes) -> None:
     """Carry one sensitivity (xx, xy, yy, xh, yh, hh) at ``t`` over a displacement."""
     xh, yh, hh = load(sens, t + 3), load(sens, t + 4), load(sens, t + 5)
@@ -399,7 +399,7 @@ def _turn_sensitivity(sens: Floats, t: int, east: Lanes, north: Lanes) -> None:
     store(sens, t + 4, yh + east * hh)
 
 
-@compiled
+@inner
 def _move_others(p: Floats, base: int, moved: Floats, nodes: int, row: int, active: int) -> None:
     """Carry a user's covariance with everything else over all its displacements at once.
 
@@ -442,7 +442,7 @@ def _move_others(p: Floats, base: int, moved: Floats, nodes: int, row: int, acti
 # -- ranges ----------------------------------------------------------------------------------------
 
 
-@compiled
+@inner
 def _second_order(
     ux: Lanes, uy: Lanes, xx: Lanes, xy: Lanes, yy: Lanes, dz: float
 ) -> tuple[Lanes, Lanes, Lanes, Lanes]:
@@ -461,7 +461,7 @@ def _second_order(
     return m, v, ux / m, uy / m
 
 
-@compiled
+@inner
 def _predict_range(
     x: Floats, p: Floats, at_x: int, base: int, i: int, j: int, dz: float
 ) -> tuple[Lanes, Lanes, Lanes, Lanes]:
@@ -477,7 +477,7 @@ def _predict_range(
     return _second_order(ux, uy, xx, xy, yy, dz)
 
 
-@compiled
+@inner
 def _range_by_arms(
     x: Floats, p: Floats, at_x: int, base: int, i: int, j: int, dz: float, arm_i: Floats,
     arm_j: Floats, active: int, east: Floats, north: Floats, g: Floats,
@@ -509,7 +509,7 @@ def _range_by_arms(
     return m, v, gx, gy
 
 
-@compiled
+@inner
 def _gain(
     p: Floats, base: int, i: int, j: int, gx: Lanes, gy: Lanes, active: int, g: Floats
 ) -> None:
@@ -542,7 +542,7 @@ def _gain(
         store(g, q, gx * off_x + gy * off_y)
 
 
-@compiled
+@inner
 def _correct(
     x: Floats, p: Floats, at_x: int, base: int, g: Floats, move: Lanes, shrink: Lanes, active: int
 ) -> None:
@@ -557,7 +557,7 @@ def _correct(
         t += o + 1
 
 
-@compiled
+@inner
 def _correct_sensitivity(
     sens: Floats, t: int, hx: Lanes, hy: Lanes, kx: Lanes, ky: Lanes, kh: Lanes
 ) -> Lanes:
@@ -577,7 +577,7 @@ def _correct_sensitivity(
     return s
 
 
-@compiled
+@inner
 def _bound_sensitivity(sens: Floats, t: int, p: Floats, base: int, b: int, most: float) -> None:
     """Keep what the levels explain of a covariance below ``most`` times the covariance.
 
@@ -742,7 +742,7 @@ def update_heading(
 # -- who is heard ----------------------------------------------------------------------------------
 
 
-@compiled
+@inner
 def _outcome(place: Lanes, heard: bool, tried: float, curve: Floats) -> Lanes:
     """Probability that a pair is heard, or is silent, at a multiple of the curve's step."""
     last = curve.shape[0] - 2.0

@@ -27,7 +27,8 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
 from relpos.fusion import vectormath
-from relpos.fusion.compiled import compiled
+from relpos.fusion.compiled import compiled, inner
+from relpos.fusion.quick_typing import FIRST
 
 Floats = npt.NDArray[np.float64]
 
@@ -114,6 +115,8 @@ def _operation(
     numbers = (types.Float, types.Integer)
 
     class Template(AbstractTemplate):
+        metadata = FIRST
+
         def generic(self, args: Any, kws: Any) -> Any:
             known = len(args) == 2 and all(a == _lanes or isinstance(a, numbers) for a in args)
             return signature(result, *args) if known and _lanes in args else None
@@ -145,6 +148,8 @@ _operation((operator.lt,), lambda b, x, y: b.fcmp_ordered("<", x, y), _mask)
 
 @infer_global(operator.and_)
 class _And(AbstractTemplate):
+    metadata = FIRST
+
     def generic(self, args: Any, kws: Any) -> Any:
         return signature(_mask, *args) if args == (_mask, _mask) else None
 
@@ -333,7 +338,7 @@ def _exponent_and_mantissa(typing: Any, x: Any) -> Any:
     return pair(_lanes), emit
 
 
-@compiled
+@inner
 def exp(x: Lanes) -> Lanes:
     """As :func:`vectormath.exp`."""
     kept = greater(x, fill(-700.0))
@@ -342,14 +347,14 @@ def exp(x: Lanes) -> Lanes:
     return select(x > -700.0, grown, fill(0.0))
 
 
-@compiled
+@inner
 def log(x: Lanes) -> Lanes:
     """As :func:`vectormath.log`."""
     e, f = _exponent_and_mantissa(x)
     return vectormath.log_series(e, f)
 
 
-@compiled
+@inner
 def cos_sin(x: Lanes) -> tuple[Lanes, Lanes]:
     """As :func:`vectormath.cos_sin`."""
     n = floor(x * vectormath.PER_QUARTER + 0.5)

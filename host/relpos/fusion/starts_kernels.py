@@ -23,7 +23,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.compiled import compiled
+from relpos.fusion.compiled import compiled, inner
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
@@ -70,8 +70,11 @@ def normal_equations(
     count = knots.shape[0] - 1
     each = FIXED + count
     dimension = picture.size
-    hessian[:] = 0.0
-    gradient[:] = 0.0
+    # Loops in place of expressions of arrays, which take the compiler seconds.
+    for i in range(dimension):
+        gradient[i] = 0.0
+        for j in range(dimension):
+            hessian[i, j] = 0.0
     cost = 0.0
     offset = np.zeros((nodes, count + 1, 2))
     angle = np.zeros((nodes, count + 1))
@@ -103,13 +106,15 @@ def normal_equations(
     slope = np.zeros((2, 2, each))
     row = np.zeros(2 * each + 1)
     column = np.zeros(2 * each + 1, dtype=np.intp)
+    # No literal: what takes it would be compiled for it, and once more for other numbers.
+    nought: int = np.intp(0)  # type: ignore[assignment]
 
     for i in range(nodes):
         if prior[1, i, 0] == 0.0 and prior[1, i, 2] == 0.0:
             continue
         base, t = i * each, prior_at[i]
         segment = segments[t, i]
-        _place(picture, i, t, tracks, segment, knots, offset, angle, place, slope, 0)
+        _place(picture, i, t, tracks, segment, knots, offset, angle, place, slope, nought)
         for a in range(3):
             precision = prior[1, i, a]
             if precision == 0.0:
@@ -132,7 +137,7 @@ def normal_equations(
 
     for e in range(measured.shape[0]):
         t = at[e]
-        used = 0
+        used = nought
         for end in range(2):
             i = ends[e, end]
             if i < 0:
@@ -150,7 +155,7 @@ def normal_equations(
             spread = 0.5 * measured[e, 0] ** 2 + variance
             for a in range(2):
                 off = -(dx if a == 0 else dy)
-                used = 0
+                used = nought
                 for end in range(2):
                     if ends[e, end] >= 0:
                         sign = 1.0 if end == 1 else -1.0
@@ -161,7 +166,7 @@ def normal_equations(
             continue
         distance = math.sqrt(dx * dx + dy * dy + measured[e, 2]) + 1e-6
         off = measured[e, 0] - distance - bias
-        used = 0
+        used = nought
         for end in range(2):
             if ends[e, end] >= 0:
                 sign = 1.0 if end == 1 else -1.0
@@ -174,7 +179,7 @@ def normal_equations(
     return cost
 
 
-@compiled
+@inner
 def _place(
     picture: Floats,
     i: int,
@@ -210,7 +215,7 @@ def _place(
             slope[end, 1, FIXED + k] = 0.0
 
 
-@compiled
+@inner
 def _add(
     off: float,
     variance: float,
@@ -234,7 +239,7 @@ def _add(
     return -2.0 * math.log(both)
 
 
-@compiled
+@inner
 def _factor(matrix: Floats, damping: float, factor: Floats) -> bool:
     """Cholesky of the lower triangle with its diagonal times 1 + damping."""
     for j in range(matrix.shape[0]):
@@ -292,7 +297,8 @@ def fit(
     for m in range(pictures.shape[0]):
         damping = 1e-3
         cost = math.inf
-        step[:] = 0.0
+        for i in range(dimension):
+            step[i] = 0.0
         # The first round only looks where it stands. (One call alone: it is compiled into here.)
         for rounds in range(iterations + 1):
             for i in range(dimension):
@@ -304,7 +310,8 @@ def fit(
             if trial_cost < cost:
                 gain = cost - trial_cost
                 cost = trial_cost
-                pictures[m] = trial
+                for i in range(dimension):
+                    pictures[m, i] = trial[i]
                 hessian, trial_hessian = trial_hessian, hessian
                 gradient, trial_gradient = trial_gradient, gradient
                 if rounds > 0:
@@ -339,7 +346,8 @@ def fit(
         # Columns of the inverse that belong to poses.
         for i in range(nodes):
             for a in range(POSE):
-                trial[:] = 0.0
+                for j in range(dimension):
+                    trial[j] = 0.0
                 trial[i * each + a] = 1.0
                 _solve(factor, trial, step)
                 for j in range(nodes):
@@ -347,7 +355,7 @@ def fit(
                         covariances[m, i * POSE + a, j * POSE + b] = step[j * each + b]
 
 
-@compiled
+@inner
 def _solve(factor: Floats, right: Floats, solution: Floats) -> None:
     """Solve L L^T x = b."""
     size = right.size
