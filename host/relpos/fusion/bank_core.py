@@ -72,6 +72,8 @@ class BankCore:
         self._set_arms(np.zeros((0, 2)))
         self.count = count
         """K, the number of hypotheses."""
+        self.ceiling = count
+        """Ordinarily at most so many: more than ``settings.hypotheses`` where much bends."""
         self._x, self._p = joint.pack(np.zeros((count, 1)), np.zeros((count, 1, 1)), 0)
         self._log_weight: Floats = np.zeros((lanes.blocks_of(count), LANES))
         self.levels = noise.Levels()
@@ -673,8 +675,8 @@ class BankCore:
             self.counters["slips"] += 1
             self._doubt(*self._alarm, self.settings.jump_m)
             self._alarm = None
-        elif self.count > self.settings.hypotheses and closed:
-            self.resample(self.weights(), self.settings.hypotheses)
+        elif self.count > self.ceiling and closed:
+            self.resample(self.weights(), self.ceiling)
         elif effective < 0.5 * self.count:
             self.resample(self.weights())
         if self.count > 1:
@@ -744,6 +746,8 @@ class BankCore:
             or max(self.surprise.tolist()) > self._usual_surprise
         )  # fmt: skip
         most = self.count >= self.settings.hypotheses
+        if most and self.since_slip % hypotheses.LOOKED_AFTER == 0:
+            self._follow_bend()
         if most and open_:
             self.unambiguous = 0
             return
@@ -769,6 +773,22 @@ class BankCore:
             if fewer and self.unambiguous >= hypotheses.HELD:
                 self.unambiguous = 0
                 self._shrink(fewer[0])
+
+    def _follow_bend(self) -> None:
+        """Have more than the ordinary number of hypotheses while the picture bends much."""
+        usual = self.settings.hypotheses
+        undoubted = np.empty_like(self._log_weight)
+        bank_kernels.undoubted_weights(self._log_weight, self.doubtful, undoubted)
+        mean, covariance = self._moments(undoubted, poses_alone=True)
+        # How short the next metre is, is in the motion's moments: arcs alone count here.
+        straight = np.full(self.nodes, np.inf)
+        bend = hypotheses.bend(mean, covariance, math.exp(0.5 * self.levels.mean[-1]), straight)
+        if bend < hypotheses.EASED:
+            self.ceiling = usual
+        elif bend > hypotheses.CURLED and self.ceiling == usual:
+            self.ceiling = hypotheses.most(usual, int(self._x.shape[1]))
+            if self.count < self.ceiling:
+                self.resample(self.weights(), self.ceiling)
 
     def _step_bend(self) -> float:
         """Bend of the next metre, inf where the hypotheses are undecided; undoubted weights."""
@@ -896,7 +916,7 @@ class BankCore:
                 self.wrong_start, self.arm, self.watch.sums, self.watch.base,
             )),
             self.rng.bit_generator.state,
-            (self.nodes, self.since_slip, self.unambiguous, *self.slipped),
+            (self.nodes, self.since_slip, self.unambiguous, self.ceiling, *self.slipped),
             dict(self.biases),
             dict(self.counters),
             dict(self.unplaced),
@@ -917,9 +937,10 @@ class BankCore:
         self._set_arms(self.arm)
         self.rng.bit_generator.state = dict(snapshot.random)
         self.nodes = self.levels.nodes = int(snapshot.numbers[0])
-        self.slipped = {int(row) for row in snapshot.numbers[3:]}
+        self.slipped = {int(row) for row in snapshot.numbers[4:]}
         self.since_slip = int(snapshot.numbers[1])
         self.unambiguous = int(snapshot.numbers[2])
+        self.ceiling = int(snapshot.numbers[3])
         self.biases = dict(snapshot.biases)
         self.counters = Counter(snapshot.counters)
         self.unplaced = dict(snapshot.unplaced)
