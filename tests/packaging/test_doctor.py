@@ -153,7 +153,13 @@ def test_the_kernels_that_are_looked_for_are_those_that_are_prepared(tmp_path):
     subprocess.run([sys.executable, "-c", program], env=environment, check=True, timeout=900)
     prepared = {path.name.split(".")[0] for path in tmp_path.rglob("*.nbi")}
     assert set(machine_code.KERNELS) <= prepared
-    assert prepared - set(machine_code.KERNELS) <= {"slips", "hypotheses", "detection"}
+    assert prepared - set(machine_code.KERNELS) <= {
+        "noise",
+        "slips",
+        "hypotheses",
+        "detection",
+        "neighbourhood_kernels",
+    }
 
 
 def test_kernels_that_cannot_be_kept_are_wrong(tmp_path):

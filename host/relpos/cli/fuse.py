@@ -191,9 +191,12 @@ class Job:
         """
         from relpos import fusion
 
-        self.make(priors)
+        fusion.check_name(self.estimator)
+        fusion.check_settings(self.estimator, self.settings)
         with output.working("preparing the estimator (compiled at the first start)"):
+            # Before anything is made: what this process compiled would be compiled twice.
             fusion.warm_up(self.estimator)
+            self.make(priors)
 
 
 def _default_out(source: str) -> Path:

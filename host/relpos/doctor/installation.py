@@ -70,13 +70,13 @@ def _kernels(computer: Computer) -> Finding:
     if not any(computer.may_write(folder) for folder in folders):
         return wrong(
             name,
-            f"what is compiled cannot be kept ({folders[0]}): every start waits a minute",
+            f"what is compiled cannot be kept ({folders[0]}): every start waits until they are compiled",
             "name a folder that can be written: export NUMBA_CACHE_DIR=$HOME/.cache/numba",
         )
     if not machine_code.is_kept(folders):
         return hint(
             name,
-            "not compiled yet: the first start takes a minute longer",
+            "not compiled yet: the first start takes some ten seconds longer",
             "relpos doctor --prepare",
         )
     return well(name, "compiled, a session starts at once")

@@ -77,6 +77,12 @@ def check_name(name: str) -> None:
         )
 
 
+def check_settings(name: str, settings: Mapping[str, object]) -> None:
+    """Raise RelposError where one of our estimators has no such settings; nothing is compiled."""
+    if name in SETTINGS:
+        parse(SETTINGS[name], settings, name)
+
+
 def make_smoother(
     name: str,
     priors: Sequence[Prior] = (),
@@ -115,12 +121,12 @@ SMOOTHER_ATTEMPTS = 4
 def warm_up(name: str) -> None:
     """Make everything compiled ready.
 
-    The very first time after an installation this takes up to a minute, in a process of its own
+    The very first time after an installation this takes some ten seconds, in other processes
     (:mod:`relpos.fusion.machine_code` says why); from then on the machine code is read from disk.
     What an estimator of somebody else's needs is its own affair.
     """
     if name in SETTINGS:
-        compile_apart()
+        compile_apart((name,))
         rehearse(name)
 
 
@@ -163,6 +169,7 @@ __all__ = [
     "SettingInfo",
     "Shape",
     "check_name",
+    "check_settings",
     "make",
     "make_smoother",
     "names",

@@ -990,9 +990,8 @@ HEADING_OUTLIER_RAD = 1.0
 
 @lru_cache(maxsize=64)
 def _no_places(count: int) -> Indices:
-    places = np.full(count, -1, dtype=np.int64)
-    places.flags.writeable = False
-    return places
+    # Not read-only: of another type, for which ``take_ranges`` would be compiled once more.
+    return np.full(count, -1, dtype=np.int64)
 
 
 def systematic(weight: Floats, count: int, rng: np.random.Generator) -> Indices:

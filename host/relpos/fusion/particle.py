@@ -188,6 +188,8 @@ def weigh(
     noise: RangeNoise,
 ) -> Floats:
     """Weigh one user's particles (3, 1, M), (1, M) by ranges (E,) to places (2, E): eq. (6)."""
+    # In another order they would be of another type, for which it would be compiled once more.
+    poses, weights, at_m = (np.ascontiguousarray(of) for of in (poses, weights, at_m))
     result = np.empty_like(weights)
     count = len(range_m)
     kernels.correct(
