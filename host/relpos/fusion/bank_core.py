@@ -46,6 +46,25 @@ class Snapshot:
     unplaced: Mapping[int, tuple[float, float]]
 
 
+@dataclass(frozen=True, slots=True)
+class Epochs:
+    """Measurements of E epochs, handed over at once.
+
+    ``rows`` (M,) were displaced by ``moves`` (M, 4): dx, dy (m), dtheta (rad), duration (s); the
+    e-th epoch has those up to ``move_ends[e]``. ``first`` and ``second`` (R,) were ``range_m`` (R,)
+    apart, their antennas ``dz_m`` (R,) in height; the e-th has those up to ``range_ends[e]``.
+    """
+
+    rows: Indices
+    moves: Floats
+    move_ends: Indices
+    first: Indices
+    second: Indices
+    range_m: Floats
+    dz_m: Floats
+    range_ends: Indices
+
+
 class BankCore:
     """K hypotheses about N users, as arrays. Nothing here knows node ids or wall time.
 
@@ -112,7 +131,8 @@ class BankCore:
         self.unambiguous = 0
         """For so many instants of ranges the picture has been so."""
         self._alarm: tuple[int, Indices, Indices, Floats] | None = None
-        self._outlier = np.array([0.0, settings.outlier_m**2, settings.outliers_short, 0.0])
+        prior = settings.outlier_m**2
+        self._outlier = np.array([0.0, prior, settings.outliers_short, 0.0, prior])
         expected = settings.outliers * OUTLIER_RANGES
         self.outlier_counts: Floats = np.array(
             [expected, OUTLIER_RANGES - expected, expected * settings.outlier_m**2]
@@ -150,9 +170,8 @@ class BankCore:
         for array in (second, *values):
             if array.shape != first.shape:
                 raise ValueError(f"array of shape {array.shape} for {len(first)} rows")
-        for rows in (first, second) if second is not first else (first,):
-            if not bank_kernels.within(rows, self.nodes):
-                raise IndexError(f"rows {rows.tolist()} of a bank of {self.nodes} users")
+        if not bank_kernels.within(first, second, self.nodes):
+            raise IndexError(f"rows {first.tolist()}, {second.tolist()} of {self.nodes} users")
 
     def _put(self, x: Floats, p: Floats) -> None:
         """Take means (K, D) and covariances (K, D, D) of ``nodes`` users for the present ones."""
@@ -404,7 +423,15 @@ class BankCore:
         if turns:
             self._misjudge_turns(rows, misjudged)
         joint.advance(
-            self._x, self._p, self.level, self._sens, rows, motion, drawn, self._sampled, CROSS
+            self._x,
+            self._p,
+            self.level,
+            self._sens,
+            rows,
+            motion,
+            drawn,
+            self._sampled,
+            bank_kernels.CROSS,
         )
 
     def _misjudge_turns(self, rows: Indices, share: Floats) -> None:
@@ -437,14 +464,13 @@ class BankCore:
         by default), ``worth`` how many independent ranges each is worth (1 by default).
         """
         several = len(first)
-        worth = np.ones(several) if worth is None else worth
-        dz_variance_m2 = np.zeros(several) if dz_variance_m2 is None else dz_variance_m2
+        worth = _always(several, 1.0) if worth is None else worth
+        dz_variance_m2 = _always(several, 0.0) if dz_variance_m2 is None else dz_variance_m2
         self._check(first, second, range_m, dz_m, dz_variance_m2, worth)
         bias = self._bias_places(first, second)
         s = self.settings
         outlier = self._outlier
-        outlier[0], outlier[3] = self.outlier_share, 1.0 / (1.0 - self._sampled)
-        outlier[1] = self.outlier_m**2
+        outlier[3] = 1.0 / (1.0 - self._sampled)
         good = np.empty(several)
         slipped, clamped = bank_kernels.take_ranges(
             self._x, self._p, self._log_weight, self.sigma2, self._sens, first, second, bias,
@@ -620,16 +646,13 @@ class BankCore:
     @property
     def outlier_share(self) -> float:
         """What share of the ranges are outliers, as far as is known."""
-        wrong, right, _ = self.outlier_counts.tolist()
-        return float(min(max(wrong / (wrong + right), 0.005), 0.5))
+        return float(bank_kernels.expect_outliers(self.outlier_counts, self._outlier))
 
     @property
     def outlier_m(self) -> float:
         """How far outliers are off (root mean square), as far as is known."""
-        wrong, _, squares = self.outlier_counts.tolist()
-        prior = self.settings.outlier_m**2
-        learned = (squares + OUTLIERS_EXPECTED * prior) / (wrong + OUTLIERS_EXPECTED)
-        return float(math.sqrt(min(max(learned, prior / 9.0), 9.0 * prior)))
+        bank_kernels.expect_outliers(self.outlier_counts, self._outlier)
+        return math.sqrt(self._outlier[1])
 
     def heading(self, row: int, heading_rad: float, sigma_rad: float) -> None:
         """Work in an absolute heading of a user."""
@@ -682,6 +705,70 @@ class BankCore:
         if self.count > 1:
             self._jump()
 
+    def follow(self, epochs: Epochs) -> None:
+        """Work in several epochs: each its displacements, its ranges, and ``settle``.
+
+        The same as one call after another; while one hypothesis is enough it is one compiled call.
+        """
+        last, begin = len(epochs.move_ends), 0
+        self._check(epochs.rows, epochs.rows)
+        self._check(epochs.first, epochs.second, epochs.range_m, epochs.dz_m)
+        ends = epochs.move_ends[-1:].tolist() + epochs.range_ends[-1:].tolist()
+        if (
+            len(epochs.range_ends) != last
+            or epochs.moves.shape != (len(epochs.rows), 4)
+            or ends != [len(epochs.rows), len(epochs.first)][: len(ends)]
+            or (np.diff(epochs.move_ends, prepend=0) < 0).any()
+            or (np.diff(epochs.range_ends, prepend=0) < 0).any()
+        ):
+            raise ValueError("epochs do not end where their measurements do")
+        while begin < last:
+            if self.count == 1 and not (self.slipped or self.unplaced or self._some_biased):
+                begin = self._follow_alone(epochs, begin)
+                continue
+            moved = slice(epochs.move_ends[begin - 1] if begin else 0, epochs.move_ends[begin])
+            ranged = slice(epochs.range_ends[begin - 1] if begin else 0, epochs.range_ends[begin])
+            self.move(epochs.rows[moved], epochs.moves[moved])
+            if ranged.stop > ranged.start:
+                self.update(
+                    epochs.first[ranged], epochs.second[ranged], epochs.range_m[ranged],
+                    epochs.dz_m[ranged],
+                )  # fmt: skip
+            self.settle()
+            begin += 1
+
+    def _follow_alone(self, epochs: Epochs, begin: int) -> int:
+        """Work in epochs with one hypothesis, until it is not enough; return the next one."""
+        s, several = self.settings, len(epochs.first)
+        self._outlier[3] = 1.0
+        wary_for = OPEN_UPDATES + 1 - self.since_slip if self.counters["slips"] > 0 else 0
+        news = np.array([0, -1, 0, self.unambiguous])
+        end = int(
+            bank_kernels.follow(
+                self._x, self._p, self._log_weight, self.sigma2, self._sens, self._outlier,
+                self._arms, self.doubtful, self.levels.mean, self.levels.covariance,
+                self.outlier_counts, self.surprise, self.watch.sums, self.watch.base, self._draw,
+                self.level, self.since_turn_s, epochs.rows, epochs.moves, epochs.move_ends,
+                epochs.first, epochs.second, _no_places(several), epochs.range_m, epochs.dz_m,
+                _always(several, 1.0), epochs.range_ends, begin, wary_for, s.spread,
+                s.hypotheses == 1, news,
+            )
+        )  # fmt: skip
+        open_, slipped, clamped, self.unambiguous = news.tolist()
+        if clamped:
+            self.counters["levels_clamped"] += clamped
+        self.since_slip += end - begin - open_
+        if open_:
+            if slipped >= 0:
+                some = slice(
+                    epochs.range_ends[end - 2] if end > 1 else 0, epochs.range_ends[end - 1]
+                )
+                self._alarm = (
+                    slipped, epochs.first[some], epochs.second[some], epochs.range_m[some],
+                )  # fmt: skip
+            self.settle()
+        return end
+
     def weights(self) -> Floats:
         """Normalised weights (K,); the log weights are shifted so that their greatest is 0."""
         self._normalise()
@@ -732,8 +819,7 @@ class BankCore:
 
     @property
     def _usual_surprise(self) -> float:
-        # Where outliers are common, it takes more of them to doubt a user.
-        return max(0.15, 2.2 * self.outlier_share)
+        return max(bank_kernels.SURPRISE, bank_kernels.SURPRISE_OF_OUTLIERS * self.outlier_share)
 
     # -- how many (relpos.fusion.hypotheses) ---------------------------------------------------
 
@@ -743,7 +829,7 @@ class BankCore:
             return
         open_ = bool(
             self._alarm or self.slipped or self.unplaced
-            or max(self.surprise.tolist()) > self._usual_surprise
+            or bank_kernels.surprises(self.surprise, self.outlier_counts, self._outlier)
         )  # fmt: skip
         most = self.count >= self.settings.hypotheses
         if most and self.since_slip % hypotheses.LOOKED_AFTER == 0:
@@ -954,9 +1040,6 @@ PAIR_BIASES = 6
 """Up to so many users each pair has a bias of its own in the state: 15 of them double its size.
 Of more, the common one is modelled."""
 
-CROSS = 0.04
-"""Variance across the way relative to along it: steps err in length, turns err apart from that."""
-
 JITTER = 0.1
 """Standard deviation of the levels' jitter at resampling, in units of their spread."""
 
@@ -981,11 +1064,14 @@ OUTLIER_RANGES = 2.0
 are reflections that has to be known before they have moved anybody (``lab``, seeds 300 to 323:
 1.07 m with 5 % worth four, 0.95 m with 10 % worth two)."""
 
-OUTLIERS_EXPECTED = 3.0
-"""How far outliers are expected to be off beforehand is worth so many of them."""
-
 HEADING_OUTLIERS = 0.1
 HEADING_OUTLIER_RAD = 1.0
+
+
+@lru_cache(maxsize=64)
+def _always(count: int, value: float) -> Floats:
+    """Give the same number (count,), for kernels to read; flagged so, it would be another type."""
+    return np.full(count, value)
 
 
 @lru_cache(maxsize=64)

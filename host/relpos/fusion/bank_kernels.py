@@ -15,11 +15,16 @@ from relpos.fusion import hypotheses, lanes, noise, slips
 from relpos.fusion.compiled import compiled, inlined
 from relpos.fusion.detection import FAILS, LENGTH, STEP_M, TRUSTED_M
 from relpos.fusion.estimator import ANY_ANGLE_RAD
-from relpos.fusion.joint import MEAN, PER_NODE, STATS, TRUST, VARIANCE, update
+from relpos.fusion.joint import MEAN, PER_NODE, STATS, TRUST, VARIANCE, advance, update
 from relpos.fusion.lanes import LANES, fill, load, store
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
+
+_POSE = 3
+
+CROSS = 0.04
+"""Variance across the way relative to along it: steps err in length, turns err apart from that."""
 
 LEAST_TURN_RAD, TURN_STANDS_OUT = 0.05, 3.5
 """A change of heading is a turn beyond both: so much, and so many deviations of white noise."""
@@ -47,13 +52,46 @@ then agree on a wrong mode (paper-h, seeds 5000 to 5011: 0.97 m and NEES 1.9 wit
 1.0 with this; paper-h2, 7000 to 7031: 1.59 m and worst 4.8, 1.50 m and worst 2.6)."""
 
 
+OUTLIERS_EXPECTED = 3.0
+"""How far outliers are expected to be off beforehand is worth so many of them."""
+
+SURPRISE, SURPRISE_OF_OUTLIERS = 0.15, 2.2
+"""A user surprises from this share of odd ranges on, or so many times the share of outliers: where
+those are common, it takes more of them to doubt a user."""
+
+
 @compiled
-def within(rows: Indices, nodes: int) -> bool:
+def within(first: Indices, second: Indices, nodes: int) -> bool:
     """Tell whether all rows are those of users: kernels look at no bounds."""
     least, most = 0, 0
-    for row in rows:
-        least, most = min(least, row), max(most, row)
+    for r in range(first.shape[0]):
+        least = min(least, first[r], second[r])
+        most = max(most, first[r], second[r])
     return least >= 0 and most < nodes
+
+
+@compiled
+def expect_outliers(counts: Floats, outlier: Floats) -> float:
+    """Say what share of the ranges are outliers, as far as is known; it and variance go in.
+
+    ``counts`` are as in ``digest``; ``outlier`` (5,) is what ``joint.update`` takes, then the
+    variance (m^2) that is expected beforehand.
+    """
+    prior = outlier[4]
+    learned = (counts[2] + OUTLIERS_EXPECTED * prior) / (counts[0] + OUTLIERS_EXPECTED)
+    outlier[0] = min(max(counts[0] / (counts[0] + counts[1]), 0.005), 0.5)
+    outlier[1] = min(max(learned, prior / 9.0), 9.0 * prior)
+    return float(outlier[0])
+
+
+@compiled
+def surprises(surprise: Floats, counts: Floats, outlier: Floats) -> bool:
+    """Tell whether any user's share of odd ranges ``surprise`` (N,) is out of the usual."""
+    usual = max(SURPRISE, SURPRISE_OF_OUTLIERS * expect_outliers(counts, outlier))
+    most = 0.0
+    for much in surprise:
+        most = max(most, much)
+    return most > usual
 
 
 @compiled
@@ -344,6 +382,7 @@ def take_ranges(
     count, ranges = doubtful.shape[0], first.shape[0]
     lines = lanes.working_lines(ranges * STATS * x.shape[0])
     before = log_weight.reshape(-1)[:count].copy()
+    expect_outliers(outlier_counts, outlier)
     update(
         x, p, log_weight, sigma2, sens, first, second, bias, measured, dz, outlier, worth,
         dz_variance, arms, lines,
@@ -448,3 +487,72 @@ def teach(
             counts[outcome, index + 1] += share * (place - index)
         sums[2] += weight
     return tried
+
+
+@compiled
+def follow(
+    x: Floats, p: Floats, log_weight: Floats, sigma2: Floats, sens: Floats, outlier: Floats,
+    arms: Floats, doubtful: Floats, levels: Floats, covariance: Floats, outlier_counts: Floats,
+    surprise: Floats, sums: Floats, base: Floats, draw: Floats, level: Floats,
+    since_turn_s: Floats, rows: Indices, moves: Floats, move_ends: Indices, first: Indices,
+    second: Indices, bias: Indices, measured: Floats, dz: Floats, worth: Floats,
+    range_ends: Indices, begin: int, wary_for: int, spread: float, alone: bool,
+    news: Indices,
+) -> int:  # fmt: skip
+    """Follow a team with one hypothesis over epochs ``begin`` to the last, or to one that is open.
+
+    An epoch is its displacements (up to ``move_ends`` (E,) of them), its ranges (up to
+    ``range_ends`` (E,)), and the question whether one hypothesis is still enough; it is always
+    where there is one ``alone``. Returns the first epoch that was not begun. ``news`` (4,)
+    receives whether the last one has to be settled, the row that has slipped in it or -1, how many
+    levels were clamped, and for how many instants the picture has been unambiguous (given: for
+    how many before). For the first ``wary_for`` instants be wary of slips.
+    """
+    nodes, size = sens.shape[1], x.shape[1]
+    nothing, weight = np.empty((0, 3)), np.empty_like(log_weight)
+    good = np.empty(first.shape[0])
+    variance = np.zeros(first.shape[0])
+    mean, whole = np.zeros(size), np.zeros((size, size))
+    metre = np.empty(nodes)
+    news[0], news[1], news[2] = 0, -1, 0
+    for e in range(begin, move_ends.shape[0]):
+        m, m_end = (0 if e == 0 else move_ends[e - 1]), move_ends[e]
+        r, r_end = (0 if e == 0 else range_ends[e - 1]), range_ends[e]
+        if m_end > m:
+            motion, misjudged = np.empty((m_end - m, 7)), np.empty(m_end - m)
+            prepare_motion(
+                rows[m:m_end], moves[m:m_end], nothing, level, 1, since_turn_s, motion, misjudged
+            )
+            drawn = np.zeros((1, m_end - m))
+            advance(x, p, level, sens, rows[m:m_end], motion, drawn, 0.0, CROSS)
+        slipped = -1
+        if r_end > r:
+            slipped, clamped = take_ranges(
+                x, p, log_weight, sigma2, sens, first[r:r_end], second[r:r_end], bias[r:r_end],
+                measured[r:r_end], dz[r:r_end], outlier, worth[r:r_end], variance[r:r_end], arms,
+                doubtful, levels, covariance, outlier_counts, surprise, sums, base,
+                e - begin < wary_for, draw, spread, level, good[r:r_end],
+            )  # fmt: skip
+            news[2] += clamped
+        if not alone:
+            odd = slipped >= 0 or surprises(surprise, outlier_counts, outlier)
+            if not odd:
+                # The mixture's moments are those of the one.
+                for i in range(_POSE * nodes):
+                    a = PER_NODE * (i // _POSE) + i % _POSE
+                    mean[a] = x[0, i, 0]
+                    for j in range(i + 1):
+                        b = PER_NODE * (j // _POSE) + j % _POSE
+                        whole[a, b] = whole[b, a] = p[0, (i * (i + 1)) // 2 + j, 0]
+                for n in range(nodes):
+                    metre[n] = math.sqrt(noise.ALONG_M2_M) * math.exp(
+                        0.5 * levels[noise.LEVELS * n + noise.ALONG]
+                    )
+                bend = hypotheses.bend(mean, whole, math.exp(0.5 * levels[-1]), metre)
+                odd = bend > hypotheses.BENT
+                news[3] = news[3] + 1 if bend <= hypotheses.FLAT else 0
+            if odd:
+                news[0], news[1] = 1, slipped
+                return e + 1
+        normalise(log_weight, 1, weight)
+    return int(move_ends.shape[0])

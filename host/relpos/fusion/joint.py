@@ -454,11 +454,16 @@ def _second_order(
     a = greater(select(flat2 > _TINY, along, 0.5 * (xx + yy)), nought)
     # Across it; rounding may leave a trace of nothing on the wrong side.
     c = greater(xx + yy - a, nought)
-    tilt = (dz * dz) / (flat2 + (dz * dz + _TINY))
-    m2 = flat2 + dz * dz + c + tilt * a
+    # A division costs as much as ten products.
+    m2, square = flat2 + c, c * c
+    if dz != 0.0:
+        tilt = (dz * dz) / (flat2 + (dz * dz + _TINY))
+        m2 = m2 + (dz * dz + tilt * a)
+        square = square + tilt * tilt * a * a
     m = lanes.sqrt(m2) + _TINY
-    v = (a * flat2 + 0.5 * (c * c + tilt * tilt * a * a)) / (m2 + _TINY)
-    return m, v, ux / m, uy / m
+    v = (a * flat2 + 0.5 * square) / (m2 + _TINY)
+    per_m = 1.0 / m
+    return m, v, ux * per_m, uy * per_m
 
 
 @inner
@@ -583,15 +588,22 @@ def _bound_sensitivity(sens: Floats, t: int, p: Floats, base: int, b: int, most:
 
     It is homogeneous in all variances, so that a true derivative obeys it with ``most`` 1.
     """
+    excess = fill(0.0)
+    for entry in range(3):
+        at = t + 2 * entry + (entry == 2)
+        explained = load(sens, at) + load(sens, at + 6) + load(sens, at + 12)
+        bound = most * load(p, base + _at(b + entry, b + entry)) + _TINY
+        excess = greater(excess, explained - bound)
+    if not some(excess > 0.0):
+        return
     ratio = fill(1.0)
     for entry in range(3):
         at = t + 2 * entry + (entry == 2)
         explained = load(sens, at) + load(sens, at + 6) + load(sens, at + 12)
-        own = load(p, base + _at(b + entry, b + entry))
-        ratio = greater(ratio, explained / (most * own + _TINY))
-    if some(ratio > 1.0):
-        for at in range(t, t + 18):
-            store(sens, at, load(sens, at) / ratio)
+        bound = most * load(p, base + _at(b + entry, b + entry)) + _TINY
+        ratio = greater(ratio, explained / bound)
+    for at in range(t, t + 18):
+        store(sens, at, load(sens, at) / ratio)
 
 
 @compiled
@@ -653,7 +665,8 @@ def update(
                 m, v, gx, gy = _predict_range(x, p, at_x, base, i, j, dz[r])
                 _gain(p, base, i, j, gx, gy, active, g)
             bent = v - gx * (load(g, j) - load(g, i)) - gy * (load(g, j + 1) - load(g, i + 1))
-            v = v + (dz[r] * dz[r] * dz_variance[r]) / (m * m)
+            if dz_variance[r] > 0.0:
+                v = v + (dz[r] * dz[r] * dz_variance[r]) / (m * m)
             innovation = measured[r] - m
             if biased and bias[r] >= 0:
                 # No range is negative: between two who stand together noise alone looks like
@@ -668,18 +681,19 @@ def update(
                     store(g, q, load(g, q) + seen * load(p, base + _at(e, q)))
             s = v + variance
             square = innovation * innovation
-            good = (1.0 - share) * lanes.exp(-0.5 * square / s) / lanes.sqrt(s)
-            spread = s + wide
+            per_sd = 1.0 / lanes.sqrt(s)
+            good = (1.0 - share) * lanes.exp(-0.5 * square * per_sd * per_sd) * per_sd
+            per_wide = 1.0 / lanes.sqrt(s + wide)
             side = select(innovation > 0.0, fill(2.0 * (1.0 - short)), fill(2.0 * short))
-            bad = share * side * lanes.exp(-0.5 * square / spread) / lanes.sqrt(spread)
+            bad = share * side * lanes.exp(-0.5 * square * per_wide * per_wide) * per_wide
             # Where both vanish, it is certainly no good one.
             both = good + bad + 1e-300
             trust = good / both
             evidence = lanes.log(both)
             total = total + worth[r] * evidence
-            heavy = v + variance * (1.0 / worth[r])
-            kf = trust / heavy
-            shrink = kf * (1.0 - (1.0 - trust) * square / heavy)
+            per_heavy = 1.0 / (v + variance * (1.0 / worth[r]))
+            kf = trust * per_heavy
+            shrink = kf * (1.0 - (1.0 - trust) * square * per_heavy)
             _correct(x, p, at_x, base, g, kf * innovation, shrink, active)
             at = r * STATS * blocks + b
             store(stats, at, measured[r] - innovation)

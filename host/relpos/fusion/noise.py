@@ -13,9 +13,10 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion import vectormath
+from relpos.fusion import lanes, vectormath
 from relpos.fusion.compiled import compiled
 from relpos.fusion.joint import BENT, EVIDENCE, MEAN, SHARES, TRUST, VARIANCE
+from relpos.fusion.lanes import LANES, fill, load
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -69,6 +70,11 @@ true levels, nu^2/S averages 0.93, 0.82, 0.72 and 0.54 in paper-h where that sha
 
 POINTS, REACH = 15, 3.5
 """The posterior along one direction is integrated at so many points over so many deviations."""
+
+_GRID = np.zeros((2, LANES))
+_GRID.reshape(-1)[:POINTS] = np.linspace(-REACH, REACH, POINTS)
+_BELL = np.exp(-0.5 * _GRID**2)
+_BELL.reshape(-1)[POINTS:] = 0.0
 
 REST_VARIANCE = 25.0
 """What no level explains of S (unknown constants, starts, jumps) is known this badly (log)."""
@@ -232,21 +238,20 @@ def learn(
             before += slope[q] / variance * gain[place[q]]
         sd = math.sqrt(before) / own
         square = innovation * innovation / variance
-        mass = 0.0
-        shift = 0.0
-        second_moment = 0.0
-        for q in range(POINTS):
-            z = REACH * (2.0 * q / (POINTS - 1.0) - 1.0)
-            ratio = rest + own * math.exp(z * sd)
-            log = math.log(math.exp(-0.5 * square / ratio) / math.sqrt(ratio) + OUTLYING)
-            density = math.exp(power * log - 0.5 * z * z)
-            mass += density
-            shift += density * z
-            second_moment += density * z * z
-        shift /= mass
+        mass, shift, second_moment = fill(0.0), fill(0.0), fill(0.0)
+        for part in range(_GRID.shape[0]):
+            z = load(_GRID, part)
+            ratio = rest + own * lanes.exp(z * sd)
+            likelihood = lanes.exp(-0.5 * square / ratio) / lanes.sqrt(ratio)
+            density = load(_BELL, part) * lanes.exp(power * lanes.log(likelihood + OUTLYING))
+            mass = mass + density
+            shift = shift + density * z
+            second_moment = second_moment + density * z * z
+        all_mass = lanes.total(mass)
+        moved = lanes.total(shift) / all_mass
         # Of a unit variance in z; an update that would widen it leaves it (multimodal posterior).
-        after = min(second_moment / mass - shift * shift, 1.0)
-        scale = shift * sd * own / before
+        after = min(lanes.total(second_moment) / all_mass - moved * moved, 1.0)
+        scale = moved * sd * own / before
         shrink = (1.0 - after) / before
         for o in range(size):
             mean[o] += gain[o] * scale
