@@ -232,10 +232,13 @@ def learn(
         before = 0.0
         for o in range(size):
             gain[o] = 0.0
-            for q in range(7):
-                gain[o] += covariance[o, place[q]] * slope[q] / variance
         for q in range(7):
-            before += slope[q] / variance * gain[place[q]]
+            slope[q] /= variance
+            row = place[q]
+            for o in range(size):
+                gain[o] += slope[q] * covariance[row, o]
+        for q in range(7):
+            before += slope[q] * gain[place[q]]
         sd = math.sqrt(before) / own
         square = innovation * innovation / variance
         mass, shift, second_moment = fill(0.0), fill(0.0), fill(0.0)
@@ -255,8 +258,9 @@ def learn(
         shrink = (1.0 - after) / before
         for o in range(size):
             mean[o] += gain[o] * scale
+            own_shrink = shrink * gain[o]
             for q in range(size):
-                covariance[o, q] -= shrink * gain[o] * gain[q]
+                covariance[o, q] -= own_shrink * gain[q]
     clamped = 0
     for o in range(size):
         bounded = min(max(mean[o], LOWEST), HIGHEST)
