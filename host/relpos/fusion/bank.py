@@ -196,9 +196,11 @@ class Bank:
                 if step.node in self._standing:
                     self._set_off(step)
                 return None
-            self._note(step)
-            self._seek(step.node)
+            self._moved = True
+            self._meet(step.node).heard(step.time_s)
             way_m = math.hypot(step.dx_m, step.dy_m)
+            self.repetition.went(step.node, way_m, step.dtheta_rad)
+            self._seek(step.node)
             odd = self.habit.is_odd(step.node, way_m, step.duration_s, step.fraction)
             self._own["motions_doubted"] += odd
             self.starts.advance(step, odd=odd)
@@ -213,12 +215,6 @@ class Bank:
             self._admit(self.starts.epoch(step.time_s))
             return self._estimate(step.time_s)
         return None
-
-    def _note(self, step: Advance) -> None:
-        """Take note of a displacement's time and way."""
-        self._moved = True
-        self._meet(step.node).heard(step.time_s)
-        self.repetition.move(step.node, step.dx_m, step.dy_m, step.dtheta_rad)
 
     def cost_s(self, step: Step) -> float:
         """About how many seconds of a processor ``take`` needs for a step."""
@@ -282,23 +278,26 @@ class Bank:
         if any(a.sigma_x_m is not None or a.sigma_theta_rad is not None for a in steps):
             told = np.array([told_sigmas(a) for a in steps])
         begin = 0
+        knowns, still, habit = self._known, self.stillness, self.habit
+        self._moved = True
         for k, a in enumerate(steps):
-            self._note(a)
-            drifted_s = self._known[a.node].drifted_s
-            if drifted_s > a.time_s - a.duration_s:
+            time_s, node, duration_s, dx_m, dy_m, turn_rad, fraction = a[:7]
+            known = knowns[node]
+            known.heard(time_s)
+            way_m = math.hypot(dx_m, dy_m)
+            self.repetition.went(node, way_m, turn_rad)
+            if known.drifted_s > time_s - duration_s:
                 # Ranges have moved it so far already; how it turned they cannot say.
-                moves[k, :2] *= max(a.time_s - drifted_s, 0.0) / max(a.duration_s, 1e-9)
+                moves[k, :2] *= max(time_s - known.drifted_s, 0.0) / max(duration_s, 1e-9)
             vague = None if told is None else _vagueness(a)
             if told is not None and vague is not None:
                 told[k] = math.nan
                 self.core.lose(int(rows[k]), *vague)
-            if self.stillness.is_still(
-                a.node, a.dx_m, a.dy_m, a.dtheta_rad, a.duration_s, a.fraction
-            ):
-                self._own["motions_still"] += a.dx_m != 0.0 or a.dtheta_rad != 0.0
+            if still.is_still(node, dx_m, dy_m, turn_rad, duration_s, fraction, way_m):
+                self._own["motions_still"] += dx_m != 0.0 or turn_rad != 0.0
                 moves[k, :3] = 0.0
                 continue
-            if self.habit.is_odd(a.node, math.hypot(a.dx_m, a.dy_m), a.duration_s, a.fraction):
+            if habit.is_odd(node, way_m, duration_s, fraction):
                 self._make(rows, moves, told, slice(begin, k))
                 self.core.grow()
                 row = int(rows[k])
@@ -307,7 +306,10 @@ class Bank:
                 after = self.core.places_of(row)
                 self.core.doubt_motion(row, after[0] - east, after[1] - north)
                 begin = k + 1
-        self._make(rows, moves, told, slice(begin, len(steps)))
+        if begin:
+            self._make(rows, moves, told, slice(begin, len(steps)))
+        else:
+            self.core.move(rows, moves, told)
 
     def _make(self, rows: Indices, moves: Floats, told: Floats | None, some: slice) -> None:
         """Make some of the displacements ``rows`` (M,), ``moves`` (M, 4)."""
@@ -512,7 +514,9 @@ class Bank:
         told = []
         for node, row in sorted(self._row.items()):
             known = self._known[node]
-            status = self._status(known, row)
+            status = known.status if known.silent_epochs else NodeStatus.OK
+            if row in slipped and status is NodeStatus.OK:
+                status = NodeStatus.AMBIGUOUS
             told.append((node, row, status, known.height_m, known.sigma_height_m))
         picture = _Picture(
             time_s, told, mean, covariance, self.core.biases.copy(),
@@ -520,11 +524,13 @@ class Bank:
             if self.detection.known else None,
         )  # fmt: skip
         mixture = self.starts.mixture
-        sought = [
-            self._sought(node, known, mixture)
-            for node, known in self._known.items()
-            if node not in self._row
-        ]
+        sought = []
+        if len(self._row) < len(self._known):
+            sought = [
+                self._sought(node, known, mixture)
+                for node, known in self._known.items()
+                if node not in self._row
+            ]
         if not slipped and not sought and mixture is None:
             return Estimate.later(time_s, picture.rows, self.north.known())
         nodes, pairs, alternatives, parameters = picture.rows()
@@ -576,12 +582,6 @@ class Bank:
         poses = np.stack([poses[likely] for poses, _ in each], axis=1)
         spread = np.stack([spread[likely, :2, :2] for _, spread in each], axis=1)
         return pictures(time_s, nodes, weight[likely] / weight[likely].sum(), poses, spread)
-
-    def _status(self, known: _Known, row: int) -> NodeStatus:
-        status = known.status
-        if status is NodeStatus.OK and row in self.core.slipped:
-            return NodeStatus.AMBIGUOUS
-        return status
 
     def _sought(self, node: int, known: _Known, mixture: Mixture | None) -> NodeEstimate:
         """Say of a node whose start is unknown what the search says."""

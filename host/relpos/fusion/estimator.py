@@ -228,7 +228,8 @@ class Presence:
 
     def heard(self, time_s: float) -> None:
         """Note that the node reported motion up to ``time_s``."""
-        self.news_s = max(self.news_s, time_s)
+        if time_s > self.news_s:
+            self.news_s = time_s
 
     def close_epoch(self, epoch_s: float) -> None:
         """Count the epoch as silent where nothing came since the one before, at ``epoch_s``."""

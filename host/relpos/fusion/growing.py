@@ -76,14 +76,17 @@ class GrowingTeam:
         """Take one measurement; return the estimates it completes."""
         if isinstance(self.estimator, LargeTeam):
             return self.estimator.process(measurement)
-        self._recent.append(measurement)
-        self._newest_s = max(self._newest_s, measurement.time_s)
-        while self._recent[0].time_s < self._newest_s - KEPT_S:
-            self._recent.popleft()
+        recent, time_s = self._recent, measurement.time_s
+        recent.append(measurement)
+        if time_s > self._newest_s:
+            self._newest_s = time_s
+            while recent[0].time_s < time_s - KEPT_S:
+                recent.popleft()
         self._met.add(measurement.node)
         if isinstance(measurement, Range):
             self._met.add(measurement.peer)
-            self._first_range_s = min(self._first_range_s, measurement.time_s)
+            if time_s < self._first_range_s:
+                self._first_range_s = time_s
         if len(self._met) <= LARGE_TEAM:
             return self._feed(measurement)
         if self._located() >= min(NUCLEUS_FOUND, len(self._priors) or NUCLEUS_FOUND):

@@ -97,8 +97,12 @@ class Repetition:
 
     def move(self, node: int, dx_m: float, dy_m: float, dtheta_rad: float) -> None:
         """Take note of a displacement."""
-        way = math.hypot(dx_m, dy_m) + TURN_M * abs(dtheta_rad)
-        self._way_m[node] = self._way_m.get(node, 0.0) + way
+        self.went(node, math.hypot(dx_m, dy_m), dtheta_rad)
+
+    def went(self, node: int, way_m: float, dtheta_rad: float) -> None:
+        """As ``move``, of a displacement so long."""
+        way_m += TURN_M * abs(dtheta_rad)
+        self._way_m[node] = self._way_m.get(node, 0.0) + way_m
 
     def worth(self, pairs: Iterable[tuple[int, int]]) -> Floats:
         """Give (R,) for the ranges of one instant, each in (0, 1], and take note of them."""

@@ -228,15 +228,19 @@ class Stillness:
         dtheta_rad: float,
         duration_s: float,
         share: float,
+        way_m: float | None = None,
     ) -> bool:
-        """Take a piece of a report (``share`` of it) and tell whether the node stands there."""
-        slow = (
-            math.hypot(dx_m, dy_m) <= STILL_M_S * duration_s
-            and abs(dtheta_rad) <= STILL_RAD_S * duration_s
-        )
-        if not slow:
-            self._open.pop(node, None)
-            self._recent.pop(node, None)
+        """Take a piece of a report (``share`` of it) and tell whether the node stands there.
+
+        ``way_m`` is its length where that is known.
+        """
+        if way_m is None:
+            way_m = math.hypot(dx_m, dy_m)
+        if way_m > STILL_M_S * duration_s or abs(dtheta_rad) > STILL_RAD_S * duration_s:
+            if node in self._open:
+                del self._open[node]
+            if node in self._recent:
+                del self._recent[node]
             return False
         x, y, turn, done = self._open.pop(node, (0.0, 0.0, 0.0, 0.0))
         x, y, turn, done = x + dx_m, y + dy_m, turn + dtheta_rad, done + share
