@@ -70,7 +70,7 @@ def _kernels(computer: Computer) -> Finding:
     if not any(computer.may_write(folder) for folder in folders):
         return wrong(
             name,
-            f"what is compiled cannot be kept ({folders[0]}): every start waits until they are compiled",
+            f"what is compiled cannot be kept ({folders[0]}): every start waits for it",
             "name a folder that can be written: export NUMBA_CACHE_DIR=$HOME/.cache/numba",
         )
     if not machine_code.is_kept(folders):
