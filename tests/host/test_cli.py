@@ -181,7 +181,10 @@ def test_a_missing_directory_is_one_clear_line(tmp_path: Path) -> None:
         assert "nowhere" in one_clear_line(relpos(*arguments))
 
 
-def test_a_port_that_does_not_exist_is_one_clear_line() -> None:
+def test_a_port_that_does_not_exist_is_one_clear_line_before_anything_is_prepared(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("relpos.fusion.warm_up", lambda name: pytest.fail("it prepares first"))
     assert "ttyNOPE" in one_clear_line(relpos("fuse", "/dev/ttyNOPE7"))
     one_clear_line(relpos("fuse", "nonsense://port"))
 

@@ -445,10 +445,12 @@ def _fuse_port(
     teach: bool,
     as_json: bool,
 ) -> None:
+    from relpos.link.live import check_port
     from relpos.measurements import Prior
 
     if initial is Initial.TRUTH:
         raise DataError(f"{job.source}: a port brings no truth to start from")
+    check_port(job.source)
     # Before the port is open: nobody takes in what arrives meanwhile. Who starts from one place is
     # heard later; that some do is known.
     some = [Prior(node, 0.0, 0.0, 0.0) for node in (1, 2)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -166,6 +167,16 @@ class Link:
         return figures
 
 
+def check_port(port: str) -> None:
+    """Raise DeviceError where there is no such port; it is not opened, and nobody is disturbed."""
+    try:
+        serial.serial_for_url(port, do_not_open=True)
+    except (serial.SerialException, OSError, ValueError) as error:
+        raise _cannot_open(port, error) from error
+    if "://" not in port and os.name == "posix" and not Path(port).exists():
+        raise _cannot_open(port, FileNotFoundError(port))
+
+
 def open_port(port: str, baud: int = BAUD) -> serial.Serial:
     """The serial port (or pyserial URL) ``port``, for this program alone.
 
@@ -177,9 +188,13 @@ def open_port(port: str, baud: int = BAUD) -> serial.Serial:
             port, baudrate=baud, timeout=READ_TIMEOUT_S, exclusive=True
         )
     except (serial.SerialException, OSError, ValueError) as error:
-        reason = _reason(error) if "://" in port or Path(port).exists() else "no such device"
-        raise DeviceError(f"{port}: cannot open the serial port: {reason}") from error
+        raise _cannot_open(port, error) from error
     return device
+
+
+def _cannot_open(port: str, error: Exception) -> DeviceError:
+    reason = _reason(error) if "://" in port or Path(port).exists() else "no such device"
+    return DeviceError(f"{port}: cannot open the serial port: {reason}")
 
 
 def send(device: Line, data: bytes) -> None:
