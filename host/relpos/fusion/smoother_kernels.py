@@ -345,9 +345,10 @@ def factorise(a: Floats, e: Floats, right: Floats, lower: Floats, w: Floats, v: 
             side = side - np.dot(w[k - 1], v[k - 1])
         if not _cholesky_inverse(block, lower[k]):
             return False
-        v[k] = np.dot(lower[k], side)
+        # Not ``v[k] = ...``: with the words for shapes that differ it takes seconds to compile.
+        np.dot(lower[k], side, v[k])
         if k < knots - 1:
-            w[k] = np.dot(e[k], lower[k].T)
+            np.dot(e[k], lower[k].T, w[k])
     return True
 
 
@@ -360,7 +361,7 @@ def back_substitute(lower: Floats, w: Floats, v: Floats) -> Floats:
         side = v[k]
         if k < knots - 1:
             side = side - np.dot(w[k].T, result[k + 1])
-        result[k] = np.dot(lower[k].T, side)
+        np.dot(lower[k].T, side, result[k])
     return result
 
 
@@ -374,13 +375,15 @@ def selected_inverse(lower: Floats, w: Floats) -> tuple[Floats, Floats]:
     diagonal = np.empty((knots, b, b))
     below = np.empty((knots - 1, b, b))
     for k in range(knots - 1, -1, -1):
-        if k == knots - 1:
-            diagonal[k] = np.dot(lower[k].T, lower[k])
-        else:
+        np.dot(lower[k].T, lower[k], diagonal[k])
+        if k < knots - 1:
             step = np.dot(w[k], lower[k])
             moved = np.dot(diagonal[k + 1], step)
-            below[k] = -moved
-            diagonal[k] = np.dot(lower[k].T, lower[k]) + np.dot(step.T, moved)
+            further = np.dot(step.T, moved)
+            for i in range(b):
+                for j in range(b):
+                    below[k, i, j] = -moved[i, j]
+                    diagonal[k, i, j] += further[i, j]
     return diagonal, below
 
 
