@@ -410,9 +410,11 @@ def test_levels_are_drawn_by_what_is_known_of_them() -> None:
     level, sigma2 = lanes.empty_lines(2, 2, noise.LEVELS), lanes.empty_lines(2)
     laid = lanes.empty_lines(2, 7)
     laid[...] = np.resize(draw, (16, 7)).reshape(2, lanes.LANES, 7).transpose(0, 2, 1)
-    bank_kernels.spread_levels(laid, mean, covariance, 0.5, level, sigma2)
+    steady = np.arange(16.0).reshape(2, lanes.LANES) % 2.0
+    bank_kernels.spread_levels(laid, steady, mean, covariance, 0.5, level, sigma2)
     sd = np.minimum(0.5 * np.sqrt(covariance.diagonal()), noise.SPREAD_MOST)
-    expected = np.exp(mean + sd * draw)
+    lower = np.append(np.tile(noise.STEADIER, 2), 0.0)
+    expected = np.exp(mean + sd * draw - np.outer(steady.ravel()[:11], lower))
     back = level.reshape(2, 6, lanes.LANES).transpose(0, 2, 1).reshape(-1, 6)[:11]
     assert back == pytest.approx(expected[:, :-1])
     assert sigma2.ravel()[:11] == pytest.approx(expected[:, -1])

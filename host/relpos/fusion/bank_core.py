@@ -102,6 +102,8 @@ class BankCore:
         """How much noisier each user is than the bases of noise (B, N, 3, LANES)."""
         self.sigma2 = lanes.empty_lines(0)
         """Variance of a range (B, LANES), m^2."""
+        self.steady: Floats = np.zeros(count)
+        """1 where headings are taken to be those of wheels or a camera (``noise.STEADIER``)."""
         self._spread_levels()
         self.has_constants: Floats = (
             self.rng.permutation(count) < round(settings.constants * count)
@@ -109,6 +111,9 @@ class BankCore:
         self.has_bias: Floats = (
             self.rng.permutation(count) < round(settings.biased * count)
         ).astype(np.float64)
+        self.steady = (self.rng.permutation(count) < int(settings.steady * count)).astype(
+            np.float64
+        )
         self._some_biased = bool(self.has_bias.any())
         self._p[:, 0] = self._in_lanes(self.has_bias) * settings.bias_m**2
         self.biases: dict[tuple[int, int], int] = {}
@@ -249,7 +254,9 @@ class BankCore:
         )
         for entry in (Of.X, Of.Y):
             p[wrong, at + entry, at + entry] += 0.5 * self.settings.jump_m**2
-        p[:, at + Of.DRIFT, at + Of.DRIFT] = self.has_constants * self.settings.drift_rad_s**2
+        p[:, at + Of.DRIFT, at + Of.DRIFT] = (
+            self.has_constants * (1.0 - self.steady) * self.settings.drift_rad_s**2
+        )
         p[:, at + Of.SCALE, at + Of.SCALE] = self.has_constants * self.settings.scale**2
         self.nodes += 1
         self._put(x, p)
@@ -478,7 +485,7 @@ class BankCore:
             self.levels.mean, self.levels.covariance, self.outlier_counts, self.surprise,
             self.watch.sums, self.watch.base,
             self.since_slip <= OPEN_UPDATES and self.counters["slips"] > 0,
-            self._draw, s.spread, self.level, good,
+            self._draw, self._steady, s.spread, self.level, good,
         )  # fmt: skip
         if clamped:
             self.counters["levels_clamped"] += clamped
@@ -748,8 +755,9 @@ class BankCore:
                 self._x, self._p, self._log_weight, self.sigma2, self._sens, self._outlier,
                 self._arms, self.doubtful, self.levels.mean, self.levels.covariance,
                 self.outlier_counts, self.surprise, self.watch.sums, self.watch.base, self._draw,
-                self.level, self.since_turn_s, epochs.rows, epochs.moves, epochs.move_ends,
-                epochs.first, epochs.second, _no_places(several), epochs.range_m, epochs.dz_m,
+                self._steady, self.level, self.since_turn_s, epochs.rows, epochs.moves,
+                epochs.move_ends, epochs.first, epochs.second, _no_places(several),
+                epochs.range_m, epochs.dz_m,
                 _always(several, 1.0), epochs.range_ends, begin, wary_for, s.spread,
                 s.hypotheses == 1, news,
             )
@@ -785,6 +793,8 @@ class BankCore:
         # Children of one parent part in their levels, too (Liu, West).
         self.draw *= math.sqrt(1.0 - JITTER**2)
         self.draw += JITTER * self.rng.standard_normal(self.draw.shape)
+        if self.steady.any():
+            self.steady *= self.rng.random(self.count) >= UNSETTLED
         self._spread_levels()
         self._log_weight = np.zeros((len(self._x), LANES))
         self.counters["resampled"] += 1
@@ -800,6 +810,7 @@ class BankCore:
         flat = joint.take(self._sens.reshape(len(self._sens), -1, LANES), chosen)
         self._sens = flat.reshape(len(flat), *self._sens.shape[1:])
         self.has_constants, self.has_bias = self.has_constants[chosen], self.has_bias[chosen]
+        self.steady = self.steady[chosen]
         self.doubtful = self.doubtful[chosen]
         self.wrong_start = self.wrong_start[chosen]
         self._some_biased = bool(self.has_bias.any())
@@ -813,9 +824,11 @@ class BankCore:
             self.sigma2 = lanes.empty_lines(blocks)
         laid = np.concatenate([self.draw, self.draw[[-1] * (blocks * LANES - self.count)]])
         self._draw = lanes.copy_lines(laid.reshape(blocks, LANES, -1).transpose(0, 2, 1))
+        self._steady = self._in_lanes(self.steady)
         bank_kernels.spread_levels(
-            self._draw, self.levels.mean, self.levels.covariance, s.spread, self.level, self.sigma2
-        )
+            self._draw, self._steady, self.levels.mean, self.levels.covariance, s.spread,
+            self.level, self.sigma2,
+        )  # fmt: skip
 
     @property
     def _usual_surprise(self) -> float:
@@ -940,6 +953,7 @@ class BankCore:
             x, mean, covariance, chosen, angles, after / before if before else 0.0
         )
         constants, bias = self.has_constants.any(), self.has_bias.any()
+        steady = float(weight @ self.steady)
         self._keep(chosen)
         self._put(thinned, np.repeat(p[None], count, axis=0))
         self._sens[...] = sens[..., None]
@@ -947,6 +961,8 @@ class BankCore:
         # The moments have something of the constants wherever any hypothesis has.
         self.has_constants = np.full(count, float(constants))
         self.has_bias = np.full(count, float(bias))
+        # Between the two, where that is open: a picture that does not bend leaves it so for long.
+        self.steady = np.full(count, steady)
         self._some_biased = bool(bias)
         if count == 1:
             self.draw = np.zeros_like(self.draw)
@@ -999,7 +1015,7 @@ class BankCore:
             tuple(a.copy() for a in (
                 self.levels.mean, self.levels.covariance, self.draw, self.has_constants,
                 self.has_bias, self.surprise, self.since_turn_s, self.outlier_counts, self.doubtful,
-                self.wrong_start, self.arm, self.watch.sums, self.watch.base,
+                self.wrong_start, self.arm, self.watch.sums, self.watch.base, self.steady,
             )),
             self.rng.bit_generator.state,
             (self.nodes, self.since_slip, self.unambiguous, self.ceiling, *self.slipped),
@@ -1016,7 +1032,7 @@ class BankCore:
         (
             self.levels.mean, self.levels.covariance, self.draw, self.has_constants,
             self.has_bias, self.surprise, self.since_turn_s, self.outlier_counts, self.doubtful,
-            self.wrong_start, self.arm, self.watch.sums, self.watch.base,
+            self.wrong_start, self.arm, self.watch.sums, self.watch.base, self.steady,
         ) = (a.copy() for a in snapshot.arrays)  # fmt: skip
         self.count = len(self.doubtful)
         self._some_biased = bool(self.has_bias.any())
@@ -1039,6 +1055,11 @@ _POSE_PLACE = 3
 PAIR_BIASES = 6
 """Up to so many users each pair has a bias of its own in the state: 15 of them double its size.
 Of more, the common one is modelled."""
+
+UNSETTLED = 0.06
+"""Of those who take the team's headings for steady, so many give it up at each resampling. People
+who walk straight on look steady; when they turn, somebody has to be left who knows better
+(``paper``, seeds 9100 to 9109: 0.77 m, without it 0.82 with a worst of 1.34)."""
 
 JITTER = 0.1
 """Standard deviation of the levels' jitter at resampling, in units of their spread."""

@@ -193,17 +193,21 @@ def step_bend(
 
 @compiled
 def spread_levels(
-    draw: Floats, mean: Floats, covariance: Floats, spread: float, level: Floats, sigma2: Floats
-) -> None:
+    draw: Floats, steady: Floats, mean: Floats, covariance: Floats, spread: float, level: Floats,
+    sigma2: Floats,
+) -> None:  # fmt: skip
     """Give every hypothesis its draw ``draw`` (B, L, LANES) of what is known of log levels (L,).
 
-    ``level`` (B, N, 3, LANES) and ``sigma2`` (B, LANES) receive them.
+    Where ``steady`` (B, LANES) is 1 they are lower by ``noise.STEADIER``. ``level``
+    (B, N, 3, LANES) and ``sigma2`` (B, LANES) receive them.
     """
     blocks, several = draw.shape[0], draw.shape[1]
     for c in range(several):
         sd = min(spread * math.sqrt(covariance[c, c]), noise.SPREAD_MOST)
+        lower = noise.STEADIER[c % noise.LEVELS] if c < several - 1 else 0.0
         for b in range(blocks):
-            value = lanes.exp(mean[c] + sd * load(draw, b * several + c))
+            drawn = sd * load(draw, b * several + c) - lower * load(steady, b)
+            value = lanes.exp(mean[c] + drawn)
             if c == several - 1:
                 store(sigma2, b, value)
             else:
@@ -376,7 +380,7 @@ def take_ranges(
     second: Indices, bias: Indices, measured: Floats, dz: Floats, outlier: Floats, worth: Floats,
     dz_variance: Floats, arms: Floats, doubtful: Floats, levels: Floats, covariance: Floats,
     outlier_counts: Floats, surprise: Floats, sums: Floats, base: Floats, wary: bool, draw: Floats,
-    spread: float, level: Floats, good: Floats,
+    steady: Floats, spread: float, level: Floats, good: Floats,
 ) -> tuple[int, int]:  # fmt: skip
     """Do all that an instant's ranges ask for: ``joint.update``, ``digest``, ``spread_levels``."""
     count, ranges = doubtful.shape[0], first.shape[0]
@@ -392,7 +396,7 @@ def take_ranges(
         worth, levels, covariance, outlier_counts, surprise, sums, base, outlier[0], wary, good,
     )  # fmt: skip
     temper(log_weight, before)
-    spread_levels(draw, levels, covariance, spread, level, sigma2)
+    spread_levels(draw, steady, levels, covariance, spread, level, sigma2)
     return slipped, clamped
 
 
@@ -493,7 +497,7 @@ def teach(
 def follow(
     x: Floats, p: Floats, log_weight: Floats, sigma2: Floats, sens: Floats, outlier: Floats,
     arms: Floats, doubtful: Floats, levels: Floats, covariance: Floats, outlier_counts: Floats,
-    surprise: Floats, sums: Floats, base: Floats, draw: Floats, level: Floats,
+    surprise: Floats, sums: Floats, base: Floats, draw: Floats, steady: Floats, level: Floats,
     since_turn_s: Floats, rows: Indices, moves: Floats, move_ends: Indices, first: Indices,
     second: Indices, bias: Indices, measured: Floats, dz: Floats, worth: Floats,
     range_ends: Indices, begin: int, wary_for: int, spread: float, alone: bool,
@@ -531,7 +535,7 @@ def follow(
                 x, p, log_weight, sigma2, sens, first[r:r_end], second[r:r_end], bias[r:r_end],
                 measured[r:r_end], dz[r:r_end], outlier, worth[r:r_end], variance[r:r_end], arms,
                 doubtful, levels, covariance, outlier_counts, surprise, sums, base,
-                e - begin < wary_for, draw, spread, level, good[r:r_end],
+                e - begin < wary_for, draw, steady, spread, level, good[r:r_end],
             )  # fmt: skip
             news[2] += clamped
         if not alone:

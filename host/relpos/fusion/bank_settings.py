@@ -24,6 +24,7 @@ class BankSettings:
     scale: float = setting(0.1, "prior standard deviation of the step scale", 0.0, 1.0)
     drift_rad_s: float = setting(0.005, "prior standard deviation of heading drift", 0.0, 1.0)
     constants: float = setting(0.5, "share of hypotheses with scale and drift", 0.0, 1.0)
+    steady: float = setting(0.4, "share of hypotheses with steady headings", 0.0, 1.0)
     bias_m: float = setting(0.3, "prior standard deviation of the range bias", 0.0, 10.0)
     pair_bias_m: float = setting(0.1, "prior standard deviation of a pair's part", 0.0, 10.0)
     biased: float = setting(0.5, "share of hypotheses with range biases", 0.0, 1.0)

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 
 BANK: Mapping[str, str] = {
     "bank_kernels.take_ranges": (
-        "f3 f3 f2 f2 f5 i1 i1 i1 f1 f1 f1 f1 f1 f2 f1 f1 f2 f1 f1 f1 f1 b f3 f f4 f1"
+        "f3 f3 f2 f2 f5 i1 i1 i1 f1 f1 f1 f1 f1 f2 f1 f1 f2 f1 f1 f1 f1 b f3 f2 f f4 f1"
     ),
     "starts_kernels.fit": "f2 i f1 f3 i2 f3 f2 i1 f3 f1 f i2 i1 f2 f3 f1 f1 f3",
     "joint.advance": "f3 f3 f4 f5 i1 f2 f2 f f",
@@ -29,7 +29,7 @@ BANK: Mapping[str, str] = {
     "joint.predicted_ranges": "f3 f3 f2 i1 i1 f1",
     "hypotheses.bend": "f1 f2 f f1",
     "bank_kernels.pairs": "f1 f2 i1",
-    "bank_kernels.spread_levels": "f3 f1 f2 f f4 f2",
+    "bank_kernels.spread_levels": "f3 f2 f1 f2 f f4 f2",
     "bank_kernels.undoubted_weights": "f2 f1 f2",
     "bank_kernels.normalise": "f2 i f2",
     "bank_kernels.temper": "f2 f1",

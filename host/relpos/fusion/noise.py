@@ -42,6 +42,11 @@ OWN_SD = np.array([0.9, 0.9, 0.9])
 """Prior of log variances: mean, and standard deviations of what is common to the team and of
 what is each wearer's own."""
 
+STEADIER = np.array([0.0, 5.0, 3.0])
+"""By how much lower the log levels of a steady team are: wheels or a camera keep the heading to
+one degree in a turn of a radian and 0.4 degrees in a root second, a twelfth and a quarter of what
+is expected of people. It is a kind of team, which some hypotheses model and the data select."""
+
 RANGE_SIGMA_M = 0.3
 RANGE_SD = 1.2
 """Prior of the range sigma, and the standard deviation of its log variance."""
