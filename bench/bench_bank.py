@@ -1,90 +1,155 @@
-"""What an epoch of the bank costs: N 6, paper-p1, one thread, measurements handed over as arrays.
+"""What an epoch of the bank costs: N 6, paper-p1, one thread.
 
-    python bench/bench_bank.py [--hypotheses 200 1] [--rounds 5]
+    python bench/bench_bank.py [--hypotheses 200 1] [--rounds 9]
 
-An epoch is 2 s: two motions of each user and about 5.3 ranges. The core's figure is the median
-over epochs of the least of several rounds over the same run (other work on the machine only adds);
-the last line is the public measurement-by-measurement interface, estimates included.
+An epoch is 2 s: two motions of each user and about 5.3 ranges. For each number of hypotheses:
+
+* measurements handed over as arrays, epoch by epoch (``BankCore.move``, ``update``, ``settle``);
+* all epochs handed over at once (``BankCore.follow``), where one hypothesis is enough;
+* one measurement after another through the public interface, an estimate a second, hearing and
+  copies for going back included; with the same state (no range biases), its estimates looked at
+  by nobody or all of them, and with default settings.
+
+Figures are processor time: over those epochs in which the bank had just so many hypotheses, the
+median (and the mean: copies and the learning of hearing come now and then) of the least of several
+rounds over the same run, since other work on the machine only adds.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Mapping
 
 import numpy as np
 
 from relpos import fusion
-from relpos.fusion.bank_core import BankCore
+from relpos.fusion.bank import Bank
+from relpos.fusion.bank_core import BankCore, Epochs
 from relpos.fusion.bank_settings import BankSettings
+from relpos.fusion.growing import GrowingTeam
 from relpos.measurements import Motion, Range
 from relpos.simulation.paper import SimulatedRun, simulate_paper
 
-Epoch = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+EPOCH_S = 2.0
 
 
-def epochs_of(run: SimulatedRun) -> list[Epoch]:
-    """Motion rows (M,), motions (M, 4), first and second rows (R,), ranges (R,) of each 2 s."""
-    epochs = []
-    for start in np.arange(0.0, run.measurements[-1].time_s, 2.0):
-        inside = [m for m in run.measurements if start < m.time_s <= start + 2.0]
-        motions = [m for m in inside if isinstance(m, Motion)]
-        ranges = [m for m in inside if isinstance(m, Range)]
-        epochs.append((
-            np.array([m.node - 1 for m in motions], dtype=np.int64),
-            np.array([(m.dx_m, m.dy_m, m.dtheta_rad, 1.0) for m in motions]),
-            np.array([m.node - 1 for m in ranges], dtype=np.int64),
-            np.array([m.peer - 1 for m in ranges], dtype=np.int64),
-            np.array([m.range_m for m in ranges]),
-        ))  # fmt: skip
-    return epochs
+def epochs_of(run: SimulatedRun) -> Epochs:
+    """All measurements as arrays."""
+    motions = [m for m in run.measurements if isinstance(m, Motion)]
+    ranges = [m for m in run.measurements if isinstance(m, Range)]
+    ends = np.arange(EPOCH_S, run.measurements[-1].time_s + EPOCH_S, EPOCH_S)
+    return Epochs(
+        np.array([m.node - 1 for m in motions]),
+        np.array([(m.dx_m, m.dy_m, m.dtheta_rad, 1.0) for m in motions]),
+        np.searchsorted([m.time_s for m in motions], ends, side="right"),
+        np.array([m.node - 1 for m in ranges]),
+        np.array([m.peer - 1 for m in ranges]),
+        np.array([m.range_m for m in ranges]),
+        np.zeros(len(ranges)),
+        np.searchsorted([m.time_s for m in ranges], ends, side="right"),
+    )
 
 
-def core_us(run: SimulatedRun, hypotheses: int) -> dict[str, np.ndarray]:
-    """Microseconds of each epoch's parts, (E,) each."""
+def core_of(run: SimulatedRun, hypotheses: int) -> BankCore:
+    """A bank with the run's users, without biases."""
     core = BankCore(BankSettings(hypotheses=hypotheses, biased=0.0), 0)
     for prior in run.priors:
         core.add_node(prior.x_m, prior.y_m, prior.heading_rad, 0.0, 0.0)
+    return core
+
+
+def core_us(run: SimulatedRun, epochs: Epochs, hypotheses: int) -> dict[str, np.ndarray]:
+    """Microseconds of each epoch's parts (E,), NaN where there were others than so many."""
+    core = core_of(run, hypotheses)
     parts: dict[str, list[float]] = {"advance": [], "update": [], "settle": []}
-    for rows, moved, first, second, measured in epochs_of(run):
+    moved = ranged = 0
+    for m, r in zip(epochs.move_ends.tolist(), epochs.range_ends.tolist(), strict=True):
+        rows, moves = epochs.rows[moved:m], epochs.moves[moved:m]
+        first, second = epochs.first[ranged:r], epochs.second[ranged:r]
+        measured, dz = epochs.range_m[ranged:r], epochs.dz_m[ranged:r]
+        moved, ranged = m, r
+        ours = core.count == hypotheses
         marks = [time.thread_time()]
-        core.move(rows, moved)
+        core.move(rows, moves)
         marks.append(time.thread_time())
         if len(first):
-            core.update(first, second, measured, np.zeros(len(first)))
+            core.update(first, second, measured, dz)
         marks.append(time.thread_time())
         core.settle()
         marks.append(time.thread_time())
         for name, spent in zip(parts, np.diff(marks), strict=True):
-            parts[name].append(1e6 * spent)
+            parts[name].append(1e6 * spent if ours and core.count == hypotheses else np.nan)
     return {name: np.array(values) for name, values in parts.items()}
 
 
+def together_us(run: SimulatedRun, epochs: Epochs, hypotheses: int) -> float:
+    """Microseconds an epoch, all handed over at once."""
+    core = core_of(run, hypotheses)
+    started = time.thread_time()
+    core.follow(epochs)
+    return 1e6 * (time.thread_time() - started) / len(epochs.move_ends)
+
+
+def interface_us(
+    run: SimulatedRun, hypotheses: int, settings: Mapping[str, object], *, read: bool
+) -> np.ndarray:
+    """Microseconds of each epoch (E,), NaN as above."""
+    estimator = fusion.make("bank", run.priors, {"hypotheses": hypotheses, **settings}, 0)
+    assert isinstance(estimator, GrowingTeam)
+    assert isinstance(estimator.estimator, Bank)
+    core = estimator.estimator.core
+    marks, counts, end_s = [time.thread_time()], [core.count], EPOCH_S
+    for measurement in run.measurements:
+        if measurement.time_s > end_s:
+            end_s += EPOCH_S
+            marks.append(time.thread_time())
+            counts.append(core.count)
+        for estimate in estimator.process(measurement):
+            if read:
+                assert estimate.nodes
+    ours = np.array(counts) == hypotheses
+    return np.where(ours[1:] & ours[:-1], 1e6 * np.diff(marks), np.nan)
+
+
+def figure(rounds: list[np.ndarray]) -> str:
+    """Median and mean over epochs of the least of the rounds (R, E)."""
+    least = np.min(rounds, axis=0)
+    return f"{np.nanmedian(least):.0f} us (mean {np.nanmean(least):.0f})"
+
+
 def main() -> None:
-    """Print a line for each number of hypotheses."""
+    """Print a paragraph for each number of hypotheses."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--hypotheses", type=int, nargs="+", default=[200, 1])
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=9)
     args = parser.parse_args()
     run = simulate_paper("paper-p1", 0, {"seconds": 300.0})
+    epochs = epochs_of(run)
     for hypotheses in args.hypotheses:
-        core_us(run, hypotheses)
-        rounds = [core_us(run, hypotheses) for _ in range(args.rounds)]
-        least = {name: np.min([r[name] for r in rounds], axis=0) for name in rounds[0]}
-        total = np.sum(list(least.values()), axis=0)
+        core_us(run, epochs, hypotheses)
+        rounds = [core_us(run, epochs, hypotheses) for _ in range(args.rounds)]
+        parts = {
+            name: np.nanmedian(np.min([r[name] for r in rounds], axis=0)) for name in rounds[0]
+        }
+        total = figure([np.sum(list(r.values()), axis=0) for r in rounds])
         print(
-            f"{hypotheses} hypotheses, states of 30: {np.median(total):.0f} us an epoch ("
-            + ", ".join(f"{name} {np.median(values):.0f}" for name, values in least.items())
+            f"{hypotheses} hypotheses, states of 30: {total} an epoch ("
+            + ", ".join(f"{name} {value:.0f}" for name, value in parts.items())
             + ")"
         )
-        whole = []
-        for _ in range(args.rounds):
-            estimator = fusion.make("bank", run.priors, {"hypotheses": hypotheses}, 0)
-            started = time.thread_time()
-            for measurement in run.measurements:
-                estimator.process(measurement)
-            whole.append(1e6 * (time.thread_time() - started) / 150)
-        print(f"  measurement by measurement, estimates included: {min(whole):.0f} us an epoch")
+        if hypotheses == 1:  # with more it is one call after another
+            least = min(together_us(run, epochs, 1) for _ in range(args.rounds + 1))
+            print(f"  all {len(epochs.move_ends)} epochs handed over at once: {least:.1f} us each")
+        for words, settings, read in (
+            ("measurement by measurement, the same state", {"biased": 0.0}, False),
+            ("  and every estimate looked at", {"biased": 0.0}, True),
+            ("  and default settings, states of 46", {}, True),
+        ):
+            told = figure(
+                [interface_us(run, hypotheses, settings, read=read) for _ in range(args.rounds)]
+            )
+            print(f"  {words}: {told}", flush=True)
 
 
 if __name__ == "__main__":
