@@ -4,8 +4,8 @@
 
 An epoch is what lies between two instants of ranging: two displacements a user and about 5.3
 ranges. "arrays" hands them to `Clouds` as arrays, "interface" goes measurement by measurement
-through `process`, with an estimate a second. Median and tenth percentile (what a busy computer
-does not disturb) over a run of 600 s, one thread.
+through `process`, with an estimate a second. Processor time, median and tenth percentile (a busy
+computer's caches are disturbed) over a run of 600 s, one thread.
 """
 
 from __future__ import annotations
