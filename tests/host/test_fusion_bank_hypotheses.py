@@ -228,3 +228,28 @@ def test_epochs_that_do_not_end_with_their_measurements_are_refused() -> None:
             core.follow(wrong)
     with pytest.raises(IndexError):
         core.follow(replace(epochs, rows=epochs.rows + len(priors)))
+
+
+def test_a_picture_that_bends_much_has_more_hypotheses_and_few_states_the_usual() -> None:
+    _, counts, _, _ = _run("paper-h2", {"seconds": 150.0})
+    usual = BankSettings().hypotheses
+    assert max(counts) == hypotheses.MORE * usual
+    assert counts[5] == usual
+    assert hypotheses.most(usual, 46) == hypotheses.MORE * usual
+    assert hypotheses.most(usual, 101) == usual
+    # A range noise of a metre hides what bends by less.
+    _, counts, _, _ = _run("paper", {"seconds": 150.0})
+    assert np.mean(np.array(counts) > usual) < 0.2
+
+
+def test_people_are_not_lost_to_a_team_of_steady_headings() -> None:
+    run = simulate_paper("paper-h", 1, {"seconds": 200.0})
+    bank = Bank(run.priors, BankSettings(steady=1.0), seed=1)
+    estimates = [e for m in run.measurements for e in bank.process(m)] + bank.finish()
+    assert float(bank.core.weights() @ bank.core.steady) < 0.1
+    figures = metrics.evaluate(
+        tracks.estimated_tracks(estimates),
+        tracks.true_tracks(run.truth),
+        tracks.estimated_pairs(estimates),
+    )
+    assert figures.relative_distance_rmse_m < 1.0

@@ -78,7 +78,7 @@ def test_biases_of_uncalibrated_pairs_are_found() -> None:
 
 
 @pytest.mark.parametrize(("name", "distance_m", "body_m"), [
-    (ROBOTS[0], 0.19, 0.75), (ROBOTS[1], 0.19, 0.6), (ROBOTS[2], 0.13, 0.55),
+    (ROBOTS[0], 0.16, 0.42), (ROBOTS[1], 0.17, 0.41), (ROBOTS[2], 0.13, 0.55),
 ])  # fmt: skip
 def test_two_robots_are_placed_better_than_by_dead_reckoning(
     name: str, distance_m: float, body_m: float

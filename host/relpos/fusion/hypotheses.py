@@ -48,8 +48,8 @@ the bend of pairs and ways is 0.2 in P and P1, and 1.2 to 2.5 in H, H2 and ``lab
 
 MORE = 8
 """``paper-h2``, seeds 9100 to 9159: 200 hypotheses 1.41 m (worst 2.80), 400 1.39 (2.46), 800 while
-much bends 1.31 (1.76), 1600 1.28 (1.64); the bound is 1.30. There the bank then takes 5 ms an
-epoch of 2 s, in place of 1."""
+much bends 1.31 (1.76), 1600 1.28 (1.64); the bound is 1.30. There the bank then takes 6 ms an
+epoch of 2 s, in place of 2."""
 
 WORK = 1.6e8
 """Hypotheses times entries cubed at most (what an epoch costs, where everybody ranges a few): six
