@@ -57,6 +57,7 @@ LARGE_TEAM: Mapping[str, str] = {
 PARTICLE: Mapping[str, str] = {
     "particle_kernels.dual_step": "f3 f2 f2 f2 i1 i1 f1 f1 f f f f2",
     "particle_kernels.correct": "f3 f2 f2 i1 i1 f1 f1 f f f2",
+    "particle_kernels.resample": "f3 f2 i1 f2",
     "particle_kernels.moments": "f3 f2 f2",
     "particle_kernels.directed": "i1 i1 i",
     "particle_kernels.advance": "f3 i1 f2 f2 f1",

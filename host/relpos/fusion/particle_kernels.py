@@ -184,7 +184,9 @@ def correct(
     for k in range(poses.shape[1]):
         prior, new = weights[k], result[k]
         if offset[k] == offset[k + 1]:
-            new[:] = prior
+            # One by one: whole arrays, with the words for lengths that differ, compile for seconds.
+            for m in range(count):
+                new[m] = prior[m]
             continue
         x, y = poses[0, k], poses[1, k]
         total[:] = 0.0
@@ -447,7 +449,8 @@ def resample(poses: Floats, weights: Floats, rows: Indices, uniforms: Floats) ->
         source[m:] = count - 1
         for axis in range(3):
             values = poses[axis, k]
-            old[:] = values
+            for m in range(count):
+                old[m] = values[m]
             for m in range(count):
                 values[m] = old[source[m]]
         w[:] = 1.0 / count
