@@ -46,7 +46,7 @@ def calibrate(*arguments):
 
 
 def test_a_guided_calibration_makes_the_field_round_and_is_kept_over_a_restart(tmp_path):
-    with emulated("turntable", 6, 1500) as port:
+    with emulated("turntable", 12, 1500) as port:
         done = calibrate(port, "--node", 1, "--out", tmp_path)
         assert done.returncode == 0, done.stderr
         assert "stored, restarted and read back" in done.stdout
@@ -75,7 +75,7 @@ def test_a_guided_calibration_makes_the_field_round_and_is_kept_over_a_restart(t
 
 
 def test_a_walk_of_known_length_sets_the_gain_on_the_node():
-    with emulated("straight", 6, 1200) as port:
+    with emulated("straight", 20, 1200) as port:
         done = calibrate("walk", port, "--node", 1, "--distance", 40)
         assert done.returncode == 0, done.stderr
         device = open_port(port)
