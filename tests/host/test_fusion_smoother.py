@@ -13,8 +13,9 @@ from relpos import fusion
 from relpos.errors import RelposError
 from relpos.evaluation import bounds, metrics, tracks
 from relpos.fusion.estimator import Estimate, NodeStatus
-from relpos.fusion.smoother import Problem, State, Weights
+from relpos.fusion.smoother import Problem, State, Weights, hear, know, weigh
 from relpos.fusion.smoother_graph import build_graph
+from relpos.fusion.smoothing import Smoother
 from relpos.fusion.twins import smoother as twin
 from relpos.measurements import Height, Motion, Prior, Range
 from relpos.simulation.paper import SimulatedRun, simulate_paper
@@ -144,6 +145,58 @@ def test_the_covariance_blocks_are_those_of_the_dense_inverse() -> None:
     assert motions.ravel() == pytest.approx(variance[: motions.size], rel=1e-4)
     ranges = problem.range_variances(state, covariance)
     assert ranges == pytest.approx(variance[motions.size :][: ranges.size], rel=1e-4)
+
+
+def test_the_levels_move_the_solution_as_small_changes_of_them_do() -> None:
+    problem, state, _ = _problem()
+    levels = problem.first_levels()
+    inliers = np.ones(problem.graph.range_m.size)
+    bases = problem.bases(state, levels)
+    weights = weigh(problem, levels, bases, inliers, 0.0)
+    equations = problem.normal_equations(state, weights)
+    whole = twin.whole_matrix(equations.a, equations.e, equations.border, equations.corner)
+    _, knowledge = know(problem, state, levels, bases, weights)
+    for node, level in ((0, 0), (1, 3), (2, 4), (2, 5)):
+        gradients = []
+        for shift in (1e-4, -1e-4):
+            changed = levels.copy()
+            changed.motion[node, level] *= math.exp(shift)
+            at = problem.normal_equations(state, weigh(problem, changed, bases, inliers, 0.0))
+            gradients.append(np.concatenate((at.gradient.ravel(), at.corner_gradient)))
+        expected = -np.linalg.solve(whole, gradients[0] - gradients[1]) / 2e-4
+        column = 7 * node + level
+        found = np.append(knowledge.poses[:, :, column], knowledge.constants[:, column])
+        assert np.abs(expected).max() > 1e-6
+        assert found == pytest.approx(expected, rel=1e-3, abs=1e-6 * np.abs(expected).max())
+    assert np.linalg.eigvalsh(knowledge.information).min() > -1e-9
+
+
+def test_silence_says_farther_and_hearing_says_nearer() -> None:
+    run = simulate_paper("paper-h", 3, {"seconds": 200})
+    graph, _ = build_graph(run.measurements, run.priors)
+    problem = Problem(graph)
+    state = problem.first_state(graph.dead_reckoned(graph.start))
+    levels = problem.first_levels()
+    weights = weigh(problem, levels, problem.bases(state, levels), np.ones(graph.range_m.size), 0.0)
+    state, _ = problem.optimise(state, weights)
+    distance = problem.tried_distances(state)
+    assert hear(problem, state, problem.covariance(state, weights)) > 0.0
+    pull = problem.heard_weight * (problem.heard_m - distance)
+    assert pull[graph.tries.silent].max() > 0.001
+    assert pull[graph.tries.silent].min() > -1e-4
+    assert pull[~graph.tries.silent].max() < 1e-4
+
+
+@pytest.mark.parametrize("scale_error", [0.0, 0.1])
+def test_step_scales_are_sought_where_there_are_any(scale_error: float) -> None:
+    options = {"seconds": 250, "nodes": 4, "scale_error": scale_error}
+    run = simulate_paper("paper-p1", 8, options)
+    smoother = fusion.make_smoother("deadreckoning", run.priors)
+    assert isinstance(smoother, Smoother)
+    for measurement in run.measurements:
+        smoother.process(measurement)
+    smoother.finish()
+    assert smoother.solutions[0].levels.to_scale == (scale_error == 0.0)
 
 
 def _smoothed(run: SimulatedRun, online: str = "bank") -> list[Estimate]:

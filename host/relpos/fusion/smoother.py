@@ -16,13 +16,16 @@ import numpy.typing as npt
 
 from relpos.errors import RelposError
 from relpos.fusion import smoother_kernels as kernels
-from relpos.fusion.detection import Detection
+from relpos.fusion.detection import LENGTH, STEP_M, Detection
 from relpos.fusion.smoother_graph import STILL_M, Graph
 
 Floats = npt.NDArray[np.float64]
 
 ALONG_WAY, ALONG_TIME, ACROSS_WAY, ACROSS_TIME, TURN_TURN, TURN_WAY, TURN_TIME = range(7)
 """Columns of ``Levels.motion``: what a chord's three variances are made of."""
+
+AXIS = np.array([0, 0, 1, 1, 2, 2, 2])
+"""Which residual of a chord each of them belongs to."""
 
 
 @dataclass
@@ -43,6 +46,10 @@ class Levels:
     colour: float = 1.0
     """How many times wider the ranges are taken because their errors last: (1 + r) / (1 - r) for
     a correlation r of a pair's consecutive errors."""
+    calibrated: bool = False
+    """Whether ranges are known to have next to no bias."""
+    to_scale: bool = False
+    """Whether steps are known to have their reported length but for noise."""
 
     def copy(self) -> Levels:
         """Return one that can be changed by itself."""
@@ -57,18 +64,50 @@ FIRST_MOTION = np.array(
 LEAST_MOTION = np.array([0.005**2, 0.001**2, 0.002**2, 0.001**2, 0.005**2, 2e-4**2, 1e-4**2])
 """No level is believed to be less; far below all sensors, and no trouble for the digits."""
 
-COUNT_FIRST = 1.0
-COUNT_TEAM = 1.0
-"""How many chords' worth of evidence the first levels count for, for the team, and the team's
-mean level, for each of its nodes: they carry the same device."""
+SPREAD_FIRST = 1.4
+SPREAD_TEAM = 1.4
+"""Standard deviations of the logarithms: of the team's mean level about the first one, and of
+its nodes' levels about the mean: they carry the same device, but walk differently."""
+
+MOST_STEP = 1.5
+"""No logarithm of a level moves by more in one step."""
 
 UNREST = 2.0
 """Standard deviations of a stride's turn beyond which it is a turn."""
 
+HEAR_FROM = 6
+"""The pass from which on who was heard is used: tracks that are still wrong by metres would teach
+a wrong edge."""
+HEAR_LEARNED = 4
+"""Passes from one learning of the curve to the next: it hardly changes, and takes longest."""
+HEAR_STEP = 0.1
+"""Share of a change that an attempt's Gaussian takes at once. Hundreds of attempts of a pair tell
+of nearly one distance and answer together: with 0.3 they overshot and diverged; 0.05 and 0.15 end
+at the same (``paper-h``, seeds 202 to 211)."""
+HEAR_SHARE = 0.2
+"""What an attempt is worth beside what its own correlation in time leaves of it: the curve itself
+is off by some percent, and for all attempts alike. ``paper-h``, seeds 202 to 208: 0.5 gave 1.006 x
+the bound with NEES 1.30, 0.2 1.016 with 1.22; no hearing 1.10."""
+HEAR_BLUR_M = 0.5
+"""No edge is taken for sharper than the step of the tabulated curve."""
+HEARD_MOVED = 0.1
+"""Deviations; when no attempt's pull on its distance changes by more, hearing has settled."""
+_NODES = np.linspace(-5.0, 5.0, 41)
+_NODE_SHARES = np.exp(-0.5 * _NODES**2)
+# Of unit variance to the last digit: else thousands of attempts that say nothing would add up.
+_NODES /= math.sqrt(float(_NODE_SHARES @ _NODES**2 / _NODE_SHARES.sum()))
+_HEARD_M = np.arange(LENGTH) * STEP_M
+_BLUR = np.exp(-0.5 * (np.arange(-3, 4) * STEP_M / HEAR_BLUR_M) ** 2)
+_BLUR /= _BLUR.sum()
 HEARING_BLUR_M = 0.5
 """How well a distance is known when it is learned from."""
 
 FIRST_SCALE = 0.1**2
+TO_SCALE = 0.005**2
+"""Of steps whose length was calibrated."""
+CALIBRATED = 0.05**2
+CALIBRATED_PAIR = 0.03**2
+"""Of ranges whose antenna delays were calibrated: the common bias, and a pair's (m^2)."""
 FIRST_DRIFT = math.radians(0.05) ** 2
 FIRST_PAIR_BIAS = 0.1**2
 COUNT_CONSTANTS = 1.0
@@ -155,6 +194,10 @@ class Problem:
             graph.antenna_m, graph.tries.rise_m,
         )  # fmt: skip
         self._no_bias = np.full(graph.tries.slot.size, -1, dtype=np.int64)
+        self.heard_m = np.zeros(graph.tries.slot.size)
+        self.heard_weight = np.zeros(graph.tries.slot.size)
+        """What an attempt's outcome says of its distance, as a Gaussian: see ``hear``."""
+        self.heard_curve = (np.zeros(LENGTH), self.heard_weight)
         self._walks = graph.length_m > STILL_M
         self._way = _usual_length(graph.length_m, self._walks)
 
@@ -169,6 +212,15 @@ class Problem:
             common_bias_m2=0.3**2,
             pair_bias_m2=0.1**2,
         )
+
+    def simpler_levels(self, *, calibrated: bool, to_scale: bool) -> Levels:
+        """Levels to begin with where ranges have next to no bias, or steps no scale."""
+        levels = replace(self.first_levels(), calibrated=calibrated, to_scale=to_scale)
+        if calibrated:
+            levels.common_bias_m2, levels.pair_bias_m2 = CALIBRATED, CALIBRATED_PAIR
+        if to_scale:
+            levels.scale = TO_SCALE
+        return levels
 
     def first_state(self, poses: Floats) -> State:
         """Begin at these poses, constants zero."""
@@ -200,6 +252,14 @@ class Problem:
         turn = parts[..., TURN_TURN] + parts[..., TURN_WAY] + parts[..., TURN_TIME]
         turn = np.maximum(turn, self.graph.reported_rad**2)
         return np.stack([along, across, turn], axis=-1)
+
+    def told(self, bases: Floats, levels: Levels) -> npt.NDArray[np.bool_]:
+        """Tell where a report's own deviation is the variance, (K - 1, N, 3)."""
+        parts = bases * levels.motion
+        result = np.zeros((*parts.shape[:2], 3), dtype=bool)
+        result[..., 0] = parts[..., :2].sum(axis=-1) < self.graph.reported_m**2
+        result[..., 2] = parts[..., 4:].sum(axis=-1) < self.graph.reported_rad**2
+        return result
 
     def motion_residuals(self, state: State) -> Floats:
         """Residuals of the chords, (K - 1, N, 3)."""
@@ -236,10 +296,33 @@ class Problem:
             state.poses, np.zeros(1), *self._tries, nothing, self._no_bias
         )
 
+    def heard_residuals(self, state: State) -> Floats:
+        """Distance of every attempt less what its outcome says of it, (Q,)."""
+        return kernels.range_residuals(
+            state.poses, np.zeros(1), *self._tries, self.heard_m, self._no_bias
+        )
+
+    def tried_variances(self, state: State, covariance: Covariance) -> Floats:
+        """Posterior variances of the attempts' distances, (Q,)."""
+        return kernels.range_variances(
+            state.poses,
+            *self._tries,
+            self._no_bias,
+            covariance.diagonal,
+            covariance.below,
+            covariance.with_constants,
+            covariance.constants,
+        )
+
     def start_residuals(self, state: State) -> Floats:
         """Difference from the prior poses, (N, 3)."""
         difference: Floats = state.poses[0] - self.graph.start
         return difference
+
+    @property
+    def hears(self) -> bool:
+        """Tell whether any attempt's outcome says something."""
+        return bool(self.heard_weight.any())
 
     def squares(self, state: State, weights: Weights) -> float:
         """Half the weighted sum of squares: what is made least."""
@@ -247,6 +330,8 @@ class Problem:
         total += np.sum(weights.ranges * self.range_residuals(state) ** 2)
         total += np.sum(self.graph.start_weight * self.start_residuals(state) ** 2)
         total += np.sum(weights.constants * state.constants**2)
+        if self.hears:
+            total += np.sum(self.heard_weight * self.heard_residuals(state) ** 2)
         return 0.5 * float(total)
 
     def constant_weights(self, levels: Levels) -> Floats:
@@ -286,6 +371,16 @@ class Problem:
             weights.ranges,
             *into,
         )
+        if self.hears:
+            kernels.add_ranges(
+                state.poses,
+                np.zeros(1),
+                *self._tries,
+                self.heard_m,
+                self._no_bias,
+                self.heard_weight,
+                *into,
+            )
         diagonal = np.arange(b)
         a[0, diagonal, diagonal] += self.graph.start_weight.ravel()
         gradient[0] += (self.graph.start_weight * self.start_residuals(state)).ravel()
@@ -333,6 +428,23 @@ class Problem:
         equations = self.normal_equations(state, weights)
         return equations.covariance()
 
+    def level_columns(self, state: State, force: Floats) -> tuple[Floats, Floats]:
+        """Change of the gradient by the levels: see :func:`kernels.add_level_columns`."""
+        knots, n = self.graph.time_s.size, self.nodes
+        count = n * force.shape[2]
+        columns, corner = np.zeros((knots, 3 * n, count)), np.zeros((self.constants, count))
+        kernels.add_level_columns(
+            state.poses,
+            state.constants[:n],
+            state.constants[n : 2 * n],
+            *self._motion,
+            force,
+            AXIS,
+            columns,
+            corner,
+        )
+        return columns, corner if self.estimate_constants else corner[:0]
+
     def motion_variances(self, state: State, covariance: Covariance) -> Floats:
         """Posterior variances of the chords' residuals, (K - 1, N, 3)."""
         n = self.nodes
@@ -371,14 +483,17 @@ class Equations:
     gradient: Floats
     corner_gradient: Floats
 
-    def _factorise(self, damping: float) -> tuple[Floats, Floats, Floats] | None:
+    def _factorise(
+        self, damping: float, further: Floats | None = None
+    ) -> tuple[Floats, Floats, Floats] | None:
         b = self.a.shape[1]
         a = self.a
         if damping > 0.0:
             diagonal = np.arange(b)
             a = a.copy()
             a[:, diagonal, diagonal] *= 1.0 + damping
-        right = np.concatenate((self.border, self.gradient[:, :, None]), axis=2)
+        parts = [self.border, self.gradient[:, :, None]]
+        right = np.concatenate(parts if further is None else [*parts, further], axis=2)
         lower, w, v = np.empty_like(a), np.empty_like(self.e), np.empty_like(right)
         if not kernels.factorise(a, self.e, right, lower, w, v):
             return None
@@ -407,18 +522,28 @@ class Equations:
 
     def covariance(self) -> Covariance:
         """Blocks of the inverse; RelposError if it does not exist."""
-        factors = self._factorise(0.0)
+        knots, b, size = self.border.shape
+        return self.covariance_and_solution(np.zeros((knots, b, 0)), np.zeros((size, 0)))[0]
+
+    def covariance_and_solution(
+        self, columns: Floats, corner_columns: Floats
+    ) -> tuple[Covariance, Floats, Floats]:
+        """Blocks of the inverse, and the inverse times columns (K, b, R) over (G, R)."""
+        factors = self._factorise(0.0, columns)
         if factors is None:
             raise RelposError("the measurements leave part of the team's way undetermined")
         lower, w, v = factors
+        size = self.corner.shape[0]
+        side, v = v[:, :, size + 1 :], v[:, :, : size + 1]
         diagonal, below = kernels.selected_inverse(lower, w)
         b = lower.shape[1]
         pivots = lower[:, np.arange(b), np.arange(b)]
         log_determinant = -2.0 * float(np.log(pivots).sum())
-        size = self.corner.shape[0]
         if not size:
             nothing = np.zeros((*lower.shape[:2], 0))
-            return Covariance(diagonal, below, nothing, np.zeros((0, 0)), log_determinant)
+            found = Covariance(diagonal, below, nothing, np.zeros((0, 0)), log_determinant)
+            solved = kernels.back_substitute(lower, w, np.ascontiguousarray(side))
+            return found, solved, np.zeros((0, side.shape[2]))
         flat = v[:, :, :-1].reshape(-1, size)
         schur = self.corner - flat.T @ flat
         through = kernels.back_substitute(lower, w, np.ascontiguousarray(v[:, :, :-1]))
@@ -427,7 +552,13 @@ class Equations:
         with_constants = -(through @ constants)
         diagonal -= with_constants @ through.transpose(0, 2, 1)
         below -= with_constants[1:] @ through[:-1].transpose(0, 2, 1)
-        return Covariance(diagonal, below, with_constants, constants, log_determinant)
+        found = Covariance(diagonal, below, with_constants, constants, log_determinant)
+        solved_constants: Floats = constants @ (
+            corner_columns - np.tensordot(v[:, :, :-1], side, axes=((0, 1), (0, 1)))
+        )
+        side = side - v[:, :, :-1] @ solved_constants
+        solved = kernels.back_substitute(lower, w, np.ascontiguousarray(side))
+        return found, solved, solved_constants
 
 
 def _usual_length(length_m: Floats, walks: npt.NDArray[np.bool_], half: int = 3) -> Floats:
@@ -449,7 +580,7 @@ def smooth(
     state: State,
     levels: Levels | None = None,
     *,
-    passes: int = 15,
+    passes: int = 21,
     learn: bool = True,
     widen_m: tuple[float, ...] = (1.0, 0.5, 0.2),
 ) -> Solution:
@@ -461,6 +592,7 @@ def smooth(
     levels = (levels or problem.first_levels()).copy()
     state = state.copy()
     solved = 0
+    problem.heard_weight = np.zeros_like(problem.heard_weight)
     inliers = np.ones(problem.graph.range_m.size)
     bases = problem.bases(state, levels)
     for turn in range(passes):
@@ -474,18 +606,25 @@ def smooth(
             inliers = judge(problem, state, levels, wide)
         if learn and turn >= len(widen_m) - 1:
             weights = weigh(problem, levels, bases, inliers, wide)
-            covariance = problem.covariance(state, weights)
-            change = learn_levels(problem, state, covariance, levels, bases, weights, inliers)
-            if turn > len(widen_m) and change < 0.02:
+            covariance, knowledge = know(problem, state, levels, bases, weights)
+            change = learn_levels(
+                problem, state, covariance, knowledge, levels, bases, weights, inliers
+            )
+            moved = math.inf
+            if turn >= HEAR_FROM:
+                relearn = (turn - HEAR_FROM) % HEAR_LEARNED == 0
+                moved = hear(problem, state, covariance, relearn=relearn)
+            if change < 0.02 and moved < HEARD_MOVED:
                 break
     weights = weigh(problem, levels, bases, inliers, 0.0)
     state, count = problem.optimise(state, weights, steps=20, tolerance=1e-7)
-    covariance = problem.covariance(state, weights)
+    covariance, knowledge = know(problem, state, levels, bases, weights)
+    cost = evidence(problem, state, levels, bases, covariance)
     return Solution(
         state,
-        covariance,
+        widened(covariance, knowledge),
         levels,
-        evidence(problem, state, levels, bases, covariance),
+        cost,
         inliers,
         solved + count,
     )
@@ -513,6 +652,60 @@ def hearing_cost(problem: Problem, state: State, sigma_m: float = HEARING_BLUR_M
     chance = detection.probability(distance, sigma_m)
     outcome = np.where(tries.silent, np.log1p(-chance), np.log(chance))
     return -float(detection.weight * np.sum(weight * outcome))
+
+
+def _learned_curve(problem: Problem, distance_m: Floats, sigma_m: Floats) -> tuple[Floats, Floats]:
+    """P(heard) over distance as ``Detection`` tabulates it, and what each attempt counts, (Q,)."""
+    tries = problem.graph.tries
+    detection = Detection()
+    weight = np.zeros(distance_m.size)
+    for k, done in enumerate(tries.rounds):
+        first, last = tries.first[k], tries.first[k + 1]
+        heard, silent = slice(first, first + len(done.heard)), slice(first + len(done.heard), last)
+        weight[heard] = done.witnessed
+        weight[silent] = detection.learn(
+            done, distance_m[heard], sigma_m[heard], distance_m[silent], sigma_m[silent]
+        )
+    curve = np.convolve(np.pad(detection.curve, 3, mode="edge"), _BLUR, mode="valid")
+    return curve, HEAR_SHARE * detection.weight * weight
+
+
+def hear(problem: Problem, state: State, covariance: Covariance, *, relearn: bool = True) -> float:
+    """Turn every attempt's outcome into a Gaussian of its distance; return the greatest change.
+
+    Expectation propagation: with the distance's posterior N(m, v) freed of what this outcome has
+    said before, its product with P(outcome | distance) is matched in mean and variance. The curve
+    is learned anew from the state where ``relearn`` says so.
+    """
+    tries = problem.graph.tries
+    distance = problem.tried_distances(state)
+    if not distance.size or not tries.silent.any():
+        return 0.0
+    variance = np.maximum(problem.tried_variances(state, covariance), 1e-6)
+    sigma = np.sqrt(variance)
+    if relearn:
+        problem.heard_curve = _learned_curve(problem, distance, sigma)
+    curve, weight = problem.heard_curve
+    old, old_m = problem.heard_weight, problem.heard_m
+    precision = np.maximum(1.0 / variance - old, 0.1 / variance)
+    mean = (distance / variance - old * old_m) / precision
+    deviation = 1.0 / np.sqrt(precision)
+    place = np.maximum(mean[:, None] + deviation[:, None] * _NODES, 0.0)
+    chance = np.interp(place, _HEARD_M, curve)
+    outcome = np.where(tries.silent[:, None], np.log1p(-chance), np.log(chance))
+    mass = _NODE_SHARES * np.exp(weight[:, None] * outcome)
+    mass /= mass.sum(axis=1, keepdims=True)
+    z = mass @ _NODES
+    spread = np.maximum(mass @ _NODES**2 - z**2, 1e-3)
+    new = np.clip(1.0 / spread - 1.0, 0.0, 20.0) * precision
+    pull = (z / spread) / deviation + mean * new
+    telling = (new * variance > 1e-3) | (np.abs(pull - new * distance) * sigma > 1e-2)
+    new = np.where(telling, old + HEAR_STEP * (np.maximum(new, 1e-6) - old), 0.0)
+    pull = np.where(telling, old * old_m + HEAR_STEP * (pull - old * old_m), 0.0)
+    moved = np.abs(pull - new * distance - old * (old_m - distance)) * sigma
+    problem.heard_weight = new
+    problem.heard_m = np.where(telling, pull / np.where(telling, new, 1.0), 0.0)
+    return float(moved.max())
 
 
 def weigh(
@@ -546,10 +739,112 @@ def judge(problem: Problem, state: State, levels: Levels, wide_m: float = 0.0) -
     return good / (good + outlier)
 
 
+@dataclass
+class Knowledge:
+    """What the data say of the L = 7 N motion levels' logarithms, at one state.
+
+    ``shares`` (K - 1, N, 7) of each level in its residual's variance, ``information`` (L, L),
+    ``poses`` (K, b, L) and ``constants`` (G, L) the change of the solution with each.
+    """
+
+    shares: Floats
+    information: Floats
+    poses: Floats
+    constants: Floats
+
+
+def know(
+    problem: Problem, state: State, levels: Levels, bases: Floats, weights: Weights
+) -> tuple[Covariance, Knowledge]:
+    """Give the covariance, and by how much the levels move the solution."""
+    w = weights.motion[..., AXIS]
+    shares = bases * levels.motion * problem.graph.news[..., None] * w
+    # Where a reported deviation is the larger one, no level matters.
+    shares = np.where(problem.told(bases, levels)[..., AXIS], 0.0, shares)
+    residual = problem.motion_residuals(state)[..., AXIS]
+    columns, corner = problem.level_columns(state, shares * residual * w)
+    equations = problem.normal_equations(state, weights)
+    covariance, solved, constants = equations.covariance_and_solution(columns, corner)
+    count = columns.shape[2]
+    forced = shares * residual * np.sqrt(w)
+    own = np.einsum("knl,knm->nlm", forced, forced) * (AXIS[:, None] == AXIS)
+    information = -(columns.reshape(-1, count).T @ solved.reshape(-1, count) + corner.T @ constants)
+    for n in range(problem.nodes):
+        at = slice(n * AXIS.size, (n + 1) * AXIS.size)
+        information[at, at] += own[n]
+    return covariance, Knowledge(shares, 0.5 * information, solved, constants)
+
+
+def _prior_precision(nodes: int) -> Floats:
+    """Precision (7 N + 7) of the logarithms of all levels, then of the team's means."""
+    count = nodes * AXIS.size
+    a, first = SPREAD_TEAM**-2, SPREAD_FIRST**-2
+    result = np.zeros((count + AXIS.size, count + AXIS.size))
+    result[:count, :count] = a * np.eye(count)
+    cross = -a * np.tile(np.eye(AXIS.size), (nodes, 1))
+    result[:count, count:], result[count:, :count] = cross, cross.T
+    result[count:, count:] = (nodes * a + first) * np.eye(AXIS.size)
+    return result
+
+
+def step_levels(
+    problem: Problem,
+    state: State,
+    covariance: Covariance,
+    knowledge: Knowledge,
+    levels: Levels,
+    bases: Floats,
+    weights: Weights,
+) -> float:
+    """One Newton step of the motion levels' logarithms."""
+    w = weights.motion
+    posterior = problem.motion_variances(state, covariance)
+    square = w * problem.motion_residuals(state) ** 2
+    free = np.maximum(1.0 - posterior * w, 0.0)
+    slope = 0.5 * np.sum(knowledge.shares * (square - free)[..., AXIS], axis=0)
+    count = slope.size
+    precision = _prior_precision(problem.nodes)
+    value = np.log(levels.motion)
+    # The team's means are where the nodes' levels have them.
+    n, a, first = problem.nodes, SPREAD_TEAM**-2, SPREAD_FIRST**-2
+    mean = (a * value.sum(axis=0) + first * np.log(FIRST_MOTION)) / (n * a + first)
+    gradient = np.concatenate(((slope - a * (value - mean)).ravel(), np.zeros(AXIS.size)))
+    precision[:count, :count] += knowledge.information
+    least = np.tile(np.log(LEAST_MOTION), n)
+    stuck = (value.ravel() <= least + 1e-9) & (gradient[:count] < 0.0)
+    keep = np.append(~stuck, np.ones(AXIS.size, dtype=bool))
+    step = np.zeros(count + AXIS.size)
+    step[keep] = np.linalg.solve(precision[np.ix_(keep, keep)], gradient[keep])
+    moved = np.clip(step[:count], -MOST_STEP, MOST_STEP)
+    new = np.maximum(value.ravel() + moved, least)
+    important = knowledge.shares.sum(axis=0).ravel() > 1.0
+    change = float(np.max(np.abs(new - value.ravel()) * important, initial=0.0))
+    levels.motion = np.exp(new).reshape(value.shape)
+    return change
+
+
+def widened(covariance: Covariance, knowledge: Knowledge) -> Covariance:
+    """Add to a covariance what the levels' own uncertainty makes of the solution."""
+    count = knowledge.poses.shape[2]
+    precision = _prior_precision(count // AXIS.size)
+    precision[:count, :count] += knowledge.information
+    unknown = np.linalg.inv(precision)[:count, :count]
+    root = np.linalg.cholesky(0.5 * (unknown + unknown.T))
+    poses, constants = knowledge.poses @ root, knowledge.constants @ root
+    return Covariance(
+        covariance.diagonal + poses @ poses.transpose(0, 2, 1),
+        covariance.below + poses[1:] @ poses[:-1].transpose(0, 2, 1),
+        covariance.with_constants + poses @ constants.T,
+        covariance.constants + constants @ constants.T,
+        covariance.log_determinant,
+    )
+
+
 def learn_levels(
     problem: Problem,
     state: State,
     covariance: Covariance,
+    knowledge: Knowledge,
     levels: Levels,
     bases: Floats,
     weights: Weights,
@@ -564,32 +859,7 @@ def learn_levels(
     over its residuals r with posterior variances p (for the square root of the quotient, and
     with p = v - ..., Zhou et al. 2019 show ascent; the quotient itself is Foerstner's).
     """
-    change = 0.0
-    residual = problem.motion_residuals(state)
-    posterior = problem.motion_variances(state, covariance)
-    for columns, axis in (
-        ((ALONG_WAY, ALONG_TIME), 0),
-        ((ACROSS_WAY, ACROSS_TIME), 1),
-        ((TURN_TURN, TURN_WAY, TURN_TIME), 2),
-    ):
-        inverse = weights.motion[..., axis]
-        square = residual[..., axis] ** 2 * inverse**2
-        free = inverse * np.maximum(1.0 - posterior[..., axis] * inverse, 0.0)
-        for column in columns:
-            u = bases[..., column] * problem.graph.news
-            old = levels.motion[:, column].copy()
-            # Of all the squares, and of their effective number, what belongs to this level.
-            squares, number = old**2 * np.sum(u * square, axis=0), old * np.sum(u * free, axis=0)
-            first = FIRST_MOTION[column]
-            team = math.exp(
-                (np.sum(number * np.log(old)) + COUNT_FIRST * math.log(first))
-                / (number.sum() + COUNT_FIRST)
-            )
-            new = (squares + COUNT_TEAM * team) / (number + COUNT_TEAM)
-            new = np.maximum(np.clip(new, 0.1 * old, 10.0 * old), LEAST_MOTION[column])
-            important = np.sum(u * old * inverse, axis=0) > 1.0
-            change = max(change, float(np.max(np.abs(np.log(new / old)) * important, initial=0.0)))
-            levels.motion[:, column] = new
+    change = step_levels(problem, state, covariance, knowledge, levels, bases, weights)
     if inliers.size:
         residual_m = problem.range_residuals(state)
         posterior_m = problem.range_variances(state, covariance)
@@ -606,9 +876,13 @@ def learn_levels(
         if problem.estimate_constants:
             spread = np.diag(covariance.constants)
             for name, part, first in (
-                ("scale", slice(0, n), FIRST_SCALE),
+                ("scale", slice(0, n), TO_SCALE if levels.to_scale else FIRST_SCALE),
                 ("drift_rad2_s2", slice(n, 2 * n), FIRST_DRIFT),
-                ("pair_bias_m2", slice(2 * n + 1, None), FIRST_PAIR_BIAS),
+                (
+                    "pair_bias_m2",
+                    slice(2 * n + 1, None),
+                    CALIBRATED_PAIR if levels.calibrated else FIRST_PAIR_BIAS,
+                ),
             ):
                 old_t = getattr(levels, name)
                 up = float(np.sum(state.constants[part] ** 2)) + COUNT_CONSTANTS * first
@@ -675,6 +949,9 @@ def evidence(
     prior = problem.constant_weights(levels)
     if problem.estimate_constants:
         total += 0.5 * np.sum(prior * state.constants**2 - np.log(prior))
+        # A chord's noise is so wide in reported metres; as a density of where it ends, in true
+        # ones, it is exp(2 c) times as wide. Without this every longer team would be likelier.
+        total += 2.0 * variance.shape[0] * float(np.sum(state.constants[: problem.nodes]))
     total += hearing_cost(problem, state)
     start = problem.graph.start_weight
     total += 0.5 * np.sum(start * problem.start_residuals(state) ** 2)

@@ -156,6 +156,46 @@ def add_motions(
 
 
 @compiled
+def add_level_columns(
+    poses: Floats,
+    log_scale: Floats,
+    drift_rad_s: Floats,
+    duration_s: Floats,
+    length_m: Floats,
+    direction_rad: Floats,
+    turn_rad: Floats,
+    follow: Floats,
+    force: Floats,
+    axis: Integers,
+    columns: Floats,
+    corner: Floats,
+) -> None:
+    """Add how the gradient changes with the logarithm of each motion level (sign turned round).
+
+    ``force`` (K - 1, N, L) is share r / V of a level in its residual's variance; level l acts on
+    residual ``axis[l]`` (0 along, 1 across, 2 turn). Column i L + l of ``columns`` (K, b, N L) and
+    of ``corner`` (G, N L) is level l of node i.
+    """
+    knots, nodes, levels = poses.shape[0], poses.shape[1], force.shape[2]
+    j = np.empty((3, 8))
+    r = np.empty(3)
+    for k in range(knots - 1):
+        for i in range(nodes):
+            _motion_derivative(
+                poses[k, i], poses[k + 1, i], log_scale[i], drift_rad_s[i], duration_s[k],
+                length_m[k, i], direction_rad[k, i], turn_rad[k, i], follow[i], r, j,
+            )  # fmt: skip
+            at = 3 * i
+            for level in range(levels):
+                column, f, a = levels * i + level, force[k, i, level], axis[level]
+                for p in range(3):
+                    columns[k, at + p, column] += f * j[a, p]
+                    columns[k + 1, at + p, column] += f * j[a, 3 + p]
+                corner[i, column] += f * j[a, 6]
+                corner[nodes + i, column] += f * j[a, 7]
+
+
+@compiled
 def _range_derivative(
     poses: Floats,
     slot: int,
@@ -457,7 +497,7 @@ def range_variances(
     with_constants: Floats,
     constants: Floats,
 ) -> Floats:
-    """Posterior variances (M,) of the predicted ranges, biases included."""
+    """Posterior variances (M,) of the predicted ranges, biases included where they have any."""
     nodes = poses.shape[1]
     result = np.empty(slots.size)
     row = np.empty(12)
@@ -468,6 +508,7 @@ def range_variances(
         )
         total = 0.0
         common, own = 2 * nodes, 2 * nodes + 1 + pair_index[m]
+        biased = constants.shape[0] > 0 and pair_index[m] >= 0
         for p in range(12):
             if row[p] == 0.0:
                 continue
@@ -483,11 +524,11 @@ def range_variances(
                     inner += row[q] * below[k, at_p, at_q]
                 else:
                     inner += row[q] * below[k, at_q, at_p]
-            if constants.shape[0] > 0:
+            if biased:
                 inner += 2.0 * with_constants[k + late_p, at_p, common]
                 inner += 2.0 * with_constants[k + late_p, at_p, own]
             total += row[p] * inner
-        if constants.shape[0] > 0:
+        if biased:
             total += constants[common, common] + constants[own, own] + 2.0 * constants[common, own]
         result[m] = total
     return result

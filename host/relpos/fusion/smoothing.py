@@ -36,6 +36,10 @@ SURE_M = 1.0
 """A node that the online estimator left ambiguous, and that smoothing does not place within
 this, stays ambiguous."""
 
+SIMPLER_BY = 3.0
+"""How much more (logarithmic) evidence a team without biases or scales must have: errors that last
+make evidence look stronger than it is, and what is left out makes the rest look surer."""
+
 
 @dataclass
 class Smoother:
@@ -76,7 +80,8 @@ class Smoother:
             poses = _poses(graph, estimates)
             self.solutions.append(smooth(problem, problem.first_state(poses)))
         self.solutions.sort(key=lambda s: s.cost)
-        best = self.solutions[0]
+        best = _without_needless_constants(problem, self.solutions[0])
+        self.solutions.insert(0, best)
         self._own["smoother_attempts"] += len(attempts)
         self._own["smoother_outliers"] += int(np.sum(best.inliers < 0.5))
         return list(_estimates(problem, best, self._estimates))
@@ -84,6 +89,17 @@ class Smoother:
     def counters(self) -> Mapping[str, int]:
         """Count what the online estimator counts, and the smoother's own."""
         return {**self.online.counters(), **self._own}
+
+
+def _without_needless_constants(problem: Problem, best: Solution) -> Solution:
+    """Leave out range biases, step scales or both where the run is clearly likelier without."""
+    chosen, least = best, best.cost - SIMPLER_BY
+    for calibrated, to_scale in ((True, True), (True, False), (False, True)):
+        levels = problem.simpler_levels(calibrated=calibrated, to_scale=to_scale)
+        tried = smooth(problem, best.state, levels)
+        if tried.cost < least:
+            chosen, least = tried, tried.cost
+    return chosen
 
 
 def _replay(estimator: Estimator, measurements: Iterable[Measurement]) -> list[Estimate]:
