@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -64,6 +66,28 @@ def test_kernels_are_kept_once_each_was_compiled_since_it_was_changed(tmp_path: 
     assert machine_code.is_kept([tmp_path])
     os.utime(tmp_path / f"joint.f-1.py{version}.nbi", (0.0, 0.0))
     assert not machine_code.is_kept([tmp_path])
+
+
+def test_what_another_modules_change_has_made_stale_is_compiled_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sources, kept = tmp_path / "sources", tmp_path / "kept"
+    kept.mkdir()
+    shutil.copytree(machine_code.SOURCES, sources, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(machine_code, "SOURCES", sources)
+    version = "".join(map(str, sys.version_info[:2]))
+    files = [kept / f"{module}.f-1.py{version}.nbi" for module in machine_code.KERNELS]
+    for file in files:
+        file.touch()
+    other = kept / f"smoother_kernels.f-1.py{version}.nbi"
+    other.touch()
+    later_s = time.time() + 10.0
+    # No kernel stands there, but a kernel's figures do.
+    assert "estimator" not in machine_code.KERNELS
+    os.utime(sources / "estimator.py", (later_s, later_s))
+    assert not machine_code.is_kept([kept])
+    machine_code.forget([kept])
+    assert [file.exists() for file in (*files, other)] == [*(False for _ in files), True]
 
 
 def test_sessions_call_the_kernels_that_are_compiled_side_by_side_and_for_those_types() -> None:

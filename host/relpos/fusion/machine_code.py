@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import atexit
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import threading
 from collections import deque
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -47,19 +48,54 @@ def folders(told: str | None) -> list[Path]:
     return [SOURCES / "__pycache__", user_cache_path("numba", appauthor=False)]
 
 
-def is_kept(places: Sequence[Path], modules: Collection[str] = KERNELS) -> bool:
-    """Whether every module's kernels have been compiled since it was last changed."""
+def changed_s(modules: Iterable[str] = KERNELS) -> float:
+    """When any of the modules, or of those of this folder that they import, was last changed.
+
+    A kernel has what it calls, and others' constants, compiled into it; numba looks at its own
+    file alone.
+    """
+    newest_s, seen, waiting = 0.0, set(), list(modules)
+    while waiting:
+        module = waiting.pop()
+        source = SOURCES / f"{module}.py"
+        if module in seen or not source.is_file():
+            continue
+        seen.add(module)
+        newest_s = max(newest_s, source.stat().st_mtime)
+        for names in _IMPORTED.findall(source.read_text(encoding="utf-8")):
+            waiting += [name for part in names if part for name in re.findall(r"\w+", part)]
+    return newest_s
+
+
+_IMPORTED = re.compile(r"^from relpos\.fusion(?:\.(\w+) import| import (.+))", re.MULTILINE)
+
+
+def _indices(places: Iterable[Path], modules: Collection[str]) -> Iterator[tuple[str, Path]]:
+    """Each module's files that tell what is kept."""
     suffix = f".py{sys.version_info.major}{sys.version_info.minor}.nbi"
-    newest = dict.fromkeys(modules, -1.0)
     for place in places:
         for file in place.rglob(f"*{suffix}"):
             module = file.name.split(".")[0]
-            if module in newest:
-                newest[module] = max(newest[module], file.stat().st_mtime)
-    return all(
-        compiled >= (SOURCES / f"{module}.py").stat().st_mtime
-        for module, compiled in newest.items()
-    )
+            if module in modules:
+                yield module, file
+
+
+def is_kept(places: Sequence[Path], modules: Collection[str] = KERNELS) -> bool:
+    """Whether every module's kernels have been compiled since any of them was last changed."""
+    since_s = changed_s(modules)
+    newest = dict.fromkeys(modules, -1.0)
+    for module, file in _indices(places, modules):
+        newest[module] = max(newest[module], file.stat().st_mtime)
+    return all(compiled_s >= since_s for compiled_s in newest.values())
+
+
+def forget(places: Sequence[Path], modules: Collection[str] = KERNELS) -> None:
+    """Have numba compile anew what was compiled before the last change."""
+    since_s = changed_s(modules)
+    for _, file in list(_indices(places, modules)):
+        with suppress(OSError):
+            if file.stat().st_mtime < since_s:
+                file.unlink()
 
 
 def compile_apart(estimators: Collection[str] = tuple(OF)) -> None:
@@ -73,6 +109,7 @@ def compile_apart(estimators: Collection[str] = tuple(OF)) -> None:
     places = folders(os.environ.get("NUMBA_CACHE_DIR"))
     if is_kept(places, modules_of(kernels)):
         return
+    forget(places, modules_of(kernels))
     later = [kernel for name in estimators for kernel in LATER.get(name, ())]
     if not any(_may_write(place) for place in places):
         os.environ["NUMBA_CACHE_DIR"] = folder = tempfile.mkdtemp(prefix="relpos-")
