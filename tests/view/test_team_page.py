@@ -102,7 +102,7 @@ def test_north_is_up_and_named_once_compasses_have_told_it(visit, stage: Stage):
     anna = colour_of(page, 1)
     heading = stage.team.pose(1, stage.at_s)[2]
     # The marker's point is told from its disc by what lies 16 pixels from its middle.
-    assert "map north up" in page.locator("#map-words").inner_text()
+    wait_for(lambda: "map north up" in page.locator("#map-words").inner_text())
     for north in (heading, heading - math.pi / 2):
         stage.team.north_rad = north
         point = [0, -16] if north == heading else [-16, 0]
