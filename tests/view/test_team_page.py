@@ -622,7 +622,7 @@ def test_the_theme_follows_the_system_until_somebody_chooses(visit, stage: Stage
     ground = "getComputedStyle(document.body).backgroundColor"
     assert rgb(page.evaluate(ground)) == [11, 16, 22]
     page.emulate_media(color_scheme="light")
-    assert rgb(page.evaluate(ground)) == [255, 255, 255]
+    wait_for(lambda: rgb(page.evaluate(ground)) == [255, 255, 255])
     page.get_by_role("button", name="Dark theme").click()
     assert rgb(page.evaluate(ground)) == [11, 16, 22]
     page.reload()
