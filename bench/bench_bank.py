@@ -28,27 +28,9 @@ from relpos.fusion.bank import Bank
 from relpos.fusion.bank_core import BankCore, Epochs
 from relpos.fusion.bank_settings import BankSettings
 from relpos.fusion.growing import GrowingTeam
-from relpos.measurements import Motion, Range
 from relpos.simulation.paper import SimulatedRun, simulate_paper
 
 EPOCH_S = 2.0
-
-
-def epochs_of(run: SimulatedRun) -> Epochs:
-    """All measurements as arrays."""
-    motions = [m for m in run.measurements if isinstance(m, Motion)]
-    ranges = [m for m in run.measurements if isinstance(m, Range)]
-    ends = np.arange(EPOCH_S, run.measurements[-1].time_s + EPOCH_S, EPOCH_S)
-    return Epochs(
-        np.array([m.node - 1 for m in motions]),
-        np.array([(m.dx_m, m.dy_m, m.dtheta_rad, 1.0) for m in motions]),
-        np.searchsorted([m.time_s for m in motions], ends, side="right"),
-        np.array([m.node - 1 for m in ranges]),
-        np.array([m.peer - 1 for m in ranges]),
-        np.array([m.range_m for m in ranges]),
-        np.zeros(len(ranges)),
-        np.searchsorted([m.time_s for m in ranges], ends, side="right"),
-    )
 
 
 def core_of(run: SimulatedRun, hypotheses: int) -> BankCore:
@@ -125,7 +107,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=9)
     args = parser.parse_args()
     run = simulate_paper("paper-p1", 0, {"seconds": 300.0})
-    epochs = epochs_of(run)
+    epochs = Epochs.of(run.measurements, EPOCH_S)
     for hypotheses in args.hypotheses:
         core_us(run, epochs, hypotheses)
         rounds = [core_us(run, epochs, hypotheses) for _ in range(args.rounds)]

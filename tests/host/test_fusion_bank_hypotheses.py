@@ -15,7 +15,7 @@ from relpos.fusion.bank_core import BankCore, Epochs
 from relpos.fusion.bank_settings import BankSettings
 from relpos.fusion.estimator import Estimate
 from relpos.fusion.joint import PER_NODE, Of
-from relpos.measurements import Motion, Prior, Range
+from relpos.measurements import Prior
 from relpos.simulation.paper import simulate_paper
 
 GOOD = {"heading_noise_deg": 0.3, "turn_noise": 0.0, "distance_noise_scale": 0.16}
@@ -162,19 +162,7 @@ def _as_arrays(
 ) -> tuple[Epochs, Sequence[Prior]]:
     """A simulated run's measurements as arrays, an epoch every 2 s, and the starts."""
     run = simulate_paper("paper-p1", seed, {"seconds": seconds, **overrides})
-    motions = [m for m in run.measurements if isinstance(m, Motion)]
-    ranges = [m for m in run.measurements if isinstance(m, Range)]
-    ends = np.arange(2.0, seconds + 1.0, 2.0)
-    return Epochs(
-        np.array([m.node - 1 for m in motions]),
-        np.array([(m.dx_m, m.dy_m, m.dtheta_rad, 1.0) for m in motions]),
-        np.searchsorted([m.time_s for m in motions], ends, side="right"),
-        np.array([m.node - 1 for m in ranges]),
-        np.array([m.peer - 1 for m in ranges]),
-        np.array([m.range_m for m in ranges]),
-        np.zeros(len(ranges)),
-        np.searchsorted([m.time_s for m in ranges], ends, side="right"),
-    ), run.priors
+    return Epochs.of(run.measurements, 2.0), run.priors
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -25,6 +25,7 @@ from relpos.fusion.slips import (
     Watch,
     doubts,
 )
+from relpos.measurements import Measurement, Motion, Range
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -63,6 +64,26 @@ class Epochs:
     range_m: Floats
     dz_m: Floats
     range_ends: Indices
+
+    @classmethod
+    def of(cls, measurements: Sequence[Measurement], epoch_s: float) -> Epochs:
+        """Motions and ranges, sorted, in epochs of ``epoch_s``; nodes 1, 2, ... in rows 0, 1, ...
+
+        Each motion lasts a second, and antennas are level, as in the simulated scenarios.
+        """
+        motions = [m for m in measurements if isinstance(m, Motion)]
+        ranges = [m for m in measurements if isinstance(m, Range)]
+        ends = np.arange(epoch_s, measurements[-1].time_s + epoch_s, epoch_s)
+        return cls(
+            np.array([m.node - 1 for m in motions]),
+            np.array([(m.dx_m, m.dy_m, m.dtheta_rad, 1.0) for m in motions]),
+            np.searchsorted([m.time_s for m in motions], ends, side="right"),
+            np.array([m.node - 1 for m in ranges]),
+            np.array([m.peer - 1 for m in ranges]),
+            np.array([m.range_m for m in ranges]),
+            np.zeros(len(ranges)),
+            np.searchsorted([m.time_s for m in ranges], ends, side="right"),
+        )
 
 
 class BankCore:

@@ -607,9 +607,7 @@ def smooth(
         if learn and turn >= len(widen_m) - 1:
             weights = weigh(problem, levels, bases, inliers, wide)
             covariance, knowledge = know(problem, state, levels, bases, weights)
-            change = learn_levels(
-                problem, state, covariance, knowledge, levels, bases, weights, inliers
-            )
+            change = learn_levels(problem, state, covariance, knowledge, levels, weights, inliers)
             moved = math.inf
             if turn >= HEAR_FROM:
                 relearn = (turn - HEAR_FROM) % HEAR_LEARNED == 0
@@ -793,7 +791,6 @@ def step_levels(
     covariance: Covariance,
     knowledge: Knowledge,
     levels: Levels,
-    bases: Floats,
     weights: Weights,
 ) -> float:
     """One Newton step of the motion levels' logarithms."""
@@ -846,7 +843,6 @@ def learn_levels(
     covariance: Covariance,
     knowledge: Knowledge,
     levels: Levels,
-    bases: Floats,
     weights: Weights,
     inliers: Floats,
 ) -> float:
@@ -859,7 +855,7 @@ def learn_levels(
     over its residuals r with posterior variances p (for the square root of the quotient, and
     with p = v - ..., Zhou et al. 2019 show ascent; the quotient itself is Foerstner's).
     """
-    change = step_levels(problem, state, covariance, knowledge, levels, bases, weights)
+    change = step_levels(problem, state, covariance, knowledge, levels, weights)
     if inliers.size:
         residual_m = problem.range_residuals(state)
         posterior_m = problem.range_variances(state, covariance)

@@ -31,7 +31,7 @@ RANGE_AGE_S = 10.0
 STALE_S = 3.0
 """Silence after which somebody is shown as stale, as after three epochs in an estimator."""
 HEALTH_S = 0.5
-NORTH_KNOWN_RAD = math.radians(15.0)
+NORTH_SHOWN_RAD = math.radians(15.0)
 """With a larger deviation one in seven would be sent to the wrong one of eight compass points."""
 NORTH_MOVES_RAD = math.radians(4.0)
 """A map that turned with every reading could not be read; less than this nobody can tell."""
@@ -235,7 +235,7 @@ class Composer:
 
 def _shown_north(shown: MagneticNorth | None, known: MagneticNorth | None) -> MagneticNorth | None:
     """Return what is to be shown of north: what is, as long as that is near enough."""
-    if known is None or known.sigma_rad > NORTH_KNOWN_RAD:
+    if known is None or known.sigma_rad > NORTH_SHOWN_RAD:
         return None
     moved_rad = math.inf
     if shown is not None:
