@@ -24,10 +24,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from relpos import fusion
-from relpos.fusion.bank import Bank
-from relpos.fusion.bank_core import BankCore, Epochs
-from relpos.fusion.bank_settings import BankSettings
-from relpos.fusion.growing import GrowingTeam
+from relpos.fusion.bank.core import BankCore, Epochs
+from relpos.fusion.bank.estimator import Bank
+from relpos.fusion.bank.settings import BankSettings
+from relpos.fusion.switching import GrowingTeam
 from relpos.simulation.paper import SimulatedRun, simulate_paper
 
 EPOCH_S = 2.0

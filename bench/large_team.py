@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from relpos.evaluation.metrics import aligned_squared_distances
 from relpos.fusion.compiled import compiled
-from relpos.fusion.neighbourhood import NeighbourhoodFilter, RangeModel
+from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter, RangeModel
 from relpos.simulation.crowd import Crowd, CrowdSettings, simulate_crowd
 
 Floats = npt.NDArray[np.float64]

@@ -14,8 +14,8 @@ class Joint:
     """The bank's core with a single hypothesis, noise told; it goes on watching and learning."""
 
     def __init__(self, case: Case, seed: int) -> None:
-        from relpos.fusion.bank_core import PER_NODE, BankCore
-        from relpos.fusion.bank_settings import BankSettings
+        from relpos.fusion.bank.core import PER_NODE, BankCore
+        from relpos.fusion.bank.settings import BankSettings
 
         alone = BankSettings(hypotheses=1, constants=0.0, outliers=0.0, biased=0.0)
         self.core, self.per = BankCore(alone, seed), PER_NODE
@@ -49,7 +49,8 @@ class JointAlone(Joint):
 
     def __init__(self, case: Case, seed: int) -> None:
         super().__init__(case, seed)
-        from relpos.fusion import joint, noise
+        from relpos.fusion.bank import joint
+        from relpos.fusion.bank import variance_components as noise
 
         self.kernels, self.base = joint, noise.motion_variances
         self.core.level[:], self.core.sigma2[:] = 1.0, self.variance
@@ -81,7 +82,7 @@ class Strips:
     """The filter for large teams: 3 states a user, noise told."""
 
     def __init__(self, case: Case, seed: int) -> None:
-        from relpos.fusion.neighbourhood import NeighbourhoodFilter, RangeModel
+        from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter, RangeModel
 
         longest = max(float(r.range_m.max()) for r in case.ranges if r is not None)
         self.filter = NeighbourhoodFilter(1.05 * longest, RangeModel(case.sigma_range_m))
@@ -109,8 +110,8 @@ class Particles:
     """The paper's filter: 3 states a particle, M particles for each user."""
 
     def __init__(self, case: Case, seed: int, size: int, alpha: float) -> None:
-        from relpos.fusion.particle import Clouds
-        from relpos.fusion.ranging_model import RangeNoise
+        from relpos.fusion.models.ranging import RangeNoise
+        from relpos.fusion.particle.estimator import Clouds
 
         noise = RangeNoise(particle_sigma(case))
         self.clouds = Clouds(size, alpha, noise, np.random.default_rng(seed))
@@ -174,8 +175,8 @@ def begin_of(case: Case) -> Floats:
 
 def smoother(case: Case, begin_m: Floats) -> Score:
     """The smoother's optimiser on the whole run, noise told, from the given poses (T + 1, N, 3)."""
-    from relpos.fusion.smoother import Problem, Weights
-    from relpos.fusion.smoother_graph import build_graph
+    from relpos.fusion.smoother.graph import build_graph
+    from relpos.fusion.smoother.problem import Problem, Weights
 
     def solve() -> tuple[Floats, float]:
         started = time.process_time()

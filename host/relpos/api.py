@@ -167,7 +167,7 @@ def _make(
     smooth: bool,
 ) -> Estimator:
     from relpos import fusion
-    from relpos.fusion import own
+    from relpos.fusion import plugins
 
     if isinstance(estimator, str):
         make = fusion.make_smoother if smooth else fusion.make
@@ -178,10 +178,10 @@ def _make(
         )
     if isinstance(estimator, type) or not hasattr(estimator, "process"):
         assert callable(estimator)
-        return own.make(name, estimator, priors, settings, seed, run.nodes)
+        return plugins.make(name, estimator, priors, settings, seed, run.nodes)
     if settings:
         raise RelposError(f"{name}: settings belong to a name or a class, not to an object")
-    return own.guard(name, estimator)
+    return plugins.guard(name, estimator)
 
 
 def _priors(run: Run, initial: str | Sequence[Prior]) -> tuple[Prior, ...]:

@@ -43,15 +43,15 @@ def figures(
     """Draw every figure of the paper's evaluation as SVG, PNG and CSV, and one page of them all."""
     from relpos.evaluation.executors import executor
     from relpos.evaluation.figures import FIGURES, Work, page, save
-    from relpos.fusion import own
+    from relpos.fusion import plugins
 
     for name in estimator or []:
-        if not own.is_own(name):
+        if not plugins.is_plugin(name):
             raise typer.BadParameter(
                 f"'{name}' is not MODULE:CLASS; ours are drawn anyway", param_hint="--estimator"
             )
         # A name that leads nowhere is told before anything is computed.
-        own.factory(name)
+        plugins.factory(name)
     wanted = list(dict.fromkeys(figure or FIGURES))
     for name in wanted:
         if name not in FIGURES:

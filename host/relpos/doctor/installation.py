@@ -63,20 +63,20 @@ def _extras() -> Iterator[Finding]:
 
 
 def _kernels(computer: Computer) -> Finding:
-    from relpos.fusion import machine_code
+    from relpos.fusion import ROOMS, kernel_cache
 
     name = "estimators"
-    folders = machine_code.folders(computer.environment("NUMBA_CACHE_DIR"))
-    if not any(computer.may_write(folder) for folder in folders):
+    folder = kernel_cache.root(computer.environment("NUMBA_CACHE_DIR"))
+    if not computer.may_write(folder):
         return wrong(
             name,
-            f"what is compiled cannot be kept ({folders[0]}): every start waits for it",
+            f"what is compiled cannot be kept ({folder}): every start waits for it",
             "name a folder that can be written: export NUMBA_CACHE_DIR=$HOME/.cache/numba",
         )
-    if not machine_code.is_kept(folders):
+    if not kernel_cache.is_complete({room for rooms in ROOMS.values() for room in rooms}, folder):
         return hint(
             name,
-            "not compiled yet: the first start takes some ten seconds longer",
+            "not compiled yet: the first start takes some twenty seconds longer",
             "relpos doctor --prepare",
         )
     return well(name, "compiled, a session starts at once")

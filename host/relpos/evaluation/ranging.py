@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.evaluation.metrics import Pair, PairTrack, Track, Tracks, interpolate
-from relpos.fusion.detection import LENGTH, STEP_M, Detection, Round
+from relpos.fusion.models.detection import LENGTH, STEP_M, Detection, Round
 from relpos.measurements import Measurement, Motion, Range
 
 Floats = npt.NDArray[np.float64]
@@ -105,7 +105,8 @@ class Heard:
     """Who was heard over which distance.
 
     ``distance_m`` and ``heard`` (n,) are attempts whose outcome counts
-    (:mod:`relpos.fusion.detection` says which) and the distance at that time: the true one where
+    (:mod:`relpos.fusion.models.detection` says which) and the distance at that time: the true one
+    where
     ``true`` says so, else the estimated one. ``curve_m`` (K,) and ``curve`` (K,) are the
     probability learned from the estimated distances, as an estimator does it on line; ``edge_m``
     with ``edge_sigma_m`` is the distance of half the near value, NaN where no edge was seen.

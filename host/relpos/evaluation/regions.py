@@ -1,7 +1,7 @@
 """Whether the alternatives of an ambiguous picture hold the truth, and how much they tell.
 
 The 90 % region of a node is the smallest that holds 90 % of what the alternatives say of it
-(:class:`relpos.fusion.ambiguity.Region`). Honest alternatives hold the truth in nine epochs of
+(:class:`relpos.fusion.modes.Region`). Honest alternatives hold the truth in nine epochs of
 ten; what they are worth is their area beside a blind guess's: 90 % of the disc round a neighbour
 whose radius is the longest range that was measured.
 """
@@ -16,8 +16,8 @@ import numpy as np
 
 from relpos.evaluation.consistency import Coverage, coverage
 from relpos.evaluation.metrics import Track
-from relpos.fusion.ambiguity import Region
 from relpos.fusion.estimator import Estimate, NodeStatus, Shape
+from relpos.fusion.modes import Region
 from relpos.measurements import Range
 
 SHARE = 0.9

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 
 from relpos.errors import RelposError
-from relpos.fusion import own
-from relpos.fusion.bank_settings import BankSettings
+from relpos.fusion import kernel_cache, plugins
+from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.deadreckoning import DeadReckoning, DeadReckoningSettings
 from relpos.fusion.estimator import (
     Alternative,
@@ -19,9 +21,8 @@ from relpos.fusion.estimator import (
     Parameter,
     Shape,
 )
-from relpos.fusion.machine_code import compile_apart
-from relpos.fusion.particle_settings import ParticleSettings
-from relpos.fusion.ranging_model import Mounting
+from relpos.fusion.models.ranging import Mounting
+from relpos.fusion.particle.settings import ParticleSettings
 from relpos.fusion.settings import SettingInfo, describe, parse
 from relpos.measurements import Heading, Height, Motion, Prior, Range
 
@@ -31,6 +32,9 @@ SETTINGS: Mapping[str, type] = {
     "deadreckoning": DeadReckoningSettings,
 }
 """Estimator name -> its settings."""
+
+ROOMS: Mapping[str, tuple[str, ...]] = {"bank": ("bank",), "particle": ("particle",)}
+"""Estimator name -> the rooms whose kernels it calls."""
 
 
 def make(
@@ -44,34 +48,35 @@ def make(
 
     Nodes without a prior start unknown. ``nodes`` tells how each is worn (``run.nodes``): the
     bank uses heights and antenna offsets, the other two are as the paper has them. Estimators of
-    others go by ``module:Class`` or by a registered name (:mod:`relpos.fusion.own`). RelposError
+    others go by ``module:Class`` or by a registered name (:mod:`relpos.fusion.plugins`).
+    RelposError
     for an unknown name or key and for a value that is out of range.
     """
     given = settings or {}
     match str(name):
         case "bank":
             # Kernels are only loaded where they are used: help texts stay quick.
-            from relpos.fusion.growing import GrowingTeam
+            from relpos.fusion.switching import GrowingTeam
 
             return GrowingTeam(priors, parse(BankSettings, given, "bank"), seed, nodes or {})
         case "particle":
-            from relpos.fusion.particle import ParticleFilter
+            from relpos.fusion.particle.estimator import ParticleFilter
 
             return ParticleFilter(priors, parse(ParticleSettings, given, "particle"), seed)
         case "deadreckoning":
             return DeadReckoning(priors, parse(DeadReckoningSettings, given, "deadreckoning"), seed)
     check_name(name)
-    return own.make(name, own.factory(name), priors, given, seed, nodes)
+    return plugins.make(name, plugins.factory(name), priors, given, seed, nodes)
 
 
 def names() -> tuple[str, ...]:
     """Return the names of all estimators: ours, then what installed packages register."""
-    return *SETTINGS, *sorted(set(own.registered()) - set(SETTINGS))
+    return *SETTINGS, *sorted(set(plugins.registered()) - set(SETTINGS))
 
 
 def check_name(name: str) -> None:
     """Raise RelposError where a name can be no estimator's."""
-    if name not in SETTINGS and not own.is_own(name):
+    if name not in SETTINGS and not plugins.is_plugin(name):
         raise RelposError(
             f"unknown estimator '{name}': one of {', '.join(names())}, or MODULE:CLASS"
         )
@@ -95,7 +100,7 @@ def make_smoother(
     It gives all its estimates at the end. An estimator whose estimates depend on the seed is run
     ``SMOOTHER_ATTEMPTS`` times, so that one wrong turn of it does not decide.
     """
-    from relpos.fusion.smoothing import Smoother
+    from relpos.fusion.smoother.estimator import Smoother
 
     attempts = 1 if name == "deadreckoning" else SMOOTHER_ATTEMPTS
     # The others' dice are far from what a user would choose as the next seed.
@@ -118,22 +123,39 @@ def make_smoother(
 SMOOTHER_ATTEMPTS = 4
 
 
+def is_compiled(name: str) -> bool:
+    """Whether every kernel of an estimator is in the cache; True of estimators not ours."""
+    return kernel_cache.is_complete(ROOMS.get(name, ()))
+
+
 def warm_up(name: str) -> None:
-    """Make everything compiled ready.
+    """Load an estimator's kernels; compile them where they are not in the cache.
 
-    The very first time after an installation this takes some ten seconds, in other processes
-    (:mod:`relpos.fusion.machine_code` says why); from then on the machine code is read from disk.
-    What an estimator of somebody else's needs is its own affair.
+    Compiling takes some twenty seconds once after an installation: each room is compiled by a
+    process of its own, side by side. Estimators that are not ours are left alone.
     """
-    if name in SETTINGS:
-        compile_apart((name,))
-        rehearse(name)
+    rooms = [room for room in ROOMS.get(name, ()) if not kernel_cache.is_complete([room])]
+    compilers = [
+        subprocess.Popen(
+            [sys.executable, "-c", f"from {__name__} import rehearse; rehearse({room!r})"]
+        )
+        for room in rooms
+    ]
+    ended = [process.wait() for process in compilers]
+    if not any(ended):
+        for room in rooms:
+            kernel_cache.mark_complete(room)
+    for room in ROOMS.get(name, ()):
+        rehearse(room)
 
 
-def rehearse(name: str) -> None:
-    """Call every kernel once, on a made-up team of three, one of them unknown."""
+def rehearse(room: str) -> None:
+    """Call every kernel of a room once, with a made-up team of three."""
     team = {1: (0.0, 0.0), 2: (6.0, 0.0), 3: (2.0, 5.0)}
-    estimator = make(name, [Prior(node, *team[node], 0.0, 0.1, 0.1) for node in (1, 2)])
+    name = "particle" if room == "particle" else "bank"
+    # With one of three unknown the search joins in.
+    known = (1, 2, 3) if room == "particle" else (1, 2)
+    estimator = make(name, [Prior(node, *team[node], 0.0, 0.1, 0.1) for node in known])
     for k in range(1, WARM_UP_S):
         for node in team:
             turn = 0.3 * (node - 2)
@@ -170,6 +192,7 @@ __all__ = [
     "Shape",
     "check_name",
     "check_settings",
+    "is_compiled",
     "make",
     "make_smoother",
     "names",

@@ -14,7 +14,7 @@ from collections import deque
 from dataclasses import dataclass, field, replace
 
 from relpos.fusion.estimator import ANY_ANGLE_RAD, Estimate, NodeEstimate, PairEstimate
-from relpos.fusion.motion_model import MotionNoise
+from relpos.fusion.models.motion import MotionNoise
 from relpos.fusion.timeline import Advance, Displacement
 from relpos.measurements import Motion
 

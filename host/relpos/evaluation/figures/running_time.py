@@ -35,9 +35,9 @@ def instants(run: SimulatedRun) -> Iterator[tuple[list[Motion], list[Range]]]:
 
 def through_arrays(run: SimulatedRun, particles: int, alpha: float) -> list[float]:
     """Seconds of every epoch whose measurements come as arrays (``Clouds``)."""
-    from relpos.fusion.motion_model import MotionNoise
-    from relpos.fusion.particle import Clouds
-    from relpos.fusion.ranging_model import RangeNoise
+    from relpos.fusion.models.motion import MotionNoise
+    from relpos.fusion.models.ranging import RangeNoise
+    from relpos.fusion.particle.estimator import Clouds
     from relpos.fusion.timeline import Advance
 
     users = len(run.priors)

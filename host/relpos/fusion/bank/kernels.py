@@ -1,0 +1,565 @@
+"""Kernels of what the bank does beside moving and ranging its hypotheses.
+
+Weights, levels of noise and what the innovations of an instant say of the sensors: little work on
+many small arrays, most of which would be Python's. Twins: :mod:`reference.bank`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.bank import hypothesis_count as hypotheses
+from relpos.fusion.bank import lanes
+from relpos.fusion.bank import variance_components as noise
+from relpos.fusion.bank.joint import MEAN, PER_NODE, STATS, TRUST, VARIANCE, advance, update
+from relpos.fusion.bank.lanes import LANES, fill, load, store
+from relpos.fusion.compiled import compiled, inlined
+from relpos.fusion.estimator import ANY_ANGLE_RAD
+from relpos.fusion.models import odometry_faults as slips
+from relpos.fusion.models.detection import FAILS, LENGTH, STEP_M, TRUSTED_M
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+_POSE = 3
+
+CROSS = 0.04
+"""Variance across the way relative to along it: steps err in length, turns err apart from that."""
+
+LEAST_TURN_RAD, TURN_STANDS_OUT = 0.05, 3.5
+"""A change of heading is a turn beyond both: so much, and so many deviations of white noise."""
+MISJUDGED, MISJUDGED_RAD = 0.1, 1.0
+"""Share of hypotheses that misjudge a turn, and by how much. In P1 one right angle in some hundred
+is reported as less than 20 degrees, and cost 0.5 m for a minute: seeds 1000 to 1009 0.206 m
+without, 0.214 with a share of 0.05, 0.195 with 0.1 (worst 0.27, 0.38, 0.24); seeds 500 to 515,
+where it does not happen, 0.192 and 0.195."""
+
+STRAIGHT_S = 10.0
+"""After going straight for so long. Without it, robots that turn every second (exp3, exp4 of
+`two_robots_vio`) lost 0.08 and 0.10 m of 0.15."""
+
+DOUBTERS = 20.0
+"""Log likelihood that is taken from those who doubt where they do not count."""
+
+DOUBTED = 1e-3
+"""Weight of those who have just jumped in what was expected of a range: to them any is usual."""
+
+
+BELIEVED = 0.7
+"""Of ranges and silences, this share of the log evidence weighs the hypotheses. All of it is right
+where the noise is known; noise that was learned is wrong for all ranges of a user alike, and they
+then agree on a wrong mode (paper-h, seeds 5000 to 5011: 0.97 m and NEES 1.9 with all, 0.75 m and
+1.0 with this; paper-h2, 7000 to 7031: 1.59 m and worst 4.8, 1.50 m and worst 2.6)."""
+
+
+OUTLIERS_EXPECTED = 3.0
+"""How far outliers are expected to be off beforehand is worth so many of them."""
+
+SURPRISE, SURPRISE_OF_OUTLIERS = 0.15, 2.2
+"""A user surprises from this share of odd ranges on, or so many times the share of outliers: where
+those are common, it takes more of them to doubt a user."""
+
+
+@compiled
+def within(first: Indices, second: Indices, nodes: int) -> bool:
+    """Tell whether all rows are those of users: kernels look at no bounds."""
+    least, most = 0, 0
+    for r in range(first.shape[0]):
+        least = min(least, first[r], second[r])
+        most = max(most, first[r], second[r])
+    return least >= 0 and most < nodes
+
+
+@compiled
+def expect_outliers(counts: Floats, outlier: Floats) -> float:
+    """Say what share of the ranges are outliers, as far as is known; it and variance go in.
+
+    ``counts`` are as in ``digest``; ``outlier`` (5,) is what ``joint.update`` takes, then the
+    variance (m^2) that is expected beforehand.
+    """
+    prior = outlier[4]
+    learned = (counts[2] + OUTLIERS_EXPECTED * prior) / (counts[0] + OUTLIERS_EXPECTED)
+    outlier[0] = min(max(counts[0] / (counts[0] + counts[1]), 0.005), 0.5)
+    outlier[1] = min(max(learned, prior / 9.0), 9.0 * prior)
+    return float(outlier[0])
+
+
+@compiled
+def surprises(surprise: Floats, counts: Floats, outlier: Floats) -> bool:
+    """Tell whether any user's share of odd ranges ``surprise`` (N,) is out of the usual."""
+    usual = max(SURPRISE, SURPRISE_OF_OUTLIERS * expect_outliers(counts, outlier))
+    most = 0.0
+    for much in surprise:
+        most = max(most, much)
+    return most > usual
+
+
+@compiled
+def normalise(log_weight: Floats, count: int, weight: Floats) -> float:
+    """Give weights (B, LANES) that sum to 1 over the first ``count``, and 0 beyond them.
+
+    The log weights are shifted so that their greatest is 0. Returns the effective size.
+    """
+    logs, weights = log_weight.reshape(-1), weight.reshape(-1)
+    most = -np.inf
+    for k in range(count):
+        most = max(most, logs[k])
+    for k in range(logs.shape[0]):
+        logs[k] -= most
+    for b in range(weight.shape[0]):
+        store(weight, b, lanes.exp(load(log_weight, b)))
+    for k in range(count, weights.shape[0]):
+        weights[k] = 0.0
+    total, squares = 0.0, 0.0
+    for k in range(count):
+        total += weights[k]
+    for k in range(count):
+        weights[k] /= total
+        squares += weights[k] * weights[k]
+    return 1.0 / squares
+
+
+@compiled
+def undoubted_weights(log_weight: Floats, doubtful: Floats, weight: Floats) -> None:
+    """As ``normalise``, with next to nothing for those who doubt (``doubtful`` (K,) above 0)."""
+    count = doubtful.shape[0]
+    logs = log_weight.copy()
+    flat = logs.reshape(-1)
+    for k in range(count):
+        if doubtful[k] > 0.0:
+            flat[k] -= DOUBTERS
+    normalise(logs, count, weight)
+
+
+@compiled
+def is_decided(
+    log_weight: Floats, doubtful: Floats, has_constants: Floats, has_bias: Floats, weight: Floats
+) -> bool:
+    """Tell whether no few hypotheses count and all model the same; brings weights up to date."""
+    count = doubtful.shape[0]
+    if normalise(log_weight, count, weight) < hypotheses.EVEN * count:
+        return False
+    flat = weight.reshape(-1)
+    doubting, constants, biased = 0.0, 0.0, 0.0
+    for k in range(count):
+        doubting += flat[k] if doubtful[k] > 0.0 else 0.0
+        constants += flat[k] * has_constants[k]
+        biased += flat[k] * has_bias[k]
+    least = max(min(constants, 1.0 - constants), min(biased, 1.0 - biased))
+    return doubting <= hypotheses.DOUBTED and least <= hypotheses.UNDECIDED
+
+
+@compiled
+def is_even(
+    p: Floats, weight: Floats, covariance: Floats, of: Indices, places: int, drawn: float
+) -> bool:
+    """Tell whether the hypotheses, by ``weight`` (B, LANES), are one cloud.
+
+    That is where the variances between them, the rest of the mixture's ``covariance`` (D, D), are
+    what ``drawn``, the drawn over the kept share of the noise, accounts for.
+    """
+    for i in range(places):
+        sums = fill(0.0)
+        for b in range(p.shape[0]):
+            at = b * p.shape[1] + (i * (i + 1)) // 2 + i
+            sums = sums + load(weight, b) * load(p, at)
+        within = lanes.total(sums)
+        between = covariance[of[i], of[i]] - within
+        if between > hypotheses.APART * drawn * within + 1e-6:
+            return False
+    return True
+
+
+@compiled
+def step_bend(
+    x: Floats, p: Floats, log_weight: Floats, doubtful: Floats, has_constants: Floats,
+    has_bias: Floats, levels: Floats, nodes: int, weight: Floats, undoubted: Floats,
+) -> float:  # fmt: skip
+    """Give the bend of everybody's next metre (``hypothesis_count``); inf where open.
+
+    That is where few hypotheses count, or they model different things. ``weight`` and
+    ``undoubted`` (B, LANES) receive the weights, and those of who does not doubt.
+    """
+    undoubted_weights(log_weight, doubtful, undoubted)
+    if not is_decided(log_weight, doubtful, has_constants, has_bias, weight):
+        return np.inf
+    heading = heading_variances(x, p, undoubted, nodes)
+    worst = 0.0
+    for n in range(nodes):
+        metre = math.sqrt(noise.ALONG_M2_M) * math.exp(0.5 * levels[noise.LEVELS * n + noise.ALONG])
+        worst = max(worst, 0.5 * heading[n] / metre)
+    return worst
+
+
+@compiled
+def spread_levels(
+    draw: Floats, steady: Floats, mean: Floats, covariance: Floats, spread: float, level: Floats,
+    sigma2: Floats,
+) -> None:  # fmt: skip
+    """Give every hypothesis its draw ``draw`` (B, L, LANES) of what is known of log levels (L,).
+
+    Where ``steady`` (B, LANES) is 1 they are lower by ``noise.STEADIER``. ``level``
+    (B, N, 3, LANES) and ``sigma2`` (B, LANES) receive them.
+    """
+    blocks, several = draw.shape[0], draw.shape[1]
+    for c in range(several):
+        sd = min(spread * math.sqrt(covariance[c, c]), noise.SPREAD_MOST)
+        lower = noise.STEADIER[c % noise.LEVELS] if c < several - 1 else 0.0
+        for b in range(blocks):
+            drawn = sd * load(draw, b * several + c) - lower * load(steady, b)
+            value = lanes.exp(mean[c] + drawn)
+            if c == several - 1:
+                store(sigma2, b, value)
+            else:
+                store(level, b * (several - 1) + c, value)
+
+
+@compiled
+def prepare_motion(
+    rows: Indices,
+    moves: Floats,
+    told: Floats,
+    level: Floats,
+    count: int,
+    since_turn_s: Floats,
+    motion: Floats,
+    misjudged: Floats,
+) -> bool:
+    """Write what ``joint.advance`` takes of displacements (M, 4) into ``motion`` (M, 7).
+
+    ``told`` (M, 3), or (0, 3) where no report brings any, are the pieces' own standard deviations.
+    ``misjudged`` (M,) receives the share of hypotheses that are to misjudge a turn, -1 where there
+    is none; returns whether there are any.
+
+    A turn's noise grows with the turn, of which only the report is known: one of a right
+    angle that was reported as next to nothing would pass for exact. Only what sticks out of
+    the wearer's white heading noise is a turn, and only reports that bring no sigma need it;
+    who turns all the time is judged by the next turn, and is left alone.
+    """
+    anybody = False
+    base = noise.motion_variances(moves, told)
+    for m in range(rows.shape[0]):
+        for part in range(4):
+            motion[m, part] = moves[m, part]
+        for part in range(noise.LEVELS):
+            motion[m, 4 + part] = base[m, part]
+        # Who reports nothing at all stands: no time passes for the heading.
+        if motion[m, 0] == 0.0 and motion[m, 1] == 0.0 and motion[m, 2] == 0.0:
+            motion[m, 3] = 0.0
+        row = rows[m]
+        misjudged[m] = -1.0
+        if count < 2:
+            continue
+        mean = 0.0
+        if motion[m, 2] != 0.0:
+            for k in range(count):
+                mean += level[k // LANES, row, noise.WHITE, k % LANES]
+        white = motion[m, 6] * mean / count
+        turn = motion[m, 2] ** 2 > LEAST_TURN_RAD**2 + TURN_STANDS_OUT**2 * white
+        if turn and (told.shape[0] == 0 or math.isnan(told[m, 2])):
+            misjudged[m] = MISJUDGED * min(since_turn_s[row] / STRAIGHT_S, 1.0) ** 2
+            since_turn_s[row] = 0.0
+            anybody = True
+        else:
+            since_turn_s[row] += motion[m, 3]
+    return anybody
+
+
+@inlined
+def digest(
+    stats: Floats,
+    before: Floats,
+    log_weight: Floats,
+    doubtful: Floats,
+    first: Indices,
+    second: Indices,
+    measured: Floats,
+    worth: Floats,
+    levels: Floats,
+    covariance: Floats,
+    outlier_counts: Floats,
+    surprise: Floats,
+    sums: Floats,
+    base: Floats,
+    outlier_share: float,
+    wary: bool,
+    good: Floats,
+) -> tuple[int, int]:
+    """Learn from the innovations of an instant's ranges (R,) what they say of the sensors.
+
+    ``stats`` (R, STATS, >= K) are of ``joint.update``, ``before`` (K,) the log weights from
+    before it. ``good`` (R,) receives each range's probability to be no outlier. ``outlier_counts``
+    are of outliers, of others, and the sum of the outliers' squares (m^2). Returns the row that
+    has slipped, or -1, and how many levels had to be clamped.
+    """
+    count, ranges = before.shape[0], first.shape[0]
+    prior = np.empty(count)
+    most, total = -np.inf, 0.0
+    for k in range(count):
+        most = max(most, before[k])
+    for k in range(count):
+        prior[k] = math.exp(before[k] - most) * (DOUBTED if doubtful[k] > 0.0 else 1.0)
+        total += prior[k]
+    for k in range(count):
+        prior[k] /= total
+    square, excess = np.empty(ranges), np.empty(ranges)
+    for r in range(ranges):
+        mean, variance = stats[r, MEAN], stats[r, VARIANCE]
+        middle = 0.0
+        for k in range(count):
+            middle += prior[k] * mean[k]
+        spread = 0.0
+        for k in range(count):
+            off = mean[k] - middle
+            spread += prior[k] * (variance[k] + off * off)
+        off = measured[r] - middle
+        square[r] = off * off / spread
+        excess[r] = max(off * off - spread, 0.0)
+    slipped = slips.look(sums, base, first, second, square, worth, outlier_share, wary)
+    weight = np.empty_like(log_weight)
+    normalise(log_weight, count, weight)
+    weights = weight.reshape(-1)
+    for r in range(ranges):
+        trust = stats[r, TRUST]
+        good[r] = 0.0
+        for k in range(count):
+            good[r] += weights[k] * trust[k]
+    quiet = np.empty(count)
+    for k in range(count):
+        quiet[k] = 1.0 if doubtful[k] <= 0.0 else 0.0
+        doubtful[k] -= 1.0
+    clamped = noise.learn(levels, covariance, first, second, measured, stats, before, quiet, worth)
+    fade = 0.998**ranges
+    outlier_counts[0] *= fade
+    outlier_counts[1] *= fade
+    for r in range(ranges):
+        outlier_counts[0] += 1.0 - good[r]
+        outlier_counts[1] += good[r]
+        outlier_counts[2] += (1.0 - good[r]) * excess[r]
+        for row in (first[r], second[r]):
+            surprise[row] += 0.2 * (1.0 - good[r] - surprise[row])
+    return slipped, clamped
+
+
+@compiled
+def heading_variances(x: Floats, p: Floats, weight: Floats, nodes: int) -> Floats:
+    """Give the variances (N,) of headings in the mixture, by ``weight`` (B, LANES)."""
+    blocks, size = x.shape[0], x.shape[1]
+    turn = 2.0 * math.pi
+    given = np.empty(nodes)
+    for n in range(nodes):
+        h = 3 * n + 2
+        own = (h * (h + 1)) // 2 + h
+        about = x[0, h, 0]
+        middle = fill(0.0)
+        for b in range(blocks):
+            off = load(x, b * size + h) - about
+            off = off - turn * lanes.floor(off * (1.0 / turn) + 0.5)
+            middle = middle + load(weight, b) * off
+        mean = lanes.total(middle)
+        spread = fill(0.0)
+        for b in range(blocks):
+            off = load(x, b * size + h) - about
+            off = off - turn * lanes.floor(off * (1.0 / turn) + 0.5) - mean
+            spread = spread + load(weight, b) * (load(p, b * p.shape[1] + own) + off * off)
+        given[n] = lanes.total(spread)
+    return given
+
+
+@compiled
+def temper(log_weight: Floats, before: Floats) -> None:
+    """Let what the log weights (B, LANES) have gained since ``before`` (K,) count ``BELIEVED``."""
+    weights = log_weight.reshape(-1)
+    for k in range(before.shape[0]):
+        weights[k] = before[k] + BELIEVED * (weights[k] - before[k])
+
+
+@compiled
+def take_ranges(
+    x: Floats, p: Floats, log_weight: Floats, sigma2: Floats, sens: Floats, first: Indices,
+    second: Indices, bias: Indices, measured: Floats, dz: Floats, outlier: Floats, worth: Floats,
+    dz_variance: Floats, arms: Floats, doubtful: Floats, levels: Floats, covariance: Floats,
+    outlier_counts: Floats, surprise: Floats, sums: Floats, base: Floats, wary: bool, draw: Floats,
+    steady: Floats, spread: float, level: Floats, good: Floats,
+) -> tuple[int, int]:  # fmt: skip
+    """Do all that an instant's ranges ask for: ``joint.update``, ``digest``, ``spread_levels``."""
+    count, ranges = doubtful.shape[0], first.shape[0]
+    lines = lanes.working_lines(ranges * STATS * x.shape[0])
+    before = log_weight.reshape(-1)[:count].copy()
+    expect_outliers(outlier_counts, outlier)
+    update(
+        x, p, log_weight, sigma2, sens, first, second, bias, measured, dz, outlier, worth,
+        dz_variance, arms, lines,
+    )  # fmt: skip
+    slipped, clamped = digest(
+        lines.reshape(ranges, STATS, -1), before, log_weight, doubtful, first, second, measured,
+        worth, levels, covariance, outlier_counts, surprise, sums, base, outlier[0], wary, good,
+    )  # fmt: skip
+    temper(log_weight, before)
+    spread_levels(draw, steady, levels, covariance, spread, level, sigma2)
+    return slipped, clamped
+
+
+@compiled
+def pairs(mean: Floats, covariance: Floats, rows: Indices) -> Floats:
+    """Give (P, 4) of every two of the users ``rows`` (N,), by the mixture's moments (D,), (D, D).
+
+    Distance and its standard deviation (m), bearing and its (rad), to first order; of two on one
+    spot no direction is along the line of sight, and any bearing is as likely.
+    """
+    several = rows.shape[0]
+    told = np.empty((several * (several - 1) // 2, 4))
+    n = 0
+    for a in range(several):
+        i = PER_NODE * rows[a]
+        for b in range(a + 1, several):
+            j = PER_NODE * rows[b]
+            east, north = mean[j] - mean[i], mean[j + 1] - mean[i + 1]
+            xx = covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j]
+            yy = covariance[i + 1, i + 1] + covariance[j + 1, j + 1]
+            yy -= 2.0 * covariance[i + 1, j + 1]
+            xy = covariance[i, i + 1] + covariance[j, j + 1]
+            xy -= covariance[i, j + 1] + covariance[i + 1, j]
+            square = east * east + north * north
+            along, sideways = 0.5 * (xx + yy), ANY_ANGLE_RAD
+            if square > 0.0:
+                along = east * east * xx + 2.0 * east * north * xy + north * north * yy
+                along /= square
+                sideways = min(math.sqrt(max(xx + yy - along, 0.0) / square), ANY_ANGLE_RAD)
+            told[n, 0], told[n, 1] = math.sqrt(square), math.sqrt(max(along, 0.0))
+            told[n, 2], told[n, 3] = math.atan2(north, east), sideways
+            n += 1
+    return told
+
+
+@compiled
+def teach(
+    first: Indices, second: Indices, heard: int, witnessed: Floats, distance_m: Floats,
+    sigma_m: Floats, curve: Floats, working: Floats, surprise: Floats, counts: Floats,
+    sums: Floats,
+) -> Floats:  # fmt: skip
+    """See :class:`relpos.fusion.models.detection.Teach`."""
+    several, slots = first.shape[0], working.shape[0]
+    chance, tried = np.empty(several), np.empty(several - heard)
+    busy = np.zeros(slots, dtype=np.bool_)
+    silence = np.full(slots, -1.0)
+    root = math.sqrt(3.0)
+    for u in range(several):
+        # Three-point Gauss-Hermite rule over the distance's error; one mass of its shares is 1.
+        chance[u] = 0.0
+        for q in range(3):
+            place = (distance_m[u] + (q - 1) * root * sigma_m[u]) / STEP_M
+            place = min(max(place, 0.0), LENGTH - 1.0)
+            index = min(int(place), LENGTH - 2)
+            here = curve[index] + (place - index) * (curve[index + 1] - curve[index])
+            chance[u] += here * (4.0 if q == 1 else 1.0) / 6.0
+        if u < heard:
+            busy[first[u]] = busy[second[u]] = True
+            continue
+        for slot in (first[u], second[u]):
+            if not busy[slot]:
+                silence[slot] = abs(silence[slot]) * (1.0 - chance[u])
+    for slot in range(slots):
+        if busy[slot]:
+            working[slot] = 1.0
+        elif silence[slot] >= 0.0:
+            up = working[slot] * (1.0 - FAILS)
+            working[slot] = up * silence[slot] / (up * silence[slot] + 1.0 - up)
+    for u in range(several):
+        a, b = first[u], second[u]
+        weight = 1.0 / (1.0 + (sigma_m[u] / TRUSTED_M) ** 2)
+        now = -chance[u]
+        outcome = 0
+        if u < heard:
+            weight *= witnessed[u]
+            now += 1.0
+            outcome = 1
+        else:
+            tried[u - heard] = working[a] * working[b]
+            weight *= tried[u - heard]
+        before = surprise[a, b]
+        if not math.isnan(before):
+            sums[0] += weight * before * now
+            sums[1] += weight * 0.5 * (before * before + now * now)
+        surprise[a, b] = now
+        for q in range(3):
+            place = (distance_m[u] + (q - 1) * root * sigma_m[u]) / STEP_M
+            place = min(max(place, 0.0), LENGTH - 1.001)
+            index = int(place)
+            share = weight * (4.0 if q == 1 else 1.0) / 6.0
+            counts[outcome, index] += share * (1.0 - (place - index))
+            counts[outcome, index + 1] += share * (place - index)
+        sums[2] += weight
+    return tried
+
+
+@compiled
+def follow(
+    x: Floats, p: Floats, log_weight: Floats, sigma2: Floats, sens: Floats, outlier: Floats,
+    arms: Floats, doubtful: Floats, levels: Floats, covariance: Floats, outlier_counts: Floats,
+    surprise: Floats, sums: Floats, base: Floats, draw: Floats, steady: Floats, level: Floats,
+    since_turn_s: Floats, rows: Indices, moves: Floats, move_ends: Indices, first: Indices,
+    second: Indices, bias: Indices, measured: Floats, dz: Floats, worth: Floats,
+    range_ends: Indices, begin: int, wary_for: int, spread: float, alone: bool,
+    news: Indices,
+) -> int:  # fmt: skip
+    """Follow a team with one hypothesis over epochs ``begin`` to the last, or to one that is open.
+
+    An epoch is its displacements (up to ``move_ends`` (E,) of them), its ranges (up to
+    ``range_ends`` (E,)), and the question whether one hypothesis is still enough; it is always
+    where there is one ``alone``. Returns the first epoch that was not begun. ``news`` (4,)
+    receives whether the last one has to be settled, the row that has slipped in it or -1, how many
+    levels were clamped, and for how many instants the picture has been unambiguous (given: for
+    how many before). For the first ``wary_for`` instants be wary of slips.
+    """
+    nodes, size = sens.shape[1], x.shape[1]
+    nothing, weight = np.empty((0, 3)), np.empty_like(log_weight)
+    good = np.empty(first.shape[0])
+    variance = np.zeros(first.shape[0])
+    mean, whole = np.zeros(size), np.zeros((size, size))
+    metre = np.empty(nodes)
+    news[0], news[1], news[2] = 0, -1, 0
+    for e in range(begin, move_ends.shape[0]):
+        m, m_end = (0 if e == 0 else move_ends[e - 1]), move_ends[e]
+        r, r_end = (0 if e == 0 else range_ends[e - 1]), range_ends[e]
+        if m_end > m:
+            motion, misjudged = np.empty((m_end - m, 7)), np.empty(m_end - m)
+            prepare_motion(
+                rows[m:m_end], moves[m:m_end], nothing, level, 1, since_turn_s, motion, misjudged
+            )
+            drawn = np.zeros((1, m_end - m))
+            advance(x, p, level, sens, rows[m:m_end], motion, drawn, 0.0, CROSS)
+        slipped = -1
+        if r_end > r:
+            slipped, clamped = take_ranges(
+                x, p, log_weight, sigma2, sens, first[r:r_end], second[r:r_end], bias[r:r_end],
+                measured[r:r_end], dz[r:r_end], outlier, worth[r:r_end], variance[r:r_end], arms,
+                doubtful, levels, covariance, outlier_counts, surprise, sums, base,
+                e - begin < wary_for, draw, steady, spread, level, good[r:r_end],
+            )  # fmt: skip
+            news[2] += clamped
+        if not alone:
+            odd = slipped >= 0 or surprises(surprise, outlier_counts, outlier)
+            if not odd:
+                # The mixture's moments are those of the one.
+                for i in range(_POSE * nodes):
+                    a = PER_NODE * (i // _POSE) + i % _POSE
+                    mean[a] = x[0, i, 0]
+                    for j in range(i + 1):
+                        b = PER_NODE * (j // _POSE) + j % _POSE
+                        whole[a, b] = whole[b, a] = p[0, (i * (i + 1)) // 2 + j, 0]
+                for n in range(nodes):
+                    metre[n] = math.sqrt(noise.ALONG_M2_M) * math.exp(
+                        0.5 * levels[noise.LEVELS * n + noise.ALONG]
+                    )
+                bend = hypotheses.bend(mean, whole, math.exp(0.5 * levels[-1]), metre)
+                odd = bend > hypotheses.BENT
+                news[3] = news[3] + 1 if bend <= hypotheses.FLAT else 0
+            if odd:
+                news[0], news[1] = 1, slipped
+                return e + 1
+        normalise(log_weight, 1, weight)
+    return int(move_ends.shape[0])

@@ -1,0 +1,266 @@
+"""Unknown starts: find where everybody is when nobody has told.
+
+:class:`Starts` keeps everybody who is not located; those whom a range ties to somebody known are
+sought by a :class:`~relpos.fusion.initialisation.search.Search`, and handed over when it agrees on
+them.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.initialisation.kernels import POSE
+from relpos.fusion.initialisation.search import STOOD_M, Mixture, Search, SearchSettings
+from relpos.fusion.modes import leader
+from relpos.fusion.timeline import Advance
+from relpos.measurements import Range
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class _Wanderer:
+    """A node that nobody has placed yet: what it has travelled since it was met."""
+
+    mean: Floats
+    sigma: Floats
+    travelled_m: float = 0.0
+    turned_rad: float = 0.0
+    turn_variance: float = 0.0
+
+    def move(self, step: Advance) -> None:
+        """Compose a displacement; a heading of which nothing is known leaves only its length."""
+        c, s = math.cos(self.mean[2]), math.sin(self.mean[2])
+        if math.isinf(self.sigma[2]) and math.isfinite(self.sigma[0]):
+            c, s = 0.0, 0.0  # which way, nobody knows: the spread says how far
+        self.mean += (c * step.dx_m - s * step.dy_m, s * step.dx_m + c * step.dy_m, step.dtheta_rad)
+        length = math.hypot(step.dx_m, step.dy_m)
+        self.travelled_m += length
+        self.turned_rad += abs(step.dtheta_rad)
+
+    def spread(self) -> Floats:
+        """Standard deviations (3,) of the pose now."""
+        heading = math.hypot(self.sigma[2], 0.1 * self.turned_rad, 0.01 * self.travelled_m)
+        lost = min(heading, 1.0) * self.travelled_m
+        place = math.hypot(self.sigma[0], lost, 0.05 * self.travelled_m)
+        return np.array([place, place, heading])
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Nodes whose start has been found, at an epoch: give them to the joint filter.
+
+    With ``frame`` the first of them is the node that defines the frame, and nobody else is known.
+    """
+
+    mixture: Mixture
+    frame: bool
+
+
+@dataclass(slots=True)
+class Starts:
+    """Everybody who is not located, until he is.
+
+    ``meet`` a node, tell of all ``advance`` and ``ranging``; ``epoch`` returns who was found. A
+    node is taken into the search when a range ties it to somebody known; where nobody is known,
+    the frame becomes the start of one node of the first ranges (one that has moved, if any: only
+    with it do the others' bearings come out).
+    """
+
+    settings: SearchSettings = field(default_factory=SearchSettings)
+    seed: int = 0
+    counters: Counter[str] = field(default_factory=Counter)
+    search: Search = field(init=False)
+    _wanderers: dict[int, _Wanderer] = field(default_factory=dict)
+    _agreed: Counter[int] = field(default_factory=Counter)
+    _framed: bool = False
+    settled: set[int] = field(default_factory=set)
+    _standing: set[int] = field(default_factory=set)
+    _quiet_since_s: float = -math.inf
+    _shared: bool = False
+    """Whether ``search``, in which nobody is, may be a snapshot's, too."""
+
+    def __post_init__(self) -> None:
+        self.search = Search(self.settings, self.seed, self.counters)
+
+    def __contains__(self, node: int) -> bool:
+        return node in self._wanderers or node in self.search.nodes
+
+    def __bool__(self) -> bool:
+        return bool(self._wanderers or self.search.nodes)
+
+    @property
+    def nodes(self) -> list[int]:
+        """Everybody who is not located."""
+        return sorted([*self._wanderers, *self.search.nodes])
+
+    def meet(
+        self, node: int, mean: Sequence[float] = (0.0, 0.0, 0.0),
+        sigma: Sequence[float] = (math.inf, math.inf, math.inf),
+    ) -> None:  # fmt: skip
+        """Take a node up, with what is known of its pose (``sigma`` inf: nothing)."""
+        self._part()
+        self._wanderers[node] = _Wanderer(np.array(mean, float), np.array(sigma, float))
+        if math.isfinite(sigma[0]):
+            self._framed = True
+
+    def forget(self, node: int) -> None:
+        """Seek a node no more."""
+        self._wanderers.pop(node, None)
+        if node in self.search.nodes:
+            self.search.release([node])
+
+    def advance(self, step: Advance, *, odd: bool = False) -> None:
+        """Move a node, if it is one of these; an ``odd`` displacement counts as its turn alone."""
+        self._part()
+        wanderer = self._wanderers.get(step.node)
+        free = len(self.search.nodes) < MOST_SOUGHT
+        if wanderer is not None and free and math.isfinite(wanderer.sigma[0]):
+            # Its place is known: where it goes from there counts from now on.
+            began_s = step.time_s - step.duration_s
+            del self._wanderers[step.node]
+            self.search.add(step.node, began_s, wanderer.mean, wanderer.spread())
+            wanderer = None
+        if wanderer is not None:
+            wanderer.move(step)
+        else:
+            self.search.advance(step, odd=odd)
+
+    def ranging(
+        self,
+        time_s: float,
+        ranges: Sequence[Range],
+        located: Mapping[int, tuple[float, float, float]],
+        heights: Mapping[int, float] | None = None,
+    ) -> None:
+        """Take all ranges of an instant; ``located`` as for :meth:`Search.ranging`."""
+        self._part()
+        self._framed |= bool(located)
+        if not self._framed and ranges:
+            self._choose_frame(time_s, ranges)
+        while len(self.search.nodes) < MOST_SOUGHT:
+            known = {*located, *self.search.nodes}
+            tied = sorted(
+                node
+                for r in ranges
+                for node, other in ((r.node, r.peer), (r.peer, r.node))
+                if node in self._wanderers
+                and (other in known or math.isfinite(self._wanderers[node].sigma[0]))
+            )
+            if not tied:
+                break
+            wanderer = self._wanderers.pop(tied[0])
+            self.search.add(tied[0], time_s, wanderer.mean, wanderer.spread())
+        self.search.ranging(time_s, ranges, located, heights)
+
+    def _choose_frame(self, time_s: float, ranges: Sequence[Range]) -> None:
+        there = sorted({n for r in ranges for n in (r.node, r.peer) if n in self._wanderers})
+        if not there:
+            return
+        moved = max(there, key=lambda n: (self._wanderers[n].travelled_m, -n))
+        node = moved if self._wanderers[moved].travelled_m > STOOD_M else there[0]
+        wanderer = self._wanderers.pop(node)
+        wanderer.sigma[:] = 0.0
+        self.search.add(node, time_s, wanderer.mean, wanderer.spread())
+        self.search.frame = node
+        self._framed = True
+
+    def epoch(self, time_s: float) -> Found | None:
+        """Search on; return who can be handed over.
+
+        ``settled`` are those whose place has been agreed on for ``AGREED_EPOCHS``. Who starts
+        together is handed over together, once all of them are settled.
+        """
+        if not self.search.nodes:
+            return None
+        search = self.search
+        search.solve()
+        agreed = search.resolve(AGREED)
+        self._agreed = Counter({n: self._agreed[n] + 1 for n in agreed})
+        settled = {n for n in agreed if self._agreed[n] >= AGREED_EPOCHS}
+        if search.frame is not None:
+            settled.add(search.frame)
+        news = settled != self.settled or any(search.extent_m(n) > STOOD_M for n in self._standing)
+        self.settled = settled
+        self._standing = {n for n in settled if search.extent_m(n) <= STOOD_M}
+        if news:
+            self._quiet_since_s = time_s
+        if search.frame is not None and (len(settled) < 2 or settled != search.active):
+            return None
+        if self._standing - {search.frame} and not self._wanderers:
+            # Somebody who stands has no heading yet. The search finds it best, with all others.
+            quiet = time_s - self._quiet_since_s >= QUIET_S
+            if len(self._standing - {search.frame}) > MOST_STANDING or not quiet:
+                settled = settled - self._standing if search.frame is None else set()
+        if not settled:
+            return None
+        self.counters["starts_found"] += len(settled)
+        found = sorted(settled, key=lambda n: (n != search.frame, n))
+        self.settled, self._standing = self.settled - settled, self._standing - settled
+        return Found(search.release(found), search.frame is not None)
+
+    @property
+    def mixture(self) -> Mixture | None:
+        """The pictures of those who are sought and tied to something known; None where none is."""
+        search = self.search
+        if not search.nodes:
+            return None
+        active = [i for i, n in enumerate(search.nodes) if n in search.active]
+        whole = search.mixture
+        if not active or not whole.weights.size or whole.weights.size != len(whole.poses):
+            return None
+        columns = (np.array(active)[:, None] * POSE + np.arange(POSE)).ravel()
+        spread = np.stack(
+            [whole.covariances[:, 3 * i : 3 * i + 2, 3 * i : 3 * i + 2] for i in active], axis=1
+        )
+        return Mixture(
+            tuple(search.nodes[i] for i in active),
+            whole.weights,
+            whole.poses[:, active],
+            WIDTH * whole.covariances[:, columns][:, :, columns],
+            whole.scales[active],
+            leader(whole.weights, whole.poses[:, active], spread),
+        )
+
+    def snapshot(self) -> Starts:
+        """Copy everything that changes."""
+        other = copy.copy(self)
+        other.counters, other._agreed = self.counters.copy(), self._agreed.copy()
+        other.settled, other._standing = self.settled.copy(), self._standing.copy()
+        other._wanderers = copy.deepcopy(self._wanderers) if self._wanderers else {}
+        if self.search.nodes:
+            other.search = self.search.snapshot(other.counters)
+        else:
+            # Nothing in it changes before somebody is met: until then the two share it.
+            self._shared = other._shared = True
+        return other
+
+    def _part(self) -> None:
+        """Take a search of one's own before it changes."""
+        if self._shared:
+            self.search = self.search.snapshot(self.counters)
+            self._shared = False
+
+
+WIDTH = 0.7
+"""Variances of what is told, relative to the search's own, whose range errors are taken too wide so
+that no mode is believed too soon. Measured: in P1 (12 seeds) the 90 % region held the truth in
+98.4, 96.6 and 94.2 % of the epochs with 1, 0.6 and 0.4; with two robots in 86, 79 and 74 %."""
+
+MOST_SOUGHT = 8
+"""So many are sought together; the others wait: the search grows with the cube of their number."""
+
+AGREED = 0.99
+AGREED_EPOCHS = 3
+
+MOST_STANDING = 2
+QUIET_S = 30.0
+"""Up to so many of those who stand are handed over without a heading, when nobody has set off or
+been settled for so long: people set off one after another."""

@@ -1,0 +1,273 @@
+"""A whole mission, smoothed: the estimator behind ``relpos fuse --smooth``.
+
+It passes everything on to an online estimator, keeps it, and smooths when the run has ended. The
+online estimates are where the optimisation begins; because they may have been in a wrong mode, it
+begins from several and the one that explains the run best is taken.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.estimator import (
+    ANY_ANGLE_RAD,
+    LOST_EPOCHS,
+    STALE_EPOCHS,
+    Estimate,
+    Estimator,
+    NodeEstimate,
+    NodeStatus,
+    PairEstimate,
+    Parameter,
+)
+from relpos.fusion.smoother.graph import Graph, build_graph
+from relpos.fusion.smoother.problem import Problem, Solution, smooth
+from relpos.measurements import Measurement, Prior
+
+Floats = npt.NDArray[np.float64]
+
+SURE_M = 1.0
+"""A node that the online estimator left ambiguous, and that smoothing does not place within
+this, stays ambiguous."""
+
+SIMPLER_BY = 3.0
+"""How much more (logarithmic) evidence a team without biases or scales must have: errors that last
+make evidence look stronger than it is, and what is left out makes the rest look surer."""
+
+
+@dataclass
+class Smoother:
+    """An :class:`~relpos.fusion.estimator.Estimator` that gives everything at the end.
+
+    ``online`` is the estimator whose estimates begin the first attempt; ``others`` make those of
+    further attempts (they see the whole run again).
+    """
+
+    online: Estimator
+    others: Sequence[Estimator] = ()
+    priors: Sequence[Prior] = ()
+    heights_m: Mapping[int, float] = field(default_factory=dict)
+    antennas_m: Mapping[int, tuple[float, float]] = field(default_factory=dict)
+    solutions: list[Solution] = field(default_factory=list)
+    """All attempts of :meth:`finish`, the best first."""
+    _measurements: list[Measurement] = field(default_factory=list)
+    _estimates: list[Estimate] = field(default_factory=list)
+    _own: Counter[str] = field(default_factory=Counter)
+
+    def process(self, measurement: Measurement) -> list[Estimate]:
+        """Take one measurement; nothing is known for sure before the end."""
+        self._measurements.append(measurement)
+        self._estimates += self.online.process(measurement)
+        return []
+
+    def finish(self) -> list[Estimate]:
+        """Smooth the whole run; RelposError if the data were unfit."""
+        self._estimates += self.online.finish()
+        graph, counted = build_graph(
+            self._measurements, self.priors, self.heights_m, self.antennas_m
+        )
+        self._own["ranges_after_the_last_motion"] += counted["ranges_after_the_last_motion"]
+        graph = _with_frame(graph, self._estimates)
+        problem = Problem(graph)
+        attempts = [self._estimates, *(_replay(e, self._measurements) for e in self.others)]
+        for estimates in attempts:
+            poses = _poses(graph, estimates)
+            self.solutions.append(smooth(problem, problem.first_state(poses)))
+        self.solutions.sort(key=lambda s: s.cost)
+        best = _without_needless_constants(problem, self.solutions[0])
+        self.solutions.insert(0, best)
+        self._own["smoother_attempts"] += len(attempts)
+        self._own["smoother_outliers"] += int(np.sum(best.inliers < 0.5))
+        return list(_estimates(problem, best, self._estimates))
+
+    def counters(self) -> Mapping[str, int]:
+        """Count what the online estimator counts, and the smoother's own."""
+        return {**self.online.counters(), **self._own}
+
+
+def _without_needless_constants(problem: Problem, best: Solution) -> Solution:
+    """Leave out range biases, step scales or both where the run is clearly likelier without."""
+    chosen, least = best, best.cost - SIMPLER_BY
+    for calibrated, to_scale in ((True, True), (True, False), (False, True)):
+        levels = problem.simpler_levels(calibrated=calibrated, to_scale=to_scale)
+        tried = smooth(problem, best.state, levels)
+        if tried.cost < least:
+            chosen, least = tried, tried.cost
+    return chosen
+
+
+def _replay(estimator: Estimator, measurements: Iterable[Measurement]) -> list[Estimate]:
+    estimates = [e for measurement in measurements for e in estimator.process(measurement)]
+    return estimates + estimator.finish()
+
+
+def _with_frame(graph: Graph, estimates: Sequence[Estimate]) -> Graph:
+    """Where no start is known, hold the node whose pose at the start is the frame."""
+    if (graph.start_weight[:, :2] > 1e-3).any():
+        return graph
+    located = [
+        (node.node, abs(node.x_m) + abs(node.y_m))
+        for estimate in estimates[:1]
+        for node in estimate.nodes
+        if node.status is not NodeStatus.UNLOCATED
+    ]
+    name = min(located, key=lambda pair: pair[1])[0] if located else graph.node_ids[0]
+    row = graph.node_ids.index(name)
+    weight, start = graph.start_weight.copy(), graph.start.copy()
+    weight[row], start[row] = 1e6, 0.0
+    return replace(graph, start=start, start_weight=weight)
+
+
+def _poses(graph: Graph, estimates: Sequence[Estimate]) -> Floats:
+    """Poses (K, N, 3) from an online estimate; dead reckoning where it has none.
+
+    Before a node was located it is reckoned backwards from where it first was.
+    """
+    knots, nodes = graph.time_s.size, len(graph.node_ids)
+    row = {node: k for k, node in enumerate(graph.node_ids)}
+    poses = np.full((knots, nodes, 3), np.nan)
+    for estimate in estimates:
+        k = int(np.argmin(np.abs(graph.time_s - estimate.time_s)))
+        for node in estimate.nodes:
+            if node.status is not NodeStatus.UNLOCATED and node.node in row:
+                poses[k, row[node.node]] = (node.x_m, node.y_m, node.heading_rad)
+    known = graph.start_weight[:, 0] > 1e-3
+    poses[0, known] = graph.start[known]
+    reckoned = graph.dead_reckoned(graph.start)
+    for n in range(nodes):
+        there = np.flatnonzero(np.isfinite(poses[:, n, 0]))
+        if not there.size:
+            poses[:, n] = reckoned[:, n]
+            continue
+        for gap in np.flatnonzero(~np.isfinite(poses[:, n, 0])):
+            k = int(gap)
+            before = there[there < k]
+            anchor = int(before[-1] if before.size else there[0])
+            poses[k, n] = _carried(poses[anchor, n], reckoned[anchor, n], reckoned[k, n])
+    # Headings go on from one another as the reports turn.
+    turn = np.diff(poses[..., 2], axis=0) - graph.turn_rad
+    turn = (turn + np.pi) % (2.0 * np.pi) - np.pi + graph.turn_rad
+    poses[1:, :, 2] = poses[0, :, 2] + np.cumsum(turn, axis=0)
+    first = np.round((poses[0, :, 2] - graph.start[:, 2]) / (2.0 * np.pi)) * 2.0 * np.pi
+    poses[..., 2] -= first
+    return poses
+
+
+def _carried(pose: Floats, reckoned_there: Floats, reckoned_here: Floats) -> Floats:
+    """Move a pose along dead reckoning, forwards or backwards."""
+    turn = pose[2] - reckoned_there[2]
+    c, s = math.cos(turn), math.sin(turn)
+    dx, dy = reckoned_here[:2] - reckoned_there[:2]
+    return np.array([pose[0] + c * dx - s * dy, pose[1] + s * dx + c * dy, reckoned_here[2] + turn])
+
+
+def _estimates(
+    problem: Problem, solution: Solution, online: Sequence[Estimate]
+) -> Iterable[Estimate]:
+    """Turn a solution into the rows of the run format, one epoch after another."""
+    graph, poses = problem.graph, solution.state.poses
+    knots, nodes = poses.shape[:2]
+    blocks = solution.covariance.diagonal.reshape(knots, nodes, 3, nodes, 3)
+    alone = blocks[:, np.arange(nodes), :, np.arange(nodes), :].transpose(1, 0, 2, 3)
+    news = graph.news.copy()
+    for slot, pair in zip(graph.slot, graph.pair, strict=True):
+        news[slot, pair] = True
+    begun = np.logical_or.accumulate(news, axis=0) | (graph.start_weight[:, 0] > 1e-3)
+    silent = np.zeros(nodes, dtype=int)
+    doubtful = {
+        n.node for n in (online[-1].nodes if online else ()) if n.status is NodeStatus.AMBIGUOUS
+    }
+    ranged = np.isin(np.arange(nodes), graph.pairs) | (graph.start_weight[:, 0] > 1e-3)
+    height_sigma = 0.0
+    for k in range(1, knots):
+        silent = (silent + 1) * ~news[k - 1]
+        rows = []
+        for n, name in enumerate(graph.node_ids):
+            p = alone[k, n]
+            spread = math.sqrt(max(float(p[0, 0] + p[1, 1]), 0.0))
+            located = bool(begun[k - 1, n] and ranged[n])
+            status = NodeStatus.OK
+            if not located:
+                status = NodeStatus.UNLOCATED
+            elif name in doubtful and spread > SURE_M:
+                status = NodeStatus.AMBIGUOUS
+            elif silent[n] >= LOST_EPOCHS:
+                status = NodeStatus.LOST
+            elif silent[n] >= STALE_EPOCHS:
+                status = NodeStatus.STALE
+            rows.append(
+                NodeEstimate(
+                    name, float(poses[k, n, 0]), float(poses[k, n, 1]),
+                    math.remainder(float(poses[k, n, 2]), 2.0 * math.pi),
+                    float(p[0, 0]), float(p[1, 1]), float(p[0, 1]),
+                    min(math.sqrt(max(float(p[2, 2]), 0.0)), ANY_ANGLE_RAD), status,
+                    float(graph.height_m[k, n]), height_sigma,
+                )
+            )  # fmt: skip
+        time_s = float(graph.time_s[k])
+        shown = [n for n, node in enumerate(rows) if node.status is not NodeStatus.UNLOCATED]
+        pairs = _pairs(graph.node_ids, poses[k], blocks[k], shown)
+        yield Estimate(time_s, tuple(rows), pairs, (), _parameters(problem, solution, time_s))
+
+
+def _pairs(
+    names: Sequence[int], poses: Floats, blocks: Floats, shown: Sequence[int]
+) -> tuple[PairEstimate, ...]:
+    pairs = []
+    for k, i in enumerate(shown):
+        for j in shown[k + 1 :]:
+            dx, dy = float(poses[j, 0] - poses[i, 0]), float(poses[j, 1] - poses[i, 1])
+            p = blocks[i, :2, i, :2] + blocks[j, :2, j, :2]
+            p = p - blocks[i, :2, j, :2] - blocks[j, :2, i, :2]
+            distance = math.hypot(dx, dy)
+            trace = float(p[0, 0] + p[1, 1])
+            if distance > 0.0:
+                u = np.array([dx, dy]) / distance
+                along = float(u @ p @ u)
+                bearing = min(math.sqrt(max(trace - along, 0.0)) / distance, ANY_ANGLE_RAD)
+            else:
+                along, bearing = 0.5 * trace, ANY_ANGLE_RAD
+            pairs.append(
+                PairEstimate(
+                    names[i], names[j], distance, math.sqrt(max(along, 0.0)),
+                    math.atan2(dy, dx), bearing,
+                )
+            )  # fmt: skip
+    return tuple(pairs)
+
+
+def _parameters(problem: Problem, solution: Solution, time_s: float) -> tuple[Parameter, ...]:
+    """The constants of the whole run; the same at every epoch."""
+    n, names = problem.nodes, problem.graph.node_ids
+    value, spread = solution.state.constants, solution.covariance.constants
+    if not spread.size:
+        return ()
+    rows = []
+    for k, name in enumerate(names):
+        grow = math.exp(float(value[k]))
+        rows.append(
+            Parameter(time_s, name, None, "step_scale", grow, grow * math.sqrt(spread[k, k]))
+        )
+        rows.append(
+            Parameter(
+                time_s, name, None, "heading_drift_rad_s", float(value[n + k]),
+                math.sqrt(spread[n + k, n + k]),
+            )
+        )  # fmt: skip
+    common = 2 * n
+    for k, (i, j) in enumerate(problem.graph.pairs):
+        own = common + 1 + k
+        variance = spread[common, common] + spread[own, own] + 2.0 * spread[common, own]
+        rows.append(
+            Parameter(
+                time_s, names[i], names[j], "range_bias_m", float(value[common] + value[own]),
+                math.sqrt(max(float(variance), 0.0)),
+            )
+        )  # fmt: skip
+    return tuple(rows)

@@ -1,0 +1,211 @@
+"""The default estimator whatever the team's size: a bank for a few, one joint filter for many.
+
+A bank's work grows with the square of the team for every hypothesis, and with many users about
+the picture is hardly ever ambiguous. So a team of more than ``LARGE_TEAM`` is handed from
+:class:`~relpos.fusion.bank.estimator.Bank` to
+:class:`~relpos.fusion.large_teams.estimator.LargeTeam`, at once where
+the priors already name so many, else when so many have been met: everybody's last estimate is
+then the prior, and who was not located yet joins later.
+
+Where nobody of so many is located, a *nucleus* comes first: the best connected user and some of its
+neighbours, whose starts a bank finds from what they say of each other. They are handed over
+once most of them are found, and all others join them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+from relpos.fusion.bank.estimator import Bank
+from relpos.fusion.bank.settings import BankSettings
+from relpos.fusion.estimator import Estimate, NodeStatus
+from relpos.fusion.large_teams.estimator import LargeTeam, unlocated
+from relpos.fusion.models.ranging import Mounting
+from relpos.fusion.timeline import Displacement
+from relpos.measurements import Measurement, Motion, Prior, Range
+
+LARGE_TEAM = 30
+"""From more users on one joint filter, strip by strip (crossover: ``docs/fusion.md``)."""
+
+KEPT_S = 20.0
+"""What is younger is kept: a bank's newest estimate is never older."""
+
+
+NUCLEUS = 6
+"""So many users begin where nobody's start is known: a bank finds six within a minute or two."""
+
+NUCLEUS_FOUND, NUCLEUS_EPOCHS = 4, 3
+"""So many of them have to be located for so many epochs."""
+
+LISTEN_S = 4.0
+"""So long ranges are listened to before the nucleus is chosen."""
+
+
+class GrowingTeam:
+    """An :class:`~relpos.fusion.estimator.Estimator` for any number of users."""
+
+    def __init__(
+        self,
+        priors: Sequence[Prior] = (),
+        settings: BankSettings | None = None,
+        seed: int = 0,
+        mountings: Mapping[int, Mounting] | None = None,
+    ) -> None:
+        """Start with whoever has a prior; ``mountings`` tell how nodes are worn."""
+        self._mountings = mountings or {}
+        self._settings = settings or BankSettings()
+        self._seed = seed
+        self._priors = tuple(priors)
+        self._met = {p.node for p in priors}
+        self._recent: deque[Measurement] = deque()
+        self._newest_s = -math.inf
+        self._last: Estimate | None = None
+        self._before: Counter[str] = Counter()
+        self._nucleus: frozenset[int] = frozenset()
+        self._first_range_s = math.inf
+        self._found_epochs = 0
+        self.estimator: Bank | LargeTeam = (
+            LargeTeam(priors, self._settings, seed, self._mountings)
+            if len(self._met) > LARGE_TEAM
+            else Bank(priors, self._settings, seed, self._mountings)
+        )
+
+    def process(self, measurement: Measurement) -> list[Estimate]:
+        """Take one measurement; return the estimates it completes."""
+        if isinstance(self.estimator, LargeTeam):
+            return self.estimator.process(measurement)
+        recent, time_s = self._recent, measurement.time_s
+        recent.append(measurement)
+        if time_s > self._newest_s:
+            self._newest_s = time_s
+            while recent[0].time_s < time_s - KEPT_S:
+                recent.popleft()
+        self._met.add(measurement.node)
+        if isinstance(measurement, Range):
+            self._met.add(measurement.peer)
+            if time_s < self._first_range_s:
+                self._first_range_s = time_s
+        if len(self._met) <= LARGE_TEAM:
+            return self._feed(measurement)
+        if self._located() >= min(NUCLEUS_FOUND, len(self._priors) or NUCLEUS_FOUND):
+            return self._feed(measurement) + self._hand_over()
+        return self._begin(measurement)
+
+    def _feed(self, measurement: Measurement) -> list[Estimate]:
+        estimates = self.estimator.process(measurement)
+        if estimates:
+            self._last = estimates[-1]
+        return estimates
+
+    def _located(self) -> int:
+        """How many users a large team could begin from."""
+        if self._last is None:
+            return sum(math.isfinite(p.sigma_m + p.sigma_rad) for p in self._priors)
+        return sum(n.status in (NodeStatus.OK, NodeStatus.STALE) for n in self._last.nodes)
+
+    def _begin(self, measurement: Measurement) -> list[Estimate]:
+        """Let a nucleus of a large team find itself; all others are unlocated until then."""
+        if not self._nucleus:
+            if self._newest_s < self._first_range_s + LISTEN_S:
+                return []
+            self._nucleus = _best_connected(self._recent)
+            self._last = None
+            priors = [p for p in self._priors if p.node in self._nucleus]
+            self.estimator = Bank(priors, self._settings, self._seed, self._mountings)
+            some = [m for m in self._recent if self._concerns(m)]
+        else:
+            some = [measurement] if self._concerns(measurement) else []
+        estimates = []
+        for one in some:
+            for estimate in self.estimator.process(one):
+                found = sum(n.status is NodeStatus.OK for n in estimate.nodes)
+                self._found_epochs = self._found_epochs + 1 if found >= NUCLEUS_FOUND else 0
+                estimates.append(self._with_others(estimate))
+                if self._found_epochs >= NUCLEUS_EPOCHS:
+                    self._last = estimate
+                    return estimates + self._hand_over()
+        return estimates
+
+    def _concerns(self, measurement: Measurement) -> bool:
+        inside = measurement.node in self._nucleus
+        return inside and (not isinstance(measurement, Range) or measurement.peer in self._nucleus)
+
+    def _with_others(self, estimate: Estimate) -> Estimate:
+        others = [unlocated(node) for node in sorted(self._met - self._nucleus)]
+        nodes = sorted([*estimate.nodes, *others], key=lambda n: n.node)
+        return replace(estimate, nodes=tuple(nodes))
+
+    def finish(self) -> list[Estimate]:
+        """Work off what waits; RelposError where the run cannot give relative positions."""
+        return self.estimator.finish()
+
+    def counters(self) -> Mapping[str, int]:
+        """Count everything dropped, late, reset or resampled."""
+        return dict(self._before + Counter(self.estimator.counters()))
+
+    def _hand_over(self) -> list[Estimate]:
+        """Go on as a large team from the last estimate; what came since is taken again."""
+        last = self._last
+        since_s = -math.inf if last is None else last.time_s
+        priors = list(self._priors)
+        if last is not None:
+            self._before = Counter(self.estimator.counters())
+            self._before["teams_handed_over"] += 1
+            priors = [
+                Prior(
+                    n.node, n.x_m, n.y_m, n.heading_rad,
+                    math.sqrt(0.5 * (n.variance_x_m2 + n.variance_y_m2)), n.sigma_heading_rad,
+                )
+                for n in last.nodes
+                if n.status not in (NodeStatus.UNLOCATED, NodeStatus.AMBIGUOUS)
+            ]  # fmt: skip
+        self.estimator = LargeTeam(
+            priors,
+            self._settings,
+            self._seed,
+            self._mountings,
+            0.0 if last is None else since_s,
+        )
+        estimates: list[Estimate] = []
+        begun: dict[int, float] = {}
+        for measurement in sorted(self._recent, key=lambda m: m.time_s):
+            again = measurement
+            if isinstance(measurement, Motion):
+                begin_s = begun.get(measurement.node, -math.inf)
+                begun[measurement.node] = measurement.time_s
+                if begin_s < since_s < measurement.time_s and math.isfinite(begin_s):
+                    again = _rest(measurement, begin_s, since_s)
+            if again.time_s > since_s:
+                estimates += self.estimator.process(again)
+        self._recent.clear()
+        return [e for e in estimates if e.time_s > since_s]
+
+
+def _best_connected(measurements: Iterable[Measurement]) -> frozenset[int]:
+    """Choose the user with most ranges, then again and again who has most with those chosen."""
+    count: Counter[tuple[int, int]] = Counter()
+    degree: Counter[int] = Counter()
+    for m in measurements:
+        if isinstance(m, Range) and m.range_m > 0.0:
+            count[min(m.node, m.peer), max(m.node, m.peer)] += 1
+            degree.update((m.node, m.peer))
+    chosen = {min(degree, key=lambda node: (-degree[node], node))}
+    while len(chosen) < NUCLEUS:
+        near: Counter[int] = Counter()
+        for (a, b), times in count.items():
+            if (a in chosen) != (b in chosen):
+                near[b if a in chosen else a] += 10 + times
+        if not near:
+            break
+        chosen.add(min(near, key=lambda node: (-near[node], node)))
+    return frozenset(chosen)
+
+
+def _rest(motion: Motion, begin_s: float, since_s: float) -> Motion:
+    """Give the part of a motion after a time within it."""
+    share = (since_s - begin_s) / (motion.time_s - begin_s)
+    _, rest = Displacement(motion.dx_m, motion.dy_m, motion.dtheta_rad).split(share)
+    return replace(motion, dx_m=rest.dx_m, dy_m=rest.dy_m, dtheta_rad=rest.dtheta_rad)

@@ -1,0 +1,79 @@
+"""The default estimator from outside: accuracy, honesty, and what it does with odd input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from relpos import fusion
+from relpos.errors import RelposError
+from relpos.evaluation import metrics, tracks
+from relpos.fusion.bank.core import BankCore
+from relpos.fusion.bank.settings import BankSettings
+from relpos.fusion.estimator import Estimate
+from relpos.simulation.paper import simulate_paper
+
+
+def _run(scenario: str, seed: int, overrides: dict[str, float] | None = None) -> metrics.Metrics:
+    run = simulate_paper(scenario, seed, overrides)
+    estimator = fusion.make("bank", run.priors, {}, seed)
+    estimates: list[Estimate] = []
+    for measurement in run.measurements:
+        estimates += estimator.process(measurement)
+    estimates += estimator.finish()
+    return metrics.evaluate(
+        tracks.estimated_tracks(estimates),
+        tracks.true_tracks(run.truth),
+        tracks.estimated_pairs(estimates),
+    )
+
+
+@pytest.mark.parametrize(("scenario", "limit_m"), [("paper", 0.8), ("paper-p1", 0.21)])
+def test_the_bank_is_near_the_bound_without_being_told_the_noise(
+    scenario: str, limit_m: float
+) -> None:
+    figures = [_run(scenario, seed) for seed in (0, 1)]
+    assert np.mean([f.relative_distance_rmse_m for f in figures]) < limit_m
+    assert 0.5 < np.mean([f.nees_distance for f in figures]) < 1.6
+
+
+@pytest.mark.parametrize(
+    ("overrides", "limit_m"),
+    [
+        ({"nlos_probability": 0.2}, 0.4),
+        ({"start_shift_m": 4.0}, 0.6),
+        ({"noisy_factor": 3.0}, 0.55),
+        ({"scale_error": 0.1, "heading_drift_deg_s": 0.5}, 0.25),
+    ],
+)
+def test_what_nobody_told_is_lived_with(overrides: dict[str, float], limit_m: float) -> None:
+    assert _run("paper-p1", 0, overrides).relative_distance_rmse_m < limit_m
+
+
+def test_white_heading_noise_and_a_short_reach_leave_the_team_in_shape() -> None:
+    figures = _run("paper-h", 1)
+    assert figures.relative_distance_rmse_m < 1.27
+    assert figures.nees_distance < 2.5
+
+
+def test_the_same_seed_gives_the_same_estimates() -> None:
+    first, second = (_run("paper", 3, {"seconds": 60.0}) for _ in range(2))
+    assert first.relative_distance_rmse_m == second.relative_distance_rmse_m
+
+
+def test_a_run_without_motion_is_refused() -> None:
+    with pytest.raises(RelposError, match="no motion"):
+        fusion.make("bank").finish()
+
+
+def test_arrays_that_do_not_fit_are_refused_before_a_kernel_reads_them() -> None:
+    core = BankCore(BankSettings(hypotheses=2), 0)
+    for x_m in (0.0, 3.0):
+        core.add_node(x_m, 0.0, 0.0, 0.1, 0.1)
+    one, two = np.ones(1), np.ones(2)
+    with pytest.raises(ValueError, match="shape"):
+        core.update(np.array([0]), np.array([1]), one, two)
+    with pytest.raises(IndexError, match="2 users"):
+        core.update(np.array([0]), np.array([2]), one, one)
+    with pytest.raises(IndexError, match="2 users"):
+        core.advance(np.array([-1]), one, one, one, one)

@@ -1,0 +1,424 @@
+"""The bank's kernels against their NumPy twins, finite differences and sampled truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from reference import bank as small
+from reference import joint as twins
+from relpos.fusion.bank import hypothesis_count as hypotheses
+from relpos.fusion.bank import joint, lanes
+from relpos.fusion.bank import kernels as bank_kernels
+from relpos.fusion.bank import variance_components as noise
+from relpos.fusion.bank.joint import PER_NODE, Of
+from relpos.fusion.models import odometry_faults as slips
+from relpos.fusion.models.detection import LENGTH, Detection, teach
+
+Floats = np.ndarray
+NODES = 3
+SIZE = PER_NODE * NODES + 1
+CROSS, SHARE = 0.04, 0.5
+OUTLIER = (0.05, 9.0, 0.1)
+
+
+def states(count: int, seed: int) -> tuple[Floats, Floats]:
+    """Random means (K, D) a few metres apart, and full-rank covariances (K, D, D)."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(count, SIZE)) * 0.1
+    for node in range(NODES):
+        x[:, PER_NODE * node : PER_NODE * node + 2] += rng.normal(size=(count, 2)) * 5.0
+    root = rng.normal(size=(count, SIZE, SIZE)) * 0.1
+    p = root @ root.transpose(0, 2, 1)
+    p[:, -1, :] = p[:, :, -1] = 0.0
+    return x, p
+
+
+class Packed:
+    """Means (K, D) and covariances (K, D, D) as the kernels take them; back at the end."""
+
+    def __init__(self, x: Floats, p: Floats) -> None:
+        self.dense, self.count = (x, p), len(x)
+
+    def __enter__(self) -> tuple[Floats, Floats, Floats]:
+        self.x, self.p = joint.pack(*self.dense, NODES)
+        sens = lanes.empty_lines(len(self.x), NODES, noise.LEVELS, 6)
+        sens[...] = 0.0
+        return self.x, self.p, sens
+
+    def __exit__(self, *_: object) -> None:
+        for mine, now in zip(
+            self.dense, joint.unpack(self.x, self.p, NODES, self.count), strict=True
+        ):
+            mine[...] = now
+
+
+def in_lanes(values: Floats) -> Floats:
+    """Numbers (K, ...) as (B, ..., LANES); what is left of a block is 0."""
+    laid = np.zeros((lanes.blocks_of(len(values)) * lanes.LANES, *values.shape[1:]))
+    laid[: len(values)] = values
+    return np.ascontiguousarray(
+        np.moveaxis(laid.reshape(-1, lanes.LANES, *values.shape[1:]), 1, -1)
+    )
+
+
+def out_of_lanes(laid: Floats, count: int) -> Floats:
+    return laid.reshape(-1)[:count]
+
+
+def advanced(x: Floats, p: Floats, motion: Floats, level: Floats, drawn: Floats) -> None:
+    rows = np.arange(len(motion), dtype=np.int64) % NODES
+    with Packed(x, p) as (px, pp, sens):
+        joint.advance(px, pp, in_lanes(level), sens, rows, motion, drawn, SHARE, CROSS)
+
+
+def updated(x: Floats, p: Floats, measured: float, dz: float, outlier: tuple[float, ...]) -> Floats:
+    log_weight = in_lanes(np.zeros(len(x)))
+    with Packed(x, p) as (px, pp, sens):
+        joint.update(
+            px, pp, log_weight, in_lanes(np.full(len(x), 0.04)), sens, np.array([0]), np.array([2]),
+            np.array([-1]), np.array([measured]), np.array([dz]), np.array([*outlier, 1.0]),
+            np.ones(1), np.zeros(1), np.zeros((0, 2)),
+            lanes.empty_lines(1, joint.STATS, len(px)),
+        )  # fmt: skip
+    return out_of_lanes(log_weight, len(x))
+
+
+def mixture(x: Floats, p: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    px, pp = joint.pack(x, p, NODES)
+    return joint.moments(px, pp, in_lanes(weight), NODES, joint.order(NODES, SIZE), SIZE, SIZE)
+
+
+def predicted(x: Floats, p: Floats) -> tuple[float, float]:
+    px, pp = joint.pack(x, p, NODES)
+    weight = in_lanes(np.full(len(x), 1.0 / len(x)))
+    mean, sigma = joint.predicted_ranges(px, pp, weight, np.array([0]), np.array([2]), np.zeros(1))
+    return float(mean[0]), float(sigma[0])
+
+
+def test_what_is_packed_comes_out_as_it_was() -> None:
+    x, p = states(11, 12)
+    px, pp = joint.pack(x, p, NODES)
+    for mine, back in zip((x, p), joint.unpack(px, pp, NODES, 11), strict=True):
+        assert (mine == back).all()
+    assert (joint.means(px, NODES, 11) == x).all()
+    chosen = np.array([3, 3, 10, 0], dtype=np.int64)
+    taken = joint.unpack(joint.take(px, chosen), joint.take(pp, chosen), NODES, 4)
+    assert (taken[0] == x[chosen]).all()
+    assert (taken[1] == p[chosen]).all()
+
+
+def test_a_displacement_is_the_twins() -> None:
+    rng = np.random.default_rng(1)
+    x, p = states(4, 2)
+    motion = np.abs(rng.normal(size=(5, 7))) * 0.3
+    level, drawn = rng.uniform(0.5, 2.0, (4, NODES, 3)), rng.normal(size=(4, 5))
+    expected = [(x[k], p[k]) for k in range(4)]
+    for m in range(5):
+        expected = [
+            twins.advance(
+                a, b, m % NODES, motion[m], level[k, m % NODES], drawn[k, m], SHARE, CROSS
+            )
+            for k, (a, b) in enumerate(expected)
+        ]
+    advanced(x, p, motion, level, drawn)
+    assert x == pytest.approx(np.array([a for a, _ in expected]), abs=1e-12)
+    assert p == pytest.approx(np.array([b for _, b in expected]), abs=1e-12)
+
+
+@pytest.mark.parametrize(("measured", "dz"), [(4.0, 0.0), (6.5, 1.2), (30.0, 0.0)])
+def test_a_range_is_the_twins(measured: float, dz: float) -> None:
+    x, p = states(6, 3)
+    expected = [
+        twins.update(a, b, 0, 2, measured, dz, 0.04, OUTLIER) for a, b in zip(x, p, strict=True)
+    ]
+    evidence = updated(x, p, measured, dz, OUTLIER)
+    assert x == pytest.approx(np.array([e[0] for e in expected]), abs=1e-10)
+    assert p == pytest.approx(np.array([e[1] for e in expected]), abs=1e-10)
+    assert evidence == pytest.approx(np.array([e[2] for e in expected]), abs=1e-9)
+
+
+def test_the_mixtures_moments_are_the_twins() -> None:
+    x, p = states(7, 4)
+    weight = np.random.default_rng(5).dirichlet(np.ones(7))
+    mean, covariance = mixture(x, p, weight)
+    expected = twins.moments(x, p, weight)
+    assert mean == pytest.approx(expected[0], abs=1e-12)
+    assert covariance == pytest.approx(expected[1], abs=1e-12)
+
+
+def test_headings_are_averaged_round_the_circle() -> None:
+    x, p = np.zeros((2, SIZE)), np.zeros((2, SIZE, SIZE))
+    x[:, Of.HEADING] = (np.pi - 0.1, -np.pi + 0.1)
+    mean, covariance = mixture(x, p, np.array([0.5, 0.5]))
+    assert np.cos(mean[Of.HEADING]) == pytest.approx(-1.0)
+    assert covariance[Of.HEADING, Of.HEADING] == pytest.approx(0.01)
+
+
+def test_the_motions_jacobian_is_that_of_finite_differences() -> None:
+    x, _ = states(1, 6)
+    p = np.zeros((1, SIZE, SIZE))
+    # What has no variance is not modelled.
+    p[0, Of.DRIFT, Of.DRIFT] = p[0, Of.SCALE, Of.SCALE] = 1e-30
+    motion = np.array([[0.6, 0.1, 0.3, 2.0, 0.0, 0.0, 0.0]])
+    level, drawn = np.ones((1, NODES, 3)), np.zeros((1, 1))
+    step = 1e-6
+    jacobian = np.empty((PER_NODE, PER_NODE))
+    for column in range(PER_NODE):
+        ends = []
+        for sign in (-1.0, 1.0):
+            moved = x.copy()
+            moved[0, column] += sign * step
+            advanced(moved, p.copy(), motion, level, drawn)
+            ends.append(moved[0, :PER_NODE])
+        jacobian[:, column] = (ends[1] - ends[0]) / (2.0 * step)
+    p[0, :PER_NODE, :PER_NODE] = 1e-8 * np.eye(PER_NODE)
+    advanced(x, p, motion, level, drawn)
+    p[0, Of.DRIFT, Of.DRIFT] -= joint.DRIFT_WALK * motion[0, 3]
+    p[0, Of.SCALE, Of.SCALE] -= joint.SCALE_WALK * motion[0, 3]
+    assert 1e8 * p[0, :PER_NODE, :PER_NODE] == pytest.approx(jacobian @ jacobian.T, abs=1e-5)
+
+
+def test_what_an_uncertain_heading_walks_has_the_moments_of_sampled_walks() -> None:
+    sigma = 0.5
+    x, p = np.zeros((1, SIZE)), np.zeros((1, SIZE, SIZE))
+    p[0, Of.HEADING, Of.HEADING] = sigma**2
+    advanced(x, p, np.array([[3.0, 0, 0, 0, 0, 0, 0]]), np.ones((1, NODES, 3)), np.zeros((1, 1)))
+    heading = sigma * np.random.default_rng(7).standard_normal(400_000)
+    walked = 3.0 * np.stack([np.cos(heading), np.sin(heading)])
+    assert x[0, :2] == pytest.approx(walked.mean(axis=1), abs=0.01)
+    assert p[0, :2, :2] == pytest.approx(np.cov(walked), abs=0.02)
+
+
+@pytest.mark.parametrize("distance", [1.5, 4.0, 12.0])
+def test_a_ranges_predicted_moments_are_those_of_sampled_places(distance: float) -> None:
+    x, p = np.zeros((1, SIZE)), np.zeros((1, SIZE, SIZE))
+    x[0, 2 * PER_NODE] = distance
+    spread = np.array([[0.09, 0.03], [0.03, 0.25]])
+    p[0, :2, :2] = spread
+    places = np.random.default_rng(8).multivariate_normal([0.0, 0.0], spread, 400_000)
+    sampled = np.hypot(distance - places[:, 0], places[:, 1])
+    mean, sigma = predicted(x, p)
+    assert mean == pytest.approx(sampled.mean(), abs=0.02)
+    assert sigma == pytest.approx(sampled.std(), abs=0.02)
+
+
+def test_two_who_meet_break_nothing() -> None:
+    x, p = np.zeros((1, SIZE)), np.zeros((1, SIZE, SIZE))
+    p[0, 0, 0] = p[0, 1, 1] = 0.5
+    updated(x, p, 0.3, 0.0, OUTLIER)
+    assert np.isfinite(x).all()
+    assert np.isfinite(p).all()
+    assert np.linalg.eigvalsh(p[0]).min() > -1e-12
+
+
+def test_covariances_stay_symmetric_and_positive_over_a_long_run() -> None:
+    rng = np.random.default_rng(9)
+    x, p = states(3, 10)
+    level = np.ones((3, NODES, 3))
+    for _ in range(300):
+        motion = np.abs(rng.normal(size=(NODES, 7))) * 0.1
+        advanced(x, p, motion, level, rng.normal(size=(3, NODES)))
+        updated(x, p, predicted(x, p)[0] + float(rng.normal()), 0.0, OUTLIER)
+    assert p == pytest.approx(p.transpose(0, 2, 1), abs=1e-9)
+    assert np.linalg.eigvalsh(p).min() > -1e-9
+
+
+def hearing(x: Floats, p: Floats, heard: bool, edge_m: float) -> Floats:
+    curve = np.where(np.arange(201) * 0.5 < edge_m, 0.98, 0.002)
+    log_weight = in_lanes(np.zeros(len(x)))
+    with Packed(x, p) as (px, pp, _):
+        joint.hearing(
+            px, pp, log_weight, NODES, np.array([0]), np.array([2]), np.zeros(1),
+            np.array([heard]), np.ones(1), 1.0, curve, 0.5,
+        )  # fmt: skip
+    return out_of_lanes(log_weight, len(x))
+
+
+def apart(distance: float, sigma: float) -> tuple[Floats, Floats]:
+    x, p = np.zeros((1, SIZE)), np.zeros((1, SIZE, SIZE))
+    x[0, 2 * PER_NODE] = distance
+    p[0, 0, 0] = sigma**2
+    return x, p
+
+
+def test_silence_is_likelier_of_those_who_are_far_apart() -> None:
+    near, far = hearing(*apart(4.0, 0.5), False, 10.0), hearing(*apart(14.0, 0.5), False, 10.0)
+    assert far[0] == pytest.approx(0.0, abs=0.01)
+    assert near[0] < -3.0
+
+
+@pytest.mark.parametrize(("heard", "sign"), [(False, 1.0), (True, -1.0)])
+def test_an_edge_within_the_spread_moves_the_two_as_sampled_places_say(
+    heard: bool, sign: float
+) -> None:
+    x, p = apart(10.0, 1.0)
+    hearing(x, p, heard, 10.0)
+    # Half of a Gaussian: mean sqrt(2/pi), variance 1 - 2/pi; the curve's edge is half a metre wide.
+    assert -x[0, 0] == pytest.approx(sign * np.sqrt(2.0 / np.pi), abs=0.25)
+    assert p[0, 0, 0] == pytest.approx(1.0 - 2.0 / np.pi, abs=0.12)
+
+
+def test_what_is_far_from_any_edge_changes_nothing_but_the_weight() -> None:
+    x, p = apart(4.0, 0.3)
+    before = x.copy(), p.copy()
+    hearing(x, p, True, 10.0)
+    assert (x == before[0]).all()
+    assert (p == before[1]).all()
+
+
+@pytest.mark.parametrize(("heard", "weight"), [(True, 1.0), (False, 1.0), (False, 0.6)])
+def test_who_is_heard_is_the_twins(heard: bool, weight: float) -> None:
+    curve = 0.002 + 0.97 / (1.0 + np.exp((np.arange(201) * 0.5 - 7.0) / 1.5))
+    x, p = states(16, 30)
+    expected = [
+        twins.hearing(a, b, 0, 2, heard, 0.9, weight, curve, 0.5) for a, b in zip(x, p, strict=True)
+    ]
+    log_weight = in_lanes(np.zeros(16))
+    with Packed(x, p) as (px, pp, _):
+        joint.hearing(
+            px, pp, log_weight, NODES, np.array([0]), np.array([2]), np.zeros(1),
+            np.array([heard]), np.array([0.9]), weight, curve, 0.5,
+        )  # fmt: skip
+    assert log_weight.ravel() == pytest.approx(np.array([e[2] for e in expected]), abs=1e-9)
+    assert x == pytest.approx(np.array([e[0] for e in expected]), abs=1e-9)
+    assert p == pytest.approx(np.array([e[1] for e in expected]), abs=1e-9)
+    assert len({e[0].tobytes() for e in expected} - {s.tobytes() for s in states(16, 30)[0]}) > 2
+
+
+def test_levels_of_noise_are_learned_from_innovations_and_their_uncertainty_is_honest() -> None:
+    errors, sigmas = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        levels = noise.Levels()
+        levels.add_node()
+        levels.add_node()
+        truth = np.array([1.0, 0.0, -0.5, -0.4, 0.0, 0.5, -2.0])
+        for _ in range(500):
+            # Innovations whose variance is a random mixture of the sorts of noise.
+            parts = rng.dirichlet(np.full(7, 0.4))
+            scale = np.exp(levels.mean)
+            stats = np.zeros((1, joint.STATS, 1))
+            stats[0, joint.SHARES : joint.BENT, 0] = parts * scale
+            stats[0, joint.VARIANCE] = (parts * scale).sum()
+            stats[0, joint.TRUST] = 1.0
+            measured = rng.normal() * np.sqrt((parts * np.exp(truth)).sum())
+            levels.learn(
+                np.array([0]), np.array([1]), np.array([measured]), stats, np.zeros(1), np.ones(1),
+                np.ones(1),
+            )  # fmt: skip
+        errors.append(levels.mean - truth)
+        sigmas.append(np.sqrt(levels.covariance.diagonal()))
+    ratio = np.sqrt(np.mean(np.square(np.array(errors) / np.array(sigmas))))
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.6
+    assert np.mean(sigmas) < 0.5
+    assert 0.6 < ratio < 1.6
+
+
+# -- the small ones --------------------------------------------------------------------------------
+
+
+def test_bases_of_noise_are_the_twins() -> None:
+    rng = np.random.default_rng(20)
+    moves = rng.normal(size=(40, 4)) * (0.5, 0.5, 1.0, 1.0)
+    moves[:, 3] = np.abs(moves[:, 3])
+    moves[0] = 0.0
+    told = np.where(rng.random((40, 3)) < 0.5, np.nan, np.abs(rng.normal(size=(40, 3))))
+    expected = small.motion_variances(*moves.T, told)
+    assert noise.motion_variances(moves, told) == pytest.approx(expected, rel=1e-12)
+    untold = small.motion_variances(*moves.T, np.full((40, 3), np.nan))
+    assert noise.motion_variances(moves, np.empty((0, 3))) == pytest.approx(untold, rel=1e-12)
+
+
+@pytest.mark.parametrize("nodes", [1, 2, 7])
+def test_a_pictures_bend_is_the_twins(nodes: int) -> None:
+    rng = np.random.default_rng(nodes)
+    root = rng.normal(size=(5 * nodes, 5 * nodes)) * 0.2
+    mean, covariance = rng.normal(size=5 * nodes) * 4.0, root @ root.T
+    metre = rng.uniform(0.05, 0.5, nodes)
+    assert hypotheses.bend(mean, covariance, 0.2, metre) == pytest.approx(
+        small.bend(mean, covariance, 0.2, metre), rel=1e-12
+    )
+
+
+@pytest.mark.parametrize("on_one_spot", [False, True])
+def test_what_an_estimate_says_of_pairs_is_the_twins(on_one_spot: bool) -> None:
+    x, p = states(1, 8)
+    if on_one_spot:
+        x[0, 5:7] = x[0, 0:2]
+    rows = list(range(NODES))
+    got = bank_kernels.pairs(x[0], p[0], np.array(rows))
+    assert got == pytest.approx(small.pairs(x[0], p[0], rows), rel=1e-9, abs=1e-12)
+
+
+def test_what_a_round_teaches_of_hearing_is_the_twins() -> None:
+    rng = np.random.default_rng(2)
+    pairs = np.array([(a, b) for a in range(5) for b in range(a + 1, 5)])
+    learned = [
+        (np.ones(5), np.full((5, 5), np.nan), np.zeros((2, LENGTH)), np.array([0.0, 25.0, 0.0]))
+        for _ in range(2)
+    ]
+    curve = Detection().curve
+    for heard in (10, 4, 0, 6, 1):
+        some = rng.permutation(pairs)
+        first, second = some[:, 0].copy(), some[:, 1].copy()
+        distance, sigma = rng.uniform(0.0, 130.0, 10), rng.uniform(0.0, 2.0, 10)
+        witnessed = rng.integers(0, 2, heard).astype(float)
+        given = first, second, heard, witnessed, distance, sigma, curve
+        tried = bank_kernels.teach(*given, *learned[0])
+        assert tried == pytest.approx(teach(*given, *learned[1]), abs=1e-12)
+        for got, expected in zip(*learned, strict=True):
+            assert got == pytest.approx(expected, abs=1e-9, nan_ok=True)
+
+
+def test_cumulative_sums_are_the_twins_until_and_after_an_alarm() -> None:
+    rng = np.random.default_rng(22)
+    watch = slips.Watch()
+    for _ in range(5):
+        watch.add_node()
+    sums, base, alarms = [0.0] * 5, 1.0, 0
+    for instant in range(300):
+        pairs = [(0, 1), (1, 2), (3, 1), (2, 4), (0, 3)][: rng.integers(1, 6)]
+        grown = np.array([8.0 if instant % 100 > 80 and 1 in pair else 1.0 for pair in pairs])
+        square, worth = rng.chisquare(1, len(pairs)) * grown, rng.uniform(0.1, 1.0, len(pairs))
+        ends = np.array(pairs)
+        slipped = watch.look(
+            np.ascontiguousarray(ends[:, 0]), np.ascontiguousarray(ends[:, 1]), square, worth, 0.02
+        )
+        sums, base, expected = small.look(
+            sums, base, pairs, square.tolist(), worth.tolist(), 0.02, slips.TEAM_ALARM
+        )
+        assert slipped == (None if expected < 0 else expected)
+        assert watch.sums == pytest.approx(sums)
+        assert float(watch.base[0]) == pytest.approx(base)
+        alarms += expected >= 0
+    assert alarms > 1
+
+
+def test_weights_sum_to_one_and_count_nothing_beyond_the_last_hypothesis() -> None:
+    logs = np.random.default_rng(23).normal(size=(2, lanes.LANES)) * 3.0 - 400.0
+    expected = np.exp(logs.ravel()[:11] - logs.ravel()[:11].max())
+    expected /= expected.sum()
+    weight = np.empty_like(logs)
+    effective = bank_kernels.normalise(logs, 11, weight)
+    assert weight.ravel()[:11] == pytest.approx(expected)
+    assert (weight.ravel()[11:] == 0.0).all()
+    assert effective == pytest.approx(1.0 / (expected @ expected))
+    assert logs.ravel()[:11].max() == 0.0
+
+
+def test_levels_are_drawn_by_what_is_known_of_them() -> None:
+    rng = np.random.default_rng(24)
+    draw, mean, root = rng.normal(size=(11, 7)), rng.normal(size=7), rng.normal(size=(7, 7))
+    covariance = root @ root.T
+    level, sigma2 = lanes.empty_lines(2, 2, noise.LEVELS), lanes.empty_lines(2)
+    laid = lanes.empty_lines(2, 7)
+    laid[...] = np.resize(draw, (16, 7)).reshape(2, lanes.LANES, 7).transpose(0, 2, 1)
+    steady = np.arange(16.0).reshape(2, lanes.LANES) % 2.0
+    bank_kernels.spread_levels(laid, steady, mean, covariance, 0.5, level, sigma2)
+    sd = np.minimum(0.5 * np.sqrt(covariance.diagonal()), noise.SPREAD_MOST)
+    lower = np.append(np.tile(noise.STEADIER, 2), 0.0)
+    expected = np.exp(mean + sd * draw - np.outer(steady.ravel()[:11], lower))
+    back = level.reshape(2, 6, lanes.LANES).transpose(0, 2, 1).reshape(-1, 6)[:11]
+    assert back == pytest.approx(expected[:, :-1])
+    assert sigma2.ravel()[:11] == pytest.approx(expected[:, -1])

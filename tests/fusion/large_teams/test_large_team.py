@@ -1,0 +1,176 @@
+"""Large teams through the public interface: known and unknown starts, growing, disturbed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from relpos import fusion
+from relpos.evaluation import metrics
+from relpos.fusion import Estimate, NodeStatus
+from relpos.fusion import switching as growing
+from relpos.fusion.bank import variance_components as noise
+from relpos.fusion.large_teams.estimator import LargeTeam
+from relpos.measurements import Measurement, Prior, Range
+from relpos.simulation.crowd import Crowd, CrowdSettings, simulate_crowd
+
+CROWD = CrowdSettings(nodes=60, seconds=50)
+
+
+@pytest.fixture(scope="module")
+def crowd() -> Crowd:
+    return simulate_crowd(CROWD, 7)
+
+
+def estimates_of(
+    priors: Sequence[Prior], measurements: Sequence[Measurement]
+) -> tuple[list[Estimate], fusion.Estimator]:
+    made = fusion.make("bank", priors, {}, 0)
+    result = [e for m in measurements for e in made.process(m)]
+    return result + made.finish(), made
+
+
+def distance_errors(crowd: Crowd, estimate: Estimate) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of the listed pairs' distances and the sigmas reported."""
+    truth = crowd.poses[round(estimate.time_s)]
+    node = np.array([p.node for p in estimate.pairs]) - 1
+    peer = np.array([p.peer for p in estimate.pairs]) - 1
+    real = np.hypot(*(truth[node, :2] - truth[peer, :2]).T)
+    return (
+        np.array([p.distance_m for p in estimate.pairs]) - real,
+        np.array([p.sigma_distance_m for p in estimate.pairs]),
+    )
+
+
+def rms_and_nees(crowd: Crowd, estimates: Sequence[Estimate]) -> tuple[float, float]:
+    pairs = [distance_errors(crowd, e) for e in estimates]
+    square = np.concatenate([e**2 for e, _ in pairs])
+    scaled = np.concatenate([(e / s) ** 2 for e, s in pairs])
+    return float(np.sqrt(square.mean())), float(scaled.mean())
+
+
+def test_a_large_team_is_known_to_a_decimetre_and_honestly(crowd: Crowd) -> None:
+    estimates, _ = estimates_of(crowd.priors(), crowd.measurements())
+    assert len(estimates) == CROWD.seconds
+    rms, nees = rms_and_nees(crowd, estimates)
+    assert rms < 0.12
+    assert 0.6 < nees < 1.4
+
+
+def test_pairs_in_reach_are_listed_in_order_and_no_others(crowd: Crowd) -> None:
+    estimates, _ = estimates_of(crowd.priors(), crowd.measurements())
+    listed = [(p.node, p.peer) for p in estimates[-1].pairs]
+    assert listed == sorted(set(listed))
+    assert all(node < peer for node, peer in listed)
+    truth = crowd.poses[-1]
+    off = np.hypot(*(truth[:, None, :2] - truth[:, :2]).transpose(2, 0, 1))
+    near = {(i + 1, j + 1) for i, j in zip(*np.nonzero(np.triu(off < 14.0, 1)), strict=True)}
+    far = {(i + 1, j + 1) for i, j in zip(*np.nonzero(np.triu(off > 17.0, 1)), strict=True)}
+    assert near <= set(listed)
+    assert not far & set(listed)
+
+
+def test_users_without_a_start_join_where_they_are(crowd: Crowd) -> None:
+    known = [p for p in crowd.priors() if p.node % 6]
+    estimates, made = estimates_of(known, crowd.measurements())
+    first, last = estimates[1], estimates[-1]
+    assert sum(n.status is NodeStatus.UNLOCATED for n in first.nodes) == 10
+    located = [n for n in last.nodes if n.status is not NodeStatus.UNLOCATED]
+    assert len(located) >= 58
+    truth = crowd.poses[-1]
+    joined = [n for n in located if n.node % 6 == 0]
+    assert joined
+    off = [math.hypot(n.x_m - truth[n.node - 1, 0], n.y_m - truth[n.node - 1, 1]) for n in joined]
+    assert max(off) < 1.0
+    assert made.counters()["joined"] == len(joined)
+
+
+def test_who_is_elsewhere_than_told_is_doubted_and_found(crowd: Crowd) -> None:
+    wrong = [replace(p, x_m=p.x_m + (6.0 if p.node == 20 else 0.0)) for p in crowd.priors()]
+    estimates, made = estimates_of(wrong, crowd.measurements())
+    node = next(n for n in estimates[-1].nodes if n.node == 20)
+    truth = crowd.poses[-1, 19]
+    assert math.hypot(node.x_m - truth[0], node.y_m - truth[1]) < 0.6
+    assert made.counters()["jumps"] >= 1
+
+
+def test_ranges_round_corners_do_little_harm() -> None:
+    late = simulate_crowd(replace(CROWD, nlos_probability=0.2), 7)
+    estimates, made = estimates_of(late.priors(), late.measurements())
+    rms, nees = rms_and_nees(late, estimates)
+    assert rms < 0.16
+    assert 0.5 < nees < 1.5
+    assert made.counters()["ranges_distrusted"] > 0.1 * len(late.range_m)
+
+
+def test_what_comes_late_is_put_in_its_place(crowd: Crowd) -> None:
+    measurements = crowd.measurements()
+    late = [m for m in measurements if isinstance(m, Range) and m.time_s == 20.0]
+    rest = [m for m in measurements if m not in late]
+    at = next(k for k, m in enumerate(rest) if m.time_s > 22.5)
+    shuffled = rest[:at] + late + rest[at:]
+    usual, _ = estimates_of(crowd.priors(), measurements)
+    other, _ = estimates_of(crowd.priors(), shuffled)
+    for a, b in zip(usual[-1].nodes, other[-1].nodes, strict=True):
+        assert a.x_m == pytest.approx(b.x_m, abs=1e-9)
+
+
+def test_a_team_that_grows_large_goes_on_from_where_everybody_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(growing, "LARGE_TEAM", 8)
+    crowd = simulate_crowd(CrowdSettings(nodes=12, neighbours=9, seconds=24), 3)
+    few = 6
+    measurements = [
+        m
+        for m in crowd.measurements()
+        if m.time_s > 8.0 or (m.node <= few and (not isinstance(m, Range) or m.peer <= few))
+    ]
+    made = fusion.make("bank", crowd.priors()[:few], {"hypotheses": 20}, 0)
+    estimates = [e for m in measurements for e in made.process(m)] + made.finish()
+    times = [e.time_s for e in estimates]
+    assert times == sorted(set(times))
+    assert made.counters()["teams_handed_over"] == 1
+    truth = crowd.poses[-1]
+    for n in estimates[-1].nodes:
+        if n.node <= few:
+            assert math.hypot(n.x_m - truth[n.node - 1, 0], n.y_m - truth[n.node - 1, 1]) < 1.5
+
+
+def test_the_same_measurements_give_the_same_estimates(crowd: Crowd) -> None:
+    measurements = [m for m in crowd.measurements() if m.time_s <= 12.0]
+    one, _ = estimates_of(crowd.priors(), measurements)
+    two, _ = estimates_of(crowd.priors(), measurements)
+    assert one == two
+
+
+def test_who_steps_unevenly_is_found_out(crowd: Crowd) -> None:
+    made = fusion.make("bank", crowd.priors(), {}, 0)
+    for m in crowd.measurements():
+        made.process(m)
+    assert isinstance(made, growing.GrowingTeam)
+    assert isinstance(made.estimator, LargeTeam)
+    level = made.estimator._levels.level
+    # The crowd's six levels of step noise are 5 10 20 10 15 10 % in turn, 9 % is the base's.
+    steady, uneven = np.median(level[0::6, noise.ALONG]), np.median(level[2::6, noise.ALONG])
+    assert uneven > 2.0 * steady
+    assert uneven > 1.3
+    # Nobody's heading wanders on a straight walk here.
+    assert np.median(level[:, noise.WHITE]) < 0.2
+
+
+def test_a_large_team_of_whom_nobody_is_located_finds_itself() -> None:
+    crowd = simulate_crowd(CrowdSettings(nodes=60, seconds=90), 6)
+    estimates, made = estimates_of([], crowd.measurements())
+    assert len(estimates[9].nodes) == 60  # who is not found yet is listed as such
+    last = estimates[-1]
+    located = [n for n in last.nodes if n.status is NodeStatus.OK]
+    assert len(located) >= 55
+    found = np.array([(n.x_m, n.y_m) for n in located])
+    truth = crowd.poses[-1][[n.node - 1 for n in located], :2]
+    assert np.sqrt(metrics.aligned_squared_distances(found, truth).mean()) < 0.5
+    assert made.counters()["joined"] >= 49

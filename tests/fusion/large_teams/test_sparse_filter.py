@@ -1,0 +1,204 @@
+"""The filter for large teams beside the dense one it stands for."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from reference import neighbourhood as dense
+from relpos.fusion.large_teams.sparse_filter import JITTER_M2, NeighbourhoodFilter, RangeModel
+from relpos.simulation.crowd import Crowd, CrowdSettings, side_of, simulate_crowd
+
+Floats = npt.NDArray[np.float64]
+
+SIGMA_M = 0.1
+
+
+def covariance_of(filter_: NeighbourhoodFilter) -> Floats:
+    """All blocks, far ones by the chain."""
+    return filter_._dense()
+
+
+def pairs_within(pose: Floats, reach_m: float) -> tuple[npt.NDArray[np.int64], ...]:
+    off = pose[:, None, :2] - pose[:, :2]
+    near = np.triu(np.hypot(off[..., 0], off[..., 1]) < reach_m, 1)
+    i, j = np.nonzero(near)
+    return i.astype(np.int64), j.astype(np.int64)
+
+
+def started(pose: Floats, width_m: float, sigma: float = 0.3) -> tuple[NeighbourhoodFilter, Floats]:
+    """Give a filter over independent starts, and the same as one dense covariance."""
+    count = len(pose)
+    each = np.tile(np.diag([sigma**2, sigma**2, 0.1**2]), (count, 1, 1))
+    made = NeighbourhoodFilter(width_m, RangeModel(SIGMA_M))
+    made.add(pose.copy(), each)
+    whole = np.zeros((3 * count, 3 * count))
+    for i in range(count):
+        whole[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = each[i] + JITTER_M2 * np.eye(3)
+    return made, whole
+
+
+def random_moves(rng: np.random.Generator, count: int) -> Floats:
+    moved = np.abs(rng.normal(0.3, 0.2, (count, 6)))
+    moved[:, :3] = rng.normal(0.0, 0.5, (count, 3))
+    return moved
+
+
+def test_within_one_strip_it_is_the_dense_filter() -> None:
+    rng = np.random.default_rng(1)
+    pose = np.column_stack([rng.uniform(0, 12, (9, 2)), rng.uniform(-3, 3, 9)])
+    made, covariance = started(pose, width_m=50.0)
+    node, peer = np.triu_indices(9, 1)
+    for _ in range(4):
+        for _ in range(2):
+            moved = 0.3 * random_moves(rng, 9)
+            made.predict(np.arange(9), moved)
+            dense.advance(pose, covariance, np.arange(9), moved)
+        true = np.hypot(*(pose[node, :2] - pose[peer, :2]).T)
+        measured = true + rng.normal(0.0, SIGMA_M, node.size)
+        made.update(node, peer, measured)
+        dense.update(pose, covariance, node, peer, measured, SIGMA_M)
+    assert np.allclose(made.pose, pose, atol=1e-7)
+    assert np.allclose(covariance_of(made), covariance, rtol=1e-6, atol=1e-10)
+
+
+def test_a_chain_of_strips_is_exact_where_the_ranges_form_one() -> None:
+    rng = np.random.default_rng(2)
+    pose = np.column_stack([rng.uniform(0, 60, 40), rng.uniform(0, 8, 40), rng.uniform(-3, 3, 40)])
+    made, covariance = started(pose, width_m=10.0)
+    assert len(made._layout.sizes) >= 5
+    node, peer = pairs_within(pose, 10.0)
+    measured = np.hypot(*(pose[node, :2] - pose[peer, :2]).T) + rng.normal(0, SIGMA_M, node.size)
+    made.update(node, peer, measured)
+    dense.update(pose, covariance, node, peer, measured, SIGMA_M)
+    assert np.allclose(made.pose, pose, atol=1e-7)
+    assert np.allclose(covariance_of(made), covariance, atol=1e-9)
+
+
+def test_time_passes_within_the_strips_as_in_the_dense_filter() -> None:
+    rng = np.random.default_rng(3)
+    pose = np.column_stack([rng.uniform(0, 30, 12), rng.uniform(0, 8, 12), rng.uniform(-3, 3, 12)])
+    made, covariance = started(pose, width_m=11.0)
+    node, peer = pairs_within(pose, 11.0)
+    measured = np.hypot(*(pose[node, :2] - pose[peer, :2]).T)
+    made.update(node, peer, measured)
+    dense.update(pose, covariance, node, peer, measured, SIGMA_M)
+    # Some nodes twice, some not at all: pieces of motion come as they come.
+    who = np.array([0, 3, 3, 5, 7, 11, 0])
+    moved = random_moves(rng, who.size)
+    made.predict(who, moved)
+    dense.advance(pose, covariance, who, moved)
+    assert np.allclose(made.pose, pose)
+    got = made.spread(node, peer)
+    expected = dense.spread(pose, covariance, node, peer)
+    assert np.allclose(got, expected, atol=1e-9)
+
+
+def test_a_node_that_walks_into_the_next_strip_takes_its_covariance_along() -> None:
+    rng = np.random.default_rng(4)
+    pose = np.column_stack([rng.uniform(0, 60, 50), rng.uniform(0, 8, 50), rng.uniform(-3, 3, 50)])
+    made, _ = started(pose, width_m=10.0)
+    node, peer = pairs_within(pose, 10.0)
+    measured = np.hypot(*(pose[node, :2] - pose[peer, :2]).T)
+    made.update(node, peer, measured)
+    before = covariance_of(made)
+    strip = made._layout.strip
+    for direction, at in ((1, 1), (-1, 3), (1, 3)):
+        movers = np.flatnonzero(made._layout.strip == at)[:2]
+        assert made._move(movers, direction)
+    assert (made._layout.strip != strip).sum() >= 2
+    layout = made._layout
+    close = np.abs(layout.strip[:, None] - layout.strip) <= 1
+    kept = np.repeat(np.repeat(close, 3, axis=0), 3, axis=1)
+    assert np.allclose(covariance_of(made)[kept], before[kept], atol=1e-12)
+    assert made.counters["covariances_unknown"] == 0
+
+
+def play(crowd: Crowd, *, with_dense: bool) -> dict[str, float]:
+    """Errors and NEES of pairs in reach, of the filter and of the dense one beside it."""
+    count = crowd.settings.nodes
+    made = NeighbourhoodFilter(crowd.settings.max_range_m, RangeModel(crowd.settings.sigma_range_m))
+    made.add(crowd.poses[0].copy(), np.zeros((count, 3, 3)))
+    pose, covariance = crowd.poses[0].copy(), JITTER_M2 * np.eye(3 * count)
+    everybody = np.arange(count)
+    squares: dict[str, list[float]] = {"filter": [], "dense": [], "nees": [], "nees_all": []}
+    one, two = np.triu_indices(count, 1)
+    for t, motion in enumerate(crowd.motions, 1):
+        moved = np.concatenate([motion, crowd.sigmas[t - 1]], axis=1)
+        made.predict(everybody, moved)
+        if with_dense:
+            dense.advance(pose, covariance, everybody, moved)
+        if t % crowd.settings.range_period_s:
+            continue
+        k = t // crowd.settings.range_period_s - 1
+        at = slice(crowd.first[k], crowd.first[k + 1])
+        node, peer, measured = crowd.node[at], crowd.peer[at], crowd.range_m[at]
+        made.update(node, peer, measured)
+        truth = crowd.poses[t]
+
+        def errors(of: Floats, a: Floats, b: Floats, truth: Floats = truth) -> Floats:
+            off, real = of[a, :2] - of[b, :2], truth[a, :2] - truth[b, :2]
+            return np.asarray(np.hypot(*off.T) - np.hypot(*real.T))
+
+        squares["filter"].append(float(np.mean(errors(made.pose, node, peer) ** 2)))
+        near = errors(made.pose, node, peer) ** 2 / made.spread(node, peer)[1]
+        squares["nees"].append(float(np.mean(near)))
+        every = dense_spread_along(made, one, two)
+        squares["nees_all"].append(float(np.mean(errors(made.pose, one, two) ** 2 / every)))
+        if with_dense:
+            dense.update(pose, covariance, node, peer, measured, crowd.settings.sigma_range_m)
+            squares["dense"].append(float(np.mean(errors(pose, node, peer) ** 2)))
+    return {
+        "filter": float(np.sqrt(np.mean(squares["filter"]))),
+        "dense": float(np.sqrt(np.mean(squares["dense"]))) if with_dense else np.nan,
+        "nees": float(np.mean(squares["nees"])),
+        "nees_all": float(np.mean(squares["nees_all"])),
+    }
+
+
+def dense_spread_along(
+    made: NeighbourhoodFilter, one: npt.NDArray[np.intp], two: npt.NDArray[np.intp]
+) -> Floats:
+    """Variance of every pair's distance, far pairs by the chain."""
+    covariance = covariance_of(made)
+    off = made.pose[two, :2] - made.pose[one, :2]
+    u = off / np.hypot(*off.T)[:, None]
+    total = np.zeros(one.size)
+    for a, b, sign in ((one, one, 1), (two, two, 1), (one, two, -1), (two, one, -1)):
+        for p in range(2):
+            for q in range(2):
+                total += sign * u[:, p] * u[:, q] * covariance[3 * a + p, 3 * b + q]
+    return total
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+def test_in_a_crowd_it_is_within_a_tenth_of_the_dense_filter_and_honest(seed: int) -> None:
+    got = play(simulate_crowd(CrowdSettings(nodes=90, seconds=60), seed), with_dense=True)
+    assert got["filter"] < 1.10 * got["dense"]
+    assert 0.8 < got["nees"] < 1.3
+    assert 0.7 < got["nees_all"] < 1.4  # one run of 90 walkers: far pairs share few errors
+
+
+def test_far_pairs_come_from_the_chain_and_ranges_beyond_a_strip_are_taken() -> None:
+    rng = np.random.default_rng(5)
+    pose = np.column_stack([np.arange(8) * 10.0, rng.uniform(0, 3, 8), np.zeros(8)])
+    made, _ = started(pose, width_m=10.0)
+    # 35 m reach over three strips: the strips have to give way, the range has to count.
+    true = float(np.hypot(*(pose[0, :2] - pose[3, :2])))
+    before = made.spread(np.array([0]), np.array([3]))[1, 0]
+    made.update(np.array([0]), np.array([3]), np.array([true]))
+    assert made.spread(np.array([0]), np.array([3]))[1, 0] < 0.2 * before
+    assert made.counters["strips_widened"] == 1
+
+
+def test_a_crowd_has_the_neighbours_it_was_asked_for() -> None:
+    crowd = simulate_crowd(CrowdSettings(nodes=300, seconds=40, neighbours=8), 3)
+    epochs = len(crowd.first) - 1
+    assert 2 * len(crowd.range_m) / (300 * epochs) == pytest.approx(8.0, rel=0.12)
+    assert crowd.side_m == pytest.approx(side_of(300, 8, 15.0))
+    assert np.array_equal(
+        crowd.range_m, simulate_crowd(CrowdSettings(nodes=300, seconds=40), 3).range_m
+    )
+    steps = np.linalg.norm(np.diff(crowd.poses[:, :, :2], axis=0), axis=2)
+    assert steps.max() <= 0.5 + 1e-9

@@ -1,0 +1,176 @@
+"""Silence is a measurement: the curve P(heard | distance) is learned, and used with care."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import groupby, permutations
+
+import numpy as np
+import pytest
+
+from relpos import fusion
+from relpos.fusion.models.detection import Detection, Round, Rounds
+from relpos.measurements import Range
+from relpos.simulation.paper import simulate_paper
+
+
+def always(_: int) -> float:
+    return math.inf
+
+
+def taught_by(scenario: str, seed: int) -> Detection:
+    """A curve learned over a simulated run, distances known to 0.1 m."""
+    run = simulate_paper(scenario, seed)
+    places: dict[float, dict[int, complex]] = {}
+    for t in run.truth:
+        places.setdefault(t.time_s, {})[t.node] = complex(t.x_m, t.y_m)
+    rng = np.random.default_rng(seed)
+    learner = Detection()
+    ranges = [m for m in run.measurements if isinstance(m, Range)]
+    for time_s, group in groupby(ranges, key=lambda r: r.time_s):
+        for one in learner.rounds.take(time_s, list(group), always):
+            at = places[one.time_s]
+
+            def seen(
+                pairs: Sequence[tuple[int, int]], at: dict[int, complex] = at
+            ) -> tuple[np.ndarray, np.ndarray]:
+                true = np.array([abs(at[a] - at[b]) for a, b in pairs])
+                return np.abs(true + rng.normal(0, 0.1, len(pairs))), np.full(len(pairs), 0.1)
+
+            learner.learn(one, *seen(one.heard), *seen(one.silent))
+    return learner
+
+
+@pytest.mark.parametrize(
+    ("scenario", "near", "edge_m"), [("paper", 0.5, 15.0), ("paper-h", 1.0, 10.0)]
+)
+def test_the_learned_curve_is_the_simulated_one(scenario: str, near: float, edge_m: float) -> None:
+    learner = taught_by(scenario, 5)
+    inside = learner.probability(np.array([1.0, 4.0, 0.8 * edge_m]))
+    beyond = learner.probability(np.array([1.15 * edge_m, 2.0 * edge_m]))
+    assert inside == pytest.approx(near, abs=0.04)
+    assert (beyond < 0.02).all()
+    assert learner.known
+    assert abs(learner.range_m - edge_m) < 0.08 * edge_m
+    assert learner.weight > 0.6  # independent silences keep most of their weight
+
+
+def test_before_anything_is_learned_silence_says_little() -> None:
+    learner = Detection()
+    near, far = np.log1p(-learner.probability(np.array([2.0, 30.0])))
+    assert 0.0 < far - near < 1.0
+    assert not learner.known
+
+
+def instants(
+    rounds: Rounds,
+    ranged: Sequence[tuple[float, list[tuple[int, int]]]],
+    alive: Callable[..., float],
+) -> list[Round]:
+    return [
+        one
+        for time_s, pairs in ranged
+        for one in rounds.take(time_s, [Range(time_s, a, b, 3.0) for a, b in pairs], alive)
+    ]
+
+
+ALL = [(1, 2), (1, 3), (2, 3)]
+
+
+def test_a_pair_counts_as_tried_when_one_of_the_two_ranged_another() -> None:
+    rounds = Rounds()
+    given = instants(rounds, [(0.0, ALL), (2.0, [(1, 2), (2, 3)])], always)
+    assert given[0].silent == ()
+    assert given[1].silent == ((1, 3),)
+
+
+def test_the_silence_of_a_node_that_is_off_says_nothing() -> None:
+    rounds = Rounds()
+    everyone = [*ALL, (1, 4), (2, 4), (3, 4)]
+    given = instants(rounds, [(0.0, everyone)], always)
+    off = {4: 0.0}  # its last motion; the others go on
+    given += instants(rounds, [(10.0, ALL)], lambda node: off.get(node, 10.0))
+    assert given[-1].silent == ()
+    on = instants(rounds, [(12.0, ALL)], always)
+    assert on[-1].silent == ((1, 4), (2, 4), (3, 4))
+
+
+def test_a_pair_that_never_ranged_is_not_taken_for_silent() -> None:
+    rounds = Rounds()
+    given = instants(rounds, [(float(t), [(1, 2), (3, 4), (2, 3)]) for t in range(9)], always)
+    assert all(one.silent == () for one in given)
+
+
+def test_where_nodes_take_turns_a_round_lasts_until_somebody_ranges_the_same_again() -> None:
+    rounds = Rounds()
+    turns = [
+        (2.0 * cycle + 0.3 * node + 0.02 * peer, [(node, peer)])
+        for cycle in range(20)
+        for node, peer in permutations((1, 2, 3), 2)
+        if not (cycle > 5 and {node, peer} == {1, 3})
+    ]
+    given = instants(rounds, turns, always)
+    assert {one.silent for one in given[4:6]} == {()}
+    assert {one.silent for one in given[8:]} == {((1, 3),)}
+    assert 17 <= len(given) <= 21
+
+
+def learn(learner: Detection, one: Round, far_m: float = 2.0) -> np.ndarray:
+    heard, silent = len(one.heard), len(one.silent)
+    return learner.learn(
+        one,
+        np.full(heard, 2.0), np.full(heard, 0.1), np.full(silent, far_m), np.full(silent, 0.1),
+    )  # fmt: skip
+
+
+def test_a_node_nobody_hears_for_long_is_taken_for_broken_and_not_for_far() -> None:
+    learner = Detection()
+    everyone = [(a, b) for a in (1, 2, 3, 4) for b in range(a + 1, 5)]
+    for one in instants(learner.rounds, [(float(t), everyone) for t in range(60)], always):
+        learn(learner, one)
+    alone = instants(learner.rounds, [(60.0 + t, ALL) for t in range(12)], always)
+    worth = [float(learn(learner, one).max()) for one in alone]
+    assert worth[-1] < 0.01
+    # It is heard again: believed at once.
+    instants(learner.rounds, [(80.0, everyone)], always)
+    learn(learner, Round(80.0, tuple(everyone), (), (True,) * 6))
+    again = instants(learner.rounds, [(81.0, [*ALL, (1, 4), (2, 4)])], always)
+    assert learn(learner, again[-1]).min() > 0.9
+
+
+def test_silences_that_follow_each_other_count_less_than_independent_ones() -> None:
+    rng = np.random.default_rng(1)
+    blocked, free = Detection(), Detection()
+    for learner, stays in ((blocked, 0.97), (free, 0.5)):
+        state = dict.fromkeys(ALL, True)
+        for t in range(400):
+            for pair in ALL:
+                if rng.random() > stays:
+                    state[pair] = not state[pair]
+            heard = tuple(p for p in ALL if state[p])
+            silent = tuple(p for p in ALL if not state[p])
+            learn(learner, Round(float(t), heard, silent, (True,) * len(heard)))
+    assert blocked.weight < 0.25
+    assert free.weight > 0.8
+
+
+def test_what_was_learned_after_a_snapshot_does_not_change_it() -> None:
+    learner = Detection()
+    given = instants(learner.rounds, [(float(t), ALL) for t in range(30)], always)
+    kept = learner.snapshot()
+    before = kept.curve.copy()
+    for one in given:
+        learn(learner, one)
+    assert (kept.curve == before).all()
+    assert not np.allclose(learner.curve, before)
+
+
+def test_the_bank_reports_how_far_the_team_hears() -> None:
+    run = simulate_paper("paper-h2", 2, {"seconds": 200.0})
+    bank = fusion.make("bank", run.priors, {}, 1)
+    estimates = [e for m in run.measurements for e in bank.process(m)] + bank.finish()
+    found = [p for p in estimates[-1].parameters if p.name == "detection_range_m"]
+    assert {p.node for p in found} == {1, 2, 3, 4, 5, 6}
+    assert found[0].value == pytest.approx(10.0, abs=1.5)
+    assert found[0].sigma < 1.5

@@ -1,0 +1,89 @@
+"""Compasses in a frame of which nobody knows how it lies to north."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from relpos import fusion
+from relpos.evaluation import metrics, tracks
+from relpos.fusion.estimator import Estimate
+from relpos.fusion.models.north import North
+from relpos.measurements import Heading, Measurement
+from relpos.simulation.paper import simulate_paper
+
+SIGMA_RAD = math.radians(15.0)
+
+
+def score(north_rad: float | None) -> tuple[metrics.Metrics, Estimate]:
+    """Two minutes of P1 with a compass each, whose east lies so in the frame; the last estimate."""
+    run = simulate_paper("paper-p1", 3, {"seconds": 120.0})
+    measurements: list[Measurement] = list(run.measurements)
+    if north_rad is not None:
+        rng = np.random.default_rng(5)
+        measurements += [
+            Heading(
+                t.time_s,
+                t.node,
+                t.heading_rad + north_rad + rng.normal(0.0, SIGMA_RAD),
+                SIGMA_RAD,
+                "magnetic",
+            )
+            for t in run.truth
+            if t.heading_rad is not None and t.time_s == round(t.time_s)
+        ]
+        measurements.sort(key=lambda m: m.time_s)
+    estimator = fusion.make("bank", run.priors, {}, 0)
+    estimates = [e for m in measurements for e in estimator.process(m)] + estimator.finish()
+    figures = metrics.evaluate(
+        tracks.estimated_tracks(estimates),
+        tracks.true_tracks(run.truth),
+        tracks.estimated_pairs(estimates),
+    )
+    return figures, estimates[-1]
+
+
+@pytest.fixture(scope="module")
+def without() -> metrics.Metrics:
+    figures, last = score(None)
+    assert last.north is None
+    return figures
+
+
+@pytest.mark.parametrize("north_rad", [0.0, 2.2, -3.1])
+def test_however_the_frame_lies_to_north_compasses_do_no_harm(
+    north_rad: float, without: metrics.Metrics
+) -> None:
+    figures, last = score(north_rad)
+    assert last.north is not None
+    # A heading is told from magnetic east: north is a right angle on.
+    off_rad = math.remainder(last.north.bearing_rad - (math.pi / 2 - north_rad), math.tau)
+    assert abs(off_rad) < 3.0 * last.north.sigma_rad < math.radians(20.0)
+    assert figures.relative_distance_rmse_m < 1.2 * without.relative_distance_rmse_m
+    assert figures.body_frame_rmse_m < 1.1 * without.body_frame_rmse_m
+
+
+def test_the_angle_is_learned_from_heads_that_are_known() -> None:
+    north, rng = North(), np.random.default_rng(0)
+    for second in range(400):
+        told = math.remainder(3.0 + rng.normal(0.0, SIGMA_RAD), math.tau)
+        sigma = north.alone_sigma_rad(1 + second % 4, float(second), SIGMA_RAD)
+        north.learn(told, sigma, 0.0, 0.01)
+    assert abs(math.remainder(north.angle_rad - 3.0, math.tau)) < 3.0 * north.sigma_rad
+    assert north.sigma_rad < math.radians(6.0)
+
+
+def test_a_compass_beside_iron_does_not_turn_the_team() -> None:
+    north = North(0.5, 0.1)
+    assert not north.learn(0.5 + math.pi, SIGMA_RAD, 0.0, 0.01)
+    assert (north.angle_rad, north.sigma_rad) == (0.5, 0.1)
+
+
+def test_readings_soon_after_each_other_count_as_one() -> None:
+    north = North()
+    first = north.alone_sigma_rad(1, 0.0, SIGMA_RAD)
+    others = [north.alone_sigma_rad(1, float(t), SIGMA_RAD) for t in range(1, 11)]
+    assert first == SIGMA_RAD
+    assert sum(1.0 / s**2 for s in others) == pytest.approx(1.0 / SIGMA_RAD**2)

@@ -1,0 +1,216 @@
+"""What stands between a measured range and two positions: bias, height, lever arm, repetition."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from relpos import fusion
+from relpos.evaluation import metrics, tracks
+from relpos.fusion.bank import joint, lanes
+from relpos.fusion.bank.joint import PER_NODE
+from relpos.fusion.estimator import Estimate
+from relpos.fusion.models.ranging import Repetition
+from relpos.measurements import Height, Measurement, Motion, Prior, Range
+from relpos.simulation.paper import simulate_paper
+
+
+@dataclass(frozen=True)
+class Worn:
+    height_m: float | None = None
+    antenna_offset_m: tuple[float, float] | None = None
+
+
+def slant(x: np.ndarray, arms: np.ndarray, dz: float) -> float:
+    """Distance between two antennas, written with complex numbers."""
+    at = [
+        complex(x[b], x[b + 1]) + complex(*arm) * np.exp(1j * x[b + 2])
+        for b, arm in ((0, arms[0]), (PER_NODE, arms[1]))
+    ]
+    return math.hypot(abs(at[1] - at[0]), dz)
+
+
+def updated(
+    x: np.ndarray, p: np.ndarray, arms: np.ndarray, dz: float, measured: float, sigma: float
+) -> tuple[np.ndarray, np.ndarray]:
+    xs, ps = joint.pack(x[None], p[None], 2)
+    sens = np.zeros((1, 2, 3, 6, lanes.LANES))
+    joint.update(
+        xs, ps, np.zeros((1, lanes.LANES)), np.full((1, lanes.LANES), sigma**2), sens,
+        np.array([0]), np.array([1]), np.array([-1]),
+        np.array([measured]), np.array([dz]), np.array([1e-9, 9.0, 0.1, 1.0]),
+        np.ones(1), np.zeros(1), arms, lanes.empty_lines(1, joint.STATS, 1),
+    )  # fmt: skip
+    after = joint.unpack(xs, ps, 2, 1)
+    return after[0][0], after[1][0]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_range_between_antennas_off_the_body_turns_the_heading_as_its_jacobian_says(
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    size = 2 * PER_NODE
+    x = rng.normal(0.0, 1.0, size)
+    x[PER_NODE : PER_NODE + 2] += 5.0
+    arms = rng.normal(0.0, 0.4, (2, 2))
+    dz, sigma = 0.7, 0.05
+    root = 1e-3 * rng.normal(size=(size, size))
+    p = root @ root.T
+    jacobian = np.empty(size)
+    for k in range(size):
+        step = np.zeros(size)
+        step[k] = 1e-6
+        jacobian[k] = (slant(x + step, arms, dz) - slant(x - step, arms, dz)) / 2e-6
+    measured = slant(x, arms, dz) + 0.01
+    gain = p @ jacobian / (jacobian @ p @ jacobian + sigma**2)
+    after_x, after_p = updated(x, p, arms, dz, measured, sigma)
+    assert after_x - x == pytest.approx(gain * 0.01, rel=2e-2, abs=1e-10)
+    assert after_p == pytest.approx(p - np.outer(gain, jacobian @ p), rel=2e-2, abs=1e-12)
+    assert jacobian[2] != 0.0
+
+
+def test_arms_of_zero_change_nothing() -> None:
+    rng = np.random.default_rng(1)
+    x = rng.normal(0.0, 3.0, 2 * PER_NODE)
+    root = 0.3 * rng.normal(size=(len(x), len(x)))
+    p = root @ root.T
+    with_arms = updated(x, p, np.zeros((2, 2)), 0.5, 4.0, 0.1)
+    without = updated(x, p, np.zeros((0, 2)), 0.5, 4.0, 0.1)
+    for a, b in zip(with_arms, without, strict=True):
+        assert a == pytest.approx(b, rel=1e-9, abs=1e-12)
+
+
+def test_repeated_ranges_of_two_who_stand_tell_little_new_and_moving_makes_them_independent() -> (
+    None
+):
+    repetition = Repetition()
+    assert repetition.worth([(1, 2)]) == pytest.approx([1.0])
+    assert sum(repetition.worth([(2, 1)])[0] for _ in range(10)) < 1.0
+    repetition.move(1, 1.0, 1.0, 0.0)
+    assert repetition.worth([(1, 2)])[0] > 0.9
+    # What a walked metre is worth does not depend on how often the two range on it.
+    often, seldom = Repetition(), Repetition()
+    for r in (often, seldom):
+        r.worth([(1, 2)])
+    total = {}
+    for r, pieces in ((often, 100), (seldom, 25)):
+        total[pieces] = 0.0
+        for _ in range(pieces):
+            r.move(2, 3.0 / pieces, 0.0, 0.0)
+            total[pieces] += r.worth([(1, 2)])[0]
+    assert 2.0 < total[25] < total[100] < 2.0 * total[25]
+
+
+def team(
+    seconds: int, seed: int, bias: dict[tuple[int, int], float] | float = 0.0, **geometry: Worn
+) -> tuple[list[Measurement], list[Prior], dict[int, list[complex]]]:
+    """Three people on circles of their own; ranges between the antennas that they wear.
+
+    ``geometry``: n1, n2, n3 -> how the node is worn.
+    """
+    rng = np.random.default_rng(seed)
+    measurements: list[Measurement] = []
+    priors, truth = [], {n: [] for n in (1, 2, 3)}
+    poses: dict[int, tuple[complex, float]] = {}
+    for n in (1, 2, 3):
+        poses[n] = (complex(2.0 * n, 3.0 * (n % 2)), 2.0 * n)
+        priors.append(Prior(n, poses[n][0].real, poses[n][0].imag, poses[n][1]))
+    for t in range(1, seconds):
+        for n, (place, heading) in poses.items():
+            turn, step = 0.25 + 0.05 * n, 0.7
+            # Turn, then move: the displacement lies along the new heading.
+            new = heading + turn
+            poses[n] = (place + step * np.exp(1j * new), new)
+            truth[n].append(poses[n][0])
+            turned = turn + rng.normal(0.0, math.radians(1.5))
+            walked = step * (1.0 + 0.05 * rng.normal())
+            measurements.append(
+                Motion(float(t), n, walked * math.cos(turned), walked * math.sin(turned), turned)
+            )
+        antenna = {}
+        for n, (place, heading) in poses.items():
+            worn = geometry.get(f"n{n}", Worn())
+            arm = complex(*(worn.antenna_offset_m or (0.0, 0.0)))
+            antenna[n] = (place + arm * np.exp(1j * heading), worn.height_m or 0.0)
+        for a, b in ((1, 2), (1, 3), (2, 3)):
+            flat = abs(antenna[a][0] - antenna[b][0])
+            own = bias if isinstance(bias, float) else bias[a, b]
+            value = math.hypot(flat, antenna[a][1] - antenna[b][1]) + own
+            measurements.append(Range(float(t), a, b, value + 0.05 * rng.normal()))
+    return measurements, priors, truth
+
+
+def fused(
+    measurements: list[Measurement], priors: list[Prior], nodes: dict[int, Worn] | None = None
+) -> list[Estimate]:
+    bank = fusion.make("bank", priors, {"hypotheses": 60}, 1, nodes)
+    return [e for m in measurements for e in bank.process(m)] + bank.finish()
+
+
+def distance_rmse(estimates: list[Estimate], truth: dict[int, list[complex]]) -> float:
+    errors = [
+        p.distance_m - abs(truth[p.node][round(e.time_s) - 1] - truth[p.peer][round(e.time_s) - 1])
+        for e in estimates
+        for p in e.pairs
+        if e.time_s == round(e.time_s) and 1 <= e.time_s <= len(truth[1])
+    ]
+    return float(np.sqrt(np.mean(np.square(errors))))
+
+
+def test_known_antenna_offsets_are_used() -> None:
+    worn = {1: Worn(antenna_offset_m=(0.5, 0.0)), 2: Worn(antenna_offset_m=(-0.4, 0.3)), 3: Worn()}
+    measurements, priors, truth = team(150, 1, n1=worn[1], n2=worn[2])
+    told = distance_rmse(fused(measurements, priors, worn), truth)
+    untold = distance_rmse(fused(measurements, priors), truth)
+    assert told < 0.1
+    assert told < 0.6 * untold
+
+
+def test_tags_at_different_heights_make_slant_ranges() -> None:
+    worn = {1: Worn(height_m=2.5), 2: Worn(height_m=1.0), 3: Worn(height_m=0.3)}
+    measurements, priors, truth = team(150, 2, n1=worn[1], n2=worn[2], n3=worn[3])
+    estimates = fused(measurements, priors, worn)
+    told, untold = (distance_rmse(e, truth) for e in (estimates, fused(measurements, priors)))
+    assert told < 0.1
+    assert told < 0.75 * untold
+    assert estimates[-1].nodes[0].z_m == pytest.approx(2.5)
+
+
+def test_heights_from_pressure_add_to_those_of_the_tags() -> None:
+    worn = {1: Worn(height_m=1.5), 2: Worn(height_m=1.0), 3: Worn(height_m=1.0)}
+    lifted = replace(worn[1], height_m=3.5)
+    measurements, priors, truth = team(150, 3, n1=lifted, n2=worn[2], n3=worn[3])
+    measurements.insert(0, Height(0.0, 1, 2.0, 0.1))
+    estimates = fused(measurements, priors, worn)
+    assert distance_rmse(estimates, truth) < 0.1
+    assert estimates[-1].nodes[0].z_m == pytest.approx(3.5)
+
+
+def test_range_biases_are_found_and_reported_with_their_pairs() -> None:
+    bias = {(1, 2): 0.30, (1, 3): 0.50, (2, 3): 0.36}
+    measurements, priors, truth = team(200, 4, bias)
+    estimates = fused(measurements, priors)
+    found = {(p.node, p.peer): p for p in estimates[-1].parameters if p.name == "range_bias_m"}
+    assert set(found) == set(bias)
+    for pair, value in bias.items():
+        assert found[pair].value == pytest.approx(value, abs=0.12)  # type: ignore[index]
+        assert 0.002 < found[pair].sigma < 0.1  # type: ignore[index]
+    assert distance_rmse(estimates, truth) < 0.12
+
+
+def test_where_ranges_have_no_bias_looking_for_one_costs_little() -> None:
+    run = simulate_paper("paper-p1", 11, {"seconds": 200.0})
+    scores = []
+    for share in (0.0, 0.5):
+        bank = fusion.make("bank", run.priors, {"biased": share}, 3)
+        estimates = [e for m in run.measurements for e in bank.process(m)] + bank.finish()
+        scores.append(
+            metrics.evaluate(
+                tracks.estimated_tracks(estimates), tracks.true_tracks(run.truth)
+            ).relative_distance_rmse_m
+        )
+    assert scores[1] < scores[0] + 0.1

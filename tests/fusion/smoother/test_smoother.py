@@ -1,0 +1,291 @@
+"""The smoother: kernels against dense twins, tracks against the truth and the bound."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from reference import smoother as twin
+from relpos import fusion
+from relpos.errors import RelposError
+from relpos.evaluation import bounds, metrics, tracks
+from relpos.fusion.estimator import Estimate, NodeStatus
+from relpos.fusion.smoother.estimator import Smoother
+from relpos.fusion.smoother.graph import build_graph
+from relpos.fusion.smoother.problem import Problem, State, Weights, hear, know, weigh
+from relpos.measurements import Height, Motion, Prior, Range
+from relpos.simulation.paper import SimulatedRun, simulate_paper
+
+Floats = npt.NDArray[np.float64]
+
+
+def _problem(seed: int = 3) -> tuple[Problem, State, Weights]:
+    """Three nodes with every kind of trouble: off-grid ranges, bends, antennas, heights."""
+    rng = np.random.default_rng(seed)
+    measurements: list[Motion | Range | Height] = [Height(0.05, 2, 1.2)]
+    for k in range(1, 7):
+        for node in (1, 2, 3):
+            # Phases of their own: chords are cut, and bend where two pieces meet.
+            time_s = k + 0.3 * (node - 1)
+            measurements.append(Motion(time_s, node, 0.6, 0.1 * node, 0.2 * node - 0.3))
+        for node, peer in ((1, 2), (1, 3), (2, 3)):
+            measurements.append(Range(k + rng.uniform(0, 0.9), node, peer, rng.uniform(2.0, 9.0)))
+    measurements.sort(key=lambda m: m.time_s)
+    priors = [Prior(1, 0, 0, 0), Prior(2, 4, 1, 0.5, 0.1, 0.1), Prior(3, 1, 6, -1, 1.0, 0.5)]
+    graph, _ = build_graph(measurements, priors, {1: 0.4}, {3: (0.2, -0.1)})
+    problem = Problem(graph)
+    shape = (graph.time_s.size, 3, 3)
+    start = graph.dead_reckoned(graph.start) + 0.2 * rng.standard_normal(shape)
+    state = State(start, 0.05 * rng.standard_normal(problem.constants))
+    weights = Weights(
+        rng.uniform(1.0, 50.0, (shape[0] - 1, 3, 3)),
+        rng.uniform(1.0, 50.0, graph.range_m.size),
+        rng.uniform(1.0, 50.0, problem.constants),
+    )
+    return problem, state, weights
+
+
+def test_the_residuals_are_the_twins() -> None:
+    problem, state, _ = _problem()
+    graph, n = problem.graph, problem.nodes
+    assert (graph.share < 0.999).any()
+    assert np.abs(graph.bend).max() > 1e-3
+    assert np.abs(graph.rise_m).max() > 0.1
+    motion = twin.motion_residuals(
+        state.poses, state.constants[:n], state.constants[n : 2 * n], graph.duration_s,
+        graph.length_m, graph.direction_rad, graph.turn_rad, graph.follow,
+    )  # fmt: skip
+    assert problem.motion_residuals(state) == pytest.approx(motion, abs=1e-12)
+    ranges = twin.range_residuals(
+        state.poses, state.constants[2 * n :], graph.slot, graph.pair, graph.share, graph.bend,
+        graph.antenna_m, graph.rise_m, graph.range_m, graph.pair_index,
+    )  # fmt: skip
+    assert problem.range_residuals(state) == pytest.approx(ranges, abs=1e-12)
+
+
+def _stacked(problem: Problem, state: State) -> tuple[Floats, Callable[[Floats], Floats]]:
+    """Give the state as one vector, and all residuals as a function of it."""
+    size = state.poses.size
+
+    def residuals(x: Floats) -> Floats:
+        at = State(x[:size].reshape(state.poses.shape), x[size:])
+        return np.concatenate(
+            [
+                problem.motion_residuals(at).ravel(),
+                problem.range_residuals(at),
+                problem.start_residuals(at).ravel(),
+                at.constants,
+            ]
+        )
+
+    return np.concatenate((state.poses.ravel(), state.constants)), residuals
+
+
+def test_the_normal_equations_are_those_of_finite_differences() -> None:
+    problem, state, weights = _problem()
+    at, residuals = _stacked(problem, state)
+    weight = np.concatenate(
+        [
+            weights.motion.ravel(),
+            weights.ranges,
+            problem.graph.start_weight.ravel(),
+            weights.constants,
+        ]
+    )
+    matrix, gradient = twin.normal_equations(residuals, at, weight)
+    equations = problem.normal_equations(state, weights)
+    whole = twin.whole_matrix(equations.a, equations.e, equations.border, equations.corner)
+    scale = np.sqrt(np.diag(matrix))
+    assert whole / np.outer(scale, scale) == pytest.approx(
+        matrix / np.outer(scale, scale), abs=1e-6
+    )
+    flat = np.concatenate((equations.gradient.ravel(), equations.corner_gradient))
+    assert flat / scale == pytest.approx(gradient / scale, abs=1e-5)
+
+
+def test_the_block_solution_is_the_dense_one() -> None:
+    problem, state, weights = _problem()
+    equations = problem.normal_equations(state, weights)
+    whole = twin.whole_matrix(equations.a, equations.e, equations.border, equations.corner)
+    gradient = np.concatenate((equations.gradient.ravel(), equations.corner_gradient))
+    solved = equations.solve()
+    assert solved is not None
+    found = np.concatenate((solved[0].ravel(), solved[1]))
+    assert found == pytest.approx(np.linalg.solve(whole, gradient), rel=1e-6, abs=1e-9)
+
+
+def test_the_covariance_blocks_are_those_of_the_dense_inverse() -> None:
+    problem, state, weights = _problem()
+    equations = problem.normal_equations(state, weights)
+    whole = twin.whole_matrix(equations.a, equations.e, equations.border, equations.corner)
+    inverse = np.linalg.inv(whole)
+    covariance = equations.covariance()
+    knots, b = covariance.diagonal.shape[:2]
+    for k in range(knots):
+        at = slice(k * b, (k + 1) * b)
+        assert covariance.diagonal[k] == pytest.approx(inverse[at, at], rel=1e-6, abs=1e-10)
+        assert covariance.with_constants[k] == pytest.approx(
+            inverse[at, knots * b :], rel=1e-6, abs=1e-10
+        )
+        if k < knots - 1:
+            after = slice((k + 1) * b, (k + 2) * b)
+            assert covariance.below[k] == pytest.approx(inverse[after, at], rel=1e-6, abs=1e-10)
+    assert covariance.log_determinant == pytest.approx(np.linalg.slogdet(whole)[1])
+
+    # Variances of the residuals, by their derivatives over the whole state.
+    at_x, residuals = _stacked(problem, state)
+    step = 1e-6 * np.eye(at_x.size)
+    slope = np.array([residuals(at_x + row) - residuals(at_x - row) for row in step]).T / 2e-6
+    variance = np.einsum("mi,ij,mj->m", slope, inverse, slope)
+    motions = problem.motion_variances(state, covariance)
+    assert motions.ravel() == pytest.approx(variance[: motions.size], rel=1e-4)
+    ranges = problem.range_variances(state, covariance)
+    assert ranges == pytest.approx(variance[motions.size :][: ranges.size], rel=1e-4)
+
+
+def test_the_levels_move_the_solution_as_small_changes_of_them_do() -> None:
+    problem, state, _ = _problem()
+    levels = problem.first_levels()
+    inliers = np.ones(problem.graph.range_m.size)
+    bases = problem.bases(state, levels)
+    weights = weigh(problem, levels, bases, inliers, 0.0)
+    equations = problem.normal_equations(state, weights)
+    whole = twin.whole_matrix(equations.a, equations.e, equations.border, equations.corner)
+    _, knowledge = know(problem, state, levels, bases, weights)
+    for node, level in ((0, 0), (1, 3), (2, 4), (2, 5)):
+        gradients = []
+        for shift in (1e-4, -1e-4):
+            changed = levels.copy()
+            changed.motion[node, level] *= math.exp(shift)
+            at = problem.normal_equations(state, weigh(problem, changed, bases, inliers, 0.0))
+            gradients.append(np.concatenate((at.gradient.ravel(), at.corner_gradient)))
+        expected = -np.linalg.solve(whole, gradients[0] - gradients[1]) / 2e-4
+        column = 7 * node + level
+        found = np.append(knowledge.poses[:, :, column], knowledge.constants[:, column])
+        assert np.abs(expected).max() > 1e-6
+        assert found == pytest.approx(expected, rel=1e-3, abs=1e-6 * np.abs(expected).max())
+    assert np.linalg.eigvalsh(knowledge.information).min() > -1e-9
+
+
+def test_silence_says_farther_and_hearing_says_nearer() -> None:
+    run = simulate_paper("paper-h", 3, {"seconds": 200})
+    graph, _ = build_graph(run.measurements, run.priors)
+    problem = Problem(graph)
+    state = problem.first_state(graph.dead_reckoned(graph.start))
+    levels = problem.first_levels()
+    weights = weigh(problem, levels, problem.bases(state, levels), np.ones(graph.range_m.size), 0.0)
+    state, _ = problem.optimise(state, weights)
+    distance = problem.tried_distances(state)
+    assert hear(problem, state, problem.covariance(state, weights)) > 0.0
+    pull = problem.heard_weight * (problem.heard_m - distance)
+    assert pull[graph.tries.silent].max() > 0.001
+    assert pull[graph.tries.silent].min() > -1e-4
+    assert pull[~graph.tries.silent].max() < 1e-4
+
+
+@pytest.mark.parametrize("scale_error", [0.0, 0.1])
+def test_step_scales_are_sought_where_there_are_any(scale_error: float) -> None:
+    options = {"seconds": 250, "nodes": 4, "scale_error": scale_error}
+    run = simulate_paper("paper-p1", 8, options)
+    smoother = fusion.make_smoother("deadreckoning", run.priors)
+    assert isinstance(smoother, Smoother)
+    for measurement in run.measurements:
+        smoother.process(measurement)
+    smoother.finish()
+    assert smoother.solutions[0].levels.to_scale == (scale_error == 0.0)
+
+
+def _smoothed(run: SimulatedRun, online: str = "bank") -> list[Estimate]:
+    settings = {"hypotheses": 50} if online == "bank" else {}
+    smoother = fusion.make_smoother(online, run.priors, settings, seed=1)
+    estimates = [e for m in run.measurements for e in smoother.process(m)]
+    assert estimates == []
+    return list(smoother.finish())
+
+
+def _score(run: SimulatedRun, estimates: list[Estimate]) -> metrics.Metrics:
+    return metrics.evaluate(
+        tracks.estimated_tracks(estimates),
+        tracks.true_tracks(run.truth),
+        tracks.estimated_pairs(estimates),
+    )
+
+
+@pytest.mark.parametrize("scenario", ["paper", "paper-p1"])
+def test_the_smoothed_track_is_near_the_bound_with_honest_sigmas(scenario: str) -> None:
+    """Noise levels are not told; 300 s, two seeds."""
+    errors, bound, nees = [], [], []
+    for seed in (11, 12):
+        options = {"seconds": 300}
+        run = simulate_paper(scenario, seed, options)
+        score = _score(run, _smoothed(run))
+        errors.append(score.relative_distance_rmse_m)
+        nees.append(score.nees_distance)
+        bound.append(bounds.of_paper(scenario, seed, options).totals())
+    least = bounds.over_seeds(bound).smoothing_distance_m
+    assert np.mean(errors) < 1.2 * least
+    assert 0.6 < np.mean(nees) < 1.5
+
+
+def test_every_motion_epoch_is_estimated_once() -> None:
+    run = simulate_paper("paper-p1", 5, {"seconds": 40, "nodes": 3})
+    estimates = _smoothed(run, "deadreckoning")
+    assert [e.time_s for e in estimates] == [float(k) for k in range(1, 41)]
+    assert all(len(e.nodes) == 3 and len(e.pairs) == 3 for e in estimates)
+    names = {p.name for p in estimates[-1].parameters}
+    assert names == {"step_scale", "heading_drift_rad_s", "range_bias_m"}
+
+
+def test_the_same_seed_gives_the_same_track() -> None:
+    run = simulate_paper("paper-p1", 5, {"seconds": 40, "nodes": 3})
+    assert _smoothed(run) == _smoothed(run)
+
+
+def test_a_hidden_step_scale_is_found_as_well_as_it_says() -> None:
+    run = simulate_paper("paper-p1", 4, {"seconds": 300, "scale_error": 0.1})
+    estimates = _smoothed(run)
+    square = []
+    for parameter in estimates[-1].parameters:
+        if parameter.name == "step_scale":
+            true = run.hidden.step_scale[parameter.node]
+            assert parameter.sigma < 0.04
+            square.append(((parameter.value - true) / parameter.sigma) ** 2)
+    assert len(square) == 6
+    # Chi-square of six: 99.9 % below 22.5.
+    assert sum(square) < 22.5
+
+
+def test_a_node_that_nobody_ranges_is_not_located() -> None:
+    measurements: list[Motion | Range] = []
+    for k in range(1, 11):
+        measurements += [Motion(float(k), node, 0.5, 0.0, 0.1) for node in (1, 2, 3)]
+        measurements.append(Range(float(k), 1, 2, 3.0))
+    measurements.sort(key=lambda m: m.time_s)
+    smoother = fusion.make_smoother(
+        "deadreckoning", [Prior(1, 0, 0, 0), Prior(2, 3, 0, 0)], {}, seed=0
+    )
+    for measurement in measurements:
+        smoother.process(measurement)
+    last = smoother.finish()[-1]
+    status = {node.node: node.status for node in last.nodes}
+    assert status == {1: NodeStatus.OK, 2: NodeStatus.OK, 3: NodeStatus.UNLOCATED}
+    assert [(pair.node, pair.peer) for pair in last.pairs] == [(1, 2)]
+
+
+def test_a_run_without_motion_is_one_clear_error() -> None:
+    smoother = fusion.make_smoother("deadreckoning", [Prior(1, 0, 0, 0)], {}, seed=0)
+    smoother.process(Range(1.0, 1, 2, 3.0))
+    with pytest.raises(RelposError, match="no motion"):
+        smoother.finish()
+
+
+def test_wild_ranges_do_not_bend_the_track() -> None:
+    options = {"seconds": 200, "nlos_probability": 0.1}
+    run = simulate_paper("paper-p1", 6, options)
+    score = _score(run, _smoothed(run))
+    assert score.relative_distance_rmse_m < 0.15
+    assert math.isfinite(score.nees_distance)

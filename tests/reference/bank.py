@@ -1,0 +1,127 @@
+"""The bank's small kernels in NumPy and plain Python."""
+
+from __future__ import annotations
+
+import math
+from statistics import median
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.bank import variance_components as noise
+from relpos.fusion.estimator import ANY_ANGLE_RAD
+from relpos.fusion.models import odometry_faults as slips
+
+Floats = npt.NDArray[np.float64]
+
+PER_NODE = 5
+
+
+def motion_variances(
+    dx: Floats, dy: Floats, dtheta: Floats, duration: Floats, sigmas: Floats
+) -> Floats:
+    """Bases (M, 3) of displacements (M,); ``sigmas`` (M, 3) NaN where a report brings none."""
+    way = np.hypot(dx, dy)
+    moving = (way > 0.0) | (dtheta != 0.0)
+    base = np.empty((len(way), noise.LEVELS))
+    base[:, noise.ALONG] = noise.ALONG_M2_M * way
+    # A turn is what turns fast: slow changes of the heading are mostly its white noise.
+    size = np.abs(dtheta)
+    fourth = size**4
+    base[:, noise.TURN] = (
+        noise.TURN_RAD2_RAD * size * fourth / (fourth + (noise.SLOW_RAD_S * duration) ** 4 + 1e-300)
+    )
+    base[:, noise.WHITE] = noise.WHITE_RAD2_S * duration * moving
+    told = ~np.isnan(sigmas)
+    if told.any():
+        own = np.where(told, sigmas, 0.0) ** 2
+        base[:, noise.ALONG] = np.where(
+            told[:, 0], np.maximum(own[:, 0], own[:, 1]), base[:, noise.ALONG]
+        )
+        base[:, noise.TURN] = np.where(told[:, 2], 0.0, base[:, noise.TURN])
+        base[:, noise.WHITE] = np.where(told[:, 2], own[:, 2], base[:, noise.WHITE])
+    return base
+
+
+def bend(mean: Floats, covariance: Floats, sigma_range_m: float, sigma_metre_m: Floats) -> float:
+    """Give the picture's bend by the mixture's moments (D,) and (D, D).
+
+    ``sigma_metre_m`` (N,) is how noisy the length of a metre is that each user walks.
+    """
+    nodes = len(sigma_metre_m)
+    at = PER_NODE * np.arange(nodes)
+    heading = np.maximum(covariance[at + 2, at + 2], 0.0)
+    shorter = float((0.5 * heading / sigma_metre_m).max(initial=0.0))
+    if nodes < 2:
+        return shorter
+    a, b = np.triu_indices(nodes, 1)
+    i, j = at[a], at[b]
+
+    def apart(r: int, s: int) -> Floats:
+        off: Floats = (
+            covariance[i + r, i + s] + covariance[j + r, j + s]
+            - covariance[i + r, j + s] - covariance[j + r, i + s]
+        )  # fmt: skip
+        return off
+
+    xx, yy, xy = apart(0, 0), apart(1, 1), apart(0, 1)
+    ux, uy = mean[j] - mean[i], mean[j + 1] - mean[i + 1]
+    distance2 = np.maximum(ux * ux + uy * uy, 1e-6)
+    across = (uy * uy * xx - 2.0 * ux * uy * xy + ux * ux * yy) / distance2
+    arcs = np.maximum(across, 0.0) / (2.0 * np.sqrt(distance2))
+    nearest = np.full(nodes, np.inf)
+    place = np.maximum(xx + yy, 0.0)
+    np.minimum.at(nearest, a, place)
+    np.minimum.at(nearest, b, place)
+    ways = 0.5 * np.sqrt(nearest * heading)
+    return max(float(max(arcs.max(), ways.max())) / sigma_range_m, shorter)
+
+
+def look(
+    sums: list[float],
+    base: float,
+    pairs: list[tuple[int, int]],
+    square: list[float],
+    worth: list[float],
+    outliers: float,
+    alarm: float,
+) -> tuple[list[float], float, int]:
+    """One step of the cumulative sums: those, the usual nu^2/S, and who slipped or -1."""
+    usual = min(max(base, slips.BASE_LEAST), slips.BASE_MOST)
+    rise, fall = 0.5 * (1.0 - 1.0 / slips.GROWN) / usual, 0.5 * math.log(slips.GROWN)
+    delta = [
+        min(rise * one - fall, slips.CLIP) * min(3.0 * weight, 1.0) - slips.CLIP * outliers
+        for one, weight in zip(square, worth, strict=True)
+    ]
+    if max(sums) < 0.25 * slips.ALARM:
+        for one in square:
+            base += slips.BASE_SHARE * (min(one, 4.0) - base)
+    after = []
+    for row, so_far in enumerate(sums):
+        own = [one for pair, one in zip(pairs, delta, strict=True) if row in pair]
+        after.append(max(so_far + median(own), 0.0) if own else so_far)
+    if max(after) < alarm:
+        return after, base, -1
+    return [0.0] * len(sums), base, after.index(max(after))
+
+
+def pairs(mean: Floats, covariance: Floats, rows: list[int]) -> Floats:
+    """Distance, bearing and their deviations (P, 4) of every two users, by rotation."""
+    told = []
+    for n, a in enumerate(rows):
+        for b in rows[n + 1 :]:
+            i, j = PER_NODE * a, PER_NODE * b
+            off = mean[j : j + 2] - mean[i : i + 2]
+            own = covariance[i : i + 2, i : i + 2] + covariance[j : j + 2, j : j + 2]
+            spread = own - covariance[i : i + 2, j : j + 2] - covariance[j : j + 2, i : i + 2]
+            distance = float(np.hypot(*off))
+            if distance == 0.0:
+                told.append((0.0, math.sqrt(0.5 * np.trace(spread)), 0.0, ANY_ANGLE_RAD))
+                continue
+            along, aside = off / distance, np.array([-off[1], off[0]]) / distance
+            bearing_sd = math.sqrt(aside @ spread @ aside) / distance
+            told.append((
+                distance, math.sqrt(along @ spread @ along),
+                math.atan2(off[1], off[0]), min(bearing_sd, ANY_ANGLE_RAD),
+            ))  # fmt: skip
+    return np.array(told).reshape(-1, 4)

@@ -1,0 +1,149 @@
+"""The joint filter's kernels in NumPy, one hypothesis at a time, as matrices.
+
+Equations and argument order as in :mod:`relpos.fusion.bank.joint`; nothing of its code is used. The
+results are returned, not written in place.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+
+X, Y, HEADING, DRIFT, SCALE = range(5)
+PER_NODE = 5
+
+
+def advance(
+    x: Floats,
+    p: Floats,
+    row: int,
+    motion: Floats,
+    level: Floats,
+    drawn: float,
+    share: float,
+    cross: float,
+) -> tuple[Floats, Floats]:
+    """One displacement of one user: x (D,), p (D, D), ``motion`` (7,), ``level`` (3,)."""
+    x, p = x.copy(), p.copy()
+    b = PER_NODE * row
+    dx, dy, turn, dt = motion[:4]
+    noise = motion[5] * level[1] + motion[6] * level[2]
+    x[b + HEADING] += drawn * np.sqrt(share * noise)
+    p[b + HEADING, b + HEADING] += (1.0 - share) * noise
+    heading = x[b + HEADING] - 0.5 * dt * x[b + DRIFT]
+    variance = p[b + HEADING, b + HEADING] - dt * p[b + HEADING, b + DRIFT]
+    rotation = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+    whole = np.exp(x[b + SCALE]) * rotation @ np.array([dx, dy])
+    mean = whole * np.exp(-0.5 * max(variance, 0.0))
+    jacobian = np.eye(x.size)
+    across = np.array([-mean[1], mean[0]])
+    jacobian[b : b + 2, b + HEADING] = across
+    jacobian[b : b + 2, b + DRIFT] = -0.5 * dt * across
+    jacobian[b : b + 2, b + SCALE] = mean
+    jacobian[b + HEADING, b + DRIFT] = -dt
+    x[b : b + 2] += mean
+    x[b + HEADING] += turn - dt * x[b + DRIFT]
+    p = jacobian @ p @ jacobian.T
+    for constant, walk in ((DRIFT, 3e-9), (SCALE, 3e-7)):
+        if p[b + constant, b + constant] > 0.0:
+            p[b + constant, b + constant] += walk * dt
+    length = float(whole @ whole)
+    if length > 0.0:
+        unit = whole / np.sqrt(length)
+        normal = np.array([-unit[1], unit[0]])
+        shorter = np.exp(-max(variance, 0.0))
+        along = motion[4] * level[0]
+        lost = 0.5 * length * (1.0 - shorter) ** 2
+        swept = length * max(0.5 * (1.0 - shorter**2) - variance * shorter, 0.0)
+        p[b : b + 2, b : b + 2] += (along + lost) * np.outer(unit, unit)
+        p[b : b + 2, b : b + 2] += (cross * along + swept) * np.outer(normal, normal)
+    return x, p
+
+
+def predict_range(
+    x: Floats, p: Floats, first: int, second: int, dz: float
+) -> tuple[float, float, Floats]:
+    """Mean and variance of a slant distance, and its covariance with the state (D,)."""
+    i, j = PER_NODE * first, PER_NODE * second
+    pick = np.zeros((2, x.size))
+    pick[0, j], pick[0, i], pick[1, j + 1], pick[1, i + 1] = 1.0, -1.0, 1.0, -1.0
+    off, spread = pick @ x, pick @ p @ pick.T
+    flat2 = float(off @ off)
+    along = float(off @ spread @ off) / flat2
+    across = float(np.trace(spread)) - along
+    tilt = dz**2 / (flat2 + dz**2)
+    square = flat2 + dz**2 + across + tilt * along
+    variance = (along * flat2 + 0.5 * (across**2 + tilt**2 * along**2)) / square
+    return np.sqrt(square), variance, p @ pick.T @ off / np.sqrt(square)
+
+
+def update(
+    x: Floats,
+    p: Floats,
+    first: int,
+    second: int,
+    measured: float,
+    dz: float,
+    sigma2: float,
+    outlier: tuple[float, float, float],
+) -> tuple[Floats, Floats, float]:
+    """One range; gives the state and the log evidence (without the constant 2 pi)."""
+    mean, variance, gain = predict_range(x, p, first, second, dz)
+    share, wide, short = outlier
+    nu, s = measured - mean, variance + sigma2
+    good = (1.0 - share) * np.exp(-0.5 * nu**2 / s) / np.sqrt(s)
+    side = 2.0 * (1.0 - short if nu > 0.0 else short)
+    bad = share * side * np.exp(-0.5 * nu**2 / (s + wide)) / np.sqrt(s + wide)
+    trust = good / (good + bad)
+    k = gain / s
+    # Used with probability trust: the mixture's mean and its full covariance.
+    x = x + trust * k * nu
+    p = p - trust * s * np.outer(k, k) + trust * (1.0 - trust) * nu**2 * np.outer(k, k)
+    return x, p, float(np.log(good + bad))
+
+
+def hearing(
+    x: Floats,
+    p: Floats,
+    first: int,
+    second: int,
+    heard: bool,
+    tried: float,
+    weight: float,
+    curve: Floats,
+    step_m: float,
+) -> tuple[Floats, Floats, float]:
+    """Whether one pair was heard; gives the state and what it adds to the log weight."""
+    mean, variance, gain = predict_range(x, p, first, second, 0.0)
+    sd = np.sqrt(variance)
+
+    def chance(z: Floats) -> Floats:
+        at = np.interp(mean + z * sd, np.arange(len(curve)) * step_m, curve)
+        outcome: Floats = np.power(at if heard else 1.0 - tried * at, weight)
+        return outcome
+
+    middle, *edges = chance(np.array([0.0, -2.5, 2.5]))
+    if all(0.97 < edge / middle < 1.03 for edge in edges):
+        return x, p, float(np.log(middle))
+    z = np.linspace(-2.5, 2.5, 11)
+    bell = np.exp(-0.5 * z**2)
+    bell /= bell.sum()
+    density = bell * chance(z)
+    mass = density.sum()
+    shift = (density * z).sum() / mass
+    # Relative to the rule's own variance, which is a little under 1.
+    after = min(((density * z**2).sum() / mass - shift**2) / (bell * z**2).sum(), 1.0)
+    x = x + gain * shift / sd
+    p = p - np.outer(gain, gain) * (1.0 - after) / variance
+    return x, p, float(np.log(mass))
+
+
+def moments(x: Floats, p: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """Mean and full covariance of a mixture whose headings are close together."""
+    mean = weight @ x
+    off = x - mean
+    covariance: Floats = np.einsum("k,kij->ij", weight, p)
+    covariance += np.einsum("k,ki,kj->ij", weight, off, off)
+    return mean, covariance

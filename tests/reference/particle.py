@@ -1,0 +1,143 @@
+"""NumPy twins of :mod:`relpos.fusion.particle.kernels`: the same functions, the same dice.
+
+Written from the equations in the shortest way; the kernels are compared with them on random
+input. Densities are always plain sums over all particles.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.models.motion import move
+from relpos.fusion.models.ranging import RangeNoise, log_likelihood, predicted_range
+from relpos.fusion.particle.kernels import DUAL_DRAWS, FAR_OUT, MIN_BANDWIDTH_M
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+Integers = npt.NDArray[np.uint64]
+
+
+def normals(random: Integers) -> Floats:
+    """Box and Muller (1958) on the two 32-bit halves of every number."""
+    radial = ((random >> np.uint64(32)) + 0.5) / 2.0**32
+    turns = (random & np.uint64(0xFFFFFFFF)) / 2.0**32
+    radius, angle = np.sqrt(-2.0 * np.log(radial)), 2.0 * math.pi * turns
+    return np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
+
+
+def advance(poses: Floats, rows: Indices, mean: Floats, sigma: Floats, noise: Floats) -> None:
+    """Move users ``rows`` (R,), each particle by its own noisy displacement."""
+    count = poses.shape[2]
+    left = iter(noise[: noise.size // count * count].reshape(-1, count))
+    for row, displacement, spread in zip(rows, mean, sigma, strict=True):
+        drawn = np.stack([s * next(left) if s > 0.0 else np.zeros(count) for s in spread])
+        move(poses[:, row], displacement[:, None] + drawn)
+
+
+def moments(poses: Floats, weights: Floats) -> Floats:
+    """Give (K, 7): mean x, y, variance x, y, covariance, and means of cosine and sine."""
+    mean = np.einsum("ckm,km->kc", poses[:2], weights)
+    off = poses[:2] - mean.T[:, :, None]
+    spread = np.einsum("akm,bkm,km->kab", off, off, weights)
+    around = np.stack([np.cos(poses[2]), np.sin(poses[2])])
+    direction = np.einsum("ckm,km->kc", around, weights)
+    return np.column_stack([mean, spread[:, 0, 0], spread[:, 1, 1], spread[:, 0, 1], direction])
+
+
+def correct(
+    poses: Floats,
+    weights: Floats,
+    centres: Floats,
+    offset: Indices,
+    other: Indices,
+    range_m: Floats,
+    height_m: Floats,
+    noise: RangeNoise,
+) -> Floats:
+    """Eq. (6) for all users: the product of the ranges' likelihoods, normalised."""
+    result = weights.copy()
+    for k in range(len(weights)):
+        seen = slice(offset[k], offset[k + 1])
+        if offset[k] == offset[k + 1]:
+            continue
+        at = centres[:, other[seen]]
+        distance = predicted_range(
+            poses[0, k][:, None] - at[0], poses[1, k][:, None] - at[1], height_m[seen]
+        )
+        total = log_likelihood(range_m[seen], distance, noise).sum(axis=1)
+        total -= total[weights[k] > 0.0].max()
+        result[k] = weights[k] * np.exp(np.minimum(total, 0.0))
+        result[k] /= result[k].sum()
+    return result
+
+
+def log_density(points_m: Floats, positions_m: Floats, weights: Floats) -> Floats:
+    """Log density (D,) of a belief, positions (2, M) and weights (M,), at points (2, D)."""
+    mean = positions_m @ weights
+    variance = (positions_m - mean[:, None]) ** 2 @ weights
+    shrink = float((weights**2).sum()) ** (1.0 / 6.0)
+    width = np.maximum(np.sqrt(variance) * shrink, MIN_BANDWIDTH_M)
+    off = (points_m[:, :, None] - positions_m[:, None, :]) / width[:, None, None]
+    exponent = -0.5 * (off**2).sum(axis=0)
+    total = np.exp(exponent) @ weights
+    with np.errstate(divide="ignore"):
+        result: Floats = np.where(total > 1e-300, np.log(total), exponent.max(axis=1) - FAR_OUT)
+    return result - math.log(2.0 * math.pi * float(width.prod()))
+
+
+def dual_step(
+    poses: Floats,
+    predicted: Floats,
+    corrected: Floats,
+    centres: Floats,
+    offset: Indices,
+    other: Indices,
+    range_m: Floats,
+    height_m: Floats,
+    noise: RangeNoise,
+    alpha: float,
+    uniforms: Floats,
+) -> None:
+    """Eq. (7), in place: redraw a share alpha of every looking user's particles."""
+    count = poses.shape[2]
+    fresh = (uniforms.shape[1] - 1) // DUAL_DRAWS
+    for k in range(len(predicted)):
+        first, seen = offset[k], offset[k + 1] - offset[k]
+        if seen == 0:
+            continue
+        whose, radial, phase, angle, heir = uniforms[k, :-1].reshape(DUAL_DRAWS, fresh)
+        edge = first + (whose * seen).astype(np.int64)
+        normal = np.sqrt(-2.0 * np.log1p(-radial)) * np.cos(2.0 * math.pi * phase)
+        radius = range_m[edge] + noise.sigma_r_m * normal
+        ring = np.stack([np.cos(2.0 * math.pi * angle), np.sin(2.0 * math.pi * angle)])
+        points = centres[:, other[edge]] + radius * ring
+        log_weight = log_density(points, poses[:2, k], predicted[k])
+        for e in range(first, first + seen):
+            dx, dy = points - centres[:, other[e]][:, None]
+            each = log_likelihood(range_m[e], predicted_range(dx, dy, height_m[e]), noise)
+            log_weight += np.where(edge == e, 0.0, each)
+        weight = np.exp(log_weight - log_weight.max())
+        edges = np.cumsum(predicted[k])
+        source = np.searchsorted(edges, heir * edges[-1], side="right")
+        heading = poses[2, k, np.minimum(source, count - 1)]
+        slot = ((uniforms[k, -1] + np.arange(fresh)) * (count / fresh)).astype(np.int64) % count
+        corrected[k, slot] = 0.0
+        rest = corrected[k].sum()
+        corrected[k] *= (1.0 - alpha) / rest if rest > 0.0 else 0.0
+        corrected[k, slot] = alpha * weight / weight.sum()
+        corrected[k] /= corrected[k].sum()
+        poses[:, k, slot] = np.stack([points[0], points[1], heading])
+
+
+def resample(poses: Floats, weights: Floats, rows: Indices, uniforms: Floats) -> None:
+    """Multinomial resampling of users ``rows`` in place, from (R, M + 1) uniforms."""
+    count = poses.shape[2]
+    for r, k in enumerate(rows):
+        spacing = -np.log1p(-uniforms[r])
+        wanted = np.cumsum(spacing)[:-1] / spacing.sum() * weights[k].sum()
+        source = np.searchsorted(np.cumsum(weights[k]), wanted, side="right")
+        poses[:, k] = poses[:, k, np.minimum(source, count - 1)]
+        weights[k] = 1.0 / count
