@@ -19,7 +19,6 @@ from xml.dom.minidom import Element, parseString
 import numpy as np
 import pytest
 from geographiclib.geodesic import Geodesic
-from pictures import NAMES, PLACES, UNIX_S, picture
 from typer.testing import CliRunner
 
 from relpos.cli.main import app
@@ -31,6 +30,7 @@ from relpos.live.cot import CotSender, PinnedFrame, Schedule, check_url, default
 from relpos.live.cot_events import Callsigns, circle_90_m
 from relpos.live.picture import Alert, Picture
 from relpos.runs import read_estimates
+from support.team_views import NAMES, PLACES, UNIX_S, picture
 
 PIN = Pin(48.1, 11.5, math.radians(90.0), 520.0)
 FRAME = MapFrame(48.1, 11.5, math.radians(90.0), 520.0)

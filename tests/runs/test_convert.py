@@ -14,7 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 from geographiclib.geodesic import Geodesic
-from small_team import (
+
+from relpos.evaluation import metrics, tracks
+from relpos.fusion.estimator import NodeStatus
+from relpos.measurements import Event, Truth
+from relpos.runs import load_run, read_estimates, save_run, write_estimates
+from support.small_team import (
     LANDMARKS,
     NAMES,
     SECONDS,
@@ -26,11 +31,6 @@ from small_team import (
     true_pose,
     written,
 )
-
-from relpos.evaluation import metrics, tracks
-from relpos.fusion.estimator import NodeStatus
-from relpos.measurements import Event, Truth
-from relpos.runs import load_run, read_estimates, save_run, write_estimates
 
 PIN = "48.137,11.575,60,520"
 START = "2026-05-04T09:30:00Z"

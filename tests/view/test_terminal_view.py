@@ -15,11 +15,11 @@ from contextlib import suppress
 from typing import Any
 
 import pytest
-from pictures import picture
 
 from relpos.live.picture import Alert, GhostPerson, Ghosts, Level, Notice, Person, Picture
 from relpos.view.terminal import TerminalView
 from relpos.view.text_page import Canvas, Looks, page
+from support.team_views import picture
 
 STILL = {"alert": Alert.STILL_ALARM, "still_s": 33.0, "moving": False}
 
