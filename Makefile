@@ -47,12 +47,12 @@ lint: $(DEVELOP) ## ruff, its formatter, mypy
 	$(call title,Lint: mypy)
 	$(VENV)/bin/mypy
 
-wire: $(DEVELOP) ## regenerate the wire's C++ and its page from protocol/messages.py
+wire: $(DEVELOP) ## regenerate the wire's C++ and its page from host/relpos/protocol/messages.py
 	$(PYTHON) protocol/generate.py
 
 .PHONY: wire-check
 wire-check: $(DEVELOP)
-	$(call title,Wire: the generated files are those of protocol/messages.py)
+	$(call title,Wire: the generated files are those of host/relpos/protocol/messages.py)
 	$(PYTHON) protocol/generate.py --check
 
 native-tests: $(DEVELOP) | system-demo

@@ -8,7 +8,7 @@ namespace relpos {
 namespace wire {
 namespace {
 
-// Offsets inside the header; the order is protocol/messages.py's HEADER.
+// Offsets inside the header; the order is host/relpos/protocol/messages.py's HEADER.
 enum HeaderOffset : uint8_t {
   kAtMagic,
   kAtVersion,
