@@ -1,4 +1,4 @@
-"""Hatchling's hook: the firmware goes into the wheel, where relpos/places.py looks for it.
+"""Hatchling's hook: the firmware goes into the wheel, where relpos/paths.py looks for it.
 
 Emulated nodes run it, and ``relpos node flash`` builds it, also where there is no repository.
 """

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from functools import cache
 from importlib import metadata
 
-from relpos import places
+from relpos import paths
 from relpos.errors import RelposError
 
 PURPOSES = {
@@ -24,7 +24,7 @@ PURPOSES = {
 @cache
 def requirements(extra: str) -> tuple[str, ...]:
     """What pyproject.toml names for the extra, as pip takes it (``starlette>=0.40``)."""
-    root = places.repository()
+    root = paths.repository()
     if root is not None:
         # What an editable installation remembers is as old as that installation.
         project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]

@@ -126,7 +126,7 @@ def test_a_missing_extra_is_a_hint_with_the_line_that_installs_it(tmp_path, monk
      ("avr-gcc", "avr-gcc", "gcc-avr"), ("avrdude", "avrdude", "avrdude")],
 )  # fmt: skip
 def test_a_missing_tool_is_a_hint_with_its_package(missing, name, remedy, tmp_path, monkeypatch):
-    monkeypatch.setattr("relpos.places.firmware_project", lambda: tmp_path)
+    monkeypatch.setattr("relpos.paths.firmware_project", lambda: tmp_path)
     commands = tuple(c for c in Pretended.commands if c != missing)
     state, _, told = said(installed(tmp_path, commands=commands), name)
     assert state == "hint"

@@ -18,14 +18,14 @@ OPTIONAL = PROJECT["project"]["optional-dependencies"]
 @pytest.fixture(autouse=True)
 def installed(monkeypatch):
     """Not in a repository, which knows its extras from the project's file."""
-    monkeypatch.setattr("relpos.places.repository", lambda: None)
+    monkeypatch.setattr("relpos.paths.repository", lambda: None)
     extras.requirements.cache_clear()
     yield
     extras.requirements.cache_clear()
 
 
 def test_a_repository_knows_its_extras_itself(monkeypatch):
-    monkeypatch.setattr("relpos.places.repository", lambda: ROOT)
+    monkeypatch.setattr("relpos.paths.repository", lambda: ROOT)
     assert extras.requirements("view") == tuple(OPTIONAL["view"])
 
 

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from relpos import __version__, extras, places
+from relpos import __version__, extras, paths
 from relpos.doctor.computer import Computer
 from relpos.doctor.finding import Finding, hint, well, wrong
 from relpos.errors import RelposError
@@ -38,7 +38,7 @@ def look(computer: Computer, key_file: Path | None, out: Path) -> Iterator[Findi
 
 
 def _python() -> Finding:
-    where = places.repository()
+    where = paths.repository()
     version = platform.python_version()
     words = f"relpos {__version__}, {f'in {where}' if where else 'installed'}; Python {version}"
     if sys.maxsize < 2**32:
@@ -129,7 +129,7 @@ def _platformio(computer: Computer) -> Finding:
 
     name = "PlatformIO"
     try:
-        project = places.firmware_project()
+        project = paths.firmware_project()
     except RelposError as error:
         return wrong(name, str(error), "reinstall relpos from its wheel or its repository")
     try:

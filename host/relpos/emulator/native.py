@@ -16,7 +16,7 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
-from relpos import places
+from relpos import paths
 from relpos.errors import DeviceError
 from relpos.protocol.messages import ResetCause
 
@@ -68,8 +68,8 @@ def build(library: Path | None = None, output: Path | None = None) -> Path:
 
     Raises DeviceError where the compiler is missing, or with its first complaint.
     """
-    library = library or places.firmware_project() / "firmware" / "lib"
-    output = output or places.build_folder() / "native"
+    library = library or paths.firmware_project() / "firmware" / "lib"
+    output = output or paths.build_folder() / "native"
     sources = _sources(library)
     units = [path for path in sources if path.suffix != ".h"]
     if not any(path.parent.name == "native" for path in units):

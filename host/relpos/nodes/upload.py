@@ -9,7 +9,7 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
-from relpos import places
+from relpos import paths
 from relpos.errors import DeviceError
 from relpos.nodes.boards import SWITCH, Board
 
@@ -42,7 +42,7 @@ def upload(board: Board, port: str, root: Path | None = None) -> int | None:
 
     Returns the bytes that were verified, or None where the uploader has not told them.
     """
-    root = root or places.firmware_project()
+    root = root or paths.firmware_project()
     command = [*platformio(root), "run", "-e", board.environment, "-t", "upload"]
     try:
         done = subprocess.run(
@@ -65,9 +65,9 @@ def upload(board: Board, port: str, root: Path | None = None) -> int | None:
 
 def _environment(root: Path) -> dict[str, str]:
     """Where PlatformIO puts what it builds: in a repository as ever, else in the user's cache."""
-    if root == places.repository():
+    if root == paths.repository():
         return {}
-    return {"PLATFORMIO_WORKSPACE_DIR": str(places.build_folder() / "platformio")}
+    return {"PLATFORMIO_WORKSPACE_DIR": str(paths.build_folder() / "platformio")}
 
 
 def why(told: str) -> str:

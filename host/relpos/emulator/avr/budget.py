@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.progress import Progress, TimeElapsedColumn
 from rich.table import Table
 
-from relpos import places
+from relpos import paths
 from relpos.emulator.avr import filters
 from relpos.emulator.avr.board import BOARDS
 from relpos.emulator.avr.elf import read_firmware
@@ -94,10 +94,10 @@ def default_build_folder() -> Path:
 
     SimulatorError in an installed package, which has neither.
     """
-    root = places.repository()
+    root = paths.repository()
     if root is None:
         raise SimulatorError(NOT_INSTALLED)
-    ours = places.build_folder() / "pio" / "build"
+    ours = paths.build_folder() / "pio" / "build"
     return ours if ours.is_dir() else root / ".pio" / "build"
 
 

@@ -10,7 +10,7 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
-from relpos import places
+from relpos import paths
 from relpos.errors import RelposError
 
 _SHIM = Path(__file__).parent / "simavr_shim"
@@ -50,7 +50,7 @@ def _build() -> Path:
     digest = hashlib.sha256(" ".join(_COMPILE).encode())
     for source in sources:
         digest.update(source.read_bytes())
-    target = places.build_folder() / "avr" / f"simavr_shim-{digest.hexdigest()[:16]}.so"
+    target = paths.build_folder() / "avr" / f"simavr_shim-{digest.hexdigest()[:16]}.so"
     if target.is_file():
         return target
     missing = missing_parts()
