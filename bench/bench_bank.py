@@ -27,7 +27,7 @@ from relpos import fusion
 from relpos.fusion.bank.core import BankCore, Epochs
 from relpos.fusion.bank.estimator import Bank
 from relpos.fusion.bank.settings import BankSettings
-from relpos.fusion.switching import GrowingTeam
+from relpos.fusion.switching import SwitchingEstimator
 from relpos.simulation.paper import SimulatedRun, simulate_paper
 
 EPOCH_S = 2.0
@@ -78,7 +78,7 @@ def interface_us(
 ) -> np.ndarray:
     """Microseconds of each epoch (E,), NaN as above."""
     estimator = fusion.make("bank", run.priors, {"hypotheses": hypotheses, **settings}, 0)
-    assert isinstance(estimator, GrowingTeam)
+    assert isinstance(estimator, SwitchingEstimator)
     assert isinstance(estimator.estimator, Bank)
     core = estimator.estimator.core
     marks, counts, end_s = [time.thread_time()], [core.count], EPOCH_S

@@ -56,9 +56,9 @@ def make(
     match str(name):
         case "bank":
             # Kernels are only loaded where they are used: help texts stay quick.
-            from relpos.fusion.switching import GrowingTeam
+            from relpos.fusion.switching import SwitchingEstimator
 
-            return GrowingTeam(priors, parse(BankSettings, given, "bank"), seed, nodes or {})
+            return SwitchingEstimator(priors, parse(BankSettings, given, "bank"), seed, nodes or {})
         case "particle":
             from relpos.fusion.particle.estimator import ParticleFilter
 

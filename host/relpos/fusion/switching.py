@@ -22,6 +22,7 @@ from dataclasses import replace
 from relpos.fusion.bank.estimator import Bank
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.estimator import Estimate, NodeStatus
+from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
 from relpos.fusion.large_teams.estimator import LargeTeam, unlocated
 from relpos.fusion.models.ranging import Mounting
 from relpos.fusion.timeline import Displacement
@@ -44,7 +45,7 @@ LISTEN_S = 4.0
 """So long ranges are listened to before the nucleus is chosen."""
 
 
-class GrowingTeam:
+class SwitchingEstimator:
     """An :class:`~relpos.fusion.estimator.Estimator` for any number of users."""
 
     def __init__(
@@ -70,8 +71,12 @@ class GrowingTeam:
         self.estimator: Bank | LargeTeam = (
             LargeTeam(priors, self._settings, seed, self._mountings)
             if len(self._met) > LARGE_TEAM
-            else Bank(priors, self._settings, seed, self._mountings)
+            else self._bank(priors)
         )
+
+    def _bank(self, priors: Sequence[Prior]) -> Bank:
+        initialiser = HypothesisInitialiser(seed=self._seed)
+        return Bank(priors, initialiser, self._settings, self._seed, self._mountings)
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         """Take one measurement; return the estimates it completes."""
@@ -114,7 +119,7 @@ class GrowingTeam:
             self._nucleus = _best_connected(self._recent)
             self._last = None
             priors = [p for p in self._priors if p.node in self._nucleus]
-            self.estimator = Bank(priors, self._settings, self._seed, self._mountings)
+            self.estimator = self._bank(priors)
             some = [m for m in self._recent if self._concerns(m)]
         else:
             some = [measurement] if self._concerns(measurement) else []

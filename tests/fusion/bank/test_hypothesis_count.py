@@ -15,6 +15,7 @@ from relpos.fusion.bank.estimator import Bank
 from relpos.fusion.bank.joint import PER_NODE, Of
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.estimator import Estimate
+from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
 from relpos.measurements import Prior
 from relpos.simulation.paper import simulate_paper
 
@@ -26,7 +27,7 @@ def _run(
     scenario: str, overrides: dict[str, float], seed: int = 0
 ) -> tuple[list[Estimate], list[int], Bank, metrics.Metrics]:
     run = simulate_paper(scenario, seed, overrides)
-    bank = Bank(run.priors, seed=seed)
+    bank = Bank(run.priors, HypothesisInitialiser(), seed=seed)
     estimates: list[Estimate] = []
     counts = []
     for measurement in run.measurements:
@@ -232,7 +233,7 @@ def test_a_picture_that_bends_much_has_more_hypotheses_and_few_states_the_usual(
 
 def test_people_are_not_lost_to_a_team_of_steady_headings() -> None:
     run = simulate_paper("paper-h", 1, {"seconds": 200.0})
-    bank = Bank(run.priors, BankSettings(steady=1.0), seed=1)
+    bank = Bank(run.priors, HypothesisInitialiser(), BankSettings(steady=1.0), seed=1)
     estimates = [e for m in run.measurements for e in bank.process(m)] + bank.finish()
     assert float(bank.core.weights() @ bank.core.steady) < 0.1
     figures = metrics.evaluate(

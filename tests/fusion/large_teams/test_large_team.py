@@ -152,7 +152,7 @@ def test_who_steps_unevenly_is_found_out(crowd: Crowd) -> None:
     made = fusion.make("bank", crowd.priors(), {}, 0)
     for m in crowd.measurements():
         made.process(m)
-    assert isinstance(made, growing.GrowingTeam)
+    assert isinstance(made, growing.SwitchingEstimator)
     assert isinstance(made.estimator, LargeTeam)
     level = made.estimator._levels.level
     # The crowd's six levels of step noise are 5 10 20 10 15 10 % in turn, 9 % is the base's.

@@ -37,8 +37,12 @@ from relpos.fusion.estimator import (
     refuse_unmoved,
     refuse_unranged,
 )
-from relpos.fusion.initialisation.initialiser import Found, Starts
-from relpos.fusion.initialisation.search import SETTLED_HEADING_RAD, Mixture
+from relpos.fusion.initial_poses import (
+    HEADING_RESOLVED_RAD,
+    Found,
+    Initialiser,
+    PoseMixture,
+)
 from relpos.fusion.models.detection import Detection
 from relpos.fusion.models.motion import told_sigmas
 from relpos.fusion.models.north import North
@@ -107,7 +111,7 @@ class _State:
     moved: bool
     ranges_used: int
     epoch_s: float
-    starts: Starts
+    initialiser: Initialiser
     standing: dict[int, complex]
     facing: dict[int, complex]
     north: North
@@ -117,12 +121,11 @@ class _State:
 class Bank:
     """The bank as an :class:`~relpos.fusion.estimator.Estimator`.
 
-    Whose start is unknown is sought by :mod:`relpos.fusion.initialisation.initialiser` until it is
-    found, and joins
-    the core then.
+    ``initialiser`` seeks the nodes whose initial pose is unknown; once found they join the core.
     """
 
-    priors: Sequence[Prior] = ()
+    priors: Sequence[Prior]
+    initialiser: Initialiser
     settings: BankSettings = field(default_factory=BankSettings)
     seed: int = 0
     mounting: Mapping[int, Mounting] = field(default_factory=dict)
@@ -133,7 +136,6 @@ class Bank:
     stillness: Stillness = field(default_factory=Stillness)
     north: North = field(default_factory=North)
     _feed: Rewinder = field(init=False)
-    starts: Starts = field(init=False)
     _row: dict[int, int] = field(default_factory=dict)
     _known: dict[int, _Known] = field(default_factory=dict)
     _standing: dict[int, complex] = field(default_factory=dict)
@@ -150,7 +152,6 @@ class Bank:
     def __post_init__(self) -> None:
         s = self.settings
         self.core = BankCore(s, self.seed)
-        self.starts = Starts(seed=self.seed)
         timeline = Timeline(
             [p.node for p in self.priors],
             reorder_s=s.reorder_s, max_lag_s=s.max_lag_s, sparing=True,
@@ -165,7 +166,7 @@ class Bank:
                     p.x_m, p.y_m, p.heading_rad, p.sigma_m, p.sigma_rad, self._arm(p.node)
                 )
             else:
-                self.starts.meet(
+                self.initialiser.add(
                     p.node, (p.x_m, p.y_m, p.heading_rad), (p.sigma_m, p.sigma_m, p.sigma_rad)
                 )
 
@@ -184,7 +185,7 @@ class Bank:
 
     def counters(self) -> Mapping[str, int]:
         """Count everything dropped, late, reset or resampled."""
-        own = self._own + self.core.counters + self.starts.counters
+        own = self._own + self.core.counters + self.initialiser.counters
         return dict(self._feed.counters() + own)
 
     # -- steps ---------------------------------------------------------------------------------
@@ -205,7 +206,7 @@ class Bank:
             self._seek(step.node)
             odd = self.habit.is_odd(step.node, way_m, step.duration_s, step.fraction)
             self._own["motions_doubted"] += odd
-            self.starts.advance(step, odd=odd)
+            self.initialiser.advance(step, faulty=odd)
         elif isinstance(step, Ranging):
             self._advance()
             self._range(step)
@@ -214,7 +215,7 @@ class Bank:
             self._sense(step)
         else:
             self._advance()
-            self._admit(self.starts.epoch(step.time_s))
+            self._admit(self.initialiser.find(step.time_s))
             return self._estimate(step.time_s)
         return None
 
@@ -223,8 +224,7 @@ class Bank:
         if isinstance(step, Ranging):
             return 3e-4 + 3e-10 * self.core.entries
         if isinstance(step, Epoch):
-            search_s = 3e-4 * len(self.starts.search.nodes) ** 2
-            return 1e-3 + 1e-9 * self.core.entries + search_s
+            return 1e-3 + 1e-9 * self.core.entries + self.initialiser.cost_s()
         return 3e-5
 
     def snapshot(self) -> _State:
@@ -234,7 +234,7 @@ class Bank:
             self.habit.snapshot(), self.stillness.snapshot(), self._row.copy(),
             {node: known.copy() for node, known in self._known.items()}, self._pending[:],
             self._own.copy(), self._moved, self._ranges_used, self._epoch_s,
-            self.starts.snapshot(), self._standing.copy(), self._facing.copy(),
+            self.initialiser.snapshot(), self._standing.copy(), self._facing.copy(),
             self.north.snapshot(),
         )  # fmt: skip
 
@@ -250,7 +250,7 @@ class Bank:
         self._pending, self._own = snapshot.pending[:], snapshot.own.copy()
         self._moved, self._ranges_used = snapshot.moved, snapshot.ranges_used
         self._epoch_s = snapshot.epoch_s
-        self.starts = snapshot.starts.snapshot()
+        self.initialiser = snapshot.initialiser.snapshot()
         self._standing, self._facing = snapshot.standing.copy(), snapshot.facing.copy()
         self.north = snapshot.north.snapshot()
 
@@ -327,7 +327,7 @@ class Bank:
             for node in sorted(everybody - located.keys()):
                 self._seek(node)
             heights = {n: k.height_m for n, k in self._known.items()}
-            self.starts.ranging(time_s, step.ranges, self._places(), heights)
+            self.initialiser.update(time_s, step.ranges, self._places(), heights)
             # A search may be long; finding nobody in it is no fault of the data.
             self._ranges_used += len(step.ranges)
             ranges = [r for r in step.ranges if r.node in located and r.peer in located]
@@ -380,8 +380,8 @@ class Bank:
         return kept
 
     def _seek(self, node: int) -> None:
-        if node not in self.starts:
-            self.starts.meet(node)
+        if node not in self.initialiser:
+            self.initialiser.add(node)
 
     def _places(self) -> dict[int, tuple[float, float, float]]:
         """Everybody in the core: x, y (m), and the variance (m^2) relative to his nearest.
@@ -416,10 +416,10 @@ class Bank:
         )  # fmt: skip
         for n, (node, row) in enumerate(zip(mixture.nodes, rows, strict=True)):
             self.core.set_scale(row, float(mixture.scales[n]))
-            if mixture.heading_sigma_rad(n) > SETTLED_HEADING_RAD:
+            if mixture.heading_sigma_rad(n) > HEADING_RESOLVED_RAD:
                 self._standing[node] = complex(0.0)
 
-    def _nearest(self, mixture: Mixture) -> int:
+    def _nearest(self, mixture: PoseMixture) -> int:
         """Row of the user of the core who is nearest to those who have been found."""
         mean, _ = self.core.moments(poses_alone=True)
         middle = mixture.poses[0, :, :2].mean(axis=0)
@@ -525,7 +525,7 @@ class Bank:
             (self.detection.range_m, self.detection.range_sigma_m)
             if self.detection.known else None,
         )  # fmt: skip
-        mixture = self.starts.mixture
+        mixture = self.initialiser.mixture
         sought = []
         if len(self._row) < len(self._known):
             sought = [
@@ -585,7 +585,7 @@ class Bank:
         spread = np.stack([spread[likely, :2, :2] for _, spread in each], axis=1)
         return pictures(time_s, nodes, weight[likely] / weight[likely].sum(), poses, spread)
 
-    def _sought(self, node: int, known: _Known, mixture: Mixture | None) -> NodeEstimate:
+    def _sought(self, node: int, known: _Known, mixture: PoseMixture | None) -> NodeEstimate:
         """Say of a node whose start is unknown what the search says."""
         if mixture is None or node not in mixture.nodes:
             return NodeEstimate(
@@ -598,7 +598,7 @@ class Bank:
             mixture.weights, mixture.poses[:, n], mixture.covariances[:, own, own], mixture.best
         )
         status = known.status
-        if status is NodeStatus.OK and node not in self.starts.settled:
+        if status is NodeStatus.OK and node not in self.initialiser.resolved:
             status = NodeStatus.AMBIGUOUS
         spread = belief.covariance_m2
         return NodeEstimate(
@@ -608,7 +608,7 @@ class Bank:
         )  # fmt: skip
 
     def _sought_pairs(
-        self, mixture: Mixture, mean: Floats, covariance: Floats
+        self, mixture: PoseMixture, mean: Floats, covariance: Floats
     ) -> tuple[PairEstimate, ...]:
         """Pairs with at least one node whose start is unknown: moments over all pictures."""
         places = {n: mixture.poses[:, i, :2] for i, n in enumerate(mixture.nodes)}
@@ -637,10 +637,10 @@ class Bank:
         return tuple(pairs)
 
     def _alternatives(
-        self, time_s: float, mixture: Mixture, mean: Floats, covariance: Floats
+        self, time_s: float, mixture: PoseMixture, mean: Floats, covariance: Floats
     ) -> tuple[Alternative, ...]:
         """List the possible pictures of the whole team while somebody's start is unknown."""
-        if set(mixture.nodes) <= self.starts.settled:
+        if set(mixture.nodes) <= self.initialiser.resolved:
             return ()
         count, sought = len(mixture.weights), len(mixture.nodes)
         located = sorted(self._row)

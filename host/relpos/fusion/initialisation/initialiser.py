@@ -1,8 +1,8 @@
-"""Unknown starts: find where everybody is when nobody has told.
+"""Finds nodes with unknown initial poses by a search over many hypotheses.
 
-:class:`Starts` keeps everybody who is not located; those whom a range ties to somebody known are
-sought by a :class:`~relpos.fusion.initialisation.search.Search`, and handed over when it agrees on
-them.
+:class:`HypothesisInitialiser` keeps the nodes that are not located. Those that a range ties to a
+known node are sought by a :class:`~relpos.fusion.initialisation.search.Search`; it hands them
+over when the hypotheses agree.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.initialisation.kernels import POSE
-from relpos.fusion.initialisation.search import STOOD_M, Mixture, Search, SearchSettings
+from relpos.fusion.initial_poses import POSE, UNKNOWN, Found, PoseMixture
+from relpos.fusion.initialisation.search import STOOD_M, Search, SearchSettings
 from relpos.fusion.modes import leader
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Range
@@ -53,22 +53,11 @@ class _Wanderer:
         return np.array([place, place, heading])
 
 
-@dataclass(frozen=True, slots=True)
-class Found:
-    """Nodes whose start has been found, at an epoch: give them to the joint filter.
-
-    With ``frame`` the first of them is the node that defines the frame, and nobody else is known.
-    """
-
-    mixture: Mixture
-    frame: bool
-
-
 @dataclass(slots=True)
-class Starts:
+class HypothesisInitialiser:
     """Everybody who is not located, until he is.
 
-    ``meet`` a node, tell of all ``advance`` and ``ranging``; ``epoch`` returns who was found. A
+    ``add`` a node, report all ``advance`` and ``update``; ``find`` returns the nodes found. A
     node is taken into the search when a range ties it to somebody known; where nobody is known,
     the frame becomes the start of one node of the first ranges (one that has moved, if any: only
     with it do the others' bearings come out).
@@ -81,7 +70,7 @@ class Starts:
     _wanderers: dict[int, _Wanderer] = field(default_factory=dict)
     _agreed: Counter[int] = field(default_factory=Counter)
     _framed: bool = False
-    settled: set[int] = field(default_factory=set)
+    resolved: set[int] = field(default_factory=set)
     _standing: set[int] = field(default_factory=set)
     _quiet_since_s: float = -math.inf
     _shared: bool = False
@@ -93,32 +82,17 @@ class Starts:
     def __contains__(self, node: int) -> bool:
         return node in self._wanderers or node in self.search.nodes
 
-    def __bool__(self) -> bool:
-        return bool(self._wanderers or self.search.nodes)
-
-    @property
-    def nodes(self) -> list[int]:
-        """Everybody who is not located."""
-        return sorted([*self._wanderers, *self.search.nodes])
-
-    def meet(
-        self, node: int, mean: Sequence[float] = (0.0, 0.0, 0.0),
-        sigma: Sequence[float] = (math.inf, math.inf, math.inf),
-    ) -> None:  # fmt: skip
+    def add(
+        self, node: int, mean: Sequence[float] = (0.0, 0.0, 0.0), sigma: Sequence[float] = UNKNOWN
+    ) -> None:
         """Take a node up, with what is known of its pose (``sigma`` inf: nothing)."""
         self._part()
         self._wanderers[node] = _Wanderer(np.array(mean, float), np.array(sigma, float))
         if math.isfinite(sigma[0]):
             self._framed = True
 
-    def forget(self, node: int) -> None:
-        """Seek a node no more."""
-        self._wanderers.pop(node, None)
-        if node in self.search.nodes:
-            self.search.release([node])
-
-    def advance(self, step: Advance, *, odd: bool = False) -> None:
-        """Move a node, if it is one of these; an ``odd`` displacement counts as its turn alone."""
+    def advance(self, step: Advance, *, faulty: bool = False) -> None:
+        """Move a sought node; of a ``faulty`` displacement only the turn is used."""
         self._part()
         wanderer = self._wanderers.get(step.node)
         free = len(self.search.nodes) < MOST_SOUGHT
@@ -131,9 +105,9 @@ class Starts:
         if wanderer is not None:
             wanderer.move(step)
         else:
-            self.search.advance(step, odd=odd)
+            self.search.advance(step, odd=faulty)
 
-    def ranging(
+    def update(
         self,
         time_s: float,
         ranges: Sequence[Range],
@@ -172,7 +146,7 @@ class Starts:
         self.search.frame = node
         self._framed = True
 
-    def epoch(self, time_s: float) -> Found | None:
+    def find(self, time_s: float) -> Found | None:
         """Search on; return who can be handed over.
 
         ``settled`` are those whose place has been agreed on for ``AGREED_EPOCHS``. Who starts
@@ -187,8 +161,8 @@ class Starts:
         settled = {n for n in agreed if self._agreed[n] >= AGREED_EPOCHS}
         if search.frame is not None:
             settled.add(search.frame)
-        news = settled != self.settled or any(search.extent_m(n) > STOOD_M for n in self._standing)
-        self.settled = settled
+        news = settled != self.resolved or any(search.extent_m(n) > STOOD_M for n in self._standing)
+        self.resolved = settled
         self._standing = {n for n in settled if search.extent_m(n) <= STOOD_M}
         if news:
             self._quiet_since_s = time_s
@@ -203,11 +177,15 @@ class Starts:
             return None
         self.counters["starts_found"] += len(settled)
         found = sorted(settled, key=lambda n: (n != search.frame, n))
-        self.settled, self._standing = self.settled - settled, self._standing - settled
+        self.resolved, self._standing = self.resolved - settled, self._standing - settled
         return Found(search.release(found), search.frame is not None)
 
+    def cost_s(self) -> float:
+        """Return about how many seconds of a processor ``find`` takes."""
+        return 3e-4 * len(self.search.nodes) ** 2
+
     @property
-    def mixture(self) -> Mixture | None:
+    def mixture(self) -> PoseMixture | None:
         """The pictures of those who are sought and tied to something known; None where none is."""
         search = self.search
         if not search.nodes:
@@ -220,7 +198,7 @@ class Starts:
         spread = np.stack(
             [whole.covariances[:, 3 * i : 3 * i + 2, 3 * i : 3 * i + 2] for i in active], axis=1
         )
-        return Mixture(
+        return PoseMixture(
             tuple(search.nodes[i] for i in active),
             whole.weights,
             whole.poses[:, active],
@@ -229,11 +207,11 @@ class Starts:
             leader(whole.weights, whole.poses[:, active], spread),
         )
 
-    def snapshot(self) -> Starts:
+    def snapshot(self) -> HypothesisInitialiser:
         """Copy everything that changes."""
         other = copy.copy(self)
         other.counters, other._agreed = self.counters.copy(), self._agreed.copy()
-        other.settled, other._standing = self.settled.copy(), self._standing.copy()
+        other.resolved, other._standing = self.resolved.copy(), self._standing.copy()
         other._wanderers = copy.deepcopy(self._wanderers) if self._wanderers else {}
         if self.search.nodes:
             other.search = self.search.snapshot(other.counters)

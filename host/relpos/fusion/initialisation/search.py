@@ -25,7 +25,8 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.initialisation.kernels import FIXED, POSE, fit
+from relpos.fusion.initial_poses import HEADING_RESOLVED_RAD, POSE, PoseMixture
+from relpos.fusion.initialisation.kernels import FIXED, fit
 from relpos.fusion.modes import believe, seen_from
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Range
@@ -75,10 +76,8 @@ _STOOD_M = 0.1
 
 SETTLED_M = 0.7
 SETTLED_RAD = 0.2
-SETTLED_HEADING_RAD = 0.35
 """A place as seen from another node is settled when its standard deviation is below the greater
-of these two (the second times the distance), a heading below the third: joint filters are then
-near enough to linear."""
+of these two (the second times the distance): joint filters are then near enough to linear."""
 
 STOOD_M = 0.5
 """A node that has not been farther from its start has no heading to be known."""
@@ -135,27 +134,6 @@ class _Event:
     def range_m(self) -> float:
         """Median of the ranges from here."""
         return float(np.median(self.values))
-
-
-@dataclass(frozen=True, slots=True)
-class Mixture:
-    """Weighted pictures: weights (K,), poses (K, N, 3), covariances (K, 3 N, 3 N) of ``nodes``."""
-
-    nodes: tuple[int, ...]
-    weights: Floats
-    poses: Floats
-    covariances: Floats
-    scales: Floats
-    """True over reported length (N,), of the best picture."""
-    best: int = 0
-    """The picture to be shown: that about which the most weight lies."""
-
-    def heading_sigma_rad(self, index: int) -> float:
-        """How well the heading of a node is known."""
-        own = slice(POSE * index, POSE * (index + 1))
-        return believe(
-            self.weights, self.poses[:, index], self.covariances[:, own, own]
-        ).sigma_heading_rad
 
 
 @dataclass(slots=True)
@@ -430,13 +408,13 @@ class Search:
     # -- what is concluded ---------------------------------------------------------------------
 
     @property
-    def mixture(self) -> Mixture:
+    def mixture(self) -> PoseMixture:
         """The pictures as they were at the last ``solve``, the most probable first."""
         each = FIXED + self._knot_columns
         count = self._pictures.shape[0]
         blocks = self._pictures[:, :-1].reshape(count, len(self.nodes), each)
         scales = np.exp(blocks[0, :, 3]) if count else np.ones(len(self.nodes))
-        return Mixture(
+        return PoseMixture(
             tuple(self.nodes), self._weights, blocks[:, :, :POSE].copy(), self._covariances, scales
         )
 
@@ -522,7 +500,7 @@ class Search:
             belief = believe(mixture.weights, poses, covariances)
             if belief.share < least or belief.sigma_here_m > max(SETTLED_M, SETTLED_RAD * reach):
                 continue
-            if belief.sigma_heading_rad > SETTLED_HEADING_RAD and self.extent_m(node) > STOOD_M:
+            if belief.sigma_heading_rad > HEADING_RESOLVED_RAD and self.extent_m(node) > STOOD_M:
                 continue
             found.append(node)
         return found
@@ -533,7 +511,7 @@ class Search:
         far = [math.hypot(x, y) for x, y, _, _ in samples]
         return max([*far, float(np.hypot(*self._tracks[node].pose[:2]))])
 
-    def release(self, nodes: Sequence[int]) -> Mixture:
+    def release(self, nodes: Sequence[int]) -> PoseMixture:
         """Hand over the poses of ``nodes``, which are sought no more; the rest is kept.
 
         Pictures that do not agree with the best one on these nodes are dropped. In what was
@@ -549,7 +527,7 @@ class Search:
         flat = off.reshape(len(poses), -1)
         agree = (flat * np.linalg.solve(spread, flat.T).T).sum(axis=1) < 9.0 + 2.0 * flat.shape[1]
         agree |= (off[:, :, :2] ** 2).sum(axis=2).max(axis=1) < 0.5
-        given = Mixture(
+        given = PoseMixture(
             tuple(nodes),
             self._weights[agree] / self._weights[agree].sum(),
             poses[agree][:, leaving],

@@ -1,0 +1,112 @@
+"""What a joint filter needs to know about finding initial poses.
+
+A filter hands everything about nodes that it has not located to an :class:`Initialiser`, and adds
+a node once the initialiser has :class:`Found` it. The filters know this protocol only;
+:mod:`relpos.fusion.initialisation` implements it, and :mod:`relpos.fusion.switching` joins them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.modes import believe
+from relpos.fusion.timeline import Advance
+from relpos.measurements import Range
+
+Floats = npt.NDArray[np.float64]
+
+POSE = 3
+"""Numbers of a pose: x, y (m), heading (rad)."""
+
+UNKNOWN = (math.inf, math.inf, math.inf)
+"""Standard deviations of a pose of which nothing is known."""
+
+HEADING_RESOLVED_RAD = 0.35
+"""A heading below this standard deviation is known: joint filters are near enough to linear."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseMixture:
+    """Weighted hypotheses about the poses of ``nodes`` (N of them).
+
+    Weights (K,), poses (K, N, 3) in m and rad, covariances (K, 3 N, 3 N).
+    """
+
+    nodes: tuple[int, ...]
+    weights: Floats
+    poses: Floats
+    covariances: Floats
+    scales: Floats
+    """True over reported path length (N,), of the best hypothesis."""
+    best: int = 0
+    """The hypothesis with the most weight near it."""
+
+    def heading_sigma_rad(self, index: int) -> float:
+        """Return the standard deviation of the heading of ``nodes[index]``."""
+        own = slice(POSE * index, POSE * (index + 1))
+        return believe(
+            self.weights, self.poses[:, index], self.covariances[:, own, own]
+        ).sigma_heading_rad
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Nodes whose poses have been found at an epoch.
+
+    With ``frame`` the first of them defines the frame, and no node had been located before.
+    """
+
+    mixture: PoseMixture
+    frame: bool = False
+
+
+class Initialiser(Protocol):
+    """Finds the poses of nodes that are not located, from their motion and ranges."""
+
+    counters: Counter[str]
+    resolved: set[int]
+    """Sought nodes whose pose is unambiguous; they are returned together with others."""
+
+    def __contains__(self, node: int) -> bool:
+        """Whether the node is sought."""
+
+    def add(
+        self, node: int, mean: Sequence[float] = (0.0, 0.0, 0.0), sigma: Sequence[float] = UNKNOWN
+    ) -> None:
+        """Seek a node; ``mean`` and ``sigma`` (inf: unknown) describe its pose (m, m, rad)."""
+
+    def advance(self, step: Advance, *, faulty: bool = False) -> None:
+        """Move a sought node; of a ``faulty`` displacement only the turn is used."""
+
+    def update(
+        self,
+        time_s: float,
+        ranges: Sequence[Range],
+        located: Mapping[int, tuple[float, float, float]],
+        heights: Mapping[int, float] | None = None,
+    ) -> None:
+        """Use the ranges of an instant, after the advances up to it.
+
+        ``located``: node -> x, y (m), variance (m^2) of the nodes that are not sought;
+        ``heights``: node -> m.
+        """
+
+    def find(self, time_s: float) -> Found | None:
+        """Search at the end of an epoch; return the nodes found, which are sought no more."""
+
+    def cost_s(self) -> float:
+        """Return about how many seconds of a processor ``find`` takes."""
+
+    def snapshot(self) -> Initialiser:
+        """Return an independent copy."""
+
+    @property
+    def mixture(self) -> PoseMixture | None:
+        """Hypotheses about the sought nodes that are tied to a known one; None without any."""
