@@ -1,4 +1,4 @@
-"""Sphinx's configuration: `make docs` builds a site that asks nobody else for anything."""
+"""Configuration of Sphinx: `make docs` builds a site that loads nothing from other hosts."""
 
 import subprocess
 import sys
@@ -34,15 +34,15 @@ html_theme_options = {"navigation_with_keys": True}
 
 
 def _commands(_: Any, document: str, source: list[str]) -> None:
-    """Fill the page of all commands with what they say of themselves."""
+    """Insert the help text of every command into the page of commands."""
     if document == "commands":
-        told = subprocess.run(
+        help_text = subprocess.run(
             [sys.executable, "-m", "typer", "relpos.cli.main", "utils", "docs", "--name", "relpos"],
             check=True,
             capture_output=True,
             text=True,
         ).stdout
-        _, _, body = told.partition("\n## ")
+        _, _, body = help_text.partition("\n## ")
         source[0] = source[0].replace("<!-- commands -->", "## " + body)
 
 
