@@ -11,9 +11,9 @@ import argparse
 import math
 from pathlib import Path
 
-from relpos.emulator import reliability
+import fault_runs
+from fault_runs import Outcome, compare
 from relpos.emulator.faults import REFUSED, TARGETS, Fault
-from relpos.emulator.reliability import Outcome, compare
 
 PAGE = Path(__file__).parents[1] / "docs" / "reliability.md"
 
@@ -24,10 +24,10 @@ faults are those of `relpos emulate --fault`; what they mean exactly stands in
 `host/relpos/emulator/faults.py`, the only place, and every line has a test
 (`tests/emulator/test_faults_behaviour.py`).
 
-{reliability.NODES} native boards walk for {reliability.SECONDS:g} s, seed {reliability.SEED}, in
+{fault_runs.NODES} native boards walk for {fault_runs.SECONDS:g} s, seed {fault_runs.SEED}, in
 conditions in which nothing else goes wrong: all in reach of all, every exchange answered, no frame
-lost. What lasts, lasts from {reliability.BEGIN_S:g} to {reliability.END_S:g} s and happens to node
-{reliability.NODE}, as the SPEC says. The same team without fault is the comparison.
+lost. What lasts, lasts from {fault_runs.BEGIN_S:g} to {fault_runs.END_S:g} s and happens to node
+{fault_runs.NODE}, as the SPEC says. The same team without fault is the comparison.
 
 - **time to recover**: from the fault's end to the first whole report, at the host, of what was
   disturbed: motion (neither gap nor start in it; reported every second), ranges (a round every two
@@ -89,8 +89,8 @@ def tail() -> str:
 
 def page() -> str:
     """All of it."""
-    specs = reliability.specs()
-    noise_m = max(map(abs, reliability.undisturbed().range_errors_m()))
+    specs = fault_runs.specs()
+    noise_m = max(map(abs, fault_runs.undisturbed().range_errors_m()))
     text = HEAD.format(noise=noise_m) + table_line(COLUMNS) + "|---" * len(COLUMNS) + "|\n"
     for target in TARGETS:
         text += "".join(row(f, compare(spec)) for f, spec in specs if f.target == target)
@@ -104,12 +104,12 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=PAGE)
     arguments = parser.parse_args()
     if arguments.faults:
-        for fault, spec in reliability.specs():
+        for fault, spec in fault_runs.specs():
             if fault.name in arguments.faults or fault.target in arguments.faults:
                 print(row(fault, compare(spec)), end="")
         return
     arguments.output.write_text(page(), encoding="utf-8")
-    print(f"{arguments.output.name}: {len(reliability.specs())} faults")
+    print(f"{arguments.output.name}: {len(fault_runs.specs())} faults")
 
 
 if __name__ == "__main__":

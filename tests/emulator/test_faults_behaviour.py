@@ -1,7 +1,7 @@
 """What node and host must do about every fault of the vocabulary, seen at the host's end.
 
 A team of three native boards walks with a fault of node 2 from 25 to 45 s and without it; the
-record of either is what the host took (relpos.emulator.reliability). Bounds are what the fault
+record of either is what the host took (bench/fault_runs.py). Bounds are what the fault
 physically allows: a report comes every second, a round of ranges every two, a person walks 0.9 m/s.
 """
 
@@ -10,12 +10,12 @@ import math
 
 import pytest
 
-from relpos.emulator import reliability
+import fault_runs
+from fault_runs import BEGIN_S, END_S, NODE, SECONDS
 from relpos.emulator.faults import FAULTS
-from relpos.emulator.reliability import BEGIN_S, END_S, NODE, SECONDS
 from relpos.protocol import messages as wire
 
-SPECS = {spec: fault for fault, spec in reliability.specs()}
+SPECS = {spec: fault for fault, spec in fault_runs.specs()}
 NOISE_M = 0.35
 """Of a range: 0.1 m of sensor noise over some 200 ranges, and what people walk in the 20 ms that a
 frame needs to the host."""
@@ -25,7 +25,7 @@ WHOLE_M = 0.003
 
 @functools.cache
 def outcome(spec):
-    return reliability.compare(spec)
+    return fault_runs.compare(spec)
 
 
 def of(*names, but=None):
@@ -62,7 +62,7 @@ def assert_motion_is_untouched(result, node=NODE):
             compared += 1
     assert compared > 20
     assert result.run.of(wire.MOTION, node)[-1][0] > SECONDS - 3.0
-    assert result.run.lost_on_the_way_m(node) < 1e-6
+    assert result.run.summing_error_m(node) < 1e-6
     assert result.run.of(wire.MOTION, node)[-1][1].values["path_m"] > 20.0
 
 
@@ -108,7 +108,7 @@ def test_without_true_samples_nothing_is_integrated_and_the_gap_is_flagged(spec)
     # What went unseen is charged: the way truly walked is no surprise to who believes the sigma.
     after = motions_between(result.run, END_S + 3.0, SECONDS)[0].values
     sigma_m = math.sqrt(after["variance_along_m2"] - first["variance_along_m2"])
-    assert sigma_m > result.run.way_m(NODE, BEGIN_S, END_S) / 3.0
+    assert sigma_m > result.run.path_length_m(NODE, BEGIN_S, END_S) / 3.0
     assert result.run.flagged(NODE, wire.Quality.FILTER_RESET) > 0
     assert result.recovery_s <= 3.0
     assert not result.run.counts.get("restarts"), "no reset"
@@ -127,7 +127,7 @@ def test_missing_samples_are_counted_and_the_rest_is_integrated(spec):
     # No more is lost than the share of the time that is missing.
     share = result.run.grown(NODE, "missed_ticks") / (50.0 * (END_S - BEGIN_S))
     assert share < 0.6
-    assert abs(result.lost_m) < share * result.run.way_m(NODE, BEGIN_S, END_S)
+    assert abs(result.lost_m) < share * result.run.path_length_m(NODE, BEGIN_S, END_S)
     assert heading_apart_rad(result) < math.radians(15.0)
     assert result.recovery_s <= (4.5 if "ranges" in result.disturbed else 2.0)
     if not spec.startswith("imu:slow"):
@@ -295,7 +295,7 @@ def test_a_radio_whose_status_is_missing_or_wrong_slows_no_report_down(name):
 
 
 def test_a_stranger_without_the_key_is_refused_by_host_and_nodes():
-    result = outcome(reliability.example(_fault("radio:foreign"), key="wrong"))
+    result = outcome(fault_runs.example(_fault("radio:foreign"), key="wrong"))
     assert result.run.counts["FrameTagError"] >= 80
     for node in result.run.walkers:
         assert result.run.grown(node, "refused_frames") >= 40
@@ -303,7 +303,7 @@ def test_a_stranger_without_the_key_is_refused_by_host_and_nodes():
 
 
 def test_a_stranger_with_the_key_is_another_node_and_touches_none():
-    result = outcome(reliability.example(_fault("radio:foreign"), key="right"))
+    result = outcome(fault_runs.example(_fault("radio:foreign"), key="right"))
     strangers = {f.node for _, f in result.run.frames} - set(result.run.walkers)
     assert len(strangers) == 1
     # What it says of distances is booked to its own number; the others' are what they measured.
@@ -345,7 +345,7 @@ def test_a_clock_that_is_off_by_half_a_percent_is_followed(spec):
     drift = [v for _, v in result.run.statuses(NODE, "link_clock_drift")]
     assert drift[-1] == pytest.approx(-0.005, abs=0.0007)
     assert_every_range_is_true(result)
-    assert abs(result.lost_m) < 0.05 * result.run.way_m(NODE, 0.0, SECONDS)
+    assert abs(result.lost_m) < 0.05 * result.run.path_length_m(NODE, 0.0, SECONDS)
 
 
 @of("clock:wrap")
@@ -360,7 +360,7 @@ def test_a_clock_that_halts_for_moments_hangs_nothing_and_loses_no_more_than_tha
     assert result.restarts == 0
     assert len(motions_between(result.run, BEGIN_S, END_S)) >= 17
     # 60 ms of every second: the totals, and the node's time, fall short of as much.
-    assert abs(result.lost_m) < 2 * 0.06 * result.run.way_m(NODE, BEGIN_S, END_S)
+    assert abs(result.lost_m) < 2 * 0.06 * result.run.path_length_m(NODE, BEGIN_S, END_S)
     assert_others_do_not_care(result)
 
 
@@ -380,7 +380,7 @@ def test_a_restart_loses_the_unreported_second_is_told_and_widens_the_first_moti
     away_s = 0.0 if fault.momentary else END_S - BEGIN_S
     # A report a second and its way to the host; start-up of processor and chips.
     assert result.lost_s <= away_s + 1.0 + 0.3
-    assert result.lost_m <= result.run.way_m(NODE, BEGIN_S - 1.2, BEGIN_S + away_s + 0.5)
+    assert result.lost_m <= result.run.path_length_m(NODE, BEGIN_S - 1.2, BEGIN_S + away_s + 0.5)
     first = next(
         m for (_, m), (t, f) in zip(
             result.run.motions(NODE), result.run.of(wire.MOTION, NODE), strict=True
@@ -407,7 +407,7 @@ def test_a_cut_while_settings_are_written_leaves_the_old_ones_or_the_new(spec):
 
 
 def test_a_bus_that_nine_clocks_free_costs_one_transaction():
-    result = outcome(reliability.example(_fault("bus:stuck"), line="sda"))
+    result = outcome(fault_runs.example(_fault("bus:stuck"), line="sda"))
     assert result.run.grown(NODE, "bus_errors") == result.clean.grown(NODE, "bus_errors") + 1
     assert result.disturbed == []
     assert abs(result.lost_m) < 0.02

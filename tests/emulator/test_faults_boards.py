@@ -2,9 +2,9 @@
 
 import pytest
 
+from fault_runs import NODE, record
 from relpos.emulator.avr.budget import default_build_folder
 from relpos.emulator.avr.library import missing_parts
-from relpos.emulator.reliability import NODE, record
 from relpos.protocol import messages as wire
 
 SECONDS = 12.0
@@ -66,6 +66,6 @@ def test_a_timer_that_wraps_and_a_radio_that_loses_half_are_survived():
     run = walk("clock:wrap:node=2,from=6", "radio:loss:rate=0.5,to=10")
     assert_sound(run)
     assert run.counts["lost"] > 5
-    assert run.lost_on_the_way_m(NODE) < 1e-6
+    assert run.summing_error_m(NODE) < 1e-6
     times = [f.values["time_s"] for _, f in run.of(wire.MOTION, NODE)]
     assert times == sorted(times)

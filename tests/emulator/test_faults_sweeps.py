@@ -11,6 +11,7 @@ from functools import cache
 
 import pytest
 
+from fault_runs import GOOD_CONDITIONS
 from relpos.emulator.air import VirtualClock
 from relpos.emulator.avr.budget import default_build_folder
 from relpos.emulator.avr.library import missing_parts
@@ -18,7 +19,6 @@ from relpos.emulator.bus import BusStatus
 from relpos.emulator.faults_injection import cut_native
 from relpos.emulator.node import EmulatedNode, draw_node_errors
 from relpos.emulator.pozyx import RangeResult
-from relpos.emulator.reliability import GOOD_CONDITIONS
 from relpos.emulator.surroundings import Surroundings
 from relpos.emulator.xbee import DELIVERED, XbeeModule
 from relpos.protocol import messages as wire

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+import fault_runs
 from relpos.cli import main
-from relpos.emulator import reliability
 from relpos.emulator.faults import FAULTS, REFUSED, TARGETS, FaultError, help_text, parse_fault
 from relpos.emulator.team import EmulatedTeam
 
@@ -118,10 +118,10 @@ def test_the_table_of_reliability_has_a_row_for_every_fault():
     page = Path(__file__).parents[2] / "docs" / "reliability.md"
     rows = [line for line in page.read_text().splitlines() if line.startswith("| `")]
     told = [row.split("`")[1] for row in rows]
-    assert told == [spec for target in TARGETS for f, spec in reliability.specs()
+    assert told == [spec for target in TARGETS for f, spec in fault_runs.specs()
                     if f.target == target]  # fmt: skip
     for row, (fault, _) in zip(rows, sorted(
-        reliability.specs(), key=lambda pair: list(TARGETS).index(pair[0].target)
+        fault_runs.specs(), key=lambda pair: list(TARGETS).index(pair[0].target)
     ), strict=True):  # fmt: skip
         cells = [cell.strip() for cell in row.strip("|").split(" | ")]
         assert len(cells) == 7

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from relpos.simulation.gait_statistics import (
+from gait_statistics import (
     GaitStatistics,
     data_folder,
     recorded_walk,
     simulated_walks,
 )
-from relpos.simulation.wearer_statistics import (
+from wearer_statistics import (
     Excursions,
     recorded_bouts,
     recorded_excursions,

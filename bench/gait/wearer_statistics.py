@@ -1,6 +1,6 @@
 """The wide wearers of `solo.make_walker` beside real recordings: tables and pictures.
 
-``python -m relpos.simulation.wearer_statistics [DATA] [--pictures FOLDER]`` prints what
+``python bench/gait/wearer_statistics.py [DATA] [--pictures FOLDER]`` prints what
 docs/gait.md shows of them; DATA is the folder of recordings, by default RELPOS_DATA or
 ../shared/data. Both sides go through the same functions.
 """
@@ -20,10 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy import signal
 
-from relpos.calibration.steps import LEG_OF_STATURE
-from relpos.simulation.activities import Activity
-from relpos.simulation.gait import rotation
-from relpos.simulation.gait_statistics import (
+from gait_statistics import (
     HARMONICS,
     GaitStatistics,
     apparent_gain,
@@ -31,6 +28,9 @@ from relpos.simulation.gait_statistics import (
     gait_statistics,
     recorded_walk,
 )
+from relpos.calibration.steps import LEG_OF_STATURE
+from relpos.simulation.activities import Activity
+from relpos.simulation.gait import rotation
 from relpos.simulation.indoor import INDOOR
 from relpos.simulation.motion import WearerTruth
 from relpos.simulation.solo import make_walker

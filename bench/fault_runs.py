@@ -16,6 +16,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from relpos.emulator.faults import FAULTS, Fault, FaultSpec, parse_fault
+from relpos.emulator.team import EmulatedTeam
 from relpos.link import xbee
 from relpos.link.live import Link
 from relpos.measurements import Heading, Motion, Observation, Range, Status
@@ -24,9 +26,6 @@ from relpos.protocol.schema import Message
 from relpos.simulation.team import SCENARIOS
 from relpos.simulation.walker import WalkerTruth
 from relpos.simulation.world import RadioChannel, UwbChannel
-
-from .faults import FAULTS, Fault, FaultSpec, parse_fault
-from .team import EmulatedTeam
 
 NODES = 3
 NODE = 2
@@ -141,8 +140,8 @@ class Record:
             if r.node in self.walkers and r.peer in self.walkers
         ]
 
-    def way_m(self, node: int, begin_s: float, end_s: float) -> float:
-        """True length of the way walked in between."""
+    def path_length_m(self, node: int, begin_s: float, end_s: float) -> float:
+        """True length of the path walked in between."""
         walker = self.walkers[node]
         inside = (walker.time_s >= begin_s) & (walker.time_s <= end_s)
         steps = np.diff(walker.position_m[inside, :2], axis=0)
@@ -163,7 +162,7 @@ class Record:
             heading += m.dtheta_rad
         return x, y, heading
 
-    def lost_on_the_way_m(self, node: int) -> float:
+    def summing_error_m(self, node: int) -> float:
         """Distance between what the host has summed and the node's own total; one boot."""
         newest = max((f for _, f in self.of(wire.MOTION, node)), key=lambda f: f.counter)
         x, y, _ = self.sum_of_motions(node)
@@ -295,14 +294,14 @@ class Outcome:
 
     @property
     def lost_m(self) -> float:
-        """Motion that the host never got, in metres of way.
+        """Motion that the host never got, in metres of path.
 
         Without restart: how much less way the node has told by the end than undisturbed. With one:
         the true way between the last total that arrived and the beginning of the new ones.
         """
         gaps = self._gaps()
         if gaps:
-            return sum(self.run.way_m(NODE, begin, end) for begin, end in gaps)
+            return sum(self.run.path_length_m(NODE, begin, end) for begin, end in gaps)
         ours = {round(f.values["time_s"], 1): f for _, f in self.run.of(wire.MOTION, NODE)}
         theirs = {round(f.values["time_s"], 1): f for _, f in self.clean.of(wire.MOTION, NODE)}
         common = max(ours.keys() & theirs.keys(), default=None)

@@ -1,6 +1,6 @@
 """Numbers that describe a walk seen by a torso IMU, for synthesised and recorded walks alike.
 
-``python -m relpos.simulation.gait_statistics [DATA]`` prints the comparison of docs/gait.md;
+``python bench/gait/gait_statistics.py [DATA]`` prints the comparison of docs/gait.md;
 DATA is the folder of recordings, by default RELPOS_DATA or ../shared/data.
 """
 
@@ -244,7 +244,7 @@ def _print(title: str, walks: list[GaitStatistics]) -> None:
 
 def data_folder() -> Path | None:
     """Find the folder of recordings, None where it is missing."""
-    beside = Path(__file__).resolve().parents[4] / "shared" / "data"
+    beside = Path(__file__).resolve().parents[3] / "shared" / "data"
     folder = Path(os.environ.get("RELPOS_DATA", beside))
     return folder if folder.is_dir() else None
 
