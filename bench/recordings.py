@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from relpos import fusion
-from relpos.evaluation import metrics, tracks
+from relpos import fusion, tracks
+from relpos.evaluation import metrics
 from relpos.fusion import Estimate, NodeStatus
 from relpos.runs import InitialPose, Run, load_run
 

@@ -12,8 +12,8 @@ import argparse
 
 import numpy as np
 
-from relpos import fusion
-from relpos.evaluation import bounds, consistency, metrics, tracks
+from relpos import fusion, tracks
+from relpos.evaluation import bounds, consistency, metrics
 from relpos.fusion.estimator import Estimate, Estimator
 from relpos.simulation.paper import SimulatedRun, simulate_paper
 

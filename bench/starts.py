@@ -24,8 +24,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from relpos import fusion
-from relpos.evaluation import metrics, regions, tracks
+from relpos import fusion, tracks
+from relpos.evaluation import metrics, regions
 from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.measurements import Measurement, Prior, Range, Truth
 from relpos.runs import load_run

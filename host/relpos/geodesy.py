@@ -188,7 +188,7 @@ def _place_of(pin: Pin, locate: Locate) -> tuple[float, float]:
 
 
 def _fit(pins: Sequence[Pin], places_m: Floats) -> Placing:
-    from relpos.evaluation.metrics import align
+    from relpos.tracks import align
 
     first = MapFrame(pins[0].latitude_deg, pins[0].longitude_deg)
     on_map_m = np.column_stack(

@@ -126,3 +126,19 @@ Measurement = Motion | Range | Height | Heading
 
 Observation = Motion | Range | Height | Heading | Status | Event | Step
 """What a link, a recording or an emulated team delivers."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawSample:
+    """What a node's sensors showed before any calibration, over one report.
+
+    Mean specific force and angular rate (x, y, z) over ``samples`` inertial samples that end at
+    ``time_s``, and the newest magnetic field meanwhile; None where a sensor gave nothing.
+    """
+
+    time_s: float
+    node: int
+    samples: int
+    acceleration_m_s2: tuple[float, float, float] | None
+    angular_rate_rad_s: tuple[float, float, float] | None
+    magnetic_field_ut: tuple[float, float, float] | None

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from relpos.calibration import guide, inertial, magnetometer, picture, steps
 from relpos.calibration.sensors import SensorCalibration, checksum
 from relpos.errors import DataError
-from relpos.link.decoder import RawSample
+from relpos.measurements import RawSample
 
 EARTH_UT = np.array([0.0, 20.0, -43.6])  # 48 uT, dipping by 65 degrees
 GRAVITY = np.array([0.0, 0.0, 9.80665])

@@ -9,8 +9,8 @@ import numpy.typing as npt
 import pytest
 
 from relpos.evaluation import consistency
-from relpos.evaluation.metrics import Track
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
+from relpos.tracks import Track
 
 Floats = npt.NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import pytest
 
 from relpos.evaluation import iso18305, summary
 from relpos.evaluation.iso18305 import Frame, assess, magnitudes, percentile
-from relpos.evaluation.metrics import Track
+from relpos.tracks import Track
 
 SECONDS = np.arange(0.0, 5.0)
 NOTHING = np.full(5, np.nan)

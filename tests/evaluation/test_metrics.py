@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from relpos.evaluation.metrics import PairTrack, Track, evaluate, over_seeds
+from relpos.evaluation.metrics import evaluate, over_seeds
+from relpos.tracks import PairTrack, Track
 
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from relpos.evaluation import regions
-from relpos.evaluation.metrics import Track
 from relpos.fusion.estimator import Alternative, Estimate, NodeEstimate, NodeStatus, Shape
 from relpos.measurements import Range
+from relpos.tracks import Track
 
 SECONDS = np.arange(400.0)
 

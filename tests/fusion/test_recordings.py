@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from relpos import fusion
-from relpos.evaluation import metrics, tracks
+from relpos import fusion, tracks
+from relpos.evaluation import metrics
 from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.runs import InitialPose, Run, load_run
 

@@ -23,13 +23,13 @@ from typer.testing import CliRunner
 
 from relpos.cli.main import app
 from relpos.errors import DataError
-from relpos.evaluation.tracks import estimated_tracks
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
 from relpos.geodesy import MapFrame, Pin
 from relpos.live.cot import CotSender, PinnedFrame, Schedule, check_url, default_prefix
 from relpos.live.cot_events import Callsigns, circle_90_m
 from relpos.live.picture import Alert, Picture
 from relpos.runs import read_estimates
+from relpos.tracks import estimated_tracks
 from support.team_views import NAMES, PLACES, UNIX_S, picture
 
 PIN = Pin(48.1, 11.5, math.radians(90.0), 520.0)

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 from geographiclib.geodesic import Geodesic
 
-from relpos.evaluation import metrics, tracks
+from relpos import tracks
+from relpos.evaluation import metrics
 from relpos.fusion.estimator import NodeStatus
 from relpos.measurements import Event, Truth
 from relpos.runs import load_run, read_estimates, save_run, write_estimates
@@ -121,12 +122,12 @@ def test_evo_ape_of_one_node_is_its_error(tmp_path: Path) -> None:
     at_s = np.arange(1.0, SECONDS + 1)
     yaw = estimated.get_orientations_euler()[:, 2]
     expected = np.array([true_pose(2, t)[2] for t in at_s])
-    assert abs(metrics.wrap_angle(yaw - expected)).max() < 1e-5
+    assert abs(tracks.wrap_angle(yaw - expected)).max() < 1e-5
     turned = ape(true, estimated, PoseRelation.rotation_angle_deg).stats["max"]
     assert turned == pytest.approx(0.0, abs=1e-3)
     plain = ape(true, estimated, PoseRelation.translation_part).stats["rmse"]
     aligned = ape(true, estimated, PoseRelation.translation_part, align=True).stats["rmse"]
-    p, _ = metrics.sample([tracks.estimated_tracks(estimates())[2]], at_s)
+    p, _ = tracks.sample([tracks.estimated_tracks(estimates())[2]], at_s)
     q = np.array([true_pose(2, t)[:2] for t in at_s])
     assert plain == pytest.approx(math.sqrt(((p[:, 0] - q) ** 2).sum(axis=1).mean()), abs=1e-5)
     ours = metrics.aligned_squared_distances(p[:, 0], q)

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from relpos.evaluation import report, tracks
-from relpos.evaluation.metrics import Track
+from relpos import tracks
+from relpos.evaluation import report
 from relpos.evaluation.result import Result
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, pairs_of
 from relpos.measurements import Motion, Range, Truth
 from relpos.runs import Description, NodeInfo, Run
+from relpos.tracks import Track
 
 TIMES = np.arange(0.0, 21.0)
 

@@ -8,9 +8,9 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from relpos import fusion
+from relpos import fusion, tracks
 from relpos.errors import RelposError
-from relpos.evaluation import metrics, tracks
+from relpos.evaluation import metrics
 from relpos.measurements import Motion, Range
 from relpos.simulation.paper import (
     DISTANCE_NOISE,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from relpos.calibration import inertial, magnetometer
 from relpos.calibration.sensors import SensorCalibration
 from relpos.errors import DataError
-from relpos.link.decoder import RawSample
+from relpos.measurements import RawSample
 
 FloatArray = NDArray[np.float64]
 

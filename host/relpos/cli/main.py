@@ -14,7 +14,6 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from relpos import __version__
 from relpos.cli import (
     convert,
     deadreckon,
@@ -30,6 +29,7 @@ from relpos.cli import (
 )
 from relpos.emulator.faults import help_text
 from relpos.errors import RelposError
+from relpos.version import __version__
 
 
 class Commands(TyperGroup):

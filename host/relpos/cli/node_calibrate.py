@@ -21,8 +21,8 @@ from relpos.errors import DataError, DeviceError
 if TYPE_CHECKING:
     from relpos.calibration.antenna import RangeFit
     from relpos.calibration.guide import Progress, Result
-    from relpos.link.decoder import RawSample
     from relpos.link.session import Session
+    from relpos.measurements import RawSample
 
 HEARD_WITHIN_S = 6.0
 STOOD_S = 5.0

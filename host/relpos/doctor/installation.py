@@ -7,10 +7,11 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from relpos import __version__, extras, paths
+from relpos import extras, paths
 from relpos.doctor.computer import Computer
 from relpos.doctor.finding import Finding, hint, well, wrong
 from relpos.errors import RelposError
+from relpos.version import __version__
 
 MEGABYTE = 1_000_000
 ROOM_TOO_LITTLE = 200 * MEGABYTE

@@ -22,8 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from relpos.evaluation.metrics import Metrics, Track, interpolate, whole_seconds, wrap_angle
+from relpos.evaluation.metrics import Metrics
 from relpos.fusion.estimator import Estimate, NodeStatus
+from relpos.tracks import Track, interpolate, whole_seconds, wrap_angle
 
 Floats = npt.NDArray[np.float64]
 

@@ -39,15 +39,8 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
-from relpos.evaluation.metrics import (
-    MAX_GAP_S,
-    MIN_NODES_FOR_SHAPE,
-    Track,
-    Tracks,
-    align,
-    interpolate,
-    whole_seconds,
-)
+from relpos.evaluation.metrics import MIN_NODES_FOR_SHAPE
+from relpos.tracks import MAX_GAP_S, Track, Tracks, align, interpolate, whole_seconds
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]

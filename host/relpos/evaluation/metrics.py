@@ -12,74 +12,18 @@ rotation without reflection, and vectors in the body frame of the node that look
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from relpos.tracks import Pair, Pairs, PairTrack, Tracks, align, interpolate, sample, whole_seconds
+
 Floats = npt.NDArray[np.float64]
-
-MAX_GAP_S = 2.0
-"""Rows further apart than this are not interpolated between (run format, "Metrics, exactly")."""
-
-_TIME_SLACK_S = 1e-6
-"""A row this near to a whole second is on it: files carry times rounded to 0.1 ms or so."""
 
 MIN_NODES_FOR_SHAPE = 3
 """The aligned position error says nothing for two nodes, so epochs with fewer are left out."""
-
-
-def _floats(values: object) -> Floats:
-    return np.asarray(values, dtype=np.float64)
-
-
-@dataclass(frozen=True)
-class Track:
-    """Where one node was, or was believed to be: equally long arrays, NaN where not known.
-
-    Rows may come in any order; of rows at the same time the last one counts. A row without a
-    position (NaN) is no row. ``z_m`` is the height, where anything tells it.
-    """
-
-    time_s: Floats
-    x_m: Floats
-    y_m: Floats
-    heading_rad: Floats = field(default_factory=lambda: np.empty(0))
-    z_m: Floats = field(default_factory=lambda: np.empty(0))
-
-    def __post_init__(self) -> None:
-        """Make float arrays of equal length of whatever sequences were given."""
-        for name in ("time_s", "x_m", "y_m", "heading_rad", "z_m"):
-            object.__setattr__(self, name, _floats(getattr(self, name)))
-        for name in ("heading_rad", "z_m"):
-            if getattr(self, name).size == 0:
-                object.__setattr__(self, name, np.full(self.time_s.shape, np.nan))
-        columns = (self.time_s, self.x_m, self.y_m, self.heading_rad, self.z_m)
-        shapes = {a.shape for a in columns}
-        if len(shapes) != 1 or self.time_s.ndim != 1:
-            raise ValueError(f"a track needs arrays of one dimension and one length, not {shapes}")
-
-
-@dataclass(frozen=True)
-class PairTrack:
-    """The estimated distance of one pair and its standard deviation over time, (n,) arrays."""
-
-    time_s: Floats
-    distance_m: Floats
-    sigma_distance_m: Floats
-
-    def __post_init__(self) -> None:
-        """Make float arrays of equal length of whatever sequences were given."""
-        for name in ("time_s", "distance_m", "sigma_distance_m"):
-            object.__setattr__(self, name, _floats(getattr(self, name)))
-        if not self.time_s.shape == self.distance_m.shape == self.sigma_distance_m.shape:
-            raise ValueError("a pair's track needs arrays of one length")
-
-
-Tracks = Mapping[int, Track]
-Pair = tuple[int, int]
-Pairs = Mapping[Pair, PairTrack]
 
 
 @dataclass(frozen=True)
@@ -128,94 +72,6 @@ class Metrics:
     def epochs(self) -> int:
         """Epochs at which at least one pair could be scored."""
         return int(np.isfinite(self.distance_rmse_over_time_m).sum())
-
-
-def interpolate(time_s: Floats, values: Floats, at_s: Floats, *, circular: bool = False) -> Floats:
-    """Values of a sampled signal at other times, (n,), (n,), (m,) -> (m,).
-
-    NaN outside the samples and inside gaps wider than ``MAX_GAP_S``; a sample that lies on a
-    wanted time counts whatever is around it. ``circular`` interpolates angles the short way
-    round.
-    """
-    good = np.isfinite(time_s) & np.isfinite(values)
-    time_s, values = time_s[good], values[good]
-    order = np.argsort(time_s, kind="stable")
-    time_s, values = time_s[order], values[order]
-    if time_s.size:
-        last_of_equal = np.append(np.diff(time_s) > 0.0, True)
-        time_s, values = time_s[last_of_equal], values[last_of_equal]
-    result = np.full(at_s.shape, np.nan)
-    if not time_s.size:
-        return result
-
-    after = np.searchsorted(time_s, at_s)
-    before = np.clip(after - 1, 0, time_s.size - 1)
-    after = np.clip(after, 0, time_s.size - 1)
-    step_s = time_s[after] - time_s[before]
-    inside = (step_s > 0.0) & (step_s <= MAX_GAP_S + _TIME_SLACK_S)
-    inside &= (time_s[before] <= at_s) & (at_s <= time_s[after])
-    change = values[after] - values[before]
-    if circular:
-        change = wrap_angle(change)
-    share = np.divide(at_s - time_s[before], step_s, out=np.zeros_like(at_s), where=step_s > 0.0)
-    result[inside] = (values[before] + share * change)[inside]
-    for neighbour in (after, before):
-        on_sample = np.abs(time_s[neighbour] - at_s) <= _TIME_SLACK_S
-        result[on_sample] = values[neighbour][on_sample]
-    return result
-
-
-def wrap_angle(angle_rad: Floats) -> Floats:
-    """Angles moved into [-pi, pi)."""
-    return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
-
-
-def whole_seconds(tracks: Iterable[Track]) -> Floats:
-    """Every whole second from the first to the last row of any of the tracks."""
-    times = [t.time_s[np.isfinite(t.time_s)] for t in tracks]
-    times = [t for t in times if t.size]
-    if not times:
-        return np.empty(0)
-    first = math.ceil(min(float(t.min()) for t in times) - _TIME_SLACK_S)
-    last = math.floor(max(float(t.max()) for t in times) + _TIME_SLACK_S)
-    return np.arange(first, last + 1, dtype=np.float64)
-
-
-@dataclass(frozen=True)
-class Alignment:
-    """The rigid motion of the plane, without reflection, that fits one set of points on another."""
-
-    cosine: float
-    sine: float
-    from_m: Floats
-    to_m: Floats
-
-    @property
-    def angle_rad(self) -> float:
-        """By how much headings turn."""
-        return math.atan2(self.sine, self.cosine)
-
-    def __call__(self, points_m: Floats) -> Floats:
-        """Move points, (n, 2) -> (n, 2)."""
-        x, y = (points_m - self.from_m).T
-        c, s = self.cosine, self.sine
-        return np.column_stack((c * x - s * y, s * x + c * y)) + self.to_m
-
-
-def align(estimate_m: Floats, truth_m: Floats) -> Alignment:
-    """Fit an estimate on the truth, (n, 2), (n, 2), in the least-squares sense.
-
-    Both sets are centred; in the plane the best angle is the argument of sum(conj(p) q), which
-    can only be a rotation. Where every angle is as good, none is taken.
-    """
-    from_m, to_m = estimate_m.mean(axis=0), truth_m.mean(axis=0)
-    p, q = estimate_m - from_m, truth_m - to_m
-    cosine = float((p * q).sum())
-    sine = float((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum())
-    norm = math.hypot(cosine, sine)
-    if norm == 0.0:
-        return Alignment(1.0, 0.0, from_m, to_m)
-    return Alignment(cosine / norm, sine / norm, from_m, to_m)
 
 
 def aligned_squared_distances(estimate_m: Floats, truth_m: Floats) -> Floats:
@@ -296,26 +152,12 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
 
 def over_seeds(figures: Sequence[float]) -> tuple[float, float]:
     """Mean of the runs' figures and its standard error (NaN for fewer than two runs)."""
-    values = _floats(figures)
+    values = np.asarray(figures, dtype=np.float64)
     if values.size == 0:
         return math.nan, math.nan
     if values.size == 1:
         return float(values[0]), math.nan
     return float(values.mean()), float(values.std(ddof=1) / math.sqrt(values.size))
-
-
-def sample(tracks: Sequence[Track], at_s: Floats) -> tuple[Floats, Floats]:
-    """Return positions (T, N, 2) and headings (T, N) of the tracks at the wanted times."""
-    position_m = np.full((at_s.size, len(tracks), 2), np.nan)
-    heading_rad = np.full((at_s.size, len(tracks)), np.nan)
-    for n, track in enumerate(tracks):
-        # A half-known position is no position: otherwise x and y could bridge different rows.
-        there = np.isfinite(track.x_m) & np.isfinite(track.y_m)
-        time_s = track.time_s[there]
-        position_m[:, n, 0] = interpolate(time_s, track.x_m[there], at_s)
-        position_m[:, n, 1] = interpolate(time_s, track.y_m[there], at_s)
-        heading_rad[:, n] = interpolate(track.time_s, track.heading_rad, at_s, circular=True)
-    return position_m, heading_rad
 
 
 def _turn(vector_m: Floats, angle_rad: Floats) -> Floats:

@@ -10,9 +10,9 @@ from itertools import groupby
 import numpy as np
 import numpy.typing as npt
 
-from relpos.evaluation.metrics import Pair, PairTrack, Track, Tracks, interpolate
 from relpos.fusion.models.detection import LENGTH, STEP_M, Detection, Round
 from relpos.measurements import Measurement, Motion, Range
+from relpos.tracks import Pair, PairTrack, Track, Tracks, interpolate
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]

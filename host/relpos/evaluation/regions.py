@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from relpos.evaluation.consistency import Coverage, coverage
-from relpos.evaluation.metrics import Track
 from relpos.fusion.estimator import Estimate, NodeStatus, Shape
 from relpos.fusion.modes import Region
 from relpos.measurements import Range
+from relpos.tracks import Track
 
 SHARE = 0.9
 DRAWS = 1500

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from relpos import tracks
 from relpos.errors import DataError
-from relpos.evaluation import consistency, iso18305, metrics, regions, summary, tracks
+from relpos.evaluation import consistency, iso18305, metrics, regions, summary
 
 if TYPE_CHECKING:
     from relpos.evaluation.bounds import Bound, Totals

@@ -17,9 +17,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from relpos import fusion
+from relpos import fusion, tracks
 from relpos.errors import RelposError
-from relpos.evaluation import bounds, metrics, tracks
+from relpos.evaluation import bounds, metrics
 from relpos.evaluation.executors import run_all
 from relpos.simulation.scenarios import simulate
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from relpos.link.authentication import CounterWindow, Verdict
 from relpos.link.clock import NodeClock
-from relpos.measurements import Heading, Height, Motion, Observation, Range, Status, Step
+from relpos.measurements import Heading, Height, Motion, Observation, Range, RawSample, Status, Step
 from relpos.protocol import messages as wire
 
 MAGNETIC_SIGMA_RAD = math.radians(25.0)
@@ -63,22 +63,6 @@ class Acknowledged:
     command: int
     result: wire.CommandResult
     value: int
-
-
-@dataclass(frozen=True, slots=True)
-class RawSample:
-    """What a node's sensors showed before any calibration, over one report.
-
-    Mean specific force and angular rate (x, y, z) over ``samples`` inertial samples that end at
-    ``time_s``, and the newest magnetic field meanwhile; None where a sensor gave nothing.
-    """
-
-    time_s: float
-    node: int
-    samples: int
-    acceleration_m_s2: tuple[float, float, float] | None
-    angular_rate_rad_s: tuple[float, float, float] | None
-    magnetic_field_ut: tuple[float, float, float] | None
 
 
 class Decoder:

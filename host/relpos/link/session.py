@@ -15,9 +15,9 @@ import serial
 from relpos.calibration.sensors import SensorCalibration, checksum
 from relpos.calibration.steps import scaled_gain_permille
 from relpos.errors import DeviceError
-from relpos.link.decoder import MOST_KEPT, Acknowledged, RawSample
+from relpos.link.decoder import MOST_KEPT, Acknowledged
 from relpos.link.live import Line, Link, observe
-from relpos.measurements import Observation
+from relpos.measurements import Observation, RawSample
 from relpos.protocol import messages as wire
 
 ANSWER_S = 1.0

@@ -38,8 +38,8 @@ class About:
 
     def metadata(self) -> dict[str, dict[str, str]]:
         """Metadata records by name."""
-        from relpos import __version__
         from relpos.protocol import messages as wire
+        from relpos.version import __version__
 
         return {
             METADATA: {

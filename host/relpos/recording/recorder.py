@@ -165,7 +165,7 @@ class Recorder:
     # -- the recorder's thread --------------------------------------------------------------------
 
     def _beginning(self, part: int) -> bytes:
-        from relpos import __version__
+        from relpos.version import __version__
 
         records = replace(self._about, part=part).metadata()
         return container.beginning(f"relpos {__version__}", records, self._topics)

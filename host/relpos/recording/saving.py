@@ -92,7 +92,7 @@ def _write_again(out: IO[bytes], run: Run, source: Recording) -> list[str]:
 
 
 def _beginning(about: About, every: Sequence[topics.Topic]) -> bytes:
-    from relpos import __version__
+    from relpos.version import __version__
 
     return container.beginning(f"relpos {__version__}", about.metadata(), every)
 

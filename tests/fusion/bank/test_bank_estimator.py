@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from relpos import fusion
+from relpos import fusion, tracks
 from relpos.errors import RelposError
-from relpos.evaluation import metrics, tracks
+from relpos.evaluation import metrics
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.estimator import Estimate

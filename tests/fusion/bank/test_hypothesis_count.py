@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from relpos.evaluation import metrics, tracks
+from relpos import tracks
+from relpos.evaluation import metrics
 from relpos.fusion.bank import hypothesis_count as hypotheses
 from relpos.fusion.bank.core import BankCore, Epochs
 from relpos.fusion.bank.estimator import Bank

@@ -12,8 +12,8 @@ import numpy.typing as npt
 import pytest
 
 from reference import starts as twin
-from relpos import fusion
-from relpos.evaluation import metrics, tracks
+from relpos import fusion, tracks
+from relpos.evaluation import metrics
 from relpos.fusion.estimator import Estimate, NodeStatus, Shape
 from relpos.fusion.initialisation.kernels import fit, normal_equations
 from relpos.fusion.initialisation.search import Search

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from relpos import fusion
-from relpos.evaluation import metrics, tracks
+from relpos import fusion, tracks
+from relpos.evaluation import metrics
 from relpos.fusion.estimator import Estimate
 from relpos.fusion.models.north import North
 from relpos.measurements import Heading, Measurement

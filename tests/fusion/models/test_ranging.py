@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from relpos import fusion
-from relpos.evaluation import metrics, tracks
+from relpos import fusion, tracks
+from relpos.evaluation import metrics
 from relpos.fusion.bank import joint, lanes
 from relpos.fusion.bank.joint import PER_NODE
 from relpos.fusion.estimator import Estimate

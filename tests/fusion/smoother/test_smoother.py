@@ -10,9 +10,9 @@ import numpy.typing as npt
 import pytest
 
 from reference import smoother as twin
-from relpos import fusion
+from relpos import fusion, tracks
 from relpos.errors import RelposError
-from relpos.evaluation import bounds, metrics, tracks
+from relpos.evaluation import bounds, metrics
 from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.fusion.smoother.estimator import Smoother
 from relpos.fusion.smoother.graph import build_graph

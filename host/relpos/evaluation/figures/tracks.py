@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from relpos import fusion
-from relpos.evaluation import metrics, tracks
+from relpos import fusion, tracks
+from relpos.evaluation import metrics
 from relpos.evaluation.figures.sheet import (
     COLOURS,
     DASHES,

@@ -8,20 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from relpos import tracks
 from relpos.errors import RelposError
-from relpos.evaluation import health, metrics, ranging, scoring, summary, tracks
-from relpos.evaluation.metrics import (
-    Alignment,
-    Metrics,
-    Pairs,
-    Tracks,
-    align,
-    sample,
-    whole_seconds,
-)
+from relpos.evaluation import health, metrics, ranging, scoring, summary
+from relpos.evaluation.metrics import Metrics
 from relpos.evaluation.result import Result, pass_through
 from relpos.fusion.estimator import NodeStatus
 from relpos.measurements import Prior
+from relpos.tracks import Alignment, Pairs, Tracks, align, sample, whole_seconds
 
 if TYPE_CHECKING:
     from relpos.evaluation.bounds import Bound

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from relpos.evaluation.metrics import MAX_GAP_S
 from relpos.evaluation.style import DARK, STYLE
+from relpos.tracks import MAX_GAP_S
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,12 +6,12 @@ import json
 from collections.abc import Mapping, Sequence
 from html import escape
 
-from relpos import __version__
 from relpos.evaluation.iso18305 import Frame
 from relpos.evaluation.report import tables
 from relpos.evaluation.report.content import Content
 from relpos.evaluation.report.drawing import Picture, colours
 from relpos.evaluation.report.tables import Table
+from relpos.version import __version__
 
 SECTIONS: Sequence[tuple[str, str, tuple[str, ...], tuple[str, ...]]] = (
     ("where", "Where everybody was", ("tracks",), ("located",)),

@@ -15,14 +15,7 @@ import numpy.typing as npt
 from relpos.evaluation import ranging
 from relpos.evaluation.health import SERIES
 from relpos.evaluation.iso18305 import Frame
-from relpos.evaluation.metrics import (
-    MAX_GAP_S,
-    Metrics,
-    Track,
-    Tracks,
-    interpolate,
-    whole_seconds,
-)
+from relpos.evaluation.metrics import Metrics
 from relpos.evaluation.report.content import Content, alignment
 from relpos.evaluation.report.drawing import Picture, broken_at_gaps, dots, grid
 from relpos.evaluation.style import (
@@ -48,6 +41,7 @@ from relpos.nodes.health import (
     RSSI_YELLOW_DBM,
     Health,
 )
+from relpos.tracks import MAX_GAP_S, Track, Tracks, interpolate, whole_seconds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from relpos import tracks
 from relpos.errors import DataError
-from relpos.evaluation import tracks
-from relpos.evaluation.metrics import Track, sample
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
 from relpos.geodesy import Locate
 from relpos.measurements import Truth
 from relpos.runs.run import Run
+from relpos.tracks import Track, sample
 
 if TYPE_CHECKING:
     from relpos.recording.reader import Recording

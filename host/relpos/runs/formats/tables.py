@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from relpos.evaluation.metrics import Track, sample
 from relpos.runs.appending import write_rows
 from relpos.runs.estimates import write_estimates
 from relpos.runs.formats.content import Content, Kind
 from relpos.runs.run import save_run
+from relpos.tracks import Track, sample
 
 _OF_PAIRS = ("pairs.csv", "ranges.csv")
 _AS_THEY_ARE = ("landmarks.csv", "imu.csv")
