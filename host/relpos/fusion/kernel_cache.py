@@ -1,12 +1,13 @@
 """Where compiled kernels are kept: in the user's cache, in folders named after their sources.
 
 Numba notices a change of the file a kernel stands in, but not of a constant that another module
-contributed to its machine code. A room imports the common ground alone (docs/architecture.md), so
-a digest of both names a folder whose content is never stale.
+contributed to its machine code. So a digest of a room's kernels and of every module of ``fusion``
+that they import, directly or not, names the folder: its content is never stale.
 """
 
 from __future__ import annotations
 
+import ast
 import atexit
 import hashlib
 import os
@@ -31,10 +32,35 @@ def root(chosen: str | None = None) -> Path:
 def folder(room: Path, under: Path) -> Path:
     """Return the folder, below ``under``, of the kernels of the room ``room`` (a folder)."""
     digest = hashlib.sha256()
-    sources = {*FUSION.glob("*.py"), *(FUSION / "models").glob("*.py"), *room.glob("*.py")}
-    for source in sorted(sources):
+    for source in sorted(_sources(room)):
         digest.update(source.read_bytes())
     return under / f"{room.name}-{digest.hexdigest()[:16]}"
+
+
+def _sources(room: Path) -> set[Path]:
+    """Return the files of a room that hold kernels, and all of ``fusion`` that they import."""
+    compiler = FUSION / "compiled.py"
+    sources: set[Path] = set()
+    waiting = [file for file in room.glob("*.py") if compiler in _imported(file)]
+    while waiting:
+        file = waiting.pop()
+        if file not in sources:
+            sources.add(file)
+            waiting += _imported(file)
+    return sources
+
+
+@cache
+def _imported(file: Path) -> set[Path]:
+    """Return the files of ``fusion`` that a file imports."""
+    imports = [
+        node for node in ast.walk(ast.parse(file.read_text())) if type(node) is ast.ImportFrom
+    ]
+    names = {node.module or "" for node in imports}
+    names |= {f"{node.module}.{alias.name}" for node in imports for alias in node.names}
+    inside = [name.split(".")[2:] for name in names if name.startswith("relpos.fusion.")]
+    files = {FUSION.joinpath(*parts).with_suffix(".py") for parts in inside}
+    return {file for file in files if file.is_file()}
 
 
 @cache
