@@ -8,10 +8,10 @@ import time
 from relpos.emulator.team import STEP_US, EmulatedTeam
 from relpos.link.live import Link
 from relpos.live.composer import Composer
-from relpos.live.fusing import Fusing
+from relpos.live.fusion_thread import FusionThread
 from relpos.live.inputs import Received
-from relpos.live.session import Session
-from relpos.live.sinks import QuietSink
+from relpos.live.session import LiveSession
+from relpos.live.sinks import Sink
 from relpos.measurements import Motion, Range
 
 
@@ -33,7 +33,7 @@ class TeamInput:
         self._unplug: tuple[float, float] | None = None
         self._waiting: list[tuple[int, bytes]] = []
         self._given_s = -math.inf
-        self.paced_by: Fusing | None = None
+        self.paced_by: FusionThread | None = None
         """A fusion that is waited for: virtual time has no pace of its own."""
 
     def sleep(self, at_s: float, for_s: float) -> None:
@@ -50,8 +50,8 @@ class TeamInput:
                 if isinstance(o, Motion | Range):
                     self._given_s = max(self._given_s, o.time_s)
             return Received(time_us * 1e-6, data, observations)
-        fusing = self.paced_by
-        while fusing is not None and fusing.failure is None and fusing.newest_s < self._given_s:
+        fusion = self.paced_by
+        while fusion is not None and fusion.failure is None and fusion.newest_s < self._given_s:
             time.sleep(0.001)
         if self._sleep is not None and self.now_s() >= self._sleep[0]:
             self.team.run(self.team.time_us + round(self._sleep[1] * 1e6))
@@ -87,14 +87,14 @@ class TeamInput:
         pass
 
 
-class Album(QuietSink):
+class Album(Sink):
     """Keeps everything it is given."""
 
     def __init__(self) -> None:
         self.bytes: list[tuple[float, bytes]] = []
         self.observations = []
         self.estimates = []
-        self.pictures = []
+        self.views = []
         self.closed = False
 
     def received(self, arrival_s, data):
@@ -106,8 +106,8 @@ class Album(QuietSink):
     def estimated(self, estimate):
         self.estimates.append(estimate)
 
-    def pictured(self, picture):
-        self.pictures.append(picture)
+    def updated(self, view):
+        self.views.append(view)
 
     def close(self):
         self.closed = True
@@ -116,11 +116,11 @@ class Album(QuietSink):
 def make_session(source, make, *sinks, priors=(), common=False, paced=False, **options):
     """A session over ``source`` with an estimator made by ``make(priors)``, and its album."""
     album = Album()
-    fusing = Fusing(make, priors, common=common)
-    source.paced_by = fusing if paced else None
+    fusion = FusionThread(make, priors, common=common)
+    source.paced_by = fusion if paced else None
     # As many pictures a second of the team's time as a session makes in real time.
     pace = source.now_s if isinstance(source, TeamInput) else time.monotonic
-    return Session(source, fusing, Composer(), [album, *sinks], pace=pace, **options), album
+    return LiveSession(source, fusion, Composer(), [album, *sinks], pace=pace, **options), album
 
 
 def run_through(session):

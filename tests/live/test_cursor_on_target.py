@@ -27,10 +27,10 @@ from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
 from relpos.geodesy import MapFrame, Pin
 from relpos.live.cot import CotSender, PinnedFrame, Schedule, check_url, default_prefix
 from relpos.live.cot_events import Callsigns, circle_90_m
-from relpos.live.picture import Alert, Picture
+from relpos.live.team_view import Alert, TeamView
 from relpos.runs import read_estimates
 from relpos.tracks import estimated_tracks
-from support.team_views import NAMES, PLACES, UNIX_S, picture
+from support.team_views import NAMES, PLACES, UNIX_S, team_view
 
 PIN = Pin(48.1, 11.5, math.radians(90.0), 520.0)
 FRAME = MapFrame(48.1, 11.5, math.radians(90.0), 520.0)
@@ -90,7 +90,7 @@ class Received:
         )
 
 
-def due(schedule: Schedule, shown: Picture, now_s: float) -> dict[str, Received]:
+def due(schedule: Schedule, shown: TeamView, now_s: float) -> dict[str, Received]:
     from relpos.live.cot_events import serialized
 
     events = [Received(serialized(e)) for e in schedule.due(shown, FRAME, now_s, {1: 0.5})]
@@ -104,7 +104,7 @@ def schedule() -> Schedule:
 
 
 def test_a_member_is_a_friendly_unit_where_it_is(schedule: Schedule) -> None:
-    events = due(schedule, picture(), 0.0)
+    events = due(schedule, team_view(), 0.0)
     assert set(events) == {f"test.{node}" for node in PLACES}
     for node, (x_m, y_m) in PLACES.items():
         event = events[f"test.{node}"]
@@ -131,7 +131,7 @@ def test_the_circle_holds_ninety_per_cent() -> None:
 
 
 def test_the_error_is_the_circles_radius(schedule: Schedule) -> None:
-    event = due(schedule, picture(), 0.0)["test.1"]
+    event = due(schedule, team_view(), 0.0)["test.1"]
     assert event.ce == pytest.approx(circle_90_m(0.8, 0.4), abs=0.06)
 
 
@@ -140,7 +140,7 @@ def test_nobody_is_sent_twice_a_second(schedule: Schedule) -> None:
     for tick in range(60):
         now_s = 0.1 * tick
         changes: dict[int, Any] = {3: {"alert": Alert.STILL_ALARM}} if 20 < tick < 40 else {}
-        for uid in due(schedule, picture(tick, changes=changes), now_s):
+        for uid in due(schedule, team_view(tick, changes=changes), now_s):
             times.setdefault(uid.removesuffix("-9-1-1"), []).append(now_s)
     for sent_s in times.values():
         assert min(np.diff(sent_s)) >= 1.0 - 1e-9
@@ -148,35 +148,35 @@ def test_nobody_is_sent_twice_a_second(schedule: Schedule) -> None:
 
 
 def test_a_picture_that_does_not_move_on_is_not_sent_again(schedule: Schedule) -> None:
-    assert due(schedule, picture(1), 0.0)
-    assert not due(schedule, picture(1), 5.0)
-    assert due(schedule, picture(2), 6.0)
+    assert due(schedule, team_view(1), 0.0)
+    assert not due(schedule, team_view(1), 5.0)
+    assert due(schedule, team_view(2), 6.0)
 
 
 def test_speed_is_that_of_the_way_between_two_events(schedule: Schedule) -> None:
-    due(schedule, picture(1), 0.0)
+    due(schedule, team_view(1), 0.0)
     moved = {"x_m": 3.0, "y_m": 4.0, "motion_s": 14.0}
-    events = due(schedule, picture(2, changes={1: moved, 2: {"moving": False}}), 4.0)
+    events = due(schedule, team_view(2, changes={1: moved, 2: {"moving": False}}), 4.0)
     assert float(events["test.1"].attributes("track")["speed"]) == pytest.approx(1.25)
     assert float(events["test.2"].attributes("track")["speed"]) == 0.0
 
 
 def test_who_is_not_heard_goes_stale_by_the_time_last_heard(schedule: Schedule) -> None:
     gone = {"status": "lost", "seen_s": 40.0, "alert": Alert.LOST}
-    event = due(schedule, picture(1, changes={2: gone}), 0.0)["test.2"]
+    event = due(schedule, team_view(1, changes={2: gone}), 0.0)["test.2"]
     assert event.how == "h-e"
     assert event.stale_s < event.time_s
     assert event.start_s == pytest.approx(event.time_s - 40.0)
     assert not event.attributes("track")
     assert "last heard 40 s ago" in event.words("remarks")
     # Now and then, for whoever joins late.
-    assert "test.2" not in due(schedule, picture(2, changes={2: gone}), 3.0)
-    assert "test.2" in due(schedule, picture(3, changes={2: gone}), 11.0)
+    assert "test.2" not in due(schedule, team_view(2, changes={2: gone}), 3.0)
+    assert "test.2" in due(schedule, team_view(3, changes={2: gone}), 11.0)
 
 
 def test_an_ambiguous_position_is_called_an_estimate(schedule: Schedule) -> None:
     unsure = {"status": "ambiguous", "sigma_major_m": 9.0, "sigma_minor_m": 9.0}
-    event = due(schedule, picture(1, changes={2: unsure}), 0.0)["test.2"]
+    event = due(schedule, team_view(1, changes={2: unsure}), 0.0)["test.2"]
     assert event.how == "h-e"
     assert event.ce == pytest.approx(9.0 * 2.146, abs=0.1)
     assert "ambiguous" in event.words("remarks")
@@ -188,12 +188,12 @@ def test_who_is_nowhere_is_not_put_anywhere(schedule: Schedule) -> None:
         2: {"x_m": None, "y_m": None},
         3: {"seen_s": None},
     }
-    assert set(due(schedule, picture(1, changes=changes), 0.0)) == {"test.4"}
+    assert set(due(schedule, team_view(1, changes=changes), 0.0)) == {"test.4"}
 
 
 def test_who_lies_still_is_an_emergency_until_it_is_over(schedule: Schedule) -> None:
     still = {"alert": Alert.STILL_ALARM, "still_s": 31.0, "moving": False}
-    alarm = due(schedule, picture(1, changes={3: still}), 0.0)["test.3-9-1-1"]
+    alarm = due(schedule, team_view(1, changes={3: still}), 0.0)["test.3-9-1-1"]
     assert alarm.type == "b-a-o-tbl"
     assert alarm.attributes("emergency") == {"type": "911 Alert"}
     assert alarm.words("emergency") == NAMES[3]
@@ -201,34 +201,34 @@ def test_who_lies_still_is_an_emergency_until_it_is_over(schedule: Schedule) -> 
     assert alarm.metres_from(*PLACES[3]) < 0.01
     assert "LIES STILL for 31 s" in alarm.words("remarks")
     # The member itself goes on beside it, and the emergency is repeated.
-    assert due(schedule, picture(2, changes={3: still}), 1.0)["test.3"].type == "a-f-G-U-C"
-    assert "test.3-9-1-1" in due(schedule, picture(3, changes={3: still}), 11.0)
+    assert due(schedule, team_view(2, changes={3: still}), 1.0)["test.3"].type == "a-f-G-U-C"
+    assert "test.3-9-1-1" in due(schedule, team_view(3, changes={3: still}), 11.0)
     # Silence is no sign of having got up.
     silent = {"alert": Alert.LOST, "status": "lost", "seen_s": 12.0}
-    later = due(schedule, picture(4, changes={3: silent}), 22.0)["test.3-9-1-1"]
+    later = due(schedule, team_view(4, changes={3: silent}), 22.0)["test.3-9-1-1"]
     assert later.type == "b-a-o-tbl"
-    over = due(schedule, picture(5), 24.0)["test.3-9-1-1"]
+    over = due(schedule, team_view(5), 24.0)["test.3-9-1-1"]
     assert over.type == "b-a-o-can"
     assert over.attributes("emergency") == {"cancel": "true"}
-    assert "test.3-9-1-1" not in due(schedule, picture(6), 26.0)
+    assert "test.3-9-1-1" not in due(schedule, team_view(6), 26.0)
 
 
 def test_an_emergency_needs_no_position(schedule: Schedule) -> None:
     still = {"alert": Alert.STILL_ALARM, "status": "unlocated", "x_m": None, "y_m": None}
-    alarm = due(schedule, picture(1, changes={3: still}), 0.0)["test.3-9-1-1"]
+    alarm = due(schedule, team_view(1, changes={3: still}), 0.0)["test.3-9-1-1"]
     assert alarm.ce == UNKNOWN
     assert alarm.metres_from(0.0, 0.0) < 0.01
     assert "position unknown" in alarm.words("remarks")
 
 
 def test_an_emulated_or_replayed_team_says_so() -> None:
-    events = due(Schedule(Callsigns("test"), exercise=True), picture(), 0.0)
+    events = due(Schedule(Callsigns("test"), exercise=True), team_view(), 0.0)
     assert {event.how for event in events.values()} == {"m-s"}
     assert all("EXERCISE" in event.words("remarks") for event in events.values())
 
 
 def test_a_name_that_xml_cannot_hold_is_sent_without_the_rest(schedule: Schedule) -> None:
-    event = due(schedule, picture(1, changes={1: {"name": "A\x00\x1b\ud800b"}}), 0.0)["test.1"]
+    event = due(schedule, team_view(1, changes={1: {"name": "A\x00\x1b\ud800b"}}), 0.0)["test.1"]
     assert event.attributes("contact")["callsign"] == "Ab"
 
 
@@ -261,16 +261,16 @@ def test_without_a_pin_nothing_is_sent() -> None:
 
 def test_a_pin_on_a_node_waits_for_it() -> None:
     pinned = PinnedFrame([Pin(48.0, 11.0, 0.0, node=2, time_s=15.0)])
-    assert pinned.update(picture(1)) is None
-    assert pinned.update(picture(6, changes={2: {"status": "ambiguous"}})) is None
+    assert pinned.update(team_view(1)) is None
+    assert pinned.update(team_view(6, changes={2: {"status": "ambiguous"}})) is None
     assert "node 2 is not located" in str(pinned.waits_for())
-    frame = pinned.update(picture(7))
+    frame = pinned.update(team_view(7))
     assert frame is not None
     assert frame.place_m == PLACES[2]
     assert pinned.waits_for() is None
     # It stays where it was put.
     moved = {2: {"x_m": 99.0}}
-    assert pinned.update(picture(8, changes=moved)) is frame
+    assert pinned.update(team_view(8, changes=moved)) is frame
 
 
 def until(condition: Callable[[], Any], what: str) -> None:
@@ -350,7 +350,7 @@ class Feeding:
         seq = 0
         while not self._stop.wait(0.05):
             seq += 1
-            self._sender.pictured(replace(picture(seq), unix_s=time.time()))
+            self._sender.updated(replace(team_view(seq), unix_s=time.time()))
 
     def __enter__(self) -> Feeding:
         return self
@@ -483,5 +483,5 @@ def test_a_server_that_is_not_there_does_not_hold_up_the_session() -> None:
         until(lambda: "refused" in str(sender.trouble()), "the refusal is not told")
         before_s = time.thread_time()
         for seq in range(1000):
-            sender.pictured(picture(1_000 + seq))
+            sender.updated(team_view(1_000 + seq))
         assert time.thread_time() - before_s < 5.0

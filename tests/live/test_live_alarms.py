@@ -5,7 +5,7 @@ import math
 import pytest
 
 from relpos.live.alarms import LOST_S, Alarms, moved
-from relpos.live.picture import Alert
+from relpos.live.team_view import Alert
 from relpos.measurements import Motion
 
 
@@ -23,7 +23,7 @@ def bend(time_s, node=1):
     return Motion(time_s, node, 0.0, 0.0, 0.02, 0.2, 0.2, 0.04, 0, False, 0.2)
 
 
-class Watching:
+class WatchedWearer:
     """Reports every second and looks twenty times in between."""
 
     def __init__(self):
@@ -35,8 +35,8 @@ class Watching:
         for _ in range(seconds):
             self.pass_time(1.0)
             if make is not None:
-                self.alarms.heard(1)
-                self.alarms.take(make(self.time_s))
+                self.alarms.mark_heard(1)
+                self.alarms.add_motion(make(self.time_s))
                 self.look(0.0)
 
     def pass_time(self, seconds, *, listening=True):
@@ -46,7 +46,7 @@ class Watching:
     def look(self, passed_s, *, listening=True):
         self.time_s += passed_s
         self.alarms.tick(self.time_s, listening=listening)
-        alert = self.alarms.of(1).alert
+        alert = self.alarms.condition(1).alert
         if not self.changes or self.changes[-1][1] != alert:
             self.changes.append((self.time_s, alert))
 
@@ -61,7 +61,7 @@ class Watching:
 
 @pytest.fixture
 def watching():
-    watching = Watching()
+    watching = WatchedWearer()
     watching.report(walk, 10)
     return watching
 
@@ -78,18 +78,18 @@ def test_any_movement_ends_the_warning(watching, move):
     watching.report(still, 25)
     watching.report(move, 1)
     assert watching.alerts == [None, Alert.STILL_WARNING, None]
-    assert watching.alarms.of(1).still_s == 0.0
+    assert watching.alarms.condition(1).still_s == 0.0
 
 
 def test_a_twitch_does_not_end_the_alarm_but_getting_up_does(watching):
     watching.report(still, 35)
     watching.report(bend, 1)
-    assert watching.alarms.of(1).still_s > 30.0, "the count goes on, too"
+    assert watching.alarms.condition(1).still_s > 30.0, "the count goes on, too"
     watching.report(still, 3)
-    assert watching.alarms.of(1).alert is Alert.STILL_ALARM
+    assert watching.alarms.condition(1).alert is Alert.STILL_ALARM
     watching.report(bend, 4)
-    assert watching.alarms.of(1).alert is None
-    assert watching.alarms.of(1).still_s == 0.0
+    assert watching.alarms.condition(1).alert is None
+    assert watching.alarms.condition(1).still_s == 0.0
 
 
 def test_who_works_on_the_spot_is_not_alarmed_of(watching):
@@ -103,62 +103,62 @@ def test_silence_is_told_as_lost_and_ends_with_the_first_frame(watching):
     watching.report(None, 15)
     assert watching.at(Alert.LOST) == pytest.approx(10.0 + LOST_S, abs=0.2)
     watching.report(walk, 1)
-    assert watching.alarms.of(1).alert is None
+    assert watching.alarms.condition(1).alert is None
 
 
 def test_nobody_is_lost_while_nobody_could_listen(watching):
     watching.pass_time(60.0, listening=False)
     assert watching.alerts == [None]
     watching.pass_time(LOST_S + 1.0)
-    assert watching.alarms.of(1).alert is Alert.LOST, "now he is"
+    assert watching.alarms.condition(1).alert is Alert.LOST, "now it is"
 
 
 def test_a_computer_that_slept_raises_no_alarm_out_of_the_gap(watching):
     watching.report(still, 5)
     watching.look(60.0)
-    assert watching.alarms.of(1).alert is None
+    assert watching.alarms.condition(1).alert is None
     # What is seen first covers the gap: nobody knows what happened in it.
     watching.report(still, 19)
-    assert watching.alarms.of(1).alert is None
+    assert watching.alarms.condition(1).alert is None
     watching.report(still, 3)
-    assert watching.alarms.of(1).alert is Alert.STILL_WARNING
+    assert watching.alarms.condition(1).alert is Alert.STILL_WARNING
 
 
 def test_an_alarm_goes_on_through_a_gap(watching):
     watching.report(still, 35)
     watching.look(60.0)
     watching.report(still, 1)
-    assert watching.alarms.of(1).alert is Alert.STILL_ALARM
+    assert watching.alarms.condition(1).alert is Alert.STILL_ALARM
 
 
 def test_a_few_lost_reports_do_not_hide_somebody_who_lies_still(watching):
     for _ in range(8):
         watching.report(still, 1)
         watching.report(None, 3)
-    assert watching.alarms.of(1).alert is Alert.STILL_ALARM
+    assert watching.alarms.condition(1).alert is Alert.STILL_ALARM
 
 
 def test_acknowledging_silences_this_alert_and_no_other(watching):
     assert not watching.alarms.acknowledge(1), "there is nothing to acknowledge"
     watching.report(still, 22)
     assert watching.alarms.acknowledge(1)
-    assert watching.alarms.of(1).acknowledged
+    assert watching.alarms.condition(1).acknowledged
     watching.report(still, 10)
-    assert watching.alarms.of(1).alert is Alert.STILL_ALARM
-    assert not watching.alarms.of(1).acknowledged
+    assert watching.alarms.condition(1).alert is Alert.STILL_ALARM
+    assert not watching.alarms.condition(1).acknowledged
 
 
 def test_an_alarm_of_who_lies_still_stays_when_his_radio_falls_silent(watching):
     watching.report(still, 35)
     watching.report(None, 30)
-    assert watching.alarms.of(1).alert is Alert.STILL_ALARM
+    assert watching.alarms.condition(1).alert is Alert.STILL_ALARM
 
 
 def test_a_first_report_is_no_movement_of_now():
-    watching = Watching()
+    watching = WatchedWearer()
     watching.report(lambda t: Motion(t, 1, 5.0, 3.0, 2.0, moving=False), 1)
     watching.report(still, 21)
-    assert watching.alarms.of(1).alert is Alert.STILL_WARNING
+    assert watching.alarms.condition(1).alert is Alert.STILL_WARNING
 
 
 def test_a_recording_without_the_nodes_own_word_is_judged_by_displacement():

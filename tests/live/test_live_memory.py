@@ -15,10 +15,10 @@ from team_input import run_through
 from relpos import fusion
 from relpos.live.composer import Composer
 from relpos.live.files import FileSink
-from relpos.live.fusing import Fusing
+from relpos.live.fusion_thread import FusionThread
 from relpos.live.inputs import PacedInput, Received
-from relpos.live.session import Session
-from relpos.live.sinks import QuietSink
+from relpos.live.session import LiveSession
+from relpos.live.sinks import Sink
 from relpos.live.tracks import MOST_POINTS, Tracks
 from relpos.measurements import Motion, Prior, Range, Status
 from relpos.runs import Description
@@ -38,15 +38,15 @@ def team(seconds):
                 yield Status(at_s, node, "battery_v", 4.8)
 
 
-class Scale(QuietSink):
+class Scale(Sink):
     """Weighs everything that Python holds, in the middle and at the end."""
 
     def __init__(self, *at_s):
         self._at_s = list(at_s)
         self.bytes = []
 
-    def pictured(self, picture):
-        if self._at_s and picture.time_s >= self._at_s[0]:
+    def updated(self, view):
+        if self._at_s and view.time_s >= self._at_s[0]:
             self._at_s.pop(0)
             gc.collect()
             self.bytes.append(tracemalloc.get_traced_memory()[0])
@@ -59,7 +59,7 @@ def test_twice_the_session_is_not_more_memory(tmp_path, monkeypatch):
     items = (Received(o.time_s, b"", (o,)) for o in team(810))
     source = PacedInput("synthetic", items, speed=0.0)
     priors = [Prior(node, float(node), 0.0, 0.0) for node in range(1, NODES + 1)]
-    fusing = Fusing(lambda p: fusion.make("deadreckoning", p), priors)
+    fusing = FusionThread(lambda p: fusion.make("deadreckoning", p), priors)
     files = FileSink(tmp_path, Description())
     # What the fusion is behind waits in memory, by design: here it is waited for.
     original = source.read
@@ -72,7 +72,7 @@ def test_twice_the_session_is_not_more_memory(tmp_path, monkeypatch):
     source.read = read
     tracemalloc.start()
     try:
-        outcome = run_through(Session(source, fusing, Composer(), [files, scale]))
+        outcome = run_through(LiveSession(source, fusing, Composer(), [files, scale]))
     finally:
         tracemalloc.stop()
     assert outcome.failure is None

@@ -15,8 +15,8 @@ def shown_after(*told: tuple[float, float] | None) -> list[float | None]:
     composer, shown = Composer(), []
     for k, north in enumerate(told):
         known = north and MagneticNorth(*map(math.radians, north))
-        composer.estimated(Estimate(float(k), (), (), north=known or None), k)
-        north_rad = composer.picture(float(k), 1e9 + k).north_rad
+        composer.add_estimate(Estimate(float(k), (), (), north=known or None), k)
+        north_rad = composer.view(float(k), 1e9 + k).north_rad
         shown.append(None if north_rad is None else math.degrees(north_rad))
     return shown
 

@@ -41,10 +41,10 @@ def assert_pose(at, pose):
 
 def test_motions_since_the_estimate_are_composed_in_order():
     nowcast = Nowcast()
-    nowcast.take(motion(1.0), 1)
-    nowcast.fused(estimate(1.0), 1)
-    nowcast.take(motion(2.0, 0.7, -0.1, -0.9), 2)
-    nowcast.take(motion(3.0, 1.1, 0.3, 0.4), 3)
+    nowcast.add_motion(motion(1.0), 1)
+    nowcast.add_estimate(estimate(1.0), 1)
+    nowcast.add_motion(motion(2.0, 0.7, -0.1, -0.9), 2)
+    nowcast.add_motion(motion(3.0, 1.1, 0.3, 0.4), 3)
     expected = composed((2.0, 1.0, 0.5), (0.7, -0.1, -0.9), (1.1, 0.3, 0.4))
     assert_pose(nowcast.node(1), expected)
     assert nowcast.newest_s(1) == 3.0
@@ -52,9 +52,9 @@ def test_motions_since_the_estimate_are_composed_in_order():
 
 def test_of_a_chord_that_the_estimate_ends_in_only_the_rest_is_composed():
     nowcast = Nowcast()
-    nowcast.take(motion(1.0), 1)
-    nowcast.take(motion(2.0, 1.0, 0.0, 0.8), 2)
-    nowcast.fused(estimate(1.75), 2)
+    nowcast.add_motion(motion(1.0), 1)
+    nowcast.add_motion(motion(2.0, 1.0, 0.0, 0.8), 2)
+    nowcast.add_estimate(estimate(1.75), 2)
     # A quarter of the chord, seen from the heading that three quarters of the turn have led to.
     c, s = math.cos(0.6), math.sin(0.6)
     assert_pose(nowcast.node(1), composed((2.0, 1.0, 0.5), (c * 0.25, -s * 0.25, 0.2)))
@@ -64,46 +64,46 @@ def test_cutting_a_chord_anywhere_leads_to_the_same_end():
     for cut in (0.1, 0.5, 0.9):
         start = composed((2.0, 1.0, 0.5), (cut * 1.0, cut * 0.4, cut * 0.8))
         nowcast = Nowcast()
-        nowcast.take(motion(1.0), 1)
-        nowcast.take(motion(2.0, 1.0, 0.4, 0.8), 2)
+        nowcast.add_motion(motion(1.0), 1)
+        nowcast.add_motion(motion(2.0, 1.0, 0.4, 0.8), 2)
         at = replace(node_estimate(), x_m=start[0], y_m=start[1], heading_rad=start[2])
-        nowcast.fused(estimate(1.0 + cut, at), 2)
+        nowcast.add_estimate(estimate(1.0 + cut, at), 2)
         assert_pose(nowcast.node(1), composed((2.0, 1.0, 0.5), (1.0, 0.4, 0.8)))
 
 
 def test_a_motion_that_the_fusion_had_not_got_yet_counts_whole():
     nowcast = Nowcast()
-    nowcast.take(motion(1.0), 1)
-    nowcast.take(motion(2.0, 0.7, 0.0, 0.0), 2)
+    nowcast.add_motion(motion(1.0), 1)
+    nowcast.add_motion(motion(2.0, 0.7, 0.0, 0.0), 2)
     # An estimate at 1.9 s came out before the motion up to 2 s had been worked off.
-    nowcast.fused(estimate(1.9), 1)
+    nowcast.add_estimate(estimate(1.9), 1)
     assert_pose(nowcast.node(1), composed((2.0, 1.0, 0.5), (0.7, 0.0, 0.0)))
 
 
 def test_a_newer_estimate_takes_the_place_of_what_was_composed():
     nowcast = Nowcast()
-    nowcast.take(motion(1.0), 1)
-    nowcast.fused(estimate(1.0), 1)
-    nowcast.take(motion(2.0), 2)
+    nowcast.add_motion(motion(1.0), 1)
+    nowcast.add_estimate(estimate(1.0), 1)
+    nowcast.add_motion(motion(2.0), 2)
     moved = node_estimate(x_m=-4.0, y_m=0.5, heading_rad=-1.0)
-    nowcast.fused(estimate(2.0, moved), 2)
+    nowcast.add_estimate(estimate(2.0, moved), 2)
     assert_pose(nowcast.node(1), (-4.0, 0.5, -1.0))
 
 
 def test_steps_are_as_long_as_the_estimator_has_learned():
     nowcast = Nowcast()
-    nowcast.take(motion(1.0), 1)
+    nowcast.add_motion(motion(1.0), 1)
     learned = Parameter(1.0, 1, None, "step_scale", 0.8, 0.02)
-    nowcast.fused(replace(estimate(1.0), parameters=(learned,)), 1)
-    nowcast.take(motion(2.0, 1.0, -0.5, 0.3), 2)
+    nowcast.add_estimate(replace(estimate(1.0), parameters=(learned,)), 1)
+    nowcast.add_motion(motion(2.0, 1.0, -0.5, 0.3), 2)
     assert_pose(nowcast.node(1), composed((2.0, 1.0, 0.5), (0.8, -0.4, 0.3)))
 
 
 def test_the_covariance_grows_as_a_filters_prediction():
     nowcast = Nowcast()
-    nowcast.fused(estimate(1.0), 0)
-    nowcast.take(motion(2.0, 1.0, 0.2, 0.3, sigmas=(0.3, 0.2, 0.1)), 1)
-    nowcast.take(motion(3.0, 0.8, -0.5, 0.6, sigmas=(0.1, 0.25, 0.05)), 2)
+    nowcast.add_estimate(estimate(1.0), 0)
+    nowcast.add_motion(motion(2.0, 1.0, 0.2, 0.3, sigmas=(0.3, 0.2, 0.1)), 1)
+    nowcast.add_motion(motion(3.0, 0.8, -0.5, 0.6, sigmas=(0.1, 0.25, 0.05)), 2)
 
     covariance = np.zeros((3, 3))
     covariance[:2, :2] = [[0.04, 0.01], [0.01, 0.09]]
@@ -126,8 +126,8 @@ def test_the_covariance_grows_as_a_filters_prediction():
 
 def test_where_a_report_tells_no_deviations_the_papers_count():
     nowcast = Nowcast()
-    nowcast.fused(estimate(1.0, node_estimate(heading_rad=0.0)), 0)
-    nowcast.take(Motion(2.0, 1, 2.0, 0.0, 0.0), 1)
+    nowcast.add_estimate(estimate(1.0, node_estimate(heading_rad=0.0)), 0)
+    nowcast.add_motion(Motion(2.0, 1, 2.0, 0.0, 0.0), 1)
     grown = nowcast.node(1).variance_x_m2 - 0.04
     assert grown == pytest.approx((0.2 * 2.0) ** 2)
 
@@ -137,13 +137,13 @@ def test_a_pair_keeps_what_the_estimator_knows_of_the_two_together():
     fused = estimate(1.0, *two)
     known = replace(fused.pairs[0], sigma_distance_m=0.01, sigma_bearing_rad=0.002)
     nowcast = Nowcast()
-    nowcast.fused(fused, 0)
+    nowcast.add_estimate(fused, 0)
     same = nowcast.pair(known)
     assert (same.distance_m, same.bearing_rad) == pytest.approx((5.0, math.atan2(4.0, 3.0)))
     assert same.sigma_distance_m == pytest.approx(0.01)
     assert same.sigma_bearing_rad == pytest.approx(0.002)
     # Node 1 goes 3 m ahead: the other is then 4 m to the left.
-    nowcast.take(Motion(2.0, 1, 3.0, 0.0, 0.0, 0.3, 0.1, 0.0), 1)
+    nowcast.add_motion(Motion(2.0, 1, 3.0, 0.0, 0.0, 0.3, 0.1, 0.0), 1)
     after = nowcast.pair(known)
     assert (after.distance_m, after.bearing_rad) == pytest.approx((4.0, math.pi / 2))
     # Across the way: its own deviation and what its heading (0.1 rad) makes of 3 m.
@@ -152,7 +152,7 @@ def test_a_pair_keeps_what_the_estimator_knows_of_the_two_together():
 
 def test_who_has_no_estimate_yet_has_no_pose():
     nowcast = Nowcast()
-    nowcast.take(motion(1.0, node=7), 1)
+    nowcast.add_motion(motion(1.0, node=7), 1)
     assert nowcast.node(7) is None
     assert nowcast.newest_s(7) == 1.0
     assert nowcast.newest_s(8) is None

@@ -83,7 +83,7 @@ def test_a_port_that_is_pulled_out_is_told_waited_for_and_read_on_from(socket, s
         return sum(isinstance(o, Motion) for _, o in album.observations)
 
     def told():
-        return [n for n in album.pictures[-1].notices if n.id == "port"] if album.pictures else []
+        return [n for n in album.views[-1].notices if n.id == "port"] if album.views else []
 
     stages = iter(("read", "gone", "back"))
     stage = next(stages)

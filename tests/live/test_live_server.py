@@ -12,7 +12,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from relpos.errors import DeviceError, RelposError
-from relpos.live.picture import Hello, Notice, Person, Picture
+from relpos.live.team_view import Hello, Notice, Person, TeamView
 from relpos.view.access import listen, make_certificate, own_address, parse_listen
 from relpos.view.web import WebView
 
@@ -49,11 +49,11 @@ class Stage:
         while not self._over.wait(0.02):
             self.seq += 1
             people = tuple(Person(n, f"Node {n}", 1.0 * n, 2.0) for n in range(1, self.people + 1))
-            self.page.pictured(Picture(self.seq, 0.02 * self.seq, time.time(), people=people))
-            for ask in self.page.asks():
-                self.asked.append(ask)
+            self.page.updated(TeamView(self.seq, 0.02 * self.seq, time.time(), people=people))
+            for request in self.page.requests():
+                self.asked.append(request)
                 if self.answering:
-                    self.page.answer(ask, {"accepted": ["a"]})
+                    self.page.respond(request, {"accepted": ["a"]})
 
     @property
     def base(self):
@@ -279,7 +279,7 @@ def test_what_is_told_to_phones_is_an_address_that_others_can_reach():
 
 
 def test_notices_and_names_of_any_kind_are_plain_json():
-    picture = Picture(
+    picture = TeamView(
         1, 2.0, 3.0, notices=(Notice("x", "alarm", 'a "quoted" <b> \u2028 line\n', 1.0),),
         people=(Person(1, "Zoë </script>", 1.0, float("nan")),),
     )  # fmt: skip

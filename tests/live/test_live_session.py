@@ -11,9 +11,9 @@ from relpos import fusion
 from relpos.emulator.team import EmulatedTeam
 from relpos.link.live import Link
 from relpos.live.inputs import PacedInput, Received
-from relpos.live.picture import Alert
-from relpos.live.sinks import QuietSink
-from relpos.live.visitors import Ask
+from relpos.live.requests import Request
+from relpos.live.sinks import Sink
+from relpos.live.team_view import Alert
 from relpos.measurements import Event, Heading, Height, Motion, Range
 
 
@@ -34,7 +34,7 @@ def walk():
 
 def test_everybody_is_in_the_picture_with_all_that_is_known(walk):
     _, album, _ = walk
-    last = album.pictures[-1]
+    last = album.views[-1]
     assert [person.node for person in last.people] == [1, 2, 3]
     for person in last.people:
         assert person.status == "ok"
@@ -53,7 +53,7 @@ def test_everybody_is_in_the_picture_with_all_that_is_known(walk):
 
 def test_the_picture_runs_ahead_of_the_fused_estimate(walk):
     _, album, _ = walk
-    later = [p for p in album.pictures if p.time_s > 20.0][:-1]
+    later = [p for p in album.views if p.time_s > 20.0][:-1]
     assert all(p.fused_s < p.time_s for p in later)
     # Motion comes once a second; the fusion waits for the slowest node.
     assert all(p.time_s - person.motion_s < 2.0 for p in later for person in p.people)
@@ -87,10 +87,10 @@ def test_somebody_who_falls_silent_is_stale_then_lost():
         session, album = make_session(TeamInput(team), deadreckoning, priors=team.priors())
         run_through(session)
     states = {}
-    for picture in album.pictures:
-        for person in picture.people:
+    for view in album.views:
+        for person in view.people:
             if person.node == 2:
-                states.setdefault((person.status, person.alert), picture.time_s)
+                states.setdefault((person.status, person.alert), view.time_s)
             else:
                 assert person.alert is not Alert.LOST
     assert ("stale", None) in states
@@ -109,10 +109,10 @@ def asleep(seconds, at_s=30.0, until_s=120.0):
 
 def test_a_laptop_that_slept_for_a_minute_raises_no_alarm_and_says_that_it_slept():
     source, album = asleep(60.0)
-    after = [p for p in album.pictures if p.time_s > 90.0]
+    after = [p for p in album.views if p.time_s > 90.0]
     assert any("slept for 60 s" in n.text for p in after for n in p.notices)
     assert not [person for p in after for person in p.people if person.alert is not None]
-    assert {person.status for person in album.pictures[-1].people} == {"ok"}
+    assert {person.status for person in album.views[-1].people} == {"ok"}
     # The nodes' clocks are as right as before: motions lie where they were made.
     for node, track in source.link.decoder.nodes.items():
         late = [o.time_s - t for t, o in album.observations if isinstance(o, Motion) and t > 92.0
@@ -128,12 +128,12 @@ def test_a_port_that_is_gone_is_told_and_nobody_is_lost_by_it():
         source.unplug(30.0, 30.0)
         session, album = make_session(source, deadreckoning, priors=team.priors())
         run_through(session)
-    gone = [p for p in album.pictures if 32.0 < p.time_s < 59.0]
+    gone = [p for p in album.views if 32.0 < p.time_s < 59.0]
     assert all(any("port vanished" in n.text for n in p.notices) for p in gone)
     assert gone[-1].people[0].status == "stale"
-    back = [p for p in album.pictures if p.time_s > 64.0]
+    back = [p for p in album.views if p.time_s > 64.0]
     assert not any("port vanished" in n.text for p in back for n in p.notices)
-    everyone = [person for p in album.pictures for person in p.people]
+    everyone = [person for p in album.views for person in p.people]
     assert not [person for person in everyone if person.alert is Alert.LOST]
     assert {person.status for person in back[-1].people} == {"ok"}
 
@@ -167,7 +167,7 @@ def test_a_fusion_that_falls_behind_holds_up_nothing_and_loses_nothing():
         session, album = make_session(TeamInput(team), make, priors=team.priors())
         for _ in session.run():
             pass
-        shown = album.pictures[-1]
+        shown = album.views[-1]
         behind = [n.text for n in shown.notices if n.id == "fusion"]
         made[0].go.set()
         outcome = session.finish()
@@ -181,12 +181,12 @@ def test_a_fusion_that_falls_behind_holds_up_nothing_and_loses_nothing():
     assert motions > 100
 
 
-class Broken(QuietSink):
-    def pictured(self, picture):
+class Broken(Sink):
+    def updated(self, view):
         raise RuntimeError("no ink")
 
 
-class Troubled(QuietSink):
+class Troubled(Sink):
     def trouble(self):
         return "disk full: 12 s wait in memory"
 
@@ -197,7 +197,7 @@ def test_a_sink_that_fails_is_told_and_the_others_go_on():
             TeamInput(team), deadreckoning, Broken(), Troubled(), priors=team.priors()
         )
         outcome = run_through(session)
-    texts = [n.text for n in album.pictures[-1].notices]
+    texts = [n.text for n in album.views[-1].notices]
     assert any("Broken has failed" in text and "no ink" in text for text in texts)
     assert "disk full: 12 s wait in memory" in texts
     assert outcome.failure is None
@@ -219,26 +219,28 @@ def test_a_fusion_that_dies_is_told_and_receiving_goes_on():
                 session.stop()
         outcome = session.finish()
     assert "matrix is not what it was" in str(outcome.failure)
-    told = [n for n in album.pictures[-1].notices if n.id == "fusion"]
+    told = [n for n in album.views[-1].notices if n.id == "fusion"]
     assert told[0].level == "alarm"
-    assert album.pictures[-1].people[0].motion_s > 12.0
+    assert album.views[-1].people[0].motion_s > 12.0
 
 
-class Phones:
-    """Visitors whose requests lie ready, each from a moment of the session on."""
+class Phones(Sink):
+    """Phones whose requests wait, each for a moment of the session."""
 
-    def __init__(self, source, *asks):
+    def __init__(self, source, *requests):
         self._source = source
-        self._asks = list(asks)
+        self._waiting = list(requests)
         self.answers = []
 
-    def asks(self):
-        due = [ask for at_s, ask in self._asks if self._source.now_s() >= at_s]
-        self._asks = [(at_s, ask) for at_s, ask in self._asks if self._source.now_s() < at_s]
+    def requests(self):
+        due = [request for at_s, request in self._waiting if self._source.now_s() >= at_s]
+        self._waiting = [
+            (at_s, request) for at_s, request in self._waiting if self._source.now_s() < at_s
+        ]
         return due
 
-    def answer(self, ask, reply, status=200):
-        self.answers.append((ask.id, reply, status))
+    def respond(self, request, reply, status=200):
+        self.answers.append((request.id, reply, status))
 
     def named(self, names):
         self.names = names
@@ -251,7 +253,7 @@ def press(number, unix_s, name="a"):
         "sent_unix_ms": None,
         "presses": [{"id": name, "landmark": "17", "unix_ms": unix_s * 1000.0}],
     }
-    return Ask(number, "presses", unix_s, body)
+    return Request(number, "presses", unix_s, body)
 
 
 def test_presses_names_and_acknowledgements_reach_record_and_picture(monkeypatch):
@@ -263,10 +265,10 @@ def test_presses_names_and_acknowledgements_reach_record_and_picture(monkeypatch
             source,
             (10.0, press(1, 1.7e9 + 9.5)),
             (11.0, press(2, 1.7e9 + 9.5)),
-            (12.0, Ask(3, "name", 1.7e9 + 12.0, {"node": 2, "name": "Kim"})),
-            (13.0, Ask(4, "acknowledge", 1.7e9 + 13.0, {"node": 2})),
+            (12.0, Request(3, "name", 1.7e9 + 12.0, {"node": 2, "name": "Kim"})),
+            (13.0, Request(4, "acknowledge", 1.7e9 + 13.0, {"node": 2})),
         )
-        session, album = make_session(source, deadreckoning, visitors=[phones])
+        session, album = make_session(source, deadreckoning, phones)
         run_through(session)
     (event,) = [o for _, o in album.observations if isinstance(o, Event)]
     assert event == Event(pytest.approx(9.5, abs=0.05), 1, "landmark", "17")
@@ -278,18 +280,18 @@ def test_presses_names_and_acknowledgements_reach_record_and_picture(monkeypatch
     ]
     assert phones.answers[1][1] == {"accepted": ["a"]}
     assert phones.answers[3][1] == {"acknowledged": False}, "there was no alarm"
-    assert [person.name for person in album.pictures[-1].people] == ["Node 1", "Kim"]
+    assert [person.name for person in album.views[-1].people] == ["Node 1", "Kim"]
 
 
 def test_a_recording_is_played_and_takes_no_presses():
     motions = [Motion(float(t), node, 1.0, 0.0, 0.1) for t in range(1, 30) for node in (1, 2)]
     source = PacedInput("a run", [Received(m.time_s, b"", (m,)) for m in motions], speed=0.0)
     phones = Phones(source, (5.0, press(1, 0.0)))
-    session, album = make_session(source, deadreckoning, visitors=[phones])
+    session, album = make_session(source, deadreckoning, phones)
     outcome = run_through(session)
     assert outcome.received == len(motions)
     assert phones.answers[0][2] == 409
-    last = album.pictures[-1]
+    last = album.views[-1]
     assert last.people[1].motion_s == 29.0
     # Nothing is known of a link, and nothing made up.
     assert last.people[1].rssi_dbm is None

@@ -4,11 +4,11 @@ import pytest
 
 from relpos.link.live import Link
 from relpos.measurements import Status
-from relpos.nodes.health import Figures, Health, assess
-from relpos.nodes.view import Counter, TeamView
+from relpos.nodes.health import Health, HealthInputs, assess
+from relpos.nodes.monitor import TeamMonitor, WindowedCount
 from relpos.protocol import messages as wire
 
-WELL = Figures(
+WELL = HealthInputs(
     silent_s=0.8,
     loss=0.02,
     rssi_dbm=-70.0,
@@ -28,7 +28,7 @@ WELL = Figures(
 
 
 def but(**changes):
-    return Figures(**(vars_of(WELL) | changes))
+    return HealthInputs(**(vars_of(WELL) | changes))
 
 
 def vars_of(figures):
@@ -91,7 +91,7 @@ def test_the_worst_comes_first():
 
 
 def test_counts_wrap_begin_anew_with_a_boot_and_leave_the_window():
-    counter = Counter()
+    counter = WindowedCount()
     counter.update(0.0, 3, 65530)  # what was before the watch began is not counted
     counter.update(10.0, 3, 4)
     assert counter.within(10.0) == 10
@@ -101,7 +101,7 @@ def test_counts_wrap_begin_anew_with_a_boot_and_leave_the_window():
 
 
 def test_a_view_tells_loss_silence_and_ranging_of_the_last_half_minute():
-    link, view = Link(), TeamView()
+    link, view = Link(), TeamMonitor()
 
     def hear(time_s, received, lost, successes, failures):
         track = link.decoder.nodes.setdefault(5, _track())
@@ -132,6 +132,6 @@ def _track():
 
 
 def test_the_unwanted_starts_are_those_of_the_wire():
-    from relpos.nodes.view import UNWANTED
+    from relpos.nodes.monitor import UNWANTED
 
     assert set(UNWANTED) == {wire.ResetCause.BROWN_OUT, wire.ResetCause.WATCHDOG}

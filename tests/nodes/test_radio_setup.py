@@ -38,7 +38,7 @@ class Adapter(threading.Thread):
             data = os.read(self.terminal, 4096)
             speed = BAUD_OF_SPEED[termios.tcgetattr(self.port)[5]]
             if speed == self.module.baud:
-                answer = self.module.hear(data)
+                answer = self.module.update_without_link(data)
                 if answer:
                     os.write(self.terminal, answer)
 
@@ -76,9 +76,9 @@ class FromTheShelf:
         self.line = b""
         self.api = None
 
-    def hear(self, data):
+    def update_without_link(self, data):
         if self.api is not None:
-            return self.api.hear(data)
+            return self.api.update_without_link(data)
         if not self.listening:
             self.listening = data == b"+++"
             return b"OK\r" if self.listening else b""
@@ -121,7 +121,7 @@ class Emulated:
     def _emit(self, _time_us, data):
         self.sent += data
 
-    def hear(self, data):
+    def update_without_link(self, data):
         self.module.from_serial(0, data)
         sent, self.sent = self.sent, b""
         return sent

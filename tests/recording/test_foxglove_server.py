@@ -13,7 +13,7 @@ from websockets.sync.client import connect
 
 from relpos.cli.live import with_default_address
 from relpos.errors import DataError, DeviceError
-from relpos.live.picture import Level, Notice, Picture
+from relpos.live.team_view import Level, Notice, TeamView
 from relpos.recording import serve_foxglove
 from relpos.recording.topics import all_topics
 
@@ -28,7 +28,7 @@ class Viewer:
         self.channels = {}
         self.messages = []
 
-    def hear(self):
+    def update_without_link(self):
         """Take in one message of the server's; False where none comes soon."""
         try:
             data = self.socket.recv(timeout=0.2)
@@ -60,7 +60,7 @@ class Viewer:
         until_s = time.monotonic() + PATIENCE_S
         while not condition():
             assert time.monotonic() < until_s, "waited in vain"
-            self.hear()
+            self.update_without_link()
 
 
 def decode(channel, data):
@@ -97,7 +97,7 @@ def test_a_viewer_sees_the_session_under_the_topics_of_a_recording(server, viewe
         return "/team" in viewer.topics()
 
     viewer.until(shown)
-    server.pictured(Picture(1, 0.0, 0.0, notices=(Notice("n", Level.ALARM, "gone", 0.0),)))
+    server.updated(TeamView(1, 0.0, 0.0, notices=(Notice("n", Level.ALARM, "gone", 0.0),)))
     viewer.until(lambda: viewer.topics() >= {"/serial", "/motion", "/estimate", "/tf", "/log"})
     drawn = {e.id: e for _, update in viewer.decoded("/team") for e in update.entities}
     assert drawn["node 1"].texts[0].text.startswith("Ada")

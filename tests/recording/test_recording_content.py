@@ -13,7 +13,7 @@ from sessions import START_NS, about, alike, play, serial_bytes, session
 
 from relpos.errors import DataError
 from relpos.link.live import Link
-from relpos.live.picture import Level, Notice, Picture
+from relpos.live.team_view import Level, Notice, TeamView
 from relpos.measurements import Event, Heading, Motion, Range, Truth
 from relpos.protocol.messages import DEFAULT_KEY
 from relpos.recording import is_recording, make_recorder, open_recording, save_recording
@@ -45,8 +45,8 @@ def recorded(tmp_path_factory):
     recorder.observed(at_s, [Event(at_s - 3.25, 2, "landmark", "17")])
     recorder.observed(at_s, [Heading(at_s - 0.5, 2, 1.5, 0.3, "phone")])
     recorder.named(names)
-    recorder.pictured(
-        Picture(1, at_s, 0.0, notices=(Notice("port", Level.ALARM, "the port vanished", at_s),))
+    recorder.updated(
+        TeamView(1, at_s, 0.0, notices=(Notice("port", Level.ALARM, "the port vanished", at_s),))
     )
     play(recorder, steps[middle:])
     recorder.close()

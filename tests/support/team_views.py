@@ -1,4 +1,4 @@
-"""Pictures of a small team, as a live session gives them."""
+"""Views of a small team, as a live session composes them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from itertools import combinations
 from math import atan2, hypot, pi
 from typing import Any
 
-from relpos.live.picture import Pair, Person, Picture
+from relpos.live.team_view import Pair, Person, TeamView
 
 UNIX_S = 1_780_000_000.0
 PLACES = {1: (0.0, 0.0), 2: (12.0, 5.0), 3: (-7.5, 20.25), 4: (3.0, -9.0)}
@@ -36,9 +36,9 @@ def person(node: int, **changes: Any) -> Person:
     return Person(**{**known, **changes})
 
 
-def picture(
+def team_view(
     seq: int = 1, *, changes: dict[int, dict[str, Any]] | None = None, **more: Any
-) -> Picture:
+) -> TeamView:
     """Everybody, each with ``changes`` of their own."""
     people = tuple(person(node, **(changes or {}).get(node, {})) for node in PLACES)
     pairs = tuple(
@@ -54,7 +54,7 @@ def picture(
         if None not in (a.x_m, a.y_m, b.x_m, b.y_m)
     )
     time_s = 10.0 + seq
-    return Picture(
+    return TeamView(
         **{
             "seq": seq,
             "time_s": time_s,

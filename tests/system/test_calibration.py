@@ -12,8 +12,8 @@ import pytest
 from matplotlib.image import imread
 
 from relpos.emulator.node import draw_uncalibrated_errors
+from relpos.link.dialogue import NodeDialogue
 from relpos.link.live import open_port
-from relpos.link.session import Session
 from relpos.protocol import messages as wire
 
 RELPOS = [sys.executable, "-m", "relpos.cli.main"]
@@ -53,16 +53,16 @@ def test_a_guided_calibration_makes_the_field_round_and_is_kept_over_a_restart(t
         assert imread(tmp_path / "node-1-magnetometer.png").shape[0] > 500
         device = open_port(port)
         try:
-            session = Session(device, 1)
-            calibration = session.read_calibration()
-            boot = session.boot()
-            session.command(wire.CommandCode.REBOOT, 0)
+            dialogue = NodeDialogue(device, 1)
+            calibration = dialogue.read_calibration()
+            boot = dialogue.boot()
+            dialogue.command(wire.CommandCode.REBOOT, 0)
             until_s = time.monotonic() + 10.0
-            while session.boot() == boot and time.monotonic() < until_s:
-                session.listen()
-            assert session.boot() == (boot + 1) % 256
-            raw = [s for s in session.raw_samples(50.0) if s is not None]
-            assert session.read_calibration().to_words() == calibration.to_words()
+            while dialogue.boot() == boot and time.monotonic() < until_s:
+                dialogue.listen()
+            assert dialogue.boot() == (boot + 1) % 256
+            raw = [s for s in dialogue.raw_samples(50.0) if s is not None]
+            assert dialogue.read_calibration().to_words() == calibration.to_words()
         finally:
             device.close()
     field = np.array([s.magnetic_field_ut for s in raw if s.magnetic_field_ut])
@@ -80,7 +80,7 @@ def test_a_walk_of_known_length_sets_the_gain_on_the_node():
         assert done.returncode == 0, done.stderr
         device = open_port(port)
         try:
-            gain = Session(device, 1).setting(wire.CommandCode.SET_STEP_GAIN_PERMILLE)
+            gain = NodeDialogue(device, 1).setting(wire.CommandCode.SET_STEP_GAIN_PERMILLE)
         finally:
             device.close()
     assert f"-> {gain / 1000:.3f}" in done.stdout
@@ -98,9 +98,9 @@ def test_two_antennas_are_calibrated_at_a_known_distance():
         # A third against the first, which keeps what it has.
         device = open_port(port)
         try:
-            session = Session(device, 1)
-            first_mm = session.setting(wire.CommandCode.SET_RANGE_OFFSET_MM)
-            period_ms = session.setting(wire.CommandCode.SET_RANGING_PERIOD_MS)
+            dialogue = NodeDialogue(device, 1)
+            first_mm = dialogue.setting(wire.CommandCode.SET_RANGE_OFFSET_MM)
+            period_ms = dialogue.setting(wire.CommandCode.SET_RANGING_PERIOD_MS)
         finally:
             device.close()
         assert first_mm == pytest.approx(500 * delay_m, abs=20)

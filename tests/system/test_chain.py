@@ -211,7 +211,7 @@ class Listener:
         self.process.communicate()
         self.vanish()
 
-    def hear(self, stream):
+    def update_without_link(self, stream):
         """Give the bytes at once, each with its virtual time, and wait until they are read."""
         for time_s, data in stream:
             stamp = xbee.UnknownFrame(xbee.VIRTUAL_TIME, round(time_s * 1e6).to_bytes(8, "big"))
@@ -252,7 +252,7 @@ def assert_received_is(directory, stream):
 def test_a_port_that_vanishes_is_told_in_one_line_and_keeps_what_came(tmp_path, team_bytes):
     half = [(time_s, data) for time_s, data in team_bytes if time_s < 40.0]
     with Listener("--initial", "common", "--out", tmp_path) as listener:
-        listener.hear(half)
+        listener.update_without_link(half)
         listener.vanish()
         status, stdout, stderr = listener.end()
     assert status == 1
@@ -267,7 +267,7 @@ def test_a_port_that_vanishes_is_told_in_one_line_and_keeps_what_came(tmp_path, 
 
 def test_an_interrupt_ends_a_session_and_keeps_what_came(tmp_path, team_bytes):
     with Listener("--initial", "common", "--out", tmp_path) as listener:
-        listener.hear(team_bytes)
+        listener.update_without_link(team_bytes)
         listener.process.send_signal(signal.SIGINT)
         status, stdout, stderr = listener.end()
     assert status == 0, stderr
@@ -280,7 +280,7 @@ def test_a_foreign_protocol_version_is_named_to_the_user(tmp_path, team_bytes, o
     foreign = bytes((wire.MAGIC, 7, 1, 9)) + bytes(40)
     packet = xbee.encode(xbee.Receive16(9, -50, foreign))
     with Listener("--out", tmp_path) as listener:
-        listener.hear([*team_bytes[:others], (9.0, packet), (9.5, packet)])
+        listener.update_without_link([*team_bytes[:others], (9.0, packet), (9.5, packet)])
         listener.process.send_signal(signal.SIGINT)
         _, _, stderr = listener.end()
     assert stderr.count("node 9 speaks protocol version 7") == 1

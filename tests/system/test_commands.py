@@ -6,7 +6,7 @@ from dataclasses import replace
 from relpos.emulator.pty import PseudoTerminal
 from relpos.emulator.team import EmulatedTeam
 from relpos.link import xbee
-from relpos.link.session import Session
+from relpos.link.dialogue import NodeDialogue
 from relpos.protocol import messages as wire
 from relpos.simulation.team import SCENARIOS
 
@@ -27,34 +27,34 @@ def test_a_node_whose_radio_has_another_address_is_reached():
     with team_at_port() as (team, port):
         wrong = xbee.AtCommand(0, b"MY", b"\x00\x77")
         team.nodes[1].radio.from_serial(0, xbee.encode(wrong))
-        session = Session(port, 1, clock=port.virtual_time_s)
-        assert session.demand(wire.CommandCode.SET_LEG_LENGTH_MM, 901) == 901
-        assert session.setting(wire.CommandCode.SET_LEG_LENGTH_MM) == 901
+        dialogue = NodeDialogue(port, 1, clock=port.virtual_time_s)
+        assert dialogue.demand(wire.CommandCode.SET_LEG_LENGTH_MM, 901) == 901
+        assert dialogue.setting(wire.CommandCode.SET_LEG_LENGTH_MM) == 901
 
 
 def test_commands_are_done_once_though_half_of_all_frames_are_lost():
     straight = SCENARIOS["straight"]
     lossy = replace(straight.world, radio=replace(straight.world.radio, loss_probability=0.5))
     with team_at_port(seed=4, scenario=replace(straight, world=lossy)) as (team, port):
-        session = Session(port, 1, clock=port.virtual_time_s)
-        before = gain_version(session)
+        dialogue = NodeDialogue(port, 1, clock=port.virtual_time_s)
+        before = gain_version(dialogue)
         for gain in (1900, 2000, 2100):
-            assert session.demand(wire.CommandCode.SET_STEP_GAIN_PERMILLE, gain) == gain
-        assert (gain_version(session) - before) % 256 == 3
-        boot = session.boot()
-        session.restart()
-        assert session.boot() == (boot + 1) % 256
+            assert dialogue.demand(wire.CommandCode.SET_STEP_GAIN_PERMILLE, gain) == gain
+        assert (gain_version(dialogue) - before) % 256 == 3
+        boot = dialogue.boot()
+        dialogue.restart()
+        assert dialogue.boot() == (boot + 1) % 256
         assert team.nodes[1].engine.resets == 1
         key = bytes(range(16))
-        assert session.set_key(key)
-        assert session.setting(wire.CommandCode.SET_STEP_GAIN_PERMILLE) == 2100
-        assert not session.set_key(key)
+        assert dialogue.set_key(key)
+        assert dialogue.setting(wire.CommandCode.SET_STEP_GAIN_PERMILLE) == 2100
+        assert not dialogue.set_key(key)
     assert team.radio.counts["lost"] > 5
 
 
-def gain_version(session):
+def gain_version(dialogue):
     """Of a report that comes from now on."""
-    newest = session.totals()
-    while session.totals() in (None, newest):
-        session.listen()
-    return session.totals()["gain_version"]
+    newest = dialogue.totals()
+    while dialogue.totals() in (None, newest):
+        dialogue.listen()
+    return dialogue.totals()["gain_version"]

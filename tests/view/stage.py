@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from playwright.sync_api import Browser, Page, Playwright, sync_playwright
 from walking_team import WalkingTeam
 
-from relpos.live.picture import Hello
-from relpos.live.visitors import Desk
+from relpos.live.requests import RequestHandler
+from relpos.live.team_view import Hello
 from relpos.measurements import Event, Heading, Observation
 from relpos.view.access import Access, listen
 from relpos.view.web import WebView
@@ -42,7 +42,7 @@ def browser_of(playwright: Playwright) -> Iterator[Browser]:
 
 
 class Stage:
-    """A session that plays ``team``: its own clock, its pictures, and what visitors asked for.
+    """A session that plays ``team``: its own clock, its views, and the requests it got.
 
     Its time goes on by itself at ``rate_hz`` pictures a second; ``at_s`` may be moved forward.
     """
@@ -62,7 +62,7 @@ class Stage:
         self._door_port = port
         self._token = token
         self._seq = 0
-        self._desk = Desk(lambda unix_s: unix_s - self.started_unix_s)
+        self._handler = RequestHandler(lambda unix_s: unix_s - self.started_unix_s)
         self._lock = threading.Lock()
         self._over = threading.Event()
         self.open()
@@ -135,25 +135,25 @@ class Stage:
                 if self.web is not None and not self.mute:
                     self._seq += 1
                     self.sent[self._seq] = time.time()
-                    self.web.pictured(self.team.picture(self._seq, self.at_s, self.sent[self._seq]))
+                    self.web.updated(self.team.view(self._seq, self.at_s, self.sent[self._seq]))
                     self._serve(self.web)
 
     def _serve(self, web: WebView) -> None:
-        for ask in web.asks():
+        for request in web.requests():
             reply: dict[str, object] = {}
-            if ask.kind == "presses":
-                reply, new = self._desk.presses(ask)
+            if request.kind == "presses":
+                reply, new = self._handler.presses(request)
                 self.observed += new
-            elif ask.kind == "headings":
-                reply, new = self._desk.headings(ask)
+            elif request.kind == "headings":
+                reply, new = self._handler.headings(request)
                 self.observed += new
-            elif ask.kind == "name":
-                self.team.names[ask.body["node"]] = ask.body["name"]
+            elif request.kind == "name":
+                self.team.names[request.body["node"]] = request.body["name"]
                 web.named(self.team.names)
-            elif ask.kind == "acknowledge":
-                self.acknowledged.append(ask.body["node"])
-                self.team.acknowledged.add(ask.body["node"])
-            web.answer(ask, reply)
+            elif request.kind == "acknowledge":
+                self.acknowledged.append(request.body["node"])
+                self.team.acknowledged.add(request.body["node"])
+            web.respond(request, reply)
 
 
 def wait_for(condition: Callable[[], bool], within_s: float = 60.0) -> None:

@@ -16,16 +16,16 @@ from typing import Any
 
 import pytest
 
-from relpos.live.picture import Alert, GhostPerson, Ghosts, Level, Notice, Person, Picture
+from relpos.live.team_view import Alert, GhostPerson, Ghosts, Level, Notice, Person, TeamView
 from relpos.view.terminal import TerminalView
-from relpos.view.text_page import Canvas, Looks, page
-from support.team_views import picture
+from relpos.view.text_page import Canvas, RenderOptions, page
+from support.team_views import team_view
 
 STILL = {"alert": Alert.STILL_ALARM, "still_s": 33.0, "moving": False}
 
 
-def lines(shown: Picture, **looks: Any) -> list[str]:
-    return [line.plain for line in page(shown, Looks(**looks))]
+def lines(shown: TeamView, **options: Any) -> list[str]:
+    return [line.plain for line in page(shown, RenderOptions(**options))]
 
 
 def row_of(name: str, shown: list[str]) -> str:
@@ -41,14 +41,14 @@ def test_the_page_is_as_large_as_the_terminal(
     columns: int, rows: int, utf8: bool, people: str
 ) -> None:
     shown = {
-        "well": picture(),
-        "in need": picture(
+        "well": team_view(),
+        "in need": team_view(
             changes={2: STILL, 3: {"alert": Alert.LOST, "status": "lost", "seen_s": 99.0}},
             notices=tuple(Notice(f"n{k}", Level.WARNING, "w" * 300, 0.0) for k in range(9)),
         ),
-        "nobody": picture(people=(), pairs=()),
+        "nobody": team_view(people=(), pairs=()),
     }[people]
-    made = page(shown, Looks(columns=columns, rows=rows, utf8=utf8, me=2))
+    made = page(shown, RenderOptions(columns=columns, rows=rows, utf8=utf8, me=2))
     assert len(made) == rows
     assert all(line.cell_len <= columns for line in made)
     if not utf8:
@@ -57,20 +57,20 @@ def test_the_page_is_as_large_as_the_terminal(
 
 def test_distance_and_direction_are_those_from_me() -> None:
     # Node 2 stands at (12, 5) facing world x; node 1 at the origin.
-    shown = picture(changes={2: {"heading_rad": 0.0}})
+    shown = team_view(changes={2: {"heading_rad": 0.0}})
     table = lines(shown, me=2)
     assert "me" in row_of("Kim", table)
     assert "13.0 m ±0.6" in row_of("Åsa", table)
     turned = math.degrees(math.atan2(-5.0, -12.0))
     assert f"{5 * round(abs(turned) / 5)}° right" in row_of("Åsa", table)
     # Seen the other way round, from somebody who faces y.
-    shown = picture(changes={1: {"heading_rad": math.pi / 2}})
+    shown = team_view(changes={1: {"heading_rad": math.pi / 2}})
     assert "65° right" in row_of("Kim", lines(shown, me=1))
     assert "65 right" in row_of("Kim", lines(shown, me=1, utf8=False))
 
 
 def test_no_direction_is_told_by_who_does_not_know_where_it_faces() -> None:
-    shown = picture(changes={2: {"sigma_heading_rad": 1.5}})
+    shown = team_view(changes={2: {"sigma_heading_rad": 1.5}})
     row = row_of("Åsa", lines(shown, me=2))
     assert "13.0 m" in row
     assert not re.search("left|right|ahead|behind", row)
@@ -78,26 +78,26 @@ def test_no_direction_is_told_by_who_does_not_know_where_it_faces() -> None:
 
 def test_whoever_needs_help_is_on_top_in_words() -> None:
     gone = {"alert": Alert.LOST, "status": "lost", "seen_s": 75.0}
-    shown = lines(picture(changes={3: STILL, 4: gone, 1: {"alert": Alert.STILL_WARNING}}), me=2)
+    shown = lines(team_view(changes={3: STILL, 4: gone, 1: {"alert": Alert.STILL_WARNING}}), me=2)
     assert shown[1].startswith("!! Li & Söhne LIES STILL for 33 s, 25 m from Kim")
     assert shown[2].startswith("!! node 4 is LOST: silent for 1 min")
     assert shown[3].startswith("! Åsa <1> has not moved")
     assert "STILL 33 s" in row_of("Li & Söhne", shown)
     assert "LOST" in row_of("node 4", shown)
-    seen = lines(picture(changes={3: {**STILL, "acknowledged": True}, 4: gone}), me=2)
+    seen = lines(team_view(changes={3: {**STILL, "acknowledged": True}, 4: gone}), me=2)
     assert "node 4" in seen[1]
     assert seen[2].endswith("(seen to)")
 
 
 def test_who_moves_again_is_not_said_to_lie() -> None:
-    shown = lines(picture(changes={3: {**STILL, "moving": True, "still_s": 0.0}}), me=2)
+    shown = lines(team_view(changes={3: {**STILL, "moving": True, "still_s": 0.0}}), me=2)
     assert shown[1].startswith("!! Li & Söhne lay still, moves again")
     assert "moving" in row_of("Li & Söhne", shown)
 
 
 def test_more_alarms_than_there_is_room_for_are_counted() -> None:
     notices = tuple(Notice(f"n{k}", Level.WARNING, f"notice {k}", 0.0) for k in range(9))
-    shown = lines(picture(changes={3: STILL}, notices=notices), me=2)
+    shown = lines(team_view(changes={3: STILL}, notices=notices), me=2)
     assert "LIES STILL" in shown[1]
     assert shown[6] == "... and 5 more"
 
@@ -105,7 +105,7 @@ def test_more_alarms_than_there_is_room_for_are_counted() -> None:
 def test_what_is_wrong_with_the_session_and_with_a_node_is_told() -> None:
     notices = (Notice("port", Level.ALARM, "the port has vanished", 0.0),)
     ill = {"health": "yellow", "reasons": ("supply 4.40 V",)}
-    shown = lines(picture(changes={2: ill}, notices=notices), columns=100)
+    shown = lines(team_view(changes={2: ill}, notices=notices), columns=100)
     assert "!! the port has vanished" in shown
     assert "supply 4.40 V" in row_of("Kim", shown)
 
@@ -114,8 +114,8 @@ def ghost(node: int, x_m: float, y_m: float, heading_rad: float = 0.0) -> GhostP
     return GhostPerson(node, x_m, y_m, heading_rad, 0.5, 0.5, 0.0, "ellipse")
 
 
-def ambiguous() -> Picture:
-    return picture(
+def ambiguous() -> TeamView:
+    return team_view(
         changes={3: {"status": "ambiguous"}},
         ambiguous=True,
         alternatives=(
@@ -138,7 +138,7 @@ def test_an_ambiguous_picture_shows_the_possibilities() -> None:
 
 
 def test_the_map_shows_who_is_where() -> None:
-    shown = lines(picture(), me=1, columns=100, rows=40, table=False)
+    shown = lines(team_view(), me=1, columns=100, rows=40, table=False)
     places = {}
     for row, line in enumerate(shown):
         for found in re.finditer(r"(?<![\d?])([1-4])[↑↖←↙↓↘→↗]", line):
@@ -152,7 +152,7 @@ def test_the_map_shows_who_is_where() -> None:
 
 
 def test_the_map_has_north_up_once_that_is_known() -> None:
-    shown = lines(picture(north_rad=0.0), me=1, columns=100, rows=40, table=False)
+    shown = lines(team_view(north_rad=0.0), me=1, columns=100, rows=40, table=False)
     places = {
         int(found[1]): (found.start(), row)
         for row, line in enumerate(shown)
@@ -162,11 +162,11 @@ def test_the_map_has_north_up_once_that_is_known() -> None:
     assert places[2][1] < places[1][1]
     assert places[3][0] < places[1][0] < places[4][0]
     assert any("up: magnetic north" in line for line in shown)
-    assert any("up: y" in line for line in lines(picture(), me=1, columns=100, rows=40))
+    assert any("up: y" in line for line in lines(team_view(), me=1, columns=100, rows=40))
 
 
 def test_the_scale_is_true() -> None:
-    shown = lines(picture(), me=1, columns=100, rows=40, table=False)
+    shown = lines(team_view(), me=1, columns=100, rows=40, table=False)
     bar = next(re.search(r"├─*┤ (\d+) m", line) for line in shown if "├" in line)
     assert bar is not None
     cells_per_m = len(bar[0].split(" ")[0]) / float(bar[1])
@@ -176,7 +176,7 @@ def test_the_scale_is_true() -> None:
 
 def test_my_face_is_up_when_it_is_wanted() -> None:
     # I face x; who is ahead of me, at larger x, is above me then.
-    shown = picture(changes={1: {"heading_rad": 0.0}})
+    shown = team_view(changes={1: {"heading_rad": 0.0}})
     drawn = lines(shown, me=1, rows=40, table=False, heading_up=True)
     rows = {int(m[1]): k for k, line in enumerate(drawn) for m in re.finditer(r"([12])[←-↙]", line)}
     assert rows[2] < rows[1]
@@ -184,8 +184,8 @@ def test_my_face_is_up_when_it_is_wanted() -> None:
 
 
 def test_zoom_changes_the_scale_and_loses_nobody() -> None:
-    wide = "\n".join(lines(picture(), me=1, rows=40, table=False, zoom=-3))
-    near = "\n".join(lines(picture(), me=1, rows=40, table=False, zoom=3))
+    wide = "\n".join(lines(team_view(), me=1, rows=40, table=False, zoom=-3))
+    near = "\n".join(lines(team_view(), me=1, rows=40, table=False, zoom=3))
     scale = [float(re.findall(r"┤ ([\d.]+) m", text)[0]) for text in (wide, near)]
     assert scale[0] > scale[1]
     # Who is beyond the border stands at it.
@@ -200,7 +200,7 @@ def test_where_not_everybody_fits_those_in_need_stay_and_the_rest_turns() -> Non
     people = (*people[:18], Person(19, "Wearer 19", 19.0, 0.0, alert=Alert.LOST), people[19])
     seen: set[str] = set()
     for second in range(60):
-        shown = lines(picture(people=people, pairs=(), time_s=float(second)), me=5)
+        shown = lines(team_view(people=people, pairs=(), time_s=float(second)), me=5)
         names = [m[0] for line in shown[2:] if (m := re.search(r"Wearer \d+", line))]
         assert names[:2] == ["Wearer 5", "Wearer 19"]
         assert any("page " in line for line in shown)
@@ -210,7 +210,7 @@ def test_where_not_everybody_fits_those_in_need_stay_and_the_rest_turns() -> Non
 
 def test_a_name_cannot_command_the_terminal() -> None:
     evil = "Eve\x1b[2J\x07\u202e"
-    shown = picture(
+    shown = team_view(
         changes={1: {"name": evil, "alert": Alert.LOST, "reasons": ("\x1b]0;x\x07",)}},
         notices=(Notice("n", Level.INFO, "\x9b1m", 0.0),),
     )
@@ -220,7 +220,7 @@ def test_a_name_cannot_command_the_terminal() -> None:
 
 
 def test_wide_names_keep_the_columns_in_line() -> None:
-    made = page(picture(changes={1: {"name": "消防士田中太郎一郎"}}), Looks(me=2))
+    made = page(team_view(changes={1: {"name": "消防士田中太郎一郎"}}), RenderOptions(me=2))
     rows = [line for line in made if "13.0 m" in line.plain or "16.6 m" in line.plain]
     from rich.cells import cell_len
 
@@ -296,9 +296,9 @@ def view(screen: Screen, monkeypatch: pytest.MonkeyPatch) -> Iterator[TerminalVi
 def test_the_terminal_shows_the_newest_picture_and_comes_back_as_it_was(
     screen: Screen, view: TerminalView
 ) -> None:
-    view.pictured(picture())
+    view.updated(team_view())
     until(lambda: "Kim" in "".join(screen.rows()), "nothing is drawn")
-    view.pictured(picture(changes={2: {"name": "Robin"}}))
+    view.updated(team_view(changes={2: {"name": "Robin"}}))
     until(lambda: "Robin" in "".join(screen.rows()), "the next picture is not drawn")
     assert "Kim" not in "".join(screen.rows())
     assert screen.rows()[-1].startswith("a seen to")
@@ -310,15 +310,15 @@ def test_the_terminal_shows_the_newest_picture_and_comes_back_as_it_was(
 def test_the_bell_rings_when_an_alarm_begins_and_not_when_it_is_muted(
     screen: Screen, view: TerminalView
 ) -> None:
-    view.pictured(picture())
+    view.updated(team_view())
     until(lambda: "Kim" in screen.received, "nothing is drawn")
     assert "\a" not in screen.received
-    view.pictured(picture(2, changes={3: STILL}))
+    view.updated(team_view(2, changes={3: STILL}))
     until(lambda: "\a" in screen.received, "the bell does not ring")
     view.press("b")
     until(lambda: "bell off" in screen.rows()[0], "it does not say that it is muted")
     rung = screen.received.count("\a")
-    view.pictured(picture(3, changes={1: STILL, 3: STILL}))
+    view.updated(team_view(3, changes={1: STILL, 3: STILL}))
     until(lambda: "sa <1> LIES STILL" in "".join(screen.rows()), "the second is not shown")
     assert screen.received.count("\a") == rung
 
@@ -329,16 +329,16 @@ def test_the_bell_goes_on_for_a_person_and_not_for_a_cable(
     monkeypatch.setattr("relpos.view.terminal.BELL_S", 0.0)
     monkeypatch.setattr("relpos.view.terminal.DRAW_S", 0.02)
     cable = (Notice("port", Level.ALARM, "the port has vanished", 0.0),)
-    view.pictured(picture(notices=cable))
+    view.updated(team_view(notices=cable))
     until(lambda: "\a" in screen.received, "the bell does not ring")
     seen = screen.received.count("time")
     for seq in range(20):
-        view.pictured(picture(seq, notices=cable))
+        view.updated(team_view(seq, notices=cable))
         time.sleep(0.03)
     assert screen.received.count("\a") == 1 + seen
-    view.pictured(picture(changes={3: STILL}))
+    view.updated(team_view(changes={3: STILL}))
     until(lambda: screen.received.count("\a") >= 5, "it does not go on")
-    view.pictured(picture(changes={3: {**STILL, "acknowledged": True}}))
+    view.updated(team_view(changes={3: {**STILL, "acknowledged": True}}))
     until(lambda: "(seen to)" in "".join(screen.rows()), "it is not shown as seen to")
     rung = screen.received.count("\a")
     time.sleep(0.2)
@@ -347,20 +347,20 @@ def test_the_bell_goes_on_for_a_person_and_not_for_a_cable(
 
 def test_a_key_says_that_the_worst_alarm_is_seen_to(screen: Screen, view: TerminalView) -> None:
     lost = {"alert": Alert.LOST, "status": "lost"}
-    view.pictured(picture(changes={1: lost, 3: STILL}))
+    view.updated(team_view(changes={1: lost, 3: STILL}))
     until(lambda: "LOST" in "".join(screen.rows()), "nothing is drawn")
     for node, others in ((3, {1: lost, 3: {**STILL, "acknowledged": True}}), (1, {1: lost})):
         view.press("a")
-        (ask,) = view.asks()
-        assert (ask.kind, ask.body) == ("acknowledge", {"node": node})
-        view.pictured(picture(changes=others))
-    view.pictured(picture())
+        (request,) = view.requests()
+        assert (request.kind, request.body) == ("acknowledge", {"node": node})
+        view.updated(team_view(changes=others))
+    view.updated(team_view())
     view.press("a")
-    assert view.asks() == []
+    assert view.requests() == []
 
 
 def test_keys_change_whose_view_it_is(screen: Screen, view: TerminalView) -> None:
-    view.pictured(picture())
+    view.updated(team_view())
     until(lambda: "me" in row_of("Kim", ["#", *screen.rows()]), "nothing is drawn")
     view.press("m")
     until(lambda: " me " in row_of("Li", ["#", *screen.rows()]), "it is still Kim's view")
@@ -383,12 +383,12 @@ def test_q_ends_the_session_as_ctrl_c_does(view: TerminalView) -> None:
 def test_a_terminal_that_is_gone_is_told_and_ends_nothing() -> None:
     screen = Screen()
     view = TerminalView(stream=screen.stream, keys=False)
-    view.pictured(picture())
+    view.updated(team_view())
     until(lambda: "Kim" in screen.received, "nothing is drawn")
     os.close(screen.master)
 
     def drawn() -> bool:
-        view.pictured(picture(int(10.0 * time.monotonic())))
+        view.updated(team_view(int(10.0 * time.monotonic())))
         return view.trouble() is not None
 
     until(drawn, "nobody is told")
@@ -402,7 +402,7 @@ def test_a_file_gets_plain_pages(tmp_path: Any, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("relpos.view.terminal.PLAIN_S", 0.05)
     with (tmp_path / "log.txt").open("w", encoding="utf-8") as file:
         view = TerminalView(me=2, stream=file)
-        view.pictured(picture())
+        view.updated(team_view())
         until(lambda: "Kim" in (tmp_path / "log.txt").read_text("utf-8"), "no page")
         view.close()
     text = (tmp_path / "log.txt").read_text("utf-8")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from relpos.live.picture import (
+from relpos.live.team_view import (
     STILL_ALARM_S,
     STILL_WARNING_S,
     Alert,
@@ -20,7 +20,7 @@ from relpos.live.picture import (
     Notice,
     Pair,
     Person,
-    Picture,
+    TeamView,
 )
 
 NAMES = (
@@ -106,7 +106,7 @@ class WalkingTeam:
             ranging=0.93 - 0.02 * node, neighbours=self.size - 1,
         )  # fmt: skip
 
-    def picture(self, seq: int, time_s: float, unix_s: float) -> Picture:
+    def view(self, seq: int, time_s: float, unix_s: float) -> TeamView:
         """Show everybody at that time."""
         people = tuple(self.person(node, time_s) for node in range(1, self.size + 1))
         placed = [p for p in people if p.x_m is not None]
@@ -125,7 +125,7 @@ class WalkingTeam:
                     age_s = (time_s + 1.3 * a.node + 0.7 * b.node) % 4.0
                     error_m = 0.2 * math.sin(3.0 * a.node + b.node + 0.1 * time_s)
                     ranges.append(MeasuredRange(a.node, b.node, distance_m + error_m, age_s))
-        return Picture(
+        return TeamView(
             seq, time_s, unix_s, unix_s - 0.02, time_s - 1.2,
             self.north_rad, None if self.north_rad is None else 0.1,
             ambiguous=self.ambiguous is not None or self.ring is not None,

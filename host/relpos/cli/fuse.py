@@ -248,7 +248,7 @@ def _fuse_mcap(
     report: bool | None,
 ) -> None:
     """Repeat a recorded session, with its own settings where the command line gives none."""
-    from relpos.live.fusing import common_start
+    from relpos.live.fusion_thread import common_start
     from relpos.live.inputs import PacedInput
     from relpos.measurements import Heading, Height, Motion, Range
     from relpos.recording import open_recording
@@ -476,7 +476,7 @@ def fuse_live(
 
     ``emulated`` tells of an emulated team whether its walk is over, which ends its port.
     """
-    from relpos.live.fusing import Fusing
+    from relpos.live.fusion_thread import FusionThread
     from relpos.runs import Description
 
     description = description or Description(name=_base_name(job.source))
@@ -484,7 +484,7 @@ def fuse_live(
     fused = live.Fused(str(job.estimator), job.settings, job.seed, tuple(priors), common=common)
     outcome = live.run(
         source,
-        Fusing(lambda known: job.make(known, description.nodes), priors, common=common),
+        FusionThread(lambda known: job.make(known, description.nodes), priors, common=common),
         options,
         name=name,
         fused=fused,

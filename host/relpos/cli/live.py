@@ -20,11 +20,11 @@ from relpos.errors import DeviceError
 
 if TYPE_CHECKING:
     from relpos.live.composer import Composer
-    from relpos.live.fusing import Fusing
+    from relpos.live.fusion_thread import FusionThread
     from relpos.live.inputs import Input
-    from relpos.live.picture import Hello
-    from relpos.live.session import Named, Outcome
+    from relpos.live.session import Outcome
     from relpos.live.sinks import Sink
+    from relpos.live.team_view import Hello
     from relpos.measurements import Prior
     from relpos.recording.about import About
     from relpos.recording.recorder import Recorder
@@ -110,10 +110,10 @@ MakeSink = Callable[["Hello"], "Sink"]
 
 @dataclass(frozen=True)
 class Options:
-    """How a session is shown and kept, as the command line said it.
+    """How a session is shown and stored, as the command line says.
 
-    ``sinks`` make whatever else is to be fed; each may also be ``Visitors``. With any of them, or
-    the page, the session outlives its port: it is opened again when it is there again.
+    ``sinks`` make further sinks. With any of them, or the page, the session outlives its port,
+    which is opened again when it is back.
     """
 
     view: bool = False
@@ -197,7 +197,7 @@ def open_port(port: str, key_file: Path | None, *, teach: bool, reopen: bool) ->
 
 def run(
     source: Input,
-    fusing: Fusing,
+    fusion: FusionThread,
     options: Options,
     *,
     name: str,
@@ -213,9 +213,8 @@ def run(
     """
     from relpos.live.composer import Composer
     from relpos.live.files import FileSink
-    from relpos.live.picture import Hello
-    from relpos.live.session import Session
-    from relpos.live.visitors import Visitors
+    from relpos.live.session import LiveSession
+    from relpos.live.team_view import Hello
 
     hello = Hello(name, source.name, fused.estimator, time.time() - source.now_s(), emulated)
     files = FileSink(out, description, keep_received=keep_received)
@@ -223,23 +222,17 @@ def run(
         {node: info.name for node, info in description.nodes.items() if info.name}
     )
     sinks: list[Sink] = [files]
-    namings: list[Named] = [files]
     if options.view:
-        page = _open_page(options, hello)
-        sinks.append(page)
-        namings.append(page)
+        sinks.append(_open_page(options, hello))
     sinks += [make(hello) for make in options.sinks]
     keepers = _keepers(options, fused.about(source, description, hello.started_unix_s))
     sinks += keepers
-    namings += keepers
     later: list[str] = []
-    session = Session(
+    session = LiveSession(
         source,
-        fusing,
+        fusion,
         composer,
         sinks,
-        visitors=[sink for sink in sinks if isinstance(sink, Visitors)],
-        namings=namings,
         seconds=options.seconds,
         lasts=options.watched or (options.shown and source.is_now),
         remark=later.append if options.screen else output.remark,

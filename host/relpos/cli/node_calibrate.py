@@ -15,13 +15,13 @@ from typer.core import TyperGroup
 
 from relpos.cli import output
 from relpos.cli.keys import KeyFile
-from relpos.cli.node_session import Node, Port, dialogue
+from relpos.cli.node_dialogue import Node, Port, connect
 from relpos.errors import DataError, DeviceError
 
 if TYPE_CHECKING:
     from relpos.calibration.antenna import RangeFit
     from relpos.calibration.guide import Progress, Result
-    from relpos.link.session import Session
+    from relpos.link.dialogue import NodeDialogue
     from relpos.measurements import RawSample
 
 HEARD_WITHIN_S = 6.0
@@ -81,8 +81,8 @@ def sensors(
     key_file: KeyFile = None,
 ) -> None:
     """Calibrate gyroscope, accelerometer and magnetometer; `calibrate PORT` for short."""
-    with dialogue(port, node, key_file) as session:
-        _sensors(session, seconds, magnetometer, out, yes)
+    with connect(port, node, key_file) as dialogue:
+        _sensors(dialogue, seconds, magnetometer, out, yes)
 
 
 @app.command()
@@ -100,8 +100,8 @@ def walk(
     key_file: KeyFile = None,
 ) -> None:
     """Set the step gain by a straight walk of known length."""
-    with dialogue(port, node, key_file) as session:
-        _walk(session, distance, stature, yes)
+    with connect(port, node, key_file) as dialogue:
+        _walk(dialogue, distance, stature, yes)
 
 
 @app.command()
@@ -130,8 +130,8 @@ def antenna(
         raise typer.BadParameter("two different nodes, 1 to 254", param_hint="--nodes")
     if reference not in (None, first, second):
         raise typer.BadParameter("one of the two nodes", param_hint="--reference")
-    with dialogue(port, first, key_file) as session:
-        _antenna(session, (first, second), distance, reference, ranges, yes)
+    with connect(port, first, key_file) as dialogue:
+        _antenna(dialogue, (first, second), distance, reference, ranges, yes)
 
 
 def _confirmed(yes: bool) -> bool:
@@ -187,11 +187,13 @@ def _shown() -> Iterator[Any]:
         yield show
 
 
-def _sensors(session: Session, seconds: float, magnetic: bool, out: Path | None, yes: bool) -> None:
+def _sensors(
+    dialogue: NodeDialogue, seconds: float, magnetic: bool, out: Path | None, yes: bool
+) -> None:
     from relpos.calibration import guide
 
     output.remark(
-        f"node {session.node}: away from steel and from your phone,\n"
+        f"node {dialogue.node}: away from steel and from your phone,\n"
         "  1. lay it on something firm and leave it alone for ten seconds,\n"
         "  2. lay it on each of its six sides, three seconds each,\n"
         "  3. turn it slowly on the spot in all directions, until the last bar is full.\n"
@@ -200,7 +202,7 @@ def _sensors(session: Session, seconds: float, magnetic: bool, out: Path | None,
     samples: list[RawSample] = []
     # Ctrl-C says that it is enough; what is missing then is told by the fits.
     with _shown() as show, suppress(KeyboardInterrupt):
-        for sample in session.raw_samples(seconds):
+        for sample in dialogue.raw_samples(seconds):
             if sample is None:
                 continue
             samples.append(sample)
@@ -209,18 +211,18 @@ def _sensors(session: Session, seconds: float, magnetic: bool, out: Path | None,
                 show(now)
                 if now.done(with_magnetometer=magnetic):
                     break
-    before = session.read_calibration()
+    before = dialogue.read_calibration()
     result = guide.solve(samples, with_magnetometer=magnetic)
     for words in result.remarks:
         output.remark(words)
-    _print_result(session.node, result)
+    _print_result(dialogue.node, result)
     if out is not None:
-        _write(out, session.node, result)
+        _write(out, dialogue.node, result)
     if not _confirmed(yes):
-        raise DataError(f"node {session.node} keeps what it had")
-    session.write_calibration(result.calibration)
+        raise DataError(f"node {dialogue.node} keeps what it had")
+    dialogue.write_calibration(result.calibration)
     again = "again" if before.gyro_bias_sigma_rad_s > 0.0 else "for the first time"
-    typer.echo(f"node {session.node} is calibrated {again}: stored, restarted and read back")
+    typer.echo(f"node {dialogue.node} is calibrated {again}: stored, restarted and read back")
 
 
 def _triple(values: Any, factor: float = 1.0, digits: int = 2) -> str:
@@ -284,26 +286,26 @@ def _write(out: Path, node: int, result: Result) -> None:
 # -- steps -----------------------------------------------------------------------------------------
 
 
-def _walk(session: Session, distance_m: float, stature_m: float | None, yes: bool) -> None:
+def _walk(dialogue: NodeDialogue, distance_m: float, stature_m: float | None, yes: bool) -> None:
     from relpos.calibration import steps
     from relpos.protocol import messages as wire
 
     if stature_m is not None:
         leg_mm = round(1000.0 * steps.leg_length_m(stature_m))
-        session.demand(wire.CommandCode.SET_LEG_LENGTH_MM, leg_mm)
+        dialogue.demand(wire.CommandCode.SET_LEG_LENGTH_MM, leg_mm)
         typer.echo(f"leg length: {leg_mm / 1000:.3f} m")
-    gain = session.setting(wire.CommandCode.SET_STEP_GAIN_PERMILLE)
-    before = _motion(session)
+    gain = dialogue.setting(wire.CommandCode.SET_STEP_GAIN_PERMILLE)
+    before = _motion(dialogue)
     output.remark(
-        f"node {session.node}: walk {distance_m:g} m straight at your usual pace, "
+        f"node {dialogue.node}: walk {distance_m:g} m straight at your usual pace, "
         f"then stand for {STOOD_S:g} seconds"
     )
     newest = before
     stepped_s = time.monotonic()
     until_s = stepped_s + WALK_WITHIN_S
     while time.monotonic() < until_s:
-        session.listen()
-        totals = _motion(session)
+        dialogue.listen()
+        totals = _motion(dialogue)
         if totals["steps"] != newest["steps"]:
             stepped_s = time.monotonic()
         newest = totals
@@ -322,18 +324,18 @@ def _walk(session: Session, distance_m: float, stature_m: float | None, yes: boo
         f"({100 * believed:+.1f} %: one walk is believed as far as people differ)"
     )
     if not _confirmed(yes):
-        raise DataError(f"node {session.node} keeps its step gain")
-    session.set_step_gain(fit.gain_permille)
-    typer.echo(f"node {session.node} has stored it")
+        raise DataError(f"node {dialogue.node} keeps its step gain")
+    dialogue.set_step_gain(fit.gain_permille)
+    typer.echo(f"node {dialogue.node} has stored it")
 
 
-def _motion(session: Session) -> dict[str, Any]:
+def _motion(dialogue: NodeDialogue) -> dict[str, Any]:
     """The node's newest running totals, waiting for the first."""
     until_s = time.monotonic() + HEARD_WITHIN_S
-    while (totals := session.totals()) is None:
+    while (totals := dialogue.totals()) is None:
         if time.monotonic() > until_s:
-            raise DeviceError(f"node {session.node} reports no motion")
-        session.listen()
+            raise DeviceError(f"node {dialogue.node} reports no motion")
+        dialogue.listen()
     return dict(totals)
 
 
@@ -341,7 +343,7 @@ def _motion(session: Session) -> dict[str, Any]:
 
 
 def _antenna(
-    session: Session,
+    dialogue: NodeDialogue,
     pair: tuple[int, int],
     distance_m: float,
     reference: int | None,
@@ -351,23 +353,23 @@ def _antenna(
     from relpos.calibration import antenna as fits
     from relpos.nodes import antenna as measuring
 
-    shares_mm = measuring.read_shares_mm(session, pair)
+    shares_mm = measuring.read_shares_mm(dialogue, pair)
     output.remark(
         f"nodes {pair[0]} and {pair[1]}: leave them alone, {distance_m:g} m apart and in sight of "
         f"each other, until {count} ranges are in"
     )
-    with measuring.ranging_fast(session, pair):
-        found = fits.fit_ranges(_ranges(session, pair, count), distance_m)
+    with measuring.ranging_fast(dialogue, pair):
+        found = fits.fit_ranges(_ranges(dialogue, pair, count), distance_m)
         _tell_ranges("before", found)
         new_mm = fits.new_shares_mm(
             found.bias_m, shares_mm, None if reference is None else pair.index(reference)
         )
         if not _confirmed(yes):
             raise DataError(f"nodes {pair[0]} and {pair[1]} keep their range offsets")
-        measuring.store_shares_mm(session, pair, new_mm)
+        measuring.store_shares_mm(dialogue, pair, new_mm)
         for node, old, new in zip(pair, shares_mm, new_mm, strict=True):
             typer.echo(f"node {node}: range offset {old / 1000:+.3f} -> {new / 1000:+.3f} m")
-        left = fits.fit_ranges(_ranges(session, pair, count), distance_m)
+        left = fits.fit_ranges(_ranges(dialogue, pair, count), distance_m)
     _tell_ranges("after", left)
     # Both fits err; three times the deviation of their difference, and a millimetre of rounding.
     most_m = 3.0 * math.hypot(found.sigma_m, left.sigma_m) + 0.001
@@ -386,7 +388,7 @@ def _tell_ranges(when: str, fit: RangeFit) -> None:
     )
 
 
-def _ranges(session: Session, pair: tuple[int, int], count: int) -> list[float]:
+def _ranges(dialogue: NodeDialogue, pair: tuple[int, int], count: int) -> list[float]:
     from relpos.nodes.antenna import collect
 
-    return list(output.with_progress(collect(session, pair, count), count, "ranges"))
+    return list(output.with_progress(collect(dialogue, pair, count), count, "ranges"))

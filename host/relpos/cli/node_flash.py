@@ -15,7 +15,7 @@ from relpos.cli.keys import KeyFile
 from relpos.errors import DataError, DeviceError
 
 if TYPE_CHECKING:
-    from relpos.link.session import Session
+    from relpos.link.dialogue import NodeDialogue
     from relpos.nodes.cable import CablePort
 
 HEARD_WITHIN_S = 20.0
@@ -82,8 +82,8 @@ def _set_up(
 ) -> None:
     """Hear the node over its cable; give it key and number."""
     from relpos.link.authentication import read_key
+    from relpos.link.dialogue import NodeDialogue
     from relpos.link.live import Link
-    from relpos.link.session import Session
     from relpos.nodes.cable import CablePort
     from relpos.protocol import messages as wire
 
@@ -92,32 +92,32 @@ def _set_up(
     with closing(CablePort(port)) as cable:
         link = Link(key=old)
         link.accept_keys(old, key)
-        session = Session(cable, 0, link)
+        dialogue = NodeDialogue(cable, 0, link)
         with output.working("waiting for the node"):
-            _hear(session, cable, port)
+            _hear(dialogue, cable, port)
         if key_file is not None or old_key_file is not None:
-            changed = session.set_key(key)
+            changed = dialogue.set_key(key)
             words = "has been given the key" if changed else "had the key already"
-            typer.echo(f"node {session.node} {words}")
-        if node_id is not None and node_id != session.node:
-            before = session.node
-            session.set_node_id(node_id)
-            typer.echo(f"node {before} is node {session.node} now")
-        session.demand(wire.CommandCode.PING, 0)
+            typer.echo(f"node {dialogue.node} {words}")
+        if node_id is not None and node_id != dialogue.node:
+            before = dialogue.node
+            dialogue.set_node_id(node_id)
+            typer.echo(f"node {before} is node {dialogue.node} now")
+        dialogue.demand(wire.CommandCode.PING, 0)
         typer.echo(
-            f"node {session.node} answers over the cable. Now set the switch back to XBEE; its "
-            f"module: relpos node radio --node {session.node}"
+            f"node {dialogue.node} answers over the cable. Now set the switch back to XBEE; its "
+            f"module: relpos node radio --node {dialogue.node}"
         )
 
 
-def _hear(session: Session, cable: CablePort, port: str) -> None:
-    """Wait for the node; its number is the session's from then on."""
+def _hear(dialogue: NodeDialogue, cable: CablePort, port: str) -> None:
+    """Wait for the node; its number is the dialogue's from then on."""
     from relpos.nodes.boards import SWITCH
 
-    decoder = session.link.decoder
+    decoder = dialogue.link.decoder
     until_s = time.monotonic() + HEARD_WITHIN_S
     while not decoder.nodes:
-        session.listen()
+        dialogue.listen()
         if time.monotonic() > until_s:
             if cable.heard:
                 raise DeviceError(
@@ -125,4 +125,4 @@ def _hear(session: Session, cable: CablePort, port: str) -> None:
                     "the one that the node has with --old-key-file"
                 )
             raise DeviceError(f"{port}: the firmware is written, but nothing is heard: {SWITCH}")
-    session.node = next(iter(decoder.nodes))
+    dialogue.node = next(iter(decoder.nodes))

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from relpos.cli.keys import KeyFile
-from relpos.cli.node_session import Cable, Node, Port, dialogue
+from relpos.cli.node_dialogue import Cable, Node, Port, connect
 from relpos.errors import DeviceError
 
 if TYPE_CHECKING:
-    from relpos.link.session import Session
+    from relpos.link.dialogue import NodeDialogue
     from relpos.nodes.settings import Change
 
 KEY, ID, DEFAULTS = "key", "id", "defaults"
@@ -70,17 +70,17 @@ def set_node(
         changes = parse_changes(rest)
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="NAME VALUE") from None
-    with dialogue(port, node, key_file, cable=cable) as session:
+    with connect(port, node, key_file, cable=cable) as dialogue:
         if not changes and number is None and not defaults:
-            _show(session)
+            _show(dialogue)
             return
-        rows = _restore(session) if defaults else []
-        rows += _apply(session, changes)
+        rows = _restore(dialogue) if defaults else []
+        rows += _apply(dialogue, changes)
         if number is not None:
-            before = session.node
-            session.set_node_id(number)
-            rows.append((ID, str(before), str(session.node)))
-        _print(f"Node {session.node}", ("setting", "before", "now"), rows)
+            before = dialogue.node
+            dialogue.set_node_id(number)
+            rows.append((ID, str(before), str(dialogue.node)))
+        _print(f"Node {dialogue.node}", ("setting", "before", "now"), rows)
         if number is not None and not cable:
             typer.echo(
                 f"its XBee module still has the address of its old number: relpos node radio "
@@ -105,39 +105,39 @@ def _take_id(words: list[str]) -> int | None:
     return None
 
 
-def _show(session: Session) -> None:
+def _show(dialogue: NodeDialogue) -> None:
     from relpos.nodes.settings import SETTINGS
 
     rows = [
-        (setting.name, setting.shown(session.setting(setting.code)), setting.meaning)
+        (setting.name, setting.shown(dialogue.setting(setting.code)), setting.meaning)
         for setting in SETTINGS
     ]
-    _print(f"Node {session.node}", ("setting", "value", "meaning"), rows)
+    _print(f"Node {dialogue.node}", ("setting", "value", "meaning"), rows)
 
 
-def _apply(session: Session, changes: Sequence[Change]) -> list[tuple[str, str, str]]:
+def _apply(dialogue: NodeDialogue, changes: Sequence[Change]) -> list[tuple[str, str, str]]:
     rows = []
     for change in changes:
         setting = change.setting
-        before = session.setting(setting.code)
-        session.demand(setting.code, change.raw)
+        before = dialogue.setting(setting.code)
+        dialogue.demand(setting.code, change.raw)
         # Read anew: not what the node was told, what it has.
-        after = session.setting(setting.code)
+        after = dialogue.setting(setting.code)
         if after != change.raw:
             raise DeviceError(
-                f"node {session.node}: {setting.name} is {setting.shown(after)} instead of "
+                f"node {dialogue.node}: {setting.name} is {setting.shown(after)} instead of "
                 f"{setting.shown(change.raw)}"
             )
         rows.append((setting.name, setting.shown(before), setting.shown(after)))
     return rows
 
 
-def _restore(session: Session) -> list[tuple[str, str, str]]:
+def _restore(dialogue: NodeDialogue) -> list[tuple[str, str, str]]:
     from relpos.nodes.settings import SETTINGS
 
-    before = [session.setting(setting.code) for setting in SETTINGS]
-    session.restore_defaults()
-    after = [session.setting(setting.code) for setting in SETTINGS]
+    before = [dialogue.setting(setting.code) for setting in SETTINGS]
+    dialogue.restore_defaults()
+    after = [dialogue.setting(setting.code) for setting in SETTINGS]
     return [
         (setting.name, setting.shown(old), setting.shown(new))
         for setting, old, new in zip(SETTINGS, before, after, strict=True)
@@ -153,11 +153,11 @@ def _set_key(
     cable: bool,
 ) -> None:
     from relpos.link.authentication import read_key, write_new_key
+    from relpos.link.dialogue import open_dialogue
     from relpos.link.live import Link
-    from relpos.link.session import open_session
     from relpos.protocol import messages as wire
 
-    from relpos.cli.node_session import open_device  # isort: skip
+    from relpos.cli.node_dialogue import open_device  # isort: skip
 
     old = wire.DEFAULT_KEY if old_key_file is None else read_key(old_key_file)
     device = open_device(port, cable)
@@ -166,10 +166,10 @@ def _set_key(
         link = Link(key=old)
         # A node that has the new key already is heard, too.
         link.accept_keys(old, key)
-        session = open_session(device, node, link)
-        changed = session.set_key(key)
+        dialogue = open_dialogue(device, node, link)
+        changed = dialogue.set_key(key)
         typer.echo(
-            f"node {session.node} {'now has' if changed else 'had'} the key of {key_file}"
+            f"node {dialogue.node} {'now has' if changed else 'had'} the key of {key_file}"
             + (" and answers under it" if changed else " already")
         )
     finally:
@@ -178,11 +178,11 @@ def _set_key(
 
 def reboot(port: Port, node: Node = None, key_file: KeyFile = None) -> None:
     """Restart a node, and wait until it is heard again."""
-    with dialogue(port, node, key_file) as session:
+    with connect(port, node, key_file) as dialogue:
         started_s = time.monotonic()
-        boot = session.restart()
+        boot = dialogue.restart()
         typer.echo(
-            f"node {session.node} has restarted in {time.monotonic() - started_s:.1f} s "
+            f"node {dialogue.node} has restarted in {time.monotonic() - started_s:.1f} s "
             f"(start {boot})"
         )
 

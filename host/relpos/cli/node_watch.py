@@ -14,13 +14,13 @@ import typer
 
 from relpos.cli import output
 from relpos.cli.keys import KeyFile
-from relpos.cli.node_session import Cable, Port, link_of, open_device
+from relpos.cli.node_dialogue import Cable, Port, link_of, open_device
 from relpos.errors import DeviceError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from relpos.nodes.view import TeamView
+    from relpos.nodes.monitor import TeamMonitor
 
 PLAIN_TABLE_EVERY_S = 5.0
 REFRESH_S = 0.5
@@ -41,20 +41,20 @@ def list_nodes(
     from rich.console import Console
 
     with output.working(f"listening for {seconds:g} s"):
-        now_s, view = deque(_watch(port, seconds, key_file, cable), maxlen=1)[0]
-    rows = view.rows(now_s)
+        now_s, monitor = deque(_watch(port, seconds, key_file, cable), maxlen=1)[0]
+    rows = monitor.rows(now_s)
     if json:
         output.print_json({"port": port, "listened_s": seconds, "nodes": rows})
         return
     if not rows:
         # Frames under another key have been told by the link.
-        why = " under this key" if view.foreign_frames else ""
+        why = " under this key" if monitor.foreign_frames else ""
         raise DeviceError(
             f"{port}: no node is heard{why}: are they switched on, and is this the coordinator's "
             "port?"
         )
-    if view.foreign_frames:
-        output.remark(f"not all are shown: {_foreign(view)}")
+    if monitor.foreign_frames:
+        output.remark(f"not all are shown: {_foreign(monitor)}")
     Console(width=None if sys.stdout.isatty() else 120).print(_list_table(rows))
 
 
@@ -81,10 +81,12 @@ def monitor(
     with Live(_monitor_table([], ""), console=console, auto_refresh=False) as live:
         shown_s = 0.0
         try:
-            for now_s, view in _watch(port, seconds, key_file, cable):
+            for now_s, monitor in _watch(port, seconds, key_file, cable):
                 if time.monotonic() - shown_s > REFRESH_S:
                     shown_s = time.monotonic()
-                    live.update(_monitor_table(view.rows(now_s), _foreign(view)), refresh=True)
+                    live.update(
+                        _monitor_table(monitor.rows(now_s), _foreign(monitor)), refresh=True
+                    )
         except KeyboardInterrupt:
             return
 
@@ -95,8 +97,8 @@ def _print_now_and_then(
     said_s = time.monotonic()
     table = _monitor_table([], "")
     try:
-        for now_s, view in _watch(port, seconds, key_file, cable):
-            table = _monitor_table(view.rows(now_s), _foreign(view))
+        for now_s, monitor in _watch(port, seconds, key_file, cable):
+            table = _monitor_table(monitor.rows(now_s), _foreign(monitor))
             if time.monotonic() - said_s >= PLAIN_TABLE_EVERY_S:
                 said_s = time.monotonic()
                 console.print(table)
@@ -107,16 +109,16 @@ def _print_now_and_then(
 
 def _watch(
     port: str, seconds: float | None, key_file: Path | None, cable: bool
-) -> Iterator[tuple[float, TeamView]]:
-    """The team as it is seen, with the present time on the view's clock; until the time is over.
+) -> Iterator[tuple[float, TeamMonitor]]:
+    """The team as it is seen, with the present time on the monitor's clock; until the time is over.
 
     Beacons are sent meanwhile, so that what is seen is how the team works with a host.
     """
     from relpos.link.beacon import HostBeacons
     from relpos.link.live import observe, send
-    from relpos.nodes.view import TeamView
+    from relpos.nodes.monitor import TeamMonitor
 
-    view = TeamView()
+    monitor = TeamMonitor()
     told = 0
     started_s = time.monotonic()
 
@@ -130,20 +132,20 @@ def _watch(
             if not cable:  # which would reach one node alone
                 send(device, beacons.due(elapsed_s))
             now_s = elapsed_s if link.virtual_s is None else link.virtual_s
-            view.update(now_s, link.decoder, batch)
+            monitor.update(now_s, link.decoder, batch)
             while told < len(link.decoder.remarks):
                 output.remark(link.decoder.remarks[told])
                 told += 1
-            yield now_s, view
+            yield now_s, monitor
             if seconds is not None and elapsed_s > seconds:
                 return
 
 
-def _foreign(view: TeamView) -> str:
+def _foreign(monitor: TeamMonitor) -> str:
     """What to say of frames under another key; nothing where there are none."""
-    if not view.foreign_frames:
+    if not monitor.foreign_frames:
         return ""
-    return f"{view.foreign_frames} frames came under another key (give the team's: --key-file)"
+    return f"{monitor.foreign_frames} frames came under another key (give the team's: --key-file)"
 
 
 def _list_table(rows: Sequence[Mapping[str, Any]]) -> Table:

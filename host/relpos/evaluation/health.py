@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from relpos.measurements import Motion, Status
 from relpos.nodes.health import SILENT_S, Health
-from relpos.nodes.view import NodeView
+from relpos.nodes.monitor import NodeMonitor
 
 Floats = npt.NDArray[np.float64]
 
@@ -77,7 +77,7 @@ def of_run(
 def _node(
     node: int, reports: Mapping[float, Mapping[str, float]], moved: list[float]
 ) -> NodeHealth:
-    view = NodeView(node)
+    view = NodeMonitor(node)
     times, colours = [], []
     series: dict[str, list[float]] = {name: [] for name in SERIES}
     reasons: dict[str, int] = {}
@@ -90,11 +90,13 @@ def _node(
             view.status = {}
         for name, value in figures.items():
             if not name.startswith("link_"):
-                view.told(time_s, name, value)
+                view.add_status(time_s, name, value)
         if view.boot > len(restarts):
             restarts.append((time_s, view.reset_cause() or "unknown"))
         if LINK_RECEIVED in figures:
-            view.link(time_s, int(figures[LINK_RECEIVED]), int(figures.get(LINK_LOST, view.lost)))
+            view.add_link(
+                time_s, int(figures[LINK_RECEIVED]), int(figures.get(LINK_LOST, view.lost))
+            )
         view.heard_s = time_s
         view.rssi_dbm = figures.get(LINK_RSSI, view.rssi_dbm)
         if not view.status:

@@ -38,7 +38,7 @@ IMPOSSIBLE = -(2**31)
 
 
 @dataclass(slots=True)
-class _Dialogue:
+class _GainChange:
     """First the gain in force is asked for, then the new one is set."""
 
     scale: float
@@ -53,7 +53,7 @@ class StepScaleSender:
 
     def __init__(self, link: Link) -> None:
         self._link = link
-        self._dialogues: dict[int, _Dialogue] = {}
+        self._changes: dict[int, _GainChange] = {}
         self._settled_s: dict[int, float] = {}
         self.remarks: list[str] = []
         self.sent = 0
@@ -61,7 +61,7 @@ class StepScaleSender:
 
     def learn(self, node: int, scale: float, sigma: float, time_s: float) -> None:
         """Take a node's learned step scale; begin a dialogue where it is worth one."""
-        if node in self._dialogues:
+        if node in self._changes:
             return
         if time_s < self._settled_s.get(node, -math.inf) + AGAIN_AFTER_S:
             return
@@ -69,67 +69,67 @@ class StepScaleSender:
         if not 1.0 / MOST_CHANGE <= scale <= MOST_CHANGE:
             return
         if sigma <= KNOWN_WELL and abs(math.log(scale)) >= WORTH_SENDING:
-            self._dialogues[node] = _Dialogue(scale, self._link.next_token())
+            self._changes[node] = _GainChange(scale, self._link.next_token())
             self._settled_s[node] = time_s
 
     def due(self, now_s: float) -> bytes:
         """Bytes for the coordinator's port now, of any clock that does not go back."""
         data = b""
-        for node, talk in list(self._dialogues.items()):
-            if now_s < talk.next_s:
+        for node, change in list(self._changes.items()):
+            if now_s < change.next_s:
                 continue
-            if talk.attempts >= ATTEMPTS:
-                del self._dialogues[node]
+            if change.attempts >= ATTEMPTS:
+                del self._changes[node]
                 self.remarks.append(
                     f"node {node} does not answer: it keeps its step length, which the ranges say "
-                    f"is to be multiplied by {talk.scale:.3f}"
+                    f"is to be multiplied by {change.scale:.3f}"
                 )
                 continue
-            talk.attempts += 1
-            talk.next_s = now_s + REPEAT_S
+            change.attempts += 1
+            change.next_s = now_s + REPEAT_S
             # A node whose radio module has another address hears only what is sent to everybody.
             data += self._link.command(
                 node,
                 wire.CommandCode.SET_STEP_GAIN_PERMILLE,
-                talk.value,
-                token=talk.token,
-                broadcast=talk.attempts % 2 == 0,
+                change.value,
+                token=change.token,
+                broadcast=change.attempts % 2 == 0,
             )[1]
         return data
 
     def take(self, answer: Acknowledged) -> None:
         """Take a node's answer; answers to anybody else's commands are left alone."""
-        talk = self._dialogues.get(answer.node)
-        if talk is None or answer.token != talk.token:
+        change = self._changes.get(answer.node)
+        if change is None or answer.token != change.token:
             return
         if answer.result == wire.CommandResult.BUSY:
-            talk.token, talk.next_s = self._link.next_token(), -math.inf
+            change.token, change.next_s = self._link.next_token(), -math.inf
             return
-        if talk.value == IMPOSSIBLE and answer.result == wire.CommandResult.OUT_OF_RANGE:
-            self._ask_for(answer.node, talk, answer.value)
+        if change.value == IMPOSSIBLE and answer.result == wire.CommandResult.OUT_OF_RANGE:
+            self._ask_for(answer.node, change, answer.value)
             return
-        del self._dialogues[answer.node]
-        if answer.result == wire.CommandResult.DONE and answer.value == talk.value:
+        del self._changes[answer.node]
+        if answer.result == wire.CommandResult.DONE and answer.value == change.value:
             self.sent += 1
             self.remarks.append(
-                f"node {answer.node}: steps are taken {talk.scale:.3f} times as long from now on, "
-                f"as the ranges say (step gain {talk.value / 1000:.3f})"
+                f"node {answer.node}: step gain {change.value / 1000:.3f} "
+                f"(x{change.scale:.3f}, learned from ranges)"
             )
         else:
             self.remarks.append(
-                f"node {answer.node} refuses a step gain of {talk.value / 1000:.3f} "
+                f"node {answer.node} refuses a step gain of {change.value / 1000:.3f} "
                 f"({answer.result.name.lower().replace('_', ' ')})"
             )
 
-    def _ask_for(self, node: int, talk: _Dialogue, before_permille: int) -> None:
+    def _ask_for(self, node: int, change: _GainChange, before_permille: int) -> None:
         try:
-            gain = scaled_gain_permille(before_permille, talk.scale)
+            gain = scaled_gain_permille(before_permille, change.scale)
         except DataError as error:
-            del self._dialogues[node]
+            del self._changes[node]
             self.remarks.append(f"node {node}: {error}")
             return
         if gain == before_permille:
-            del self._dialogues[node]
+            del self._changes[node]
             return
-        talk.value, talk.attempts = gain, 0
-        talk.token, talk.next_s = self._link.next_token(), -math.inf
+        change.value, change.attempts = gain, 0
+        change.token, change.next_s = self._link.next_token(), -math.inf

@@ -1,4 +1,4 @@
-"""From what was received and concluded to the picture that is shown."""
+"""Builds the team's view: newest estimate, motion since, alarms, node health, measured ranges."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from relpos.fusion.estimator import Estimate, MagneticNorth, NodeEstimate, NodeStatus
 from relpos.live.alarms import Alarms, Condition
 from relpos.live.nowcast import Nowcast
-from relpos.live.picture import (
+from relpos.live.team_view import (
     Alert,
     GhostPerson,
     Ghosts,
@@ -18,30 +18,32 @@ from relpos.live.picture import (
     Notice,
     Pair,
     Person,
-    Picture,
+    TeamView,
 )
 from relpos.measurements import Motion, Observation, Range
-from relpos.nodes.view import NodeView, TeamView
+from relpos.nodes.monitor import NodeMonitor, TeamMonitor
 
 if TYPE_CHECKING:
     from relpos.link.decoder import Decoder
 
 RANGE_AGE_S = 10.0
-"""A range older than this is no link any more."""
+"""Age from which a range is not shown any more."""
 STALE_S = 3.0
-"""Silence after which somebody is shown as stale, as after three epochs in an estimator."""
+"""Silence after which a wearer is shown as stale, as after three epochs in an estimator."""
 HEALTH_S = 0.5
 NORTH_SHOWN_RAD = math.radians(15.0)
-"""With a larger deviation one in seven would be sent to the wrong one of eight compass points."""
+"""With a larger standard deviation one reading in seven would name the wrong one of eight compass
+points."""
 NORTH_MOVES_RAD = math.radians(4.0)
-"""A map that turned with every reading could not be read; less than this nobody can tell."""
+"""The map keeps its orientation while north moves by less: a map that turns with every reading is
+unreadable."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Health:
-    """What a node told of itself, judged at ``looked_s``."""
+    """A node's own health at ``assessed_s``."""
 
-    looked_s: float
+    assessed_s: float
     colour: str
     reasons: tuple[str, ...]
     battery_v: float | None
@@ -51,74 +53,69 @@ class _Health:
 
 
 class Composer:
-    """Feed it everything that happens, in order; ask for the picture at any moment.
+    """Gathers everything that happens, in order, and composes the view of any moment.
 
-    ``names`` are shown in place of numbers and may be changed at any time.
+    ``names`` replace node numbers on display and may change at any time.
     """
 
     def __init__(self, names: Mapping[int, str] | None = None, start_s: float = 0.0) -> None:
         self.names: dict[int, str] = dict(names or {})
         self.alarms = Alarms()
         self.nowcast = Nowcast(start_s)
-        self.team = TeamView()
+        self.monitor = TeamMonitor()
         self._ranges: dict[tuple[int, int], Range] = {}
-        self._paired: dict[tuple[int, int], tuple[tuple[int, int], Pair]] = {}
-        self._healths: dict[int, _Health] = {}
+        self._pair_cache: dict[tuple[int, int], tuple[tuple[int, int], Pair]] = {}
+        self._health_cache: dict[int, _Health] = {}
         self._north: MagneticNorth | None = None
-        self._given = 0
+        self._submitted = 0
         self._seq = 0
         self.first_s: float | None = None
         """Time of the first motion or range that came."""
         self.newest_s: float | None = None
         """Time of the newest motion or range."""
 
-    @property
-    def given(self) -> int:
-        """How many observations have been taken; estimates refer to this count."""
-        return self._given
-
-    def observed(
+    def add_observations(
         self, now_s: float, observations: Sequence[Observation], decoder: Decoder | None
     ) -> None:
-        """Take what has just been decoded."""
+        """Add observations that have just been decoded; ``decoder`` is None for a recorded run."""
         if decoder is None:
-            self.team.hear(now_s, observations)
+            self.monitor.update_without_link(now_s, observations)
         else:
             self._count_heard(now_s, decoder, observations)
         for observation in observations:
-            self._given += 1
+            self._submitted += 1
             if isinstance(observation, Motion):
-                self.nowcast.take(observation, self._given)
-                self.alarms.take(observation)
+                self.nowcast.add_motion(observation, self._submitted)
+                self.alarms.add_motion(observation)
                 self._newer(observation.time_s)
             elif isinstance(observation, Range):
                 self._range(observation)
                 self._newer(observation.time_s)
             if decoder is None:
-                self.alarms.heard(observation.node)
+                self.alarms.mark_heard(observation.node)
 
-    def told(self, observations: Sequence[Observation]) -> None:
-        """Take what phones told: the fusion is given it, but no node was heard by it."""
-        self._given += len(observations)
+    def add_reported(self, observations: Sequence[Observation]) -> None:
+        """Count observations sent by phones: the fusion gets them, but no node was heard."""
+        self._submitted += len(observations)
 
-    def estimated(self, estimate: Estimate, given: int) -> None:
-        """Take an estimate that came out when ``given`` observations had been worked off."""
-        self.nowcast.fused(estimate, given)
+    def add_estimate(self, estimate: Estimate, processed: int) -> None:
+        """Add an estimate that was emitted after ``processed`` observations."""
+        self.nowcast.add_estimate(estimate, processed)
         self._north = _shown_north(self._north, estimate.north)
 
-    def picture(
+    def view(
         self,
         now_s: float,
         unix_s: float,
         arrived_unix_s: float | None = None,
         notices: Iterable[Notice] = (),
-    ) -> Picture:
-        """Give the picture of this moment."""
+    ) -> TeamView:
+        """Return the view of this moment."""
         self._seq += 1
         estimate = self.nowcast.estimate
-        placed = {} if estimate is None else {n.node: n for n in estimate.nodes}
-        people = sorted(self.team.nodes.keys() | placed.keys())
-        return Picture(
+        located = {} if estimate is None else {n.node: n for n in estimate.nodes}
+        people = sorted(self.monitor.nodes.keys() | located.keys())
+        return TeamView(
             seq=self._seq,
             time_s=now_s,
             unix_s=unix_s,
@@ -137,11 +134,11 @@ class Composer:
     def _count_heard(
         self, now_s: float, decoder: Decoder, observations: Sequence[Observation]
     ) -> None:
-        before = {node: view.received for node, view in self.team.nodes.items()}
-        self.team.update(now_s, decoder, observations)
-        for node, view in self.team.nodes.items():
-            if view.received != before.get(node):
-                self.alarms.heard(node)
+        before = {node: monitor.received for node, monitor in self.monitor.nodes.items()}
+        self.monitor.update(now_s, decoder, observations)
+        for node, monitor in self.monitor.nodes.items():
+            if monitor.received != before.get(node):
+                self.alarms.mark_heard(node)
 
     def _newer(self, time_s: float) -> None:
         self.first_s = time_s if self.first_s is None else self.first_s
@@ -165,9 +162,9 @@ class Composer:
         )
 
     def _pairs(self, estimate: Estimate) -> tuple[Pair, ...]:
-        """Everybody's distances; those anew of whom something is new."""
+        """Return all pairs; recompute those of nodes with new motion or a new estimate."""
         versions = {node.node: self.nowcast.version(node.node) for node in estimate.nodes}
-        before, self._paired = self._paired, {}
+        before, self._pair_cache = self._pair_cache, {}
         for fused in estimate.pairs:
             ends = fused.node, fused.peer
             version = versions[ends[0]], versions[ends[1]]
@@ -184,32 +181,32 @@ class Composer:
                         p.sigma_bearing_rad,
                     ),
                 )
-            self._paired[ends] = known
-        return tuple(pair for _, pair in self._paired.values())
+            self._pair_cache[ends] = known
+        return tuple(pair for _, pair in self._pair_cache.values())
 
     def _health(self, node: int, now_s: float) -> _Health:
-        """How the node itself is; looked at now and then, for it goes by half minutes."""
-        known = self._healths.get(node)
-        if known is None or now_s - known.looked_s > HEALTH_S or now_s < known.looked_s:
-            view = self.team.nodes.get(node) or NodeView(node)
-            colour, reasons = view.health(now_s)
-            neighbours = view.status.get("neighbours")
-            known = self._healths[node] = _Health(
+        """Return the node's own health, at most :data:`HEALTH_S` old: it changes slowly."""
+        known = self._health_cache.get(node)
+        if known is None or now_s - known.assessed_s > HEALTH_S or now_s < known.assessed_s:
+            monitor = self.monitor.nodes.get(node) or NodeMonitor(node)
+            colour, reasons = monitor.health(now_s)
+            neighbours = monitor.status.get("neighbours")
+            known = self._health_cache[node] = _Health(
                 now_s,
                 colour.name.lower(),
                 tuple(reasons),
                 # 0: this board does not measure it.
-                view.status.get("battery_v") or None,
-                view.loss(now_s),
-                view.ranging(now_s)[0],
+                monitor.status.get("battery_v") or None,
+                monitor.loss(now_s),
+                monitor.ranging(now_s)[0],
                 None if neighbours is None else int(neighbours),
             )
         return known
 
     def _person(self, node: int, now_s: float) -> Person:
-        view = self.team.nodes.get(node)
-        condition = self.alarms.of(node)
-        seen_s = None if view is None else now_s - view.heard_s
+        monitor = self.monitor.nodes.get(node)
+        condition = self.alarms.condition(node)
+        seen_s = None if monitor is None else now_s - monitor.heard_s
         at = self.nowcast.node(node)
         health = self._health(node, now_s)
         return Person(
@@ -225,7 +222,7 @@ class Composer:
             health=health.colour,
             reasons=health.reasons,
             battery_v=health.battery_v,
-            rssi_dbm=None if view is None else view.rssi_dbm,
+            rssi_dbm=None if monitor is None else monitor.rssi_dbm,
             loss=health.loss,
             ranging=health.ranging,
             neighbours=health.neighbours,
@@ -234,7 +231,7 @@ class Composer:
 
 
 def _shown_north(shown: MagneticNorth | None, known: MagneticNorth | None) -> MagneticNorth | None:
-    """Return what is to be shown of north: what is, as long as that is near enough."""
+    """Return the north to show: the one shown before while the estimate is close to it."""
     if known is None or known.sigma_rad > NORTH_SHOWN_RAD:
         return None
     moved_rad = math.inf
@@ -259,10 +256,10 @@ def _pose(at: NodeEstimate) -> dict[str, float]:
 
 
 def _status(at: NodeEstimate | None, seen_s: float | None, condition: Condition) -> str:
-    """What the estimator says of the position, unless silence says more.
+    """Return the estimator's status of the position, unless silence overrules it.
 
-    An estimate is of a moment ago, or of a minute ago where the fusion is behind: whether somebody
-    is heard is known better here.
+    An estimate is a second old, or a minute where the fusion is behind; silence is known here at
+    once.
     """
     if condition.alert is Alert.LOST:
         return NodeStatus.LOST
@@ -275,11 +272,11 @@ def _status(at: NodeEstimate | None, seen_s: float | None, condition: Condition)
 
 
 def _ghosts(estimate: Estimate) -> tuple[Ghosts, ...]:
-    """The alternatives, by probability; of the fused moment, for they are not moved on."""
+    """Return the alternatives by probability, at the time of the estimate (no nowcast)."""
     rows: dict[int, list[GhostPerson]] = {}
-    shares: dict[int, float] = {}
+    probabilities: dict[int, float] = {}
     for a in estimate.alternatives:
-        shares[a.alternative] = a.probability
+        probabilities[a.alternative] = a.probability
         rows.setdefault(a.alternative, []).append(
             GhostPerson(
                 a.node,
@@ -292,4 +289,4 @@ def _ghosts(estimate: Estimate) -> tuple[Ghosts, ...]:
                 str(a.shape),
             )
         )
-    return tuple(Ghosts(shares[k], tuple(rows[k])) for k in sorted(rows))
+    return tuple(Ghosts(probabilities[k], tuple(rows[k])) for k in sorted(rows))

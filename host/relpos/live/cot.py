@@ -1,6 +1,6 @@
 """The team on TAK's screens: a sink that sends every member as Cursor-on-Target, through pytak.
 
-It works in a thread of its own with an event loop; the session only leaves the newest picture
+It works in a thread of its own with an event loop; the session only leaves the newest view
 here. What a slow network does not take is not sent later: of a position only the newest counts.
 """
 
@@ -24,8 +24,8 @@ from relpos.extras import missing_extra
 from relpos.fusion.estimator import Estimate
 from relpos.geodesy import MapFrame, Pin, place
 from relpos.live.cot_events import Callsigns, Moved, emergency, member, serialized
-from relpos.live.picture import Alert, Person, Picture
-from relpos.live.sinks import QuietSink
+from relpos.live.sinks import Sink
+from relpos.live.team_view import Alert, Person, TeamView
 
 EVERY_S = 1.0
 """Each member is sent at most this often."""
@@ -82,16 +82,16 @@ class Schedule:
 
     def due(
         self,
-        picture: Picture,
+        view: TeamView,
         frame: MapFrame,
         now_s: float,
         sigma_z_m: Mapping[int, float],
     ) -> Iterator[ET.Element]:
         """Yield what is to be sent at ``now_s``: at most one event a second of each member."""
-        for person in picture.people:
+        for person in view.people:
             if now_s - self._sent_s.get(person.node, -EVERY_S) < EVERY_S:
                 continue
-            event = self._event(person, picture, frame, now_s, sigma_z_m.get(person.node))
+            event = self._event(person, view, frame, now_s, sigma_z_m.get(person.node))
             if event is not None:
                 self._sent_s[person.node] = now_s
                 yield event
@@ -99,7 +99,7 @@ class Schedule:
     def _event(
         self,
         person: Person,
-        picture: Picture,
+        view: TeamView,
         frame: MapFrame,
         now_s: float,
         sigma_z_m: float | None,
@@ -112,17 +112,17 @@ class Schedule:
         )
         if lies and (told_s is None or now_s - told_s >= ALARM_EVERY_S):
             self._alarm_sent_s[node] = now_s
-            return self._emergency(person, picture, frame, sigma_z_m, over=False)
+            return self._emergency(person, view, frame, sigma_z_m, over=False)
         if not lies and told_s is not None:
             del self._alarm_sent_s[node]
-            return self._emergency(person, picture, frame, sigma_z_m, over=True)
-        if self._seen_seq.get(node) == picture.seq:
+            return self._emergency(person, view, frame, sigma_z_m, over=True)
+        if self._seen_seq.get(node) == view.seq:
             return None
         if person.status == "lost" and now_s - self._sent_s.get(node, -1e9) < LOST_EVERY_S:
             return None
         event = member(
             person,
-            picture,
+            view,
             frame,
             self._calls,
             sigma_z_m=sigma_z_m,
@@ -130,7 +130,7 @@ class Schedule:
             exercise=self._exercise,
         )
         if event is not None:
-            self._seen_seq[node] = picture.seq
+            self._seen_seq[node] = view.seq
             if person.motion_s is not None and person.x_m is not None and person.y_m is not None:
                 self._moved[node] = Moved(person.motion_s, person.x_m, person.y_m)
         return event
@@ -138,7 +138,7 @@ class Schedule:
     def _emergency(
         self,
         person: Person,
-        picture: Picture,
+        view: TeamView,
         frame: MapFrame,
         sigma_z_m: float | None,
         *,
@@ -146,7 +146,7 @@ class Schedule:
     ) -> ET.Element:
         return emergency(
             person,
-            picture,
+            view,
             frame,
             self._calls,
             over=over,
@@ -160,7 +160,7 @@ class PinnedFrame:
 
     def __init__(self, pins: Sequence[Pin]) -> None:
         if not pins:
-            raise DataError("--cot needs --pin LAT,LON,BEARING: where on the map the picture lies")
+            raise DataError("--cot needs --pin LAT,LON,BEARING: where on the map the view lies")
         self._pins = pins
         self._places: dict[int, tuple[float, float]] = {}
         self.frame: MapFrame | None = None
@@ -169,11 +169,11 @@ class PinnedFrame:
         if all(pin.node is None for pin in pins):
             self._place()
 
-    def update(self, picture: Picture) -> MapFrame | None:
+    def update(self, view: TeamView) -> MapFrame | None:
         """Return the frame once every pin's place is known."""
         if self.frame is not None or self.trouble is not None:
             return self.frame
-        people = {p.node: p for p in picture.people if p.status == "ok"}
+        people = {p.node: p for p in view.people if p.status == "ok"}
         for k, pin in enumerate(self._pins):
             there = people.get(pin.node) if pin.node is not None else None
             if (
@@ -181,7 +181,7 @@ class PinnedFrame:
                 and there is not None
                 and there.x_m is not None
                 and there.y_m is not None
-                and (pin.time_s is None or picture.time_s >= pin.time_s)
+                and (pin.time_s is None or view.time_s >= pin.time_s)
             ):
                 self._places[k] = there.x_m, there.y_m
         if all(pin.node is None or k in self._places for k, pin in enumerate(self._pins)):
@@ -220,7 +220,7 @@ class PinnedFrame:
         self.frame, self.remarks = placing.frame, placing.remarks
 
 
-class CotSender(QuietSink):
+class CotSender(Sink):
     """Sends pictures as Cursor-on-Target to a TAK server, a multicast group or one screen."""
 
     def __init__(
@@ -246,7 +246,7 @@ class CotSender(QuietSink):
         for name in ("pytak.classes", "pytak.client_functions", "pytak"):
             logging.getLogger(name).disabled = True
         self._schedule = Schedule(Callsigns(prefix or default_prefix()), exercise=exercise)
-        self._picture: Picture | None = None
+        self._view: TeamView | None = None
         self._sigma_z_m: dict[int, float] = {}
         self._trouble: str | None = None
         self.sent = 0
@@ -259,9 +259,9 @@ class CotSender(QuietSink):
         for node in estimate.nodes:
             self._sigma_z_m[node.node] = node.sigma_z_m
 
-    def pictured(self, picture: Picture) -> None:
-        """Leave the newest picture for the sender."""
-        self._picture = picture
+    def updated(self, view: TeamView) -> None:
+        """Leave the newest view for the sender."""
+        self._view = view
 
     def trouble(self) -> str | None:
         """Say why nothing arrives there; None when all is well."""
@@ -329,16 +329,15 @@ class CotSender(QuietSink):
             writer.close()
 
     def _due(self) -> list[bytes]:
-        picture = self._picture
-        if picture is None:
+        view = self._view
+        if view is None:
             return []
-        frame = self._map.update(picture)
+        frame = self._map.update(view)
         if frame is None:
             return []
         now_s = time.monotonic()
         return [
-            serialized(event)
-            for event in self._schedule.due(picture, frame, now_s, self._sigma_z_m)
+            serialized(event) for event in self._schedule.due(view, frame, now_s, self._sigma_z_m)
         ]
 
 

@@ -9,7 +9,7 @@ What goes where in an event (base schema 2.0), and what this project puts there:
   and EXERCISE in the remarks, of teams that are emulated or replayed;
 - ``start`` is when the member was last heard, ``stale`` ``STALE_S`` later: then clients grey it;
 - ``ce`` and ``le`` are the radius, and the height up and down, that hold the member with 90 %
-  probability (CE90 and LE90, as TAK's clients take them), of the picture alone: by how much the
+  probability (CE90 and LE90, as TAK's clients take them), of the view alone: by how much the
   pin is wrong comes on top;
 - ``hae`` is known where the pin has an altitude, 9999999 stands for unknown as everywhere in TAK.
 """
@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.geodesy import MapFrame
-from relpos.live.picture import Alert, Person, Picture
+from relpos.live.team_view import Alert, Person, TeamView
 
 STALE_S = 15.0
 """Nodes report every second and count as lost after ten: then TAK's clients grey the member."""
@@ -69,7 +69,7 @@ class Moved:
 
 def member(
     person: Person,
-    picture: Picture,
+    view: TeamView,
     frame: MapFrame,
     calls: Callsigns,
     *,
@@ -83,7 +83,7 @@ def member(
     import pytak
 
     fresh = person.status == "ok"
-    seen_unix_s = picture.unix_s - person.seen_s
+    seen_unix_s = view.unix_s - person.seen_s
     details = [
         ET.Element("contact", callsign=text(person.name)),
         ET.Element("uid", Droid=text(person.name)),
@@ -101,12 +101,12 @@ def member(
         point=_point(person, frame, sigma_z_m),
         detail=pytak.cot_detail(*details, flow_tag=False),
     )
-    return _timed(event, picture.unix_s, seen_unix_s, seen_unix_s + STALE_S)
+    return _timed(event, view.unix_s, seen_unix_s, seen_unix_s + STALE_S)
 
 
 def emergency(
     person: Person,
-    picture: Picture,
+    view: TeamView,
     frame: MapFrame,
     calls: Callsigns,
     *,
@@ -137,7 +137,7 @@ def emergency(
             flow_tag=False,
         ),
     )
-    now_s = picture.unix_s
+    now_s = view.unix_s
     return _timed(event, now_s, now_s, now_s + (STALE_S if over else ALARM_STALE_S))
 
 

@@ -1,4 +1,4 @@
-"""What a session leaves on disk: the run format's files, written as it goes."""
+"""The run format's files, written while the session runs."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from relpos.fusion.estimator import Estimate
-from relpos.live.sinks import QuietSink
+from relpos.live.sinks import Sink
 from relpos.measurements import Observation, Step
 from relpos.runs import Description, EstimateFiles, NodeInfo, RunFiles
 
 
-class FileSink(QuietSink):
-    """Estimates into ``directory``, and what was received into its ``received/``.
+class FileSink(Sink):
+    """Writes estimates to ``directory``, and received observations to its ``received/``.
 
-    A disk that is full is told; what it does not take is kept and written when it does.
+    Reports a full disk through ``trouble``; rows wait in memory until it accepts them.
     """
 
     def __init__(
@@ -26,7 +26,7 @@ class FileSink(QuietSink):
         self._received = RunFiles(directory / "received", description) if keep_received else None
 
     def named(self, names: Mapping[int, str]) -> None:
-        """Keep the wearers' names."""
+        """Store the wearers' names."""
         if self._received is None:
             return
         nodes = dict(self._description.nodes)
@@ -36,23 +36,23 @@ class FileSink(QuietSink):
         self._received.describe(self._description)
 
     def observed(self, arrival_s: float, observations: Sequence[Observation]) -> None:
-        """Write them."""
+        """Write observations."""
         self._estimates.write_steps([o for o in observations if isinstance(o, Step)])
         if self._received is not None:
             self._received.write(observations)
 
     def estimated(self, estimate: Estimate) -> None:
-        """Write it."""
+        """Write an estimate."""
         self._estimates.write(estimate)
 
     def trouble(self) -> str | None:
-        """The first file that cannot be written."""
+        """Return the first file that cannot be written, and why."""
         received = () if self._received is None else self._received.tables
         for table in (*self._estimates.tables, *received):
             if table.error is not None:
                 why = table.error.strerror or str(table.error)
                 lost = f"; {table.lost_rows} rows are lost" * bool(table.lost_rows)
-                return f"{table.path}: {why}: what it should hold waits in memory{lost}"
+                return f"{table.path}: {why}: its rows wait in memory{lost}"
         return None
 
     def close(self) -> None:

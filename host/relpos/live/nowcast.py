@@ -1,10 +1,9 @@
-"""Where everybody is now: each node's motions that are not fused yet, on its newest estimate.
+"""Each node's pose now: its newest fused estimate, and the motions that this does not contain yet.
 
-The fused estimate is a second or two old, because it waits for every node; a motion is known as
-soon as its packet is there. So the motions that an estimate does not contain are composed onto
-it, the chord that it ends in cut as the estimator cuts it (:mod:`relpos.fusion.timeline`), their
-lengths as the estimator has learned them (``step_scale``), and the covariance grows by what the
-motions bring with them. Every figure comes from what was measured; nothing is extrapolated.
+A fused estimate is a second or two old, because it waits for every node; a motion is known as
+soon as its packet arrives. The nowcast composes the motions since onto the estimate. It splits the
+motion in which the estimate lies as the estimator does (:mod:`relpos.fusion.timeline`), scales
+lengths by the learned ``step_scale``, and adds each motion's covariance. Nothing is extrapolated.
 """
 
 from __future__ import annotations
@@ -18,29 +17,29 @@ from relpos.fusion.models.motion import MotionNoise
 from relpos.fusion.timeline import Advance, Displacement
 from relpos.measurements import Motion
 
-MOST_CHORDS = 7200
-"""Kept of a node that no estimate has taken up: two hours of motion."""
+MAX_CHORDS = 7200
+"""Stored for a node without an estimate: two hours of motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Chord:
-    """A motion, what is left of it, and its place in the order in which the fusion gets them."""
+    """A motion, the time at which it begins, and its number in the order of the fusion's input."""
 
     begin_s: float
     motion: Motion
     number: int
 
     def after(self, time_s: float, *, known: bool) -> tuple[Displacement, float]:
-        """What comes after ``time_s`` and its share of the chord; all of it where not ``known``.
+        """Return the part after ``time_s`` and its fraction of the chord; all where not ``known``.
 
-        A motion that had not reached the estimator moved nobody in its estimate.
+        An estimate contains no part of a motion that had not reached the estimator.
         """
         motion = self.motion
-        whole = Displacement(motion.dx_m, motion.dy_m, motion.dtheta_rad)
+        full = Displacement(motion.dx_m, motion.dy_m, motion.dtheta_rad)
         if not known or time_s <= self.begin_s:
-            return whole, 1.0
-        share = (motion.time_s - time_s) / (motion.time_s - self.begin_s)
-        return whole.split(1.0 - share)[1], share
+            return full, 1.0
+        fraction = (motion.time_s - time_s) / (motion.time_s - self.begin_s)
+        return full.split(1.0 - fraction)[1], fraction
 
 
 @dataclass(slots=True)
@@ -83,7 +82,7 @@ class _Track:
     """One node's motions since its newest estimate, and the pose that they lead to."""
 
     reported_s: float
-    chords: deque[_Chord] = field(default_factory=lambda: deque(maxlen=MOST_CHORDS))
+    chords: deque[_Chord] = field(default_factory=lambda: deque(maxlen=MAX_CHORDS))
     fused: NodeEstimate | None = None
     pose: _Pose | None = None
     step_scale: float = 1.0
@@ -91,7 +90,7 @@ class _Track:
 
 
 class Nowcast:
-    """Feed it motions as the fusion gets them, and the estimates that come out; ask for poses.
+    """Composes motions, in the order of the fusion's input, onto the newest estimates.
 
     ``start_s`` is the time from which a node's first motion counts, as for the estimator.
     """
@@ -101,10 +100,10 @@ class Nowcast:
         self._tracks: dict[int, _Track] = {}
         self._noise = MotionNoise()
         self.estimate: Estimate | None = None
-        """The newest fused one."""
+        """The newest fused estimate."""
 
-    def take(self, motion: Motion, number: int) -> None:
-        """Take the ``number``-th thing that the fusion was given, a motion."""
+    def add_motion(self, motion: Motion, number: int) -> None:
+        """Add a motion, the ``number``-th observation submitted to the fusion."""
         track = self._tracks.get(motion.node)
         if track is None:
             track = self._tracks[motion.node] = _Track(min(self._start_s, motion.time_s))
@@ -115,8 +114,8 @@ class Nowcast:
         if track.pose is not None:
             self._compose(track, track.pose, chord, -math.inf, known=False)
 
-    def fused(self, estimate: Estimate, given: int) -> None:
-        """Take an estimate that came out when the fusion had worked off ``given`` things."""
+    def add_estimate(self, estimate: Estimate, processed: int) -> None:
+        """Add an estimate that was emitted after ``processed`` observations."""
         self.estimate = estimate
         scales = {p.node: p.value for p in estimate.parameters if p.name == "step_scale"}
         for node in estimate.nodes:
@@ -127,7 +126,7 @@ class Nowcast:
             track.step_scale = scales.get(node.node, 1.0)
             track.version += 1
             chords = track.chords
-            while chords and chords[0].number <= given:
+            while chords and chords[0].number <= processed:
                 if chords[0].motion.time_s > estimate.time_s:
                     break
                 chords.popleft()
@@ -141,49 +140,49 @@ class Nowcast:
                 node.covariance_xy_m2,
             )
             for chord in chords:
-                known = chord.number <= given
+                known = chord.number <= processed
                 self._compose(track, track.pose, chord, estimate.time_s, known=known)
 
     def _compose(
         self, track: _Track, pose: _Pose, chord: _Chord, since_s: float, *, known: bool
     ) -> None:
-        moved, share = chord.after(since_s, known=known)
-        sigmas = self._sigmas(chord, moved, share)
+        moved, fraction = chord.after(since_s, known=known)
+        sigmas = self._sigmas(chord, moved, fraction)
         scale = track.step_scale
         pose.move(Displacement(scale * moved.dx_m, scale * moved.dy_m, moved.dtheta_rad), sigmas)
 
     def _sigmas(
-        self, chord: _Chord, moved: Displacement, share: float
+        self, chord: _Chord, moved: Displacement, fraction: float
     ) -> tuple[float, float, float]:
-        """Deviations of a piece: as the node told, else as the paper has them."""
-        motion, root = chord.motion, math.sqrt(share)
+        """Return standard deviations of a part: the node's own, else those of the paper's model."""
+        motion, root = chord.motion, math.sqrt(fraction)
         along = motion.sigma_x_m if motion.sigma_x_alone_m is None else motion.sigma_x_alone_m
-        told = (along, motion.sigma_y_m, motion.sigma_theta_rad)
-        duration_s = share * (motion.time_s - chord.begin_s)
+        reported = (along, motion.sigma_y_m, motion.sigma_theta_rad)
+        duration_s = fraction * (motion.time_s - chord.begin_s)
         piece = (motion.time_s, motion.node, duration_s)
-        untold = self._noise.sigmas(
-            Advance(*piece, moved.dx_m, moved.dy_m, moved.dtheta_rad, share)
+        modelled = self._noise.sigmas(
+            Advance(*piece, moved.dx_m, moved.dy_m, moved.dtheta_rad, fraction)
         )
         x, y, turn = (
-            alone if sigma is None else sigma * root
-            for sigma, alone in zip(told, untold, strict=True)
+            model if sigma is None else sigma * root
+            for sigma, model in zip(reported, modelled, strict=True)
         )
         return x, y, turn
 
     def version(self, node: int) -> int:
-        """Another number after everything that moved the node."""
+        """Return a number that changes with every motion and estimate of the node."""
         track = self._tracks.get(node)
         return 0 if track is None else track.version
 
     def newest_s(self, node: int) -> float | None:
-        """Time up to which the node's pose contains its motion; None where it never reported."""
+        """Return the time up to which the pose contains motion; None before the first report."""
         track = self._tracks.get(node)
         if track is None:
             return None
         return track.chords[-1].motion.time_s if track.chords else track.reported_s
 
     def node(self, node: int) -> NodeEstimate | None:
-        """The node as in the newest estimate that has it, moved on to now."""
+        """Return the node of the newest estimate that has it, moved on to now."""
         track = self._tracks.get(node)
         if track is None or track.fused is None or track.pose is None:
             return None
@@ -200,10 +199,10 @@ class Nowcast:
         )
 
     def pair(self, fused: PairEstimate) -> PairEstimate:
-        """A pair of the newest estimate, moved on to now.
+        """Return a pair of the newest estimate, moved on to now.
 
-        What the estimator knows of the two together (its cross-covariance) stays in force; their
-        motions since are independent of each other and add to it.
+        The estimator's cross-covariance of the two stays in force; their motions since then are
+        independent and add to it.
         """
         one, other = self._tracks[fused.node], self._tracks[fused.peer]
         a, b = one.pose, other.pose

@@ -1,9 +1,9 @@
-"""A live session: what is received goes to the fusion, to the picture and to whoever keeps it.
+"""A live session: from a serial port or a recording to the estimator, the view and the sinks.
 
-Two threads. The *receive thread* (whoever iterates over :meth:`Session.run`) reads the input,
-decodes, judges, composes pictures and calls the sinks; it never waits for the fusion. The *fusion
-thread* (:mod:`relpos.live.fusing`) works off what it is given. Everything else is in processes of
-its own.
+Two threads. The *receive thread*, which iterates over :meth:`LiveSession.run`, reads the input,
+decodes it, updates alarms, composes views and calls the sinks; it never waits for the fusion. The
+*fusion thread* (:mod:`relpos.live.fusion_thread`) processes the observations. Servers run in
+processes of their own.
 """
 
 from __future__ import annotations
@@ -16,42 +16,34 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from relpos.errors import RelposError
 from relpos.fusion.estimator import Estimate
 from relpos.live.composer import Composer
-from relpos.live.fusing import Fusing
+from relpos.live.fusion_thread import FusionThread
 from relpos.live.inputs import Input, Received
-from relpos.live.picture import Level, Notice, Picture
-from relpos.live.sinks import QuietSink, Sink
-from relpos.live.visitors import Ask, Desk, Visitors
+from relpos.live.notices import NoticeBoard
+from relpos.live.requests import Request, RequestHandler, RequestSource
+from relpos.live.sinks import Sink
+from relpos.live.team_view import Level
 from relpos.measurements import Observation
 
-PICTURE_S = 0.05
-"""At most twenty pictures a second: as smooth as anybody walks, and a twentieth of a second old."""
-IDLE_PICTURE_S = 0.5
-"""Silence is shown, too: how long somebody was not heard, how long not moved."""
+VIEW_S = 0.05
+"""At most twenty views a second: smooth for a walking person, and a twentieth of a second old."""
+IDLE_VIEW_S = 0.5
+"""Silence is shown, too: how long a wearer was not heard, how long they have not moved."""
 WAIT_S = 0.05
 BEHIND_S = 5.0
-"""From so much on the fusion is told to be behind; two or three seconds it always waits."""
+"""Delay of the fusion from which a notice says so; it always waits two or three seconds."""
 ASLEEP_S = 5.0
-"""The receive thread looks twenty times a second; what is longer was sleep, or another program."""
-REMARK_S = 60.0
+"""The receive thread runs twenty times a second; a longer gap was sleep, or another program."""
 SWITCH_S = 0.001
-"""Python hands over between its threads so often: a packet does not wait for the fusion."""
-
-
-class Named(Protocol):
-    """Who wants to know the wearers' names."""
-
-    def named(self, names: dict[int, str]) -> None:
-        """Take all names that phones have given so far."""
+"""Python's thread switch interval: a packet does not wait for the fusion."""
 
 
 @dataclass
 class Outcome:
-    """What a session came to."""
+    """The result of a session."""
 
     estimates: int = 0
     last: Estimate | None = None
@@ -60,25 +52,23 @@ class Outcome:
     counters: dict[str, float] = field(default_factory=dict)
 
 
-class Session:
+class LiveSession:
     """One session over ``source``; see the module's text.
 
-    ``sinks`` are fed; ``visitors`` are asked for what people want to change. ``seconds`` end it
-    (of the wall clock). The end of a recording and the failure of the fusion do, unless it
-    ``lasts``: then receiving, and showing the last picture, go on until it is stopped. ``remark``
-    is told what a user should read, once each. ``pace`` is the clock that pictures and ``seconds``
-    go by.
+    ``sinks`` are fed; those that are also a ``RequestSource`` are asked for requests. The session
+    ends after ``seconds`` of the ``pace`` clock, at the end of a recording, or when the fusion
+    fails. With ``lasts`` only :meth:`stop` and ``seconds`` end it: receiving, and showing the last
+    view, go on. ``remark`` gets every message for the user, once each. ``pace`` is the clock of
+    views and ``seconds``.
     """
 
     def __init__(
         self,
         source: Input,
-        fusing: Fusing,
+        fusion: FusionThread,
         composer: Composer,
         sinks: Sequence[Sink] = (),
         *,
-        visitors: Sequence[Visitors] = (),
-        namings: Sequence[Named] = (),
         seconds: float | None = None,
         lasts: bool = False,
         remark: Callable[[str], None] = lambda _: None,
@@ -86,54 +76,53 @@ class Session:
     ) -> None:
         self.outcome = Outcome()
         self._source = source
-        self._fusing = fusing
+        self._fusion = fusion
         self._composer = composer
         self._sinks = list(sinks)
-        self._visitors = list(visitors)
-        self._namings = list(namings)
+        self._request_sources = [sink for sink in sinks if isinstance(sink, RequestSource)]
         self._seconds = seconds
         self._lasts = lasts
         self._remark = remark
         self._pace = pace
-        self._desk = Desk(lambda unix_s: source.now_s() - (time.time() - unix_s))
+        self._handler = RequestHandler(lambda unix_s: source.now_s() - (time.time() - unix_s))
+        self._notices = NoticeBoard(source.now_s)
         self._stopped = threading.Event()
-        self._notices: dict[str, Notice] = {}
-        self._remarks = 0
-        self._expiring: dict[str, float] = {}
         self._arrived_unix_s: float | None = None
-        self._pictured_s = -math.inf
-        self._news = False
-        self._looked_s: float | None = None
+        self._viewed_s = -math.inf
+        self._changed = False
+        """Whether the view has changed since it was last shown."""
+        self._watched_s: float | None = None
         self._connected = True
-        # Where nobody looks, no picture is composed.
-        self._pictures = any(type(s).pictured is not QuietSink.pictured for s in self._sinks)
+        # Without a sink that shows it, no view is composed.
+        self._shows = any(type(s).updated is not Sink.updated for s in self._sinks)
         self._finishing = False
 
     def stop(self) -> None:
-        """End it soon; from any thread or signal handler."""
+        """End the session soon; from any thread or signal handler."""
         self._stopped.set()
 
     # -- the receive thread -----------------------------------------------------------------------
 
     def run(self) -> Iterator[Observation]:
-        """Yield every observation as it comes, until the session is over; then :meth:`finish`.
+        """Yield every observation as it comes, until the session ends; then call :meth:`finish`.
 
-        Ctrl-C ends it. DeviceError where the port vanishes and is not to be opened again.
+        Ctrl-C ends it. A port that vanishes and is not opened again ends it with a failure in the
+        outcome.
         """
         started_s = self._pace()
         before_s = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
         try:
-            with _ended_by_interrupt(self.stop):
+            with _stopped_by_interrupt(self.stop):
                 while not self._stopped.is_set():
                     received = self._source.read(self._wait_s())
                     if received is not None:
-                        self._take(received)
+                        self._add(received)
                         yield from received.observations
-                    self._look()
+                    self._update()
                     if self._seconds is not None and self._pace() - started_s > self._seconds:
                         return
-                    if not self._lasts and (self._source.over() or self._fusing.failure):
+                    if not self._lasts and (self._source.over() or self._fusion.failure):
                         return
         except RelposError as error:
             self.outcome.failure = error
@@ -141,208 +130,181 @@ class Session:
             sys.setswitchinterval(before_s)
 
     def finish(self, abandon: bool = False) -> Outcome:
-        """Let the fusion work off the rest, end everything, and tell what it came to.
+        """Wait for the fusion to process the rest, close everything, and return the outcome.
 
-        A KeyboardInterrupt leaves it; call again with ``abandon`` to do without the rest.
+        A KeyboardInterrupt leaves it; call again with ``abandon`` to drop the rest.
         """
         if abandon:
-            self._fusing.abandon()
+            self._fusion.abandon()
         elif not self._finishing:
-            self._fusing.finish()
-        while not self._fusing.join(WAIT_S):
-            self._take_estimates()
-            self._picture_if_due()
-        self._take_estimates()
-        if self._pictures:
-            self._picture(self._source.now_s())
+            self._fusion.finish()
+        while not self._fusion.join(WAIT_S):
+            self._collect_estimates()
+            self._show_if_due()
+        self._collect_estimates()
+        if self._shows:
+            self._show()
         self._source.close()
-        self.outcome.failure = self.outcome.failure or self._fusing.failure
+        self.outcome.failure = self.outcome.failure or self._fusion.failure
         for sink in self._sinks:
             try:
                 sink.close()
             except Exception as error:
                 self.outcome.failure = self.outcome.failure or error
-        self.outcome.counters = {**self._source.counters(), **self._fusing.counters()}
+        self.outcome.counters = {**self._source.counters(), **self._fusion.counters()}
         return self.outcome
 
     def _wait_s(self) -> float:
-        """How long to wait for bytes: until a picture with news in it is due."""
-        if not self._news:
+        """How long to wait for bytes: until a changed view is due."""
+        if not self._changed:
             return WAIT_S
-        return min(max(self._pictured_s + PICTURE_S - self._pace(), 0.0), WAIT_S)
+        return min(max(self._viewed_s + VIEW_S - self._pace(), 0.0), WAIT_S)
 
-    def _take(self, received: Received) -> None:
+    def _add(self, received: Received) -> None:
         now_s = self._source.now_s()
         self._arrived_unix_s = time.time()
         self.outcome.received += len(received.observations)
         if received.data:
-            self._tell(lambda sink: sink.received(received.arrival_s, received.data))
+            self._feed(lambda sink: sink.received(received.arrival_s, received.data))
         link = self._source.link
-        self._composer.observed(now_s, received.observations, link.decoder if link else None)
+        decoder = link.decoder if link else None
+        self._composer.add_observations(now_s, received.observations, decoder)
         if received.observations:
-            self._hand_on(received.arrival_s, received.observations)
-        self._news = True
+            self._submit(received.arrival_s, received.observations)
+        self._changed = True
 
-    def _hand_on(self, arrival_s: float, observations: Sequence[Observation]) -> None:
-        self._fusing.give(observations)
-        self._tell(lambda sink: sink.observed(arrival_s, observations))
+    def _submit(self, arrival_s: float, observations: Sequence[Observation]) -> None:
+        self._fusion.submit(observations)
+        self._feed(lambda sink: sink.observed(arrival_s, observations))
 
-    def _tell(self, call: Callable[[Sink], None]) -> None:
-        """Call every sink; one that raises after all is told of and asked no more."""
+    def _feed(self, call: Callable[[Sink], None]) -> None:
+        """Call every sink; drop one that raises, with a notice."""
         for sink in list(self._sinks):
             try:
                 call(sink)
             except Exception as error:
                 self._sinks.remove(sink)
-                self._note(
-                    f"failed-{type(sink).__name__}",
-                    Level.ALARM,
-                    f"{type(sink).__name__} has failed and was ended: {error!r}",
-                )
+                name = type(sink).__name__
+                self._post(f"failed-{name}", Level.ALARM, f"{name} has failed and ended: {error!r}")
 
-    def _look(self) -> None:
-        """Do what has to be done all the time, whether anything was received or not."""
+    def _update(self) -> None:
+        """Do everything that is due at any time, whether anything was received or not."""
         now_s = self._source.now_s()
-        self._take_estimates()
-        self._serve()
-        for words in self._source.remarks():
-            self._remark(words)
-            self._remarks += 1
-            name = f"remark-{self._remarks}"
-            self._note(name, Level.INFO, words)
-            self._expiring[name] = now_s + REMARK_S
+        self._collect_estimates()
+        self._handle_requests()
+        for text in self._source.remarks():
+            self._remark(text)
+            self._notices.post_remark(text)
+            self._changed = True
         self._watch(now_s)
-        self._picture_if_due()
+        self._show_if_due()
 
-    def _take_estimates(self) -> None:
-        for fused in self._fusing.take():
+    def _collect_estimates(self) -> None:
+        for fused in self._fusion.poll():
             self.outcome.estimates += 1
             self.outcome.last = fused.estimate
-            self._composer.estimated(fused.estimate, fused.given)
-            self._tell(lambda sink, e=fused.estimate: sink.estimated(e))  # type: ignore[misc]
+            self._composer.add_estimate(fused.estimate, fused.processed)
+            self._feed(lambda sink, e=fused.estimate: sink.estimated(e))  # type: ignore[misc]
             self._source.learn(fused.estimate)
-            self._news = True
+            self._changed = True
 
-    # -- what everybody has to know ---------------------------------------------------------------
+    # -- alarms and notices -----------------------------------------------------------------------
 
     def _watch(self, now_s: float) -> None:
-        """Let alarms and notices follow the time."""
+        """Update alarms and notices to ``now_s``."""
         gone = self._source.trouble()
         connected = gone is None and not self._source.over()
-        slept_s = 0.0 if self._looked_s is None else now_s - self._looked_s
-        self._looked_s = now_s
-        # The clock of an emulated team jumps between its packets, and nobody has slept.
+        slept_s = 0.0 if self._watched_s is None else now_s - self._watched_s
+        self._watched_s = now_s
+        # The clock of an emulated team jumps between its packets without any sleep.
         virtual = self._source.link is not None and self._source.link.virtual_s is not None
         if slept_s > ASLEEP_S and not virtual and self._source.is_now:
-            self._note(
-                "asleep",
-                Level.WARNING,
-                f"this computer slept for {slept_s:.0f} s, or was too busy to listen",
-            )
-            self._expiring["asleep"] = now_s + REMARK_S
+            text = f"this computer slept for {slept_s:.0f} s, or was too busy to receive"
+            self._post("asleep", Level.WARNING, text)
+            self._notices.expire("asleep")
         self._composer.alarms.tick(now_s, listening=connected and self._connected)
         self._connected = connected
-        self._note_or_clear(
-            "port", Level.ALARM, None if gone is None else f"{gone}; tried again each second"
-        )
+        self._post("port", Level.ALARM, gone and f"{gone}; trying again each second")
         if self._source.over() and not self._finishing:
             self._finishing = True
-            self._fusing.finish()
-            self._note("over", Level.INFO, "the recording is over: this is its last picture")
+            self._fusion.finish()
+            self._post("over", Level.INFO, "end of the recording: this is the last picture")
         self._watch_fusion()
-        nobody = not self._composer.team.nodes and gone is None
-        self._note_or_clear(
-            "nobody", Level.INFO, "nobody is heard yet: are the nodes on?" if nobody else None
-        )
+        silent = not self._composer.monitor.nodes and gone is None
+        text = "no node is heard yet: are the nodes switched on?"
+        self._post("nobody", Level.INFO, text if silent else None)
         for k, sink in enumerate(self._sinks):
-            self._note_or_clear(f"sink-{k}", Level.ALARM, sink.trouble())
-        for name, until_s in list(self._expiring.items()):
-            if now_s > until_s:
-                del self._expiring[name]
-                self._notices.pop(name, None)
+            self._post(f"sink-{k}", Level.ALARM, sink.trouble())
+        self._notices.drop_expired(now_s)
 
     def _watch_fusion(self) -> None:
-        failure = self._fusing.failure
+        failure = self._fusion.failure
         if failure is not None:
-            self._note("fusion", Level.ALARM, f"the fusion has ended: {failure}; receiving goes on")
+            self._post(
+                "fusion", Level.ALARM, f"the fusion has failed: {failure}; receiving goes on"
+            )
             return
         newest_s, first_s, behind_s = self._composer.newest_s, self._composer.first_s, 0.0
         if newest_s is not None and first_s is not None:
-            behind_s = newest_s - max(self._fusing.newest_s, first_s)
-        self._note_or_clear(
-            "fusion",
-            Level.WARNING,
-            f"the fusion is {behind_s:.0f} s behind: meanwhile positions go on from each wearer's "
-            "own motion"
-            if behind_s > BEHIND_S
-            else None,
+            behind_s = newest_s - max(self._fusion.newest_s, first_s)
+        text = (
+            f"the fusion is {behind_s:.0f} s behind: positions follow each wearer's own motion "
+            "meanwhile"
         )
+        self._post("fusion", Level.WARNING, text if behind_s > BEHIND_S else None)
 
-    def _note_or_clear(self, name: str, level: Level, text: str | None) -> None:
-        if text is None:
-            if self._notices.pop(name, None) is not None:
-                self._news = True
-        else:
-            self._note(name, level, text)
+    def _post(self, name: str, level: Level, text: str | None) -> None:
+        """Set the notice ``name``, or clear it where ``text`` is None."""
+        if self._notices.post(name, level, text):
+            self._changed = True
 
-    def _note(self, name: str, level: Level, text: str) -> None:
-        before = self._notices.get(name)
-        since_s = self._source.now_s() if before is None else before.since_s
-        if before is None or before.text != text:
-            self._notices[name] = Notice(name, level, text, since_s)
-            self._news = self._news or before is None
+    # -- views ------------------------------------------------------------------------------------
 
-    # -- pictures ---------------------------------------------------------------------------------
+    def _show_if_due(self) -> None:
+        if not self._shows:
+            self._changed = False
+        elif self._pace() - self._viewed_s >= (VIEW_S if self._changed else IDLE_VIEW_S):
+            self._show()
 
-    def _picture_if_due(self) -> None:
-        if not self._pictures:
-            self._news = False
-            return
-        since_s = self._pace() - self._pictured_s
-        if since_s >= (PICTURE_S if self._news else IDLE_PICTURE_S):
-            self._picture(self._source.now_s())
-
-    def _picture(self, now_s: float) -> Picture:
-        self._news = False
-        self._pictured_s = self._pace()
-        picture = self._composer.picture(
-            now_s, time.time(), self._arrived_unix_s, self._notices.values()
+    def _show(self) -> None:
+        self._changed = False
+        self._viewed_s = self._pace()
+        view = self._composer.view(
+            self._source.now_s(), time.time(), self._arrived_unix_s, self._notices.all()
         )
-        self._tell(lambda sink: sink.pictured(picture))
-        return picture
+        self._feed(lambda sink: sink.updated(view))
 
-    # -- visitors ---------------------------------------------------------------------------------
+    # -- requests ---------------------------------------------------------------------------------
 
-    def _serve(self) -> None:
-        for visitors in self._visitors:
-            for ask in visitors.asks():
-                reply, status = self._reply(ask)
-                visitors.answer(ask, reply, status)
-                self._news = True
+    def _handle_requests(self) -> None:
+        for source in self._request_sources:
+            for request in source.requests():
+                source.respond(request, *self._reply(request))
+                self._changed = True
 
-    def _reply(self, ask: Ask) -> tuple[dict[str, object], int]:
-        match ask.kind:
+    def _reply(self, request: Request) -> tuple[dict[str, object], int]:
+        body = request.body
+        match request.kind:
             case "acknowledge":
-                return {"acknowledged": self._composer.alarms.acknowledge(ask.body["node"])}, 200
+                return {"acknowledged": self._composer.alarms.acknowledge(body["node"])}, 200
             case "name":
-                self._desk.names[ask.body["node"]] = ask.body["name"]
-                self._composer.names[ask.body["node"]] = ask.body["name"]
-                for naming in self._namings:
-                    naming.named(dict(self._desk.names))
-                return {"node": ask.body["node"], "name": ask.body["name"]}, 200
+                self._handler.names[body["node"]] = body["name"]
+                self._composer.names[body["node"]] = body["name"]
+                self._feed(lambda sink: sink.named(dict(self._handler.names)))
+                return {"node": body["node"], "name": body["name"]}, 200
         if not self._source.is_now:
-            return {"error": "this is a recording: nothing can be added to it"}, 409
-        take = self._desk.presses if ask.kind == "presses" else self._desk.headings
-        reply, new = take(ask)
+            return {"error": "this is a recording: it takes no presses or headings"}, 409
+        handle = self._handler.presses if request.kind == "presses" else self._handler.headings
+        reply, new = handle(request)
         if new:
-            self._composer.told(new)
-            self._hand_on(self._source.now_s(), new)
+            self._composer.add_reported(new)
+            self._submit(self._source.now_s(), new)
         return reply, 200
 
 
 @contextmanager
-def _ended_by_interrupt(stop: Callable[[], None]) -> Iterator[None]:
-    """Let Ctrl-C end it between two packets, not within one; only the main thread can."""
+def _stopped_by_interrupt(stop: Callable[[], None]) -> Iterator[None]:
+    """Let Ctrl-C stop between two packets, not within one; only the main thread can."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

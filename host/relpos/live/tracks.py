@@ -6,7 +6,7 @@ from array import array
 from collections.abc import Mapping
 from typing import Any
 
-from relpos.live.picture import to_json
+from relpos.live.team_view import to_json
 
 MOST_POINTS = 2000
 FIRST_SPACING_S = 0.5

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from relpos.errors import DeviceError
-from relpos.link.session import Session
+from relpos.link.dialogue import NodeDialogue
 from relpos.measurements import Range
 from relpos.protocol.messages import CommandCode
 
@@ -16,54 +16,56 @@ SILENT_S = 15.0
 """Without a range for so long, none will come."""
 
 
-def read_shares_mm(session: Session, pair: tuple[int, int]) -> tuple[int, int]:
+def read_shares_mm(dialogue: NodeDialogue, pair: tuple[int, int]) -> tuple[int, int]:
     """Both nodes' shares, asked for; the link's decoder subtracts them from then on."""
-    first, second = (_at(session, node, CommandCode.SET_RANGE_OFFSET_MM) for node in pair)
-    _subtract(session, pair, (first, second))
+    first, second = (_at(dialogue, node, CommandCode.SET_RANGE_OFFSET_MM) for node in pair)
+    _subtract(dialogue, pair, (first, second))
     return first, second
 
 
-def store_shares_mm(session: Session, pair: tuple[int, int], shares_mm: tuple[int, int]) -> None:
+def store_shares_mm(
+    dialogue: NodeDialogue, pair: tuple[int, int], shares_mm: tuple[int, int]
+) -> None:
     """Set both nodes' shares and read them back. DeviceError where a node has another one."""
     for node, share_mm in zip(pair, shares_mm, strict=True):
-        session.node = node
-        session.demand(CommandCode.SET_RANGE_OFFSET_MM, share_mm)
-        stored_mm = session.setting(CommandCode.SET_RANGE_OFFSET_MM)
+        dialogue.node = node
+        dialogue.demand(CommandCode.SET_RANGE_OFFSET_MM, share_mm)
+        stored_mm = dialogue.setting(CommandCode.SET_RANGE_OFFSET_MM)
         if stored_mm != share_mm:
             raise DeviceError(
                 f"node {node} has stored an offset of {stored_mm} mm instead of {share_mm} mm"
             )
-    _subtract(session, pair, shares_mm)
+    _subtract(dialogue, pair, shares_mm)
 
 
-def _at(session: Session, node: int, code: CommandCode) -> int:
-    session.node = node
-    return session.setting(code)
+def _at(dialogue: NodeDialogue, node: int, code: CommandCode) -> int:
+    dialogue.node = node
+    return dialogue.setting(code)
 
 
-def _subtract(session: Session, pair: tuple[int, int], shares_mm: tuple[int, int]) -> None:
+def _subtract(dialogue: NodeDialogue, pair: tuple[int, int], shares_mm: tuple[int, int]) -> None:
     """Do not wait for the next status to tell the decoder."""
     for node, share_mm in zip(pair, shares_mm, strict=True):
-        session.link.decoder.range_offsets_m[node] = share_mm / 1000.0
-    session.observations.clear()
+        dialogue.link.decoder.range_offsets_m[node] = share_mm / 1000.0
+    dialogue.observations.clear()
 
 
 @contextmanager
-def ranging_fast(session: Session, pair: tuple[int, int]) -> Iterator[None]:
+def ranging_fast(dialogue: NodeDialogue, pair: tuple[int, int]) -> Iterator[None]:
     """Both nodes range twice a second meanwhile; their own periods come back at the end."""
-    periods_ms = {node: _at(session, node, CommandCode.SET_RANGING_PERIOD_MS) for node in pair}
+    periods_ms = {node: _at(dialogue, node, CommandCode.SET_RANGING_PERIOD_MS) for node in pair}
     try:
         for node in pair:
-            session.node = node
-            session.demand(CommandCode.SET_RANGING_PERIOD_MS, FAST_PERIOD_MS)
+            dialogue.node = node
+            dialogue.demand(CommandCode.SET_RANGING_PERIOD_MS, FAST_PERIOD_MS)
         yield
     finally:
         for node, period_ms in periods_ms.items():
-            session.node = node
-            session.demand(CommandCode.SET_RANGING_PERIOD_MS, period_ms)
+            dialogue.node = node
+            dialogue.demand(CommandCode.SET_RANGING_PERIOD_MS, period_ms)
 
 
-def collect(session: Session, pair: tuple[int, int], count: int) -> Iterator[float]:
+def collect(dialogue: NodeDialogue, pair: tuple[int, int], count: int) -> Iterator[float]:
     """The next ``count`` ranges in metres between the two, whoever began them.
 
     Fewer where none comes for a while.
@@ -71,14 +73,14 @@ def collect(session: Session, pair: tuple[int, int], count: int) -> Iterator[flo
     # What is under way may still be from before: a report waits for a second at most.
     until_s = time.monotonic() + 0.2
     while time.monotonic() < until_s:
-        session.listen()
-    session.observations.clear()
+        dialogue.listen()
+    dialogue.observations.clear()
     collected = 0
     heard_s = time.monotonic()
     while collected < count and time.monotonic() - heard_s < SILENT_S:
-        session.listen()
-        while session.observations and collected < count:
-            observation = session.observations.popleft()
+        dialogue.listen()
+        while dialogue.observations and collected < count:
+            observation = dialogue.observations.popleft()
             if isinstance(observation, Range) and {observation.node, observation.peer} == set(pair):
                 heard_s = time.monotonic()
                 collected += 1

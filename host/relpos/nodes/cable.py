@@ -18,7 +18,7 @@ DELIVERED = 0
 
 
 class CablePort:
-    """Looks like a coordinator's serial port to :class:`relpos.link.session.Session`.
+    """Looks like a coordinator's serial port to :class:`relpos.link.dialogue.NodeDialogue`.
 
     Opening it restarts an Arduino (its USB chip pulls the reset line): what the node had counted is
     lost, as at any start. ``heard`` counts the frames that came from the node.

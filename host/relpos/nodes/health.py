@@ -44,7 +44,7 @@ class Health(IntEnum):
 
 
 @dataclass(frozen=True)
-class Figures:
+class HealthInputs:
     """What is known of one node; None where it has not told, or it cannot be known yet.
 
     ``status`` is whether it has told any at all. ``loss`` and ``ranging`` are shares over the last
@@ -73,14 +73,14 @@ class Figures:
     free_stack_bytes: int | None = None
 
 
-def assess(figures: Figures) -> tuple[Health, list[str]]:
+def assess(figures: HealthInputs) -> tuple[Health, list[str]]:
     """Colour and its reasons, the worst first; a green node has none."""
     reasons = sorted(_reasons(figures), key=lambda reason: -reason[0])
     worst = max((colour for colour, _ in reasons), default=Health.GREEN)
     return worst, [words for _, words in reasons]
 
 
-def _reasons(f: Figures) -> Iterator[tuple[Health, str]]:
+def _reasons(f: HealthInputs) -> Iterator[tuple[Health, str]]:
     red, yellow = Health.RED, Health.YELLOW
     if f.silent_s > SILENT_S:
         yield red, f"silent for {f.silent_s:.0f} s"

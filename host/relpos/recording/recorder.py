@@ -17,6 +17,7 @@ from threading import Event, Lock, Thread
 from typing import TYPE_CHECKING
 
 from relpos.fusion.estimator import Estimate
+from relpos.live.sinks import Sink
 from relpos.measurements import Observation
 from relpos.recording import container, topics
 from relpos.recording.about import DESCRIPTION, About
@@ -25,7 +26,7 @@ from relpos.recording.output import NO_ROOM, Disk, Output
 from relpos.runs.description import NodeInfo, description_text
 
 if TYPE_CHECKING:
-    from relpos.live.picture import Picture
+    from relpos.live.team_view import TeamView
 
 TICK_S = 0.1
 BLOCK_S = 0.25
@@ -58,7 +59,7 @@ class _Names:
     names: Mapping[int, str]
 
 
-class Recorder:
+class Recorder(Sink):
     """Writes a session to ``path``: a sink of the live session; see the module.
 
     DataError where the file exists already or cannot be made.
@@ -115,9 +116,9 @@ class Recorder:
         weight = 400 * (rows + len(estimate.parameters))
         self._put(self._arrival_s, estimate, weight, is_input=False)
 
-    def pictured(self, picture: Picture) -> None:
+    def updated(self, view: TeamView) -> None:
         """Take what the page tells everybody into the log."""
-        for notice in picture.notices:
+        for notice in view.notices:
             if self._notices.get(notice.id) != notice.text:
                 self._notices[notice.id] = notice.text
                 self.log(str(notice.level), notice.text)

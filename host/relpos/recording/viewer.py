@@ -9,20 +9,21 @@ from typing import TYPE_CHECKING
 
 from relpos.errors import DataError, DeviceError
 from relpos.fusion.estimator import Estimate
+from relpos.live.sinks import Sink
 from relpos.measurements import Observation
 from relpos.recording import topics
 from relpos.recording.about import About
 from relpos.recording.encoder import Encoder, Item, Line, names_of
 
 if TYPE_CHECKING:
-    from relpos.live.picture import Picture
+    from relpos.live.team_view import TeamView
 
 TICK_S = 0.05
 MOST_WAITING = 2000
 """Items; beyond it the oldest go. A viewer shows what is now."""
 
 
-class FoxgloveServer:
+class FoxgloveServer(Sink):
     """A sink of the live session that Foxglove connects to. DeviceError where it cannot listen."""
 
     def __init__(self, listen: str, about: About) -> None:
@@ -76,9 +77,9 @@ class FoxgloveServer:
         """Take an estimate."""
         self._queue.append((self._arrival_s, estimate))
 
-    def pictured(self, picture: Picture) -> None:
+    def updated(self, view: TeamView) -> None:
         """Take what the page tells everybody into the log."""
-        for notice in picture.notices:
+        for notice in view.notices:
             if self._notices.get(notice.id) != notice.text:
                 self._notices[notice.id] = notice.text
                 self._queue.append((self._arrival_s, Line(str(notice.level), notice.text)))

@@ -40,7 +40,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from relpos.live.picture import to_json
+from relpos.live.team_view import to_json
 from relpos.live.tracks import Tracks
 from relpos.view.access import Access, qr_svg
 
@@ -67,7 +67,7 @@ CONTENT_POLICY = (
 )
 
 
-class Session:
+class SessionProxy:
     """The session as this process sees it: what it said last, and what it is asked."""
 
     def __init__(self, lines: asyncio.StreamReader, out: asyncio.StreamWriter) -> None:
@@ -152,7 +152,7 @@ class Session:
             self._answers.pop(number, None)
 
 
-class Guard:
+class TokenMiddleware:
     """Lets nobody in without the token: in the address once, in a cookie from then on."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
@@ -223,7 +223,7 @@ class BadRequestError(Exception):
 class Pages:
     """What is served, of one session."""
 
-    def __init__(self, session: Session, access: Access) -> None:
+    def __init__(self, session: SessionProxy, access: Access) -> None:
         self.session = session
         self._access = access
         self._code: str | None = None
@@ -250,7 +250,7 @@ class Pages:
             ],
             exception_handlers={BadRequestError: _refuse},
         )
-        return Guard(app, self._access)
+        return TokenMiddleware(app, self._access)
 
     @staticmethod
     def page(name: str) -> Any:
@@ -443,7 +443,7 @@ def _clocks(body: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Premises:
+class ServerConfig:
     """What a serving process is started with."""
 
     door: socket.socket
@@ -452,19 +452,19 @@ class Premises:
     access: Access
 
 
-def run(premises: Premises) -> None:
+def run(config: ServerConfig) -> None:
     """Serve until the session ends. The body of the process."""
     # Ctrl-C in the terminal reaches this process, too; the session decides when it is over.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    asyncio.run(_serve(premises))
+    asyncio.run(_serve(config))
 
 
-async def _serve(premises: Premises) -> None:
-    lines, out = await asyncio.open_connection(sock=premises.wire, limit=MOST_LINE_BYTES)
-    session = Session(lines, out)
-    with _certificate_files(premises.access) as files:
-        config = uvicorn.Config(
-            Pages(session, premises.access).app(),
+async def _serve(config: ServerConfig) -> None:
+    lines, out = await asyncio.open_connection(sock=config.wire, limit=MOST_LINE_BYTES)
+    session = SessionProxy(lines, out)
+    with _certificate_files(config.access) as files:
+        uvicorn_config = uvicorn.Config(
+            Pages(session, config.access).app(),
             log_level="warning",
             access_log=False,
             lifespan="off",
@@ -475,9 +475,9 @@ async def _serve(premises: Premises) -> None:
             timeout_graceful_shutdown=1,
             **files,
         )
-        config.load()
-    server = _Server(config)
-    serving = asyncio.create_task(server.serve(sockets=[premises.door]))
+        uvicorn_config.load()
+    server = _Server(uvicorn_config)
+    serving = asyncio.create_task(server.serve(sockets=[config.door]))
     await session.listen()
     server.should_exit = True
     await serving

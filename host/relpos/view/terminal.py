@@ -1,4 +1,4 @@
-"""The team in a terminal: a sink that draws the newest picture, for a laptop in the rain over ssh.
+"""The team in a terminal: a sink that draws the newest view, for a laptop in the rain over ssh.
 
 It draws in a thread of its own: a line that is slow, or a terminal that has been stopped, holds up
 nobody. Only lines that have changed are sent.
@@ -18,10 +18,10 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any, TextIO
 
-from relpos.live.picture import Picture
-from relpos.live.sinks import QuietSink
-from relpos.live.visitors import Ask
-from relpos.view.text_page import Looks, alarming, page, unattended
+from relpos.live.requests import Request
+from relpos.live.sinks import Sink
+from relpos.live.team_view import TeamView
+from relpos.view.text_page import RenderOptions, alarming, page, unattended
 
 DRAW_S = 0.5
 """Two pages a second: as fast as anybody reads, a few hundred bytes each."""
@@ -35,7 +35,7 @@ TRAIL_EVERY_S = 1.0
 KEY_WAIT_S = 0.1
 
 
-class TerminalView(QuietSink):
+class TerminalView(Sink):
     """Draws pictures on a terminal, reads keys, rings the bell when an alarm begins."""
 
     def __init__(
@@ -48,8 +48,8 @@ class TerminalView(QuietSink):
     ) -> None:
         """Take over the terminal that ``stream`` (stdout) is; a plain file gets a page at times."""
         self._stream = stream or sys.stdout
-        self._looks = Looks(me=me, title=title, utf8=takes_utf8(self._stream))
-        self._picture: Picture | None = None
+        self._options = RenderOptions(me=me, title=title, utf8=takes_utf8(self._stream))
+        self._view: TeamView | None = None
         self._trails: dict[int, deque[tuple[float, float]]] = {}
         self._trailed_s = -TRAIL_EVERY_S
         self._drawn: list[str] = []
@@ -58,7 +58,7 @@ class TerminalView(QuietSink):
         self._rung: frozenset[str | int] = frozenset()
         self._rung_s = 0.0
         self._trouble: str | None = None
-        self._asks: deque[Ask] = deque()
+        self._asks: deque[Request] = deque()
         self._asked = 0
         self._wake = threading.Event()
         self._stop = threading.Event()
@@ -71,22 +71,22 @@ class TerminalView(QuietSink):
         for thread in self._threads:
             thread.start()
 
-    def pictured(self, picture: Picture) -> None:
-        """Leave the newest picture for the drawing thread; an alarm wakes it."""
-        self._picture = picture
-        if alarming(picture) - self._rung:
+    def updated(self, view: TeamView) -> None:
+        """Leave the newest view for the drawing thread; an alarm wakes it."""
+        self._view = view
+        if alarming(view) - self._rung:
             self._wake.set()
 
     def trouble(self) -> str | None:
         """Say that the terminal is gone; None when all is well."""
         return self._trouble
 
-    def asks(self) -> list[Ask]:
+    def requests(self) -> list[Request]:
         """What was asked for by keys since the last call."""
         return [self._asks.popleft() for _ in range(len(self._asks))]
 
-    def answer(self, ask: Ask, reply: dict[str, Any], status: int = 200) -> None:
-        """Nothing to do: the next picture shows it."""
+    def respond(self, request: Request, reply: dict[str, Any], status: int = 200) -> None:
+        """Nothing to do: the next view shows it."""
 
     def close(self) -> None:
         """Give the terminal back as it was."""
@@ -106,8 +106,8 @@ class TerminalView(QuietSink):
             while not self._stop.is_set():
                 self._wake.wait(DRAW_S if self._screen else PLAIN_S)
                 self._wake.clear()
-                if self._picture is not None and not self._stop.is_set():
-                    self._draw(self._picture)
+                if self._view is not None and not self._stop.is_set():
+                    self._draw(self._view)
         except OSError as error:
             self._trouble = f"terminal view: {error.strerror or error}"
         except Exception as error:  # the session goes on, and says that this does not
@@ -117,19 +117,19 @@ class TerminalView(QuietSink):
                 with suppress(OSError, ValueError):
                     self._write("\x1b[?7h\x1b[?25h\x1b[?1049l")
 
-    def _draw(self, picture: Picture) -> None:
+    def _draw(self, view: TeamView) -> None:
         from rich.console import Console
 
-        self._follow(picture)
-        columns, rows = 100, len(picture.people) + 26
+        self._follow(view)
+        columns, rows = 100, len(view.people) + 26
         if self._screen:
             columns, rows = os.get_terminal_size(self._stream.fileno())
         console = Console(
             file=self._stream, force_terminal=self._screen or None, legacy_windows=False
         )
-        looks = replace(self._looks, columns=columns, rows=rows, trails=self._trails)
-        lines = page(picture, looks)
-        bell = self._bell(picture) if self._screen else ""
+        options = replace(self._options, columns=columns, rows=rows, trails=self._trails)
+        lines = page(view, options)
+        bell = self._bell(view) if self._screen else ""
         if not self._screen:
             text = "\n".join(line.plain.rstrip() for line in lines[:-1])
             self._write(text.rstrip() + "\n\n")
@@ -153,31 +153,31 @@ class TerminalView(QuietSink):
         if bell or changed:
             self._write(bell + changed)
 
-    def _follow(self, picture: Picture) -> None:
+    def _follow(self, view: TeamView) -> None:
         """Keep where everybody has been of late."""
-        if picture.time_s - self._trailed_s < TRAIL_EVERY_S:
+        if view.time_s - self._trailed_s < TRAIL_EVERY_S:
             return
-        self._trailed_s = picture.time_s
-        for person in picture.people:
+        self._trailed_s = view.time_s
+        for person in view.people:
             if person.x_m is not None and person.y_m is not None and person.status == "ok":
                 trail = self._trails.setdefault(
                     person.node, deque(maxlen=int(TRAIL_S / TRAIL_EVERY_S))
                 )
                 trail.append((person.x_m, person.y_m))
 
-    def _bell(self, picture: Picture) -> str:
+    def _bell(self, view: TeamView) -> str:
         """Ring for a new alarm, and again as long as there is somebody nobody has seen to.
 
         What is wrong with the session rings once: a bell that goes on for a cable is not heard
         any more when it is for a person.
         """
-        alarms = alarming(picture)
+        alarms = alarming(view)
         new = alarms - self._rung
         now_s = time.monotonic()
         somebody = any(isinstance(alarm, int) for alarm in alarms)
         again = somebody and now_s - self._rung_s >= BELL_S
         self._rung = alarms
-        if self._looks.muted or not (new or again):
+        if self._options.muted or not (new or again):
             return ""
         self._rung_s = now_s
         return "\a"
@@ -190,26 +190,26 @@ class TerminalView(QuietSink):
 
     def press(self, key: str) -> None:
         """Do what a key stands for."""
-        looks = self._looks
+        options = self._options
         match key:
             case "a":
                 self._see_to()
             case "m" | "M":
-                self._looks = replace(looks, me=self._other(1 if key == "m" else -1))
+                self._options = replace(options, me=self._other(1 if key == "m" else -1))
             case "+" | "=":
-                self._looks = replace(looks, zoom=looks.zoom + 1)
+                self._options = replace(options, zoom=options.zoom + 1)
             case "-":
-                self._looks = replace(looks, zoom=looks.zoom - 1)
+                self._options = replace(options, zoom=options.zoom - 1)
             case "0":
-                self._looks = replace(looks, zoom=0)
+                self._options = replace(options, zoom=0)
             case "u":
-                self._looks = replace(looks, heading_up=not looks.heading_up)
+                self._options = replace(options, heading_up=not options.heading_up)
             case "t":
-                self._looks = replace(looks, table=True, map=not looks.map)
+                self._options = replace(options, table=True, map=not options.map)
             case "c":
-                self._looks = replace(looks, map=True, table=not looks.table)
+                self._options = replace(options, map=True, table=not options.table)
             case "b":
-                self._looks = replace(looks, muted=not looks.muted)
+                self._options = replace(options, muted=not options.muted)
             case "q":
                 # As Ctrl-C does: the session ends, and with it this view.
                 os.kill(os.getpid(), signal.SIGINT)
@@ -219,18 +219,20 @@ class TerminalView(QuietSink):
 
     def _see_to(self) -> None:
         """Tell everybody that the alarm on top is seen to; the next press is for the next one."""
-        if self._picture is None:
+        if self._view is None:
             return
-        for person in unattended(self._picture)[:1]:
+        for person in unattended(self._view)[:1]:
             self._asked += 1
-            self._asks.append(Ask(self._asked, "acknowledge", time.time(), {"node": person.node}))
+            self._asks.append(
+                Request(self._asked, "acknowledge", time.time(), {"node": person.node})
+            )
 
     def _other(self, step: int) -> int | None:
-        picture = self._picture
-        nodes = [person.node for person in picture.people] if picture is not None else []
+        view = self._view
+        nodes = [person.node for person in view.people] if view is not None else []
         if not nodes:
-            return self._looks.me
-        me = self._looks.me
+            return self._options.me
+        me = self._options.me
         place = nodes.index(me) if me in nodes else 0
         return nodes[(place + step) % len(nodes)]
 

@@ -1,4 +1,4 @@
-"""The picture of the team as lines of characters: alarms, a table, a small map. Pure.
+"""The view of the team as lines of characters: alarms, a table, a small map. Pure.
 
 Everything is said in words and shapes, colour only repeats it. Distances and directions are those
 from *me*, one of the team; the map has me in its middle. Two character sets: braille and arrows
@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from relpos.live.picture import Alert, GhostPerson, Level, Person, Picture
+from relpos.live.team_view import Alert, GhostPerson, Level, Person, TeamView
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -39,7 +39,7 @@ _NO_STYLE = ""
 
 
 @dataclass(frozen=True)
-class Looks:
+class RenderOptions:
     """How it is to be shown: whose view, the size, and what the terminal can do.
 
     ``zoom`` counts steps in (positive) or out of the map that holds everybody.
@@ -68,77 +68,77 @@ class _Seen:
     """Relative to where I face, counter-clockwise."""
     rise_m: float | None = None
     ways: tuple[tuple[float, float | None], ...] = ()
-    """Distance and bearing in each possible picture, the most probable first, where they differ."""
+    """Distance and bearing in each possible view, the most probable first, where they differ."""
 
 
-def page(picture: Picture, looks: Looks) -> list[Text]:
+def page(view: TeamView, options: RenderOptions) -> list[Text]:
     """Return exactly ``rows`` lines of at most ``columns`` characters."""
-    lines = [_title(picture, looks), *_alarms(picture, looks, max(1, looks.rows // 4))]
-    me = find_me(picture, looks.me)
-    left = looks.rows - len(lines) - 1
-    beside = looks.table and looks.map and looks.columns >= BESIDE_COLUMNS
+    lines = [_title(view, options), *_alarms(view, options, max(1, options.rows // 4))]
+    me = find_me(view, options.me)
+    left = options.rows - len(lines) - 1
+    beside = options.table and options.map and options.columns >= BESIDE_COLUMNS
     if beside:
-        table = _table(picture, me, looks, left)
-        drawn = _map(picture, me, looks, looks.columns - TABLE_COLUMNS - 1, left)
+        table = _table(view, me, options, left)
+        drawn = _map(view, me, options, options.columns - TABLE_COLUMNS - 1, left)
         for k in range(left):
-            line = table[k] if k < len(table) else _line("", looks)
-            line.truncate(TABLE_COLUMNS, overflow="ellipsis" if looks.utf8 else "crop")
+            line = table[k] if k < len(table) else _line("", options)
+            line.truncate(TABLE_COLUMNS, overflow="ellipsis" if options.utf8 else "crop")
             line.pad_right(TABLE_COLUMNS + 1 - line.cell_len)
             lines.append(line + drawn[k] if k < len(drawn) else line)
     else:
-        wanted = len(picture.people) + 1
-        rows = left if not looks.map else min(wanted, max(left - LEAST_MAP_ROWS, 4))
-        if looks.table:
-            lines += _table(picture, me, looks, rows)
-        left = looks.rows - len(lines) - 1
-        if looks.map and left >= 3:
-            lines += _map(picture, me, looks, looks.columns, left)
-    lines = lines[: looks.rows - 1]
-    lines += [_line("", looks) for _ in range(looks.rows - 1 - len(lines))]
-    lines.append(_keys(looks))
+        wanted = len(view.people) + 1
+        rows = left if not options.map else min(wanted, max(left - LEAST_MAP_ROWS, 4))
+        if options.table:
+            lines += _table(view, me, options, rows)
+        left = options.rows - len(lines) - 1
+        if options.map and left >= 3:
+            lines += _map(view, me, options, options.columns, left)
+    lines = lines[: options.rows - 1]
+    lines += [_line("", options) for _ in range(options.rows - 1 - len(lines))]
+    lines.append(_keys(options))
     for line in lines:
-        line.truncate(looks.columns, overflow="ellipsis" if looks.utf8 else "crop")
+        line.truncate(options.columns, overflow="ellipsis" if options.utf8 else "crop")
     return lines
 
 
-def alarming(picture: Picture) -> frozenset[str | int]:
+def alarming(view: TeamView) -> frozenset[str | int]:
     """Return what rings the bell: nodes that lie still or are lost, ids of the session's alarms."""
-    people: set[str | int] = {person.node for person in unattended(picture)}
-    return frozenset(people | {n.id for n in picture.notices if n.level is Level.ALARM})
+    people: set[str | int] = {person.node for person in unattended(view)}
+    return frozenset(people | {n.id for n in view.notices if n.level is Level.ALARM})
 
 
-def unattended(picture: Picture) -> list[Person]:
+def unattended(view: TeamView) -> list[Person]:
     """Return whose alarm nobody has seen to, in the order in which the page has them."""
     ranks = (Alert.STILL_ALARM, Alert.LOST)
-    waiting = [p for p in picture.people if p.alert in ranks and not p.acknowledged]
+    waiting = [p for p in view.people if p.alert in ranks and not p.acknowledged]
     return sorted(waiting, key=lambda person: ranks.index(person.alert))
 
 
-def find_me(picture: Picture, wanted: int | None) -> Person | None:
+def find_me(view: TeamView, wanted: int | None) -> Person | None:
     """Return the person whose view it is: the wanted one, else the first."""
-    people = picture.people
+    people = view.people
     return next((p for p in people if p.node == wanted), people[0] if people else None)
 
 
-def _title(picture: Picture, looks: Looks) -> Text:
-    minutes, seconds = divmod(max(int(picture.time_s), 0), 60)
+def _title(view: TeamView, options: RenderOptions) -> Text:
+    minutes, seconds = divmod(max(int(view.time_s), 0), 60)
     hours, minutes = divmod(minutes, 60)
     clock = f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes:02d}:{seconds:02d}"
-    count = len(picture.people)
-    words = f"{looks.title}  {clock}  {count} {'person' if count == 1 else 'people'}"
-    if picture.fused_s is None:
+    count = len(view.people)
+    words = f"{options.title}  {clock}  {count} {'person' if count == 1 else 'people'}"
+    if view.fused_s is None:
         words += "  no position yet"
-    if looks.muted:
+    if options.muted:
         words += "  bell off"
-    return _line(words, looks, "bold")
+    return _line(words, options, "bold")
 
 
-def _alarms(picture: Picture, looks: Looks, most: int) -> list[Text]:
+def _alarms(view: TeamView, options: RenderOptions, most: int) -> list[Text]:
     """Return at most so many lines of what has to be read first, the worst on top."""
     said: list[tuple[int, str, str]] = []
-    me = find_me(picture, looks.me)
-    for person in picture.people:
-        where = _where(person, me, picture, looks)
+    me = find_me(view, options.me)
+    for person in view.people:
+        where = _where(person, me, view, options)
         seen = " (seen to)" if person.acknowledged else ""
         match person.alert:
             case Alert.STILL_ALARM:
@@ -153,41 +153,41 @@ def _alarms(picture: Picture, looks: Looks, most: int) -> list[Text]:
                 said.append((3, words, _STYLES[Level.WARNING]))
             case None:
                 pass
-    for notice in picture.notices:
+    for notice in view.notices:
         mark, rank = {Level.ALARM: ("!!", 1), Level.WARNING: ("!", 4)}.get(notice.level, ("-", 6))
         said.append((rank, f"{mark} {notice.text}", _STYLES[notice.level]))
-    if picture.ambiguous and picture.alternatives:
-        shares = ", ".join(f"{100.0 * g.probability:.0f} %" for g in picture.alternatives[:4])
-        more = len(picture.alternatives) - 4
+    if view.ambiguous and view.alternatives:
+        shares = ", ".join(f"{100.0 * g.probability:.0f} %" for g in view.alternatives[:4])
+        more = len(view.alternatives) - 4
         shares += f" and {more} more" * (more > 0)
-        words = f"? ambiguous: {len(picture.alternatives)} possible pictures ({shares})"
+        words = f"? ambiguous: {len(view.alternatives)} possible pictures ({shares})"
         said.append((5, words, _STYLES[Level.WARNING]))
     said.sort(key=lambda row: row[0])
     if len(said) > most:
         left_out = len(said) - most + 1
         said[most - 1 :] = [(9, f"... and {left_out} more", "bold")]
-    return [_line(words, looks, style) for _, words, style in said]
+    return [_line(words, options, style) for _, words, style in said]
 
 
 def _still(person: Person) -> str:
     return f"LIES STILL for {person.still_s:.0f} s"
 
 
-def _where(person: Person, me: Person | None, picture: Picture, looks: Looks) -> str:
+def _where(person: Person, me: Person | None, view: TeamView, options: RenderOptions) -> str:
     if me is None or person.node == me.node:
         return ""
-    seen = _seen(person, me, picture)
+    seen = _seen(person, me, view)
     if seen.distance_m is None:
         return ", place unknown"
-    direction = _direction(seen, looks)
+    direction = _direction(seen, options)
     return f", {seen.distance_m:.0f} m from {me.name}" + f", {direction}" * (direction != "-")
 
 
-def _table(picture: Picture, me: Person | None, looks: Looks, rows: int) -> list[Text]:
+def _table(view: TeamView, me: Person | None, options: RenderOptions, rows: int) -> list[Text]:
     head = _row("#", "who", "distance", "direction", "height", "state", "seen", "health")
-    lines = [_line(head, looks, "underline")]
+    lines = [_line(head, options, "underline")]
     people = sorted(
-        picture.people,
+        view.people,
         key=lambda p: (me is None or p.node != me.node, _urgency(p), p.node),
     )
     room = max(rows - 1, 1)
@@ -196,14 +196,14 @@ def _table(picture: Picture, me: Person | None, looks: Looks, rows: int) -> list
         stay = min(urgent, max(room - 2, 1))
         turning, places = people[stay:], max(room - stay - 1, 1)
         pages = -(-len(turning) // places)
-        shown = int(picture.time_s / PAGE_S) % pages
+        shown = int(view.time_s / PAGE_S) % pages
         people = [*people[:stay], *turning[shown * places : (shown + 1) * places]]
         more = f"    page {shown + 1} of {pages}; t shows the table alone"
     else:
         more = ""
-    lines += [_person(person, me, picture, looks) for person in people]
+    lines += [_person(person, me, view, options) for person in people]
     if more:
-        lines.append(_line(more, looks, "dim"))
+        lines.append(_line(more, options, "dim"))
     return lines
 
 
@@ -217,16 +217,16 @@ def _row(*cells: str) -> str:
     return row.rstrip()
 
 
-def _person(person: Person, me: Person | None, picture: Picture, looks: Looks) -> Text:
-    seen = _Seen() if me is None or person.node == me.node else _seen(person, me, picture)
+def _person(person: Person, me: Person | None, view: TeamView, options: RenderOptions) -> Text:
+    seen = _Seen() if me is None or person.node == me.node else _seen(person, me, view)
     own = me is not None and person.node == me.node
     health = "ok" if person.health == "green" else ", ".join(person.reasons) or person.health
     rise = seen.rise_m
     cells = (
         str(person.node),
         person.name,
-        "me" if own else _distance(seen, looks),
-        "-" if own else _direction(seen, looks),
+        "me" if own else _distance(seen, options),
+        "-" if own else _direction(seen, options),
         "" if rise is None or abs(rise) < STOREY_M else f"{rise:+.0f} m",
         _state(person),
         _ago(person.seen_s),
@@ -237,7 +237,7 @@ def _person(person: Person, me: Person | None, picture: Picture, looks: Looks) -
         style = "bold reverse"
     elif own:
         style = f"bold {style}".strip()
-    return _line(_row(*cells), looks, style)
+    return _line(_row(*cells), options, style)
 
 
 def _urgency(person: Person) -> int:
@@ -273,13 +273,13 @@ def _ago(seen_s: float | None) -> str:
     return f"{seen_s / 60.0:.0f} min" if seen_s < 3600.0 else f"{seen_s / 3600.0:.0f} h"
 
 
-def _seen(person: Person, me: Person, picture: Picture) -> _Seen:
+def _seen(person: Person, me: Person, view: TeamView) -> _Seen:
     """Return distance and direction from me; from the pair where it is told, with its sigma."""
     facing = me.heading_rad
     if me.sigma_heading_rad is None or me.sigma_heading_rad > HEADING_KNOWN_RAD:
         facing = None
-    ways = _ways(person.node, me.node, facing, picture)
-    pair = next((p for p in picture.pairs if {p.node, p.peer} == {person.node, me.node}), None)
+    ways = _ways(person.node, me.node, facing, view)
+    pair = next((p for p in view.pairs if {p.node, p.peer} == {person.node, me.node}), None)
     rise = None if person.z_m is None or me.z_m is None else person.z_m - me.z_m
     if pair is not None:
         bearing = pair.bearing_rad if pair.node == me.node else pair.bearing_rad + math.pi
@@ -294,11 +294,11 @@ def _seen(person: Person, me: Person, picture: Picture) -> _Seen:
 
 
 def _ways(
-    node: int, me: int, facing: float | None, picture: Picture
+    node: int, me: int, facing: float | None, view: TeamView
 ) -> tuple[tuple[float, float | None], ...]:
-    """Return how far and whereto somebody is in each possible picture, if that differs."""
+    """Return how far and whereto somebody is in each possible view, if that differs."""
     found: list[tuple[float, float | None]] = []
-    for ghosts in picture.alternatives:
+    for ghosts in view.alternatives:
         places = {ghost.node: ghost for ghost in ghosts.people}
         a, b = places.get(me), places.get(node)
         if a is None or b is None or "ring" in (a.shape, b.shape):
@@ -332,7 +332,7 @@ def _wrapped(angle_rad: float) -> float:
     return math.remainder(angle_rad, 2.0 * math.pi)
 
 
-def _distance(seen: _Seen, looks: Looks) -> str:
+def _distance(seen: _Seen, options: RenderOptions) -> str:
     if seen.ways:
         (first, _), (second, _) = seen.ways
         return f"{first:.0f} or {second:.0f} m"
@@ -342,40 +342,40 @@ def _distance(seen: _Seen, looks: Looks) -> str:
         return f"{seen.distance_m:.1f} m"
     # What is not known to a metre is not told to a decimetre.
     digits = 1 if seen.sigma_m < 1.0 and seen.distance_m < 100.0 else 0
-    sign = "±" if looks.utf8 else "+-"
+    sign = "±" if options.utf8 else "+-"
     return f"{seen.distance_m:.{digits}f} m {sign}{seen.sigma_m:.{digits}f}"
 
 
-def _direction(seen: _Seen, looks: Looks) -> str:
+def _direction(seen: _Seen, options: RenderOptions) -> str:
     if seen.ways:
-        first, second = (_arrow(bearing, looks) for _, bearing in seen.ways)
+        first, second = (_arrow(bearing, options) for _, bearing in seen.ways)
         return f"{first} or {second}" if "" not in (first, second) else "-"
     if seen.bearing_rad is None:
         return "-"
     degrees = round(math.degrees(seen.bearing_rad) / 5.0) * 5
     side = "left" if degrees > 0 else "right"
-    words = f"{abs(degrees)}{'°' if looks.utf8 else ''} {side}"
+    words = f"{abs(degrees)}{'°' if options.utf8 else ''} {side}"
     if degrees == 0:
         words = "ahead"
     elif abs(degrees) == 180:
         words = "behind"
-    return f"{_arrow(seen.bearing_rad, looks)} {words}" if looks.utf8 else words
+    return f"{_arrow(seen.bearing_rad, options)} {words}" if options.utf8 else words
 
 
-def _arrow(bearing_rad: float | None, looks: Looks) -> str:
+def _arrow(bearing_rad: float | None, options: RenderOptions) -> str:
     if bearing_rad is None:
         return ""
     eighth = round(bearing_rad / (math.pi / 4.0)) % 8
-    if looks.utf8:
+    if options.utf8:
         return _ARROWS[eighth]
     return ("ahead", "left", "left", "left", "behind", "right", "right", "right")[eighth]
 
 
-def _keys(looks: Looks) -> Text:
-    up = "map up" if looks.heading_up else "face up"
-    bell = "bell on" if looks.muted else "bell off"
+def _keys(options: RenderOptions) -> Text:
+    up = "map up" if options.heading_up else "face up"
+    bell = "bell on" if options.muted else "bell off"
     words = f"a seen to  m/M me  +/-/0 zoom  u {up}  t table  c chart  b {bell}  q quit"
-    return _line(words, looks, "dim")
+    return _line(words, options, "dim")
 
 
 class Canvas:
@@ -424,24 +424,26 @@ class Canvas:
         return chr(0x2800 + dots) if self._utf8 else "."
 
 
-def _map(picture: Picture, me: Person | None, looks: Looks, columns: int, rows: int) -> list[Text]:
+def _map(
+    view: TeamView, me: Person | None, options: RenderOptions, columns: int, rows: int
+) -> list[Text]:
     """Return the map: me in the middle, north (unknown: y) or where I face up, a scale below."""
-    canvas = Canvas(columns, rows - 1, utf8=looks.utf8)
+    canvas = Canvas(columns, rows - 1, utf8=options.utf8)
     middle = _xy(me) if me is not None else None
-    places = {p.node: xy for p in picture.people if (xy := _xy(p)) is not None}
+    places = {p.node: xy for p in view.people if (xy := _xy(p)) is not None}
     if middle is None and places:
         middle = (
             sum(x for x, _ in places.values()) / len(places),
             sum(y for _, y in places.values()) / len(places),
         )
     if middle is None:
-        return [_line("    (nobody is located yet)", looks, "dim")]
+        return [_line("    (nobody is located yet)", options, "dim")]
     x0, y0 = middle
-    turn = 0.0 if picture.north_rad is None else 0.5 * math.pi - picture.north_rad
-    if looks.heading_up and me is not None and me.heading_rad is not None:
+    turn = 0.0 if view.north_rad is None else 0.5 * math.pi - view.north_rad
+    if options.heading_up and me is not None and me.heading_rad is not None:
         turn = 0.5 * math.pi - me.heading_rad
     c, s = math.cos(turn), math.sin(turn)
-    span_m = _span_m(canvas, [((x - x0), (y - y0)) for x, y in places.values()], looks.zoom, turn)
+    span_m = _span_m(canvas, [((x - x0), (y - y0)) for x, y in places.values()], options.zoom, turn)
     dots_per_m = 0.5 * min(canvas.width, canvas.height) / span_m
 
     def at(x_m: float, y_m: float) -> tuple[float, float]:
@@ -451,28 +453,29 @@ def _map(picture: Picture, me: Person | None, looks: Looks, columns: int, rows: 
             0.5 * canvas.height - dots_per_m * (s * dx + c * dy),
         )
 
-    for trail in looks.trails.values():
+    for trail in options.trails.values():
         for x_m, y_m in trail:
             canvas.dot(*at(x_m, y_m))
-    for ghosts in picture.alternatives:
+    for ghosts in view.alternatives:
         for ghost in ghosts.people:
             for point in _outline(ghost):
                 canvas.dot(*at(*point))
-    for person in picture.people:
+    for person in view.people:
         if person.node in places and person.status != "ambiguous":
             for point in _outline(person):
                 canvas.dot(*at(*point))
-    for ghosts in picture.alternatives[:4]:
+    for ghosts in view.alternatives[:4]:
         for ghost in ghosts.people:
-            if ghost.shape != "ring" and _is_ambiguous(ghost.node, picture):
+            if ghost.shape != "ring" and _is_ambiguous(ghost.node, view):
                 canvas.write(*_label(at(ghost.x_m, ghost.y_m), f"{ghost.node}?"), over=False)
-    for person in sorted(picture.people, key=_urgency, reverse=True):
-        if person.node in places and not (person.status == "ambiguous" and picture.alternatives):
+    for person in sorted(view.people, key=_urgency, reverse=True):
+        if person.node in places and not (person.status == "ambiguous" and view.alternatives):
             mark = {0: "!", 1: "!", 2: "!"}.get(_urgency(person), "")
-            words = f"{person.node}{mark}" + _faces(person, turn, looks)
+            words = f"{person.node}{mark}" + _faces(person, turn, options)
             canvas.write(*_label(at(*places[person.node]), words))
     return [
-        _line(line, looks) for line in (*canvas.lines(), _scale(canvas, dots_per_m, looks, picture))
+        _line(line, options)
+        for line in (*canvas.lines(), _scale(canvas, dots_per_m, options, view))
     ]
 
 
@@ -480,8 +483,8 @@ def _label(at: tuple[float, float], words: str) -> tuple[float, float, str]:
     return at[0] - len(words) + 1, at[1], words
 
 
-def _is_ambiguous(node: int, picture: Picture) -> bool:
-    return any(p.node == node and p.status == "ambiguous" for p in picture.people)
+def _is_ambiguous(node: int, view: TeamView) -> bool:
+    return any(p.node == node and p.status == "ambiguous" for p in view.people)
 
 
 def _span_m(
@@ -521,27 +524,27 @@ def _outline(shape: Person | GhostPerson) -> Iterable[tuple[float, float]]:
         )
 
 
-def _faces(person: Person, turn: float, looks: Looks) -> str:
+def _faces(person: Person, turn: float, options: RenderOptions) -> str:
     """Return an arrow for where somebody faces, in UTF-8 and where it is known."""
     known = person.sigma_heading_rad is not None and person.sigma_heading_rad < HEADING_KNOWN_RAD
-    if person.heading_rad is None or not known or not looks.utf8:
+    if person.heading_rad is None or not known or not options.utf8:
         return ""
-    return _arrow(_wrapped(person.heading_rad + turn - 0.5 * math.pi), looks)
+    return _arrow(_wrapped(person.heading_rad + turn - 0.5 * math.pi), options)
 
 
-def _scale(canvas: Canvas, dots_per_m: float, looks: Looks, picture: Picture) -> str:
+def _scale(canvas: Canvas, dots_per_m: float, options: RenderOptions, view: TeamView) -> str:
     """Return a scale bar of 1, 2 or 5 times a power of ten, at most a quarter of the width."""
     most_m = 0.25 * canvas.width / dots_per_m
     power = 10.0 ** math.floor(math.log10(most_m))
     length_m = next(f * power for f in (5.0, 2.0, 1.0) if f * power <= most_m)
     cells = max(round(length_m * dots_per_m / 2.0), 2)
-    ends, line = ("├┤", "─") if looks.utf8 else ("||", "-")
-    unturned = "y" if picture.north_rad is None else "magnetic north"
-    up = "up: where I face" if looks.heading_up else f"up: {unturned}"
+    ends, line = ("├┤", "─") if options.utf8 else ("||", "-")
+    unturned = "y" if view.north_rad is None else "magnetic north"
+    up = "up: where I face" if options.heading_up else f"up: {unturned}"
     return f"{ends[0]}{line * (cells - 2)}{ends[1]} {length_m:g} m  {up}"
 
 
-def _line(words: str, looks: Looks, style: str = "") -> Text:
+def _line(words: str, options: RenderOptions, style: str = "") -> Text:
     """Return one line of what the terminal can show, and nothing that could command it.
 
     Names come from phones: whoever is on the network may have typed them.
@@ -549,7 +552,7 @@ def _line(words: str, looks: Looks, style: str = "") -> Text:
     from rich.text import Text
 
     plain = "".join(letter if letter.isprintable() else "?" for letter in words)
-    if not looks.utf8:
+    if not options.utf8:
         plain = plain.replace("…", "~")
         bare = unicodedata.normalize("NFKD", plain)
         plain = "".join(a if a.isascii() else "?" for a in bare if not unicodedata.combining(a))

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 from relpos.extras import missing_extra
 from relpos.fusion.estimator import NodeStatus
-from relpos.live.picture import Hello, Picture, to_json
-from relpos.live.sinks import QuietSink
+from relpos.live.requests import Request
+from relpos.live.sinks import Sink
+from relpos.live.team_view import Hello, TeamView, to_json
 from relpos.live.tracks import Tracks
-from relpos.live.visitors import Ask
 from relpos.view.access import Access
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ SHOWN_STATUSES = (NodeStatus.OK, NodeStatus.STALE)
 """Only what is believed leaves a track."""
 
 
-class WebView(QuietSink):
+class WebView(Sink):
     """Serves the session's pages at ``access`` from the listening socket ``door``.
 
     RelposError where the libraries for it are not installed.
@@ -80,9 +80,9 @@ class WebView(QuietSink):
         if points:
             self._say(to_json({"type": "points", "points": points}))
 
-    def pictured(self, picture: Picture) -> None:
+    def updated(self, view: TeamView) -> None:
         """Send it on, or keep it until the one before has left."""
-        self._newest = picture.to_json().encode() + b"\n"
+        self._newest = view.to_json().encode() + b"\n"
         self._work()
 
     def trouble(self) -> str | None:
@@ -109,19 +109,19 @@ class WebView(QuietSink):
 
     # -- visitors ---------------------------------------------------------------------------------
 
-    def asks(self) -> Sequence[Ask]:
+    def requests(self) -> Sequence[Request]:
         """What browsers and phones have asked for since the last call."""
         self._work()
         *lines, self._in = self._in.split(b"\n")
         asks = []
         for line in lines:
-            ask = json.loads(line)
-            asks.append(Ask(ask["id"], ask["kind"], ask["unix_s"], ask["body"]))
+            request = json.loads(line)
+            asks.append(Request(request["id"], request["kind"], request["unix_s"], request["body"]))
         return asks
 
-    def answer(self, ask: Ask, reply: dict[str, Any], status: int = 200) -> None:
+    def respond(self, request: Request, reply: dict[str, Any], status: int = 200) -> None:
         """Answer one of them."""
-        self._say(to_json({"type": "answer", "id": ask.id, "reply": reply, "status": status}))
+        self._say(to_json({"type": "answer", "id": request.id, "reply": reply, "status": status}))
 
     def named(self, names: dict[int, str]) -> None:
         """Tell which nodes have been named by a phone."""
@@ -140,7 +140,7 @@ class WebView(QuietSink):
         self._started_s = time.monotonic()
         self._process = multiprocessing.get_context("spawn").Process(
             target=server.run,
-            args=(server.Premises(self._door, theirs, self.access),),
+            args=(server.ServerConfig(self._door, theirs, self.access),),
             name="relpos view",
             daemon=True,
         )

@@ -37,7 +37,7 @@ RAW_REPORTS_PER_S = 5
 MOST_RAW_REPORTS = 3000
 
 
-class Session:
+class NodeDialogue:
     """Talks to ``node`` over an open coordinator ``port``.
 
     ``clock`` is that of :func:`relpos.link.live.observe`. What arrives is taken in while an answer
@@ -160,7 +160,7 @@ class Session:
     # -- who it is, and whose ---------------------------------------------------------------------
 
     def set_node_id(self, node: int) -> None:
-        """Give the node another number; it restarts with it, and the session goes on with it.
+        """Give the node another number; it restarts with it, and the dialogue goes on with it.
 
         DeviceError where that number is heard already, or the node is not heard by it.
         """
@@ -197,9 +197,9 @@ class Session:
             raise DeviceError(f"node {self.node} was not heard restarting: switch it off and on")
 
     def set_key(self, key: bytes) -> bool:
-        """Give the node this key in place of the session's; False where it had it already.
+        """Give the node this key in place of the dialogue's; False where it had it already.
 
-        From then on the session speaks under the new key. DeviceError where the node answers under
+        From then on the dialogue speaks under the new key. DeviceError where the node answers under
         neither.
         """
         old = self.link.key
@@ -340,18 +340,18 @@ class Session:
         return before, after
 
 
-def open_session(port: Line, node: int | None, link: Link | None = None) -> Session:
-    """A session with the node that is asked for, or with the only one that is heard.
+def open_dialogue(port: Line, node: int | None, link: Link | None = None) -> NodeDialogue:
+    """A dialogue with the node that is asked for, or with the only one that is heard.
 
     DeviceError where that node is not heard, or none or several are and none was asked for.
     """
-    session = Session(port, node or 0, link)
+    dialogue = NodeDialogue(port, node or 0, link)
     started_s = time.monotonic()
-    decoder = session.link.decoder
+    decoder = dialogue.link.decoder
     while (waited_s := time.monotonic() - started_s) < SILENT_S:
-        session.listen()
+        dialogue.listen()
         if node is not None and node in decoder.nodes:
-            return session
+            return dialogue
         if node is None and decoder.nodes and waited_s > SILENT_S / 2:
             break
     heard = ", ".join(map(str, sorted(decoder.nodes))) or "nobody"
@@ -362,5 +362,5 @@ def open_session(port: Line, node: int | None, link: Link | None = None) -> Sess
         raise DeviceError(f"node {node} is not heard on this port; heard: {heard}")
     if len(decoder.nodes) != 1:
         raise DeviceError(f"which node? Heard: {heard}. Say it with --node")
-    session.node = next(iter(decoder.nodes))
-    return session
+    dialogue.node = next(iter(decoder.nodes))
+    return dialogue

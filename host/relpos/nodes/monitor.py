@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from relpos.link.decoder import Decoder
 from relpos.measurements import Observation, Status
-from relpos.nodes.health import Figures, Health, assess
+from relpos.nodes.health import Health, HealthInputs, assess
 from relpos.protocol import messages as wire
 
 WINDOW_S = 30.0
@@ -24,7 +24,7 @@ _FLAGS = {
 }
 
 
-class Counter:
+class WindowedCount:
     """A count that wraps at 16 bits and begins anew with a boot: its growth within the window."""
 
     def __init__(self, modulus: int = 65536) -> None:
@@ -51,7 +51,7 @@ class Counter:
 
 
 @dataclass
-class NodeView:
+class NodeMonitor:
     """One node as watched."""
 
     node: int
@@ -62,21 +62,21 @@ class NodeView:
     rssi_dbm: float | None = None
     status: dict[str, float] = field(default_factory=dict)
     _frames: deque[tuple[float, int, int]] = field(default_factory=deque)
-    _counters: dict[str, Counter] = field(default_factory=dict)
+    _counters: dict[str, WindowedCount] = field(default_factory=dict)
 
     def counted(self, name: str, now_s: float) -> int:
         """Growth of one of the status's counts within the window."""
         counter = self._counters.get(name)
         return 0 if counter is None else counter.within(now_s)
 
-    def told(self, now_s: float, name: str, value: float) -> None:
+    def add_status(self, now_s: float, name: str, value: float) -> None:
         """Take in one figure of a status report."""
         self.status[name] = value
         if name in _COUNTS:
-            counter = self._counters.setdefault(name, Counter())
+            counter = self._counters.setdefault(name, WindowedCount())
             counter.update(now_s, self.boot, int(value))
 
-    def link(self, now_s: float, received: int, lost: int) -> None:
+    def add_link(self, now_s: float, received: int, lost: int) -> None:
         """Take in how many frames of it have come and how many were lost, since the beginning."""
         self.received, self.lost = received, lost
         self.heard_s = now_s
@@ -113,7 +113,7 @@ class NodeView:
         value = self.status.get("health")
         return None if value is None else bool(int(value) & flag)
 
-    def figures(self, now_s: float) -> Figures:
+    def health_inputs(self, now_s: float) -> HealthInputs:
         """What :func:`relpos.nodes.health.assess` judges by."""
         status = self.status
         share, tried = self.ranging(now_s)
@@ -122,7 +122,7 @@ class NodeView:
         def whole(name: str) -> int | None:
             return int(status[name]) if name in status else None
 
-        return Figures(
+        return HealthInputs(
             silent_s=now_s - self.heard_s,
             status=bool(status),
             loss=self.loss(now_s),
@@ -142,14 +142,14 @@ class NodeView:
 
     def health(self, now_s: float) -> tuple[Health, list[str]]:
         """Its colour and why."""
-        return assess(self.figures(now_s))
+        return assess(self.health_inputs(now_s))
 
 
-class TeamView:
+class TeamMonitor:
     """All nodes that are heard; feed it what the link yields."""
 
     def __init__(self) -> None:
-        self.nodes: dict[int, NodeView] = {}
+        self.nodes: dict[int, NodeMonitor] = {}
         self.foreign_frames = 0
         """Frames under another key than ours."""
 
@@ -157,59 +157,59 @@ class TeamView:
         """Take in what has just arrived, at ``now_s`` on the clock of the views."""
         self.foreign_frames = decoder.counts["FrameTagError"]
         for node, track in decoder.nodes.items():
-            view = self.nodes.get(node)
-            if view is None:
-                view = self.nodes[node] = NodeView(node, track.boot, now_s)
-            view.boot = track.boot
+            monitor = self.nodes.get(node)
+            if monitor is None:
+                monitor = self.nodes[node] = NodeMonitor(node, track.boot, now_s)
+            monitor.boot = track.boot
             received = track.counts["received"]
-            if received != view.received:
-                view.link(now_s, received, track.counts["lost"])
-            view.rssi_dbm = None if track.rssi_dbm is None else float(track.rssi_dbm)
+            if received != monitor.received:
+                monitor.add_link(now_s, received, track.counts["lost"])
+            monitor.rssi_dbm = None if track.rssi_dbm is None else float(track.rssi_dbm)
         self._statuses(now_s, observations)
 
-    def hear(self, now_s: float, observations: Iterable[Observation]) -> None:
+    def update_without_link(self, now_s: float, observations: Iterable[Observation]) -> None:
         """Like :meth:`update` where only observations were kept: of the link nothing is known."""
         observations = list(observations)
         for observation in observations:
-            view = self.nodes.get(observation.node)
-            if view is None:
-                view = self.nodes[observation.node] = NodeView(observation.node)
-            view.heard_s = now_s
+            monitor = self.nodes.get(observation.node)
+            if monitor is None:
+                monitor = self.nodes[observation.node] = NodeMonitor(observation.node)
+            monitor.heard_s = now_s
         self._statuses(now_s, observations)
 
     def _statuses(self, now_s: float, observations: Iterable[Observation]) -> None:
         for observation in observations:
             if isinstance(observation, Status) and not observation.name.startswith("link_"):
-                self.nodes[observation.node].told(now_s, observation.name, observation.value)
+                self.nodes[observation.node].add_status(now_s, observation.name, observation.value)
 
     def rows(self, now_s: float) -> list[Mapping[str, object]]:
         """One row a node, by id: plain values for tables and JSON."""
         rows: list[Mapping[str, object]] = []
         for node in sorted(self.nodes):
-            view = self.nodes[node]
-            health, reasons = view.health(now_s)
-            share, tried = view.ranging(now_s)
+            monitor = self.nodes[node]
+            health, reasons = monitor.health(now_s)
+            share, tried = monitor.ranging(now_s)
             rows.append(
                 {
                     "node": node,
                     "health": health.name.lower(),
                     "reasons": reasons,
-                    "firmware": view.firmware(),
-                    "uptime_s": view.status.get("uptime_s"),
-                    "reset_cause": view.reset_cause(),
-                    "boots": view.boot,
-                    "battery_v": view.status.get("battery_v"),
-                    "rssi_dbm": view.rssi_dbm,
-                    "loss": view.loss(now_s),
-                    "received": view.received,
-                    "lost": view.lost,
-                    "seen_s": round(now_s - view.heard_s, 3),
+                    "firmware": monitor.firmware(),
+                    "uptime_s": monitor.status.get("uptime_s"),
+                    "reset_cause": monitor.reset_cause(),
+                    "boots": monitor.boot,
+                    "battery_v": monitor.status.get("battery_v"),
+                    "rssi_dbm": monitor.rssi_dbm,
+                    "loss": monitor.loss(now_s),
+                    "received": monitor.received,
+                    "lost": monitor.lost,
+                    "seen_s": round(now_s - monitor.heard_s, 3),
                     "ranging": share,
                     "exchanges": tried,
-                    "key_set": view.flag(wire.Health.KEY_SET),
-                    "range_offset_m": view.status.get("range_offset_m"),
-                    "neighbours": view.status.get("neighbours"),
-                    "team": view.status.get("team"),
+                    "key_set": monitor.flag(wire.Health.KEY_SET),
+                    "range_offset_m": monitor.status.get("range_offset_m"),
+                    "neighbours": monitor.status.get("neighbours"),
+                    "team": monitor.status.get("team"),
                 }
             )
         return rows

@@ -2,15 +2,15 @@
 
 import pytest
 
-from relpos.live.visitors import Ask, Desk
+from relpos.live.requests import Request, RequestHandler
 from relpos.measurements import Event, Heading
 
 STARTED_UNIX_S = 1_700_000_000.0
 
 
 @pytest.fixture
-def desk():
-    return Desk(lambda unix_s: unix_s - STARTED_UNIX_S)
+def handler():
+    return RequestHandler(lambda unix_s: unix_s - STARTED_UNIX_S)
 
 
 def presses(*rows, arrived_s, offset_ms=0.0, sent_ms=None, node=3):
@@ -20,34 +20,34 @@ def presses(*rows, arrived_s, offset_ms=0.0, sent_ms=None, node=3):
         "sent_unix_ms": sent_ms,
         "presses": [{"id": i, "landmark": m, "unix_ms": ms} for i, m, ms in rows],
     }
-    return Ask(1, "presses", STARTED_UNIX_S + arrived_s, body)
+    return Request(1, "presses", STARTED_UNIX_S + arrived_s, body)
 
 
 def unix_ms(session_s):
     return (STARTED_UNIX_S + session_s) * 1000.0
 
 
-def test_a_press_has_the_phones_time_on_the_servers_clock(desk):
+def test_a_press_has_the_phones_time_on_the_servers_clock(handler):
     # The phone's clock is 7 s behind the server's.
-    ask = presses(
+    request = presses(
         ("a", "17", unix_ms(100.0) - 7000.0),
         arrived_s=100.2,
         offset_ms=7000.0,
         sent_ms=unix_ms(100.1) - 7000.0,
     )
-    reply, new = desk.presses(ask)
+    reply, new = handler.presses(request)
     assert reply == {"accepted": ["a"]}
     assert new == [Event(pytest.approx(100.0), 3, "landmark", "17")]
 
 
-def test_a_press_made_offline_keeps_its_own_time(desk):
-    ask = presses(("a", "4", unix_ms(100.0)), arrived_s=460.0, sent_ms=unix_ms(459.9))
-    assert desk.presses(ask)[1] == [Event(pytest.approx(100.0), 3, "landmark", "4")]
+def test_a_press_made_offline_keeps_its_own_time(handler):
+    request = presses(("a", "4", unix_ms(100.0)), arrived_s=460.0, sent_ms=unix_ms(459.9))
+    assert handler.presses(request)[1] == [Event(pytest.approx(100.0), 3, "landmark", "4")]
 
 
-def test_the_same_press_counts_once_however_often_it_is_sent(desk):
-    first = desk.presses(presses(("a", "4", unix_ms(10.0)), arrived_s=10.1))
-    again = desk.presses(
+def test_the_same_press_counts_once_however_often_it_is_sent(handler):
+    first = handler.presses(presses(("a", "4", unix_ms(10.0)), arrived_s=10.1))
+    again = handler.presses(
         presses(("a", "4", unix_ms(10.0)), ("b", "5", unix_ms(11.0)), arrived_s=12.0)
     )
     assert len(first[1]) == 1
@@ -55,24 +55,24 @@ def test_the_same_press_counts_once_however_often_it_is_sent(desk):
     assert [event.value for event in again[1]] == ["5"]
 
 
-def test_where_a_clock_was_set_meanwhile_the_presses_age_counts(desk):
+def test_where_a_clock_was_set_meanwhile_the_presses_age_counts(handler):
     # By the offset it would have been sent an hour ago: but it was sent now, 5 s after the press.
-    ask = presses(
+    request = presses(
         ("a", "4", unix_ms(95.0) - 3.6e6),
         arrived_s=100.0,
         offset_ms=0.0,
         sent_ms=unix_ms(100.0) - 3.6e6,
     )
-    assert desk.presses(ask)[1][0].time_s == pytest.approx(95.0)
+    assert handler.presses(request)[1][0].time_s == pytest.approx(95.0)
 
 
-def test_nothing_happens_after_it_was_told(desk):
-    ask = presses(("a", "4", unix_ms(100.5)), arrived_s=100.0)
-    assert desk.presses(ask)[1][0].time_s == pytest.approx(100.0)
+def test_nothing_happens_after_it_was_sent(handler):
+    request = presses(("a", "4", unix_ms(100.5)), arrived_s=100.0)
+    assert handler.presses(request)[1][0].time_s == pytest.approx(100.0)
 
 
-def test_a_phones_compass_is_a_heading_of_its_node(desk):
+def test_a_phones_compass_is_a_heading_of_its_node(handler):
     rows = [{"unix_ms": unix_ms(50.0), "heading_rad": 1.5, "sigma_rad": None}]
     body = {"node": 2, "clock_offset_ms": 0.0, "sent_unix_ms": None, "headings": rows}
-    _, new = desk.headings(Ask(2, "headings", STARTED_UNIX_S + 50.1, body))
+    _, new = handler.headings(Request(2, "headings", STARTED_UNIX_S + 50.1, body))
     assert new == [Heading(pytest.approx(50.0), 2, 1.5, None, "phone")]

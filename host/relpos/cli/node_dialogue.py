@@ -12,8 +12,8 @@ import typer
 from relpos.cli.keys import make_link
 
 if TYPE_CHECKING:
+    from relpos.link.dialogue import NodeDialogue
     from relpos.link.live import Link
-    from relpos.link.session import Session
 
 Port = Annotated[str, typer.Argument(metavar="PORT", help="The coordinator's port.")]
 Node = Annotated[
@@ -49,15 +49,15 @@ def open_device(port: str, cable: bool) -> Any:
 
 
 @contextmanager
-def dialogue(
+def connect(
     port: str, node: int | None, key_file: Path | None = None, *, cable: bool = False
-) -> Iterator[Session]:
-    """A session with the node, or with the only one that is heard."""
-    from relpos.link.session import open_session
+) -> Iterator[NodeDialogue]:
+    """A dialogue with the node, or with the only one that is heard."""
+    from relpos.link.dialogue import open_dialogue
 
     with link_of(key_file) as link:
         device = open_device(port, cable)
         try:
-            yield open_session(device, node, link)
+            yield open_dialogue(device, node, link)
         finally:
             device.close()

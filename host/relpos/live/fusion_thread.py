@@ -1,8 +1,8 @@
-"""The estimator in a thread of its own, so that nobody waits for it.
+"""The estimator in a thread of its own, so that receiving never waits for it.
 
-Observations go in by ``give`` in the order of the session's inputs; estimates come out by
-``take``, each with the count of observations that had been worked off. Nothing is dropped: what
-the estimator is behind waits.
+``submit`` takes observations in the order of the session's inputs; ``poll`` returns estimates, each
+with the number of observations processed by then. Nothing is dropped: observations that the
+estimator has not reached wait in a queue.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from relpos.measurements import (
 GATHER_S = 3.0
 """A node reports its motion every second; with two losses in a row it has still been heard."""
 
-Make = Callable[[Sequence[Prior]], Estimator]
+MakeEstimator = Callable[[Sequence[Prior]], Estimator]
 
 
 @dataclass(frozen=True, slots=True)
-class Fused:
-    """An estimate, and how many observations had been given to the estimator by then."""
+class FusedEstimate:
+    """An estimate, and how many observations the estimator had processed by then."""
 
     estimate: Estimate
-    given: int
+    processed: int
 
 
 def common_start(observations: Sequence[Observation]) -> list[Prior]:
-    """One place and heading for everybody who is heard within :data:`GATHER_S` of the first."""
+    """Return priors at one pose for all nodes that are heard in the first :data:`GATHER_S`."""
     nodes: set[int] = set()
     for o in observations:
         if isinstance(o, Motion | Range):
@@ -53,57 +53,59 @@ def common_start(observations: Sequence[Observation]) -> list[Prior]:
     return [Prior(node, 0.0, 0.0, 0.0) for node in sorted(nodes)]
 
 
-class Fusing:
-    """``make(priors)`` makes the estimator, in the thread.
+class FusionThread:
+    """Runs the estimator that ``make(priors)`` returns, in its own thread.
 
-    With ``common`` everybody who is heard in the first :data:`GATHER_S` starts from one place and
-    the priors name them; what came meanwhile is worked off then.
+    With ``common`` all nodes heard in the first :data:`GATHER_S` start at one common pose;
+    observations wait until these nodes are known.
     """
 
-    def __init__(self, make: Make, priors: Sequence[Prior] = (), *, common: bool = False) -> None:
+    def __init__(
+        self, make: MakeEstimator, priors: Sequence[Prior] = (), *, common: bool = False
+    ) -> None:
         self._make = make
         self._priors = tuple(priors)
         self._gathering: list[Observation] | None = [] if common else None
-        self._given = 0
+        self._processed = 0
         self._inbox: queue.SimpleQueue[Sequence[Observation] | None] = queue.SimpleQueue()
-        self._outbox: deque[Fused] = deque()
+        self._outbox: deque[FusedEstimate] = deque()
         self._estimator: Estimator | None = None
         self.failure: Exception | None = None
-        """What ended it before its time."""
+        """The exception that ended the thread early."""
         self.newest_s = -math.inf
-        """Time of the newest motion or range that was worked off."""
+        """Time of the newest processed motion or range."""
         self._abandon = threading.Event()
         self._thread = threading.Thread(target=self._work, name="fusion", daemon=True)
         self._thread.start()
 
-    def give(self, observations: Sequence[Observation]) -> None:
-        """Hand over; never waits."""
+    def submit(self, observations: Sequence[Observation]) -> None:
+        """Queue observations; never waits."""
         if observations and self.failure is None:
             self._inbox.put(observations)
 
-    def take(self) -> list[Fused]:
-        """What has come out since the last call."""
+    def poll(self) -> list[FusedEstimate]:
+        """Return the estimates since the last call."""
         fused = []
         while self._outbox:
             fused.append(self._outbox.popleft())
         return fused
 
     def finish(self) -> None:
-        """Let it work off the rest and end, without waiting: see :meth:`join`."""
+        """Let the thread process the rest and end, without waiting: see :meth:`join`."""
         self._inbox.put(None)
 
     def join(self, timeout_s: float | None = None) -> bool:
-        """Wait until it has ended; whether it has."""
+        """Wait until the thread has ended; return whether it has."""
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
     def abandon(self) -> None:
-        """Let it end at the next observation, whatever still waits."""
+        """End the thread at the next observation and drop the rest."""
         self._abandon.set()
         self._inbox.put(None)
 
     def counters(self) -> Mapping[str, int]:
-        """The estimator's; ask once it has ended."""
+        """Return the estimator's counters; call once the thread has ended."""
         return {} if self._estimator is None else self._estimator.counters()
 
     def _work(self) -> None:
@@ -130,26 +132,26 @@ class Fusing:
                 self._rescue(self._estimator)
 
     def _rescue(self, estimator: Estimator) -> None:
-        """Take what still waits in an estimator that has failed on its input."""
+        """Collect what still waits in an estimator that has failed on its input."""
         try:
             self._emit(estimator.finish())
         except RelposError:
             return
 
-    def _gather(self, came: list[Observation], observation: Observation) -> None:
-        came.append(observation)
-        if observation.time_s - came[0].time_s > GATHER_S:
-            self._begin(came)
+    def _gather(self, gathered: list[Observation], observation: Observation) -> None:
+        gathered.append(observation)
+        if observation.time_s - gathered[0].time_s > GATHER_S:
+            self._begin(gathered)
 
-    def _begin(self, came: Sequence[Observation]) -> None:
+    def _begin(self, gathered: Sequence[Observation]) -> None:
         self._gathering = None
-        self._estimator = self._make(common_start(came))
-        for observation in came:
+        self._estimator = self._make(common_start(gathered))
+        for observation in gathered:
             self._process(observation)
 
     def _process(self, observation: Observation) -> None:
         assert self._estimator is not None
-        self._given += 1
+        self._processed += 1
         if not isinstance(observation, Motion | Range | Height | Heading):
             return
         measurement: Measurement = observation
@@ -159,4 +161,4 @@ class Fusing:
 
     def _emit(self, estimates: Sequence[Estimate]) -> None:
         for estimate in estimates:
-            self._outbox.append(Fused(estimate, self._given))
+            self._outbox.append(FusedEstimate(estimate, self._processed))

@@ -1,4 +1,4 @@
-"""The picture of the team at one moment, as people and programs are shown it.
+"""The view of the team at one moment, as people and programs are shown it.
 
 Frames and units as everywhere: metres, radians counter-clockwise from the common frame's x axis,
 seconds of the session's arrival clock; ``unix_s`` for who needs a date. None where unknown, which
@@ -127,7 +127,7 @@ class Ghosts:
 
 
 @dataclass(frozen=True)
-class Picture:
+class TeamView:
     """Everybody at ``time_s``.
 
     ``arrived_unix_s`` is when the newest packet in it arrived; ``fused_s`` the time of the newest
@@ -150,12 +150,12 @@ class Picture:
     alternatives: tuple[Ghosts, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, numbers rounded to what a picture needs."""
+        """Plain values, numbers rounded to what a view needs."""
         document: dict[str, Any] = json.loads(self.to_json())
         return document
 
     def to_json(self) -> str:
-        """The message ``picture`` of the page's protocol."""
+        """The message ``view`` of the page's protocol."""
         document = {
             "type": "picture",
             "seq": self.seq,
@@ -177,7 +177,7 @@ class Picture:
                 for ghosts in self.alternatives
             ],
         }
-        # Twenty people make 190 pairs, of which few have changed since the last picture.
+        # Twenty people make 190 pairs, of which few have changed since the last view.
         pairs = ",".join(map(_pair_json, self.pairs))
         return f'{to_json(document)[:-1]},"pairs":[{pairs}]}}'
 
