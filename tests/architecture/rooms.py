@@ -7,6 +7,8 @@ from functools import cache
 from pathlib import Path
 
 import grimp
+from scipy.sparse import lil_array
+from scipy.sparse.csgraph import connected_components
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "host" / "relpos"
@@ -32,23 +34,24 @@ def file_of(module: str) -> Path:
 
 
 def room_of(module: str) -> str:
-    """The room a module stands in: its folder; of ``fusion``, the inner folder or the ground.
+    """The room that a module stands in: its folder, or the file itself.
 
-    Files directly in ``relpos`` are rooms of their own. ``fusion/__init__.py`` and ``switching.py``
-    stand above the rooms of ``fusion``: they join them.
+    The files in ``fusion`` and its ``models`` are the common ground of the estimators; what joins
+    them (``fusion/__init__.py``, ``switching.py``) is a room above them.
     """
     parts = module.split(".")[1:]
     if not parts:
         return "relpos"
     if parts[0] != "fusion":
         return parts[0]
-    if parts == ["fusion"] or parts[1] in ABOVE:
-        return "fusion (registry)"
-    folder = (PACKAGE / "fusion" / parts[1]).is_dir()
-    return f"fusion.{parts[1]}" if folder else "fusion (ground)"
+    if parts == ["fusion"] or parts[1] in JOINS:
+        return "fusion: registry"
+    if (PACKAGE / "fusion" / parts[1]).is_dir() and parts[1] != "models":
+        return f"fusion.{parts[1]}"
+    return "fusion: common ground"
 
 
-ABOVE = ("switching",)
+JOINS = ("switching",)
 
 
 def imports_between_rooms() -> Edges:
@@ -69,35 +72,18 @@ def allowed() -> Edges:
 
 def circles() -> list[list[str]]:
     """Groups of modules that import each other around a circle."""
-    edges = {
-        m: [i for i in graph().find_modules_directly_imported_by(m) if i in set(modules())]
-        for m in modules()
-    }
-    return [group for group in _strongly_connected(edges) if len(group) > 1]
+    ours = set(modules())
+    return circles_of({m: graph().find_modules_directly_imported_by(m) & ours for m in ours})
 
 
-def _strongly_connected(edges: dict[str, list[str]]) -> list[list[str]]:
-    """Kosaraju's algorithm."""
-
-    def visit(start: str, of: dict[str, list[str]], seen: set[str]) -> list[str]:
-        order, stack = [], [(start, iter(of[start]))]
-        seen.add(start)
-        while stack:
-            node, rest = stack[-1]
-            following = next((n for n in rest if n not in seen), None)
-            if following is None:
-                stack.pop()
-                order.append(node)
-            else:
-                seen.add(following)
-                stack.append((following, iter(of[following])))
-        return order
-
-    seen: set[str] = set()
-    order = [n for start in edges if start not in seen for n in visit(start, edges, seen)]
-    back: dict[str, list[str]] = {m: [] for m in edges}
-    for module, imported in edges.items():
-        for i in imported:
-            back[i].append(module)
-    seen = set()
-    return [sorted(visit(m, back, seen)) for m in reversed(order) if m not in seen]
+def circles_of(edges: Edges) -> list[list[str]]:
+    """Groups of nodes of a directed graph each of which can be reached from the others."""
+    names = sorted(edges)
+    index = {name: k for k, name in enumerate(names)}
+    matrix = lil_array((len(names), len(names)), dtype=bool)
+    for name, others in edges.items():
+        for other in others:
+            matrix[index[name], index[other]] = True
+    count, labels = connected_components(matrix, connection="strong")
+    groups = [[n for n in names if labels[index[n]] == k] for k in range(count)]
+    return [group for group in groups if len(group) > 1]
