@@ -106,13 +106,13 @@ $(PYTHON): | system-demo
 
 $(RUN): pyproject.toml | $(PYTHON)
 	$(call title,Installing relpos and its libraries)
-	$(PIP) --editable '.[view,recording]'
+	$(PIP) --editable '.[view,recording,report]'
 	$(compile-kernels)
 	@touch $@
 
 $(DEVELOP): pyproject.toml | $(PYTHON)
 	$(call title,Installing the tools for tests and firmware)
-	$(PIP) --editable '.[view,recording,exchange,docs,test,lint,firmware]'
+	$(PIP) --editable '.[all,docs,test,lint,firmware]'
 	$(compile-kernels)
 	@touch $@ $(RUN)
 
@@ -124,7 +124,7 @@ $(FUZZ): $(DEVELOP)
 $(PEERS): pyproject.toml | system-demo
 	$(call title,Installing relpos and its peers in $(BENCH_VENV))
 	[ -x $(BENCH_VENV)/bin/python ] || "$$(tools/find_python.sh)" -m venv $(BENCH_VENV)
-	$(BENCH_VENV)/bin/python -m pip --disable-pip-version-check install --progress-bar on --editable '.[bench]'
+	$(BENCH_VENV)/bin/python -m pip --disable-pip-version-check install --progress-bar on --editable '.[bench,report]'
 	@touch $@
 
 system-demo:

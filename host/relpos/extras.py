@@ -16,6 +16,7 @@ from relpos.errors import RelposError
 PURPOSES = {
     "view": "the live page (`relpos fuse PORT --view`)",
     "recording": "recordings as MCAP and Foxglove (`--record`, `--foxglove`)",
+    "report": "pictures and reports (`relpos report`, `relpos figures`)",
     "exchange": "maps, GPX and Cursor-on-Target (`relpos convert`, `--cot`)",
 }
 """What the extras for users bring; the others are for who changes relpos."""
