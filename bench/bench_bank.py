@@ -79,19 +79,24 @@ def interface_us(
     """Microseconds of each epoch (E,), NaN as above."""
     estimator = fusion.make("bank", run.priors, {"hypotheses": hypotheses, **settings}, 0)
     assert isinstance(estimator, SwitchingEstimator)
-    assert isinstance(estimator.estimator, Bank)
-    core = estimator.estimator.core
-    marks, counts, end_s = [time.thread_time()], [core.count], EPOCH_S
+    marks, counts, end_s = [time.thread_time()], [count_of(estimator)], EPOCH_S
     for measurement in run.measurements:
         if measurement.time_s > end_s:
             end_s += EPOCH_S
             marks.append(time.thread_time())
-            counts.append(core.count)
+            counts.append(count_of(estimator))
         for estimate in estimator.process(measurement):
             if read:
                 assert estimate.nodes
     ours = np.array(counts) == hypotheses
     return np.where(ours[1:] & ours[:-1], 1e6 * np.diff(marks), np.nan)
+
+
+def count_of(estimator: SwitchingEstimator) -> int:
+    """How many hypotheses the bank has now."""
+    core = estimator.estimator.core
+    assert isinstance(core, Bank)
+    return core.core.count
 
 
 def figure(rounds: list[np.ndarray]) -> str:

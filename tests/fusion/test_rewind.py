@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,15 +19,16 @@ from relpos.simulation.paper import simulate_paper
 
 @dataclass
 class Log:
-    """An estimator's state of the simplest kind: what it was given, and some dice."""
+    """A core of the simplest kind: it logs its steps and draws random numbers."""
 
     steps: list[Step] = field(default_factory=list)
     dice: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
     thrown: list[float] = field(default_factory=list)
-    taken: int = 0
+    calls: list[Step] = field(default_factory=list)
+    """Every step ever processed, the repeated ones included."""
 
-    def take(self, step: Step) -> Estimate | None:
-        self.taken += 1
+    def update(self, step: Step, timeline: Timeline) -> Estimate | None:
+        self.calls.append(step)
         self.steps.append(step)
         self.thrown.append(self.dice.random())
         return Estimate(step.time_s, (), ()) if isinstance(step, Epoch) else None
@@ -34,17 +36,25 @@ class Log:
     def cost_s(self, step: Step) -> float:
         return 1e-5
 
-    def snapshot(self) -> tuple[list[Step], dict[str, object], list[float]]:
-        return self.steps[:], dict(self.dice.bit_generator.state), self.thrown[:]
+    @property
+    def shared(self) -> tuple[object, ...]:
+        return (self.calls,)
 
-    def restore(self, snapshot: tuple[list[Step], dict[str, object], list[float]]) -> None:
-        self.steps, self.thrown = snapshot[0][:], snapshot[2][:]
-        self.dice.bit_generator.state = snapshot[1]
+    def check_run(self, counters: Mapping[str, int]) -> None:
+        pass
+
+    def counters(self) -> Counter[str]:
+        return Counter()
 
 
-def rewinder() -> tuple[Log, Rewinder]:
-    log = Log()
-    return log, Rewinder(log, Timeline([1, 2, 3], reorder_s=0.3, max_lag_s=1.5))
+def rewinder() -> Rewinder:
+    return Rewinder(Log(), Timeline([1, 2, 3], reorder_s=0.3, max_lag_s=1.5))
+
+
+def log_of(rewinder: Rewinder) -> Log:
+    """The core that is current now."""
+    assert isinstance(rewinder.core, Log)
+    return rewinder.core
 
 
 def feed(rewinder: Rewinder, measurements: Iterable[Measurement]) -> list[Estimate]:
@@ -81,28 +91,28 @@ def delayed(
 def test_after_the_replay_all_is_as_if_nothing_had_been_late(share: float, seed: int) -> None:
     straight, mixed = rewinder(), rewinder()
     ordered = team()
-    feed(straight[1], ordered)
+    feed(straight, ordered)
     shuffled = delayed(ordered, share, seed)
     assert shuffled != ordered
-    feed(mixed[1], shuffled)
-    assert mixed[0].steps == straight[0].steps
-    assert mixed[0].thrown == straight[0].thrown
-    assert mixed[1].counters()["rewinds"] > 0
-    assert straight[1].counters()["rewinds"] == 0
-    assert not any("late" in name for name in mixed[1].counters())
+    feed(mixed, shuffled)
+    assert log_of(mixed).steps == log_of(straight).steps
+    assert log_of(mixed).thrown == log_of(straight).thrown
+    assert mixed.counters()["rewinds"] > 0
+    assert straight.counters()["rewinds"] == 0
+    assert not any("late" in name for name in mixed.counters())
 
 
 def test_the_steps_are_those_of_a_timeline_that_waits_long_enough() -> None:
-    log, quick = rewinder()
+    quick = rewinder()
     ordered = team(slow=[2])
     feed(quick, delayed(ordered, 0.3, 7, most_s=1.5))
     patient = Timeline([1, 2, 3], reorder_s=0.3, max_lag_s=5.0)
     steps = [s for m in ordered for s in patient.push(m)] + patient.finish()
-    assert log.steps == steps
+    assert log_of(quick).steps == steps
 
 
 def test_estimates_do_not_wait_for_what_is_late_and_come_only_once() -> None:
-    _, quick = rewinder()
+    quick = rewinder()
     lags, times = [], []
     newest = 0.0
     for m in delayed(team(), 0.3, 8):
@@ -118,7 +128,7 @@ def test_estimates_do_not_wait_for_what_is_late_and_come_only_once() -> None:
 
 def test_a_node_that_falls_silent_holds_nobody_up_and_its_way_is_not_lost() -> None:
     ordered = [m for m in team() if not (isinstance(m, Motion) and m.node == 3 and m.time_s > 10)]
-    log, quick = rewinder()
+    quick = rewinder()
     lags = []
     for m in ordered:
         lags += [m.time_s - e.time_s for e in quick.process(m)]
@@ -126,7 +136,7 @@ def test_a_node_that_falls_silent_holds_nobody_up_and_its_way_is_not_lost() -> N
     # It comes back after 20 s with one long displacement.
     back = Motion(39.9, 3, 7.0, 0.0, 0.0)
     feed(quick, [back])
-    way = [s for s in log.steps if isinstance(s, Advance) and s.node == 3]
+    way = [s for s in log_of(quick).steps if isinstance(s, Advance) and s.node == 3]
     assert sum(s.fraction for s in way) == pytest.approx(9 + 1)
     # What lies within the window is spread over its time, the rest handed out at its beginning.
     last = [s for s in way if s.time_s > 11.0]
@@ -136,24 +146,26 @@ def test_a_node_that_falls_silent_holds_nobody_up_and_its_way_is_not_lost() -> N
 
 
 def test_ranges_later_than_the_window_are_dropped_and_counted() -> None:
-    log, quick = rewinder()
+    quick = rewinder()
     feed(quick, [*team(), Range(20.2, 1, 2, 99.0)])
-    assert not any(isinstance(s, Ranging) and s.ranges[0].range_m == 99.0 for s in log.steps)
+    assert not any(
+        isinstance(s, Ranging) and s.ranges[0].range_m == 99.0 for s in log_of(quick).steps
+    )
     assert quick.counters()["ranges_late"] == 1
 
 
 def test_a_late_height_is_put_in_its_place() -> None:
-    log, quick = rewinder()
+    quick = rewinder()
     ordered = team()
     at = next(k for k, m in enumerate(ordered) if m.time_s > 24.0)
     feed(quick, [*ordered[:at], Height(20.2, 1, 7.5), *ordered[at:]])
-    sensed = [s for s in log.steps if isinstance(s, Sensed)]
+    sensed = [s for s in log_of(quick).steps if isinstance(s, Sensed)]
     assert [s.time_s for s in sensed] == sorted(s.time_s for s in sensed)
     assert any(s.measurement == Height(20.2, 1, 7.5) for s in sensed)
 
 
 def test_refused_ranges_are_counted_once_whatever_is_replayed() -> None:
-    _, quick = rewinder()
+    quick = rewinder()
     ordered = team()
     broken = [Range(10.2, 1, 2, 0.0), Range(20.2, 2, 2, 1.0)]
     feed(quick, delayed(sorted([*ordered, *broken], key=lambda m: m.time_s), 0.5, 9))
@@ -167,31 +179,31 @@ def test_a_burst_of_late_reports_costs_one_replay() -> None:
     assert len(late) == 9
     rest = [m for m in ordered if m not in late]
     at = next(k for k, m in enumerate(rest) if m.time_s > 24.0)
-    log, quick = rewinder()
+    quick = rewinder()
     feed(quick, [*rest[:at], *late, *rest[at:]])
     assert quick.counters()["rewinds"] == 1
     # At most the window, a report and a second between copies.
-    assert 0 < quick.counters()["rewound_steps"] < 8.0 * len(log.steps) / 40
+    assert 0 < quick.counters()["rewound_steps"] < 8.0 * len(log_of(quick).steps) / 40
 
 
 def test_a_call_works_off_a_bounded_share_of_a_replay_and_the_next_ones_the_rest() -> None:
     ordered = team()
     at = next(k for k, m in enumerate(ordered) if m.time_s > 24.0)
     late = [*ordered[:at], Height(20.2, 1, 7.5), *ordered[at:]]
-    log, quick = rewinder()
+    quick = rewinder()
     quick.most_s = 1e-4
     most, estimates = 0, []
     for m in late:
-        before = log.taken
+        before = len(log_of(quick).calls)
         estimates += quick.process(m)
-        most = max(most, log.taken - before)
+        most = max(most, len(log_of(quick).calls) - before)
     estimates += quick.finish()
     assert most <= 11
     assert quick.counters()["rewound_steps"] > 3 * most
     straight = rewinder()
-    whole = feed(straight[1], sorted(late, key=lambda m: m.time_s))
-    assert log.steps == straight[0].steps
-    assert log.thrown == straight[0].thrown
+    whole = feed(straight, sorted(late, key=lambda m: m.time_s))
+    assert log_of(quick).steps == log_of(straight).steps
+    assert log_of(quick).thrown == log_of(straight).thrown
     assert [e.time_s for e in estimates] == [e.time_s for e in whole]
 
 

@@ -104,9 +104,6 @@ class Initialiser(Protocol):
     def cost_s(self) -> float:
         """Return about how many seconds of a processor ``find`` takes."""
 
-    def snapshot(self) -> Initialiser:
-        """Return an independent copy."""
-
     @property
     def mixture(self) -> PoseMixture | None:
         """Hypotheses about the sought nodes that are tied to a known one; None without any."""

@@ -26,10 +26,11 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import Any, Protocol
+from typing import Protocol
 
 from relpos.fusion.estimator import Estimate
 from relpos.fusion.timeline import Epoch, Step, Timeline, refusal
@@ -40,22 +41,27 @@ QUIET_S = 30.0
 
 
 class Core(Protocol):
-    """An estimator behind a timeline, whose state can be copied and taken up again.
+    """The filter behind a timeline: steps in, estimates out.
 
-    Nothing but ``take`` may change what ``snapshot`` copies.
+    A :class:`Rewinder` copies it with ``copy.deepcopy``, its random generators and counters
+    included, and may continue from the copy. So a core owns all that it changes.
     """
 
-    def take(self, step: Step) -> Estimate | None:
-        """Work off one step; an estimate at the end of an epoch."""
+    @property
+    def shared(self) -> tuple[object, ...]:
+        """Objects that the core never changes, so that its copies refer to the same ones."""
+
+    def update(self, step: Step, timeline: Timeline) -> Estimate | None:
+        """Process one step that ``timeline`` has released; an estimate at the end of an epoch."""
 
     def cost_s(self, step: Step) -> float:
-        """About how many seconds of a processor ``take`` needs for a step."""
+        """Return about how many seconds of a processor ``update`` needs for a step."""
 
-    def snapshot(self) -> Any:
-        """Copy everything that ``take`` changes, random generators and counters included."""
+    def check_run(self, counters: Mapping[str, int]) -> None:
+        """Raise RelposError if the whole run was unfit; ``counters`` are the timeline's."""
 
-    def restore(self, snapshot: Any) -> None:
-        """Be as at the time of the snapshot, which may be restored again later."""
+    def counters(self) -> Counter[str]:
+        """Name -> how often: everything rejected, clamped, reset or resampled."""
 
 
 @dataclass(slots=True)
@@ -64,13 +70,13 @@ class _Copy:
 
     frontier_s: float
     timeline: Timeline
-    core: Any
+    core: Core
     pushed: int
 
 
 @dataclass(slots=True)
 class Rewinder:
-    """Feeds ``core`` from ``timeline``: measurements in, estimates out, each time only once.
+    """The estimator around ``core`` and ``timeline``; it yields one estimate for each epoch.
 
     ``window_s`` is how late a measurement may be, ``spacing_s`` how far apart copies are where
     things come late now and then (eight times as far where nothing has for half a minute, because
@@ -130,16 +136,19 @@ class Rewinder:
         return []
 
     def finish(self) -> list[Estimate]:
-        """Work off everything that still waits."""
+        """Process everything that still waits; RelposError if the run was unfit."""
         steps = self.timeline.push_all((), final=True)
         self._note_late()
         if self._copies and self._back_to_s < math.inf:
-            return list(self._rewind(final=True))
-        return list(self._work_off(chain(self._rest or (), steps), math.inf))
+            estimates = list(self._rewind(final=True))
+        else:
+            estimates = list(self._work_off(chain(self._rest or (), steps), math.inf))
+        self.core.check_run(self.timeline.counters + self._own)
+        return estimates
 
     def counters(self) -> Counter[str]:
-        """What was refused, late, and gone back for; the core's own counters are its own."""
-        return self.timeline.counters + self._own
+        """Count everything refused, late or repeated, and what the core counts."""
+        return self.timeline.counters + self._own + self.core.counters()
 
     def _note_late(self) -> None:
         """Tell whether, and to what time, to go back."""
@@ -160,7 +169,7 @@ class Rewinder:
         self._rewound_s = self._newest_s
         self._own["rewinds"] += 1
         self.timeline = copy.timeline.snapshot()
-        self.core.restore(copy.core)
+        self.core = self._copy_of(copy.core)
         since = self._history[copy.pushed - self._forgotten :]
         steps = self.timeline.push_all(since, final=final)
         self.timeline.take_late()  # what the copy cannot help either
@@ -168,14 +177,14 @@ class Rewinder:
         yield from self._work_off(steps, math.inf if final else self.most_s)
 
     def _work_off(self, steps: Iterator[Step], most_s: float | None = None) -> Iterator[Estimate]:
-        take, cost_s = self.core.take, self.core.cost_s
+        core, timeline = self.core, self.timeline
         left_s = self.most_s if most_s is None else most_s
         self._rest = steps
         for step in steps:
-            left_s -= cost_s(step)
+            left_s -= core.cost_s(step)
             if self._replaying:
                 self._own["rewound_steps"] += 1
-            estimate = take(step)
+            estimate = core.update(step, timeline)
             if estimate is not None and estimate.time_s > self._emitted_s:
                 self._emitted_s = estimate.time_s
                 yield estimate
@@ -199,7 +208,12 @@ class Rewinder:
     def _copy(self) -> None:
         pushed = self._forgotten + len(self._history)
         self._copies.append(
-            _Copy(self.timeline.frontier_s, self.timeline.snapshot(), self.core.snapshot(), pushed)
+            _Copy(
+                self.timeline.frontier_s,
+                self.timeline.snapshot(),
+                self._copy_of(self.core),
+                pushed,
+            )
         )
         # What is late by the window may belong to a chord that began a report earlier.
         horizon_s = self._newest_s - self.window_s - self.timeline.max_lag_s
@@ -209,3 +223,7 @@ class Rewinder:
         if old > 0:
             del self._history[:old]
             self._forgotten += old
+
+    @staticmethod
+    def _copy_of(core: Core) -> Core:
+        return deepcopy(core, {id(one): one for one in core.shared})

@@ -19,12 +19,13 @@ from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
-from relpos.fusion.bank.estimator import Bank
+from relpos.fusion.bank import estimator as bank
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
-from relpos.fusion.large_teams.estimator import LargeTeam, unlocated
+from relpos.fusion.large_teams import estimator as large_teams
 from relpos.fusion.models.ranging import Mounting
+from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Displacement
 from relpos.measurements import Measurement, Motion, Prior, Range
 
@@ -68,19 +69,19 @@ class SwitchingEstimator:
         self._nucleus: frozenset[int] = frozenset()
         self._first_range_s = math.inf
         self._found_epochs = 0
-        self.estimator: Bank | LargeTeam = (
-            LargeTeam(priors, self._settings, seed, self._mountings)
+        self.estimator = (
+            large_teams.make(priors, self._settings, seed, self._mountings)
             if len(self._met) > LARGE_TEAM
             else self._bank(priors)
         )
 
-    def _bank(self, priors: Sequence[Prior]) -> Bank:
+    def _bank(self, priors: Sequence[Prior]) -> Rewinder:
         initialiser = HypothesisInitialiser(seed=self._seed)
-        return Bank(priors, initialiser, self._settings, self._seed, self._mountings)
+        return bank.make(priors, initialiser, self._settings, self._seed, self._mountings)
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         """Take one measurement; return the estimates it completes."""
-        if isinstance(self.estimator, LargeTeam):
+        if isinstance(self.estimator.core, large_teams.LargeTeam):
             return self.estimator.process(measurement)
         recent, time_s = self._recent, measurement.time_s
         recent.append(measurement)
@@ -139,7 +140,7 @@ class SwitchingEstimator:
         return inside and (not isinstance(measurement, Range) or measurement.peer in self._nucleus)
 
     def _with_others(self, estimate: Estimate) -> Estimate:
-        others = [unlocated(node) for node in sorted(self._met - self._nucleus)]
+        others = [large_teams.unlocated(node) for node in sorted(self._met - self._nucleus)]
         nodes = sorted([*estimate.nodes, *others], key=lambda n: n.node)
         return replace(estimate, nodes=tuple(nodes))
 
@@ -167,7 +168,7 @@ class SwitchingEstimator:
                 for n in last.nodes
                 if n.status not in (NodeStatus.UNLOCATED, NodeStatus.AMBIGUOUS)
             ]  # fmt: skip
-        self.estimator = LargeTeam(
+        self.estimator = large_teams.make(
             priors,
             self._settings,
             self._seed,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
@@ -335,7 +336,7 @@ def test_a_copy_of_a_search_goes_on_as_the_search_does() -> None:
 
     for m in walk.measurements:
         if m.time_s == 15.0 and len(copies) == 1:
-            copies.append(search.snapshot(search.counters))
+            copies.append(deepcopy(search))
         feed(m)
     first, second = (one.mixture for one in copies)
     assert first.weights.tolist() == second.weights.tolist()

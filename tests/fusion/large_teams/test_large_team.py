@@ -153,8 +153,8 @@ def test_who_steps_unevenly_is_found_out(crowd: Crowd) -> None:
     for m in crowd.measurements():
         made.process(m)
     assert isinstance(made, growing.SwitchingEstimator)
-    assert isinstance(made.estimator, LargeTeam)
-    level = made.estimator._levels.level
+    assert isinstance(made.estimator.core, LargeTeam)
+    level = made.estimator.core._levels.level
     # The crowd's six levels of step noise are 5 10 20 10 15 10 % in turn, 9 % is the base's.
     steady, uneven = np.median(level[0::6, noise.ALONG]), np.median(level[2::6, noise.ALONG])
     assert uneven > 2.0 * steady

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from copy import deepcopy
 from itertools import groupby, permutations
 
 import numpy as np
@@ -155,10 +156,10 @@ def test_silences_that_follow_each_other_count_less_than_independent_ones() -> N
     assert free.weight > 0.8
 
 
-def test_what_was_learned_after_a_snapshot_does_not_change_it() -> None:
+def test_what_was_learned_after_a_copy_does_not_change_it() -> None:
     learner = Detection()
     given = instants(learner.rounds, [(float(t), ALL) for t in range(30)], always)
-    kept = learner.snapshot()
+    kept = deepcopy(learner)
     before = kept.curve.copy()
     for one in given:
         learn(learner, one)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -35,19 +35,6 @@ Indices = npt.NDArray[np.int64]
 
 _TWO_PI = 2.0 * math.pi
 _UNTOLD: Floats = np.empty((0, 3))
-
-
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """Everything a core needs to go back: array copies and the generator's state."""
-
-    lines: tuple[Floats, ...]
-    arrays: tuple[Floats, ...]
-    random: Mapping[str, object]
-    numbers: tuple[float, ...]
-    biases: Mapping[tuple[int, int], int]
-    counters: Mapping[str, int]
-    unplaced: Mapping[int, tuple[float, float]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +89,6 @@ class BankCore:
     The order of work in one epoch: ``advance`` (once or more), ``update`` (all ranges of one
     instant), ``log_weight +=`` whatever else is known (silence, ...), then ``settle`` (jumps,
     resampling). ``moments`` gives the mixture's mean and full covariance at any time.
-    ``snapshot`` and ``restore`` bring everything back exactly, randomness included, so that what
-    came late can be put in its place and the rest be repeated.
     """
 
     def __init__(self, settings: BankSettings, seed: int = 0) -> None:
@@ -1034,46 +1019,6 @@ class BankCore:
         """
         self._normalise()
         return self._moments(self._weight, poses_alone)
-
-    def snapshot(self) -> Snapshot:
-        """Copy everything."""
-        return Snapshot(
-            tuple(lanes.copy_lines(a) for a in (self._x, self._p, self._log_weight, self._sens)),
-            tuple(a.copy() for a in (
-                self.levels.mean, self.levels.covariance, self.draw, self.has_constants,
-                self.has_bias, self.surprise, self.since_turn_s, self.outlier_counts, self.doubtful,
-                self.wrong_start, self.arm, self.watch.sums, self.watch.base, self.steady,
-            )),
-            self.rng.bit_generator.state,
-            (self.nodes, self.since_slip, self.unambiguous, self.ceiling, *self.slipped),
-            dict(self.biases),
-            dict(self.counters),
-            dict(self.unplaced),
-        )  # fmt: skip
-
-    def restore(self, snapshot: Snapshot) -> None:
-        """Go back to a snapshot of this core; it can be restored again."""
-        self._x, self._p, self._log_weight, self._sens = (
-            lanes.copy_lines(a) for a in snapshot.lines
-        )
-        (
-            self.levels.mean, self.levels.covariance, self.draw, self.has_constants,
-            self.has_bias, self.surprise, self.since_turn_s, self.outlier_counts, self.doubtful,
-            self.wrong_start, self.arm, self.watch.sums, self.watch.base, self.steady,
-        ) = (a.copy() for a in snapshot.arrays)  # fmt: skip
-        self.count = len(self.doubtful)
-        self._some_biased = bool(self.has_bias.any())
-        self._set_arms(self.arm)
-        self.rng.bit_generator.state = dict(snapshot.random)
-        self.nodes = self.levels.nodes = int(snapshot.numbers[0])
-        self.slipped = {int(row) for row in snapshot.numbers[4:]}
-        self.since_slip = int(snapshot.numbers[1])
-        self.unambiguous = int(snapshot.numbers[2])
-        self.ceiling = int(snapshot.numbers[3])
-        self.biases = dict(snapshot.biases)
-        self.counters = Counter(snapshot.counters)
-        self.unplaced = dict(snapshot.unplaced)
-        self._spread_levels()
 
 
 _POSE_PLACE = 3

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from relpos.errors import RelposError
 from relpos.fusion.bank import kernels as bank_kernels
-from relpos.fusion.bank.core import BankCore, Snapshot
+from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.joint import PER_NODE, Of
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.estimator import (
@@ -51,7 +51,7 @@ from relpos.fusion.models.ranging import Mounting, Repetition
 from relpos.fusion.modes import believe, pictures
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
-from relpos.measurements import Heading, Height, Measurement, Prior, Range
+from relpos.measurements import Heading, Height, Prior, Range
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -88,38 +88,10 @@ class _Known(Presence):
     drifted_s: float = -math.inf
     """Until then it was tracked by ranges alone."""
 
-    def copy(self) -> _Known:
-        return _Known(
-            self.height_m, self.sigma_height_m, self.news_s, self.silent_epochs, self.worn_m,
-            self.drifted_s,
-        )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class _State:
-    """What :class:`Bank` is at one time, to go back to."""
-
-    core: Snapshot
-    detection: Detection
-    repetition: Repetition
-    habit: Habit
-    stillness: Stillness
-    row: dict[int, int]
-    known: dict[int, _Known]
-    pending: list[Advance]
-    own: Counter[str]
-    moved: bool
-    ranges_used: int
-    epoch_s: float
-    initialiser: Initialiser
-    standing: dict[int, complex]
-    facing: dict[int, complex]
-    north: North
-
 
 @dataclass(slots=True)
 class Bank:
-    """The bank as an :class:`~relpos.fusion.estimator.Estimator`.
+    """The filter; :func:`make` returns the :class:`~relpos.fusion.estimator.Estimator` around it.
 
     ``initialiser`` seeks the nodes whose initial pose is unknown; once found they join the core.
     """
@@ -135,7 +107,6 @@ class Bank:
     habit: Habit = field(default_factory=Habit)
     stillness: Stillness = field(default_factory=Stillness)
     north: North = field(default_factory=North)
-    _feed: Rewinder = field(init=False)
     _row: dict[int, int] = field(default_factory=dict)
     _known: dict[int, _Known] = field(default_factory=dict)
     _standing: dict[int, complex] = field(default_factory=dict)
@@ -152,11 +123,6 @@ class Bank:
     def __post_init__(self) -> None:
         s = self.settings
         self.core = BankCore(s, self.seed)
-        timeline = Timeline(
-            [p.node for p in self.priors],
-            reorder_s=s.reorder_s, max_lag_s=s.max_lag_s, sparing=True,
-        )  # fmt: skip
-        self._feed = Rewinder(self, timeline, s.late_s)
         for p in sorted(self.priors, key=lambda p: p.node):
             if p.node in self._known:
                 raise RelposError(f"node {p.node} has two initial poses")
@@ -170,28 +136,22 @@ class Bank:
                     p.node, (p.x_m, p.y_m, p.heading_rad), (p.sigma_m, p.sigma_m, p.sigma_rad)
                 )
 
-    # -- the estimator's interface -------------------------------------------------------------
+    @property
+    def shared(self) -> tuple[object, ...]:
+        """Objects that copies of the core refer to (:class:`~relpos.fusion.rewind.Core`)."""
+        return self.priors, self.settings, self.mounting, self.detection.teach
 
-    def process(self, measurement: Measurement) -> list[Estimate]:
-        """Take one measurement; return the estimates it completes."""
-        return self._feed.process(measurement)
-
-    def finish(self) -> list[Estimate]:
-        """Work off what waits; RelposError where the run cannot give relative positions."""
-        estimates = self._feed.finish()
+    def check_run(self, counters: Mapping[str, int]) -> None:
+        """Raise RelposError if the run cannot give relative positions."""
         refuse_unmoved(self._moved or bool(self._pending))
-        refuse_unranged(self._ranges_used, self._feed.counters())
-        return estimates
+        refuse_unranged(self._ranges_used, counters)
 
-    def counters(self) -> Mapping[str, int]:
-        """Count everything dropped, late, reset or resampled."""
-        own = self._own + self.core.counters + self.initialiser.counters
-        return dict(self._feed.counters() + own)
+    def counters(self) -> Counter[str]:
+        """Count everything doubted, clamped, reset or resampled."""
+        return self._own + self.core.counters + self.initialiser.counters
 
-    # -- steps ---------------------------------------------------------------------------------
-
-    def take(self, step: Step) -> Estimate | None:
-        """Work off one step of the timeline (:class:`~relpos.fusion.rewind.Core`)."""
+    def update(self, step: Step, timeline: Timeline) -> Estimate | None:
+        """Process one step of the timeline; an estimate at the end of an epoch."""
         if isinstance(step, Advance):
             if step.node in self._row:
                 # Most of it waits until somebody needs to know, or the epoch ends.
@@ -209,7 +169,7 @@ class Bank:
             self.initialiser.advance(step, faulty=odd)
         elif isinstance(step, Ranging):
             self._advance()
-            self._range(step)
+            self._range(step, timeline)
         elif isinstance(step, Sensed):
             self._meet(step.measurement.node)
             self._sense(step)
@@ -220,39 +180,12 @@ class Bank:
         return None
 
     def cost_s(self, step: Step) -> float:
-        """About how many seconds of a processor ``take`` needs for a step."""
+        """Return about how many seconds of a processor ``update`` needs for a step."""
         if isinstance(step, Ranging):
             return 3e-4 + 3e-10 * self.core.entries
         if isinstance(step, Epoch):
             return 1e-3 + 1e-9 * self.core.entries + self.initialiser.cost_s()
         return 3e-5
-
-    def snapshot(self) -> _State:
-        """Copy everything that ``take`` changes."""
-        return _State(
-            self.core.snapshot(), self.detection.snapshot(), self.repetition.snapshot(),
-            self.habit.snapshot(), self.stillness.snapshot(), self._row.copy(),
-            {node: known.copy() for node, known in self._known.items()}, self._pending[:],
-            self._own.copy(), self._moved, self._ranges_used, self._epoch_s,
-            self.initialiser.snapshot(), self._standing.copy(), self._facing.copy(),
-            self.north.snapshot(),
-        )  # fmt: skip
-
-    def restore(self, snapshot: _State) -> None:
-        """Be as at the time of the snapshot."""
-        self.core.restore(snapshot.core)
-        self.detection = snapshot.detection.snapshot()
-        self.repetition = snapshot.repetition.snapshot()
-        self.habit = snapshot.habit.snapshot()
-        self.stillness = snapshot.stillness.snapshot()
-        self._row = snapshot.row.copy()
-        self._known = {node: known.copy() for node, known in snapshot.known.items()}
-        self._pending, self._own = snapshot.pending[:], snapshot.own.copy()
-        self._moved, self._ranges_used = snapshot.moved, snapshot.ranges_used
-        self._epoch_s = snapshot.epoch_s
-        self.initialiser = snapshot.initialiser.snapshot()
-        self._standing, self._facing = snapshot.standing.copy(), snapshot.facing.copy()
-        self.north = snapshot.north.snapshot()
 
     def _meet(self, node: int) -> _Known:
         known = self._known.get(node)
@@ -317,7 +250,7 @@ class Bank:
         """Make some of the displacements ``rows`` (M,), ``moves`` (M, 4)."""
         self.core.move(rows[some], moves[some], None if told is None else told[some])
 
-    def _range(self, step: Ranging) -> None:
+    def _range(self, step: Ranging, timeline: Timeline) -> None:
         located, time_s = self._row, step.time_s
         everybody = {n for r in step.ranges for n in (r.node, r.peer)}
         for node in everybody:
@@ -332,13 +265,13 @@ class Bank:
             self._ranges_used += len(step.ranges)
             ranges = [r for r in step.ranges if r.node in located and r.peer in located]
         tried = ranges
-        ranges = self._heard_moving(time_s, ranges)
+        ranges = self._heard_moving(time_s, ranges, timeline)
         measured = np.array([r.range_m for r in ranges])
         pairs = [(r.node, r.peer) for r in ranges]
         first, second, dz = self._pairs(pairs)
         if self.core.unplaced and ranges:
             self.core.sight(first, second, measured)
-        rounds = self._hear(time_s, tried)
+        rounds = self._hear(time_s, tried, timeline)
         if ranges:
             known = self._known
             variance = np.array(
@@ -351,14 +284,16 @@ class Bank:
             self.core.hearing(*who, heard, surely, self.detection)
         self.core.settle()
 
-    def _heard_moving(self, time_s: float, ranges: Sequence[Range]) -> Sequence[Range]:
+    def _heard_moving(
+        self, time_s: float, ranges: Sequence[Range], timeline: Timeline
+    ) -> Sequence[Range]:
         """Leave out ranges of nodes whose motion is missing; let those drift who miss it long.
 
         A node without motion may be anywhere that it can have walked to. For a while its motion
         may still come (then the ranges are worked in after all, in their place); after
         ``SILENT_S`` it is tracked by ranges alone, as somebody who wanders.
         """
-        reported = self._feed.timeline.reported_s
+        reported = timeline.reported_s
         silent = {
             node
             for node in {n for r in ranges for n in (r.node, r.peer)}
@@ -368,7 +303,7 @@ class Bank:
             return ranges
         for node in sorted(silent):
             known = self._known[node]
-            reported_s = self._feed.timeline.reported_s(node)
+            reported_s = reported(node)
             if time_s - reported_s > SILENT_S:
                 since_s = max(known.drifted_s, reported_s)
                 self.core.lose(self._row[node], WANDER_M * math.sqrt(time_s - since_s), 0.0)
@@ -452,7 +387,7 @@ class Bank:
         return first, second, dz
 
     def _hear(
-        self, time_s: float, ranges: Sequence[Range]
+        self, time_s: float, ranges: Sequence[Range], timeline: Timeline
     ) -> list[tuple[tuple[Indices, Indices, Floats], Bools, Floats]]:
         """Learn who is heard how far.
 
@@ -460,11 +395,10 @@ class Bank:
         tried.
         """
         rounds = []
-        timeline = self._feed.timeline
         for done in self.detection.rounds.take(time_s, ranges, timeline.reported_s):
             pairs = done.heard + done.silent
             for late in timeline.catch_up({n for p in pairs for n in p}, time_s):
-                self.take(late)
+                self.update(late, timeline)
             self._advance()
             who = self._pairs(pairs)
             heard = np.arange(len(pairs)) < len(done.heard)
@@ -655,6 +589,23 @@ class Bank:
             poses[:, sought + i] = mean[at : at + 3]
             spread[:, sought + i] = covariance[at : at + 2, at : at + 2]
         return pictures(time_s, nodes, mixture.weights, poses, spread)
+
+
+def make(
+    priors: Sequence[Prior],
+    initialiser: Initialiser,
+    settings: BankSettings,
+    seed: int,
+    mounting: Mapping[int, Mounting],
+) -> Rewinder:
+    """Return the bank as an estimator that accepts late measurements."""
+    timeline = Timeline(
+        [p.node for p in priors],
+        reorder_s=settings.reorder_s,
+        max_lag_s=settings.max_lag_s,
+        sparing=True,
+    )
+    return Rewinder(Bank(priors, initialiser, settings, seed, mounting), timeline, settings.late_s)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,6 @@ over when the hypotheses agree.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -73,8 +72,6 @@ class HypothesisInitialiser:
     resolved: set[int] = field(default_factory=set)
     _standing: set[int] = field(default_factory=set)
     _quiet_since_s: float = -math.inf
-    _shared: bool = False
-    """Whether ``search``, in which nobody is, may be a snapshot's, too."""
 
     def __post_init__(self) -> None:
         self.search = Search(self.settings, self.seed, self.counters)
@@ -86,14 +83,12 @@ class HypothesisInitialiser:
         self, node: int, mean: Sequence[float] = (0.0, 0.0, 0.0), sigma: Sequence[float] = UNKNOWN
     ) -> None:
         """Take a node up, with what is known of its pose (``sigma`` inf: nothing)."""
-        self._part()
         self._wanderers[node] = _Wanderer(np.array(mean, float), np.array(sigma, float))
         if math.isfinite(sigma[0]):
             self._framed = True
 
     def advance(self, step: Advance, *, faulty: bool = False) -> None:
         """Move a sought node; of a ``faulty`` displacement only the turn is used."""
-        self._part()
         wanderer = self._wanderers.get(step.node)
         free = len(self.search.nodes) < MOST_SOUGHT
         if wanderer is not None and free and math.isfinite(wanderer.sigma[0]):
@@ -115,7 +110,6 @@ class HypothesisInitialiser:
         heights: Mapping[int, float] | None = None,
     ) -> None:
         """Take all ranges of an instant; ``located`` as for :meth:`Search.ranging`."""
-        self._part()
         self._framed |= bool(located)
         if not self._framed and ranges:
             self._choose_frame(time_s, ranges)
@@ -206,25 +200,6 @@ class HypothesisInitialiser:
             whole.scales[active],
             leader(whole.weights, whole.poses[:, active], spread),
         )
-
-    def snapshot(self) -> HypothesisInitialiser:
-        """Copy everything that changes."""
-        other = copy.copy(self)
-        other.counters, other._agreed = self.counters.copy(), self._agreed.copy()
-        other.resolved, other._standing = self.resolved.copy(), self._standing.copy()
-        other._wanderers = copy.deepcopy(self._wanderers) if self._wanderers else {}
-        if self.search.nodes:
-            other.search = self.search.snapshot(other.counters)
-        else:
-            # Nothing in it changes before somebody is met: until then the two share it.
-            self._shared = other._shared = True
-        return other
-
-    def _part(self) -> None:
-        """Take a search of one's own before it changes."""
-        if self._shared:
-            self.search = self.search.snapshot(self.counters)
-            self._shared = False
 
 
 WIDTH = 0.7

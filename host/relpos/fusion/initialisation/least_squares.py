@@ -65,14 +65,6 @@ class Joining:
     counters: Counter[str] = field(default_factory=Counter)
     _heard: dict[int, _Heard] = field(default_factory=dict)
 
-    def copy(self) -> Joining:
-        """Give a copy that goes on by itself."""
-        heard = {
-            node: _Heard(one.rows.copy(), one.fresh, one.waited)
-            for node, one in self._heard.items()
-        }
-        return Joining(self.counters.copy(), heard)
-
     def move(self, node: int, dx_m: float, dy_m: float, dtheta_rad: float) -> None:
         """The user walks: all that was is seen from its new pose."""
         heard = self._heard.get(node)

@@ -14,7 +14,6 @@ data open later is found later, and a mirror image is only dropped because its e
 
 from __future__ import annotations
 
-import copy
 import math
 from bisect import bisect_left
 from collections import Counter
@@ -103,13 +102,6 @@ class _Track:
     solved: Floats = field(default_factory=lambda: np.zeros(3))
     """The pose at the last fit."""
 
-    def snapshot(self) -> _Track:
-        """Copy it."""
-        other = copy.copy(self)
-        other.pose, other.solved = self.pose.copy(), self.solved.copy()
-        other.knots, other.samples = self.knots.copy(), self.samples.copy()
-        return other
-
 
 @dataclass(slots=True)
 class _Event:
@@ -123,12 +115,6 @@ class _Event:
     values: list[float]
     height_m2: float
     extra_m2: float
-
-    def snapshot(self) -> _Event:
-        """Copy it."""
-        other = copy.copy(self)
-        other.places, other.values = self.places.copy(), self.values.copy()
-        return other
 
     @property
     def range_m(self) -> float:
@@ -387,23 +373,6 @@ class Search:
         for event in {id(e): e for e in [*self._events, *self._newest.values()]}.values():
             event.time = index[event.time]
         self._priors = {n: (index[t], m, p) for n, (t, m, p) in self._priors.items()}
-
-    def snapshot(self, counters: Counter[str]) -> Search:
-        """Copy everything that changes; the copy counts in ``counters``."""
-        other = copy.copy(self)
-        other.counters = counters
-        other._rng = copy.deepcopy(self._rng)
-        other.nodes = self.nodes.copy()
-        other._tracks = {n: t.snapshot() for n, t in self._tracks.items()}
-        other._priors = self._priors.copy()
-        other._times = self._times.copy()
-        twins = {id(e): e.snapshot() for e in self._events}
-        other._events = list(twins.values())
-        other._newest = {pair: twins.get(id(e)) or e.snapshot() for pair, e in self._newest.items()}
-        other._new = self._new.copy()
-        for name in ("_pictures", "_weights", "_covariances", "_costs", "_volume"):
-            setattr(other, name, getattr(self, name).copy())
-        return other
 
     # -- what is concluded ---------------------------------------------------------------------
 

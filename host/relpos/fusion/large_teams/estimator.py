@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -42,7 +42,7 @@ from relpos.fusion.models.motion import told_sigmas
 from relpos.fusion.models.ranging import Mounting
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
-from relpos.measurements import Height, Measurement, Prior, Range
+from relpos.measurements import Height, Prior, Range
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -72,15 +72,13 @@ _TWO_PI = 2.0 * math.pi
 
 @dataclass(slots=True)
 class LargeTeam:
-    """An :class:`~relpos.fusion.estimator.Estimator` for dozens to thousands of users."""
+    """The filter for dozens to thousands of users; :func:`make` returns the estimator."""
 
     priors: Sequence[Prior] = ()
     settings: BankSettings = field(default_factory=BankSettings)
     seed: int = 0
     mountings: Mapping[int, Mounting] = field(default_factory=dict)
-    start_s: float = 0.0
     filter: NeighbourhoodFilter = field(init=False)
-    _feed: Rewinder = field(init=False)
     _nodes: list[int] = field(default_factory=list)
     _row: dict[int, int] = field(default_factory=dict)
     _known: dict[int, Presence] = field(default_factory=dict)
@@ -99,13 +97,6 @@ class LargeTeam:
         s = self.settings
         model = RangeModel(SIGMA_R_M, OUTLIERS, OUTLIER_M, s.outliers_short)
         self.filter = NeighbourhoodFilter(math.inf, model)
-        timeline = Timeline(
-            [p.node for p in self.priors],
-            start_s=self.start_s,
-            reorder_s=s.reorder_s,
-            max_lag_s=s.max_lag_s,
-        )
-        self._feed = Rewinder(self, timeline, s.late_s)
         known: list[Prior] = []
         for p in sorted(self.priors, key=lambda p: p.node):
             if p.node in self._known:
@@ -117,28 +108,13 @@ class LargeTeam:
         sigmas = np.array([(p.sigma_m, p.sigma_m, p.sigma_rad) for p in known]).reshape(-1, 3)
         self._add([p.node for p in known], poses, sigmas[:, :, None] ** 2 * np.eye(3))
 
-    # -- the estimator's interface -------------------------------------------------------------
+    @property
+    def shared(self) -> tuple[object, ...]:
+        """Objects that copies of the core refer to (:class:`~relpos.fusion.rewind.Core`)."""
+        return self.priors, self.settings, self.mountings
 
-    def process(self, measurement: Measurement) -> list[Estimate]:
-        """Take one measurement; return the estimates it completes."""
-        return self._feed.process(measurement)
-
-    def finish(self) -> list[Estimate]:
-        """Work off what waits; RelposError where the run cannot give relative positions."""
-        estimates = self._feed.finish()
-        refuse_unmoved(self._moved)
-        refuse_unranged(self._ranges_used, self._feed.counters())
-        return estimates
-
-    def counters(self) -> Mapping[str, int]:
-        """Count everything dropped, late, doubted or joined."""
-        total = self._feed.counters() + self._own + self.filter.counters
-        return dict(total + self._joining.counters)
-
-    # -- state that can be taken up again --------------------------------------------------------
-
-    def take(self, step: Step) -> Estimate | None:
-        """Work off one step; an estimate at the end of an epoch."""
+    def update(self, step: Step, timeline: Timeline) -> Estimate | None:
+        """Process one step; an estimate at the end of an epoch."""
         match step:
             case Advance():
                 self._moved = True
@@ -157,26 +133,17 @@ class LargeTeam:
         return None
 
     def cost_s(self, step: Step) -> float:
-        """About how many seconds of a processor ``take`` needs for a step."""
+        """Return about how many seconds of a processor ``update`` needs for a step."""
         return 2e-5 if isinstance(step, Advance) else 5e-5 * len(self._nodes)
 
-    def snapshot(self) -> tuple[object, ...]:
-        """Copy everything that ``take`` changes."""
-        return (
-            self.filter.copy(), self._nodes[:], dict(self._row),
-            {node: replace(known) for node, known in self._known.items()},
-            self._pending[:], self._joining.copy(), self._own.copy(), self._odd.copy(),
-            self._levels.copy(), self._sigma_worth, self._reach_m, self._moved, self._ranges_used,
-            self._epoch_s,
-        )  # fmt: skip
+    def check_run(self, counters: Mapping[str, int]) -> None:
+        """Raise RelposError if the run cannot give relative positions."""
+        refuse_unmoved(self._moved)
+        refuse_unranged(self._ranges_used, counters)
 
-    def restore(self, snapshot: tuple[object, ...]) -> None:
-        """Be as at the time of the snapshot, which may be restored again later."""
-        for name, value in zip(_STATE, snapshot, strict=True):
-            setattr(self, name, value)
-        # What was just taken up will change: it has to be a copy of its own.
-        for name, value in zip(_STATE, self.snapshot(), strict=True):
-            setattr(self, name, value)
+    def counters(self) -> Counter[str]:
+        """Count everything perturbed or joined."""
+        return self._own + self.filter.counters + self._joining.counters
 
     # -- users ---------------------------------------------------------------------------------
 
@@ -380,6 +347,23 @@ class LargeTeam:
         return tuple(PairEstimate(*row) for row in rows)
 
 
+def make(
+    priors: Sequence[Prior],
+    settings: BankSettings,
+    seed: int,
+    mountings: Mapping[int, Mounting],
+    start_s: float = 0.0,
+) -> Rewinder:
+    """Return the estimator for a large team; motion counts from ``start_s``."""
+    timeline = Timeline(
+        [p.node for p in priors],
+        start_s=start_s,
+        reorder_s=settings.reorder_s,
+        max_lag_s=settings.max_lag_s,
+    )
+    return Rewinder(LargeTeam(priors, settings, seed, mountings), timeline, settings.late_s)
+
+
 ACROSS = 0.1
 """Variance of a displacement across its direction relative to that along it."""
 
@@ -388,11 +372,6 @@ REACH_FADE = 0.999
 
 LEAST_REACH_M = 5.0
 """Who is nearer than this is listed, however short the ranges are."""
-
-_STATE = (
-    "filter", "_nodes", "_row", "_known", "_pending", "_joining", "_own", "_odd", "_levels",
-    "_sigma_worth", "_reach_m", "_moved", "_ranges_used", "_epoch_s",
-)  # fmt: skip
 
 
 def unlocated(node: int, height_m: float = 0.0, sigma_height_m: float = 0.0) -> NodeEstimate:

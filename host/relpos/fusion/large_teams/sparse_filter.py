@@ -30,7 +30,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -177,24 +177,6 @@ class NeighbourhoodFilter:
     _layout: _Layout = field(init=False)
     _covariance: Floats = field(default_factory=lambda: np.empty(0))
     _cell: Indices = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-
-    def copy(self) -> NeighbourhoodFilter:
-        """Give a copy that goes on by itself."""
-        other = replace(
-            self,
-            model=replace(self.model),
-            pose=self.pose.copy(),
-            antenna_m=self.antenna_m.copy(),
-            counters=self.counters.copy(),
-            _lever=self._lever.copy(),
-            _noise=self._noise.copy(),
-            _variance=self._variance.copy(),
-            _covariance=self._covariance.copy(),
-            _cell=self._cell.copy(),
-        )
-        if self.pose.size:
-            other._layout = self._layout  # replaced as a whole, never changed
-        return other
 
     # -- nodes ---------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ force follows it, for the team by the mean over all and for each user by what it
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -53,13 +53,6 @@ class TeamLevels:
     _count: Floats = field(default_factory=lambda: np.empty((0, LEVELS)))
     _turned: Floats = field(default_factory=lambda: np.empty(0))
     _last: Floats = field(default_factory=lambda: np.empty((0, 2)))
-
-    def copy(self) -> TeamLevels:
-        """Give a copy that goes on by itself."""
-        return replace(
-            self, level=self.level.copy(), _team=self._team.copy(), _own=self._own.copy(),
-            _count=self._count.copy(), _turned=self._turned.copy(), _last=self._last.copy(),
-        )  # fmt: skip
 
     def add(self, poses: Floats) -> None:
         """Take in users at poses (E, 3) with the team's levels."""

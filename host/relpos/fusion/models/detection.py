@@ -31,7 +31,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cache
 from itertools import chain
 from typing import Protocol
@@ -162,10 +162,6 @@ class Rounds:
             rounds.append(self._close(time_s, reported_s))
         return rounds
 
-    def snapshot(self) -> Rounds:
-        """Give a copy that goes on by itself."""
-        return Rounds(self.heard_ever.copy(), self._turns, self._open.copy(), self._directed.copy())
-
     def _close(self, time_s: float, reported_s: Callable[[int], float]) -> Round:
         heard = self._open
         self.heard_ever |= heard
@@ -286,17 +282,6 @@ class Detection:
         """Whether an edge has been seen at all, so that ``range_m`` means something."""
         return self.range_sigma_m < 0.3 * self.range_m
 
-    def snapshot(self) -> Detection:
-        """Give a copy that later learning leaves alone."""
-        # A refit makes a new curve and leaves the old one alone.
-        copy = object.__new__(Detection)
-        for name in _FIELDS:
-            setattr(copy, name, getattr(self, name))
-        copy.rounds, copy._slot = self.rounds.snapshot(), self._slot.copy()
-        copy._counts, copy._sums = self._counts.copy(), self._sums.copy()
-        copy._working, copy._surprise = self._working.copy(), self._surprise.copy()
-        return copy
-
     def probability(self, distance_m: Floats, sigma_m: Floats | float = 0.0) -> Floats:
         """P(heard) over distances (K,), averaged over their error."""
         return expected(self.curve, distance_m, sigma_m)
@@ -371,9 +356,6 @@ class Detection:
         # Later evidence changes little: the cost of refitting stays a small share of the whole.
         seen = float(self._sums[2])
         self._refit_at = min(seen * 1.15, seen + 1000.0) + 10.0
-
-
-_FIELDS = tuple(one.name for one in fields(Detection))
 
 
 def expected(curve: Floats, distance_m: Floats, sigma_m: Floats | float = 0.0) -> Floats:

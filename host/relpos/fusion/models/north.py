@@ -12,7 +12,7 @@ variance is raised accordingly.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from relpos.fusion.estimator import ANY_ANGLE_RAD, MagneticNorth
 
@@ -31,10 +31,6 @@ class North:
     angle_rad: float = 0.0
     sigma_rad: float = ANY_ANGLE_RAD
     _told_s: dict[int, float] = field(default_factory=dict)
-
-    def snapshot(self) -> North:
-        """Give a copy that goes on by itself."""
-        return replace(self, _told_s=self._told_s.copy())
 
     def known(self) -> MagneticNorth | None:
         """Where north lies; None while nothing has been told."""

@@ -194,10 +194,6 @@ class Habit:
         self.usual_m_s[node] = usual + max(HABIT, 1.0 / seen) * (min(speed, most) - usual)
         return speed > most
 
-    def snapshot(self) -> Habit:
-        """Give a copy that goes on by itself."""
-        return Habit(self.usual_m_s.copy(), self._steps.copy())
-
 
 STILL_M_S, STILL_RAD_S = 0.05, 0.05
 """Whoever reports to be faster does not stand."""
@@ -257,10 +253,6 @@ class Stillness:
         return net <= STILL_RATIO * way and abs(sum(t for _, _, t in recent)) <= (
             STILL_RATIO * turned
         )
-
-    def snapshot(self) -> Stillness:
-        """Give a copy that goes on by itself."""
-        return Stillness(self._open.copy(), self._recent.copy())
 
 
 @dataclass(frozen=True, slots=True)

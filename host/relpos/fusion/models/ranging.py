@@ -118,7 +118,3 @@ class Repetition:
             rho = STILL * math.exp((before - now) / DECORRELATION_M)
             worth.append((1.0 - rho) / (1.0 + rho))
         return np.array(worth)
-
-    def snapshot(self) -> Repetition:
-        """Give a copy that goes on by itself."""
-        return Repetition(self._way_m.copy(), self._last_m.copy())
