@@ -19,12 +19,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from relpos import sources
 from relpos.errors import RelposError
 from relpos.evaluation.result import Result, pass_through, read_result, result_of
 from relpos.evaluation.scoring import Evaluation
 from relpos.fusion.estimator import Estimate, Estimator
 from relpos.measurements import Prior
-from relpos.runs import InitialPose, Run, load_run, save_run
+from relpos.runs import InitialPose, Run, save_run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,7 +41,7 @@ def load(path: Path | str) -> Run:
 
     DataError names the file, line and column of the first fault.
     """
-    return load_run(path)
+    return sources.load(path)
 
 
 def save(run: Run, path: Path | str) -> None:

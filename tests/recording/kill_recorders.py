@@ -23,7 +23,7 @@ from pathlib import Path
 
 from relpos.recording.about import About
 from relpos.recording.recorder import Recorder
-from relpos.recording.topics import all_topics
+from relpos.recording.schemas import all_topics
 
 PAGE = struct.Struct("<Qd")
 EVERY_S = 0.02

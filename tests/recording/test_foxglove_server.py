@@ -15,7 +15,7 @@ from relpos.cli.live import with_default_address
 from relpos.errors import DataError, DeviceError
 from relpos.live.team_view import Level, Notice, TeamView
 from relpos.recording import serve_foxglove
-from relpos.recording.topics import all_topics
+from relpos.recording.schemas import all_topics
 
 PATIENCE_S = 200.0
 

@@ -18,9 +18,10 @@ from relpos.measurements import Event, Heading, Motion, Range, Truth
 from relpos.protocol.messages import DEFAULT_KEY
 from relpos.recording import is_recording, make_recorder, open_recording, save_recording
 from relpos.recording.replay import Replay
-from relpos.recording.topics import all_topics
+from relpos.recording.schemas import all_topics
 from relpos.runs import Description, NodeInfo, Run, load_run, save_run
 from relpos.runs.landmarks import Landmark
+from relpos.sources import load
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +167,7 @@ def test_the_session_is_told_of_and_the_key_is_not(recorded):
 
 
 def test_a_recording_is_a_run_like_the_directory_of_the_same_session(recorded, tmp_path):
-    run = load_run(recorded)
+    run = load(recorded)
     save_run(run, tmp_path / "run")
     directory = load_run(tmp_path / "run")
     assert is_recording(recorded)
@@ -187,7 +188,7 @@ def test_a_run_with_truth_becomes_a_recording_and_a_run_again(tmp_path):
         truth=(Truth(0.0, 1, 0.0, 0.0, 0.5), Truth(1.0, 1, 0.5, 0.0)),
     )
     assert save_recording(tmp_path / "a.mcap", run, started_unix_ns=START_NS) == []
-    again = load_run(tmp_path / "a.mcap")
+    again = load(tmp_path / "a.mcap")
     assert dataclasses.replace(again, directory=None) == run
     assert open_recording(tmp_path / "a.mcap").started_unix_ns == START_NS
     with pytest.raises(DataError, match="exists already"):
@@ -208,7 +209,7 @@ def test_what_is_no_recording_is_one_clear_line(tmp_path):
         open_recording(path)
     path.unlink()
     with pytest.raises(DataError, match="no such run directory"):
-        load_run(path)
+        load(path)
 
 
 def test_without_the_key_the_decoded_measurements_are_taken_and_that_is_said(tmp_path):

@@ -20,7 +20,7 @@ from relpos.protocol.messages import DEFAULT_KEY
 from relpos.recording import open_recording
 from relpos.recording.replay import Replay
 from relpos.recording.topics import Serial
-from relpos.runs import load_run
+from relpos.sources import load
 
 PATIENCE_S = 200.0
 
@@ -120,7 +120,7 @@ def test_the_command_line_overrules_the_recorded_settings(recorded, tmp_path):
 
 def test_what_was_received_as_a_run_and_the_recording_are_the_same_run(recorded):
     path, live = recorded
-    ours, theirs = load_run(path), load_run(live / "received")
+    ours, theirs = load(path), load(live / "received")
     assert ours.measurements == theirs.measurements
     assert ours.statuses == theirs.statuses
     assert ours.steps == theirs.steps

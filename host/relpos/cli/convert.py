@@ -83,10 +83,10 @@ def convert(
     run's truth. docs/exchange.md tells what each format holds.
     """
     from relpos.cli import output
+    from relpos.exchange import convert as formats
+    from relpos.exchange.content import Kind
+    from relpos.exchange.times import unix_of
     from relpos.geodesy import parse_pin
-    from relpos.runs.formats import convert as formats
-    from relpos.runs.formats.content import Kind
-    from relpos.runs.formats.times import unix_of
 
     wanted = formats.Format(to)
     placed = tuple(parse_pin(pin) for pin in pins or ())

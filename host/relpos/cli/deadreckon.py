@@ -42,14 +42,15 @@ def deadreckon(
     from dataclasses import replace
 
     from relpos.emulator.replay import LEAST_RATE_HZ, replay_imu
-    from relpos.runs import Run, load_run, save_run
+    from relpos.runs import Run, save_run
+    from relpos.sources import load
 
-    recording = load_run(run)
+    recording = load(run)
     if not recording.load_imu():
         raise DataError(f"{run}: no inertial data in this run (imu.csv)")
     walks = []
     for path in calibrate_from or ():
-        walk = load_run(path)
+        walk = load(path)
         if walk.description.true_distance_m is None:
             raise DataError(f"{path}: run.toml gives no true_distance_m to calibrate with")
         if not walk.load_imu():

@@ -20,9 +20,10 @@ def evaluate(
     """Print the metrics of an estimate: for the team, per pair and over time."""
     from relpos.cli import output
     from relpos.evaluation import scoring
-    from relpos.runs import load_run, read_estimates
+    from relpos.runs import read_estimates
+    from relpos.sources import load
 
-    recording = load_run(run)
+    recording = load(run)
     scoring.need_truth(recording)
     bound = scoring.bound_of(recording)
     score = scoring.evaluate(

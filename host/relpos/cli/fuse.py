@@ -13,11 +13,9 @@ import typer
 from typer.core import TyperCommand
 
 from relpos.cli import live, output
-from relpos.cli import source as sources
 from relpos.cli.estimators import BANK, DEADRECKONING, EstimatorName
 from relpos.cli.keys import KeyFile, team_key
 from relpos.errors import DataError, DeviceError, RelposError
-from relpos.recording import is_recording
 
 if TYPE_CHECKING:
     from relpos.evaluation.bounds import Bound
@@ -129,6 +127,8 @@ def fuse(
     records it, a port that vanishes is waited for, and a recording is played at the pace at which
     it was made (--speed).
     """
+    from relpos import sources
+
     chosen = output.parse_settings(settings or [])
     sinks: list[live.MakeSink] = []
     if terminal and json:
@@ -154,7 +154,7 @@ def fuse(
     job = Job(source, estimator, chosen, seed, out or _default_out(source), smooth=smooth)
     if sources.is_port(source):
         _fuse_port(job, initial, options, key_file, teach=teach, as_json=json)
-    elif is_recording(source):
+    elif sources.is_recording(source):
         sources_of = {name: context.get_parameter_source(name) for name in context.params}
         given = {name for name, how in sources_of.items() if how and how.name != "DEFAULT"}
         _fuse_mcap(job, given, initial, options, key_file, as_json=json, report=report)
@@ -201,6 +201,8 @@ class Job:
 
 def _default_out(source: str) -> Path:
     """Of a port a new folder each time: a mission must not overwrite the one before."""
+    from relpos import sources
+
     name = _base_name(source)
     if sources.is_port(source):
         name += f"-{datetime.now().astimezone():%Y-%m-%d-%H%M%S}"
@@ -212,18 +214,18 @@ def _base_name(source: str) -> str:
 
 
 def _fuse_run(job: Job, initial: Initial | None, *, as_json: bool, report: bool) -> None:
-    from relpos.runs import load_run
+    from relpos import sources
 
-    run = load_run(sources.check_recording(job.source))
+    run = sources.load(job.source)
     fuse_recording(job, run, _priors(run, initial), as_json=as_json, report=report)
 
 
 def _replay_run(job: Job, initial: Initial | None, options: live.Options, *, as_json: bool) -> None:
     """Show a run directory as if it happened now."""
+    from relpos import sources
     from relpos.live.inputs import PacedInput, run_items
-    from relpos.runs import load_run
 
-    run = load_run(sources.check_recording(job.source))
+    run = sources.load(job.source)
     _check_usable(run, job.estimator)
     priors = _priors(run, initial)
     job.prepare(priors)

@@ -45,9 +45,9 @@ def report(
     """
     from relpos.evaluation import report as reports
     from relpos.evaluation.result import read_result
-    from relpos.runs import load_run
+    from relpos.sources import load
 
-    recording = load_run(run)
+    recording = load(run)
     if estimate is not None:
         result = read_result(estimate)
     else:

@@ -19,6 +19,7 @@ from relpos.recording import topics
 from relpos.recording.about import About
 from relpos.recording.container import MAGIC, MESSAGE_HEAD, Entry, Walk, parse, records_in, unpack
 from relpos.recording.output import part_path
+from relpos.recording.schemas import all_topics
 from relpos.runs.landmarks import Landmark
 from relpos.runs.run import Run, assemble
 
@@ -69,7 +70,7 @@ class Recording:
             if its is not None:
                 about = its if about is None else replace(its, part=about.part)
             files.append(found)
-        known = {topic.name for topic in topics.all_topics()}
+        known = {topic.name for topic in all_topics()}
         there = {channel.topic for file in files for channel in file.channels.values()}
         if about is None and files[0].channels and not known & there:
             raise DataError(f"{path}: an MCAP file, but no recording of relpos: none of its topics")

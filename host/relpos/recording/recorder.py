@@ -23,6 +23,7 @@ from relpos.recording import container, topics
 from relpos.recording.about import DESCRIPTION, About
 from relpos.recording.encoder import Encoder, Item, Line, names_of
 from relpos.recording.output import NO_ROOM, Disk, Output
+from relpos.recording.schemas import all_topics
 from relpos.runs.description import NodeInfo, description_text
 
 if TYPE_CHECKING:
@@ -76,7 +77,7 @@ class Recorder(Sink):
         self._about = about
         self._bounds = bounds or Bounds()
         self._encoder = Encoder(about.started_unix_ns, names_of(about.description))
-        self._topics = topics.all_topics()
+        self._topics = all_topics()
         self._block = container.Block(container.numbered(self._topics))
         self._looked_s = self._block_began_s = time.monotonic()
         self._sequence = 0

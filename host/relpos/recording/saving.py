@@ -14,6 +14,7 @@ from relpos.recording import container, topics
 from relpos.recording.about import DESCRIPTION, About
 from relpos.recording.encoder import Encoder, names_of
 from relpos.recording.reader import Recording
+from relpos.recording.schemas import all_topics
 from relpos.runs.description import description_text
 from relpos.runs.run import Run
 
@@ -48,7 +49,7 @@ def _write_run(
     about = About(
         started_unix_ns, source=run.name, description=replace(run.description, name=run.name)
     )
-    every = topics.all_topics()
+    every = all_topics()
     out.write(_beginning(about, every))
     writer = _Writer(out, Encoder(started_unix_ns, names_of(run.description)), every)
     for landmark in run.landmarks:
@@ -71,7 +72,7 @@ def _write_again(out: IO[bytes], run: Run, source: Recording) -> list[str]:
                 out.write(container.MAGIC)
             lost += container.copy_blocks(stream, out, beginning=file is source.files[0])
     there = {channel.topic: number for number, channel in source.files[0].channels.items()}
-    further = [topic for topic in topics.all_topics() if topic.name not in there]
+    further = [topic for topic in all_topics() if topic.name not in there]
     free = max(there.values(), default=0) + 1
     numbers = there | {topic.name: free + k for k, topic in enumerate(further)}
     out.write(container.channel_records(numbers, further))

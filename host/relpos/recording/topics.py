@@ -143,7 +143,7 @@ def encode_serial(serial: Serial) -> bytes:
 def encode_row(row: Row) -> tuple[str, bytes]:
     """Topic and message of an observation, a truth, a landmark or a gap."""
     kind: type = type(row)
-    return ROWS[kind], _json(_object(row, _names(kind)))
+    return ROWS[kind], _json(_object(row, names_of(kind)))
 
 
 def encode_estimate(estimate: Estimate) -> Iterable[tuple[str, bytes]]:
@@ -155,7 +155,7 @@ def encode_estimate(estimate: Estimate) -> Iterable[tuple[str, bytes]]:
         (Parameter, estimate.parameters),
     ):
         if rows or kind is NodeEstimate:
-            names = _list_names(kind)
+            names = list_names_of(kind)
             document = {
                 "time_s": estimate.time_s,
                 LIST_NAMES[kind]: [_rounded(_object(row, names)) for row in rows],
@@ -185,14 +185,15 @@ def _json(document: Mapping[str, Any]) -> bytes:
 
 
 @cache
-def _names(kind: type) -> tuple[str, ...]:
+def names_of(kind: type) -> tuple[str, ...]:
+    """Return the fields of a class, which are those of its messages."""
     return tuple(field.name for field in fields(kind))
 
 
 @cache
-def _list_names(kind: type) -> tuple[str, ...]:
+def list_names_of(kind: type) -> tuple[str, ...]:
     """What one entry of a list holds; its time stands beside the list."""
-    names = tuple(name for name in _names(kind) if name != "time_s")
+    names = tuple(name for name in names_of(kind) if name != "time_s")
     return (*names, *ELLIPSE) if kind is NodeEstimate else names
 
 
@@ -226,7 +227,7 @@ def decode_list(topic: str, data: bytes) -> tuple[float, type, tuple[Any, ...]] 
     time_s = float(document["time_s"])
     entries = document[LIST_NAMES[kind]]
     for entry in entries:
-        if "time_s" in _names(kind):
+        if "time_s" in names_of(kind):
             entry["time_s"] = time_s
         # Of whom nothing is known the variance is infinite, which JSON cannot say.
         if entry.get("status") == NodeStatus.UNLOCATED:
@@ -248,78 +249,14 @@ def _makers(kind: type) -> dict[str, tuple[Any, Any]]:
     """How each field is made of what JSON has, and what stands for one that is missing."""
     makers: dict[str, tuple[Any, Any]] = {}
     for name, hint in get_type_hints(kind).items():
-        optional, plain = _plain(hint)
+        optional, plain = plain_type(hint)
         missing = None if optional else math.nan if plain is float else ...
         makers[name] = (plain, missing)
     return makers
 
 
-def _plain(hint: Any) -> tuple[bool, Any]:
+def plain_type(hint: Any) -> tuple[bool, Any]:
     """Whether None is allowed, and the type beside it."""
     if get_origin(hint) in (Union, types.UnionType):
         return True, next(part for part in get_args(hint) if part is not type(None))
     return False, hint
-
-
-# -- schemas ---------------------------------------------------------------------------------------
-
-
-def _schema_of(kind: type, names: Iterable[str]) -> dict[str, Any]:
-    hints = get_type_hints(kind)
-    properties: dict[str, Any] = {}
-    required: list[str] = []
-    for name in names:
-        optional, plain = _plain(hints.get(name, float))
-        word = {bool: "boolean", int: "integer", float: "number"}.get(plain, "string")
-        properties[name] = {"type": word}
-        # A float may be none at all (NaN), and is left out then.
-        if not optional and plain is not float:
-            required.append(name)
-    return {"type": "object", "properties": properties, "required": required}
-
-
-def _topic(name: str, title: str, schema: Mapping[str, Any]) -> Topic:
-    document = json.dumps({"title": title, **schema}).encode()
-    return Topic(name, "json", title, "jsonschema", document)
-
-
-@cache
-def all_topics() -> tuple[Topic, ...]:
-    """Every topic of a recording, always in the same order."""
-    from relpos.recording import scene
-
-    serial = {
-        "type": "object",
-        "properties": {
-            "arrival_s": {"type": "number"},
-            "data": {"type": "string", "contentEncoding": "base64"},
-        },
-        "required": ["arrival_s", "data"],
-    }
-    rows = [
-        _topic(name, f"relpos.{kind.__name__}", _schema_of(kind, _names(kind)))
-        for kind, name in ROWS.items()
-    ]
-    lists = [
-        _topic(
-            name,
-            f"relpos.{kind.__name__}s",
-            {
-                "type": "object",
-                "properties": {
-                    "time_s": {"type": "number"},
-                    LIST_NAMES[kind]: {
-                        "type": "array",
-                        "items": _schema_of(kind, _list_names(kind)),
-                    },
-                },
-                "required": ["time_s", LIST_NAMES[kind]],
-            },
-        )
-        for kind, name in LISTS.items()
-    ]
-    drawn = [
-        Topic(name, "protobuf", schema.name, schema.encoding, schema.data)
-        for name, schema in scene.schemas().items()
-    ]
-    return (_topic(SERIAL, "relpos.Serial", serial), *rows, *lists, *drawn)

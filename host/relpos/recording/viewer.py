@@ -14,6 +14,7 @@ from relpos.measurements import Observation
 from relpos.recording import topics
 from relpos.recording.about import About
 from relpos.recording.encoder import Encoder, Item, Line, names_of
+from relpos.recording.schemas import all_topics
 
 if TYPE_CHECKING:
     from relpos.live.team_view import TeamView
@@ -41,7 +42,7 @@ class FoxgloveServer(Sink):
                 ),
                 context=self._context,
             )
-            for topic in topics.all_topics()
+            for topic in all_topics()
         }
         try:
             self._server = foxglove.start_server(

@@ -135,18 +135,11 @@ class Run:
 
 
 def load_run(path: Path | str) -> Run:
-    """Read a run directory, or a recording (MCAP).
-
-    DataError names the file, line and column of the first fault.
-    """
+    """Read a run directory. DataError names file, line and column of the first fault."""
     directory = Path(path)
     if not directory.exists():
         raise DataError(f"{directory}: no such run directory")
     if not directory.is_dir():
-        from relpos import recording
-
-        if recording.is_recording(directory):
-            return recording.open_recording(directory).run
         raise DataError(f"{directory}: not a directory")
     description = read_description(directory / "run.toml")
     counters: Counter[str] = Counter()

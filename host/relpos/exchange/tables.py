@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from relpos.exchange.content import Content, Kind
 from relpos.runs.appending import write_rows
 from relpos.runs.estimates import write_estimates
-from relpos.runs.formats.content import Content, Kind
 from relpos.runs.run import save_run
 from relpos.tracks import Track, sample
 

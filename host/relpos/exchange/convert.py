@@ -9,9 +9,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from relpos.errors import DataError, RelposError
-from relpos.geodesy import MapFrame, Pin, place
-from relpos.runs.estimates import read_estimates, write_estimates
-from relpos.runs.formats.content import (
+from relpos.exchange.content import (
     PLACED,
     Content,
     Kind,
@@ -20,6 +18,9 @@ from relpos.runs.formats.content import (
     as_truth,
     points_of,
 )
+from relpos.geodesy import MapFrame, Pin, place
+from relpos.recording import is_recording, open_recording, save_recording
+from relpos.runs.estimates import read_estimates, write_estimates
 from relpos.runs.landmarks import PRESS, Landmark, read_landmarks, truth_from_presses
 from relpos.runs.run import TABLE_NAMES, Run, load_run, save_run
 from relpos.runs.table import find_table
@@ -84,8 +85,6 @@ def read(source: Path, hints: Hints) -> Content:
 
 
 def _format_of(source: Path) -> Format:
-    from relpos.recording import is_recording
-
     if not source.exists():
         raise DataError(f"{source}: no such file or directory")
     if source.is_dir():
@@ -142,9 +141,7 @@ def _started(content: Content, hints: Hints) -> Content:
 
 
 def _read_mcap(source: Path) -> Content:
-    from relpos import recording
-
-    opened = recording.open_recording(source)
+    opened = open_recording(source)
     run = opened.run
     start_unix_s = None if opened.started_unix_ns is None else opened.started_unix_ns * 1e-9
     remarks = (*opened.remarks, *_press_remarks(run))
@@ -160,7 +157,7 @@ def _read_tracks(source: Path, form: Format, base: Content, hints: Hints) -> Con
     points: dict[Kind, list[Point]]
     landmarks: Sequence[Landmark] = ()
     if form is Format.TUM:
-        from relpos.runs.formats import tum
+        from relpos.exchange import tum
 
         files = tum.find_files(source)
         if not files:
@@ -170,8 +167,8 @@ def _read_tracks(source: Path, form: Format, base: Content, hints: Hints) -> Con
         frame, told = frame_of(base, hints.pins, Kind.TRUTH if base.run.truth else Kind.ESTIMATE)
         remarks += told
         if form is Format.GPX:
-            from relpos.runs.formats import gpx
-            from relpos.runs.formats.times import iso_of
+            from relpos.exchange import gpx
+            from relpos.exchange.times import iso_of
 
             first_s = gpx.first_time(source)
             if start_unix_s is None and first_s is not None:
@@ -184,7 +181,7 @@ def _read_tracks(source: Path, form: Format, base: Content, hints: Hints) -> Con
             )
             landmarks = gpx.read_landmarks(source, frame)
         else:
-            from relpos.runs.formats import geojson
+            from relpos.exchange import geojson
 
             points = geojson.read_geojson(
                 source, frame, node=hints.node, kind=hints.kind, start_unix_s=start_unix_s
@@ -230,11 +227,11 @@ def with_landmarks(content: Content, path: Path, pins: Sequence[Pin]) -> Content
         frame, told = frame_of(content, pins, Kind.TRUTH)
         remarks += told
         if suffix is Format.GPX:
-            from relpos.runs.formats import gpx
+            from relpos.exchange import gpx
 
             landmarks = gpx.read_landmarks(path, frame)
         else:
-            from relpos.runs.formats import geojson
+            from relpos.exchange import geojson
 
             landmarks = geojson.read_landmarks(path, frame)
     else:
@@ -319,14 +316,12 @@ def _write_run(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
 
 
 def _write_csv(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
-    from relpos.runs.formats.tables import write_tables
+    from relpos.exchange.tables import write_tables
 
     return write_tables(content, out), []
 
 
 def _write_mcap(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
-    from relpos.recording import save_recording
-
     start_ns = 0 if content.start_unix_s is None else round(content.start_unix_s * 1e9)
     # Under its own name only when it is whole.
     part = out.with_name(f"{out.name}.part")
@@ -348,7 +343,7 @@ def _write_mcap(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
 
 
 def _write_tum(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
-    from relpos.runs.formats.tum import file_name, write_tum
+    from relpos.exchange.tum import file_name, write_tum
 
     files: list[Path] = []
     remarks: list[str] = []
@@ -402,13 +397,13 @@ def _write_map(
 
 
 def _write_geojson(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
-    from relpos.runs.formats.geojson import write_geojson
+    from relpos.exchange.geojson import write_geojson
 
     return _write_map(content, out, pins, write_geojson)
 
 
 def _write_gpx(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
-    from relpos.runs.formats.gpx import write_gpx
+    from relpos.exchange.gpx import write_gpx
 
     files, remarks = _write_map(content, out, pins, write_gpx)
     if content.start_unix_s is None:

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from relpos.errors import DataError
+from relpos.exchange.content import PLACED, Content, Kind, Point, stretches_of
+from relpos.exchange.times import iso_of, unix_of
 from relpos.fusion.estimator import NodeEstimate
 from relpos.geodesy import MapFrame
-from relpos.runs.formats.content import PLACED, Content, Kind, Point, stretches_of
-from relpos.runs.formats.times import iso_of, unix_of
 from relpos.runs.landmarks import Landmark
 from relpos.runs.table import read_text
 

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from relpos.errors import DataError
+from relpos.exchange.content import Content, Kind, Point, stretches_of
+from relpos.exchange.times import time_of
 from relpos.extras import missing_extra
 from relpos.geodesy import MapFrame
-from relpos.runs.formats.content import Content, Kind, Point, stretches_of
-from relpos.runs.formats.times import time_of
 from relpos.runs.landmarks import Landmark
 from relpos.runs.table import read_text
 
