@@ -4,7 +4,7 @@
 # Six people walk round a rectangle of 20 by 10 m; their steps and turns are reported with errors,
 # and now and then two of them measure how far apart they are. Dead reckoning, the particle filter
 # of the paper and the bank get the same reports. The run is simulated, so two things are known that
-# a recording does not tell: the truth, and the Cramer-Rao bound, below which no estimator can stay
+# a recording does not hold: the truth, and the Cramer-Rao bound, below which no estimator can stay
 # on average.
 #
 # Run it as a script, or cell by cell in an editor that knows `# %%`:
@@ -57,7 +57,7 @@ for name, score in scores.items():
 
 # %%
 bound = relpos.bound(run)
-assert bound is not None, "only of a simulated run it can be told"
+assert bound is not None, "only a simulated run has a bound"
 least = bound.totals()
 print(f"{'bound':14}  {least.filtering_distance_m:6.2f} m  {least.filtering_position_m:6.2f} m")
 for name, score in scores.items():
@@ -77,7 +77,7 @@ for name, score in scores.items():
     print(f"{name:14}", "  ".join(f"{value:5.2f} m" for value in rms))
 
 poses = results["bank"].arrays()
-print(f"the bank told {poses['time_s'].size} poses; the last is of node {poses['node'][-1]}")
+print(f"the bank returned {poses['time_s'].size} poses; the last is of node {poses['node'][-1]}")
 
 # %% [markdown]
 # ## Figures

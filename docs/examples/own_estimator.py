@@ -1,5 +1,5 @@
 # %% [markdown]
-# # An estimator of one's own, held against ours
+# # An estimator of one's own, compared with ours
 #
 # An estimator is any object with three methods: `process` takes one measurement and returns the
 # estimates that it completes, `finish` returns the rest, `counters` says what was dropped. It sees
@@ -44,7 +44,7 @@ class SmallEkf:
         gate: float = 3.0,
     ) -> None:
         if not priors:
-            raise relpos.RelposError("a small EKF needs to be told where everybody starts")
+            raise relpos.RelposError("a small EKF needs to know where everybody starts")
         self.row = {prior.node: 3 * k for k, prior in enumerate(priors)}
         self.mean = np.array([(p.x_m, p.y_m, p.heading_rad) for p in priors]).ravel()
         sigmas = np.array([(p.sigma_m, p.sigma_m, p.sigma_rad) for p in priors]).ravel()
@@ -139,7 +139,7 @@ class SmallEkf:
 
 # %%
 def main() -> dict[str, relpos.Evaluation]:
-    """Run the filter as it is told three different things, and the bank, which is told none."""
+    """Run the filter with three settings, and the bank without any."""
     run = relpos.simulate("lab", seed=5)
     print(f"{run.name}: {len(run.motions)} motions, {len(run.ranges)} ranges")
     scores: dict[str, relpos.Evaluation] = {}
@@ -156,12 +156,12 @@ def main() -> dict[str, relpos.Evaluation]:
 # %% [markdown]
 # ## What to look at
 #
-# An extended Kalman filter is as good as what it is told: with the right noise of a turn it is
-# ahead of the bank on this run (1.1 m against 1.6 m), with twice that it follows ranges that walls
+# An extended Kalman filter is as good as its settings: with the right noise of a turn it is ahead
+# of the bank on this run (1.1 m against 1.6 m), with twice that it follows ranges that walls
 # have lengthened, gates good ones, and is worse than dead reckoning (2.4 m). No recording says what
 # is right, and one run says little: `relpos figures --estimator FILE.py:CLASS` draws an estimator
-# beside ours over many seeds. The bank learns noise levels, scales and drifts as it goes, and is
-# told nothing.
+# beside ours over many seeds. The bank learns noise variances, scales and drifts, and
+# needs no settings.
 
 # %%
 if __name__ == "__main__":
