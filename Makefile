@@ -23,7 +23,7 @@ compile-kernels = @printf '%s\n' 'compiling the estimators, once'; \
 	$(PYTHON) -c 'from relpos import fusion; [fusion.warm_up(n) for n in fusion.SETTINGS]'
 title = @printf '\n\033[1m== %s\033[0m\n' "$(1)"
 
-.PHONY: help setup demo live test lint bench bench-chain firmware docs pages wire clean soak \
+.PHONY: help setup demo live test lint coverage bench bench-chain firmware docs pages wire clean soak \
         system-demo system-avr system-browser system-soak native-tests board-builds simulated-tests python-tests
 
 help: ## this list
@@ -67,6 +67,15 @@ simulated-tests: $(DEVELOP) | system-avr
 	$(call title,Firmware suites on the simulated Uno)
 	tools/pio test -e uno_sim
 
+coverage: $(DEVELOP) | system-avr system-browser ## share of lines that tests reach: firmware/lib, host/relpos
+	$(call title,Firmware suites on this computer, line by line)
+	rm -rf .build/pio/build/native_coverage
+	tools/pio test -e native_coverage
+	$(VENV)/bin/gcovr --filter firmware/lib/ --exclude firmware/lib/board/arduino/ \
+		--fail-under-line 90 .build/pio/build/native_coverage
+	$(call title,Python tests, line by line)
+	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist worksteal --cov --cov-report=term:skip-covered
+
 # Last, so that its closing line is the last of `make test`.
 # One BLAS thread a worker: more of them than cores only wait for each other.
 python-tests: $(DEVELOP) | system-avr system-browser
@@ -90,6 +99,7 @@ bench-chain: board-builds ## how fast boards and teams are emulated, and the par
 
 docs: $(DEVELOP) ## the documentation as a site, in out/docs
 	$(call title,Documentation)
+	$(PYTHON) tests/architecture/draw_rooms.py
 	$(PYTHON) -m sphinx -W --keep-going -q -b html -d .build/docs docs out/docs
 	@echo 'open out/docs/index.html'
 

@@ -4,6 +4,7 @@ import ast
 import tomllib
 from pathlib import Path
 
+import draw_rooms
 import pytest
 from rooms import (
     PACKAGE,
@@ -56,3 +57,7 @@ def test_modules_that_only_posix_has_are_imported_in_the_listed_places_alone():
 def test_nothing_but_the_command_line_is_above_the_command_line():
     importers = graph().find_modules_that_directly_import("relpos.cli.main")
     assert not {m for m in importers if not m.startswith("relpos.cli")}
+
+
+def test_the_picture_shows_the_imports_as_they_are():
+    assert draw_rooms.PICTURE.read_text() == draw_rooms.picture(), "run `make docs`"
