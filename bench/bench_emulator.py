@@ -20,7 +20,7 @@ from relpos import fusion
 from relpos.emulator.avr.library import SimulatorError
 from relpos.emulator.native import build
 from relpos.emulator.node import BoardKind
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DeviceError
 from relpos.link.live import Link, observe, open_port
 from relpos.measurements import Heading, Height, Motion, Range
@@ -31,7 +31,7 @@ def measure(board: str, nodes: int, seconds: float, scenario: str, seed: int) ->
     if board == BoardKind.NATIVE:
         build()  # compiling is no part of it
     start_s = time.perf_counter()
-    with EmulatedTeam(scenario, nodes, seconds, seed, board) as team:
+    with EmulatedTeam(TeamConfig(scenario, nodes, seconds, seed, board)) as team:
         ready_s, ready_cpu_s = time.perf_counter(), time.process_time()
         byte_count = sum(len(data) for _, data in team.stream())
         done_s, done_cpu_s = time.perf_counter(), time.process_time()
@@ -51,7 +51,7 @@ def measure(board: str, nodes: int, seconds: float, scenario: str, seed: int) ->
 
 def measure_chain(board: str, nodes: int, seconds: float, scenario: str, seed: int) -> str:
     """`relpos emulate` in a process of its own, link and particle filter in this one."""
-    with EmulatedTeam(scenario, nodes, seconds, seed) as team:  # knows where they begin
+    with EmulatedTeam(TeamConfig(scenario, nodes, seconds, seed)) as team:  # knows where they begin
         estimator = fusion.make("particle", team.priors(), {}, seed)
     arguments = f"--nodes {nodes} --board {board} --scenario {scenario} --seconds {seconds:g}"
     command = [sys.executable, "-m", "relpos.cli.main", "emulate", *arguments.split()]

@@ -17,7 +17,7 @@ from itertools import pairwise
 import numpy as np
 
 from relpos.emulator.faults import FAULTS, Fault, FaultSpec, parse_fault
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link import xbee
 from relpos.link.live import Link
 from relpos.measurements import Heading, Motion, Observation, Range, Status
@@ -202,7 +202,7 @@ def record(
 ) -> Record:
     """Let a team walk with those faults; the same arguments give the same record."""
     with EmulatedTeam(
-        GOOD_CONDITIONS, nodes, seconds, seed, board, faults=faults, beacons=True
+        TeamConfig(GOOD_CONDITIONS, nodes, seconds, seed, board, faults=faults, beacons=True)
     ) as team:
         tap = _Tap(team.key)
         errors = {number: node.errors for number, node in team.nodes.items()}

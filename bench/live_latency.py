@@ -38,7 +38,7 @@ from multiprocessing.connection import Connection
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link.live import Link
 from relpos.measurements import Motion, Range
 
@@ -58,7 +58,7 @@ class Packet:
 
 def record(nodes: int, seconds: float, seed: int) -> list[tuple[float, bytes]]:
     """Bytes of an emulated team at their virtual times."""
-    with EmulatedTeam("paper", nodes, seconds, seed, beacons=True) as team:
+    with EmulatedTeam(TeamConfig("paper", nodes, seconds, seed, beacons=True)) as team:
         return [(time_us * 1e-6, data) for time_us, data in team.stream()]
 
 

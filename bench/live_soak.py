@@ -31,7 +31,8 @@ from pathlib import Path
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
-from relpos.emulator.rehearsal import Cast, Rehearsal
+from relpos.emulator.process import EmulatorProcess
+from relpos.emulator.team import TeamConfig
 
 WARM_UP_SHARE = 0.1
 FLAT = 1.05
@@ -110,7 +111,9 @@ def main() -> int:
         out = wanted.out or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         print(f"preparing a walk of {seconds:.0f} s of {wanted.nodes} people", flush=True)
         team = stack.enter_context(
-            Rehearsal(Cast(wanted.nodes, seconds, seed=wanted.seed, speed=wanted.speed))
+            EmulatorProcess(
+                TeamConfig(nodes=wanted.nodes, seconds=seconds, seed=wanted.seed), wanted.speed
+            )
         )
         session = subprocess.Popen(
             [

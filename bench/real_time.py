@@ -15,7 +15,8 @@ import time
 import numpy as np
 
 from relpos import fusion
-from relpos.emulator.team import record_team
+from relpos.emulator.serving import record_team
+from relpos.emulator.team import TeamConfig
 
 
 def main() -> None:
@@ -29,7 +30,9 @@ def main() -> None:
     fusion.warm_up("bank")
     for seed in range(args.seeds):
         run = record_team(
-            board="native", nodes=args.nodes, seconds=args.seconds, scenario="paper", seed=seed
+            TeamConfig(
+                board="native", nodes=args.nodes, seconds=args.seconds, scenario="paper", seed=seed
+            )
         )
         bank = fusion.make("bank", () if args.unknown else run.priors, {}, seed, run.nodes)
         calls = []

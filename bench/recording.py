@@ -16,7 +16,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.fusion import make
 from relpos.link.live import Link
 from relpos.measurements import Heading, Height, Motion, Range
@@ -37,7 +37,9 @@ def main() -> None:
 
     link, steps = Link(), []
     length_s = SETTLE_S + options.seconds
-    with EmulatedTeam("paper", options.nodes, length_s, options.seed, beacons=True) as team:
+    with EmulatedTeam(
+        TeamConfig("paper", options.nodes, length_s, options.seed, beacons=True)
+    ) as team:
         estimator = make("bank", team.priors())
         for time_us, data in team.stream():
             observations = link.feed(data, time_us * 1e-6)

@@ -41,7 +41,9 @@ def climb(climbers: int, seed: int) -> list[tuple[FloatArray, FloatArray, FloatA
     link = Link()
     with (
         mock.patch.object(emulated, "make_team", return_value=(walkers, World(name="stairs"))),
-        emulated.EmulatedTeam("stairs", climbers, end_s, seed, beacons=True) as team,
+        emulated.EmulatedTeam(
+            emulated.TeamConfig("stairs", climbers, end_s, seed, beacons=True)
+        ) as team,
     ):
         for time_us, data in team.stream():
             for seen in link.feed(data, time_us * 1e-6):

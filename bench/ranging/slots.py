@@ -17,7 +17,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 from relpos.emulator.air import ExchangeRecord, Outcome
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link.live import BAUD, Link
 from relpos.measurements import Range
 from relpos.simulation.team import Scenario
@@ -107,7 +107,9 @@ def measure(
     heard: list[tuple[float, Pair]] = []
     byte_count = 0
     link = Link()
-    with EmulatedTeam(crowd(loss, detection), nodes, end_s, seed, beacons=slotted) as team:
+    with EmulatedTeam(
+        TeamConfig(crowd(loss, detection), nodes, end_s, seed, beacons=slotted)
+    ) as team:
         team.uwb.on_end = records.append
         for time_us, data in team.stream():
             byte_count += len(data) if time_us >= SETTLE_S * 1e6 else 0

@@ -15,7 +15,7 @@ from relpos.cli import main
 from relpos.doctor import devices, installation
 from relpos.doctor.computer import Computer, SerialPort
 from relpos.emulator.pty import PseudoTerminal
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.emulator.xbee import XbeeModule
 from relpos.errors import DeviceError
 from relpos.link import xbee
@@ -329,7 +329,7 @@ def doctor(*arguments):
 
 
 def test_an_emulated_coordinator_is_well_for_the_command(tmp_path):
-    with EmulatedTeam("paper", 1, 60.0, 1) as team, PseudoTerminal(team) as terminal:
+    with EmulatedTeam(TeamConfig("paper", 1, 60.0, 1)) as team, PseudoTerminal(team) as terminal:
         terminal.start()
         told = json.loads(doctor(terminal.path, "--out", str(tmp_path), "--json").stdout)
     assert [f["state"] for f in told["findings"] if f["name"] == "coordinator"] == ["well"]

@@ -5,7 +5,7 @@ import shutil
 import pytest
 
 from relpos.emulator.avr.budget import default_build_folder
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link import xbee
 from relpos.protocol import messages as wire
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.skipif(
 def motions(board):
     parser = xbee.Parser()
     latest = {}
-    with EmulatedTeam("paper", 2, SECONDS, 4, board) as team:
+    with EmulatedTeam(TeamConfig("paper", 2, SECONDS, 4, board)) as team:
         for _, data in team.stream():
             for packet in parser.feed(data):
                 if isinstance(packet, xbee.Receive16):

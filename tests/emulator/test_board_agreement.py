@@ -19,7 +19,7 @@ from relpos.emulator import mpu9150
 from relpos.emulator.engine import NodeClockError
 from relpos.emulator.node import draw_node_errors
 from relpos.emulator.surroundings import Surroundings
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link import xbee
 from relpos.protocol import messages as wire
 
@@ -94,7 +94,7 @@ def frames(board, seconds):
     parser = xbee.Parser()
     errors = functools.partial(exact_clocks, power_on_us=POWER_ON_US[board])
     options = {"collisions": False, "node_errors": errors, "beacons": True}
-    with EmulatedTeam("paper", 2, seconds, 4, board, **options) as team:
+    with EmulatedTeam(TeamConfig("paper", 2, seconds, 4, board, **options)) as team:
         for node in team.nodes.values():
             node.mpu.__class__ = GridMpu
             given = {
@@ -195,7 +195,7 @@ def test_two_minutes_of_every_board_end_at_the_same_place(board):
 @pytest.mark.parametrize("board", ["uno", pytest.param("mega", marks=pytest.mark.soak)])
 def test_the_same_seed_gives_the_same_bytes_of_simulated_boards_too(board):
     def stream():
-        with EmulatedTeam("paper", 2, 6.0, 7, board, beacons=True) as team:
+        with EmulatedTeam(TeamConfig("paper", 2, 6.0, 7, board, beacons=True)) as team:
             return list(team.stream())
 
     assert stream() == stream()

@@ -8,7 +8,7 @@ from relpos.emulator.avr.budget import default_build_folder
 from relpos.emulator.avr.library import missing_parts
 from relpos.emulator.engine import NodeClockError
 from relpos.emulator.node import BoardKind, NodeErrors
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link import xbee
 from relpos.protocol import messages as wire
 
@@ -58,10 +58,10 @@ class Listener:
 
 
 def straight(board, seconds, **errors):
-    return EmulatedTeam(
+    return EmulatedTeam(TeamConfig(
         "straight", 1, seconds, seed=3, board=board, configured=False,
         node_errors=lambda _seed, _node: NodeErrors(**errors),
-    )  # fmt: skip
+    ))  # fmt: skip
 
 
 @pytest.mark.parametrize("board", BOARDS)

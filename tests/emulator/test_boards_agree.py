@@ -17,7 +17,7 @@ from relpos.emulator.bus import BusStatus
 from relpos.emulator.engine import NodeClockError
 from relpos.emulator.native import NativeEngine
 from relpos.emulator.node import prepared_eeprom
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link import xbee
 from relpos.protocol import messages as wire
 
@@ -99,7 +99,7 @@ class Sent:
 
 def written_down(board, seconds):
     """What node 1 of two met on a simulated board, and the frames it sent."""
-    with EmulatedTeam("paper", 2, seconds, 4, board) as team:
+    with EmulatedTeam(TeamConfig("paper", 2, seconds, 4, board)) as team:
         node = team.nodes[1]
         bus, sent = Bus(node.bus), Sent()
         pass_on = node.engine.on_transmit

@@ -16,7 +16,7 @@ from relpos.emulator.air import VirtualClock
 from relpos.emulator.avr.budget import default_build_folder
 from relpos.emulator.avr.library import missing_parts
 from relpos.emulator.bus import BusStatus
-from relpos.emulator.faults_injection import cut_native
+from relpos.emulator.faults.boards import cut_native
 from relpos.emulator.node import EmulatedNode, draw_node_errors
 from relpos.emulator.pozyx import RangeResult
 from relpos.emulator.surroundings import Surroundings
@@ -81,18 +81,18 @@ class Bench:
             ),
         )
 
-    def send(self, sender, destination, long, data, time_us, report):
+    def send(self, sent):
         """The air as the node's radio sees it."""
         frame = None
         for key in (OLD_KEY, NEW_KEY):
             try:
-                frame = wire.decode(data, key)
+                frame = wire.decode(sent.data, key)
                 break
             except wire.FrameTagError:
                 continue
         assert frame is not None, "a frame under no key that was ever given"
-        self.frames.append((time_us * 1e-6, frame))
-        self.clock.at(time_us + 10_000, lambda now_us: report(now_us, DELIVERED))
+        self.frames.append((sent.time_us * 1e-6, frame))
+        self.clock.at(sent.time_us + 10_000, lambda now_us: sent.report(now_us, DELIVERED))
 
     def run(self, seconds=SECONDS):
         self.clock.run(round(seconds * 1e6))
@@ -334,7 +334,7 @@ def cut(write, left, ask):
             old = node.eeprom[at]
             return {"erased": 0xFF, "old": old, "garbage": (old * 7 + 91) & 0xFF}[left]
 
-        cut_native(node, node.engine, bench.clock, 3_000_000, write, remains)
+        cut_native(node, bench.clock, 3_000_000, write, remains)
         ask(bench)
 
     return Bench(prepare=prepare)

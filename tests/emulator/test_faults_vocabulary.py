@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 import fault_runs
 from relpos.cli import main
 from relpos.emulator.faults import FAULTS, REFUSED, TARGETS, FaultError, help_text, parse_fault
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 
 NODES = (1, 2, 3)
 
@@ -26,7 +26,7 @@ def test_every_fault_can_be_written_and_happens(fault):
     spec = parse_fault(example(fault), NODES)
     assert spec.fault is fault
     assert spec.node == (None if fault.team else 2)
-    with EmulatedTeam("paper", NODES, 6.0, 1, faults=[spec]) as team:
+    with EmulatedTeam(TeamConfig("paper", NODES, 6.0, 1, faults=[spec])) as team:
         assert sum(len(data) for _, data in team.stream()) > 500
 
 
@@ -107,10 +107,10 @@ def test_the_same_faults_and_seed_give_the_same_bytes():
     faults = ["radio:bitflip:rate=0.5", "imu:intermittent:node=1", "uwb:collisions:from=1"]
     runs = []
     for _ in range(2):
-        with EmulatedTeam("paper", 2, 10.0, 3, faults=faults) as team:
+        with EmulatedTeam(TeamConfig("paper", 2, 10.0, 3, faults=faults)) as team:
             runs.append(list(team.stream()))
     assert runs[0] == runs[1]
-    with EmulatedTeam("paper", 2, 10.0, 3) as team:
+    with EmulatedTeam(TeamConfig("paper", 2, 10.0, 3)) as team:
         assert list(team.stream()) != runs[0]
 
 

@@ -7,7 +7,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from relpos.emulator import team as emulated
-from relpos.emulator.team import record_team
+from relpos.emulator.serving import record_team
+from relpos.emulator.team import TeamConfig
 from relpos.measurements import Height
 from relpos.runs import load_run, save_run
 from relpos.simulation.activities import Activity
@@ -49,7 +50,9 @@ def climb(tmp_path_factory):
     patch = pytest.MonkeyPatch()
     patch.setattr(emulated, "make_team", lambda *_: (walkers, World(name="stairs")))
     try:
-        run = record_team(board="native", nodes=2, seconds=seconds, scenario="stairs", seed=1)
+        run = record_team(
+            TeamConfig(board="native", nodes=2, seconds=seconds, scenario="stairs", seed=1)
+        )
     finally:
         patch.undo()
     folder = tmp_path_factory.mktemp("climb")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from relpos.emulator.air import Outcome
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link.live import Link
 from relpos.measurements import Status
 from relpos.protocol import messages as wire
@@ -106,7 +106,7 @@ def test_seven_share_the_air_fairly(seven):
 
 def test_a_node_without_beacons_says_so_and_ranges_on():
     link, told = Link(), []
-    with EmulatedTeam("paper", 3, 60.0, 2, beacons=True) as team:
+    with EmulatedTeam(TeamConfig("paper", 3, 60.0, 2, beacons=True)) as team:
         records = []
         team.uwb.on_end = records.append
         for until_us in (25_000_000, 60_000_000):
@@ -125,7 +125,7 @@ def test_a_node_without_beacons_says_so_and_ranges_on():
 
 def test_exchanges_stay_within_their_window_of_the_superframe():
     """By the coordinator's clock, which the nodes know to some milliseconds from the beacons."""
-    with EmulatedTeam("paper", 6, 30.0, 4, beacons=True) as team:
+    with EmulatedTeam(TeamConfig("paper", 6, 30.0, 4, beacons=True)) as team:
         records = []
         team.uwb.on_end = records.append
         for _ in team.stream():
@@ -141,7 +141,7 @@ def test_exchanges_stay_within_their_window_of_the_superframe():
 
 def test_the_same_seed_gives_the_same_bytes_in_slots_too():
     def output():
-        with EmulatedTeam("paper", 5, 12.0, 3, beacons=True) as team:
+        with EmulatedTeam(TeamConfig("paper", 5, 12.0, 3, beacons=True)) as team:
             return list(team.stream())
 
     assert output() == output()

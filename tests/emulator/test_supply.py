@@ -4,7 +4,7 @@ import pytest
 
 from relpos.emulator.avr.library import missing_parts
 from relpos.emulator.node import BoardKind
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link.live import Link
 from relpos.measurements import Status
 
@@ -32,7 +32,7 @@ def told_v(team, link, until_us):
 
 @pytest.mark.parametrize("board", BOARDS)
 def test_a_sagging_supply_is_told_by_the_status(board):
-    with EmulatedTeam("straight", 1, 40.0, seed=1, board=board) as team:
+    with EmulatedTeam(TeamConfig("straight", 1, 40.0, seed=1, board=board)) as team:
         link = Link()
         # One count of the 10-bit converter is 22 mV at 5 V, 16 mV at 4.3 V.
         assert told_v(team, link, 5_000_000) == pytest.approx(5.0, abs=0.03)

@@ -9,7 +9,8 @@ from collections import Counter
 import pytest
 
 from relpos.emulator.pty import PseudoTerminal
-from relpos.emulator.team import EmulatedTeam, record_team, serve_team
+from relpos.emulator.serving import record_team, serve_team
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DataError, RelposError
 from relpos.link.live import Link, observe, open_port
 from relpos.link.xbee import Parser, Receive16
@@ -21,14 +22,14 @@ NODES = 3
 
 
 def serial_output(seed, seconds=SECONDS, nodes=NODES, **options):
-    with EmulatedTeam("paper", nodes, seconds, seed, **options) as team:
+    with EmulatedTeam(TeamConfig("paper", nodes, seconds, seed, **options)) as team:
         return list(team.stream())
 
 
 @pytest.fixture(scope="module")
 def heard():
     """A team after its walk, what left its port, and the link that read it."""
-    with EmulatedTeam("paper", NODES, SECONDS, 5) as team:
+    with EmulatedTeam(TeamConfig("paper", NODES, SECONDS, 5)) as team:
         link = Link()
         chunks, observations = [], []
         for time_us, data in team.stream():
@@ -122,7 +123,7 @@ def test_chips_are_driven_without_bus_errors(heard):
 
 def test_a_command_reaches_its_node_and_is_acknowledged():
     link = Link()
-    with EmulatedTeam("paper", 2, 20.0, 3) as team:
+    with EmulatedTeam(TeamConfig("paper", 2, 20.0, 3)) as team:
         for time_us, data in team.run(3_000_000):
             link.feed(data, time_us * 1e-6)
         token, request = link.command(2, wire.CommandCode.PING, 0)
@@ -155,7 +156,7 @@ def beacons_of(team, node, seconds):
 
 def test_a_team_that_sends_beacons_itself_tells_its_virtual_time():
     key = bytes(range(16))
-    with EmulatedTeam("paper", 3, 30.0, 3, key=key, beacons=True) as team:
+    with EmulatedTeam(TeamConfig("paper", 3, 30.0, 3, key=key, beacons=True)) as team:
         heard = beacons_of(team, 2, 30.0)
     assert 23 <= len(heard) <= 26
     counters = [frame.counter for _, frame in heard]
@@ -168,9 +169,9 @@ def test_a_team_that_sends_beacons_itself_tells_its_virtual_time():
 
 
 def test_who_hears_a_beacon_hears_it_at_the_same_moment_as_the_others():
-    with EmulatedTeam("paper", 2, 20.0, 3, beacons=True) as team:
+    with EmulatedTeam(TeamConfig("paper", 2, 20.0, 3, beacons=True)) as team:
         one = beacons_of(team, 1, 20.0)
-    with EmulatedTeam("paper", 2, 20.0, 3, beacons=True) as team:
+    with EmulatedTeam(TeamConfig("paper", 2, 20.0, 3, beacons=True)) as team:
         other = {frame.counter: time_s for time_s, frame in beacons_of(team, 2, 20.0)}
     both = [(time_s, other[frame.counter]) for time_s, frame in one if frame.counter in other]
     assert len(both) > 10
@@ -178,12 +179,12 @@ def test_who_hears_a_beacon_hears_it_at_the_same_moment_as_the_others():
 
 
 def test_a_team_sends_no_beacons_unless_it_is_asked_to():
-    with EmulatedTeam("paper", 2, 10.0, 3) as team:
+    with EmulatedTeam(TeamConfig("paper", 2, 10.0, 3)) as team:
         assert beacons_of(team, 1, 10.0) == []
 
 
 def test_collisions_can_be_switched_off():
-    with EmulatedTeam("paper", 4, 20.0, 3, collisions=False) as team:
+    with EmulatedTeam(TeamConfig("paper", 4, 20.0, 3, collisions=False)) as team:
         for _ in team.stream():
             pass
         assert team.uwb.counts["attempts"] > 10
@@ -192,29 +193,20 @@ def test_collisions_can_be_switched_off():
 
 def test_an_unknown_scenario_or_fault_is_one_clear_error():
     with pytest.raises(DataError, match="moon"):
-        EmulatedTeam("moon", 2, 10.0, 1)
+        EmulatedTeam(TeamConfig("moon", 2, 10.0, 1))
     with pytest.raises(RelposError, match="gremlins"):
-        serve_team(
-            nodes=2,
-            board="native",
-            scenario="paper",
-            speed=1.0,
-            seconds=10.0,
-            faults=("gremlins",),
-            seed=1,
-            announce=print,
-        )
+        serve_team(TeamConfig("paper", 2, 10.0, 1, faults=("gremlins",)), 1.0, print)
 
 
 def test_a_walk_that_does_not_fit_into_memory_is_refused_before_it_is_prepared(monkeypatch):
     monkeypatch.setattr("relpos.emulator.team.physical_memory_gb", lambda: 8.0)
     with pytest.raises(DataError, match=r"20 people for 7200 s takes 8.1 GB .* of 8.0 GB here"):
-        EmulatedTeam("paper", 20, 7200.0)
+        EmulatedTeam(TeamConfig("paper", 20, 7200.0))
 
 
 def test_a_recorded_team_is_the_same_run_each_time():
     arguments = {"board": "native", "nodes": 2, "seconds": 15.0, "scenario": "paper", "seed": 4}
-    one, other = record_team(**arguments), record_team(**arguments)
+    one, other = record_team(TeamConfig(**arguments)), record_team(TeamConfig(**arguments))
     assert one.measurements == other.measurements
     assert one.statuses == other.statuses
     assert {m.node for m in one.motions} == {1, 2}
@@ -229,19 +221,8 @@ def test_an_emulated_port_faster_than_real_time_is_read_in_virtual_time(capsys):
         path.append(name)
         opened.set()
 
-    thread = threading.Thread(
-        target=serve_team,
-        kwargs={
-            "nodes": 2,
-            "board": "native",
-            "scenario": "paper",
-            "speed": 0.0,
-            "seconds": 30.0,
-            "faults": (),
-            "seed": 2,
-            "announce": announce,
-        },
-    )
+    config = TeamConfig("paper", 2, 30.0, 2)
+    thread = threading.Thread(target=serve_team, args=(config, 0.0, announce))
     thread.start()
     assert opened.wait(20.0)
     link, motions = Link(), []
@@ -264,7 +245,7 @@ def test_a_terminal_of_a_real_team_gives_its_bytes_whole():
     expected = b"".join(data for _, data in serial_output(9, 10.0, 2))
     got = b""
     with (
-        EmulatedTeam("paper", 2, 10.0, 9) as team,
+        EmulatedTeam(TeamConfig("paper", 2, 10.0, 9)) as team,
         PseudoTerminal(team, 0.0) as terminal,
         terminal.open_port() as port,
     ):

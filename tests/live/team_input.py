@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import time
 
-from relpos.emulator.team import STEP_US, EmulatedTeam
+from relpos.emulator.air import STEP_US
+from relpos.emulator.team import EmulatedTeam
 from relpos.link.live import Link
 from relpos.live.composer import Composer
 from relpos.live.fusion_thread import FusionThread

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from relpos import fusion
 from relpos.cli import main
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DeviceError
 from relpos.link import xbee
 from relpos.link.live import Link
@@ -53,7 +53,7 @@ def socket(tmp_path):
 @pytest.fixture(scope="module")
 def stream():
     """Eight seconds of two nodes, each piece marked with its virtual time."""
-    with EmulatedTeam("straight", 2, 20.0, 3, beacons=True) as team:
+    with EmulatedTeam(TeamConfig("straight", 2, 20.0, 3, beacons=True)) as team:
         marks = []
         for time_us, data in team.stream():
             mark = xbee.UnknownFrame(xbee.VIRTUAL_TIME, time_us.to_bytes(8, "big"))

@@ -8,7 +8,7 @@ import pytest
 from team_input import TeamInput, make_session, run_through
 
 from relpos import fusion
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link.live import Link
 from relpos.live.inputs import PacedInput, Received
 from relpos.live.requests import Request
@@ -24,7 +24,7 @@ def deadreckoning(priors):
 @pytest.fixture(scope="module")
 def walk():
     """Forty seconds of three people through a session with the default estimator."""
-    with EmulatedTeam("paper", 3, 40.0, 3, beacons=True) as team:
+    with EmulatedTeam(TeamConfig("paper", 3, 40.0, 3, beacons=True)) as team:
         priors = team.priors()
         session, album = make_session(
             TeamInput(team), lambda p: fusion.make("bank", p), priors=priors, paced=True
@@ -82,7 +82,7 @@ def test_what_is_recorded_is_what_was_decoded_in_its_order(walk):
 
 def test_somebody_who_falls_silent_is_stale_then_lost():
     with EmulatedTeam(
-        "straight", 3, 60.0, 3, beacons=True, faults=["node:off:node=2,from=25,to=100"]
+        TeamConfig("straight", 3, 60.0, 3, beacons=True, faults=["node:off:node=2,from=25,to=100"])
     ) as team:
         session, album = make_session(TeamInput(team), deadreckoning, priors=team.priors())
         run_through(session)
@@ -98,7 +98,7 @@ def test_somebody_who_falls_silent_is_stale_then_lost():
 
 
 def asleep(seconds, at_s=30.0, until_s=120.0):
-    with EmulatedTeam("paper", 3, until_s, 5, beacons=True) as team:
+    with EmulatedTeam(TeamConfig("paper", 3, until_s, 5, beacons=True)) as team:
         source = TeamInput(team)
         source.sleep(at_s, seconds)
         # The team's clock is the session's; a virtual one would be told by the link.
@@ -123,7 +123,7 @@ def test_a_laptop_that_slept_for_a_minute_raises_no_alarm_and_says_that_it_slept
 
 
 def test_a_port_that_is_gone_is_told_and_nobody_is_lost_by_it():
-    with EmulatedTeam("paper", 3, 90.0, 5, beacons=True) as team:
+    with EmulatedTeam(TeamConfig("paper", 3, 90.0, 5, beacons=True)) as team:
         source = TeamInput(team)
         source.unplug(30.0, 30.0)
         session, album = make_session(source, deadreckoning, priors=team.priors())
@@ -163,7 +163,7 @@ def test_a_fusion_that_falls_behind_holds_up_nothing_and_loses_nothing():
         made.append(Slow(priors))
         return made[0]
 
-    with EmulatedTeam("straight", 3, 40.0, 3, beacons=True) as team:
+    with EmulatedTeam(TeamConfig("straight", 3, 40.0, 3, beacons=True)) as team:
         session, album = make_session(TeamInput(team), make, priors=team.priors())
         for _ in session.run():
             pass
@@ -192,7 +192,7 @@ class Troubled(Sink):
 
 
 def test_a_sink_that_fails_is_told_and_the_others_go_on():
-    with EmulatedTeam("straight", 2, 8.0, 3, beacons=True) as team:
+    with EmulatedTeam(TeamConfig("straight", 2, 8.0, 3, beacons=True)) as team:
         session, album = make_session(
             TeamInput(team), deadreckoning, Broken(), Troubled(), priors=team.priors()
         )
@@ -211,7 +211,7 @@ class Failing(Slow):
 
 
 def test_a_fusion_that_dies_is_told_and_receiving_goes_on():
-    with EmulatedTeam("straight", 2, 20.0, 3, beacons=True) as team:
+    with EmulatedTeam(TeamConfig("straight", 2, 20.0, 3, beacons=True)) as team:
         source = TeamInput(team, until_s=15.0)
         session, album = make_session(source, Failing, priors=team.priors(), lasts=True)
         for _ in session.run():
@@ -257,7 +257,7 @@ def press(number, unix_s, name="a"):
 
 
 def test_presses_names_and_acknowledgements_reach_record_and_picture(monkeypatch):
-    with EmulatedTeam("straight", 2, 20.0, 3, beacons=True) as team:
+    with EmulatedTeam(TeamConfig("straight", 2, 20.0, 3, beacons=True)) as team:
         source = TeamInput(team)
         # The wall clock as the team's, from a date on.
         monkeypatch.setattr("relpos.live.session.time.time", lambda: 1.7e9 + source.now_s())
@@ -299,7 +299,7 @@ def test_a_recording_is_played_and_takes_no_presses():
 
 
 def test_who_is_heard_first_starts_from_one_place_where_that_was_said():
-    with EmulatedTeam("straight", 3, 15.0, 3, beacons=True) as team:
+    with EmulatedTeam(TeamConfig("straight", 3, 15.0, 3, beacons=True)) as team:
         given = []
 
         def make(priors):

@@ -4,7 +4,7 @@ from dataclasses import fields, is_dataclass
 from functools import cache
 from math import isclose
 
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.fusion import make
 from relpos.link.live import Link
 from relpos.measurements import Heading, Height, Motion, Range
@@ -17,7 +17,7 @@ START_NS = 1_790_000_000_123_456_789
 def serial_bytes(nodes=3, seconds=40.0, seed=2, key=None):
     """What leaves the coordinator's port of an emulated team: (virtual seconds, bytes)."""
     with EmulatedTeam(
-        "paper", nodes, seconds, seed, beacons=True, **({"key": key} if key else {})
+        TeamConfig("paper", nodes, seconds, seed, beacons=True, **({"key": key} if key else {}))
     ) as team:
         return tuple((time_us * 1e-6, data) for time_us, data in team.stream())
 

@@ -22,7 +22,8 @@ import pytest
 from typer.testing import CliRunner
 
 from relpos.cli import main
-from relpos.emulator.team import EmulatedTeam, record_team
+from relpos.emulator.serving import record_team
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.evaluation.summary import FIGURES
 from relpos.link import xbee
 from relpos.link.live import Link
@@ -56,7 +57,7 @@ def figures_of(*arguments):
 @pytest.fixture(scope="module")
 def team_bytes():
     """Serial bytes of three emulated nodes over 60 s, as (virtual seconds, bytes)."""
-    with EmulatedTeam("paper", 3, 60.0, 2) as team:
+    with EmulatedTeam(TeamConfig("paper", 3, 60.0, 2)) as team:
         return [(time_us * 1e-6, data) for time_us, data in team.stream()]
 
 
@@ -67,7 +68,9 @@ def test_the_fusion_beats_dead_reckoning_in_every_demo(tmp_path):
     factors, emulated_s = [], []
     for seed in range(5):
         began_s = time.process_time()
-        run = record_team(board="native", nodes=6, seconds=120.0, scenario="paper", seed=seed)
+        run = record_team(
+            TeamConfig(board="native", nodes=6, seconds=120.0, scenario="paper", seed=seed)
+        )
         emulated_s.append(time.process_time() - began_s)
         save_run(run, tmp_path / str(seed))
         figures = figures_of("fuse", tmp_path / str(seed), "--seed", seed, "--out", tmp_path / "o")
@@ -311,7 +314,7 @@ def test_an_emulated_team_is_fused_live_by_another_process(tmp_path):
     # 4 s at 20 times real time, less what a busy machine cannot keep up with.
     assert 20.0 < received.measurements[-1].time_s < 100.0
     assert {m.node for m in received.motions} == {1, 2, 3}
-    with EmulatedTeam("paper", 3, 300.0, 4, beacons=True) as team:
+    with EmulatedTeam(TeamConfig("paper", 3, 300.0, 4, beacons=True)) as team:
         sent = end_poses((t * 1e-6, data) for t, data in team.run(100_000_000))[1]
     heard = Counter((r.node, r.peer, round(r.range_m, 3)) for r in received.ranges)
     assert heard.total() > 20

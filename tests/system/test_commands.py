@@ -4,7 +4,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from relpos.emulator.pty import PseudoTerminal
-from relpos.emulator.team import EmulatedTeam
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link import xbee
 from relpos.link.dialogue import NodeDialogue
 from relpos.protocol import messages as wire
@@ -15,7 +15,7 @@ from relpos.simulation.team import SCENARIOS
 def team_at_port(nodes=1, seed=1, scenario="straight"):
     """A team and the port behind which it is, at eight times real time."""
     with (
-        EmulatedTeam(scenario, nodes, 900.0, seed) as team,
+        EmulatedTeam(TeamConfig(scenario, nodes, 900.0, seed)) as team,
         PseudoTerminal(team, speed=8.0) as terminal,
         terminal.open_port() as port,
     ):

@@ -12,7 +12,7 @@ from relpos.cli import fuse, live, output
 from relpos.cli.estimators import BANK
 
 if TYPE_CHECKING:
-    from relpos.emulator.rehearsal import Cast
+    from relpos.emulator.team import TeamConfig
 
 
 class Board(StrEnum):
@@ -65,16 +65,14 @@ def demo(
     With --view the team walks in real time behind the live page, with --terminal in this
     terminal; Ctrl-C ends it.
     """
-    from relpos.emulator.team import record_team
+    from relpos.emulator.team import TeamConfig
     from relpos.runs import save_run
 
     faults = check_faults(fault, nodes)
     shown = view or terminal
     job = fuse.Job("emulated" if shown else str(out / "run"), BANK, {}, seed, out)
+    config = TeamConfig(scenario, nodes, seconds, seed, str(board), faults)
     if shown:
-        from relpos.emulator.rehearsal import Cast
-
-        cast = Cast(nodes, seconds, scenario, seed, str(board), faults)
         options = live.Options(
             view,
             view_listen,
@@ -83,40 +81,37 @@ def demo(
             sinks=[live.terminal_sink(None)] if terminal else [],
             screen=terminal,
         )
-        _perform(cast, job, options, as_json=json)
+        _fuse_emulated(config, job, options, as_json=json)
         return
+    from relpos.emulator.serving import record_team
+
     with output.working(f"emulating {nodes} nodes for {seconds:g} s"):
-        run = record_team(
-            board=str(board),
-            nodes=nodes,
-            seconds=seconds,
-            scenario=scenario,
-            seed=seed,
-            faults=faults,
-        )
+        run = record_team(config)
     save_run(run, out / "run")
     fuse.fuse_recording(job, run, run.priors, as_json=json, report=True)
 
 
-def _perform(cast: Cast, job: fuse.Job, options: live.Options, *, as_json: bool) -> None:
-    """Let an emulated team walk in real time, its port listened to as a real one's."""
-    from relpos.emulator.rehearsal import Rehearsal
+def _fuse_emulated(
+    config: TeamConfig, job: fuse.Job, options: live.Options, *, as_json: bool
+) -> None:
+    """Emulate a team in real time and fuse what its port sends, as from a real one."""
+    from relpos.emulator.process import EmulatorProcess
     from relpos.runs import Description
 
-    with output.working(f"preparing the walk of {cast.nodes} people"):
-        rehearsal = Rehearsal(cast)
-    with rehearsal:
-        job.prepare(rehearsal.priors)
+    with output.working(f"preparing the walk of {config.nodes} people"):
+        emulator = EmulatorProcess(config)
+    with emulator:
+        job.prepare(emulator.priors)
         fuse.fuse_live(
             job,
-            live.open_port(rehearsal.port, None, teach=True, reopen=False),
+            live.open_port(emulator.port, None, teach=True, reopen=False),
             options,
             description=Description(
-                name=f"{cast.scenario}-{cast.board}-{cast.seed}",
-                source=f"relpos demo --view --nodes {cast.nodes} --seed {cast.seed}",
-                priors=rehearsal.priors,
+                name=f"{config.scenario}-{config.board}-{config.seed}",
+                source=f"relpos demo --view --nodes {config.nodes} --seed {config.seed}",
+                priors=emulator.priors,
             ),
-            priors=rehearsal.priors,
+            priors=emulator.priors,
             as_json=as_json,
-            emulated=rehearsal.over,
+            emulated=emulator.over,
         )

@@ -28,16 +28,16 @@ def emulate(
 
     Prints the pseudo-terminal's path, which `relpos fuse` takes as its SOURCE.
     """
-    from relpos.emulator.team import serve_team
+    from relpos.emulator.serving import UNLIMITED_S, serve_team
+    from relpos.emulator.team import TeamConfig
 
-    serve_team(
-        nodes=nodes,
-        board=str(board),
-        scenario=scenario,
-        speed=speed,
-        seconds=seconds,
-        faults=check_faults(fault, nodes),
-        seed=seed,
-        announce=typer.echo,
+    config = TeamConfig(
+        scenario,
+        nodes,
+        UNLIMITED_S if seconds is None else seconds,
+        seed,
+        str(board),
+        check_faults(fault, nodes),
         key=team_key(key_file),
     )
+    serve_team(config, speed, typer.echo)

@@ -19,9 +19,12 @@ from .pozyx import (
     Pozyx,
     RangeResult,
 )
-from .xbee import BROADCAST, DELIVERED, NO_ACKNOWLEDGEMENT, XbeeModule
+from .xbee import BROADCAST, DELIVERED, NO_ACKNOWLEDGEMENT, Transmission, XbeeModule
 
 Action = Callable[[int], None]
+
+STEP_US = 20_000
+"""How far a team's clock advances between two looks at its serial port."""
 
 NO_ACKNOWLEDGEMENT_US = 40_000
 """Until an XBee gives up: four attempts of 802.15.4 with carrier sensing (assumed)."""
@@ -68,7 +71,7 @@ class UwbModel:
     """Until the initiator gives up on an answer: pypozyx's 25 ms and some margin."""
     collisions: bool = True
     """Two exchanges that overlap in time, with a tag of the one in reach of a tag of the other,
-    both fail: nobody hears through another's preamble, and no tag is in two exchanges at once.
+    both fail: a preamble hides other frames, and no tag is in two exchanges at once.
     Harder than the air is: a strong frame may survive a weak one, and an initiator that waits in
     vain disturbs nobody."""
 
@@ -124,10 +127,10 @@ class UwbAir:
         self._rng = rng
         self._under_way: list[_Exchange] = []
         self.on_end: Callable[[ExchangeRecord], None] | None = None
-        """Told of each exchange when it is over: for measurements and tests."""
+        """Called with each exchange when it is over: for measurements and tests."""
         self.spoil: Callable[[Pozyx, float | None, int], tuple[float | None, bool]] | None = None
         """Fault: (initiator, what would be measured in metres, end of the exchange) -> what is
-        measured instead, and whether a stranger's exchange spoils it."""
+        measured instead, and whether an exchange of foreign tags spoils it."""
 
     def begin_exchange(self, initiator: Pozyx, destination: int, time_us: int) -> None:
         """See :class:`relpos.emulator.pozyx.UwbMedium`."""
@@ -210,7 +213,7 @@ def _uwb_rss_dbm(distance_m: float) -> int:
 class RadioAir:
     """802.15.4 between the modules: the world's loss and delay, in order from each sender.
 
-    A broadcast leaves once: who hears it hears it at the same moment.
+    A broadcast leaves once: all that receive it receive it at the same moment.
     """
 
     def __init__(
@@ -233,27 +236,19 @@ class RadioAir:
         """Fault: (sender, receiver, data, arrival) -> (arrival, data) of what comes instead;
         nothing: lost."""
 
-    def send(
-        self,
-        sender: XbeeModule,
-        destination: int,
-        long: bool,
-        data: bytes,
-        time_us: int,
-        report: Callable[[int, int], None],
-    ) -> None:
+    def send(self, sent: Transmission) -> None:
         """See :class:`relpos.emulator.xbee.Air`."""
         self.counts["sent"] += 1
-        broadcast = destination == BROADCAST and not long
-        others = [m for m in self.modules if m is not sender]
+        broadcast = sent.destination == BROADCAST and not sent.long
+        others = [m for m in self.modules if m is not sent.sender]
         if broadcast:
             receivers = others
-        elif long:
-            receivers = [m for m in others if m.serial_number == destination]
+        elif sent.long:
+            receivers = [m for m in others if m.serial_number == sent.destination]
         else:
-            receivers = [m for m in others if m.address == destination]
-        heard = False
-        done_us = time_us
+            receivers = [m for m in others if m.address == sent.destination]
+        received = False
+        done_us = sent.time_us
         common_s: float | None = None
         for receiver in receivers:
             delay_s = self._world.transmit(self._rng)
@@ -263,25 +258,26 @@ class RadioAir:
             if broadcast:
                 common_s = delay_s = delay_s if common_s is None else common_s
             arrival_us = max(
-                time_us + round(delay_s * 1e6), self._last_us.get(sender.serial_number, 0) + 1
+                sent.time_us + round(delay_s * 1e6),
+                self._last_us.get(sent.sender.serial_number, 0) + 1,
             )
-            arrivals = [(arrival_us, data)]
+            arrivals = [(arrival_us, sent.data)]
             if self.spoil is not None:
-                arrivals = self.spoil(sender, receiver, data, arrival_us)
+                arrivals = self.spoil(sent.sender, receiver, sent.data, arrival_us)
                 if not arrivals:
                     self.counts["lost"] += 1
                     continue
-            heard = True
+            received = True
             done_us = max(done_us, arrival_us)
             for at_us, came in arrivals:
-                self._clock.at(at_us, self._arrival(sender, receiver, came, broadcast))
-        if broadcast or heard:
+                self._clock.at(at_us, self._arrival(sent.sender, receiver, came, broadcast))
+        if broadcast or received:
             status = DELIVERED
         else:
             status = NO_ACKNOWLEDGEMENT
-            done_us = max(time_us + NO_ACKNOWLEDGEMENT_US, done_us)
-        self._last_us[sender.serial_number] = done_us
-        self._clock.at(done_us, lambda now_us: report(now_us, status))
+            done_us = max(sent.time_us + NO_ACKNOWLEDGEMENT_US, done_us)
+        self._last_us[sent.sender.serial_number] = done_us
+        self._clock.at(done_us, lambda now_us: sent.report(now_us, status))
 
     def _arrival(
         self, sender: XbeeModule, receiver: XbeeModule, data: bytes, broadcast: bool

@@ -208,8 +208,8 @@ class EmulatedNode:
         data = wire.encode(wire.COMMAND, self.node, 0, token, values, key)
         self.hand(coordinator, data, at_us)
 
-    def give_key(self, coordinator: XbeeModule, key: bytes, token: int, at_us: int) -> None:
-        """Give a node fresh from the shelf the team's key, likewise."""
+    def set_key(self, coordinator: XbeeModule, key: bytes, token: int, at_us: int) -> None:
+        """Set the team's key in a node that still has the default one, likewise."""
         mask = wire.key_mask(wire.DEFAULT_KEY, token)
         words = [a ^ b for a, b in zip(key, mask, strict=True)]
         values = {"token": token} | {

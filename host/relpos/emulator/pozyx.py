@@ -101,6 +101,10 @@ class RangeResult:
     rss_dbm: int
 
 
+Completion = Callable[[int, RangeResult | None, int, int], None]
+"""(peer, result, error, time) of an exchange that is over."""
+
+
 class UwbMedium(Protocol):
     """The air between tags."""
 
@@ -144,7 +148,7 @@ class Pozyx(I2cDevice):
         """What it makes every range too long by."""
         self.ranging = False
         """Whether an exchange that this tag started is on the air."""
-        self.intercept: Callable[[int, RangeResult | None, int, int], None] | None = None
+        self.intercept: Completion | None = None
         """Fault: takes (peer, result, error, time) of an exchange that this tag started, and sees
         to its :meth:`complete`."""
         self.frozen: Callable[[int], bool] | None = None

@@ -14,14 +14,13 @@ same process :class:`VirtualTimePort` hands out bytes with their virtual times.
 from __future__ import annotations
 
 import array
-import fcntl
 import os
 import select
 import sys
-import termios
 import threading
 import time
 from collections import deque
+from typing import Protocol
 
 import serial
 
@@ -29,7 +28,15 @@ from relpos.errors import DeviceError
 from relpos.link.live import BAUD, READ_TIMEOUT_S
 from relpos.link.xbee import VIRTUAL_TIME, UnknownFrame, encode
 
-from .team import STEP_US, EmulatedTeam
+from .air import STEP_US
+
+try:
+    import fcntl
+    import termios
+except ImportError:  # no POSIX: the rest of the emulator works all the same
+    PSEUDO_TERMINALS = False
+else:
+    PSEUDO_TERMINALS = True
 
 SETTLE_S = 0.1
 """From an open to the first byte: the reader configures and empties its port meanwhile."""
@@ -39,16 +46,38 @@ _POLL_S = 0.02
 _QUIET_POLLS = 5
 
 
+class SerialDevice(Protocol):
+    """A device with a serial port, on a virtual clock that its user advances."""
+
+    seconds: float
+    end_us: int
+
+    @property
+    def time_us(self) -> int:
+        """Virtual time."""
+
+    def run(self, until_us: int) -> list[tuple[int, bytes]]:
+        """Advance to ``until_us``; (time in microseconds, bytes) that left the port."""
+
+    def send(self, data: bytes) -> None:
+        """Bytes that begin to arrive now at the port."""
+
+
 class PseudoTerminal:
-    """Offers ``team`` at :attr:`path`. ``speed`` 1 is real time, 0 as fast as it is read.
+    """Offers ``device`` at :attr:`path`. ``speed`` 1 is real time, 0 as fast as it is read.
 
     Either ``serve`` in this thread, or ``start`` and ``join`` around reading it from another.
+    DeviceError where the system has no pseudo-terminal.
     """
 
-    def __init__(self, team: EmulatedTeam, speed: float = 1.0, *, mark_time: bool = False) -> None:
+    def __init__(
+        self, device: SerialDevice, speed: float = 1.0, *, mark_time: bool = False
+    ) -> None:
+        if not PSEUDO_TERMINALS:
+            raise DeviceError("an emulated serial port needs POSIX pseudo-terminals: not available")
         if speed < 0.0:
             raise DeviceError(f"the speed is not negative, unlike {speed:g}")
-        self.team = team
+        self.device = device
         self.interrupted_chunks = 0
         self._speed = 0.0 if speed == float("inf") else speed
         self._mark_time = mark_time
@@ -133,28 +162,28 @@ class PseudoTerminal:
             self._serve()
         except KeyboardInterrupt:
             print(
-                f"relpos emulate: stopped after {self.team.time_us * 1e-6:.1f} s of the walk",
+                f"relpos emulate: stopped after {self.device.time_us * 1e-6:.1f} s of the walk",
                 file=sys.stderr,
             )
             return
         self.drain()
-        print(f"relpos emulate: the walk of {self.team.seconds:g} s is over", file=sys.stderr)
+        print(f"relpos emulate: the walk of {self.device.seconds:g} s is over", file=sys.stderr)
 
     def _serve(self) -> None:
-        team = self.team
+        device = self.device
         anchor_wall_s = time.monotonic()
-        anchor_us = team.time_us
-        while team.time_us < team.end_us and not self._stop.is_set():
+        anchor_us = device.time_us
+        while device.time_us < device.end_us and not self._stop.is_set():
             waited = self._wait_for_reader()
-            for time_us, data in team.run(min(team.time_us + STEP_US, team.end_us)):
+            for time_us, data in device.run(min(device.time_us + STEP_US, device.end_us)):
                 if self._mark_time:
                     data = encode(UnknownFrame(VIRTUAL_TIME, time_us.to_bytes(8, "big"))) + data
                 waited |= self._write(time_us, data)
             if waited:
-                anchor_wall_s, anchor_us = time.monotonic(), team.time_us
+                anchor_wall_s, anchor_us = time.monotonic(), device.time_us
             self._listen(0.0)
             if self._speed:
-                due_s = anchor_wall_s + (team.time_us - anchor_us) * 1e-6 / self._speed
+                due_s = anchor_wall_s + (device.time_us - anchor_us) * 1e-6 / self._speed
                 while (left_s := due_s - time.monotonic()) > 0 and not self._stop.is_set():
                     self._listen(min(left_s, _POLL_S))
 
@@ -210,7 +239,7 @@ class PseudoTerminal:
                 data = os.read(self._master, 4096)
             except (BlockingIOError, OSError):
                 return
-            self.team.send(data)
+            self.device.send(data)
 
     def drain(self) -> None:
         """Give a reader the time to take what is left: closing would throw it away."""

@@ -7,7 +7,7 @@ the recording's clock. Nothing is taken from the recording but its samples.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,7 +31,7 @@ from relpos.simulation.world import World
 from .air import Action, UwbAir, VirtualClock
 from .node import BoardKind, EmulatedNode, NodeErrors
 from .surroundings import FloatArray, Surroundings
-from .xbee import DELIVERED, XbeeModule
+from .xbee import DELIVERED, Transmission, XbeeModule
 
 GRID_HZ = 200.0
 """The recording is brought to this uniform rate before the chip's filter feels it."""
@@ -168,29 +168,21 @@ class _Recorder:
         self.motions: list[Motion] = []
         self.steps: list[Step] = []
 
-    def send(
-        self,
-        sender: XbeeModule,
-        destination: int,
-        long: bool,
-        data: bytes,
-        time_us: int,
-        report: Callable[[int, int], None],
-    ) -> None:
+    def send(self, sent: Transmission) -> None:
         """See :class:`relpos.emulator.xbee.Air`."""
         try:
-            frame = wire.decode(data)
+            frame = wire.decode(sent.data)
         except wire.FrameError:
-            arrival_s = time_us * 1e-6
+            arrival_s = sent.time_us * 1e-6
         else:
             # The node's clock is the recording's: as if the frame had arrived when it was stamped.
-            arrival_s = float(frame.values.get("time_s", time_us * 1e-6))
-        for observation in self.decoder.feed(data, arrival_s):
+            arrival_s = float(frame.values.get("time_s", sent.time_us * 1e-6))
+        for observation in self.decoder.feed(sent.data, arrival_s):
             if isinstance(observation, Motion):
                 self.motions.append(observation)
             elif isinstance(observation, Step):
                 self.steps.append(observation)
-        report(time_us, DELIVERED)
+        sent.report(sent.time_us, DELIVERED)
 
 
 def _unless_answered(

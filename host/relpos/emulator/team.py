@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,78 +22,78 @@ from relpos.simulation.team import Scenario, make_team
 from relpos.simulation.walker import RATE_HZ, WalkerTruth
 from relpos.simulation.world import FloatArray
 
-from .air import RadioAir, UwbAir, UwbModel, VirtualClock
+from .air import STEP_US, RadioAir, UwbAir, UwbModel, VirtualClock
 from .faults import FaultSpec, parse_faults
-from .faults_injection import FaultInjector, prepare_errors
+from .faults.boards import faulty_clock
+from .faults.injection import inject
 from .node import BoardKind, EmulatedNode, NodeErrors, draw_node_errors, draw_uncalibrated_errors
 from .pozyx import Pozyx
 from .surroundings import Surroundings
 from .xbee import XbeeModule, line_time_us
 
-if TYPE_CHECKING:
-    from relpos.runs import Run
-
-STEP_US = 20_000
-"""How far the clock goes in one step of :meth:`EmulatedTeam.stream`."""
 SET_UP_AFTER_US = 1_500_000
 """After power-on: the boards have booted and their tags, too."""
 BEACONS_FROM_US = 4_000_000
-"""Everybody has been switched on and set up: a beacon under a key not known yet is refused."""
+"""All nodes have been switched on and set up: a beacon under a key not known yet is refused."""
 TRUTH_PERIOD_S = 0.2
 PRIOR_SIGMA_M = 0.1
 PRIOR_SIGMA_RAD = 0.1
 """How well the start is known where a scenario has a common one: feet on a mark, facing a wall."""
-UNLIMITED_S = 1800.0
-"""Walk prepared where none was asked for: for six walkers half an hour takes 6 s and 0.6 GB."""
 BYTES_PER_SAMPLE = 280.0
 """Of a prepared walk (27 numbers of truth, 6 once more for the chip); measured, 20 walkers, 2 h."""
 
 
-class EmulatedTeam:
-    """Six people, say, and everything they wear.
+@dataclass(frozen=True)
+class TeamConfig:
+    """Who is emulated, and how.
 
-    ``configured`` nodes know the team's size and their wearer's leg length from the stature, as
-    after ``relpos node set``; others run on the firmware's defaults. All are given the team's
-    ``key``. ``node_errors`` replaces what is drawn by the seed: nodes from the shelf, or in
-    scenarios "turntable" and "bench" such as nobody has
-    calibrated. ``faults`` are SPECs of :mod:`relpos.emulator.faults`; FaultError where one makes
-    no sense, DataError where the walk does not fit into memory. ``beacons``: the coordinator
-    sends them by itself, as a host would in real time. The truth methods are for evaluation alone.
+    ``nodes`` is a count or the node numbers. ``faults`` are SPECs of :mod:`relpos.emulator.faults`.
+    ``beacons``: the coordinator sends them by itself, as a host would in real time. All nodes get
+    the team's ``key``. ``configured`` nodes know the team's size and the wearer's leg length from
+    the stature, as after ``relpos node set``; others run on the firmware's defaults.
+    ``node_errors`` is (seed, node) -> errors of its chips and clock; None draws usual ones, in
+    the scenarios "turntable" and "bench" those of uncalibrated nodes.
     """
 
-    def __init__(
-        self,
-        scenario: str | Scenario = "paper",
-        nodes: int | Sequence[int] = 6,
-        seconds: float = 300.0,
-        seed: int = 0,
-        board: BoardKind | str = BoardKind.NATIVE,
-        *,
-        collisions: bool = True,
-        configured: bool = True,
-        node_errors: Callable[[int, int], NodeErrors] | None = None,
-        key: bytes = wire.DEFAULT_KEY,
-        faults: Sequence[str | FaultSpec] = (),
-        beacons: bool = False,
-    ) -> None:
-        if node_errors is None:
-            uncalibrated = scenario in ("turntable", "bench")
-            node_errors = draw_uncalibrated_errors if uncalibrated else draw_node_errors
-        _check_memory(nodes if isinstance(nodes, int) else len(nodes), seconds)
-        walkers, self.world = make_team(scenario, nodes, seconds, seed)
+    scenario: str | Scenario = "paper"
+    nodes: int | Sequence[int] = 6
+    seconds: float = 300.0
+    seed: int = 0
+    board: BoardKind | str = BoardKind.NATIVE
+    faults: Sequence[str | FaultSpec] = ()
+    beacons: bool = False
+    key: bytes = wire.DEFAULT_KEY
+    collisions: bool = True
+    configured: bool = True
+    node_errors: Callable[[int, int], NodeErrors] | None = None
+
+    def errors_of(self, node: int) -> NodeErrors:
+        """How the node's chips and clock differ from the ideal."""
+        if self.node_errors is not None:
+            return self.node_errors(self.seed, node)
+        uncalibrated = self.scenario in ("turntable", "bench")
+        return (draw_uncalibrated_errors if uncalibrated else draw_node_errors)(self.seed, node)
+
+
+class EmulatedTeam:
+    """People and everything they wear, with a coordinator whose serial port a host can use.
+
+    FaultError where a fault makes no sense, DataError where the walk does not fit into memory.
+    The truth methods are for evaluation alone.
+    """
+
+    def __init__(self, config: TeamConfig) -> None:
+        nodes, seed = config.nodes, config.seed
+        _check_memory(nodes if isinstance(nodes, int) else len(nodes), config.seconds)
+        walkers, self.world = make_team(config.scenario, nodes, config.seconds, seed)
         self.walkers: dict[int, WalkerTruth] = {walker.node: walker for walker in walkers}
-        self.seconds = seconds
-        self.key = key
-        self.end_us = round(seconds * 1e6)
+        self.seconds = config.seconds
+        self.key = config.key
+        self.end_us = round(config.seconds * 1e6)
         self.clock = VirtualClock()
         uwb_rng, radio_rng = (np.random.default_rng([seed, k, 0xA17]) for k in (1, 2))
-        self.uwb = UwbAir(
-            self.clock,
-            self.world,
-            self._tag_position_m,
-            uwb_rng,
-            UwbModel(collisions=collisions),
-        )
+        model = UwbModel(collisions=config.collisions)
+        self.uwb = UwbAir(self.clock, self.world, self._tag_position_m, uwb_rng, model)
         self.radio = RadioAir(self.clock, self.world, self._module_distance_m, radio_rng)
         self._output: list[tuple[int, bytes]] = []
         self.host_fault: Callable[[int], int | None] | None = None
@@ -105,14 +105,13 @@ class EmulatedTeam:
         self.nodes: dict[int, EmulatedNode] = {}
         self._walker_of_tag: dict[Pozyx, WalkerTruth] = {}
         self._walker_of_module: dict[XbeeModule, WalkerTruth] = {}
-        specs = parse_faults(faults, list(self.walkers))
+        specs = parse_faults(config.faults, list(self.walkers))
         try:
             for walker in walkers:
-                errors = prepare_errors(node_errors(seed, walker.node), walker.node, specs)
-                self._add(walker, board, errors, configured)
-            if specs:
-                FaultInjector(self, specs, seed)
-            if beacons:
+                errors = faulty_clock(config.errors_of(walker.node), walker.node, specs)
+                self._add(walker, config.board, errors, config.configured)
+            inject(self, specs, seed)
+            if config.beacons:
                 self._beacons = BeaconSchedule(self.walkers)
                 self._beacon_counter = 0
                 self.clock.at(BEACONS_FROM_US, self._send_beacon)
@@ -140,7 +139,7 @@ class EmulatedTeam:
         self._walker_of_module[node.radio] = walker
         if self.key != wire.DEFAULT_KEY:
             at_us = errors.power_on_us + SET_UP_AFTER_US - 200_000
-            node.give_key(self.coordinator, self.key, 0xFE00, at_us)
+            node.set_key(self.coordinator, self.key, 0xFE00, at_us)
         if configured:
             at_us = errors.power_on_us + SET_UP_AFTER_US
             leg_mm = round(LEG_OF_STATURE * walker.person.stature_m * 1000.0)
@@ -174,7 +173,7 @@ class EmulatedTeam:
         self.clock.at(arrived_us, lambda now_us: self.coordinator.from_serial(now_us, data))
 
     def _send_beacon(self, now_us: int) -> None:
-        """Send one as a host would, with counters of their own: no command is disturbed by them."""
+        """Send one as a host would. They have counters of their own: they disturb no command."""
         self.clock.at(now_us + round(BEACON_PERIOD_S * 1e6), self._send_beacon)
         self._beacon_counter += 1
         values = self._beacons.values(now_us * 1e-6)
@@ -224,7 +223,7 @@ class EmulatedTeam:
                                walker.heading_rad))  # fmt: skip
 
     def truth(self, period_s: float = TRUTH_PERIOD_S) -> list[Truth]:
-        """True poses of everybody, by time."""
+        """True poses of all nodes, by time."""
         rows = []
         stride = max(round(period_s * RATE_HZ), 1)
         for node, walker in self.walkers.items():
@@ -259,9 +258,11 @@ class EmulatedTeam:
         return self._walker_of_tag[tag].position_at(time_us * 1e-6)
 
     def _module_distance_m(self, one: XbeeModule, other: XbeeModule, time_us: int) -> float:
-        return math.dist(self._place_m(one, time_us), self._place_m(other, time_us))
+        return math.dist(
+            self._module_position_m(one, time_us), self._module_position_m(other, time_us)
+        )
 
-    def _place_m(self, module: XbeeModule, time_us: int) -> FloatArray:
+    def _module_position_m(self, module: XbeeModule, time_us: int) -> FloatArray:
         walker = self._walker_of_module.get(module)
         if walker is None:  # the coordinator lies on a table in the middle
             return np.array((self.world.size_m[0] / 2.0, self.world.size_m[1] / 2.0, 1.0))
@@ -280,106 +281,8 @@ def _check_memory(nodes: int, seconds: float) -> None:
 
 
 def physical_memory_gb() -> float:
-    """Size of this computer's memory; infinite where it does not tell."""
+    """Size of this computer's memory; infinite where it is unknown."""
     try:
         return 1e-9 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):
         return math.inf
-
-
-def serve_team(
-    *,
-    nodes: int,
-    board: str,
-    scenario: str,
-    speed: float,
-    seconds: float | None,
-    faults: Sequence[str],
-    seed: int,
-    announce: Callable[[str], None],
-    key: bytes = wire.DEFAULT_KEY,
-) -> None:
-    """Body of ``relpos emulate``: the team behind a pseudo-terminal until its walk ends or Ctrl-C.
-
-    ``announce(path)`` is called once the pseudo-terminal is there. ``speed`` 0 is as fast as the
-    reader takes it; other than 1, time frames mark the virtual time (see ``pty``) and the team
-    sends its beacons itself, which a host cannot time.
-    """
-    from .pty import PseudoTerminal
-
-    with (
-        EmulatedTeam(
-            scenario,
-            nodes,
-            UNLIMITED_S if seconds is None else seconds,
-            seed,
-            board,
-            faults=faults,
-            key=key,
-            beacons=speed != 1.0,
-        ) as team,
-        PseudoTerminal(team, speed=speed, mark_time=speed != 1.0) as terminal,
-    ):
-        announce(terminal.path)
-        terminal.serve()
-
-
-def record_team(
-    *,
-    board: str,
-    nodes: int,
-    seconds: float,
-    scenario: str,
-    seed: int,
-    faults: Sequence[str] = (),
-) -> Run:
-    """Body of ``relpos demo``'s first half: the team through a real serial port into a Run.
-
-    The bytes go through a pseudo-terminal and pyserial as from a real coordinator, as fast as they
-    are taken; each arrives at its virtual time, so that the same arguments give the same Run.
-    """
-    from relpos.link.live import Link, observe
-    from relpos.measurements import Event, Motion, Range, Status, Step
-    from relpos.measurements import Heading, Height  # isort: skip
-    from relpos.runs import Description, NodeInfo, Run
-
-    from .pty import PseudoTerminal
-
-    link = Link()
-    measurements: list[Motion | Range | Height | Heading] = []
-    statuses: list[Status] = []
-    steps: list[Step] = []
-    with EmulatedTeam(scenario, nodes, seconds, seed, board, faults=faults, beacons=True) as team:
-        with PseudoTerminal(team, speed=0.0) as terminal, terminal.open_port() as port:
-            terminal.start()
-            for batch in observe(port, link, port.virtual_time_s):
-                for observation in batch:
-                    if isinstance(observation, Status):
-                        statuses.append(observation)
-                    elif isinstance(observation, Step):
-                        steps.append(observation)
-                    elif not isinstance(observation, Event):
-                        measurements.append(observation)
-                if port.exhausted:
-                    break
-            terminal.join()
-        priors = team.priors()
-        return Run(
-            name=f"{scenario}-{board}-{seed}",
-            description=Description(
-                source=f"relpos demo --board {board} --scenario {scenario} --nodes {nodes} "
-                f"--seconds {seconds:g} --seed {seed}"
-                + "".join(f" --fault {fault}" for fault in faults),
-                heading_known=True,
-                priors=tuple(priors),
-                nodes={
-                    node: NodeInfo(stature_m=walker.person.stature_m)
-                    for node, walker in team.walkers.items()
-                },
-            ),
-            measurements=tuple(sorted(measurements, key=lambda m: m.time_s)),
-            statuses=tuple(sorted(statuses, key=lambda s: s.time_s)),
-            steps=tuple(sorted(steps, key=lambda s: s.time_s)),
-            truth=tuple(team.truth()),
-            counters={name: int(count) for name, count in link.summary().items()},
-        )

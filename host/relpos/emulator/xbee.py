@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 from relpos.link.xbee import (
@@ -41,6 +42,10 @@ HARDWARE_RESET = 0
 AT_OK = 0
 AT_BAD_COMMAND = 2
 AT_BAD_PARAMETER = 3
+
+Report = Callable[[int, int], None]
+"""(time, transmit status) -> None."""
+
 _BAUD_RATES = {1200: 0, 2400: 1, 4800: 2, 9600: 3, 19200: 4, 38400: 5, 57600: 6, 115200: 7}
 
 
@@ -49,19 +54,23 @@ def line_time_us(byte_count: int, baud: int) -> int:
     return -(-byte_count * 10_000_000 // baud)
 
 
-class Air(Protocol):
-    """What a module needs of the radio: who hears it, when, and how loud."""
+@dataclass(frozen=True, slots=True)
+class Transmission:
+    """What a module hands to the air: to a 16-bit address, or a serial number where ``long``."""
 
-    def send(
-        self,
-        sender: XbeeModule,
-        destination: int,
-        long: bool,
-        data: bytes,
-        time_us: int,
-        report: Callable[[int, int], None],
-    ) -> None:
-        """Transmit; later call ``report(time_us, status)`` once."""
+    sender: XbeeModule
+    destination: int
+    long: bool
+    data: bytes
+    time_us: int
+    report: Report
+
+
+class Air(Protocol):
+    """What a module needs of the radio: who receives it, when, and how loud."""
+
+    def send(self, sent: Transmission) -> None:
+        """Transmit; later call ``sent.report(time_us, status)`` once."""
 
 
 class XbeeModule:
@@ -132,7 +141,7 @@ class XbeeModule:
             self._handle(frame, time_us)
 
     def restart(self, time_us: int) -> None:
-        """Supply off and on again: what has come of a frame is lost; the reset is told."""
+        """Supply off and on again: a frame half received is lost; the reset is reported."""
         self._parser = Parser(escaped=self._escaped)
         self._line_free_us = time_us
         self._emit(time_us, UnknownFrame(MODEM_STATUS, bytes((HARDWARE_RESET,))))
@@ -169,7 +178,7 @@ class XbeeModule:
         if len(data) > MOST_PAYLOAD:
             report(time_us, TOO_LARGE)
             return
-        self.air.send(self, destination, long, data, time_us, report)
+        self.air.send(Transmission(self, destination, long, data, time_us, report))
 
     def _at(self, frame: AtCommand, time_us: int) -> None:
         command = frame.command.upper()

@@ -30,7 +30,7 @@ from relpos.emulator.surroundings import (
     draw_inertial_errors,
     draw_magnetic_errors,
 )
-from relpos.emulator.xbee import DELIVERED, XbeeModule, line_time_us
+from relpos.emulator.xbee import DELIVERED, Transmission, XbeeModule, line_time_us
 from relpos.link.beacon import BEACON_PERIOD_S, BeaconSchedule
 from relpos.protocol import messages as wire
 from relpos.simulation.team import make_team
@@ -132,25 +132,17 @@ class Service:
 
     # -- the radio (Air) ------------------------------------------------------------------------
 
-    def send(
-        self,
-        sender: XbeeModule,
-        destination: int,
-        long: bool,
-        data: bytes,
-        time_us: int,
-        report: Callable[[int, int], None],
-    ) -> None:
-        """Deliver everything; what the node sends is decoded and kept."""
+    def send(self, sent: Transmission) -> None:
+        """Deliver everything; what the node sends is decoded and stored."""
 
         def arrive(now_us: int) -> None:
-            report(now_us, DELIVERED)
+            sent.report(now_us, DELIVERED)
             try:
-                self.frames.append(wire.decode(data))
+                self.frames.append(wire.decode(sent.data))
             except wire.FrameError as error:
                 self.counts[type(error).__name__] += 1
 
-        self._at(time_us + AIR_US, arrive)
+        self._at(sent.time_us + AIR_US, arrive)
 
     def _command(self, now_us: int) -> None:
         code, value = next(self._commands)

@@ -1,19 +1,19 @@
 """An emulated team in a process of its own, behind a pseudo-terminal, for a live session.
 
-The session is not disturbed by what emulating costs, and knows of the team what a leader knows:
-where it starts.
+The session does not lose time to the emulation, and knows only where the team starts.
 """
 
 from __future__ import annotations
 
 import multiprocessing
 import signal
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from relpos.errors import DeviceError, RelposError
 from relpos.measurements import Prior
+
+from .serving import team_at_terminal
+from .team import TeamConfig
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -21,31 +21,18 @@ if TYPE_CHECKING:
 ENDING_S = 5.0
 
 
-@dataclass(frozen=True)
-class Cast:
-    """Who is to be emulated, how; see :class:`~relpos.emulator.team.EmulatedTeam`."""
-
-    nodes: int
-    seconds: float
-    scenario: str = "paper"
-    seed: int = 0
-    board: str = "native"
-    faults: Sequence[str] = ()
-    speed: float = 1.0
-
-
-class Rehearsal:
+class EmulatorProcess:
     """The team at ``port`` until its walk ends or ``close``; ``priors`` is its known start.
 
     The walk begins when the port is opened. DeviceError where the team cannot be emulated.
     """
 
-    def __init__(self, cast: Cast) -> None:
+    def __init__(self, config: TeamConfig, speed: float = 1.0) -> None:
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
         self._pipe: Connection = ours
         self._process = context.Process(
-            target=_play, args=(cast, theirs), name="relpos emulator", daemon=True
+            target=_serve, args=(config, speed, theirs), name="relpos emulator", daemon=True
         )
         self._process.start()
         theirs.close()
@@ -59,7 +46,7 @@ class Rehearsal:
         self.port: str = answer[0]
         self.priors: tuple[Prior, ...] = answer[1]
 
-    def __enter__(self) -> Rehearsal:
+    def __enter__(self) -> EmulatorProcess:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -79,27 +66,12 @@ class Rehearsal:
             self._process.join()
 
 
-def _play(cast: Cast, pipe: Connection) -> None:
+def _serve(config: TeamConfig, speed: float, pipe: Connection) -> None:
     """Body of the process: ends with the walk, or when the other end of the pipe is closed."""
-    from relpos.emulator.pty import PseudoTerminal
-    from relpos.emulator.team import EmulatedTeam
-
     # Ctrl-C in the terminal is for the session.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    marked = cast.speed != 1.0
     try:
-        with (
-            EmulatedTeam(
-                cast.scenario,
-                cast.nodes,
-                cast.seconds,
-                cast.seed,
-                cast.board,
-                faults=cast.faults,
-                beacons=marked,
-            ) as team,
-            PseudoTerminal(team, speed=cast.speed, mark_time=marked) as terminal,
-        ):
+        with team_at_terminal(config, speed) as (team, terminal):
             terminal.start()
             pipe.send((terminal.path, tuple(team.priors())))
             while not terminal.finished:

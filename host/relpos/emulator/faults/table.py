@@ -1,27 +1,19 @@
-"""Faults as a vocabulary: what can be made to go wrong, in words that a command line takes.
+"""Every fault that can be injected: :data:`FAULTS`, and why others are refused: :data:`REFUSED`.
 
-``TARGET:BEHAVIOUR[:KEY=VALUE,...]``. The table :data:`FAULTS` is the one place that says what there
-is, which keys each takes and what node and host have to do about it; :data:`REFUSED` says why the
-other combinations make no sense. ``fault_injection`` makes them happen.
+This table alone says which faults exist, which keys each takes and what node and host must do
+about it. `docs/reliability.md` prints it beside what was measured.
 """
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-
-from relpos.errors import RelposError
-
-
-class FaultError(RelposError):
-    """A fault that nobody knows, or that makes no sense; the words say what is allowed."""
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """What a fault may be given besides node, from and to. A number, or one of ``choices``."""
+    """A parameter of a fault besides node, from and to: a number, or one of ``choices``."""
 
     name: str
     meaning: str
@@ -34,9 +26,9 @@ class Key:
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One line of the vocabulary.
+    """One line of the table.
 
-    ``team`` faults concern everybody and take no node; ``whole_run`` ones take neither from nor to,
+    ``team`` faults concern all nodes and take no node; ``whole_run`` ones take neither from nor to,
     ``momentary`` ones happen at ``from`` and take no to. ``must`` is what node and host have to do.
     """
 
@@ -78,7 +70,7 @@ TARGETS: Mapping[str, str] = {
     "host": "the laptop at the coordinator's serial port",
 }
 
-_SHARE = Key("rate", "share of them", 0.3, "", 0.0, 1.0)
+_FRACTION = Key("rate", "share of them", 0.3, "", 0.0, 1.0)
 _ANSWER = Key("value", "what it answers", "random", choices=("random", "zeros", "ones"))
 
 
@@ -125,7 +117,7 @@ FAULTS: tuple[Fault, ...] = (
         "intermittent",
         "does not answer a share of the transactions (loose contact)",
         "bus errors and missed ticks counted and flagged, the rest integrated",
-        (_SHARE,),
+        (_FRACTION,),
     ),
     Fault(
         "imu",
@@ -161,7 +153,7 @@ FAULTS: tuple[Fault, ...] = (
         "intermittent",
         "does not answer a share of the transactions",
         "headings that are reported are true; motion unharmed",
-        (_SHARE,),
+        (_FRACTION,),
     ),
     Fault("pozyx", "off", "no supply: does not answer, restarts", _NO_RANGES),
     Fault("pozyx", "stuck", "tells the same row again for every exchange", _NO_RANGES),
@@ -192,7 +184,7 @@ FAULTS: tuple[Fault, ...] = (
         "intermittent",
         "does not answer a share of the transactions",
         "failures counted, the ranges that come are true",
-        (_SHARE,),
+        (_FRACTION,),
     ),
     Fault(
         "pozyx",
@@ -244,7 +236,7 @@ FAULTS: tuple[Fault, ...] = (
         "intermittent",
         "loses a share of the serial frames, either way",
         _RADIO,
-        (_SHARE,),
+        (_FRACTION,),
         coordinator=True,
     ),
     Fault(
@@ -313,35 +305,35 @@ FAULTS: tuple[Fault, ...] = (
         "bitflip",
         "frames arrive with a bit turned over, under a right XBee checksum",
         f"refused, counted; {_RADIO}",
-        (_SHARE,),
+        (_FRACTION,),
     ),
     Fault(
         "radio",
         "truncate",
         "frames arrive cut, under a right XBee checksum",
         f"refused, counted; {_RADIO}",
-        (_SHARE,),
+        (_FRACTION,),
     ),
     Fault(
         "radio",
         "duplicate",
         "frames arrive twice",
         "the second counted and refused; no motion, range or command twice",
-        (_SHARE,),
+        (_FRACTION,),
     ),
     Fault(
         "radio",
         "reorder",
         "frames are held back and overtaken",
         "late motion is not used; ranges are, at their time; 0 motion lost",
-        (_SHARE, _s("held for", 2.5)),
+        (_FRACTION, _s("held for", 2.5)),
     ),
     Fault(
         "radio",
         "replay",
         "frames are recorded and sent again later",
         "refused, counted; no motion, range or command twice",
-        (_SHARE, _s("later by", 20.0)),
+        (_FRACTION, _s("later by", 20.0)),
     ),
     Fault(
         "radio",
@@ -377,7 +369,7 @@ FAULTS: tuple[Fault, ...] = (
         "wrong",
         "the direct path is blocked: ranges are too long",
         "not to be seen from inside: the fusion weighs what contradicts the motion",
-        (_SHARE, Key("value", "at most longer by", 3.0, "m", 0.0, 100.0)),
+        (_FRACTION, Key("value", "at most longer by", 3.0, "m", 0.0, 100.0)),
         team=True,
     ),
     Fault(
@@ -392,7 +384,7 @@ FAULTS: tuple[Fault, ...] = (
         "nack",
         "a share of all transactions is not acknowledged",
         "bus errors counted, gaps flagged, no wrong value used",
-        (_SHARE, Key("part", "which acknowledge", "address", choices=("address", "data"))),
+        (_FRACTION, Key("part", "which acknowledge", "address", choices=("address", "data"))),
     ),
     Fault(
         "node",
@@ -456,155 +448,3 @@ REFUSED: Mapping[tuple[str, str], str] = {
     ("node", "stuck"): "a node that executes nothing is clock:off",
     ("bus", "off"): "that is bus:stuck",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class FaultSpec:
-    """A fault that is to happen: to ``node`` (None: all), while ``from_s <= t < to_s``."""
-
-    fault: Fault
-    node: int | None = None
-    from_s: float = 0.0
-    to_s: float = math.inf
-    values: Mapping[str, float | str] = field(default_factory=dict)
-
-    def number(self, name: str) -> float:
-        """A key's number, given or default."""
-        value = self._value(name)
-        assert not isinstance(value, str)
-        return value
-
-    def choice(self, name: str) -> str:
-        """A key's word, given or default."""
-        value = self._value(name)
-        assert isinstance(value, str)
-        return value
-
-    def _value(self, name: str) -> float | str:
-        if name in self.values:
-            return self.values[name]
-        return next(key.default for key in self.fault.keys if key.name == name)
-
-    @property
-    def from_us(self) -> int:
-        """Begin, in virtual microseconds."""
-        return round(self.from_s * 1e6)
-
-    @property
-    def to_us(self) -> int | None:
-        """End, in virtual microseconds; None: never."""
-        return None if math.isinf(self.to_s) else round(self.to_s * 1e6)
-
-    def active(self, time_us: int) -> bool:
-        """Whether it lasts at that moment."""
-        return self.from_us <= time_us and (self.to_us is None or time_us < self.to_us)
-
-
-def _known(words: Iterable[str]) -> str:
-    return ", ".join(words)
-
-
-def parse_fault(text: str, nodes: Sequence[int] | None = None) -> FaultSpec:
-    """One SPEC. ``nodes`` are those that there are, where that is known.
-
-    Raises :class:`FaultError`, one line that says what is allowed.
-    """
-    target, _, rest = text.partition(":")
-    behaviour, _, keys = rest.partition(":")
-    if target not in TARGETS:
-        raise FaultError(f"fault '{text}': unknown target '{target}': {_known(TARGETS)}")
-    allowed = [f.behaviour for f in FAULTS if f.target == target]
-    fault = BY_NAME.get((target, behaviour))
-    if fault is None:
-        reason = REFUSED.get((target, behaviour))
-        if not behaviour:
-            why = "no behaviour given"
-        elif reason is not None:
-            why = f"refused: {reason}"
-        else:
-            why = f"{target} has no '{behaviour}'"
-            near = difflib.get_close_matches(behaviour, allowed, 1)
-            why += f" (did you mean '{near[0]}'?)" if near else ""
-        raise FaultError(f"fault '{text}': {why}; {target} can be {_known(allowed)}")
-    given: dict[str, str] = {}
-    for pair in keys.split(",") if keys else ():
-        name, equals, value = pair.partition("=")
-        if not equals or not value:
-            raise FaultError(f"fault '{text}': '{pair}' is not KEY=VALUE")
-        if name not in fault.key_names():
-            raise FaultError(
-                f"fault '{text}': {fault.name} takes no '{name}'; "
-                f"its keys: {_known(fault.key_names()) or 'none'}"
-            )
-        if name in given:
-            raise FaultError(f"fault '{text}': '{name}' is given twice")
-        given[name] = value
-    return _spec(text, fault, given, nodes)
-
-
-def _spec(
-    text: str, fault: Fault, given: Mapping[str, str], nodes: Sequence[int] | None
-) -> FaultSpec:
-    values: dict[str, float | str] = {}
-    for key in fault.keys:
-        if key.name in given:
-            word = given[key.name]
-            if key.choices:
-                if word not in key.choices:
-                    raise FaultError(
-                        f"fault '{text}': {key.name} is one of {_known(key.choices)}, not '{word}'"
-                    )
-                values[key.name] = word
-            else:
-                values[key.name] = _number(text, key.name, word, key.low, key.high)
-    node = None
-    if "node" in given:
-        node = int(_number(text, "node", given["node"], 0, 254, whole=True))
-        if node == 0 and not fault.coordinator:
-            raise FaultError(
-                f"fault '{text}': node 0 is the coordinator, which has no {fault.name}"
-            )
-        if node and nodes is not None and node not in nodes:
-            raise FaultError(
-                f"fault '{text}': there is no node {node}; nodes: {_known(map(str, nodes))}"
-            )
-    from_s = _number(text, "from", given["from"], 0.0, 86_400.0) if "from" in given else 0.0
-    to_s = _number(text, "to", given["to"], 0.0, 86_400.0) if "to" in given else math.inf
-    if to_s <= from_s:
-        raise FaultError(f"fault '{text}': it ends at {to_s:g} s, before it begins at {from_s:g} s")
-    if fault.momentary and "from" not in given:
-        raise FaultError(f"fault '{text}': {fault.name} happens at a moment: give from=SECONDS")
-    return FaultSpec(fault, node, from_s, to_s, values)
-
-
-def _number(
-    text: str, name: str, word: str, low: float, high: float, *, whole: bool = False
-) -> float:
-    try:
-        value = float(word)
-    except ValueError:
-        value = math.nan
-    if not low <= value <= high or (whole and value != int(value)):
-        kind = "a whole number" if whole else "a number"
-        raise FaultError(f"fault '{text}': {name} is {kind} from {low:g} to {high:g}, not '{word}'")
-    return value
-
-
-def parse_faults(
-    faults: Iterable[str | FaultSpec], nodes: Sequence[int] | None = None
-) -> list[FaultSpec]:
-    """Every SPEC of them; what is a FaultSpec already stays as it is."""
-    return [f if isinstance(f, FaultSpec) else parse_fault(f, nodes) for f in faults]
-
-
-def help_text() -> str:
-    """The vocabulary as a command's help shows it: one paragraph a target."""
-    parts = ["SPEC is TARGET:BEHAVIOUR[:KEY=VALUE,...], its times from and to in seconds."]
-    for target, meaning in TARGETS.items():
-        behaviours = []
-        for fault in FAULTS:
-            if fault.target == target:
-                keys = [k for k in fault.key_names() if k not in ("node", "from", "to")]
-                behaviours.append(fault.behaviour + (f" ({', '.join(keys)})" if keys else ""))
-        parts.append(f"{target} - {meaning}: {', '.join(behaviours)}.")
-    return "\n\n".join(parts)
