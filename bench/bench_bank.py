@@ -5,7 +5,6 @@
 An epoch is 2 s: two motions of each user and about 5.3 ranges. For each number of hypotheses:
 
 * measurements handed over as arrays, epoch by epoch (``BankCore.move``, ``update``, ``settle``);
-* all epochs handed over at once (``BankCore.follow``), where one hypothesis is enough;
 * one measurement after another through the public interface, an estimate a second, hearing and
   copies for going back included; with the same state (no range biases), its estimates looked at
   by nobody or all of them, and with default settings.
@@ -24,10 +23,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from relpos import fusion
-from relpos.fusion.bank.core import BankCore, Epochs
+from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.estimator import Bank
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.switching import SwitchingEstimator
+from relpos.measurements import Motion, Range
 from relpos.simulation.paper import SimulatedRun, simulate_paper
 
 EPOCH_S = 2.0
@@ -41,36 +41,38 @@ def core_of(run: SimulatedRun, hypotheses: int) -> BankCore:
     return core
 
 
-def core_us(run: SimulatedRun, epochs: Epochs, hypotheses: int) -> dict[str, np.ndarray]:
+def core_us(run: SimulatedRun, hypotheses: int) -> dict[str, np.ndarray]:
     """Microseconds of each epoch's parts (E,), NaN where there were others than so many."""
+    motions = [m for m in run.measurements if isinstance(m, Motion)]
+    ranges = [m for m in run.measurements if isinstance(m, Range)]
+    rows = np.array([m.node - 1 for m in motions])
+    moves = np.array([(m.dx_m, m.dy_m, m.dtheta_rad, 1.0) for m in motions])
+    first = np.array([m.node - 1 for m in ranges])
+    second = np.array([m.peer - 1 for m in ranges])
+    range_m, dz_m = np.array([m.range_m for m in ranges]), np.zeros(len(ranges))
+    ends_s = np.arange(EPOCH_S, run.measurements[-1].time_s + EPOCH_S, EPOCH_S)
+    move_ends = np.searchsorted([m.time_s for m in motions], ends_s, side="right")
+    range_ends = np.searchsorted([m.time_s for m in ranges], ends_s, side="right")
     core = core_of(run, hypotheses)
     parts: dict[str, list[float]] = {"advance": [], "update": [], "settle": []}
     moved = ranged = 0
-    for m, r in zip(epochs.move_ends.tolist(), epochs.range_ends.tolist(), strict=True):
-        rows, moves = epochs.rows[moved:m], epochs.moves[moved:m]
-        first, second = epochs.first[ranged:r], epochs.second[ranged:r]
-        measured, dz = epochs.range_m[ranged:r], epochs.dz_m[ranged:r]
+    for m, r in zip(move_ends.tolist(), range_ends.tolist(), strict=True):
+        some_moves, some_ranges = slice(moved, m), slice(ranged, r)
         moved, ranged = m, r
         ours = core.count == hypotheses
         marks = [time.thread_time()]
-        core.move(rows, moves)
+        core.move(rows[some_moves], moves[some_moves])
         marks.append(time.thread_time())
-        if len(first):
-            core.update(first, second, measured, dz)
+        if len(first[some_ranges]):
+            core.update(
+                first[some_ranges], second[some_ranges], range_m[some_ranges], dz_m[some_ranges]
+            )
         marks.append(time.thread_time())
         core.settle()
         marks.append(time.thread_time())
         for name, spent in zip(parts, np.diff(marks), strict=True):
             parts[name].append(1e6 * spent if ours and core.count == hypotheses else np.nan)
     return {name: np.array(values) for name, values in parts.items()}
-
-
-def together_us(run: SimulatedRun, epochs: Epochs, hypotheses: int) -> float:
-    """Microseconds an epoch, all handed over at once."""
-    core = core_of(run, hypotheses)
-    started = time.thread_time()
-    core.follow(epochs)
-    return 1e6 * (time.thread_time() - started) / len(epochs.move_ends)
 
 
 def interface_us(
@@ -112,10 +114,9 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=9)
     args = parser.parse_args()
     run = simulate_paper("paper-p1", 0, {"seconds": 300.0})
-    epochs = Epochs.of(run.measurements, EPOCH_S)
     for hypotheses in args.hypotheses:
-        core_us(run, epochs, hypotheses)
-        rounds = [core_us(run, epochs, hypotheses) for _ in range(args.rounds)]
+        core_us(run, hypotheses)
+        rounds = [core_us(run, hypotheses) for _ in range(args.rounds)]
         parts = {
             name: np.nanmedian(np.min([r[name] for r in rounds], axis=0)) for name in rounds[0]
         }
@@ -125,9 +126,6 @@ def main() -> None:
             + ", ".join(f"{name} {value:.0f}" for name, value in parts.items())
             + ")"
         )
-        if hypotheses == 1:  # with more it is one call after another
-            least = min(together_us(run, epochs, 1) for _ in range(args.rounds + 1))
-            print(f"  all {len(epochs.move_ends)} epochs handed over at once: {least:.1f} us each")
         for words, settings, read in (
             ("measurement by measurement, the same state", {"biased": 0.0}, False),
             ("  and every estimate looked at", {"biased": 0.0}, True),

@@ -32,7 +32,7 @@ class Joint:
     def predict(self, motion: Floats, sigma: Floats) -> None:
         """Move everybody by told noise."""
         self.core.level[:] = 1.0
-        self.core.advance(self.rows, motion[:, 0], motion[:, 1], motion[:, 2], self.ones, sigma)
+        self.core.move(self.rows, np.column_stack([motion, self.ones]), sigma)
 
     def update(self, ranges: Instant) -> None:
         """Ranges one after another, to second order."""
@@ -50,9 +50,9 @@ class JointAlone(Joint):
     def __init__(self, case: Case, seed: int) -> None:
         super().__init__(case, seed)
         from relpos.fusion.bank import joint
-        from relpos.fusion.bank import variance_components as noise
+        from relpos.fusion.models.motion_variances import base_variances
 
-        self.kernels, self.base = joint, noise.motion_variances
+        self.kernels, self.base = joint, base_variances
         self.core.level[:], self.core.sigma2[:] = 1.0, self.variance
         self.state = self.core.lines
         self.outlier = np.array([1e-9, 9.0, 0.1, 1.0])

@@ -8,38 +8,43 @@ from statistics import median
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.bank import variance_components as noise
 from relpos.fusion.estimator import ANY_ANGLE_RAD
 from relpos.fusion.models import odometry_faults as slips
+from relpos.fusion.models.motion_variances import (
+    ALONG,
+    ALONG_M2_M,
+    COMPONENTS,
+    SLOW_RAD_S,
+    TURN,
+    TURN_RAD2_RAD,
+    WHITE,
+    WHITE_RAD2_S,
+)
 
 Floats = npt.NDArray[np.float64]
 
 PER_NODE = 5
 
 
-def motion_variances(
+def base_variances(
     dx: Floats, dy: Floats, dtheta: Floats, duration: Floats, sigmas: Floats
 ) -> Floats:
     """Bases (M, 3) of displacements (M,); ``sigmas`` (M, 3) NaN where a report brings none."""
     way = np.hypot(dx, dy)
     moving = (way > 0.0) | (dtheta != 0.0)
-    base = np.empty((len(way), noise.LEVELS))
-    base[:, noise.ALONG] = noise.ALONG_M2_M * way
+    base = np.empty((len(way), COMPONENTS))
+    base[:, ALONG] = ALONG_M2_M * way
     # A turn is what turns fast: slow changes of the heading are mostly its white noise.
     size = np.abs(dtheta)
     fourth = size**4
-    base[:, noise.TURN] = (
-        noise.TURN_RAD2_RAD * size * fourth / (fourth + (noise.SLOW_RAD_S * duration) ** 4 + 1e-300)
-    )
-    base[:, noise.WHITE] = noise.WHITE_RAD2_S * duration * moving
+    base[:, TURN] = TURN_RAD2_RAD * size * fourth / (fourth + (SLOW_RAD_S * duration) ** 4 + 1e-300)
+    base[:, WHITE] = WHITE_RAD2_S * duration * moving
     told = ~np.isnan(sigmas)
     if told.any():
         own = np.where(told, sigmas, 0.0) ** 2
-        base[:, noise.ALONG] = np.where(
-            told[:, 0], np.maximum(own[:, 0], own[:, 1]), base[:, noise.ALONG]
-        )
-        base[:, noise.TURN] = np.where(told[:, 2], 0.0, base[:, noise.TURN])
-        base[:, noise.WHITE] = np.where(told[:, 2], own[:, 2], base[:, noise.WHITE])
+        base[:, ALONG] = np.where(told[:, 0], np.maximum(own[:, 0], own[:, 1]), base[:, ALONG])
+        base[:, TURN] = np.where(told[:, 2], 0.0, base[:, TURN])
+        base[:, WHITE] = np.where(told[:, 2], own[:, 2], base[:, WHITE])
     return base
 
 

@@ -76,4 +76,4 @@ def test_arrays_that_do_not_fit_are_refused_before_a_kernel_reads_them() -> None
     with pytest.raises(IndexError, match="2 users"):
         core.update(np.array([0]), np.array([2]), one, one)
     with pytest.raises(IndexError, match="2 users"):
-        core.advance(np.array([-1]), one, one, one, one)
+        core.move(np.array([-1]), np.ones((1, 4)))

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from relpos import tracks
 from relpos.evaluation import metrics
 from relpos.fusion.bank import hypothesis_count as hypotheses
-from relpos.fusion.bank.core import BankCore, Epochs
+from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.estimator import Bank, make
 from relpos.fusion.bank.joint import PER_NODE, Of
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.estimator import Estimate
 from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
 from relpos.fusion.rewind import Rewinder
-from relpos.measurements import Prior
 from relpos.simulation.paper import simulate_paper
 
 GOOD = {"heading_noise_deg": 0.3, "turn_noise": 0.0, "distance_noise_scale": 0.16}
@@ -133,10 +129,11 @@ def _epochs(core: BankCore, first: int, count: int) -> None:
     noise_m = 0.1 * np.random.default_rng(9).standard_normal((first + count, 3))
     for k in range(first, first + count):
         turned = 0.6 * float(np.sin(0.3 * k))
-        core.advance(
-            np.arange(3), np.full(3, 0.5), np.zeros(3), np.full(3, turned), np.ones(3),
+        core.move(
+            np.arange(3),
+            np.tile([0.5, 0.0, turned, 1.0], (3, 1)),
             np.tile([0.02, 0.02, 0.005], (3, 1)),
-        )  # fmt: skip
+        )
         core.update(*pair, distance + noise_m[k], np.zeros(3))
         core.settle()
 
@@ -164,67 +161,6 @@ def test_a_copy_is_exact_across_a_change_of_number() -> None:
     core.grow()
     for got, wanted in zip(core.moments(), grown, strict=True):
         np.testing.assert_array_equal(got, wanted)
-
-
-def _as_arrays(
-    seconds: float, seed: int, overrides: Mapping[str, float]
-) -> tuple[Epochs, Sequence[Prior]]:
-    """A simulated run's measurements as arrays, an epoch every 2 s, and the starts."""
-    run = simulate_paper("paper-p1", seed, {"seconds": seconds, **overrides})
-    return Epochs.of(run.measurements, 2.0), run.priors
-
-
-@pytest.mark.parametrize(
-    ("hypotheses", "precise"), [(1, False), (200, False), (200, True)], ids=["1", "200", "200 to 1"]
-)
-def test_epochs_handed_over_together_are_those_handed_over_one_by_one(
-    hypotheses: int, precise: bool
-) -> None:
-    epochs, priors = _as_arrays(160.0, 0, GOOD if precise else {})
-    settings = BankSettings(hypotheses=hypotheses, biased=0.0, constants=0.0)
-    together, single = BankCore(settings, 0), BankCore(settings, 0)
-    for core in (together, single):
-        for p in priors:
-            core.add_node(p.x_m, p.y_m, p.heading_rad, 0.0, 0.0)
-    together.follow(epochs)
-    moved = ranged = 0
-    counts = set()
-    for m, r in zip(epochs.move_ends, epochs.range_ends, strict=True):
-        single.move(epochs.rows[moved:m], epochs.moves[moved:m])
-        if r > ranged:
-            single.update(
-                epochs.first[ranged:r], epochs.second[ranged:r], epochs.range_m[ranged:r],
-                epochs.dz_m[ranged:r],
-            )  # fmt: skip
-        single.settle()
-        moved, ranged = m, r
-        counts.add(single.count)
-    assert (1 in counts) == (hypotheses == 1 or precise)
-    assert together.count == single.count
-    assert together.counters == single.counters
-    assert together.unambiguous == single.unambiguous
-    assert together.since_slip == single.since_slip
-    for got, expected in zip(together.moments(), single.moments(), strict=True):
-        assert got == pytest.approx(expected, rel=1e-6, abs=1e-9)
-    assert together.levels.mean == pytest.approx(single.levels.mean, rel=1e-6)
-    assert together.rng.random() == single.rng.random()
-
-
-def test_epochs_that_do_not_end_with_their_measurements_are_refused() -> None:
-    epochs, priors = _as_arrays(20.0, 1, {})
-    core = BankCore(BankSettings(hypotheses=1), 0)
-    for p in priors:
-        core.add_node(p.x_m, p.y_m, p.heading_rad, 0.1, 0.1)
-    for wrong in (
-        replace(epochs, move_ends=epochs.move_ends - 1),
-        replace(epochs, range_ends=epochs.range_ends[:-1]),
-        replace(epochs, range_ends=epochs.range_ends[::-1].copy()),
-        replace(epochs, moves=epochs.moves[:, :3]),
-    ):
-        with pytest.raises(ValueError, match="end"):
-            core.follow(wrong)
-    with pytest.raises(IndexError):
-        core.follow(replace(epochs, rows=epochs.rows + len(priors)))
 
 
 def test_a_picture_that_bends_much_has_more_hypotheses_and_few_states_the_usual() -> None:

@@ -13,8 +13,8 @@ from relpos import fusion
 from relpos.evaluation import metrics
 from relpos.fusion import Estimate, NodeStatus
 from relpos.fusion import switching as growing
-from relpos.fusion.bank import variance_components as noise
 from relpos.fusion.large_teams.estimator import LargeTeam
+from relpos.fusion.models.motion_variances import ALONG, WHITE
 from relpos.measurements import Measurement, Prior, Range
 from relpos.simulation.crowd import Crowd, CrowdSettings, simulate_crowd
 
@@ -156,11 +156,14 @@ def test_who_steps_unevenly_is_found_out(crowd: Crowd) -> None:
     assert isinstance(made.estimator.core, LargeTeam)
     level = made.estimator.core._levels.level
     # The crowd's six levels of step noise are 5 10 20 10 15 10 % in turn, 9 % is the base's.
-    steady, uneven = np.median(level[0::6, noise.ALONG]), np.median(level[2::6, noise.ALONG])
+    steady, uneven = (
+        np.median(level[0::6, ALONG]),
+        np.median(level[2::6, ALONG]),
+    )
     assert uneven > 2.0 * steady
     assert uneven > 1.3
     # Nobody's heading wanders on a straight walk here.
-    assert np.median(level[:, noise.WHITE]) < 0.2
+    assert np.median(level[:, WHITE]) < 0.2
 
 
 def test_a_large_team_of_whom_nobody_is_located_finds_itself() -> None:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -19,6 +17,7 @@ from relpos.fusion.bank.joint import PER_NODE, Of
 from relpos.fusion.bank.lanes import LANES
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.models.detection import STEP_M, Detection
+from relpos.fusion.models.motion_variances import ALONG, ALONG_M2_M, COMPONENTS
 from relpos.fusion.models.odometry_faults import (
     BELIEVING,
     HEADING_CELL_RAD,
@@ -28,52 +27,12 @@ from relpos.fusion.models.odometry_faults import (
     Watch,
     doubts,
 )
-from relpos.measurements import Measurement, Motion, Range
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 _TWO_PI = 2.0 * math.pi
 _UNTOLD: Floats = np.empty((0, 3))
-
-
-@dataclass(frozen=True, slots=True)
-class Epochs:
-    """Measurements of E epochs, handed over at once.
-
-    ``rows`` (M,) were displaced by ``moves`` (M, 4): dx, dy (m), dtheta (rad), duration (s); the
-    e-th epoch has those up to ``move_ends[e]``. ``first`` and ``second`` (R,) were ``range_m`` (R,)
-    apart, their antennas ``dz_m`` (R,) in height; the e-th has those up to ``range_ends[e]``.
-    """
-
-    rows: Indices
-    moves: Floats
-    move_ends: Indices
-    first: Indices
-    second: Indices
-    range_m: Floats
-    dz_m: Floats
-    range_ends: Indices
-
-    @classmethod
-    def of(cls, measurements: Sequence[Measurement], epoch_s: float) -> Epochs:
-        """Motions and ranges, sorted, in epochs of ``epoch_s``; nodes 1, 2, ... in rows 0, 1, ...
-
-        Each motion lasts a second, and antennas are level, as in the simulated scenarios.
-        """
-        motions = [m for m in measurements if isinstance(m, Motion)]
-        ranges = [m for m in measurements if isinstance(m, Range)]
-        ends = np.arange(epoch_s, measurements[-1].time_s + epoch_s, epoch_s)
-        return cls(
-            np.array([m.node - 1 for m in motions]),
-            np.array([(m.dx_m, m.dy_m, m.dtheta_rad, 1.0) for m in motions]),
-            np.searchsorted([m.time_s for m in motions], ends, side="right"),
-            np.array([m.node - 1 for m in ranges]),
-            np.array([m.peer - 1 for m in ranges]),
-            np.array([m.range_m for m in ranges]),
-            np.zeros(len(ranges)),
-            np.searchsorted([m.time_s for m in ranges], ends, side="right"),
-        )
 
 
 class BankCore:
@@ -86,7 +45,7 @@ class BankCore:
     then the range bias that all pairs share, then that of each pair as it is first heard. They are
     kept as the kernels want them, eight hypotheses to a block (:mod:`relpos.fusion.bank.joint`).
 
-    The order of work in one epoch: ``advance`` (once or more), ``update`` (all ranges of one
+    The order of work in one epoch: ``move`` (once or more), ``update`` (all ranges of one
     instant), ``log_weight +=`` whatever else is known (silence, ...), then ``settle`` (jumps,
     resampling). ``moments`` gives the mixture's mean and full covariance at any time.
     """
@@ -107,8 +66,8 @@ class BankCore:
         self._log_weight: Floats = np.zeros((lanes.blocks_of(count), LANES))
         self.levels = noise.Levels()
         self.draw: Floats = self.rng.standard_normal((count, 1))
-        self._sens: Floats = lanes.empty_lines(lanes.blocks_of(count), 0, noise.LEVELS, 6)
-        self.level = lanes.empty_lines(0, 0, noise.LEVELS)
+        self._sens: Floats = lanes.empty_lines(lanes.blocks_of(count), 0, COMPONENTS, 6)
+        self.level = lanes.empty_lines(0, 0, COMPONENTS)
         """How much noisier each user is than the bases of noise (B, N, 3, LANES)."""
         self.sigma2 = lanes.empty_lines(0)
         """Variance of a range (B, LANES), m^2."""
@@ -272,9 +231,9 @@ class BankCore:
         self._put(x, p)
         self.biases = {pair: place + PER_NODE for pair, place in self.biases.items()}
         self.levels.add_node()
-        drawn = self.rng.standard_normal((count, noise.LEVELS))
+        drawn = self.rng.standard_normal((count, COMPONENTS))
         self.draw = np.concatenate([self.draw[:, :-1], drawn, self.draw[:, -1:]], axis=1)
-        sens = lanes.empty_lines(len(self._x), self.nodes, noise.LEVELS, 6)
+        sens = lanes.empty_lines(len(self._x), self.nodes, COMPONENTS, 6)
         sens[:, :-1], sens[:, -1] = self._sens, 0.0
         self._sens = sens
         self._spread_levels()
@@ -283,65 +242,11 @@ class BankCore:
         self.watch.add_node()
         return row
 
-    def remove(self, row: int) -> None:
-        """Forget a user; the rows above it move down by one."""
-        at = PER_NODE * row
-        x, p = joint.unpack(self._x, self._p, self.nodes, self.count)
-        self.nodes -= 1
-        gone = [*range(at, at + PER_NODE), *(e for pair, e in self.biases.items() if row in pair)]
-        keep = np.delete(np.arange(x.shape[1]), gone)
-        self._put(x[:, keep], p[:, keep][:, :, keep])
-        place = {int(old): new for new, old in enumerate(keep)}
-        self.biases = {
-            (a - (a > row), b - (b > row)): place[e]
-            for (a, b), e in self.biases.items()
-            if row not in (a, b)
-        }
-        self.levels.remove(row)
-        self.draw = np.delete(self.draw, noise.LEVELS * row + np.arange(noise.LEVELS), axis=1)
-        self._sens = lanes.copy_lines(np.delete(self._sens, row, axis=1))
-        self._spread_levels()
-        self.surprise = np.delete(self.surprise, row)
-        self.since_turn_s = np.delete(self.since_turn_s, row)
-        self.watch.remove(row)
-        self.slipped = {r - (r > row) for r in self.slipped if r != row}
-        self.unplaced = {r - (r > row): s for r, s in self.unplaced.items() if r != row}
-        self._set_arms(np.delete(self.arm, row, axis=0))
-
     def _set_arms(self, arm: Floats) -> None:
         self.arm = arm
         """Each user's antenna, (forward, left) of its pose, metres."""
         # Where all are on their wearers' axes kernels take the shorter way.
         self._arms = arm if arm.any() else arm[:0]
-
-    def seed_hypotheses(self, poses: Floats, covariances: Floats, log_weights: Floats) -> None:
-        """Replace all users' poses by start hypotheses.
-
-        ``poses`` (H, N, 3), ``covariances`` (H, 3 N, 3 N) in the order x, y, heading of user 0,
-        of user 1, ...; ``log_weights`` (H,). The K hypotheses (levels of noise, constants) are
-        dealt out over them by weight, each H at least once where H <= K.
-        """
-        self.grow()
-        share = np.exp(log_weights - log_weights.max())
-        share /= share.sum()
-        given = len(share)
-        chosen = systematic(share, max(self.count - given, 0), self.rng)
-        if given <= self.count:
-            chosen = np.concatenate([np.arange(given), chosen])
-        else:
-            chosen = systematic(share, self.count, self.rng)
-        times = np.bincount(chosen, minlength=given)
-        order = self.rng.permutation(self.count)
-        self._keep(order)
-        self._spread_levels()
-        x, p = joint.unpack(self._x, self._p, self.nodes, self.count)
-        pose = (PER_NODE * np.arange(self.nodes)[:, None] + np.arange(3)).ravel()
-        x[:, pose] = poses.reshape(given, -1)[chosen]
-        p[:, pose, :] = 0.0
-        p[:, :, pose] = 0.0
-        p[np.ix_(np.arange(self.count), pose, pose)] = covariances[chosen]
-        self._put(x, p)
-        self._log_weight = self._in_lanes(np.log(share[chosen] / times[chosen]))
 
     def place(
         self,
@@ -403,25 +308,12 @@ class BankCore:
 
     # -- one epoch -----------------------------------------------------------------------------
 
-    def advance(
-        self,
-        rows: Indices,
-        dx_m: Floats,
-        dy_m: Floats,
-        dtheta_rad: Floats,
-        duration_s: Floats,
-        sigmas: Floats | None = None,
-    ) -> None:
-        """Move users ``rows`` (M,), in this order; a user may come several times.
-
-        ``sigmas`` (M, 3) are the pieces' own standard deviations (forward and left m, turn rad)
-        where the reports bring any, else NaN.
-        """
-        moves = np.array([dx_m, dy_m, dtheta_rad, duration_s])
-        self.move(rows, np.ascontiguousarray(moves.T), sigmas)
-
     def move(self, rows: Indices, moves: Floats, sigmas: Floats | None = None) -> None:
-        """As ``advance``, of displacements (M, 4): dx, dy (m), dtheta (rad), duration (s)."""
+        """Move users ``rows`` (M,) in this order; a user may occur several times.
+
+        ``moves`` (M, 4) are dx, dy (m), dtheta (rad), duration (s); ``sigmas`` (M, 3) the
+        reported standard deviations (forward and left m, turn rad), NaN where there are none.
+        """
         several = len(rows)
         if not several:
             return
@@ -666,12 +558,6 @@ class BankCore:
         """What share of the ranges are outliers, as far as is known."""
         return float(bank_kernels.expect_outliers(self.outlier_counts, self._outlier))
 
-    @property
-    def outlier_m(self) -> float:
-        """How far outliers are off (root mean square), as far as is known."""
-        bank_kernels.expect_outliers(self.outlier_counts, self._outlier)
-        return math.sqrt(self._outlier[1])
-
     def heading(self, row: int, heading_rad: float, sigma_rad: float) -> None:
         """Work in an absolute heading of a user."""
         joint.update_heading(
@@ -723,71 +609,6 @@ class BankCore:
         if self.count > 1:
             self._jump()
 
-    def follow(self, epochs: Epochs) -> None:
-        """Work in several epochs: each its displacements, its ranges, and ``settle``.
-
-        The same as one call after another; while one hypothesis is enough it is one compiled call.
-        """
-        last, begin = len(epochs.move_ends), 0
-        self._check(epochs.rows, epochs.rows)
-        self._check(epochs.first, epochs.second, epochs.range_m, epochs.dz_m)
-        ends = epochs.move_ends[-1:].tolist() + epochs.range_ends[-1:].tolist()
-        if (
-            len(epochs.range_ends) != last
-            or epochs.moves.shape != (len(epochs.rows), 4)
-            or ends != [len(epochs.rows), len(epochs.first)][: len(ends)]
-            or (np.diff(epochs.move_ends, prepend=0) < 0).any()
-            or (np.diff(epochs.range_ends, prepend=0) < 0).any()
-        ):
-            raise ValueError("epochs do not end where their measurements do")
-        while begin < last:
-            if self.count == 1 and not (self.slipped or self.unplaced or self._some_biased):
-                begin = self._follow_alone(epochs, begin)
-                continue
-            moved = slice(epochs.move_ends[begin - 1] if begin else 0, epochs.move_ends[begin])
-            ranged = slice(epochs.range_ends[begin - 1] if begin else 0, epochs.range_ends[begin])
-            self.move(epochs.rows[moved], epochs.moves[moved])
-            if ranged.stop > ranged.start:
-                self.update(
-                    epochs.first[ranged], epochs.second[ranged], epochs.range_m[ranged],
-                    epochs.dz_m[ranged],
-                )  # fmt: skip
-            self.settle()
-            begin += 1
-
-    def _follow_alone(self, epochs: Epochs, begin: int) -> int:
-        """Work in epochs with one hypothesis, until it is not enough; return the next one."""
-        s, several = self.settings, len(epochs.first)
-        self._outlier[3] = 1.0
-        wary_for = OPEN_UPDATES + 1 - self.since_slip if self.counters["slips"] > 0 else 0
-        news = np.array([0, -1, 0, self.unambiguous])
-        end = int(
-            bank_kernels.follow(
-                self._x, self._p, self._log_weight, self.sigma2, self._sens, self._outlier,
-                self._arms, self.doubtful, self.levels.mean, self.levels.covariance,
-                self.outlier_counts, self.surprise, self.watch.sums, self.watch.base, self._draw,
-                self._steady, self.level, self.since_turn_s, epochs.rows, epochs.moves,
-                epochs.move_ends, epochs.first, epochs.second, _no_places(several),
-                epochs.range_m, epochs.dz_m,
-                _always(several, 1.0), epochs.range_ends, begin, wary_for, s.spread,
-                s.hypotheses == 1, news,
-            )
-        )  # fmt: skip
-        open_, slipped, clamped, self.unambiguous = news.tolist()
-        if clamped:
-            self.counters["levels_clamped"] += clamped
-        self.since_slip += end - begin - open_
-        if open_:
-            if slipped >= 0:
-                some = slice(
-                    epochs.range_ends[end - 2] if end > 1 else 0, epochs.range_ends[end - 1]
-                )
-                self._alarm = (
-                    slipped, epochs.first[some], epochs.second[some], epochs.range_m[some],
-                )  # fmt: skip
-            self.settle()
-        return end
-
     def weights(self) -> Floats:
         """Normalised weights (K,); the log weights are shifted so that their greatest is 0."""
         self._normalise()
@@ -814,9 +635,6 @@ class BankCore:
         """Go on with the hypotheses ``chosen`` (M,)."""
         self._x, self._p = joint.take(self._x, chosen), joint.take(self._p, chosen)
         self.count = len(chosen)
-        self._permute_parameters(chosen)
-
-    def _permute_parameters(self, chosen: Indices) -> None:
         self.draw = self.draw[chosen]
         flat = joint.take(self._sens.reshape(len(self._sens), -1, LANES), chosen)
         self._sens = flat.reshape(len(flat), *self._sens.shape[1:])
@@ -831,7 +649,7 @@ class BankCore:
         s = self.settings
         blocks = lanes.blocks_of(self.count)
         if self.level.shape[:2] != (blocks, self.nodes):
-            self.level = lanes.empty_lines(blocks, self.nodes, noise.LEVELS)
+            self.level = lanes.empty_lines(blocks, self.nodes, COMPONENTS)
             self.sigma2 = lanes.empty_lines(blocks)
         laid = np.concatenate([self.draw, self.draw[[-1] * (blocks * LANES - self.count)]])
         self._draw = lanes.copy_lines(laid.reshape(blocks, LANES, -1).transpose(0, 2, 1))
@@ -871,7 +689,7 @@ class BankCore:
             self._x, self._p, self._undoubted, self.nodes, poses, len(poses), len(poses)
         )
         sigmas = np.exp(0.5 * self.levels.mean)
-        metre = math.sqrt(noise.ALONG_M2_M) * sigmas[noise.ALONG : -1 : noise.LEVELS]
+        metre = math.sqrt(ALONG_M2_M) * sigmas[ALONG:-1:COMPONENTS]
         bend = hypotheses.bend(mean, covariance, float(sigmas[-1]), metre)
         if open_ or bend > hypotheses.BENT:
             self.unambiguous = 0

@@ -14,12 +14,19 @@ import numpy.typing as npt
 from relpos.fusion.bank import hypothesis_count as hypotheses
 from relpos.fusion.bank import lanes
 from relpos.fusion.bank import variance_components as noise
-from relpos.fusion.bank.joint import MEAN, PER_NODE, STATS, TRUST, VARIANCE, advance, update
+from relpos.fusion.bank.joint import MEAN, PER_NODE, STATS, TRUST, VARIANCE, update
 from relpos.fusion.bank.lanes import LANES, fill, load, store
 from relpos.fusion.compiled import compiled, inlined
 from relpos.fusion.estimator import ANY_ANGLE_RAD
 from relpos.fusion.models import odometry_faults as slips
 from relpos.fusion.models.detection import FAILS, LENGTH, STEP_M, TRUSTED_M
+from relpos.fusion.models.motion_variances import (
+    ALONG,
+    ALONG_M2_M,
+    COMPONENTS,
+    WHITE,
+    base_variances,
+)
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -189,7 +196,7 @@ def step_bend(
     heading = heading_variances(x, p, undoubted, nodes)
     worst = 0.0
     for n in range(nodes):
-        metre = math.sqrt(noise.ALONG_M2_M) * math.exp(0.5 * levels[noise.LEVELS * n + noise.ALONG])
+        metre = math.sqrt(ALONG_M2_M) * math.exp(0.5 * levels[COMPONENTS * n + ALONG])
         worst = max(worst, 0.5 * heading[n] / metre)
     return worst
 
@@ -207,7 +214,7 @@ def spread_levels(
     blocks, several = draw.shape[0], draw.shape[1]
     for c in range(several):
         sd = min(spread * math.sqrt(covariance[c, c]), noise.SPREAD_MOST)
-        lower = noise.STEADIER[c % noise.LEVELS] if c < several - 1 else 0.0
+        lower = noise.STEADIER[c % COMPONENTS] if c < several - 1 else 0.0
         for b in range(blocks):
             drawn = sd * load(draw, b * several + c) - lower * load(steady, b)
             value = lanes.exp(mean[c] + drawn)
@@ -240,11 +247,11 @@ def prepare_motion(
     who turns all the time is judged by the next turn, and is left alone.
     """
     anybody = False
-    base = noise.motion_variances(moves, told)
+    base = base_variances(moves, told)
     for m in range(rows.shape[0]):
         for part in range(4):
             motion[m, part] = moves[m, part]
-        for part in range(noise.LEVELS):
+        for part in range(COMPONENTS):
             motion[m, 4 + part] = base[m, part]
         # Who reports nothing at all stands: no time passes for the heading.
         if motion[m, 0] == 0.0 and motion[m, 1] == 0.0 and motion[m, 2] == 0.0:
@@ -256,7 +263,7 @@ def prepare_motion(
         mean = 0.0
         if motion[m, 2] != 0.0:
             for k in range(count):
-                mean += level[k // LANES, row, noise.WHITE, k % LANES]
+                mean += level[k // LANES, row, WHITE, k % LANES]
         white = motion[m, 6] * mean / count
         turn = motion[m, 2] ** 2 > LEAST_TURN_RAD**2 + TURN_STANDS_OUT**2 * white
         if turn and (told.shape[0] == 0 or math.isnan(told[m, 2])):
@@ -318,7 +325,7 @@ def digest(
         off = measured[r] - middle
         square[r] = off * off / spread
         excess[r] = max(off * off - spread, 0.0)
-    slipped = slips.look(sums, base, first, second, square, worth, outlier_share, wary)
+    slipped = slips.update_cusum(sums, base, first, second, square, worth, outlier_share, wary)
     weight = np.empty_like(log_weight)
     normalise(log_weight, count, weight)
     weights = weight.reshape(-1)
@@ -494,72 +501,3 @@ def teach(
             counts[outcome, index + 1] += share * (place - index)
         sums[2] += weight
     return tried
-
-
-@compiled
-def follow(
-    x: Floats, p: Floats, log_weight: Floats, sigma2: Floats, sens: Floats, outlier: Floats,
-    arms: Floats, doubtful: Floats, levels: Floats, covariance: Floats, outlier_counts: Floats,
-    surprise: Floats, sums: Floats, base: Floats, draw: Floats, steady: Floats, level: Floats,
-    since_turn_s: Floats, rows: Indices, moves: Floats, move_ends: Indices, first: Indices,
-    second: Indices, bias: Indices, measured: Floats, dz: Floats, worth: Floats,
-    range_ends: Indices, begin: int, wary_for: int, spread: float, alone: bool,
-    news: Indices,
-) -> int:  # fmt: skip
-    """Follow a team with one hypothesis over epochs ``begin`` to the last, or to one that is open.
-
-    An epoch is its displacements (up to ``move_ends`` (E,) of them), its ranges (up to
-    ``range_ends`` (E,)), and the question whether one hypothesis is still enough; it is always
-    where there is one ``alone``. Returns the first epoch that was not begun. ``news`` (4,)
-    receives whether the last one has to be settled, the row that has slipped in it or -1, how many
-    levels were clamped, and for how many instants the picture has been unambiguous (given: for
-    how many before). For the first ``wary_for`` instants be wary of slips.
-    """
-    nodes, size = sens.shape[1], x.shape[1]
-    nothing, weight = np.empty((0, 3)), np.empty_like(log_weight)
-    good = np.empty(first.shape[0])
-    variance = np.zeros(first.shape[0])
-    mean, whole = np.zeros(size), np.zeros((size, size))
-    metre = np.empty(nodes)
-    news[0], news[1], news[2] = 0, -1, 0
-    for e in range(begin, move_ends.shape[0]):
-        m, m_end = (0 if e == 0 else move_ends[e - 1]), move_ends[e]
-        r, r_end = (0 if e == 0 else range_ends[e - 1]), range_ends[e]
-        if m_end > m:
-            motion, misjudged = np.empty((m_end - m, 7)), np.empty(m_end - m)
-            prepare_motion(
-                rows[m:m_end], moves[m:m_end], nothing, level, 1, since_turn_s, motion, misjudged
-            )
-            drawn = np.zeros((1, m_end - m))
-            advance(x, p, level, sens, rows[m:m_end], motion, drawn, 0.0, CROSS)
-        slipped = -1
-        if r_end > r:
-            slipped, clamped = take_ranges(
-                x, p, log_weight, sigma2, sens, first[r:r_end], second[r:r_end], bias[r:r_end],
-                measured[r:r_end], dz[r:r_end], outlier, worth[r:r_end], variance[r:r_end], arms,
-                doubtful, levels, covariance, outlier_counts, surprise, sums, base,
-                e - begin < wary_for, draw, steady, spread, level, good[r:r_end],
-            )  # fmt: skip
-            news[2] += clamped
-        if not alone:
-            odd = slipped >= 0 or surprises(surprise, outlier_counts, outlier)
-            if not odd:
-                # The mixture's moments are those of the one.
-                for i in range(_POSE * nodes):
-                    a = PER_NODE * (i // _POSE) + i % _POSE
-                    mean[a] = x[0, i, 0]
-                    for j in range(i + 1):
-                        b = PER_NODE * (j // _POSE) + j % _POSE
-                        whole[a, b] = whole[b, a] = p[0, (i * (i + 1)) // 2 + j, 0]
-                for n in range(nodes):
-                    metre[n] = math.sqrt(noise.ALONG_M2_M) * math.exp(
-                        0.5 * levels[noise.LEVELS * n + noise.ALONG]
-                    )
-                bend = hypotheses.bend(mean, whole, math.exp(0.5 * levels[-1]), metre)
-                odd = bend > hypotheses.BENT
-                news[3] = news[3] + 1 if bend <= hypotheses.FLAT else 0
-            if odd:
-                news[0], news[1] = 1, slipped
-                return e + 1
-        normalise(log_weight, 1, weight)
-    return int(move_ends.shape[0])

@@ -18,24 +18,10 @@ from relpos.fusion.bank import lanes
 from relpos.fusion.bank.joint import BENT, EVIDENCE, MEAN, SHARES, TRUST, VARIANCE
 from relpos.fusion.bank.lanes import LANES, fill, load
 from relpos.fusion.compiled import compiled
+from relpos.fusion.models.motion_variances import COMPONENTS
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
-
-ALONG_M2_M = 0.004
-"""7 % of half a metre at each half metre; people and sensors spread over 3 to 25 %."""
-
-TURN_RAD2_RAD = 0.04
-"""15 degrees at a right angle."""
-
-WHITE_RAD2_S = math.radians(3.0) ** 2
-"""3 degrees in a second's walking."""
-
-SLOW_RAD_S = 0.5
-"""Turning at this rate counts half as a turn."""
-
-LEVELS = 3
-ALONG, TURN, WHITE = range(LEVELS)
 
 PRIOR = np.array([0.0, 0.0, -1.0])
 TEAM_SD = np.array([0.6, 1.2, 1.5])
@@ -105,17 +91,17 @@ class Levels:
 
     def add_node(self) -> None:
         """Add a user: correlated with the others by what is common to the team."""
-        old = LEVELS * self.nodes
-        keep = np.r_[0:old, old + LEVELS]
-        covariance = np.zeros((old + LEVELS + 1, old + LEVELS + 1))
-        mean = np.empty(old + LEVELS + 1)
+        old = COMPONENTS * self.nodes
+        keep = np.r_[0:old, old + COMPONENTS]
+        covariance = np.zeros((old + COMPONENTS + 1, old + COMPONENTS + 1))
+        mean = np.empty(old + COMPONENTS + 1)
         covariance[np.ix_(keep, keep)] = self.covariance
         mean[keep] = self.mean
-        for level in range(LEVELS):
+        for level in range(COMPONENTS):
             at = old + level
             mean[at] = PRIOR[level]
             share = TEAM_SD[level] ** 2 / (TEAM_SD[level] ** 2 + OWN_SD[level] ** 2)
-            others = np.arange(level, old, LEVELS)
+            others = np.arange(level, old, COMPONENTS)
             if others.size:
                 # The new one is like the others' common part: a regression on their mean.
                 weight = share / (1.0 - share + share * others.size)
@@ -130,26 +116,6 @@ class Levels:
         self.mean, self.covariance = mean, covariance
         self.nodes += 1
 
-    def remove(self, row: int) -> None:
-        """Forget a user."""
-        gone = LEVELS * row + np.arange(LEVELS)
-        self.mean = np.delete(self.mean, gone)
-        self.covariance = np.delete(np.delete(self.covariance, gone, 0), gone, 1)
-        self.nodes -= 1
-
-    def learn(self, first: Indices, second: Indices, measured: Floats, stats: Floats,
-              log_weight: Floats, quiet: Floats, worth: Floats) -> int:  # fmt: skip
-        """Learn from ranges (R,); return how many levels had to be clamped.
-
-        ``stats`` (R, STATS, K) are of ``joint.update`` (more than K columns
-        do no harm), ``log_weight`` (K,) from before it;
-        hypotheses with ``quiet`` (K,) 0 have jumped of late and do not count. ``worth`` (R,) is
-        how many independent ranges each is worth.
-        """
-        return learn(
-            self.mean, self.covariance, first, second, measured, stats, log_weight, quiet, worth
-        )  # fmt: skip
-
 
 @compiled
 def learn(
@@ -163,7 +129,12 @@ def learn(
     quiet: Floats,
     worth: Floats,
 ) -> int:
-    """See :meth:`Levels.learn`; works in place."""
+    """Learn log levels (L,) and their covariance from ranges (R,), in place; see ``Levels``.
+
+    ``stats`` (R, STATS, K) are of ``joint.update`` (further columns are ignored), ``log_weight``
+    (K,) from before it; hypotheses with ``quiet`` (K,) 0 do not count. ``worth`` (R,) is how many
+    independent ranges each is worth. Returns how many levels had to be clamped.
+    """
     count = log_weight.shape[0]
     size = mean.shape[0]
     # Loops in place of expressions of arrays, which take the compiler seconds.
@@ -225,8 +196,8 @@ def learn(
             explained = variance - slope[6]
         innovation = measured[n] - middle
         for q in range(3):
-            place[q] = LEVELS * first[n] + q
-            place[3 + q] = LEVELS * second[n] + q
+            place[q] = COMPONENTS * first[n] + q
+            place[3 + q] = COMPONENTS * second[n] + q
         place[6] = size - 1
         own = (explained + slope[6]) / variance
         if own < LEAST_SHARE:
@@ -273,32 +244,3 @@ def learn(
         clamped += bounded != mean[o]
         mean[o] = bounded
     return clamped
-
-
-@compiled
-def motion_variances(moves: Floats, told: Floats) -> Floats:
-    """Give the bases (M, 3) of displacements (M, 4): along (m^2), turn and white (rad^2).
-
-    ``moves`` are dx, dy (m), dtheta (rad) and duration (s). ``told`` (M, 3), or (0, 3), are the
-    reports' own deviations (forward, left, turn), NaN where one brings none; they take the bases'
-    place.
-    """
-    base = np.empty((moves.shape[0], LEVELS))
-    for m in range(moves.shape[0]):
-        way = math.sqrt(moves[m, 0] * moves[m, 0] + moves[m, 1] * moves[m, 1])
-        size = abs(moves[m, 2])
-        # A turn is what turns fast: slow changes of the heading are mostly its white noise.
-        fourth = size**4
-        slow = fourth + (SLOW_RAD_S * moves[m, 3]) ** 4 + 1e-300
-        base[m, ALONG] = ALONG_M2_M * way
-        base[m, TURN] = TURN_RAD2_RAD * size * fourth / slow
-        base[m, WHITE] = WHITE_RAD2_S * moves[m, 3] if way > 0.0 or size != 0.0 else 0.0
-        if told.shape[0] == 0:
-            continue
-        if not math.isnan(told[m, 0]):
-            left = 0.0 if math.isnan(told[m, 1]) else told[m, 1] ** 2
-            base[m, ALONG] = max(told[m, 0] ** 2, left)
-        if not math.isnan(told[m, 2]):
-            base[m, TURN] = 0.0
-            base[m, WHITE] = told[m, 2] ** 2
-    return base

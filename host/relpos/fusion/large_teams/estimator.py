@@ -23,7 +23,6 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from relpos.errors import RelposError
-from relpos.fusion.bank import variance_components as noise
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.estimator import (
     ANY_ANGLE_RAD,
@@ -39,6 +38,7 @@ from relpos.fusion.initialisation.least_squares import Joining
 from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter, RangeModel
 from relpos.fusion.large_teams.variance_components import TeamLevels
 from relpos.fusion.models.motion import told_sigmas
+from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_variances
 from relpos.fusion.models.ranging import Mounting
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
@@ -185,16 +185,16 @@ class LargeTeam:
     def _with_noise(self, rows: Indices, moves: Floats, told: Floats) -> Floats:
         """Displacements and their sigmas (E, 6) from bases of noise times the nodes' levels."""
         dx, dy, turn, _ = moves.T
-        variance = noise.motion_variances(moves, told) * self._levels.level[rows]
+        variance = base_variances(moves, told) * self._levels.level[rows]
         result = np.empty((len(rows), 6))
         result[:, :3] = moves[:, :3]
         # Along the way, and a tenth of that across: both as the frame of the body sees them.
         self._levels.turn(rows, turn)
         way = np.maximum(dx * dx + dy * dy, 1e-12)
-        along = variance[:, noise.ALONG]
+        along = variance[:, ALONG]
         result[:, 3] = np.sqrt(along * (dx * dx + ACROSS * dy * dy) / way)
         result[:, 4] = np.sqrt(along * (dy * dy + ACROSS * dx * dx) / way)
-        result[:, 5] = np.sqrt(variance[:, noise.TURN] + variance[:, noise.WHITE])
+        result[:, 5] = np.sqrt(variance[:, TURN] + variance[:, WHITE])
         return result
 
     # -- ranges --------------------------------------------------------------------------------

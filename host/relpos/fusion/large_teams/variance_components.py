@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.bank.variance_components import ALONG, LEVELS, TURN, WHITE
+from relpos.fusion.models.motion_variances import ALONG, COMPONENTS, TURN, WHITE
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -47,18 +47,18 @@ HEARD = 3
 class TeamLevels:
     """Levels (N, 3) by which the bases of the motion variances are multiplied."""
 
-    level: Floats = field(default_factory=lambda: np.empty((0, LEVELS)))
-    _team: Floats = field(default_factory=lambda: np.zeros(LEVELS))
-    _own: Floats = field(default_factory=lambda: np.empty((0, LEVELS)))
-    _count: Floats = field(default_factory=lambda: np.empty((0, LEVELS)))
+    level: Floats = field(default_factory=lambda: np.empty((0, COMPONENTS)))
+    _team: Floats = field(default_factory=lambda: np.zeros(COMPONENTS))
+    _own: Floats = field(default_factory=lambda: np.empty((0, COMPONENTS)))
+    _count: Floats = field(default_factory=lambda: np.empty((0, COMPONENTS)))
     _turned: Floats = field(default_factory=lambda: np.empty(0))
     _last: Floats = field(default_factory=lambda: np.empty((0, 2)))
 
     def add(self, poses: Floats) -> None:
         """Take in users at poses (E, 3) with the team's levels."""
         more = len(poses)
-        self._own = np.concatenate([self._own, np.zeros((more, LEVELS))])
-        self._count = np.concatenate([self._count, np.zeros((more, LEVELS))])
+        self._own = np.concatenate([self._own, np.zeros((more, COMPONENTS))])
+        self._count = np.concatenate([self._count, np.zeros((more, COMPONENTS))])
         self._turned = np.concatenate([self._turned, np.zeros(more)])
         self._last = np.concatenate([self._last, poses[:, :2]])
         self._refresh()

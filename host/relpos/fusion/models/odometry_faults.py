@@ -91,34 +91,9 @@ class Watch:
         """Watch one more."""
         self.sums = np.append(self.sums, 0.0)
 
-    def remove(self, row: int) -> None:
-        """Forget one."""
-        self.sums = np.delete(self.sums, row)
-
-    def look(
-        self,
-        first: Indices,
-        second: Indices,
-        square: Floats,
-        worth: Floats,
-        outliers: float,
-        *,
-        wary: bool = False,
-    ) -> int | None:
-        """Take the ranges (R,) of one instant; return the row that slipped, if any.
-
-        Of two alone either may be meant: what is between them is doubted in the same way.
-
-        ``square`` is nu^2/S of the mixture before the update, ``worth`` how independent the range
-        is, ``outliers`` the share of outliers as far as is known. Be ``wary`` for a while after a
-        slip: what was found then may have been the wrong place.
-        """
-        slipped = look(self.sums, self.base, first, second, square, worth, outliers, wary)
-        return None if slipped < 0 else int(slipped)
-
 
 @compiled
-def look(
+def update_cusum(
     sums: Floats,
     base: Floats,
     first: Indices,
@@ -128,7 +103,12 @@ def look(
     outliers: float,
     wary: bool,
 ) -> int:
-    """See :meth:`Watch.look`; works in place, -1 for nobody."""
+    """Update the sums with the ranges (R,) of one instant; return the row with a fault, or -1.
+
+    ``square`` is nu^2/S of the mixture before the update, ``worth`` how many independent ranges
+    each is worth, ``outliers`` the share of outliers. ``wary`` lowers the threshold for a while
+    after a fault: the node may have been relocalised wrongly.
+    """
     usual = min(max(base[0], BASE_LEAST), BASE_MOST)
     rise, fall = 0.5 * (1.0 - 1.0 / GROWN) / usual, 0.5 * math.log(GROWN)
     ranges = first.shape[0]
