@@ -130,7 +130,7 @@ def heard(
     """Find the attempts of a run and learn the curve; None where no attempt can be placed."""
     detection = Detection()
     rounds = list(_rounds(measurements, detection))
-    every = sorted({pair for one in rounds for pair in one.heard + one.silent})
+    every = sorted({pair for one in rounds for pair in one.received + one.missed})
     at_s = np.array([one.time_s for one in rounds])
     estimated = {pair: distance_at(estimate, pair, at_s) for pair in every}
     true = {pair: distance_at(truth, pair, at_s) for pair in every}
@@ -140,26 +140,24 @@ def heard(
     outcomes: list[bool] = []
     for k, one in enumerate(rounds):
         known = [
-            (pair, sure) for pair, sure in zip(one.heard, one.witnessed, strict=True)
+            (pair, sure) for pair, sure in zip(one.received, one.observable, strict=True)
             if np.isfinite(estimated[pair][k])
         ]  # fmt: skip
-        silent = [pair for pair in one.silent if np.isfinite(estimated[pair][k])]
-        told = Round(
+        placed = Round(
             one.time_s,
             tuple(pair for pair, _ in known),
-            tuple(silent),
+            tuple(pair for pair in one.missed if np.isfinite(estimated[pair][k])),
             tuple(sure for _, sure in known),
         )
-        detection.learn(
-            told,
-            np.array([estimated[pair][k] for pair, _ in known]),
-            np.array([sigma[pair][k] for pair, _ in known]),
-            np.array([estimated[pair][k] for pair in silent]),
-            np.array([sigma[pair][k] for pair in silent]),
+        attempted = placed.received + placed.missed
+        detection.update(
+            placed,
+            np.array([estimated[pair][k] for pair in attempted]),
+            np.array([sigma[pair][k] for pair in attempted]),
         )
         where = true if use_truth else estimated
-        counted = [pair for pair, sure in zip(one.heard, one.witnessed, strict=True) if sure]
-        for pairs_of, outcome in ((counted, True), (one.silent, False)):
+        counted = [pair for pair, sure in zip(one.received, one.observable, strict=True) if sure]
+        for pairs_of, outcome in ((counted, True), (one.missed, False)):
             for pair in pairs_of:
                 if np.isfinite(where[pair][k]):
                     distances.append(float(where[pair][k]))
@@ -190,7 +188,7 @@ def _rounds(measurements: Sequence[Measurement], detection: Detection) -> Iterat
                 reported[one.node] = time_s
         ranges = [m for m in at_once if isinstance(m, Range) and m.range_m > 0.0]
         if ranges:
-            yield from detection.rounds.take(time_s, ranges, reported_s)
+            yield from detection.rounds.add(time_s, ranges, reported_s)
 
 
 def _sigma_at(pairs: Mapping[Pair, PairTrack], pair: Pair, at_s: Floats) -> Floats:

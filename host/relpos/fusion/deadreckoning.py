@@ -125,7 +125,7 @@ class DeadReckoning:
                 case Advance():
                     self._moved = True
                     node = self._nodes[step.node]
-                    node.presence.heard(step.time_s)
+                    node.presence.received(step.time_s)
                     node.move(step)
                 case Ranging():
                     self._own["ranges_unused"] += len(step.ranges)

@@ -7,11 +7,11 @@ files nor ports nor the truth.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from math import atan2, hypot, inf, pi, sqrt
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from relpos.errors import RelposError
 from relpos.measurements import Measurement
@@ -144,9 +144,6 @@ class Estimate:
     located nodes (of large teams: of those within reach of each other). ``alternatives`` is
     empty unless something is ambiguous; ``parameters`` is what has been learned so far; ``north``
     is None where no compass has told anything of it.
-
-    The rows are some fifty objects. One of :meth:`later` makes them when the first is asked for
-    (not at all where every second estimate is looked at); nothing else tells it from another.
     """
 
     time_s: float
@@ -155,30 +152,6 @@ class Estimate:
     alternatives: tuple[Alternative, ...] = ()
     parameters: tuple[Parameter, ...] = ()
     north: MagneticNorth | None = None
-    _make: Callable[[], Rows] | None = field(default=None, init=False, repr=False, compare=False)
-
-    @classmethod
-    def later(
-        cls, time_s: float, make: Callable[[], Rows], north: MagneticNorth | None = None
-    ) -> Estimate:
-        """Give an estimate whose rows ``make`` will make, once, from what it alone holds."""
-        estimate = object.__new__(cls)
-        object.__setattr__(estimate, "time_s", time_s)
-        object.__setattr__(estimate, "north", north)
-        object.__setattr__(estimate, "_make", make)
-        return estimate
-
-    if not TYPE_CHECKING:  # every field is declared
-
-        def __getattr__(self, name: str) -> object:
-            """Make the rows; called where a field has not been set."""
-            make = self._make if name in _ROWS else None
-            if make is not None:
-                for field_name, rows in zip(_ROWS, make(), strict=True):
-                    object.__setattr__(self, field_name, rows)
-                object.__setattr__(self, "_make", None)
-            # Another thread may have made them just now.
-            return object.__getattribute__(self, name)
 
 
 Rows = tuple[
@@ -188,8 +161,6 @@ Rows = tuple[
     tuple[Parameter, ...],
 ]
 """Nodes, pairs, alternatives and parameters of an estimate."""
-
-_ROWS = ("nodes", "pairs", "alternatives", "parameters")
 
 
 @runtime_checkable
@@ -219,14 +190,14 @@ LOST_EPOCHS = 10
 
 @dataclass(slots=True)
 class Presence:
-    """What every estimator keeps of a node beside its pose: its height, and when it was heard."""
+    """What every estimator keeps of a node beside its pose: its height, and its last motion."""
 
     height_m: float = 0.0
     sigma_height_m: float = 0.0
     news_s: float = -inf
     silent_epochs: int = 0
 
-    def heard(self, time_s: float) -> None:
+    def received(self, time_s: float) -> None:
         """Note that the node reported motion up to ``time_s``."""
         if time_s > self.news_s:
             self.news_s = time_s

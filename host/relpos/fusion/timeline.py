@@ -16,9 +16,9 @@ its place is counted and, where it is not a displacement, dropped; a displacemen
 
 What shares one instant is handed out in the order of the nodes, however it arrived.
 
-A ``sparing`` timeline advances between epochs only those whom a measurement concerns: of twenty
-who range in turns, two in place of twenty at every range. The others' pieces come when they are
-needed, at the latest at the next epoch; ``catch_up`` asks for them.
+With lazy propagation (``lazy``) only the nodes that a measurement concerns are advanced between
+epochs: of twenty that range in turns, two in place of twenty at every range. The others' pieces
+come when they are needed, at the latest at the next epoch; ``catch_up`` asks for them.
 """
 
 from __future__ import annotations
@@ -111,14 +111,16 @@ class _Track:
 
     reported_s: float
     reached_s: float
-    heard: bool = False
+    has_reported: bool = False
     chords: deque[Motion] = field(default_factory=deque)
     """Reports that wait, from the node's reached time on."""
     left: tuple[Displacement, float] | None = None
     """What is left of the first one, and its share of it; None where that is all."""
 
     def copy(self) -> _Track:
-        return _Track(self.reported_s, self.reached_s, self.heard, self.chords.copy(), self.left)
+        return _Track(
+            self.reported_s, self.reached_s, self.has_reported, self.chords.copy(), self.left
+        )
 
 
 def refusal(measurement: Measurement) -> str | None:
@@ -172,7 +174,7 @@ class Timeline:
     ``nodes`` are those known beforehand (they are waited for from the start); ``start_s`` is the
     time from which a node's first motion counts; ``reorder_s`` is how long everything is held
     back for what is still under way (in measurement time, so that a recording pays nothing for
-    it); ``max_lag_s`` is how long a silent node is waited for; ``sparing`` see above.
+    it); ``max_lag_s`` is how long a silent node is waited for; ``lazy`` see above.
     ``counters`` tells what was dropped or came late, by name; with ``keep_late`` ``take_late``
     tells when.
     """
@@ -182,7 +184,7 @@ class Timeline:
     reorder_s: float = 0.5
     max_lag_s: float = 5.0
     keep_late: bool = False
-    sparing: bool = False
+    lazy: bool = False
     counters: Counter[str] = field(default_factory=Counter)
     _tracks: dict[int, _Track] = field(default_factory=dict)
     _arrived: list[tuple[float, int, Measurement]] = field(default_factory=list)
@@ -209,7 +211,7 @@ class Timeline:
     def reported_s(self, node: int) -> float:
         """Time of the node's newest motion; ``-inf`` where it never reported any."""
         track = self._tracks.get(node)
-        return track.reported_s if track is not None and track.heard else -inf
+        return track.reported_s if track is not None and track.has_reported else -inf
 
     @property
     def frontier_s(self) -> float:
@@ -304,7 +306,7 @@ class Timeline:
         return list(self.push_all((), final=True))
 
     def _end(self) -> Iterator[Step]:
-        last = max((t.reported_s for t in self._tracks.values() if t.heard), default=-inf)
+        last = max((t.reported_s for t in self._tracks.values() if t.has_reported), default=-inf)
         last = max(last, self._frontier_s)
         # A displacement that came late may still lie behind the frontier.
         rest = list(self._advance_all(last))
@@ -367,11 +369,11 @@ class Timeline:
             self.counters["motions_late"] += 1
         if begin_s < self._frontier_s and self.keep_late:
             self._late.append(Late(begin_s, motion.time_s))
-        if not track.heard:
+        if not track.has_reported:
             # A run may begin a little before zero: then nothing is known before the first motion.
             track.reached_s = min(track.reached_s, motion.time_s)
             track.reported_s = track.reached_s
-            track.heard = True
+            track.has_reported = True
         if motion.time_s > track.reported_s:
             track.reported_s = motion.time_s
 
@@ -405,7 +407,7 @@ class Timeline:
             closes = self._closes_epoch(time_s, motions)
             if ranges or sensed or closes:
                 time_s = max(time_s, self._frontier_s)
-                if closes or not self.sparing:
+                if closes or not self.lazy:
                     yield from self._advance_all(time_s)
                 else:
                     self._frontier_s = time_s

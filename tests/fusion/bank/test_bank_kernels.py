@@ -13,7 +13,6 @@ from relpos.fusion.bank import kernels as bank_kernels
 from relpos.fusion.bank import variance_components as noise
 from relpos.fusion.bank.joint import PER_NODE, Of
 from relpos.fusion.models import odometry_faults as slips
-from relpos.fusion.models.detection import LENGTH, Detection, teach
 from relpos.fusion.models.motion_variances import COMPONENTS, base_variances
 
 Floats = np.ndarray
@@ -352,47 +351,25 @@ def test_what_an_estimate_says_of_pairs_is_the_twins(on_one_spot: bool) -> None:
     assert got == pytest.approx(small.pairs(x[0], p[0], rows), rel=1e-9, abs=1e-12)
 
 
-def test_what_a_round_teaches_of_hearing_is_the_twins() -> None:
-    rng = np.random.default_rng(2)
-    pairs = np.array([(a, b) for a in range(5) for b in range(a + 1, 5)])
-    learned = [
-        (np.ones(5), np.full((5, 5), np.nan), np.zeros((2, LENGTH)), np.array([0.0, 25.0, 0.0]))
-        for _ in range(2)
-    ]
-    curve = Detection().curve
-    for heard in (10, 4, 0, 6, 1):
-        some = rng.permutation(pairs)
-        first, second = some[:, 0].copy(), some[:, 1].copy()
-        distance, sigma = rng.uniform(0.0, 130.0, 10), rng.uniform(0.0, 2.0, 10)
-        witnessed = rng.integers(0, 2, heard).astype(float)
-        given = first, second, heard, witnessed, distance, sigma, curve
-        tried = bank_kernels.teach(*given, *learned[0])
-        assert tried == pytest.approx(teach(*given, *learned[1]), abs=1e-12)
-        for got, expected in zip(*learned, strict=True):
-            assert got == pytest.approx(expected, abs=1e-9, nan_ok=True)
-
-
 def test_cumulative_sums_are_the_twins_until_and_after_an_alarm() -> None:
     rng = np.random.default_rng(22)
-    watch = slips.Watch()
+    detector = slips.CusumDetector.of_nobody()
     for _ in range(5):
-        watch.add_node()
+        detector = detector.with_node()
     sums, base, alarms = [0.0] * 5, 1.0, 0
     for instant in range(300):
         pairs = [(0, 1), (1, 2), (3, 1), (2, 4), (0, 3)][: rng.integers(1, 6)]
         grown = np.array([8.0 if instant % 100 > 80 and 1 in pair else 1.0 for pair in pairs])
         square, worth = rng.chisquare(1, len(pairs)) * grown, rng.uniform(0.1, 1.0, len(pairs))
         ends = np.array(pairs)
-        slipped = slips.update_cusum(
-            watch.sums, watch.base, np.ascontiguousarray(ends[:, 0]),
-            np.ascontiguousarray(ends[:, 1]), square, worth, 0.02, False,
-        )  # fmt: skip
+        first, second = np.ascontiguousarray(ends.T)
+        faulty = slips.update_cusum(detector, first, second, square, worth, 0.02, False)
         sums, base, expected = small.look(
             sums, base, pairs, square.tolist(), worth.tolist(), 0.02, slips.TEAM_ALARM
         )
-        assert slipped == expected
-        assert watch.sums == pytest.approx(sums)
-        assert float(watch.base[0]) == pytest.approx(base)
+        assert faulty == expected
+        assert detector.sums == pytest.approx(sums)
+        assert float(detector.base[0]) == pytest.approx(base)
         alarms += expected >= 0
     assert alarms > 1
 

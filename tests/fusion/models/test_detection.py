@@ -1,4 +1,4 @@
-"""Silence is a measurement: the curve P(heard | distance) is learned, and used with care."""
+"""A missed range is a measurement: the detection curve is learned, and used with care."""
 
 from __future__ import annotations
 
@@ -10,8 +10,17 @@ from itertools import groupby, permutations
 import numpy as np
 import pytest
 
+from reference import detection as reference
 from relpos import fusion
-from relpos.fusion.models.detection import Detection, Round, Rounds
+from relpos.fusion.models.detection import (
+    LENGTH,
+    Attempts,
+    Detection,
+    Round,
+    Rounds,
+    Statistics,
+    add_attempts,
+)
 from relpos.measurements import Range
 from relpos.simulation.paper import simulate_paper
 
@@ -30,7 +39,7 @@ def taught_by(scenario: str, seed: int) -> Detection:
     learner = Detection()
     ranges = [m for m in run.measurements if isinstance(m, Range)]
     for time_s, group in groupby(ranges, key=lambda r: r.time_s):
-        for one in learner.rounds.take(time_s, list(group), always):
+        for one in learner.rounds.add(time_s, list(group), always):
             at = places[one.time_s]
 
             def seen(
@@ -39,7 +48,7 @@ def taught_by(scenario: str, seed: int) -> Detection:
                 true = np.array([abs(at[a] - at[b]) for a, b in pairs])
                 return np.abs(true + rng.normal(0, 0.1, len(pairs))), np.full(len(pairs), 0.1)
 
-            learner.learn(one, *seen(one.heard), *seen(one.silent))
+            learner.update(one, *seen(one.received + one.missed))
     return learner
 
 
@@ -54,10 +63,10 @@ def test_the_learned_curve_is_the_simulated_one(scenario: str, near: float, edge
     assert (beyond < 0.02).all()
     assert learner.known
     assert abs(learner.range_m - edge_m) < 0.08 * edge_m
-    assert learner.weight > 0.6  # independent silences keep most of their weight
+    assert learner.weight > 0.6  # independent misses keep most of their weight
 
 
-def test_before_anything_is_learned_silence_says_little() -> None:
+def test_before_anything_is_learned_a_miss_says_little() -> None:
     learner = Detection()
     near, far = np.log1p(-learner.probability(np.array([2.0, 30.0])))
     assert 0.0 < far - near < 1.0
@@ -72,38 +81,38 @@ def instants(
     return [
         one
         for time_s, pairs in ranged
-        for one in rounds.take(time_s, [Range(time_s, a, b, 3.0) for a, b in pairs], alive)
+        for one in rounds.add(time_s, [Range(time_s, a, b, 3.0) for a, b in pairs], alive)
     ]
 
 
 ALL = [(1, 2), (1, 3), (2, 3)]
 
 
-def test_a_pair_counts_as_tried_when_one_of_the_two_ranged_another() -> None:
+def test_a_pair_counts_as_attempted_when_one_of_the_two_ranged_another() -> None:
     rounds = Rounds()
     given = instants(rounds, [(0.0, ALL), (2.0, [(1, 2), (2, 3)])], always)
-    assert given[0].silent == ()
-    assert given[1].silent == ((1, 3),)
+    assert given[0].missed == ()
+    assert given[1].missed == ((1, 3),)
 
 
-def test_the_silence_of_a_node_that_is_off_says_nothing() -> None:
+def test_misses_of_a_node_that_is_off_say_nothing() -> None:
     rounds = Rounds()
     everyone = [*ALL, (1, 4), (2, 4), (3, 4)]
     given = instants(rounds, [(0.0, everyone)], always)
     off = {4: 0.0}  # its last motion; the others go on
     given += instants(rounds, [(10.0, ALL)], lambda node: off.get(node, 10.0))
-    assert given[-1].silent == ()
+    assert given[-1].missed == ()
     on = instants(rounds, [(12.0, ALL)], always)
-    assert on[-1].silent == ((1, 4), (2, 4), (3, 4))
+    assert on[-1].missed == ((1, 4), (2, 4), (3, 4))
 
 
-def test_a_pair_that_never_ranged_is_not_taken_for_silent() -> None:
+def test_a_pair_that_never_ranged_is_not_taken_for_missed() -> None:
     rounds = Rounds()
     given = instants(rounds, [(float(t), [(1, 2), (3, 4), (2, 3)]) for t in range(9)], always)
-    assert all(one.silent == () for one in given)
+    assert all(one.missed == () for one in given)
 
 
-def test_where_nodes_take_turns_a_round_lasts_until_somebody_ranges_the_same_again() -> None:
+def test_where_nodes_take_turns_a_round_lasts_until_a_pair_ranges_again() -> None:
     rounds = Rounds()
     turns = [
         (2.0 * cycle + 0.3 * node + 0.02 * peer, [(node, peer)])
@@ -112,20 +121,18 @@ def test_where_nodes_take_turns_a_round_lasts_until_somebody_ranges_the_same_aga
         if not (cycle > 5 and {node, peer} == {1, 3})
     ]
     given = instants(rounds, turns, always)
-    assert {one.silent for one in given[4:6]} == {()}
-    assert {one.silent for one in given[8:]} == {((1, 3),)}
+    assert {one.missed for one in given[4:6]} == {()}
+    assert {one.missed for one in given[8:]} == {((1, 3),)}
     assert 17 <= len(given) <= 21
 
 
 def learn(learner: Detection, one: Round, far_m: float = 2.0) -> np.ndarray:
-    heard, silent = len(one.heard), len(one.silent)
-    return learner.learn(
-        one,
-        np.full(heard, 2.0), np.full(heard, 0.1), np.full(silent, far_m), np.full(silent, 0.1),
-    )  # fmt: skip
+    received, missed = len(one.received), len(one.missed)
+    distance_m = np.repeat([2.0, far_m], [received, missed])
+    return learner.update(one, distance_m, np.full(distance_m.size, 0.1))
 
 
-def test_a_node_nobody_hears_for_long_is_taken_for_broken_and_not_for_far() -> None:
+def test_a_node_that_is_not_received_for_long_is_taken_for_broken_and_not_for_far() -> None:
     learner = Detection()
     everyone = [(a, b) for a in (1, 2, 3, 4) for b in range(a + 1, 5)]
     for one in instants(learner.rounds, [(float(t), everyone) for t in range(60)], always):
@@ -133,14 +140,14 @@ def test_a_node_nobody_hears_for_long_is_taken_for_broken_and_not_for_far() -> N
     alone = instants(learner.rounds, [(60.0 + t, ALL) for t in range(12)], always)
     worth = [float(learn(learner, one).max()) for one in alone]
     assert worth[-1] < 0.01
-    # It is heard again: believed at once.
+    # It is received again: believed at once.
     instants(learner.rounds, [(80.0, everyone)], always)
     learn(learner, Round(80.0, tuple(everyone), (), (True,) * 6))
     again = instants(learner.rounds, [(81.0, [*ALL, (1, 4), (2, 4)])], always)
     assert learn(learner, again[-1]).min() > 0.9
 
 
-def test_silences_that_follow_each_other_count_less_than_independent_ones() -> None:
+def test_misses_that_follow_each_other_count_less_than_independent_ones() -> None:
     rng = np.random.default_rng(1)
     blocked, free = Detection(), Detection()
     for learner, stays in ((blocked, 0.97), (free, 0.5)):
@@ -149,9 +156,9 @@ def test_silences_that_follow_each_other_count_less_than_independent_ones() -> N
             for pair in ALL:
                 if rng.random() > stays:
                     state[pair] = not state[pair]
-            heard = tuple(p for p in ALL if state[p])
-            silent = tuple(p for p in ALL if not state[p])
-            learn(learner, Round(float(t), heard, silent, (True,) * len(heard)))
+            received = tuple(p for p in ALL if state[p])
+            missed = tuple(p for p in ALL if not state[p])
+            learn(learner, Round(float(t), received, missed, (True,) * len(received)))
     assert blocked.weight < 0.25
     assert free.weight > 0.8
 
@@ -167,7 +174,7 @@ def test_what_was_learned_after_a_copy_does_not_change_it() -> None:
     assert not np.allclose(learner.curve, before)
 
 
-def test_the_bank_reports_how_far_the_team_hears() -> None:
+def test_the_bank_reports_the_detection_range() -> None:
     run = simulate_paper("paper-h2", 2, {"seconds": 200.0})
     bank = fusion.make("bank", run.priors, {}, 1)
     estimates = [e for m in run.measurements for e in bank.process(m)] + bank.finish()
@@ -175,3 +182,25 @@ def test_the_bank_reports_how_far_the_team_hears() -> None:
     assert {p.node for p in found} == {1, 2, 3, 4, 5, 6}
     assert found[0].value == pytest.approx(10.0, abs=1.5)
     assert found[0].sigma < 1.5
+
+
+def test_the_statistics_of_attempts_are_those_of_the_reference() -> None:
+    rng = np.random.default_rng(2)
+    pairs = np.array([(a, b) for a in range(5) for b in range(a + 1, 5)])
+    ours, expected = (
+        Statistics(
+            np.ones(5), np.full((5, 5), np.nan), np.zeros((2, LENGTH)), np.array([0.0, 25.0, 0.0])
+        )
+        for _ in range(2)
+    )
+    curve = Detection().curve
+    for received in (10, 4, 0, 6, 1):
+        first, second = np.ascontiguousarray(rng.permutation(pairs).T)
+        distance_m, sigma_m = rng.uniform(0.0, 130.0, 10), rng.uniform(0.0, 2.0, 10)
+        observable = rng.integers(0, 2, received).astype(float)
+        attempts = Attempts(first, second, received, observable, distance_m, sigma_m)
+        attempted = add_attempts(attempts, curve, ours)
+        again = reference.add_attempts(attempts, curve, expected)
+        assert attempted == pytest.approx(again, abs=1e-12)
+        for got, wanted in zip(ours, expected, strict=True):
+            assert got == pytest.approx(wanted, abs=1e-9, nan_ok=True)

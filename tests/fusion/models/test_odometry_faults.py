@@ -1,4 +1,4 @@
-"""Odometry that slips is noticed by the ranges, doubted, and found again."""
+"""Odometry faults are noticed in the ranges, answered by perturbations, and recovered from."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from relpos import fusion
 from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.fusion.models.odometry_faults import (
     ALARM,
-    Habit,
-    Stillness,
-    Watch,
-    doubts,
+    CusumDetector,
+    SpeedGate,
+    ZeroMotionDetector,
+    perturb,
     update_cusum,
 )
 from relpos.measurements import Measurement, Motion, Prior, Range
@@ -22,66 +22,61 @@ from relpos.measurements import Measurement, Motion, Prior, Range
 PAIRS = [(a, b) for a in range(4) for b in range(a + 1, 4)]
 
 
-def watching(nodes: int) -> Watch:
-    watch = Watch()
+def detector_of(nodes: int) -> CusumDetector:
+    detector = CusumDetector.of_nobody()
     for _ in range(nodes):
-        watch.add_node()
-    return watch
+        detector = detector.with_node()
+    return detector
 
 
-def look(watch: Watch, square: dict[tuple[int, int], float]) -> int | None:
-    pairs = np.array(list(square), dtype=np.int64)
-    row = int(
-        update_cusum(
-            watch.sums, watch.base, pairs[:, 0].copy(), pairs[:, 1].copy(),
-            np.array(list(square.values())), np.ones(len(pairs)), 0.02, False,
-        )
-    )  # fmt: skip
-    return None if row < 0 else row
+def update(detector: CusumDetector, square: dict[tuple[int, int], float]) -> int:
+    first, second = np.ascontiguousarray(np.array(list(square), dtype=np.int64).T)
+    values = np.array(list(square.values()))
+    return update_cusum(detector, first, second, values, np.ones(len(values)), 0.02, False)
 
 
 def test_the_one_that_fits_nobody_is_named_and_not_its_peers() -> None:
-    watch = watching(4)
-    named = None
+    detector = detector_of(4)
+    named = -1
     for _ in range(6):
-        named = look(watch, {p: 30.0 if 2 in p else 1.0 for p in PAIRS})
-        if named is not None:
+        named = update(detector, {p: 30.0 if 2 in p else 1.0 for p in PAIRS})
+        if named >= 0:
             break
     assert named == 2
 
 
 def test_innovations_as_usual_raise_no_alarm() -> None:
     rng = np.random.default_rng(0)
-    watch = watching(4)
+    detector = detector_of(4)
     alarms = sum(
-        look(watch, dict(zip(PAIRS, rng.standard_normal(6) ** 2, strict=True))) is not None
+        update(detector, dict(zip(PAIRS, rng.standard_normal(6) ** 2, strict=True))) >= 0
         for _ in range(3000)
     )
     assert alarms <= 2
 
 
-def test_one_outlier_is_no_slip() -> None:
-    watch = watching(2)
-    assert look(watch, {(0, 1): 1e6}) is None
-    assert watch.sums.max() < ALARM / 2
+def test_one_outlier_is_no_fault() -> None:
+    detector = detector_of(2)
+    assert update(detector, {(0, 1): 1e6}) == -1
+    assert detector.sums.max() < ALARM / 2
 
 
-def test_a_displacement_far_out_of_habit_is_odd_and_walking_after_standing_is_not() -> None:
-    habit = Habit()
-    assert not any(habit.is_odd(1, 0.25, 1.0) for _ in range(60))
-    assert habit.is_odd(1, 1.9, 1.0)
-    assert not habit.is_odd(1, 1.4, 1.0)
-    assert not habit.is_odd(2, 1.3, 1.0)  # a newcomer may walk at once
-    assert not habit.is_odd(1, 0.3, 0.0005)  # two clocks have crossed
-    # Whoever runs from now on is believed after some seconds.
-    assert sum(habit.is_odd(1, 3.0, 1.0) for _ in range(40)) < 15
+def test_a_sprint_exceeds_the_gate_and_walking_after_standing_does_not() -> None:
+    gate = SpeedGate()
+    assert not any(gate.exceeded(1, 0.25, 1.0) for _ in range(60))
+    assert gate.exceeded(1, 1.9, 1.0)
+    assert not gate.exceeded(1, 1.4, 1.0)
+    assert not gate.exceeded(2, 1.3, 1.0)  # a newcomer may walk at once
+    assert not gate.exceeded(1, 0.3, 0.0005)  # two clocks have crossed
+    # A node that runs from now on is believed after some seconds.
+    assert sum(gate.exceeded(1, 3.0, 1.0) for _ in range(40)) < 15
 
 
-def test_doubts_lie_on_the_peers_ring_with_headings_all_round() -> None:
+def test_perturbed_poses_lie_on_the_peers_ring_with_headings_all_round() -> None:
     rng = np.random.default_rng(1)
     old = np.tile([2.0, 1.0, 0.5], (600, 1))
     peers = np.zeros((600, 2))
-    made = doubts(old, peers, np.full(600, 4.0), 3.0, rng)
+    made = perturb(old, peers, np.full(600, 4.0), 3.0, rng)
     moved = ~made.kept[:, 0]
     assert np.hypot(*made.poses[moved, :2].T) == pytest.approx(4.0)
     assert (made.poses[made.kept[:, 0], :2] == [2.0, 1.0]).all()
@@ -175,26 +170,26 @@ def test_a_heading_slip_that_no_hypothesis_foresaw_is_said(seed: int) -> None:
 
 def test_noise_of_a_standing_sensor_is_told_from_slow_motion() -> None:
     rng = np.random.default_rng(2)
-    still, creeping = Stillness(), Stillness()
-    stood = [still.is_still(1, *rng.normal(0.0, 0.01, 3), 1.0, 1.0) for _ in range(200)]
+    still, creeping = ZeroMotionDetector(), ZeroMotionDetector()
+    stood = [still.update(1, *rng.normal(0.0, 0.01, 3), 1.0, 1.0) for _ in range(200)]
     crept = [
-        creeping.is_still(1, 0.03 + rng.normal(0.0, 0.01), rng.normal(0.0, 0.01), 0.0, 1.0, 1.0)
+        creeping.update(1, 0.03 + rng.normal(0.0, 0.01), rng.normal(0.0, 0.01), 0.0, 1.0, 1.0)
         for _ in range(200)
     ]
     assert np.mean(stood) > 0.5
     assert not any(crept)
-    assert not still.is_still(1, 0.5, 0.0, 0.0, 1.0, 1.0)
-    assert not still.is_still(1, 0.0, 0.0, 0.0, 1.0, 1.0)  # it has just moved
+    assert not still.update(1, 0.5, 0.0, 0.0, 1.0, 1.0)
+    assert not still.update(1, 0.0, 0.0, 0.0, 1.0, 1.0)  # it has just moved
 
 
 def test_a_report_in_pieces_is_one_report() -> None:
     rng = np.random.default_rng(3)
-    whole, pieces = Stillness(), Stillness()
+    whole, pieces = ZeroMotionDetector(), ZeroMotionDetector()
     for _ in range(50):
         dx, dy, turn = rng.normal(0.0, 0.01, 3)
-        told = whole.is_still(1, dx, dy, turn, 1.0, 1.0)
+        told = whole.update(1, dx, dy, turn, 1.0, 1.0)
         for part in (0.25, 0.75):
-            last = pieces.is_still(1, part * dx, part * dy, part * turn, part, part)
+            last = pieces.update(1, part * dx, part * dy, part * turn, part, part)
         assert told == last
 
 

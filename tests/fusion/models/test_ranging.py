@@ -13,7 +13,7 @@ from relpos.evaluation import metrics
 from relpos.fusion.bank import joint, lanes
 from relpos.fusion.bank.joint import PER_NODE
 from relpos.fusion.estimator import Estimate
-from relpos.fusion.models.ranging import Repetition
+from relpos.fusion.models.ranging import RangeCorrelation
 from relpos.measurements import Height, Measurement, Motion, Prior, Range
 from relpos.simulation.paper import simulate_paper
 
@@ -87,21 +87,21 @@ def test_arms_of_zero_change_nothing() -> None:
 def test_repeated_ranges_of_two_who_stand_tell_little_new_and_moving_makes_them_independent() -> (
     None
 ):
-    repetition = Repetition()
-    assert repetition.worth([(1, 2)]) == pytest.approx([1.0])
-    assert sum(repetition.worth([(2, 1)])[0] for _ in range(10)) < 1.0
-    repetition.move(1, 1.0, 1.0, 0.0)
-    assert repetition.worth([(1, 2)])[0] > 0.9
-    # What a walked metre is worth does not depend on how often the two range on it.
-    often, seldom = Repetition(), Repetition()
+    correlation = RangeCorrelation()
+    assert correlation.effective_counts([(1, 2)]) == pytest.approx([1.0])
+    assert sum(correlation.effective_counts([(2, 1)])[0] for _ in range(10)) < 1.0
+    correlation.move(1, 1.4, 0.0)
+    assert correlation.effective_counts([(1, 2)])[0] > 0.9
+    # How much a walked metre tells does not depend on how often the two range on it.
+    often, seldom = RangeCorrelation(), RangeCorrelation()
     for r in (often, seldom):
-        r.worth([(1, 2)])
+        r.effective_counts([(1, 2)])
     total = {}
     for r, pieces in ((often, 100), (seldom, 25)):
         total[pieces] = 0.0
         for _ in range(pieces):
-            r.move(2, 3.0 / pieces, 0.0, 0.0)
-            total[pieces] += r.worth([(1, 2)])[0]
+            r.move(2, 3.0 / pieces, 0.0)
+            total[pieces] += r.effective_counts([(1, 2)])[0]
     assert 2.0 < total[25] < total[100] < 2.0 * total[25]
 
 

@@ -24,8 +24,8 @@ from relpos.fusion.models.odometry_faults import (
     HYPOTHESES,
     LOST_M,
     LOST_RAD,
-    Watch,
-    doubts,
+    CusumDetector,
+    perturb,
 )
 
 Floats = npt.NDArray[np.float64]
@@ -95,7 +95,7 @@ class BankCore:
             self.rng.permutation(count) < int(settings.wrong_starts * count)
         ).astype(np.float64)
         self.doubtful: Floats = DOUBT_UPDATES * self.wrong_start
-        self.watch = Watch()
+        self.cusum = CusumDetector.of_nobody()
         self.slipped: set[int] = set()
         """Rows whose odometry has slipped and that are not found again yet."""
         self.unplaced: dict[int, tuple[float, float]] = {}
@@ -239,7 +239,7 @@ class BankCore:
         self._spread_levels()
         self.surprise = np.append(self.surprise, 0.0)
         self.since_turn_s = np.append(self.since_turn_s, 0.0)
-        self.watch.add_node()
+        self.cusum = self.cusum.with_node()
         return row
 
     def _set_arms(self, arm: Floats) -> None:
@@ -385,7 +385,7 @@ class BankCore:
             self._x, self._p, self._log_weight, self.sigma2, self._sens, first, second, bias,
             range_m, dz_m, outlier, worth, dz_variance_m2, self._arms, self.doubtful,
             self.levels.mean, self.levels.covariance, self.outlier_counts, self.surprise,
-            self.watch.sums, self.watch.base,
+            self.cusum.sums, self.cusum.base,
             self.since_slip <= OPEN_UPDATES and self.counters["slips"] > 0,
             self._draw, self._steady, s.spread, self.level, good,
         )  # fmt: skip
@@ -453,7 +453,7 @@ class BankCore:
         block, lane = which[:, None] // LANES, which[:, None] % LANES
         old = self._x[block, own + np.arange(3), lane]
         peers = self._x[block, beside + np.arange(2), lane]
-        made = doubts(old, peers, range_m[sight], place_m, self.rng, lost)
+        made = perturb(old, peers, range_m[sight], place_m, self.rng)
         self._x[block, own + np.arange(3), lane] = made.poses
         # What was lost has nothing to do any more with what else is known.
         for anew, part in ((~made.kept[:, 0], (0, 1)), (~made.kept[:, 1], (2,))):

@@ -44,10 +44,10 @@ from relpos.fusion.initial_poses import (
     PoseMixture,
 )
 from relpos.fusion.models.detection import Detection
-from relpos.fusion.models.motion import told_sigmas
+from relpos.fusion.models.motion import reported_sigmas
 from relpos.fusion.models.north import North
-from relpos.fusion.models.odometry_faults import LOST_RAD, VAGUE_M, Habit, Stillness
-from relpos.fusion.models.ranging import Mounting, Repetition
+from relpos.fusion.models.odometry_faults import LOST_RAD, VAGUE_M, SpeedGate, ZeroMotionDetector
+from relpos.fusion.models.ranging import Mounting, RangeCorrelation
 from relpos.fusion.modes import believe, pictures
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
@@ -102,10 +102,10 @@ class Bank:
     seed: int = 0
     mounting: Mapping[int, Mounting] = field(default_factory=dict)
     core: BankCore = field(init=False)
-    detection: Detection = field(default_factory=lambda: Detection(teach=bank_kernels.teach))
-    repetition: Repetition = field(default_factory=Repetition)
-    habit: Habit = field(default_factory=Habit)
-    stillness: Stillness = field(default_factory=Stillness)
+    detection: Detection = field(default_factory=Detection)
+    range_correlation: RangeCorrelation = field(default_factory=RangeCorrelation)
+    speed_gate: SpeedGate = field(default_factory=SpeedGate)
+    zero_motion: ZeroMotionDetector = field(default_factory=ZeroMotionDetector)
     north: North = field(default_factory=North)
     _row: dict[int, int] = field(default_factory=dict)
     _known: dict[int, _Known] = field(default_factory=dict)
@@ -139,7 +139,7 @@ class Bank:
     @property
     def shared(self) -> tuple[object, ...]:
         """Objects that copies of the core refer to (:class:`~relpos.fusion.rewind.Core`)."""
-        return self.priors, self.settings, self.mounting, self.detection.teach
+        return self.priors, self.settings, self.mounting
 
     def check_run(self, counters: Mapping[str, int]) -> None:
         """Raise RelposError if the run cannot give relative positions."""
@@ -160,11 +160,11 @@ class Bank:
                     self._set_off(step)
                 return None
             self._moved = True
-            self._meet(step.node).heard(step.time_s)
+            self._meet(step.node).received(step.time_s)
             way_m = math.hypot(step.dx_m, step.dy_m)
-            self.repetition.went(step.node, way_m, step.dtheta_rad)
+            self.range_correlation.move(step.node, way_m, step.dtheta_rad)
             self._seek(step.node)
-            odd = self.habit.is_odd(step.node, way_m, step.duration_s, step.fraction)
+            odd = self.speed_gate.exceeded(step.node, way_m, step.duration_s, step.fraction)
             self._own["motions_doubted"] += odd
             self.initialiser.advance(step, faulty=odd)
         elif isinstance(step, Ranging):
@@ -211,16 +211,16 @@ class Bank:
         moves = np.array([(a.dx_m, a.dy_m, a.dtheta_rad, a.duration_s) for a in steps])
         told = None
         if any(a.sigma_x_m is not None or a.sigma_theta_rad is not None for a in steps):
-            told = np.array([told_sigmas(a) for a in steps])
+            told = np.array([reported_sigmas(a) for a in steps])
         begin = 0
-        knowns, still, habit = self._known, self.stillness, self.habit
+        knowns, zero_motion, speed_gate = self._known, self.zero_motion, self.speed_gate
         self._moved = True
         for k, a in enumerate(steps):
             time_s, node, duration_s, dx_m, dy_m, turn_rad, fraction = a[:7]
             known = knowns[node]
-            known.heard(time_s)
+            known.received(time_s)
             way_m = math.hypot(dx_m, dy_m)
-            self.repetition.went(node, way_m, turn_rad)
+            self.range_correlation.move(node, way_m, turn_rad)
             if known.drifted_s > time_s - duration_s:
                 # Ranges have moved it so far already; how it turned they cannot say.
                 moves[k, :2] *= max(time_s - known.drifted_s, 0.0) / max(duration_s, 1e-9)
@@ -228,11 +228,11 @@ class Bank:
             if told is not None and vague is not None:
                 told[k] = math.nan
                 self.core.lose(int(rows[k]), *vague)
-            if still.is_still(node, dx_m, dy_m, turn_rad, duration_s, fraction, way_m):
+            if zero_motion.update(node, dx_m, dy_m, turn_rad, duration_s, fraction):
                 self._own["motions_still"] += dx_m != 0.0 or turn_rad != 0.0
                 moves[k, :3] = 0.0
                 continue
-            if habit.is_odd(node, way_m, duration_s, fraction):
+            if speed_gate.exceeded(node, way_m, duration_s, fraction):
                 self._make(rows, moves, told, slice(begin, k))
                 self.core.grow()
                 row = int(rows[k])
@@ -254,7 +254,7 @@ class Bank:
         located, time_s = self._row, step.time_s
         everybody = {n for r in step.ranges for n in (r.node, r.peer)}
         for node in everybody:
-            self._meet(node).heard(time_s)
+            self._meet(node).received(time_s)
         ranges: Sequence[Range] = step.ranges
         if not everybody <= located.keys():
             for node in sorted(everybody - located.keys()):
@@ -277,7 +277,7 @@ class Bank:
             variance = np.array(
                 [known[a].sigma_height_m ** 2 + known[b].sigma_height_m ** 2 for a, b in pairs]
             )
-            worth = self.repetition.worth(pairs)
+            worth = self.range_correlation.effective_counts(pairs)
             self.core.update(first, second, measured, dz, variance, worth)
             self._ranges_used += len(ranges)
         for who, heard, surely in rounds:
@@ -395,15 +395,15 @@ class Bank:
         tried.
         """
         rounds = []
-        for done in self.detection.rounds.take(time_s, ranges, timeline.reported_s):
-            pairs = done.heard + done.silent
+        for done in self.detection.rounds.add(time_s, ranges, timeline.reported_s):
+            pairs = done.received + done.missed
             for late in timeline.catch_up({n for p in pairs for n in p}, time_s):
                 self.update(late, timeline)
             self._advance()
             who = self._pairs(pairs)
-            heard = np.arange(len(pairs)) < len(done.heard)
+            heard = np.arange(len(pairs)) < len(done.received)
             surely = np.ones(len(pairs))
-            surely[len(done.heard) :] = self.detection.learn_all(
+            surely[len(done.received) :] = self.detection.update(
                 done, *self.core.predicted_ranges(*who)
             )
             rounds.append((who, heard, surely))
@@ -467,8 +467,6 @@ class Bank:
                 for node, known in self._known.items()
                 if node not in self._row
             ]
-        if not slipped and not sought and mixture is None:
-            return Estimate.later(time_s, picture.rows, self.north.known())
         nodes, pairs, alternatives, parameters = picture.rows()
         if slipped:
             nodes = tuple(self._tell_mode(n) if self._row[n.node] in slipped else n for n in nodes)
@@ -603,7 +601,7 @@ def make(
         [p.node for p in priors],
         reorder_s=settings.reorder_s,
         max_lag_s=settings.max_lag_s,
-        sparing=True,
+        lazy=True,
     )
     return Rewinder(Bank(priors, initialiser, settings, seed, mounting), timeline, settings.late_s)
 
@@ -689,7 +687,7 @@ def _pair_of_pictures(
 
 def _vagueness(step: Advance) -> tuple[float, float] | None:
     """Standard deviations (m, rad) of a piece whose report says to know next to nothing."""
-    sigma_m, _, sigma_rad = (0.0 if math.isnan(s) else s for s in told_sigmas(step))
+    sigma_m, _, sigma_rad = (0.0 if math.isnan(s) else s for s in reported_sigmas(step))
     sigma_m = min(sigma_m, step.sigma_y_m or 0.0)
     whole = math.sqrt(max(step.fraction, 1e-9))
     if sigma_m / whole > VAGUE_M or sigma_rad / whole > LOST_RAD:

@@ -18,8 +18,6 @@ from relpos.fusion.bank.joint import MEAN, PER_NODE, STATS, TRUST, VARIANCE, upd
 from relpos.fusion.bank.lanes import LANES, fill, load, store
 from relpos.fusion.compiled import compiled, inlined
 from relpos.fusion.estimator import ANY_ANGLE_RAD
-from relpos.fusion.models import odometry_faults as slips
-from relpos.fusion.models.detection import FAILS, LENGTH, STEP_M, TRUSTED_M
 from relpos.fusion.models.motion_variances import (
     ALONG,
     ALONG_M2_M,
@@ -27,6 +25,7 @@ from relpos.fusion.models.motion_variances import (
     WHITE,
     base_variances,
 )
+from relpos.fusion.models.odometry_faults import CusumDetector, update_cusum
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -325,7 +324,8 @@ def digest(
         off = measured[r] - middle
         square[r] = off * off / spread
         excess[r] = max(off * off - spread, 0.0)
-    slipped = slips.update_cusum(sums, base, first, second, square, worth, outlier_share, wary)
+    detector = CusumDetector(sums, base)
+    slipped = update_cusum(detector, first, second, square, worth, outlier_share, wary)
     weight = np.empty_like(log_weight)
     normalise(log_weight, count, weight)
     weights = weight.reshape(-1)
@@ -440,64 +440,3 @@ def pairs(mean: Floats, covariance: Floats, rows: Indices) -> Floats:
             told[n, 2], told[n, 3] = math.atan2(north, east), sideways
             n += 1
     return told
-
-
-@compiled
-def teach(
-    first: Indices, second: Indices, heard: int, witnessed: Floats, distance_m: Floats,
-    sigma_m: Floats, curve: Floats, working: Floats, surprise: Floats, counts: Floats,
-    sums: Floats,
-) -> Floats:  # fmt: skip
-    """See :class:`relpos.fusion.models.detection.Teach`."""
-    several, slots = first.shape[0], working.shape[0]
-    chance, tried = np.empty(several), np.empty(several - heard)
-    busy = np.zeros(slots, dtype=np.bool_)
-    silence = np.full(slots, -1.0)
-    root = math.sqrt(3.0)
-    for u in range(several):
-        # Three-point Gauss-Hermite rule over the distance's error; one mass of its shares is 1.
-        chance[u] = 0.0
-        for q in range(3):
-            place = (distance_m[u] + (q - 1) * root * sigma_m[u]) / STEP_M
-            place = min(max(place, 0.0), LENGTH - 1.0)
-            index = min(int(place), LENGTH - 2)
-            here = curve[index] + (place - index) * (curve[index + 1] - curve[index])
-            chance[u] += here * (4.0 if q == 1 else 1.0) / 6.0
-        if u < heard:
-            busy[first[u]] = busy[second[u]] = True
-            continue
-        for slot in (first[u], second[u]):
-            if not busy[slot]:
-                silence[slot] = abs(silence[slot]) * (1.0 - chance[u])
-    for slot in range(slots):
-        if busy[slot]:
-            working[slot] = 1.0
-        elif silence[slot] >= 0.0:
-            up = working[slot] * (1.0 - FAILS)
-            working[slot] = up * silence[slot] / (up * silence[slot] + 1.0 - up)
-    for u in range(several):
-        a, b = first[u], second[u]
-        weight = 1.0 / (1.0 + (sigma_m[u] / TRUSTED_M) ** 2)
-        now = -chance[u]
-        outcome = 0
-        if u < heard:
-            weight *= witnessed[u]
-            now += 1.0
-            outcome = 1
-        else:
-            tried[u - heard] = working[a] * working[b]
-            weight *= tried[u - heard]
-        before = surprise[a, b]
-        if not math.isnan(before):
-            sums[0] += weight * before * now
-            sums[1] += weight * 0.5 * (before * before + now * now)
-        surprise[a, b] = now
-        for q in range(3):
-            place = (distance_m[u] + (q - 1) * root * sigma_m[u]) / STEP_M
-            place = min(max(place, 0.0), LENGTH - 1.001)
-            index = int(place)
-            share = weight * (4.0 if q == 1 else 1.0) / 6.0
-            counts[outcome, index] += share * (1.0 - (place - index))
-            counts[outcome, index + 1] += share * (place - index)
-        sums[2] += weight
-    return tried

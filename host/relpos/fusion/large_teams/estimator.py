@@ -37,7 +37,7 @@ from relpos.fusion.estimator import (
 from relpos.fusion.initialisation.least_squares import Joining
 from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter, RangeModel
 from relpos.fusion.large_teams.variance_components import TeamLevels
-from relpos.fusion.models.motion import told_sigmas
+from relpos.fusion.models.motion import reported_sigmas
 from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_variances
 from relpos.fusion.models.ranging import Mounting
 from relpos.fusion.rewind import Rewinder
@@ -120,7 +120,7 @@ class LargeTeam:
                 self._moved = True
                 self._meet(step.node)
                 known = self._known[step.node]
-                known.heard(step.time_s)
+                known.received(step.time_s)
                 self._pending.append(step)
             case Ranging():
                 self._advance()
@@ -179,7 +179,7 @@ class LargeTeam:
             return
         rows = np.array([self._row[a.node] for a in steps], dtype=np.int64)
         moves = np.array([(a.dx_m, a.dy_m, a.dtheta_rad, a.duration_s) for a in steps])
-        told = np.array([told_sigmas(a) for a in steps])
+        told = np.array([reported_sigmas(a) for a in steps])
         self.filter.predict(rows, self._with_noise(rows, moves, told))
 
     def _with_noise(self, rows: Indices, moves: Floats, told: Floats) -> Floats:
@@ -204,7 +204,7 @@ class LargeTeam:
             for node in (r.node, r.peer):
                 self._meet(node)
                 known = self._known[node]
-                known.heard(step.time_s)
+                known.received(step.time_s)
         if not self._row:
             self._found_frame(step.ranges)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]

@@ -1,28 +1,28 @@
-"""Who is heard over which distance, learned as it goes: what silence says of two positions.
+"""Which attempts to range succeed, by distance: the detection curve, learned as the team ranges.
 
-A range that was attempted and did not come is a measurement too: the two are probably far apart.
-How far depends on radio, bodies and walls, so the curve P(heard | distance) is learned by the
-team itself. The family is a logistic edge,
+A range that was attempted and did not come is a measurement too (negative information): the two
+are probably far apart. How far depends on radio, bodies and walls, so P(received | distance) is
+learned from the team itself. The family is a logistic edge,
 
     P(d) = eps + (1 - 2 eps) p0 / (1 + exp((d - R) / (w R))),
 
-with everything known of (p0, R, w) kept as a posterior on a grid; hypotheses are weighed with
-its mean curve. So an edge that was never seen says next to nothing, and one that was seen
-clearly says much. Evidence fades slowly (``MEMORY``): surroundings change.
+with the posterior of (p0, R, w) on a grid; hypotheses are weighed with its mean curve. An edge
+that was never seen says next to nothing, one that was seen clearly says much. Evidence fades
+slowly (``MEMORY``), because surroundings change.
 
-Silence is told with care, because it has other causes than distance:
+A missed attempt has other causes than distance, so it counts with care:
 
-* a pair counts as tried only where one of the two took part in another range of the same round
-  and the other is alive (it ranged, or moved of late), and only once the pair was heard at all:
-  of pairs that nobody ever ranges silence says nothing;
-* a node that nobody hears may have lost its UWB: each node's probability of that is carried
-  along (a two-state hidden Markov chain), and silence counts by so much less;
-* what blocks a pair now blocks it a second later: the correlation of consecutive surprises is
-  measured, and the weight of each is reduced to what independent ones would have
-  ((1 - rho) / (1 + rho), the effective number of a first-order autoregressive sequence).
+* a pair counts as attempted only where one of the two took part in another range of the same
+  round and the other is alive (it ranged, or moved of late), and only once a range of the pair was
+  received at all: pairs that never range each other tell nothing;
+* the UWB of a node that nobody receives may have failed: a two-state hidden Markov chain carries
+  each node's probability of that, and its missed attempts count by so much less;
+* what blocks a pair now blocks it a second later: the correlation rho of consecutive surprises is
+  measured, and each attempt counts (1 - rho) / (1 + rho) independent ones, the effective sample
+  count of a first-order autoregressive sequence.
 
 A *round* is one instant where ranges of several initiators share it (simulations, synchronised
-systems); where nodes range in turns it lasts until somebody ranges the same peer again, which
+systems); where nodes range in turns it lasts until a node ranges the same peer again, which
 covers the schedule whatever it is.
 """
 
@@ -34,11 +34,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from itertools import chain
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion.compiled import compiled
 from relpos.measurements import Range
 
 Floats = npt.NDArray[np.float64]
@@ -51,103 +52,45 @@ STEP_M = 0.5
 LENGTH = 201
 """Entries of the curve: 0 to 100 m; farther is as far as that."""
 
-FLOOR = 0.002
-"""Least probability of either outcome: reflections are heard far out, antennas have nulls."""
-
-MEMORY = 20_000.0
-"""Attempts after which evidence has faded to 1/e: half an hour of six people."""
+# -- rounds of ranging -----------------------------------------------------------------------------
 
 ALIVE_S = 2.5
 """A node whose newest motion is not older is alive: two reports in a row may be lost."""
 
-FAILS = 0.002
-"""Probability that a node's UWB falls silent in a round; an hour has 1,800 rounds, and a wrong
-alarm costs only a little of the information."""
-
-TRUSTED_M = 1.0
-"""Attempts teach the less, the less their distance is known: weight 1 / (1 + (sigma / this)^2).
-Both outcomes must be given with the distance predicted before the round, or the heard ones,
-which are better known afterwards, would be over-counted."""
-
-SHAPE = 0.03
-"""Relative error of the edge because no real edge is quite of this family (hard ones at 10 and
-15 m, seen with distances uncertain by 0.1 to 0.4 m, were placed 1 to 7 % too near)."""
-
-_NEAR = np.array([0.03, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.96, 0.995])
-_EDGE_M = np.geomspace(2.0, 80.0, 90)
-_SOFTNESS = np.array([0.005, 0.03, 0.08, 0.2, 0.5])
-_OFFSETS = math.sqrt(3.0) * np.array([[-1.0], [0.0], [1.0]])
-_SHARES = np.array([[1.0], [4.0], [1.0]]) / 6.0
-"""Three-point Gauss-Hermite rule: offsets in standard deviations, and their shares."""
-
-LONG_SHOT = 28.0
-"""Curves whose log posterior is so far below the best one's do not count: 1e-12 each."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Family:
-    """All curves, F = P0 * R * W of them."""
-
-    curves: npt.NDArray[np.float32]
-    """(F, LENGTH)."""
-    log_silent: npt.NDArray[np.float32]
-    log_heard: npt.NDArray[np.float32]
-    """(LENGTH, F): attempts lie at some distances only, whose rows are then one after another."""
-    edge_m: Floats
-
-
-@cache
-def _family() -> _Family:
-    """Make all curves, when first needed; all teams of this process share them."""
-    distance = np.arange(LENGTH) * STEP_M
-    near, edge, soft = (
-        grid.reshape(-1, 1) for grid in np.meshgrid(_NEAR, _EDGE_M, _SOFTNESS, indexing="ij")
-    )
-    exponent = (distance - edge) / (soft * edge)
-    curves = near / (1.0 + np.exp(np.clip(exponent, -60.0, 60.0)))
-    curves = FLOOR + (1.0 - 2.0 * FLOOR) * curves
-    single = np.float32
-    return _Family(
-        curves.astype(single),
-        np.ascontiguousarray(np.log1p(-curves).T.astype(single)),
-        np.ascontiguousarray(np.log(curves).T.astype(single)),
-        edge.ravel(),
-    )
-
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """Who was heard in one round of ranging, and who was tried in vain (pairs, lower id first).
+    """The attempts of one round of ranging: received ones and missed ones (pairs, lower id first).
 
-    ``witnessed`` tells of each heard pair whether its silence would have counted as tried: only
-    those may teach, or the curve would be learned from chosen successes.
+    ``observable`` tells of each received pair whether a miss would have counted as attempted:
+    the curve is learned from those alone, or it would be learned from chosen successes.
     """
 
     time_s: float
-    heard: tuple[Pair, ...]
-    silent: tuple[Pair, ...]
-    witnessed: tuple[bool, ...]
+    received: tuple[Pair, ...]
+    missed: tuple[Pair, ...]
+    observable: tuple[bool, ...]
 
 
 @dataclass(slots=True)
 class Rounds:
-    """Divides ranges into rounds and tells which pairs of each were tried in vain.
+    """Divides ranges into rounds and finds the missed attempts of each.
 
-    ``heard_ever`` holds the pairs that are known to range each other.
+    ``ever_received`` holds the pairs that are known to range each other.
     """
 
-    heard_ever: set[Pair] = field(default_factory=set)
+    ever_received: set[Pair] = field(default_factory=set)
     _turns: float | None = None
     """Running share of instants in which one node alone initiated: near 1 where in turns."""
     _open: set[Pair] = field(default_factory=set)
     _directed: set[Pair] = field(default_factory=set)
 
-    def take(
+    def add(
         self, time_s: float, ranges: Sequence[Range], reported_s: Callable[[int], float]
     ) -> list[Round]:
-        """Give the rounds that end with these ranges of one instant: none, one or two.
+        """Return the rounds that end with these ranges of one instant: none, one or two.
 
-        ``reported_s`` tells the time of a node's newest motion, -inf where there was none.
+        ``reported_s`` returns the time of a node's newest motion, -inf where there was none.
         """
         rounds = []
         directed = {(r.node, r.peer) for r in ranges}
@@ -163,117 +106,210 @@ class Rounds:
         return rounds
 
     def _close(self, time_s: float, reported_s: Callable[[int], float]) -> Round:
-        heard = self._open
-        self.heard_ever |= heard
-        busy = Counter(chain.from_iterable(heard))
-        silent = []
-        for pair in self.heard_ever - heard:
+        received = self._open
+        self.ever_received |= received
+        busy = Counter(chain.from_iterable(received))
+        missed = []
+        for pair in self.ever_received - received:
             there = (pair[0] in busy) + (pair[1] in busy)
             if there == 1:
                 other = pair[1] if pair[0] in busy else pair[0]
                 there += reported_s(other) >= time_s - ALIVE_S
             if there == 2:
-                silent.append(pair)
-        silent.sort()
+                missed.append(pair)
+        missed.sort()
         self._open, self._directed = set(), set()
-        ordered = tuple(sorted(heard))
-        witnessed = tuple([busy[a] > 1 or busy[b] > 1 for a, b in ordered])
-        return Round(time_s, ordered, tuple(silent), witnessed)
+        ordered = tuple(sorted(received))
+        observable = tuple([busy[a] > 1 or busy[b] > 1 for a, b in ordered])
+        return Round(time_s, ordered, tuple(missed), observable)
 
 
-class Teach(Protocol):
-    """Learn from one round, in place, and tell what its silences are worth.
+# -- the statistics of attempts --------------------------------------------------------------------
 
-    Pairs (U,) of slots ``first`` and ``second``, the ``heard`` ones first, with their predicted
-    distances and standard deviations (m) and whether the heard ones were ``witnessed`` (1 or 0).
-    ``working`` (S,), ``surprise`` (S, S), ``counts`` (2, LENGTH) and ``sums`` (together, apart,
-    seen) are of :class:`Detection`. Returns (U - heard,): the probability that both nodes' UWB
-    worked.
+FAILS = 0.002
+"""Probability that a node's UWB falls silent in a round; an hour has 1,800 rounds, and a wrong
+alarm costs only a little of the information."""
+
+TRUSTED_M = 1.0
+"""An attempt's weight is 1 / (1 + (sigma / this)^2): it teaches the less, the less its distance is
+known. Received and missed ones need the distance predicted before the round, or the received
+ones, which are better known afterwards, would be over-counted."""
+
+
+class Attempts(NamedTuple):
+    """U attempts of one round as arrays, the received ones first.
+
+    ``first`` and ``second`` (U,) are the nodes' slots, ``observable`` (received,) is 1 or 0,
+    ``distance_m`` and ``sigma_m`` (U,) the predicted distances and their standard deviations.
     """
 
-    def __call__(
-        self, first: Indices, second: Indices, heard: int, witnessed: Floats, distance_m: Floats,
-        sigma_m: Floats, curve: Floats, working: Floats, surprise: Floats, counts: Floats,
-        sums: Floats,
-    ) -> Floats:  # fmt: skip
-        """Learn; see the class's text."""
+    first: Indices
+    second: Indices
+    received: int
+    observable: Floats
+    distance_m: Floats
+    sigma_m: Floats
 
 
-def teach(
-    first: Indices, second: Indices, heard: int, witnessed: Floats, distance_m: Floats,
-    sigma_m: Floats, curve: Floats, working: Floats, surprise: Floats, counts: Floats,
-    sums: Floats,
-) -> Floats:  # fmt: skip
-    """See :class:`Teach`; the bank uses a compiled twin (``bank_kernels.teach``)."""
-    chance = expected(curve, distance_m, sigma_m)
-    # Each node's probability that its UWB works, from whether anybody hears it.
-    busy = {int(slot) for slot in (*first[:heard], *second[:heard])}
-    unheard: dict[int, float] = {}
-    for a, b, p in zip(first[heard:], second[heard:], chance[heard:], strict=True):
-        for slot in (int(a), int(b)):
-            if slot not in busy:
-                unheard[slot] = unheard.get(slot, 1.0) * (1.0 - float(p))
-    working[list(busy)] = 1.0
-    for slot, silence in unheard.items():
-        up = working[slot] * (1.0 - FAILS)
-        working[slot] = up * silence / (up * silence + 1.0 - up)
-    tried: Floats = working[first[heard:]] * working[second[heard:]]
-    weight = 1.0 / (1.0 + (sigma_m / TRUSTED_M) ** 2)
-    weight[:heard] *= witnessed
-    weight[heard:] *= tried
-    # Each pair's surprise beside its last one.
-    now = (np.arange(len(first)) < heard) - chance
-    before = surprise[first, second]
-    again = ~np.isnan(before)
-    w, then, since = weight[again], before[again], now[again]
-    sums[0] += float((w * then * since).sum())
-    sums[1] += float((w * 0.5 * (then**2 + since**2)).sum())
-    surprise[first, second] = now
-    # Attempts are spread over the two nearest entries of three places each.
-    place = np.clip((distance_m + _OFFSETS * sigma_m) / STEP_M, 0.0, LENGTH - 1.001)
-    index = place.astype(np.intp)
-    beyond = place - index
-    share = _SHARES * weight
-    for outcome, some in ((1, slice(None, heard)), (0, slice(heard, None))):
-        np.add.at(counts[outcome], index[:, some], (share * (1.0 - beyond))[:, some])
-        np.add.at(counts[outcome], index[:, some] + 1, (share * beyond)[:, some])
-    sums[2] += float(weight.sum())
-    return tried
+class Statistics(NamedTuple):
+    """What has been seen so far, of S nodes."""
+
+    working: Floats
+    """(S,) probability that each node's UWB works."""
+    surprise: Floats
+    """(S, S) last outcome less its probability, of each pair; NaN before the first."""
+    counts: Floats
+    """(2, LENGTH) attempts by outcome (missed, received) and distance."""
+    sums: Floats
+    """(3,): products of consecutive surprises, their mean squares, and attempts."""
+
+
+@compiled
+def add_attempts(attempts: Attempts, curve: Floats, statistics: Statistics) -> Floats:
+    """Add one round to the statistics, in place.
+
+    ``curve`` (LENGTH,) is P(received | distance) as learned so far. Returns (U - received,): the
+    probability that each missed attempt was made, which is that both nodes' UWB worked.
+    """
+    first, second, received, observable, distance_m, sigma_m = attempts
+    working, surprise, counts, sums = statistics
+    several, slots = first.shape[0], working.shape[0]
+    chance, attempted = np.empty(several), np.empty(several - received)
+    busy = np.zeros(slots, dtype=np.bool_)
+    silence = np.full(slots, -1.0)
+    root = math.sqrt(3.0)
+    for u in range(several):
+        # Three-point Gauss-Hermite rule over the distance's error; one mass of its shares is 1.
+        chance[u] = 0.0
+        for q in range(3):
+            place = (distance_m[u] + (q - 1) * root * sigma_m[u]) / STEP_M
+            place = min(max(place, 0.0), LENGTH - 1.0)
+            index = min(int(place), LENGTH - 2)
+            here = curve[index] + (place - index) * (curve[index + 1] - curve[index])
+            chance[u] += here * (4.0 if q == 1 else 1.0) / 6.0
+        if u < received:
+            busy[first[u]] = busy[second[u]] = True
+            continue
+        for slot in (first[u], second[u]):
+            if not busy[slot]:
+                silence[slot] = abs(silence[slot]) * (1.0 - chance[u])
+    for slot in range(slots):
+        if busy[slot]:
+            working[slot] = 1.0
+        elif silence[slot] >= 0.0:
+            up = working[slot] * (1.0 - FAILS)
+            working[slot] = up * silence[slot] / (up * silence[slot] + 1.0 - up)
+    for u in range(several):
+        a, b = first[u], second[u]
+        weight = 1.0 / (1.0 + (sigma_m[u] / TRUSTED_M) ** 2)
+        now = -chance[u]
+        outcome = 0
+        if u < received:
+            weight *= observable[u]
+            now += 1.0
+            outcome = 1
+        else:
+            attempted[u - received] = working[a] * working[b]
+            weight *= attempted[u - received]
+        before = surprise[a, b]
+        if not math.isnan(before):
+            sums[0] += weight * before * now
+            sums[1] += weight * 0.5 * (before * before + now * now)
+        surprise[a, b] = now
+        for q in range(3):
+            place = (distance_m[u] + (q - 1) * root * sigma_m[u]) / STEP_M
+            place = min(max(place, 0.0), LENGTH - 1.001)
+            index = int(place)
+            share = weight * (4.0 if q == 1 else 1.0) / 6.0
+            counts[outcome, index] += share * (1.0 - (place - index))
+            counts[outcome, index + 1] += share * (place - index)
+        sums[2] += weight
+    return attempted
+
+
+# -- the curve -------------------------------------------------------------------------------------
+
+FLOOR = 0.002
+"""Least probability of either outcome: reflections are received far out, antennas have nulls."""
+
+MEMORY = 20_000.0
+"""Attempts after which evidence has faded to 1/e: half an hour of six people."""
+
+SHAPE = 0.03
+"""Relative error of the edge because no real edge is quite of this family (hard ones at 10 and
+15 m, seen with distances uncertain by 0.1 to 0.4 m, were placed 1 to 7 % too near)."""
+
+_NEAR = np.array([0.03, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.96, 0.995])
+_EDGE_M = np.geomspace(2.0, 80.0, 90)
+_SOFTNESS = np.array([0.005, 0.03, 0.08, 0.2, 0.5])
+
+_GRID_M = np.arange(LENGTH) * STEP_M
+_OFFSETS = math.sqrt(3.0) * np.array([[-1.0], [0.0], [1.0]])
+_SHARES = np.array([[1.0], [4.0], [1.0]]) / 6.0
+"""Three-point Gauss-Hermite rule: offsets in standard deviations, and their shares."""
+
+LONG_SHOT = 28.0
+"""Curves whose log posterior is so far below the best one's do not count: 1e-12 each."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Family:
+    """All curves, F = P0 * R * W of them."""
+
+    curves: npt.NDArray[np.float32]
+    """(F, LENGTH)."""
+    log_missed: npt.NDArray[np.float32]
+    log_received: npt.NDArray[np.float32]
+    """(LENGTH, F): attempts lie at some distances only, whose rows are then one after another."""
+    edge_m: Floats
+
+
+@cache
+def _family() -> _Family:
+    """Make all curves, when first needed; all teams of this process share them."""
+    near, edge, soft = (
+        grid.reshape(-1, 1) for grid in np.meshgrid(_NEAR, _EDGE_M, _SOFTNESS, indexing="ij")
+    )
+    exponent = (_GRID_M - edge) / (soft * edge)
+    curves = near / (1.0 + np.exp(np.clip(exponent, -60.0, 60.0)))
+    curves = FLOOR + (1.0 - 2.0 * FLOOR) * curves
+    single = np.float32
+    return _Family(
+        curves.astype(single),
+        np.ascontiguousarray(np.log1p(-curves).T.astype(single)),
+        np.ascontiguousarray(np.log(curves).T.astype(single)),
+        edge.ravel(),
+    )
 
 
 @dataclass(slots=True)
 class Detection:
     """The learned curve of one team.
 
-    ``curve`` (LENGTH,) is P(heard | distance) at multiples of ``STEP_M`` for a pair that was
-    tried; ``weight`` (0 to 1) is what one silence counts, see the module's text. ``range_m`` and
-    ``range_sigma_m`` are the distance of half the near value.
+    ``curve`` (LENGTH,) is P(received | distance) at multiples of ``STEP_M`` for a pair that was
+    attempted. ``range_m`` and ``range_sigma_m`` are the distance of half the near value.
     """
 
     rounds: Rounds = field(default_factory=Rounds)
-    teach: Teach = teach
     curve: Floats = field(init=False)
     range_m: float = field(init=False)
     range_sigma_m: float = field(init=False)
-    _counts: Floats = field(default_factory=lambda: np.zeros((2, LENGTH)))
-    """Attempts by outcome (silent, heard) and distance."""
-    _sums: Floats = field(default_factory=lambda: np.array([0.0, 25.0, 0.0]))
-    """Of products of consecutive surprises, of their mean squares, and of attempts."""
+    _statistics: Statistics = field(
+        default_factory=lambda: Statistics(
+            np.ones(0), np.empty((0, 0)), np.zeros((2, LENGTH)), np.array([0.0, 25.0, 0.0])
+        )
+    )
     _refit_at: float = 0.0
     _slot: dict[int, int] = field(default_factory=dict)
-    """Where in the arrays below a node is."""
-    _working: Floats = field(default_factory=lambda: np.ones(0))
-    """Probability that each node's UWB works (S,)."""
-    _surprise: Floats = field(default_factory=lambda: np.empty((0, 0)))
-    """Last outcome less its probability, of each pair (S, S); NaN before the first."""
+    """Where in the statistics a node is."""
 
     def __post_init__(self) -> None:
         self._refit()
 
     @property
     def weight(self) -> float:
-        """How many independent silences one is worth."""
-        together, apart, _ = self._sums.tolist()
+        """How many independent attempts one counts (0 to 1)."""
+        together, apart, _ = self._statistics.sums.tolist()
         rho = min(max(together / apart, 0.0), 0.9)
         return float((1.0 - rho) / (1.0 + rho))
 
@@ -283,30 +319,18 @@ class Detection:
         return self.range_sigma_m < 0.3 * self.range_m
 
     def probability(self, distance_m: Floats, sigma_m: Floats | float = 0.0) -> Floats:
-        """P(heard) over distances (K,), averaged over their error."""
-        return expected(self.curve, distance_m, sigma_m)
+        """P(received) over distances (K,), averaged over their Gaussian errors."""
+        place = distance_m + _OFFSETS * sigma_m
+        mean: Floats = (_SHARES * np.interp(place, _GRID_M, self.curve)).sum(axis=0)
+        return mean
 
-    def learn(
-        self,
-        of: Round,
-        heard_m: Floats,
-        heard_sigma_m: Floats,
-        silent_m: Floats,
-        silent_sigma_m: Floats,
-    ) -> Floats:
-        """Learn from one round and tell what its silences are worth.
+    def update(self, of: Round, distance_m: Floats, sigma_m: Floats) -> Floats:
+        """Learn from one round; return (missed,), how surely each missed attempt was made.
 
-        Distances and their standard deviations as predicted before the round, in the order of
-        ``of.heard`` and ``of.silent``. Returns (len(of.silent),): the probability that both
-        nodes' UWB worked.
+        ``distance_m`` and ``sigma_m`` are predicted before the round, of ``of.received`` and then
+        of ``of.missed``.
         """
-        return self.learn_all(
-            of, np.concatenate([heard_m, silent_m]), np.concatenate([heard_sigma_m, silent_sigma_m])
-        )
-
-    def learn_all(self, of: Round, distance_m: Floats, sigma_m: Floats) -> Floats:
-        """As ``learn``, of the heard and the silent pairs in one array each."""
-        pairs = of.heard + of.silent
+        pairs = of.received + of.missed
         if not pairs:
             return np.empty(0)
         slot = self._slot
@@ -314,32 +338,34 @@ class Detection:
             slots = np.array([(slot[a], slot[b]) for a, b in pairs], dtype=np.int64)
         except KeyError:
             self._add(pairs)
-            return self.learn_all(of, distance_m, sigma_m)
+            return self.update(of, distance_m, sigma_m)
         first, second = np.ascontiguousarray(slots.T)
-        tried = self.teach(
-            first, second, len(of.heard), np.array(of.witnessed, dtype=np.float64), distance_m,
-            sigma_m, self.curve, self._working, self._surprise, self._counts, self._sums,
-        )  # fmt: skip
-        if self._sums[2] >= self._refit_at:
+        observable = np.array(of.observable, dtype=np.float64)
+        attempts = Attempts(first, second, len(of.received), observable, distance_m, sigma_m)
+        attempted = add_attempts(attempts, self.curve, self._statistics)
+        if self._statistics.sums[2] >= self._refit_at:
             self._refit()
-        return tried
+        return attempted
 
     def _add(self, pairs: Sequence[Pair]) -> None:
         """Make room for nodes that were not met before."""
         for node in sorted({node for pair in pairs for node in pair} - self._slot.keys()):
             self._slot[node] = len(self._slot)
-        more = len(self._slot) - len(self._working)
-        self._working = np.pad(self._working, (0, more), constant_values=1.0)
-        self._surprise = np.pad(self._surprise, (0, more), constant_values=np.nan)
+        old = self._statistics
+        more = len(self._slot) - len(old.working)
+        self._statistics = old._replace(
+            working=np.pad(old.working, (0, more), constant_values=1.0),
+            surprise=np.pad(old.surprise, (0, more), constant_values=np.nan),
+        )
 
     def _refit(self) -> None:
-        family = _family()
-        if self._sums[2] > MEMORY:
-            self._counts *= MEMORY / self._sums[2]
-            self._sums[2] = MEMORY
-        counts = self._counts.astype(np.float32)
+        family, (_, _, seen, sums) = _family(), self._statistics
+        if sums[2] > MEMORY:
+            seen *= MEMORY / sums[2]
+            sums[2] = MEMORY
+        counts = seen.astype(np.float32)
         log_posterior = np.zeros(len(family.curves), dtype=np.float32)
-        for outcome, logs in enumerate((family.log_silent, family.log_heard)):
+        for outcome, logs in enumerate((family.log_missed, family.log_received)):
             there = np.flatnonzero(counts[outcome])
             if there.size:
                 some = slice(int(there[0]), int(there[-1]) + 1)
@@ -354,15 +380,5 @@ class Detection:
         spread = float(posterior @ (edge_m - self.range_m) ** 2)
         self.range_sigma_m = math.sqrt(spread + (SHAPE * self.range_m) ** 2 + STEP_M**2 / 12.0)
         # Later evidence changes little: the cost of refitting stays a small share of the whole.
-        seen = float(self._sums[2])
-        self._refit_at = min(seen * 1.15, seen + 1000.0) + 10.0
-
-
-def expected(curve: Floats, distance_m: Floats, sigma_m: Floats | float = 0.0) -> Floats:
-    """Average ``curve`` over Gaussian distances (K,)."""
-    place = distance_m + _OFFSETS * sigma_m
-    mean: Floats = (_SHARES * np.interp(place, _GRID_M, curve)).sum(axis=0)
-    return mean
-
-
-_GRID_M = np.arange(LENGTH) * STEP_M
+        attempts = float(sums[2])
+        self._refit_at = min(attempts * 1.15, attempts + 1000.0) + 10.0

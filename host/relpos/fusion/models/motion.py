@@ -33,11 +33,11 @@ from relpos.fusion.timeline import Advance
 Floats = npt.NDArray[np.float64]
 
 
-def told_sigmas(step: Advance) -> tuple[float, float, float]:
-    """Give a piece's own deviations of forward (m), left (m), turn (rad); NaN where untold.
+def reported_sigmas(step: Advance) -> tuple[float, float, float]:
+    """Return a piece's reported deviations of forward (m), left (m), turn (rad); NaN where none.
 
-    Ranges correct the way as it goes: a common scale error does not build up, so that the
-    motion's error alone counts where it is told.
+    Ranges correct the path as it goes: a common scale error does not build up, so that the
+    motion's error alone counts where it is reported.
     """
     along = step.sigma_x_m if step.sigma_x_alone_m is None else step.sigma_x_alone_m
     return (
@@ -63,7 +63,7 @@ class MotionNoise:
     def sigmas(self, step: Advance) -> tuple[float, float, float]:
         """Standard deviations of forward (m), left (m) and turn (rad) for one piece."""
         share = max(step.fraction, 1e-9) ** 0.5
-        along, left, turn = (0.0 if math.isnan(s) else s for s in told_sigmas(step))
+        along, left, turn = (0.0 if math.isnan(s) else s for s in reported_sigmas(step))
         root_s = step.duration_s**0.5
         relative_d, relative_theta = self.sigma_d / share, self.sigma_theta / share
         floor_d, floor_theta = self.floor_d_m * root_s, self.floor_theta_rad * root_s

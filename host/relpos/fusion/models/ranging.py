@@ -71,50 +71,46 @@ def log_likelihood(measured_m: Floats, predicted_m: Floats, noise: RangeNoise) -
 
 
 DECORRELATION_M = 0.45
-"""Way of both nodes together over which a range's error changes. Most of it is multipath, which
-is the place's and not the moment's: in the recordings of robots, consecutive errors of one pair
-correlate by 0.5 at 0.3 m and 0.2 to 0.4 at 0.35 m of common way, by 0.9 and more at a standstill.
-At half a second's walking it is next to nothing."""
+"""Path length of both nodes together over which a range's error changes. Most of it is multipath,
+which belongs to the place and not to the moment: in the recordings of robots, consecutive errors
+of one pair correlate by 0.5 at 0.3 m and 0.2 to 0.4 at 0.35 m of common path, by 0.9 and more at
+a standstill. At half a second's walking it is next to nothing."""
 
 STILL = 0.9
-"""Correlation of two ranges that nobody moved between: a tenth of the variance is the moment's."""
+"""Correlation of two ranges without motion in between: a tenth of the variance is independent."""
 
 TURN_M = 0.2
-"""A radian of turning counts as so much way: antenna and body turn along."""
+"""A radian of turning counts as so much path: antenna and body turn along."""
 
 
 @dataclass(slots=True)
-class Repetition:
-    """How many independent ranges one is worth, by how far the two have moved since their last.
+class RangeCorrelation:
+    """How many independent ranges each counts, by the pair's path since its last one.
 
-    A sequence of errors that correlate by rho from one to the next is worth (1-rho)/(1+rho)
-    independent ones each (the effective size of a first-order autoregressive sequence), however
-    often the two range: hundred ranges of two who stand tell little more than one.
+    With a correlation rho of consecutive errors each counts (1 - rho) / (1 + rho), the effective
+    sample count of a first-order autoregressive sequence: a hundred ranges between two nodes that
+    stand say little more than one.
     """
 
-    _way_m: dict[int, float] = field(default_factory=dict)
+    _path_m: dict[int, float] = field(default_factory=dict)
     _last_m: dict[tuple[int, int], float] = field(default_factory=dict)
 
-    def move(self, node: int, dx_m: float, dy_m: float, dtheta_rad: float) -> None:
-        """Take note of a displacement."""
-        self.went(node, math.hypot(dx_m, dy_m), dtheta_rad)
+    def move(self, node: int, length_m: float, dtheta_rad: float) -> None:
+        """Add a displacement to a node's path."""
+        length_m += TURN_M * abs(dtheta_rad)
+        self._path_m[node] = self._path_m.get(node, 0.0) + length_m
 
-    def went(self, node: int, way_m: float, dtheta_rad: float) -> None:
-        """As ``move``, of a displacement so long."""
-        way_m += TURN_M * abs(dtheta_rad)
-        self._way_m[node] = self._way_m.get(node, 0.0) + way_m
-
-    def worth(self, pairs: Iterable[tuple[int, int]]) -> Floats:
-        """Give (R,) for the ranges of one instant, each in (0, 1], and take note of them."""
-        worth = []
+    def effective_counts(self, pairs: Iterable[tuple[int, int]]) -> Floats:
+        """Add the ranges of one instant; return (R,), each within (0, 1]."""
+        counts = []
         for node, peer in pairs:
             key = (node, peer) if node < peer else (peer, node)
-            now = self._way_m.get(node, 0.0) + self._way_m.get(peer, 0.0)
+            now = self._path_m.get(node, 0.0) + self._path_m.get(peer, 0.0)
             before = self._last_m.get(key)
             self._last_m[key] = now
             if before is None:
-                worth.append(1.0)
+                counts.append(1.0)
                 continue
             rho = STILL * math.exp((before - now) / DECORRELATION_M)
-            worth.append((1.0 - rho) / (1.0 + rho))
-        return np.array(worth)
+            counts.append((1.0 - rho) / (1.0 + rho))
+        return np.array(counts)

@@ -311,7 +311,7 @@ class ParticleFilter:
                 case Advance():
                     self._moved = True
                     known = self._known[step.node]
-                    known.heard(step.time_s)
+                    known.received(step.time_s)
                     self._pending.setdefault(step.node, []).append(step)
                 case Ranging():
                     self._predict()
@@ -360,7 +360,7 @@ class ParticleFilter:
         for measured in step.ranges:
             for node in (measured.node, measured.peer):
                 known = self._known[node]
-                known.heard(step.time_s)
+                known.received(step.time_s)
         if not self._row:
             self._found_frame(step.ranges)
         column, placed_m = self._row, None

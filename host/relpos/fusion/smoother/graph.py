@@ -149,10 +149,10 @@ class _Builder:
                 for one in step.ranges:
                     self.seen |= {one.node, one.peer}
                     self.ranges.append(self._entry(step.time_s, one.node, one.peer, one.range_m))
-                for done in self.rounds.take(step.time_s, step.ranges, reported_s):
+                for done in self.rounds.add(step.time_s, step.ranges, reported_s):
                     entries = [
                         self._entry(step.time_s, node, peer, 0.0)
-                        for node, peer in done.heard + done.silent
+                        for node, peer in done.received + done.missed
                     ]
                     self.tried.append((done, entries))
             case Sensed(measurement=Height() as height):
@@ -238,7 +238,7 @@ def _finished(
         np.cumsum([0, *(len(entries) for _, entries in tried)]),
         *_placed(attempts, row, time_s, chord),
         np.array(
-            [k >= len(done.heard) for done, entries in tried for k in range(len(entries))],
+            [k >= len(done.received) for done, entries in tried for k in range(len(entries))],
             dtype=bool,
         ),
     )

@@ -641,11 +641,10 @@ def hearing_cost(problem: Problem, state: State, sigma_m: float = HEARING_BLUR_M
     weight = np.zeros(distance.size)
     for k, done in enumerate(tries.rounds):
         first, last = tries.first[k], tries.first[k + 1]
-        middle = first + len(done.heard)
-        heard, silent = distance[first:middle], distance[middle:last]
-        weight[first:middle] = done.witnessed
-        weight[middle:last] = detection.learn(
-            done, heard, np.full(heard.size, sigma_m), silent, np.full(silent.size, sigma_m)
+        middle = first + len(done.received)
+        weight[first:middle] = done.observable
+        weight[middle:last] = detection.update(
+            done, distance[first:last], np.full(last - first, sigma_m)
         )
     chance = detection.probability(distance, sigma_m)
     outcome = np.where(tries.silent, np.log1p(-chance), np.log(chance))
@@ -659,11 +658,9 @@ def _learned_curve(problem: Problem, distance_m: Floats, sigma_m: Floats) -> tup
     weight = np.zeros(distance_m.size)
     for k, done in enumerate(tries.rounds):
         first, last = tries.first[k], tries.first[k + 1]
-        heard, silent = slice(first, first + len(done.heard)), slice(first + len(done.heard), last)
-        weight[heard] = done.witnessed
-        weight[silent] = detection.learn(
-            done, distance_m[heard], sigma_m[heard], distance_m[silent], sigma_m[silent]
-        )
+        middle = first + len(done.received)
+        weight[first:middle] = done.observable
+        weight[middle:last] = detection.update(done, distance_m[first:last], sigma_m[first:last])
     curve = np.convolve(np.pad(detection.curve, 3, mode="edge"), _BLUR, mode="valid")
     return curve, HEAR_SHARE * detection.weight * weight
 
