@@ -211,7 +211,7 @@ def simulated_gains(speed_m_s: tuple[float, float], walkers: int, seed: int) -> 
 
 
 def _print_gains(title: str, gains: FloatArray) -> None:
-    names = ("speed_m_s", "step_length_m", "walk_ratio_m_s", "rise_m", "pendulum_gain")
+    names = ("speed_m_s", "step_length_m", "walk_ratio_m_s", "excursion_m", "pendulum_gain")
     print(f"{title} ({len(gains)} walks)")
     for name, mean, sd in zip(names, gains.mean(axis=0), gains.std(axis=0), strict=True):
         print(f"  {name:22s} {mean:6.3f} +- {sd:.3f}")

@@ -30,10 +30,10 @@ from gait_statistics import (
 )
 from relpos.calibration.steps import LEG_OF_STATURE
 from relpos.simulation.activities import Activity
-from relpos.simulation.gait import rotation
 from relpos.simulation.indoor import INDOOR
 from relpos.simulation.motion import WearerTruth
 from relpos.simulation.solo import make_walker
+from relpos.simulation.torso import rotation
 from relpos.simulation.wearer import make_wearer
 from relpos.simulation.world import FloatArray
 

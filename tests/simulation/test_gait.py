@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from relpos.errors import DataError
-from relpos.simulation.gait import Spectral, pendulum_rise_m, vertical_shape
+from relpos.simulation.gait import pendulum_rise_m
+from relpos.simulation.spectral import Spectral
 from relpos.simulation.team import MAX_WALKERS, SCENARIOS, make_team
+from relpos.simulation.torso import vertical_shape
 from relpos.simulation.walker import Route, WalkerTruth
 from relpos.simulation.world import GRAVITY_M_S2, FloatArray
 

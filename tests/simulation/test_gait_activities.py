@@ -166,8 +166,8 @@ def test_people_cover_the_ranges_that_are_promised() -> None:
     assert low < 0.35
     assert high > 1.75
     assert spread("stature_m")[1] - spread("stature_m")[0] > 0.4
-    assert spread("rise_m")[1] / spread("rise_m")[0] > 1.5
-    low, high = spread("rise_by_length")
+    assert spread("excursion_m")[1] / spread("excursion_m")[0] > 1.5
+    low, high = spread("excursion_by_length")
     assert low < 0.6
     assert high > 1.9
     assert spread("walk_ratio_m_s")[1] / spread("walk_ratio_m_s")[0] > 1.6

@@ -9,14 +9,28 @@ in a direction it does not face, and the sensor is carried by soft tissue and ma
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from relpos.simulation import gait
 from relpos.simulation.activities import ACTIVITIES, HIP_OF_STATURE, STEP_FIELDS, Itinerary
-from relpos.simulation.gait import Grid, rotation, slow_noise, vertical_shape
+from relpos.simulation.spectral import Grid, slow_noise
+from relpos.simulation.torso import (
+    Attitude,
+    angular_rates,
+    differentiate,
+    draw_strikes,
+    field_along,
+    heel_shocks,
+    quiet_sway,
+    rotation,
+    shaken_attitude,
+    true_steps,
+    vertical_shape,
+)
 from relpos.simulation.walker import RATE_HZ, StepTruth, WalkerTruth
 from relpos.simulation.wearer import Wearer
 from relpos.simulation.world import GRAVITY_M_S2, FloatArray, World
@@ -44,7 +58,7 @@ class WearerTruth(WalkerTruth):
     """`WalkerTruth` of any activity, with what is known about it.
 
     ``facing_rad`` (n,) is where the body faces without the trunk's oscillation (``heading_rad``
-    has it), ``path_m`` (n,) the way that the body has moved, whatever its direction; falls are
+    has it), ``path_m`` (n,) how far the body has moved, in whatever direction; falls are
     in it but are no steps. ``activity`` (n,) are indices into `ACTIVITIES`, -1 after the last;
     ``intervals`` the same as (begin, end, label). ``angular_rate`` and ``specific_force`` are
     those of the sensor, wherever it sits and however it wobbles.
@@ -59,11 +73,11 @@ class WearerTruth(WalkerTruth):
 
     @property
     def distance_m(self) -> float:
-        """Way moved from the first to the last sample."""
+        """Path length from the first to the last sample."""
         return float(self.path_m[-1] - self.path_m[0])
 
     def since(self, begin_s: float) -> WearerTruth:
-        """Give the same wearer, switched on at ``begin_s``: times count from there."""
+        """The same wearer, switched on at ``begin_s``: times count from there."""
         first = round(begin_s * RATE_HZ)
         begin_s = first / RATE_HZ
         keep = self.steps.time_s >= begin_s
@@ -101,13 +115,241 @@ class WearerTruth(WalkerTruth):
         )
 
 
-def bearing_rad(way_m: FloatArray, bends: list[tuple[float, float, float]]) -> FloatArray:
-    """Direction of the way (n,): in each bend the curvature is a raised cosine."""
-    out = np.zeros_like(way_m)
+def bearing_rad(path_m: FloatArray, bends: list[tuple[float, float, float]]) -> FloatArray:
+    """Direction of the path (n,): in each bend the curvature is a raised cosine."""
+    out = np.zeros_like(path_m)
     for begin, length, angle in bends:
-        u = np.clip((way_m - begin) / length, 0.0, 1.0)
+        u = np.clip((path_m - begin) / length, 0.0, 1.0)
         out += angle * (u - np.sin(2 * np.pi * u) / (2 * np.pi))
     return out
+
+
+class _Progress(NamedTuple):
+    """What the feet do, (n,) each; ``shape`` interpolates the columns of `STEP_FIELDS`."""
+
+    stepped_m: FloatArray
+    phase: FloatArray
+    turned_rad: FloatArray
+    ground_m: FloatArray
+    going: FloatArray
+    """0 standing, 1 walking."""
+    shape: Callable[[str], FloatArray]
+
+    @property
+    def stride(self) -> FloatArray:
+        """Phase of the stride in radians."""
+        return np.asarray(np.pi * self.phase)
+
+    @property
+    def pace(self) -> FloatArray:
+        """Speed over 1.2 m/s, within the range that the recordings support."""
+        return np.clip(self.shape("pace"), 0.0, 1.6)
+
+
+def _progress(plan: Itinerary, steps: Mapping[str, FloatArray], grid: Grid) -> _Progress:
+    def smooth(values: list[float], width_s: float = 0.18) -> tuple[FloatArray, FloatArray]:
+        raw = np.interp(grid.time_s, plan.knot_time_s, values)
+        value, slope = grid.spectral.derivatives(raw, 1, smooth_s=width_s)
+        return value, slope
+
+    phase, cadence = smooth(plan.knot_phase)
+
+    def shape(name: str) -> FloatArray:
+        if not plan.steps:
+            return np.zeros_like(phase)
+        return np.asarray(np.interp(phase, np.arange(len(plan.steps)) + 0.5, steps[name]))
+
+    return _Progress(
+        smooth(plan.knot_path_m)[0],
+        phase,
+        smooth(plan.knot_turn_rad, 0.22)[0],
+        smooth(plan.knot_ground_m)[0],
+        np.tanh(np.maximum(cadence, 0.0) / 0.4),
+        shape,
+    )
+
+
+class _Track(NamedTuple):
+    """Where the body is on the floor (n, 2), where it faces and moves, and how far it has moved."""
+
+    centre_m: FloatArray
+    facing_rad: FloatArray
+    course_rad: FloatArray
+    path_m: FloatArray
+
+
+def _track(
+    rng: np.random.Generator,
+    plan: Itinerary,
+    progress: _Progress,
+    grid: Grid,
+    start_heading_rad: float,
+) -> _Track:
+    """Nobody walks on a drawn line: 6 cm aside over 3 m."""
+    t = grid.time_s
+    path = progress.stepped_m + plan.slide.at(t)
+    span = max(float(path[-1]), 1.0) + 4.0
+    side_s = np.arange(-2.0, span + 2.0, 0.25)
+    aside = CubicSpline(side_s, slow_noise(rng, side_s, 0.06, 3.0))
+    slope = np.arctan(np.asarray(aside(path, 1), dtype=np.float64))
+    facing = start_heading_rad + progress.turned_rad + plan.twist.at(t)
+    facing = facing + bearing_rad(progress.stepped_m, plan.bends) + slope
+    course = facing + plan.offset.at(t)
+    speed = np.gradient(path, 1.0 / RATE_HZ)
+    east, north = speed * np.cos(course), speed * np.sin(course)
+    centre = np.zeros((len(t), 2))
+    centre[1:, 0] = np.cumsum(0.5 * (east[1:] + east[:-1])) / RATE_HZ
+    centre[1:, 1] = np.cumsum(0.5 * (north[1:] + north[:-1])) / RATE_HZ
+    centre -= centre[grid.pad]
+    return _Track(centre, facing, course, path)
+
+
+def _angles(
+    rng: np.random.Generator,
+    wearer: Wearer,
+    plan: Itinerary,
+    progress: _Progress,
+    facing_rad: FloatArray,
+    t: FloatArray,
+) -> tuple[tuple[FloatArray, FloatArray, FloatArray], float]:
+    """Roll, pitch and yaw of the trunk (n,), and the phase of the fore-aft fluctuation.
+
+    It turns into a bend a little ahead of the feet, oscillates with the stride, looks about.
+    """
+    tone = progress.going * progress.pace**0.7 * progress.shape("trunk")
+    stride = progress.stride
+    shift = rng.normal(0.0, (0.4, 0.4, 0.25, 0.4))
+    shift[2] += wearer.pitch_phase_rad
+    lead = rng.uniform(0.0, 0.25)
+    yaw = np.interp(t + lead, t, facing_rad) + slow_noise(rng, t, math.radians(1.5), 2.5)
+    low = 1.5 if wearer.place == "lower_back" else 1.0  # the pelvis turns more than the chest
+    yaw += low * wearer.yaw_rad * tone * np.cos(stride + shift[0])
+    roll = -wearer.roll_rad * tone * np.sin(stride + 1.9 + shift[1])
+    roll += 0.3 * wearer.limp * progress.going * np.cos(stride + shift[1])
+    pitch = wearer.pitch_rad * tone * np.sin(2 * stride + 2.1 + shift[2])
+    pitch += wearer.lean_rad * progress.going + slow_noise(rng, t, math.radians(1.0), 1.5)
+    pitch += plan.pitch.at(t)
+    roll += plan.roll.at(t)
+    return (roll, pitch, yaw), float(shift[3])
+
+
+def _hips(wearer: Wearer, progress: _Progress, surge_phase_rad: float) -> list[FloatArray]:
+    """Where the hips move within a step: up, fore and side (n,)."""
+    going, stride = progress.going, progress.stride
+    pace_m_s = 1.2 * progress.pace
+    support = 0.72 - 0.10 * np.clip((1.2 - pace_m_s) / 0.7, 0.0, 1.0)
+    up = progress.shape("excursion_m") * going * (vertical_shape(progress.phase, support) - 1.0)
+    length = progress.shape("length_m")
+    surge = progress.shape("surge") * length / (2 * np.pi)
+    fore = surge * np.sin(2 * stride + surge_phase_rad) * going
+    lateral = wearer.lateral_scale * np.maximum(0.038 - 0.014 * pace_m_s, 0.015)
+    return [up, fore, lateral * progress.shape("sway") * going * np.sin(stride)]
+
+
+def _shocks(
+    rng: np.random.Generator,
+    wearer: Wearer,
+    plan: Itinerary,
+    steps: Mapping[str, FloatArray],
+    grid: Grid,
+) -> list[FloatArray]:
+    """Displacements up, fore, side and rotations pitch, yaw, roll after each foot strike."""
+    count = len(plan.steps)
+    if not count:
+        return [np.zeros_like(grid.time_s) for _ in range(6)]
+    phases, times = np.array(plan.knot_phase[1:]), np.array(plan.knot_time_s[1:])
+    strikes = draw_strikes(rng, phases, times, count, wearer.irregularity)
+    # The recordings fix the powers between 0.9 and 1.2 m/s only; held beyond 1.6 m/s.
+    pace = np.clip(steps["pace"], 0.0, 1.35)
+    begin_s = grid.time_s[0]
+    out = heel_shocks(
+        grid.spectral, begin_s, strikes, pace, wearer.impact_scale, steps["shock"],
+        _PLACE_SHOCKS[wearer.place],
+    )  # fmt: skip
+    # The jolt of the heel itself, 20 ms before the slower shock.
+    size = wearer.jolt_m_s2 * steps["shock"] * pace**1.5 * strikes.spread[0] ** 2
+    at = (strikes.time_s - 0.02 - begin_s) * RATE_HZ
+    jolt = grid.spectral.shocks(at, size, wearer.jolt_hz, 0.5, 0.008)
+    out[0] = out[0] + jolt
+    out[1] = out[1] - 0.5 * jolt
+    return out
+
+
+def _torso_path(
+    wearer: Wearer,
+    plan: Itinerary,
+    progress: _Progress,
+    track: _Track,
+    moved: Sequence[FloatArray],
+    grid: Grid,
+) -> FloatArray:
+    """Path (n, 3) of the hips' middle: ``moved`` up, fore and side, and what falls do to it."""
+    up, fore, side = moved
+    for blow in plan.impacts:
+        at = np.array([(blow.time_s - grid.time_s[0]) * RATE_HZ])
+        for part, size in ((up, blow.up_m_s2), (fore, blow.level_m_s2)):
+            part += grid.spectral.shocks(at, np.array([size]), blow.resonance_hz, 0.35)
+    position = np.empty((len(up), 3))
+    course, facing = track.course_rad, track.facing_rad
+    position[:, 0] = track.centre_m[:, 0] + fore * np.cos(course) - side * np.sin(facing)
+    position[:, 1] = track.centre_m[:, 1] + fore * np.sin(course) + side * np.cos(facing)
+    position[:, 2] = (
+        HIP_OF_STATURE * wearer.stature_m + progress.ground_m + up - plan.drop.at(grid.time_s)
+    )
+    return position
+
+
+def _carried(
+    wearer: Wearer, plan: Itinerary, hips_m: FloatArray, trunk: FloatArray, grid: Grid
+) -> tuple[FloatArray, FloatArray]:
+    """Path (n, 3) of the sensor on its lever arm, and how far soft tissue lets it lag (n, 3)."""
+    position = hips_m
+    lever_arm = np.tile(np.array(wearer.arm_m), (len(position), 1))
+    for slip in plan.slips:
+        u = np.clip((grid.time_s - slip.begin_s) / slip.last_s, 0.0, 1.0)
+        lever_arm += (u**3 * (10 - 15 * u + 6 * u**2))[:, None] * slip.shift_m
+    position += np.einsum("nij,nj->ni", trunk, lever_arm)
+    lag = np.zeros_like(position)
+    if wearer.tissue_hz > 0.0:
+        for axis in range(3):
+            carried = grid.spectral.transmitted(
+                position[:, axis], wearer.tissue_hz, wearer.tissue_damping
+            )
+            lag[:, axis] = carried - position[:, axis]
+            position[:, axis] = carried
+    return position, lag
+
+
+def _mounted(
+    rng: np.random.Generator,
+    wearer: Wearer,
+    plan: Itinerary,
+    torso: Attitude,
+    lag_m: FloatArray,
+    grid: Grid,
+) -> tuple[FloatArray, FloatArray]:
+    """The sensor's attitude and rate: tipped by its lag, wandering in its strap, slipping."""
+    t, spectral = grid.time_s, grid.spectral
+    local = np.einsum("nji,nj->ni", torso.trunk, lag_m)
+    tip = wearer.tissue_tilt_rad_m
+    loose = [slow_noise(rng, t, wearer.loose_rad, 4.0) for _ in range(3)]
+    roll, roll_rate = spectral.derivatives(loose[0] - tip * local[:, 2] * 0.7, 1)
+    pitch, pitch_rate = spectral.derivatives(loose[1] + tip * local[:, 2], 1)
+    yaw, yaw_rate = spectral.derivatives(loose[2] + tip * local[:, 1], 1)
+    attitude, rate = _turned(
+        torso.body,
+        torso.rate_rad_s,
+        rotation(roll, pitch, yaw),
+        angular_rates(roll, pitch, roll_rate, pitch_rate, yaw_rate),
+    )
+    for slip in plan.slips:
+        u = np.clip((t - slip.begin_s) / slip.last_s, 0.0, 1.0)
+        angle = slip.angle_rad * u**3 * (10 - 15 * u + 6 * u**2)
+        angle, angle_rate = spectral.derivatives(angle, 1)
+        attitude, rate = _turned(
+            attitude, rate, _about(slip.axis, angle), angle_rate[:, None] * slip.axis
+        )
+    return attitude, rate
 
 
 def move(
@@ -121,240 +363,56 @@ def move(
     carried_ut: FloatArray | None = None,
 ) -> WearerTruth:
     """Synthesise the truth of one wearer; ``carried_ut`` (3,) is a field fixed to the body."""
-    t, spectral = grid.time_s, grid.spectral
-
-    def smooth(values: list[float], width_s: float = 0.18) -> tuple[FloatArray, FloatArray]:
-        raw = np.interp(t, plan.knot_time_s, values)
-        value, slope = spectral.derivatives(raw, 1, smooth_s=width_s)
-        return value, slope
-
-    stepped, _ = smooth(plan.knot_way_m)
-    phase, cadence = smooth(plan.knot_phase)
-    turned, _ = smooth(plan.knot_turn_rad, 0.22)
-    ground, _ = smooth(plan.knot_ground_m)
-    cadence = np.maximum(cadence, 0.0)
-    going = np.tanh(cadence / 0.4)
-    way = stepped + plan.slide.at(t)
+    t = grid.time_s
     table = np.array(plan.steps).reshape(-1, len(STEP_FIELDS))
-    column = {name: table[:, k] for k, name in enumerate(STEP_FIELDS)}
+    steps = {name: table[:, k] for k, name in enumerate(STEP_FIELDS)}
+    progress = _progress(plan, steps, grid)
+    track = _track(rng, plan, progress, grid, start_heading_rad)
+    (roll, pitch, yaw), surge_phase = _angles(rng, wearer, plan, progress, track.facing_rad, t)
+    sway = quiet_sway(rng, t, wearer.sway_scale)
+    sway.tilt(roll, pitch, wearer.sensor_height_m)
+    moved = _hips(wearer, progress, surge_phase)
+    shocks = _shocks(rng, wearer, plan, steps, grid)
+    moved[0] += shocks[0]
+    moved[1] += shocks[1] + sway.fore_m + 0.0015 * sway.breath
+    moved[2] += shocks[2] + sway.side_m
+    torso = shaken_attitude(grid.spectral, roll, pitch, yaw, shocks[3:])
+    hips = _torso_path(wearer, plan, progress, track, moved, grid)
+    position, lag = _carried(wearer, plan, hips, torso.trunk, grid)
+    velocity, acceleration = differentiate(grid.spectral, position)
+    attitude, rate = _mounted(rng, wearer, plan, torso, lag, grid)
 
-    def per_step(name: str) -> FloatArray:
-        if not len(table):
-            return np.zeros_like(t)
-        centre = np.arange(len(table)) + 0.5
-        return np.asarray(np.interp(phase, centre, column[name]))
-
-    # Where the body goes, and where it faces. Nobody walks on a drawn line: 6 cm over 3 m.
-    span = max(float(way[-1]), 1.0) + 4.0
-    side_s = np.arange(-2.0, span + 2.0, 0.25)
-    aside = CubicSpline(side_s, slow_noise(rng, side_s, 0.06, 3.0))
-    slope = np.arctan(np.asarray(aside(way, 1), dtype=np.float64))
-    facing = start_heading_rad + turned + plan.twist.at(t)
-    facing = facing + bearing_rad(stepped, plan.bends) + slope
-    course = facing + plan.offset.at(t)
-    speed = np.gradient(way, 1.0 / RATE_HZ)
-    east, north = speed * np.cos(course), speed * np.sin(course)
-    centre = np.zeros((len(t), 2))
-    centre[1:, 0] = np.cumsum(0.5 * (east[1:] + east[:-1])) / RATE_HZ
-    centre[1:, 1] = np.cumsum(0.5 * (north[1:] + north[:-1])) / RATE_HZ
-    centre -= centre[grid.pad]
-
-    # Trunk: turns into a bend a little ahead of the feet, oscillates with the stride, looks about.
-    pace = np.clip(per_step("pace"), 0.0, 1.6)
-    tone = going * pace**0.7 * per_step("trunk")
-    stride = np.pi * phase
-    shift = rng.normal(0.0, (0.4, 0.4, 0.25, 0.4))
-    shift[2] += wearer.pitch_phase_rad
-    lead = rng.uniform(0.0, 0.25)
-    yaw = np.interp(t + lead, t, facing) + slow_noise(rng, t, math.radians(1.5), 2.5)
-    low = 1.5 if wearer.place == "lower_back" else 1.0  # the pelvis turns more than the chest
-    yaw += low * wearer.yaw_rad * tone * np.cos(stride + shift[0])
-    roll = -wearer.roll_rad * tone * np.sin(stride + 1.9 + shift[1])
-    roll += 0.3 * wearer.limp * going * np.cos(stride + shift[1])
-    pitch = wearer.pitch_rad * tone * np.sin(2 * stride + 2.1 + shift[2])
-    pitch += wearer.lean_rad * going + slow_noise(rng, t, math.radians(1.0), 1.5)
-    pitch += plan.pitch.at(t)
-    roll += plan.roll.at(t)
-
-    # Quiet standing: sway about the ankles, 4 mm rms fore-aft at the chest, and breathing.
-    height = wearer.sensor_height_m
-    sway_fore = slow_noise(rng, t, 0.004 * wearer.sway_scale, 0.7)
-    sway_side = slow_noise(rng, t, 0.0025 * wearer.sway_scale, 0.7)
-    breath = np.sin(2 * np.pi * (0.25 * t + 0.3 * slow_noise(rng, t, 1.0, 6.0)) + rng.uniform(0, 6))
-    pitch += sway_fore / height + math.radians(0.2) * breath
-    roll -= sway_side / height
-
-    # The hips within a step.
-    pace_m_s = 1.2 * pace
-    support = 0.72 - 0.10 * np.clip((1.2 - pace_m_s) / 0.7, 0.0, 1.0)
-    up = per_step("rise_m") * going * (vertical_shape(phase, support) - 1.0)
-    length = per_step("length_m")
-    fore = per_step("surge") * length / (2 * np.pi) * np.sin(2 * stride + shift[3]) * going
-    lateral = wearer.lateral_scale * np.maximum(0.038 - 0.014 * pace_m_s, 0.015)
-    side = lateral * per_step("sway") * going * np.sin(stride)
-
-    # What heel strikes and falls shake.
-    shocks = _shocks(rng, wearer, plan, column, t, spectral)
-    up += shocks[0]
-    fore += shocks[1] + sway_fore + 0.0015 * breath
-    side += shocks[2] + sway_side
-    for blow in plan.impacts:
-        place = np.array([(blow.time_s - t[0]) * RATE_HZ])
-        for axis, size in ((0, blow.up_m_s2), (1, blow.level_m_s2)):
-            shake = spectral.shocks(place, np.array([size]), blow.resonance_hz, 0.35)
-            if axis == 0:
-                up += shake
-            else:
-                fore += shake
-
-    trunk = rotation(roll, pitch, yaw)
-    yaw, yaw_rate = spectral.derivatives(yaw + shocks[4], 1)
-    pitch, pitch_rate = spectral.derivatives(pitch + shocks[3], 1)
-    roll, roll_rate = spectral.derivatives(roll + shocks[5], 1)
-    body = rotation(roll, pitch, yaw)
-    rate = _rates(roll, pitch, roll_rate, pitch_rate, yaw_rate)
-
-    # The sensor: an arm from the hips' middle along the trunk, its wobble on soft tissue.
-    arm = np.tile(np.array(wearer.arm_m), (len(t), 1))
-    for slip in plan.slips:
-        u = np.clip((t - slip.begin_s) / slip.last_s, 0.0, 1.0)
-        arm += (u**3 * (10 - 15 * u + 6 * u**2))[:, None] * slip.shift_m
-    position = np.empty((len(t), 3))
-    cos_c, sin_c = np.cos(course), np.sin(course)
-    cos_f, sin_f = np.cos(facing), np.sin(facing)
-    position[:, 0] = centre[:, 0] + fore * cos_c - side * sin_f
-    position[:, 1] = centre[:, 1] + fore * sin_c + side * cos_f
-    position[:, 2] = HIP_OF_STATURE * wearer.stature_m + ground + up - plan.drop.at(t)
-    position += np.einsum("nij,nj->ni", trunk, arm)
-    lag = np.zeros_like(position)
-    if wearer.tissue_hz > 0.0:
-        for axis in range(3):
-            carried = spectral.transmitted(
-                position[:, axis], wearer.tissue_hz, wearer.tissue_damping
-            )
-            lag[:, axis] = carried - position[:, axis]
-            position[:, axis] = carried
-    velocity, acceleration = np.empty_like(position), np.empty_like(position)
-    for axis in range(3):
-        position[:, axis], velocity[:, axis], acceleration[:, axis] = spectral.derivatives(
-            position[:, axis], 2
-        )
-
-    # How the sensor turns on the body: tipped by its lag, wandering in its strap, slipping.
-    local = np.einsum("nji,nj->ni", trunk, lag)
-    tip = wearer.tissue_tilt_rad_m
-    loose = [slow_noise(rng, t, wearer.loose_rad, 4.0) for _ in range(3)]
-    tilt_roll, tilt_roll_rate = spectral.derivatives(loose[0] - tip * local[:, 2] * 0.7, 1)
-    tilt_pitch, tilt_pitch_rate = spectral.derivatives(loose[1] + tip * local[:, 2], 1)
-    tilt_yaw, tilt_yaw_rate = spectral.derivatives(loose[2] + tip * local[:, 1], 1)
-    attitude, turn_rate = _turned(
-        body,
-        rate,
-        rotation(tilt_roll, tilt_pitch, tilt_yaw),
-        _rates(tilt_roll, tilt_pitch, tilt_roll_rate, tilt_pitch_rate, tilt_yaw_rate),
-    )
-    for slip in plan.slips:
-        raw = np.clip((t - slip.begin_s) / slip.last_s, 0.0, 1.0)
-        raw = slip.angle_rad * raw**3 * (10 - 15 * raw + 6 * raw**2)
-        angle, angle_rate = spectral.derivatives(raw, 1)
-        attitude, turn_rate = _turned(
-            attitude, turn_rate, _about(slip.axis, angle), angle_rate[:, None] * slip.axis
-        )
-    mount = wearer.axes_matrix
-
-    inner = grid.inner
-    position, velocity = position[inner], velocity[inner]
-    attitude = attitude[inner] @ mount
+    inner, mount = grid.inner, wearer.axes_matrix
+    position, attitude = position[inner], attitude[inner] @ mount
     force = acceleration[inner] + np.array([0.0, 0.0, GRAVITY_M_S2])
-    field = gait._field(world, position)
+    field = field_along(world, position)
     if carried_ut is not None:
-        field = field + body[inner] @ carried_ut
+        field = field + torso.body[inner] @ carried_ut
     time_s = t[inner] + 0.0
-    base = gait._steps(t, phase, stepped, grid)
+    base = true_steps(t, progress.phase, progress.stepped_m, grid)
     activity = _labels(time_s, plan.intervals)
     at = np.clip(np.searchsorted(time_s, base.time_s), 0, len(time_s) - 1)
+    direction = (track.course_rad - track.facing_rad)[inner][at]
     walking = [begin for begin, _, kind in plan.intervals if kind != "stand"]
     return WearerTruth(
         node=node,
         person=wearer,
         time_s=time_s,
         position_m=position,
-        velocity_m_s=velocity,
-        heading_rad=yaw[inner],
+        velocity_m_s=velocity[inner],
+        heading_rad=torso.yaw_rad[inner],
         attitude=attitude,
         specific_force_m_s2=np.einsum("nji,nj->ni", attitude, force),
-        angular_rate_rad_s=turn_rate[inner] @ mount,
+        angular_rate_rad_s=rate[inner] @ mount,
         magnetic_field_ut=np.einsum("nji,nj->ni", attitude, field),
         pressure_pa=world.pressure_pa(position[:, 2]),
-        steps=LabelledSteps(base.time_s, base.length_m, activity[at], (course - facing)[inner][at]),
+        steps=LabelledSteps(base.time_s, base.length_m, activity[at], direction),
         walk_start_s=walking[0] if walking else float(time_s[-1]),
         wearer=wearer,
-        facing_rad=facing[inner],
-        path_m=way[inner] - way[grid.pad],
+        facing_rad=track.facing_rad[inner],
+        path_m=track.path_m[inner] - track.path_m[grid.pad],
         activity=activity,
         intervals=tuple(plan.intervals),
-    )
-
-
-def _shocks(
-    rng: np.random.Generator,
-    wearer: Wearer,
-    plan: Itinerary,
-    column: dict[str, FloatArray],
-    t: FloatArray,
-    spectral: gait.Spectral,
-) -> list[FloatArray]:
-    """Displacements up, fore, side and rotations pitch, yaw, roll after each foot strike."""
-    count = len(plan.steps)
-    kinds = (
-        gait._SHOCK_UP,
-        gait._SHOCK_FORE,
-        gait._SHOCK_SIDE,
-        gait._SHOCK_PITCH,
-        gait._SHOCK_YAW,
-        gait._SHOCK_ROLL,
-    )
-    if not count:
-        return [np.zeros_like(t) for _ in kinds]
-    whole = np.arange(count)
-    phases = np.array(plan.knot_phase[1:])
-    times = np.array(plan.knot_time_s[1:])
-    strike_s = np.interp(whole + gait._STRIKE_PHASE, phases, times)
-    strike_s = strike_s + 0.012 * wearer.irregularity * rng.standard_normal(count)
-    spread = np.exp(0.2 * wearer.irregularity * rng.standard_normal((6, count)))
-    foot = np.where(whole % 2 == 0, 1.0, -1.0)
-    scale = _PLACE_SHOCKS[wearer.place]
-    # The recordings fix the powers between 0.9 and 1.2 m/s only; held beyond 1.6 m/s.
-    pace = np.clip(column["pace"], 0.0, 1.35)
-    out = []
-    for row, (size, power, resonance, damping) in enumerate(kinds):
-        sign = np.ones(count) if row in (0, 1, 3) else foot
-        size_k = size * scale[row] * wearer.impact_scale * column["shock"] * pace**power
-        size_k = size_k * spread[row] * sign
-        out.append(spectral.shocks((strike_s - t[0]) * RATE_HZ, size_k, resonance, damping))
-    # The jolt of the heel itself, 20 ms before the slower shock.
-    size_k = wearer.jolt_m_s2 * column["shock"] * pace**1.5 * spread[0] ** 2
-    place = (strike_s - 0.02 - t[0]) * RATE_HZ
-    jolt = spectral.shocks(place, size_k, wearer.jolt_hz, 0.5, 0.008)
-    out[0] = out[0] + jolt
-    out[1] = out[1] - 0.5 * jolt
-    return out
-
-
-def _rates(
-    roll: FloatArray,
-    pitch: FloatArray,
-    roll_rate: FloatArray,
-    pitch_rate: FloatArray,
-    yaw_rate: FloatArray,
-) -> FloatArray:
-    """Angular rate (n, 3) in the turned axes, of Rz(yaw) Ry(pitch) Rx(roll)."""
-    return np.column_stack(
-        [
-            roll_rate - yaw_rate * np.sin(pitch),
-            pitch_rate * np.cos(roll) + yaw_rate * np.cos(pitch) * np.sin(roll),
-            -pitch_rate * np.sin(roll) + yaw_rate * np.cos(pitch) * np.cos(roll),
-        ]
     )
 
 

@@ -20,8 +20,8 @@ import numpy as np
 
 from relpos.errors import DataError
 from relpos.simulation.activities import SCRIPTS, Activity, make_itinerary
-from relpos.simulation.gait import make_grid
 from relpos.simulation.motion import WearerTruth, move
+from relpos.simulation.spectral import make_grid
 from relpos.simulation.wearer import Wearer, make_wearer
 from relpos.simulation.world import World
 

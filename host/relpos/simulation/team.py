@@ -14,7 +14,8 @@ import numpy as np
 
 from relpos.errors import DataError
 from relpos.simulation.bench import BENCH, SPACING_M, lie_still
-from relpos.simulation.gait import make_grid, walk
+from relpos.simulation.gait import walk
+from relpos.simulation.spectral import make_grid
 from relpos.simulation.turntable import TURNTABLE, turn_by_hand
 from relpos.simulation.walker import Route, WalkerTruth, make_person, make_plan
 from relpos.simulation.world import MagneticField, UwbChannel, World

@@ -202,7 +202,7 @@ class Plan:
 
     knot_time_s: FloatArray
     knot_phase: FloatArray
-    knot_way_m: FloatArray
+    knot_path_m: FloatArray
     step_strength: FloatArray
     """Vertical excursion of each step against what its length asks, about 1."""
     walk_start_s: float

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relpos.simulation.gait import rotation
+from relpos.simulation.torso import rotation
 from relpos.simulation.walker import Person
 from relpos.simulation.world import FloatArray
 
@@ -21,7 +21,7 @@ PLACES = ("chest", "lower_back", "upper_back", "side")
 
 REFERENCE_STEP_M = 0.59
 REFERENCE_CADENCE_HZ = 1.82
-"""The mean walk of walk_lowerback_20m, at which `Wearer.rise_m` holds."""
+"""The mean walk of walk_lowerback_20m, at which `Wearer.excursion_m` holds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +29,8 @@ class Wearer(Person):
     """A `Person` with everything that may differ on the torso. Metres, radians, hertz.
 
     The vertical excursion of the pelvis in a step of length s at cadence f is
-    ``rise_m (s / 0.59 m)^rise_by_length (f / 1.82 Hz)^rise_by_cadence`` rather than the
-    pendulum's ``h(s)``: within people of walk_lowerback_20m the regression gives exponents 0.6
+    ``excursion_m (s / 0.59 m)^excursion_by_length (f / 1.82 Hz)^excursion_by_cadence`` rather than
+    the pendulum's ``h(s)``: within people of walk_lowerback_20m the regression gives exponents 0.6
     and 1.1 with 5.7 % left over from walk to walk, the pendulum says 2 and 0; each wearer is
     drawn between and a little beyond.
     """
@@ -40,10 +40,10 @@ class Wearer(Person):
     """Sensor from the trunk's turning point (between the hips): forward, left, up."""
     axes: tuple[float, ...]
     """Sensor axes in body axes (forward, left, up): nine numbers of a rotation, by rows."""
-    rise_m: float
-    rise_by_length: float
-    rise_by_cadence: float
-    rise_walk_sd: float
+    excursion_m: float
+    excursion_by_length: float
+    excursion_by_cadence: float
+    excursion_walk_sd: float
     """Relative change of the excursion from one walk of the person to the next."""
     irregularity: float
     """Scale of the step to step variation; 1 is a healthy adult."""
@@ -175,12 +175,12 @@ def make_wearer(
         place=where,
         arm_m=arm,
         axes=tuple(float(a) for a in _axes(rng, where).ravel()),
-        rise_m=0.0345 * math.exp(rng.normal(0.0, 0.075)),
-        rise_by_length=by_length,
+        excursion_m=0.0345 * math.exp(rng.normal(0.0, 0.075)),
+        excursion_by_length=by_length,
         # Orendurff 2004: 27 mm at 0.7 m/s, 48 at 1.6: 1.4 in all at a constant walk ratio;
         # within people of walk_lowerback_20m 1.7.
-        rise_by_cadence=float(rng.uniform(1.1, 2.0)) - by_length,
-        rise_walk_sd=0.06,
+        excursion_by_cadence=float(rng.uniform(1.1, 2.0)) - by_length,
+        excursion_walk_sd=0.06,
         irregularity=float(rng.uniform(0.7, 2.0)),
         limp=limp,
         surge=float(rng.uniform(0.06, 0.16)),
