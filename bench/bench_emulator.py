@@ -22,7 +22,7 @@ from relpos.emulator.native import build
 from relpos.emulator.node import BoardKind
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DeviceError
-from relpos.link.live import Link, observe, open_port
+from relpos.link.port import Link, observe, open_port
 from relpos.measurements import Heading, Height, Motion, Range
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from relpos.emulator.faults import FAULTS, Fault, FaultSpec, parse_fault
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link import xbee
-from relpos.link.live import Link
+from relpos.link.port import Link
 from relpos.measurements import Heading, Motion, Observation, Range, Status
 from relpos.protocol import messages as wire
 from relpos.protocol.schema import Message

@@ -13,7 +13,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from relpos.nodes import health, power, radio, settings, traffic
+import node_power as power
+import radio_traffic as traffic
+from relpos.nodes import health, radio, settings
 
 DOCS = Path(__file__).parents[1] / "docs"
 EXAMPLE_NODE = 3

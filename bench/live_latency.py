@@ -39,7 +39,7 @@ from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
 from relpos.emulator.team import EmulatedTeam, TeamConfig
-from relpos.link.live import Link
+from relpos.link.port import Link
 from relpos.measurements import Motion, Range
 
 SETTLE_S = 15.0

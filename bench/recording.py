@@ -18,7 +18,7 @@ from pathlib import Path
 
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.fusion import make
-from relpos.link.live import Link
+from relpos.link.port import Link
 from relpos.measurements import Heading, Height, Motion, Range
 from relpos.recording import make_recorder, open_recording
 from relpos.recording.about import About

@@ -14,7 +14,7 @@ from unittest import mock
 import numpy as np
 
 from relpos.emulator import team as emulated
-from relpos.link.live import Link
+from relpos.link.port import Link
 from relpos.measurements import Height
 from relpos.simulation.activities import Activity
 from relpos.simulation.solo import make_walker

@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, replace
 
 from relpos.emulator.air import ExchangeRecord, Outcome
 from relpos.emulator.team import EmulatedTeam, TeamConfig
-from relpos.link.live import BAUD, Link
+from relpos.link.port import BAUD, Link
 from relpos.measurements import Range
 from relpos.simulation.team import Scenario
 from relpos.simulation.world import RadioChannel, UwbChannel, World

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from relpos.nodes import power, traffic
+import node_power as power
+import radio_traffic as traffic
 from relpos.protocol import messages as wire
 
 ROOT = Path(__file__).resolve().parents[2]

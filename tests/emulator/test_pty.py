@@ -10,7 +10,7 @@ import serial
 
 from relpos.emulator.pty import PseudoTerminal
 from relpos.errors import DeviceError
-from relpos.link.live import Link, observe
+from relpos.link.port import Link, observe
 from relpos.link.xbee import VIRTUAL_TIME, Parser, Receive16, UnknownFrame, encode
 from relpos.protocol import messages as wire
 

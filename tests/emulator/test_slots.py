@@ -11,7 +11,7 @@ import pytest
 
 from relpos.emulator.air import Outcome
 from relpos.emulator.team import EmulatedTeam, TeamConfig
-from relpos.link.live import Link
+from relpos.link.port import Link
 from relpos.measurements import Status
 from relpos.protocol import messages as wire
 

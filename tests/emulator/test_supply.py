@@ -5,7 +5,7 @@ import pytest
 from relpos.emulator.avr.library import missing_parts
 from relpos.emulator.node import BoardKind
 from relpos.emulator.team import EmulatedTeam, TeamConfig
-from relpos.link.live import Link
+from relpos.link.port import Link
 from relpos.measurements import Status
 
 NEEDS = missing_parts()

@@ -12,7 +12,7 @@ from relpos.emulator.pty import PseudoTerminal
 from relpos.emulator.serving import record_team, serve_team
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DataError, RelposError
-from relpos.link.live import Link, observe, open_port
+from relpos.link.port import Link, observe, open_port
 from relpos.link.xbee import Parser, Receive16
 from relpos.measurements import Motion, Range, Status
 from relpos.protocol import messages as wire

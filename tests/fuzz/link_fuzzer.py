@@ -20,7 +20,8 @@ from dataclasses import fields
 
 import fuzz_builds
 
-from relpos.link import live, xbee
+from relpos.link import port as serial_port
+from relpos.link import xbee
 from relpos.link.authentication import HostCounter
 from relpos.link.decoder import Decoder
 from relpos.measurements import Observation
@@ -139,7 +140,9 @@ class Script:
         self._counters: Counter[int] = Counter()
         flags = self.u8()
         self._escaped = flags & 3 != 0
-        self.link = live.Link(key=KEY, counter=HostCounter(lambda: 0.0), escaped=self._escaped)
+        self.link = serial_port.Link(
+            key=KEY, counter=HostCounter(lambda: 0.0), escaped=self._escaped
+        )
         self.decoder = self.link.decoder = CheckedDecoder(totals)
         self._genuine = self.decoder.genuine
         self._chunk = flags >> 2
@@ -342,7 +345,7 @@ def main() -> None:
             print(totals_line(totals, start_s), flush=True)
             os._exit(0)
 
-    for module in (xbee, live, sys.modules["relpos.link.decoder"], wire):
+    for module in (xbee, serial_port, sys.modules["relpos.link.decoder"], wire):
         for name, value in list(vars(module).items()):
             if callable(value) and getattr(value, "__module__", None) == module.__name__:
                 if isinstance(value, type):

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relpos.errors import DataError
-from relpos.link import live, xbee
+from relpos.link import port as serial_port
+from relpos.link import xbee
 from relpos.link.authentication import (
     WINDOW,
     CounterWindow,
@@ -86,11 +87,11 @@ def test_frames_that_overtake_each_other_are_all_taken():
 
 
 def test_a_session_knows_what_an_earlier_one_has_heard():
-    first = live.Link()
+    first = serial_port.Link()
     heard = [motion(n, 1.0 + n) for n in range(10)]
     for frame in heard:
         first.decoder.feed(frame, 1.0)
-    second = live.Link(newest_counters=first.newest_counters())
+    second = serial_port.Link(newest_counters=first.newest_counters())
     for frame in heard:
         assert second.decoder.feed(frame, 1.0) == []
     assert second.decoder.nodes == {}
@@ -120,7 +121,7 @@ def test_a_forged_restart_does_not_end_the_real_one():
 
 
 def test_a_new_key_travels_hidden_and_comes_out_whole():
-    link = live.Link(key=KEY, counter=HostCounter(lambda: 1.8e9))
+    link = serial_port.Link(key=KEY, counter=HostCounter(lambda: 1.8e9))
     new = bytes(range(100, 116))
     token, data = link.new_key(3, new)
     (request,) = xbee.Parser().feed(data)

@@ -11,7 +11,7 @@ from relpos.errors import DataError
 from relpos.link import xbee
 from relpos.link.authentication import HostCounter
 from relpos.link.beacon import FORGET_S, MOST_NODES, BeaconSchedule, HostBeacons
-from relpos.link.live import Link
+from relpos.link.port import Link
 from relpos.live.inputs import PortInput
 from relpos.protocol import messages as wire
 

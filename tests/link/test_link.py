@@ -12,7 +12,8 @@ from digi.xbee.models.mode import OperatingMode
 from digi.xbee.packets import common, factory, raw
 
 from relpos.errors import DeviceError
-from relpos.link import live, xbee
+from relpos.link import port as serial_port
+from relpos.link import xbee
 from relpos.link.clock import NodeClock
 from relpos.link.decoder import Decoder
 from relpos.measurements import Heading, Height, Motion, Range, Status
@@ -338,13 +339,13 @@ def test_one_late_frame_does_not_move_the_clock():
 
 def test_a_port_that_does_not_exist_is_named_in_one_line():
     with pytest.raises(DeviceError, match=r"no-such-port: cannot open.*no such device") as caught:
-        live.open_port("no-such-port")
+        serial_port.open_port("no-such-port")
     assert "\n" not in str(caught.value)
 
 
 def test_a_port_that_vanishes_is_an_error_after_all_that_came_before():
     master, slave = pty.openpty()
-    device = live.open_port(os.ttyname(slave))
+    device = serial_port.open_port(os.ttyname(slave))
     os.close(slave)
     stream = b"".join(
         xbee.encode(xbee.Receive16(1, -40, motion_frame(n, time_s=n + 1, x_m=n))) for n in range(5)
@@ -353,7 +354,7 @@ def test_a_port_that_vanishes_is_an_error_after_all_that_came_before():
     closer = threading.Timer(0.3, os.close, [master])
     closer.start()
     received = []
-    stream_of_observations = live.observe(device, live.Link())
+    stream_of_observations = serial_port.observe(device, serial_port.Link())
     with pytest.raises(DeviceError, match="vanished"):
         received.extend(o for batch in stream_of_observations for o in batch)
     closer.join()
@@ -361,7 +362,7 @@ def test_a_port_that_vanishes_is_an_error_after_all_that_came_before():
 
 
 def test_a_command_reaches_the_node_as_the_wire_says():
-    link = live.Link()
+    link = serial_port.Link()
     token, data = link.command(7, wire.CommandCode.SET_LEG_LENGTH_MM, 930)
     (request,) = xbee.Parser().feed(data)
     frame = wire.decode(request.data)

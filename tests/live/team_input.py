@@ -7,7 +7,7 @@ import time
 
 from relpos.emulator.air import STEP_US
 from relpos.emulator.team import EmulatedTeam
-from relpos.link.live import Link
+from relpos.link.port import Link
 from relpos.live.composer import Composer
 from relpos.live.fusion_thread import FusionThread
 from relpos.live.inputs import Received

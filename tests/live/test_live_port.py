@@ -15,7 +15,7 @@ from relpos.cli import main
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DeviceError
 from relpos.link import xbee
-from relpos.link.live import Link
+from relpos.link.port import Link
 from relpos.live.inputs import PortInput
 from relpos.measurements import Motion
 

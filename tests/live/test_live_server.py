@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import socket
 import ssl
 import threading
 import time
@@ -23,10 +24,10 @@ class Stage:
     """A page without a session behind it: this feeds pictures and answers visitors."""
 
     def __init__(self, *, https=False, people=2):
-        door, access = listen("127.0.0.1:0")
+        listener, access = listen("127.0.0.1:0")
         if https:
             object.__setattr__(access, "certificate", make_certificate(access.hosts))
-        self.page = WebView(door, access, Hello("test", "nowhere", "bank", time.time()))
+        self.page = WebView(listener, access, Hello("test", "nowhere", "bank", time.time()))
         self.access = access
         self.people = people
         self.asked = []
@@ -264,14 +265,32 @@ def test_addresses_are_understood_or_refused_in_one_line():
     assert parse_listen("[::1]:9000") == ("::1", 9000)
     with pytest.raises(RelposError, match="HOST:PORT"):
         parse_listen("0.0.0.0:http")
-    door, access = listen("127.0.0.1:0")
-    with door, pytest.raises(DeviceError, match="cannot listen"):
+    listener, access = listen("127.0.0.1:0")
+    with listener, pytest.raises(DeviceError, match="cannot listen"):
         listen(f"127.0.0.1:{access.port}")
 
 
+@pytest.mark.parametrize("windows", [True, False])
+def test_two_sessions_never_share_a_port(monkeypatch, windows):
+    """On Windows SO_REUSEADDR lets a second program bind a port that another listens on."""
+    options = []
+
+    class Socket(socket.socket):
+        def setsockopt(self, *arguments):
+            options.append(arguments)
+
+    monkeypatch.setattr(socket, "socket", Socket)
+    if windows:
+        monkeypatch.setattr(socket, "SO_EXCLUSIVEADDRUSE", -5, raising=False)
+    listener, _ = listen("127.0.0.1:0")
+    listener.close()
+    option = -5 if windows else socket.SO_REUSEADDR
+    assert options == [(socket.SOL_SOCKET, option, 1)]
+
+
 def test_what_is_told_to_phones_is_an_address_that_others_can_reach():
-    door, access = listen("0.0.0.0:0")
-    with door:
+    listener, access = listen("0.0.0.0:0")
+    with listener:
         if own_address() is not None:
             assert access.reachable
             assert access.hosts[0] == own_address()

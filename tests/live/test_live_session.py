@@ -9,7 +9,7 @@ from team_input import TeamInput, make_session, run_through
 
 from relpos import fusion
 from relpos.emulator.team import EmulatedTeam, TeamConfig
-from relpos.link.live import Link
+from relpos.link.port import Link
 from relpos.live.inputs import PacedInput, Received
 from relpos.live.requests import Request
 from relpos.live.sinks import Sink

@@ -2,7 +2,7 @@
 
 import pytest
 
-from relpos.link.live import Link
+from relpos.link.port import Link
 from relpos.measurements import Status
 from relpos.nodes.health import Health, HealthInputs, assess
 from relpos.nodes.monitor import TeamMonitor, WindowedCount

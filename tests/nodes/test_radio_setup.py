@@ -15,7 +15,7 @@ import pytest
 
 from relpos.emulator.xbee import XbeeModule
 from relpos.errors import DeviceError
-from relpos.link.live import open_port
+from relpos.link.port import open_port
 from relpos.nodes import radio
 
 BAUD_OF_SPEED = {getattr(termios, f"B{baud}"): baud for baud in radio.BAUD_CODES}

@@ -6,7 +6,7 @@ from math import isclose
 
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.fusion import make
-from relpos.link.live import Link
+from relpos.link.port import Link
 from relpos.measurements import Heading, Height, Motion, Range
 from relpos.recording.about import About
 

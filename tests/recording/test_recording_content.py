@@ -12,7 +12,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from sessions import START_NS, about, alike, play, serial_bytes, session
 
 from relpos.errors import DataError
-from relpos.link.live import Link
+from relpos.link.port import Link
 from relpos.live.team_view import Level, Notice, TeamView
 from relpos.measurements import Event, Heading, Motion, Range, Truth
 from relpos.protocol.messages import DEFAULT_KEY

@@ -26,7 +26,7 @@ from relpos.emulator.serving import record_team
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.evaluation.summary import FIGURES
 from relpos.link import xbee
-from relpos.link.live import Link
+from relpos.link.port import Link
 from relpos.measurements import Motion, Range
 from relpos.protocol import messages as wire
 from relpos.runs import load_run, save_run

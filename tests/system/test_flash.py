@@ -17,7 +17,7 @@ from boot_loaders import MEGA_LOADER, build_optiboot, mega_loader, needs
 from relpos.emulator.avr.board import BOARDS as SIMULATED
 from relpos.emulator.avr.board import Board, ResetCause
 from relpos.errors import DeviceError
-from relpos.link.live import open_port
+from relpos.link.port import open_port
 from relpos.nodes import boards, upload
 
 MILLISECOND_CYCLES = 16_000

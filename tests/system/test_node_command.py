@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 import pytest
 
 from relpos.emulator.avr.library import missing_parts
-from relpos.link.live import open_port
+from relpos.link.port import open_port
 
 RELPOS = [sys.executable, "-m", "relpos.cli.main"]
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from relpos.emulator.team import EmulatedTeam, TeamConfig
-from relpos.link.live import Link
+from relpos.link.port import Link
 from relpos.link.step_scale import ATTEMPTS, KNOWN_WELL, StepScaleSender
 from relpos.measurements import Motion
 from relpos.simulation.team import SCENARIOS

@@ -59,7 +59,7 @@ class Stage:
         self.observed: list[Observation] = []
         self.acknowledged: list[int] = []
         self.started_unix_s = time.time() - self.at_s
-        self._door_port = port
+        self._listen_port = port
         self._token = token
         self._seq = 0
         self._handler = RequestHandler(lambda unix_s: unix_s - self.started_unix_s)
@@ -88,14 +88,14 @@ class Stage:
 
     def open(self) -> None:
         """Start serving, at the same address as before."""
-        door, access = listen(f"127.0.0.1:{self._door_port}")
-        self._door_port = access.port
+        listener, access = listen(f"127.0.0.1:{self._listen_port}")
+        self._listen_port = access.port
         if self._token is not None:
             access = Access(access.port, access.hosts, self._token)
         self._token = access.token
         self.access = access
         hello = Hello("Drill at the old mill", "/dev/ttyUSB0", "bank", self.started_unix_s)
-        self.web: WebView | None = WebView(door, access, hello)
+        self.web: WebView | None = WebView(listener, access, hello)
 
     def shut(self) -> None:
         """Stop serving; the team goes on."""

@@ -8,15 +8,18 @@ import os
 import pty
 import re
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from relpos.live.team_view import Alert, GhostPerson, Ghosts, Level, Notice, Person, TeamView
+from relpos.view.keys import has_keys, raw_keys
 from relpos.view.terminal import TerminalView
 from relpos.view.text_page import Canvas, RenderOptions, page
 from support.team_views import team_view
@@ -370,7 +373,11 @@ def test_keys_change_whose_view_it_is(screen: Screen, view: TerminalView) -> Non
     until(lambda: not any(r.startswith("#") for r in screen.rows()), "the table stays")
 
 
-def test_q_ends_the_session_as_ctrl_c_does(view: TerminalView) -> None:
+def test_q_ends_the_session_as_ctrl_c_does(
+    view: TerminalView, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # os.kill(pid, SIGINT) terminates the process on Windows, before any file is closed.
+    monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("the process is killed"))
     ended = threading.Event()
     before = signal.signal(signal.SIGINT, lambda *_: ended.set())
     try:
@@ -380,7 +387,19 @@ def test_q_ends_the_session_as_ctrl_c_does(view: TerminalView) -> None:
         signal.signal(signal.SIGINT, before)
 
 
-def test_a_terminal_that_is_gone_is_told_and_ends_nothing() -> None:
+def test_keys_are_read_from_the_console_of_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    typed = ["q", "m"]
+    console = SimpleNamespace(kbhit=lambda: bool(typed), getwch=lambda: typed.pop())
+    monkeypatch.setitem(sys.modules, "msvcrt", console)
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: True))
+    assert has_keys()
+    read, restore = raw_keys()
+    assert [read(0.05) for _ in range(3)] == ["m", "q", ""]
+    restore()
+
+
+def test_a_terminal_that_is_gone_is_reported_and_ends_nothing() -> None:
     screen = Screen()
     view = TerminalView(stream=screen.stream, keys=False)
     view.updated(team_view())

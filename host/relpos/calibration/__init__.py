@@ -1,7 +1,11 @@
-"""What a node's sensors and its wearer's steps are wrong by, found from what the node tells.
+"""Calibration of a node's sensors, of its wearer's steps and of two nodes' antennas.
 
-Pure: arrays in, figures out, no port and no file. :mod:`relpos.link.dialogue` fetches the samples
-and sends the result, ``relpos node calibrate`` guides through it.
+Pure functions: arrays in, fits out, no port and no file; ``relpos node calibrate`` guides through
+the steps and ``relpos.link.dialogue`` moves samples and results. ``inertial`` fits gyroscope bias
+and accelerometer (Frosio, Pedersini and Borghese 2009), ``magnetometer`` hard and soft iron (Li and
+Griffiths 2004), ``steps`` the step gain from a walk of known length, ``antenna`` the range offset
+(Decawave APS014). ``guide`` tells from raw samples how far a calibration is, and joins the fits.
+``sensors.SensorCalibration`` is the result that a node stores. Begin with ``guide``.
 """
 
 from relpos.calibration.sensors import SensorCalibration

@@ -43,15 +43,6 @@ class SensorCalibration:
         )
         return corrected
 
-    def correct_rate(self, rate_rad_s: FloatArray) -> FloatArray:
-        """Corrected angular rate of samples (n, 3)."""
-        return rate_rad_s - self.gyro_bias_rad_s
-
-    def correct_field(self, field_ut: FloatArray) -> FloatArray:
-        """Corrected magnetic field of readings (n, 3)."""
-        corrected: FloatArray = (field_ut - self.field_offset_ut) @ self.field_matrix.T
-        return corrected
-
     def to_words(self) -> list[int]:
         """The 16-bit words that the node stores. DataError where one does not fit."""
         values = [

@@ -447,7 +447,7 @@ def _fuse_port(
     teach: bool,
     as_json: bool,
 ) -> None:
-    from relpos.link.live import check_port
+    from relpos.link.port import check_port
     from relpos.measurements import Prior
 
     if initial is Initial.TRUTH:

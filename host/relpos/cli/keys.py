@@ -9,7 +9,7 @@ import typer
 
 if TYPE_CHECKING:
     from relpos.link.authentication import SeenCounters
-    from relpos.link.live import Link
+    from relpos.link.port import Link
 
 KeyFile = Annotated[
     Path | None,
@@ -36,7 +36,7 @@ def make_link(key_file: Path | None) -> tuple[Link, SeenCounters | None]:
     Save ``link.newest_counters()`` there now and then, and at the end.
     """
     from relpos.link.authentication import SeenCounters
-    from relpos.link.live import Link
+    from relpos.link.port import Link
 
     if key_file is None:
         return Link(), None

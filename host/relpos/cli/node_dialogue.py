@@ -13,7 +13,7 @@ from relpos.cli.keys import make_link
 
 if TYPE_CHECKING:
     from relpos.link.dialogue import NodeDialogue
-    from relpos.link.live import Link
+    from relpos.link.port import Link
 
 Port = Annotated[str, typer.Argument(metavar="PORT", help="The coordinator's port.")]
 Node = Annotated[
@@ -43,7 +43,7 @@ def open_device(port: str, cable: bool) -> Any:
         from relpos.nodes.cable import CablePort
 
         return CablePort(port)
-    from relpos.link.live import open_port
+    from relpos.link.port import open_port
 
     return open_port(port)
 

@@ -58,7 +58,7 @@ def flash(
     The XBee shield's switch in position USB (or the XBee out of its socket) until it is done.
     """
     from relpos.link.authentication import write_new_key
-    from relpos.link.live import open_port
+    from relpos.link.port import open_port
     from relpos.nodes import boards, upload
 
     if new and key_file is None:
@@ -83,7 +83,7 @@ def _set_up(
     """Hear the node over its cable; give it key and number."""
     from relpos.link.authentication import read_key
     from relpos.link.dialogue import NodeDialogue
-    from relpos.link.live import Link
+    from relpos.link.port import Link
     from relpos.nodes.cable import CablePort
     from relpos.protocol import messages as wire
 

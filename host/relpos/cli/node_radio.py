@@ -45,7 +45,7 @@ def radio(
     Finds the module whether it is new (9600 baud, transparent) or has been set before, writes
     everything, keeps it, and reads it back.
     """
-    from relpos.link.live import open_port
+    from relpos.link.port import open_port
     from relpos.nodes import radio as modules
 
     if coordinator == (node is not None):

@@ -154,7 +154,7 @@ def _set_key(
 ) -> None:
     from relpos.link.authentication import read_key, write_new_key
     from relpos.link.dialogue import open_dialogue
-    from relpos.link.live import Link
+    from relpos.link.port import Link
     from relpos.protocol import messages as wire
 
     from relpos.cli.node_dialogue import open_device  # isort: skip

@@ -115,7 +115,7 @@ def _watch(
     Beacons are sent meanwhile, so that what is seen is how the team works with a host.
     """
     from relpos.link.beacon import HostBeacons
-    from relpos.link.live import observe, send
+    from relpos.link.port import observe, send
     from relpos.nodes.monitor import TeamMonitor
 
     monitor = TeamMonitor()

@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import typer
 
-from relpos.errors import RelposError
-
 if TYPE_CHECKING:
     from relpos.evaluation.bounds import Totals
     from relpos.evaluation.consistency import Nees
@@ -352,8 +350,3 @@ def degrees(value_rad: float) -> str:
 def plain(value: float) -> str:
     """Two decimals; a dash where nothing can be said."""
     return f"{value:.2f}" if math.isfinite(value) else "-"
-
-
-def not_built_yet(what: str) -> RelposError:
-    """Return the error for an option or command whose machinery is still to come."""
-    return RelposError(f"{what} is not built yet")

@@ -112,10 +112,10 @@ def _ignored_by_modem_manager(computer: Computer, device: str) -> bool:
 
 
 def _module(port: str, open_port: Callable[[str, int], serial.Serial] | None) -> Iterator[Finding]:
-    from relpos.link import live
+    from relpos.link.port import open_port as open_serial_port
     from relpos.nodes import radio
 
-    opener = partial(open_port or live.open_port, port)
+    opener = partial(open_port or open_serial_port, port)
     remedy = f"relpos node radio {port} --coordinator"
     name = "coordinator"
     try:

@@ -29,10 +29,6 @@ class NodeClockError:
         """Node clock at virtual time ``time_us``, not wrapped."""
         return time_us + round(time_us * self.drift_ppm * 1e-6) + self.offset_us
 
-    def virtual_us(self, node_interval_us: int) -> int:
-        """Virtual time that ``node_interval_us`` of the node's clock takes, rounded up."""
-        return -int(-node_interval_us // (1.0 + self.drift_ppm * 1e-6))
-
 
 class Engine(Protocol):
     """One board that executes the firmware in lock-step with the virtual clock."""

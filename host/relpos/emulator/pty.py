@@ -25,7 +25,7 @@ from typing import Protocol
 import serial
 
 from relpos.errors import DeviceError
-from relpos.link.live import BAUD, READ_TIMEOUT_S
+from relpos.link.port import BAUD, READ_TIMEOUT_S
 from relpos.link.xbee import VIRTUAL_TIME, UnknownFrame, encode
 
 from .air import STEP_US
@@ -269,7 +269,7 @@ class PseudoTerminal:
 class VirtualTimePort(serial.Serial):  # type: ignore[misc, unused-ignore]
     """The terminal as pyserial's port, whose reads never go past the end of one moment.
 
-    ``virtual_time_s`` is the clock for ``relpos.link.live.observe``: the time at which the last
+    ``virtual_time_s`` is the clock for ``relpos.link.port.observe``: the time at which the last
     byte read arrived. ``exhausted`` is true once the team has ended and all is read.
     """
 

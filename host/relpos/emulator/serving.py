@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
-from relpos.link.live import Link, observe
+from relpos.link.port import Link, observe
 from relpos.measurements import Event, Heading, Height, Motion, Range, Status, Step
 from relpos.runs import Description, NodeInfo, Run
 

@@ -13,7 +13,7 @@ from relpos.errors import DataError
 from relpos.protocol import messages as wire
 
 if TYPE_CHECKING:
-    from relpos.link.live import Link
+    from relpos.link.port import Link
 
 MOST_NODES = 20
 """Slots of a beacon: what fits into a frame beside its authentication."""

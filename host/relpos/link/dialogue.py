@@ -13,10 +13,9 @@ from typing import Any
 import serial
 
 from relpos.calibration.sensors import SensorCalibration, checksum
-from relpos.calibration.steps import scaled_gain_permille
 from relpos.errors import DeviceError
 from relpos.link.decoder import MOST_KEPT, Acknowledged
-from relpos.link.live import Line, Link, observe
+from relpos.link.port import Line, Link, observe
 from relpos.measurements import Observation, RawSample
 from relpos.protocol import messages as wire
 
@@ -40,7 +39,7 @@ MOST_RAW_REPORTS = 3000
 class NodeDialogue:
     """Talks to ``node`` over an open coordinator ``port``.
 
-    ``clock`` is that of :func:`relpos.link.live.observe`. What arrives is taken in while an answer
+    ``clock`` is that of :func:`relpos.link.port.observe`. What arrives is taken in while an answer
     is waited for: raw samples collect in the link's decoder, running totals in its tracks.
     """
 
@@ -325,19 +324,6 @@ class NodeDialogue:
                 f"node {self.node} has a step gain of {in_force / 1000:.3f} instead of "
                 f"{gain_permille / 1000:.3f}"
             )
-
-    def send_step_scale(self, step_scale: float) -> tuple[int, int]:
-        """Make the node's steps ``step_scale`` times as long, as a fusion or a walk has learned.
-
-        ``step_scale`` is true over reported length, of motion reported with the gain in force now
-        (see the motion's gain_version). Returns the gains before and after, in permille. DataError
-        where the scale is impossible, DeviceError where the node does not take it.
-        """
-        before = self.setting(wire.CommandCode.SET_STEP_GAIN_PERMILLE)
-        after = scaled_gain_permille(before, step_scale)
-        if after != before:
-            self.set_step_gain(after)
-        return before, after
 
 
 def open_dialogue(port: Line, node: int | None, link: Link | None = None) -> NodeDialogue:

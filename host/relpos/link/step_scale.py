@@ -20,7 +20,7 @@ from relpos.protocol import messages as wire
 
 if TYPE_CHECKING:
     from relpos.link.decoder import Acknowledged
-    from relpos.link.live import Link
+    from relpos.link.port import Link
 
 WORTH_SENDING = 0.03
 """Least relative change: one walk repeats to 5 % in the same person, and each change is a write to

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from relpos.errors import DeviceError
-from relpos.link import live
+from relpos.link import port as serial_port
 from relpos.link.beacon import HostBeacons
-from relpos.link.live import READ_BYTES, Link
+from relpos.link.port import READ_BYTES, Link
 from relpos.link.step_scale import StepScaleSender
 from relpos.live.clock import SessionClock
 from relpos.measurements import Event, Heading, Height, Motion, Observation, Range, Status, Step
@@ -104,7 +104,7 @@ class PortInput:
         self._scales = StepScaleSender(link) if teach else None
         self._beacons = HostBeacons(link)
         self._told = 0
-        self._device: serial.Serial | None = live.open_port(port)
+        self._device: serial.Serial | None = serial_port.open_port(port)
         self._waits_on = _descriptor(self._device)
         self._gone: str | None = None
         self._try_at_s = 0.0
@@ -189,20 +189,20 @@ class PortInput:
             data: bytes = device.read(max(1, min(waiting, READ_BYTES)))
         except (OSError, TypeError, ValueError) as error:
             # pyserial's exceptions are OSErrors; TypeError: closed under a waiting read.
-            raise live.vanished(device, error) from error
+            raise serial_port.vanished(device, error) from error
         return data
 
     def _talk(self) -> None:
         assert self._device is not None
         # An emulated team's virtual time is not for beacons: it sends its own.
         now_s = self.clock()
-        live.send(self._device, self._beacons.due(now_s))
+        serial_port.send(self._device, self._beacons.due(now_s))
         if self._scales is None:
             return
         answers = self._link.decoder.acknowledged
         while answers:
             self._scales.take(answers.popleft())
-        live.send(self._device, self._scales.due(now_s))
+        serial_port.send(self._device, self._scales.due(now_s))
 
     def _lose(self, error: DeviceError) -> None:
         if not self._reopen:
@@ -217,7 +217,7 @@ class PortInput:
         if time.monotonic() < self._try_at_s:
             return False
         try:
-            self._device = live.open_port(self.name)
+            self._device = serial_port.open_port(self.name)
         except DeviceError as error:
             self._gone = str(error)
             self._try_at_s = time.monotonic() + REOPEN_S

@@ -149,11 +149,6 @@ class TeamView:
     ranges: tuple[MeasuredRange, ...] = ()
     alternatives: tuple[Ghosts, ...] = ()
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, numbers rounded to what a view needs."""
-        document: dict[str, Any] = json.loads(self.to_json())
-        return document
-
     def to_json(self) -> str:
         """The message ``view`` of the page's protocol."""
         document = {

@@ -9,7 +9,7 @@ that everything that speaks with a coordinator's port speaks with a cable.
 from __future__ import annotations
 
 from relpos.link import xbee
-from relpos.link.live import open_port
+from relpos.link.port import open_port
 from relpos.protocol import messages as wire
 
 CABLE_DBM = 0

@@ -16,7 +16,7 @@ import serial
 
 from relpos.errors import DeviceError
 from relpos.link import xbee
-from relpos.link.live import BAUD
+from relpos.link.port import BAUD
 
 FACTORY_BAUD = 9600
 BAUD_CODES = {1200: 0, 2400: 1, 4800: 2, 9600: 3, 19200: 4, 38400: 5, 57600: 6, 115200: 7}

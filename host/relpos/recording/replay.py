@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 from relpos.errors import DataError
-from relpos.link.live import Link
+from relpos.link.port import Link
 from relpos.live.inputs import Received
 from relpos.measurements import Observation
 from relpos.recording import topics

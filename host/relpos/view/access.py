@@ -79,27 +79,32 @@ def listen(address: str | None) -> tuple[socket.socket, Access]:
     except OSError as error:
         raise DeviceError(f"{host}: cannot listen there: {error.strerror or error}") from None
     try:
-        door = _bind(family, where)
+        listener = _bind(family, where)
     except OSError as error:
         if address is not None:
             raise DeviceError(
                 f"{host}:{port}: cannot listen there: {error.strerror or error}"
             ) from None
-        door = _bind(family, (where[0], 0, *where[2:]))
-    return door, Access(int(door.getsockname()[1]), _hosts(host))
+        listener = _bind(family, (where[0], 0, *where[2:]))
+    return listener, Access(int(listener.getsockname()[1]), _hosts(host))
 
 
 def _bind(family: int, where: tuple[object, ...]) -> socket.socket:
-    door = socket.socket(family, socket.SOCK_STREAM)
+    listener = socket.socket(family, socket.SOCK_STREAM)
     try:
-        # A session that was just ended leaves connections waiting to die.
-        door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        door.bind(where)
-        door.listen(128)
+        exclusive = getattr(socket, "SO_EXCLUSIVEADDRUSE", None)
+        if exclusive is not None:
+            # Windows: SO_REUSEADDR would let a second session take the same port there.
+            listener.setsockopt(socket.SOL_SOCKET, exclusive, 1)
+        else:
+            # A session that has just ended leaves connections in TIME_WAIT.
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(where)
+        listener.listen(128)
     except OSError:
-        door.close()
+        listener.close()
         raise
-    return door
+    return listener
 
 
 def _hosts(host: str) -> tuple[str, ...]:

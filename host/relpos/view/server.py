@@ -446,9 +446,9 @@ def _clocks(body: Mapping[str, Any]) -> dict[str, Any]:
 class ServerConfig:
     """What a serving process is started with."""
 
-    door: socket.socket
+    listener: socket.socket
     """Listens already: browsers that come while it is restarted wait."""
-    wire: socket.socket
+    channel: socket.socket
     access: Access
 
 
@@ -460,7 +460,7 @@ def run(config: ServerConfig) -> None:
 
 
 async def _serve(config: ServerConfig) -> None:
-    lines, out = await asyncio.open_connection(sock=config.wire, limit=MOST_LINE_BYTES)
+    lines, out = await asyncio.open_connection(sock=config.channel, limit=MOST_LINE_BYTES)
     session = SessionProxy(lines, out)
     with _certificate_files(config.access) as files:
         uvicorn_config = uvicorn.Config(
@@ -477,7 +477,7 @@ async def _serve(config: ServerConfig) -> None:
         )
         uvicorn_config.load()
     server = _Server(uvicorn_config)
-    serving = asyncio.create_task(server.serve(sockets=[config.door]))
+    serving = asyncio.create_task(server.serve(sockets=[config.listener]))
     await session.listen()
     server.should_exit = True
     await serving

@@ -1,19 +1,18 @@
-"""The team in a terminal: a sink that draws the newest view, for a laptop in the rain over ssh.
+"""The team in a terminal, also over ssh: a sink that draws the newest view.
 
-It draws in a thread of its own: a line that is slow, or a terminal that has been stopped, holds up
-nobody. Only lines that have changed are sent.
+It draws in a thread of its own, so that a slow line or a stopped terminal does not delay the
+session. Only lines that have changed are sent.
 """
 
 from __future__ import annotations
 
+import _thread
 import atexit
 import os
-import signal
 import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any, TextIO
@@ -21,14 +20,15 @@ from typing import Any, TextIO
 from relpos.live.requests import Request
 from relpos.live.sinks import Sink
 from relpos.live.team_view import TeamView
+from relpos.view.keys import has_keys, raw_keys
 from relpos.view.text_page import RenderOptions, alarming, page, unattended
 
 DRAW_S = 0.5
-"""Two pages a second: as fast as anybody reads, a few hundred bytes each."""
+"""Two pages a second, a few hundred bytes each."""
 PLAIN_S = 5.0
-"""Where it is no terminal, a page this often does not flood a log."""
+"""Pages to a file or pipe: seldom enough for a log."""
 REPAINT_S = 10.0
-"""Whatever else was written over the page is gone by then."""
+"""The whole page is redrawn this often, over anything that was written to the terminal."""
 BELL_S = 5.0
 TRAIL_S = 90.0
 TRAIL_EVERY_S = 1.0
@@ -46,7 +46,7 @@ class TerminalView(Sink):
         stream: TextIO | None = None,
         keys: bool = True,
     ) -> None:
-        """Take over the terminal that ``stream`` (stdout) is; a plain file gets a page at times."""
+        """Draw on ``stream`` (default: stdout); a file gets a plain page every :data:`PLAIN_S`."""
         self._stream = stream or sys.stdout
         self._options = RenderOptions(me=me, title=title, utf8=takes_utf8(self._stream))
         self._view: TeamView | None = None
@@ -58,38 +58,38 @@ class TerminalView(Sink):
         self._rung: frozenset[str | int] = frozenset()
         self._rung_s = 0.0
         self._trouble: str | None = None
-        self._asks: deque[Request] = deque()
-        self._asked = 0
+        self._pending: deque[Request] = deque()
+        self._request_count = 0
         self._wake = threading.Event()
         self._stop = threading.Event()
         self._screen = self._stream.isatty()
         self._threads = [threading.Thread(target=self._draw_until_stopped, daemon=True)]
-        if self._screen and keys and _has_keys():
+        if self._screen and keys and has_keys():
             self._threads.append(threading.Thread(target=self._read_keys, daemon=True))
-        # Whatever ends the program, the terminal is given back.
+        # Restore the terminal however the program ends.
         atexit.register(self.close)
         for thread in self._threads:
             thread.start()
 
     def updated(self, view: TeamView) -> None:
-        """Leave the newest view for the drawing thread; an alarm wakes it."""
+        """Store the newest view for the drawing thread; an alarm wakes it."""
         self._view = view
         if alarming(view) - self._rung:
             self._wake.set()
 
     def trouble(self) -> str | None:
-        """Say that the terminal is gone; None when all is well."""
+        """Return why nothing is drawn any more; None when all is well."""
         return self._trouble
 
     def requests(self) -> list[Request]:
-        """What was asked for by keys since the last call."""
-        return [self._asks.popleft() for _ in range(len(self._asks))]
+        """Return the requests made by keys since the last call."""
+        return [self._pending.popleft() for _ in range(len(self._pending))]
 
     def respond(self, request: Request, reply: dict[str, Any], status: int = 200) -> None:
         """Nothing to do: the next view shows it."""
 
     def close(self) -> None:
-        """Give the terminal back as it was."""
+        """Restore the terminal."""
         atexit.unregister(self.close)
         self._stop.set()
         self._wake.set()
@@ -101,7 +101,7 @@ class TerminalView(Sink):
     def _draw_until_stopped(self) -> None:
         try:
             if self._screen:
-                # The other screen, no cursor, no wrapping: what was there comes back in the end.
+                # Alternate screen, no cursor, no wrapping; the end restores the old screen.
                 self._write("\x1b[?1049h\x1b[?25l\x1b[?7l")
             while not self._stop.is_set():
                 self._wake.wait(DRAW_S if self._screen else PLAIN_S)
@@ -110,8 +110,8 @@ class TerminalView(Sink):
                     self._draw(self._view)
         except OSError as error:
             self._trouble = f"terminal view: {error.strerror or error}"
-        except Exception as error:  # the session goes on, and says that this does not
-            self._trouble = f"terminal view: has failed: {error!r}"
+        except Exception as error:  # the session goes on and shows the trouble
+            self._trouble = f"terminal view: failed: {error!r}"
         finally:
             if self._screen:
                 with suppress(OSError, ValueError):
@@ -154,7 +154,7 @@ class TerminalView(Sink):
             self._write(bell + changed)
 
     def _follow(self, view: TeamView) -> None:
-        """Keep where everybody has been of late."""
+        """Add to the trails of the last :data:`TRAIL_S`."""
         if view.time_s - self._trailed_s < TRAIL_EVERY_S:
             return
         self._trailed_s = view.time_s
@@ -166,16 +166,16 @@ class TerminalView(Sink):
                 trail.append((person.x_m, person.y_m))
 
     def _bell(self, view: TeamView) -> str:
-        """Ring for a new alarm, and again as long as there is somebody nobody has seen to.
+        """Return a bell for a new alarm, and again while a person's alarm is not acknowledged.
 
-        What is wrong with the session rings once: a bell that goes on for a cable is not heard
-        any more when it is for a person.
+        An alarm of the session rings once: a bell that rings on for a cable is ignored when it
+        rings for a person.
         """
         alarms = alarming(view)
         new = alarms - self._rung
         now_s = time.monotonic()
-        somebody = any(isinstance(alarm, int) for alarm in alarms)
-        again = somebody and now_s - self._rung_s >= BELL_S
+        person = any(isinstance(alarm, int) for alarm in alarms)
+        again = person and now_s - self._rung_s >= BELL_S
         self._rung = alarms
         if self._options.muted or not (new or again):
             return ""
@@ -189,11 +189,11 @@ class TerminalView(Sink):
     # -- keys -------------------------------------------------------------------------------------
 
     def press(self, key: str) -> None:
-        """Do what a key stands for."""
+        """Carry out a key's command."""
         options = self._options
         match key:
             case "a":
-                self._see_to()
+                self._acknowledge()
             case "m" | "M":
                 self._options = replace(options, me=self._other(1 if key == "m" else -1))
             case "+" | "=":
@@ -211,20 +211,20 @@ class TerminalView(Sink):
             case "b":
                 self._options = replace(options, muted=not options.muted)
             case "q":
-                # As Ctrl-C does: the session ends, and with it this view.
-                os.kill(os.getpid(), signal.SIGINT)
+                # As Ctrl-C does. os.kill would end the program at once on Windows, files unwritten.
+                _thread.interrupt_main()
             case _:
                 return
         self._wake.set()
 
-    def _see_to(self) -> None:
-        """Tell everybody that the alarm on top is seen to; the next press is for the next one."""
+    def _acknowledge(self) -> None:
+        """Request to acknowledge the alarm on top; the next press is for the next one."""
         if self._view is None:
             return
         for person in unattended(self._view)[:1]:
-            self._asked += 1
-            self._asks.append(
-                Request(self._asked, "acknowledge", time.time(), {"node": person.node})
+            self._request_count += 1
+            self._pending.append(
+                Request(self._request_count, "acknowledge", time.time(), {"node": person.node})
             )
 
     def _other(self, step: int) -> int | None:
@@ -238,7 +238,7 @@ class TerminalView(Sink):
 
     def _read_keys(self) -> None:
         with suppress(OSError, ValueError):
-            read, restore = _raw_keys()
+            read, restore = raw_keys()
             try:
                 while not self._stop.is_set():
                     for key in read(KEY_WAIT_S):
@@ -248,56 +248,7 @@ class TerminalView(Sink):
 
 
 def takes_utf8(stream: TextIO) -> bool:
-    """Return whether braille and arrows can be shown there."""
+    """Return whether the terminal shows braille and arrows."""
     encoding = (getattr(stream, "encoding", None) or "").lower().replace("-", "")
-    # The kernel's own console has 512 glyphs, braille not among them.
+    # The Linux console has 512 glyphs, without braille.
     return encoding == "utf8" and os.environ.get("TERM") not in ("linux", "dumb", "vt100", "vt220")
-
-
-def _has_keys() -> bool:
-    """Return whether keys come here: not to a program in the background, whom asking would stop."""
-    if not sys.stdin.isatty():
-        return False
-    if sys.platform == "win32":
-        return True
-    try:
-        return os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
-    except OSError:
-        return False
-
-
-def _raw_keys() -> tuple[Callable[[float], str], Callable[[], None]]:
-    """Return what reads keys without waiting for a line, and what undoes that."""
-    if sys.platform == "win32":
-        import msvcrt
-
-        def read(wait_s: float) -> str:
-            until_s = time.monotonic() + wait_s
-            while time.monotonic() < until_s:
-                if msvcrt.kbhit():
-                    return msvcrt.getwch()
-                time.sleep(0.02)
-            return ""
-
-        return read, lambda: None
-    import select
-    import termios
-    import tty
-
-    descriptor = sys.stdin.fileno()
-    before: Any = termios.tcgetattr(descriptor)
-    # Signals stay: Ctrl-C ends the session as always.
-    tty.setcbreak(descriptor)
-
-    def read_posix(wait_s: float) -> str:
-        ready, _, _ = select.select([descriptor], [], [], wait_s)
-        if not ready:
-            return ""
-        typed = os.read(descriptor, 64)
-        if not typed:
-            raise OSError("no more keys")
-        text = typed.decode("utf-8", "ignore")
-        # Arrows and the like come as a sequence, whose letters are nobody's keys.
-        return "" if text.startswith("\x1b") else text
-
-    return read_posix, lambda: termios.tcsetattr(descriptor, termios.TCSADRAIN, before)

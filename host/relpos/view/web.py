@@ -1,7 +1,7 @@
 """The live page, as the session sees it: a sink that feeds a serving process, and its visitors.
 
 The serving process cannot hold up the session: what it does not take at once waits here, of the
-pictures the newest alone. Where it dies, it is started again behind the same door.
+pictures the newest alone. Where it dies, it is started again behind the same listener.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ SHOWN_STATUSES = (NodeStatus.OK, NodeStatus.STALE)
 
 
 class WebView(Sink):
-    """Serves the session's pages at ``access`` from the listening socket ``door``.
+    """Serves the session's pages at ``access`` from the listening socket ``listener``.
 
     RelposError where the libraries for it are not installed.
     """
 
-    def __init__(self, door: socket.socket, access: Access, hello: Hello) -> None:
+    def __init__(self, listener: socket.socket, access: Access, hello: Hello) -> None:
         try:
             import starlette  # noqa: F401
             import uvicorn  # noqa: F401
@@ -51,7 +51,7 @@ class WebView(Sink):
         self.access = access
         self.hello = hello
         self.restarts = 0
-        self._door = door
+        self._door = listener
         self._tracks = Tracks()
         self._names: dict[int, str] = {}
         self._newest: bytes | None = None
@@ -59,13 +59,13 @@ class WebView(Sink):
         self._out_bytes = 0
         self._in = b""
         self._process: SpawnProcess | None = None
-        self._wire: socket.socket | None = None
+        self._channel: socket.socket | None = None
         self._started_s = 0.0
         self._start()
 
     def fileno(self) -> int:
         """For who waits for visitors."""
-        return -1 if self._wire is None else self._wire.fileno()
+        return -1 if self._channel is None else self._channel.fileno()
 
     # -- as a sink --------------------------------------------------------------------------------
 
@@ -93,13 +93,13 @@ class WebView(Sink):
 
     def close(self) -> None:
         """Let browsers know that it is over."""
-        wire, self._wire = self._wire, None
-        if wire is not None:
-            wire.setblocking(True)
-            wire.settimeout(1.0)
+        channel, self._channel = self._channel, None
+        if channel is not None:
+            channel.setblocking(True)
+            channel.settimeout(1.0)
             with contextlib.suppress(OSError):
-                wire.sendall(b"".join(self._out) + (self._newest or b""))
-            wire.close()
+                channel.sendall(b"".join(self._out) + (self._newest or b""))
+            channel.close()
         if self._process is not None:
             self._process.join(3.0)
             if self._process.is_alive():
@@ -133,8 +133,8 @@ class WebView(Sink):
     def _start(self) -> None:
         from relpos.view import server
 
-        if self._wire is not None:
-            self._wire.close()
+        if self._channel is not None:
+            self._channel.close()
         ours, theirs = socket.socketpair()
         ours.setblocking(False)
         self._started_s = time.monotonic()
@@ -146,7 +146,7 @@ class WebView(Sink):
         )
         self._process.start()
         theirs.close()
-        self._wire = ours
+        self._channel = ours
         self._in = b""
         self._out.clear()
         self._out_bytes = 0
@@ -161,7 +161,7 @@ class WebView(Sink):
 
     def _work(self) -> None:
         """Move what can be moved without waiting; start anew what has died."""
-        if self._wire is None:
+        if self._channel is None:
             return
         try:
             self._send()
@@ -177,7 +177,7 @@ class WebView(Sink):
             self._start()
 
     def _send(self) -> None:
-        assert self._wire is not None
+        assert self._channel is not None
         while self._out or self._newest is not None:
             if not self._out and self._newest is not None:
                 self._out.append(self._newest)
@@ -185,7 +185,7 @@ class WebView(Sink):
                 self._newest = None
             data = self._out.popleft()
             try:
-                sent = self._wire.send(data)
+                sent = self._channel.send(data)
             except BlockingIOError:
                 sent = 0
             self._out_bytes -= sent
@@ -194,10 +194,10 @@ class WebView(Sink):
                 return
 
     def _receive(self) -> None:
-        assert self._wire is not None
+        assert self._channel is not None
         while True:
             try:
-                data = self._wire.recv(65536)
+                data = self._channel.recv(65536)
             except BlockingIOError:
                 return
             if not data:

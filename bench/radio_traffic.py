@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from relpos.link.live import BAUD
+from relpos.link.port import BAUD
 from relpos.protocol import messages as wire
 
 BITS_A_BYTE = 10
