@@ -48,6 +48,17 @@ class PoseMixture:
     best: int = 0
     """The hypothesis with the most weight near it."""
 
+    def moments(self, index: int) -> tuple[Floats, Floats]:
+        """Return mean (3,) and covariance (3, 3) of the pose of ``nodes[index]``."""
+        own = slice(POSE * index, POSE * (index + 1))
+        off = self.poses[:, index] - self.poses[self.best, index]
+        off[:, 2] = np.remainder(off[:, 2] + math.pi, 2.0 * math.pi) - math.pi
+        mean = self.weights @ off
+        off -= mean
+        covariance = np.einsum("k,kab->ab", self.weights, self.covariances[:, own, own])
+        covariance += np.einsum("k,ka,kb->ab", self.weights, off, off)
+        return self.poses[self.best, index] + mean, covariance
+
     def heading_sigma_rad(self, index: int) -> float:
         """Return the standard deviation of the heading of ``nodes[index]``."""
         own = slice(POSE * index, POSE * (index + 1))

@@ -69,15 +69,22 @@ class SwitchingEstimator:
         self._nucleus: frozenset[int] = frozenset()
         self._first_range_s = math.inf
         self._found_epochs = 0
-        self.estimator = (
-            large_teams.make(priors, self._settings, seed, self._mountings)
-            if len(self._met) > LARGE_TEAM
-            else self._bank(priors)
-        )
+        self.estimator = self._large_team(priors) if self._is_large() else self._bank(priors)
 
     def _bank(self, priors: Sequence[Prior]) -> Rewinder:
         initialiser = HypothesisInitialiser(seed=self._seed)
         return bank.make(priors, initialiser, self._settings, self._seed, self._mountings)
+
+    def _large_team(self, priors: Sequence[Prior], start_s: float = 0.0) -> Rewinder:
+        initialiser = HypothesisInitialiser(seed=self._seed, large_team=True)
+        return large_teams.make(
+            priors, initialiser, self._settings, self._seed, self._mountings, start_s
+        )
+
+    def _is_large(self) -> bool:
+        """Whether the team is a large one of which enough is located to continue from."""
+        enough = min(NUCLEUS_FOUND, len(self._priors) or NUCLEUS_FOUND)
+        return len(self._met) > LARGE_TEAM and self._located() >= enough
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         """Take one measurement; return the estimates it completes."""
@@ -96,7 +103,7 @@ class SwitchingEstimator:
                 self._first_range_s = time_s
         if len(self._met) <= LARGE_TEAM:
             return self._feed(measurement)
-        if self._located() >= min(NUCLEUS_FOUND, len(self._priors) or NUCLEUS_FOUND):
+        if self._is_large():
             return self._feed(measurement) + self._hand_over()
         return self._begin(measurement)
 
@@ -168,13 +175,7 @@ class SwitchingEstimator:
                 for n in last.nodes
                 if n.status not in (NodeStatus.UNLOCATED, NodeStatus.AMBIGUOUS)
             ]  # fmt: skip
-        self.estimator = large_teams.make(
-            priors,
-            self._settings,
-            self._seed,
-            self._mountings,
-            0.0 if last is None else since_s,
-        )
+        self.estimator = self._large_team(priors, 0.0 if last is None else since_s)
         estimates: list[Estimate] = []
         begun: dict[int, float] = {}
         for measurement in sorted(self._recent, key=lambda m: m.time_s):

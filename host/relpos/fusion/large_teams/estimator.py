@@ -3,10 +3,8 @@
 What :class:`~relpos.fusion.bank.estimator.Bank` is for a few people, :class:`LargeTeam` is for
 many: with
 dozens of users ranging their neighbours the picture is rarely ambiguous, and one hypothesis over
-all (:mod:`relpos.fusion.large_teams.sparse_filter`) takes the place of many. Users whose start is
-unknown
-join by least squares (:mod:`relpos.fusion.initialisation.least_squares`); what is doubted is
-widened.
+all (:mod:`relpos.fusion.large_teams.sparse_filter`) takes the place of many. A node whose
+initial pose is unknown joins once the initialiser has found it; what is doubted is widened.
 
 Of so many users not every pair is listed: ``Estimate.pairs`` holds those in reach of each other.
 """
@@ -34,7 +32,7 @@ from relpos.fusion.estimator import (
     refuse_unmoved,
     refuse_unranged,
 )
-from relpos.fusion.initialisation.least_squares import Joining
+from relpos.fusion.initial_poses import Found, Initialiser
 from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter, RangeModel
 from relpos.fusion.large_teams.variance_components import TeamLevels
 from relpos.fusion.models.motion import reported_sigmas
@@ -74,7 +72,8 @@ _TWO_PI = 2.0 * math.pi
 class LargeTeam:
     """The filter for dozens to thousands of users; :func:`make` returns the estimator."""
 
-    priors: Sequence[Prior] = ()
+    priors: Sequence[Prior]
+    initialiser: Initialiser
     settings: BankSettings = field(default_factory=BankSettings)
     seed: int = 0
     mountings: Mapping[int, Mounting] = field(default_factory=dict)
@@ -83,7 +82,6 @@ class LargeTeam:
     _row: dict[int, int] = field(default_factory=dict)
     _known: dict[int, Presence] = field(default_factory=dict)
     _pending: list[Advance] = field(default_factory=list)
-    _joining: Joining = field(default_factory=Joining)
     _own: Counter[str] = field(default_factory=Counter)
     _odd: Floats = field(default_factory=lambda: np.empty(0))
     _levels: TeamLevels = field(default_factory=TeamLevels)
@@ -104,6 +102,10 @@ class LargeTeam:
             self._known[p.node] = Presence()
             if math.isfinite(p.sigma_m) and math.isfinite(p.sigma_rad):
                 known.append(p)
+            else:
+                self.initialiser.add(
+                    p.node, (p.x_m, p.y_m, p.heading_rad), (p.sigma_m, p.sigma_m, p.sigma_rad)
+                )
         poses = np.array([(p.x_m, p.y_m, p.heading_rad) for p in known]).reshape(-1, 3)
         sigmas = np.array([(p.sigma_m, p.sigma_m, p.sigma_rad) for p in known]).reshape(-1, 3)
         self._add([p.node for p in known], poses, sigmas[:, :, None] ** 2 * np.eye(3))
@@ -129,12 +131,16 @@ class LargeTeam:
                 self._sense(step)
             case Epoch():
                 self._advance()
+                self._admit(self.initialiser.find(step.time_s))
                 return self._estimate(step.time_s)
         return None
 
     def cost_s(self, step: Step) -> float:
         """Return about how many seconds of a processor ``update`` needs for a step."""
-        return 2e-5 if isinstance(step, Advance) else 5e-5 * len(self._nodes)
+        if isinstance(step, Advance):
+            return 2e-5
+        search_s = self.initialiser.cost_s() if isinstance(step, Epoch) else 0.0
+        return 5e-5 * len(self._nodes) + search_s
 
     def check_run(self, counters: Mapping[str, int]) -> None:
         """Raise RelposError if the run cannot give relative positions."""
@@ -143,7 +149,7 @@ class LargeTeam:
 
     def counters(self) -> Counter[str]:
         """Count everything perturbed or joined."""
-        return self._own + self.filter.counters + self._joining.counters
+        return self._own + self.filter.counters + self.initialiser.counters
 
     # -- users ---------------------------------------------------------------------------------
 
@@ -173,7 +179,7 @@ class LargeTeam:
             return
         for a in steps:
             if a.node not in self._row:
-                self._joining.move(a.node, a.dx_m, a.dy_m, a.dtheta_rad)
+                self.initialiser.advance(a)
         steps = [a for a in steps if a.node in self._row]
         if not steps:
             return
@@ -205,12 +211,10 @@ class LargeTeam:
                 self._meet(node)
                 known = self._known[node]
                 known.received(step.time_s)
-        if not self._row:
-            self._found_frame(step.ranges)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
         if located:
             self._weigh(located)
-        self._join(step.ranges)
+        self._seek(step)
 
     def _weigh(self, ranges: Sequence[Range]) -> None:
         node = np.array([self._row[r.node] for r in ranges], dtype=np.int64)
@@ -261,35 +265,35 @@ class LargeTeam:
         tag_m = 0.0 if worn is None or worn.height_m is None else worn.height_m
         return tag_m + self._known[node].height_m
 
-    # -- joining -------------------------------------------------------------------------------
+    # -- nodes that are not located ------------------------------------------------------------
 
-    def _found_frame(self, ranges: Sequence[Range]) -> None:
-        """Make the best connected node of this instant (the lowest of equals) the frame."""
-        degree: Counter[int] = Counter()
-        for r in ranges:
-            degree.update((r.node, r.peer))
-        node = min(degree, key=lambda n: (-degree[n], n))
-        self._add([node], np.zeros((1, 3)), np.zeros((1, 3, 3)))
-
-    def _join(self, ranges: Sequence[Range]) -> None:
-        """Collect what located nodes tell of the others; let those join that are found."""
-        heard: list[tuple[int, int, float]] = []
-        for r in ranges:
-            for node, peer in ((r.node, r.peer), (r.peer, r.node)):
-                if node not in self._row and peer in self._row:
-                    rise = self._height(node) - self._height(peer)
-                    flat = math.sqrt(max(r.range_m**2 - rise**2, 0.0))
-                    heard.append((node, self._row[peer], flat))
-        if not heard:
+    def _seek(self, step: Ranging) -> None:
+        """Let the initialiser use the ranges of nodes that are not located."""
+        ranges = [r for r in step.ranges if r.node not in self._row or r.peer not in self._row]
+        if not ranges:
             return
+        nodes = sorted({n for r in ranges for n in (r.node, r.peer)})
         own = self.filter.marginals()
-        for node, row, flat in heard:
-            pose = self.filter.pose[row]
-            at = (float(pose[0]), float(pose[1]))
-            self._joining.hear(node, at, 0.5 * float(own[row, 0] + own[row, 1]), flat)
-        self._ranges_used += len(heard)
-        for node, pose, covariance in self._joining.found(self.filter.model.sigma_m):
-            self._add([node], pose[None], covariance[None])
+        located: dict[int, tuple[float, float, float]] = {}
+        for node in nodes:
+            row = self._row.get(node)
+            if row is not None:
+                x, y = self.filter.pose[row, :2]
+                located[node] = float(x), float(y), 0.5 * float(own[row, 0] + own[row, 1])
+            elif node not in self.initialiser:
+                self.initialiser.add(node)
+        heights = {node: self._height(node) for node in nodes}
+        self.initialiser.update(step.time_s, ranges, located, heights)
+        self._ranges_used += len(ranges)
+
+    def _admit(self, found: Found | None) -> None:
+        """Add the nodes whose poses have been found to the filter, each as one Gaussian."""
+        if found is None:
+            return
+        moments = [found.mixture.moments(k) for k in range(len(found.mixture.nodes))]
+        poses, covariances = (np.stack(each) for each in zip(*moments, strict=True))
+        self._add(found.mixture.nodes, poses, covariances)
+        self._own["joined"] += len(moments)
 
     def _sense(self, step: Sensed) -> None:
         self._meet(step.measurement.node)
@@ -349,6 +353,7 @@ class LargeTeam:
 
 def make(
     priors: Sequence[Prior],
+    initialiser: Initialiser,
     settings: BankSettings,
     seed: int,
     mountings: Mapping[int, Mounting],
@@ -361,7 +366,8 @@ def make(
         reorder_s=settings.reorder_s,
         max_lag_s=settings.max_lag_s,
     )
-    return Rewinder(LargeTeam(priors, settings, seed, mountings), timeline, settings.late_s)
+    core = LargeTeam(priors, initialiser, settings, seed, mountings)
+    return Rewinder(core, timeline, settings.late_s)
 
 
 ACROSS = 0.1
