@@ -3,7 +3,7 @@
     python bench/bench_particle.py [--particles 50 100 200 500 1000 5000 50000]
 
 An epoch is what lies between two instants of ranging: two displacements a user and about 5.3
-ranges. "arrays" hands them to `Clouds` as arrays, "interface" goes measurement by measurement
+ranges. "arrays" hands them to `ParticleSet` as arrays, "interface" goes measurement by measurement
 through `process`, with an estimate a second. Processor time, median and tenth percentile (a busy
 computer's caches are disturbed) over a run of 600 s, one thread.
 """

@@ -111,25 +111,25 @@ class Particles:
 
     def __init__(self, case: Case, seed: int, size: int, alpha: float) -> None:
         from relpos.fusion.models.ranging import RangeNoise
-        from relpos.fusion.particle.estimator import Clouds
+        from relpos.fusion.particle.particle_set import ParticleSet
 
         noise = RangeNoise(particle_sigma(case))
-        self.clouds = Clouds(size, alpha, noise, np.random.default_rng(seed))
+        self.particles = ParticleSet(size, alpha, noise, np.random.default_rng(seed))
         for pose in case.truth[0]:
-            self.clouds.add(np.repeat(pose[:, None], size, axis=1))
+            self.particles.add(np.repeat(pose[:, None], size, axis=1))
         self.rows = np.arange(case.nodes)
 
     def predict(self, motion: Floats, sigma: Floats) -> None:
         """Move every particle with its own noise."""
-        self.clouds.advance(self.rows, motion, particle_motion(sigma))
+        self.particles.predict(self.rows, motion, particle_motion(sigma))
 
     def update(self, ranges: Instant) -> None:
         """Weigh by the neighbours' means, resample."""
-        self.clouds.range(ranges.node, ranges.peer, ranges.range_m, np.zeros(ranges.node.size))
+        self.particles.update(ranges.node, ranges.peer, ranges.range_m, np.zeros(ranges.node.size))
 
     def positions(self) -> Floats:
         """Weighted means."""
-        at: Floats = np.einsum("akm,km->ka", self.clouds.poses[:2], self.clouds.weights)
+        at: Floats = np.einsum("akm,km->ka", self.particles.poses[:2], self.particles.weights)
         return at
 
 

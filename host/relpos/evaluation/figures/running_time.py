@@ -34,17 +34,17 @@ def instants(run: SimulatedRun) -> Iterator[tuple[list[Motion], list[Range]]]:
 
 
 def through_arrays(run: SimulatedRun, particles: int, alpha: float) -> list[float]:
-    """Seconds of every epoch whose measurements come as arrays (``Clouds``)."""
+    """Seconds of every epoch whose measurements come as arrays (``ParticleSet``)."""
     from relpos.fusion.models.motion import MotionNoise
     from relpos.fusion.models.ranging import RangeNoise
-    from relpos.fusion.particle.estimator import Clouds
+    from relpos.fusion.particle.particle_set import ParticleSet
     from relpos.fusion.timeline import Advance
 
     users = len(run.priors)
-    clouds = Clouds(particles, alpha, RangeNoise(), np.random.default_rng(0))
+    particle_set = ParticleSet(particles, alpha, RangeNoise(), np.random.default_rng(0))
     for prior in run.priors:
         pose = np.array([prior.x_m, prior.y_m, prior.heading_rad])
-        clouds.add(np.repeat(pose[:, None], particles, axis=1))
+        particle_set.add(np.repeat(pose[:, None], particles, axis=1))
     noise, rows, height = MotionNoise(), np.arange(users), np.zeros(users * users)
     spent, busy = [], 0.0
     for motions, ranges in instants(run):
@@ -55,9 +55,9 @@ def through_arrays(run: SimulatedRun, particles: int, alpha: float) -> list[floa
         second = np.array([r.peer - 1 for r in ranges], dtype=np.int64)
         range_m = np.array([r.range_m for r in ranges])
         started = time.thread_time()
-        clouds.advance(rows, mean, sigma)
+        particle_set.predict(rows, mean, sigma)
         if ranges:
-            clouds.range(first, second, range_m, height[: len(ranges)])
+            particle_set.update(first, second, range_m, height[: len(ranges)])
         busy += time.thread_time() - started
         if ranges:
             spent.append(busy)

@@ -27,6 +27,7 @@ from relpos.fusion.models.odometry_faults import (
     CusumDetector,
     perturb,
 )
+from relpos.fusion.resampling import systematic
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -889,12 +890,3 @@ def _always(count: int, value: float) -> Floats:
 def _no_places(count: int) -> Indices:
     # Not read-only: of another type, for which ``take_ranges`` would be compiled once more.
     return np.full(count, -1, dtype=np.int64)
-
-
-def systematic(weight: Floats, count: int, rng: np.random.Generator) -> Indices:
-    """Draw ``count`` indices by ``weight`` (K,) with the least variance; sorted."""
-    edges = np.cumsum(weight)
-    comb = (np.arange(count) + rng.random()) / max(count, 1) * edges[-1]
-    index = np.searchsorted(edges, comb, side="right")
-    chosen: Indices = np.minimum(index, len(weight) - 1).astype(np.int64)
-    return chosen

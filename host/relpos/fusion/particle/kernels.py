@@ -1,15 +1,16 @@
-"""Kernels of the paper's particle filter over all users at once.
+"""Compiled loops of the paper's particle filter, over all nodes at once.
 
-Beliefs are ``poses`` (3, K, M), x, y (m) and heading (rad) of M particles of K users, and
-``weights`` (K, M), each row summing to one. Random numbers come in as arrays of uniforms, so that
-a kernel is a function of its arguments and its NumPy twin (:mod:`reference.particle`)
-can be given the same dice. The equations are those of :mod:`relpos.fusion.models.motion`,
-:mod:`relpos.fusion.models.ranging` and :mod:`relpos.fusion.particle.estimator`.
+A set of particles is ``poses`` (3, K, M), x, y (m) and heading (rad) of M particles of K nodes,
+and ``weights`` (K, M), each row summing to one. Random numbers are arguments, so that a kernel
+and its reference implementation in the tests can use the same ones. The equations are in
+:mod:`relpos.fusion.models.motion`, :mod:`relpos.fusion.models.ranging` and
+:mod:`relpos.fusion.particle.particle_set`.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,36 +22,30 @@ Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Integers = npt.NDArray[np.uint64]
 
-MIN_BANDWIDTH_M = 1e-3
-"""A belief of identical particles has no spread; its density is then one of a millimetre."""
 
-FAR_OUT = math.log(1e4)
-"""Where all kernels underflow, the nearest counts as one particle of very many."""
+class NodeRanges(NamedTuple):
+    """The ranges of one instant, each once for either of its nodes, sorted by that node (E of them).
 
-DIRECT_MOST = 8_000
-"""Kernels per user (points times particles) up to which the density is their plain sum.
+    Node k measured the ranges offset[k] to offset[k + 1].
+    """
 
-Above it the binned sum is faster. At M 500 five points (2,500 kernels) took 2.8 us a user plain and
-7.6 us binned, at M 50,000 and 500 points 17,800 and 345 (one thread, AVX-512)."""
-
-CELLS = 128
-CELL = 0.5
-WINDOW = 10
-"""The binned density: a grid of CELLS x CELLS cells of CELL bandwidths about the mean, of which
-the WINDOW cells around a point (5 bandwidths: a kernel is 4e-6 of its peak there) are summed."""
-
-THINNED = 512
-"""Particles (about) that stand for all where a point has no mass within the window."""
-
-DUAL_DRAWS = 5
-"""Uniforms a dual particle takes: whose ring, radius (two), angle, heading."""
+    centres_m: Floats
+    """Mean positions (2, K) of all nodes before the correction."""
+    offset: Indices
+    """(K + 1,)"""
+    peer: Indices
+    """Row of the other node (E,)."""
+    range_m: Floats
+    """(E,)"""
+    height_m: Floats
+    """Height difference of the two nodes (E,)."""
 
 
 @compiled
 def normals(random: Integers, result: Floats) -> None:
     """Turn 64 random bits each of ``random`` (P,) into two standard normals (Box, Muller 1958).
 
-    ``result`` (2 P,) gets one in each half. 32 bits a uniform: up to 6.8 standard deviations.
+    ``result`` (2 P,) receives one in each half. 32 bits a uniform: up to 6.8 standard deviations.
     """
     half = random.shape[0]
     # Slices, because an index of i + half keeps the loop from becoming vector instructions.
@@ -66,11 +61,11 @@ def normals(random: Integers, result: Floats) -> None:
 
 
 @compiled
-def advance(poses: Floats, rows: Indices, mean: Floats, sigma: Floats, noise: Floats) -> None:
-    """Move users ``rows`` (R,) by body-frame displacements ``mean`` (R, 3) with ``sigma`` (R, 3).
+def predict(poses: Floats, rows: Indices, mean: Floats, sigma: Floats, noise: Floats) -> None:
+    """Move nodes ``rows`` (R,) by body-frame displacements ``mean`` (R, 3) with ``sigma`` (R, 3).
 
-    ``noise`` are standard normals: M for every sigma that is not zero, in the order of the rows
-    and of x, y, heading; at least M in all.
+    ``noise`` contains standard normals: M for every sigma that is not zero, in the order of the
+    rows and of x, y, heading; at least M in all.
     """
     count = poses.shape[2]
     taken = 0
@@ -96,7 +91,7 @@ def advance(poses: Floats, rows: Indices, mean: Floats, sigma: Floats, noise: Fl
 
 @compiled
 def moments(poses: Floats, weights: Floats, result: Floats) -> None:
-    """Give (K, 7): mean x, y, variance x, y, covariance, and means of cosine and sine."""
+    """Fill ``result`` (K, 7): mean x, y, variance x, y, covariance, mean cosine and sine."""
     count = poses.shape[2]
     for k in range(poses.shape[1]):
         x, y, heading, w = poses[0, k], poses[1, k], poses[2, k], weights[k]
@@ -120,7 +115,7 @@ def moments(poses: Floats, weights: Floats, result: Floats) -> None:
 
 @compiled
 def means(poses: Floats, weights: Floats, result: Floats) -> None:
-    """Give the weighted mean positions, into columns 0 to K - 1 of ``result`` (2, C)."""
+    """Fill ``result`` (2, K) with the weighted mean positions."""
     for k in range(poses.shape[1]):
         x, y, w = poses[0, k], poses[1, k], weights[k]
         at_x, at_y = 0.0, 0.0
@@ -131,67 +126,58 @@ def means(poses: Floats, weights: Floats, result: Floats) -> None:
 
 
 @compiled
-def directed(first: Indices, second: Indices, rows: int) -> tuple[Indices, Indices, Indices]:
-    """Sort ranges between ``first`` and ``second`` (R,) by the user that looks.
+def sort_by_node(first: Indices, second: Indices, rows: int) -> tuple[Indices, Indices, Indices]:
+    """Sort the ranges between ``first`` and ``second`` (R,) by node, each range once for either.
 
-    Gives ``offset`` (rows + 1,), ``other`` (E,) and ``which`` (E,): user k sees ``other`` by the
-    range ``which`` at the places offset[k] to offset[k + 1]. Those from ``rows`` on are seen and
-    do not look.
+    Returns ``offset`` (rows + 1,), ``peer`` (E,) and ``which`` (E,): the entries offset[k] to
+    offset[k + 1] are the ranges ``which`` of node k to the nodes ``peer``.
     """
     offset = np.zeros(rows + 1, dtype=np.int64)
     for r in range(first.shape[0]):
-        if first[r] < rows:
-            offset[first[r] + 1] += 1
-        if second[r] < rows:
-            offset[second[r] + 1] += 1
+        offset[first[r] + 1] += 1
+        offset[second[r] + 1] += 1
     for k in range(rows):
         offset[k + 1] += offset[k]
     place = offset[:rows].copy()
-    other = np.empty(offset[rows], dtype=np.int64)
+    peer = np.empty(offset[rows], dtype=np.int64)
     which = np.empty(offset[rows], dtype=np.int64)
     for r in range(first.shape[0]):
         a, b = first[r], second[r]
-        if a < rows:
-            other[place[a]], which[place[a]] = b, r
-            place[a] += 1
-        if b < rows:
-            other[place[b]], which[place[b]] = a, r
-            place[b] += 1
-    return offset, other, which
+        peer[place[a]], which[place[a]] = b, r
+        place[a] += 1
+        peer[place[b]], which[place[b]] = a, r
+        place[b] += 1
+    return offset, peer, which
 
 
 @compiled
 def correct(
     poses: Floats,
     weights: Floats,
-    centres: Floats,
-    offset: Indices,
-    other: Indices,
-    range_m: Floats,
-    height_m: Floats,
+    ranges: NodeRanges,
     sigma_m: float,
     floor: float,
     result: Floats,
 ) -> None:
-    """Weigh by eq. (6): new weights (K, M) of all users, each row summing to one.
+    """Multiply the weights by the ranges' likelihoods, eq. (6); each row of ``result`` sums to one.
 
-    Edges as ``directed`` sorts them, ``range_m`` and ``height_m`` (E,) in the same order;
-    ``centres`` (2, C) the neighbours' positions; ``floor`` the outliers' density relative to the
-    Gaussian's peak (0: none). Users without an edge keep their weights.
+    ``floor`` is the outliers' density relative to the Gaussian's peak (0: none). Nodes without a
+    range keep their weights.
     """
+    centres, offset, peer, range_m, height_m = ranges
     count = poses.shape[2]
     total = np.empty(count)
     for k in range(poses.shape[1]):
         prior, new = weights[k], result[k]
         if offset[k] == offset[k + 1]:
-            # One by one: whole arrays, with the words for lengths that differ, compile for seconds.
+            # A loop, because assignments of whole arrays take seconds to compile.
             for m in range(count):
                 new[m] = prior[m]
             continue
         x, y = poses[0, k], poses[1, k]
         total[:] = 0.0
         for e in range(offset[k], offset[k + 1]):
-            at_x, at_y = centres[0, other[e]], centres[1, other[e]]
+            at_x, at_y = centres[0, peer[e]], centres[1, peer[e]]
             h2, z = height_m[e] * height_m[e], range_m[e]
             if floor > 0.0:
                 for m in range(count):
@@ -215,11 +201,24 @@ def correct(
             new[m] /= mass
 
 
+MIN_BANDWIDTH_M = 1e-3
+"""The bandwidth of particles that coincide: their density stays finite."""
+
+CELLS = 128
+CELL = 0.5
+WINDOW = 10
+"""The binned density: a grid of CELLS x CELLS cells of CELL bandwidths about the mean, of which
+the WINDOW cells around a point (5 bandwidths: a kernel is 4e-6 of its peak there) are summed."""
+
+THINNED = 512
+"""Particles (about) that represent all where a point has no mass within the window."""
+
+
 @compiled
 def log_density(
     px: Floats, py: Floats, x: Floats, y: Floats, w: Floats, cells: Floats, result: Floats
 ) -> None:
-    """Log density (D,) of a belief, positions ``x``, ``y`` and weights ``w`` (M,), at points.
+    """Log density (D,) at points of particles at ``x``, ``y`` with weights ``w`` (M,).
 
     A Gaussian kernel with Silverman's bandwidth for two dimensions, per axis, from the effective
     sample size. With ``cells``, (CELLS, CELLS) of working memory, particles are added up in cells
@@ -266,12 +265,12 @@ def log_density(
     far_x, far_y, far_w = np.empty(left_out), np.empty(left_out), np.empty(left_out)
     for m in range(left_out):
         far_x[m], far_y[m], far_w[m] = x[outside[m]], y[outside[m]], w[outside[m]]
-    # Sharing a particle among its four cells widens it by CELL^2/6 an axis, on average: the
+    # Distributing a particle over four cells widens it by CELL^2/6 an axis, on average: the
     # kernel is narrower by as much.
     squared = 1.0 - CELL * CELL / 6.0
     scale = -0.5 * CELL * CELL / squared
     along = np.empty(2 * WINDOW + 1)
-    # Copies, because what lies far apart in memory is slow to fetch.
+    # Copies, because strided reads are slow.
     stride = max(count // THINNED, 1)
     thin_x, thin_y, thin_w = x[::stride].copy(), y[::stride].copy(), w[::stride] * stride
     for d in range(px.shape[0]):
@@ -296,8 +295,12 @@ def log_density(
         if total > 1e-300:
             result[d] = math.log(total) - peak_log
         else:
-            # Far from everything only how far counts: some particles tell as much as all.
+            # Far from everything only the distance counts: some particles represent all.
             result[d] = _plain(px[d], py[d], thin_x, thin_y, thin_w, per_x, per_y) - peak_log
+
+
+FAR_OUT = math.log(1e4)
+"""Where all kernels underflow, the nearest counts as one particle of very many."""
 
 
 @compiled
@@ -311,8 +314,8 @@ def _plain(
         total += w[m] * vectormath.exp(-0.5 * (u * u + v * v))
     if total > 1e-300:
         return math.log(total)
-    # A point very far out has density zero in every kernel: its nearest one keeps it comparable.
-    # (Apart: a loop that also compares does not become vector instructions.)
+    # A point very far out has density zero in every kernel: the nearest one keeps it comparable.
+    # (A loop of its own: one that also compares does not become vector instructions.)
     nearest = math.inf
     for m in range(x.shape[0]):
         u, v = (x[m] - px) * per_x, (y[m] - py) * per_y
@@ -320,27 +323,34 @@ def _plain(
     return -0.5 * nearest - FAR_OUT
 
 
+DUAL_DRAWS = 5
+"""Uniforms per dual particle: whose ring, radius (two), angle, heading."""
+
+DIRECT_MOST = 8_000
+"""Kernels per node (points times particles) up to which the density is their plain sum.
+
+Above it the binned sum is faster. At M 500 five points (2,500 kernels) took 2.8 us a node plain and
+7.6 us binned, at M 50,000 and 500 points 17,800 and 345 (one thread, AVX-512)."""
+
+
 @compiled
 def dual_step(
     poses: Floats,
     predicted: Floats,
     corrected: Floats,
-    centres: Floats,
-    offset: Indices,
-    other: Indices,
-    range_m: Floats,
-    height_m: Floats,
+    ranges: NodeRanges,
     sigma_m: float,
     floor: float,
     alpha: float,
     uniforms: Floats,
 ) -> None:
-    """Redraw a share alpha of the particles of all users who look from their ranges (eq. (7)).
+    """Redraw a fraction alpha of the particles of every node that ranged, eq. (7), in place.
 
-    ``uniforms`` (K, DUAL_DRAWS * D + 1) give D dual particles a user; ``predicted`` and
-    ``corrected`` (K, M) are the weights before and after the ranges. ``poses`` and ``corrected``
-    are changed in place; the dual particles' mass is alpha.
+    ``uniforms`` (K, DUAL_DRAWS * D + 1) make D dual particles a node; ``predicted`` and
+    ``corrected`` (K, M) are the weights before and after the ranges. The dual particles' weights
+    in ``corrected`` sum to alpha.
     """
+    centres, offset, peer, range_m, height_m = ranges
     count = poses.shape[2]
     fresh = (uniforms.shape[1] - 1) // DUAL_DRAWS
     side = CELLS if fresh * count > DIRECT_MOST else 0
@@ -352,23 +362,23 @@ def dual_step(
         first, seen = offset[k], offset[k + 1] - offset[k]
         if seen == 0:
             continue
-        x, y, w, new, dice = poses[0, k], poses[1, k], predicted[k], corrected[k], uniforms[k]
+        x, y, w, new, draws = poses[0, k], poses[1, k], predicted[k], corrected[k], uniforms[k]
         for d in range(fresh):
-            # On whose ring? Any of the user's neighbours, the same chance each.
-            e = first + min(int(dice[d] * seen), seen - 1)
+            # On the ring of a random neighbour.
+            e = first + min(int(draws[d] * seen), seen - 1)
             ring[d] = e
-            c, _ = vectormath.cos_sin_turns(dice[2 * fresh + d])
-            normal = c * math.sqrt(-2.0 * vectormath.log(1.0 - dice[fresh + d]))
+            c, _ = vectormath.cos_sin_turns(draws[2 * fresh + d])
+            normal = c * math.sqrt(-2.0 * vectormath.log(1.0 - draws[fresh + d]))
             radius = range_m[e] + sigma_m * normal
-            c, s = vectormath.cos_sin_turns(dice[3 * fresh + d])
-            px[d] = centres[0, other[e]] + radius * c
-            py[d] = centres[1, other[e]] + radius * s
+            c, s = vectormath.cos_sin_turns(draws[3 * fresh + d])
+            px[d] = centres[0, peer[e]] + radius * c
+            py[d] = centres[1, peer[e]] + radius * s
         log_density(px, py, x, y, w, cells, weight)
         for d in range(fresh):
             for e in range(first, first + seen):
-                # The ring a point was drawn from is in its density already.
+                # The points are drawn by the likelihood of their own ring.
                 if e != ring[d]:
-                    dx, dy = px[d] - centres[0, other[e]], py[d] - centres[1, other[e]]
+                    dx, dy = px[d] - centres[0, peer[e]], py[d] - centres[1, peer[e]]
                     off = range_m[e] - math.sqrt(dx * dx + dy * dy + height_m[e] ** 2)
                     exponent = -0.5 * (off / sigma_m) ** 2
                     if floor > 0.0:
@@ -385,10 +395,10 @@ def dual_step(
             run += w[m]
             edges[m] = run
         for d in range(fresh):
-            at = np.searchsorted(edges, dice[4 * fresh + d] * run, side="right")
+            at = np.searchsorted(edges, draws[4 * fresh + d] * run, side="right")
             heading[d] = poses[2, k, min(at, count - 1)]
-        # An evenly spaced comb with a random start: every particle is as likely to be replaced.
-        start = dice[5 * fresh]
+        # Evenly spaced slots with a random start: every particle is as likely to be replaced.
+        start = draws[5 * fresh]
         for d in range(fresh):
             new[int((start + d) * (count / fresh)) % count] = 0.0
         rest = 0.0
@@ -406,7 +416,7 @@ def dual_step(
 
 @compiled
 def effective_sizes(weights: Floats, result: Floats) -> None:
-    """Give 1 / sum w^2 of each row of weights (K, M) that sum to one."""
+    """Fill ``result`` (K,) with 1 / sum w^2 of each row of weights (K, M)."""
     for k in range(weights.shape[0]):
         w = weights[k]
         square = 0.0
@@ -417,7 +427,7 @@ def effective_sizes(weights: Floats, result: Floats) -> None:
 
 @compiled
 def resample(poses: Floats, weights: Floats, rows: Indices, uniforms: Floats) -> None:
-    """Draw users ``rows`` (R,) anew from their weights (multinomial), in place.
+    """Resample nodes ``rows`` (R,) from their weights (multinomial), in place.
 
     ``uniforms`` (R, M + 1): the spacings of M sorted uniforms are exponentials divided by the sum
     of M + 1 of them (Devroye 1986, sect. V.3), which saves sorting.
@@ -436,7 +446,7 @@ def resample(poses: Floats, weights: Floats, rows: Indices, uniforms: Floats) ->
         for m in range(count):
             mass += w[m]
         scale = mass / total
-        # Either the draw or the particle goes one on: no branch that nobody could predict.
+        # Either the draw or the particle advances; conditional values avoid unpredictable branches.
         at, m = 0, 0
         edge, wanted = w[0], spacing[0] * scale
         while m < count and at < count - 1:
