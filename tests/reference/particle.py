@@ -1,7 +1,7 @@
-"""NumPy twins of :mod:`relpos.fusion.particle.kernels`: the same functions, the same dice.
+"""Reference implementation of :mod:`relpos.fusion.particle.kernels` in NumPy.
 
 Written from the equations in the shortest way; the kernels are compared with them on random
-input. Densities are always plain sums over all particles.
+input and the same random numbers. Densities are always plain sums over all particles.
 """
 
 from __future__ import annotations
@@ -11,13 +11,32 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.models.motion import move
-from relpos.fusion.models.ranging import RangeNoise, log_likelihood, predicted_range
-from relpos.fusion.particle.kernels import DUAL_DRAWS, FAR_OUT, MIN_BANDWIDTH_M
+from relpos.fusion.models.ranging import RangeNoise
+from relpos.fusion.particle.kernels import DUAL_DRAWS, FAR_OUT, MIN_BANDWIDTH_M, NodeRanges
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Integers = npt.NDArray[np.uint64]
+
+
+def move(poses: Floats, displacement: Floats) -> None:
+    """Eqs. (2) to (4): move poses (3, ...) in place by body-frame displacements (3, ...)."""
+    c, s = np.cos(poses[2]), np.sin(poses[2])
+    poses[0] += c * displacement[0] - s * displacement[1]
+    poses[1] += s * displacement[0] + c * displacement[1]
+    poses[2] += displacement[2]
+
+
+def log_likelihood(
+    measured_m: Floats, dx_m: Floats, dy_m: Floats, dz_m: Floats, noise: RangeNoise
+) -> Floats:
+    """Eq. (6) as a logarithm, up to a constant; with outliers the mixture's."""
+    predicted_m = np.sqrt(dx_m**2 + dy_m**2 + dz_m**2)
+    exponent: Floats = -0.5 * ((measured_m - predicted_m) / noise.sigma_r_m) ** 2
+    if noise.outliers <= 0.0:
+        return exponent
+    mixed: Floats = np.logaddexp(exponent, math.log(noise.flat_over_peak))
+    return mixed
 
 
 def normals(random: Integers) -> Floats:
@@ -28,8 +47,8 @@ def normals(random: Integers) -> Floats:
     return np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
 
 
-def advance(poses: Floats, rows: Indices, mean: Floats, sigma: Floats, noise: Floats) -> None:
-    """Move users ``rows`` (R,), each particle by its own noisy displacement."""
+def predict(poses: Floats, rows: Indices, mean: Floats, sigma: Floats, noise: Floats) -> None:
+    """Move nodes ``rows`` (R,), each particle by its own noisy displacement."""
     count = poses.shape[2]
     left = iter(noise[: noise.size // count * count].reshape(-1, count))
     for row, displacement, spread in zip(rows, mean, sigma, strict=True):
@@ -47,27 +66,17 @@ def moments(poses: Floats, weights: Floats) -> Floats:
     return np.column_stack([mean, spread[:, 0, 0], spread[:, 1, 1], spread[:, 0, 1], direction])
 
 
-def correct(
-    poses: Floats,
-    weights: Floats,
-    centres: Floats,
-    offset: Indices,
-    other: Indices,
-    range_m: Floats,
-    height_m: Floats,
-    noise: RangeNoise,
-) -> Floats:
-    """Eq. (6) for all users: the product of the ranges' likelihoods, normalised."""
+def correct(poses: Floats, weights: Floats, ranges: NodeRanges, noise: RangeNoise) -> Floats:
+    """Eq. (6) for all nodes: the product of the ranges' likelihoods, normalised."""
+    centres, offset, peer, range_m, height_m = ranges
     result = weights.copy()
     for k in range(len(weights)):
         seen = slice(offset[k], offset[k + 1])
         if offset[k] == offset[k + 1]:
             continue
-        at = centres[:, other[seen]]
-        distance = predicted_range(
-            poses[0, k][:, None] - at[0], poses[1, k][:, None] - at[1], height_m[seen]
-        )
-        total = log_likelihood(range_m[seen], distance, noise).sum(axis=1)
+        at = centres[:, peer[seen]]
+        dx, dy = poses[0, k][:, None] - at[0], poses[1, k][:, None] - at[1]
+        total = log_likelihood(range_m[seen], dx, dy, height_m[seen], noise).sum(axis=1)
         total -= total[weights[k] > 0.0].max()
         result[k] = weights[k] * np.exp(np.minimum(total, 0.0))
         result[k] /= result[k].sum()
@@ -75,7 +84,7 @@ def correct(
 
 
 def log_density(points_m: Floats, positions_m: Floats, weights: Floats) -> Floats:
-    """Log density (D,) of a belief, positions (2, M) and weights (M,), at points (2, D)."""
+    """Log density (D,) of particles, positions (2, M) and weights (M,), at points (2, D)."""
     mean = positions_m @ weights
     variance = (positions_m - mean[:, None]) ** 2 @ weights
     shrink = float((weights**2).sum()) ** (1.0 / 6.0)
@@ -92,36 +101,33 @@ def dual_step(
     poses: Floats,
     predicted: Floats,
     corrected: Floats,
-    centres: Floats,
-    offset: Indices,
-    other: Indices,
-    range_m: Floats,
-    height_m: Floats,
+    ranges: NodeRanges,
     noise: RangeNoise,
     alpha: float,
     uniforms: Floats,
 ) -> None:
-    """Eq. (7), in place: redraw a share alpha of every looking user's particles."""
+    """Eq. (7), in place: redraw a fraction alpha of the particles of every node that ranged."""
+    centres, offset, peer, range_m, height_m = ranges
     count = poses.shape[2]
     fresh = (uniforms.shape[1] - 1) // DUAL_DRAWS
     for k in range(len(predicted)):
         first, seen = offset[k], offset[k + 1] - offset[k]
         if seen == 0:
             continue
-        whose, radial, phase, angle, heir = uniforms[k, :-1].reshape(DUAL_DRAWS, fresh)
-        edge = first + (whose * seen).astype(np.int64)
+        ring_of, radial, phase, angle, source_of = uniforms[k, :-1].reshape(DUAL_DRAWS, fresh)
+        edge = first + (ring_of * seen).astype(np.int64)
         normal = np.sqrt(-2.0 * np.log1p(-radial)) * np.cos(2.0 * math.pi * phase)
         radius = range_m[edge] + noise.sigma_r_m * normal
         ring = np.stack([np.cos(2.0 * math.pi * angle), np.sin(2.0 * math.pi * angle)])
-        points = centres[:, other[edge]] + radius * ring
+        points = centres[:, peer[edge]] + radius * ring
         log_weight = log_density(points, poses[:2, k], predicted[k])
         for e in range(first, first + seen):
-            dx, dy = points - centres[:, other[e]][:, None]
-            each = log_likelihood(range_m[e], predicted_range(dx, dy, height_m[e]), noise)
+            dx, dy = points - centres[:, peer[e]][:, None]
+            each = log_likelihood(range_m[e], dx, dy, height_m[e], noise)
             log_weight += np.where(edge == e, 0.0, each)
         weight = np.exp(log_weight - log_weight.max())
         edges = np.cumsum(predicted[k])
-        source = np.searchsorted(edges, heir * edges[-1], side="right")
+        source = np.searchsorted(edges, source_of * edges[-1], side="right")
         heading = poses[2, k, np.minimum(source, count - 1)]
         slot = ((uniforms[k, -1] + np.arange(fresh)) * (count / fresh)).astype(np.int64) % count
         corrected[k, slot] = 0.0
@@ -133,7 +139,7 @@ def dual_step(
 
 
 def resample(poses: Floats, weights: Floats, rows: Indices, uniforms: Floats) -> None:
-    """Multinomial resampling of users ``rows`` in place, from (R, M + 1) uniforms."""
+    """Multinomial resampling of nodes ``rows`` in place, from (R, M + 1) uniforms."""
     count = poses.shape[2]
     for r, k in enumerate(rows):
         spacing = -np.log1p(-uniforms[r])

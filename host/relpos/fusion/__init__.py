@@ -60,9 +60,12 @@ def make(
 
             return SwitchingEstimator(priors, parse(BankSettings, given, "bank"), seed, nodes or {})
         case "particle":
+            from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
             from relpos.fusion.particle.estimator import ParticleFilter
 
-            return ParticleFilter(priors, parse(ParticleSettings, given, "particle"), seed)
+            initialiser = HypothesisInitialiser(seed=seed)
+            parsed = parse(ParticleSettings, given, "particle")
+            return ParticleFilter(priors, initialiser, parsed, seed)
         case "deadreckoning":
             return DeadReckoning(priors, parse(DeadReckoningSettings, given, "deadreckoning"), seed)
     check_name(name)
@@ -153,9 +156,8 @@ def rehearse(room: str) -> None:
     """Call every kernel of a room once, with a made-up team of three."""
     team = {1: (0.0, 0.0), 2: (6.0, 0.0), 3: (2.0, 5.0)}
     name = "particle" if room == "particle" else "bank"
-    # With one of three unknown the search joins in.
-    known = (1, 2, 3) if room == "particle" else (1, 2)
-    estimator = make(name, [Prior(node, *team[node], 0.0, 0.1, 0.1) for node in known])
+    # The third node's initial pose is unknown, so that the search for it is called, too.
+    estimator = make(name, [Prior(node, *team[node], 0.0, 0.1, 0.1) for node in (1, 2)])
     for k in range(1, WARM_UP_S):
         for node in team:
             turn = 0.3 * (node - 2)

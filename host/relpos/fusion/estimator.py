@@ -214,6 +214,14 @@ class Presence:
         return NodeStatus.STALE if self.silent_epochs >= STALE_EPOCHS else NodeStatus.OK
 
 
+def unlocated(node: int, height_m: float = 0.0, sigma_height_m: float = 0.0) -> NodeEstimate:
+    """Return the estimate of a node of which nothing but its height is known."""
+    return NodeEstimate(
+        node, 0.0, 0.0, 0.0, inf, inf, 0.0, ANY_ANGLE_RAD, NodeStatus.UNLOCATED,
+        height_m, sigma_height_m,
+    )  # fmt: skip
+
+
 def refuse_unmoved(moved: bool) -> None:
     """Raise RelposError where a run brought no motion."""
     if not moved:

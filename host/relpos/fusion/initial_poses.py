@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion.estimator import NodeEstimate, NodeStatus, Presence, unlocated
 from relpos.fusion.modes import believe
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Range
@@ -118,3 +119,24 @@ class Initialiser(Protocol):
     @property
     def mixture(self) -> PoseMixture | None:
         """Hypotheses about the sought nodes that are tied to a known one; None without any."""
+
+
+def sought_node(initialiser: Initialiser, node: int, presence: Presence) -> NodeEstimate:
+    """Return what the initialiser knows of a node that it seeks."""
+    mixture = initialiser.mixture
+    if mixture is None or node not in mixture.nodes:
+        return unlocated(node, presence.height_m, presence.sigma_height_m)
+    n = mixture.nodes.index(node)
+    own = slice(POSE * n, POSE * (n + 1))
+    belief = believe(
+        mixture.weights, mixture.poses[:, n], mixture.covariances[:, own, own], mixture.best
+    )
+    status = presence.status
+    if status is NodeStatus.OK and node not in initialiser.resolved:
+        status = NodeStatus.AMBIGUOUS
+    spread = belief.covariance_m2
+    return NodeEstimate(
+        node, belief.x_m, belief.y_m, belief.heading_rad, float(spread[0, 0]),
+        float(spread[1, 1]), float(spread[0, 1]), belief.sigma_heading_rad, status,
+        presence.height_m, presence.sigma_height_m,
+    )  # fmt: skip

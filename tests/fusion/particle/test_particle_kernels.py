@@ -1,4 +1,4 @@
-"""The particle filter's kernels against their NumPy twins, on random input with the same dice."""
+"""The particle filter's kernels against their reference, with the same random numbers."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from reference import particle as twins
+from reference import particle as reference
 from relpos.fusion import vectormath
 from relpos.fusion.compiled import compiled
 from relpos.fusion.models.ranging import RangeNoise
 from relpos.fusion.particle import kernels
-from relpos.fusion.particle.estimator import Clouds
+from relpos.fusion.particle.particle_set import ParticleSet
 
 ROWS, SIZE = 4, 301
 
@@ -49,7 +49,7 @@ def test_the_normals_are_standard_normal() -> None:
     bits = np.random.default_rng(1).bit_generator.random_raw(100_000)
     drawn = np.empty(2 * bits.size)
     kernels.normals(bits, drawn)
-    assert drawn == pytest.approx(twins.normals(bits), abs=1e-9)
+    assert drawn == pytest.approx(reference.normals(bits), abs=1e-9)
     # Standard errors: .0022 of the mean, .0032 of the variance, .011 of the fourth moment.
     assert abs(drawn.mean()) < 0.01
     assert drawn.var() == pytest.approx(1.0, abs=0.015)
@@ -61,75 +61,77 @@ def test_the_normals_are_standard_normal() -> None:
     assert abs(worst).max() == pytest.approx(math.sqrt(-2.0 * math.log(2.0**-33)))
 
 
-def belief(rng: np.random.Generator, size: int = SIZE) -> tuple[np.ndarray, np.ndarray]:
+def particles(rng: np.random.Generator, size: int = SIZE) -> tuple[np.ndarray, np.ndarray]:
     poses = rng.normal(0.0, 3.0, (3, ROWS, size))
     weights = rng.random((ROWS, size)) ** 4
     weights[:, 5:9] = 0.0
     return poses, weights / weights.sum(axis=1, keepdims=True)
 
 
-def edges(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Rows 0, 1 and 3 range; row 3 sees a place (4) that does not look; row 2 has no range."""
-    first, second = np.array([0, 3, 1, 3]), np.array([1, 0, 3, 4])
-    offset, other, which = kernels.directed(first, second, ROWS)
-    centres = rng.normal(0.0, 2.0, (2, ROWS + 1))
-    return centres, offset, other, rng.uniform(1.0, 6.0, 4)[which], rng.normal(size=4)[which]
+def ranges(rng: np.random.Generator) -> kernels.NodeRanges:
+    """Four ranges between rows 0, 1 and 3; row 2 has none."""
+    first, second = np.array([0, 3, 1, 3]), np.array([1, 0, 3, 1])
+    offset, peer, which = kernels.sort_by_node(first, second, ROWS)
+    centres = rng.normal(0.0, 2.0, (2, ROWS))
+    return kernels.NodeRanges(
+        centres, offset, peer, rng.uniform(1.0, 6.0, 4)[which], rng.normal(size=4)[which]
+    )
 
 
-def test_ranges_are_sorted_by_who_looks() -> None:
-    offset, other, which = kernels.directed(np.array([0, 3, 1, 3]), np.array([1, 0, 3, 4]), ROWS)
-    seen = [
-        sorted(zip(other[a:b].tolist(), which[a:b].tolist(), strict=True))
+def test_every_range_is_listed_with_both_of_its_nodes() -> None:
+    first, second = np.array([0, 3, 1, 3]), np.array([1, 0, 3, 1])
+    offset, peer, which = kernels.sort_by_node(first, second, ROWS)
+    listed = [
+        sorted(zip(peer[a:b].tolist(), which[a:b].tolist(), strict=True))
         for a, b in pairwise(offset)
     ]
-    assert seen == [[(1, 0), (3, 1)], [(0, 0), (3, 2)], [], [(0, 1), (1, 2), (4, 3)]]
+    assert listed == [[(1, 0), (3, 1)], [(0, 0), (3, 2), (3, 3)], [], [(0, 1), (1, 2), (1, 3)]]
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_moving_and_moments_are_their_twins(seed: int) -> None:
+def test_prediction_and_moments_match_the_reference(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    poses, weights = belief(rng)
+    poses, weights = particles(rng)
     rows, mean = np.array([0, 2, 3]), rng.normal(size=(3, 3))
     sigma = np.array([[0.1, 0.0, 0.0], [0.2, 0.3, 0.4], [0.0, 0.0, 0.5]])
     noise = rng.normal(size=5 * SIZE)
     moved, expected = poses.copy(), poses.copy()
-    kernels.advance(moved, rows, mean, sigma, noise)
-    twins.advance(expected, rows, mean, sigma, noise)
+    kernels.predict(moved, rows, mean, sigma, noise)
+    reference.predict(expected, rows, mean, sigma, noise)
     assert moved == pytest.approx(expected, abs=1e-11)
     assert np.array_equal(moved[:, 1], poses[:, 1])
     kernels.moments(moved, weights, figures := np.empty((ROWS, 7)))
-    assert figures == pytest.approx(twins.moments(expected, weights), abs=1e-11)
+    assert figures == pytest.approx(reference.moments(expected, weights), abs=1e-11)
     kernels.means(moved, weights, at := np.empty((2, ROWS)))
     assert at == pytest.approx(figures[:, :2].T, abs=1e-11)
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.1])
-def test_weighing_and_the_dual_step_are_their_twins(outliers: float) -> None:
+def test_correction_and_the_dual_step_match_the_reference(outliers: float) -> None:
     rng = np.random.default_rng(7)
-    poses, weights = belief(rng)
-    sight = edges(rng)
+    poses, weights = particles(rng)
+    measured = ranges(rng)
     noise = RangeNoise(0.7, outliers)
-    kernels.correct(
-        poses, weights, *sight, noise.sigma_r_m, noise.flat_over_peak, new := np.empty_like(weights)
-    )
-    expected = twins.correct(poses, weights, *sight, noise)
+    floor = noise.flat_over_peak
+    kernels.correct(poses, weights, measured, noise.sigma_r_m, floor, new := np.empty_like(weights))
+    expected = reference.correct(poses, weights, measured, noise)
     assert new == pytest.approx(expected, rel=1e-9, abs=1e-15)
-    dice = rng.random((ROWS, 3 * kernels.DUAL_DRAWS + 1))
+    uniforms = rng.random((ROWS, 3 * kernels.DUAL_DRAWS + 1))
     ours, theirs = poses.copy(), poses.copy()
-    kernels.dual_step(ours, weights, new, *sight, noise.sigma_r_m, noise.flat_over_peak, 0.01, dice)
-    twins.dual_step(theirs, weights, expected, *sight, noise, 0.01, dice)
+    kernels.dual_step(ours, weights, new, measured, noise.sigma_r_m, floor, 0.01, uniforms)
+    reference.dual_step(theirs, weights, expected, measured, noise, 0.01, uniforms)
     assert ours == pytest.approx(theirs, abs=1e-9)
     assert new == pytest.approx(expected, rel=1e-8, abs=1e-15)
     assert (ours != poses).any(axis=0).sum(axis=1).tolist() == [3, 3, 0, 3]
 
 
-def test_resampling_draws_what_its_twin_draws() -> None:
+def test_resampling_draws_what_the_reference_draws() -> None:
     rng = np.random.default_rng(8)
-    poses, weights = belief(rng)
-    rows, dice = np.array([1, 3]), rng.random((2, SIZE + 1))
+    poses, weights = particles(rng)
+    rows, uniforms = np.array([1, 3]), rng.random((2, SIZE + 1))
     ours, theirs = (poses.copy(), weights.copy()), (poses.copy(), weights.copy())
-    kernels.resample(*ours, rows, dice)
-    twins.resample(*theirs, rows, dice)
+    kernels.resample(*ours, rows, uniforms)
+    reference.resample(*theirs, rows, uniforms)
     # Sums in another order may move an edge past a draw: never more than one in all of these.
     assert (ours[0] != theirs[0]).any(axis=0).sum() <= 1
     assert np.array_equal(ours[1], theirs[1])
@@ -145,7 +147,7 @@ def densities(points: np.ndarray, at: np.ndarray, weights: np.ndarray) -> list[n
 
 
 @pytest.mark.parametrize("size", [500, 5000])
-def test_the_density_is_its_twin_and_adding_up_in_cells_changes_it_by_little(size: int) -> None:
+def test_the_density_matches_the_reference_and_binning_changes_it_by_little(size: int) -> None:
     rng = np.random.default_rng(9)
     # Two lumps, one of them narrow, and stragglers beyond the grid.
     at = np.concatenate(
@@ -162,7 +164,7 @@ def test_the_density_is_its_twin_and_adding_up_in_cells_changes_it_by_little(siz
         [at[:, ::7] + rng.normal(0.0, 0.3, at[:, ::7].shape), [[70.0], [70.0]]], 1
     )
     plain, binned = densities(points, at, weights)
-    assert plain == pytest.approx(twins.log_density(points, at, weights), abs=1e-9)
+    assert plain == pytest.approx(reference.log_density(points, at, weights), abs=1e-9)
     likely = plain > plain.max() - math.log(1e3)
     assert np.abs(binned - plain)[likely].max() < 0.05
     assert np.sqrt(np.mean((binned - plain)[likely] ** 2)) < 0.01
@@ -177,16 +179,15 @@ def test_points_far_from_everything_keep_their_order() -> None:
         assert (np.diff(result) < 0.0).all()
 
 
-def test_the_same_generator_gives_the_same_clouds() -> None:
-    def run() -> Clouds:
-        clouds = Clouds(50, 0.1, RangeNoise(), np.random.default_rng(3))
+def test_the_same_generator_gives_the_same_particles() -> None:
+    def run() -> ParticleSet:
+        made = ParticleSet(50, 0.1, RangeNoise(), np.random.default_rng(3))
         for k in range(3):
-            clouds.add(np.tile([[float(k)], [0.0], [0.0]], 50))
+            made.add(np.tile([[float(k)], [0.0], [0.0]], 50))
         for _ in range(5):
-            clouds.advance(np.arange(3), np.full((3, 3), 0.3), np.full((3, 3), 0.1))
-            looks = clouds.range(np.array([0, 1]), np.array([1, 2]), np.ones(2), np.zeros(2))
-            assert looks == 4
-        return clouds
+            made.predict(np.arange(3), np.full((3, 3), 0.3), np.full((3, 3), 0.1))
+            made.update(np.array([0, 1]), np.array([1, 2]), np.ones(2), np.zeros(2))
+        return made
 
     first, second = run(), run()
     assert np.array_equal(first.poses, second.poses)

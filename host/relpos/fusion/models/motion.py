@@ -25,12 +25,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
 from relpos.fusion.timeline import Advance
-
-Floats = npt.NDArray[np.float64]
 
 
 def reported_sigmas(step: Advance) -> tuple[float, float, float]:
@@ -72,26 +67,3 @@ class MotionNoise:
             max(abs(step.dy_m) * relative_d, floor_d, left),
             max(abs(step.dtheta_rad) * relative_theta, floor_theta, turn),
         )
-
-
-def move(poses: Floats, displacement: Floats) -> None:
-    """Move ``poses`` (3, ...) in place by body-frame displacements (3, ...), x, y, theta."""
-    c, s = np.cos(poses[2]), np.sin(poses[2])
-    poses[0] += c * displacement[0] - s * displacement[1]
-    poses[1] += s * displacement[0] + c * displacement[1]
-    poses[2] += displacement[2]
-
-
-def predict(
-    poses: Floats, steps: list[Advance], noise: MotionNoise, rng: np.random.Generator
-) -> None:
-    """Move particles ``poses`` (3, K, M) in place, row k by ``steps[k]``, each with own noise."""
-    mean = np.array([(a.dx_m, a.dy_m, a.dtheta_rad) for a in steps]).T[:, :, None]
-    sigma = np.array([noise.sigmas(a) for a in steps]).T[:, :, None]
-    if not sigma.any():
-        move(poses, mean)
-        return
-    drawn = rng.standard_normal(poses.shape)
-    drawn *= sigma
-    drawn += mean
-    move(poses, drawn)

@@ -52,24 +52,6 @@ class RangeNoise:
         return self.outliers / self.outlier_span_m / peak
 
 
-def predicted_range(dx_m: Floats, dy_m: Floats, dz_m: Floats | float = 0.0) -> Floats:
-    """Slant distance over the given differences."""
-    squared: Floats = dx_m * dx_m
-    squared += dy_m * dy_m
-    squared += np.square(dz_m)
-    return np.sqrt(squared, out=squared)
-
-
-def log_likelihood(measured_m: Floats, predicted_m: Floats, noise: RangeNoise) -> Floats:
-    """Give eq. (6) as a logarithm, up to a constant; with outliers the mixture's."""
-    scaled: Floats = (measured_m - predicted_m) / noise.sigma_r_m
-    exponent: Floats = -0.5 * scaled * scaled
-    if noise.outliers <= 0.0:
-        return exponent
-    mixed: Floats = np.logaddexp(exponent, math.log(noise.flat_over_peak))
-    return mixed
-
-
 DECORRELATION_M = 0.45
 """Path length of both nodes together over which a range's error changes. Most of it is multipath,
 which belongs to the place and not to the moment: in the recordings of robots, consecutive errors

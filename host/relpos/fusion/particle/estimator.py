@@ -8,37 +8,37 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from relpos.errors import RelposError
 from relpos.fusion.estimator import (
     ANY_ANGLE_RAD,
     Estimate,
     NodeEstimate,
-    NodeStatus,
     Presence,
     pairs_of,
     refuse_unmoved,
     refuse_unranged,
 )
+from relpos.fusion.initial_poses import POSE, Found, Initialiser, sought_node
 from relpos.fusion.models.motion import MotionNoise
 from relpos.fusion.models.ranging import RangeNoise
 from relpos.fusion.particle.particle_set import ParticleSet
 from relpos.fusion.particle.settings import ParticleSettings
+from relpos.fusion.resampling import systematic
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.measurements import Height, Measurement, Prior, Range
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(slots=True)
 class ParticleFilter:
     """The paper's filter as an :class:`~relpos.fusion.estimator.Estimator`.
 
-    Nodes with a full prior start there.
+    Nodes with a full prior start there. ``initialiser`` seeks all others, which join once they
+    have been found; without any prior it also chooses the frame.
     """
 
-    priors: Sequence[Prior] = ()
+    priors: Sequence[Prior]
+    initialiser: Initialiser
     settings: ParticleSettings = field(default_factory=ParticleSettings)
     seed: int = 0
     _timeline: Timeline = field(init=False)
@@ -72,6 +72,12 @@ class ParticleFilter:
                 sigma = np.array([prior.sigma_m, prior.sigma_m, prior.sigma_rad])[:, None]
                 drawn = pose + sigma * self._rng.standard_normal((3, s.particles))
                 self._row[prior.node] = self._particles.add(drawn)
+            else:
+                self.initialiser.add(
+                    prior.node,
+                    (prior.x_m, prior.y_m, prior.heading_rad),
+                    (prior.sigma_m, prior.sigma_m, prior.sigma_rad),
+                )
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         """Take one measurement; return the estimates it completes."""
@@ -88,9 +94,9 @@ class ParticleFilter:
         return estimates
 
     def counters(self) -> Mapping[str, int]:
-        """Count everything dropped, late or resampled."""
+        """Count everything dropped, late, resampled or found."""
         own = self._own + Counter(resampled=self._particles.resampled)
-        return dict(self._timeline.counters + own)
+        return dict(self._timeline.counters + own + self.initialiser.counters)
 
     def _meet(self, node: int) -> None:
         if node not in self._known:
@@ -103,7 +109,11 @@ class ParticleFilter:
                 case Advance():
                     self._moved = True
                     self._known[step.node].heard(step.time_s)
-                    self._pending.setdefault(step.node, []).append(step)
+                    if step.node in self._row:
+                        self._pending.setdefault(step.node, []).append(step)
+                    else:
+                        self._seek(step.node)
+                        self.initialiser.advance(step)
                 case Ranging():
                     self._predict()
                     self._update(step)
@@ -114,12 +124,13 @@ class ParticleFilter:
                     self._own["headings_unused"] += 1
                 case Epoch():
                     self._predict()
+                    self._add_found(self.initialiser.find(step.time_s))
                     estimates.append(self._estimate(step.time_s))
         return estimates
 
     def _predict(self) -> None:
         """Apply the displacements since the last call: the k-th of every node at once."""
-        pending = [(self._row[n], steps) for n, steps in self._pending.items() if n in self._row]
+        pending = [(self._row[node], steps) for node, steps in self._pending.items()]
         self._pending = {}
         for k in range(max((len(steps) for _, steps in pending), default=0)):
             now = [(row, steps[k]) for row, steps in pending if len(steps) > k]
@@ -130,9 +141,15 @@ class ParticleFilter:
             )
 
     def _update(self, step: Ranging) -> None:
-        for r in step.ranges:
-            for node in (r.node, r.peer):
-                self._known[node].heard(step.time_s)
+        nodes = sorted({n for r in step.ranges for n in (r.node, r.peer)})
+        for node in nodes:
+            self._known[node].heard(step.time_s)
+            self._seek(node)
+        if any(node in self.initialiser for node in nodes):
+            # The search may end without a result; the ranges are usable all the same.
+            self._ranges_used += len(step.ranges)
+            heights = {node: known.height_m for node, known in self._known.items()}
+            self.initialiser.update(step.time_s, step.ranges, self._positions(), heights)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
         if located:
             self._ranges_used += len(located)
@@ -145,6 +162,38 @@ class ParticleFilter:
                 ),
             )
 
+    # -- initial poses -------------------------------------------------------------------------
+
+    def _seek(self, node: int) -> None:
+        """Hand a node to the initialiser if its initial pose is unknown."""
+        if node not in self._row and node not in self.initialiser:
+            self.initialiser.add(node)
+
+    def _positions(self) -> dict[int, tuple[float, float, float]]:
+        """Return x, y (m) and variance (m^2) of the located nodes."""
+        moments = self._particles.moments().tolist()
+        return {
+            node: (moments[row][0], moments[row][1], 0.5 * (moments[row][2] + moments[row][3]))
+            for node, row in self._row.items()
+        }
+
+    def _add_found(self, found: Found | None) -> None:
+        """Draw the particles of nodes that the initialiser has found."""
+        if found is None:
+            return
+        mixture, count = found.mixture, self.settings.particles
+        chosen = systematic(mixture.weights, count, self._rng)
+        # Not Cholesky's factor: the pose of the frame's node is exact, its covariance zero.
+        variances, axes = np.linalg.eigh(mixture.covariances)
+        roots = axes * np.sqrt(np.maximum(variances, 0.0))[:, None, :]
+        normals = self._rng.standard_normal((count, roots.shape[1]))
+        deviations = np.einsum("mab,mb->ma", roots[chosen], normals)
+        poses = mixture.poses[chosen] + deviations.reshape(count, -1, POSE)
+        for n, node in enumerate(mixture.nodes):
+            self._row[node] = self._particles.add(poses[:, n].T)
+
+    # -- estimates -----------------------------------------------------------------------------
+
     def _estimate(self, time_s: float) -> Estimate:
         for known in self._known.values():
             known.close_epoch(self._epoch_s)
@@ -152,17 +201,14 @@ class ParticleFilter:
         moments = self._particles.moments().tolist()
         nodes = []
         for node, known in sorted(self._known.items()):
-            status = known.status
-            if node in self._row:
-                x_m, y_m, xx, yy, xy, c, s = moments[self._row[node]]
-                heading, sigma_heading = math.atan2(s, c), _spread_rad(math.hypot(c, s))
-            else:
-                x_m, y_m, xx, yy, xy, heading = 0.0, 0.0, math.inf, math.inf, 0.0, 0.0
-                sigma_heading, status = ANY_ANGLE_RAD, NodeStatus.UNLOCATED
+            if node not in self._row:
+                nodes.append(sought_node(self.initialiser, node, known))
+                continue
+            x_m, y_m, xx, yy, xy, c, s = moments[self._row[node]]
             nodes.append(
                 NodeEstimate(
-                    node, x_m, y_m, heading, xx, yy, xy, sigma_heading, status,
-                    known.height_m, known.sigma_height_m,
+                    node, x_m, y_m, math.atan2(s, c), xx, yy, xy, _spread_rad(math.hypot(c, s)),
+                    known.status, known.height_m, known.sigma_height_m,
                 )
             )  # fmt: skip
         return Estimate(time_s, tuple(nodes), pairs_of(nodes))

@@ -24,7 +24,7 @@ Integers = npt.NDArray[np.uint64]
 
 
 class NodeRanges(NamedTuple):
-    """The ranges of one instant, each once for either of its nodes, sorted by that node (E of them).
+    """The ranges of one instant, each once for either of its nodes, sorted by node (E in all).
 
     Node k measured the ranges offset[k] to offset[k + 1].
     """

@@ -102,9 +102,7 @@ class ParticleSet:
         kernels.effective_sizes(corrected, sizes)
         low = np.flatnonzero(sizes < 0.5 * self.size)
         if low.size:
-            kernels.resample(
-                self.poses, self.weights, low, self._uniforms(low.size, self.size + 1)
-            )
+            kernels.resample(self.poses, self.weights, low, self._uniforms(low.size, self.size + 1))
             self.resampled += int(low.size)
 
     def means(self) -> Floats:

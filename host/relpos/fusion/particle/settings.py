@@ -12,7 +12,9 @@ class ParticleSettings:
     """What ``--set`` can change; the defaults are the paper's."""
 
     particles: int = setting(500, "particles per node (M)", 10, 1_000_000)
-    alpha: float = setting(0.01, "fraction of dual particles; 0 switches the dual step off", 0.0, 0.9)
+    alpha: float = setting(
+        0.01, "fraction of dual particles; 0 switches the dual step off", 0.0, 0.9
+    )
     sigma_r_m: float = setting(2.0, "standard deviation of a range", 1e-3, 100.0)
     sigma_d: float = setting(0.2, "relative standard deviation of a displacement", 0.0, 10.0)
     sigma_theta: float = setting(0.1, "relative standard deviation of a turn", 0.0, 10.0)
