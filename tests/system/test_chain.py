@@ -346,10 +346,10 @@ def test_a_simulated_run_is_scored_alike_by_fuse_and_by_evaluate(tmp_path):
 
 
 RECORDINGS = {
-    "two_robots_vio/exp1_los": 0.72,
-    "two_robots_vio/exp3_los": 0.39,
-    "two_robots_vio/exp4_los": 0.32,
-    "two_robots_vio/exp1_unobservable": 0.55,
+    "two_robots_vio/exp1_los": 0.69,
+    "two_robots_vio/exp3_los": 0.31,
+    "two_robots_vio/exp4_los": 0.30,
+    "two_robots_vio/exp1_unobservable": 0.42,
     "four_robots_uwb/run1": 0.26,
 }
 """Relative distance RMSE in metres of the particle filter from what each run says of its start

@@ -21,7 +21,7 @@ from dataclasses import replace
 
 from relpos.fusion.bank import estimator as bank
 from relpos.fusion.bank.settings import BankSettings
-from relpos.fusion.estimator import Estimate, NodeStatus
+from relpos.fusion.estimator import Estimate, NodeStatus, unlocated
 from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
 from relpos.fusion.large_teams import estimator as large_teams
 from relpos.fusion.models.ranging import Mounting
@@ -147,7 +147,7 @@ class SwitchingEstimator:
         return inside and (not isinstance(measurement, Range) or measurement.peer in self._nucleus)
 
     def _with_others(self, estimate: Estimate) -> Estimate:
-        others = [large_teams.unlocated(node) for node in sorted(self._met - self._nucleus)]
+        others = [unlocated(node) for node in sorted(self._met - self._nucleus)]
         nodes = sorted([*estimate.nodes, *others], key=lambda n: n.node)
         return replace(estimate, nodes=tuple(nodes))
 

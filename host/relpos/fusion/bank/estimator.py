@@ -42,6 +42,7 @@ from relpos.fusion.initial_poses import (
     Found,
     Initialiser,
     PoseMixture,
+    sought_node,
 )
 from relpos.fusion.models.detection import Detection
 from relpos.fusion.models.motion import reported_sigmas
@@ -463,7 +464,7 @@ class Bank:
         sought = []
         if len(self._row) < len(self._known):
             sought = [
-                self._sought(node, known, mixture)
+                sought_node(self.initialiser, node, known)
                 for node, known in self._known.items()
                 if node not in self._row
             ]
@@ -516,28 +517,6 @@ class Bank:
         poses = np.stack([poses[likely] for poses, _ in each], axis=1)
         spread = np.stack([spread[likely, :2, :2] for _, spread in each], axis=1)
         return pictures(time_s, nodes, weight[likely] / weight[likely].sum(), poses, spread)
-
-    def _sought(self, node: int, known: _Known, mixture: PoseMixture | None) -> NodeEstimate:
-        """Say of a node whose start is unknown what the search says."""
-        if mixture is None or node not in mixture.nodes:
-            return NodeEstimate(
-                node, 0.0, 0.0, 0.0, math.inf, math.inf, 0.0, ANY_ANGLE_RAD,
-                NodeStatus.UNLOCATED, known.height_m, known.sigma_height_m,
-            )  # fmt: skip
-        n = mixture.nodes.index(node)
-        own = slice(3 * n, 3 * n + 3)
-        belief = believe(
-            mixture.weights, mixture.poses[:, n], mixture.covariances[:, own, own], mixture.best
-        )
-        status = known.status
-        if status is NodeStatus.OK and node not in self.initialiser.resolved:
-            status = NodeStatus.AMBIGUOUS
-        spread = belief.covariance_m2
-        return NodeEstimate(
-            node, belief.x_m, belief.y_m, belief.heading_rad, float(spread[0, 0]),
-            float(spread[1, 1]), float(spread[0, 1]), belief.sigma_heading_rad, status,
-            known.height_m, known.sigma_height_m,
-        )  # fmt: skip
 
     def _sought_pairs(
         self, mixture: PoseMixture, mean: Floats, covariance: Floats

@@ -26,11 +26,11 @@ from relpos.fusion.estimator import (
     ANY_ANGLE_RAD,
     Estimate,
     NodeEstimate,
-    NodeStatus,
     PairEstimate,
     Presence,
     refuse_unmoved,
     refuse_unranged,
+    unlocated,
 )
 from relpos.fusion.initial_poses import Found, Initialiser
 from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter, RangeModel
@@ -378,11 +378,3 @@ REACH_FADE = 0.999
 
 LEAST_REACH_M = 5.0
 """Who is nearer than this is listed, however short the ranges are."""
-
-
-def unlocated(node: int, height_m: float = 0.0, sigma_height_m: float = 0.0) -> NodeEstimate:
-    """Estimate of a node of which nothing but its height is known."""
-    return NodeEstimate(
-        node, 0.0, 0.0, 0.0, math.inf, math.inf, 0.0, ANY_ANGLE_RAD, NodeStatus.UNLOCATED,
-        height_m, sigma_height_m,
-    )  # fmt: skip
