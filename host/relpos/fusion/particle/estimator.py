@@ -108,7 +108,7 @@ class ParticleFilter:
             match step:
                 case Advance():
                     self._moved = True
-                    self._known[step.node].heard(step.time_s)
+                    self._known[step.node].received(step.time_s)
                     if step.node in self._row:
                         self._pending.setdefault(step.node, []).append(step)
                     else:
@@ -143,7 +143,7 @@ class ParticleFilter:
     def _update(self, step: Ranging) -> None:
         nodes = sorted({n for r in step.ranges for n in (r.node, r.peer)})
         for node in nodes:
-            self._known[node].heard(step.time_s)
+            self._known[node].received(step.time_s)
             self._seek(node)
         if any(node in self.initialiser for node in nodes):
             # The search may end without a result; the ranges are usable all the same.
