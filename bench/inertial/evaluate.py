@@ -469,7 +469,7 @@ def registers(verbose: bool) -> Figures:
     Between the two lie the chip's filter (causal, with its delay), its range and steps of 0.0012
     m/s2, the instants at which the firmware reads it, and lengths in whole millimetres.
     """
-    from relpos.emulator.replay import Wearer, play
+    from relpos.emulator.deadreckoning import WearerSettings, play
     from relpos.runs import load_run
 
     distances, turns = [], []
@@ -480,7 +480,7 @@ def registers(verbose: bool) -> Figures:
             leg_m = recording.leg_length_m
             direct = replay.reckon(recording.imu, recording.field_ut, leg_length_m=leg_m)
             ((node, imu),) = load_run(folder).load_imu().items()
-            played = play(node, imu, Wearer(leg_m))
+            played = play(node, imu, WearerSettings(leg_m))
             turn = sum(motion.dtheta_rad for motion in played.motions)
             same_steps += len(played.steps) == int(direct.rows["steps"][-1])
             turns.append(np.degrees(turn - direct.turn_rad))

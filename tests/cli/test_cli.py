@@ -262,14 +262,22 @@ IMU_COLUMNS = "ax_m_s2,ay_m_s2,az_m_s2,gx_rad_s,gy_rad_s,gz_rad_s,mx_ut,my_ut,mz
 def test_deadreckon_sums_what_the_firmware_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from relpos.emulator.replay import Played, Replay, Wearer
+    from relpos.emulator.deadreckoning import FirmwareOutput, NodeResult, WearerSettings
 
-    def replayed(*_: object, **__: object) -> dict[int, Played]:
+    def replayed(*_: object, **__: object) -> dict[int, NodeResult]:
         motions = (Motion(1.0, 4, 0.5, 0.0, 0.5 * math.pi), Motion(2.0, 4, 0.5, 0.25, 0.5))
         steps = (Step(0.5, 4, 0.75), Step(1.5, 4, 0.5))
-        return {4: Played(Replay(motions, steps, {}, clipped=7), Wearer(0.9, 1300), 100, 2, 5.0)}
+        return {
+            4: NodeResult(
+                FirmwareOutput(motions, steps, {}, clipped=7),
+                WearerSettings(0.9, 1300),
+                100,
+                2,
+                5.0,
+            )
+        }
 
-    monkeypatch.setattr("relpos.emulator.replay.replay_imu", replayed)
+    monkeypatch.setattr("relpos.emulator.deadreckoning.reckon_run", replayed)
     (tmp_path / "imu.csv").write_text(f"time_s,node,{IMU_COLUMNS}\n0,4,0,0,9.8,0,0,0,,,\n")
     result = relpos("deadreckon", tmp_path, "--out", tmp_path / "o", "--json")
     assert json.loads(result.stdout) == {

@@ -29,10 +29,16 @@ def outcome(spec):
 
 
 def of(*names, but=None):
-    """Every SPEC of the faults of those names, without those that end in ``but``."""
-    chosen = [spec for spec, fault in SPECS.items() if fault.name in names]
-    chosen = [spec for spec in chosen if but is None or not spec.endswith(but)]
-    assert {SPECS[spec].name for spec in chosen} == set(names)
+    """Every SPEC of the faults of those names, without those that end in ``but``.
+
+    One of each fault; its other kinds in soak.
+    """
+    chosen, seen = [], set()
+    for spec, fault in SPECS.items():
+        if fault.name in names and (but is None or not spec.endswith(but)):
+            chosen.append(pytest.param(spec, marks=pytest.mark.soak if fault in seen else ()))
+            seen.add(fault)
+    assert {fault.name for fault in seen} == set(names)
     COVERED.update(names)
     return pytest.mark.parametrize("spec", chosen)
 

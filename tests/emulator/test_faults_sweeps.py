@@ -25,6 +25,7 @@ from relpos.protocol import messages as wire
 from relpos.simulation.team import make_team
 from relpos.simulation.walker import RATE_HZ
 
+SOAK = pytest.mark.soak
 SECONDS = 6.0
 FAILURES = (BusStatus.ADDRESS_NACK, BusStatus.DATA_NACK, BusStatus.TIMEOUT)
 EXCHANGE_US = 20_000
@@ -33,7 +34,7 @@ OLD_KEY, NEW_KEY = wire.DEFAULT_KEY, bytes(range(16))
 
 @cache
 def surroundings():
-    """Somebody who stands for two seconds and walks off."""
+    """A walker who stands for two seconds and walks off."""
     (walker,), _ = make_team(replace(GOOD_CONDITIONS, still_s=2.0), 1, 20.0, 3)
     return Surroundings(
         rate_hz=RATE_HZ,
@@ -161,11 +162,6 @@ def assert_no_more_than_lost(bench, gap_s, board="native", seconds=SECONDS, astr
     assert abs(ours["heading_rad"] - theirs["heading_rad"]) < 0.05 + 2.0 * gap_s
 
 
-def parts(count):
-    """``count`` shares of a sweep, so that workers can share it."""
-    return pytest.mark.parametrize("part", range(count))
-
-
 # --- the bus -------------------------------------------------------------------------
 
 
@@ -182,24 +178,21 @@ def fail_once(number, failure, gap_s=1.2, board="native", seconds=SECONDS):
         return len(assert_ranges_are_true(bench))
 
 
-@pytest.mark.parametrize(
-    "shift", [0, pytest.param(1, marks=pytest.mark.soak), pytest.param(2, marks=pytest.mark.soak)]
-)
-@parts(4)
+@pytest.mark.parametrize("shift", [0, *(pytest.param(k, marks=SOAK) for k in (1, 2))])
+@pytest.mark.parametrize("part", [0, *(pytest.param(k, marks=SOAK) for k in range(1, 8))])
 def test_no_transaction_whose_failure_hangs_the_node_or_lets_a_wrong_value_in(part, shift):
-    """Each one once, with one of the three ways to fail; the other two in soak."""
-    numbers = range(part, len(undisturbed()[0]), 4)
-    assert len(numbers) > 200
+    """Each eighth one, with one of the three ways to fail; the others in soak."""
+    numbers = range(part, len(undisturbed()[0]), 8)
+    assert len(numbers) > 100
     for number in numbers:
-        told = fail_once(number, FAILURES[(number // 4 + shift) % 3])
-        assert told >= 3, number
+        reported = fail_once(number, FAILURES[(number // 8 + shift) % 3])
+        assert reported >= 3, number
 
 
-@pytest.mark.parametrize("stride", [9, pytest.param(1, marks=pytest.mark.soak)])
-@parts(2)
-def test_a_bus_stuck_for_a_tenth_of_a_second_from_any_transaction_on_is_survived(part, stride):
+@pytest.mark.parametrize("stride", [37, pytest.param(1, marks=SOAK)])
+def test_a_bus_stuck_for_a_tenth_of_a_second_from_any_transaction_on_is_survived(stride):
     transactions = undisturbed()[0]
-    for number in range(part * stride, len(transactions), 2 * stride):
+    for number in range(0, len(transactions), stride):
         begin_us = transactions[number][0]
 
         def prepare(bench, begin_us=begin_us):
@@ -215,7 +208,7 @@ def test_a_bus_stuck_for_a_tenth_of_a_second_from_any_transaction_on_is_survived
 
 
 @pytest.mark.skipif(missing_parts() is not None, reason=str(missing_parts()))
-@parts(2)
+@pytest.mark.parametrize("part", [0, pytest.param(1, marks=SOAK)])
 def test_on_the_simulated_uno_no_sampled_transaction_does_either(part):
     """Some of each chip, in set-up and after; natively there are all of them."""
     if not (default_build_folder() / "uno" / "firmware.elf").exists():
@@ -277,7 +270,8 @@ def assert_it_is_back(bench, at_us):
     return ended
 
 
-def test_a_brown_out_at_any_point_of_an_exchange_leaves_nothing_wrong_behind():
+@pytest.mark.parametrize("stride", [7, pytest.param(2, marks=SOAK)])
+def test_a_brown_out_at_any_point_of_an_exchange_leaves_nothing_wrong_behind(stride):
     transactions = undisturbed()[0]
     pozyx = [t for t, address in transactions if address == 0x4B and t > 3_500_000]
     begin_us = pozyx[0]
@@ -285,18 +279,19 @@ def test_a_brown_out_at_any_point_of_an_exchange_leaves_nothing_wrong_behind():
     times = sorted({t + d for t in pozyx[:24] for d in (-1, 1)} | {
         begin_us + 1_700 * k for k in range(40)
     })  # fmt: skip
-    for at_us in times[::2]:
+    for at_us in times[::stride]:
         with restarted(at_us) as bench:
             assert_it_is_back(bench, at_us)
 
 
-def test_a_brown_out_at_any_point_of_a_frame_lets_no_part_of_it_be_taken():
+@pytest.mark.parametrize("stride_us", [2_900, pytest.param(700, marks=SOAK)])
+def test_a_brown_out_at_any_point_of_a_frame_lets_no_part_of_it_be_taken(stride_us):
     with Bench() as bench:
         bench.node.hold_frames = True
         bench.run()
         left_s = next(t for t, f in bench.of(wire.MOTION) if 3.0 < t < 5.0)
     whole = None
-    for back_us in range(0, 24_000, 700):
+    for back_us in range(0, 24_000, stride_us):
         at_us = round(left_s * 1e6) - back_us
         with restarted(at_us) as bench:
             assert_it_is_back(bench, at_us)
@@ -307,9 +302,10 @@ def test_a_brown_out_at_any_point_of_a_frame_lets_no_part_of_it_be_taken():
     assert whole is False
 
 
-def test_a_brown_out_at_any_point_of_a_command_leaves_the_old_setting_or_the_new():
+@pytest.mark.parametrize("stride", [4, pytest.param(1, marks=SOAK)])
+def test_a_brown_out_at_any_point_of_a_command_leaves_the_old_setting_or_the_new(stride):
     found = []
-    for k in range(45):
+    for k in range(0, 45, stride):
         at_us = 3_999_000 + 1_900 * k if k < 20 else 4_037_000 + 23_000 * (k - 20)
         with restarted(at_us, command=True) as bench:
             assert_it_is_back(bench, at_us)
@@ -321,6 +317,10 @@ def test_a_brown_out_at_any_point_of_a_command_leaves_the_old_setting_or_the_new
 
 
 # --- power cuts ----------------------------------------------------------------------
+
+EACH_REMAINDER = pytest.mark.parametrize(
+    "left", ["garbage", *(pytest.param(k, marks=SOAK) for k in ("erased", "old"))]
+)
 
 
 def cut(write, left, ask):
@@ -347,7 +347,7 @@ def store_settings(bench):
 
 def store_key(bench):
     bench.node.command(bench.coordinator, wire.CommandCode.SET_TEAM_SIZE, 3, 8, 1_000_000)
-    bench.node.give_key(bench.coordinator, NEW_KEY, 9, 3_000_000)
+    bench.node.set_key(bench.coordinator, NEW_KEY, 9, 3_000_000)
 
 
 @cache
@@ -366,7 +366,7 @@ def writes_of(ask):
         return count[0]
 
 
-@pytest.mark.parametrize("left", ["erased", "old", "garbage"])
+@EACH_REMAINDER
 def test_a_power_cut_at_any_byte_of_the_settings_leaves_the_old_or_the_new(left):
     count = writes_of(store_settings)
     assert count >= 10, "what changes of the setting, its version and the CRC, twice"
@@ -383,12 +383,15 @@ def test_a_power_cut_at_any_byte_of_the_settings_leaves_the_old_or_the_new(left)
     assert found == sorted(found, reverse=True)
 
 
-@pytest.mark.parametrize("left", ["erased", "old", "garbage"])
-def test_a_power_cut_at_any_byte_of_the_key_leaves_the_old_or_the_new(left):
+@pytest.mark.parametrize(
+    ("left", "stride"),
+    [("garbage", 3), *(pytest.param(k, 1, marks=SOAK) for k in ("erased", "old", "garbage"))],
+)
+def test_a_power_cut_at_any_byte_of_the_key_leaves_the_old_or_the_new(left, stride):
     count = writes_of(store_key)
     assert count > 30
     found = []
-    for write in range(1, count + 1):
+    for write in range(1, count + 1, stride):
         with cut(write, left, store_key) as bench:
             bench.run(5.0)
             counters = [f.counter for _, f in bench.frames]
@@ -408,7 +411,7 @@ def start_again(bench):
     bench.clock.at(3_000_000, lambda now_us: bench.node.restart(now_us, wire.ResetCause.POWER_ON))
 
 
-@pytest.mark.parametrize("left", ["erased", "old", "garbage"])
+@EACH_REMAINDER
 def test_a_power_cut_at_any_byte_written_while_starting_sets_no_counter_back(left):
     count = writes_of(start_again)
     assert count >= 5

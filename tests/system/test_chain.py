@@ -66,7 +66,7 @@ def team_bytes():
 
 def test_the_fusion_beats_dead_reckoning_in_every_demo(tmp_path):
     factors, emulated_s = [], []
-    for seed in range(5):
+    for seed in (101, 102):
         began_s = time.process_time()
         run = record_team(
             TeamConfig(board="native", nodes=6, seconds=120.0, scenario="paper", seed=seed)
@@ -77,15 +77,14 @@ def test_the_fusion_beats_dead_reckoning_in_every_demo(tmp_path):
         plain_m = figures["dead_reckoning"]["relative_distance_rmse_m"]
         factors.append(plain_m / figures["relative_distance_rmse_m"])
         assert 1.0 < plain_m < 8.0, "torso dead reckoning of two minutes"
-    # Measured over seeds 0 to 4: 4 to 24, their mean 11.5; less than three times as good as dead
-    # reckoning, in any demo, would miss what the bank is there for.
+    # Seeds 0 to 4 gave factors of 4 to 24, their mean 11.5; below three the bank fails its purpose.
     assert min(factors) > 3.0
     assert mean(factors) < 25.0, "more would be as suspicious"
     assert min(emulated_s) < 120.0 / 20.0, "at least 20 times faster than real time"
 
 
 def test_the_demo_draws_its_report_and_repeats_itself(tmp_path):
-    arguments = ("demo", "--seconds", 60, "--seed", 1, "--out")
+    arguments = ("demo", "--seconds", 20, "--seed", 101, "--out")
     demo = start(*arguments, tmp_path / "a", "--json")
     second = figures_of(*arguments, tmp_path / "b")
     stdout, stderr = demo.communicate(timeout=PATIENCE_S)
@@ -354,9 +353,17 @@ RECORDINGS = {
 }
 """Relative distance RMSE in metres of the particle filter from what each run says of its start
 (docs/results.md, mean of eight seeds, whose standard deviation is at most 0.09 m)."""
+SHORT = ("two_robots_vio/exp4_los", "four_robots_uwb/run1")
+"""The others are fused in soak."""
 
 
-@pytest.mark.parametrize(("name", "documented_m"), RECORDINGS.items())
+@pytest.mark.parametrize(
+    ("name", "documented_m"),
+    [
+        pytest.param(*row, marks=() if row[0] in SHORT else pytest.mark.soak)
+        for row in RECORDINGS.items()
+    ],
+)
 def test_a_real_recording_is_fused_and_scored_as_documented(tmp_path, name, documented_m):
     if not (DATA / name).is_dir():
         pytest.skip("no recordings: the folder ../shared/data (or RELPOS_DATA) is missing")

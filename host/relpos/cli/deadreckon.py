@@ -15,7 +15,7 @@ from relpos.cli.demo import Board
 from relpos.errors import DataError
 
 if TYPE_CHECKING:
-    from relpos.emulator.replay import Played
+    from relpos.emulator.deadreckoning import NodeResult
 
 
 def deadreckon(
@@ -41,7 +41,7 @@ def deadreckon(
     """Play imu.csv into the emulated sensor chip, run the firmware, print the walked path."""
     from dataclasses import replace
 
-    from relpos.emulator.replay import LEAST_RATE_HZ, replay_imu
+    from relpos.emulator.deadreckoning import LEAST_RATE_HZ, reckon_run
     from relpos.runs import Run, save_run
     from relpos.sources import load
 
@@ -57,11 +57,11 @@ def deadreckon(
             raise DataError(f"{path}: no inertial data in this run (imu.csv)")
         walks.append(walk)
     with output.working("running the firmware over the recording"):
-        played = replay_imu(recording, board=str(board), stature_m=stature, calibration=walks)
+        played = reckon_run(recording, board=str(board), stature_m=stature, calibration=walks)
 
     nodes = {str(node): _figures(part) for node, part in sorted(played.items())}
     if out is not None:
-        parts = [part.replay for part in played.values()]
+        parts = [part.output for part in played.values()]
         save_run(
             Run(
                 name=recording.name,
@@ -98,9 +98,9 @@ def deadreckon(
                 f"node {node}: {part.rate_hz:.3g} samples a second are too few to see steps: "
                 f"{LEAST_RATE_HZ:g} are needed"
             )
-        if part.replay.clipped:
+        if part.output.clipped:
             output.remark(
-                f"node {node}: {part.replay.clipped} of {part.samples} samples are beyond the "
+                f"node {node}: {part.output.clipped} of {part.samples} samples are beyond the "
                 "range the firmware configures; the chip clips them"
             )
     if json:
@@ -116,22 +116,22 @@ def deadreckon(
         output.remark(f"written to {out}")
 
 
-def _figures(part: Played) -> dict[str, Any]:
+def _figures(part: NodeResult) -> dict[str, Any]:
     """What is printed of one node; the end is in its heading frame at the start."""
-    leg_m = part.wearer.leg_length_m
+    leg_m = part.settings.leg_length_m
     end, heading_rad = 0j, 0.0
-    for motion in part.replay.motions:
+    for motion in part.output.motions:
         end += complex(motion.dx_m, motion.dy_m) * cmath.exp(1j * heading_rad)
         heading_rad += motion.dtheta_rad
     return {
-        "distance_m": round(part.replay.distance_m, 4),
-        "steps": len(part.replay.steps),
+        "distance_m": round(part.output.distance_m, 4),
+        "steps": len(part.output.steps),
         "turn_rad": round(heading_rad, 5),
         "x_m": round(end.real, 3),
         "y_m": round(end.imag, 3),
         "leg_length_m": None if leg_m is None else round(leg_m, 4),
-        "step_gain_permille": part.wearer.step_gain_permille,
+        "step_gain_permille": part.settings.step_gain_permille,
         "step_scale": None if part.calibration is None else round(part.calibration.scale, 4),
         "samples": part.samples,
-        "clipped_samples": part.replay.clipped,
+        "clipped_samples": part.output.clipped,
     }

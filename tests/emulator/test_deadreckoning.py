@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from relpos.calibration.steps import believed_scale
-from relpos.emulator.replay import Wearer, calibrate, play, replay_imu, surroundings_of
+from relpos.emulator.deadreckoning import (
+    WearerSettings,
+    calibrate,
+    play,
+    reckon_run,
+    surroundings_of,
+)
 from relpos.errors import DataError
 from relpos.runs import Description, Run
 from relpos.runs.imu import ImuRecording
@@ -32,12 +38,18 @@ def recorded(walker, times_s, start_s=0.0, turned=UPRIGHT, magnetic=True):
     )
 
 
+@pytest.fixture(scope="module")
+def reference(walker):
+    """The walk sampled 100 times a second, played with the default settings."""
+    return play(1, recorded(walker, even(100.0)), WearerSettings())
+
+
 def even(rate_hz, seconds=75.0):
     return np.arange(int(seconds * rate_hz) - 1) / rate_hz
 
 
 def test_a_walk_comes_out_with_about_its_steps_and_its_turns(walker):
-    replay = play(1, recorded(walker, even(RATE_HZ)), Wearer(walker.person.leg_length_m))
+    replay = play(1, recorded(walker, even(RATE_HZ)), WearerSettings(walker.person.leg_length_m))
     assert len(replay.steps) == pytest.approx(len(walker.steps.time_s), abs=6)
     assert replay.distance_m == pytest.approx(walker.steps.length_m.sum(), rel=0.25)
     turn = sum(m.dtheta_rad for m in replay.motions)
@@ -45,7 +57,7 @@ def test_a_walk_comes_out_with_about_its_steps_and_its_turns(walker):
 
 
 def test_steps_come_at_their_times_on_the_recordings_clock(walker):
-    replay = play(1, recorded(walker, even(100.0), start_s=-3.2), Wearer())
+    replay = play(1, recorded(walker, even(100.0), start_s=-3.2), WearerSettings())
     found = np.array([s.time_s for s in replay.steps]) + 3.2
     nearest = np.abs(found[:, None] - walker.steps.time_s).min(axis=1)
     assert np.median(nearest) < 0.25
@@ -53,11 +65,10 @@ def test_steps_come_at_their_times_on_the_recordings_clock(walker):
     assert replay.motions[-1].time_s + 3.2 == pytest.approx(75.0, abs=2.6)
 
 
-@pytest.mark.parametrize("rate_hz", [25.0, 52.0, 100.0, 400.0, 1000.0, 2500.0])
-def test_the_recordings_rate_does_not_matter(walker, rate_hz):
-    reference = play(1, recorded(walker, even(RATE_HZ)), Wearer()).distance_m
-    assert play(1, recorded(walker, even(rate_hz)), Wearer()).distance_m == pytest.approx(
-        reference, rel=0.06
+@pytest.mark.parametrize("rate_hz", [25.0, 52.0, 200.0, 400.0, 1000.0, 2500.0])
+def test_the_recordings_rate_does_not_matter(walker, reference, rate_hz):
+    assert play(1, recorded(walker, even(rate_hz)), WearerSettings()).distance_m == pytest.approx(
+        reference.distance_m, rel=0.06
     )
 
 
@@ -68,26 +79,24 @@ def test_vibration_that_the_chip_filters_does_not_fold_into_the_walk(walker, rat
     # 201 Hz becomes 1 Hz where it is sampled 200 times a second: 6 m/s2 at the pace of walking. Of
     # that the chip's filter leaves a hundredth, which its own sampling folds all the same.
     shaken.acceleration_m_s2[:] += 6.0 * np.sin(2.0 * np.pi * 201.0 * times_s)[:, None]
-    assert play(1, shaken, Wearer()).distance_m == pytest.approx(
-        play(1, quiet, Wearer()).distance_m, rel=0.05
+    assert play(1, shaken, WearerSettings()).distance_m == pytest.approx(
+        play(1, quiet, WearerSettings()).distance_m, rel=0.05
     )
 
 
-def test_uneven_times_and_repeated_samples_do_not_matter(walker):
+def test_uneven_times_and_repeated_samples_do_not_matter(walker, reference):
     rng = np.random.default_rng(1)
     times_s = np.sort(
         np.concatenate((even(100.0) + rng.uniform(-0.002, 0.002, 7499), [10.0, 10.0, 20.0, 20.0]))
     )
-    reference = play(1, recorded(walker, even(100.0)), Wearer()).distance_m
-    assert play(1, recorded(walker, times_s), Wearer()).distance_m == pytest.approx(
-        reference, rel=0.04
+    assert play(1, recorded(walker, times_s), WearerSettings()).distance_m == pytest.approx(
+        reference.distance_m, rel=0.04
     )
 
 
-def test_any_mounting_gives_the_same_walk(walker):
+def test_any_mounting_gives_the_same_walk(walker, reference):
     upside_down = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
-    reference = play(1, recorded(walker, even(100.0)), Wearer())
-    turned = play(1, recorded(walker, even(100.0), turned=upside_down), Wearer())
+    turned = play(1, recorded(walker, even(100.0), turned=upside_down), WearerSettings())
     assert turned.distance_m == pytest.approx(reference.distance_m, rel=0.05)
     assert sum(m.dtheta_rad for m in turned.motions) == pytest.approx(
         sum(m.dtheta_rad for m in reference.motions), abs=0.1
@@ -95,40 +104,38 @@ def test_any_mounting_gives_the_same_walk(walker):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_random_mounting_gives_nearly_the_same_walk(walker, seed):
+def test_a_random_mounting_gives_nearly_the_same_walk(walker, reference, seed):
     turned, _ = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))
     turned *= np.linalg.det(turned)
-    reference = play(1, recorded(walker, even(100.0)), Wearer())
-    other = play(1, recorded(walker, even(100.0), turned=turned), Wearer())
+    other = play(1, recorded(walker, even(100.0), turned=turned), WearerSettings())
     assert other.distance_m == pytest.approx(reference.distance_m, rel=0.02)
     assert len(other.steps) == pytest.approx(len(reference.steps), abs=1)
 
 
 def test_what_is_beyond_the_chips_range_is_clipped_and_counted(walker):
     recording = recorded(walker, even(100.0, 40.0))
-    assert play(1, recording, Wearer()).clipped == 0
+    assert play(1, recording, WearerSettings()).clipped == 0
     recording.acceleration_m_s2[2000:2030, 0] = 200.0  # no range of the chip reaches 20 g
     recording.angular_rate_rad_s[2020:2050, 2] = -50.0
-    replay = play(1, recording, Wearer())
+    replay = play(1, recording, WearerSettings())
     assert replay.clipped == 50
     assert np.isfinite(replay.distance_m)
 
 
 def test_a_recording_without_magnetometer_is_played(walker):
-    replay = play(1, recorded(walker, even(100.0), magnetic=False), Wearer())
+    replay = play(1, recorded(walker, even(100.0), magnetic=False), WearerSettings())
     assert len(replay.steps) > 60
 
 
 def test_longer_legs_walk_further_in_the_same_recording(walker):
     recording = recorded(walker, even(100.0))
-    short, long = (play(1, recording, Wearer(leg)).distance_m for leg in (0.8, 1.0))
+    short, long = (play(1, recording, WearerSettings(leg)).distance_m for leg in (0.8, 1.0))
     # s = c (l^2 h)^(1/3): as the leg to two thirds, less where the filter disagrees.
     assert 1.08 < long / short < 1.25 ** (2 / 3) + 0.01
 
 
-def test_the_same_recording_gives_the_same_motion(walker):
-    recording = recorded(walker, even(100.0))
-    assert play(1, recording, Wearer()) == play(1, recording, Wearer())
+def test_the_same_recording_gives_the_same_motion(walker, reference):
+    assert play(1, recorded(walker, even(100.0)), WearerSettings()) == reference
 
 
 def test_a_gap_is_silence_and_not_motion(walker):
@@ -138,7 +145,7 @@ def test_a_gap_is_silence_and_not_motion(walker):
     silent = surroundings_of(recording).silent_us
     assert len(silent) == 2  # the gap, and behind the end
     assert silent[0][1] - silent[0][0] == pytest.approx(4.0e6, abs=0.02e6)
-    replay = play(1, recording, Wearer())
+    replay = play(1, recording, WearerSettings())
     inside = [s for s in replay.steps if 30.8 < s.time_s < 34.0]
     assert inside == []
     assert len(replay.steps) > 60
@@ -146,12 +153,12 @@ def test_a_gap_is_silence_and_not_motion(walker):
 
 def test_a_calibration_walk_sets_the_gain_as_far_as_one_walk_is_believed(walker):
     recording = recorded(walker, even(100.0))
-    before_m = play(1, recording, Wearer(0.9)).distance_m
+    before_m = play(1, recording, WearerSettings(0.9)).distance_m
     found = calibrate(1, [recording], [1.05 * before_m], 0.9)
     # With the gain that the firmware begins with.
     assert found.measured_m == pytest.approx((before_m,), rel=1e-3)
     assert found.scale == pytest.approx(believed_scale([1.05]), abs=1e-3)
-    after_m = play(1, recording, Wearer(0.9, found.gain_permille)).distance_m
+    after_m = play(1, recording, WearerSettings(0.9, found.gain_permille)).distance_m
     assert after_m / before_m == pytest.approx(found.scale, abs=0.005)
     # Walks that agree are believed more than one of them.
     many = calibrate(1, [recording] * 4, [1.05 * before_m] * 4, 0.9)
@@ -173,25 +180,25 @@ def run_of(recordings, **description):
 
 def test_every_node_of_a_run_is_played_under_its_own_name(walker):
     recording = recorded(walker, even(100.0, 30.0))
-    played = replay_imu(run_of({3: recording, 300: recording}))
+    played = reckon_run(run_of({3: recording, 300: recording}))
     assert set(played) == {3, 300}
     for node, part in played.items():
-        assert {m.node for m in part.replay.motions} == {node}
-        assert {s.node for s in part.replay.steps} == {node}
-    assert played[3].replay.distance_m == played[300].replay.distance_m
+        assert {m.node for m in part.output.motions} == {node}
+        assert {s.node for s in part.output.steps} == {node}
+    assert played[3].output.distance_m == played[300].output.distance_m
 
 
 def test_the_stature_sets_the_leg_length(walker):
     recording = recorded(walker, even(100.0, 30.0))
-    given = replay_imu(run_of({1: recording}), stature_m=1.9)[1]
-    own = replay_imu(run_of({1: recording}, stature_m=1.9))[1]
-    direct = play(1, recording, Wearer(0.53 * 1.9)).steps
-    assert given.replay.steps == own.replay.steps == direct
+    given = reckon_run(run_of({1: recording}), stature_m=1.9)[1]
+    own = reckon_run(run_of({1: recording}, stature_m=1.9))[1]
+    direct = play(1, recording, WearerSettings(0.53 * 1.9)).steps
+    assert given.output.steps == own.output.steps == direct
 
 
 def test_repeated_times_are_counted(walker):
     times_s = np.sort(np.concatenate((even(100.0, 30.0), [10.0, 20.0])))
-    part = replay_imu(run_of({1: recorded(walker, times_s)}))[1]
+    part = reckon_run(run_of({1: recorded(walker, times_s)}))[1]
     assert (part.samples, part.repeated) == (len(times_s), 2)
 
 
@@ -199,10 +206,10 @@ def test_calibration_needs_a_true_distance_and_the_node(walker):
     recording = recorded(walker, even(100.0, 30.0))
     run = run_of({1: recording})
     with pytest.raises(DataError, match="true_distance_m"):
-        replay_imu(run, calibration=[run_of({1: recording})])
+        reckon_run(run, calibration=[run_of({1: recording})])
     others = run_of({2: recording, 3: recording}, true_distance_m=20.0)
     with pytest.raises(DataError, match="node 1"):
-        replay_imu(run, calibration=[others])
+        reckon_run(run, calibration=[others])
 
 
 def test_what_cannot_be_played_is_refused(walker):
@@ -211,13 +218,13 @@ def test_what_cannot_be_played_is_refused(walker):
     with pytest.raises(DataError, match="that can be played"):
         surroundings_of(recorded(walker, np.array([0.0, 0.01, 1.7e9])))
     with pytest.raises(DataError, match="no inertial data"):
-        replay_imu(run_of({}))
+        reckon_run(run_of({}))
     still = recorded(walker, np.linspace(0.0, 4.0, 400))
     with pytest.raises(DataError, match="no step"):
         calibrate(1, [still], [20.0], None)
     with pytest.raises(DataError, match="must be positive"):
         calibrate(1, [still], [0.0], None)
     with pytest.raises(DataError, match=r"memory: node 1: .*LEG_LENGTH"):
-        replay_imu(run_of({1: still}, stature_m=0.1))
+        reckon_run(run_of({1: still}, stature_m=0.1))
     with pytest.raises(DataError, match="not as 2000 m"):
         calibrate(1, [recorded(walker, even(100.0, 30.0))], [2000.0], None)

@@ -1,8 +1,8 @@
-"""Recorded inertial data through the emulated chip and the firmware: the body of deadreckon.
+"""Dead reckoning of recorded inertial data by the firmware: what ``relpos deadreckon`` runs.
 
-The recording becomes what the MPU-9150 and the AK8975 feel; the production driver configures
+The recording becomes what the MPU-9150 and the AK8975 measure; the production driver configures
 range, filter and rate, the chip quantises accordingly, and what the firmware reports comes back on
-the recording's clock. Nothing is taken from the recording but its samples.
+the recording's clock. Nothing but its samples is used of the recording.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from .surroundings import FloatArray, Surroundings
 from .xbee import DELIVERED, Transmission, XbeeModule
 
 GRID_HZ = 200.0
-"""The recording is brought to this uniform rate before the chip's filter feels it."""
+"""The recording is brought to this uniform rate before the chip's filter processes it."""
 FAST_GRID_HZ = 1000.0
 """The same for a recording that is faster than the usual grid: the chip's own filter is to take the
 vibration out, which sampling it at 200 Hz would fold into the walk."""
 LEAD_S = 0.3
-"""From power-on to the first sample: the board boots, configures its sensor and is told its
-wearer. The first sample is held meanwhile, of which the node sees the last tenth of a second."""
+"""From power-on to the first sample: the board boots, configures its sensor and gets its settings.
+The first sample is held meanwhile; the node sees the last tenth of a second of it."""
 COMMAND_ATTEMPTS_US = (20_000, 180_000, 500_000, 1_000_000, 2_000_000)
 """A board that is still starting misses the first; a token that is repeated has no effect twice."""
 COMMAND_PERIOD_US = 40_000
@@ -57,15 +57,15 @@ STANDARD_PRESSURE_PA = 101_325.0
 
 
 @dataclass(frozen=True)
-class Wearer:
-    """What the node is told before the recording is played; None leaves the firmware's default."""
+class WearerSettings:
+    """The node's settings while the recording is played; None leaves the firmware's default."""
 
     leg_length_m: float | None = None
     step_gain_permille: int | None = None
 
 
 @dataclass(frozen=True)
-class Replay:
+class FirmwareOutput:
     """What one node reported, on the recording's clock; ``counts`` are the frames by name.
 
     ``clipped`` samples of the recording were beyond the range that the firmware had configured.
@@ -83,11 +83,11 @@ class Replay:
 
 
 @dataclass(frozen=True)
-class Played:
-    """One node's part of a run: what it reported and what it was told."""
+class NodeResult:
+    """One node's part of a run: what it reported, with which settings."""
 
-    replay: Replay
-    wearer: Wearer
+    output: FirmwareOutput
+    settings: WearerSettings
     samples: int
     repeated: int
     """Samples at the time of the one before, which were left out."""
@@ -96,7 +96,7 @@ class Played:
 
 
 def surroundings_of(recording: ImuRecording) -> Surroundings:
-    """What the chips feel while the recording is played, ``LEAD_S`` after power-on.
+    """What the chips measure while the recording is played, ``LEAD_S`` after power-on.
 
     Samples are joined by shape-preserving cubics; no sample is made inside a gap. DataError where
     there is no motion to play.
@@ -203,9 +203,9 @@ def _unless_answered(
 def play(
     node: int,
     recording: ImuRecording,
-    wearer: Wearer,
+    settings: WearerSettings,
     board: BoardKind | str = BoardKind.NATIVE,
-) -> Replay:
+) -> FirmwareOutput:
     """Run the firmware over one node's recording.
 
     DataError where a setting is refused, DeviceError where the node does not answer.
@@ -219,14 +219,14 @@ def play(
     try:
         nowhere.tags.append(emulated.tag)
         coordinator = XbeeModule(wire.COORDINATOR, 0x40000000, recorder, lambda time, data: None)
-        settings = [(wire.CommandCode.SET_STEP_REPORTS, 1)]
-        if wearer.leg_length_m is not None:
-            settings.append(
-                (wire.CommandCode.SET_LEG_LENGTH_MM, round(wearer.leg_length_m * 1000.0))
+        commands = [(wire.CommandCode.SET_STEP_REPORTS, 1)]
+        if settings.leg_length_m is not None:
+            commands.append(
+                (wire.CommandCode.SET_LEG_LENGTH_MM, round(settings.leg_length_m * 1000.0))
             )
-        if wearer.step_gain_permille is not None:
-            settings.append((wire.CommandCode.SET_STEP_GAIN_PERMILLE, wearer.step_gain_permille))
-        for k, (code, value) in enumerate(settings):
+        if settings.step_gain_permille is not None:
+            commands.append((wire.CommandCode.SET_STEP_GAIN_PERMILLE, settings.step_gain_permille))
+        for k, (code, value) in enumerate(commands):
             for attempt_us in COMMAND_ATTEMPTS_US:
                 clock.at(
                     attempt_us + COMMAND_PERIOD_US * k,
@@ -237,7 +237,7 @@ def play(
     finally:
         emulated.close()
     answers = {answer.token: answer for answer in recorder.decoder.acknowledged}
-    for k, (code, value) in enumerate(settings):
+    for k, (code, value) in enumerate(commands):
         answer = answers.get(k + 1)
         if answer is None:
             raise DeviceError(f"node {node}: the firmware did not answer {code.name}")
@@ -263,7 +263,7 @@ def play(
     counts = dict(recorder.decoder.counts)
     for track in recorder.decoder.nodes.values():
         counts.update(track.counts)
-    return Replay(motions, steps, counts, int(beyond.sum()))
+    return FirmwareOutput(motions, steps, counts, int(beyond.sum()))
 
 
 @dataclass(frozen=True)
@@ -285,17 +285,17 @@ def calibrate(
     """Step gain after walks of one wearer, as far as `steps.believed_scale` believes them.
 
     A walk's length goes with the gain: 5 % more of it makes the recorded walks 5.03 % longer at the
-    median. So one pass tells; making the walk come out right by several may run into a step that is
-    found with one gain and not with the next (2.7 for 2.1 in one walk). DataError where no step is
-    found, a distance is not positive, or the walks are not what was told.
+    median. So one pass suffices; several may run into a step that is found with one gain and not
+    with the next (2.7 for 2.1 m in one walk). DataError where no step is
+    found, a distance is not positive, or a walk's length contradicts the one stated.
     """
     for distance_m in true_m:
         if not distance_m > 0.0:
             raise DataError(
                 f"the calibration walk's true_distance_m is {distance_m:g}: it must be positive"
             )
-    wearer = Wearer(leg_length_m, POPULATION_GAIN_PERMILLE)
-    measured_m = tuple(play(node, part, wearer, board).distance_m for part in recordings)
+    settings = WearerSettings(leg_length_m, POPULATION_GAIN_PERMILLE)
+    measured_m = tuple(play(node, part, settings, board).distance_m for part in recordings)
     if min(measured_m) <= 0.0:
         raise DataError(f"node {node}: no step is found in the calibration walk")
     asked = [true / measured for true, measured in zip(true_m, measured_m, strict=True)]
@@ -309,13 +309,13 @@ def calibrate(
     return Calibration(scaled_gain_permille(POPULATION_GAIN_PERMILLE, scale), scale, measured_m)
 
 
-def replay_imu(
+def reckon_run(
     run: Run,
     *,
     board: BoardKind | str = BoardKind.NATIVE,
     stature_m: float | None = None,
     calibration: Sequence[Run] = (),
-) -> dict[int, Played]:
+) -> dict[int, NodeResult]:
     """What the firmware reports while the run's ``imu.csv`` is played, for every node in it.
 
     The leg length is the run's own, or 0.53 of ``stature_m`` or of the run's stature. With
@@ -326,7 +326,7 @@ def replay_imu(
     if not recordings:
         raise DataError(f"{run.name}: no inertial data (imu.csv)")
     walks = [(walk, walk.load_imu()) for walk in calibration]
-    played: dict[int, Played] = {}
+    played: dict[int, NodeResult] = {}
     for node, recording in recordings.items():
         leg_m = _leg_length_m(run, node, stature_m)
         calibrated = None
@@ -343,15 +343,15 @@ def replay_imu(
                 lengths_m.append(distance_m)
             # A calibration walk's own leg length would put another gain beside this one.
             calibrated = calibrate(node, own, lengths_m, leg_m, board)
-        wearer = Wearer(leg_m, None if calibrated is None else calibrated.gain_permille)
+        settings = WearerSettings(leg_m, None if calibrated is None else calibrated.gain_permille)
         try:
-            replay = play(node, recording, wearer, board)
+            output = play(node, recording, settings, board)
         except DataError as error:
             raise DataError(f"{run.name}: {error}") from error
         time_s, _ = _increasing(recording)
-        played[node] = Played(
-            replay,
-            wearer,
+        played[node] = NodeResult(
+            output,
+            settings,
             samples=len(recording.time_s),
             repeated=len(recording.time_s) - len(time_s),
             rate_hz=float(1.0 / np.median(np.diff(time_s))),
