@@ -181,15 +181,16 @@ def smoother(case: Case, begin_m: Floats) -> Score:
     def solve() -> tuple[Floats, float]:
         started = time.process_time()
         graph, _ = build_graph(case.measurements, case.priors)
-        problem = Problem(graph, constants=False)
+        problem = Problem(graph)
         sigma = case.sigmas[:, :, [0, 1, 2]]
         weights = Weights(
             1.0 / sigma**2,
             np.full(graph.range_m.size, 1.0 / case.sigma_range_m**2),
-            np.ones(problem.constants),
+            # The peers know no step scales, drifts or biases: here they are held at zero.
+            np.full(problem.constants, 1e12),
         )
         unwrapped = begin_m.copy()
-        state, _ = problem.optimise(problem.first_state(unwrapped), weights, steps=100)
+        state = problem.optimise(problem.first_state(unwrapped), weights, steps=100)
         return state.poses, time.process_time() - started
 
     solve()  # compiles

@@ -1,4 +1,4 @@
-"""NumPy twins of the smoother's kernels: one dense matrix, derivatives by small steps."""
+"""Reference of the smoother's kernels: one dense matrix, derivatives by small steps."""
 
 from __future__ import annotations
 
@@ -7,55 +7,40 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion.smoother.graph import Chords, Ranges
+
 Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 
 
 def motion_residuals(
-    poses: Floats,
-    log_scale: Floats,
-    drift_rad_s: Floats,
-    duration_s: Floats,
-    length_m: Floats,
-    direction_rad: Floats,
-    turn_rad: Floats,
-    follow: Floats,
+    poses: Floats, log_scale: Floats, drift_rad_s: Floats, chords: Chords
 ) -> Floats:
     """Along, across (m) and turn (rad) residuals, (K - 1, N, 3), as complex numbers see them."""
     place = poses[..., 0] + 1j * poses[..., 1]
-    turn = np.diff(poses[..., 2], axis=0) - turn_rad - duration_s[:, None] * drift_rad_s
-    angle = poses[:-1, :, 2] + follow * turn + direction_rad
-    seen = np.exp(-log_scale - 1j * angle) * np.diff(place, axis=0) - length_m
+    turn = np.diff(poses[..., 2], axis=0) - chords.turn_rad
+    turn = turn - chords.duration_s[:, None] * drift_rad_s
+    angle = poses[:-1, :, 2] + chords.turn_share * turn + chords.direction_rad
+    seen = np.exp(-log_scale - 1j * angle) * np.diff(place, axis=0) - chords.length_m
     return np.stack((seen.real, seen.imag, turn), axis=-1)
 
 
-def range_residuals(
-    poses: Floats,
-    bias_m: Floats,
-    slots: Integers,
-    pairs: Integers,
-    shares: Floats,
-    bends: Floats,
-    antenna_m: Floats,
-    rise_m: Floats,
-    range_m: Floats,
-    pair_index: Integers,
-) -> Floats:
-    """Predicted minus measured ranges, (M,)."""
+def range_residuals(poses: Floats, bias_m: Floats, ranges: Ranges, measured_m: Floats) -> Floats:
+    """Predicted less measured ranges, (M,)."""
     ends = []
     for side in (0, 1):
-        before, after = poses[slots, pairs[:, side]], poses[slots + 1, pairs[:, side]]
-        between = before + shares[:, None] * (after - before)
-        lever = antenna_m[pairs[:, side]] @ [1.0, 1j]
-        bend = bends[:, 2 * side : 2 * side + 2] @ [1.0, 1j]
+        node = ranges.pair[:, side]
+        before, after = poses[ranges.chord, node], poses[ranges.chord + 1, node]
+        between = before + ranges.fraction[:, None] * (after - before)
+        lever = ranges.antenna_m[node] @ [1.0, 1j]
+        offset = ranges.offset_m[:, 2 * side : 2 * side + 2] @ [1.0, 1j]
         ends.append(
             between[:, 0]
             + 1j * between[:, 1]
-            + np.exp(1j * before[:, 2]) * bend
+            + np.exp(1j * before[:, 2]) * offset
             + np.exp(1j * between[:, 2]) * lever
         )
-    slant = np.hypot(np.abs(ends[0] - ends[1]), rise_m)
-    result: Floats = slant + bias_m[0] + bias_m[1 + pair_index] - range_m
+    slant = np.hypot(np.abs(ends[0] - ends[1]), ranges.dz_m)
+    result: Floats = slant + bias_m[0] + bias_m[1 + ranges.pair_index] - measured_m
     return result
 
 

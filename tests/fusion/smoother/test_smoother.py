@@ -1,4 +1,4 @@
-"""The smoother: kernels against dense twins, tracks against the truth and the bound."""
+"""The smoother: kernels against dense references, tracks against the truth and the bound."""
 
 from __future__ import annotations
 
@@ -9,14 +9,22 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from reference import smoother as twin
+from reference import smoother as reference
 from relpos import fusion, tracks
 from relpos.errors import RelposError
 from relpos.evaluation import bounds, metrics
 from relpos.fusion.estimator import Estimate, NodeStatus
+from relpos.fusion.smoother.detection import learn_curve, update_factors
 from relpos.fusion.smoother.estimator import Smoother
 from relpos.fusion.smoother.graph import build_graph
-from relpos.fusion.smoother.problem import Problem, State, Weights, hear, know, weigh
+from relpos.fusion.smoother.kernels import State
+from relpos.fusion.smoother.problem import Problem, Weights
+from relpos.fusion.smoother.variance_components import (
+    VarianceComponents,
+    linearise,
+    motion_bases,
+    weights_of,
+)
 from relpos.measurements import Height, Motion, Prior, Range
 from relpos.simulation.paper import SimulatedRun, simulate_paper
 
@@ -39,7 +47,7 @@ def _problem(seed: int = 3) -> tuple[Problem, State, Weights]:
     graph, _ = build_graph(measurements, priors, {1: 0.4}, {3: (0.2, -0.1)})
     problem = Problem(graph)
     shape = (graph.time_s.size, 3, 3)
-    start = graph.dead_reckoned(graph.start) + 0.2 * rng.standard_normal(shape)
+    start = graph.dead_reckoned(graph.prior) + 0.2 * rng.standard_normal(shape)
     state = State(start, 0.05 * rng.standard_normal(problem.constants))
     weights = Weights(
         rng.uniform(1.0, 50.0, (shape[0] - 1, 3, 3)),
@@ -49,21 +57,19 @@ def _problem(seed: int = 3) -> tuple[Problem, State, Weights]:
     return problem, state, weights
 
 
-def test_the_residuals_are_the_twins() -> None:
+def test_the_residuals_are_those_of_the_reference() -> None:
     problem, state, _ = _problem()
     graph, n = problem.graph, problem.nodes
-    assert (graph.share < 0.999).any()
-    assert np.abs(graph.bend).max() > 1e-3
-    assert np.abs(graph.rise_m).max() > 0.1
-    motion = twin.motion_residuals(
-        state.poses, state.constants[:n], state.constants[n : 2 * n], graph.duration_s,
-        graph.length_m, graph.direction_rad, graph.turn_rad, graph.follow,
-    )  # fmt: skip
+    assert (graph.ranges.fraction < 0.999).any()
+    assert np.abs(graph.ranges.offset_m).max() > 1e-3
+    assert np.abs(graph.ranges.dz_m).max() > 0.1
+    motion = reference.motion_residuals(
+        state.poses, state.constants[:n], state.constants[n : 2 * n], graph.chords
+    )
     assert problem.motion_residuals(state) == pytest.approx(motion, abs=1e-12)
-    ranges = twin.range_residuals(
-        state.poses, state.constants[2 * n :], graph.slot, graph.pair, graph.share, graph.bend,
-        graph.antenna_m, graph.rise_m, graph.range_m, graph.pair_index,
-    )  # fmt: skip
+    ranges = reference.range_residuals(
+        state.poses, state.constants[2 * n :], graph.ranges, graph.range_m
+    )
     assert problem.range_residuals(state) == pytest.approx(ranges, abs=1e-12)
 
 
@@ -77,7 +83,7 @@ def _stacked(problem: Problem, state: State) -> tuple[Floats, Callable[[Floats],
             [
                 problem.motion_residuals(at).ravel(),
                 problem.range_residuals(at),
-                problem.start_residuals(at).ravel(),
+                problem.prior_residuals(at).ravel(),
                 at.constants,
             ]
         )
@@ -92,13 +98,13 @@ def test_the_normal_equations_are_those_of_finite_differences() -> None:
         [
             weights.motion.ravel(),
             weights.ranges,
-            problem.graph.start_weight.ravel(),
+            problem.graph.prior_weight.ravel(),
             weights.constants,
         ]
     )
-    matrix, gradient = twin.normal_equations(residuals, at, weight)
+    matrix, gradient = reference.normal_equations(residuals, at, weight)
     equations = problem.normal_equations(state, weights)
-    whole = twin.whole_matrix(equations.a, equations.e, equations.border, equations.corner)
+    whole = reference.whole_matrix(equations.a, equations.e, equations.border, equations.corner)
     scale = np.sqrt(np.diag(matrix))
     assert whole / np.outer(scale, scale) == pytest.approx(
         matrix / np.outer(scale, scale), abs=1e-6
@@ -110,7 +116,7 @@ def test_the_normal_equations_are_those_of_finite_differences() -> None:
 def test_the_block_solution_is_the_dense_one() -> None:
     problem, state, weights = _problem()
     equations = problem.normal_equations(state, weights)
-    whole = twin.whole_matrix(equations.a, equations.e, equations.border, equations.corner)
+    whole = reference.whole_matrix(equations.a, equations.e, equations.border, equations.corner)
     gradient = np.concatenate((equations.gradient.ravel(), equations.corner_gradient))
     solved = equations.solve()
     assert solved is not None
@@ -121,7 +127,7 @@ def test_the_block_solution_is_the_dense_one() -> None:
 def test_the_covariance_blocks_are_those_of_the_dense_inverse() -> None:
     problem, state, weights = _problem()
     equations = problem.normal_equations(state, weights)
-    whole = twin.whole_matrix(equations.a, equations.e, equations.border, equations.corner)
+    whole = reference.whole_matrix(equations.a, equations.e, equations.border, equations.corner)
     inverse = np.linalg.inv(whole)
     covariance = equations.covariance()
     knots, b = covariance.diagonal.shape[:2]
@@ -147,44 +153,48 @@ def test_the_covariance_blocks_are_those_of_the_dense_inverse() -> None:
     assert ranges == pytest.approx(variance[motions.size :][: ranges.size], rel=1e-4)
 
 
-def test_the_levels_move_the_solution_as_small_changes_of_them_do() -> None:
+def test_the_components_move_the_solution_as_small_changes_of_them_do() -> None:
     problem, state, _ = _problem()
-    levels = problem.first_levels()
+    components = VarianceComponents.first(problem.nodes)
     inliers = np.ones(problem.graph.range_m.size)
-    bases = problem.bases(state, levels)
-    weights = weigh(problem, levels, bases, inliers, 0.0)
+    bases = motion_bases(problem, state, components)
+    weights = weights_of(problem, components, bases, inliers)
     equations = problem.normal_equations(state, weights)
-    whole = twin.whole_matrix(equations.a, equations.e, equations.border, equations.corner)
-    _, knowledge = know(problem, state, levels, bases, weights)
-    for node, level in ((0, 0), (1, 3), (2, 4), (2, 5)):
+    whole = reference.whole_matrix(equations.a, equations.e, equations.border, equations.corner)
+    at = linearise(problem, state, components, bases, weights)
+    for node, component in ((0, 0), (1, 3), (2, 4), (2, 5)):
         gradients = []
         for shift in (1e-4, -1e-4):
-            changed = levels.copy()
-            changed.motion[node, level] *= math.exp(shift)
-            at = problem.normal_equations(state, weigh(problem, changed, bases, inliers, 0.0))
-            gradients.append(np.concatenate((at.gradient.ravel(), at.corner_gradient)))
+            changed = components.copy()
+            changed.motion[node, component] *= math.exp(shift)
+            shifted = problem.normal_equations(state, weights_of(problem, changed, bases, inliers))
+            gradients.append(np.concatenate((shifted.gradient.ravel(), shifted.corner_gradient)))
         expected = -np.linalg.solve(whole, gradients[0] - gradients[1]) / 2e-4
-        column = 7 * node + level
-        found = np.append(knowledge.poses[:, :, column], knowledge.constants[:, column])
+        column = 7 * node + component
+        found = np.append(at.poses[:, :, column], at.constants[:, column])
         assert np.abs(expected).max() > 1e-6
         assert found == pytest.approx(expected, rel=1e-3, abs=1e-6 * np.abs(expected).max())
-    assert np.linalg.eigvalsh(knowledge.information).min() > -1e-9
+    assert np.linalg.eigvalsh(at.information).min() > -1e-9
 
 
-def test_silence_says_farther_and_hearing_says_nearer() -> None:
+def test_missed_attempts_say_farther_and_received_ones_nearer() -> None:
     run = simulate_paper("paper-h", 3, {"seconds": 200})
     graph, _ = build_graph(run.measurements, run.priors)
     problem = Problem(graph)
-    state = problem.first_state(graph.dead_reckoned(graph.start))
-    levels = problem.first_levels()
-    weights = weigh(problem, levels, problem.bases(state, levels), np.ones(graph.range_m.size), 0.0)
-    state, _ = problem.optimise(state, weights)
-    distance = problem.tried_distances(state)
-    assert hear(problem, state, problem.covariance(state, weights)) > 0.0
-    pull = problem.heard_weight * (problem.heard_m - distance)
-    assert pull[graph.tries.silent].max() > 0.001
-    assert pull[graph.tries.silent].min() > -1e-4
-    assert pull[~graph.tries.silent].max() < 1e-4
+    state = problem.first_state(graph.dead_reckoned(graph.prior))
+    components = VarianceComponents.first(problem.nodes)
+    bases = motion_bases(problem, state, components)
+    weights = weights_of(problem, components, bases, np.ones(graph.range_m.size))
+    state = problem.optimise(state, weights)
+    distance = problem.attempt_distances(state)
+    covariance = problem.normal_equations(state, weights).covariance()
+    variance = problem.attempt_variances(state, covariance)
+    learned = learn_curve(problem, distance, np.sqrt(variance))
+    assert update_factors(problem, distance, variance, *learned) > 0.0
+    pull = problem.detection.weight * (problem.detection.mean_m - distance)
+    assert pull[graph.attempts.missed].max() > 0.001
+    assert pull[graph.attempts.missed].min() > -1e-4
+    assert pull[~graph.attempts.missed].max() < 1e-4
 
 
 @pytest.mark.parametrize("scale_error", [0.0, 0.1])
@@ -196,7 +206,7 @@ def test_step_scales_are_sought_where_there_are_any(scale_error: float) -> None:
     for measurement in run.measurements:
         smoother.process(measurement)
     smoother.finish()
-    assert smoother.solutions[0].levels.to_scale == (scale_error == 0.0)
+    assert smoother.solutions[0].components.to_scale == (scale_error == 0.0)
 
 
 def _smoothed(run: SimulatedRun, online: str = "bank") -> list[Estimate]:

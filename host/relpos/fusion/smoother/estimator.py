@@ -27,7 +27,9 @@ from relpos.fusion.estimator import (
     Parameter,
 )
 from relpos.fusion.smoother.graph import Graph, build_graph
-from relpos.fusion.smoother.problem import Problem, Solution, smooth
+from relpos.fusion.smoother.problem import Problem
+from relpos.fusion.smoother.solution import Solution, smooth
+from relpos.fusion.smoother.variance_components import VarianceComponents
 from relpos.measurements import Measurement, Prior
 
 Floats = npt.NDArray[np.float64]
@@ -95,10 +97,12 @@ def _without_needless_constants(problem: Problem, best: Solution) -> Solution:
     """Leave out range biases, step scales or both where the run is clearly likelier without."""
     chosen, least = best, best.cost - SIMPLER_BY
     for calibrated, to_scale in ((True, True), (True, False), (False, True)):
-        levels = problem.simpler_levels(calibrated=calibrated, to_scale=to_scale)
-        tried = smooth(problem, best.state, levels)
-        if tried.cost < least:
-            chosen, least = tried, tried.cost
+        components = VarianceComponents.first(
+            problem.nodes, calibrated=calibrated, to_scale=to_scale
+        )
+        simpler = smooth(problem, best.state, components)
+        if simpler.cost < least:
+            chosen, least = simpler, simpler.cost
     return chosen
 
 
@@ -109,7 +113,7 @@ def _replay(estimator: Estimator, measurements: Iterable[Measurement]) -> list[E
 
 def _with_frame(graph: Graph, estimates: Sequence[Estimate]) -> Graph:
     """Where no start is known, hold the node whose pose at the start is the frame."""
-    if (graph.start_weight[:, :2] > 1e-3).any():
+    if (graph.prior_weight[:, :2] > 1e-3).any():
         return graph
     located = [
         (node.node, abs(node.x_m) + abs(node.y_m))
@@ -119,9 +123,9 @@ def _with_frame(graph: Graph, estimates: Sequence[Estimate]) -> Graph:
     ]
     name = min(located, key=lambda pair: pair[1])[0] if located else graph.node_ids[0]
     row = graph.node_ids.index(name)
-    weight, start = graph.start_weight.copy(), graph.start.copy()
-    weight[row], start[row] = 1e6, 0.0
-    return replace(graph, start=start, start_weight=weight)
+    weight, prior = graph.prior_weight.copy(), graph.prior.copy()
+    weight[row], prior[row] = 1e6, 0.0
+    return replace(graph, prior=prior, prior_weight=weight)
 
 
 def _poses(graph: Graph, estimates: Sequence[Estimate]) -> Floats:
@@ -137,9 +141,9 @@ def _poses(graph: Graph, estimates: Sequence[Estimate]) -> Floats:
         for node in estimate.nodes:
             if node.status is not NodeStatus.UNLOCATED and node.node in row:
                 poses[k, row[node.node]] = (node.x_m, node.y_m, node.heading_rad)
-    known = graph.start_weight[:, 0] > 1e-3
-    poses[0, known] = graph.start[known]
-    reckoned = graph.dead_reckoned(graph.start)
+    known = graph.prior_weight[:, 0] > 1e-3
+    poses[0, known] = graph.prior[known]
+    reckoned = graph.dead_reckoned(graph.prior)
     for n in range(nodes):
         there = np.flatnonzero(np.isfinite(poses[:, n, 0]))
         if not there.size:
@@ -151,10 +155,11 @@ def _poses(graph: Graph, estimates: Sequence[Estimate]) -> Floats:
             anchor = int(before[-1] if before.size else there[0])
             poses[k, n] = _carried(poses[anchor, n], reckoned[anchor, n], reckoned[k, n])
     # Headings go on from one another as the reports turn.
-    turn = np.diff(poses[..., 2], axis=0) - graph.turn_rad
-    turn = (turn + np.pi) % (2.0 * np.pi) - np.pi + graph.turn_rad
+    reported = graph.chords.turn_rad
+    turn = np.diff(poses[..., 2], axis=0) - reported
+    turn = (turn + np.pi) % (2.0 * np.pi) - np.pi + reported
     poses[1:, :, 2] = poses[0, :, 2] + np.cumsum(turn, axis=0)
-    first = np.round((poses[0, :, 2] - graph.start[:, 2]) / (2.0 * np.pi)) * 2.0 * np.pi
+    first = np.round((poses[0, :, 2] - graph.prior[:, 2]) / (2.0 * np.pi)) * 2.0 * np.pi
     poses[..., 2] -= first
     return poses
 
@@ -175,16 +180,15 @@ def _estimates(
     knots, nodes = poses.shape[:2]
     blocks = solution.covariance.diagonal.reshape(knots, nodes, 3, nodes, 3)
     alone = blocks[:, np.arange(nodes), :, np.arange(nodes), :].transpose(1, 0, 2, 3)
-    news = graph.news.copy()
-    for slot, pair in zip(graph.slot, graph.pair, strict=True):
-        news[slot, pair] = True
-    begun = np.logical_or.accumulate(news, axis=0) | (graph.start_weight[:, 0] > 1e-3)
+    news = graph.has_report.copy()
+    for chord, pair in zip(graph.ranges.chord, graph.ranges.pair, strict=True):
+        news[chord, pair] = True
+    begun = np.logical_or.accumulate(news, axis=0) | (graph.prior_weight[:, 0] > 1e-3)
     silent = np.zeros(nodes, dtype=int)
-    doubtful = {
+    ambiguous = {
         n.node for n in (online[-1].nodes if online else ()) if n.status is NodeStatus.AMBIGUOUS
     }
-    ranged = np.isin(np.arange(nodes), graph.pairs) | (graph.start_weight[:, 0] > 1e-3)
-    height_sigma = 0.0
+    ranged = np.isin(np.arange(nodes), graph.pairs) | (graph.prior_weight[:, 0] > 1e-3)
     for k in range(1, knots):
         silent = (silent + 1) * ~news[k - 1]
         rows = []
@@ -195,7 +199,7 @@ def _estimates(
             status = NodeStatus.OK
             if not located:
                 status = NodeStatus.UNLOCATED
-            elif name in doubtful and spread > SURE_M:
+            elif name in ambiguous and spread > SURE_M:
                 status = NodeStatus.AMBIGUOUS
             elif silent[n] >= LOST_EPOCHS:
                 status = NodeStatus.LOST
@@ -207,7 +211,7 @@ def _estimates(
                     math.remainder(float(poses[k, n, 2]), 2.0 * math.pi),
                     float(p[0, 0]), float(p[1, 1]), float(p[0, 1]),
                     min(math.sqrt(max(float(p[2, 2]), 0.0)), ANY_ANGLE_RAD), status,
-                    float(graph.height_m[k, n]), height_sigma,
+                    float(graph.height_m[k, n]),
                 )
             )  # fmt: skip
         time_s = float(graph.time_s[k])
@@ -246,8 +250,6 @@ def _parameters(problem: Problem, solution: Solution, time_s: float) -> tuple[Pa
     """The constants of the whole run; the same at every epoch."""
     n, names = problem.nodes, problem.graph.node_ids
     value, spread = solution.state.constants, solution.covariance.constants
-    if not spread.size:
-        return ()
     rows = []
     for k, name in enumerate(names):
         grow = math.exp(float(value[k]))

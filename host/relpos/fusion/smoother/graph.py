@@ -1,8 +1,8 @@
 """A whole run as one problem in arrays: the chords of every node and the ranges between them.
 
 The knots are the motion epochs and the start of the run; every node has a pose at every knot. A
-range between two knots sees each node where its chord was at that time: the reported way, bent
-by what is known of the poses at both ends.
+range between two knots sees each node where its chord was at that time: on the reported path,
+moved along with the poses at both ends.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -24,94 +25,110 @@ Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 STILL_M = 0.02
-"""A chord shorter than this is a standing node's noise: no way, no direction."""
+"""A chord shorter than this is a standing node's noise: no path, no direction."""
 
 UNKNOWN_M = 1e3
 UNKNOWN_RAD = 10.0
-"""No knowledge of a start: far above what a run tells, and no trouble for the digits."""
+"""Standard deviations of an unknown start: far above what a run tells, and no trouble for the
+digits."""
+
+
+class Chords(NamedTuple):
+    """The reported displacements between consecutive knots, (K - 1, N) each."""
+
+    duration_s: Floats
+    """(K - 1,)"""
+    length_m: Floats
+    direction_rad: Floats
+    """In the heading frame of the chord's beginning."""
+    turn_rad: Floats
+    turn_share: Floats
+    """(N,) share of its turn that a node's chord follows: 1 where it turns first, then walks."""
+
+
+class Ranges(NamedTuple):
+    """M distances between nodes, measured or attempted."""
+
+    chord: Integers
+    """(M,) the chords in which they lie."""
+    pair: Integers
+    """(M, 2) rows of nodes."""
+    fraction: Floats
+    """(M,) how far into the chord in time."""
+    offset_m: Floats
+    """(M, 4) path less straight chord (x, y of the first node, then of the second), in the heading
+    frame of the chord's beginning."""
+    antenna_m: Floats
+    """(N, 2) forward, left."""
+    dz_m: Floats
+    """(M,) difference of heights."""
+    pair_index: Integers
+    """(M,) index of the pair's bias; -1 for a distance without biases."""
 
 
 @dataclass(frozen=True)
-class Tries:
-    """Attempts to range, one round after another: Q attempts in ``rounds``.
-
-    ``slot``, ``share``, ``bend``, ``pair``, ``rise_m`` as of ranges. ``first`` (rounds + 1,) is
-    where each round begins; in a round the heard come first, then the silent.
-    """
+class Attempts:
+    """Q attempts to range, one round after another; in a round the received come first."""
 
     rounds: tuple[Round, ...]
     first: Integers
-    slot: Integers
-    share: Floats
-    bend: Floats
-    pair: Integers
-    rise_m: Floats
-    silent: npt.NDArray[np.bool_]
+    """(rounds + 1,) where each round begins."""
+    ranges: Ranges
+    missed: npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class Graph:
-    """K knots, N nodes, M ranges; metres, radians, seconds.
-
-    ``node_ids`` (N,). ``time_s`` (K,). Chords (K - 1, N): ``length_m`` and ``direction_rad`` of
-    the reported way in the heading frame of its beginning, ``turn_rad``; ``reported_m`` and
-    ``reported_rad`` are the standard deviations that the reports bring, 0 where they bring none.
-    ``news`` (K - 1, N) tells whether anything was reported. ``follow`` (N,) is the share of a
-    turn that its chord follows.
-
-    Ranges (M,): ``slot`` is the chord, ``share`` how far into it in time, ``bend`` (M, 4) where
-    the reported way was then beside the straight one (first, second node; in the frame of the
-    chord's beginning), ``pair`` (M, 2) rows of nodes, ``pair_index`` into ``pairs`` (P, 2),
-    ``rise_m`` the difference of heights. ``antenna_m`` (N, 2): forward, left.
-
-    ``start`` (N, 3) is the prior pose at knot 0, ``start_weight`` its 1 / variances.
-    ``compass`` holds (knot, row, heading, 1 / variance) of absolute headings.
-    """
+    """K knots, N nodes, M ranges; metres, radians, seconds."""
 
     node_ids: tuple[int, ...]
     time_s: Floats
-    length_m: Floats
-    direction_rad: Floats
-    turn_rad: Floats
-    reported_m: Floats
-    reported_rad: Floats
-    news: npt.NDArray[np.bool_]
-    follow: Floats
-    slot: Integers
-    share: Floats
-    bend: Floats
-    pair: Integers
-    pair_index: Integers
-    pairs: Integers
-    rise_m: Floats
+    """(K,)"""
+    chords: Chords
+    usual_length_m: Floats
+    """(K - 1, N) mean over the walked chords around each."""
+    walks: npt.NDArray[np.bool_]
+    """(K - 1, N) whether a chord is longer than ``STILL_M``."""
+    sigma_m: Floats
+    sigma_rad: Floats
+    """(K - 1, N) reported standard deviations of chords, 0 where none are."""
+    has_report: npt.NDArray[np.bool_]
+    """(K - 1, N)"""
+    ranges: Ranges
     range_m: Floats
-    antenna_m: Floats
-    start: Floats
-    start_weight: Floats
-    tries: Tries
-    """Who tried to range whom, and whether in vain."""
+    """(M,) as measured."""
+    pairs: Integers
+    """(P, 2) rows of the pairs that ``ranges.pair_index`` counts."""
+    attempts: Attempts
+    prior: Floats
+    prior_weight: Floats
+    """(N, 3) pose at knot 0 and 1 / its variances."""
     height_m: Floats
-    """(K, N) height of every node over its own start, 0 where none is told."""
-
-    @property
-    def duration_s(self) -> Floats:
-        """Duration of each chord, (K - 1,)."""
-        return np.diff(self.time_s)
+    """(K, N) height of every node over its own start, 0 where none is measured."""
 
     def dead_reckoned(self, start: Floats) -> Floats:
         """Compose the reported chords from poses (N, 3): (K, N, 3), headings unwrapped."""
         knots, nodes = self.time_s.size, len(self.node_ids)
         poses = np.empty((knots, nodes, 3))
         poses[0] = start
-        poses[1:, :, 2] = start[:, 2] + np.cumsum(self.turn_rad, axis=0)
-        angle = poses[:-1, :, 2] + self.direction_rad
-        poses[1:, :, 0] = start[:, 0] + np.cumsum(self.length_m * np.cos(angle), axis=0)
-        poses[1:, :, 1] = start[:, 1] + np.cumsum(self.length_m * np.sin(angle), axis=0)
+        _, length_m, direction_rad, turn_rad, _ = self.chords
+        poses[1:, :, 2] = start[:, 2] + np.cumsum(turn_rad, axis=0)
+        angle = poses[:-1, :, 2] + direction_rad
+        poses[1:, :, 0] = start[:, 0] + np.cumsum(length_m * np.cos(angle), axis=0)
+        poses[1:, :, 1] = start[:, 1] + np.cumsum(length_m * np.sin(angle), axis=0)
         return poses
 
 
-_Entry = tuple[int, float, int, int, float, float, tuple[float, ...]]
-"""Slot, time, node, peer, range, rise, and where both were in their chords."""
+class _Entry(NamedTuple):
+    """One range or attempt; ``places_m`` is where both nodes were in their chords."""
+
+    chord: int
+    time_s: float
+    node: int
+    peer: int
+    range_m: float
+    dz_m: float
+    places_m: tuple[float, ...]
 
 
 @dataclass
@@ -127,13 +144,11 @@ class _Builder:
     times: list[float] = field(default_factory=list)
     ranges: list[_Entry] = field(default_factory=list)
     rounds: Rounds = field(default_factory=Rounds)
-    tried: list[
-        tuple[Round, list[tuple[int, float, int, int, float, float, tuple[float, ...]]]]
-    ] = field(default_factory=list)
+    attempts: list[tuple[Round, list[_Entry]]] = field(default_factory=list)
     seen: set[int] = field(default_factory=set)
     unused_headings: int = 0
 
-    def take(self, step: object, reported_s: Callable[[int], float]) -> None:
+    def add(self, step: object, reported_s: Callable[[int], float]) -> None:
         match step:
             case Advance():
                 self.seen.add(step.node)
@@ -154,7 +169,7 @@ class _Builder:
                         self._entry(step.time_s, node, peer, 0.0)
                         for node, peer in done.received + done.missed
                     ]
-                    self.tried.append((done, entries))
+                    self.attempts.append((done, entries))
             case Sensed(measurement=Height() as height):
                 self.height_now[height.node] = height.height_m
             case Sensed(measurement=Heading()):
@@ -169,8 +184,8 @@ class _Builder:
         places: list[float] = []
         for one in (node, peer):
             places += self.partial.get(one, [0.0, 0.0])[:2]
-        rise = self._height(node) - self._height(peer)
-        return len(self.times), time_s, node, peer, range_m, rise, tuple(places)
+        dz_m = self._height(node) - self._height(peer)
+        return _Entry(len(self.times), time_s, node, peer, range_m, dz_m, tuple(places))
 
     def _height(self, node: int) -> float:
         return self.heights.get(node, 0.0) + self.height_now.get(node, 0.0)
@@ -194,9 +209,9 @@ def build_graph(
     builder = _Builder(dict(heights_m or {}))
     for measurement in measurements:
         for step in timeline.push(measurement):
-            builder.take(step, timeline.reported_s)
+            builder.add(step, timeline.reported_s)
     for step in timeline.finish():
-        builder.take(step, timeline.reported_s)
+        builder.add(step, timeline.reported_s)
     counters = Counter(timeline.counters)
     if builder.unused_headings:
         counters["headings_unused"] += builder.unused_headings
@@ -213,69 +228,71 @@ def _finished(
 ) -> Graph:
     names = tuple(sorted(builder.seen | {p.node for p in priors}))
     row = {node: k for k, node in enumerate(names)}
-    first_s = min([0.0, *(entry[1] for entry in builder.ranges)])
+    first_s = min([0.0, *(entry.time_s for entry in builder.ranges)])
     if builder.times[0] <= first_s:
         first_s = builder.times[0] - 1.0
     time_s = np.array([first_s, *builder.times])
     slots = time_s.size - 1
     chord = np.zeros((slots, len(names), 5))
-    news = np.zeros((slots, len(names)), dtype=bool)
+    has_report = np.zeros((slots, len(names)), dtype=bool)
     height = np.zeros((time_s.size, len(names)))
     for k in range(slots):
         for node, values in builder.chords[k].items():
             chord[k, row[node]] = values
-            news[k, row[node]] = True
+            has_report[k, row[node]] = True
         for node, value in builder.heights_at[k].items():
             height[k + 1, row[node]] = value
-    kept = [entry for entry in builder.ranges if entry[0] < slots]
+    kept = [entry for entry in builder.ranges if entry.chord < slots]
     counters["ranges_after_the_last_motion"] += len(builder.ranges) - len(kept)
 
-    slot, share, bend, pair, rise = _placed(kept, row, time_s, chord)
-    tried = [one for one in builder.tried if all(entry[0] < slots for entry in one[1])]
-    attempts = [entry for _, entries in tried for entry in entries]
-    tries = Tries(
-        tuple(done for done, _ in tried),
-        np.cumsum([0, *(len(entries) for _, entries in tried)]),
-        *_placed(attempts, row, time_s, chord),
-        np.array(
-            [k >= len(done.received) for done, entries in tried for k in range(len(entries))],
-            dtype=bool,
-        ),
-    )
-    ordered = np.sort(pair, axis=1)
-    pairs, pair_index = (
-        np.unique(ordered, axis=0, return_inverse=True) if len(kept) else (ordered, slot)
-    )
     length = np.hypot(chord[..., 0], chord[..., 1])
     direction = np.where(length > 0.0, np.arctan2(chord[..., 1], chord[..., 0]), 0.0)
-    start, weight = _start(priors, row)
+    turn = chord[..., 2].copy()
+    walks = length > STILL_M
     antenna = np.zeros((len(names), 2))
     for node, place in antennas_m.items():
         if node in row:
             antenna[row[node]] = place
+    ranges = _placed(kept, row, time_s, chord, antenna)
+    ordered = np.sort(ranges.pair, axis=1)
+    pairs, pair_index = (
+        np.unique(ordered, axis=0, return_inverse=True) if kept else (ordered, ranges.chord)
+    )
+    prior, weight = _prior(priors, row)
     return Graph(
         names,
         time_s,
-        length,
-        direction,
-        chord[..., 2].copy(),
+        Chords(np.diff(time_s), length, direction, turn, _turn_share(length, direction, turn)),
+        _usual_length(length, walks),
+        walks,
         np.sqrt(chord[..., 3]),
         np.sqrt(chord[..., 4]),
-        news,
-        _follow(length, direction, chord[..., 2]),
-        slot,
-        share,
-        bend,
-        pair,
-        np.asarray(pair_index, dtype=np.int64).ravel(),
+        has_report,
+        ranges._replace(pair_index=np.asarray(pair_index, dtype=np.int64).ravel()),
+        np.array([entry.range_m for entry in kept]),
         pairs,
-        rise,
-        np.array([entry[4] for entry in kept]),
-        antenna,
-        start,
+        _attempts(builder, row, time_s, chord, antenna),
+        prior,
         weight,
-        tries,
         height,
+    )
+
+
+def _attempts(
+    builder: _Builder, row: Mapping[int, int], time_s: Floats, chord: Floats, antenna_m: Floats
+) -> Attempts:
+    inside = [
+        one for one in builder.attempts if all(entry.chord < time_s.size - 1 for entry in one[1])
+    ]
+    entries = [entry for _, every in inside for entry in every]
+    return Attempts(
+        tuple(done for done, _ in inside),
+        np.cumsum([0, *(len(every) for _, every in inside)]),
+        _placed(entries, row, time_s, chord, antenna_m),
+        np.array(
+            [k >= len(done.received) for done, every in inside for k in range(len(every))],
+            dtype=bool,
+        ),
     )
 
 
@@ -284,37 +301,53 @@ def _placed(
     row: Mapping[int, int],
     time_s: Floats,
     chord: Floats,
-) -> tuple[Integers, Floats, Floats, Integers, Floats]:
-    """Give slot, share, bend, pair and rise of ranges or attempts."""
-    slot = np.array([entry[0] for entry in entries], dtype=np.int64)
-    at_s = np.array([entry[1] for entry in entries])
-    pair = np.array([(row[e[2]], row[e[3]]) for e in entries], dtype=np.int64).reshape(-1, 2)
-    share = np.clip((at_s - time_s[slot]) / (time_s[slot + 1] - time_s[slot]), 0.0, 1.0)
-    places = np.array([entry[6] for entry in entries]).reshape(-1, 4)
+    antenna_m: Floats,
+) -> Ranges:
+    """Lay out ranges or attempts in arrays, without biases."""
+    slot = np.array([entry.chord for entry in entries], dtype=np.int64)
+    at_s = np.array([entry.time_s for entry in entries])
+    pair = np.array([(row[e.node], row[e.peer]) for e in entries], dtype=np.int64).reshape(-1, 2)
+    fraction = np.clip((at_s - time_s[slot]) / (time_s[slot + 1] - time_s[slot]), 0.0, 1.0)
+    places = np.array([entry.places_m for entry in entries]).reshape(-1, 4)
     ends = np.concatenate((chord[slot, pair[:, 0], :2], chord[slot, pair[:, 1], :2]), axis=1)
-    bend = places - share[:, None] * ends
-    return slot, share, bend, pair, np.array([entry[5] for entry in entries])
+    offset = places - fraction[:, None] * ends
+    dz_m = np.array([entry.dz_m for entry in entries])
+    return Ranges(slot, pair, fraction, offset, antenna_m, dz_m, np.full(slot.size, -1))
 
 
-def _start(priors: Sequence[Prior], row: Mapping[int, int]) -> tuple[Floats, Floats]:
-    start, weight = np.zeros((len(row), 3)), np.empty((len(row), 3))
+def _usual_length(length_m: Floats, walks: npt.NDArray[np.bool_], half: int = 3) -> Floats:
+    """Mean length of the walked chords around each, (K - 1, N); as reported for a standing one.
+
+    A chord that happened to be reported too short is not more certain than its neighbours.
+    """
+    kernel = np.ones(2 * half + 1)
+    total = np.empty_like(length_m)
+    for i in range(length_m.shape[1]):
+        count = np.convolve(walks[:, i].astype(float), kernel, mode="full")[half:-half]
+        summed = np.convolve(length_m[:, i] * walks[:, i], kernel, mode="full")[half:-half]
+        total[:, i] = summed / np.maximum(count, 1.0)
+    return np.where(walks, total, length_m)
+
+
+def _prior(priors: Sequence[Prior], row: Mapping[int, int]) -> tuple[Floats, Floats]:
+    pose, weight = np.zeros((len(row), 3)), np.empty((len(row), 3))
     weight[:] = (UNKNOWN_M**-2, UNKNOWN_M**-2, UNKNOWN_RAD**-2)
     for prior in priors:
         k = row[prior.node]
-        start[k] = (prior.x_m, prior.y_m, prior.heading_rad)
-        # Nobody stands on a point to the millimetre, and exact zeros would spoil the digits.
+        pose[k] = (prior.x_m, prior.y_m, prior.heading_rad)
+        # No start is exact to the millimetre, and zeros would spoil the digits.
         sigma = np.clip([prior.sigma_m] * 2 + [prior.sigma_rad], 1e-3, UNKNOWN_M)
         sigma[2] = min(sigma[2], UNKNOWN_RAD)
         weight[k] = sigma**-2
-    return start, weight
+    return pose, weight
 
 
-def _follow(length_m: Floats, direction_rad: Floats, turn_rad: Floats) -> Floats:
-    """Which share of its turn a node's chord follows, from the reports themselves, (N,).
+def _turn_share(length_m: Floats, direction_rad: Floats, turn_rad: Floats) -> Floats:
+    """Share of its turn that a node's chord follows, (N,), from the reports themselves.
 
     A chord that is walked after the turn points along the whole turn, one that turns evenly
     along half of it. The slope of direction over turn, weighted by length; what turns little
-    counts as even. Forwards is presumed: sideways and backwards ways say nothing.
+    counts as even. Only forward motion is used.
     """
     forwards = (np.abs(direction_rad) < 1.8) & (length_m > STILL_M)
     weight = length_m * forwards

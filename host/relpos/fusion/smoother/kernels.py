@@ -1,55 +1,53 @@
-"""The smoother's arithmetic: normal equations of a team's whole way, and their solution.
+"""Residuals of chords and ranges, their derivatives, and what they add to the normal equations.
 
-K knots in time, N nodes, poses (x, y, heading): a block of b = 3 N unknowns a knot, and a border
-of G constants (per node log scale and heading drift, one common range bias, pair biases):
-
-    [ A_0  E_0'              B_0 ]
-    [ E_0  A_1  E_1'         B_1 ]          A (K, b, b), E (K - 1, b, b), B (K, b, G), C (G, G)
-    [      E_1  A_2  ...     ... ]
-    [ B_0' B_1' ...          C   ]
-
-The twins are in :mod:`reference.smoother`.
+The tests compare them with :mod:`reference.smoother`.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.compiled import compiled
+from relpos.fusion.smoother.block_solver import Covariance, Equations
+from relpos.fusion.smoother.graph import Chords, Ranges
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 
+class State(NamedTuple):
+    """A point of the optimisation."""
+
+    poses: Floats
+    """(K, N, 3): x, y (m), unwrapped heading (rad)."""
+    constants: Floats
+    """(2 N + 1 + P,): each node's log of true over reported length, each node's heading drift
+    (rad/s), the common range bias, each pair's own bias (m)."""
+
+
 @compiled
-def motion_residuals(
-    poses: Floats,
-    log_scale: Floats,
-    drift_rad_s: Floats,
-    duration_s: Floats,
-    length_m: Floats,
-    direction_rad: Floats,
-    turn_rad: Floats,
-    follow: Floats,
-) -> Floats:
+def motion_residuals(state: State, chords: Chords) -> Floats:
     """Residuals (K - 1, N, 3) of the reported chords: along (m), across (m), turn (rad).
 
     With the turn's error r_t = h' - h - turn - drift dt, a chord of the reported length and
-    direction (in the frame of its beginning) is seen under h + follow r_t + direction; ``follow``
-    is the share of a turn that its chord follows (1: turned first, then walked).
+    direction (in the frame of its beginning) is seen under h + s r_t + direction, where s is
+    ``turn_share``.
     """
+    poses, constants = state
+    duration_s, length_m, direction_rad, turn_rad, turn_share = chords
     knots, nodes = poses.shape[0], poses.shape[1]
     result = np.empty((knots - 1, nodes, 3))
     for k in range(knots - 1):
         for i in range(nodes):
             turn = poses[k + 1, i, 2] - poses[k, i, 2] - turn_rad[k, i]
-            turn -= drift_rad_s[i] * duration_s[k]
-            angle = poses[k, i, 2] + follow[i] * turn + direction_rad[k, i]
+            turn -= constants[nodes + i] * duration_s[k]
+            angle = poses[k, i, 2] + turn_share[i] * turn + direction_rad[k, i]
             c, s = math.cos(angle), math.sin(angle)
-            shrink = math.exp(-log_scale[i])
+            shrink = math.exp(-constants[i])
             dx, dy = poses[k + 1, i, 0] - poses[k, i, 0], poses[k + 1, i, 1] - poses[k, i, 1]
             result[k, i, 0] = shrink * (c * dx + s * dy) - length_m[k, i]
             result[k, i, 1] = shrink * (c * dy - s * dx)
@@ -59,33 +57,26 @@ def motion_residuals(
 
 @compiled
 def _motion_derivative(
-    before: Floats,
-    after: Floats,
-    log_scale: float,
-    drift_rad_s: float,
-    duration_s: float,
-    length_m: float,
-    direction_rad: float,
-    turn_rad: float,
-    follow: float,
-    residual: Floats,
-    j: Floats,
+    state: State, chords: Chords, k: int, i: int, residual: Floats, j: Floats
 ) -> None:
-    """One chord's residuals (3) and derivatives (3, 8): pose before, after, log scale, drift."""
-    turn = after[2] - before[2] - turn_rad - drift_rad_s * duration_s
-    angle = before[2] + follow * turn + direction_rad
-    shrink = math.exp(-log_scale)
+    """Chord k of node i: residuals (3) and derivatives (3, 8) by both poses, log scale, drift."""
+    before, after = state.poses[k, i], state.poses[k + 1, i]
+    nodes = state.poses.shape[1]
+    duration_s, share = chords.duration_s[k], chords.turn_share[i]
+    turn = after[2] - before[2] - chords.turn_rad[k, i] - state.constants[nodes + i] * duration_s
+    angle = before[2] + share * turn + chords.direction_rad[k, i]
+    shrink = math.exp(-state.constants[i])
     c, s = shrink * math.cos(angle), shrink * math.sin(angle)
     dx, dy = after[0] - before[0], after[1] - before[1]
     along, across = c * dx + s * dy, c * dy - s * dx
-    residual[0], residual[1], residual[2] = along - length_m, across, turn
-    g = 1.0 - follow
-    late = follow * duration_s
+    residual[0], residual[1], residual[2] = along - chords.length_m[k, i], across, turn
+    g = 1.0 - share
+    late = share * duration_s
     j[0, 0], j[0, 1], j[0, 2] = -c, -s, g * across
-    j[0, 3], j[0, 4], j[0, 5] = c, s, follow * across
+    j[0, 3], j[0, 4], j[0, 5] = c, s, share * across
     j[0, 6], j[0, 7] = -along, -late * across
     j[1, 0], j[1, 1], j[1, 2] = s, -c, -g * along
-    j[1, 3], j[1, 4], j[1, 5] = -s, c, -follow * along
+    j[1, 3], j[1, 4], j[1, 5] = -s, c, -share * along
     j[1, 6], j[1, 7] = -across, late * along
     j[2, 0], j[2, 1], j[2, 2] = 0.0, 0.0, -1.0
     j[2, 3], j[2, 4], j[2, 5] = 0.0, 0.0, 1.0
@@ -93,36 +84,18 @@ def _motion_derivative(
 
 
 @compiled
-def add_motions(
-    poses: Floats,
-    log_scale: Floats,
-    drift_rad_s: Floats,
-    duration_s: Floats,
-    length_m: Floats,
-    direction_rad: Floats,
-    turn_rad: Floats,
-    follow: Floats,
-    weight: Floats,
-    a: Floats,
-    e: Floats,
-    border: Floats,
-    corner: Floats,
-    gradient: Floats,
-    corner_gradient: Floats,
-) -> None:
+def add_motions(state: State, chords: Chords, weight: Floats, equations: Equations) -> None:
     """Add the chords' normal equations; ``weight`` (K - 1, N, 3) is 1 / variance.
 
-    Constants: column i is node i's log scale, N + i its drift. Gradients are of half the squares.
+    Gradients are of half the squares.
     """
-    knots, nodes = poses.shape[0], poses.shape[1]
+    a, e, border, corner, gradient, corner_gradient = equations
+    knots, nodes = state.poses.shape[0], state.poses.shape[1]
     j = np.empty((3, 8))
     r = np.empty(3)
     for k in range(knots - 1):
         for i in range(nodes):
-            _motion_derivative(
-                poses[k, i], poses[k + 1, i], log_scale[i], drift_rad_s[i], duration_s[k],
-                length_m[k, i], direction_rad[k, i], turn_rad[k, i], follow[i], r, j,
-            )  # fmt: skip
+            _motion_derivative(state, chords, k, i, r, j)
             r0, r1, r2 = r[0], r[1], r[2]
             w0, w1, w2 = weight[k, i, 0], weight[k, i, 1], weight[k, i, 2]
             at = 3 * i
@@ -156,38 +129,30 @@ def add_motions(
 
 
 @compiled
-def add_level_columns(
-    poses: Floats,
-    log_scale: Floats,
-    drift_rad_s: Floats,
-    duration_s: Floats,
-    length_m: Floats,
-    direction_rad: Floats,
-    turn_rad: Floats,
-    follow: Floats,
+def add_component_columns(
+    state: State,
+    chords: Chords,
     force: Floats,
     axis: Integers,
     columns: Floats,
     corner: Floats,
 ) -> None:
-    """Add how the gradient changes with the logarithm of each motion level (sign turned round).
+    """Add the negative derivative of the gradient by the logarithm of each variance component.
 
-    ``force`` (K - 1, N, L) is share r / V of a level in its residual's variance; level l acts on
-    residual ``axis[l]`` (0 along, 1 across, 2 turn). Column i L + l of ``columns`` (K, b, N L) and
-    of ``corner`` (G, N L) is level l of node i.
+    ``force`` (K - 1, N, C) is share r / V of a component in its residual's variance; component c
+    acts on residual ``axis[c]`` (0 along, 1 across, 2 turn). Column i C + c of ``columns``
+    (K, b, N C) and of ``corner`` (G, N C) is component c of node i.
     """
-    knots, nodes, levels = poses.shape[0], poses.shape[1], force.shape[2]
+    poses, count = state.poses, force.shape[2]
+    knots, nodes = poses.shape[0], poses.shape[1]
     j = np.empty((3, 8))
     r = np.empty(3)
     for k in range(knots - 1):
         for i in range(nodes):
-            _motion_derivative(
-                poses[k, i], poses[k + 1, i], log_scale[i], drift_rad_s[i], duration_s[k],
-                length_m[k, i], direction_rad[k, i], turn_rad[k, i], follow[i], r, j,
-            )  # fmt: skip
+            _motion_derivative(state, chords, k, i, r, j)
             at = 3 * i
-            for level in range(levels):
-                column, f, a = levels * i + level, force[k, i, level], axis[level]
+            for c in range(count):
+                column, f, a = count * i + c, force[k, i, c], axis[c]
                 for p in range(3):
                     columns[k, at + p, column] += f * j[a, p]
                     columns[k + 1, at + p, column] += f * j[a, 3 + p]
@@ -196,30 +161,23 @@ def add_level_columns(
 
 
 @compiled
-def _range_derivative(
-    poses: Floats,
-    slot: int,
-    i: int,
-    j: int,
-    share: float,
-    bend: Floats,
-    antenna_m: Floats,
-    rise_m: float,
-    row: Floats,
-) -> float:
-    """Distance of one range without biases; its derivative goes into ``row`` (12).
+def _range_derivative(state: State, ranges: Ranges, m: int, row: Floats) -> float:
+    """Distance of range m without biases; its derivative goes into ``row`` (12).
 
     Order: node i before (x, y, h), i after, j before, j after.
     """
-    f, g = share, 1.0 - share
+    poses, slot, dz_m = state.poses, ranges.chord[m], ranges.dz_m[m]
+    i, j = ranges.pair[m, 0], ranges.pair[m, 1]
+    offset, antenna_m = ranges.offset_m[m], ranges.antenna_m
+    f, g = ranges.fraction[m], 1.0 - ranges.fraction[m]
     x0, y0 = 0.0, 0.0
     for side in range(2):
         node, sign = (i, 1.0) if side == 0 else (j, -1.0)
         before, after = poses[slot, node], poses[slot + 1, node]
         x, y = g * before[0] + f * after[0], g * before[1] + f * after[1]
         c, s = math.cos(before[2]), math.sin(before[2])
-        bx = c * bend[2 * side] - s * bend[2 * side + 1]
-        by = s * bend[2 * side] + c * bend[2 * side + 1]
+        bx = c * offset[2 * side] - s * offset[2 * side + 1]
+        by = s * offset[2 * side] + c * offset[2 * side + 1]
         heading = g * before[2] + f * after[2]
         c, s = math.cos(heading), math.sin(heading)
         ox = c * antenna_m[node, 0] - s * antenna_m[node, 1]
@@ -229,8 +187,8 @@ def _range_derivative(
         # Kept here until the direction is known: the lever arms turned by a right angle.
         row[6 * side + 0], row[6 * side + 1] = -by - g * oy, bx + g * ox
         row[6 * side + 3], row[6 * side + 4] = -f * oy, f * ox
-    distance = math.sqrt(x0 * x0 + y0 * y0 + rise_m * rise_m)
-    # Where two stand at one place no direction is nearer: the range is left without a derivative.
+    distance = math.sqrt(x0 * x0 + y0 * y0 + dz_m * dz_m)
+    # At one and the same place no direction is nearer: the range has no derivative there.
     scale = 1.0 / distance if distance > 1e-6 else 0.0
     ux, uy = x0 * scale, y0 * scale
     for side in range(2):
@@ -244,74 +202,36 @@ def _range_derivative(
 
 
 @compiled
-def range_residuals(
-    poses: Floats,
-    bias_m: Floats,
-    slots: Integers,
-    pairs: Integers,
-    shares: Floats,
-    bends: Floats,
-    antenna_m: Floats,
-    rise_m: Floats,
-    range_m: Floats,
-    pair_index: Integers,
-) -> Floats:
-    """Predicted minus measured ranges, (M,); ``bias_m`` is the common one, then one a pair.
-
-    A negative ``pair_index`` stands for a distance without any bias.
-    """
-    result = np.empty(range_m.size)
+def range_residuals(state: State, ranges: Ranges, measured_m: Floats) -> Floats:
+    """Predicted less measured ranges, (M,)."""
+    constants, pair_index, common = state.constants, ranges.pair_index, 2 * state.poses.shape[1]
+    result = np.empty(measured_m.size)
     row = np.empty(12)
-    for m in range(range_m.size):
-        distance = _range_derivative(
-            poses, slots[m], pairs[m, 0], pairs[m, 1], shares[m], bends[m], antenna_m, rise_m[m],
-            row,
-        )  # fmt: skip
-        result[m] = distance - range_m[m]
+    for m in range(measured_m.size):
+        result[m] = _range_derivative(state, ranges, m, row) - measured_m[m]
         if pair_index[m] >= 0:
-            result[m] += bias_m[0] + bias_m[1 + pair_index[m]]
+            result[m] += constants[common] + constants[common + 1 + pair_index[m]]
     return result
 
 
 @compiled
 def add_ranges(
-    poses: Floats,
-    bias_m: Floats,
-    slots: Integers,
-    pairs: Integers,
-    shares: Floats,
-    bends: Floats,
-    antenna_m: Floats,
-    rise_m: Floats,
-    range_m: Floats,
-    pair_index: Integers,
-    weight: Floats,
-    a: Floats,
-    e: Floats,
-    border: Floats,
-    corner: Floats,
-    gradient: Floats,
-    corner_gradient: Floats,
+    state: State, ranges: Ranges, measured_m: Floats, weight: Floats, equations: Equations
 ) -> None:
-    """Add the ranges' normal equations; ``weight`` (M,) is 1 / variance.
-
-    Constants: column 2 N is the common bias, 2 N + 1 + pair that of a pair.
-    """
-    nodes = poses.shape[1]
+    """Add the ranges' normal equations; ``weight`` (M,) is 1 / variance."""
+    a, e, border, corner, gradient, corner_gradient = equations
+    constants, pairs, pair_index = state.constants, ranges.pair, ranges.pair_index
+    common = 2 * state.poses.shape[1]
     row = np.empty(12)
-    for m in range(range_m.size):
+    for m in range(measured_m.size):
         w = weight[m]
         if w <= 0.0:
             continue
-        k, f = slots[m], shares[m]
-        distance = _range_derivative(
-            poses, k, pairs[m, 0], pairs[m, 1], f, bends[m], antenna_m, rise_m[m], row
-        )
-        common, own = 2 * nodes, 2 * nodes + 1 + pair_index[m]
+        k, own = ranges.chord[m], common + 1 + pair_index[m]
         biased = pair_index[m] >= 0
-        r = distance - range_m[m]
+        r = _range_derivative(state, ranges, m, row) - measured_m[m]
         if biased:
-            r += bias_m[0] + bias_m[1 + pair_index[m]]
+            r += constants[common] + constants[own]
         for p in range(12):
             value = w * row[p]
             if value == 0.0:
@@ -340,175 +260,50 @@ def add_ranges(
 
 
 @compiled
-def _cholesky_inverse(matrix: Floats, inverse: Floats) -> bool:
-    """Inverse of the lower Cholesky factor, in place of ``inverse``; False if not definite."""
-    n = matrix.shape[0]
-    low = np.zeros((n, n))
-    for j in range(n):
-        total = matrix[j, j]
-        for p in range(j):
-            total -= low[j, p] * low[j, p]
-        if not total > 0.0:
-            return False
-        pivot = math.sqrt(total)
-        low[j, j] = pivot
-        for i in range(j + 1, n):
-            total = matrix[i, j]
-            for p in range(j):
-                total -= low[i, p] * low[j, p]
-            low[i, j] = total / pivot
-    inverse[:] = 0.0
-    for i in range(n):
-        scale = 1.0 / low[i, i]
-        inverse[i, i] = scale
-        for p in range(i):
-            factor = -low[i, p] * scale
-            for j in range(p + 1):
-                inverse[i, j] += factor * inverse[p, j]
-    return True
-
-
-@compiled
-def factorise(a: Floats, e: Floats, right: Floats, lower: Floats, w: Floats, v: Floats) -> bool:
-    """Block Cholesky of the poses' part, and the border through it; False if not definite.
-
-    ``right`` (K, b, R) is the border with the gradient as a last column. Fills ``lower``
-    (K, b, b) with the inverse L^-1 of each diagonal factor, ``w`` (K - 1, b, b) = E L^-T and
-    ``v`` (K, b, R) = L^-1 (right - W v of before).
-    """
-    knots = a.shape[0]
-    for k in range(knots):
-        block = a[k]
-        side = right[k]
-        if k > 0:
-            block = block - np.dot(w[k - 1], w[k - 1].T)
-            side = side - np.dot(w[k - 1], v[k - 1])
-        if not _cholesky_inverse(block, lower[k]):
-            return False
-        # Not ``v[k] = ...``: with the words for shapes that differ it takes seconds to compile.
-        np.dot(lower[k], side, v[k])
-        if k < knots - 1:
-            np.dot(e[k], lower[k].T, w[k])
-    return True
-
-
-@compiled
-def back_substitute(lower: Floats, w: Floats, v: Floats) -> Floats:
-    """Solve the poses' part for every right side: (K, b, R)."""
-    knots = lower.shape[0]
-    result = np.empty_like(v)
-    for k in range(knots - 1, -1, -1):
-        side = v[k]
-        if k < knots - 1:
-            side = side - np.dot(w[k].T, result[k + 1])
-        np.dot(lower[k].T, side, result[k])
-    return result
-
-
-@compiled
-def selected_inverse(lower: Floats, w: Floats) -> tuple[Floats, Floats]:
-    """Diagonal blocks (K, b, b) of the inverse and those below them (K - 1, b, b).
-
-    Without the border: X C^-1 X' of the solved border is added to it.
-    """
-    knots, b = lower.shape[0], lower.shape[1]
-    diagonal = np.empty((knots, b, b))
-    below = np.empty((knots - 1, b, b))
-    for k in range(knots - 1, -1, -1):
-        np.dot(lower[k].T, lower[k], diagonal[k])
-        if k < knots - 1:
-            step = np.dot(w[k], lower[k])
-            moved = np.dot(diagonal[k + 1], step)
-            further = np.dot(step.T, moved)
-            for i in range(b):
-                for j in range(b):
-                    below[k, i, j] = -moved[i, j]
-                    diagonal[k, i, j] += further[i, j]
-    return diagonal, below
-
-
-@compiled
-def motion_variances(
-    poses: Floats,
-    log_scale: Floats,
-    drift_rad_s: Floats,
-    duration_s: Floats,
-    length_m: Floats,
-    direction_rad: Floats,
-    turn_rad: Floats,
-    follow: Floats,
-    diagonal: Floats,
-    below: Floats,
-    with_constants: Floats,
-    constants: Floats,
-) -> Floats:
-    """Posterior variances (K - 1, N, 3) of the chords' residuals.
-
-    From the covariance's blocks: ``diagonal`` (K, b, b), ``below`` (K - 1, b, b) of a knot with
-    the one before, ``with_constants`` (K, b, G) and ``constants`` (G, G), the last two with no
-    columns where no constants are estimated.
-    """
-    knots, nodes = poses.shape[0], poses.shape[1]
-    used = 8 if constants.shape[0] > 0 else 6
+def motion_variances(state: State, chords: Chords, covariance: Covariance) -> Floats:
+    """Posterior variances (K - 1, N, 3) of the chords' residuals."""
+    diagonal, below, with_constants, constants, _ = covariance
+    knots, nodes = state.poses.shape[0], state.poses.shape[1]
     result = np.empty((knots - 1, nodes, 3))
     j, r, own = np.empty((3, 8)), np.empty(3), np.zeros((8, 8))
     for k in range(knots - 1):
         for i in range(nodes):
-            _motion_derivative(
-                poses[k, i], poses[k + 1, i], log_scale[i], drift_rad_s[i], duration_s[k],
-                length_m[k, i], direction_rad[k, i], turn_rad[k, i], follow[i], r, j,
-            )  # fmt: skip
+            _motion_derivative(state, chords, k, i, r, j)
             at = 3 * i
             for p in range(3):
                 for q in range(3):
                     own[p, q] = diagonal[k, at + p, at + q]
                     own[3 + p, 3 + q] = diagonal[k + 1, at + p, at + q]
                     own[3 + p, q] = own[q, 3 + p] = below[k, at + p, at + q]
-            if used == 8:
-                for c in range(2):
-                    column = c * nodes + i
-                    for p in range(3):
-                        own[p, 6 + c] = own[6 + c, p] = with_constants[k, at + p, column]
-                        own[3 + p, 6 + c] = with_constants[k + 1, at + p, column]
-                        own[6 + c, 3 + p] = own[3 + p, 6 + c]
-                    for d in range(2):
-                        own[6 + c, 6 + d] = constants[column, d * nodes + i]
+            for c in range(2):
+                column = c * nodes + i
+                for p in range(3):
+                    own[p, 6 + c] = own[6 + c, p] = with_constants[k, at + p, column]
+                    own[3 + p, 6 + c] = with_constants[k + 1, at + p, column]
+                    own[6 + c, 3 + p] = own[3 + p, 6 + c]
+                for d in range(2):
+                    own[6 + c, 6 + d] = constants[column, d * nodes + i]
             for axis in range(3):
                 total = 0.0
-                for p in range(used):
-                    for q in range(used):
+                for p in range(8):
+                    for q in range(8):
                         total += j[axis, p] * own[p, q] * j[axis, q]
                 result[k, i, axis] = total
     return result
 
 
 @compiled
-def range_variances(
-    poses: Floats,
-    slots: Integers,
-    pairs: Integers,
-    shares: Floats,
-    bends: Floats,
-    antenna_m: Floats,
-    rise_m: Floats,
-    pair_index: Integers,
-    diagonal: Floats,
-    below: Floats,
-    with_constants: Floats,
-    constants: Floats,
-) -> Floats:
+def range_variances(state: State, ranges: Ranges, covariance: Covariance) -> Floats:
     """Posterior variances (M,) of the predicted ranges, biases included where they have any."""
-    nodes = poses.shape[1]
-    result = np.empty(slots.size)
+    diagonal, below, with_constants, constants, _ = covariance
+    pairs, pair_index, common = ranges.pair, ranges.pair_index, 2 * state.poses.shape[1]
+    result = np.empty(ranges.chord.size)
     row = np.empty(12)
-    for m in range(slots.size):
-        k = slots[m]
-        _range_derivative(
-            poses, k, pairs[m, 0], pairs[m, 1], shares[m], bends[m], antenna_m, rise_m[m], row
-        )
+    for m in range(ranges.chord.size):
+        k = ranges.chord[m]
+        _range_derivative(state, ranges, m, row)
         total = 0.0
-        common, own = 2 * nodes, 2 * nodes + 1 + pair_index[m]
-        biased = constants.shape[0] > 0 and pair_index[m] >= 0
+        own, biased = common + 1 + pair_index[m], pair_index[m] >= 0
         for p in range(12):
             if row[p] == 0.0:
                 continue

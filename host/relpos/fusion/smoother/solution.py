@@ -1,0 +1,120 @@
+"""The most probable track of a whole run: what alternates until nothing changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.smoother import detection
+from relpos.fusion.smoother.block_solver import Covariance
+from relpos.fusion.smoother.kernels import State
+from relpos.fusion.smoother.problem import Problem
+from relpos.fusion.smoother.variance_components import (
+    Linearisation,
+    VarianceComponents,
+    inlier_probabilities,
+    linearise,
+    motion_bases,
+    range_densities,
+    update_components,
+    weights_of,
+    widened,
+)
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass
+class Solution:
+    """A smoothed run: the state, its covariance, the variance components and the evidence."""
+
+    state: State
+    covariance: Covariance
+    components: VarianceComponents
+    cost: float
+    """Minus the logarithm of the marginal likelihood (Laplace), up to the run's own constant."""
+    inliers: Floats
+    """(M,) probability of each range to be no outlier."""
+
+
+PASSES = 21
+"""At most so many alternations."""
+
+WIDENED_M = (1.0, 0.5, 0.2)
+"""In the first passes ranges are taken to be so much wider, so that a wrong beginning can slide
+over what would hold it fast."""
+
+DETECTION_FROM = 6
+"""The pass from which on attempts count: tracks that are still wrong by metres would teach a wrong
+edge."""
+
+CURVE_EVERY = 4
+"""Passes from one learning of the curve to the next: it hardly changes, and takes longest."""
+
+SETTLED_COMPONENTS, SETTLED_DETECTION = 0.02, 0.1
+"""The alternation ends when no component changes by a greater share, and no attempt's pull by more
+deviations."""
+
+
+def smooth(
+    problem: Problem, state: State, components: VarianceComponents | None = None
+) -> Solution:
+    """Alternate between the best track at given variances and the variances at a given track.
+
+    RelposError where the trajectory is not observable.
+    """
+    components = (components or VarianceComponents.first(problem.nodes)).copy()
+    problem.detection = problem.no_detection()
+    inliers = np.ones(problem.graph.range_m.size)
+    bases = motion_bases(problem, state, components)
+    for k in range(PASSES):
+        widened_m = WIDENED_M[k] if k < len(WIDENED_M) else 0.0
+        problem.resolve_signs(state, components.range_m2)
+        weights = weights_of(problem, components, bases, inliers, widened_m)
+        state = problem.optimise(state, weights, steps=12, tolerance=1e-4)
+        bases = motion_bases(problem, state, components)
+        if k >= 1:
+            inliers = inlier_probabilities(problem, state, components, widened_m)
+        if k < len(WIDENED_M) - 1:
+            continue
+        weights = weights_of(problem, components, bases, inliers, widened_m)
+        at = linearise(problem, state, components, bases, weights)
+        change = update_components(problem, at, components, inliers)
+        if k < DETECTION_FROM:
+            continue
+        pulled = 0.0
+        if problem.graph.attempts.missed.any():
+            distance = problem.attempt_distances(state)
+            variance = np.maximum(problem.attempt_variances(state, at.covariance), 1e-6)
+            if (k - DETECTION_FROM) % CURVE_EVERY == 0:
+                curve, weight = detection.learn_curve(problem, distance, np.sqrt(variance))
+            pulled = detection.update_factors(problem, distance, variance, curve, weight)
+        if change < SETTLED_COMPONENTS and pulled < SETTLED_DETECTION:
+            break
+    weights = weights_of(problem, components, bases, inliers)
+    state = problem.optimise(state, weights, steps=20, tolerance=1e-7)
+    at = linearise(problem, state, components, bases, weights)
+    cost = negative_evidence(problem, at, components, bases)
+    return Solution(state, widened(at), components, cost, inliers)
+
+
+def negative_evidence(
+    problem: Problem, at: Linearisation, components: VarianceComponents, bases: Floats
+) -> float:
+    """Minus the log marginal likelihood by Laplace's method, up to the run's own constant."""
+    state = at.state
+    variance = components.variances(problem.graph, bases)
+    total = 0.5 * np.sum(problem.motion_residuals(state) ** 2 / variance + np.log(variance))
+    good, outlier = range_densities(problem, state, components)
+    total -= np.sum(np.log(good + outlier))
+    prior = components.constant_weights(problem)
+    total += 0.5 * np.sum(prior * state.constants**2 - np.log(prior))
+    # A chord's noise is so wide in reported metres; as a density of where it ends, in true ones,
+    # it is exp(2 c) times as wide. Without this every longer team would be likelier.
+    total += 2.0 * variance.shape[0] * float(np.sum(state.constants[: problem.nodes]))
+    total += detection.negative_log_probability(problem, state)
+    weight = problem.graph.prior_weight
+    total += 0.5 * np.sum(weight * problem.prior_residuals(state) ** 2)
+    return float(total + 0.5 * at.covariance.log_determinant)
