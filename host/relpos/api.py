@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from relpos import sources
-from relpos.errors import RelposError
-from relpos.evaluation.result import Result, pass_through, read_result, result_of
+from relpos.errors import FusionInterrupted, RelposError
+from relpos.evaluation.result import Progress, Result, read_result, result_of, run_estimator
 from relpos.evaluation.scoring import Evaluation
 from relpos.fusion.estimator import Estimate, Estimator
-from relpos.measurements import Prior
+from relpos.measurements import Measurement, Prior
 from relpos.runs import InitialPose, Run, save_run
 
 if TYPE_CHECKING:
@@ -68,28 +68,43 @@ def fuse(
     settings: Mapping[str, object] | None = None,
     smooth: bool = False,
     initial: str | Sequence[Prior] | None = None,
+    measurements: Sequence[Measurement] | None = None,
+    progress: Progress | None = None,
 ) -> Result:
     """Run an estimator over a whole run.
 
     ``estimator`` is ``"bank"``, ``"particle"``, ``"deadreckoning"``, a name that an installed
     package registers, ``"module:Class"`` or ``"file.py:Class"``; a class or function that makes
     an estimator (with those of ``priors``, ``seed``, ``nodes`` and ``settings`` that it names);
-    or an object that is one. ``settings`` are what ``--set`` takes. ``smooth`` estimates from the
-    whole run, when all is over. ``initial`` overrules what the run says of its start:
-    ``"unknown"``, ``"common"`` (all at one place, facing alike), ``"truth"``, or priors.
+    or an object that is one. ``settings`` are the keys of ``--set``. ``smooth`` estimates from
+    the whole run after its end. ``initial`` replaces the start that the run states:
+    ``"unknown"``, ``"common"`` (all at one place with one heading), ``"truth"``, or priors.
+    ``measurements`` are those of the run in order of arrival, where that is not by time.
+    ``progress`` is called with a stage (``"compiling"``, once after an installation,
+    ``"fusing"``, ``"finishing"``), the number of parts that are done, and their total.
 
-    RelposError where the run has no motion, where the estimator gives up, and where one that is
-    not ours fails or breaks the interface (its own error is the cause, ``__cause__``).
+    RelposError where the run has no motion (or no ranges, for an estimator that is named), where
+    the estimator gives up, and where one from outside of relpos fails or breaks the interface
+    (its own error is the ``__cause__``); ``result`` of the error holds the estimates so far.
     """
-    priors = run.priors if initial is None else _priors(run, initial)
     name = name_of(estimator)
+    run.check_usable(needs_ranges=isinstance(estimator, str) and name != "deadreckoning")
+    priors = priors_of(run, initial)
+    if isinstance(estimator, str):
+        _compile(estimator, settings, progress)
     made = _make(estimator, name, run, priors, settings, seed, smooth=smooth)
-    passage = pass_through(made, run.measurements)
-    if passage.failure is not None:
-        raise passage.failure
-    if passage.interrupted:
-        raise KeyboardInterrupt
-    return result_of(name, passage, seed=seed, settings=settings, priors=priors, smoothed=smooth)
+    estimator_run = run_estimator(
+        made, run.measurements if measurements is None else measurements, progress
+    )
+    result = result_of(
+        name, estimator_run, seed=seed, settings=settings, priors=priors, smoothed=smooth
+    )
+    if estimator_run.failure is not None:
+        estimator_run.failure.result = result
+        raise estimator_run.failure
+    if estimator_run.interrupted:
+        raise FusionInterrupted(result)
+    return result
 
 
 def evaluate(
@@ -97,21 +112,13 @@ def evaluate(
 ) -> Evaluation:
     """Score a result (or estimates, or a directory with ``estimate.csv``) against a run's truth.
 
-    ``bound`` computes the Cramer-Rao bound of a simulated run beside it. DataError where the run
-    has no truth, or none at a time of which there is an estimate.
+    ``bound`` adds the Cramer-Rao bound of a simulated run. DataError where the run has no truth,
+    or none at a time of an estimate.
     """
     from relpos.evaluation import scoring
 
-    scoring.need_truth(run)
-    result = _result(result)
-    least = scoring.bound_of(run) if bound else None
-    return scoring.evaluate(
-        run,
-        result.estimates,
-        result.priors,
-        latency=result.latency,
-        bound=None if least is None else least.totals(),
-    )
+    scoring.check_truth(run)
+    return scoring.evaluate(run, _result(result), bound=bound)
 
 
 def plot(
@@ -157,6 +164,34 @@ def name_of(estimator: Given) -> str:
     return getattr(estimator, "__name__", type(estimator).__name__)
 
 
+def priors_of(run: Run, initial: str | Sequence[Prior] | None = None) -> tuple[Prior, ...]:
+    """Return the starts that an estimator of a run begins with; see ``initial`` of :func:`fuse`."""
+    if initial is None:
+        return run.priors
+    if not isinstance(initial, str):
+        return tuple(initial)
+    words = {
+        "unknown": InitialPose.UNKNOWN,
+        "common": InitialPose.COMMON,
+        "truth": InitialPose.FROM_TRUTH,
+    }
+    if initial not in words:
+        raise RelposError(f"initial: '{initial}' is none of {', '.join(words)}")
+    return run.priors_for(words[initial])
+
+
+def _compile(name: str, settings: Mapping[str, object] | None, progress: Progress | None) -> None:
+    """Compile the kernels of an estimator where they are not in the cache."""
+    from relpos import fusion
+
+    fusion.check_name(name)
+    fusion.check_settings(name, settings or {})
+    if not fusion.is_compiled(name):
+        if progress is not None:
+            progress("compiling", 0, 0)
+        fusion.warm_up(name)
+
+
 def _make(
     estimator: Given,
     name: str,
@@ -183,19 +218,6 @@ def _make(
     if settings:
         raise RelposError(f"{name}: settings belong to a name or a class, not to an object")
     return plugins.guard(name, estimator)
-
-
-def _priors(run: Run, initial: str | Sequence[Prior]) -> tuple[Prior, ...]:
-    if not isinstance(initial, str):
-        return tuple(initial)
-    words = {
-        "unknown": InitialPose.UNKNOWN,
-        "common": InitialPose.COMMON,
-        "truth": InitialPose.FROM_TRUTH,
-    }
-    if initial not in words:
-        raise RelposError(f"initial: '{initial}' is none of {', '.join(words)}")
-    return run.priors_for(words[initial])
 
 
 def _result(given: Result | Sequence[Estimate] | Path | str) -> Result:

@@ -1,8 +1,17 @@
-"""What a user can cause: the command line turns each into one clear line and exit status 1."""
+"""Errors that a user can cause: the command line turns each into one line and exit status 1."""
+
+from __future__ import annotations
+
+from typing import Any
 
 
 class RelposError(Exception):
-    """Base of every error whose cause lies in the data, the device or the request."""
+    """Base of every error whose cause lies in the data, the device or the request.
+
+    ``result``: the :class:`relpos.Result` up to there, where an estimator has failed.
+    """
+
+    result: Any = None
 
 
 class DataError(RelposError):
@@ -11,3 +20,11 @@ class DataError(RelposError):
 
 class DeviceError(RelposError):
     """A port, a radio or a node does not answer as it should."""
+
+
+class FusionInterrupted(KeyboardInterrupt):
+    """Ctrl-C has ended an estimator; ``result`` is its :class:`relpos.Result` up to there."""
+
+    def __init__(self, result: Any) -> None:
+        super().__init__()
+        self.result = result

@@ -18,17 +18,10 @@ def evaluate(
     json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
 ) -> None:
     """Print the metrics of an estimate: for the team, per pair and over time."""
+    from relpos import api
     from relpos.cli import output
-    from relpos.evaluation import scoring
-    from relpos.runs import read_estimates
-    from relpos.sources import load
 
-    recording = load(run)
-    scoring.need_truth(recording)
-    bound = scoring.bound_of(recording)
-    score = scoring.evaluate(
-        recording, read_estimates(estimate), bound=None if bound is None else bound.totals()
-    )
+    score = api.evaluate(estimate, api.load(run))
     if json:
         output.print_json(score.as_json())
     else:

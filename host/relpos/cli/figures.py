@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -62,7 +63,8 @@ def figures(
     with executor(cluster, workers) as pool:
         work = Work(range(first, first + seeds), pool, own=tuple(estimator or ()))
         for name in wanted:
-            with output.counting(name) as work.on_done:
+            with output.progress() as show:
+                work.on_done = partial(show, name)
                 sheet = FIGURES[name](work)
             svg, _, _ = save(sheet, out)
             sheets.append(sheet)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence, Set
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from enum import StrEnum
@@ -15,12 +16,10 @@ from typer.core import TyperCommand
 from relpos.cli import live, output
 from relpos.cli.estimators import BANK, DEADRECKONING, EstimatorName
 from relpos.cli.keys import KeyFile, team_key
-from relpos.errors import DataError, DeviceError, RelposError
+from relpos.errors import DataError, DeviceError, FusionInterrupted, RelposError
 
 if TYPE_CHECKING:
-    from relpos.evaluation.bounds import Bound
     from relpos.evaluation.report import Baseline
-    from relpos.evaluation.result import Passage, Result
     from relpos.evaluation.scoring import Evaluation
     from relpos.fusion.estimator import Estimate, Estimator
     from relpos.live.inputs import Input
@@ -185,18 +184,20 @@ class Job:
         return make(self.estimator, priors, self.settings, self.seed, nodes)
 
     def prepare(self, priors: Sequence[Prior] = ()) -> None:
-        """Have the estimator's kernels compiled, telling it the first time, when it takes long.
+        """Load the estimator's kernels, and compile them where they are not in the cache.
 
-        RelposError, at once, where a setting does not fit it, or it cannot start from such priors.
+        RelposError where a setting does not fit the estimator, or it cannot start from the priors.
         """
         from relpos import fusion
 
         fusion.check_name(self.estimator)
         fusion.check_settings(self.estimator, self.settings)
-        with output.working("preparing the estimator (compiled at the first start)"):
+        with output.progress(output.STAGES) as progress:
+            if not fusion.is_compiled(self.estimator):
+                progress("compiling", 0, 0)
             # Before anything is made: what this process compiled would be compiled twice.
             fusion.warm_up(self.estimator)
-            self.make(priors)
+        self.make(priors)
 
 
 def _default_out(source: str) -> Path:
@@ -214,20 +215,19 @@ def _base_name(source: str) -> str:
 
 
 def _fuse_run(job: Job, initial: Initial | None, *, as_json: bool, report: bool) -> None:
-    from relpos import sources
+    from relpos import api
 
-    run = sources.load(job.source)
-    fuse_recording(job, run, _priors(run, initial), as_json=as_json, report=report)
+    fuse_recording(job, api.load(job.source), initial, as_json=as_json, report=report)
 
 
 def _replay_run(job: Job, initial: Initial | None, options: live.Options, *, as_json: bool) -> None:
     """Show a run directory as if it happened now."""
-    from relpos import sources
+    from relpos import api
     from relpos.live.inputs import PacedInput, run_items
 
-    run = sources.load(job.source)
-    _check_usable(run, job.estimator)
-    priors = _priors(run, initial)
+    run = api.load(job.source)
+    run.check_usable(needs_ranges=job.estimator != DEADRECKONING)
+    priors = api.priors_of(run, initial)
     job.prepare(priors)
     fuse_live(
         job,
@@ -250,6 +250,7 @@ def _fuse_mcap(
     report: bool | None,
 ) -> None:
     """Repeat a recorded session, with its own settings where the command line gives none."""
+    from relpos import api
     from relpos.live.fusion_thread import common_start
     from relpos.live.inputs import PacedInput
     from relpos.measurements import Heading, Height, Motion, Range
@@ -279,12 +280,12 @@ def _fuse_mcap(
         output.remark(words)
     observations = replay.observations()
     run = recording.run_of(observations)
-    _check_usable(run, job.estimator)
+    start: str | Sequence[Prior] | None = initial
     if initial is None and about is not None and about.initial == Initial.COMMON:
-        priors: Sequence[Prior] = common_start(observations)
-    else:
-        priors = _priors(run, initial)
+        start = common_start(observations)
     if options.shown:
+        run.check_usable(needs_ranges=job.estimator != DEADRECKONING)
+        priors = api.priors_of(run, start)
         job.prepare(priors)
         again = Replay(recording, key)
         source = PacedInput(job.source, again, speed=options.pace, link=again.link)
@@ -294,148 +295,61 @@ def _fuse_mcap(
     fuse_recording(
         job,
         replace(run, counters={**run.counters, **counted}),
-        priors,
+        start,
+        [o for o in observations if isinstance(o, Motion | Range | Height | Heading)],
         as_json=as_json,
         report=not as_json if report is None else report,
-        measurements=[o for o in observations if isinstance(o, Motion | Range | Height | Heading)],
     )
 
 
 def fuse_recording(
     job: Job,
     run: Run,
-    priors: Sequence[Prior],
+    initial: str | Sequence[Prior] | None = None,
+    measurements: Sequence[Measurement] | None = None,
     *,
     as_json: bool,
     report: bool,
-    measurements: Sequence[Measurement] | None = None,
 ) -> None:
     """Fuse a whole run, write the output files and the report, print the result.
 
-    ``measurements``: those of the run in the order in which they came, if not by time.
+    ``initial`` and ``measurements`` are those of :func:`relpos.fuse`.
     """
-    from relpos.runs import write_estimates
+    from relpos import api
+    from relpos.evaluation import report as reports
 
-    passage = _pass_through(job, run, priors, measurements)
-    write_estimates(job.out, passage.estimates, steps=run.steps)
-    if passage.failure is not None:
-        raise passage.failure
-    if passage.interrupted:
-        raise RelposError(f"interrupted; the estimates so far are in {job.out}")
-    result = _result(job, passage, priors)
-    scored = _score(run, result) if run.truth else None
+    try:
+        with output.progress(output.STAGES) as progress:
+            result = api.fuse(
+                run,
+                job.estimator,
+                seed=job.seed,
+                settings=job.settings,
+                smooth=job.smooth,
+                initial=initial,
+                measurements=measurements,
+                progress=progress,
+            )
+    except (RelposError, FusionInterrupted) as error:
+        if error.result is not None:
+            error.result.save(job.out, run.steps)
+        if isinstance(error, FusionInterrupted):
+            raise RelposError(f"interrupted; the estimates so far are in {job.out}") from None
+        raise
+    result.save(job.out, run.steps)
+    evaluation, baseline = None, None
+    if run.truth:
+        # The truth may be at no time of an estimate.
+        with suppress(DataError):
+            evaluation = api.evaluate(result, run)
+            baseline = reports.reckon(run, result)
     if report:
         with output.working("drawing"):
-            write_page(run, result, job.out / "index.html", scored)
+            content = reports.gather(run, result, evaluation=evaluation, baseline=baseline)
+            reports.write(content, job.out / "index.html")
     counters = {**run.counters, **result.counters}
-    _tell(job, run.name, counters, result.estimates, scored, as_json=as_json)
-
-
-def fused(run: Run, estimator: str, settings: dict[str, str], seed: int, *, smooth: bool) -> Result:
-    """Fuse a whole run as ``relpos fuse`` does, and write nothing."""
-    job = Job(run.name, estimator, settings, seed, Path(), smooth=smooth)
-    passage = _pass_through(job, run, run.priors)
-    if passage.failure is not None:
-        raise passage.failure
-    if passage.interrupted:
-        raise KeyboardInterrupt
-    return _result(job, passage, run.priors)
-
-
-def _pass_through(
-    job: Job,
-    run: Run,
-    priors: Sequence[Prior],
-    measurements: Sequence[Measurement] | None = None,
-) -> Passage:
-    from relpos.evaluation.result import pass_through
-
-    _check_usable(run, job.estimator)
-    given = run.measurements if measurements is None else measurements
-    job.prepare(priors)
-    return pass_through(
-        job.make(priors, run.nodes),
-        output.with_progress(given, len(given), "fusing"),
-        output.working("finishing"),
-    )
-
-
-def _result(job: Job, passage: Passage, priors: Sequence[Prior]) -> Result:
-    from relpos.evaluation.result import result_of
-
-    return result_of(
-        job.estimator,
-        passage,
-        seed=job.seed,
-        settings=job.settings,
-        priors=priors,
-        smoothed=job.smooth,
-    )
-
-
-def _check_usable(run: Run, estimator: str) -> None:
-    """Refuse a run nothing can be concluded from, before anything is computed."""
-    if not run.motions:
-        raise DataError(
-            f"{run.directory or run.name}: no motion in this run (motion.csv): nothing to fuse"
-        )
-    if estimator == DEADRECKONING:
-        return
-    if not run.ranges:
-        raise DataError(
-            f"{run.directory or run.name}: no ranges in this run (ranges.csv): nothing to fuse"
-        )
-    if all(measured.range_m <= 0.0 for measured in run.ranges):
-        raise DataError(
-            f"{run.directory or run.name}: all {len(run.ranges)} ranges are 0, which marks a "
-            "failed measurement: nothing to fuse"
-        )
-
-
-def _priors(run: Run, initial: Initial | None) -> tuple[Prior, ...]:
-    from relpos.runs import InitialPose
-
-    if initial is None:
-        return run.priors
-    words = {
-        Initial.UNKNOWN: InitialPose.UNKNOWN,
-        Initial.COMMON: InitialPose.COMMON,
-        Initial.TRUTH: InitialPose.FROM_TRUTH,
-    }
-    return run.priors_for(words[initial])
-
-
-@dataclass(frozen=True)
-class _Scored:
-    """The fusion's score, beside that of dead reckoning over the same run."""
-
-    evaluation: Evaluation
-    baseline: Baseline | None
-    bound: Bound | None
-
-
-def _score(run: Run, result: Result) -> _Scored | None:
-    from relpos.evaluation import report, scoring
-
-    bound = scoring.bound_of(run)
-    evaluation = scoring.evaluate_result(run, result, bound)
-    if evaluation is None:
-        return None
-    return _Scored(evaluation, report.reckon(run, result), bound)
-
-
-def write_page(run: Run, result: Result, path: Path, scored: _Scored | None = None) -> None:
-    """Write the report of a run."""
-    from relpos.evaluation import report
-
-    content = report.gather(
-        run,
-        result,
-        evaluation=None if scored is None else scored.evaluation,
-        bound=None if scored is None else scored.bound,
-        baseline=None if scored is None else scored.baseline,
-    )
-    report.write(content, path)
+    outcome = Outcome(run.name, counters, result.estimates, len(result.estimates))
+    _print_outcome(job, outcome, evaluation, baseline, as_json=as_json)
 
 
 def _fuse_port(
@@ -484,7 +398,7 @@ def fuse_live(
     description = description or Description(name=_base_name(job.source))
     name = description.name or _base_name(job.source)
     fused = live.Fused(str(job.estimator), job.settings, job.seed, tuple(priors), common=common)
-    outcome = live.run(
+    session = live.run(
         source,
         FusionThread(lambda known: job.make(known, description.nodes), priors, common=common),
         options,
@@ -495,52 +409,59 @@ def fuse_live(
         keep_received=source.is_now,
         emulated=emulated is not None,
     )
-    failure = outcome.failure
+    failure = session.failure
     walk_is_over = emulated is not None and emulated() and isinstance(failure, DeviceError)
     if failure is not None and not walk_is_over:
         raise live.told(failure, job.out)
-    last = [outcome.last] if outcome.last is not None else []
-    _tell(job, name, outcome.counters, last, None, as_json=as_json, count=outcome.estimates)
+    last = [session.last] if session.last is not None else []
+    _print_outcome(job, Outcome(name, session.counters, last, session.estimates), as_json=as_json)
 
 
-def _tell(
+@dataclass(frozen=True)
+class Outcome:
+    """What is printed of a run or session: ``estimates`` are all of ``count``, or the last."""
+
+    name: str
+    counters: Mapping[str, Any]
+    estimates: Sequence[Estimate]
+    count: int
+
+
+def _print_outcome(
     job: Job,
-    name: str,
-    counters: Mapping[str, Any],
-    estimates: Sequence[Estimate],
-    scored: _Scored | None,
+    outcome: Outcome,
+    evaluation: Evaluation | None = None,
+    baseline: Baseline | None = None,
     *,
     as_json: bool,
-    count: int | None = None,
 ) -> None:
-    """Print the result; ``count`` where ``estimates`` are not all there were."""
     from relpos.evaluation import summary
 
-    baseline = scored.baseline.metrics if scored and scored.baseline else None
-    bound = scored.evaluation.bound if scored else None
+    reckoned = baseline.metrics if baseline else None
     if as_json:
+        bound = evaluation.bound if evaluation else None
         output.print_json(
             {
-                "run": name,
+                "run": outcome.name,
                 "estimator": job.estimator,
                 "seed": job.seed,
                 "out": str(job.out),
-                "estimates": len(estimates) if count is None else count,
-                "counters": counters,
-                **(summary.as_json(scored.evaluation.metrics) if scored else summary.no_metrics()),
-                "iso_18305": summary.iso_as_json(scored.evaluation.iso) if scored else None,
-                "dead_reckoning": summary.figures(baseline) if baseline else None,
+                "estimates": outcome.count,
+                "counters": outcome.counters,
+                **(summary.as_json(evaluation.metrics) if evaluation else summary.no_metrics()),
+                "iso_18305": summary.iso_as_json(evaluation.iso) if evaluation else None,
+                "dead_reckoning": summary.figures(reckoned) if reckoned else None,
                 "bound": asdict(bound) if bound else None,
             }
         )
         return
-    output.print_last_pairs(f"{name}: {job.estimator}", estimates)
-    if scored is not None:
-        output.print_metrics(f"{name}: scored", scored.evaluation.metrics, baseline)
-        output.print_iso(scored.evaluation.iso)
-        if bound is not None:
-            output.print_bound(bound)
-    noted = {key: value for key, value in counters.items() if value}
+    output.print_last_pairs(f"{outcome.name}: {job.estimator}", outcome.estimates)
+    if evaluation is not None:
+        output.print_metrics(f"{outcome.name}: scored", evaluation.metrics, reckoned)
+        output.print_iso(evaluation.iso)
+        if evaluation.bound is not None:
+            output.print_bound(evaluation.bound)
+    noted = {key: value for key, value in outcome.counters.items() if value}
     if noted:
         output.remark("counted: " + ", ".join(f"{k} {v:g}" for k, v in sorted(noted.items())))
     output.remark(f"written to {job.out}")

@@ -26,7 +26,13 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 PROGRESS_AFTER_S = 1.0
-"""Nothing is shown for what is quicker than this; the promise is two seconds."""
+"""A quicker stage shows nothing; the promise is two seconds."""
+
+FEW_PARTS = 10
+"""A stage of fewer parts reports too seldom: a log announces it by a line."""
+
+STAGES = {"compiling": "compiling the estimator, once after an installation"}
+"""Stages of :func:`relpos.fuse` in the words of the command line."""
 
 PLAIN_PROGRESS_EVERY_S = 5.0
 """Where stderr is no terminal, a line this often does not flood a log."""
@@ -53,76 +59,87 @@ def parse_settings(pairs: Sequence[str]) -> dict[str, str]:
     return settings
 
 
-def with_progress(items: Iterable[T], total: int | None, label: str) -> Iterator[T]:
-    """Pass the items on and show how far it is, once it takes noticeably long."""
-    from rich.console import Console
-    from rich.progress import Progress
+class Progress:
+    """Shows how far a task is: a bar in a terminal, a line every few seconds in a log.
 
-    console = Console(stderr=True)
-    started = last_said = time.monotonic()
-    bar: Progress | None = None
-    task = None
-    try:
-        for done, item in enumerate(items):
-            now = time.monotonic()
-            if console.is_terminal:
-                if bar is None and now - started > PROGRESS_AFTER_S:
-                    bar = Progress(console=console, transient=True)
-                    bar.start()
-                    task = bar.add_task(label, total=total)
-                if bar is not None and task is not None:
-                    bar.update(task, completed=done)
-            elif now - last_said > PLAIN_PROGRESS_EVERY_S:
-                last_said = now
-                share = f"{100 * done // total} %" if total else f"{done}"
-                print(f"{label}: {share}", file=sys.stderr, flush=True)
-            yield item
-    finally:
-        if bar is not None:
-            bar.stop()
+    Call it with the stage of the task, and how many of how many parts are done; a total of 0 says
+    that the length is not known, None that there is no end. Quick stages show nothing.
+    """
+
+    def __init__(self) -> None:
+        from rich.console import Console
+
+        self._console = Console(stderr=True)
+        self._stage: str | None = None
+        self._bar: Any = None
+        self._started_s = self._printed_s = 0.0
+        self._late: Timer | None = None
+
+    def __call__(self, stage: str, done: int, total: int | None) -> None:
+        """Show the stage."""
+        now_s = time.monotonic()
+        if stage != self._stage:
+            self.close()
+            self._stage, self._started_s, self._printed_s = stage, now_s, now_s
+            if total is not None and total < FEW_PARTS and not self._console.is_terminal:
+                # Only a stage that really takes long is announced: a quick failure stays one line.
+                self._late = Timer(PROGRESS_AFTER_S, remark, args=(f"{stage} ...",))
+                self._late.daemon = True
+                self._late.start()
+        if self._console.is_terminal:
+            self._draw(stage, done, total, now_s)
+        elif done and now_s - self._printed_s > PLAIN_PROGRESS_EVERY_S:
+            self._printed_s = now_s
+            remark(f"{stage}: {100 * done // total} %" if total else f"{stage}: {done}")
+
+    def _draw(self, stage: str, done: int, total: int | None, now_s: float) -> None:
+        from rich.progress import Progress as Bar
+
+        if self._bar is None:
+            if total and now_s - self._started_s < PROGRESS_AFTER_S:
+                return
+            self._bar = Bar(console=self._console, transient=True)
+            self._bar.start()
+            self._bar.add_task(stage, total=total or None)
+        self._bar.update(self._bar.task_ids[0], completed=done, total=total or None)
+
+    def close(self) -> None:
+        """Remove what is shown."""
+        if self._late is not None:
+            self._late.cancel()
+        if self._bar is not None:
+            self._bar.stop()
+        self._stage = self._late = self._bar = None
 
 
 @contextmanager
-def counting(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Give what is to be called after every job with how many are done of how many."""
-    from rich.console import Console
-    from rich.progress import Progress
+def progress(words: Mapping[str, str] | None = None) -> Iterator[Callable[[str, int, int], None]]:
+    """Yield a callback for long tasks of :mod:`relpos.api`; ``words``: stage -> what is shown."""
+    shown = Progress()
+    names = words or {}
+    try:
+        yield lambda stage, done, total: shown(names.get(stage, stage), done, total)
+    finally:
+        shown.close()
 
-    console = Console(stderr=True)
-    if console.is_terminal:
-        with Progress(console=console, transient=True) as bar:
-            task = bar.add_task(label, total=None)
-            yield lambda done, total: bar.update(task, completed=done, total=total)
-        return
-    last_said = time.monotonic()
 
-    def say(done: int, total: int) -> None:
-        nonlocal last_said
-        if time.monotonic() - last_said > PLAIN_PROGRESS_EVERY_S:
-            last_said = time.monotonic()
-            print(f"{label}: {done} of {total}", file=sys.stderr, flush=True)
-
-    yield say
+def with_progress(items: Iterable[T], total: int | None, label: str) -> Iterator[T]:
+    """Yield the items and show the progress."""
+    shown = Progress()
+    try:
+        for done, item in enumerate(items):
+            shown(label, done, total)
+            yield item
+    finally:
+        shown.close()
 
 
 @contextmanager
 def working(label: str) -> Iterator[None]:
-    """Show that something of unknown length is going on: a spinner, or a line in a log."""
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    if console.is_terminal:
-        with console.status(label):
-            yield
-        return
-    # Only what really takes long is announced: a quick failure stays one line.
-    late = Timer(PROGRESS_AFTER_S, remark, args=(f"{label} ...",))
-    late.daemon = True
-    late.start()
-    try:
+    """Show a task of unknown length."""
+    with progress() as show:
+        show(label, 0, 0)
         yield
-    finally:
-        late.cancel()
 
 
 def print_evaluation(score: Evaluation) -> None:

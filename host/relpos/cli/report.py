@@ -43,18 +43,19 @@ def report(
     Of an estimate that is there (--estimate), or of one that is made now. The page is one file
     that needs no other: metrics of ISO/IEC 18305 among the numbers, all of them in it as JSON too.
     """
+    from relpos import api
     from relpos.evaluation import report as reports
     from relpos.evaluation.result import read_result
-    from relpos.sources import load
 
-    recording = load(run)
+    recording = api.load(run)
     if estimate is not None:
         result = read_result(estimate)
     else:
-        from relpos.cli.fuse import fused
-
         chosen = output.parse_settings(settings or [])
-        result = fused(recording, estimator, chosen, seed, smooth=smooth)
+        with output.progress(output.STAGES) as progress:
+            result = api.fuse(
+                recording, estimator, seed=seed, settings=chosen, smooth=smooth, progress=progress
+            )
     with output.working("drawing"):
         words = [] if estimate is None else [f"relpos report {run} --estimate {estimate}"]
         content = reports.gather(recording, result, words=words)

@@ -24,11 +24,10 @@ def simulate(
 ) -> None:
     """Simulate a team and write its measurements, priors and truth as a run directory."""
     chosen = output.parse_settings(settings or [])
-    from relpos.runs import save_run
-    from relpos.simulation.scenarios import simulate_run
+    from relpos import api
 
-    run = simulate_run(scenario, seed, chosen)
-    save_run(run, out)
+    run = api.simulate(scenario, seed, **chosen)
+    api.save(run, out)
     output.remark(
         f"{len(run.motions)} motions and {len(run.ranges)} ranges of {len(run.node_ids)} nodes "
         f"written to {out}"

@@ -1,11 +1,10 @@
-"""What one estimator made of one run, and what was seen of it on the way."""
+"""Running an estimator over a run, and the result with its tables."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -41,13 +40,20 @@ POSE_COLUMNS = (
 _TABLES = {"poses": POSE_COLUMNS, "pairs": PAIR_COLUMNS, "parameters": PARAMETER_COLUMNS}
 
 
-@dataclass(frozen=True)
-class Passage:
-    """Everything an estimator gave over a sequence of measurements, and when.
+Progress = Callable[[str, int, int], None]
+"""Called with the stage of a long task, and how many of how many parts of it are done.
 
-    ``emitted_s`` (T,) is the time of the measurement upon which each estimate came out,
-    ``computing_s`` the estimator's wall time over all ``measurements``. ``failure`` is why it
-    gave up, ``interrupted`` whether Ctrl-C ended it; what came before is there in both cases.
+A total of 0 parts says that the length of the stage is not known.
+"""
+
+
+@dataclass(frozen=True)
+class EstimatorRun:
+    """The estimates of one estimator over a sequence of measurements, with their times.
+
+    ``emitted_s`` (T,) is the time of the measurement upon which each estimate was returned,
+    ``computing_s`` the estimator's wall time over all ``measurements``. ``failure`` is the error
+    that ended it, ``interrupted`` tells whether Ctrl-C did; earlier estimates are kept.
     """
 
     estimates: tuple[Estimate, ...] = ()
@@ -60,7 +66,7 @@ class Passage:
 
     @property
     def latency(self) -> Latency | None:
-        """How much later than its own time an estimate came; None without estimates."""
+        """How much later than its own time an estimate was returned; None without estimates."""
         if not self.estimates or not self.emitted_s.size:
             return None
         own_s = np.array([estimate.time_s for estimate in self.estimates])
@@ -73,16 +79,17 @@ class Passage:
         )
 
 
-def pass_through(
+def run_estimator(
     estimator: Estimator,
-    measurements: Iterable[Measurement],
-    finishing: AbstractContextManager[None] | None = None,
-) -> Passage:
-    """Give an estimator every measurement in order, and let it finish within ``finishing``.
+    measurements: Sequence[Measurement],
+    progress: Progress | None = None,
+) -> EstimatorRun:
+    """Pass every measurement to an estimator in order, then let it finish.
 
-    A RelposError of it, or Ctrl-C, ends the passage and is kept in it; any other error is a fault
-    of the program and goes through.
+    A RelposError of the estimator, or Ctrl-C, ends the run and is stored in it; any other error
+    is a fault of the program and is raised.
     """
+    progress = progress or (lambda stage, done, total: None)
     estimates: list[Estimate] = []
     emitted: list[float] = []
     computing, count, now_s = 0.0, 0, -math.inf
@@ -90,6 +97,7 @@ def pass_through(
     interrupted = False
     try:
         for measurement in measurements:
+            progress("fusing", count, len(measurements))
             now_s = max(now_s, measurement.time_s)
             count += 1
             started = time.perf_counter()
@@ -102,15 +110,15 @@ def pass_through(
     except RelposError as error:
         failure = error
     try:
+        progress("finishing", 0, 0)
         started = time.perf_counter()
-        with finishing or nullcontext():
-            new = estimator.finish()
+        new = estimator.finish()
         computing += time.perf_counter() - started
         estimates += new
         emitted += len(new) * [now_s]
     except RelposError as error:
         failure = failure or error
-    return Passage(
+    return EstimatorRun(
         tuple(estimates),
         np.array(emitted),
         computing,
@@ -123,10 +131,11 @@ def pass_through(
 
 @dataclass(frozen=True)
 class Result:
-    """An estimator's estimates of one run: what ``fuse`` gives and ``evaluate`` takes.
+    """An estimator's estimates of one run: what ``fuse`` returns and ``evaluate`` scores.
 
-    ``parameters`` are what was learned, a row where one changed. ``priors`` are the starts it was
-    given; None where that is not known, as of files. ``passage`` is None there too.
+    ``parameters`` are the learned values, a row for each change. ``priors`` are the starts that
+    the estimator began with. ``priors`` and ``estimator_run`` are None for a result that was read
+    from files.
     """
 
     estimator: str
@@ -137,12 +146,12 @@ class Result:
     settings: Mapping[str, object] = field(default_factory=dict)
     priors: tuple[Prior, ...] | None = None
     smoothed: bool = False
-    passage: Passage | None = None
+    estimator_run: EstimatorRun | None = None
 
     @property
     def latency(self) -> Latency | None:
-        """How much later than its own time an estimate came out; None where not seen."""
-        return None if self.passage is None else self.passage.latency
+        """How much later than its own time an estimate was returned; None where not observed."""
+        return None if self.estimator_run is None else self.estimator_run.latency
 
     def arrays(self, table: str = "poses") -> dict[str, npt.NDArray[Any]]:
         """Return a table as arrays (n,), one a column, by time and node.
@@ -205,24 +214,24 @@ class Result:
 
 def result_of(
     estimator: str,
-    passage: Passage,
+    estimator_run: EstimatorRun,
     *,
     seed: int | None = None,
     settings: Mapping[str, object] | None = None,
     priors: Sequence[Prior] | None = None,
     smoothed: bool = False,
 ) -> Result:
-    """Put what an estimator gave together as a result."""
+    """Make a result of an estimator's run."""
     return Result(
         estimator,
-        passage.estimates,
-        _learned(passage.estimates),
-        passage.counters,
+        estimator_run.estimates,
+        _learned(estimator_run.estimates),
+        estimator_run.counters,
         seed,
         dict(settings or {}),
         None if priors is None else tuple(priors),
         smoothed,
-        passage,
+        estimator_run,
     )
 
 

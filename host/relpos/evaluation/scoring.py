@@ -1,4 +1,4 @@
-"""One estimate of one run, scored in every way there is: what ``evaluate`` and reports tell."""
+"""The score of one result against its run's truth, which ``evaluate`` and reports show."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from relpos.evaluation import consistency, iso18305, metrics, regions, summary
 if TYPE_CHECKING:
     from relpos.evaluation.bounds import Bound, Totals
     from relpos.evaluation.result import Result
-    from relpos.fusion.estimator import Estimate
     from relpos.measurements import Prior
     from relpos.runs import Run
 
@@ -24,9 +23,9 @@ class Evaluation:
     """Every figure of one estimate against a run's truth; ``print`` shows the main ones.
 
     ``metrics`` are the run format's four, per pair and over time; ``iso`` those of ISO/IEC 18305.
-    ``nees_position`` and ``nees_heading`` are there where the run gave every start, so that
-    absolute poses can be held against the truth; ``ambiguity`` where anything was ambiguous;
-    ``bound`` where the run was simulated and its Cramer-Rao bound was asked for.
+    ``nees_position`` and ``nees_heading`` need the start of every node, so that absolute poses can
+    be compared with the truth; ``ambiguity`` is None where no node was ambiguous; ``bound`` is
+    that of a simulated run, as totals and over time.
     """
 
     run: str
@@ -36,7 +35,12 @@ class Evaluation:
     nees_position: consistency.Nees | None = None
     nees_heading: consistency.Nees | None = None
     ambiguity: regions.Ambiguity | None = None
-    bound: Totals | None = None
+    bound_over_time: Bound | None = None
+
+    @property
+    def bound(self) -> Totals | None:
+        """The root mean square bounds over the whole run."""
+        return None if self.bound_over_time is None else self.bound_over_time.totals()
 
     def as_json(self) -> dict[str, Any]:
         """Return what ``relpos evaluate --json`` prints; None where nothing can be said."""
@@ -47,7 +51,7 @@ class Evaluation:
             "nees_heading": _nees(self.nees_heading),
             "alternatives": summary.ambiguity_as_json(self.ambiguity),
             "iso_18305": summary.iso_as_json(self.iso),
-            "bound": None if self.bound is None else asdict(self.bound),
+            "bound": None if (bound := self.bound) is None else asdict(bound),
         }
 
     def __str__(self) -> str:
@@ -66,29 +70,25 @@ class Evaluation:
             words = f"  horizontal error        mean {_metres(flat.mean_m)}, RMS "
             words += f"{_metres(flat.rms_m)}, CE50 {_metres(flat.e50_m)}, CE95 "
             lines.append(words + f"{_metres(flat.e95_m)} ({frame.replace('_', ' ')})")
-        if self.bound is not None:
+        bound = self.bound
+        if bound is not None:
             lines.append(
-                f"  bound, on line          {_metres(self.bound.filtering_distance_m)} relative "
-                f"distance, {_metres(self.bound.filtering_position_m)} aligned"
+                f"  bound, on line          {_metres(bound.filtering_distance_m)} relative "
+                f"distance, {_metres(bound.filtering_position_m)} aligned"
             )
         return "\n".join(lines)
 
 
-def evaluate(
-    run: Run,
-    estimates: Sequence[Estimate],
-    priors: Sequence[Prior] | None = None,
-    *,
-    latency: iso18305.Latency | None = None,
-    bound: Totals | None = None,
-) -> Evaluation:
-    """Score estimates against the truth of their run.
+def evaluate(run: Run, result: Result, *, bound: bool = True) -> Evaluation:
+    """Score a result against the truth of its run.
 
-    ``priors`` are the starts that the estimator was given; without them, those of the run.
-    DataError where there is no truth, or none at a time of which there is an estimate.
+    The starts are those of the result, or of the run where the result has none. ``bound`` computes
+    the Cramer-Rao bound of a simulated run. DataError where there is no truth, or none at a time
+    of an estimate.
     """
-    need_truth(run)
-    priors = run.priors if priors is None else priors
+    check_truth(run)
+    estimates = result.estimates
+    priors = run.priors if result.priors is None else result.priors
     truth = tracks.true_tracks(run.truth)
     estimated = tracks.estimated_tracks(estimates)
     score = metrics.evaluate(estimated, truth, tracks.estimated_pairs(estimates))
@@ -102,7 +102,7 @@ def evaluate(
         truth,
         common_frame=starts_known,
         located=tracks.located_tracks(estimates),
-        latency=latency,
+        latency=result.latency,
     )
     if not score.epochs and not iso.known:
         raise DataError(f"{run.name}: no node has an estimate and a truth at the same time")
@@ -116,25 +116,11 @@ def evaluate(
         regions.summarise(
             estimates, truth, run.ranges, starts_known=bool(priors) and not _common(run, priors)
         ),
-        bound,
+        bound_of(run) if bound else None,
     )
 
 
-def evaluate_result(run: Run, result: Result, bound: Bound | None = None) -> Evaluation | None:
-    """Score a result; None where nothing was estimated at a time of which the truth is known."""
-    try:
-        return evaluate(
-            run,
-            result.estimates,
-            result.priors,
-            latency=result.latency,
-            bound=None if bound is None else bound.totals(),
-        )
-    except DataError:
-        return None
-
-
-def need_truth(run: Run) -> None:
+def check_truth(run: Run) -> None:
     """Raise DataError where a run has no truth."""
     if not run.truth:
         raise DataError(f"{run.directory or run.name}: the run has no truth to score against")

@@ -129,6 +129,21 @@ class Run:
         priors = _priors_from_truth(self)
         return tuple(priors[node] for node in sorted(priors))
 
+    def check_usable(self, *, needs_ranges: bool = True) -> None:
+        """Raise DataError where nothing can be concluded: without motion, or without ranges."""
+        where, ranges = self.directory or self.name, self.ranges
+        if not self.motions:
+            raise DataError(f"{where}: no motion in this run (motion.csv): nothing to fuse")
+        if not needs_ranges:
+            return
+        if not ranges:
+            raise DataError(f"{where}: no ranges in this run (ranges.csv): nothing to fuse")
+        if all(measured.range_m <= 0.0 for measured in ranges):
+            raise DataError(
+                f"{where}: all {len(ranges)} ranges are 0, which marks a failed measurement: "
+                "nothing to fuse"
+            )
+
     def load_imu(self) -> dict[int, ImuRecording]:
         """Read the raw inertial recording of every node; empty where the run has none."""
         return read_imu(self.directory) if self.directory is not None else {}

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from relpos import tracks
-from relpos.errors import RelposError
+from relpos.errors import DataError, RelposError
 from relpos.evaluation import health, metrics, ranging, scoring, summary
 from relpos.evaluation.metrics import Metrics
-from relpos.evaluation.result import Result, pass_through
+from relpos.evaluation.result import Result, run_estimator
 from relpos.fusion.estimator import NodeStatus
 from relpos.measurements import Prior
 from relpos.tracks import Alignment, Pairs, Tracks, align, sample, whole_seconds
@@ -125,18 +126,18 @@ def gather(
     result: Result,
     *,
     evaluation: Evaluation | None = None,
-    bound: Bound | None = None,
     baseline: Baseline | None = None,
     words: Sequence[str] = (),
 ) -> Content:
-    """Gather what a report tells; what is not handed over is computed.
+    """Gather the content of a report; the parts that are not passed are computed.
 
-    A run without truth, or one whose truth is at no time of which there is an estimate, gives
-    content without an evaluation.
+    A run without truth, or with truth at no time of an estimate, gives content without an
+    evaluation.
     """
-    bound = bound or scoring.bound_of(run)
     if evaluation is None and run.truth:
-        evaluation = scoring.evaluate_result(run, result, bound)
+        with suppress(DataError):
+            evaluation = scoring.evaluate(run, result)
+    bound = None if evaluation is None else evaluation.bound_over_time
     truth = tracks.true_tracks(run.truth)
     fused = tracks.located_tracks(result.estimates)
     pairs = tracks.estimated_pairs(result.estimates)
@@ -151,7 +152,7 @@ def gather(
         ranging.heard(run.measurements, fused, truth, pairs),
         health.of_run(run.motions, run.statuses, run.node_ids),
         evaluation,
-        bound,
+        bound or scoring.bound_of(run),
         baseline if baseline is not None else reckon(run, result),
         words,
     )
@@ -177,7 +178,7 @@ def reckon(run: Run, result: Result) -> Baseline | None:
             priors = _first_located(result)
             words = "dead reckoning from where the fusion first located each"
     try:
-        made = pass_through(
+        made = run_estimator(
             fusion.make("deadreckoning", priors, {}, result.seed or 0), run.measurements
         )
     except RelposError:

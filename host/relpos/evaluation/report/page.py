@@ -87,7 +87,7 @@ def _figure(picture: Picture, svg: str) -> str:
 def _subtitle(content: Content) -> str:
     result, run = content.result, content.run
     parts = [f"estimator {result.estimator}" + (", smoothed" if result.smoothed else "")]
-    if result.passage is None:
+    if result.estimator_run is None:
         parts = ["an estimate that was read"]
     if result.seed is not None:
         parts.append(f"seed {result.seed}")
