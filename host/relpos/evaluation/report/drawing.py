@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,13 +15,16 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.evaluation.style import DARK, STYLE
-from relpos.tracks import MAX_GAP_S
+from relpos.tracks import MAX_GAP_S, Tracks, interpolate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Floats = npt.NDArray[np.float64]
+
+MOST_PANELS = 15
+"""All pairs of six nodes; more would be too small to read."""
 
 MANY_DOTS = 3000
 """More dots than this become pixels: a page of a long session stays a few megabytes."""
@@ -162,3 +166,26 @@ def grid(figure: Figure, count: int, columns: int, *, sharey: bool = True) -> Se
             axes.set_xlabel("time (s)")
             axes.xaxis.set_tick_params(labelbottom=True)
     return list(panels[:count])
+
+
+def flat_distance(tracks: Tracks, pair: tuple[int, int], at_s: Floats) -> Floats:
+    """Return the horizontal distance of a pair at given times (n,), NaN where not known."""
+    if pair[0] not in tracks or pair[1] not in tracks:
+        return np.full(at_s.shape, np.nan)
+    a, b = (tracks[node] for node in pair)
+    dx = interpolate(a.time_s, a.x_m, at_s) - interpolate(b.time_s, b.x_m, at_s)
+    dy = interpolate(a.time_s, a.y_m, at_s) - interpolate(b.time_s, b.y_m, at_s)
+    result: Floats = np.hypot(dx, dy)
+    return result
+
+
+def logarithmic(axes: Axes, bottom: float) -> None:
+    """Make the y axis logarithmic from ``bottom`` on, with plain numbers."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set_yscale("log")
+    axes.set_ylim(bottom=bottom)
+    decades = math.log10(axes.get_ylim()[1] / bottom)
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades < 3.0 else (1.0,)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())

@@ -13,8 +13,9 @@ import numpy.typing as npt
 from relpos.evaluation import ranging
 from relpos.evaluation.iso18305 import Accuracy, Frame, Magnitudes
 from relpos.evaluation.metrics import PairMetrics
+from relpos.evaluation.report.consistency_figures import STATUS_WORDS
 from relpos.evaluation.report.content import Content
-from relpos.evaluation.report.pictures import STATUS_WORDS, TEAM_WIDE
+from relpos.evaluation.report.node_figures import TEAM_WIDE
 from relpos.evaluation.summary import figure
 from relpos.nodes.health import Health
 
