@@ -45,7 +45,7 @@ def main() -> None:
         run = simulate_paper(given.scenario, seed, overrides)
         scores.append(score(run, fusion.make_smoother("bank", run.priors, {}, seed)))
         online.append(score(run, fusion.make("bank", run.priors, {}, seed)))
-        least.append(bounds.of_paper(given.scenario, seed, overrides).totals())
+        least.append(bounds.of_simulated(given.scenario, seed, overrides).totals())
         bound = bounds.over_seeds(least)
         distance = np.array([s.relative_distance_rmse_m for s in scores])
         position = np.array([s.relative_position_rmse_m for s in scores])

@@ -11,7 +11,9 @@ import pytest
 from scipy.optimize import least_squares
 
 from relpos.evaluation import bounds
+from relpos.simulation import true_run
 from relpos.simulation.paper import settings_of, simulate_paper
+from relpos.simulation.true_run import TrueRun
 
 Floats = npt.NDArray[np.float64]
 
@@ -24,7 +26,7 @@ def _scene(
     constants: bool = False,
     start: float = 0.0,
     seed: int = 1,
-) -> bounds.Scene:
+) -> TrueRun:
     """Three people on curved ways, every pair ranging now and then."""
     rng = np.random.default_rng(seed)
     step = np.array([0.6, 0.0]) + 0.3 * rng.standard_normal((3, steps, 2))
@@ -34,7 +36,7 @@ def _scene(
     chosen = np.sort(rng.integers(1, steps + 1, 2 * steps)).astype(float)
     if off_grid:
         chosen -= rng.choice([0.0, 0.25, 0.6], chosen.size)
-    return bounds.Scene(
+    return TrueRun(
         np.arange(steps + 1.0),
         position,
         np.full((3, steps), 0.1),
@@ -50,8 +52,8 @@ def _scene(
     )
 
 
-def _paper_scene(name: str, seed: int, overrides: dict[str, float | str]) -> bounds.Scene:
-    return bounds.paper_scene(settings_of(name, overrides), simulate_paper(name, seed, overrides))
+def _paper_scene(name: str, seed: int, overrides: dict[str, float | str]) -> TrueRun:
+    return true_run.of_paper(settings_of(name, overrides), simulate_paper(name, seed, overrides))
 
 
 class _Dense:
@@ -60,7 +62,7 @@ class _Dense:
     A vector of unit errors says how the true way differs from the reported one.
     """
 
-    def __init__(self, scene: bounds.Scene) -> None:
+    def __init__(self, scene: TrueRun) -> None:
         self.scene = scene
         self.chord = np.diff(scene.position_m, axis=1)
         count, steps = scene.along.shape
@@ -142,7 +144,7 @@ def test_the_recursion_is_the_inverse_of_the_whole_information(
     off_grid: bool, constants: bool, start: float
 ) -> None:
     scene = _scene(off_grid=off_grid, constants=constants, start=start)
-    bound = bounds.of_scene(scene)
+    bound = bounds.of_true_run(scene)
     dense = _Dense(scene)
     for until_s, pair_m, position_m in (
         (scene.time_s + 1e-9, bound.filtering_pair_m, bound.filtering_position_m),
@@ -206,7 +208,9 @@ def test_the_best_estimator_scatters_as_the_bound_says() -> None:
         squares.append(np.mean(error[:, 1:] ** 2))
     scatter = math.sqrt(np.mean(squares))
     # 150 runs: the standard error of the root mean square is below 4 %.
-    assert scatter == pytest.approx(bounds.of_scene(scene).totals().smoothing_distance_m, rel=0.1)
+    assert scatter == pytest.approx(
+        bounds.of_true_run(scene).totals().smoothing_distance_m, rel=0.1
+    )
 
 
 def test_more_ranges_never_raise_the_bound() -> None:
@@ -215,7 +219,7 @@ def test_more_ranges_never_raise_the_bound() -> None:
         name: getattr(scene, name)[::2]
         for name in ("range_time_s", "range_nodes", "range_information")
     }
-    everything, half = bounds.of_scene(scene), bounds.of_scene(replace(scene, **fewer))
+    everything, half = bounds.of_true_run(scene), bounds.of_true_run(replace(scene, **fewer))
     slack = 1e-9
     assert (half.filtering_pair_m >= everything.filtering_pair_m - slack).all()
     assert (half.smoothing_pair_m >= everything.smoothing_pair_m - slack).all()
@@ -224,7 +228,7 @@ def test_more_ranges_never_raise_the_bound() -> None:
 
 
 def test_the_last_epoch_is_smoothed_by_nothing() -> None:
-    bound = bounds.of_scene(_scene(off_grid=True))
+    bound = bounds.of_true_run(_scene(off_grid=True))
     assert bound.smoothing_pair_m[-1] == pytest.approx(bound.filtering_pair_m[-1])
 
 
@@ -241,7 +245,7 @@ def test_the_bound_has_the_known_values(
     scenario: str, filtering: tuple[float, float], smoothing: tuple[float, float] | None
 ) -> None:
     """Against an independent implementation's figures over 16 other seeds; distance, aligned."""
-    total = bounds.over_seeds(bounds.of_paper(scenario, seed).totals() for seed in range(6))
+    total = bounds.over_seeds(bounds.of_simulated(scenario, seed).totals() for seed in range(6))
     assert (total.filtering_distance_m, total.filtering_position_m) == pytest.approx(
         filtering, rel=0.05
     )
@@ -253,7 +257,7 @@ def test_the_bound_has_the_known_values(
 
 def test_who_waits_at_a_known_place_is_known_there() -> None:
     """Six people start at one corner; the last leaves it after 80 s."""
-    bound = bounds.of_paper("paper", 0, {"seconds": 100})
+    bound = bounds.of_simulated("paper", 0, {"seconds": 100})
     last_two = list(zip(*np.triu_indices(6, 1), strict=True)).index((4, 5))
     waiting = bound.time_s <= 64.0
     assert (bound.filtering_pair_m[waiting, last_two] == 0.0).all()
@@ -268,17 +272,17 @@ def test_an_unknown_start_is_found_and_the_frame_does_not_matter() -> None:
     away = scene.position_m + np.array([[[0.0, 0.0]], [[4.0, 1.0]], [[1.0, 5.0]]])
     unknown = replace(scene, position_m=away)
     turned = replace(unknown, **_reordered(unknown, [2, 0, 1]))
-    one, other = bounds.of_scene(unknown), bounds.of_scene(turned)
+    one, other = bounds.of_true_run(unknown), bounds.of_true_run(turned)
     assert one.filtering_position_m[0] > 100.0
     assert one.filtering_position_m[-1] < 1.0
     assert one.filtering_position_m[100:] == pytest.approx(
         other.filtering_position_m[100:], rel=1e-3
     )
-    known = bounds.of_scene(replace(unknown, start_m=np.zeros(3), start_rad=np.zeros(3)))
+    known = bounds.of_true_run(replace(unknown, start_m=np.zeros(3), start_rad=np.zeros(3)))
     assert (known.filtering_position_m <= one.filtering_position_m + 1e-6).all()
 
 
-def _reordered(scene: bounds.Scene, order: list[int]) -> dict[str, npt.NDArray[np.generic]]:
+def _reordered(scene: TrueRun, order: list[int]) -> dict[str, npt.NDArray[np.generic]]:
     place = np.argsort(order)
     fields = (
         "position_m", "along", "turn_rad", "sigma_m", "start_m", "start_rad", "walked_m",
@@ -290,8 +294,8 @@ def _reordered(scene: bounds.Scene, order: list[int]) -> dict[str, npt.NDArray[n
 
 
 def test_ranges_that_are_sometimes_too_long_tell_less() -> None:
-    clean = bounds.of_paper("paper-p1", 0, {"seconds": 120}).totals()
-    late = bounds.of_paper("paper-p1", 0, {"seconds": 120, "nlos_probability": 0.2}).totals()
+    clean = bounds.of_simulated("paper-p1", 0, {"seconds": 120}).totals()
+    late = bounds.of_simulated("paper-p1", 0, {"seconds": 120, "nlos_probability": 0.2}).totals()
     # A fifth of the ranges tells next to nothing; the others can be told from them.
     assert late.filtering_distance_m == pytest.approx(
         clean.filtering_distance_m / math.sqrt(0.8), rel=0.08
@@ -301,9 +305,9 @@ def test_ranges_that_are_sometimes_too_long_tell_less() -> None:
 
 def test_what_is_hidden_costs_what_it_has_to_be_learned_with() -> None:
     """Scale and drift raise the bound, and are themselves known the better the later."""
-    plain = bounds.of_paper("paper-p1", 2, {"seconds": 200})
+    plain = bounds.of_simulated("paper-p1", 2, {"seconds": 200})
     hidden = {"seconds": 200, "scale_error": 0.1, "heading_drift_deg_s": 0.1}
-    bound = bounds.of_paper("paper-p1", 2, hidden)
+    bound = bounds.of_simulated("paper-p1", 2, hidden)
     assert (bound.filtering_pair_m >= plain.filtering_pair_m - 1e-9).all()
     assert bound.totals().filtering_distance_m > 1.02 * plain.totals().filtering_distance_m
     drift, scale = bound.filtering_constants.T
@@ -315,8 +319,8 @@ def test_a_kidnapped_user_is_lost_until_it_is_seen_again() -> None:
     options = {"seconds": 200, "kidnap_m": 5.0, "kidnap_s": 150.0}
     run = simulate_paper("paper-p1", 1, options)
     who = (run.hidden.kidnapped_node or 0) - 1
-    bound = bounds.of_paper("paper-p1", 1, options)
-    plain = bounds.of_paper("paper-p1", 1, {"seconds": 200})
+    bound = bounds.of_simulated("paper-p1", 1, options)
+    plain = bounds.of_simulated("paper-p1", 1, {"seconds": 200})
     first, second = np.triu_indices(6, 1)
     others = (first != who) & (second != who)
     before = bound.time_s < 150.0

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from relpos.evaluation.report import Baseline
     from relpos.evaluation.scoring import Evaluation
     from relpos.fusion.estimator import Estimate, Estimator
+    from relpos.live.assembly import MakeSink
     from relpos.live.inputs import Input
     from relpos.measurements import Measurement, Prior
     from relpos.runs import Description, NodeInfo, Run
@@ -129,7 +130,7 @@ def fuse(
     from relpos import sources
 
     chosen = output.parse_settings(settings or [])
-    sinks: list[live.MakeSink] = []
+    sinks: list[MakeSink] = []
     if terminal and json:
         raise typer.BadParameter("draws where --json prints", param_hint="--terminal")
     if terminal:
@@ -392,29 +393,36 @@ def fuse_live(
 
     ``emulated`` tells of an emulated team whether its walk is over, which ends its port.
     """
-    from relpos.live.fusion_thread import FusionThread
+    from relpos.live.assembly import SessionPlan
     from relpos.runs import Description
 
     description = description or Description(name=_base_name(job.source))
-    name = description.name or _base_name(job.source)
-    fused = live.Fused(str(job.estimator), job.settings, job.seed, tuple(priors), common=common)
-    session = live.run(
-        source,
-        FusionThread(lambda known: job.make(known, description.nodes), priors, common=common),
-        options,
-        name=name,
-        fused=fused,
-        out=job.out,
-        description=description,
-        keep_received=source.is_now,
+    nodes = description.nodes
+    plan = SessionPlan(
+        description.name or _base_name(job.source),
+        job.out,
+        description,
+        lambda known: job.make(known, nodes),
+        job.estimator,
+        job.settings,
+        job.seed,
+        tuple(priors),
+        common=common,
         emulated=emulated is not None,
+        seconds=options.seconds,
+        lasts=options.watched or (options.shown and source.is_now),
     )
+    session = live.run(source, plan, options)
     failure = session.failure
     walk_is_over = emulated is not None and emulated() and isinstance(failure, DeviceError)
     if failure is not None and not walk_is_over:
-        raise live.told(failure, job.out)
+        if isinstance(failure, DeviceError):
+            raise DeviceError(f"{failure}; what was received is in {job.out}")
+        raise failure
     last = [session.last] if session.last is not None else []
-    _print_outcome(job, Outcome(name, session.counters, last, session.estimates), as_json=as_json)
+    _print_outcome(
+        job, Outcome(plan.name, session.counters, last, session.estimates), as_json=as_json
+    )
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import os
 import re
 import sys
-import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,20 +14,16 @@ import typer
 
 from relpos.cli import output
 from relpos.cli.keys import make_link
-from relpos.errors import DeviceError
 
 if TYPE_CHECKING:
-    from relpos.live.composer import Composer
-    from relpos.live.fusion_thread import FusionThread
+    from relpos.live.assembly import MakeSink, SessionPlan
     from relpos.live.inputs import Input
     from relpos.live.session import Outcome
     from relpos.live.sinks import Sink
     from relpos.live.team_view import Hello
-    from relpos.measurements import Prior
     from relpos.recording.about import About
     from relpos.recording.recorder import Recorder
     from relpos.recording.viewer import FoxgloveServer
-    from relpos.runs import Description
     from relpos.view.web import WebView
 
 View = Annotated[bool, typer.Option("--view", help="Serve the live page, for browsers.")]
@@ -104,10 +98,6 @@ def with_default_address(arguments: Sequence[str]) -> list[str]:
     return full
 
 
-MakeSink = Callable[["Hello"], "Sink"]
-"""Makes a sink once the session's name, source and start are known."""
-
-
 @dataclass(frozen=True)
 class Options:
     """How a session is shown and stored, as the command line says.
@@ -122,7 +112,7 @@ class Options:
     open_browser: bool | None = None
     seconds: float | None = None
     speed: float = 1.0
-    sinks: Sequence[MakeSink] = field(default_factory=tuple)
+    sinks: Sequence[MakeSink] = ()
     screen: bool = False
     """The terminal is drawn upon: nothing else may be printed until the session is over."""
     record: Path | None = None
@@ -151,42 +141,6 @@ class Options:
             recording.check(self.record)
 
 
-@dataclass(frozen=True)
-class Fused:
-    """How a session is fused, as a recording has to know it."""
-
-    estimator: str
-    settings: Mapping[str, str]
-    seed: int
-    priors: Sequence[Prior] = ()
-    common: bool = False
-
-    def about(self, source: Input, description: Description, started_unix_s: float) -> About:
-        """All that a replay needs beside what is received, but for the key."""
-        from relpos.protocol import messages as wire
-        from relpos.recording.about import About
-        from relpos.runs import InitialPose
-
-        link = source.link
-        return About(
-            round(started_unix_s * 1e9),
-            source=source.name,
-            estimator=self.estimator,
-            settings=self.settings,
-            seed=self.seed,
-            initial="common" if self.common else None,
-            own_key=link is not None and link.key != wire.DEFAULT_KEY,
-            newest_counters={} if link is None else link.counters_before,
-            # Of a port it is the port's name: the recording has its own.
-            description=replace(
-                description,
-                name=None if source.is_now else description.name,
-                priors=tuple(self.priors),
-                initial_pose=InitialPose.UNKNOWN,
-            ),
-        )
-
-
 def open_port(port: str, key_file: Path | None, *, teach: bool, reopen: bool) -> Input:
     """The team behind a serial port, under the team's key."""
     from relpos.live.inputs import PortInput
@@ -195,77 +149,71 @@ def open_port(port: str, key_file: Path | None, *, teach: bool, reopen: bool) ->
     return PortInput(port, link, seen, teach=teach, reopen=reopen)
 
 
-def run(
-    source: Input,
-    fusion: FusionThread,
-    options: Options,
-    *,
-    name: str,
-    fused: Fused,
-    out: Path,
-    description: Description,
-    keep_received: bool,
-    emulated: bool = False,
-) -> Outcome:
-    """Run a session until it ends; what it leaves is in ``out``. Ctrl-C ends it, and is no error.
+def run(source: Input, plan: SessionPlan, options: Options) -> Outcome:
+    """Run a session with everything that shows or records it; see :func:`live.run_session`."""
+    from relpos.live.assembly import run_session
 
-    Its failure, if any, is in the outcome: what came before has been kept.
-    """
-    from relpos.live.composer import Composer
-    from relpos.live.files import FileSink
-    from relpos.live.session import LiveSession
-    from relpos.live.team_view import Hello
-
-    hello = Hello(name, source.name, fused.estimator, time.time() - source.now_s(), emulated)
-    files = FileSink(out, description, keep_received=keep_received)
-    composer: Composer = Composer(
-        {node: info.name for node, info in description.nodes.items() if info.name}
-    )
-    sinks: list[Sink] = [files]
-    if options.view:
-        sinks.append(_open_page(options, hello))
-    sinks += [make(hello) for make in options.sinks]
-    keepers = _keepers(options, fused.about(source, description, hello.started_unix_s))
-    sinks += keepers
+    made: list[Recorder | FoxgloveServer] = []
+    page: list[MakeSink] = [lambda hello: _open_page(options, hello)] if options.view else []
+    sinks = [*page, *options.sinks, *_recorders(options, source, plan, made)]
     later: list[str] = []
-    session = LiveSession(
-        source,
-        fusion,
-        composer,
-        sinks,
-        seconds=options.seconds,
-        lasts=options.watched or (options.shown and source.is_now),
-        remark=later.append if options.screen else output.remark,
-    )
-    observations = session.run()
-    for _ in (
-        observations if options.screen else output.with_progress(observations, None, "received")
-    ):
-        pass
     try:
-        with nullcontext() if options.screen else output.working("finishing"):
-            return session.finish()
-    except KeyboardInterrupt:
-        return session.finish(abandon=True)
+        if options.screen:
+            return run_session(source, plan, sinks, remark=later.append)
+        with output.progress() as progress:
+            return run_session(source, plan, sinks, remark=output.remark, progress=progress)
     finally:
-        # What a recording could not take at its end no page shows any more.
-        troubles = [words for keeper in keepers if (words := keeper.trouble()) is not None]
+        # The page is closed when a recording reports what it could not write at its end.
+        troubles = [words for sink in made if (words := sink.trouble()) is not None]
         for words in dict.fromkeys([*later, *troubles]):
             output.remark(words)
 
 
-def _keepers(options: Options, about: About) -> list[Recorder | FoxgloveServer]:
-    """Make whatever keeps the session or shows it elsewhere."""
+def _recorders(
+    options: Options, source: Input, plan: SessionPlan, made: list[Recorder | FoxgloveServer]
+) -> list[MakeSink]:
+    """Return what makes the recorder and Foxglove's server; these are added to ``made``."""
     from relpos import recording
 
-    made: list[Recorder | FoxgloveServer] = []
-    if options.record is not None:
-        made.append(recording.make_recorder(options.record, about))
-    if options.foxglove is not None:
-        server = recording.serve_foxglove(options.foxglove, about)
+    def record(hello: Hello) -> Sink:
+        assert options.record is not None
+        made.append(recording.make_recorder(options.record, _about(source, plan, hello)))
+        return made[-1]
+
+    def serve(hello: Hello) -> Sink:
+        server = recording.serve_foxglove(options.foxglove or "", _about(source, plan, hello))
         output.remark(f"Foxglove: open connection {server.address}")
         made.append(server)
-    return made
+        return server
+
+    wanted = ((record, options.record), (serve, options.foxglove))
+    return [make for make, where in wanted if where is not None]
+
+
+def _about(source: Input, plan: SessionPlan, hello: Hello) -> About:
+    """Return all that a replay needs beside the received bytes, except for the key."""
+    from relpos.protocol import messages as wire
+    from relpos.recording.about import About
+    from relpos.runs import InitialPose
+
+    link = source.link
+    return About(
+        round(hello.started_unix_s * 1e9),
+        source=source.name,
+        estimator=plan.estimator,
+        settings=plan.settings,
+        seed=plan.seed,
+        initial="common" if plan.common else None,
+        own_key=link is not None and link.key != wire.DEFAULT_KEY,
+        newest_counters={} if link is None else link.counters_before,
+        # The name of a port is not that of the recording.
+        description=replace(
+            plan.description,
+            name=None if source.is_now else plan.description.name,
+            priors=tuple(plan.priors),
+            initial_pose=InitialPose.UNKNOWN,
+        ),
+    )
 
 
 def terminal_sink(me: int | None) -> MakeSink:
@@ -325,10 +273,3 @@ def _has_desktop() -> bool:
     if sys.platform in ("darwin", "win32"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
-
-def told(failure: Exception, out: Path) -> Exception:
-    """The failure with where to find what came before it."""
-    if isinstance(failure, DeviceError):
-        return DeviceError(f"{failure}; what was received is in {out}")
-    return failure

@@ -113,7 +113,9 @@ class Progress:
 
 
 @contextmanager
-def progress(words: Mapping[str, str] | None = None) -> Iterator[Callable[[str, int, int], None]]:
+def progress(
+    words: Mapping[str, str] | None = None,
+) -> Iterator[Callable[[str, int, int | None], None]]:
     """Yield a callback for long tasks of :mod:`relpos.api`; ``words``: stage -> what is shown."""
     shown = Progress()
     names = words or {}

@@ -235,7 +235,7 @@ def test_the_smoothed_track_is_near_the_bound_with_honest_sigmas(scenario: str) 
         score = _score(run, _smoothed(run))
         errors.append(score.relative_distance_rmse_m)
         nees.append(score.nees_distance)
-        bound.append(bounds.of_paper(scenario, seed, options).totals())
+        bound.append(bounds.of_simulated(scenario, seed, options).totals())
     least = bounds.over_seeds(bound).smoothing_distance_m
     assert np.mean(errors) < 1.2 * least
     assert 0.6 < np.mean(nees) < 1.5

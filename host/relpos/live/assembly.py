@@ -1,0 +1,81 @@
+"""Assembles a live session: files, sinks, composer and fusion; and runs it to its end."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from relpos.live.composer import Composer
+from relpos.live.files import FileSink
+from relpos.live.fusion_thread import FusionThread, MakeEstimator
+from relpos.live.inputs import Input
+from relpos.live.session import LiveSession, Outcome
+from relpos.live.sinks import Sink
+from relpos.live.team_view import Hello
+from relpos.measurements import Prior
+from relpos.runs import Description
+
+MakeSink = Callable[[Hello], Sink]
+"""Makes a sink once the name, source and start of the session are known."""
+
+
+@dataclass(frozen=True)
+class SessionPlan:
+    """How a session is fused, and where its files go.
+
+    ``make_estimator`` makes the estimator of the ``priors``, or, with ``common``, of one common
+    start of all nodes. ``estimator``, ``settings`` and ``seed`` describe it for the page and for
+    recordings. The session ends after ``seconds``; with ``lasts`` it goes on after the end of its
+    input.
+    """
+
+    name: str
+    out: Path
+    description: Description
+    make_estimator: MakeEstimator
+    estimator: str
+    settings: Mapping[str, str] = field(default_factory=dict)
+    seed: int = 0
+    priors: Sequence[Prior] = ()
+    common: bool = False
+    emulated: bool = False
+    seconds: float | None = None
+    lasts: bool = False
+
+
+def run_session(
+    source: Input,
+    plan: SessionPlan,
+    make_sinks: Sequence[MakeSink] = (),
+    *,
+    remark: Callable[[str], None] = lambda _: None,
+    progress: Callable[[str, int, int | None], None] = lambda stage, done, total: None,
+) -> Outcome:
+    """Run a session until it ends; its files are in ``plan.out``. Ctrl-C ends it without error.
+
+    A failure is in the outcome, and the files hold what came before. ``remark`` gets every message
+    for the user, ``progress`` a stage ("received", "finishing") and a count.
+    """
+    started_unix_s = time.time() - source.now_s()
+    hello = Hello(plan.name, source.name, plan.estimator, started_unix_s, plan.emulated)
+    fusion = FusionThread(plan.make_estimator, plan.priors, common=plan.common)
+    files = FileSink(plan.out, plan.description, keep_received=source.is_now)
+    nodes = plan.description.nodes
+    session = LiveSession(
+        source,
+        fusion,
+        Composer({node: info.name for node, info in nodes.items() if info.name}),
+        [files, *(make(hello) for make in make_sinks)],
+        seconds=plan.seconds,
+        lasts=plan.lasts,
+        remark=remark,
+    )
+    for count, _ in enumerate(session.run()):
+        progress("received", count, None)
+    progress("finishing", 0, 0)
+    try:
+        return session.finish()
+    except KeyboardInterrupt:
+        return session.finish(abandon=True)
