@@ -41,11 +41,11 @@ def doctor(
     from relpos.doctor.finding import State
 
     if prepare:
-        with output.working("compiling the estimators"):
-            installation.prepare()
+        with output.progress(output.STAGES) as progress:
+            installation.prepare(progress)
     computer = Computer()
     looked = chain(installation.look(computer, key_file, out), devices.look(computer, port))
-    findings = list(looked if json else _told(looked))
+    findings = list(looked if json else _printed(looked))
     wrong = sum(finding.state is State.WRONG for finding in findings)
     if json:
         document = {"well": not wrong, "findings": [f.to_json() for f in findings]}
@@ -57,8 +57,8 @@ def doctor(
         raise typer.Exit(1)
 
 
-def _told(findings: Iterator[Finding]) -> Iterator[Finding]:
-    """Print each finding as it comes: some take seconds."""
+def _printed(findings: Iterator[Finding]) -> Iterator[Finding]:
+    """Print each finding as it comes, because some take seconds."""
     from rich.console import Console
     from rich.text import Text
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from relpos import extras, paths
@@ -83,11 +83,13 @@ def _kernels(computer: Computer) -> Finding:
     return well(name, "compiled, a session starts at once")
 
 
-def prepare() -> None:
-    """Compile every estimator's kernels, so that no session waits for it."""
+def prepare(progress: Callable[[str, int, int], None] = lambda stage, done, total: None) -> None:
+    """Compile the kernels of every estimator, so that no session waits for them."""
     from relpos import fusion
 
-    for name in fusion.SETTINGS:
+    waiting = [name for name in fusion.SETTINGS if not fusion.is_compiled(name)]
+    for done, name in enumerate(waiting):
+        progress("compiling", done, len(waiting))
         fusion.warm_up(name)
 
 

@@ -1,6 +1,12 @@
-"""Sessions kept as MCAP files: everything received, as received, and what was made of it.
+"""Recordings: a session in an MCAP file, with all received bytes, measurements and estimates.
 
-Formats and libraries stay inside; they are the extra ``recording``, and loaded when asked for.
+:class:`~relpos.recording.recorder.Recorder` writes blocks in a thread of its own, so that neither
+a slow disk nor a power failure costs more than a second;
+:class:`~relpos.recording.reader.Recording`
+reads them back, closed or not. :mod:`relpos.recording.replay` sends the bytes through the link
+again, which gives the same estimates. The topics are Foxglove's or JSON with a schema, and
+:mod:`relpos.recording.viewer` serves them to Foxglove's viewer. The libraries are the extra
+``recording``, loaded when they are needed; begin reading with :mod:`relpos.recording.topics`.
 """
 
 from __future__ import annotations
