@@ -4,7 +4,7 @@
 
 An epoch is 2 s: two motions of each user and about 5.3 ranges. For each number of hypotheses:
 
-* measurements handed over as arrays, epoch by epoch (``BankCore.move``, ``update``, ``settle``);
+* measurements handed over as arrays, epoch by epoch (``move``, ``update``, ``end_instant``);
 * one measurement after another through the public interface, an estimate a second, hearing and
   copies for going back included; with the same state (no range biases), its estimates looked at
   by nobody or all of them, and with default settings.
@@ -37,7 +37,7 @@ def core_of(run: SimulatedRun, hypotheses: int) -> BankCore:
     """A bank with the run's users, without biases."""
     core = BankCore(BankSettings(hypotheses=hypotheses, biased=0.0), 0)
     for prior in run.priors:
-        core.add_node(prior.x_m, prior.y_m, prior.heading_rad, 0.0, 0.0)
+        core.add_node((prior.x_m, prior.y_m, prior.heading_rad), 0.0, 0.0)
     return core
 
 
@@ -54,12 +54,12 @@ def core_us(run: SimulatedRun, hypotheses: int) -> dict[str, np.ndarray]:
     move_ends = np.searchsorted([m.time_s for m in motions], ends_s, side="right")
     range_ends = np.searchsorted([m.time_s for m in ranges], ends_s, side="right")
     core = core_of(run, hypotheses)
-    parts: dict[str, list[float]] = {"advance": [], "update": [], "settle": []}
+    parts: dict[str, list[float]] = {"advance": [], "update": [], "end_instant": []}
     moved = ranged = 0
     for m, r in zip(move_ends.tolist(), range_ends.tolist(), strict=True):
         some_moves, some_ranges = slice(moved, m), slice(ranged, r)
         moved, ranged = m, r
-        ours = core.count == hypotheses
+        ours = core.hypotheses.count == hypotheses
         marks = [time.thread_time()]
         core.move(rows[some_moves], moves[some_moves])
         marks.append(time.thread_time())
@@ -68,10 +68,12 @@ def core_us(run: SimulatedRun, hypotheses: int) -> dict[str, np.ndarray]:
                 first[some_ranges], second[some_ranges], range_m[some_ranges], dz_m[some_ranges]
             )
         marks.append(time.thread_time())
-        core.settle()
+        core.end_instant()
         marks.append(time.thread_time())
         for name, spent in zip(parts, np.diff(marks), strict=True):
-            parts[name].append(1e6 * spent if ours and core.count == hypotheses else np.nan)
+            parts[name].append(
+                1e6 * spent if ours and core.hypotheses.count == hypotheses else np.nan
+            )
     return {name: np.array(values) for name, values in parts.items()}
 
 
@@ -98,7 +100,7 @@ def count_of(estimator: SwitchingEstimator) -> int:
     """How many hypotheses the bank has now."""
     core = estimator.estimator.core
     assert isinstance(core, Bank)
-    return core.core.count
+    return core.core.hypotheses.count
 
 
 def figure(rounds: list[np.ndarray]) -> str:

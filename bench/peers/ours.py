@@ -14,29 +14,33 @@ class Joint:
     """The bank's core with a single hypothesis, noise told; it goes on watching and learning."""
 
     def __init__(self, case: Case, seed: int) -> None:
-        from relpos.fusion.bank.core import PER_NODE, BankCore
+        from relpos.fusion.bank.core import BankCore
         from relpos.fusion.bank.settings import BankSettings
+        from relpos.fusion.bank.storage import PER_NODE
 
         alone = BankSettings(hypotheses=1, constants=0.0, outliers=0.0, biased=0.0)
         self.core, self.per = BankCore(alone, seed), PER_NODE
         for pose in case.truth[0]:
-            self.core.add_node(*map(float, pose), 1e-3, 1e-3)
+            x, y, heading = map(float, pose)
+            self.core.add_node((x, y, heading), 1e-3, 1e-3)
         self.variance = case.sigma_range_m**2
         self.rows, self.ones = np.arange(case.nodes), np.ones(case.nodes)
 
     def pose(self) -> Floats:
         """Poses (N, 3)."""
-        at: Floats = self.core.x[0, : self.per * len(self.rows)].reshape(-1, self.per)[:, :3]
+        at: Floats = self.core.hypotheses.x[0, : self.per * len(self.rows)].reshape(-1, self.per)[
+            :, :3
+        ]
         return at
 
     def predict(self, motion: Floats, sigma: Floats) -> None:
         """Move everybody by told noise."""
-        self.core.level[:] = 1.0
+        self.core.hypotheses.arrays.component[:] = 1.0
         self.core.move(self.rows, np.column_stack([motion, self.ones]), sigma)
 
     def update(self, ranges: Instant) -> None:
         """Ranges one after another, to second order."""
-        self.core.sigma2[:] = self.variance
+        self.core.hypotheses.arrays.range_variance[:] = self.variance
         self.core.update(ranges.node, ranges.peer, ranges.range_m, np.zeros(ranges.node.size))
 
     def positions(self) -> Floats:
@@ -49,33 +53,33 @@ class JointAlone(Joint):
 
     def __init__(self, case: Case, seed: int) -> None:
         super().__init__(case, seed)
-        from relpos.fusion.bank import joint
-        from relpos.fusion.models.motion_variances import base_variances
-
-        self.kernels, self.base = joint, base_variances
-        self.core.level[:], self.core.sigma2[:] = 1.0, self.variance
-        self.state = self.core.lines
-        self.outlier = np.array([1e-9, 9.0, 0.1, 1.0])
-        self.drawn, self.arm = np.zeros((1, case.nodes)), np.zeros((0, 2))
+        self.arrays = self.core.hypotheses.arrays
+        self.arrays.component[:], self.arrays.range_variance[:] = 1.0, self.variance
+        self.outlier = np.array([1e-9, 9.0, 0.1, 1.0, 9.0])
 
     def predict(self, motion: Floats, sigma: Floats) -> None:
         """Move everybody by told noise."""
+        from relpos.fusion.bank import motion_update
+        from relpos.fusion.models.motion_variances import base_variances
+
         moved = np.empty((len(motion), 7))
         moved[:, :3], moved[:, 3] = motion, self.ones
-        moved[:, 4:] = self.base(np.ascontiguousarray(moved[:, :4]), sigma)
-        self.kernels.advance(
-            *self.state[:2], self.core.level, self.state[3], self.rows, moved, self.drawn, 0.0, 0.0
-        )
+        moved[:, 4:] = base_variances(np.ascontiguousarray(moved[:, :4]), sigma)
+        noise = motion_update.Noise(np.zeros((1, len(motion))), 0.0, 0.0)
+        motion_update.advance(self.arrays, self.rows, moved, noise)
 
     def update(self, ranges: Instant) -> None:
         """Ranges one after another, to second order."""
+        from relpos.fusion.bank import lanes, range_update
+
         count = ranges.node.size
-        # More columns of statistics than the kernel fills: what it fills is not used here.
-        self.kernels.update(
-            *self.state[:3], self.core.sigma2, self.state[3], ranges.node, ranges.peer,
-            np.full(count, -1), ranges.range_m, np.zeros(count), self.outlier,
-            np.ones(count), np.zeros(count), self.arm, np.empty((count, 64, 1, 8)),
+        those = range_update.Ranges(
+            ranges.node, ranges.peer, ranges.range_m, np.zeros(count), np.zeros(count),
+            np.ones(count), np.full(count, -1),
         )  # fmt: skip
+        model = range_update.RangeModel(self.outlier, np.zeros((0, 2)))
+        stats = lanes.empty_lines(count, range_update.STATS, 1)
+        range_update.update(self.arrays, those, model, stats)
 
 
 class Strips:

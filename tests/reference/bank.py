@@ -39,17 +39,19 @@ def base_variances(
     fourth = size**4
     base[:, TURN] = TURN_RAD2_RAD * size * fourth / (fourth + (SLOW_RAD_S * duration) ** 4 + 1e-300)
     base[:, WHITE] = WHITE_RAD2_S * duration * moving
-    told = ~np.isnan(sigmas)
-    if told.any():
-        own = np.where(told, sigmas, 0.0) ** 2
-        base[:, ALONG] = np.where(told[:, 0], np.maximum(own[:, 0], own[:, 1]), base[:, ALONG])
-        base[:, TURN] = np.where(told[:, 2], 0.0, base[:, TURN])
-        base[:, WHITE] = np.where(told[:, 2], own[:, 2], base[:, WHITE])
+    result = ~np.isnan(sigmas)
+    if result.any():
+        own = np.where(result, sigmas, 0.0) ** 2
+        base[:, ALONG] = np.where(result[:, 0], np.maximum(own[:, 0], own[:, 1]), base[:, ALONG])
+        base[:, TURN] = np.where(result[:, 2], 0.0, base[:, TURN])
+        base[:, WHITE] = np.where(result[:, 2], own[:, 2], base[:, WHITE])
     return base
 
 
-def bend(mean: Floats, covariance: Floats, sigma_range_m: float, sigma_metre_m: Floats) -> float:
-    """Give the picture's bend by the mixture's moments (D,) and (D, D).
+def nonlinearity_index(
+    mean: Floats, covariance: Floats, sigma_range_m: float, sigma_metre_m: Floats
+) -> float:
+    """Return the nonlinearity index by the mixture's moments (D,) and (D, D).
 
     ``sigma_metre_m`` (N,) is how noisy the length of a metre is that each user walks.
     """
@@ -82,7 +84,7 @@ def bend(mean: Floats, covariance: Floats, sigma_range_m: float, sigma_metre_m: 
     return max(float(max(arcs.max(), ways.max())) / sigma_range_m, shorter)
 
 
-def look(
+def update_cusum(
     sums: list[float],
     base: float,
     pairs: list[tuple[int, int]],
@@ -112,7 +114,7 @@ def look(
 
 def pairs(mean: Floats, covariance: Floats, rows: list[int]) -> Floats:
     """Distance, bearing and their deviations (P, 4) of every two users, by rotation."""
-    told = []
+    result = []
     for n, a in enumerate(rows):
         for b in rows[n + 1 :]:
             i, j = PER_NODE * a, PER_NODE * b
@@ -121,12 +123,12 @@ def pairs(mean: Floats, covariance: Floats, rows: list[int]) -> Floats:
             spread = own - covariance[i : i + 2, j : j + 2] - covariance[j : j + 2, i : i + 2]
             distance = float(np.hypot(*off))
             if distance == 0.0:
-                told.append((0.0, math.sqrt(0.5 * np.trace(spread)), 0.0, ANY_ANGLE_RAD))
+                result.append((0.0, math.sqrt(0.5 * np.trace(spread)), 0.0, ANY_ANGLE_RAD))
                 continue
             along, aside = off / distance, np.array([-off[1], off[0]]) / distance
             bearing_sd = math.sqrt(aside @ spread @ aside) / distance
-            told.append((
+            result.append((
                 distance, math.sqrt(along @ spread @ along),
                 math.atan2(off[1], off[0]), min(bearing_sd, ANY_ANGLE_RAD),
             ))  # fmt: skip
-    return np.array(told).reshape(-1, 4)
+    return np.array(result).reshape(-1, 4)

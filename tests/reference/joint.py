@@ -1,7 +1,7 @@
 """The joint filter's kernels in NumPy, one hypothesis at a time, as matrices.
 
-Equations and argument order as in :mod:`relpos.fusion.bank.joint`; nothing of its code is used. The
-results are returned, not written in place.
+The equations are those of ``motion_update``, ``range_update`` and ``detection_update`` in
+:mod:`relpos.fusion.bank`; nothing of their code is used. Results are returned, not in place.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ def advance(
     p: Floats,
     row: int,
     motion: Floats,
-    level: Floats,
+    component: Floats,
     drawn: float,
     share: float,
     cross: float,
 ) -> tuple[Floats, Floats]:
-    """One displacement of one user: x (D,), p (D, D), ``motion`` (7,), ``level`` (3,)."""
+    """One displacement of one user: x (D,), p (D, D), ``motion`` (7,), ``component`` (3,)."""
     x, p = x.copy(), p.copy()
     b = PER_NODE * row
     dx, dy, turn, dt = motion[:4]
-    noise = motion[5] * level[1] + motion[6] * level[2]
+    noise = motion[5] * component[1] + motion[6] * component[2]
     x[b + HEADING] += drawn * np.sqrt(share * noise)
     p[b + HEADING, b + HEADING] += (1.0 - share) * noise
     heading = x[b + HEADING] - 0.5 * dt * x[b + DRIFT]
@@ -54,7 +54,7 @@ def advance(
         unit = whole / np.sqrt(length)
         normal = np.array([-unit[1], unit[0]])
         shorter = np.exp(-max(variance, 0.0))
-        along = motion[4] * level[0]
+        along = motion[4] * component[0]
         lost = 0.5 * length * (1.0 - shorter) ** 2
         swept = length * max(0.5 * (1.0 - shorter**2) - variance * shorter, 0.0)
         p[b : b + 2, b : b + 2] += (along + lost) * np.outer(unit, unit)
@@ -96,32 +96,32 @@ def update(
     good = (1.0 - share) * np.exp(-0.5 * nu**2 / s) / np.sqrt(s)
     side = 2.0 * (1.0 - short if nu > 0.0 else short)
     bad = share * side * np.exp(-0.5 * nu**2 / (s + wide)) / np.sqrt(s + wide)
-    trust = good / (good + bad)
+    inlier = good / (good + bad)
     k = gain / s
-    # Used with probability trust: the mixture's mean and its full covariance.
-    x = x + trust * k * nu
-    p = p - trust * s * np.outer(k, k) + trust * (1.0 - trust) * nu**2 * np.outer(k, k)
+    # Used with probability inlier: the mixture's mean and its full covariance.
+    x = x + inlier * k * nu
+    p = p - inlier * s * np.outer(k, k) + inlier * (1.0 - inlier) * nu**2 * np.outer(k, k)
     return x, p, float(np.log(good + bad))
 
 
-def hearing(
+def detection(
     x: Floats,
     p: Floats,
     first: int,
     second: int,
-    heard: bool,
-    tried: float,
+    received: bool,
+    attempted: float,
     weight: float,
     curve: Floats,
     step_m: float,
 ) -> tuple[Floats, Floats, float]:
-    """Whether one pair was heard; gives the state and what it adds to the log weight."""
+    """Whether one attempt was received; gives the state and what it adds to the log weight."""
     mean, variance, gain = predict_range(x, p, first, second, 0.0)
     sd = np.sqrt(variance)
 
     def chance(z: Floats) -> Floats:
         at = np.interp(mean + z * sd, np.arange(len(curve)) * step_m, curve)
-        outcome: Floats = np.power(at if heard else 1.0 - tried * at, weight)
+        outcome: Floats = np.power(at if received else 1.0 - attempted * at, weight)
         return outcome
 
     middle, *edges = chance(np.array([0.0, -2.5, 2.5]))

@@ -69,7 +69,7 @@ def test_a_run_without_motion_is_refused() -> None:
 def test_arrays_that_do_not_fit_are_refused_before_a_kernel_reads_them() -> None:
     core = BankCore(BankSettings(hypotheses=2), 0)
     for x_m in (0.0, 3.0):
-        core.add_node(x_m, 0.0, 0.0, 0.1, 0.1)
+        core.add_node((x_m, 0.0, 0.0), 0.1, 0.1)
     one, two = np.ones(1), np.ones(2)
     with pytest.raises(ValueError, match="shape"):
         core.update(np.array([0]), np.array([1]), one, two)

@@ -1,4 +1,4 @@
-"""The bank's kernels against their NumPy twins, finite differences and sampled truth."""
+"""The bank's kernels against their NumPy reference, finite differences and sampled truth."""
 
 from __future__ import annotations
 
@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 
 from reference import bank as small
-from reference import joint as twins
-from relpos.fusion.bank import hypothesis_count as hypotheses
-from relpos.fusion.bank import joint, lanes
-from relpos.fusion.bank import kernels as bank_kernels
-from relpos.fusion.bank import variance_components as noise
-from relpos.fusion.bank.joint import PER_NODE, Of
+from reference import joint as reference
+from relpos.fusion.bank import lanes, mixture, motion_update, range_update, storage
+from relpos.fusion.bank import variance_components as components
+from relpos.fusion.bank.detection_update import Attempts, update_detection
+from relpos.fusion.bank.hypothesis_count import nonlinearity_index
+from relpos.fusion.bank.motion_update import Noise
+from relpos.fusion.bank.range_update import RangeModel, Ranges
+from relpos.fusion.bank.storage import PER_NODE, Hypotheses, StateIndex
 from relpos.fusion.models import odometry_faults as slips
+from relpos.fusion.models.detection import STEP_M
 from relpos.fusion.models.motion_variances import COMPONENTS, base_variances
 
 Floats = np.ndarray
@@ -35,21 +38,28 @@ def states(count: int, seed: int) -> tuple[Floats, Floats]:
 
 
 class Packed:
-    """Means (K, D) and covariances (K, D, D) as the kernels take them; back at the end."""
+    """Means (K, D) and covariances (K, D, D) as the kernels take them; back at the end.
 
-    def __init__(self, x: Floats, p: Floats) -> None:
+    Variance components (K, N, 3) are 1, ranges have a deviation of 0.2 m.
+    """
+
+    def __init__(self, x: Floats, p: Floats, component: Floats | None = None) -> None:
         self.dense, self.count = (x, p), len(x)
+        self.component = np.ones((len(x), NODES, COMPONENTS)) if component is None else component
 
-    def __enter__(self) -> tuple[Floats, Floats, Floats]:
-        self.x, self.p = joint.pack(*self.dense, NODES)
-        sens = lanes.empty_lines(len(self.x), NODES, COMPONENTS, 6)
-        sens[...] = 0.0
-        return self.x, self.p, sens
+    def __enter__(self) -> Hypotheses:
+        x, p = storage.pack(*self.dense, NODES)
+        sensitivity = lanes.empty_lines(len(x), NODES, COMPONENTS, 6)
+        sensitivity[...] = 0.0
+        log_weight, variance = np.zeros(self.count), np.full(self.count, 0.04)
+        self.arrays = Hypotheses(
+            x, p, in_lanes(log_weight), sensitivity, in_lanes(self.component), in_lanes(variance)
+        )
+        return self.arrays
 
     def __exit__(self, *_: object) -> None:
-        for mine, now in zip(
-            self.dense, joint.unpack(self.x, self.p, NODES, self.count), strict=True
-        ):
+        back = storage.unpack(self.arrays.x, self.arrays.p, NODES, self.count)
+        for mine, now in zip(self.dense, back, strict=True):
             mine[...] = now
 
 
@@ -66,71 +76,75 @@ def out_of_lanes(laid: Floats, count: int) -> Floats:
     return laid.reshape(-1)[:count]
 
 
-def advanced(x: Floats, p: Floats, motion: Floats, level: Floats, drawn: Floats) -> None:
+def advanced(x: Floats, p: Floats, motion: Floats, component: Floats, drawn: Floats) -> None:
     rows = np.arange(len(motion), dtype=np.int64) % NODES
-    with Packed(x, p) as (px, pp, sens):
-        joint.advance(px, pp, in_lanes(level), sens, rows, motion, drawn, SHARE, CROSS)
+    with Packed(x, p, component) as packed:
+        motion_update.advance(packed, rows, motion, Noise(drawn, SHARE, CROSS))
 
 
 def updated(x: Floats, p: Floats, measured: float, dz: float, outlier: tuple[float, ...]) -> Floats:
-    log_weight = in_lanes(np.zeros(len(x)))
-    with Packed(x, p) as (px, pp, sens):
-        joint.update(
-            px, pp, log_weight, in_lanes(np.full(len(x), 0.04)), sens, np.array([0]), np.array([2]),
-            np.array([-1]), np.array([measured]), np.array([dz]), np.array([*outlier, 1.0]),
-            np.ones(1), np.zeros(1), np.zeros((0, 2)),
-            lanes.empty_lines(1, joint.STATS, len(px)),
-        )  # fmt: skip
-    return out_of_lanes(log_weight, len(x))
+    ranges = Ranges(
+        np.array([0]), np.array([2]), np.array([measured]), np.array([dz]), np.zeros(1),
+        np.ones(1), np.array([-1]),
+    )  # fmt: skip
+    model = RangeModel(np.array([*outlier, 1.0, 9.0]), np.zeros((0, 2)))
+    with Packed(x, p) as packed:
+        stats = lanes.empty_lines(1, range_update.STATS, len(packed.x))
+        range_update.update(packed, ranges, model, stats)
+    return out_of_lanes(packed.log_weight, len(x))
 
 
-def mixture(x: Floats, p: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    px, pp = joint.pack(x, p, NODES)
-    return joint.moments(px, pp, in_lanes(weight), NODES, joint.order(NODES, SIZE), SIZE, SIZE)
+def moments_of(x: Floats, p: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    px, pp = storage.pack(x, p, NODES)
+    order = storage.order(NODES, SIZE)
+    return mixture.moments(px, pp, in_lanes(weight), NODES, order, SIZE, SIZE)
 
 
 def predicted(x: Floats, p: Floats) -> tuple[float, float]:
-    px, pp = joint.pack(x, p, NODES)
+    px, pp = storage.pack(x, p, NODES)
     weight = in_lanes(np.full(len(x), 1.0 / len(x)))
-    mean, sigma = joint.predicted_ranges(px, pp, weight, np.array([0]), np.array([2]), np.zeros(1))
+    ends = np.array([0]), np.array([2])
+    mean, sigma = mixture.predicted_ranges(px, pp, weight, *ends, np.zeros(1))
     return float(mean[0]), float(sigma[0])
 
 
 def test_what_is_packed_comes_out_as_it_was() -> None:
     x, p = states(11, 12)
-    px, pp = joint.pack(x, p, NODES)
-    for mine, back in zip((x, p), joint.unpack(px, pp, NODES, 11), strict=True):
+    px, pp = storage.pack(x, p, NODES)
+    for mine, back in zip((x, p), storage.unpack(px, pp, NODES, 11), strict=True):
         assert (mine == back).all()
-    assert (joint.means(px, NODES, 11) == x).all()
+    assert (storage.means(px, NODES, 11) == x).all()
     chosen = np.array([3, 3, 10, 0], dtype=np.int64)
-    taken = joint.unpack(joint.take(px, chosen), joint.take(pp, chosen), NODES, 4)
+    taken = storage.unpack(
+        storage.select_hypotheses(px, chosen), storage.select_hypotheses(pp, chosen), NODES, 4
+    )
     assert (taken[0] == x[chosen]).all()
     assert (taken[1] == p[chosen]).all()
 
 
-def test_a_displacement_is_the_twins() -> None:
+def test_a_displacement_is_the_reference_implementation() -> None:
     rng = np.random.default_rng(1)
     x, p = states(4, 2)
     motion = np.abs(rng.normal(size=(5, 7))) * 0.3
-    level, drawn = rng.uniform(0.5, 2.0, (4, NODES, 3)), rng.normal(size=(4, 5))
+    component, drawn = rng.uniform(0.5, 2.0, (4, NODES, 3)), rng.normal(size=(4, 5))
     expected = [(x[k], p[k]) for k in range(4)]
     for m in range(5):
         expected = [
-            twins.advance(
-                a, b, m % NODES, motion[m], level[k, m % NODES], drawn[k, m], SHARE, CROSS
+            reference.advance(
+                a, b, m % NODES, motion[m], component[k, m % NODES], drawn[k, m], SHARE, CROSS
             )
             for k, (a, b) in enumerate(expected)
         ]
-    advanced(x, p, motion, level, drawn)
+    advanced(x, p, motion, component, drawn)
     assert x == pytest.approx(np.array([a for a, _ in expected]), abs=1e-12)
     assert p == pytest.approx(np.array([b for _, b in expected]), abs=1e-12)
 
 
 @pytest.mark.parametrize(("measured", "dz"), [(4.0, 0.0), (6.5, 1.2), (30.0, 0.0)])
-def test_a_range_is_the_twins(measured: float, dz: float) -> None:
+def test_a_range_is_the_reference_implementation(measured: float, dz: float) -> None:
     x, p = states(6, 3)
     expected = [
-        twins.update(a, b, 0, 2, measured, dz, 0.04, OUTLIER) for a, b in zip(x, p, strict=True)
+        reference.update(a, b, 0, 2, measured, dz, 0.04, OUTLIER) for a, b in zip(x, p, strict=True)
     ]
     evidence = updated(x, p, measured, dz, OUTLIER)
     assert x == pytest.approx(np.array([e[0] for e in expected]), abs=1e-10)
@@ -138,30 +152,30 @@ def test_a_range_is_the_twins(measured: float, dz: float) -> None:
     assert evidence == pytest.approx(np.array([e[2] for e in expected]), abs=1e-9)
 
 
-def test_the_mixtures_moments_are_the_twins() -> None:
+def test_the_mixtures_moments_are_the_reference_implementation() -> None:
     x, p = states(7, 4)
     weight = np.random.default_rng(5).dirichlet(np.ones(7))
-    mean, covariance = mixture(x, p, weight)
-    expected = twins.moments(x, p, weight)
+    mean, covariance = moments_of(x, p, weight)
+    expected = reference.moments(x, p, weight)
     assert mean == pytest.approx(expected[0], abs=1e-12)
     assert covariance == pytest.approx(expected[1], abs=1e-12)
 
 
 def test_headings_are_averaged_round_the_circle() -> None:
     x, p = np.zeros((2, SIZE)), np.zeros((2, SIZE, SIZE))
-    x[:, Of.HEADING] = (np.pi - 0.1, -np.pi + 0.1)
-    mean, covariance = mixture(x, p, np.array([0.5, 0.5]))
-    assert np.cos(mean[Of.HEADING]) == pytest.approx(-1.0)
-    assert covariance[Of.HEADING, Of.HEADING] == pytest.approx(0.01)
+    x[:, StateIndex.HEADING] = (np.pi - 0.1, -np.pi + 0.1)
+    mean, covariance = moments_of(x, p, np.array([0.5, 0.5]))
+    assert np.cos(mean[StateIndex.HEADING]) == pytest.approx(-1.0)
+    assert covariance[StateIndex.HEADING, StateIndex.HEADING] == pytest.approx(0.01)
 
 
 def test_the_motions_jacobian_is_that_of_finite_differences() -> None:
     x, _ = states(1, 6)
     p = np.zeros((1, SIZE, SIZE))
     # What has no variance is not modelled.
-    p[0, Of.DRIFT, Of.DRIFT] = p[0, Of.SCALE, Of.SCALE] = 1e-30
+    p[0, StateIndex.DRIFT, StateIndex.DRIFT] = p[0, StateIndex.SCALE, StateIndex.SCALE] = 1e-30
     motion = np.array([[0.6, 0.1, 0.3, 2.0, 0.0, 0.0, 0.0]])
-    level, drawn = np.ones((1, NODES, 3)), np.zeros((1, 1))
+    component, drawn = np.ones((1, NODES, 3)), np.zeros((1, 1))
     step = 1e-6
     jacobian = np.empty((PER_NODE, PER_NODE))
     for column in range(PER_NODE):
@@ -169,20 +183,20 @@ def test_the_motions_jacobian_is_that_of_finite_differences() -> None:
         for sign in (-1.0, 1.0):
             moved = x.copy()
             moved[0, column] += sign * step
-            advanced(moved, p.copy(), motion, level, drawn)
+            advanced(moved, p.copy(), motion, component, drawn)
             ends.append(moved[0, :PER_NODE])
         jacobian[:, column] = (ends[1] - ends[0]) / (2.0 * step)
     p[0, :PER_NODE, :PER_NODE] = 1e-8 * np.eye(PER_NODE)
-    advanced(x, p, motion, level, drawn)
-    p[0, Of.DRIFT, Of.DRIFT] -= joint.DRIFT_WALK * motion[0, 3]
-    p[0, Of.SCALE, Of.SCALE] -= joint.SCALE_WALK * motion[0, 3]
+    advanced(x, p, motion, component, drawn)
+    p[0, StateIndex.DRIFT, StateIndex.DRIFT] -= motion_update.DRIFT_WALK * motion[0, 3]
+    p[0, StateIndex.SCALE, StateIndex.SCALE] -= motion_update.SCALE_WALK * motion[0, 3]
     assert 1e8 * p[0, :PER_NODE, :PER_NODE] == pytest.approx(jacobian @ jacobian.T, abs=1e-5)
 
 
 def test_what_an_uncertain_heading_walks_has_the_moments_of_sampled_walks() -> None:
     sigma = 0.5
     x, p = np.zeros((1, SIZE)), np.zeros((1, SIZE, SIZE))
-    p[0, Of.HEADING, Of.HEADING] = sigma**2
+    p[0, StateIndex.HEADING, StateIndex.HEADING] = sigma**2
     advanced(x, p, np.array([[3.0, 0, 0, 0, 0, 0, 0]]), np.ones((1, NODES, 3)), np.zeros((1, 1)))
     heading = sigma * np.random.default_rng(7).standard_normal(400_000)
     walked = 3.0 * np.stack([np.cos(heading), np.sin(heading)])
@@ -215,24 +229,30 @@ def test_two_who_meet_break_nothing() -> None:
 def test_covariances_stay_symmetric_and_positive_over_a_long_run() -> None:
     rng = np.random.default_rng(9)
     x, p = states(3, 10)
-    level = np.ones((3, NODES, 3))
+    component = np.ones((3, NODES, 3))
     for _ in range(300):
         motion = np.abs(rng.normal(size=(NODES, 7))) * 0.1
-        advanced(x, p, motion, level, rng.normal(size=(3, NODES)))
+        advanced(x, p, motion, component, rng.normal(size=(3, NODES)))
         updated(x, p, predicted(x, p)[0] + float(rng.normal()), 0.0, OUTLIER)
     assert p == pytest.approx(p.transpose(0, 2, 1), abs=1e-9)
     assert np.linalg.eigvalsh(p).min() > -1e-9
 
 
-def hearing(x: Floats, p: Floats, heard: bool, edge_m: float) -> Floats:
-    curve = np.where(np.arange(201) * 0.5 < edge_m, 0.98, 0.002)
-    log_weight = in_lanes(np.zeros(len(x)))
-    with Packed(x, p) as (px, pp, _):
-        joint.hearing(
-            px, pp, log_weight, NODES, np.array([0]), np.array([2]), np.zeros(1),
-            np.array([heard]), np.ones(1), 1.0, curve, 0.5,
-        )  # fmt: skip
-    return out_of_lanes(log_weight, len(x))
+def detection(x: Floats, p: Floats, received: bool, edge_m: float) -> Floats:
+    curve = np.where(np.arange(201) * STEP_M < edge_m, 0.98, 0.002)
+    return with_attempt(x, p, received, 1.0, 1.0, curve)
+
+
+def with_attempt(
+    x: Floats, p: Floats, received: bool, attempted: float, weight: float, curve: Floats
+) -> Floats:
+    """Log weights (K,) after an attempt of users 0 and 2."""
+    attempts = Attempts(
+        np.array([0]), np.array([2]), np.zeros(1), np.array([received]), np.array([attempted])
+    )
+    with Packed(x, p) as packed:
+        update_detection(packed, attempts, weight, curve)
+    return out_of_lanes(packed.log_weight, len(x))
 
 
 def apart(distance: float, sigma: float) -> tuple[Floats, Floats]:
@@ -243,17 +263,17 @@ def apart(distance: float, sigma: float) -> tuple[Floats, Floats]:
 
 
 def test_silence_is_likelier_of_those_who_are_far_apart() -> None:
-    near, far = hearing(*apart(4.0, 0.5), False, 10.0), hearing(*apart(14.0, 0.5), False, 10.0)
+    near, far = detection(*apart(4.0, 0.5), False, 10.0), detection(*apart(14.0, 0.5), False, 10.0)
     assert far[0] == pytest.approx(0.0, abs=0.01)
     assert near[0] < -3.0
 
 
-@pytest.mark.parametrize(("heard", "sign"), [(False, 1.0), (True, -1.0)])
+@pytest.mark.parametrize(("received", "sign"), [(False, 1.0), (True, -1.0)])
 def test_an_edge_within_the_spread_moves_the_two_as_sampled_places_say(
-    heard: bool, sign: float
+    received: bool, sign: float
 ) -> None:
     x, p = apart(10.0, 1.0)
-    hearing(x, p, heard, 10.0)
+    detection(x, p, received, 10.0)
     # Half of a Gaussian: mean sqrt(2/pi), variance 1 - 2/pi; the curve's edge is half a metre wide.
     assert -x[0, 0] == pytest.approx(sign * np.sqrt(2.0 / np.pi), abs=0.25)
     assert p[0, 0, 0] == pytest.approx(1.0 - 2.0 / np.pi, abs=0.12)
@@ -262,53 +282,50 @@ def test_an_edge_within_the_spread_moves_the_two_as_sampled_places_say(
 def test_what_is_far_from_any_edge_changes_nothing_but_the_weight() -> None:
     x, p = apart(4.0, 0.3)
     before = x.copy(), p.copy()
-    hearing(x, p, True, 10.0)
+    detection(x, p, True, 10.0)
     assert (x == before[0]).all()
     assert (p == before[1]).all()
 
 
-@pytest.mark.parametrize(("heard", "weight"), [(True, 1.0), (False, 1.0), (False, 0.6)])
-def test_who_is_heard_is_the_twins(heard: bool, weight: float) -> None:
-    curve = 0.002 + 0.97 / (1.0 + np.exp((np.arange(201) * 0.5 - 7.0) / 1.5))
+@pytest.mark.parametrize(("received", "weight"), [(True, 1.0), (False, 1.0), (False, 0.6)])
+def test_an_attempt_is_the_reference_implementation(received: bool, weight: float) -> None:
+    curve = 0.002 + 0.97 / (1.0 + np.exp((np.arange(201) * STEP_M - 7.0) / 1.5))
     x, p = states(16, 30)
     expected = [
-        twins.hearing(a, b, 0, 2, heard, 0.9, weight, curve, 0.5) for a, b in zip(x, p, strict=True)
+        reference.detection(a, b, 0, 2, received, 0.9, weight, curve, STEP_M)
+        for a, b in zip(x, p, strict=True)
     ]
-    log_weight = in_lanes(np.zeros(16))
-    with Packed(x, p) as (px, pp, _):
-        joint.hearing(
-            px, pp, log_weight, NODES, np.array([0]), np.array([2]), np.zeros(1),
-            np.array([heard]), np.array([0.9]), weight, curve, 0.5,
-        )  # fmt: skip
-    assert log_weight.ravel() == pytest.approx(np.array([e[2] for e in expected]), abs=1e-9)
+    log_weight = with_attempt(x, p, received, 0.9, weight, curve)
+    assert log_weight == pytest.approx(np.array([e[2] for e in expected]), abs=1e-9)
     assert x == pytest.approx(np.array([e[0] for e in expected]), abs=1e-9)
     assert p == pytest.approx(np.array([e[1] for e in expected]), abs=1e-9)
     assert len({e[0].tobytes() for e in expected} - {s.tobytes() for s in states(16, 30)[0]}) > 2
 
 
-def test_levels_of_noise_are_learned_from_innovations_and_their_uncertainty_is_honest() -> None:
+def test_variance_components_are_learned_from_innovations_and_their_uncertainty_is_honest() -> None:
     errors, sigmas = [], []
     for seed in range(12):
         rng = np.random.default_rng(seed)
-        levels = noise.Levels()
-        levels.add_node()
-        levels.add_node()
+        known = components.VarianceComponents()
+        known.add_node()
+        known.add_node()
         truth = np.array([1.0, 0.0, -0.5, -0.4, 0.0, 0.5, -2.0])
         for _ in range(500):
             # Innovations whose variance is a random mixture of the sorts of noise.
             parts = rng.dirichlet(np.full(7, 0.4))
-            scale = np.exp(levels.mean)
-            stats = np.zeros((1, joint.STATS, 1))
-            stats[0, joint.SHARES : joint.BENT, 0] = parts * scale
-            stats[0, joint.VARIANCE] = (parts * scale).sum()
-            stats[0, joint.TRUST] = 1.0
+            scale = np.exp(known.mean)
+            stats = np.zeros((1, range_update.STATS, 1))
+            stats[0, range_update.SHARES : range_update.CURVATURE, 0] = parts * scale
+            stats[0, range_update.VARIANCE] = (parts * scale).sum()
+            stats[0, range_update.INLIER] = 1.0
             measured = rng.normal() * np.sqrt((parts * np.exp(truth)).sum())
-            noise.learn(
-                levels.mean, levels.covariance, np.array([0]), np.array([1]),
-                np.array([measured]), stats, np.zeros(1), np.ones(1), np.ones(1),
+            ranges = Ranges(
+                np.array([0]), np.array([1]), np.array([measured]), np.zeros(1), np.zeros(1),
+                np.ones(1), np.array([-1]),
             )  # fmt: skip
-        errors.append(levels.mean - truth)
-        sigmas.append(np.sqrt(levels.covariance.diagonal()))
+            components.learn(known.mean, known.covariance, ranges, stats, np.zeros(1), np.ones(1))
+        errors.append(known.mean - truth)
+        sigmas.append(np.sqrt(known.covariance.diagonal()))
     ratio = np.sqrt(np.mean(np.square(np.array(errors) / np.array(sigmas))))
     assert np.abs(np.mean(errors, axis=0)).max() < 0.6
     assert np.mean(sigmas) < 0.5
@@ -318,7 +335,7 @@ def test_levels_of_noise_are_learned_from_innovations_and_their_uncertainty_is_h
 # -- the small ones --------------------------------------------------------------------------------
 
 
-def test_bases_of_noise_are_the_twins() -> None:
+def test_bases_of_noise_are_the_reference_implementation() -> None:
     rng = np.random.default_rng(20)
     moves = rng.normal(size=(40, 4)) * (0.5, 0.5, 1.0, 1.0)
     moves[:, 3] = np.abs(moves[:, 3])
@@ -331,27 +348,27 @@ def test_bases_of_noise_are_the_twins() -> None:
 
 
 @pytest.mark.parametrize("nodes", [1, 2, 7])
-def test_a_pictures_bend_is_the_twins(nodes: int) -> None:
+def test_the_nonlinearity_index_is_the_reference_implementation(nodes: int) -> None:
     rng = np.random.default_rng(nodes)
     root = rng.normal(size=(5 * nodes, 5 * nodes)) * 0.2
     mean, covariance = rng.normal(size=5 * nodes) * 4.0, root @ root.T
     metre = rng.uniform(0.05, 0.5, nodes)
-    assert hypotheses.bend(mean, covariance, 0.2, metre) == pytest.approx(
-        small.bend(mean, covariance, 0.2, metre), rel=1e-12
+    assert nonlinearity_index(mean, covariance, 0.2, metre) == pytest.approx(
+        small.nonlinearity_index(mean, covariance, 0.2, metre), rel=1e-12
     )
 
 
 @pytest.mark.parametrize("on_one_spot", [False, True])
-def test_what_an_estimate_says_of_pairs_is_the_twins(on_one_spot: bool) -> None:
+def test_what_an_estimate_says_of_pairs_is_the_reference_implementation(on_one_spot: bool) -> None:
     x, p = states(1, 8)
     if on_one_spot:
         x[0, 5:7] = x[0, 0:2]
     rows = list(range(NODES))
-    got = bank_kernels.pairs(x[0], p[0], np.array(rows))
+    got = mixture.pairs(x[0], p[0], np.array(rows))
     assert got == pytest.approx(small.pairs(x[0], p[0], rows), rel=1e-9, abs=1e-12)
 
 
-def test_cumulative_sums_are_the_twins_until_and_after_an_alarm() -> None:
+def test_cumulative_sums_are_the_reference_implementation_until_and_after_an_alarm() -> None:
     rng = np.random.default_rng(22)
     detector = slips.CusumDetector.of_nobody()
     for _ in range(5):
@@ -364,7 +381,7 @@ def test_cumulative_sums_are_the_twins_until_and_after_an_alarm() -> None:
         ends = np.array(pairs)
         first, second = np.ascontiguousarray(ends.T)
         faulty = slips.update_cusum(detector, first, second, square, worth, 0.02, False)
-        sums, base, expected = small.look(
+        sums, base, expected = small.update_cusum(
             sums, base, pairs, square.tolist(), worth.tolist(), 0.02, slips.TEAM_ALARM
         )
         assert faulty == expected
@@ -379,25 +396,30 @@ def test_weights_sum_to_one_and_count_nothing_beyond_the_last_hypothesis() -> No
     expected = np.exp(logs.ravel()[:11] - logs.ravel()[:11].max())
     expected /= expected.sum()
     weight = np.empty_like(logs)
-    effective = bank_kernels.normalise(logs, 11, weight)
+    effective = mixture.normalise(logs, 11, weight)
     assert weight.ravel()[:11] == pytest.approx(expected)
     assert (weight.ravel()[11:] == 0.0).all()
     assert effective == pytest.approx(1.0 / (expected @ expected))
     assert logs.ravel()[:11].max() == 0.0
 
 
-def test_levels_are_drawn_by_what_is_known_of_them() -> None:
+def test_variance_components_are_drawn_by_what_is_known_of_them() -> None:
     rng = np.random.default_rng(24)
     draw, mean, root = rng.normal(size=(11, 7)), rng.normal(size=7), rng.normal(size=(7, 7))
     covariance = root @ root.T
-    level, sigma2 = lanes.empty_lines(2, 2, COMPONENTS), lanes.empty_lines(2)
     laid = lanes.empty_lines(2, 7)
     laid[...] = np.resize(draw, (16, 7)).reshape(2, lanes.LANES, 7).transpose(0, 2, 1)
-    steady = np.arange(16.0).reshape(2, lanes.LANES) % 2.0
-    bank_kernels.spread_levels(laid, steady, mean, covariance, 0.5, level, sigma2)
-    sd = np.minimum(0.5 * np.sqrt(covariance.diagonal()), noise.SPREAD_MOST)
-    lower = np.append(np.tile(noise.STEADIER, 2), 0.0)
-    expected = np.exp(mean + sd * draw - np.outer(steady.ravel()[:11], lower))
-    back = level.reshape(2, 6, lanes.LANES).transpose(0, 2, 1).reshape(-1, 6)[:11]
+    low_noise = np.arange(16.0).reshape(2, lanes.LANES) % 2.0
+    nothing = lanes.empty_lines(0)
+    component, variance = lanes.empty_lines(2, 2, COMPONENTS), lanes.empty_lines(2)
+    arrays = Hypotheses(
+        nothing[None], nothing[None], nothing, lanes.empty_lines(2, 2, COMPONENTS, 6), component,
+        variance,
+    )  # fmt: skip
+    components.spread(components.Draws(laid, low_noise, 0.5), mean, covariance, arrays)
+    sd = np.minimum(0.5 * np.sqrt(covariance.diagonal()), components.SPREAD_MOST)
+    lower = np.append(np.tile(components.LOWER, 2), 0.0)
+    expected = np.exp(mean + sd * draw - np.outer(low_noise.ravel()[:11], lower))
+    back = component.reshape(2, 6, lanes.LANES).transpose(0, 2, 1).reshape(-1, 6)[:11]
     assert back == pytest.approx(expected[:, :-1])
-    assert sigma2.ravel()[:11] == pytest.approx(expected[:, -1])
+    assert variance.ravel()[:11] == pytest.approx(expected[:, -1])

@@ -8,11 +8,11 @@ import numpy as np
 
 from relpos import tracks
 from relpos.evaluation import metrics
-from relpos.fusion.bank import hypothesis_count as hypotheses
+from relpos.fusion.bank import hypothesis_count
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.estimator import Bank, make
-from relpos.fusion.bank.joint import PER_NODE, Of
 from relpos.fusion.bank.settings import BankSettings
+from relpos.fusion.bank.storage import PER_NODE, StateIndex
 from relpos.fusion.estimator import Estimate
 from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
 from relpos.fusion.rewind import Rewinder
@@ -31,7 +31,7 @@ def _run(
     counts = []
     for measurement in run.measurements:
         made = bank.process(measurement)
-        counts += [_core(bank).count] * len(made)
+        counts += [_core(bank).hypotheses.count] * len(made)
         estimates += made
     estimates += bank.finish()
     figures = metrics.evaluate(
@@ -53,7 +53,7 @@ def test_a_good_team_is_followed_by_one_hypothesis_and_as_well() -> None:
         _, counts, bank, figures = _run("paper-p1", {**GOOD, "seconds": 400.0}, seed)
         assert counts[-1] == 1
         alone.append(np.mean(np.array(counts) == 1))
-        assert bank.counters()["hypotheses_shrunk"] >= len(hypotheses.STEPS)
+        assert bank.counters()["hypotheses_shrunk"] >= len(hypothesis_count.STEPS)
         # 0.109 m with 200 throughout (600 s, seed 0).
         assert figures.relative_distance_rmse_m < 0.125
     # When that is certain differs: after 197 to 393 s on four seeds.
@@ -90,7 +90,7 @@ def test_fewer_hypotheses_have_the_moments_that_the_many_had() -> None:
     covariance = np.eye(6) + np.cov(x.T, bias=True)
     for count, kept in ((50, 0.7), (10, 0.3), (1, 0.0)):
         chosen = np.arange(count) * (200 // count)
-        fewer, p = hypotheses.thinned(x, mean, covariance, chosen, np.array([2]), kept)
+        fewer, p = hypothesis_count.thinned(x, mean, covariance, chosen, np.array([2]), kept)
         assert len(fewer) == count
         np.testing.assert_allclose(fewer.mean(axis=0), mean, atol=1e-9)
         np.testing.assert_allclose(p + np.cov(fewer.T, bias=True), covariance, atol=1e-9)
@@ -101,24 +101,24 @@ def test_drawn_headings_take_their_part_out_of_the_covariance() -> None:
     rng = np.random.default_rng(2)
     root = rng.standard_normal((6, 6))
     covariance = root @ root.T
-    x, p = hypotheses.parted(
+    x, p = hypothesis_count.parted(
         np.zeros((200, 6)), np.repeat(covariance[None], 200, axis=0), np.array([2, 5]), 0.5, rng
     )
     np.testing.assert_allclose(p[0] + np.cov(x.T, bias=True), covariance, atol=1e-6)
     np.testing.assert_allclose(p[0][[2, 5]], 0.5 * covariance[[2, 5]], atol=1e-6)
 
 
-def test_the_bend_of_an_arc_is_its_sagitta() -> None:
+def test_the_nonlinearity_of_an_arc_is_its_sagitta() -> None:
     # Two users 2 m apart, the second's place 0.4 m uncertain across: 0.4^2 / 4 = 0.04 m.
     mean = np.zeros(2 * PER_NODE)
     mean[PER_NODE] = 2.0
     covariance = np.zeros((2 * PER_NODE, 2 * PER_NODE))
-    covariance[PER_NODE + Of.Y, PER_NODE + Of.Y] = 0.4**2
+    covariance[PER_NODE + StateIndex.Y, PER_NODE + StateIndex.Y] = 0.4**2
     metre = np.full(2, 0.06)
-    assert np.isclose(hypotheses.bend(mean, covariance, 0.1, metre), 0.4)
+    assert np.isclose(hypothesis_count.nonlinearity_index(mean, covariance, 0.1, metre), 0.4)
     # A metre at a heading 0.3 rad uncertain is 0.045 m shorter.
-    covariance[Of.HEADING, Of.HEADING] = 0.09
-    assert np.isclose(hypotheses.bend(mean, covariance, 1.0, metre), 0.75)
+    covariance[StateIndex.HEADING, StateIndex.HEADING] = 0.09
+    assert np.isclose(hypothesis_count.nonlinearity_index(mean, covariance, 1.0, metre), 0.75)
 
 
 def _epochs(core: BankCore, first: int, count: int) -> None:
@@ -135,52 +135,52 @@ def _epochs(core: BankCore, first: int, count: int) -> None:
             np.tile([0.02, 0.02, 0.005], (3, 1)),
         )
         core.update(*pair, distance + noise_m[k], np.zeros(3))
-        core.settle()
+        core.end_instant()
 
 
 def test_a_copy_is_exact_across_a_change_of_number() -> None:
     core = BankCore(BankSettings(), seed=6)
     for x_m, y_m in ((0.0, 0.0), (4.0, 0.0), (0.0, 3.0)):
-        core.add_node(x_m, y_m, 0.0, 0.01, 0.01)
+        core.add_node((x_m, y_m, 0.0), 0.01, 0.01)
     many = deepcopy(core)
     _epochs(core, 0, 200)
-    assert core.count == 1
-    few, expected = deepcopy(core), core.moments()
+    assert core.hypotheses.count == 1
+    few, expected = deepcopy(core), core.hypotheses.moments()
     core = many
-    assert core.count == 200
+    assert core.hypotheses.count == 200
     _epochs(core, 0, 200)
-    for got, wanted in zip(core.moments(), expected, strict=True):
+    for got, wanted in zip(core.hypotheses.moments(), expected, strict=True):
         np.testing.assert_array_equal(got, wanted)
-    core.grow()
-    assert core.count == 200
-    grown = core.moments()
+    core.adaptive.grow()
+    assert core.hypotheses.count == 200
+    grown = core.hypotheses.moments()
     for got, wanted in zip(grown, expected, strict=True):
         np.testing.assert_allclose(got, wanted, atol=1e-5)
     core = few
-    assert core.count == 1
-    core.grow()
-    for got, wanted in zip(core.moments(), grown, strict=True):
+    assert core.hypotheses.count == 1
+    core.adaptive.grow()
+    for got, wanted in zip(core.hypotheses.moments(), grown, strict=True):
         np.testing.assert_array_equal(got, wanted)
 
 
-def test_a_picture_that_bends_much_has_more_hypotheses_and_few_states_the_usual() -> None:
+def test_a_strongly_nonlinear_mixture_has_more_hypotheses_and_few_states_the_usual() -> None:
     _, counts, _, _ = _run("paper-h2", {"seconds": 150.0})
     usual = BankSettings().hypotheses
-    assert max(counts) == hypotheses.MORE * usual
+    assert max(counts) == hypothesis_count.MORE * usual
     assert counts[5] == usual
-    assert hypotheses.most(usual, 46) == hypotheses.MORE * usual
-    assert hypotheses.most(usual, 101) == usual
+    assert hypothesis_count.most(usual, 46) == hypothesis_count.MORE * usual
+    assert hypothesis_count.most(usual, 101) == usual
     # A range noise of a metre hides what bends by less.
     _, counts, _, _ = _run("paper", {"seconds": 150.0})
     assert np.mean(np.array(counts) > usual) < 0.2
 
 
-def test_people_are_not_lost_to_a_team_of_steady_headings() -> None:
+def test_people_are_not_lost_to_low_heading_noise() -> None:
     run = simulate_paper("paper-h", 1, {"seconds": 200.0})
     bank = make(run.priors, HypothesisInitialiser(), BankSettings(steady=1.0), 1, {})
     estimates = [e for m in run.measurements for e in bank.process(m)] + bank.finish()
     core = _core(bank)
-    assert float(core.weights() @ core.steady) < 0.1
+    assert float(core.hypotheses.weights() @ core.hypotheses.low_heading_noise) < 0.1
     figures = metrics.evaluate(
         tracks.estimated_tracks(estimates),
         tracks.true_tracks(run.truth),

@@ -10,8 +10,9 @@ import pytest
 
 from relpos import fusion, tracks
 from relpos.evaluation import metrics
-from relpos.fusion.bank import joint, lanes
-from relpos.fusion.bank.joint import PER_NODE
+from relpos.fusion.bank import lanes, range_update, storage
+from relpos.fusion.bank.range_update import RangeModel, Ranges
+from relpos.fusion.bank.storage import PER_NODE, Hypotheses
 from relpos.fusion.estimator import Estimate
 from relpos.fusion.models.ranging import RangeCorrelation
 from relpos.measurements import Height, Measurement, Motion, Prior, Range
@@ -24,27 +25,31 @@ class Worn:
     antenna_offset_m: tuple[float, float] | None = None
 
 
-def slant(x: np.ndarray, arms: np.ndarray, dz: float) -> float:
+def slant(x: np.ndarray, levers_m: np.ndarray, dz: float) -> float:
     """Distance between two antennas, written with complex numbers."""
     at = [
-        complex(x[b], x[b + 1]) + complex(*arm) * np.exp(1j * x[b + 2])
-        for b, arm in ((0, arms[0]), (PER_NODE, arms[1]))
+        complex(x[b], x[b + 1]) + complex(*lever) * np.exp(1j * x[b + 2])
+        for b, lever in ((0, levers_m[0]), (PER_NODE, levers_m[1]))
     ]
     return math.hypot(abs(at[1] - at[0]), dz)
 
 
 def updated(
-    x: np.ndarray, p: np.ndarray, arms: np.ndarray, dz: float, measured: float, sigma: float
+    x: np.ndarray, p: np.ndarray, levers_m: np.ndarray, dz: float, measured: float, sigma: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    xs, ps = joint.pack(x[None], p[None], 2)
-    sens = np.zeros((1, 2, 3, 6, lanes.LANES))
-    joint.update(
-        xs, ps, np.zeros((1, lanes.LANES)), np.full((1, lanes.LANES), sigma**2), sens,
-        np.array([0]), np.array([1]), np.array([-1]),
-        np.array([measured]), np.array([dz]), np.array([1e-9, 9.0, 0.1, 1.0]),
-        np.ones(1), np.zeros(1), arms, lanes.empty_lines(1, joint.STATS, 1),
+    stored = storage.pack(x[None], p[None], 2)
+    ones = np.ones((1, 2, 3, lanes.LANES))
+    hypotheses = Hypotheses(
+        *stored, np.zeros((1, lanes.LANES)), np.zeros((1, 2, 3, 6, lanes.LANES)), ones,
+        np.full((1, lanes.LANES), sigma**2),
     )  # fmt: skip
-    after = joint.unpack(xs, ps, 2, 1)
+    ranges = Ranges(
+        np.array([0]), np.array([1]), np.array([measured]), np.array([dz]), np.zeros(1),
+        np.ones(1), np.array([-1]),
+    )  # fmt: skip
+    model = RangeModel(np.array([1e-9, 9.0, 0.1, 1.0, 9.0]), levers_m)
+    range_update.update(hypotheses, ranges, model, lanes.empty_lines(1, range_update.STATS, 1))
+    after = storage.unpack(*stored, 2, 1)
     return after[0][0], after[1][0]
 
 
@@ -56,7 +61,7 @@ def test_a_range_between_antennas_off_the_body_turns_the_heading_as_its_jacobian
     size = 2 * PER_NODE
     x = rng.normal(0.0, 1.0, size)
     x[PER_NODE : PER_NODE + 2] += 5.0
-    arms = rng.normal(0.0, 0.4, (2, 2))
+    levers_m = rng.normal(0.0, 0.4, (2, 2))
     dz, sigma = 0.7, 0.05
     root = 1e-3 * rng.normal(size=(size, size))
     p = root @ root.T
@@ -64,23 +69,23 @@ def test_a_range_between_antennas_off_the_body_turns_the_heading_as_its_jacobian
     for k in range(size):
         step = np.zeros(size)
         step[k] = 1e-6
-        jacobian[k] = (slant(x + step, arms, dz) - slant(x - step, arms, dz)) / 2e-6
-    measured = slant(x, arms, dz) + 0.01
+        jacobian[k] = (slant(x + step, levers_m, dz) - slant(x - step, levers_m, dz)) / 2e-6
+    measured = slant(x, levers_m, dz) + 0.01
     gain = p @ jacobian / (jacobian @ p @ jacobian + sigma**2)
-    after_x, after_p = updated(x, p, arms, dz, measured, sigma)
+    after_x, after_p = updated(x, p, levers_m, dz, measured, sigma)
     assert after_x - x == pytest.approx(gain * 0.01, rel=2e-2, abs=1e-10)
     assert after_p == pytest.approx(p - np.outer(gain, jacobian @ p), rel=2e-2, abs=1e-12)
     assert jacobian[2] != 0.0
 
 
-def test_arms_of_zero_change_nothing() -> None:
+def test_levers_m_of_zero_change_nothing() -> None:
     rng = np.random.default_rng(1)
     x = rng.normal(0.0, 3.0, 2 * PER_NODE)
     root = 0.3 * rng.normal(size=(len(x), len(x)))
     p = root @ root.T
-    with_arms = updated(x, p, np.zeros((2, 2)), 0.5, 4.0, 0.1)
+    with_levers_m = updated(x, p, np.zeros((2, 2)), 0.5, 4.0, 0.1)
     without = updated(x, p, np.zeros((0, 2)), 0.5, 4.0, 0.1)
-    for a, b in zip(with_arms, without, strict=True):
+    for a, b in zip(with_levers_m, without, strict=True):
         assert a == pytest.approx(b, rel=1e-9, abs=1e-12)
 
 

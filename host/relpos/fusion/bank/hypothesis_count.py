@@ -1,31 +1,35 @@
-"""How many hypotheses: one where the picture is unambiguous, more where it is not.
+"""How many hypotheses are needed: one where the posterior is near a Gaussian, else more.
 
 A mixture may be replaced by its moments where that loses nothing: where everything that the
 joint filter linearises is nearly a line within what is not known. Two things are not, a
-displacement's direction and a range, and both bend by a length that can be told from the
+displacement's direction and a range, and both are curved by a length that can be told from the
 mixture's covariance alone, beside noise that it is to be negligible against:
 
 * a pair of users at distance d whose difference has the variance c across the line of sight
   lies on an arc, which is off its tangent by c / (2 d), against a range's sigma_r;
-* a user whose heading has the deviation sigma_theta and whose place, as seen from his nearest,
+* a user whose heading has the deviation sigma_theta and whose place, as seen from its nearest user,
   has sigma_p has come there on an arc of length sigma_p, which is off its tangent by
   sigma_p sigma_theta / 2, against sigma_r;
-* the next metre of his way will be shorter by sigma_theta^2 / 2 than it is long, against the
+* the next metre of its way will be shorter by sigma_theta^2 / 2 than it is long, against the
   noise sigma_l of a metre's length.
 
-The greatest of the three ratios is the picture's *bend*. It counts together with whether the
+The greatest of the three ratios is the *nonlinearity index*. It counts together with whether the
 hypotheses lie apart by more than what was drawn of the noise accounts for.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.bank.joint import PER_NODE
+from relpos.fusion.bank import lanes, mixture
+from relpos.fusion.bank.lanes import fill, load
+from relpos.fusion.bank.storage import PER_NODE
 from relpos.fusion.compiled import compiled
+from relpos.fusion.models.motion_variances import ALONG, ALONG_M2_M, COMPONENTS
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -33,33 +37,33 @@ Indices = npt.NDArray[np.int64]
 STEPS = (50, 10, 1)
 """The bank shrinks by one of these at a time."""
 
-FLAT = 0.2
-"""Bend of an unambiguous picture."""
+LINEAR = 0.2
+"""Greatest nonlinearity index of an unambiguous mixture."""
 
-BENT = 0.4
-"""Bend from which on there are as many hypotheses as may be; between the two nothing changes."""
+NONLINEAR = 0.4
+"""From this index on there are as many hypotheses as may be; between the two nothing changes."""
 
-CURLED, EASED = 1.0, 0.7
-"""Bend from which on there are ``MORE`` times as many hypotheses, and below which as many as ever.
+STRONGLY_NONLINEAR, LESS_NONLINEAR = 1.0, 0.7
+"""From this index on there are ``MORE`` times as many hypotheses, until it falls below the second.
 
 From 1 on, what is not known lies on an arc that is off its tangent by a range's whole deviation
 and more: no Gaussian covers it, and what two users do not know multiplies. In the middle of a run
-the bend of pairs and ways is 0.2 in P and P1, and 1.2 to 2.5 in H, H2 and ``lab``."""
+the index of pairs and ways is 0.2 in P and P1, and 1.2 to 2.5 in H, H2 and ``lab``."""
 
 MORE = 8
 """``paper-h2``, seeds 9100 to 9159: 200 hypotheses 1.41 m (worst 2.80), 400 1.39 (2.46), 800 while
-much bends 1.31 (1.76), 1600 1.28 (1.64); the bound is 1.30. There the bank then takes 6 ms an
-epoch of 2 s, in place of 2."""
+strongly nonlinear 1.31 (1.76), 1600 1.28 (1.64); the bound is 1.30. There the bank then takes 6 ms
+an epoch of 2 s, in place of 2."""
 
 WORK = 1.6e8
 """Hypotheses times entries cubed at most (what an epoch costs, where everybody ranges a few): six
 people with biases of all pairs have 1600 of 46 entries, ten without 1200, twenty the usual 200."""
 
-LOOKED_AFTER = 4
-"""So many instants of ranges lie between two looks at the bend of a picture that is not flat."""
+CHECKED_AFTER = 4
+"""The strong nonlinearity is checked after so many instants of ranges."""
 
 HELD = 10
-"""The picture has to be unambiguous for so many instants of ranges before each step."""
+"""The mixture has to be unambiguous for so many instants of ranges before each step."""
 
 APART = 3.0
 """Between-hypothesis variance in units of what the drawn share accounts for, at most."""
@@ -76,8 +80,19 @@ KNOWN = 0.4
 Both keep the bank as it is in the beginning: without them the recordings of two robots, whose
 starts are known exactly, went to one before scales and biases were, and lost a third."""
 
-DOUBTED = 0.1
-"""Greatest weight of those who doubt somebody's pose."""
+PERTURBED_MOST = 0.1
+"""Greatest weight of perturbed hypotheses."""
+
+
+class Flags(NamedTuple):
+    """What kind each hypothesis (K,) is of."""
+
+    perturbed: Floats
+    """Above 0 for so many updates after its pose was perturbed."""
+    has_constants: Floats
+    """1 where step scale and heading drift are modelled."""
+    has_bias: Floats
+    """1 where range biases are."""
 
 
 def sampled_share(share: float, count: int, most: int) -> float:
@@ -96,8 +111,10 @@ def most(usual: int, size: int) -> int:
 
 
 @compiled
-def bend(mean: Floats, covariance: Floats, sigma_range_m: float, sigma_metre_m: Floats) -> float:
-    """Give the picture's bend by the mixture's moments (D,) and (D, D).
+def nonlinearity_index(
+    mean: Floats, covariance: Floats, sigma_range_m: float, sigma_metre_m: Floats
+) -> float:
+    """Return the nonlinearity index of a mixture with the moments (D,) and (D, D).
 
     ``sigma_metre_m`` (N,) is how noisy the length of a metre is that each user walks.
     """
@@ -125,6 +142,64 @@ def bend(mean: Floats, covariance: Floats, sigma_range_m: float, sigma_metre_m: 
         if nodes > 1:
             greatest = max(greatest, 0.5 * math.sqrt(nearest[a] * heading))
     return max(greatest / sigma_range_m, shorter)
+
+
+@compiled
+def is_decided(log_weight: Floats, flags: Flags, weight: Floats) -> bool:
+    """Whether many hypotheses count and all model the same; writes normalised weights."""
+    count = flags.perturbed.shape[0]
+    if mixture.normalise(log_weight, count, weight) < EVEN * count:
+        return False
+    flat = weight.reshape(-1)
+    perturbed, constants, biased = 0.0, 0.0, 0.0
+    for k in range(count):
+        perturbed += flat[k] if flags.perturbed[k] > 0.0 else 0.0
+        constants += flat[k] * flags.has_constants[k]
+        biased += flat[k] * flags.has_bias[k]
+    least = max(min(constants, 1.0 - constants), min(biased, 1.0 - biased))
+    return perturbed <= PERTURBED_MOST and least <= UNDECIDED
+
+
+@compiled
+def is_even(
+    p: Floats, weight: Floats, covariance: Floats, of: Indices, places: int, drawn: float
+) -> bool:
+    """Whether the hypotheses, by ``weight`` (B, LANES), lie together.
+
+    That is where the variances between them, the rest of the mixture's ``covariance`` (D, D), are
+    what ``drawn``, the drawn over the kept share of the noise, accounts for.
+    """
+    for i in range(places):
+        sums = fill(0.0)
+        for b in range(p.shape[0]):
+            at = b * p.shape[1] + (i * (i + 1)) // 2 + i
+            sums = sums + load(weight, b) * load(p, at)
+        within = lanes.total(sums)
+        between = covariance[of[i], of[i]] - within
+        if between > APART * drawn * within + 1e-6:
+            return False
+    return True
+
+
+@compiled
+def step_index(
+    x: Floats, p: Floats, log_weight: Floats, flags: Flags, log_components: Floats, nodes: int,
+    weight: Floats, unperturbed: Floats,
+) -> float:  # fmt: skip
+    """Return the nonlinearity index of every user's next metre; inf where it is undecided.
+
+    That is where few hypotheses count, or they model different things. ``weight`` and
+    ``unperturbed`` (B, LANES) receive the weights, and those without perturbed hypotheses.
+    """
+    mixture.unperturbed_weights(log_weight, flags.perturbed, unperturbed)
+    if not is_decided(log_weight, flags, weight):
+        return np.inf
+    heading = mixture.heading_variances(x, p, unperturbed, nodes)
+    worst = 0.0
+    for n in range(nodes):
+        metre = math.sqrt(ALONG_M2_M) * math.exp(0.5 * log_components[COMPONENTS * n + ALONG])
+        worst = max(worst, 0.5 * heading[n] / metre)
+    return worst
 
 
 def thinned(

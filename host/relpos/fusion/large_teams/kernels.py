@@ -174,7 +174,7 @@ def gather(
     first). ``weight`` (E,) is each range's probability to be good, by which its information is
     multiplied, ``surprise`` (E,) its squared innovation over the expected variance.
 
-    Second order, finite where two meet (:mod:`relpos.fusion.bank.joint`): with c the variance
+    Second order, finite where two meet (as ``bank/range_update.py``): with c the variance
     across,
     m^2 = d^2 + c, the range's variance is a d^2 / m^2 + c^2 / 2m^2 and its slope d / m.
     ``outlier`` holds the share of outliers, their variance (m^2)

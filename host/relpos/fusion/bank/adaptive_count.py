@@ -1,0 +1,151 @@
+"""The adaptive number of hypotheses: growing, shrinking, and the ceiling of both."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.bank import hypothesis_count, mixture, storage
+from relpos.fusion.bank.hypothesis_set import HypothesisSet
+from relpos.fusion.bank.mixture import PERTURBED_LOSS
+from relpos.fusion.bank.storage import PER_NODE, POSE, StateIndex
+from relpos.fusion.models.motion_variances import ALONG, ALONG_M2_M, COMPONENTS
+from relpos.fusion.resampling import systematic
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+
+class AdaptiveCount:
+    """Resizes a :class:`HypothesisSet` by how nonlinear and how ambiguous it is.
+
+    The criteria are those of :mod:`relpos.fusion.bank.hypothesis_count`.
+    """
+
+    def __init__(self, hypotheses: HypothesisSet, counters: Counter[str]) -> None:
+        """Begin with the usual number of hypotheses."""
+        self._hypotheses = hypotheses
+        self._counters = counters
+        self.ceiling = hypotheses.settings.hypotheses
+        """Ordinarily at most so many: more than usual while strongly nonlinear."""
+        self.unambiguous = 0
+        """For so many instants of ranges the mixture has been so."""
+        self._unperturbed: Floats = np.zeros(0)
+
+    def resize(self, *, ambiguous: bool, since_fault: int) -> None:
+        """Shrink where the mixture has been unambiguous for a while; grow where it is not."""
+        these = self._hypotheses
+        if these.settings.hypotheses == 1 or not these.nodes:
+            return
+        most = these.count >= these.settings.hypotheses
+        if most and since_fault % hypothesis_count.CHECKED_AFTER == 0:
+            self._adapt_ceiling()
+        if most and ambiguous:
+            self.unambiguous = 0
+            return
+        step_index = self._step_index()
+        if most and step_index > hypothesis_count.LINEAR:
+            self.unambiguous = 0
+            return
+        x, p = these.arrays.x, these.arrays.p
+        poses = storage.order(these.nodes, x.shape[1])[: POSE * these.nodes]
+        mean, covariance = mixture.moments(
+            x, p, self._unperturbed, these.nodes, poses, len(poses), len(poses)
+        )
+        sigmas = np.exp(0.5 * these.components.mean)
+        metre = math.sqrt(ALONG_M2_M) * sigmas[ALONG:-1:COMPONENTS]
+        index = hypothesis_count.nonlinearity_index(mean, covariance, float(sigmas[-1]), metre)
+        if ambiguous or index > hypothesis_count.NONLINEAR:
+            self.unambiguous = 0
+            self.grow()
+        elif index > hypothesis_count.LINEAR or not self._is_even(covariance, poses, step_index):
+            self.unambiguous = 0
+        else:
+            self.unambiguous += 1
+            fewer = [n for n in hypothesis_count.STEPS if n < these.count]
+            if fewer and self.unambiguous >= hypothesis_count.HELD:
+                self.unambiguous = 0
+                self._shrink(fewer[0])
+
+    def _adapt_ceiling(self) -> None:
+        """Have more than the usual number of hypotheses while strongly nonlinear."""
+        these = self._hypotheses
+        usual = these.settings.hypotheses
+        unperturbed = np.empty_like(these.arrays.log_weight)
+        mixture.unperturbed_weights(these.arrays.log_weight, these.perturbed, unperturbed)
+        mean, covariance = these.moments_by(unperturbed, poses_alone=True)
+        # How short the next metre is, is in the motion's moments: arcs alone count here.
+        straight = np.full(these.nodes, np.inf)
+        sigma_range_m = math.exp(0.5 * these.components.mean[-1])
+        index = hypothesis_count.nonlinearity_index(mean, covariance, sigma_range_m, straight)
+        if index < hypothesis_count.LESS_NONLINEAR:
+            self.ceiling = usual
+        elif index > hypothesis_count.STRONGLY_NONLINEAR and self.ceiling == usual:
+            self.ceiling = hypothesis_count.most(usual, int(these.arrays.x.shape[1]))
+            if these.count < self.ceiling:
+                these.resample(these.weights(), self.ceiling)
+
+    def _step_index(self) -> float:
+        """Nonlinearity index of the next metre, inf while the hypotheses are undecided."""
+        these = self._hypotheses
+        log_weight = these.arrays.log_weight
+        self._unperturbed = np.empty_like(log_weight)
+        if float(these.components.covariance[-1, -1]) > hypothesis_count.KNOWN**2:
+            mixture.unperturbed_weights(log_weight, these.perturbed, self._unperturbed)
+            return math.inf
+        flags = hypothesis_count.Flags(these.perturbed, these.has_constants, these.has_bias)
+        return float(
+            hypothesis_count.step_index(
+                these.arrays.x, these.arrays.p, log_weight, flags, these.components.mean,
+                these.nodes, np.empty_like(log_weight), self._unperturbed,
+            )
+        )  # fmt: skip
+
+    def _is_even(self, covariance: Floats, poses: Indices, step_index: float) -> bool:
+        """Whether the hypotheses lie together and not few of them count."""
+        these = self._hypotheses
+        if these.count == 1:
+            return True
+        drawn = these.sampled_share / (1.0 - these.sampled_share)
+        return step_index < math.inf and bool(
+            hypothesis_count.is_even(
+                these.arrays.p, self._unperturbed, covariance, poses, len(poses), drawn
+            )
+        )
+
+    def grow(self) -> None:
+        """Have as many hypotheses as may be: fewer are copied, and their headings drawn."""
+        these = self._hypotheses
+        s = these.settings
+        if these.count >= s.hypotheses:
+            return
+        full = hypothesis_count.sampled_share(s.sampled, s.hypotheses, s.hypotheses)
+        share = full - these.sampled_share
+        these.resample(these.weights(), s.hypotheses)
+        these.redraw()
+        x, p = these.dense()
+        these.store(*hypothesis_count.parted(x, p, self._headings(), share, these.rng))
+        self._counters["hypotheses_grown"] += 1
+
+    def _headings(self) -> Indices:
+        nodes = np.arange(self._hypotheses.nodes, dtype=np.int64)
+        return PER_NODE * nodes + StateIndex.HEADING
+
+    def _shrink(self, count: int) -> None:
+        """Go on with fewer hypotheses; the mixture's moments are unchanged."""
+        these = self._hypotheses
+        s = these.settings
+        self._step_index()
+        mean, covariance = these.moments_by(self._unperturbed, poses_alone=False)
+        these.log_weight[:] -= np.where(these.perturbed > 0.0, PERTURBED_LOSS, 0.0)
+        before, weight = these.sampled_share, these.weights()
+        chosen = systematic(weight, count, these.rng)
+        after = hypothesis_count.sampled_share(s.sampled, count, s.hypotheses)
+        thinned, p = hypothesis_count.thinned(
+            these.x, mean, covariance, chosen, self._headings(), after / before if before else 0.0
+        )
+        these.replace_by(chosen, weight, thinned, p)
+        self._counters["hypotheses_shrunk"] += 1

@@ -1,0 +1,435 @@
+"""The bank's hypotheses: their storage, what is read and changed in them, and resampling."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.bank import hypothesis_count, lanes, mixture, storage
+from relpos.fusion.bank import variance_components as components
+from relpos.fusion.bank.lanes import LANES
+from relpos.fusion.bank.settings import BankSettings
+from relpos.fusion.bank.storage import PER_NODE, Hypotheses, StateIndex
+from relpos.fusion.bank.variance_components import Draws, VarianceComponents
+from relpos.fusion.models.motion_variances import COMPONENTS
+from relpos.fusion.resampling import systematic
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+PAIR_BIASES = 6
+"""Up to so many users each pair has a bias of its own in the state: 15 of them double its size.
+Of more, the common one is modelled."""
+
+RETURN_SHARE = 0.06
+"""Of the hypotheses with low heading noise, this share returns to the usual noise at each
+resampling. People who walk straight on seem to have little; when they turn, some hypotheses have
+to be left that expect it (``paper``, seeds 9100 to 9109: 0.77 m, without it 0.82 with a worst of
+1.34)."""
+
+PERTURBED_UPDATES = 5.0
+"""For so many instants of ranges a perturbed hypothesis teaches nothing about noise."""
+
+JITTER = 0.1
+"""Standard deviation of the log components' jitter at resampling, in units of their spread."""
+
+
+class HypothesisSet:
+    """K weighted hypotheses about N users, as arrays that kernels work on.
+
+    Users are *rows* 0 ... N-1 in the order of ``add_node``. The state has D = 5 N + 1 + pairs
+    entries: five a user (:class:`~relpos.fusion.bank.storage.StateIndex`), then the range bias that
+    all pairs share, then that of each pair when it is first ranged.
+    """
+
+    def __init__(
+        self, settings: BankSettings, rng: np.random.Generator, counters: Counter[str]
+    ) -> None:
+        """Begin with no users and ``settings.hypotheses`` equal hypotheses."""
+        self.settings, self.rng, self._counters = settings, rng, counters
+        count = settings.hypotheses
+        self.nodes = 0
+        self.count = count
+        """K, the number of hypotheses."""
+        blocks = lanes.blocks_of(count)
+        x, p = storage.pack(np.zeros((count, 1)), np.zeros((count, 1, 1)), 0)
+        self.arrays = Hypotheses(
+            x, p, np.zeros((blocks, LANES)), lanes.empty_lines(blocks, 0, COMPONENTS, 6),
+            lanes.empty_lines(blocks, 0, COMPONENTS), lanes.empty_lines(blocks),
+        )  # fmt: skip
+        self.components = VarianceComponents()
+        self._normals: Floats = rng.standard_normal((count, 1))
+        self.has_constants = self._share_of_all(round(settings.constants * count))
+        """1 where step scale and heading drift are modelled (K,)."""
+        self.has_bias = self._share_of_all(round(settings.biased * count))
+        """1 where range biases are (K,)."""
+        self.low_heading_noise = self._share_of_all(int(settings.steady * count))
+        """1 where headings are taken to be those of wheels or a camera (K,)."""
+        # Whoever reports initial poses may be wrong about all of them at once.
+        self.wrong_start = self._share_of_all(int(settings.wrong_starts * count))
+        self.perturbed: Floats = PERTURBED_UPDATES * self.wrong_start
+        """For so many instants of ranges a hypothesis teaches nothing about noise (K,)."""
+        self.biases: dict[tuple[int, int], int] = {}
+        """Pair of rows, the lower first -> entry of its range bias in the state."""
+        self.arrays.p[:, 0] = self._in_lanes(self.has_bias) * settings.bias_m**2
+        self.spread_components()
+
+    def _share_of_all(self, many: int) -> Floats:
+        return (self.rng.permutation(self.count) < many).astype(np.float64)
+
+    # -- reading -------------------------------------------------------------------------------
+
+    @property
+    def x(self) -> Floats:
+        """Means (K, D), a copy."""
+        return storage.means(self.arrays.x, self.nodes, self.count)
+
+    def dense(self) -> tuple[Floats, Floats]:
+        """Means (K, D) and covariances (K, D, D), copies."""
+        return storage.unpack(self.arrays.x, self.arrays.p, self.nodes, self.count)
+
+    @property
+    def log_weight(self) -> Floats:
+        """Log weights (K,), a view."""
+        return self.arrays.log_weight.reshape(-1)[: self.count]
+
+    @property
+    def covariance_entries(self) -> int:
+        """How many numbers all covariances have."""
+        return self.count * int(self.arrays.x.shape[1]) ** 2
+
+    @property
+    def sampled_share(self) -> float:
+        """Share of the heading noise that is drawn; one hypothesis alone draws none."""
+        s = self.settings
+        return hypothesis_count.sampled_share(s.sampled, self.count, s.hypotheses)
+
+    def weights(self) -> Floats:
+        """Normalised weights (K,); the log weights are shifted so that their greatest is 0."""
+        return self.normalise()[0].reshape(-1)[: self.count]
+
+    def normalise(self) -> tuple[Floats, float]:
+        """Return weights (B, LANES) and the effective sample count."""
+        weight = np.empty_like(self.arrays.log_weight)
+        return weight, float(mixture.normalise(self.arrays.log_weight, self.count, weight))
+
+    def moments(self, *, poses_alone: bool = False) -> tuple[Floats, Floats]:
+        """Return the mixture's mean (D,) and full covariance (D, D).
+
+        With ``poses_alone`` constants and biases have variances, and covariances of 0.
+        """
+        return self.moments_by(self.normalise()[0], poses_alone=poses_alone)
+
+    def moments_by(self, weight: Floats, *, poses_alone: bool) -> tuple[Floats, Floats]:
+        """As :meth:`moments`, by ``weight`` (B, LANES)."""
+        x, p = self.arrays.x, self.arrays.p
+        size = x.shape[1]
+        places = storage.POSE * self.nodes if poses_alone else size
+        order = storage.order(self.nodes, size)
+        return mixture.moments(x, p, weight, self.nodes, order, places, size)
+
+    def positions_of(self, row: int) -> tuple[Floats, Floats]:
+        """Where a user is in every hypothesis: x (K,) and y (K,), metres."""
+        return self._column(row, StateIndex.X), self._column(row, StateIndex.Y)
+
+    def poses_of(self, row: int) -> tuple[Floats, Floats]:
+        """A user's poses (K, 3) and their covariances (K, 3, 3)."""
+        poses = np.stack([self._column(row, entry) for entry in range(3)], axis=1)
+        spread = np.empty((self.count, 3, 3))
+        for a in range(3):
+            for b in range(3):
+                spread[:, a, b] = self._covariance_column(self._place(row, a), self._place(row, b))
+        return poses, spread
+
+    def apart(self, row: int, other: int) -> tuple[Floats, Floats]:
+        """Where a user is relative to another: (K, 2) and its covariances (K, 2, 2)."""
+        (from_x, from_y), (to_x, to_y) = self.positions_of(row), self.positions_of(other)
+        i, j = self._place(row), self._place(other)
+        spread = np.empty((self.count, 2, 2))
+        for a in range(2):
+            for b in range(2):
+                own, peer, cross, back = (
+                    self._covariance_column(m, n)
+                    for m, n in ((i + a, i + b), (j + a, j + b), (i + a, j + b), (j + a, i + b))
+                )
+                spread[:, a, b] = own + peer - cross - back
+        return np.stack([to_x - from_x, to_y - from_y], axis=1), spread
+
+    def _place(self, row: int, entry: int = 0) -> int:
+        """Where an entry of a user is stored."""
+        return storage.place_of(PER_NODE * row + entry, self.nodes)
+
+    def _column(self, row: int, entry: int) -> Floats:
+        flat: Floats = self.arrays.x[:, self._place(row, entry)].reshape(-1)[: self.count]
+        return flat.copy()
+
+    def _covariance_column(self, place: int, other: int) -> Floats:
+        flat: Floats = self.arrays.p[:, storage.triangle_place(place, other)].reshape(-1)
+        return flat[: self.count]
+
+    def _in_lanes(self, values: Floats) -> Floats:
+        """Lay out one number of each hypothesis (K,) as (B, LANES)."""
+        laid = np.full(lanes.blocks_of(self.count) * LANES, values[0])
+        laid[: self.count] = values
+        return laid.reshape(-1, LANES)
+
+    # -- changing one user ---------------------------------------------------------------------
+
+    def shift(self, row: int, entry: int, by: Floats, which: Indices | None = None) -> None:
+        """Add ``by`` (K,) to an entry of a user in all hypotheses, or in ``which`` (K,)."""
+        place, x = self._place(row, entry), self.arrays.x
+        if which is None:
+            x[:, place] += self._in_lanes(by)
+        else:
+            x[which // LANES, place, which % LANES] += by
+
+    def set_all(self, row: int, entry: int, values: Floats) -> None:
+        """Set an entry of a user to ``values`` (K,)."""
+        self.arrays.x[:, self._place(row, entry)] = self._in_lanes(values)
+
+    def inflate(self, row: int, entry: int, variance: float, which: Indices | None = None) -> None:
+        """Add to the variance of an entry of a user in all hypotheses, or in ``which``."""
+        place = storage.triangle_place(self._place(row, entry), self._place(row, entry))
+        if which is None:
+            self.arrays.p[:, place] += variance
+        else:
+            self.arrays.p[which // LANES, place, which % LANES] += variance
+
+    def decorrelate(self, row: int, entry: int, which: Indices | None = None) -> None:
+        """Set all covariances of an entry of a user to zero, in all hypotheses or ``which``."""
+        place, p = self._place(row, entry), self.arrays.p
+        others = [storage.triangle_place(place, q) for q in range(self.arrays.x.shape[1])]
+        if which is None:
+            p[:, others] = 0.0
+        else:
+            p[which[:, None] // LANES, np.array(others), which[:, None] % LANES] = 0.0
+
+    def poses_in(self, rows: Indices, which: Indices) -> Floats:
+        """Poses (M, 3) of users ``rows`` (M,) or (1,) in the hypotheses ``which`` (M,)."""
+        places = storage.POSE * rows[:, None] + np.arange(storage.POSE)
+        poses: Floats = self.arrays.x[which[:, None] // LANES, places, which[:, None] % LANES]
+        return poses
+
+    def set_poses(self, row: int, which: Indices, poses: Floats) -> None:
+        """Set a user's poses (M, 3) in the hypotheses ``which`` (M,)."""
+        places = storage.POSE * np.array([[row]]) + np.arange(storage.POSE)
+        self.arrays.x[which[:, None] // LANES, places, which[:, None] % LANES] = poses
+
+    def set_covariances(
+        self, row: int, entries: tuple[int, ...], which: Indices, covariances: Floats
+    ) -> None:
+        """Set covariances (M, 3, 3) of a user's ``entries`` alone; they correlate with no other."""
+        for entry in entries:
+            self.decorrelate(row, entry, which)
+        for a in entries:
+            for b in entries:
+                place = storage.triangle_place(self._place(row, a), self._place(row, b))
+                self.arrays.p[which // LANES, place, which % LANES] = covariances[:, a, b]
+
+    # -- adding --------------------------------------------------------------------------------
+
+    def add_node(self, pose: tuple[float, float, float], sigma_m: float, sigma_rad: float) -> int:
+        """Add a user with a Gaussian prior, independent of the others; return its row."""
+        before, spread = self.dense()
+        count, old = before.shape
+        row = self.nodes
+        at = PER_NODE * row
+        x = np.zeros((count, old + PER_NODE))
+        p = np.zeros((count, old + PER_NODE, old + PER_NODE))
+        keep = np.r_[0:at, at + PER_NODE : old + PER_NODE]
+        x[:, keep] = before
+        p[np.ix_(np.arange(count), keep, keep)] = spread
+        x[:, at : at + 3] = pose
+        for entry, sigma in ((0, sigma_m), (1, sigma_m), (2, sigma_rad)):
+            p[:, at + entry, at + entry] = sigma**2
+        wrong, s = self.wrong_start > 0.0, self.settings
+        off = math.sqrt(0.5) * s.jump_m * self.rng.standard_normal((wrong.sum(), 2))
+        x[wrong, at : at + 2] += off
+        for entry in (StateIndex.X, StateIndex.Y):
+            p[wrong, at + entry, at + entry] += 0.5 * s.jump_m**2
+        drift, scale = at + StateIndex.DRIFT, at + StateIndex.SCALE
+        p[:, drift, drift] = self.has_constants * (1.0 - self.low_heading_noise) * s.drift_rad_s**2
+        p[:, scale, scale] = self.has_constants * s.scale**2
+        self.nodes += 1
+        self.store(x, p)
+        self.biases = {pair: place + PER_NODE for pair, place in self.biases.items()}
+        self.components.add_node()
+        drawn = self.rng.standard_normal((count, COMPONENTS))
+        self._normals = np.concatenate([self._normals[:, :-1], drawn, self._normals[:, -1:]], 1)
+        sensitivity = lanes.empty_lines(len(self.arrays.x), self.nodes, COMPONENTS, 6)
+        sensitivity[:, :-1], sensitivity[:, -1] = self.arrays.sensitivity, 0.0
+        self.arrays = self.arrays._replace(sensitivity=sensitivity)
+        self.spread_components()
+        return row
+
+    def place(
+        self, rows: Indices, poses: Floats, covariances: Floats, log_weights: Floats,
+        beside: int | None = None,
+    ) -> None:  # fmt: skip
+        """Put users ``rows`` (M,) at initial hypotheses; all other users stay.
+
+        ``poses`` (H, M, 3), ``covariances`` (H, 3 M, 3 M), ``log_weights`` (H,); they are dealt
+        out by weight, independently of what the hypotheses say of the others. Where the poses
+        were found relative to the others, their errors contain the error of user ``beside``.
+        """
+        share = np.exp(log_weights - log_weights.max())
+        share /= share.sum()
+        chosen = self.rng.permutation(systematic(share, self.count, self.rng))
+        pose = (PER_NODE * rows[:, None] + np.arange(3)).ravel()
+        x, p = self.dense()
+        x[:, pose] = poses.reshape(len(share), -1)[chosen]
+        p[:, pose, :] = 0.0
+        p[:, :, pose] = 0.0
+        if beside is not None:
+            leader = PER_NODE * beside
+            for row in rows:
+                for axis in (StateIndex.X, StateIndex.Y):
+                    at = PER_NODE * int(row) + axis
+                    p[:, at, :] = p[:, leader + axis, :]
+                    p[:, :, at] = p[:, :, leader + axis]
+            common = p[:, leader : leader + 2, leader : leader + 2]
+            for a in rows:
+                for b in rows:
+                    i, j = PER_NODE * int(a), PER_NODE * int(b)
+                    p[:, i : i + 2, j : j + 2] = common
+        p[np.ix_(np.arange(self.count), pose, pose)] += covariances[chosen]
+        self.store(x, p)
+
+    def split_heading(self, row: int, moved_m: float) -> None:
+        """Spread a user's unknown heading round the circle, one direction a hypothesis.
+
+        ``moved_m`` is how far the user has moved without a heading.
+        """
+        order = self.rng.permutation(self.count)
+        width = 2.0 * math.pi / self.count
+        self.set_all(row, StateIndex.HEADING, width * (order + self.rng.random(self.count)))
+        self.decorrelate(row, StateIndex.HEADING)
+        self.inflate(row, StateIndex.HEADING, max(1.5 * width, 0.12) ** 2)
+        for entry in (StateIndex.X, StateIndex.Y):
+            self.inflate(row, entry, 0.5 * moved_m**2)
+
+    def set_scale(self, row: int, scale: float) -> None:
+        """Start a user's step scale (true over reported) where it is modelled."""
+        self.set_all(row, StateIndex.SCALE, self.has_constants * math.log(scale))
+
+    def bias_entries(self, first: Indices, second: Indices) -> Indices:
+        """Entries of the state that hold the biases of ranges; those of new pairs are added.
+
+        A pair's bias is the common one plus its own part, so a new pair begins with what is known
+        of the common one. Where there are too many pairs, only the common one is modelled.
+        """
+        if not self.has_bias.any():
+            return np.full(len(first), -1, dtype=np.int64)
+        entries = np.full(len(first), PER_NODE * self.nodes, dtype=np.int64)
+        for r, (a, b) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
+            pair = (a, b) if a < b else (b, a)
+            entry = self.biases.get(pair)
+            if entry is None and self.nodes <= PAIR_BIASES:
+                entry = self._add_bias(pair)
+            if entry is not None:
+                entries[r] = entry
+        return entries
+
+    def _add_bias(self, pair: tuple[int, int]) -> int:
+        x0, p0 = self.arrays.x, self.arrays.p
+        size, common, old = int(x0.shape[1]), PER_NODE * self.nodes, p0.shape[1]
+        x = lanes.empty_lines(len(x0), size + 1)
+        p = lanes.empty_lines(len(x0), old + size + 1)
+        x[:, :size], x[:, size] = x0, x0[:, common]
+        p[:, :old] = p0
+        p[:, old:-1] = p0[:, [storage.triangle_place(common, q) for q in range(size)]]
+        own = self.has_bias * self.settings.pair_bias_m**2
+        p[:, -1] = p0[:, storage.triangle_place(common, common)] + self._in_lanes(own)
+        self.arrays = self.arrays._replace(x=x, p=p)
+        self.biases[pair] = size
+        return size
+
+    # -- resampling ----------------------------------------------------------------------------
+
+    def store(self, x: Floats, p: Floats) -> None:
+        """Replace means (K, D) and covariances (K, D, D); K may change."""
+        stored_x, stored_p = storage.pack(x, p, self.nodes)
+        self.arrays = self.arrays._replace(x=stored_x, p=stored_p)
+        self.count = len(x)
+
+    def resample(self, weight: Floats, count: int | None = None) -> None:
+        """Draw hypotheses by their weights; log components are jittered (Liu and West 2001)."""
+        self._select(systematic(weight, self.count if count is None else count, self.rng))
+        # Children of one parent differ in their components, too.
+        self._normals *= math.sqrt(1.0 - JITTER**2)
+        self._normals += JITTER * self.rng.standard_normal(self._normals.shape)
+        if self.low_heading_noise.any():
+            self.low_heading_noise *= self.rng.random(self.count) >= RETURN_SHARE
+        self._equalise()
+        self._counters["resampled"] += 1
+
+    def redraw(self) -> None:
+        """Draw all log components again."""
+        self._normals = self.rng.standard_normal(self._normals.shape)
+        self.spread_components()
+
+    def replace_by(self, chosen: Indices, weight: Floats, x: Floats, p: Floats) -> None:
+        """Go on with the hypotheses ``chosen`` (M,) at means ``x`` (M, D), covariance ``p`` (D, D).
+
+        ``weight`` (K,) are the weights so far; the new ones are equal.
+        """
+        laid = np.zeros(len(self.arrays.x) * LANES)
+        laid[: self.count] = weight
+        blocks = laid.reshape(-1, LANES)
+        sensitivity = np.einsum("bl,b...l->...", blocks, self.arrays.sensitivity)
+        constants, bias = self.has_constants.any(), self.has_bias.any()
+        low_noise = float(weight @ self.low_heading_noise)
+        count = len(chosen)
+        self._select(chosen)
+        self.store(x, np.repeat(p[None], count, axis=0))
+        self.arrays.sensitivity[...] = sensitivity[..., None]
+        self.perturbed = np.zeros(count)
+        # The moments have something of the constants wherever any hypothesis has.
+        self.has_constants = np.full(count, float(constants))
+        self.has_bias = np.full(count, float(bias))
+        # Between the two, where that is open: a nearly linear mixture leaves it so for long.
+        self.low_heading_noise = np.full(count, low_noise)
+        if count == 1:
+            self._normals = np.zeros_like(self._normals)
+        self._equalise()
+
+    def _select(self, chosen: Indices) -> None:
+        """Go on with the hypotheses ``chosen`` (M,)."""
+        old = self.arrays.sensitivity
+        flat = storage.select_hypotheses(old.reshape(len(old), -1, LANES), chosen)
+        self.arrays = self.arrays._replace(
+            x=storage.select_hypotheses(self.arrays.x, chosen),
+            p=storage.select_hypotheses(self.arrays.p, chosen),
+            sensitivity=flat.reshape(len(flat), *old.shape[1:]),
+        )
+        self.count = len(chosen)
+        self._normals = self._normals[chosen]
+        self.has_constants, self.has_bias = self.has_constants[chosen], self.has_bias[chosen]
+        self.low_heading_noise = self.low_heading_noise[chosen]
+        self.perturbed, self.wrong_start = self.perturbed[chosen], self.wrong_start[chosen]
+
+    def _equalise(self) -> None:
+        """Set all weights equal, and draw the components for the present number."""
+        self.spread_components()
+        self.arrays = self.arrays._replace(log_weight=np.zeros((len(self.arrays.x), LANES)))
+
+    def spread_components(self) -> None:
+        """Give every hypothesis its draw of what is known of the variance components."""
+        blocks = lanes.blocks_of(self.count)
+        if self.arrays.component.shape[:2] != (blocks, self.nodes):
+            self.arrays = self.arrays._replace(
+                component=lanes.empty_lines(blocks, self.nodes, COMPONENTS),
+                range_variance=lanes.empty_lines(blocks),
+            )
+        fill = self._normals[[-1] * (blocks * LANES - self.count)]
+        laid = np.concatenate([self._normals, fill]).reshape(blocks, LANES, -1)
+        self.draws = Draws(
+            lanes.copy_lines(laid.transpose(0, 2, 1)),
+            self._in_lanes(self.low_heading_noise),
+            self.settings.spread,
+        )
+        known = self.components
+        components.spread(self.draws, known.mean, known.covariance, self.arrays)

@@ -1,0 +1,343 @@
+"""Ranges: how a measured distance between two users corrects every hypothesis.
+
+To second order. With rho^2 = |p_j - p_i|^2 + dz^2 and the relative covariance's parts along (a)
+and across (c) the line of sight, the moments of rho^2 give, without any clamp,
+
+    m^2 = d^2 + dz^2 + c (+ a dz^2/m^2),   Cov(x, rho) = P u d/m,
+    Var rho = a d^2/m^2 + (a^2 e^4 + c^2)/(2 m^2)
+
+which for c << d^2 is the second-order extended Kalman filter (d + c/2d, a + c^2/2d^2), and
+stays finite where two users meet. Reference implementation: :mod:`reference.joint`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.bank import lanes
+from relpos.fusion.bank.lanes import Lanes, fill, greater, load, select, some, store
+from relpos.fusion.bank.storage import (
+    PER_NODE,
+    POSE,
+    TINY,
+    Block,
+    Hypotheses,
+    block_of,
+    correct,
+    place,
+    row_place,
+)
+from relpos.fusion.compiled import compiled, inner
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+STATS = 12
+MEAN, VARIANCE, EVIDENCE, INLIER, SHARES, RANGE_SHARE, CURVATURE = 0, 1, 2, 3, 4, 10, 11
+"""Columns of the statistics that :func:`update` returns of each range; ``SHARES`` are six."""
+
+FAR = 9.0
+"""Squared distance, in range variances, from which on noise of either sign is seen alike."""
+
+
+class Ranges(NamedTuple):
+    """The ranges (R,) of one instant."""
+
+    first: Indices
+    """Row of the user at one end."""
+    second: Indices
+    range_m: Floats
+    dz_m: Floats
+    """Height difference of the antennas."""
+    dz_variance_m2: Floats
+    sample_count: Floats
+    """How many independent ranges each is worth: the variance that the gain sees is divided by
+    it, the evidence multiplied."""
+    bias: Indices
+    """Entry of the state that holds the range's bias, or -1."""
+
+
+class RangeModel(NamedTuple):
+    """What is known of all ranges."""
+
+    outlier: Floats
+    """(5,): share of outliers, their variance (m^2), the share of these that are too short, the
+    whole motion noise over its part in the covariances, the variance expected beforehand (m^2)."""
+    lever_m: Floats
+    """Antennas (N, 2), forward and left of the poses; (0, 2) where all are zero."""
+
+
+@inner
+def _second_order(
+    ux: Lanes, uy: Lanes, xx: Lanes, xy: Lanes, yy: Lanes, dz: float
+) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+    """Give a range's mean m, variance v, and the two gains' factors gx, gy."""
+    flat2 = ux * ux + uy * uy
+    # Along the line of sight, without a square root.
+    along = (ux * ux * xx + 2.0 * ux * uy * xy + uy * uy * yy) / greater(flat2, fill(TINY))
+    nought = fill(0.0)
+    a = greater(select(flat2 > TINY, along, 0.5 * (xx + yy)), nought)
+    # Across it; rounding may leave a trace of nothing on the wrong side.
+    c = greater(xx + yy - a, nought)
+    # A division costs as much as ten products.
+    m2, square = flat2 + c, c * c
+    if dz != 0.0:
+        tilt = (dz * dz) / (flat2 + (dz * dz + TINY))
+        m2 = m2 + (dz * dz + tilt * a)
+        square = square + tilt * tilt * a * a
+    m = lanes.sqrt(m2) + TINY
+    v = (a * flat2 + 0.5 * square) / (m2 + TINY)
+    per_m = 1.0 / m
+    return m, v, ux * per_m, uy * per_m
+
+
+@inner
+def predict_range(block: Block, i: int, j: int, dz: float) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+    """As ``_second_order``, between users whose poses begin at ``i`` and ``j``."""
+    x, p, at_x, base, _ = block
+    ux = load(x, at_x + j) - load(x, at_x + i)
+    uy = load(x, at_x + j + 1) - load(x, at_x + i + 1)
+    i_x, i_y = base + row_place(i) + i, base + row_place(i + 1) + i
+    j_x, j_y = base + row_place(j) + j, base + row_place(j + 1) + j
+    xx = load(p, i_x) + load(p, j_x) - 2.0 * load(p, base + place(i, j))
+    yy = load(p, i_y + 1) + load(p, j_y + 1) - 2.0 * load(p, base + place(i + 1, j + 1))
+    xy = load(p, i_y) + load(p, j_y)
+    xy = xy - load(p, base + place(i, j + 1)) - load(p, base + place(i + 1, j))
+    return _second_order(ux, uy, xx, xy, yy, dz)
+
+
+@inner
+def _predict_by_lever(
+    block: Block, i: int, j: int, dz: float, levers_m: tuple[Floats, Floats], off: Floats,
+    g: Floats,
+) -> tuple[Lanes, Lanes, Lanes, Lanes]:  # fmt: skip
+    """As ``predict_range``, between antennas with lever arms; ``g`` (D, LANES) gets P h.
+
+    An antenna at o = R(theta) lever moves by (-o_y, o_x) per radian of heading, so the heading has
+    a share in the line of sight. ``off`` (2 D, LANES) is working space: east, then north.
+    """
+    x, p, at_x, base, active = block
+    lever_i, lever_j = levers_m
+    ci, si = lanes.cos_sin(load(x, at_x + i + 2))
+    cj, sj = lanes.cos_sin(load(x, at_x + j + 2))
+    xi, yi = ci * lever_i[0] - si * lever_i[1], si * lever_i[0] + ci * lever_i[1]
+    xj, yj = cj * lever_j[0] - sj * lever_j[1], sj * lever_j[0] + cj * lever_j[1]
+    ux = load(x, at_x + j) + xj - load(x, at_x + i) - xi
+    uy = load(x, at_x + j + 1) + yj - load(x, at_x + i + 1) - yi
+    n = x.shape[1]
+    for q in range(active):
+        hi, hj = load(p, base + place(i + 2, q)), load(p, base + place(j + 2, q))
+        east = load(p, base + place(j, q)) - load(p, base + place(i, q))
+        store(off, q, east - yj * hj + yi * hi)
+        north = load(p, base + place(j + 1, q)) - load(p, base + place(i + 1, q))
+        store(off, n + q, north + xj * hj - xi * hi)
+    xx = load(off, j) - load(off, i) - yj * load(off, j + 2) + yi * load(off, i + 2)
+    xy = load(off, n + j) - load(off, n + i) - yj * load(off, n + j + 2)
+    xy = xy + yi * load(off, n + i + 2)
+    yy = load(off, n + j + 1) - load(off, n + i + 1)
+    yy = yy + xj * load(off, n + j + 2) - xi * load(off, n + i + 2)
+    m, v, gx, gy = _second_order(ux, uy, xx, xy, yy, dz)
+    for q in range(active):
+        store(g, q, gx * load(off, q) + gy * load(off, n + q))
+    return m, v, gx, gy
+
+
+@inner
+def range_gain(block: Block, i: int, j: int, gx: Lanes, gy: Lanes, g: Floats) -> None:
+    """Write P h of a range into ``g`` (D, LANES)."""
+    p, base, active = block.p, block.base, block.active
+    if i > j:
+        i, j, gx, gy = j, i, 0.0 - gx, 0.0 - gy
+    i_x, i_y, j_x, j_y = (
+        base + row_place(i),
+        base + row_place(i + 1),
+        base + row_place(j),
+        base + row_place(j + 1),
+    )
+    for q in range(i):
+        off_x = load(p, j_x + q) - load(p, i_x + q)
+        off_y = load(p, j_y + q) - load(p, i_y + q)
+        store(g, q, gx * off_x + gy * off_y)
+    for q in range(i, i + 2):
+        off_x = load(p, j_x + q) - load(p, base + place(q, i))
+        off_y = load(p, j_y + q) - load(p, base + place(q, i + 1))
+        store(g, q, gx * off_x + gy * off_y)
+    for q in range(i + 2, j):
+        at = base + row_place(q) + i
+        off_x = load(p, j_x + q) - load(p, at)
+        off_y = load(p, j_y + q) - load(p, at + 1)
+        store(g, q, gx * off_x + gy * off_y)
+    for q in range(j, j + 2):
+        at = base + row_place(q) + i
+        off_x = load(p, base + place(q, j)) - load(p, at)
+        off_y = load(p, base + place(q, j + 1)) - load(p, at + 1)
+        store(g, q, gx * off_x + gy * off_y)
+    for q in range(j + 2, active):
+        at = base + row_place(q)
+        off_x = load(p, at + j) - load(p, at + i)
+        off_y = load(p, at + j + 1) - load(p, at + i + 1)
+        store(g, q, gx * off_x + gy * off_y)
+
+
+@inner
+def _correct_sensitivity(
+    sens: Floats, t: int, hx: Lanes, hy: Lanes, kx: Lanes, ky: Lanes, kh: Lanes
+) -> Lanes:
+    """Carry one sensitivity over a range's update; return what it adds to the innovation's."""
+    xx, xy, yy = load(sens, t), load(sens, t + 1), load(sens, t + 2)
+    xh, yh = load(sens, t + 3), load(sens, t + 4)
+    ax = xx * hx + xy * hy
+    ay = xy * hx + yy * hy
+    ah = xh * hx + yh * hy
+    s = hx * ax + hy * ay
+    store(sens, t, xx + kx * (s * kx - 2.0 * ax))
+    store(sens, t + 1, xy + s * kx * ky - kx * ay - ky * ax)
+    store(sens, t + 2, yy + ky * (s * ky - 2.0 * ay))
+    store(sens, t + 3, xh + s * kx * kh - kx * ah - kh * ax)
+    store(sens, t + 4, yh + s * ky * kh - ky * ah - kh * ay)
+    store(sens, t + 5, load(sens, t + 5) + kh * (s * kh - 2.0 * ah))
+    return s
+
+
+@inner
+def _bound_sensitivity(sens: Floats, t: int, p: Floats, base: int, b: int, most: float) -> None:
+    """Keep what the levels explain of a covariance below ``most`` times the covariance.
+
+    It is homogeneous in all variances, so that a true derivative obeys it with ``most`` 1.
+    """
+    excess = fill(0.0)
+    for entry in range(3):
+        at = t + 2 * entry + (entry == 2)
+        explained = load(sens, at) + load(sens, at + 6) + load(sens, at + 12)
+        bound = most * load(p, base + place(b + entry, b + entry)) + TINY
+        excess = greater(excess, explained - bound)
+    if not some(excess > 0.0):
+        return
+    ratio = fill(1.0)
+    for entry in range(3):
+        at = t + 2 * entry + (entry == 2)
+        explained = load(sens, at) + load(sens, at + 6) + load(sens, at + 12)
+        bound = most * load(p, base + place(b + entry, b + entry)) + TINY
+        ratio = greater(ratio, explained / bound)
+    for at in range(t, t + 18):
+        store(sens, at, load(sens, at) / ratio)
+
+
+@inner
+def _share_inlier(innovation: Lanes, s: Lanes, outlier: Floats) -> tuple[Lanes, Lanes]:
+    """Return an innovation's inlier probability and log evidence; ``s`` is its variance."""
+    share, wide, short = outlier[0], outlier[1], outlier[2]
+    square = innovation * innovation
+    per_sd = 1.0 / lanes.sqrt(s)
+    good = (1.0 - share) * lanes.exp(-0.5 * square * per_sd * per_sd) * per_sd
+    per_wide = 1.0 / lanes.sqrt(s + wide)
+    side = select(innovation > 0.0, fill(2.0 * (1.0 - short)), fill(2.0 * short))
+    bad = share * side * lanes.exp(-0.5 * square * per_wide * per_wide) * per_wide
+    # Where both vanish, it is certainly an outlier.
+    both = good + bad + 1e-300
+    return good / both, lanes.log(both)
+
+
+@inner
+def _subtract_bias(
+    block: Block, e: int, m: Lanes, variance: Lanes, g: Floats
+) -> tuple[Lanes, Lanes]:
+    """Return a range's bias (entry ``e``) and what it adds to the innovation's variance.
+
+    ``g`` becomes the gain with it. No range is negative: between two who stand together noise
+    alone looks like a bias, so there it is left out.
+    """
+    x, p, at_x, base, active = block
+    seen = select(m * m > FAR * variance, fill(1.0), fill(0.0))
+    added = seen * (2.0 * load(g, e) + load(p, base + row_place(e) + e))
+    for q in range(active):
+        store(g, q, load(g, q) + seen * load(p, base + place(e, q)))
+    return seen * load(x, at_x + e), added
+
+
+@inner
+def _carry_sensitivities(
+    sensitivity: Floats, stats: Floats, at: int, users: tuple[int, int], ends: tuple[int, int],
+    slope: tuple[Lanes, Lanes, Lanes], g: Floats,
+) -> None:  # fmt: skip
+    """Carry both users' sensitivities over a range's update, and note its own in ``stats``.
+
+    ``users`` are their numbers through all blocks, ``ends`` where their poses begin; ``slope`` is
+    (gx, gy) of the range and the gain's factor; ``stats`` is written from line ``at`` on.
+    """
+    gx, gy, kf = slope
+    blocks = stats.shape[2]
+    (i, j), (t_i, t_j) = ends, (18 * users[0], 18 * users[1])
+    back_x, back_y = 0.0 - gx, 0.0 - gy
+    ix, iy, ih = kf * load(g, i), kf * load(g, i + 1), kf * load(g, i + 2)
+    jx, jy, jh = kf * load(g, j), kf * load(g, j + 1), kf * load(g, j + 2)
+    for part in range(3):
+        grown = _correct_sensitivity(sensitivity, t_i + 6 * part, back_x, back_y, ix, iy, ih)
+        store(stats, at + (SHARES + part) * blocks, grown)
+        grown = _correct_sensitivity(sensitivity, t_j + 6 * part, gx, gy, jx, jy, jh)
+        store(stats, at + (SHARES + 3 + part) * blocks, grown)
+
+
+@compiled
+def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Floats) -> None:
+    """Update with ranges (R,) one after another; each hypothesis' log weight gets their evidence.
+
+    Biases come last in the state, their common part first, and a hypothesis whose common part has
+    no variance has none. An innovation that may be an outlier's is used by its probability r of
+    being none (probabilistic data association): the mean moves by r K nu, the covariance keeps
+    the spread between used and not used.
+
+    ``stats`` (R, STATS, B, LANES) receives m, S, the range's log evidence, r, and by how much S
+    grows with the logarithms of the three variance components of the first and of the second user
+    and of the range variance, and what of S is due to curvature.
+    """
+    x, p, log_weight = hypotheses.x, hypotheses.p, hypotheses.log_weight
+    blocks, nodes = x.shape[0], hypotheses.sensitivity.shape[1]
+    g, off = lanes.working_lines(x.shape[1]), lanes.working_lines(2 * x.shape[1])
+    for b in range(blocks):
+        block = block_of(x, p, b, nodes)
+        biased = block.active > PER_NODE * nodes
+        variance = load(hypotheses.range_variance, b)
+        total = fill(0.0)
+        for r in range(ranges.first.shape[0]):
+            first, second, dz = ranges.first[r], ranges.second[r], ranges.dz_m[r]
+            i, j = POSE * first, POSE * second
+            if model.lever_m.shape[0] > 0:
+                levers = (model.lever_m[first], model.lever_m[second])
+                m, v, gx, gy = _predict_by_lever(block, i, j, dz, levers, off, g)
+            else:
+                m, v, gx, gy = predict_range(block, i, j, dz)
+                range_gain(block, i, j, gx, gy, g)
+            curvature = v - gx * (load(g, j) - load(g, i)) - gy * (load(g, j + 1) - load(g, i + 1))
+            if ranges.dz_variance_m2[r] > 0.0:
+                v = v + (dz * dz * ranges.dz_variance_m2[r]) / (m * m)
+            innovation = ranges.range_m[r] - m
+            if biased and ranges.bias[r] >= 0:
+                bias, added = _subtract_bias(block, ranges.bias[r], m, variance, g)
+                innovation = innovation - bias
+                v = v + added
+            s = v + variance
+            inlier, evidence = _share_inlier(innovation, s, model.outlier)
+            count = ranges.sample_count[r]
+            total = total + count * evidence
+            per_heavy = 1.0 / (v + variance * (1.0 / count))
+            kf = inlier * per_heavy
+            shrink = kf * (1.0 - (1.0 - inlier) * (innovation * innovation) * per_heavy)
+            correct(block, g, kf * innovation, shrink)
+            at = r * STATS * blocks + b
+            store(stats, at, ranges.range_m[r] - innovation)
+            store(stats, at + VARIANCE * blocks, s)
+            store(stats, at + EVIDENCE * blocks, evidence)
+            store(stats, at + INLIER * blocks, inlier)
+            store(stats, at + RANGE_SHARE * blocks, variance)
+            store(stats, at + CURVATURE * blocks, curvature)
+            users = (b * nodes + first, b * nodes + second)
+            _carry_sensitivities(hypotheses.sensitivity, stats, at, users, (i, j), (gx, gy, kf), g)
+            for user, pose in ((users[0], i), (users[1], j)):
+                _bound_sensitivity(
+                    hypotheses.sensitivity, 18 * user, p, block.base, pose, model.outlier[3]
+                )
+        store(log_weight, b, load(log_weight, b) + total)

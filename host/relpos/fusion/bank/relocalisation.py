@@ -1,0 +1,183 @@
+"""What happens when a user's pose is doubtful: its covariance is inflated, or it is relocalised.
+
+After an odometry fault (:mod:`relpos.fusion.models.odometry_faults`) most hypotheses move the user
+to the ring of its next range, and the ranges choose. Until then the user is ambiguous.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.bank.adaptive_count import AdaptiveCount
+from relpos.fusion.bank.hypothesis_set import PERTURBED_UPDATES, HypothesisSet
+from relpos.fusion.bank.storage import PER_NODE, StateIndex
+from relpos.fusion.models.odometry_faults import (
+    BELIEVING,
+    HEADING_CELL_RAD,
+    HYPOTHESES,
+    LOST_M,
+    LOST_RAD,
+    perturb,
+)
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+OPEN_UPDATES = 60
+"""Many hypotheses are kept for so many instants of ranges at most: what has not resolved a pose
+by then (few peers, standing) will not soon."""
+
+FOUND_M, FOUND_RAD = 1.0, 0.4
+"""A user is found when its place relative to another user, and its heading, are known so well."""
+
+ODD_M = 0.3
+"""How far a doubtful displacement may be off, whether it is left out or not."""
+
+FAULT_UPDATES = 10.0
+"""As ``PERTURBED_UPDATES``, of all hypotheses after an odometry fault."""
+
+
+class Relocalisation:
+    """Perturbs the poses of users in a :class:`HypothesisSet`."""
+
+    def __init__(
+        self, hypotheses: HypothesisSet, adaptive: AdaptiveCount, counters: Counter[str]
+    ) -> None:
+        """Begin with no user lost."""
+        self._hypotheses, self._adaptive, self._counters = hypotheses, adaptive, counters
+        self.ambiguous: set[int] = set()
+        """Rows that had an odometry fault and are not found again yet."""
+        self.lost: dict[int, tuple[float, float]] = {}
+        """Row -> standard deviations of its place (m) and heading (rad), until it is ranged."""
+        self.since_fault = 0
+        """Instants of ranges since the last relocalisation."""
+
+    @property
+    def open(self) -> bool:
+        """Whether a user is ambiguous, and that for not too long."""
+        return bool(self.ambiguous) and self.since_fault <= OPEN_UPDATES
+
+    def inflate_covariance(self, row: int, sigma_m: float, sigma_rad: float) -> None:
+        """Know less of a user: isotropic in place (m), and in heading (rad).
+
+        A user that is lost by this is relocalised when it is ranged next.
+        """
+        self._adaptive.grow()
+        these = self._hypotheses
+        off = math.sqrt(0.5) * sigma_m * these.rng.standard_normal((these.count, 2))
+        these.shift(row, StateIndex.X, off[:, 0])
+        these.shift(row, StateIndex.Y, off[:, 1])
+        kept = min(0.5 * sigma_rad**2, HEADING_CELL_RAD**2)
+        turned = math.sqrt(sigma_rad**2 - kept) * these.rng.standard_normal(these.count)
+        these.shift(row, StateIndex.HEADING, turned)
+        for entry, variance in ((0, 0.5 * sigma_m**2), (1, 0.5 * sigma_m**2), (2, kept)):
+            these.inflate(row, entry, variance)
+        these.perturbed[:] = FAULT_UPDATES
+        before = self.lost.get(row, (0.0, 0.0))
+        total = math.hypot(sigma_m, before[0]), math.hypot(sigma_rad, before[1])
+        if these.settings.hypotheses > 1 and (total[0] > LOST_M or total[1] > LOST_RAD):
+            self.lost[row] = total
+            self.ambiguous.add(row)
+
+    def relocalise_lost(self, first: Indices, second: Indices, range_m: Floats) -> None:
+        """Place lost users on the rings of the ranges (R,) that the next update will use."""
+        for row, (sigma_m, sigma_rad) in sorted(self.lost.items()):
+            if (first == row).any() or (second == row).any():
+                del self.lost[row]
+                self._counters["nodes_sought_again"] += 1
+                lost = (sigma_m > LOST_M, sigma_rad > LOST_RAD)
+                self.relocalise(row, (first, second, range_m), sigma_m, lost)
+
+    def relocalise(
+        self,
+        row: int,
+        ranges: tuple[Indices, Indices, Floats],
+        place_m: float,
+        lost: tuple[bool, bool] | None = None,
+    ) -> None:
+        """Move a user to the ring of a range in most hypotheses, ``place_m`` off at most.
+
+        In all hypotheses, where its place or heading or both are ``lost``.
+        """
+        first, second, range_m = ranges
+        self.since_fault = 0
+        self._adaptive.grow()
+        these = self._hypotheses
+        # Of two alone either may be the one: what is between them is perturbed in the same way.
+        self.ambiguous.update([row] if these.nodes > 2 or lost else range(these.nodes))
+        these.resample(these.weights(), max(these.count, HYPOTHESES))
+        believing = BELIEVING if lost is None else 0.0
+        which = these.rng.permutation(these.count)[round(believing * these.count) :]
+        sights = np.flatnonzero((first == row) | (second == row))
+        sight = sights[np.arange(len(which)) % len(sights)]
+        peer = np.where(first[sight] == row, second[sight], first[sight])
+        old = these.poses_in(np.array([row]), which)
+        peers = these.poses_in(peer, which)[:, :2]
+        made = perturb(old, peers, range_m[sight], place_m, these.rng)
+        these.set_poses(row, which, made.poses)
+        # What was lost is no longer correlated with anything else.
+        for perturbed, part in ((~made.kept[:, 0], (0, 1)), (~made.kept[:, 1], (2,))):
+            these.set_covariances(row, part, which[perturbed], made.covariances[perturbed])
+        # Neither the perturbed nor the others may say how noisy anything is.
+        these.perturbed[:] = FAULT_UPDATES
+
+    def end_ambiguity(self, covariance: Floats) -> None:
+        """Take users for found again, by the mixture's covariance (D, D)."""
+        for row in list(self.ambiguous):
+            at = PER_NODE * row
+            others = PER_NODE * np.delete(np.arange(self._hypotheses.nodes), row)
+            spread = [
+                covariance[at + e, at + e] + covariance[others + e, others + e]
+                - 2.0 * covariance[at + e, others + e]
+                for e in (StateIndex.X, StateIndex.Y)
+            ]  # fmt: skip
+            near = float(np.min(spread[0] + spread[1], initial=math.inf))
+            heading = float(covariance[at + StateIndex.HEADING, at + StateIndex.HEADING])
+            if near < FOUND_M**2 and heading < FOUND_RAD**2:
+                self.ambiguous.discard(row)
+
+    def split_motion(self, row: int, east_m: Floats, north_m: Floats) -> None:
+        """Let half the hypotheses leave out a displacement (K,) just made, world axes."""
+        these = self._hypotheses
+        skip = np.flatnonzero(np.arange(these.count) % 2 == 0)
+        these.shift(row, StateIndex.X, -east_m[skip], skip)
+        these.shift(row, StateIndex.Y, -north_m[skip], skip)
+        for entry in (StateIndex.X, StateIndex.Y):
+            these.inflate(row, entry, ODD_M**2)
+        these.perturbed[:] = FAULT_UPDATES
+        self._counters["motions_doubted"] += 1
+
+    def perturb_some(self, surprise: Sequence[float], usual: float) -> None:
+        """Perturb a user's pose in some hypotheses; the more, the worse its ranges fit.
+
+        ``surprise`` (N,) is each user's share of odd ranges, ``usual`` the ordinary one.
+        """
+        these = self._hypotheses
+        s = these.settings
+        if not these.nodes or these.count < 2:
+            return
+        quiet = s.jumps / these.nodes
+        rate = [
+            quiet + (s.jumps_most - quiet) * min(max((much - usual) / 0.35, 0.0), 1.0)
+            for much in surprise
+        ]
+        total = sum(rate)
+        which = np.flatnonzero(these.rng.random(these.count) < total)
+        if not which.size:
+            return
+        these.perturbed[which] = PERTURBED_UPDATES
+        edges = np.cumsum(rate) / total
+        edges[-1] = 1.0
+        for k in which:
+            row = int(np.searchsorted(edges, these.rng.random(), side="right"))
+            offset = these.rng.standard_normal(3).tolist()
+            one = np.array([k])
+            for entry, sigma in enumerate((s.jump_m, s.jump_m, s.jump_rad)):
+                these.shift(row, entry, np.array([math.sqrt(0.5) * offset[entry] * sigma]), one)
+                these.inflate(row, entry, 0.5 * sigma**2, one)
+        self._counters["jumps"] += len(which)

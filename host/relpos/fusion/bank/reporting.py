@@ -1,0 +1,236 @@
+"""What the bank's hypotheses are reported as: the rows of an estimate.
+
+Located nodes are given by the mixture's moments; a node that is ambiguous after an odometry fault
+by its most probable position, and the team by alternatives. Nodes whose initial pose is unknown are
+reported as the initialiser has them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.bank import mixture as mixture_kernels
+from relpos.fusion.bank.core import BankCore
+from relpos.fusion.bank.storage import PER_NODE, StateIndex
+from relpos.fusion.estimator import (
+    ANY_ANGLE_RAD,
+    Alternative,
+    Estimate,
+    MagneticNorth,
+    NodeEstimate,
+    NodeStatus,
+    PairEstimate,
+    Parameter,
+    Presence,
+)
+from relpos.fusion.initial_poses import Initialiser, PoseMixture, sought_node
+from relpos.fusion.models.detection import Detection
+from relpos.fusion.modes import believe, pictures
+
+Floats = npt.NDArray[np.float64]
+
+MOST_LISTED = 200
+"""Hypotheses that alternatives are made of after an odometry fault."""
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Everything that one estimate is made of."""
+
+    time_s: float
+    row: Mapping[int, int]
+    """Located node -> its row in the core."""
+    presence: Mapping[int, Presence]
+    """Every node, located or not."""
+    core: BankCore
+    mean: Floats
+    covariance: Floats
+    """Moments of the mixture, (D,) and (D, D)."""
+    initialiser: Initialiser
+    detection: Detection
+
+    def estimate(self, north: MagneticNorth | None) -> Estimate:
+        """Make the estimate."""
+        sought = [
+            sought_node(self.initialiser, node, presence)
+            for node, presence in self.presence.items()
+            if node not in self.row
+        ]
+        ambiguous = self.core.relocalisation.ambiguous
+        nodes = [self._node(node) for node in sorted(self.row)]
+        pairs = self._pairs()
+        alternatives: tuple[Alternative, ...] = ()
+        if ambiguous:
+            nodes = [self._at_mode(n) if self.row[n.node] in ambiguous else n for n in nodes]
+            pairs = [self._ambiguous_pair(pair) for pair in pairs]
+        mixture = self.initialiser.mixture
+        if mixture is not None:
+            pairs += self._sought_pairs(mixture)
+            alternatives = self._sought_alternatives(mixture)
+        elif ambiguous:
+            alternatives = self._ambiguous_alternatives()
+        together = sorted([*nodes, *sought], key=lambda n: n.node)
+        return Estimate(
+            self.time_s, tuple(together), tuple(pairs), alternatives, self._parameters(), north
+        )
+
+    # -- located nodes -------------------------------------------------------------------------
+
+    def _node(self, node: int) -> NodeEstimate:
+        row, presence = self.row[node], self.presence[node]
+        status = presence.status
+        if row in self.core.relocalisation.ambiguous and status is NodeStatus.OK:
+            status = NodeStatus.AMBIGUOUS
+        at = PER_NODE * row
+        x, y, heading = self.mean[at : at + 3].tolist()
+        own = self.covariance[at : at + 3, at : at + 3].tolist()
+        return NodeEstimate(
+            node, x, y, math.remainder(heading, math.tau), own[0][0], own[1][1], own[0][1],
+            min(math.sqrt(own[2][2]), ANY_ANGLE_RAD), status, presence.height_m,
+            presence.sigma_height_m,
+        )  # fmt: skip
+
+    def _parameters(self) -> tuple[Parameter, ...]:
+        means, variances = self.mean.tolist(), self.covariance.diagonal().tolist()
+        time_s, parameters = self.time_s, []
+        for node, row in sorted(self.row.items()):
+            drift, scale = PER_NODE * row + StateIndex.DRIFT, PER_NODE * row + StateIndex.SCALE
+            sigma_drift = math.sqrt(max(variances[drift], 0.0))
+            sigma_scale = math.sqrt(max(variances[scale], 0.0))
+            grow = math.exp(means[scale])
+            parameters += [
+                Parameter(time_s, node, None, "step_scale", grow, grow * sigma_scale),
+                Parameter(time_s, node, None, "heading_drift_rad_s", means[drift], sigma_drift),
+            ]
+        named = {row: node for node, row in self.row.items()}
+        for (a, b), entry in sorted(self.core.hypotheses.biases.items()):
+            node, peer = sorted((named[a], named[b]))
+            sigma = math.sqrt(max(variances[entry], 0.0))
+            parameters.append(Parameter(time_s, node, peer, "range_bias_m", means[entry], sigma))
+        if self.detection.known:
+            # One curve for the team; every node has it.
+            curve = self.detection.range_m, self.detection.range_sigma_m
+            parameters += [
+                Parameter(time_s, node, None, "detection_range_m", *curve)
+                for node in sorted(self.row)
+            ]
+        return tuple(parameters)
+
+    def _pairs(self) -> list[PairEstimate]:
+        nodes = sorted(self.row)
+        rows = np.array([self.row[node] for node in nodes], dtype=np.int64)
+        figures = mixture_kernels.pairs(self.mean, self.covariance, rows).tolist()
+        every = combinations(nodes, 2)
+        return [PairEstimate(*two, *own) for two, own in zip(every, figures, strict=True)]
+
+    # -- ambiguous nodes -----------------------------------------------------------------------
+
+    def _at_mode(self, node: NodeEstimate) -> NodeEstimate:
+        """Report an ambiguous node at its most probable position, not at the mean of them."""
+        these = self.core.hypotheses
+        belief = believe(these.weights(), *these.poses_of(self.row[node.node]))
+        spread = belief.covariance_m2
+        return replace(
+            node, x_m=belief.x_m, y_m=belief.y_m,
+            heading_rad=math.remainder(belief.heading_rad, math.tau),
+            variance_x_m2=float(spread[0, 0]), variance_y_m2=float(spread[1, 1]),
+            covariance_xy_m2=float(spread[0, 1]),
+            sigma_heading_rad=min(belief.sigma_heading_rad, ANY_ANGLE_RAD),
+        )  # fmt: skip
+
+    def _ambiguous_pair(self, pair: PairEstimate) -> PairEstimate:
+        """Report a pair with an ambiguous node from all hypotheses: the mean says nothing."""
+        a, b = self.row[pair.node], self.row[pair.peer]
+        if {a, b}.isdisjoint(self.core.relocalisation.ambiguous):
+            return pair
+        these = self.core.hypotheses
+        return _pair_of_mixture(pair.node, pair.peer, these.weights(), *these.apart(a, b))
+
+    def _ambiguous_alternatives(self) -> tuple[Alternative, ...]:
+        """List the modes of the team while a node is ambiguous, from the likeliest hypotheses."""
+        these = self.core.hypotheses
+        weight = these.weights()
+        likely = np.argsort(-weight, kind="stable")[:MOST_LISTED]
+        nodes = sorted(self.row)
+        each = [these.poses_of(self.row[n]) for n in nodes]
+        poses = np.stack([poses[likely] for poses, _ in each], axis=1)
+        spread = np.stack([spread[likely, :2, :2] for _, spread in each], axis=1)
+        share = weight[likely] / weight[likely].sum()
+        return pictures(self.time_s, nodes, share, poses, spread)
+
+    # -- sought nodes --------------------------------------------------------------------------
+
+    def _sought_pairs(self, mixture: PoseMixture) -> list[PairEstimate]:
+        """Pairs with at least one node whose initial pose is unknown: moments over all modes."""
+        places = {n: mixture.poses[:, i, :2] for i, n in enumerate(mixture.nodes)}
+        columns = {n: slice(3 * i, 3 * i + 2) for i, n in enumerate(mixture.nodes)}
+        pairs = []
+        for a, b in combinations(sorted([*self.row, *mixture.nodes]), 2):
+            if a in self.row and b in self.row:
+                continue
+            total: Floats = np.zeros((len(mixture.weights), 2, 2))
+            ends = []
+            for node in (a, b):
+                if node in self.row:
+                    at = PER_NODE * self.row[node]
+                    ends.append(self.mean[None, at : at + 2])
+                    total = total + self.covariance[at : at + 2, at : at + 2]
+                else:
+                    own = columns[node]
+                    ends.append(places[node])
+                    total = total + mixture.covariances[:, own, own]
+            if a in columns and b in columns:
+                cross = mixture.covariances[:, columns[a], columns[b]]
+                total = total - cross - cross.transpose(0, 2, 1)
+            pairs.append(_pair_of_mixture(a, b, mixture.weights, ends[1] - ends[0], total))
+        return pairs
+
+    def _sought_alternatives(self, mixture: PoseMixture) -> tuple[Alternative, ...]:
+        """List the modes of the whole team while a node's initial pose is unknown."""
+        if set(mixture.nodes) <= self.initialiser.resolved:
+            return ()
+        count, sought = len(mixture.weights), len(mixture.nodes)
+        located = sorted(self.row)
+        nodes = [*mixture.nodes, *located]
+        poses = np.zeros((count, len(nodes), 3))
+        spread = np.zeros((count, len(nodes), 2, 2))
+        poses[:, :sought] = mixture.poses
+        for i in range(sought):
+            spread[:, i] = mixture.covariances[:, 3 * i : 3 * i + 2, 3 * i : 3 * i + 2]
+        for i, node in enumerate(located):
+            at = PER_NODE * self.row[node]
+            poses[:, sought + i] = self.mean[at : at + 3]
+            spread[:, sought + i] = self.covariance[at : at + 2, at : at + 2]
+        return pictures(self.time_s, nodes, mixture.weights, poses, spread)
+
+
+def _pair_of_mixture(
+    node: int, peer: int, weights: Floats, off: Floats, spread: Floats
+) -> PairEstimate:
+    """Distance and bearing of a pair whose difference is a mixture: (K, 2), (K, 2, 2)."""
+    distance = np.hypot(off[:, 0], off[:, 1])
+    both = np.trace(spread, axis1=1, axis2=2)
+    # On the same spot no direction is along; one is as good as the other.
+    apart = distance > 1e-3 * np.sqrt(both)
+    unit = np.where(apart[:, None], off / np.where(apart, distance, 1.0)[:, None], 0.0)
+    along = np.where(apart, np.einsum("ka,kab,kb->k", unit, spread, unit), 0.5 * both)
+    across = both - along
+    # To second order, as the joint filter's range: E d^2 = |off|^2 + across.
+    distance = np.sqrt(distance**2 + across)
+    middle = float(weights @ distance)
+    variance = float(weights @ (along + (distance - middle) ** 2))
+    together = complex((weights * (unit[:, 0] + 1j * unit[:, 1])).sum())
+    length = min(max(abs(together), 1e-3), 1.0)
+    bearing_sd = math.sqrt(
+        -2.0 * math.log(length) + float(weights @ across) / max(middle, 1e-3) ** 2
+    )
+    return PairEstimate(
+        node, peer, middle, math.sqrt(max(variance, 0.0)), float(np.angle(together)),
+        min(bearing_sd, ANY_ANGLE_RAD),
+    )  # fmt: skip

@@ -1,0 +1,239 @@
+"""How the bank's hypotheses are stored: eight to a block, as kernels read and write them.
+
+One hypothesis is a mean (D,) and a covariance (D, D) over all users: five entries a user in the
+order of :class:`StateIndex`, then (where modelled) the range biases. ``x`` (B, D, LANES) and ``p``
+(B, D (D + 1) / 2, LANES) are B blocks of eight hypotheses (:mod:`relpos.fusion.bank.lanes`); of a
+covariance the lower triangle alone is stored, row by row. All users' poses (x, y, heading) come
+first, then all constants (drift, scale), then the biases, so that what a block does not model is
+at its end. :func:`pack` and :func:`unpack` convert.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.bank import lanes
+from relpos.fusion.bank.lanes import LANES, Lanes, load, some, store
+from relpos.fusion.compiled import compiled, inner
+
+Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+
+class StateIndex(IntEnum):
+    """A user's entries in the joint state: world metres, radians, and two constants.
+
+    ``DRIFT`` (rad/s) is what the reported heading gains over the true one while moving (a node
+    that reports nothing at all stands, and its heading with it), ``SCALE`` the logarithm of the
+    true over the reported length.
+    """
+
+    X = 0
+    Y = 1
+    HEADING = 2
+    DRIFT = 3
+    SCALE = 4
+
+
+PER_NODE = len(StateIndex)
+POSE = 3
+"""x, y and heading of a user are stored side by side."""
+CONSTANTS = 2
+TINY = 1e-12
+
+
+class Hypotheses(NamedTuple):
+    """B blocks of hypotheses about N users; kernels change the arrays in place."""
+
+    x: Floats
+    """Means (B, D, LANES)."""
+    p: Floats
+    """Covariances (B, D (D + 1) / 2, LANES)."""
+    log_weight: Floats
+    """Unnormalised log weights (B, LANES)."""
+    sensitivity: Floats
+    """(B, N, 3, 6, LANES): derivative of each user's pose covariance (xx, xy, yy, xh, yh, hh)
+    with respect to the logarithm of each of its variance components; what leaks to other users is
+    left out."""
+    component: Floats
+    """(B, N, 3, LANES): variance components by which each user's base variances are multiplied."""
+    range_variance: Floats
+    """Variance of a range (B, LANES), m^2."""
+
+
+class Block(NamedTuple):
+    """One block of eight hypotheses within the arrays."""
+
+    x: Floats
+    p: Floats
+    at_x: int
+    """Line of ``x`` where the block begins."""
+    base: int
+    """Line of ``p`` where the block begins."""
+    active: int
+    """So many entries of the state vary: poses, or also constants, or also biases."""
+
+
+# -- conversion ------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=64)
+def order(nodes: int, size: int) -> Indices:
+    """Give the state's entry (D,) that each place of the storage holds."""
+    user = PER_NODE * np.arange(nodes)[:, None]
+    poses, constants = user + np.arange(POSE), user + POSE + np.arange(CONSTANTS)
+    return np.concatenate(
+        [poses.ravel(), constants.ravel(), np.arange(PER_NODE * nodes, size)]
+    ).astype(np.int64)
+
+
+def place_of(entry: int, nodes: int) -> int:
+    """Give the storage's place of an entry of the state."""
+    user, part = divmod(entry, PER_NODE)
+    if user >= nodes:
+        return entry
+    if part < POSE:
+        return POSE * user + part
+    return POSE * nodes + CONSTANTS * user + part - POSE
+
+
+def pack(x: Floats, p: Floats, nodes: int) -> tuple[Floats, Floats]:
+    """Store means (K, D) and covariances (K, D, D); what is left of a block repeats the first."""
+    count, size = x.shape
+    blocks = lanes.blocks_of(count)
+    stored = lanes.empty_lines(blocks, size), lanes.empty_lines(blocks, size * (size + 1) // 2)
+    _pack(np.ascontiguousarray(x), np.ascontiguousarray(p), order(nodes, size), *stored)
+    return stored
+
+
+def unpack(x: Floats, p: Floats, nodes: int, count: int) -> tuple[Floats, Floats]:
+    """Give means (K, D) and covariances (K, D, D) as they are stored."""
+    size = x.shape[1]
+    given = np.empty((count, size)), np.empty((count, size, size))
+    _unpack(x, p, order(nodes, size), *given)
+    return given
+
+
+def means(x: Floats, nodes: int, count: int) -> Floats:
+    """Give the means (K, D) alone."""
+    flat = x.transpose(0, 2, 1).reshape(-1, x.shape[1])[:count]
+    given = np.empty_like(flat)
+    given[:, order(nodes, x.shape[1])] = flat
+    return given
+
+
+def triangle_place(i: int, j: int) -> int:
+    """Give the place of a covariance in the triangle."""
+    return i * (i + 1) // 2 + j if i >= j else j * (j + 1) // 2 + i
+
+
+def select_hypotheses(of: Floats, chosen: Indices) -> Floats:
+    """Give the hypotheses ``chosen`` (M,) of an array (B, ..., LANES) as another."""
+    taken = lanes.empty_lines(lanes.blocks_of(len(chosen)), of.shape[1])
+    _select(of, chosen, taken)
+    return taken
+
+
+@compiled
+def _pack(x: Floats, p: Floats, of: Indices, to_x: Floats, to_p: Floats) -> None:
+    count, size = x.shape
+    for b in range(to_x.shape[0]):
+        for lane in range(LANES):
+            k = b * LANES + lane
+            if k >= count:
+                k = 0
+            t = 0
+            for i in range(size):
+                to_x[b, i, lane] = x[k, of[i]]
+                for j in range(i + 1):
+                    to_p[b, t, lane] = p[k, of[i], of[j]]
+                    t += 1
+
+
+@compiled
+def _unpack(x: Floats, p: Floats, of: Indices, to_x: Floats, to_p: Floats) -> None:
+    count, size = to_x.shape
+    for k in range(count):
+        b, lane = k // LANES, k % LANES
+        t = 0
+        for i in range(size):
+            to_x[k, of[i]] = x[b, i, lane]
+            for j in range(i + 1):
+                to_p[k, of[i], of[j]] = p[b, t, lane]
+                to_p[k, of[j], of[i]] = p[b, t, lane]
+                t += 1
+
+
+@compiled
+def _select(of: Floats, chosen: Indices, to: Floats) -> None:
+    count, rows = chosen.shape[0], of.shape[1]
+    taken, given = of.reshape(-1), to.reshape(-1)
+    # Unsigned, and in registers: a sixth of the time.
+    begin = np.empty(LANES, dtype=np.uintp)
+    for b in range(to.shape[0]):
+        for at in range(LANES):
+            k = chosen[min(b * LANES + at, count - 1)]
+            begin[at] = (k // LANES) * rows * LANES + k % LANES
+        b0, b1, b2, b3 = begin[0], begin[1], begin[2], begin[3]
+        b4, b5, b6, b7 = begin[4], begin[5], begin[6], begin[7]
+        for t in range(rows):
+            line = np.uintp(t * LANES)
+            own = np.uintp(b * rows * LANES) + line
+            given[own] = taken[b0 + line]
+            given[own + np.uintp(1)] = taken[b1 + line]
+            given[own + np.uintp(2)] = taken[b2 + line]
+            given[own + np.uintp(3)] = taken[b3 + line]
+            given[own + np.uintp(4)] = taken[b4 + line]
+            given[own + np.uintp(5)] = taken[b5 + line]
+            given[own + np.uintp(6)] = taken[b6 + line]
+            given[own + np.uintp(7)] = taken[b7 + line]
+
+
+# -- places ----------------------------------------------------------------------------------------
+
+
+@inner
+def row_place(i: int) -> int:
+    """Where a row of the triangle begins."""
+    return (i * (i + 1)) >> 1
+
+
+@inner
+def place(i: int, j: int) -> int:
+    """Place of an entry in the triangle."""
+    return ((i * (i + 1)) >> 1) + j if i >= j else ((j * (j + 1)) >> 1) + i
+
+
+@inner
+def block_of(x: Floats, p: Floats, b: int, nodes: int) -> Block:
+    """Return block ``b``; ``active`` covers every entry of the state that varies in it."""
+    size = x.shape[1]
+    base = b * p.shape[1]
+    poses = PER_NODE * nodes
+    active = POSE * nodes
+    if size > poses and some(load(p, base + place(poses, poses)) > 0.0):
+        active = size
+    else:
+        for i in range(POSE * nodes, poses):
+            if some(load(p, base + place(i, i)) > 0.0):
+                active = poses
+                break
+    return Block(x, p, b * size, base, active)
+
+
+@inner
+def correct(block: Block, gain: Floats, move: Lanes, shrink: Lanes) -> None:
+    """Add ``move`` g to a block's means and subtract ``shrink`` g g^T from its covariances."""
+    x, p, at_x, t, active = block
+    for o in range(active):
+        own = load(gain, o)
+        store(x, at_x + o, load(x, at_x + o) + move * own)
+        f = shrink * own
+        for q in range(o + 1):
+            store(p, t + q, load(p, t + q) - f * load(gain, q))
+        t += o + 1
