@@ -24,7 +24,7 @@ compile-kernels = @printf '%s\n' 'compiling the estimators, once'; \
 title = @printf '\n\033[1m== %s\033[0m\n' "$(1)"
 
 .PHONY: help setup demo live test lint coverage bench bench-chain firmware docs pages wire clean soak \
-        system-demo system-avr system-browser system-soak native-tests board-builds simulated-tests python-tests
+        system-demo system-avr system-browser system-soak firmware-tests board-builds python-tests
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -37,7 +37,7 @@ demo: $(RUN) | system-demo ## six emulated nodes through a serial port into the 
 live: $(RUN) | system-demo ## the same team in real time behind the live page; LIVE="--seconds 600 --nodes 20"
 	$(VENV)/bin/relpos demo --view --seconds 1800 --out out/live $(LIVE)
 
-test: lint wire-check native-tests board-builds simulated-tests python-tests ## every check; pytest last
+test: lint wire-check board-builds python-tests ## every check, the C++ suites among them; pytest last
 
 lint: $(DEVELOP) ## ruff, its formatter, mypy
 	$(call title,Lint: ruff)
@@ -55,17 +55,12 @@ wire-check: $(DEVELOP)
 	$(call title,Wire: the generated files are those of host/relpos/protocol/messages.py)
 	$(PYTHON) protocol/generate.py --check
 
-native-tests: $(DEVELOP) | system-demo
-	$(call title,Firmware suites on this computer, plain and under sanitizers)
-	tools/pio test -e native -e native_sanitized
+firmware-tests: $(DEVELOP) | system-avr ## the C++ suites alone: here, under sanitizers, on the simulated Uno
+	tools/pio test -e native -e native_sanitized -e uno_sim
 
 board-builds: $(DEVELOP) | system-avr
 	$(call title,Firmware for both boards)
 	tools/pio run -e uno -e megaatmega2560
-
-simulated-tests: $(DEVELOP) | system-avr
-	$(call title,Firmware suites on the simulated Uno)
-	tools/pio test -e uno_sim
 
 coverage: $(DEVELOP) | system-avr system-browser ## share of lines that tests reach: firmware/lib, host/relpos
 	$(call title,Firmware suites on this computer, line by line)
@@ -74,13 +69,13 @@ coverage: $(DEVELOP) | system-avr system-browser ## share of lines that tests re
 	$(VENV)/bin/gcovr --filter firmware/lib/ --exclude firmware/lib/board/arduino/ \
 		--fail-under-line 90 .build/pio/build/native_coverage
 	$(call title,Python tests, line by line)
-	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist worksteal --cov --cov-report=term:skip-covered
+	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist loadfile --no-loadscope-reorder --cov --cov-report=term:skip-covered
 
 # Last, so that its closing line is the last of `make test`.
 # One BLAS thread a worker: more of them than cores only wait for each other.
 python-tests: $(DEVELOP) | system-avr system-browser
 	$(call title,Python tests)
-	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist worksteal
+	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist loadfile --no-loadscope-reorder --durations 10
 
 soak: board-builds $(FUZZ) | system-soak ## fuzzing and whatever else takes long: an hour
 	$(call title,Long runs)

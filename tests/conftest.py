@@ -1,0 +1,46 @@
+"""The order of the files: the longest first, so that no worker is left alone at the end."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+DURATIONS = "relpos/durations"
+"""Key in pytest's cache: file -> seconds that its tests took the last time."""
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Some tests wait for browsers and processes: one worker more than cores keeps them busy."""
+    return (os.cpu_count() or 1) + 1
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    durations = config.cache.get(DURATIONS, {})  # type: ignore[union-attr]
+    # Tests of a file stay together and share its fixtures (--dist loadfile); a new one may be long.
+    items.sort(key=lambda item: -durations.get(_file_of(item.nodeid), 60.0))
+
+
+def _file_of(nodeid: str) -> str:
+    return nodeid.partition("::")[0]
+
+
+class _Stopwatch:
+    def __init__(self, config: pytest.Config) -> None:
+        self.config = config
+        self.seconds: dict[str, float] = {}
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        file = _file_of(report.nodeid)
+        self.seconds[file] = self.seconds.get(file, 0.0) + report.duration
+
+    def pytest_sessionfinish(self) -> None:
+        """Keep what this run measured; a run of a few files keeps the others' figures."""
+        before = self.config.cache.get(DURATIONS, {})  # type: ignore[union-attr]
+        self.config.cache.set(DURATIONS, before | self.seconds)  # type: ignore[union-attr]
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if not hasattr(config, "workerinput"):
+        config.pluginmanager.register(_Stopwatch(config))
