@@ -2,7 +2,7 @@
 
     python bench/large_team.py [--nodes 200] [--seeds 8] [--seconds 120] [--no-dense] [--first 0]
 
-A crowd with eight neighbours each (:mod:`relpos.simulation.crowd`), both filters told the noise.
+A crowd with eight neighbours each (`crowd.py`), both filters told the noise.
 The dense one works range by range, to second order, over all 3 N states, compiled. Distance RMSE
 and NEES of pairs in reach (ranged at that instant) and of all pairs; processor time of an epoch
 (two motions, some 4 N ranges) as the median and mean over the epochs.
@@ -20,10 +20,10 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from crowd import Crowd, CrowdSettings, simulate_crowd
 from relpos.evaluation.metrics import aligned_squared_distances
 from relpos.fusion.compiled import compiled
 from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter, RangeModel
-from relpos.simulation.crowd import Crowd, CrowdSettings, simulate_crowd
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

@@ -29,13 +29,15 @@ from gait_statistics import (
     recorded_walk,
 )
 from relpos.calibration.steps import LEG_OF_STATURE
-from relpos.simulation.activities import Activity
-from relpos.simulation.indoor import INDOOR
-from relpos.simulation.motion import WearerTruth
-from relpos.simulation.solo import make_walker
 from relpos.simulation.torso import rotation
-from relpos.simulation.wearer import make_wearer
 from relpos.simulation.world import FloatArray
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from wearers.activities import Activity
+from wearers.indoor import INDOOR
+from wearers.motion import WearerTruth
+from wearers.solo import make_walker
+from wearers.wearer import make_wearer
 
 LOWER_BACK = "walk_lowerback_20m"
 STAND = Activity("stand", seconds=4.0)

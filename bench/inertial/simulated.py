@@ -1,6 +1,6 @@
 """Dead reckoning on simulated wearers: what is claimed, against the truth that is known.
 
-The wearers are those of ``relpos.simulation.solo.make_walker``; the sensors are the emulator's
+The wearers are those of ``wearers.solo.make_walker``; the sensors are the emulator's
 MPU-9150 (DLPF 4, 4 g, 500 deg/s) and AK8975. `simulate` gives one walk for work on the filter:
 
     imu, field_ut, truth = simulate("mixed", seed=3)      # (n, 6), (n, 3) at 50 Hz, WearerTruth
@@ -18,11 +18,13 @@ from __future__ import annotations
 
 import argparse
 import multiprocessing
+import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import replay
@@ -36,11 +38,13 @@ from relpos.emulator.surroundings import (
     draw_inertial_errors,
     draw_magnetic_errors,
 )
-from relpos.simulation.activities import ACTIVITIES, SCRIPTS
-from relpos.simulation.indoor import INDOOR
-from relpos.simulation.motion import WearerTruth
-from relpos.simulation.solo import make_walker
-from relpos.simulation.wearer import PLACES
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from wearers.activities import ACTIVITIES, SCRIPTS
+from wearers.indoor import INDOOR
+from wearers.motion import WearerTruth
+from wearers.solo import make_walker
+from wearers.wearer import PLACES
 
 Array = NDArray[np.float64]
 

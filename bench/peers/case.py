@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -13,8 +15,10 @@ import numpy.typing as npt
 
 from relpos.evaluation.metrics import aligned_squared_distances
 from relpos.measurements import Measurement, Motion, Prior, Range
-from relpos.simulation.crowd import CrowdSettings, simulate_crowd
 from relpos.simulation.paper import DISTANCE_NOISE, HEADING_PATTERN, settings_of, simulate_paper
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from crowd import CrowdSettings, simulate_crowd
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

@@ -9,6 +9,8 @@ pressure sensors are as in docs/emulator.md. docs/height.md has the table.
 from __future__ import annotations
 
 import argparse
+import sys
+from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -16,9 +18,11 @@ import numpy as np
 from relpos.emulator import team as emulated
 from relpos.link.port import Link
 from relpos.measurements import Height
-from relpos.simulation.activities import Activity
-from relpos.simulation.solo import make_walker
 from relpos.simulation.world import FloatArray, World
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from wearers.activities import Activity
+from wearers.solo import make_walker
 
 STAND_S = 15.0
 FLIGHT = (Activity("stairs_up", count=18), Activity("stand", seconds=2.0))

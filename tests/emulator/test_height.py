@@ -11,9 +11,9 @@ from relpos.emulator.serving import record_team
 from relpos.emulator.team import TeamConfig
 from relpos.measurements import Height
 from relpos.runs import load_run, save_run
-from relpos.simulation.activities import Activity
-from relpos.simulation.solo import make_walker
 from relpos.simulation.world import World
+from wearers.activities import Activity
+from wearers.solo import make_walker
 
 GROUND_PA = 98_700.0
 WALK = (Activity("walk", 8.0), Activity("turn", turn_rad=np.pi))

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from crowd import Crowd, CrowdSettings, simulate_crowd
 from relpos import fusion
 from relpos.evaluation import metrics
 from relpos.fusion import Estimate, NodeStatus
@@ -16,7 +17,6 @@ from relpos.fusion import switching as growing
 from relpos.fusion.large_teams.estimator import LargeTeam
 from relpos.fusion.models.motion_variances import ALONG, WHITE
 from relpos.measurements import Measurement, Prior, Range
-from relpos.simulation.crowd import Crowd, CrowdSettings, simulate_crowd
 
 CROWD = CrowdSettings(nodes=60, seconds=50)
 

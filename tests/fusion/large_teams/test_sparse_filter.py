@@ -6,9 +6,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from crowd import Crowd, CrowdSettings, side_of, simulate_crowd
 from reference import neighbourhood as dense
 from relpos.fusion.large_teams.sparse_filter import JITTER_M2, NeighbourhoodFilter, RangeModel
-from relpos.simulation.crowd import Crowd, CrowdSettings, side_of, simulate_crowd
 
 Floats = npt.NDArray[np.float64]
 

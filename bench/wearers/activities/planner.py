@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from relpos.simulation.wearer import REFERENCE_CADENCE_HZ, REFERENCE_STEP_M, Wearer
+from wearers.wearer import REFERENCE_CADENCE_HZ, REFERENCE_STEP_M, Wearer
 
 from .itinerary import Itinerary
 

@@ -8,16 +8,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_gait import strapdown
 
 from relpos.errors import DataError
-from relpos.simulation.activities import ACTIVITIES, SCRIPTS, Activity, make_itinerary
-from relpos.simulation.indoor import INDOOR
-from relpos.simulation.motion import WearerTruth
-from relpos.simulation.solo import make_walker
 from relpos.simulation.team import make_team
-from relpos.simulation.wearer import PLACES, Wearer, make_wearer
 from relpos.simulation.world import GRAVITY_M_S2
+from support.strapdown import strapdown
+from wearers.activities import ACTIVITIES, SCRIPTS, Activity, make_itinerary
+from wearers.indoor import INDOOR
+from wearers.motion import WearerTruth
+from wearers.solo import make_walker
+from wearers.wearer import PLACES, Wearer, make_wearer
 
 STAND = Activity("stand", seconds=4.0)
 

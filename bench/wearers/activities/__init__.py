@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from relpos.simulation.wearer import Wearer
+from wearers.wearer import Wearer
 
 from . import postures, walking
 from .activity import ACTIVITIES, FORWARD, Activity

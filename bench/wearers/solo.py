@@ -19,11 +19,11 @@ from dataclasses import replace
 import numpy as np
 
 from relpos.errors import DataError
-from relpos.simulation.activities import SCRIPTS, Activity, make_itinerary
-from relpos.simulation.motion import WearerTruth, move
 from relpos.simulation.spectral import make_grid
-from relpos.simulation.wearer import Wearer, make_wearer
 from relpos.simulation.world import World
+from wearers.activities import SCRIPTS, Activity, make_itinerary
+from wearers.motion import WearerTruth, move
+from wearers.wearer import Wearer, make_wearer
 
 PAPER_SECONDS = 380.0
 """How long the 310 m of the paper's laboratory walk took."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from relpos.simulation.wearer import Wearer
+from wearers.wearer import Wearer
 
 from .activity import ACTIVITIES, Activity
 

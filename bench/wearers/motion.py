@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from relpos.simulation.activities import ACTIVITIES, HIP_OF_STATURE, STEP_FIELDS, Itinerary
 from relpos.simulation.spectral import Grid, slow_noise
 from relpos.simulation.torso import (
     Attitude,
@@ -32,8 +31,9 @@ from relpos.simulation.torso import (
     vertical_shape,
 )
 from relpos.simulation.walker import RATE_HZ, StepTruth, WalkerTruth
-from relpos.simulation.wearer import Wearer
 from relpos.simulation.world import GRAVITY_M_S2, FloatArray, World
+from wearers.activities import ACTIVITIES, HIP_OF_STATURE, STEP_FIELDS, Itinerary
+from wearers.wearer import Wearer
 
 _PLACE_SHOCKS = {
     "chest": (1.0, 1.0, 1.0, 1.0, 1.0, 1.0),
