@@ -1,4 +1,4 @@
-"""The firmware's C++ suites, as PlatformIO runs them: here, under sanitizers, on a simulated Uno."""
+"""The firmware's C++ suites, run by PlatformIO: here, under sanitizers, on a simulated Uno."""
 
 import re
 import subprocess
