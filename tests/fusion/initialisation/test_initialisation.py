@@ -1,4 +1,4 @@
-"""Unknown starts from outside: found when the data allow it, honest until then."""
+"""Unknown initial poses: found when the data allow it, with honest uncertainty until then."""
 
 from __future__ import annotations
 
@@ -12,12 +12,20 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from reference import starts as twin
+from reference import initialisation as reference
 from relpos import fusion, tracks
 from relpos.evaluation import metrics
 from relpos.fusion.estimator import Estimate, NodeStatus, Shape
-from relpos.fusion.initialisation.kernels import fit, normal_equations
-from relpos.fusion.initialisation.search import Search
+from relpos.fusion.initialisation.hypotheses import fitted
+from relpos.fusion.initialisation.kernels import (
+    Priors,
+    Problem,
+    Ranges,
+    System,
+    Tracks,
+    normal_equations,
+)
+from relpos.fusion.initialisation.search import HypothesisSearch
 from relpos.fusion.modes import Region
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Measurement, Motion, Prior, Range
@@ -102,106 +110,98 @@ def off_m(estimate: Estimate, walk: Walk, time: int, node: int, peer: int) -> fl
 # -- the kernel ------------------------------------------------------------------------------------
 
 
-class Problem:
-    """Random arguments of the kernel: three nodes, two knots, one end given by its place."""
+def random_problem(seed: int) -> tuple[Problem, Floats]:
+    """Three nodes, two knots, some ranges to fixed places; and a hypothesis (19,)."""
+    rng = np.random.default_rng(seed)
+    nodes, knots, times, count = 3, 2, 9, 20
+    tracks = Tracks(
+        rng.normal(0.0, 3.0, (times, nodes, 3)),
+        rng.integers(0, knots + 1, (times, nodes)).astype(np.intp),
+        rng.normal(0.0, 2.0, (knots + 1, nodes, 2)),
+        rng.uniform(0.01, 0.1, (knots, nodes)),
+    )
+    tracks.knots[0] = 0.0
+    priors = Priors(
+        rng.integers(0, times, nodes).astype(np.intp), rng.normal(size=(nodes, 3)),
+        rng.uniform(0.1, 4.0, (nodes, 3)), np.full(nodes, 0.04), 0.09,
+    )  # fmt: skip
+    priors.precision[1] = 0.0
+    ends = np.array([(0, 1), (0, 2), (1, 2), (1, -1), (-1, 2)], dtype=np.intp)
+    ranges = Ranges(
+        ends[rng.integers(0, 5, count)], rng.integers(0, times, count).astype(np.intp),
+        rng.uniform(0.5, 8.0, count), rng.uniform(0.02, 0.3, count),
+        rng.uniform(0.0, 1.0, count), rng.random(count) < 0.2,
+        rng.normal(0.0, 4.0, (count, 2, 2)),
+    )  # fmt: skip
+    parameters = rng.normal(0.0, 1.0, nodes * 6 + 1)
+    parameters[3::6] *= 0.1
+    return Problem(tracks, priors, ranges, np.full(3 * nodes, 2.0)), parameters
 
-    def __init__(self, seed: int) -> None:
-        rng = np.random.default_rng(seed)
-        nodes, knots, times, events = 3, 2, 9, 20
-        self.tracks = rng.normal(0.0, 3.0, (times, nodes, 3))
-        self.segments = rng.integers(0, knots + 1, (times, nodes)).astype(np.intp)
-        self.knots = rng.normal(0.0, 2.0, (knots + 1, nodes, 2))
-        self.knots[0] = 0.0
-        self.turn_variance = rng.uniform(0.01, 0.1, (knots, nodes))
-        self.prior_at = rng.integers(0, times, nodes).astype(np.intp)
-        self.prior = np.stack((rng.normal(size=(nodes, 3)), rng.uniform(0.1, 4.0, (nodes, 3))))
-        self.prior[1, 1] = 0.0
-        self.scale_variance = np.full(nodes, 0.04)
-        ends = np.array([(0, 1), (0, 2), (1, 2), (1, -1), (-1, 2)], dtype=np.intp)
-        self.ends = ends[rng.integers(0, 5, events)]
-        self.at = rng.integers(0, times, events).astype(np.intp)
-        self.measured = np.column_stack(
-            (
-                rng.uniform(0.5, 8.0, events), rng.uniform(0.02, 0.3, events),
-                rng.uniform(0.0, 1.0, events), rng.random(events) < 0.2,
-            )
-        )  # fmt: skip
-        self.places = rng.normal(0.0, 4.0, (events, 2, 2))
-        self.picture = rng.normal(0.0, 1.0, nodes * 6 + 1)
-        self.picture[3::6] *= 0.1
 
-    @property
-    def arguments(self) -> tuple[object, ...]:
-        return (
-            self.tracks, self.segments, self.knots, self.turn_variance, self.prior_at, self.prior,
-            self.scale_variance, 0.09, self.ends, self.at, self.measured, self.places,
-        )  # fmt: skip
-
-    def system(self) -> tuple[float, Floats, Floats]:
-        size = self.picture.size
-        hessian, gradient = np.zeros((size, size)), np.zeros(size)
-        cost = normal_equations(self.picture, *self.arguments, hessian, gradient)  # type: ignore[arg-type]
-        return cost, hessian, gradient
+def system_of(problem: Problem, parameters: Floats) -> System:
+    size = parameters.size
+    system = System(np.zeros(1), np.zeros((size, size)), np.zeros(size))
+    normal_equations(parameters, problem, system)
+    return system
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_kernel_s_cost_is_its_twin_s(seed: int) -> None:
-    problem = Problem(seed)
-    assert problem.system()[0] == pytest.approx(
-        twin.cost(problem.picture, *problem.arguments),  # type: ignore[arg-type]
-        rel=1e-9,
+def test_the_kernel_s_cost_is_that_of_the_reference(seed: int) -> None:
+    problem, parameters = random_problem(seed)
+    assert system_of(problem, parameters).cost[0] == pytest.approx(
+        reference.cost(parameters, problem), rel=1e-9
     )
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_kernel_s_gradient_is_half_the_slope_of_the_twin_s_cost_downwards(seed: int) -> None:
-    problem = Problem(seed)
-    gradient = problem.system()[2]
+def test_the_kernel_s_gradient_is_half_the_slope_of_the_reference_downwards(seed: int) -> None:
+    problem, parameters = random_problem(seed)
+    gradient = system_of(problem, parameters).gradient
     slope = np.empty_like(gradient)
     for k in range(gradient.size):
         ends = []
         for sign in (1.0, -1.0):
-            moved = problem.picture.copy()
+            moved = parameters.copy()
             moved[k] += sign * 1e-5
-            ends.append(twin.cost(moved, *problem.arguments))  # type: ignore[arg-type]
+            ends.append(reference.cost(moved, problem))
         slope[k] = (ends[0] - ends[1]) / 2e-5
     assert gradient == pytest.approx(-0.5 * slope, rel=1e-4, abs=1e-4)
 
 
-def test_a_fit_goes_back_to_what_made_the_ranges() -> None:
-    problem = Problem(7)
-    true = 0.3 * problem.picture
+def test_a_fit_returns_to_what_made_the_ranges() -> None:
+    problem, parameters = random_problem(7)
+    tracks, priors, ranges, _ = problem
+    true = 0.3 * parameters
     true[3::6], true[4::6], true[5::6], true[-1] = 0.0, 0.0, 0.0, 0.0
     blocks = true[:-1].reshape(3, 6)
 
-    def place(node: int, time: int) -> complex:
-        segment = int(problem.segments[time, node])
-        where, _ = twin.pose_at(
-            blocks[node], problem.tracks[time, node], segment, problem.knots[:, node]
-        )
-        return complex(where)
-
-    for e, (a, b) in enumerate(problem.ends):
-        ends = [
-            place(n, problem.at[e]) if n >= 0 else complex(*problem.places[e, k])
-            for k, n in enumerate((a, b))
-        ]
-        problem.measured[e] = (abs(ends[1] - ends[0]), 0.01, 0.0, 0.0)
-    for i in range(3):
-        where, heading = twin.pose_at(
-            blocks[i], problem.tracks[problem.prior_at[i], i],
-            int(problem.segments[problem.prior_at[i], i]), problem.knots[:, i],
+    def pose(node: int, time: int) -> tuple[complex, float]:
+        place, heading = reference.pose_at(
+            blocks[node], tracks.poses[time, node], int(tracks.segments[time, node]),
+            tracks.knots[:, node],
         )  # fmt: skip
-        problem.prior[0, i] = (complex(where).real, complex(where).imag, heading)
-    pictures = true + 0.05 * np.random.default_rng(1).standard_normal((5, true.size))
-    costs, volume, covariances = np.zeros(5), np.zeros(5), np.zeros((5, 9, 9))
-    fit(pictures, 100, np.full(9, 2.0), *problem.arguments, costs, volume, covariances)  # type: ignore[arg-type]
-    poses = pictures[:, :-1].reshape(5, 3, 6)[:, :, :3]
+        x, y = tracks.place(blocks[node], node, time)
+        assert complex(x, y) == pytest.approx(complex(place))
+        return complex(place), heading
+
+    for e, (a, b) in enumerate(ranges.ends):
+        first, second = (
+            pose(n, ranges.at[e])[0] if n >= 0 else complex(*ranges.places[e, k])
+            for k, n in enumerate((a, b))
+        )
+        ranges.range_m[e], ranges.variance_m2[e] = abs(second - first), 0.01
+    ranges.height2_m2[:], ranges.is_disc[:] = 0.0, False
+    for i in range(3):
+        place, heading = pose(i, int(priors.at[i]))
+        priors.mean[i] = place.real, place.imag, heading
+    begin = true + 0.05 * np.random.default_rng(1).standard_normal((5, true.size))
+    fits = fitted(begin, 100, problem)
+    poses = fits.parameters[:, :-1].reshape(5, 3, 6)[:, :, :3]
     assert poses == pytest.approx(np.broadcast_to(blocks[:, :3], poses.shape), abs=0.02)
-    assert (np.linalg.eigvalsh(covariances) > 0.0).all()
+    assert (np.linalg.eigvalsh(fits.covariances) > 0.0).all()
 
 
-# -- what nobody can know --------------------------------------------------------------------------
+# -- what is not observable ------------------------------------------------------------------------
 
 
 def test_before_anybody_moves_everybody_else_is_on_a_ring_about_the_first() -> None:
@@ -258,7 +258,7 @@ def test_while_the_first_stands_alone_the_other_walks_on_a_ring() -> None:
     assert inside >= 36
 
 
-# -- what can be known -----------------------------------------------------------------------------
+# -- what is observable ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("people", [2, 4])
@@ -313,14 +313,14 @@ def test_the_paper_s_team_without_priors_is_found_within_two_minutes() -> None:
     assert {n.status for n in estimates[-1].nodes} == {NodeStatus.OK}
 
 
-def test_the_same_seed_finds_the_same_starts() -> None:
+def test_the_same_seed_finds_the_same_initial_poses() -> None:
     walk = Walk((0, 5 + 2j), (0.4, 2.0), *wander(25, 2, seed=2))
     assert play(walk.measurements, seed=4) == play(walk.measurements, seed=4)
 
 
 def test_a_copy_of_a_search_goes_on_as_the_search_does() -> None:
     walk = Walk((0, 5 + 2j), (0.4, 2.0), *wander(30, 2, seed=3))
-    search = Search(seed=1)
+    search = HypothesisSearch(seed=1)
     search.add(1, 0.0, sigma=(0.0, 0.0, 0.0))
     search.add(2, 0.0)
     copies = [search]
@@ -331,7 +331,7 @@ def test_a_copy_of_a_search_goes_on_as_the_search_does() -> None:
                 case Motion(time_s, node, dx, dy, turn):
                     one.advance(Advance(time_s, node, 1.0, dx, dy, turn))
                 case Range():
-                    one.ranging(measurement.time_s, [measurement], {})
+                    one.update(measurement.time_s, [measurement], {})
                     one.solve()
 
     for m in walk.measurements:

@@ -1,6 +1,6 @@
 """Unknown starts: how soon they are found, and how honest the estimate is until then.
 
-    python bench/starts.py [--seeds 50] [--first 0] [--every 10] [--only paper|robots|...]
+    python bench/initial_poses.py [--seeds 50] [--first 0] [--every 10] [--only paper|robots|...]
 
 *paper*: scenario P1 with nothing told, or only a part of it; aligned RMSE at 120 s, and how often
 the alternatives' 90 % region holds the truth until everybody is located, its area beside that of

@@ -1,15 +1,18 @@
-"""NumPy twin of :mod:`relpos.fusion.initialisation.kernels`: the cost of one picture, term by
-term."""
+"""Reference of :mod:`relpos.fusion.initialisation.kernels`: a hypothesis's cost term by term."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.initialisation.kernels import FIXED, OUTLIER_SHARE, OUTLIER_VARIANCE_M2
+from relpos.fusion.initialisation.kernels import (
+    OUTLIER_FRACTION,
+    OUTLIER_VARIANCE_M2,
+    PER_NODE,
+    Problem,
+)
 
 Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
 
 
 def pose_at(
@@ -21,48 +24,36 @@ def pose_at(
     knots (K + 1, 2): from now back. Every piece between two knots is turned by all turns since.
     """
     corners = [complex(*k) for k in knots[: segment + 1]] + [complex(track[0], track[1])]
-    heading = block[2] + np.concatenate(([0.0], np.cumsum(block[FIXED : FIXED + segment])))
+    heading = block[2] + np.concatenate(([0.0], np.cumsum(block[PER_NODE : PER_NODE + segment])))
     pieces = np.diff(np.array(corners))
     place = complex(block[0], block[1]) + np.exp(block[3]) * (np.exp(1j * heading) @ pieces)
     return np.asarray(place), float(heading[-1] + track[2])
 
 
-def cost(
-    picture: Floats,
-    tracks: Floats,
-    segments: Indices,
-    knots: Floats,
-    turn_variance: Floats,
-    prior_at: Indices,
-    prior: Floats,
-    scale_variance: Floats,
-    bias_variance: float,
-    ends: Indices,
-    at: Indices,
-    measured: Floats,
-    places: Floats,
-) -> float:
-    """-2 log posterior of one picture; arguments as of ``starts_kernels.normal_equations``."""
-    nodes = tracks.shape[1]
-    blocks = picture[:-1].reshape(nodes, -1)
-    bias = picture[-1]
-    total = bias**2 / bias_variance + (blocks[:, 3] ** 2 / scale_variance).sum()
-    total += (blocks[:, FIXED:].T ** 2 / turn_variance).sum()
+def cost(parameters: Floats, problem: Problem) -> float:
+    """-2 log posterior of one hypothesis, as of ``kernels.normal_equations``."""
+    tracks, priors, ranges, _ = problem
+    nodes = tracks.poses.shape[1]
+    blocks = parameters[:-1].reshape(nodes, -1)
+    bias = parameters[-1]
+    total = bias**2 / priors.bias_variance_m2 + (blocks[:, 3] ** 2 / priors.scale_variance).sum()
+    total += (blocks[:, PER_NODE:].T ** 2 / tracks.turn_variance).sum()
 
     def pose(node: int, time: int) -> tuple[complex, float]:
         place, heading = pose_at(
-            blocks[node], tracks[time, node], int(segments[time, node]), knots[:, node]
+            blocks[node],
+            tracks.poses[time, node],
+            int(tracks.segments[time, node]),
+            tracks.knots[:, node],
         )
         return complex(place), heading
 
     for i in range(nodes):
-        place, heading = pose(i, int(prior_at[i]))
-        off = prior[0, i] - (place.real, place.imag, heading)
+        place, heading = pose(i, int(priors.at[i]))
+        off = priors.mean[i] - (place.real, place.imag, heading)
         off[2] = np.angle(np.exp(1j * off[2]))
-        total += (prior[1, i] * off**2).sum()
-    for (a, b), time, (range_m, variance, height_m2, disc), place in zip(
-        ends, at, measured, places, strict=True
-    ):
+        total += (priors.precision[i] * off**2).sum()
+    for (a, b), time, range_m, variance, height_m2, disc, place in zip(*ranges, strict=True):
         first = pose(a, time)[0] if a >= 0 else complex(*place[0])
         second = pose(b, time)[0] if b >= 0 else complex(*place[1])
         off = second - first
@@ -77,6 +68,6 @@ def cost(
 
 def _mixture(off: float, variance: float) -> float:
     wide = variance + OUTLIER_VARIANCE_M2
-    near = (1.0 - OUTLIER_SHARE) * np.exp(-0.5 * off**2 / variance)
-    far = OUTLIER_SHARE * np.sqrt(variance / wide) * np.exp(-0.5 * off**2 / wide)
+    near = (1.0 - OUTLIER_FRACTION) * np.exp(-0.5 * off**2 / variance)
+    far = OUTLIER_FRACTION * np.sqrt(variance / wide) * np.exp(-0.5 * off**2 / wide)
     return float(-2.0 * np.log(near + far))
