@@ -79,7 +79,7 @@ def test_an_emulated_team_is_seen_walking_lost_found_and_pressing_a_landmark(
     phone.get_by_label("Your name").fill("Ben")
     phone.get_by_role("button", name="This is me").click()
     expect(page.locator("#people")).to_contain_text("Ben")
-    expect(phone.locator("#clock-told")).to_contain_text("The laptop's clock is")
+    expect(phone.locator("#clock-status")).to_contain_text("The laptop's clock is")
     for digit in "17":
         phone.locator("#pad").get_by_role("button", name=digit, exact=True).click()
     earliest = time.time()

@@ -28,7 +28,7 @@ def choose(page: Page, who: str, name: str | None = None) -> None:
 
 
 def wait_clock(page: Page) -> None:
-    expect(page.locator("#clock-told")).to_contain_text("The laptop's clock is")
+    expect(page.locator("#clock-status")).to_contain_text("The laptop's clock is")
 
 
 def press(page: Page, landmark: str) -> None:
@@ -55,7 +55,7 @@ def test_a_press_is_recorded_with_its_node_and_time_whatever_the_phones_clock(
     before_s = session_s(stage)
     press(page, "17")
     after_s = session_s(stage)
-    expect(page.locator("#queue")).to_contain_text("1 press kept on this phone")
+    expect(page.locator("#queue")).to_contain_text("1 press stored on this phone")
     wait_for(lambda: len(stage.presses) == 1)
     event = stage.presses[0]
     assert (event.node, event.event, event.value) == (2, "landmark", "17")
@@ -75,7 +75,7 @@ def test_presses_made_offline_are_sent_later_with_their_own_time(visit, stage: S
         press(page, landmark)
         times.append((before_s, session_s(stage)))
         page.wait_for_timeout(400)
-    expect(page.locator("#queue")).to_contain_text("2 presses kept on this phone")
+    expect(page.locator("#queue")).to_contain_text("2 presses stored on this phone")
     expect(page.locator("#queue")).to_contain_text("sent once connected")
     # Closed and opened again in the meantime, as somebody does whose phone seems dead.
     context = page.context
@@ -166,7 +166,7 @@ def test_a_shared_compass_is_a_heading_from_east_counter_clockwise(visit, stage:
     assert heading.heading_rad == pytest.approx(math.radians(150), abs=0.01)
     assert heading.sigma_rad == pytest.approx(math.radians(15), abs=0.01)
     assert before_s - 0.25 <= heading.time_s <= session_s(stage) + 0.25
-    expect(page.locator("#compass-told")).to_contain_text("Heading 300° from magnetic north")
+    expect(page.locator("#compass-status")).to_contain_text("Heading 300° from magnetic north")
     page.get_by_role("button", name="Sharing compass").click()
     page.wait_for_timeout(2500)
     count = len(stage.headings)
@@ -179,7 +179,7 @@ def test_without_https_the_compass_says_what_is_missing(visit, stage: Stage):
     page = visit("/phone", **PHONE, init=insecure)
     expect(page.locator("#connection")).to_have_attribute("data-state", "live")
     page.get_by_role("button", name="Share compass").click()
-    expect(page.locator("#compass-told")).to_contain_text("over HTTPS alone")
+    expect(page.locator("#compass-status")).to_contain_text("over HTTPS alone")
     expect(page.get_by_role("button", name="Share compass")).to_have_attribute(
         "aria-pressed", "false"
     )

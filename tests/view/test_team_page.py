@@ -658,7 +658,7 @@ def test_help_and_the_phones_code_open_and_close_by_keyboard(visit, stage: Stage
     wait_live(page)
     page.locator("#help").focus()
     page.keyboard.press("Enter")
-    expect(page.get_by_role("dialog")).to_contain_text("What is seen here")
+    expect(page.get_by_role("dialog")).to_contain_text("Legend")
     page.keyboard.press("Escape")
     expect(page.get_by_role("dialog")).to_have_count(0)
     page.locator("#phones").click()

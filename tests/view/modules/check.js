@@ -11,8 +11,8 @@ export async function run(sentence) {
   await tests.get(sentence)();
 }
 
-export function ok(condition, told = "") {
-  if (!condition) throw new Error(`not so: ${told}`);
+export function ok(condition, message = "") {
+  if (!condition) throw new Error(`not so: ${message}`);
 }
 
 export function equal(actual, expected) {

@@ -26,13 +26,13 @@ test("from ahead to the other side the order changes hands", () => {
   equal(turnOrder(radians(-40), "bear left"), "bear right");
 });
 
-test("within reach one is told to search, not to turn", () => {
+test("within reach the instruction is to search, not to turn", () => {
   equal(guidance(seen(1.2, 120)).key, "there");
   equal(guidance(seen(4, 120, { sigmaM: 3 })).key, "there");
   equal(guidance(seen(4, 120)).key, "left");
 });
 
-test("without a known heading one is told how to get one", () => {
+test("without a known heading the instruction says how to get one", () => {
   const guide = guidance(seen(9, null, { headingKnown: false }));
   equal(guide.arrowRad, null);
   ok(guide.words.startsWith("walk a few steps"), guide.words);
@@ -60,7 +60,7 @@ test("nothing is said of a trend before it can be known", () => {
   equal(trend.direction, null);
 });
 
-test("a turn from colder to warmer is told within the window", () => {
+test("a turn from colder to warmer shows within the window", () => {
   const trend = new Trend();
   walk(trend, { t: 0, d: 10 }, 1, 10);
   equal(trend.direction, "colder");

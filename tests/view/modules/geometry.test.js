@@ -36,7 +36,7 @@ const person = (node, x_m, y_m, more = {}) => ({
   sigma_angle_rad: 0, status: "ok", ...more,
 });
 
-test("a pair told the other way round has the opposite bearing", () => {
+test("a pair in the other order has the opposite bearing", () => {
   const pair = [1, 2, 5, 0.2, 0.3, 0.1];
   near(relation(person(1, 0, 0), person(2, 1, 1), pair).bearingRad, 0.3);
   near(relation(person(2, 1, 1), person(1, 0, 0), pair).bearingRad, 0.3 - Math.PI);
@@ -62,13 +62,13 @@ test("an ellipse's covariance has its axes as eigenvectors", () => {
   near(-xx * s + xy * c, -s);
 });
 
-test("no direction is told while my heading is unknown", () => {
+test("no direction is shown while my heading is unknown", () => {
   equal(relation(person(1, 0, 0, { sigma_heading_rad: 1.8 }), person(2, 4, 0)).relativeRad, null);
   equal(relation(person(1, 0, 0, { sigma_heading_rad: null }), person(2, 4, 0)).relativeRad, null);
   near(relation(person(1, 0, 0), person(2, 4, 0)).relativeRad, 0);
 });
 
-test("nobody is seen from, or at, no place", () => {
+test("a person without a position has no relation to others", () => {
   equal(relation(person(1, 0, 0), person(2, 4, 0, { status: "unlocated" })), null);
   equal(relation(person(1, null, null), person(2, 4, 0)), null);
   equal(relation(null, person(2, 4, 0)), null);
@@ -118,7 +118,7 @@ test("zooming leaves the point under the finger where it is", () => {
   near(py, 90, 1e-6);
 });
 
-test("nobody zooms beyond the limits", () => {
+test("zoom stays within its limits", () => {
   near(zoomAt(VIEW, 1e9, 0, 0).scale, 400);
   near(zoomAt(VIEW, 1e-9, 0, 0).scale, 0.5);
 });

@@ -2,7 +2,7 @@ import { Alarms } from "/static/js/alarms.js";
 import { delayS, judge } from "/static/js/backoff.js";
 import { overlap, placeLabels, placeWhereFree } from "/static/js/labels.js";
 import { Team } from "/static/js/team.js";
-import { MOST_POINTS, Track } from "/static/js/tracks.js";
+import { MAX_POINTS, Track } from "/static/js/tracks.js";
 import { equal, near, ok, test } from "./check.js";
 
 test("twenty labels in a crowd do not cover each other or a marker", () => {
@@ -62,7 +62,7 @@ test("a picture that changes its mind leaves no line", () => {
 test("hours of walking stay bounded and keep their newest part whole", () => {
   const track = new Track();
   for (let k = 0; k < 20000; k += 1) track.add(k, k, 0);
-  ok(track.points.length <= MOST_POINTS, String(track.points.length));
+  ok(track.points.length <= MAX_POINTS, String(track.points.length));
   const newest = track.points.slice(-500).map((p) => p[0]);
   equal(newest, Array.from({ length: 500 }, (_, k) => 19500 + k));
   ok(track.redrawn > 0);
@@ -97,7 +97,7 @@ test("what somebody else has acknowledged is silent here", () => {
   equal(alarms.list().length, 1);
 });
 
-test("whoever moves again is told once", () => {
+test("a person who moves again is announced once", () => {
   const alarms = new Alarms();
   alarms.update([still(1, "still_alarm", 40), still(2, "lost", 0)]);
   const { cleared } = alarms.update([still(1, null, 0), still(2, "lost", 0)]);
@@ -118,28 +118,28 @@ const person = (node, x_m, more = {}) => ({ node, name: `N${node}`, x_m, y_m: 0,
 
 test("another session begins with an empty map, a reconnection does not", () => {
   const team = new Team();
-  team.take(HELLO);
-  team.take({ type: "picture", seq: 1, time_s: 1, people: [person(1, 0)] });
-  team.take(HELLO);
+  team.handle(HELLO);
+  team.handle({ type: "picture", seq: 1, time_s: 1, people: [person(1, 0)] });
+  team.handle(HELLO);
   equal(team.people.size, 1);
-  team.take({ ...HELLO, session: { name: "b", started_unix_s: 6 } });
+  team.handle({ ...HELLO, session: { name: "b", started_unix_s: 6 } });
   equal(team.people.size, 0);
   equal(team.tracks.size, 0);
 });
 
 test("a server of another protocol, or an unknown message, is noticed", () => {
   const team = new Team();
-  equal(team.take({ ...HELLO, protocol: 2 }), "unknown");
-  equal(team.take({ type: "surprise" }), "unknown");
-  equal(team.take(null), "unknown");
-  equal(team.take({ type: "ping" }), "ping");
+  equal(team.handle({ ...HELLO, protocol: 2 }), "unknown");
+  equal(team.handle({ type: "surprise" }), "unknown");
+  equal(team.handle(null), "unknown");
+  equal(team.handle({ type: "ping" }), "ping");
 });
 
 test("only what is believed leaves a track", () => {
   const team = new Team();
-  team.take(HELLO);
+  team.handle(HELLO);
   ["ok", "ambiguous", "lost", "unlocated", "stale"].forEach((status, k) => {
-    team.take({ type: "picture", seq: k, time_s: k, people: [person(1, k, { status })] });
+    team.handle({ type: "picture", seq: k, time_s: k, people: [person(1, k, { status })] });
   });
   equal(team.tracks.get(1).points.map((p) => p[1]), [0, 4]);
 });
@@ -149,15 +149,15 @@ const ghost = (node, x_m, shape = "ellipse", sigma = 0.2) => (
 
 function ambiguous(alternatives) {
   const team = new Team();
-  team.take(HELLO);
-  team.take({
+  team.handle(HELLO);
+  team.handle({
     type: "picture", seq: 1, time_s: 1, ambiguous: true, alternatives,
     people: [person(1, 0), person(2, 10), person(3, null, { status: "unlocated" })],
   });
   return team.possible();
 }
 
-test("the shown picture is told from the other possible ones", () => {
+test("the position shown is separated from the alternatives", () => {
   const { shown, places, rings } = ambiguous([
     { probability: 0.3, people: [ghost(1, 0), ghost(2, -10), ghost(3, 5, "ring")] },
     { probability: 0.7, people: [ghost(1, 0), ghost(2, 10), ghost(3, 5, "ring")] },
@@ -195,7 +195,7 @@ test("places are one where the shown one is known no better than that", () => {
 
 test("somebody without a name is called by his number", () => {
   const team = new Team();
-  team.take({ type: "picture", seq: 1, time_s: 1, people: [person(4, 0, { name: "" })] });
+  team.handle({ type: "picture", seq: 1, time_s: 1, people: [person(4, 0, { name: "" })] });
   equal(team.person(4).name, "Node 4");
 });
 
@@ -206,6 +206,6 @@ test("attempts become rarer, never rarer than twelve seconds", () => {
   ok(delayS(0, 0) > 0.3);
 });
 
-test("silence is told from loss", () => {
+test("silence is not loss", () => {
   equal([0, 2.1, 5, 9.9, 10].map(judge), ["live", "live", "silent", "silent", "dead"]);
 });

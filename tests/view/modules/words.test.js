@@ -2,7 +2,7 @@ import { contrast, inkOn, palette, personColour } from "/static/js/colours.js";
 import { connectionWords, dataAgeS } from "/static/js/status_line.js";
 import {
   ago, alarmText, compass, compassShort, dbm, distance, duration, percent, plusMinus, probability, seconds, side,
-  spokenDistance, volts, whereabouts, whichWay,
+  spokenDistance, volts, whereabouts, directionWords,
 } from "/static/js/words.js";
 import { equal, near, ok, test } from "./check.js";
 
@@ -14,12 +14,12 @@ test("distances have tenths where they are near and sure", () => {
   equal(distance(null), "–");
 });
 
-test("a deviation is never told as nothing", () => {
+test("a standard deviation is never shown as zero", () => {
   equal([0.01, 0.42, 1.26, 12.3].map((m) => plain(plusMinus(m))), ["±0.1 m", "±0.4 m", "±1.3 m", "±12 m"]);
   equal(plusMinus(undefined), "");
 });
 
-test("times are told in the unit that one thinks in", () => {
+test("durations have the unit of everyday speech", () => {
   equal([0.3, 7, 59.6, 119, 185, 3725, 8000].map(duration), ["0.3 s", "7 s", "60 s", "119 s", "3:05 min", "62:05 min", "2:13 h"]);
   equal([0.9, 34.9, 130].map(seconds), ["0 s", "34 s", "2:10 min"]);
   equal([0.3, 1.9, 2.1, 42].map(ago), ["now", "now", "2 s ago", "42 s ago"]);
@@ -52,9 +52,9 @@ test("whereabouts are one line for the ear", () => {
   equal(whereabouts(null, true), "position unknown");
 });
 
-test("a direction that nobody knows is not told", () => {
-  equal(whichWay({ relativeRad: null, distanceM: 8, sigmaM: 1 }), "direction unknown");
-  equal(whichWay({ relativeRad: null, distanceM: 0.5, sigmaM: 0.3 }), "close by");
+test("an unknown direction is not shown", () => {
+  equal(directionWords({ relativeRad: null, distanceM: 8, sigmaM: 1 }), "direction unknown");
+  equal(directionWords({ relativeRad: null, distanceM: 0.5, sigmaM: 0.3 }), "close by");
 });
 
 test("alarms name who and how long", () => {
@@ -62,7 +62,7 @@ test("alarms name who and how long", () => {
   equal(alarmText({ kind: "lost", name: "Ben", seconds: 125 }), "Ben is lost: not heard for 2:05 min");
 });
 
-test("nobody hears tenths of metres", () => {
+test("spoken distances have no tenths", () => {
   equal([0.3, 1.2, 4.6, 23].map(spokenDistance), ["half a metre", "1 metre", "5 metres", "23 metres"]);
 });
 
@@ -92,7 +92,7 @@ test("the data's age counts the time at the server and the time here", () => {
 
 test("an old picture is never called live", () => {
   equal(connectionWords("live", 0.2, null), { state: "live", words: "Live", age: "data now" });
-  equal(connectionWords("live", 7, null), { state: "old", words: "Old picture", age: "data 7 s old" });
+  equal(connectionWords("live", 7, null), { state: "old", words: "Old data", age: "data 7 s old" });
   equal(connectionWords("waiting", 12, 3), { state: "waiting", words: "Not connected, next try in 3 s", age: "data 12 s old" });
   equal(connectionWords("live", null, null).age, "no data yet");
 });

@@ -1,4 +1,4 @@
-// Who is in trouble, and what of it has been acknowledged.
+// The active alarms, and which of them are acknowledged.
 
 const KINDS = {
   still_warning: { kind: "still", level: "warning" },
@@ -7,9 +7,8 @@ const KINDS = {
 };
 
 /**
- * Keeps the alarms between pictures. `update` returns what has changed, so that it can be told
- * once: {raised, cleared}. A warning that has become an alarm is raised anew, and has to be
- * acknowledged anew.
+ * Keeps the alarms between views. `update` returns what has changed, so that it is announced once:
+ * {raised, cleared}. A warning that becomes an alarm is raised, and must be acknowledged, again.
  */
 export class Alarms {
   constructor() {
@@ -31,7 +30,7 @@ export class Alarms {
         name: person.name,
         ...of,
         seconds: of.kind === "lost" ? person.seen_s : person.still_s,
-        // Acknowledged here at once; at every other page by the server's word.
+        // Acknowledged here at once; on other pages when the server says so.
         acknowledged: person.acknowledged === true || (same ? before.acknowledged : false),
       };
       this.active.set(person.node, alarm);
@@ -56,7 +55,7 @@ export class Alarms {
     return [...this.active.values()].sort((a, b) => rank(a) - rank(b) || b.seconds - a.seconds);
   }
 
-  /** What has to be heard: "alarm", "warning" or null. */
+  /** The sound to play: "alarm", "warning" or null. */
   get sounding() {
     const open = this.list().filter((alarm) => !alarm.acknowledged);
     if (open.length === 0) return null;

@@ -1,5 +1,5 @@
 // Angles as the Picture has them: radians, counter-clockwise, bearings from the map's x axis.
-// What people are told is clockwise: the clock's hours and the compass.
+// People read directions clockwise: the clock's hours and the compass.
 
 export const TAU = 2 * Math.PI;
 
@@ -9,7 +9,7 @@ export function wrap(rad) {
   return turned > Math.PI ? turned - TAU : turned;
 }
 
-/** A bearing as somebody with that heading has it: 0 ahead, positive to the left. */
+/** A bearing relative to a heading: 0 ahead, positive to the left. */
 export function relative(bearingRad, headingRad) {
   return wrap(bearingRad - headingRad);
 }

@@ -1,13 +1,13 @@
-// What is told above everything: alarms of people, notices of the session.
+// The top of the page: alarms of people, notices of the session.
 
 import { make, setAttribute, setText } from "./dom.js";
 import { alarmText } from "./words.js";
 
-const MOST_ROWS = 4;
+const MAX_ROWS = 4;
 
 /**
- * One row an alarm, kept while it lasts, so that its button can be hit; at most four, the worst
- * ones. The others, and those that somebody has acknowledged, share a line each.
+ * One row an alarm, the same element while it lasts, so that its button stays under the finger; at
+ * most four, the worst ones. The others, and the acknowledged ones, share a line each.
  */
 export class AlarmBanner {
   constructor(section, { acknowledge, show }) {
@@ -36,8 +36,8 @@ export class AlarmBanner {
     const open = list.filter((alarm) => !alarm.acknowledged);
     const known = list.filter((alarm) => alarm.acknowledged);
     this.open = open.map((alarm) => alarm.node);
-    const shown = open.slice(0, MOST_ROWS);
-    const others = open.slice(MOST_ROWS);
+    const shown = open.slice(0, MAX_ROWS);
+    const others = open.slice(MAX_ROWS);
     for (const [node, row] of this.rows) {
       if (!shown.some((alarm) => alarm.node === node)) {
         row.element.remove();
@@ -80,7 +80,7 @@ export class AlarmBanner {
 
 const KINDS = { info: "Note", warning: "Warning", alarm: "Alarm" };
 
-/** Warnings and alarms a line each; mere notes share one, the newest first. */
+/** Warnings and alarms have a line each; notes share one, the newest first. */
 export function showNotices(section, notices) {
   const key = JSON.stringify(notices.map((n) => [n.level, n.text]));
   if (section.dataset.shown === key) return;

@@ -10,7 +10,7 @@ const DARK = [
   "#6db7ff", "#ff9a5c", "#4fd6a4", "#f09bd0", "#f2c14e", "#5fd9e8", "#b5a3ff", "#d9a77f", "#b4c2d6",
 ];
 
-/** Colour of whoever wears that node: it stays, whoever joins. */
+/** Colour of a node's wearer; it does not change when others join. */
 export function personColour(node, dark) {
   const palette = dark ? DARK : LIGHT;
   return palette[(node - 1) % palette.length];

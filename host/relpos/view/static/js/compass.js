@@ -15,7 +15,7 @@ export function headingOfCompass(degreesFromNorth) {
 }
 
 /**
- * Heading of somebody who holds the phone with its screen towards himself, flat or upright, from
+ * Heading of a person who holds the phone with its screen towards them, flat or upright, from
  * the angles of a `deviceorientationabsolute` event in degrees; `screenDeg` is how far the
  * screen's content is turned.
  *

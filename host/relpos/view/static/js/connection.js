@@ -1,4 +1,4 @@
-// The WebSocket: reconnects by itself, knows silence from loss, and notices that it was asleep.
+// The WebSocket: reconnects by itself, tells silence from loss, and notices sleep.
 
 import { delayS, judge, SILENT_S } from "./backoff.js";
 

@@ -112,8 +112,8 @@ export async function postJson(address, body) {
     body: JSON.stringify(body),
   });
   if (!answer.ok) {
-    const told = await answer.json().catch(() => null);
-    throw new Error(told?.error ?? `the server answered ${answer.status}`);
+    const reply = await answer.json().catch(() => null);
+    throw new Error(reply?.error ?? `the server answered ${answer.status}`);
   }
   return answer.json();
 }

@@ -1,4 +1,4 @@
-// Finding somebody: arrow, distance and what to do, big enough for gloves and smoke.
+// Guidance to a person: arrow, distance and instruction, large enough for gloves and smoke.
 
 import { degrees } from "./angles.js";
 import { arrow, make, setAttribute, setText } from "./dom.js";
@@ -28,7 +28,7 @@ export class FindView {
     this.trendWords = make("span");
     this.trendLine = make("p", { class: "trend", "data-trend": "none" }, this.trendSign, this.trendWords);
     this.sure = make("p", { class: "sure" });
-    this.doubt = make("p", { class: "doubt" });
+    this.caution = make("p", { class: "caution" });
     this.voice = make("p", { class: "unseen", role: "status", "aria-live": "polite", "aria-atomic": "true" });
     const button = (text, action, attributes = {}) => {
       const element = make("button", { type: "button", text, ...attributes });
@@ -45,7 +45,7 @@ export class FindView {
     ];
     section.append(
       this.title, this.arrow.element, this.distance, this.order, this.trendLine, this.sure,
-      this.doubt, make("div", { class: "actions" }, ...buttons), this.voice,
+      this.caution, make("div", { class: "actions" }, ...buttons), this.voice,
     );
     section.addEventListener("keydown", (event) => {
       if (event.key === "Escape") actions.close();
@@ -88,7 +88,7 @@ export class FindView {
     const name = (person, node) => person?.name ?? `Node ${node}`;
     const targetName = name(target, this.to);
     setText(this.title, `${name(seeker, this.from)} → ${targetName}`);
-    setAttribute(this.title, "aria-label", `Leading ${name(seeker, this.from)} to ${targetName}`);
+    setAttribute(this.title, "aria-label", `Guiding ${name(seeker, this.from)} to ${targetName}`);
     const relation = team.relation(this.from, this.to);
     const guide = guidance(relation, this.previous);
     this.previous = guide.key;
@@ -100,13 +100,13 @@ export class FindView {
     setAttribute(this.trendLine, "data-trend", trend ?? "none");
     setText(this.trendSign, TREND_SIGNS[trend] ?? "");
     setText(this.trendWords, TREND_WORDS[trend] ?? "warmer or colder: walk to find out");
-    setText(this.sure, sureness(seeker, target, relation));
-    const doubt = doubts(team, seeker, target, connected);
-    setText(this.doubt, doubt);
-    this.doubt.hidden = doubt === "";
-    const key = `${guide.key} ${doubt.replace(/\d+/g, "")}`;
+    setText(this.sure, accuracyWords(seeker, target, relation));
+    const caution = cautions(team, seeker, target, connected);
+    setText(this.caution, caution);
+    this.caution.hidden = caution === "";
+    const key = `${guide.key} ${caution.replace(/\d+/g, "")}`;
     if (this.announcer.due(Date.now(), { key, distanceM: relation?.distanceM ?? 0, trend })) {
-      this.say(`${spoken(targetName, relation, guide, trend)} ${doubt}`.trim());
+      this.say(`${spoken(targetName, relation, guide, trend)} ${caution}`.trim());
     }
   }
 
@@ -124,8 +124,8 @@ export class FindView {
   }
 }
 
-/** How sure all this is: of the distance, the direction, and each of the two. */
-export function sureness(seeker, target, relation) {
+/** Standard deviations of distance, direction and both positions, in words. */
+export function accuracyWords(seeker, target, relation) {
   if (!relation) return "";
   const parts = [`distance ${plusMinus(relation.sigmaM)}`];
   if (relation.relativeRad !== null) parts.push(`direction ±${Math.round(degrees(relation.sigmaRad))}°`);
@@ -135,20 +135,20 @@ export function sureness(seeker, target, relation) {
   return parts.join(" · ");
 }
 
-/** Why not to trust it blindly; empty where there is no reason. */
-export function doubts(team, seeker, target, connected) {
+/** Reasons for caution; empty where there are none. */
+export function cautions(team, seeker, target, connected) {
   const words = [];
-  if (!connected) words.push("No connection: this is an old picture.");
+  if (!connected) words.push("No connection: this position is old.");
   for (const person of [target, seeker]) {
     if (!person) continue;
     if (person.status === "unlocated") words.push(`${person.name} is not located.`);
     else if (person.status === "lost" || person.status === "stale") {
-      words.push(`${person.name}: last heard ${ago(person.seen_s)}; led to where that was.`);
+      words.push(`${person.name}: last heard ${ago(person.seen_s)}; guiding to the last known position.`);
     } else if (person.status === "ambiguous") {
       const here = team.possible().here.get(person.node);
       words.push(here < 0.97
         ? `${person.name} may be elsewhere: ${probability(here)} where shown.`
-        : `${person.name} is not sure yet.`);
+        : `${person.name}: position not certain yet.`);
     }
   }
   return words.join(" ");

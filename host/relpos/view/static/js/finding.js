@@ -1,11 +1,11 @@
-// Leading one person to another: which way to turn, and whether it gets warmer.
+// Guiding one person to another: which way to turn, and whether it gets warmer.
 
 import { side, spokenDistance } from "./words.js";
 
 const AHEAD_RAD = (25 * Math.PI) / 180;
 const BEAR_RAD = (60 * Math.PI) / 180;
 const AROUND_RAD = (140 * Math.PI) / 180;
-// An instruction holds until the direction is this far beyond its border, lest it flutters.
+// Hysteresis: an instruction holds until the direction is this far beyond its limit.
 const HOLD_RAD = (7 * Math.PI) / 180;
 
 const ORDERS = {
@@ -26,7 +26,7 @@ function order(relativeRad, slack) {
   return "around";
 }
 
-/** Which way to turn; `previous` is what was said before. */
+/** The direction to turn; `previous` is the last instruction. */
 export function turnOrder(relativeRad, previous = null) {
   const now = order(relativeRad, 0);
   if (previous && previous !== now) {
@@ -36,12 +36,12 @@ export function turnOrder(relativeRad, previous = null) {
   return now;
 }
 
-/** At that distance one is there: within reach of a hand, or as near as can be told. */
+/** Whether the target is within reach of a hand, or as near as the position is known. */
 export function isThere(relation) {
   return relation.distanceM < Math.max(1.5, 1.5 * relation.sigmaM);
 }
 
-/** What the seeker is to do: {key, words, arrowRad}; `arrowRad` null while nobody can say. */
+/** The instruction for the seeker: {key, words, arrowRad}; `arrowRad` is null while unknown. */
 export function guidance(relation, previous = null) {
   if (!relation) return { key: "unknown", words: "position unknown", arrowRad: null };
   if (isThere(relation)) {
@@ -58,9 +58,9 @@ export function guidance(relation, previous = null) {
 }
 
 const TREND_S = 6;
-const LEAST_SPAN_S = 2.5;
-const LEAST_SPEED_M_S = 0.15;
-const LEAST_CHANGE_M = 0.6;
+const MIN_SPAN_S = 2.5;
+const MIN_SPEED_M_S = 0.15;
+const MIN_CHANGE_M = 0.6;
 
 /** Warmer or colder, by the slope of the distance over the last seconds. */
 export class Trend {
@@ -75,12 +75,12 @@ export class Trend {
     while (this.samples[0][0] < timeS - TREND_S) this.samples.shift();
   }
 
-  /** "warmer", "colder", "same", or null while too little is known. */
+  /** "warmer", "colder", "same", or null with too few samples. */
   get direction() {
     const n = this.samples.length;
     if (n < 3) return null;
     const [first, last] = [this.samples[0][0], this.samples[n - 1][0]];
-    if (last - first < LEAST_SPAN_S) return null;
+    if (last - first < MIN_SPAN_S) return null;
     let [st, sd, stt, std] = [0, 0, 0, 0];
     for (const [t, d] of this.samples) {
       st += t - first;
@@ -89,7 +89,7 @@ export class Trend {
       std += (t - first) * d;
     }
     const slope = (n * std - st * sd) / (n * stt - st * st);
-    if (Math.abs(slope) < LEAST_SPEED_M_S || Math.abs(slope) * (last - first) < LEAST_CHANGE_M) {
+    if (Math.abs(slope) < MIN_SPEED_M_S || Math.abs(slope) * (last - first) < MIN_CHANGE_M) {
       return "same";
     }
     return slope < 0 ? "warmer" : "colder";
@@ -102,7 +102,7 @@ export const TREND_WORDS = {
   same: "distance unchanged",
 };
 
-/** What is read aloud. */
+/** The text that is read aloud. */
 export function spoken(targetName, relation, guide, trend) {
   if (!relation) return `${targetName}: position unknown.`;
   const parts = [`${targetName}, ${spokenDistance(relation.distanceM)}`];
@@ -116,7 +116,7 @@ export function spoken(targetName, relation, guide, trend) {
 
 const SAY_EVERY_MS = 4000;
 
-/** Is it time to say it? Something must have changed, and the last word be a while ago. */
+/** Decides when to speak: after a change, and not too soon after the last announcement. */
 export class Announcer {
   constructor() {
     this.last = null;

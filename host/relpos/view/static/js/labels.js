@@ -1,4 +1,4 @@
-// Where labels go so that none covers another, nor anybody's marker.
+// Places labels so that none covers another label or a marker.
 
 /** Overlap of two boxes [x, y, width, height] in square pixels. */
 export function overlap(a, b) {
@@ -28,7 +28,7 @@ const CANDIDATES = DIRECTIONS.length * REACHES.length;
  * Place the labels of `items` {id, x, y, radius, width, height}, the most important first.
  *
  * `bounds` is [width, height] of the screen, `taken` further boxes to keep free. `previous` (id ->
- * candidate) keeps labels from hopping about: where a label was is tried first. Returns a Map of id
+ * candidate) keeps labels from jumping: the previous place is tried first. Returns a Map of id
  * -> {box, candidate, far}; `far` labels need a line to their marker.
  */
 export function placeLabels(items, bounds, previous = new Map(), taken = []) {

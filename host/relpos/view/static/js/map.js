@@ -7,7 +7,7 @@ import { TrackLayer } from "./track_layer.js";
 import {
   clampScale, fit, gridStep, headingUp, isLoose, pan, scaleBar, toMap, toScreen, zoomAt,
 } from "./transform.js";
-import { distance, plusMinusDegrees, probability, seconds, sureHere } from "./words.js";
+import { distance, plusMinusDegrees, probability, seconds, probabilityHere } from "./words.js";
 
 const TAIL_S = 30;
 const MINUTE_S = 60;
@@ -295,7 +295,7 @@ export class TeamMap {
       }
       context.globalAlpha = 1;
     }
-    // The newest stretch stands out: it says where somebody has just come from.
+    // The newest part of a track stands out: it shows the last direction of motion.
     const tailS = this.layers.tracks === "all" ? TAIL_S : MINUTE_S;
     context.lineWidth = 3 * unit;
     context.lineCap = "round";
@@ -328,7 +328,7 @@ export class TeamMap {
     }
   }
 
-  /** A place where somebody may be instead. */
+  /** An alternative position of a person. */
   drawGhost(place) {
     const { context, view, unit } = this;
     if (place.shape === "ring") {
@@ -436,7 +436,7 @@ export class TeamMap {
     context.globalAlpha = gone ? 0.6 : 0.75;
     context.strokeStyle = colour;
     context.lineWidth = 1.25 * unit;
-    // Nobody knows where he is by now: a border, no area that hides the others.
+    // The position is unknown by now: an outline, no area that hides the others.
     if (gone) context.setLineDash([3 * unit, 5 * unit]);
     context.stroke();
     context.setLineDash([]);
@@ -564,7 +564,7 @@ export class TeamMap {
       ? `lost ${seconds(person.seen_s)}` : `still ${seconds(person.still_s)}`;
     if (person.status === "lost") return `lost ${seconds(person.seen_s)}`;
     if (person.status === "stale") return `no news ${seconds(person.seen_s)}`;
-    if (person.status === "ambiguous") return sureHere(here.get(person.node));
+    if (person.status === "ambiguous") return probabilityHere(here.get(person.node));
     return "";
   }
 
@@ -846,7 +846,7 @@ export class TeamMap {
     const placed = people.filter(isPlaced);
     const parts = [`${placed.length} of ${people.length} people located`];
     if (this.camera.mode === "follow") {
-      parts.push(`following ${this.team.person(this.camera.node)?.name ?? "nobody"}`);
+      parts.push(`following ${this.team.person(this.camera.node)?.name ?? "no one"}`);
     }
     parts.push(this.up === "heading" ? `${this.headingPerson()?.name ?? "heading"} up`
       : this.team.northRad === null ? "map north up" : `magnetic north up ${plusMinusDegrees(this.team.sigmaNorthRad)}`);

@@ -1,18 +1,18 @@
-// The people beside the map: who, where from me, how well; and the map as a table.
+// The list of people beside the map, and the map as a table.
 
 import { inkOn } from "./colours.js";
 import { arrow, healthSign, make, setAttribute, setText } from "./dom.js";
 import { isPlaced, VAGUE_RAD } from "./relation.js";
 import {
   ago, compass, compassShort, dbm, distance, HEALTH_WORDS, percent, plusMinus, probability, seconds,
-  STATUS_WORDS, UNKNOWN, volts, whereabouts, whichWay,
+  STATUS_WORDS, UNKNOWN, volts, whereabouts, directionWords,
 } from "./words.js";
 
-/** What somebody does, in words; empty where all is well and nothing need be said. */
+/** A person's state in words; empty while all is well. */
 export function stateWords(person, alarm, here) {
   const words = [];
   if (alarm?.kind === "lost" || person.status === "lost") words.push(`Lost: last heard ${ago(person.seen_s)}`);
-  else if (person.status === "stale") words.push(`No news: last heard ${ago(person.seen_s)}`);
+  else if (person.status === "stale") words.push(`No report: last heard ${ago(person.seen_s)}`);
   else if (person.status === "unlocated") words.push("Not located yet");
   else if (person.status === "ambiguous") {
     words.push(here < 0.97 ? `Ambiguous: ${probability(here)} where shown` : "Ambiguous");
@@ -77,13 +77,13 @@ class Card {
     setText(this.health, HEALTH_WORDS[person.health] ?? person.health);
     this.where.hidden = me || meName === null;
     this.spacer.hidden = !this.where.hidden;
-    setText(this.spacer, me ? "the others are seen from here" : "");
+    setText(this.spacer, me ? "distances are from here" : "");
     if (!this.where.hidden) {
       this.arrow.point(relation?.relativeRad ?? null);
       setText(this.far, relation ? distance(relation.distanceM, relation.sigmaM) : UNKNOWN);
       setText(this.sigma, relation ? plusMinus(relation.sigmaM) : "");
       setText(this.direction, !relation ? "position unknown"
-        : whichWay(relation));
+        : directionWords(relation));
       setText(this.compass, relation ? compassShort(relation.bearingRad, northRad) : "");
     }
     setText(this.state, stateWords(person, alarm, here));
@@ -192,12 +192,12 @@ export function alternativeWords(team) {
   const { here, places, rings } = team.possible();
   const name = (node) => team.person(node)?.name ?? `Node ${node}`;
   const words = rings.map((ring) => `${name(ring.node)} is somewhere on a ring of ${distance(ring.sigma_major_m)} about x ${number(ring.x_m)}, y ${number(ring.y_m)}.`);
-  const told = new Set();
+  const listed = new Set();
   for (const place of places) {
-    if (!told.has(place.node) && here.has(place.node)) {
+    if (!listed.has(place.node) && here.has(place.node)) {
       words.push(`${name(place.node)} is where shown with ${probability(here.get(place.node))}.`);
     }
-    told.add(place.node);
+    listed.add(place.node);
     words.push(place.shape === "ring"
       ? `With ${probability(place.probability)} ${name(place.node)} is on a ring of ${distance(place.sigma_major_m)} about x ${number(place.x_m)}, y ${number(place.y_m)}.`
       : `With ${probability(place.probability)} ${name(place.node)} is at x ${number(place.x_m)}, y ${number(place.y_m)}.`);

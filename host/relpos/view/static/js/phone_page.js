@@ -1,4 +1,4 @@
-// The wearer's page: puts the pieces together.
+// The wearer's page: joins the modules.
 
 import { Alarms } from "./alarms.js";
 import { degrees } from "./angles.js";
@@ -16,15 +16,15 @@ import { connectionWords, dataAgeS, showConnection } from "./status_line.js";
 import { Team } from "./team.js";
 import { isDark, themeSwitch } from "./theme_switch.js";
 import { ScreenLock } from "./wake_lock.js";
-import { alarmText, clock, compass, distance, plusMinus, side, timeOfDay, whichWay } from "./words.js";
+import { alarmText, clock, compass, distance, plusMinus, side, timeOfDay, directionWords } from "./words.js";
 
 const CLOCK_EVERY_MS = 60_000;
 const LIST_MS = 250;
 
-const kept = storage();
+const store = storage();
 const team = new Team();
 const alarms = new Alarms();
-const queue = new PressQueue(kept);
+const queue = new PressQueue(store);
 const others = new Map();
 let me = readMe();
 let page = me ? "landmarks" : "me";
@@ -48,7 +48,7 @@ const lock = new ScreenLock(showLock);
 const sharing = new CompassSharing(showCompass);
 const findView = new FindView(byId("find"), { close: stopFinding, next: findNext });
 const connection = new Connection({
-  onMessage: take,
+  onMessage: handle,
   onState: (state) => {
     showAge();
     if (state === "live") {
@@ -60,17 +60,17 @@ const connection = new Connection({
 
 function readMe() {
   try {
-    const read = JSON.parse(kept.getItem("relpos.wearer") ?? "null");
+    const read = JSON.parse(store.getItem("relpos.wearer") ?? "null");
     return Number.isInteger(read?.node) ? read : null;
   } catch {
     return null;
   }
 }
 
-// -- pictures --------------------------------------------------------------------------------------
+// -- messages --------------------------------------------------------------------------------------
 
-function take(message) {
-  const kind = team.take(message);
+function handle(message) {
+  const kind = team.handle(message);
   if (kind === "hello") {
     alarms.clear();
     trouble = null;
@@ -86,7 +86,7 @@ function take(message) {
     findView.update(team, { connected: true });
     if (performance.now() - listMs > LIST_MS) showTeam();
   } else if (kind === "unknown") {
-    trouble = { level: "warning", text: "The server speaks another language than this page: reload it." };
+    trouble = { level: "warning", text: "The server's version differs from this page's: reload the page." };
   }
 }
 
@@ -128,7 +128,7 @@ function showTeam() {
     setText(row.sigma, relation ? plusMinus(relation.sigmaM) : "");
     setText(row.where, !relation ? (me ? "position unknown" : "say who you are first")
       : relation.relativeRad === null
-        ? `${whichWay(relation)} · ${compass(relation.bearingRad, team.northRad)}`
+        ? `${directionWords(relation)} · ${compass(relation.bearingRad, team.northRad)}`
         : `${clock(relation.relativeRad)}, ${side(relation.relativeRad)}`);
     setText(row.state, stateWords(person, alarm, here.get(person.node)));
     row.find.disabled = !me;
@@ -167,9 +167,9 @@ function showMe() {
 
 function showAge() {
   const age = dataAgeS({ unixS: team.unixS, arrivedUnixS: team.arrivedUnixS, receivedMs, nowMs: Date.now() });
-  const told = connectionWords(connection.state, age, connection.retryS);
-  showConnection({ line: byId("connection"), words: byId("connection-words"), age: byId("age"), retry: byId("retry") }, told);
-  document.body.dataset.connection = told.state;
+  const status = connectionWords(connection.state, age, connection.retryS);
+  showConnection({ line: byId("connection"), words: byId("connection-words"), age: byId("age"), retry: byId("retry") }, status);
+  document.body.dataset.connection = status.state;
 }
 
 async function acknowledge(node) {
@@ -179,7 +179,7 @@ async function acknowledge(node) {
   try {
     await postJson("/api/acknowledge", { node });
   } catch (error) {
-    trouble = { level: "warning", text: `Acknowledged on this phone alone: ${error.message}` };
+    trouble = { level: "warning", text: `Acknowledged only on this phone: ${error.message}` };
   }
 }
 
@@ -245,7 +245,7 @@ function showPress() {
 function pressNow() {
   const landmark = field.value;
   if (!me || !landmark) return;
-  // The finger's touch counts, not its lifting.
+  // The press counts from the touch, not from the release.
   const now = Date.now();
   const unixMs = downMs !== null && now - downMs < 2000 ? downMs : now;
   downMs = null;
@@ -260,10 +260,10 @@ function pressNow() {
 
 function undo() {
   const undone = queue.undo();
-  setText(byId("voice"), undone ? `Landmark ${undone.landmark} taken back` : "Too late to take back");
+  setText(byId("voice"), undone ? `Landmark ${undone.landmark} undone` : "Too late to undo");
   if (undone) {
     lastPress = null;
-    setText(byId("last"), `Landmark ${undone.landmark} at ${timeOfDay(undone.unix_ms)} was taken back`);
+    setText(byId("last"), `Landmark ${undone.landmark} at ${timeOfDay(undone.unix_ms)} was undone`);
   }
   showQueue();
 }
@@ -277,12 +277,12 @@ function showQueue() {
   const count = (n) => (n === 1 ? "1 press" : `${n} presses`);
   let text;
   if (waiting) {
-    text = `${count(waiting)} kept on this phone, ${live ? (held ? "sent in a moment" : "being sent") : "sent once connected"}`;
+    text = `${count(waiting)} stored on this phone, ${live ? (held ? "sent in a moment" : "being sent") : "sent once connected"}`;
     if (sendTrouble) text += ` (${sendTrouble})`;
   } else {
     text = queue.acknowledged ? `${count(queue.acknowledged)} received by the laptop` : "No presses yet";
   }
-  if (kept.lasting === false && waiting) text += ". This browser keeps nothing: do not close the page";
+  if (store.lasting === false && waiting) text += ". This browser stores nothing: do not close the page";
   setText(line, text);
   const leftMs = held ? UNDO_MS - (Date.now() - queue.newest.unix_ms) : 0;
   byId("undo").hidden = !held;
@@ -318,8 +318,8 @@ async function sendHeadings() {
     await postJson("/api/headings", { node: me.node, clock_offset_ms: offset.offsetMs, sent_unix_ms: Date.now(), headings });
     sharing.sent += headings.length;
   } catch (error) {
-    sharing.giveBack(headings);
-    sharing.told = `Not sent: ${error.message}`;
+    sharing.putBack(headings);
+    sharing.status = `Not sent: ${error.message}`;
   }
   showCompass();
 }
@@ -335,7 +335,7 @@ async function compareClocks(now = false) {
     });
     if (found) {
       offset = { ...found, atMs: Date.now() };
-      setText(byId("clock-told"), `The laptop's clock is ${Math.abs(found.offsetMs).toFixed(0)} ms ${found.offsetMs < 0 ? "behind" : "ahead of"} this phone's, within ${(found.roundTripMs / 2).toFixed(0)} ms.`);
+      setText(byId("clock-status"), `The laptop's clock is ${Math.abs(found.offsetMs).toFixed(0)} ms ${found.offsetMs < 0 ? "behind" : "ahead of"} this phone's, within ${(found.roundTripMs / 2).toFixed(0)} ms.`);
     }
   } catch {
     // Not connected after all; tried again with the next tick.
@@ -344,7 +344,7 @@ async function compareClocks(now = false) {
   }
 }
 
-/** Another session does not know my name yet. */
+/** Send my name to a session that does not know it yet. */
 async function introduce() {
   const session = team.session.started_unix_s ?? null;
   if (!me || me.session === session) return;
@@ -352,13 +352,13 @@ async function introduce() {
     await postJson("/api/name", { node: me.node, name: me.name });
     rememberMe({ ...me, session });
   } catch {
-    // Told with the next connection.
+    // Sent with the next connection.
   }
 }
 
 function rememberMe(now) {
   me = now;
-  kept.setItem("relpos.wearer", JSON.stringify(me));
+  store.setItem("relpos.wearer", JSON.stringify(me));
 }
 
 // -- who I am --------------------------------------------------------------------------------------
@@ -396,7 +396,7 @@ function choose(wearer) {
   chosen = wearer.node;
   byId("name-form").hidden = false;
   byId("name").value = wearer.name;
-  setText(byId("name-told"), "");
+  setText(byId("name-status"), "");
   for (const button of byId("wearers").querySelectorAll("button")) {
     setAttribute(button, "aria-pressed", String(Number(button.dataset.wearer) === chosen));
   }
@@ -412,10 +412,10 @@ byId("name-form").addEventListener("submit", async (event) => {
   try {
     await postJson("/api/name", { node: chosen, name });
     rememberMe({ ...me, session: team.session?.started_unix_s ?? null });
-    setText(byId("name-told"), `You are ${name}, node ${me.node}.`);
+    setText(byId("name-status"), `You are ${name}, node ${me.node}.`);
     open("landmarks");
   } catch (error) {
-    setText(byId("name-told"), `Kept on this phone; the laptop was not told: ${error.message}`);
+    setText(byId("name-status"), `Stored on this phone, not sent to the laptop: ${error.message}`);
   }
   fetchWearers();
   showTeam();
@@ -444,21 +444,21 @@ function showLock() {
   const button = byId("wake");
   setAttribute(button, "aria-pressed", String(lock.on));
   button.disabled = !lock.possible;
-  setText(byId("wake-told"), !lock.possible
-    ? "Browsers keep the screen on over HTTPS alone: set the phone's own screen time."
+  setText(byId("wake-status"), !lock.possible
+    ? "Browsers keep the screen on only over HTTPS: change the phone's screen timeout instead."
     : lock.trouble || (lock.on ? "The screen stays on while this page is open." : ""));
 }
 
 function showCompass() {
   setAttribute(byId("compass"), "aria-pressed", String(sharing.on));
   setText(byId("compass"), sharing.on ? "Sharing compass" : "Share compass");
-  const told = byId("compass-told");
-  if (sharing.told) setText(told, sharing.told);
+  const status = byId("compass-status");
+  if (sharing.status) setText(status, sharing.status);
   else if (sharing.on && sharing.newest) {
     const deg = ((450 - degrees(sharing.newest.heading_rad)) % 360).toFixed(0);
-    setText(told, `Heading ${deg}° from magnetic north, ±${degrees(sharing.newest.sigma_rad).toFixed(0)}°; ${sharing.sent} sent.`);
+    setText(status, `Heading ${deg}° from magnetic north, ±${degrees(sharing.newest.sigma_rad).toFixed(0)}°; ${sharing.sent} sent.`);
   } else {
-    setText(told, CompassSharing.obstacle() ||
+    setText(status, CompassSharing.obstacle() ||
       "Hold or wear the phone pointing ahead, flat or upright, screen towards you.");
   }
 }

@@ -1,4 +1,4 @@
-// Landmark presses, kept on the phone until the server has said that it has them.
+// Landmark presses, stored on the phone until the server confirms them.
 
 const KEY = "relpos.presses";
 export const UNDO_MS = 5000;
@@ -19,7 +19,7 @@ export class PressQueue {
       const kept = JSON.parse(storage.getItem(KEY) ?? "[]");
       this.presses = Array.isArray(kept) ? kept : [];
     } catch {
-      // What cannot be read cannot be sent: kept aside instead of overwritten.
+      // Unreadable presses cannot be sent: stored elsewhere instead of overwritten.
       storage.setItem(`${KEY}.unreadable`, storage.getItem(KEY));
     }
   }
@@ -31,7 +31,7 @@ export class PressQueue {
     return press;
   }
 
-  /** Take back the newest press; null where its five seconds are over. */
+  /** Undo the newest press; null where its five seconds are over. */
   undo() {
     const last = this.presses[this.presses.length - 1];
     if (!last || !this.isHeld(last)) return null;
@@ -42,7 +42,7 @@ export class PressQueue {
 
   isHeld(press) {
     const age = this.now() - press.unix_ms;
-    // A clock that was set back would hold presses for ever.
+    // Otherwise a clock that was set back would hold presses for ever.
     return age >= 0 && age < UNDO_MS;
   }
 
@@ -70,7 +70,7 @@ export class PressQueue {
     return [...batches.values()];
   }
 
-  /** The server has these. */
+  /** Remove the presses that the server has confirmed. */
   accepted(ids) {
     const gone = new Set(ids);
     const before = this.presses.length;

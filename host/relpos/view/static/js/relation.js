@@ -5,7 +5,7 @@ import { relative, wrap } from "./angles.js";
 /** Standard deviation of a bearing of which nothing is known: a uniform angle's. */
 export const ANY_ANGLE_RAD = Math.PI / Math.sqrt(3);
 
-/** From this standard deviation on a direction is not told: 60 degrees, half of all round. */
+/** From this standard deviation on no direction is shown: 60 degrees, half of all round. */
 export const VAGUE_RAD = Math.PI / 3;
 
 /** Position covariance [xx, yy, xy] in m^2 of an ellipse given by semi-axes and direction. */
@@ -47,10 +47,10 @@ function byPositions(from, to) {
 /**
  * `to` as `from` sees it, or null where either is not placed.
  *
- * `pair` is the Picture's [node, peer, distance_m, sigma_distance_m, bearing_rad,
- * sigma_bearing_rad] of the two in either order, where it has one: it knows what the errors of the
- * two have in common. `relativeRad` is null while the heading of `from` is unknown or the
- * direction too vague to be told.
+ * `pair` is the view's [node, peer, distance_m, sigma_distance_m, bearing_rad,
+ * sigma_bearing_rad] of the two in either order, where it has one: it includes the correlation
+ * of the two. `relativeRad` is null while the heading of `from` is unknown or the direction too
+ * uncertain to show.
  */
 export function relation(from, to, pair = null) {
   if (!isPlaced(from) || !isPlaced(to) || from.node === to.node) return null;
@@ -58,13 +58,13 @@ export function relation(from, to, pair = null) {
   if (pair && pair[0] !== from.node) bearingRad = wrap(bearingRad + Math.PI);
   const sigmaHeadingRad = from.sigma_heading_rad ?? ANY_ANGLE_RAD;
   const sigmaRad = Math.min(Math.hypot(sigmaBearingRad, sigmaHeadingRad), ANY_ANGLE_RAD);
-  const told = Number.isFinite(from.heading_rad) && sigmaRad < VAGUE_RAD;
+  const shown = Number.isFinite(from.heading_rad) && sigmaRad < VAGUE_RAD;
   return {
     distanceM,
     sigmaM,
     bearingRad,
     sigmaBearingRad,
-    relativeRad: told ? relative(bearingRad, from.heading_rad) : null,
+    relativeRad: shown ? relative(bearingRad, from.heading_rad) : null,
     sigmaRad,
     headingKnown: Number.isFinite(from.heading_rad) && sigmaHeadingRad < VAGUE_RAD,
   };

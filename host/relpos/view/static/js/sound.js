@@ -1,4 +1,4 @@
-// Alarms that are heard: WebAudio, which browsers allow after the first touch or key, and
+// The sound of alarms: WebAudio, which browsers allow after the first touch or key, and
 // vibration where there is some.
 
 const PATTERNS = {

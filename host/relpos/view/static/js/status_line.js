@@ -1,9 +1,9 @@
-// The connection and the age of what is shown: never a picture that looks newer than it is.
+// The state of the connection and the age of the data: a view never looks newer than it is.
 
 import { setAttribute, setText } from "./dom.js";
 import { seconds } from "./words.js";
 
-/** From this age on the picture is called old even while messages come. */
+/** Age in seconds from which the data are called old even while messages arrive. */
 export const OLD_S = 5;
 
 const WORDS = {
@@ -11,13 +11,13 @@ const WORDS = {
   live: "Live",
   silent: "Server silent",
   waiting: "Not connected",
-  refused: "Not let in: open the address with the token that relpos prints",
-  old: "Old picture",
+  refused: "Access denied: open the address with the token that relpos prints",
+  old: "Old data",
 };
 
 /**
- * Age in seconds of the newest packet in the picture: what it was when the server sent it, by its
- * own clock, and the time since then by ours. Null before the first picture.
+ * Age in seconds of the newest packet in the view: its age by the server's clock when it was sent,
+ * plus the time since then by ours. Null before the first view.
  */
 export function dataAgeS({ unixS, arrivedUnixS, receivedMs, nowMs }) {
   if (receivedMs === null || unixS === null) return null;
@@ -36,9 +36,9 @@ export function connectionWords(state, ageS, retryS) {
   return { state: shown, words, age };
 }
 
-export function showConnection({ line, words, age, retry }, told) {
-  setAttribute(line, "data-state", told.state);
-  setText(words, told.words);
-  setText(age, told.age);
-  retry.hidden = told.state !== "waiting" && told.state !== "refused";
+export function showConnection({ line, words, age, retry }, status) {
+  setAttribute(line, "data-state", status.state);
+  setText(words, status.words);
+  setText(age, status.age);
+  retry.hidden = status.state !== "waiting" && status.state !== "refused";
 }

@@ -1,13 +1,13 @@
-// The newest Picture, and what follows from it; fed by the server's messages (protocol 1).
+// The newest view of the team, and what follows from it; fed by the server's messages (protocol 1).
 
 import { pairKey, relation } from "./relation.js";
 import { Track } from "./tracks.js";
 
 export const PROTOCOL = 1;
 
-/** Places with less would be clutter; they are too little to send anybody to. */
-const LEAST_PROBABILITY = 0.03;
-const ONE_PLACE_M = 0.7; // as the host's ambiguity.py has it
+/** Less probable positions are not shown: they would be clutter. */
+const MIN_PROBABILITY = 0.03;
+const ONE_PLACE_M = 0.7; // as in the host's fusion/modes.py
 
 export class Team {
   constructor() {
@@ -36,8 +36,8 @@ export class Team {
     this.pictures = 0;
   }
 
-  /** Take a message; returns its type, or "unknown" for one that this page cannot read. */
-  take(message) {
+  /** Handle a message; returns its type, or "unknown" for one that this page cannot read. */
+  handle(message) {
     switch (message?.type) {
       case "hello": {
         const other = message.session?.started_unix_s !== this.session?.started_unix_s;
@@ -52,7 +52,7 @@ export class Team {
         }
         return "tracks";
       case "picture":
-        this.takePicture(message);
+        this.handleView(message);
         return "picture";
       case "ping":
         return "ping";
@@ -61,7 +61,7 @@ export class Team {
     }
   }
 
-  takePicture(picture) {
+  handleView(picture) {
     this.seq = picture.seq;
     this.timeS = picture.time_s;
     this.unixS = picture.unix_s;
@@ -77,7 +77,7 @@ export class Team {
     this.order = [...this.people.keys()].sort((a, b) => a - b);
     this.pictures += 1;
     for (const person of this.people.values()) {
-      // Only what is believed leaves a track.
+      // Only located people leave a track.
       if (person.status === "ok" || person.status === "stale") {
         this.trackOf(person.node).add(picture.time_s, person.x_m, person.y_m);
       }
@@ -93,7 +93,7 @@ export class Team {
     return track;
   }
 
-  /** Everybody, by number. */
+  /** All people, by number. */
   list() {
     return this.order.map((node) => this.people.get(node));
   }
@@ -108,13 +108,13 @@ export class Team {
   }
 
   /**
-   * Where people may be while the team is ambiguous: {shown, places, rings, here}.
+   * Possible positions while the team is ambiguous: {shown, places, rings, here}.
    *
-   * The server lists whole pictures of the team with their probabilities, the shown one among them
-   * (the one nearest to what is shown). What concerns one person are his places: those of several
-   * pictures that are one place add up. `here` (node -> probability) is what speaks for where he is
-   * shown, `places` are the other ones of everybody, the likeliest first, `rings` are those who are
-   * shown as somewhere on a ring.
+   * The server lists alternatives of the whole team with their probabilities, the one shown (the
+   * nearest to the view) among them. For each person, equal positions of several alternatives are
+   * one place, and their probabilities add up. `here` (node -> probability) is that of the position
+   * shown, `places` are all other positions, the most probable first, `rings` are the people shown
+   * on a ring.
    */
   possible() {
     if (this.possibleOf === this.alternatives) return this.possibleNow;
@@ -147,7 +147,7 @@ export class Team {
       shown,
       here,
       places: [...found.values()].flat()
-        .filter((place) => place.probability >= LEAST_PROBABILITY)
+        .filter((place) => place.probability >= MIN_PROBABILITY)
         .sort((a, b) => b.probability - a.probability),
       rings: [...homes.values()].filter((p) => p.shape === "ring"),
     };
@@ -166,7 +166,7 @@ export class Team {
   }
 }
 
-/** Are two places of a person one, beside how well the second is known? */
+/** Whether two positions of a person are the same, given the uncertainty of the second. */
 function isSamePlace(a, b) {
   if (a.shape !== b.shape) return false;
   const off = Math.hypot(a.x_m - b.x_m, a.y_m - b.y_m);

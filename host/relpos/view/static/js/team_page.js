@@ -1,4 +1,4 @@
-// The team's page: puts the pieces together.
+// The team's page: joins the modules.
 
 import { Alarms } from "./alarms.js";
 import { AlarmBanner, showNotices } from "./banner.js";
@@ -13,10 +13,10 @@ import { Team } from "./team.js";
 import { isDark, themeSwitch } from "./theme_switch.js";
 import { alarmText } from "./words.js";
 
-const LIST_MS = 200; // the list is read by eyes: five times a second will do
-const TABLE_MS = 1000; // and the table by screen readers
+const LIST_MS = 200; // five times a second is enough for the eye
+const TABLE_MS = 1000; // screen readers read the table
 
-const kept = storage();
+const store = storage();
 const team = new Team();
 const alarms = new Alarms();
 let receivedMs = null;
@@ -35,12 +35,12 @@ const findView = new FindView(byId("find"), {
   next: (by) => find(neighbour(findView.to, by, findView.from)),
   swap: () => startFinding(findView.to, findView.from),
 });
-const connection = new Connection({ onMessage: take, onState: () => refresh(true) });
+const connection = new Connection({ onMessage: handle, onState: () => refresh(true) });
 
-// -- what comes ------------------------------------------------------------------------------------
+// -- messages --------------------------------------------------------------------------------------
 
-function take(message) {
-  const kind = team.take(message);
+function handle(message) {
+  const kind = team.handle(message);
   if (kind === "hello") {
     receivedMs = null;
     trouble = null;
@@ -58,7 +58,7 @@ function take(message) {
     map.alarms = alarms.active;
     findView.update(team, { connected: true });
   } else if (kind === "unknown") {
-    trouble = { level: "warning", text: "The server speaks another language than this page: reload it." };
+    trouble = { level: "warning", text: "The server's version differs from this page's: reload the page." };
   }
   if (kind !== "ping") map.invalidate();
   refresh(kind === "hello");
@@ -75,7 +75,7 @@ function takeAlarms() {
   banner.update(alarms);
 }
 
-// -- what is shown ---------------------------------------------------------------------------------
+// -- display ---------------------------------------------------------------------------------------
 
 /** Bring the text up to date, now or within a fifth of a second. */
 function refresh(now = false) {
@@ -99,7 +99,7 @@ function show() {
   const notices = [...team.notices];
   if (trouble) notices.unshift(trouble);
   if (connection.unreadable) {
-    notices.unshift({ level: "warning", text: `${connection.unreadable} messages of the server could not be read.` });
+    notices.unshift({ level: "warning", text: `${connection.unreadable} messages of the server were unreadable.` });
   }
   showNotices(byId("notices"), notices);
   setText(byId("count"), team.people.size ? `(${team.people.size})` : "");
@@ -133,12 +133,12 @@ function age() {
 }
 
 function showAge() {
-  const told = connectionWords(connection.state, age(), connection.retryS);
+  const status = connectionWords(connection.state, age(), connection.retryS);
   showConnection(
     { line: byId("connection"), words: byId("connection-words"), age: byId("age"), retry: byId("retry") },
-    told,
+    status,
   );
-  document.body.dataset.connection = told.state;
+  document.body.dataset.connection = status.state;
   if (connection.state !== "live" && connection.state !== "silent" && team.pictures) {
     findView.update(team, { connected: false });
   }
@@ -168,16 +168,16 @@ function fillMe() {
   const wanted = ["", ...team.list().map((p) => `${p.node} ${p.name}`)].join("\n");
   if (select.dataset.people !== wanted) {
     select.dataset.people = wanted;
-    select.replaceChildren(make("option", { value: "", text: "nobody" }),
+    select.replaceChildren(make("option", { value: "", text: "none" }),
       ...team.list().map((p) => make("option", { value: p.node, text: p.name })));
   }
-  // Until somebody chooses, directions are seen from the first person.
-  if (map.me === null && kept.getItem("relpos.me") === null) map.me = team.order[0] ?? null;
+  // Until a person is chosen, directions are relative to the first one.
+  if (map.me === null && store.getItem("relpos.me") === null) map.me = team.order[0] ?? null;
   const value = map.me === null ? "" : String(map.me);
   if (select.value !== value) select.value = value;
 }
 
-// -- what is done ----------------------------------------------------------------------------------
+// -- actions ---------------------------------------------------------------------------------------
 
 function select(node) {
   map.selected = node === map.selected ? null : node;
@@ -194,12 +194,12 @@ function follow(node) {
 
 function setMe(node) {
   map.me = node;
-  kept.setItem("relpos.me", node === null ? "" : String(node));
+  store.setItem("relpos.me", node === null ? "" : String(node));
   map.invalidate();
   refresh(true);
 }
 
-/** Who comes after `node` by number, but for `but`. */
+/** The next node by number after `node`, without `but`. */
 function neighbour(node, by, but) {
   const others = team.order.filter((n) => n !== but);
   const at = others.indexOf(node);
@@ -211,7 +211,7 @@ function find(node) {
   startFinding(seeker !== null && seeker !== node ? seeker : nearest(node), node);
 }
 
-/** Whoever is nearest goes, where nobody is chosen. */
+/** The nearest person, who seeks where none is chosen. */
 function nearest(node) {
   const near = team.order
     .filter((n) => n !== node)
@@ -245,7 +245,7 @@ async function acknowledge(node) {
   try {
     await postJson("/api/acknowledge", { node });
   } catch (error) {
-    trouble = { level: "warning", text: `Acknowledged on this page alone: ${error.message}` };
+    trouble = { level: "warning", text: `Acknowledged only on this page: ${error.message}` };
     refresh(true);
   }
 }
@@ -264,12 +264,12 @@ byId("me").addEventListener("change", (event) => setMe(event.target.value ? Numb
 byId("retry").addEventListener("click", () => connection.wake());
 for (const layer of ["tracks", "ranges"]) {
   const select = byId(layer);
-  const value = kept.getItem(`relpos.${layer}`);
+  const value = store.getItem(`relpos.${layer}`);
   if ([...select.options].some((option) => option.value === value)) select.value = value;
   map.layers[layer] = select.value;
   select.addEventListener("change", () => {
     map.layers[layer] = select.value;
-    kept.setItem(`relpos.${layer}`, select.value);
+    store.setItem(`relpos.${layer}`, select.value);
     map.invalidate();
   });
 }
@@ -282,11 +282,11 @@ byId("phones").addEventListener("click", async () => {
   byId("phones-dialog").showModal();
   const answer = await fetch("/qr.svg").catch(() => null);
   const image = byId("qr");
-  const told = byId("qr-trouble");
+  const status = byId("qr-trouble");
   image.hidden = !answer?.ok;
-  told.hidden = Boolean(answer?.ok);
+  status.hidden = Boolean(answer?.ok);
   if (answer?.ok) image.src = "/qr.svg";
-  else setText(told, answer ? await answer.text() : "The server does not answer.");
+  else setText(status, answer ? await answer.text() : "The server does not answer.");
 });
 byId("as-table").addEventListener("click", () => {
   const view = byId("table-view");
@@ -300,12 +300,12 @@ themeSwitch(byId("theme"), () => {
   refresh(true);
 });
 
-const savedMe = kept.getItem("relpos.me");
+const savedMe = store.getItem("relpos.me");
 map.me = savedMe ? Number(savedMe) : null;
 showSound();
 setInterval(() => {
   showAge();
-  // Seconds go on while nothing comes.
+  // The age counts on while nothing arrives.
   if (connection.state !== "live") map.invalidate();
 }, 1000);
 connection.start();

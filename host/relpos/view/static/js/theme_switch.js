@@ -9,7 +9,7 @@ export function isDark() {
 
 /** Make `button` switch; `changed` is called after every change, the system's too. */
 export function themeSwitch(button, changed) {
-  const kept = storage();
+  const store = storage();
   const show = () => {
     const next = isDark() ? "Light" : "Dark";
     setText(button.querySelector(".word"), next);
@@ -19,7 +19,7 @@ export function themeSwitch(button, changed) {
   button.addEventListener("click", () => {
     const theme = isDark() ? "light" : "dark";
     document.documentElement.dataset.theme = theme;
-    kept.setItem("relpos.theme", theme);
+    store.setItem("relpos.theme", theme);
     show();
   });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", show);

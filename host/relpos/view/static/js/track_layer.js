@@ -3,7 +3,7 @@
 
 import { toScreen } from "./transform.js";
 
-const MOST_PX = 4096;
+const MAX_PX = 4096;
 const SPARE = 1.3; // how much wider than the screen's diagonal
 const SETTLE_MS = 150; // while zooming, the bitmap is stretched and drawn anew at most so often
 
@@ -26,7 +26,7 @@ export class TrackLayer {
    */
   draw(context, view, ratio, tracks, width) {
     const needM = Math.hypot(view.width, view.height) / view.scale;
-    const wanted = Math.min(view.scale * ratio, MOST_PX / (needM * SPARE));
+    const wanted = Math.min(view.scale * ratio, MAX_PX / (needM * SPARE));
     const now = performance.now();
     const layout = this.layout;
     const covers = layout &&

@@ -1,9 +1,9 @@
 // Where people have been: points thinned as they come, so that hours stay light.
 
-const LEAST_STEP_M = 0.3; // less is the position's own jitter
+const MIN_STEP_M = 0.3; // less is the position's own jitter
 const FASTEST_M_S = 5; // faster than that the picture has changed its mind, not the person its place
-const LEAST_JUMP_M = 3;
-export const MOST_POINTS = 3000;
+const MIN_JUMP_M = 3;
+export const MAX_POINTS = 3000;
 
 /** The track of one person: `points` of [time_s, x_m, y_m, starts], the last `starts` a line. */
 export class Track {
@@ -13,7 +13,7 @@ export class Track {
     this.redrawn = 0;
   }
 
-  /** Take what the server kept: [[t, x, y], ...], in time order. */
+  /** Restore the server's points: [[t, x, y], ...], in time order. */
   restore(points) {
     this.points = [];
     this.redrawn += 1;
@@ -28,12 +28,12 @@ export class Track {
     if (last) {
       if (t < last[0]) return false;
       const step = Math.hypot(x - last[1], y - last[2]);
-      if (step < LEAST_STEP_M) return false;
-      // A gap in time is drawn through: somebody who was lost has walked there, by whichever way.
-      starts = step > Math.max(LEAST_JUMP_M, FASTEST_M_S * (t - last[0]));
+      if (step < MIN_STEP_M) return false;
+      // A gap in time is drawn as a line: a person who was lost has walked there on some path.
+      starts = step > Math.max(MIN_JUMP_M, FASTEST_M_S * (t - last[0]));
     }
     this.points.push([t, x, y, starts]);
-    if (this.points.length > MOST_POINTS) this.thin();
+    if (this.points.length > MAX_POINTS) this.thin();
     return true;
   }
 

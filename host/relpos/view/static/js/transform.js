@@ -4,11 +4,11 @@
 // how far the map is turned (radians counter-clockwise), the screen in pixels. The map's y points
 // up, the screen's down.
 
-export const LEAST_SCALE = 0.5; // 1000 m across a small screen
-export const MOST_SCALE = 400; // 5 m across a large one
+export const MIN_SCALE = 0.5; // 1000 m across a small screen
+export const MAX_SCALE = 400; // 5 m across a large one
 
 export function clampScale(scale) {
-  return Math.min(Math.max(scale, LEAST_SCALE), MOST_SCALE);
+  return Math.min(Math.max(scale, MIN_SCALE), MAX_SCALE);
 }
 
 export function toScreen(view, x, y) {
@@ -78,7 +78,7 @@ export function fit(view, points, { margin = 0.14, most = 60, reachM = 2 } = {})
 }
 
 /**
- * Does an automatic view have to move? When somebody nears the border, or all have come so close
+ * Does an automatic view have to move? When a person nears the border, or all have come so close
  * together, or so far to one side, that much of the screen is empty.
  */
 export function isLoose(view, fitted, points, border = 0.05) {

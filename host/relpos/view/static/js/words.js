@@ -22,7 +22,7 @@ export function plusMinusDegrees(sigmaRad) {
   return Number.isFinite(sigmaRad) ? `±${Math.max(degrees(sigmaRad), 1).toFixed(0)}°` : "";
 }
 
-/** For the ear: "4 metres", "half a metre"; nobody hears tenths. */
+/** To be read aloud: "4 metres", "half a metre"; without tenths. */
 export function spokenDistance(m) {
   if (!Number.isFinite(m)) return "distance unknown";
   if (m < 0.75) return "half a metre";
@@ -33,11 +33,11 @@ export function spokenDistance(m) {
 /** "0.4 s", "12 s", "3:05 min", "1:02 h". */
 export function duration(s) {
   if (!Number.isFinite(s)) return UNKNOWN;
-  const whole = Math.max(0, s);
-  if (whole < 9.95) return `${whole.toFixed(whole < 0.95 ? 1 : 0)} s`;
-  if (whole < 120) return `${Math.round(whole)} s`;
-  const minutes = Math.floor(whole / 60);
-  if (minutes < 120) return `${minutes}:${two(whole % 60)} min`;
+  const positive = Math.max(0, s);
+  if (positive < 9.95) return `${positive.toFixed(positive < 0.95 ? 1 : 0)} s`;
+  if (positive < 120) return `${Math.round(positive)} s`;
+  const minutes = Math.floor(positive / 60);
+  if (minutes < 120) return `${minutes}:${two(positive % 60)} min`;
   return `${Math.floor(minutes / 60)}:${two(minutes % 60)} h`;
 }
 
@@ -45,13 +45,13 @@ function two(n) {
   return String(Math.floor(n)).padStart(2, "0");
 }
 
-/** Whole seconds: a figure that is not to flicker. */
+/** Full seconds, so that the figure does not flicker. */
 export function seconds(s) {
   if (!Number.isFinite(s)) return UNKNOWN;
   return s < 120 ? `${Math.floor(Math.max(s, 0))} s` : duration(s);
 }
 
-/** How long ago somebody was heard: "now" within two reports. */
+/** Time since the last report: "now" within two reports. */
 export function ago(s) {
   if (!Number.isFinite(s)) return UNKNOWN;
   return s < 2 ? "now" : `${seconds(s)} ago`;
@@ -65,12 +65,12 @@ export function dbm(v) {
   return Number.isFinite(v) ? `${Math.round(v)} dBm`.replace("-", "−") : UNKNOWN;
 }
 
-export function percent(share) {
-  if (!Number.isFinite(share)) return UNKNOWN;
-  return `${Math.round(100 * share)} %`;
+export function percent(fraction) {
+  if (!Number.isFinite(fraction)) return UNKNOWN;
+  return `${Math.round(100 * fraction)} %`;
 }
 
-/** A probability: never told as certain or impossible while it is neither. */
+/** A probability: never shown as certain or impossible while it is neither. */
 export function probability(p) {
   if (!Number.isFinite(p)) return UNKNOWN;
   if (p > 0 && p < 0.01) return "<1 %";
@@ -94,7 +94,7 @@ const EIGHTHS = [
   "ahead left",
 ];
 
-/** Where something lies, as seen by somebody: "ahead left". */
+/** A relative direction in words: "ahead left". */
 export function side(relativeRad) {
   const eighth = Math.round(-relativeRad / (Math.PI / 4));
   return EIGHTHS[((eighth % 8) + 8) % 8];
@@ -110,27 +110,27 @@ export function compassShort(bearingRad, northRad) {
   return northRad === null ? `map ${compassPoint(bearingRad).short}` : compassPoint(bearingRad, northRad).short;
 }
 
-/** The direction in short: "2 o'clock"; where it is too vague, why that is or does not matter. */
-export function whichWay(relation) {
+/** The direction in short: "2 o'clock"; "close by" or "direction unknown" where it is too vague. */
+export function directionWords(relation) {
   if (relation.relativeRad !== null) return clock(relation.relativeRad);
   return relation.distanceM < Math.max(1, 2 * relation.sigmaM) ? "close by" : "direction unknown";
 }
 
-/** One line of where somebody is, for lists and for screen readers. */
+/** A person's position in one line, for lists and for screen readers. */
 export function whereabouts(relation, northRad) {
   if (!relation) return "position unknown";
   const parts = [`${distance(relation.distanceM, relation.sigmaM)} ${plusMinus(relation.sigmaM)}`.trim()];
   if (relation.relativeRad !== null) {
     parts.push(`${clock(relation.relativeRad)}, ${side(relation.relativeRad)}`);
   } else {
-    parts.push(whichWay(relation));
+    parts.push(directionWords(relation));
   }
   parts.push(compass(relation.bearingRad, northRad));
   return parts.join(" · ");
 }
 
-/** How sure it is that an ambiguous person is where he is shown: "62 % here". */
-export function sureHere(p) {
+/** Probability of an ambiguous person's position shown: "62 % here". */
+export function probabilityHere(p) {
   return Number.isFinite(p) && p < 0.97 ? `${probability(p)} here` : "ambiguous";
 }
 
@@ -140,11 +140,11 @@ export const STATUS_WORDS = {
   ok: "located",
   ambiguous: "ambiguous",
   unlocated: "not located",
-  stale: "no news",
+  stale: "no report",
   lost: "lost",
 };
 
-/** What an alarm says. `alarm` is from `alarms.js`. */
+/** The text of an alarm from `alarms.js`. */
 export function alarmText(alarm) {
   if (alarm.kind === "lost") return `${alarm.name} is lost: not heard for ${seconds(alarm.seconds)}`;
   return `${alarm.name} has not moved for ${seconds(alarm.seconds)}`;
