@@ -115,7 +115,7 @@ def health_limits() -> str:
         (
             "rangings that succeed",
             "",
-            f"under {percent * health.RANGING_YELLOW:g} % of {health.LEAST_EXCHANGES} or more",
+            f"under {percent * health.RANGING_YELLOW:g} % of {health.MIN_EXCHANGES} or more",
         ),
         ("neighbours", "", "none in a team of two or more"),
         ("radio's signal", "", f"under {health.RSSI_YELLOW_DBM:g} dBm"),
@@ -126,7 +126,7 @@ def health_limits() -> str:
             f"within the last {health.FRESH_START_S:g} s",
         ),
         ("50 Hz ticks missed, frames refused", "", "any"),
-        ("stack left", "", f"under {health.LEAST_STACK_BYTES} bytes"),
+        ("stack left", "", f"under {health.MIN_STACK_BYTES} bytes"),
         ("status", "", "none heard yet"),
     )
     return table(("what", "red", "yellow"), rows)

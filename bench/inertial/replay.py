@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from relpos.calibration.steps import LEG_OF_STATURE, believed_scale
+from relpos.calibration.steps import LEG_OF_STATURE, posterior_scale
 
 Array = NDArray[np.float64]
 
@@ -313,4 +313,6 @@ def calibrate(recording: Recording, true_distance_m: float, *, believed: bool = 
     """
     walked_m = reckon(recording.imu, leg_length_m=recording.leg_length_m).distance_m
     asked = true_distance_m / walked_m
-    return float(build().inertial_default_gain()) * (believed_scale([asked]) if believed else asked)
+    return float(build().inertial_default_gain()) * (
+        posterior_scale([asked]) if believed else asked
+    )

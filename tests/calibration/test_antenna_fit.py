@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from relpos.calibration.antenna import fit_ranges, new_shares_mm
+from relpos.calibration.antenna import fit_ranges, new_offsets_mm
 from relpos.errors import DataError
 
 
@@ -30,7 +30,7 @@ def test_the_stated_deviation_is_that_of_the_bias():
     [
         ([5.0] * 19, "only 19 ranges"),
         (list(np.linspace(4.0, 6.0, 50)), "spread"),
-        ([9.0] * 50, "is it 5 m"),
+        ([9.0] * 50, "is the distance 5 m"),
     ],
 )
 def test_ranges_that_cannot_be_believed_are_refused(ranges, words):
@@ -39,9 +39,9 @@ def test_ranges_that_cannot_be_believed_are_refused(ranges, words):
 
 
 def test_shares_add_up_and_a_reference_keeps_its_own():
-    assert new_shares_mm(0.301, (10, -20)) == (160, 131)
-    assert new_shares_mm(-0.301, (0, 0)) == (-151, -150)
-    assert new_shares_mm(0.3, (10, 20), 0) == (10, 320)
-    assert new_shares_mm(0.3, (10, 20), 1) == (310, 20)
+    assert new_offsets_mm(0.301, (10, -20)) == (160, 131)
+    assert new_offsets_mm(-0.301, (0, 0)) == (-151, -150)
+    assert new_offsets_mm(0.3, (10, 20), 0) == (10, 320)
+    assert new_offsets_mm(0.3, (10, 20), 1) == (310, 20)
     with pytest.raises(DataError, match="at most 5 m"):
-        new_shares_mm(1.0, (4900, 0))
+        new_offsets_mm(1.0, (4900, 0))

@@ -52,7 +52,7 @@ def test_a_few_readings_beside_steel_do_not_bend_the_ellipsoid():
     ("spoil", "words"),
     [
         (lambda f, u: (f[:40], u[:40]), "too few"),
-        (lambda f, u: (np.tile(f[:1], (100, 1)), u[:100]), "always shows the same"),
+        (lambda f, u: (np.tile(f[:1], (100, 1)), u[:100]), "do not change"),
         (lambda f, u: (f[f[:, 2] > f[:, 2].mean() + 15.0], None), "directions|uncertain|ellipsoid"),
         (lambda f, u: (f + np.linspace(0, 60, len(f))[:, None], u), "ellipsoid|uniform"),
         (lambda f, u: (4.0 * f, u), "Earth"),
@@ -156,25 +156,25 @@ def test_a_calibration_that_no_node_can_hold_is_refused():
 
 def test_one_walk_is_believed_less_the_more_it_asks_for():
     asked = np.array([1.02, 1.05, 1.10, 1.20, 1.40])
-    shares = [np.log(steps.believed_scale([a])) / np.log(a) for a in asked]
+    shares = [np.log(steps.posterior_scale([a])) / np.log(a) for a in asked]
     assert all(a > b for a, b in itertools.pairwise(shares))
     assert 0.6 < shares[0] < 0.7
     assert shares[-1] < 0.05
-    assert steps.believed_scale([1.0]) == 1.0
+    assert steps.posterior_scale([1.0]) == 1.0
 
 
 def test_walks_that_agree_are_believed():
-    one, three = steps.believed_scale([1.15]), steps.believed_scale([1.15, 1.14, 1.16])
+    one, three = steps.posterior_scale([1.15]), steps.posterior_scale([1.15, 1.14, 1.16])
     assert 1.0 < one < 1.06
     assert three > 1.09
     # One that was not what was told does not carry the others away.
-    assert steps.believed_scale([1.04, 1.05, 1.60]) == steps.believed_scale([1.04, 1.05, 1.055])
+    assert steps.posterior_scale([1.04, 1.05, 1.60]) == steps.posterior_scale([1.04, 1.05, 1.055])
 
 
 @pytest.mark.parametrize("scales", [[], [0.0], [-1.0], [float("nan")]])
 def test_a_scale_that_is_none_is_refused(scales):
     with pytest.raises(DataError):
-        steps.believed_scale(scales)
+        steps.posterior_scale(scales)
 
 
 def test_people_scatter_about_the_population_whatever_the_node_was_set_to():

@@ -50,7 +50,7 @@ class Pretended(Computer):
     def which(self, name):
         return f"/usr/bin/{name}" if name in self.commands else None
 
-    def told(self, *command):
+    def output_of(self, *command):
         return next((said for words, said in self.answers.items() if words in command), "")
 
     def processes(self):
@@ -294,15 +294,15 @@ def test_a_module_that_is_set_up_is_well(monkeypatch):
 def test_each_setting_that_differs_is_named_with_the_command_that_sets_it(monkeypatch):
     state, words, remedy = module_said({b"MY": b"\x00\x07", b"SM": b"\x04"}, monkeypatch)
     assert state == "wrong"
-    assert "MY=7 in place of 0" in words
-    assert "SM=4 in place of 0" in words
+    assert "MY=7 instead of 0" in words
+    assert "SM=4 instead of 0" in words
     assert remedy == f"relpos node radio {PORT} --coordinator"
 
 
 def test_another_network_is_a_hint(monkeypatch):
     state, words, _ = module_said({b"ID": b"\x12\x34"}, monkeypatch)
     assert state == "hint"
-    assert "ID=1234 in place of 3332" in words
+    assert "ID=1234 instead of 3332" in words
 
 
 def test_a_port_with_no_module_is_wrong(monkeypatch):

@@ -50,7 +50,7 @@ def test_the_window_takes_each_counter_once_and_nothing_older(counters):
     """Against the plain definition: a set of all that was taken."""
     window, taken, newest = CounterWindow(), set(), -1
     for counter in counters:
-        verdict = window.judge(counter)
+        verdict = window.check(counter)
         if counter > newest:
             expected = Verdict.NEW
         elif newest - counter >= WINDOW:
@@ -59,7 +59,7 @@ def test_the_window_takes_each_counter_once_and_nothing_older(counters):
             expected = Verdict.DUPLICATE if counter in taken else Verdict.LATE
         assert verdict is expected
         if verdict in (Verdict.NEW, Verdict.LATE):
-            window.take(counter)
+            window.add(counter)
             taken.add(counter)
             newest = max(newest, counter)
 

@@ -10,7 +10,7 @@ from relpos.cli.node_watch import _watch
 from relpos.errors import DataError
 from relpos.link import xbee
 from relpos.link.authentication import HostCounter
-from relpos.link.beacon import FORGET_S, MOST_NODES, BeaconSchedule, HostBeacons
+from relpos.link.beacon import FORGET_S, MAX_NODES, BeaconSchedule, HostBeacons
 from relpos.link.port import Link
 from relpos.live.inputs import PortInput
 from relpos.protocol import messages as wire
@@ -83,28 +83,28 @@ def test_those_given_stay_whether_they_are_heard_or_not():
 
 def test_the_twenty_first_node_is_left_out_and_named():
     schedule = BeaconSchedule()
-    heard(schedule, range(10, 10 + MOST_NODES), 0.0)
+    heard(schedule, range(10, 10 + MAX_NODES), 0.0)
     schedule.team(0.0)
-    heard(schedule, range(10, 10 + MOST_NODES), 1.0)
+    heard(schedule, range(10, 10 + MAX_NODES), 1.0)
     heard(schedule, (1,), 1.0)
-    assert len(schedule.team(1.0)) == MOST_NODES
+    assert len(schedule.team(1.0)) == MAX_NODES
     assert 1 not in schedule.team(1.0)
     assert schedule.left_out == (1,)
 
 
-@pytest.mark.parametrize("nodes", [[0], [255], [1, 1], range(1, MOST_NODES + 2)])
+@pytest.mark.parametrize("nodes", [[0], [255], [1, 1], range(1, MAX_NODES + 2)])
 def test_a_team_that_cannot_be_is_refused(nodes):
     with pytest.raises(DataError):
         BeaconSchedule(nodes)
 
 
 def test_every_beacon_fits_the_wire():
-    schedule = BeaconSchedule(range(1, MOST_NODES + 1))
+    schedule = BeaconSchedule(range(1, MAX_NODES + 1))
     for k in range(5000):
         values = schedule.values(k * 0.1234567)
         assert 0.0 <= values["phase_s"] < values["period_s"]
         frame = wire.decode(wire.encode(wire.BEACON, wire.BROADCAST, 0, k + 1, values))
-        assert ids(frame.values) == list(range(1, MOST_NODES + 1))
+        assert ids(frame.values) == list(range(1, MAX_NODES + 1))
 
 
 # --- of a host -----------------------------------------------------------------------------------
@@ -150,7 +150,7 @@ def test_a_forged_frame_brings_nobody_into_the_team():
 def test_the_user_is_told_once_of_a_node_too_many():
     link = Link()
     beacons = HostBeacons(link)
-    link.feed(b"".join(motion(node, 1) for node in range(1, MOST_NODES + 2)), 0.5)
+    link.feed(b"".join(motion(node, 1) for node in range(1, MAX_NODES + 2)), 0.5)
     for time_s in (1.0, 2.0, 3.0):
         assert beacons.due(time_s)
     assert len(link.decoder.remarks) == 1

@@ -19,7 +19,7 @@ from relpos.live.fusion_thread import FusionThread
 from relpos.live.inputs import PacedInput, Received
 from relpos.live.session import LiveSession
 from relpos.live.sinks import Sink
-from relpos.live.tracks import MOST_POINTS, Tracks
+from relpos.live.tracks import MAX_POINTS, Tracks
 from relpos.measurements import Motion, Prior, Range, Status
 from relpos.runs import Description
 
@@ -87,7 +87,7 @@ def test_tracks_of_hours_stay_small_and_evenly_spaced():
     for k in range(40_000):
         tracks.add(1, 0.5 * k, 0.01 * k, 1.0)
     points = tracks.of(1)
-    assert len(points) <= MOST_POINTS
+    assert len(points) <= MAX_POINTS
     assert points[0][0] == 0.0
     assert points[-1][0] > 19_900.0
     gaps = [b[0] - a[0] for a, b in itertools.pairwise(points)]

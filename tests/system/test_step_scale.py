@@ -26,7 +26,7 @@ class Conversation:
                     if isinstance(observation, Motion):
                         self.motions[observation.node] = observation
             while self.link.decoder.acknowledged:
-                self.sender.take(self.link.decoder.acknowledged.popleft())
+                self.sender.handle(self.link.decoder.acknowledged.popleft())
             data = self.sender.due(self.team.time_us * 1e-6)
             if data:
                 self.team.send(data)

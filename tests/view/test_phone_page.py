@@ -179,7 +179,7 @@ def test_without_https_the_compass_says_what_is_missing(visit, stage: Stage):
     page = visit("/phone", **PHONE, init=insecure)
     expect(page.locator("#connection")).to_have_attribute("data-state", "live")
     page.get_by_role("button", name="Share compass").click()
-    expect(page.locator("#compass-status")).to_contain_text("over HTTPS alone")
+    expect(page.locator("#compass-status")).to_contain_text("only over HTTPS")
     expect(page.get_by_role("button", name="Share compass")).to_have_attribute(
         "aria-pressed", "false"
     )
@@ -208,7 +208,7 @@ def test_the_phones_page_works_on_the_smallest_screen_by_keyboard(visit, stage: 
     page.keyboard.type("8x")
     expect(field).to_have_value("8")
     page.keyboard.press("Enter")
-    expect(page.locator("#queue")).to_contain_text("1 press kept")
+    expect(page.locator("#queue")).to_contain_text("1 press stored")
     nameless = page.evaluate("""() => [...document.querySelectorAll("button, input")]
         .filter((e) => e.checkVisibility() && !e.textContent.trim()
             && !e.getAttribute("aria-label") && !(e.labels && e.labels.length)).length""")

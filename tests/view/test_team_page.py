@@ -386,7 +386,7 @@ def test_find_leads_by_arrow_distance_and_words(visit, stage: Stage):
     stage.frozen = False
     expect(find.locator(".trend")).to_contain_text("warmer: getting closer")
     stage.team.lost_since[3] = stage.at_s - 8.0
-    expect(find.locator(".doubt")).to_contain_text("Chloé: last heard")
+    expect(find.locator(".caution")).to_contain_text("Chloé: last heard")
     page.keyboard.press("Escape")
     expect(find).to_be_hidden()
     expect(find_button(page, "Chloé")).to_be_focused()
@@ -399,7 +399,7 @@ def test_find_says_so_while_nobody_knows_which_way(visit, stage: Stage):
     page.locator("#me").select_option("1")
     find_button(page, "Ben").click()
     expect(page.locator("#find .order")).to_have_text("position unknown")
-    expect(page.locator("#find .doubt")).to_contain_text("Anna is not located")
+    expect(page.locator("#find .caution")).to_contain_text("Anna is not located")
     expect(page.locator("#find .big-arrow")).to_have_attribute("data-direction", "unknown")
 
 

@@ -1,8 +1,8 @@
-"""What a calibration still asks for, and what it finds, from raw samples in any order.
+"""Progress and result of a sensor calibration from raw samples in any order.
 
-Lying still gives the gyroscope's bias, six different attitudes the accelerometer's, readings in all
-directions the magnetometer's ellipsoid. Which of them a sample belongs to is seen from the samples:
-whoever calibrates may do things in any order and twice.
+Rest gives the gyroscope's bias, six attitudes the accelerometer's, readings in all directions the
+magnetometer's ellipsoid. The samples themselves show to which part they belong, so that the steps
+may come in any order and repeatedly.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 SAMPLE_S = 0.02
 """The firmware's inertial samples come at 50 Hz."""
 STILL_S = 6.0
-"""0.02 deg/s of noise are left of the gyroscope's bias; its temperature does more."""
+"""Leaves 0.02 deg/s of noise in the gyroscope's bias, less than its temperature causes."""
 COVERAGE = 0.9
 READINGS = 300
 """A minute at five a second: the worst direction is then known to half a percent."""
@@ -40,7 +40,7 @@ class Samples:
 
 
 def gather(samples: Sequence[RawSample]) -> Samples:
-    """Arrays of those samples that hold inertial data."""
+    """Return the samples with inertial data as arrays."""
     missing = (np.nan, np.nan, np.nan)
     kept = [s for s in samples if s.acceleration_m_s2 and s.angular_rate_rad_s]
     return Samples(
@@ -53,7 +53,7 @@ def gather(samples: Sequence[RawSample]) -> Samples:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far it is: seconds of the longest rest, attitudes, share of directions, readings."""
+    """Seconds of the longest rest, attitudes, fraction of directions, and readings so far."""
 
     still_s: float
     attitudes: int
@@ -61,7 +61,7 @@ class Progress:
     readings: int
 
     def done(self, *, with_magnetometer: bool) -> bool:
-        """Whether nothing is asked for any more."""
+        """Return whether the samples are sufficient."""
         inertial_done = self.still_s >= STILL_S and self.attitudes >= inertial.POSES_FOR_SCALE
         turned = self.coverage >= COVERAGE and self.readings >= READINGS
         return inertial_done and (turned or not with_magnetometer)
@@ -77,7 +77,7 @@ def _fields(data: Samples) -> FloatArray:
 
 
 def progress(samples: Sequence[RawSample]) -> Progress:
-    """What the samples so far give."""
+    """Return the progress of the samples so far."""
     data = gather(samples)
     rest = _longest_rest(data)
     fields = _fields(data)
@@ -94,7 +94,7 @@ def progress(samples: Sequence[RawSample]) -> Progress:
 
 @dataclass(frozen=True)
 class Result:
-    """The calibration and the fits it comes from."""
+    """The calibration and its fits."""
 
     calibration: SensorCalibration
     gyro: inertial.GyroFit
@@ -103,20 +103,20 @@ class Result:
     fields_ut: FloatArray
     """Readings (n, 3) that the magnetometer's fit used."""
     remarks: tuple[str, ...]
-    """What was left as it is, and why."""
+    """What was not calibrated, and why."""
 
 
 def solve(samples: Sequence[RawSample], *, with_magnetometer: bool = True) -> Result:
-    """Fit what the samples hold.
+    """Fit gyroscope, accelerometer and magnetometer.
 
-    DataError, with what to do, where the node never lay still or the magnetometer cannot be fitted;
-    too few attitudes leave the accelerometer alone, which is remarked.
+    DataError, with a remedy, where the node never lay still or the magnetometer cannot be fitted;
+    with too few attitudes the accelerometer stays as it is, with a remark.
     """
     data = gather(samples)
     rest = _longest_rest(data)
     if rest is None:
         raise DataError(
-            "the node never lay still: put it on something firm for ten seconds without touching it"
+            "the node never lay still: put it on a firm surface for ten seconds without touching it"
         )
     gyro = inertial.fit_gyro(data.rate_rad_s[rest], data.duration_s[rest])
     remarks: list[str] = []
@@ -126,7 +126,7 @@ def solve(samples: Sequence[RawSample], *, with_magnetometer: bool = True) -> Re
             inertial.poses(data.force_m_s2, data.rate_rad_s, data.duration_s)
         )
     except DataError as error:
-        remarks.append(f"accelerometer left as it is: {error}")
+        remarks.append(f"accelerometer not calibrated: {error}")
     still = SensorCalibration(
         gyro_bias_rad_s=gyro.bias_rad_s,
         gyro_bias_sigma_rad_s=gyro.sigma_rad_s,

@@ -1,6 +1,6 @@
-"""Gyroscope and accelerometer from a node that lies still, on as many sides as it can.
+"""Gyroscope bias and accelerometer bias and scale from a node at rest on several sides.
 
-Gyroscope: what it shows while nothing turns is its bias (the Earth's 0.004 deg/s counts as such).
+Gyroscope: its rate at rest is the bias (including the Earth's 0.004 deg/s).
 
 Accelerometer: at rest |(force - bias) (1 + scale)| = g whatever the attitude, the six-parameter
 calibration (for example Frosio, Pedersini and Borghese 2009, IEEE Trans. Instrum. Meas. 58(6)).
@@ -26,21 +26,21 @@ STANDARD_GRAVITY_M_S2 = 9.80665
 
 STILL_RATE_RAD_S = math.radians(0.35)
 """Spread of the mean rates of successive reports up to which a node counts as lying still: on a
-table 0.02 deg/s, worn by somebody who stands quietly 0.8 (docs/deadreckoning.md)."""
+table 0.02 deg/s, worn by a person who stands quietly 0.8 (docs/deadreckoning.md)."""
 STILL_FORCE_M_S2 = 0.05
-LEAST_STILL_S = 3.0
-LEAST_POSE_S = 1.0
+MIN_STILL_S = 3.0
+MIN_POSE_S = 1.0
 TEMPERATURE_SIGMA_RAD_S = math.radians(0.1)
-"""What the gyroscope's bias moves by between the calibration and the walk. The data sheet's
+"""Change of the gyroscope's bias between calibration and walk. The data sheet's
 20 deg/s over the whole temperature range make 0.2 deg/s a kelvin at worst; a warm node varies by
-less than a kelvin. Hardware has to show it."""
-MOST_GYRO_BIAS_RAD_S = math.radians(40.0)
+less than a kelvin. Not verified on hardware."""
+MAX_GYRO_BIAS_RAD_S = math.radians(40.0)
 POSE_APART_RAD = math.radians(25.0)
-"""Two attitudes closer than this count as one."""
-LEAST_POSES = 3
+"""Attitudes closer than this count as one."""
+MIN_POSES = 3
 POSES_FOR_SCALE = 6
-MOST_BIAS_SIGMA_M_S2 = 0.05
-MOST_SCALE_SIGMA = 0.005
+MAX_BIAS_SIGMA_M_S2 = 0.05
+MAX_SCALE_SIGMA = 0.005
 FORCE_SIGMA_M_S2 = 0.01
 """Of one attitude's mean: noise, and the cross-axis terms that the model leaves out (0.5 % of
 gravity in the worst attitude, less on the faces)."""
@@ -50,8 +50,7 @@ gravity in the worst attitude, less on the faces)."""
 class GyroFit:
     """Bias (3,) and its standard deviation (3,) from ``still_s`` of lying still.
 
-    ``sigma_rad_s`` is one figure for what is left when the node is worn: the fit's own and what the
-    temperature does afterwards.
+    ``sigma_rad_s`` is the standard deviation in use: that of the fit and of the temperature.
     """
 
     bias_rad_s: FloatArray
@@ -60,20 +59,19 @@ class GyroFit:
 
     @property
     def sigma_rad_s(self) -> float:
-        """What the node should believe of the rest of its bias."""
+        """Standard deviation of the bias that remains, for the node's filter."""
         return math.hypot(float(np.max(self.deviation_rad_s)), TEMPERATURE_SIGMA_RAD_S)
 
 
 def fit_gyro(rate_rad_s: FloatArray, duration_s: FloatArray) -> GyroFit:
-    """Bias from mean rates (n, 3) over reports of ``duration_s`` (n,), the node lying still.
+    """Return the bias from mean rates (n, 3) over reports of ``duration_s`` (n,) at rest.
 
-    DataError where that is too short, where it moved, or where the bias is no sensor's.
+    DataError where the rest is too short, the node moved, or the bias is implausible.
     """
     total_s = float(duration_s.sum())
-    if len(rate_rad_s) < 5 or total_s < LEAST_STILL_S:
+    if len(rate_rad_s) < 5 or total_s < MIN_STILL_S:
         raise DataError(
-            f"{total_s:.1f} s of lying still are too few for the gyroscope, {LEAST_STILL_S:g} s "
-            "are needed"
+            f"{total_s:.1f} s at rest are too short for the gyroscope, {MIN_STILL_S:g} s are needed"
         )
     weights = duration_s / total_s
     bias = weights @ rate_rad_s
@@ -81,9 +79,9 @@ def fit_gyro(rate_rad_s: FloatArray, duration_s: FloatArray) -> GyroFit:
     if float(np.max(spread)) > STILL_RATE_RAD_S:
         raise DataError(
             f"the node moved: its rate varied by {math.degrees(float(np.max(spread))):.1f} deg/s. "
-            "Lay it on something firm and do not touch it"
+            "Lay it on a firm surface and do not touch it"
         )
-    if float(np.max(np.abs(bias))) > MOST_GYRO_BIAS_RAD_S:
+    if float(np.max(np.abs(bias))) > MAX_GYRO_BIAS_RAD_S:
         raise DataError(
             f"a gyroscope bias of {math.degrees(float(np.max(np.abs(bias)))):.0f} deg/s: the "
             "node turned steadily, or the sensor is broken"
@@ -102,10 +100,10 @@ class Pose:
 def still_stretches(
     force_m_s2: FloatArray, rate_rad_s: FloatArray, duration_s: FloatArray
 ) -> list[slice]:
-    """Stretches of successive reports in which neither force nor rate changes.
+    """Return stretches of successive reports in which neither force nor rate changes.
 
     Mean forces and rates (n, 3) over reports of ``duration_s`` (n,). A stretch ends before the
-    report that leaves its running mean; those shorter than LEAST_POSE_S are dropped, and so are the
+    report that leaves its running mean; those shorter than MIN_POSE_S are dropped, and so are the
     first and the last report of each, which may hold half a movement.
     """
     found: list[slice] = []
@@ -113,7 +111,7 @@ def still_stretches(
 
     def close(end: int) -> None:
         inner = slice(begin + 1, end - 1)
-        if inner.stop > inner.start and float(duration_s[inner].sum()) >= LEAST_POSE_S:
+        if inner.stop > inner.start and float(duration_s[inner].sum()) >= MIN_POSE_S:
             found.append(inner)
 
     for k in range(1, len(force_m_s2) + 1):
@@ -131,7 +129,7 @@ def still_stretches(
 
 
 def poses(force_m_s2: FloatArray, rate_rad_s: FloatArray, duration_s: FloatArray) -> list[Pose]:
-    """Different still attitudes in the order of their coming; repeated ones are put together.
+    """Return the different attitudes at rest in order of time; repeated ones are merged.
 
     Arguments as of :func:`still_stretches`. Both force and rate must be free of motion: a steady
     turn shows a rate that no other stretch shows, and is dropped.
@@ -172,7 +170,7 @@ def _angle_rad(a: FloatArray, b: FloatArray) -> float:
 class AccelerometerFit:
     """Bias (3,) and scale (3,) with (force - bias) (1 + scale) = specific force.
 
-    ``sigma_*`` are standard deviations (3,); ``partial`` tells that the scale was left at none.
+    ``sigma_*`` are standard deviations (3,); ``partial``: the scale was left at zero.
     ``residual_before_m_s2`` and ``residual_m_s2`` are RMS of |force| - g over the attitudes.
     """
 
@@ -189,11 +187,11 @@ class AccelerometerFit:
 def fit_accelerometer(
     attitudes: list[Pose], gravity_m_s2: float = STANDARD_GRAVITY_M_S2
 ) -> AccelerometerFit:
-    """Fit still attitudes. DataError where they are too few or too much alike."""
-    if len(attitudes) < LEAST_POSES:
+    """Fit attitudes at rest; DataError where they are too few or too similar."""
+    if len(attitudes) < MIN_POSES:
         raise DataError(
-            f"{len(attitudes)} still attitudes do not tell the accelerometer's bias: "
-            f"{POSES_FOR_SCALE} are needed (each side down once), {LEAST_POSES} for the bias alone"
+            f"{len(attitudes)} attitudes at rest do not determine the accelerometer's bias: "
+            f"{POSES_FOR_SCALE} are needed (each side down once), {MIN_POSES} for the bias alone"
         )
     forces = np.array([pose.force_m_s2 for pose in attitudes])
     partial = len(attitudes) < POSES_FOR_SCALE
@@ -207,14 +205,14 @@ def fit_accelerometer(
     solution = optimize.least_squares(misfits, np.zeros(free))
     info = solution.jac.T @ solution.jac / FORCE_SIGMA_M_S2**2
     if np.linalg.cond(info) > 1e10:
-        raise _alike()
+        raise _too_similar()
     sigma = np.sqrt(np.diag(np.linalg.inv(info)))
     scale = np.zeros(3) if partial else solution.x[3:]
     sigma_scale = np.zeros(3) if partial else sigma[3:]
-    if float(np.max(sigma[:3])) > MOST_BIAS_SIGMA_M_S2 or (
-        float(np.max(sigma_scale)) > MOST_SCALE_SIGMA
+    if float(np.max(sigma[:3])) > MAX_BIAS_SIGMA_M_S2 or (
+        float(np.max(sigma_scale)) > MAX_SCALE_SIGMA
     ):
-        raise _alike()
+        raise _too_similar()
     rest = misfits(solution.x)
     return AccelerometerFit(
         bias_m_s2=solution.x[:3],
@@ -230,8 +228,8 @@ def fit_accelerometer(
     )
 
 
-def _alike() -> DataError:
+def _too_similar() -> DataError:
     return DataError(
-        "the still attitudes are too much alike to tell the accelerometer's bias: lay the node "
+        "the attitudes at rest are too similar for the accelerometer's bias: lay the node "
         "on each of its six sides"
     )

@@ -1,7 +1,7 @@
 """Hard and soft iron from readings in many directions.
 
-Where the field is uniform, a perfect magnetometer that is turned draws a sphere. Magnetised iron on
-the node (hard iron) moves its centre, soft iron and the sensor's own errors make it an ellipsoid:
+In a uniform field the readings of a perfect magnetometer lie on a sphere. Magnetised iron on the
+node (hard iron) moves its centre; soft iron and the sensor's own errors make it an ellipsoid:
 
     reading = offset + M^-1 R field,   |M (reading - offset)| = |field|
 
@@ -11,13 +11,13 @@ the node (hard iron) moves its centre, soft iron and the sensor's own errors mak
    centre, hence a second pass weighted by the inverse gradient (Taubin 1991; Sampson 1982).
 2. Least squares of the first-order geometric distance, (|M d| - r) / |grad|, over centre and
    symmetric M: maximum likelihood where the sensor's noise is white and alike in all axes. The loss
-   is Huber's, so that a few readings beside a steel leg do not bend it.
-3. The norm alone cannot tell a rotation of M. Gravity can: the dip of the field is the same in
-   every attitude, so up . (Q M d) must be one number for all readings, which gives the rotation Q.
-   This is what makes the *heading* right and not only the sphere round.
+   is Huber's, against a few readings beside steel.
+3. The norm alone does not determine the rotation of M. Gravity does: the field's dip is the same
+   in every attitude, so up . (Q M d) must be one number for all readings, which gives the rotation
+   Q. Without it the sphere would be round, but the *heading* wrong.
 
-det M = 1 keeps the field's norm in microtesla: nothing here knows the true strength, and the mean
-semi-axis is the best that the sensor itself says of it.
+det M = 1 keeps the field's norm in microtesla: the true strength is unknown, and the mean semi-axis
+is its best estimate.
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ FloatArray = NDArray[np.float64]
 
 DIRECTIONS = 60
 """Equal patches of the sphere by which coverage is counted: 30 degrees across."""
-LEAST_READINGS = 60
-LEAST_COVERAGE = 0.6
+MIN_READINGS = 60
+MIN_COVERAGE = 0.6
 """Of the patches. A band around the equator (a node turned about one axis only) fills 30 to 40 %,
-two bands 60 %; the live display asks for more."""
-LEAST_EARTH_UT, MOST_EARTH_UT = 20.0, 75.0
+two bands 60 %; the guide asks for more."""
+MIN_EARTH_UT, MAX_EARTH_UT = 20.0, 75.0
 """The Earth's field is 22 to 67 uT; the firmware takes no reading outside this."""
-MOST_RESIDUAL = 0.05
-"""RMS distance from the ellipsoid over its radius. Noise makes 1 %, a field that is not uniform
-more: such a fit would move the disturbance of one place into every other."""
-MOST_UNCERTAINTY = 0.02
+MAX_RESIDUAL = 0.05
+"""RMS distance from the ellipsoid over its radius. Noise makes 1 %, a non-uniform field more:
+such a fit would carry the disturbance of one place to all others."""
+MAX_UNCERTAINTY = 0.02
 """Of a corrected reading in the worst direction, over the radius: 1 degree of heading."""
-MOST_CONDITION = 3.0
+MAX_CONDITION = 3.0
 """Longest over shortest semi-axis. Worse is a node beside a magnet, or no ellipsoid at all."""
-MOST_MISALIGNMENT_RAD = math.radians(20.0)
+MAX_MISALIGNMENT_RAD = math.radians(20.0)
 ALIGNED_WITHIN_RAD = math.radians(1.0)
-"""A rotation that is known worse than this (standard deviation) is left at none."""
+"""A rotation with a larger standard deviation is ignored."""
 QUASI_STATIC = 0.05
-"""Change of |force| from gravity up to which the accelerometer shows where up is."""
+"""Relative deviation of |force| from gravity up to which the accelerometer shows the vertical."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class MagnetometerFit:
     without any calibration. ``uncertainty`` is the standard deviation of a corrected reading in the
     worst direction, over the radius, from the parameters alone. ``dip_rad`` is how far the field
     points below the horizon and ``turned_rad`` the rotation that gravity found; None where gravity
-    was not given or did not say enough.
+    was not given or is not sufficient.
     """
 
     offset_ut: FloatArray
@@ -97,7 +97,7 @@ _PATCHES = directions()
 
 
 def visited(vectors: FloatArray) -> NDArray[np.bool_]:
-    """Which patches of the sphere (DIRECTIONS,) hold one of the vectors (n, 3)."""
+    """Return which patches of the sphere (DIRECTIONS,) contain one of the vectors (n, 3)."""
     seen = np.zeros(DIRECTIONS, dtype=np.bool_)
     norms = np.linalg.norm(vectors, axis=1)
     good = norms > 0.0
@@ -107,7 +107,7 @@ def visited(vectors: FloatArray) -> NDArray[np.bool_]:
 
 
 def coverage(vectors: FloatArray) -> float:
-    """Share of the sphere's patches that hold one of the vectors (n, 3)."""
+    """Return the fraction of the sphere's patches that contain one of the vectors (n, 3)."""
     return float(visited(vectors).mean())
 
 
@@ -130,19 +130,19 @@ def fit(field_ut: FloatArray, up: FloatArray | None = None) -> MagnetometerFit:
     """Fit readings (n, 3) in microtesla; ``up`` (n, 3) turns the result into gravity's axes.
 
     ``up`` is the specific force at the same moments in the same axes, NaN where it is unknown.
-    Raises DataError, with what to do, where the readings do not determine an ellipsoid: too few,
+    Raises DataError, with a remedy, where the readings do not determine an ellipsoid: too few,
     too much of the sphere unseen, a field that is not uniform, or no Earth's field.
     """
     good = np.isfinite(field_ut).all(axis=1)
     readings = field_ut[good]
-    if len(readings) < LEAST_READINGS:
+    if len(readings) < MIN_READINGS:
         raise DataError(
-            f"{len(readings)} magnetometer readings are too few, at least {LEAST_READINGS} are "
+            f"{len(readings)} magnetometer readings are too few, at least {MIN_READINGS} are "
             "needed: turn the node for a minute"
         )
     scale = float(np.linalg.norm(readings - readings.mean(axis=0), axis=1).mean())
     if scale < 1.0:
-        raise DataError("the magnetometer always shows the same: turn the node in all directions")
+        raise DataError("the magnetometer readings do not change: turn the node in all directions")
     shift = readings.mean(axis=0)
     centre, shape = _algebraic((readings - shift) / scale)
     for _ in range(2):
@@ -171,34 +171,34 @@ def fit(field_ut: FloatArray, up: FloatArray | None = None) -> MagnetometerFit:
 
 
 def _check(result: MagnetometerFit) -> None:
-    if result.coverage < LEAST_COVERAGE:
+    if result.coverage < MIN_COVERAGE:
         raise DataError(
             f"only {100 * result.coverage:.0f} % of the directions were seen, at least "
-            f"{100 * LEAST_COVERAGE:.0f} % are needed: point each side of the node up, down and "
+            f"{100 * MIN_COVERAGE:.0f} % are needed: point each side of the node up, down and "
             "all around"
         )
     axes = np.linalg.svd(result.matrix, compute_uv=False)
-    if axes[0] / axes[-1] > MOST_CONDITION:
+    if axes[0] / axes[-1] > MAX_CONDITION:
         raise DataError(
             f"the readings make an ellipsoid {axes[0] / axes[-1]:.1f} times as long as wide: "
             "iron or a magnet is close to the sensor, or the field changed meanwhile"
         )
-    if result.residual > MOST_RESIDUAL:
+    if result.residual > MAX_RESIDUAL:
         raise DataError(
             f"the readings lie {100 * result.residual:.0f} % of the field off the best ellipsoid, "
-            f"at most {100 * MOST_RESIDUAL:.0f} % are sound: the field is not uniform here; go "
+            f"at most {100 * MAX_RESIDUAL:.0f} % are acceptable: the field is not uniform here; go "
             "outside or away from steel, and turn the node on the spot"
         )
-    if result.uncertainty > MOST_UNCERTAINTY:
+    if result.uncertainty > MAX_UNCERTAINTY:
         raise DataError(
             f"a corrected field would still be uncertain by {100 * result.uncertainty:.1f} % in "
-            f"the worst direction, at most {100 * MOST_UNCERTAINTY:.0f} % are sound: turn the node "
-            "longer and in all directions"
+            f"the worst direction, at most {100 * MAX_UNCERTAINTY:.0f} % are acceptable: turn the "
+            "node longer and in all directions"
         )
-    if not LEAST_EARTH_UT <= result.radius_ut <= MOST_EARTH_UT:
+    if not MIN_EARTH_UT <= result.radius_ut <= MAX_EARTH_UT:
         raise DataError(
             f"the corrected field is {result.radius_ut:.0f} uT strong, the Earth's is 22 to 67: "
-            "something magnetic is close by, or this is not a calibrated sensor's scale"
+            "a magnet is close by, or the sensor's scale is wrong"
         )
 
 
@@ -309,13 +309,13 @@ def _geometric(
 def _aligned(result: MagnetometerFit, readings: FloatArray, up: FloatArray) -> MagnetometerFit:
     """Turn the fit so that the field's dip is the same in every attitude.
 
-    Unchanged where gravity was not seen from enough sides. DataError where the rotation is no
-    mounting error any more.
+    Unchanged where gravity was not seen from enough sides. DataError where the rotation is too
+    large for a mounting error.
     """
     norms = np.linalg.norm(up, axis=1)
     typical = float(np.nanmedian(norms)) if np.isfinite(norms).any() else math.nan
     still = np.isfinite(norms) & (np.abs(norms - typical) < QUASI_STATIC * typical)
-    if still.sum() < LEAST_READINGS or coverage(up[still]) < LEAST_COVERAGE:
+    if still.sum() < MIN_READINGS or coverage(up[still]) < MIN_COVERAGE:
         return result
     field = result.correct(readings[still]) / result.radius_ut
     vertical = up[still] / norms[still, None]
@@ -334,10 +334,10 @@ def _aligned(result: MagnetometerFit, readings: FloatArray, up: FloatArray) -> M
     if float(np.max(sigma[:3])) > ALIGNED_WITHIN_RAD:
         return result
     turned_rad = float(np.linalg.norm(solution.x[:3]))
-    if turned_rad > MOST_MISALIGNMENT_RAD:
+    if turned_rad > MAX_MISALIGNMENT_RAD:
         raise DataError(
             f"magnetometer and accelerometer disagree by {math.degrees(turned_rad):.0f} degrees "
-            "about where things are: their axes are not what the firmware takes them for"
+            "about directions: their axes differ from the firmware's"
         )
     rotation = Rotation.from_rotvec(solution.x[:3]).as_matrix()
     return MagnetometerFit(

@@ -1,4 +1,4 @@
-"""A node's calibration in SI units, what it does to samples, and how it travels."""
+"""A node's sensor calibration in SI units, and its words on the wire."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ def _zeros() -> FloatArray:
 
 @dataclass(frozen=True)
 class SensorCalibration:
-    """What the firmware does to every sample; the default changes nothing.
+    """The corrections that the firmware applies to every sample; the default changes nothing.
 
     In the axes of accelerometer and gyroscope: specific force (3,) := (force - bias) (1 + scale),
     rate (3,) := rate - bias, field (3,) := field_matrix (field - offset). ``gyro_bias_sigma_rad_s``
-    says how well the gyroscope's bias will hold; 0 means that it was never calibrated.
+    is the standard deviation of the bias in use; 0 means never calibrated.
     """
 
     acceleration_bias_m_s2: FloatArray = field(default_factory=_zeros)
@@ -37,14 +37,14 @@ class SensorCalibration:
     field_matrix: FloatArray = field(default_factory=lambda: np.eye(3))
 
     def correct_acceleration(self, force_m_s2: FloatArray) -> FloatArray:
-        """Corrected specific force of samples (n, 3)."""
+        """Return the corrected specific force of samples (n, 3)."""
         corrected: FloatArray = (force_m_s2 - self.acceleration_bias_m_s2) * (
             1.0 + self.acceleration_scale
         )
         return corrected
 
     def to_words(self) -> list[int]:
-        """The 16-bit words that the node stores. DataError where one does not fit."""
+        """Return the 16-bit words that the node stores; DataError where one does not fit."""
         values = [
             *self.acceleration_bias_m_s2,
             *self.gyro_bias_rad_s,
@@ -60,8 +60,8 @@ class SensorCalibration:
             ]
         except OutOfRangeError as error:
             raise DataError(
-                f"the calibration does not fit a node ({error}): the sensor is broken, or what was "
-                "measured is not what was asked for"
+                f"the calibration does not fit a node ({error}): the sensor is broken, or the "
+                "calibration was not carried out as described"
             ) from error
 
     @staticmethod
@@ -81,5 +81,5 @@ class SensorCalibration:
 
 
 def checksum(words: Sequence[int]) -> int:
-    """What COMMIT_CALIBRATION has to bring for these words to be put into force."""
+    """Return the checksum with which COMMIT_CALIBRATION puts these words into force."""
     return wire.crc16(struct.pack(f"<{len(words)}h", *words))

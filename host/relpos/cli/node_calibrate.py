@@ -310,7 +310,7 @@ def _walk(dialogue: NodeDialogue, distance_m: float, stature_m: float | None, ye
             stepped_s = time.monotonic()
         newest = totals
         walked = (newest["steps"] - before["steps"]) % 65536
-        if walked >= steps.LEAST_STEPS and time.monotonic() - stepped_s > STOOD_S:
+        if walked >= steps.MIN_STEPS and time.monotonic() - stepped_s > STOOD_S:
             break
     walked = (newest["steps"] - before["steps"]) % 65536
     fit = steps.fit_walk(gain, walked, newest["path_m"] - before["path_m"], distance_m)
@@ -353,7 +353,7 @@ def _antenna(
     from relpos.calibration import antenna as fits
     from relpos.nodes import antenna as measuring
 
-    shares_mm = measuring.read_shares_mm(dialogue, pair)
+    offsets_mm = measuring.read_offsets_mm(dialogue, pair)
     output.remark(
         f"nodes {pair[0]} and {pair[1]}: leave them alone, {distance_m:g} m apart and in sight of "
         f"each other, until {count} ranges are in"
@@ -361,13 +361,13 @@ def _antenna(
     with measuring.ranging_fast(dialogue, pair):
         found = fits.fit_ranges(_ranges(dialogue, pair, count), distance_m)
         _tell_ranges("before", found)
-        new_mm = fits.new_shares_mm(
-            found.bias_m, shares_mm, None if reference is None else pair.index(reference)
+        new_mm = fits.new_offsets_mm(
+            found.bias_m, offsets_mm, None if reference is None else pair.index(reference)
         )
         if not _confirmed(yes):
             raise DataError(f"nodes {pair[0]} and {pair[1]} keep their range offsets")
-        measuring.store_shares_mm(dialogue, pair, new_mm)
-        for node, old, new in zip(pair, shares_mm, new_mm, strict=True):
+        measuring.store_offsets_mm(dialogue, pair, new_mm)
+        for node, old, new in zip(pair, offsets_mm, new_mm, strict=True):
             typer.echo(f"node {node}: range offset {old / 1000:+.3f} -> {new / 1000:+.3f} m")
         left = fits.fit_ranges(_ranges(dialogue, pair, count), distance_m)
     _tell_ranges("after", left)

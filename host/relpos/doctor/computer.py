@@ -1,4 +1,4 @@
-"""What the checks ask of the computer: the one place that touches it, so that tests can pretend."""
+"""The checks' questions to the operating system, in one place, so that tests can replace it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ COMMAND_WITHIN_S = 10.0
 
 @dataclass
 class SerialPort:
-    """A port as the system lists it; ids are None where it is none on USB."""
+    """A port as the system lists it; ids are None for a port that is not on USB."""
 
     device: str
     description: str
@@ -32,11 +32,11 @@ class Computer:
     platform = sys.platform
 
     def which(self, name: str) -> str | None:
-        """Where a command lies, or None."""
+        """Return the path of a command, or None."""
         return shutil.which(name)
 
-    def told(self, *command: str) -> str:
-        """What a command prints, "" where it is missing, fails or does not end."""
+    def output_of(self, *command: str) -> str:
+        """Return what a command prints, "" where it is missing, fails or does not end."""
         try:
             done = subprocess.run(
                 command, capture_output=True, text=True, timeout=COMMAND_WITHIN_S, check=False
@@ -46,7 +46,7 @@ class Computer:
         return done.stdout if done.returncode == 0 else ""
 
     def processes(self) -> dict[int, str]:
-        """Process ids and names; nothing where the system has no /proc."""
+        """Return process ids and names; nothing where the system has no /proc."""
         found = {}
         for folder in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):  # it may have ended meanwhile
@@ -54,7 +54,7 @@ class Computer:
         return found
 
     def holders(self, device: str) -> list[str]:
-        """Processes that have the device open, as `name (id)`, as far as we may see."""
+        """Return the visible processes that have the device open, as `name (id)`."""
         try:
             wanted = os.path.realpath(device)
         except OSError:
@@ -69,28 +69,28 @@ class Computer:
         return found
 
     def ports(self) -> list[SerialPort]:
-        """The serial ports that the system lists."""
+        """Return the serial ports that the system lists."""
         from serial.tools.list_ports import comports
 
         return [SerialPort(p.device, p.description or "", p.vid, p.pid) for p in comports()]
 
     def exists(self, device: str) -> bool:
-        """Whether a device is there."""
+        """Return whether a device exists."""
         return Path(device).exists()
 
     def may_use(self, device: str) -> bool:
-        """Whether this user may read and write a device."""
+        """Return whether this user may read and write a device."""
         return os.access(device, os.R_OK | os.W_OK)
 
     def group_of(self, device: str) -> str:
-        """The group that a device belongs to; "" where there are none."""
+        """Return the group of a device; "" on systems without groups."""
         try:
             return Path(device).group()
         except (OSError, KeyError, NotImplementedError):
             return ""
 
     def has_group_after_login(self, group: str) -> bool:
-        """Whether the system's lists have the user in a group, whatever this session knows."""
+        """Return whether the user is in a group from the next login on."""
         try:
             import grp
 
@@ -99,32 +99,32 @@ class Computer:
             return False
 
     def user(self) -> str:
-        """The user's name."""
+        """Return the user's name."""
         try:
             return getpass.getuser()
         except (OSError, KeyError):
             return "$USER"
 
     def free_bytes(self, folder: Path) -> int:
-        """Room for this user on the disk that ``folder`` is, or will be, on."""
+        """Return the free bytes on the disk of ``folder``, which may not exist yet."""
         while not folder.exists() and folder != folder.parent:
             folder = folder.parent
         return shutil.disk_usage(folder).free
 
     def may_write(self, folder: Path) -> bool:
-        """Whether files can be made in the folder, or in the one that it would be made in."""
+        """Return whether files can be written to the folder, which may not exist yet."""
         while not folder.exists() and folder != folder.parent:
             folder = folder.parent
         return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)
 
     def now(self) -> datetime:
-        """The clock, in the computer's time zone."""
+        """Return the time, in the computer's time zone."""
         return datetime.now().astimezone()
 
     def sleeps_on(self) -> bool:
-        """Whether there is a clock that goes on while the computer sleeps."""
+        """Return whether there is a clock that counts on while the computer sleeps."""
         return hasattr(time, "CLOCK_BOOTTIME")
 
     def environment(self, name: str) -> str:
-        """An environment variable, or ""."""
+        """Return an environment variable, or ""."""
         return os.environ.get(name, "")

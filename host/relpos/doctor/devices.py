@@ -1,4 +1,4 @@
-"""Whether there is a coordinator at a port that we may use, set up as it should be."""
+"""Checks of serial ports, and of the coordinator's XBee module behind one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 COORDINATOR = 0
 SHARED = ("CH", "ID")
-"""May be anything, as long as it is the same in all modules."""
+"""May have any value that is the same in all modules."""
 _CH340 = 0x1A86
 
 
@@ -27,7 +27,7 @@ def look(
     port: str | None,
     open_port: Callable[[str, int], serial.Serial] | None = None,
 ) -> Iterator[Finding]:
-    """The port that is named with the module behind it, or every port on USB."""
+    """Check the named port and the module behind it, or every port on USB."""
     if port is None:
         yield from _all_ports(computer)
         return
@@ -59,31 +59,35 @@ def _all_ports(computer: Computer) -> Iterator[Finding]:
 def _port(computer: Computer, port: str) -> Finding:
     name = f"port {port}"
     if "://" in port or computer.platform == "win32":
-        return well(name, "whether it opens is seen when it is opened")
+        return well(name, "not checked before it is opened")
     if not computer.exists(port):
         ports = [p.device for p in computer.ports() if p.vid is not None]
         there = f"plugged in: {', '.join(ports)}" if ports else "no serial port is on USB"
-        return wrong(name, f"there is none; {there}", "check cable and adapter: some cables charge")
+        return wrong(
+            name, f"not found; {there}", "check cable and adapter: some cables only charge"
+        )
     if not computer.may_use(port):
         return _no_permission(computer, port, name)
     holders = computer.holders(port)
     if holders:
         return wrong(name, f"in use by {', '.join(holders)}", "end that program")
-    return well(name, "there, free, and you may use it")
+    return well(name, "found, free, with permission")
 
 
 def _no_permission(computer: Computer, port: str, name: str) -> Finding:
     group = computer.group_of(port)
-    words = f"you may not use it; it belongs to group {group or 'unknown'}"
+    words = f"no permission; it belongs to group {group or 'unknown'}"
     if not group or group == "root":
         return wrong(name, words, f"sudo chmod a+rw {port}, or a udev rule that does it each time")
     if computer.has_group_after_login(group):
-        return wrong(name, f"{words}, and you are in it since your last login", "log out and in")
+        return wrong(
+            name, f"{words}, which you have joined since your last login", "log out and in"
+        )
     return wrong(name, words, f"sudo usermod -aG {group} {computer.user()}, then log out and in")
 
 
 def _programs_that_grab(computer: Computer, ports: list[SerialPort]) -> Iterator[Finding]:
-    """Services that open a new port on their own, for a modem or a Braille display."""
+    """Report services that open new ports for a modem or a Braille display."""
     usb = [p for p in ports if p.vid is not None]
     running = set(computer.processes().values()) if usb else set()
     if "ModemManager" in running:
@@ -91,21 +95,21 @@ def _programs_that_grab(computer: Computer, ports: list[SerialPort]) -> Iterator
         if free:
             yield hint(
                 "ModemManager",
-                f"it looks for a modem behind {', '.join(free)}: for half a minute after plugging "
-                "in the port is busy, and a node's firmware is disturbed",
+                f"it probes {', '.join(free)} for a modem: for half a minute after plugging in the "
+                "port is busy, and the probing disturbs a node's firmware",
                 "sudo systemctl disable --now ModemManager, or wait",
             )
     if "brltty" in running and any(p.vid == _CH340 for p in usb):
         yield wrong(
             "brltty",
-            "it takes adapters with a CH340 chip for Braille displays, and their port away",
+            "it takes adapters with a CH340 chip for Braille displays and claims their ports",
             "sudo systemctl mask --now brltty-udev.service; sudo apt-get remove brltty",
         )
 
 
 def _ignored_by_modem_manager(computer: Computer, device: str) -> bool:
-    told = computer.told("udevadm", "info", "--query=property", f"--name={device}")
-    return "ID_MM_DEVICE_IGNORE=1" in told or "ID_MM_PORT_IGNORE=1" in told
+    properties = computer.output_of("udevadm", "info", "--query=property", f"--name={device}")
+    return "ID_MM_DEVICE_IGNORE=1" in properties or "ID_MM_PORT_IGNORE=1" in properties
 
 
 # -- the module ------------------------------------------------------------------------------------
@@ -124,15 +128,14 @@ def _module(port: str, open_port: Callable[[str, int], serial.Serial] | None) ->
         yield wrong(
             name,
             str(error),
-            "the coordinator is an XBee in a USB adapter; a node's Arduino is none",
+            "the coordinator is an XBee in a USB adapter, not a node's Arduino",
         )
         return
     try:
         if not isinstance(access, radio.ApiMode):
             yield wrong(
                 name,
-                f"an XBee that speaks {access.device.baudrate} baud without frames, as from the "
-                "shelf",
+                f"an XBee at {access.device.baudrate} baud without API frames: factory settings",
                 remedy,
             )
         else:
@@ -152,17 +155,17 @@ def _settings(access: Access, wanted: list[Parameter], remedy: str) -> Iterator[
             off.append(str(error))
             continue
         if value != parameter.value:
-            words = f"{parameter.command}={value:X} in place of {parameter.value:X} "
+            words = f"{parameter.command}={value:X} instead of {parameter.value:X} "
             words += f"({parameter.meaning})"
             (unlike if parameter.command in SHARED else off).append(words)
     if off:
-        yield wrong(name, f"an XBee set otherwise: {'; '.join(off)}", remedy)
+        yield wrong(name, f"an XBee with other settings: {'; '.join(off)}", remedy)
         return
     if unlike:
         yield hint(
             name,
-            f"an XBee on a network of its own: {'; '.join(unlike)}. Well, if all nodes are on it",
-            f"{remedy} sets what is usual",
+            f"an XBee on another network: {'; '.join(unlike)}. Fine if all nodes are on it",
+            f"{remedy} sets the usual one",
         )
         return
-    yield well(name, "an XBee, set as it should be")
+    yield well(name, "an XBee with the right settings")

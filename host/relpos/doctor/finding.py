@@ -1,4 +1,4 @@
-"""What was looked at, how it is, and what to do."""
+"""The result of one check: its name, state, description and remedy."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from enum import StrEnum
 
 
 class State(StrEnum):
-    """How something is."""
+    """The state of what was checked."""
 
     WELL = "well"
     HINT = "hint"
-    """Nothing is broken; it is worth knowing, or something optional is not there."""
+    """Nothing is broken; something optional is missing, or worth knowing."""
     WRONG = "wrong"
-    """A team will not work like this."""
+    """A team does not work in this state."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at: ``words`` say how it is, ``remedy`` what to do about it."""
+    """One check's result: ``words`` describe the state, ``remedy`` says what to do."""
 
     name: str
     state: State
@@ -26,20 +26,20 @@ class Finding:
     remedy: str = ""
 
     def to_json(self) -> dict[str, str]:
-        """As `--json` shows it."""
+        """Return the finding as `--json` prints it."""
         return {**asdict(self), "state": str(self.state)}
 
 
 def well(name: str, words: str) -> Finding:
-    """All is as it should be."""
+    """Return a finding without a problem."""
     return Finding(name, State.WELL, words)
 
 
 def hint(name: str, words: str, remedy: str = "") -> Finding:
-    """It works, with less than it could have."""
+    """Return a finding that reduces what works."""
     return Finding(name, State.HINT, words, remedy)
 
 
 def wrong(name: str, words: str, remedy: str) -> Finding:
-    """It does not work, and what to do."""
+    """Return a finding that keeps a team from working, with its remedy."""
     return Finding(name, State.WRONG, words, remedy)

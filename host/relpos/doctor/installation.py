@@ -1,4 +1,4 @@
-"""Whether relpos itself is complete, and the computer ready for it."""
+"""Checks of the installation: Python, extras, kernels, tools, key, disk, browser, clock."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ROOM_TOO_LITTLE = 200 * MEGABYTE
 ROOM_LITTLE = 2000 * MEGABYTE
 COUNTERS_BEGIN = 2024
 COUNTERS_END = 2041
-"""Frames to the nodes are counted by the time (docs/protocol.md)."""
+"""Frames to the nodes use the time as their counter (docs/protocol.md)."""
 BROWSERS = (
     "firefox", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable",
     "microsoft-edge", "brave-browser",
@@ -27,7 +27,7 @@ APT = "sudo apt-get install -y"
 
 
 def look(computer: Computer, key_file: Path | None, out: Path) -> Iterator[Finding]:
-    """Everything but the ports. ``out`` is the folder where recordings go."""
+    """Run all checks except those of ports; ``out`` is the folder for recordings."""
     yield _python()
     yield from _extras()
     yield _kernels(computer)
@@ -43,7 +43,7 @@ def _python() -> Finding:
     version = platform.python_version()
     words = f"relpos {__version__}, {f'in {where}' if where else 'installed'}; Python {version}"
     if sys.maxsize < 2**32:
-        return wrong("python", f"{words}, 32 bit", "install a 64-bit Python: numba has no other")
+        return wrong("python", f"{words}, 32 bit", "install a 64-bit Python, which numba needs")
     return well("python", words)
 
 
@@ -52,12 +52,12 @@ def _extras() -> Iterator[Finding]:
         needed, lacking = extras.requirements(extra), extras.missing(extra)
         name = f"extra {extra}"
         if lacking:
-            words = f"not installed: {', '.join(lacking)}; without it there is no {purpose}"
+            words = f"not installed: {', '.join(lacking)}; without it: no {purpose}"
             yield hint(name, words, extras.install_line(lacking))
         elif needed:
             yield well(name, f"installed: {purpose}")
         else:
-            yield hint(name, "what it needs is not known: this relpos is not installed")
+            yield hint(name, "its requirements are unknown: this relpos is not installed")
 
 
 # -- compiled kernels ------------------------------------------------------------------------------
@@ -71,8 +71,8 @@ def _kernels(computer: Computer) -> Finding:
     if not computer.may_write(folder):
         return wrong(
             name,
-            f"what is compiled cannot be kept ({folder}): every start waits for it",
-            "name a folder that can be written: export NUMBA_CACHE_DIR=$HOME/.cache/numba",
+            f"compiled code cannot be stored in {folder}: every start compiles again",
+            "choose a writable folder: export NUMBA_CACHE_DIR=$HOME/.cache/numba",
         )
     if not kernel_cache.is_complete({room for rooms in ROOMS.values() for room in rooms}, folder):
         return hint(
@@ -80,7 +80,7 @@ def _kernels(computer: Computer) -> Finding:
             "not compiled yet: the first start takes some twenty seconds longer",
             "relpos doctor --prepare",
         )
-    return well(name, "compiled, a session starts at once")
+    return well(name, "compiled")
 
 
 def prepare(progress: Callable[[str, int, int], None] = lambda stage, done, total: None) -> None:
@@ -116,15 +116,15 @@ def _tools(computer: Computer) -> Iterator[Finding]:
         else:
             yield hint(
                 command,
-                f"missing ({purpose}): PlatformIO fetches its own, online",
+                f"missing ({purpose}): PlatformIO downloads its own",
                 f"{APT} {package}",
             )
 
 
 def _version(computer: Computer, command: str) -> str:
-    # avrdude tells its version with its help alone, and on stderr.
-    lines = computer.told(command, "--version").splitlines() if command != "avrdude" else []
-    return lines[0] if lines else "there"
+    # avrdude prints its version only with its help, and on stderr.
+    lines = computer.output_of(command, "--version").splitlines() if command != "avrdude" else []
+    return lines[0] if lines else "found"
 
 
 def _platformio(computer: Computer) -> Finding:
@@ -156,8 +156,7 @@ def _key(key_file: Path | None) -> Finding:
     if key_file is None:
         return hint(
             name,
-            "none is named: nodes are spoken to under the key that every new node has, which "
-            "keeps nobody out",
+            "no key file: nodes use the public default key of every new node",
             "relpos node flash --key-file team.key --new, then export "
             "RELPOS_KEY_FILE=$PWD/team.key",
         )
@@ -165,12 +164,10 @@ def _key(key_file: Path | None) -> Finding:
         read_key(key_file)
         SeenCounters.beside(key_file).load()
     except RelposError as error:
-        return wrong(
-            name, str(error), "name the file that the nodes were given their key from: --key-file"
-        )
+        return wrong(name, str(error), "give the nodes' key file: --key-file")
     if sys.platform != "win32" and key_file.stat().st_mode & 0o077:
         return wrong(name, f"{key_file}: others can read it", f"chmod 600 {key_file}")
-    return well(name, f"{key_file}, readable by you alone")
+    return well(name, f"{key_file}, readable only by you")
 
 
 def _room(computer: Computer, out: Path) -> Finding:
@@ -178,11 +175,13 @@ def _room(computer: Computer, out: Path) -> Finding:
     where = out.resolve()
     if not computer.may_write(where):
         return wrong(
-            name, f"{where} cannot be written", "go to a folder of your own, or name one with --out"
+            name,
+            f"{where} cannot be written",
+            "change to a folder of your own, or choose one with --out",
         )
     free = computer.free_bytes(where)
     words = f"{free / 1e9:.1f} GB free for {where}"
-    remedy = "delete what is not needed, or record to another disk: --out DIR"
+    remedy = "free some space, or record to another disk: --out DIR"
     if free < ROOM_TOO_LITTLE:
         return wrong(name, words, remedy)
     return hint(name, words, remedy) if free < ROOM_LITTLE else well(name, words)
@@ -195,7 +194,7 @@ def _browser(computer: Computer) -> Finding:
     if computer.platform in ("win32", "darwin"):
         return well(name, "the system's")
     if found is None:
-        return hint(name, f"none is found here; {elsewhere}", f"{APT} firefox-esr")
+        return hint(name, f"none found here; {elsewhere}", f"{APT} firefox-esr")
     if not (computer.environment("DISPLAY") or computer.environment("WAYLAND_DISPLAY")):
         return hint(name, f"{found}, but this session has no screen; {elsewhere}")
     return well(name, found)
@@ -208,22 +207,26 @@ def _clock(computer: Computer) -> Iterator[Finding]:
     if not COUNTERS_BEGIN <= now.year < COUNTERS_END:
         yield wrong(
             "clock",
-            f"{words}: nodes take the time as the frames' counter, and refuse this one",
+            f"{words}: nodes use the time as the frames' counter and reject this one",
             "set date and time, best by a time server: sudo timedatectl set-ntp true",
         )
-    elif computer.told("timedatectl", "show", "--property=NTPSynchronized").strip().endswith("=no"):
+    elif (
+        computer.output_of("timedatectl", "show", "--property=NTPSynchronized")
+        .strip()
+        .endswith("=no")
+    ):
         yield hint(
             "clock",
-            f"{words}, not set by a time server: a clock that goes back lets nodes refuse "
-            "commands until it has caught up",
-            "sudo timedatectl set-ntp true, before you go where there is no network",
+            f"{words}, not synchronised: after a clock goes back, nodes reject commands until it "
+            "has caught up",
+            "sudo timedatectl set-ntp true, while there is a network",
         )
     else:
         yield well("clock", words)
     if not computer.sleeps_on():
         yield hint(
             "sleep",
-            "this system has no clock that goes on while it sleeps: a session that was asleep "
-            "has to be started again",
+            "this system has no clock that counts on while it sleeps: restart a session after "
+            "sleep",
             "keep the laptop awake during a mission",
         )

@@ -15,9 +15,9 @@ from scipy.interpolate import PchipInterpolator
 
 from relpos.calibration.steps import (
     LEG_OF_STATURE,
-    MOST_CHANGE,
+    MAX_CHANGE,
     POPULATION_GAIN_PERMILLE,
-    believed_scale,
+    posterior_scale,
     scaled_gain_permille,
 )
 from relpos.errors import DataError, DeviceError
@@ -282,7 +282,7 @@ def calibrate(
     leg_length_m: float | None,
     board: BoardKind | str = BoardKind.NATIVE,
 ) -> Calibration:
-    """Step gain after walks of one wearer, as far as `steps.believed_scale` believes them.
+    """Step gain after walks of one wearer, weighted by `steps.posterior_scale`.
 
     A walk's length goes with the gain: 5 % more of it makes the recorded walks 5.03 % longer at the
     median. So one pass suffices; several may run into a step that is found with one gain and not
@@ -300,12 +300,12 @@ def calibrate(
         raise DataError(f"node {node}: no step is found in the calibration walk")
     asked = [true / measured for true, measured in zip(true_m, measured_m, strict=True)]
     for scale, true, measured in zip(asked, true_m, measured_m, strict=True):
-        if not 1.0 / MOST_CHANGE <= scale <= MOST_CHANGE:
+        if not 1.0 / MAX_CHANGE <= scale <= MAX_CHANGE:
             raise DataError(
                 f"node {node}: the calibration walk comes out as {measured:.2f} m and not as "
                 f"{true:g} m: is true_distance_m right?"
             )
-    scale = believed_scale(asked)
+    scale = posterior_scale(asked)
     return Calibration(scaled_gain_permille(POPULATION_GAIN_PERMILLE, scale), scale, measured_m)
 
 

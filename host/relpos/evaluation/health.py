@@ -132,8 +132,8 @@ def _node(
 
 
 _SHARES = (
-    ("% of its rangings succeed", "few of its rangings succeed"),
-    ("% of its", "many of its"),
+    ("% of rangings succeed", "few rangings succeed"),
+    ("% of", "many"),
 )
 
 

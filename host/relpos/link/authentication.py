@@ -1,6 +1,6 @@
 """The team key, and counters that tell a new frame from one that is sent again.
 
-What a frame's tag and counter mean: docs/protocol.md. Nothing here changes state before a frame has
+docs/protocol.md describes a frame's tag and counter. Nothing here changes state before a frame has
 been verified by :func:`relpos.protocol.messages.decode`.
 """
 
@@ -21,16 +21,16 @@ from relpos.protocol import messages as wire
 EPOCH_UNIX_S = 1_704_067_200
 """2024-01-01 UTC: where the host's counter begins."""
 COUNTS_PER_S = 8
-"""A host may send so many frames a second for ever; 32 bits last until 2041."""
+"""Frames a second that a host may send without end; 32 bits last until 2041."""
 WINDOW = 64
-"""How far a frame may be behind the newest and still be taken, once."""
+"""How far behind the newest a frame may be and still be accepted, once."""
 
 
 class HostCounter:
-    """Counters of what the host sends: the time in eighths of a second, or the last one plus 1.
+    """Counters of the host's frames: the time in eighths of a second, or the last one plus 1.
 
-    ``clock`` gives Unix time in seconds; two hosts of a team, or one that was restarted, need no
-    common memory as long as their clocks are right to a few seconds.
+    ``clock`` gives Unix time in seconds. Two hosts of a team, or one that was restarted, need no
+    common memory while their clocks are right to a few seconds.
     """
 
     def __init__(self, clock: Callable[[], float] = time.time) -> None:
@@ -38,14 +38,14 @@ class HostCounter:
         self._last = 0
 
     def next(self) -> int:
-        """The next frame's counter."""
+        """Return the next frame's counter."""
         now = int((self._clock() - EPOCH_UNIX_S) * COUNTS_PER_S)
         self._last = max(now, self._last + 1)
         return self._last
 
 
 class Verdict(enum.Enum):
-    """What a frame's counter says."""
+    """Result of the check of a frame's counter."""
 
     NEW = "new"
     LATE = "late"
@@ -60,8 +60,8 @@ class CounterWindow:
     newest: int = -1
     _seen: int = 0
 
-    def judge(self, counter: int) -> Verdict:
-        """Whether a frame of that counter may be taken; changes nothing."""
+    def check(self, counter: int) -> Verdict:
+        """Return whether a frame of that counter is new; changes nothing."""
         if counter > self.newest:
             return Verdict.NEW
         behind = self.newest - counter
@@ -69,8 +69,8 @@ class CounterWindow:
             return Verdict.REPLAYED
         return Verdict.DUPLICATE if self._seen >> behind & 1 else Verdict.LATE
 
-    def take(self, counter: int) -> None:
-        """Remember the counter of a frame that was taken."""
+    def add(self, counter: int) -> None:
+        """Store the counter of an accepted frame."""
         if counter > self.newest:
             ahead = counter - self.newest
             self._seen = (self._seen << min(ahead, WINDOW) | 1) & ((1 << WINDOW) - 1)
@@ -80,7 +80,7 @@ class CounterWindow:
 
     @classmethod
     def after(cls, newest: int) -> CounterWindow:
-        """A window in which everything up to ``newest`` has been seen."""
+        """Return a window in which everything up to ``newest`` has been seen."""
         return cls(newest, (1 << WINDOW) - 1)
 
 
@@ -88,7 +88,7 @@ class CounterWindow:
 
 
 def write_new_key(path: Path) -> bytes:
-    """Make a random key, readable by the owner alone. DataError where the file exists already."""
+    """Write and return a random key, for its owner to read; DataError if the file exists."""
     key = secrets.token_bytes(wire.KEY_BYTES)
     try:
         handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
@@ -102,11 +102,11 @@ def write_new_key(path: Path) -> bytes:
 
 
 def read_key(path: Path) -> bytes:
-    """The key in a file: 32 hexadecimal digits. DataError, which never quotes it, where not."""
+    """Return the key in a file (32 hexadecimal digits); DataError, which never quotes it."""
     try:
         text = path.read_text(encoding="ascii").strip()
     except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        reason = error.strerror if isinstance(error, OSError) else "it is not text"
         raise DataError(f"{path}: no key can be read: {reason}") from error
     try:
         key = bytes.fromhex(text)
@@ -120,9 +120,9 @@ def read_key(path: Path) -> bytes:
 
 
 class SeenCounters:
-    """Each node's newest counter in a file beside the key, so that a restarted host knows them.
+    """Stores each node's newest counter in a file beside the key, for the next start of the host.
 
-    Without it, what was recorded before could be sent again to a host that has just begun.
+    Without it, recorded frames could be sent again to a host that has just started.
     """
 
     EVERY_S = 5.0
@@ -134,11 +134,11 @@ class SeenCounters:
 
     @classmethod
     def beside(cls, key_file: Path) -> SeenCounters:
-        """The one that belongs to a key file."""
+        """Return the counters that belong to a key file."""
         return cls(key_file.with_name(key_file.name + ".seen"))
 
     def load(self) -> dict[int, int]:
-        """Node to newest counter; nothing where there is no file. DataError where it is damaged."""
+        """Return node to newest counter, empty without a file; DataError where it is damaged."""
         try:
             values = json.loads(self.path.read_text(encoding="ascii"))
             self._saved = {int(node): int(counter) for node, counter in values.items()}
@@ -146,13 +146,13 @@ class SeenCounters:
             return {}
         except (OSError, ValueError, AttributeError, TypeError) as error:
             raise DataError(
-                f"{self.path}: not the counters of a team: delete it, and old frames can be sent "
-                "again until each node has been heard"
+                f"{self.path}: not a counter file: delete it; until each node has been heard, "
+                "old frames can then be sent again"
             ) from error
         return dict(self._saved)
 
     def save(self, newest: Mapping[int, int], now_s: float, *, at_once: bool = False) -> None:
-        """Write what has grown, at most every few seconds. DataError where that fails."""
+        """Write counters that have grown, at most every few seconds; DataError where that fails."""
         if newest == self._saved or not (at_once or now_s - self._saved_s >= self.EVERY_S):
             return
         merged = dict(self._saved)

@@ -1,4 +1,4 @@
-"""A node's clock seen from the host: the one place where node time becomes host time.
+"""A node's clock seen from the host: the only place where node time becomes host time.
 
 A frame stamped ``node_s`` arrives at ``arrival_s = offset + (1 + drift) node_s + delay`` with a
 delay that is never negative and often small. The line under all points that lies closest to them
@@ -19,9 +19,9 @@ DRIFT_LIMIT = 0.006
 WINDOW_S = 300.0
 """History kept: long enough that 20 ms of jitter leaves 0.1 ms/s of drift error, short enough to
 follow a resonator that warms up against the body."""
-MOST_POINTS = 512
-LEAST_SPAN_S = 20.0
-"""Below this span the delays say more than the drift: a clock without drift is assumed."""
+MAX_POINTS = 512
+MIN_SPAN_S = 20.0
+"""Below this span the delays outweigh the drift: the clock is assumed to have none."""
 CLOCK_MODULUS_S = 4294967.296
 """The wire's node time counts milliseconds in 32 bits."""
 
@@ -30,14 +30,14 @@ CLOCK_MODULUS_S = 4294967.296
 class NodeClock:
     """Maps the node time of one node, of one boot, to host time."""
 
-    _points: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=MOST_POINTS))
+    _points: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=MAX_POINTS))
     _offset_s: float = 0.0
     _drift: float = 0.0
     _reference_s: float = 0.0
     _newest_s: float | None = None
 
     def unwrap(self, node_s: float) -> float:
-        """Node time without its 32-bit wrap, nearest to the newest seen (49.7 days apart)."""
+        """Return node time without its 32-bit wrap (49.7 days), nearest to the newest seen."""
         if self._newest_s is None:
             return node_s
         ahead = (node_s - self._newest_s) % CLOCK_MODULUS_S
@@ -46,7 +46,7 @@ class NodeClock:
         return self._newest_s + ahead
 
     def observe(self, node_s: float, arrival_s: float) -> None:
-        """A frame stamped ``node_s`` (wrapped) arrived at ``arrival_s`` on the host's clock."""
+        """Add a frame stamped ``node_s`` (wrapped) that arrived at ``arrival_s`` (host clock)."""
         unwrapped_s = self.unwrap(node_s)
         if self._newest_s is None or unwrapped_s > self._newest_s:
             self._newest_s = unwrapped_s
@@ -56,7 +56,7 @@ class NodeClock:
         self._fit()
 
     def to_host_s(self, node_s: float) -> float:
-        """Host time of ``node_s`` (wrapped). Raises ValueError before the first observation."""
+        """Return the host time of ``node_s`` (wrapped); ValueError before the first observation."""
         if self._newest_s is None:
             raise ValueError("no frame of this node has arrived yet")
         unwrapped_s = self.unwrap(node_s)
@@ -70,7 +70,7 @@ class NodeClock:
     def _fit(self) -> None:
         points = sorted(self._points)
         mean_s = sum(p[0] for p in points) / len(points)
-        if points[-1][0] - points[0][0] < LEAST_SPAN_S:
+        if points[-1][0] - points[0][0] < MIN_SPAN_S:
             self._set(mean_s, 0.0, points)
             return
         left, right = _edge_below(_lower_hull(points), mean_s)

@@ -1,6 +1,6 @@
 """Frames of all nodes to observations: running totals to motion, node clocks to host time.
 
-Sans I/O: bytes and their arrival times go in, observations come out. A frame is verified whole
+Sans I/O: bytes and their arrival times go in, observations come out. A frame is verified completely
 (magic, version, length, CRC, tag, layout, ranges, counter) before anything is changed by it.
 """
 
@@ -21,23 +21,23 @@ MAGNETIC_SIGMA_RAD = math.radians(25.0)
 """Indoor magnetic heading, one sample (the dead-reckoning filter weighs it alike)."""
 UNSEEN_SPEED_M_S = 1.5
 UNSEEN_TURN_RAD_S_SQRT = 0.5
-"""What a wearer may have done while the node restarted: brisk walking (Bohannon 1997: 1.3 to
+"""Possible motion of a wearer while the node restarts: brisk walking (Bohannon 1997: 1.3 to
 1.5 m/s), and turning as a random walk that loses the heading after some ten seconds."""
-MOST_KEPT = 10_000
-"""Answers and raw samples that nobody fetches are forgotten: half an hour of one node's samples."""
+MAX_KEPT = 10_000
+"""Answers and raw samples stored until they are fetched: half an hour of one node's samples."""
 FOREIGN_BEFORE_REMARK = 5
-"""Frames under another key before it is told, where none is heard under this one."""
+"""Frames under another key before a remark, while none arrives under this one."""
 REPLAYS_BEFORE_REMARK = 5
-"""A frame or two of that kind may be an echo; a node that does nothing else has forgotten."""
+"""One or two such frames may be an echo; more mean that the node has lost its counter."""
 
 
 DOWN = (wire.COMMAND, wire.BEACON, wire.NEW_KEY)
-"""What only a host sends."""
+"""Messages that only a host sends."""
 
 
 @dataclass
 class NodeTrack:
-    """What the host remembers of one node between two frames."""
+    """State of one node between two frames."""
 
     boot: int
     clock: NodeClock = field(default_factory=NodeClock)
@@ -49,7 +49,7 @@ class NodeTrack:
     rssi_dbm: int | None = None
     unseen_s: float = 0.0
     height_m: float = 0.0
-    """Told last, over where the node was first heard of: a restart begins at 0 again."""
+    """Newest height over the node's first; a restarted node begins at 0 again."""
     restart_height_m: float = 0.0
     counts: Counter[str] = field(default_factory=Counter)
 
@@ -68,15 +68,15 @@ class Acknowledged:
 class Decoder:
     """Frames in, observations out; one instance for the whole team.
 
-    ``remarks`` grows by what the user should be told, once each: nodes of a foreign version.
+    ``remarks`` collects messages for the user, once each, such as nodes of another version.
     ``acknowledged`` and ``raw_samples`` hold the newest answers and raw samples.
     ``counts`` holds every rejected frame by its reason, ``nodes`` each node's own counts:
     ``received``, ``lost``, ``duplicate``, ``replayed``, ``late_motion``, ``restarts``.
 
-    ``keys``: a frame is taken whose tag fits one of them (two while a node's key is changed).
-    ``newest_counters``: of each node, from an earlier session; nothing up to it is taken.
-    ``range_offsets_m`` holds each node's share of its ranges' offset as its status tells it; ranges
-    come out without both ends' shares.
+    ``keys``: a frame is accepted whose tag fits one of them (two while a node's key changes).
+    ``newest_counters``: of each node, from an earlier session; frames up to it are rejected.
+    ``range_offsets_m`` holds each node's range offset from its status; ranges come out with both
+    ends' offsets subtracted.
     """
 
     def __init__(
@@ -92,11 +92,11 @@ class Decoder:
         self.counts: Counter[str] = Counter()
         self.foreign_versions: dict[int, int] = {}
         self.remarks: list[str] = []
-        self.acknowledged: deque[Acknowledged] = deque(maxlen=MOST_KEPT)
-        self.raw_samples: deque[RawSample] = deque(maxlen=MOST_KEPT)
+        self.acknowledged: deque[Acknowledged] = deque(maxlen=MAX_KEPT)
+        self.raw_samples: deque[RawSample] = deque(maxlen=MAX_KEPT)
 
     def feed(self, data: bytes, arrival_s: float, rssi_dbm: int | None = None) -> list[Observation]:
-        """Observations of one frame that arrived at ``arrival_s`` (host clock, seconds)."""
+        """Return the observations of one frame that arrived at ``arrival_s`` of the host clock."""
         try:
             frame = self._open(data)
         except wire.ForeignVersionError as error:
@@ -110,8 +110,8 @@ class Decoder:
             foreign = isinstance(error, wire.FrameTagError) and not self.nodes
             if foreign and self.counts["FrameTagError"] == FOREIGN_BEFORE_REMARK:
                 self.remarks.append(
-                    "frames under another key are refused: give the team's with --key-file, or "
-                    "they are another team's"
+                    "frames under another key are rejected: give the team's key with --key-file, "
+                    "or they are another team's"
                 )
             return []
         if frame.node in (wire.COORDINATOR, wire.BROADCAST) or frame.message in DOWN:
@@ -166,8 +166,8 @@ class Decoder:
     def _raw(self, node: int, track: NodeTrack, values: Mapping[str, Any]) -> RawSample:
         count = values["samples"]
 
-        def vector(name: str, unit: str, share: float) -> tuple[float, float, float]:
-            x, y, z = (values[f"{name}_{axis}_{unit}"] * share for axis in "xyz")
+        def vector(name: str, unit: str, factor: float) -> tuple[float, float, float]:
+            x, y, z = (values[f"{name}_{axis}_{unit}"] * factor for axis in "xyz")
             return x, y, z
 
         return RawSample(
@@ -188,7 +188,7 @@ class Decoder:
         return wire.decode(data, self.keys[-1])
 
     def _ranges(self, node: int, track: NodeTrack, values: Mapping[str, Any]) -> list[Observation]:
-        """Ranges without what both ends' antenna delays make them too long."""
+        """Return ranges with both ends' offsets, from their antenna delays, subtracted."""
         ranges: list[Observation] = []
         for entry in values["ranges"]:
             offset_m = sum(self.range_offsets_m.get(end, 0.0) for end in (node, entry["peer"]))
@@ -201,23 +201,23 @@ class Decoder:
         return ranges
 
     def _track(self, frame: wire.Frame, arrival_s: float) -> NodeTrack | None:
-        """The node's track if the frame is new, after booking its counter; else ``None``."""
+        """Return the node's track and store the counter if the frame is new; else None."""
         track = self.nodes.get(frame.node)
         if track is None:
             track = NodeTrack(frame.boot, arrival_s=arrival_s)
             if frame.node in self._newest_counters:
                 track.window = CounterWindow.after(self._newest_counters[frame.node])
         window = track.window
-        verdict = window.judge(frame.counter)
+        verdict = window.check(frame.counter)
         if verdict in (Verdict.DUPLICATE, Verdict.REPLAYED):
-            self._refuse(frame.node, track, verdict)
+            self._count_rejected(frame.node, track, verdict)
             return None
         if frame.boot != track.boot and verdict is Verdict.LATE:
             track.counts["stale_boot"] += 1
             return None
         if frame.boot != track.boot and track.heard:
-            # Totals, clock and height of the node begin anew; only its counter, counts and pose
-            # go on, and its height from the last one told: people do not fly while it restarts.
+            # Totals, clock and height restart; counter, counts and pose go on. The height goes on
+            # from the last one: the wearer does not fly while the node restarts.
             unseen_s = arrival_s - track.arrival_s if track.totals is not None else 0.0
             track = NodeTrack(
                 frame.boot,
@@ -237,20 +237,20 @@ class Decoder:
             track.counts["lost"] += frame.counter - window.newest - 1
         self.nodes[frame.node] = track
         track.heard = True
-        window.take(frame.counter)
+        window.add(frame.counter)
         track.counts["received"] += 1
         return track
 
-    def _refuse(self, node: int, track: NodeTrack, verdict: Verdict) -> None:
+    def _count_rejected(self, node: int, track: NodeTrack, verdict: Verdict) -> None:
         track.counts[verdict.value] += 1
-        # Of a node that was not heard since the start a "duplicate" is one of an earlier session.
+        # For a node not heard since the start, a "duplicate" is from an earlier session.
         if verdict is Verdict.DUPLICATE and track.heard:
             return
         self._replays[node] += 1
         if self._replays[node] == REPLAYS_BEFORE_REMARK:
             self.remarks.append(
-                f"node {node}: old frames are sent again, or its memory was erased (then begin "
-                "anew here: restart, without the key file's .seen)"
+                f"node {node}: old frames are sent again, or its memory was erased (then delete "
+                "the key file's .seen and restart)"
             )
 
     def _motion(self, node: int, track: NodeTrack, values: Mapping[str, Any]) -> list[Observation]:
@@ -302,7 +302,7 @@ class Decoder:
                 Heading(
                     time_s,
                     node,
-                    # A node counts from north; everybody else from x, which is east.
+                    # A node counts from north, everything else from x, which is east.
                     math.remainder(values["magnetic_heading_rad"] + 0.5 * math.pi, math.tau),
                     MAGNETIC_SIGMA_RAD,
                     "magnetic",
@@ -314,8 +314,8 @@ class Decoder:
         return observations
 
     def _link_status(self, node: int, track: NodeTrack, time_s: float) -> list[Observation]:
-        figures: dict[str, float] = {f"link_{name}": n for name, n in track.counts.items()}
-        figures["link_clock_drift"] = track.clock.drift
+        values: dict[str, float] = {f"link_{name}": n for name, n in track.counts.items()}
+        values["link_clock_drift"] = track.clock.drift
         if track.rssi_dbm is not None:
-            figures["link_rssi_dbm"] = track.rssi_dbm
-        return [Status(time_s, node, name, float(value)) for name, value in figures.items()]
+            values["link_rssi_dbm"] = track.rssi_dbm
+        return [Status(time_s, node, name, float(value)) for name, value in values.items()]

@@ -1,6 +1,6 @@
-"""One node in dialogue: commands that are repeated until they are answered, and what it tells.
+"""Commands to one node, repeated until it answers, and what it reports meanwhile.
 
-A command's token makes a repetition harmless: the node answers it again and does nothing twice.
+A command's token makes repetition harmless: the node answers it again and executes it once.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import serial
 
 from relpos.calibration.sensors import SensorCalibration, checksum
 from relpos.errors import DeviceError
-from relpos.link.decoder import MOST_KEPT, Acknowledged
+from relpos.link.decoder import MAX_KEPT, Acknowledged
 from relpos.link.port import Line, Link, observe
 from relpos.measurements import Observation, RawSample
 from relpos.protocol import messages as wire
@@ -31,16 +31,16 @@ BUSY_ATTEMPTS = 6
 SILENT_S = 6.0
 """A node that is on reports its motion every second."""
 IMPOSSIBLE = -(2**31)
-"""Out of every setting's range."""
+"""A value outside every setting's range."""
 RAW_REPORTS_PER_S = 5
-MOST_RAW_REPORTS = 3000
+MAX_RAW_REPORTS = 3000
 
 
 class NodeDialogue:
     """Talks to ``node`` over an open coordinator ``port``.
 
-    ``clock`` is that of :func:`relpos.link.port.observe`. What arrives is taken in while an answer
-    is waited for: raw samples collect in the link's decoder, running totals in its tracks.
+    ``clock`` is that of :func:`relpos.link.port.observe`. Frames that arrive during the wait for an
+    answer are processed: raw samples collect in the link's decoder, running totals in its tracks.
     """
 
     def __init__(
@@ -56,11 +56,11 @@ class NodeDialogue:
         self._batches = observe(port, self.link, clock)
         self._token = int(time.time() * 10) % 0xFF00
         self._answers: dict[int, Acknowledged] = {}
-        self.observations: deque[Observation] = deque(maxlen=MOST_KEPT)
-        """The newest of all nodes, for who is interested; nobody has to fetch them."""
+        self.observations: deque[Observation] = deque(maxlen=MAX_KEPT)
+        """The newest observations of all nodes."""
 
     def listen(self) -> None:
-        """Take in what has arrived, or wait a moment for it. DeviceError where the port is gone."""
+        """Process what has arrived, or wait a moment for it; DeviceError where the port is gone."""
         self.observations.extend(next(self._batches))
         acknowledged = self.link.decoder.acknowledged
         while acknowledged:
@@ -69,19 +69,19 @@ class NodeDialogue:
                 self._answers[answer.token] = answer
 
     def totals(self) -> Mapping[str, Any] | None:
-        """Values (SI) of the node's newest motion message; None before the first."""
+        """Return the values (SI) of the node's newest motion message; None before the first."""
         track = self.link.decoder.nodes.get(self.node)
         return None if track is None else track.totals
 
     def boot(self) -> int | None:
-        """The node's boot counter; None before its first frame."""
+        """Return the node's boot counter; None before its first frame."""
         track = self.link.decoder.nodes.get(self.node)
         return None if track is None else track.boot
 
     def command(self, code: wire.CommandCode, value: int) -> Acknowledged:
-        """Send, repeat until it is answered, return the answer; a busy node is asked again.
+        """Send a command, repeat it until the node answers, and return the answer.
 
-        DeviceError where the node does not answer at all.
+        A busy node is asked again. DeviceError where the node does not answer.
         """
         for _ in range(BUSY_ATTEMPTS):
             answer = self._ask(code, value)
@@ -100,8 +100,8 @@ class NodeDialogue:
             if answer is not None:
                 return answer
         raise DeviceError(
-            f"node {self.node} does not answer {code.name}: is it switched on, in reach, its "
-            f"number {self.node}, and this its key?" + self._heard()
+            f"node {self.node} does not answer {code.name}: is it switched on and in reach, is its "
+            f"number {self.node}, and is the key right?" + self._heard()
         )
 
     def _next_token(self) -> int:
@@ -109,7 +109,7 @@ class NodeDialogue:
         return self._token
 
     def _send(self, token: int, data: bytes, wait_s: float = ANSWER_S) -> Acknowledged | None:
-        """Send once; the answer, or None where none comes in time."""
+        """Send once; return the answer, or None where none comes in time."""
         try:
             self._port.write(data)
         except (serial.SerialException, OSError) as error:
@@ -127,7 +127,7 @@ class NodeDialogue:
         return f" Heard: node {', '.join(map(str, others))}" if others else ""
 
     def demand(self, code: wire.CommandCode, value: int) -> int:
-        """Value in force after a command that has to be done. DeviceError where it is not."""
+        """Return the value in force after a command; DeviceError where the node refuses it."""
         answer = self.command(code, value)
         if answer.result != wire.CommandResult.DONE:
             raise DeviceError(
@@ -137,38 +137,35 @@ class NodeDialogue:
         return answer.value
 
     def setting(self, code: wire.CommandCode) -> int:
-        """Value of a setting: an impossible one changes nothing and brings it."""
+        """Return the value of a setting, by setting an impossible one, which changes nothing."""
         answer = self.command(code, IMPOSSIBLE)
         if answer.result != wire.CommandResult.OUT_OF_RANGE:
             raise DeviceError(f"node {self.node} does not know {code.name}")
         return answer.value
 
     def restart(self) -> int:
-        """Restart the node and wait for it; returns its new boot counter. DeviceError in vain."""
+        """Restart the node and return its new boot counter; DeviceError if it stays silent."""
         boot = self.boot()
         self.demand(wire.CommandCode.REBOOT, 0)
         if not self._restarted(boot):
             raise DeviceError(
-                f"node {self.node} took the command but was not heard restarting: switch it off "
-                "and on"
+                f"node {self.node} took the command but was not heard again: switch it off and on"
             )
         new_boot = self.boot()
         assert new_boot is not None
         return new_boot
 
-    # -- who it is, and whose ---------------------------------------------------------------------
+    # -- number, defaults, key --------------------------------------------------------------------
 
     def set_node_id(self, node: int) -> None:
-        """Give the node another number; it restarts with it, and the dialogue goes on with it.
+        """Give the node another number; it restarts, and the dialogue goes on under that number.
 
-        DeviceError where that number is heard already, or the node is not heard by it.
+        DeviceError where that number is in use, or the node is not heard under it.
         """
         if node == self.node:
             return
-        if node in self.link.decoder.nodes or self._somebody_is(node):
-            raise DeviceError(
-                f"there is a node {node} already: two of one number confuse everybody"
-            )
+        if node in self.link.decoder.nodes or self._is_in_use(node):
+            raise DeviceError(f"there is a node {node} already: numbers must differ")
         self.demand(wire.CommandCode.SET_NODE_ID, node)
         before, self.node = self.node, node
         until_s = time.monotonic() + SILENT_S
@@ -180,8 +177,8 @@ class NodeDialogue:
                 "and on"
             )
 
-    def _somebody_is(self, node: int) -> bool:
-        """Whether a node of that number answers."""
+    def _is_in_use(self, node: int) -> bool:
+        """Return whether a node of that number answers."""
         own, self.node = self.node, node
         try:
             return any(self._answers_under_present_key() for _ in range(ADDRESSED_ATTEMPTS))
@@ -189,17 +186,16 @@ class NodeDialogue:
             self.node = own
 
     def restore_defaults(self) -> None:
-        """Everything but number and key as in a new node; it restarts. DeviceError in vain."""
+        """Reset all but number and key; the node restarts. DeviceError if it stays silent."""
         boot = self.boot()
         self.demand(wire.CommandCode.RESTORE_DEFAULTS, 0)
         if not self._restarted(boot):
-            raise DeviceError(f"node {self.node} was not heard restarting: switch it off and on")
+            raise DeviceError(f"node {self.node} was not heard again: switch it off and on")
 
     def set_key(self, key: bytes) -> bool:
-        """Give the node this key in place of the dialogue's; False where it had it already.
+        """Give the node this key in place of the dialogue's; return False where it had it already.
 
-        From then on the dialogue speaks under the new key. DeviceError where the node answers under
-        neither.
+        The dialogue then uses the new key. DeviceError where the node answers under neither.
         """
         old = self.link.key
         if key == old:
@@ -214,7 +210,7 @@ class NodeDialogue:
             self.link.accept_keys(old, key)
             _, data = self.link.new_key(self.node, key, token=token)
             answer = self._send(token, data)
-            # It answers under the new key; where that answer is lost, the old key is gone for good.
+            # It answers under the new key, also where that answer is lost: the old key is gone.
             self.link.accept_keys(key, old)
             if answer is not None or self._answers_under_present_key():
                 self.link.accept_keys(key)
@@ -233,7 +229,7 @@ class NodeDialogue:
         return self._send(token, data) is not None
 
     def _restarted(self, boot: int | None) -> bool:
-        """Wait until the node is heard with another boot; whether it was."""
+        """Wait until the node is heard with another boot; return whether it was."""
         until_s = time.monotonic() + SILENT_S
         while self.boot() == boot and time.monotonic() < until_s:
             self.listen()
@@ -241,13 +237,13 @@ class NodeDialogue:
 
     # -- raw samples ------------------------------------------------------------------------------
 
-    def raw_samples(self, most_s: float) -> Iterator[RawSample | None]:
-        """Raw samples as they arrive, for at most ``most_s`` of reports; None after each silence.
+    def raw_samples(self, max_s: float) -> Iterator[RawSample | None]:
+        """Yield raw samples for at most ``max_s`` of reports, and None after each silence.
 
-        Reports stop when the iteration is left or comes to its end. DeviceError where none comes,
-        or the node's sensor is silent.
+        Reports stop when the iteration ends. DeviceError where none arrives, or the node's sensor
+        is silent.
         """
-        reports = min(round(most_s * RAW_REPORTS_PER_S), MOST_RAW_REPORTS)
+        reports = min(round(max_s * RAW_REPORTS_PER_S), MAX_RAW_REPORTS)
         self.link.decoder.raw_samples.clear()
         self.demand(wire.CommandCode.SET_RAW_REPORTS, reports)
         heard_s = time.monotonic()
@@ -277,7 +273,7 @@ class NodeDialogue:
                             f"node {self.node}: its inertial sensor is silent (wiring, supply)"
                         )
                     yield sample
-                    if sample.time_s - first_s >= most_s:
+                    if sample.time_s - first_s >= max_s:
                         return
         finally:
             self.command(wire.CommandCode.SET_RAW_REPORTS, 0)
@@ -285,7 +281,7 @@ class NodeDialogue:
     # -- calibration ------------------------------------------------------------------------------
 
     def read_calibration(self) -> SensorCalibration:
-        """What is in force on the node."""
+        """Return the calibration in force on the node."""
         return SensorCalibration.from_words(
             [
                 self.demand(wire.CommandCode.READ_CALIBRATION, index << 16)
@@ -296,7 +292,7 @@ class NodeDialogue:
     def write_calibration(self, calibration: SensorCalibration) -> None:
         """Store a calibration, wait until the node has restarted with it, and read it back.
 
-        DataError where it does not fit a node, DeviceError where it does not arrive there whole.
+        DataError where it does not fit a node, DeviceError where it does not read back.
         """
         words = calibration.to_words()
         for index, word in enumerate(words):
@@ -305,19 +301,19 @@ class NodeDialogue:
         self.demand(wire.CommandCode.COMMIT_CALIBRATION, checksum(words))
         if not self._restarted(boot):
             raise DeviceError(
-                f"node {self.node} took the calibration but was not heard restarting with it: "
+                f"node {self.node} took the calibration but was not heard again: "
                 "switch it off and on"
             )
         if self.read_calibration().to_words() != words:
             raise DeviceError(
-                f"node {self.node} does not show the calibration that it was given: its memory "
+                f"node {self.node} reads back another calibration than was written: its memory "
                 "may be worn out; calibrate again"
             )
 
     # -- steps ------------------------------------------------------------------------------------
 
     def set_step_gain(self, gain_permille: int) -> None:
-        """Set the step gain and see that it is in force."""
+        """Set the step gain; DeviceError where another one is in force afterwards."""
         in_force = self.demand(wire.CommandCode.SET_STEP_GAIN_PERMILLE, gain_permille)
         if in_force != gain_permille:
             raise DeviceError(
@@ -327,9 +323,9 @@ class NodeDialogue:
 
 
 def open_dialogue(port: Line, node: int | None, link: Link | None = None) -> NodeDialogue:
-    """A dialogue with the node that is asked for, or with the only one that is heard.
+    """Return a dialogue with ``node``, or with the only node that is heard.
 
-    DeviceError where that node is not heard, or none or several are and none was asked for.
+    DeviceError where it is not heard, or where none or several are heard without ``node``.
     """
     dialogue = NodeDialogue(port, node or 0, link)
     started_s = time.monotonic()
@@ -340,13 +336,13 @@ def open_dialogue(port: Line, node: int | None, link: Link | None = None) -> Nod
             return dialogue
         if node is None and decoder.nodes and waited_s > SILENT_S / 2:
             break
-    heard = ", ".join(map(str, sorted(decoder.nodes))) or "nobody"
+    heard = ", ".join(map(str, sorted(decoder.nodes))) or "none"
     foreign = decoder.counts["FrameTagError"]
     if foreign:
         heard += f", and {foreign} frames under another key (give the team's with --key-file)"
     if node is not None:
         raise DeviceError(f"node {node} is not heard on this port; heard: {heard}")
     if len(decoder.nodes) != 1:
-        raise DeviceError(f"which node? Heard: {heard}. Say it with --node")
+        raise DeviceError(f"which node? Heard: {heard}. Choose one with --node")
     dialogue.node = next(iter(decoder.nodes))
     return dialogue

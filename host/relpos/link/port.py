@@ -1,4 +1,4 @@
-"""The serial port side of the link: an XBee coordinator in, observations out, commands back."""
+"""The link of one coordinator, and its serial port: bytes in, observations out, commands back."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from relpos.protocol.schema import Message
 BAUD = 38_400
 """0.2 % off on the ATmega at 16 MHz, where 115200 is 2.1 % off; the coordinator uses the same."""
 READ_TIMEOUT_S = 0.05
-"""Longest wait for bytes: bounds how late silence is noticed."""
+"""Longest wait for bytes; bounds the delay with which silence is noticed."""
 READ_BYTES = 4096
 
 
 class Line(Protocol):
-    """What is needed of a port: pyserial's, or a node's cable in its place."""
+    """A port as the link uses it: pyserial's, or a node's cable in its place."""
 
     @property
     def port(self) -> str | None:
@@ -34,7 +34,7 @@ class Line(Protocol):
 
     @property
     def in_waiting(self) -> int:
-        """Bytes that are there."""
+        """Number of bytes that are there."""
 
     def read(self, size: int = 1) -> bytes:
         """At most ``size`` bytes; fewer after a timeout."""
@@ -44,10 +44,10 @@ class Line(Protocol):
 
 
 class Link:
-    """XBee bytes to observations, and commands to bytes: no I/O of its own.
+    """XBee bytes to observations, and commands to bytes; without I/O.
 
-    ``key`` is the team's. ``counter`` is of what is sent, ``newest_counters`` of what was received
-    in an earlier session (see :mod:`relpos.link.authentication`).
+    ``key`` is the team's. ``counter`` counts sent frames, ``newest_counters`` are the nodes' from
+    an earlier session (see :mod:`relpos.link.authentication`).
     """
 
     def __init__(
@@ -68,13 +68,13 @@ class Link:
         self._virtual_s: float | None = None
 
     def newest_counters(self) -> dict[int, int]:
-        """Of each node that was heard, for the next session."""
+        """Return the newest counter of each node heard, for the next session."""
         return {n: track.window.newest for n, track in self.decoder.nodes.items() if track.heard}
 
     def feed(self, data: bytes, arrival_s: float) -> list[Observation]:
-        """Observations completed by ``data``, whose last byte arrived at ``arrival_s``.
+        """Return the observations completed by ``data``, whose last byte arrived at ``arrival_s``.
 
-        An emulated team's own frames of virtual time overrule ``arrival_s`` from then on.
+        Virtual time frames of an emulated team replace ``arrival_s`` from then on.
         """
         observations: list[Observation] = []
         for frame in self.parser.feed(data):
@@ -99,17 +99,17 @@ class Link:
         token: int | None = None,
         broadcast: bool = False,
     ) -> tuple[int, bytes]:
-        """Token and serial bytes of a command; the same token again repeats, not re-does, it.
+        """Return token and serial bytes of a command; a node executes one token once.
 
-        ``broadcast`` sends it to every radio module, whatever the node's has for an address; only
-        the node obeys.
+        ``broadcast`` sends it to every radio module, for a node whose module has another address;
+        only that node obeys.
         """
         token = self.next_token() if token is None else token
         values = {"token": token, "command": code, "value": value}
         return token, self.frame(wire.COMMAND, node, values, broadcast=broadcast)
 
     def new_key(self, node: int, key: bytes, *, token: int | None = None) -> tuple[int, bytes]:
-        """Token and serial bytes that give ``node`` another ``key``, hidden under the present one.
+        """Return token and serial bytes that give ``node`` a new ``key``, masked by the old one.
 
         The node answers under the new key: see :meth:`accept_keys`.
         """
@@ -123,14 +123,14 @@ class Link:
         return token, self._sealed(wire.NEW_KEY, node, counter, {"token": token} | words, False)
 
     def accept_keys(self, *keys: bytes) -> None:
-        """Send under the first key from now on, and take frames under any of them."""
+        """Send under the first key from now on, and accept frames under any of them."""
         self.key = keys[0]
         self.decoder.keys = keys
 
     def frame(
         self, message: Message, node: int, values: Mapping[str, Any], *, broadcast: bool = False
     ) -> bytes:
-        """Serial bytes of a message down; ``broadcast``: see :meth:`command`."""
+        """Return the serial bytes of a message to ``node``; ``broadcast``: see :meth:`command`."""
         return self._sealed(message, node, self._counter.next(), values, broadcast)
 
     def _sealed(
@@ -141,34 +141,34 @@ class Link:
         return xbee.encode(xbee.Transmit16(0, address, data), escaped=self._escaped)
 
     def next_token(self) -> int:
-        """A token that the last 65,534 commands did not have."""
+        """Return a token that the last 65,534 commands did not have."""
         self._token = self._token % 0xFFFF + 1
         return self._token
 
     @property
     def virtual_s(self) -> float | None:
-        """Virtual time of an emulated team that marks it; None for a real one."""
+        """Virtual time of an emulated team that marks it; None for a real team."""
         return self._virtual_s
 
     def summary(self) -> dict[str, float]:
-        """Counts of the whole link, for the user: frames, losses, rejections."""
-        figures: dict[str, float] = dict(self.decoder.counts)
-        counts = self.parser.counts
-        figures |= {
-            "frames": counts.frames,
-            "bad_checksums": counts.bad_checksums,
-            "bad_lengths": counts.bad_lengths,
-            "broken_off": counts.broken_off,
-            "skipped_bytes": counts.skipped_bytes,
+        """Return the counts of the whole link: frames, losses, rejections."""
+        counters: dict[str, float] = dict(self.decoder.counts)
+        parsed = self.parser.counts
+        counters |= {
+            "frames": parsed.frames,
+            "bad_checksums": parsed.bad_checksums,
+            "bad_lengths": parsed.bad_lengths,
+            "broken_off": parsed.broken_off,
+            "skipped_bytes": parsed.skipped_bytes,
         }
         for track in self.decoder.nodes.values():
             for name, count in track.counts.items():
-                figures[name] = figures.get(name, 0) + count
-        return figures
+                counters[name] = counters.get(name, 0) + count
+        return counters
 
 
 def check_port(port: str) -> None:
-    """Raise DeviceError where there is no such port; it is not opened, and nobody is disturbed."""
+    """Raise DeviceError where there is no such port, without opening it."""
     try:
         serial.serial_for_url(port, do_not_open=True)
     except (serial.SerialException, OSError, ValueError) as error:
@@ -178,12 +178,9 @@ def check_port(port: str) -> None:
 
 
 def open_port(port: str, baud: int = BAUD) -> serial.Serial:
-    """The serial port (or pyserial URL) ``port``, for this program alone.
-
-    Raises DeviceError with the reason.
-    """
+    """Open the serial port (or pyserial URL) ``port`` exclusively; DeviceError with the reason."""
     try:
-        # Two programs at one port would each get some of the bytes, and neither would know.
+        # Two programs at one port would each get some of the bytes without noticing.
         device: serial.Serial = serial.serial_for_url(
             port, baudrate=baud, timeout=READ_TIMEOUT_S, exclusive=True
         )
@@ -198,7 +195,7 @@ def _cannot_open(port: str, error: Exception) -> DeviceError:
 
 
 def send(device: Line, data: bytes) -> None:
-    """Write ``data``, if there is any. DeviceError when the port has vanished."""
+    """Write ``data``, if there is any; DeviceError where the port has vanished."""
     if not data:
         return
     try:
@@ -208,7 +205,7 @@ def send(device: Line, data: bytes) -> None:
 
 
 def vanished(device: Line, error: Exception) -> DeviceError:
-    """What to raise where a port that was open fails."""
+    """Return the error for an open port that fails."""
     return DeviceError(f"{device.port}: the port vanished: {_reason(error)}")
 
 
@@ -225,10 +222,10 @@ def observe(
     link: Link,
     clock: Callable[[], float] | None = None,
 ) -> Iterator[list[Observation]]:
-    """Lists of observations as they arrive, an empty one after each silent READ_TIMEOUT_S.
+    """Yield lists of observations as they arrive, an empty one after each silent READ_TIMEOUT_S.
 
     ``clock`` gives the host's time in seconds (default: monotonic, from 0 at the first call).
-    Raises DeviceError when the port vanishes; all that came before has been yielded.
+    DeviceError when the port vanishes, after everything received before has been yielded.
     """
     if clock is None:
         start_s = time.monotonic()

@@ -1,11 +1,11 @@
-"""Step lengths that the ranges have taught, sent back to the nodes as step gains.
+"""Sends step scales that an estimator has learned from ranges to the nodes, as step gains.
 
-A node's step length is proportional to its gain (docs/deadreckoning.md); an estimator that learns
-``step_scale`` (true over reported length) knows what to multiply it with. A change is seen in
-the motion's ``gain_version``, from which on an estimator learns anew.
+A node's step length is proportional to its gain (docs/deadreckoning.md). An estimator that learns
+``step_scale`` (true over reported length) gives the factor. The motion's ``gain_version`` marks a
+change, after which the estimator learns again.
 
-Pure: bytes out, answers in, the time is an argument. Nothing waits: a command is repeated with its
-token until it is answered, between everything else that the port has to do.
+Pure: bytes out, answers in, the time is an argument. Nothing blocks: a command is repeated with its
+token until it is answered, between the port's other traffic.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from relpos.calibration.steps import MOST_CHANGE, scaled_gain_permille
+from relpos.calibration.steps import MAX_CHANGE, scaled_gain_permille
 from relpos.errors import DataError
 from relpos.protocol import messages as wire
 
@@ -26,20 +26,20 @@ WORTH_SENDING = 0.03
 """Least relative change: one walk repeats to 5 % in the same person, and each change is a write to
 the node's EEPROM."""
 KNOWN_WELL = 0.025
-"""Largest standard deviation of a scale that is sent: the estimator goes on with what is left."""
+"""Largest standard deviation of a scale that is sent; the estimator learns the remainder."""
 AGAIN_AFTER_S = 120.0
-"""Until the next change of the same node, in measurement time: an estimator has begun anew."""
+"""Until the next change of the same node, in measurement time: the estimator learns again."""
 REPEAT_S = 1.0
 """A full frame each way takes 50 ms, storing the settings on the node 0.4 s."""
 ATTEMPTS = 14
-"""As in a dialogue: where half of all frames are lost, all fail once in a thousand times."""
+"""As in a dialogue: at 50 % loss all attempts fail once in a thousand times."""
 IMPOSSIBLE = -(2**31)
 """Out of the setting's range: changes nothing, and the answer brings the gain in force."""
 
 
 @dataclass(slots=True)
 class _GainChange:
-    """First the gain in force is asked for, then the new one is set."""
+    """A dialogue that reads the gain in force, then sets the new one."""
 
     scale: float
     token: int
@@ -49,7 +49,7 @@ class _GainChange:
 
 
 class StepScaleSender:
-    """Tells nodes their learned step scales over ``link``; ``remarks`` is what a user may hear."""
+    """Sends learned step scales to nodes over ``link``; ``remarks`` are messages for the user."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
@@ -57,23 +57,23 @@ class StepScaleSender:
         self._settled_s: dict[int, float] = {}
         self.remarks: list[str] = []
         self.sent = 0
-        """Gains that are in force on a node now because of what was learned."""
+        """Number of learned gains that nodes have confirmed."""
 
     def learn(self, node: int, scale: float, sigma: float, time_s: float) -> None:
-        """Take a node's learned step scale; begin a dialogue where it is worth one."""
+        """Begin to send a node's learned step scale, if the change is large and certain enough."""
         if node in self._changes:
             return
         if time_s < self._settled_s.get(node, -math.inf) + AGAIN_AFTER_S:
             return
-        # Beyond that it was not the wearer's step that was learned.
-        if not 1.0 / MOST_CHANGE <= scale <= MOST_CHANGE:
+        # A larger change is not the wearer's step.
+        if not 1.0 / MAX_CHANGE <= scale <= MAX_CHANGE:
             return
         if sigma <= KNOWN_WELL and abs(math.log(scale)) >= WORTH_SENDING:
             self._changes[node] = _GainChange(scale, self._link.next_token())
             self._settled_s[node] = time_s
 
     def due(self, now_s: float) -> bytes:
-        """Bytes for the coordinator's port now, of any clock that does not go back."""
+        """Return bytes due for the coordinator's port, by any clock that does not go back."""
         data = b""
         for node, change in list(self._changes.items()):
             if now_s < change.next_s:
@@ -81,13 +81,13 @@ class StepScaleSender:
             if change.attempts >= ATTEMPTS:
                 del self._changes[node]
                 self.remarks.append(
-                    f"node {node} does not answer: it keeps its step length, which the ranges say "
-                    f"is to be multiplied by {change.scale:.3f}"
+                    f"node {node}: no answer, step gain not changed "
+                    f"(x{change.scale:.3f}, learned from ranges)"
                 )
                 continue
             change.attempts += 1
             change.next_s = now_s + REPEAT_S
-            # A node whose radio module has another address hears only what is sent to everybody.
+            # A node whose radio module has another address hears only broadcasts.
             data += self._link.command(
                 node,
                 wire.CommandCode.SET_STEP_GAIN_PERMILLE,
@@ -97,8 +97,8 @@ class StepScaleSender:
             )[1]
         return data
 
-    def take(self, answer: Acknowledged) -> None:
-        """Take a node's answer; answers to anybody else's commands are left alone."""
+    def handle(self, answer: Acknowledged) -> None:
+        """Process a node's answer; answers to other commands are ignored."""
         change = self._changes.get(answer.node)
         if change is None or answer.token != change.token:
             return
@@ -106,7 +106,7 @@ class StepScaleSender:
             change.token, change.next_s = self._link.next_token(), -math.inf
             return
         if change.value == IMPOSSIBLE and answer.result == wire.CommandResult.OUT_OF_RANGE:
-            self._ask_for(answer.node, change, answer.value)
+            self._set_gain(answer.node, change, answer.value)
             return
         del self._changes[answer.node]
         if answer.result == wire.CommandResult.DONE and answer.value == change.value:
@@ -121,7 +121,7 @@ class StepScaleSender:
                 f"({answer.result.name.lower().replace('_', ' ')})"
             )
 
-    def _ask_for(self, node: int, change: _GainChange, before_permille: int) -> None:
+    def _set_gain(self, node: int, change: _GainChange, before_permille: int) -> None:
         try:
             gain = scaled_gain_permille(before_permille, change.scale)
         except DataError as error:

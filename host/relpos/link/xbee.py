@@ -1,7 +1,7 @@
 """XBee API frames, both ways: bytes to frames that resynchronise after garbage, and back.
 
 Layout and numbers are Digi's (802.15.4 and Zigbee/DigiMesh API frames; AP=1 plain, AP=2 escaped).
-Host and emulator both use this file; the tests hold it against the independent ``digi-xbee``.
+Host and emulator both use this file; the tests compare it with the independent ``digi-xbee``.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ DELIMITER = 0x7E
 ESCAPE = 0x7D
 ESCAPED = frozenset((0x7E, 0x7D, 0x11, 0x13))
 ESCAPE_XOR = 0x20
-MOST_FRAME_DATA = 128
-"""Longest frame data that any module we speak to sends: 116 bytes of RF data and 12 of header."""
+MAX_FRAME_DATA = 128
+"""Longest frame data of the supported modules: 116 bytes of RF data and 12 of header."""
 BROADCAST_16 = 0xFFFF
 VIRTUAL_TIME = 0xF0
-"""Frame by which an emulated team that does not run in real time tells the time of what follows:
+"""Frame by which an emulated team that does not run in real time marks the time of the next frames:
 8 bytes, microseconds. Digi's 802.15.4 modules have no frame of this type."""
 
 
@@ -127,7 +127,7 @@ class TransmitStatus:
 
 @dataclass(frozen=True, slots=True)
 class AtCommand:
-    """A command to the local module (0x08); without a value it asks for the present one."""
+    """A command to the local module (0x08); without a value it queries the present one."""
 
     kind: ClassVar[int] = 0x08
     frame_id: int
@@ -168,7 +168,7 @@ class AtResponse:
 
 @dataclass(frozen=True, slots=True)
 class ModemStatus:
-    """The local module tells an event (0x8A): 0 hardware reset, 1 watchdog reset, 2 associated."""
+    """An event of the local module (0x8A): 0 hardware reset, 1 watchdog reset, 2 associated."""
 
     kind: ClassVar[int] = 0x8A
     status: int
@@ -185,7 +185,7 @@ class ModemStatus:
 
 @dataclass(frozen=True, slots=True)
 class UnknownFrame:
-    """A frame of good checksum whose type we have no use for."""
+    """A frame with a good checksum and a type that is not used here."""
 
     type: int
     data: bytes
@@ -218,7 +218,7 @@ _KINDS = {
 
 
 def checksum(frame_data: bytes) -> int:
-    """What makes the sum of frame data and checksum 0xFF modulo 256."""
+    """Return the byte that makes the sum of frame data and checksum 0xFF modulo 256."""
     return 0xFF - (sum(frame_data) & 0xFF)
 
 
@@ -238,7 +238,7 @@ def encode(frame: ApiFrame, *, escaped: bool = True) -> bytes:
 
 
 def interpret(frame_data: bytes) -> ApiFrame:
-    """Frame data (type and body) of good checksum to a frame; unknown or short ones as such."""
+    """Return the frame in ``frame_data`` (type and body); UnknownFrame where unknown or short."""
     kind = _KINDS.get(frame_data[0])
     if kind is not None:
         try:
@@ -250,7 +250,7 @@ def interpret(frame_data: bytes) -> ApiFrame:
 
 @dataclass
 class ParserCounts:
-    """What the parser saw; every dropped byte is in ``skipped_bytes``."""
+    """Counts of a parser; ``skipped_bytes`` includes every dropped byte."""
 
     frames: int = 0
     bad_checksums: int = 0
@@ -261,7 +261,7 @@ class ParserCounts:
 
 @dataclass
 class Parser:
-    """Feed bytes, get frames. Never raises on input; never holds more than one frame.
+    """Bytes in, frames out. Never raises on input; never holds more than one frame.
 
     In AP=2 a raw delimiter always starts a frame, so a frame that is broken off costs only
     itself. In AP=1 the delimiter may be data: after a bad frame the search goes on from the byte
@@ -275,16 +275,16 @@ class Parser:
     def feed(self, data: bytes) -> list[ApiFrame]:
         """Frames completed by ``data``, in order."""
         self._buffer += data
-        return list(self._take_all())
+        return list(self._parse_all())
 
-    def _take_all(self) -> Iterator[ApiFrame]:
+    def _parse_all(self) -> Iterator[ApiFrame]:
         while True:
             start = self._buffer.find(DELIMITER)
             if start < 0:
                 self._skip(len(self._buffer))
                 return
             self._skip(start)
-            frame, done = self._take()
+            frame, done = self._parse_one()
             if not done:
                 return
             if frame is not None:
@@ -299,7 +299,7 @@ class Parser:
         self._skip(used if self.escaped else 1)
         return None, True
 
-    def _take(self) -> tuple[ApiFrame | None, bool]:
+    def _parse_one(self) -> tuple[ApiFrame | None, bool]:
         """Try the frame at the buffer's start: (frame, whether the buffer moved on)."""
         plain = bytearray()
         position = 1
@@ -325,7 +325,7 @@ class Parser:
             if len(plain) < 2:
                 continue
             length = plain[0] << 8 | plain[1]
-            if not 1 <= length <= MOST_FRAME_DATA:
+            if not 1 <= length <= MAX_FRAME_DATA:
                 self.counts.bad_lengths += 1
                 return self._reject(position)
             if len(plain) == length + 3:

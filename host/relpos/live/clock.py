@@ -1,11 +1,11 @@
-"""The clock that arrivals are stamped with."""
+"""The clock of arrival times."""
 
 from __future__ import annotations
 
 import time
 
-# Both go on while the computer sleeps, as the nodes' clocks do: Linux's under this name, macOS's
-# under the other. Where there is neither, a sleep shows as a jump of all nodes' delays.
+# Both count on while the computer sleeps, as the nodes' clocks do: CLOCK_BOOTTIME on Linux,
+# CLOCK_MONOTONIC on macOS. Without either, a sleep shows as a jump of all nodes' delays.
 _CLOCK = getattr(time, "CLOCK_BOOTTIME", getattr(time, "CLOCK_MONOTONIC", None))
 
 
@@ -14,12 +14,12 @@ def _read_s() -> float:
 
 
 class SessionClock:
-    """Seconds since it was made, a computer's sleep included; ``started_unix_s`` is its zero."""
+    """Seconds since its creation, sleep included; ``started_unix_s`` is the Unix time of zero."""
 
     def __init__(self) -> None:
         self._zero_s = _read_s()
         self.started_unix_s = time.time()
 
     def __call__(self) -> float:
-        """Seconds by now."""
+        """Return the seconds since creation."""
         return _read_s() - self._zero_s

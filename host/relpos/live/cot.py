@@ -1,7 +1,7 @@
-"""The team on TAK's screens: a sink that sends every member as Cursor-on-Target, through pytak.
+"""A sink that sends every member to TAK clients as Cursor-on-Target, through pytak.
 
-It works in a thread of its own with an event loop; the session only leaves the newest view
-here. What a slow network does not take is not sent later: of a position only the newest counts.
+It works in a thread of its own with an event loop; the session only stores the newest view here.
+A slow network gets fewer positions, never old ones.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from relpos.live.team_view import Alert, Person, TeamView
 EVERY_S = 1.0
 """Each member is sent at most this often."""
 LOST_EVERY_S = 10.0
-"""Somebody who is not heard any more: often enough for a screen that has just joined."""
+"""A lost member: often enough for a client that has just joined."""
 ALARM_EVERY_S = 10.0
 TICK_S = 0.2
 CONNECT_WITHIN_S = 10.0
@@ -38,15 +38,15 @@ SEND_WITHIN_S = 5.0
 RETRY_FIRST_S = 1.0
 RETRY_LAST_S = 15.0
 SETTLED_S = 1.5
-"""That nobody listens to a UDP port is heard only after something was sent there."""
+"""A UDP port without a listener shows only after something was sent there."""
 
 SCHEMES = ("udp", "udp+broadcast", "tcp", "tls", "ssl")
 
 
 def check_url(url: str) -> str:
-    """Return the URL as pytak wants it to send alone; DataError where it is none.
+    """Return the URL in pytak's send-only form; DataError where it is invalid.
 
-    ``udp`` would listen at the same address as well, and refuse where something does already.
+    Plain ``udp`` would also listen at the same address, and fail where another program does.
     """
     try:
         parsed = urlparse(url)
@@ -57,12 +57,12 @@ def check_url(url: str) -> str:
     if scheme not in SCHEMES:
         raise DataError(f"--cot {url}: begins with none of {', '.join(f'{s}://' for s in SCHEMES)}")
     if not host or not port:
-        raise DataError(f"--cot {url}: host and port are wanted, as in {scheme}://HOST:PORT")
+        raise DataError(f"--cot {url}: host and port are missing, as in {scheme}://HOST:PORT")
     return f"{scheme}+wo://{parsed.netloc.rpartition('@')[2]}"
 
 
 def default_prefix() -> str:
-    """Return what this computer's teams are called: the same in every session, here alone."""
+    """Return a uid prefix that is the same in every session of this computer, and only here."""
     hardware = uuid.getnode()
     # A random number in place of a hardware address has this bit set, and changes.
     name = platform.node() if hardware & (1 << 40) else f"{hardware:012x}"
@@ -70,7 +70,7 @@ def default_prefix() -> str:
 
 
 class Schedule:
-    """Which events are due: pure, but for what was sent before."""
+    """Decides which events are due; its only state is what was sent before."""
 
     def __init__(self, calls: Callsigns, *, exercise: bool = False) -> None:
         self._calls = calls
@@ -87,7 +87,7 @@ class Schedule:
         now_s: float,
         sigma_z_m: Mapping[int, float],
     ) -> Iterator[ET.Element]:
-        """Yield what is to be sent at ``now_s``: at most one event a second of each member."""
+        """Yield the events due at ``now_s``: at most one a second of each member."""
         for person in view.people:
             if now_s - self._sent_s.get(person.node, -EVERY_S) < EVERY_S:
                 continue
@@ -105,15 +105,15 @@ class Schedule:
         sigma_z_m: float | None,
     ) -> ET.Element | None:
         node = person.node
-        told_s = self._alarm_sent_s.get(node)
-        # Who lay still and is not heard any more has not got up.
+        alarm_s = self._alarm_sent_s.get(node)
+        # A member who lay still and then falls silent has not got up.
         lies = person.alert is Alert.STILL_ALARM or (
-            told_s is not None and person.alert is Alert.LOST
+            alarm_s is not None and person.alert is Alert.LOST
         )
-        if lies and (told_s is None or now_s - told_s >= ALARM_EVERY_S):
+        if lies and (alarm_s is None or now_s - alarm_s >= ALARM_EVERY_S):
             self._alarm_sent_s[node] = now_s
             return self._emergency(person, view, frame, sigma_z_m, over=False)
-        if not lies and told_s is not None:
+        if not lies and alarm_s is not None:
             del self._alarm_sent_s[node]
             return self._emergency(person, view, frame, sigma_z_m, over=True)
         if self._seen_seq.get(node) == view.seq:
@@ -156,13 +156,13 @@ class Schedule:
 
 
 class PinnedFrame:
-    """The map frame of a running session: pins stuck to nodes wait until those are located."""
+    """The map frame of a running session; pins on nodes wait until these are located."""
 
     def __init__(self, pins: Sequence[Pin]) -> None:
         if not pins:
-            raise DataError("--cot needs --pin LAT,LON,BEARING: where on the map the view lies")
+            raise DataError("--cot needs --pin LAT,LON,BEARING to place the team on the map")
         self._pins = pins
-        self._places: dict[int, tuple[float, float]] = {}
+        self._pinned_xy: dict[int, tuple[float, float]] = {}
         self.frame: MapFrame | None = None
         self.remarks: tuple[str, ...] = ()
         self.trouble: str | None = None
@@ -170,32 +170,32 @@ class PinnedFrame:
             self._place()
 
     def update(self, view: TeamView) -> MapFrame | None:
-        """Return the frame once every pin's place is known."""
+        """Return the frame once every pin's position is known."""
         if self.frame is not None or self.trouble is not None:
             return self.frame
         people = {p.node: p for p in view.people if p.status == "ok"}
         for k, pin in enumerate(self._pins):
-            there = people.get(pin.node) if pin.node is not None else None
+            person = people.get(pin.node) if pin.node is not None else None
             if (
-                k not in self._places
-                and there is not None
-                and there.x_m is not None
-                and there.y_m is not None
+                k not in self._pinned_xy
+                and person is not None
+                and person.x_m is not None
+                and person.y_m is not None
                 and (pin.time_s is None or view.time_s >= pin.time_s)
             ):
-                self._places[k] = there.x_m, there.y_m
-        if all(pin.node is None or k in self._places for k, pin in enumerate(self._pins)):
+                self._pinned_xy[k] = person.x_m, person.y_m
+        if all(pin.node is None or k in self._pinned_xy for k, pin in enumerate(self._pins)):
             self._place()
         return self.frame
 
     def waits_for(self) -> str | None:
-        """Say which nodes are not located yet that pins are stuck to."""
+        """Return which pinned nodes are not located yet; None where the frame is known."""
         if self.trouble is not None or self.frame is not None:
             return self.trouble
         waiting = [
             str(pin.node)
             for k, pin in enumerate(self._pins)
-            if pin.node is not None and k not in self._places
+            if pin.node is not None and k not in self._pinned_xy
         ]
         return f"no map yet: the pinned node {', '.join(waiting)} is not located"
 
@@ -206,14 +206,14 @@ class PinnedFrame:
                 pin.longitude_deg,
                 pin.bearing_rad,
                 pin.altitude_m,
-                self._places.get(k, pin.place_m),
+                self._pinned_xy.get(k, pin.place_m),
             )
             for k, pin in enumerate(self._pins)
         ]
         try:
             placing = place(pins, lambda node, time_s: None)
         except DataError as error:
-            if not self._places:
+            if not self._pinned_xy:
                 raise
             self.trouble = str(error)
             return
@@ -231,18 +231,18 @@ class CotSender(Sink):
         prefix: str | None = None,
         exercise: bool = False,
     ) -> None:
-        """Begin to connect; DataError or RelposError where that can never work."""
+        """Begin to connect; DataError or RelposError where that can never succeed."""
         self._shown = url
         self._url = check_url(url)
         self._map = PinnedFrame(pins)
         try:
             with warnings.catch_warnings():
-                # Of what only enrolling with a TAK server needs.
+                # pytak warns of a package that only enrolment with a TAK server needs.
                 warnings.simplefilter("ignore")
                 import pytak  # noqa: F401
         except ImportError:
             raise missing_extra("pytak", "exchange") from None
-        # Its loggers write to stderr by themselves; what is wrong is told by trouble().
+        # Its loggers write to stderr; trouble() reports errors instead.
         for name in ("pytak.classes", "pytak.client_functions", "pytak"):
             logging.getLogger(name).disabled = True
         self._schedule = Schedule(Callsigns(prefix or default_prefix()), exercise=exercise)
@@ -260,29 +260,29 @@ class CotSender(Sink):
             self._sigma_z_m[node.node] = node.sigma_z_m
 
     def updated(self, view: TeamView) -> None:
-        """Leave the newest view for the sender."""
+        """Store the newest view for the sender."""
         self._view = view
 
     def trouble(self) -> str | None:
-        """Say why nothing arrives there; None when all is well."""
-        said = self._trouble or self._map.waits_for()
-        return f"Cursor-on-Target: {said}" if said else None
+        """Return why nothing is sent; None when all is well."""
+        problem = self._trouble or self._map.waits_for()
+        return f"Cursor-on-Target: {problem}" if problem else None
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What there is to say of where the map lies."""
+        """Remarks on the placement of the map."""
         return self._map.remarks
 
     def close(self) -> None:
-        """End the connection."""
+        """Close the connection."""
         self._stop.set()
         self._thread.join(SEND_WITHIN_S)
 
     def _run(self) -> None:
         try:
             asyncio.run(self._work())
-        except Exception as error:  # the session goes on, and says that this does not
-            self._trouble = f"{self._shown}: ended: {_words(error)}"
+        except Exception as error:  # the session goes on and shows the trouble
+            self._trouble = f"{self._shown}: ended: {_reason(error)}"
 
     async def _work(self) -> None:
         wait_s = RETRY_FIRST_S
@@ -291,10 +291,10 @@ class CotSender(Sink):
             try:
                 await self._connected()
             except (OSError, SyntaxError, ValueError, asyncio.IncompleteReadError) as error:
-                self._trouble = f"{self._shown}: {_words(error)}; trying again"
+                self._trouble = f"{self._shown}: {_reason(error)}; trying again"
             except Exception as error:
                 # pytak's own exceptions have no common base.
-                self._trouble = f"{self._shown}: {_words(error)}; trying again"
+                self._trouble = f"{self._shown}: {_reason(error)}; trying again"
             if time.monotonic() - began_s > RETRY_LAST_S:
                 wait_s = RETRY_FIRST_S
             until_s = time.monotonic() + wait_s
@@ -303,7 +303,7 @@ class CotSender(Sink):
             wait_s = min(2.0 * wait_s, RETRY_LAST_S)
 
     async def _connected(self) -> None:
-        """Send until it breaks (raising) or is over."""
+        """Send until the connection breaks (raises) or the sink is closed."""
         import pytak
 
         tls = {key: value for key, value in os.environ.items() if key.startswith("PYTAK_")}
@@ -342,7 +342,7 @@ class CotSender(Sink):
 
 
 async def _drain(reader: Any) -> None:
-    """Read away what the server says, lest it stops taking; return when it has gone."""
+    """Discard what the server sends, so that it goes on receiving; return when it has gone."""
     try:
         while await reader.read(65536):
             pass
@@ -350,10 +350,10 @@ async def _drain(reader: Any) -> None:
         return
 
 
-def _words(error: BaseException) -> str:
+def _reason(error: BaseException) -> str:
     if isinstance(error, TimeoutError):
         return "no answer"
     if isinstance(error, OSError) and error.errno is not None and error.errno > 0:
-        # asyncio's own words repeat the address and leave out the reason.
+        # asyncio's own message repeats the address and omits the reason.
         return os.strerror(error.errno)
     return " ".join(str(error).split()) or type(error).__name__

@@ -1,17 +1,17 @@
-"""Members of the team as Cursor-on-Target events, the language of ATAK, WinTAK and TAK servers.
+"""Members of the team as Cursor-on-Target events, for ATAK, WinTAK and TAK servers.
 
-What goes where in an event (base schema 2.0), and what this project puts there:
+The attributes of an event (base schema 2.0), and what this project puts there:
 
-- ``uid`` names the member for good, an emergency's is the member's with ``-9-1-1``, as ATAK's own;
+- ``uid`` is the member's in every session; an emergency's has ``-9-1-1`` added, as in ATAK;
 - ``type`` a-f-G-U-C, a friendly unit on the ground; b-a-o-tbl an emergency, b-a-o-can its end;
-- ``how`` m-g while the position is measured and fresh: what TAK's clients know as a moving member.
-  h-e, estimated, where it is ambiguous, or of somebody who is not heard any more. m-s, simulated,
-  and EXERCISE in the remarks, of teams that are emulated or replayed;
-- ``start`` is when the member was last heard, ``stale`` ``STALE_S`` later: then clients grey it;
+- ``how`` m-g while the position is measured and fresh: TAK clients show a moving member.
+  h-e, estimated, where it is ambiguous or the member is stale or lost. m-s, simulated, and
+  EXERCISE in the remarks, where the team is emulated or replayed;
+- ``start`` is when the member was last heard, ``stale`` ``STALE_S`` later: clients grey it out;
 - ``ce`` and ``le`` are the radius, and the height up and down, that hold the member with 90 %
-  probability (CE90 and LE90, as TAK's clients take them), of the view alone: by how much the
-  pin is wrong comes on top;
-- ``hae`` is known where the pin has an altitude, 9999999 stands for unknown as everywhere in TAK.
+  probability (CE90 and LE90, as TAK's clients take them), of the relative position alone: the
+  pin's own error comes on top;
+- ``hae`` is known where the pin has an altitude; 9999999 stands for unknown.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from relpos.geodesy import MapFrame
 from relpos.live.team_view import Alert, Person, TeamView
 
 STALE_S = 15.0
-"""Nodes report every second and count as lost after ten: then TAK's clients grey the member."""
+"""Nodes report every second and count as lost after ten: then TAK clients grey the member out."""
 ALARM_STALE_S = 600.0
 """An emergency is not forgotten because the link to the server broke."""
 MEMBER = "a-f-G-U-C"
@@ -49,7 +49,7 @@ _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]"
 
 @dataclass(frozen=True)
 class Callsigns:
-    """What members are called on TAK: ``prefix`` keeps teams on one server apart."""
+    """Identifiers of members on TAK; ``prefix`` keeps teams on one server apart."""
 
     prefix: str
 
@@ -60,7 +60,7 @@ class Callsigns:
 
 @dataclass(frozen=True)
 class Moved:
-    """Where a member was at an earlier event, from which its speed follows."""
+    """Position of a member at its last event, from which its speed follows."""
 
     time_s: float
     x_m: float
@@ -77,8 +77,8 @@ def member(
     before: Moved | None = None,
     exercise: bool = False,
 ) -> ET.Element | None:
-    """Return the event of one member; None of whom no position or sign of life is known."""
-    if person.seen_s is None or not _placed(person):
+    """Return the event of one member; None while its position is unknown or it was never heard."""
+    if person.seen_s is None or not _located(person):
         return None
     import pytak
 
@@ -114,16 +114,16 @@ def emergency(
     sigma_z_m: float | None = None,
     exercise: bool = False,
 ) -> ET.Element:
-    """Return the event that somebody lies still, or does no longer.
+    """Return the event that a member lies still, or with ``over`` does so no longer.
 
-    It is sent of members whose place is unknown, too: at the pin, with an unknown error.
+    A member without a position is placed at the pin, with an unknown error.
     """
     import pytak
 
     name = text(person.name)
     link = ET.Element("link", uid=calls.uid(person.node), type=MEMBER, relation="p-p")
-    said = ET.Element("emergency", {"cancel": "true"} if over else {"type": "911 Alert"})
-    said.text = name
+    emergency_tag = ET.Element("emergency", {"cancel": "true"} if over else {"type": "911 Alert"})
+    emergency_tag.text = name
     event: ET.Element = pytak.cot_event(
         uid=f"{calls.uid(person.node)}-9-1-1",
         cot_type=EMERGENCY_OVER if over else EMERGENCY,
@@ -132,7 +132,7 @@ def emergency(
         detail=pytak.cot_detail(
             link,
             ET.Element("contact", callsign=f"{name}-Alert"),
-            said,
+            emergency_tag,
             _remarks(person, exercise),
             flow_tag=False,
         ),
@@ -181,14 +181,14 @@ def text(value: str) -> str:
     return _NOT_XML.sub("", value)
 
 
-def _placed(person: Person) -> bool:
+def _located(person: Person) -> bool:
     return person.x_m is not None and person.y_m is not None and person.status != "unlocated"
 
 
 def _point(person: Person, frame: MapFrame, sigma_z_m: float | None) -> ET.Element:
     import pytak
 
-    if not _placed(person):
+    if not _located(person):
         point: ET.Element = pytak.cot_point(
             frame.latitude_deg, frame.longitude_deg, precision=DECIMALS
         )
@@ -211,13 +211,13 @@ def _point(person: Person, frame: MapFrame, sigma_z_m: float | None) -> ET.Eleme
 
 
 def _remarks(person: Person, exercise: bool) -> ET.Element:
-    """Say in words what the symbol cannot."""
+    """Return the remarks: what the symbol cannot show."""
     words = []
     if exercise:
         words.append("EXERCISE")
     if person.alert is Alert.STILL_ALARM:
         words.append(f"LIES STILL for {person.still_s:.0f} s")
-    if not _placed(person):
+    if not _located(person):
         words.append("position unknown")
     elif person.status == "ambiguous":
         words.append("position ambiguous")

@@ -1,7 +1,7 @@
-"""Where a session's bytes and observations come from: a serial port, or a recording in its place.
+"""Inputs of a session: a serial port, or a recording in its place.
 
-An input is read by the session's receive thread alone. All that it gives is stamped with its
-``arrival_s``; in this order, and in these portions, it can be replayed.
+Only the session's receive thread reads an input. Everything that it returns carries its
+``arrival_s``; a recording replays it in the same order and the same portions.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ REOPEN_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """What arrived together: the bytes, where it was bytes, and what they mean."""
+    """Bytes that arrived together, and the observations in them; a recorded run has no bytes."""
 
     arrival_s: float
     data: bytes
@@ -41,47 +41,47 @@ class Received:
 
 
 class Input(Protocol):
-    """See the module's text."""
+    """A source of bytes and observations; see the module's text."""
 
     name: str
     is_now: bool
-    """Whether it happens now, so that what phones tell belongs to it."""
+    """Whether the team is live, so that presses and headings of phones belong to it."""
 
     @property
     def link(self) -> Link | None:
-        """Counts, clocks and radio figures of the nodes; None where only observations were kept."""
+        """The link, its counts and clocks; None where only observations were recorded."""
 
     def read(self, timeout_s: float) -> Received | None:
-        """What has arrived; None where nothing does in time. DeviceError where it ended so."""
+        """Return what arrives in time, else None; DeviceError where the port fails."""
 
     def now_s(self) -> float:
-        """The session's time: the arrival clock's, or an emulated team's own."""
+        """Return the session's time: the arrival clock's, or an emulated team's own."""
 
     def learn(self, estimate: Estimate) -> None:
-        """Take what the newest estimate has learned of the wearers' steps."""
+        """Pass on what the newest estimate has learned of the wearers' steps."""
 
     def remarks(self) -> list[str]:
-        """What the user should be told, each once."""
+        """Return new messages for the user, each once."""
 
     def trouble(self) -> str | None:
-        """Why nothing can arrive at present; None where it can."""
+        """Return why nothing can arrive at present; None where it can."""
 
     def over(self) -> bool:
-        """Whether nothing more will come."""
+        """Return whether the input has ended."""
 
     def counters(self) -> Mapping[str, float]:
-        """Counts of what went wrong on the way, by name."""
+        """Return counts of errors on the way, by name."""
 
     def close(self) -> None:
-        """End it."""
+        """Close the input."""
 
 
 class PortInput:
-    """A live team behind a serial port, which is sent beacons.
+    """A live team behind a serial port; sends it beacons.
 
-    What an estimator learns of the wearers' steps goes back to the nodes, unless ``teach`` is off.
-    A port that vanishes is opened again each second where ``reopen``, else it is a DeviceError, as
-    is one that cannot be opened at first.
+    With ``teach`` the nodes get the step scales that the estimator learns. With ``reopen`` a port
+    that vanishes is tried again each second; otherwise it is a DeviceError, as is a port that
+    cannot be opened at first.
     """
 
     is_now = True
@@ -103,24 +103,24 @@ class PortInput:
         self._reopen = reopen
         self._scales = StepScaleSender(link) if teach else None
         self._beacons = HostBeacons(link)
-        self._told = 0
+        self._remarked = 0
         self._device: serial.Serial | None = serial_port.open_port(port)
         self._waits_on = _descriptor(self._device)
-        self._gone: str | None = None
+        self._trouble: str | None = None
         self._try_at_s = 0.0
 
     @property
     def link(self) -> Link | None:
-        """The link that everything goes through."""
+        """The link to the team."""
         return self._link
 
     def read(self, timeout_s: float) -> Received | None:
-        """Wait for bytes; in between tell the nodes what is due to them."""
+        """Send what is due to the nodes, then wait for bytes."""
         if self._device is None and not self._open_again():
             time.sleep(min(timeout_s, REOPEN_S))
             return None
         try:
-            self._talk()
+            self._send_due()
             data = self._bytes(timeout_s)
         except DeviceError as error:
             self._lose(error)
@@ -134,41 +134,41 @@ class PortInput:
         return received
 
     def now_s(self) -> float:
-        """The clock, unless an emulated team marks its own time."""
+        """Return the clock's time, or that of an emulated team which marks its own."""
         virtual_s = self._link.virtual_s
         return self.clock() if virtual_s is None else virtual_s
 
     def learn(self, estimate: Estimate) -> None:
-        """Tell the nodes what the newest estimate has learned of their wearers' steps."""
+        """Begin to send newly learned step scales to the nodes."""
         if self._scales is not None:
             for p in estimate.parameters:
                 if p.name == "step_scale":
                     self._scales.learn(p.node, p.value, p.sigma, p.time_s)
 
     def remarks(self) -> list[str]:
-        """Of the link and of the dialogues about step lengths."""
+        """Return new remarks of the decoder and of the step scales."""
         if self._scales is not None:
             self._link.decoder.remarks += self._scales.remarks
             self._scales.remarks.clear()
-        new = self._link.decoder.remarks[self._told :]
-        self._told += len(new)
+        new = self._link.decoder.remarks[self._remarked :]
+        self._remarked += len(new)
         return new
 
     def trouble(self) -> str | None:
-        """Why the port is not open."""
-        return self._gone
+        """Return why the port is not open."""
+        return self._trouble
 
     def over(self) -> bool:
-        """Never: a port that is silent may speak again."""
+        """Return False: a silent port may speak again."""
         return False
 
     def counters(self) -> Mapping[str, float]:
-        """Counts of the whole link so far."""
+        """Return the counts of the whole link so far."""
         sent = {"step_scales_sent": self._scales.sent} if self._scales else {}
         return {**self._link.summary(), **sent}
 
     def close(self) -> None:
-        """Close the port and keep which frames have been seen."""
+        """Close the port and store the newest frame counters."""
         if self._device is not None:
             self._device.close()
             self._device = None
@@ -176,13 +176,13 @@ class PortInput:
             self._seen.save(self._link.newest_counters(), time.monotonic(), at_once=True)
 
     def _bytes(self, timeout_s: float) -> bytes:
-        """What is there, or comes within the time."""
+        """Return bytes that are there, or arrive within the time."""
         device = self._device
         assert device is not None
         try:
             waiting = device.in_waiting
             if not waiting and self._waits_on is not None:
-                # pyserial's own wait is a setting of the port, and ends with the first byte.
+                # pyserial's own timeout is a setting of the port; it waits for all bytes asked for.
                 if not select.select([self._waits_on], [], [], max(timeout_s, 0.0))[0]:
                     return b""
                 waiting = device.in_waiting
@@ -192,22 +192,22 @@ class PortInput:
             raise serial_port.vanished(device, error) from error
         return data
 
-    def _talk(self) -> None:
+    def _send_due(self) -> None:
         assert self._device is not None
-        # An emulated team's virtual time is not for beacons: it sends its own.
+        # An emulated team in virtual time sends beacons of its own.
         now_s = self.clock()
         serial_port.send(self._device, self._beacons.due(now_s))
         if self._scales is None:
             return
         answers = self._link.decoder.acknowledged
         while answers:
-            self._scales.take(answers.popleft())
+            self._scales.handle(answers.popleft())
         serial_port.send(self._device, self._scales.due(now_s))
 
     def _lose(self, error: DeviceError) -> None:
         if not self._reopen:
             raise error
-        self._gone = str(error)
+        self._trouble = str(error)
         if self._device is not None:
             self._device.close()
             self._device = None
@@ -219,16 +219,16 @@ class PortInput:
         try:
             self._device = serial_port.open_port(self.name)
         except DeviceError as error:
-            self._gone = str(error)
+            self._trouble = str(error)
             self._try_at_s = time.monotonic() + REOPEN_S
             return False
         self._waits_on = _descriptor(self._device)
-        self._gone = None
+        self._trouble = None
         return True
 
 
 def _descriptor(device: serial.Serial) -> int | None:
-    """What can be waited on; None of ports that are none of the operating system's files."""
+    """Return the descriptor to wait on; None for ports that are not files of the system."""
     if sys.platform == "win32":
         return None
     try:
@@ -238,9 +238,9 @@ def _descriptor(device: serial.Serial) -> int | None:
 
 
 class PacedInput:
-    """A recording as if it happened now: what arrived at ``arrival_s`` comes at that time again.
+    """A recording played at the pace of its arrival times.
 
-    ``items`` are in the order of arrival. ``speed`` 2 is twice as fast, 0 as fast as it is taken.
+    ``items`` are in the order of arrival. ``speed`` 2 is twice as fast, 0 as fast as it is read.
     """
 
     is_now = False
@@ -265,7 +265,7 @@ class PacedInput:
         self._now_s = self._first_s
 
     def read(self, timeout_s: float) -> Received | None:
-        """What is due by now, one portion at a time."""
+        """Return what is due by now, one portion at a time."""
         due_s = self._first_s + self._elapsed_s()
         if self._next is None:
             time.sleep(timeout_s)
@@ -286,14 +286,14 @@ class PacedInput:
         return (self._clock() - self._started_s) * self._speed
 
     def now_s(self) -> float:
-        """The recording's time."""
+        """Return the recording's time."""
         return self._now_s
 
     def learn(self, estimate: Estimate) -> None:
-        """Nobody is there to be taught."""
+        """Ignore: a recording has no nodes to send to."""
 
     def remarks(self) -> list[str]:
-        """Of the link, where bytes were recorded."""
+        """Return new remarks of the decoder, where bytes were recorded."""
         if self.link is None:
             return []
         new = list(self.link.decoder.remarks)
@@ -301,23 +301,23 @@ class PacedInput:
         return new
 
     def trouble(self) -> str | None:
-        """None: a recording is there."""
+        """Return None: a recording has no port to lose."""
         return None
 
     def over(self) -> bool:
-        """Whether all of it has been read."""
+        """Return whether all of it has been read."""
         return self._next is None
 
     def counters(self) -> Mapping[str, float]:
-        """Of the link, where bytes were recorded."""
+        """Return the counts of the link, where bytes were recorded."""
         return {} if self.link is None else self.link.summary()
 
     def close(self) -> None:
-        """Nothing to end."""
+        """Nothing to close."""
 
 
 def run_items(run: Run) -> list[Received]:
-    """A run directory's observations, as if each had arrived when it was measured."""
+    """Return a run's observations, each arriving at the time of its measurement."""
     observations: list[Observation] = [*run.measurements, *run.events, *run.statuses, *run.steps]
     order = (Status, Motion, Range, Height, Heading, Step, Event)
     observations.sort(key=lambda o: (o.time_s, order.index(type(o))))

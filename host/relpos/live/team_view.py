@@ -1,8 +1,8 @@
-"""The view of the team at one moment, as people and programs are shown it.
+"""The team at one moment, as pages, terminals and programs show it.
 
-Frames and units as everywhere: metres, radians counter-clockwise from the common frame's x axis,
-seconds of the session's arrival clock; ``unix_s`` for who needs a date. None where unknown, which
-JSON has as null. The JSON is the page's protocol, version 1.
+Metres, radians counter-clockwise from the common frame's x axis, seconds of the session's arrival
+clock; ``unix_s`` is the same moment as Unix time. Unknown values are None, null in JSON. The JSON
+is the page's protocol, version 1, in which a view is a message of type ``picture``.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Level(StrEnum):
 
 
 class Alert(StrEnum):
-    """What is wrong with a person."""
+    """Why a wearer may need help."""
 
     STILL_WARNING = "still_warning"
     STILL_ALARM = "still_alarm"
@@ -39,7 +39,7 @@ class Alert(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """Something that everybody has to know, of the session as a whole."""
+    """A message about the session as a whole, shown to every user."""
 
     id: str
     level: Level
@@ -51,9 +51,9 @@ class Notice:
 class Person:
     """One node's wearer.
 
-    The pose is the newest there is (nowcast): it contains all motion up to ``motion_s``. ``status``
-    is one of ``ok``, ``ambiguous``, ``unlocated``, ``stale``, ``lost``. ``loss`` and ``ranging``
-    are shares. ``acknowledged``: the alert has been seen by somebody.
+    The pose is the newest (nowcast): it contains all motion up to ``motion_s``. ``status`` is one
+    of ``ok``, ``ambiguous``, ``unlocated``, ``stale``, ``lost``. ``loss`` and ``ranging`` are
+    fractions. ``acknowledged``: a user has confirmed the alert.
     """
 
     node: int
@@ -106,7 +106,7 @@ class MeasuredRange:
 
 @dataclass(frozen=True, slots=True)
 class GhostPerson:
-    """A person in an alternative; of a ring, x and y are the centre, sigma_major_m the radius."""
+    """A person in an alternative; for a ring, x and y are the centre, sigma_major_m the radius."""
 
     node: int
     x_m: float
@@ -128,11 +128,11 @@ class Ghosts:
 
 @dataclass(frozen=True)
 class TeamView:
-    """Everybody at ``time_s``.
+    """All people at ``time_s``.
 
-    ``arrived_unix_s`` is when the newest packet in it arrived; ``fused_s`` the time of the newest
-    fused estimate. Pairs have node < peer, of those who are located. ``north_rad`` is the bearing
-    of magnetic north in the common frame, None while that is not known well enough to go by.
+    ``arrived_unix_s`` is the arrival of the newest packet in it; ``fused_s`` the time of the newest
+    fused estimate. Pairs have node < peer, among located people. ``north_rad`` is the bearing of
+    magnetic north in the common frame, None while its standard deviation is too large.
     """
 
     seq: int
@@ -150,7 +150,7 @@ class TeamView:
     alternatives: tuple[Ghosts, ...] = ()
 
     def to_json(self) -> str:
-        """The message ``view`` of the page's protocol."""
+        """Return the message ``picture`` of the page's protocol."""
         document = {
             "type": "picture",
             "seq": self.seq,
@@ -184,7 +184,7 @@ def _pair_json(pair: Pair) -> str:
 
 @dataclass(frozen=True)
 class Hello:
-    """What a page is told first."""
+    """The first message to a page: the session and its limits."""
 
     name: str
     source: str
@@ -199,7 +199,7 @@ class Hello:
     )
 
     def to_json(self) -> str:
-        """The message ``hello`` of the page's protocol."""
+        """Return the message ``hello`` of the page's protocol."""
         session = asdict(self)
         limits = session.pop("limits")
         return to_json(
@@ -211,7 +211,7 @@ _ENCODE = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
 
 
 def to_json(document: Mapping[str, Any]) -> str:
-    """Compact, and without the NaN that no browser reads."""
+    """Return compact JSON; ValueError for NaN, which browsers cannot parse."""
     return _ENCODE(document)
 
 
@@ -221,6 +221,6 @@ def _fields(row: Any) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     if type(value) is float:
-        # A tenth of a millimetre and of a milliradian: nobody needs more.
+        # To a tenth of a millimetre and of a milliradian.
         return round(value, 4) if math.isfinite(value) else None
     return value

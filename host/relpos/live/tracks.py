@@ -1,4 +1,4 @@
-"""Where everybody has been, thinned out so that hours of it stay small."""
+"""Past positions of all people, thinned so that hours of them stay small."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Any
 
 from relpos.live.team_view import to_json
 
-MOST_POINTS = 2000
+MAX_POINTS = 2000
 FIRST_SPACING_S = 0.5
 
 
 class Tracks:
-    """Points (time_s, x_m, y_m) of each node, at most :data:`MOST_POINTS`.
+    """Points (time_s, x_m, y_m) of each node, at most :data:`MAX_POINTS`.
 
-    A track that is full gives up every second point and is twice as coarse from then on, so that
-    its points stay evenly apart in time.
+    A full track drops every second point and doubles its spacing, so that its points stay evenly
+    apart in time.
     """
 
     def __init__(self) -> None:
@@ -25,13 +25,13 @@ class Tracks:
         self._spacing_s: dict[int, float] = {}
 
     def add(self, node: int, time_s: float, x_m: float, y_m: float) -> bool:
-        """Take a point, unless one as near in time is there; whether it was taken."""
+        """Add a point unless one is as close in time; return whether it was added."""
         points = self._points.setdefault(node, array("d"))
         spacing_s = self._spacing_s.get(node, FIRST_SPACING_S)
         if points and time_s < points[-3] + spacing_s:
             return False
         points.extend((round(time_s, 2), round(x_m, 2), round(y_m, 2)))
-        if len(points) > 3 * MOST_POINTS:
+        if len(points) > 3 * MAX_POINTS:
             kept = array("d")
             for k in range(0, len(points), 6):
                 kept.extend(points[k : k + 3])
@@ -40,18 +40,18 @@ class Tracks:
         return True
 
     def of(self, node: int) -> list[tuple[float, float, float]]:
-        """The node's points, by time."""
+        """Return the node's points by time."""
         points = self._points.get(node, array("d"))
         return list(zip(points[::3], points[1::3], points[2::3], strict=True))
 
     def to_json(self) -> str:
-        """The message ``tracks`` of the page's protocol."""
+        """Return the message ``tracks`` of the page's protocol."""
         tracks = {str(node): self.of(node) for node in sorted(self._points)}
         return to_json({"type": "tracks", "tracks": tracks})
 
     @classmethod
     def from_message(cls, message: Mapping[str, Any]) -> Tracks:
-        """Take a ``tracks`` message's points as they are."""
+        """Restore the tracks of a ``tracks`` message."""
         tracks = cls()
         for node, points in message["tracks"].items():
             tracks._points[int(node)] = array("d", (value for point in points for value in point))

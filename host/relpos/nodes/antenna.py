@@ -1,4 +1,4 @@
-"""Ranges between two nodes at rest, and their shares of the ranges' offset."""
+"""Ranges between two nodes at rest, and the two nodes' range offsets."""
 
 from __future__ import annotations
 
@@ -13,47 +13,47 @@ from relpos.protocol.messages import CommandCode
 
 FAST_PERIOD_MS = 500
 SILENT_S = 15.0
-"""Without a range for so long, none will come."""
+"""Silence after which no range is expected."""
 
 
-def read_shares_mm(dialogue: NodeDialogue, pair: tuple[int, int]) -> tuple[int, int]:
-    """Both nodes' shares, asked for; the link's decoder subtracts them from then on."""
-    first, second = (_at(dialogue, node, CommandCode.SET_RANGE_OFFSET_MM) for node in pair)
+def read_offsets_mm(dialogue: NodeDialogue, pair: tuple[int, int]) -> tuple[int, int]:
+    """Read both nodes' range offsets; the link's decoder subtracts them from then on."""
+    first, second = (_read(dialogue, node, CommandCode.SET_RANGE_OFFSET_MM) for node in pair)
     _subtract(dialogue, pair, (first, second))
     return first, second
 
 
-def store_shares_mm(
-    dialogue: NodeDialogue, pair: tuple[int, int], shares_mm: tuple[int, int]
+def store_offsets_mm(
+    dialogue: NodeDialogue, pair: tuple[int, int], offsets_mm: tuple[int, int]
 ) -> None:
-    """Set both nodes' shares and read them back. DeviceError where a node has another one."""
-    for node, share_mm in zip(pair, shares_mm, strict=True):
+    """Set both nodes' range offsets; DeviceError where one reads back otherwise."""
+    for node, offset_mm in zip(pair, offsets_mm, strict=True):
         dialogue.node = node
-        dialogue.demand(CommandCode.SET_RANGE_OFFSET_MM, share_mm)
+        dialogue.demand(CommandCode.SET_RANGE_OFFSET_MM, offset_mm)
         stored_mm = dialogue.setting(CommandCode.SET_RANGE_OFFSET_MM)
-        if stored_mm != share_mm:
+        if stored_mm != offset_mm:
             raise DeviceError(
-                f"node {node} has stored an offset of {stored_mm} mm instead of {share_mm} mm"
+                f"node {node} has stored an offset of {stored_mm} mm instead of {offset_mm} mm"
             )
-    _subtract(dialogue, pair, shares_mm)
+    _subtract(dialogue, pair, offsets_mm)
 
 
-def _at(dialogue: NodeDialogue, node: int, code: CommandCode) -> int:
+def _read(dialogue: NodeDialogue, node: int, code: CommandCode) -> int:
     dialogue.node = node
     return dialogue.setting(code)
 
 
-def _subtract(dialogue: NodeDialogue, pair: tuple[int, int], shares_mm: tuple[int, int]) -> None:
-    """Do not wait for the next status to tell the decoder."""
-    for node, share_mm in zip(pair, shares_mm, strict=True):
-        dialogue.link.decoder.range_offsets_m[node] = share_mm / 1000.0
+def _subtract(dialogue: NodeDialogue, pair: tuple[int, int], offsets_mm: tuple[int, int]) -> None:
+    """Set the decoder's offsets at once, without waiting for the next status."""
+    for node, offset_mm in zip(pair, offsets_mm, strict=True):
+        dialogue.link.decoder.range_offsets_m[node] = offset_mm / 1000.0
     dialogue.observations.clear()
 
 
 @contextmanager
 def ranging_fast(dialogue: NodeDialogue, pair: tuple[int, int]) -> Iterator[None]:
-    """Both nodes range twice a second meanwhile; their own periods come back at the end."""
-    periods_ms = {node: _at(dialogue, node, CommandCode.SET_RANGING_PERIOD_MS) for node in pair}
+    """Let both nodes range twice a second meanwhile; restore their own periods at the end."""
+    periods_ms = {node: _read(dialogue, node, CommandCode.SET_RANGING_PERIOD_MS) for node in pair}
     try:
         for node in pair:
             dialogue.node = node
@@ -66,11 +66,11 @@ def ranging_fast(dialogue: NodeDialogue, pair: tuple[int, int]) -> Iterator[None
 
 
 def collect(dialogue: NodeDialogue, pair: tuple[int, int], count: int) -> Iterator[float]:
-    """The next ``count`` ranges in metres between the two, whoever began them.
+    """Yield the next ``count`` ranges in metres between the two, in both directions.
 
-    Fewer where none comes for a while.
+    Ends early where none arrives for :data:`SILENT_S`.
     """
-    # What is under way may still be from before: a report waits for a second at most.
+    # Reports on their way may still be from before.
     until_s = time.monotonic() + 0.2
     while time.monotonic() < until_s:
         dialogue.listen()

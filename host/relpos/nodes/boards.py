@@ -1,4 +1,4 @@
-"""Arduinos on USB: which ports may be one, and which board answers there."""
+"""Arduinos on USB: candidate ports, and the board that answers at one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from relpos.errors import DeviceError
 BOOT_BAUD = 115_200
 """Optiboot on the Uno, Arduino's STK500v2 on the Mega."""
 RESET_S = 0.25
-"""As long as avrdude holds DTR: the capacitor at the reset line has to discharge."""
+"""As long as avrdude holds DTR, so that the capacitor at the reset line discharges."""
 BOOT_S = 0.05
 SYNC_S = 0.2
 SYNC_ATTEMPTS = 5
@@ -55,7 +55,7 @@ _BRIDGES = {
 
 
 class UsbPort(Protocol):
-    """What pyserial's list_ports tells of a port."""
+    """A port as pyserial's list_ports describes it."""
 
     device: str
     vid: int | None
@@ -64,7 +64,7 @@ class UsbPort(Protocol):
 
 @dataclass(frozen=True)
 class Candidate:
-    """A port behind which a board may be; ``sure`` where its USB id is Arduino's own."""
+    """A port with a possible board; ``sure`` where its USB id is Arduino's own."""
 
     port: str
     what: str
@@ -72,7 +72,7 @@ class Candidate:
 
 
 def candidates(ports: Iterable[UsbPort]) -> list[Candidate]:
-    """Ports that may be boards, by name."""
+    """Return ports that may be boards, by name."""
     found = []
     for port in ports:
         if port.vid is None or port.pid is None:
@@ -86,7 +86,7 @@ def candidates(ports: Iterable[UsbPort]) -> list[Candidate]:
 
 
 def choose(ports: Iterable[UsbPort]) -> str:
-    """The port of the only board. DeviceError in one line where there is none, or a choice."""
+    """Return the port of the only board; DeviceError where there is none, or more than one."""
     found = candidates(ports)
     sure = [candidate for candidate in found if candidate.sure] or found
     if not sure:
@@ -98,27 +98,27 @@ def choose(ports: Iterable[UsbPort]) -> str:
 
 
 def find_port() -> str:
-    """The port of the only board that is plugged in; DeviceError as :func:`choose`."""
+    """Return the port of the only board plugged in; DeviceError as in :func:`choose`."""
     from serial.tools.list_ports import comports
 
     return choose(comports())
 
 
 def identify(device: serial.Serial) -> bytes:
-    """The chip's signature as its boot loader tells it; ``device`` is open at BOOT_BAUD.
+    """Return the chip's signature from its boot loader; ``device`` is open at BOOT_BAUD.
 
     DeviceError where no boot loader answers.
     """
-    for ask in (_stk500_signature, _stk500v2_signature):
+    for read_signature in (_stk500_signature, _stk500v2_signature):
         _reset(device)
-        signature = ask(device)
+        signature = read_signature(device)
         if signature is not None:
             return signature
     raise DeviceError(f"{device.port}: no board answers: {SWITCH}")
 
 
 def check(device: serial.Serial, wanted: str | None) -> Board:
-    """The board that answers; DeviceError where it is another one than ``wanted``, or unknown."""
+    """Return the board that answers; DeviceError where it is not ``wanted``, or unknown."""
     signature = identify(device)
     for board in BOARDS.values():
         if board.signature == signature:
@@ -135,7 +135,7 @@ def check(device: serial.Serial, wanted: str | None) -> Board:
 
 
 def _reset(device: serial.Serial) -> None:
-    """Restart the board through its USB chip; ports without modem lines restart on their own."""
+    """Restart the board through its USB chip; ports without modem lines need no reset."""
     with suppress(OSError, serial.SerialException):
         device.dtr = device.rts = False
         time.sleep(RESET_S)
@@ -144,12 +144,12 @@ def _reset(device: serial.Serial) -> None:
 
 
 def _stk500_signature(device: serial.Serial) -> bytes | None:
-    """Signature from an STK500 boot loader (Uno: optiboot). None where none answers.
+    """Return the signature from an STK500 boot loader (Uno: optiboot); None where none answers.
 
-    Atmel AVR061: 0x30 0x20 asks for sync, 0x75 0x20 for the signature; answers stand between 0x14
+    Atmel AVR061: 0x30 0x20 requests sync, 0x75 0x20 the signature; answers are enclosed in 0x14
     and 0x10.
     """
-    if not _ask(device, lambda: _exchange(device, b"\x30\x20", 2) == b"\x14\x10"):
+    if not _synced(lambda: _exchange(device, b"\x30\x20", 2) == b"\x14\x10"):
         return None
     answer = _exchange(device, b"\x75\x20", 5)
     if len(answer) == 5 and answer[0] == 0x14 and answer[4] == 0x10:
@@ -157,7 +157,7 @@ def _stk500_signature(device: serial.Serial) -> bytes | None:
     return None
 
 
-def _ask(device: serial.Serial, answered: Callable[[], bool]) -> bool:
+def _synced(answered: Callable[[], bool]) -> bool:
     return any(answered() for _ in range(SYNC_ATTEMPTS))
 
 
@@ -172,7 +172,7 @@ def _exchange(device: serial.Serial, request: bytes, answer_bytes: int) -> bytes
 
 
 def _stk500v2_signature(device: serial.Serial) -> bytes | None:
-    """Signature from an STK500v2 boot loader (Mega). None where none answers.
+    """Return the signature from an STK500v2 boot loader (Mega); None where none answers.
 
     Atmel AVR068: 0x1B, sequence, length (2), 0x0E, message, xor of all. 0x01 signs on, 0x1B reads a
     byte of the signature by an ISP command (0x30 0 n 0).
@@ -193,7 +193,7 @@ def _stk500v2_signature(device: serial.Serial) -> bytes | None:
         return answer[5:-1] if good else None
 
     # "AVRISP_2" and its length: eleven bytes of answer.
-    if not _ask(device, lambda: talk(b"\x01", 11) is not None):
+    if not _synced(lambda: talk(b"\x01", 11) is not None):
         return None
     signature = bytearray()
     for position in range(3):

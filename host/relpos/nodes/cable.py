@@ -1,9 +1,9 @@
 """A node on its USB cable: the host takes the XBee module's place at the node's UART.
 
-The microcontroller's one UART serves the USB cable or the XBee, as the shield's switch says; in
-either case the node speaks API frames. Here its transmit requests become frames received by the
-coordinator, and what the host would give its coordinator becomes frames received by the node, so
-that everything that speaks with a coordinator's port speaks with a cable.
+The microcontroller's only UART serves the USB cable or the XBee, by the shield's switch; in both
+cases the node sends API frames. Here its transmit requests become frames received by the
+coordinator, and the host's transmit requests become frames received by the node, so that code for
+a coordinator's port works with a cable, too.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from relpos.link.port import open_port
 from relpos.protocol import messages as wire
 
 CABLE_DBM = 0
-"""Signal strength that is told of what came through the cable."""
+"""Signal strength reported for frames from the cable."""
 DELIVERED = 0
 
 
 class CablePort:
     """Looks like a coordinator's serial port to :class:`relpos.link.dialogue.NodeDialogue`.
 
-    Opening it restarts an Arduino (its USB chip pulls the reset line): what the node had counted is
-    lost, as at any start. ``heard`` counts the frames that came from the node.
+    Opening it restarts an Arduino (its USB chip pulls the reset line), so the node's totals are
+    lost. ``heard`` counts the node's frames.
     """
 
     def __init__(self, port: str) -> None:
@@ -34,11 +34,11 @@ class CablePort:
 
     @property
     def in_waiting(self) -> int:
-        """Bytes for the host that are there; or such of the node's that may become some."""
+        """Number of bytes for the host, or of bytes of the node that may become some."""
         return len(self._waiting) or int(self._device.in_waiting)
 
     def read(self, size: int = 1) -> bytes:
-        """At most ``size`` bytes as a coordinator would give them; few or none after a timeout."""
+        """Return at most ``size`` bytes as a coordinator would send them; fewer after a timeout."""
         if not self._waiting:
             self._listen()
         data = bytes(self._waiting[:size])
@@ -46,7 +46,7 @@ class CablePort:
         return data
 
     def write(self, data: bytes) -> int:
-        """Bytes for a coordinator: what it would transmit reaches the node."""
+        """Pass what a coordinator would transmit to the node."""
         for frame in self._from_host.feed(data):
             if isinstance(frame, xbee.Transmit16):
                 received = xbee.Receive16(wire.COORDINATOR, CABLE_DBM, frame.data)
@@ -59,11 +59,11 @@ class CablePort:
             if not isinstance(frame, xbee.Transmit16):
                 continue
             self.heard += 1
-            # The node does not send the next frame before it knows what became of this one.
+            # The node waits for this status before it sends the next frame.
             if frame.frame_id:
                 status = xbee.TransmitStatus(frame.frame_id, DELIVERED)
                 self._device.write(xbee.encode(status))
-            # Its module's address is not known here; the frame inside says whose it is.
+            # The module's address is unknown here; the frame inside names the node.
             self._waiting += xbee.encode(xbee.Receive16(0, CABLE_DBM, frame.data))
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
-"""Is a node well? One rule in three colours, from what it and its link have told.
+"""A node's health in three colours, from its own reports and its link.
 
-Red: what it tells cannot be used, or it is about to fall silent. Yellow: it works, with less than
-it should have. Green: everything else. The limits stand below, each with its reason.
+Red: its data are unusable, or it is about to fall silent. Yellow: it works with reduced quality.
+Green: everything else. The limits stand below, each with its reason.
 """
 
 from __future__ import annotations
@@ -13,25 +13,25 @@ from enum import IntEnum
 SILENT_S = 5.0
 """A node reports its motion every second; five in a row are lost once in 10^8 at 2 % loss."""
 LOSS_YELLOW = 0.10
-"""The totals make up for lost motion, the ranges' evidence is gone: five times the usual 2 %."""
+"""Running totals replace lost motion, lost ranges are gone: five times the usual 2 %."""
 LOSS_RED = 0.50
 RANGING_YELLOW = 0.20
-LEAST_EXCHANGES = 15
-"""Whom it cannot reach counts as failed, so a team that spreads over a floor is at 30 to 50 % and
-well. Of fifteen exchanges at 40 % under a fifth succeed three times in a hundred by chance; more
-often the tag is covered, or all the others are out of reach, both worth knowing. Two nodes make
+MIN_EXCHANGES = 15
+"""An unreachable peer counts as a failure, so a team spread over a floor is at 30 to 50 % and well.
+ Of fifteen exchanges at 40 % under a fifth succeed three times in a hundred by chance; more
+often the tag is covered, or all others are out of reach, which users should know. Two nodes make
 fifteen in half a minute."""
 BATTERY_YELLOW_V = 4.5
-"""Under what the Uno's 3.3 V regulator and the boards on it are sure to work from (5 V - 10 %). The
-AVR's reference is 1.0 to 1.2 V, so a single board may tell 9 % too little or too much."""
+"""Below the guaranteed supply of the Uno's 3.3 V regulator and its boards (5 V - 10 %). The AVR's
+reference is 1.0 to 1.2 V, so a single board may report 9 % too little or too much."""
 BATTERY_RED_V = 4.2
 """At 16 MHz an ATmega328P is specified down to 3.78 V; a transmission pulls a weak cell further."""
 RSSI_YELLOW_DBM = -86
 """An XBee Series 1 hears down to -92 dBm (data sheet, from memory: check); a body that turns takes
 more than the 6 dB that are left."""
 FRESH_START_S = 60.0
-"""How long an unwanted restart is worth telling."""
-LEAST_STACK_BYTES = 48
+"""How long an unwanted restart is reported."""
+MIN_STACK_BYTES = 48
 """An interrupt with its registers takes 40."""
 
 
@@ -45,11 +45,11 @@ class Health(IntEnum):
 
 @dataclass(frozen=True)
 class HealthInputs:
-    """What is known of one node; None where it has not told, or it cannot be known yet.
+    """The inputs of :func:`assess` for one node; None where unknown.
 
-    ``status`` is whether it has told any at all. ``loss`` and ``ranging`` are shares over the last
-    half minute, ``exchanges`` the number that the latter is of. ``missed_ticks`` and
-    ``refused_frames`` count within that time.
+    ``status`` says whether a status report has arrived. ``loss`` and ``ranging`` are fractions over
+    the last half minute, ``exchanges`` the number of exchanges in ``ranging``. ``missed_ticks``
+    and ``refused_frames`` are counts within that time.
     """
 
     silent_s: float
@@ -73,9 +73,9 @@ class HealthInputs:
     free_stack_bytes: int | None = None
 
 
-def assess(figures: HealthInputs) -> tuple[Health, list[str]]:
-    """Colour and its reasons, the worst first; a green node has none."""
-    reasons = sorted(_reasons(figures), key=lambda reason: -reason[0])
+def assess(inputs: HealthInputs) -> tuple[Health, list[str]]:
+    """Return the colour and its reasons, the worst first; a green node has none."""
+    reasons = sorted(_reasons(inputs), key=lambda reason: -reason[0])
     worst = max((colour for colour, _ in reasons), default=Health.GREEN)
     return worst, [words for _, words in reasons]
 
@@ -89,7 +89,7 @@ def _reasons(f: HealthInputs) -> Iterator[tuple[Health, str]]:
     if f.imu is False:
         yield red, "inertial sensor missing"
     if f.loss is not None and f.loss > LOSS_YELLOW:
-        yield (red if f.loss > LOSS_RED else yellow), f"{100 * f.loss:.0f} % of its frames lost"
+        yield (red if f.loss > LOSS_RED else yellow), f"{100 * f.loss:.0f} % of frames lost"
     # 0: this board does not measure it.
     if f.battery_v and f.battery_v < BATTERY_YELLOW_V:
         yield (red if f.battery_v < BATTERY_RED_V else yellow), f"supply {f.battery_v:.2f} V"
@@ -103,21 +103,21 @@ def _reasons(f: HealthInputs) -> Iterator[tuple[Health, str]]:
         if there is False:
             yield yellow, f"{what} missing"
     if f.beacon is False:
-        yield yellow, "hears no beacon"
+        yield yellow, "receives no beacon"
     if (
         f.ranging is not None
-        and f.exchanges >= LEAST_EXCHANGES
+        and f.exchanges >= MIN_EXCHANGES
         and f.ranging < RANGING_YELLOW
         and f.pozyx is not False
     ):
-        yield yellow, f"{100 * f.ranging:.0f} % of its rangings succeed"
+        yield yellow, f"{100 * f.ranging:.0f} % of rangings succeed"
     if f.neighbours == 0 and (f.team or 0) > 1:
-        yield yellow, "ranges nobody"
+        yield yellow, "no peer in range"
     if f.rssi_dbm is not None and f.rssi_dbm < RSSI_YELLOW_DBM:
         yield yellow, f"weak radio ({f.rssi_dbm:.0f} dBm)"
     if f.missed_ticks > 0:
         yield yellow, f"{f.missed_ticks} ticks missed"
     if f.refused_frames > 0:
-        yield yellow, f"{f.refused_frames} forged or repeated frames refused"
-    if f.free_stack_bytes is not None and f.free_stack_bytes < LEAST_STACK_BYTES:
+        yield yellow, f"{f.refused_frames} forged or repeated frames rejected"
+    if f.free_stack_bytes is not None and f.free_stack_bytes < MIN_STACK_BYTES:
         yield yellow, f"{f.free_stack_bytes} bytes of stack left"

@@ -1,4 +1,4 @@
-"""A team watched: what each node and its link have told, newest and over the last half minute."""
+"""What each node and its link report: the newest values, and counts over the last half minute."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FLAGS = {
 
 
 class WindowedCount:
-    """A count that wraps at 16 bits and begins anew with a boot: its growth within the window."""
+    """Growth within the window of a count that wraps at 16 bits and restarts with a boot."""
 
     def __init__(self, modulus: int = 65536) -> None:
         self._modulus = modulus
@@ -33,18 +33,18 @@ class WindowedCount:
         self._growth: deque[tuple[float, int]] = deque()
 
     def update(self, time_s: float, boot: int, value: int) -> None:
-        """The count was ``value`` at ``time_s`` in that boot."""
+        """Add the count's ``value`` at ``time_s`` in that boot."""
         if self._newest is not None and self._newest[0] == boot:
             grown = (value - self._newest[1]) % self._modulus
         else:
-            # Before its first report nothing is known of a node that runs already; a new boot's
-            # count began at zero.
+            # The count of a node that already runs is unknown before its first report; a new
+            # boot's count starts at zero.
             grown = 0 if self._newest is None else value
         self._newest = (boot, value)
         self._growth.append((time_s, grown))
 
     def within(self, now_s: float) -> int:
-        """Growth within the window that ends at ``now_s``."""
+        """Return the growth within the window that ends at ``now_s``."""
         while self._growth and self._growth[0][0] < now_s - WINDOW_S:
             self._growth.popleft()
         return sum(grown for _, grown in self._growth)
@@ -52,7 +52,7 @@ class WindowedCount:
 
 @dataclass
 class NodeMonitor:
-    """One node as watched."""
+    """The state of one node."""
 
     node: int
     boot: int = 0
@@ -65,35 +65,35 @@ class NodeMonitor:
     _counters: dict[str, WindowedCount] = field(default_factory=dict)
 
     def counted(self, name: str, now_s: float) -> int:
-        """Growth of one of the status's counts within the window."""
+        """Return the growth of one of the status's counts within the window."""
         counter = self._counters.get(name)
         return 0 if counter is None else counter.within(now_s)
 
     def add_status(self, now_s: float, name: str, value: float) -> None:
-        """Take in one figure of a status report."""
+        """Add one value of a status report."""
         self.status[name] = value
         if name in _COUNTS:
             counter = self._counters.setdefault(name, WindowedCount())
             counter.update(now_s, self.boot, int(value))
 
     def add_link(self, now_s: float, received: int, lost: int) -> None:
-        """Take in how many frames of it have come and how many were lost, since the beginning."""
+        """Add the total numbers of frames received and lost."""
         self.received, self.lost = received, lost
         self.heard_s = now_s
         self._frames.append((now_s, received, lost))
 
     def firmware(self) -> str | None:
-        """Version of the firmware; None before the first status."""
+        """Return the firmware's version; None before the first status."""
         parts = [self.status.get(f"firmware_{part}") for part in ("major", "minor", "patch")]
         return ".".join(f"{p:.0f}" for p in parts if p is not None) if None not in parts else None
 
     def reset_cause(self) -> str | None:
-        """Why it started; None before the first status."""
+        """Return the cause of the last reset; None before the first status."""
         cause = self.status.get("reset_cause")
         return None if cause is None else wire.ResetCause(int(cause)).name.lower()
 
     def loss(self, now_s: float) -> float | None:
-        """Share of its frames that were lost within the window; None where there were none."""
+        """Return the fraction of frames lost within the window; None without frames."""
         frames = self._frames
         while len(frames) > 1 and frames[1][0] < now_s - WINDOW_S:
             frames.popleft()
@@ -103,23 +103,23 @@ class NodeMonitor:
         return max(lost, 0) / (received + lost) if received + lost > 0 else None
 
     def ranging(self, now_s: float) -> tuple[float | None, int]:
-        """Share of the ranging exchanges within the window that succeeded, and their number."""
+        """Return the successful fraction of ranging exchanges in the window, and their number."""
         good = self.counted("ranging_successes", now_s)
-        tried = good + self.counted("ranging_failures", now_s)
-        return (good / tried if tried else None), tried
+        attempted = good + self.counted("ranging_failures", now_s)
+        return (good / attempted if attempted else None), attempted
 
     def flag(self, flag: wire.Health) -> bool | None:
-        """One of the status's health flags; None where the node has not told."""
+        """Return one of the status's health flags; None before the first status."""
         value = self.status.get("health")
         return None if value is None else bool(int(value) & flag)
 
     def health_inputs(self, now_s: float) -> HealthInputs:
-        """What :func:`relpos.nodes.health.assess` judges by."""
+        """Return the inputs of :func:`relpos.nodes.health.assess`."""
         status = self.status
-        share, tried = self.ranging(now_s)
+        success, attempted = self.ranging(now_s)
         cause = status.get("reset_cause")
 
-        def whole(name: str) -> int | None:
+        def integer(name: str) -> int | None:
             return int(status[name]) if name in status else None
 
         return HealthInputs(
@@ -128,30 +128,30 @@ class NodeMonitor:
             loss=self.loss(now_s),
             rssi_dbm=self.rssi_dbm,
             battery_v=status.get("battery_v"),
-            ranging=share,
-            exchanges=tried,
-            neighbours=whole("neighbours"),
-            team=whole("team"),
+            ranging=success,
+            exchanges=attempted,
+            neighbours=integer("neighbours"),
+            team=integer("team"),
             uptime_s=status.get("uptime_s"),
             unwanted_start=None if cause is None else UNWANTED.get(wire.ResetCause(int(cause))),
             missed_ticks=self.counted("missed_ticks", now_s),
             refused_frames=self.counted("refused_frames", now_s),
-            free_stack_bytes=whole("free_stack_bytes"),
+            free_stack_bytes=integer("free_stack_bytes"),
             **{name: self.flag(flag) for name, flag in _FLAGS.items()},
         )
 
     def health(self, now_s: float) -> tuple[Health, list[str]]:
-        """Its colour and why."""
+        """Return the node's colour and its reasons."""
         return assess(self.health_inputs(now_s))
 
 
 class TeamMonitor:
-    """All nodes that are heard; feed it what the link yields."""
+    """All nodes that are heard."""
 
     def __init__(self) -> None:
         self.nodes: dict[int, NodeMonitor] = {}
         self.foreign_frames = 0
-        """Frames under another key than ours."""
+        """Frames under another key."""
 
     def update(self, now_s: float, decoder: Decoder, observations: Iterable[Observation]) -> None:
         """Take in what has just arrived, at ``now_s`` on the clock of the views."""
@@ -168,7 +168,7 @@ class TeamMonitor:
         self._statuses(now_s, observations)
 
     def update_without_link(self, now_s: float, observations: Iterable[Observation]) -> None:
-        """Like :meth:`update` where only observations were kept: of the link nothing is known."""
+        """Like :meth:`update` for recorded observations, without a link."""
         observations = list(observations)
         for observation in observations:
             monitor = self.nodes.get(observation.node)
@@ -183,12 +183,12 @@ class TeamMonitor:
                 self.nodes[observation.node].add_status(now_s, observation.name, observation.value)
 
     def rows(self, now_s: float) -> list[Mapping[str, object]]:
-        """One row a node, by id: plain values for tables and JSON."""
+        """Return one row a node, by id: plain values for tables and JSON."""
         rows: list[Mapping[str, object]] = []
         for node in sorted(self.nodes):
             monitor = self.nodes[node]
             health, reasons = monitor.health(now_s)
-            share, tried = monitor.ranging(now_s)
+            success, attempted = monitor.ranging(now_s)
             rows.append(
                 {
                     "node": node,
@@ -204,8 +204,8 @@ class TeamMonitor:
                     "received": monitor.received,
                     "lost": monitor.lost,
                     "seen_s": round(now_s - monitor.heard_s, 3),
-                    "ranging": share,
-                    "exchanges": tried,
+                    "ranging": success,
+                    "exchanges": attempted,
                     "key_set": monitor.flag(wire.Health.KEY_SET),
                     "range_offset_m": monitor.status.get("range_offset_m"),
                     "neighbours": monitor.status.get("neighbours"),

@@ -48,9 +48,9 @@ STATIC = Path(__file__).parent / "static"
 PING_S = 2.0
 ANSWER_S = 5.0
 """A session that does not answer a request for so long is told to the phone, which asks again."""
-MOST_LINE_BYTES = 1 << 26
-MOST_BODY_BYTES = 1 << 20
-MOST_ITEMS = 2000
+MAX_LINE_BYTES = 1 << 26
+MAX_BODY_BYTES = 1 << 20
+MAX_ITEMS = 2000
 """Presses, or headings, of one request."""
 COOKIE_S = 7 * 24 * 3600
 
@@ -383,8 +383,8 @@ async def _body(request: Request) -> dict[str, Any]:
     data = b""
     async for part in request.stream():
         data += part
-        if len(data) > MOST_BODY_BYTES:
-            raise BadRequestError(f"more than {MOST_BODY_BYTES} bytes")
+        if len(data) > MAX_BODY_BYTES:
+            raise BadRequestError(f"more than {MAX_BODY_BYTES} bytes")
     try:
         body = json.loads(data)
     except ValueError:
@@ -428,8 +428,8 @@ def _items(body: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
     items = body.get(name)
     if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
         raise BadRequestError(f"{name}: not a list of objects")
-    if len(items) > MOST_ITEMS:
-        raise BadRequestError(f"{name}: more than {MOST_ITEMS} at once")
+    if len(items) > MAX_ITEMS:
+        raise BadRequestError(f"{name}: more than {MAX_ITEMS} at once")
     return items
 
 
@@ -460,7 +460,7 @@ def run(config: ServerConfig) -> None:
 
 
 async def _serve(config: ServerConfig) -> None:
-    lines, out = await asyncio.open_connection(sock=config.channel, limit=MOST_LINE_BYTES)
+    lines, out = await asyncio.open_connection(sock=config.channel, limit=MAX_LINE_BYTES)
     session = SessionProxy(lines, out)
     with _certificate_files(config.access) as files:
         uvicorn_config = uvicorn.Config(

@@ -22,7 +22,7 @@ HEADING_KNOWN_RAD = math.radians(45.0)
 """With a heading worse than this, left and right of somebody would be a guess."""
 SPANS_M = (5.0, 7.5, 10.0, 15.0, 20.0, 30.0, 50.0, 75.0, 100.0, 150.0, 200.0, 300.0, 500.0, 1000.0)
 """How far the map reaches from its middle: steps, so that it does not breathe with every step."""
-LEAST_MAP_ROWS = 6
+MIN_MAP_ROWS = 6
 BESIDE_COLUMNS = 118
 """From this width on the map stands beside the table."""
 TABLE_COLUMNS = 79
@@ -87,7 +87,7 @@ def page(view: TeamView, options: RenderOptions) -> list[Text]:
             lines.append(line + drawn[k] if k < len(drawn) else line)
     else:
         wanted = len(view.people) + 1
-        rows = left if not options.map else min(wanted, max(left - LEAST_MAP_ROWS, 4))
+        rows = left if not options.map else min(wanted, max(left - MIN_MAP_ROWS, 4))
         if options.table:
             lines += _table(view, me, options, rows)
         left = options.rows - len(lines) - 1

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from relpos.fusion.estimator import Estimate
 
 RESTART_AFTER_S = 1.0
-MOST_WAITING_BYTES = 1 << 24
+MAX_WAITING_BYTES = 1 << 24
 """A serving process that leaves so much unread is stuck, and started again."""
 SHOWN_STATUSES = (NodeStatus.OK, NodeStatus.STALE)
 """Only what is believed leaves a track."""
@@ -166,7 +166,7 @@ class WebView(Sink):
         try:
             self._send()
             self._receive()
-            stuck = self._out_bytes > MOST_WAITING_BYTES
+            stuck = self._out_bytes > MAX_WAITING_BYTES
         except OSError:
             stuck = True
         if stuck and time.monotonic() > self._started_s + RESTART_AFTER_S:
