@@ -66,7 +66,7 @@ def python_names(title: str) -> list[str]:
 
 
 ROOMS = {path.stem for path in PACKAGE.iterdir()}
-NAMES = sorted({name for lines in walks().values() for names in lines for name in names})
+NAMES = sorted({n for lines in walks().values() for names in lines for n in names if " " not in n})
 
 
 def exists(name: str) -> bool:
