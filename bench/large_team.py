@@ -23,7 +23,8 @@ import numpy.typing as npt
 from crowd import Crowd, CrowdSettings, simulate_crowd
 from relpos.evaluation.metrics import aligned_squared_distances
 from relpos.fusion.compiled import compiled
-from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter, RangeModel
+from relpos.fusion.large_teams.kernels import RangeModel
+from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

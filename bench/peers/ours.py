@@ -86,7 +86,8 @@ class Strips:
     """The filter for large teams: 3 states a user, noise told."""
 
     def __init__(self, case: Case, seed: int) -> None:
-        from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter, RangeModel
+        from relpos.fusion.large_teams.kernels import RangeModel
+        from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter
 
         longest = max(float(r.range_m.max()) for r in case.ranges if r is not None)
         self.filter = NeighbourhoodFilter(1.05 * longest, RangeModel(case.sigma_range_m))

@@ -77,9 +77,11 @@ class SwitchingEstimator:
 
     def _large_team(self, priors: Sequence[Prior], start_s: float = 0.0) -> Rewinder:
         initialiser = HypothesisInitialiser(seed=self._seed, large_team=True)
-        return large_teams.make(
-            priors, initialiser, self._settings, self._seed, self._mountings, start_s
+        s = self._settings
+        settings = large_teams.LargeTeamSettings(
+            s.outliers_short, s.jump_m, s.jump_rad, s.reorder_s, s.max_lag_s, s.late_s
         )
+        return large_teams.make(priors, initialiser, settings, self._mountings, start_s)
 
     def _is_large(self) -> bool:
         """Whether the team is a large one of which enough is located to continue from."""

@@ -1,4 +1,4 @@
-"""Large teams through the public interface: known and unknown starts, growing, disturbed."""
+"""Large teams through the public interface."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import pytest
 from crowd import Crowd, CrowdSettings, simulate_crowd
 from relpos import fusion
 from relpos.evaluation import metrics
-from relpos.fusion import Estimate, NodeStatus
-from relpos.fusion import switching as growing
+from relpos.fusion import Estimate, NodeStatus, switching
 from relpos.fusion.large_teams.estimator import LargeTeam
 from relpos.fusion.models.motion_variances import ALONG, WHITE
 from relpos.measurements import Measurement, Prior, Range
@@ -74,7 +73,7 @@ def test_pairs_in_reach_are_listed_in_order_and_no_others(crowd: Crowd) -> None:
     assert not far & set(listed)
 
 
-def test_users_without_a_start_join_where_they_are(crowd: Crowd) -> None:
+def test_nodes_without_a_prior_join_at_their_true_position(crowd: Crowd) -> None:
     known = [p for p in crowd.priors() if p.node % 6]
     estimates, made = estimates_of(known, crowd.measurements())
     first, last = estimates[1], estimates[-1]
@@ -89,7 +88,7 @@ def test_users_without_a_start_join_where_they_are(crowd: Crowd) -> None:
     assert made.counters()["joined"] == len(joined)
 
 
-def test_who_is_elsewhere_than_told_is_doubted_and_found(crowd: Crowd) -> None:
+def test_a_node_that_is_elsewhere_than_its_prior_is_inflated_and_found(crowd: Crowd) -> None:
     wrong = [replace(p, x_m=p.x_m + (6.0 if p.node == 20 else 0.0)) for p in crowd.priors()]
     estimates, made = estimates_of(wrong, crowd.measurements())
     node = next(n for n in estimates[-1].nodes if n.node == 20)
@@ -98,7 +97,7 @@ def test_who_is_elsewhere_than_told_is_doubted_and_found(crowd: Crowd) -> None:
     assert made.counters()["jumps"] >= 1
 
 
-def test_ranges_round_corners_do_little_harm() -> None:
+def test_ranges_without_line_of_sight_do_little_harm() -> None:
     late = simulate_crowd(replace(CROWD, nlos_probability=0.2), 7)
     estimates, made = estimates_of(late.priors(), late.measurements())
     rms, nees = rms_and_nees(late, estimates)
@@ -107,7 +106,7 @@ def test_ranges_round_corners_do_little_harm() -> None:
     assert made.counters()["ranges_distrusted"] > 0.1 * len(late.range_m)
 
 
-def test_what_comes_late_is_put_in_its_place(crowd: Crowd) -> None:
+def test_late_ranges_give_the_estimates_of_ranges_in_time(crowd: Crowd) -> None:
     measurements = crowd.measurements()
     late = [m for m in measurements if isinstance(m, Range) and m.time_s == 20.0]
     rest = [m for m in measurements if m not in late]
@@ -119,10 +118,10 @@ def test_what_comes_late_is_put_in_its_place(crowd: Crowd) -> None:
         assert a.x_m == pytest.approx(b.x_m, abs=1e-9)
 
 
-def test_a_team_that_grows_large_goes_on_from_where_everybody_was(
+def test_a_team_that_becomes_large_continues_from_its_last_poses(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(growing, "LARGE_TEAM", 8)
+    monkeypatch.setattr(switching, "LARGE_TEAM", 8)
     crowd = simulate_crowd(CrowdSettings(nodes=12, neighbours=9, seconds=24), 3)
     few = 6
     measurements = [
@@ -148,25 +147,25 @@ def test_the_same_measurements_give_the_same_estimates(crowd: Crowd) -> None:
     assert one == two
 
 
-def test_who_steps_unevenly_is_found_out(crowd: Crowd) -> None:
+def test_the_noise_of_each_nodes_steps_is_learned(crowd: Crowd) -> None:
     made = fusion.make("bank", crowd.priors(), {}, 0)
     for m in crowd.measurements():
         made.process(m)
-    assert isinstance(made, growing.SwitchingEstimator)
+    assert isinstance(made, switching.SwitchingEstimator)
     assert isinstance(made.estimator.core, LargeTeam)
-    level = made.estimator.core._levels.level
+    factor = made.estimator.core._components.factor
     # The crowd's six levels of step noise are 5 10 20 10 15 10 % in turn, 9 % is the base's.
     steady, uneven = (
-        np.median(level[0::6, ALONG]),
-        np.median(level[2::6, ALONG]),
+        np.median(factor[0::6, ALONG]),
+        np.median(factor[2::6, ALONG]),
     )
     assert uneven > 2.0 * steady
     assert uneven > 1.3
     # Nobody's heading wanders on a straight walk here.
-    assert np.median(level[:, WHITE]) < 0.2
+    assert np.median(factor[:, WHITE]) < 0.2
 
 
-def test_a_large_team_of_whom_nobody_is_located_finds_itself() -> None:
+def test_a_large_team_without_priors_is_located() -> None:
     crowd = simulate_crowd(CrowdSettings(nodes=60, seconds=90), 6)
     estimates, made = estimates_of([], crowd.measurements())
     assert len(estimates[9].nodes) == 60  # who is not found yet is listed as such

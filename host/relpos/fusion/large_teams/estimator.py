@@ -1,12 +1,8 @@
-"""The default estimator's shape for large teams: one joint filter, strip by strip.
+"""The estimator for large teams: the sparse filter behind measurements and estimates.
 
-What :class:`~relpos.fusion.bank.estimator.Bank` is for a few people, :class:`LargeTeam` is for
-many: with
-dozens of users ranging their neighbours the picture is rarely ambiguous, and one hypothesis over
-all (:mod:`relpos.fusion.large_teams.sparse_filter`) takes the place of many. A node whose
-initial pose is unknown joins once the initialiser has found it; what is doubted is widened.
-
-Of so many users not every pair is listed: ``Estimate.pairs`` holds those in reach of each other.
+It learns the noise of ranges and motion, inflates nodes whose ranges contradict their poses, and
+lets nodes join that the initialiser has found. ``Estimate.pairs`` holds the pairs within reach of
+each other, not all.
 """
 
 from __future__ import annotations
@@ -21,7 +17,6 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from relpos.errors import RelposError
-from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.estimator import (
     ANY_ANGLE_RAD,
     Estimate,
@@ -33,8 +28,9 @@ from relpos.fusion.estimator import (
     unlocated,
 )
 from relpos.fusion.initial_poses import Found, Initialiser
-from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter, RangeModel
-from relpos.fusion.large_teams.variance_components import TeamLevels
+from relpos.fusion.large_teams.kernels import RangeModel
+from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter
+from relpos.fusion.large_teams.variance_components import VarianceComponents
 from relpos.fusion.models.motion import reported_sigmas
 from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_variances
 from relpos.fusion.models.ranging import Mounting
@@ -45,55 +41,95 @@ from relpos.measurements import Height, Prior, Range
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-OUTLIERS, OUTLIER_M = 0.01, 3.0
-"""A large team's share of outliers is not learned, so it is no setting: 0.05 and 5 m cost a crowd
-0.002 m of 0.12."""
+
+@dataclass(frozen=True, slots=True)
+class LargeTeamSettings:
+    """The bank's settings that a large team uses, too (``fusion/bank/settings.py``)."""
+
+    outliers_short: float
+    jump_m: float
+    jump_rad: float
+    reorder_s: float
+    max_lag_s: float
+    late_s: float
+
+
+def make(
+    priors: Sequence[Prior],
+    initialiser: Initialiser,
+    settings: LargeTeamSettings,
+    mountings: Mapping[int, Mounting],
+    start_s: float = 0.0,
+) -> Rewinder:
+    """Return the estimator for a large team; motion counts from ``start_s``.
+
+    ``initialiser`` seeks the nodes without a full prior.
+    """
+    timeline = Timeline(
+        [p.node for p in priors],
+        start_s=start_s,
+        reorder_s=settings.reorder_s,
+        max_lag_s=settings.max_lag_s,
+    )
+    return Rewinder(LargeTeam(priors, initialiser, settings, mountings), timeline, settings.late_s)
+
 
 SIGMA_R_M = 0.3
-"""Range sigma to begin with; a few instants of many ranges tell the true one."""
+"""Range sigma to begin with; a few instants of many ranges determine the true one."""
 
-SIGMA_R_WORTH = 50.0
+SIGMA_R_COUNT = 50.0
 SIGMA_R_MEMORY = 20_000.0
 """The beginning counts as so many ranges; so many are remembered."""
+
+OUTLIERS, OUTLIER_M = 0.01, 3.0
+"""A large team's fraction of outliers is not learned: 0.05 and 5 m cost a crowd 0.002 m of
+0.12."""
+
+
+ACROSS = 0.1
+"""Variance of a displacement across its direction relative to that along it."""
 
 REACH_SLACK = 1.05
 """Strips are this much wider than the longest range of the first instant."""
 
-DOUBTED = 0.5
-"""Share of a node's latest ranges that has to be odd before the node is doubted instead."""
+REACH_FADE = 0.999
+"""The reach by which pairs are listed shrinks so slowly where ranges become shorter."""
+
+LEAST_REACH_M = 5.0
+"""Nodes nearer than this are listed as pairs, however short the ranges are."""
+
+MOSTLY_OUTLYING = 0.5
+"""From this fraction of outliers on a node's pose, and not its ranges, is taken to be wrong."""
 
 FORGET = 0.3
-"""Weight of an instant in that share: at a range every 2 s, three instants or so."""
-
-_TWO_PI = 2.0 * math.pi
+"""Weight of an instant in that fraction: at a range every 2 s, three instants or so."""
 
 
 @dataclass(slots=True)
 class LargeTeam:
-    """The filter for dozens to thousands of users; :func:`make` returns the estimator."""
+    """The core of the estimator (:class:`~relpos.fusion.rewind.Core`)."""
 
     priors: Sequence[Prior]
     initialiser: Initialiser
-    settings: BankSettings = field(default_factory=BankSettings)
-    seed: int = 0
-    mountings: Mapping[int, Mounting] = field(default_factory=dict)
+    settings: LargeTeamSettings
+    mountings: Mapping[int, Mounting]
     filter: NeighbourhoodFilter = field(init=False)
     _nodes: list[int] = field(default_factory=list)
     _row: dict[int, int] = field(default_factory=dict)
     _known: dict[int, Presence] = field(default_factory=dict)
     _pending: list[Advance] = field(default_factory=list)
     _own: Counter[str] = field(default_factory=Counter)
-    _odd: Floats = field(default_factory=lambda: np.empty(0))
-    _levels: TeamLevels = field(default_factory=TeamLevels)
-    _sigma_worth: float = SIGMA_R_WORTH
+    _outlying: Floats = field(default_factory=lambda: np.empty(0))
+    """Fraction of outliers in each node's latest ranges."""
+    _components: VarianceComponents = field(default_factory=VarianceComponents)
+    _sigma_count: float = SIGMA_R_COUNT
     _reach_m: float = 0.0
     _moved: bool = False
     _ranges_used: int = 0
     _epoch_s: float = -math.inf
 
     def __post_init__(self) -> None:
-        s = self.settings
-        model = RangeModel(SIGMA_R_M, OUTLIERS, OUTLIER_M, s.outliers_short)
+        model = RangeModel(SIGMA_R_M, OUTLIERS, OUTLIER_M, self.settings.outliers_short)
         self.filter = NeighbourhoodFilter(math.inf, model)
         known: list[Prior] = []
         for p in sorted(self.priors, key=lambda p: p.node):
@@ -120,18 +156,20 @@ class LargeTeam:
         match step:
             case Advance():
                 self._moved = True
-                self._meet(step.node)
-                known = self._known[step.node]
-                known.received(step.time_s)
+                self._presence(step.node).received(step.time_s)
                 self._pending.append(step)
             case Ranging():
-                self._advance()
-                self._range(step)
+                self._predict()
+                self._use_ranges(step)
+            case Sensed(measurement=Height() as height):
+                known = self._presence(height.node)
+                known.height_m, known.sigma_height_m = height.height_m, height.sigma_m or 0.0
             case Sensed():
-                self._sense(step)
+                self._presence(step.measurement.node)
+                self._own["headings_unused"] += 1
             case Epoch():
-                self._advance()
-                self._admit(self.initialiser.find(step.time_s))
+                self._predict()
+                self._add_found(self.initialiser.find(step.time_s))
                 return self._estimate(step.time_s)
         return None
 
@@ -148,35 +186,37 @@ class LargeTeam:
         refuse_unranged(self._ranges_used, counters)
 
     def counters(self) -> Counter[str]:
-        """Count everything perturbed or joined."""
+        """Count everything inflated or found."""
         return self._own + self.filter.counters + self.initialiser.counters
 
-    # -- users ---------------------------------------------------------------------------------
+    # -- nodes ---------------------------------------------------------------------------------
 
-    def _meet(self, node: int) -> None:
-        if node not in self._known:
-            self._known[node] = Presence()
+    def _presence(self, node: int) -> Presence:
+        return self._known.setdefault(node, Presence())
+
+    def _height(self, node: int) -> float:
+        mounting = self.mountings.get(node)
+        tag_m = 0.0 if mounting is None or mounting.height_m is None else mounting.height_m
+        return tag_m + self._known[node].height_m
 
     def _add(self, nodes: Sequence[int], poses: Floats, covariances: Floats) -> None:
-        if not len(nodes):
+        if not nodes:
             return
         self.filter.add(poses, covariances)
         for node in nodes:
             self._row[node] = len(self._nodes)
             self._nodes.append(node)
-            worn = self.mountings.get(node)
-            if worn is not None and worn.antenna_offset_m is not None:
-                self.filter.antenna_m[self._row[node]] = worn.antenna_offset_m
-        self._odd = np.append(self._odd, np.zeros(len(nodes)))
-        self._levels.add(poses)
+            mounting = self.mountings.get(node)
+            if mounting is not None and mounting.antenna_offset_m is not None:
+                self.filter.antenna_m[self._row[node]] = mounting.antenna_offset_m
+        self._outlying = np.append(self._outlying, np.zeros(len(nodes)))
+        self._components.add(poses)
 
     # -- motion --------------------------------------------------------------------------------
 
-    def _advance(self) -> None:
-        """Work off the displacements since the last time."""
+    def _predict(self) -> None:
+        """Apply the displacements since the last call."""
         steps, self._pending = self._pending, []
-        if not steps:
-            return
         for a in steps:
             if a.node not in self._row:
                 self.initialiser.advance(a)
@@ -185,85 +225,72 @@ class LargeTeam:
             return
         rows = np.array([self._row[a.node] for a in steps], dtype=np.int64)
         moves = np.array([(a.dx_m, a.dy_m, a.dtheta_rad, a.duration_s) for a in steps])
-        told = np.array([reported_sigmas(a) for a in steps])
-        self.filter.predict(rows, self._with_noise(rows, moves, told))
-
-    def _with_noise(self, rows: Indices, moves: Floats, told: Floats) -> Floats:
-        """Displacements and their sigmas (E, 6) from bases of noise times the nodes' levels."""
+        reported = np.array([reported_sigmas(a) for a in steps])
         dx, dy, turn, _ = moves.T
-        variance = base_variances(moves, told) * self._levels.level[rows]
-        result = np.empty((len(rows), 6))
-        result[:, :3] = moves[:, :3]
-        # Along the way, and a tenth of that across: both as the frame of the body sees them.
-        self._levels.turn(rows, turn)
-        way = np.maximum(dx * dx + dy * dy, 1e-12)
+        variance = base_variances(moves, reported) * self._components.factor[rows]
+        self._components.add_turns(rows, turn)
+        # Along the path, and a tenth of that across, both in the frame of the body.
+        square = np.maximum(dx * dx + dy * dy, 1e-12)
         along = variance[:, ALONG]
-        result[:, 3] = np.sqrt(along * (dx * dx + ACROSS * dy * dy) / way)
-        result[:, 4] = np.sqrt(along * (dy * dy + ACROSS * dx * dx) / way)
-        result[:, 5] = np.sqrt(variance[:, TURN] + variance[:, WHITE])
-        return result
+        sigma_x = np.sqrt(along * (dx * dx + ACROSS * dy * dy) / square)
+        sigma_y = np.sqrt(along * (dy * dy + ACROSS * dx * dx) / square)
+        sigma_turn = np.sqrt(variance[:, TURN] + variance[:, WHITE])
+        self.filter.predict(rows, np.column_stack([moves[:, :3], sigma_x, sigma_y, sigma_turn]))
 
     # -- ranges --------------------------------------------------------------------------------
 
-    def _range(self, step: Ranging) -> None:
+    def _use_ranges(self, step: Ranging) -> None:
         for r in step.ranges:
             for node in (r.node, r.peer):
-                self._meet(node)
-                known = self._known[node]
-                known.received(step.time_s)
+                self._presence(node).received(step.time_s)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
         if located:
-            self._weigh(located)
+            self._update(located)
         self._seek(step)
 
-    def _weigh(self, ranges: Sequence[Range]) -> None:
+    def _update(self, ranges: Sequence[Range]) -> None:
         node = np.array([self._row[r.node] for r in ranges], dtype=np.int64)
         peer = np.array([self._row[r.peer] for r in ranges], dtype=np.int64)
         measured = np.array([r.range_m for r in ranges])
-        rise = np.array([self._height(r.peer) - self._height(r.node) for r in ranges])
-        flat = np.sqrt(np.maximum(measured**2 - rise**2, 0.0))
+        height = np.array([self._height(r.peer) - self._height(r.node) for r in ranges])
+        horizontal = np.sqrt(np.maximum(measured**2 - height**2, 0.0))
         self._ranges_used += len(ranges)
         f = self.filter
         if not math.isfinite(f.width_m):
             f.widen(float(measured.max()) * REACH_SLACK)
         self._reach_m = max(self._reach_m * REACH_FADE, float(measured.max()))
         before, prior = f.pose.copy(), f.marginals()
-        trust, _ = f.update(node, peer, flat)
-        self._levels.learn(before, prior, f.pose, f.marginals(), np.concatenate([node, peer]))
-        self._own["ranges_distrusted"] += int((trust < 0.5).sum())
-        self._learn_sigma(node, peer, flat, trust)
-        self._doubt(node, peer, trust)
+        inlier = f.update(node, peer, horizontal)
+        both = np.concatenate([node, peer])
+        self._components.update(before, prior, f.pose, f.marginals(), both)
+        self._own["ranges_distrusted"] += int((inlier < 0.5).sum())
+        self._learn_sigma(node, peer, horizontal, inlier)
+        self._inflate(both, np.concatenate([inlier, inlier]))
 
-    def _learn_sigma(self, node: Indices, peer: Indices, measured: Floats, trust: Floats) -> None:
-        """Learn the range sigma by expectation and maximisation, as it goes.
+    def _learn_sigma(self, node: Indices, peer: Indices, measured: Floats, inlier: Floats) -> None:
+        """Learn the range sigma by online expectation maximisation.
 
-        E |z - d|^2 after the ranges is the residual's square and what is still unsure of d.
+        E |z - d|^2 after the ranges is the residual's square plus what is still uncertain of d.
         """
-        spread = self.filter.antenna_spread(node, peer)
-        middle = np.sqrt(spread[0] ** 2 + spread[2])
-        square = (measured - middle) ** 2 + spread[1]
-        total, model = float(trust.sum()), self.filter.model
-        summed = model.sigma_m**2 * self._sigma_worth + float((trust * square).sum())
-        model.sigma_m = max(math.sqrt(summed / (self._sigma_worth + total)), 0.01)
-        self._sigma_worth = min(self._sigma_worth + total, SIGMA_R_MEMORY)
+        pairs, model = self.filter.antenna_pairs(node, peer), self.filter.model
+        square = (measured - np.sqrt(pairs[0] ** 2 + pairs[2])) ** 2 + pairs[1]
+        total = float(inlier.sum())
+        summed = model.sigma_m**2 * self._sigma_count + float((inlier * square).sum())
+        sigma_m = max(math.sqrt(summed / (self._sigma_count + total)), 0.01)
+        self.filter.model = model._replace(sigma_m=sigma_m)
+        self._sigma_count = min(self._sigma_count + total, SIGMA_R_MEMORY)
 
-    def _doubt(self, node: Indices, peer: Indices, trust: Floats) -> None:
-        """Widen nodes most of whose ranges are odd: they were carried, fell, or slipped."""
-        both, twice = np.concatenate([node, peer]), np.concatenate([trust, trust])
-        count = np.bincount(both, minlength=self._odd.size)
-        odd = np.bincount(both, weights=1.0 - twice, minlength=self._odd.size)
-        seen = count > 0
-        self._odd[seen] += FORGET * (odd[seen] / count[seen] - self._odd[seen])
-        doubted = np.flatnonzero((self._odd > DOUBTED) & (count >= 2))
-        if doubted.size:
-            self.filter.doubt(doubted, self.settings.jump_m, self.settings.jump_rad)
-            self._odd[doubted] = 0.0
-            self._own["jumps"] += int(doubted.size)
-
-    def _height(self, node: int) -> float:
-        worn = self.mountings.get(node)
-        tag_m = 0.0 if worn is None or worn.height_m is None else worn.height_m
-        return tag_m + self._known[node].height_m
+    def _inflate(self, rows: Indices, inlier: Floats) -> None:
+        """Inflate nodes most of whose ranges are outliers: carried nodes, odometry faults."""
+        count = np.bincount(rows, minlength=self._outlying.size)
+        outliers = np.bincount(rows, weights=1.0 - inlier, minlength=self._outlying.size)
+        some = count > 0
+        self._outlying[some] += FORGET * (outliers[some] / count[some] - self._outlying[some])
+        wrong = np.flatnonzero((self._outlying > MOSTLY_OUTLYING) & (count >= 2))
+        if wrong.size:
+            self.filter.inflate(wrong, self.settings.jump_m, self.settings.jump_rad)
+            self._outlying[wrong] = 0.0
+            self._own["jumps"] += int(wrong.size)
 
     # -- nodes that are not located ------------------------------------------------------------
 
@@ -286,7 +313,7 @@ class LargeTeam:
         self.initialiser.update(step.time_s, ranges, located, heights)
         self._ranges_used += len(ranges)
 
-    def _admit(self, found: Found | None) -> None:
+    def _add_found(self, found: Found | None) -> None:
         """Add the nodes whose poses have been found to the filter, each as one Gaussian."""
         if found is None:
             return
@@ -294,15 +321,6 @@ class LargeTeam:
         poses, covariances = (np.stack(each) for each in zip(*moments, strict=True))
         self._add(found.mixture.nodes, poses, covariances)
         self._own["joined"] += len(moments)
-
-    def _sense(self, step: Sensed) -> None:
-        self._meet(step.measurement.node)
-        if isinstance(step.measurement, Height):
-            known = self._known[step.measurement.node]
-            known.height_m = step.measurement.height_m
-            known.sigma_height_m = step.measurement.sigma_m or 0.0
-        else:
-            self._own["headings_unused"] += 1
 
     # -- estimates -----------------------------------------------------------------------------
 
@@ -323,7 +341,7 @@ class LargeTeam:
             x, y, heading = pose[row]
             nodes.append(
                 NodeEstimate(
-                    node, x, y, math.remainder(heading, _TWO_PI), xx, yy, xy,
+                    node, x, y, math.remainder(heading, 2.0 * math.pi), xx, yy, xy,
                     min(math.sqrt(hh), ANY_ANGLE_RAD), known.status, known.height_m,
                     known.sigma_height_m,
                 )
@@ -331,7 +349,7 @@ class LargeTeam:
         return Estimate(time_s, tuple(nodes), self._pairs())
 
     def _pairs(self) -> tuple[PairEstimate, ...]:
-        """Distance and bearing of the pairs in reach of each other, in the order of ids."""
+        """Return the pairs within reach of each other, in the order of ids."""
         if len(self._row) < 2:
             return ()
         ids = np.array(self._nodes)
@@ -341,40 +359,11 @@ class LargeTeam:
         swap = ids[near[:, 0]] > ids[near[:, 1]]
         near[swap] = near[swap][:, ::-1]
         near = near[np.lexsort((ids[near[:, 1]], ids[near[:, 0]]))]
-        spread = self.filter.spread(near[:, 0].astype(np.int64), near[:, 1].astype(np.int64))
-        distance, along, across, bearing = spread
+        near = near.astype(np.int64)
+        distance, along, across, bearing = self.filter.pairs(near[:, 0].copy(), near[:, 1].copy())
         sigma_bearing = np.minimum(np.sqrt(across) / np.maximum(distance, 1e-9), ANY_ANGLE_RAD)
         rows = zip(
             ids[near[:, 0]].tolist(), ids[near[:, 1]].tolist(), distance.tolist(),
             np.sqrt(along).tolist(), bearing.tolist(), sigma_bearing.tolist(), strict=True,
         )  # fmt: skip
         return tuple(PairEstimate(*row) for row in rows)
-
-
-def make(
-    priors: Sequence[Prior],
-    initialiser: Initialiser,
-    settings: BankSettings,
-    seed: int,
-    mountings: Mapping[int, Mounting],
-    start_s: float = 0.0,
-) -> Rewinder:
-    """Return the estimator for a large team; motion counts from ``start_s``."""
-    timeline = Timeline(
-        [p.node for p in priors],
-        start_s=start_s,
-        reorder_s=settings.reorder_s,
-        max_lag_s=settings.max_lag_s,
-    )
-    core = LargeTeam(priors, initialiser, settings, seed, mountings)
-    return Rewinder(core, timeline, settings.late_s)
-
-
-ACROSS = 0.1
-"""Variance of a displacement across its direction relative to that along it."""
-
-REACH_FADE = 0.999
-"""The reach by which pairs are listed shrinks so slowly where ranges become shorter."""
-
-LEAST_REACH_M = 5.0
-"""Who is nearer than this is listed, however short the ranges are."""

@@ -1,19 +1,15 @@
-"""Compiled loops of :mod:`relpos.fusion.large_teams.sparse_filter`: over nodes, ranges and pairs.
-
-The joint covariance stands in one buffer, strip after strip: block (k, k) of strip k and block
-(k, k + 1) between it and the next, each in columns (Fortran's order) over the states x of all its
-nodes, then y, then heading. ``at_diagonal[k]`` and ``at_next[k]`` say where they begin,
-``sizes[k]`` how many nodes the strip has; ``strip[i]`` and ``slot[i]`` say where node i stands.
-"""
+"""Compiled loops of the sparse filter over nodes, ranges and pairs."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.compiled import compiled
+from relpos.fusion.compiled import compiled, inlined
+from relpos.fusion.large_teams.layout import COVARIANCE, INFORMATION, Blocks, StripLayout
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -23,16 +19,16 @@ NEAREST_M = 1e-3
 
 
 @compiled
-def advance(
+def move(
     pose: Floats, lever: Floats, noise: Floats, variance: Floats, node: Indices, moved: Floats
 ) -> None:
     """Move nodes by pieces of reported displacements, one after the other.
 
     ``pose`` (N, 3) is moved in place. ``moved`` (E, 6): forward, left, turn and their standard
     deviations. The turn's noise enters before the displacement (people turn, then move). What the
-    covariance has to be changed by is gathered per node: ``lever`` (N, 2) is the derivative of
+    covariance has to be changed by is collected per node: ``lever`` (N, 2) is the derivative of
     the position by the heading of the last update, ``noise`` (N, 6) the covariance xx, xy, yy,
-    xh, yh, hh of what has been added since. ``variance`` (N,) is the heading's at the last update.
+    xh, yh, hh added since. ``variance`` (N,) is the heading's at the last update.
 
     A heading error e of variance v turns the displacement d: on average it is shorter by
     exp(-v/2), and varies along itself by d^2 (1 - exp(-v))^2 / 2, the second-order terms.
@@ -67,15 +63,12 @@ def advance(
 
 
 @compiled
-def pass_time(
-    covariance: Floats, at_diagonal: Indices, at_next: Indices, sizes: Indices,
-    members: Indices, first: Indices, lever: Floats, noise: Floats,
-) -> None:  # fmt: skip
-    """Bring the blocks up to the poses: P <- F P F^T + Q, F the levers, Q the noise.
+def propagate(covariance: Floats, layout: StripLayout, lever: Floats, noise: Floats) -> None:
+    """Bring the blocks up to the poses: P <- F P F^T + Q, F from the levers, Q the noise.
 
-    ``members`` are the nodes strip by strip, those of strip k from ``first[k]``. Levers and noise
-    are zero afterwards.
+    Levers and noise are zero afterwards.
     """
+    members, first, sizes, blocks = layout.members, layout.first, layout.sizes, layout.covariance
     for k in range(len(sizes)):
         n = sizes[k]
         m = 3 * n
@@ -83,7 +76,7 @@ def pass_time(
         for other in range(k, min(k + 2, len(sizes))):
             p = sizes[other]
             peers = members[first[other] : first[other + 1]]
-            start = at_diagonal[k] if other == k else at_next[k]
+            start = blocks.diagonal[k] if other == k else blocks.following[k]
             block = covariance[start : start + m * 3 * p].reshape(3 * p, m)
             # block[column, row]: first the rows of every column, then columns among each other.
             for column in range(3 * p):
@@ -112,15 +105,34 @@ def pass_time(
     noise[:] = 0.0
 
 
-@compiled
-def pair_spread(
-    covariance: Floats, at_diagonal: Indices, at_next: Indices, sizes: Indices,
-    strip: Indices, slot: Indices, pose: Floats, node: Indices, peer: Indices,
-) -> Floats:  # fmt: skip
-    """Of pairs (E,) the distance and the variances along and across the line between: (4, E).
+@inlined
+def entry(blocks: Blocks, layout: StripLayout, each: int, i: int, j: int) -> tuple[int, int, int]:
+    """Return where the matrix of nodes i and j stands in a buffer with ``each`` states a node.
 
-    The fourth row is the bearing of the peer. Pairs further apart than two strips count as
-    independent.
+    State a of i and state b of j meet at ``base + down * a + right * b``; base is -1 where the
+    strips of the two are not adjacent.
+    """
+    k, q = layout.strip[i], layout.strip[j]
+    n, p = layout.sizes[k], layout.sizes[q]
+    row, column = layout.slot[i], layout.slot[j]
+    base, down, right = -1, n, each * n * p
+    if k == q:
+        base = blocks.diagonal[k] + each * n * column + row
+    elif q == k + 1:
+        base = blocks.following[k] + each * n * column + row
+    elif k == q + 1:
+        base = blocks.following[q] + each * p * row + column
+        down, right = each * n * p, p
+    return base, down, right
+
+
+@compiled
+def pair_moments(
+    covariance: Floats, layout: StripLayout, pose: Floats, node: Indices, peer: Indices
+) -> Floats:
+    """Return distance, variances along and across the line, and bearing of pairs (E,): (4, E).
+
+    Nodes whose strips are not adjacent count as independent.
     """
     result = np.empty((4, len(node)))
     for e in range(len(node)):
@@ -132,26 +144,11 @@ def pair_spread(
             ux, uy = 1.0, 0.0
         xx = xy = yy = 0.0
         for one, two, sign in ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0)):
-            k, q = strip[one], strip[two]
-            start, height = 0, 3 * sizes[k]
-            row, column, turned = slot[one], slot[two], False
-            if k == q:
-                start = at_diagonal[k]
-            elif q == k + 1:
-                start = at_next[k]
-            elif k == q + 1:
-                start, height, turned = at_next[q], 3 * sizes[q], True
-                row, column = column, row
-            else:
-                continue
-            # Steps from x to y within rows and within columns.
-            down, right = sizes[k], sizes[q]
-            if turned:
-                down, right = right, down
-            base = start + height * column + row
-            xx += sign * covariance[base]
-            yy += sign * covariance[base + height * right + down]
-            xy += sign * 0.5 * (covariance[base + down] + covariance[base + height * right])
+            base, down, right = entry(layout.covariance, layout, COVARIANCE, one, two)
+            if base >= 0:
+                xx += sign * covariance[base]
+                yy += sign * covariance[base + down + right]
+                xy += sign * 0.5 * (covariance[base + down] + covariance[base + right])
         along = ux * ux * xx + 2.0 * ux * uy * xy + uy * uy * yy
         result[0, e] = distance
         result[1, e] = max(along, 0.0)
@@ -160,155 +157,127 @@ def pair_spread(
     return result
 
 
+class RangeModel(NamedTuple):
+    """Noise of all ranges, and their outliers."""
+
+    sigma_m: float = 0.1
+    outliers: float = 0.0
+    """Fraction of outliers."""
+    outlier_m: float = 3.0
+    outliers_short: float = 0.1
+    """Fraction of the outliers that are too short."""
+
+
 @compiled
-def gather(
-    spread: Floats, node: Indices, peer: Indices, measured: Floats, variance: Floats,
-    outlier: Floats, strip: Indices, slot: Indices, sizes: Indices, at_diagonal: Indices,
-    at_next: Indices, information: Floats, push: Floats, weight: Floats, surprise: Floats,
-) -> None:  # fmt: skip
-    """Put the ranges of one instant into information about positions, linear at the present poses.
+def range_information(
+    layout: StripLayout,
+    pairs: Floats,
+    node: Indices,
+    peer: Indices,
+    measured: Floats,
+    model: RangeModel,
+) -> tuple[Floats, Floats, Floats]:
+    """Return the ranges of one instant as information about positions, at the present poses.
 
-    ``spread`` is :func:`pair_spread`'s, ``measured`` and ``variance`` (E,) are m and m^2.
-    ``information`` holds blocks as the covariance's, but of positions alone (2n states);
-    ``push`` (2N,) the right-hand side, strip by strip as the blocks' rows (both are set to zero
-    first). ``weight`` (E,) is each range's probability to be good, by which its information is
-    multiplied, ``surprise`` (E,) its squared innovation over the expected variance.
+    ``pairs`` (4, E) are :func:`pair_moments`, ``measured`` (E,) in m. The result is the blocks of
+    the information matrix A, the right-hand side b (2N,) strip by strip as the blocks' rows, and
+    each range's probability of not being an outlier, by which its information is multiplied.
 
-    Second order, finite where two meet (as ``bank/range_update.py``): with c the variance
-    across,
-    m^2 = d^2 + c, the range's variance is a d^2 / m^2 + c^2 / 2m^2 and its slope d / m.
-    ``outlier`` holds the share of outliers, their variance (m^2)
-    and the share of these that are too short.
+    Second order, finite where two nodes meet: with c the variance across, m^2 = d^2 + c, the
+    range's variance is a d^2 / m^2 + c^2 / 2m^2 and its slope d / m.
     """
-    information[:] = 0.0
-    push[:] = 0.0
-    starts = np.zeros(len(sizes) + 1, dtype=np.int64)
-    for k in range(len(sizes)):
-        starts[k + 1] = starts[k] + 2 * sizes[k]
+    blocks, sizes, strip, slot = layout.information, layout.sizes, layout.strip, layout.slot
+    information, push = np.zeros(blocks.total), np.zeros(2 * len(strip))
+    inlier = np.empty(len(node))
+    short = model.outliers_short
     for e in range(len(node)):
         i, j = node[e], peer[e]
-        distance, along, across = spread[0, e], spread[1, e], spread[2, e]
+        distance, along, across, bearing = pairs[0, e], pairs[1, e], pairs[2, e], pairs[3, e]
         square = distance * distance + across + NEAREST_M * NEAREST_M
         middle = math.sqrt(square)
         innovation = measured[e] - middle
-        doubt = variance[e] + 0.5 * across * across / square
+        noise = model.sigma_m * model.sigma_m + 0.5 * across * across / square
         slope = distance / middle
-        expected = slope * slope * along + doubt
-        surprise[e] = innovation * innovation / expected
-        wide = expected + outlier[1]
-        side = 2.0 * (1.0 - outlier[2]) if innovation > 0.0 else 2.0 * outlier[2]
-        usual = (1.0 - outlier[0]) * math.exp(-0.5 * surprise[e]) / math.sqrt(expected)
-        odd = outlier[0] * side * math.exp(-0.5 * innovation * innovation / wide) / math.sqrt(wide)
-        # Where both vanish, it is certainly no good one.
-        believed = usual / (usual + odd + 1e-300)
-        weight[e] = believed
-        if believed < 1e-3 or abs(strip[i] - strip[j]) > 1:
+        expected = slope * slope * along + noise
+        wide = expected + model.outlier_m * model.outlier_m
+        side = 2.0 * (1.0 - short) if innovation > 0.0 else 2.0 * short
+        usual = (1.0 - model.outliers) * math.exp(-0.5 * (innovation * innovation / expected))
+        usual /= math.sqrt(expected)
+        odd = model.outliers * side * math.exp(-0.5 * innovation * innovation / wide)
+        odd /= math.sqrt(wide)
+        # Where both vanish, the range is an outlier.
+        inlier[e] = usual / (usual + odd + 1e-300)
+        if inlier[e] < 1e-3 or abs(strip[i] - strip[j]) > 1:
             continue
-        each = believed / doubt
-        bearing = spread[3, e]
+        weight = inlier[e] / noise
         ux, uy = slope * math.cos(bearing), slope * math.sin(bearing)
         # The range grows with the peer along u and with the node against it.
-        pushed = each * innovation
         for who, sign in ((i, -1.0), (j, 1.0)):
-            k = strip[who]
-            n = sizes[k]
-            at = starts[k] + slot[who]
-            push[at] += sign * pushed * ux
-            push[at + n] += sign * pushed * uy
-            start = at_diagonal[k] + 2 * n * slot[who] + slot[who]
-            information[start] += each * ux * ux
-            information[start + n] += each * ux * uy
-            information[start + 2 * n * n] += each * ux * uy
-            information[start + 2 * n * n + n] += each * uy * uy
-        k, q = strip[i], strip[j]
-        row, column = slot[i], slot[j]
-        if k > q:
-            k, q, row, column = q, k, column, row
-        n, p = sizes[k], sizes[q]
-        start = (at_diagonal[k] if k == q else at_next[k]) + 2 * n * column + row
-        information[start] -= each * ux * ux
-        information[start + n] -= each * ux * uy
-        information[start + 2 * n * p] -= each * ux * uy
-        information[start + 2 * n * p + n] -= each * uy * uy
-        if k == q:
-            start = at_diagonal[k] + 2 * n * row + column
-            information[start] -= each * ux * ux
-            information[start + n] -= each * ux * uy
-            information[start + 2 * n * n] -= each * ux * uy
-            information[start + 2 * n * n + n] -= each * uy * uy
+            at = 2 * layout.first[strip[who]] + slot[who]
+            push[at] += sign * (weight * innovation) * ux
+            push[at + sizes[strip[who]]] += sign * (weight * innovation) * uy
+        for one, two, sign in ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0)):
+            if one > two and strip[one] != strip[two]:
+                continue  # adjacent strips have one block
+            base, down, right = entry(blocks, layout, INFORMATION, one, two)
+            information[base] += sign * weight * ux * ux
+            information[base + down] += sign * weight * ux * uy
+            information[base + right] += sign * weight * ux * uy
+            information[base + down + right] += sign * weight * uy * uy
+    return information, push, inlier
+
+
+class FarCovariances(NamedTuple):
+    """Covariances of nodes that change strips with the strip beyond the next.
+
+    ``values[start[i]:]`` holds those of node i with the n nodes of strip ``strip[i]``, (3, 3n);
+    ``start[i]`` is -1 for a node without any.
+    """
+
+    values: Floats
+    start: Indices
+    strip: Indices
 
 
 @compiled
-def lay_over(
-    before: Floats, diagonal_before: Indices, next_before: Indices, sizes_before: Indices,
-    strip_before: Indices, slot_before: Indices, far: Floats, far_start: Indices,
-    far_strip: Indices, after: Floats, diagonal_after: Indices, next_after: Indices,
-    sizes_after: Indices, members: Indices, first: Indices,
-) -> int:  # fmt: skip
-    """Copy blocks from one layout to another; count pairs of nodes whose covariance is unknown.
-
-    For a node i that moves over, ``far[far_start[i]:]`` (3, 3n) holds its covariance with the
-    n nodes of strip ``far_strip[i]`` of the layout before, two strips off.
-    """
+def change_layout(
+    before: Floats, old: StripLayout, far: FarCovariances, after: Floats, new: StripLayout
+) -> int:
+    """Copy covariances from one layout to another; return how many are unknown, and so zero."""
     unknown = 0
-    for k in range(len(sizes_after)):
-        n = sizes_after[k]
-        for other in range(k, min(k + 2, len(sizes_after))):
-            p = sizes_after[other]
-            start = diagonal_after[k] if other == k else next_after[k]
-            for q in range(p):
-                j = members[first[other] + q]
-                sj, tj = strip_before[j], slot_before[j]
-                for r in range(n):
-                    i = members[first[k] + r]
-                    si, ti = strip_before[i], slot_before[i]
-                    # Where (a of i, b of j) stood: base + down * a + right * b.
-                    if si == sj:
-                        base = diagonal_before[si] + 3 * sizes_before[si] * tj + ti
-                        down = sizes_before[si]
-                        right = 3 * sizes_before[si] * sizes_before[si]
-                    elif sj == si + 1:
-                        base = next_before[si] + 3 * sizes_before[si] * tj + ti
-                        down = sizes_before[si]
-                        right = 3 * sizes_before[si] * sizes_before[sj]
-                    elif si == sj + 1:
-                        base = next_before[sj] + 3 * sizes_before[sj] * ti + tj
-                        down = 3 * sizes_before[sj] * sizes_before[si]
-                        right = sizes_before[sj]
-                    else:
-                        base = -1
-                        down = 0
-                        right = 0
-                    to = start + 3 * n * q + r
-                    if base >= 0:
-                        for b in range(3):
-                            for a in range(3):
-                                after[to + 3 * n * p * b + n * a] = before[
-                                    base + down * a + right * b
-                                ]
-                        continue
-                    if far_start[i] >= 0 and far_strip[i] == sj:
-                        base = far_start[i] + tj
-                        down, right = 3 * sizes_before[sj], sizes_before[sj]
-                    elif far_start[j] >= 0 and far_strip[j] == si:
-                        base = far_start[j] + ti
-                        down, right = sizes_before[si], 3 * sizes_before[si]
-                    else:
-                        unknown += 1
+    for k in range(len(new.sizes)):
+        for other in range(k, min(k + 2, len(new.sizes))):
+            for j in new.members[new.first[other] : new.first[other + 1]]:
+                for i in new.members[new.first[k] : new.first[k + 1]]:
+                    to, to_down, to_right = entry(new.covariance, new, COVARIANCE, i, j)
+                    base, down, right = entry(old.covariance, old, COVARIANCE, i, j)
+                    source = before
+                    if base < 0:
+                        source = far.values
+                        si, sj = old.strip[i], old.strip[j]
+                        if far.start[i] >= 0 and far.strip[i] == sj:
+                            base = far.start[i] + old.slot[j]
+                            down, right = 3 * old.sizes[sj], old.sizes[sj]
+                        elif far.start[j] >= 0 and far.strip[j] == si:
+                            base = far.start[j] + old.slot[i]
+                            down, right = old.sizes[si], 3 * old.sizes[si]
+                        else:
+                            unknown += 1
                     for b in range(3):
                         for a in range(3):
-                            after[to + 3 * n * p * b + n * a] = (
-                                far[base + down * a + right * b] if base >= 0 else 0.0
+                            after[to + to_down * a + to_right * b] = (
+                                source[base + down * a + right * b] if base >= 0 else 0.0
                             )
     return unknown
 
 
 @compiled
-def mirror(covariance: Floats, at_diagonal: Indices, sizes: Indices) -> None:
+def mirror(covariance: Floats, layout: StripLayout) -> None:
     """Fill the upper halves of the diagonal blocks from the lower ones."""
-    for k in range(len(sizes)):
-        m = 3 * sizes[k]
-        block = covariance[at_diagonal[k] : at_diagonal[k] + m * m].reshape(m, m)
+    for k in range(len(layout.sizes)):
+        m = 3 * layout.sizes[k]
+        start = layout.covariance.diagonal[k]
+        block = covariance[start : start + m * m].reshape(m, m)
         # block[column, row], so the lower half is column < row.
         for column in range(m):
             for row in range(column + 1, m):
@@ -316,16 +285,13 @@ def mirror(covariance: Floats, at_diagonal: Indices, sizes: Indices) -> None:
 
 
 @compiled
-def marginals(covariance: Floats, at_diagonal: Indices, sizes: Indices, strip: Indices,
-              slot: Indices) -> Floats:  # fmt: skip
-    """Of every node xx, yy, xy and heading variance: (N, 4)."""
-    result = np.empty((len(strip), 4))
-    for i in range(len(strip)):
-        n = sizes[strip[i]]
-        m = 3 * n
-        at = at_diagonal[strip[i]] + slot[i] * (m + 1)
-        result[i, 0] = covariance[at]
-        result[i, 1] = covariance[at + n * (m + 1)]
-        result[i, 2] = covariance[at + n]
-        result[i, 3] = covariance[at + 2 * n * (m + 1)]
+def marginals(covariance: Floats, layout: StripLayout) -> Floats:
+    """Return xx, yy, xy and heading variance of every node: (N, 4)."""
+    result = np.empty((len(layout.strip), 4))
+    for i in range(len(layout.strip)):
+        base, down, right = entry(layout.covariance, layout, COVARIANCE, i, i)
+        result[i, 0] = covariance[base]
+        result[i, 1] = covariance[base + down + right]
+        result[i, 2] = covariance[base + down]
+        result[i, 3] = covariance[base + 2 * (down + right)]
     return result

@@ -1,10 +1,11 @@
-"""How noisy each wearer's motion is, learned by a large team from what its ranges correct.
+"""How noisy each node's motion is, learned by a large team from what its ranges correct.
 
 If the filter's noise is right, the corrections x+ - x- of a pose have the variance by which its
-own fell: E (x+ - x-)^2 = P- - P+ (Myers and Tapley's covariance matching). The quotient of both
-is taken of every user and instant, along its way for the step's noise and of the heading for a
-turn's and for that of walking straight on, whichever came before; the logarithm of the level in
-force follows it, for the team by the mean over all and for each user by what it differs.
+own fell: E (x+ - x-)^2 = P- - P+ (covariance matching, Myers and Tapley 1976). The quotient of
+both is formed for every node and instant: along its path for the noise of steps, and of the
+heading for that of turns or of walking straight, whichever came before. The logarithm of each
+variance component follows its quotient, for the team by the mean over all nodes and for each node
+by its difference from that mean.
 """
 
 from __future__ import annotations
@@ -20,34 +21,34 @@ Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 TEAM_GAIN = 0.3
-"""How far the team's levels follow the mean of an instant, where all users told something."""
+"""How far the team's components follow the mean of an instant that many nodes contributed to."""
 
 OWN_LEAST, OWN_BEGIN = 0.02, 10.0
-"""A user's own level follows by 1 / (count + begin) and at least so much."""
+"""A node's difference follows by 1 / (count + begin) and at least so much."""
 
 CAP = 9.0
-"""A quotient beyond three sigmas says that something else is wrong."""
+"""A quotient beyond three sigmas has another cause."""
 
 SPAN = (-5.0, 3.0)
-"""Of the logarithm of the level: a twelfth of the base's standard deviation to 4.5 times it. A
-little white noise always stays: it is what a badly measured turn can be corrected by."""
+"""Of the component's logarithm: a twelfth of the base's standard deviation to 4.5 times it. A
+little white noise always remains: a badly measured turn is corrected through it."""
 
 MOVED_M = 0.2
 TURNED_RAD = 0.2
-"""From so much since the last ranges on a user has moved, or turned."""
+"""From so much since the last ranges on a node has moved, or turned."""
 
 FADE = 0.3
-"""How much of a turn still counts at the next instant."""
+"""The fraction of a turn that still counts at the next instant."""
 
-HEARD = 3
-"""With fewer ranges an instant says little of a user."""
+LEAST_RANGES = 3
+"""With fewer ranges an instant says little about a node."""
 
 
 @dataclass(slots=True)
-class TeamLevels:
-    """Levels (N, 3) by which the bases of the motion variances are multiplied."""
+class VarianceComponents:
+    """Factors (N, 3) of the base variances of motion, in the order of ``motion_variances``."""
 
-    level: Floats = field(default_factory=lambda: np.empty((0, COMPONENTS)))
+    factor: Floats = field(default_factory=lambda: np.empty((0, COMPONENTS)))
     _team: Floats = field(default_factory=lambda: np.zeros(COMPONENTS))
     _own: Floats = field(default_factory=lambda: np.empty((0, COMPONENTS)))
     _count: Floats = field(default_factory=lambda: np.empty((0, COMPONENTS)))
@@ -55,7 +56,7 @@ class TeamLevels:
     _last: Floats = field(default_factory=lambda: np.empty((0, 2)))
 
     def add(self, poses: Floats) -> None:
-        """Take in users at poses (E, 3) with the team's levels."""
+        """Add nodes at poses (E, 3) with the team's components."""
         more = len(poses)
         self._own = np.concatenate([self._own, np.zeros((more, COMPONENTS))])
         self._count = np.concatenate([self._count, np.zeros((more, COMPONENTS))])
@@ -63,31 +64,31 @@ class TeamLevels:
         self._last = np.concatenate([self._last, poses[:, :2]])
         self._refresh()
 
-    def turn(self, rows: Indices, turn_rad: Floats) -> None:
-        """Note the turns of users (E,)."""
+    def add_turns(self, rows: Indices, turn_rad: Floats) -> None:
+        """Add the turns of nodes ``rows`` (E,)."""
         np.add.at(self._turned, rows, np.abs(turn_rad))
 
-    def learn(
-        self, before: Floats, prior: Floats, after: Floats, posterior: Floats, heard: Indices
+    def update(
+        self, before: Floats, prior: Floats, after: Floats, posterior: Floats, ranged: Indices
     ) -> None:
         """Compare poses (N, 3) and marginals (N, 4) before and after the ranges of an instant.
 
-        ``heard`` are the rows at both ends of the ranges, one after the other.
+        ``ranged`` are the rows at both ends of the ranges, one after the other.
         """
-        way = before[:, :2] - self._last
-        length = np.hypot(way[:, 0], way[:, 1])
-        ux, uy = way.T / np.maximum(length, 1e-9)
-        fallen = prior - posterior
+        path = before[:, :2] - self._last
+        length = np.hypot(path[:, 0], path[:, 1])
+        ux, uy = path.T / np.maximum(length, 1e-9)
+        xx, yy, xy, hh = (prior - posterior).T
         step = after - before
-        along = ux * ux * fallen[:, 0] + uy * uy * fallen[:, 1] + 2.0 * ux * uy * fallen[:, 2]
+        along = ux * ux * xx + uy * uy * yy + 2.0 * ux * uy * xy
         along_step = ux * step[:, 0] + uy * step[:, 1]
-        clear = np.bincount(heard, minlength=len(before)) >= HEARD
-        moved = clear & (length > MOVED_M)
+        enough = np.bincount(ranged, minlength=len(before)) >= LEAST_RANGES
+        moved = enough & (length > MOVED_M)
         turned = self._turned > TURNED_RAD
         for which, square, expected, fits in (
             (ALONG, along_step**2, along, moved),
-            (TURN, step[:, 2] ** 2, fallen[:, 3], clear & turned),
-            (WHITE, step[:, 2] ** 2, fallen[:, 3], moved & ~turned),
+            (TURN, step[:, 2] ** 2, hh, enough & turned),
+            (WHITE, step[:, 2] ** 2, hh, moved & ~turned),
         ):
             rows = np.flatnonzero(fits & (expected > 1e-9))
             if rows.size:
@@ -106,4 +107,4 @@ class TeamLevels:
         self._own[rows, which] = np.clip(own, -2.0, 2.0)
 
     def _refresh(self) -> None:
-        self.level = np.exp(np.clip(self._team + self._own, *SPAN))
+        self.factor = np.exp(np.clip(self._team + self._own, *SPAN))

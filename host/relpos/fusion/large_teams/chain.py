@@ -1,0 +1,201 @@
+"""The chain of strips: posterior of a block-tridiagonal Gaussian after ranges.
+
+The covariance P is known within strips and between adjacent ones. It represents the Gaussian of
+greatest entropy that has these blocks, a Markov chain of strips:
+
+    p(x) = p(x_1) p(x_2 | x_1) p(x_3 | x_2) ...        P_ac = P_ab P_bb^-1 P_bc  for a < b < c
+
+Ranges are information A about positions, block-tridiagonal like the chain's own. With
+B_k = P_kk^-1 P_k,k+1 and V_k+1 = P_k+1,k+1 - P_k+1,k B_k the chain's information is
+
+    L_kk = V_k^-1 + B_k V_k+1^-1 B_k^T,    L_k,k+1 = -B_k V_k+1^-1
+
+and the blocks of (L + A)^-1 follow from one block Cholesky sweep forwards and one of selected
+inversion backwards. Headings follow the positions of their strip by regression, h | p ~ K p +
+noise, which a range does not change: K = P_hp P_pp^-1, P_hp <- K P_pp,
+P_hh <- K P_pp K^T + (P_hh - K P_ph).
+
+BLAS and LAPACK work on whole blocks; symmetric ones are kept as their lower halves.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import blas, lapack
+
+from relpos.fusion.large_teams import kernels
+from relpos.fusion.large_teams.layout import COVARIANCE, INFORMATION, StripLayout
+
+Floats = npt.NDArray[np.float64]
+
+
+def update(layout: StripLayout, covariance: Floats, information: Floats, push: Floats) -> Floats:
+    """Add information to a covariance, in place; return how the poses change (N, 3).
+
+    ``push`` (2 N,) is the information's right-hand side, strip by strip; it is overwritten.
+    """
+    diagonal, following = layout.views(covariance, COVARIANCE)
+    added, added_next = layout.views(information, INFORMATION)
+    sizes, starts = layout.sizes.tolist(), (2 * layout.first).tolist()
+    eliminated: list[_Eliminated] = []
+    carried: _Carried | None = None
+    for k, n in enumerate(sizes):
+        to_next = None
+        if k + 1 < len(sizes):
+            p = 2 * sizes[k + 1]
+            to_next = following[k][: 2 * n, :p], diagonal[k + 1][:p, :p], added_next[k]
+        one, carried = _eliminate(
+            diagonal[k], n, added[k], push[starts[k] : starts[k + 1]], carried, to_next
+        )
+        if carried is not None:
+            push[starts[k + 1] : starts[k + 2]] -= carried.push
+        eliminated.append(one)
+    moved = np.empty((len(layout.strip), 3))
+    _back_substitute(layout, eliminated, diagonal, following, moved)
+    kernels.mirror(covariance, layout)
+    return moved
+
+
+class _Eliminated(NamedTuple):
+    """What the forward sweep leaves of a strip for the backward one."""
+
+    factor: Floats
+    """Cholesky factor of the strip's information, given the strips before it."""
+    right: Floats
+    """The factor's inverse times the right-hand side."""
+    ahead: Floats
+    """The factor's inverse times the information between this strip and the next."""
+    regression: Floats
+    """K^T of the headings on the positions."""
+    rest: Floats
+    """What the positions leave of the headings' covariance."""
+
+
+class _Carried(NamedTuple):
+    """What eliminating a strip adds to the next one."""
+
+    information: Floats
+    push: Floats
+
+
+def _eliminate(
+    block: Floats,
+    n: int,
+    added: Floats,
+    push: Floats,
+    before: _Carried | None,
+    to_next: tuple[Floats, Floats, Floats] | None,
+) -> tuple[_Eliminated, _Carried | None]:
+    """Form the chain's information of a strip of ``n`` nodes and eliminate its positions.
+
+    ``to_next`` are the positions' covariance with the next strip, the next strip's own, and the
+    information between the two; None for the last strip.
+    """
+    m = 2 * n
+    prior = _lower(_copy(block[:m, :m]))
+    both = np.empty((m, n + (0 if to_next is None else to_next[0].shape[1])), order="F")
+    both[:, :n] = block[:m, m:]
+    if to_next is not None:
+        both[:, n:] = to_next[0]
+    both = _solve_lower(prior, both)
+    rest = _minus_square(both[:, :n], block[m:, m:])
+    given = np.empty((0, 0)) if to_next is None else _lower(_minus_square(both[:, n:], to_next[1]))
+    both = _solve_lower(prior, both, transposed=True)
+    joined = _inverse(prior) if before is None else before.information
+    joined += added
+    ahead = coupling = np.empty((m, 0))
+    if to_next is not None:
+        # Y^T = B L_V^-T, then B V^-1 = Y^T L_V^-1.
+        y = blas.dtrsm(1.0, given, both[:, n:], side=1, lower=1, trans_a=1, overwrite_b=1)
+        joined = blas.dsyrk(1.0, y, 1.0, joined, lower=1, overwrite_c=1)
+        coupling = blas.dtrsm(-1.0, given, y, side=1, lower=1, overwrite_b=1)
+        coupling += to_next[2]
+    factor = _lower(joined)
+    right = blas.dtrsv(factor, push, lower=1)
+    carried = None
+    if to_next is not None:
+        ahead = _solve_lower(factor, coupling)
+        carried = _Carried(
+            blas.dsyrk(-1.0, ahead, 1.0, _inverse(given), trans=1, lower=1, overwrite_c=1),
+            blas.dgemv(1.0, ahead, right, trans=1),
+        )
+    return _Eliminated(factor, right, ahead, both[:, :n], rest), carried
+
+
+def _back_substitute(
+    layout: StripLayout,
+    eliminated: list[_Eliminated],
+    diagonal: list[Floats],
+    following: list[Floats],
+    moved: Floats,
+) -> None:
+    """Fill the posterior blocks and the changes of the poses, from the last strip to the first."""
+    last = len(eliminated) - 1
+    step = later = np.empty((0, 0))
+    for k in range(last, -1, -1):
+        factor, right, ahead, regression, rest = eliminated[k]
+        n = int(layout.sizes[k])
+        m = 2 * n
+        if k < last:
+            p = 2 * int(layout.sizes[k + 1])
+            right -= blas.dgemv(1.0, ahead, step)
+            slope = _solve_lower(factor, ahead, transposed=True)
+            cross = blas.dsymm(-1.0, later, slope, side=1, lower=1)
+            later = blas.dgemm(-1.0, cross, slope, 1.0, _inverse(factor), trans_b=1, overwrite_c=1)
+            headings = blas.dgemm(1.0, cross, eliminated[k + 1].regression)
+            block = following[k]
+            block[:m, :p] = cross
+            block[:m, p:] = headings
+            block[m:, :p] = blas.dgemm(1.0, regression, cross, trans_a=1)
+            block[m:, p:] = blas.dgemm(1.0, regression, headings, trans_a=1)
+        else:
+            later = _inverse(factor)
+        step = blas.dtrsv(factor, right, lower=1, trans=1)
+        block = diagonal[k]
+        headings = blas.dsymm(1.0, later, regression, lower=1)
+        block[:m, :m] = later
+        block[m:, :m] = headings.T
+        block[m:, m:] = blas.dgemm(1.0, regression, headings, 1.0, rest, trans_a=1)
+        nodes = layout.nodes_of(k)
+        moved[nodes, 0], moved[nodes, 1] = step[:n], step[n:]
+        moved[nodes, 2] = blas.dgemv(1.0, regression, step, trans=1)
+
+
+def far_covariance(near: Floats, middle: Floats, on: Floats) -> Floats:
+    """Return P_ac = P_ab P_bb^-1 P_bc from P_ba (``near``), P_bb and P_bc."""
+    solved: Floats = lapack.dpotrs(_lower(_copy(middle)), _copy(near), lower=1)[0]
+    return solved.T @ on
+
+
+def _lower(matrix: Floats) -> Floats:
+    """Cholesky factor of a symmetric matrix in place; ArithmeticError if it is not positive."""
+    factor, failed = lapack.dpotrf(matrix, lower=1, clean=0, overwrite_a=1)
+    if failed:
+        raise ArithmeticError("a covariance block is not positive definite")
+    return factor  # type: ignore[no-any-return]
+
+
+def _solve_lower(factor: Floats, right: Floats, *, transposed: bool = False) -> Floats:
+    """L^-1 R or L^-T R; R is overwritten."""
+    return blas.dtrsm(  # type: ignore[no-any-return]
+        1.0, factor, right, lower=1, trans_a=int(transposed), overwrite_b=1
+    )
+
+
+def _inverse(factor: Floats) -> Floats:
+    """(L L^T)^-1, its lower half; L is kept."""
+    return lapack.dpotri(factor, lower=1)[0]  # type: ignore[no-any-return]
+
+
+def _minus_square(half: Floats, of: Floats) -> Floats:
+    """Return the lower half of A - H^T H."""
+    return blas.dsyrk(  # type: ignore[no-any-return]
+        -1.0, half, 1.0, _copy(of), trans=1, lower=1, overwrite_c=1
+    )
+
+
+def _copy(matrix: Floats) -> Floats:
+    return np.array(matrix, order="F")
