@@ -10,7 +10,9 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from typer.testing import CliRunner
 
+from relpos.cli.main import app
 from relpos.emulator.node import draw_uncalibrated_errors
 from relpos.link.dialogue import NodeDialogue
 from relpos.link.port import open_port
@@ -35,20 +37,13 @@ def emulated(scenario, speed, seconds, seed=3, nodes=1):
 
 
 def calibrate(*arguments):
-    return subprocess.run(
-        [*RELPOS, "node", "calibrate", *map(str, arguments), "--yes"],
-        capture_output=True,
-        text=True,
-        timeout=90,
-        stdin=subprocess.DEVNULL,
-        check=False,
-    )
+    return CliRunner().invoke(app, ["node", "calibrate", *map(str, arguments), "--yes"])
 
 
 def test_a_guided_calibration_makes_the_field_round_and_is_kept_over_a_restart(tmp_path):
-    with emulated("turntable", 12, 1500) as port:
+    with emulated("turntable", 20, 1500) as port:
         done = calibrate(port, "--node", 1, "--out", tmp_path)
-        assert done.returncode == 0, done.stderr
+        assert done.exit_code == 0, done.stderr
         assert "stored, restarted and read back" in done.stdout
         assert imread(tmp_path / "node-1-magnetometer.png").shape[0] > 500
         device = open_port(port)
@@ -61,7 +56,7 @@ def test_a_guided_calibration_makes_the_field_round_and_is_kept_over_a_restart(t
             while dialogue.boot() == boot and time.monotonic() < until_s:
                 dialogue.listen()
             assert dialogue.boot() == (boot + 1) % 256
-            raw = [s for s in dialogue.raw_samples(50.0) if s is not None]
+            raw = [s for s in dialogue.raw_samples(30.0) if s is not None]
             assert dialogue.read_calibration().to_words() == calibration.to_words()
         finally:
             device.close()
@@ -70,7 +65,7 @@ def test_a_guided_calibration_makes_the_field_round_and_is_kept_over_a_restart(t
     after = np.linalg.norm(
         (field - calibration.field_offset_ut) @ calibration.field_matrix.T, axis=1
     )
-    assert len(field) > 100
+    assert len(field) > 80
     assert before.std() / before.mean() > 0.1
     assert after.std() / after.mean() < 0.02
     assert 0.05 < np.degrees(calibration.gyro_bias_sigma_rad_s) < 0.3
@@ -79,7 +74,7 @@ def test_a_guided_calibration_makes_the_field_round_and_is_kept_over_a_restart(t
 def test_a_walk_of_known_length_sets_the_gain_on_the_node():
     with emulated("straight", 20, 1200) as port:
         done = calibrate("walk", port, "--node", 1, "--distance", 40)
-        assert done.returncode == 0, done.stderr
+        assert done.exit_code == 0, done.stderr
         device = open_port(port)
         try:
             gain = NodeDialogue(device, 1).setting(wire.CommandCode.SET_STEP_GAIN_PERMILLE)
@@ -90,14 +85,21 @@ def test_a_walk_of_known_length_sets_the_gain_on_the_node():
 
 def test_two_antennas_are_calibrated_at_a_known_distance():
     with emulated("bench", 20, 3000, nodes=3) as port:
-        done = calibrate("antenna", port, "--nodes", "1,2", "--distance", 5)
-        assert done.returncode == 0, done.stderr
+        done = calibrate("antenna", port, "--nodes", "1,2", "--distance", 5, "--ranges", 60)
+        assert done.exit_code == 0, done.stderr
         before, after = (float(x) for x in re.findall(r"ranges, ([+-][\d.]+) m off", done.stdout))
-        # What the two nodes' tags really add.
+        # The true sum of the two nodes' delays.
         delay_m = sum(draw_uncalibrated_errors(3, node).antenna_delay_m for node in (1, 2))
         assert before == pytest.approx(delay_m, abs=0.03)
         assert abs(after) < 0.03
-        # A third against the first, which keeps what it has.
+
+
+@pytest.mark.soak
+def test_a_third_antenna_is_calibrated_against_one_that_keeps_its_offset():
+    with emulated("bench", 20, 3000, nodes=3) as port:
+        done = calibrate("antenna", port, "--nodes", "1,2", "--distance", 5)
+        assert done.exit_code == 0, done.stderr
+        delay_m = sum(draw_uncalibrated_errors(3, node).antenna_delay_m for node in (1, 2))
         device = open_port(port)
         try:
             dialogue = NodeDialogue(device, 1)
@@ -110,7 +112,7 @@ def test_two_antennas_are_calibrated_at_a_known_distance():
         done = calibrate(
             "antenna", port, "--nodes", "1,3", "--distance", 10, "--reference", 1, "--ranges", 60
         )
-        assert done.returncode == 0, done.stderr
+        assert done.exit_code == 0, done.stderr
         assert (
             f"node 1: range offset {first_mm / 1000:+.3f} -> {first_mm / 1000:+.3f}" in done.stdout
         )
@@ -124,8 +126,8 @@ def test_two_antennas_are_calibrated_at_a_known_distance():
         (("walk", "/dev/nowhere", "--distance", 20), "cannot open"),
     ],
 )
-def test_a_port_that_is_none_is_told_in_one_line(arguments, words):
+def test_a_missing_port_is_reported_in_one_line(arguments, words):
     done = calibrate(*arguments)
-    assert done.returncode == 1
+    assert done.exit_code == 1
     assert words in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
