@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 HEARD_WITHIN_S = 6.0
 STOOD_S = 5.0
-"""Who has not made a step for so long has arrived."""
+"""Time without a step after which the walk counts as finished."""
 WALK_WITHIN_S = 900.0
 DEFAULT = "sensors"
 _FLAGS = ("--yes", "-y", "--magnetometer", "--no-magnetometer", "--help")
@@ -194,13 +194,13 @@ def _sensors(
 
     output.remark(
         f"node {dialogue.node}: away from steel and from your phone,\n"
-        "  1. lay it on something firm and leave it alone for ten seconds,\n"
+        "  1. lay it on a firm surface and do not touch it for ten seconds,\n"
         "  2. lay it on each of its six sides, three seconds each,\n"
         "  3. turn it slowly on the spot in all directions, until the last bar is full.\n"
-        "In any order; Ctrl-C says that it is enough."
+        "In any order; Ctrl-C ends the collection."
     )
     samples: list[RawSample] = []
-    # Ctrl-C says that it is enough; what is missing then is told by the fits.
+    # After Ctrl-C the fits report what is missing.
     with _shown() as show, suppress(KeyboardInterrupt):
         for sample in dialogue.raw_samples(seconds):
             if sample is None:
@@ -233,7 +233,7 @@ def _rows(result: Result) -> list[tuple[str, str]]:
     degree = 180.0 / math.pi
     rows = [
         ("gyroscope bias / deg/s", _triple(result.gyro.bias_rad_s, degree, 3)),
-        ("  trusted to / deg/s", f"{degree * result.gyro.sigma_rad_s:.2f}"),
+        ("  standard deviation in use / deg/s", f"{degree * result.gyro.sigma_rad_s:.2f}"),
     ]
     if (a := result.accelerometer) is not None:
         rows += [
@@ -315,13 +315,13 @@ def _walk(dialogue: NodeDialogue, distance_m: float, stature_m: float | None, ye
     walked = (newest["steps"] - before["steps"]) % 65536
     fit = steps.fit_walk(gain, walked, newest["path_m"] - before["path_m"], distance_m)
     typer.echo(
-        f"{fit.steps} steps: the node said {fit.measured_m:.2f} m, it was {fit.true_m:g} m "
+        f"{fit.steps} steps: the node measured {fit.measured_m:.2f} m, true {fit.true_m:g} m "
         f"({100 * (fit.scale - 1):+.1f} %)"
     )
-    believed = fit.gain_permille / fit.gain_before_permille - 1.0
+    change = fit.gain_permille / fit.gain_before_permille - 1.0
     typer.echo(
         f"step gain {fit.gain_before_permille / 1000:.3f} -> {fit.gain_permille / 1000:.3f} "
-        f"({100 * believed:+.1f} %: one walk is believed as far as people differ)"
+        f"({100 * change:+.1f} %: one walk, weighted against the population)"
     )
     if not _confirmed(yes):
         raise DataError(f"node {dialogue.node} keeps its step gain")
@@ -330,7 +330,7 @@ def _walk(dialogue: NodeDialogue, distance_m: float, stature_m: float | None, ye
 
 
 def _motion(dialogue: NodeDialogue) -> dict[str, Any]:
-    """The node's newest running totals, waiting for the first."""
+    """Return the node's newest running totals; wait for the first."""
     until_s = time.monotonic() + HEARD_WITHIN_S
     while (totals := dialogue.totals()) is None:
         if time.monotonic() > until_s:
@@ -355,12 +355,12 @@ def _antenna(
 
     offsets_mm = measuring.read_offsets_mm(dialogue, pair)
     output.remark(
-        f"nodes {pair[0]} and {pair[1]}: leave them alone, {distance_m:g} m apart and in sight of "
+        f"nodes {pair[0]} and {pair[1]}: keep them still, {distance_m:g} m apart and in sight of "
         f"each other, until {count} ranges are in"
     )
     with measuring.ranging_fast(dialogue, pair):
         found = fits.fit_ranges(_ranges(dialogue, pair, count), distance_m)
-        _tell_ranges("before", found)
+        _print_ranges("before", found)
         new_mm = fits.new_offsets_mm(
             found.bias_m, offsets_mm, None if reference is None else pair.index(reference)
         )
@@ -370,7 +370,7 @@ def _antenna(
         for node, old, new in zip(pair, offsets_mm, new_mm, strict=True):
             typer.echo(f"node {node}: range offset {old / 1000:+.3f} -> {new / 1000:+.3f} m")
         left = fits.fit_ranges(_ranges(dialogue, pair, count), distance_m)
-    _tell_ranges("after", left)
+    _print_ranges("after", left)
     # Both fits err; three times the deviation of their difference, and a millimetre of rounding.
     most_m = 3.0 * math.hypot(found.sigma_m, left.sigma_m) + 0.001
     if abs(left.bias_m) > most_m:
@@ -378,10 +378,10 @@ def _antenna(
             f"stored, but the ranges are still {left.bias_m:+.3f} m off, more than {most_m:.3f} m: "
             "has something moved? Calibrate again"
         )
-    typer.echo(f"nodes {pair[0]} and {pair[1]} have stored it; measured again: it holds")
+    typer.echo(f"nodes {pair[0]} and {pair[1]} have stored it; verified by measuring again")
 
 
-def _tell_ranges(when: str, fit: RangeFit) -> None:
+def _print_ranges(when: str, fit: RangeFit) -> None:
     typer.echo(
         f"{when}: {fit.count} ranges, {fit.bias_m:+.3f} m off (+-{fit.sigma_m:.3f}), "
         f"each spreads by {fit.spread_m:.3f} m"

@@ -1,4 +1,4 @@
-"""What the node commands have in common: options, and a dialogue with one node."""
+"""Options of the node commands, and a dialogue with one node."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Cable = Annotated[
 
 @contextmanager
 def link_of(key_file: Path | None) -> Iterator[Link]:
-    """A link under that key which refuses what earlier ones have seen already."""
+    """A link under that key, which rejects frames that earlier sessions have seen."""
     link, seen = make_link(key_file)
     try:
         yield link

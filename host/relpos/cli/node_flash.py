@@ -80,7 +80,7 @@ def flash(
 def _set_up(
     port: str, node_id: int | None, key_file: Path | None, old_key_file: Path | None
 ) -> None:
-    """Hear the node over its cable; give it key and number."""
+    """Set key and number of the node over its cable."""
     from relpos.link.authentication import read_key
     from relpos.link.dialogue import NodeDialogue
     from relpos.link.port import Link
@@ -111,7 +111,7 @@ def _set_up(
 
 
 def _hear(dialogue: NodeDialogue, cable: CablePort, port: str) -> None:
-    """Wait for the node; its number is the dialogue's from then on."""
+    """Wait for the node and set the dialogue to its number."""
     from relpos.nodes.boards import SWITCH
 
     decoder = dialogue.link.decoder

@@ -1,4 +1,4 @@
-"""``relpos node list`` and ``relpos node monitor``: what the nodes tell of themselves."""
+"""``relpos node list`` and ``relpos node monitor``: the nodes' own reports."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def list_nodes(
         output.print_json({"port": port, "listened_s": seconds, "nodes": rows})
         return
     if not rows:
-        # Frames under another key have been told by the link.
+        # The link has reported frames under another key.
         why = " under this key" if monitor.foreign_frames else ""
         raise DeviceError(
             f"{port}: no node is heard{why}: are they switched on, and is this the coordinator's "
@@ -142,7 +142,7 @@ def _watch(
 
 
 def _foreign(monitor: TeamMonitor) -> str:
-    """What to say of frames under another key; nothing where there are none."""
+    """Return a note on frames under another key; empty where there are none."""
     if not monitor.foreign_frames:
         return ""
     return f"{monitor.foreign_frames} frames came under another key (give the team's: --key-file)"
