@@ -1,4 +1,4 @@
-"""Estimators of others, behind the same interface as ours.
+"""Plugins: estimators that other packages or files define, behind the same interface as ours.
 
 A class, or a function that makes an object, is found in three ways:
 
@@ -13,7 +13,7 @@ What it is made with goes by the names of its parameters, each of which it may l
 ``settings`` has its settings as parameters: ``def __init__(self, priors=(), *, range_m=0.5)``
 takes ``--set range_m=0.3``, a number because the default is one.
 
-What it then does wrong is told in one line, as a fault of that estimator and not of the data.
+Its errors are reported in one line, as a fault of that estimator and not of the data.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _GIVEN = ("priors", "seed", "nodes", "settings")
 
 
 class EstimatorError(RelposError):
-    """An estimator that is not ours did something wrong; its own error is the cause."""
+    """A plugin failed; its own error is the cause."""
 
 
 @cache
@@ -55,7 +55,7 @@ def registered() -> Mapping[str, EntryPoint]:
 
 
 def is_plugin(name: str) -> bool:
-    """Whether a name can be an estimator that is not ours."""
+    """Whether a name can be a plugin's."""
     return ":" in name or name in registered()
 
 
@@ -77,7 +77,7 @@ def factory(name: str) -> Factory:
     except ModuleNotFoundError as error:
         raise EstimatorError(f"estimator '{name}': {error}") from error
     except Exception as error:
-        raise EstimatorError(f"estimator '{name}': {_told(error, None)}") from error
+        raise EstimatorError(f"estimator '{name}': {_describe(error, None)}") from error
     if not callable(found):
         raise EstimatorError(f"estimator '{name}': '{attribute}' is no class or function")
     maker: Factory = found
@@ -92,7 +92,7 @@ def make(
     seed: int = 0,
     nodes: Mapping[int, Mounting] | None = None,
 ) -> Estimator:
-    """Make an estimator, its faults told as EstimatorError."""
+    """Make a plugin's estimator; its errors become EstimatorError."""
     given = {"priors": tuple(priors), "seed": seed, "nodes": nodes or {}}
     arguments = _arguments(name, maker, {**given, "settings": settings or {}})
     try:
@@ -100,12 +100,12 @@ def make(
     except RelposError:
         raise
     except Exception as error:
-        raise EstimatorError(f"estimator {name}: {_told(error, maker)}") from error
+        raise EstimatorError(f"estimator {name}: {_describe(error, maker)}") from error
     return guard(name, made)
 
 
 def guard(name: str, estimator: Any) -> Estimator:
-    """Put an object behind the interface, so that what it does wrong is told in one line."""
+    """Wrap an object so that its errors become EstimatorError, in one line."""
     if isinstance(estimator, type) or not isinstance(estimator, Estimator):
         missing = [
             part for part in ("process", "finish", "counters") if not hasattr(estimator, part)
@@ -117,7 +117,7 @@ def guard(name: str, estimator: Any) -> Estimator:
 
 
 class _Guarded:
-    """An estimator of somebody else's; every fault of it becomes an EstimatorError."""
+    """A plugin's estimator; each of its errors becomes an EstimatorError."""
 
     def __init__(self, name: str, estimator: Estimator) -> None:
         self._name = name
@@ -151,7 +151,7 @@ class _Guarded:
             raise self._failed("counters()", error) from error
 
     def _failed(self, where: str, error: Exception) -> EstimatorError:
-        words = _told(error, type(self._estimator))
+        words = _describe(error, type(self._estimator))
         return EstimatorError(f"estimator {self._name}: {where} failed: {words}")
 
     def _listed(self, where: str, given: Any) -> list[Estimate]:
@@ -173,7 +173,7 @@ def _module(where: str) -> ModuleType:
     path = Path(where).resolve()
     if not path.is_file():
         raise EstimatorError(f"{where}: no such file")
-    name = f"relpos_own_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    name = f"relpos_plugin_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path)
@@ -233,8 +233,8 @@ def _converted(name: str, key: str, value: object, default: object) -> object:
         return value
 
 
-def _told(error: Exception, of: Any) -> str:
-    """Say what an error was and where, in one line: the innermost place in the estimator's file."""
+def _describe(error: Exception, of: Any) -> str:
+    """Describe an error in one line, with the innermost place in the estimator's file."""
     frames = traceback.extract_tb(error.__traceback__)
     try:
         own = inspect.getsourcefile(of) if of is not None else None
