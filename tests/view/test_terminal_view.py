@@ -130,7 +130,7 @@ def ambiguous() -> TeamView:
 
 def test_an_ambiguous_picture_shows_the_possibilities() -> None:
     shown = lines(ambiguous(), me=2, table=True)
-    assert "? ambiguous: 2 possible pictures (70 %, 30 %)" in shown
+    assert "? ambiguous: 2 alternatives (70 %, 30 %)" in shown
     row = row_of("Li & Söhne", shown)
     assert "10 or 20 m" in row
     assert "↑ or ←" in row

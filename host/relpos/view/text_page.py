@@ -29,7 +29,7 @@ TABLE_COLUMNS = 79
 PAGE_S = 4.0
 """Where not everybody fits, the table turns its page so often; who needs help stays on top."""
 STOREY_M = 1.5
-"""Smaller differences of height are nobody's floor."""
+"""Smaller height differences are within one storey."""
 
 _STYLES = {Level.ALARM: "bold reverse red", Level.WARNING: "bold yellow", Level.INFO: ""}
 _HEALTH_STYLES = {"green": "", "yellow": "yellow", "red": "bold red"}
@@ -60,13 +60,13 @@ class RenderOptions:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Somebody as seen from me; None where it cannot be told."""
+    """A person relative to me; None where unknown."""
 
     distance_m: float | None = None
     sigma_m: float | None = None
     bearing_rad: float | None = None
     """Relative to where I face, counter-clockwise."""
-    rise_m: float | None = None
+    height_difference_m: float | None = None
     ways: tuple[tuple[float, float | None], ...] = ()
     """Distance and bearing in each possible view, the most probable first, where they differ."""
 
@@ -108,7 +108,7 @@ def alarming(view: TeamView) -> frozenset[str | int]:
 
 
 def unattended(view: TeamView) -> list[Person]:
-    """Return whose alarm nobody has seen to, in the order in which the page has them."""
+    """Return people with an alarm that is not acknowledged, in the order of the page."""
     ranks = (Alert.STILL_ALARM, Alert.LOST)
     waiting = [p for p in view.people if p.alert in ranks and not p.acknowledged]
     return sorted(waiting, key=lambda person: ranks.index(person.alert))
@@ -134,7 +134,7 @@ def _title(view: TeamView, options: RenderOptions) -> Text:
 
 
 def _alarms(view: TeamView, options: RenderOptions, most: int) -> list[Text]:
-    """Return at most so many lines of what has to be read first, the worst on top."""
+    """Return at most ``most`` lines of alarms and notices, the worst on top."""
     said: list[tuple[int, str, str]] = []
     me = find_me(view, options.me)
     for person in view.people:
@@ -157,10 +157,10 @@ def _alarms(view: TeamView, options: RenderOptions, most: int) -> list[Text]:
         mark, rank = {Level.ALARM: ("!!", 1), Level.WARNING: ("!", 4)}.get(notice.level, ("-", 6))
         said.append((rank, f"{mark} {notice.text}", _STYLES[notice.level]))
     if view.ambiguous and view.alternatives:
-        shares = ", ".join(f"{100.0 * g.probability:.0f} %" for g in view.alternatives[:4])
+        percentages = ", ".join(f"{100.0 * g.probability:.0f} %" for g in view.alternatives[:4])
         more = len(view.alternatives) - 4
-        shares += f" and {more} more" * (more > 0)
-        words = f"? ambiguous: {len(view.alternatives)} possible pictures ({shares})"
+        percentages += f" and {more} more" * (more > 0)
+        words = f"? ambiguous: {len(view.alternatives)} alternatives ({percentages})"
         said.append((5, words, _STYLES[Level.WARNING]))
     said.sort(key=lambda row: row[0])
     if len(said) > most:
@@ -221,13 +221,15 @@ def _person(person: Person, me: Person | None, view: TeamView, options: RenderOp
     seen = _Seen() if me is None or person.node == me.node else _seen(person, me, view)
     own = me is not None and person.node == me.node
     health = "ok" if person.health == "green" else ", ".join(person.reasons) or person.health
-    rise = seen.rise_m
+    height_difference = seen.height_difference_m
     cells = (
         str(person.node),
         person.name,
         "me" if own else _distance(seen, options),
         "-" if own else _direction(seen, options),
-        "" if rise is None or abs(rise) < STOREY_M else f"{rise:+.0f} m",
+        ""
+        if height_difference is None or abs(height_difference) < STOREY_M
+        else f"{height_difference:+.0f} m",
         _state(person),
         _ago(person.seen_s),
         health,
@@ -280,17 +282,17 @@ def _seen(person: Person, me: Person, view: TeamView) -> _Seen:
         facing = None
     ways = _ways(person.node, me.node, facing, view)
     pair = next((p for p in view.pairs if {p.node, p.peer} == {person.node, me.node}), None)
-    rise = None if person.z_m is None or me.z_m is None else person.z_m - me.z_m
+    height_difference = None if person.z_m is None or me.z_m is None else person.z_m - me.z_m
     if pair is not None:
         bearing = pair.bearing_rad if pair.node == me.node else pair.bearing_rad + math.pi
         relative = None if facing is None else _wrapped(bearing - facing)
-        return _Seen(pair.distance_m, pair.sigma_distance_m, relative, rise, ways)
+        return _Seen(pair.distance_m, pair.sigma_distance_m, relative, height_difference, ways)
     here, there = _xy(me), _xy(person)
     if here is None or there is None:
-        return _Seen(rise_m=rise, ways=ways)
+        return _Seen(height_difference_m=height_difference, ways=ways)
     dx, dy = there[0] - here[0], there[1] - here[1]
     relative = None if facing is None else _wrapped(math.atan2(dy, dx) - facing)
-    return _Seen(math.hypot(dx, dy), None, relative, rise, ways)
+    return _Seen(math.hypot(dx, dy), None, relative, height_difference, ways)
 
 
 def _ways(
@@ -340,7 +342,7 @@ def _distance(seen: _Seen, options: RenderOptions) -> str:
         return "-"
     if seen.sigma_m is None:
         return f"{seen.distance_m:.1f} m"
-    # What is not known to a metre is not told to a decimetre.
+    # No decimetres where the standard deviation is a metre or more.
     digits = 1 if seen.sigma_m < 1.0 and seen.distance_m < 100.0 else 0
     sign = "±" if options.utf8 else "+-"
     return f"{seen.distance_m:.{digits}f} m {sign}{seen.sigma_m:.{digits}f}"
@@ -437,7 +439,7 @@ def _map(
             sum(y for _, y in places.values()) / len(places),
         )
     if middle is None:
-        return [_line("    (nobody is located yet)", options, "dim")]
+        return [_line("    (no position known yet)", options, "dim")]
     x0, y0 = middle
     turn = 0.0 if view.north_rad is None else 0.5 * math.pi - view.north_rad
     if options.heading_up and me is not None and me.heading_rad is not None:
@@ -547,7 +549,7 @@ def _scale(canvas: Canvas, dots_per_m: float, options: RenderOptions, view: Team
 def _line(words: str, options: RenderOptions, style: str = "") -> Text:
     """Return one line of what the terminal can show, and nothing that could command it.
 
-    Names come from phones: whoever is on the network may have typed them.
+    Names come from phones: anyone on the network may have typed them.
     """
     from rich.text import Text
 

@@ -64,7 +64,7 @@ class WebView(Sink):
         self._start()
 
     def fileno(self) -> int:
-        """For who waits for visitors."""
+        """Return the descriptor on which requests arrive."""
         return -1 if self._channel is None else self._channel.fileno()
 
     # -- as a sink --------------------------------------------------------------------------------
@@ -86,9 +86,9 @@ class WebView(Sink):
         self._work()
 
     def trouble(self) -> str | None:
-        """Say that the page was away."""
+        """Return that the server was restarted, for half a minute."""
         if self.restarts and time.monotonic() - self._started_s < 30.0:
-            return "the page's server had died and was started again"
+            return "the page's server failed and was restarted"
         return None
 
     def close(self) -> None:
@@ -107,7 +107,7 @@ class WebView(Sink):
                 self._process.join()
         self._door.close()
 
-    # -- visitors ---------------------------------------------------------------------------------
+    # -- requests ---------------------------------------------------------------------------------
 
     def requests(self) -> Sequence[Request]:
         """What browsers and phones have asked for since the last call."""
