@@ -33,6 +33,7 @@ from relpos.fusion.estimator import (
 from relpos.fusion.models.ranging import Mounting
 from relpos.fusion.particle.settings import ParticleSettings
 from relpos.fusion.settings import SettingInfo, describe, parse
+from relpos.fusion.timeline import Advance
 from relpos.measurements import Heading, Height, Motion, Prior, Range
 
 SETTINGS: Mapping[str, type] = {
@@ -42,7 +43,10 @@ SETTINGS: Mapping[str, type] = {
 }
 """Estimator name -> its settings."""
 
-ROOMS: Mapping[str, tuple[str, ...]] = {"bank": ("bank",), "particle": ("particle",)}
+ROOMS: Mapping[str, tuple[str, ...]] = {
+    "bank": ("bank", "initialisation"),
+    "particle": ("particle", "initialisation"),
+}
 """Estimator name -> the rooms whose kernels it calls."""
 
 
@@ -164,19 +168,39 @@ def warm_up(name: str) -> None:
 def rehearse(room: str) -> None:
     """Call every kernel of a room once, with a made-up team of three."""
     team = {1: (0.0, 0.0), 2: (6.0, 0.0), 3: (2.0, 5.0)}
-    name = "particle" if room == "particle" else "bank"
-    # The third node's initial pose is unknown, so that the search for it is called, too.
-    estimator = make(name, [Prior(node, *team[node], 0.0, 0.1, 0.1) for node in (1, 2)])
+    pairs = ((1, 2), (1, 3), (2, 3))
+    if room == "initialisation":
+        _rehearse_initialiser(team, pairs)
+        return
+    estimator = make(room, [Prior(node, *team[node], 0.0, 0.1, 0.1) for node in team])
     for k in range(1, WARM_UP_S):
         for node in team:
             turn = 0.3 * (node - 2)
             estimator.process(Motion(float(k), node, 0.7, 0.0, turn, gain_version=0))
             estimator.process(Height(float(k), node, 0.1 * node, 0.3))
             estimator.process(Heading(float(k), node, turn * k, 0.2))
-        for node, peer in ((1, 2), (1, 3), (2, 3)):
+        for node, peer in pairs:
             apart = math.dist(team[node], team[peer])
             estimator.process(Range(float(k), node, peer, apart + 0.1 * (k % 3)))
     estimator.finish()
+
+
+def _rehearse_initialiser(
+    team: Mapping[int, tuple[float, float]], pairs: Sequence[tuple[int, int]]
+) -> None:
+    from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
+
+    initialiser = HypothesisInitialiser()
+    for node in team:
+        initialiser.add(node)
+    for k in range(1, WARM_UP_S):
+        for node in team:
+            step = Advance(float(k), node, 1.0, 0.7, 0.0, 0.3 * (node - 2))
+            initialiser.advance(step, faulty=False)
+        apart = [math.dist(team[node], team[peer]) + 0.1 * (k % 3) for node, peer in pairs]
+        ranges = [Range(float(k), *pair, m) for pair, m in zip(pairs, apart, strict=True)]
+        initialiser.update(float(k), ranges, {})
+        initialiser.find(float(k))
 
 
 WARM_UP_S = 8

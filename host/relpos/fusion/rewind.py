@@ -1,25 +1,25 @@
-"""Late and out-of-order measurements are put in their place: the estimator goes back and on.
+"""Late and out-of-order measurements are used at their own time: rewind and replay.
 
 Over radio a report may come seconds late, and the estimate cannot wait for it. So the estimator
-goes on without (a node that is silent for ``Timeline.max_lag_s`` is not waited for), copies of
-its whole state are kept for the last ``window_s``, and when the late one comes, the state before
-its time is taken up again and everything since is worked off anew, in order. Afterwards the state
-is, to the last bit, the one that sorted data would have given: the copies contain the random
-generator, and what shares an instant has a fixed order.
+continues without it (a node that is silent for ``Timeline.max_lag_s`` is not waited for), keeps
+copies of its whole state over the last ``window_s``, and when a late measurement arrives, it
+restores the state before its time and processes everything since again, in order. Afterwards the
+state is, to the last bit, the one that sorted data would have given: the copies contain the random
+generator, and measurements of one instant have a fixed order.
 
-A displacement is late, too, where steps behind the *beginning* of its chord have been handed out:
-the node was taken to stand there.
+A displacement is late, too, where steps behind the *beginning* of its chord have been released:
+the node was assumed to stand there.
 
-Nobody waits for it long either: a call of ``process`` works off at most ``most_s`` of what the
-core reckons its steps to cost, and the rest is worked off in the next calls. Estimates pause for
-so long. What a step costs is reckoned and not measured, so that the same measurements in the same
-order always give the same estimates.
+One call of ``process`` replays at most ``most_s`` of processor time, as the core estimates the cost
+of its steps; the rest is replayed in the next calls, and estimates pause for so long. Costs are
+estimated and not measured, so that the same measurements in the same order always give the same
+estimates.
 
-What it costs is bounded: a burst of late reports is worked off in one go, at most one every
-``every_s`` of measurement time, and none goes back farther than ``window_s``, one report
-(``max_lag_s``) and one spacing of the copies. Counted are ``rewinds``, the steps repeated
-(``rewound_steps``), and what came later than the window (the timeline's ``ranges_late`` and
-``motions_late``; ``motions_beyond_window`` whose chord began before it).
+The cost is bounded: a burst of late reports is replayed once, at most one every ``every_s`` of
+measurement time, and no rewind goes back farther than ``window_s``, one report (``max_lag_s``) and
+one spacing of the copies. Counters: ``rewinds``, the repeated steps (``rewound_steps``), and what
+came later than the window (the timeline's ``ranges_late`` and ``motions_late``;
+``motions_beyond_window`` whose chord began before it).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from relpos.fusion.timeline import Epoch, Step, Timeline, refusal
 from relpos.measurements import Measurement
 
 QUIET_S = 30.0
-"""After so long without anything late, copies are made more rarely."""
+"""After so long without a late measurement, copies are made more rarely."""
 
 
 class Core(Protocol):
@@ -78,11 +78,10 @@ class _Copy:
 class Rewinder:
     """The estimator around ``core`` and ``timeline``; it yields one estimate for each epoch.
 
-    ``window_s`` is how late a measurement may be, ``spacing_s`` how far apart copies are where
-    things come late now and then (eight times as far where nothing has for half a minute, because
-    copies cost, too), ``every_s`` how often it may go back, ``most_s`` how much is worked off in a
-    call. A replay does not repeat estimates
-    that were given already, and those given go on in time.
+    ``window_s`` is how late a measurement may be, ``spacing_s`` how far apart copies are while
+    measurements come late (eight times as far after ``QUIET_S`` without any), ``every_s`` how often
+    it may rewind, ``most_s`` how much a call replays. A replay does not repeat estimates that were
+    returned already; times of estimates always increase.
     """
 
     core: Core
@@ -102,14 +101,14 @@ class Rewinder:
     _back_to_s: float = math.inf
     _rewound_s: float = -math.inf
     _rest: Iterator[Step] | None = None
-    """Steps that the last call has left."""
+    """Steps that the last call left."""
     _replaying: bool = False
 
     def __post_init__(self) -> None:
         self.timeline.keep_late = True
 
     def process(self, measurement: Measurement) -> list[Estimate]:
-        """Take one measurement; return the estimates it completes."""
+        """Add one measurement; return the estimates it completes."""
         reason = refusal(measurement)
         if reason is not None:
             self._own[reason] += 1
@@ -129,8 +128,8 @@ class Rewinder:
                 return []
             # What is left goes on with what has been sorted in since.
             return list(self._work_off(self._rest or timeline.push_all(())))
-        # Until it has gone back, the timeline only sorts in. A burst of late ones is put in its
-        # place together, when the next thing of now comes.
+        # Until it has gone back, the timeline only sorts in. A burst of late measurements is
+        # replayed at once, when the next new measurement comes.
         if news and self._newest_s >= self._rewound_s + self.every_s:
             return list(self._rewind(final=False))
         return []
@@ -151,7 +150,7 @@ class Rewinder:
         return self.timeline.counters + self._own + self.core.counters()
 
     def _note_late(self) -> None:
-        """Tell whether, and to what time, to go back."""
+        """Find out whether to go back, and to what time."""
         for late in self.timeline.take_late():
             oldest_s = self._copies[0].frontier_s
             if late.time_s <= oldest_s:
@@ -172,7 +171,7 @@ class Rewinder:
         self.core = self._copy_of(copy.core)
         since = self._history[copy.pushed - self._forgotten :]
         steps = self.timeline.push_all(since, final=final)
-        self.timeline.take_late()  # what the copy cannot help either
+        self.timeline.take_late()  # behind the copy as well
         self._replaying = True
         yield from self._work_off(steps, math.inf if final else self.most_s)
 

@@ -7,7 +7,14 @@ from collections import Counter
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.bank import detection_update, heading_update, mixture, motion_update, sensors
+from relpos.fusion.bank import (
+    detection_update,
+    heading_update,
+    mixture,
+    motion_update,
+    range_update,
+    sensors,
+)
 from relpos.fusion.bank.adaptive_count import AdaptiveCount
 from relpos.fusion.bank.detection_update import Attempts
 from relpos.fusion.bank.hypothesis_set import PERTURBED_UPDATES, HypothesisSet
@@ -24,9 +31,9 @@ Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 OUTLIER_RANGES = 2.0
-"""The share of outliers that is expected beforehand is worth so many ranges: where a third of them
-are reflections that has to be known before they have moved anybody (``lab``, seeds 300 to 323:
-1.07 m with 5 % worth four, 0.95 m with 10 % worth two)."""
+"""The prior share of outliers counts as so many ranges. Where a third of the ranges are reflected,
+that has to be learned before they have moved a user (``lab``, seeds 300 to 323: 1.07 m with 5 %
+counting as four, 0.95 m with 10 % as two)."""
 
 _NOT_REPORTED: Floats = np.empty((0, 3))
 
@@ -135,7 +142,7 @@ class BankCore:
         """Update with the ranges (R,) of one instant; return each one's inlier probability.
 
         ``dz_m`` are the antennas' differences of height, ``dz_variance_m2`` their variances (0
-        by default), ``sample_count`` how many independent ranges each is worth (1 by default).
+        by default), ``sample_count`` how many independent ranges each counts as (1 by default).
         """
         several, these = len(first), self.hypotheses
         variance = np.zeros(several) if dz_variance_m2 is None else dz_variance_m2
@@ -145,9 +152,14 @@ class BankCore:
         ranges = Ranges(first, second, range_m, dz_m, variance, counts, biases)
         self._outlier[3] = 1.0 / (1.0 - these.sampled_share)
         wary = self.relocalisation.since_fault <= OPEN_UPDATES and self.counters["slips"] > 0
-        inlier, fault, clamped = sensors.update_with_ranges(
-            these.arrays, ranges, self._sensors(), these.draws, these.perturbed, wary
-        )
+        known, before = self._sensors(), these.log_weight.copy()
+        sensors.expect_outliers(self._outlier_counts, self._outlier)
+        stats = range_update.statistics(several, len(these.arrays.x))
+        range_update.update(these.arrays, ranges, known.model, stats)
+        inlier, fault, clamped = sensors.learn(
+            these.arrays, ranges, known, these.draws, these.perturbed,
+            stats.reshape(several, range_update.STATS, -1), before, wary,
+        )  # fmt: skip
         if clamped:
             self.counters["levels_clamped"] += clamped
         if fault >= 0 and self.settings.hypotheses > 1:
@@ -170,7 +182,7 @@ class BankCore:
     def update_detection(self, attempts: Attempts, detection: Detection) -> None:
         """Update with which attempts were received.
 
-        After their ranges: it is the distances after them that decide what this tells.
+        After their ranges: the detection probability depends on the distances after them.
         """
         these = self.hypotheses
         before = these.log_weight.copy()

@@ -1,8 +1,8 @@
-"""Detection: what it tells that a pair received each other, or did not.
+"""Detection: how received and missed attempts of a pair update every hypothesis.
 
 Silence is negative information: those who are far apart do not receive each other. A range near
 the edge of reception is more likely too long than one beyond the edge is received: without the
-share of those received, the silent ones would drive everybody apart.
+share of those received, the silent ones would drive all users apart.
 """
 
 from __future__ import annotations

@@ -233,12 +233,12 @@ class Bank:
 
     def _range(self, step: Ranging, timeline: Timeline) -> None:
         located, time_s = self._row, step.time_s
-        everybody = {n for r in step.ranges for n in (r.node, r.peer)}
-        for node in everybody:
+        ends = {n for r in step.ranges for n in (r.node, r.peer)}
+        for node in ends:
             self._meet(node).received(time_s)
         ranges: Sequence[Range] = step.ranges
-        if not everybody <= located.keys():
-            for node in sorted(everybody - located.keys()):
+        if not ends <= located.keys():
+            for node in sorted(ends - located.keys()):
                 self._seek(node)
             heights = {n: k.height_m for n, k in self._known.items()}
             self.initialiser.update(time_s, step.ranges, self._places(), heights)
@@ -381,13 +381,13 @@ class Bank:
             for late in timeline.catch_up({n for p in pairs for n in p}, time_s):
                 self.update(late, timeline)
             self._advance()
-            ends = self._pairs(pairs)
+            rows = self._pairs(pairs)
             received = np.arange(len(pairs)) < len(done.received)
             attempted = np.ones(len(pairs))
             attempted[len(done.received) :] = self.detection.update(
-                done, *self.core.predicted_ranges(*ends)
+                done, *self.core.predicted_ranges(*rows)
             )
-            rounds.append(Attempts(*ends, received, attempted))
+            rounds.append(Attempts(*rows, received, attempted))
         return rounds
 
     def _sense(self, step: Sensed) -> None:

@@ -2,7 +2,7 @@
 
 A mixture may be replaced by its moments where that loses nothing: where everything that the
 joint filter linearises is nearly a line within what is not known. Two things are not, a
-displacement's direction and a range, and both are curved by a length that can be told from the
+displacement's direction and a range, and both are curved by a length that follows from the
 mixture's covariance alone, beside noise that it is to be negligible against:
 
 * a pair of users at distance d whose difference has the variance c across the line of sight
@@ -56,7 +56,7 @@ strongly nonlinear 1.31 (1.76), 1600 1.28 (1.64); the bound is 1.30. There the b
 an epoch of 2 s, in place of 2."""
 
 WORK = 1.6e8
-"""Hypotheses times entries cubed at most (what an epoch costs, where everybody ranges a few): six
+"""Hypotheses times entries cubed at most (what an epoch costs, where every user ranges a few): six
 people with biases of all pairs have 1600 of 46 entries, ten without 1200, twenty the usual 200."""
 
 CHECKED_AFTER = 4

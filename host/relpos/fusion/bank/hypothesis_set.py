@@ -68,7 +68,7 @@ class HypothesisSet:
         """1 where range biases are (K,)."""
         self.low_heading_noise = self._share_of_all(int(settings.steady * count))
         """1 where headings are taken to be those of wheels or a camera (K,)."""
-        # Whoever reports initial poses may be wrong about all of them at once.
+        # Reported initial poses may all be wrong at once.
         self.wrong_start = self._share_of_all(int(settings.wrong_starts * count))
         self.perturbed: Floats = PERTURBED_UPDATES * self.wrong_start
         """For so many instants of ranges a hypothesis teaches nothing about noise (K,)."""

@@ -233,7 +233,7 @@ def select(typing: Any, mask: Any, this: Any, that: Any) -> Any:
 
 @_intrinsic
 def some(typing: Any, mask: Any) -> Any:
-    """Tell whether the mask holds anywhere."""
+    """Whether the mask holds anywhere."""
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         bits = builder.bitcast(args[0], ir.IntType(LANES))

@@ -54,10 +54,15 @@ class Ranges(NamedTuple):
     """Height difference of the antennas."""
     dz_variance_m2: Floats
     sample_count: Floats
-    """How many independent ranges each is worth: the variance that the gain sees is divided by
+    """How many independent ranges each counts as: the variance that the gain sees is divided by
     it, the evidence multiplied."""
     bias: Indices
     """Entry of the state that holds the range's bias, or -1."""
+
+
+def statistics(ranges: int, blocks: int) -> Floats:
+    """Return an array (R, STATS, B, LANES) for the statistics of :func:`update`."""
+    return lanes.empty_lines(ranges, STATS, blocks)
 
 
 class RangeModel(NamedTuple):
@@ -204,7 +209,7 @@ def _correct_sensitivity(
 
 @inner
 def _bound_sensitivity(sens: Floats, t: int, p: Floats, base: int, b: int, most: float) -> None:
-    """Keep what the levels explain of a covariance below ``most`` times the covariance.
+    """Keep what the components explain of a covariance below ``most`` times the covariance.
 
     It is homogeneous in all variances, so that a true derivative obeys it with ``most`` 1.
     """

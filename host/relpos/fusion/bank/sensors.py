@@ -13,10 +13,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.bank import lanes, mixture
-from relpos.fusion.bank import range_update as ranging
+from relpos.fusion.bank import mixture
 from relpos.fusion.bank import variance_components as components
-from relpos.fusion.bank.range_update import INLIER, MEAN, STATS, VARIANCE, Ranges
+from relpos.fusion.bank.range_update import INLIER, MEAN, VARIANCE, RangeModel, Ranges
 from relpos.fusion.bank.storage import Hypotheses
 from relpos.fusion.bank.variance_components import Draws
 from relpos.fusion.compiled import compiled, inner
@@ -36,7 +35,7 @@ then agree on a wrong mode (paper-h, seeds 5000 to 5011: 0.97 m and NEES 1.9 wit
 
 
 OUTLIERS_EXPECTED = 3.0
-"""How far outliers are expected to be off beforehand is worth so many of them."""
+"""The prior variance of outliers counts as so many of them."""
 
 ODD_SHARE, ODD_SHARE_OF_OUTLIERS = 0.15, 2.2
 """A user surprises from this share of odd ranges on, or so many times the share of outliers: where
@@ -50,7 +49,7 @@ class Sensors(NamedTuple):
     """Logarithms of the variance components (L,)."""
     covariance: Floats
     """Theirs (L, L)."""
-    model: ranging.RangeModel
+    model: RangeModel
     outlier_counts: Floats
     """(3,): outliers, others, and the sum of the outliers' squares (m^2)."""
     surprise: Floats
@@ -113,17 +112,28 @@ def _innovations(
     return square, excess
 
 
-@inner
-def _learn(
-    ranges: Ranges, stats: Floats, before: Floats, log_weight: Floats, perturbed: Floats,
-    sensors: Sensors, wary: bool,
+@compiled
+def temper(log_weight: Floats, before: Floats) -> None:
+    """Scale the evidence since ``before`` (K,) in the log weights by ``EVIDENCE_SHARE``."""
+    weights = log_weight.reshape(-1)
+    for k in range(before.shape[0]):
+        weights[k] = before[k] + EVIDENCE_SHARE * (weights[k] - before[k])
+
+
+@compiled
+def learn(
+    hypotheses: Hypotheses, ranges: Ranges, sensors: Sensors, draws: Draws, perturbed: Floats,
+    stats: Floats, before: Floats, wary: bool,
 ) -> tuple[Floats, int, int]:  # fmt: skip
     """Learn from the innovations of an instant's ranges (R,) what they say of the sensors.
 
-    ``stats`` (R, STATS, >= K) are of the update, ``before`` (K,) the log weights before it.
-    Returns each range's inlier probability (R,), the row with an odometry fault or -1, and how
-    many variance components were clamped.
+    ``stats`` (R, STATS, >= K) are of the update, ``before`` (K,) the log weights before it. Then
+    the evidence is tempered, and the variance components are drawn again. ``perturbed`` (K,)
+    counts down the updates for which a hypothesis teaches nothing; ``wary`` lowers the threshold
+    of the fault detector. Returns each range's inlier probability (R,), the row with an odometry
+    fault or -1, and how many variance components were clamped.
     """
+    log_weight = hypotheses.log_weight
     count, several = before.shape[0], ranges.first.shape[0]
     first, second = ranges.first, ranges.second
     square, excess = _innovations(ranges, stats, before, perturbed)
@@ -153,37 +163,6 @@ def _learn(
         outliers[2] += (1.0 - inlier[r]) * excess[r]
         for row in (first[r], second[r]):
             surprise[row] += 0.2 * (1.0 - inlier[r] - surprise[row])
-    return inlier, fault, clamped
-
-
-@compiled
-def temper(log_weight: Floats, before: Floats) -> None:
-    """Scale the evidence since ``before`` (K,) in the log weights by ``EVIDENCE_SHARE``."""
-    weights = log_weight.reshape(-1)
-    for k in range(before.shape[0]):
-        weights[k] = before[k] + EVIDENCE_SHARE * (weights[k] - before[k])
-
-
-@compiled
-def update_with_ranges(
-    hypotheses: Hypotheses, ranges: Ranges, sensors: Sensors, draws: Draws, perturbed: Floats,
-    wary: bool,
-) -> tuple[Floats, int, int]:  # fmt: skip
-    """Update hypotheses with an instant's ranges (R,), learn from them, redraw the components.
-
-    ``perturbed`` (K,) counts down the updates for which a hypothesis teaches nothing; ``wary``
-    lowers the threshold of the fault detector. Returns what :func:`_learn` does.
-    """
-    x, log_weight = hypotheses.x, hypotheses.log_weight
-    count, several, blocks = perturbed.shape[0], ranges.first.shape[0], x.shape[0]
-    lines = lanes.working_lines(several * STATS * blocks)
-    before = log_weight.reshape(-1)[:count].copy()
-    expect_outliers(sensors.outlier_counts, sensors.model.outlier)
-    stats = lines.reshape(several, STATS, blocks, lanes.LANES)
-    ranging.update(hypotheses, ranges, sensors.model, stats)
-    learned = _learn(
-        ranges, lines.reshape(several, STATS, -1), before, log_weight, perturbed, sensors, wary
-    )
     temper(log_weight, before)
     components.spread(draws, sensors.mean, sensors.covariance, hypotheses)
-    return learned
+    return inlier, fault, clamped
