@@ -73,7 +73,7 @@ def test_a_node_that_does_not_answer_is_told_and_nothing_waits_for_it(conversati
     conversation.learn(77, 1.10)
     conversation.run(ATTEMPTS + 3.0)
     assert conversation.sender.sent == 0
-    assert any("node 77 no answer" in r for r in conversation.sender.remarks)
+    assert any("node 77: no answer" in r for r in conversation.sender.remarks)
     assert conversation.motions[1].time_s > ATTEMPTS
 
 
