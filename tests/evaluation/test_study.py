@@ -11,7 +11,7 @@ import pytest
 
 from relpos.errors import RelposError
 from relpos.evaluation import executors, study
-from relpos.evaluation.study import Case, Figure
+from relpos.evaluation.study import Case, Statistic
 
 SHORT = {"seconds": 30}
 CASES = [
@@ -93,7 +93,7 @@ def test_a_failed_job_is_raised_with_its_own_words(pool: Executor) -> None:
 
 
 def test_a_figure_is_mean_standard_error_and_worst() -> None:
-    figure = Figure.of([1.0, 2.0, math.nan, 6.0])
+    figure = Statistic.of([1.0, 2.0, math.nan, 6.0])
     assert (figure.mean, figure.worst, figure.count) == (3.0, 6.0, 3)
     assert figure.error == pytest.approx(math.sqrt(7.0 / 3.0))
     assert figure.overlaps(3.0 + 1.96 * figure.error + 0.9, 0.5)

@@ -24,7 +24,7 @@ class FormatName(StrEnum):
 
 
 class KindName(StrEnum):
-    """What a trajectory from another tool is."""
+    """Kind of a trajectory from another tool."""
 
     TRUTH = "truth"
     ESTIMATE = "estimate"
@@ -43,11 +43,12 @@ def convert(
     out: Annotated[
         Path,
         typer.Option(
-            metavar="PATH", help="Where it goes: a file for mcap, geojson, gpx; else a directory."
+            metavar="PATH", help="Output: a file for mcap, geojson, gpx; else a directory."
         ),
     ],
     source_format: Annotated[
-        FormatName | None, typer.Option("--from", help="What SOURCE is, if its name does not say.")
+        FormatName | None,
+        typer.Option("--from", help="Format of SOURCE, if its name does not show it."),
     ] = None,
     run: Annotated[
         Path | None,
@@ -64,23 +65,24 @@ def convert(
     pins: live.Pins = None,
     start: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="When the run's second 0 was: 2026-05-04T09:30:00Z."),
+        typer.Option(metavar="TIME", help="Time of second 0 of the run: 2026-05-04T09:30:00Z."),
     ] = None,
     kind: Annotated[
-        KindName | None, typer.Option("--as", help="What another tool's trajectories are.")
+        KindName | None, typer.Option("--as", help="Kind of trajectories from another tool.")
     ] = None,
     node: Annotated[
-        int | None, typer.Option(min=0, help="Whose trajectory it is, if its name does not say.")
+        int | None,
+        typer.Option(min=0, help="Node of the trajectory, if its name does not show it."),
     ] = None,
     located: Annotated[
-        bool, typer.Option("--located", help="Leave out guesses at nodes not located.")
+        bool, typer.Option("--located", help="Leave out poses of nodes that are not located.")
     ] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
     """Convert a recording or an estimate: MCAP, TUM (evo), GeoJSON, GPX, CSV with names.
 
-    With --landmarks, the wearers' landmark presses and a table of surveyed places become the
-    run's truth. docs/exchange.md tells what each format holds.
+    With --landmarks, the landmark presses of the wearers and a table of surveyed positions become
+    the truth of the run. docs/exchange.md describes the formats.
     """
     from relpos.cli import output
     from relpos.exchange import convert as formats
@@ -92,10 +94,11 @@ def convert(
     placed = tuple(parse_pin(pin) for pin in pins or ())
     if wanted in (formats.Format.GEOJSON, formats.Format.GPX) and not placed:
         raise typer.BadParameter(
-            f"{to} is a map's: say where one position lies ({live.PINS})", param_hint="--pin"
+            f"{to} needs geographic coordinates: give a known position ({live.PINS})",
+            param_hint="--pin",
         )
     if out.resolve() == source.resolve():
-        raise DataError(f"{out}: that is SOURCE itself; name another place (--out)")
+        raise DataError(f"{out}: --out is SOURCE itself; name another path")
     hints = formats.Hints(
         format=formats.Format(source_format) if source_format else None,
         run=run,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cmath
 import math
+from collections.abc import Sequence
 from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,6 +17,7 @@ from relpos.errors import DataError
 
 if TYPE_CHECKING:
     from relpos.emulator.deadreckoning import NodeResult
+    from relpos.runs import Run
 
 
 def deadreckon(
@@ -41,7 +43,7 @@ def deadreckon(
     """Play imu.csv into the emulated sensor chip, run the firmware, print the walked path."""
     from dataclasses import replace
 
-    from relpos.emulator.deadreckoning import LEAST_RATE_HZ, reckon_run
+    from relpos.emulator.deadreckoning import reckon_run
     from relpos.runs import Run, save_run
     from relpos.sources import load
 
@@ -78,31 +80,7 @@ def deadreckon(
         document = dumps({"nodes": nodes}, indent=2, allow_nan=False)
         (out / "summary.json").write_text(document + "\n", encoding="utf-8")
     for node, part in sorted(played.items()):
-        if part.repeated:
-            output.remark(
-                f"node {node}: {part.repeated} of {part.samples} samples repeat a time: "
-                "the first of each time is played"
-            )
-        if part.calibration is not None:
-            for walk, measured_m in zip(walks, part.calibration.measured_m, strict=True):
-                output.remark(
-                    f"node {node}: {walk.name} of {walk.description.true_distance_m:g} m comes out "
-                    f"as {measured_m:.2f} m before calibration"
-                )
-            output.remark(
-                f"node {node}: steps are taken {part.calibration.scale:.3f} times as long after "
-                "that; one walk is believed in part, one that is far off hardly"
-            )
-        if part.rate_hz < LEAST_RATE_HZ:
-            output.remark(
-                f"node {node}: {part.rate_hz:.3g} samples a second are too few to see steps: "
-                f"{LEAST_RATE_HZ:g} are needed"
-            )
-        if part.output.clipped:
-            output.remark(
-                f"node {node}: {part.output.clipped} of {part.samples} samples are beyond the "
-                "range the firmware configures; the chip clips them"
-            )
+        _print_remarks(node, part, walks)
     if json:
         output.print_json({"nodes": nodes})
         return
@@ -116,8 +94,39 @@ def deadreckon(
         output.remark(f"written to {out}")
 
 
+def _print_remarks(node: int, part: NodeResult, walks: Sequence[Run]) -> None:
+    """Print what a user must know of one node: calibration, and faults of the recording."""
+    from relpos.emulator.deadreckoning import LEAST_RATE_HZ
+
+    if part.repeated:
+        output.remark(
+            f"node {node}: {part.repeated} of {part.samples} samples repeat a time: "
+            "the first of each time is played"
+        )
+    if part.calibration is not None:
+        for walk, measured_m in zip(walks, part.calibration.measured_m, strict=True):
+            output.remark(
+                f"node {node}: {walk.name} of {walk.description.true_distance_m:g} m comes out "
+                f"as {measured_m:.2f} m before calibration"
+            )
+        output.remark(
+            f"node {node}: step length x{part.calibration.scale:.3f} after calibration; one walk "
+            "alone is weighted in part, a walk that is far off hardly"
+        )
+    if part.rate_hz < LEAST_RATE_HZ:
+        output.remark(
+            f"node {node}: {part.rate_hz:.3g} samples a second are too few to see steps: "
+            f"{LEAST_RATE_HZ:g} are needed"
+        )
+    if part.output.clipped:
+        output.remark(
+            f"node {node}: {part.output.clipped} of {part.samples} samples are beyond the "
+            "range the firmware configures; the chip clips them"
+        )
+
+
 def _figures(part: NodeResult) -> dict[str, Any]:
-    """What is printed of one node; the end is in its heading frame at the start."""
+    """Return the figures of one node; the end is in its heading frame at the start."""
     leg_m = part.settings.leg_length_m
     end, heading_rad = 0j, 0.0
     for motion in part.output.motions:

@@ -24,7 +24,7 @@ class Board(StrEnum):
 
 
 def check_faults(faults: list[str] | None, nodes: int) -> tuple[str, ...]:
-    """The SPECs as they were given; a line and exit status 2 where one makes no sense."""
+    """Return the SPECs as given; print a line and exit with status 2 where one is invalid."""
     from relpos.emulator.faults import FaultError, parse_faults
 
     try:
@@ -38,7 +38,7 @@ def check_faults(faults: list[str] | None, nodes: int) -> tuple[str, ...]:
 Faults = Annotated[
     list[str] | None,
     typer.Option(
-        "--fault", metavar="SPEC", help="Something to go wrong; repeatable. See the list below."
+        "--fault", metavar="SPEC", help="A fault to inject; repeatable. See the list below."
     ),
 ]
 
@@ -60,7 +60,7 @@ def demo(
     terminal: live.Terminal = False,
     json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
 ) -> None:
-    """Run the production firmware of an emulated team and show who was where.
+    """Run the production firmware of an emulated team and show the estimated positions.
 
     With --view the team walks in real time behind the live page, with --terminal in this
     terminal; Ctrl-C ends it.

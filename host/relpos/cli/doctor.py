@@ -20,7 +20,7 @@ def doctor(
     port: Annotated[
         str | None,
         typer.Argument(
-            metavar="[PORT]", help="The coordinator's: its XBee is asked for its settings."
+            metavar="[PORT]", help="Port of the coordinator, whose XBee settings are checked."
         ),
     ] = None,
     key_file: KeyFile = None,
@@ -32,9 +32,9 @@ def doctor(
     ] = False,
     json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
 ) -> None:
-    """Check installation, tools, ports, permissions and the coordinator; say what to do.
+    """Check installation, tools, ports, permissions and the coordinator; print remedies.
 
-    Changes nothing. Exit status 0 where nothing is wrong (hints are no harm), else 1.
+    Changes nothing. Exit status 1 where something is wrong, else 0; hints do not count.
     """
     from relpos.doctor import devices, installation
     from relpos.doctor.computer import Computer

@@ -15,10 +15,11 @@ def emulate(
     board: Annotated[Board, typer.Option(help="What runs the firmware.")] = Board.NATIVE,
     scenario: Annotated[str, typer.Option(metavar="NAME", help="Where they walk.")] = "paper",
     speed: Annotated[
-        float, typer.Option(min=0.0, help="1 is real time; 0 is as fast as it goes.")
+        float, typer.Option(min=0.0, help="1 is real time; 0 is as fast as possible.")
     ] = 1.0,
     seconds: Annotated[
-        float | None, typer.Option(min=1.0, help="End after so long. (default: Ctrl-C ends)")
+        float | None,
+        typer.Option(min=1.0, help="End after so many seconds. (default: Ctrl-C ends)"),
     ] = None,
     fault: Faults = None,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same bytes.")] = 0,

@@ -1,4 +1,4 @@
-"""``--estimator``: ours by name, anybody's by ``MODULE:CLASS``."""
+"""``--estimator``: those of relpos by name, others by ``MODULE:CLASS``."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ def figures(
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="Draw this estimator of yours too: MODULE:CLASS, FILE.py:CLASS, or a name that a "
+            help="Draw an estimator of your own too: MODULE:CLASS, FILE.py:CLASS, or a name that a "
             "package registers. May be repeated.",
         ),
     ] = None,
@@ -49,9 +49,10 @@ def figures(
     for name in estimator or []:
         if not plugins.is_plugin(name):
             raise typer.BadParameter(
-                f"'{name}' is not MODULE:CLASS; ours are drawn anyway", param_hint="--estimator"
+                f"'{name}' is not MODULE:CLASS; those of relpos are drawn anyway",
+                param_hint="--estimator",
             )
-        # A name that leads nowhere is told before anything is computed.
+        # An estimator that cannot be found is an error before anything is computed.
         plugins.factory(name)
     wanted = list(dict.fromkeys(figure or FIGURES))
     for name in wanted:
@@ -81,4 +82,4 @@ def figures(
         "with 95 % confidence intervals. The bound is the posterior Cramer-Rao bound of "
         "filtering, computed at the true path with the true noise levels.",
     )
-    output.remark(f"all of them: {where}")
+    output.remark(f"all figures: {where}")

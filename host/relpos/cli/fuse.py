@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class Initial(StrEnum):
-    """Where the nodes start, as the user says."""
+    """Start of the nodes, as given by the user."""
 
     UNKNOWN = "unknown"
     COMMON = "common"
@@ -37,10 +37,10 @@ class Initial(StrEnum):
 
 
 class FuseCommand(TyperCommand):
-    """The command with the estimators' settings below its help, read from the estimators."""
+    """The command whose help ends with the settings of every estimator."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Let --foxglove stand without a value, too, which Typer's options cannot."""
+        """Allow --foxglove without a value, which Typer's options cannot."""
         return super().parse_args(ctx, live.with_default_address(args))
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
@@ -71,7 +71,7 @@ def fuse(
     ] = None,
     initial: Annotated[
         Initial | None,
-        typer.Option(help="Where the nodes start. (default: what the run says, else unknown)"),
+        typer.Option(help="Where the nodes start. (default: the start in the run, else unknown)"),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the estimator's randomness.")] = 0,
     smooth: Annotated[bool, typer.Option("--smooth", help="Smooth over the whole run.")] = False,
@@ -79,7 +79,7 @@ def fuse(
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Where the output goes. (default: out/NAME, of a port with the time)",
+            help="Output directory. (default: out/NAME; of a port, with the time)",
         ),
     ] = None,
     record: live.Record = None,
@@ -94,17 +94,17 @@ def fuse(
     pins: live.Pins = None,
     seconds: Annotated[
         float | None,
-        typer.Option(min=0.0, help="Listen to a port, or show a recording, this long, then end."),
+        typer.Option(min=0.0, help="End after so many seconds of a port or a shown recording."),
     ] = None,
     speed: Annotated[
         float,
-        typer.Option(min=0.0, help="Of a recording that is shown: 2 is twice as fast as it was."),
+        typer.Option(min=0.0, help="Speed of a shown recording: 2 is twice as fast as recorded."),
     ] = 1.0,
     teach: Annotated[
         bool,
         typer.Option(
             "--teach/--no-teach",
-            help="Send the step lengths that the ranges teach to the nodes of a port.",
+            help="Send step lengths learned from ranges to the nodes of a port.",
         ),
     ] = True,
     key_file: KeyFile = None,
@@ -113,26 +113,26 @@ def fuse(
         bool | None,
         typer.Option(
             "--report/--no-report",
-            help="Write the page index.html with pictures and numbers. (default: unless --json)",
+            help="Write the page index.html with figures and numbers. (default: unless --json)",
         ),
     ] = None,
 ) -> None:
     """Fuse motion and ranges into relative positions; score them where there is truth.
 
-    With --smooth the estimates come when all is over, each from the whole run: the best track.
+    With --smooth every estimate uses the whole run and is written at the end: the best track.
 
-    Writes estimate.csv, pairs.csv and parameters.csv, and of a run the page index.html with its
-    pictures (`relpos report` makes it of anything). From a port, what was received is kept too, as
-    a run directory under received/; Ctrl-C ends it. With --view, or anything else that shows or
-    records it, a port that vanishes is waited for, and a recording is played at the pace at which
-    it was made (--speed).
+    Writes estimate.csv, pairs.csv and parameters.csv, and for a run the page index.html with
+    figures (`relpos report` writes it for any estimate). For a port, received data is stored as a
+    run directory under received/; Ctrl-C ends the session. With --view, or another option that
+    shows or records the session, relpos waits for a port that vanishes, and plays a recording at
+    its original speed (--speed).
     """
     from relpos import sources
 
     chosen = output.parse_settings(settings or [])
     sinks: list[MakeSink] = []
     if terminal and json:
-        raise typer.BadParameter("draws where --json prints", param_hint="--terminal")
+        raise typer.BadParameter("cannot be combined with --json", param_hint="--terminal")
     if terminal:
         sinks.append(live.terminal_sink(me))
     if cot is not None:
@@ -166,7 +166,7 @@ def fuse(
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be done, as the command line said it."""
+    """The request of the command line."""
 
     source: str
     estimator: str
@@ -202,7 +202,7 @@ class Job:
 
 
 def _default_out(source: str) -> Path:
-    """Of a port a new folder each time: a mission must not overwrite the one before."""
+    """Return a new folder for each session of a port: it must not overwrite the last one."""
     from relpos import sources
 
     name = _base_name(source)
@@ -250,7 +250,7 @@ def _fuse_mcap(
     as_json: bool,
     report: bool | None,
 ) -> None:
-    """Repeat a recorded session, with its own settings where the command line gives none."""
+    """Repeat a recorded session; the command line replaces its settings."""
     from relpos import api
     from relpos.live.fusion_thread import common_start
     from relpos.live.inputs import PacedInput
@@ -263,9 +263,9 @@ def _fuse_mcap(
     if about is not None:
         estimator = job.estimator if "estimator" in given else about.estimator
         if "estimator" not in given and ":" in estimator:
-            # A file must not choose what code is run.
+            # A file must not choose the code that runs.
             raise RelposError(
-                f"{job.source}: recorded with the estimator {estimator}: give it by --estimator"
+                f"{job.source}: recorded with the estimator {estimator}: name it with --estimator"
             )
         recorded = about.settings if estimator == about.estimator else {}
         job = replace(
@@ -349,7 +349,7 @@ def fuse_recording(
             content = reports.gather(run, result, evaluation=evaluation, baseline=baseline)
             reports.write(content, job.out / "index.html")
     counters = {**run.counters, **result.counters}
-    outcome = Outcome(run.name, counters, result.estimates, len(result.estimates))
+    outcome = FusionSummary(run.name, counters, result.estimates, len(result.estimates))
     _print_outcome(job, outcome, evaluation, baseline, as_json=as_json)
 
 
@@ -366,10 +366,10 @@ def _fuse_port(
     from relpos.measurements import Prior
 
     if initial is Initial.TRUTH:
-        raise DataError(f"{job.source}: a port brings no truth to start from")
+        raise DataError(f"{job.source}: a port has no truth to start from")
     check_port(job.source)
-    # Before the port is open: nobody takes in what arrives meanwhile. Who starts from one place is
-    # heard later; that some do is known.
+    # Before the port is open, because nothing reads it meanwhile. The nodes that start at one
+    # place are heard later; two stand for them here.
     some = [Prior(node, 0.0, 0.0, 0.0) for node in (1, 2)]
     job.prepare(some if initial is Initial.COMMON else ())
     port = live.open_port(job.source, key_file, teach=teach, reopen=options.shown)
@@ -389,9 +389,9 @@ def fuse_live(
     as_json: bool,
     emulated: Callable[[], bool] | None = None,
 ) -> None:
-    """Fuse what comes from ``source`` as it comes; write, show, and tell the result.
+    """Fuse measurements of ``source`` as they arrive; write, show and print the result.
 
-    ``emulated`` tells of an emulated team whether its walk is over, which ends its port.
+    ``emulated`` tells whether the walk of an emulated team is over, which ends its port.
     """
     from relpos.live.assembly import SessionPlan
     from relpos.runs import Description
@@ -421,12 +421,12 @@ def fuse_live(
         raise failure
     last = [session.last] if session.last is not None else []
     _print_outcome(
-        job, Outcome(plan.name, session.counters, last, session.estimates), as_json=as_json
+        job, FusionSummary(plan.name, session.counters, last, session.estimates), as_json=as_json
     )
 
 
 @dataclass(frozen=True)
-class Outcome:
+class FusionSummary:
     """What is printed of a run or session: ``estimates`` are all of ``count``, or the last."""
 
     name: str
@@ -437,7 +437,7 @@ class Outcome:
 
 def _print_outcome(
     job: Job,
-    outcome: Outcome,
+    outcome: FusionSummary,
     evaluation: Evaluation | None = None,
     baseline: Baseline | None = None,
     *,

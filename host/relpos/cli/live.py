@@ -1,4 +1,4 @@
-"""What the commands that run live have in common: a session, its sinks, and what is printed."""
+"""Options and sinks that the commands with a live session share."""
 
 from __future__ import annotations
 
@@ -31,20 +31,18 @@ ViewListen = Annotated[
     str | None,
     typer.Option(
         metavar="HOST:PORT",
-        help="Where the page is served: 0.0.0.0 for phones and others. (default: here alone)",
+        help="Address of the page: 0.0.0.0 for phones and others. (default: this computer)",
     ),
 ]
 Https = Annotated[
     bool,
     typer.Option(
-        "--https", help="With a certificate made on the spot: phones share their compass."
+        "--https", help="Serve with a new certificate, so that phones can share their compass."
     ),
 ]
 OpenBrowser = Annotated[
     bool | None,
-    typer.Option(
-        "--open/--no-open", help="Open the page here. (default: where there is a desktop)"
-    ),
+    typer.Option("--open/--no-open", help="Open the page here. (default: on a desktop)"),
 ]
 
 Terminal = Annotated[
@@ -52,9 +50,7 @@ Terminal = Annotated[
 ]
 Me = Annotated[
     int | None,
-    typer.Option(
-        metavar="NODE", help="From whom --terminal measures at first. (default: the first)"
-    ),
+    typer.Option(metavar="NODE", help="Node from which --terminal measures. (default: the first)"),
 ]
 Cot = Annotated[
     str | None,
@@ -66,30 +62,30 @@ Cot = Annotated[
 ]
 PINS = "LAT,LON[,BEARING[,ALTITUDE]][@POINT]"
 PIN_HELP = (
-    "A known place: latitude, longitude, the compass bearing that world x points to, the altitude "
-    "of z = 0 over WGS84. POINT is what lies there: X,Y or NODE or NODE:TIME (default 0,0). Two or "
-    "more pins give the bearing."
+    "A known position: latitude, longitude, the compass bearing of world x, the altitude of z = 0 "
+    "over WGS84. POINT is the point there: X,Y or NODE or NODE:TIME (default 0,0). Two or more "
+    "pins give the bearing."
 )
 Pins = Annotated[list[str] | None, typer.Option("--pin", metavar=PINS, help=PIN_HELP)]
 
 Record = Annotated[
     Path | None,
-    typer.Option(metavar="FILE.mcap", help="Record all that is received, for replay and Foxglove."),
+    typer.Option(metavar="FILE.mcap", help="Record all received data, for replay and Foxglove."),
 ]
 Foxglove = Annotated[
     str | None,
     typer.Option(
         metavar="[HOST:PORT]",
-        help="Serve the session to Foxglove's viewer, at 127.0.0.1:8765 if nothing else is said.",
+        help="Serve the session to Foxglove's viewer. (default: 127.0.0.1:8765)",
     ),
 ]
 FOXGLOVE_AT = "127.0.0.1:8765"
-"""Where its viewer looks first; on this computer alone, for its protocol knows no password."""
+"""The viewer's own default; this computer alone, because its protocol has no password."""
 ADDRESS = re.compile(r"[\w.\-\[\]:]*:\d+|\d+")
 
 
 def with_default_address(arguments: Sequence[str]) -> list[str]:
-    """The command line with an address behind each --foxglove that has none."""
+    """Return the command line with an address behind each --foxglove that has none."""
     full: list[str] = []
     for k, word in enumerate(arguments):
         full.append(word)
@@ -120,21 +116,21 @@ class Options:
 
     @property
     def shown(self) -> bool:
-        """Whether somebody looks at it, or records it, while it runs."""
+        """Whether the session is shown or recorded while it runs."""
         return self.watched or self.record is not None
 
     @property
     def pace(self) -> float:
-        """How fast a recording is played; where nobody looks, as fast as it goes."""
+        """Speed at which a recording is played; 0, as fast as possible, where nothing shows it."""
         return self.speed if self.watched else 0.0
 
     @property
     def watched(self) -> bool:
-        """Whether somebody looks at it while it runs: its last picture stays, then."""
+        """Whether the session is shown while it runs; its last view stays then."""
         return self.view or bool(self.sinks) or self.foxglove is not None
 
     def check(self) -> None:
-        """Refuse what cannot be done before anything else is: DataError, RelposError."""
+        """Raise DataError or RelposError at once where an option cannot work."""
         if self.record is not None or self.foxglove is not None:
             from relpos import recording
 
@@ -142,7 +138,7 @@ class Options:
 
 
 def open_port(port: str, key_file: Path | None, *, teach: bool, reopen: bool) -> Input:
-    """The team behind a serial port, under the team's key."""
+    """Return the team behind a serial port, under the team's key."""
     from relpos.live.inputs import PortInput
 
     link, seen = make_link(key_file)
@@ -217,7 +213,7 @@ def _about(source: Input, plan: SessionPlan, hello: Hello) -> About:
 
 
 def terminal_sink(me: int | None) -> MakeSink:
-    """Draw table and map on stdout."""
+    """Return a maker of the view that draws table and map on stdout."""
 
     def make(hello: Hello) -> Sink:
         from relpos.view.terminal import TerminalView
@@ -228,7 +224,7 @@ def terminal_sink(me: int | None) -> MakeSink:
 
 
 def cot_sink(url: str, pins: Sequence[str], *, replayed: bool) -> MakeSink:
-    """Send to TAK's screens; DataError at once where URL or pins cannot work."""
+    """Return a maker of the sender to TAK; DataError at once where URL or pins cannot work."""
     from relpos.geodesy import parse_pin
     from relpos.live.cot import CotSender, PinnedFrame, check_url
 
@@ -244,7 +240,7 @@ def cot_sink(url: str, pins: Sequence[str], *, replayed: bool) -> MakeSink:
 
 
 def _open_page(options: Options, hello: Hello) -> WebView:
-    """Serve the page, tell its address, open it where there is a desktop."""
+    """Serve the page, print its address, and open it on a desktop."""
     from relpos.view import access as doors
     from relpos.view.web import WebView
 
@@ -267,7 +263,7 @@ def _open_page(options: Options, hello: Hello) -> WebView:
 
 
 def _has_desktop() -> bool:
-    """Whether a browser would appear before the user's eyes."""
+    """Whether a browser window would be visible to the user."""
     if os.environ.get("SSH_CONNECTION"):
         return False
     if sys.platform in ("darwin", "win32"):

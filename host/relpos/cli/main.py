@@ -1,4 +1,4 @@
-"""``relpos``: the commands, and how a failure is told.
+"""``relpos``: the commands, and how a failure is printed.
 
 Every command lives in its own file and imports what is heavy inside its body, so that
 ``relpos --help`` answers at once. Exit status: 0 done, 1 the data or device failed (one clear
@@ -42,7 +42,7 @@ class Commands(TyperGroup):
         except RelposError as error:
             _fail(str(error))
         except BrokenPipeError:
-            # Whoever read our output has gone; a second complaint at exit would only confuse.
+            # The reader of our output has gone; a second error at exit would only confuse.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(1) from None
         except KeyboardInterrupt:

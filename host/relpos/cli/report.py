@@ -32,7 +32,9 @@ def report(
     ] = None,
     figures: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Write every figure there, too: NAME.svg and NAME.png."),
+        typer.Option(
+            metavar="DIR", help="Also write every figure to this directory: NAME.svg and NAME.png."
+        ),
     ] = None,
     json: Annotated[
         bool, typer.Option("--json", help="Print the numbers as JSON; a page only with --out.")
@@ -40,8 +42,8 @@ def report(
 ) -> None:
     """Write one page of a run: tracks, errors, consistency, ranging, health, and the numbers.
 
-    Of an estimate that is there (--estimate), or of one that is made now. The page is one file
-    that needs no other: metrics of ISO/IEC 18305 among the numbers, all of them in it as JSON too.
+    The estimate is read from --estimate, or made now. The page is one self-contained file; it
+    holds all numbers, the metrics of ISO/IEC 18305 among them, also as JSON.
     """
     from relpos import api
     from relpos.evaluation import report as reports

@@ -98,7 +98,7 @@ def score(case: Case, seed: int) -> Score:
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
+class Statistic:
     """A figure over seeds: mean, standard error, largest run, and how many runs gave one."""
 
     mean: float
@@ -107,11 +107,11 @@ class Figure:
     count: int
 
     @staticmethod
-    def of(values: Sequence[float]) -> Figure:
+    def of(values: Sequence[float]) -> Statistic:
         """Sum up the runs' figures; those that gave none (NaN) are left out and not counted."""
         finite = [float(v) for v in values if math.isfinite(v)]
         mean, error = metrics.over_seeds(finite)
-        return Figure(mean, error, max(finite, default=math.nan), len(finite))
+        return Statistic(mean, error, max(finite, default=math.nan), len(finite))
 
     @property
     def half_width(self) -> float:
@@ -131,29 +131,29 @@ class Outcome:
     scores: tuple[Score, ...]
 
     @property
-    def distance_m(self) -> Figure:
+    def distance_m(self) -> Statistic:
         """The relative distance's RMSE."""
-        return Figure.of([s.distance_m for s in self.scores])
+        return Statistic.of([s.distance_m for s in self.scores])
 
     @property
-    def aligned_m(self) -> Figure:
+    def aligned_m(self) -> Statistic:
         """The RMSE of positions after the best rigid alignment."""
-        return Figure.of([s.aligned_m for s in self.scores])
+        return Statistic.of([s.aligned_m for s in self.scores])
 
     @property
-    def body_frame_m(self) -> Figure:
+    def body_frame_m(self) -> Statistic:
         """The RMSE of peers in the body frame."""
-        return Figure.of([s.body_frame_m for s in self.scores])
+        return Statistic.of([s.body_frame_m for s in self.scores])
 
     @property
-    def nees(self) -> Figure:
+    def nees(self) -> Statistic:
         """The distance NEES."""
-        return Figure.of([s.nees for s in self.scores])
+        return Statistic.of([s.nees for s in self.scores])
 
     @property
-    def busy_s(self) -> Figure:
+    def busy_s(self) -> Statistic:
         """The estimator's wall time."""
-        return Figure.of([s.busy_s for s in self.scores])
+        return Statistic.of([s.busy_s for s in self.scores])
 
     @property
     def failures(self) -> list[str]:

@@ -19,10 +19,10 @@ from relpos.evaluation.figures.sheet import (
     own_colour,
     printed,
 )
-from relpos.evaluation.study import Case, Figure
+from relpos.evaluation.study import Case, Statistic
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Canvas
+    from matplotlib.figure import Figure
 
 SIGMA_R_M = (0.5, 1.0, 2.0, 4.0, 8.0)
 PARTICLES = (50, 100, 200, 500, 1000)
@@ -35,7 +35,7 @@ BANK = Case("bank", estimator="bank")
 _COLUMNS = ("distance_rmse_m", "half_width_95_m", "aligned_rmse_m", "seeds")
 
 
-def _numbers(figure: Figure, aligned: Figure) -> tuple[float, float, float, int]:
+def _numbers(figure: Statistic, aligned: Statistic) -> tuple[float, float, float, int]:
     return figure.mean, figure.half_width, aligned.mean, figure.count
 
 
@@ -66,7 +66,7 @@ def range_noise(work: Work) -> Sheet:
         ("bound", "", "", "", bound.filtering_distance_m, "", bound.filtering_position_m, ""),
     ]
 
-    def draw(canvas: Canvas) -> None:
+    def draw(canvas: Figure) -> None:
         axes = canvas.add_subplot()
         level(axes, reckoned.distance_m, "0, 0 (IMU alone)", GREY)
         for k, (scale, outcomes) in enumerate(by_scale.items()):
@@ -122,7 +122,7 @@ def particles(work: Work) -> Sheet:
         ("bound", "", "", bound.filtering_distance_m, "", bound.filtering_position_m, ""),
     ]
 
-    def draw(canvas: Canvas) -> None:
+    def draw(canvas: Figure) -> None:
         axes = canvas.add_subplot()
         for k, (alpha, outcomes) in enumerate(by_alpha.items()):
             curve(axes, k, PARTICLES, [o.distance_m for o in outcomes], f"{alpha:g}")
@@ -180,7 +180,7 @@ def wrong_start(work: Work) -> Sheet:
         for shift, b in zip(SHIFTS_M, bounds, strict=True)
     ]
 
-    def draw(canvas: Canvas) -> None:
+    def draw(canvas: Figure) -> None:
         axes = canvas.add_subplot()
         for k, (label, outcomes) in enumerate(by_kind.items()):
             curve(axes, k, SHIFTS_M, [o.distance_m for o in outcomes], label)

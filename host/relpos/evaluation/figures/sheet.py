@@ -124,13 +124,13 @@ def key(case: study.Case) -> tuple[Any, ...]:
     )
 
 
-def beside(what: str, paper: str, figure: study.Figure) -> Beside:
+def beside(what: str, paper: str, figure: study.Statistic) -> Beside:
     """Put a figure over seeds beside a printed value."""
     return Beside(what, paper, figure.mean, figure.half_width)
 
 
 def curve(
-    axes: Axes, place: int, x: Sequence[float], figures: Sequence[study.Figure], label: str
+    axes: Axes, place: int, x: Sequence[float], figures: Sequence[study.Statistic], label: str
 ) -> None:
     """Draw means over seeds with their 95 % intervals."""
     mean = np.array([f.mean for f in figures])
@@ -142,7 +142,7 @@ def curve(
     )  # fmt: skip
 
 
-def level(axes: Axes, figure: study.Figure, label: str, color: str, dash: Any = "-") -> None:
+def level(axes: Axes, figure: study.Statistic, label: str, color: str, dash: Any = "-") -> None:
     """Draw a mean over seeds that depends on nothing along x, with its 95 % interval."""
     axes.axhline(figure.mean, color=color, linestyle=dash, label=label)
     half = 0.0 if math.isnan(figure.half_width) else figure.half_width
