@@ -1,4 +1,4 @@
-"""What a session hands over becomes messages: the same for a file and for Foxglove's viewer."""
+"""Items of a session become messages: the same for a file and for Foxglove's viewer."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, PairEstimate
+from relpos.live.sinks import Sink
+from relpos.live.team_view import TeamView
 from relpos.measurements import (
     Event,
     Heading,
@@ -103,3 +105,49 @@ class Encoder:
 def names_of(description: Description) -> dict[int, str]:
     """What each wearer is called, where it is known."""
     return {node: info.name for node, info in description.nodes.items() if info.name}
+
+
+class ItemSink(Sink):
+    """A sink of the live session that turns every call into an item of its queue.
+
+    ``_put`` must be quick and must not raise, because a session calls it while it receives.
+    """
+
+    def __init__(self) -> None:
+        self._arrival_s = 0.0
+        self._notices: dict[str, str] = {}
+        self._trouble: str | None = None
+
+    def received(self, arrival_s: float, data: bytes) -> None:
+        """Add bytes of the serial port, as they were read."""
+        self._arrival_s = arrival_s
+        self._put(arrival_s, topics.Serial(arrival_s, bytes(data)))
+
+    def observed(self, arrival_s: float, observations: Sequence[Observation]) -> None:
+        """Add decoded observations, and those that phones sent."""
+        self._arrival_s = max(arrival_s, self._arrival_s)
+        if observations:
+            self._put(arrival_s, tuple(observations))
+
+    def estimated(self, estimate: Estimate) -> None:
+        """Add an estimate."""
+        self._put(self._arrival_s, estimate)
+
+    def updated(self, view: TeamView) -> None:
+        """Add new notices to the log."""
+        for notice in view.notices:
+            if self._notices.get(notice.id) != notice.text:
+                self._notices[notice.id] = notice.text
+                self.log(str(notice.level), notice.text)
+
+    def log(self, level: str, text: str) -> None:
+        """Add a line to the log; ``level`` is info, warning or alarm."""
+        self._put(self._arrival_s, Line(level, text))
+
+    def trouble(self) -> str | None:
+        """Return what is wrong at present; None when all is well."""
+        return self._trouble
+
+    def _put(self, at_s: float, item: Item) -> None:
+        """Queue an item that the session had at ``at_s``."""
+        raise NotImplementedError

@@ -10,24 +10,22 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event, Lock, Thread
 from typing import TYPE_CHECKING
 
 from relpos.fusion.estimator import Estimate
-from relpos.live.sinks import Sink
-from relpos.measurements import Observation
 from relpos.recording import container, topics
 from relpos.recording.about import DESCRIPTION, About
-from relpos.recording.encoder import Encoder, Item, Line, names_of
+from relpos.recording.encoder import Encoder, Item, ItemSink, Line, names_of
 from relpos.recording.output import NO_ROOM, Disk, Output
 from relpos.recording.schemas import all_topics
 from relpos.runs.description import NodeInfo, description_text
 
 if TYPE_CHECKING:
-    from relpos.live.team_view import TeamView
+    pass
 
 TICK_S = 0.1
 BLOCK_S = 0.25
@@ -60,7 +58,7 @@ class _Names:
     names: Mapping[int, str]
 
 
-class Recorder(Sink):
+class Recorder(ItemSink):
     """Writes a session to ``path``: a sink of the live session; see the module.
 
     DataError where the file exists already or cannot be made.
@@ -74,6 +72,7 @@ class Recorder(Sink):
         disk: Disk | None = None,
         bounds: Bounds | None = None,
     ) -> None:
+        super().__init__()
         self._about = about
         self._bounds = bounds or Bounds()
         self._encoder = Encoder(about.started_unix_ns, names_of(about.description))
@@ -86,9 +85,6 @@ class Recorder(Sink):
         self._queued = 0
         self._gap: topics.Gap | None = None
         self._lost = (0, 0)
-        self._arrival_s = 0.0
-        self._notices: dict[str, str] = {}
-        self._trouble: str | None = None
         self._refused_since_s: float | None = None
         self._retry_s = 0.0
         # The first of everything takes a while in Python; nobody waits for it now.
@@ -100,41 +96,9 @@ class Recorder(Sink):
 
     # -- what a session calls: quick, and never an error ------------------------------------------
 
-    def received(self, arrival_s: float, data: bytes) -> None:
-        """Take bytes of the serial port, as they were read."""
-        self._arrival_s = arrival_s
-        self._put(arrival_s, topics.Serial(arrival_s, bytes(data)), 200 + len(data))
-
-    def observed(self, arrival_s: float, observations: Sequence[Observation]) -> None:
-        """Take what the bytes said, and what phones sent."""
-        self._arrival_s = max(arrival_s, self._arrival_s)
-        if observations:
-            self._put(arrival_s, tuple(observations), 300 * len(observations))
-
-    def estimated(self, estimate: Estimate) -> None:
-        """Take an estimate."""
-        rows = len(estimate.nodes) + len(estimate.pairs) + len(estimate.alternatives)
-        weight = 400 * (rows + len(estimate.parameters))
-        self._put(self._arrival_s, estimate, weight, is_input=False)
-
-    def updated(self, view: TeamView) -> None:
-        """Take what the page tells everybody into the log."""
-        for notice in view.notices:
-            if self._notices.get(notice.id) != notice.text:
-                self._notices[notice.id] = notice.text
-                self.log(str(notice.level), notice.text)
-
     def named(self, names: Mapping[int, str]) -> None:
-        """Take the wearers' names."""
-        self._put(self._arrival_s, _Names(dict(names)), 200 * len(names))
-
-    def log(self, level: str, text: str) -> None:
-        """Take a line for the log; ``level`` is info, warning or alarm."""
-        self._put(self._arrival_s, Line(level, text), 200 + len(text))
-
-    def trouble(self) -> str | None:
-        """Say what is wrong with the recording now; None while it is well."""
-        return self._trouble
+        """Add the names of the wearers."""
+        self._put(self._arrival_s, _Names(dict(names)))
 
     @property
     def lost(self) -> tuple[int, int]:
@@ -151,8 +115,9 @@ class Recorder(Sink):
         self._stop.set()
         self._thread.join()
 
-    def _put(self, at_s: float, item: Item | _Names, weight: int, *, is_input: bool = True) -> None:
-        bound = self._bounds.inputs if is_input else self._bounds.others
+    def _put(self, at_s: float, item: Item | _Names) -> None:
+        is_input = not isinstance(item, Estimate)
+        weight, bound = _weight(item), self._bounds.inputs if is_input else self._bounds.others
         with self._lock:
             if self._queued + weight > bound:
                 gap = self._gap or topics.Gap(at_s, at_s, 0, 0)
@@ -240,7 +205,7 @@ class Recorder(Sink):
             self._retry_s = now_s + RETRY_S
             if self._refused_since_s is None:
                 self._refused_since_s = now_s
-            self._tell(error, now_s - self._refused_since_s)
+            self._report(error, now_s - self._refused_since_s)
             return False
         if self._output.part != part:
             self.log("warning", f"the recording goes on in {self._output.path.name}")
@@ -257,7 +222,7 @@ class Recorder(Sink):
         )
         return True
 
-    def _tell(self, error: OSError, since_s: float) -> None:
+    def _report(self, error: OSError, since_s: float) -> None:
         reason = "disk full" if error.errno in NO_ROOM else error.strerror or str(error)
         inputs, others = self._lost
         lost = (
@@ -309,3 +274,21 @@ class Recorder(Sink):
         self._encoder.rename(names_of(description))
         text = {"text": description_text(description)}
         self._output.put(container.metadata_record(DESCRIPTION, text))
+
+
+def _weight(item: Item | _Names) -> int:
+    """Return how much memory an item takes, roughly (bytes)."""
+    match item:
+        case topics.Serial():
+            return 200 + len(item.data)
+        case Estimate():
+            rows = len(item.nodes) + len(item.pairs) + len(item.alternatives)
+            return 400 * (rows + len(item.parameters))
+        case Line():
+            return 200 + len(item.text)
+        case _Names():
+            return 200 * len(item.names)
+        case topics.Gap():
+            return 200
+        case _:
+            return 300 * len(item)

@@ -3,33 +3,30 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from threading import Event, Thread
 from typing import TYPE_CHECKING
 
 from relpos.errors import DataError, DeviceError
-from relpos.fusion.estimator import Estimate
-from relpos.live.sinks import Sink
-from relpos.measurements import Observation
-from relpos.recording import topics
 from relpos.recording.about import About
-from relpos.recording.encoder import Encoder, Item, Line, names_of
+from relpos.recording.encoder import Encoder, Item, ItemSink, names_of
 from relpos.recording.schemas import all_topics
 
 if TYPE_CHECKING:
-    from relpos.live.team_view import TeamView
+    pass
 
 TICK_S = 0.05
 MOST_WAITING = 2000
 """Items; beyond it the oldest go. A viewer shows what is now."""
 
 
-class FoxgloveServer(Sink):
+class FoxgloveServer(ItemSink):
     """A sink of the live session that Foxglove connects to. DeviceError where it cannot listen."""
 
     def __init__(self, listen: str, about: About) -> None:
         import foxglove
 
+        super().__init__()
         host, port = parse_listen(listen)
         self._encoder = Encoder(about.started_unix_ns, names_of(about.description))
         self._context = foxglove.Context()
@@ -56,42 +53,16 @@ class FoxgloveServer(Sink):
             raise DeviceError(f"{host}:{port}: cannot serve Foxglove there: {error}") from None
         self.address = f"ws://{host}:{self._server.port}"
         self._queue: deque[tuple[float, Item]] = deque(maxlen=MOST_WAITING)
-        self._arrival_s = 0.0
-        self._notices: dict[str, str] = {}
-        self._trouble: str | None = None
         self._stop = Event()
         self._thread = Thread(target=self._run, name="foxglove", daemon=True)
         self._thread.start()
 
-    def received(self, arrival_s: float, data: bytes) -> None:
-        """Take bytes of the serial port, as they were read."""
-        self._arrival_s = arrival_s
-        self._queue.append((arrival_s, topics.Serial(arrival_s, bytes(data))))
-
-    def observed(self, arrival_s: float, observations: Sequence[Observation]) -> None:
-        """Take what the bytes said, and what phones sent."""
-        self._arrival_s = max(arrival_s, self._arrival_s)
-        if observations:
-            self._queue.append((arrival_s, tuple(observations)))
-
-    def estimated(self, estimate: Estimate) -> None:
-        """Take an estimate."""
-        self._queue.append((self._arrival_s, estimate))
-
-    def updated(self, view: TeamView) -> None:
-        """Take what the page tells everybody into the log."""
-        for notice in view.notices:
-            if self._notices.get(notice.id) != notice.text:
-                self._notices[notice.id] = notice.text
-                self._queue.append((self._arrival_s, Line(str(notice.level), notice.text)))
-
     def named(self, names: Mapping[int, str]) -> None:
-        """Take the wearers' names."""
+        """Use the names of the wearers from now on."""
         self._encoder.rename(names)
 
-    def trouble(self) -> str | None:
-        """Say what is wrong; None while it is well."""
-        return self._trouble
+    def _put(self, at_s: float, item: Item) -> None:
+        self._queue.append((at_s, item))
 
     def close(self) -> None:
         """Send what waits and stop listening."""
