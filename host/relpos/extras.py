@@ -19,12 +19,12 @@ PURPOSES = {
     "report": "pictures and reports (`relpos report`, `relpos figures`)",
     "exchange": "maps, GPX and Cursor-on-Target (`relpos convert`, `--cot`)",
 }
-"""What the extras for users bring; the others are for who changes relpos."""
+"""Purpose of each extra for users; the others are for developers of relpos."""
 
 
 @cache
 def requirements(extra: str) -> tuple[str, ...]:
-    """What pyproject.toml names for the extra, as pip takes it (``starlette>=0.40``)."""
+    """Return the requirements of an extra, in pip's notation (``starlette>=0.40``)."""
     root = paths.repository()
     if root is not None:
         # What an editable installation remembers is as old as that installation.

@@ -50,7 +50,7 @@ class Pin:
 
 
 Locate = Callable[[int, float | None], tuple[float, float] | None]
-"""Where a node was at a time, or first (None), in the world's metres; None where nobody knows."""
+"""Returns a node's position at a time, or its first (None), in world metres; None if unknown."""
 
 
 def parse_pin(text: str) -> Pin:

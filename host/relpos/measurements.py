@@ -1,4 +1,4 @@
-"""The vocabulary of everything behind the link: what a node, or a recording, can tell us.
+"""The observations of nodes, in the form that link, recordings and estimators exchange.
 
 Frames and signs: world x east-like, y north-like, z up, metres, radians counter-clockwise
 (REP-103). Times are seconds from the start of the run on one clock. Every class is one row of
@@ -111,7 +111,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """What is known of ``node``'s pose at the start; ``None`` sigmas mean exactly known."""
+    """Known pose of ``node`` at the start; a sigma of 0 means exactly known."""
 
     node: int
     x_m: float
@@ -122,10 +122,10 @@ class Prior:
 
 
 Measurement = Motion | Range | Height | Heading
-"""What an estimator consumes."""
+"""Input of an estimator."""
 
 Observation = Motion | Range | Height | Heading | Status | Event | Step
-"""What a link, a recording or an emulated team delivers."""
+"""Output of a link, a recording or an emulated team."""
 
 
 @dataclass(frozen=True, slots=True)

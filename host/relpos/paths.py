@@ -1,4 +1,4 @@
-"""Where the firmware's project lies, and where built things go: in a repository, or installed.
+"""Folders of the firmware's project and of built files, in a repository or installed.
 
 A wheel brings the firmware's sources along (``relpos/firmware_project``), so that emulated nodes
 and ``relpos node flash`` work without the repository; what is built from them goes into the user's

@@ -552,9 +552,9 @@ def test_presses_become_truth_and_what_does_not_count_is_told(
     assert (tmp_path / "out" / "truth.csv").exists()
     said = "\n".join(told.remarks)
     assert "truth from 3 of 6 landmark presses" in said
-    assert "1 landmark press left out, of landmarks that nobody surveyed: 99 (node 2" in said
+    assert "1 landmark press left out, of landmarks without a survey: 99 (node 2" in said
     assert "within 2 s after the same one: 17 (node 1, at 4.5 s)" in said
-    assert "by nodes that the run knows nothing else of: 17 (node 8, at 10.0 s)" in said
+    assert "by nodes without other data: 17 (node 8, at 10.0 s)" in said
 
 
 def test_a_run_with_landmarks_of_its_own_needs_no_option(tmp_path: Path, pressed: Path) -> None:

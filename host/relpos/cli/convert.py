@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -10,24 +9,7 @@ import typer
 
 from relpos.cli import live
 from relpos.errors import DataError
-
-
-class FormatName(StrEnum):
-    """The formats by the names people's scripts rely on."""
-
-    RUN = "run"
-    MCAP = "mcap"
-    TUM = "tum"
-    GEOJSON = "geojson"
-    GPX = "gpx"
-    CSV = "csv"
-
-
-class KindName(StrEnum):
-    """Kind of a trajectory from another tool."""
-
-    TRUTH = "truth"
-    ESTIMATE = "estimate"
+from relpos.exchange.formats import Format, Kind
 
 
 def convert(
@@ -39,7 +21,7 @@ def convert(
             ".geojson) or a directory of them.",
         ),
     ],
-    to: Annotated[FormatName, typer.Option("--to", help="The wanted format.")],
+    to: Annotated[Format, typer.Option("--to", help="The wanted format.")],
     out: Annotated[
         Path,
         typer.Option(
@@ -47,7 +29,7 @@ def convert(
         ),
     ],
     source_format: Annotated[
-        FormatName | None,
+        Format | None,
         typer.Option("--from", help="Format of SOURCE, if its name does not show it."),
     ] = None,
     run: Annotated[
@@ -68,7 +50,7 @@ def convert(
         typer.Option(metavar="TIME", help="Time of second 0 of the run: 2026-05-04T09:30:00Z."),
     ] = None,
     kind: Annotated[
-        KindName | None, typer.Option("--as", help="Kind of trajectories from another tool.")
+        Kind | None, typer.Option("--as", help="Kind of trajectories from another tool.")
     ] = None,
     node: Annotated[
         int | None,
@@ -86,13 +68,11 @@ def convert(
     """
     from relpos.cli import output
     from relpos.exchange import convert as formats
-    from relpos.exchange.content import Kind
     from relpos.exchange.times import unix_of
     from relpos.geodesy import parse_pin
 
-    wanted = formats.Format(to)
     placed = tuple(parse_pin(pin) for pin in pins or ())
-    if wanted in (formats.Format.GEOJSON, formats.Format.GPX) and not placed:
+    if to in (Format.GEOJSON, Format.GPX) and not placed:
         raise typer.BadParameter(
             f"{to} needs geographic coordinates: give a known position ({live.PINS})",
             param_hint="--pin",
@@ -100,9 +80,9 @@ def convert(
     if out.resolve() == source.resolve():
         raise DataError(f"{out}: --out is SOURCE itself; name another path")
     hints = formats.Hints(
-        format=formats.Format(source_format) if source_format else None,
+        format=source_format,
         run=run,
-        kind=Kind(kind) if kind else None,
+        kind=kind,
         node=node,
         start_unix_s=unix_of(start, "--start") if start else None,
         pins=placed,
@@ -112,7 +92,7 @@ def convert(
         content = formats.with_landmarks(content, landmarks, placed)
     if located:
         content = formats.located_alone(content)
-    files, remarks = formats.write(content, wanted, out, pins=placed, overwrite=overwrite)
+    files, remarks = formats.write(content, to, out, pins=placed, overwrite=overwrite)
     for words in (*content.remarks, *remarks):
         output.remark(words)
     for path in files:

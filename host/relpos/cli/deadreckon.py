@@ -111,7 +111,7 @@ def _print_remarks(node: int, part: NodeResult, walks: Sequence[Run]) -> None:
             )
         output.remark(
             f"node {node}: step length x{part.calibration.scale:.3f} after calibration; one walk "
-            "alone is weighted in part, a walk that is far off hardly"
+            "alone has partial weight, a walk that is far off little"
         )
     if part.rate_hz < LEAST_RATE_HZ:
         output.remark(

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Board(StrEnum):
-    """What runs the firmware: this computer, or a simulated board."""
+    """Target that runs the firmware: this computer, or a simulated board."""
 
     NATIVE = "native"
     UNO = "uno"

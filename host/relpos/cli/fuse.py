@@ -1,4 +1,4 @@
-"""``relpos fuse``: from a run directory or a port to where everybody is."""
+"""``relpos fuse``: relative positions from a run directory, a recording or a port."""
 
 from __future__ import annotations
 
@@ -427,7 +427,7 @@ def fuse_live(
 
 @dataclass(frozen=True)
 class FusionSummary:
-    """What is printed of a run or session: ``estimates`` are all of ``count``, or the last."""
+    """The printed result of a run or session: ``estimates`` are all ``count``, or the last."""
 
     name: str
     counters: Mapping[str, Any]

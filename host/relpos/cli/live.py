@@ -96,7 +96,7 @@ def with_default_address(arguments: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class Options:
-    """How a session is shown and stored, as the command line says.
+    """Options of the command line for showing and storing a session.
 
     ``sinks`` make further sinks. With any of them, or the page, the session outlives its port,
     which is opened again when it is back.

@@ -1,4 +1,4 @@
-"""What the commands print: results on stdout, progress and remarks on stderr."""
+"""Output of the commands: results on stdout, progress and remarks on stderr."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ STAGES = {"compiling": "compiling the estimator, once after an installation"}
 """Stages of :func:`relpos.fuse` in the words of the command line."""
 
 PLAIN_PROGRESS_EVERY_S = 5.0
-"""Where stderr is no terminal, a line this often does not flood a log."""
+"""Interval of progress lines in a log, which must not be flooded."""
 
 
 def print_json(document: Mapping[str, Any]) -> None:
@@ -44,7 +44,7 @@ def print_json(document: Mapping[str, Any]) -> None:
 
 
 def remark(words: str) -> None:
-    """Say something beside the result, on stderr."""
+    """Print a remark beside the result, on stderr."""
     typer.echo(words, err=True)
 
 
@@ -145,7 +145,7 @@ def working(label: str) -> Iterator[None]:
 
 
 def print_evaluation(score: Evaluation) -> None:
-    """Print everything that is known of one estimate."""
+    """Print all figures of one estimate."""
     print_metrics(score.run, score.metrics)
     if score.nees_position is not None and score.nees_heading is not None:
         print_nees(score.nees_position, score.nees_heading)
@@ -161,7 +161,7 @@ FRAMES = {
     "per_run": "one motion of the plane for the run",
     "per_epoch": "one motion of the plane a second",
 }
-"""How the estimate was brought onto the truth, in the words of tables."""
+"""Alignments of the estimate with the truth, in the words of tables."""
 
 
 def print_iso(iso: Assessment) -> None:
@@ -196,7 +196,7 @@ def print_metrics(title: str, metrics: Metrics, baseline: Metrics | None = None)
     from rich.console import Console
     from rich.table import Table
 
-    # A pipe has no width; 80 columns would squeeze the numbers out of the table.
+    # A pipe has no width, and 80 columns are too narrow for the table.
     console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
     table = Table(title=title, caption=f"{metrics.epochs} whole seconds scored")
     table.add_column("pair")
@@ -249,7 +249,7 @@ def print_metrics(title: str, metrics: Metrics, baseline: Metrics | None = None)
 
 
 def print_nees(position: Nees, heading: Nees) -> None:
-    """Print how honest the absolute poses are, where estimate and truth share a frame."""
+    """Print the consistency of absolute poses, where estimate and truth have one frame."""
     from rich.console import Console
 
     console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
@@ -261,7 +261,7 @@ def print_nees(position: Nees, heading: Nees) -> None:
 
 
 def print_bound(bound: Totals) -> None:
-    """Print the least root mean square errors that any estimator could reach in this run."""
+    """Print the Cramer-Rao bound: the least root mean square errors of any estimator."""
     from rich.console import Console
 
     console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
@@ -275,7 +275,7 @@ def print_bound(bound: Totals) -> None:
 
 
 def print_ambiguity(ambiguity: Ambiguity) -> None:
-    """Print whether the regions of ambiguous nodes held the truth, and what they were worth."""
+    """Print how often the regions of ambiguous nodes contained the truth, and their area."""
     held = ambiguity.coverage
     typer.echo(
         f"while ambiguous          the 90 % region held the truth in {100.0 * held.share:.0f} % "
@@ -285,7 +285,7 @@ def print_ambiguity(ambiguity: Ambiguity) -> None:
 
 
 def print_last_pairs(title: str, estimates: Sequence[Estimate]) -> None:
-    """Print where everybody was relative to each other at the end, with the uncertainty."""
+    """Print the relative positions at the end, with their uncertainty."""
     from rich.console import Console
     from rich.table import Table
 
@@ -314,7 +314,7 @@ def print_last_pairs(title: str, estimates: Sequence[Estimate]) -> None:
         shares = {a.alternative: a.probability for a in last.alternatives}
         rings = sorted({a.node for a in last.alternatives if a.shape == "ring"})
         console.print(
-            f"{len(shares)} possible pictures (alternatives.csv): "
+            f"{len(shares)} possible modes (alternatives.csv): "
             + ", ".join(f"{100.0 * share:.0f} %" for share in shares.values())
             + (f"; somewhere on a ring: {', '.join(map(str, rings))}" if rings else "")
         )
@@ -355,17 +355,17 @@ def _root_mean_square(values: Any) -> float:
 
 
 def metres(value: float, *, sign: bool = False) -> str:
-    """Two decimals and the unit; a dash where nothing can be said."""
+    """Format two decimals and the unit; a dash for an unknown value."""
     if not math.isfinite(value):
         return "-"
     return f"{value:+.2f} m" if sign else f"{value:.2f} m"
 
 
 def degrees(value_rad: float) -> str:
-    """Whole degrees; a dash where nothing can be said."""
+    """Format whole degrees; a dash for an unknown value."""
     return f"{math.degrees(value_rad):.0f} deg" if math.isfinite(value_rad) else "-"
 
 
 def plain(value: float) -> str:
-    """Two decimals; a dash where nothing can be said."""
+    """Format two decimals; a dash for an unknown value."""
     return f"{value:.2f}" if math.isfinite(value) else "-"

@@ -1,4 +1,4 @@
-"""How well a team's shape can be known at all: the posterior Cramer-Rao bound.
+"""The posterior Cramer-Rao bound of a team's relative positions.
 
 No estimator of random states can have a smaller mean squared error than the inverse of the
 posterior information (Van Trees 1968; recursively for filtering: Tichavsky, Muravchik, Nehorai

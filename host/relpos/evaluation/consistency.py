@@ -163,7 +163,7 @@ def honesty(errors: Floats, sigmas: Floats) -> Honesty:
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """How often a region held the truth: the share, its 95 % interval, and what it is worth."""
+    """How often a region contained the truth: fraction, 95 % interval, effective sample count."""
 
     share: float
     low: float

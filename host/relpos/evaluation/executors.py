@@ -1,4 +1,4 @@
-"""Where many independent jobs are run: here, on all cores, or on a Dask cluster.
+"""Executors for many independent jobs: this process, all cores, or a Dask cluster.
 
 Everything takes a :class:`concurrent.futures.Executor`, so that the same code runs in all three
 places. Jobs are module-level functions with picklable arguments that depend on nothing else: the
@@ -23,7 +23,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 CONNECT_S = 10.0
-"""A scheduler that has not answered by then is not there."""
+"""Timeout of the connection to a scheduler."""
 
 
 class Serial(Executor):
@@ -41,7 +41,7 @@ class Serial(Executor):
 
 @contextmanager
 def executor(cluster: str | None = None, workers: int | None = None) -> Iterator[Executor]:
-    """Give a place to run jobs: ``workers`` processes (all cores), or the cluster at an address.
+    """Yield an executor: ``workers`` processes (all cores), or the cluster at an address.
 
     One worker is this process itself. ``cluster`` is the address of a Dask scheduler, as
     ``tcp://host:8786``; its workers need relpos installed. RelposError where that fails.
@@ -67,7 +67,7 @@ def executor(cluster: str | None = None, workers: int | None = None) -> Iterator
 
 
 def _leave_interrupts_to_the_parent() -> None:
-    """Ctrl-C reaches every process of a terminal; one of them says what there is to say."""
+    """Ignore Ctrl-C, which reaches every process of a terminal; the parent reports it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -98,7 +98,7 @@ def run_all(
 ) -> list[T]:
     """Call ``function`` with the arguments of every job; results in the order of the jobs.
 
-    ``on_done`` hears after every job how many are done and of how many. The first failure is
+    ``on_done`` is called after every job with how many are done, of how many. The first failure is
     raised, and what has not begun is not begun.
     """
     futures: dict[Future[T], int] = {}

@@ -1,4 +1,4 @@
-"""How nodes and links fared over a run, from what the run recorded of them.
+"""The health of nodes and links over a run, from their recorded status.
 
 The rules are those of the live table (:mod:`relpos.nodes.health`), applied to every status report
 in turn. A run without status reports still tells how regularly each node moved.
@@ -22,7 +22,7 @@ Floats = npt.NDArray[np.float64]
 
 LINK_RECEIVED, LINK_LOST, LINK_RSSI = "link_received", "link_lost", "link_rssi_dbm"
 SERIES = ("battery_v", "rssi_dbm", "loss", "ranging")
-"""What is kept of each report: volts, dBm, and shares of the last half minute."""
+"""Stored figures of each report: volts, dBm, and fractions of the last half minute."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class NodeHealth:
 
     @property
     def loss(self) -> float:
-        """Share of its frames that were lost over the whole run; NaN where nothing tells."""
+        """Share of its frames that were lost over the whole run; NaN where it is not known."""
         total = self.received + self.lost
         return self.lost / total if total else math.nan
 

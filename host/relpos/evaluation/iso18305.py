@@ -47,7 +47,7 @@ Integers = npt.NDArray[np.int64]
 
 
 class Frame(StrEnum):
-    """How the estimate was moved onto the truth before errors were taken."""
+    """Alignment of the estimate with the truth, before errors are computed."""
 
     AS_GIVEN = "as_given"
     PER_RUN = "per_run"
@@ -103,7 +103,7 @@ class Accuracy:
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """How much later than its own time an estimate comes out (s).
+    """Delay of an estimate after its own time (s).
 
     ``wait_*`` is what the estimator waits for later measurements, in the run's own time; what it
     computes comes on top, ``computing_s`` for one measurement on average.

@@ -1,4 +1,4 @@
-"""What the ranges of a run were worth: residuals a pair, and who was heard over which distance."""
+"""The ranges of a run: residuals of each pair, and detection over distance."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def spread(values: Floats) -> float:
 
 @dataclass(frozen=True)
 class Heard:
-    """Who was heard over which distance.
+    """Successful and failed ranging attempts by distance.
 
     ``distance_m`` and ``heard`` (n,) are attempts whose outcome counts
     (:mod:`relpos.fusion.models.detection` says which) and the distance at that time: the true one
@@ -199,7 +199,7 @@ def _sigma_at(pairs: Mapping[Pair, PairTrack], pair: Pair, at_s: Floats) -> Floa
 
 
 def shares(values: Heard, edges_m: Floats) -> tuple[Floats, Floats, Floats, npt.NDArray[np.int64]]:
-    """Share heard in each bin (B,), its 95 % interval (Wilson) and the attempts there.
+    """Detected fraction in each bin (B,), its 95 % interval (Wilson) and the attempts there.
 
     The interval takes attempts as independent; those of one pair a second apart are not, so it is
     rather too narrow.

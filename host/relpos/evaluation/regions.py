@@ -27,14 +27,14 @@ DRAWS = 1500
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """Where the estimate's frame lies in the truth's: its origin (m) and heading (rad)."""
+    """Pose of the estimate's frame in the truth's: its origin (m) and heading (rad)."""
 
     x_m: float = 0.0
     y_m: float = 0.0
     heading_rad: float = 0.0
 
     def seen(self, x_m: float, y_m: float) -> tuple[float, float]:
-        """Give a place of the truth in the estimate's frame."""
+        """Return a position of the truth in the estimate's frame."""
         dx, dy = x_m - self.x_m, y_m - self.y_m
         c, s = math.cos(self.heading_rad), math.sin(self.heading_rad)
         return c * dx + s * dy, c * dy - s * dx
@@ -65,7 +65,7 @@ class Ambiguity:
 def frame_of(estimates: Iterable[Estimate], truth: Mapping[int, Track]) -> Frame | None:
     """Frame of an estimate without priors: the first located node's true pose at the start.
 
-    None where nobody was located or that node's truth has no heading.
+    None where no node was located or that node's truth has no heading.
     """
     for estimate in estimates:
         for node in estimate.nodes:

@@ -203,12 +203,12 @@ class Result:
         return [tuple(getattr(p, name) for name in PARAMETER_COLUMNS) for p in self.parameters]
 
     def __str__(self) -> str:
-        """Say what it is, in a line."""
+        """Return one line about the result."""
         last = self.estimates[-1].time_s if self.estimates else 0.0
         return f"{self.estimator}: {len(self.estimates)} estimates up to {last:.1f} s"
 
     def __repr__(self) -> str:
-        """Say what it is, in a line, not thousands of numbers."""
+        """Return one line, not thousands of numbers."""
         return f"<relpos.Result {self}>"
 
 
@@ -236,7 +236,7 @@ def result_of(
 
 
 def read_result(directory: Path | str) -> Result:
-    """Read an estimate's files back, whoever wrote them; DataError where they are faulty."""
+    """Read the files of an estimate; DataError where they are faulty."""
     from relpos.runs import read_estimates
 
     estimates = tuple(read_estimates(directory))

@@ -55,7 +55,7 @@ class Evaluation:
         }
 
     def __str__(self) -> str:
-        """Give the main figures, one a line."""
+        """Return the main figures, one a line."""
         m, chance = self.metrics, self.nees_distance
         lines = [
             f"{self.run}: {m.epochs} whole seconds scored",
@@ -133,7 +133,7 @@ def starts_given(run: Run, priors: Sequence[Prior]) -> bool:
 
 
 def _common(run: Run, priors: Sequence[Prior]) -> bool:
-    """Whether the priors only say that all start alike: their frame is nobody's but their own."""
+    """Whether the priors are one common start, which is in a frame of its own."""
     from relpos.runs import InitialPose
 
     given = tuple(priors)
@@ -143,7 +143,7 @@ def _common(run: Run, priors: Sequence[Prior]) -> bool:
 
 
 def bound_of(run: Run) -> Bound | None:
-    """Compute the Cramer-Rao bound of a simulated run; None where it cannot be told."""
+    """Compute the Cramer-Rao bound of a simulated run; None for other runs."""
     made = run.description.simulated
     if made is None:
         return None

@@ -45,7 +45,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Score:
-    """What one run gave; NaN where a figure is undefined or the estimator gave up.
+    """The result of one run; NaN where a figure is undefined or the estimator gave up.
 
     ``busy_s`` is the wall time of the estimator alone. ``time_s`` (T,) are the whole seconds
     that could be scored, ``distance_over_time_m`` and ``aligned_over_time_m`` (T,) the root mean

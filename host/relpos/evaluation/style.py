@@ -1,4 +1,4 @@
-"""How figures look: colours that any colour vision tells apart, in light and in dark."""
+"""Colours and lines of figures, distinct for any colour vision, in light and in dark."""
 
 from __future__ import annotations
 

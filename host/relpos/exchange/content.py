@@ -1,17 +1,17 @@
-"""What a source holds, whatever its format: a run, estimates, and when its clock began."""
+"""The content of a source in any format: a run, estimates, and the start of its clock."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from relpos import tracks
 from relpos.errors import DataError
+from relpos.exchange.formats import Kind
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
 from relpos.geodesy import Locate
 from relpos.measurements import Truth
@@ -22,13 +22,6 @@ if TYPE_CHECKING:
     from relpos.recording.reader import Recording
 
 
-class Kind(StrEnum):
-    """What a trajectory is."""
-
-    ESTIMATE = "estimate"
-    TRUTH = "truth"
-
-
 PLACED = (NodeStatus.OK, NodeStatus.STALE, NodeStatus.LOST)
 """With any other status the numbers are the mean of what is possible, and no position."""
 
@@ -37,7 +30,7 @@ PLACED = (NodeStatus.OK, NodeStatus.STALE, NodeStatus.LOST)
 class Content:
     """A run and the estimates that belong to it, either of which may be empty.
 
-    ``start_unix_s`` is the Unix time of the run's second 0, None where nobody knows it.
+    ``start_unix_s`` is the Unix time of the run's second 0, None where it is not known.
     ``remarks`` is what there is to tell the user about how it was read. ``recording`` is the MCAP
     file that the run, and all estimates, were read from, with whatever else it holds.
     """
@@ -93,7 +86,7 @@ class Content:
 
     @property
     def one_frame(self) -> bool:
-        """Whether estimates and truth share a frame: where the starts were given, they do."""
+        """Whether estimates and truth have one frame, as where the starts were given."""
         return bool(self.run.description.priors) or self.run.description.initial_pose != "unknown"
 
 

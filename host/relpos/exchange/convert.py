@@ -1,23 +1,22 @@
-"""From a path to what it holds, and from there to another format's files."""
+"""Reading any source into content, and writing content in another format."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from pathlib import Path
 
 from relpos.errors import DataError, RelposError
 from relpos.exchange.content import (
     PLACED,
     Content,
-    Kind,
     Point,
     as_estimates,
     as_truth,
     points_of,
 )
+from relpos.exchange.formats import Format, Kind
 from relpos.geodesy import MapFrame, Pin, place
 from relpos.recording import is_recording, open_recording, save_recording
 from relpos.runs.estimates import read_estimates, write_estimates
@@ -25,20 +24,8 @@ from relpos.runs.landmarks import PRESS, Landmark, read_landmarks, truth_from_pr
 from relpos.runs.run import TABLE_NAMES, Run, load_run, save_run
 from relpos.runs.table import find_table
 
-
-class Format(StrEnum):
-    """The formats by the names people's scripts rely on."""
-
-    RUN = "run"
-    MCAP = "mcap"
-    TUM = "tum"
-    GEOJSON = "geojson"
-    GPX = "gpx"
-    CSV = "csv"
-
-
 RECEIVED = "received"
-"""Where ``relpos fuse PORT`` keeps the run that its estimates are of."""
+"""Folder in which ``relpos fuse PORT`` stores the run of its estimates."""
 
 _ESTIMATE_TABLES = (
     "estimate.csv",
@@ -60,7 +47,7 @@ _FILES = (Format.MCAP, Format.GEOJSON, Format.GPX)
 
 @dataclass(frozen=True)
 class Hints:
-    """What the user says that the source does not.
+    """Facts from the user that the source does not state.
 
     ``run`` is the recording that the source belongs to; ``format``, ``kind`` and ``node`` say
     what a trajectory is; ``start_unix_s`` when the run's second 0 was.
@@ -104,7 +91,7 @@ def _format_of(source: Path) -> Format:
 
 
 def _base(source: Path, hints: Hints) -> Content:
-    """Return the recording that the source belongs to; an empty one where nobody says which."""
+    """Return the recording that the source belongs to; an empty one where none is named."""
     if hints.run is None:
         return Content(Run(name=source.resolve().stem))
     form = _format_of(hints.run)
@@ -164,8 +151,8 @@ def _read_tracks(source: Path, form: Format, base: Content, hints: Hints) -> Con
             raise DataError(f"{source}: no trajectories (*.tum) in there")
         points = tum.read_files(files, hints.node, hints.kind, start_unix_s)
     else:
-        frame, told = frame_of(base, hints.pins, Kind.TRUTH if base.run.truth else Kind.ESTIMATE)
-        remarks += told
+        frame, words = frame_of(base, hints.pins, Kind.TRUTH if base.run.truth else Kind.ESTIMATE)
+        remarks += words
         if form is Format.GPX:
             from relpos.exchange import gpx
             from relpos.exchange.times import iso_of
@@ -224,8 +211,8 @@ def with_landmarks(content: Content, path: Path, pins: Sequence[Pin]) -> Content
     suffix = _SUFFIXES.get(path.suffix.lower())
     remarks: tuple[str, ...] = tuple(r for r in content.remarks if r not in own.remarks())
     if suffix in (Format.GEOJSON, Format.GPX):
-        frame, told = frame_of(content, pins, Kind.TRUTH)
-        remarks += told
+        frame, words = frame_of(content, pins, Kind.TRUTH)
+        remarks += words
         if suffix is Format.GPX:
             from relpos.exchange import gpx
 
@@ -267,7 +254,7 @@ def write(
     """Write the content to ``out``; return the files and what there is to tell about them.
 
     What is there already is left alone unless ``overwrite``; then what an earlier conversion to
-    the same format left is removed, lest it be taken for part of this one.
+    the same format left is removed, because it is no part of this one.
     """
     writer = _WRITERS[form]
     _make_room(out, form, overwrite=overwrite)
@@ -387,13 +374,13 @@ def _write_map(
             )
     if not kinds and not content.run.landmarks:
         raise DataError(f"{content.run.name}: neither estimates nor truth: fuse it first")
-    frame, told = frame_of(content, pins, kinds[0] if kinds else Kind.TRUTH)
+    frame, words = frame_of(content, pins, kinds[0] if kinds else Kind.TRUTH)
     if content.run.landmarks and Kind.TRUTH not in kinds and content.estimates:
         # They are surveyed in the truth's frame.
         content = replace(content, run=replace(content.run, landmarks=()))
         remarks.append("so are the landmarks, which are surveyed in the truth's")
     write_file(out, content, kinds, frame)
-    return [out], [*told, *remarks]
+    return [out], [*words, *remarks]
 
 
 def _write_geojson(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:

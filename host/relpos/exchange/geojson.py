@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from relpos.errors import DataError
-from relpos.exchange.content import PLACED, Content, Kind, Point, stretches_of
+from relpos.exchange.content import PLACED, Content, Point, stretches_of
+from relpos.exchange.formats import Kind
 from relpos.exchange.times import iso_of, unix_of
 from relpos.fusion.estimator import NodeEstimate
 from relpos.geodesy import MapFrame

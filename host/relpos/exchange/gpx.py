@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from relpos.errors import DataError
-from relpos.exchange.content import Content, Kind, Point, stretches_of
+from relpos.exchange.content import Content, Point, stretches_of
+from relpos.exchange.formats import Kind
 from relpos.exchange.times import time_of
 from relpos.extras import missing_extra
 from relpos.geodesy import MapFrame

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from relpos.exchange.content import Content, Kind
+from relpos.exchange.content import Content
+from relpos.exchange.formats import Kind
 from relpos.runs.appending import write_rows
 from relpos.runs.estimates import write_estimates
 from relpos.runs.run import save_run
@@ -67,7 +68,7 @@ def _transposed(columns: Mapping[str, Sequence[object]]) -> Iterable[Sequence[ob
 
 
 def _true_distances(rows: _Rows, true: Mapping[int, Track]) -> list[object]:
-    """Give the true distance of each row's two nodes at its time; empty where nobody knows."""
+    """Return the true distance of each row's two nodes at its time; empty where not known."""
     of_pair: dict[tuple[int, int], list[int]] = {}
     for k, row in enumerate(rows):
         of_pair.setdefault((int(row["node"]), int(row["peer"])), []).append(k)

@@ -13,7 +13,8 @@ from itertools import pairwise
 from pathlib import Path
 
 from relpos.errors import DataError
-from relpos.exchange.content import Kind, Point
+from relpos.exchange.content import Point
+from relpos.exchange.formats import Kind
 from relpos.runs.table import number, read_text
 
 UNIX_TIME_S = 1.0e8

@@ -1,4 +1,4 @@
-"""What a recording says of the session itself: enough to repeat it, and never the key."""
+"""The description of a session in its recording: enough to repeat it, never the key."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DESCRIPTION = "run.toml"
 
 @dataclass(frozen=True)
 class About:
-    """A session: when it began, what it was told to do with what came.
+    """A session: when it began, and how its inputs were fused.
 
     ``started_unix_ns`` is Unix time at the session's second 0. ``own_key``: the team has another
     key than the one that every new node has; the key itself is not recorded.
@@ -60,7 +60,7 @@ class About:
 
     @classmethod
     def read(cls, where: str, records: Mapping[str, Mapping[str, str]]) -> About | None:
-        """What the metadata says; None where it is no recording of relpos. DataError if damaged."""
+        """Read the metadata; None for a recording of another program. DataError if damaged."""
         values = records.get(METADATA)
         if values is None:
             return None

@@ -44,7 +44,7 @@ from relpos.recording.topics import Topic
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD_BYTES = 9
-"""Of each record: one byte says what it is, eight how long."""
+"""Head of a record: one byte for the opcode, eight for the length."""
 _CHUNK_HEAD = struct.Struct("<QQQI")
 CONTENT = (
     Opcode.HEADER,
@@ -56,7 +56,7 @@ CONTENT = (
     Opcode.METADATA,
     Opcode.ATTACHMENT,
 )
-"""What may stand before the end of the data; anything else at its place is damage."""
+"""Records before the end of the data; any other opcode is damage."""
 
 
 def _bytes_of(builder: RecordBuilder) -> bytes:
@@ -122,8 +122,8 @@ class Block:
         )
         self._messages += data
 
-    def take(self) -> bytes:
-        """The block's bytes; it is empty afterwards."""
+    def pop(self) -> bytes:
+        """Return the block's bytes, and empty the block."""
         raw = bytes(self._messages)
         times = [time_ns for entries in self._index.values() for time_ns, _ in entries]
         builder = RecordBuilder()
@@ -249,7 +249,7 @@ def records_in(raw: bytes) -> Iterator[tuple[int, memoryview]]:
 
 @dataclass
 class _Summary:
-    """What the records before it say of the whole file."""
+    """The summary of a whole file."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -258,7 +258,7 @@ class _Summary:
     counts: Counter[int] = field(default_factory=Counter)
 
     def read(self, walk: Walk) -> None:
-        """Take in every whole block."""
+        """Add every whole block."""
         open_chunk: ChunkIndex | None = None
         for piece in walk:
             if piece.opcode == Opcode.CHUNK:
@@ -342,7 +342,7 @@ class _Summary:
 
 
 def finish(path: Path) -> None:
-    """Give a file that was not closed its summary, behind its last whole record. OSError."""
+    """Append the summary to a file that was not closed, after its last whole record. OSError."""
     with path.open("r+b") as file:
         walk = Walk(file)
         summary = _Summary()

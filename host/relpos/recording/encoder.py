@@ -52,11 +52,11 @@ class Encoder:
         self._scene = Scene(started_unix_ns, dict(names))
 
     def rename(self, names: Mapping[int, str]) -> None:
-        """Call the wearers so from now on."""
+        """Use these names from now on."""
         self._scene.names = dict(names)
 
     def rehearse(self) -> None:
-        """Encode one of each, for nothing: the first time takes longer than all others."""
+        """Encode one item of each kind, because the first takes longest."""
         node = NodeEstimate(1, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 1.0, NodeStatus.OK)
         items: list[Item] = [
             topics.Serial(0.0, b""),
@@ -103,7 +103,7 @@ class Encoder:
 
 
 def names_of(description: Description) -> dict[int, str]:
-    """What each wearer is called, where it is known."""
+    """Return the name of each wearer, where it is known."""
     return {node: info.name for node, info in description.nodes.items() if info.name}
 
 

@@ -27,7 +27,7 @@ MOST_UNCONFIRMED = 64 << 20
 
 
 class Disk:
-    """What is asked of the disk; tests put a worse one in its place."""
+    """Calls to the disk; tests replace them by failing ones."""
 
     def write(self, file: int, data: memoryview) -> int:
         """Write some of it; how much. OSError."""
@@ -39,7 +39,7 @@ class Disk:
 
 
 def part_path(path: Path, part: int) -> Path:
-    """Where the ``part``-th part of a recording is."""
+    """Return the path of the ``part``-th part of a recording."""
     return path if part == 1 else path.with_name(f"{path.stem}.part{part}{path.suffix}")
 
 
@@ -61,7 +61,7 @@ class _Syncer:
         Thread(target=self._run, name="disk", daemon=True).start()
 
     def ask(self, size: int) -> None:
-        """Have it confirm the file up to ``size``."""
+        """Request confirmation of the file up to ``size``."""
         with self._changed:
             self._wanted = size
             if self._since_s is None and size > self._confirmed:
@@ -77,7 +77,7 @@ class _Syncer:
             return self._confirmed
 
     def late_s(self) -> float:
-        """How long the oldest that is not confirmed waits."""
+        """Return for how long the oldest unconfirmed bytes wait."""
         with self._changed:
             return 0.0 if self._since_s is None else time.monotonic() - self._since_s
 
@@ -127,7 +127,7 @@ class _Syncer:
 
 
 class Output:
-    """Whole blocks to a file and its further parts.
+    """Writes whole blocks to a file and its further parts.
 
     ``beginning(part)`` gives what each part begins with. DataError where ``path`` or a second part
     exists already, or cannot be made.
@@ -168,7 +168,7 @@ class Output:
         return size > self._written or size > MOST_UNCONFIRMED
 
     def late_s(self) -> float:
-        """How long what was written waits for the disk to confirm it."""
+        """Return for how long written bytes wait for the disk's confirmation."""
         return self._syncer.late_s()
 
     def put(self, block: bytes) -> None:
@@ -183,7 +183,7 @@ class Output:
             if error.errno in NO_ROOM:
                 raise
             if error.errno == errno.EFBIG:
-                self._keep_whole()
+                self._truncate_to_whole()
             self._begin(self.part + 1)
             self._write()
 
@@ -213,7 +213,7 @@ class Output:
         handle = os.open(path, flags, 0o666)
         start = self._beginning(part)
         try:
-            # At once: a file of this name that is no recording would stand in everybody's way.
+            # At once: a file of this name that is no recording would block the name.
             if self._disk.write(handle, memoryview(start)) < len(start):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             self._disk.sync(handle)
@@ -229,7 +229,7 @@ class Output:
         self._syncer = _Syncer(self._disk, handle, len(start))
 
     def _whole(self) -> int:
-        """How many blocks are written whole."""
+        """Return how many blocks are written whole."""
         size = count = 0
         for block in self._blocks:
             size += len(block)
@@ -238,7 +238,7 @@ class Output:
             count += 1
         return count
 
-    def _keep_whole(self) -> None:
+    def _truncate_to_whole(self) -> None:
         """Leave in a file that may not grow what is whole in it, if the disk confirms it."""
         count = self._whole()
         size = sum(map(len, self._blocks[:count]))
@@ -251,7 +251,7 @@ class Output:
             del self._blocks[:count]
 
     def _cut(self) -> None:
-        """Let the present part end with its last confirmed block."""
+        """End the present part with its last confirmed block."""
         with contextlib.suppress(OSError):
             os.ftruncate(self._syncer.handle, self._start)
 
@@ -288,7 +288,7 @@ class Output:
 
 
 def _sync_directory(directory: Path) -> None:
-    """Have the disk confirm that a new file has its name; not every system can be asked."""
+    """Synchronise a directory, so that a new file keeps its name; not every system can."""
     with contextlib.suppress(OSError):
         handle = os.open(directory, os.O_RDONLY)
         try:

@@ -26,7 +26,7 @@ from relpos.runs.run import Run, assemble
 
 @dataclass
 class _File:
-    """One part: what it says of itself, and how whole it is."""
+    """One part: its metadata, and how complete it is."""
 
     path: Path
     metadata: dict[str, dict[str, str]]
@@ -90,12 +90,12 @@ class Recording:
 
     @property
     def closed(self) -> bool:
-        """Whether the recorder came to its end in every part."""
+        """Whether every part was closed."""
         return all(file.closed for file in self.files)
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
-        """What to know of it."""
+        """Remarks about the recording, a line each."""
         said: list[str] = []
         for file in self.files:
             if file.damaged:
@@ -155,7 +155,7 @@ class Recording:
                         yield Entry(topic, log_ns, publish_ns, sequence, data)
 
     def inputs(self) -> Iterator[tuple[float, topics.Serial | Observation]]:
-        """What entered the session, in its order: reads of the port, and what phones sent.
+        """Yield the inputs of the session in order: reads of the port, and observations of phones.
 
         With each the session's time at which it did, in seconds.
         """
@@ -169,7 +169,7 @@ class Recording:
                     yield self._session_s(entry), row
 
     def observations(self) -> Iterator[Observation]:
-        """What was decoded, and what phones sent, in the order of the session."""
+        """Yield decoded observations, and those of phones, in the order of the session."""
         return self._rows(_OBSERVED)
 
     def observations_by_arrival(self) -> Iterator[tuple[float, Observation]]:

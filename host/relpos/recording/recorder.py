@@ -1,9 +1,9 @@
-"""The sink that writes a session to an MCAP file, whatever the disk does.
+"""The sink that writes a session to an MCAP file, even on a slow or full disk.
 
 The session only puts things into a queue. A thread of the recorder's own encodes them, closes a
 block four times a second and has the disk confirm it. While the disk does not take it (slow, full,
 gone) the queue grows up to a bound; beyond that things are left out, estimates first. What is lost
-is counted, told by :meth:`Recorder.trouble` and written into the recording (topic ``/gap``).
+is counted, reported by :meth:`Recorder.trouble` and written into the recording (topic ``/gap``).
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ computer that is too busy to let us."""
 BLOCK_BYTES = 1 << 20
 RETRY_S = 0.5
 LATE_S = 3.0
-"""A disk that confirms nothing for so long is told of."""
+"""A disk that confirms nothing for so long is reported."""
 CLOSE_WITHIN_S = 10.0
-"""How long the end of a session waits for a disk that takes nothing."""
+"""Longest wait at the end of a session for a disk that accepts nothing."""
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """How much may wait for the disk, in bytes of memory, roughly.
+    """Bounds of what waits for the disk, in bytes of memory, roughly.
 
     ``inputs``: of everything; a team of 20 fills it in an hour. ``others``: beyond it estimates are
     left out, which a replay gives again; a few minutes.
@@ -53,7 +53,7 @@ class Bounds:
 
 @dataclass(frozen=True)
 class _Names:
-    """What the wearers are called from now on."""
+    """New names of the wearers."""
 
     names: Mapping[int, str]
 
@@ -87,7 +87,7 @@ class Recorder(ItemSink):
         self._lost = (0, 0)
         self._refused_since_s: float | None = None
         self._retry_s = 0.0
-        # The first of everything takes a while in Python; nobody waits for it now.
+        # The first of everything takes a while in Python, and here nothing is late.
         self._encoder.rehearse()
         self._output = Output(Path(path), self._beginning, disk or Disk())
         self._stop = Event()
@@ -102,7 +102,7 @@ class Recorder(ItemSink):
 
     @property
     def lost(self) -> tuple[int, int]:
-        """How many inputs and how many estimates had to be left out."""
+        """Numbers of lost inputs and of lost estimates."""
         return self._lost
 
     @property
@@ -188,13 +188,13 @@ class Recorder(ItemSink):
             full = len(self._block) >= BLOCK_BYTES
             old = time.monotonic() - self._block_began_s >= BLOCK_S
             if len(self._block) and (full or old or closing):
-                self._output.put(self._block.take())
+                self._output.put(self._block.pop())
                 self._block_began_s = time.monotonic()
             if not self._output.waiting and not self._queue:
                 return True
 
     def _flushed(self) -> bool:
-        """Have the disk take what waits, or tell why it does not."""
+        """Flush waiting blocks to the disk; report the reason where it refuses."""
         now_s = time.monotonic()
         if self._refused_since_s is not None and now_s < self._retry_s:
             return False
@@ -265,7 +265,7 @@ class Recorder(ItemSink):
     def _rename(self, names: Mapping[int, str]) -> None:
         """Write names as metadata between two blocks, where the newest counts."""
         if len(self._block):
-            self._output.put(self._block.take())
+            self._output.put(self._block.pop())
         nodes = dict(self._about.description.nodes)
         for node, name in names.items():
             nodes[node] = replace(nodes.get(node, NodeInfo()), name=name)

@@ -136,4 +136,4 @@ class _Writer:
     def end(self) -> None:
         """Write the open block."""
         if len(self._block):
-            self._out.write(self._block.take())
+            self._out.write(self._block.pop())

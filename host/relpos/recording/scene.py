@@ -1,4 +1,4 @@
-"""What Foxglove draws without any set-up: the team in its 3D panel, its frames, its log.
+"""Drawings for Foxglove without any set-up: the team in its 3D panel, frames, log.
 
 World axes as everywhere: x east-like, y north-like, z up, metres. The common frame is called
 ``team``, a wearer's ``node N``.
@@ -24,7 +24,7 @@ SCALE_90 = math.sqrt(-2.0 * math.log(0.1))
 RANGE_SHOWN_S = 10.0
 TRAIL_EVERY_S = 4.0
 TRAIL_POINTS = 30
-"""Two minutes: enough to see the way somebody came, and a file that stays small."""
+"""Two minutes: enough to see the last path, and a file that stays small."""
 GRID_M = 1.0 / 256.0
 """Drawn figures are rounded to a power of two: eyes see no difference, and they compress."""
 RING_POINTS = 48
@@ -41,7 +41,7 @@ COLOURS: Mapping[NodeStatus, tuple[float, float, float]] = {
 
 
 def _messages() -> Any:
-    """Foxglove's message classes, loaded when somebody draws: help texts stay quick."""
+    """Foxglove's message classes, loaded when they are used: help texts stay quick."""
     from foxglove import messages
 
     return messages
@@ -72,7 +72,7 @@ def log_message(unix_ns: int, level: str, text: str) -> bytes:
 
 @dataclass
 class Scene:
-    """Draws estimates; remembers the ranges and the ways that led there.
+    """Draws estimates, with recent ranges and trails.
 
     ``names``: node -> what its wearer is called.
     """
@@ -90,7 +90,7 @@ class Scene:
             self._ranges[pair] = measured
 
     def draw(self, estimate: Estimate) -> Iterator[tuple[str, bytes]]:
-        """Topics and messages of the picture that an estimate gives."""
+        """Yield topics and messages that draw an estimate."""
         m = _messages()
         unix_ns = self.started_unix_ns + round(estimate.time_s * 1e9)
         stamp = _stamp(unix_ns)
@@ -126,7 +126,7 @@ class Scene:
                     lines=[_ring(row) for row in ghosts if row.shape is Shape.RING],
                 )
             )
-        # What is not in this picture goes: a ghost that has been ruled out, somebody unlocated.
+        # Delete entities without a drawing now: a rejected alternative, an unlocated node.
         keep = {f"node {node}" for node in drawn}
         if ghosts:
             keep.add("alternatives")
@@ -174,7 +174,7 @@ class Scene:
         )
 
     def _links(self, time_s: float, drawn: Mapping[int, NodeEstimate]) -> Any:
-        """Lines between two who measured each other; None where nobody did."""
+        """Lines between nodes with a recent range; None without any."""
         m = _messages()
         points: list[Any] = []
         for (node, peer), measured in self._ranges.items():

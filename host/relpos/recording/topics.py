@@ -70,7 +70,7 @@ class Serial:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """What could not be recorded between two times of the session, because the disk was not there.
+    """Items lost between two times of the session, because the disk did not accept them.
 
     ``inputs``: reads of the serial port and what phones sent; ``others``: messages that a replay of
     the inputs gives again.
@@ -120,11 +120,11 @@ ELLIPSE = ("sigma_major_m", "sigma_minor_m", "sigma_angle_rad")
 
 
 PHONE_KINDS = (Event, Heading)
-"""What phones send."""
+"""Observations that phones send."""
 
 
 def is_input(observation: Observation) -> bool:
-    """Tell whether it entered the session by itself, from a phone, and not by the serial port."""
+    """Tell whether an observation came from a phone, and not from the serial port."""
     return isinstance(observation, Event) or (
         isinstance(observation, Heading) and observation.source == "phone"
     )
@@ -192,7 +192,7 @@ def names_of(kind: type) -> tuple[str, ...]:
 
 @cache
 def list_names_of(kind: type) -> tuple[str, ...]:
-    """What one entry of a list holds; its time stands beside the list."""
+    """Return the fields of one entry of a list; its time stands beside the list."""
     names = tuple(name for name in names_of(kind) if name != "time_s")
     return (*names, *ELLIPSE) if kind is NodeEstimate else names
 
@@ -246,7 +246,7 @@ def _build(kind: type, values: Mapping[str, Any]) -> Any:
 
 @cache
 def _makers(kind: type) -> dict[str, tuple[Any, Any]]:
-    """How each field is made of what JSON has, and what stands for one that is missing."""
+    """Return how each field is made of its JSON value, and the value for a missing one."""
     makers: dict[str, tuple[Any, Any]] = {}
     for name, hint in get_type_hints(kind).items():
         optional, plain = plain_type(hint)

@@ -1,8 +1,8 @@
 """CSV files: written whole, or line by line while a session runs.
 
 An appended file keeps in memory what the disk does not take (it is full, or was pulled out) and
-tries again, so that nothing is missing once there is room. Lines are written whole: whoever reads
-along, or after a crash, finds none that is broken but perhaps the last.
+tries again, so that nothing is missing once there is room. Lines are written whole: a reader
+during the session, or after a crash, finds at most the last one broken.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``run.toml``: what a recording says about itself, every key optional."""
+"""``run.toml``: the description of a recording, every key optional."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from relpos.measurements import Prior
 
 
 class InitialPose(StrEnum):
-    """What a run says of where its nodes start; the words of ``initial_pose``."""
+    """Start of the nodes, as the run states it; the values of ``initial_pose``."""
 
     UNKNOWN = "unknown"
     COMMON = "common"
@@ -25,7 +25,7 @@ class InitialPose(StrEnum):
 
 @dataclass(frozen=True)
 class NodeInfo:
-    """What is known of the wearer and the mounting of one node; None where it is not."""
+    """Wearer and mounting of one node; None for an unknown value."""
 
     name: str | None = None
     stature_m: float | None = None
@@ -37,7 +37,7 @@ class NodeInfo:
 
 @dataclass(frozen=True)
 class Simulated:
-    """What made a simulated run: its scenario, seed and settings. For evaluation alone."""
+    """Scenario, seed and settings of a simulated run. For evaluation alone."""
 
     scenario: str
     seed: int

@@ -1,4 +1,4 @@
-"""Landmark presses as ground truth: who pressed for which surveyed place, and what cannot count."""
+"""Landmark presses as ground truth, and the presses that cannot count."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ class Landmark:
 
 @dataclass(frozen=True)
 class Presses:
-    """What presses are worth: ``truth``, and those that give none, by the reason."""
+    """Presses as ``truth``, and the presses left out, by reason."""
 
     truth: tuple[Truth, ...] = ()
     unknown: tuple[Event, ...] = ()
-    """Of landmarks that nobody surveyed."""
+    """Of landmarks without a survey."""
     repeated: tuple[Event, ...] = ()
     """Within ``REPEATED_WITHIN_S`` after the same node's press of the same landmark."""
     strangers: tuple[Event, ...] = ()
-    """By nodes that the run knows nothing else of."""
+    """By nodes without other data in the run."""
 
     def remarks(self) -> list[str]:
         """One line for each reason that left presses out; none where all counted."""
@@ -48,15 +48,15 @@ class Presses:
             f"{len(events)} landmark {'press' if len(events) == 1 else 'presses'} left out, "
             f"{why}: {_listed(events)}"
             for events, why in (
-                (self.unknown, "of landmarks that nobody surveyed"),
+                (self.unknown, "of landmarks without a survey"),
                 (self.repeated, f"within {REPEATED_WITHIN_S:g} s after the same one"),
-                (self.strangers, "by nodes that the run knows nothing else of"),
+                (self.strangers, "by nodes without other data"),
             )
             if events
         ]
 
     def counters(self) -> dict[str, int]:
-        """How many were left out for each reason, by the names of a run's counters."""
+        """Return the number left out for each reason, by the names of a run's counters."""
         return {
             "landmarks_unknown": len(self.unknown),
             "landmarks_repeated": len(self.repeated),

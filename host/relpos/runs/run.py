@@ -51,7 +51,7 @@ from relpos.runs.table import (
 )
 
 UNKNOWN_HEADING_SIGMA_RAD = math.pi
-"""Of a first truth pose without a heading: wider than any heading can be wrong."""
+"""For a first truth pose without a heading: wider than any heading error."""
 
 PRIOR_FROM_TRUTH_WITHIN_S = 2.0
 """A first truth pose later than this after a node's start says nothing of its start. The same
@@ -64,8 +64,8 @@ class Run:
 
     ``truth`` is for evaluation alone. ``counters`` says how many rows of note were met:
     ``ranges_failed`` (a range of 0 or less, kept as the failure marker it is),
-    ``landmarks_unknown`` (presses of a landmark nobody surveyed), ``landmarks_repeated`` (pressed
-    twice in passing), ``landmarks_of_strangers`` (by nodes of whom nothing else is known) and
+    ``landmarks_unknown`` (presses of a landmark without a survey), ``landmarks_repeated`` (pressed
+    twice in passing), ``landmarks_of_strangers`` (by nodes without other data) and
     ``unsorted_rows``.
     """
 
@@ -92,12 +92,12 @@ class Run:
 
     @property
     def nodes(self) -> dict[int, NodeInfo]:
-        """What is known of each node; the defaults where ``run.toml`` is silent."""
+        """Each node with its description; the defaults where ``run.toml`` has none."""
         return {node: self.description.nodes.get(node, NodeInfo()) for node in self.node_ids}
 
     @property
     def heading_known(self) -> bool:
-        """Whether the nodes' headings share one reference."""
+        """Whether the headings of the nodes have one reference."""
         return self.description.heading_known
 
     @property
@@ -112,7 +112,7 @@ class Run:
 
     @property
     def priors(self) -> tuple[Prior, ...]:
-        """What the run itself says of its start; a table of one node overrules the rest."""
+        """The stated starts; the table of a node replaces ``initial_pose``."""
         tables = {prior.node: prior for prior in self.description.priors}
         merged = {p.node: p for p in self.priors_for(self.description.initial_pose)} | tables
         return tuple(merged[node] for node in sorted(merged))
@@ -295,11 +295,11 @@ class RunFiles:
         self._newest_s = -math.inf
 
     def describe(self, description: Description) -> None:
-        """Write what the run says of itself, in place of what it said before."""
+        """Replace the description of the run."""
         write_description(self._directory / "run.toml", description)
 
     def write(self, observations: Iterable[Observation]) -> None:
-        """Take observations, in the order of their arrival."""
+        """Add observations, in the order of their arrival."""
         for observation in observations:
             self._count += 1
             heapq.heappush(self._waiting, (observation.time_s, self._count, observation))
@@ -324,7 +324,7 @@ class RunFiles:
 
 
 REORDER_S = 5.0
-"""Ranges are told up to two seconds after they were measured."""
+"""Ranges are reported up to two seconds after they were measured."""
 
 
 @dataclass(frozen=True)

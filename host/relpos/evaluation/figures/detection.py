@@ -1,4 +1,4 @@
-"""How often who is heard at which distance in the laboratory (paper, fig. 10)."""
+"""Detection probability over distance in the laboratory (paper, fig. 10)."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ PARTICLES = (*PAPER_S, 5000, 50_000)
 
 
 def instants(run: SimulatedRun) -> Iterator[tuple[list[Motion], list[Range]]]:
-    """The run second by second: everybody's motions, and the ranges after them."""
+    """Return the run second by second: all motions, then the ranges."""
     for _, group in groupby(run.measurements, key=lambda m: m.time_s):
         at_once = list(group)
         yield (

@@ -1,4 +1,4 @@
-"""What every figure is made of: numbers, a picture, and the paper's values beside ours."""
+"""A sheet: the numbers of a figure, its drawing, and the paper's values beside ours."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ T = TypeVar("T")
 Cell = str | float | int
 
 OWN_COLOURS = ("#6A3D9A", "#8C510A", "#01665E")
-"""Of the estimators that somebody adds to ours."""
+"""Colours of the estimators that a user adds."""
 
 IMU_SCALES = ((0.0, 0.0), (0.1, 0.05), (0.2, 0.1), (0.4, 0.2), (0.8, 0.4))
 """The paper's five scales of IMU noise, (sigma_d, sigma_theta) (sect. V-B)."""
@@ -65,9 +65,9 @@ class Sheet:
 
 @dataclass
 class Work:
-    """Where and on how many seeds figures are computed; ``on_done`` hears of every job.
+    """Where and on how many seeds figures are computed; ``on_done`` is called after every job.
 
-    ``own`` are estimators of somebody else's, drawn beside ours wherever estimators are compared.
+    ``own`` are estimators of the user, drawn wherever estimators are compared.
     """
 
     seeds: Sequence[int]
@@ -82,21 +82,21 @@ class Work:
         fresh = {key(case): case for case in cases if key(case) not in self._outcomes}
         made = study.run(list(fresh.values()), self.seeds, self.pool, self.on_done)
         for outcome in made:
-            # Ours may give up on a run, which is a result; of somebody else's it is a fault.
+            # An estimator of relpos may give up on a run; one of the user must not.
             if outcome.case.estimator in self.own and outcome.failures:
                 raise RelposError(outcome.failures[0])
         self._outcomes.update(zip(fresh, made, strict=True))
         return [self._outcomes[key(case)] for case in cases]
 
     def bounds(self, cases: Sequence[study.Case]) -> list[bounds.Totals]:
-        """Give the bound of each case's scenario over all seeds."""
+        """Return the bound of each case's scenario over all seeds."""
         fresh = {key(case)[:2]: case for case in cases if key(case)[:2] not in self._bounds}
         made = study.bounds_of(list(fresh.values()), self.seeds, self.pool, self.on_done)
         self._bounds.update(zip(fresh, made, strict=True))
         return [self._bounds[key(case)[:2]] for case in cases]
 
     def own_cases(self, scenario: str = "paper") -> list[study.Case]:
-        """Give a case for each estimator of somebody else's."""
+        """Return a case for each estimator of the user."""
         return [study.Case(short(name), scenario, estimator=name) for name in self.own]
 
     def each(self, function: Callable[..., T], jobs: Sequence[tuple[Any, ...]]) -> list[T]:
@@ -110,12 +110,12 @@ def short(name: str) -> str:
 
 
 def own_colour(place: int) -> str:
-    """Colour of the somebody else's estimator at that place."""
+    """Colour of the user's estimator at an index."""
     return OWN_COLOURS[place % len(OWN_COLOURS)]
 
 
 def key(case: study.Case) -> tuple[Any, ...]:
-    """Tell cases apart by what is computed, whatever they are called."""
+    """Return a key of what is computed, without the label."""
     return (
         case.scenario,
         tuple(sorted(case.overrides.items())),

@@ -133,15 +133,15 @@ def error_distribution(content: Content) -> Picture | None:
         for share in (0.5, 0.95):
             axes.axhline(share, color=GREY, linewidth=0.8, linestyle=":")
         most = max(one.horizontal.e95_m for one in iso.frames.values())
-        axes.set(xlabel="horizontal error (m)", ylabel="share of errors below", ylim=(0.0, 1.01))
+        axes.set(xlabel="horizontal error (m)", ylabel="fraction of errors below", ylim=(0.0, 1.01))
         axes.set_xlim(0.0, max(1.6 * most, 0.1))
         axes.legend(loc="lower right")
 
     return Picture(
         "error-distribution",
         "Distribution of the horizontal error",
-        "All nodes and whole seconds together (ISO/IEC 18305). How the relative picture was laid "
-        "on the truth first is said at each curve; the tail beyond 1.6 CE95 is cut off.",
+        "All nodes and whole seconds together (ISO/IEC 18305). The alignment with the "
+        "truth stands at each curve; the tail beyond 1.6 CE95 is cut off.",
         "Cumulative share of horizontal errors: "
         + "; ".join(
             f"{labels[frame]}, half below {one.horizontal.e50_m:.2f} m, 95 % below "

@@ -50,7 +50,7 @@ STATUS_WORDS: Mapping[str, str] = {
 
 
 def consistency(content: Content) -> Picture | None:
-    """Draw whether the estimate is as uncertain as it says."""
+    """Draw the consistency of the reported uncertainty with the real errors."""
     scored = content.evaluation
     # An error of exactly 0 is a copy of the truth, not an estimate with an uncertainty.
     if scored is None or not (scored.metrics.nees_over_time > 1e-12).any():
@@ -121,7 +121,7 @@ def normalised(content: Content) -> Floats:
 
 
 def status(content: Content) -> Picture | None:
-    """Draw how sure the picture was: every node's status, and how many pictures were possible."""
+    """Draw the status of every node, and the number of possible modes."""
     estimates = content.result.estimates
     if not estimates:
         return None
@@ -157,9 +157,9 @@ def status(content: Content) -> Picture | None:
         if ambiguous:
             time_s = [e.time_s for e in estimates]
             panels[1].plot(
-                time_s, pictures, color=FUSED, drawstyle="steps-post", label="possible pictures"
+                time_s, pictures, color=FUSED, drawstyle="steps-post", label="possible modes"
             )
-            panels[1].set_ylabel("possible pictures")
+            panels[1].set_ylabel("possible modes")
             panels[1].set_ylim(bottom=0.0)
             beside = panels[1].twinx()
             beside.plot(
@@ -190,9 +190,9 @@ def status(content: Content) -> Picture | None:
     )
     return Picture(
         "status",
-        "How sure the picture was",
+        "Status and modes",
         f"Status of every node over time: {words}."
-        + (" Below: how many pictures of the team were possible." if ambiguous else "")
+        + (" Below: the number of possible modes of the team." if ambiguous else "")
         + region,
         f"A bar for each node over time, coloured by status: {words}.{region}",
         draw,

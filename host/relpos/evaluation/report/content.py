@@ -1,4 +1,4 @@
-"""Everything a report tells, gathered before anything is drawn."""
+"""The content of a report, gathered before anything is drawn."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Baseline:
-    """Dead reckoning alone over the same run: where it started, and how well it did."""
+    """Dead reckoning alone over the same run: its start, tracks and score."""
 
     words: str
     tracks: Tracks
@@ -55,15 +55,15 @@ class Content:
     bound: Bound | None = None
     baseline: Baseline | None = None
     words: Sequence[str] = field(default=())
-    """What else the page should say of itself, as the command that made it."""
+    """Further sentences for the page, as the command that made it."""
 
     @property
     def nodes(self) -> tuple[int, ...]:
-        """Every node that anything tells of."""
+        """Every node with data."""
         return tuple(sorted({*self.run.node_ids, *self.guessed, *self.truth}))
 
     def name(self, node: int) -> str:
-        """What a node's wearer is called, with the number."""
+        """Return the name of a node's wearer, with the number."""
         info = self.run.nodes.get(node)
         return f"{info.name} ({node})" if info is not None and info.name else f"node {node}"
 
@@ -161,8 +161,8 @@ def gather(
 def reckon(run: Run, result: Result) -> Baseline | None:
     """Run dead reckoning over a run, from the same start as the estimator had where it can.
 
-    It can place nobody by itself: without priors it is given the true start, which is more than
-    the fusion had, and without a truth the first pose that the fusion found of each node.
+    Dead reckoning needs a start: without priors it gets the true start, which is more than the
+    fusion had, and without a truth the first pose of each node that the fusion found.
     """
     from relpos import fusion
     from relpos.runs import InitialPose

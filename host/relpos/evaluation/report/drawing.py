@@ -1,4 +1,4 @@
-"""From something that draws to SVG for a page, and to files."""
+"""Drawing: a figure as SVG for a page, and as files."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MANY_DOTS = 3000
 
 @dataclass(frozen=True)
 class Picture:
-    """One figure: what it is called and says, how to draw it, and what it shows in words."""
+    """One figure: its name, texts and size, and the function that draws it."""
 
     name: str
     title: str
@@ -54,7 +54,7 @@ class Picture:
 
 
 def svg(figure: Figure) -> str:
-    """Give a figure as an SVG document; the same figure is the same text."""
+    """Return a figure as an SVG document; the same figure is the same text."""
     import matplotlib as mpl
 
     written = io.StringIO()
@@ -153,7 +153,7 @@ def dots(axes: Axes, x: Floats, y: Floats, colour: str, **more: Any) -> None:
 
 
 def grid(figure: Figure, count: int, columns: int, *, sharey: bool = True) -> Sequence[Axes]:
-    """Give ``count`` panels in rows of at most ``columns``, those of a column with one time axis.
+    """Return ``count`` panels in rows of at most ``columns``, those of a column with one time axis.
 
     The labels of the time axis stand under the lowest panel of each column.
     """

@@ -1,4 +1,4 @@
-"""The figures of where everybody was: tracks, and height over time."""
+"""The figures of positions: tracks on a map, and height over time."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Floats = npt.NDArray[np.float64]
 
 
 def tracks(content: Content) -> Picture | None:
-    """Draw who walked where: truth, dead reckoning, fusion."""
+    """Draw the tracks on a map: truth, dead reckoning, fusion."""
     fused = {node: t for node, t in content.guessed.items() if np.isfinite(t.x_m).any()}
     if not fused:
         return None
@@ -40,7 +40,7 @@ def tracks(content: Content) -> Picture | None:
     true = bool(content.truth)
     moved = {name: _moved(ways, content.truth if true else content.guessed) for name, ways in shown}
     extent = {name: _extent([*moved[name].values(), *_points(content.truth)]) for name, _ in shown}
-    # A picture that dead reckoning has blown up must not shrink the other to a dot.
+    # A map that dead reckoning has blown up must not shrink the other to a dot.
     share = max(size for _, size in extent.values()) < 3.0 * min(
         size for _, size in extent.values()
     )
@@ -74,7 +74,7 @@ def tracks(content: Content) -> Picture | None:
         + (
             "A node is left out while it was not located."
             if located
-            else "Nobody was located: each way is from where it began."
+            else "No node was located: each track begins at its own origin."
         ),
         f"Map of the ways of {nodes}"
         + (", dead reckoning beside the fusion" if len(shown) > 1 else "")
@@ -147,7 +147,7 @@ def _draw_tracks(
 
 
 def heights(content: Content) -> Picture | None:
-    """Draw everybody's height over the own start."""
+    """Draw the height of every node over its own start."""
     known = {n: t for n, t in content.guessed.items() if np.isfinite(t.z_m).any()}
     if not known:
         return None
@@ -206,7 +206,7 @@ def _extent(ways: Sequence[Floats]) -> tuple[float, float]:
 
 
 def _alone(track: Track) -> npt.NDArray[np.bool_]:
-    """Which rows no line joins to another."""
+    """Return which rows no line joins to another."""
     apart = np.diff(track.time_s, prepend=-math.inf, append=math.inf) > MAX_GAP_S
     result: npt.NDArray[np.bool_] = apart[:-1] & apart[1:]
     return result

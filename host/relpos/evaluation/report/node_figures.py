@@ -36,7 +36,7 @@ MOST_BANDS = 6
 
 
 TEAM_WIDE = ("detection_range_m",)
-"""Parameters that are the team's, though they are told of each node."""
+"""Parameters of the whole team, though they are reported for each node."""
 
 
 _PARAMETER_WORDS: Mapping[str, tuple[str, float]] = {
@@ -47,7 +47,7 @@ _PARAMETER_WORDS: Mapping[str, tuple[str, float]] = {
 
 
 def parameters(content: Content) -> Picture | None:
-    """Draw what the estimator learned on the way, range biases apart."""
+    """Draw the learned parameters over time, range biases apart."""
     rows: dict[str, dict[int, list[tuple[float, float, float]]]] = {}
     for p in content.result.parameters:
         if p.peer is None:
@@ -107,16 +107,16 @@ _HEALTH_WORDS: Mapping[str, tuple[str, float | None]] = {
 
 
 def health(content: Content) -> Picture | None:
-    """Draw how nodes and links fared."""
+    """Draw the health of nodes and links."""
     nodes = content.health
     shown = [
         name
         for name in SERIES
         if any(np.isfinite(one.series[name]).any() for one in nodes.values())
     ]
-    told = any(one.time_s.size for one in nodes.values())
+    reported = any(one.time_s.size for one in nodes.values())
     silent = any(one.silences for one in nodes.values())
-    if not told and not silent:
+    if not reported and not silent:
         return None
     places = {node: k for k, node in enumerate(content.nodes)}
     last_s = max(

@@ -1,4 +1,4 @@
-"""The page: everything in one HTML file that asks nobody for anything."""
+"""The page: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from relpos.evaluation.report.tables import Table
 from relpos.version import __version__
 
 SECTIONS: Sequence[tuple[str, str, tuple[str, ...], tuple[str, ...]]] = (
-    ("where", "Where everybody was", ("tracks",), ("located",)),
+    ("where", "Positions", ("tracks",), ("located",)),
     (
         "accuracy",
         "Accuracy",
@@ -109,7 +109,7 @@ def _duration(seconds: float) -> str:
 
 
 def _tiles(content: Content) -> str:
-    """Give the figures that are looked at first."""
+    """Return the tiles with the main figures."""
     tiles: list[tuple[str, str, str]] = []
     scored = content.evaluation
     if scored is not None:
@@ -168,7 +168,7 @@ def _tiles(content: Content) -> str:
 
 
 def _in_short(content: Content) -> list[str]:
-    """Say in sentences what the numbers mean."""
+    """Return sentences that explain the numbers."""
     scored, result = content.evaluation, content.result
     words = []
     if not result.estimates:

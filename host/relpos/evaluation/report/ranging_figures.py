@@ -28,7 +28,7 @@ Floats = npt.NDArray[np.float64]
 
 
 def detection(content: Content) -> Picture | None:
-    """Draw who was heard over which distance, and the curve learned of it."""
+    """Draw the detection probability over distance, and its learned curve."""
     heard = content.heard
     if heard is None or heard.distance_m.size < 20:
         return None
@@ -91,7 +91,7 @@ def detection(content: Content) -> Picture | None:
 
 
 def residuals(content: Content) -> Picture | None:
-    """Draw what ranges differ from the estimated distance by, pair by pair."""
+    """Draw the range residuals of every pair."""
     known = [one for one in content.ranges if np.isfinite(one.residual_m).any()]
     if not known:
         return None

@@ -43,7 +43,7 @@ class Table:
     note: str = ""
 
     def html(self) -> str:
-        """Give it as HTML, in a region of its own that scrolls where it is too wide."""
+        """Return the table as HTML, in a region of its own that scrolls if it is too wide."""
         head = "".join(f'<th scope="col">{escape(c)}</th>' for c in self.columns)
         body = "\n".join(
             f'<tr><th scope="row">{first}</th>{"".join(map(_cell, rest))}</tr>'
@@ -67,7 +67,7 @@ def _cell(content: str) -> str:
 
 
 def value(number: float | None, unit: str = "", digits: int = 2, *, sign: bool = False) -> str:
-    """Give a number with its unit, and all its digits in the attribute."""
+    """Return a number with its unit as HTML, all digits in the attribute."""
     if number is None or not math.isfinite(number):
         return '<span aria-label="not known">-</span>'
     words = f"{number:+.{digits}f}" if sign else f"{number:.{digits}f}"
@@ -83,7 +83,7 @@ def _share(number: float) -> str:
 
 
 def main_figures(content: Content) -> Table | None:
-    """Tell the run format's metrics, beside dead reckoning and the bound."""
+    """Return the table of the run format's metrics, dead reckoning and the bound."""
     if content.evaluation is None:
         return None
     metrics = content.evaluation.metrics
@@ -127,7 +127,7 @@ def main_figures(content: Content) -> Table | None:
 
 
 def consistency(content: Content) -> Table | None:
-    """Tell every NEES with its interval."""
+    """Return the table of every NEES with its interval."""
     scored = content.evaluation
     if scored is None:
         return None
@@ -160,7 +160,7 @@ def consistency(content: Content) -> Table | None:
 
 
 def iso(content: Content) -> Table | None:
-    """Tell the metrics of ISO/IEC 18305, a column for each way of alignment."""
+    """Return the table of ISO/IEC 18305, a column for each alignment."""
     if content.evaluation is None or not content.evaluation.iso.known:
         return None
     assessed = content.evaluation.iso
@@ -200,14 +200,14 @@ def iso(content: Content) -> Table | None:
     note = (
         "Errors are estimate less truth at every whole second of every node. A relative picture "
         "has no frame of its own; columns differ in how it was laid on the truth before: as given "
-        "(only where the run told the starts in the truth's frame), by one rigid motion of the "
+        "(only where the run states the starts in the truth's frame), by one rigid motion of the "
         "plane, SE(2), for the whole run and all nodes, or by one each second over the nodes known "
         "then. CE50 and CE95 are the least radii that hold half and 95 % of the horizontal errors "
         "that occurred, VE of the vertical ones, SE of those in space. Heights are over each "
         f"node's own start. Relative accuracy ({words}): the vectors between two nodes are off by "
         f"{relative.mean_m:.2f} m on average, {relative.rms_m:.2f} m RMS, {relative.e95_m:.2f} m "
         f"at 95 %. Coverage: a node was located at {100.0 * assessed.coverage:.1f} % of its test "
-        "points. Floor and zone detection need a map and are not told."
+        "points. Floor and zone detection need a map and are left out."
     )
     if not any(one.vertical.count for _, one in kinds):
         note += " No height is known in both estimate and truth: no vertical or spherical error."
@@ -230,7 +230,7 @@ def _variances(accuracy: Accuracy) -> str:
 
 
 def latency(content: Content) -> Table | None:
-    """Tell how much later than its own time an estimate came."""
+    """Return the table of the delay of estimates."""
     seen = content.result.latency
     if seen is None:
         return None
@@ -253,7 +253,7 @@ def latency(content: Content) -> Table | None:
 
 
 def nodes(content: Content) -> Table | None:
-    """Tell each node's errors."""
+    """Return the table of each node's errors."""
     if content.evaluation is None or not content.evaluation.iso.nodes:
         return None
     assessed = content.evaluation.iso
@@ -279,7 +279,7 @@ def _figures(kind: Magnitudes) -> list[str]:
 
 
 def pairs(content: Content) -> Table | None:
-    """Tell each pair's errors."""
+    """Return the table of each pair's errors."""
     scored = content.evaluation
     if scored is None or not scored.metrics.pairs:
         return None
@@ -310,7 +310,7 @@ def _rmse(pair: PairMetrics | None) -> float:
 
 
 def ranges(content: Content) -> Table | None:
-    """Tell each pair's ranges and what was learned of them."""
+    """Return the table of each pair's ranges and learned bias."""
     if not content.ranges:
         return None
     learned = {
@@ -363,7 +363,7 @@ _UNITS: Mapping[str, tuple[str, str, float, int]] = {
 
 
 def learned(content: Content) -> Table | None:
-    """Tell what was learned in the end, range biases apart."""
+    """Return the table of the last learned parameters, range biases apart."""
     rows, told = [], set[str]()
     for (name, node, peer), p in content.learned().items():
         if peer is not None or (name in TEAM_WIDE and name in told):
@@ -381,7 +381,7 @@ def learned(content: Content) -> Table | None:
 
 
 def health(content: Content) -> Table | None:
-    """Tell how each node and its link fared."""
+    """Return the table of the health of each node and its link."""
     if not any(one.time_s.size or one.motions for one in content.health.values()):
         return None
     told = any(one.time_s.size for one in content.health.values())
@@ -424,7 +424,7 @@ def health(content: Content) -> Table | None:
 
 
 def reasons(content: Content) -> Table | None:
-    """Tell why nodes were not green."""
+    """Return the table of the reasons for yellow and red."""
     rows = [
         [
             escape(content.name(node)),
@@ -447,7 +447,7 @@ def _least(values: npt.NDArray[np.float64]) -> float:
 
 
 def located(content: Content) -> Table | None:
-    """Tell where everybody was at the end."""
+    """Return the table of the poses at the end."""
     if not content.result.estimates:
         return None
     last = content.result.estimates[-1]
@@ -472,7 +472,7 @@ def located(content: Content) -> Table | None:
 
 
 def counters(content: Content) -> Table | None:
-    """Tell everything that was dropped, rejected, clamped or reset."""
+    """Return the table of counts: dropped, rejected, clamped, reset."""
     noted = {**content.run.counters, **content.result.counters}
     rows = [
         [escape(name.replace("_", " ")), value(float(count), "", 0)]

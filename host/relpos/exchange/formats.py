@@ -1,0 +1,23 @@
+"""The formats, and the kinds of trajectories; light enough for a help text."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class Format(StrEnum):
+    """The formats by the names people's scripts rely on."""
+
+    RUN = "run"
+    MCAP = "mcap"
+    TUM = "tum"
+    GEOJSON = "geojson"
+    GPX = "gpx"
+    CSV = "csv"
+
+
+class Kind(StrEnum):
+    """Kind of a trajectory."""
+
+    ESTIMATE = "estimate"
+    TRUTH = "truth"
