@@ -345,7 +345,10 @@ def test_a_port_that_vanishes_keeps_what_was_received(tmp_path: Path) -> None:
     os.close(theirs)
 
     def vanish() -> None:
-        time.sleep(0.5)
+        deadline_s = time.monotonic() + 60.0
+        while not (tmp_path / "received").exists() and time.monotonic() < deadline_s:
+            time.sleep(0.1)
+        time.sleep(0.2)
         os.close(ours)
 
     closing = threading.Thread(target=vanish)
