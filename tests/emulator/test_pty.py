@@ -2,6 +2,8 @@
 
 import os
 import select
+import subprocess
+import sys
 import threading
 import time
 
@@ -257,3 +259,21 @@ def test_the_end_is_said_in_words_and_the_last_byte_arrives(capsys):
 def test_a_negative_speed_is_refused():
     with pytest.raises(DeviceError, match="speed"):
         PseudoTerminal(Talker(1.0), speed=-1.0)
+
+
+@pytest.mark.parametrize("command", ["emulate --nodes 2", "demo --seconds 10", "demo --view"])
+def test_a_system_without_pseudo_terminals_gets_one_line(command):
+    """As on Windows, whose Python has neither of these modules."""
+    without = (
+        "import runpy, serial, sys\n"
+        "sys.modules['fcntl'] = sys.modules['termios'] = None\n"
+        f"sys.argv = ['relpos', *{command.split()!r}]\n"
+        "runpy.run_module('relpos.cli.main', run_name='__main__')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", without], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1, done.stderr
+    (line,) = [x for x in done.stderr.splitlines() if x.startswith("relpos: ")]
+    assert "emulated teams need pseudo-terminals" in line
+    assert "Traceback" not in done.stderr

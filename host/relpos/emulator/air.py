@@ -56,7 +56,7 @@ class VirtualClock:
 
 @dataclass(frozen=True, slots=True)
 class UwbModel:
-    """What ranging takes, and what happens where two exchanges meet. Assumed, not measured.
+    """How long ranging takes, and what happens where two exchanges meet. Assumed, not measured.
 
     At 110 kbit/s, a PRF of 64 MHz and a preamble of 1024 symbols of 1.018 us, a frame of 20 bytes
     takes 3.0 ms on the air: preamble 1.04 ms, start delimiter 0.07 ms, header 0.17 ms (21 bits of
@@ -73,7 +73,7 @@ class UwbModel:
     """Two exchanges that overlap in time, with a tag of the one in reach of a tag of the other,
     both fail: a preamble hides other frames, and no tag is in two exchanges at once.
     Harder than the air is: a strong frame may survive a weak one, and an initiator that waits in
-    vain disturbs nobody."""
+    vain disturbs no other."""
 
 
 class Outcome(StrEnum):

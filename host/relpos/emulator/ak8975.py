@@ -41,7 +41,7 @@ SELF_TEST_UT = (0.0, 0.0, -180.0)
 
 
 class Ak8975(I2cDevice):
-    """The chip. ``reachable`` tells whether the host's bus is joined to the auxiliary bus.
+    """The chip. ``reachable`` says whether the host's bus is joined to the auxiliary bus.
 
     ``accelerometer axes to chip axes``: chip x along accelerometer y, chip y along accelerometer
     x, chip z opposite to accelerometer z.

@@ -169,7 +169,7 @@ class I2cBus:
         return True
 
     def read(self) -> int:
-        """Read a byte; 0xFF (nobody pulls the line down) where no chip answers."""
+        """Read a byte; 0xFF (a line that is not pulled down) where no chip answers."""
         if self._active is None:
             return 0xFF
         self._active.advance(self.time_us)

@@ -14,8 +14,6 @@ EEPROM_WRITE_US = 3_400
 """A byte of the ATmega's EEPROM erased and written (ATmega328P data sheet, EEPROM timing)."""
 POWER_LOSS = frozenset((ResetCause.POWER_ON, ResetCause.BROWN_OUT))
 """Causes of a reset with the supply gone meanwhile."""
-NEVER_US = 1 << 62
-"""A due time that does not come."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +51,7 @@ class Engine(Protocol):
     def reset(self, time_us: int, cause: ResetCause) -> None:
         """Restart the board at ``time_us``; it executes again RESTART_US later.
 
-        The firmware is told the cause as that board tells it (MCUSR on an AVR). EEPROM and chips
+        The firmware reads the cause as on that board (MCUSR on an AVR). EEPROM and chips
         keep their state, but where the supply was lost (power-on, brown-out) the EEPROM byte being
         written is left erased. The firmware of an AVR finds in its RAM what was there, or after a
         loss of supply garbage.

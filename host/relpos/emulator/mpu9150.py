@@ -92,7 +92,7 @@ class _Pipeline:
     """Truth to filtered measurements (steps, 6) at the chip's 1 kHz, block by block.
 
     Noise is a function of the seed and the step alone, so that the same step gives the same noise
-    whatever is configured and whoever asks first.
+    whatever is configured and which chip reads first.
     """
 
     def __init__(self, surroundings: Surroundings, errors: InertialErrors) -> None:
@@ -157,9 +157,9 @@ class _Pipeline:
         walk = self._errors.gyroscope_walk_rad_s_rts * np.sqrt(_BLOCK_STEPS * self.step_s)
         while len(self._walk) < number + 2:
             self._walk.append(self._walk[-1] + walk * self._walk_rng.standard_normal(3))
-        share = np.arange(_BLOCK_STEPS)[:, None] / _BLOCK_STEPS
+        fraction = np.arange(_BLOCK_STEPS)[:, None] / _BLOCK_STEPS
         begin, end = self._walk[max(number, 0)], self._walk[max(number + 1, 0)]
-        noise[:, 3:] += (1.0 - share) * begin + share * end
+        noise[:, 3:] += (1.0 - fraction) * begin + fraction * end
         return noise
 
 

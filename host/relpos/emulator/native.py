@@ -133,7 +133,7 @@ def load(path: Path) -> ctypes.CDLL:
 
 
 def _nowhere(_time_us: int, _data: bytes) -> None:
-    """Nobody listens yet."""
+    """No listener yet."""
 
 
 class NativeEngine:
@@ -285,7 +285,7 @@ class NativeEngine:
         if wait_us < LOOP_US:
             self.next_due_us = time_us + LOOP_US
             return
-        # First virtual microsecond at which the node's clock, cut to whole ones, shows that time.
+        # First virtual microsecond at which the node's clock, truncated, shows that time.
         due_node_us = int((time_us - self._bend_us) * self._rate) + wait_us
         since_us = int(due_node_us / self._rate)
         while int(since_us * self._rate) < due_node_us:

@@ -136,7 +136,7 @@ class EmulatedNode:
         self.engine.on_transmit = self._to_radio
         self.hold_frames = False
         """Whether bytes of the native board go to the radio as they leave, so that a restart can
-        cut a frame; else whole."""
+        cut a frame; else frame by frame."""
         self._leaving: list[tuple[int, bytes]] = []
         self._stopped_until_us = 0
         self._paced_by_engine = BoardKind(board) is not BoardKind.NATIVE
@@ -242,7 +242,7 @@ def make_engine(
             power_on_us=errors.power_on_us,
             stored_id=True,
         )
-    # Only here: the simulator's library is not needed by anybody else.
+    # Only here: the simulator's library is needed by AVR boards alone.
     from .avr import BOARDS, AvrEngine, read_firmware
     from .avr.budget import default_build_folder, find_firmware
 

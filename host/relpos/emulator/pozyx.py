@@ -1,7 +1,7 @@
 """Pozyx tag as registers and functions, firmware 1.x (sources: docs/emulator.md).
 
 Two-way ranging itself happens in a :class:`UwbMedium` that all tags share; the tag only starts an
-exchange and is told its end. What no source states is fixed here and has to be checked on
+exchange and learns its end. What no source states is fixed here and has to be checked on
 hardware: the time of an exchange, the default UWB settings, the clock stretching.
 """
 
@@ -152,7 +152,7 @@ class Pozyx(I2cDevice):
         """Fault: takes (peer, result, error, time) of an exchange that this tag started, and sees
         to its :meth:`complete`."""
         self.frozen: Callable[[int], bool] | None = None
-        """Fault: (time) -> whether what exchanges give is not stored, though told as done."""
+        """Fault: (time) -> whether what exchanges give is not stored, though reported as done."""
         self._begin()
 
     def power_cycle(self, time_us: int) -> None:

@@ -1,11 +1,11 @@
 """A pseudo-terminal that speaks as the team's XBee coordinator.
 
-The virtual clock waits for its reader: while nobody has the port open, or the reader is behind and
-the buffer is full, it stands, so that nothing is lost at any speed but what lies in the buffer when
-a reader goes away (as with a real port). Opening a port discards what waited in it (pyserial and
-most others do that), hence the short wait after an open.
+The virtual clock waits for its reader: while no reader has the port open, or the reader is behind
+and the buffer is full, it stands, so that nothing is lost at any speed but what lies in the buffer
+when a reader goes away (as with a real port). Opening a port discards what waited in it (pyserial
+and most others do that), hence the short wait after an open.
 
-At other speeds than 1 a host cannot tell virtual time by its own clock. Two ways out:
+At other speeds than 1 a host cannot read virtual time from its own clock. Two ways out:
 ``mark_time`` puts a frame of type VIRTUAL_TIME (8 bytes, big-endian, microseconds) before what
 arrives at that time; no XBee has such a frame, and a host that does not know it skips it. In the
 same process :class:`VirtualTimePort` hands out bytes with their virtual times.
@@ -46,6 +46,14 @@ _POLL_S = 0.02
 _QUIET_POLLS = 5
 
 
+def require_pseudo_terminals() -> None:
+    """Raise DeviceError where the system has none."""
+    if not PSEUDO_TERMINALS:
+        raise DeviceError(
+            "emulated teams need pseudo-terminals, which Linux and macOS have and this system lacks"
+        )
+
+
 class SerialDevice(Protocol):
     """A device with a serial port, on a virtual clock that its user advances."""
 
@@ -73,8 +81,7 @@ class PseudoTerminal:
     def __init__(
         self, device: SerialDevice, speed: float = 1.0, *, mark_time: bool = False
     ) -> None:
-        if not PSEUDO_TERMINALS:
-            raise DeviceError("an emulated serial port needs POSIX pseudo-terminals: not available")
+        require_pseudo_terminals()
         if speed < 0.0:
             raise DeviceError(f"the speed is not negative, unlike {speed:g}")
         self.device = device
@@ -191,7 +198,7 @@ class PseudoTerminal:
         return any(event & select.POLLHUP for _, event in self._poll.poll(0))
 
     def _wait_for_reader(self) -> bool:
-        """Stand still while nobody has the port open; whether that took any time."""
+        """Wait while no reader has the port open; whether that took any time."""
         if self._had_reader and not self._reader_gone():
             return False
         while self._reader_gone():

@@ -10,7 +10,7 @@ from relpos.link.port import Link, observe
 from relpos.measurements import Event, Heading, Height, Motion, Range, Status, Step
 from relpos.runs import Description, NodeInfo, Run
 
-from .pty import PseudoTerminal
+from .pty import PseudoTerminal, require_pseudo_terminals
 from .team import EmulatedTeam, TeamConfig
 
 UNLIMITED_S = 1800.0
@@ -26,6 +26,7 @@ def team_at_terminal(
     At other speeds than 1 time frames mark the virtual time (see ``pty``) and the team sends its
     beacons itself, which a host cannot time.
     """
+    require_pseudo_terminals()
     marked = speed != 1.0
     with (
         EmulatedTeam(replace(config, beacons=marked)) as team,
@@ -50,6 +51,7 @@ def record_team(config: TeamConfig) -> Run:
     The bytes go through a pseudo-terminal and pyserial as from a real coordinator, as fast as they
     are read; each arrives at its virtual time, so that the same config gives the same run.
     """
+    require_pseudo_terminals()
     link = Link()
     measurements: list[Motion | Range | Height | Heading] = []
     statuses: list[Status] = []

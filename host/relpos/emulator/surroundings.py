@@ -1,4 +1,4 @@
-"""What an emulated board feels, and how imperfectly its chips feel it."""
+"""What surrounds an emulated board, and how imperfectly its chips measure it."""
 
 from __future__ import annotations
 
@@ -70,9 +70,9 @@ class Surroundings:
 def _linear(rows: FloatArray, position: float) -> FloatArray:
     place = min(max(position, 0.0), len(rows) - 1.0)
     below = min(int(place), max(len(rows) - 2, 0))
-    share = place - below
+    fraction = place - below
     above = rows[min(below + 1, len(rows) - 1)]
-    return np.asarray((1.0 - share) * rows[below] + share * above)
+    return np.asarray((1.0 - fraction) * rows[below] + fraction * above)
 
 
 @dataclass(frozen=True)

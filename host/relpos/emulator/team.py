@@ -270,7 +270,7 @@ class EmulatedTeam:
 
 
 def _check_memory(nodes: int, seconds: float) -> None:
-    """Refuse what would end in swapping: the whole walk is prepared beforehand."""
+    """Refuse what would end in swapping: the walk is prepared in full beforehand."""
     needed_gb = 1e-9 * BYTES_PER_SAMPLE * RATE_HZ * nodes * seconds
     here_gb = physical_memory_gb()
     if needed_gb > 0.8 * here_gb:

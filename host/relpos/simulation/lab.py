@@ -9,7 +9,7 @@ here is what the paper could only describe.
 **The room plan** (:data:`WALLS`): the walkway surrounds a block of rooms with two partitions, so
 that people on different sides see each other, if at all, through walls.
 
-**Who hears whom.** An attempt over distance d succeeds with the probability
+**Detection.** An attempt over distance d succeeds with the probability
 
     p(d) * wall_transmission^walls * body_transmission^bodies,
 
@@ -21,7 +21,7 @@ often do not hear each other although they are close, as the paper's figure of t
 probability shows.
 
 **What it measures.** Every wall delays the first path by up to 0.3 m, every body by up to 0.5 m
-(uniform), on top of the tag's own noise. Where anything is in the way, a share ``reflection`` of
+(uniform), on top of the tag's own noise. Where anything is in the way, a fraction ``reflection`` of
 the ranges are those of a reflection, whose detour in a room of this size is 2 to 6 m.
 
 **Odometry.** Relative white noise of the step length, relative noise of the turns, white heading
@@ -31,7 +31,7 @@ magnetic field"). Wearers differ by the paper's patterns. ``noise_scale`` multip
 It is set so that the distance RMSE of dead reckoning is the paper's 3.0 m: 3.25 +- 0.07 m at 1 and
 3.02 +- 0.07 m at 0.92 (200 seeds, standard errors).
 
-What the paper does not print, the transmissions and the share of reflections, was chosen within
+What the paper does not print, the transmissions and the fraction of reflections, was chosen within
 what is plausible such that few attempts succeed even among close people and that ranges are bad
 enough for the paper's own result: its filter errs by 1.96 +- 0.05 m (seeds 0 to 23) and 2.21 +-
 0.08 m (seeds 100 to 147) where the paper has 2.2 m.
@@ -95,7 +95,7 @@ def _walls() -> Floats:
 
 
 WALLS = _walls()
-"""Inner walls (W, 4): x, y of both ends, m; the outer walls block nobody from anybody."""
+"""Inner walls (W, 4): x, y of both ends, m; the outer walls block no line of sight."""
 
 BEHIND_RAD = math.radians(110.0)
 
@@ -106,7 +106,7 @@ class LabSettings:
 
     nodes: int = setting(3, "people", 2, 20)
     seconds: float = setting(380.0, "length of the run", 1.0, 1e5)
-    spacing_m: float = setting(8.0, "way between two at the start", 0.0, 1e3)
+    spacing_m: float = setting(8.0, "path length between two at the start", 0.0, 1e3)
     noise_scale: float = setting(0.92, "factor on all errors of the odometry", 0.0, 100.0)
     distance_noise: float = setting(0.15, "factor on the step length's white noise", 0.0, 100.0)
     turn_noise: float = setting(0.035, "mean relative error of a turn", 0.0, 10.0)
@@ -132,7 +132,7 @@ class LabSettings:
     body_delay_min_m: float = setting(0.0, "least delay of a body", 0.0, 100.0)
     body_delay_max_m: float = setting(0.5, "greatest delay of a body", 0.0, 100.0)
     reflection: float = setting(
-        0.35, "share of ranges with anything in the way that are a reflection's", 0.0, 1.0
+        0.35, "fraction of ranges with anything in the way that are a reflection's", 0.0, 1.0
     )
     reflection_min_m: float = setting(2.0, "least detour of a reflection", 0.0, 100.0)
     reflection_max_m: float = setting(6.0, "greatest detour of a reflection", 0.0, 100.0)
@@ -177,7 +177,7 @@ def detection(settings: LabSettings, distance_m: Floats, walls: Counts, bodies: 
 
 @dataclass(frozen=True)
 class Walk:
-    """True poses of all on a common grid: (T,), ways, positions (N, T, 2), headings (N, T)."""
+    """True poses on a common grid (T,): path lengths, positions (N, T, 2), headings (N, T)."""
 
     time_s: Floats
     path_m: Floats
@@ -186,7 +186,7 @@ class Walk:
 
 
 def walk(settings: LabSettings, rng: np.random.Generator) -> Walk:
-    """Let everybody walk round, one after the other, until 310 m are done."""
+    """Let all walk round, one after the other, until 310 m are done."""
     times = np.arange(math.floor(settings.seconds) + 1, dtype=np.float64)
     speed = rng.uniform(*_TEAM.speed_m_s, settings.nodes)
     walked = speed[:, None] * np.maximum(times[None, :] - _TEAM.still_s, 0.0)
@@ -197,7 +197,7 @@ def walk(settings: LabSettings, rng: np.random.Generator) -> Walk:
 
 
 def odometry(settings: LabSettings, rng: np.random.Generator) -> Drawn:
-    """Draw what is hidden of everybody's odometry."""
+    """Draw the hidden constants of each wearer's odometry."""
     count, factor = settings.nodes, settings.noise_scale
     pattern = np.resize(np.array(HEADING_PATTERN), count)
     pattern /= pattern.mean()
@@ -257,7 +257,7 @@ _MOST_OBSTACLES = 4
 
 
 def _streams(seed: int) -> list[np.random.Generator]:
-    """Dice of the walk, the odometry's constants, its noise, the ranges and the presses."""
+    """Random streams: walk, the odometry's constants, its noise, ranges, presses."""
     return [np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(5)]
 
 

@@ -43,7 +43,7 @@ HEADING_PATTERN = (1.0, 2.0, 4.0, 2.0, 3.0, 2.0)
 
 
 class Start(StrEnum):
-    """What an estimator is told of the pose every user starts with."""
+    """What an estimator knows of the pose each user starts with."""
 
     KNOWN = "known"
     POSITION = "position"
@@ -142,7 +142,7 @@ SCENARIOS: Mapping[str, Mapping[str, float]] = {
 
 @dataclass(frozen=True, slots=True)
 class Hidden:
-    """What no estimator is told, for evaluation alone; every mapping has all nodes.
+    """What is hidden from estimators, for evaluation alone; every mapping has all nodes.
 
     ``step_scale`` is true over reported length, ``heading_drift_rad_s`` what the reported
     heading gains over the true one (the constants of the same names in ``parameters.csv``).
@@ -239,10 +239,10 @@ def true_poses(settings: PaperSettings) -> tuple[Floats, Floats, Floats]:
 
 
 def round_rectangle(path_m: Floats, length: float, width: float) -> tuple[Floats, Floats]:
-    """Positions (..., 2) and unwrapped headings after ways along a rectangle's sides."""
+    """Positions (..., 2) and unwrapped headings after path lengths along a rectangle's sides."""
     arcs, corners = _corners(length, width)
     lap, along = np.divmod(path_m, arcs[-1])
-    # Rounding must not put somebody who has just reached a corner behind or beyond it.
+    # Rounding must not put a person who has just reached a corner behind or beyond it.
     positions: Floats = np.stack([np.interp(along, arcs, corners[:, k]) for k in (0, 1)], axis=-1)
     side = np.clip(np.searchsorted(arcs, along - 1e-9, side="left") - 1, -1, 3)
     heading: Floats = np.maximum((4.0 * lap + side) * (math.pi / 2.0), 0.0)
@@ -269,7 +269,7 @@ class Drawn:
 
 
 def _draw(settings: PaperSettings, rng: np.random.Generator) -> Drawn:
-    # Everything is drawn whether it is used or not: one setting does not change another's dice.
+    # Everything is drawn, used or not: no setting changes the random numbers of another.
     count = settings.nodes
     scale, drift = rng.standard_normal(count), rng.standard_normal(count)
     noisy = int(rng.integers(count))

@@ -19,7 +19,7 @@ _PASS_HZ, _STOP_HZ = 28.0, 45.0
 """The torso has next to nothing above 25 Hz in the recordings; the fade is smooth."""
 
 _PUSH_S = 0.025
-"""Standard deviation in time of the push: heel pad, leg and spine let nothing faster through."""
+"""Standard deviation in time of the push: heel pad, leg and spine pass nothing faster."""
 
 
 class Spectral:
@@ -91,10 +91,10 @@ class Spectral:
         train = np.zeros(self._count)
         inside = (place >= 0) & (place < self._count - 1)
         low = place[inside].astype(np.int64)
-        share = place[inside] - low
+        fraction = place[inside] - low
         weight = size[inside] * (push_s * math.sqrt(2 * np.pi) * RATE_HZ)
-        np.add.at(train, low, weight * (1.0 - share))
-        np.add.at(train, low + 1, weight * share)
+        np.add.at(train, low, weight * (1.0 - fraction))
+        np.add.at(train, low + 1, weight * fraction)
         omega, own = 2 * np.pi * self._frequency, 2 * np.pi * resonance_hz
         response = np.exp(-0.5 * (omega * push_s) ** 2) / (
             own**2 - omega**2 + 2j * damping * own * omega

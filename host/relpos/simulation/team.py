@@ -25,7 +25,7 @@ MAX_WALKERS = 20
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """What is the same for everybody in a walk. Change one with `dataclasses.replace`."""
+    """What is the same for all people of a walk. Change one with `dataclasses.replace`."""
 
     name: str
     path_m: tuple[float, float]
@@ -35,7 +35,7 @@ class Scenario:
     spacing_m: float
     """A walker starts when the one before has this lead."""
     still_s: float = 5.0
-    """Everybody stands at least this long at the beginning."""
+    """All stand at least this long at the beginning."""
     pause_every_s: float = 0.0
     """Mean time between brief pauses; 0 for none."""
     distance_limit_m: float | None = None

@@ -136,7 +136,7 @@ class Sway:
 
 
 def quiet_sway(rng: np.random.Generator, t: FloatArray, scale: float) -> Sway:
-    """Draw somebody's sway at times ``t`` (n,)."""
+    """Draw a person's sway at times ``t`` (n,)."""
     fore = slow_noise(rng, t, 0.004 * scale, 0.7)
     side = slow_noise(rng, t, 0.0025 * scale, 0.7)
     breath = np.sin(2 * np.pi * (0.25 * t + 0.3 * slow_noise(rng, t, 1.0, 6.0)) + rng.uniform(0, 6))

@@ -1,4 +1,4 @@
-"""A node in somebody's hands instead of on their chest: what a calibration asks for.
+"""A node turned in the hands instead of worn on the chest: what a calibration asks for.
 
 Lying still, on each of its six sides, turned in all directions, and at last held upright as it is
 worn and turned about the vertical in steps of 45 degrees, where a heading can be checked.
@@ -72,8 +72,8 @@ def turn_by_hand(node: int, seconds: float, seed: int, world: World) -> WalkerTr
     """Truth of a node that is calibrated by hand; the same arguments give the same arrays.
 
     Every turn is about an axis fixed in the sensor with quintic timing, so that attitude and rate
-    agree exactly. Nobody walks: the position stays, but for the hands' trembling, which is in the
-    specific force alone (some millimetres).
+    agree exactly. The node is not carried anywhere: its position stays, but for the hands'
+    trembling, which is in the specific force alone (some millimetres).
     """
     rng = np.random.default_rng([seed, node, 0x7AB])
     person = make_person(rng, (1.0, 1.0), 0.0)
@@ -93,9 +93,9 @@ def turn_by_hand(node: int, seconds: float, seed: int, world: World) -> WalkerTr
         rows = slice(math.ceil(begin_s * RATE_HZ), min(math.ceil(end_s * RATE_HZ), n))
         if rows.start < rows.stop:
             u = np.clip((time_s[rows] - begin_s) / max(turn_s, 1e-9), 0.0, 1.0)
-            share = u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
+            fraction = u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
             speed = 30.0 * (u * (1.0 - u)) ** 2 / max(turn_s, 1e-9)
-            attitude[rows] = (here * Rotation.from_rotvec(np.outer(share, rotation))).as_matrix()
+            attitude[rows] = (here * Rotation.from_rotvec(np.outer(fraction, rotation))).as_matrix()
             rate[rows] = np.outer(speed, rotation)
             hands[rows] = np.where(u < 1.0, speed * turn_s / 1.875, 0.0) if by_hand else 0.0
         here, begin_s = target, end_s

@@ -77,10 +77,10 @@ def make_person(
 
 @dataclass(frozen=True, slots=True)
 class StepTruth:
-    """Mid-stance times (k,) and the way since the previous mid-stance (k,), in metres.
+    """Mid-stance times (k,) and the path length since the previous mid-stance (k,), in metres.
 
     The first step after standing counts from where the person stood, so the lengths up to a
-    mid-stance sum to the whole way walked until then.
+    mid-stance sum to the path length walked until then.
     """
 
     time_s: FloatArray
@@ -115,15 +115,15 @@ class WalkerTruth:
         """Position (3,) at any time, held at the ends: exact to 0.1 mm between samples."""
         place = min(max(time_s * RATE_HZ, 0.0), len(self.time_s) - 1.0)
         low = min(int(place), len(self.time_s) - 2)
-        share = place - low
-        between = (1.0 - share) * self.position_m[low] + share * self.position_m[low + 1]
+        fraction = place - low
+        between = (1.0 - fraction) * self.position_m[low] + fraction * self.position_m[low + 1]
         return np.asarray(between, dtype=np.float64)
 
 
 class Route:
     """A closed polygon walked for ever from its first corner, its corners rounded.
 
-    In a corner the curvature rises and falls as a raised cosine over ``turn_length_m`` of way,
+    In a corner the curvature rises and falls as a raised cosine over ``turn_length_m`` of path,
     so heading, turn rate and its rate are all smooth. The first corner is only rounded from the
     second lap on: the walk starts in it.
     """
@@ -145,7 +145,7 @@ class Route:
         before = np.roll(tangent, 1)  # of corner k
         straight = side_m - tangent - before
         if np.any(straight <= 0.1):
-            raise DataError("a route's sides are too short for the way its corners need")
+            raise DataError("a route's sides are too short for the path that its corners need")
         starts = np.cumsum(straight + turn_length_m) - turn_length_m
         self._initial_m = float(before[0])
         self.lap_m = float(starts[-1] + turn_length_m)
@@ -174,10 +174,10 @@ class Route:
         )
         self._s, self._bend = s, bend
 
-    def at(self, way_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Position (n, 2) and unwrapped heading (n,) after ``way_m`` of way from the start."""
-        lap = np.maximum(np.floor((way_m - self._initial_m) / self.lap_m), 0.0)
-        in_lap = way_m - self._initial_m - lap * self.lap_m
+    def at(self, path_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Position (n, 2) and unwrapped heading (n,) after ``path_m`` of path from the start."""
+        lap = np.maximum(np.floor((path_m - self._initial_m) / self.lap_m), 0.0)
+        in_lap = path_m - self._initial_m - lap * self.lap_m
         table = np.asarray(self._table(np.maximum(in_lap, 0.0)), dtype=np.float64)
         first = np.minimum(in_lap, 0.0)
         position = table[:, :2] + first[:, None] * np.array(
@@ -185,18 +185,18 @@ class Route:
         )
         return position, table[:, 2] + lap * self.turn_rad
 
-    def curvature(self, way_m: float) -> float:
-        """Absolute curvature in 1/m after ``way_m`` of way."""
-        if way_m < self._initial_m:
+    def curvature(self, path_m: float) -> float:
+        """Absolute curvature in 1/m after ``path_m`` of path."""
+        if path_m < self._initial_m:
             return 0.0
-        return float(np.interp((way_m - self._initial_m) % self.lap_m, self._s, self._bend))
+        return float(np.interp((path_m - self._initial_m) % self.lap_m, self._s, self._bend))
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Steps as decided: knots of step phase and way over time, and when feet come down.
+    """Steps as decided: knots of step phase and path length over time, and when feet come down.
 
-    The phase grows by one a step and is whole in the middle of double support; between knots
+    The phase grows by one a step and is an integer in the middle of double support; between knots
     both go on steadily, standing where neither changes. ``contact_*`` belong to heel strikes.
     """
 
@@ -226,9 +226,9 @@ def make_plan(
     slow = 1.0 - 0.25 * np.minimum(route._bend * 0.7, 1.0)
     # Mean speed on a lap is what the person chose: the straights make up for the bends.
     straight_speed = person.speed_m_s * float(np.mean(1.0 / slow))
-    times, phases, ways = [-1e3, walk_start_s], [0.0, 0.0], [0.0, 0.0]
+    times, phases, paths = [-1e3, walk_start_s], [0.0, 0.0], [0.0, 0.0]
     strength: list[float] = []
-    time_s, phase, way, wander = walk_start_s, 0.0, 0.0, 0.0
+    time_s, phase, path, wander = walk_start_s, 0.0, 0.0, 0.0
     since_stand = 0
 
     def next_pause() -> float:
@@ -239,17 +239,17 @@ def make_plan(
     pause_at = next_pause()
     while time_s < until_s:
         pausing = time_s >= pause_at
-        finished = distance_limit_m is not None and way >= distance_limit_m
+        finished = distance_limit_m is not None and path >= distance_limit_m
         if (pausing or finished) and since_stand > 0:
             times.append(time_s + (1e6 if finished else float(rng.uniform(1.5, 5.0))))
             phases.append(phase)
-            ways.append(way)
+            paths.append(path)
             time_s = times[-1]
             pause_at = next_pause()
             since_stand = 0
             continue
         wander = 0.9 * wander + 0.04 * math.sqrt(1 - 0.9**2) * rng.standard_normal()
-        bend = 0.25 * min(route.curvature(way + 0.3) * 0.7, 1.0)
+        bend = 0.25 * min(route.curvature(path + 0.3) * 0.7, 1.0)
         speed = straight_speed * (1.0 - bend) * math.exp(wander)
         cadence = math.sqrt(speed / person.walk_ratio_m_s)
         side = 1.0 if int(phase) % 2 == 0 else -1.0
@@ -262,19 +262,19 @@ def make_plan(
             length *= 0.65
             duration *= 1.1
         time_s += duration
-        way += length
+        path += length
         phase += 1.0
         since_stand += 1
         times.append(time_s)
         phases.append(phase)
-        ways.append(way)
+        paths.append(path)
         strength.append(
             (1.0 + side * 2.0 * person.asymmetry) * math.exp(0.06 * rng.standard_normal())
         )
     return Plan(
         np.array(times),
         np.array(phases),
-        np.array(ways),
+        np.array(paths),
         np.array(strength),
         walk_start_s,
     )

@@ -91,7 +91,6 @@ class AvrEngine:
         clock: NodeClockError | None = None,
         power_on_us: int = 0,
         line_baud: int = XBEE_BAUD,
-        reset_cause: ResetCause = ResetCause.POWER_ON,
     ) -> None:
         self.node_id = node_id
         self.bus = bus
@@ -109,14 +108,13 @@ class AvrEngine:
         self._eeprom_writes = 0
         self._now_us = power_on_us
         self.lost_while_off = 0
-        """Received bytes for which there was no board yet, or none that listened."""
+        """Received bytes for which there was no board yet, or one that was starting."""
         self.board = Board(
             kind,
             firmware,
             BusBridge(bus, self._time_us),
             frequency_hz=self._frequency_hz,
             line_baud=line_baud,
-            reset_cause=reset_cause,
         )
         self.board.load_eeprom(bytes(eeprom))
         if clock.offset_us:
@@ -231,4 +229,4 @@ class AvrEngine:
 
 
 def _nowhere(_time_us: int, _data: bytes) -> None:
-    """Nobody listens yet."""
+    """No listener yet."""

@@ -1,4 +1,4 @@
-"""The places of an emulated team that faults act on; several faults can share one place."""
+"""The points of an emulated team where faults act; several faults can share one place."""
 
 from __future__ import annotations
 

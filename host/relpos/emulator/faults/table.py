@@ -70,7 +70,7 @@ TARGETS: Mapping[str, str] = {
     "host": "the laptop at the coordinator's serial port",
 }
 
-_FRACTION = Key("rate", "share of them", 0.3, "", 0.0, 1.0)
+_FRACTION = Key("rate", "fraction of them", 0.3, "", 0.0, 1.0)
 _ANSWER = Key("value", "what it answers", "random", choices=("random", "zeros", "ones"))
 
 
@@ -95,27 +95,27 @@ FAULTS: tuple[Fault, ...] = (
         "imu",
         "wrong",
         "angular rate off by a constant about each axis",
-        "not to be seen from inside: goes on, bias learned while standing and walking straight",
+        "not observable from inside: goes on, bias learned while standing and walking straight",
         (Key("value", "error", 1.0, "deg/s", -500.0, 500.0),),
     ),
     Fault(
         "imu",
         "slow",
-        "gives only a share of its samples",
+        "gives only a fraction of its samples",
         "missed ticks counted and flagged, the longer steps integrated",
-        (Key("rate", "share of the samples that come", 0.5, "", 0.0, 1.0),),
+        (Key("rate", "fraction of the samples that come", 0.5, "", 0.0, 1.0),),
     ),
     Fault(
         "imu",
         "delayed",
         "samples are handed out late",
-        "not to be seen from inside: motion is late by as much, none is lost",
+        "not observable from inside: motion is late by as much, none is lost",
         (_ms("delay", 100.0),),
     ),
     Fault(
         "imu",
         "intermittent",
-        "does not answer a share of the transactions (loose contact)",
+        "does not answer a fraction of the transactions (loose contact)",
         "bus errors and missed ticks counted and flagged, the rest integrated",
         (_FRACTION,),
     ),
@@ -151,18 +151,18 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "magnetometer",
         "intermittent",
-        "does not answer a share of the transactions",
+        "does not answer a fraction of the transactions",
         "headings that are reported are true; motion unharmed",
         (_FRACTION,),
     ),
     Fault("pozyx", "off", "no supply: does not answer, restarts", _NO_RANGES),
-    Fault("pozyx", "stuck", "tells the same row again for every exchange", _NO_RANGES),
+    Fault("pozyx", "stuck", "reports the same row again for every exchange", _NO_RANGES),
     Fault("pozyx", "garbage", "every byte that it answers is wrong", _NO_RANGES, (_ANSWER,)),
     Fault(
         "pozyx",
         "wrong",
         "ranges that it begins are off by a constant",
-        "not to be seen from inside: the fusion weighs what contradicts the motion",
+        "not observable from inside: the fusion weighs what contradicts the motion",
         (Key("value", "error", 2.0, "m", -100.0, 100.0),),
     ),
     Fault(
@@ -175,21 +175,21 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "pozyx",
         "delayed",
-        "the end of an exchange is told late: over 100 ms in the middle of the next one",
+        "the end of an exchange is reported late: over 100 ms in the middle of the next one",
         "a completion is never taken for another exchange's; no wrong range",
         (_ms("delay", 110.0),),
     ),
     Fault(
         "pozyx",
         "intermittent",
-        "does not answer a share of the transactions",
+        "does not answer a fraction of the transactions",
         "failures counted, the ranges that come are true",
         (_FRACTION,),
     ),
     Fault(
         "pozyx",
         "inverted",
-        "tells failure for success and success for failure (seen in the field)",
+        "reports failure for success and success for failure (seen in the field)",
         _NO_RANGES,
     ),
     Fault(
@@ -199,7 +199,7 @@ FAULTS: tuple[Fault, ...] = (
         "set up anew, ranges again within 15 s",
         momentary=True,
     ),
-    Fault("xbee", "off", "takes and gives nothing", _RADIO, coordinator=True),
+    Fault("xbee", "off", "neither sends nor receives", _RADIO, coordinator=True),
     Fault(
         "xbee",
         "stuck",
@@ -234,7 +234,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "xbee",
         "intermittent",
-        "loses a share of the serial frames, either way",
+        "loses a fraction of the serial frames, in both directions",
         _RADIO,
         (_FRACTION,),
         coordinator=True,
@@ -244,7 +244,7 @@ FAULTS: tuple[Fault, ...] = (
         "bitflip",
         "bits of the serial line are turned over",
         f"refused by checksum; {_RADIO}",
-        (Key("rate", "share of the bytes", 0.01, "", 0.0, 1.0),),
+        (Key("rate", "fraction of the bytes", 0.01, "", 0.0, 1.0),),
         coordinator=True,
     ),
     Fault(
@@ -252,7 +252,7 @@ FAULTS: tuple[Fault, ...] = (
         "truncate",
         "bytes of the serial line are missing",
         f"refused by length and checksum; {_RADIO}",
-        (Key("rate", "share of the bytes", 0.01, "", 0.0, 1.0),),
+        (Key("rate", "fraction of the bytes", 0.01, "", 0.0, 1.0),),
         coordinator=True,
     ),
     Fault(
@@ -260,13 +260,13 @@ FAULTS: tuple[Fault, ...] = (
         "duplicate",
         "bytes of the serial line come twice",
         f"refused by length and checksum; {_RADIO}",
-        (Key("rate", "share of the bytes", 0.01, "", 0.0, 1.0),),
+        (Key("rate", "fraction of the bytes", 0.01, "", 0.0, 1.0),),
         coordinator=True,
     ),
     Fault(
         "xbee",
         "brownout",
-        "its supply dips: what it held is lost, it tells its reset",
+        "its supply dips: what it held is lost, it reports its reset",
         _RADIO,
         momentary=True,
         coordinator=True,
@@ -296,10 +296,16 @@ FAULTS: tuple[Fault, ...] = (
         "clock",
         "wrap",
         "the 32-bit microsecond timer wraps at `from`",
-        "nothing is to be seen",
+        "no effect is observable",
         momentary=True,
     ),
-    Fault("radio", "loss", "frames are lost", _RADIO, (Key("rate", "share", 0.5, "", 0.0, 1.0),)),
+    Fault(
+        "radio",
+        "loss",
+        "frames are lost",
+        _RADIO,
+        (Key("rate", "fraction", 0.5, "", 0.0, 1.0),),
+    ),
     Fault(
         "radio",
         "bitflip",
@@ -338,9 +344,9 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "radio",
         "foreign",
-        "a stranger sends motion, ranges, commands and beacons in everybody's name",
+        "a foreign module sends motion, ranges, commands and beacons in every node's name",
         "with another key: refused and counted by node and host, nothing changes. "
-        "With the team's key: only the stranger's own id appears besides",
+        "With the team's key: only the foreign module's own id appears besides",
         (
             Key("key", "whose", "wrong", choices=("wrong", "right")),
             Key("rate", "frames a second", 5.0, "1/s", 0.1, 20.0),
@@ -351,9 +357,9 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "uwb",
         "collisions",
-        "strangers range within reach",
+        "foreign tags range within reach",
         "failures counted, no wrong range; motion unharmed",
-        (Key("rate", "exchanges of strangers a second", 15.0, "1/s", 0.0, 50.0),),
+        (Key("rate", "exchanges of foreign tags a second", 15.0, "1/s", 0.0, 50.0),),
         team=True,
     ),
     Fault(
@@ -361,14 +367,14 @@ FAULTS: tuple[Fault, ...] = (
         "loss",
         "exchanges get no answer",
         "failures counted, ranges go on",
-        (Key("rate", "share", 0.5, "", 0.0, 1.0),),
+        (Key("rate", "fraction", 0.5, "", 0.0, 1.0),),
         team=True,
     ),
     Fault(
         "uwb",
         "wrong",
         "the direct path is blocked: ranges are too long",
-        "not to be seen from inside: the fusion weighs what contradicts the motion",
+        "not observable from inside: the fusion weighs what contradicts the motion",
         (_FRACTION, Key("value", "at most longer by", 3.0, "m", 0.0, 100.0)),
         team=True,
     ),
@@ -382,7 +388,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "bus",
         "nack",
-        "a share of all transactions is not acknowledged",
+        "a fraction of all transactions is not acknowledged",
         "bus errors counted, gaps flagged, no wrong value used",
         (_FRACTION, Key("part", "which acknowledge", "address", choices=("address", "data"))),
     ),
@@ -415,7 +421,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "host",
         "gone",
-        "nobody reads the port or sends to it",
+        "no host reads the port or sends to it",
         "ranging goes on without beacon; the first motion after it holds all: 0 motion lost",
         team=True,
     ),
@@ -437,11 +443,14 @@ REFUSED: Mapping[tuple[str, str], str] = {
     ("xbee", "reorder"): f"a serial line keeps its order; {_STREAM % 'reorder'}",
     ("xbee", "replay"): f"a serial line keeps its order; {_STREAM % 'replay'}",
     ("xbee", "loss"): f"{_STREAM % 'loss'}, bytes missing on the line xbee:truncate",
-    ("xbee", "foreign"): f"nobody else is on the line; {_STREAM % 'foreign'}",
+    ("xbee", "foreign"): f"no other device is on the line; {_STREAM % 'foreign'}",
     ("clock", "stuck"): "a processor whose clock stands executes nothing: clock:off",
     ("clock", "garbage"): "a board knows no other time to have garbage beside: clock:wrong",
     ("clock", "slow"): "that is clock:wrong with a negative value",
-    ("clock", "delayed"): "nobody asks a clock and waits: one that halts is clock:intermittent",
+    (
+        "clock",
+        "delayed",
+    ): "no part waits for a clock's answer: one that halts is clock:intermittent",
     ("radio", "off"): "air cannot be: xbee:off, or radio:loss:rate=1",
     ("uwb", "off"): "air cannot be: pozyx:off, or uwb:loss:rate=1",
     ("uwb", "garbage"): "frames are protected by the tags' own checks: pozyx:garbage",
