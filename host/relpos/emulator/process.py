@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from relpos.errors import DeviceError, RelposError
 from relpos.measurements import Prior
 
+from .pty import require_pseudo_terminals
 from .serving import team_at_terminal
 from .team import TeamConfig
 
@@ -28,6 +29,7 @@ class EmulatorProcess:
     """
 
     def __init__(self, config: TeamConfig, speed: float = 1.0) -> None:
+        require_pseudo_terminals()
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
         self._pipe: Connection = ours
