@@ -30,7 +30,7 @@ SHELLS = ("sh", "bash", "shell", "console")
 PARSED = {
     "node flash": "wants a board on USB; tests/system/test_flash.py plays one",
     "node calibrate": "somebody turns the node or walks; tests/system/test_calibration.py does",
-    "figures": "computes for minutes; tests/host/test_figures.py draws small ones",
+    "figures": "computes for minutes; tests/evaluation/test_figures.py draws small ones",
 }
 """Subcommands that are parsed alone, and why."""
 
