@@ -1,4 +1,4 @@
-"""What every estimator takes and gives.
+"""The interface of all estimators.
 
 An estimator takes measurements in roughly time order, however they come about (serial port,
 recording, simulation), and yields an :class:`Estimate` at every motion epoch. It knows neither
@@ -90,11 +90,11 @@ class Shape(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Alternative:
-    """One node in one of the possible pictures of the team while anything is ambiguous.
+    """One node in one of the possible modes of the team while anything is ambiguous.
 
     The rows of one ``alternative`` (0, 1, ... from the most probable on, at most
-    ``MAX_ALTERNATIVES``) at one time are one picture of the whole team and share its
-    ``probability``; those of all pictures sum to 1. Of a ring, x, y is the centre,
+    ``MAX_ALTERNATIVES``) at one time are one mode of the whole team and share its
+    ``probability``; those of all modes sum to 1. Of a ring, x, y is the centre,
     ``sigma_major_m`` the radius and ``sigma_minor_m`` the width.
     """
 
@@ -129,7 +129,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class MagneticNorth:
-    """Where magnetic north lies in the common frame, as compasses have told."""
+    """Where magnetic north lies in the common frame, as compasses have reported."""
 
     bearing_rad: float
     sigma_rad: float
@@ -143,7 +143,7 @@ class Estimate:
     at the start. ``nodes`` is ordered by node id, ``pairs`` holds node < peer of every two
     located nodes (of large teams: of those within reach of each other). ``alternatives`` is
     empty unless something is ambiguous; ``parameters`` is what has been learned so far; ``north``
-    is None where no compass has told anything of it.
+    is None where no compass has reported.
     """
 
     time_s: float
@@ -171,7 +171,7 @@ class Estimator(Protocol):
         """Take one measurement; return the estimates it completes, oldest first."""
 
     def finish(self) -> list[Estimate]:
-        """Work off what waits for a later motion; raise RelposError if the data were unfit."""
+        """Process what waits for a later motion; raise RelposError if the data were unfit."""
 
     def counters(self) -> Mapping[str, int]:
         """Name -> how often: everything dropped, rejected, clamped, reset or resampled."""
@@ -181,7 +181,7 @@ ANY_ANGLE_RAD = pi / sqrt(3.0)
 """Standard deviation of a heading or bearing of which nothing is known."""
 
 MAX_ALTERNATIVES = 16
-"""At most so many pictures are listed (run format, ``alternatives.csv``)."""
+"""At most so many modes are listed (run format, ``alternatives.csv``)."""
 
 STALE_EPOCHS = 3
 LOST_EPOCHS = 10

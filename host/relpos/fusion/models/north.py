@@ -1,12 +1,12 @@
 """Where an absolute heading's x axis lies in the frame of the estimate.
 
-A compass tells headings from magnetic east; the frame's x axis is where the priors, or the first
-node that was located, had it. Nobody knows the angle in between, so it is estimated: one number
-for the team, whose innovation is a heading less the node's own heading less the angle.
+A compass reports headings from magnetic east; the frame's x axis is where the priors, or the first
+node that was located, had it. The angle in between is unknown and estimated: one number for the
+team, whose innovation is a reported heading less the node's own heading less the angle.
 
-Indoors a compass is wrong by what stands nearby, and wrong alike for some metres: readings of one
-node within :data:`CORRELATED_S` of each other tell no more together than one alone, so their
-variance is raised accordingly.
+Indoors iron nearby disturbs a compass, in the same way for some metres: readings of one node within
+:data:`CORRELATED_S` of each other tell no more together than one alone, so their variance is raised
+accordingly.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CORRELATED_S = 10.0
 LEAST_SIGMA_RAD = math.radians(3.0)
 """Magnetic east itself is not one direction all over a building."""
 GATE = 3.0
-"""Deviations; what lies farther off says something of its place, nothing of the frame."""
+"""Standard deviations; a reading farther off says something of its place, not of the frame."""
 
 
 @dataclass(slots=True)
@@ -30,10 +30,10 @@ class North:
 
     angle_rad: float = 0.0
     sigma_rad: float = ANY_ANGLE_RAD
-    _told_s: dict[int, float] = field(default_factory=dict)
+    _reported_s: dict[int, float] = field(default_factory=dict)
 
     def known(self) -> MagneticNorth | None:
-        """Where north lies; None while nothing has been told."""
+        """Where north lies; None before the first reading."""
         if self.sigma_rad >= ANY_ANGLE_RAD:
             return None
         # A heading of pi/2 from magnetic east is north, and the frame's own is less the angle.
@@ -43,18 +43,20 @@ class North:
 
     def alone_sigma_rad(self, node: int, time_s: float, sigma_rad: float) -> float:
         """Deviation of a reading such that its node's readings may be taken as independent."""
-        since_s = time_s - self._told_s.get(node, -math.inf)
-        self._told_s[node] = time_s
+        since_s = time_s - self._reported_s.get(node, -math.inf)
+        self._reported_s[node] = time_s
         return sigma_rad * math.sqrt(max(CORRELATED_S / max(since_s, 0.01), 1.0))
 
-    def learn(self, told_rad: float, told_sigma_rad: float, own_rad: float, own_var: float) -> bool:
+    def learn(
+        self, reported_rad: float, reported_sigma_rad: float, own_rad: float, own_var: float
+    ) -> bool:
         """Learn from a reading of a node whose own heading and its variance are these.
 
         False where it contradicts what is known of the angle.
         """
         variance = self.sigma_rad**2
-        expected = variance + told_sigma_rad**2 + own_var
-        innovation = math.remainder(told_rad - own_rad - self.angle_rad, math.tau)
+        expected = variance + reported_sigma_rad**2 + own_var
+        innovation = math.remainder(reported_rad - own_rad - self.angle_rad, math.tau)
         if innovation**2 > GATE**2 * expected:
             return False
         gain = variance / expected
