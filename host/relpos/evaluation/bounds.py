@@ -104,6 +104,12 @@ class Totals:
     smoothing_distance_m: float
     smoothing_position_m: float
 
+    def of(self, *, smoothed: bool) -> tuple[float, float]:
+        """Return the bounds of distance and position, of smoothing or of filtering."""
+        if smoothed:
+            return self.smoothing_distance_m, self.smoothing_position_m
+        return self.filtering_distance_m, self.filtering_position_m
+
 
 def over_seeds(totals: Iterable[Totals]) -> Totals:
     """Return the root mean squares over runs: the scenario's bound that a ratio divides by."""

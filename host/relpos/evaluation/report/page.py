@@ -114,14 +114,8 @@ def _tiles(content: Content) -> str:
     scored = content.evaluation
     if scored is not None:
         m, bound = scored.metrics, content.bound
-        totals = bound.totals() if bound is not None else None
-        least = (
-            None
-            if totals is None
-            else totals.smoothing_distance_m
-            if content.result.smoothed
-            else totals.filtering_distance_m
-        )
+        smoothed = content.result.smoothed
+        least = None if bound is None else bound.totals().of(smoothed=smoothed)[0]
         if m.epochs:
             tiles.append(
                 (
@@ -184,7 +178,7 @@ def _in_short(content: Content) -> list[str]:
             said += f"; {content.baseline.words} is off by {other:.2f} m"
         if content.bound is not None:
             totals = content.bound.totals()
-            least = totals.smoothing_distance_m if result.smoothed else totals.filtering_distance_m
+            least, _ = totals.of(smoothed=result.smoothed)
             said += f", and no estimator can be expected below {least:.2f} m"
         words.append(said + ".")
         nees = scored.nees_distance

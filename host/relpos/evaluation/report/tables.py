@@ -92,14 +92,8 @@ def main_figures(content: Content) -> Table | None:
     smoothed = content.result.smoothed
     least: dict[str, float] = {}
     if totals is not None:
-        least = {
-            "relative_distance_rmse_m": totals.smoothing_distance_m
-            if smoothed
-            else totals.filtering_distance_m,
-            "relative_position_rmse_m": totals.smoothing_position_m
-            if smoothed
-            else totals.filtering_position_m,
-        }
+        names = ("relative_distance_rmse_m", "relative_position_rmse_m")
+        least = dict(zip(names, totals.of(smoothed=smoothed), strict=True))
     columns = ["", content.result.estimator]
     columns += ["dead reckoning"] * (baseline is not None)
     columns += [f"bound ({'smoothing' if smoothed else 'filtering'})"] * (totals is not None)
