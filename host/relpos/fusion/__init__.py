@@ -11,10 +11,12 @@ nodes on), ``particle/`` (the paper's filter) and ``smoother/`` (a whole run, af
 
 from __future__ import annotations
 
-import math
+import cmath
+import random
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
 
 from relpos.errors import RelposError
 from relpos.fusion import kernel_cache, plugins
@@ -33,7 +35,6 @@ from relpos.fusion.estimator import (
 from relpos.fusion.models.ranging import Mounting
 from relpos.fusion.particle.settings import ParticleSettings
 from relpos.fusion.settings import SettingInfo, describe, parse
-from relpos.fusion.timeline import Advance
 from relpos.measurements import Heading, Height, Motion, Prior, Range
 
 SETTINGS: Mapping[str, type] = {
@@ -62,8 +63,7 @@ def make(
     Nodes without a prior start unknown. ``nodes`` tells how each is worn (``run.nodes``): the
     bank uses heights and antenna offsets, the other two are as the paper has them. Estimators of
     others go by ``module:Class`` or by a registered name (:mod:`relpos.fusion.plugins`).
-    RelposError
-    for an unknown name or key and for a value that is out of range.
+    RelposError for an unknown name or key and for a value that is out of range.
     """
     given = settings or {}
     match str(name):
@@ -144,67 +144,63 @@ def is_compiled(name: str) -> bool:
     return kernel_cache.is_complete(ROOMS.get(name, ()))
 
 
-def warm_up(name: str) -> None:
+def warm_up(name: str, progress: Callable[[str], None] = lambda message: None) -> None:
     """Load an estimator's kernels; compile them where they are not in the cache.
 
     Compiling takes some twenty seconds once after an installation: each room is compiled by a
-    process of its own, side by side. Estimators that are not ours are left alone.
+    process of its own, side by side. ``progress`` is called with a message before that and after
+    each room. Estimators that are not ours are left alone.
     """
     rooms = [room for room in ROOMS.get(name, ()) if not kernel_cache.is_complete([room])]
-    compilers = [
-        subprocess.Popen(
+    if rooms:
+        progress(f"compiling the estimator '{name}', once after an installation")
+    compilers = {
+        room: subprocess.Popen(
             [sys.executable, "-c", f"from {__name__} import rehearse; rehearse({room!r})"]
         )
         for room in rooms
-    ]
-    ended = [process.wait() for process in compilers]
-    if not any(ended):
-        for room in rooms:
+    }
+    for done, (room, process) in enumerate(compilers.items(), 1):
+        if process.wait() == 0:
             kernel_cache.mark_complete(room)
+        progress(f"compiled {room} ({done} of {len(rooms)})")
     for room in ROOMS.get(name, ()):
         rehearse(room)
 
 
+_REHEARSAL_S = 25
+"""Enough for each kernel to be called once, those that reduce the bank's hypotheses, too."""
+
+
 def rehearse(room: str) -> None:
-    """Call every kernel of a room once, with a made-up team of three."""
-    team = {1: (0.0, 0.0), 2: (6.0, 0.0), 3: (2.0, 5.0)}
-    pairs = ((1, 2), (1, 3), (2, 3))
+    """Call every kernel of a room once, with a made-up team of six that walk at random."""
+    places = {node: cmath.rect(8.0, node) for node in range(1, 7)}
+    pairs = list(combinations(places, 2))
     if room == "initialisation":
-        _rehearse_initialiser(team, pairs)
+        from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
+
+        initialiser = HypothesisInitialiser()
+        for node in places:
+            initialiser.add(node)
+        initialiser.update(
+            0.0, [Range(0.0, a, b, abs(places[b] - places[a])) for a, b in pairs], {}
+        )
+        initialiser.find(0.0)
         return
-    estimator = make(room, [Prior(node, *team[node], 0.0, 0.1, 0.1) for node in team])
-    for k in range(1, WARM_UP_S):
-        for node in team:
-            turn = 0.3 * (node - 2)
-            estimator.process(Motion(float(k), node, 0.7, 0.0, turn, gain_version=0))
-            estimator.process(Height(float(k), node, 0.1 * node, 0.3))
-            estimator.process(Heading(float(k), node, turn * k, 0.2))
+    priors = [Prior(node, place.real, place.imag, 0.0, 0.1, 0.1) for node, place in places.items()]
+    estimator, dice, headings = make(room, priors), random.Random(1), dict.fromkeys(places, 0.0)
+    for k in range(1, _REHEARSAL_S):
+        for node in places:
+            turn = dice.gauss(0.0, 0.5)
+            places[node] += cmath.rect(1.2, headings[node])
+            headings[node] += turn
+            estimator.process(Motion(float(k), node, 1.2, 0.0, turn, gain_version=0))
+            estimator.process(Height(float(k), node, 0.0, 0.01))
+            estimator.process(Heading(float(k), node, headings[node], 0.2))
         for node, peer in pairs:
-            apart = math.dist(team[node], team[peer])
-            estimator.process(Range(float(k), node, peer, apart + 0.1 * (k % 3)))
+            distance_m = abs(places[peer] - places[node])
+            estimator.process(Range(float(k), node, peer, abs(distance_m + dice.gauss(0.0, 0.1))))
     estimator.finish()
-
-
-def _rehearse_initialiser(
-    team: Mapping[int, tuple[float, float]], pairs: Sequence[tuple[int, int]]
-) -> None:
-    from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
-
-    initialiser = HypothesisInitialiser()
-    for node in team:
-        initialiser.add(node)
-    for k in range(1, WARM_UP_S):
-        for node in team:
-            step = Advance(float(k), node, 1.0, 0.7, 0.0, 0.3 * (node - 2))
-            initialiser.advance(step, faulty=False)
-        apart = [math.dist(team[node], team[peer]) + 0.1 * (k % 3) for node, peer in pairs]
-        ranges = [Range(float(k), *pair, m) for pair, m in zip(pairs, apart, strict=True)]
-        initialiser.update(float(k), ranges, {})
-        initialiser.find(float(k))
-
-
-WARM_UP_S = 8
-"""Enough for each kernel to be called once."""
 
 
 def settings_of(name: str) -> list[SettingInfo]:
