@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.estimator import NodeEstimate, NodeStatus, Presence, unlocated
-from relpos.fusion.modes import believe
+from relpos.fusion.modes import belief_of
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Range
 
@@ -63,20 +63,16 @@ class PoseMixture:
     def heading_sigma_rad(self, index: int) -> float:
         """Return the standard deviation of the heading of ``nodes[index]``."""
         own = slice(POSE * index, POSE * (index + 1))
-        return believe(
+        return belief_of(
             self.weights, self.poses[:, index], self.covariances[:, own, own]
         ).sigma_heading_rad
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Nodes whose poses have been found at an epoch.
-
-    With ``frame`` the first of them defines the frame, and no node had been located before.
-    """
+    """Nodes whose poses have been found at an epoch."""
 
     mixture: PoseMixture
-    frame: bool = False
 
 
 class Initialiser(Protocol):
@@ -128,7 +124,7 @@ def sought_node(initialiser: Initialiser, node: int, presence: Presence) -> Node
         return unlocated(node, presence.height_m, presence.sigma_height_m)
     n = mixture.nodes.index(node)
     own = slice(POSE * n, POSE * (n + 1))
-    belief = believe(
+    belief = belief_of(
         mixture.weights, mixture.poses[:, n], mixture.covariances[:, own, own], mixture.best
     )
     status = presence.status

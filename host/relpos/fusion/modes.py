@@ -1,10 +1,10 @@
-"""What may be said of weighted hypotheses: pictures with probabilities, rings, regions.
+"""What weighted hypotheses say of a team: modes with probabilities, rings, regions.
 
 Hypotheses about a team (weights, poses, position covariances) become at most
-``MAX_ALTERNATIVES`` pictures: hypotheses that put everybody at about the same place are one. A
+``MAX_ALTERNATIVES`` modes: hypotheses that put all nodes at about the same places are one. A
 node that is spread round a whole circle is given as a ring. The other way round,
-:class:`Region` is the smallest region that holds a wanted share of what the alternatives say of a
-node, its area, and whether a place lies in it.
+:class:`Region` is the smallest region that holds a wanted probability of a node's alternatives, its
+area, and whether a place lies in it.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ Indices = npt.NDArray[np.intp]
 _TWO_PI = 2.0 * math.pi
 
 ONE_PLACE_M = 0.7
-"""Hypotheses that differ by less are one picture; the first tried, then wider ones."""
+"""Hypotheses that differ by less are one mode; the first tried, then wider ones."""
 
 RING_SECTORS = 8
 RING_FULLEST = 0.4
 RING_WIDTH = 0.35
-"""A circle: no sector of eight empty, none with more than this share, the width at most this
-share of the radius."""
+"""A circle: no sector of eight empty, none with more than this fraction, the width at most this
+fraction of the radius."""
 
 _LEAST_SIGMA_M = 0.01
 """An ellipse's axis or a ring's width below this would make densities of points that no
@@ -39,10 +39,10 @@ measurement can tell apart differ."""
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """What a mixture says of one node: the best picture's pose, the mixture's spread about it.
+    """What a mixture says of one node: the best mode's pose, the mixture's spread about it.
 
-    ``share`` is the probability that the node is within ``ONE_PLACE_M`` (or two standard
-    deviations) of where the best picture has it; ``sigma_here_m`` the picture's own spread.
+    ``mode_weight`` is the probability that the node is within ``ONE_PLACE_M`` (or two standard
+    deviations) of where the best mode has it; ``mode_sigma_m`` the mode's own spread.
     """
 
     x_m: float
@@ -50,12 +50,11 @@ class Belief:
     heading_rad: float
     covariance_m2: Floats
     sigma_heading_rad: float
-    share: float
-    sigma_here_m: float
-    sigma_heading_here_rad: float
+    mode_weight: float
+    mode_sigma_m: float
 
 
-def pictures(
+def alternatives_of(
     time_s: float,
     nodes: Sequence[int],
     weights: Floats,
@@ -70,8 +69,8 @@ def pictures(
     ringed = [
         _circle(weights, poses[:, n, :2], covariances[:, n]) is not None for n in range(len(nodes))
     ]
-    told = np.flatnonzero(~np.array(ringed, dtype=bool))
-    group = _groups(weights, poses[:, told, :2], covariances[:, told], most)
+    compact = np.flatnonzero(~np.array(ringed, dtype=bool))
+    group = _groups(weights, poses[:, compact, :2], covariances[:, compact], most)
     probability = np.bincount(group, weights=weights)
     rows = []
     for rank, g in enumerate(np.argsort(-probability, kind="stable")):
@@ -100,10 +99,10 @@ def pictures(
     return tuple(rows)
 
 
-def leader(weights: Floats, poses: Floats, covariances: Floats) -> int:
+def best_mode(weights: Floats, poses: Floats, covariances: Floats) -> int:
     """Name the hypothesis about which the most weight lies: (K,), (K, N, 3), (K, N, 2, 2).
 
-    All nodes' best places are taken from one picture; each node's own likeliest place could
+    All nodes' best places are taken from one mode; each node's own likeliest place could
     belong to different ones, and together they would be none.
     """
     leaders = np.argsort(-weights, kind="stable")[:32]
@@ -121,7 +120,9 @@ def _near(places: Floats, covariances: Floats, of: Indices) -> npt.NDArray[np.bo
     return near
 
 
-def believe(weights: Floats, poses: Floats, covariances: Floats, best: int | None = None) -> Belief:
+def belief_of(
+    weights: Floats, poses: Floats, covariances: Floats, best: int | None = None
+) -> Belief:
     """Say where one node is: weights (K,), poses (K, 3), covariances (K, 3, 3).
 
     The place is that of hypothesis ``best`` and those that are one with it; without it, of the
@@ -129,23 +130,25 @@ def believe(weights: Floats, poses: Floats, covariances: Floats, best: int | Non
     """
     places = poses[:, :2]
     if best is None:
-        best = leader(weights, poses[:, None], covariances[:, None, :2, :2])
+        best = best_mode(weights, poses[:, None], covariances[:, None, :2, :2])
     here = _near(places, covariances[:, :2, :2], np.array([best]))[0]
-    share = float(weights[here].sum())
+    weight = float(weights[here].sum())
     own = weights[here] / weights[here].sum()
     mean, spread = _moments(own, places[here], covariances[here, :2, :2])
     total = np.einsum("k,kab->ab", weights, covariances[:, :2, :2])
     all_off = places - mean
     total += np.einsum("k,ka,kb->ab", weights, all_off, all_off)
-    heading, sigma_here = _heading(own, poses[here, 2], covariances[here, 2, 2])
+    heading, _ = _heading(own, poses[here, 2], covariances[here, 2, 2])
     _, sigma = _heading(weights, poses[:, 2], covariances[:, 2, 2])
     return Belief(
-        float(mean[0]), float(mean[1]), heading, total, sigma, share,
-        float(_axes(spread)[0]), sigma_here,
+        float(mean[0]), float(mean[1]), heading, total, sigma, weight,
+        float(_axes(spread)[0]),
     )  # fmt: skip
 
 
-def seen_from(poses: Floats, covariances: Floats, first: int, second: int) -> tuple[Floats, Floats]:
+def relative_poses(
+    poses: Floats, covariances: Floats, first: int, second: int
+) -> tuple[Floats, Floats]:
     """Give the pose (K, 3) of node ``second`` in the body frame of ``first``, and (K, 3, 3).
 
     poses (K, N, 3), covariances (K, 3 N, 3 N).
@@ -232,7 +235,7 @@ def _circle(
 
 
 def _groups(weights: Floats, places: Floats, covariances: Floats, most: int) -> Indices:
-    """Number hypotheses (K,) by picture: places (K, N, 2), covariances (K, N, 2, 2)."""
+    """Number hypotheses (K,) by mode: places (K, N, 2), covariances (K, N, 2, 2)."""
     count = weights.size
     if places.shape[1] == 0 or count == 1:
         return np.zeros(count, dtype=np.intp)
@@ -263,7 +266,7 @@ def _groups(weights: Floats, places: Floats, covariances: Floats, most: int) -> 
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """The smallest region that holds ``share`` of a mixture of ellipses and rings.
+    """The smallest region that holds ``probability`` of a mixture of ellipses and rings.
 
     ``rows`` (A, 7): probability, x, y, major, minor, angle, 1 for a ring. ``level`` is the
     density (1/m^2) at its border, ``area_m2`` its area.
@@ -274,7 +277,9 @@ class Region:
     area_m2: float
 
     @staticmethod
-    def of(alternatives: Iterable[Alternative], share: float = 0.9, draws: int = 4000) -> Region:
+    def of(
+        alternatives: Iterable[Alternative], probability: float = 0.9, draws: int = 4000
+    ) -> Region:
         """Build the region of one node's alternatives of one time.
 
         The level is a quantile of the density at points of the mixture itself; the area is the
@@ -308,7 +313,7 @@ class Region:
             )
         )
         density = _density(rows, points)
-        level = float(np.quantile(density, 1.0 - share))
+        level = float(np.quantile(density, 1.0 - probability))
         inside = density >= level
         return Region(rows, level, float((inside / density).mean()))
 

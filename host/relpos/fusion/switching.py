@@ -1,15 +1,14 @@
-"""The default estimator whatever the team's size: a bank for a few, one joint filter for many.
+"""The default estimator whatever the team's size: a bank for few nodes, one sparse filter for many.
 
-A bank's work grows with the square of the team for every hypothesis, and with many users about
-the picture is hardly ever ambiguous. So a team of more than ``LARGE_TEAM`` is handed from
-:class:`~relpos.fusion.bank.estimator.Bank` to
-:class:`~relpos.fusion.large_teams.estimator.LargeTeam`, at once where
-the priors already name so many, else when so many have been met: everybody's last estimate is
-then the prior, and who was not located yet joins later.
+A bank's work grows with the square of the team for every hypothesis, and a large team is hardly
+ever ambiguous. So :class:`SwitchingEstimator` replaces the
+:class:`~relpos.fusion.bank.estimator.Bank` of a team of more than ``LARGE_TEAM`` by a
+:class:`~relpos.fusion.large_teams.estimator.LargeTeam`: at once if the priors name so many nodes,
+else when so many have been received. The last estimates are then the priors; nodes that are not
+located yet join later.
 
-Where nobody of so many is located, a *nucleus* comes first: the best connected user and some of its
-neighbours, whose starts a bank finds from what they say of each other. They are handed over
-once most of them are found, and all others join them.
+If too few of a large team are located, a *nucleus* comes first: the best connected node and some of
+its neighbours, whose initial poses a bank finds. Once most of them are found, all others join them.
 """
 
 from __future__ import annotations
@@ -30,14 +29,14 @@ from relpos.fusion.timeline import Displacement
 from relpos.measurements import Measurement, Motion, Prior, Range
 
 LARGE_TEAM = 30
-"""From more users on one joint filter, strip by strip (crossover: ``docs/fusion.md``)."""
+"""From more nodes on one sparse filter, strip by strip (crossover: ``docs/fusion.md``)."""
 
 KEPT_S = 20.0
 """What is younger is kept: a bank's newest estimate is never older."""
 
 
 NUCLEUS = 6
-"""So many users begin where nobody's start is known: a bank finds six within a minute or two."""
+"""Nodes of the nucleus: a bank finds six within a minute or two."""
 
 NUCLEUS_FOUND, NUCLEUS_EPOCHS = 4, 3
 """So many of them have to be located for so many epochs."""
@@ -47,7 +46,7 @@ LISTEN_S = 4.0
 
 
 class SwitchingEstimator:
-    """An :class:`~relpos.fusion.estimator.Estimator` for any number of users."""
+    """An :class:`~relpos.fusion.estimator.Estimator` for any number of nodes."""
 
     def __init__(
         self,
@@ -56,7 +55,7 @@ class SwitchingEstimator:
         seed: int = 0,
         mountings: Mapping[int, Mounting] | None = None,
     ) -> None:
-        """Start with whoever has a prior; ``mountings`` tell how nodes are worn."""
+        """Begin with the nodes that have a prior; ``mountings`` describe how nodes are worn."""
         self._mountings = mountings or {}
         self._settings = settings or BankSettings()
         self._seed = seed
@@ -116,13 +115,13 @@ class SwitchingEstimator:
         return estimates
 
     def _located(self) -> int:
-        """How many users a large team could begin from."""
+        """Return how many nodes a large team could begin from."""
         if self._last is None:
             return sum(math.isfinite(p.sigma_m + p.sigma_rad) for p in self._priors)
         return sum(n.status in (NodeStatus.OK, NodeStatus.STALE) for n in self._last.nodes)
 
     def _begin(self, measurement: Measurement) -> list[Estimate]:
-        """Let a nucleus of a large team find itself; all others are unlocated until then."""
+        """Let a bank find a nucleus of a large team; all other nodes are unlocated until then."""
         if not self._nucleus:
             if self._newest_s < self._first_range_s + LISTEN_S:
                 return []
@@ -194,7 +193,7 @@ class SwitchingEstimator:
 
 
 def _best_connected(measurements: Iterable[Measurement]) -> frozenset[int]:
-    """Choose the user with most ranges, then again and again who has most with those chosen."""
+    """Return the node with most ranges, then one by one that with most to those chosen."""
     count: Counter[tuple[int, int]] = Counter()
     degree: Counter[int] = Counter()
     for m in measurements:
@@ -215,6 +214,6 @@ def _best_connected(measurements: Iterable[Measurement]) -> frozenset[int]:
 
 def _rest(motion: Motion, begin_s: float, since_s: float) -> Motion:
     """Give the part of a motion after a time within it."""
-    share = (since_s - begin_s) / (motion.time_s - begin_s)
-    _, rest = Displacement(motion.dx_m, motion.dy_m, motion.dtheta_rad).split(share)
+    fraction = (since_s - begin_s) / (motion.time_s - begin_s)
+    _, rest = Displacement(motion.dx_m, motion.dy_m, motion.dtheta_rad).split(fraction)
     return replace(motion, dx_m=rest.dx_m, dy_m=rest.dy_m, dtheta_rad=rest.dtheta_rad)

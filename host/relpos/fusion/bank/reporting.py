@@ -31,7 +31,7 @@ from relpos.fusion.estimator import (
 )
 from relpos.fusion.initial_poses import Initialiser, PoseMixture, sought_node
 from relpos.fusion.models.detection import Detection
-from relpos.fusion.modes import believe, pictures
+from relpos.fusion.modes import alternatives_of, belief_of
 
 Floats = npt.NDArray[np.float64]
 
@@ -134,7 +134,7 @@ class Report:
     def _at_mode(self, node: NodeEstimate) -> NodeEstimate:
         """Report an ambiguous node at its most probable position, not at the mean of them."""
         these = self.core.hypotheses
-        belief = believe(these.weights(), *these.poses_of(self.row[node.node]))
+        belief = belief_of(these.weights(), *these.poses_of(self.row[node.node]))
         spread = belief.covariance_m2
         return replace(
             node, x_m=belief.x_m, y_m=belief.y_m,
@@ -162,7 +162,7 @@ class Report:
         poses = np.stack([poses[likely] for poses, _ in each], axis=1)
         spread = np.stack([spread[likely, :2, :2] for _, spread in each], axis=1)
         share = weight[likely] / weight[likely].sum()
-        return pictures(self.time_s, nodes, share, poses, spread)
+        return alternatives_of(self.time_s, nodes, share, poses, spread)
 
     # -- sought nodes --------------------------------------------------------------------------
 
@@ -207,7 +207,7 @@ class Report:
             at = PER_NODE * self.row[node]
             poses[:, sought + i] = self.mean[at : at + 3]
             spread[:, sought + i] = self.covariance[at : at + 2, at : at + 2]
-        return pictures(self.time_s, nodes, mixture.weights, poses, spread)
+        return alternatives_of(self.time_s, nodes, mixture.weights, poses, spread)
 
 
 def _pair_of_mixture(

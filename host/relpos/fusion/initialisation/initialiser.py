@@ -196,9 +196,8 @@ class HypothesisInitialiser:
             return None
         self.counters["starts_found"] += len(found)
         self.resolved, self._standing = self.resolved - found, self._standing - found
-        has_frame = search.frame is not None
         order = sorted(found, key=lambda n: (n != search.frame, n))
-        return Found(search.release(order), has_frame)
+        return Found(search.release(order))
 
     def cost_s(self) -> float:
         """Return about how many seconds of a processor ``find`` takes."""

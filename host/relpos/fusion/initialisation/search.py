@@ -26,7 +26,7 @@ from relpos.fusion.initialisation.hypotheses import Hypotheses, fitted, pose_col
 from relpos.fusion.initialisation.kernels import Problem
 from relpos.fusion.initialisation.measurement_log import MeasurementLog, SensorModel
 from relpos.fusion.initialisation.proposals import Proposals
-from relpos.fusion.modes import believe, leader, seen_from
+from relpos.fusion.modes import belief_of, best_mode, relative_poses
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Range
 
@@ -227,7 +227,7 @@ class HypothesisSearch:
             whole.poses[:, active],
             _REPORTED_VARIANCE * whole.covariances[:, columns][:, :, columns],
             whole.scales[active],
-            leader(whole.weights, whole.poses[:, active], places),
+            best_mode(whole.weights, whole.poses[:, active], places),
         )
 
     def resolved(self, least: float) -> list[int]:
@@ -248,11 +248,11 @@ class HypothesisSearch:
                 distance_m = 0.0
             else:
                 first = self.nodes.index(self.frame)
-                poses, covariances = seen_from(mixture.poses, mixture.covariances, first, i)
+                poses, covariances = relative_poses(mixture.poses, mixture.covariances, first, i)
                 distance_m = float(np.median(np.hypot(*poses[:, :2].T)))
-            belief = believe(mixture.weights, poses, covariances)
+            belief = belief_of(mixture.weights, poses, covariances)
             most_m = max(_RESOLVED_M, _RESOLVED_RAD * distance_m)
-            if belief.share < least or belief.sigma_here_m > most_m:
+            if belief.mode_weight < least or belief.mode_sigma_m > most_m:
                 continue
             if belief.sigma_heading_rad > HEADING_RESOLVED_RAD and self.has_moved(node):
                 continue
