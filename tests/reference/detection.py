@@ -51,8 +51,8 @@ def add_attempts(attempts: Attempts, curve: Floats, statistics: Statistics) -> F
     sums[1] += float((w * 0.5 * (then**2 + since**2)).sum())
     surprise[first, second] = now
     # Attempts are spread over the two nearest entries of three places each.
-    place = np.clip((distance_m + _OFFSETS * sigma_m) / STEP_M, 0.0, LENGTH - 1.001)
-    index = place.astype(np.intp)
+    place = np.clip((distance_m + _OFFSETS * sigma_m) / STEP_M, 0.0, LENGTH - 1.0)
+    index = np.minimum(place.astype(np.intp), LENGTH - 2)
     beyond = place - index
     share = _SHARES * weight
     for outcome, some in ((1, slice(None, received)), (0, slice(received, None))):

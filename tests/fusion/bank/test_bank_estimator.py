@@ -77,3 +77,11 @@ def test_arrays_that_do_not_fit_are_refused_before_a_kernel_reads_them() -> None
         core.update(np.array([0]), np.array([2]), one, one)
     with pytest.raises(IndexError, match="2 users"):
         core.move(np.array([-1]), np.ones((1, 4)))
+
+
+def test_a_state_that_is_no_longer_finite_is_an_error() -> None:
+    core = BankCore(BankSettings(hypotheses=8))
+    core.add_node((0.0, 0.0, 0.0), 0.1, 0.1)
+    core.hypotheses.arrays.x[0, 0, 0] = np.nan
+    with pytest.raises(RelposError, match="no longer finite"):
+        core.hypotheses.moments()

@@ -287,6 +287,13 @@ def test_what_is_far_from_any_edge_changes_nothing_but_the_weight() -> None:
     assert (p == before[1]).all()
 
 
+def test_a_place_that_is_no_number_is_looked_up_within_the_curve() -> None:
+    x, p = states(16, 31)
+    x[3, 0] = np.nan
+    log_weight = with_attempt(x, p, False, 1.0, 1.0, np.full(201, 0.5))
+    assert np.isfinite(np.delete(log_weight, 3)).all()
+
+
 @pytest.mark.parametrize(("received", "weight"), [(True, 1.0), (False, 1.0), (False, 0.6)])
 def test_an_attempt_is_the_reference_implementation(received: bool, weight: float) -> None:
     curve = 0.002 + 0.97 / (1.0 + np.exp((np.arange(201) * STEP_M - 7.0) / 1.5))

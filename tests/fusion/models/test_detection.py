@@ -204,3 +204,18 @@ def test_the_statistics_of_attempts_are_those_of_the_reference() -> None:
         assert attempted == pytest.approx(again, abs=1e-12)
         for got, wanted in zip(ours, expected, strict=True):
             assert got == pytest.approx(wanted, abs=1e-9, nan_ok=True)
+
+
+def test_distances_that_are_no_numbers_are_counted_within_the_arrays() -> None:
+    # The kernel checks no bounds: the rows before and after are what it could hit.
+    room = np.zeros((4, LENGTH))
+    learned = Statistics(np.ones(2), np.full((2, 2), np.nan), room[1:3], np.zeros(3))
+    for distance_m, sigma_m in ((np.nan, 1.0), (1.0, np.nan), (np.inf, 1.0), (-np.inf, 1.0)):
+        ends = np.array([0]), np.array([1])
+        for received in (0, 1):
+            attempts = Attempts(
+                *ends, received, np.ones(received), np.array([distance_m]), np.array([sigma_m])
+            )
+            add_attempts(attempts, Detection().curve, learned)
+    assert not room[[0, 3]].any()
+    assert not room[1:3, 2:-2].any()

@@ -47,6 +47,7 @@ class Attempts(NamedTuple):
 def _outcome(place: Lanes, received: bool, attempted: float, curve: Floats) -> Lanes:
     """Probability that a pair is received, or silent, at a multiple of the curve's step."""
     last = curve.shape[0] - 2.0
+    # In this order a place of NaN is 0, too: ``look_up`` checks no bounds.
     kept = lesser(greater(place, fill(0.0)), fill(last + 1.0))
     index = lesser(lanes.floor(kept), fill(last))
     here = lanes.look_up(curve, index)

@@ -8,6 +8,7 @@ from collections import Counter
 import numpy as np
 import numpy.typing as npt
 
+from relpos.errors import RelposError
 from relpos.fusion.bank import hypothesis_count, lanes, mixture, storage
 from relpos.fusion.bank import variance_components as components
 from relpos.fusion.bank.lanes import LANES
@@ -119,9 +120,13 @@ class HypothesisSet:
     def moments(self, *, poses_alone: bool = False) -> tuple[Floats, Floats]:
         """Return the mixture's mean (D,) and full covariance (D, D).
 
-        With ``poses_alone`` constants and biases have variances, and covariances of 0.
+        With ``poses_alone`` constants and biases have variances, and covariances of 0. Raises
+        RelposError where a mean is not finite.
         """
-        return self.moments_by(self.normalise()[0], poses_alone=poses_alone)
+        mean, covariance = self.moments_by(self.normalise()[0], poses_alone=poses_alone)
+        if not np.isfinite(mean).all():
+            raise RelposError("the estimate is no longer finite: this is an error of the program")
+        return mean, covariance
 
     def moments_by(self, weight: Floats, *, poses_alone: bool) -> tuple[Floats, Floats]:
         """As :meth:`moments`, by ``weight`` (B, LANES)."""

@@ -272,13 +272,13 @@ def _extreme(sign: str) -> Any:
 
 @_intrinsic
 def greater(typing: Any, x: Any, y: Any) -> Any:
-    """The greater of each two."""
+    """The greater of each two; ``y`` where one is NaN."""
     return _lanes(_lanes, _lanes), _extreme(">")
 
 
 @_intrinsic
 def lesser(typing: Any, x: Any, y: Any) -> Any:
-    """The lesser of each two."""
+    """The lesser of each two; ``y`` where one is NaN."""
     return _lanes(_lanes, _lanes), _extreme("<")
 
 

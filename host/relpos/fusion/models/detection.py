@@ -39,7 +39,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.compiled import compiled
+from relpos.fusion.compiled import compiled, inlined
 from relpos.measurements import Range
 
 Floats = npt.NDArray[np.float64]
@@ -164,6 +164,14 @@ class Statistics(NamedTuple):
     """(3,): products of consecutive surprises, their mean squares, and attempts."""
 
 
+@inlined
+def _place(distance_m: float, sigma_m: float, q: int) -> float:
+    """Place in the curve of one of three points over the distance's error (Gauss-Hermite)."""
+    place = (distance_m + (q - 1) * math.sqrt(3.0) * sigma_m) / STEP_M
+    # A place of NaN is 0, too: an index that is made of it has to lie within the arrays.
+    return min(place, LENGTH - 1.0) if place > 0.0 else 0.0
+
+
 @compiled
 def add_attempts(attempts: Attempts, curve: Floats, statistics: Statistics) -> Floats:
     """Add one round to the statistics, in place.
@@ -177,13 +185,10 @@ def add_attempts(attempts: Attempts, curve: Floats, statistics: Statistics) -> F
     chance, attempted = np.empty(several), np.empty(several - received)
     busy = np.zeros(slots, dtype=np.bool_)
     silence = np.full(slots, -1.0)
-    root = math.sqrt(3.0)
     for u in range(several):
-        # Three-point Gauss-Hermite rule over the distance's error; one mass of its shares is 1.
         chance[u] = 0.0
         for q in range(3):
-            place = (distance_m[u] + (q - 1) * root * sigma_m[u]) / STEP_M
-            place = min(max(place, 0.0), LENGTH - 1.0)
+            place = _place(distance_m[u], sigma_m[u], q)
             index = min(int(place), LENGTH - 2)
             here = curve[index] + (place - index) * (curve[index + 1] - curve[index])
             chance[u] += here * (4.0 if q == 1 else 1.0) / 6.0
@@ -217,9 +222,8 @@ def add_attempts(attempts: Attempts, curve: Floats, statistics: Statistics) -> F
             sums[1] += weight * 0.5 * (before * before + now * now)
         surprise[a, b] = now
         for q in range(3):
-            place = (distance_m[u] + (q - 1) * root * sigma_m[u]) / STEP_M
-            place = min(max(place, 0.0), LENGTH - 1.001)
-            index = int(place)
+            place = _place(distance_m[u], sigma_m[u], q)
+            index = min(int(place), LENGTH - 2)
             share = weight * (4.0 if q == 1 else 1.0) / 6.0
             counts[outcome, index] += share * (1.0 - (place - index))
             counts[outcome, index + 1] += share * (place - index)
