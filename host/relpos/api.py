@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING
 
 from relpos import sources
 from relpos.errors import FusionInterrupted, RelposError
-from relpos.evaluation.result import Progress, Result, read_result, result_of, run_estimator
+from relpos.evaluation.result import Result, read_result, result_of, run_estimator
 from relpos.evaluation.scoring import Evaluation
-from relpos.fusion.estimator import Estimate, Estimator
+from relpos.fusion.estimator import Estimate, Estimator, Progress
 from relpos.measurements import Measurement, Prior
 from relpos.runs import InitialPose, Run, save_run
 
@@ -187,9 +187,7 @@ def _compile(name: str, settings: Mapping[str, object] | None, progress: Progres
     fusion.check_name(name)
     fusion.check_settings(name, settings or {})
     if not fusion.is_compiled(name):
-        if progress is not None:
-            progress("compiling", 0, 0)
-        fusion.warm_up(name)
+        fusion.warm_up(name, progress)
 
 
 def _make(

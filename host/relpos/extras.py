@@ -67,6 +67,13 @@ def install_line(needed: Sequence[str]) -> str:
     return f"{shlex.quote(sys.executable)} -m pip install {packages}"
 
 
+def require(extra: str) -> None:
+    """Raise RelposError where a package of the extra is not installed: the line that helps."""
+    lacking = missing(extra)
+    if lacking:
+        raise missing_extra(lacking[0], extra)
+
+
 def missing_extra(package: str, extra: str) -> RelposError:
     """The error to raise where ``package`` of ``extra`` cannot be imported: the line that helps.
 

@@ -88,7 +88,7 @@ def demo(
     with output.working(f"emulating {nodes} nodes for {seconds:g} s"):
         run = record_team(config)
     save_run(run, out / "run")
-    fuse.fuse_recording(job, run, as_json=json, report=True)
+    fuse.fuse_recording(job, run, as_json=json, report=fuse.can_report())
 
 
 def _fuse_emulated(

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from relpos import extras
 from relpos.cli import live, output
 from relpos.cli.estimators import BANK, DEADRECKONING, EstimatorName
 from relpos.cli.keys import KeyFile, team_key
@@ -161,7 +162,7 @@ def fuse(
     elif options.shown:
         _replay_run(job, initial, options, as_json=json)
     else:
-        _fuse_run(job, initial, as_json=json, report=not json if report is None else report)
+        _fuse_run(job, initial, as_json=json, report=_is_wanted(report, as_json=json))
 
 
 @dataclass(frozen=True)
@@ -194,10 +195,8 @@ class Job:
         fusion.check_name(self.estimator)
         fusion.check_settings(self.estimator, self.settings)
         with output.progress(output.STAGES) as progress:
-            if not fusion.is_compiled(self.estimator):
-                progress("compiling", 0, 0)
             # Before anything is made: what this process compiled would be compiled twice.
-            fusion.warm_up(self.estimator)
+            fusion.warm_up(self.estimator, progress)
         self.make(priors)
 
 
@@ -299,8 +298,25 @@ def _fuse_mcap(
         start,
         [o for o in observations if isinstance(o, Motion | Range | Height | Heading)],
         as_json=as_json,
-        report=not as_json if report is None else report,
+        report=_is_wanted(report, as_json=as_json),
     )
+
+
+def _is_wanted(report: bool | None, *, as_json: bool) -> bool:
+    """Whether to write the report; without its extra only where the command line asks for it."""
+    if report is not None or as_json:
+        return bool(report)
+    return can_report()
+
+
+def can_report() -> bool:
+    """Whether the extra for reports is installed; a remark says how to install it."""
+    lacking = extras.missing("report")
+    if lacking:
+        output.remark(
+            f"no report is written; this installs what it needs: {extras.install_line(lacking)}"
+        )
+    return not lacking
 
 
 def fuse_recording(

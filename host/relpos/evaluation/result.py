@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -15,6 +15,8 @@ import numpy.typing as npt
 
 from relpos.errors import RelposError
 from relpos.evaluation.iso18305 import Latency
+from relpos.fusion.estimator import Progress
+from relpos.fusion.linear_algebra import one_thread
 from relpos.runs.estimates import PAIR_COLUMNS, PARAMETER_COLUMNS
 
 if TYPE_CHECKING:
@@ -38,13 +40,6 @@ POSE_COLUMNS = (
     "status",
 )
 _TABLES = {"poses": POSE_COLUMNS, "pairs": PAIR_COLUMNS, "parameters": PARAMETER_COLUMNS}
-
-
-Progress = Callable[[str, int, int], None]
-"""Called with the stage of a long task, and how many of how many parts of it are done.
-
-A total of 0 parts says that the length of the stage is not known.
-"""
 
 
 @dataclass(frozen=True)
@@ -95,29 +90,30 @@ def run_estimator(
     computing, count, now_s = 0.0, 0, -math.inf
     failure: RelposError | None = None
     interrupted = False
-    try:
-        for measurement in measurements:
-            progress("fusing", count, len(measurements))
-            now_s = max(now_s, measurement.time_s)
-            count += 1
+    with one_thread():
+        try:
+            for measurement in measurements:
+                progress("fusing", count, len(measurements))
+                now_s = max(now_s, measurement.time_s)
+                count += 1
+                started = time.perf_counter()
+                new = estimator.process(measurement)
+                computing += time.perf_counter() - started
+                estimates += new
+                emitted += len(new) * [now_s]
+        except KeyboardInterrupt:
+            interrupted = True
+        except RelposError as error:
+            failure = error
+        try:
+            progress("finishing", 0, 0)
             started = time.perf_counter()
-            new = estimator.process(measurement)
+            new = estimator.finish()
             computing += time.perf_counter() - started
             estimates += new
             emitted += len(new) * [now_s]
-    except KeyboardInterrupt:
-        interrupted = True
-    except RelposError as error:
-        failure = error
-    try:
-        progress("finishing", 0, 0)
-        started = time.perf_counter()
-        new = estimator.finish()
-        computing += time.perf_counter() - started
-        estimates += new
-        emitted += len(new) * [now_s]
-    except RelposError as error:
-        failure = failure or error
+        except RelposError as error:
+            failure = failure or error
     return EstimatorRun(
         tuple(estimates),
         np.array(emitted),

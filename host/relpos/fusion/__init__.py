@@ -30,6 +30,7 @@ from relpos.fusion.estimator import (
     NodeStatus,
     PairEstimate,
     Parameter,
+    Progress,
     Shape,
 )
 from relpos.fusion.models.ranging import Mounting
@@ -144,26 +145,25 @@ def is_compiled(name: str) -> bool:
     return kernel_cache.is_complete(ROOMS.get(name, ()))
 
 
-def warm_up(name: str, progress: Callable[[str], None] = lambda message: None) -> None:
+def warm_up(name: str, progress: Progress | None = None) -> None:
     """Load an estimator's kernels; compile them where they are not in the cache.
 
     Compiling takes some twenty seconds once after an installation: each room is compiled by a
-    process of its own, side by side. ``progress`` is called with a message before that and after
-    each room. Estimators that are not ours are left alone.
+    process of its own, side by side. ``progress`` is called with ``"compiling"``, the number of
+    compiled rooms and that of all. Estimators that are not ours are left alone.
     """
     rooms = [room for room in ROOMS.get(name, ()) if not kernel_cache.is_complete([room])]
-    if rooms:
-        progress(f"compiling the estimator '{name}', once after an installation")
     compilers = {
         room: subprocess.Popen(
             [sys.executable, "-c", f"from {__name__} import rehearse; rehearse({room!r})"]
         )
         for room in rooms
     }
-    for done, (room, process) in enumerate(compilers.items(), 1):
+    for done, (room, process) in enumerate(compilers.items()):
+        if progress is not None:
+            progress("compiling", done, len(rooms))
         if process.wait() == 0:
             kernel_cache.mark_complete(room)
-        progress(f"compiled {room} ({done} of {len(rooms)})")
     for room in ROOMS.get(name, ()):
         rehearse(room)
 

@@ -7,7 +7,7 @@ files nor ports nor the truth.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from math import atan2, hypot, inf, pi, sqrt
@@ -15,6 +15,12 @@ from typing import Protocol, runtime_checkable
 
 from relpos.errors import RelposError
 from relpos.measurements import Measurement
+
+Progress = Callable[[str, int, int], None]
+"""Called with the stage of a long task, and how many of how many parts of it are done.
+
+A total of 0 parts says that the length of the stage is not known.
+"""
 
 
 class NodeStatus(StrEnum):

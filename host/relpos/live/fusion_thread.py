@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 from relpos.errors import RelposError
 from relpos.fusion.estimator import Estimate, Estimator
+from relpos.fusion.linear_algebra import one_thread
 from relpos.measurements import (
     Heading,
     Height,
@@ -75,7 +76,7 @@ class FusionThread:
         self.newest_s = -math.inf
         """Time of the newest processed motion or range."""
         self._abandon = threading.Event()
-        self._thread = threading.Thread(target=self._work, name="fusion", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="fusion", daemon=True)
         self._thread.start()
 
     def submit(self, observations: Sequence[Observation]) -> None:
@@ -107,6 +108,10 @@ class FusionThread:
     def counters(self) -> Mapping[str, int]:
         """Return the estimator's counters; call once the thread has ended."""
         return {} if self._estimator is None else self._estimator.counters()
+
+    def _run(self) -> None:
+        with one_thread():
+            self._work()
 
     def _work(self) -> None:
         try:

@@ -14,6 +14,7 @@ from relpos.evaluation.report.content import Baseline, Content, gather, reckon
 from relpos.evaluation.report.drawing import Picture, inline, save, svg
 from relpos.evaluation.report.page import page
 from relpos.evaluation.report.pictures import PICTURES, pictures
+from relpos.extras import require
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,6 +34,7 @@ def write_figures(content: Content, figures: Path | str) -> None:
 
 
 def _drawn(content: Content, figures: Path | str | None) -> dict[str, tuple[Picture, str]]:
+    require("report")
     if figures is not None:
         Path(figures).mkdir(parents=True, exist_ok=True)
     drawn: dict[str, tuple[Picture, str]] = {}
@@ -50,6 +52,7 @@ def _drawn(content: Content, figures: Path | str | None) -> dict[str, tuple[Pict
 
 def draw(content: Content, name: str) -> Figure:
     """Draw one of the page's figures; RelposError where there is none of that name, or nothing."""
+    require("report")
     if name not in PICTURES:
         raise RelposError(f"no figure '{name}': one of {', '.join(PICTURES)}")
     picture = PICTURES[name](content)
