@@ -47,7 +47,7 @@ def test_modules_that_only_posix_has_are_imported_in_the_listed_places_alone():
             names = []
             if isinstance(node, ast.Import):
                 names = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom):
+            elif isinstance(node, ast.ImportFrom) and not node.level:
                 names = [node.module or ""]
             for name in set(names) & POSIX:
                 found.setdefault(file.relative_to(PACKAGE).as_posix(), set()).add(name)

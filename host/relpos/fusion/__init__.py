@@ -15,7 +15,7 @@ import cmath
 import random
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 from relpos.errors import RelposError
