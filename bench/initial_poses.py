@@ -1,12 +1,12 @@
-"""Unknown starts: how soon they are found, and how honest the estimate is until then.
+"""Unknown initial poses: how soon they are found, and how honest the estimate is until then.
 
     python bench/initial_poses.py [--seeds 50] [--first 0] [--every 10] [--only paper|robots|...]
 
-*paper*: scenario P1 with nothing told, or only a part of it; aligned RMSE at 120 s, and how often
+*paper*: scenario P1 with no initial poses, or only a part of them; aligned RMSE at 120 s, and how often
 the alternatives' 90 % region holds the truth until everybody is located, its area beside that of
 a blind guess (90 % of the disc whose radius is the longest range so far).
 *robots*: two robots, windows of 90 s cut out of the recordings every so many seconds, each with
-nothing told. "Under .5 m" is the first time from which the body-frame error (both directions) is
+nothing scored. "Under .5 m" is the first time from which the body-frame error (both directions) is
 less for five seconds; "declared" is when both are ``ok``.
 *still* and *four*: the recordings in which one robot stands.
 """
@@ -40,7 +40,7 @@ WINDOW_S = 90.0
 
 
 @dataclass(frozen=True)
-class Told:
+class ScoredRun:
     """One run: by epoch (T,), NaN where there is nothing to say."""
 
     time_s: Floats
@@ -60,12 +60,12 @@ class Told:
         )
 
 
-def tell(
+def run_bank(
     measurements: Sequence[Measurement],
     truth: tuple[Truth, ...],
     priors: Sequence[Prior],
     seed: int,
-) -> Told:
+) -> ScoredRun:
     """Run the bank and look at every epoch."""
     true = tracks.true_tracks(truth)
     estimator = fusion.make("bank", priors, {}, seed)
@@ -92,7 +92,7 @@ def tell(
             started = time.perf_counter()
         estimates += new
     time_s, located_share, inside_, area_, ring_, blind_, cost = np.array(rows).T
-    return Told(time_s, located_share, inside_, area_, blind_, ring_, cost, estimates, truth)
+    return ScoredRun(time_s, located_share, inside_, area_, blind_, ring_, cost, estimates, truth)
 
 
 def paper(seeds: range) -> None:
@@ -110,16 +110,16 @@ def paper(seeds: range) -> None:
         at, later, inside, area, blind, cost = [], [], [], [], [], []
         for seed in seeds:
             run = simulate_paper("paper-p1", seed, {"seconds": 180.0})
-            told = tell(run.measurements, run.truth, keep(run.priors), seed)
-            m = told.scored()
+            scored = run_bank(run.measurements, run.truth, keep(run.priors), seed)
+            m = scored.scored()
             error = m.position_rmse_over_time_m
             at.append(float(np.interp(120.0, m.time_s, error)))
             later.append(float(np.sqrt((error[m.time_s > 120.0] ** 2).mean())))
-            vague = np.isfinite(told.inside)
-            inside += list(told.inside[vague])
-            area += list(told.area_m2[vague])
-            blind += list(told.blind_m2[vague])
-            cost += list(told.cost_s[vague])
+            vague = np.isfinite(scored.inside)
+            inside += list(scored.inside[vague])
+            area += list(scored.area_m2[vague])
+            blind += list(scored.blind_m2[vague])
+            cost += list(scored.cost_s[vague])
         print(
             f"{name:24}{np.mean(np.array(at) < 0.5):7.0%}{np.mean(at):10.2f}{np.mean(later):7.2f}"
             f"{np.mean(inside):9.1%}{np.mean(area):8.1f}{np.mean(blind):8.0f}"
@@ -140,19 +140,19 @@ def robots(every_s: int) -> None:
                 if begin <= m.time_s < begin + WINDOW_S
             ]
             truth = tuple(replace(q, time_s=q.time_s - begin) for q in run.truth)
-            told = tell(cut, truth, (), 0)
-            m = told.scored()
+            scored = run_bank(cut, truth, (), 0)
+            m = scored.scored()
             error, at = m.body_frame_rmse_over_time_m, m.time_s
             short = np.convolve(error < 0.5, np.ones(5), "valid") == 5
             found.append(at[np.argmax(short)] if short.any() else math.inf)
-            both = np.flatnonzero(told.located == 1.0)
-            since = told.time_s[both[0]] if both.size else math.inf
+            both = np.flatnonzero(scored.located == 1.0)
+            since = scored.time_s[both[0]] if both.size else math.inf
             declared.append(since)
             if both.size:
                 wrong.append(np.interp(since, at, error) > 1.0)
                 after += list(error[at > since])
-            inside += list(told.inside[np.isfinite(told.inside)])
-            cost += list(told.cost_s[np.isfinite(told.inside)])
+            inside += list(scored.inside[np.isfinite(scored.inside)])
+            cost += list(scored.cost_s[np.isfinite(scored.inside)])
     print(f"two robots, {len(found)} starts, one each {every_s} s of two recordings")
     for title, values in (("under .5 m", found), ("declared", declared)):
         middle, late = np.quantile(np.array(values), (0.5, 0.9), method="higher")
@@ -167,12 +167,12 @@ def robots(every_s: int) -> None:
 def still() -> None:
     """Print the recording in which one of two robots stands."""
     run = load_run(DATA / "two_robots_vio" / "exp1_unobservable")
-    told = tell(run.measurements, tuple(run.truth), (), 0)
-    vague = np.isfinite(told.inside)
+    scored = run_bank(run.measurements, tuple(run.truth), (), 0)
+    vague = np.isfinite(scored.inside)
     print(
-        f"exp1_unobservable: {np.mean(told.located == 1.0):.0%} of the epochs declared, the "
-        f"region ({np.nanmean(told.area_m2):.0f} m^2) holds the truth in "
-        f"{told.inside[vague].mean():.1%}, a ring in {told.ring[vague].mean():.0%}"
+        f"exp1_unobservable: {np.mean(scored.located == 1.0):.0%} of the epochs declared, the "
+        f"region ({np.nanmean(scored.area_m2):.0f} m^2) holds the truth in "
+        f"{scored.inside[vague].mean():.1%}, a ring in {scored.ring[vague].mean():.0%}"
     )
 
 
@@ -180,16 +180,16 @@ def four() -> None:
     """Print the four robots with uncalibrated ranges."""
     run = load_run(DATA / "four_robots_uwb" / "run1")
     for seed in range(3):
-        told = tell(run.measurements, tuple(run.truth), (), seed)
-        m = told.scored()
+        scored = run_bank(run.measurements, tuple(run.truth), (), seed)
+        m = scored.scored()
         error = m.position_rmse_over_time_m
         bad = m.time_s[error > 0.5]
-        first = told.time_s[np.argmax(told.located == 1.0)]
+        first = scored.time_s[np.argmax(scored.located == 1.0)]
         print(
             f"four_robots_uwb, seed {seed}: aligned under .5 m from {bad.max(initial=0.0):.0f} s, "
             f"all located at {first:.0f} s, then "
             f"{np.sqrt(np.mean(error[m.time_s > first] ** 2)):.2f} m; "
-            f"region {np.nanmean(told.inside):.0%}"
+            f"region {np.nanmean(scored.inside):.0%}"
         )
 
 
@@ -203,7 +203,7 @@ def main() -> None:
     given = parser.parse_args()
     # The first call compiles.
     warm = simulate_paper("paper-p1", 0, {"seconds": 10.0})
-    tell(warm.measurements, warm.truth, (), 0)
+    run_bank(warm.measurements, warm.truth, (), 0)
     if given.only in ("", "robots"):
         robots(given.every)
     if given.only in ("", "still"):

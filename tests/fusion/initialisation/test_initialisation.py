@@ -204,7 +204,7 @@ def test_a_fit_returns_to_what_made_the_ranges() -> None:
 # -- what is not observable ------------------------------------------------------------------------
 
 
-def test_before_anybody_moves_everybody_else_is_on_a_ring_about_the_first() -> None:
+def test_before_any_node_moves_all_others_are_on_rings_about_the_first() -> None:
     still = np.zeros((6, 3))
     walk = Walk((0, 4 + 1j, -2 + 3j), (0.0, 1.0, 2.0), still, still)
     last = play(walk.measurements)[-1]
@@ -262,7 +262,7 @@ def test_while_the_first_stands_alone_the_other_walks_on_a_ring() -> None:
 
 
 @pytest.mark.parametrize("people", [2, 4])
-def test_people_who_walk_about_find_each_other(people: int) -> None:
+def test_walking_nodes_are_located_relative_to_each_other(people: int) -> None:
     places = (0, 5 + 2j, -3 + 4j, 1 - 6j)[:people]
     walk = Walk(places, (0.4, 2.0, -1.0, 3.0)[:people], *wander(80, people, seed=2))
     estimates = play(walk.measurements)
@@ -277,7 +277,7 @@ def test_people_who_walk_about_find_each_other(people: int) -> None:
             assert off_m(e, walk, int(e.time_s), 1, 2) < 1.0
 
 
-def test_one_who_joins_later_is_found_among_those_who_are_located() -> None:
+def test_a_node_that_joins_later_is_found_among_located_ones() -> None:
     walk = Walk((0, 5 + 2j, -3 + 4j), (0.0, 0.5, 2.0), *wander(70, 3, seed=5))
     late = [
         m
@@ -346,7 +346,7 @@ def test_a_copy_of_a_search_goes_on_as_the_search_does() -> None:
 # -- real recordings -------------------------------------------------------------------------------
 
 
-def test_two_robots_of_which_one_stands_are_never_said_to_be_located() -> None:
+def test_two_robots_of_which_one_stands_are_never_reported_as_located() -> None:
     folder = DATA / "two_robots_vio" / "exp1_unobservable"
     if not folder.exists():
         pytest.skip(f"needs the recording {folder}")
@@ -370,7 +370,7 @@ def test_two_robots_of_which_one_stands_are_never_said_to_be_located() -> None:
     assert rings > 0.9 * len(inside)
 
 
-def test_who_stand_on_one_spot_are_not_told_closer_than_their_ranges_can_say() -> None:
+def test_nodes_on_one_spot_are_not_reported_closer_than_their_ranges_resolve() -> None:
     rng = np.random.default_rng(4)
     nodes = (1, 2, 3, 4)
     measurements: list[Measurement] = []
