@@ -2,9 +2,9 @@
 
     python bench/initial_poses.py [--seeds 50] [--first 0] [--every 10] [--only paper|robots|...]
 
-*paper*: scenario P1 with no initial poses, or only a part of them; aligned RMSE at 120 s, and how often
-the alternatives' 90 % region holds the truth until everybody is located, its area beside that of
-a blind guess (90 % of the disc whose radius is the longest range so far).
+*paper*: scenario P1 with no initial poses, or only a part of them; aligned RMSE at 120 s, and how
+often the alternatives' 90 % region holds the truth until all are located, its area beside that of a
+blind guess (90 % of the disc whose radius is the longest range so far).
 *robots*: two robots, windows of 90 s cut out of the recordings every so many seconds, each with
 nothing scored. "Under .5 m" is the first time from which the body-frame error (both directions) is
 less for five seconds; "declared" is when both are ``ok``.

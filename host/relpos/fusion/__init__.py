@@ -165,15 +165,15 @@ def warm_up(name: str, progress: Progress | None = None) -> None:
         if process.wait() == 0:
             kernel_cache.mark_complete(room)
     for room in ROOMS.get(name, ()):
-        rehearse(room)
+        rehearse(room, _FEW_S)
 
 
-_REHEARSAL_S = 25
-"""Enough for each kernel to be called once, those that reduce the bank's hypotheses, too."""
+_ALL_S, _FEW_S = 25, 4
+"""Enough to call every kernel, those that reduce the bank's hypotheses, too; or all usual ones."""
 
 
-def rehearse(room: str) -> None:
-    """Call every kernel of a room once, with a made-up team of six that walk at random."""
+def rehearse(room: str, seconds: int = _ALL_S) -> None:
+    """Call the kernels of a room, with a made-up team of six that walk at random."""
     places = {node: cmath.rect(8.0, node) for node in range(1, 7)}
     pairs = list(combinations(places, 2))
     if room == "initialisation":
@@ -189,7 +189,7 @@ def rehearse(room: str) -> None:
         return
     priors = [Prior(node, place.real, place.imag, 0.0, 0.1, 0.1) for node, place in places.items()]
     estimator, dice, headings = make(room, priors), random.Random(1), dict.fromkeys(places, 0.0)
-    for k in range(1, _REHEARSAL_S):
+    for k in range(1, seconds):
         for node in places:
             turn = dice.gauss(0.0, 0.5)
             places[node] += cmath.rect(1.2, headings[node])
