@@ -16,10 +16,9 @@ class Joint:
     def __init__(self, case: Case, seed: int) -> None:
         from relpos.fusion.bank.core import BankCore
         from relpos.fusion.bank.settings import BankSettings
-        from relpos.fusion.bank.storage import PER_NODE
 
         alone = BankSettings(hypotheses=1, constants=0.0, outliers=0.0, biased=0.0)
-        self.core, self.per = BankCore(alone, seed), PER_NODE
+        self.core = BankCore(alone, seed)
         for pose in case.truth[0]:
             x, y, heading = map(float, pose)
             self.core.add_node((x, y, heading), 1e-3, 1e-3)
@@ -28,10 +27,7 @@ class Joint:
 
     def pose(self) -> Floats:
         """Poses (N, 3)."""
-        at: Floats = self.core.hypotheses.x[0, : self.per * len(self.rows)].reshape(-1, self.per)[
-            :, :3
-        ]
-        return at
+        return self.core.hypotheses.poses_in(self.rows, np.zeros_like(self.rows))
 
     def predict(self, motion: Floats, sigma: Floats) -> None:
         """Move everybody by told noise."""

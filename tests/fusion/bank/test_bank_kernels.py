@@ -113,7 +113,6 @@ def test_what_is_packed_comes_out_as_it_was() -> None:
     px, pp = storage.pack(x, p, NODES)
     for mine, back in zip((x, p), storage.unpack(px, pp, NODES, 11), strict=True):
         assert (mine == back).all()
-    assert (storage.means(px, NODES, 11) == x).all()
     chosen = np.array([3, 3, 10, 0], dtype=np.int64)
     taken = storage.unpack(
         storage.select_hypotheses(px, chosen), storage.select_hypotheses(pp, chosen), NODES, 4

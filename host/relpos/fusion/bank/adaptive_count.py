@@ -55,9 +55,10 @@ class AdaptiveCount:
         mean, covariance = mixture.moments(
             x, p, self._unperturbed, these.nodes, poses, len(poses), len(poses)
         )
-        sigmas = np.exp(0.5 * these.components.mean)
-        metre = math.sqrt(ALONG_M2_M) * sigmas[ALONG:-1:COMPONENTS]
-        index = hypothesis_count.nonlinearity_index(mean, covariance, float(sigmas[-1]), metre)
+        sigma_range_m = math.exp(0.5 * these.components.mean[-1])
+        index = hypothesis_count.nonlinearity_index(
+            mean, covariance, sigma_range_m, self._sigma_metre_m()
+        )
         if ambiguous or index > hypothesis_count.NONLINEAR:
             self.unambiguous = 0
             self.grow()
@@ -74,9 +75,7 @@ class AdaptiveCount:
         """Have more than the usual number of hypotheses while strongly nonlinear."""
         these = self._hypotheses
         usual = these.settings.hypotheses
-        unperturbed = np.empty_like(these.arrays.log_weight)
-        mixture.unperturbed_weights(these.arrays.log_weight, these.perturbed, unperturbed)
-        mean, covariance = these.moments_by(unperturbed, poses_alone=True)
+        mean, covariance = these.moments_by(these.unperturbed_weights(), poses_alone=True)
         # How short the next metre is, is in the motion's moments: arcs alone count here.
         straight = np.full(these.nodes, np.inf)
         sigma_range_m = math.exp(0.5 * these.components.mean[-1])
@@ -88,33 +87,51 @@ class AdaptiveCount:
             if these.count < self.ceiling:
                 these.resample(these.weights(), self.ceiling)
 
+    def _sigma_metre_m(self) -> Floats:
+        """How noisy the length of a metre is that each user walks (N,)."""
+        sigmas: Floats = np.exp(0.5 * self._hypotheses.components.mean[ALONG:-1:COMPONENTS])
+        return math.sqrt(ALONG_M2_M) * sigmas
+
     def _step_index(self) -> float:
-        """Nonlinearity index of the next metre, inf while the hypotheses are undecided."""
+        """Nonlinearity index of every user's next metre, inf where it is undecided.
+
+        That is where the range variance is not known yet, where few hypotheses count, and where
+        they model different things.
+        """
         these = self._hypotheses
-        log_weight = these.arrays.log_weight
-        self._unperturbed = np.empty_like(log_weight)
+        self._unperturbed = these.unperturbed_weights()
         if float(these.components.covariance[-1, -1]) > hypothesis_count.KNOWN**2:
-            mixture.unperturbed_weights(log_weight, these.perturbed, self._unperturbed)
             return math.inf
-        flags = hypothesis_count.Flags(these.perturbed, these.has_constants, these.has_bias)
-        return float(
-            hypothesis_count.step_index(
-                these.arrays.x, these.arrays.p, log_weight, flags, these.components.mean,
-                these.nodes, np.empty_like(log_weight), self._unperturbed,
-            )
-        )  # fmt: skip
+        weight, effective = these.normalise()
+        if effective < hypothesis_count.EVEN * these.count:
+            return math.inf
+        weights = weight.reshape(-1)[: these.count]
+        constants, biased = float(weights @ these.has_constants), float(weights @ these.has_bias)
+        least = max(min(constants, 1.0 - constants), min(biased, 1.0 - biased))
+        perturbed = float(weights @ (these.perturbed > 0.0))
+        if perturbed > hypothesis_count.PERTURBED_MOST or least > hypothesis_count.UNDECIDED:
+            return math.inf
+        heading = mixture.heading_variances(
+            these.arrays.x, these.arrays.p, self._unperturbed, these.nodes
+        )
+        return float((0.5 * heading / self._sigma_metre_m()).max())
 
     def _is_even(self, covariance: Floats, poses: Indices, step_index: float) -> bool:
-        """Whether the hypotheses lie together and not few of them count."""
+        """Whether not few hypotheses count and they lie together.
+
+        That is where the variances between them, the rest of the mixture's ``covariance`` (D, D),
+        are what the drawn share of the noise accounts for.
+        """
         these = self._hypotheses
         if these.count == 1:
             return True
         drawn = these.sampled_share / (1.0 - these.sampled_share)
-        return step_index < math.inf and bool(
-            hypothesis_count.is_even(
-                these.arrays.p, self._unperturbed, covariance, poses, len(poses), drawn
-            )
-        )
+        places = np.arange(len(poses))
+        own = these.arrays.p[:, storage.triangle_place(places, places)]
+        inside = np.einsum("bl,bil->i", self._unperturbed, own)
+        between = covariance[poses, poses] - inside
+        most = hypothesis_count.APART * drawn * inside + 1e-6
+        return step_index < math.inf and bool((between <= most).all())
 
     def grow(self) -> None:
         """Have as many hypotheses as may be: fewer are copied, and their headings drawn."""
@@ -144,8 +161,9 @@ class AdaptiveCount:
         before, weight = these.sampled_share, these.weights()
         chosen = systematic(weight, count, these.rng)
         after = hypothesis_count.sampled_share(s.sampled, count, s.hypotheses)
+        kept, means = after / before if before else 0.0, these.dense()[0]
         thinned, p = hypothesis_count.thinned(
-            these.x, mean, covariance, chosen, self._headings(), after / before if before else 0.0
+            means, mean, covariance, chosen, self._headings(), kept
         )
         these.replace_by(chosen, weight, thinned, p)
         self._counters["hypotheses_shrunk"] += 1

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from relpos.fusion.bank import (
     detection_update,
     heading_update,
+    lanes,
     mixture,
     motion_update,
     range_update,
@@ -56,17 +57,17 @@ class BankCore:
         self.relocalisation = Relocalisation(self.hypotheses, self.adaptive, self.counters)
         self._lever_m: Floats = np.zeros((0, 2))
         """Each user's antenna, forward and left of its pose."""
-        self._surprise: Floats = np.zeros(0)
         self._since_turn_s: Floats = np.zeros(0)
         """How long each user has gone straight ahead."""
-        self._cusum = CusumDetector.of_nobody()
         self._alarm: tuple[int, tuple[Indices, Indices, Floats]] | None = None
-        prior = settings.outlier_m**2
-        self._outlier = np.array([0.0, prior, settings.outliers_short, 0.0, prior])
-        expected = settings.outliers * OUTLIER_RANGES
-        self._outlier_counts: Floats = np.array(
-            [expected, OUTLIER_RANGES - expected, expected * settings.outlier_m**2]
-        )
+        prior, expected = settings.outlier_m**2, settings.outliers * OUTLIER_RANGES
+        outlier = np.array([0.0, prior, settings.outliers_short, 0.0, prior])
+        counts = np.array([expected, OUTLIER_RANGES - expected, expected * prior])
+        components = self.hypotheses.components
+        self._sensors = Sensors(
+            components.mean, components.covariance, RangeModel(outlier, self._lever_m), counts,
+            np.zeros(0), CusumDetector.of_nobody(),
+        )  # fmt: skip
 
     def add_node(
         self,
@@ -77,19 +78,26 @@ class BankCore:
     ) -> int:
         """Add a user with a Gaussian prior, independent of the others; return its row."""
         self._lever_m = np.concatenate([self._lever_m, np.array([lever_m])])
-        self._surprise = np.append(self._surprise, 0.0)
         self._since_turn_s = np.append(self._since_turn_s, 0.0)
-        self._cusum = self._cusum.with_node()
-        return self.hypotheses.add_node(pose, sigma_m, sigma_rad)
+        row = self.hypotheses.add_node(pose, sigma_m, sigma_rad)
+        components, known = self.hypotheses.components, self._sensors
+        # Where all antennas are on their wearers' axes kernels take the shorter way.
+        levers_m = self._lever_m if self._lever_m.any() else self._lever_m[:0]
+        self._sensors = known._replace(
+            mean=components.mean, covariance=components.covariance,
+            model=known.model._replace(lever_m=levers_m),
+            surprise=np.append(known.surprise, 0.0), cusum=known.cusum.with_node(),
+        )  # fmt: skip
+        return row
 
     def _check(self, first: Indices, second: Indices, *values: Floats) -> None:
         """Raise ``IndexError`` or ``ValueError``: kernels check no bounds."""
         for array in (second, *values):
             if array.shape != first.shape:
                 raise ValueError(f"array of shape {array.shape} for {len(first)} rows")
-        nodes = self.hypotheses.nodes
-        if not mixture.within(first, second, nodes):
-            raise IndexError(f"rows {first.tolist()}, {second.tolist()} of {nodes} users")
+        rows, nodes = [*first.tolist(), *second.tolist()], self.hypotheses.nodes
+        if rows and not 0 <= min(rows) <= max(rows) < nodes:
+            raise IndexError(f"rows {rows} of {nodes} users")
 
     # -- one epoch -----------------------------------------------------------------------------
 
@@ -106,17 +114,14 @@ class BankCore:
         self._check(rows, rows)
         if moves.shape != (several, 4) or len(reported) not in (0, several):
             raise ValueError(f"displacements of shape {moves.shape} for {several} rows")
-        motion, misjudged = np.empty((several, 7)), np.empty(several)
-        turns = motion_update.prepare_motion(
-            rows, moves, reported, these.arrays.component, these.count, self._since_turn_s, motion,
-            misjudged,
-        )  # fmt: skip
+        motion, misjudged = motion_update.prepare_motion(
+            rows, moves, reported, these.arrays.component, these.count, self._since_turn_s
+        )
         if these.count == 1:
             normals = np.zeros((1, several))
         else:
             normals = self.rng.standard_normal((these.count, several))
-        if turns:
-            self._misjudge_turns(rows, misjudged)
+        self._misjudge_turns(rows, misjudged)
         noise = Noise(normals, these.sampled_share, motion_update.CROSS)
         motion_update.advance(these.arrays, rows, motion, noise)
 
@@ -150,11 +155,12 @@ class BankCore:
         self._check(first, second, range_m, dz_m, variance, counts)
         biases = these.bias_entries(first, second)
         ranges = Ranges(first, second, range_m, dz_m, variance, counts, biases)
-        self._outlier[3] = 1.0 / (1.0 - these.sampled_share)
+        outlier, known = self._sensors.model.outlier, self._sensors
+        outlier[3] = 1.0 / (1.0 - these.sampled_share)
         wary = self.relocalisation.since_fault <= OPEN_UPDATES and self.counters["slips"] > 0
-        known, before = self._sensors(), these.log_weight.copy()
-        sensors.expect_outliers(self._outlier_counts, self._outlier)
-        stats = range_update.statistics(several, len(these.arrays.x))
+        before = these.log_weight.copy()
+        sensors.expect_outliers(known.outlier_counts, outlier)
+        stats = lanes.empty_lines(several, range_update.STATS, len(these.arrays.x))
         range_update.update(these.arrays, ranges, known.model, stats)
         inlier, fault, clamped = sensors.learn(
             these.arrays, ranges, known, these.draws, these.perturbed,
@@ -165,15 +171,6 @@ class BankCore:
         if fault >= 0 and self.settings.hypotheses > 1:
             self._alarm = (fault, (first, second, range_m))
         return inlier
-
-    def _sensors(self) -> Sensors:
-        known = self.hypotheses.components
-        # Where all antennas are on their wearers' axes kernels take the shorter way.
-        lever_m = self._lever_m if self._lever_m.any() else self._lever_m[:0]
-        return Sensors(
-            known.mean, known.covariance, RangeModel(self._outlier, lever_m),
-            self._outlier_counts, self._surprise, self._cusum,
-        )  # fmt: skip
 
     def update_heading(self, row: int, heading_rad: float, sigma_rad: float) -> None:
         """Update with an absolute heading of a user."""
@@ -200,10 +197,12 @@ class BankCore:
     def end_instant(self) -> None:
         """Resize, relocalise, resample where the weights are uneven, and perturb a few."""
         these, relocalisation = self.hypotheses, self.relocalisation
-        known = self._sensors()
+        known = self._sensors
+        share = sensors.expect_outliers(known.outlier_counts, known.model.outlier)
+        usual = max(sensors.ODD_SHARE, sensors.ODD_SHARE_OF_OUTLIERS * share)
         ambiguous = bool(
             self._alarm or relocalisation.ambiguous or relocalisation.lost
-            or sensors.surprises(known)
+            or (known.surprise > usual).any()
         )  # fmt: skip
         self.adaptive.resize(ambiguous=ambiguous, since_fault=relocalisation.since_fault)
         _, effective = these.normalise()
@@ -218,6 +217,4 @@ class BankCore:
         elif effective < 0.5 * these.count:
             these.resample(these.weights())
         if these.count > 1:
-            share = float(sensors.expect_outliers(self._outlier_counts, self._outlier))
-            usual = max(sensors.ODD_SHARE, sensors.ODD_SHARE_OF_OUTLIERS * share)
-            relocalisation.perturb_some(self._surprise.tolist(), usual)
+            relocalisation.perturb_some(known.surprise.tolist(), usual)

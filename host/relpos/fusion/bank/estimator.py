@@ -222,10 +222,9 @@ class Bank:
         """Make displacement ``k``, which is far out of its node's habit, in half the hypotheses."""
         self.core.adaptive.grow()
         row, these = int(rows[k]), self.core.hypotheses
-        east, north = these.positions_of(row)
+        before, _ = these.poses_of(row)
         self._make(rows, moves, reported, slice(k, k + 1))
-        after = these.positions_of(row)
-        self.core.relocalisation.split_motion(row, after[0] - east, after[1] - north)
+        self.core.relocalisation.split_motion(row, these.poses_of(row)[0] - before)
 
     def _make(self, rows: Indices, moves: Floats, reported: Floats | None, some: slice) -> None:
         """Make some of the displacements ``rows`` (M,), ``moves`` (M, 4)."""

@@ -20,16 +20,12 @@ hypotheses lie apart by more than what was drawn of the noise accounts for.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.bank import lanes, mixture
-from relpos.fusion.bank.lanes import fill, load
 from relpos.fusion.bank.storage import PER_NODE
 from relpos.fusion.compiled import compiled
-from relpos.fusion.models.motion_variances import ALONG, ALONG_M2_M, COMPONENTS
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -84,17 +80,6 @@ PERTURBED_MOST = 0.1
 """Greatest weight of perturbed hypotheses."""
 
 
-class Flags(NamedTuple):
-    """What kind each hypothesis (K,) is of."""
-
-    perturbed: Floats
-    """Above 0 for so many updates after its pose was perturbed."""
-    has_constants: Floats
-    """1 where step scale and heading drift are modelled."""
-    has_bias: Floats
-    """1 where range biases are."""
-
-
 def sampled_share(share: float, count: int, most: int) -> float:
     """Share of the heading noise that ``count`` hypotheses draw, where ``most`` draw ``share``.
 
@@ -142,64 +127,6 @@ def nonlinearity_index(
         if nodes > 1:
             greatest = max(greatest, 0.5 * math.sqrt(nearest[a] * heading))
     return max(greatest / sigma_range_m, shorter)
-
-
-@compiled
-def is_decided(log_weight: Floats, flags: Flags, weight: Floats) -> bool:
-    """Whether many hypotheses count and all model the same; writes normalised weights."""
-    count = flags.perturbed.shape[0]
-    if mixture.normalise(log_weight, count, weight) < EVEN * count:
-        return False
-    flat = weight.reshape(-1)
-    perturbed, constants, biased = 0.0, 0.0, 0.0
-    for k in range(count):
-        perturbed += flat[k] if flags.perturbed[k] > 0.0 else 0.0
-        constants += flat[k] * flags.has_constants[k]
-        biased += flat[k] * flags.has_bias[k]
-    least = max(min(constants, 1.0 - constants), min(biased, 1.0 - biased))
-    return perturbed <= PERTURBED_MOST and least <= UNDECIDED
-
-
-@compiled
-def is_even(
-    p: Floats, weight: Floats, covariance: Floats, of: Indices, places: int, drawn: float
-) -> bool:
-    """Whether the hypotheses, by ``weight`` (B, LANES), lie together.
-
-    That is where the variances between them, the rest of the mixture's ``covariance`` (D, D), are
-    what ``drawn``, the drawn over the kept share of the noise, accounts for.
-    """
-    for i in range(places):
-        sums = fill(0.0)
-        for b in range(p.shape[0]):
-            at = b * p.shape[1] + (i * (i + 1)) // 2 + i
-            sums = sums + load(weight, b) * load(p, at)
-        within = lanes.total(sums)
-        between = covariance[of[i], of[i]] - within
-        if between > APART * drawn * within + 1e-6:
-            return False
-    return True
-
-
-@compiled
-def step_index(
-    x: Floats, p: Floats, log_weight: Floats, flags: Flags, log_components: Floats, nodes: int,
-    weight: Floats, unperturbed: Floats,
-) -> float:  # fmt: skip
-    """Return the nonlinearity index of every user's next metre; inf where it is undecided.
-
-    That is where few hypotheses count, or they model different things. ``weight`` and
-    ``unperturbed`` (B, LANES) receive the weights, and those without perturbed hypotheses.
-    """
-    mixture.unperturbed_weights(log_weight, flags.perturbed, unperturbed)
-    if not is_decided(log_weight, flags, weight):
-        return np.inf
-    heading = mixture.heading_variances(x, p, unperturbed, nodes)
-    worst = 0.0
-    for n in range(nodes):
-        metre = math.sqrt(ALONG_M2_M) * math.exp(0.5 * log_components[COMPONENTS * n + ALONG])
-        worst = max(worst, 0.5 * heading[n] / metre)
-    return worst
 
 
 def thinned(

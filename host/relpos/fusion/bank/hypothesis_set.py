@@ -12,6 +12,7 @@ from relpos.errors import RelposError
 from relpos.fusion.bank import hypothesis_count, lanes, mixture, storage
 from relpos.fusion.bank import variance_components as components
 from relpos.fusion.bank.lanes import LANES
+from relpos.fusion.bank.mixture import PERTURBED_LOSS
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import PER_NODE, Hypotheses, StateIndex
 from relpos.fusion.bank.variance_components import Draws, VarianceComponents
@@ -75,18 +76,13 @@ class HypothesisSet:
         """For so many instants of ranges a hypothesis teaches nothing about noise (K,)."""
         self.biases: dict[tuple[int, int], int] = {}
         """Pair of rows, the lower first -> entry of its range bias in the state."""
-        self.arrays.p[:, 0] = self._in_lanes(self.has_bias) * settings.bias_m**2
+        self.arrays.p[:, 0] = storage.lay_out(self.has_bias) * settings.bias_m**2
         self.spread_components()
 
     def _share_of_all(self, many: int) -> Floats:
         return (self.rng.permutation(self.count) < many).astype(np.float64)
 
     # -- reading -------------------------------------------------------------------------------
-
-    @property
-    def x(self) -> Floats:
-        """Means (K, D), a copy."""
-        return storage.means(self.arrays.x, self.nodes, self.count)
 
     def dense(self) -> tuple[Floats, Floats]:
         """Means (K, D) and covariances (K, D, D), copies."""
@@ -136,81 +132,56 @@ class HypothesisSet:
         order = storage.order(self.nodes, size)
         return mixture.moments(x, p, weight, self.nodes, order, places, size)
 
-    def positions_of(self, row: int) -> tuple[Floats, Floats]:
-        """Where a user is in every hypothesis: x (K,) and y (K,), metres."""
-        return self._column(row, StateIndex.X), self._column(row, StateIndex.Y)
+    def unperturbed_weights(self) -> Floats:
+        """Return weights (B, LANES), those of perturbed hypotheses next to nothing."""
+        logs = self.arrays.log_weight.copy()
+        logs.reshape(-1)[: self.count] -= np.where(self.perturbed > 0.0, PERTURBED_LOSS, 0.0)
+        weight = np.empty_like(logs)
+        mixture.normalise(logs, self.count, weight)
+        return weight
 
-    def poses_of(self, row: int) -> tuple[Floats, Floats]:
-        """A user's poses (K, 3) and their covariances (K, 3, 3)."""
-        poses = np.stack([self._column(row, entry) for entry in range(3)], axis=1)
-        spread = np.empty((self.count, 3, 3))
-        for a in range(3):
-            for b in range(3):
-                spread[:, a, b] = self._covariance_column(self._place(row, a), self._place(row, b))
-        return poses, spread
+    def poses_of(self, *rows: int) -> tuple[Floats, Floats]:
+        """Poses (K, 3 M) of users and their covariances (K, 3 M, 3 M)."""
+        places = (storage.POSE * np.array(rows)[:, None] + np.arange(storage.POSE)).ravel()
+        pairs = storage.triangle_place(places[:, None], places)
+        return (
+            storage.of_each(self.arrays.x[:, places], self.count),
+            storage.of_each(self.arrays.p[:, pairs], self.count),
+        )
 
-    def apart(self, row: int, other: int) -> tuple[Floats, Floats]:
-        """Where a user is relative to another: (K, 2) and its covariances (K, 2, 2)."""
-        (from_x, from_y), (to_x, to_y) = self.positions_of(row), self.positions_of(other)
-        i, j = self._place(row), self._place(other)
-        spread = np.empty((self.count, 2, 2))
-        for a in range(2):
-            for b in range(2):
-                own, peer, cross, back = (
-                    self._covariance_column(m, n)
-                    for m, n in ((i + a, i + b), (j + a, j + b), (i + a, j + b), (j + a, i + b))
-                )
-                spread[:, a, b] = own + peer - cross - back
-        return np.stack([to_x - from_x, to_y - from_y], axis=1), spread
-
-    def _place(self, row: int, entry: int = 0) -> int:
+    def _place(self, row: int, entry: int) -> int:
         """Where an entry of a user is stored."""
-        return storage.place_of(PER_NODE * row + entry, self.nodes)
+        if entry < storage.POSE:
+            return storage.POSE * row + entry
+        constants = storage.POSE * self.nodes + storage.CONSTANTS * row
+        return constants + entry - storage.POSE
 
-    def _column(self, row: int, entry: int) -> Floats:
-        flat: Floats = self.arrays.x[:, self._place(row, entry)].reshape(-1)[: self.count]
-        return flat.copy()
-
-    def _covariance_column(self, place: int, other: int) -> Floats:
-        flat: Floats = self.arrays.p[:, storage.triangle_place(place, other)].reshape(-1)
-        return flat[: self.count]
-
-    def _in_lanes(self, values: Floats) -> Floats:
-        """Lay out one number of each hypothesis (K,) as (B, LANES)."""
-        laid = np.full(lanes.blocks_of(self.count) * LANES, values[0])
-        laid[: self.count] = values
-        return laid.reshape(-1, LANES)
+    def _at(self, which: Indices | None) -> tuple[Indices, Indices]:
+        """Block and lane of the hypotheses ``which``, or of all."""
+        which = np.arange(self.count) if which is None else which
+        return which // LANES, which % LANES
 
     # -- changing one user ---------------------------------------------------------------------
 
     def shift(self, row: int, entry: int, by: Floats, which: Indices | None = None) -> None:
-        """Add ``by`` (K,) to an entry of a user in all hypotheses, or in ``which`` (K,)."""
-        place, x = self._place(row, entry), self.arrays.x
-        if which is None:
-            x[:, place] += self._in_lanes(by)
-        else:
-            x[which // LANES, place, which % LANES] += by
+        """Add ``by`` (M,) to an entry of a user in the hypotheses ``which`` (M,), or in all."""
+        block, lane = self._at(which)
+        self.arrays.x[block, self._place(row, entry), lane] += by
 
     def set_all(self, row: int, entry: int, values: Floats) -> None:
         """Set an entry of a user to ``values`` (K,)."""
-        self.arrays.x[:, self._place(row, entry)] = self._in_lanes(values)
+        self.arrays.x[:, self._place(row, entry)] = storage.lay_out(values)
 
     def inflate(self, row: int, entry: int, variance: float, which: Indices | None = None) -> None:
-        """Add to the variance of an entry of a user in all hypotheses, or in ``which``."""
-        place = storage.triangle_place(self._place(row, entry), self._place(row, entry))
-        if which is None:
-            self.arrays.p[:, place] += variance
-        else:
-            self.arrays.p[which // LANES, place, which % LANES] += variance
+        """Add to the variance of an entry of a user in the hypotheses ``which``, or in all."""
+        place, (block, lane) = self._place(row, entry), self._at(which)
+        self.arrays.p[block, storage.triangle_place(place, place), lane] += variance
 
     def decorrelate(self, row: int, entry: int, which: Indices | None = None) -> None:
-        """Set all covariances of an entry of a user to zero, in all hypotheses or ``which``."""
-        place, p = self._place(row, entry), self.arrays.p
-        others = [storage.triangle_place(place, q) for q in range(self.arrays.x.shape[1])]
-        if which is None:
-            p[:, others] = 0.0
-        else:
-            p[which[:, None] // LANES, np.array(others), which[:, None] % LANES] = 0.0
+        """Set all covariances of an entry to zero in the hypotheses ``which``, or in all."""
+        block, lane = self._at(which)
+        others = storage.triangle_place(self._place(row, entry), np.arange(self.arrays.x.shape[1]))
+        self.arrays.p[block[:, None], others, lane[:, None]] = 0.0
 
     def poses_in(self, rows: Indices, which: Indices) -> Floats:
         """Poses (M, 3) of users ``rows`` (M,) or (1,) in the hypotheses ``which`` (M,)."""
@@ -345,9 +316,9 @@ class HypothesisSet:
         p = lanes.empty_lines(len(x0), old + size + 1)
         x[:, :size], x[:, size] = x0, x0[:, common]
         p[:, :old] = p0
-        p[:, old:-1] = p0[:, [storage.triangle_place(common, q) for q in range(size)]]
+        p[:, old:-1] = p0[:, storage.triangle_place(common, np.arange(size))]
         own = self.has_bias * self.settings.pair_bias_m**2
-        p[:, -1] = p0[:, storage.triangle_place(common, common)] + self._in_lanes(own)
+        p[:, -1] = p0[:, storage.triangle_place(common, common)] + storage.lay_out(own)
         self.arrays = self.arrays._replace(x=x, p=p)
         self.biases[pair] = size
         return size
@@ -429,12 +400,7 @@ class HypothesisSet:
                 component=lanes.empty_lines(blocks, self.nodes, COMPONENTS),
                 range_variance=lanes.empty_lines(blocks),
             )
-        fill = self._normals[[-1] * (blocks * LANES - self.count)]
-        laid = np.concatenate([self._normals, fill]).reshape(blocks, LANES, -1)
-        self.draws = Draws(
-            lanes.copy_lines(laid.transpose(0, 2, 1)),
-            self._in_lanes(self.low_heading_noise),
-            self.settings.spread,
-        )
+        normals, low = storage.lay_out(self._normals), storage.lay_out(self.low_heading_noise)
+        self.draws = Draws(normals, low, self.settings.spread)
         known = self.components
         components.spread(self.draws, known.mean, known.covariance, self.arrays)

@@ -65,13 +65,6 @@ def empty_lines(*shape: int) -> Floats:
     return working_lines(math.prod(shape)).reshape(*shape, LANES)
 
 
-def copy_lines(array: Floats) -> Floats:
-    """Copy an array of ``empty_lines``."""
-    copy = empty_lines(*array.shape[:-1])
-    copy[...] = array
-    return copy
-
-
 # -- the two types ---------------------------------------------------------------------------------
 
 

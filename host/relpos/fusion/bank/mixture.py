@@ -22,16 +22,6 @@ PERTURBED_LOSS = 20.0
 
 
 @compiled
-def within(first: Indices, second: Indices, nodes: int) -> bool:
-    """Whether all rows are those of users: kernels check no bounds."""
-    least, most = 0, 0
-    for r in range(first.shape[0]):
-        least = min(least, first[r], second[r])
-        most = max(most, first[r], second[r])
-    return least >= 0 and most < nodes
-
-
-@compiled
 def normalise(log_weight: Floats, count: int, weight: Floats) -> float:
     """Write weights (B, LANES) that sum to 1 over the first ``count``, and 0 beyond them.
 
@@ -54,18 +44,6 @@ def normalise(log_weight: Floats, count: int, weight: Floats) -> float:
         weights[k] /= total
         squares += weights[k] * weights[k]
     return 1.0 / squares
-
-
-@compiled
-def unperturbed_weights(log_weight: Floats, perturbed: Floats, weight: Floats) -> None:
-    """As ``normalise``, with next to nothing where ``perturbed`` (K,) is above 0."""
-    count = perturbed.shape[0]
-    logs = log_weight.copy()
-    flat = logs.reshape(-1)
-    for k in range(count):
-        if perturbed[k] > 0.0:
-            flat[k] -= PERTURBED_LOSS
-    normalise(logs, count, weight)
 
 
 @compiled

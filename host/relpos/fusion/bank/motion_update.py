@@ -353,23 +353,22 @@ def prepare_motion(
     component: Floats,
     count: int,
     since_turn_s: Floats,
-    motion: Floats,
-    misjudged: Floats,
-) -> bool:
-    """Write what ``advance`` takes of displacements (M, 4) into ``motion`` (M, 7).
+) -> tuple[Floats, Floats]:
+    """Return what ``advance`` takes of displacements (M, 4), (M, 7), and who misjudges their turns.
 
-    ``reported`` (M, 3), or (0, 3) where no report brings any, are the reported deviations.
-    ``misjudged`` (M,) receives the share of hypotheses that are to misjudge a turn, -1 where there
-    is none; returns whether there are any.
+    ``reported`` (M, 3), or (0, 3) where no report brings any, are the reported deviations. The
+    second result (M,) is the share of hypotheses that are to misjudge a turn, -1 where there is
+    none.
 
     A turn's noise grows with the turn, of which only the report is known: one of a right
     angle that was reported as next to nothing would pass for exact. Only what sticks out of
     the wearer's white heading noise is a turn, and only reports that bring no sigma need it;
     who turns all the time is judged by the next turn, and is left alone.
     """
-    anybody = False
+    several = rows.shape[0]
+    motion, misjudged = np.empty((several, 7)), np.full(several, -1.0)
     base = base_variances(moves, reported)
-    for m in range(rows.shape[0]):
+    for m in range(several):
         for part in range(4):
             motion[m, part] = moves[m, part]
         for part in range(COMPONENTS):
@@ -378,7 +377,6 @@ def prepare_motion(
         if motion[m, 0] == 0.0 and motion[m, 1] == 0.0 and motion[m, 2] == 0.0:
             motion[m, 3] = 0.0
         row = rows[m]
-        misjudged[m] = -1.0
         if count < 2:
             continue
         mean = 0.0
@@ -390,7 +388,6 @@ def prepare_motion(
         if turn and (reported.shape[0] == 0 or math.isnan(reported[m, 2])):
             misjudged[m] = MISJUDGED * min(since_turn_s[row] / STRAIGHT_S, 1.0) ** 2
             since_turn_s[row] = 0.0
-            anybody = True
         else:
             since_turn_s[row] += motion[m, 3]
-    return anybody
+    return motion, misjudged

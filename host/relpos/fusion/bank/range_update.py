@@ -60,11 +60,6 @@ class Ranges(NamedTuple):
     """Entry of the state that holds the range's bias, or -1."""
 
 
-def statistics(ranges: int, blocks: int) -> Floats:
-    """Return an array (R, STATS, B, LANES) for the statistics of :func:`update`."""
-    return lanes.empty_lines(ranges, STATS, blocks)
-
-
 class RangeModel(NamedTuple):
     """What is known of all ranges."""
 

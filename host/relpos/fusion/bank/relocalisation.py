@@ -141,13 +141,12 @@ class Relocalisation:
             if near < FOUND_M**2 and heading < FOUND_RAD**2:
                 self.ambiguous.discard(row)
 
-    def split_motion(self, row: int, east_m: Floats, north_m: Floats) -> None:
-        """Let half the hypotheses leave out a displacement (K,) just made, world axes."""
+    def split_motion(self, row: int, moved: Floats) -> None:
+        """Let half the hypotheses leave out a displacement (K, 3) just made, world axes."""
         these = self._hypotheses
         skip = np.flatnonzero(np.arange(these.count) % 2 == 0)
-        these.shift(row, StateIndex.X, -east_m[skip], skip)
-        these.shift(row, StateIndex.Y, -north_m[skip], skip)
         for entry in (StateIndex.X, StateIndex.Y):
+            these.shift(row, entry, -moved[skip, entry], skip)
             these.inflate(row, entry, ODD_M**2)
         these.perturbed[:] = FAULT_UPDATES
         self._counters["motions_doubted"] += 1

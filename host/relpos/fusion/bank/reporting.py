@@ -149,8 +149,11 @@ class Report:
         a, b = self.row[pair.node], self.row[pair.peer]
         if {a, b}.isdisjoint(self.core.relocalisation.ambiguous):
             return pair
-        these = self.core.hypotheses
-        return _pair_of_mixture(pair.node, pair.peer, these.weights(), *these.apart(a, b))
+        these, here, there = self.core.hypotheses, slice(0, 2), slice(3, 5)
+        poses, p = these.poses_of(a, b)
+        spread = p[:, here, here] + p[:, there, there] - p[:, here, there] - p[:, there, here]
+        off = poses[:, there] - poses[:, here]
+        return _pair_of_mixture(pair.node, pair.peer, these.weights(), off, spread)
 
     def _ambiguous_alternatives(self) -> tuple[Alternative, ...]:
         """List the modes of the team while a node is ambiguous, from the likeliest hypotheses."""

@@ -57,28 +57,17 @@ class Sensors(NamedTuple):
     cusum: CusumDetector
 
 
-@compiled
 def expect_outliers(counts: Floats, outlier: Floats) -> float:
     """Return the expected share of outliers; it and their variance are written to ``outlier``.
 
     ``counts`` are :attr:`Sensors.outlier_counts`, ``outlier`` (5,) is ``RangeModel.outlier``.
     """
-    prior = outlier[4]
-    learned = (counts[2] + OUTLIERS_EXPECTED * prior) / (counts[0] + OUTLIERS_EXPECTED)
-    outlier[0] = min(max(counts[0] / (counts[0] + counts[1]), 0.005), 0.5)
-    outlier[1] = min(max(learned, prior / 9.0), 9.0 * prior)
-    return float(outlier[0])
-
-
-@compiled
-def surprises(sensors: Sensors) -> bool:
-    """Whether any user's share of odd ranges is out of the usual."""
-    expected = expect_outliers(sensors.outlier_counts, sensors.model.outlier)
-    usual = max(ODD_SHARE, ODD_SHARE_OF_OUTLIERS * expected)
-    most = 0.0
-    for much in sensors.surprise:
-        most = max(most, much)
-    return most > usual
+    outliers, others, squares = counts.tolist()
+    prior = float(outlier[4])
+    share: float = min(max(outliers / (outliers + others), 0.005), 0.5)
+    learned = (squares + OUTLIERS_EXPECTED * prior) / (outliers + OUTLIERS_EXPECTED)
+    outlier[0], outlier[1] = share, min(max(learned, prior / 9.0), 9.0 * prior)
+    return share
 
 
 @inner

@@ -23,6 +23,7 @@ from relpos.fusion.compiled import compiled, inner
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
+IndicesOrInt = Indices | int
 
 
 class StateIndex(IntEnum):
@@ -92,44 +93,41 @@ def order(nodes: int, size: int) -> Indices:
     ).astype(np.int64)
 
 
-def place_of(entry: int, nodes: int) -> int:
-    """Give the storage's place of an entry of the state."""
-    user, part = divmod(entry, PER_NODE)
-    if user >= nodes:
-        return entry
-    if part < POSE:
-        return POSE * user + part
-    return POSE * nodes + CONSTANTS * user + part - POSE
+def lay_out(values: Floats) -> Floats:
+    """Lay out numbers (K, ...) as (B, ..., LANES); what is left of a block repeats the first."""
+    count, *rest = values.shape
+    which = np.arange(lanes.blocks_of(count) * LANES)
+    which[count:] = 0
+    laid = lanes.empty_lines(len(which) // LANES, *rest)
+    laid[...] = np.moveaxis(values[which].reshape(-1, LANES, *rest), 1, -1)
+    return laid
+
+
+def of_each(laid: Floats, count: int) -> Floats:
+    """Give numbers (B, ..., LANES) of each hypothesis, (K, ...)."""
+    rows = np.moveaxis(laid, -1, 1).reshape(-1, *laid.shape[1:-1])
+    return np.ascontiguousarray(rows[:count])
+
+
+def triangle_place(i: IndicesOrInt, j: IndicesOrInt) -> Indices:
+    """Give the place of a covariance in the triangle."""
+    later = np.maximum(i, j)
+    place: Indices = later * (later + 1) // 2 + np.minimum(i, j)
+    return place
 
 
 def pack(x: Floats, p: Floats, nodes: int) -> tuple[Floats, Floats]:
-    """Store means (K, D) and covariances (K, D, D); what is left of a block repeats the first."""
-    count, size = x.shape
-    blocks = lanes.blocks_of(count)
-    stored = lanes.empty_lines(blocks, size), lanes.empty_lines(blocks, size * (size + 1) // 2)
-    _pack(np.ascontiguousarray(x), np.ascontiguousarray(p), order(nodes, size), *stored)
-    return stored
+    """Store means (K, D) and covariances (K, D, D)."""
+    of = order(nodes, x.shape[1])
+    row, column = np.tril_indices(len(of))
+    return lay_out(x[:, of]), lay_out(p[:, of[row], of[column]])
 
 
 def unpack(x: Floats, p: Floats, nodes: int, count: int) -> tuple[Floats, Floats]:
     """Give means (K, D) and covariances (K, D, D) as they are stored."""
-    size = x.shape[1]
-    given = np.empty((count, size)), np.empty((count, size, size))
-    _unpack(x, p, order(nodes, size), *given)
-    return given
-
-
-def means(x: Floats, nodes: int, count: int) -> Floats:
-    """Give the means (K, D) alone."""
-    flat = x.transpose(0, 2, 1).reshape(-1, x.shape[1])[:count]
-    given = np.empty_like(flat)
-    given[:, order(nodes, x.shape[1])] = flat
-    return given
-
-
-def triangle_place(i: int, j: int) -> int:
-    """Give the place of a covariance in the triangle."""
-    return i * (i + 1) // 2 + j if i >= j else j * (j + 1) // 2 + i
+    place = np.argsort(order(nodes, x.shape[1]))
+    pairs = triangle_place(place[:, None], place)
+    return of_each(x[:, place], count), of_each(p[:, pairs], count)
 
 
 def select_hypotheses(of: Floats, chosen: Indices) -> Floats:
@@ -137,36 +135,6 @@ def select_hypotheses(of: Floats, chosen: Indices) -> Floats:
     taken = lanes.empty_lines(lanes.blocks_of(len(chosen)), of.shape[1])
     _select(of, chosen, taken)
     return taken
-
-
-@compiled
-def _pack(x: Floats, p: Floats, of: Indices, to_x: Floats, to_p: Floats) -> None:
-    count, size = x.shape
-    for b in range(to_x.shape[0]):
-        for lane in range(LANES):
-            k = b * LANES + lane
-            if k >= count:
-                k = 0
-            t = 0
-            for i in range(size):
-                to_x[b, i, lane] = x[k, of[i]]
-                for j in range(i + 1):
-                    to_p[b, t, lane] = p[k, of[i], of[j]]
-                    t += 1
-
-
-@compiled
-def _unpack(x: Floats, p: Floats, of: Indices, to_x: Floats, to_p: Floats) -> None:
-    count, size = to_x.shape
-    for k in range(count):
-        b, lane = k // LANES, k % LANES
-        t = 0
-        for i in range(size):
-            to_x[k, of[i]] = x[b, i, lane]
-            for j in range(i + 1):
-                to_p[k, of[i], of[j]] = p[b, t, lane]
-                to_p[k, of[j], of[i]] = p[b, t, lane]
-                t += 1
 
 
 @compiled
