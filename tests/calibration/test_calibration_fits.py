@@ -184,7 +184,7 @@ def test_people_scatter_about_the_population_whatever_the_node_was_set_to():
     assert again.gain_permille == pytest.approx(fresh.gain_permille, abs=2)
 
 
-def test_a_walk_that_cannot_be_the_one_that_was_told_is_refused():
+def test_a_walk_that_does_not_match_the_stated_distance_is_refused():
     with pytest.raises(DataError, match="too far apart"):
         steps.fit_walk(2130, 40, 30.0, 60.0)
     with pytest.raises(DataError, match="steps"):

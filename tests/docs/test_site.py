@@ -49,7 +49,7 @@ def test_every_page_is_built(site):
     assert len(pages) > 20
 
 
-def test_the_built_pages_ask_nobody_else_for_anything(site):
+def test_the_built_pages_load_nothing_from_other_sites(site):
     for page in site.rglob("*.html"):
         requests = Requests()
         requests.feed(page.read_text(encoding="utf-8"))

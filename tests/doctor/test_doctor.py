@@ -183,7 +183,7 @@ def test_without_a_browser_or_a_screen_other_ways_are_named(tmp_path):
         assert "--terminal" in words
 
 
-def test_a_clock_before_the_counters_is_wrong_and_one_that_nobody_sets_a_hint(tmp_path):
+def test_a_clock_before_the_counters_is_wrong_and_an_unsynchronised_one_is_a_hint(tmp_path):
     early = datetime(1970, 1, 1, tzinfo=UTC)
     assert said(installed(tmp_path, time=early), "clock")[0] == "wrong"
     answers = {"timedatectl": "NTPSynchronized=no\n"}
@@ -220,7 +220,7 @@ def test_a_port_that_may_not_be_used_is_wrong(differences, remedy):
     assert told.startswith(remedy)
 
 
-def test_who_holds_a_port_is_named():
+def test_the_program_that_holds_a_port_is_named():
     state, words, _ = said(ports(PORT, held=["screen (42)"]), f"port {PORT}")
     assert state == "wrong"
     assert "screen (42)" in words

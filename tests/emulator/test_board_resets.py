@@ -65,7 +65,7 @@ def straight(board, seconds, **errors):
 
 
 @pytest.mark.parametrize("board", BOARDS)
-def test_a_node_tells_why_it_was_restarted_and_counts_it(board):
+def test_a_node_reports_the_cause_of_a_restart_and_counts_it(board):
     told = []
     causes = ("POWER_ON", "BROWN_OUT", "WATCHDOG", "EXTERNAL")
     with straight(board, 60.0) as team:
@@ -84,7 +84,7 @@ def test_a_node_tells_why_it_was_restarted_and_counts_it(board):
 
 
 @pytest.mark.parametrize("board", BOARDS)
-def test_nothing_is_executed_or_heard_in_the_start_up_after_a_reset(board):
+def test_nothing_is_executed_or_received_in_the_start_up_after_a_reset(board):
     with straight(board, 20.0) as team:
         listener = Listener(team)
         listener.until(10_000_000)

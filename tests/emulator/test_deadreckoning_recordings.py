@@ -85,7 +85,7 @@ def test_alignment_spends_the_first_leg_and_nothing_else():
     assert long["median_percent"] == pytest.approx(100.0 * np.median(ends))
 
 
-def test_a_recording_that_lost_samples_is_told_from_a_sound_one():
+def test_a_recording_that_lost_samples_is_distinguished_from_a_sound_one():
     time = np.arange(0.0, 30.0, 0.02)
     contacts = np.arange(5.0, 26.0, 0.6)
 

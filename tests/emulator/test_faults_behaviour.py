@@ -175,7 +175,7 @@ def test_a_chip_that_fell_asleep_is_set_up_anew_at_once(spec):
 
 @of("magnetometer:off", "magnetometer:stuck", "magnetometer:garbage", "magnetometer:wrong",
     "magnetometer:slow")  # fmt: skip
-def test_without_a_true_field_no_heading_is_told_and_the_gyroscope_goes_on(spec):
+def test_no_heading_is_reported_without_a_true_field_and_the_gyroscope_goes_on(spec):
     result = outcome(spec)
     inside = [h for t, h in result.run.headings(NODE) if BEGIN_S + 3.0 <= t < END_S]
     # A tick that is left out for a step gives a slow conversion the time it needs: a true reading.
@@ -371,7 +371,7 @@ def test_a_clock_that_halts_for_moments_hangs_nothing_and_loses_no_more_than_tha
 
 
 @of("clock:off", "node:off", "node:brownout")
-def test_a_restart_loses_the_unreported_second_is_told_and_widens_the_first_motion(spec):
+def test_a_restart_is_reported_loses_the_unreported_second_and_widens_the_first_motion(spec):
     result = outcome(spec)
     fault = SPECS[spec]
     cause = {

@@ -42,7 +42,7 @@ def assert_sound(run):
         ("eeprom:cut:node=2,from=1.7,write=3,left=garbage", wire.ResetCause.BROWN_OUT),
     ],
 )
-def test_a_restart_is_told_with_its_cause_and_the_next_boot_count(spec, cause):
+def test_a_restart_is_reported_with_its_cause_and_the_next_boot_count(spec, cause):
     run = walk(spec)
     assert_sound(run)
     boots = [f.boot for _, f in run.frames if f.node == NODE]

@@ -78,7 +78,7 @@ def test_every_part_has_every_behaviour_or_a_reason_why_not(target, behaviour):
         ("node:brownout", "happens at a moment: give from=SECONDS"),
     ],
 )
-def test_a_mistake_is_told_in_one_line_that_says_what_is_allowed(spec, words):
+def test_a_mistake_is_reported_in_one_line_that_says_what_is_allowed(spec, words):
     with pytest.raises(FaultError) as refused:
         parse_fault(spec, NODES)
     assert words in str(refused.value)

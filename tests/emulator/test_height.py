@@ -74,7 +74,7 @@ def over_start(walker, time_s):
     return np.interp(time_s, walker.time_s, walker.position_m[:, 2]) - start_m
 
 
-def test_a_climb_is_told_with_every_motion_once_the_start_is_known(climb):
+def test_a_climb_is_reported_with_every_motion_once_the_start_is_known(climb):
     walkers, run, _ = climb
     time_s, height_m = of_node(run, 1)
     assert len(time_s) >= 0.85 * (walkers[1].time_s[-1] - 10.0)

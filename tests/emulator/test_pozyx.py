@@ -138,7 +138,7 @@ def test_an_exchange_ends_with_the_true_distance_at_both_tags(by_bytes):
     assert field.info(1, 1)[2] == 7321
 
 
-def test_the_air_tells_of_each_exchange_when_it_is_over():
+def test_the_channel_reports_each_exchange_when_it_is_over():
     field = Field(0.0, 5.0, 9.0, 40.0, 44.0)
     records = []
     field.air.on_end = records.append

@@ -78,7 +78,7 @@ def test_nothing_is_lost_at_full_speed_with_a_slow_reader():
     assert numbers(data) == list(range(1, 6001))
 
 
-def test_the_clock_stands_while_nobody_reads():
+def test_the_clock_stands_while_the_port_is_not_read():
     talker = Talker(seconds=1000.0)
     with PseudoTerminal(talker, speed=0.0) as terminal:
         terminal.start()
@@ -150,7 +150,7 @@ def test_a_reader_without_settings_of_its_own_gets_raw_bytes():
     assert talker.heard == b""  # nothing was echoed
 
 
-def test_marks_tell_the_virtual_time_of_what_follows():
+def test_marks_carry_the_virtual_time_of_what_follows():
     talker = Talker(seconds=5.0)
     with PseudoTerminal(talker, speed=0.0, mark_time=True) as terminal:
         with serial.Serial(terminal.path, 38_400, timeout=0.05) as port:
@@ -168,7 +168,7 @@ def test_marks_tell_the_virtual_time_of_what_follows():
         assert int.from_bytes(mark.data, "big") == number * 10_000
 
 
-def test_the_port_of_the_same_process_tells_the_exact_arrival_of_every_byte():
+def test_the_port_of_the_same_process_gives_the_exact_arrival_of_every_byte():
     talker = Talker(seconds=20.0, period_us=7_000)
     parser = Parser()
     arrivals = []
@@ -220,7 +220,7 @@ def test_the_link_lives_in_the_marked_time_whatever_its_own_clock_says():
     assert [m.time_s for m in motions] == pytest.approx([k + 0.002 for k in range(1, 100)])
 
 
-def test_a_team_that_fails_tells_the_reader_why():
+def test_a_team_that_fails_gives_the_reader_its_error():
     talker = Talker(seconds=10.0)
     talker.fails_at_us = 5_000_000
     with PseudoTerminal(talker, speed=0.0) as terminal, terminal.open_port() as port:
@@ -234,7 +234,7 @@ def test_a_team_that_fails_tells_the_reader_why():
             read_on()
 
 
-def test_the_end_is_said_in_words_and_the_last_byte_arrives(capsys):
+def test_the_end_is_reported_in_words_and_the_last_byte_arrives(capsys):
     talker = Talker(seconds=3.0)
     terminal = PseudoTerminal(talker, speed=0.0)
     data = b""

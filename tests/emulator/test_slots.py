@@ -75,7 +75,7 @@ def test_twenty_share_the_air_fairly(twenty):
     assert twenty.fewest_ranges >= 0.8 * twenty.most_ranges
 
 
-def test_without_slots_nobody_of_twenty_is_shut_out(twenty_unslotted):
+def test_no_node_of_twenty_is_shut_out_without_slots(twenty_unslotted):
     assert twenty_unslotted.fewest_ranges > 0
     assert twenty_unslotted.fewest_ranges >= 0.2 * twenty_unslotted.most_ranges
 

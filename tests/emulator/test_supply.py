@@ -31,7 +31,7 @@ def told_v(team, link, until_us):
 
 
 @pytest.mark.parametrize("board", BOARDS)
-def test_a_sagging_supply_is_told_by_the_status(board):
+def test_a_sagging_supply_is_reported_by_the_status(board):
     with EmulatedTeam(TeamConfig("straight", 1, 40.0, seed=1, board=board)) as team:
         link = Link()
         # One count of the 10-bit converter is 22 mV at 5 V, 16 mV at 4.3 V.

@@ -154,7 +154,7 @@ def beacons_of(team, node, seconds):
     return heard
 
 
-def test_a_team_that_sends_beacons_itself_tells_its_virtual_time():
+def test_a_team_that_sends_beacons_itself_sends_its_virtual_time():
     key = bytes(range(16))
     with EmulatedTeam(TeamConfig("paper", 3, 30.0, 3, key=key, beacons=True)) as team:
         heard = beacons_of(team, 2, 30.0)

@@ -80,7 +80,7 @@ def test_loss_is_reported_as_no_acknowledgement():
     assert network.frames(1)[0].transmit_status.code == 1
 
 
-def test_an_address_nobody_has_gives_no_acknowledgement():
+def test_an_unused_address_gives_no_acknowledgement():
     network = Network()
     network.feed(1, tx16(9, b"x"))
     assert network.run().frames(1)[0].transmit_status.code == 1
@@ -120,7 +120,7 @@ def test_a_64_bit_address_is_one_of_a_module():
     assert bytes(network.run().frames(2)[0].rf_data) == b"long"
 
 
-def test_a_module_without_short_address_is_heard_by_its_long_one():
+def test_a_module_without_a_short_address_is_received_under_its_long_one():
     network = Network()
     network.feed(1, ATCommPacket(1, "MY", parameter=b"\xff\xff"))
     network.feed(1, tx16(0, b"x", frame_id=0))

@@ -293,7 +293,7 @@ def _reordered(scene: TrueRun, order: list[int]) -> dict[str, npt.NDArray[np.gen
     }
 
 
-def test_ranges_that_are_sometimes_too_long_tell_less() -> None:
+def test_ranges_that_are_sometimes_too_long_carry_less_information() -> None:
     clean = bounds.of_simulated("paper-p1", 0, {"seconds": 120}).totals()
     late = bounds.of_simulated("paper-p1", 0, {"seconds": 120, "nlos_probability": 0.2}).totals()
     # A fifth of the ranges tells next to nothing; the others can be told from them.

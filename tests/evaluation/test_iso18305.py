@@ -81,9 +81,7 @@ def test_vertical_and_spherical_errors_are_over_each_ones_own_start() -> None:
     assert found.spherical.rms_m == pytest.approx(math.sqrt(4.0 + 9.0 / 5.0))
 
 
-def test_a_picture_that_lies_elsewhere_as_a_whole_has_no_error_after_one_motion_for_the_run() -> (
-    None
-):
+def test_an_estimate_displaced_as_a_whole_has_no_error_after_one_alignment_of_the_run() -> None:
     truth = {1: straight(), 2: straight((3.0, 0.0)), 3: straight((0.0, -4.0))}
     estimate = {node: turned(track, 1.1, (50.0, -7.0)) for node, track in truth.items()}
     found = assess(estimate, truth, common_frame=False)
@@ -93,7 +91,7 @@ def test_a_picture_that_lies_elsewhere_as_a_whole_has_no_error_after_one_motion_
         assert found.frames[frame].horizontal.max_m == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_picture_that_turns_as_it_goes_is_right_a_second_at_a_time_alone() -> None:
+def test_an_estimate_that_keeps_turning_is_right_only_after_an_alignment_each_second() -> None:
     truth = {1: straight(), 2: straight((3.0, 0.0)), 3: straight((0.0, -4.0))}
     estimate = {}
     for node, track in truth.items():
@@ -113,7 +111,7 @@ def test_two_nodes_say_nothing_of_a_shape() -> None:
     assert Frame.PER_EPOCH not in assess(truth, truth, common_frame=True).frames
 
 
-def test_a_mirrored_picture_is_not_forgiven() -> None:
+def test_a_mirrored_estimate_has_an_error() -> None:
     truth = {1: straight(), 2: straight((3.0, 0.0)), 3: straight((0.0, -4.0))}
     mirrored = {n: Track(t.time_s, t.x_m, -t.y_m) for n, t in truth.items()}
     found = assess(mirrored, truth, common_frame=False)

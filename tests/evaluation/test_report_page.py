@@ -161,7 +161,7 @@ def page(made: Path) -> Page:
     return Page((made / "report.html").read_text())
 
 
-def test_the_page_is_well_formed_and_asks_nobody_for_anything(page: Page, made: Path) -> None:
+def test_the_page_is_well_formed_and_loads_nothing_from_elsewhere(page: Page, made: Path) -> None:
     assert page.outside == []
     assert "http" not in (made / "report.html").read_text()
     assert len(page.ids) == len(set(page.ids))
@@ -194,7 +194,7 @@ def test_its_numbers_are_those_of_evaluate(page: Page, directory: Path, made: Pa
         assert repr(value) in page.values, value
 
 
-def test_it_tells_of_links_and_nodes(page: Page) -> None:
+def test_the_page_describes_links_and_nodes(page: Page) -> None:
     words = " ".join(" ".join(page.text).split())
     health = {row["node"]: row for row in json.loads(page.json)["health"]}
     assert health[2]["restarts"] == 1
@@ -222,7 +222,7 @@ def test_the_same_estimate_gives_the_same_page(made: Path, directory: Path) -> N
     assert again.read_bytes() == (made / "report.html").read_bytes()
 
 
-def test_without_truth_it_still_tells_what_is_known(run: relpos.Run, tmp_path: Path) -> None:
+def test_a_page_without_truth_shows_what_is_known(run: relpos.Run, tmp_path: Path) -> None:
     blind = replace(run, truth=())
     blind = replace(blind, description=replace(run.description, simulated=None))
     relpos.save(blind, tmp_path / "blind")

@@ -71,7 +71,7 @@ def test_a_cluster_that_is_not_there_is_one_clear_error(monkeypatch: pytest.Monk
         pass
 
 
-def test_an_estimator_that_gives_up_is_told_and_not_counted() -> None:
+def test_an_estimator_that_gives_up_is_reported_and_not_counted() -> None:
     outcome = study.run(CASES[2:], range(2), executors.Serial())[0]
     assert outcome.distance_m.count == 0
     assert math.isnan(outcome.distance_m.mean)

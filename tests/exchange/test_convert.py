@@ -182,7 +182,7 @@ def test_another_tools_trajectory_is_scored_as_an_estimate(tmp_path: Path) -> No
     assert laid.motions == load_run(yard).motions
 
 
-def test_guesses_are_told_and_may_be_left_out(tmp_path: Path) -> None:
+def test_guesses_are_reported_and_may_be_left_out(tmp_path: Path) -> None:
     lost = {(3, second): NodeStatus.UNLOCATED for second in range(1, 11)}
     write_estimates(tmp_path / "fused", estimates(statuses=lost))
     told = convert(tmp_path / "fused", "--to", "tum", "--out", tmp_path / "all")
@@ -296,7 +296,7 @@ def test_presses_become_the_truth_of_a_recording(tmp_path: Path, pressed: Path) 
     check_truth(tmp_path / "back")
 
 
-def test_a_recording_that_broke_off_is_read_and_told(tmp_path: Path) -> None:
+def test_a_recording_that_broke_off_is_read_and_reported(tmp_path: Path) -> None:
     yard, fused = written(tmp_path)
     path = tmp_path / "walk.mcap"
     convert(fused, "--run", yard, "--start", START, "--to", "mcap", "--out", path)
@@ -543,7 +543,7 @@ def check_truth(directory: Path) -> None:
     )
 
 
-def test_presses_become_truth_and_what_does_not_count_is_told(
+def test_presses_become_truth_and_those_left_out_are_reported(
     tmp_path: Path, pressed: Path
 ) -> None:
     words = ("--landmarks", tmp_path / "surveyed.csv", "--to", "run", "--out", tmp_path / "out")
@@ -611,7 +611,7 @@ def test_a_second_truth_is_not_laid_over_the_first(tmp_path: Path, pressed: Path
         ("a.geojson", '{"type":"FeatureCollection","features":[3]}', (), "feature 1: no GeoJSON"),
     ],
 )
-def test_a_file_that_is_wrong_is_told_in_one_line(
+def test_a_wrong_file_is_reported_in_one_line(
     tmp_path: Path, name: str, content: str, words: tuple[str, ...], told: str
 ) -> None:
     (tmp_path / name).write_text(content)
@@ -651,7 +651,7 @@ TRACK = '{{"type":"Feature","geometry":{{"type":"{0}","coordinates":{1}}},"prope
         ("Point", "[11.575,48.137]", '{"kind":"landmark"}', "a landmark needs an id"),
     ],
 )
-def test_a_feature_that_is_wrong_is_told_in_one_line(
+def test_a_wrong_feature_is_reported_in_one_line(
     tmp_path: Path, shape: str, coordinates: str, properties: str, told: str
 ) -> None:
     (tmp_path / "a.geojson").write_text(TRACK.format(shape, coordinates, properties))
@@ -659,7 +659,7 @@ def test_a_feature_that_is_wrong_is_told_in_one_line(
     assert told in refused(tmp_path / "a.geojson", *words)
 
 
-def test_wrong_requests_are_told_in_one_line(tmp_path: Path) -> None:
+def test_wrong_requests_are_reported_in_one_line(tmp_path: Path) -> None:
     yard, fused = written(tmp_path)
     out = tmp_path / "out"
     assert "no such file" in refused(tmp_path / "nowhere", "--to", "tum", "--out", out)

@@ -68,7 +68,7 @@ def test_a_pin_says_where_and_what_lies_there() -> None:
         ("48,11@1:noon", "'noon' is not a number"),
     ],
 )
-def test_a_wrong_pin_is_told_in_one_line(text: str, words: str) -> None:
+def test_a_wrong_pin_is_reported_in_one_line(text: str, words: str) -> None:
     with pytest.raises(DataError) as caught:
         parse_pin(text)
     assert words in str(caught.value)
@@ -128,7 +128,7 @@ def test_a_position_on_another_continent_is_a_mistake() -> None:
             frame.to_world(latitude_deg, longitude_deg)
 
 
-def test_altitudes_are_said_only_where_the_pin_gave_one() -> None:
+def test_altitudes_are_given_only_where_the_pin_has_one() -> None:
     assert MapFrame(48.0, 11.0).altitude_of(1.0) is None
     assert MapFrame(48.0, 11.0, altitude_m=520.0).altitude_of(1.5) == 521.5
     assert MapFrame(48.0, 11.0, altitude_m=520.0).altitude_of(math.nan) is None

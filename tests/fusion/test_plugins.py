@@ -101,7 +101,7 @@ def test_an_object_is_used_as_it_is(run: relpos.Run) -> None:
         ("nowhere/file.py:Class", ["nowhere/file.py: no such file"]),
     ],
 )
-def test_what_an_estimator_does_wrong_is_told_in_one_line(
+def test_a_faulty_estimator_is_reported_in_one_line(
     name: str, words: list[str], directory: Path, tmp_path: Path
 ) -> None:
     message = one_clear_line(command("fuse", directory, "--estimator", name, "--out", tmp_path))
@@ -118,7 +118,9 @@ def test_the_estimators_own_error_is_the_cause_in_python(run: relpos.Run) -> Non
 @pytest.mark.parametrize(
     ("setting", "words"), [("strech=1", "one of stretch"), ("stretch=wide", "is no float")]
 )
-def test_a_wrong_setting_is_told(setting: str, words: str, directory: Path, tmp_path: Path) -> None:
+def test_a_wrong_setting_is_reported(
+    setting: str, words: str, directory: Path, tmp_path: Path
+) -> None:
     name = f"{OWN}:Adder"
     made = command("fuse", directory, "--estimator", name, "--set", setting, "--out", tmp_path)
     assert words in one_clear_line(made)
@@ -140,7 +142,9 @@ def test_figures_draw_it_beside_ours(tmp_path: Path) -> None:
     assert f"{OWN}:Adder" in (tmp_path / "tracks-simulation.csv").read_text()
 
 
-def test_figures_tell_of_one_that_leads_nowhere_before_anything_is_drawn(tmp_path: Path) -> None:
+def test_figures_report_a_plugin_that_cannot_be_loaded_before_anything_is_drawn(
+    tmp_path: Path,
+) -> None:
     name = "no_such_module_at_all:Class"
     assert "No module" in one_clear_line(command("figures", "--estimator", name, "--out", tmp_path))
     assert command("figures", "--estimator", "bank", "--out", tmp_path).exit_code == 2

@@ -126,7 +126,7 @@ def test_estimates_do_not_wait_for_what_is_late_and_come_only_once() -> None:
     assert len(times) > 30
 
 
-def test_a_node_that_falls_silent_holds_nobody_up_and_its_way_is_not_lost() -> None:
+def test_a_node_that_falls_silent_delays_no_other_and_its_path_is_not_lost() -> None:
     ordered = [m for m in team() if not (isinstance(m, Motion) and m.node == 3 and m.time_s > 10)]
     quick = rewinder()
     lags = []

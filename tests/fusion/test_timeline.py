@@ -119,7 +119,7 @@ def test_measurements_out_of_order_within_the_bound_give_the_same_steps() -> Non
     assert not mixed.counters
 
 
-def test_a_silent_node_holds_nobody_up_longer_than_the_bound() -> None:
+def test_a_silent_node_delays_no_other_longer_than_the_bound() -> None:
     timeline = Timeline(nodes=[1, 2], max_lag_s=3.0, reorder_s=0.0)
     closed: list[float] = []
     for k in range(1, 11):

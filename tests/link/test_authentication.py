@@ -86,7 +86,7 @@ def test_frames_that_overtake_each_other_are_all_taken():
     assert (counts["received"], counts["lost"], counts["reordered"]) == (6, 0, 3)
 
 
-def test_a_session_knows_what_an_earlier_one_has_heard():
+def test_a_session_knows_what_an_earlier_one_received():
     first = serial_port.Link()
     heard = [motion(n, 1.0 + n) for n in range(10)]
     for frame in heard:

@@ -25,7 +25,7 @@ def heard(schedule, nodes, time_s):
         schedule.heard(node, time_s)
 
 
-def test_a_beacon_leaves_once_a_second_and_tells_the_time_in_the_superframe():
+def test_a_beacon_leaves_once_a_second_with_the_time_in_the_superframe():
     schedule = BeaconSchedule([1, 2])
     sent = []
     for k in range(1000):  # looked at every 10 ms
@@ -38,7 +38,7 @@ def test_a_beacon_leaves_once_a_second_and_tells_the_time_in_the_superframe():
         assert values["round"] * 2.0 + values["phase_s"] == pytest.approx(time_s, abs=1e-3)
 
 
-def test_a_beacon_that_leaves_late_tells_the_time_at_which_it_leaves():
+def test_a_late_beacon_carries_the_time_at_which_it_leaves():
     schedule = BeaconSchedule([1])
     assert schedule.due(0.0)["phase_s"] == 0.0
     assert schedule.due(0.9) is None
@@ -54,7 +54,7 @@ def test_the_round_wraps_after_256_superframes():
     assert schedule.due(512.0)["round"] == 0
 
 
-def test_nobody_is_told_while_there_is_nobody():
+def test_no_beacon_is_sent_to_an_empty_team():
     schedule = BeaconSchedule()
     assert schedule.due(0.0) is None
     schedule.heard(4, 0.5)
@@ -74,7 +74,7 @@ def test_who_is_there_keeps_the_order_and_newcomers_follow_sorted():
     assert schedule.team(32.0) == (5, 1, 7, 9)
 
 
-def test_those_given_stay_whether_they_are_heard_or_not():
+def test_given_nodes_stay_whether_they_are_received_or_not():
     schedule = BeaconSchedule([3, 2])
     heard(schedule, (1,), 0.0)
     assert schedule.team(0.0) == (2, 3, 1)
@@ -116,7 +116,7 @@ def motion(node, counter):
     return xbee.encode(xbee.Receive16(node, -60, data))
 
 
-def test_a_host_tells_the_nodes_that_it_hears():
+def test_a_host_reports_the_nodes_that_it_receives():
     link = Link(counter=HostCounter(lambda: 2e9))
     beacons = HostBeacons(link)
     assert beacons.due(0.0) == b""
@@ -140,14 +140,14 @@ def test_a_host_sends_none_to_an_emulated_team_that_marks_its_own_time():
     assert beacons.due(1.0) == b""
 
 
-def test_a_forged_frame_brings_nobody_into_the_team():
+def test_a_forged_frame_adds_no_node_to_the_team():
     link = Link(key=bytes(range(16)))
     beacons = HostBeacons(link)
     link.feed(motion(6, 1), 0.5)
     assert beacons.due(1.0) == b""
 
 
-def test_the_user_is_told_once_of_a_node_too_many():
+def test_a_node_too_many_is_reported_once():
     link = Link()
     beacons = HostBeacons(link)
     link.feed(b"".join(motion(node, 1) for node in range(1, MAX_NODES + 2)), 0.5)
@@ -158,7 +158,7 @@ def test_the_user_is_told_once_of_a_node_too_many():
 
 
 @pytest.mark.parametrize("command", ["fuse", "monitor"])
-def test_a_command_that_listens_sends_beacons_to_whom_it_hears(command):
+def test_a_command_that_listens_sends_beacons_to_the_nodes_it_receives(command):
     master, slave = pty.openpty()
     tty.setraw(slave)
     os.set_blocking(master, False)

@@ -148,7 +148,7 @@ def test_a_broken_frame_costs_only_itself_when_escaped():
     ("over_north_rad", "from_east_rad"),
     [(0.0, math.pi / 2), (-math.pi / 2, 0.0), (math.pi / 2, math.pi), (math.pi, -math.pi / 2)],
 )
-def test_a_heading_over_magnetic_north_is_told_from_the_worlds_x_axis(
+def test_a_heading_over_magnetic_north_is_converted_to_the_worlds_x_axis(
     over_north_rad, from_east_rad
 ):
     decoder = Decoder()
@@ -234,7 +234,7 @@ def test_totals_differ_rightly_over_their_wrap():
     assert decoder.nodes[1].counts["lost"] == 0
 
 
-def test_late_and_doubled_frames_move_nobody():
+def test_late_and_doubled_frames_move_no_node():
     decoder = Decoder()
     frames = [motion_frame(n, time_s=n + 1, x_m=n + 1) for n in range(4)]
     decoder.feed(frames[0], 1.0)

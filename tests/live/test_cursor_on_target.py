@@ -135,7 +135,7 @@ def test_the_error_is_the_circles_radius(schedule: Schedule) -> None:
     assert event.ce == pytest.approx(circle_90_m(0.8, 0.4), abs=0.06)
 
 
-def test_nobody_is_sent_twice_a_second(schedule: Schedule) -> None:
+def test_no_member_is_sent_twice_a_second(schedule: Schedule) -> None:
     times: dict[str, list[float]] = {}
     for tick in range(60):
         now_s = 0.1 * tick
@@ -147,7 +147,7 @@ def test_nobody_is_sent_twice_a_second(schedule: Schedule) -> None:
         assert len(sent_s) >= 5
 
 
-def test_a_picture_that_does_not_move_on_is_not_sent_again(schedule: Schedule) -> None:
+def test_a_view_that_does_not_change_is_not_sent_again(schedule: Schedule) -> None:
     assert due(schedule, team_view(1), 0.0)
     assert not due(schedule, team_view(1), 5.0)
     assert due(schedule, team_view(2), 6.0)
@@ -161,7 +161,7 @@ def test_speed_is_that_of_the_way_between_two_events(schedule: Schedule) -> None
     assert float(events["test.2"].attributes("track")["speed"]) == 0.0
 
 
-def test_who_is_not_heard_goes_stale_by_the_time_last_heard(schedule: Schedule) -> None:
+def test_a_silent_member_goes_stale_by_its_last_reception_time(schedule: Schedule) -> None:
     gone = {"status": "lost", "seen_s": 40.0, "alert": Alert.LOST}
     event = due(schedule, team_view(1, changes={2: gone}), 0.0)["test.2"]
     assert event.how == "h-e"
@@ -247,7 +247,7 @@ def test_a_teams_uids_are_the_same_in_every_session() -> None:
         ("tcp://tak.example:high", "--cot tcp://tak.example:high: "),
     ],
 )
-def test_an_address_that_cannot_work_is_told_at_once(url: str, words: str) -> None:
+def test_an_address_that_cannot_work_is_reported_at_once(url: str, words: str) -> None:
     with pytest.raises(DataError, match=re.escape(words)):
         check_url(url)
     with pytest.raises(DataError):
@@ -413,7 +413,7 @@ def test_a_session_sends_every_member(tmp_path: Path, udp_port: socket.socket) -
         assert min(event.metres_from(x_m, y_m) for x_m, y_m in places) < 1.0
 
 
-def test_a_udp_port_where_nobody_listens_is_told() -> None:
+def test_a_udp_port_without_a_listener_is_reported() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
         held.bind(("127.0.0.1", 0))
         port = held.getsockname()[1]

@@ -99,14 +99,14 @@ def test_who_works_on_the_spot_is_not_alarmed_of(watching):
     assert watching.alerts == [None]
 
 
-def test_silence_is_told_as_lost_and_ends_with_the_first_frame(watching):
+def test_silence_is_reported_as_lost_and_ends_with_the_first_frame(watching):
     watching.report(None, 15)
     assert watching.at(Alert.LOST) == pytest.approx(10.0 + LOST_S, abs=0.2)
     watching.report(walk, 1)
     assert watching.alarms.condition(1).alert is None
 
 
-def test_nobody_is_lost_while_nobody_could_listen(watching):
+def test_no_node_is_lost_while_the_port_is_closed(watching):
     watching.pass_time(60.0, listening=False)
     assert watching.alerts == [None]
     watching.pass_time(LOST_S + 1.0)
@@ -148,7 +148,7 @@ def test_acknowledging_silences_this_alert_and_no_other(watching):
     assert not watching.alarms.condition(1).acknowledged
 
 
-def test_an_alarm_of_who_lies_still_stays_when_his_radio_falls_silent(watching):
+def test_a_motionless_alarm_stays_when_the_radio_falls_silent(watching):
     watching.report(still, 35)
     watching.report(None, 30)
     assert watching.alarms.condition(1).alert is Alert.STILL_ALARM

@@ -84,7 +84,7 @@ class FullDisk(io.RawIOBase):
         return len(part)
 
 
-def test_a_full_disk_is_told_and_nothing_is_missing_once_there_is_room(tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_and_nothing_is_missing_once_there_is_room(tmp_path, monkeypatch):
     disk = FullDisk(tmp_path / "table.csv")
     monkeypatch.setattr(Path, "open", lambda *_, **__: disk)
     table = AppendedTable(tmp_path / "table.csv", ["time_s", "node"])

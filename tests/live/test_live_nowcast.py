@@ -124,7 +124,7 @@ def test_the_covariance_grows_as_a_filters_prediction():
     assert at.sigma_heading_rad**2 == pytest.approx(covariance[2, 2])
 
 
-def test_where_a_report_tells_no_deviations_the_papers_count():
+def test_a_report_without_deviations_uses_the_papers():
     nowcast = Nowcast()
     nowcast.add_estimate(estimate(1.0, node_estimate(heading_rad=0.0)), 0)
     nowcast.add_motion(Motion(2.0, 1, 2.0, 0.0, 0.0), 1)

@@ -70,7 +70,7 @@ def motions_of(pieces):
     return [o for p in pieces for o in link.feed(p, 0.0) if isinstance(o, Motion)]
 
 
-def test_a_port_that_is_pulled_out_is_told_waited_for_and_read_on_from(socket, stream):
+def test_a_port_that_is_pulled_out_is_reported_and_read_again_once_it_is_back(socket, stream):
     pieces, priors = stream
     half = len(pieces) // 2
     source = PortInput(str(socket.path), Link(), teach=False, reopen=True)
@@ -134,7 +134,7 @@ def test_a_port_that_is_not_to_be_opened_again_ends_the_session(socket, stream):
     assert album.closed
 
 
-def test_a_port_that_is_not_there_is_said_before_anything_begins(tmp_path):
+def test_a_missing_port_is_reported_before_anything_begins(tmp_path):
     with pytest.raises(DeviceError, match="no such device"):
         PortInput(str(tmp_path / "ttyUSB9"), Link(), reopen=True)
 
@@ -167,7 +167,7 @@ def test_what_comes_at_once_is_received_at_once(socket, stream):
     assert received.data == b"".join(pieces[:5]), "not a byte first, and the rest later"
 
 
-def test_a_setting_that_does_not_fit_is_said_before_the_port_is_opened(socket):
+def test_a_setting_that_does_not_fit_is_reported_before_the_port_is_opened(socket):
     asked = ["fuse", str(socket.path), "--view", "--no-open", "--set", "bogus=1"]
     result = CliRunner().invoke(main.app, asked, catch_exceptions=False)
     assert result.exit_code == 1

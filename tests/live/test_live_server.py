@@ -138,7 +138,7 @@ def test_a_browser_gets_hello_tracks_and_then_pictures(stage):
     assert first["people"][0]["heading_rad"] is None
 
 
-def test_time_and_wearers_are_told(stage):
+def test_the_server_reports_time_and_wearers(stage):
     with stage.client() as client:
         told = client.get("/api/time").json()
         assert told["unix_ms"] / 1000.0 == pytest.approx(time.time(), abs=30.0)
@@ -197,7 +197,7 @@ def test_no_qr_code_leads_phones_to_an_address_that_they_cannot_reach(stage):
     assert "--view-listen" in answer.text
 
 
-def test_a_session_that_does_not_answer_is_told_to_the_phone(stage, monkeypatch):
+def test_a_session_that_does_not_answer_is_reported_to_the_phone(stage, monkeypatch):
     stage.answering = False
     try:
         with stage.client() as client:
@@ -207,7 +207,7 @@ def test_a_session_that_does_not_answer_is_told_to_the_phone(stage, monkeypatch)
     assert answer.status_code == 503
 
 
-def test_ten_browsers_each_get_the_newest_picture_and_one_that_sleeps_holds_up_nobody(stage):
+def test_ten_browsers_each_get_the_newest_view_and_a_sleeping_one_blocks_no_other(stage):
     with contextlib.ExitStack() as stack:
         # This one never reads.
         stack.enter_context(stage.socket(max_queue=1))
@@ -288,7 +288,7 @@ def test_two_sessions_never_share_a_port(monkeypatch, windows):
     assert options == [(socket.SOL_SOCKET, option, 1)]
 
 
-def test_what_is_told_to_phones_is_an_address_that_others_can_reach():
+def test_phones_get_an_address_that_others_can_reach():
     listener, access = listen("0.0.0.0:0")
     with listener:
         if own_address() is not None:

@@ -32,7 +32,7 @@ def walk():
         yield run_through(session), album, priors
 
 
-def test_everybody_is_in_the_picture_with_all_that_is_known(walk):
+def test_the_view_has_every_node_with_all_that_is_known(walk):
     _, album, _ = walk
     last = album.views[-1]
     assert [person.node for person in last.people] == [1, 2, 3]
@@ -51,7 +51,7 @@ def test_everybody_is_in_the_picture_with_all_that_is_known(walk):
     assert message["pairs"][0][:2] == [1, 2]
 
 
-def test_the_picture_runs_ahead_of_the_fused_estimate(walk):
+def test_the_view_runs_ahead_of_the_fused_estimate(walk):
     _, album, _ = walk
     later = [p for p in album.views if p.time_s > 20.0][:-1]
     assert all(p.fused_s < p.time_s for p in later)
@@ -122,7 +122,7 @@ def test_a_laptop_that_slept_for_a_minute_raises_no_alarm_and_says_that_it_slept
         assert abs(track.clock.drift) < 0.006
 
 
-def test_a_port_that_is_gone_is_told_and_nobody_is_lost_by_it():
+def test_a_port_that_is_gone_is_reported_and_makes_no_node_lost():
     with EmulatedTeam(TeamConfig("paper", 3, 90.0, 5, beacons=True)) as team:
         source = TeamInput(team)
         source.unplug(30.0, 30.0)
@@ -191,7 +191,7 @@ class Troubled(Sink):
         return "disk full: 12 s wait in memory"
 
 
-def test_a_sink_that_fails_is_told_and_the_others_go_on():
+def test_a_sink_that_fails_is_reported_and_the_others_go_on():
     with EmulatedTeam(TeamConfig("straight", 2, 8.0, 3, beacons=True)) as team:
         session, album = make_session(
             TeamInput(team), deadreckoning, Broken(), Troubled(), priors=team.priors()
@@ -210,7 +210,7 @@ class Failing(Slow):
         return self._own.process(measurement)
 
 
-def test_a_fusion_that_dies_is_told_and_receiving_goes_on():
+def test_a_fusion_that_dies_is_reported_and_receiving_goes_on():
     with EmulatedTeam(TeamConfig("straight", 2, 20.0, 3, beacons=True)) as team:
         source = TeamInput(team, until_s=15.0)
         session, album = make_session(source, Failing, priors=team.priors(), lasts=True)
@@ -256,7 +256,7 @@ def press(number, unix_s, name="a"):
     return Request(number, "presses", unix_s, body)
 
 
-def test_presses_names_and_acknowledgements_reach_record_and_picture(monkeypatch):
+def test_presses_names_and_acknowledgements_reach_record_and_view(monkeypatch):
     with EmulatedTeam(TeamConfig("straight", 2, 20.0, 3, beacons=True)) as team:
         source = TeamInput(team)
         # The wall clock as the team's, from a date on.
@@ -298,7 +298,7 @@ def test_a_recording_is_played_and_takes_no_presses():
     assert math.isfinite(last.time_s)
 
 
-def test_who_is_heard_first_starts_from_one_place_where_that_was_said():
+def test_nodes_received_first_share_one_start_with_a_common_start():
     with EmulatedTeam(TeamConfig("straight", 3, 15.0, 3, beacons=True)) as team:
         given = []
 

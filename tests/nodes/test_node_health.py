@@ -100,7 +100,7 @@ def test_counts_wrap_begin_anew_with_a_boot_and_leave_the_window():
     assert counter.within(45.0) == 7
 
 
-def test_a_view_tells_loss_silence_and_ranging_of_the_last_half_minute():
+def test_a_view_has_loss_silence_and_ranging_of_the_last_half_minute():
     link, view = Link(), TeamMonitor()
 
     def hear(time_s, received, lost, successes, failures):

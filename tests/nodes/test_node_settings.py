@@ -43,7 +43,7 @@ def test_a_stature_stands_for_its_leg_length():
         (("led", "on", "leg-length", "9"), "between 0.4 and 1.4 m"),
     ],
 )
-def test_what_cannot_be_set_is_told(words, complaint):
+def test_a_setting_that_cannot_be_set_is_reported(words, complaint):
     with pytest.raises(ValueError, match=complaint):
         parse_changes(words)
 

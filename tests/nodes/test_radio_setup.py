@@ -162,7 +162,7 @@ def test_a_module_that_speaks_frames_is_set_by_frames(escaped):
     assert module.module._settings[b"RN"] == b"\3"
 
 
-def test_a_port_without_a_module_is_told(monkeypatch):
+def test_a_port_without_a_module_is_reported(monkeypatch):
     monkeypatch.setattr(radio, "GUARD_S", 0.01)
     monkeypatch.setattr(radio, "ANSWER_S", 0.02)
 

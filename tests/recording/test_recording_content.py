@@ -115,7 +115,7 @@ def test_the_team_is_drawn_where_it_was_estimated(recorded):
         assert math.remainder(heading - node.heading_rad, 2 * math.pi) == pytest.approx(0, abs=1e-9)
 
 
-def test_messages_tell_when_they_arrived_and_what_time_they_are_of(recorded):
+def test_messages_have_their_arrival_time_and_their_measurement_time(recorded):
     for topic, _, message, decoded in messages(recorded):
         if topic == "/serial":
             assert message.log_time == START_NS + round(decoded["arrival_s"] * 1e9)
@@ -153,7 +153,7 @@ def test_the_bytes_through_the_link_give_the_same_once_more(recorded):
     assert again.counters()["received"] > 100
 
 
-def test_the_session_is_told_of_and_the_key_is_not(recorded):
+def test_a_recording_describes_the_session_without_the_key(recorded):
     told = open_recording(recorded).about
     assert (told.started_unix_ns, told.seed, told.initial) == (START_NS, 7, "common")
     assert told.settings == {"outliers": "0.03"}
@@ -212,7 +212,7 @@ def test_what_is_no_recording_is_one_clear_line(tmp_path):
         load(path)
 
 
-def test_without_the_key_the_decoded_measurements_are_taken_and_that_is_said(tmp_path):
+def test_the_decoded_measurements_are_used_without_the_key_with_a_remark(tmp_path):
     key = bytes(range(16))
     path = tmp_path / "secret.mcap"
     recorder = make_recorder(path, about(own_key=True))

@@ -146,7 +146,7 @@ def test_zeros_behind_the_end_as_after_a_power_failure_are_no_data(closed, tmp_p
     assert "was not closed" in open_recording(path).remarks[0]
 
 
-def test_a_damaged_block_is_left_out_and_told(tmp_path):
+def test_a_damaged_block_is_left_out_and_reported(tmp_path):
     path = tmp_path / "damaged.mcap"
     recorder = make_recorder(path, about())
     steps = session()
@@ -184,7 +184,7 @@ class FullDisk(Disk):
         return super().write(file, data[:size])
 
 
-def test_a_full_disk_is_told_and_gone_on_from_without_losing_anything(tmp_path):
+def test_recording_goes_on_after_a_full_disk_without_losing_anything(tmp_path):
     path = tmp_path / "full.mcap"
     disk = FullDisk(60_000)
     recorder = Recorder(path, about(), disk=disk)
@@ -276,7 +276,7 @@ def test_a_file_that_may_not_grow_is_followed_by_another_part(tmp_path):
     assert len(serials(tmp_path / "one.mcap")) == len(steps)
 
 
-def test_a_disk_that_confirms_nothing_holds_nobody_up_and_is_told(tmp_path, monkeypatch):
+def test_a_disk_that_confirms_nothing_blocks_no_writer_and_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr("relpos.recording.recorder.LATE_S", 0.3)
     held = threading.Event()
 
@@ -327,7 +327,7 @@ def test_what_the_disk_refused_to_confirm_is_written_again(tmp_path):
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount a small disk")
-def test_a_real_full_disk_is_told_and_gone_on_from(tmp_path):
+def test_recording_goes_on_after_a_real_full_disk(tmp_path):
     mount = tmp_path / "disk"
     mount.mkdir()
     if subprocess.run(

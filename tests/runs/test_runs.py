@@ -261,7 +261,7 @@ def test_a_first_true_pose_long_after_the_start_is_no_prior(tmp_path: Path) -> N
     assert [p.node for p in load_run(tmp_path).priors_for(InitialPose.FROM_TRUTH)] == [2]
 
 
-def test_a_start_from_truth_without_truth_is_said(tmp_path: Path) -> None:
+def test_a_start_from_truth_without_truth_is_refused(tmp_path: Path) -> None:
     write(tmp_path, run_toml='initial_pose = "from truth"', motion_csv=MOTION)
     with pytest.raises(DataError, match="there is none"):
         _ = load_run(tmp_path).priors

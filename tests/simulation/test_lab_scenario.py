@@ -59,7 +59,7 @@ def test_the_block_of_rooms_is_in_the_way_across_and_not_along_a_side() -> None:
     assert np.array_equal(lab.walls_between(first, second), lab.walls_between(second, first))
 
 
-def test_whoever_walks_ahead_is_in_the_way_of_his_own_tag() -> None:
+def test_the_person_ahead_obstructs_the_link_to_their_own_tag() -> None:
     behind, ahead = np.array([[0.0, 0.0]]), np.array([[4.0, 0.0]])
     east, west = np.array([0.0]), np.array([math.pi])
     assert lab.bodies_between(behind, ahead, east, east) == [1]

@@ -17,7 +17,7 @@ def attempts(channel: UwbChannel, distance_m: float, count: int = 4000) -> list[
     return [value for value in heard if value is not None]
 
 
-def test_nothing_is_heard_past_the_range_limit() -> None:
+def test_nothing_is_received_past_the_range_limit() -> None:
     assert attempts(UwbChannel(), 15.01) == []
     assert UwbChannel().detection_probability(15.01) == 0.0
 
@@ -54,7 +54,7 @@ def test_a_range_is_never_negative() -> None:
     assert min(attempts(UwbChannel(noise_sigma_m=1.0), 0.1)) == 0.0
 
 
-def test_an_unheard_attempt_does_not_shift_the_noise_of_the_next() -> None:
+def test_a_failed_attempt_does_not_shift_the_noise_of_the_next() -> None:
     near, far = np.random.default_rng(1), np.random.default_rng(1)
     UwbChannel().measure_range(near, 1.0)
     UwbChannel().measure_range(far, 100.0)

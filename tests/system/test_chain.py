@@ -251,7 +251,7 @@ def assert_received_is(directory, stream):
         assert turned == pytest.approx(heading, abs=1e-3)
 
 
-def test_a_port_that_vanishes_is_told_in_one_line_and_keeps_what_came(tmp_path, team_bytes):
+def test_a_port_that_vanishes_is_reported_in_one_line_and_the_data_is_kept(tmp_path, team_bytes):
     half = [(time_s, data) for time_s, data in team_bytes if time_s < 40.0]
     with Listener("--initial", "common", "--out", tmp_path) as listener:
         listener.update_without_link(half)

@@ -170,7 +170,7 @@ def test_a_mega_becomes_a_node_as_well(tmp_path):
     assert "node 5 answers over the cable" in done.stdout
 
 
-def test_the_shields_switch_in_the_wrong_position_is_told(optiboot):
+def test_the_shields_switch_in_the_wrong_position_is_reported(optiboot):
     with plugged("uno", optiboot, connected=False) as uno:
         done = relpos_node("flash", uno.path)
     assert done.returncode == 1
@@ -194,7 +194,7 @@ def test_the_only_board_is_found_by_its_usb_id():
     assert boards.choose(ports) == "/dev/ttyACM0"
 
 
-def test_several_boards_want_a_choice_and_none_is_told():
+def test_several_boards_need_a_choice_and_a_missing_board_is_reported():
     several = [UsbPort("/dev/ttyACM0", 0x2341, 0x0043), UsbPort("/dev/ttyACM1", 0x2341, 0x0042)]
     with pytest.raises(
         DeviceError, match=r"ttyACM0 \(Arduino Uno\), /dev/ttyACM1 \(Arduino Mega\)"
@@ -218,12 +218,12 @@ def test_several_boards_want_a_choice_and_none_is_told():
         ("", "no reason"),
     ],
 )
-def test_a_failed_upload_is_told_by_its_cause(told, words):
+def test_a_failed_upload_is_reported_with_its_cause(told, words):
     assert words in upload.why(told)
     assert "\n" not in upload.why(told)
 
 
-def test_without_platformio_it_is_told(tmp_path, monkeypatch):
+def test_a_missing_platformio_is_reported(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(DeviceError, match="PlatformIO is missing"):
         upload.platformio(tmp_path)

@@ -48,7 +48,7 @@ def node(*arguments):
     )
 
 
-def test_list_tells_of_every_node(port):
+def test_list_shows_every_node(port):
     done = node("list", port, "--seconds", 5, "--json")
     assert done.returncode == 0, done.stderr
     rows = json.loads(done.stdout)["nodes"]
@@ -182,14 +182,14 @@ def test_the_uno_keeps_its_settings_over_a_restart():
         ("reboot", "/dev/nowhere"),
     ],
 )
-def test_a_port_that_is_none_is_told_in_one_line(arguments):
+def test_a_port_that_is_none_is_reported_in_one_line(arguments):
     done = node(*arguments)
     assert done.returncode == 1
     assert "cannot open" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_a_port_that_another_program_has_is_told(port):
+def test_a_port_that_another_program_has_is_reported(port):
     first = open_port(port)
     try:
         done = node("list", port)

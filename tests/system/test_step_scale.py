@@ -69,7 +69,7 @@ def test_a_node_is_left_alone_until_the_estimator_has_learned_anew(conversation)
     assert conversation.sender.due(conversation.team.time_us * 1e-6) == b""
 
 
-def test_a_node_that_does_not_answer_is_told_and_nothing_waits_for_it(conversation):
+def test_a_node_that_does_not_answer_is_reported_and_nothing_waits_for_it(conversation):
     conversation.learn(77, 1.10)
     conversation.run(ATTEMPTS + 3.0)
     assert conversation.sender.sent == 0

@@ -116,7 +116,7 @@ def test_a_name_given_on_the_phone_is_everybodys(visit, stage: Stage):
     expect(page.locator("#my-name")).to_have_text("Dmitri the Tall")
 
 
-def test_a_new_session_is_told_the_name_by_the_phone(visit, stage: Stage):
+def test_the_phone_sends_its_name_to_a_new_session(visit, stage: Stage):
     page = visit("/phone", expect_gone=True, **PHONE)
     choose(page, "Dmitri", "Dmitri the Tall")
     wait_for(lambda: stage.team.names.get(4) == "Dmitri the Tall")
@@ -185,7 +185,7 @@ def test_without_https_the_compass_says_what_is_missing(visit, stage: Stage):
     )
 
 
-def test_an_alarm_reaches_the_phones_and_speaks_to_whoever_is_meant(visit, stage: Stage):
+def test_an_alarm_reaches_the_phones_and_addresses_its_wearer(visit, stage: Stage):
     page = visit("/phone", **PHONE)
     choose(page, "Ben")
     stage.team.still_since[2] = stage.at_s - 21.0

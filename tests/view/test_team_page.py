@@ -61,7 +61,7 @@ def find_button(page: Page, name: str) -> Any:
 # --- the map ------------------------------------------------------------------------------------
 
 
-def test_whoever_is_followed_stays_in_the_middle_while_the_map_moves(visit, stage: Stage):
+def test_the_followed_person_stays_in_the_middle_while_the_map_moves(visit, stage: Stage):
     page = visit()
     wait_live(page)
     page.get_by_role("button", name="Follow Ben").click()
@@ -94,7 +94,7 @@ def test_heading_up_points_the_followed_persons_marker_upwards_on_every_side(vis
     del behind
 
 
-def test_north_is_up_and_named_once_compasses_have_told_it(visit, stage: Stage):
+def test_north_is_up_and_named_once_compasses_have_reported_it(visit, stage: Stage):
     stage.frozen = True
     page = visit()
     wait_live(page)
@@ -160,7 +160,7 @@ def test_the_map_zooms_by_wheel_buttons_keys_and_two_fingers(visit, stage: Stage
     wait_for(lambda: metres_across(page) > 20)
 
 
-def test_dragging_lets_go_of_whoever_is_followed(visit, stage: Stage):
+def test_dragging_ends_following(visit, stage: Stage):
     page = visit()
     wait_live(page)
     page.get_by_role("button", name="Follow Ben").click()
@@ -220,7 +220,7 @@ def test_distance_and_direction_from_me_are_those_of_the_team(visit, stage: Stag
         expect(card(page, other).locator(".compass")).to_have_text(f"map {point}")
 
 
-def test_health_is_told_by_a_word_and_a_shape_and_its_reason(visit, stage: Stage):
+def test_health_is_shown_by_a_word_and_a_shape_and_its_reason(visit, stage: Stage):
     stage.team.health = {2: ("yellow", ("weak radio (-88 dBm)",)), 3: ("red", ("supply 4.10 V",))}
     page = visit()
     wait_live(page)
@@ -239,7 +239,7 @@ def test_health_is_told_by_a_word_and_a_shape_and_its_reason(visit, stage: Stage
         assert figure in facts
 
 
-def test_somebody_lost_is_alarmed_and_told_when_found(visit, stage: Stage):
+def test_a_lost_person_raises_an_alarm_and_is_announced_when_found(visit, stage: Stage):
     page = visit()
     wait_live(page)
     stage.team.lost_since[5] = stage.at_s - 4.5
@@ -295,7 +295,7 @@ def test_many_alarms_at_once_leave_room_for_the_map_and_are_acknowledged_togethe
     expect(page.locator("#alarms .known")).to_contain_text("Anna has not moved for")
 
 
-def test_alarms_are_heard_until_acknowledged(visit, stage: Stage):
+def test_alarms_sound_until_acknowledged(visit, stage: Stage):
     listen = """
         window.beeps = 0;
         const start = OscillatorNode.prototype.start;
@@ -332,7 +332,9 @@ def test_a_notice_of_the_session_is_shown(visit, stage: Stage):
     expect(page.locator("#notices p")).to_have_count(0)
 
 
-def test_an_ambiguous_picture_tells_the_other_places_and_their_probabilities(visit, stage: Stage):
+def test_an_ambiguous_estimate_shows_the_other_positions_and_their_probabilities(
+    visit, stage: Stage
+):
     stage.team.ambiguous, stage.team.ring = 3, 6
     stage.frozen = True
     page = visit()
@@ -392,7 +394,7 @@ def test_find_leads_by_arrow_distance_and_words(visit, stage: Stage):
     expect(find_button(page, "Chloé")).to_be_focused()
 
 
-def test_find_says_so_while_nobody_knows_which_way(visit, stage: Stage):
+def test_find_says_that_the_direction_is_unknown(visit, stage: Stage):
     stage.team.ring = 1
     page = visit()
     wait_live(page)
@@ -406,7 +408,7 @@ def test_find_says_so_while_nobody_knows_which_way(visit, stage: Stage):
 # --- the connection -----------------------------------------------------------------------------
 
 
-def test_a_server_that_is_gone_is_told_and_found_again_without_reloading(visit, stage: Stage):
+def test_a_server_that_is_gone_is_reported_and_found_again_without_reloading(visit, stage: Stage):
     page = visit(expect_gone=True)
     wait_live(page)
     page.evaluate("window.same_page = true")
@@ -441,7 +443,7 @@ def test_a_laptop_that_slept_for_a_minute_is_connected_anew_when_it_wakes(visit,
     assert math.dist(stage.team.pose(1, stage.at_s)[:2], x_before[:2]) > 1.0
 
 
-def test_silence_of_the_server_is_told_before_the_connection_breaks(visit, stage: Stage):
+def test_silence_of_the_server_is_reported_before_the_connection_breaks(visit, stage: Stage):
     page = visit()
     wait_live(page)
     # Its process stands still: not even pings come.
@@ -458,7 +460,7 @@ def test_silence_of_the_server_is_told_before_the_connection_breaks(visit, stage
     expect(page.locator("#connection")).to_have_attribute("data-state", "live")
 
 
-def test_a_page_without_the_token_is_told_where_it_is(visit, stage: Stage):
+def test_a_page_without_the_token_says_where_to_find_it(visit, stage: Stage):
     page = visit(expect_gone=True)
     wait_live(page)
     stage.shut()
@@ -576,7 +578,7 @@ def test_everything_has_a_name_and_enough_contrast(visit, stage: Stage, scheme: 
     assert page.evaluate("document.documentElement.lang") == "en"
 
 
-def test_a_table_tells_what_the_map_shows(visit, stage: Stage):
+def test_a_table_states_what_the_map_shows(visit, stage: Stage):
     stage.frozen = True
     page = visit()
     wait_live(page)
@@ -631,7 +633,7 @@ def test_the_theme_follows_the_system_until_somebody_chooses(visit, stage: Stage
     wait_for(lambda: page.evaluate(PIXELS, [[-300, 250]])[0][0] < 40)
 
 
-def test_nothing_moves_for_whoever_wants_less_motion(visit, stage: Stage):
+def test_nothing_moves_with_reduced_motion(visit, stage: Stage):
     stage.team.still_since = {2: stage.at_s - 60.0}
     stage.frozen = True
     page = visit(reduced_motion="reduce")

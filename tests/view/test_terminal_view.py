@@ -72,14 +72,14 @@ def test_distance_and_direction_are_those_from_me() -> None:
     assert "65 right" in row_of("Kim", lines(shown, me=1, utf8=False))
 
 
-def test_no_direction_is_told_by_who_does_not_know_where_it_faces() -> None:
+def test_a_person_with_unknown_heading_has_no_direction() -> None:
     shown = team_view(changes={2: {"sigma_heading_rad": 1.5}})
     row = row_of("Åsa", lines(shown, me=2))
     assert "13.0 m" in row
     assert not re.search("left|right|ahead|behind", row)
 
 
-def test_whoever_needs_help_is_on_top_in_words() -> None:
+def test_a_person_who_needs_help_is_on_top_in_words() -> None:
     gone = {"alert": Alert.LOST, "status": "lost", "seen_s": 75.0}
     shown = lines(team_view(changes={3: STILL, 4: gone, 1: {"alert": Alert.STILL_WARNING}}), me=2)
     assert shown[1].startswith("!! Li & Söhne LIES STILL for 33 s, 25 m from Kim")
@@ -92,7 +92,7 @@ def test_whoever_needs_help_is_on_top_in_words() -> None:
     assert seen[2].endswith("(seen to)")
 
 
-def test_who_moves_again_is_not_said_to_lie() -> None:
+def test_a_person_who_moves_again_is_not_shown_as_lying() -> None:
     shown = lines(team_view(changes={3: {**STILL, "moving": True, "still_s": 0.0}}), me=2)
     assert shown[1].startswith("!! Li & Söhne lay still, moves again")
     assert "moving" in row_of("Li & Söhne", shown)
@@ -105,7 +105,7 @@ def test_more_alarms_than_there_is_room_for_are_counted() -> None:
     assert shown[6] == "... and 5 more"
 
 
-def test_what_is_wrong_with_the_session_and_with_a_node_is_told() -> None:
+def test_faults_of_the_session_and_of_a_node_are_shown() -> None:
     notices = (Notice("port", Level.ALARM, "the port has vanished", 0.0),)
     ill = {"health": "yellow", "reasons": ("supply 4.40 V",)}
     shown = lines(team_view(changes={2: ill}, notices=notices), columns=100)
@@ -128,7 +128,7 @@ def ambiguous() -> TeamView:
     )
 
 
-def test_an_ambiguous_picture_shows_the_possibilities() -> None:
+def test_an_ambiguous_estimate_shows_the_possibilities() -> None:
     shown = lines(ambiguous(), me=2, table=True)
     assert "? ambiguous: 2 alternatives (70 %, 30 %)" in shown
     row = row_of("Li & Söhne", shown)
@@ -186,7 +186,7 @@ def test_my_face_is_up_when_it_is_wanted() -> None:
     assert any("up: where I face" in line for line in drawn)
 
 
-def test_zoom_changes_the_scale_and_loses_nobody() -> None:
+def test_zoom_changes_the_scale_and_keeps_everybody() -> None:
     wide = "\n".join(lines(team_view(), me=1, rows=40, table=False, zoom=-3))
     near = "\n".join(lines(team_view(), me=1, rows=40, table=False, zoom=3))
     scale = [float(re.findall(r"┤ ([\d.]+) m", text)[0]) for text in (wide, near)]
@@ -296,7 +296,7 @@ def view(screen: Screen, monkeypatch: pytest.MonkeyPatch) -> Iterator[TerminalVi
     made.close()
 
 
-def test_the_terminal_shows_the_newest_picture_and_comes_back_as_it_was(
+def test_the_terminal_shows_the_newest_view_and_is_restored_at_the_end(
     screen: Screen, view: TerminalView
 ) -> None:
     view.updated(team_view())

@@ -446,7 +446,7 @@ TEST(twenty_nodes_get_every_pair_within_ten_seconds) {
   }
 }
 
-TEST(in_its_window_a_node_asks_again_whom_it_ranged_lately_and_nobody_else) {
+TEST(a_node_retries_only_peers_it_ranged_recently_in_its_window) {
   wire::Beacon beacon;
   beacon.period_ms = 2000;
   beacon.count = 6;
@@ -481,7 +481,7 @@ TEST(in_its_window_a_node_asks_again_whom_it_ranged_lately_and_nobody_else) {
   CHECK(others >= 3 * 29);     // thirty rounds, the gone one takes nothing from the others
 }
 
-TEST(the_led_tells_the_states_apart) {
+TEST(the_led_distinguishes_the_states) {
   enum State { kWell, kNoBeacon, kSupplyLow, kSensorMissing };
   // Flashes in 4.096 s, and the share of the time that it is lit, in per cent.
   const uint8_t flashes[] = {4, 8, 4, 16}, lit[] = {6, 12, 75, 50};
@@ -578,7 +578,7 @@ TEST(a_node_that_is_not_in_the_beacon_ranges_by_itself) {
   CHECK_EQUAL(5, status.neighbours);
 }
 
-TEST(without_its_pozyx_a_node_tells_no_neighbours_and_no_team_of_old) {
+TEST(a_node_without_its_pozyx_reports_no_neighbours_and_no_old_team) {
   Team team;
   for (uint8_t second = 0; second < 12; ++second) {
     Slots::hear(team, 0, second, 5);
@@ -674,7 +674,7 @@ TEST(garbage_pressure_is_no_height_and_a_new_level_is_no_climb) {
   CHECK_NEAR(0.0f, barometer.height_m(), 0.01f);
 }
 
-TEST(a_pressure_sensor_that_tells_nonsense_leaves_no_old_height) {
+TEST(a_pressure_sensor_with_invalid_readings_leaves_no_old_height) {
   relpos::Barometer barometer = relpos::Barometer();
   for (uint8_t i = 0; i < 20; ++i) barometer.add(101325000);
   CHECK(barometer.ready());
@@ -685,7 +685,7 @@ TEST(a_pressure_sensor_that_tells_nonsense_leaves_no_old_height) {
   CHECK_NEAR(3.0f, barometer.height_m(), 0.05f);
 }
 
-TEST(a_height_beyond_the_message_is_not_told) {
+TEST(a_height_beyond_the_message_is_not_reported) {
   Team team;
   team.run_ms(10000);
   for (uint32_t i = 0; i < 85; ++i) {  // a lift of 4 m/s, up to 360 m
@@ -788,7 +788,7 @@ TEST(a_slow_line_drops_the_oldest_ranges_counts_them_and_keeps_the_motion) {
   CHECK(team.sent(wire::MessageType::kMotion) >= 25);
 }
 
-TEST(a_missing_imu_is_told_and_stops_neither_ranges_nor_reports) {
+TEST(a_missing_imu_is_reported_and_stops_neither_ranges_nor_reports) {
   Team team;
   team.world.inertial_present = false;
   team.run_ms(12000);
@@ -1036,7 +1036,7 @@ TEST(raw_samples_come_five_times_a_second_and_end_by_themselves) {
   CHECK(team.sent(wire::MessageType::kMotion) >= 15);  // which goes on
 }
 
-TEST(raw_samples_tell_a_silent_sensor_and_end_all_the_same) {
+TEST(raw_samples_report_a_silent_sensor_and_still_end) {
   Team team;
   team.world.inertial_present = false;
   ask(team, team.node, wire::CommandCode::kSetRawReports, 10);
@@ -1358,7 +1358,7 @@ TEST(a_number_is_changed_with_a_restart_and_kept) {
   }
 }
 
-TEST(a_range_offset_of_either_sign_is_kept_and_told) {
+TEST(a_range_offset_of_either_sign_is_kept_and_reported) {
   Team team;
   for (int32_t bad : {-5001, 5001}) {
     CHECK_EQUAL(result(wire::CommandResult::kOutOfRange),

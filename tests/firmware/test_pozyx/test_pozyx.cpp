@@ -233,7 +233,7 @@ TEST(signal_strength_is_clamped_not_wrapped) {
   CHECK_EQUAL(127, bench.result.rss_dbm);
 }
 
-TEST(an_error_of_the_chip_is_told_with_its_code) {
+TEST(an_error_of_the_chip_is_reported_with_its_code) {
   Bench bench;
   bench.set_up();
   bench.chip.code = 0x12;
@@ -370,7 +370,7 @@ TEST(a_distance_is_not_given_twice) {
   CHECK(bench.result.success);
 }
 
-TEST(an_older_distance_told_as_new_by_inverted_flags_is_refused) {
+TEST(an_older_distance_flagged_as_new_by_inverted_flags_is_refused) {
   Bench bench;
   bench.set_up();
   bench.chip.code = 0x12;

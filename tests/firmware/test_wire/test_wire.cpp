@@ -178,7 +178,7 @@ TEST(a_frame_cut_short_anywhere_is_refused) {
   }
 }
 
-TEST(a_foreign_version_is_told_from_damage) {
+TEST(a_foreign_version_is_distinguished_from_damage) {
   uint8_t frame[sizeof vectors::kCommandBytes];
   memcpy(frame, vectors::kCommandBytes, sizeof frame);
   frame[1] = wire::kProtocolVersion + 1;

@@ -183,7 +183,7 @@ TEST(two_frames_at_once_arrive_one_a_step) {
   CHECK(!bench.xbee.step(bench.line));
 }
 
-TEST(only_a_frame_that_is_told_as_delivered_is_delivered) {
+TEST(only_a_frame_that_is_reported_as_delivered_is_delivered) {
   Bench bench;
   const uint8_t data[1] = {1};
   CHECK(bench.xbee.send(0, data, sizeof data));  // frame id 1, as in the status frames

@@ -29,7 +29,7 @@ def _run(scenario: str, seed: int, overrides: dict[str, float] | None = None) ->
 
 
 @pytest.mark.parametrize(("scenario", "limit_m"), [("paper", 0.8), ("paper-p1", 0.21)])
-def test_the_bank_is_near_the_bound_without_being_told_the_noise(
+def test_the_bank_is_near_the_bound_without_knowing_the_noise(
     scenario: str, limit_m: float
 ) -> None:
     figures = [_run(scenario, seed) for seed in (0, 1)]
@@ -46,7 +46,7 @@ def test_the_bank_is_near_the_bound_without_being_told_the_noise(
         ({"scale_error": 0.1, "heading_drift_deg_s": 0.5}, 0.25),
     ],
 )
-def test_what_nobody_told_is_lived_with(overrides: dict[str, float], limit_m: float) -> None:
+def test_the_bank_adapts_to_unknown_settings(overrides: dict[str, float], limit_m: float) -> None:
     assert _run("paper-p1", 0, overrides).relative_distance_rmse_m < limit_m
 
 

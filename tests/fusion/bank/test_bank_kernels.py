@@ -216,7 +216,7 @@ def test_a_ranges_predicted_moments_are_those_of_sampled_places(distance: float)
     assert sigma == pytest.approx(sampled.std(), abs=0.02)
 
 
-def test_two_who_meet_break_nothing() -> None:
+def test_two_nodes_that_meet_break_nothing() -> None:
     x, p = np.zeros((1, SIZE)), np.zeros((1, SIZE, SIZE))
     p[0, 0, 0] = p[0, 1, 1] = 0.5
     updated(x, p, 0.3, 0.0, OUTLIER)

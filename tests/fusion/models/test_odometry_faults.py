@@ -35,7 +35,7 @@ def update(detector: CusumDetector, square: dict[tuple[int, int], float]) -> int
     return update_cusum(detector, first, second, values, np.ones(len(values)), 0.02, False)
 
 
-def test_the_one_that_fits_nobody_is_named_and_not_its_peers() -> None:
+def test_the_node_that_fits_no_other_is_named_and_not_its_peers() -> None:
     detector = detector_of(4)
     named = -1
     for _ in range(6):
@@ -152,7 +152,7 @@ def test_a_heading_that_slips_is_found_again_within_twenty_seconds(seed: int) ->
 
 
 @pytest.mark.parametrize("seed", [2, 4])
-def test_a_heading_slip_that_no_hypothesis_foresaw_is_said(seed: int) -> None:
+def test_a_heading_fault_that_no_hypothesis_covers_is_reported(seed: int) -> None:
     measurements, priors, _ = slipping_run(60.0, 140, seed)
     bank = fusion.make("bank", priors, {}, seed)
     estimates = [e for m in measurements for e in bank.process(m)] + bank.finish()
@@ -168,7 +168,7 @@ def test_a_heading_slip_that_no_hypothesis_foresaw_is_said(seed: int) -> None:
     assert sum(a.probability for a in listed if a.node == 3) == pytest.approx(1.0)
 
 
-def test_noise_of_a_standing_sensor_is_told_from_slow_motion() -> None:
+def test_noise_of_a_standing_sensor_is_distinguished_from_slow_motion() -> None:
     rng = np.random.default_rng(2)
     still, creeping = ZeroMotionDetector(), ZeroMotionDetector()
     stood = [still.update(1, *rng.normal(0.0, 0.01, 3), 1.0, 1.0) for _ in range(200)]

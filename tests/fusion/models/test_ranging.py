@@ -89,9 +89,7 @@ def test_levers_m_of_zero_change_nothing() -> None:
         assert a == pytest.approx(b, rel=1e-9, abs=1e-12)
 
 
-def test_repeated_ranges_of_two_who_stand_tell_little_new_and_moving_makes_them_independent() -> (
-    None
-):
+def test_ranges_repeated_at_rest_add_little_information_and_moving_makes_them_independent() -> None:
     correlation = RangeCorrelation()
     assert correlation.effective_counts([(1, 2)]) == pytest.approx([1.0])
     assert sum(correlation.effective_counts([(2, 1)])[0] for _ in range(10)) < 1.0

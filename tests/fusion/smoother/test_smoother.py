@@ -278,7 +278,7 @@ def test_a_hidden_step_scale_is_found_as_well_as_it_says() -> None:
     assert sum(square) < 22.5
 
 
-def test_a_node_that_nobody_ranges_is_not_located() -> None:
+def test_a_node_without_ranges_is_not_located() -> None:
     measurements: list[Motion | Range] = []
     for k in range(1, 11):
         measurements += [Motion(float(k), node, 0.5, 0.0, 0.1) for node in (1, 2, 3)]
