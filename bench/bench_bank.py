@@ -133,10 +133,10 @@ def main() -> None:
             ("  and every estimate looked at", {"biased": 0.0}, True),
             ("  and default settings, states of 46", {}, True),
         ):
-            told = figure(
+            summary = figure(
                 [interface_us(run, hypotheses, settings, read=read) for _ in range(args.rounds)]
             )
-            print(f"  {words}: {told}", flush=True)
+            print(f"  {words}: {summary}", flush=True)
 
 
 if __name__ == "__main__":

@@ -142,8 +142,8 @@ def simulate_crowd(settings: CrowdSettings, seed: int = 0) -> Crowd:
     ranges: list[Floats] = []
     for t in range(settings.range_period_s, len(poses), settings.range_period_s):
         i, j, d = _near(poses[t, :, :2], settings.max_range_m)
-        heard = range_rng.random(d.shape) < settings.detection
-        i, j, d = i[heard], j[heard], d[heard]
+        received = range_rng.random(d.shape) < settings.detection
+        i, j, d = i[received], j[received], d[received]
         late = range_rng.random(d.shape) < settings.nlos_probability
         d += settings.sigma_range_m * range_rng.standard_normal(d.shape)
         d += late * range_rng.uniform(2.0, 6.0, d.shape)

@@ -98,7 +98,7 @@ def play(stream: Sequence[tuple[float, bytes]], port: int) -> list[Packet]:
 
 def score(packets: Sequence[Packet], got: Sequence[tuple[float, str]]) -> dict[str, list[float]]:
     """Seconds from writing to showing of each motion and ranges report, and the fused age."""
-    pictures = [(s, m) for s, text in got if (m := json.loads(text))["type"] == "picture"]
+    views = [(s, m) for s, text in got if (m := json.loads(text))["type"] == "picture"]
     shown_s: dict[int, list[tuple[float, float]]] = defaultdict(list)
     ranged_s: dict[tuple[int, int, float], list[float]] = defaultdict(list)
     newest: dict[int, float] = {}
@@ -106,20 +106,20 @@ def score(packets: Sequence[Packet], got: Sequence[tuple[float, str]]) -> dict[s
     page: list[float] = []
     to_unix_s = time.time() - time.monotonic()
     begin_s = packets[0].written_s + SETTLE_S
-    for at_s, picture in pictures:
-        for person in picture["people"]:
+    for at_s, view in views:
+        for person in view["people"]:
             motion_s = person["motion_s"]
             placed = motion_s is not None and person["x_m"] is not None
             if placed and motion_s > newest.get(person["node"], -1.0):
                 newest[person["node"]] = motion_s
                 shown_s[person["node"]].append((motion_s, at_s))
-        for node, peer, range_m, age_s in picture["ranges"]:
+        for node, peer, range_m, age_s in view["ranges"]:
             if age_s < 5.0:
                 ranged_s[node, peer, round(range_m, 4)].append(at_s)
         if at_s > begin_s:
-            if picture["fused_s"] is not None:
-                fused.append(picture["time_s"] - picture["fused_s"])
-            page.append(at_s + to_unix_s - picture["unix_s"])
+            if view["fused_s"] is not None:
+                fused.append(view["time_s"] - view["fused_s"])
+            page.append(at_s + to_unix_s - view["unix_s"])
     # The session's clock began earlier or later than the stream's: by as much for all.
     offset_s = clock_offset_s(packets, shown_s)
     result: dict[str, list[float]] = {"motion": [], "ranges": [], "missing": []}

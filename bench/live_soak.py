@@ -64,16 +64,16 @@ class Follower:
         """Until the session ends."""
         with contextlib.suppress(WebSocketException, OSError), connect(self.url) as socket:
             for message in socket:
-                picture = json.loads(message)
-                if picture["type"] != "picture":
+                view = json.loads(message)
+                if view["type"] != "picture":
                     continue
                 self.pictures += 1
-                self.notices |= {n["text"] for n in picture["notices"] if n["id"] != "fusion"}
-                if picture["time_s"] > self.time_s and picture["arrived_unix_s"] is not None:
-                    self.age_s.append(time.time() - picture["arrived_unix_s"])
-                    if picture["fused_s"] is not None:
-                        self.behind_s.append(picture["time_s"] - picture["fused_s"])
-                self.time_s = max(self.time_s, picture["time_s"])
+                self.notices |= {n["text"] for n in view["notices"] if n["id"] != "fusion"}
+                if view["time_s"] > self.time_s and view["arrived_unix_s"] is not None:
+                    self.age_s.append(time.time() - view["arrived_unix_s"])
+                    if view["fused_s"] is not None:
+                        self.behind_s.append(view["time_s"] - view["fused_s"])
+                self.time_s = max(self.time_s, view["time_s"])
 
 
 def resident_mb(pid: int) -> float:
@@ -130,8 +130,8 @@ def main() -> int:
             if found := re.search(r"page: http(://\S+?)/\?(\S+)", line):
                 url = f"ws{found[1]}/ws?{found[2]}"
                 break
-        said: list[str] = []
-        threading.Thread(target=lambda: said.extend(session.stderr or ()), daemon=True).start()
+        errors: list[str] = []
+        threading.Thread(target=lambda: errors.extend(session.stderr or ()), daemon=True).start()
         follower = Follower(url)
         threading.Thread(target=follower.follow, daemon=True).start()
         looks = watch(session, follower, seconds, wanted.look_s)

@@ -233,11 +233,11 @@ def judge(imu: Array, field_ut: Array | None, truth: WearerTruth) -> Walk:
     edges = np.arange(first, count - 1, round(WINDOW_S * 50))
     for a, b in pairwise(edges):
         moved = planar(-float(facing[a])) @ (position[b] - position[a])
-        said = planar(-float(turned[a])) @ (claimed[b] - claimed[a])
-        delta = said - moved
+        reported = planar(-float(turned[a])) @ (claimed[b] - claimed[a])
+        delta = reported - moved
         turn = float(error[b - 25 : b + 25].mean() - error[max(a - 25, 0) : a + 25].mean())
         spans = {name: float(v[b] - v[a]) for name, v in variance.items()}
-        if path[b] - path[a] > 0.3 or np.linalg.norm(said) > 0.3:
+        if path[b] - path[a] > 0.3 or np.linalg.norm(reported) > 0.3:
             walk.windows += 1
             if min(spans.values()) <= 0.0:
                 walk.without_variance += 1

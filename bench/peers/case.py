@@ -85,12 +85,12 @@ def paper_case(scenario: str, seed: int, seconds: int) -> Case:
     run = simulate_paper(scenario, seed, {"seconds": seconds})
     count = settings.nodes
     motions = np.zeros((seconds, count, 3))
-    heard: dict[int, list[Range]] = {}
+    ranges_at: dict[int, list[Range]] = {}
     for m in run.measurements:
         if isinstance(m, Motion):
             motions[round(m.time_s) - 1, m.node - 1] = m.dx_m, m.dy_m, m.dtheta_rad
         elif isinstance(m, Range):
-            heard.setdefault(round(m.time_s) - 1, []).append(m)
+            ranges_at.setdefault(round(m.time_s) - 1, []).append(m)
     truth = np.zeros((seconds + 1, count, 3))
     for row in run.truth:
         truth[round(row.time_s), row.node - 1] = row.x_m, row.y_m, row.heading_rad or 0.0
@@ -99,7 +99,7 @@ def paper_case(scenario: str, seed: int, seconds: int) -> Case:
         scenario,
         motions,
         _sigmas(truth, np.array(DISTANCE_NOISE), settings.turn_noise * pattern / pattern.mean()),
-        tuple(_instant(heard.get(t)) for t in range(seconds)),
+        tuple(_instant(ranges_at.get(t)) for t in range(seconds)),
         truth,
         settings.sigma_range_m,
         run.measurements,

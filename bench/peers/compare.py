@@ -127,8 +127,8 @@ def peers_table(seeds: int, seconds: int) -> list[Row]:
                     break
                 row.scores.append(got)
             rows.append(row)
-            said = row.failure or f"{row.epoch_us:10.0f} us  {row.mean('distance_m'):.3f} m"
-            print(f"  {scenario:9} {contender.name:38} {said}", flush=True)
+            summary = row.failure or f"{row.epoch_us:10.0f} us  {row.mean('distance_m'):.3f} m"
+            print(f"  {scenario:9} {contender.name:38} {summary}", flush=True)
     return rows
 
 

@@ -41,7 +41,7 @@ def climb(climbers: int, seed: int) -> list[tuple[FloatArray, FloatArray, FloatA
     """Each climber's (time in seconds, height told, true height) in metres over the start."""
     walkers = [make_walker(SCRIPT, 100 * seed + k, node=k)[0] for k in range(1, climbers + 1)]
     end_s = max(float(walker.time_s[-1]) for walker in walkers)
-    told: dict[int, list[tuple[float, float]]] = {walker.node: [] for walker in walkers}
+    reported: dict[int, list[tuple[float, float]]] = {walker.node: [] for walker in walkers}
     link = Link()
     with (
         mock.patch.object(emulated, "make_team", return_value=(walkers, World(name="stairs"))),
@@ -52,10 +52,10 @@ def climb(climbers: int, seed: int) -> list[tuple[FloatArray, FloatArray, FloatA
         for time_us, data in team.stream():
             for seen in link.feed(data, time_us * 1e-6):
                 if isinstance(seen, Height):
-                    told[seen.node].append((seen.time_s, seen.height_m))
+                    reported[seen.node].append((seen.time_s, seen.height_m))
     rows = []
     for walker in walkers:
-        time_s, height_m = np.array(told[walker.node]).T
+        time_s, height_m = np.array(reported[walker.node]).T
         start_m = walker.position_m[walker.time_s < STAND_S / 2.0, 2].mean()
         true_m = np.interp(time_s, walker.time_s, walker.position_m[:, 2]) - start_m
         kept = time_s < walker.time_s[-1]

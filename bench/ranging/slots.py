@@ -104,7 +104,7 @@ def measure(
     """Run one team; the same arguments give the same figures."""
     end_s = SETTLE_S + seconds
     records: list[ExchangeRecord] = []
-    heard: list[tuple[float, Pair]] = []
+    received: list[tuple[float, Pair]] = []
     byte_count = 0
     link = Link()
     with EmulatedTeam(
@@ -113,7 +113,7 @@ def measure(
         team.uwb.on_end = records.append
         for time_us, data in team.stream():
             byte_count += len(data) if time_us >= SETTLE_S * 1e6 else 0
-            heard += [
+            received += [
                 (o.time_s, (o.node, o.peer))
                 for o in link.feed(data, time_us * 1e-6)
                 if isinstance(o, Range)
@@ -126,7 +126,7 @@ def measure(
     gaps = longest_gaps(
         ((r.end_us * 1e-6, (r.initiator, r.destination)) for r in ranged), pairs, SETTLE_S, end_s
     )
-    host_gaps = longest_gaps(heard, pairs, SETTLE_S, end_s)
+    host_gaps = longest_gaps(received, pairs, SETTLE_S, end_s)
     by_node = Counter(dict.fromkeys(ids, 0))
     by_node.update(r.initiator for r in ranged)
     return Figures(
@@ -145,7 +145,7 @@ def measure(
         pairs_within_10_s=sum(gap <= WANTED_GAP_S for gap in gaps) / len(gaps),
         fewest_ranges=min(by_node.values()),
         most_ranges=max(by_node.values()),
-        host_ranges=sum(time_s >= SETTLE_S for time_s, _ in heard),
+        host_ranges=sum(time_s >= SETTLE_S for time_s, _ in received),
         host_longest_gap_s=host_gaps[-1],
         line_load=byte_count * 10.0 / BAUD / seconds,
     )

@@ -24,8 +24,10 @@ def result(run: relpos.Run) -> relpos.Result:
 
 def test_importing_relpos_loads_nothing_heavy() -> None:
     code = "import relpos, sys; print(sorted(m for m in sys.modules if m in {'numpy','numba'}))"
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == "[]"
+    result_of_process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result_of_process.stdout.strip() == "[]"
 
 
 def test_every_name_it_promises_is_there() -> None:

@@ -1,4 +1,4 @@
-"""Who imports whom: no circles, and only what docs/architecture.md allows."""
+"""Imports between rooms: no circles, and only what docs/architecture.md allows."""
 
 import ast
 import tomllib

@@ -260,7 +260,7 @@ def test_a_buildings_field_has_neither_curl_nor_sources() -> None:
         step = h * np.eye(3)[j]
         gradient[:, :, j] = (field.field_ut(place + step) - field.field_ut(place - step)) / (2 * h)
     size = np.abs(gradient).max(axis=(1, 2))
-    # Within 0.7 m of a column's or an item's middle the field is held: nobody walks there.
+    # Within 0.7 m of a column's or an item's middle the field is held: no path leads there.
     outside = np.abs(np.trace(gradient, axis1=1, axis2=2)) < 1e-3 * size
     assert outside.mean() > 0.85
     curl = np.abs(gradient - gradient.transpose(0, 2, 1)).max(axis=(1, 2))

@@ -167,7 +167,7 @@ def test_walks_that_agree_are_believed():
     one, three = steps.posterior_scale([1.15]), steps.posterior_scale([1.15, 1.14, 1.16])
     assert 1.0 < one < 1.06
     assert three > 1.09
-    # One that was not what was told does not carry the others away.
+    # One walk that was not of the stated distance is an outlier.
     assert steps.posterior_scale([1.04, 1.05, 1.60]) == steps.posterior_scale([1.04, 1.05, 1.055])
 
 

@@ -163,8 +163,8 @@ def test_wrong_usage_is_exit_status_two(arguments: tuple[str, ...]) -> None:
 
 def test_a_recording_that_is_there_is_refused_at_once(simulated: Path, tmp_path: Path) -> None:
     (tmp_path / "f.mcap").write_bytes(b"")
-    told = one_clear_line(relpos("fuse", simulated, "--record", tmp_path / "f.mcap"))
-    assert "exists already: a recording is not overwritten" in told
+    message = one_clear_line(relpos("fuse", simulated, "--record", tmp_path / "f.mcap"))
+    assert "exists already: a recording is not overwritten" in message
 
 
 def test_an_unknown_setting_is_one_clear_line(simulated: Path) -> None:
@@ -391,10 +391,10 @@ def test_an_interrupt_ends_listening_and_keeps_what_was_received(tmp_path: Path)
     )  # fmt: skip
     try:
         assert listening.stderr is not None
-        said = listening.stderr.readline()
-        if "preparing" in said:
-            said = listening.stderr.readline()
-        assert "listening" in said
+        line = listening.stderr.readline()
+        if "preparing" in line:
+            line = listening.stderr.readline()
+        assert "listening" in line
         for second in range(1, 13):
             for node in (1, 2):
                 os.write(ours, motion_bytes(node, second))

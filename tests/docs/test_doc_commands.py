@@ -86,9 +86,9 @@ def emulated(*arguments):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     try:
-        told = re.search(r"/dev/\S+", process.stdout.readline())
-        assert told, process.stderr.read()
-        yield told[0]
+        port = re.search(r"/dev/\S+", process.stdout.readline())
+        assert port, process.stderr.read()
+        yield port[0]
         process.send_signal(signal.SIGINT)
         process.wait(PATIENCE_S)
     finally:

@@ -1,4 +1,4 @@
-"""The documentation's site: it builds without a warning and asks nobody else for anything."""
+"""The documentation's site: it builds without a warning and loads nothing from other sites."""
 
 import os
 import subprocess

@@ -20,9 +20,9 @@ def test_comparing_estimators_ranks_them_above_the_bound_and_draws(
     script = EXAMPLES / "compare_estimators.py"
     monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "figures")])
     names = runpy.run_path(str(script))
-    told = capsys.readouterr().out
+    output = capsys.readouterr().out
     ratios = {
-        name: float(value) for name, value in re.findall(r"(\w+): ([\d.]+) times the bound", told)
+        name: float(value) for name, value in re.findall(r"(\w+): ([\d.]+) times the bound", output)
     }
     assert ratios["deadreckoning"] > max(ratios["particle"], ratios["bank"])
     assert min(ratios.values()) > 0.8

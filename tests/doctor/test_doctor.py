@@ -51,7 +51,7 @@ class Pretended(Computer):
         return f"/usr/bin/{name}" if name in self.commands else None
 
     def output_of(self, *command):
-        return next((said for words, said in self.answers.items() if words in command), "")
+        return next((answer for words, answer in self.answers.items() if words in command), "")
 
     def processes(self):
         return dict(enumerate(self.running, 1))
@@ -90,7 +90,7 @@ class Pretended(Computer):
         return self.variables.get(name, "")
 
 
-def said(findings, name):
+def finding(findings, name):
     """(state, words, remedy) of the only finding of that name."""
     (found,) = (f for f in findings if f.name == name)
     assert "\n" not in found.words + found.remedy
@@ -102,7 +102,7 @@ def installed(tmp_path, key_file=None, **differences):
 
 
 def ports(port=None, **differences):
-    # Nobody opens a port that is not fit.
+    # The doctor does not open an unusable port.
     return list(devices.look(Pretended(**differences), port, lambda *_: pytest.fail("opened")))
 
 
@@ -113,11 +113,11 @@ def test_a_missing_extra_is_a_hint_with_the_line_that_installs_it(tmp_path, monk
     lacking = {"view": ["starlette>=0.40"], "recording": [], "exchange": []}
     monkeypatch.setattr(extras, "missing", lacking.__getitem__)
     findings = installed(tmp_path)
-    state, words, remedy = said(findings, "extra view")
+    state, words, remedy = finding(findings, "extra view")
     assert state == "hint"
     assert "live page" in words
     assert remedy.endswith("-m pip install 'starlette>=0.40'")
-    assert said(findings, "extra recording")[0] == "well"
+    assert finding(findings, "extra recording")[0] == "well"
 
 
 @pytest.mark.parametrize(
@@ -128,56 +128,56 @@ def test_a_missing_extra_is_a_hint_with_the_line_that_installs_it(tmp_path, monk
 def test_a_missing_tool_is_a_hint_with_its_package(missing, name, remedy, tmp_path, monkeypatch):
     monkeypatch.setattr("relpos.paths.firmware_project", lambda: tmp_path)
     commands = tuple(c for c in Pretended.commands if c != missing)
-    state, _, told = said(installed(tmp_path, commands=commands), name)
+    state, _, remedy_text = finding(installed(tmp_path, commands=commands), name)
     assert state == "hint"
-    assert remedy in told
-    assert said(installed(tmp_path), name)[0] == "well"
+    assert remedy in remedy_text
+    assert finding(installed(tmp_path), name)[0] == "well"
 
 
 def test_kernels_are_ready_once_every_room_has_been_compiled(tmp_path):
     environment = {"NUMBA_CACHE_DIR": str(tmp_path)}
-    state, _, remedy = said(installed(tmp_path, variables=environment), "estimators")
+    state, _, remedy = finding(installed(tmp_path, variables=environment), "estimators")
     assert (state, remedy) == ("hint", "relpos doctor --prepare")
     program = "from relpos.doctor import installation; installation.prepare()"
     subprocess.run([sys.executable, "-c", program], env=os.environ | environment, check=True)
-    assert said(installed(tmp_path, variables=environment), "estimators")[0] == "well"
+    assert finding(installed(tmp_path, variables=environment), "estimators")[0] == "well"
 
 
 def test_kernels_that_cannot_be_kept_are_wrong(tmp_path):
-    state, _, remedy = said(installed(tmp_path, writable=False), "estimators")
+    state, _, remedy = finding(installed(tmp_path, writable=False), "estimators")
     assert state == "wrong"
     assert "NUMBA_CACHE_DIR" in remedy
 
 
 def test_the_key_has_to_be_one_and_to_be_the_owners_alone(tmp_path):
-    assert said(installed(tmp_path), "team's key")[0] == "hint"
+    assert finding(installed(tmp_path), "team's key")[0] == "hint"
     key = tmp_path / "team.key"
-    state, words, _ = said(installed(tmp_path, key), "team's key")
+    state, words, _ = finding(installed(tmp_path, key), "team's key")
     assert (state, "no key can be read" in words) == ("wrong", True)
     write_new_key(key)
-    assert said(installed(tmp_path, key), "team's key")[0] == "well"
+    assert finding(installed(tmp_path, key), "team's key")[0] == "well"
     key.chmod(0o644)
-    state, _, remedy = said(installed(tmp_path, key), "team's key")
+    state, _, remedy = finding(installed(tmp_path, key), "team's key")
     assert (state, remedy) == ("wrong", f"chmod 600 {key}")
     key.chmod(0o600)
     (tmp_path / "team.key.seen").write_text("garbage")
-    assert said(installed(tmp_path, key), "team's key")[0] == "wrong"
+    assert finding(installed(tmp_path, key), "team's key")[0] == "wrong"
 
 
 @pytest.mark.parametrize(
     ("free", "state"), [(10_000_000, "wrong"), (1_000_000_000, "hint"), (5_000_000_000, "well")]
 )
 def test_room_for_recordings_is_judged(free, state, tmp_path):
-    assert said(installed(tmp_path, free=free), "room for recordings")[0] == state
+    assert finding(installed(tmp_path, free=free), "room for recordings")[0] == state
 
 
 def test_a_folder_that_cannot_be_written_is_wrong(tmp_path):
-    assert said(installed(tmp_path, writable=False), "room for recordings")[0] == "wrong"
+    assert finding(installed(tmp_path, writable=False), "room for recordings")[0] == "wrong"
 
 
 def test_without_a_browser_or_a_screen_other_ways_are_named(tmp_path):
     for differences in ({"commands": ()}, {"variables": {}}):
-        state, words, _ = said(installed(tmp_path, **differences), "browser")
+        state, words, _ = finding(installed(tmp_path, **differences), "browser")
         assert state == "hint"
         assert "--view-listen" in words
         assert "--terminal" in words
@@ -185,10 +185,10 @@ def test_without_a_browser_or_a_screen_other_ways_are_named(tmp_path):
 
 def test_a_clock_before_the_counters_is_wrong_and_an_unsynchronised_one_is_a_hint(tmp_path):
     early = datetime(1970, 1, 1, tzinfo=UTC)
-    assert said(installed(tmp_path, time=early), "clock")[0] == "wrong"
+    assert finding(installed(tmp_path, time=early), "clock")[0] == "wrong"
     answers = {"timedatectl": "NTPSynchronized=no\n"}
-    assert said(installed(tmp_path, answers=answers), "clock")[0] == "hint"
-    state, words, _ = said(installed(tmp_path), "clock")
+    assert finding(installed(tmp_path, answers=answers), "clock")[0] == "hint"
+    state, words, _ = finding(installed(tmp_path), "clock")
     assert state == "well"
     assert "2026-11-21 12:00:00, UTC (UTC+00:00)" in words
 
@@ -197,14 +197,14 @@ def test_a_clock_before_the_counters_is_wrong_and_an_unsynchronised_one_is_a_hin
 
 
 def test_every_port_on_usb_is_named_with_its_adapter():
-    state, words, _ = said(ports(), f"port {PORT}")
+    state, words, _ = finding(ports(), f"port {PORT}")
     assert state == "well"
     assert "CH340" in words
 
 
 def test_no_port_is_a_hint_unless_one_was_named():
-    assert said(ports(listed=()), "serial ports")[0] == "hint"
-    state, words, _ = said(ports("/dev/ttyUSB1"), "port /dev/ttyUSB1")
+    assert finding(ports(listed=()), "serial ports")[0] == "hint"
+    state, words, _ = finding(ports("/dev/ttyUSB1"), "port /dev/ttyUSB1")
     assert state == "wrong"
     assert f"plugged in: {PORT}" in words
 
@@ -215,21 +215,21 @@ def test_no_port_is_a_hint_unless_one_was_named():
      ({"joined": True}, "log out and in"), ({"group": "root"}, f"sudo chmod a+rw {PORT}")],
 )  # fmt: skip
 def test_a_port_that_may_not_be_used_is_wrong(differences, remedy):
-    state, _, told = said(ports(PORT, usable=False, **differences), f"port {PORT}")
+    state, _, remedy_text = finding(ports(PORT, usable=False, **differences), f"port {PORT}")
     assert state == "wrong"
-    assert told.startswith(remedy)
+    assert remedy_text.startswith(remedy)
 
 
 def test_the_program_that_holds_a_port_is_named():
-    state, words, _ = said(ports(PORT, held=["screen (42)"]), f"port {PORT}")
+    state, words, _ = finding(ports(PORT, held=["screen (42)"]), f"port {PORT}")
     assert state == "wrong"
     assert "screen (42)" in words
 
 
 def test_services_that_take_new_ports_are_named():
     found = ports(running=("ModemManager", "brltty"))
-    assert said(found, "ModemManager")[0] == "hint"
-    assert said(found, "brltty")[0] == "wrong"
+    assert finding(found, "ModemManager")[0] == "hint"
+    assert finding(found, "brltty")[0] == "wrong"
     ignored = ports(running=("ModemManager",), answers={"udevadm": "ID_MM_DEVICE_IGNORE=1\n"})
     assert [f.name for f in ignored] == [f"port {PORT}"]
 
@@ -266,8 +266,8 @@ class Wire:
         self.closed = True
 
 
-def module_said(changes, monkeypatch):
-    """What is said of a coordinator with these settings; None: nothing answers."""
+def coordinator_finding(changes, monkeypatch):
+    """Return the finding for a coordinator with these settings; None: nothing answers."""
     monkeypatch.setattr("relpos.nodes.radio.GUARD_S", 0.001)
     monkeypatch.setattr("relpos.nodes.radio.ANSWER_S", 0.01)
     module = None
@@ -284,15 +284,15 @@ def module_said(changes, monkeypatch):
     found = list(devices.look(Pretended(), PORT, open_port))
     assert opened
     assert all(wire.closed for wire in opened)
-    return said(found, "coordinator")
+    return finding(found, "coordinator")
 
 
 def test_a_module_that_is_set_up_is_well(monkeypatch):
-    assert module_said({}, monkeypatch)[0] == "well"
+    assert coordinator_finding({}, monkeypatch)[0] == "well"
 
 
 def test_each_setting_that_differs_is_named_with_the_command_that_sets_it(monkeypatch):
-    state, words, remedy = module_said({b"MY": b"\x00\x07", b"SM": b"\x04"}, monkeypatch)
+    state, words, remedy = coordinator_finding({b"MY": b"\x00\x07", b"SM": b"\x04"}, monkeypatch)
     assert state == "wrong"
     assert "MY=7 instead of 0" in words
     assert "SM=4 instead of 0" in words
@@ -300,13 +300,13 @@ def test_each_setting_that_differs_is_named_with_the_command_that_sets_it(monkey
 
 
 def test_another_network_is_a_hint(monkeypatch):
-    state, words, _ = module_said({b"ID": b"\x12\x34"}, monkeypatch)
+    state, words, _ = coordinator_finding({b"ID": b"\x12\x34"}, monkeypatch)
     assert state == "hint"
     assert "ID=1234 instead of 3332" in words
 
 
 def test_a_port_with_no_module_is_wrong(monkeypatch):
-    state, words, _ = module_said(None, monkeypatch)
+    state, words, _ = coordinator_finding(None, monkeypatch)
     assert state == "wrong"
     assert "no XBee module answers" in words
 
@@ -316,7 +316,7 @@ def test_a_port_that_does_not_open_is_wrong():
         raise DeviceError(f"{port}: cannot open the serial port: another program has it open")
 
     found = list(devices.look(Pretended(), PORT, open_port))
-    assert said(found, "coordinator")[:2] == (
+    assert finding(found, "coordinator")[:2] == (
         "wrong", f"{PORT}: cannot open the serial port: another program has it open",
     )  # fmt: skip
 
@@ -331,8 +331,8 @@ def doctor(*arguments):
 def test_an_emulated_coordinator_is_well_for_the_command(tmp_path):
     with EmulatedTeam(TeamConfig("paper", 1, 60.0, 1)) as team, PseudoTerminal(team) as terminal:
         terminal.start()
-        told = json.loads(doctor(terminal.path, "--out", str(tmp_path), "--json").stdout)
-    assert [f["state"] for f in told["findings"] if f["name"] == "coordinator"] == ["well"]
+        report = json.loads(doctor(terminal.path, "--out", str(tmp_path), "--json").stdout)
+    assert [f["state"] for f in report["findings"] if f["name"] == "coordinator"] == ["well"]
 
 
 def test_the_exit_status_is_1_where_something_is_wrong(tmp_path, monkeypatch):
@@ -344,5 +344,5 @@ def test_the_exit_status_is_1_where_something_is_wrong(tmp_path, monkeypatch):
     assert bad.exit_code == 1
     assert "wrong  port /dev/ttyUSB0" in bad.output
     assert bad.output.splitlines()[-1].startswith("1 wrong")
-    told = json.loads(doctor(PORT, "--out", str(tmp_path), "--json").stdout)
-    assert told["well"] is False
+    report = json.loads(doctor(PORT, "--out", str(tmp_path), "--json").stdout)
+    assert report["well"] is False

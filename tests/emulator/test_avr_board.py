@@ -635,8 +635,8 @@ def test_what_comes_before_power_on_is_lost_and_counted(build: Builder) -> None:
     board = AvrEngine(
         BOARDS["uno"], build(ECHO), bus, bytearray(1024), 1, power_on_us=50_000, line_baud=38400
     )
-    heard: list[tuple[int, bytes]] = []
-    board.on_transmit = lambda time_us, data: heard.append((time_us, data))
+    transmitted: list[tuple[int, bytes]] = []
+    board.on_transmit = lambda time_us, data: transmitted.append((time_us, data))
     board.run(20_000)
     board.receive(b"early")
     board.run(60_000)
@@ -644,8 +644,8 @@ def test_what_comes_before_power_on_is_lost_and_counted(build: Builder) -> None:
     board.run(70_000)
     board.close()
     assert board.lost_while_off == 5
-    assert [data for _, data in heard] == [b"!"]
-    assert heard[0][0] == pytest.approx(60_000 + 2 * 260, abs=10)
+    assert [data for _, data in transmitted] == [b"!"]
+    assert transmitted[0][0] == pytest.approx(60_000 + 2 * 260, abs=10)
 
 
 def test_boards_in_different_threads_do_not_disturb_each_other(build: Builder) -> None:

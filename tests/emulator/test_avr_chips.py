@@ -29,7 +29,7 @@ static void read_n(uint8_t chip, uint8_t reg, uint8_t n) {
 """
 
 
-class Nobody:
+class SilentChannel:
     """Air in which no tag answers."""
 
     def __init__(self) -> None:
@@ -39,7 +39,7 @@ class Nobody:
         self.wanted.append((destination, time_us))
 
 
-def run(elf_program: str, tmp_path: Path, seconds: float) -> tuple[bytes, I2cBus, Nobody]:
+def run(elf_program: str, tmp_path: Path, seconds: float) -> tuple[bytes, I2cBus, SilentChannel]:
     still = np.tile([9.80665, 0.0, 0.0], (100, 1))
     around = Surroundings(
         rate_hz=200.0,
@@ -50,7 +50,7 @@ def run(elf_program: str, tmp_path: Path, seconds: float) -> tuple[bytes, I2cBus
     )
     compass = Ak8975(around, None, lambda: inertial.bypassed())
     inertial = Mpu9150(around, None, {0x0C: compass})
-    bus, air = I2cBus(), Nobody()
+    bus, air = I2cBus(), SilentChannel()
     bus.attach(0x68, inertial)
     bus.attach(0x0C, compass.host_side())
     bus.attach(0x4B, Pozyx(7, air, around))

@@ -36,7 +36,7 @@ POWER_ON_US = {"native": 6000, "uno": 4000, "mega": 0}
 SEEN_S = 0.006
 """How far two boards' times of one sample may be apart: it is looked for every millisecond."""
 SENT_S = 0.07
-"""And those of the other messages, which tell when they were written: once the radio is free, and
+"""And those of the other messages, stamped when they are written: once the radio is free and
 an exchange of ranges is over."""
 OWN = {"free_stack_bytes", "worst_tick_s"}
 """What is the board's own: a computer has all the stack it wants and no tick that takes time."""
@@ -117,7 +117,7 @@ def frames(board, seconds):
 
 
 def time_s(frame):
-    """When what it tells was so: of an answer, nothing is told."""
+    """Return the time of a frame's content in seconds; 0 for answers, which have none."""
     return frame.values.get("time_s", 0.0)
 
 

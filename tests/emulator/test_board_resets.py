@@ -66,7 +66,7 @@ def straight(board, seconds, **errors):
 
 @pytest.mark.parametrize("board", BOARDS)
 def test_a_node_reports_the_cause_of_a_restart_and_counts_it(board):
-    told = []
+    reported = []
     causes = ("POWER_ON", "BROWN_OUT", "WATCHDOG", "EXTERNAL")
     with straight(board, 60.0) as team:
         listener = Listener(team)
@@ -78,9 +78,9 @@ def test_a_node_reports_the_cause_of_a_restart_and_counts_it(board):
             at_us += 12_000_000 + 7_919 * k
             frames = listener.until(at_us)
             (status, *_) = [f for f in frames if f.message is wire.STATUS]
-            told.append((wire.ResetCause(status.values["reset_cause"]).name, status.boot))
-    first_boot = told[0][1]
-    assert told == [(cause, first_boot + k) for k, cause in enumerate(causes)]
+            reported.append((wire.ResetCause(status.values["reset_cause"]).name, status.boot))
+    first_boot = reported[0][1]
+    assert reported == [(cause, first_boot + k) for k, cause in enumerate(causes)]
 
 
 @pytest.mark.parametrize("board", BOARDS)
@@ -109,7 +109,7 @@ def settings_after_a_cut(board, cut_after_us):
         node.restart(2_000_000 + cut_after_us, wire.ResetCause.BROWN_OUT)
         team.run(4_000_000)
         listener.frames.clear()
-        # What is in force is told by the answer to a command that is out of range.
+        # The answer to a command that is out of range has the value in force.
         code = wire.CommandCode.SET_LEG_LENGTH_MM
         node.command(team.coordinator, code, 1, 0x4000, 4_000_000)
         (answer,) = [f for f in listener.until(6_000_000) if f.message is wire.ACKNOWLEDGEMENT]
@@ -181,12 +181,12 @@ def test_times_follow_a_clock_that_changes_its_rate(board):
         rates = []
         for drift_ppm in (0.0, 20_000.0):
             listener.node.engine.set_drift(team.clock.now_us, drift_ppm)
-            told = [
+            reported = [
                 (frame.values["time_s"], left_s)
                 for frame, left_s in listener.timed(team.clock.now_us + 12_000_000)
                 if frame.message is wire.MOTION
             ]
-            rates.append((told[-1][0] - told[0][0]) / (told[-1][1] - told[0][1]))
+            rates.append((reported[-1][0] - reported[0][0]) / (reported[-1][1] - reported[0][1]))
         # A report leaves within 40 ms of its time.
         assert rates == pytest.approx([1.0, 1.02], abs=0.004)
-        assert 0.0 < told[0][0] - 12.0 < 1.1  # no jump in between
+        assert 0.0 < reported[0][0] - 12.0 < 1.1  # no jump in between

@@ -116,13 +116,13 @@ def written_down(board, seconds):
             node.command(team.coordinator, code, value, 0xFFF0 + k, at_us)
         raw_from_us = round((seconds - 6.0) * 1e6)
         node.command(team.coordinator, wire.CommandCode.SET_RAW_REPORTS, 20, 0xFFF8, raw_from_us)
-        looks, heard, marks = [], [], []
+        looks, received, marks = [], [], []
         for until_us in range(500_000, round(seconds * 1e6) + 1, 500_000):
             team.run(until_us)
             looks += board.take_looks()
-            heard += board.take_heard()
+            received += board.take_heard()
             marks += board.take_marks()
-        return bus, passes(looks, marks), heard, sent.frames
+        return bus, passes(looks, marks), received, sent.frames
 
 
 def passes(looks, marks):
@@ -142,7 +142,7 @@ def passes(looks, marks):
     return found
 
 
-def played(bus, passed, heard):
+def played(bus, passed, received):
     """The frames that the native build sends, asked the same at the same times."""
     (_, first_us), *passed = passed
     engine = NativeEngine(
@@ -150,11 +150,11 @@ def played(bus, passed, heard):
     )
     sent = Sent()
     engine.on_transmit = sent
-    heard = list(heard)
+    received = list(received)
     for k, (cycle, now_us) in enumerate(passed):
-        arrived = bytes(byte for at, byte in heard if at <= cycle + READS_AFTER_CYCLES)
+        arrived = bytes(byte for at, byte in received if at <= cycle + READS_AFTER_CYCLES)
         if arrived:
-            del heard[: len(arrived)]
+            del received[: len(arrived)]
             engine.receive(arrived)
         try:
             engine.poll(cycle // 16, now_us)
@@ -184,8 +184,8 @@ def digits(frame):
 )
 def test_native_and_avr_agree_in_every_message_within_its_last_digit(board):
     _firmware_is_built()
-    bus, passed, heard, theirs = written_down(board, 45.0)
-    ours = played(bus, passed, heard)
+    bus, passed, received, theirs = written_down(board, 45.0)
+    ours = played(bus, passed, received)
     assert [(f.message.name, f.boot, f.counter) for f in ours] == [
         (f.message.name, f.boot, f.counter) for f in theirs
     ]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from relpos.calibration.steps import believed_scale
+from relpos.calibration.steps import posterior_scale
 from relpos.emulator.deadreckoning import (
     WearerSettings,
     calibrate,
@@ -157,7 +157,7 @@ def test_a_calibration_walk_sets_the_gain_as_far_as_one_walk_is_believed(walker)
     found = calibrate(1, [recording], [1.05 * before_m], 0.9)
     # With the gain that the firmware begins with.
     assert found.measured_m == pytest.approx((before_m,), rel=1e-3)
-    assert found.scale == pytest.approx(believed_scale([1.05]), abs=1e-3)
+    assert found.scale == pytest.approx(posterior_scale([1.05]), abs=1e-3)
     after_m = play(1, recording, WearerSettings(0.9, found.gain_permille)).distance_m
     assert after_m / before_m == pytest.approx(found.scale, abs=0.005)
     # Walks that agree are believed more than one of them.

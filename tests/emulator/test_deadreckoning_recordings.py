@@ -46,7 +46,7 @@ def test_a_constant_offset_costs_no_step_but_a_missing_and_an_extra_one_count():
     steps = np.sort(np.append(np.delete(contacts, 12) + 0.2, 5.25))
     score = replay.score_steps(walk, steps)
     assert (score.found, score.extra) == (29, 1)
-    # Steps before the trial and behind it are nobody's.
+    # Steps before and after the trial do not count.
     score = replay.score_steps(walk, np.concatenate(([0.1], contacts, [21.0, 22.0])))
     assert (score.found, score.extra) == (30, 0)
 

@@ -20,7 +20,7 @@ NOISE_M = 0.35
 """Of a range: 0.1 m of sensor noise over some 200 ranges, and what people walk in the 20 ms that a
 frame needs to the host."""
 WHOLE_M = 0.003
-"""Totals are told in whole millimetres."""
+"""Totals are reported in whole millimetres."""
 
 
 @functools.cache
@@ -51,7 +51,7 @@ def motions_between(run, begin_s, end_s, node=NODE):
 
 
 def heading_apart_rad(result):
-    """Between the heading told with the fault and without, at the end."""
+    """Difference of the final headings reported with the fault and without, in radians."""
     ours, theirs = (r.of(wire.MOTION, NODE)[-1][1].values for r in (result.run, result.clean))
     return abs(ours["heading_rad"] - theirs["heading_rad"])
 
@@ -212,10 +212,10 @@ def test_a_pozyx_that_fails_or_lies_gives_no_wrong_range_and_touches_no_motion(s
     assert_every_range_is_true(result)
     assert_motion_is_untouched(result)
     assert_others_do_not_care(result)
-    told = result.run.grown(NODE, "ranging_failures") + result.run.grown(NODE, "bus_errors")
+    failures = result.run.grown(NODE, "ranging_failures") + result.run.grown(NODE, "bus_errors")
     before = result.clean.grown(NODE, "ranging_failures") + result.clean.grown(NODE, "bus_errors")
     unwell = wire.Health.POZYX in result.run.unwell(NODE, BEGIN_S + 1.0, END_S)
-    assert unwell or told >= before + 3
+    assert unwell or failures >= before + 3
     assert result.recovery_s <= 4.5
 
 
@@ -275,7 +275,7 @@ def test_no_fault_of_the_radio_loses_motion_or_lets_anything_in_twice(spec):
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "least_counts"),
     [
         ("radio:bitflip", {"FrameCrcError": 5}),
         ("radio:truncate", {"FrameLengthError": 1, "FrameCrcError": 1}),
@@ -287,9 +287,9 @@ def test_no_fault_of_the_radio_loses_motion_or_lets_anything_in_twice(spec):
         ("xbee:delayed", {"reordered": 3}),
     ],
 )
-def test_the_host_counts_what_it_refuses_or_misses(name, told):
+def test_the_host_counts_what_it_refuses_or_misses(name, least_counts):
     counts = outcome(next(spec for spec, fault in SPECS.items() if fault.name == name)).run.counts
-    for reason, least in told.items():
+    for reason, least in least_counts.items():
         assert counts[reason] >= least
 
 

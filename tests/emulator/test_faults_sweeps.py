@@ -46,8 +46,8 @@ def surroundings():
 
 
 class Bench:
-    """One node; its peers answer each exchange with a distance of its own, so that a range tells
-    which exchange it is of. The radio delivers everything."""
+    """One node; its peers answer each exchange with a distance of its own, so that a range
+    identifies its exchange. The radio delivers everything."""
 
     def __init__(self, board="native", prepare=lambda bench: None):
         self.clock = VirtualClock()
@@ -115,22 +115,22 @@ class Bench:
 
 
 def assert_ranges_are_true(bench):
-    """Each is of an exchange that was made, with that peer, at that time, and told once."""
-    told = []
+    """Each is of an exchange that was made, with that peer, at that time, and reported once."""
+    reported_mm = []
     boots = {}
     for t, f in bench.frames:
         boots.setdefault(f.boot, t)
     for t, frame in bench.of(wire.RANGES):
         for entry in frame.values["ranges"]:
             range_mm = round(entry["range_m"] * 1000)
-            assert range_mm in bench.exchanges, "a distance that nobody measured"
+            assert range_mm in bench.exchanges, "a distance that was not measured"
             peer, ended_s = bench.exchanges[range_mm]
             assert entry["peer"] == peer
             # Node time of the frame is when it left: from there back by the age.
             assert t - entry["age_s"] == pytest.approx(ended_s, abs=0.15)
-            told.append(range_mm)
-    assert len(told) == len(set(told))
-    return told
+            reported_mm.append(range_mm)
+    assert len(reported_mm) == len(set(reported_mm))
+    return reported_mm
 
 
 @cache
@@ -155,8 +155,8 @@ def assert_no_more_than_lost(bench, gap_s, board="native", seconds=SECONDS, astr
     ours = motions[-1][1].values
     assert abs(ours["time_s"] - theirs["time_s"]) < 0.2
     apart_m = math.dist((ours["x_m"], ours["y_m"]), (theirs["x_m"], theirs["y_m"]))
-    # A gap of samples costs the way of that time (1.5 m/s at most) and, where it hides the end
-    # of a step, that one: 0.8 m. It turns nobody by more than one turns in it (2 rad/s).
+    # A gap of samples costs the path of that time (1.5 m/s at most) and, where it hides the end
+    # of a step, that step: 0.8 m. The heading is off by at most the turn in it (2 rad/s).
     assert apart_m < 0.8 * astray + 1.5 * gap_s
     assert abs(ours["path_m"] - theirs["path_m"]) < 0.8 * astray + 1.5 * gap_s
     assert abs(ours["heading_rad"] - theirs["heading_rad"]) < 0.05 + 2.0 * gap_s
@@ -261,9 +261,9 @@ def assert_it_is_back(bench, at_us):
     assert first - at_us * 1e-6 < RESTART_S + 1.3, "a report within a period of the start"
     statuses = [f.values for _, f in bench.of(wire.STATUS) if f.boot == boots[-1]]
     assert statuses[0]["reset_cause"] == wire.ResetCause.BROWN_OUT
-    told = assert_ranges_are_true(bench)
-    ended = [bench.exchanges[range_mm][1] for range_mm in told]
-    # No range of before the restart is told after it.
+    reported_mm = assert_ranges_are_true(bench)
+    ended = [bench.exchanges[range_mm][1] for range_mm in reported_mm]
+    # No range from before the restart is reported after it.
     for t, frame in bench.of(wire.RANGES):
         if frame.boot == boots[-1]:
             assert all(t - e["age_s"] > at_us * 1e-6 for e in frame.values["ranges"])

@@ -117,8 +117,8 @@ def test_the_same_faults_and_seed_give_the_same_bytes():
 def test_the_table_of_reliability_has_a_row_for_every_fault():
     page = Path(__file__).parents[2] / "docs" / "reliability.md"
     rows = [line for line in page.read_text().splitlines() if line.startswith("| `")]
-    told = [row.split("`")[1] for row in rows]
-    assert told == [spec for target in TARGETS for f, spec in fault_runs.specs()
+    listed = [row.split("`")[1] for row in rows]
+    assert listed == [spec for target in TARGETS for f, spec in fault_runs.specs()
                     if f.target == target]  # fmt: skip
     for row, (fault, _) in zip(rows, sorted(
         fault_runs.specs(), key=lambda pair: list(TARGETS).index(pair[0].target)

@@ -67,7 +67,7 @@ class Node:
     def polls(self):
         return [int.from_bytes(d[d.index(b"P") + 1 :][:4], "little") for _, d in self.sent]
 
-    def said(self):
+    def transmitted(self):
         return b"".join(d for _, d in self.sent)
 
 
@@ -109,14 +109,14 @@ def test_the_bus_is_driven_at_the_virtual_time_of_the_poll(library):
     node = Node(library, chip).run(5_000)
     node.engine.receive(b"T")
     node.run(10_500)
-    assert b"I\0\xa7" in node.said()
+    assert b"I\0\xa7" in node.transmitted()
     assert chip.time_us == pytest.approx(10_000, abs=2)
 
 
 def test_an_absent_chip_is_an_address_nack(library):
     node = Node(library)
     node.engine.receive(b"T")
-    assert b"I\1\0" in node.run(0).said()
+    assert b"I\1\0" in node.run(0).transmitted()
 
 
 def test_an_error_in_a_chip_model_comes_out_of_the_run(library):
@@ -128,7 +128,7 @@ def test_an_error_in_a_chip_model_comes_out_of_the_run(library):
 
 def test_a_reset_starts_the_firmware_anew_and_keeps_the_eeprom(library):
     node = Node(library).run(0)
-    assert node.said()[:3] == b"B\1\xff"
+    assert node.transmitted()[:3] == b"B\1\xff"
     node.engine.receive(b"W\x42")
     node.run(10_500)
     assert node.eeprom[0] == 0x42

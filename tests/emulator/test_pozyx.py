@@ -149,8 +149,8 @@ def test_the_channel_reports_each_exchange_when_it_is_over():
     field.at(BOOTED_US + 50_000)
     field.range(3, 77)
     field.at(BOOTED_US + 100_000)
-    told = [(r.initiator, r.destination, r.outcome) for r in records]
-    assert told == [
+    outcomes = [(r.initiator, r.destination, r.outcome) for r in records]
+    assert outcomes == [
         (1, 2, Outcome.COLLIDED),
         (3, 2, Outcome.COLLIDED),
         (4, 5, Outcome.RANGED),

@@ -24,7 +24,7 @@ class Talker:
         self.seconds = seconds
         self.end_us = round(seconds * 1e6)
         self.time_us = 0
-        self.heard = bytearray()
+        self.received = bytearray()
         self.period_us = period_us
         self.size = size
         self.fails_at_us = None
@@ -43,7 +43,7 @@ class Talker:
         return [(k * self.period_us, self.frame(k)) for k in range(first, last + 1)]
 
     def send(self, data):
-        self.heard += data
+        self.received += data
 
 
 def numbers(data):
@@ -128,9 +128,9 @@ def test_what_the_host_writes_reaches_the_coordinator_unspoilt():
             read_all(port, 1)
             port.write(message)
             deadline = time.monotonic() + 5.0
-            while len(talker.heard) < len(message) and time.monotonic() < deadline:
+            while len(talker.received) < len(message) and time.monotonic() < deadline:
                 port.read(4096)
-    assert bytes(talker.heard) == message
+    assert bytes(talker.received) == message
 
 
 def test_a_reader_without_settings_of_its_own_gets_raw_bytes():
@@ -147,7 +147,7 @@ def test_a_reader_without_settings_of_its_own_gets_raw_bytes():
             os.close(reader)
         terminal.join()
     assert numbers(data) == list(range(1, 1001))
-    assert talker.heard == b""  # nothing was echoed
+    assert talker.received == b""  # nothing was echoed
 
 
 def test_marks_carry_the_virtual_time_of_what_follows():

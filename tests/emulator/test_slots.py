@@ -105,16 +105,16 @@ def test_seven_share_the_air_fairly(seven):
 
 
 def test_a_node_without_beacons_says_so_and_ranges_on():
-    link, told = Link(), []
+    link, statuses = Link(), []
     with EmulatedTeam(TeamConfig("paper", 3, 60.0, 2, beacons=True)) as team:
         records = []
         team.uwb.on_end = records.append
         for until_us in (25_000_000, 60_000_000):
             for time_us, data in team.run(until_us):
-                told += [o for o in link.feed(data, time_us * 1e-6) if isinstance(o, Status)]
+                statuses += [o for o in link.feed(data, time_us * 1e-6) if isinstance(o, Status)]
             team.coordinator.from_serial = lambda *_: None  # no beacon from now on
-    teams = {t.time_s: t.value for t in told if t.name == "team"}
-    health = {t.time_s: int(t.value) for t in told if t.name == "health"}
+    teams = {t.time_s: t.value for t in statuses if t.name == "team"}
+    health = {t.time_s: int(t.value) for t in statuses if t.name == "health"}
     assert {value for s, value in teams.items() if 8.0 < s < 25.0} == {3.0}
     assert {value for s, value in teams.items() if s > 32.0} == {0.0}
     assert all(h & wire.Health.BEACON for s, h in health.items() if 8.0 < s < 25.0)

@@ -27,7 +27,7 @@ def serial_output(seed, seconds=SECONDS, nodes=NODES, **options):
 
 
 @pytest.fixture(scope="module")
-def heard():
+def received():
     """A team after its walk, what left its port, and the link that read it."""
     with EmulatedTeam(TeamConfig("paper", NODES, SECONDS, 5)) as team:
         link = Link()
@@ -45,8 +45,8 @@ def frames_of(chunks):
     return frames
 
 
-def test_everything_at_the_port_is_a_frame_of_this_protocol(heard):
-    _, chunks, _, _ = heard
+def test_everything_at_the_port_is_a_frame_of_this_protocol(received):
+    _, chunks, _, _ = received
     frames = frames_of(chunks)
     assert all(isinstance(frame, Receive16) for frame in frames)
     decoded = [wire.decode(frame.data) for frame in frames]
@@ -55,14 +55,14 @@ def test_everything_at_the_port_is_a_frame_of_this_protocol(heard):
     assert {"motion", "ranges", "status"} <= {f.message.name for f in decoded}
 
 
-def test_times_rise_and_bytes_keep_to_the_speed_of_the_line(heard):
-    _, chunks, _, _ = heard
+def test_times_rise_and_bytes_keep_to_the_speed_of_the_line(received):
+    _, chunks, _, _ = received
     for (before, _), (after, data) in itertools.pairwise(chunks):
         assert after - before >= len(data) * 10 / 38_400 * 1e6 - 1
 
 
-def test_every_node_reports_its_motion_every_second(heard):
-    team, _, _, observations = heard
+def test_every_node_reports_its_motion_every_second(received):
+    team, _, _, observations = received
     counts = Counter(o.node for o in observations if isinstance(o, Motion))
     # 2 % of the frames are lost on the air, the first second is for booting.
     assert all(0.85 * SECONDS <= counts[node] <= SECONDS for node in team.nodes)
@@ -77,8 +77,8 @@ def test_the_same_seed_gives_the_same_bytes_at_the_same_times():
     )
 
 
-def test_ranges_are_the_true_distances_at_their_times(heard):
-    team, _, _, observations = heard
+def test_ranges_are_the_true_distances_at_their_times(received):
+    team, _, _, observations = received
     ranges = [o for o in observations if isinstance(o, Range)]
     assert len(ranges) > 10
     for r in ranges:
@@ -87,9 +87,9 @@ def test_ranges_are_the_true_distances_at_their_times(heard):
         assert r.range_m == pytest.approx(true, abs=0.55)
 
 
-def test_dead_reckoning_goes_where_the_walker_goes(heard):
+def test_dead_reckoning_goes_where_the_walker_goes(received):
     """A coarse check of the whole chain's scales and signs, not of its accuracy."""
-    team, _, _, observations = heard
+    team, _, _, observations = received
     motions = [o for o in observations if isinstance(o, Motion) and o.node == 1]
     x = y = heading = 0.0
     for m in motions:
@@ -102,16 +102,16 @@ def test_dead_reckoning_goes_where_the_walker_goes(heard):
     assert heading == pytest.approx(true_turn, abs=0.5)
 
 
-def test_what_the_radio_loses_is_what_the_link_misses(heard):
-    team, _, link, _ = heard
+def test_what_the_radio_loses_is_what_the_link_misses(received):
+    team, _, link, _ = received
     assert team.radio.counts["sent"] - team.radio.counts["lost"] == pytest.approx(
         link.summary()["received"], abs=3
     )
     assert link.summary()["lost"] <= team.radio.counts["lost"]
 
 
-def test_chips_are_driven_without_bus_errors(heard):
-    team, _, _, observations = heard
+def test_chips_are_driven_without_bus_errors(received):
+    team, _, _, observations = received
     for node in team.nodes.values():
         failed = sum(n for (_, status), n in node.bus.counts.items() if status)
         assert failed < 0.02 * node.bus.transactions
@@ -138,11 +138,11 @@ def test_a_command_reaches_its_node_and_is_acknowledged():
 
 def beacons_of(team, node, seconds):
     """Arrival times and values of the beacons that come out of a node's radio module."""
-    heard, parser = [], Parser()
+    received, parser = [], Parser()
     inner = team.nodes[node].radio.on_serial
 
     def tap(left_us, data):
-        heard.extend(
+        received.extend(
             (left_us * 1e-6, wire.decode(frame.data, team.key))
             for frame in parser.feed(data)
             if isinstance(frame, Receive16) and frame.data[2] == wire.BEACON.number
@@ -151,21 +151,21 @@ def beacons_of(team, node, seconds):
 
     team.nodes[node].radio.on_serial = tap
     team.run(round(seconds * 1e6))
-    return heard
+    return received
 
 
 def test_a_team_that_sends_beacons_itself_sends_its_virtual_time():
     key = bytes(range(16))
     with EmulatedTeam(TeamConfig("paper", 3, 30.0, 3, key=key, beacons=True)) as team:
-        heard = beacons_of(team, 2, 30.0)
-    assert 23 <= len(heard) <= 26
-    counters = [frame.counter for _, frame in heard]
+        received = beacons_of(team, 2, 30.0)
+    assert 23 <= len(received) <= 26
+    counters = [frame.counter for _, frame in received]
     assert counters == sorted(set(counters))
-    for time_s, frame in heard:
+    for time_s, frame in received:
         assert [entry["node"] for entry in frame.values["nodes"]] == [1, 2, 3]
-        told_s = frame.values["round"] * 2.0 + frame.values["phase_s"]
+        beacon_s = frame.values["round"] * 2.0 + frame.values["phase_s"]
         # Two lines of 38400 baud and the air lie between.
-        assert 0.02 < time_s - told_s < 0.12
+        assert 0.02 < time_s - beacon_s < 0.12
 
 
 def test_who_hears_a_beacon_hears_it_at_the_same_moment_as_the_others():

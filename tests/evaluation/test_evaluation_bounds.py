@@ -128,9 +128,9 @@ class _Dense:
         by_position = by_position.reshape(count, steps + 1, 2, self.size)
         result = []
         for k in range(1, steps + 1):
-            heard = scene.range_time_s <= until_s[k]
-            one = by_range[heard]
-            weight = scene.range_information[heard, None]
+            received = scene.range_time_s <= until_s[k]
+            one = by_range[received]
+            weight = scene.range_information[received, None]
             information = np.eye(self.size) + one.T @ (weight * one)
             wanted = by_position[:, k].reshape(2 * count, self.size)
             result.append(wanted @ np.linalg.solve(information, wanted.T))
@@ -296,7 +296,7 @@ def _reordered(scene: TrueRun, order: list[int]) -> dict[str, npt.NDArray[np.gen
 def test_ranges_that_are_sometimes_too_long_carry_less_information() -> None:
     clean = bounds.of_simulated("paper-p1", 0, {"seconds": 120}).totals()
     late = bounds.of_simulated("paper-p1", 0, {"seconds": 120, "nlos_probability": 0.2}).totals()
-    # A fifth of the ranges tells next to nothing; the others can be told from them.
+    # A fifth of the ranges carries next to no information, and can be distinguished.
     assert late.filtering_distance_m == pytest.approx(
         clean.filtering_distance_m / math.sqrt(0.8), rel=0.08
     )

@@ -45,26 +45,26 @@ def test_a_region_of_drawn_places_holds_the_truth_in_nine_of_ten():
 
     def drawn(t):
         side = 1.0 if rng.random() < 0.7 else -1.0
-        # The picture is the other way about with the probability that it says.
+        # The estimate is mirrored with its stated probability.
         off = rng.standard_normal(2)
         yield ellipse(t, 0, 0.7, 6.0 + off[0], side * (3.0 + off[1]), 1.0)
         yield ellipse(t, 1, 0.3, 6.0 + off[0], -side * (3.0 + off[1]), 1.0)
 
-    told = regions.summarise(estimates(drawn), truth, RANGES, starts_known=True)
-    assert told is not None
-    assert told.looks == 399
-    assert told.coverage.low < 0.9 < told.coverage.high
-    assert told.blind_m2 == pytest.approx(0.9 * math.pi * 100.0)
+    summary = regions.summarise(estimates(drawn), truth, RANGES, starts_known=True)
+    assert summary is not None
+    assert summary.looks == 399
+    assert summary.coverage.low < 0.9 < summary.coverage.high
+    assert summary.blind_m2 == pytest.approx(0.9 * math.pi * 100.0)
     # Two Gaussians that do not touch: each up to the density where 0.9 of both is inside.
-    assert told.area_m2 < 2.0 * 2.0 * math.pi * math.log(10.0) * 1.05
+    assert summary.area_m2 < 2.0 * 2.0 * math.pi * math.log(10.0) * 1.05
 
 
 def test_without_priors_the_frame_is_the_first_located_nodes_pose():
     truth = {1: still(5.0, 5.0, math.pi / 2), 2: still(5.0, 8.0)}
     ahead = estimates(lambda t: [ellipse(t, 0, 1.0, 3.0, 0.0, 0.2)])
     behind = estimates(lambda t: [ellipse(t, 0, 1.0, -3.0, 0.0, 0.2)])
-    for told, share in ((ahead, 1.0), (behind, 0.0)):
-        summary = regions.summarise(told, truth, RANGES, starts_known=False)
+    for estimate, share in ((ahead, 1.0), (behind, 0.0)):
+        summary = regions.summarise(estimate, truth, RANGES, starts_known=False)
         assert summary is not None
         assert summary.coverage.share == share
 
@@ -74,14 +74,14 @@ def test_a_rings_region_is_its_circumference_times_its_width():
     ring = estimates(
         lambda t: [Alternative(t, 0, 1.0, 2, 0.0, 0.0, 0.0, 5.0, 0.1, 0.0, Shape.RING)]
     )
-    told = regions.summarise(ring[:3], truth, RANGES, starts_known=True)
-    assert told is not None
-    assert told.rings == 1.0
-    assert told.coverage.share == 1.0
-    assert told.area_m2 == pytest.approx(2.0 * math.pi * 5.0 * 2.0 * 1.645 * 0.1, rel=0.05)
+    summary = regions.summarise(ring[:3], truth, RANGES, starts_known=True)
+    assert summary is not None
+    assert summary.rings == 1.0
+    assert summary.coverage.share == 1.0
+    assert summary.area_m2 == pytest.approx(2.0 * math.pi * 5.0 * 2.0 * 1.645 * 0.1, rel=0.05)
 
 
-def test_nothing_ambiguous_is_nothing_to_tell():
-    told = [Estimate(t, (located(1), located(2)), ()) for t in SECONDS]
+def test_an_unambiguous_estimate_has_no_summary():
+    estimate = [Estimate(t, (located(1), located(2)), ()) for t in SECONDS]
     truth = {1: still(0.0, 0.0), 2: still(0.0, -5.0)}
-    assert regions.summarise(told, truth, RANGES, starts_known=True) is None
+    assert regions.summarise(estimate, truth, RANGES, starts_known=True) is None

@@ -147,12 +147,12 @@ def made(directory: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         out / "estimate", "--json",
     )  # fmt: skip
     assert fused.exit_code == 0, fused.stderr
-    told = command(
+    outcome = command(
         "report", directory, "--estimate", out / "estimate", "--out", out / "report.html",
         "--figures", out / "figures", "--json",
     )  # fmt: skip
-    assert told.exit_code == 0, told.stderr
-    (out / "told.json").write_text(told.stdout)
+    assert outcome.exit_code == 0, outcome.stderr
+    (out / "stdout.json").write_text(outcome.stdout)
     return out
 
 
@@ -179,11 +179,11 @@ def test_every_figure_has_a_text_and_every_table_heads(page: Page) -> None:
 
 
 def test_its_numbers_are_those_of_evaluate(page: Page, directory: Path, made: Path) -> None:
-    told = command("evaluate", directory, "--estimate", made / "estimate", "--json")
-    scored = json.loads(told.stdout)
+    outcome = command("evaluate", directory, "--estimate", made / "estimate", "--json")
+    scored = json.loads(outcome.stdout)
     embedded = json.loads(page.json)
     assert {key: embedded[key] for key in scored} == scored
-    assert json.loads((made / "told.json").read_text()) == embedded
+    assert json.loads((made / "stdout.json").read_text()) == embedded
     # And they stand in its tables with all their digits.
     flat = scored["iso_18305"]["frames"]["per_run"]["horizontal"]
     wanted = [scored["relative_distance_rmse_m"], scored["nees_distance"]]
@@ -217,8 +217,8 @@ def test_figures_are_written_as_svg_and_png(made: Path) -> None:
 
 def test_the_same_estimate_gives_the_same_page(made: Path, directory: Path) -> None:
     again = made / "again.html"
-    told = command("report", directory, "--estimate", made / "estimate", "--out", again)
-    assert told.exit_code == 0, told.stderr
+    outcome = command("report", directory, "--estimate", made / "estimate", "--out", again)
+    assert outcome.exit_code == 0, outcome.stderr
     assert again.read_bytes() == (made / "report.html").read_bytes()
 
 
@@ -226,14 +226,14 @@ def test_a_page_without_truth_shows_what_is_known(run: relpos.Run, tmp_path: Pat
     blind = replace(run, truth=())
     blind = replace(blind, description=replace(run.description, simulated=None))
     relpos.save(blind, tmp_path / "blind")
-    told = command(
+    outcome = command(
         "report", tmp_path / "blind", "--estimator", "particle", "--set", "particles=60",
         "--out", tmp_path / "r.html", "--json",
     )  # fmt: skip
-    assert told.exit_code == 0, told.stderr
+    assert outcome.exit_code == 0, outcome.stderr
     page = Page((tmp_path / "r.html").read_text())
     assert page.outside == []
-    numbers = json.loads(told.stdout)
+    numbers = json.loads(outcome.stdout)
     assert "relative_distance_rmse_m" not in numbers
     assert sum(pair["ranges"] for pair in numbers["ranges"]) == sum(
         r.range_m > 0.0 for r in run.ranges
@@ -299,7 +299,7 @@ def test_an_unknown_figure_is_named_among_the_known(run: relpos.Run) -> None:
 
 def test_a_missing_run_or_estimate_is_one_clear_line(directory: Path, tmp_path: Path) -> None:
     for words in (("report", tmp_path / "no"), ("report", directory, "--estimate", tmp_path)):
-        told = command(*words, "--out", tmp_path / "r.html")
-        assert told.exit_code == 1
-        assert told.stderr.count("\n") == 1
+        outcome = command(*words, "--out", tmp_path / "r.html")
+        assert outcome.exit_code == 1
+        assert outcome.stderr.count("\n") == 1
         assert not (tmp_path / "r.html").exists()

@@ -80,11 +80,13 @@ def test_an_estimator_that_gives_up_is_reported_and_not_counted() -> None:
 
 
 def test_results_come_in_the_order_of_the_jobs_with_progress(pool: Executor) -> None:
-    heard: list[tuple[int, int]] = []
+    progress: list[tuple[int, int]] = []
     jobs = [(k,) for k in range(7)]
-    results = executors.run_all(pool, square, jobs, lambda done, total: heard.append((done, total)))
+    results = executors.run_all(
+        pool, square, jobs, lambda done, total: progress.append((done, total))
+    )
     assert results == [k * k for k in range(7)]
-    assert heard == [(k, 7) for k in range(1, 8)]
+    assert progress == [(k, 7) for k in range(1, 8)]
 
 
 def test_a_failed_job_is_raised_with_its_own_words(pool: Executor) -> None:
@@ -101,10 +103,10 @@ def test_a_figure_is_mean_standard_error_and_worst() -> None:
 
 
 def test_the_bound_of_a_scenario_is_computed_once_for_all_its_estimators() -> None:
-    heard: list[tuple[int, int]] = []
+    progress: list[tuple[int, int]] = []
     found = study.bounds_of(
-        CASES, range(2), executors.Serial(), lambda done, total: heard.append((done, total))
+        CASES, range(2), executors.Serial(), lambda done, total: progress.append((done, total))
     )
     assert found[0] == found[1]
     assert found[2].filtering_distance_m > found[0].filtering_distance_m
-    assert heard[-1] == (4, 4)
+    assert progress[-1] == (4, 4)

@@ -24,7 +24,7 @@ from support.small_team import (
     LANDMARKS,
     NAMES,
     SECONDS,
-    Told,
+    CommandResult,
     convert,
     estimates,
     refused,
@@ -98,8 +98,10 @@ def test_evo_gets_the_same_aligned_error_of_a_team_as_relpos_evaluate(tmp_path: 
         squares.append(result.np_arrays["error_array"] ** 2)
     by_evo_m = math.sqrt(np.mean(squares))
 
-    told = Told("evaluate", tmp_path / "yard", "--estimate", tmp_path / "fused", "--json")
-    by_relpos_m = json.loads(str(told.files[0]))["relative_position_rmse_m"]
+    result = CommandResult(
+        "evaluate", tmp_path / "yard", "--estimate", tmp_path / "fused", "--json"
+    )
+    by_relpos_m = json.loads(str(result.files[0]))["relative_position_rmse_m"]
     assert 0.2 < by_relpos_m < 0.6
     assert by_evo_m == pytest.approx(by_relpos_m, abs=2e-4)
 
@@ -168,8 +170,8 @@ def test_another_tools_trajectory_is_scored_as_an_estimate(tmp_path: Path) -> No
         (tmp_path / "slam" / f"kf_{node}.tum").write_text("# kf\n" + "\n".join(lines))
     slam = tmp_path / "slam"
     convert(slam, "--as", "estimate", "--start", START, "--to", "run", "--out", tmp_path / "est")
-    told = Told("evaluate", yard, "--estimate", tmp_path / "est", "--json")
-    assert json.loads(str(told.files[0]))["relative_distance_rmse_m"] < 1e-4
+    result = CommandResult("evaluate", yard, "--estimate", tmp_path / "est", "--json")
+    assert json.loads(str(result.files[0]))["relative_distance_rmse_m"] < 1e-4
     first = read_estimates(tmp_path / "est")[0]
     assert first.time_s == 1.0
     assert first.nodes[1].heading_rad == pytest.approx(true_pose(2, 1)[2], abs=1e-5)
@@ -185,10 +187,10 @@ def test_another_tools_trajectory_is_scored_as_an_estimate(tmp_path: Path) -> No
 def test_guesses_are_reported_and_may_be_left_out(tmp_path: Path) -> None:
     lost = {(3, second): NodeStatus.UNLOCATED for second in range(1, 11)}
     write_estimates(tmp_path / "fused", estimates(statuses=lost))
-    told = convert(tmp_path / "fused", "--to", "tum", "--out", tmp_path / "all")
-    assert any("10 poses are guesses" in line for line in told.remarks)
-    told = convert(tmp_path / "fused", "--located", "--to", "tum", "--out", tmp_path / "some")
-    assert not told.remarks
+    result = convert(tmp_path / "fused", "--to", "tum", "--out", tmp_path / "all")
+    assert any("10 poses are guesses" in line for line in result.remarks)
+    result = convert(tmp_path / "fused", "--located", "--to", "tum", "--out", tmp_path / "some")
+    assert not result.remarks
     rows = Counter(
         line.startswith("#")
         for line in (tmp_path / "some" / "estimate_3.tum").read_text().splitlines()
@@ -199,9 +201,9 @@ def test_guesses_are_reported_and_may_be_left_out(tmp_path: Path) -> None:
 def test_a_truth_without_headings_says_so(tmp_path: Path) -> None:
     bare = replace(run(), truth=(Truth(0.0, 1, 1.0, 2.0), Truth(1.0, 1, 1.5, 2.0)))
     save_run(bare, tmp_path / "yard")
-    told = convert(tmp_path / "yard", "--to", "tum", "--out", tmp_path / "t")
-    assert any("without a heading" in line for line in told.remarks)
-    assert told.files == [tmp_path / "t" / "truth_1.tum"]
+    result = convert(tmp_path / "yard", "--to", "tum", "--out", tmp_path / "t")
+    assert any("without a heading" in line for line in result.remarks)
+    assert result.files == [tmp_path / "t" / "truth_1.tum"]
 
 
 # -- tables ----------------------------------------------------------------------------------------
@@ -262,8 +264,8 @@ def test_a_run_and_its_estimate_come_back_from_a_recording(tmp_path: Path) -> No
     yard, fused = written(tmp_path)
     path = tmp_path / "walk.mcap"
     convert(fused, "--run", yard, "--start", START, "--to", "mcap", "--out", path)
-    told = convert(path, "--to", "csv", "--out", tmp_path / "tables")
-    assert not told.remarks
+    result = convert(path, "--to", "csv", "--out", tmp_path / "tables")
+    assert not result.remarks
     back, was = load_run(tmp_path / "tables"), load_run(yard)
     assert back.measurements == was.measurements
     assert back.truth == was.truth
@@ -271,7 +273,7 @@ def test_a_run_and_its_estimate_come_back_from_a_recording(tmp_path: Path) -> No
     assert repr(read_estimates(tmp_path / "tables")) == repr(read_estimates(fused))
     first = (tmp_path / "tables" / "estimate.csv").read_text("utf-8").splitlines()[1]
     assert float(first.split(",")[-1]) == START_UNIX_S + 1.0
-    # The start is in the recording: a map has its times without being told.
+    # The start is in the recording: a map has its times without an option.
     words = ("--pin", PIN, "--to", "geojson", "--out", tmp_path / "map.geojson")
     convert(path, *words)
     track = features(tmp_path / "map.geojson", kind="track", node=2, of="estimate")[0]
@@ -280,8 +282,8 @@ def test_a_run_and_its_estimate_come_back_from_a_recording(tmp_path: Path) -> No
 
 def test_a_recording_without_a_start_says_when_its_clock_begins(tmp_path: Path) -> None:
     yard, _ = written(tmp_path)
-    told = convert(yard, "--to", "mcap", "--out", tmp_path / "walk.mcap")
-    assert any("begins in 1970" in line for line in told.remarks)
+    result = convert(yard, "--to", "mcap", "--out", tmp_path / "walk.mcap")
+    assert any("begins in 1970" in line for line in result.remarks)
     convert(tmp_path / "walk.mcap", "--to", "run", "--out", tmp_path / "back")
     assert load_run(tmp_path / "back").measurements == load_run(yard).measurements
 
@@ -290,8 +292,8 @@ def test_presses_become_the_truth_of_a_recording(tmp_path: Path, pressed: Path) 
     words = ("--start", START, "--to", "mcap", "--out")
     convert(pressed, *words, tmp_path / "walk.mcap")
     marks = ("--landmarks", tmp_path / "surveyed.csv")
-    told = convert(tmp_path / "walk.mcap", *marks, *words, tmp_path / "scored.mcap")
-    assert any("truth from 3 of 6" in line for line in told.remarks)
+    result = convert(tmp_path / "walk.mcap", *marks, *words, tmp_path / "scored.mcap")
+    assert any("truth from 3 of 6" in line for line in result.remarks)
     convert(tmp_path / "scored.mcap", "--to", "run", "--out", tmp_path / "back")
     check_truth(tmp_path / "back")
 
@@ -302,8 +304,8 @@ def test_a_recording_that_broke_off_is_read_and_reported(tmp_path: Path) -> None
     convert(fused, "--run", yard, "--start", START, "--to", "mcap", "--out", path)
     whole = path.read_bytes()
     path.write_bytes(whole[:-200])
-    told = convert(path, "--to", "run", "--out", tmp_path / "back")
-    assert any("was not closed" in line for line in told.remarks)
+    result = convert(path, "--to", "run", "--out", tmp_path / "back")
+    assert any("was not closed" in line for line in result.remarks)
     (tmp_path / "broken.mcap").write_bytes(b"not at all")
     line = refused(tmp_path / "broken.mcap", "--to", "run", "--out", tmp_path / "no")
     assert "no MCAP file" in line
@@ -471,8 +473,8 @@ def test_truth_in_another_frame_is_left_out_of_the_map(tmp_path: Path) -> None:
     save_run(replace(run(priors=False), landmarks=LANDMARKS), tmp_path / "yard")
     write_estimates(tmp_path / "fused", estimates())
     words = ("--run", tmp_path / "yard", "--pin", PIN, "--to", "geojson")
-    told = convert(tmp_path / "fused", *words, "--out", tmp_path / "map.geojson")
-    assert any("the truth is left out" in line for line in told.remarks)
+    result = convert(tmp_path / "fused", *words, "--out", tmp_path / "map.geojson")
+    assert any("the truth is left out" in line for line in result.remarks)
     assert {f["properties"].get("of", "estimate") for f in features(tmp_path / "map.geojson")} == {
         "estimate"
     }
@@ -486,8 +488,10 @@ def test_a_pin_may_lie_where_a_node_was(tmp_path: Path) -> None:
     track = features(path, kind="track", node=3)[0]
     tenth = track["geometry"]["coordinates"][9]
     assert tenth == pytest.approx([11.575, 48.137], abs=1e-8)
-    told = refused(fused, "--pin", "48,11,0@9", "--to", "geojson", "--out", tmp_path / "x.geojson")
-    assert "node 9 was not located" in told
+    result = refused(
+        fused, "--pin", "48,11,0@9", "--to", "geojson", "--out", tmp_path / "x.geojson"
+    )
+    assert "node 9 was not located" in result
 
 
 def test_a_track_of_gnss_becomes_truth(tmp_path: Path) -> None:
@@ -507,8 +511,8 @@ def test_a_track_of_gnss_becomes_truth(tmp_path: Path) -> None:
         + "</trkseg></trk></gpx>"
     )
     words = ("--as", "truth", "--node", 2, "--run", yard, "--pin", PIN, "--to", "run")
-    told = convert(tmp_path / "watch.gpx", *words, "--out", tmp_path / "with-truth")
-    assert any("second 0 is 2026-05-04T09:30:00" in line for line in told.remarks)
+    result = convert(tmp_path / "watch.gpx", *words, "--out", tmp_path / "with-truth")
+    assert any("second 0 is 2026-05-04T09:30:00" in line for line in result.remarks)
     truth = load_run(tmp_path / "with-truth").truth
     assert [row.time_s for row in truth] == [float(s) for s in range(30)]
     for row in truth:
@@ -547,21 +551,21 @@ def test_presses_become_truth_and_those_left_out_are_reported(
     tmp_path: Path, pressed: Path
 ) -> None:
     words = ("--landmarks", tmp_path / "surveyed.csv", "--to", "run", "--out", tmp_path / "out")
-    told = convert(pressed, *words)
+    result = convert(pressed, *words)
     check_truth(tmp_path / "out")
     assert (tmp_path / "out" / "truth.csv").exists()
-    said = "\n".join(told.remarks)
-    assert "truth from 3 of 6 landmark presses" in said
-    assert "1 landmark press left out, of landmarks without a survey: 99 (node 2" in said
-    assert "within 2 s after the same one: 17 (node 1, at 4.5 s)" in said
-    assert "by nodes without other data: 17 (node 8, at 10.0 s)" in said
+    remarks = "\n".join(result.remarks)
+    assert "truth from 3 of 6 landmark presses" in remarks
+    assert "1 landmark press left out, of landmarks without a survey: 99 (node 2" in remarks
+    assert "within 2 s after the same one: 17 (node 1, at 4.5 s)" in remarks
+    assert "by nodes without other data: 17 (node 8, at 10.0 s)" in remarks
 
 
 def test_a_run_with_landmarks_of_its_own_needs_no_option(tmp_path: Path, pressed: Path) -> None:
     (tmp_path / "surveyed.csv").rename(pressed / "landmarks.csv")
-    told = convert(pressed, "--to", "run", "--out", tmp_path / "out")
+    result = convert(pressed, "--to", "run", "--out", tmp_path / "out")
     check_truth(tmp_path / "out")
-    assert len([line for line in told.remarks if "left out" in line]) == 3
+    assert len([line for line in result.remarks if "left out" in line]) == 3
     assert load_run(pressed).counters == {
         "landmarks_unknown": 1,
         "landmarks_repeated": 1,
@@ -592,7 +596,7 @@ def test_a_second_truth_is_not_laid_over_the_first(tmp_path: Path, pressed: Path
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "words", "told"),
+    ("name", "content", "words", "complaint"),
     [
         ("a_1.tum", "1 2 3\n", (), "truth or an estimate"),
         ("estimate_1.tum", "1 2 3\n", (), "line 1: 3 values, 8 are wanted"),
@@ -612,11 +616,11 @@ def test_a_second_truth_is_not_laid_over_the_first(tmp_path: Path, pressed: Path
     ],
 )
 def test_a_wrong_file_is_reported_in_one_line(
-    tmp_path: Path, name: str, content: str, words: tuple[str, ...], told: str
+    tmp_path: Path, name: str, content: str, words: tuple[str, ...], complaint: str
 ) -> None:
     (tmp_path / name).write_text(content)
     line = refused(tmp_path / name, *words, "--pin", PIN, "--to", "run", "--out", tmp_path / "out")
-    assert told in line
+    assert complaint in line
     assert name in line
     assert not (tmp_path / "out").exists()
 
@@ -625,7 +629,7 @@ TRACK = '{{"type":"Feature","geometry":{{"type":"{0}","coordinates":{1}}},"prope
 
 
 @pytest.mark.parametrize(
-    ("shape", "coordinates", "properties", "told"),
+    ("shape", "coordinates", "properties", "complaint"),
     [
         ("LineString", "[[11,48],[11,48]]", "{}", "whose track is this"),
         ("LineString", "[[11,48],[11,48]]", '{"node":1}', "truth or an estimate"),
@@ -652,11 +656,11 @@ TRACK = '{{"type":"Feature","geometry":{{"type":"{0}","coordinates":{1}}},"prope
     ],
 )
 def test_a_wrong_feature_is_reported_in_one_line(
-    tmp_path: Path, shape: str, coordinates: str, properties: str, told: str
+    tmp_path: Path, shape: str, coordinates: str, properties: str, complaint: str
 ) -> None:
     (tmp_path / "a.geojson").write_text(TRACK.format(shape, coordinates, properties))
     words = ("--pin", PIN, "--to", "run", "--out", tmp_path / "out")
-    assert told in refused(tmp_path / "a.geojson", *words)
+    assert complaint in refused(tmp_path / "a.geojson", *words)
 
 
 def test_wrong_requests_are_reported_in_one_line(tmp_path: Path) -> None:
@@ -682,7 +686,7 @@ def test_wrong_requests_are_reported_in_one_line(tmp_path: Path) -> None:
     assert "no landmark was pressed" in refused(tmp_path / "unfused", *words)
     none.write_text("id,x_m,y_m\n17,0,zero\n")
     assert "line 2: column y_m: 'zero'" in refused(tmp_path / "unfused", *words)
-    assert Told("convert", fused, "--to", "gpx", "--out", tmp_path / "x.gpx").status == 2
+    assert CommandResult("convert", fused, "--to", "gpx", "--out", tmp_path / "x.gpx").status == 2
     assert not out.exists()
 
 

@@ -1,4 +1,4 @@
-"""Pins: what they say, and that the plane between picture and map is WGS84's."""
+"""Pins: how they are parsed, and that the transform between plane and map is WGS84's."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from relpos.geodesy import MapFrame, Pin, parse_pin, place
 SITES = [(48.137, 11.575), (-33.92, 18.42), (69.65, 18.96), (0.0, -78.5), (35.0, 179.9999)]
 
 
-def nobody(node: int, time_s: float | None) -> None:
+def no_position(node: int, time_s: float | None) -> None:
     return None
 
 
@@ -77,17 +77,17 @@ def test_a_wrong_pin_is_reported_in_one_line(text: str, words: str) -> None:
 
 
 def test_one_pin_without_a_bearing_says_what_is_taken_for_it() -> None:
-    placing = place([Pin(48.0, 11.0)], nobody)
+    placing = place([Pin(48.0, 11.0)], no_position)
     assert placing.frame.bearing_rad == pytest.approx(math.pi / 2)
     assert "east" in placing.remarks[0]
-    assert place([Pin(48.0, 11.0, 0.0)], nobody).remarks == ()
+    assert place([Pin(48.0, 11.0, 0.0)], no_position).remarks == ()
 
 
 def test_a_pin_on_a_node_lies_where_the_node_was() -> None:
     placing = place([Pin(48.0, 11.0, 0.0, node=3, time_s=2.0)], lambda n, t: (n + 1.0, t or 0.0))
     assert placing.frame.place_m == (4.0, 2.0)
     with pytest.raises(DataError, match=r"node 3 was not located at 2 s"):
-        place([Pin(48.0, 11.0, 0.0, node=3, time_s=2.0)], nobody)
+        place([Pin(48.0, 11.0, 0.0, node=3, time_s=2.0)], no_position)
 
 
 def test_two_pins_give_the_bearing() -> None:
@@ -96,7 +96,7 @@ def test_two_pins_give_the_bearing() -> None:
     for x_m, y_m in ((-20.0, 3.0), (40.0, 11.0)):
         lat, lon = true.to_map(x_m, y_m)
         pins.append(Pin(float(lat), float(lon), place_m=(x_m, y_m)))
-    placing = place(pins, nobody)
+    placing = place(pins, no_position)
     # North at the first pin, some 20 m further west, is a quarter of a thousandth further round.
     assert math.degrees(placing.frame.bearing_rad) == pytest.approx(77.0, abs=1e-3)
     for x_m, y_m in ((0.0, 0.0), (100.0, -50.0)):
@@ -109,16 +109,16 @@ def test_two_pins_give_the_bearing() -> None:
 def test_pins_that_do_not_fit_say_by_how_much() -> None:
     lat, lon = MapFrame(48.0, 11.0).to_map(30.0, 0.0)
     pins = [Pin(48.0, 11.0), Pin(float(lat), float(lon), place_m=(40.0, 0.0))]
-    assert "fit to within 5.00 m" in place(pins, nobody).remarks[0]
+    assert "fit to within 5.00 m" in place(pins, no_position).remarks[0]
 
 
 def test_pins_that_give_no_bearing_are_refused() -> None:
     with pytest.raises(DataError, match="at one place in the picture"):
-        place([Pin(48.0, 11.0), Pin(48.001, 11.0)], nobody)
+        place([Pin(48.0, 11.0), Pin(48.001, 11.0)], no_position)
     with pytest.raises(DataError, match="at one place on the map"):
-        place([Pin(48.0, 11.0), Pin(48.0, 11.0, place_m=(9.0, 0.0))], nobody)
+        place([Pin(48.0, 11.0), Pin(48.0, 11.0, place_m=(9.0, 0.0))], no_position)
     with pytest.raises(DataError, match="leave it out"):
-        place([Pin(48.0, 11.0, 0.0), Pin(48.001, 11.0, place_m=(9.0, 0.0))], nobody)
+        place([Pin(48.0, 11.0, 0.0), Pin(48.001, 11.0, place_m=(9.0, 0.0))], no_position)
 
 
 def test_a_position_on_another_continent_is_a_mistake() -> None:

@@ -58,10 +58,10 @@ class CustomTestRunner(UnityTestRunner):
             self.run_program(NativeTestOutputReader(self).get_testing_command())
         if self.closing is None:
             raise UnitTestError("The program ended before its closing line")
-        told = int(self.closing[1])
+        stated = int(self.closing[1])
         seen = len(self.test_suite.cases)
-        if told != seen or told == 0:
-            raise UnitTestError(f"The closing line counts {told} tests, its output shows {seen}")
+        if stated != seen or stated == 0:
+            raise UnitTestError(f"The closing line counts {stated} tests, its output shows {seen}")
 
     def run_program(self, command: list[str]) -> None:
         """Feed the program's output to the parser, at most TIME_LIMIT_S long."""
@@ -102,7 +102,7 @@ class CustomTestRunner(UnityTestRunner):
             raise UnitTestError("The program crashed and started again")
         if expired.is_set():
             raise UnitTestError(f"The program did not end within {TIME_LIMIT_S:.0f} s")
-        # The programs return the number of failures; those are told by their own lines.
+        # The programs return the number of failures; those have their own lines.
         if status and (self.closing is None or int(self.closing[2]) == 0):
             raise UnitTestError(f"The program ended with status {status}")
 
@@ -113,7 +113,7 @@ class CustomTestRunner(UnityTestRunner):
             super().on_testing_line_output(line)
 
     def parse_test_case(self, line):
-        """Parse a test's line; a crash of an AVR shows as a test that is told twice."""
+        """Parse a test's line; a crash of an AVR shows as a test that is reported twice."""
         case = super().parse_test_case(line)
         if case and any(case.name == other.name for other in self.test_suite.cases):
             self.restarted = True

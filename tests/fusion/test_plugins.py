@@ -1,4 +1,4 @@
-"""Estimators that are not ours: found, used everywhere, and their faults told in one line."""
+"""Plugin estimators are found, used everywhere, and their faults reported in one line."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ def test_a_file_on_the_command_line_gives_what_the_object_gives(
         "--json",
     )  # fmt: skip
     assert made.exit_code == 0, made.stderr
-    told = json.loads(made.stdout)
-    assert told["counters"]["motions"] == len(run.motions)
+    report = json.loads(made.stdout)
+    assert report["counters"]["motions"] == len(run.motions)
     adder = plugins.factory(f"{OWN}:Adder")
     result = relpos.fuse(run, adder, settings={"stretch": 0.5})
     score = relpos.evaluate(result, run)
-    assert told["relative_distance_rmse_m"] == pytest.approx(
+    assert report["relative_distance_rmse_m"] == pytest.approx(
         score.metrics.relative_distance_rmse_m, abs=1e-6
     )
     evaluated = command("evaluate", directory, "--estimate", tmp_path, "--json")

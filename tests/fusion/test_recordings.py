@@ -1,7 +1,7 @@
 """Accuracy budgets of the default estimator on real recordings, from known starts.
 
 The recordings lie beside the repository (docs/results.md); without them these tests are skipped.
-Biases, noise levels and step scales are not told.
+Biases, noise levels and step scales are unknown to the estimators.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def test_biases_of_uncalibrated_pairs_are_found() -> None:
     }
     errors = {pair: found[pair] - float(np.median(r)) for pair, r in residuals.items()}
     assert set(found) == set(residuals)
-    # A node that stands and two biases towards it cannot be told apart better than this.
+    # A node that stands and two biases towards it cannot be separated better than this.
     assert max(map(abs, errors.values())) < 0.11
     assert np.sqrt(np.mean(np.square(list(errors.values())))) < 0.06
 
@@ -103,5 +103,5 @@ def test_an_odometry_that_slips_by_137_degrees_is_noticed_and_recovered_from() -
     recovered = scored(run, [e for e in estimates if 205.0 <= e.time_s < 215.0])
     assert recovered.body_frame_rmse_m is not None
     assert recovered.body_frame_rmse_m < 1.0
-    # What was said meanwhile was honest.
+    # The estimates in between were consistent.
     assert scored(run, estimates).nees_distance < 2.0  # type: ignore[operator]

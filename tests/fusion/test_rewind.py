@@ -1,4 +1,4 @@
-"""What comes late is put in its place, and nobody has to wait for it."""
+"""Late measurements are put in their place, and no estimate waits for them."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ class CheckedDecoder(Decoder):
         except wire.FrameError:
             frame = None
         if frame is not None:
-            require(data in self.genuine, "a frame is taken that nobody has sealed")
+            require(data in self.genuine, "a frame without a genuine tag is accepted")
             values = (frame.message, frame.node, frame.boot, frame.counter, frame.values)
             require(wire.encode(*values, KEY) == data, "decoded, it is encoded as another one")
         received = self.received()

@@ -88,11 +88,11 @@ def test_frames_that_overtake_each_other_are_all_taken():
 
 def test_a_session_knows_what_an_earlier_one_received():
     first = serial_port.Link()
-    heard = [motion(n, 1.0 + n) for n in range(10)]
-    for frame in heard:
+    frames = [motion(n, 1.0 + n) for n in range(10)]
+    for frame in frames:
         first.decoder.feed(frame, 1.0)
     second = serial_port.Link(newest_counters=first.newest_counters())
-    for frame in heard:
+    for frame in frames:
         assert second.decoder.feed(frame, 1.0) == []
     assert second.decoder.nodes == {}
     assert second.newest_counters() == {}
@@ -152,7 +152,7 @@ def test_ranges_come_without_both_ends_offsets():
         return [o.range_m for o in decoder.feed(frame, 2.0) if isinstance(o, Range)]
 
     assert ranges(1, 5.0) == [pytest.approx(4.85)]
-    assert ranges(2, 5.0, peer=9) == [pytest.approx(4.8)]  # which has told nothing yet
+    assert ranges(2, 5.0, peer=9) == [pytest.approx(4.8)]  # which has reported nothing yet
     assert ranges(3, 0.1) == []
     assert decoder.nodes[1].counts["range_below_its_offset"] == 1
 

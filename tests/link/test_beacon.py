@@ -1,4 +1,4 @@
-"""The beacon: who is in it, in which order, and what time it tells."""
+"""The beacon: its nodes, their order, and its time."""
 
 import os
 import pty
@@ -20,7 +20,7 @@ def ids(beacon):
     return [entry["node"] for entry in beacon["nodes"]]
 
 
-def heard(schedule, nodes, time_s):
+def receive(schedule, nodes, time_s):
     for node in nodes:
         schedule.heard(node, time_s)
 
@@ -63,30 +63,30 @@ def test_no_beacon_is_sent_to_an_empty_team():
 
 def test_who_is_there_keeps_the_order_and_newcomers_follow_sorted():
     schedule = BeaconSchedule()
-    heard(schedule, (5, 9), 0.0)
+    receive(schedule, (5, 9), 0.0)
     assert schedule.team(0.0) == (5, 9)
-    heard(schedule, (7, 1, 5, 9), 1.0)
+    receive(schedule, (7, 1, 5, 9), 1.0)
     assert schedule.team(1.0) == (5, 9, 1, 7)
-    heard(schedule, (5, 1, 7), 20.0)
+    receive(schedule, (5, 1, 7), 20.0)
     assert schedule.team(1.0 + FORGET_S) == (5, 9, 1, 7)
-    assert schedule.team(1.1 + FORGET_S) == (5, 1, 7), "9 was not heard for too long"
-    heard(schedule, (9,), 32.0)
+    assert schedule.team(1.1 + FORGET_S) == (5, 1, 7), "9 was silent for too long"
+    receive(schedule, (9,), 32.0)
     assert schedule.team(32.0) == (5, 1, 7, 9)
 
 
 def test_given_nodes_stay_whether_they_are_received_or_not():
     schedule = BeaconSchedule([3, 2])
-    heard(schedule, (1,), 0.0)
+    receive(schedule, (1,), 0.0)
     assert schedule.team(0.0) == (2, 3, 1)
     assert schedule.team(100.0) == (2, 3)
 
 
 def test_the_twenty_first_node_is_left_out_and_named():
     schedule = BeaconSchedule()
-    heard(schedule, range(10, 10 + MAX_NODES), 0.0)
+    receive(schedule, range(10, 10 + MAX_NODES), 0.0)
     schedule.team(0.0)
-    heard(schedule, range(10, 10 + MAX_NODES), 1.0)
-    heard(schedule, (1,), 1.0)
+    receive(schedule, range(10, 10 + MAX_NODES), 1.0)
+    receive(schedule, (1,), 1.0)
     assert len(schedule.team(1.0)) == MAX_NODES
     assert 1 not in schedule.team(1.0)
     assert schedule.left_out == (1,)

@@ -153,12 +153,12 @@ def test_a_heading_over_magnetic_north_is_converted_to_the_worlds_x_axis(
 ):
     decoder = Decoder()
     decoder.feed(motion_frame(0, time_s=1), 1.0)
-    told = {
+    fields = {
         "time_s": 2,
         "magnetic_heading_rad": round(over_north_rad, 4),
         "quality": wire.Quality.MAGNETOMETER_VALID,
     }
-    (heading,) = (o for o in decoder.feed(motion_frame(1, **told), 2.0) if isinstance(o, Heading))
+    (heading,) = (o for o in decoder.feed(motion_frame(1, **fields), 2.0) if isinstance(o, Heading))
     assert math.remainder(heading.heading_rad - from_east_rad, math.tau) == pytest.approx(
         0.0, abs=1e-3
     )

@@ -82,7 +82,7 @@ class Received:
         return "".join(child.data for child in found.childNodes)
 
     def metres_from(self, x_m: float, y_m: float) -> float:
-        """How far the event is from a place in the picture, x being east of the pin."""
+        """How far the event is from a place in the plane, x being east of the pin."""
         bearing, far_m = 90.0 - math.degrees(math.atan2(y_m, x_m)), math.hypot(x_m, y_m)
         there = Geodesic.WGS84.Direct(PIN.latitude_deg, PIN.longitude_deg, bearing, far_m)
         return float(
@@ -169,7 +169,7 @@ def test_a_silent_member_goes_stale_by_its_last_reception_time(schedule: Schedul
     assert event.start_s == pytest.approx(event.time_s - 40.0)
     assert not event.attributes("track")
     assert "last heard 40 s ago" in event.words("remarks")
-    # Now and then, for whoever joins late.
+    # Now and then, for clients that join late.
     assert "test.2" not in due(schedule, team_view(2, changes={2: gone}), 3.0)
     assert "test.2" in due(schedule, team_view(3, changes={2: gone}), 11.0)
 
@@ -375,7 +375,7 @@ def test_every_member_arrives_by_udp(udp_port: socket.socket) -> None:
         while len(events) < len(PLACES):
             event = Received(udp_port.recv(65536))
             events[event.attributes("contact")["callsign"]] = event
-        until(lambda: sender.trouble() is None, "the trouble is told for ever")
+        until(lambda: sender.trouble() is None, "the error is reported for ever")
     assert set(events) == set(NAMES.values())
     for node, place in PLACES.items():
         assert events[NAMES[node]].metres_from(*place) < 0.01
@@ -402,13 +402,13 @@ def test_a_session_sends_every_member(tmp_path: Path, udp_port: socket.socket) -
     done = CliRunner().invoke(app, [*words, *more])
     assert done.exit_code == 0, done.output
     until(lambda: len(events) >= 4, f"only {sorted(events)} arrived")
-    # It walked some time ago: nobody shall be sent out for it.
+    # It walked some time ago: the positions are not live.
     assert {event.how for event in events.values()} == {"m-s"}
     tracks = estimated_tracks(read_estimates(tmp_path / "out"))
     for event in events.values():
         assert event.type == "a-f-G-U-C"
         track = tracks[int(event.uid.rpartition(".")[2])]
-        # A picture is between two estimates, a step's length apart.
+        # A view is between two estimates, a step's length apart.
         places = zip(track.x_m, track.y_m, strict=True)
         assert min(event.metres_from(x_m, y_m) for x_m, y_m in places) < 1.0
 
@@ -419,7 +419,7 @@ def test_a_udp_port_without_a_listener_is_reported() -> None:
         port = held.getsockname()[1]
     sender = CotSender(f"udp://127.0.0.1:{port}", [PIN])
     with closing(sender), Feeding(sender):
-        until(lambda: "Connection refused" in str(sender.trouble()), "the refusal is not told")
+        until(lambda: "Connection refused" in str(sender.trouble()), "the refusal is not reported")
 
 
 def test_every_member_arrives_by_tcp_also_after_the_server_was_away() -> None:
@@ -436,10 +436,12 @@ def test_every_member_arrives_by_tcp_also_after_the_server_was_away() -> None:
         )
         assert sender.trouble() is None
         server.close()
-        until(lambda: f"tcp://127.0.0.1:{port}" in str(sender.trouble()), "the loss is not told")
+        until(
+            lambda: f"tcp://127.0.0.1:{port}" in str(sender.trouble()), "the loss is not reported"
+        )
         back = Server(port)
         until(lambda: len(back.received) >= len(PLACES), "it does not come back")
-        until(lambda: sender.trouble() is None, "the trouble is told for ever")
+        until(lambda: sender.trouble() is None, "the error is reported for ever")
         back.close()
 
 
@@ -455,7 +457,10 @@ def test_every_member_arrives_by_tls(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     server = Server(context=context)
     sender = CotSender(f"tls://localhost:{server.port}", [PIN])
     with closing(sender), Feeding(sender):
-        until(lambda: "PYTAK_TLS_CLIENT_CERT" in str(sender.trouble()), "what lacks is not told")
+        until(
+            lambda: "PYTAK_TLS_CLIENT_CERT" in str(sender.trouble()),
+            "the missing variable is not reported",
+        )
     for name in ("CERT", "KEY"):
         monkeypatch.setenv(f"PYTAK_TLS_CLIENT_{name}", str(tmp_path / "client.pem"))
     sender = CotSender(f"tls://localhost:{server.port}", [PIN])
@@ -480,7 +485,7 @@ def test_a_server_that_is_not_there_does_not_hold_up_the_session() -> None:
     server.close()
     sender = CotSender(f"tcp://127.0.0.1:{server.port}", [PIN])
     with closing(sender), Feeding(sender):
-        until(lambda: "refused" in str(sender.trouble()), "the refusal is not told")
+        until(lambda: "refused" in str(sender.trouble()), "the refusal is not reported")
         before_s = time.thread_time()
         for seq in range(1000):
             sender.updated(team_view(1_000 + seq))

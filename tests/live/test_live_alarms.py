@@ -19,7 +19,7 @@ def walk(time_s, node=1):
 
 
 def bend(time_s, node=1):
-    """The body moves without a step: only the node's own uncertainty tells."""
+    """The body moves without a step: only the node's own uncertainty shows it."""
     return Motion(time_s, node, 0.0, 0.0, 0.02, 0.2, 0.2, 0.04, 0, False, 0.2)
 
 
@@ -117,7 +117,7 @@ def test_a_computer_that_slept_raises_no_alarm_out_of_the_gap(watching):
     watching.report(still, 5)
     watching.look(60.0)
     assert watching.alarms.condition(1).alert is None
-    # What is seen first covers the gap: nobody knows what happened in it.
+    # The first report covers the gap, in which anything may have happened.
     watching.report(still, 19)
     assert watching.alarms.condition(1).alert is None
     watching.report(still, 3)

@@ -16,7 +16,7 @@ OBSERVATIONS = [
     Motion(1.0, 1, 0.5, 0.0, 0.1, 0.1, 0.1, 0.1, 2, True, 0.05),
     Range(1.6, 1, 2, 3.25, -80.0),
     Height(1.0, 1, 0.5),
-    # Told two seconds after it was measured, as ranges are.
+    # Reported two seconds after it was measured, as ranges are.
     Range(0.4, 2, 1, 3.5, None),
     Heading(1.5, 2, 0.7, 0.2, "phone"),
     Status(1.2, 1, "battery_v", 4.9),

@@ -99,10 +99,10 @@ def test_tracks_of_hours_stay_small_and_evenly_spaced():
 
 @pytest.mark.soak
 def test_two_hours_of_twenty_nodes_leave_memory_and_delay_as_they_were(tmp_path):
-    told = subprocess.run(
+    process = subprocess.run(
         [sys.executable, str(BENCH / "live_soak.py"), "--hours", "2", "--nodes", "20",
          "--speed", "3", "--look-s", "20", "--out", str(tmp_path)],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
-    print(told.stdout[-2000:])
-    assert told.returncode == 0, told.stdout[-2000:] + told.stderr[-2000:]
+    print(process.stdout[-2000:])
+    assert process.returncode == 0, process.stdout[-2000:] + process.stderr[-2000:]

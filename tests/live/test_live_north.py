@@ -1,4 +1,4 @@
-"""North on the live picture: shown when it is known, and still enough to be read."""
+"""North on the live map: shown when it is known, and steady enough to be read."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from relpos.fusion.estimator import Estimate, MagneticNorth
 from relpos.live.composer import Composer
 
 
-def shown_after(*told: tuple[float, float] | None) -> list[float | None]:
-    """Bearing of north on the picture after each estimate of (bearing, deviation) in degrees."""
+def shown_after(*norths: tuple[float, float] | None) -> list[float | None]:
+    """Bearing of north on the map after each estimate of (bearing, deviation) in degrees."""
     composer, shown = Composer(), []
-    for k, north in enumerate(told):
+    for k, north in enumerate(norths):
         known = north and MagneticNorth(*map(math.radians, north))
         composer.add_estimate(Estimate(float(k), (), (), north=known or None), k)
         north_rad = composer.view(float(k), 1e9 + k).north_rad

@@ -82,7 +82,7 @@ def test_a_port_that_is_pulled_out_is_reported_and_read_again_once_it_is_back(so
     def motions():
         return sum(isinstance(o, Motion) for _, o in album.observations)
 
-    def told():
+    def port_notices():
         return [n for n in album.views[-1].notices if n.id == "port"] if album.views else []
 
     stages = iter(("read", "gone", "back"))
@@ -98,15 +98,15 @@ def test_a_port_that_is_pulled_out_is_reported_and_read_again_once_it_is_back(so
         if stage == "read" and motions() >= first:
             socket.pull()
             stage = next(stages)
-        elif stage == "gone" and told():
-            assert told()[0].level == "alarm"
-            assert "vanished" in told()[0].text or "cannot open" in told()[0].text
+        elif stage == "gone" and port_notices():
+            assert port_notices()[0].level == "alarm"
+            assert "vanished" in port_notices()[0].text or "cannot open" in port_notices()[0].text
             socket.plug()
             stage = next(stages)
         elif stage == "back" and source.trouble() is None and motions() == first:
             socket.write(b"".join(pieces[half:]))
             stage = "written"
-        elif stage == "written" and motions() >= wanted and not told():
+        elif stage == "written" and motions() >= wanted and not port_notices():
             session.stop()
         return received
 
@@ -116,7 +116,7 @@ def test_a_port_that_is_pulled_out_is_reported_and_read_again_once_it_is_back(so
     outcome = session.finish()
     assert outcome.failure is None
     assert motions() >= wanted
-    assert not told()
+    assert not port_notices()
 
 
 def test_a_port_that_is_not_to_be_opened_again_ends_the_session(socket, stream):

@@ -140,9 +140,9 @@ def test_a_browser_gets_hello_tracks_and_then_pictures(stage):
 
 def test_the_server_reports_time_and_wearers(stage):
     with stage.client() as client:
-        told = client.get("/api/time").json()
-        assert told["unix_ms"] / 1000.0 == pytest.approx(time.time(), abs=30.0)
-        assert told["session_s"] > 0.0
+        reply = client.get("/api/time").json()
+        assert reply["unix_ms"] / 1000.0 == pytest.approx(time.time(), abs=30.0)
+        assert reply["session_s"] > 0.0
         wearers = client.get("/api/wearers").json()
         assert wearers[1] == {"node": 2, "name": "Node 2", "taken": False}
         stage.page.named({2: "Kim"})
@@ -241,7 +241,7 @@ def test_a_server_that_dies_is_started_again_behind_the_same_address(stage):
     assert stage.page.restarts == 1
     assert "started again" in stage.page.trouble()
     with stage.client() as client:
-        # Whom a phone has named is known to the new one, too.
+        # The new session knows names given by phones, too.
         assert client.get("/api/wearers").status_code == 200
 
 
@@ -298,10 +298,10 @@ def test_phones_get_an_address_that_others_can_reach():
 
 
 def test_notices_and_names_of_any_kind_are_plain_json():
-    picture = TeamView(
+    view = TeamView(
         1, 2.0, 3.0, notices=(Notice("x", "alarm", 'a "quoted" <b> \u2028 line\n', 1.0),),
         people=(Person(1, "Zoë </script>", 1.0, float("nan")),),
     )  # fmt: skip
-    text = picture.to_json()
+    text = view.to_json()
     assert "\n" not in text
     assert json.loads(text)["people"][0]["y_m"] is None

@@ -101,7 +101,7 @@ def asleep(seconds, at_s=30.0, until_s=120.0):
     with EmulatedTeam(TeamConfig("paper", 3, until_s, 5, beacons=True)) as team:
         source = TeamInput(team)
         source.sleep(at_s, seconds)
-        # The team's clock is the session's; a virtual one would be told by the link.
+        # The team's clock is the session's; a virtual one would come over the link.
         session, album = make_session(source, deadreckoning, priors=team.priors())
         run_through(session)
         return source, album
@@ -219,8 +219,8 @@ def test_a_fusion_that_dies_is_reported_and_receiving_goes_on():
                 session.stop()
         outcome = session.finish()
     assert "matrix is not what it was" in str(outcome.failure)
-    told = [n for n in album.views[-1].notices if n.id == "fusion"]
-    assert told[0].level == "alarm"
+    notices = [n for n in album.views[-1].notices if n.id == "fusion"]
+    assert notices[0].level == "alarm"
     assert album.views[-1].people[0].motion_s > 12.0
 
 

@@ -1,4 +1,4 @@
-"""The rule by which a node's health is told, and the figures that it judges by."""
+"""The rule of a node's health, and the figures it is computed from."""
 
 import pytest
 
@@ -76,7 +76,7 @@ def test_each_trouble_has_its_colour_and_its_words(changes, health, words):
         {"ranging": 0.0, "exchanges": 11},  # too few to say
         {"unwanted_start": "watchdog", "uptime_s": 90.0},  # long ago
         {"neighbours": 0, "team": 1},  # alone
-        {"ranging": None, "neighbours": None, "beacon": None, "imu": None},  # not told
+        {"ranging": None, "neighbours": None, "beacon": None, "imu": None},  # not reported
     ],
 )
 def test_what_is_no_trouble_stays_green(changes):
@@ -107,11 +107,11 @@ def test_a_view_has_loss_silence_and_ranging_of_the_last_half_minute():
         track = link.decoder.nodes.setdefault(5, _track())
         track.counts.update({"received": received, "lost": lost})
         track.rssi_dbm = -71
-        told = {"ranging_successes": successes, "ranging_failures": failures, "battery_v": 4.9}
+        statuses = {"ranging_successes": successes, "ranging_failures": failures, "battery_v": 4.9}
         view.update(
             time_s,
             link.decoder,
-            [Status(time_s, 5, name, float(value)) for name, value in told.items()],
+            [Status(time_s, 5, name, float(value)) for name, value in statuses.items()],
         )
 
     hear(0.0, 1, 0, 100, 100)

@@ -52,10 +52,10 @@ def test_what_is_not_installed_is_missing(monkeypatch):
     lines = ['nobody-has-this>=2; extra == "view"', "pytest ; extra == 'view'", "nor-this>=1"]
     monkeypatch.setattr(metadata, "requires", lambda _: lines)
     assert extras.missing("view") == ["nobody-has-this>=2"]
-    told = str(extras.missing_extra("nobody", "view"))
-    assert "\n" not in told
-    assert "'nobody-has-this>=2'" in told
-    assert "nor-this" not in told
+    message = str(extras.missing_extra("nobody", "view"))
+    assert "\n" not in message
+    assert "'nobody-has-this>=2'" in message
+    assert "nor-this" not in message
 
 
 @pytest.mark.parametrize(

@@ -115,11 +115,11 @@ def test_emulated_nodes_run_away_from_the_repository(elsewhere):
     try:
         assert emulated.stdout is not None
         port = emulated.stdout.readline().split()[-1]
-        told = json.loads(relpos("node", "list", port, "--seconds", 3, "--json").stdout)
+        listing = json.loads(relpos("node", "list", port, "--seconds", 3, "--json").stdout)
     finally:
         emulated.terminate()
         emulated.wait(PATIENCE_S)
-    assert [node["node"] for node in told["nodes"]] == [1, 2]
+    assert [node["node"] for node in listing["nodes"]] == [1, 2]
     assert (folder / "cache" / "relpos" / "native").is_dir()
     built = list((folder / "venv").rglob("relpos-node-*.so"))
     assert not built, "an installed package's folder may be read-only"

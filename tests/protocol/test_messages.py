@@ -88,7 +88,7 @@ def test_a_frame_under_another_key_is_refused():
 
 
 def test_every_bit_of_a_frame_is_under_its_tag():
-    """A forger may make the CRC fit; the tag he cannot."""
+    """A forger can compute the CRC, but not the tag."""
     data = bytes.fromhex(BY_NAME["command"]["hex"])
     for bit in range(16, 8 * (len(data) - wire.CRC_BYTES - wire.TAG_BYTES)):
         raw = bytearray(data[: -wire.CRC_BYTES - wire.TAG_BYTES])

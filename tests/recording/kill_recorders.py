@@ -2,7 +2,7 @@
 
     python kill_recorders.py STEPS FOLDER KILLS SEED
 
-Each recorder is a fork of this process (which has imported everything) and is told a session in
+Each recorder is a fork of this process (which has imported everything) and gets a session in
 real time: every 20 ms a read of the port that says its number and when it was handed over, now and
 then what was decoded and estimated. After a random time it is killed with SIGKILL. What it had
 handed over by then stands in a page of shared memory; printed, one line of JSON a kill: file,

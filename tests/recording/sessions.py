@@ -1,4 +1,4 @@
-"""A small emulated session, and what a sink is told of it: for the tests of recordings."""
+"""A small emulated session, and its playback to a sink: for the tests of recordings."""
 
 from dataclasses import fields, is_dataclass
 from functools import cache
@@ -44,7 +44,7 @@ def about(**changes):
 
 
 def play(sink, steps):
-    """Tell a sink a session."""
+    """Play a session to a sink."""
     for arrival_s, data, observations, estimates in steps:
         sink.received(arrival_s, data)
         sink.observed(arrival_s, observations)

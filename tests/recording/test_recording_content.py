@@ -146,7 +146,7 @@ def test_what_was_received_and_decoded_comes_back_exactly_and_in_order(recorded)
 
 def test_the_bytes_through_the_link_give_the_same_once_more(recorded):
     recording = open_recording(recorded)
-    # Counters up to 5 of node 1 had been seen before; the session here was not told so.
+    # Counters up to 5 of node 1 had been seen before; this session does not know.
     recording.about = dataclasses.replace(recording.about, newest_counters={})
     again = Replay(recording, DEFAULT_KEY)
     assert again.observations() == tuple(recording.observations())
@@ -154,12 +154,12 @@ def test_the_bytes_through_the_link_give_the_same_once_more(recorded):
 
 
 def test_a_recording_describes_the_session_without_the_key(recorded):
-    told = open_recording(recorded).about
-    assert (told.started_unix_ns, told.seed, told.initial) == (START_NS, 7, "common")
-    assert told.settings == {"outliers": "0.03"}
-    assert told.newest_counters == {1: 5}
-    assert told.protocol == 2
-    nodes = told.description.nodes
+    about = open_recording(recorded).about
+    assert (about.started_unix_ns, about.seed, about.initial) == (START_NS, 7, "common")
+    assert about.settings == {"outliers": "0.03"}
+    assert about.newest_counters == {1: 5}
+    assert about.protocol == 2
+    nodes = about.description.nodes
     assert {node: info.name for node, info in nodes.items()} == {1: "Ada Lovelace", 2: "Grace"}
     assert nodes[2].height_m == 1.1
     assert DEFAULT_KEY not in recorded.read_bytes()
@@ -237,7 +237,7 @@ def test_the_lines_of_python_in_the_page_read_it(recorded, tmp_path, monkeypatch
     (tmp_path / "walk.mcap").write_bytes(recorded.read_bytes())
     monkeypatch.chdir(tmp_path)
     exec(compile(code, str(page), "exec"), {})
-    told = capsys.readouterr().out
+    output = capsys.readouterr().out
     ranges = [o for *_, found, _ in session() for o in found if isinstance(o, Range)]
-    assert "mean" in told
-    assert str(min((o.node, o.peer) for o in ranges)[0]) in told
+    assert "mean" in output
+    assert str(min((o.node, o.peer) for o in ranges)[0]) in output

@@ -1,4 +1,4 @@
-"""A recorder that is killed, a disk that is full, slow or gone: what is left, and what is told."""
+"""A recorder that is killed, a disk that is full, slow or gone: what is left, and the notices."""
 
 import errno
 import json
@@ -79,7 +79,7 @@ def readable_by_others_once_repaired(path, repaired, count):
             for record in StreamReader(file, validate_crcs=True).records:
                 streamed += type(record).__name__ == "Message" and record.channel_id == 1
         except Exception:
-            pass  # It tells a cut file by whatever error it meets at the cut.
+            pass  # A cut file shows as any error at the cut.
     assert streamed == count
     recording = open_recording(path)
     repaired.unlink(missing_ok=True)

@@ -88,10 +88,10 @@ def test_a_replay_gives_the_same_estimates_to_the_last_byte(recorded, tmp_path):
     path, live = recorded
     done = relpos("fuse", path, "--out", tmp_path, "--json")
     assert done.exit_code == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert told["seed"] == 3
-    assert told["estimates"] > 30
-    assert told["counters"]["received"] > 200
+    summary = json.loads(done.stdout)
+    assert summary["seed"] == 3
+    assert summary["estimates"] > 30
+    assert summary["counters"]["received"] > 200
     tables = {file.name for file in live.glob("*.csv")}
     assert tables == {file.name for file in tmp_path.glob("*.csv")}
     assert tables >= {"estimate.csv", "pairs.csv", "parameters.csv"}
@@ -114,8 +114,8 @@ def test_the_command_line_overrules_the_recorded_settings(recorded, tmp_path):
     path, _ = recorded
     done = relpos("fuse", path, "--estimator", "deadreckoning", "--seed", 9, "--out", tmp_path,
                   "--json")  # fmt: skip
-    told = json.loads(done.stdout)
-    assert (told["estimator"], told["seed"]) == ("deadreckoning", 9)
+    summary = json.loads(done.stdout)
+    assert (summary["estimator"], summary["seed"]) == ("deadreckoning", 9)
 
 
 def test_what_was_received_as_a_run_and_the_recording_are_the_same_run(recorded):

@@ -110,7 +110,7 @@ def test_a_range_of_zero_is_kept_as_the_failure_it_marks(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("row", "said"),
+    ("row", "complaint"),
     [
         ("1,1,abc,0,0", "line 3: column dx_m: 'abc' is not a number"),
         ("1,1,nan,0,0", "line 3: column dx_m: 'nan' is not a finite number"),
@@ -125,15 +125,17 @@ def test_a_range_of_zero_is_kept_as_the_failure_it_marks(tmp_path: Path) -> None
         ('1,1,0,0,"0', "line 3: not CSV"),
     ],
 )
-def test_a_malformed_row_names_file_line_and_column(tmp_path: Path, row: str, said: str) -> None:
+def test_a_malformed_row_names_file_line_and_column(
+    tmp_path: Path, row: str, complaint: str
+) -> None:
     header = "time_s,node,dx_m,dy_m,dtheta_rad\n0,1,0,0,0\n"
     message = fault(write(tmp_path, motion_csv=header + row + "\n"))
     assert "motion.csv" in message
-    assert said in message
+    assert complaint in message
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "complaint"),
     [
         ("", "not even a header"),
         ("time_s,node,dx_m,dy_m\n", "column dtheta_rad is missing"),
@@ -141,8 +143,8 @@ def test_a_malformed_row_names_file_line_and_column(tmp_path: Path, row: str, sa
         ("time_s,node,node,dx_m,dy_m,dtheta_rad\n", "column node is there twice"),
     ],
 )
-def test_a_wrong_header_is_named(tmp_path: Path, text: str, said: str) -> None:
-    assert said in fault(write(tmp_path, motion_csv=text))
+def test_a_wrong_header_is_named(tmp_path: Path, text: str, complaint: str) -> None:
+    assert complaint in fault(write(tmp_path, motion_csv=text))
 
 
 def test_a_node_that_ranges_to_itself_is_refused(tmp_path: Path) -> None:
@@ -190,7 +192,7 @@ def load_run_imu(directory: Path) -> object:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "complaint"),
     [
         ("name = ", "not TOML"),
         ('initial_pose = "somewhere"', 'key initial_pose: "somewhere" is none of'),
@@ -202,10 +204,10 @@ def load_run_imu(directory: Path) -> object:
         ("[initial.1]\nx_m = nan\ny_m = 2\nheading_rad = 0", "is not a finite number"),
     ],
 )
-def test_a_wrong_description_names_file_and_key(tmp_path: Path, text: str, said: str) -> None:
+def test_a_wrong_description_names_file_and_key(tmp_path: Path, text: str, complaint: str) -> None:
     message = fault(write(tmp_path, run_toml=text))
     assert "run.toml" in message
-    assert said in message
+    assert complaint in message
 
 
 def test_every_key_of_the_description_is_read(tmp_path: Path) -> None:
@@ -306,7 +308,7 @@ def test_a_slow_or_absent_magnetometer_leaves_gaps(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("row", "said"),
+    ("row", "complaint"),
     [
         ("0.5,1,x,2,3,4,5,6,7,8,9", "line 1002: column ax_m_s2: 'x' is not a number"),
         ("0.5,1,1,2,nan,4,5,6,7,8,9", "line 1002: column az_m_s2: 'nan'"),
@@ -315,12 +317,12 @@ def test_a_slow_or_absent_magnetometer_leaves_gaps(tmp_path: Path) -> None:
         ("0.5,1,1,2,3,4,5,6,7,8,9,10", "line 1002: 12 cells for 11 columns"),
     ],
 )
-def test_a_fault_deep_in_inertial_data_is_named(tmp_path: Path, row: str, said: str) -> None:
+def test_a_fault_deep_in_inertial_data_is_named(tmp_path: Path, row: str, complaint: str) -> None:
     good = "".join(f"{k * 0.01:.2f},1,1,2,3,4,5,6,7,8,9\n" for k in range(1000))
     run = load_run(write(tmp_path, imu_csv=IMU_HEADER + good + row + "\n"))
     with pytest.raises(DataError) as caught:
         run.load_imu()
-    assert said in str(caught.value)
+    assert complaint in str(caught.value)
 
 
 def test_a_saved_run_reads_back_the_same(tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ def test_detection_and_delays_are_those_stated() -> None:
         lab.attempt(settings, lab.walk(settings, rng), rng)
         for rng in map(np.random.default_rng, range(30))
     ]
-    walls, bodies, distance, heard, measured = (
+    walls, bodies, distance, received, measured = (
         np.concatenate([getattr(a, name) for a in attempts])
         for name in ("walls", "bodies", "distance_m", "heard", "range_m")
     )
@@ -82,13 +82,13 @@ def test_detection_and_delays_are_those_stated() -> None:
         these = (walls == many_walls) & (bodies == many_bodies)
         assert these.sum() > 300
         near = 0.9 - 0.4 * distance[these] / 30.0
-        assert heard[these].mean() == pytest.approx(factor * near.mean(), abs=0.03)
+        assert received[these].mean() == pytest.approx(factor * near.mean(), abs=0.03)
         excess = (measured - distance)[these]
         assert np.median(excess[excess < 1.9]) == pytest.approx(delay, abs=0.1)
         reflected = (excess > 1.9).mean()
         assert reflected == pytest.approx(0.35 if many_walls + many_bodies else 0.0, abs=0.05)
-    # Even close ones are often not heard, as in the paper.
-    assert 0.2 < heard[distance < 5.0].mean() < 0.6
+    # Even close ones are often not received, as in the paper.
+    assert 0.2 < received[distance < 5.0].mean() < 0.6
 
 
 def test_everything_is_a_function_of_settings_and_seed() -> None:

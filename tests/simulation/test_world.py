@@ -13,8 +13,8 @@ from relpos.simulation.world import MagneticField, RadioChannel, UwbChannel, Wor
 
 def attempts(channel: UwbChannel, distance_m: float, count: int = 4000) -> list[float]:
     rng = np.random.default_rng(3)
-    heard = (channel.measure_range(rng, distance_m) for _ in range(count))
-    return [value for value in heard if value is not None]
+    ranges = (channel.measure_range(rng, distance_m) for _ in range(count))
+    return [value for value in ranges if value is not None]
 
 
 def test_nothing_is_received_past_the_range_limit() -> None:

@@ -90,7 +90,7 @@ def written(tmp_path: Path, **settings: bool) -> tuple[Path, Path]:
     return tmp_path / "yard", tmp_path / "fused"
 
 
-class Told:
+class CommandResult:
     """What a command printed and how it ended."""
 
     def __init__(self, *words: object) -> None:
@@ -102,18 +102,18 @@ class Told:
         self.remarks = result.stderr.splitlines()
 
 
-def convert(*words: object) -> Told:
+def convert(*words: object) -> CommandResult:
     """Run ``relpos convert`` and see that it went well."""
-    told = Told("convert", *words)
-    assert told.status == 0, told.remarks
-    return told
+    result = CommandResult("convert", *words)
+    assert result.status == 0, result.remarks
+    return result
 
 
 def refused(*words: object) -> str:
     """Run ``relpos convert`` and return the one line it fails with."""
-    told = Told("convert", *words)
-    assert told.status == 1, told.remarks
-    assert not told.files
-    (line,) = told.remarks
+    result = CommandResult("convert", *words)
+    assert result.status == 1, result.remarks
+    assert not result.files
+    (line,) = result.remarks
     assert line.startswith("relpos: ")
     return line

@@ -146,7 +146,7 @@ def test_damaged_bytes_let_nothing_wrong_in(team_bytes):
     rng = random.Random(5)
 
     def damage(byte):
-        """One byte in 150 is turned into another, lost, or followed by one that nobody sent."""
+        """One byte in 150 is turned into another, lost, or followed by one that was not sent."""
         if rng.random() > 1 / 150:
             return bytes((byte,))
         other = byte ^ rng.randrange(1, 256)
@@ -162,7 +162,7 @@ def test_damaged_bytes_let_nothing_wrong_in(team_bytes):
     assert counts["bad_checksums"] + counts["bad_lengths"] + counts["broken_off"] > 50
     assert counts["skipped_bytes"] > 500
     assert 0.3 < counts["received"] / clean.summary()["received"] < 0.9
-    assert not ranges_left - ranges, "a range that nobody measured"
+    assert not ranges_left - ranges, "a range that was not measured"
     assert_no_motion_is_lost(ends, whole)
 
 
@@ -173,7 +173,7 @@ def test_what_the_air_damaged_under_a_right_serial_checksum_is_refused(team_byte
         for packet in parser.feed(data):
             payload = bytearray(packet.data)
             if time_s < 57.0 and rng.random() < 0.5:
-                # Behind the header's first bytes, so that only the CRC can tell.
+                # After the header's first bytes, so that only the CRC can detect it.
                 payload[rng.randrange(4, len(payload))] ^= rng.randrange(1, 256)
                 damaged += 1
             received = xbee.Receive16(packet.source, packet.rssi_dbm, bytes(payload))
@@ -184,7 +184,7 @@ def test_what_the_air_damaged_under_a_right_serial_checksum_is_refused(team_byte
     assert counts["bad_checksums"] == 0
     assert counts["FrameCrcError"] + counts["FrameTagError"] == damaged
     assert counts["received"] == clean.summary()["received"] - damaged
-    assert not ranges_left - ranges, "a range that nobody measured"
+    assert not ranges_left - ranges, "a range that was not measured"
     assert_no_motion_is_lost(ends, whole)
 
 
@@ -201,11 +201,11 @@ class Listener:
 
     def __enter__(self):
         # The line comes after the port was opened and emptied: nothing sent from now on is lost.
-        # A first start, or a busy machine, tells before that it prepares.
-        said = self.process.stderr.readline()
-        if "preparing" in said:
-            said = self.process.stderr.readline()
-        assert "listening" in said
+        # A first start, or a busy machine, prints before that it prepares.
+        line = self.process.stderr.readline()
+        if "preparing" in line:
+            line = self.process.stderr.readline()
+        assert "listening" in line
         return self
 
     def __exit__(self, *_):
@@ -259,10 +259,10 @@ def test_a_port_that_vanishes_is_reported_in_one_line_and_the_data_is_kept(tmp_p
         status, stdout, stderr = listener.end()
     assert status == 1
     assert stdout == ""
-    (told,) = [line for line in stderr.splitlines() if not line.startswith("received")]
-    assert told.startswith("relpos: ")
-    assert "vanished" in told
-    assert str(tmp_path) in told
+    (message,) = [line for line in stderr.splitlines() if not line.startswith("received")]
+    assert message.startswith("relpos: ")
+    assert "vanished" in message
+    assert str(tmp_path) in message
     assert_received_is(tmp_path / "received", half)
     assert (tmp_path / "estimate.csv").stat().st_size > 1000
 
@@ -304,8 +304,8 @@ def test_an_emulated_team_is_fused_live_by_another_process(tmp_path):
         )
     finally:
         emulator.send_signal(signal.SIGINT)
-        _, said = emulator.communicate(timeout=PATIENCE_S)
-    assert "stopped after" in said
+        _, errors = emulator.communicate(timeout=PATIENCE_S)
+    assert "stopped after" in errors
     figures = json.loads(stdout)
     assert figures["estimates"] > 30
     assert figures["counters"]["bad_checksums"] == 0
@@ -315,9 +315,9 @@ def test_an_emulated_team_is_fused_live_by_another_process(tmp_path):
     assert {m.node for m in received.motions} == {1, 2, 3}
     with EmulatedTeam(TeamConfig("paper", 3, 300.0, 4, beacons=True)) as team:
         sent = end_poses((t * 1e-6, data) for t, data in team.run(100_000_000))[1]
-    heard = Counter((r.node, r.peer, round(r.range_m, 3)) for r in received.ranges)
-    assert heard.total() > 20
-    assert not heard - Counter((n, p, round(r, 3)) for n, p, r in sent.elements())
+    in_run = Counter((r.node, r.peer, round(r.range_m, 3)) for r in received.ranges)
+    assert in_run.total() > 20
+    assert not in_run - Counter((n, p, round(r, 3)) for n, p, r in sent.elements())
 
 
 # --- runs ----------------------------------------------------------------------------------------

@@ -205,7 +205,7 @@ def test_several_boards_need_a_choice_and_a_missing_board_is_reported():
 
 
 @pytest.mark.parametrize(
-    ("told", "words"),
+    ("output", "words"),
     [
         ("avrdude: stk500_getsync() attempt 10 of 10: not in sync: resp=0x00", "switch to USB"),
         (
@@ -218,9 +218,9 @@ def test_several_boards_need_a_choice_and_a_missing_board_is_reported():
         ("", "no reason"),
     ],
 )
-def test_a_failed_upload_is_reported_with_its_cause(told, words):
-    assert words in upload.why(told)
-    assert "\n" not in upload.why(told)
+def test_a_failed_upload_is_reported_with_its_cause(output, words):
+    assert words in upload.why(output)
+    assert "\n" not in upload.why(output)
 
 
 def test_a_missing_platformio_is_reported(tmp_path, monkeypatch):

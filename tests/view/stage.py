@@ -55,7 +55,7 @@ class Stage:
         self.mute = False
         """The server is connected, but not a word comes."""
         self.sent: dict[int, float] = {}
-        """When each picture was sent, in Unix time."""
+        """When each view was sent, in Unix time."""
         self.observed: list[Observation] = []
         self.acknowledged: list[int] = []
         self.started_unix_s = time.time() - self.at_s

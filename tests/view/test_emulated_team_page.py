@@ -38,12 +38,12 @@ def session(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
         running.communicate()
 
 
-# Everything that the page has told screen readers, however late this test looks.
+# All that the page has announced to screen readers, however late this test looks.
 LISTEN = """addEventListener("DOMContentLoaded", () => {
-    window.told = [];
+    window.announced = [];
     new MutationObserver((changes) => {
         for (const { target } of changes) {
-            if (/-voice$/.test(target.id ?? "")) window.told.push(target.textContent);
+            if (/-voice$/.test(target.id ?? "")) window.announced.push(target.textContent);
         }
     }).observe(document.body, { subtree: true, childList: true });
 })"""
@@ -86,14 +86,14 @@ def test_an_emulated_team_is_seen_walking_lost_found_and_pressing_a_landmark(
     phone.get_by_role("button", name="I am at 17").click()
     latest = time.time()
     expect(phone.locator("#queue")).to_have_text("1 press received by the laptop")
-    picture = page.evaluate("fetch('/api/picture').then((answer) => answer.json())")
-    began = picture["unix_s"] - picture["time_s"]
+    view = page.evaluate("fetch('/api/picture').then((answer) => answer.json())")
+    began = view["unix_s"] - view["time_s"]
 
-    def told(words: str) -> bool:
-        return any(words in text for text in page.evaluate("window.told"))
+    def announced(words: str) -> bool:
+        return any(words in text for text in page.evaluate("window.announced"))
 
-    wait_for(lambda: told("Node 4 is lost: not heard for"), 120.0)
-    wait_for(lambda: told("Node 4 is heard again"), 120.0)
+    wait_for(lambda: announced("Node 4 is lost: not heard for"), 120.0)
+    wait_for(lambda: announced("Node 4 is heard again"), 120.0)
     expect(page.locator("#alarms [data-node='4']")).to_have_count(0)
     after = positions(page)
     moved = [name for name in before if name in after and before[name] != after[name]]

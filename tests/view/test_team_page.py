@@ -45,9 +45,9 @@ def wait_live(page: Page) -> None:
 
 def metres_across(page: Page) -> int:
     expect(page.locator("#map-words")).to_contain_text("about")
-    told = re.search(r"about (\d+)", page.locator("#map-words").inner_text())
-    assert told
-    return int(told.group(1))
+    scale = re.search(r"about (\d+)", page.locator("#map-words").inner_text())
+    assert scale
+    return int(scale.group(1))
 
 
 def overflow(page: Page) -> int:
@@ -101,7 +101,7 @@ def test_north_is_up_and_named_once_compasses_have_reported_it(visit, stage: Sta
     page.get_by_role("button", name="Follow Anna").first.click()
     anna = colour_of(page, 1)
     heading = stage.team.pose(1, stage.at_s)[2]
-    # The marker's point is told from its disc by what lies 16 pixels from its middle.
+    # The pixels 16 from its middle distinguish the marker's point from its disc.
     wait_for(lambda: "map north up" in page.locator("#map-words").inner_text())
     for north in (heading, heading - math.pi / 2):
         stage.team.north_rad = north
@@ -216,7 +216,7 @@ def test_distance_and_direction_from_me_are_those_of_the_team(visit, stage: Stag
         expect(card(page, other).locator(".direction")).to_have_text(f"{hour} o'clock")
         north = (math.pi / 2 - math.atan2(oy - y, ox - x)) % math.tau
         point = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")[round(north / math.tau * 8) % 8]
-        # The frame is the team's own: nobody claims that its y axis is north.
+        # The frame is the team's own; its y axis need not be north.
         expect(card(page, other).locator(".compass")).to_have_text(f"map {point}")
 
 
@@ -343,11 +343,13 @@ def test_an_ambiguous_estimate_shows_the_other_positions_and_their_probabilities
     expect(card(page, 6).locator(".state")).to_have_text("Not located yet")
     expect(page.locator("#map-hint")).to_have_text("Not located yet: Fatima")
     page.get_by_role("button", name="Table").click()
-    told = page.locator("#table-alternatives")
+    alternatives = page.locator("#table-alternatives")
     x, y, _ = stage.team.pose(3, stage.at_s)
-    expect(told).to_contain_text("Chloé is where shown with 62 %.")
-    expect(told).to_contain_text(f"With 29 % Chloé is at x {x - 4:.1f}, y {y + 7:.1f}.")
-    expect(told).to_contain_text("Fatima is somewhere on a ring of 6.0 m about x 10.0, y 5.0.")
+    expect(alternatives).to_contain_text("Chloé is where shown with 62 %.")
+    expect(alternatives).to_contain_text(f"With 29 % Chloé is at x {x - 4:.1f}, y {y + 7:.1f}.")
+    expect(alternatives).to_contain_text(
+        "Fatima is somewhere on a ring of 6.0 m about x 10.0, y 5.0."
+    )
 
 
 def test_names_are_text_whatever_is_in_them(visit, stage: Stage):
@@ -492,16 +494,16 @@ def test_everything_can_be_done_with_the_keyboard_alone(visit, stage: Stage):
     reached, unseen = [], []
     for _ in range(40):
         page.keyboard.press("Tab")
-        told = page.evaluate("""() => {
+        focused = page.evaluate("""() => {
             const e = document.activeElement;
             if (e === document.body) return ["", true];
             const style = getComputedStyle(e);
             return [e.id || e.getAttribute("aria-label") || e.textContent.trim(),
                     style.outlineStyle !== "none" && parseFloat(style.outlineWidth) >= 2];
         }""")
-        reached.append(told[0])
-        if not told[1]:
-            unseen.append(told[0])
+        reached.append(focused[0])
+        if not focused[1]:
+            unseen.append(focused[0])
     controls = ("me", "sound", "theme", "phones", "help", "map", "zoom-in", "fit", "heading-up")
     for wanted in (*controls, "as-table", "Find Ben", "Follow Fatima"):
         assert wanted in reached

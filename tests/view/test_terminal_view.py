@@ -39,7 +39,7 @@ def row_of(name: str, shown: list[str]) -> str:
 
 @pytest.mark.parametrize("utf8", [True, False])
 @pytest.mark.parametrize(("columns", "rows"), [(80, 24), (60, 15), (132, 43), (200, 12), (40, 10)])
-@pytest.mark.parametrize("people", ["well", "in need", "nobody"])
+@pytest.mark.parametrize("people", ["well", "in need", "empty"])
 def test_the_page_is_as_large_as_the_terminal(
     columns: int, rows: int, utf8: bool, people: str
 ) -> None:
@@ -49,7 +49,7 @@ def test_the_page_is_as_large_as_the_terminal(
             changes={2: STILL, 3: {"alert": Alert.LOST, "status": "lost", "seen_s": 99.0}},
             notices=tuple(Notice(f"n{k}", Level.WARNING, "w" * 300, 0.0) for k in range(9)),
         ),
-        "nobody": team_view(people=(), pairs=()),
+        "empty": team_view(people=(), pairs=()),
     }[people]
     made = page(shown, RenderOptions(columns=columns, rows=rows, utf8=utf8, me=2))
     assert len(made) == rows
@@ -302,7 +302,7 @@ def test_the_terminal_shows_the_newest_view_and_is_restored_at_the_end(
     view.updated(team_view())
     until(lambda: "Kim" in "".join(screen.rows()), "nothing is drawn")
     view.updated(team_view(changes={2: {"name": "Robin"}}))
-    until(lambda: "Robin" in "".join(screen.rows()), "the next picture is not drawn")
+    until(lambda: "Robin" in "".join(screen.rows()), "the next view is not drawn")
     assert "Kim" not in "".join(screen.rows())
     assert screen.rows()[-1].startswith("a seen to")
     assert view.trouble() is None
@@ -410,7 +410,7 @@ def test_a_terminal_that_is_gone_is_reported_and_ends_nothing() -> None:
         view.updated(team_view(int(10.0 * time.monotonic())))
         return view.trouble() is not None
 
-    until(drawn, "nobody is told")
+    until(drawn, "the error is not reported")
     assert str(view.trouble()).startswith("terminal view: ")
     view.close()
     with suppress(OSError):

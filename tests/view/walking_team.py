@@ -1,7 +1,7 @@
-"""A team that walks by a formula, as pictures: what the pages are shown in these tests.
+"""A team that walks by a formula, as views: what the pages show in these tests.
 
-Everybody goes round a rectangle of 20 m x 10 m at walking speed, each on a way of his own. What
-may go wrong is switched on by the tests.
+Everybody goes round a rectangle of 20 m x 10 m at walking speed, each on a path of their own.
+The tests switch faults on.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SPEED_M_S = 1.2
 
 @dataclass
 class WalkingTeam:
-    """State of the play; ``picture`` shows it."""
+    """State of the team; ``view`` returns it as the server sends it."""
 
     size: int = 6
     spread_m: float = 2.0
@@ -73,7 +73,7 @@ class WalkingTeam:
         raise AssertionError("off the rectangle")
 
     def person(self, node: int, time_s: float) -> Person:
-        """Make somebody as a picture has him."""
+        """Make a person of a view."""
         if node == self.ring:
             return Person(node, self.name(node), status="unlocated", seen_s=0.4, health="green")
         x_m, y_m, heading_rad = self.pose(node, time_s)
@@ -120,8 +120,8 @@ class WalkingTeam:
                 pairs.append(
                     Pair(a.node, b.node, distance_m, sigma_m, math.atan2(dy, dx), bearing_sd)
                 )
-                heard = not {a.node, b.node} & self.lost_since.keys()
-                if heard and distance_m < 16.0:
+                received = not {a.node, b.node} & self.lost_since.keys()
+                if received and distance_m < 16.0:
                     age_s = (time_s + 1.3 * a.node + 0.7 * b.node) % 4.0
                     error_m = 0.2 * math.sin(3.0 * a.node + b.node + 0.1 * time_s)
                     ranges.append(MeasuredRange(a.node, b.node, distance_m + error_m, age_s))

@@ -346,11 +346,11 @@ def test_bases_of_noise_are_the_reference_implementation() -> None:
     moves = rng.normal(size=(40, 4)) * (0.5, 0.5, 1.0, 1.0)
     moves[:, 3] = np.abs(moves[:, 3])
     moves[0] = 0.0
-    told = np.where(rng.random((40, 3)) < 0.5, np.nan, np.abs(rng.normal(size=(40, 3))))
-    expected = small.base_variances(*moves.T, told)
-    assert base_variances(moves, told) == pytest.approx(expected, rel=1e-12)
-    untold = small.base_variances(*moves.T, np.full((40, 3), np.nan))
-    assert base_variances(moves, np.empty((0, 3))) == pytest.approx(untold, rel=1e-12)
+    reported = np.where(rng.random((40, 3)) < 0.5, np.nan, np.abs(rng.normal(size=(40, 3))))
+    expected = small.base_variances(*moves.T, reported)
+    assert base_variances(moves, reported) == pytest.approx(expected, rel=1e-12)
+    without_reported = small.base_variances(*moves.T, np.full((40, 3), np.nan))
+    assert base_variances(moves, np.empty((0, 3))) == pytest.approx(without_reported, rel=1e-12)
 
 
 @pytest.mark.parametrize("nodes", [1, 2, 7])

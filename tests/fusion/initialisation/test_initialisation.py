@@ -244,7 +244,7 @@ def test_while_the_first_stands_alone_the_other_walks_on_a_ring() -> None:
     speeds, turns = wander(40, 2, seed=4)
     speeds[:, 0] = turns[:, 0] = 0.0
     walk = Walk((0, 4 + 0j), (0.0, 1.0), speeds, turns)
-    # Both are heard of before anybody has moved, so the frame is the first's.
+    # Both report before any motion, so the frame is the first node's.
     walk.measurements[:0] = [Motion(0.1, 1, 0, 0, 0), Motion(0.1, 2, 0, 0, 0)]
     walk.measurements.insert(2, Range(0.1, 1, 2, 4.0))
     inside = 0

@@ -169,7 +169,7 @@ def test_the_noise_of_each_nodes_steps_is_learned(crowd: Crowd) -> None:
     )
     assert uneven > 2.0 * steady
     assert uneven > 1.3
-    # Nobody's heading wanders on a straight walk here.
+    # No heading wanders on a straight walk here.
     assert np.median(factor[:, WHITE]) < 0.2
 
 

@@ -1,4 +1,4 @@
-"""Compasses in a frame of which nobody knows how it lies to north."""
+"""Compasses in a frame whose bearing of north is unknown."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_however_the_frame_lies_to_north_compasses_do_no_harm(
 ) -> None:
     figures, last = score(north_rad)
     assert last.north is not None
-    # A heading is told from magnetic east: north is a right angle on.
+    # A heading counts from magnetic east: north is a right angle further.
     off_rad = math.remainder(last.north.bearing_rad - (math.pi / 2 - north_rad), math.tau)
     assert abs(off_rad) < 3.0 * last.north.sigma_rad < math.radians(20.0)
     assert figures.relative_distance_rmse_m < 1.2 * without.relative_distance_rmse_m
@@ -68,9 +68,9 @@ def test_however_the_frame_lies_to_north_compasses_do_no_harm(
 def test_the_angle_is_learned_from_heads_that_are_known() -> None:
     north, rng = North(), np.random.default_rng(0)
     for second in range(400):
-        told = math.remainder(3.0 + rng.normal(0.0, SIGMA_RAD), math.tau)
+        measured = math.remainder(3.0 + rng.normal(0.0, SIGMA_RAD), math.tau)
         sigma = north.alone_sigma_rad(1 + second % 4, float(second), SIGMA_RAD)
-        north.learn(told, sigma, 0.0, 0.01)
+        north.learn(measured, sigma, 0.0, 0.01)
     assert abs(math.remainder(north.angle_rad - 3.0, math.tau)) < 3.0 * north.sigma_rad
     assert north.sigma_rad < math.radians(6.0)
 

@@ -187,10 +187,10 @@ def test_a_report_in_pieces_is_one_report() -> None:
     whole, pieces = ZeroMotionDetector(), ZeroMotionDetector()
     for _ in range(50):
         dx, dy, turn = rng.normal(0.0, 0.01, 3)
-        told = whole.update(1, dx, dy, turn, 1.0, 1.0)
+        reported = whole.update(1, dx, dy, turn, 1.0, 1.0)
         for part in (0.25, 0.75):
             last = pieces.update(1, part * dx, part * dy, part * turn, part, part)
-        assert told == last
+        assert reported == last
 
 
 def compose(motions: list[Motion]) -> tuple[float, float, float]:
@@ -219,11 +219,11 @@ def test_a_node_that_was_away_for_half_a_minute_is_located_again(off: bool, rest
         if restarts
         else Motion(90.0, 3, *compose(gap))
     )
-    told = [m for m in measurements if m not in gone]
-    at = next(k for k, m in enumerate(told) if m.time_s >= 90.0)
-    told.insert(at, back)
+    reported = [m for m in measurements if m not in gone]
+    at = next(k for k, m in enumerate(reported) if m.time_s >= 90.0)
+    reported.insert(at, back)
     bank = fusion.make("bank", priors, {}, 1)
-    estimates = [e for m in told for e in bank.process(m)] + bank.finish()
+    estimates = [e for m in reported for e in bank.process(m)] + bank.finish()
     absent = [e for e in estimates if 75.0 < e.time_s < 88.0]
     others = [body_error_m(e, truth, 2) for e in absent if e.time_s == round(e.time_s)]
     assert np.median(others) < 0.6  # the others go on

@@ -95,7 +95,7 @@ def test_ranges_repeated_at_rest_add_little_information_and_moving_makes_them_in
     assert sum(correlation.effective_counts([(2, 1)])[0] for _ in range(10)) < 1.0
     correlation.move(1, 1.4, 0.0)
     assert correlation.effective_counts([(1, 2)])[0] > 0.9
-    # How much a walked metre tells does not depend on how often the two range on it.
+    # The information of a walked metre does not depend on the rate of ranges.
     often, seldom = RangeCorrelation(), RangeCorrelation()
     for r in (often, seldom):
         r.effective_counts([(1, 2)])
@@ -167,19 +167,19 @@ def distance_rmse(estimates: list[Estimate], truth: dict[int, list[complex]]) ->
 def test_known_antenna_offsets_are_used() -> None:
     worn = {1: Worn(antenna_offset_m=(0.5, 0.0)), 2: Worn(antenna_offset_m=(-0.4, 0.3)), 3: Worn()}
     measurements, priors, truth = team(150, 1, n1=worn[1], n2=worn[2])
-    told = distance_rmse(fused(measurements, priors, worn), truth)
-    untold = distance_rmse(fused(measurements, priors), truth)
-    assert told < 0.1
-    assert told < 0.6 * untold
+    known_m = distance_rmse(fused(measurements, priors, worn), truth)
+    unknown_m = distance_rmse(fused(measurements, priors), truth)
+    assert known_m < 0.1
+    assert known_m < 0.6 * unknown_m
 
 
 def test_tags_at_different_heights_make_slant_ranges() -> None:
     worn = {1: Worn(height_m=2.5), 2: Worn(height_m=1.0), 3: Worn(height_m=0.3)}
     measurements, priors, truth = team(150, 2, n1=worn[1], n2=worn[2], n3=worn[3])
     estimates = fused(measurements, priors, worn)
-    told, untold = (distance_rmse(e, truth) for e in (estimates, fused(measurements, priors)))
-    assert told < 0.1
-    assert told < 0.75 * untold
+    known_m, unknown_m = (distance_rmse(e, truth) for e in (estimates, fused(measurements, priors)))
+    assert known_m < 0.1
+    assert known_m < 0.75 * unknown_m
     assert estimates[-1].nodes[0].z_m == pytest.approx(2.5)
 
 

@@ -53,7 +53,7 @@ test("coming closer is warmer, going away colder, standing neither", () => {
   }
 });
 
-test("nothing is said of a trend before it can be known", () => {
+test("no trend is shown before it can be known", () => {
   const trend = new Trend();
   equal(trend.direction, null);
   walk(trend, { t: 0, d: 20 }, -1, 2);
@@ -74,7 +74,7 @@ test("what is read aloud is a sentence", () => {
   equal(spoken("Ben", null, guidance(null), null), "Ben: position unknown.");
 });
 
-test("it is said when something has changed, and not too often", () => {
+test("an instruction is spoken when something has changed, and not too often", () => {
   const announcer = new Announcer();
   ok(announcer.due(0, { key: "ahead", distanceM: 20, trend: null }));
   ok(!announcer.due(1000, { key: "left", distanceM: 20, trend: null }), "too soon");

@@ -26,7 +26,7 @@ test("the compass has east along x and north along y", () => {
 });
 
 test("somebody to the right of me is at a negative angle", () => {
-  // I look north, he is in the east.
+  // I look north, the other is in the east.
   near(relative(0, Math.PI / 2), -Math.PI / 2);
   near(relative(-3, 3), 2 * Math.PI - 6);
 });

@@ -32,7 +32,7 @@ test("a label stays on its side as long as there is room", () => {
   equal(moved.candidate, 0);
 });
 
-test("what finds no room is left out rather than drawn over", () => {
+test("a label without room is left out rather than drawn over", () => {
   const box = [10, 10, 30, 10];
   const found = placeWhereFree([{ id: "a", places: [box] }, { id: "b", places: [box, [60, 10, 30, 10]] },
     { id: "c", places: [box] }], [200, 100], []);
@@ -50,7 +50,7 @@ test("a track keeps steps, not jitter", () => {
   equal(track.points.length, 2);
 });
 
-test("a picture that changes its mind leaves no line", () => {
+test("a position that jumps leaves no line", () => {
   const track = new Track();
   track.add(0, 0, 0);
   track.add(1, 1.2, 0);
@@ -90,7 +90,7 @@ test("a warning that becomes an alarm has to be acknowledged anew", () => {
   equal(alarms.list()[0].seconds, 30);
 });
 
-test("what somebody else has acknowledged is silent here", () => {
+test("an alarm acknowledged elsewhere is silent here", () => {
   const alarms = new Alarms();
   equal(alarms.update([still(1, "lost", 0, { acknowledged: true })]).raised.length, 0);
   equal(alarms.sounding, null);
@@ -135,7 +135,7 @@ test("a server of another protocol, or an unknown message, is noticed", () => {
   equal(team.handle({ type: "ping" }), "ping");
 });
 
-test("only what is believed leaves a track", () => {
+test("only a certain position leaves a track", () => {
   const team = new Team();
   team.handle(HELLO);
   ["ok", "ambiguous", "lost", "unlocated", "stale"].forEach((status, k) => {
@@ -167,7 +167,7 @@ test("the position shown is separated from the alternatives", () => {
   equal(rings.map((r) => [r.node, r.x_m]), [[3, 5]]);
 });
 
-test("what several pictures say of one person's place adds up", () => {
+test("the probabilities of one person's place in several hypotheses add up", () => {
   const { here, places } = ambiguous([
     { probability: 0.4, people: [ghost(1, 0), ghost(2, 10)] },
     { probability: 0.3, people: [ghost(1, 6), ghost(2, 10.2)] },
@@ -179,7 +179,7 @@ test("what several pictures say of one person's place adds up", () => {
   equal(places.map((p) => [p.node, p.x_m, round(p.probability)]), [[1, 6, 50], [2, -4, 30]]);
 });
 
-test("places that hardly anything speaks for are left out", () => {
+test("places of low probability are left out", () => {
   const { places } = ambiguous([
     { probability: 0.98, people: [ghost(1, 0), ghost(2, 10)] },
     { probability: 0.02, people: [ghost(1, 8), ghost(2, 10)] },
@@ -187,13 +187,13 @@ test("places that hardly anything speaks for are left out", () => {
   equal(places, []);
 });
 
-test("places are one where the shown one is known no better than that", () => {
+test("places closer than the uncertainty of the shown one are merged", () => {
   const far = { probability: 0.4, people: [ghost(1, 2)] };
   equal(ambiguous([{ probability: 0.6, people: [ghost(1, 0, "ellipse", 2)] }, far]).places, []);
   equal(ambiguous([{ probability: 0.6, people: [ghost(1, 0)] }, far]).places.length, 1);
 });
 
-test("somebody without a name is called by his number", () => {
+test("a person without a name is called by their number", () => {
   const team = new Team();
   team.handle({ type: "picture", seq: 1, time_s: 1, people: [person(4, 0, { name: "" })] });
   equal(team.person(4).name, "Node 4");

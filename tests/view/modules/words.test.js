@@ -90,7 +90,7 @@ test("the data's age counts the time at the server and the time here", () => {
   equal(dataAgeS({ unixS: null, arrivedUnixS: null, receivedMs: null, nowMs: 6000 }), null);
 });
 
-test("an old picture is never called live", () => {
+test("an old view is never called live", () => {
   equal(connectionWords("live", 0.2, null), { state: "live", words: "Live", age: "data now" });
   equal(connectionWords("live", 7, null), { state: "old", words: "Old data", age: "data 7 s old" });
   equal(connectionWords("waiting", 12, 3), { state: "waiting", words: "Not connected, next try in 3 s", age: "data 12 s old" });

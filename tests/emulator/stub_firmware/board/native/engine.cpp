@@ -1,4 +1,4 @@
-// A firmware of a few lines for the tests of the native engine: it tells over its UART what the
+// A firmware of a few lines for the tests of the native engine: it reports over its UART what the
 // engine did to it. 'P' and its clock at each poll, 'R' and what it received, 'B' and its reset
 // cause and first EEPROM byte at the start, 'I' and the outcome of a read of the byte at 0x50/3.
 // Received 'X' makes it ask for a reset, 'W' n writes n into the EEPROM, 'H' makes it want to run
@@ -13,7 +13,7 @@ struct relpos_node {
   uint8_t cause;
   uint8_t inbox[64];
   uint16_t count;
-  bool told, hasty;
+  bool announced, hasty;
 };
 
 extern "C" {
@@ -40,8 +40,8 @@ void relpos_node_set_supply(relpos_node*, uint16_t) {}
 uint32_t relpos_node_poll(relpos_node* node, uint32_t now_us) {
   uint8_t out[80];
   uint16_t n = 0;
-  if (!node->told) {
-    node->told = true;
+  if (!node->announced) {
+    node->announced = true;
     out[n++] = 'B';
     out[n++] = node->cause;
     out[n++] = node->eeprom[0];
