@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from relpos.evaluation.regions import Region
 from relpos.fusion.estimator import MAX_ALTERNATIVES, Alternative, Shape
-from relpos.fusion.modes import Region, alternatives_of, belief_of, relative_poses
+from relpos.fusion.modes import alternatives_of, belief_of, relative_poses
 
 TWO_PI = 2.0 * math.pi
 

@@ -160,15 +160,6 @@ class Estimate:
     north: MagneticNorth | None = None
 
 
-Rows = tuple[
-    tuple[NodeEstimate, ...],
-    tuple[PairEstimate, ...],
-    tuple[Alternative, ...],
-    tuple[Parameter, ...],
-]
-"""Nodes, pairs, alternatives and parameters of an estimate."""
-
-
 @runtime_checkable
 class Estimator(Protocol):
     """Measurements in, estimates out; live, replay and simulation call it in the same way."""

@@ -2,15 +2,13 @@
 
 Hypotheses about a team (weights, poses, position covariances) become at most
 ``MAX_ALTERNATIVES`` modes: hypotheses that put all nodes at about the same places are one. A
-node that is spread round a whole circle is given as a ring. The other way round,
-:class:`Region` is the smallest region that holds a wanted probability of a node's alternatives, its
-area, and whether a place lies in it.
+node that is spread round a whole circle is given as a ring.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +19,6 @@ from relpos.fusion.estimator import ANY_ANGLE_RAD, MAX_ALTERNATIVES, Alternative
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
-_TWO_PI = 2.0 * math.pi
-
 ONE_PLACE_M = 0.7
 """Hypotheses that differ by less are one mode; the first tried, then wider ones."""
 
@@ -31,10 +27,6 @@ RING_FULLEST = 0.4
 RING_WIDTH = 0.35
 """A circle: no sector of eight empty, none with more than this fraction, the width at most this
 fraction of the radius."""
-
-_LEAST_SIGMA_M = 0.01
-"""An ellipse's axis or a ring's width below this would make densities of points that no
-measurement can tell apart differ."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,7 +217,7 @@ def _circle(
     width = math.sqrt(float(weights @ ((distance - radius) ** 2 + radial)))
     if width > RING_WIDTH * radius:
         return None
-    sector = (np.arctan2(from_centre[:, 1], from_centre[:, 0]) / _TWO_PI * RING_SECTORS) % (
+    sector = (np.arctan2(from_centre[:, 1], from_centre[:, 0]) / math.tau * RING_SECTORS) % (
         RING_SECTORS
     )
     share = np.bincount(sector.astype(np.intp) % RING_SECTORS, weights, RING_SECTORS)
@@ -262,84 +254,3 @@ def _groups(weights: Floats, places: Floats, covariances: Floats, most: int) -> 
         off = places[left, None] - places[None, leaders]
         group[left] = (off * off).sum(axis=(2, 3)).argmin(axis=1)
     return group
-
-
-@dataclass(frozen=True, slots=True)
-class Region:
-    """The smallest region that holds ``probability`` of a mixture of ellipses and rings.
-
-    ``rows`` (A, 7): probability, x, y, major, minor, angle, 1 for a ring. ``level`` is the
-    density (1/m^2) at its border, ``area_m2`` its area.
-    """
-
-    rows: Floats
-    level: float
-    area_m2: float
-
-    @staticmethod
-    def of(
-        alternatives: Iterable[Alternative], probability: float = 0.9, draws: int = 4000
-    ) -> Region:
-        """Build the region of one node's alternatives of one time.
-
-        The level is a quantile of the density at points of the mixture itself; the area is the
-        mean of 1/density over those that lie inside. Both from ``draws`` fixed random points:
-        an area to about 2 %.
-        """
-        rows = np.array(
-            [
-                (
-                    a.probability, a.x_m, a.y_m, max(a.sigma_major_m, _LEAST_SIGMA_M),
-                    max(a.sigma_minor_m, _LEAST_SIGMA_M), a.sigma_angle_rad,
-                    float(a.shape is Shape.RING),
-                )
-                for a in alternatives
-            ]
-        )  # fmt: skip
-        rng = np.random.default_rng(0)
-        share_of = rows[:, 0] / rows[:, 0].sum()
-        one = rng.choice(len(rows), size=draws, p=share_of)
-        normal = rng.standard_normal((draws, 2))
-        turn = _TWO_PI * rng.random(draws)
-        _, x, y, major, minor, angle, ring = rows[one].T
-        c, s = np.cos(angle), np.sin(angle)
-        along, across = major * normal[:, 0], minor * normal[:, 1]
-        distance = major + minor * normal[:, 0]
-        is_ring = ring > 0.0
-        points = np.column_stack(
-            (
-                x + np.where(is_ring, distance * np.cos(turn), c * along - s * across),
-                y + np.where(is_ring, distance * np.sin(turn), s * along + c * across),
-            )
-        )
-        density = _density(rows, points)
-        level = float(np.quantile(density, 1.0 - probability))
-        inside = density >= level
-        return Region(rows, level, float((inside / density).mean()))
-
-    def contains(self, x_m: float, y_m: float) -> bool:
-        """Tell whether a place lies inside."""
-        return bool(_density(self.rows, np.array([[x_m, y_m]]))[0] >= self.level)
-
-
-def _density(rows: Floats, points: Floats) -> Floats:
-    """Density (1/m^2) of a mixture (A, 7) at points (P, 2)."""
-    total = np.zeros(len(points))
-    for probability, x, y, major, minor, angle, ring in rows:
-        dx, dy = points[:, 0] - x, points[:, 1] - y
-        if ring > 0.0:
-            # Normal across, even round; the circumference of each distance keeps it a density.
-            distance = np.hypot(dx, dy)
-            scaled = (distance - major) / minor
-            total += (
-                probability * np.exp(-0.5 * scaled * scaled)
-                / (math.sqrt(_TWO_PI) * minor * _TWO_PI * np.maximum(distance, minor))
-            )  # fmt: skip
-        else:
-            c, s = math.cos(angle), math.sin(angle)
-            along, across = (c * dx + s * dy) / major, (c * dy - s * dx) / minor
-            total += (
-                probability * np.exp(-0.5 * (along * along + across * across))
-                / (_TWO_PI * major * minor)
-            )  # fmt: skip
-    return total

@@ -127,32 +127,24 @@ class _Guarded:
         """Pass one measurement on."""
         kind = type(measurement).__name__
         where = f"process({kind} of node {measurement.node} at {measurement.time_s:g} s)"
-        try:
-            return self._listed(where, self._estimator.process(measurement))
-        except RelposError:
-            raise
-        except Exception as error:
-            raise self._failed(where, error) from error
+        return self._listed(where, self._call(where, self._estimator.process, measurement))
 
     def finish(self) -> list[Estimate]:
         """Let it finish."""
-        try:
-            return self._listed("finish()", self._estimator.finish())
-        except RelposError:
-            raise
-        except Exception as error:
-            raise self._failed("finish()", error) from error
+        return self._listed("finish()", self._call("finish()", self._estimator.finish))
 
     def counters(self) -> Mapping[str, int]:
         """Give its counters."""
-        try:
-            return dict(self._estimator.counters())
-        except Exception as error:
-            raise self._failed("counters()", error) from error
+        return dict(self._call("counters()", self._estimator.counters))
 
-    def _failed(self, where: str, error: Exception) -> EstimatorError:
-        words = _describe(error, type(self._estimator))
-        return EstimatorError(f"estimator {self._name}: {where} failed: {words}")
+    def _call(self, where: str, method: Callable[..., Any], *arguments: object) -> Any:
+        try:
+            return method(*arguments)
+        except RelposError:
+            raise
+        except Exception as error:
+            words = _describe(error, type(self._estimator))
+            raise EstimatorError(f"estimator {self._name}: {where} failed: {words}") from error
 
     def _listed(self, where: str, given: Any) -> list[Estimate]:
         if isinstance(given, list | tuple) and all(isinstance(one, Estimate) for one in given):

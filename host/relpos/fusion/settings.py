@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 def setting(default: float, text: str, low: float, high: float) -> Any:
     """Declare a dataclass field that ``--set`` may change; whole where the default is an int."""
-    return field(default=default, metadata={"help": text, "low": low, "high": high})
+    return field(default=default, metadata={"text": text, "low": low, "high": high})
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,14 +30,7 @@ class SettingInfo:
 def describe(settings_class: type[Any]) -> list[SettingInfo]:
     """List the keys of a settings class in their order."""
     return [
-        SettingInfo(
-            f.name,
-            cast("float", f.default),
-            f.metadata["help"],
-            f.metadata["low"],
-            f.metadata["high"],
-        )
-        for f in fields(settings_class)
+        SettingInfo(f.name, cast("float", f.default), **f.metadata) for f in fields(settings_class)
     ]
 
 

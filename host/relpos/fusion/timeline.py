@@ -498,7 +498,9 @@ def _advance(track: _Track, node: int, until_s: float, steps: list[Advance]) -> 
         else:
             end_s, duration_s = until_s, until_s - reached_s
             cut = duration_s / (chord.time_s - reached_s)
-            whole, whole_share = left or (_whole(chord), 1.0)
+            if left is None:
+                left = Displacement(chord.dx_m, chord.dy_m, chord.dtheta_rad), 1.0
+            whole, whole_share = left
             piece, rest = whole.split(cut)
             share = cut * whole_share
             left = piece, share
@@ -522,10 +524,6 @@ def _advance(track: _Track, node: int, until_s: float, steps: list[Advance]) -> 
             )
         )  # fmt: skip
         steps.append(_new(Advance, (end_s, node, duration_s, *moved, *sigmas)))
-
-
-def _whole(report: Motion) -> Displacement:
-    return Displacement(report.dx_m, report.dy_m, report.dtheta_rad)
 
 
 _new = tuple.__new__

@@ -376,9 +376,7 @@ def test_what_an_estimate_says_of_pairs_is_the_reference_implementation(on_one_s
 
 def test_cumulative_sums_are_the_reference_implementation_until_and_after_an_alarm() -> None:
     rng = np.random.default_rng(22)
-    detector = slips.CusumDetector.of_nobody()
-    for _ in range(5):
-        detector = detector.with_node()
+    detector = slips.CusumDetector(np.zeros(5), np.ones(1))
     sums, base, alarms = [0.0] * 5, 1.0, 0
     for instant in range(300):
         pairs = [(0, 1), (1, 2), (3, 1), (2, 4), (0, 3)][: rng.integers(1, 6)]

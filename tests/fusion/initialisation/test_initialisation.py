@@ -15,6 +15,7 @@ import pytest
 from reference import initialisation as reference
 from relpos import fusion, tracks
 from relpos.evaluation import metrics
+from relpos.evaluation.regions import Region
 from relpos.fusion.estimator import Estimate, NodeStatus, Shape
 from relpos.fusion.initialisation.hypotheses import fitted
 from relpos.fusion.initialisation.kernels import (
@@ -26,7 +27,6 @@ from relpos.fusion.initialisation.kernels import (
     normal_equations,
 )
 from relpos.fusion.initialisation.search import HypothesisSearch
-from relpos.fusion.modes import Region
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Measurement, Motion, Prior, Range
 from relpos.runs import load_run

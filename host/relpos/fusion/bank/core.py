@@ -66,7 +66,7 @@ class BankCore:
         components = self.hypotheses.components
         self._sensors = Sensors(
             components.mean, components.covariance, RangeModel(outlier, self._lever_m), counts,
-            np.zeros(0), CusumDetector.of_nobody(),
+            np.zeros(0), CusumDetector(np.zeros(0), np.ones(1)),
         )  # fmt: skip
 
     def add_node(
@@ -81,12 +81,13 @@ class BankCore:
         self._since_turn_s = np.append(self._since_turn_s, 0.0)
         row = self.hypotheses.add_node(pose, sigma_m, sigma_rad)
         components, known = self.hypotheses.components, self._sensors
+        cusum = known.cusum._replace(sums=np.append(known.cusum.sums, 0.0))
         # Where all antennas are on their wearers' axes kernels take the shorter way.
         levers_m = self._lever_m if self._lever_m.any() else self._lever_m[:0]
         self._sensors = known._replace(
             mean=components.mean, covariance=components.covariance,
             model=known.model._replace(lever_m=levers_m),
-            surprise=np.append(known.surprise, 0.0), cusum=known.cusum.with_node(),
+            surprise=np.append(known.surprise, 0.0), cusum=cusum,
         )  # fmt: skip
         return row
 

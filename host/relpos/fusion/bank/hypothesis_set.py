@@ -260,17 +260,10 @@ class HypothesisSet:
         p[:, pose, :] = 0.0
         p[:, :, pose] = 0.0
         if beside is not None:
-            leader = PER_NODE * beside
-            for row in rows:
-                for axis in (StateIndex.X, StateIndex.Y):
-                    at = PER_NODE * int(row) + axis
-                    p[:, at, :] = p[:, leader + axis, :]
-                    p[:, :, at] = p[:, :, leader + axis]
-            common = p[:, leader : leader + 2, leader : leader + 2]
-            for a in rows:
-                for b in rows:
-                    i, j = PER_NODE * int(a), PER_NODE * int(b)
-                    p[:, i : i + 2, j : j + 2] = common
+            own = (PER_NODE * rows[:, None] + np.arange(2)).ravel()
+            common = np.tile(PER_NODE * beside + np.arange(2), len(rows))
+            p[:, own, :] = p[:, common, :]
+            p[:, :, own] = p[:, :, common]
         p[np.ix_(np.arange(self.count), pose, pose)] += covariances[chosen]
         self.store(x, p)
 

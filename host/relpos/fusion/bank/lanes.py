@@ -100,9 +100,7 @@ def _spread(builder: Any, value: Any) -> Any:
     )
 
 
-def _operation(
-    operators: tuple[Callable[..., object], ...], emit: Callable[..., Any], result: Any
-) -> None:
+def _operation(one: Callable[..., object], emit: Callable[..., Any], result: Any) -> None:
     """Teach numba an operator between eight numbers, or eight and one."""
     numbers = (types.Float, types.Integer)
 
@@ -120,20 +118,19 @@ def _operation(
         ]
         return emit(builder, *both)
 
-    for one in operators:
-        infer_global(one)(type(f"Lanes_{one.__name__}", (Template,), {}))
-        for other in numbers:
-            lower_builtin(one, _LanesType, other)(lower)
-            lower_builtin(one, other, _LanesType)(lower)
-        lower_builtin(one, _LanesType, _LanesType)(lower)
+    infer_global(one)(Template)
+    for other in numbers:
+        lower_builtin(one, _LanesType, other)(lower)
+        lower_builtin(one, other, _LanesType)(lower)
+    lower_builtin(one, _LanesType, _LanesType)(lower)
 
 
-_operation((operator.add, operator.iadd), lambda b, x, y: b.fadd(x, y), _lanes)
-_operation((operator.sub, operator.isub), lambda b, x, y: b.fsub(x, y), _lanes)
-_operation((operator.mul, operator.imul), lambda b, x, y: b.fmul(x, y), _lanes)
-_operation((operator.truediv, operator.itruediv), lambda b, x, y: b.fdiv(x, y), _lanes)
-_operation((operator.gt,), lambda b, x, y: b.fcmp_ordered(">", x, y), _mask)
-_operation((operator.lt,), lambda b, x, y: b.fcmp_ordered("<", x, y), _mask)
+_operation(operator.add, lambda b, x, y: b.fadd(x, y), _lanes)
+_operation(operator.sub, lambda b, x, y: b.fsub(x, y), _lanes)
+_operation(operator.mul, lambda b, x, y: b.fmul(x, y), _lanes)
+_operation(operator.truediv, lambda b, x, y: b.fdiv(x, y), _lanes)
+_operation(operator.gt, lambda b, x, y: b.fcmp_ordered(">", x, y), _mask)
+_operation(operator.lt, lambda b, x, y: b.fcmp_ordered("<", x, y), _mask)
 
 
 @infer_global(operator.and_)

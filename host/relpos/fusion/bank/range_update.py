@@ -148,37 +148,10 @@ def _predict_by_lever(
 @inner
 def range_gain(block: Block, i: int, j: int, gx: Lanes, gy: Lanes, g: Floats) -> None:
     """Write P h of a range into ``g`` (D, LANES)."""
-    p, base, active = block.p, block.base, block.active
-    if i > j:
-        i, j, gx, gy = j, i, 0.0 - gx, 0.0 - gy
-    i_x, i_y, j_x, j_y = (
-        base + row_place(i),
-        base + row_place(i + 1),
-        base + row_place(j),
-        base + row_place(j + 1),
-    )
-    for q in range(i):
-        off_x = load(p, j_x + q) - load(p, i_x + q)
-        off_y = load(p, j_y + q) - load(p, i_y + q)
-        store(g, q, gx * off_x + gy * off_y)
-    for q in range(i, i + 2):
-        off_x = load(p, j_x + q) - load(p, base + place(q, i))
-        off_y = load(p, j_y + q) - load(p, base + place(q, i + 1))
-        store(g, q, gx * off_x + gy * off_y)
-    for q in range(i + 2, j):
-        at = base + row_place(q) + i
-        off_x = load(p, j_x + q) - load(p, at)
-        off_y = load(p, j_y + q) - load(p, at + 1)
-        store(g, q, gx * off_x + gy * off_y)
-    for q in range(j, j + 2):
-        at = base + row_place(q) + i
-        off_x = load(p, base + place(q, j)) - load(p, at)
-        off_y = load(p, base + place(q, j + 1)) - load(p, at + 1)
-        store(g, q, gx * off_x + gy * off_y)
-    for q in range(j + 2, active):
-        at = base + row_place(q)
-        off_x = load(p, at + j) - load(p, at + i)
-        off_y = load(p, at + j + 1) - load(p, at + i + 1)
+    p, base = block.p, block.base
+    for q in range(block.active):
+        off_x = load(p, base + place(j, q)) - load(p, base + place(i, q))
+        off_y = load(p, base + place(j + 1, q)) - load(p, base + place(i + 1, q))
         store(g, q, gx * off_x + gy * off_y)
 
 
@@ -208,20 +181,14 @@ def _bound_sensitivity(sens: Floats, t: int, p: Floats, base: int, b: int, most:
 
     It is homogeneous in all variances, so that a true derivative obeys it with ``most`` 1.
     """
-    excess = fill(0.0)
-    for entry in range(3):
-        at = t + 2 * entry + (entry == 2)
-        explained = load(sens, at) + load(sens, at + 6) + load(sens, at + 12)
-        bound = most * load(p, base + place(b + entry, b + entry)) + TINY
-        excess = greater(excess, explained - bound)
-    if not some(excess > 0.0):
-        return
     ratio = fill(1.0)
     for entry in range(3):
         at = t + 2 * entry + (entry == 2)
         explained = load(sens, at) + load(sens, at + 6) + load(sens, at + 12)
         bound = most * load(p, base + place(b + entry, b + entry)) + TINY
         ratio = greater(ratio, explained / bound)
+    if not some(ratio > 1.0):
+        return
     for at in range(t, t + 18):
         store(sens, at, load(sens, at) / ratio)
 

@@ -111,19 +111,14 @@ class VarianceComponents:
             mean[at] = PRIOR[component]
             share = TEAM_SD[component] ** 2 / (TEAM_SD[component] ** 2 + OWN_SD[component] ** 2)
             others = np.arange(component, old, COMPONENTS)
-            if others.size:
-                # The new one is like the others' common part: a regression on their mean.
-                weight = share / (1.0 - share + share * others.size)
-                row = weight * covariance[others].sum(axis=0)
-                mean[at] += weight * float((mean[others] - PRIOR[component]).sum())
-                rest = (
-                    TEAM_SD[component] ** 2 * (1.0 - weight * others.size) + OWN_SD[component] ** 2
-                )
-                covariance[at] += row
-                covariance[:, at] += row
-                covariance[at, at] = weight * float(row[others].sum()) + rest
-            else:
-                covariance[at, at] = TEAM_SD[component] ** 2 + OWN_SD[component] ** 2
+            # The new one is like the others' common part: a regression on their mean.
+            weight = share / (1.0 - share + share * others.size)
+            row = weight * covariance[others].sum(axis=0)
+            mean[at] += weight * float((mean[others] - PRIOR[component]).sum())
+            rest = TEAM_SD[component] ** 2 * (1.0 - weight * others.size) + OWN_SD[component] ** 2
+            covariance[at] += row
+            covariance[:, at] += row
+            covariance[at, at] = weight * float(row[others].sum()) + rest
         self.mean, self.covariance = mean, covariance
         self.nodes += 1
 

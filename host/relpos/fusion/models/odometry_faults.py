@@ -74,15 +74,6 @@ class CusumDetector(NamedTuple):
     base: Floats
     """(1,) the usual nu^2/S."""
 
-    @classmethod
-    def of_nobody(cls) -> CusumDetector:
-        """Begin without nodes."""
-        return cls(np.zeros(0), np.ones(1))
-
-    def with_node(self) -> CusumDetector:
-        """Add a row."""
-        return self._replace(sums=np.append(self.sums, 0.0))
-
 
 @compiled
 def update_cusum(
