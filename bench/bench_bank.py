@@ -5,13 +5,13 @@
 An epoch is 2 s: two motions of each user and about 5.3 ranges. For each number of hypotheses:
 
 * measurements handed over as arrays, epoch by epoch (``move``, ``update``, ``end_instant``);
-* one measurement after another through the public interface, an estimate a second, hearing and
-  copies for going back included; with the same state (no range biases), its estimates looked at
-  by nobody or all of them, and with default settings.
+* one measurement after another through the public interface, an estimate a second, detection and
+  snapshots for rewinding included; with the same state (no range biases), once
+  reading none of its estimates and once all of them, and with default settings.
 
-Figures are processor time: over those epochs in which the bank had just so many hypotheses, the
-median (and the mean: copies and the learning of hearing come now and then) of the least of several
-rounds over the same run, since other work on the machine only adds.
+Figures are processor time: over those epochs in which the bank had just that many hypotheses, the
+median (and the mean: snapshots and the learning of detection come now and then) of the least of
+several rounds over the same run, since other work on the machine only adds.
 """
 
 from __future__ import annotations

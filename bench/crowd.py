@@ -22,16 +22,16 @@ Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
 
 MARGIN_M = 0.5
-"""Nobody walks nearer to a wall."""
+"""Least distance of a path from a wall."""
 
 
 @dataclass(frozen=True, slots=True)
 class CrowdSettings:
-    """What a crowd does and what its sensors err by (metres, seconds, radians).
+    """Motion and sensor errors of a crowd (metres, seconds, radians).
 
     ``turn_noise`` is the mean over the six levels of the relative error of a turn, ``neighbours``
-    the mean number of others within ``max_range_m``; each of them is heard with probability
-    ``detection``.
+    the mean number of others within ``max_range_m``; each of them is received with
+    probability ``detection``.
     """
 
     nodes: int = 200
@@ -55,8 +55,8 @@ class Crowd:
     ``poses`` (T + 1, N, 3) is the truth, ``motions`` (T, N, 3) forward, left, turn as measured.
     The ranges of all instants stand one after the other, those of instant k from ``first[k]`` to
     ``first[k + 1]``: ``node`` and ``peer`` (E,) count from 0, ``range_m`` (E,). ``sigmas``
-    (T, N, 3) are the motions' standard deviations, for who is to be told: forward and left
-    (the step's own along its direction), turn. They follow from the truth: a turn that was
+    (T, N, 3) are the motions' standard deviations, for filters that use them: forward and
+    left (the step's own along its direction), turn. They follow from the truth: a turn that was
     measured as next to nothing is not exact.
     """
 

@@ -29,7 +29,7 @@ from relpos.simulation.world import RadioChannel, UwbChannel
 
 NODES = 3
 NODE = 2
-"""Whom faults of one node happen to."""
+"""The node that faults of one node affect."""
 SECONDS = 65.0
 BEGIN_S = 25.0
 END_S = 45.0
@@ -108,7 +108,7 @@ class Record:
         ]
 
     def unwell(self, node: int, begin_s: float, end_s: float) -> wire.Health:
-        """What a node's status told at some time in between not to work."""
+        """Union of a node's health flags of fault between the two times."""
         missing = wire.Health(0)
         for t, value in self.statuses(node, "health"):
             if begin_s <= t < end_s:
@@ -133,7 +133,7 @@ class Record:
         ]
 
     def range_errors_m(self) -> list[float]:
-        """Every range less the true distance at its time, whoever measured it."""
+        """Every range, of any node, minus the true distance at its time."""
         return [
             r.range_m - self.true_distance_m(r.node, r.peer, r.time_s)
             for _, r in self.ranges()
@@ -296,8 +296,8 @@ class Outcome:
     def lost_m(self) -> float:
         """Motion that the host never got, in metres of path.
 
-        Without restart: how much less way the node has told by the end than undisturbed. With one:
-        the true way between the last total that arrived and the beginning of the new ones.
+        Without restart: how much less path the node has reported by the end than undisturbed.
+        With one: the true path from the last total that arrived to the first of the new ones.
         """
         gaps = self._gaps()
         if gaps:
@@ -316,7 +316,7 @@ class Outcome:
         return max(map(abs, self.run.range_errors_m()), default=0.0)
 
     def seen(self) -> list[str]:
-        """What tells of the fault: counters that grew, flags, restarts."""
+        """Signs of the fault: counters that grew, flags, restarts."""
         words = []
         for name in ("bus_errors", "missed_ticks", "ranging_failures", "radio_failures",
                      "bad_frames", "refused_frames"):  # fmt: skip

@@ -2,7 +2,7 @@
 
     python bench/large_team.py [--nodes 200] [--seeds 8] [--seconds 120] [--no-dense] [--first 0]
 
-A crowd with eight neighbours each (`crowd.py`), both filters told the noise.
+A crowd with eight neighbours each (`crowd.py`), both filters with known noise.
 The dense one works range by range, to second order, over all 3 N states, compiled. Distance RMSE
 and NEES of pairs in reach (ranged at that instant) and of all pairs; processor time of an epoch
 (two motions, some 4 N ranges) as the median and mean over the epochs.

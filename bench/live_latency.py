@@ -1,12 +1,12 @@
-"""From a packet's last byte on the serial port to its picture in a browser's hands.
+"""Latency from a packet's last byte on the serial port to its view in a browser.
 
 An emulated team's bytes go into a pseudo-terminal at their own times; ``relpos fuse PORT --view``
 reads it as a real coordinator's port, and a WebSocket client in a process of its own stamps every
-picture that it gets. A packet is shown by the first picture that contains it: a motion report when
+view that it gets. A packet is shown by the first view that contains it: a motion report when
 its node's pose contains that motion (``motion_s``), a ranges report when all of its ranges, but
-those that newer ones of the same pair have replaced, are among the picture's.
+those that newer ones of the same pair have replaced, are among the view's.
 
-Told are the median and the 99th percentile of both, of the part from the picture's making to its
+Prints the median and the 99th percentile of both, of the part from the view's making to its
 arrival (``page``), how old the newest fused estimate is, and the computer's load, which is part of
 the answer.
 
@@ -203,7 +203,7 @@ def main() -> int:
                 process.start()
                 clients.append((pipe, process))
             time.sleep(3.0)
-            # Beacons and commands of the session: nobody reads them, and they must not fill up.
+            # Discard beacons and commands of the session, so that the buffer does not fill up.
             threading.Thread(target=_swallow, args=(ours,), daemon=True).start()
             packets = play(stream, ours)
             load = os.getloadavg()[0]

@@ -1,9 +1,9 @@
-"""How much of a computer the team's page takes: 20 people, 20 pictures a second.
+"""How much of a computer the team's page takes: 20 people, 20 views a second.
 
     python bench/live_page.py [--people 20] [--seconds 10]
 
-Prints, for views that do and do not move, the share of one core that the page's main thread is
-busy, frames a second, and how late the drawing of a picture ends after the server sent it (both on
+Prints, for views that do and do not move, the fraction of one core that the page's main thread is
+busy, frames a second, and how late the drawing of a view ends after the server sent it (both on
 this computer, one clock). Without a graphics card Chromium draws the canvas on the processor, in
 another process; that is not in the first figure.
 """

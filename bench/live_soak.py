@@ -1,13 +1,13 @@
-"""A live session of hours: whether its memory stays flat and its pictures stay fresh.
+"""A live session of hours: whether its memory stays flat and its views stay fresh.
 
 An emulated team walks behind a pseudo-terminal; ``relpos fuse PORT --view`` runs as a user would
-start it; a WebSocket client follows the page's pictures. Every so often the processes' resident
+start it; a WebSocket client follows the page's views. Every so often the processes' resident
 memory is read. Compared are the time after the warm-up and the end:
 
 - memory of the session and of the page's server: the last quarter's median against that of the
   first quarter after the warm-up;
-- the picture's age when it arrives (from its newest packet's arrival), and how far the fused
-  estimate is behind the picture.
+- the view's age when it arrives (from its newest packet's arrival), and how far the fused
+  estimate is behind the view.
 
     python bench/live_soak.py --hours 2 --nodes 20 --speed 10
 """

@@ -25,7 +25,7 @@ def main() -> None:
     parser.add_argument("--nodes", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=120.0)
     parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--unknown", action="store_true", help="tell no starts")
+    parser.add_argument("--unknown", action="store_true", help="give no starts")
     args = parser.parse_args()
     fusion.warm_up("bank")
     for seed in range(args.seeds):

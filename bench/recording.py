@@ -1,9 +1,9 @@
 """What a recording costs: bytes an hour, and processor time beside the session's own.
 
 An emulated team is decoded and fused first; then its session is handed to a recorder at its own
-pace, as the live session does, and nothing else is computed meanwhile. Told are the file's size, by
-topic before compression, the share of one processor that recorder and calls took, and the longest
-that the session had to wait in a call.
+pace, as the live session does, and nothing else is computed meanwhile. Prints the file's size, by
+topic before compression, the fraction of one processor that recorder and calls took, and the
+longest time that the session had to wait in a call.
 
     python bench/recording.py --nodes 20 --seconds 60
 """

@@ -32,13 +32,13 @@ lost. What lasts, lasts from {fault_runs.BEGIN_S:g} to {fault_runs.END_S:g} s an
 - **time to recover**: from the fault's end to the first whole report, at the host, of what was
   disturbed: motion (neither gap nor start in it; reported every second), ranges (a round every two
   seconds), magnetic headings. 0 where nothing was.
-- **motion lost**: way in metres that the host never got. For a restart the true way between the
+- **motion lost**: path in metres that the host never got. For a restart the true path between the
   last total that arrived and the beginning of the new ones, with its duration; else by how much
-  less way the node has told by the end than without the fault (negative: more). The faults of
+  less path the node has reported by the end than without the fault (negative: more). The faults of
   radio, ranging and host lose none: running totals.
 - **worst range**: largest error of a range that the host was given, anywhere in the team
   (noise alone: {{noise:.2f}} m).
-- **seen**: what tells of the fault, as more than without it: counters in the node's status, flags
+- **seen**: signs of the fault, beyond those without it: counters in the node's status, flags
   in its reports, counts of the host's link.
 
 """

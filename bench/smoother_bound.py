@@ -1,4 +1,4 @@
-"""The smoother against the bound of smoothing, seed by seed, noise levels not told.
+"""The smoother against the bound of smoothing, seed by seed, noise levels unknown.
 
     python bench/smoother_bound.py --scenario paper-p1 [--seeds 50] [--first 200]
 

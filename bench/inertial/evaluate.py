@@ -421,7 +421,7 @@ def waypoints(verbose: bool) -> Figures:
             kinds[name].append((at_waypoints(recording, track, times_s), places))
         heading = gyro_heading_rad(floors.prepare(recording, steps=False))
         way = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(places)))))
-        # Nobody walks shorter than along the waypoints: it is the distance as good as there is.
+        # The path along the waypoints is the shortest possible, and the best distance known.
         squares.append((plain.distance_m - way[-1]) ** 2 / plain.rows["variance_along_m2"][-1])
         true_m = np.diff(np.interp(recording.time_s, times_s, way), prepend=0.0)
         leg = np.clip(np.searchsorted(times_s, recording.time_s, "right") - 1, 0, len(places) - 2)

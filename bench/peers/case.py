@@ -38,10 +38,10 @@ class Instant:
 
 @dataclass(frozen=True)
 class Case:
-    """T motions a second apart, ranges after every second one; noise as everybody is told it.
+    """T motions a second apart, ranges after every second one; noise as all filters know it.
 
     ``motions``, ``sigmas`` (T, N, 3): forward, left, turn and their standard deviations (along the
-    way it is the step's, across it nothing but the floor); ``ranges[t]`` after motion t or None;
+    path it is the step's, across it nothing but the floor); ``ranges[t]`` after motion t or None;
     ``truth`` (T + 1, N, 3).
     """
 

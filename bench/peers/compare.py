@@ -7,7 +7,7 @@ levels as relpos' filters, as arrays, and are used as their documentation says: 
 functions or subclasses, exact Jacobians, all ranges of an instant as one measurement. Writes
 peers.md, peers.csv, peers.png (error over time per epoch), scaling.csv and scaling.png (over the
 number of particles and over the size of the team). Times are processor time on one thread, of the
-median epoch in the fastest run; what could not be run is said. Default: some four minutes.
+median epoch in the fastest run; failures to run are listed. Default: some four minutes.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def _interface(name: str, **settings: object) -> Run:
 
 
 JOINT, CLOUD = "joint filter", "particle filter, M 500, no dual step"
-SMOOTHER, WHOLE = "smoother", "relpos through its interface, noise not told"
+SMOOTHER, WHOLE = "smoother", "relpos through its interface, noise unknown"
 
 CONTENDERS = (
     Contender(JOINT, "relpos joint (one hypothesis)", "5 N + 1, of which 3 N live",
@@ -105,7 +105,7 @@ class Row:
 
 
 def attempt(run: Run, case: Case, seed: int) -> tuple[Score | None, str]:
-    """Run one; what is missing or breaks is told, not raised: the others go on."""
+    """Run one; return a missing package or failure as text, so that the others go on."""
     try:
         return run(case, seed), ""
     except Exception as failure:
@@ -205,7 +205,7 @@ def draw_peers(rows: Sequence[Row], out: Path) -> None:
     figure.legend(
         handles=handles, loc="outside center right", frameon=False, fontsize=9,
         title="circle: joint filter, square: particles,\ntriangle: smoother, diamond: through\n"
-        "the interface, noise not told;\nblue: relpos, orange: peers",
+        "the interface, noise unknown;\nblue: relpos, orange: peers",
     )  # fmt: skip
     figure.tight_layout(rect=(0.0, 0.0, 0.79, 1.0))
     figure.savefig(out / "peers.png", dpi=110)

@@ -1,4 +1,4 @@
-"""filterpy and Stone Soup: joint filters of 3 states a user (x, y, heading), noise told."""
+"""filterpy and Stone Soup: joint filters of 3 states a user (x, y, heading), noise known."""
 
 from __future__ import annotations
 

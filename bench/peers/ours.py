@@ -11,7 +11,7 @@ from relpos import fusion
 
 
 class Joint:
-    """The bank's core with a single hypothesis, noise told; it goes on watching and learning."""
+    """The bank's core with a single hypothesis, noise known; fault detection and learning go on."""
 
     def __init__(self, case: Case, seed: int) -> None:
         from relpos.fusion.bank.core import BankCore
@@ -30,7 +30,7 @@ class Joint:
         return self.core.hypotheses.poses_in(self.rows, np.zeros_like(self.rows))
 
     def predict(self, motion: Floats, sigma: Floats) -> None:
-        """Move everybody by told noise."""
+        """Move everybody with known noise."""
         self.core.hypotheses.arrays.component[:] = 1.0
         self.core.move(self.rows, np.column_stack([motion, self.ones]), sigma)
 
@@ -54,7 +54,7 @@ class JointAlone(Joint):
         self.outlier = np.array([1e-9, 9.0, 0.1, 1.0, 9.0])
 
     def predict(self, motion: Floats, sigma: Floats) -> None:
-        """Move everybody by told noise."""
+        """Move everybody with known noise."""
         from relpos.fusion.bank import motion_update
         from relpos.fusion.models.motion_variances import base_variances
 
@@ -79,7 +79,7 @@ class JointAlone(Joint):
 
 
 class Strips:
-    """The filter for large teams: 3 states a user, noise told."""
+    """The filter for large teams: 3 states a user, noise known."""
 
     def __init__(self, case: Case, seed: int) -> None:
         from relpos.fusion.large_teams.kernels import RangeModel
@@ -135,20 +135,20 @@ class Particles:
 
 
 def particle_sigma(case: Case) -> float:
-    """Range sigma that filters are told which take their neighbours' means as places.
+    """Range sigma for filters that take their neighbours' means as positions.
 
-    The paper's own: what the means err by is in it.
+    The paper's own: it includes the errors of the means.
     """
     return max(2.0 * case.sigma_range_m, 0.5)
 
 
 def particle_motion(sigma: Floats) -> Floats:
-    """Noise for particles: 2 cm and a degree more than told, lest the clouds collapse."""
+    """Noise for particles: 2 cm and a degree more than stated, against collapse of the set."""
     return np.hypot(sigma, [0.02, 0.02, 0.0175])
 
 
 def through_interface(case: Case, name: str, settings: dict[str, object], seed: int) -> Score:
-    """Measurement by measurement, estimates included; noise is not told."""
+    """Measurement by measurement, estimates included; noise unknown."""
     made = fusion.make(name, case.priors, settings, seed)
     estimated = case.truth[1:, :, :2].copy()
     begin = time.process_time()
@@ -175,7 +175,7 @@ def begin_of(case: Case) -> Floats:
 
 
 def smoother(case: Case, begin_m: Floats) -> Score:
-    """The smoother's optimiser on the whole run, noise told, from the given poses (T + 1, N, 3)."""
+    """The smoother's optimiser on the full run, noise known, from the given poses (T + 1, N, 3)."""
     from relpos.fusion.smoother.graph import build_graph
     from relpos.fusion.smoother.problem import Problem, Weights
 

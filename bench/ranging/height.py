@@ -1,4 +1,4 @@
-"""How true is the height that nodes tell? Climbs through chips, firmware, radio and link.
+"""Error of the height that nodes report: climbs through chips, firmware, radio and link.
 
     python bench/ranging/height.py [--climbers 6] [--seed 1]
 
@@ -38,7 +38,7 @@ SCRIPT = (
 
 
 def climb(climbers: int, seed: int) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Each climber's (time in seconds, height told, true height) in metres over the start."""
+    """Each climber's (time in seconds, height reported, true height) in metres over the start."""
     walkers = [make_walker(SCRIPT, 100 * seed + k, node=k)[0] for k in range(1, climbers + 1)]
     end_s = max(float(walker.time_s[-1]) for walker in walkers)
     reported: dict[int, list[tuple[float, float]]] = {walker.node: [] for walker in walkers}

@@ -16,7 +16,7 @@ import numpy as np
 from relpos.simulation.world import FloatArray, MagneticField, World
 
 _NEAREST_M = 0.7
-"""Nobody comes closer to the middle of a column."""
+"""Least distance of a path from the middle of a column."""
 
 
 @dataclass(frozen=True, slots=True)

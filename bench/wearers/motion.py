@@ -185,7 +185,7 @@ def _track(
     grid: Grid,
     start_heading_rad: float,
 ) -> _Track:
-    """Nobody walks on a drawn line: 6 cm aside over 3 m."""
+    """Return the track with lateral wander: 6 cm aside over 3 m."""
     t = grid.time_s
     path = progress.stepped_m + plan.slide.at(t)
     span = max(float(path[-1]), 1.0) + 4.0

@@ -146,7 +146,7 @@ def make_wearer(
     leg = 0.53 * stature * float(np.clip(rng.normal(1.0, 0.03), 0.92, 1.08))
     where = str(rng.choice(PLACES, p=(0.4, 0.3, 0.1, 0.2)))
     where = where if place is None else place
-    # One in eight limps when nothing is said.
+    # One in eight limps unless ``limping`` is given.
     limps = (rng.random() < 0.125) if limping is None else limping
     limp = float(rng.uniform(0.1, 0.35)) if limps else 0.0
     carrier = rng.random()

@@ -100,7 +100,7 @@ void redo_crc(Bytes* frame) {
 }
 
 // What an API frame with escapes carries, by Digi's description: what stands between two delimiters,
-// unescaped, is length, data, checksum; the rest of it is nobody's.
+// unescaped, is length, data, checksum; the rest of it is ignored.
 struct ReferenceModule {
   Bytes plain;
   bool open = false, escape = false;
@@ -222,7 +222,7 @@ struct World : FakeBoard {
   uint32_t busy_polls = 0;
   bool active = false;  // wrote to the EEPROM or the line
   bool restart_asked = false;
-  std::vector<Bytes> heard;
+  std::vector<Bytes> received;
 
   World() { memset(eeprom, 0xFF, sizeof eeprom); }
 
@@ -327,7 +327,7 @@ struct World : FakeBoard {
     for (size_t i = 2; i < sent_.size(); ++i) sum = static_cast<uint8_t>(sum + sent_[i]);
     if (sum != 0xFF || sent_[2] != 0x01) fail("the node sends the module something else");
     frame_id = sent_[3];
-    heard.push_back(Bytes(sent_.begin() + 7, sent_.end() - 1));
+    received.push_back(Bytes(sent_.begin() + 7, sent_.end() - 1));
   }
 
  public:
@@ -401,10 +401,10 @@ class Script {
     world_.space_left = world_.space;
     node().poll(world_.now);
     if (world_.without_power) {
-      world_.heard.clear();
+      world_.received.clear();
       world_.restart_asked = false;
     }
-    for (const Bytes& frame : world_.heard) {
+    for (const Bytes& frame : world_.received) {
       ++totals.sent;
       wire::Header header;
       if (wire::open(frame.data(), static_cast<uint8_t>(frame.size()), sending_key(frame), &header) !=
@@ -416,7 +416,7 @@ class Script {
       newest_sent_ = header.counter;
       if (header.type == wire::MessageType::kAcknowledgement) note_answer(frame);
     }
-    world_.heard.clear();
+    world_.received.clear();
   }
   void note_answer(const Bytes& frame) {
     const uint8_t* body = frame.data() + wire::kHeaderBytes;
@@ -504,7 +504,7 @@ class Script {
     const bool good = wire::open(exact.data(), static_cast<uint8_t>(exact.size()), state().key_,
                                  &header) == wire::FrameStatus::kGood;
     const bool genuine = find_genuine(payload, state().key_) != nullptr;
-    if (good && !genuine) fail("a frame is opened that nobody has sealed");
+    if (good && !genuine) fail("a frame without a genuine tag is opened");
     if (!good && genuine && payload.size() <= wire::kFrameBytes) fail("a genuine frame is refused");
     totals.opened += good;
     if (payload.size() >= wire::kOverhead) {

@@ -21,8 +21,8 @@ constexpr uint8_t kDataReady = 0x01;     // ST1
 constexpr uint8_t kPeriodTicks = 10;     // 5 Hz
 constexpr uint8_t kAbsentTicks = 50;     // between attempts to reach a chip that does not answer
 constexpr uint8_t kMostFailures = 3;     // in a row, then set up anew
-// Readings in a row that a chip may repeat: while its wearer walks it never repeats one, and while he
-// stands no heading is needed.
+// Readings in a row that a chip may repeat: it never repeats one while its wearer walks, and no heading
+// is needed while the wearer stands.
 constexpr uint8_t kMostRepeats = 5;
 constexpr float kUnit = 0.3f / 256.0f;   // 0.3 uT a count, adjusted by (ASA + 128) / 256
 

@@ -23,8 +23,8 @@ enum Register : uint8_t {
 constexpr uint8_t kIdentity = 0x34;       // bits 6:1 of WHO_AM_I; the others are not specified
 constexpr uint8_t kIdentityMask = 0x7E;
 constexpr uint8_t kDataReady = 0x01;
-// Read with every sample: INT_PIN_CFG, INT_ENABLE, two more, then the sample. That the first two are
-// as they were set tells a chip that has lost its set-up, and 0xFF, zeros or noise on the bus.
+// Read with every sample: INT_PIN_CFG, INT_ENABLE, two more, then the sample. The first two
+// differ from their set-up where a chip has lost it, or at 0xFF, zeros or noise on the bus.
 constexpr uint8_t kPinConfig = 0x22;  // latched until INT_STATUS is read; bypass
 constexpr uint8_t kBefore = kAccelXHigh - kIntPinConfig;
 constexpr uint8_t kBurst = kBefore + 14;

@@ -170,8 +170,8 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
   }
   switch (state_) {
     case State::kBefore:
-      // What the chip has of this peer by now is no answer to the exchange: after a failure with
-      // inverted flags, or another's exchange that ends meanwhile, it would be told as one.
+      // The chip's present distance of this peer is no answer to the exchange: after a failure with
+      // inverted flags, or another's exchange that ends meanwhile, it would be reported as one.
       before_ms_ = little_endian_long(answer + 1);  // 0 where it has nothing
       advance();
       return Event::kNothing;
@@ -197,7 +197,7 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
         return Event::kNothing;
       }
       if (is_due(now_us, due_us_)) {
-        // A chip that has restarted with its interrupts masked answers, but never tells.
+        // A chip that has restarted with its interrupts masked answers, but never interrupts.
         count_failure();
         return done(kTimedOut, wait_us, result);
       }
@@ -217,7 +217,7 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
   const int32_t advance_ms = static_cast<int32_t>(time_ms - before_ms_);
   if (answer[0] != 1 || (before_ms_ != 0 && advance_ms <= 0) || time_ms == last_ms_) {
     // No row or the one from before: it was another exchange that ended, where this chip answered.
-    // Or the one of another peer, which chips have been seen to tell twice.
+    // Or the one of another peer, which chips have been seen to report twice.
     state_ = State::kPoll;
     *wait_us = kPollUs;
     return Event::kNothing;

@@ -20,7 +20,7 @@ class Xbee {
   bool busy() const { return sending_; }
   // Begins a TX16 request. The data must stay unchanged until !busy(). False while busy().
   bool send(uint16_t destination, const uint8_t* data, uint8_t length);
-  // The module has not told that the last request was delivered.
+  // The module has not reported that the last request was delivered.
   bool undelivered() const { return undelivered_; }
   // Pushes what fits into the UART and reads what has come, up to the end of the first RF payload.
   // True where there is one: received(), received_length() and source() hold until the next step.

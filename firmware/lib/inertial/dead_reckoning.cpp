@@ -37,8 +37,8 @@ const float kTiltMoving_rad = 6.0f * kDegree;  // half a step's braking left in 
 // time; one that gets ready spreads its rates, of which a quarter is left in the mean of an axis.
 const float kSway_rad = 1.7f * kDegree;
 const float kSwayShare = 0.25f;
-// Who stands can tell: a chip fresh from the factory is let be off by twice what is configured,
-// of which it specifies 20 deg/s. Who walks at once cannot.
+// Prior of a start at rest, where the bias can be measured: a new chip may be off by twice what is
+// configured (its data sheet says 20 deg/s). Not of a start while walking.
 const float kStandingPrior = 4.0f;
 const float kSpeedUnknown_m_s = 1.0f;
 const float kSpeedFound_m_s = 0.3f;   // step length over interval, at mid-stance
@@ -114,8 +114,8 @@ const float kSigmas[] PROGMEM = {
 
 const uint8_t kHoldTicks = 100;       // two seconds: a flag is seen by a report a second
 
-// By its bits: the boards' compiler is told that there is no other number (-ffinite-math-only), so
-// what comes from outside is looked at first.
+// By its bits: the boards' compiler assumes finite numbers (-ffinite-math-only), so
+// input is checked first.
 bool finite(float value) {
   uint32_t bits;
   memcpy(&bits, &value, sizeof bits);
@@ -212,8 +212,8 @@ RELPOS_APART void DeadReckoning::initialise(bool still) {
   float variance = filter_.covariance(kBias, kBias);  // as reset() set it
   if (still) {
     gravity_m_s2_ = norm(velocity_m_s_) * share;
-    // The mean rate is bias and what the body turned meanwhile. How much that may be, its spread
-    // tells: 0.03 deg/s on a table, 0.8 standing quietly, 2 to 3 while getting ready, when the mean
+    // The mean rate is bias and what the body turned meanwhile. The spread shows how much:
+    // 0.03 deg/s on a table, 0.8 standing quietly, 2 to 3 while getting ready, when the mean
     // was wrong by 1 to 2 deg/s (walk_chest) and turned the whole walk.
     const float noise =
         kSway_rad * kSway_rad / (since_.time_s * since_.time_s) +
@@ -526,8 +526,8 @@ void DeadReckoning::run(Job job) {
       break;
     case kCommit:
       commit_step();
-      // Until the forward axis is known a step says nothing of the horizontal; that nobody is faster
-      // than people are has to hold the tilt, which ran away with the gyroscope's bias.
+      // Until the forward axis is known a step says nothing of the horizontal; the limit of walking
+      // speed has to hold the tilt, which ran away with the gyroscope's bias.
       job_ = forward_.found() ? kIdle : kStillX;
       return;
     case kStillX:

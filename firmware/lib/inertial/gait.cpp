@@ -19,7 +19,7 @@ const float kShortestStep_s = 0.28f;   // 3.6 steps/s: faster than anybody walks
 const float kSmallestSwing_m = 0.005f;
 const float kSmallestRange_m_s2 = 0.6f;
 const float kPause_s = 1.5f;       // longest time between steps of one walk
-const float kFirstPeriod_s = 0.6f; // 100 steps a minute, until two steps tell
+const float kFirstPeriod_s = 0.6f; // 100 steps a minute, until two steps are known
 const float kPeriodGain = 0.3f;    // the rhythm of the last three steps
 const float kLongestPeriod_s = 1.0f;   // longer is a step that was missed, or hesitation
 const float kEarly = 0.6f;         // of the period: what comes sooner is a shock of the same step
@@ -88,7 +88,7 @@ RELPOS_SHARED bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance*
   stance->age_s = 0.0f;
   stance->last = first && footfall_due_;
   if (stance->last) {
-    // Whoever was over one foot and going put down the other one before standing.
+    // A wearer over one foot and walking put down the other one before standing.
     footfall_due_ = false;
     stance->age_s = since_s_ - period_s_;
     return true;

@@ -4,7 +4,7 @@
 namespace relpos {
 namespace {
 
-// What people can be in; a chip that is not ready tells 0.
+// Pressures that people can be in; a chip that is not ready reports 0.
 constexpr uint32_t kLeastMpa = 30000000;
 constexpr uint32_t kMostMpa = 120000000;
 // More than 12 m in a tenth of a second is a fault; so many of them are a new truth (a fan, a

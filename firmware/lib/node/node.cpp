@@ -12,12 +12,12 @@ namespace relpos {
 namespace {
 
 constexpr uint32_t kMostStepUs = 200000;   // dead reckoning takes no longer step: it starts anew
-constexpr uint32_t kSilentMs = 500;        // without a sample for so long there is no motion to tell
+constexpr uint32_t kSilentMs = 500;        // without a sample for so long there is no motion to report
 constexpr uint32_t kFieldStaleMs = 1000;
 constexpr uint32_t kSilentPollUs = 500;    // two bytes at 38400 baud
 constexpr uint32_t kMostWaitUs = 100000;
-// From one frame to the next where it is not told as delivered: the module answers in some 10 ms, with
-// its own retries in under 100 ms.
+// From one frame to the next where it is not reported as delivered: the module answers in some 10 ms,
+// with its own retries in under 100 ms.
 constexpr uint16_t kTransmitStatusMs = 200;
 constexpr int16_t kWeakSignalDbm = -95;    // DW1000: close to the sensitivity limit [K]
 constexpr uint16_t kMotionPhaseMs = 157;   // between the reports of neighbouring ids, up to
@@ -88,7 +88,7 @@ void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
     id_ = good ? stored : kDefaultNodeId;
   }
 
-  // A reboot on command is remembered with its token: the host may not have heard the answer, and
+  // A reboot on command is remembered with its token: the host may not have received the answer, and
   // repeating the command must not reboot the node again.
   uint8_t reboot[kRebootBytes];
   for (uint8_t i = 0; i < kRebootBytes; ++i) reboot[i] = board_.storage_read(kStoredReboot + i);
@@ -115,7 +115,7 @@ void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
   motion_ms_ = static_cast<uint16_t>(
       (static_cast<uint16_t>(id_ * kMotionPhaseMs) & kMostMotionPhaseMs) - settings_.report_period_ms);
   plan_.begin(now_ms(), static_cast<uint16_t>(id_ * 257 + counter_));
-  // The first status follows the first motion: it tells who is there, and why.
+  // The first status follows the first motion: it reports what is there, and the cause of the reset.
   status_ms_ = static_cast<uint16_t>(motion_ms_ + settings_.report_period_ms - settings_.status_period_ms);
   show_health();
 }
@@ -175,7 +175,7 @@ void Node::show_health() {
   bool on = settings_.led == kLedOn;
   if (settings_.led == kLedHealth) {
     // The worst shows (docs/hardware.md): fast blinking, a sensor is missing; long on and short off,
-    // the supply is low; two flashes a second, no beacon is heard; one, all well.
+    // the supply is low; two flashes a second, no beacon is received; one, all well.
     uint16_t turn = 1023, lit = 64;
     if (imu_silent() || !magnetometer_.running() || !pozyx_.running()) {
       turn = 255;
@@ -537,8 +537,8 @@ bool Node::run_reboot() {
 
 // ---- telemetry ----
 
-// The module takes the next frame once the last one was delivered. After one that was not, or of which
-// nothing is told, it is left alone for a while: where the air is full, more would make it fuller.
+// The module takes the next frame once the last one was delivered. After one that was not, or
+// without a report, it gets no frame for a while: where the channel is full, more would make it worse.
 bool Node::radio_free() {
   if (xbee_.busy()) return false;
   if (!xbee_.undelivered()) awaiting_status_ = false;

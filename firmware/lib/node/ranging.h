@@ -1,4 +1,4 @@
-// Whom to range when. With the coordinator's beacon: in this node's own window of the superframe, so
+// Which peer to range when. With the coordinator's beacon: in this node's own window of the superframe, so
 // that exchanges do not collide. Without: at random times. How it works: docs/ranging.md.
 #pragma once
 
@@ -30,7 +30,7 @@ constexpr uint8_t kAllInARound = 7;
 // with a pause after each failure left 20 nodes 16 % of their exchanges and some nodes none; this, 42 %:
 // bench/ranging/slots.py.)
 // Without a beacon ids are tried that may not exist: the silent ones only in the first pass over all
-// that begins in each so many ms. A pass takes at most five rounds: nobody waits longer than 10 s.
+// that begins in each so many ms. A pass takes at most five rounds: no node waits longer than 10 s.
 constexpr uint16_t kProbeMs = 4096;
 
 // Zeroed memory is the start: make it as `RangingPlan()`. Times are the low 16 bits of milliseconds;

@@ -22,7 +22,7 @@ struct Preferences {
   uint16_t report_period_ms;
   uint16_t ranging_period_ms;  // 0: no ranging
   uint16_t status_period_ms;
-  int16_t range_offset_mm;  // told, not applied
+  int16_t range_offset_mm;  // reported, not applied
   uint8_t node_id;          // 0: the one that the board was prepared with
   uint8_t reserved;
 };
@@ -51,7 +51,7 @@ constexpr uint8_t kRecords = 3;
 // A record is stored twice: layout, its bytes, CRC(2).
 constexpr uint8_t stored_bytes(uint8_t size) { return static_cast<uint8_t>(2 * (size + 3)); }
 
-// The EEPROM's layout. Whoever prepares a board writes the first two bytes.
+// The EEPROM's layout. Preparing a board writes the first two bytes.
 enum StorageAddress : uint16_t {
   kStoredNodeId = 0,            // 1 to 254
   kStoredNodeIdComplement = 1,  // node id ^ 0xFF

@@ -1,4 +1,4 @@
-// The firmware's version, told in every status message.
+// The firmware's version, sent in every status message.
 #pragma once
 
 #include <stdint.h>

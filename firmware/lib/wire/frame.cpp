@@ -64,7 +64,7 @@ FrameStatus open(const uint8_t* frame, uint8_t length, const uint8_t* key, Heade
   if (crc16(frame, checked) != crc) return FrameStatus::kBadCrc;
   uint8_t tag[kTagBytes];
   siphash24(key, frame, tagged, tag);
-  // All bytes, whatever the first ones say: how long it takes tells a forger nothing.
+  // All bytes, whatever the first ones are: the time it takes gives a forger no information.
   uint8_t different = 0;
   for (uint8_t i = 0; i < kTagBytes; ++i) different |= static_cast<uint8_t>(frame[tagged + i] ^ tag[i]);
   if (different != 0) return FrameStatus::kBadTag;

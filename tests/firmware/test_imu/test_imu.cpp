@@ -15,7 +15,7 @@ namespace {
 struct Chips : FakeBoard {
   bool present = true;
   bool stuck = false;
-  uint8_t loose = 0;  // every so many-th transaction finds nobody
+  uint8_t loose = 0;  // every so many-th transaction is not acknowledged
   uint8_t inertial[128] = {};
   uint8_t field[0x13] = {};
   uint8_t asa[3] = {128, 128, 128};

@@ -385,7 +385,7 @@ TEST(with_a_beacon_every_exchange_lies_in_the_node_s_own_window) {
     team.world.exchange_us = 20000;
     team.run_ms(3000);
     const uint32_t start_us = team.world.now;
-    uint16_t heard = 0;
+    uint16_t exchanges = 0;
     for (uint8_t second = 0; second < 24; ++second) {
       const uint32_t phase_ms = (team.world.now - start_us) / 1000 % 2000;
       Slots::hear(team, static_cast<uint16_t>(phase_ms), static_cast<uint8_t>(second / 2), count);
@@ -399,12 +399,12 @@ TEST(with_a_beacon_every_exchange_lies_in_the_node_s_own_window) {
         const uint32_t at_ms = (team.world.exchange_at_us[i] - start_us) / 1000 % 2000;
         CHECK(at_ms + 1 >= (kId - 1) * window_ms);  // its place is id - 1
         CHECK(at_ms + relpos::kExchangeMs <= kId * window_ms);
-        ++heard;
+        ++exchanges;
       }
     }
     // Eleven rounds: all others up to seven; else half of them, or what 100 ms take.
     const uint16_t a_round = count <= 7 ? count - 1 : count == 12 ? 6 : 4;
-    CHECK(heard >= 10 * a_round && heard <= 12 * a_round);
+    CHECK(exchanges >= 10 * a_round && exchanges <= 12 * a_round);
   }
 }
 
@@ -750,11 +750,11 @@ TEST(the_schedule_does_not_feel_the_wrap_of_the_microseconds) {
 }
 
 TEST(a_lost_frame_changes_nothing_in_the_next_ones) {
-  Team heard, lost;
+  Team received, lost;
   lost.world.delivery = 1;  // no acknowledgement from the coordinator
-  heard.run_ms(12000);
+  received.run_ms(12000);
   lost.run_ms(12000);
-  const Sent* a = heard.last(wire::MessageType::kMotion);
+  const Sent* a = received.last(wire::MessageType::kMotion);
   const Sent* b = lost.last(wire::MessageType::kMotion);
   CHECK(a != nullptr && b != nullptr);
   CHECK(a->header.counter == b->header.counter);
@@ -819,15 +819,15 @@ TEST(an_imu_that_was_away_gives_a_gap_a_reset_and_a_larger_variance) {
   team.run_ms(3000);
   team.world.inertial_present = true;
   team.run_ms(2000);
-  bool reset_told = false;
+  bool reset_reported = false;
   wire::Motion motion = {};
   for (uint16_t i = 0; i < team.world.count; ++i) {
     const Sent& sent = team.world.frames[i];
     if (sent.header.type != wire::MessageType::kMotion) continue;
     CHECK(wire::decode(sent.body, sent.length, &motion));
-    reset_told |= (motion.quality & static_cast<uint8_t>(wire::Quality::kFilterReset)) != 0;
+    reset_reported |= (motion.quality & static_cast<uint8_t>(wire::Quality::kFilterReset)) != 0;
   }
-  CHECK(reset_told);
+  CHECK(reset_reported);
   // At least 3 s at the 1 m/s that a wearer may have walked unseen.
   CHECK(motion.variance_along_mm2 - before.variance_along_mm2 >= 9000000);
   team.run_ms(10000);

@@ -184,7 +184,7 @@ TEST(a_foreign_version_is_distinguished_from_damage) {
   frame[1] = wire::kProtocolVersion + 1;
   Header header;
   CHECK_EQUAL(FrameStatus::kForeignVersion, wire::open(frame, sizeof frame, vectors::kCommandKey, &header));
-  // The version tells even where the length is another one.
+  // The version is checked even where the length differs.
   CHECK_EQUAL(FrameStatus::kForeignVersion, wire::open(frame, 3, vectors::kCommandKey, &header));
   frame[0] ^= 1;
   CHECK_EQUAL(FrameStatus::kNotOurs, wire::open(frame, sizeof frame, vectors::kCommandKey, &header));

@@ -9,7 +9,7 @@ using relpos::Xbee;
 namespace {
 
 struct Line : FakeBoard {
-  uint8_t space = 255;       // that uart_write_space() tells
+  uint8_t space = 255;       // that uart_write_space() returns
   uint8_t sent[160];
   uint8_t sent_count = 0;
   uint8_t overruns = 0;      // bytes written without space

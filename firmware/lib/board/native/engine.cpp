@@ -63,7 +63,7 @@ class NativeBoard final : public Board {
   void led(bool) override {}
   void reset() override { callbacks_.reset(callbacks_.context); }
   uint16_t free_stack() override { return 0xFFFF; }  // a PC has enough
-  // Through the boards' 10-bit converter, so that all tell the same.
+  // Through the boards' 10-bit converter, so that all report the same.
   uint16_t supply_mv() override {
     constexpr uint32_t kReferenceCounts = 1100UL * 1024;
     const uint32_t reading = supply_mv_ == 0 ? 0 : kReferenceCounts / supply_mv_;
