@@ -1,7 +1,7 @@
 """Where everybody is, relative to each other: cooperative positioning from IMU and UWB.
 
 The names below are loaded when they are first used, so that ``import relpos`` costs nothing:
-:mod:`relpos.api` tells what they do.
+See :mod:`relpos.api`.
 """
 
 from __future__ import annotations

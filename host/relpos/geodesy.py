@@ -1,6 +1,6 @@
-"""Putting the team's picture on a map: pinned positions, and the plane between world and WGS84.
+"""Putting the team's plane on a map: pinned positions, and the plane between world and WGS84.
 
-The picture has a frame of its own: x, y in metres from an origin, headings from x. A *pin* says
+The team has a frame of its own: x, y in metres from an origin, headings from x. A *pin* says
 where one point of it is on Earth. Together with the compass bearing of world x, or with a second
 pin, that places everything else on the plane that touches WGS84's ellipsoid at the pin. Within
 a kilometre the plane is true to a hundredth of a millimetre.
@@ -25,7 +25,7 @@ Floats = npt.NDArray[np.float64]
 PIN_GRAMMAR = "LAT,LON[,BEARING[,ALTITUDE]][@X,Y or @NODE[:TIME]]"
 
 EAST_RAD = math.pi / 2.0
-"""The bearing of world x where nothing else is said: x is east-like, y north-like."""
+"""The default bearing of world x: x is east-like, y north-like."""
 
 FARTHEST_M = 100_000.0
 """The plane is 8 m off at this distance, and a position further off is a mistake."""
@@ -33,11 +33,11 @@ FARTHEST_M = 100_000.0
 
 @dataclass(frozen=True)
 class Pin:
-    """A point of the picture whose place on Earth is known.
+    """A point of the team's plane whose place on Earth is known.
 
     The point is ``place_m`` in world coordinates, or where ``node`` was at ``time_s`` (None: where
     it was first located). ``bearing_rad`` is the compass bearing, clockwise from true north, that
-    world x points to; ``altitude_m`` the height of the picture's z = 0 over WGS84's ellipsoid.
+    world x points to; ``altitude_m`` the height of the team's z = 0 over WGS84's ellipsoid.
     """
 
     latitude_deg: float
@@ -134,7 +134,7 @@ class MapFrame:
         return east * s + north * c + self.place_m[0], north * s - east * c + self.place_m[1]
 
     def altitude_of(self, z_m: float) -> float | None:
-        """Return the height over the ellipsoid of a height in the picture; None if unknown."""
+        """Return the height over the ellipsoid of a height in the team's frame; None if unknown."""
         known = self.altitude_m is not None and math.isfinite(z_m)
         return self.altitude_m + z_m if known and self.altitude_m is not None else None
 
@@ -158,7 +158,7 @@ class Placing:
 def place(pins: Sequence[Pin], locate: Locate) -> Placing:
     """Turn pins into one frame: one pin with a bearing, or several that give it together.
 
-    Of several the best turn and shift counts, and how far they miss is said. DataError where a
+    With several, the best turn and shift count, and a remark states the residual. DataError where a
     pinned node was not there, or the pins contradict what they are for.
     """
     if not pins:
@@ -170,8 +170,8 @@ def place(pins: Sequence[Pin], locate: Locate) -> Placing:
         frame = MapFrame(
             pin.latitude_deg, pin.longitude_deg, bearing_rad, pin.altitude_m, places[0]
         )
-        unsaid = "the pin has no bearing: world x is taken to point east (a second pin would tell)"
-        return Placing(frame, (unsaid,) * (pin.bearing_rad is None))
+        assumed = "the pin has no bearing: world x is taken to point east (a second pin sets it)"
+        return Placing(frame, (assumed,) * (pin.bearing_rad is None))
     if any(pin.bearing_rad is not None for pin in pins):
         raise DataError("several pins give the bearing together: leave it out of each")
     return _fit(pins, np.array(places))

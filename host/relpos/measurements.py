@@ -2,8 +2,8 @@
 
 Frames and signs: world x east-like, y north-like, z up, metres, radians counter-clockwise
 (REP-103). Times are seconds from the start of the run on one clock. Every class is one row of
-the run format's file of the same name, so that a live link, a recording and a simulation speak
-alike and an estimator cannot tell them apart.
+the run format's file of the same name, so that a live link, a recording and a simulation agree
+and an estimator cannot distinguish them.
 """
 
 from __future__ import annotations

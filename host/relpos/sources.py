@@ -26,7 +26,7 @@ def load(path: Path | str) -> Run:
 
 
 def is_port(source: str) -> bool:
-    """Tell whether the source can only be a serial port: a device, a pyserial URL, a COM name."""
+    """Return whether the source can only be a serial port: a device, a pyserial URL, a COM name."""
     if "://" in source or (source.upper().startswith("COM") and source[3:].isdigit()):
         return True
     path = Path(source)

@@ -31,7 +31,7 @@ class Track:
     """Where one node was, or was believed to be: equally long arrays, NaN where not known.
 
     Rows may come in any order; of rows at the same time the last one counts. A row without a
-    position (NaN) is no row. ``z_m`` is the height, where anything tells it.
+    position (NaN) is no row. ``z_m`` is the height, where it is known.
     """
 
     time_s: Floats
@@ -227,5 +227,5 @@ def true_tracks(truth: Iterable[Truth]) -> dict[int, Track]:
 
 
 def _height(node: NodeEstimate) -> float:
-    """Return the height over the start; 0 without any uncertainty is what nothing told."""
+    """Return the height over the start; NaN where it is 0 without any uncertainty."""
     return node.z_m if node.z_m or node.sigma_z_m else np.nan

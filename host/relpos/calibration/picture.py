@@ -13,7 +13,7 @@ from relpos.extras import require
 FloatArray = NDArray[np.float64]
 
 BEFORE, AFTER, SPHERE = "#D55E00", "#0072B2", "#7f7f7f"
-"""Okabe and Ito's orange and blue, which colour-blind people can tell apart."""
+"""Okabe and Ito's orange and blue, which colour-blind people can distinguish."""
 _PLANES = ((0, 1), (0, 2), (1, 2))
 
 

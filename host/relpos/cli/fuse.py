@@ -385,7 +385,7 @@ def _fuse_port(
         raise DataError(f"{job.source}: a port has no truth to start from")
     check_port(job.source)
     # Before the port is open, because nothing reads it meanwhile. The nodes that start at one
-    # place are heard later; two stand for them here.
+    # place are received later; two stand for them here.
     some = [Prior(node, 0.0, 0.0, 0.0) for node in (1, 2)]
     job.prepare(some if initial is Initial.COMMON else ())
     port = live.open_port(job.source, key_file, teach=teach, reopen=options.shown)
@@ -407,7 +407,7 @@ def fuse_live(
 ) -> None:
     """Fuse measurements of ``source`` as they arrive; write, show and print the result.
 
-    ``emulated`` tells whether the walk of an emulated team is over, which ends its port.
+    ``emulated`` returns whether the walk of an emulated team is over, which ends its port.
     """
     from relpos.live.assembly import SessionPlan
     from relpos.runs import Description

@@ -154,12 +154,12 @@ def _shown() -> Iterator[Any]:
 
     console = Console(stderr=True)
     if not console.is_terminal:
-        said_s = time.monotonic()
+        reported_s = time.monotonic()
 
         def say(now: Progress) -> None:
-            nonlocal said_s
-            if time.monotonic() - said_s > output.PLAIN_PROGRESS_EVERY_S:
-                said_s = time.monotonic()
+            nonlocal reported_s
+            if time.monotonic() - reported_s > output.PLAIN_PROGRESS_EVERY_S:
+                reported_s = time.monotonic()
                 output.remark(
                     f"still {now.still_s:.0f} s, {now.attitudes} sides, "
                     f"{100 * now.coverage:.0f} % of the directions"

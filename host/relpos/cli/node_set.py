@@ -121,7 +121,7 @@ def _apply(dialogue: NodeDialogue, changes: Sequence[Change]) -> list[tuple[str,
         setting = change.setting
         before = dialogue.setting(setting.code)
         dialogue.demand(setting.code, change.raw)
-        # Read anew: not what the node was told, what it has.
+        # Read the value in force, which may differ from the one that was sent.
         after = dialogue.setting(setting.code)
         if after != change.raw:
             raise DeviceError(
@@ -164,7 +164,7 @@ def _set_key(
     try:
         key = write_new_key(key_file) if new else read_key(key_file)
         link = Link(key=old)
-        # A node that has the new key already is heard, too.
+        # A node that already has the new key is received, too.
         link.accept_keys(old, key)
         dialogue = open_dialogue(device, node, link)
         changed = dialogue.set_key(key)

@@ -94,13 +94,13 @@ def monitor(
 def _print_now_and_then(
     console: Any, port: str, seconds: float | None, key_file: Path | None, cable: bool
 ) -> None:
-    said_s = time.monotonic()
+    printed_s = time.monotonic()
     table = _monitor_table([], "")
     try:
         for now_s, monitor in _watch(port, seconds, key_file, cable):
             table = _monitor_table(monitor.rows(now_s), _foreign(monitor))
-            if time.monotonic() - said_s >= PLAIN_TABLE_EVERY_S:
-                said_s = time.monotonic()
+            if time.monotonic() - printed_s >= PLAIN_TABLE_EVERY_S:
+                printed_s = time.monotonic()
                 console.print(table)
     except KeyboardInterrupt:
         return
@@ -119,7 +119,7 @@ def _watch(
     from relpos.nodes.monitor import TeamMonitor
 
     monitor = TeamMonitor()
-    told = 0
+    remarks_shown = 0
     started_s = time.monotonic()
 
     def clock() -> float:
@@ -133,9 +133,9 @@ def _watch(
                 send(device, beacons.due(elapsed_s))
             now_s = elapsed_s if link.virtual_s is None else link.virtual_s
             monitor.update(now_s, link.decoder, batch)
-            while told < len(link.decoder.remarks):
-                output.remark(link.decoder.remarks[told])
-                told += 1
+            while remarks_shown < len(link.decoder.remarks):
+                output.remark(link.decoder.remarks[remarks_shown])
+                remarks_shown += 1
             yield now_s, monitor
             if seconds is not None and elapsed_s > seconds:
                 return

@@ -1,7 +1,7 @@
 """The health of nodes and links over a run, from their recorded status.
 
 The rules are those of the live table (:mod:`relpos.nodes.health`), applied to every status report
-in turn. A run without status reports still tells how regularly each node moved.
+in turn. A run without status reports still shows how regularly each node reported motion.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SERIES = ("battery_v", "rssi_dbm", "loss", "ranging")
 
 @dataclass(frozen=True)
 class NodeHealth:
-    """One node over a run: a row (T,) a status report, NaN where it did not tell.
+    """One node over a run: a row (T,) a status report, NaN where it did not report.
 
     ``colour`` holds the worst of :class:`relpos.nodes.health.Health` at each report. ``restarts``
     are (time in s, why). ``silences`` are (from, to) in s without any motion for more than
@@ -107,14 +107,14 @@ def _node(
             reasons[kind] = reasons.get(kind, 0) + 1
         times.append(time_s)
         colours.append(int(colour))
-        told = {
+        latest = {
             # 0: this board does not measure it.
             "battery_v": view.status.get("battery_v") or None,
             "rssi_dbm": view.rssi_dbm,
             "loss": view.loss(time_s),
             "ranging": view.ranging(time_s)[0],
         }
-        for name, now in told.items():
+        for name, now in latest.items():
             series[name].append(math.nan if now is None else float(now))
     gaps = [(a, b) for a, b in pairwise(moved) if b - a > SILENT_S]
     return NodeHealth(

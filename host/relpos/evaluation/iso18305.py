@@ -16,17 +16,17 @@ length of (e_x, e_y), its vertical one v that of e_z, its spherical one s that o
 Variances and covariances divide by the number of errors, so that RMS^2 = mean^2 + variance.
 Floor and zone detection (8.2, 8.3) need a map, which this system does without.
 
-**Frames.** The standard expects positions in the building's frame. A relative picture has none of
+**Frames.** The standard expects positions in the building's frame. A relative estimate has none of
 its own, so errors can be stated in three ways, and every figure says in which:
 
-* ``AS_GIVEN``: nothing is moved. Only where the run told the starts, in the truth's frame.
+* ``AS_GIVEN``: nothing is moved. Only where the run states the starts, in the truth's frame.
 * ``PER_RUN``: one rigid motion of the plane, SE(2) without reflection, for the whole run and all
   nodes, that fits all errors best in the least-squares sense. What a map pinned once would show.
 * ``PER_EPOCH``: one such motion at every second, over the nodes known then (three or more): what
   of the error is the team's shape alone.
 
 Heights are taken over each node's own height at its first test point, in the estimate and in the
-truth, in every frame: pressure tells nothing else.
+truth, in every frame: pressure observes nothing else.
 """
 
 from __future__ import annotations

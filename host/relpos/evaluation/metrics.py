@@ -86,7 +86,7 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
 
     ``pairs`` gives the estimated distance and its sigma for the NEES (``pairs.csv``), under
     (node, peer) in either order; without it the NEES is NaN. Nodes that only one side knows
-    are left out. Never raises for missing data: a figure nothing can be said about is NaN.
+    are left out. Never raises for missing data: an undefined figure is NaN.
     """
     nodes = sorted(set(estimate) & set(truth))
     at_s = whole_seconds([truth[n] for n in nodes])

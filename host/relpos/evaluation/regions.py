@@ -1,4 +1,4 @@
-"""Whether the alternatives of an ambiguous picture hold the truth, and how much they tell.
+"""Coverage and size of the regions of an ambiguous estimate's alternatives.
 
 The 90 % region of a node is the smallest that holds 90 % of what the alternatives say of it
 (:class:`Region`). Honest alternatives hold the truth in nine epochs of
@@ -28,7 +28,7 @@ DRAWS = 1500
 
 _LEAST_SIGMA_M = 0.01
 """An ellipse's axis or a ring's width below this would make densities of points that no
-measurement can tell apart differ."""
+measurement can distinguish differ."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ def summarise(
     *,
     starts_known: bool,
 ) -> Ambiguity | None:
-    """Look at every epoch; None where nothing was ambiguous or the frame is not known."""
+    """Evaluate every epoch; None where nothing was ambiguous or the frame is not known."""
     frame = Frame() if starts_known else frame_of(estimates, truth)
     if frame is None:
         return None
@@ -193,7 +193,7 @@ class Region:
         return Region(rows, level, float((inside / density).mean()))
 
     def contains(self, x_m: float, y_m: float) -> bool:
-        """Tell whether a place lies inside."""
+        """Return whether a place lies inside."""
         return bool(_density(self.rows, np.array([[x_m, y_m]]))[0] >= self.level)
 
 

@@ -48,7 +48,7 @@ class EstimatorRun:
 
     ``emitted_s`` (T,) is the time of the measurement upon which each estimate was returned,
     ``computing_s`` the estimator's wall time over all ``measurements``. ``failure`` is the error
-    that ended it, ``interrupted`` tells whether Ctrl-C did; earlier estimates are kept.
+    that ended it, ``interrupted`` is whether Ctrl-C did; earlier estimates are kept.
     """
 
     estimates: tuple[Estimate, ...] = ()

@@ -43,7 +43,7 @@ class Evaluation:
         return None if self.bound_over_time is None else self.bound_over_time.totals()
 
     def as_json(self) -> dict[str, Any]:
-        """Return what ``relpos evaluate --json`` prints; None where nothing can be said."""
+        """Return what ``relpos evaluate --json`` prints; undefined figures are None."""
         return {
             "run": self.run,
             **summary.as_json(self.metrics),

@@ -22,7 +22,7 @@ FIGURES = (
 def as_json(metrics: Metrics) -> dict[str, Any]:
     """Return the figures under their names in the run format, per pair and over time.
 
-    A figure that nothing can be said about is None, which JSON writes as null.
+    An undefined figure is None, which JSON writes as null.
     """
     return {
         **figures(metrics),

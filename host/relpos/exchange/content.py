@@ -31,7 +31,7 @@ class Content:
     """A run and the estimates that belong to it, either of which may be empty.
 
     ``start_unix_s`` is the Unix time of the run's second 0, None where it is not known.
-    ``remarks`` is what there is to tell the user about how it was read. ``recording`` is the MCAP
+    ``remarks`` tell the user how it was read. ``recording`` is the MCAP
     file that the run, and all estimates, were read from, with whatever else it holds.
     """
 

@@ -232,8 +232,8 @@ def with_landmarks(content: Content, path: Path, pins: Sequence[Pin]) -> Content
     if not presses.truth:
         raise DataError(f"{run.name}: no press counts: {'; '.join(presses.remarks())}")
     run = replace(run, landmarks=tuple(landmarks), truth=presses.truth)
-    told_of = f"truth from {len(presses.truth)} of {pressed} landmark presses"
-    return replace(content, run=run, remarks=(*remarks, told_of, *presses.remarks()))
+    summary = f"truth from {len(presses.truth)} of {pressed} landmark presses"
+    return replace(content, run=run, remarks=(*remarks, summary, *presses.remarks()))
 
 
 def located_alone(content: Content) -> Content:
@@ -251,7 +251,7 @@ def located_alone(content: Content) -> Content:
 def write(
     content: Content, form: Format, out: Path, *, pins: Sequence[Pin] = (), overwrite: bool = False
 ) -> tuple[list[Path], list[str]]:
-    """Write the content to ``out``; return the files and what there is to tell about them.
+    """Write the content to ``out``; return the files and remarks about them.
 
     What is there already is left alone unless ``overwrite``; then what an earlier conversion to
     the same format left is removed, because it is no part of this one.

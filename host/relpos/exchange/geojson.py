@@ -74,14 +74,14 @@ def _last_positions(content: Content, frame: MapFrame) -> list[dict[str, Any]]:
     features: list[dict[str, Any]] = []
     for node, (time_s, n) in sorted(last.items()):
         who = {"node": node, "name": content.name_of(node), "time_s": round(time_s, 6)}
-        said = {
+        figures = {
             "status": str(n.status),
             "course_deg": _course(n.heading_rad, frame),
             "sigma_major_m": _rounded(n.sigma_major_m),
             "sigma_minor_m": _rounded(n.sigma_minor_m),
         }
         where = _positions([Point(time_s, node, n.x_m, n.y_m, n.z_m)], frame)[0]
-        features.append(_feature("Point", where, {"kind": "position", **who, **said}))
+        features.append(_feature("Point", where, {"kind": "position", **who, **figures}))
         if math.isfinite(n.sigma_major_m) and n.sigma_major_m > 0.0:
             ring = _region(n, frame)
             about = {"kind": "region", **who, "probability": REGION}

@@ -1,7 +1,7 @@
 """TUM trajectories, the format of ``evo``: one file a node, ``time x y z qx qy qz qw`` a line.
 
 Times are the run's own seconds and the frame is the run's. A heading is the turn about z; where
-none is known the quaternion is the unit one, which the format cannot tell from heading 0.
+none is known the quaternion is the unit one, which the format cannot distinguish from heading 0.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def find_files(source: Path) -> list[Path]:
 
 
 def node_of(path: Path, node: int | None) -> int:
-    """Return whose trajectory a file holds: as said, else by the last number in its name."""
+    """Return the node of a file's trajectory: ``node``, else the last number in its name."""
     if node is not None:
         return node
     numbers = re.findall(r"[0-9]+", path.stem)
@@ -112,7 +112,7 @@ def node_of(path: Path, node: int | None) -> int:
 
 
 def kind_of(path: Path, kind: Kind | None) -> Kind:
-    """Return what a file holds: as said, else by its name."""
+    """Return what a file holds: ``kind``, else by its name."""
     if kind is not None:
         return kind
     for known in Kind:

@@ -1,4 +1,4 @@
-"""The team key, and counters that tell a new frame from one that is sent again.
+"""The team key, and counters that distinguish a new frame from a repeated one.
 
 docs/protocol.md describes a frame's tag and counter. Nothing here changes state before a frame has
 been verified by :func:`relpos.protocol.messages.decode`.

@@ -30,7 +30,7 @@ where half of the frames are lost, 30 in a row are lost once in 2^31 s."""
 class BeaconSchedule:
     """Which beacon is due when.
 
-    ``nodes`` are always in the team; others while they were heard within the last
+    ``nodes`` are always in the team; others while they were received within the last
     :data:`FORGET_S`. Nodes keep their order; new ones follow, sorted.
     DataError where ``nodes`` are not different ids from 1 to 254, at most :data:`MAX_NODES`.
     """
@@ -49,7 +49,7 @@ class BeaconSchedule:
         self._superframe_ms = round(superframe_s * 1000.0)
         self._due_s: float | None = None
         self.left_out: tuple[int, ...] = ()
-        """Nodes heard without a free slot: they range without one and disturb the others."""
+        """Nodes received without a free slot: they range without one and disturb the others."""
 
     def heard(self, node: int, time_s: float) -> None:
         """Note a frame of ``node``."""

@@ -95,7 +95,7 @@ class Composer:
                 self.alarms.mark_heard(observation.node)
 
     def add_reported(self, observations: Sequence[Observation]) -> None:
-        """Count observations sent by phones: the fusion gets them, but no node was heard."""
+        """Count observations sent by phones: the fusion gets them, but no node was received."""
         self._submitted += len(observations)
 
     def add_estimate(self, estimate: Estimate, processed: int) -> None:

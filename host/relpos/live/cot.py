@@ -221,7 +221,7 @@ class PinnedFrame:
 
 
 class CotSender(Sink):
-    """Sends pictures as Cursor-on-Target to a TAK server, a multicast group or one screen."""
+    """Sends views as Cursor-on-Target to a TAK server, a multicast group or one screen."""
 
     def __init__(
         self,
@@ -255,7 +255,7 @@ class CotSender(Sink):
         self._thread.start()
 
     def estimated(self, estimate: Estimate) -> None:
-        """Note how well heights are known; pictures do not say."""
+        """Store the uncertainty of heights, which views do not have."""
         for node in estimate.nodes:
             self._sigma_z_m[node.node] = node.sigma_z_m
 

@@ -7,7 +7,7 @@ The attributes of an event (base schema 2.0), and what this project puts there:
 - ``how`` m-g while the position is measured and fresh: TAK clients show a moving member.
   h-e, estimated, where it is ambiguous or the member is stale or lost. m-s, simulated, and
   EXERCISE in the remarks, where the team is emulated or replayed;
-- ``start`` is when the member was last heard, ``stale`` ``STALE_S`` later: clients grey it out;
+- ``start`` is when the member was last received, ``stale`` ``STALE_S`` later: clients grey it out;
 - ``ce`` and ``le`` are the radius, and the height up and down, that hold the member with 90 %
   probability (CE90 and LE90, as TAK's clients take them), of the relative position alone: the
   pin's own error comes on top;
@@ -77,7 +77,7 @@ def member(
     before: Moved | None = None,
     exercise: bool = False,
 ) -> ET.Element | None:
-    """Return the event of one member; None while its position is unknown or it was never heard."""
+    """Return the event of one member; None while its position is unknown or never received."""
     if person.seen_s is None or not _located(person):
         return None
     import pytak

@@ -28,7 +28,7 @@ from relpos.measurements import (
 )
 
 GATHER_S = 3.0
-"""A node reports its motion every second; with two losses in a row it has still been heard."""
+"""A node reports its motion every second; with two losses in a row it has still been received."""
 
 MakeEstimator = Callable[[Sequence[Prior]], Estimator]
 
@@ -42,7 +42,7 @@ class FusedEstimate:
 
 
 def common_start(observations: Sequence[Observation]) -> list[Prior]:
-    """Return priors at one pose for all nodes that are heard in the first :data:`GATHER_S`."""
+    """Return priors at one pose for all nodes that are received in the first :data:`GATHER_S`."""
     nodes: set[int] = set()
     for o in observations:
         if isinstance(o, Motion | Range):
@@ -57,7 +57,7 @@ def common_start(observations: Sequence[Observation]) -> list[Prior]:
 class FusionThread:
     """Runs the estimator that ``make(priors)`` returns, in its own thread.
 
-    With ``common`` all nodes heard in the first :data:`GATHER_S` start at one common pose;
+    With ``common`` all nodes received in the first :data:`GATHER_S` start at one common pose;
     observations wait until these nodes are known.
     """
 

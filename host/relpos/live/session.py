@@ -31,7 +31,7 @@ from relpos.measurements import Observation
 VIEW_S = 0.05
 """At most twenty views a second: smooth for a walking person, and a twentieth of a second old."""
 IDLE_VIEW_S = 0.5
-"""Silence is shown, too: how long a wearer was not heard, how long they have not moved."""
+"""Silence is shown, too: how long a node was not received, how long its wearer has not moved."""
 WAIT_S = 0.05
 BEHIND_S = 5.0
 """Delay of the fusion from which a notice says so; it always waits two or three seconds."""

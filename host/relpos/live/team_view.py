@@ -120,7 +120,7 @@ class GhostPerson:
 
 @dataclass(frozen=True, slots=True)
 class Ghosts:
-    """One of the possible pictures of the team while anything is ambiguous."""
+    """One hypothesis of the team while anything is ambiguous."""
 
     probability: float
     people: tuple[GhostPerson, ...]

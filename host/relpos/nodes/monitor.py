@@ -146,7 +146,7 @@ class NodeMonitor:
 
 
 class TeamMonitor:
-    """All nodes that are heard."""
+    """All nodes that are received."""
 
     def __init__(self) -> None:
         self.nodes: dict[int, NodeMonitor] = {}

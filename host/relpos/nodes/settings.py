@@ -15,7 +15,7 @@ class Setting:
     """One setting: ``low`` to ``high`` in ``unit``; raw value = value x ``per_unit``.
 
     The node's own limits are the same (firmware/lib/node/node.cpp); they are known here so that a
-    wrong value is told before anything is sent. ``words`` names values; ``off`` means 0.
+    wrong value is refused before anything is sent. ``words`` names values; ``off`` means 0.
     """
 
     name: str
@@ -104,7 +104,7 @@ SETTINGS: tuple[Setting, ...] = (
     Setting(
         "step-reports",
         CommandCode.SET_STEP_REPORTS,
-        "tell every single step",
+        "report every single step",
         words=("off", "on"),
     ),
     Setting(

@@ -36,11 +36,11 @@ def platformio(root: Path, which: Callable[[str], str | None] = shutil.which) ->
 
 
 def upload(board: Board, port: str, root: Path | None = None) -> int | None:
-    """Build, write and verify; DeviceError says why not.
+    """Build, write and verify the firmware. DeviceError with the cause where that fails.
 
     ``root`` is the firmware's project (default: the one that came with this package).
 
-    Returns the bytes that were verified, or None where the uploader has not told them.
+    Returns the bytes that were verified, or None where the uploader does not print them.
     """
     root = root or paths.firmware_project()
     command = [*platformio(root), "run", "-e", board.environment, "-t", "upload"]
@@ -56,25 +56,25 @@ def upload(board: Board, port: str, root: Path | None = None) -> int | None:
         )
     except subprocess.TimeoutExpired as error:
         raise DeviceError(f"{port}: the upload took over {UPLOAD_WITHIN_S:g} s") from error
-    told = done.stdout + done.stderr
+    printed = done.stdout + done.stderr
     if done.returncode != 0:
-        raise DeviceError(f"{port}: {why(told)}")
-    verified = re.search(r"(\d+) bytes of flash verified", told)
+        raise DeviceError(f"{port}: {why(printed)}")
+    verified = re.search(r"(\d+) bytes of flash verified", printed)
     return int(verified[1]) if verified else None
 
 
 def _environment(root: Path) -> dict[str, str]:
-    """Where PlatformIO puts what it builds: in a repository as ever, else in the user's cache."""
+    """Return PlatformIO's build folder: in a repository its default, else in the user's cache."""
     if root == paths.repository():
         return {}
     return {"PLATFORMIO_WORKSPACE_DIR": str(paths.build_folder() / "platformio")}
 
 
-def why(told: str) -> str:
-    """What went wrong in an upload, in one line, from what PlatformIO and avrdude have told."""
-    low = told.lower()
+def why(printed: str) -> str:
+    """Return the cause of a failed upload in one line, from PlatformIO's and avrdude's output."""
+    low = printed.lower()
     if "error:" in low and "avrdude" not in low:
-        line = next(line for line in told.splitlines() if "error:" in line.lower())
+        line = next(line for line in printed.splitlines() if "error:" in line.lower())
         return f"the firmware does not build: {line.strip()}"
     if "can't open device" in low or "busy" in low:
         return "the port cannot be opened: does another program hold it?"
@@ -82,5 +82,5 @@ def why(told: str) -> str:
         return f"the board does not answer: {SWITCH}"
     if "verification error" in low or "mismatch" in low:
         return "the program does not read back as it was written: is the cable good? Try again"
-    lines = [line for line in told.splitlines() if line.strip()]
+    lines = [line for line in printed.splitlines() if line.strip()]
     return f"the upload failed: {lines[-1].strip() if lines else 'PlatformIO gave no reason'}"

@@ -31,7 +31,7 @@ MAGIC = b"\x89MCAP0\r\n"
 
 
 def is_recording(path: Path | str) -> bool:
-    """Tell whether a file is a recording, by its name or its first bytes."""
+    """Return whether a file is a recording, by its name or its first bytes."""
     path = Path(path)
     if not path.is_file():
         return False
@@ -75,7 +75,7 @@ def save_recording(
     started_unix_ns: int = 0,
     source: Recording | None = None,
 ) -> list[str]:
-    """Write a run and its estimates to a new recording; returns what there is to tell.
+    """Write a run and its estimates to a new recording; return remarks about it.
 
     ``source`` is the recording that the run was read from: what was received is taken over as it
     is, and so is everything else but truth and landmarks; of one that was not closed, whatever can

@@ -96,19 +96,19 @@ class Recording:
     @cached_property
     def remarks(self) -> tuple[str, ...]:
         """Remarks about the recording, a line each."""
-        said: list[str] = []
+        remarks: list[str] = []
         for file in self.files:
             if file.damaged:
-                said.append(f"{file.path}: {file.damaged} damaged blocks are left out")
+                remarks.append(f"{file.path}: {file.damaged} damaged blocks are left out")
             if file in self._cut_off:
                 cut = f", {file.unread} bytes of a last block are cut off" if file.unread else ""
-                said.append(f"{file.path}: was not closed{cut}; read up to {self._end(file)}")
-        said.extend(
+                remarks.append(f"{file.path}: was not closed{cut}; read up to {self._end(file)}")
+        remarks.extend(
             f"{self.path}: not recorded between {gap.from_s:.1f} and {gap.to_s:.1f} s: "
             f"{gap.inputs} reads of the port, {gap.others} estimates"
             for gap in self._rows({topics.GAP})
         )
-        return tuple(said)
+        return tuple(remarks)
 
     @property
     def _cut_off(self) -> list[_File]:

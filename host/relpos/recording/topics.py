@@ -124,7 +124,7 @@ PHONE_KINDS = (Event, Heading)
 
 
 def is_input(observation: Observation) -> bool:
-    """Tell whether an observation came from a phone, and not from the serial port."""
+    """Return whether an observation came from a phone, and not from the serial port."""
     return isinstance(observation, Event) or (
         isinstance(observation, Heading) and observation.source == "phone"
     )
@@ -229,7 +229,7 @@ def decode_list(topic: str, data: bytes) -> tuple[float, type, tuple[Any, ...]] 
     for entry in entries:
         if "time_s" in names_of(kind):
             entry["time_s"] = time_s
-        # Of whom nothing is known the variance is infinite, which JSON cannot say.
+        # The variance of an unlocated node is infinite, which JSON cannot express.
         if entry.get("status") == NodeStatus.UNLOCATED:
             entry.setdefault("variance_x_m2", math.inf)
             entry.setdefault("variance_y_m2", math.inf)

@@ -61,13 +61,13 @@ class PaperSettings:
     Users repeat the six noise levels when there are more of them. ``turn_noise`` is the mean
     over the six users of the relative error of a turn; ``heading_noise_deg`` the white error a
     step of user 1 (the others by ``HEADING_PATTERN``). ``start`` is what is known of the starts
-    (:class:`Start`); ``start_shift_m`` moves every user's prior, untold, by this distance into a
-    random direction. ``nlos_probability`` of the ranges are too long by ``nlos_min_m`` to
-    ``nlos_max_m``. ``max_range_m`` 0 means unlimited.
+    (:class:`Start`); ``start_shift_m`` moves every user's prior (which does not say so)
+    by this distance into a random direction. ``nlos_probability`` of the ranges are too long by
+    ``nlos_min_m`` to ``nlos_max_m``. ``max_range_m`` 0 means unlimited.
 
     At ``kidnap_s`` one user (drawn) is carried ``kidnap_m`` into a random direction without any
     odometry of it, and walks on from there on a rectangle that is shifted by as much. The motion
-    noise of ``noisy_user`` (0: one is drawn) is multiplied by ``noisy_factor``, untold.
+    noise of ``noisy_user`` (0: one is drawn) is multiplied by ``noisy_factor``, without stating it.
 
     Hidden constants, one draw a user: the true length of every step is exp(N(0, scale_error))
     times the reported one, and headings drift by N(0, heading_drift_deg_s) while the user walks

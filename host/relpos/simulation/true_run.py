@@ -45,7 +45,7 @@ class TrueRun:
     turn_rad: Floats
     """(N, K) error of a chord's reported turn, which turns the chord too."""
     sigma_m: Floats
-    """(N, K) error of a chord in x and in y that no report tells, as of a carried node."""
+    """(N, K) error of a chord in x and in y that no report contains, as of a carried node."""
     range_time_s: Floats
     """(M,) times of the measured ranges."""
     range_nodes: Integers
@@ -108,9 +108,9 @@ def simulate_true_run(
 def of_paper(settings: PaperSettings, run: SimulatedRun) -> TrueRun:
     """Describe a run of the paper's simulation as its bound sees it: nodes are numbered from 1.
 
-    What only some runs have is taken at its true spread, as if it had been told: a shifted start
-    is known to ``start_shift_m / sqrt(2)`` in x and y, a kidnapped user to as much of the way
-    carried, the noisy user is known as such, and a range of which a share is too long has the
+    What only some runs have is taken at its true spread, as if it were known: a shifted start
+    is known to ``start_shift_m / sqrt(2)`` in x and y, a kidnapped user to as much of the path
+    carried, the noisy user is known as such, and a range of which a fraction is too long has the
     information of that mixture.
     """
     times, walked, heading = true_poses(settings)
@@ -158,8 +158,8 @@ def of_paper(settings: PaperSettings, run: SimulatedRun) -> TrueRun:
 def of_lab(seed: int, overrides: Mapping[str, str | float] | None = None) -> TrueRun:
     """Describe a run of the laboratory as its bound sees it.
 
-    What is in the way of each range is told; how long the delays and which ranges are
-    reflections, not: those have the information of that mixture, the delays' spread counted as
+    Obstructions of each range are known; the delays and which ranges are
+    reflections are not: those have the information of that mixture, the delays' spread counted as
     noise. Steps' scale and headings' drift are known to their spread.
     """
     run = simulate_lab(seed, overrides)

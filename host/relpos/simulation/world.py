@@ -46,19 +46,19 @@ class UwbChannel:
         return self.detection_near - fall * distance_m / self.max_range_m
 
     def measure_range(self, rng: np.random.Generator, distance_m: float) -> float | None:
-        """One attempt over the true ``distance_m``: the range in metres, or None if unheard.
+        """One attempt over the true ``distance_m``: the range in metres, or None if not received.
 
         A range is never negative: what noise pushes below zero a tag reports as zero distance.
-        Every attempt draws the same count of numbers from ``rng``, heard or not, so that one
+        Every attempt draws the same count of numbers from ``rng``, received or not, so that one
         pair's fate does not change the noise of the next.
         """
-        heard, normal, blocked, excess = (
+        detected, normal, blocked, excess = (
             rng.random(),
             rng.standard_normal(),
             rng.random(),
             rng.random(),
         )
-        if heard >= self.detection_probability(distance_m):
+        if detected >= self.detection_probability(distance_m):
             return None
         measured = distance_m + self.bias_m + self.noise_sigma_m * normal
         if blocked < self.nlos_probability:

@@ -15,7 +15,7 @@ from relpos.extras import missing_extra
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8460
 TOKEN_BYTES = 16
-"""128 bits: nobody guesses them, and the QR code stays coarse enough for a wet screen."""
+"""128 bits: they cannot be guessed, and the QR code stays coarse enough for a wet screen."""
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ from relpos.view.access import Access, qr_svg
 STATIC = Path(__file__).parent / "static"
 PING_S = 2.0
 ANSWER_S = 5.0
-"""A session that does not answer a request for so long is told to the phone, which asks again."""
+"""Timeout of the session's answer to a request; then the phone gets an error and asks again."""
 MAX_LINE_BYTES = 1 << 26
 MAX_BODY_BYTES = 1 << 20
 MAX_ITEMS = 2000
@@ -68,7 +68,7 @@ CONTENT_POLICY = (
 
 
 class SessionProxy:
-    """The session as this process sees it: what it said last, and what it is asked."""
+    """The session as seen by this process: its last messages, and pending requests."""
 
     def __init__(self, lines: asyncio.StreamReader, out: asyncio.StreamWriter) -> None:
         self._lines = lines
@@ -76,30 +76,30 @@ class SessionProxy:
         self._asked = 0
         self._answers: dict[int, asyncio.Future[dict[str, Any]]] = {}
         self.hello: str | None = None
-        self.picture: str | None = None
+        self.view: str | None = None
         self.tracks = Tracks()
         self.names: dict[str, str] = {}
         self._news = asyncio.Event()
         self.over = False
 
     async def listen(self) -> None:
-        """Take what the session says until it ends."""
+        """Read messages of the session until it ends."""
         with contextlib.suppress(ConnectionError):
             while line := await self._lines.readline():
-                self._take(line.decode())
+                self._handle(line.decode())
         self.over = True
-        self._tell()
+        self._notify()
 
-    def _take(self, line: str) -> None:
+    def _handle(self, line: str) -> None:
         if line.startswith('{"type":"picture"'):
-            self.picture = line.rstrip("\n")
-            self._tell()
+            self.view = line.rstrip("\n")
+            self._notify()
             return
         message = json.loads(line)
         match message["type"]:
             case "hello":
                 self.hello = line.rstrip("\n")
-                self._tell()
+                self._notify()
             case "tracks":
                 self.tracks = Tracks.from_message(message)
             case "points":
@@ -112,20 +112,20 @@ class SessionProxy:
                 if waiting is not None and not waiting.done():
                     waiting.set_result(message)
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         self._news.set()
         self._news = asyncio.Event()
 
     async def news(self, seen: str | None, within_s: float) -> str | None:
-        """The newest picture, once it is another than ``seen``; None where none comes in time."""
-        if self.picture is not None and self.picture is not seen:
-            return self.picture
+        """Return the newest view once it differs from ``seen``; None where none comes in time."""
+        if self.view is not None and self.view is not seen:
+            return self.view
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(within_s):
                 while not self.over:
                     await self._news.wait()
-                    if self.picture is not None and self.picture is not seen:
-                        return self.picture
+                    if self.view is not None and self.view is not seen:
+                        return self.view
         return None
 
     async def until_hello(self) -> str | None:
@@ -153,14 +153,14 @@ class SessionProxy:
 
 
 class TokenMiddleware:
-    """Lets nobody in without the token: in the address once, in a cookie from then on."""
+    """Requires the token: in the address once, in a cookie from then on."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app = app
         self._access = access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let it in, refuse it, or give it the cookie and send it on."""
+        """Pass the request on, refuse it, or set the cookie and redirect."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
@@ -179,7 +179,7 @@ class TokenMiddleware:
         if not allowed:
             response: Response = HTMLResponse(REFUSED, 401)
         elif by_address and scope["path"] in ("/", "/phone"):
-            # What stays in the address bar, in histories and in screenshots is without the token.
+            # The address bar, histories and screenshots then show no token.
             rest = [(k, v) for k, v in parse_qsl(asking.url.query) if k != "token"]
             response = RedirectResponse(scope["path"] + ("?" + urlencode(rest)) * bool(rest), 303)
         else:
@@ -198,7 +198,7 @@ class TokenMiddleware:
 
 
 def _own_page(asking: HTTPConnection) -> bool:
-    """Whether no other site's page asks: a browser tells whose page it is."""
+    """Return whether the request is from our own page, by its Origin header."""
     origin = asking.headers.get("origin")
     return origin is None or urlsplit(origin).netloc == asking.headers.get("host")
 
@@ -231,7 +231,7 @@ class Pages:
     def app(self) -> ASGIApp:
         """The whole application behind its guard."""
         api = [
-            Route("/api/picture", self.picture),
+            Route("/api/picture", self.view),
             Route("/api/time", self.time),
             Route("/api/wearers", self.wearers),
             Route("/api/name", self.name, methods=["POST"]),
@@ -274,7 +274,7 @@ class Pages:
         return Response(self._code, media_type="image/svg+xml")
 
     async def follow(self, socket: WebSocket) -> None:
-        """Hello, the tracks, then every picture, or as many as the browser takes."""
+        """Send hello, the tracks, then every view, or as many as the browser takes."""
         await socket.accept()
         gone = asyncio.create_task(_until_gone(socket))
         try:
@@ -295,24 +295,24 @@ class Pages:
             with contextlib.suppress(RuntimeError, WebSocketDisconnect):
                 await socket.close(1001)
 
-    async def picture(self, _: Request) -> Response:
-        """The newest picture."""
-        if self.session.picture is None:
-            return JSONResponse({"error": "no picture yet"}, 503)
-        return Response(self.session.picture, media_type="application/json")
+    async def view(self, _: Request) -> Response:
+        """Return the newest view."""
+        if self.session.view is None:
+            return JSONResponse({"error": "no view yet"}, 503)
+        return Response(self.session.view, media_type="application/json")
 
     async def time(self, _: Request) -> Response:
         """The server's clock, to which a phone refers its own."""
         now_s = time.time()
         session_s = None
-        if self.session.picture is not None:
-            newest = json.loads(self.session.picture)
+        if self.session.view is not None:
+            newest = json.loads(self.session.view)
             session_s = newest["time_s"] + now_s - newest["unix_s"]
         return JSONResponse({"unix_ms": now_s * 1000.0, "session_s": session_s})
 
     async def wearers(self, _: Request) -> Response:
         """Who is there, and who has a phone already."""
-        people = [] if self.session.picture is None else json.loads(self.session.picture)["people"]
+        people = [] if self.session.view is None else json.loads(self.session.view)["people"]
         return JSONResponse(
             [
                 {
@@ -469,7 +469,7 @@ async def _serve(config: ServerConfig) -> None:
             access_log=False,
             lifespan="off",
             ws="auto",
-            # A picture a twentieth of a second: compressing it would cost more than sending it.
+            # Twenty views a second: compressing one would cost more than sending it.
             ws_per_message_deflate=False,
             ws_ping_interval=20.0,
             timeout_graceful_shutdown=1,

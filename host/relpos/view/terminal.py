@@ -36,7 +36,7 @@ KEY_WAIT_S = 0.1
 
 
 class TerminalView(Sink):
-    """Draws pictures on a terminal, reads keys, rings the bell when an alarm begins."""
+    """Draws views on a terminal, reads keys, rings the bell when an alarm begins."""
 
     def __init__(
         self,

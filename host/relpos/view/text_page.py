@@ -1,6 +1,6 @@
 """The view of the team as lines of characters: alarms, a table, a small map. Pure.
 
-Everything is said in words and shapes, colour only repeats it. Distances and directions are those
+Words and shapes carry everything; colour only repeats it. Distances and directions are those
 from *me*, one of the team; the map has me in its middle. Two character sets: braille and arrows
 where the terminal takes UTF-8, plain ASCII where not.
 """
@@ -135,7 +135,7 @@ def _title(view: TeamView, options: RenderOptions) -> Text:
 
 def _alarms(view: TeamView, options: RenderOptions, most: int) -> list[Text]:
     """Return at most ``most`` lines of alarms and notices, the worst on top."""
-    said: list[tuple[int, str, str]] = []
+    alarms: list[tuple[int, str, str]] = []
     me = find_me(view, options.me)
     for person in view.people:
         where = _where(person, me, view, options)
@@ -144,29 +144,29 @@ def _alarms(view: TeamView, options: RenderOptions, most: int) -> list[Text]:
             case Alert.STILL_ALARM:
                 lies = "lay still, moves again" if person.moving else _still(person)
                 words = f"!! {person.name} {lies}{where}{seen}"
-                said.append((0 if not seen else 2, words, _STYLES[Level.ALARM]))
+                alarms.append((0 if not seen else 2, words, _STYLES[Level.ALARM]))
             case Alert.LOST:
                 words = f"!! {person.name} is LOST: silent for {_ago(person.seen_s)}{where}{seen}"
-                said.append((1 if not seen else 2, words, _STYLES[Level.ALARM]))
+                alarms.append((1 if not seen else 2, words, _STYLES[Level.ALARM]))
             case Alert.STILL_WARNING:
                 words = f"! {person.name} has not moved for {person.still_s:.0f} s{where}"
-                said.append((3, words, _STYLES[Level.WARNING]))
+                alarms.append((3, words, _STYLES[Level.WARNING]))
             case None:
                 pass
     for notice in view.notices:
         mark, rank = {Level.ALARM: ("!!", 1), Level.WARNING: ("!", 4)}.get(notice.level, ("-", 6))
-        said.append((rank, f"{mark} {notice.text}", _STYLES[notice.level]))
+        alarms.append((rank, f"{mark} {notice.text}", _STYLES[notice.level]))
     if view.ambiguous and view.alternatives:
         percentages = ", ".join(f"{100.0 * g.probability:.0f} %" for g in view.alternatives[:4])
         more = len(view.alternatives) - 4
         percentages += f" and {more} more" * (more > 0)
         words = f"? ambiguous: {len(view.alternatives)} alternatives ({percentages})"
-        said.append((5, words, _STYLES[Level.WARNING]))
-    said.sort(key=lambda row: row[0])
-    if len(said) > most:
-        left_out = len(said) - most + 1
-        said[most - 1 :] = [(9, f"... and {left_out} more", "bold")]
-    return [_line(words, options, style) for _, words, style in said]
+        alarms.append((5, words, _STYLES[Level.WARNING]))
+    alarms.sort(key=lambda row: row[0])
+    if len(alarms) > most:
+        left_out = len(alarms) - most + 1
+        alarms[most - 1 :] = [(9, f"... and {left_out} more", "bold")]
+    return [_line(words, options, style) for _, words, style in alarms]
 
 
 def _still(person: Person) -> str:
@@ -276,7 +276,7 @@ def _ago(seen_s: float | None) -> str:
 
 
 def _seen(person: Person, me: Person, view: TeamView) -> _Seen:
-    """Return distance and direction from me; from the pair where it is told, with its sigma."""
+    """Return distance and direction from me; from the pair where there is one, with its sigma."""
     facing = me.heading_rad
     if me.sigma_heading_rad is None or me.sigma_heading_rad > HEADING_KNOWN_RAD:
         facing = None

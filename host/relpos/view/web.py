@@ -1,7 +1,7 @@
 """The live page, as the session sees it: a sink that feeds a serving process, and its visitors.
 
 The serving process cannot hold up the session: what it does not take at once waits here, of the
-pictures the newest alone. Where it dies, it is started again behind the same listener.
+views the newest alone. Where it dies, it is started again behind the same listener.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class WebView(Sink):
         self._say(to_json({"type": "answer", "id": request.id, "reply": reply, "status": status}))
 
     def named(self, names: dict[int, str]) -> None:
-        """Tell which nodes have been named by a phone."""
+        """Send the names that phones have given to nodes."""
         self._names = dict(names)
         self._say(_names_message(self._names))
 

@@ -77,7 +77,7 @@ class AvrEngine:
     ``eeprom`` is loaded at power-on and kept up to date with what the firmware writes. The board is
     powered on at ``power_on_us`` of virtual time; its crystal is off by ``clock.drift_ppm``. An
     offset of ``clock`` is put into the firmware's counter (timer and turns, to 4 us) between its
-    making and the first look at it: as if the board had been on for so long.
+    making and the first poll: as if the board had been on for so long.
     """
 
     def __init__(

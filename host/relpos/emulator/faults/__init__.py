@@ -3,7 +3,7 @@
 ``table.py`` lists the faults and what node and host must do about each; ``spec.py`` parses one.
 ``injection.py`` installs them in a team: the effects are in ``chips.py``, ``radio.py`` (XBee, air,
 UWB, host port) and ``boards.py`` (clock, supply, EEPROM). Every fault acts through a hook of the
-emulated part, so the firmware cannot tell it from the real one. Begin with ``FAULTS``. Importing
+emulated part, so the firmware sees no difference to the real one. Begin with ``FAULTS``. Importing
 this package does not import the emulator: the command line's help needs only the table.
 """
 

@@ -87,7 +87,7 @@ def range_noise(work: Work) -> Sheet:
         "range-noise",
         "Error against the range noise that is assumed, for five scales of IMU noise",
         "Simulation, M 500, alpha .01 (paper, fig. 5a). Too small a sigma_r loses the truth, too "
-        "large a one wastes the ranges. The bank is told no noise level and depends on no sigma_r.",
+        "large a one wastes the ranges. The bank knows no noise level and depends on no sigma_r.",
         ("estimator", "sigma_d", "sigma_theta", "sigma_r_m", *_COLUMNS),
         rows,
         draw,
@@ -186,11 +186,11 @@ def wrong_start(work: Work) -> Sheet:
             curve(axes, k, SHIFTS_M, [o.distance_m for o in outcomes], label)
         axes.plot(
             SHIFTS_M, [b.filtering_distance_m for b in bounds], color="#222222",
-            linestyle=(0, (2, 2)), linewidth=1.2, label="bound, told the shift's size",
+            linestyle=(0, (2, 2)), linewidth=1.2, label="bound, shift's size known",
         )  # fmt: skip
         printed(axes, [4.0, 4.0], [2.6, 4.5])
         axes.set(
-            xlabel="distance of the believed start from the true one (m)",
+            xlabel="distance of the assumed start from the true one (m)",
             ylabel="relative distance RMSE (m)",
         )
         axes.set_ylim(bottom=0.0)
@@ -201,7 +201,7 @@ def wrong_start(work: Work) -> Sheet:
     return Sheet(
         "wrong-start",
         "Error against a wrong start, with and without dual particles",
-        "Simulation, every user's start shifted into a random direction, untold (paper, fig. 5c).",
+        "Simulation, every user's start shifted into a random direction, unknown (paper, fig. 5c).",
         ("estimator", "shift_m", *_COLUMNS),
         rows,
         draw,

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 STEP_M = 2.0
 KINDS = ("all", "nothing in the way", "a body", "walls")
 LEAST = 30
-"""A share of fewer attempts than this is not shown."""
+"""A fraction of fewer attempts than this is not shown."""
 
 
-def heard(seed: int) -> Floats:
+def count_attempts(seed: int) -> Floats:
     """Attempts and successes by kind and distance of one run, (2, kinds, bins)."""
     made = attempts_of(LabSettings(), seed)
     places = (made.distance_m // STEP_M).astype(np.int64)
@@ -42,7 +42,7 @@ def heard(seed: int) -> Floats:
 
 def laboratory(work: Work) -> Sheet:
     """Detection probability over distance."""
-    tried, found = np.sum(work.each(heard, [(seed,) for seed in work.seeds]), axis=0)
+    tried, found = np.sum(work.each(count_attempts, [(seed,) for seed in work.seeds]), axis=0)
     middle = (np.arange(tried.shape[1]) + 0.5) * STEP_M
     with np.errstate(invalid="ignore", divide="ignore"):
         share = np.where(tried >= LEAST, found / tried, np.nan)
@@ -69,9 +69,9 @@ def laboratory(work: Work) -> Sheet:
     return Sheet(
         "detection",
         "Detection probability over distance in the laboratory",
-        f"Share of attempts heard, 95 % intervals; {100 * total:.0f} % of all. The paper's figure "
-        "is not printed as numbers; its text says that even close users may not hear each other. "
-        "Here that is so because a wearer who walks ahead is in the way of his own tag.",
+        f"Fraction of attempts received, 95 % intervals; {100 * total:.0f} % of all. The paper's "
+        "figure is not printed as numbers; its text says that even close users may not receive "
+        "each other. Here the reason is that the person ahead obstructs the link to their own tag.",
         ("between", "from_m", "to_m", "attempts", "heard", "share", "half_width_95"),
         rows,
         draw,

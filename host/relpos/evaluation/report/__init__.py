@@ -1,6 +1,6 @@
 """One page of a run and its estimate: tracks, errors, consistency, ranging, health, numbers.
 
-``gather`` collects what there is to tell, ``write`` draws and writes it. The page is one HTML file
+``gather`` collects the content, ``write`` draws and writes it. The page is one HTML file
 that needs nothing else; the figures go beside it as SVG and PNG where that is wanted.
 """
 

@@ -169,18 +169,18 @@ def _in_short(content: Content) -> list[str]:
         return ["Nothing could be estimated."]
     if scored is not None and scored.metrics.epochs:
         m = scored.metrics
-        said = (
+        sentence = (
             f"Distances between people are off by {m.relative_distance_rmse_m:.2f} m (RMS over all "
             "pairs and seconds)"
         )
         if content.baseline is not None and content.baseline.metrics is not None:
             other = content.baseline.metrics.relative_distance_rmse_m
-            said += f"; {content.baseline.words} is off by {other:.2f} m"
+            sentence += f"; {content.baseline.words} is off by {other:.2f} m"
         if content.bound is not None:
             totals = content.bound.totals()
             least, _ = totals.of(smoothed=result.smoothed)
-            said += f", and no estimator can be expected below {least:.2f} m"
-        words.append(said + ".")
+            sentence += f", and no estimator can be expected below {least:.2f} m"
+        words.append(sentence + ".")
         nees = scored.nees_distance
         if nees.values:
             verdict = (
@@ -198,7 +198,7 @@ def _in_short(content: Content) -> list[str]:
         words.append(
             "The run has no truth"
             + (" at a time of which there is an estimate" if content.truth else "")
-            + ": what is told here is what the estimate and the measurements say of themselves."
+            + ": the page shows what follows from the estimate and the measurements alone."
         )
     return words
 

@@ -358,11 +358,11 @@ _UNITS: Mapping[str, tuple[str, str, float, int]] = {
 
 def learned(content: Content) -> Table | None:
     """Return the table of the last learned parameters, range biases apart."""
-    rows, told = [], set[str]()
+    rows, listed = [], set[str]()
     for (name, node, peer), p in content.learned().items():
-        if peer is not None or (name in TEAM_WIDE and name in told):
+        if peer is not None or (name in TEAM_WIDE and name in listed):
             continue
-        told.add(name)
+        listed.add(name)
         words, unit, factor, digits = _UNITS.get(name, (name, "", 1.0, 4))
         rows.append(
             [
@@ -378,7 +378,7 @@ def health(content: Content) -> Table | None:
     """Return the table of the health of each node and its link."""
     if not any(one.time_s.size or one.motions for one in content.health.values()):
         return None
-    told = any(one.time_s.size for one in content.health.values())
+    has_status = any(one.time_s.size for one in content.health.values())
     rows = []
     for node, one in content.health.items():
         row = [
@@ -386,7 +386,7 @@ def health(content: Content) -> Table | None:
             value(one.motions, "", 0),
             value(len(one.silences), "", 0),
         ]
-        if told:
+        if has_status:
             total = one.colour.size
             row += [
                 value(_least(one.series["battery_v"]), "V"),
@@ -401,7 +401,7 @@ def health(content: Content) -> Table | None:
             ]
         rows.append(row)
     heads = ["node", "motions", "silences"]
-    if told:
+    if has_status:
         heads += ["lowest supply", "radio", "frames lost", "ranging", "restarts"]
         heads += ["green", "yellow", "red"]
     return Table(
@@ -411,7 +411,7 @@ def health(content: Content) -> Table | None:
         "Silences: longer than 5 s without a motion heard. Radio and ranging: medians over the "
         "node's reports, of the signal and of the share of its exchanges that succeed. Colours: "
         "share of its reports, by the rules of the live table."
-        if told
+        if has_status
         else "Silences: longer than 5 s without a motion heard. This run carries no status reports "
         "(status.csv).",
     )
