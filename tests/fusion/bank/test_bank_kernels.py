@@ -97,7 +97,7 @@ def updated(x: Floats, p: Floats, measured: float, dz: float, outlier: tuple[flo
 def moments_of(x: Floats, p: Floats, weight: Floats) -> tuple[Floats, Floats]:
     px, pp = storage.pack(x, p, NODES)
     order = storage.order(NODES, SIZE)
-    return mixture.moments(px, pp, in_lanes(weight), NODES, order, SIZE, SIZE)
+    return mixture.moments(px, pp, in_lanes(weight), NODES, order, SIZE)
 
 
 def predicted(x: Floats, p: Floats) -> tuple[float, float]:

@@ -50,11 +50,7 @@ class AdaptiveCount:
         if most and step_index > hypothesis_count.LINEAR:
             self.unambiguous = 0
             return
-        x, p = these.arrays.x, these.arrays.p
-        poses = storage.order(these.nodes, x.shape[1])[: POSE * these.nodes]
-        mean, covariance = mixture.moments(
-            x, p, self._unperturbed, these.nodes, poses, len(poses), len(poses)
-        )
+        mean, covariance = these.moments(self._unperturbed, poses_alone=True)
         sigma_range_m = math.exp(0.5 * these.components.mean[-1])
         index = hypothesis_count.nonlinearity_index(
             mean, covariance, sigma_range_m, self._sigma_metre_m()
@@ -62,7 +58,7 @@ class AdaptiveCount:
         if ambiguous or index > hypothesis_count.NONLINEAR:
             self.unambiguous = 0
             self.grow()
-        elif index > hypothesis_count.LINEAR or not self._is_even(covariance, poses, step_index):
+        elif index > hypothesis_count.LINEAR or not self._is_even(covariance, step_index):
             self.unambiguous = 0
         else:
             self.unambiguous += 1
@@ -75,7 +71,7 @@ class AdaptiveCount:
         """Have more than the usual number of hypotheses while strongly nonlinear."""
         these = self._hypotheses
         usual = these.settings.hypotheses
-        mean, covariance = these.moments_by(these.unperturbed_weights(), poses_alone=True)
+        mean, covariance = these.moments(these.unperturbed_weights(), poses_alone=True)
         # How short the next metre is, is in the motion's moments: arcs alone count here.
         straight = np.full(these.nodes, np.inf)
         sigma_range_m = math.exp(0.5 * these.components.mean[-1])
@@ -116,7 +112,7 @@ class AdaptiveCount:
         )
         return float((0.5 * heading / self._sigma_metre_m()).max())
 
-    def _is_even(self, covariance: Floats, poses: Indices, step_index: float) -> bool:
+    def _is_even(self, covariance: Floats, step_index: float) -> bool:
         """Whether not few hypotheses count and they lie together.
 
         That is where the variances between them, the rest of the mixture's ``covariance`` (D, D),
@@ -126,7 +122,8 @@ class AdaptiveCount:
         if these.count == 1:
             return True
         drawn = these.sampled_share / (1.0 - these.sampled_share)
-        places = np.arange(len(poses))
+        places = np.arange(POSE * these.nodes)
+        poses = storage.order(these.nodes, these.arrays.x.shape[1])[: len(places)]
         own = these.arrays.p[:, storage.triangle_place(places, places)]
         inside = np.einsum("bl,bil->i", self._unperturbed, own)
         between = covariance[poses, poses] - inside
@@ -156,7 +153,7 @@ class AdaptiveCount:
         these = self._hypotheses
         s = these.settings
         self._step_index()
-        mean, covariance = these.moments_by(self._unperturbed, poses_alone=False)
+        mean, covariance = these.moments(self._unperturbed)
         these.log_weight[:] -= np.where(these.perturbed > 0.0, PERTURBED_LOSS, 0.0)
         before, weight = these.sampled_share, these.weights()
         chosen = systematic(weight, count, these.rng)

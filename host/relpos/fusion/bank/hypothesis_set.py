@@ -113,24 +113,24 @@ class HypothesisSet:
         weight = np.empty_like(self.arrays.log_weight)
         return weight, float(mixture.normalise(self.arrays.log_weight, self.count, weight))
 
-    def moments(self, *, poses_alone: bool = False) -> tuple[Floats, Floats]:
+    def moments(
+        self, weight: Floats | None = None, *, poses_alone: bool = False
+    ) -> tuple[Floats, Floats]:
         """Return the mixture's mean (D,) and full covariance (D, D).
 
-        With ``poses_alone`` constants and biases have variances, and covariances of 0. Raises
-        RelposError where a mean is not finite.
+        ``weight`` (B, LANES) takes the place of the hypotheses' own. With ``poses_alone``
+        constants and biases have variances, and covariances of 0. Raises RelposError where a mean
+        is not finite.
         """
-        mean, covariance = self.moments_by(self.normalise()[0], poses_alone=poses_alone)
+        x, p = self.arrays.x, self.arrays.p
+        size = x.shape[1]
+        weight = self.normalise()[0] if weight is None else weight
+        places = storage.POSE * self.nodes if poses_alone else size
+        order = storage.order(self.nodes, size)
+        mean, covariance = mixture.moments(x, p, weight, self.nodes, order, places)
         if not np.isfinite(mean).all():
             raise RelposError("the estimate is no longer finite: this is an error of the program")
         return mean, covariance
-
-    def moments_by(self, weight: Floats, *, poses_alone: bool) -> tuple[Floats, Floats]:
-        """As :meth:`moments`, by ``weight`` (B, LANES)."""
-        x, p = self.arrays.x, self.arrays.p
-        size = x.shape[1]
-        places = storage.POSE * self.nodes if poses_alone else size
-        order = storage.order(self.nodes, size)
-        return mixture.moments(x, p, weight, self.nodes, order, places, size)
 
     def unperturbed_weights(self) -> Floats:
         """Return weights (B, LANES), those of perturbed hypotheses next to nothing."""

@@ -102,23 +102,22 @@ def predicted_ranges(
 
 @compiled
 def moments(
-    x: Floats, p: Floats, weight: Floats, nodes: int, of: Indices, places: int, size: int
+    x: Floats, p: Floats, weight: Floats, nodes: int, of: Indices, places: int
 ) -> tuple[Floats, Floats]:
     """Give the mixture's mean (D,) and full covariance (D, D), in the state's order.
 
     ``weight`` (B, LANES) as for ``predicted_ranges``, ``of`` (D,) is ``order``. Of the storage
-    beyond the first ``places`` only means and variances are given, its covariances as 0, and
-    nothing beyond ``size``. Headings are averaged round the circle, about the heaviest
-    hypothesis' value.
+    beyond the first ``places`` only means and variances are given, its covariances as 0. Headings
+    are averaged round the circle, about the heaviest hypothesis' value.
     """
-    blocks, whole, triangle = x.shape[0], x.shape[1], p.shape[1]
+    blocks, size, triangle = x.shape[0], x.shape[1], p.shape[1]
     best, best_lane = 0, 0
     for b in range(blocks):
         for lane in range(LANES):
             if weight[b, lane] > weight[best, best_lane]:
                 best, best_lane = b, lane
-    mean = np.zeros(whole)
-    cov = np.zeros((whole, whole))
+    mean = np.zeros(size)
+    cov = np.zeros((size, size))
     turn = 2.0 * math.pi
     off = lanes.working_lines(blocks * size)
     for i in range(size):
@@ -126,7 +125,7 @@ def moments(
         angle = i < POSE * nodes and i % POSE == 2
         middle = fill(0.0)
         for b in range(blocks):
-            away = load(x, b * whole + i) - about
+            away = load(x, b * size + i) - about
             if angle:
                 away = away - turn * lanes.floor(away * (1.0 / turn) + 0.5)
             store(off, b * size + i, away)
