@@ -69,7 +69,7 @@ def test_frames_are_tables_of_pandas(result: relpos.Result) -> None:
     assert (pairs["node"] < pairs["peer"]).all()
 
 
-def test_without_pandas_a_frame_is_a_record_array(
+def test_a_frame_is_a_record_array_without_pandas(
     result: relpos.Result, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)

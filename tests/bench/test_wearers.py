@@ -288,7 +288,7 @@ def test_every_script_is_made_and_repeats_with_its_seed(name: str) -> None:
     assert world.magnetic.seed == 21
 
 
-def test_what_cannot_be_is_refused_by_name() -> None:
+def test_an_unknown_script_or_activity_is_refused_by_name() -> None:
     with pytest.raises(DataError, match="unknown script 'swim'"):
         make_walker("swim", 1)
     with pytest.raises(DataError, match="unknown activity 'swim'"):

@@ -113,7 +113,7 @@ def test_the_order_of_a_calibration_does_not_matter(order):
     assert 0.0 < np.degrees(result.calibration.gyro_bias_sigma_rad_s) < 0.2
 
 
-def test_without_rest_there_is_no_calibration_and_without_sides_no_accelerometer():
+def test_calibration_needs_rest_and_the_accelerometer_needs_sides():
     with pytest.raises(DataError, match="never lay still"):
         guide.solve(samples_of(("turn",))[0])
     result = guide.solve(samples_of(("still", "turn"))[0])
@@ -135,7 +135,7 @@ def test_the_picture_shows_before_and_after(tmp_path):
     assert (tmp_path / "deep" / "one.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_calibration_survives_its_way_to_the_node():
+def test_a_calibration_survives_the_transfer_to_the_node():
     samples, _, _ = samples_of(("still", "sides", "turn"))
     calibration = guide.solve(samples).calibration
     words = calibration.to_words()
@@ -154,7 +154,7 @@ def test_a_calibration_that_no_node_can_hold_is_refused():
 # --- steps ---------------------------------------------------------------------------------------
 
 
-def test_one_walk_is_believed_less_the_more_it_asks_for():
+def test_the_weight_of_one_walk_falls_with_its_deviation():
     asked = np.array([1.02, 1.05, 1.10, 1.20, 1.40])
     shares = [np.log(steps.posterior_scale([a])) / np.log(a) for a in asked]
     assert all(a > b for a, b in itertools.pairwise(shares))
@@ -163,7 +163,7 @@ def test_one_walk_is_believed_less_the_more_it_asks_for():
     assert steps.posterior_scale([1.0]) == 1.0
 
 
-def test_walks_that_agree_are_believed():
+def test_walks_that_agree_have_a_large_weight():
     one, three = steps.posterior_scale([1.15]), steps.posterior_scale([1.15, 1.14, 1.16])
     assert 1.0 < one < 1.06
     assert three > 1.09

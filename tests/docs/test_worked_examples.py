@@ -31,7 +31,7 @@ def test_comparing_estimators_ranks_them_above_the_bound_and_draws(
     assert written == {"particle.svg", "bank.html"}
 
 
-def test_an_estimator_of_ones_own_is_scored_beside_ours() -> None:
+def test_a_plugin_estimator_is_scored_beside_the_built_in_ones() -> None:
     scores = runpy.run_path(str(EXAMPLES / "own_estimator.py"))["main"]()
     errors = {name: score.metrics.relative_distance_rmse_m for name, score in scores.items()}
     assert errors["SmallEkf, turn_rad 0.01"] < 1.5

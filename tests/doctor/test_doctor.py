@@ -167,7 +167,7 @@ def test_the_key_has_to_be_one_and_to_be_the_owners_alone(tmp_path):
 @pytest.mark.parametrize(
     ("free", "state"), [(10_000_000, "wrong"), (1_000_000_000, "hint"), (5_000_000_000, "well")]
 )
-def test_room_for_recordings_is_judged(free, state, tmp_path):
+def test_free_space_for_recordings_is_checked(free, state, tmp_path):
     assert finding(installed(tmp_path, free=free), "room for recordings")[0] == state
 
 
@@ -175,7 +175,7 @@ def test_a_folder_that_cannot_be_written_is_wrong(tmp_path):
     assert finding(installed(tmp_path, writable=False), "room for recordings")[0] == "wrong"
 
 
-def test_without_a_browser_or_a_screen_other_ways_are_named(tmp_path):
+def test_a_missing_browser_or_screen_is_a_hint_that_names_alternatives(tmp_path):
     for differences in ({"commands": ()}, {"variables": {}}):
         state, words, _ = finding(installed(tmp_path, **differences), "browser")
         assert state == "hint"

@@ -630,7 +630,7 @@ def test_a_truncated_firmware_is_an_error_wherever_it_is_cut(
             read_firmware(path)
 
 
-def test_what_comes_before_power_on_is_lost_and_counted(build: Builder) -> None:
+def test_bytes_before_power_on_are_lost_and_counted(build: Builder) -> None:
     bus = I2cBus()
     board = AvrEngine(
         BOARDS["uno"], build(ECHO), bus, bytearray(1024), 1, power_on_us=50_000, line_baud=38400

@@ -112,7 +112,7 @@ def test_a_random_mounting_gives_nearly_the_same_walk(walker, reference, seed):
     assert len(other.steps) == pytest.approx(len(reference.steps), abs=1)
 
 
-def test_what_is_beyond_the_chips_range_is_clipped_and_counted(walker):
+def test_a_sample_beyond_the_chips_range_is_clipped_and_counted(walker):
     recording = recorded(walker, even(100.0, 40.0))
     assert play(1, recording, WearerSettings()).clipped == 0
     recording.acceleration_m_s2[2000:2030, 0] = 200.0  # no range of the chip reaches 20 g
@@ -151,7 +151,7 @@ def test_a_gap_is_silence_and_not_motion(walker):
     assert len(replay.steps) > 60
 
 
-def test_a_calibration_walk_sets_the_gain_as_far_as_one_walk_is_believed(walker):
+def test_a_calibration_walk_sets_the_gain_by_the_weight_of_one_walk(walker):
     recording = recorded(walker, even(100.0))
     before_m = play(1, recording, WearerSettings(0.9)).distance_m
     found = calibrate(1, [recording], [1.05 * before_m], 0.9)
@@ -212,7 +212,7 @@ def test_calibration_needs_a_true_distance_and_the_node(walker):
         reckon_run(run, calibration=[others])
 
 
-def test_what_cannot_be_played_is_refused(walker):
+def test_a_recording_that_cannot_be_played_is_refused(walker):
     with pytest.raises(DataError, match="fewer than two"):
         surroundings_of(recorded(walker, np.array([1.0])))
     with pytest.raises(DataError, match="that can be played"):

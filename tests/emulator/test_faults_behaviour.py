@@ -102,7 +102,7 @@ def assert_others_do_not_care(result):
 
 
 @of("imu:off", "imu:stuck", "imu:garbage", "bus:stuck", but="line=sda")
-def test_without_true_samples_nothing_is_integrated_and_the_gap_is_flagged(spec):
+def test_nothing_is_integrated_without_true_samples_and_the_gap_is_flagged(spec):
     result = outcome(spec)
     # The first sample after the last one used is late by more than half a second from then on.
     inside = motions_between(result.run, BEGIN_S + 2.0, END_S)

@@ -52,7 +52,7 @@ def test_a_restart_is_reported_with_its_cause_and_the_next_boot_count(spec, caus
 
 
 @pytest.mark.parametrize("spec", ["imu:stuck", "imu:garbage", "bus:stuck"])
-def test_without_true_samples_nothing_is_integrated_and_the_gap_is_flagged(spec):
+def test_nothing_is_integrated_without_true_samples_and_the_gap_is_flagged(spec):
     run = walk(f"{spec}:node=2,from=5,to=9")
     assert_sound(run)
     inside = [f.values for t, f in run.of(wire.MOTION, NODE) if 6.6 <= t < 9.0]

@@ -209,7 +209,7 @@ def test_a_bus_stuck_for_a_tenth_of_a_second_from_any_transaction_on_is_survived
 
 @pytest.mark.skipif(missing_parts() is not None, reason=str(missing_parts()))
 @pytest.mark.parametrize("part", [0, pytest.param(1, marks=SOAK)])
-def test_on_the_simulated_uno_no_sampled_transaction_does_either(part):
+def test_no_sampled_transaction_of_the_simulated_uno_does_either(part):
     """Some of each chip, in set-up and after; natively there are all of them."""
     if not (default_build_folder() / "uno" / "firmware.elf").exists():
         pytest.fail("no firmware for the uno: run `make firmware` first")

@@ -41,7 +41,7 @@ def test_a_combination_without_sense_is_refused_with_the_reason(target, behaviou
     assert words.endswith(f"{target} can be {', '.join(allowed)}")
 
 
-def test_what_is_refused_is_not_offered():
+def test_refused_faults_are_not_offered():
     assert not {(fault.target, fault.behaviour) for fault in FAULTS} & set(REFUSED)
     assert {target for target, _ in REFUSED} <= set(TARGETS)
 

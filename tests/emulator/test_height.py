@@ -88,7 +88,7 @@ def test_a_climb_is_reported_with_every_motion_once_the_start_is_known(climb):
     assert abs((height_m[still] - true_m[still]).mean()) < 0.25
 
 
-def test_who_stays_on_the_floor_has_no_height(climb):
+def test_a_node_that_stays_on_the_floor_has_no_height(climb):
     _, run, _ = climb
     _, height_m = of_node(run, 2)
     assert np.abs(height_m).max() < 0.4

@@ -290,7 +290,7 @@ def test_its_own_master_fetches_the_magnetometer(by_bytes):
     assert words(data[1:7], "little") == [-40, 100, -20]  # chip x is accelerometer y, z is down
 
 
-def test_what_is_read_only_cannot_be_written():
+def test_a_read_only_register_cannot_be_written():
     host = board()
     host.write(MPU, 0x75, 0x00)
     host.write(MPU, 0x3B, 0x12)

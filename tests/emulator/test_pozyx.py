@@ -106,7 +106,7 @@ def test_a_register_written_the_usual_way_is_an_error(by_bytes):
     assert field.error(0) == 0x01
 
 
-def test_what_is_read_only_is_not_written():
+def test_a_read_only_register_is_not_written():
     field = Field(0.0)
     field.hosts[0].transfer(TAG, b"\x00", b"\x99", 0)
     assert field.hosts[0].byte(TAG, 0x00) == 0x43
@@ -210,7 +210,7 @@ def test_a_second_call_while_ranging_is_refused_as_busy():
     assert field.error(0) == 0x15
 
 
-def test_a_tag_does_not_range_to_itself_or_to_everybody():
+def test_a_tag_does_not_range_to_itself_or_to_the_broadcast_id():
     field = Field(0.0, 5.0)
     assert field.range(0, 1) == 0
     assert field.range(0, 0) == 0

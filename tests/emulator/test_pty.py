@@ -119,7 +119,7 @@ def test_real_time_is_real_time():
     assert speed == pytest.approx(2.0, rel=0.2)
 
 
-def test_what_the_host_writes_reaches_the_coordinator_unspoilt():
+def test_bytes_of_the_host_reach_the_coordinator_unchanged():
     talker = Talker(seconds=1000.0)
     message = bytes(range(256)) * 4
     with PseudoTerminal(talker, speed=1.0) as terminal:

@@ -55,7 +55,7 @@ def test_the_longest_gap_of_a_pair_counts_both_directions_and_both_edges():
 # --- twenty -----------------------------------------------------------------------------------
 
 
-def test_of_twenty_in_slots_nine_exchanges_in_ten_succeed(twenty):
+def test_nine_exchanges_in_ten_of_twenty_slotted_nodes_succeed(twenty):
     assert twenty.absent == twenty.undetected == 0
     assert twenty.exchanges >= 20 * SECONDS / 2.0, "less than one a node and round"
     assert twenty.ranged >= 0.9 * twenty.exchanges

@@ -102,7 +102,7 @@ def test_dead_reckoning_goes_where_the_walker_goes(received):
     assert heading == pytest.approx(true_turn, abs=0.5)
 
 
-def test_what_the_radio_loses_is_what_the_link_misses(received):
+def test_the_link_misses_what_the_radio_loses(received):
     team, _, link, _ = received
     assert team.radio.counts["sent"] - team.radio.counts["lost"] == pytest.approx(
         link.summary()["received"], abs=3
@@ -168,7 +168,7 @@ def test_a_team_that_sends_beacons_itself_sends_its_virtual_time():
         assert 0.02 < time_s - beacon_s < 0.12
 
 
-def test_who_hears_a_beacon_hears_it_at_the_same_moment_as_the_others():
+def test_nodes_receive_a_beacon_at_the_same_moment():
     with EmulatedTeam(TeamConfig("paper", 2, 20.0, 3, beacons=True)) as team:
         one = beacons_of(team, 1, 20.0)
     with EmulatedTeam(TeamConfig("paper", 2, 20.0, 3, beacons=True)) as team:

@@ -94,7 +94,7 @@ def test_loss_has_the_worlds_rate():
     assert 0.25 < 1 - len(network.out[0]) / 1000 < 0.35
 
 
-def test_what_is_too_long_is_refused_with_status_0x74():
+def test_a_payload_that_is_too_long_is_refused_with_status_0x74():
     network = Network()
     network.feed(1, tx16(0, b"x" * 101))
     network.feed(1, tx16(0, b"x" * 100, frame_id=2))
@@ -103,7 +103,7 @@ def test_what_is_too_long_is_refused_with_status_0x74():
     assert len(network.out[0]) == 1
 
 
-def test_a_broadcast_reaches_everybody_else_and_is_marked():
+def test_a_broadcast_reaches_all_others_and_is_marked():
     network = Network(nodes=3)
     network.feed(0, tx16(0xFFFF, b"all"))
     network.run()

@@ -255,7 +255,7 @@ def test_the_bound_has_the_known_values(
         )
 
 
-def test_who_waits_at_a_known_place_is_known_there() -> None:
+def test_a_person_waiting_at_a_known_place_has_no_error() -> None:
     """Six people start at one corner; the last leaves it after 80 s."""
     bound = bounds.of_simulated("paper", 0, {"seconds": 100})
     last_two = list(zip(*np.triu_indices(6, 1), strict=True)).index((4, 5))
@@ -303,7 +303,7 @@ def test_ranges_that_are_sometimes_too_long_carry_less_information() -> None:
     assert late.filtering_distance_m > clean.filtering_distance_m
 
 
-def test_what_is_hidden_costs_what_it_has_to_be_learned_with() -> None:
+def test_hidden_parameters_raise_the_bound() -> None:
     """Scale and drift raise the bound, and are themselves known the better the later."""
     plain = bounds.of_simulated("paper-p1", 2, {"seconds": 200})
     hidden = {"seconds": 200, "scale_error": 0.1, "heading_drift_deg_s": 0.1}

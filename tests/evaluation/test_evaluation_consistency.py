@@ -60,7 +60,7 @@ def test_an_overconfident_estimate_is_caught() -> None:
     assert not result.honest
 
 
-def test_what_is_missing_is_left_out() -> None:
+def test_missing_values_are_left_out() -> None:
     assert math.isnan(consistency.nees([np.full(5, np.nan)]).mean)
     one = consistency.nees([np.array([[1.0, np.nan], [3.0, 5.0]] * 20)])
     assert one.mean == pytest.approx(2.5)

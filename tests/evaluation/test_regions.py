@@ -59,7 +59,7 @@ def test_a_region_of_drawn_places_holds_the_truth_in_nine_of_ten():
     assert summary.area_m2 < 2.0 * 2.0 * math.pi * math.log(10.0) * 1.05
 
 
-def test_without_priors_the_frame_is_the_first_located_nodes_pose():
+def test_the_frame_is_the_first_located_nodes_pose_without_priors():
     truth = {1: still(5.0, 5.0, math.pi / 2), 2: still(5.0, 8.0)}
     ahead = estimates(lambda t: [ellipse(t, 0, 1.0, 3.0, 0.0, 0.2)])
     behind = estimates(lambda t: [ellipse(t, 0, 1.0, -3.0, 0.0, 0.2)])

@@ -249,7 +249,7 @@ def test_a_run_comes_back_as_it_went(tmp_path: Path) -> None:
     assert repr(read_estimates(tmp_path / "again")) == repr(read_estimates(fused))
 
 
-def test_what_a_live_session_left_is_taken_with_its_recording(tmp_path: Path) -> None:
+def test_the_files_of_a_live_session_are_converted_with_its_recording(tmp_path: Path) -> None:
     write_estimates(tmp_path / "live", estimates())
     save_run(run(truth=False), tmp_path / "live" / "received")
     convert(tmp_path / "live", "--to", "csv", "--out", tmp_path / "tables")
@@ -455,7 +455,7 @@ def test_gpx_is_read_back_by_gpxpy(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["geojson", "gpx"])
-def test_a_track_has_a_hole_where_somebody_was_not_located(tmp_path: Path, form: str) -> None:
+def test_a_track_has_a_gap_where_a_node_was_not_located(tmp_path: Path, form: str) -> None:
     unsure = {(3, second): NodeStatus.AMBIGUOUS for second in (*range(1, 6), 20, 22)}
     write_estimates(tmp_path / "fused", estimates(statuses=unsure))
     path = tmp_path / f"map.{form}"
@@ -690,7 +690,7 @@ def test_wrong_requests_are_reported_in_one_line(tmp_path: Path) -> None:
     assert not out.exists()
 
 
-def test_what_is_there_is_not_written_over_unasked(tmp_path: Path) -> None:
+def test_existing_files_are_not_overwritten_unasked(tmp_path: Path) -> None:
     yard, fused = written(tmp_path)
     out = tmp_path / "t"
     convert(fused, "--run", yard, "--to", "tum", "--out", out)

@@ -40,7 +40,7 @@ def test_the_region_of_a_ring_is_a_band_round_it() -> None:
 
 
 @pytest.mark.parametrize("share", [0.5, 0.9])
-def test_a_region_holds_the_share_of_places_that_it_promises(share: float) -> None:
+def test_a_region_holds_the_stated_fraction_of_positions(share: float) -> None:
     rows = [
         alternative(0.3, 0.0, 0.0, 2.0, 0.5, 0.4),
         alternative(0.2, 8.0, 0.0, 0.5, 0.5),

@@ -88,7 +88,7 @@ def delayed(
 
 
 @pytest.mark.parametrize(("share", "seed"), [(0.05, 1), (0.05, 2), (0.4, 3), (1.0, 4), (1.0, 5)])
-def test_after_the_replay_all_is_as_if_nothing_had_been_late(share: float, seed: int) -> None:
+def test_a_replay_gives_the_result_of_punctual_measurements(share: float, seed: int) -> None:
     straight, mixed = rewinder(), rewinder()
     ordered = team()
     feed(straight, ordered)
@@ -186,7 +186,7 @@ def test_a_burst_of_late_reports_costs_one_replay() -> None:
     assert 0 < quick.counters()["rewound_steps"] < 8.0 * len(log_of(quick).steps) / 40
 
 
-def test_a_call_works_off_a_bounded_share_of_a_replay_and_the_next_ones_the_rest() -> None:
+def test_a_call_replays_a_bounded_part_and_the_next_calls_the_rest() -> None:
     ordered = team()
     at = next(k for k, m in enumerate(ordered) if m.time_s > 24.0)
     late = [*ordered[:at], Height(20.2, 1, 7.5), *ordered[at:]]
@@ -207,7 +207,7 @@ def test_a_call_works_off_a_bounded_share_of_a_replay_and_the_next_ones_the_rest
     assert [e.time_s for e in estimates] == [e.time_s for e in whole]
 
 
-def test_what_is_kept_stays_bounded_without_any_motion() -> None:
+def test_the_history_stays_bounded_without_any_motion() -> None:
     quick = Rewinder(Log(), Timeline(reorder_s=0.3, max_lag_s=1.5))
     for k in range(2000):
         quick.process(Range(0.1 * k, 1, 2, 3.0))

@@ -16,7 +16,7 @@ LONG_FRAMES = 10_000_000
 GUIDED_FRAMES = 1_000_000
 
 
-def test_what_is_no_frame_of_the_team_s_changes_nothing_in_the_host():
+def test_a_foreign_frame_changes_nothing_in_the_host():
     """The short run: random scripts, without coverage."""
     source = random.Random(1)
     count: Counter[str] = Counter()

@@ -101,7 +101,7 @@ def test_a_session_knows_what_an_earlier_one_received():
     assert second.decoder.nodes[1].counts["lost"] == 0
 
 
-def test_without_the_key_nothing_is_taken_and_nothing_remembered():
+def test_frames_without_the_key_are_refused_and_not_remembered():
     decoder = Decoder((KEY,))
     for n in range(20):
         assert decoder.feed(motion(n, 1.0 + n), 1.0) == []
@@ -169,7 +169,7 @@ def test_a_key_file_is_secret_random_and_never_overwritten(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "00" * 15, "00" * 17, "zz" * 16, "geheim\n", "\xe9" * 16])
-def test_what_is_no_key_is_refused_in_one_line_that_does_not_quote_it(tmp_path, text):
+def test_an_invalid_key_is_refused_in_one_line_that_does_not_quote_it(tmp_path, text):
     path = tmp_path / "team.key"
     path.write_text(text, encoding="latin-1")
     with pytest.raises(DataError, match=r"team\.key") as caught:

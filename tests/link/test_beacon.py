@@ -61,7 +61,7 @@ def test_no_beacon_is_sent_to_an_empty_team():
     assert ids(schedule.due(0.6)) == [4]
 
 
-def test_who_is_there_keeps_the_order_and_newcomers_follow_sorted():
+def test_present_nodes_keep_their_order_and_newcomers_follow_sorted():
     schedule = BeaconSchedule()
     receive(schedule, (5, 9), 0.0)
     assert schedule.team(0.0) == (5, 9)

@@ -153,7 +153,7 @@ def test_a_view_that_does_not_change_is_not_sent_again(schedule: Schedule) -> No
     assert due(schedule, team_view(2), 6.0)
 
 
-def test_speed_is_that_of_the_way_between_two_events(schedule: Schedule) -> None:
+def test_speed_is_that_of_the_path_between_two_events(schedule: Schedule) -> None:
     due(schedule, team_view(1), 0.0)
     moved = {"x_m": 3.0, "y_m": 4.0, "motion_s": 14.0}
     events = due(schedule, team_view(2, changes={1: moved, 2: {"moving": False}}), 4.0)
@@ -182,7 +182,7 @@ def test_an_ambiguous_position_is_called_an_estimate(schedule: Schedule) -> None
     assert "ambiguous" in event.words("remarks")
 
 
-def test_who_is_nowhere_is_not_put_anywhere(schedule: Schedule) -> None:
+def test_a_member_without_position_is_not_sent(schedule: Schedule) -> None:
     changes: dict[int, dict[str, Any]] = {
         1: {"status": "unlocated"},
         2: {"x_m": None, "y_m": None},
@@ -191,7 +191,7 @@ def test_who_is_nowhere_is_not_put_anywhere(schedule: Schedule) -> None:
     assert set(due(schedule, team_view(1, changes=changes), 0.0)) == {"test.4"}
 
 
-def test_who_lies_still_is_an_emergency_until_it_is_over(schedule: Schedule) -> None:
+def test_a_motionless_person_is_an_emergency_until_it_is_over(schedule: Schedule) -> None:
     still = {"alert": Alert.STILL_ALARM, "still_s": 31.0, "moving": False}
     alarm = due(schedule, team_view(1, changes={3: still}), 0.0)["test.3-9-1-1"]
     assert alarm.type == "b-a-o-tbl"
@@ -254,7 +254,7 @@ def test_an_address_that_cannot_work_is_reported_at_once(url: str, words: str) -
         CotSender(url, [PIN])
 
 
-def test_without_a_pin_nothing_is_sent() -> None:
+def test_nothing_is_sent_without_a_pin() -> None:
     with pytest.raises(DataError, match="--pin LAT,LON"):
         CotSender("udp://127.0.0.1:9", [])
 

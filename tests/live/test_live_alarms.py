@@ -66,7 +66,7 @@ def watching():
     return watching
 
 
-def test_who_stops_is_warned_of_after_20_s_and_alarmed_after_30(watching):
+def test_a_person_who_stops_raises_a_warning_after_20_s_and_an_alarm_after_30(watching):
     watching.report(still, 40)
     assert watching.alerts == [None, Alert.STILL_WARNING, Alert.STILL_ALARM]
     assert watching.at(Alert.STILL_WARNING) == pytest.approx(10.0 + 20.0, abs=0.2)
@@ -92,7 +92,7 @@ def test_a_twitch_does_not_end_the_alarm_but_getting_up_does(watching):
     assert watching.alarms.condition(1).still_s == 0.0
 
 
-def test_who_works_on_the_spot_is_not_alarmed_of(watching):
+def test_a_person_working_on_the_spot_raises_no_alarm(watching):
     for _ in range(20):
         watching.report(still, 5)
         watching.report(bend, 1)
@@ -131,7 +131,7 @@ def test_an_alarm_goes_on_through_a_gap(watching):
     assert watching.alarms.condition(1).alert is Alert.STILL_ALARM
 
 
-def test_a_few_lost_reports_do_not_hide_somebody_who_lies_still(watching):
+def test_a_few_lost_reports_do_not_hide_a_motionless_person(watching):
     for _ in range(8):
         watching.report(still, 1)
         watching.report(None, 3)
@@ -161,7 +161,7 @@ def test_a_first_report_is_no_movement_of_now():
     assert watching.alarms.condition(1).alert is Alert.STILL_WARNING
 
 
-def test_a_recording_without_the_nodes_own_word_is_judged_by_displacement():
+def test_motion_without_the_nodes_flag_is_decided_by_displacement():
     assert moved(Motion(1.0, 1, 0.5, 0.0, 0.0))
     assert moved(Motion(1.0, 1, 0.0, 0.0, math.radians(30.0)))
     assert not moved(Motion(1.0, 1, 0.01, 0.0, 0.0, 0.3, 0.3, 0.1))

@@ -31,7 +31,7 @@ def an_estimate(time_s, scale=1.0):
     return Estimate(time_s, (node,), (), (), parameters)
 
 
-def test_what_was_received_loads_as_a_run_in_the_order_of_time(tmp_path):
+def test_received_measurements_load_as_a_run_in_the_order_of_time(tmp_path):
     files = FileSink(tmp_path, Description(name="walk"))
     files.observed(2.0, OBSERVATIONS)
     files.estimated(an_estimate(1.0))
@@ -111,7 +111,7 @@ def test_a_disk_that_stays_full_is_an_error_at_the_end(tmp_path, monkeypatch):
         table.close()
 
 
-def test_what_nothing_can_hold_any_more_is_counted(tmp_path, monkeypatch):
+def test_rows_beyond_the_buffer_are_counted(tmp_path, monkeypatch):
     disk = FullDisk(tmp_path / "table.csv")
     monkeypatch.setattr(Path, "open", lambda *_, **__: disk)
     monkeypatch.setattr("relpos.runs.appending.MOST_WAITING_BYTES", 100)

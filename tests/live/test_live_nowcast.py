@@ -50,7 +50,7 @@ def test_motions_since_the_estimate_are_composed_in_order():
     assert nowcast.newest_s(1) == 3.0
 
 
-def test_of_a_chord_that_the_estimate_ends_in_only_the_rest_is_composed():
+def test_only_the_rest_of_a_chord_after_the_estimate_is_composed():
     nowcast = Nowcast()
     nowcast.add_motion(motion(1.0), 1)
     nowcast.add_motion(motion(2.0, 1.0, 0.0, 0.8), 2)
@@ -150,7 +150,7 @@ def test_a_pair_keeps_what_the_estimator_knows_of_the_two_together():
     assert after.sigma_distance_m == pytest.approx(math.sqrt(0.01**2 + 0.1**2 + 0.3**2))
 
 
-def test_who_has_no_estimate_yet_has_no_pose():
+def test_a_node_without_estimate_has_no_pose():
     nowcast = Nowcast()
     nowcast.add_motion(motion(1.0, node=7), 1)
     assert nowcast.node(7) is None

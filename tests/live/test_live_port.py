@@ -158,7 +158,7 @@ def test_a_port_by_its_url_is_read_like_a_device(stream):
     source.close()
 
 
-def test_what_comes_at_once_is_received_at_once(socket, stream):
+def test_bytes_that_arrive_together_are_received_together(socket, stream):
     pieces, _ = stream
     source = PortInput(str(socket.path), Link(), teach=False)
     socket.write(b"".join(pieces[:5]))

@@ -55,7 +55,7 @@ def test_the_same_press_counts_once_however_often_it_is_sent(handler):
     assert [event.value for event in again[1]] == ["5"]
 
 
-def test_where_a_clock_was_set_meanwhile_the_presses_age_counts(handler):
+def test_the_age_of_a_press_counts_when_a_clock_was_set_meanwhile(handler):
     # By the offset it would have been sent an hour ago: but it was sent now, 5 s after the press.
     request = presses(
         ("a", "4", unix_ms(95.0) - 3.6e6),

@@ -86,7 +86,7 @@ def pictures(socket):
     "path", ["/", "/phone", "/qr.svg", "/api/picture", "/api/time", "/static/"]
 )
 @pytest.mark.parametrize("token", [None, "", "wrong"])
-def test_without_the_token_nothing_is_shown(stage, path, token):
+def test_nothing_is_shown_without_the_token(stage, path, token):
     params = {} if token is None else {"token": token}
     with stage.client(token=False) as client:
         answer = client.get(path, params=params)
@@ -95,7 +95,7 @@ def test_without_the_token_nothing_is_shown(stage, path, token):
     assert "set-cookie" not in answer.headers
 
 
-def test_without_the_token_nothing_is_taken(stage):
+def test_nothing_is_accepted_without_the_token(stage):
     with stage.client(token=False) as client:
         before = len(stage.asked)
         assert client.post("/api/acknowledge", json={"node": 1}).status_code == 401
@@ -182,7 +182,7 @@ def test_a_press_is_accepted_when_the_session_has_it(stage):
         ("acknowledge", b"x" * (1 << 20) + b"x", "bytes"),
     ],
 )  # fmt: skip
-def test_what_makes_no_sense_is_refused_in_words(stage, path, body, why):
+def test_an_invalid_request_is_refused_in_words(stage, path, body, why):
     with stage.client() as client:
         content = body if isinstance(body, bytes) else json.dumps(body).encode()
         answer = client.post(f"/api/{path}", content=content)
@@ -245,7 +245,7 @@ def test_a_server_that_dies_is_started_again_behind_the_same_address(stage):
         assert client.get("/api/wearers").status_code == 200
 
 
-def test_over_https_the_cookie_is_for_https_alone():
+def test_the_cookie_of_https_is_for_https_alone():
     with Stage(https=True) as stage:
         context = ssl.create_default_context()
         context.check_hostname = False

@@ -72,7 +72,7 @@ def test_replaying_the_recorded_bytes_gives_the_same_estimates_to_the_last_bit(w
     assert again == album.estimates
 
 
-def test_what_is_recorded_is_what_was_decoded_in_its_order(walk):
+def test_the_recording_has_what_was_decoded_in_its_order(walk):
     _, album, _ = walk
     link = Link()
     decoded = [o for arrival_s, data in album.bytes for o in link.feed(data, arrival_s)]
@@ -80,7 +80,7 @@ def test_what_is_recorded_is_what_was_decoded_in_its_order(walk):
     assert album.closed
 
 
-def test_somebody_who_falls_silent_is_stale_then_lost():
+def test_a_node_that_falls_silent_is_stale_then_lost():
     with EmulatedTeam(
         TeamConfig("straight", 3, 60.0, 3, beacons=True, faults=["node:off:node=2,from=25,to=100"])
     ) as team:

@@ -79,7 +79,7 @@ def test_each_trouble_has_its_colour_and_its_words(changes, health, words):
         {"ranging": None, "neighbours": None, "beacon": None, "imu": None},  # not reported
     ],
 )
-def test_what_is_no_trouble_stays_green(changes):
+def test_a_node_without_trouble_stays_green(changes):
     assert assess(but(**changes))[0] is Health.GREEN
 
 

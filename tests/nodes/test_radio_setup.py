@@ -185,7 +185,7 @@ def relpos(*arguments):
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
-def test_without_a_port_the_lines_are_printed():
+def test_the_lines_are_printed_without_a_port():
     lines = relpos("--node", 18).stdout.splitlines()
     words = [line.split()[0] for line in lines]
     assert words[0] == "+++"
@@ -204,5 +204,5 @@ def test_the_command_writes_a_module():
 @pytest.mark.parametrize(
     "arguments", [(), ("--node", 1, "--coordinator"), ("--node", 1, "--channel", "1B")]
 )
-def test_what_it_cannot_mean_is_wrong_usage(arguments):
+def test_contradicting_arguments_are_wrong_usage(arguments):
     assert relpos(*arguments).returncode == 2

@@ -48,7 +48,7 @@ def test_all_is_every_extra_that_has_a_purpose():
     assert OPTIONAL["all"] == [f"relpos[{','.join(extras.PURPOSES)}]"]
 
 
-def test_what_is_not_installed_is_missing(monkeypatch):
+def test_a_package_that_is_not_installed_is_missing(monkeypatch):
     lines = ['nobody-has-this>=2; extra == "view"', "pytest ; extra == 'view'", "nor-this>=1"]
     monkeypatch.setattr(metadata, "requires", lambda _: lines)
     assert extras.missing("view") == ["nobody-has-this>=2"]

@@ -162,7 +162,7 @@ def test_an_unknown_type_is_refused_despite_a_good_crc_and_tag():
         wire.decode(sealed(200, b""))
 
 
-def test_what_does_not_fit_is_not_sent():
+def test_a_value_that_does_not_fit_is_not_sent():
     with pytest.raises(OutOfRangeError, match="range_m"):
         wire.RANGES.build(
             {

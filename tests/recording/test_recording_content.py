@@ -129,7 +129,7 @@ def test_notices_are_in_the_log(recorded):
     assert "the port vanished" in lines
 
 
-def test_what_was_received_and_decoded_comes_back_exactly_and_in_order(recorded):
+def test_received_bytes_and_measurements_come_back_exactly_and_in_order(recorded):
     recording = open_recording(recorded)
     steps = session()
     middle = len(steps) // 2
@@ -202,7 +202,7 @@ def test_a_recording_is_not_overwritten(recorded):
     assert recorded.read_bytes() == before
 
 
-def test_what_is_no_recording_is_one_clear_line(tmp_path):
+def test_a_file_that_is_no_recording_is_one_clear_line(tmp_path):
     path = tmp_path / "x.mcap"
     path.write_bytes(b"time_s,node\n0.1,3\n")
     with pytest.raises(DataError, match=r"x\.mcap: no MCAP file$"):

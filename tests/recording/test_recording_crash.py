@@ -305,7 +305,7 @@ def test_a_disk_that_confirms_nothing_blocks_no_writer_and_is_reported(tmp_path,
     assert open_recording(path).closed
 
 
-def test_what_the_disk_refused_to_confirm_is_written_again(tmp_path):
+def test_a_block_that_the_disk_did_not_confirm_is_written_again(tmp_path):
     class Forgetful(Disk):
         calls = 0
 

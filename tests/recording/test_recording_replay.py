@@ -102,7 +102,7 @@ def test_a_replay_gives_the_same_estimates_to_the_last_byte(recorded, tmp_path):
         assert len(ours) == len(theirs), name
 
 
-def test_what_was_decoded_then_and_what_the_bytes_give_now_are_the_same(recorded):
+def test_decoding_the_recorded_bytes_gives_the_recorded_measurements(recorded):
     """A team with a key of its own has the first without the key at hand."""
     recording = open_recording(recorded[0])
     decoded = Replay(recording, None).observations()
@@ -118,7 +118,7 @@ def test_the_command_line_overrules_the_recorded_settings(recorded, tmp_path):
     assert (summary["estimator"], summary["seed"]) == ("deadreckoning", 9)
 
 
-def test_what_was_received_as_a_run_and_the_recording_are_the_same_run(recorded):
+def test_the_received_run_and_the_recording_are_the_same_run(recorded):
     path, live = recorded
     ours, theirs = load(path), load(live / "received")
     assert ours.measurements == theirs.measurements

@@ -269,7 +269,7 @@ def test_a_start_from_truth_without_truth_is_refused(tmp_path: Path) -> None:
         _ = load_run(tmp_path).priors
 
 
-def test_without_a_word_the_start_is_unknown(tmp_path: Path) -> None:
+def test_the_start_is_unknown_by_default(tmp_path: Path) -> None:
     truth = "time_s,node,x_m,y_m\n0,1,1,2\n"
     assert load_run(write(tmp_path, motion_csv=MOTION, truth_csv=truth)).priors == ()
 
@@ -428,7 +428,7 @@ def test_parameters_are_written_where_they_change(tmp_path: Path) -> None:
     assert rows == ["1.5,1,,step_scale,1.1,0.05", "3.5,1,,step_scale,1.2,0.05"]
 
 
-def test_somebody_elses_estimate_needs_positions_alone(tmp_path: Path) -> None:
+def test_a_foreign_estimate_needs_positions_alone(tmp_path: Path) -> None:
     write(tmp_path, estimate_csv="time_s,node,x_m,y_m\n0,1,1,2\n0,2,,\n")
     (estimate,) = read_estimates(tmp_path)
     assert estimate.nodes[0].x_m == 1.0

@@ -74,7 +74,7 @@ def test_a_turn_to_the_left_is_positive_about_the_upward_axis(team: list[WalkerT
     assert mean[0] > 0
 
 
-def test_step_lengths_add_up_to_the_way_along_the_route(team: list[WalkerTruth]) -> None:
+def test_step_lengths_add_up_to_the_path_along_the_route(team: list[WalkerTruth]) -> None:
     walker = team[1]
     smooth = walker.position_m[::100, :2]  # at 2 Hz the step's own motion hardly counts
     until = walker.steps.time_s[-1]

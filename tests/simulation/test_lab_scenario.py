@@ -34,7 +34,7 @@ def test_three_people_walk_310_m_of_380_s_round_the_room() -> None:
         assert 300.0 < walked <= 310.0
 
 
-def test_without_noise_motions_lead_along_the_truth_and_clear_ranges_are_distances() -> None:
+def test_motions_without_noise_follow_the_truth_and_clear_ranges_are_distances() -> None:
     run = scenarios.simulate("lab", 2, QUIET)
     truth = {(t.time_s, t.node): complex(t.x_m, t.y_m) for t in run.truth}
     place = {p.node: complex(p.x_m, p.y_m) for p in run.priors}
@@ -51,7 +51,7 @@ def test_without_noise_motions_lead_along_the_truth_and_clear_ranges_are_distanc
             )
 
 
-def test_the_block_of_rooms_is_in_the_way_across_and_not_along_a_side() -> None:
+def test_the_block_of_rooms_obstructs_links_across_and_not_along_a_side() -> None:
     first = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 5.0], [23.0, 0.0]])
     second = np.array([[20.0, 0.0], [10.0, 13.0], [23.0, 5.0], [0.0, 13.0]])
     # Along a side; across one room; through all three; corner to corner.

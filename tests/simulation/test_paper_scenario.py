@@ -28,7 +28,7 @@ def positions(run: SimulatedRun) -> dict[tuple[float, int], complex]:
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
-def test_without_noise_the_motions_lead_along_the_truth_and_ranges_are_distances(
+def test_motions_without_noise_follow_the_truth_and_ranges_are_distances(
     scenario: str,
 ) -> None:
     run = simulate_paper(scenario, 3, {**QUIET, "seconds": 300})

@@ -56,7 +56,7 @@ def test_a_learned_scale_becomes_the_nodes_gain_and_a_new_gain_version(conversat
 @pytest.mark.parametrize(
     ("scale", "sigma"), [(1.02, 0.005), (1.10, 2.0 * KNOWN_WELL), (2.0, 0.01), (0.3, 0.01)]
 )
-def test_what_is_small_uncertain_or_impossible_is_not_sent(conversation, scale, sigma):
+def test_a_small_uncertain_or_impossible_scale_is_not_sent(conversation, scale, sigma):
     conversation.learn(1, scale, sigma)
     assert conversation.sender.due(0.0) == b""
 

@@ -174,7 +174,7 @@ def test_a_shared_compass_is_a_heading_from_east_counter_clockwise(visit, stage:
     assert len(stage.headings) == count
 
 
-def test_without_https_the_compass_says_what_is_missing(visit, stage: Stage):
+def test_the_compass_says_what_is_missing_without_https(visit, stage: Stage):
     insecure = "Object.defineProperty(window, 'isSecureContext', { value: false });"
     page = visit("/phone", **PHONE, init=insecure)
     expect(page.locator("#connection")).to_have_attribute("data-state", "live")

@@ -195,7 +195,7 @@ def test_zoom_changes_the_scale_and_keeps_everybody() -> None:
     assert all(re.search(rf"(?m){node}[←-↙]", near) for node in (1, 2, 3, 4))
 
 
-def test_where_not_everybody_fits_those_in_need_stay_and_the_rest_turns() -> None:
+def test_people_in_need_stay_and_the_rest_rotates_on_a_small_screen() -> None:
     people = tuple(
         Person(node, f"Wearer {node}", float(node), 0.0, status="ok", seen_s=0.1)
         for node in range(1, 21)

@@ -112,7 +112,7 @@ def test_a_pair_that_never_ranged_is_not_taken_for_missed() -> None:
     assert all(one.missed == () for one in given)
 
 
-def test_where_nodes_take_turns_a_round_lasts_until_a_pair_ranges_again() -> None:
+def test_a_round_of_nodes_in_turn_lasts_until_a_pair_ranges_again() -> None:
     rounds = Rounds()
     turns = [
         (2.0 * cycle + 0.3 * node + 0.02 * peer, [(node, peer)])
@@ -163,7 +163,7 @@ def test_misses_that_follow_each_other_count_less_than_independent_ones() -> Non
     assert free.weight > 0.8
 
 
-def test_what_was_learned_after_a_copy_does_not_change_it() -> None:
+def test_learning_after_a_copy_does_not_change_the_copy() -> None:
     learner = Detection()
     given = instants(learner.rounds, [(float(t), ALL) for t in range(30)], always)
     kept = deepcopy(learner)

@@ -205,7 +205,7 @@ def test_range_biases_are_found_and_reported_with_their_pairs() -> None:
     assert distance_rmse(estimates, truth) < 0.12
 
 
-def test_where_ranges_have_no_bias_looking_for_one_costs_little() -> None:
+def test_estimating_an_absent_range_bias_costs_little() -> None:
     run = simulate_paper("paper-p1", 11, {"seconds": 200.0})
     scores = []
     for share in (0.0, 0.5):
