@@ -34,6 +34,7 @@ class AdaptiveCount:
         self.unambiguous = 0
         """For so many instants of ranges the mixture has been so."""
         self._unperturbed: Floats = np.zeros(0)
+        """Weights (B, LANES) without perturbed hypotheses, as the last ``_step_index`` had them."""
 
     def resize(self, *, ambiguous: bool, since_fault: int) -> None:
         """Shrink where the mixture has been unambiguous for a while; grow where it is not."""
@@ -152,7 +153,6 @@ class AdaptiveCount:
         """Go on with fewer hypotheses; the mixture's moments are unchanged."""
         these = self._hypotheses
         s = these.settings
-        self._step_index()
         mean, covariance = these.moments(self._unperturbed)
         these.log_weight[:] -= np.where(these.perturbed > 0.0, PERTURBED_LOSS, 0.0)
         before, weight = these.sampled_share, these.weights()
