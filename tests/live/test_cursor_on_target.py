@@ -242,8 +242,8 @@ def test_a_teams_uids_are_the_same_in_every_session() -> None:
     [
         ("239.2.3.1:6969", "begins with none of udp://"),
         ("http://tak.example:80", "begins with none of"),
-        ("udp://239.2.3.1", "host and port are wanted"),
-        ("tcp://:8087", "host and port are wanted"),
+        ("udp://239.2.3.1", "host and port are missing"),
+        ("tcp://:8087", "host and port are missing"),
         ("tcp://tak.example:high", "--cot tcp://tak.example:high: "),
     ],
 )
