@@ -21,8 +21,8 @@ LONG = tuple(
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Some tests wait for browsers and processes: one worker more than cores keeps them busy."""
-    return (os.cpu_count() or 1) + 1
+    """Some tests wait for browsers and processes: two workers a core keep the cores busy."""
+    return 2 * (os.cpu_count() or 1)
 
 
 @pytest.hookimpl(tryfirst=True)
