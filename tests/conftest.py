@@ -3,20 +3,11 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import pytest
 
 DURATIONS = "relpos/durations"
 """Key in pytest's cache: file -> seconds that its tests took the last time."""
-
-
-LONG = tuple(
-    line.strip()
-    for line in (Path(__file__).parent / "long_tests.txt").read_text().splitlines()
-    if line and not line.startswith("#")
-)
-"""Beginnings of the names of tests that `make soak` runs, and `make test` does not."""
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -25,11 +16,7 @@ def pytest_xdist_auto_num_workers() -> int:
     return 2 * (os.cpu_count() or 1)
 
 
-@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    for item in items:
-        if item.nodeid.startswith(LONG):
-            item.add_marker(pytest.mark.soak)
     durations = config.cache.get(DURATIONS, {})  # type: ignore[union-attr]
     # Tests of a file stay together and share its fixtures (--dist loadfile); a new one may be long.
     items.sort(key=lambda item: -durations.get(_file_of(item.nodeid), 60.0))

@@ -217,7 +217,9 @@ def _print_gains(title: str, gains: FloatArray) -> None:
         print(f"  {name:22s} {mean:6.3f} +- {sd:.3f}")
 
 
-def _print(title: str, walks: list[GaitStatistics]) -> None:
+def print_statistics(title: str, walks: list[GaitStatistics]) -> None:
+    """Print means over walks, with the range of the sizes."""
+
     def mean(name: str) -> FloatArray:
         return np.asarray(np.mean([getattr(w, name) for w in walks], axis=0))
 
@@ -259,9 +261,11 @@ def main(arguments: list[str]) -> int:
         walks = [w for f in sorted((folder / name).iterdir()) if (w := recorded_walk(f))]
         for low, high in groups or ((0.8, 2.6),):
             some = [w for w in walks if low <= w.step_frequency_hz < high]
-            _print(f"recorded {name}, {low} to {high} steps/s", some)
+            print_statistics(f"recorded {name}, {low} to {high} steps/s", some)
     for speeds in ((0.88, 0.95), (1.07, 1.15), (0.5, 0.6)):
-        _print(f"simulated, {speeds[0]} to {speeds[1]} m/s", simulated_walks(speeds, 20, 3))
+        print_statistics(
+            f"simulated, {speeds[0]} to {speeds[1]} m/s", simulated_walks(speeds, 20, 3)
+        )
     gains = recorded_gains(folder / "walk_lowerback_20m")
     _print_gains("recorded walk_lowerback_20m, under 1 m/s", gains[gains[:, 0] < 1.0])
     _print_gains("recorded walk_lowerback_20m, from 1 m/s", gains[gains[:, 0] >= 1.0])

@@ -21,11 +21,11 @@ import numpy as np
 from scipy import signal
 
 from gait_statistics import (
-    HARMONICS,
     GaitStatistics,
     apparent_gain,
     data_folder,
     gait_statistics,
+    print_statistics,
     recorded_walk,
 )
 from relpos.calibration.steps import LEG_OF_STATURE
@@ -253,27 +253,6 @@ def simulated_walking(
         )
         out.append(Walking(gait_statistics(force, rate, 100.0), _density(force, 100.0)))
     return out
-
-
-def print_walking(title: str, walks: list[Walking]) -> None:
-    """Print means over walks, with the range of the sizes."""
-    some = [w.statistics for w in walks]
-    print(f"{title} ({len(some)} walks)")
-    for name in (
-        "step_frequency_hz",
-        "vertical_rms_m_s2",
-        "vertical_peak_m_s2",
-        "horizontal_rms_m_s2",
-        "step_similarity",
-        "stride_similarity",
-        "above_15_hz",
-    ):
-        values = [float(getattr(s, name)) for s in some]
-        print(f"  {name:22s} {np.mean(values):5.2f}  from {min(values):.2f} to {max(values):.2f}")
-    print(f"  {'harmonic':22s} " + " ".join(f"{h:5.2f}" for h in HARMONICS))
-    for name in ("vertical", "fore_aft", "lateral", "yaw_rate", "pitch_rate", "roll_rate"):
-        mean = np.mean([getattr(s, name) for s in some], axis=0)
-        print(f"  {name:22s} " + " ".join(f"{v:5.2f}" for v in mean))
 
 
 # -- slow indoor bouts ------------------------------------------------------------------------
@@ -545,8 +524,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ):
         made = simulated_walking(place, speeds, 24, 8)
         walking.append((title, real, made))
-        print_walking(f"recorded {title}", real)
-        print_walking(f"simulated {place}, {speeds[0]} to {speeds[1]} m/s", made)
+        print_statistics(f"recorded {title}", [walk.statistics for walk in real])
+        simulated = f"simulated {place}, {speeds[0]} to {speeds[1]} m/s"
+        print_statistics(simulated, [walk.statistics for walk in made])
     print_bouts("recorded walk_daily_lowerback, under 0.7 m/s", recorded_bouts(folder))
     print_bouts("simulated daily, under 0.7 m/s", simulated_bouts(20, 9))
     print_fields("recorded walk_handheld_waypoints", recorded_fields(folder))

@@ -184,8 +184,7 @@ def _compile(name: str, settings: Mapping[str, object] | None, progress: Progres
     """Compile the kernels of an estimator where they are not in the cache."""
     from relpos import fusion
 
-    fusion.check_name(name)
-    fusion.check_settings(name, settings or {})
+    fusion.check(name, settings)
     if not fusion.is_compiled(name):
         fusion.warm_up(name, progress)
 

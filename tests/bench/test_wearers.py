@@ -31,6 +31,7 @@ def only(kind: str, seed: int, **given: float) -> WearerTruth:
     return make_walker([STAND, Activity(kind, **given), STAND], seed)[0]  # type: ignore[arg-type]
 
 
+@pytest.mark.soak
 def test_integrating_the_sensors_returns_the_path_of_every_activity(
     mixed: list[WearerTruth],
 ) -> None:

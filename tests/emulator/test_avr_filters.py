@@ -41,6 +41,7 @@ def on_this_computer(samples: filters.Samples) -> np.ndarray:
     return rows
 
 
+@pytest.mark.soak
 def test_a_walk_of_310_m_ends_at_the_same_place_on_the_avr() -> None:
     samples = filters.walk(380.0, 5, scenario="paper")
     native = on_this_computer(samples)

@@ -61,6 +61,7 @@ def test_nine_exchanges_in_ten_of_twenty_slotted_nodes_succeed(twenty):
     assert twenty.ranged >= 0.9 * twenty.exchanges
 
 
+@pytest.mark.soak
 def test_slots_are_clearly_better_than_none(twenty, twenty_unslotted):
     assert twenty.free_of_collision >= twenty_unslotted.free_of_collision + 0.1
     assert twenty.ranged > 1.2 * twenty_unslotted.ranged
@@ -75,11 +76,13 @@ def test_twenty_share_the_air_fairly(twenty):
     assert twenty.fewest_ranges >= 0.8 * twenty.most_ranges
 
 
+@pytest.mark.soak
 def test_no_node_of_twenty_is_shut_out_without_slots(twenty_unslotted):
     assert twenty_unslotted.fewest_ranges > 0
     assert twenty_unslotted.fewest_ranges >= 0.2 * twenty_unslotted.most_ranges
 
 
+@pytest.mark.soak
 def test_ranges_keep_flowing_where_the_radio_loses_half_of_the_beacons():
     lossy = slots.measure(20, slotted=True, loss=0.5, seconds=SECONDS, detection=1.0)
     assert lossy.free_of_collision >= 0.9

@@ -39,6 +39,7 @@ def figures(outcomes: list[study.Outcome]) -> list[list[float]]:
     return [[s.distance_m for s in o.scores] for o in outcomes]
 
 
+@pytest.mark.soak
 def test_every_core_gives_the_figures_of_one(pool: Executor) -> None:
     seeds = range(3)
     one = study.run(CASES, seeds, executors.Serial())

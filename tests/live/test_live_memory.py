@@ -52,6 +52,7 @@ class Scale(Sink):
             self.bytes.append(tracemalloc.get_traced_memory()[0])
 
 
+@pytest.mark.soak
 def test_twice_the_session_is_not_more_memory(tmp_path, monkeypatch):
     # What waits a second for the disk is more here, where a second holds minutes.
     monkeypatch.setattr("relpos.runs.appending.WRITE_EVERY_S", 0.0)

@@ -207,6 +207,7 @@ def test_a_session_that_does_not_answer_is_reported_to_the_phone(stage, monkeypa
     assert answer.status_code == 503
 
 
+@pytest.mark.soak
 def test_ten_browsers_each_get_the_newest_view_and_a_sleeping_one_blocks_no_other(stage):
     with contextlib.ExitStack() as stack:
         # This one never reads.

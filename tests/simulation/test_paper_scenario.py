@@ -59,6 +59,7 @@ def test_six_users_follow_each_other_counter_clockwise_round_20_m_by_10_m() -> N
     assert abs(truth[17.0, 1] - truth[17.0, 2]) == pytest.approx(8.0)
 
 
+@pytest.mark.soak
 def test_the_noise_levels_are_those_stated() -> None:
     steps, turns, ranges = defaultdict(list), defaultdict(list), []
     pairs = 0

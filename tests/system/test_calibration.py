@@ -40,6 +40,7 @@ def calibrate(*arguments):
     return CliRunner().invoke(app, ["node", "calibrate", *map(str, arguments), "--yes"])
 
 
+@pytest.mark.soak
 def test_a_guided_calibration_makes_the_field_round_and_is_kept_over_a_restart(tmp_path):
     with emulated("turntable", 20, 1500) as port:
         done = calibrate(port, "--node", 1, "--out", tmp_path)

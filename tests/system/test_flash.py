@@ -161,6 +161,7 @@ def test_a_mega_is_known_by_its_own_boot_loader(tmp_path):
             boards.check(device, "uno")
 
 
+@pytest.mark.soak
 @pytest.mark.skipif(not MEGA_LOADER.is_file(), reason="no boot loader of the Mega is installed")
 def test_a_mega_becomes_a_node_as_well(tmp_path):
     with plugged("mega", mega_loader(tmp_path)) as mega:

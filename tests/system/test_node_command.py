@@ -110,6 +110,7 @@ def test_settings_are_shown_before_and_after_and_survive_a_restart(port):
     assert "stature" not in shown
 
 
+@pytest.mark.soak
 def test_a_number_is_changed_over_the_air_though_the_radio_keeps_its_address():
     with emulated(2, speed=8) as path:
         done = node("set", path, "--node", 2, "id", 7, "led=off")
@@ -124,6 +125,7 @@ def test_a_number_is_changed_over_the_air_though_the_radio_keeps_its_address():
         assert "there is a node 1 already" in taken.stderr
 
 
+@pytest.mark.soak
 def test_a_new_key_is_made_given_and_asked_for(tmp_path):
     file = tmp_path / "team.key"
     with emulated(1) as path:
@@ -150,6 +152,7 @@ def test_a_new_key_is_made_given_and_asked_for(tmp_path):
         assert "not overwritten" in overwritten.stderr
 
 
+@pytest.mark.soak
 def test_defaults_leave_number_and_key():
     with emulated(1) as path:
         assert node("set", path, "step-gain", 2.5, "range-offset=-0.25").returncode == 0
@@ -159,6 +162,7 @@ def test_defaults_leave_number_and_key():
         assert re.search(r"range-offset\W+-0\.25 m\W+0 m", done.stdout)
 
 
+@pytest.mark.soak
 @pytest.mark.skipif(missing_parts() is not None, reason=str(missing_parts()))
 def test_the_uno_keeps_its_settings_over_a_restart():
     with emulated(1, board="uno", speed=2) as path:

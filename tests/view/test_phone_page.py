@@ -41,7 +41,7 @@ def session_s(stage: Stage) -> float:
     return time.time() - stage.started_unix_s
 
 
-@pytest.mark.parametrize("wrong_s", [0.0, 37.0, -7200.0])
+@pytest.mark.parametrize("wrong_s", [0.0, pytest.param(37.0, marks=pytest.mark.soak), -7200.0])
 def test_a_press_is_recorded_with_its_node_and_time_whatever_the_phones_clock(
     visit, stage: Stage, wrong_s: float
 ):

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relpos.calibration.magnetometer import MagnetometerFit
-from relpos.extras import require
 
 FloatArray = NDArray[np.float64]
 
@@ -19,7 +18,6 @@ _PLANES = ((0, 1), (0, 2), (1, 2))
 
 def draw(fit: MagnetometerFit, fields_ut: FloatArray, path: Path) -> None:
     """Write a PNG: readings (n, 3) seen along each axis, before and after, and their strength."""
-    require("report")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

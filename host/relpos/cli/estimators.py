@@ -23,7 +23,7 @@ def check(name: str | None) -> str | None:
 
     if name is not None:
         try:
-            fusion.check_name(name)
+            fusion.check(name)
         except RelposError as error:
             raise typer.BadParameter(str(error)) from None
     return name

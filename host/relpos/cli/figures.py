@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from relpos import extras
 from relpos.cli import output
 
 NAMES = (
@@ -46,6 +47,7 @@ def figures(
     from relpos.evaluation.figures import FIGURES, Work, page, save
     from relpos.fusion import plugins
 
+    extras.require("report")
     for name in estimator or []:
         if not plugins.is_plugin(name):
             raise typer.BadParameter(

@@ -192,8 +192,7 @@ class Job:
         """
         from relpos import fusion
 
-        fusion.check_name(self.estimator)
-        fusion.check_settings(self.estimator, self.settings)
+        fusion.check(self.estimator, self.settings)
         with output.progress(output.STAGES) as progress:
             # Before anything is made: what this process compiled would be compiled twice.
             fusion.warm_up(self.estimator, progress)
@@ -303,7 +302,9 @@ def _fuse_mcap(
 
 
 def _is_wanted(report: bool | None, *, as_json: bool) -> bool:
-    """Whether to write the report; without its extra only where the command line asks for it."""
+    """Whether to write the report; RelposError where it is asked for and its extra is missing."""
+    if report:
+        extras.require("report")
     if report is not None or as_json:
         return bool(report)
     return can_report()

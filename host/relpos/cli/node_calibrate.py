@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from relpos import extras
 from relpos.cli import output
 from relpos.cli.keys import KeyFile
 from relpos.cli.node_dialogue import Node, Port, connect
@@ -81,6 +82,8 @@ def sensors(
     key_file: KeyFile = None,
 ) -> None:
     """Calibrate gyroscope, accelerometer and magnetometer; `calibrate PORT` for short."""
+    if out is not None and magnetometer:
+        extras.require("report")
     with connect(port, node, key_file) as dialogue:
         _sensors(dialogue, seconds, magnetometer, out, yes)
 

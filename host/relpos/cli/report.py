@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from relpos import extras
 from relpos.cli import output
 from relpos.cli.estimators import BANK, EstimatorName
 
@@ -49,6 +50,8 @@ def report(
     from relpos.evaluation import report as reports
     from relpos.evaluation.result import read_result
 
+    if not json or out is not None or figures is not None:
+        extras.require("report")
     recording = api.load(run)
     if estimate is not None:
         result = read_result(estimate)

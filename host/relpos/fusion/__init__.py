@@ -82,7 +82,7 @@ def make(
             return ParticleFilter(priors, initialiser, parsed, seed)
         case "deadreckoning":
             return DeadReckoning(priors, parse(DeadReckoningSettings, given, "deadreckoning"), seed)
-    check_name(name)
+    check(name)
     return plugins.make(name, plugins.factory(name), priors, given, seed, nodes)
 
 
@@ -91,18 +91,17 @@ def names() -> tuple[str, ...]:
     return *SETTINGS, *sorted(set(plugins.registered()) - set(SETTINGS))
 
 
-def check_name(name: str) -> None:
-    """Raise RelposError where a name can be no estimator's."""
-    if name not in SETTINGS and not plugins.is_plugin(name):
+def check(name: str, settings: Mapping[str, object] | None = None) -> None:
+    """Raise RelposError where there is no such estimator, or it has no such settings.
+
+    Nothing is compiled. Settings of an estimator that is not ours are its own affair.
+    """
+    if name in SETTINGS:
+        parse(SETTINGS[name], settings or {}, name)
+    elif not plugins.is_plugin(name):
         raise RelposError(
             f"unknown estimator '{name}': one of {', '.join(names())}, or MODULE:CLASS"
         )
-
-
-def check_settings(name: str, settings: Mapping[str, object]) -> None:
-    """Raise RelposError where one of our estimators has no such settings; nothing is compiled."""
-    if name in SETTINGS:
-        parse(SETTINGS[name], settings, name)
 
 
 def make_smoother(
@@ -120,7 +119,7 @@ def make_smoother(
     from relpos.fusion.smoother.estimator import Smoother
 
     attempts = 1 if name == "deadreckoning" else SMOOTHER_ATTEMPTS
-    # The others' dice are far from what a user would choose as the next seed.
+    # The others' seeds are far from what a user would choose as the next one.
     seeds = [seed + k * 1_000_003 for k in range(attempts)]
     online, *others = (make(name, priors, settings, one, nodes) for one in seeds)
     worn = nodes or {}
@@ -153,6 +152,8 @@ def warm_up(name: str, progress: Progress | None = None) -> None:
     compiled rooms and that of all. Estimators that are not ours are left alone.
     """
     rooms = [room for room in ROOMS.get(name, ()) if not kernel_cache.is_complete([room])]
+    for room in rooms:  # a temporary folder, where it has to be one, is shared with the processes
+        kernel_cache.folder_here(kernel_cache.FUSION / room)
     compilers = {
         room: subprocess.Popen(
             [sys.executable, "-c", f"from {__name__} import rehearse; rehearse({room!r})"]
@@ -188,10 +189,10 @@ def rehearse(room: str, seconds: int = _ALL_S) -> None:
         initialiser.find(0.0)
         return
     priors = [Prior(node, place.real, place.imag, 0.0, 0.1, 0.1) for node, place in places.items()]
-    estimator, dice, headings = make(room, priors), random.Random(1), dict.fromkeys(places, 0.0)
+    estimator, rng, headings = make(room, priors), random.Random(1), dict.fromkeys(places, 0.0)
     for k in range(1, seconds):
         for node in places:
-            turn = dice.gauss(0.0, 0.5)
+            turn = rng.gauss(0.0, 0.5)
             places[node] += cmath.rect(1.2, headings[node])
             headings[node] += turn
             estimator.process(Motion(float(k), node, 1.2, 0.0, turn, gain_version=0))
@@ -199,7 +200,7 @@ def rehearse(room: str, seconds: int = _ALL_S) -> None:
             estimator.process(Heading(float(k), node, headings[node], 0.2))
         for node, peer in pairs:
             distance_m = abs(places[peer] - places[node])
-            estimator.process(Range(float(k), node, peer, abs(distance_m + dice.gauss(0.0, 0.1))))
+            estimator.process(Range(float(k), node, peer, abs(distance_m + rng.gauss(0.0, 0.1))))
     estimator.finish()
 
 
@@ -221,8 +222,7 @@ __all__ = [
     "Parameter",
     "SettingInfo",
     "Shape",
-    "check_name",
-    "check_settings",
+    "check",
     "is_compiled",
     "make",
     "make_smoother",

@@ -22,7 +22,6 @@ from relpos.evaluation.style import GREY as GREY
 from relpos.evaluation.style import INK as INK
 from relpos.evaluation.style import MARKERS as MARKERS
 from relpos.evaluation.style import STYLE
-from relpos.extras import require
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -180,7 +179,6 @@ def legend_beside(axes: Axes, title: str | None = None) -> None:
 
 def save(sheet: Sheet, directory: Path) -> tuple[Path, Path, Path]:
     """Write NAME.svg, NAME.png and NAME.csv; return their paths in this order."""
-    require("report")
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
