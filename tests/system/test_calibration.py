@@ -88,11 +88,13 @@ def test_two_antennas_are_calibrated_at_a_known_distance():
     with emulated("bench", 20, 3000, nodes=3) as port:
         done = calibrate("antenna", port, "--nodes", "1,2", "--distance", 5, "--ranges", 60)
         assert done.exit_code == 0, done.stderr
-        before, after = (float(x) for x in re.findall(r"ranges, ([+-][\d.]+) m off", done.stdout))
+        found = re.findall(r"ranges, ([+-][\d.]+) m off \(\+-([\d.]+)\)", done.stdout)
+        (before_m, sigma_before_m), (after_m, sigma_after_m) = np.array(found, float)
         # The true sum of the two nodes' delays.
         delay_m = sum(draw_uncalibrated_errors(3, node).antenna_delay_m for node in (1, 2))
-        assert before == pytest.approx(delay_m, abs=0.03)
-        assert abs(after) < 0.03
+        assert sigma_before_m < 0.02 < delay_m / 20
+        assert abs(before_m - delay_m) < 5 * sigma_before_m
+        assert abs(after_m) < 5 * np.hypot(sigma_before_m, sigma_after_m)
 
 
 @pytest.mark.soak

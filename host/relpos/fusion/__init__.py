@@ -33,6 +33,7 @@ from relpos.fusion.estimator import (
     Progress,
     Shape,
 )
+from relpos.fusion.linear_algebra import one_thread
 from relpos.fusion.models.ranging import Mounting
 from relpos.fusion.particle.settings import ParticleSettings
 from relpos.fusion.settings import SettingInfo, describe, parse
@@ -67,23 +68,26 @@ def make(
     RelposError for an unknown name or key and for a value that is out of range.
     """
     given = settings or {}
-    match str(name):
-        case "bank":
-            # Kernels are only loaded where they are used: help texts stay quick.
-            from relpos.fusion.switching import SwitchingEstimator
-
-            return SwitchingEstimator(priors, parse(BankSettings, given, "bank"), seed, nodes or {})
-        case "particle":
-            from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
-            from relpos.fusion.particle.estimator import ParticleFilter
-
-            initialiser = HypothesisInitialiser(seed=seed)
-            parsed = parse(ParticleSettings, given, "particle")
-            return ParticleFilter(priors, initialiser, parsed, seed)
-        case "deadreckoning":
-            return DeadReckoning(priors, parse(DeadReckoningSettings, given, "deadreckoning"), seed)
     check(name)
-    return plugins.make(name, plugins.factory(name), priors, given, seed, nodes)
+    with one_thread():
+        match str(name):
+            case "bank":
+                # Kernels are only loaded where they are used: help texts stay quick.
+                from relpos.fusion.switching import SwitchingEstimator
+
+                bank = parse(BankSettings, given, "bank")
+                return SwitchingEstimator(priors, bank, seed, nodes or {})
+            case "particle":
+                from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
+                from relpos.fusion.particle.estimator import ParticleFilter
+
+                initialiser = HypothesisInitialiser(seed=seed)
+                particle = parse(ParticleSettings, given, "particle")
+                return ParticleFilter(priors, initialiser, particle, seed)
+            case "deadreckoning":
+                reckoning = parse(DeadReckoningSettings, given, "deadreckoning")
+                return DeadReckoning(priors, reckoning, seed)
+        return plugins.make(name, plugins.factory(name), priors, given, seed, nodes)
 
 
 def names() -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""One thread for NumPy's linear algebra while an estimator runs.
+"""One thread for NumPy's linear algebra while an estimator is made and while it runs.
 
 A BLAS library divides its sums among its threads, so their last digits depend on the number of
 cores. With one thread a recording gives the same bytes on any number, and the small matrices of a

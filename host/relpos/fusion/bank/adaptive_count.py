@@ -33,8 +33,6 @@ class AdaptiveCount:
         """Ordinarily at most so many: more than usual while strongly nonlinear."""
         self.unambiguous = 0
         """For so many instants of ranges the mixture has been so."""
-        self._unperturbed: Floats = np.zeros(0)
-        """Weights (B, LANES) without perturbed hypotheses, as the last ``_step_index`` had them."""
 
     def resize(self, *, ambiguous: bool, since_fault: int) -> None:
         """Shrink where the mixture has been unambiguous for a while; grow where it is not."""
@@ -47,26 +45,28 @@ class AdaptiveCount:
         if most and ambiguous:
             self.unambiguous = 0
             return
-        step_index = self._step_index()
+        unperturbed = these.unperturbed_weights()
+        step_index = self._step_index(unperturbed)
         if most and step_index > hypothesis_count.LINEAR:
             self.unambiguous = 0
             return
-        mean, covariance = these.moments(self._unperturbed, poses_alone=True)
-        sigma_range_m = math.exp(0.5 * these.components.mean[-1])
+        mean, covariance = these.moments(unperturbed, poses_alone=True)
         index = hypothesis_count.nonlinearity_index(
-            mean, covariance, sigma_range_m, self._sigma_metre_m()
+            mean, covariance, self._sigma_range_m(), self._sigma_metre_m()
         )
         if ambiguous or index > hypothesis_count.NONLINEAR:
             self.unambiguous = 0
             self.grow()
-        elif index > hypothesis_count.LINEAR or not self._is_even(covariance, step_index):
+        elif index > hypothesis_count.LINEAR or not self._is_even(
+            covariance, step_index, unperturbed
+        ):
             self.unambiguous = 0
         else:
             self.unambiguous += 1
             fewer = [n for n in hypothesis_count.STEPS if n < these.count]
             if fewer and self.unambiguous >= hypothesis_count.HELD:
                 self.unambiguous = 0
-                self._shrink(fewer[0])
+                self._shrink(fewer[0], unperturbed)
 
     def _adapt_ceiling(self) -> None:
         """Have more than the usual number of hypotheses while strongly nonlinear."""
@@ -75,8 +75,9 @@ class AdaptiveCount:
         mean, covariance = these.moments(these.unperturbed_weights(), poses_alone=True)
         # How short the next metre is, is in the motion's moments: arcs alone count here.
         straight = np.full(these.nodes, np.inf)
-        sigma_range_m = math.exp(0.5 * these.components.mean[-1])
-        index = hypothesis_count.nonlinearity_index(mean, covariance, sigma_range_m, straight)
+        index = hypothesis_count.nonlinearity_index(
+            mean, covariance, self._sigma_range_m(), straight
+        )
         if index < hypothesis_count.LESS_NONLINEAR:
             self.ceiling = usual
         elif index > hypothesis_count.STRONGLY_NONLINEAR and self.ceiling == usual:
@@ -84,19 +85,21 @@ class AdaptiveCount:
             if these.count < self.ceiling:
                 these.resample(these.weights(), self.ceiling)
 
+    def _sigma_range_m(self) -> float:
+        return math.exp(0.5 * float(self._hypotheses.components.mean[-1]))
+
     def _sigma_metre_m(self) -> Floats:
         """How noisy the length of a metre is that each user walks (N,)."""
         sigmas: Floats = np.exp(0.5 * self._hypotheses.components.mean[ALONG:-1:COMPONENTS])
         return math.sqrt(ALONG_M2_M) * sigmas
 
-    def _step_index(self) -> float:
+    def _step_index(self, unperturbed: Floats) -> float:
         """Nonlinearity index of every user's next metre, inf where it is undecided.
 
         That is where the range variance is not known yet, where few hypotheses count, and where
         they model different things.
         """
         these = self._hypotheses
-        self._unperturbed = these.unperturbed_weights()
         if float(these.components.covariance[-1, -1]) > hypothesis_count.KNOWN**2:
             return math.inf
         weight, effective = these.normalise()
@@ -109,11 +112,11 @@ class AdaptiveCount:
         if perturbed > hypothesis_count.PERTURBED_MOST or least > hypothesis_count.UNDECIDED:
             return math.inf
         heading = mixture.heading_variances(
-            these.arrays.x, these.arrays.p, self._unperturbed, these.nodes
+            these.arrays.x, these.arrays.p, unperturbed, these.nodes
         )
         return float((0.5 * heading / self._sigma_metre_m()).max())
 
-    def _is_even(self, covariance: Floats, step_index: float) -> bool:
+    def _is_even(self, covariance: Floats, step_index: float, unperturbed: Floats) -> bool:
         """Whether not few hypotheses count and they lie together.
 
         That is where the variances between them, the rest of the mixture's ``covariance`` (D, D),
@@ -126,7 +129,7 @@ class AdaptiveCount:
         places = np.arange(POSE * these.nodes)
         poses = storage.order(these.nodes, these.arrays.x.shape[1])[: len(places)]
         own = these.arrays.p[:, storage.triangle_place(places, places)]
-        inside = np.einsum("bl,bil->i", self._unperturbed, own)
+        inside = np.einsum("bl,bil->i", unperturbed, own)
         between = covariance[poses, poses] - inside
         most = hypothesis_count.APART * drawn * inside + 1e-6
         return step_index < math.inf and bool((between <= most).all())
@@ -149,11 +152,11 @@ class AdaptiveCount:
         nodes = np.arange(self._hypotheses.nodes, dtype=np.int64)
         return PER_NODE * nodes + StateIndex.HEADING
 
-    def _shrink(self, count: int) -> None:
+    def _shrink(self, count: int, unperturbed: Floats) -> None:
         """Go on with fewer hypotheses; the mixture's moments are unchanged."""
         these = self._hypotheses
         s = these.settings
-        mean, covariance = these.moments(self._unperturbed)
+        mean, covariance = these.moments(unperturbed)
         these.log_weight[:] -= np.where(these.perturbed > 0.0, PERTURBED_LOSS, 0.0)
         before, weight = these.sampled_share, these.weights()
         chosen = systematic(weight, count, these.rng)
