@@ -26,7 +26,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import blas, lapack
 
-from relpos.fusion.large_teams import kernels
 from relpos.fusion.large_teams.layout import COVARIANCE, INFORMATION, StripLayout
 
 Floats = npt.NDArray[np.float64]
@@ -55,7 +54,6 @@ def update(layout: StripLayout, covariance: Floats, information: Floats, push: F
         eliminated.append(one)
     moved = np.empty((len(layout.strip), 3))
     _back_substitute(layout, eliminated, diagonal, following, moved)
-    kernels.mirror(covariance, layout)
     return moved
 
 
@@ -159,15 +157,10 @@ def _back_substitute(
         block[:m, :m] = later
         block[m:, :m] = headings.T
         block[m:, m:] = blas.dgemm(1.0, regression, headings, 1.0, rest, trans_a=1)
+        block[:] = np.tril(block) + np.tril(block, -1).T
         nodes = layout.nodes_of(k)
         moved[nodes, 0], moved[nodes, 1] = step[:n], step[n:]
         moved[nodes, 2] = blas.dgemv(1.0, regression, step, trans=1)
-
-
-def far_covariance(near: Floats, middle: Floats, on: Floats) -> Floats:
-    """Return P_ac = P_ab P_bb^-1 P_bc from P_ba (``near``), P_bb and P_bc."""
-    solved: Floats = lapack.dpotrs(_lower(_copy(middle)), _copy(near), lower=1)[0]
-    return solved.T @ on
 
 
 def _lower(matrix: Floats) -> Floats:

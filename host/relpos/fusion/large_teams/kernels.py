@@ -17,6 +17,9 @@ Indices = npt.NDArray[np.int64]
 NEAREST_M = 1e-3
 """Below this distance a direction means nothing; it keeps divisions finite."""
 
+ENTRIES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
+"""Components (x, y, heading) of the six distinct entries of a pose's covariance."""
+
 
 @compiled
 def move(
@@ -62,45 +65,26 @@ def move(
         pose[i, 2] += turn
 
 
-@compiled
 def propagate(covariance: Floats, layout: StripLayout, lever: Floats, noise: Floats) -> None:
     """Bring the blocks up to the poses: P <- F P F^T + Q, F from the levers, Q the noise.
 
     Levers and noise are zero afterwards.
     """
-    members, first, sizes, blocks = layout.members, layout.first, layout.sizes, layout.covariance
-    for k in range(len(sizes)):
-        n = sizes[k]
-        m = 3 * n
-        nodes = members[first[k] : first[k + 1]]
-        for other in range(k, min(k + 2, len(sizes))):
-            p = sizes[other]
-            peers = members[first[other] : first[other + 1]]
-            start = blocks.diagonal[k] if other == k else blocks.following[k]
-            block = covariance[start : start + m * 3 * p].reshape(3 * p, m)
-            # block[column, row]: first the rows of every column, then columns among each other.
-            for column in range(3 * p):
-                line = block[column]
-                for r in range(n):
-                    line[r] += lever[nodes[r], 0] * line[2 * n + r]
-                    line[n + r] += lever[nodes[r], 1] * line[2 * n + r]
-            for q in range(p):
-                x, y = lever[peers[q], 0], lever[peers[q], 1]
-                for r in range(m):
-                    block[q, r] += x * block[2 * p + q, r]
-                    block[p + q, r] += y * block[2 * p + q, r]
-            if other == k:
-                for r in range(n):
-                    i = nodes[r]
-                    block[r, r] += noise[i, 0]
-                    block[n + r, r] += noise[i, 1]
-                    block[r, n + r] += noise[i, 1]
-                    block[n + r, n + r] += noise[i, 2]
-                    block[2 * n + r, r] += noise[i, 3]
-                    block[r, 2 * n + r] += noise[i, 3]
-                    block[2 * n + r, n + r] += noise[i, 4]
-                    block[n + r, 2 * n + r] += noise[i, 4]
-                    block[2 * n + r, 2 * n + r] += noise[i, 5]
+    diagonal, following = layout.views(covariance, COVARIANCE)
+    nodes = [layout.nodes_of(k) for k in range(len(diagonal))]
+    blocks = [*zip(diagonal, nodes, nodes, strict=True)]
+    blocks += zip(following, nodes, nodes[1:], strict=False)
+    for block, rows, columns in blocks:
+        n, p = len(rows), len(columns)
+        for axis in range(2):
+            block[axis * n : axis * n + n] += lever[rows, axis, None] * block[2 * n :]
+        for axis in range(2):
+            block[:, axis * p : axis * p + p] += lever[columns, axis] * block[:, 2 * p :]
+    for block, rows in zip(diagonal, nodes, strict=True):
+        own = len(rows) * np.arange(3)[:, None] + np.arange(len(rows))
+        for (a, b), added in zip(ENTRIES, noise[rows].T, strict=True):
+            block[own[a], own[b]] += added
+            block[own[b], own[a]] = block[own[a], own[b]]
     lever[:] = 0.0
     noise[:] = 0.0
 
@@ -225,73 +209,3 @@ def range_information(
             information[base + right] += sign * weight * ux * uy
             information[base + down + right] += sign * weight * uy * uy
     return information, push, inlier
-
-
-class FarCovariances(NamedTuple):
-    """Covariances of nodes that change strips with the strip beyond the next.
-
-    ``values[start[i]:]`` holds those of node i with the n nodes of strip ``strip[i]``, (3, 3n);
-    ``start[i]`` is -1 for a node without any.
-    """
-
-    values: Floats
-    start: Indices
-    strip: Indices
-
-
-@compiled
-def change_layout(
-    before: Floats, old: StripLayout, far: FarCovariances, after: Floats, new: StripLayout
-) -> int:
-    """Copy covariances from one layout to another; return how many are unknown, and so zero."""
-    unknown = 0
-    for k in range(len(new.sizes)):
-        for other in range(k, min(k + 2, len(new.sizes))):
-            for j in new.members[new.first[other] : new.first[other + 1]]:
-                for i in new.members[new.first[k] : new.first[k + 1]]:
-                    to, to_down, to_right = entry(new.covariance, new, COVARIANCE, i, j)
-                    base, down, right = entry(old.covariance, old, COVARIANCE, i, j)
-                    source = before
-                    if base < 0:
-                        source = far.values
-                        si, sj = old.strip[i], old.strip[j]
-                        if far.start[i] >= 0 and far.strip[i] == sj:
-                            base = far.start[i] + old.slot[j]
-                            down, right = 3 * old.sizes[sj], old.sizes[sj]
-                        elif far.start[j] >= 0 and far.strip[j] == si:
-                            base = far.start[j] + old.slot[i]
-                            down, right = old.sizes[si], 3 * old.sizes[si]
-                        else:
-                            unknown += 1
-                    for b in range(3):
-                        for a in range(3):
-                            after[to + to_down * a + to_right * b] = (
-                                source[base + down * a + right * b] if base >= 0 else 0.0
-                            )
-    return unknown
-
-
-@compiled
-def mirror(covariance: Floats, layout: StripLayout) -> None:
-    """Fill the upper halves of the diagonal blocks from the lower ones."""
-    for k in range(len(layout.sizes)):
-        m = 3 * layout.sizes[k]
-        start = layout.covariance.diagonal[k]
-        block = covariance[start : start + m * m].reshape(m, m)
-        # block[column, row], so the lower half is column < row.
-        for column in range(m):
-            for row in range(column + 1, m):
-                block[row, column] = block[column, row]
-
-
-@compiled
-def marginals(covariance: Floats, layout: StripLayout) -> Floats:
-    """Return xx, yy, xy and heading variance of every node: (N, 4)."""
-    result = np.empty((len(layout.strip), 4))
-    for i in range(len(layout.strip)):
-        base, down, right = entry(layout.covariance, layout, COVARIANCE, i, i)
-        result[i, 0] = covariance[base]
-        result[i, 1] = covariance[base + down + right]
-        result[i, 2] = covariance[base + down]
-        result[i, 3] = covariance[base + 2 * (down + right)]
-    return result

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.large_teams import chain, kernels
-from relpos.fusion.large_teams.kernels import FarCovariances, RangeModel
+from relpos.fusion.large_teams.kernels import RangeModel
 from relpos.fusion.large_teams.layout import COVARIANCE, StripLayout, lay_out
 
 Floats = npt.NDArray[np.float64]
@@ -100,13 +100,13 @@ class NeighbourhoodFilter:
             cell = np.floor((along - origin) / self.width_m).astype(np.int64)
             cost = float((np.bincount(cell).astype(float) ** 3).sum())
             if cost < best:
-                best, self._axis, self._origin_m, self._cell = cost, axis, origin, cell
-        self._layout = lay_out(np.unique(self._cell, return_inverse=True)[1].astype(np.int64))
-        self._store(whole)
+                best, self._axis, self._origin_m, chosen = cost, axis, origin, cell
+        self._cut(chosen, whole)
 
-    def _store(self, whole: Floats) -> None:
-        """Cut the blocks from a covariance (3N, 3N) kept node by node."""
-        layout = self._layout
+    def _cut(self, cell: Indices, whole: Floats) -> None:
+        """Put nodes into cells (N,) and cut the blocks from a covariance kept node by node."""
+        layout = lay_out(np.unique(cell, return_inverse=True)[1].astype(np.int64))
+        self._cell, self._layout = cell, layout
         self._covariance = np.empty(layout.covariance.total)
         diagonal, following = layout.views(self._covariance, COVARIANCE)
         states = layout.states()
@@ -116,18 +116,21 @@ class NeighbourhoodFilter:
                 following[k][:] = whole[np.ix_(at, states[k + 1])]
         self._variance = whole.diagonal()[2::3].copy()
 
-    def _dense(self) -> Floats:
-        """Return the whole covariance (3N, 3N), node by node: far blocks by the chain."""
+    def _dense(self, reach: int | None = None) -> Floats:
+        """Return the whole covariance (3N, 3N), node by node: far blocks by the chain.
+
+        With ``reach`` only strips so many apart at most; the other blocks are 0.
+        """
         self._catch_up()
         layout, count = self._layout, self.pose.shape[0]
-        whole = np.empty((3 * count, 3 * count))
+        whole = np.zeros((3 * count, 3 * count))
         diagonal, following = layout.views(self._covariance, COVARIANCE)
         states = layout.states()
         onward = [np.linalg.solve(d, c) for d, c in zip(diagonal[1:], following[1:], strict=False)]
         for k, block in enumerate(diagonal):
             whole[np.ix_(states[k], states[k])] = block
             far = block
-            for q in range(k, len(following)):
+            for q in range(k, len(following) if reach is None else min(k + reach, len(following))):
                 far = following[q] if q == k else far @ onward[q - 1]
                 whole[np.ix_(states[k], states[q + 1])] = far
                 whole[np.ix_(states[q + 1], states[k])] = far.T
@@ -183,7 +186,14 @@ class NeighbourhoodFilter:
     def marginals(self) -> Floats:
         """Return the variances xx, yy, the covariance xy, and the heading's variance: (N, 4)."""
         self._catch_up()
-        return kernels.marginals(self._covariance, self._layout)
+        result = np.empty((self.pose.shape[0], 4))
+        for k, block in enumerate(self._layout.views(self._covariance, COVARIANCE)[0]):
+            n = len(block) // 3
+            x, y = block[:n], block[n : 2 * n, n : 2 * n]
+            result[self._layout.nodes_of(k)] = np.column_stack(
+                (x.diagonal(), y.diagonal(), x.diagonal(n), block.diagonal()[2 * n :])
+            )
+        return result
 
     def inflate(self, nodes: Indices, sigma_m: float, sigma_rad: float) -> None:
         """Add so much to the standard deviations of nodes, independently of all others."""
@@ -202,66 +212,23 @@ class NeighbourhoodFilter:
 
     def _change_strips(self, node: Indices, peer: Indices) -> None:
         """Move nodes to the strip that they walked into; lay out all strips anew if that fails."""
-        layout = self._layout
+        strip = self._layout.strip
         place = (self.pose[:, :2] @ self._axis - self._origin_m) / self.width_m
         lag = place - self._cell
-        apart = np.abs(layout.strip[node] - layout.strip[peer]) > 1
+        apart = np.abs(strip[node] - strip[peer]) > 1
         if not apart.any() and lag.min() >= -SLACK and lag.max() < 1.0 + SLACK:
             return
-        for direction in (1, -1):
-            movers = np.flatnonzero(lag >= 1.0 if direction > 0 else lag < 0.0)
-            if movers.size and not self._shift(movers, direction):
-                self._lay_out(self._dense())
-                self.counters["strips_laid_out"] += 1
-                break
+        cell = np.where((lag < 0.0) | (lag >= 1.0), np.floor(place), self._cell).astype(np.int64)
+        changed = np.abs(cell - self._cell)
+        if np.array_equal(np.unique(cell), np.unique(self._cell)):
+            self._cut(cell, self._dense(1 + 2 * int(changed.max())))
+            self.counters["strips_changed"] += int((changed > 0).sum())
+        else:
+            self._lay_out(self._dense())
+            self.counters["strips_laid_out"] += 1
         apart = np.abs(self._layout.strip[node] - self._layout.strip[peer]) > 1
         if apart.any():
             # A range is longer than a strip is wide.
             off = self.pose[node, :2] - self.pose[peer, :2]
             self.widen(float(np.hypot(off[:, 0], off[:, 1]).max()) + MARGIN_M)
             self.counters["strips_widened"] += 1
-
-    def _shift(self, movers: Indices, direction: int) -> bool:
-        """Move nodes to an adjacent strip; return False if a strip would become empty."""
-        layout = self._layout
-        cell = self._cell.copy()
-        cell[movers] += direction
-        cells, strip = np.unique(cell, return_inverse=True)
-        old_cells = np.unique(self._cell)
-        if not np.isin(old_cells, cells).all() or np.any(np.diff(cells) > 1):
-            return False
-        after = lay_out(strip.astype(np.int64))
-        covariance = np.empty(after.covariance.total)
-        far = self._far_covariances(movers, direction)
-        unknown = kernels.change_layout(self._covariance, layout, far, covariance, after)
-        self._covariance, self._layout, self._cell = covariance, after, cell
-        self.counters["strips_changed"] += int(movers.size)
-        self.counters["covariances_unknown"] += int(unknown)
-        return True
-
-    def _far_covariances(self, movers: Indices, direction: int) -> FarCovariances:
-        """Return the movers' covariances with the strip that becomes adjacent, by the chain."""
-        layout = self._layout
-        diagonal, following = layout.views(self._covariance, COVARIANCE)
-        values, begin = [np.empty(0)], 0
-        far_start = np.full(layout.strip.size, -1)
-        far_strip = np.full(layout.strip.size, -1)
-        at = layout.strip[movers]
-        for k in np.unique(at).tolist():
-            middle, beyond = k + direction, k + 2 * direction
-            if not 0 <= beyond < len(layout.sizes):
-                continue
-            some = movers[at == k]
-            rows = (layout.slot[some] + int(layout.sizes[k]) * np.arange(3)[:, None]).reshape(-1)
-            if direction > 0:
-                near, on = following[k][rows].T, following[middle]
-            else:
-                near, on = following[middle][:, rows], following[beyond].T
-            # Rows (component, mover) become (mover, component).
-            block = chain.far_covariance(near, diagonal[middle], on)
-            block = block.reshape(3, some.size, -1).transpose(1, 0, 2)
-            values.append(block.reshape(-1))
-            far_start[some] = begin + block[0].size * np.arange(some.size)
-            far_strip[some] = beyond
-            begin += block.size
-        return FarCovariances(np.concatenate(values), far_start, far_strip)
