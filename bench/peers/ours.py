@@ -27,7 +27,7 @@ class Joint:
 
     def pose(self) -> Floats:
         """Poses (N, 3)."""
-        return self.core.hypotheses.poses_in(self.rows, np.zeros_like(self.rows))
+        return self.core.hypotheses.poses_of(*self.rows.tolist())[0][0].reshape(-1, 3)
 
     def predict(self, motion: Floats, sigma: Floats) -> None:
         """Move everybody with known noise."""

@@ -8,7 +8,7 @@ from collections import Counter
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.bank import hypothesis_count, mixture, storage
+from relpos.fusion.bank import hypothesis_count, storage
 from relpos.fusion.bank.hypothesis_set import HypothesisSet
 from relpos.fusion.bank.mixture import PERTURBED_LOSS
 from relpos.fusion.bank.storage import PER_NODE, POSE, StateIndex
@@ -42,14 +42,7 @@ class AdaptiveCount:
         most = these.count >= these.settings.hypotheses
         if most and since_fault % hypothesis_count.CHECKED_AFTER == 0:
             self._adapt_ceiling()
-        if most and ambiguous:
-            self.unambiguous = 0
-            return
         unperturbed = these.unperturbed_weights()
-        step_index = self._step_index(unperturbed)
-        if most and step_index > hypothesis_count.LINEAR:
-            self.unambiguous = 0
-            return
         mean, covariance = these.moments(unperturbed, poses_alone=True)
         index = hypothesis_count.nonlinearity_index(
             mean, covariance, self._sigma_range_m(), self._sigma_metre_m()
@@ -57,9 +50,7 @@ class AdaptiveCount:
         if ambiguous or index > hypothesis_count.NONLINEAR:
             self.unambiguous = 0
             self.grow()
-        elif index > hypothesis_count.LINEAR or not self._is_even(
-            covariance, step_index, unperturbed
-        ):
+        elif index > hypothesis_count.LINEAR or not self._is_even(covariance, unperturbed):
             self.unambiguous = 0
         else:
             self.unambiguous += 1
@@ -93,30 +84,21 @@ class AdaptiveCount:
         sigmas: Floats = np.exp(0.5 * self._hypotheses.components.mean[ALONG:-1:COMPONENTS])
         return math.sqrt(ALONG_M2_M) * sigmas
 
-    def _step_index(self, unperturbed: Floats) -> float:
-        """Nonlinearity index of every user's next metre, inf where it is undecided.
-
-        That is where the range variance is not known yet, where few hypotheses count, and where
-        they model different things.
-        """
+    def _is_decided(self) -> bool:
+        """Whether the range variance is known, and most hypotheses count and model the same."""
         these = self._hypotheses
-        if float(these.components.covariance[-1, -1]) > hypothesis_count.KNOWN**2:
-            return math.inf
         weight, effective = these.normalise()
-        if effective < hypothesis_count.EVEN * these.count:
-            return math.inf
         weights = weight.reshape(-1)[: these.count]
         constants, biased = float(weights @ these.has_constants), float(weights @ these.has_bias)
         least = max(min(constants, 1.0 - constants), min(biased, 1.0 - biased))
-        perturbed = float(weights @ (these.perturbed > 0.0))
-        if perturbed > hypothesis_count.PERTURBED_MOST or least > hypothesis_count.UNDECIDED:
-            return math.inf
-        heading = mixture.heading_variances(
-            these.arrays.x, these.arrays.p, unperturbed, these.nodes
+        return (
+            float(these.components.covariance[-1, -1]) <= hypothesis_count.KNOWN**2
+            and effective >= hypothesis_count.EVEN * these.count
+            and float(weights @ (these.perturbed > 0.0)) <= hypothesis_count.PERTURBED_MOST
+            and least <= hypothesis_count.UNDECIDED
         )
-        return float((0.5 * heading / self._sigma_metre_m()).max())
 
-    def _is_even(self, covariance: Floats, step_index: float, unperturbed: Floats) -> bool:
+    def _is_even(self, covariance: Floats, unperturbed: Floats) -> bool:
         """Whether not few hypotheses count and they lie together.
 
         That is where the variances between them, the rest of the mixture's ``covariance`` (D, D),
@@ -132,7 +114,7 @@ class AdaptiveCount:
         inside = np.einsum("bl,bil->i", unperturbed, own)
         between = covariance[poses, poses] - inside
         most = hypothesis_count.APART * drawn * inside + 1e-6
-        return step_index < math.inf and bool((between <= most).all())
+        return self._is_decided() and bool((between <= most).all())
 
     def grow(self) -> None:
         """Have as many hypotheses as may be: fewer are copied, and their headings drawn."""

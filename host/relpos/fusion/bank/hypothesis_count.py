@@ -24,6 +24,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion.bank.mixture import difference
 from relpos.fusion.bank.storage import PER_NODE
 from relpos.fusion.compiled import compiled
 
@@ -107,15 +108,8 @@ def nonlinearity_index(
     greatest, shorter = 0.0, 0.0
     nearest = np.full(nodes, np.inf)
     for a in range(nodes):
-        i = PER_NODE * a
         for b in range(a + 1, nodes):
-            j = PER_NODE * b
-            xx = covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j]
-            yy = covariance[i + 1, i + 1] + covariance[j + 1, j + 1]
-            yy -= 2.0 * covariance[i + 1, j + 1]
-            xy = covariance[i, i + 1] + covariance[j, j + 1]
-            xy -= covariance[i, j + 1] + covariance[j, i + 1]
-            ux, uy = mean[j] - mean[i], mean[j + 1] - mean[i + 1]
+            ux, uy, xx, yy, xy = difference(mean, covariance, a, b)
             distance2 = max(ux * ux + uy * uy, 1e-6)
             across = (uy * uy * xx - 2.0 * ux * uy * xy + ux * ux * yy) / distance2
             greatest = max(greatest, max(across, 0.0) / (2.0 * math.sqrt(distance2)))

@@ -168,42 +168,10 @@ class HypothesisSet:
         block, lane = self._at(which)
         self.arrays.x[block, self._place(row, entry), lane] += by
 
-    def set_all(self, row: int, entry: int, values: Floats) -> None:
-        """Set an entry of a user to ``values`` (K,)."""
-        self.arrays.x[:, self._place(row, entry)] = storage.lay_out(values)
-
     def inflate(self, row: int, entry: int, variance: float, which: Indices | None = None) -> None:
         """Add to the variance of an entry of a user in the hypotheses ``which``, or in all."""
         place, (block, lane) = self._place(row, entry), self._at(which)
         self.arrays.p[block, storage.triangle_place(place, place), lane] += variance
-
-    def decorrelate(self, row: int, entry: int, which: Indices | None = None) -> None:
-        """Set all covariances of an entry to zero in the hypotheses ``which``, or in all."""
-        block, lane = self._at(which)
-        others = storage.triangle_place(self._place(row, entry), np.arange(self.arrays.x.shape[1]))
-        self.arrays.p[block[:, None], others, lane[:, None]] = 0.0
-
-    def poses_in(self, rows: Indices, which: Indices) -> Floats:
-        """Poses (M, 3) of users ``rows`` (M,) or (1,) in the hypotheses ``which`` (M,)."""
-        places = storage.POSE * rows[:, None] + np.arange(storage.POSE)
-        poses: Floats = self.arrays.x[which[:, None] // LANES, places, which[:, None] % LANES]
-        return poses
-
-    def set_poses(self, row: int, which: Indices, poses: Floats) -> None:
-        """Set a user's poses (M, 3) in the hypotheses ``which`` (M,)."""
-        places = storage.POSE * np.array([[row]]) + np.arange(storage.POSE)
-        self.arrays.x[which[:, None] // LANES, places, which[:, None] % LANES] = poses
-
-    def set_covariances(
-        self, row: int, entries: tuple[int, ...], which: Indices, covariances: Floats
-    ) -> None:
-        """Set covariances (M, 3, 3) of a user's ``entries`` alone; they correlate with no other."""
-        for entry in entries:
-            self.decorrelate(row, entry, which)
-        for a in entries:
-            for b in entries:
-                place = storage.triangle_place(self._place(row, a), self._place(row, b))
-                self.arrays.p[which // LANES, place, which % LANES] = covariances[:, a, b]
 
     # -- adding --------------------------------------------------------------------------------
 
@@ -274,15 +242,19 @@ class HypothesisSet:
         """
         order = self.rng.permutation(self.count)
         width = 2.0 * math.pi / self.count
-        self.set_all(row, StateIndex.HEADING, width * (order + self.rng.random(self.count)))
-        self.decorrelate(row, StateIndex.HEADING)
-        self.inflate(row, StateIndex.HEADING, max(1.5 * width, 0.12) ** 2)
-        for entry in (StateIndex.X, StateIndex.Y):
-            self.inflate(row, entry, 0.5 * moved_m**2)
+        x, p = self.dense()
+        heading = PER_NODE * row + StateIndex.HEADING
+        x[:, heading] = width * (order + self.rng.random(self.count))
+        p[:, heading] = p[:, :, heading] = 0.0
+        p[:, heading, heading] = max(1.5 * width, 0.12) ** 2
+        for place in (PER_NODE * row + StateIndex.X, PER_NODE * row + StateIndex.Y):
+            p[:, place, place] += 0.5 * moved_m**2
+        self.store(x, p)
 
     def set_scale(self, row: int, scale: float) -> None:
         """Start a user's step scale (true over reported) where it is modelled."""
-        self.set_all(row, StateIndex.SCALE, self.has_constants * math.log(scale))
+        scales = storage.lay_out(self.has_constants * math.log(scale))
+        self.arrays.x[:, self._place(row, StateIndex.SCALE)] = scales
 
     def bias_entries(self, first: Indices, second: Indices) -> Indices:
         """Entries of the state that hold the biases of ranges; those of new pairs are added.

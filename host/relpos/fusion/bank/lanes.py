@@ -133,17 +133,6 @@ _operation(operator.gt, lambda b, x, y: b.fcmp_ordered(">", x, y), _mask)
 _operation(operator.lt, lambda b, x, y: b.fcmp_ordered("<", x, y), _mask)
 
 
-@infer_global(operator.and_)
-class _And(AbstractTemplate):
-    def generic(self, args: Any, kws: Any) -> Any:
-        return signature(_mask, *args) if args == (_mask, _mask) else None
-
-
-@lower_builtin(operator.and_, _MaskType, _MaskType)
-def _lower_and(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    return builder.and_(*args)
-
-
 def _intrinsic(made: Callable[..., Any]) -> Callable[..., Any]:
     """Teach numba a function: ``made`` gives its signature and what emits its instructions."""
     return cast(Callable[..., Any], intrinsic(made))
@@ -347,5 +336,5 @@ def cos_sin(x: Lanes) -> tuple[Lanes, Lanes]:
     quarter = n - 4.0 * floor(0.25 * n)
     odd = (quarter - 2.0 * floor(0.5 * quarter)) > 0.5
     c, s = select(odd, sine, cosine), select(odd, cosine, sine)
-    turned = (quarter > 0.5) & (quarter < 2.5)
-    return select(turned, 0.0 - c, c), select(quarter > 1.5, 0.0 - s, s)
+    off = quarter - 1.5
+    return select(off * off < 1.0, 0.0 - c, c), select(quarter > 1.5, 0.0 - s, s)

@@ -11,7 +11,7 @@ from relpos.fusion.bank import lanes
 from relpos.fusion.bank.lanes import LANES, fill, greater, load, store
 from relpos.fusion.bank.range_update import predict_range
 from relpos.fusion.bank.storage import PER_NODE, POSE, Block, row_place
-from relpos.fusion.compiled import compiled
+from relpos.fusion.compiled import compiled, inner
 from relpos.fusion.estimator import ANY_ANGLE_RAD
 
 Floats = npt.NDArray[np.float64]
@@ -44,31 +44,6 @@ def normalise(log_weight: Floats, count: int, weight: Floats) -> float:
         weights[k] /= total
         squares += weights[k] * weights[k]
     return 1.0 / squares
-
-
-@compiled
-def heading_variances(x: Floats, p: Floats, weight: Floats, nodes: int) -> Floats:
-    """Give the variances (N,) of headings in the mixture, by ``weight`` (B, LANES)."""
-    blocks, size = x.shape[0], x.shape[1]
-    turn = 2.0 * math.pi
-    given = np.empty(nodes)
-    for n in range(nodes):
-        h = POSE * n + 2
-        own = row_place(h) + h
-        about = x[0, h, 0]
-        middle = fill(0.0)
-        for b in range(blocks):
-            off = load(x, b * size + h) - about
-            off = off - turn * lanes.floor(off * (1.0 / turn) + 0.5)
-            middle = middle + load(weight, b) * off
-        mean = lanes.total(middle)
-        spread = fill(0.0)
-        for b in range(blocks):
-            off = load(x, b * size + h) - about
-            off = off - turn * lanes.floor(off * (1.0 / turn) + 0.5) - mean
-            spread = spread + load(weight, b) * (load(p, b * p.shape[1] + own) + off * off)
-        given[n] = lanes.total(spread)
-    return given
 
 
 @compiled
@@ -163,6 +138,18 @@ def moments(
     return mean, cov
 
 
+@inner
+def difference(
+    mean: Floats, covariance: Floats, a: int, b: int
+) -> tuple[float, float, float, float, float]:
+    """Return where user ``b`` is from ``a``, east and north, and its covariance xx, yy, xy."""
+    i, j = PER_NODE * a, PER_NODE * b
+    xx = covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j]
+    yy = covariance[i + 1, i + 1] + covariance[j + 1, j + 1] - 2.0 * covariance[i + 1, j + 1]
+    xy = covariance[i, i + 1] + covariance[j, j + 1] - (covariance[i, j + 1] + covariance[i + 1, j])
+    return mean[j] - mean[i], mean[j + 1] - mean[i + 1], xx, yy, xy
+
+
 @compiled
 def pairs(mean: Floats, covariance: Floats, rows: Indices) -> Floats:
     """Give (P, 4) of every two of the users ``rows`` (N,), by the mixture's moments (D,), (D, D).
@@ -174,15 +161,8 @@ def pairs(mean: Floats, covariance: Floats, rows: Indices) -> Floats:
     result = np.empty((several * (several - 1) // 2, 4))
     n = 0
     for a in range(several):
-        i = PER_NODE * rows[a]
         for b in range(a + 1, several):
-            j = PER_NODE * rows[b]
-            east, north = mean[j] - mean[i], mean[j + 1] - mean[i + 1]
-            xx = covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j]
-            yy = covariance[i + 1, i + 1] + covariance[j + 1, j + 1]
-            yy -= 2.0 * covariance[i + 1, j + 1]
-            xy = covariance[i, i + 1] + covariance[j, j + 1]
-            xy -= covariance[i, j + 1] + covariance[i + 1, j]
+            east, north, xx, yy, xy = difference(mean, covariance, rows[a], rows[b])
             square = east * east + north * north
             along, sideways = 0.5 * (xx + yy), ANY_ANGLE_RAD
             if square > 0.0:

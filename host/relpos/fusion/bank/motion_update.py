@@ -317,17 +317,6 @@ def _move_others(block: Block, moved: Floats, nodes: int, row: int) -> None:
     east, north, time = load(moved, m), load(moved, m + 1), load(moved, m + 4)
     drift_x, drift_y = load(moved, m + 2), load(moved, m + 3)
     r_x, r_y, r_h = base + row_place(px), base + row_place(px + 1), base + row_place(px + 2)
-    if active == POSE * nodes:
-        for q in range(px):
-            h = load(p, r_h + q)
-            store(p, r_x + q, load(p, r_x + q) - north * h)
-            store(p, r_y + q, load(p, r_y + q) + east * h)
-        for q in range(px + POSE, active):
-            at = base + row_place(q) + px
-            h = load(p, at + 2)
-            store(p, at, load(p, at) - north * h)
-            store(p, at + 1, load(p, at + 1) + east * h)
-        return
     r_w, r_s = base + row_place(pw), base + row_place(pw + 1)
     for q in range(active):
         if px <= q < px + POSE or pw <= q <= pw + 1:

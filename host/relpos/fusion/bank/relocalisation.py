@@ -116,13 +116,18 @@ class Relocalisation:
         sights = np.flatnonzero((first == row) | (second == row))
         sight = sights[np.arange(len(which)) % len(sights)]
         peer = np.where(first[sight] == row, second[sight], first[sight])
-        old = these.poses_in(np.array([row]), which)
-        peers = these.poses_in(peer, which)[:, :2]
-        made = perturb(old, peers, range_m[sight], place_m, these.rng)
-        these.set_poses(row, which, made.poses)
+        x, p = these.dense()
+        own, at = PER_NODE * row + np.arange(3), which[:, None]
+        peers = x[at, PER_NODE * peer[:, None] + np.arange(2)]
+        made = perturb(x[at, own], peers, range_m[sight], place_m, these.rng)
+        x[at, own] = made.poses
         # What was lost is no longer correlated with anything else.
-        for perturbed, part in ((~made.kept[:, 0], (0, 1)), (~made.kept[:, 1], (2,))):
-            these.set_covariances(row, part, which[perturbed], made.covariances[perturbed])
+        for kept, part in zip(made.kept.T, (np.array([0, 1]), np.array([2])), strict=True):
+            some = which[~kept]
+            p[np.ix_(some, own[part])] = 0.0
+            p[some[:, None], :, own[part]] = 0.0
+            p[np.ix_(some, own[part], own[part])] = made.covariances[~kept][:, part[:, None], part]
+        these.store(x, p)
         # Neither the perturbed nor the others may say how noisy anything is.
         these.perturbed[:] = FAULT_UPDATES
 
