@@ -121,7 +121,7 @@ class Rewinder:
             self._newest_s = measurement.time_s
         timeline = self.timeline
         certain = timeline.take_in(measurement)
-        if timeline.is_late:
+        if timeline.late:
             self._note_late()
         if self._back_to_s == math.inf:
             if not certain and self._rest is None:
@@ -151,7 +151,8 @@ class Rewinder:
 
     def _note_late(self) -> None:
         """Find out whether to go back, and to what time."""
-        for late in self.timeline.take_late():
+        late_ones, self.timeline.late = self.timeline.late, []
+        for late in late_ones:
             oldest_s = self._copies[0].frontier_s
             if late.time_s <= oldest_s:
                 continue  # too late for all of it
@@ -171,7 +172,7 @@ class Rewinder:
         self.core = self._copy_of(copy.core)
         since = self._history[copy.pushed - self._forgotten :]
         steps = self.timeline.push_all(since, final=final)
-        self.timeline.take_late()  # behind the copy as well
+        self.timeline.late.clear()  # behind the copy as well
         self._replaying = True
         yield from self._work_off(steps, math.inf if final else self.most_s)
 

@@ -175,8 +175,8 @@ class Timeline:
     time from which a node's first motion counts; ``reorder_s`` is how long everything is held
     back for what is still under way (in measurement time, so that a recording pays nothing for
     it); ``max_lag_s`` is how long a silent node is waited for; ``lazy`` see above.
-    ``counters`` tells what was dropped or came late, by name; with ``keep_late`` ``take_late``
-    tells when.
+    ``counters`` tells what was dropped or came late, by name; with ``keep_late`` ``late`` tells
+    when.
     """
 
     nodes: Iterable[int] = ()
@@ -186,6 +186,10 @@ class Timeline:
     keep_late: bool = False
     lazy: bool = False
     counters: Counter[str] = field(default_factory=Counter)
+    frontier_s: float = -inf
+    """Everything up to here has been handed out; ``-inf`` before the first step."""
+    late: list[Late] = field(default_factory=list)
+    """What came behind the frontier, where ``keep_late``; its reader clears it."""
     _tracks: dict[int, _Track] = field(default_factory=dict)
     _arrived: list[tuple[float, int, Measurement]] = field(default_factory=list)
     """What is not sorted in yet, as it came."""
@@ -195,11 +199,9 @@ class Timeline:
     """What is, in order of time."""
     _pushed: int = 0
     _newest_s: float = -inf
-    _frontier_s: float = -inf
     _ranged: set[tuple[int, int]] = field(default_factory=set)
     _reported: set[int] = field(default_factory=set)
     _epoch_s: float = -inf
-    _late: list[Late] = field(default_factory=list)
     _slowest: _Track | None = None
     """Who was waited for last."""
     _sorted_nodes: list[int] = field(default_factory=list)
@@ -212,16 +214,6 @@ class Timeline:
         """Time of the node's newest motion; ``-inf`` where it never reported any."""
         track = self._tracks.get(node)
         return track.reported_s if track is not None and track.has_reported else -inf
-
-    @property
-    def frontier_s(self) -> float:
-        """Everything up to here has been handed out; ``-inf`` before the first step."""
-        return self._frontier_s
-
-    @property
-    def newest_s(self) -> float:
-        """Time of the newest measurement."""
-        return self._newest_s
 
     def push(self, measurement: Measurement) -> list[Step]:
         """Take one measurement; return what has become certain, in order."""
@@ -273,19 +265,6 @@ class Timeline:
         if time_s > self._newest_s:
             self._newest_s = time_s
 
-    @property
-    def is_late(self) -> bool:
-        """Whether ``take_late`` has anything to give."""
-        return bool(self._late)
-
-    def take_late(self) -> list[Late]:
-        """Give, once, what came behind the frontier since it was last asked for.
-
-        Kept only where ``keep_late``.
-        """
-        late, self._late = self._late, []
-        return late
-
     def snapshot(self) -> Timeline:
         """Give a copy that goes on by itself."""
         return replace(
@@ -298,7 +277,7 @@ class Timeline:
             _ordered=self._ordered[:],
             _ranged=self._ranged.copy(),
             _reported=self._reported.copy(),
-            _late=self._late[:],
+            late=self.late[:],
         )
 
     def finish(self) -> list[Step]:
@@ -307,7 +286,7 @@ class Timeline:
 
     def _end(self) -> Iterator[Step]:
         last = max((t.reported_s for t in self._tracks.values() if t.has_reported), default=-inf)
-        last = max(last, self._frontier_s)
+        last = max(last, self.frontier_s)
         # A displacement that came late may still lie behind the frontier.
         rest = list(self._advance_all(last))
         yield from rest
@@ -334,11 +313,11 @@ class Timeline:
             time_s, _, measurement = entry
             if isinstance(measurement, Motion):
                 self._take_motion(measurement)
-            elif time_s <= self._frontier_s:
+            elif time_s <= self.frontier_s:
                 if self.keep_late:
                     # Behind the frontier or at it: the rest of its instant was handed out.
-                    self._late.append(Late(nextafter(time_s, -inf), time_s))
-                if time_s < self._frontier_s:
+                    self.late.append(Late(nextafter(time_s, -inf), time_s))
+                if time_s < self.frontier_s:
                     name = "ranges" if isinstance(measurement, Range) else "sensed"
                     self.counters[f"{name}_late"] += 1
                     continue
@@ -365,10 +344,10 @@ class Timeline:
             begin_s = chords[place - 1].time_s if placed and place else track.reached_s
             if not placed:
                 begin_s = -inf
-        if motion.time_s < self._frontier_s or not placed:
+        if motion.time_s < self.frontier_s or not placed:
             self.counters["motions_late"] += 1
-        if begin_s < self._frontier_s and self.keep_late:
-            self._late.append(Late(begin_s, motion.time_s))
+        if begin_s < self.frontier_s and self.keep_late:
+            self.late.append(Late(begin_s, motion.time_s))
         if not track.has_reported:
             # A run may begin a little before zero: then nothing is known before the first motion.
             track.reached_s = min(track.reached_s, motion.time_s)
@@ -386,7 +365,7 @@ class Timeline:
             motions: set[int] = set()
             ranges: list[Range] = []
             sensed: list[Height | Heading] = []
-            if time_s > self._frontier_s:
+            if time_s > self.frontier_s:
                 self._ranged.clear()
             count = 0
             for entry_s, _, measurement in ordered:
@@ -406,11 +385,11 @@ class Timeline:
                 sensed.sort(key=_sensed_order)
             closes = self._closes_epoch(time_s, motions)
             if ranges or sensed or closes:
-                time_s = max(time_s, self._frontier_s)
+                time_s = max(time_s, self.frontier_s)
                 if closes or not self.lazy:
                     yield from self._advance_all(time_s)
                 else:
-                    self._frontier_s = time_s
+                    self.frontier_s = time_s
                     concerned = {n for r in ranges for n in (r.node, r.peer)}
                     # A height says nothing of where anybody is.
                     concerned |= {m.node for m in sensed if isinstance(m, Heading)}
@@ -468,11 +447,11 @@ class Timeline:
         for node in sorted(nodes):
             track = self._tracks.get(node)
             if track is not None:
-                _advance(track, node, min(time_s, self._frontier_s), steps)
+                _advance(track, node, min(time_s, self.frontier_s), steps)
         return steps
 
     def _advance_all(self, time_s: float) -> list[Advance]:
-        self._frontier_s = max(self._frontier_s, time_s)
+        self.frontier_s = max(self.frontier_s, time_s)
         steps: list[Advance] = []
         for node in self._sorted_nodes:
             _advance(self._tracks[node], node, time_s, steps)
@@ -485,7 +464,7 @@ def _advance(track: _Track, node: int, until_s: float, steps: list[Advance]) -> 
     while chords:
         chord = chords[0]
         end_s, reached_s = chord.time_s, track.reached_s
-        left = track.left
+        piece, share = track.left or (Displacement(chord.dx_m, chord.dy_m, chord.dtheta_rad), 1.0)
         if end_s <= until_s:
             chords.popleft()
             track.left = None
@@ -498,37 +477,22 @@ def _advance(track: _Track, node: int, until_s: float, steps: list[Advance]) -> 
         else:
             end_s, duration_s = until_s, until_s - reached_s
             cut = duration_s / (chord.time_s - reached_s)
-            if left is None:
-                left = Displacement(chord.dx_m, chord.dy_m, chord.dtheta_rad), 1.0
-            whole, whole_share = left
-            piece, rest = whole.split(cut)
-            share = cut * whole_share
-            left = piece, share
-            track.left = rest, whole_share - share
+            piece, rest = piece.split(cut)
+            share, rest_share = cut * share, share - cut * share
+            track.left = rest, rest_share
             track.reached_s = until_s
-        if left is None:
-            moved = chord.dx_m, chord.dy_m, chord.dtheta_rad, 1.0
-        else:
-            moved = left[0].dx_m, left[0].dy_m, left[0].dtheta_rad, left[1]
-        if (
-            chord.sigma_x_m is chord.sigma_y_m is chord.sigma_theta_rad is None
-            and chord.sigma_x_alone_m is None
-        ):
-            steps.append(_new(Advance, (end_s, node, duration_s, *moved, *_UNTOLD)))
-            continue
-        part = sqrt(moved[3])
+        part = sqrt(share)
         sigmas = (
             None if sigma is None else sigma * part
             for sigma in (
                 chord.sigma_x_m, chord.sigma_y_m, chord.sigma_theta_rad, chord.sigma_x_alone_m,
             )
         )  # fmt: skip
-        steps.append(_new(Advance, (end_s, node, duration_s, *moved, *sigmas)))
+        steps.append(
+            Advance(
+                end_s, node, duration_s, piece.dx_m, piece.dy_m, piece.dtheta_rad, share, *sigmas
+            )
+        )
 
-
-_new = tuple.__new__
-"""Makes a named tuple in half the time that its own constructor takes."""
-
-_UNTOLD = (None, None, None, None)
 
 _time_of = itemgetter(0)
