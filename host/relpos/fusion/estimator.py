@@ -33,6 +33,13 @@ class NodeStatus(StrEnum):
     LOST = "lost"
 
 
+def ellipse_axes(xx: float, yy: float, xy: float) -> tuple[float, float, float]:
+    """Return a covariance's deviations along its long and short axis, and the long one's angle."""
+    middle, radius = 0.5 * (xx + yy), hypot(0.5 * (xx - yy), xy)
+    major, minor = sqrt(max(middle + radius, 0.0)), sqrt(max(middle - radius, 0.0))
+    return major, minor, 0.5 * atan2(2.0 * xy, xx - yy)
+
+
 @dataclass(frozen=True, slots=True)
 class NodeEstimate:
     """One node's pose in the common frame: world axes, metres, radians counter-clockwise.
@@ -54,25 +61,20 @@ class NodeEstimate:
     z_m: float = 0.0
     sigma_z_m: float = 0.0
 
-    def _semi_axes(self) -> tuple[float, float]:
-        middle = 0.5 * (self.variance_x_m2 + self.variance_y_m2)
-        radius = hypot(0.5 * (self.variance_x_m2 - self.variance_y_m2), self.covariance_xy_m2)
-        return sqrt(max(middle + radius, 0.0)), sqrt(max(middle - radius, 0.0))
-
     @property
     def sigma_major_m(self) -> float:
         """Standard deviation along the ellipse's long axis."""
-        return self._semi_axes()[0]
+        return ellipse_axes(self.variance_x_m2, self.variance_y_m2, self.covariance_xy_m2)[0]
 
     @property
     def sigma_minor_m(self) -> float:
         """Standard deviation along the ellipse's short axis."""
-        return self._semi_axes()[1]
+        return ellipse_axes(self.variance_x_m2, self.variance_y_m2, self.covariance_xy_m2)[1]
 
     @property
     def sigma_angle_rad(self) -> float:
         """Direction of the long axis, counter-clockwise from world x, in (-pi/2, pi/2]."""
-        return 0.5 * atan2(2.0 * self.covariance_xy_m2, self.variance_x_m2 - self.variance_y_m2)
+        return ellipse_axes(self.variance_x_m2, self.variance_y_m2, self.covariance_xy_m2)[2]
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.estimator import ANY_ANGLE_RAD, MAX_ALTERNATIVES, Alternative, Shape
+from relpos.fusion.estimator import (
+    ANY_ANGLE_RAD,
+    MAX_ALTERNATIVES,
+    Alternative,
+    Shape,
+    ellipse_axes,
+)
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.intp]
@@ -81,7 +87,7 @@ def alternatives_of(
             else:
                 mean, spread = _moments(share, places, covariance)
                 x, y = mean
-                major, minor, angle = _axes(spread)
+                major, minor, angle = ellipse_axes(spread[0, 0], spread[1, 1], spread[0, 1])
             rows.append(
                 Alternative(
                     time_s, rank, float(probability[g]), node, float(x), float(y), heading,
@@ -134,7 +140,7 @@ def belief_of(
     _, sigma = _heading(weights, poses[:, 2], covariances[:, 2, 2])
     return Belief(
         float(mean[0]), float(mean[1]), heading, total, sigma, weight,
-        float(_axes(spread)[0]),
+        ellipse_axes(spread[0, 0], spread[1, 1], spread[0, 1])[0],
     )  # fmt: skip
 
 
@@ -176,15 +182,6 @@ def _moments(weights: Floats, places: Floats, covariances: Floats) -> tuple[Floa
     spread = np.einsum("k,kab->ab", weights, covariances)
     spread += np.einsum("k,ka,kb->ab", weights, off, off)
     return mean, spread
-
-
-def _axes(covariance: Floats) -> tuple[float, float, float]:
-    """Standard deviations along the long and the short axis, and the long one's direction."""
-    xx, yy, xy = covariance[0, 0], covariance[1, 1], covariance[0, 1]
-    middle, radius = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
-    major = math.sqrt(max(middle + radius, 0.0))
-    minor = math.sqrt(max(middle - radius, 0.0))
-    return major, minor, 0.5 * math.atan2(2.0 * xy, xx - yy)
 
 
 def _circle(

@@ -92,8 +92,6 @@ class Bank:
     _pending: list[Advance] = field(default_factory=list)
     _counters: Counter[str] = field(default_factory=Counter)
     _moved: bool = False
-    _heights: bool = False
-    """Whether any height is known; all are 0 else."""
     _ranges_used: int = 0
     _epoch_s: float = -math.inf
 
@@ -171,7 +169,6 @@ class Bank:
             worn = self.mounting.get(node)
             if worn is not None and worn.height_m is not None:
                 known.worn_m = known.height_m = worn.height_m
-                self._heights = True
         return known
 
     def _lever_m(self, node: int) -> tuple[float, float]:
@@ -365,8 +362,6 @@ class Bank:
         row, known = self._row, self._known
         rows = np.array([(row[a], row[b]) for a, b in pairs], dtype=np.int64).reshape(-1, 2)
         first, second = np.ascontiguousarray(rows.T)
-        if not self._heights:
-            return first, second, np.zeros(len(rows))
         dz = np.array([known[b].height_m - known[a].height_m for a, b in pairs])
         return first, second, dz
 
@@ -393,7 +388,6 @@ class Bank:
         measured = step.measurement
         if isinstance(measured, Height):
             known = self._known[measured.node]
-            self._heights = True
             known.height_m = known.worn_m + measured.height_m
             known.sigma_height_m = measured.sigma_m or 0.0
         elif isinstance(measured, Heading) and measured.node in self._row:

@@ -169,47 +169,41 @@ class Report:
 
     # -- sought nodes --------------------------------------------------------------------------
 
+    def _whole_team(self, mixture: PoseMixture) -> tuple[list[int], Floats, Floats]:
+        """Return sought and then located nodes, poses (K, N, 3), covariances (K, N, 2, 2)."""
+        sought, located = len(mixture.nodes), sorted(self.row)
+        nodes = [*mixture.nodes, *located]
+        poses = np.zeros((len(mixture.weights), len(nodes), 3))
+        spread = np.zeros((len(mixture.weights), len(nodes), 2, 2))
+        poses[:, :sought] = mixture.poses
+        for i in range(sought):
+            spread[:, i] = mixture.covariances[:, 3 * i : 3 * i + 2, 3 * i : 3 * i + 2]
+        for i, node in enumerate(located, sought):
+            at = PER_NODE * self.row[node]
+            poses[:, i] = self.mean[at : at + 3]
+            spread[:, i] = self.covariance[at : at + 2, at : at + 2]
+        return nodes, poses, spread
+
     def _sought_pairs(self, mixture: PoseMixture) -> list[PairEstimate]:
         """Pairs with at least one node whose initial pose is unknown: moments over all modes."""
-        places = {n: mixture.poses[:, i, :2] for i, n in enumerate(mixture.nodes)}
-        columns = {n: slice(3 * i, 3 * i + 2) for i, n in enumerate(mixture.nodes)}
-        pairs = []
-        for a, b in combinations(sorted([*self.row, *mixture.nodes]), 2):
-            if a in self.row and b in self.row:
+        nodes, poses, spread = self._whole_team(mixture)
+        sought, pairs = len(mixture.nodes), []
+        for i, j in combinations(sorted(range(len(nodes)), key=nodes.__getitem__), 2):
+            if min(i, j) >= sought:
                 continue
-            total: Floats = np.zeros((len(mixture.weights), 2, 2))
-            ends = []
-            for node in (a, b):
-                if node in self.row:
-                    at = PER_NODE * self.row[node]
-                    ends.append(self.mean[None, at : at + 2])
-                    total = total + self.covariance[at : at + 2, at : at + 2]
-                else:
-                    own = columns[node]
-                    ends.append(places[node])
-                    total = total + mixture.covariances[:, own, own]
-            if a in columns and b in columns:
-                cross = mixture.covariances[:, columns[a], columns[b]]
+            total = spread[:, i] + spread[:, j]
+            if max(i, j) < sought:
+                cross = mixture.covariances[:, 3 * i : 3 * i + 2, 3 * j : 3 * j + 2]
                 total = total - cross - cross.transpose(0, 2, 1)
-            pairs.append(_pair_of_mixture(a, b, mixture.weights, ends[1] - ends[0], total))
+            off = poses[:, j, :2] - poses[:, i, :2]
+            pairs.append(_pair_of_mixture(nodes[i], nodes[j], mixture.weights, off, total))
         return pairs
 
     def _sought_alternatives(self, mixture: PoseMixture) -> tuple[Alternative, ...]:
         """List the modes of the whole team while a node's initial pose is unknown."""
         if set(mixture.nodes) <= self.initialiser.resolved:
             return ()
-        count, sought = len(mixture.weights), len(mixture.nodes)
-        located = sorted(self.row)
-        nodes = [*mixture.nodes, *located]
-        poses = np.zeros((count, len(nodes), 3))
-        spread = np.zeros((count, len(nodes), 2, 2))
-        poses[:, :sought] = mixture.poses
-        for i in range(sought):
-            spread[:, i] = mixture.covariances[:, 3 * i : 3 * i + 2, 3 * i : 3 * i + 2]
-        for i, node in enumerate(located):
-            at = PER_NODE * self.row[node]
-            poses[:, sought + i] = self.mean[at : at + 3]
-            spread[:, sought + i] = self.covariance[at : at + 2, at : at + 2]
+        nodes, poses, spread = self._whole_team(mixture)
         return alternatives_of(self.time_s, nodes, mixture.weights, poses, spread)
 
 
