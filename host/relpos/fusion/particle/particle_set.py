@@ -98,9 +98,8 @@ class ParticleSet:
                 uniforms,
             )  # fmt: skip
         self.weights, self._corrected = corrected, self.weights
-        sizes = np.empty(rows)
-        kernels.effective_sizes(corrected, sizes)
-        low = np.flatnonzero(sizes < 0.5 * self.size)
+        effective_sizes = 1.0 / np.einsum("km,km->k", corrected, corrected)
+        low = np.flatnonzero(effective_sizes < 0.5 * self.size)
         if low.size:
             kernels.resample(self.poses, self.weights, low, self._uniforms(low.size, self.size + 1))
             self.resampled += int(low.size)
