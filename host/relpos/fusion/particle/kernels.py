@@ -125,16 +125,29 @@ def means(poses: Floats, weights: Floats, result: Floats) -> None:
         result[0, k], result[1, k] = at_x, at_y
 
 
+@compiled
 def sort_by_node(first: Indices, second: Indices, rows: int) -> tuple[Indices, Indices, Indices]:
     """Sort the ranges between ``first`` and ``second`` (R,) by node, each range once for either.
 
     Returns ``offset`` (rows + 1,), ``peer`` (E,) and ``which`` (E,): the entries offset[k] to
     offset[k + 1] are the ranges ``which`` of node k to the nodes ``peer``.
     """
-    nodes, peers = np.concatenate((first, second)), np.concatenate((second, first))
-    order = np.lexsort((np.tile(np.arange(len(first)), 2), nodes))
-    offset = np.searchsorted(nodes[order], np.arange(rows + 1))
-    return offset, peers[order], order % len(first)
+    offset = np.zeros(rows + 1, dtype=np.int64)
+    for r in range(first.shape[0]):
+        offset[first[r] + 1] += 1
+        offset[second[r] + 1] += 1
+    for k in range(rows):
+        offset[k + 1] += offset[k]
+    place = offset[:rows].copy()
+    peer = np.empty(offset[rows], dtype=np.int64)
+    which = np.empty(offset[rows], dtype=np.int64)
+    for r in range(first.shape[0]):
+        a, b = first[r], second[r]
+        peer[place[a]], which[place[a]] = b, r
+        place[a] += 1
+        peer[place[b]], which[place[b]] = a, r
+        place[b] += 1
+    return offset, peer, which
 
 
 @compiled
