@@ -107,12 +107,17 @@ def _harmonics(values: FloatArray, step_hz: float, rate_hz: float) -> FloatArray
     )
 
 
+def read_samples(folder: Path) -> tuple[FloatArray, FloatArray]:
+    """Times (n,) of a run's inertial samples and (n, 9): force, rate, field."""
+    raw = np.loadtxt(folder / "imu.csv.gz", delimiter=",", skiprows=1)
+    return raw[:, 0], raw[:, 2:11]
+
+
 def recorded_walk(folder: Path) -> GaitStatistics | None:
     """Statistics of a recording's walking part; None where there is less than 8 s of it."""
-    table = np.genfromtxt(folder / "imu.csv.gz", delimiter=",", names=True)
-    rate_hz = 1.0 / float(np.median(np.diff(table["time_s"])))
-    force = np.column_stack([table[f"a{axis}_m_s2"] for axis in "xyz"])
-    rate = np.column_stack([table[f"g{axis}_rad_s"] for axis in "xyz"])
+    time_s, values = read_samples(folder)
+    rate_hz = 1.0 / float(np.median(np.diff(time_s)))
+    force, rate = values[:, :3], values[:, 3:6]
     norm = np.linalg.norm(force, axis=1)
     # Walking: the norm moves by more than 0.7 m/s2 rms within two seconds.
     kernel = np.ones(round(2 * rate_hz)) / round(2 * rate_hz)
@@ -185,9 +190,8 @@ def recorded_gains(folder: Path) -> FloatArray:
         out = contacts[contacts < turn]
         if "stature_m" not in about or len(out) < 8:
             continue
-        table = np.genfromtxt(run / "imu.csv.gz", delimiter=",", names=True)
-        part = (table["time_s"] > out[1]) & (table["time_s"] < out[-1])
-        force = np.column_stack([table[f"a{axis}_m_s2"][part] for axis in "xyz"])
+        time_s, values = read_samples(run)
+        force = values[(time_s > out[1]) & (time_s < out[-1]), :3]
         step_hz = (len(out) - 2) / (out[-1] - out[1])
         length = 20.0 / len(contacts)
         rise, gain = apparent_gain(force, 100.0, step_hz, length, 0.53 * about["stature_m"])

@@ -26,6 +26,7 @@ from gait_statistics import (
     data_folder,
     gait_statistics,
     print_statistics,
+    read_samples,
     recorded_walk,
 )
 from relpos.calibration.steps import LEG_OF_STATURE
@@ -41,12 +42,6 @@ from wearers.wearer import make_wearer
 
 LOWER_BACK = "walk_lowerback_20m"
 STAND = Activity("stand", seconds=4.0)
-
-
-def _read(folder: Path) -> tuple[FloatArray, FloatArray]:
-    """Times (n,) from the first sample on and (n, 9): force, rate, field."""
-    raw = np.genfromtxt(folder / "imu.csv.gz", delimiter=",", skip_header=1)
-    return np.asarray(raw[:, 0]), np.asarray(raw[:, 2:11])
 
 
 def _events(folder: Path) -> list[tuple[float, str, str]]:
@@ -120,7 +115,7 @@ def recorded_excursions(folder: Path) -> Excursions:
         out = contacts[contacts < turn]
         if "stature_m" not in about or len(out) < 8:
             continue
-        time_s, values = _read(run)
+        time_s, values = read_samples(run)
         part = (time_s > out[1]) & (time_s < out[-1])
         cadence = (len(out) - 2) / (out[-1] - out[1])
         length = 20.0 / len(contacts)
@@ -224,7 +219,7 @@ def recorded_walking(folder: Path) -> list[Walking]:
         statistics = recorded_walk(run)
         if statistics is None:
             continue
-        time_s, values = _read(run)
+        time_s, values = read_samples(run)
         norm = np.linalg.norm(values[:, :3], axis=1)
         spread = np.convolve((norm - norm.mean()) ** 2, np.ones(200) / 200, "same")
         walking = np.flatnonzero(spread > 0.5)
@@ -293,7 +288,7 @@ def recorded_bouts(folder: Path) -> FloatArray:
     rows = []
     for run in sorted((folder / "walk_daily_lowerback").iterdir()):
         events = _events(run)
-        time_s, values = _read(run)
+        time_s, values = read_samples(run)
         leg = LEG_OF_STATURE * float(_about(run)["stature_m"])
         rate_hz = 1.0 / float(np.median(np.diff(time_s)))
         begins = [(t, float(v)) for t, event, v in events if event == "bout_start"]
@@ -359,12 +354,13 @@ def field_direction(
     east /= np.linalg.norm(east)
     attitude = np.stack([east, np.cross(up, east), up])
     level = np.empty((count, 3))
+    turns = rotation(*(rate * spans[:, None]).T)
     for k in range(count):
-        turn = rate[k] * spans[k]
-        attitude = attitude @ _small(turn)
-        pulled = attitude @ force[k]
-        pulled /= np.linalg.norm(pulled)
-        attitude = _small(np.array([pulled[1], -pulled[0], 0.0]) * spans[k] / 5.0) @ attitude
+        attitude = attitude @ turns[k]
+        x, y, z = attitude @ force[k]
+        pull = spans[k] / 5.0 / math.hypot(x, y, z)
+        tilt = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
+        attitude = attitude + pull * tilt @ attitude
         if k % 50 == 0:
             u, _, v = np.linalg.svd(attitude)
             attitude = u @ v
@@ -375,11 +371,6 @@ def field_direction(
         np.linalg.norm(level, axis=1),
         np.arctan2(-level[:, 2], flat),
     )
-
-
-def _small(turn: FloatArray) -> FloatArray:
-    x, y, z = (np.array([a]) for a in turn)
-    return np.asarray(rotation(x, y, z)[0], dtype=np.float64)
 
 
 def field_statistics(time_s: FloatArray, values: FloatArray) -> FloatArray:
@@ -408,7 +399,7 @@ def recorded_fields(folder: Path, runs: Sequence[Path] | None = None) -> FloatAr
     """Rows of `field_statistics` of walk_handheld_waypoints, or of those ``runs`` of it."""
     rows = []
     for run in runs or sorted((folder / "walk_handheld_waypoints").iterdir()):
-        time_s, values = _read(run)
+        time_s, values = read_samples(run)
         known = np.isfinite(values).all(axis=1) & (np.linalg.norm(values[:, :3], axis=1) > 0.1)
         if known.sum() > 500:
             rows.append(field_statistics(time_s[known], values[known]))

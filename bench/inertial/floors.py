@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -55,10 +56,12 @@ def upwards(recording: Recording) -> Array:
     up = force[:25].mean(axis=0)
     up /= np.linalg.norm(up)
     out = np.empty_like(force)
-    for i in range(len(force)):
-        up = up - np.cross(rate[i], up) / RATE_HZ
-        up = up + (force[i] / 9.81 - up) / (RATE_HZ * TILT_TIME_S)
-        up /= np.linalg.norm(up)
+    axes = np.cross(np.eye(3), rate[:, None, :])  # (n, 3, 3): axes @ up is the cross product
+    turns = np.eye(3) - axes / RATE_HZ
+    share = 1.0 / (RATE_HZ * TILT_TIME_S)
+    for i, turn in enumerate(turns):
+        up = (1.0 - share) * (turn @ up) + share * force[i] / 9.81
+        up /= math.sqrt(up @ up)
         out[i] = up
     return out
 
