@@ -377,6 +377,7 @@ def ranges_bytes(node: int, second: int, peer: int, range_m: float) -> bytes:
     return xbee.encode(xbee.Receive16(node, -50, frame), escaped=True)
 
 
+@pytest.mark.soak  # tests/system/test_chain.py interrupts a longer session
 def test_an_interrupt_ends_listening_and_keeps_what_was_received(tmp_path: Path) -> None:
     ours, theirs = pty.openpty()
     tty.setraw(theirs)
