@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import relpos
 from relpos.recording import save_recording
 
@@ -14,10 +16,10 @@ FIRST_CALLS = """
 import relpos
 from relpos import fusion
 
-assert not fusion.is_compiled("bank")
+assert not fusion.is_compiled(ESTIMATOR)
 run = relpos.load("walk")
-relpos.fuse(run, seed=4).save("first call")
-relpos.fuse(run, seed=4).save("second call")
+relpos.fuse(run, ESTIMATOR, seed=4).save("first call")
+relpos.fuse(run, ESTIMATOR, seed=4).save("second call")
 """
 
 WITH_A_KEPT_CACHE = """
@@ -25,25 +27,29 @@ import relpos
 from relpos import fusion
 from relpos.cli.main import app
 
-assert fusion.is_compiled("bank")
-relpos.fuse(relpos.load("walk.mcap"), seed=4).save("recording by the API")
+assert fusion.is_compiled(ESTIMATOR)
+relpos.fuse(relpos.load("walk.mcap"), ESTIMATOR, seed=4).save("recording by the API")
 for source in ("walk", "walk.mcap"):
-    words = ["fuse", source, "--seed", "4", "--no-report", "--out", f"{source} by the command"]
-    app(words, standalone_mode=False)
+    words = ["fuse", source, "--estimator", ESTIMATOR, "--seed", "4", "--no-report"]
+    app([*words, "--out", f"{source} by the command"], standalone_mode=False)
 """
 
 
+@pytest.mark.parametrize(
+    "estimator",
+    # Compiling the bank's kernels takes twice as long.
+    ["particle", pytest.param("bank", marks=pytest.mark.soak)],
+)
 def test_command_and_api_give_the_same_bytes_with_and_without_compiled_kernels(
-    tmp_path: Path,
+    tmp_path: Path, estimator: str
 ) -> None:
     run = relpos.simulate("paper-p1", 11, seconds=20, nodes=3)
     relpos.save(run, tmp_path / "walk")
     save_recording(tmp_path / "walk.mcap", run)
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     for program in (FIRST_CALLS, WITH_A_KEPT_CACHE):
-        subprocess.run(
-            [sys.executable, "-c", program], cwd=tmp_path, env=environment, check=True
-        )  # fmt: skip
+        code = f"ESTIMATOR = {estimator!r}\n{program}"
+        subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True)
     estimates = {path.parent.name: path.read_bytes() for path in tmp_path.glob("*/estimate.csv")}
     assert len(estimates) == 5, sorted(estimates)
     assert len(set(estimates.values())) == 1, sorted(estimates)
