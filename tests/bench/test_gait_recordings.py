@@ -132,7 +132,7 @@ def recordings() -> Path:
 
 @pytest.fixture(scope="module")
 def excursions() -> tuple[Excursions, Excursions]:
-    return recorded_excursions(recordings()), simulated_excursions(40, 4, 31)
+    return recorded_excursions(recordings()), simulated_excursions(24, 3, 31)
 
 
 def test_step_length_follows_the_excursion_as_loosely_as_in_real_people(
@@ -181,7 +181,7 @@ def test_slow_indoor_steps_lift_as_much_for_their_length() -> None:
 def test_a_buildings_field_leads_astray_as_far_as_a_real_one() -> None:
     folders = sorted((recordings() / "walk_handheld_waypoints").iterdir())[::4]
     real = np.nanmedian(recorded_fields(recordings(), folders), axis=0)
-    ours = np.nanmedian(simulated_fields(20, 34), axis=0)
+    ours = np.nanmedian(simulated_fields(12, 34), axis=0)
     ratio = ours / real
     # Heading off (median, 95 %), norm, dip, and changes over 1 to 10 s.
     assert ratio.min() > 0.5, ratio.round(2)

@@ -99,5 +99,5 @@ def built() -> Path:
 
 @pytest.mark.parametrize("board", ["uno", "mega"])
 def test_the_whole_firmware_stays_within_its_budgets(built: Path, board: str) -> None:
-    cost = measure(board, find_firmware(board, built), 45.0)
+    cost = measure(board, find_firmware(board, built), 20.0)
     assert cost.faults == (), cost

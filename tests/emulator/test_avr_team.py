@@ -9,7 +9,7 @@ from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link import xbee
 from relpos.protocol import messages as wire
 
-SECONDS = 30.0
+SECONDS = 20.0
 
 pytestmark = pytest.mark.skipif(
     shutil.which("avr-gcc") is None, reason="the AVR toolchain is not installed"

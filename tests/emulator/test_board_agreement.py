@@ -195,7 +195,7 @@ def test_two_minutes_of_every_board_end_at_the_same_place(board):
 @pytest.mark.parametrize("board", ["uno", pytest.param("mega", marks=pytest.mark.soak)])
 def test_the_same_seed_gives_the_same_bytes_of_simulated_boards_too(board):
     def stream():
-        with EmulatedTeam(TeamConfig("paper", 2, 6.0, 7, board, beacons=True)) as team:
+        with EmulatedTeam(TeamConfig("paper", 2, 4.0, 7, board, beacons=True)) as team:
             return list(team.stream())
 
     assert stream() == stream()

@@ -20,6 +20,8 @@ BOARDS = [
     pytest.param(BoardKind.MEGA, marks=[needs_avr, pytest.mark.soak]),
 ]
 
+UNO_IN_SOAK = pytest.param(BoardKind.UNO, marks=[needs_avr, pytest.mark.soak])
+
 
 @pytest.fixture(autouse=True)
 def _firmware_is_built():
@@ -64,7 +66,7 @@ def straight(board, seconds, **errors):
     ))  # fmt: skip
 
 
-@pytest.mark.parametrize("board", BOARDS)
+@pytest.mark.parametrize("board", [BoardKind.NATIVE, UNO_IN_SOAK])
 def test_a_node_reports_the_cause_of_a_restart_and_counts_it(board):
     reported = []
     causes = ("POWER_ON", "BROWN_OUT", "WATCHDOG", "EXTERNAL")
@@ -120,7 +122,7 @@ def settings_after_a_cut(board, cut_after_us):
 @pytest.mark.parametrize("board", [BOARDS[0], BOARDS[1]])
 def test_a_power_cut_while_settings_are_stored_leaves_the_old_or_the_new_ones(board):
     # Two copies of a record of 65 bytes at 3.4 ms each: half a second.
-    step_us = 23_300 if board is BoardKind.NATIVE else 93_100
+    step_us = 23_300 if board is BoardKind.NATIVE else 139_700
     outcomes = [settings_after_a_cut(board, us) for us in range(20_000, 700_000, step_us)]
     assert set(outcomes) == {930, 777}
     assert outcomes == sorted(outcomes, reverse=True)  # once stored, it stays
@@ -154,8 +156,8 @@ def test_a_byte_of_the_native_eeprom_takes_its_time_and_is_erased_by_a_cut():
 
 
 def motion_of(board, offset_us):
-    with straight(board, 30.0, clock=NodeClockError(offset_us=offset_us)) as team:
-        frames = Listener(team).until(30_000_000)
+    with straight(board, 22.0, clock=NodeClockError(offset_us=offset_us)) as team:
+        frames = Listener(team).until(22_000_000)
         return [f.values for f in frames if f.message is wire.MOTION]
 
 

@@ -18,6 +18,10 @@ def _firmware_is_built():
         pytest.fail("no firmware for the uno: run `make firmware` first")
 
 
+def in_soak(*values):
+    return pytest.param(*values, marks=pytest.mark.soak)
+
+
 def walk(*faults):
     return record(faults, seconds=SECONDS, nodes=2, board="uno")
 
@@ -36,10 +40,10 @@ def assert_sound(run):
 @pytest.mark.parametrize(
     ("spec", "cause"),
     [
-        ("node:brownout:node=2,from=6.1", wire.ResetCause.BROWN_OUT),
-        ("node:off:node=2,from=5,to=6", wire.ResetCause.POWER_ON),
         ("clock:off:node=2,from=5,to=6", wire.ResetCause.WATCHDOG),
         ("eeprom:cut:node=2,from=1.7,write=3,left=garbage", wire.ResetCause.BROWN_OUT),
+        in_soak("node:brownout:node=2,from=6.1", wire.ResetCause.BROWN_OUT),
+        in_soak("node:off:node=2,from=5,to=6", wire.ResetCause.POWER_ON),
     ],
 )
 def test_a_restart_is_reported_with_its_cause_and_the_next_boot_count(spec, cause):
@@ -51,7 +55,7 @@ def test_a_restart_is_reported_with_its_cause_and_the_next_boot_count(spec, caus
     assert run.statuses(NODE, "reset_cause")[-1][1] == cause
 
 
-@pytest.mark.parametrize("spec", ["imu:stuck", "imu:garbage", "bus:stuck"])
+@pytest.mark.parametrize("spec", ["imu:garbage", in_soak("imu:stuck"), in_soak("bus:stuck")])
 def test_nothing_is_integrated_without_true_samples_and_the_gap_is_flagged(spec):
     run = walk(f"{spec}:node=2,from=5,to=9")
     assert_sound(run)

@@ -261,7 +261,9 @@ def test_a_negative_speed_is_refused():
         PseudoTerminal(Talker(1.0), speed=-1.0)
 
 
-@pytest.mark.parametrize("command", ["emulate --nodes 2", "demo --seconds 10", "demo --view"])
+@pytest.mark.parametrize(
+    "command", ["emulate --nodes 2", pytest.param("demo --view", marks=pytest.mark.soak)]
+)
 def test_a_system_without_pseudo_terminals_gets_one_line(command):
     """As on Windows, whose Python has neither of these modules."""
     without = (

@@ -24,7 +24,7 @@ slots = importlib.util.module_from_spec(_spec)
 sys.modules["slots"] = slots
 _spec.loader.exec_module(slots)
 
-SECONDS = 40.0
+SECONDS = 20.0
 
 
 @pytest.fixture(scope="module")

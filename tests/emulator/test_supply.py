@@ -12,9 +12,12 @@ NEEDS = missing_parts()
 BOARDS = [
     pytest.param(
         board,
-        marks=pytest.mark.skipif(
-            board is not BoardKind.NATIVE and NEEDS is not None, reason=str(NEEDS)
-        ),
+        marks=[
+            pytest.mark.skipif(
+                board is not BoardKind.NATIVE and NEEDS is not None, reason=str(NEEDS)
+            ),
+            *([pytest.mark.soak] if board is BoardKind.MEGA else []),
+        ],
     )
     for board in BoardKind
 ]

@@ -20,10 +20,10 @@ def test_a_foreign_frame_changes_nothing_in_the_host():
     """The short run: random scripts, without coverage."""
     source = random.Random(1)
     count: Counter[str] = Counter()
-    while count["frames"] < 30_000:
+    while count["frames"] < 12_000:
         link_fuzzer.run_one(source.randbytes(600), count)
-    assert min(count["mutants"], count["forged"], count["taken"]) > 3000
-    assert count["refused"] > 10_000
+    assert min(count["mutants"], count["forged"], count["taken"]) > 1200
+    assert count["refused"] > 4_000
     assert count["crc of mutants"] + count["crc of noise"] <= 5
 
 

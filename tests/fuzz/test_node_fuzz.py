@@ -37,13 +37,13 @@ def check_that_only_the_crc_lets_noise_through(count):
     assert count["crc of mutants"] <= count["mutants"] / 2**16 + 10
 
 
-def test_a_hundred_thousand_frames_change_nothing_that_their_key_does_not_allow():
-    count = run(fuzz_builds.build(fuzz_builds.RANDOM), 100_000, 1)
-    assert count["frames"] >= 100_000
+def test_forty_thousand_frames_change_nothing_that_their_key_does_not_allow():
+    count = run(fuzz_builds.build(fuzz_builds.RANDOM), 40_000, 1)
+    assert count["frames"] >= 40_000
     # The run reached what it is about.
-    assert min(count["mutants"], count["forged"], count["obeyed"], count["refused"]) > 10_000
-    assert count["restarts"] > 1000
-    assert count["noise"] > 3000
+    assert min(count["mutants"], count["forged"], count["obeyed"], count["refused"]) > 4_000
+    assert count["restarts"] > 400
+    assert count["noise"] > 1200
     check_that_only_the_crc_lets_noise_through(count)
 
 

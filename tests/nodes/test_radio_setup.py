@@ -3,8 +3,6 @@
 import os
 import re
 import select
-import subprocess
-import sys
 import termios
 import threading
 import tty
@@ -12,7 +10,9 @@ from contextlib import contextmanager
 from functools import partial
 
 import pytest
+from typer.testing import CliRunner
 
+from relpos.cli.main import app
 from relpos.emulator.xbee import XbeeModule
 from relpos.errors import DeviceError
 from relpos.link.port import open_port
@@ -140,7 +140,8 @@ def adapter(module):
         os.close(thread.port)
 
 
-def test_a_module_from_the_shelf_is_set_in_command_mode_and_kept():
+def test_a_module_from_the_shelf_is_set_in_command_mode_and_kept(monkeypatch):
+    monkeypatch.setattr(radio, "GUARD_S", 0.1)
     module = FromTheShelf()
     with adapter(module) as path:
         written = radio.configure(partial(open_port, path), radio.parameters(3, 0x4242, 0x0E))
@@ -181,8 +182,7 @@ def test_other_firmware_is_named():
 
 
 def relpos(*arguments):
-    command = [sys.executable, "-m", "relpos.cli.main", "node", "radio", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return CliRunner().invoke(app, ["node", "radio", *map(str, arguments)])
 
 
 def test_the_lines_are_printed_without_a_port():
@@ -197,7 +197,7 @@ def test_the_lines_are_printed_without_a_port():
 def test_the_command_writes_a_module():
     with adapter(Emulated(9)) as path:
         done = relpos(path, "--node", 5)
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     assert re.search(r"MY\W+9\W+5", done.stdout)
 
 
@@ -205,4 +205,4 @@ def test_the_command_writes_a_module():
     "arguments", [(), ("--node", 1, "--coordinator"), ("--node", 1, "--channel", "1B")]
 )
 def test_contradicting_arguments_are_wrong_usage(arguments):
-    assert relpos(*arguments).returncode == 2
+    assert relpos(*arguments).exit_code == 2

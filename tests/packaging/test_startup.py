@@ -49,23 +49,19 @@ def test_help_imports_nothing_heavy(arguments):
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
-@pytest.mark.parametrize(
-    ("words", "completed"),
-    [
-        ("relpos dead", ["deadreckon"]),
-        ("relpos node fla", ["flash"]),
-        ("relpos fuse --estimator ba", ["bank"]),
-        ("relpos node calibrate ant", ["antenna"]),
-    ],
-)
-def test_bash_completes_commands_and_values(words, completed, shell_environment):
-    count = len(words.split())
-    script = (
-        'eval "$(relpos --show-completion)"\n'
-        f"COMP_WORDS=({words})\nCOMP_CWORD={count - 1}\n"
-        "_relpos_completion relpos\nprintf '%s\\n' \"${COMPREPLY[@]}\"\n"
-    )
-    assert bash(script, shell_environment).split() == completed
+def test_bash_completes_commands_and_values(shell_environment):
+    completed = {
+        "relpos dead": "deadreckon",
+        "relpos node calibrate ant": "antenna",
+        "relpos fuse --estimator ba": "bank",
+    }
+    script = 'eval "$(relpos --show-completion)"\n'
+    for words in completed:
+        script += (
+            f"COMP_WORDS=({words})\nCOMP_CWORD={len(words.split()) - 1}\n"
+            "_relpos_completion relpos\nprintf '%s\\n' \"${COMPREPLY[@]}\"\n"
+        )
+    assert bash(script, shell_environment).split() == list(completed.values())
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")

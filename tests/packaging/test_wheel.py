@@ -105,7 +105,7 @@ def test_the_commands_work_away_from_the_repository(elsewhere):
 def test_emulated_nodes_run_away_from_the_repository(elsewhere):
     relpos, folder, environment = elsewhere
     emulated = subprocess.Popen(
-        [folder / "venv" / "bin" / "relpos", "emulate", "--nodes", "2", "--speed", "0"],
+        [folder / "venv" / "bin" / "relpos", "emulate", "--nodes", "2", "--speed", "2"],
         cwd=folder,
         env=environment,
         stdout=subprocess.PIPE,

@@ -73,7 +73,7 @@ def test_a_guided_calibration_makes_the_field_round_and_is_kept_over_a_restart(t
 
 
 def test_a_walk_of_known_length_sets_the_gain_on_the_node():
-    with emulated("straight", 20, 1200) as port:
+    with emulated("straight", 40, 600) as port:
         done = calibrate("walk", port, "--node", 1, "--distance", 40)
         assert done.exit_code == 0, done.stderr
         device = open_port(port)
@@ -85,7 +85,7 @@ def test_a_walk_of_known_length_sets_the_gain_on_the_node():
 
 
 def test_two_antennas_are_calibrated_at_a_known_distance():
-    with emulated("bench", 20, 3000, nodes=3) as port:
+    with emulated("bench", 60, 900, nodes=2) as port:
         done = calibrate("antenna", port, "--nodes", "1,2", "--distance", 5, "--ranges", 60)
         assert done.exit_code == 0, done.stderr
         found = re.findall(r"ranges, ([+-][\d.]+) m off \(\+-([\d.]+)\)", done.stdout)

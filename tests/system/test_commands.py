@@ -15,7 +15,7 @@ from relpos.simulation.team import SCENARIOS
 def team_at_port(nodes=1, seed=1, scenario="straight"):
     """A team and the port behind which it is, at eight times real time."""
     with (
-        EmulatedTeam(TeamConfig(scenario, nodes, 900.0, seed)) as team,
+        EmulatedTeam(TeamConfig(scenario, nodes, 400.0, seed)) as team,
         PseudoTerminal(team, speed=8.0) as terminal,
         terminal.open_port() as port,
     ):

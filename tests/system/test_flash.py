@@ -3,8 +3,6 @@
 import os
 import re
 import select
-import subprocess
-import sys
 import termios
 import threading
 import tty
@@ -13,7 +11,9 @@ from dataclasses import dataclass
 
 import pytest
 from boot_loaders import MEGA_LOADER, build_optiboot, mega_loader, needs
+from typer.testing import CliRunner
 
+from relpos.cli.main import app
 from relpos.emulator.avr.board import BOARDS as SIMULATED
 from relpos.emulator.avr.board import Board, ResetCause
 from relpos.errors import DeviceError
@@ -113,13 +113,7 @@ def plugged(kind, firmware, *, connected=True):
 
 
 def relpos_node(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "relpos.cli.main", "node", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    return CliRunner().invoke(app, ["node", *map(str, arguments)])
 
 
 def test_a_board_becomes_a_node_and_answers_over_its_cable(optiboot, tmp_path):
@@ -127,24 +121,24 @@ def test_a_board_becomes_a_node_and_answers_over_its_cable(optiboot, tmp_path):
     key.write_text("00112233445566778899aabbccddeeff\n")
     with plugged("uno", optiboot) as uno:
         done = relpos_node("flash", uno.path, "--board", "uno", "--id", 9, "--key-file", key)
-        assert done.returncode == 0, done.stdout + done.stderr
+        assert done.exit_code == 0, done.stdout + done.stderr
         assert re.search(r"written and verified \([1-9]\d{4} bytes\)", done.stdout)
         assert "has been given the key" in done.stdout
         assert "node 1 is node 9 now" in done.stdout
         assert "node 9 answers over the cable" in done.stdout
         # And goes on doing so, under its key alone.
         shown = relpos_node("set", uno.path, "--cable", "--key-file", key, "led", "on")
-        assert shown.returncode == 0, shown.stderr
+        assert shown.exit_code == 0, shown.stderr
         assert "Node 9" in shown.stdout
         stranger = relpos_node("set", uno.path, "--cable")
-        assert stranger.returncode == 1
+        assert stranger.exit_code == 1
         assert "under another key" in stranger.stderr
 
 
 def test_the_wrong_board_is_refused_before_anything_is_written(optiboot):
     with plugged("uno", optiboot) as uno:
         done = relpos_node("flash", uno.path, "--board", "mega")
-        assert done.returncode == 1
+        assert done.exit_code == 1
         assert len(done.stderr.strip().splitlines()) == 1
         assert "this is an Arduino uno (ATmega328P), not a mega" in done.stderr
         assert uno.board.counters().eeprom_writes == 0
@@ -166,7 +160,7 @@ def test_a_mega_is_known_by_its_own_boot_loader(tmp_path):
 def test_a_mega_becomes_a_node_as_well(tmp_path):
     with plugged("mega", mega_loader(tmp_path)) as mega:
         done = relpos_node("flash", mega.path, "--id", 5)
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.exit_code == 0, done.stdout + done.stderr
     assert "Arduino mega (ATmega2560)" in done.stdout
     assert "node 5 answers over the cable" in done.stdout
 
@@ -174,7 +168,7 @@ def test_a_mega_becomes_a_node_as_well(tmp_path):
 def test_the_shields_switch_in_the_wrong_position_is_reported(optiboot):
     with plugged("uno", optiboot, connected=False) as uno:
         done = relpos_node("flash", uno.path)
-    assert done.returncode == 1
+    assert done.exit_code == 1
     assert len(done.stderr.strip().splitlines()) == 1
     assert "no board answers" in done.stderr
     assert "switch to USB" in done.stderr

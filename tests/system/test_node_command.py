@@ -9,7 +9,10 @@ import sys
 from contextlib import contextmanager, suppress
 
 import pytest
+from typer.testing import CliRunner
 
+from relpos.cli import node_watch
+from relpos.cli.main import app
 from relpos.emulator.avr.library import missing_parts
 from relpos.link.port import open_port
 
@@ -33,24 +36,17 @@ def emulated(nodes, board="native", speed=4, seed=3):
 
 @pytest.fixture(scope="module")
 def port():
-    with emulated(3) as path:
+    with emulated(3, speed=10) as path:
         yield path
 
 
 def node(*arguments):
-    return subprocess.run(
-        [*RELPOS, "node", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=90,
-        stdin=subprocess.DEVNULL,
-        check=False,
-    )
+    return CliRunner().invoke(app, ["node", *map(str, arguments)])
 
 
 def test_list_shows_every_node(port):
-    done = node("list", port, "--seconds", 5, "--json")
-    assert done.returncode == 0, done.stderr
+    done = node("list", port, "--seconds", 2, "--json")
+    assert done.exit_code == 0, done.stderr
     rows = json.loads(done.stdout)["nodes"]
     assert [row["node"] for row in rows] == [1, 2, 3]
     for row in rows:
@@ -58,15 +54,16 @@ def test_list_shows_every_node(port):
         assert row["battery_v"] == pytest.approx(5.0, abs=0.03)
         assert row["uptime_s"] >= 0
         assert -100 < row["rssi_dbm"] < -20
-    table = node("list", port, "--seconds", 4).stdout
+    table = node("list", port, "--seconds", 2).stdout
     assert "firmware" in table
     assert "power on" in table
 
 
-def test_monitor_prints_plain_tables_where_there_is_no_terminal(port):
-    done = node("monitor", port, "--seconds", 6)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("neighbours") == 2  # one after five seconds, one at the end
+def test_monitor_prints_plain_tables_where_there_is_no_terminal(port, monkeypatch):
+    monkeypatch.setattr(node_watch, "PLAIN_TABLE_EVERY_S", 1.2)
+    done = node("monitor", port, "--seconds", 2)
+    assert done.exit_code == 0, done.stderr
+    assert done.stdout.count("neighbours") == 2  # one while it runs, one at the end
     assert "\x1b" not in done.stdout
     assert re.search(r"5\.0\d V", done.stdout)
 
@@ -75,7 +72,7 @@ def test_monitor_is_a_live_table_on_a_terminal(port):
     screen, terminal = os.openpty()
     try:
         done = subprocess.Popen(
-            [*RELPOS, "node", "monitor", port, "--seconds", "4"],
+            [*RELPOS, "node", "monitor", port, "--seconds", "3"],
             stdout=terminal,
             stderr=subprocess.PIPE,
             env={**os.environ, "TERM": "xterm", "COLUMNS": "120"},
@@ -97,11 +94,11 @@ def test_monitor_is_a_live_table_on_a_terminal(port):
 
 def test_settings_are_shown_before_and_after_and_survive_a_restart(port):
     done = node("set", port, "--node", 2, "stature", 1.9, "led", "off", "ranging-period=4")
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     assert re.search(r"led\W+health\W+off", done.stdout)
     assert re.search(r"ranging-period\W+2 s\W+4 s", done.stdout)
     rebooted = node("reboot", port, "--node", 2)
-    assert rebooted.returncode == 0, rebooted.stderr
+    assert rebooted.exit_code == 0, rebooted.stderr
     assert "has restarted" in rebooted.stdout
     shown = node("set", port, "--node", 2).stdout
     assert re.search(r"leg-length\W+1\.007 m", shown)
@@ -114,14 +111,14 @@ def test_settings_are_shown_before_and_after_and_survive_a_restart(port):
 def test_a_number_is_changed_over_the_air_though_the_radio_keeps_its_address():
     with emulated(2, speed=8) as path:
         done = node("set", path, "--node", 2, "id", 7, "led=off")
-        assert done.returncode == 0, done.stderr
+        assert done.exit_code == 0, done.stderr
         assert re.search(r"id\W+2\W+7", done.stdout)
         assert "relpos node radio --node 7" in done.stdout
         shown = node("set", path, "--node", 7)
-        assert shown.returncode == 0, shown.stderr
+        assert shown.exit_code == 0, shown.stderr
         assert re.search(r"led\W+off", shown.stdout)
         taken = node("set", path, "--node", 7, "id", 1)
-        assert taken.returncode == 1
+        assert taken.exit_code == 1
         assert "there is a node 1 already" in taken.stderr
 
 
@@ -130,34 +127,34 @@ def test_a_new_key_is_made_given_and_asked_for(tmp_path):
     file = tmp_path / "team.key"
     with emulated(1) as path:
         done = node("set", path, "key", "--key-file", file, "--new")
-        assert done.returncode == 0, done.stderr
+        assert done.exit_code == 0, done.stderr
         assert file.stat().st_mode & 0o777 == 0o600
         assert "answers under it" in done.stdout
         again = node("set", path, "key", "--key-file", file)
         assert "already" in again.stdout
         stranger = node("set", path, "--node", 1)
-        assert stranger.returncode == 1
+        assert stranger.exit_code == 1
         assert "--key-file" in stranger.stderr
         shown = node("set", path, "--key-file", file)
-        assert shown.returncode == 0, shown.stderr
+        assert shown.exit_code == 0, shown.stderr
         assert "leg-length" in shown.stdout
         unheard = node("list", path, "--seconds", 3)
-        assert unheard.returncode == 1
+        assert unheard.exit_code == 1
         assert "under another key" in unheard.stderr
         assert file.read_text().strip() not in done.stdout + done.stderr
         listed = node("list", path, "--seconds", 5, "--key-file", file, "--json")
         assert json.loads(listed.stdout)["nodes"][0]["key_set"] is True
         overwritten = node("set", path, "key", "--key-file", file, "--new")
-        assert overwritten.returncode == 1
+        assert overwritten.exit_code == 1
         assert "not overwritten" in overwritten.stderr
 
 
 @pytest.mark.soak
 def test_defaults_leave_number_and_key():
     with emulated(1) as path:
-        assert node("set", path, "step-gain", 2.5, "range-offset=-0.25").returncode == 0
+        assert node("set", path, "step-gain", 2.5, "range-offset=-0.25").exit_code == 0
         done = node("set", path, "defaults")
-        assert done.returncode == 0, done.stderr
+        assert done.exit_code == 0, done.stderr
         assert re.search(r"step-gain\W+2\.5\W+2\.13", done.stdout)
         assert re.search(r"range-offset\W+-0\.25 m\W+0 m", done.stdout)
 
@@ -169,9 +166,9 @@ def test_the_uno_keeps_its_settings_over_a_restart():
         listed = json.loads(node("list", path, "--seconds", 6, "--json").stdout)["nodes"]
         assert [row["node"] for row in listed] == [1]
         assert listed[0]["battery_v"] == pytest.approx(5.0, abs=0.03)
-        assert node("set", path, "led", "on", "step-gain", "2.2").returncode == 0
+        assert node("set", path, "led", "on", "step-gain", "2.2").exit_code == 0
         rebooted = node("reboot", path)
-        assert rebooted.returncode == 0, rebooted.stderr
+        assert rebooted.exit_code == 0, rebooted.stderr
         shown = node("set", path).stdout
     assert re.search(r"led\W+on", shown)
     assert re.search(r"step-gain\W+2\.2", shown)
@@ -188,7 +185,7 @@ def test_the_uno_keeps_its_settings_over_a_restart():
 )
 def test_a_port_that_is_none_is_reported_in_one_line(arguments):
     done = node(*arguments)
-    assert done.returncode == 1
+    assert done.exit_code == 1
     assert "cannot open" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 
@@ -199,20 +196,20 @@ def test_a_port_that_another_program_has_is_reported(port):
         done = node("list", port)
     finally:
         first.close()
-    assert done.returncode == 1
+    assert done.exit_code == 1
     assert "another program has it open" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 
 
 def test_several_nodes_want_a_choice(port):
     done = node("reboot", port)
-    assert done.returncode == 1
+    assert done.exit_code == 1
     assert "Heard: 1, 2, 3" in done.stderr
 
 
 def test_a_value_that_will_not_do_is_wrong_usage(port):
     done = node("set", port, "--node", 2, "led", "blue")
-    assert done.returncode == 2
+    assert done.exit_code == 2
     assert "off, on, health" in done.stderr
 
 

@@ -37,7 +37,7 @@ class Conversation:
 
 @pytest.fixture
 def conversation():
-    with EmulatedTeam(TeamConfig("straight", 2, 900.0, 3)) as team:
+    with EmulatedTeam(TeamConfig("straight", 2, 60.0, 3)) as team:
         yield Conversation(team)
 
 
@@ -80,7 +80,7 @@ def test_a_node_that_does_not_answer_is_reported_and_nothing_waits_for_it(conver
 def test_the_gain_arrives_once_though_half_of_all_frames_are_lost():
     straight = SCENARIOS["straight"]
     lossy = replace(straight.world, radio=replace(straight.world.radio, loss_probability=0.5))
-    with EmulatedTeam(TeamConfig(replace(straight, world=lossy), 1, 900.0, 4)) as team:
+    with EmulatedTeam(TeamConfig(replace(straight, world=lossy), 1, 60.0, 4)) as team:
         conversation = Conversation(team)
         conversation.run(5.0)
         before = conversation.motions[1].gain_version
