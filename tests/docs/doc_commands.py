@@ -37,6 +37,7 @@ PARSED = {
 SHORTER = {
     "demo": ("--seconds 10", "--nodes 3"),
     "emulate": ("--seconds 10",),
+    "fuse": ("--no-report",),
     "simulate": ("--set seconds=20",),
     "fuse PORT": ("--seconds 2",),
     "node list": ("--seconds 3",),

@@ -207,7 +207,43 @@ def test_commands_of_other_programs_name_what_is_there(command):
     assert check(command.words), command
 
 
-@pytest.mark.parametrize("command", RUN, ids=str)
+def options_of(command):
+    """What a command exercises: name, kind of its source, options, and values that matter."""
+    words = with_things(command.words, "PORT")
+    name, _, rest = subcommand(words)
+    options = {word for word in rest if word.startswith("--")}
+    kinds = {rest[k + 1] for k, word in enumerate(rest) if word in DECISIVE}
+    source = next((word for word in rest if word in SOURCES), "")
+    return name, source, options - COSTLESS, kinds
+
+
+DECISIVE = {"--to", "--as", "--estimator"}
+"""Options whose values decide what is done."""
+SOURCES = {"PORT", "FILE.mcap", "mocap.tum", "watch.gpx", "PRESSED"}
+"""Kinds of arguments that are read in different ways."""
+COSTLESS = {"--out", "--seed"}
+"""Options that nearly every command has."""
+
+
+def runs_in_soak(command):
+    """Whether another shown command does all that this one does."""
+    name, source, options, kinds = options_of(command)
+    for other in RUN:
+        beside = options_of(other)
+        if beside[:2] != (name, source) or other is command:
+            continue
+        more = options < beside[2] and kinds <= beside[3]
+        alike = (options, kinds) == beside[2:] and RUN.index(other) < RUN.index(command)
+        if more or alike:
+            return True
+    return False
+
+
+@pytest.mark.parametrize(
+    "command",
+    [pytest.param(c, marks=[pytest.mark.soak] if runs_in_soak(c) else []) for c in RUN],
+    ids=str,
+)
 @pytest.mark.usefixtures("scratch")
 def test_a_shown_command_runs(command, port, radio, monkeypatch):
     name, _, _ = subcommand(command.words)
