@@ -136,7 +136,7 @@ class Rows(HTMLParser):
             self._inside = False
 
 
-@pytest.mark.parametrize("nodes", [2, 3, pytest.param(8, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("nodes", [2, *(pytest.param(n, marks=pytest.mark.soak) for n in (3, 8))])
 def test_the_page_holds_everything_for_teams_of_any_size(tmp_path: Path, nodes: int) -> None:
     ways = {n: circle(1.0 + n) for n in range(1, nodes + 1)}
     page = report.write(content(ways, ways, {1: "Kim <3"}), tmp_path / "r.html").read_text()

@@ -36,7 +36,7 @@ def bytes_recorded(path):
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A session of six nodes at a pseudo-terminal, as the user records it; where, and its output.
+    """A session of four nodes at a pseudo-terminal, as the user records it; where, and its output.
 
     The bytes come as fast as they are taken; frames of virtual time say when they arrived.
     """
@@ -44,7 +44,7 @@ def recorded(tmp_path_factory):
     path, out = folder / "walk.mcap", folder / "live"
     stream = [
         encode(UnknownFrame(VIRTUAL_TIME, round(time_s * 1e6).to_bytes(8, "big"))) + data
-        for time_s, data in serial_bytes(6, 45.0, 4)
+        for time_s, data in serial_bytes(4, 45.0, 4)
     ]
     ours, theirs = pty.openpty()
     tty.setraw(theirs)

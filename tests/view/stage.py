@@ -33,7 +33,8 @@ def browser_of(playwright: Playwright) -> Iterator[Browser]:
     # Chromium refuses its sandbox to root.
     arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
     browser = playwright.chromium.launch(
-        executable_path=chromium(), args=[*arguments, "--autoplay-policy=no-user-gesture-required"]
+        executable_path=chromium(),
+        args=[*arguments, "--disable-gpu", "--autoplay-policy=no-user-gesture-required"],
     )
     try:
         yield browser
