@@ -6,6 +6,8 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 # Stamps are folder-wide state: two recipes at once would install into one environment.
 .NOTPARALLEL:
+# Where bytecode is not kept, each of the processes that tests start compiles its imports anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 VENV := .venv
 PYTHON := $(VENV)/bin/python
