@@ -122,7 +122,7 @@ def settings_after_a_cut(board, cut_after_us):
 @pytest.mark.parametrize("board", [BOARDS[0], BOARDS[1]])
 def test_a_power_cut_while_settings_are_stored_leaves_the_old_or_the_new_ones(board):
     # Two copies of a record of 65 bytes at 3.4 ms each: half a second.
-    step_us = 23_300 if board is BoardKind.NATIVE else 139_700
+    step_us = 46_700 if board is BoardKind.NATIVE else 139_700
     outcomes = [settings_after_a_cut(board, us) for us in range(20_000, 700_000, step_us)]
     assert set(outcomes) == {930, 777}
     assert outcomes == sorted(outcomes, reverse=True)  # once stored, it stays
