@@ -34,7 +34,7 @@ def browser_of(playwright: Playwright) -> Iterator[Browser]:
     arguments = ["--no-sandbox"] if os.geteuid() == 0 else []
     browser = playwright.chromium.launch(
         executable_path=chromium(),
-        args=[*arguments, "--disable-gpu", "--autoplay-policy=no-user-gesture-required"],
+        args=[*arguments, "--autoplay-policy=no-user-gesture-required"],
     )
     try:
         yield browser
