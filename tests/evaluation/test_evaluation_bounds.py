@@ -236,7 +236,7 @@ def test_the_last_epoch_is_smoothed_by_nothing() -> None:
     ("scenario", "filtering", "smoothing"),
     [
         ("paper", (0.686, 0.629), (0.322, 0.281)),
-        ("paper-p1", (0.184, 0.164), (0.082, 0.070)),
+        pytest.param("paper-p1", (0.184, 0.164), (0.082, 0.070), marks=pytest.mark.soak),
         ("paper-h", (0.907, 0.919), (0.53, 0.50)),
         ("paper-h2", (1.29, 1.30), None),
     ],

@@ -87,7 +87,15 @@ def delayed(
     return [measurements[k] for k in np.argsort(arrival, kind="stable")]
 
 
-@pytest.mark.parametrize(("share", "seed"), [(0.05, 1), (0.05, 2), (0.4, 3), (1.0, 4), (1.0, 5)])
+@pytest.mark.parametrize(
+    ("share", "seed"),
+    [
+        (0.05, 1),
+        *(pytest.param(*row, marks=pytest.mark.soak) for row in ((0.05, 2), (1.0, 5))),
+        (0.4, 3),
+        (1.0, 4),
+    ],
+)
 def test_a_replay_gives_the_result_of_punctual_measurements(share: float, seed: int) -> None:
     straight, mixed = rewinder(), rewinder()
     ordered = team()

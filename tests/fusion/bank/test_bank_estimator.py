@@ -28,7 +28,10 @@ def _run(scenario: str, seed: int, overrides: dict[str, float] | None = None) ->
     )
 
 
-@pytest.mark.parametrize(("scenario", "limit_m"), [("paper", 0.8), ("paper-p1", 0.21)])
+@pytest.mark.parametrize(
+    ("scenario", "limit_m"),
+    [pytest.param("paper", 0.8, marks=pytest.mark.soak), ("paper-p1", 0.21)],
+)
 def test_the_bank_is_near_the_bound_without_knowing_the_noise(
     scenario: str, limit_m: float
 ) -> None:
