@@ -105,7 +105,10 @@ def test_the_commands_work_away_from_the_repository(elsewhere):
 def test_emulated_nodes_run_away_from_the_repository(elsewhere):
     relpos, folder, environment = elsewhere
     emulated = subprocess.Popen(
-        [folder / "venv" / "bin" / "relpos", "emulate", "--nodes", "2", "--speed", "2"],
+        [
+            folder / "venv" / "bin" / "relpos",
+            *("emulate", "--nodes", "2", "--speed", "2", "--seconds", "60"),
+        ],
         cwd=folder,
         env=environment,
         stdout=subprocess.PIPE,
