@@ -55,16 +55,22 @@ class Track:
 
 @dataclass(frozen=True)
 class PairTrack:
-    """The estimated distance of one pair and its standard deviation over time, (n,) arrays."""
+    """The estimated distance of one pair and its standard deviation over time, (n,) arrays.
+
+    ``ok`` is 1 where the estimator stands by both, and 0 elsewhere.
+    """
 
     time_s: Floats
     distance_m: Floats
     sigma_distance_m: Floats
+    ok: Floats = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         """Make float arrays of equal length of whatever sequences were given."""
         for name in ("time_s", "distance_m", "sigma_distance_m"):
             object.__setattr__(self, name, _floats(getattr(self, name)))
+        if not len(self.ok):
+            object.__setattr__(self, "ok", np.ones_like(self.time_s))
         if not self.time_s.shape == self.distance_m.shape == self.sigma_distance_m.shape:
             raise ValueError("a pair's track needs arrays of one length")
 
@@ -207,11 +213,16 @@ def located_tracks(estimates: Iterable[Estimate]) -> dict[int, Track]:
 
 def estimated_pairs(estimates: Iterable[Estimate]) -> dict[Pair, PairTrack]:
     """Return each pair's distance and sigma over time, under (node, peer) as it was reported."""
-    rows: dict[Pair, list[tuple[float, float, float]]] = defaultdict(list)
+    rows: dict[Pair, list[tuple[float, float, float, bool]]] = defaultdict(list)
     for estimate in estimates:
-        for pair in estimate.pairs:
+        for pair, status in zip(estimate.pairs, estimate.pair_statuses(), strict=True):
             rows[pair.node, pair.peer].append(
-                (estimate.time_s, pair.distance_m, pair.sigma_distance_m)
+                (
+                    estimate.time_s,
+                    pair.distance_m,
+                    pair.sigma_distance_m,
+                    status is NodeStatus.OK,
+                )
             )
     return {pair: PairTrack(*np.array(rows[pair]).T) for pair in sorted(rows)}
 

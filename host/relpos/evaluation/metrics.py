@@ -67,6 +67,9 @@ class Metrics:
     pair_distance_m: Floats
     pair_true_distance_m: Floats
     nees_left_out: int = 0
+    ok_over_3_sigma: float = math.nan
+    ok_over_2_m: float = math.nan
+    """Of the pair-seconds with status ok, the shares whose distance errs by more."""
 
     @property
     def epochs(self) -> int:
@@ -100,6 +103,7 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
     shape = (at_s.size, len(pair_ids))
     estimated_m, true_m = np.full(shape, np.nan), np.full(shape, np.nan)
     nees = np.full(shape, np.nan)
+    ok = np.full(shape, np.nan)
     body_squared = np.full((*shape, 2), np.nan)
     for k, (i, j) in enumerate(pair_indices):
         both = known[:, i] & known[:, j]
@@ -111,6 +115,9 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
             really = _turn(q[:, b] - q[:, a], -q_heading[:, a])
             body_squared[both, k, direction] = ((seen - really) ** 2).sum(axis=1)[both]
         nees[:, k] = _pair_nees(pairs or {}, pair_ids[k], at_s, true_distance_m)
+        track = _of_pair(pairs or {}, pair_ids[k])
+        if track is not None:
+            ok[:, k] = interpolate(track.time_s, track.ok, at_s)
 
     position_squared = np.full((at_s.size, count), np.nan)
     for epoch in np.flatnonzero(known.sum(axis=1) >= MIN_NODES_FOR_SHAPE):
@@ -118,6 +125,7 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
         position_squared[epoch, there] = aligned_squared_distances(p[epoch, there], q[epoch, there])
 
     error_m = estimated_m - true_m
+    relied_on = ok == 1.0
     figures = np.concatenate((error_m, position_squared, nees), axis=1)
     scored = np.flatnonzero(np.isfinite(figures).any(axis=1))
     return Metrics(
@@ -146,6 +154,8 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
         pair_ids=pair_ids,
         pair_distance_m=estimated_m[scored],
         pair_true_distance_m=true_m[scored],
+        ok_over_3_sigma=_mean(np.where(np.isfinite(nees), nees > 9.0, np.nan)[relied_on]),
+        ok_over_2_m=_mean(np.where(np.isfinite(error_m), np.abs(error_m) > 2.0, np.nan)[relied_on]),
         nees_left_out=sum(_certain_rows(_of_pair(pairs or {}, pair)) for pair in pair_ids),
     )
 

@@ -57,6 +57,8 @@ class Score:
     aligned_m: float
     body_frame_m: float
     nees: float
+    ok_over_3_sigma: float
+    ok_over_2_m: float
     busy_s: float
     time_s: Floats
     distance_over_time_m: Floats
@@ -88,6 +90,8 @@ def score(case: Case, seed: int) -> Score:
         result.relative_position_rmse_m,
         result.body_frame_rmse_m,
         result.nees_distance,
+        result.ok_over_3_sigma,
+        result.ok_over_2_m,
         busy_s,
         result.time_s,
         result.distance_rmse_over_time_m,
@@ -149,6 +153,16 @@ class Outcome:
     def nees(self) -> Statistic:
         """The distance NEES."""
         return Statistic.of([s.nees for s in self.scores])
+
+    @property
+    def ok_over_3_sigma(self) -> Statistic:
+        """Of the pair-seconds with status ok, the share that errs by more than three sigmas."""
+        return Statistic.of([s.ok_over_3_sigma for s in self.scores])
+
+    @property
+    def ok_over_2_m(self) -> Statistic:
+        """Of the pair-seconds with status ok, the share that errs by more than 2 m."""
+        return Statistic.of([s.ok_over_2_m for s in self.scores])
 
     @property
     def busy_s(self) -> Statistic:

@@ -29,6 +29,8 @@ def as_json(metrics: Metrics) -> dict[str, Any]:
         "nees_distance_interval": _interval(consistency.of_distances([metrics])),
         "epochs": metrics.epochs,
         "nees_left_out": metrics.nees_left_out,
+        "ok_over_3_sigma": figure(metrics.ok_over_3_sigma),
+        "ok_over_2_m": figure(metrics.ok_over_2_m),
         "pairs": [
             {
                 "node": node,

@@ -161,6 +161,16 @@ class Estimate:
     parameters: tuple[Parameter, ...] = ()
     north: MagneticNorth | None = None
 
+    def pair_statuses(self) -> list[NodeStatus]:
+        """Return the status of every pair, in their order: the worse of its two nodes'."""
+        of = {node.node: node.status for node in self.nodes}
+        order = list(NodeStatus)
+        unknown = NodeStatus.UNLOCATED
+        return [
+            max((of.get(p.node, unknown), of.get(p.peer, unknown)), key=order.index)
+            for p in self.pairs
+        ]
+
 
 @runtime_checkable
 class Estimator(Protocol):

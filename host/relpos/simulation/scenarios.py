@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from relpos.errors import RelposError
-from relpos.simulation import paper
+from relpos.simulation import missions, paper
 from relpos.simulation.lab import simulate_lab
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 LAB = "lab"
 
-NAMES = (*paper.SCENARIOS, LAB)
+NAMES = (*paper.SCENARIOS, LAB, *missions.NAMES)
 
 
 def simulate(
@@ -26,6 +26,8 @@ def simulate(
         raise RelposError(f"unknown scenario '{scenario}': one of {', '.join(NAMES)}")
     if scenario == LAB:
         return simulate_lab(seed, overrides)
+    if scenario in missions.NAMES:
+        return missions.simulate_mission(scenario, seed, overrides)
     return paper.simulate_paper(scenario, seed, overrides)
 
 
