@@ -217,7 +217,7 @@ def _follow(settings: MissionSettings, time_s: Floats, leader: Floats, place: in
         # Before the leader's way begins they stand in a line behind it.
         poses = np.stack([np.interp(then_s, time_s, column) for column in leader.T], axis=-1)
         waiting_m = settings.speed_m_s * np.maximum(BEHIND_S * place - time_s, 0.0)
-        x, y, heading = leader[0]
+        _, _, heading = leader[0]
         poses[:, 0] -= waiting_m * math.cos(heading)
         poses[:, 1] -= waiting_m * math.sin(heading)
         return poses
