@@ -107,9 +107,11 @@ def update_cusum(
     for row, so_far in enumerate(sums):
         own = [one for pair, one in zip(pairs, delta, strict=True) if row in pair]
         after.append(max(so_far + median(own), 0.0) if own else so_far)
-    if max(after) < alarm:
+    ranged = {row for pair in pairs for row in pair}
+    row = max(sorted(ranged), key=lambda row: after[row])
+    if after[row] < alarm:
         return after, base, -1
-    return [0.0] * len(sums), base, after.index(max(after))
+    return [0.0] * len(sums), base, row
 
 
 def pairs(mean: Floats, covariance: Floats, rows: list[int]) -> Floats:

@@ -58,6 +58,14 @@ def test_one_outlier_is_no_fault() -> None:
     assert detector.sums.max() < ALARM / 2
 
 
+def test_only_a_node_that_is_ranged_now_is_named() -> None:
+    detector = detector_of(3)
+    # Node 0 was odd when the alarm's threshold was higher; now two others range.
+    detector.sums[0] = 1000.0
+    assert update(detector, {(1, 2): 1.0}) == -1
+    assert update(detector, {(0, 2): 1.0}) == 0
+
+
 def test_a_sprint_exceeds_the_gate_and_walking_after_standing_does_not() -> None:
     gate = SpeedGate()
     assert not any(gate.exceeded(1, 0.25, 1.0) for _ in range(60))

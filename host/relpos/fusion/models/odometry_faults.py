@@ -124,8 +124,9 @@ def update_cusum(
         if several:
             median = 0.5 * (own[(several - 1) // 2] + own[several // 2])
             sums[row] = max(sums[row] + median, 0.0)
-        if sums[row] > highest:
-            highest, faulty = sums[row], row
+            # Only one that is ranged now can be placed anew.
+            if sums[row] > highest:
+                highest, faulty = sums[row], row
     alarm = ALARM if sums.shape[0] < 3 else TEAM_ALARM
     if highest < (WARY if wary else 1.0) * alarm:
         return -1
