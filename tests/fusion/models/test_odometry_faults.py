@@ -244,4 +244,4 @@ def test_a_node_that_was_away_for_half_a_minute_is_located_again(off: bool, rest
     if restarts:
         assert bank.counters()["nodes_sought_again"] >= 1
     if not off:
-        assert bank.counters()["ranges_of_silent"] > 0
+        assert bank.counters()["diffusions"] > 0

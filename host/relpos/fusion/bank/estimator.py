@@ -30,7 +30,7 @@ from relpos.fusion.initial_poses import (
     PoseMixture,
 )
 from relpos.fusion.models.detection import Detection
-from relpos.fusion.models.motion import reported_sigmas
+from relpos.fusion.models.motion import reported_sigmas, unseen_variance
 from relpos.fusion.models.north import North
 from relpos.fusion.models.odometry_faults import LOST_RAD, VAGUE_M, SpeedGate, ZeroMotionDetector
 from relpos.fusion.models.ranging import Mounting, RangeCorrelation
@@ -44,12 +44,6 @@ Indices = npt.NDArray[np.int64]
 SET_OFF_M = 0.3
 """A node without a heading has set off when it is this far from where it stood."""
 
-SILENT_S = 10.0
-"""A node whose motion is missing for longer is tracked by its ranges alone."""
-
-WANDER_M = 0.7
-"""Random walk of a person without reported motion, m per root second: to and fro in a room."""
-
 NORTH_KNOWN_RAD = 0.5
 """Headings are used once north is known so well; before, they only teach where north is."""
 HEADING_SIGMA_RAD = 0.17
@@ -62,8 +56,8 @@ class _Known(Presence):
 
     worn_m: float = 0.0
     """Height of the tag over the floor at the start."""
-    drifted_s: float = -math.inf
-    """Until then it was tracked by ranges alone."""
+    diffused_s: float = -math.inf
+    """Until then it may have walked without a report, and its ranges have moved it."""
 
 
 @dataclass(slots=True)
@@ -144,12 +138,14 @@ class Bank:
             self.initialiser.advance(step, faulty=odd)
         elif isinstance(step, Ranging):
             self._advance()
+            self._diffuse(step.time_s, timeline)
             self._range(step, timeline)
         elif isinstance(step, Sensed):
             self._meet(step.measurement.node)
             self._sense(step)
         else:
             self._advance()
+            self._diffuse(step.time_s, timeline)
             self._admit(self.initialiser.find(step.time_s))
             return self._estimate(step.time_s)
         return None
@@ -195,9 +191,9 @@ class Bank:
             known.received(time_s)
             way_m = math.hypot(dx_m, dy_m)
             self.range_correlation.move(node, way_m, turn_rad)
-            if known.drifted_s > time_s - duration_s:
+            if known.diffused_s > time_s - duration_s:
                 # Ranges have moved it so far already; how it turned they cannot say.
-                moves[k, :2] *= max(time_s - known.drifted_s, 0.0) / max(duration_s, 1e-9)
+                moves[k, :2] *= max(time_s - known.diffused_s, 0.0) / max(duration_s, 1e-9)
             vague = None if reported is None else _vagueness(a)
             if reported is not None and vague is not None:
                 reported[k] = math.nan
@@ -241,14 +237,12 @@ class Bank:
             # A search may be long; finding no pose in it is no fault of the data.
             self._ranges_used += len(step.ranges)
             ranges = [r for r in step.ranges if r.node in located and r.peer in located]
-        attempted = ranges
-        ranges = self._with_motion(time_s, ranges, timeline)
         measured = np.array([r.range_m for r in ranges])
         pairs = [(r.node, r.peer) for r in ranges]
         first, second, dz = self._pairs(pairs)
-        if self.core.relocalisation.lost and ranges:
+        if ranges:
             self.core.relocalisation.relocalise_lost(first, second, measured)
-        rounds = self._attempts(time_s, attempted, timeline)
+        rounds = self._attempts(time_s, ranges, timeline)
         if ranges:
             known = self._known
             variance = np.array(
@@ -261,36 +255,23 @@ class Bank:
             self.core.update_detection(attempts, self.detection)
         self.core.end_instant()
 
-    def _with_motion(
-        self, time_s: float, ranges: Sequence[Range], timeline: Timeline
-    ) -> Sequence[Range]:
-        """Leave out ranges of nodes whose motion is missing.
+    def _diffuse(self, time_s: float, timeline: Timeline) -> None:
+        """Let nodes whose motion is missing be anywhere that they can have walked to.
 
-        A node without motion may be anywhere that it can have walked to. For a while its motion
-        may still come (then the rewinder repeats the ranges); after ``SILENT_S`` the node is
-        tracked by ranges alone, as a random walk.
+        Their ranges are used all the same. Where the motion comes late, the rewinder repeats both.
         """
-        silent = {
-            node
-            for node in {n for r in ranges for n in (r.node, r.peer)}
-            if -math.inf < timeline.reported_s(node) < time_s
-        }
-        if not silent:
-            return ranges
-        for node in sorted(silent):
-            known = self._known[node]
+        for node, row in self._row.items():
             reported_s = timeline.reported_s(node)
-            if time_s - reported_s > SILENT_S:
-                since_s = max(known.drifted_s, reported_s)
-                self.core.relocalisation.inflate_covariance(
-                    self._row[node], WANDER_M * math.sqrt(time_s - since_s), 0.0
-                )
-                known.drifted_s = time_s
-                self._counters["drifts"] += 1
-                silent.discard(node)
-        kept = [r for r in ranges if r.node not in silent and r.peer not in silent]
-        self._counters["ranges_of_silent"] += len(ranges) - len(kept)
-        return kept
+            if not -math.inf < reported_s < time_s:
+                continue
+            known = self._known[node]
+            since_s = max(known.diffused_s, reported_s)
+            if time_s > since_s:
+                unseen_m2 = unseen_variance(time_s - reported_s)
+                unseen_m2 -= unseen_variance(since_s - reported_s)
+                self.core.relocalisation.diffuse(row, math.sqrt(unseen_m2))
+                known.diffused_s = time_s
+                self._counters["diffusions"] += 1
 
     def _seek(self, node: int) -> None:
         if node not in self.initialiser:

@@ -42,6 +42,20 @@ def reported_sigmas(step: Advance) -> tuple[float, float, float]:
     )
 
 
+WALK_M_S, WALK_S = 1.0, 4.0
+"""Speed of a person of whom no motion is reported, and how long it keeps its direction."""
+
+
+def unseen_variance(duration_s: float) -> float:
+    """Return the variance (m^2, both axes) of the way that a person walks unseen.
+
+    The velocity is an Ornstein-Uhlenbeck process: the deviation grows as the person walks at
+    first, and as the square root of time later.
+    """
+    kept_s = WALK_S * (1.0 - math.exp(-duration_s / WALK_S))
+    return 2.0 * WALK_M_S**2 * WALK_S * (duration_s - kept_s)
+
+
 @dataclass(frozen=True, slots=True)
 class MotionNoise:
     """Parameters of the motion model.
