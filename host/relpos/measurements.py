@@ -8,6 +8,8 @@ and an estimator cannot distinguish them.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 
@@ -119,6 +121,15 @@ class Prior:
     heading_rad: float
     sigma_m: float = 0.0
     sigma_rad: float = 0.0
+
+
+COMMON_M, COMMON_RAD = 0.5, math.radians(10.0)
+"""People who start in one place stand half a metre and ten degrees apart (standard deviations)."""
+
+
+def common_priors(nodes: Iterable[int]) -> tuple[Prior, ...]:
+    """Return the priors of nodes that all start in one place, looking the same way."""
+    return tuple(Prior(node, 0.0, 0.0, 0.0, COMMON_M, COMMON_RAD) for node in sorted(nodes))
 
 
 Measurement = Motion | Range | Height | Heading

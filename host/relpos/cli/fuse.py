@@ -380,14 +380,14 @@ def _fuse_port(
     as_json: bool,
 ) -> None:
     from relpos.link.port import check_port
-    from relpos.measurements import Prior
+    from relpos.measurements import common_priors
 
     if initial is Initial.TRUTH:
         raise DataError(f"{job.source}: a port has no truth to start from")
     check_port(job.source)
     # Before the port is open, because nothing reads it meanwhile. The nodes that start at one
     # place are received later; two stand for them here.
-    some = [Prior(node, 0.0, 0.0, 0.0) for node in (1, 2)]
+    some = common_priors((1, 2))
     job.prepare(some if initial is Initial.COMMON else ())
     port = live.open_port(job.source, key_file, teach=teach, reopen=options.shown)
     if not as_json:

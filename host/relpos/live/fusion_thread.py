@@ -25,6 +25,7 @@ from relpos.measurements import (
     Observation,
     Prior,
     Range,
+    common_priors,
 )
 
 GATHER_S = 3.0
@@ -51,7 +52,7 @@ def common_start(observations: Sequence[Observation]) -> list[Prior]:
             nodes.add(o.peer)
         if o.time_s - observations[0].time_s > GATHER_S:
             break
-    return [Prior(node, 0.0, 0.0, 0.0) for node in sorted(nodes)]
+    return list(common_priors(nodes))
 
 
 class FusionThread:

@@ -27,6 +27,7 @@ from relpos.measurements import (
     Status,
     Step,
     Truth,
+    common_priors,
 )
 from relpos.runs.appending import AppendedTable, close_all, write_rows
 from relpos.runs.description import (
@@ -125,7 +126,7 @@ class Run:
         if initial is InitialPose.UNKNOWN:
             return ()
         if initial is InitialPose.COMMON:
-            return tuple(Prior(node, 0.0, 0.0, 0.0) for node in self.node_ids)
+            return common_priors(self.node_ids)
         priors = _priors_from_truth(self)
         return tuple(priors[node] for node in sorted(priors))
 

@@ -21,7 +21,16 @@ import numpy.typing as npt
 
 from relpos.errors import RelposError
 from relpos.fusion.settings import parse, setting
-from relpos.measurements import Heading, Height, Measurement, Motion, Prior, Range, Truth
+from relpos.measurements import (
+    Heading,
+    Height,
+    Measurement,
+    Motion,
+    Prior,
+    Range,
+    Truth,
+    common_priors,
+)
 from relpos.simulation.paper import SimulatedRun
 
 Floats = npt.NDArray[np.float64]
@@ -366,9 +375,11 @@ def simulate_mission(
         *_sensed(settings, truth, sensed_rng),
     ]
     priors = tuple(
-        Prior(k + 1, 0.0, 0.0, 0.0) if common else Prior(k + 1, *map(float, pose))
+        Prior(k + 1, *map(float, pose))
         for k, pose in enumerate(np.column_stack([truth.position_m[:, 0], truth.heading_rad[:, 0]]))
     )
+    if common:
+        priors = common_priors(p.node for p in priors)
     seconds = np.arange(0.0, settings.seconds + 1e-9)
     rows = tuple(
         Truth(float(t), node + 1, float(x), float(y), math.remainder(heading, 2.0 * math.pi),
