@@ -13,7 +13,10 @@ from relpos.cli import output
 def simulate(
     scenario: Annotated[
         str,
-        typer.Option(metavar="NAME", help="paper, paper-p1, paper-a, paper-h, paper-h2 or lab."),
+        typer.Option(
+            metavar="NAME",
+            help="paper, paper-p1, paper-a, paper-h, paper-h2, lab or mission-CONDITION.",
+        ),
     ],
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same run.")],
     out: Annotated[Path, typer.Option(metavar="RUN", help="The run directory to write.")],

@@ -192,9 +192,9 @@ class Result:
             ]
         if table == "pairs":
             return [
-                (e.time_s, *(getattr(p, name) for name in PAIR_COLUMNS[1:]))
+                (e.time_s, *(getattr(p, name) for name in PAIR_COLUMNS[1:-1]), str(status))
                 for e in self.estimates
-                for p in e.pairs
+                for p, status in zip(e.pairs, e.pair_statuses(), strict=True)
             ]
         return [tuple(getattr(p, name) for name in PARAMETER_COLUMNS) for p in self.parameters]
 

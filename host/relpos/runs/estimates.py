@@ -69,6 +69,7 @@ _PAIR_TABLE = (
     Column("sigma_distance_m", not_negative, optional=True),
     Column("bearing_rad", number, optional=True),
     Column("sigma_bearing_rad", not_negative, optional=True),
+    Column("status", _status, optional=True),
 )
 _ALTERNATIVE_TABLE = (
     Column("time_s", number),
@@ -149,7 +150,9 @@ class EstimateFiles:
         """Append one estimate; of its parameters those that have changed."""
         time_s = estimate.time_s
         self._estimates.add(_rows(estimate.nodes, ESTIMATE_COLUMNS, time_s))
-        self._pairs.add(_rows(estimate.pairs, PAIR_COLUMNS, time_s))
+        statuses = map(str, estimate.pair_statuses())
+        pairs = _rows(estimate.pairs, PAIR_COLUMNS[:-1], time_s)
+        self._pairs.add((*row, status) for row, status in zip(pairs, statuses, strict=True))
         changed = changes(estimate.parameters, self._last)
         self._parameters.add(_rows(changed, PARAMETER_COLUMNS))
         if estimate.alternatives:
@@ -231,7 +234,7 @@ def _by_time(
 
 def _pair_estimate(row: dict[str, Any]) -> PairEstimate:
     node, peer = row["node"], row["peer"]
-    return PairEstimate(node, peer, *(_nan_if_none(row[name]) for name in PAIR_COLUMNS[3:]))
+    return PairEstimate(node, peer, *(_nan_if_none(row[name]) for name in PAIR_COLUMNS[3:-1]))
 
 
 def _node_estimate(row: dict[str, Any]) -> NodeEstimate:

@@ -8,7 +8,7 @@ reported as the initialiser has them.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -34,6 +34,10 @@ from relpos.fusion.models.detection import Detection
 from relpos.fusion.modes import alternatives_of, belief_of
 
 Floats = npt.NDArray[np.float64]
+
+VAGUE_M, VAGUE_RAD = 2.0, math.radians(45.0)
+"""A user whose distance to every peer, or whose heading relative to every peer's, has a larger
+standard deviation is ambiguous."""
 
 MOST_LISTED = 200
 """Hypotheses that alternatives are made of after an odometry fault."""
@@ -63,8 +67,9 @@ class Report:
             if node not in self.row
         ]
         ambiguous = self.core.relocalisation.ambiguous
-        nodes = [self._node(node) for node in sorted(self.row)]
         pairs = self._pairs()
+        vague = self._vague(pairs)
+        nodes = [self._node(node, vague) for node in sorted(self.row)]
         alternatives: tuple[Alternative, ...] = ()
         if ambiguous:
             nodes = [self._at_mode(n) if self.row[n.node] in ambiguous else n for n in nodes]
@@ -82,10 +87,32 @@ class Report:
 
     # -- located nodes -------------------------------------------------------------------------
 
-    def _node(self, node: int) -> NodeEstimate:
+    def _vague(self, pairs: Sequence[PairEstimate]) -> set[int]:
+        """Return the nodes that are known too badly relative to every other one.
+
+        What all have in common, the team's place and its rotation, does not count.
+        """
+        nodes = sorted(self.row)
+        if len(nodes) < 2:
+            return set()
+        place = PER_NODE * np.array([self.row[node] for node in nodes]) + StateIndex.HEADING
+        own = self.covariance[np.ix_(place, place)]
+        apart = own.diagonal()[:, None] + own.diagonal() - 2.0 * own
+        np.fill_diagonal(apart, np.inf)
+        unturned = apart.min(axis=1) > VAGUE_RAD**2
+        near = dict.fromkeys(nodes, math.inf)
+        for pair in pairs:
+            for node in (pair.node, pair.peer):
+                near[node] = min(near[node], pair.sigma_distance_m)
+        return {
+            node for node, bad in zip(nodes, unturned, strict=True) if bad or near[node] > VAGUE_M
+        }
+
+    def _node(self, node: int, vague: Collection[int]) -> NodeEstimate:
         row, presence = self.row[node], self.presence[node]
         status = presence.status
-        if row in self.core.relocalisation.ambiguous and status is NodeStatus.OK:
+        doubtful = row in self.core.relocalisation.ambiguous or node in vague
+        if doubtful and status is NodeStatus.OK:
             status = NodeStatus.AMBIGUOUS
         at = PER_NODE * row
         x, y, heading = self.mean[at : at + 3].tolist()
