@@ -57,14 +57,14 @@ class Score:
     aligned_m: float
     body_frame_m: float
     nees: float
-    ok_over_3_sigma: float
-    ok_over_2_m: float
     busy_s: float
     time_s: Floats
     distance_over_time_m: Floats
     aligned_over_time_m: Floats
     counters: Mapping[str, int]
     failure: str = ""
+    ok_over_3_sigma: float = math.nan
+    ok_over_2_m: float = math.nan
 
 
 def score(case: Case, seed: int) -> Score:
@@ -90,14 +90,14 @@ def score(case: Case, seed: int) -> Score:
         result.relative_position_rmse_m,
         result.body_frame_rmse_m,
         result.nees_distance,
-        result.ok_over_3_sigma,
-        result.ok_over_2_m,
         busy_s,
         result.time_s,
         result.distance_rmse_over_time_m,
         result.position_rmse_over_time_m,
         dict(estimator.counters()),
         failure,
+        result.ok_over_3_sigma,
+        result.ok_over_2_m,
     )
 
 
