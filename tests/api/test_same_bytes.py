@@ -37,8 +37,7 @@ for source in ("walk", "walk.mcap"):
 
 @pytest.mark.parametrize(
     "estimator",
-    # Compiling the bank's kernels takes twice as long.
-    ["particle", pytest.param("bank", marks=pytest.mark.soak)],
+    ["bank", pytest.param("particle", marks=pytest.mark.soak)],
 )
 def test_command_and_api_give_the_same_bytes_with_and_without_compiled_kernels(
     tmp_path: Path, estimator: str

@@ -13,10 +13,10 @@ from relpos.simulation.team import SCENARIOS
 
 @contextmanager
 def team_at_port(nodes=1, seed=1, scenario="straight"):
-    """A team and the port behind which it is, at thirty times real time."""
+    """A team and the port behind which it is, at eight times real time."""
     with (
-        EmulatedTeam(TeamConfig(scenario, nodes, 400.0, seed)) as team,
-        PseudoTerminal(team, speed=30.0) as terminal,
+        EmulatedTeam(TeamConfig(scenario, nodes, 900.0, seed)) as team,
+        PseudoTerminal(team, speed=8.0) as terminal,
         terminal.open_port() as port,
     ):
         terminal.start()
