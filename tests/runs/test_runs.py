@@ -246,7 +246,12 @@ antenna_offset_m = [0.1, -0.2]
 
 def test_a_common_start_puts_every_node_on_one_place(tmp_path: Path) -> None:
     write(tmp_path, run_toml='initial_pose = "common"', ranges_csv=RANGES)
-    assert load_run(tmp_path).priors == (Prior(1, 0, 0, 0), Prior(2, 0, 0, 0))
+    first, second = load_run(tmp_path).priors
+    assert second == replace(first, node=2)
+    assert (first.node, first.x_m, first.y_m, first.heading_rad) == (1, 0.0, 0.0, 0.0)
+    # People who start in one place do not stand in each other.
+    assert 0.3 <= first.sigma_m <= 0.7
+    assert 5.0 <= math.degrees(first.sigma_rad) <= 15.0
 
 
 def test_a_start_from_truth_takes_the_first_pose_alone(tmp_path: Path) -> None:
@@ -405,7 +410,8 @@ def test_the_output_files_have_the_columns_of_the_run_format(tmp_path: Path) -> 
     assert headers == {
         "estimate.csv": "time_s,node,x_m,y_m,z_m,heading_rad,sigma_major_m,sigma_minor_m,"
         "sigma_angle_rad,sigma_z_m,sigma_heading_rad,status",
-        "pairs.csv": "time_s,node,peer,distance_m,sigma_distance_m,bearing_rad,sigma_bearing_rad",
+        "pairs.csv": "time_s,node,peer,distance_m,sigma_distance_m,bearing_rad,sigma_bearing_rad,"
+        "status",
         "alternatives.csv": "time_s,alternative,probability,node,x_m,y_m,heading_rad,"
         "sigma_major_m,sigma_minor_m,sigma_angle_rad,shape",
         "parameters.csv": "time_s,node,peer,name,value,sigma",
