@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+import relpos
 from relpos.errors import RelposError
 from relpos.measurements import Heading, Height, Motion, Range
 from relpos.simulation import missions
@@ -106,3 +107,10 @@ def test_a_wrong_setting_is_named() -> None:
         mission("base", gaps=1)
     with pytest.raises(RelposError, match="unknown scenario"):
         simulate("mission-moon", 1)
+
+
+def test_a_mission_is_scored_without_a_bound() -> None:
+    run = relpos.simulate("mission-base", 1, seconds=20)
+    score = relpos.evaluate(relpos.fuse(run, estimator="deadreckoning"), run)
+    assert score.bound is None
+    assert score.metrics.relative_distance_rmse_m > 0.0

@@ -149,9 +149,9 @@ def bound_of(run: Run) -> Bound | None:
         return None
     # Not for what was recorded: the simulations take half a second to import.
     from relpos.evaluation import bounds
-    from relpos.simulation.scenarios import NAMES
+    from relpos.simulation.scenarios import BOUNDED
 
-    if made.scenario not in NAMES:
+    if made.scenario not in BOUNDED:
         return None
     return bounds.of_simulated(made.scenario, made.seed, made.settings)
 

@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
 LAB = "lab"
 
-NAMES = (*paper.SCENARIOS, LAB, *missions.NAMES)
+BOUNDED = (*paper.SCENARIOS, LAB)
+"""Those whose Cramer-Rao bound can be computed (:mod:`relpos.evaluation.bounds`)."""
+
+NAMES = (*BOUNDED, *missions.NAMES)
 
 
 def simulate(
