@@ -178,6 +178,10 @@ def test_a_press_is_accepted_when_the_session_has_it(stage):
         ("headings", {"node": 1, "clock_offset_ms": 0, "headings": [
             {"unix_ms": 1, "heading_rad": 1, "sigma_rad": 0}]}, "sigma_rad"),
         ("name", {"node": 1, "name": "x" * 41}, "name"),
+        ("name", {"node": 1, "name": " "}, "name"),
+        # Half of a character outside of the basic plane: no file could hold it.
+        ("name", b'{"node": 1, "name": "\\ud800"}', "printable"),
+        ("name", {"node": 1, "name": "a\x1bb"}, "printable"),
         ("acknowledge", {"node": True}, "node"),
         ("acknowledge", b"x" * (1 << 20) + b"x", "bytes"),
     ],

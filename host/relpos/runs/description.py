@@ -127,7 +127,8 @@ def parse_description(path: Path | str, text: str) -> Description:
 
 def write_description(path: Path, description: Description) -> None:
     """Write ``run.toml`` so that reading it gives the same description."""
-    path.write_text(description_text(description), encoding="utf-8")
+    # Encoded before the file is opened: a text that cannot be leaves what was there.
+    path.write_bytes(description_text(description).encode())
 
 
 def description_text(description: Description) -> str:

@@ -327,10 +327,11 @@ class Pages:
     async def name(self, request: Request) -> Response:
         """Call a node by its wearer's name."""
         body = await _body(request)
-        name = body.get("name")
-        if not isinstance(name, str) or not 0 < len(name.strip()) <= 40:
-            raise BadRequestError("name: not 1 to 40 characters")
-        return await self._ask("name", {"node": _node(body), "name": " ".join(name.split())})
+        given = body.get("name")
+        # White space of any kind becomes one space; other characters have to be printable.
+        tidy = " ".join(given.split()) if isinstance(given, str) else given
+        name = _text({"name": tidy}, "name", 40)
+        return await self._ask("name", {"node": _node(body), "name": name})
 
     async def presses(self, request: Request) -> Response:
         """Landmark presses of a phone; those accepted need not be sent again."""
@@ -420,7 +421,7 @@ def _sigma(row: Mapping[str, Any]) -> float | None:
 def _text(row: Mapping[str, Any], name: str, most: int) -> str:
     value = row.get(name)
     if not isinstance(value, str) or not 0 < len(value) <= most or not value.isprintable():
-        raise BadRequestError(f"{name}: not 1 to {most} characters")
+        raise BadRequestError(f"{name}: not 1 to {most} printable characters")
     return value
 
 
