@@ -77,7 +77,7 @@ def _kernels(computer: Computer) -> Finding:
     if not kernel_cache.is_complete({room for rooms in ROOMS.values() for room in rooms}, folder):
         return hint(
             name,
-            "not compiled yet: the first start takes some twenty seconds longer",
+            "not compiled yet: the first start takes half a minute longer",
             "relpos doctor --prepare",
         )
     return well(name, "compiled")

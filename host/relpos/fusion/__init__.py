@@ -151,7 +151,7 @@ def is_compiled(name: str) -> bool:
 def warm_up(name: str, progress: Progress | None = None) -> None:
     """Load an estimator's kernels; compile them where they are not in the cache.
 
-    Compiling takes some twenty seconds once after an installation: each room is compiled by a
+    Compiling takes half a minute once after an installation: each room is compiled by a
     process of its own, side by side. ``progress`` is called with ``"compiling"``, the number of
     compiled rooms and that of all. Estimators that are not ours are left alone.
     """
