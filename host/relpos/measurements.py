@@ -49,6 +49,11 @@ class Range:
     rss_dbm: float | None = None
 
 
+def nodes_of(ranges: Iterable[Range]) -> set[int]:
+    """Return the ids of all that take part in ranges."""
+    return {node for measured in ranges for node in (measured.node, measured.peer)}
+
+
 @dataclass(frozen=True, slots=True)
 class Height:
     """Height of ``node`` over its own start, from pressure."""

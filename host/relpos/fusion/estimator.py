@@ -14,6 +14,7 @@ from math import atan2, hypot, inf, pi, sqrt
 from typing import Protocol, runtime_checkable
 
 from relpos.errors import RelposError
+from relpos.fusion.models.motion import unseen_variance
 from relpos.measurements import Measurement
 
 Progress = Callable[[str, int, int], None]
@@ -205,6 +206,8 @@ class Presence:
     sigma_height_m: float = 0.0
     news_s: float = -inf
     silent_epochs: int = 0
+    diffused_s: float = -inf
+    """Until then it may have walked without a report, and its ranges have moved it."""
 
     def received(self, time_s: float) -> None:
         """Note that the node reported motion up to ``time_s``."""
@@ -214,6 +217,23 @@ class Presence:
     def close_epoch(self, epoch_s: float) -> None:
         """Count the epoch as silent where nothing came since the one before, at ``epoch_s``."""
         self.silent_epochs = 0 if self.news_s > epoch_s else self.silent_epochs + 1
+
+    def diffuse(self, time_s: float, reported_s: float) -> float:
+        """Return the variance (m^2, both axes) of what it has walked unseen since the last call.
+
+        0 for a node that has reported its motion up to ``time_s`` (s), or never did.
+        """
+        since_s = max(self.diffused_s, reported_s)
+        if not -inf < since_s < time_s:
+            return 0.0
+        self.diffused_s = time_s
+        return unseen_variance(time_s - reported_s) - unseen_variance(since_s - reported_s)
+
+    def undiffused(self, time_s: float, duration_s: float) -> float:
+        """Return the share of a displacement up to ``time_s`` that ranges have not made yet."""
+        if self.diffused_s <= time_s - duration_s:
+            return 1.0
+        return max(time_s - self.diffused_s, 0.0) / max(duration_s, 1e-9)
 
     @property
     def status(self) -> NodeStatus:

@@ -33,7 +33,7 @@ from operator import attrgetter, itemgetter
 from typing import NamedTuple
 
 from relpos.errors import DataError
-from relpos.measurements import Heading, Height, Measurement, Motion, Range
+from relpos.measurements import Heading, Height, Measurement, Motion, Range, nodes_of
 
 
 class Advance(NamedTuple):
@@ -390,7 +390,7 @@ class Timeline:
                     yield from self._advance_all(time_s)
                 else:
                     self.frontier_s = time_s
-                    concerned = {n for r in ranges for n in (r.node, r.peer)}
+                    concerned = nodes_of(ranges)
                     # A height says nothing of where anybody is.
                     concerned |= {m.node for m in sensed if isinstance(m, Heading)}
                     yield from self.catch_up(concerned, time_s)

@@ -9,13 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import relpos
 from crowd import Crowd, CrowdSettings, simulate_crowd
 from relpos import fusion
 from relpos.evaluation import metrics
 from relpos.fusion import Estimate, NodeStatus, switching
 from relpos.fusion.large_teams.estimator import LargeTeam
 from relpos.fusion.models.motion_variances import ALONG, WHITE
-from relpos.measurements import Measurement, Prior, Range
+from relpos.measurements import Measurement, Motion, Prior, Range
 
 CROWD = CrowdSettings(nodes=60, seconds=50)
 
@@ -184,3 +185,16 @@ def test_a_large_team_without_priors_is_located() -> None:
     truth = crowd.poses[-1][[n.node - 1 for n in located], :2]
     assert np.sqrt(metrics.aligned_squared_distances(found, truth).mean()) < 0.5
     assert made.counters()["joined"] >= 49
+
+
+def test_a_node_of_a_large_team_whose_motion_is_missing_is_found_by_its_ranges() -> None:
+    run = relpos.simulate("mission-thirty-one", 5, seconds=70, drift_deg_min=0, step_scale=1)
+    gap = [m for m in run.measurements if isinstance(m, Motion) and m.node == 3 and m.time_s > 40]
+    kept = [m for m in run.measurements if m not in gap]
+    result = relpos.fuse(run, measurements=kept)
+    assert result.counters["diffusions"] > 0
+    score = relpos.evaluate(result, run).metrics
+    late = score.time_s > 45
+    own = [k for k, pair in enumerate(score.pair_ids) if 3 in pair]
+    error_m = (score.pair_distance_m - score.pair_true_distance_m)[late][:, own]
+    assert np.nanmean(np.abs(error_m)) < 0.6

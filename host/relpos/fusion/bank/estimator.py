@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,13 +30,13 @@ from relpos.fusion.initial_poses import (
     PoseMixture,
 )
 from relpos.fusion.models.detection import Detection
-from relpos.fusion.models.motion import reported_sigmas, unseen_variance
+from relpos.fusion.models.motion import reported_sigmas
 from relpos.fusion.models.north import North
 from relpos.fusion.models.odometry_faults import LOST_RAD, VAGUE_M, SpeedGate, ZeroMotionDetector
 from relpos.fusion.models.ranging import Mounting, RangeCorrelation
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
-from relpos.measurements import Heading, Height, Prior, Range
+from relpos.measurements import Heading, Height, Prior, Range, nodes_of
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -56,8 +56,6 @@ class _Known(Presence):
 
     worn_m: float = 0.0
     """Height of the tag over the floor at the start."""
-    diffused_s: float = -math.inf
-    """Until then it may have walked without a report, and its ranges have moved it."""
 
 
 @dataclass(slots=True)
@@ -138,14 +136,14 @@ class Bank:
             self.initialiser.advance(step, faulty=odd)
         elif isinstance(step, Ranging):
             self._advance()
-            self._diffuse(step.time_s, timeline)
+            self._diffuse(nodes_of(step.ranges), step.time_s, timeline)
             self._range(step, timeline)
         elif isinstance(step, Sensed):
             self._meet(step.measurement.node)
             self._sense(step)
         else:
             self._advance()
-            self._diffuse(step.time_s, timeline)
+            self._diffuse(self._row, step.time_s, timeline)
             self._admit(self.initialiser.find(step.time_s))
             return self._estimate(step.time_s)
         return None
@@ -191,9 +189,8 @@ class Bank:
             known.received(time_s)
             way_m = math.hypot(dx_m, dy_m)
             self.range_correlation.move(node, way_m, turn_rad)
-            if known.diffused_s > time_s - duration_s:
-                # Ranges have moved it so far already; how it turned they cannot say.
-                moves[k, :2] *= max(time_s - known.diffused_s, 0.0) / max(duration_s, 1e-9)
+            # How it turned meanwhile its ranges cannot say.
+            moves[k, :2] *= known.undiffused(time_s, duration_s)
             vague = None if reported is None else _vagueness(a)
             if reported is not None and vague is not None:
                 reported[k] = math.nan
@@ -225,7 +222,7 @@ class Bank:
 
     def _range(self, step: Ranging, timeline: Timeline) -> None:
         located, time_s = self._row, step.time_s
-        ends = {n for r in step.ranges for n in (r.node, r.peer)}
+        ends = nodes_of(step.ranges)
         for node in ends:
             self._meet(node).received(time_s)
         ranges: Sequence[Range] = step.ranges
@@ -255,22 +252,15 @@ class Bank:
             self.core.update_detection(attempts, self.detection)
         self.core.end_instant()
 
-    def _diffuse(self, time_s: float, timeline: Timeline) -> None:
+    def _diffuse(self, nodes: Iterable[int], time_s: float, timeline: Timeline) -> None:
         """Let nodes whose motion is missing be anywhere that they can have walked to.
 
         Their ranges are used all the same. Where the motion comes late, the rewinder repeats both.
         """
-        for node, row in self._row.items():
-            reported_s = timeline.reported_s(node)
-            if not -math.inf < reported_s < time_s:
-                continue
-            known = self._known[node]
-            since_s = max(known.diffused_s, reported_s)
-            if time_s > since_s:
-                unseen_m2 = unseen_variance(time_s - reported_s)
-                unseen_m2 -= unseen_variance(since_s - reported_s)
-                self.core.relocalisation.diffuse(row, math.sqrt(unseen_m2))
-                known.diffused_s = time_s
+        for node in sorted(self._row.keys() & nodes):
+            unseen_m2 = self._known[node].diffuse(time_s, timeline.reported_s(node))
+            if unseen_m2 > 0.0:
+                self.core.relocalisation.diffuse(self._row[node], math.sqrt(unseen_m2))
                 self._counters["diffusions"] += 1
 
     def _seek(self, node: int) -> None:

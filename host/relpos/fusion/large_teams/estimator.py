@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -36,7 +36,7 @@ from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_varia
 from relpos.fusion.models.ranging import Mounting
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
-from relpos.measurements import Height, Prior, Range
+from relpos.measurements import Height, Prior, Range, nodes_of
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -160,6 +160,7 @@ class LargeTeam:
                 self._pending.append(step)
             case Ranging():
                 self._predict()
+                self._diffuse(nodes_of(step.ranges), step.time_s, timeline)
                 self._use_ranges(step)
             case Sensed(measurement=Height() as height):
                 known = self._presence(height.node)
@@ -169,6 +170,7 @@ class LargeTeam:
                 self._own["headings_unused"] += 1
             case Epoch():
                 self._predict()
+                self._diffuse(self._row, step.time_s, timeline)
                 self._add_found(self.initialiser.find(step.time_s))
                 return self._estimate(step.time_s)
         return None
@@ -225,6 +227,10 @@ class LargeTeam:
             return
         rows = np.array([self._row[a.node] for a in steps], dtype=np.int64)
         moves = np.array([(a.dx_m, a.dy_m, a.dtheta_rad, a.duration_s) for a in steps])
+        # Ranges have made the rest of a late displacement already.
+        moves[:, :2] *= np.array(
+            [[self._known[a.node].undiffused(a.time_s, a.duration_s)] for a in steps]
+        )
         reported = np.array([reported_sigmas(a) for a in steps])
         dx, dy, turn, _ = moves.T
         variance = base_variances(moves, reported) * self._components.factor[rows]
@@ -236,6 +242,15 @@ class LargeTeam:
         sigma_y = np.sqrt(along * (dy * dy + ACROSS * dx * dx) / square)
         sigma_turn = np.sqrt(variance[:, TURN] + variance[:, WHITE])
         self.filter.predict(rows, np.column_stack([moves[:, :3], sigma_x, sigma_y, sigma_turn]))
+
+    def _diffuse(self, nodes: Iterable[int], time_s: float, timeline: Timeline) -> None:
+        """Let nodes whose motion is missing be anywhere that they can have walked to."""
+        for node in sorted(self._row.keys() & nodes):
+            unseen_m2 = self._known[node].diffuse(time_s, timeline.reported_s(node))
+            if unseen_m2 > 0.0:
+                rows = np.array([self._row[node]])
+                self.filter.inflate(rows, math.sqrt(0.5 * unseen_m2), 0.0)
+                self._own["diffusions"] += 1
 
     # -- ranges --------------------------------------------------------------------------------
 
@@ -299,7 +314,7 @@ class LargeTeam:
         ranges = [r for r in step.ranges if r.node not in self._row or r.peer not in self._row]
         if not ranges:
             return
-        nodes = sorted({n for r in ranges for n in (r.node, r.peer)})
+        nodes = sorted(nodes_of(ranges))
         own = self.filter.marginals()
         located: dict[int, tuple[float, float, float]] = {}
         for node in nodes:

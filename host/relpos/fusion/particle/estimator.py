@@ -26,7 +26,7 @@ from relpos.fusion.particle.particle_set import ParticleSet
 from relpos.fusion.particle.settings import ParticleSettings
 from relpos.fusion.resampling import systematic
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
-from relpos.measurements import Height, Measurement, Prior, Range
+from relpos.measurements import Height, Measurement, Prior, Range, nodes_of
 
 
 @dataclass(slots=True)
@@ -141,7 +141,7 @@ class ParticleFilter:
             )
 
     def _update(self, step: Ranging) -> None:
-        nodes = sorted({n for r in step.ranges for n in (r.node, r.peer)})
+        nodes = sorted(nodes_of(step.ranges))
         for node in nodes:
             self._known[node].received(step.time_s)
             self._seek(node)
