@@ -262,7 +262,11 @@ def test_a_negative_speed_is_refused():
 
 
 @pytest.mark.parametrize(
-    "command", ["emulate --nodes 2", pytest.param("demo --view", marks=pytest.mark.soak)]
+    "command",
+    [
+        "emulate --nodes 2",
+        *(pytest.param(c, marks=pytest.mark.soak) for c in ("demo --seconds 10", "demo --view")),
+    ],
 )
 def test_a_system_without_pseudo_terminals_gets_one_line(command):
     """As on Windows, whose Python has neither of these modules."""

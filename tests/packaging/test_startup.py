@@ -52,6 +52,7 @@ def test_help_imports_nothing_heavy(arguments):
 def test_bash_completes_commands_and_values(shell_environment):
     completed = {
         "relpos dead": "deadreckon",
+        "relpos node fla": "flash",
         "relpos node calibrate ant": "antenna",
         "relpos fuse --estimator ba": "bank",
     }
