@@ -57,7 +57,7 @@ class Track:
 class PairTrack:
     """The estimated distance of one pair and its standard deviation over time, (n,) arrays.
 
-    ``ok`` is 1 where the estimator stands by both, and 0 elsewhere.
+    ``ok`` is 1 where the status of both nodes is ok, else 0; 1 throughout where not given.
     """
 
     time_s: Floats
@@ -67,11 +67,12 @@ class PairTrack:
 
     def __post_init__(self) -> None:
         """Make float arrays of equal length of whatever sequences were given."""
-        for name in ("time_s", "distance_m", "sigma_distance_m"):
+        for name in ("time_s", "distance_m", "sigma_distance_m", "ok"):
             object.__setattr__(self, name, _floats(getattr(self, name)))
-        if not len(self.ok):
-            object.__setattr__(self, "ok", np.ones_like(self.time_s))
-        if not self.time_s.shape == self.distance_m.shape == self.sigma_distance_m.shape:
+        if self.ok.size == 0:
+            object.__setattr__(self, "ok", np.ones(self.time_s.shape))
+        columns = (self.time_s, self.distance_m, self.sigma_distance_m, self.ok)
+        if len({a.shape for a in columns}) != 1:
             raise ValueError("a pair's track needs arrays of one length")
 
 

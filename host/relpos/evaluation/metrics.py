@@ -114,9 +114,9 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
             seen = _turn(p[:, b] - p[:, a], -p_heading[:, a])
             really = _turn(q[:, b] - q[:, a], -q_heading[:, a])
             body_squared[both, k, direction] = ((seen - really) ** 2).sum(axis=1)[both]
-        nees[:, k] = _pair_nees(pairs or {}, pair_ids[k], at_s, true_distance_m)
         track = _of_pair(pairs or {}, pair_ids[k])
         if track is not None:
+            nees[:, k] = _pair_nees(track, at_s, true_distance_m)
             ok[:, k] = interpolate(track.time_s, track.ok, at_s)
 
     position_squared = np.full((at_s.size, count), np.nan)
@@ -154,8 +154,8 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
         pair_ids=pair_ids,
         pair_distance_m=estimated_m[scored],
         pair_true_distance_m=true_m[scored],
-        ok_over_3_sigma=_mean(np.where(np.isfinite(nees), nees > 9.0, np.nan)[relied_on]),
-        ok_over_2_m=_mean(np.where(np.isfinite(error_m), np.abs(error_m) > 2.0, np.nan)[relied_on]),
+        ok_over_3_sigma=_share_above(nees[relied_on], 3.0**2),
+        ok_over_2_m=_share_above(np.abs(error_m[relied_on]), 2.0),
         nees_left_out=sum(_certain_rows(_of_pair(pairs or {}, pair)) for pair in pair_ids),
     )
 
@@ -177,10 +177,7 @@ def _turn(vector_m: Floats, angle_rad: Floats) -> Floats:
     return np.column_stack((c * x - s * y, s * x + c * y))
 
 
-def _pair_nees(pairs: Pairs, pair: Pair, at_s: Floats, true_distance_m: Floats) -> Floats:
-    track = _of_pair(pairs, pair)
-    if track is None:
-        return np.full(at_s.shape, np.nan)
+def _pair_nees(track: PairTrack, at_s: Floats, true_distance_m: Floats) -> Floats:
     # A sigma of zero claims certainty; the quotient would be infinite and say only that. Such
     # rows are counted in ``Metrics.nees_left_out``.
     good = track.sigma_distance_m > 0.0
@@ -201,6 +198,11 @@ def _certain_rows(track: PairTrack | None) -> int:
 def _mean(values: Floats) -> float:
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if finite.size else math.nan
+
+
+def _share_above(values: Floats, limit: float) -> float:
+    finite = values[np.isfinite(values)]
+    return float((finite > limit).mean()) if finite.size else math.nan
 
 
 def _root_mean(squares: Floats) -> float:

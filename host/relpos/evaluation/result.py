@@ -17,7 +17,7 @@ from relpos.errors import RelposError
 from relpos.evaluation.iso18305 import Latency
 from relpos.fusion.estimator import Progress
 from relpos.fusion.linear_algebra import one_thread
-from relpos.runs.estimates import PAIR_COLUMNS, PARAMETER_COLUMNS
+from relpos.runs.estimates import PAIR_COLUMNS, PARAMETER_COLUMNS, pair_rows
 
 if TYPE_CHECKING:
     from relpos.fusion.estimator import Estimate, Estimator, Parameter
@@ -191,11 +191,7 @@ class Result:
                 for n in e.nodes
             ]
         if table == "pairs":
-            return [
-                (e.time_s, *(getattr(p, name) for name in PAIR_COLUMNS[1:-1]), str(status))
-                for e in self.estimates
-                for p, status in zip(e.pairs, e.pair_statuses(), strict=True)
-            ]
+            return [(e.time_s, *row) for e in self.estimates for row in pair_rows(e)]
         return [tuple(getattr(p, name) for name in PARAMETER_COLUMNS) for p in self.parameters]
 
     def __str__(self) -> str:

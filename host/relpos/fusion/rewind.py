@@ -151,14 +151,14 @@ class Rewinder:
 
     def _note_late(self) -> None:
         """Find out whether to go back, and to what time."""
-        late_ones, self.timeline.late = self.timeline.late, []
-        for late in late_ones:
+        for late in self.timeline.late:
             oldest_s = self._copies[0].frontier_s
             if late.time_s <= oldest_s:
                 continue  # too late for all of it
             if late.since_s < oldest_s:
                 self._own["motions_beyond_window"] += 1
             self._back_to_s = min(self._back_to_s, max(late.since_s, oldest_s))
+        self.timeline.late.clear()
 
     def _rewind(self, *, final: bool) -> Iterator[Estimate]:
         """Go back to the newest copy at or before ``_back_to_s`` and work off all since."""

@@ -150,9 +150,7 @@ class EstimateFiles:
         """Append one estimate; of its parameters those that have changed."""
         time_s = estimate.time_s
         self._estimates.add(_rows(estimate.nodes, ESTIMATE_COLUMNS, time_s))
-        statuses = map(str, estimate.pair_statuses())
-        pairs = _rows(estimate.pairs, PAIR_COLUMNS[:-1], time_s)
-        self._pairs.add((*row, status) for row, status in zip(pairs, statuses, strict=True))
+        self._pairs.add(map(_cell, (time_s, *row)) for row in pair_rows(estimate))
         changed = changes(estimate.parameters, self._last)
         self._parameters.add(_rows(changed, PARAMETER_COLUMNS))
         if estimate.alternatives:
@@ -274,6 +272,12 @@ def changes(
             last[key] = figures
             kept.append(row)
     return kept
+
+
+def pair_rows(estimate: Estimate) -> Iterable[tuple[object, ...]]:
+    """Yield the cells of ``pairs.csv`` behind the time, of every pair."""
+    for pair, status in zip(estimate.pairs, estimate.pair_statuses(), strict=True):
+        yield *(getattr(pair, name) for name in PAIR_COLUMNS[1:-1]), str(status)
 
 
 def _rows(

@@ -12,6 +12,7 @@ numbers of another.
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,10 +29,9 @@ from relpos.measurements import (
     Motion,
     Prior,
     Range,
-    Truth,
     common_priors,
 )
-from relpos.simulation.paper import SimulatedRun
+from relpos.simulation.paper import SimulatedRun, true_rows
 
 Floats = npt.NDArray[np.float64]
 
@@ -257,21 +257,17 @@ def _motions(settings: MissionSettings, truth: Walk, rng: np.random.Generator) -
         turned += settings.turn_noise * turn * normals[3] + drift_rad_s * duration_s
         off_s = settings.clock_off_s if node == DISTURBED else 0.0
         outage_s = max(settings.lost_s, settings.reboot_s) if node == DISTURBED else 0.0
-        pending: complex | None = None
-        pending_turn = 0.0
+        pending, pending_turn = 0j, 0.0
         for t, *(dx, dy, angle) in zip(time_s, x, y, turned, strict=True):
             if middle_s <= t < middle_s + outage_s:
                 continue
-            step = complex(dx, dy)
-            if pending is not None:
-                c_rad = pending_turn
-                step = pending + step * complex(math.cos(c_rad), math.sin(c_rad))
-                angle += pending_turn
+            step = pending + complex(dx, dy) * cmath.rect(1.0, pending_turn)
+            angle += pending_turn
             if t > gap_phase_s and (t - gap_phase_s) % 60.0 < settings.gap_s:
                 # The next report has the sum.
                 pending, pending_turn = step, float(angle)
                 continue
-            pending, pending_turn = None, 0.0
+            pending, pending_turn = 0j, 0.0
             made.append(Motion(float(t + off_s), node + 1, step.real, step.imag, float(angle)))
     return made
 
@@ -380,11 +376,8 @@ def simulate_mission(
     )
     if common:
         priors = common_priors(p.node for p in priors)
-    seconds = np.arange(0.0, settings.seconds + 1e-9)
-    rows = tuple(
-        Truth(float(t), node + 1, float(x), float(y), math.remainder(heading, 2.0 * math.pi),
-              float(truth.floor_m[node]))
-        for node in range(settings.nodes)
-        for t, (x, y, heading) in zip(seconds, truth.at(node, seconds), strict=True)
-    )  # fmt: skip
+    whole = slice(None, None, RATE_HZ)
+    rows = true_rows(
+        truth.time_s[whole], truth.position_m[:, whole], truth.heading_rad[:, whole], truth.floor_m
+    )
     return SimulatedRun(scenario, tuple(sorted(measurements, key=lambda m: m.time_s)), priors, rows)

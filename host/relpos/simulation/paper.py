@@ -407,11 +407,14 @@ def simulate_paper(
                         _hidden(settings, drawn, too_long))  # fmt: skip
 
 
-def true_rows(times: Floats, positions: Floats, heading: Floats) -> tuple[Truth, ...]:
-    """Rows of ``truth.csv`` of poses (T,), (N, T, 2), (N, T)."""
+def true_rows(
+    times: Floats, positions: Floats, heading: Floats, height: Floats | None = None
+) -> tuple[Truth, ...]:
+    """Rows of ``truth.csv`` of poses (T,), (N, T, 2), (N, T) at heights (N,), where given."""
     return tuple(
         Truth(float(t), i + 1, float(positions[i, k, 0]), float(positions[i, k, 1]),
-              math.remainder(float(heading[i, k]), 2.0 * math.pi))
+              math.remainder(float(heading[i, k]), 2.0 * math.pi),
+              None if height is None else float(height[i]))
         for k, t in enumerate(times)
         for i in range(len(positions))
     )  # fmt: skip

@@ -327,11 +327,11 @@ class Pages:
     async def name(self, request: Request) -> Response:
         """Call a node by its wearer's name."""
         body = await _body(request)
-        given = body.get("name")
-        # White space of any kind becomes one space; other characters have to be printable.
-        tidy = " ".join(given.split()) if isinstance(given, str) else given
-        name = _text({"name": tidy}, "name", 40)
-        return await self._ask("name", {"node": _node(body), "name": name})
+        name = body.get("name")
+        if isinstance(name, str):
+            # White space of any kind becomes one space; other characters have to be printable.
+            body["name"] = " ".join(name.split())
+        return await self._ask("name", {"node": _node(body), "name": _text(body, "name", 40)})
 
     async def presses(self, request: Request) -> Response:
         """Landmark presses of a phone; those accepted need not be sent again."""

@@ -42,12 +42,16 @@ class AdaptiveCount:
         most = these.count >= these.settings.hypotheses
         if most and since_fault % hypothesis_count.CHECKED_AFTER == 0:
             self._adapt_ceiling()
+        if ambiguous:
+            self.unambiguous = 0
+            self.grow()
+            return
         unperturbed = these.unperturbed_weights()
         mean, covariance = these.moments(unperturbed, poses_alone=True)
         index = hypothesis_count.nonlinearity_index(
             mean, covariance, self._sigma_range_m(), self._sigma_metre_m()
         )
-        if ambiguous or index > hypothesis_count.NONLINEAR:
+        if index > hypothesis_count.NONLINEAR:
             self.unambiguous = 0
             self.grow()
         elif index > hypothesis_count.LINEAR or not self._is_even(covariance, unperturbed):

@@ -136,7 +136,6 @@ class Bank:
             self.initialiser.advance(step, faulty=odd)
         elif isinstance(step, Ranging):
             self._advance()
-            self._diffuse(nodes_of(step.ranges), step.time_s, timeline)
             self._range(step, timeline)
         elif isinstance(step, Sensed):
             self._meet(step.measurement.node)
@@ -223,6 +222,7 @@ class Bank:
     def _range(self, step: Ranging, timeline: Timeline) -> None:
         located, time_s = self._row, step.time_s
         ends = nodes_of(step.ranges)
+        self._diffuse(ends, time_s, timeline)
         for node in ends:
             self._meet(node).received(time_s)
         ranges: Sequence[Range] = step.ranges
@@ -260,7 +260,7 @@ class Bank:
         for node in sorted(self._row.keys() & nodes):
             unseen_m2 = self._known[node].diffuse(time_s, timeline.reported_s(node))
             if unseen_m2 > 0.0:
-                self.core.relocalisation.diffuse(self._row[node], math.sqrt(unseen_m2))
+                self.core.relocalisation.diffuse(self._row[node], unseen_m2)
                 self._counters["diffusions"] += 1
 
     def _seek(self, node: int) -> None:

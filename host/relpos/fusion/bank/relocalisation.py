@@ -54,8 +54,8 @@ class Relocalisation:
         """Rows that had an odometry fault and are not found again yet."""
         self.lost: dict[int, tuple[float, float]] = {}
         """Row -> standard deviations of its place (m) and heading (rad), until it is ranged."""
-        self.diffused_m: dict[int, float] = {}
-        """Row -> how far it may have walked without a report since it was last ranged."""
+        self.diffused_m2: dict[int, float] = {}
+        """Row -> variance of its walk without a report since it was last ranged."""
         self.since_fault = 0
         """Instants of ranges since the last relocalisation."""
 
@@ -86,23 +86,23 @@ class Relocalisation:
             self.lost[row] = total
             self.ambiguous.add(row)
 
-    def diffuse(self, row: int, sigma_m: float) -> None:
-        """Know less of where a user is, isotropic (m); lost where that has grown without a range.
+    def diffuse(self, row: int, variance_m2: float) -> None:
+        """Know less of where a user is (m^2, both axes); lost where that grows without a range.
 
         Every hypothesis widens: a filter that hears its ranges follows the user.
         """
         for entry in (StateIndex.X, StateIndex.Y):
-            self._hypotheses.inflate(row, entry, 0.5 * sigma_m**2)
-        total_m = math.hypot(sigma_m, self.diffused_m.get(row, 0.0))
-        self.diffused_m[row] = total_m
-        if self._hypotheses.settings.hypotheses > 1 and total_m > LOST_M:
-            self.lost[row] = total_m, self.lost.get(row, (0.0, 0.0))[1]
+            self._hypotheses.inflate(row, entry, 0.5 * variance_m2)
+        total_m2 = self.diffused_m2[row] = self.diffused_m2.get(row, 0.0) + variance_m2
+        if self._hypotheses.settings.hypotheses > 1 and total_m2 > LOST_M**2:
+            self.lost[row] = math.sqrt(total_m2), self.lost.get(row, (0.0, 0.0))[1]
             self.ambiguous.add(row)
 
     def relocalise_lost(self, first: Indices, second: Indices, range_m: Floats) -> None:
         """Place lost users on the rings of the ranges (R,) that the next update will use."""
-        for row in {*first.tolist(), *second.tolist()} & self.diffused_m.keys():
-            del self.diffused_m[row]
+        for row in list(self.diffused_m2):
+            if (first == row).any() or (second == row).any():
+                del self.diffused_m2[row]
         for row, (sigma_m, sigma_rad) in sorted(self.lost.items()):
             if (first == row).any() or (second == row).any():
                 del self.lost[row]

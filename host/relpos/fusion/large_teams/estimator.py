@@ -160,8 +160,7 @@ class LargeTeam:
                 self._pending.append(step)
             case Ranging():
                 self._predict()
-                self._diffuse(nodes_of(step.ranges), step.time_s, timeline)
-                self._use_ranges(step)
+                self._use_ranges(step, timeline)
             case Sensed(measurement=Height() as height):
                 known = self._presence(height.node)
                 known.height_m, known.sigma_height_m = height.height_m, height.sigma_m or 0.0
@@ -254,10 +253,11 @@ class LargeTeam:
 
     # -- ranges --------------------------------------------------------------------------------
 
-    def _use_ranges(self, step: Ranging) -> None:
-        for r in step.ranges:
-            for node in (r.node, r.peer):
-                self._presence(node).received(step.time_s)
+    def _use_ranges(self, step: Ranging, timeline: Timeline) -> None:
+        ends = nodes_of(step.ranges)
+        self._diffuse(ends, step.time_s, timeline)
+        for node in ends:
+            self._presence(node).received(step.time_s)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
         if located:
             self._update(located)
