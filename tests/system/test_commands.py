@@ -32,9 +32,9 @@ def test_a_node_whose_radio_has_another_address_is_reached():
         assert dialogue.setting(wire.CommandCode.SET_LEG_LENGTH_MM) == 901
 
 
-def test_commands_are_done_once_though_half_of_all_frames_are_lost():
+def test_commands_are_done_once_though_two_in_five_frames_are_lost():
     straight = SCENARIOS["straight"]
-    lossy = replace(straight.world, radio=replace(straight.world.radio, loss_probability=0.5))
+    lossy = replace(straight.world, radio=replace(straight.world.radio, loss_probability=0.4))
     with team_at_port(seed=4, scenario=replace(straight, world=lossy)) as (team, port):
         dialogue = NodeDialogue(port, 1, clock=port.virtual_time_s)
         before = gain_version(dialogue)

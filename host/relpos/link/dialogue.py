@@ -223,8 +223,11 @@ class NodeDialogue:
 
     def _answers_under_present_key(self) -> bool:
         token = self._next_token()
-        _, data = self.link.command(
-            self.node, wire.CommandCode.PING, 0, token=token, broadcast=True
+        data = b"".join(
+            self.link.command(
+                self.node, wire.CommandCode.PING, 0, token=token, broadcast=broadcast
+            )[1]
+            for broadcast in (False, True)
         )
         return self._send(token, data) is not None
 
