@@ -15,7 +15,7 @@ from relpos import tracks
 from relpos.evaluation import report
 from relpos.evaluation.result import Result
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, pairs_of
-from relpos.measurements import Motion, Range, Truth
+from relpos.measurements import Motion, Range, Status, Truth
 from relpos.runs import Description, NodeInfo, Run
 from relpos.tracks import Track
 
@@ -162,3 +162,13 @@ def test_an_estimate_of_nothing_still_gets_its_page(tmp_path: Path) -> None:
     given = content({1: circle(3.0), 2: circle(4.0)}, {1: circle(3.0)})
     empty = report.gather(replace(given.run, truth=()), Result("ours", ()))
     assert "Nothing could be estimated." in report.write(empty, tmp_path / "r.html").read_text()
+
+
+def test_a_node_with_motion_but_without_status_is_a_row_of_the_health_figure() -> None:
+    ways = {1: circle(3.0), 2: circle(4.0)}
+    given = content(ways, ways)
+    silent = tuple(m for m in given.run.measurements if not (m.node == 2 and 5.0 < m.time_s < 15.0))
+    status = tuple(Status(t, 1, "battery_v", 4.9) for t in (0.0, 10.0, 20.0))
+    run = replace(given.run, measurements=silent, statuses=status)
+    drawn = report.draw(report.gather(run, given.result), "health")
+    assert [label.get_text() for label in drawn.axes[0].get_yticklabels()] == ["node 1", "node 2"]

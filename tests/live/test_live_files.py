@@ -2,6 +2,7 @@
 
 import errno
 import io
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from relpos.live.files import FileSink
 from relpos.measurements import Event, Heading, Height, Motion, Range, Status, Step
 from relpos.runs import Description, load_run, read_estimates, write_estimates
 from relpos.runs.appending import AppendedTable
+from relpos.runs.description import read_description, write_description
 
 OBSERVATIONS = [
     Motion(1.0, 1, 0.5, 0.0, 0.1, 0.1, 0.1, 0.1, 2, True, 0.05),
@@ -86,7 +88,7 @@ class FullDisk(io.RawIOBase):
 
 def test_a_full_disk_is_reported_and_nothing_is_missing_once_there_is_room(tmp_path, monkeypatch):
     disk = FullDisk(tmp_path / "table.csv")
-    monkeypatch.setattr(Path, "open", lambda *_, **__: disk)
+    monkeypatch.setattr(Path, "open", lambda path, *_, **__: path.touch() or disk)
     table = AppendedTable(tmp_path / "table.csv", ["time_s", "node"])
     for k in range(50):
         table.add([(k, 1)])
@@ -104,7 +106,7 @@ def test_a_full_disk_is_reported_and_nothing_is_missing_once_there_is_room(tmp_p
 
 def test_a_disk_that_stays_full_is_an_error_at_the_end(tmp_path, monkeypatch):
     disk = FullDisk(tmp_path / "table.csv")
-    monkeypatch.setattr(Path, "open", lambda *_, **__: disk)
+    monkeypatch.setattr(Path, "open", lambda path, *_, **__: path.touch() or disk)
     table = AppendedTable(tmp_path / "table.csv", ["time_s", "node"])
     table.add((k, 1) for k in range(50))
     with pytest.raises(OSError, match="No space left"):
@@ -113,10 +115,53 @@ def test_a_disk_that_stays_full_is_an_error_at_the_end(tmp_path, monkeypatch):
 
 def test_rows_beyond_the_buffer_are_counted(tmp_path, monkeypatch):
     disk = FullDisk(tmp_path / "table.csv")
-    monkeypatch.setattr(Path, "open", lambda *_, **__: disk)
+    monkeypatch.setattr(Path, "open", lambda path, *_, **__: path.touch() or disk)
     monkeypatch.setattr("relpos.runs.appending.MOST_WAITING_BYTES", 100)
     table = AppendedTable(tmp_path / "table.csv", ["time_s", "node"])
     for k in range(100):
         table.add([(k, 1)])
         table.flush()
     assert table.lost_rows > 50
+
+
+def test_a_description_that_cannot_be_written_leaves_the_one_before(tmp_path):
+    path = tmp_path / "run.toml"
+    write_description(path, Description(name="walk"))
+    with pytest.raises(UnicodeEncodeError):
+        write_description(path, Description(name="\ud800"))
+    assert read_description(path).name == "walk"
+
+    class FullDisk(type(path)):
+        def write_bytes(self, data):
+            super().write_bytes(data[: len(data) // 2])
+            raise OSError(errno.ENOSPC, "No space left on device", str(self))
+
+    with pytest.raises(OSError, match="No space"):
+        write_description(FullDisk(path), Description(name="another"))
+    assert read_description(path).name == "walk"
+    assert [file.name for file in tmp_path.iterdir()] == ["run.toml"]
+
+
+def test_a_name_for_a_folder_that_has_vanished_is_told_and_written_once_it_is_back(tmp_path):
+    files = FileSink(tmp_path, Description(name="walk"))
+    shutil.rmtree(tmp_path / "received")
+    files.named({2: "Kim"})
+    assert "run.toml" in files.trouble()
+    files.estimated(an_estimate(1.0))
+    (tmp_path / "received").mkdir()
+    files.named({2: "Kim", 3: "Robin"})
+    assert files.trouble() is None
+    files.close()
+    assert load_run(tmp_path / "received").description.nodes[3].name == "Robin"
+    assert read_estimates(tmp_path)
+
+
+def test_rows_of_a_file_that_was_deleted_are_told(tmp_path):
+    files = FileSink(tmp_path, Description(name="walk"))
+    files.observed(2.0, OBSERVATIONS)
+    files.observed(10.0, [Motion(10.0, 1, 0.5, 0.0, 0.1)])
+    shutil.rmtree(tmp_path / "received")
+    files.observed(20.0, [Motion(20.0, 1, 0.5, 0.0, 0.1)])
+    with pytest.raises(FileNotFoundError, match="was deleted"):
+        files.close()
+    assert "was deleted" in files.trouble()

@@ -205,6 +205,48 @@ def test_a_sink_that_fails_is_reported_and_the_others_go_on():
     assert outcome.failure is None
 
 
+class Fragile(Sink):
+    """A view that raises in everything that visitors and names lead to."""
+
+    def __init__(self):
+        self.closed = False
+        self.asked = 0
+
+    def requests(self):
+        self.asked += 1
+        if self.asked % 2:
+            raise ValueError("half a line")
+        return [Request(self.asked, "name", 0.0, {"node": 1})]
+
+    def respond(self, request, reply, status=200):
+        self.answer = status
+
+    def named(self, names):
+        raise OSError("no such folder")
+
+    def trouble(self):
+        raise RuntimeError("no words")
+
+    def close(self):
+        self.closed = True
+
+
+def test_no_request_reply_name_or_view_ends_a_session():
+    with EmulatedTeam(TeamConfig("straight", 2, 8.0, 3, beacons=True)) as team:
+        source, fragile = TeamInput(team), Fragile()
+        phones = Phones(source, (3.0, Request(1, "name", 0.0, {"node": 2, "name": "Kim"})))
+        session, album = make_session(source, deadreckoning, fragile, phones, priors=team.priors())
+        outcome = run_through(session)
+    assert outcome.failure is None
+    assert album.views[-1].time_s > 7.0
+    assert fragile.answer == 500
+    assert fragile.closed, "what a failed sink holds is written all the same"
+    assert outcome.counters["requests_failed"] > 2
+    texts = [notice.text for notice in album.views[-1].notices]
+    assert any("visitor's request has failed" in text for text in texts)
+    assert [person.name for person in album.views[-1].people] == ["Node 1", "Kim"]
+
+
 class Failing(Slow):
     def process(self, measurement):
         if measurement.time_s > 5.0:

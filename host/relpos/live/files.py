@@ -24,6 +24,8 @@ class FileSink(Sink):
         self._description = description
         self._estimates = EstimateFiles(directory)
         self._received = RunFiles(directory / "received", description) if keep_received else None
+        self._undescribed: OSError | None = None
+        """Why the newest names are not in run.toml yet."""
 
     def named(self, names: Mapping[int, str]) -> None:
         """Store the wearers' names."""
@@ -33,7 +35,17 @@ class FileSink(Sink):
         for node, name in names.items():
             nodes[node] = replace(nodes.get(node, NodeInfo()), name=name)
         self._description = replace(self._description, nodes=nodes)
-        self._received.describe(self._description)
+        self._describe()
+
+    def _describe(self) -> None:
+        if self._received is None:
+            return
+        try:
+            self._received.describe(self._description)
+        except OSError as error:
+            self._undescribed = error
+        else:
+            self._undescribed = None
 
     def observed(self, arrival_s: float, observations: Sequence[Observation]) -> None:
         """Write observations."""
@@ -53,12 +65,19 @@ class FileSink(Sink):
                 why = table.error.strerror or str(table.error)
                 lost = f"; {table.lost_rows} rows are lost" * bool(table.lost_rows)
                 return f"{table.path}: {why}: its rows wait in memory{lost}"
+        if self._undescribed is not None:
+            why = self._undescribed.strerror or str(self._undescribed)
+            return f"{self._undescribed.filename}: {why}: names wait in memory"
         return None
 
     def close(self) -> None:
         """Finish the files; OSError where one could not be written."""
         try:
+            if self._undescribed is not None:
+                self._describe()
             if self._received is not None:
                 self._received.close()
         finally:
             self._estimates.close()
+        if self._undescribed is not None:
+            raise self._undescribed

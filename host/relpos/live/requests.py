@@ -8,6 +8,7 @@ meanwhile), the age of the press on the phone's clock when it was sent counts in
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -52,6 +53,8 @@ class RequestHandler:
         self._session_s = session_s
         self._accepted: set[str] = set()
         self.names: dict[int, str] = {}
+        self.counts: Counter[str] = Counter()
+        """What was refused, and what failed, by name."""
 
     def presses(self, request: Request) -> tuple[dict[str, Any], list[Observation]]:
         """Return the reply and the presses that are new."""

@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 
 from relpos.errors import RelposError
@@ -79,6 +79,7 @@ class LiveSession:
         self._fusion = fusion
         self._composer = composer
         self._sinks = list(sinks)
+        self._failed_sinks: list[Sink] = []
         self._request_sources = [sink for sink in sinks if isinstance(sink, RequestSource)]
         self._seconds = seconds
         self._lasts = lasts
@@ -151,7 +152,15 @@ class LiveSession:
                 sink.close()
             except Exception as error:
                 self.outcome.failure = self.outcome.failure or error
-        self.outcome.counters = {**self._source.counters(), **self._fusion.counters()}
+        for sink in self._failed_sinks:
+            # Its failure was told; what it still holds may go to disk all the same.
+            with suppress(Exception):
+                sink.close()
+        self.outcome.counters = {
+            **self._source.counters(),
+            **self._fusion.counters(),
+            **self._handler.counts,
+        }
         return self.outcome
 
     def _wait_s(self) -> float:
@@ -184,6 +193,8 @@ class LiveSession:
                 call(sink)
             except Exception as error:
                 self._sinks.remove(sink)
+                self._failed_sinks.append(sink)
+                self._post(f"sink-{id(sink)}", Level.ALARM, None)
                 name = type(sink).__name__
                 self._post(f"failed-{name}", Level.ALARM, f"{name} has failed and ended: {error!r}")
 
@@ -233,8 +244,7 @@ class LiveSession:
         silent = not self._composer.monitor.nodes and gone is None
         text = "no node is heard yet: are the nodes switched on?"
         self._post("nobody", Level.INFO, text if silent else None)
-        for k, sink in enumerate(self._sinks):
-            self._post(f"sink-{k}", Level.ALARM, sink.trouble())
+        self._feed(lambda sink: self._post(f"sink-{id(sink)}", Level.ALARM, sink.trouble()))
         self._notices.drop_expired(now_s)
 
     def _watch_fusion(self) -> None:
@@ -278,9 +288,24 @@ class LiveSession:
 
     def _handle_requests(self) -> None:
         for source in self._request_sources:
-            for request in source.requests():
-                source.respond(request, *self._reply(request))
-                self._changed = True
+            try:
+                for request in source.requests():
+                    try:
+                        reply = self._reply(request)
+                    except Exception as error:
+                        self._count_failed_request(error)
+                        reply = {"error": "the session could not do this"}, 500
+                    source.respond(request, *reply)
+                    self._changed = True
+            except Exception as error:
+                self._count_failed_request(error)
+
+    def _count_failed_request(self, error: Exception) -> None:
+        """Count and tell it: whatever a visitor sends, the session goes on."""
+        self._handler.counts["requests_failed"] += 1
+        text = f"a visitor's request has failed: {error!r}"
+        self._post("request", Level.WARNING, text)
+        self._notices.expire("request")
 
     def _reply(self, request: Request) -> tuple[dict[str, object], int]:
         body = request.body

@@ -8,6 +8,7 @@ during the session, or after a crash, finds at most the last one broken.
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import math
 import time
@@ -78,6 +79,9 @@ class AppendedTable:
         try:
             if self._file is None:
                 self._file = self.path.open("wb", buffering=0)
+            elif not self.path.exists():
+                # Somebody deleted it: rows would go nowhere without any error.
+                raise FileNotFoundError(errno.ENOENT, "was deleted", str(self.path))
             while self._waiting:
                 # A disk that is nearly full takes a part.
                 self._waiting = self._waiting[self._file.write(self._waiting) or 0 :]

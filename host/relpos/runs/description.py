@@ -6,6 +6,7 @@ import json
 import math
 import tomllib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -126,9 +127,19 @@ def parse_description(path: Path | str, text: str) -> Description:
 
 
 def write_description(path: Path, description: Description) -> None:
-    """Write ``run.toml`` so that reading it gives the same description."""
-    # Encoded before the file is opened: a text that cannot be leaves what was there.
-    path.write_bytes(description_text(description).encode())
+    """Write ``run.toml`` so that reading it gives the same description.
+
+    A failure (a full disk, text that cannot be encoded) leaves the file that was there.
+    """
+    new = path.with_name(path.name + ".new")
+    data = description_text(description).encode()
+    try:
+        new.write_bytes(data)
+        new.replace(path)
+    except OSError:
+        with suppress(OSError):
+            new.unlink()
+        raise
 
 
 def description_text(description: Description) -> str:

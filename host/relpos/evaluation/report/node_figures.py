@@ -172,7 +172,7 @@ def _draw_colours(axes: Axes, content: Content, last_s: float) -> None:
              Health.RED: ("not usable, or about to fall silent", BAD)}  # fmt: skip
     used: dict[Health, None] = {}
     for row, one in enumerate(content.health.values()):
-        ends = np.append(one.time_s[1:], last_s)
+        ends = np.append(one.time_s, last_s)[1:]
         for begin, end, colour in zip(one.time_s, ends, one.colour, strict=True):
             # One report a ten seconds: after a longer silence nothing is known of it.
             end = min(end, begin + 15.0)
