@@ -44,8 +44,8 @@ int main(void) {
     [
         (("-DVARIABLES=2", "-DFILLER=2", "-DBUSY_MS=10"), "worst tick 1600"),
         (("-DVARIABLES=2", "-DFILLER=2", "-DBUSY_MS=6", "-DOTHERS_MS=6"), "mean tick 960"),
-        (("-DVARIABLES=1850", "-DFILLER=2", "-DBUSY_MS=1"), "static RAM and deepest stack 18"),
-        (("-DVARIABLES=2", "-DFILLER=30500", "-DBUSY_MS=1"), "flash 30"),
+        (("-DVARIABLES=1925", "-DFILLER=2", "-DBUSY_MS=1"), "static RAM and deepest stack 19"),
+        (("-DVARIABLES=2", "-DFILLER=31500", "-DBUSY_MS=1"), "flash 31"),
     ],
 )
 def test_each_budget_that_is_exceeded_is_named(

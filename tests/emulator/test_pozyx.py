@@ -293,3 +293,20 @@ def test_an_unknown_function_fails():
     field = Field(0.0)
     assert field.call(0, 0xBF) == b"\0"
     assert field.error(0) == 0x0D
+
+
+def test_flags_show_without_the_mask_of_the_interrupt_pin():
+    # The vendor's library never writes INT_MASK when it polls.
+    field = Field(0.0, 5.0)
+    assert field.hosts[0].byte(TAG, 0x10) == 0
+    field.range(0, 2)
+    assert field.at(BOOTED_US + 100_000).interrupts(0) == 0x10
+
+
+def test_the_ranges_of_twenty_peers_are_kept_and_no_more():
+    field = Field(*range(22), max_range_m=50.0)
+    for k, peer in enumerate([*range(2, 23), 2]):
+        field.range(0, peer)
+        field.at(BOOTED_US + 100_000 * (k + 1))
+    assert [peer for peer in range(2, 23) if field.info(0, peer)[0]] == list(range(2, 22))
+    assert field.info(0, 2)[1] > field.info(0, 21)[1]  # a known peer's row is renewed

@@ -1,11 +1,17 @@
 """The emulated XBee modules against the API; frames are made and read by digi-xbee."""
 
+import os
+import select
+import threading
+import tty
+
 import numpy as np
 import pytest
+from digi.xbee.devices import Raw802Device
 from digi.xbee.models.address import XBee16BitAddress, XBee64BitAddress
 from digi.xbee.models.mode import OperatingMode
 from digi.xbee.packets.base import XBeePacket
-from digi.xbee.packets.common import ATCommPacket
+from digi.xbee.packets.common import ATCommPacket, ATCommQueuePacket
 from digi.xbee.packets.factory import build_frame
 from digi.xbee.packets.raw import TX16Packet, TX64Packet
 
@@ -141,6 +147,56 @@ def test_at_commands_read_and_set_the_local_module():
     assert bytes(answers[0].command_value) == b"\0\1"
     assert bytes(answers[2].command_value) == b"\x12\x34"
     assert [a.status.code for a in answers] == [0, 0, 0, 2, 3]
+
+
+def test_a_queued_setting_is_in_force_from_the_next_command_that_is_not_queued():
+    network = Network()
+    network.feed(1, ATCommQueuePacket(1, "ID", parameter=b"\x12\x34"))
+    network.feed(1, ATCommQueuePacket(2, "ID"))
+    network.feed(1, ATCommPacket(3, "AC"))
+    network.feed(1, ATCommQueuePacket(4, "ID"))
+    network.feed(1, ATCommQueuePacket(5, "ZZ"))
+    answers = network.run().frames(1)
+    assert [(a.frame_id, a.status.code) for a in answers] == [
+        (1, 0),
+        (2, 0),
+        (3, 0),
+        (4, 0),
+        (5, 2),
+    ]
+    assert bytes(answers[1].command_value) == b"\x33\x32"
+    assert bytes(answers[3].command_value) == b"\x12\x34"
+
+
+def test_the_makers_library_opens_the_module():
+    terminal, port = os.openpty()
+    tty.setraw(port)
+    network = Network()
+    module = network.modules[1]
+    module.on_serial = lambda _time_us, data: os.write(terminal, data)
+    over = threading.Event()
+
+    def serve():
+        while not over.is_set():
+            if select.select([terminal], [], [], 0.02)[0]:
+                module.from_serial(0, os.read(terminal, 4096))
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    device = Raw802Device(os.ttyname(port), 38_400)
+    try:
+        device.open()
+        assert device.operating_mode is MODE
+        assert int(str(device.get_16bit_addr()), 16) == 1
+        assert device.get_node_id() == "NODE1"
+        device.set_parameter("ID", b"\x12\x34")
+        assert bytes(device.get_parameter("ID")) == b"\x12\x34"
+    finally:
+        device.close()
+        over.set()
+        thread.join()
+        os.close(terminal)
+        os.close(port)
 
 
 def test_frames_leave_at_the_speed_of_the_line():

@@ -29,9 +29,15 @@ enum class BusStatus : uint8_t {
 
 class Board {
  public:
+  // The one chip that may hold the clock: the Pozyx, while it carries out a function. How long is not
+  // published (docs/emulator.md).
+  static constexpr uint8_t kStretchingAddress = 0x4B;
+  static constexpr uint16_t kMostStretchUs = 5000;
+
   // One transaction, every part but the address optional:
   //   S address+W first.. [Sr address+W second..] [Sr address+R read..] P
-  // Blocks until the end, at most about 1 ms. Failures are counted.
+  // Blocks until the end, at most 1 ms (at 400 kHz), with the chip that stretches 6 ms. Failures are
+  // counted.
   RELPOS_APART BusStatus transfer(uint8_t address, const uint8_t* first, uint8_t first_count,
                      const uint8_t* second, uint8_t second_count, uint8_t* read,
                      uint8_t read_count) {

@@ -65,7 +65,7 @@ constexpr uint32_t kSilentUs = 120000;
 constexpr uint8_t kMostFailures = 35;
 
 constexpr float kAccelerationUnit = 9.80665f / 8192.0f;                   // 4 g range
-constexpr float kAngularRateUnit = 3.14159265f / 180.0f * 1000.0f / 32768.0f;  // 1000 deg/s range
+constexpr float kAngularRateUnit = 3.14159265f / 180.0f / 32.8f;  // LSB/(deg/s), 1000 deg/s range
 
 int16_t big_endian(const uint8_t* bytes) {
   return static_cast<int16_t>(static_cast<uint16_t>(static_cast<uint16_t>(bytes[0]) << 8) |

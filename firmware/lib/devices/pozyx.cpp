@@ -21,7 +21,7 @@ constexpr uint8_t kIdentity = 0x43;
 constexpr uint32_t kPowerUpUs = 250000;
 constexpr uint32_t kAbsentUs = 1000000;   // between attempts to reach a chip that does not answer
 constexpr uint32_t kPollUs = 1000;
-// After a failed poll: a stuck bus costs a millisecond each time.
+// After a failed poll: a stuck bus costs six milliseconds each time.
 constexpr uint32_t kFailedPollUs = 5000;
 constexpr uint32_t kTimeoutUs = 100000;
 constexpr uint8_t kMostFailures = 5;
@@ -181,7 +181,10 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
       return Event::kNothing;
 
     case State::kCall:
-      if (answer[0] != 1) return done(kRefused, wait_us, result);
+      if (answer[0] != 1) {  // the chip knows why: busy, or no such peer
+        state_ = State::kError;
+        return Event::kNothing;
+      }
       advance();
       due_us_ = now_us + kTimeoutUs;
       *wait_us = kPollUs;
@@ -197,7 +200,8 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
         return Event::kNothing;
       }
       if (is_due(now_us, due_us_)) {
-        // A chip that has restarted with its interrupts masked answers, but never interrupts.
+        // Neither a result nor an error: setting the chip up anew may help. (Not by the mask, which
+        // concerns the interrupt's pin: without it the flags show as well.)
         count_failure();
         return done(kTimedOut, wait_us, result);
       }

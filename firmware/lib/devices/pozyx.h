@@ -11,14 +11,14 @@ namespace relpos {
 // many microseconds it wants the next. Zeroed memory is the start: make it as `Pozyx()`.
 class Pozyx {
  public:
-  static constexpr uint8_t kAddress = 0x4B;
+  static constexpr uint8_t kAddress = Board::kStretchingAddress;
   static constexpr uint32_t kIdleUs = UINT32_MAX;  // *wait_us where only range() gives work
 
   // Result::error where the fault was not found by the chip, in a gap of the chip's own codes.
   enum Error : uint8_t {
     kTimedOut = 0x80,     // neither result nor error within 100 ms
     kBusFailed = 0x81,
-    kRefused = 0x82,      // a function call was answered with failure, or an error has no code
+    kRefused = 0x82,      // a function call was answered with failure, or an error flag, without a code
     kImplausible = 0x83,  // not a distance
   };
 

@@ -66,6 +66,7 @@ RESET_US = 1_000_000
 FUNCTION_STRETCH_US = 150
 """Clock held while a function is carried out (assumed; the vendor states only that it is)."""
 MOST_DEVICES = 20
+"""Rows of the device list, and of the ranges: a further peer's is not stored (assumed)."""
 
 _READABLE = (
     (0x00, 0x06), (0x10, 0x11), (0x14, 0x23), (0x27, 0x2A), (0x30, 0x47), (0x4E, 0x88),
@@ -217,7 +218,8 @@ class Pozyx(I2cDevice):
         inverted: bool = False,
     ) -> None:
         """Store what an exchange gave and raise its flag; a fault inverts that."""
-        if result is not None and not (self.frozen is not None and self.frozen(time_us)):
+        room = peer in self._ranges or len(self._ranges) < MOST_DEVICES
+        if result is not None and room and not (self.frozen and self.frozen(time_us)):
             stamp_ms = (time_us - self._power_on_us) // 1000
             self._ranges[peer] = struct.pack(
                 "<IIh", stamp_ms & 0xFFFFFFFF, result.distance_mm, result.rss_dbm

@@ -36,6 +36,7 @@ SERIAL_HIGH = 0x0013A200
 PAN_BROADCAST = 0x04
 ADDRESS_BROADCAST_OPTION = 0x02
 TRANSMIT_64 = 0x00
+QUEUED_AT_COMMAND = 0x09
 MODEM_STATUS = 0x8A
 HARDWARE_RESET = 0
 
@@ -101,6 +102,7 @@ class XbeeModule:
         self._parser = Parser(escaped=escaped)
         self._line_free_us = 0
         self._last_rssi = 0
+        self._queued: dict[bytes, bytes] = {}
         # As `relpos node radio` sets a module up.
         self._settings: dict[bytes, bytes] = {
             b"MY": address.to_bytes(2, "big"),
@@ -152,6 +154,11 @@ class XbeeModule:
             self._transmit(frame.frame_id, destination, False, frame.data, time_us)
         elif isinstance(frame, AtCommand):
             self._at(frame, time_us)
+        elif isinstance(frame, UnknownFrame) and frame.type == QUEUED_AT_COMMAND:
+            if len(frame.data) < 3:
+                self.counts["short_requests"] += 1
+            else:
+                self._at(AtCommand.parse(frame.data), time_us, queued=True)
         elif isinstance(frame, UnknownFrame) and frame.type == TRANSMIT_64:
             if len(frame.data) < 10:
                 self.counts["short_requests"] += 1
@@ -180,9 +187,17 @@ class XbeeModule:
             return
         self.air.send(Transmission(self, destination, long, data, time_us, report))
 
-    def _at(self, frame: AtCommand, time_us: int) -> None:
+    def _at(self, frame: AtCommand, time_us: int, *, queued: bool = False) -> None:
+        """Carry out or answer a command.
+
+        A queued value is in force from the next command on that is not queued; until then queries
+        show the old value.
+        """
         command = frame.command.upper()
         status, value = AT_OK, b""
+        if not queued:
+            self._settings |= self._queued
+            self._queued.clear()
         if command in (b"WR", b"AC", b"RE", b"FR"):
             pass
         elif command == b"DB":
@@ -194,14 +209,15 @@ class XbeeModule:
         elif command in (b"SH", b"SL", b"NP", b"VR", b"HV"):
             status = AT_BAD_COMMAND
         else:
-            status = self._set(command, frame.value)
+            status = self._set(command, frame.value, self._queued if queued else self._settings)
         if frame.frame_id:
             self._emit(time_us, AtResponse(frame.frame_id, command, status, value))
-        if command == b"AP" and frame.value and status == AT_OK:
-            self._escaped = self._settings[b"AP"] == b"\2"
+        escaped = self._settings[b"AP"] == b"\2"
+        if escaped is not self._escaped:
+            self._escaped = escaped
             self._parser = Parser(escaped=self._escaped)
 
-    def _set(self, command: bytes, value: bytes) -> int:
+    def _set(self, command: bytes, value: bytes, settings: dict[bytes, bytes]) -> int:
         if command != b"NI":
             width = len(self._settings[command])
             value = value.lstrip(b"\0").rjust(width, b"\0")
@@ -212,7 +228,7 @@ class XbeeModule:
         if command == b"BD" and value != self._settings[command]:
             # The line's other end keeps its speed: a module that left it would be deaf for good.
             return AT_BAD_PARAMETER
-        self._settings[command] = value
+        settings[command] = value
         return AT_OK
 
     # -- to the UART --------------------------------------------------------------------------

@@ -115,9 +115,9 @@ TEST(a_sample_comes_in_si_units) {
   CHECK_NEAR(9.80665f, force[0], 1e-4f);
   CHECK_NEAR(-9.80665f, force[1], 1e-4f);
   CHECK_NEAR(39.2254f, force[2], 1e-3f);
-  CHECK_NEAR(-17.453293f, rate[0], 1e-4f);      // 1000 deg/s
+  CHECK_NEAR(-17.436270f, rate[0], 1e-4f);      // 999 deg/s
   CHECK_NEAR(0.3489f, rate[1], 1e-3f);          // 20 deg/s
-  CHECK_NEAR(0.000532632f, rate[2], 1e-8f);     // 1000 / 32768 deg/s
+  CHECK_NEAR(0.000532113f, rate[2], 1e-8f);     // 1 / 32.8 deg/s (data sheet)
 }
 
 TEST(a_sample_is_not_announced_twice) {

@@ -278,6 +278,17 @@ TEST(a_flag_from_before_the_exchange_ends_nothing) {
   CHECK(bench.result.success);
 }
 
+TEST(a_call_that_is_refused_is_reported_with_the_chips_own_code) {
+  Bench bench;
+  bench.set_up();
+  bench.chip.call_status = 0;
+  bench.chip.code = 0x15;  // busy
+  CHECK(bench.exchange(3));
+  CHECK(!bench.result.success);
+  CHECK_EQUAL(0x15, bench.result.error);
+  CHECK(bench.pozyx.ready());
+}
+
 TEST(a_refused_call_ends_the_exchange) {
   Bench bench;
   bench.set_up();

@@ -23,9 +23,14 @@ constexpr uint8_t kScl = _BV(PC5);
 #define RELPOS_TWI_PIN PINC
 #endif
 
-constexpr uint32_t kBitRate = 400000;
-// The longest transaction, 14 bytes read, takes 0.44 ms; the Pozyx may stretch its clock besides.
-constexpr uint16_t kMostCounts = 1000 / 4;  // of timer 1, the board's clock
+// For long wires or weak pull-ups: -DRELPOS_TWI_HZ=100000.
+#ifndef RELPOS_TWI_HZ
+#define RELPOS_TWI_HZ 400000
+#endif
+constexpr uint32_t kBitRate = RELPOS_TWI_HZ;
+// Of timer 1, the board's clock, for a transaction: the longest, 18 bytes read, takes half of it.
+constexpr uint16_t kMostCounts = 400000UL * (1000 / 4) / kBitRate;
+constexpr uint16_t kMostStretchCounts = Board::kMostStretchUs / 4;
 
 enum Status : uint8_t {  // TWSR without the prescaler
   kStart = 0x08,
@@ -40,9 +45,9 @@ enum Status : uint8_t {  // TWSR without the prescaler
   kDataReadNack = 0x58
 };
 
-uint16_t started;  // the transaction, by the clock
+uint16_t deadline;  // of the transaction, by the clock
 
-bool late() { return static_cast<uint16_t>(TCNT1 - started) > kMostCounts; }
+bool late() { return static_cast<int16_t>(TCNT1 - deadline) > 0; }
 
 // Starts what `control` asks for and waits. 0 (no status of a master) where the deadline passes.
 uint8_t run(uint8_t control) {
@@ -125,7 +130,8 @@ void begin() {
 BusStatus transfer(uint8_t address, const uint8_t* first, uint8_t first_count,
                    const uint8_t* second, uint8_t second_count, uint8_t* read,
                    uint8_t read_count) {
-  started = TCNT1;
+  deadline = TCNT1 + kMostCounts;
+  if (address == Board::kStretchingAddress) deadline += kMostStretchCounts;
   BusStatus status = BusStatus::kOk;
   if (first_count != 0 || read_count == 0) status = write(address, first, first_count);
   if (status == BusStatus::kOk && second_count != 0) {

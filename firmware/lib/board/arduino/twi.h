@@ -8,7 +8,7 @@
 namespace relpos {
 namespace twi {
 
-void begin();  // 400 kHz, pull-ups on
+void begin();  // 400 kHz or RELPOS_TWI_HZ, pull-ups on
 BusStatus transfer(uint8_t address, const uint8_t* first, uint8_t first_count,
                    const uint8_t* second, uint8_t second_count, uint8_t* read,
                    uint8_t read_count);

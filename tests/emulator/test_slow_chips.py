@@ -1,0 +1,98 @@
+"""A Pozyx that holds the bus' clock, and a slow bus: what the Uno's firmware makes of them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from relpos.emulator import pozyx
+from relpos.emulator.avr.board import BOARDS
+from relpos.emulator.avr.budget import TICK_CYCLES, default_build_folder, find_firmware
+from relpos.emulator.avr.elf import read_firmware
+from relpos.emulator.avr.library import missing_parts
+from relpos.emulator.avr.service import Service
+from relpos.protocol import messages as wire
+
+MISSING = missing_parts()
+pytestmark = pytest.mark.skipif(MISSING is not None, reason=str(MISSING))
+ROOT = Path(__file__).resolve().parents[2]
+SECONDS = 15.0
+
+
+@pytest.fixture(scope="module")
+def uno() -> Path:
+    """The Uno's program as the sources now are."""
+    build({})
+    return find_firmware("uno", default_build_folder())
+
+
+def build(environment: dict[str, str]) -> None:
+    command = [sys.executable, str(ROOT / "tools" / "pio"), "run", "-e", "uno"]
+    done = subprocess.run(
+        command, env={**os.environ, **environment}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+
+
+def serve(elf: Path) -> tuple[int, Service]:
+    """Ranges reported in a quarter of a minute of service, and what served."""
+    with Service(BOARDS["uno"], read_firmware(elf), SECONDS, seed=1) as service:
+        service.run(round(SECONDS * 1e6))
+        ranges = sum(
+            len(frame.values["ranges"]) for frame in service.frames if frame.message is wire.RANGES
+        )
+        service.work_done()
+        counters = service.engine.board.counters()
+        assert counters.ticks > 45 * (SECONDS - 2.0)
+        assert counters.tick_cycles_max < 0.45 * TICK_CYCLES
+        return ranges, service
+
+
+@pytest.fixture(scope="module")
+def unstretched(uno: Path) -> int:
+    ranges, _ = serve(uno)
+    assert ranges > 10
+    return ranges
+
+
+@pytest.mark.parametrize(
+    ("stretch_us", "share"), [(650, 0.8), (750, 0.8), (2_000, 0.8), (5_000, 0.5)]
+)
+def test_ranges_flow_from_a_tag_that_holds_the_clock(
+    uno: Path,
+    unstretched: int,
+    monkeypatch: pytest.MonkeyPatch,
+    stretch_us: int,
+    share: float,
+) -> None:
+    monkeypatch.setattr(pozyx, "FUNCTION_STRETCH_US", stretch_us)
+    assert serve(uno)[0] >= share * unstretched
+
+
+def test_a_tag_that_never_lets_go_of_the_clock_costs_no_motion(
+    uno: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pozyx, "FUNCTION_STRETCH_US", 50_000)
+    ranges, service = serve(uno)
+    assert ranges == 0
+    assert sum(frame.message is wire.MOTION for frame in service.frames) >= SECONDS - 3
+
+
+def test_the_bus_at_100_khz_is_a_build_that_works(tmp_path: Path) -> None:
+    build(
+        {
+            "PLATFORMIO_BUILD_DIR": str(tmp_path),
+            "PLATFORMIO_BUILD_FLAGS": "-DRELPOS_TWI_HZ=100000",
+        }
+    )
+    with Service(BOARDS["uno"], read_firmware(find_firmware("uno", tmp_path)), 15.0, 1) as service:
+        service.run(15_000_000)
+        words, faults = service.work_done()
+        counters = service.engine.board.counters()
+    assert faults == (), words
+    # Beyond the budget of 400 kHz, within the 20 ms.
+    assert counters.tick_cycles_max < 0.6 * TICK_CYCLES
