@@ -9,8 +9,8 @@ and an estimator cannot distinguish them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +142,54 @@ Measurement = Motion | Range | Height | Heading
 
 Observation = Motion | Range | Height | Heading | Status | Event | Step
 """Output of a link, a recording or an emulated team."""
+
+
+BOUNDS: Mapping[str, tuple[float, float]] = {
+    "time_s": (-86_400.0, 604_800.0),
+    "dx_m": (-1e4, 1e4),
+    "dy_m": (-1e4, 1e4),
+    "dtheta_rad": (-1e4, 1e4),
+    "sigma_x_m": (0.0, 1e6),
+    "sigma_y_m": (0.0, 1e6),
+    "sigma_theta_rad": (0.0, 1e3),
+    "sigma_x_alone_m": (0.0, 1e6),
+    "range_m": (-1e4, 1e4),
+    "rss_dbm": (-1e3, 1e3),
+    "height_m": (-1e4, 1e4),
+    "sigma_m": (0.0, 1e4),
+    "heading_rad": (-1e3, 1e3),
+    "sigma_rad": (0.0, 1e3),
+    "length_m": (-1e2, 1e2),
+    "value": (-1e15, 1e15),
+    "x_m": (-1e8, 1e8),
+    "y_m": (-1e8, 1e8),
+    "z_m": (-1e8, 1e8),
+    "stature_m": (0.0, 1e1),
+    "leg_length_m": (0.0, 1e1),
+    "antenna_offset_m": (-1e1, 1e1),
+}
+"""Least and greatest value of each quantity, by the name of its field or column.
+
+Far beyond what a person can do in a session of a week (motions may span hours without radio,
+coordinates may be a country's grid), and small enough that no sum of squares overflows. Readers of
+files refuse what is beyond, estimators count it (``beyond_bounds``); docs/run-format.md shows it.
+"""
+
+
+_bounded_fields: dict[type, tuple[tuple[str, float, float], ...]] = {}
+
+
+def out_of_bounds(row: Observation | Truth) -> str | None:
+    """Return the first field that is beyond its bounds, or no finite number; None where all fit."""
+    kind = type(row)
+    if kind not in _bounded_fields:
+        names = (field.name for field in fields(kind))
+        _bounded_fields[kind] = tuple((name, *BOUNDS[name]) for name in names if name in BOUNDS)
+    for name, low, high in _bounded_fields[kind]:
+        value = getattr(row, name)
+        if value is not None and not isinstance(value, str) and not low <= value <= high:
+            return name
+    return None
 
 
 @dataclass(frozen=True, slots=True)

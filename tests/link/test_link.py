@@ -377,3 +377,35 @@ def test_status_figures_carry_the_links_own_counts():
     observed = decoder.feed(wire.encode(wire.STATUS, 1, 0, 3, values), 9.0, -61)
     figures = {o.name: o.value for o in observed if isinstance(o, Status)}
     assert (figures["battery_v"], figures["link_lost"], figures["link_rssi_dbm"]) == (3.7, 2, -61)
+
+
+def mark(time_us, size=8):
+    return xbee.encode(xbee.UnknownFrame(xbee.VIRTUAL_TIME, time_us.to_bytes(size, "big")))
+
+
+def from_node(counter):
+    data = motion_frame(counter, time_s=float(counter))
+    return xbee.encode(xbee.Receive16(1, -40, data))
+
+
+def test_noise_on_a_real_teams_port_never_becomes_a_virtual_time():
+    link = serial_port.Link()
+    for k in range(1, 20):
+        link.feed(from_node(k), float(k))
+    link.feed(mark(7_000_000), 19.5)
+    assert link.virtual_s is None
+    assert link.decoder.counts["UnknownFrame"] == 1
+    (motion,) = motions(link.feed(from_node(20), 20.0))
+    assert motion.time_s == pytest.approx(20.0, abs=0.1)
+
+
+def test_virtual_time_is_taken_from_an_emulated_team_alone_and_never_goes_back():
+    link = serial_port.Link()
+    link.feed(from_node(1), 0.5)
+    link.feed(mark(5, size=7), 0.5)
+    link.feed(mark(2**63), 0.5)
+    assert link.virtual_s is None
+    link.feed(mark(7_000_000), 0.6)
+    link.feed(mark(6_000_000), 0.7)
+    assert link.virtual_s == 7.0
+    assert link.decoder.counts["UnknownFrame"] == 3

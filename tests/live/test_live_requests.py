@@ -76,3 +76,36 @@ def test_a_phones_compass_is_a_heading_of_its_node(handler):
     body = {"node": 2, "clock_offset_ms": 0.0, "sent_unix_ms": None, "headings": rows}
     _, new = handler.headings(Request(2, "headings", STARTED_UNIX_S + 50.1, body))
     assert new == [Heading(pytest.approx(50.0), 2, 1.5, None, "phone")]
+
+
+@pytest.mark.parametrize("ms", [-1e305, -1e308, unix_ms(-200_000.0)])
+def test_a_press_of_another_age_is_dropped_counted_and_not_sent_again(handler, ms):
+    for offset_ms, sent_ms in ((0.0, None), (0.0, unix_ms(9.0)), (ms, 1e308)):
+        request = presses(
+            (f"{offset_ms}{sent_ms}", "4", ms), arrived_s=10.0, offset_ms=offset_ms, sent_ms=sent_ms
+        )
+        reply, new = handler.presses(request)
+        assert len(reply["accepted"]) == 1
+        assert new == []
+    assert handler.counts["presses_beyond_bounds"] == 3
+
+
+def test_a_heading_that_no_compass_shows_is_dropped_and_counted(handler):
+    rows = [
+        {"unix_ms": unix_ms(50.0), "heading_rad": 1e308, "sigma_rad": 1e-300},
+        {"unix_ms": unix_ms(50.0), "heading_rad": 1.0, "sigma_rad": 1e308},
+        {"unix_ms": unix_ms(50.0), "heading_rad": 1.0, "sigma_rad": 0.2},
+    ]
+    body = {"node": 2, "clock_offset_ms": 0.0, "sent_unix_ms": None, "headings": rows}
+    reply, new = handler.headings(Request(2, "headings", STARTED_UNIX_S + 50.1, body))
+    assert reply == {"accepted": 1}
+    assert [heading.sigma_rad for heading in new] == [0.2]
+    assert handler.counts["headings_beyond_bounds"] == 2
+
+
+def test_the_ids_of_presses_take_no_more_memory_in_a_flood(handler, monkeypatch):
+    monkeypatch.setattr("relpos.live.requests.MAX_ACCEPTED", 10)
+    for k in range(30):
+        handler.presses(presses((str(k), "4", unix_ms(5.0)), arrived_s=6.0))
+    assert handler.presses(presses(("29", "4", unix_ms(5.0)), arrived_s=7.0))[1] == []
+    assert len(handler.presses(presses(("3", "4", unix_ms(5.0)), arrived_s=7.0))[1]) == 1

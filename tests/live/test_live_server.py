@@ -14,7 +14,7 @@ from websockets.sync.client import connect
 
 from relpos.errors import DeviceError, RelposError
 from relpos.live.team_view import Hello, Notice, Person, TeamView
-from relpos.view.access import listen, make_certificate, own_address, parse_listen
+from relpos.view.access import Allowance, listen, make_certificate, own_address, parse_listen
 from relpos.view.web import WebView
 
 PATIENCE_S = 60.0
@@ -112,10 +112,16 @@ def test_the_token_becomes_a_cookie_and_leaves_the_address(stage):
         assert answer.headers["location"] == "/phone?node=3"
         cookie = answer.headers["set-cookie"].lower()
         assert "httponly" in cookie
+        assert "max-age=86400" in cookie
         assert "samesite=lax" in cookie
         assert client.get("/phone").status_code == 200
         assert "script-src" not in answer.headers["content-security-policy"]
-        assert "default-src 'self'" in client.get("/").headers["content-security-policy"]
+        policy = client.get("/").headers["content-security-policy"]
+        own = stage.base.split("//")[1].rstrip("/")
+        rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+        assert rules["default-src"] == "'self'"
+        assert rules["connect-src"] == f"'self' ws://{own} wss://{own}"
+        assert {rules[r] for r in ("base-uri", "form-action", "object-src")} == {"'none'"}
 
 
 def test_another_sites_page_cannot_use_the_cookie(stage):
@@ -125,6 +131,36 @@ def test_another_sites_page_cannot_use_the_cookie(stage):
         assert answer.status_code == 401
         own = {"Origin": stage.base.rstrip("/")}
         assert client.post("/api/acknowledge", json={"node": 1}, headers=own).status_code == 200
+
+
+@pytest.mark.parametrize("host", ["elsewhere.example", "elsewhere.example:8460", "", "a b"])
+def test_a_name_that_is_not_this_computers_is_refused(stage, host):
+    with stage.client() as client:
+        assert client.get("/", headers={"Host": host}).status_code in (400, 421)
+        assert client.get("/", headers={"Host": "localhost:1"}).status_code == 200
+    assert not stage.access.is_own(host)
+    with pytest.raises(InvalidStatus), stage.socket(additional_headers={"Host": host}):
+        pass
+
+
+def test_a_flood_of_one_visitor_is_refused_and_leaves_the_others_alone():
+    clock = [0.0]
+    allowance = Allowance(20.0, 100.0, lambda: clock[0])
+    assert sum(allowance.take("10.0.0.1", 10) for _ in range(1000)) == 10
+    assert allowance.take("10.0.0.2", 100)
+    clock[0] = 1.0
+    assert allowance.take("10.0.0.1", 20)
+    assert not allowance.take("10.0.0.1", 1)
+    for k in range(2000):
+        allowance.take(f"10.1.0.{k}", 1)
+    assert allowance.take("10.0.0.1", 100), "long forgotten"
+
+
+def test_a_flood_of_presses_is_told_to_the_phone(monkeypatch):
+    with Stage() as stage, stage.client() as client:
+        body = {"node": 1, "clock_offset_ms": 0, "presses": [PRESS] * 2000}
+        statuses = [client.post("/api/presses", json=body).status_code for _ in range(4)]
+    assert statuses == [200, 200, 429, 429]
 
 
 def test_a_browser_gets_hello_tracks_and_then_pictures(stage):
@@ -183,6 +219,10 @@ def test_a_press_is_accepted_when_the_session_has_it(stage):
         ("name", b'{"node": 1, "name": "\\ud800"}', "printable"),
         ("name", {"node": 1, "name": "a\x1bb"}, "printable"),
         ("acknowledge", {"node": True}, "node"),
+        ("acknowledge", b"[" * 100_000, "not JSON"),
+        ("acknowledge", b'{"node":' * 100_000, "not JSON"),
+        ("presses", b'{"node": 1, "presses": [], "clock_offset_ms": 1' + b"0" * 400 + b"}",
+         "clock_offset_ms"),
         ("acknowledge", b"x" * (1 << 20) + b"x", "bytes"),
     ],
 )  # fmt: skip

@@ -200,6 +200,8 @@ def _features(path: Path) -> list[tuple[str, Any, dict[str, Any]]]:
         document = json.loads(read_text(path))
     except json.JSONDecodeError as error:
         raise DataError(f"{path}: line {error.lineno}: not JSON: {error.msg}") from None
+    except (RecursionError, ValueError):  # The latter by a number of thousands of digits.
+        raise DataError(f"{path}: no GeoJSON: nested too deeply, or numbers too long") from None
     kind = document.get("type") if isinstance(document, dict) else None
     features = document.get("features") if kind == "FeatureCollection" else None
     if kind == "Feature":

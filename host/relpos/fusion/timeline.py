@@ -33,7 +33,15 @@ from operator import attrgetter, itemgetter
 from typing import NamedTuple
 
 from relpos.errors import DataError
-from relpos.measurements import Heading, Height, Measurement, Motion, Range, nodes_of
+from relpos.measurements import (
+    Heading,
+    Height,
+    Measurement,
+    Motion,
+    Range,
+    nodes_of,
+    out_of_bounds,
+)
 
 
 class Advance(NamedTuple):
@@ -128,17 +136,11 @@ def refusal(measurement: Measurement) -> str | None:
 
     DataError where a number is not finite: that is no failure of a sensor but of the source.
     """
-    # A sum is finite where everything in it is, but for what overflows: that is no measurement.
-    if isinstance(measurement, Motion):
-        total = measurement.dx_m + measurement.dy_m + measurement.dtheta_rad
-    elif isinstance(measurement, Range):
-        total = measurement.range_m
-    elif isinstance(measurement, Height):
-        total = measurement.height_m
-    else:
-        total = measurement.heading_rad
-    if not isfinite(measurement.time_s + total):
-        raise DataError(f"a measurement is not a finite number: {measurement}")
+    name = out_of_bounds(measurement)
+    if name is not None:
+        if not isfinite(getattr(measurement, name)):
+            raise DataError(f"a measurement is not a finite number: {measurement}")
+        return "beyond_bounds"
     if isinstance(measurement, Range):
         if measurement.range_m <= 0.0:
             return "ranges_failed"

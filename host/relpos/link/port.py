@@ -14,7 +14,7 @@ from relpos.errors import DeviceError
 from relpos.link import xbee
 from relpos.link.authentication import HostCounter
 from relpos.link.decoder import Decoder
-from relpos.measurements import Observation
+from relpos.measurements import BOUNDS, Observation
 from relpos.protocol import messages as wire
 from relpos.protocol.schema import Message
 
@@ -23,6 +23,8 @@ BAUD = 38_400
 READ_TIMEOUT_S = 0.05
 """Longest wait for bytes; bounds the delay with which silence is noticed."""
 READ_BYTES = 4096
+UNMARKED_FRAMES = 10
+"""A reader that joins an emulated team in the middle gets a few frames before the first mark."""
 
 
 class Line(Protocol):
@@ -66,6 +68,8 @@ class Link:
         self._escaped = escaped
         self._token = 0
         self._virtual_s: float | None = None
+        self._unmarked = 0
+        """Frames of nodes before the first mark of virtual time."""
 
     def newest_counters(self) -> dict[int, int]:
         """Return the newest counter of each node heard, for the next session."""
@@ -74,7 +78,8 @@ class Link:
     def feed(self, data: bytes, arrival_s: float) -> list[Observation]:
         """Return the observations completed by ``data``, whose last byte arrived at ``arrival_s``.
 
-        Virtual time frames of an emulated team replace ``arrival_s`` from then on.
+        Virtual time frames of an emulated team replace ``arrival_s`` from then on. A real team
+        has none: what looks like one after :data:`UNMARKED_FRAMES` frames is line noise.
         """
         observations: list[Observation] = []
         for frame in self.parser.feed(data):
@@ -84,11 +89,25 @@ class Link:
                 observations += self.decoder.feed(frame.data, arrival_s, frame.rssi_dbm)
             elif isinstance(frame, xbee.ReceivePacket):
                 observations += self.decoder.feed(frame.data, arrival_s)
-            elif isinstance(frame, xbee.UnknownFrame) and frame.type == xbee.VIRTUAL_TIME:
-                self._virtual_s = int.from_bytes(frame.data, "big") * 1e-6
-            else:
+            elif not self._is_mark(frame):
                 self.decoder.counts[type(frame).__name__] += 1
+                continue
+            self._unmarked += self._virtual_s is None
         return observations
+
+    def _is_mark(self, frame: object) -> bool:
+        """Set the virtual time if the frame marks one that an emulated team can have."""
+        if not isinstance(frame, xbee.UnknownFrame) or frame.type != xbee.VIRTUAL_TIME:
+            return False
+        virtual_s = int.from_bytes(frame.data, "big") * 1e-6
+        if (
+            len(frame.data) != 8
+            or self._unmarked >= UNMARKED_FRAMES
+            or not (self._virtual_s or 0.0) <= virtual_s <= BOUNDS["time_s"][1]
+        ):
+            return False
+        self._virtual_s = virtual_s
+        return True
 
     def command(
         self,

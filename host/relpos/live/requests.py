@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
-from relpos.measurements import Event, Heading, Observation
+from relpos.measurements import Event, Heading, Observation, out_of_bounds
 
 EARLY_S = 1.0
 LATE_S = 60.0
@@ -51,7 +51,8 @@ class RequestHandler:
 
     def __init__(self, session_s: Callable[[float], float]) -> None:
         self._session_s = session_s
-        self._accepted: set[str] = set()
+        self._accepted: dict[str, None] = {}
+        """The newest ids, the oldest first."""
         self.names: dict[int, str] = {}
         self.counts: Counter[str] = Counter()
         """What was refused, and what failed, by name."""
@@ -62,10 +63,13 @@ class RequestHandler:
         for press in request.body["presses"]:
             if press["id"] in self._accepted:
                 continue
-            if len(self._accepted) < MAX_ACCEPTED:
-                self._accepted.add(press["id"])
+            if len(self._accepted) >= MAX_ACCEPTED:
+                del self._accepted[next(iter(self._accepted))]
+            self._accepted[press["id"]] = None
             time_s = self._time_s(request, press["unix_ms"])
             new.append(Event(time_s, request.body["node"], "landmark", press["landmark"]))
+        new = self._believable("presses", new)
+        # Those that are dropped, too: sent again, they would be no better.
         return {"accepted": [press["id"] for press in request.body["presses"]]}, new
 
     def headings(self, request: Request) -> tuple[dict[str, Any], list[Observation]]:
@@ -80,7 +84,15 @@ class RequestHandler:
             )
             for row in request.body["headings"]
         ]
+        new = self._believable("headings", new)
         return {"accepted": len(new)}, new
+
+    def _believable(self, kind: str, rows: Sequence[Observation]) -> list[Observation]:
+        """Return the rows within bounds; count the others."""
+        good = [row for row in rows if out_of_bounds(row) is None]
+        if len(good) < len(rows):
+            self.counts[f"{kind}_beyond_bounds"] += len(rows) - len(good)
+        return good
 
     def _time_s(self, request: Request, unix_ms: float) -> float:
         sent_ms, offset_ms = request.body["sent_unix_ms"], request.body["clock_offset_ms"]

@@ -38,7 +38,6 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
-from mcap.stream_reader import get_chunk_data_stream
 
 from relpos.recording.topics import Topic
 
@@ -46,6 +45,10 @@ MAGIC = b"\x89MCAP0\r\n"
 HEAD_BYTES = 9
 """Head of a record: one byte for the opcode, eight for the length."""
 _CHUNK_HEAD = struct.Struct("<QQQI")
+MOST_UNPACKED_BYTES = 64 << 20
+MOST_RATIO = 200
+MOST_RATIO_FROM_BYTES = 1 << 16
+"""Limits of a chunk; ours hold a megabyte and are packed to a fifth."""
 CONTENT = (
     Opcode.HEADER,
     Opcode.SCHEMA,
@@ -209,15 +212,33 @@ def parse(kind: Any, payload: bytes) -> Any:
 
 
 def unpack(chunk: Chunk) -> bytes:
-    """The messages of a chunk; ValueError where they are not what was written."""
+    """The messages of a chunk; ValueError where they are not what was written.
+
+    Nothing is unpacked beyond what a chunk of its size may hold, whatever it says.
+    """
+    size = chunk.uncompressed_size
+    if size > min(MOST_UNPACKED_BYTES, MOST_RATIO * len(chunk.data) + MOST_RATIO_FROM_BYTES):
+        raise ValueError(f"damaged: {len(chunk.data)} bytes that say they unpack to {size}")
     try:
-        stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-        raw: bytes = stream.read(length)
+        # The byte too many shows what is longer than it says.
+        if chunk.compression == "zstd":
+            with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
+                raw = stream.read(size + 1)
+        elif chunk.compression == "lz4":
+            import lz4.frame
+
+            raw = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, size + 1)
+        elif chunk.compression == "":
+            raw = chunk.data
+        else:
+            raise ValueError(f"unknown compression {chunk.compression!r}")
     except Exception as error:  # Each compression has errors of its own.
         raise ValueError(f"damaged: {error}") from None
-    if len(raw) != chunk.uncompressed_size:
-        raise ValueError(f"damaged: {len(raw)} bytes instead of {chunk.uncompressed_size}")
-    return raw
+    if len(raw) != size:
+        raise ValueError(f"damaged: {len(raw)} bytes instead of {size}")
+    if chunk.uncompressed_crc and zlib.crc32(raw) != chunk.uncompressed_crc:
+        raise ValueError("damaged: the checksum does not fit")
+    return bytes(raw)
 
 
 @dataclass(frozen=True, slots=True)

@@ -187,7 +187,7 @@ class Recording:
     def _decoded(self, entry: Entry, decode: Any) -> Any:
         try:
             return decode(entry)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except _UNREADABLE as error:
             raise DataError(
                 f"{self.path}: message {entry.sequence} on {entry.topic}: not what it should be "
                 f"({error!r})"
@@ -247,12 +247,18 @@ _OBSERVED = {
 _PHONE = {topics.ROWS[kind] for kind in topics.PHONE_KINDS}
 
 
+_UNREADABLE = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
+"""What a message raises that is not what it should be; the last by lists within lists."""
+
+
 def _row(entry: Entry) -> Any:
     return topics.decode_row(entry.topic, entry.data)
 
 
 def _opened(path: Path) -> Any:
     try:
+        if path.exists() and not path.is_file():
+            raise DataError(f"{path}: cannot be read: not a regular file")
         return path.open("rb")
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None

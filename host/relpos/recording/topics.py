@@ -28,6 +28,7 @@ from relpos.fusion.estimator import (
     Parameter,
 )
 from relpos.measurements import (
+    BOUNDS,
     Event,
     Heading,
     Height,
@@ -37,6 +38,7 @@ from relpos.measurements import (
     Status,
     Step,
     Truth,
+    out_of_bounds,
 )
 from relpos.runs.landmarks import Landmark
 
@@ -206,7 +208,15 @@ _LIST_OF_TOPIC = {topic: kind for kind, topic in LISTS.items()}
 def decode_serial(data: bytes) -> Serial:
     """Undo :func:`encode_serial`; ValueError or KeyError where it is none."""
     document = json.loads(data)
-    return Serial(float(document["arrival_s"]), base64.b64decode(document["data"], validate=True))
+    return Serial(_time_s(document["arrival_s"]), base64.b64decode(document["data"], validate=True))
+
+
+def _time_s(value: Any) -> float:
+    low, high = BOUNDS["time_s"]
+    time_s = float(value)
+    if not low <= time_s <= high:
+        raise ValueError(f"a time of {time_s:g} s")
+    return time_s
 
 
 def decode_row(topic: str, data: bytes) -> Any:
@@ -215,7 +225,13 @@ def decode_row(topic: str, data: bytes) -> Any:
     What a later version has added is passed over.
     """
     kind = _KIND_OF_TOPIC.get(topic)
-    return None if kind is None else _build(kind, json.loads(data))
+    if kind is None:
+        return None
+    row = _build(kind, json.loads(data))
+    beyond = out_of_bounds(row)
+    if beyond is not None:
+        raise ValueError(f"{beyond} is {getattr(row, beyond):g}")
+    return row
 
 
 def decode_list(topic: str, data: bytes) -> tuple[float, type, tuple[Any, ...]] | None:
@@ -224,7 +240,7 @@ def decode_list(topic: str, data: bytes) -> tuple[float, type, tuple[Any, ...]] 
     if kind is None:
         return None
     document = json.loads(data)
-    time_s = float(document["time_s"])
+    time_s = _time_s(document["time_s"])
     entries = document[LIST_NAMES[kind]]
     for entry in entries:
         if "time_s" in names_of(kind):

@@ -14,6 +14,7 @@ from typing import Any
 
 from relpos.errors import DataError
 from relpos.measurements import Prior
+from relpos.runs.table import read_text, within_bounds
 
 
 class InitialPose(StrEnum):
@@ -64,6 +65,9 @@ class Description:
     """The ``[simulated]`` table: the bound of such a run can be computed."""
 
 
+MOST_BYTES = 1 << 20
+"""Of a ``run.toml``; names of a thousand nodes are a tenth of it."""
+MOST_DOTS = 200
 _PLAIN_NUMBERS = ("stature_m", "sensor_height_m", "true_distance_m", "true_turn_deg")
 
 
@@ -71,21 +75,20 @@ def read_description(path: Path) -> Description:
     """Read ``run.toml``; a missing file says nothing. DataError names file and key or line."""
     if not path.exists():
         return Description()
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except UnicodeDecodeError:
-        raise DataError(f"{path}: not UTF-8 text") from None
-    return parse_description(path, text)
+    return parse_description(path, read_text(path, MOST_BYTES))
 
 
 def parse_description(path: Path | str, text: str) -> Description:
     """Read the text of a ``run.toml`` that is found at ``path``. DataError names key or line."""
     try:
+        # The time that a key takes grows with the square of its parts.
+        if any(line.count(".") > MOST_DOTS for line in text.splitlines()):
+            raise RecursionError
         document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # tomllib's own, and Python's of a number of thousands of digits.
         raise DataError(f"{path}: not TOML: {error}") from None
+    except RecursionError:
+        raise DataError(f"{path}: not TOML of a run: nested too deeply") from None
     reader = _Reader(path)
 
     pose = reader.text(document, "initial_pose")
@@ -187,7 +190,11 @@ class _Reader:
         self._path = path
 
     def _fail(self, where: str, key: str, value: object, words: str) -> DataError:
-        shown = repr(value) if len(repr(value)) <= 40 else repr(value)[:40] + "..."
+        try:
+            shown = repr(value)
+        except (RecursionError, ValueError):  # Lists within lists; a number of thousands of digits.
+            shown = type(value).__name__
+        shown = shown if len(shown) <= 40 else shown[:40] + "..."
         return DataError(f"{self._path}: key {where}{key}: {shown} {words}")
 
     def text(self, table: Mapping[str, Any], key: str, where: str = "") -> str | None:
@@ -208,9 +215,16 @@ class _Reader:
             return None
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise self._fail(where, key, value, "is not a number")
-        if not math.isfinite(value):
+        try:
+            number = float(value)
+        except OverflowError:
+            number = math.inf
+        if not math.isfinite(number):
             raise self._fail(where, key, value, "is not a finite number")
-        return float(value)
+        try:
+            return within_bounds(key, number)
+        except ValueError as error:
+            raise self._fail(where, key, value, str(error)) from None
 
     def needed_number(self, table: Mapping[str, Any], key: str, where: str) -> float:
         value = self.number(table, key, where)
@@ -219,10 +233,7 @@ class _Reader:
         return value
 
     def sigma(self, table: Mapping[str, Any], key: str, where: str) -> float:
-        value = self.number(table, key, where) or 0.0
-        if value < 0.0:
-            raise self._fail(where, key, value, "is negative")
-        return value
+        return self.number(table, key, where) or 0.0
 
     def offset(self, table: Mapping[str, Any], key: str, where: str) -> tuple[float, float] | None:
         value = table.get(key)

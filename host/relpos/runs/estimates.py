@@ -20,7 +20,15 @@ from relpos.fusion.estimator import (
 )
 from relpos.measurements import Step
 from relpos.runs.appending import AppendedTable, close_all
-from relpos.runs.table import Column, find_table, node_id, not_negative, number, read_rows
+from relpos.runs.table import (
+    Column,
+    bounded,
+    find_table,
+    node_id,
+    not_negative,
+    number,
+    read_rows,
+)
 
 T = TypeVar("T")
 
@@ -47,7 +55,7 @@ def _whole(text: str) -> int:
 
 
 _ESTIMATE_TABLE = (
-    Column("time_s", number),
+    Column("time_s", bounded("time_s")),
     Column("node", node_id),
     # An estimator that knows nothing of a node may leave its cells empty.
     Column("x_m", number, optional=True),
@@ -62,7 +70,7 @@ _ESTIMATE_TABLE = (
     Column("status", _status, optional=True),
 )
 _PAIR_TABLE = (
-    Column("time_s", number),
+    Column("time_s", bounded("time_s")),
     Column("node", node_id),
     Column("peer", node_id),
     Column("distance_m", number),
@@ -72,7 +80,7 @@ _PAIR_TABLE = (
     Column("status", _status, optional=True),
 )
 _ALTERNATIVE_TABLE = (
-    Column("time_s", number),
+    Column("time_s", bounded("time_s")),
     Column("alternative", _whole),
     Column("probability", not_negative),
     Column("node", node_id),
@@ -85,7 +93,7 @@ _ALTERNATIVE_TABLE = (
     Column("shape", _shape),
 )
 _PARAMETER_TABLE = (
-    Column("time_s", number),
+    Column("time_s", bounded("time_s")),
     Column("node", node_id),
     Column("peer", node_id, optional=True),
     Column("name", str),

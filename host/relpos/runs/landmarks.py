@@ -8,7 +8,7 @@ from pathlib import Path
 
 from relpos.errors import DataError
 from relpos.measurements import Event, Truth
-from relpos.runs.table import Column, number, numbered_rows, read_text
+from relpos.runs.table import Column, bounded, numbered_rows, read_text
 
 PRESS = "landmark"
 """The event of a press; its value is the landmark's id."""
@@ -102,9 +102,9 @@ def read_landmarks(path: Path) -> list[Landmark]:
     """Read a table of surveyed landmarks; DataError names line and column of a fault."""
     columns = (
         Column("id", str),
-        Column("x_m", number),
-        Column("y_m", number),
-        Column("z_m", number, optional=True),
+        Column("x_m", bounded("x_m")),
+        Column("y_m", bounded("y_m")),
+        Column("z_m", bounded("z_m"), optional=True),
     )
     landmarks: dict[str, Landmark] = {}
     for line, cells in numbered_rows(path, read_text(path), columns):

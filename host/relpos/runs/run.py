@@ -41,11 +41,10 @@ from relpos.runs.imu import ImuRecording, read_imu
 from relpos.runs.landmarks import Landmark, read_landmarks, truth_from_presses
 from relpos.runs.table import (
     Column,
+    bounded,
     find_table,
     flag,
     node_id,
-    not_negative,
-    number,
     numbered_rows,
     read_text,
     whole,
@@ -57,6 +56,11 @@ UNKNOWN_HEADING_SIGMA_RAD = math.pi
 PRIOR_FROM_TRUTH_WITHIN_S = 2.0
 """A first truth pose later than this after a node's start says nothing of its start. The same
 2 s as the metrics allow between two rows that are interpolated."""
+
+
+SPARSE_S, CRAWLING_M_S = 2.0, 0.005
+"""A walk whose times are milliseconds: rows seconds apart (up to 500 a second), at the thousandth
+of a person's speed. Nodes that stand still report small errors as often as ever."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +167,26 @@ def load_run(path: Path | str) -> Run:
     surveyed = find_table(directory, "landmarks.csv")
     landmarks = tuple(read_landmarks(surveyed)) if surveyed is not None else ()
     name = description.name or directory.resolve().name
+    _check_time_unit(directory, [row for row in rows if isinstance(row, Motion)])
     return assemble(name, description, rows, landmarks, directory=directory, counters=counters)
+
+
+def _check_time_unit(directory: Path, motions: Sequence[Motion]) -> None:
+    """Raise DataError where people crawl at millimetres a second: the times are milliseconds."""
+    before: dict[int, float] = {}
+    way_m, slow_m = 0.0, 0.0
+    for motion in motions:
+        took_s = motion.time_s - before.get(motion.node, math.inf)
+        before[motion.node] = motion.time_s
+        went_m = math.hypot(motion.dx_m, motion.dy_m)
+        way_m += went_m
+        if took_s > SPARSE_S and went_m < CRAWLING_M_S * took_s:
+            slow_m += went_m
+    if way_m > 10.0 and slow_m > 0.9 * way_m:
+        raise DataError(
+            f"{directory}: motion.csv: {way_m:.0f} m at less than {CRAWLING_M_S * 1e3:g} mm/s: "
+            "time_s is in seconds, these look like milliseconds"
+        )
 
 
 def assemble(
@@ -366,7 +389,11 @@ class _Table:
         return rows
 
 
-_TIME_AND_NODE = (Column("time_s", number), Column("node", node_id))
+def _quantity(name: str, *, optional: bool = False) -> Column:
+    return Column(name, bounded(name), optional)
+
+
+_TIME_AND_NODE = (_quantity("time_s"), Column("node", node_id))
 
 _TABLES = (
     _Table(
@@ -374,15 +401,15 @@ _TABLES = (
         Motion,
         (
             *_TIME_AND_NODE,
-            Column("dx_m", number),
-            Column("dy_m", number),
-            Column("dtheta_rad", number),
-            Column("sigma_x_m", not_negative, optional=True),
-            Column("sigma_y_m", not_negative, optional=True),
-            Column("sigma_theta_rad", not_negative, optional=True),
+            _quantity("dx_m"),
+            _quantity("dy_m"),
+            _quantity("dtheta_rad"),
+            _quantity("sigma_x_m", optional=True),
+            _quantity("sigma_y_m", optional=True),
+            _quantity("sigma_theta_rad", optional=True),
             Column("gain_version", whole, optional=True),
             Column("moving", flag, optional=True),
-            Column("sigma_x_alone_m", not_negative, optional=True),
+            _quantity("sigma_x_alone_m", optional=True),
         ),
     ),
     _Table(
@@ -391,8 +418,8 @@ _TABLES = (
         (
             *_TIME_AND_NODE,
             Column("peer", node_id),
-            Column("range_m", number),
-            Column("rss_dbm", number, optional=True),
+            _quantity("range_m"),
+            _quantity("rss_dbm", optional=True),
         ),
     ),
     _Table(
@@ -400,8 +427,8 @@ _TABLES = (
         Height,
         (
             *_TIME_AND_NODE,
-            Column("height_m", number),
-            Column("sigma_m", not_negative, optional=True),
+            _quantity("height_m"),
+            _quantity("sigma_m", optional=True),
         ),
     ),
     _Table(
@@ -409,8 +436,8 @@ _TABLES = (
         Heading,
         (
             *_TIME_AND_NODE,
-            Column("heading_rad", number),
-            Column("sigma_rad", not_negative, optional=True),
+            _quantity("heading_rad"),
+            _quantity("sigma_rad", optional=True),
             Column("source", str, optional=True),
         ),
     ),
@@ -422,18 +449,18 @@ _TABLES = (
     _Table(
         "status.csv",
         Status,
-        (*_TIME_AND_NODE, Column("name", str), Column("value", number)),
+        (*_TIME_AND_NODE, Column("name", str), _quantity("value")),
     ),
-    _Table("steps.csv", Step, (*_TIME_AND_NODE, Column("length_m", number))),
+    _Table("steps.csv", Step, (*_TIME_AND_NODE, _quantity("length_m"))),
     _Table(
         "truth.csv",
         Truth,
         (
             *_TIME_AND_NODE,
-            Column("x_m", number),
-            Column("y_m", number),
-            Column("heading_rad", number, optional=True),
-            Column("z_m", number, optional=True),
+            _quantity("x_m"),
+            _quantity("y_m"),
+            _quantity("heading_rad", optional=True),
+            _quantity("z_m", optional=True),
         ),
     ),
 )

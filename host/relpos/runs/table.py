@@ -17,6 +17,15 @@ from pathlib import Path
 from typing import Any
 
 from relpos.errors import DataError
+from relpos.measurements import BOUNDS
+
+MOST_LINE_BYTES = 64 << 20
+"""A GeoJSON file is one line."""
+MOST_UNPACKED_BYTES = 64 << 20
+MOST_RATIO = 50
+"""A gzipped file may unpack to the one and, on top, to so many times its size; recordings reach
+twenty."""
+_PART_BYTES = 1 << 20
 
 Parser = Callable[[str], Any]
 
@@ -50,6 +59,21 @@ def not_negative(text: str) -> float:
     if value < 0.0:
         raise ValueError("is negative")
     return value
+
+
+def bounded(name: str) -> Parser:
+    """Return the parser of a quantity that :data:`relpos.measurements.BOUNDS` names."""
+    return lambda text: within_bounds(name, number(text))
+
+
+def within_bounds(name: str, value: float) -> float:
+    """Return the value of the quantity ``name``; ValueError where it is beyond its bounds."""
+    low, high = BOUNDS.get(name, (-math.inf, math.inf))
+    if low <= value <= high:
+        return value
+    if low == 0.0 and value < 0.0:
+        raise ValueError("is negative")
+    raise ValueError(f"is not between {low:g} and {high:g}")
 
 
 def whole(text: str) -> int:
@@ -87,22 +111,44 @@ def find_table(directory: Path, name: str) -> Path | None:
     return found[0] if found else None
 
 
-def read_text(path: Path) -> str:
-    """Read a whole file as text, unpacked where it is gzipped; DataError in one line otherwise."""
+def read_text(path: Path, most_bytes: int | None = None) -> str:
+    """Read a whole file as text, unpacked where it is gzipped; DataError in one line otherwise.
+
+    Somebody else's file takes no more memory than a file of its size deserves: a device, a line
+    longer than :data:`MOST_LINE_BYTES` and a gzip file that unpacks to a multiple are refused.
+    """
     try:
-        data = path.read_bytes()
+        if not path.is_file():
+            raise DataError(f"{path}: cannot be read: not a regular file")
+        packed = path.suffix == ".gz"
+        if most_bytes is None:
+            ratio = MOST_RATIO if packed else 1
+            most_bytes = MOST_UNPACKED_BYTES + ratio * path.stat().st_size
+        with gzip.open(path) if packed else path.open("rb") as file:
+            data = _read_lines(path, file, most_bytes)
+    except (EOFError, gzip.BadGzipFile, zlib.error):
+        raise DataError(f"{path}: the gzip file is truncated or damaged") from None
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from None
-    if path.suffix == ".gz":
-        try:
-            data = gzip.decompress(data)
-        except (EOFError, gzip.BadGzipFile, zlib.error):
-            raise DataError(f"{path}: the gzip file is truncated or damaged") from None
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         raise DataError(f"{path}: line {line}: not UTF-8 text") from None
+
+
+def _read_lines(path: Path, file: Any, most_bytes: int) -> bytearray:
+    data, line_bytes = bytearray(), 0
+    while part := file.read(_PART_BYTES):
+        data += part
+        end = max(part.rfind(b"\n"), part.rfind(b"\r"))
+        line_bytes = len(part) - end - 1 if end >= 0 else line_bytes + len(part)
+        if line_bytes > MOST_LINE_BYTES:
+            line = data.count(b"\n") + 1
+            raise DataError(f"{path}: line {line}: longer than {MOST_LINE_BYTES >> 20} MB")
+        if len(data) > most_bytes:
+            raise DataError(f"{path}: more than {most_bytes >> 10} kB of text")
+    return data
 
 
 def read_rows(path: Path, columns: Sequence[Column]) -> Iterator[tuple[Any, ...]]:

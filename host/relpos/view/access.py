@@ -6,6 +6,8 @@ import ipaddress
 import re
 import secrets
 import socket
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from urllib.parse import urlencode
 
@@ -52,9 +54,46 @@ class Access:
         host = f"[{host}]" if ":" in host else host
         return f"{scheme}://{host}:{self.port}{path}?{urlencode({'token': self.token})}"
 
+    def is_own(self, host: str) -> bool:
+        """Return whether a Host header names this computer.
+
+        A name of somebody else's that leads here (DNS rebinding) would make their page ours.
+        """
+        name = host.rpartition(":")[0] if re.search(r":\d*$", host) else host
+        name = name.strip("[]").lower().removesuffix(".local")
+        if name in ("localhost", *(h.lower().removesuffix(".local") for h in self.hosts)):
+            return True
+        try:
+            return bool(ipaddress.ip_address(name))
+        except ValueError:
+            return name == socket.gethostname().lower()
+
     def fits(self, token: str | None) -> bool:
         """Whether it is this session's; takes the same time whatever it is."""
         return token is not None and secrets.compare_digest(token.encode(), self.token.encode())
+
+
+class Allowance:
+    """What each visitor may send: ``burst`` items at once, and ``per_s`` again every second."""
+
+    MOST_VISITORS = 1000
+
+    def __init__(
+        self, per_s: float, burst: float, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._per_s, self._burst, self._clock = per_s, burst, clock
+        self._left: dict[str, tuple[float, float]] = {}
+
+    def take(self, visitor: str, count: int) -> bool:
+        """Return whether the visitor may send so many, and count them if so."""
+        now_s = self._clock()
+        left, at_s = self._left.pop(visitor, (self._burst, now_s))
+        left = min(left + (now_s - at_s) * self._per_s, self._burst)
+        allowed = count <= left
+        self._left[visitor] = (left - count if allowed else left), now_s
+        if len(self._left) > self.MOST_VISITORS:
+            del self._left[next(iter(self._left))]
+        return allowed
 
 
 def parse_listen(address: str) -> tuple[str, int]:

@@ -13,6 +13,7 @@ import asyncio
 import contextlib
 import json
 import math
+import re
 import signal
 import socket
 import tempfile
@@ -42,7 +43,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from relpos.live.team_view import to_json
 from relpos.live.tracks import Tracks
-from relpos.view.access import Access, qr_svg
+from relpos.view.access import Access, Allowance, qr_svg
 
 STATIC = Path(__file__).parent / "static"
 PING_S = 2.0
@@ -52,7 +53,15 @@ MAX_LINE_BYTES = 1 << 26
 MAX_BODY_BYTES = 1 << 20
 MAX_ITEMS = 2000
 """Presses, or headings, of one request."""
-COOKIE_S = 7 * 24 * 3600
+COOKIE_S = 24 * 3600
+"""A mission; each session has its own token."""
+ALLOWED = {
+    "presses": (20.0, 4000.0),
+    "headings": (50.0, 4000.0),
+    "name": (2.0, 100.0),
+    "acknowledge": (2.0, 100.0),
+}
+"""Items that a visitor may send, per second and at once: a phone sends what it gathered offline."""
 
 REFUSED = """<!doctype html><html lang="en"><meta charset="utf-8">
 <meta name="viewport" content="width=device-width"><title>relpos</title>
@@ -61,9 +70,13 @@ REFUSED = """<!doctype html><html lang="en"><meta charset="utf-8">
 <code>relpos</code> runs, and shown as a QR code there and on the team's page. Each session has
 its own token.</p></html>"""
 
+NOT_OURS = "This name is not this computer's: use the address that relpos has printed."
+
 CONTENT_POLICY = (
     "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
-    "connect-src 'self' ws: wss:; frame-ancestors 'none'"
+    # Safari before 15.4 does not take 'self' for a socket of the same host.
+    "connect-src 'self' ws://{host} wss://{host}; object-src 'none'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'"
 )
 
 
@@ -165,6 +178,13 @@ class TokenMiddleware:
             await self._app(scope, receive, send)
             return
         asking = HTTPConnection(scope)
+        send = _with_headers(send, asking) if scope["type"] == "http" else send
+        if not self._access.is_own(asking.headers.get("host", "")):
+            if scope["type"] == "http":
+                await PlainTextResponse(NOT_OURS, 421)(scope, receive, send)
+            else:
+                await send({"type": "websocket.close", "code": 4421})
+            return
         given = asking.query_params.get("token")
         by_address = self._access.fits(given)
         allowed = by_address or self._access.fits(asking.cookies.get(self._access.cookie))
@@ -183,7 +203,7 @@ class TokenMiddleware:
             rest = [(k, v) for k, v in parse_qsl(asking.url.query) if k != "token"]
             response = RedirectResponse(scope["path"] + ("?" + urlencode(rest)) * bool(rest), 303)
         else:
-            await self._app(scope, receive, _with_headers(send))
+            await self._app(scope, receive, send)
             return
         if allowed:
             response.set_cookie(
@@ -194,7 +214,7 @@ class TokenMiddleware:
                 samesite="lax",
                 secure=self._access.certificate is not None,
             )
-        await response(scope, receive, _with_headers(send))
+        await response(scope, receive, send)
 
 
 def _own_page(asking: HTTPConnection) -> bool:
@@ -203,11 +223,14 @@ def _own_page(asking: HTTPConnection) -> bool:
     return origin is None or urlsplit(origin).netloc == asking.headers.get("host")
 
 
-def _with_headers(send: Send) -> Send:
+def _with_headers(send: Send, asking: HTTPConnection) -> Send:
+    host = asking.headers.get("host", "")
+    host = host if re.fullmatch(r"[\w.:\[\]-]+", host, re.ASCII) else "localhost"
+
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
             headers = MutableHeaders(scope=message)
-            headers["Content-Security-Policy"] = CONTENT_POLICY
+            headers["Content-Security-Policy"] = CONTENT_POLICY.format(host=host)
             headers["X-Content-Type-Options"] = "nosniff"
             headers["Referrer-Policy"] = "no-referrer"
             headers.setdefault("Cache-Control", "no-cache")
@@ -227,6 +250,7 @@ class Pages:
         self.session = session
         self._access = access
         self._code: str | None = None
+        self._allowances = {kind: Allowance(*most) for kind, most in ALLOWED.items()}
 
     def app(self) -> ASGIApp:
         """The whole application behind its guard."""
@@ -331,7 +355,9 @@ class Pages:
         if isinstance(name, str):
             # White space of any kind becomes one space; other characters have to be printable.
             body["name"] = " ".join(name.split())
-        return await self._ask("name", {"node": _node(body), "name": _text(body, "name", 40)})
+        return await self._ask(
+            request, "name", {"node": _node(body), "name": _text(body, "name", 40)}
+        )
 
     async def presses(self, request: Request) -> Response:
         """Landmark presses of a phone; those accepted need not be sent again."""
@@ -344,7 +370,8 @@ class Pages:
             }
             for press in _items(body, "presses")
         ]
-        return await self._ask("presses", {**_clocks(body), "presses": presses})
+        asked = {**_clocks(body), "presses": presses}
+        return await self._ask(request, "presses", asked, len(presses))
 
     async def headings(self, request: Request) -> Response:
         """Compass headings of a phone, already in the common convention (counter-clockwise)."""
@@ -357,13 +384,19 @@ class Pages:
             }
             for row in _items(body, "headings")
         ]
-        return await self._ask("headings", {**_clocks(body), "headings": headings})
+        asked = {**_clocks(body), "headings": headings}
+        return await self._ask(request, "headings", asked, len(headings))
 
     async def acknowledge(self, request: Request) -> Response:
         """Silence somebody's alarm until its reason has gone."""
-        return await self._ask("acknowledge", {"node": _node(await _body(request))})
+        return await self._ask(request, "acknowledge", {"node": _node(await _body(request))})
 
-    async def _ask(self, kind: str, body: Mapping[str, Any]) -> Response:
+    async def _ask(
+        self, request: Request, kind: str, body: Mapping[str, Any], items: int = 1
+    ) -> Response:
+        visitor = request.client.host if request.client else ""
+        if not self._allowances[kind].take(visitor, max(items, 1)):
+            return JSONResponse({"error": "too many at once; try again in a minute"}, 429)
         answer = await self.session.ask(kind, body)
         if answer is None:
             return JSONResponse({"error": "the session does not answer; try again"}, 503)
@@ -388,7 +421,7 @@ async def _body(request: Request) -> dict[str, Any]:
             raise BadRequestError(f"more than {MAX_BODY_BYTES} bytes")
     try:
         body = json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):  # The latter by lists within lists.
         raise BadRequestError("not JSON") from None
     if not isinstance(body, dict):
         raise BadRequestError("not a JSON object")
@@ -404,9 +437,13 @@ def _node(body: Mapping[str, Any]) -> int:
 
 def _number(row: Mapping[str, Any], name: str) -> float:
     value = row.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    try:
+        number = math.nan if isinstance(value, bool | str) else float(value)  # type: ignore[arg-type]
+    except (TypeError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
         raise BadRequestError(f"{name}: not a number")
-    return float(value)
+    return number
 
 
 def _sigma(row: Mapping[str, Any]) -> float | None:
