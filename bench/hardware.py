@@ -121,7 +121,7 @@ def health_limits() -> str:
         ("radio's signal", "", f"under {health.RSSI_YELLOW_DBM:g} dBm"),
         ("beacon", "", "not heard"),
         (
-            "restart by brown-out or watchdog",
+            "restart by brown-out, watchdog, or of hidden cause",
             "",
             f"within the last {health.FRESH_START_S:g} s",
         ),

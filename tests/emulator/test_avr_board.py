@@ -506,13 +506,23 @@ def test_a_watchdog_reset_happens_and_the_program_sees_its_cause(
 
 
 @pytest.mark.parametrize("cause", list(ResetCause))
-def test_the_program_sees_why_it_was_reset(build: Builder, cause: ResetCause) -> None:
-    program = "int main(void) { uart(51); put(MCUSR); for (;;); }"
+def test_the_causes_of_resets_add_up_until_zeros_are_written_or_power_was_lost(
+    build: Builder, cause: ResetCause
+) -> None:
+    program = """int main(void) {
+      uart(51); put(MCUSR); if (MCUSR & _BV(BORF)) MCUSR = ~_BV(BORF); put(MCUSR); for (;;); }"""
     with Board(BOARDS["uno"], build(program), reset_cause=cause) as board:
-        board.run(16_000)
-        board.reset(ResetCause.BROWN_OUT)
-        board.run(32_000)
-        assert sent(board) == bytes([cause, ResetCause.BROWN_OUT])
+        for again in (ResetCause.BROWN_OUT, ResetCause.EXTERNAL, ResetCause.POWER_ON):
+            board.run(board.cycle + 16_000)
+            board.reset(again)
+        board.run(board.cycle + 16_000)
+        seen = sent(board)
+    rest = cause & ~ResetCause.BROWN_OUT
+    both = cause | ResetCause.BROWN_OUT
+    assert seen[0] == cause
+    assert seen[2:4] == bytes([both if cause is not ResetCause.BROWN_OUT else cause, rest])
+    assert seen[4:6] == bytes([rest | ResetCause.EXTERNAL] * 2)
+    assert seen[6:] == bytes([ResetCause.POWER_ON] * 2)
 
 
 def test_ram_is_not_zero_at_power_on(build: Builder) -> None:

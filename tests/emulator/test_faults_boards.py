@@ -40,7 +40,7 @@ def assert_sound(run):
 @pytest.mark.parametrize(
     ("spec", "cause"),
     [
-        ("clock:off:node=2,from=5,to=6", wire.ResetCause.WATCHDOG),
+        ("clock:off:node=2,from=5,to=7", wire.ResetCause.WATCHDOG),
         ("eeprom:cut:node=2,from=1.7,write=3,left=garbage", wire.ResetCause.BROWN_OUT),
         in_soak("node:brownout:node=2,from=6.1", wire.ResetCause.BROWN_OUT),
         in_soak("node:off:node=2,from=5,to=6", wire.ResetCause.POWER_ON),

@@ -134,4 +134,20 @@ def _track():
 def test_the_unwanted_starts_are_those_of_the_wire():
     from relpos.nodes.monitor import UNWANTED
 
-    assert set(UNWANTED) == {wire.ResetCause.BROWN_OUT, wire.ResetCause.WATCHDOG}
+    assert set(UNWANTED) == {
+        wire.ResetCause.BROWN_OUT,
+        wire.ResetCause.WATCHDOG,
+        wire.ResetCause.UNKNOWN,
+    }
+
+
+def test_a_restart_whose_cause_the_boot_loader_hides_is_reported_and_a_first_start_is_not():
+    from relpos.nodes.monitor import NodeMonitor
+
+    view = NodeMonitor(3, boot=7)
+    for name, value in (("reset_cause", 0.0), ("uptime_s", 5.0)):
+        view.add_status(10.0, name, value)
+    view.add_link(10.0, 1, 0)
+    assert not [words for words in view.health(10.0)[1] if "restarted" in words]
+    view.restarted = True
+    assert "restarted (brown-out or button)" in view.health(10.0)[1]

@@ -11,12 +11,12 @@ ROOT = Path(__file__).resolve().parents[2]
 LOADERS = Path("/usr/share/arduino/hardware/arduino/avr/bootloaders")
 OPTIBOOT = LOADERS / "optiboot/optiboot.c"
 MEGA_LOADER = LOADERS / "stk500v2/stk500boot_v2_mega2560.hex"
-# A fuse starts the loader at the end of flash instead of address 0; here a jump does it, which
-# the upload overwrites.
+# A fuse starts the loader at the end of flash instead of address 0.
 OPTIBOOT_ADDRESS = 0x7E00
-JUMP_TO_OPTIBOOT = bytes.fromhex("0c94003f")
 MEGA_ADDRESS = 0x3E000
-JUMP_TO_MEGA_LOADER = bytes.fromhex("0d9400f0")
+ADDRESSES = {"uno": OPTIBOOT_ADDRESS, "mega": MEGA_ADDRESS}
+# Where no program has been uploaded yet: an endless loop.
+NO_PROGRAM = bytes.fromhex("ffcf")
 
 
 def needs() -> str | None:
@@ -42,17 +42,22 @@ def build_optiboot(folder: Path) -> Firmware:
     arguments = f"{options} {chip} {settings} {places}".split()
     subprocess.run(["avr-gcc", *arguments, str(OPTIBOOT), "-o", str(elf)], check=True)
     image = bytearray(read_firmware(elf).flash)
-    image[: len(JUMP_TO_OPTIBOOT)] = JUMP_TO_OPTIBOOT
+    image[: len(NO_PROGRAM)] = NO_PROGRAM
     return Firmware(bytes(image), 0, 0x100, b"", {})
+
+
+def read_hex(path: Path, folder: Path) -> bytes:
+    """What an Intel HEX file holds, from its first address on."""
+    binary = folder / f"{path.stem}.bin"
+    convert = ["avr-objcopy", "-I", "ihex", "-O", "binary", "--gap-fill", "0xff"]
+    subprocess.run([*convert, str(path), str(binary)], check=True)
+    return binary.read_bytes()
 
 
 def mega_loader(folder: Path) -> Firmware:
     """The Mega's, as Debian ships it."""
-    binary = folder / "mega.bin"
-    convert = ["avr-objcopy", "-I", "ihex", "-O", "binary", "--gap-fill", "0xff"]
-    subprocess.run([*convert, str(MEGA_LOADER), str(binary)], check=True)
-    loader = binary.read_bytes()
+    loader = read_hex(MEGA_LOADER, folder)
     image = bytearray(b"\xff" * 0x40000)
-    image[: len(JUMP_TO_MEGA_LOADER)] = JUMP_TO_MEGA_LOADER
+    image[: len(NO_PROGRAM)] = NO_PROGRAM
     image[MEGA_ADDRESS : MEGA_ADDRESS + len(loader)] = loader
     return Firmware(bytes(image), 0, 0x200, b"", {})

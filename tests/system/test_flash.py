@@ -7,10 +7,10 @@ import termios
 import threading
 import tty
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
-from boot_loaders import MEGA_LOADER, build_optiboot, mega_loader, needs
+from boot_loaders import ADDRESSES, MEGA_LOADER, build_optiboot, mega_loader, needs
 from typer.testing import CliRunner
 
 from relpos.cli.main import app
@@ -100,6 +100,7 @@ def plugged(kind, firmware, *, connected=True):
     path = os.ttyname(port)
     os.close(port)
     with Board(SIMULATED[kind], firmware, reset_cause=ResetCause.EXTERNAL) as board:
+        board.set_reset_vector(ADDRESSES[kind])
         arduino = Arduino(board, terminal, connected)
         arduino.start()
         try:
@@ -153,6 +154,23 @@ def test_a_mega_is_known_by_its_own_boot_loader(tmp_path):
         assert boards.check(device, None).name == "mega"
         with pytest.raises(DeviceError, match="not a uno"):
             boards.check(device, "uno")
+
+
+@pytest.mark.parametrize("of_2011", [True, False])
+@pytest.mark.skipif(not MEGA_LOADER.is_file(), reason="no boot loader of the Mega is installed")
+def test_a_boot_loader_that_leaves_the_watchdog_armed_is_told(tmp_path, of_2011):
+    program = mega_loader(tmp_path)
+    if of_2011:  # as that one: without the instruction that feeds the watchdog
+        program = replace(program, flash=program.flash.replace(b"\xa8\x95", b"\0\0"))
+    with (
+        plugged("mega", program) as mega,
+        closing(open_port(mega.path, 115200)) as device,
+    ):
+        warning = boards.warning(device, boards.check(device, None))
+    if of_2011:
+        assert "leaves the watchdog armed" in warning
+    else:
+        assert warning is None
 
 
 @pytest.mark.soak

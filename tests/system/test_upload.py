@@ -7,7 +7,7 @@ import threading
 import tty
 
 import pytest
-from boot_loaders import ROOT, build_optiboot, needs
+from boot_loaders import OPTIBOOT_ADDRESS, ROOT, build_optiboot, needs
 
 from relpos.emulator.avr.board import BOARDS, Board, ResetCause
 
@@ -54,6 +54,7 @@ def test_upload_writes_and_verifies_the_firmware_through_the_bootloader(tmp_path
         line_baud=115200,
         reset_cause=ResetCause.EXTERNAL,
     ) as board:
+        board.set_reset_vector(OPTIBOOT_ADDRESS)
         serial_board = SerialBoard(board, terminal)
         serial_board.start()
         try:

@@ -23,7 +23,7 @@ constexpr int16_t kWeakSignalDbm = -95;    // DW1000: close to the sensitivity l
 constexpr uint16_t kMotionPhaseMs = 157;   // between the reports of neighbouring ids, up to
 constexpr uint16_t kMostMotionPhaseMs = 1023;
 constexpr uint16_t kMostStepAgeMs = 2000;  // then it is sent without waiting for others
-constexpr uint8_t kRebootBytes = 5;
+constexpr uint8_t kRebootBytes = 6;
 // 5 V - 10 %: what the boards' 3.3 V regulators and the Pozyx are sure to work from.
 constexpr uint16_t kSupplyLowMv = 4500;
 // Counters of frames are reserved in blocks of so many: at a frame or two a second the EEPROM is
@@ -94,12 +94,12 @@ void Node::begin(uint32_t now_us, wire::ResetCause cause, uint8_t node_id) {
   for (uint8_t i = 0; i < kRebootBytes; ++i) reboot[i] = board_.storage_read(kStoredReboot + i);
   const uint8_t previous = board_.storage_read(kStoredBootCount);
   reset_cause_ = cause;
-  if (reboot[0] == previous &&
-      (cause == wire::ResetCause::kWatchdog || cause == wire::ResetCause::kCommand)) {
+  // Whatever cause the board tells (after a boot loader often none): it fits this one start.
+  if (reboot[4] == previous && (reboot[5] ^ previous) == 0xFF) {
     reset_cause_ = wire::ResetCause::kCommand;
     DoneCommand& done = commands_[0];
-    done.token = static_cast<uint16_t>(reboot[1] | static_cast<uint16_t>(reboot[2]) << 8);
-    done.key = static_cast<uint16_t>(reboot[3] | static_cast<uint16_t>(reboot[4]) << 8);
+    done.token = static_cast<uint16_t>(reboot[0] | static_cast<uint16_t>(reboot[1]) << 8);
+    done.key = static_cast<uint16_t>(reboot[2] | static_cast<uint16_t>(reboot[3]) << 8);
     done.command = static_cast<uint8_t>(wire::CommandCode::kReboot);
     done.result = static_cast<uint8_t>(wire::CommandResult::kDone);
     done.known = true;
@@ -515,7 +515,8 @@ bool Node::answer_due() const {
   return false;
 }
 
-// Behind the answer: writes down whose command it was, a byte a poll, then restarts.
+// Behind the answer: writes down whose command it was, a byte a poll and last what makes it count, then
+// restarts.
 bool Node::run_reboot() {
   if (reboot_step_ == 0 || store_.saving() || answer_due()) return false;
   if (reboot_step_ > kRebootBytes) {
@@ -527,8 +528,9 @@ bool Node::run_reboot() {
   const DoneCommand* reboot =
       &commands_[(next_command_ == 0 ? kRememberedCommands : next_command_) - 1];
   const uint8_t bytes[kRebootBytes] = {
-      boot_, static_cast<uint8_t>(reboot->token), static_cast<uint8_t>(reboot->token >> 8),
-      static_cast<uint8_t>(reboot->key), static_cast<uint8_t>(reboot->key >> 8)};
+      static_cast<uint8_t>(reboot->token), static_cast<uint8_t>(reboot->token >> 8),
+      static_cast<uint8_t>(reboot->key), static_cast<uint8_t>(reboot->key >> 8), boot_,
+      static_cast<uint8_t>(~boot_)};
   const uint8_t at = static_cast<uint8_t>(reboot_step_ - 1);
   if (!board_.storage_write(kStoredReboot + at, bytes[at])) return false;
   ++reboot_step_;

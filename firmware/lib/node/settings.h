@@ -56,7 +56,8 @@ enum StorageAddress : uint16_t {
   kStoredNodeId = 0,            // 1 to 254
   kStoredNodeIdComplement = 1,  // node id ^ 0xFF
   kStoredBootCount = 2,
-  kStoredReboot = 3,            // boot count, token(2), key(2) of the last REBOOT command
+  kStoredReboot = 3,            // token(2), key(2), boot count, boot count ^ 0xFF of the last
+                                // restart on command
   kStoredRecords = 16,
   // A calibration before its COMMIT.
   kStoredStaging = kStoredRecords + stored_bytes(sizeof(Marks)) + stored_bytes(wire::kKeyBytes) +

@@ -68,7 +68,10 @@ def flash(
     found = port or boards.find_port()
     with closing(open_port(found, boards.BOOT_BAUD)) as device:
         kind = boards.check(device, None if board is None else str(board))
+        warning = boards.warning(device, kind)
     typer.echo(f"{found}: Arduino {kind.name} ({kind.chip})")
+    if warning is not None:
+        typer.echo(f"{found}: {warning}", err=True)
     with output.working("building and writing the firmware"):
         size = upload.upload(kind, found)
     typer.echo("firmware written and verified" + (f" ({size} bytes)" if size else ""))

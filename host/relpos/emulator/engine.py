@@ -9,7 +9,10 @@ from typing import Protocol
 from relpos.protocol.messages import ResetCause
 
 RESTART_US = 70_000
-"""From a reset to the first pass: 65 ms start-up of the ATmega's fuses, then the C runtime."""
+"""From a reset to the first pass: 65 ms start-up of the ATmega's fuses, then the C runtime. A boot
+loader, which no engine has, adds to it (docs/emulator.md)."""
+JUMP_US = 1_000
+"""A restart on command is a jump: the C runtime alone."""
 EEPROM_WRITE_US = 3_400
 """A byte of the ATmega's EEPROM erased and written (ATmega328P data sheet, EEPROM timing)."""
 POWER_LOSS = frozenset((ResetCause.POWER_ON, ResetCause.BROWN_OUT))

@@ -21,7 +21,7 @@ from relpos.errors import DeviceError
 from relpos.protocol.messages import ResetCause
 
 from .bus import BusStatus, I2cBus
-from .engine import EEPROM_WRITE_US, POWER_LOSS, RESTART_US, NodeClockError
+from .engine import EEPROM_WRITE_US, JUMP_US, POWER_LOSS, RESTART_US, NodeClockError
 from .xbee import line_time_us
 
 _COMPILE = ("-std=gnu++11", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
@@ -312,7 +312,8 @@ class NativeEngine:
         self._written_until_us = 0
         self.resets += 1
         self._library.relpos_node_destroy(self._node)
-        self._power_on_us = self._bend_us = time_us + RESTART_US
+        away_us = JUMP_US if cause is ResetCause.COMMAND else RESTART_US
+        self._power_on_us = self._bend_us = time_us + away_us
         self._bend_node_us = 0
         self.next_due_us = self._power_on_us
         self._create(cause)

@@ -20,6 +20,8 @@ BOOT_S = 0.05
 SYNC_S = 0.2
 SYNC_ATTEMPTS = 5
 """Optiboot waits for a second."""
+_MEGA_LOADER, _MEGA_FLASH, _PAGE = 0x3E000, 0x40000, 256
+_WDR = b"\xa8\x95"
 SWITCH = (
     "put the XBee shield's switch to USB (SparkFun: DLINE; Arduino: USB), or take the XBee out of "
     "its socket, and try again"
@@ -171,19 +173,22 @@ def _exchange(device: serial.Serial, request: bytes, answer_bytes: int) -> bytes
     return answer
 
 
-def _stk500v2_signature(device: serial.Serial) -> bytes | None:
-    """Return the signature from an STK500v2 boot loader (Mega); None where none answers.
+class _Stk500v2:
+    """The dialogue with an STK500v2 boot loader (Mega).
 
-    Atmel AVR068: 0x1B, sequence, length (2), 0x0E, message, xor of all. 0x01 signs on, 0x1B reads a
-    byte of the signature by an ISP command (0x30 0 n 0).
+    Atmel AVR068: 0x1B, sequence, length (2), 0x0E, message, xor of all.
     """
-    sequence = 0
 
-    def talk(message: bytes, answer_bytes: int) -> bytes | None:
-        nonlocal sequence
-        sequence = sequence % 255 + 1
-        frame = bytes((0x1B, sequence, 0, len(message), 0x0E)) + message
-        answer = _exchange(device, frame + bytes((_xor(frame),)), 6 + answer_bytes)
+    def __init__(self, device: serial.Serial) -> None:
+        self._device = device
+        self._sequence = 0
+
+    def talk(self, message: bytes, answer_bytes: int) -> bytes | None:
+        """Return the answer's bytes from its command on; None where it is none, or a failure."""
+        self._sequence = self._sequence % 255 + 1
+        frame = bytes((0x1B, self._sequence, 0, len(message), 0x0E)) + message
+        request = frame + bytes((_xor(frame),))
+        answer = _exchange(self._device, request, 6 + answer_bytes)
         good = (
             len(answer) == 6 + answer_bytes
             and answer[:2] == frame[:2]
@@ -192,17 +197,50 @@ def _stk500v2_signature(device: serial.Serial) -> bytes | None:
         )
         return answer[5:-1] if good else None
 
-    # "AVRISP_2" and its length: eleven bytes of answer.
-    if not _synced(lambda: talk(b"\x01", 11) is not None):
+    def signs_on(self) -> bool:
+        """Whether it answers: "AVRISP_2" and its length, eleven bytes."""
+        return _synced(lambda: self.talk(b"\x01", 11) is not None)
+
+
+def _stk500v2_signature(device: serial.Serial) -> bytes | None:
+    """Return the signature from an STK500v2 boot loader; None where none answers."""
+    loader = _Stk500v2(device)
+    if not loader.signs_on():
         return None
     signature = bytearray()
     for position in range(3):
-        # Command, status, the byte, status.
-        answer = talk(bytes((0x1B, 4, 0x30, 0, position, 0)), 4)
+        # 0x1B reads a byte by an ISP command: answers command, status, the byte, status.
+        answer = loader.talk(bytes((0x1B, 4, 0x30, 0, position, 0)), 4)
         if answer is None:
             return None
         signature.append(answer[2])
     return bytes(signature)
+
+
+def warning(device: serial.Serial, board: Board) -> str | None:
+    """Return what is wrong with the boot loader that has just answered :func:`check`, or None.
+
+    The Mega's of 2011 never touches the watchdog: its code has no WDR instruction.
+    """
+    if board.name != "mega":
+        return None
+    loader = _Stk500v2(device)
+    code = bytearray()
+    for at in range(_MEGA_LOADER, _MEGA_FLASH, _PAGE):
+        address = (at // 2 | 1 << 31).to_bytes(4, "big")
+        page = None
+        if loader.talk(b"\x06" + address, 2) is not None:
+            page = loader.talk(bytes((0x14, _PAGE >> 8, _PAGE & 0xFF, 0x20)), _PAGE + 3)
+        if page is None:
+            return None  # an upload will tell
+        code += page[2:-1]
+    if any(code[at : at + 2] == _WDR for at in range(0, len(code), 2)):
+        return None
+    return (
+        "this Mega's boot loader (of 2011) leaves the watchdog armed: should the firmware ever "
+        "hang, the node is silent until its supply is switched off and on. A newer one cures that: "
+        "Burn Bootloader of the Arduino IDE, with an ISP programmer"
+    )
 
 
 def _xor(data: bytes) -> int:

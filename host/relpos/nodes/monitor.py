@@ -14,7 +14,12 @@ from relpos.protocol import messages as wire
 WINDOW_S = 30.0
 """Three status reports at their usual period."""
 _COUNTS = ("ranging_successes", "ranging_failures", "missed_ticks", "refused_frames")
-UNWANTED = {wire.ResetCause.BROWN_OUT: "brown-out", wire.ResetCause.WATCHDOG: "watchdog"}
+UNWANTED = {
+    wire.ResetCause.BROWN_OUT: "brown-out",
+    wire.ResetCause.WATCHDOG: "watchdog",
+    wire.ResetCause.UNKNOWN: "brown-out or button",
+}
+"""Many boot loaders hide the cause: unknown is unwanted where the node had been heard before."""
 _FLAGS = {
     "imu": wire.Health.IMU,
     "magnetometer": wire.Health.MAGNETOMETER,
@@ -61,6 +66,8 @@ class NodeMonitor:
     lost: int = 0
     rssi_dbm: float | None = None
     status: dict[str, float] = field(default_factory=dict)
+    restarted: bool = False
+    """Since it was first heard."""
     _frames: deque[tuple[float, int, int]] = field(default_factory=deque)
     _counters: dict[str, WindowedCount] = field(default_factory=dict)
 
@@ -117,7 +124,8 @@ class NodeMonitor:
         """Return the inputs of :func:`relpos.nodes.health.assess`."""
         status = self.status
         success, attempted = self.ranging(now_s)
-        cause = status.get("reset_cause")
+        cause = wire.ResetCause(int(status.get("reset_cause", 0)))
+        known = self.restarted or cause is not wire.ResetCause.UNKNOWN
 
         def integer(name: str) -> int | None:
             return int(status[name]) if name in status else None
@@ -133,7 +141,7 @@ class NodeMonitor:
             neighbours=integer("neighbours"),
             team=integer("team"),
             uptime_s=status.get("uptime_s"),
-            unwanted_start=None if cause is None else UNWANTED.get(wire.ResetCause(int(cause))),
+            unwanted_start=UNWANTED.get(cause) if known else None,
             missed_ticks=self.counted("missed_ticks", now_s),
             refused_frames=self.counted("refused_frames", now_s),
             free_stack_bytes=integer("free_stack_bytes"),
@@ -160,6 +168,7 @@ class TeamMonitor:
             monitor = self.nodes.get(node)
             if monitor is None:
                 monitor = self.nodes[node] = NodeMonitor(node, track.boot, now_s)
+            monitor.restarted |= monitor.boot != track.boot
             monitor.boot = track.boot
             received = track.counts["received"]
             if received != monitor.received:

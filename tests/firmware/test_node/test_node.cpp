@@ -931,6 +931,32 @@ TEST(a_reboot_is_acknowledged_first_and_not_repeated_by_the_same_command) {
   CHECK_EQUAL(static_cast<uint8_t>(wire::ResetCause::kCommand), status.reset_cause);
 }
 
+TEST(a_reboot_is_known_where_the_boot_loader_hides_the_cause) {
+  Team team;
+  team.world.command(7, code(wire::CommandCode::kReboot), 0);
+  team.run_ms(1000);
+  Node again(team.world);
+  again.begin(team.world.now, wire::ResetCause::kUnknown, 0);
+  team.world.command(7, code(wire::CommandCode::kReboot), 0);
+  team.run(again, 3000);
+  CHECK_EQUAL(1, team.world.restarts);
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK_EQUAL(static_cast<uint8_t>(wire::ResetCause::kCommand), status.reset_cause);
+}
+
+TEST(a_record_of_a_reboot_that_a_power_cut_left_unfinished_counts_for_nothing) {
+  Team team;
+  team.world.command(7, code(wire::CommandCode::kReboot), 0);
+  while (team.world.eeprom[relpos::kStoredReboot] != 7) team.run_ms(1);  // the token's first byte
+  Node again(team.world);
+  again.begin(team.world.now, wire::ResetCause::kBrownOut, 0);
+  team.run(again, 3000);
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK_EQUAL(static_cast<uint8_t>(wire::ResetCause::kBrownOut), status.reset_cause);
+}
+
 TEST(a_uart_with_little_space_carries_the_same_frames) {
   Team team;
   team.world.line_bytes = 3;

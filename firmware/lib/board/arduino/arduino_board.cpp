@@ -15,6 +15,11 @@ namespace {
 
 // Set before the C runtime clears the memory, hence not part of it.
 uint8_t reset_flags __attribute__((section(".noinit")));
+// Turns of the timer since the watchdog was last fed, above a number that memory hardly holds by chance.
+// It outlives a reset: many boot loaders clear MCUSR, and then this alone tells what the watchdog did.
+constexpr uint16_t kFed = 0xA500;
+volatile uint16_t unfed __attribute__((section(".noinit")));
+constexpr uint8_t kWatchdogTurns = 2;  // of .26 s: never between two passes of the loop, in 0.9 s always
 
 // The board's LED, of both the same port: digitalWrite and its tables are 350 bytes of flash.
 #if defined(__AVR_ATmega2560__)
@@ -46,8 +51,8 @@ extern "C" {
 
 extern uint8_t __heap_start;  // the end of the static memory
 
-// The watchdog stays armed at 15 ms through the reset it causes: off at once, and the stack painted
-// to see how far it reaches.
+// The watchdog stays armed at 15 ms through the reset it causes, and armed at all where reset() jumped
+// here: off at once. The stack is painted to see how far it reaches.
 void relpos_before_main(void) __attribute__((naked, used, section(".init3")));
 void relpos_before_main(void) {
   reset_flags = MCUSR;
@@ -61,7 +66,7 @@ void relpos_before_main(void) {
 namespace relpos {
 
 void ArduinoBoard::begin() {
-  wdt_enable(WDTO_500MS);
+  wdt_enable(WDTO_1S);
   TCCR1B = _BV(CS11) | _BV(CS10);  // 16 MHz / 64
   TIMSK1 = _BV(TOIE1) | _BV(OCIE1A);
   twi::begin();
@@ -79,7 +84,10 @@ wire::ResetCause ArduinoBoard::reset_cause() const {
   if ((reset_flags & _BV(PORF)) != 0) return wire::ResetCause::kPowerOn;
   if ((reset_flags & _BV(BORF)) != 0) return wire::ResetCause::kBrownOut;
   if ((reset_flags & _BV(EXTRF)) != 0) return wire::ResetCause::kExternal;
-  return wire::ResetCause::kUnknown;  // a boot loader has cleared it
+  // A boot loader has cleared it. A button cannot be told from a dip of the supply.
+  const uint16_t turned = unfed - kFed;
+  if (turned >= kWatchdogTurns && turned < 0x100) return wire::ResetCause::kWatchdog;
+  return wire::ResetCause::kUnknown;
 }
 
 void ArduinoBoard::idle(uint32_t wait_us) {
@@ -121,7 +129,10 @@ uint32_t Board::now_us() {
   SREG = flags;
   return (static_cast<uint32_t>(high) << 16 | low) * kMicrosecondsACount;
 }
-void Board::watchdog_reset() { wdt_reset(); }
+void Board::watchdog_reset() {
+  wdt_reset();
+  unfed = kFed;
+}
 void Board::led(bool on) {
   if (on) {
     PORTB |= kLed;
@@ -130,11 +141,15 @@ void Board::led(bool on) {
   }
 }
 
+// A jump to the start, with what interrupts or moves by itself off. Not by the watchdog: the Mega's boot
+// loader of 2011 leaves it armed and never comes back.
 void Board::reset() {
   cli();
-  wdt_enable(WDTO_15MS);
-  for (;;) {
-  }
+  TIMSK1 = 0;
+  UCSR0B = 0;
+  TWCR = 0;
+  asm volatile("jmp 0");
+  __builtin_unreachable();
 }
 
 uint16_t Board::free_stack() {
@@ -155,7 +170,10 @@ void Board::mark(uint8_t value) { GPIOR0 = value; }
 
 }  // namespace relpos
 
-ISR(TIMER1_OVF_vect) { ++turns; }
+ISR(TIMER1_OVF_vect) {
+  ++turns;
+  ++unfed;
+}
 EMPTY_INTERRUPT(TIMER1_COMPA_vect)  // the alarm's work is done by waking
 
 #endif

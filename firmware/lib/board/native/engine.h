@@ -20,7 +20,7 @@ typedef struct {
   /* Bytes leaving the node, at the end of a poll; the line's speed is the caller's to model. */
   void (*uart_write)(void* context, const uint8_t* bytes, uint16_t count);
   /* The node asked to reboot: destroy it after the poll has returned and create it anew with reset
-   * cause 4 (watchdog) or 5 (command). */
+   * cause 5 (command). */
   void (*reset)(void* context);
   /* A byte begins to be written to eeprom, which is the caller's to do; NULL: written in place. For
    * 3.4 ms the node gets no further one written. What already stands there is not written again. */

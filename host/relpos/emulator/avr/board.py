@@ -159,6 +159,14 @@ class Board:
         """
         self._library.relpos_avr_reset(self._alive(), int(cause))
 
+    def set_reset_vector(self, address: int) -> None:
+        """Let resets start the program there, as the fuse does for a boot loader; 0 at first."""
+        self._library.relpos_avr_set_reset_vector(self._alive(), address)
+
+    def jump(self, address: int) -> None:
+        """Continue at that place of the program, as if it had gone astray."""
+        self._library.relpos_avr_jump(self._alive(), address)
+
     def receive(self, data: bytes, cycle: int = 0) -> None:
         """Put bytes on the receive line from that cycle on, after those already on their way."""
         self._library.relpos_avr_receive(self._alive(), data, len(data), cycle)

@@ -90,6 +90,8 @@ def load() -> ctypes.CDLL:
         "run": (ctypes.c_int32, [board, u64]),
         "error": (text, [board]),
         "reset": (None, [board, u8]),
+        "set_reset_vector": (None, [board, u32]),
+        "jump": (None, [board, u32]),
         "receive": (None, [board, text, u32, u64]),
         "take_sent": (u32, [board, u64s, out, u32]),
         "take_marks": (u32, [board, u64s, out, u32]),

@@ -14,7 +14,7 @@ from relpos.protocol.messages import ResetCause
 from .hooks import NEVER_US, Hooks, Rng
 from .spec import FaultSpec
 
-WATCHDOG_US = 500_000
+WATCHDOG_US = 1_000_000
 
 
 def faulty_clock(errors: NodeErrors, node: int, specs: Sequence[FaultSpec]) -> NodeErrors:

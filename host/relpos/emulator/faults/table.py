@@ -274,7 +274,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         "clock",
         "off",
-        "the oscillator stops; above 0.5 s the watchdog, which has its own, resets the node",
+        "the oscillator stops; above 1 s the watchdog, which has its own, resets the node",
         "restart with cause WATCHDOG and the next boot count; the host widens the first motion",
     ),
     Fault(

@@ -12,6 +12,8 @@
  *  - Entering an interrupt takes no time.  The data sheet's 4 (ATmega2560: 5) cycles are added.
  *  - RAM is zero at power-on and kept by any reset.  Replaced by a fixed pseudo-random pattern at
  *    power-on, and by its continuation after a reset with loss of supply.
+ *  - A reset forgets MCUSR, and ones written to it are set.  Replaced by the chip's: causes add up until
+ *    zeros are written or power was lost.
  *  - Invalid opcodes are only printed.  Any message of simavr at error level stops the run.
  *  - sleep() slows the host down.  Replaced by nothing.
  */
@@ -54,7 +56,7 @@ struct relpos_avr {
 	void *context;
 	int failed;
 	char error[200];
-	uint8_t next_cause;
+	uint8_t next_cause, causes; /* MCUSR across resets */
 	uint64_t counter[COUNTER_COUNT];
 	uint32_t static_end, lowest_sp;
 	uint64_t tick_began;
@@ -575,6 +577,13 @@ static void sph_write(avr_t *avr, avr_io_addr_t address, uint8_t v, void *param)
 	if (!is_out(avr)) look_at_stack(param);
 }
 
+static void mcusr_write(avr_t *avr, avr_io_addr_t address, uint8_t v, void *param)
+{
+	relpos_avr *e = param;
+	e->causes &= v;
+	avr->data[address] = e->causes;
+}
+
 static avr_cycle_count_t reached(avr_t *avr, avr_cycle_count_t when, void *param)
 {
 	(void)avr; (void)when; (void)param;
@@ -600,7 +609,9 @@ static void on_reset(avr_io_t *io)
 		e->writing = 0;
 		e->counter[COUNTER_EEPROM_WRITES]++;
 	}
-	d[A_MCUSR] |= e->next_cause;
+	if (e->next_cause & PORF) e->causes = 0;
+	e->causes |= (uint8_t)((d[A_MCUSR] & WDRF) | e->next_cause);
+	d[A_MCUSR] = e->causes;
 	e->next_cause = 0;
 	d[A_EECR] = 0;
 	d[A_TWCR] = 0;
@@ -709,6 +720,7 @@ relpos_avr *relpos_avr_create(const char *mmcu, const uint8_t *flash, uint32_t f
 	hook_write(e, A_UBRRL, plain_write);
 	hook_write(e, A_EECR, eecr_write);
 	hook_write(e, A_GPIOR0, mark_write);
+	hook_write(e, A_MCUSR, mcusr_write);
 	hook_write(e, R_SPL, spl_write);
 	hook_write(e, R_SPH, sph_write);
 	for (int i = 0; i < avr->interrupts.vector_count; i++)
@@ -758,6 +770,18 @@ void relpos_avr_reset(relpos_avr *e, uint8_t cause)
 	e->next_cause = cause;
 	avr_reset(e->avr);
 	if (cause & (PORF | BORF)) scramble(e);
+}
+
+void relpos_avr_set_reset_vector(relpos_avr *e, uint32_t address)
+{
+	e->avr->reset_pc = address;
+	if (!e->avr->cycle) e->avr->pc = address;
+}
+
+void relpos_avr_jump(relpos_avr *e, uint32_t address)
+{
+	e->avr->pc = address;
+	e->avr->state = cpu_Running;
 }
 
 const char *relpos_avr_error(const relpos_avr *e) { return e->error; }

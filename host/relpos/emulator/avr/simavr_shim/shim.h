@@ -56,6 +56,10 @@ const char *relpos_avr_error(const relpos_avr *);
 /* Reset from outside; cause becomes MCUSR.  EEPROM and RAM keep their contents, but after a loss of
  * supply (power-on, brown-out) the EEPROM byte being written is erased and the RAM holds garbage. */
 void relpos_avr_reset(relpos_avr *, uint8_t cause);
+/* Where resets start the program (bytes): the fuse BOOTRST's boot loader; 0 from the start. */
+void relpos_avr_set_reset_vector(relpos_avr *, uint32_t address);
+/* Continue at a place (bytes) of the program: as it would be after it had gone astray. */
+void relpos_avr_jump(relpos_avr *, uint32_t address);
 
 /* Queue bytes for the receiver; the first begins on the wire at `cycle` or when the wire is free. */
 void relpos_avr_receive(relpos_avr *, const uint8_t *bytes, uint32_t count, uint64_t cycle);
