@@ -125,7 +125,7 @@ def health_limits() -> str:
             "",
             f"within the last {health.FRESH_START_S:g} s",
         ),
-        ("50 Hz ticks missed, frames refused", "", "any"),
+        ("50 Hz ticks missed, frames refused, bytes damaged or lost at the UART", "", "any"),
         ("stack left", "", f"under {health.MIN_STACK_BYTES} bytes"),
         ("status", "", "none heard yet"),
     )

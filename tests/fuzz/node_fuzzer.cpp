@@ -244,18 +244,21 @@ struct World : FakeBoard {
     if (at >= sizeof eeprom) fail("the node reads behind its EEPROM");
     return eeprom[at];
   }
-  bool storage_write(uint16_t at, uint8_t value) override {
-    if (at >= sizeof eeprom) fail("the node writes behind its EEPROM");
+  bool storage_ready() override {
     active = true;
     if (busy_polls != 0) {
       --busy_polls;
       return false;
     }
+    return true;
+  }
+  void storage_write(uint16_t at, uint8_t value) override {
+    if (at >= sizeof eeprom) fail("the node writes behind its EEPROM");
+    active = true;
     without_power = writes_left == 0;
-    if (without_power) return true;
+    if (without_power) return;
     --writes_left;
     eeprom[at] = value;
-    return true;
   }
   uint32_t now_us() override { return now; }
   void reset() override { restart_asked = true; }

@@ -58,6 +58,8 @@ def test_a_node_with_everything_is_green_and_says_nothing():
         ({"unwanted_start": "watchdog", "uptime_s": 12.0}, Health.YELLOW, "watchdog"),
         ({"missed_ticks": 3}, Health.YELLOW, "3 ticks"),
         ({"refused_frames": 2}, Health.YELLOW, "2 forged"),
+        ({"damaged_bytes": 3}, Health.YELLOW, "3 bytes damaged"),
+        ({"lost_bytes": 4}, Health.YELLOW, "4 received bytes lost"),
         ({"free_stack_bytes": 40}, Health.YELLOW, "40 bytes of stack"),
         ({"status": False}, Health.YELLOW, "no status"),
     ],

@@ -15,7 +15,7 @@ from relpos.errors import DataError
 from relpos.link.port import Link
 from relpos.live.team_view import Level, Notice, TeamView
 from relpos.measurements import Event, Heading, Motion, Range, Truth
-from relpos.protocol.messages import DEFAULT_KEY
+from relpos.protocol.messages import DEFAULT_KEY, PROTOCOL_VERSION
 from relpos.recording import is_recording, make_recorder, open_recording, save_recording
 from relpos.recording.replay import Replay
 from relpos.recording.schemas import all_topics
@@ -158,7 +158,7 @@ def test_a_recording_describes_the_session_without_the_key(recorded):
     assert (about.started_unix_ns, about.seed, about.initial) == (START_NS, 7, "common")
     assert about.settings == {"outliers": "0.03"}
     assert about.newest_counters == {1: 5}
-    assert about.protocol == 2
+    assert about.protocol == PROTOCOL_VERSION
     nodes = about.description.nodes
     assert {node: info.name for node, info in nodes.items()} == {1: "Ada Lovelace", 2: "Grace"}
     assert nodes[2].height_m == 1.1

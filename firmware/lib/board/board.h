@@ -16,6 +16,12 @@ enum class BusStatus : uint8_t {
   kTimeout = 3,  // also: the bus is held by somebody
 };
 
+// Of the receiver since the start; they wrap.
+struct UartErrors {
+  uint16_t damaged;  // without a stop bit: noise, or another speed
+  uint16_t lost;     // there was no room
+};
+
 // One class and no other with functions of the board's. Firmware has one board: a table of virtual
 // functions would cost it 22 bytes of RAM and 490 of flash. Where a program makes boards of its own
 // (on the PC, in the suites) they are virtual.
@@ -58,10 +64,12 @@ class Board {
   RELPOS_VIRTUAL uint8_t uart_write_space() RELPOS_PURE;  // bytes that uart_write takes at once
   RELPOS_VIRTUAL void uart_write(uint8_t byte) RELPOS_PURE;  // only with space left
   RELPOS_VIRTUAL int16_t uart_read() RELPOS_PURE;            // -1 where nothing has come
-  // Non-volatile; 0xFF where never written.
+  RELPOS_VIRTUAL UartErrors uart_errors() RELPOS_PURE;
+  // Non-volatile; 0xFF where never written. Both wait for the end of a write that is under way, some
+  // milliseconds: ask storage_ready() first.
   RELPOS_VIRTUAL uint8_t storage_read(uint16_t at) RELPOS_PURE;
-  // Begins; false while still busy.
-  RELPOS_VIRTUAL bool storage_write(uint16_t at, uint8_t value) RELPOS_PURE;
+  RELPOS_VIRTUAL void storage_write(uint16_t at, uint8_t value) RELPOS_PURE;  // begins
+  RELPOS_VIRTUAL bool storage_ready() RELPOS_PURE;
   RELPOS_VIRTUAL uint32_t now_us() RELPOS_PURE;  // wraps
   RELPOS_VIRTUAL void watchdog_reset() RELPOS_PURE;
   RELPOS_VIRTUAL void led(bool on) RELPOS_PURE;

@@ -141,6 +141,7 @@ void DeadReckoning::reset() {
   // All but the configuration starts at zero, cleared as one block: member by member it would be a
   // kilobyte of the Uno's flash. Every member is a number, an enum or an array of such.
   // The configuration is the first member and stays.
+  static_assert(__is_standard_layout(DeadReckoning), "the configuration is at its start");
   memset(reinterpret_cast<uint8_t*>(this) + sizeof config_, 0, sizeof *this - sizeof config_);
   displacement_.quality_flags = kStarting | kForwardUnknown | kBiasUncertain;
   filter_.reset(kTiltMoving_rad * kTiltMoving_rad,

@@ -43,6 +43,7 @@ struct Choice {
   uint8_t command, offset, bytes;
   uint16_t low, high;
 };
+static_assert(__is_standard_layout(Preferences), "a setting is where its offset says");
 static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "settings are written a byte at a time");
 const Choice kChoices[] RELPOS_FLASH = {
     {static_cast<uint8_t>(wire::CommandCode::kSetReportPeriodMs),
@@ -293,8 +294,7 @@ void Node::note_step() {
   PendingStep step;
   step.time_ms = static_cast<uint16_t>(clock_.ms() - age_ms);
   step.length_mm = static_cast<uint16_t>(scaled(now.last_step_length_m, 1000));
-  // The status has no count of its own for these; they are lost for the same reason.
-  if (!steps_.push(step)) ++dropped_ranges_;
+  if (!steps_.push(step)) ++dropped_steps_;
 }
 
 // ---- ranging ----
@@ -316,6 +316,7 @@ RELPOS_SHARED void Node::run_ranging(uint32_t now_us) {
       if (raw_reports_ != 0 || !ranges_.push(pending)) ++dropped_ranges_;
     } else {
       ++ranging_failures_;
+      ranging_error_ = result.error;
     }
     wait = 0;
   }
@@ -440,7 +441,8 @@ wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_forc
       return wire::CommandResult::kDone;  // PING and REBOOT set nothing
     }
   }
-  uint8_t* setting = reinterpret_cast<uint8_t*>(&settings_) + flash_byte(&choice->offset);
+  uint8_t* setting =
+      reinterpret_cast<uint8_t*>(static_cast<Preferences*>(&settings_)) + flash_byte(&choice->offset);
   const bool wide = flash_byte(&choice->bytes) == 2;
   uint16_t before = setting[0];
   if (wide) before = static_cast<uint16_t>(before | static_cast<uint16_t>(setting[1]) << 8);
@@ -488,7 +490,7 @@ wire::CommandResult Node::apply_calibration(wire::CommandCode code, int32_t valu
     report_raw(static_cast<uint16_t>(value));
     return wire::CommandResult::kDone;
   }
-  if (store_.saving()) return wire::CommandResult::kBusy;
+  if (store_.saving() || !board_.storage_ready()) return wire::CommandResult::kBusy;
   if (code == wire::CommandCode::kCommitCalibration) {
     if (!store_.commit(board_, &settings_, static_cast<uint16_t>(value))) {
       return wire::CommandResult::kOutOfRange;
@@ -532,7 +534,8 @@ bool Node::run_reboot() {
       static_cast<uint8_t>(reboot->key), static_cast<uint8_t>(reboot->key >> 8), boot_,
       static_cast<uint8_t>(~boot_)};
   const uint8_t at = static_cast<uint8_t>(reboot_step_ - 1);
-  if (!board_.storage_write(kStoredReboot + at, bytes[at])) return false;
+  if (!board_.storage_ready()) return false;
+  board_.storage_write(kStoredReboot + at, bytes[at]);
   ++reboot_step_;
   return true;
 }
@@ -665,6 +668,11 @@ uint8_t Node::fill_status(uint8_t* body) {
   status.free_stack_bytes = board_.free_stack();
   status.bad_frames = static_cast<uint16_t>(bad_frames_ + xbee_.bad_frames());
   status.dropped_ranges = dropped_ranges_;
+  status.dropped_steps = dropped_steps_;
+  const UartErrors uart = board_.uart_errors();
+  status.damaged_bytes = uart.damaged;
+  status.lost_bytes = uart.lost;
+  status.ranging_error = ranging_error_;
   status.radio_failures = radio_failures_;
   status.refused_frames = refused_frames_;
   status.range_offset_mm = settings_.range_offset_mm;

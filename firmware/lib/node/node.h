@@ -79,6 +79,8 @@ struct NodeState : Persistent {
   uint16_t ranging_successes_;
   uint16_t ranging_failures_;
   uint16_t dropped_ranges_;
+  uint16_t dropped_steps_;
+  uint8_t ranging_error_;  // of the newest exchange that failed
   uint16_t raw_ms_;  // of the last report, low bits as in the next ones
   uint16_t raw_reports_;  // still to be sent
   uint8_t raw_samples_;   // in the sums

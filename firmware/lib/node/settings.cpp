@@ -9,6 +9,7 @@
 namespace relpos {
 namespace {
 
+static_assert(__is_trivial(Persistent), "records are copied byte by byte");
 static_assert(sizeof(Preferences) == 18 && sizeof(Settings) == 62 && sizeof(Marks) == 8,
               "the stored bytes are those of the struct on every board");
 constexpr uint8_t kLayout = 3;  // of all records; another one is not read
@@ -87,7 +88,7 @@ bool Storage::commit(Board& board, Settings* settings, uint16_t crc) {
 }
 
 void Storage::step(Board& board, const Persistent& all) {
-  if (!saving()) return;
+  if (!saving() || !board.storage_ready()) return;
   uint8_t value;
   uint8_t end = 0;
   if (left_ != 0 && record_ == kRecords) {
@@ -126,7 +127,7 @@ void Storage::step(Board& board, const Persistent& all) {
       value = static_cast<uint8_t>(behind == 2 ? crc_ : crc_ >> 8);
     }
   }
-  if (!board.storage_write(at_, value)) return;
+  board.storage_write(at_, value);
   --left_;
   if (++at_ == end) at_ = static_cast<uint8_t>(end - 2 * left_);  // the other copy, or done
 }

@@ -142,7 +142,7 @@ bool decode(const uint8_t* body, uint8_t length, Ranges* message) {
 const Field kStatus[] = {
     {offsetof(Status, time_ms), 7, 7},
     {offsetof(Status, uptime_s), 5, 5},
-    {offsetof(Status, battery_mv), 27, 27},
+    {offsetof(Status, battery_mv), 34, 34},
 };
 static_assert(offsetof(Status, firmware_patch) - offsetof(Status, time_ms) ==
                   6,
@@ -151,16 +151,16 @@ static_assert(offsetof(Status, reset_cause) - offsetof(Status, uptime_s) ==
                   4,
               "no gaps: copied as one");
 static_assert(offsetof(Status, health) - offsetof(Status, battery_mv) ==
-                  26,
+                  33,
               "no gaps: copied as one");
 
 #endif
 uint8_t encode(const Status& message, uint8_t* body) {
   if (message.reset_cause > 5) return 0;
   if (message.health > 63) return 0;
-  const uint8_t length = static_cast<uint8_t>(39);
+  const uint8_t length = static_cast<uint8_t>(46);
 #if defined(__AVR__)
-  static_assert(sizeof message == 39, "as on the wire");
+  static_assert(sizeof message == 46, "as on the wire");
   memcpy(body, &message, length);
 #else
   uint8_t* out = put(kStatus, 3, &message, body);
@@ -170,7 +170,7 @@ uint8_t encode(const Status& message, uint8_t* body) {
 }
 
 bool decode(const uint8_t* body, uint8_t length, Status* message) {
-  if (length != 39) return false;
+  if (length != 46) return false;
 #if defined(__AVR__)
   memcpy(message, body, length);
 #else

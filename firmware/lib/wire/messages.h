@@ -8,8 +8,8 @@ namespace relpos {
 namespace wire {
 
 constexpr uint8_t kMagic = 181;
-constexpr uint8_t kProtocolVersion = 2;
-constexpr uint16_t kFingerprint = 697;  // seed of the CRC
+constexpr uint8_t kProtocolVersion = 3;
+constexpr uint16_t kFingerprint = 7962;  // seed of the CRC
 constexpr uint8_t kFrameBytes = 66;  // the longest frame
 constexpr uint8_t kMostBody = 47;
 constexpr uint8_t kHeaderBytes = 9;
@@ -180,15 +180,19 @@ struct Status {
   uint16_t free_stack_bytes;  // Bytes between heap end and deepest stack so far; B
   uint16_t bad_frames;  // Received frames that failed a check; wraps
   uint16_t dropped_ranges;  // Ranges dropped because the radio was busy; wraps
+  uint16_t dropped_steps;  // Steps dropped because the radio was busy; wraps
   uint16_t radio_failures;  // Frames that the radio reported as not delivered; wraps
   uint16_t refused_frames;  // Received frames with a wrong tag or a counter that was used before; wraps
   int16_t range_offset_mm;  // This end's share of what its ranges are too long by (antenna delay); the host subtracts both ends' shares; 1000 = 1 m
+  uint16_t damaged_bytes;  // Bytes that arrived damaged at the UART: noise; wraps
+  uint16_t lost_bytes;  // Bytes that the UART had no room for; wraps
+  uint8_t ranging_error;  // Why the newest failed exchange failed: the Pozyx's code, or 128 no end, 129 bus, 130 refused without a code, 131 not a distance; 0: none has failed
   uint8_t neighbours;  // Nodes ranged within the last 10 s
   uint8_t team;  // Nodes in the beacon in force; 0: none is heard
   uint8_t health;  // What works
 };
 
-constexpr uint8_t kStatusBytes = 39;  // the longest body
+constexpr uint8_t kStatusBytes = 46;  // the longest body
 
 // Writes the body, returns its length; 0 where a value is outside
 // its range; body is then half-written.

@@ -48,8 +48,8 @@ class HealthInputs:
     """The inputs of :func:`assess` for one node; None where unknown.
 
     ``status`` says whether a status report has arrived. ``loss`` and ``ranging`` are fractions over
-    the last half minute, ``exchanges`` the number of exchanges in ``ranging``. ``missed_ticks``
-    and ``refused_frames`` are counts within that time.
+    the last half minute, ``exchanges`` the number of exchanges in ``ranging``. ``missed_ticks``,
+    ``refused_frames``, ``damaged_bytes`` and ``lost_bytes`` are counts within that time.
     """
 
     silent_s: float
@@ -70,6 +70,8 @@ class HealthInputs:
     unwanted_start: str | None = None
     missed_ticks: int = 0
     refused_frames: int = 0
+    damaged_bytes: int = 0
+    lost_bytes: int = 0
     free_stack_bytes: int | None = None
 
 
@@ -119,5 +121,9 @@ def _reasons(f: HealthInputs) -> Iterator[tuple[Health, str]]:
         yield yellow, f"{f.missed_ticks} ticks missed"
     if f.refused_frames > 0:
         yield yellow, f"{f.refused_frames} forged or repeated frames rejected"
+    if f.damaged_bytes > 0:
+        yield yellow, f"{f.damaged_bytes} bytes damaged on the way from the XBee"
+    if f.lost_bytes > 0:
+        yield yellow, f"{f.lost_bytes} received bytes lost"
     if f.free_stack_bytes is not None and f.free_stack_bytes < MIN_STACK_BYTES:
         yield yellow, f"{f.free_stack_bytes} bytes of stack left"

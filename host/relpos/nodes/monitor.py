@@ -13,7 +13,14 @@ from relpos.protocol import messages as wire
 
 WINDOW_S = 30.0
 """Three status reports at their usual period."""
-_COUNTS = ("ranging_successes", "ranging_failures", "missed_ticks", "refused_frames")
+_COUNTS = (
+    "ranging_successes",
+    "ranging_failures",
+    "missed_ticks",
+    "refused_frames",
+    "damaged_bytes",
+    "lost_bytes",
+)
 UNWANTED = {
     wire.ResetCause.BROWN_OUT: "brown-out",
     wire.ResetCause.WATCHDOG: "watchdog",
@@ -144,6 +151,8 @@ class NodeMonitor:
             unwanted_start=UNWANTED.get(cause) if known else None,
             missed_ticks=self.counted("missed_ticks", now_s),
             refused_frames=self.counted("refused_frames", now_s),
+            damaged_bytes=self.counted("damaged_bytes", now_s),
+            lost_bytes=self.counted("lost_bytes", now_s),
             free_stack_bytes=integer("free_stack_bytes"),
             **{name: self.flag(flag) for name, flag in _FLAGS.items()},
         )

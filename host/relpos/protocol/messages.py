@@ -29,7 +29,7 @@ import siphash24
 from .schema import Entries, Message, OutOfRangeError, Quantity
 
 MAGIC = 0xB5
-PROTOCOL_VERSION = 2
+PROTOCOL_VERSION = 3
 FRAME_BYTES = 66
 CRC_BYTES = 2
 TAG_BYTES = 8
@@ -320,6 +320,7 @@ STATUS = Message(
         ),
         Quantity("bad_frames", "u16", "Received frames that failed a check", wraps=True),
         Quantity("dropped_ranges", "u16", "Ranges dropped because the radio was busy", wraps=True),
+        Quantity("dropped_steps", "u16", "Steps dropped because the radio was busy", wraps=True),
         Quantity(
             "radio_failures", "u16", "Frames that the radio reported as not delivered", wraps=True
         ),
@@ -337,6 +338,16 @@ STATUS = Message(
             raw_name="range_offset_mm",
             unit="m",
             per_unit=1000,
+        ),
+        Quantity(
+            "damaged_bytes", "u16", "Bytes that arrived damaged at the UART: noise", wraps=True
+        ),
+        Quantity("lost_bytes", "u16", "Bytes that the UART had no room for", wraps=True),
+        Quantity(
+            "ranging_error",
+            "u8",
+            "Why the newest failed exchange failed: the Pozyx's code, or 128 no end, "
+            "129 bus, 130 refused without a code, 131 not a distance; 0: none has failed",
         ),
         Quantity("neighbours", "u8", "Nodes ranged within the last 10 s"),
         Quantity("team", "u8", "Nodes in the beacon in force; 0: none is heard"),

@@ -8,7 +8,9 @@ struct FakeBoard : relpos::Board {
   void uart_write(uint8_t) override {}
   int16_t uart_read() override { return -1; }
   uint8_t storage_read(uint16_t) override { return 0xFF; }
-  bool storage_write(uint16_t, uint8_t) override { return true; }
+  void storage_write(uint16_t, uint8_t) override {}
+  bool storage_ready() override { return true; }
+  relpos::UartErrors uart_errors() override { return {0, 0}; }
   uint32_t now_us() override { return 0; }
   void watchdog_reset() override {}
   void led(bool) override {}

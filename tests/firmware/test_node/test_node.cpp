@@ -34,6 +34,7 @@ struct World : FakeBoard {
   uint8_t eeprom[relpos::kStorageBytes];
   uint16_t writes[relpos::kStorageBytes] = {};
   bool inertial_present = true;
+  bool walking = false;
   bool tag_present = true;
   bool magnetometer_present = false;
   uint32_t writes_left = 0xFFFFFFFF;  // then the power is cut
@@ -129,13 +130,24 @@ struct World : FakeBoard {
   uint32_t pressure_mpa = 101325000;
   uint8_t to = kId;  // the node that is meant
 
-  uint8_t storage_read(uint16_t at) override { return eeprom[at]; }
-  bool storage_write(uint16_t at, uint8_t value) override {
-    if (writes_left == 0) return true;
+  uint32_t storage_us = 0;  // a byte takes
+  uint32_t stored_at = 0;
+  uint16_t waited = 0;      // reads and writes that waited for the end of another write
+  relpos::UartErrors errors = {0, 0};
+
+  relpos::UartErrors uart_errors() override { return errors; }
+  bool storage_ready() override { return now - stored_at >= storage_us; }
+  uint8_t storage_read(uint16_t at) override {
+    if (!storage_ready()) ++waited;
+    return eeprom[at];
+  }
+  void storage_write(uint16_t at, uint8_t value) override {
+    if (!storage_ready()) ++waited;
+    stored_at = now;
+    if (writes_left == 0) return;
     --writes_left;
     if (eeprom[at] != value) ++writes[at];
     eeprom[at] = value;
-    return true;
   }
   uint32_t now_us() override { return now; }
   void reset() override { ++restarts; }
@@ -155,7 +167,10 @@ struct World : FakeBoard {
       if (first_count == 1 && first[0] == 0x37) {  // set up, then the sample
         read[0] = 0x22;
         read[1] = 0x01;
-        read[4] = 0x20;  // 1 g along x
+        const int16_t up = static_cast<int16_t>(
+            8192 + (walking ? 2500.0 * sin(12.0 * 1e-6 * (now - start)) : 0.0));
+        read[4] = static_cast<uint8_t>(up >> 8);  // 1 g along x
+        read[5] = static_cast<uint8_t>(up);
         read[7] = ++noise_ & 1;  // along y: no sample is quite the one before
       }
       return BusStatus::kOk;
@@ -786,6 +801,53 @@ TEST(a_slow_line_drops_the_oldest_ranges_counts_them_and_keeps_the_motion) {
   CHECK(team.read(wire::MessageType::kStatus, &status));
   CHECK(status.dropped_ranges > 0);
   CHECK(team.sent(wire::MessageType::kMotion) >= 25);
+}
+
+TEST(steps_that_are_dropped_are_not_counted_as_ranges) {
+  Team team;
+  team.world.command(1, code(wire::CommandCode::kSetStepReports), 1);
+  team.world.command(2, code(wire::CommandCode::kSetRangingPeriodMs), 0);
+  team.run_ms(5000);
+  team.world.walking = true;
+  team.run_ms(10000);
+  CHECK(team.sent(wire::MessageType::kSteps) > 0);
+  team.world.line_bytes = 0;
+  team.run_ms(10000);
+  team.world.line_bytes = 255;
+  team.world.walking = false;
+  team.run_ms(12000);
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK(status.dropped_steps > 2);
+  CHECK_EQUAL(0, status.dropped_ranges);
+}
+
+TEST(the_status_has_what_the_uart_and_the_tag_complained_of) {
+  Team team;
+  team.world.errors = {513, 258};
+  team.world.exchange_us = 0xFFFFFFFF;  // none ends
+  team.run_ms(12000);
+  wire::Status status;
+  CHECK(team.read(wire::MessageType::kStatus, &status));
+  CHECK_EQUAL(513, status.damaged_bytes);
+  CHECK_EQUAL(258, status.lost_bytes);
+  CHECK(status.ranging_failures > 0);
+  CHECK_EQUAL(relpos::Pozyx::kTimedOut, status.ranging_error);
+}
+
+TEST(the_loop_never_waits_for_the_storage) {
+  Team team;
+  team.world.storage_us = 3400;
+  team.world.waited = 0;
+  team.run_ms(2000);
+  ask(team, team.node, wire::CommandCode::kSetTeamSize, 9);
+  const Words words = example(91);
+  stage(team, team.node, words);
+  CHECK_EQUAL(result(wire::CommandResult::kDone),
+              ask(team, team.node, wire::CommandCode::kCommitCalibration, words.crc()).result);
+  team.run_ms(2000);
+  CHECK_EQUAL(1, team.world.restarts);
+  CHECK_EQUAL(0, team.world.waited);
 }
 
 TEST(a_missing_imu_is_reported_and_stops_neither_ranges_nor_reports) {

@@ -43,7 +43,9 @@ bool same(const wire::Status& a, const wire::Status& b) {
          a.ranging_successes == b.ranging_successes && a.ranging_failures == b.ranging_failures &&
          a.worst_tick_us == b.worst_tick_us && a.missed_ticks == b.missed_ticks &&
          a.free_stack_bytes == b.free_stack_bytes && a.bad_frames == b.bad_frames &&
-         a.dropped_ranges == b.dropped_ranges && a.radio_failures == b.radio_failures &&
+         a.dropped_ranges == b.dropped_ranges && a.dropped_steps == b.dropped_steps &&
+         a.damaged_bytes == b.damaged_bytes && a.lost_bytes == b.lost_bytes &&
+         a.ranging_error == b.ranging_error && a.radio_failures == b.radio_failures &&
          a.refused_frames == b.refused_frames && a.range_offset_mm == b.range_offset_mm &&
          a.neighbours == b.neighbours && a.team == b.team && a.health == b.health;
 }

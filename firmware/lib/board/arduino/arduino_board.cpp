@@ -94,7 +94,16 @@ void ArduinoBoard::idle(uint32_t wait_us) {
   if (wait_us < kWorthSleepingUs) return;
   if (wait_us > kMostSleepUs) wait_us = kMostSleepUs;
   OCR1A = static_cast<uint16_t>(TCNT1 + static_cast<uint16_t>(wait_us / kMicrosecondsACount));
-  sleep_mode();
+  // What came since the node looked would be slept over: looked at again with interrupts off, which
+  // are allowed behind the instruction that follows sei().
+  cli();
+  if (!uart::waiting()) {
+    sleep_enable();
+    sei();
+    sleep_cpu();
+    sleep_disable();
+  }
+  sei();
 }
 
 BusStatus Board::i2c_transfer(uint8_t address, const uint8_t* first, uint8_t first_count,
@@ -106,18 +115,17 @@ BusStatus Board::i2c_transfer(uint8_t address, const uint8_t* first, uint8_t fir
 uint8_t Board::uart_write_space() { return uart::write_space(); }
 void Board::uart_write(uint8_t byte) { uart::write(byte); }
 int16_t Board::uart_read() { return uart::read(); }
+UartErrors Board::uart_errors() { return uart::errors(); }
 
 uint8_t Board::storage_read(uint16_t at) {
   return eeprom_read_byte(reinterpret_cast<const uint8_t*>(at));
 }
 
 // A byte takes 3.4 ms; the loop goes on meanwhile.
-bool Board::storage_write(uint16_t at, uint8_t value) {
-  if (!eeprom_is_ready()) return false;
-  uint8_t* address = reinterpret_cast<uint8_t*>(at);
-  if (eeprom_read_byte(address) != value) eeprom_write_byte(address, value);
-  return true;
+void Board::storage_write(uint16_t at, uint8_t value) {
+  eeprom_update_byte(reinterpret_cast<uint8_t*>(at), value);
 }
+bool Board::storage_ready() { return eeprom_is_ready(); }
 
 uint32_t Board::now_us() {
   const uint8_t flags = SREG;

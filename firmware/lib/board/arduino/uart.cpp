@@ -26,6 +26,7 @@ volatile uint8_t received[kReceiveBytes];
 volatile uint8_t received_head, received_tail;  // head: next to write
 volatile uint8_t written[kWriteBytes];
 volatile uint8_t written_head, written_tail;
+UartErrors counts;
 
 }  // namespace
 
@@ -55,6 +56,15 @@ int16_t read() {
   return byte;
 }
 
+bool waiting() { return received_tail != received_head; }
+
+UartErrors errors() {
+  cli();
+  const UartErrors now = counts;
+  sei();
+  return now;
+}
+
 }  // namespace uart
 }  // namespace relpos
 
@@ -68,10 +78,17 @@ int16_t read() {
 
 ISR(RELPOS_RECEIVED_VECTOR) {
   using namespace relpos::uart;
+  const uint8_t flags = UCSR0A;  // of the byte: read first
   const uint8_t byte = UDR0;
+  if ((flags & _BV(FE0)) != 0) {
+    ++counts.damaged;
+    return;
+  }
   const uint8_t head = received_head;
   const uint8_t next = static_cast<uint8_t>(head + 1) & (kReceiveBytes - 1);
-  if (next == received_tail) return;  // full: the frame it tears is counted as bad
+  const bool full = next == received_tail;
+  if (full || (flags & _BV(DOR0)) != 0) ++counts.lost;
+  if (full) return;
   received[head] = byte;
   received_head = next;
 }

@@ -5,6 +5,8 @@
 
 #include <stdint.h>
 
+#include "board/board.h"
+
 namespace relpos {
 namespace uart {
 
@@ -12,6 +14,8 @@ void begin();
 uint8_t write_space();
 void write(uint8_t byte);
 int16_t read();
+bool waiting();  // for read()
+UartErrors errors();
 
 }  // namespace uart
 }  // namespace relpos

@@ -21,7 +21,10 @@ class NativeBoard final : public Board {
   void set_supply(uint16_t supply_mv) { supply_mv_ = supply_mv; }
   void set_now(uint32_t now_us) { now_us_ = now_us; }
   void receive(uint8_t byte) {
-    if (received_count_ == kReceiveBytes) return;
+    if (received_count_ == kReceiveBytes) {
+      ++errors_.lost;
+      return;
+    }
     received_[(received_first_ + received_count_++) % kReceiveBytes] = byte;
   }
   void flush() {
@@ -44,11 +47,14 @@ class NativeBoard final : public Board {
     --received_count_;
     return byte;
   }
+  UartErrors uart_errors() override { return errors_; }
   uint8_t storage_read(uint16_t at) override { return at < eeprom_size_ ? eeprom_[at] : 0xFF; }
-  bool storage_write(uint16_t at, uint8_t value) override {
-    if (writing_ && now_us_ - writing_since_us_ < kStorageWriteUs) return false;
-    writing_ = false;
-    if (at >= eeprom_size_ || eeprom_[at] == value) return true;
+  bool storage_ready() override {
+    if (writing_ && now_us_ - writing_since_us_ >= kStorageWriteUs) writing_ = false;
+    return !writing_;
+  }
+  void storage_write(uint16_t at, uint8_t value) override {
+    if (at >= eeprom_size_ || eeprom_[at] == value) return;
     writing_ = true;
     writing_since_us_ = now_us_;
     if (callbacks_.storage_write != nullptr) {
@@ -56,7 +62,6 @@ class NativeBoard final : public Board {
     } else {
       eeprom_[at] = value;
     }
-    return true;
   }
   uint32_t now_us() override { return now_us_; }
   void watchdog_reset() override {}
@@ -96,6 +101,7 @@ class NativeBoard final : public Board {
   uint8_t received_[kReceiveBytes];
   uint16_t received_first_ = 0;
   uint16_t received_count_ = 0;
+  UartErrors errors_ = {0, 0};
   uint8_t written_[kWriteBytes];
   uint8_t written_count_ = 0;
 };

@@ -167,9 +167,12 @@ class Board:
         """Continue at that place of the program, as if it had gone astray."""
         self._library.relpos_avr_jump(self._alive(), address)
 
-    def receive(self, data: bytes, cycle: int = 0) -> None:
-        """Put bytes on the receive line from that cycle on, after those already on their way."""
-        self._library.relpos_avr_receive(self._alive(), data, len(data), cycle)
+    def receive(self, data: bytes, cycle: int = 0, *, damaged: bool = False) -> None:
+        """Put bytes on the receive line from that cycle on, after those already on their way.
+
+        Damaged ones, as noise makes them, have no stop bit.
+        """
+        self._library.relpos_avr_receive(self._alive(), data, len(data), cycle, damaged)
 
     def take_sent(self) -> list[tuple[int, int]]:
         """Bytes sent since the last call, as (cycle at which the stop bit ended, byte)."""

@@ -92,7 +92,7 @@ def load() -> ctypes.CDLL:
         "reset": (None, [board, u8]),
         "set_reset_vector": (None, [board, u32]),
         "jump": (None, [board, u32]),
-        "receive": (None, [board, text, u32, u64]),
+        "receive": (None, [board, text, u32, u64, u8]),
         "take_sent": (u32, [board, u64s, out, u32]),
         "take_marks": (u32, [board, u64s, out, u32]),
         "trace": (None, [board]),

@@ -39,12 +39,14 @@ enum {
 	A_UCSRA = 0xc0, A_UCSRB = 0xc1, A_UCSRC = 0xc2, A_UBRRL = 0xc4, A_UBRRH = 0xc5, A_UDR = 0xc6
 };
 enum { TWINT = 0x80, TWEA = 0x40, TWSTA = 0x20, TWSTO = 0x10, TWEN = 0x04, TWIE = 0x01 };
-enum { RXC = 0x80, TXC = 0x40, UDRE = 0x20, DOR = 0x08, U2X = 0x02 };       /* UCSRA */
+enum { RXC = 0x80, TXC = 0x40, UDRE = 0x20, FE = 0x10, DOR = 0x08, U2X = 0x02 };       /* UCSRA */
 enum { RXCIE = 0x80, TXCIE = 0x40, UDRIE = 0x20, RXEN = 0x10, TXEN = 0x08 }; /* UCSRB */
 enum { EERE = 0x01, EEPE = 0x02, EEMPE = 0x04, EERIE = 0x08 };
 enum { PORF = 0x01, BORF = 0x04, WDRF = 0x08 }; /* MCUSR */
 
 typedef enum { TWI_IDLE, TWI_ADDRESS, TWI_SEND, TWI_FETCH, TWI_UNHEARD } twi_phase;
+
+enum { DAMAGED = 0x100 }; /* beside a received byte */
 
 typedef struct { uint64_t cycle; uint8_t value; } record;
 typedef struct { record *items; uint32_t count, room; } record_list;
@@ -76,9 +78,10 @@ struct relpos_avr {
 	/* UART */
 	avr_int_vector_t *rxc_vector, *txc_vector, *udre_vector;
 	uint32_t line_baud;
-	uint8_t shift, buffer, received[3];
+	uint8_t shift, buffer;
+	uint16_t received[3]; /* DAMAGED: without a stop bit */
 	int shift_full, buffer_full, received_count, receiving;
-	uint8_t *queue;
+	uint16_t *queue;
 	uint32_t queue_head, queue_count, queue_room;
 	uint64_t line_free;
 	/* EEPROM */
@@ -378,14 +381,23 @@ static void udr_write(avr_t *avr, avr_io_addr_t address, uint8_t v, void *param)
 	levels(e);
 }
 
+/* FE is the flag of the byte that is read next. */
+static void show_damage(relpos_avr *e)
+{
+	uint8_t *flags = &e->avr->data[A_UCSRA];
+	*flags &= (uint8_t)~FE;
+	if (e->received_count && (e->received[0] & DAMAGED)) *flags |= FE;
+}
+
 static uint8_t udr_read(avr_t *avr, avr_io_addr_t address, void *param)
 {
 	relpos_avr *e = param;
-	uint8_t v = e->received[0];
+	uint8_t v = (uint8_t)e->received[0];
 	if (e->received_count) {
 		e->received_count--;
-		memmove(e->received, e->received + 1, 2);
+		memmove(e->received, e->received + 1, 2 * sizeof *e->received);
 	}
+	show_damage(e);
 	if (!e->received_count) avr->data[A_UCSRA] &= (uint8_t)~RXC;
 	avr->data[A_UCSRA] &= (uint8_t)~DOR;
 	if (e->tracing) append(e, &e->heard, avr->cycle, v);
@@ -422,7 +434,7 @@ static uint64_t line_frame_cycles(const relpos_avr *e)
 static avr_cycle_count_t receive_done(avr_t *avr, avr_cycle_count_t when, void *param)
 {
 	relpos_avr *e = param;
-	uint8_t byte = e->queue[e->queue_head];
+	uint16_t byte = e->queue[e->queue_head];
 	e->queue_head = (e->queue_head + 1) % e->queue_room;
 	e->queue_count--;
 	e->line_free = when;
@@ -435,6 +447,7 @@ static avr_cycle_count_t receive_done(avr_t *avr, avr_cycle_count_t when, void *
 			avr->data[A_UCSRA] |= DOR;
 		} else {
 			e->received[e->received_count++] = byte;
+			show_damage(e);
 			avr->data[A_UCSRA] |= RXC;
 		}
 		levels(e);
@@ -443,11 +456,12 @@ static avr_cycle_count_t receive_done(avr_t *avr, avr_cycle_count_t when, void *
 	return e->receiving ? when + line_frame_cycles(e) : 0;
 }
 
-void relpos_avr_receive(relpos_avr *e, const uint8_t *bytes, uint32_t count, uint64_t cycle)
+void relpos_avr_receive(relpos_avr *e, const uint8_t *bytes, uint32_t count, uint64_t cycle,
+		uint8_t damaged)
 {
 	if (e->queue_count + count > e->queue_room) {
 		uint32_t room = 2 * (e->queue_count + count);
-		uint8_t *queue = malloc(room);
+		uint16_t *queue = malloc(room * sizeof *queue);
 		if (!queue) { e->counter[COUNTER_LOST_RECORDS] += count; return; }
 		for (uint32_t i = 0; i < e->queue_count; i++)
 			queue[i] = e->queue[(e->queue_head + i) % e->queue_room];
@@ -457,7 +471,7 @@ void relpos_avr_receive(relpos_avr *e, const uint8_t *bytes, uint32_t count, uin
 		e->queue_room = room;
 	}
 	for (uint32_t i = 0; i < count; i++)
-		e->queue[(e->queue_head + e->queue_count++) % e->queue_room] = bytes[i];
+		e->queue[(e->queue_head + e->queue_count++) % e->queue_room] = (uint16_t)(bytes[i] | (damaged ? DAMAGED : 0));
 	if (!e->receiving && e->queue_count) {
 		uint64_t begin = cycle > e->line_free ? cycle : e->line_free;
 		uint64_t end = begin + line_frame_cycles(e), now = e->avr->cycle;

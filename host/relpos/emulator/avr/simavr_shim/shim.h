@@ -61,8 +61,10 @@ void relpos_avr_set_reset_vector(relpos_avr *, uint32_t address);
 /* Continue at a place (bytes) of the program: as it would be after it had gone astray. */
 void relpos_avr_jump(relpos_avr *, uint32_t address);
 
-/* Queue bytes for the receiver; the first begins on the wire at `cycle` or when the wire is free. */
-void relpos_avr_receive(relpos_avr *, const uint8_t *bytes, uint32_t count, uint64_t cycle);
+/* Queue bytes for the receiver; the first begins on the wire at `cycle` or when the wire is free.
+ * Damaged ones arrive without a stop bit. */
+void relpos_avr_receive(relpos_avr *, const uint8_t *bytes, uint32_t count, uint64_t cycle,
+		uint8_t damaged);
 /* Take up to `room` bytes sent; cycles[] = when the last stop bit ended. */
 uint32_t relpos_avr_take_sent(relpos_avr *, uint64_t *cycles, uint8_t *bytes, uint32_t room);
 /* Take up to `room` values written to GPIOR0 and the cycles of the writes. */
