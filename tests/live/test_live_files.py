@@ -165,3 +165,29 @@ def test_rows_of_a_file_that_was_deleted_are_told(tmp_path):
     with pytest.raises(FileNotFoundError, match="was deleted"):
         files.close()
     assert "was deleted" in files.trouble()
+
+
+def test_a_kill_loses_at_most_two_seconds_of_the_plain_files(tmp_path, monkeypatch):
+    now_s = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now_s[0])
+    files = FileSink(tmp_path, Description(name="walk"))
+    press = Event(3.0, 1, "landmark", "17")
+    for k in range(1, 400):
+        now_s[0] = 0.05 * k
+        time_s = now_s[0]
+        if k % 20 == 0 and time_s < 15.0:
+            files.observed(time_s, [Motion(time_s, 1, 0.5, 0.0, 0.1)])
+            files.observed(time_s, [Range(time_s - 0.9, 1, 2, 3.0)])
+            files.estimated(an_estimate(time_s))
+        if k == 60:
+            files.observed(time_s, [press])
+        files.trouble()
+        if time_s > 2.5:
+            # What a kill at this moment would leave.
+            run = load_run(tmp_path / "received")
+            assert run.motions[-1].time_s >= min(time_s, 14.95) - 2.0
+            assert "unsorted_rows" not in run.counters
+            assert read_estimates(tmp_path)[-1].time_s >= min(time_s, 14.95) - 2.0
+            assert time_s < press.time_s + 2.0 or run.events == (press,)
+    assert run.motions[-1].time_s == pytest.approx(14.0), "nothing waits for what never comes"
+    files.close()

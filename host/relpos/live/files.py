@@ -58,7 +58,11 @@ class FileSink(Sink):
         self._estimates.write(estimate)
 
     def trouble(self) -> str | None:
-        """Return the first file that cannot be written, and why."""
+        """Write what has waited long enough; return the first file that cannot be, and why."""
+        if self._received is not None:
+            self._received.tick()
+        for table in self._estimates.tables:
+            table.tick()
         received = () if self._received is None else self._received.tables
         for table in (*self._estimates.tables, *received):
             if table.error is not None:

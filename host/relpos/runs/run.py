@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -317,6 +318,7 @@ class RunFiles:
         self._waiting: list[tuple[float, int, Observation]] = []
         self._count = 0
         self._newest_s = -math.inf
+        self._written_s = -math.inf
 
     def describe(self, description: Description) -> None:
         """Replace the description of the run."""
@@ -328,7 +330,15 @@ class RunFiles:
             self._count += 1
             heapq.heappush(self._waiting, (observation.time_s, self._count, observation))
             self._newest_s = max(self._newest_s, observation.time_s)
+            self._written_s = time.monotonic()
         self._release(self._newest_s - REORDER_S)
+
+    def tick(self) -> None:
+        """Write what has waited long enough, also while nothing comes."""
+        if time.monotonic() - self._written_s > REORDER_S:
+            self._release(math.inf)
+        for table in self.tables:
+            table.tick()
 
     @property
     def tables(self) -> tuple[AppendedTable, ...]:
@@ -347,8 +357,9 @@ class RunFiles:
             table.add(([getattr(observation, name) for name in names],))
 
 
-REORDER_S = 5.0
-"""Ranges are reported up to two seconds after they were measured."""
+REORDER_S = 1.0
+"""Nine ranges in ten are reported within a tenth of a second, all but lost frames' within this.
+With the half second of the files, a kill loses no more than a second and a half."""
 
 
 @dataclass(frozen=True)
