@@ -376,8 +376,10 @@ def page_text() -> str:
         "",
         "**Counter.** Grows with every frame of a sender and never goes back: a node reserves "
         "blocks of counts in its EEPROM ahead of their use. The host accepts from each node what "
-        "is newer than all before, or within the last 64 counts and not seen yet (frames overtake "
-        "each other); a node accepts from the host only what is newer. The host's counter is the "
+        "is newer than all before by at most 2^24, or within the last 64 counts and not seen yet "
+        "(frames overtake each other). A node whose counter does not fit, such as one whose memory "
+        "was erased, gets a PING with 48 bits that nobody foresees; its answer sets its counter. "
+        "A node accepts from the host only what is newer. The host's counter is the "
         "time: eighths of a second since 2024, or the last one plus 1 where that is more, so "
         "that a host needs no memory. A node keeps the newest counter of a command in the EEPROM; "
         "that of beacons begins anew with a restart, so an old beacon may be taken until the next "

@@ -6,10 +6,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from relpos.errors import DataError
+from relpos.emulator.team import EmulatedTeam, TeamConfig
+from relpos.errors import DataError, DeviceError
 from relpos.link import port as serial_port
 from relpos.link import xbee
 from relpos.link.authentication import (
+    MAX_JUMP,
     WINDOW,
     CounterWindow,
     HostCounter,
@@ -18,7 +20,9 @@ from relpos.link.authentication import (
     read_key,
     write_new_key,
 )
-from relpos.link.decoder import REPLAYS_BEFORE_REMARK, Decoder
+from relpos.link.beacon import HostBeacons
+from relpos.link.decoder import REPLAYS_BEFORE_CHALLENGE, Decoder
+from relpos.link.dialogue import NodeDialogue
 from relpos.measurements import Motion, Range
 from relpos.protocol import messages as wire
 
@@ -75,7 +79,7 @@ def test_a_frame_that_is_sent_again_changes_nothing():
     assert (repr(decoder.nodes[1].totals), decoder.nodes[1].motion_s) == before
     assert decoder.nodes[1].counts["replayed"] + decoder.nodes[1].counts["duplicate"] == 200
     assert len(decoder.remarks) == 1
-    assert REPLAYS_BEFORE_REMARK < 200
+    assert REPLAYS_BEFORE_CHALLENGE < 200
 
 
 def test_frames_that_overtake_each_other_are_all_taken():
@@ -96,7 +100,7 @@ def test_a_session_knows_what_an_earlier_one_received():
         assert second.decoder.feed(frame, 1.0) == []
     assert second.decoder.nodes == {}
     assert second.newest_counters() == {}
-    assert ["node 1: old frames" in line for line in second.decoder.remarks] == [True]
+    assert ["node 1: frame counters" in line for line in second.decoder.remarks] == [True]
     second.decoder.feed(motion(10, 11.0), 2.0)
     assert second.decoder.nodes[1].counts["lost"] == 0
 
@@ -189,3 +193,115 @@ def test_counters_are_kept_beside_the_key_and_never_go_back(tmp_path):
     seen.path.write_text("{")
     with pytest.raises(DataError, match=r"team\.key\.seen"):
         SeenCounters(seen.path).load()
+
+
+def answer(counter, challenge, command=wire.CommandCode.PING, boot=0, **other):
+    values = {"token": challenge.token, "command": command, "value": challenge.value} | other
+    values["result"] = wire.CommandResult.DONE
+    return wire.encode(wire.ACKNOWLEDGEMENT, challenge.node, boot, counter, values, KEY)
+
+
+def test_one_frame_of_the_last_counter_silences_no_node():
+    decoder = Decoder((KEY,))
+    for n in range(10):
+        decoder.feed(motion(n, 1.0 + n, key=KEY), 1.0 + n)
+    assert decoder.feed(motion((1 << 32) - 1, 500.0, key=KEY), 11.0) == []
+    assert decoder.nodes[1].counts["jumped"] == 1
+    assert len(decoder.feed(motion(10, 11.0, key=KEY), 11.0)) == 1
+    assert decoder.nodes[1].window.newest == 10
+
+
+def test_a_node_may_have_sent_for_a_month_while_no_host_listened():
+    decoder = Decoder((KEY,), {1: 1000})
+    assert decoder.feed(motion(1000 + MAX_JUMP, 1.0, key=KEY), 1.0)
+    decoder = Decoder((KEY,), {1: 1000})
+    assert not decoder.feed(motion(1001 + MAX_JUMP, 1.0, key=KEY), 1.0)
+
+
+@pytest.mark.parametrize("before", [(1 << 32) - 1, 5000])
+def test_a_node_that_lost_its_counter_comes_back_by_an_answer_and_nothing_else(before):
+    decoder = Decoder((KEY,), {1: before})
+    for n in range(40):
+        assert decoder.feed(motion(n, 1.0 + 0.2 * n, key=KEY), 1.0 + 0.2 * n) == []
+    asked = list(decoder.challenges)
+    assert len(asked) == 2, "one in five seconds"
+    assert len(decoder.remarks) == 1
+    last = asked[-1]
+    for wrong in (
+        answer(40, asked[0]),
+        answer(40, last, wire.CommandCode.REBOOT),
+        answer(40, last, token=last.token ^ 1),
+        answer(40, last, value=last.value ^ 1),
+    ):
+        decoder.feed(wrong, 9.0)
+    assert decoder.nodes == {}
+    decoder.feed(answer(41, last), 9.0)
+    assert [line for line in decoder.remarks if "heard again" in line] == [decoder.remarks[1]]
+    assert len(decoder.feed(motion(42, 10.0, key=KEY), 10.0)) == 1
+    # What it said before is old now, and so is its answer.
+    decoder.feed(answer(41, last), 11.0)
+    decoder.feed(motion(30, 7.0, key=KEY), 11.0)
+    counts = decoder.nodes[1].counts
+    assert (counts["received"], counts["duplicate"], counts["lost"]) == (2, 2, 0)
+
+
+def test_a_recorded_answer_brings_no_recorded_session_back():
+    first, heard = Decoder((KEY,), {1: 5000}), []
+    for n in range(20):
+        heard.append((motion(n, 1.0 + n, key=KEY), 1.0 + n))
+        first.feed(*heard[-1])
+    heard.append((answer(20, first.challenges[-1]), 21.0))
+    heard += [(motion(n, 1.0 + n, key=KEY), 1.0 + n) for n in range(21, 30)]
+    taken = [o for frame, at_s in heard[20:] for o in first.feed(frame, at_s)]
+    assert len(taken) == 9
+    # The session's recording, with the same times of arrival, gives the same.
+    again = Decoder((KEY,), {1: 5000})
+    assert [o for frame, at_s in heard for o in again.feed(frame, at_s)] == taken
+    # Somebody who sends it again, to a host that knows what this one knew, cannot have its times.
+    another = Decoder((KEY,), {1: 5000})
+    assert [o for frame, at_s in heard for o in another.feed(frame, at_s + 1e-6)] == []
+    assert another.nodes == {}
+
+
+def test_a_node_answers_the_challenge_of_a_host_that_remembers_a_higher_counter():
+    with EmulatedTeam(TeamConfig("straight", 2, 30.0, 3)) as team:
+        link = serial_port.Link(newest_counters={1: (1 << 32) - 1})
+        beacons, heard_s = HostBeacons(link), []
+        while team.time_us < 20e6 and not heard_s:
+            for time_us, data in team.run(team.time_us + 20_000):
+                for o in link.feed(data, time_us * 1e-6):
+                    heard_s += [o.time_s] * (o.node == 1)
+            due = beacons.due(team.time_us * 1e-6)
+            if due:
+                team.send(due)
+    assert heard_s
+    assert any("node 1: its frame counter had changed" in line for line in link.decoder.remarks)
+
+
+@pytest.mark.parametrize(("clock_s", "day"), [(0.0, "1970-01-01"), (3e9, "2065-01-24")])
+def test_a_clock_that_cannot_be_right_is_told_as_that(clock_s, day):
+    link = serial_port.Link(counter=HostCounter(lambda: clock_s))
+    for _ in range(3):
+        link.command(1, wire.CommandCode.PING, 0)
+    (remark,) = link.decoder.remarks
+    assert f"clock says {day}" in remark
+    assert "set the clock" in remark
+    assert HostCounter(lambda: clock_s).next() == 1
+    assert HostCounter(lambda: 1.8e9).clock_fault() is None
+
+
+def test_a_node_that_does_not_answer_a_host_of_1970_is_no_wrong_key(monkeypatch):
+    monkeypatch.setattr("relpos.link.dialogue.ANSWER_S", 0.01)
+
+    class Silent:
+        port, in_waiting = "test", 0
+
+        def read(self, size=1):
+            return b""
+
+        def write(self, data):
+            return len(data)
+
+    link = serial_port.Link(counter=HostCounter(lambda: 86_400.0))
+    with pytest.raises(DeviceError, match="clock says 1970-01-02"):
+        NodeDialogue(Silent(), 1, link).command(wire.CommandCode.PING, 0)

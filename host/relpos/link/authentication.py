@@ -24,13 +24,17 @@ COUNTS_PER_S = 8
 """Frames a second that a host may send without end; 32 bits last until 2041."""
 WINDOW = 64
 """How far behind the newest a frame may be and still be accepted, once."""
+MAX_JUMP = 1 << 24
+"""How far ahead of the newest a frame may be: a node's frames of a month, which a host that was
+away may have missed. A node that is further ahead has to answer a challenge."""
 
 
 class HostCounter:
     """Counters of the host's frames: the time in eighths of a second, or the last one plus 1.
 
     ``clock`` gives Unix time in seconds. Two hosts of a team, or one that was restarted, need no
-    common memory while their clocks are right to a few seconds.
+    common memory while their clocks are right to a few seconds. A clock that cannot be right
+    counts as none; :meth:`clock_fault` says so.
     """
 
     def __init__(self, clock: Callable[[], float] = time.time) -> None:
@@ -39,9 +43,20 @@ class HostCounter:
 
     def next(self) -> int:
         """Return the next frame's counter."""
-        now = int((self._clock() - EPOCH_UNIX_S) * COUNTS_PER_S)
+        now = 0 if self.clock_fault() else int((self._clock() - EPOCH_UNIX_S) * COUNTS_PER_S)
         self._last = max(now, self._last + 1)
         return self._last
+
+    def clock_fault(self) -> str | None:
+        """Say in a line what is wrong with this computer's clock; None where nothing is."""
+        now_s = self._clock()
+        if EPOCH_UNIX_S <= now_s < EPOCH_UNIX_S + (1 << 32) / COUNTS_PER_S:
+            return None
+        day = time.strftime("%Y-%m-%d", time.gmtime(min(max(now_s, 0.0), 1e11)))
+        return (
+            f"this computer's clock says {day}, which cannot be: nodes refuse commands and beacons "
+            "that seem older than earlier ones; set the clock"
+        )
 
 
 class Verdict(enum.Enum):
@@ -51,6 +66,7 @@ class Verdict(enum.Enum):
     LATE = "late"
     DUPLICATE = "duplicate"
     REPLAYED = "replayed"
+    JUMPED = "jumped"
 
 
 @dataclass(slots=True)
@@ -63,7 +79,8 @@ class CounterWindow:
     def check(self, counter: int) -> Verdict:
         """Return whether a frame of that counter is new; changes nothing."""
         if counter > self.newest:
-            return Verdict.NEW
+            known = self.newest >= 0
+            return Verdict.JUMPED if known and counter - self.newest > MAX_JUMP else Verdict.NEW
         behind = self.newest - counter
         if behind >= WINDOW:
             return Verdict.REPLAYED

@@ -95,7 +95,7 @@ class HostBeacons:
     """Sends beacons to the nodes that ``link`` hears, unless an emulated team sends its own.
 
     Such a team marks virtual time, which a host cannot follow. A node without a free slot gets a
-    remark in the decoder, once.
+    remark in the decoder, once. Nodes whose frame counters do not fit get the decoder's challenges.
     """
 
     def __init__(self, link: Link, schedule: BeaconSchedule | None = None) -> None:
@@ -104,10 +104,17 @@ class HostBeacons:
         self._remarked: set[int] = set()
 
     def due(self, now_s: float) -> bytes:
-        """Return bytes for the coordinator's port, empty where no beacon is due.
+        """Return bytes for the coordinator's port, empty where nothing is due.
 
         ``now_s`` is on the clock of the link's arrival times.
         """
+        asked, challenges = b"", self._link.decoder.challenges
+        while challenges:
+            c = challenges.popleft()
+            asked += self._link.command(c.node, wire.CommandCode.PING, c.value, token=c.token)[1]
+        return asked + self._beacon(now_s)
+
+    def _beacon(self, now_s: float) -> bytes:
         if self._link.virtual_s is not None:
             return b""
         for node, track in self._link.decoder.nodes.items():

@@ -6,7 +6,9 @@ Sans I/O: bytes and their arrival times go in, observations come out. A frame is
 
 from __future__ import annotations
 
+import hashlib
 import math
+import struct
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,8 +29,10 @@ MAX_KEPT = 10_000
 """Answers and raw samples stored until they are fetched: half an hour of one node's samples."""
 FOREIGN_BEFORE_REMARK = 5
 """Frames under another key before a remark, while none arrives under this one."""
-REPLAYS_BEFORE_REMARK = 5
-"""One or two such frames may be an echo; more mean that the node has lost its counter."""
+REPLAYS_BEFORE_CHALLENGE = 5
+"""One or two such frames may be an echo; more may mean that the node has lost its counter."""
+CHALLENGE_S = 5.0
+"""Between two challenges of one node, which answers within a second."""
 
 
 DOWN = (wire.COMMAND, wire.BEACON, wire.NEW_KEY)
@@ -65,8 +69,20 @@ class Acknowledged:
     value: int
 
 
+@dataclass(frozen=True, slots=True)
+class Challenge:
+    """Token and value of a PING that only a node can answer that holds the key now."""
+
+    node: int
+    token: int
+    value: int
+
+
 class Decoder:
     """Frames in, observations out; one instance for the whole team.
+
+    A node whose counters do not fit has to answer a PING, which ``challenges`` asks the host to
+    send: the answer sets the counter.
 
     ``remarks`` collects messages for the user, once each, such as nodes of another version.
     ``acknowledged`` and ``raw_samples`` hold the newest answers and raw samples.
@@ -87,7 +103,10 @@ class Decoder:
         self.keys = tuple(keys)
         self.range_offsets_m: dict[int, float] = {}
         self._newest_counters = dict(newest_counters or {})
-        self._replays: Counter[int] = Counter()
+        self._misfits: Counter[int] = Counter()
+        self._challenged: dict[int, tuple[float, Challenge | None]] = {}
+        """When each node was challenged last, and what it has not answered yet."""
+        self.challenges: deque[Challenge] = deque(maxlen=MAX_KEPT)
         self.nodes: dict[int, NodeTrack] = {}
         self.counts: Counter[str] = Counter()
         self.foreign_versions: dict[int, int] = {}
@@ -209,26 +228,22 @@ class Decoder:
                 track.window = CounterWindow.after(self._newest_counters[frame.node])
         window = track.window
         verdict = window.check(frame.counter)
-        if verdict in (Verdict.DUPLICATE, Verdict.REPLAYED):
-            self._count_rejected(frame.node, track, verdict)
-            return None
+        if verdict in (Verdict.DUPLICATE, Verdict.REPLAYED, Verdict.JUMPED):
+            if not self._answers_challenge(frame):
+                self._reject(frame, track, verdict, arrival_s)
+                return None
+            self.remarks.append(
+                f"node {frame.node}: its frame counter had changed; it has answered and is heard "
+                "again"
+            )
+            # What came under the other counter may have been forged: begin anew, as at a restart.
+            window, verdict = CounterWindow.after(frame.counter - 1), Verdict.NEW
+            track = self._restarted(track, frame, window, arrival_s)
         if frame.boot != track.boot and verdict is Verdict.LATE:
             track.counts["stale_boot"] += 1
             return None
         if frame.boot != track.boot and track.heard:
-            # Totals, clock and height restart; counter, counts and pose go on. The height goes on
-            # from the last one: the wearer does not fly while the node restarts.
-            unseen_s = arrival_s - track.arrival_s if track.totals is not None else 0.0
-            track = NodeTrack(
-                frame.boot,
-                window=window,
-                counts=track.counts,
-                arrival_s=arrival_s,
-                motion_s=track.motion_s,
-                unseen_s=unseen_s,
-                height_m=track.height_m,
-                restart_height_m=track.height_m,
-            )
+            track = self._restarted(track, frame, window, arrival_s)
             track.counts["restarts"] += 1
         elif verdict is Verdict.LATE:
             track.counts["lost"] -= 1
@@ -238,20 +253,65 @@ class Decoder:
         self.nodes[frame.node] = track
         track.heard = True
         window.add(frame.counter)
+        self._misfits[frame.node] = 0
         track.counts["received"] += 1
         return track
 
-    def _count_rejected(self, node: int, track: NodeTrack, verdict: Verdict) -> None:
+    @staticmethod
+    def _restarted(
+        track: NodeTrack, frame: wire.Frame, window: CounterWindow, arrival_s: float
+    ) -> NodeTrack:
+        """Return a track whose totals, clock and height begin anew; counts and pose go on.
+
+        The height goes on from the last one: the wearer does not fly while the node restarts.
+        """
+        return NodeTrack(
+            frame.boot,
+            window=window,
+            counts=track.counts,
+            arrival_s=arrival_s,
+            motion_s=track.motion_s,
+            unseen_s=arrival_s - track.arrival_s if track.totals is not None else 0.0,
+            height_m=track.height_m,
+            restart_height_m=track.height_m,
+        )
+
+    def _reject(
+        self, frame: wire.Frame, track: NodeTrack, verdict: Verdict, arrival_s: float
+    ) -> None:
+        node = frame.node
         track.counts[verdict.value] += 1
         # For a node not heard since the start, a "duplicate" is from an earlier session.
         if verdict is Verdict.DUPLICATE and track.heard:
             return
-        self._replays[node] += 1
-        if self._replays[node] == REPLAYS_BEFORE_REMARK:
+        self._misfits[node] += 1
+        challenged_s, _ = self._challenged.get(node, (-math.inf, None))
+        if self._misfits[node] < REPLAYS_BEFORE_CHALLENGE or arrival_s - challenged_s < CHALLENGE_S:
+            return
+        if node not in self._challenged:
             self.remarks.append(
-                f"node {node}: old frames are sent again, or its memory was erased (then delete "
-                "the key file's .seen and restart)"
+                f"node {node}: frame counters that do not follow its last: old frames are sent "
+                "again, or its memory was erased; asked it for an answer, which brings it back"
             )
+        # Keyed, and of a time that nobody can set: an old answer fits no new challenge. A replay
+        # of the session makes the same one.
+        said = struct.pack("<BId", node, frame.counter, arrival_s)
+        digest = hashlib.blake2b(said, key=self.keys[0], digest_size=6).digest()
+        challenge = Challenge(node, *struct.unpack("<Hi", digest))
+        self._challenged[node] = arrival_s, challenge
+        self.challenges.append(challenge)
+
+    def _answers_challenge(self, frame: wire.Frame) -> bool:
+        """Return whether a frame is a node's answer to its challenge, which then is over."""
+        asked_s, challenge = self._challenged.get(frame.node, (0.0, None))
+        if challenge is None or frame.message is not wire.ACKNOWLEDGEMENT:
+            return False
+        values = frame.values
+        answer = Challenge(frame.node, values["token"], values["value"])
+        if values["command"] != wire.CommandCode.PING or answer != challenge:
+            return False
+        self._challenged[frame.node] = asked_s, None
+        return True
 
     def _motion(self, node: int, track: NodeTrack, values: Mapping[str, Any]) -> list[Observation]:
         fields = wire.MOTION.field

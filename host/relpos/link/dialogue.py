@@ -124,7 +124,9 @@ class NodeDialogue:
 
     def _heard(self) -> str:
         others = sorted(set(self.link.decoder.nodes) - {self.node})
-        return f" Heard: node {', '.join(map(str, others))}" if others else ""
+        heard = f" Heard: node {', '.join(map(str, others))}." if others else ""
+        fault = self.link.clock_fault()
+        return heard + (f" And {fault}." if fault else "")
 
     def demand(self, code: wire.CommandCode, value: int) -> int:
         """Return the value in force after a command; DeviceError where the node refuses it."""
@@ -218,7 +220,7 @@ class NodeDialogue:
         self.link.accept_keys(old)
         raise DeviceError(
             f"node {self.node} does not answer: neither under the key that it should have nor "
-            "under the new one"
+            "under the new one." + self._heard()
         )
 
     def _answers_under_present_key(self) -> bool:

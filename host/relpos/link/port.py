@@ -68,6 +68,7 @@ class Link:
         self._escaped = escaped
         self._token = 0
         self._virtual_s: float | None = None
+        self._fault_told = False
         self._unmarked = 0
         """Frames of nodes before the first mark of virtual time."""
 
@@ -155,9 +156,17 @@ class Link:
     def _sealed(
         self, message: Message, node: int, counter: int, values: Mapping[str, Any], broadcast: bool
     ) -> bytes:
+        fault = self.clock_fault()
+        if fault and not self._fault_told:
+            self._fault_told = True
+            self.decoder.remarks.append(fault)
         data = wire.encode(message, node, 0, counter, values, self.key)
         address = xbee.BROADCAST_16 if broadcast or node == wire.BROADCAST else node
         return xbee.encode(xbee.Transmit16(0, address, data), escaped=self._escaped)
+
+    def clock_fault(self) -> str | None:
+        """Say in a line why nodes may refuse what this host sends; None where nothing is wrong."""
+        return self._counter.clock_fault()
 
     def next_token(self) -> int:
         """Return a token that the last 65,534 commands did not have."""
