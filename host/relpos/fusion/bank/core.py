@@ -44,7 +44,7 @@ class BankCore:
 
     The order of work in one epoch: ``move`` (once or more), ``update`` (all ranges of one
     instant), ``update_heading`` and ``update_detection`` where there is anything, then
-    ``end_instant`` (resampling and perturbing). ``hypotheses.moments`` gives the mixture.
+    ``end_instant`` (resampling and perturbing), and at its end ``moments``.
     """
 
     def __init__(self, settings: BankSettings, seed: int = 0) -> None:
@@ -175,6 +175,7 @@ class BankCore:
 
     def update_heading(self, row: int, heading_rad: float, sigma_rad: float) -> None:
         """Update with an absolute heading of a user."""
+        self.hypotheses.put_back_common_rotation()
         heading_update.update_heading(self.hypotheses.arrays, row, heading_rad, sigma_rad**2)
 
     def update_detection(self, attempts: Attempts, detection: Detection) -> None:
@@ -186,6 +187,15 @@ class BankCore:
         before = these.log_weight.copy()
         detection_update.update_detection(these.arrays, attempts, detection.weight, detection.curve)
         sensors.temper(these.arrays.log_weight, before)
+
+    def moments(self) -> tuple[Floats, Floats, Floats]:
+        """Return the poses' mean (D,), covariance (D, D), and what the whole team shares (D, D).
+
+        The second is without the rigid motion of the team that no range measures, and that this
+        takes out of the hypotheses (:mod:`relpos.fusion.bank.common_rotation`); the third adds it.
+        """
+        mean, covariance = self.hypotheses.take_out_common_rotation()
+        return mean, covariance, self.hypotheses.common_covariance(mean)
 
     def predicted_ranges(
         self, first: Indices, second: Indices, dz_m: Floats

@@ -372,9 +372,10 @@ class Bank:
         north = self.north
         reported = measured.sigma_rad or HEADING_SIGMA_RAD
         sigma = north.alone_sigma_rad(measured.node, time_s, reported)
-        mean, covariance = self.core.hypotheses.moments(poses_alone=True)
+        these = self.core.hypotheses
+        mean, covariance = these.moments(poses_alone=True)
         place = PER_NODE * row + StateIndex.HEADING
-        own, variance = float(mean[place]), float(covariance[place, place])
+        own, variance = float(mean[place]), float(covariance[place, place] + these.common[2, 2])
         if north.sigma_rad < NORTH_KNOWN_RAD:
             self.core.update_heading(
                 row, measured.heading_rad - north.angle_rad, math.hypot(sigma, north.sigma_rad)
@@ -386,11 +387,11 @@ class Bank:
         for known in self._known.values():
             known.close_epoch(self._epoch_s)
         self._epoch_s = time_s
-        mean, covariance = self.core.hypotheses.moments(poses_alone=True)
+        mean, covariance, common = self.core.moments()
         self.core.relocalisation.end_ambiguity(covariance)
         report = Report(
-            time_s, self._row, self._known, self.core, mean, covariance, self.initialiser,
-            self.detection,
+            time_s, self._row, self._known, self.core, mean, covariance, common,
+            self.initialiser, self.detection,
         )  # fmt: skip
         return report.estimate(self.north.known())
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import RelposError
-from relpos.fusion.bank import hypothesis_count, lanes, mixture, storage
+from relpos.fusion.bank import common_rotation, hypothesis_count, lanes, mixture, storage
 from relpos.fusion.bank import variance_components as components
 from relpos.fusion.bank.lanes import LANES
 from relpos.fusion.bank.mixture import PERTURBED_LOSS
@@ -77,6 +77,8 @@ class HypothesisSet:
         self.biases: dict[tuple[int, int], int] = {}
         """Pair of rows, the lower first -> entry of its range bias in the state."""
         self.arrays.p[:, 0] = storage.lay_out(self.has_bias) * settings.bias_m**2
+        self.common: Floats = np.zeros((common_rotation.RIGID, common_rotation.RIGID))
+        """Covariance of the rigid motion of the whole team that has been taken out."""
         self.spread_components()
 
     def _share_of_all(self, many: int) -> Floats:
@@ -160,6 +162,46 @@ class HypothesisSet:
         """Block and lane of the hypotheses ``which``, or of all."""
         which = np.arange(self.count) if which is None else which
         return which // LANES, which % LANES
+
+    # -- the common rotation -------------------------------------------------------------------
+
+    def take_out_common_rotation(self) -> tuple[Floats, Floats]:
+        """Take the team's rigid motion out where it is large; return the poses' moments."""
+        mean, covariance = self.moments(poses_alone=True)
+        gain, known = common_rotation.estimate(mean, covariance, self.nodes)
+        if known[2, 2] < common_rotation.LEAST_RAD**2:
+            return mean, covariance
+        poses, _ = self.poses_of(*range(self.nodes))
+        entries = storage.order(self.nodes, len(mean))[: poses.shape[1]]
+        middle = mean[entries].reshape(-1, storage.POSE).mean(axis=0)[:2]
+        weight, blocks = self.weights(), len(self.arrays.x)
+        taken = lanes.empty_lines(blocks, 6)
+        common_rotation.take_out(self.arrays, middle, taken)
+        own = common_rotation.full(weight @ storage.of_each(taken, self.count))
+        off = poses - mean[entries]
+        off[:, 2::3] = np.remainder(off[:, 2::3] + math.pi, 2.0 * math.pi) - math.pi
+        motion = off @ gain.T
+        motion -= weight @ motion
+        if self.count > 1:
+            laid = common_rotation.lay_out_motion(motion, blocks)
+            common_rotation.align(self.arrays, middle, laid)
+        between = np.einsum("k,ki,kj->ij", weight, motion, motion)
+        self.common += common_rotation.about_origin(own + between, *middle)
+        return self.moments(poses_alone=True)
+
+    def put_back_common_rotation(self) -> None:
+        """Put back what was taken out: an absolute heading is to measure it."""
+        if self.common[2, 2] > 0.0:
+            common_rotation.put_back(self.arrays, self.common[np.tril_indices(3)])
+            self.common[...] = 0.0
+
+    def common_covariance(self, mean: Floats) -> Floats:
+        """Return what has been taken out of the mixture's covariance (D, D), by its mean (D,)."""
+        entries = storage.order(self.nodes, len(mean))[: storage.POSE * self.nodes]
+        g = common_rotation.rigid_motion(mean[entries[0::3]], mean[entries[1::3]])
+        covariance = np.zeros((len(mean), len(mean)))
+        covariance[np.ix_(entries, entries)] = g @ self.common @ g.T
+        return covariance
 
     # -- changing one user ---------------------------------------------------------------------
 

@@ -151,25 +151,22 @@ def difference(
 
 
 @compiled
-def pairs(mean: Floats, covariance: Floats, rows: Indices) -> Floats:
-    """Give (P, 4) of every two of the users ``rows`` (N,), by the mixture's moments (D,), (D, D).
+def bearings(mean: Floats, covariance: Floats, rows: Indices) -> Floats:
+    """Give (P, 2) of every two of the users ``rows`` (N,), by the mixture's moments (D,), (D, D).
 
-    Distance and its standard deviation (m), bearing and its (rad), to first order; of two on one
-    spot no direction is along the line of sight, and any bearing is as likely.
+    Bearing and its standard deviation (rad), to first order; of two on one spot any is as likely.
     """
     several = rows.shape[0]
-    result = np.empty((several * (several - 1) // 2, 4))
+    result = np.empty((several * (several - 1) // 2, 2))
     n = 0
     for a in range(several):
         for b in range(a + 1, several):
             east, north, xx, yy, xy = difference(mean, covariance, rows[a], rows[b])
             square = east * east + north * north
-            along, sideways = 0.5 * (xx + yy), ANY_ANGLE_RAD
+            sideways = ANY_ANGLE_RAD
             if square > 0.0:
-                along = east * east * xx + 2.0 * east * north * xy + north * north * yy
-                along /= square
-                sideways = min(math.sqrt(max(xx + yy - along, 0.0) / square), ANY_ANGLE_RAD)
-            result[n, 0], result[n, 1] = math.sqrt(square), math.sqrt(max(along, 0.0))
-            result[n, 2], result[n, 3] = math.atan2(north, east), sideways
+                across = north * north * xx - 2.0 * east * north * xy + east * east * yy
+                sideways = min(math.sqrt(max(across, 0.0)) / square, ANY_ANGLE_RAD)
+            result[n, 0], result[n, 1] = math.atan2(north, east), sideways
             n += 1
     return result

@@ -55,7 +55,9 @@ class Report:
     core: BankCore
     mean: Floats
     covariance: Floats
-    """Moments of the mixture, (D,) and (D, D)."""
+    """Moments of the mixture, (D,) and (D, D), without the team's rigid motion."""
+    common: Floats
+    """What that adds to the covariance (D, D)."""
     initialiser: Initialiser
     detection: Detection
 
@@ -116,7 +118,7 @@ class Report:
             status = NodeStatus.AMBIGUOUS
         at = PER_NODE * row
         x, y, heading = self.mean[at : at + 3].tolist()
-        own = self.covariance[at : at + 3, at : at + 3].tolist()
+        own = (self.covariance + self.common)[at : at + 3, at : at + 3].tolist()
         return NodeEstimate(
             node, x, y, math.remainder(heading, math.tau), own[0][0], own[1][1], own[0][1],
             min(math.sqrt(own[2][2]), ANY_ANGLE_RAD), status, presence.height_m,
@@ -152,7 +154,10 @@ class Report:
     def _pairs(self) -> list[PairEstimate]:
         nodes = sorted(self.row)
         rows = np.array([self.row[node] for node in nodes], dtype=np.int64)
-        figures = mixture_kernels.pairs(self.mean, self.covariance, rows).tolist()
+        bearings = mixture_kernels.bearings(self.mean, self.covariance + self.common, rows)
+        first, second = (rows[k] for k in np.triu_indices(len(rows), 1))
+        distances = self.core.predicted_ranges(first, second, np.zeros(len(first)))
+        figures = np.column_stack([*distances, bearings]).tolist()
         every = combinations(nodes, 2)
         return [PairEstimate(*two, *own) for two, own in zip(every, figures, strict=True)]
 
@@ -208,7 +213,7 @@ class Report:
         for i, node in enumerate(located, sought):
             at = PER_NODE * self.row[node]
             poses[:, i] = self.mean[at : at + 3]
-            spread[:, i] = self.covariance[at : at + 2, at : at + 2]
+            spread[:, i] = (self.covariance + self.common)[at : at + 2, at : at + 2]
         return nodes, poses, spread
 
     def _sought_pairs(self, mixture: PoseMixture) -> list[PairEstimate]:
