@@ -125,7 +125,9 @@ class Parameter:
     """One learned constant; ``peer`` is given where it belongs to a pair.
 
     Names: ``step_scale`` (true over reported length), ``heading_drift_rad_s``,
-    ``range_bias_m``, ``detection_range_m``.
+    ``range_bias_m``, ``detection_range_m``, ``body_shadow_m`` (what a body in between adds to a
+    range), ``range_lateness_s`` (by how much ranges are dated late), ``clock_offset_s`` (how far a
+    node's clock is ahead of most others').
     """
 
     time_s: float

@@ -144,18 +144,21 @@ class BankCore:
         dz_m: Floats,
         dz_variance_m2: Floats | None = None,
         sample_count: Floats | None = None,
+        velocity_m_s: Floats | None = None,
     ) -> Floats:
         """Update with the ranges (R,) of one instant; return each one's inlier probability.
 
         ``dz_m`` are the antennas' differences of height, ``dz_variance_m2`` their variances (0
-        by default), ``sample_count`` how many independent ranges each counts as (1 by default).
+        by default), ``sample_count`` how many independent ranges each counts as (1 by default),
+        ``velocity_m_s`` (R, 4) those of the first and of the second, forward and left (0).
         """
         several, these = len(first), self.hypotheses
         variance = np.zeros(several) if dz_variance_m2 is None else dz_variance_m2
         counts = np.ones(several) if sample_count is None else sample_count
         self._check(first, second, range_m, dz_m, variance, counts)
         biases = these.bias_entries(first, second)
-        ranges = Ranges(first, second, range_m, dz_m, variance, counts, biases)
+        velocity = np.zeros((several, 4)) if velocity_m_s is None else velocity_m_s
+        ranges = Ranges(first, second, range_m, dz_m, variance, counts, biases, velocity)
         outlier, known = self._sensors.model.outlier, self._sensors
         outlier[3] = 1.0 / (1.0 - these.sampled_share)
         wary = self.relocalisation.since_fault <= OPEN_UPDATES and self.counters["slips"] > 0

@@ -17,11 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import RelposError
+from relpos.fusion.bank.clocks import Clocks
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.detection_update import Attempts
 from relpos.fusion.bank.reporting import Report
 from relpos.fusion.bank.settings import BankSettings
-from relpos.fusion.bank.storage import PER_NODE, StateIndex
+from relpos.fusion.bank.storage import PER_NODE, CommonIndex, StateIndex
 from relpos.fusion.estimator import Estimate, Presence, refuse_unmoved, refuse_unranged
 from relpos.fusion.initial_poses import (
     HEADING_RESOLVED_RAD,
@@ -76,6 +77,11 @@ class Bank:
     speed_gate: SpeedGate = field(default_factory=SpeedGate)
     zero_motion: ZeroMotionDetector = field(default_factory=ZeroMotionDetector)
     north: North = field(default_factory=North)
+    clocks: Clocks = field(default_factory=Clocks)
+    _dated: Clocks = field(default_factory=Clocks)
+    """What of ``clocks`` the state knows; another, where it is a copy from before."""
+    _velocity_m_s: dict[int, tuple[float, float]] = field(default_factory=dict)
+    """Node -> velocity forward and left, by its newest displacement."""
     _row: dict[int, int] = field(default_factory=dict)
     _known: dict[int, _Known] = field(default_factory=dict)
     _standing: dict[int, complex] = field(default_factory=dict)
@@ -106,7 +112,7 @@ class Bank:
     @property
     def shared(self) -> tuple[object, ...]:
         """Objects that copies of the core refer to (:class:`~relpos.fusion.rewind.Core`)."""
-        return self.priors, self.settings, self.mounting
+        return self.priors, self.settings, self.mounting, self.clocks
 
     def check_run(self, counters: Mapping[str, int]) -> None:
         """Raise RelposError if the run cannot give relative positions."""
@@ -144,7 +150,7 @@ class Bank:
             self._advance()
             self._diffuse(self._row, step.time_s, timeline)
             self._admit(self.initialiser.find(step.time_s))
-            return self._estimate(step.time_s)
+            return self._estimate(step.time_s, timeline)
         return None
 
     def cost_s(self, step: Step) -> float:
@@ -188,6 +194,7 @@ class Bank:
             known.received(time_s)
             way_m = math.hypot(dx_m, dy_m)
             self.range_correlation.move(node, way_m, turn_rad)
+            self._velocity_m_s[node] = _velocity_m_s(dx_m, dy_m, turn_rad, duration_s)
             # How it turned meanwhile its ranges cannot say.
             moves[k, :2] *= known.undiffused(time_s, duration_s)
             vague = None if reported is None else _vagueness(a)
@@ -197,6 +204,7 @@ class Bank:
             if zero_motion.update(node, dx_m, dy_m, turn_rad, duration_s, fraction):
                 self._counters["motions_still"] += dx_m != 0.0 or turn_rad != 0.0
                 moves[k, :3] = 0.0
+                self._velocity_m_s[node] = (0.0, 0.0)
                 continue
             if speed_gate.exceeded(node, way_m, duration_s, fraction):
                 self._make(rows, moves, reported, slice(begin, k))
@@ -246,11 +254,17 @@ class Bank:
                 [known[a].sigma_height_m ** 2 + known[b].sigma_height_m ** 2 for a, b in pairs]
             )
             counts = self.range_correlation.effective_counts(pairs)
-            self.core.update(first, second, measured, dz, variance, counts)
+            velocity = [self._velocity_at(a, time_s) + self._velocity_at(b, time_s) for a, b in pairs]
+            self.core.update(first, second, measured, dz, variance, counts, np.array(velocity))
             self._ranges_used += len(ranges)
         for attempts in rounds:
             self.core.update_detection(attempts, self.detection)
         self.core.end_instant()
+
+    def _velocity_at(self, node: int, time_s: float) -> tuple[float, float]:
+        """Return a node's velocity forward and left (m/s); 0 where its motion is missing."""
+        missing = self._known[node].diffused_s >= time_s
+        return (0.0, 0.0) if missing else self._velocity_m_s.get(node, (0.0, 0.0))
 
     def _diffuse(self, nodes: Iterable[int], time_s: float, timeline: Timeline) -> None:
         """Let nodes whose motion is missing be anywhere that they can have walked to.
@@ -383,17 +397,49 @@ class Bank:
         if not north.learn(measured.heading_rad, sigma, own, variance):
             self._counters["headings_doubted"] += 1
 
-    def _estimate(self, time_s: float) -> Estimate:
+    def _estimate(self, time_s: float, timeline: Timeline) -> Estimate:
+        self._know_clocks()
         for known in self._known.values():
             known.close_epoch(self._epoch_s)
-        self._epoch_s = time_s
+        since_s, self._epoch_s = self._epoch_s, time_s
         mean, covariance, common = self.core.moments()
         self.core.relocalisation.end_ambiguity(covariance)
         report = Report(
             time_s, self._row, self._known, self.core, mean, covariance, common,
-            self.initialiser, self.detection,
+            self.initialiser, self.detection, self._dated,
         )  # fmt: skip
-        return report.estimate(self.north.known())
+        estimate = report.estimate(self.north.known())
+        if since_s > -math.inf:
+            self._slew_clocks(time_s - since_s, mean, covariance, timeline)
+        return estimate
+
+    def _know_clocks(self) -> None:
+        """Take out of the state what ``clocks`` has put right since."""
+        these, known, now = self.core.hypotheses, self._dated, self.clocks
+        if known == now:
+            return
+        lateness = these.common_entry(CommonIndex.LATENESS)
+        these.shift_common(lateness, known.lateness_s - now.lateness_s)
+        known.lateness_s = now.lateness_s
+        for node, row in self._row.items():
+            before_s, now_s = known.offset_s.get(node, 0.0), now.offset_s.get(node, 0.0)
+            these.shift_common(these.clock_entry(row), before_s - now_s)
+            known.offset_s[node] = now_s
+
+    def _slew_clocks(
+        self, duration_s: float, mean: Floats, covariance: Floats, timeline: Timeline
+    ) -> None:
+        """Let what has been learned of time stamps go into those of later measurements."""
+        these, rows = self.core.hypotheses, self._row
+        lateness = these.common_entry(CommonIndex.LATENESS)
+        sigma_s = math.sqrt(max(float(covariance[lateness, lateness]), 0.0))
+        offset_s, sigmas_s = these.clock_offsets(mean, covariance)
+        usual_s = float(np.median(offset_s)) if rows else 0.0
+        offsets = {n: (offset_s[row] - usual_s, sigmas_s[row]) for n, row in rows.items()}
+        self.clocks.slew(duration_s, (float(mean[lateness]), sigma_s), offsets)
+        # Otherwise whatever is dated back would come late.
+        timeline.reorder_s = self.settings.reorder_s + self.clocks.longest_s
+        self._know_clocks()
 
 
 def make(
@@ -410,7 +456,18 @@ def make(
         max_lag_s=settings.max_lag_s,
         lazy=True,
     )
-    return Rewinder(Bank(priors, initialiser, settings, seed, mounting), timeline, settings.late_s)
+    bank = Bank(priors, initialiser, settings, seed, mounting)
+    return Rewinder(bank, timeline, settings.late_s, redate=bank.clocks.redate)
+
+
+def _velocity_m_s(
+    dx_m: float, dy_m: float, turn_rad: float, duration_s: float
+) -> tuple[float, float]:
+    """Return the velocity, forward and left at its end, of a displacement given at its begin."""
+    if duration_s <= 0.0:
+        return 0.0, 0.0
+    c, s = math.cos(turn_rad) / duration_s, math.sin(turn_rad) / duration_s
+    return c * dx_m + s * dy_m, c * dy_m - s * dx_m
 
 
 def _vagueness(step: Advance) -> tuple[float, float] | None:

@@ -14,7 +14,7 @@ from relpos.fusion.bank import variance_components as components
 from relpos.fusion.bank.lanes import LANES
 from relpos.fusion.bank.mixture import PERTURBED_LOSS
 from relpos.fusion.bank.settings import BankSettings
-from relpos.fusion.bank.storage import PER_NODE, Hypotheses, StateIndex
+from relpos.fusion.bank.storage import COMMON, PER_NODE, CommonIndex, Hypotheses, StateIndex
 from relpos.fusion.bank.variance_components import Draws, VarianceComponents
 from relpos.fusion.models.motion_variances import COMPONENTS
 from relpos.fusion.resampling import systematic
@@ -25,6 +25,16 @@ Indices = npt.NDArray[np.int64]
 PAIR_BIASES = 6
 """Up to so many users each pair has a bias of its own in the state: 15 of them double its size.
 Of more, the common one is modelled."""
+
+SHADOW_SD_M, LATENESS_SD_S, CLOCK_SD_S = 0.3, 0.3, 0.3
+"""Prior standard deviations of what a body adds to a range, of how late ranges are dated, and of
+each clock's offset. Larger ones are learned, too (``mission-late-1``: 0.99 m without, 0.13 with)."""
+
+MODEL_RETURN_SHARE = 0.002
+"""Of the hypotheses without constants (or range biases), this share gets them back at each
+resampling: none may be left when they begin to matter. ``mission-split-hard`` 611: 2.49 m without,
+1.63 with; more than that costs where there are none (``paper-h``: 0.83 with it, 0.90 with ten times
+as much)."""
 
 RETURN_SHARE = 0.06
 """Of the hypotheses with low heading noise, this share returns to the usual noise at each
@@ -42,9 +52,10 @@ JITTER = 0.1
 class HypothesisSet:
     """K weighted hypotheses about N users, as arrays that kernels work on.
 
-    Users are *rows* 0 ... N-1 in the order of ``add_node``. The state has D = 5 N + 1 + pairs
-    entries: five a user (:class:`~relpos.fusion.bank.storage.StateIndex`), then the range bias that
-    all pairs share, then that of each pair when it is first ranged.
+    Users are *rows* 0 ... N-1 in the order of ``add_node``. The state has D = 6 N + 3 + pairs
+    entries: five a user (:class:`~relpos.fusion.bank.storage.StateIndex`), what ranges have in
+    common (:class:`~relpos.fusion.bank.storage.CommonIndex`), each user's clock offset, and the
+    range bias of each pair when it is first ranged.
     """
 
     def __init__(
@@ -57,7 +68,7 @@ class HypothesisSet:
         self.count = count
         """K, the number of hypotheses."""
         blocks = lanes.blocks_of(count)
-        x, p = storage.pack(np.zeros((count, 1)), np.zeros((count, 1, 1)), 0)
+        x, p = storage.pack(np.zeros((count, COMMON)), np.zeros((count, COMMON, COMMON)), 0)
         self.arrays = Hypotheses(
             x, p, np.zeros((blocks, LANES)), lanes.empty_lines(blocks, 0, COMPONENTS, 6),
             lanes.empty_lines(blocks, 0, COMPONENTS), lanes.empty_lines(blocks),
@@ -76,7 +87,7 @@ class HypothesisSet:
         """For so many instants of ranges a hypothesis teaches nothing about noise (K,)."""
         self.biases: dict[tuple[int, int], int] = {}
         """Pair of rows, the lower first -> entry of its range bias in the state."""
-        self.arrays.p[:, 0] = storage.lay_out(self.has_bias) * settings.bias_m**2
+        self._allow_common(np.arange(count))
         self.common: Floats = np.zeros((common_rotation.RIGID, common_rotation.RIGID))
         """Covariance of the rigid motion of the whole team that has been taken out."""
         self.spread_components()
@@ -223,9 +234,10 @@ class HypothesisSet:
         count, old = before.shape
         row = self.nodes
         at = PER_NODE * row
-        x = np.zeros((count, old + PER_NODE))
-        p = np.zeros((count, old + PER_NODE, old + PER_NODE))
-        keep = np.r_[0:at, at + PER_NODE : old + PER_NODE]
+        x = np.zeros((count, old + PER_NODE + 1))
+        p = np.zeros((count, old + PER_NODE + 1, old + PER_NODE + 1))
+        clock = at + COMMON + row
+        keep = np.delete(np.arange(old + PER_NODE + 1), [*range(at, at + PER_NODE), PER_NODE + clock])
         x[:, keep] = before
         p[np.ix_(np.arange(count), keep, keep)] = spread
         x[:, at : at + 3] = pose
@@ -240,8 +252,10 @@ class HypothesisSet:
         p[:, drift, drift] = self.has_constants * (1.0 - self.low_heading_noise) * s.drift_rad_s**2
         p[:, scale, scale] = self.has_constants * s.scale**2
         self.nodes += 1
+        clock = self.clock_entry(row)
+        p[:, clock, clock] = self.has_bias * CLOCK_SD_S**2
         self.store(x, p)
-        self.biases = {pair: place + PER_NODE for pair, place in self.biases.items()}
+        self.biases = {pair: place + PER_NODE + 1 for pair, place in self.biases.items()}
         self.components.add_node()
         drawn = self.rng.standard_normal((count, COMPONENTS))
         self._normals = np.concatenate([self._normals[:, :-1], drawn, self._normals[:, -1:]], 1)
@@ -293,6 +307,62 @@ class HypothesisSet:
             p[:, place, place] += 0.5 * moved_m**2
         self.store(x, p)
 
+    def common_entry(self, index: CommonIndex) -> int:
+        """Return the entry of the state that ranges have in common."""
+        return PER_NODE * self.nodes + index
+
+    def clock_entry(self, row: int) -> int:
+        """Return the entry of the state that holds a user's clock offset."""
+        return PER_NODE * self.nodes + COMMON + row
+
+    def clock_offsets(self, mean: Floats, covariance: Floats) -> tuple[Floats, Floats]:
+        """Return the users' clock offsets (N,) by the moments, and their deviations (s).
+
+        These are without what all offsets share: ranges say how clocks differ, and no more.
+        """
+        entries = PER_NODE * self.nodes + COMMON + np.arange(self.nodes)
+        shared = float(self.weights() @ self.has_bias) * CLOCK_SD_S**2 / max(self.nodes, 1)
+        return mean[entries], np.sqrt(np.maximum(covariance[entries, entries] - shared, 0.0))
+
+    def _allow_common(self, which: Indices) -> None:
+        """Let hypotheses ``which`` (M,) of those with biases have what ranges have in common."""
+        priors = {self.common_entry(CommonIndex.SHADOW): SHADOW_SD_M}
+        priors[self.common_entry(CommonIndex.LATENESS)] = LATENESS_SD_S
+        priors |= {self.clock_entry(row): CLOCK_SD_S for row in range(self.nodes)}
+        priors |= dict.fromkeys(self.biases.values(), self.settings.pair_bias_m)
+        block, lane = self._at(which)
+        p, has = self.arrays.p, self.has_bias[which]
+        for entry, sigma in priors.items():
+            p[block, storage.triangle_place(entry, entry), lane] = has * sigma**2
+        # The bias of a pair is the common one and its own part.
+        biased = [self.common_entry(CommonIndex.BIAS), *self.biases.values()]
+        for n, entry in enumerate(biased):
+            for other in biased[: n + 1]:
+                place = storage.triangle_place(entry, other)
+                p[block, place, lane] += has * self.settings.bias_m**2
+
+    def _return_to_models(self) -> None:
+        """Let a few hypotheses without constants, or without biases, have them again."""
+        s, p = self.settings, self.arrays.p
+        back = self.rng.random((2, self.count)) < MODEL_RETURN_SHARE
+        if 0.0 < s.constants and (back[0] > self.has_constants).any():
+            which = np.flatnonzero(back[0] > self.has_constants)
+            self.has_constants[which] = 1.0
+            block, lane = self._at(which)
+            for row in range(self.nodes):
+                drift, scale = self._place(row, StateIndex.DRIFT), self._place(row, StateIndex.SCALE)
+                drifts = (1.0 - self.low_heading_noise[which]) * s.drift_rad_s**2
+                p[block, storage.triangle_place(drift, drift), lane] = drifts
+                p[block, storage.triangle_place(scale, scale), lane] = s.scale**2
+        if 0.0 < s.biased and (back[1] > self.has_bias).any():
+            which = np.flatnonzero(back[1] > self.has_bias)
+            self.has_bias[which] = 1.0
+            self._allow_common(which)
+
+    def shift_common(self, entry: int, by: float) -> None:
+        """Add to an entry of what ranges have in common in every hypothesis that models it."""
+        self.arrays.x[:, entry] += by * storage.lay_out(self.has_bias > 0.0)
+
     def set_scale(self, row: int, scale: float) -> None:
         """Start a user's step scale (true over reported) where it is modelled."""
         scales = storage.lay_out(self.has_constants * math.log(scale))
@@ -306,7 +376,8 @@ class HypothesisSet:
         """
         if not self.has_bias.any():
             return np.full(len(first), -1, dtype=np.int64)
-        entries = np.full(len(first), PER_NODE * self.nodes, dtype=np.int64)
+        common = self.common_entry(CommonIndex.BIAS)
+        entries = np.full(len(first), common, dtype=np.int64)
         for r, (a, b) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
             pair = (a, b) if a < b else (b, a)
             entry = self.biases.get(pair)
@@ -318,7 +389,8 @@ class HypothesisSet:
 
     def _add_bias(self, pair: tuple[int, int]) -> int:
         x0, p0 = self.arrays.x, self.arrays.p
-        size, common, old = int(x0.shape[1]), PER_NODE * self.nodes, p0.shape[1]
+        size, old = int(x0.shape[1]), p0.shape[1]
+        common = self.common_entry(CommonIndex.BIAS)
         x = lanes.empty_lines(len(x0), size + 1)
         p = lanes.empty_lines(len(x0), old + size + 1)
         x[:, :size], x[:, size] = x0, x0[:, common]
@@ -346,6 +418,7 @@ class HypothesisSet:
         self._normals += JITTER * self.rng.standard_normal(self._normals.shape)
         if self.low_heading_noise.any():
             self.low_heading_noise *= self.rng.random(self.count) >= RETURN_SHARE
+        self._return_to_models()
         self._equalise()
         self._counters["resampled"] += 1
 

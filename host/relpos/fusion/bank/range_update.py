@@ -7,7 +7,16 @@ and across (c) the line of sight, the moments of rho^2 give, without any clamp,
     Var rho = a d^2/m^2 + (a^2 e^4 + c^2)/(2 m^2)
 
 which for c << d^2 is the second-order extended Kalman filter (d + c/2d, a + c^2/2d^2), and
-stays finite where two users meet. Reference implementation: :mod:`reference.joint`.
+stays finite where two users meet.
+
+What many ranges have in common enters to first order. With the direction u from the first to the
+second, the velocities v and the headings n (a body shadows who is behind it)
+
+    E rho = m + bias + shadow (max(-u n_i, 0) + max(u n_j, 0)) - lateness u (v_j - v_i)
+              - (clock_i - clock_j) u v_j
+
+as the first, whose clock dates the range, sees the second where it was when that clock was right.
+Reference implementation: :mod:`reference.joint`.
 """
 
 from __future__ import annotations
@@ -20,10 +29,12 @@ import numpy.typing as npt
 from relpos.fusion.bank import lanes
 from relpos.fusion.bank.lanes import Lanes, fill, greater, load, select, some, store
 from relpos.fusion.bank.storage import (
+    COMMON,
     PER_NODE,
     POSE,
     TINY,
     Block,
+    CommonIndex,
     Hypotheses,
     block_of,
     correct,
@@ -58,6 +69,8 @@ class Ranges(NamedTuple):
     it, the evidence multiplied."""
     bias: Indices
     """Entry of the state that holds the range's bias, or -1."""
+    velocity_m_s: Floats
+    """(R, 4): of the first, forward and left, and of the second; no motion is 0."""
 
 
 class RangeModel(NamedTuple):
@@ -209,20 +222,49 @@ def _share_inlier(innovation: Lanes, s: Lanes, outlier: Floats) -> tuple[Lanes, 
 
 
 @inner
-def _subtract_bias(
-    block: Block, e: int, m: Lanes, variance: Lanes, g: Floats
-) -> tuple[Lanes, Lanes]:
-    """Return a range's bias (entry ``e``) and what it adds to the innovation's variance.
+def _add_term(block: Block, e: int, slope: Lanes, g: Floats) -> tuple[Lanes, Lanes]:
+    """Return what entry ``e`` of the state adds to a range, and to the innovation's variance.
 
-    ``g`` becomes the gain with it. No range is negative: between two who stand together noise
-    alone looks like a bias, so there it is left out.
+    ``g`` becomes the gain with it.
     """
     x, p, at_x, base, active = block
-    seen = select(m * m > FAR * variance, fill(1.0), fill(0.0))
-    added = seen * (2.0 * load(g, e) + load(p, base + row_place(e) + e))
+    added = slope * (2.0 * load(g, e) + slope * load(p, base + row_place(e) + e))
     for q in range(active):
-        store(g, q, load(g, q) + seen * load(p, base + place(e, q)))
-    return seen * load(x, at_x + e), added
+        store(g, q, load(g, q) + slope * load(p, base + place(e, q)))
+    return slope * load(x, at_x + e), added
+
+
+@inner
+def _add_common(
+    block: Block, users: tuple[int, int, int], bias: int, velocity: Floats,
+    sight: tuple[Lanes, Lanes, Lanes], g: Floats,
+) -> tuple[Lanes, Lanes]:  # fmt: skip
+    """Return what bias, shadow, lateness and clocks add to a range and to its variance.
+
+    ``users`` are N and the two rows, ``velocity`` (4,) theirs as in :class:`Ranges`; ``sight`` is
+    the direction gx, gy and whether they are apart: no range is negative, so that between two who
+    stand together noise alone looks like a bias, and nothing is added there.
+    """
+    nodes, first, second = users
+    ux, uy, seen = sight
+    ux, uy = seen * ux, seen * uy
+    ci, si = lanes.cos_sin(load(block.x, block.at_x + POSE * first + 2))
+    cj, sj = lanes.cos_sin(load(block.x, block.at_x + POSE * second + 2))
+    nought = fill(0.0)
+    shadow = greater(nought - ux * ci - uy * si, nought) + greater(ux * cj + uy * sj, nought)
+    own = ux * (ci * velocity[0] - si * velocity[1]) + uy * (si * velocity[0] + ci * velocity[1])
+    peer = ux * (cj * velocity[2] - sj * velocity[3]) + uy * (sj * velocity[2] + cj * velocity[3])
+    common = PER_NODE * nodes
+    clocks = common + COMMON
+    length, variance = _add_term(block, bias, seen, g)
+    more, wider = _add_term(block, common + CommonIndex.SHADOW, shadow, g)
+    length, variance = length + more, variance + wider
+    more, wider = _add_term(block, common + CommonIndex.LATENESS, own - peer, g)
+    length, variance = length + more, variance + wider
+    more, wider = _add_term(block, clocks + first, nought - peer, g)
+    length, variance = length + more, variance + wider
+    more, wider = _add_term(block, clocks + second, peer, g)
+    return length + more, variance + wider
 
 
 @inner
@@ -252,8 +294,8 @@ def _carry_sensitivities(
 def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Floats) -> None:
     """Update with ranges (R,) one after another; each hypothesis' log weight gets their evidence.
 
-    Biases come last in the state, their common part first, and a hypothesis whose common part has
-    no variance has none. An innovation that may be an outlier's is used by its probability r of
+    What ranges have in common comes last in the state, its bias first, and a hypothesis whose bias
+    has no variance has none of it. An innovation that may be an outlier's is used by its probability r of
     being none (probabilistic data association): the mean moves by r K nu, the covariance keeps
     the spread between used and not used.
 
@@ -283,8 +325,12 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
                 v = v + (dz * dz * ranges.dz_variance_m2[r]) / (m * m)
             innovation = ranges.range_m[r] - m
             if biased and ranges.bias[r] >= 0:
-                bias, added = _subtract_bias(block, ranges.bias[r], m, variance, g)
-                innovation = innovation - bias
+                seen = select(m * m > FAR * variance, fill(1.0), fill(0.0))
+                length, added = _add_common(
+                    block, (nodes, first, second), ranges.bias[r], ranges.velocity_m_s[r],
+                    (gx, gy, seen), g,
+                )  # fmt: skip
+                innovation = innovation - length
                 v = v + added
             s = v + variance
             inlier, evidence = _share_inlier(innovation, s, model.outlier)

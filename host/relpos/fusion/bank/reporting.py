@@ -11,13 +11,15 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from statistics import median
 
 import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.bank import mixture as mixture_kernels
+from relpos.fusion.bank.clocks import Clocks
 from relpos.fusion.bank.core import BankCore
-from relpos.fusion.bank.storage import PER_NODE, StateIndex
+from relpos.fusion.bank.storage import PER_NODE, CommonIndex, StateIndex
 from relpos.fusion.estimator import (
     ANY_ANGLE_RAD,
     Alternative,
@@ -60,6 +62,8 @@ class Report:
     """What that adds to the covariance (D, D)."""
     initialiser: Initialiser
     detection: Detection
+    clocks: Clocks
+    """What of the time stamps has been put right, beside the state."""
 
     def estimate(self, north: MagneticNorth | None) -> Estimate:
         """Make the estimate."""
@@ -142,6 +146,7 @@ class Report:
             node, peer = sorted((named[a], named[b]))
             sigma = math.sqrt(max(variances[entry], 0.0))
             parameters.append(Parameter(time_s, node, peer, "range_bias_m", means[entry], sigma))
+        parameters += self._common_parameters()
         if self.detection.known:
             # One curve for the team; every node has it.
             curve = self.detection.range_m, self.detection.range_sigma_m
@@ -150,6 +155,30 @@ class Report:
                 for node in sorted(self.row)
             ]
         return tuple(parameters)
+
+    def _common_parameters(self) -> list[Parameter]:
+        """Return what ranges have in common; the team's figures stand beside every node."""
+        these, clocks, nodes = self.core.hypotheses, self.clocks, sorted(self.row)
+        if not these.has_bias.any():
+            return []
+
+        def learned(index: CommonIndex) -> tuple[float, float]:
+            entry = these.common_entry(index)
+            return float(self.mean[entry]), math.sqrt(max(float(self.covariance[entry, entry]), 0.0))
+
+        shadow, (lateness, sigma) = learned(CommonIndex.SHADOW), learned(CommonIndex.LATENESS)
+        offsets, sigmas = these.clock_offsets(self.mean, self.covariance)
+        offset = {n: offsets[self.row[n]] + clocks.offset_s.get(n, 0.0) for n in nodes}
+        # Ranges say how clocks differ, and most are right.
+        usual = median(offset.values())
+        rows = []
+        for node in nodes:
+            rows += [
+                (node, "body_shadow_m", *shadow),
+                (node, "range_lateness_s", lateness + clocks.lateness_s, sigma),
+                (node, "clock_offset_s", offset[node] - usual, float(sigmas[self.row[node]])),
+            ]
+        return [Parameter(self.time_s, node, None, *figures) for node, *figures in rows]
 
     def _pairs(self) -> list[PairEstimate]:
         nodes = sorted(self.row)

@@ -1,7 +1,8 @@
 """How the bank's hypotheses are stored: eight to a block, as kernels read and write them.
 
 One hypothesis is a mean (D,) and a covariance (D, D) over all users: five entries a user in the
-order of :class:`StateIndex`, then (where modelled) the range biases. ``x`` (B, D, LANES) and ``p``
+order of :class:`StateIndex`, then (where modelled) what many ranges have in common
+(:class:`CommonIndex`, and a clock offset a user), then the pairs' biases. ``x`` (B, D, LANES) and ``p``
 (B, D (D + 1) / 2, LANES) are B blocks of eight hypotheses (:mod:`relpos.fusion.bank.lanes`); of a
 covariance the lower triangle alone is stored, row by row. All users' poses (x, y, heading) come
 first, then all constants (drift, scale), then the biases, so that what a block does not model is
@@ -41,6 +42,19 @@ class StateIndex(IntEnum):
     SCALE = 4
 
 
+class CommonIndex(IntEnum):
+    """The team's entries after the users', before their clock offsets.
+
+    ``BIAS`` (m) lengthens every range, ``SHADOW`` (m) those that pass through a body, ``LATENESS``
+    (s) is by how much ranges are dated late.
+    """
+
+    BIAS = 0
+    SHADOW = 1
+    LATENESS = 2
+
+
+COMMON = len(CommonIndex)
 PER_NODE = len(StateIndex)
 POSE = 3
 """x, y and heading of a user are stored side by side."""

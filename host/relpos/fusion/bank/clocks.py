@@ -1,0 +1,60 @@
+"""What is learned of time stamps is put right where measurements come in.
+
+The bank learns by how much ranges are dated late, and each clock's offset, from how ranges change
+while people walk. That is linear for fractions of a second alone. So what it has learned goes, bit
+by bit, into the time stamps of all later measurements, and out of the state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from relpos.measurements import Measurement, Range
+
+SLEW = 0.1
+"""Seconds a second at most: consecutive reports of a node keep their order."""
+
+LEAST_S, LEAST_SIGMAS = 0.03, 3.0
+"""Smaller offsets, or less certain ones, stay in the state: a walker makes 3 cm in it."""
+
+
+@dataclass(slots=True)
+class Clocks:
+    """By how much time stamps are put right: seconds that are subtracted.
+
+    One object for the bank and its copies: what has been dated once is not dated again.
+    """
+
+    lateness_s: float = 0.0
+    offset_s: dict[int, float] = field(default_factory=dict)
+    """Node -> how far its clock is ahead."""
+
+    @property
+    def longest_s(self) -> float:
+        """The most by which a measurement is dated back."""
+        return max(self.lateness_s, 0.0) + max(self.offset_s.values(), default=0.0)
+
+    def redate(self, measurement: Measurement) -> Measurement:
+        """Return a measurement at its time by the team's clock."""
+        off_s = self.offset_s.get(measurement.node, 0.0)
+        if isinstance(measurement, Range):
+            off_s += self.lateness_s
+        return measurement if off_s == 0.0 else replace(measurement, time_s=measurement.time_s - off_s)
+
+    def slew(
+        self, duration_s: float, lateness: tuple[float, float], offsets: Mapping[int, tuple[float, float]]
+    ) -> None:
+        """Take over a part of what has been learned beside it: values and deviations (s)."""
+        self.lateness_s += _step(duration_s, *lateness)
+        for node, learned in offsets.items():
+            step_s = _step(duration_s, *learned)
+            if step_s != 0.0:
+                self.offset_s[node] = self.offset_s.get(node, 0.0) + step_s
+
+
+def _step(duration_s: float, value_s: float, sigma_s: float) -> float:
+    if abs(value_s) <= max(LEAST_S, LEAST_SIGMAS * sigma_s):
+        return 0.0
+    most_s = SLEW * duration_s
+    return min(max(value_s, -most_s), most_s)
