@@ -43,6 +43,10 @@ class JointEkf:
         self.noise = missions.MissionSettings()
 
     @property
+    def clocks(self) -> None:
+        """Nothing is learned of time stamps."""
+
+    @property
     def shared(self) -> tuple[object, ...]:
         """Nothing else refers to what it changes."""
         return (self.row,)

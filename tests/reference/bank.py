@@ -114,8 +114,8 @@ def update_cusum(
     return [0.0] * len(sums), base, row
 
 
-def pairs(mean: Floats, covariance: Floats, rows: list[int]) -> Floats:
-    """Distance, bearing and their deviations (P, 4) of every two users, by rotation."""
+def bearings(mean: Floats, covariance: Floats, rows: list[int]) -> Floats:
+    """Bearing and its deviation (P, 2) of every two users, by rotation."""
     result = []
     for n, a in enumerate(rows):
         for b in rows[n + 1 :]:
@@ -125,12 +125,19 @@ def pairs(mean: Floats, covariance: Floats, rows: list[int]) -> Floats:
             spread = own - covariance[i : i + 2, j : j + 2] - covariance[j : j + 2, i : i + 2]
             distance = float(np.hypot(*off))
             if distance == 0.0:
-                result.append((0.0, math.sqrt(0.5 * np.trace(spread)), 0.0, ANY_ANGLE_RAD))
+                result.append((0.0, ANY_ANGLE_RAD))
                 continue
-            along, aside = off / distance, np.array([-off[1], off[0]]) / distance
+            aside = np.array([-off[1], off[0]]) / distance
             bearing_sd = math.sqrt(aside @ spread @ aside) / distance
-            result.append((
-                distance, math.sqrt(along @ spread @ along),
-                math.atan2(off[1], off[0]), min(bearing_sd, ANY_ANGLE_RAD),
-            ))  # fmt: skip
-    return np.array(result).reshape(-1, 4)
+            result.append((math.atan2(off[1], off[0]), min(bearing_sd, ANY_ANGLE_RAD)))
+    return np.array(result).reshape(-1, 2)
+
+
+def rigid_motion(x: Floats, nodes: int, middle_m: Floats) -> Floats:
+    """G (D, 3): the change of a state (D,) with a small rigid motion about a point (2,)."""
+    g = np.zeros((x.size, 3))
+    for n in range(nodes):
+        at = PER_NODE * n
+        g[at : at + 3] = np.eye(3)
+        g[at : at + 2, 2] = middle_m[1] - x[at + 1], x[at] - middle_m[0]
+    return g

@@ -88,9 +88,16 @@ def update(
     dz: float,
     sigma2: float,
     outlier: tuple[float, float, float],
+    more: Floats | None = None,
 ) -> tuple[Floats, Floats, float]:
-    """One range; gives the state and the log evidence (without the constant 2 pi)."""
+    """One range; gives the state and the log evidence (without the constant 2 pi).
+
+    ``more`` (D,) is the slope of what is added to the distance.
+    """
     mean, variance, gain = predict_range(x, p, first, second, dz)
+    if more is not None:
+        mean, variance = mean + more @ x, variance + 2.0 * gain @ more + more @ p @ more
+        gain = gain + p @ more
     share, wide, short = outlier
     nu, s = measured - mean, variance + sigma2
     good = (1.0 - share) * np.exp(-0.5 * nu**2 / s) / np.sqrt(s)
@@ -102,6 +109,29 @@ def update(
     x = x + inlier * k * nu
     p = p - inlier * s * np.outer(k, k) + inlier * (1.0 - inlier) * nu**2 * np.outer(k, k)
     return x, p, float(np.log(good + bad))
+
+
+def common_terms(
+    x: Floats, p: Floats, nodes: int, first: int, second: int, velocity: Floats
+) -> Floats:
+    """Slope (D,) of bias, shadow, lateness and clocks, before the pairs' biases, of a range.
+
+    ``velocity`` (2, 2) is forward and left of the first and of the second.
+    """
+    i, j, common = PER_NODE * first, PER_NODE * second, PER_NODE * nodes
+    off = x[j : j + 2] - x[i : i + 2]
+    sight = off / predict_range(x, p, first, second, 0.0)[0]
+    ahead = [np.array([np.cos(h), np.sin(h)]) for h in (x[i + HEADING], x[j + HEADING])]
+    moving = [
+        v[0] * a + v[1] * np.array([-a[1], a[0]]) for v, a in zip(velocity, ahead, strict=True)
+    ]
+    slope = np.zeros(x.size)
+    slope[common] = 1.0
+    slope[common + 1] = max(-sight @ ahead[0], 0.0) + max(sight @ ahead[1], 0.0)
+    slope[common + 2] = -sight @ (moving[1] - moving[0])
+    slope[common + 3 + first] = -sight @ moving[1]
+    slope[common + 3 + second] = sight @ moving[1]
+    return slope
 
 
 def detection(

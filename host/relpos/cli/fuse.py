@@ -461,6 +461,7 @@ def _print_outcome(
     as_json: bool,
 ) -> None:
     from relpos.evaluation import summary
+    from relpos.fusion.estimator import time_offsets
 
     reckoned = baseline.metrics if baseline else None
     if as_json:
@@ -486,6 +487,8 @@ def _print_outcome(
         output.print_iso(evaluation.iso)
         if evaluation.bound is not None:
             output.print_bound(evaluation.bound)
+    for text in time_offsets(outcome.estimates[-1]) if outcome.estimates else ():
+        output.remark(f"{text}; this is taken into account")
     noted = {key: value for key, value in outcome.counters.items() if value}
     if noted:
         output.remark("counted: " + ", ".join(f"{k} {v:g}" for k, v in sorted(noted.items())))

@@ -165,14 +165,21 @@ class Estimate:
     north: MagneticNorth | None = None
 
     def pair_statuses(self) -> list[NodeStatus]:
-        """Return the status of every pair, in their order: the worse of its two nodes'."""
+        """Return the status of every pair, in their order.
+
+        It is the worse of its two nodes', and ``ambiguous`` at best where the distance is uncertain
+        by more than ``VAGUE_PAIR_M``: both may be well known relative to others.
+        """
         of = {node.node: node.status for node in self.nodes}
         order = list(NodeStatus)
         unknown = NodeStatus.UNLOCATED
-        return [
-            max((of.get(p.node, unknown), of.get(p.peer, unknown)), key=order.index)
-            for p in self.pairs
-        ]
+        statuses = []
+        for p in self.pairs:
+            vague = p.sigma_distance_m > VAGUE_PAIR_M
+            own = NodeStatus.AMBIGUOUS if vague else NodeStatus.OK
+            both = of.get(p.node, unknown), of.get(p.peer, unknown)
+            statuses.append(max((own, *both), key=order.index))
+        return statuses
 
 
 @runtime_checkable
@@ -192,12 +199,22 @@ class Estimator(Protocol):
 ANY_ANGLE_RAD = pi / sqrt(3.0)
 """Standard deviation of a heading or bearing of which nothing is known."""
 
+VAGUE_PAIR_M = 1.0
+"""Greatest standard deviation of the distance of a pair that is ``ok``: of those that are, an
+error of over 2 m is then one over two deviations (``mission-split``, seeds 600 and 601: 5.6 % of
+the ok pair-seconds without this, 0.1 % with it)."""
+
 MAX_ALTERNATIVES = 16
 """At most so many modes are listed (run format, ``alternatives.csv``)."""
 
 STALE_EPOCHS = 3
 LOST_EPOCHS = 10
 """Without news for so many epochs a node is ``stale``, then ``lost`` (run format, "Out")."""
+
+
+PLACING_RANGES = 3
+"""So many ranges place a node whose motion is missing: what it walks unseen begins at the oldest
+of them (``mission-gap-20``, 300 s: 0.76 m where it begins at the last report, 0.44 so)."""
 
 
 @dataclass(slots=True)
@@ -210,11 +227,18 @@ class Presence:
     silent_epochs: int = 0
     diffused_s: float = -inf
     """Until then it may have walked without a report, and its ranges have moved it."""
+    ranges_s: tuple[float, ...] = (-inf,) * PLACING_RANGES
+    """Times of its last ranges."""
 
     def received(self, time_s: float) -> None:
         """Note that the node reported motion up to ``time_s``."""
         if time_s > self.news_s:
             self.news_s = time_s
+
+    def ranged(self, time_s: float) -> None:
+        """Note that a range of the node was used."""
+        self.received(time_s)
+        self.ranges_s = (*self.ranges_s[1:], time_s)
 
     def close_epoch(self, epoch_s: float) -> None:
         """Count the epoch as silent where nothing came since the one before, at ``epoch_s``."""
@@ -229,7 +253,8 @@ class Presence:
         if not -inf < since_s < time_s:
             return 0.0
         self.diffused_s = time_s
-        return unseen_variance(time_s - reported_s) - unseen_variance(since_s - reported_s)
+        placed_s = max(reported_s, self.ranges_s[0])
+        return unseen_variance(time_s - placed_s) - unseen_variance(since_s - placed_s)
 
     def undiffused(self, time_s: float, duration_s: float) -> float:
         """Return the share of a displacement up to ``time_s`` that ranges have not made yet."""
@@ -243,6 +268,24 @@ class Presence:
         if self.silent_epochs >= LOST_EPOCHS:
             return NodeStatus.LOST
         return NodeStatus.STALE if self.silent_epochs >= STALE_EPOCHS else NodeStatus.OK
+
+
+TOLD_S = 0.1
+"""Time stamps that are off by less are nothing to tell: a walker makes 10 cm in it."""
+
+
+def time_offsets(estimate: Estimate) -> list[str]:
+    """Return what the user should know of time stamps that are off, a sentence each."""
+    told = []
+    for p in estimate.parameters:
+        if abs(p.value) < max(TOLD_S, 3.0 * p.sigma):
+            continue
+        way = ("late", "ahead") if p.value > 0.0 else ("early", "behind")
+        if p.name == "range_lateness_s":
+            told.append(f"ranges are dated {abs(p.value):.1f} s {way[0]}")
+        elif p.name == "clock_offset_s":
+            told.append(f"the clock of node {p.node} is {abs(p.value):.1f} s {way[1]}")
+    return list(dict.fromkeys(told))
 
 
 def unlocated(node: int, height_m: float = 0.0, sigma_height_m: float = 0.0) -> NodeEstimate:

@@ -26,12 +26,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import Protocol
 
+from relpos.fusion.clocks import Clocks
 from relpos.fusion.estimator import Estimate
 from relpos.fusion.timeline import Epoch, Step, Timeline, refusal
 from relpos.measurements import Measurement
@@ -50,6 +51,10 @@ class Core(Protocol):
     @property
     def shared(self) -> tuple[object, ...]:
         """Objects that the core never changes, so that its copies refer to the same ones."""
+
+    @property
+    def clocks(self) -> Clocks | None:
+        """What the core has learned of time stamps; None where it learns nothing of them."""
 
     def update(self, step: Step, timeline: Timeline) -> Estimate | None:
         """Process one step that ``timeline`` has released; an estimate at the end of an epoch."""
@@ -90,12 +95,10 @@ class Rewinder:
     spacing_s: float = 1.0
     every_s: float = 0.25
     most_s: float = 0.02
-    redate: Callable[[Measurement], Measurement] | None = None
-    """Puts a measurement's time stamp right, as far as the core has learned that it is wrong."""
     _own: Counter[str] = field(default_factory=Counter)
     _copies: list[_Copy] = field(default_factory=list)
     _history: list[Measurement] = field(default_factory=list)
-    """What came since the oldest copy, in the order of arrival."""
+    """What came since the oldest copy, in the order of arrival and by its own time stamps."""
     _forgotten: int = 0
     """Measurements before ``_history``."""
     _newest_s: float = -math.inf
@@ -115,11 +118,10 @@ class Rewinder:
         if reason is not None:
             self._own[reason] += 1
             return []
-        if self.redate is not None:
-            measurement = self.redate(measurement)
         if not self._copies:
             self._copy()
         self._history.append(measurement)
+        measurement = self._redated(measurement)
         news = measurement.time_s > self._newest_s
         if news:
             self._newest_s = measurement.time_s
@@ -153,6 +155,15 @@ class Rewinder:
         """Count everything refused, late or repeated, and what the core counts."""
         return self.timeline.counters + self._own + self.core.counters()
 
+    def _redated(self, measurement: Measurement) -> Measurement:
+        clocks = self.core.clocks
+        return measurement if clocks is None else clocks.redate(measurement)
+
+    def _hold(self, *, replaying: bool) -> None:
+        self._replaying = replaying
+        if self.core.clocks is not None:
+            self.core.clocks.held = replaying
+
     def _note_late(self) -> None:
         """Find out whether to go back, and to what time."""
         for late in self.timeline.late:
@@ -174,10 +185,11 @@ class Rewinder:
         self._own["rewinds"] += 1
         self.timeline = copy.timeline.snapshot()
         self.core = self._copy_of(copy.core)
-        since = self._history[copy.pushed - self._forgotten :]
+        # With the clocks of that time, which are held until all of this is worked off.
+        since = [self._redated(m) for m in self._history[copy.pushed - self._forgotten :]]
         steps = self.timeline.push_all(since, final=final)
         self.timeline.late.clear()  # behind the copy as well
-        self._replaying = True
+        self._hold(replaying=True)
         yield from self._work_off(steps, math.inf if final else self.most_s)
 
     def _work_off(self, steps: Iterator[Step], most_s: float | None = None) -> Iterator[Estimate]:
@@ -196,7 +208,8 @@ class Rewinder:
                 self._copy_if_due()
             if left_s < 0.0:
                 return
-        self._rest, self._replaying = None, False
+        self._rest = None
+        self._hold(replaying=False)
         # Without motion there are no epochs, but what is kept has to be bounded all the same.
         self._copy_if_due(overdue_s=self.spacing_s)
 

@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 
 from relpos.errors import RelposError
-from relpos.fusion.estimator import Estimate
+from relpos.fusion.estimator import Estimate, time_offsets
 from relpos.live.composer import Composer
 from relpos.live.fusion_thread import FusionThread
 from relpos.live.inputs import Input, Received
@@ -217,6 +217,8 @@ class LiveSession:
             self._composer.add_estimate(fused.estimate, fused.processed)
             self._feed(lambda sink, e=fused.estimate: sink.estimated(e))  # type: ignore[misc]
             self._source.learn(fused.estimate)
+            text = "; ".join(time_offsets(fused.estimate))
+            self._post("time-offsets", Level.WARNING, text or None)
             self._changed = True
 
     # -- alarms and notices -----------------------------------------------------------------------

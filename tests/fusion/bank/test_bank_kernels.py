@@ -85,7 +85,7 @@ def advanced(x: Floats, p: Floats, motion: Floats, component: Floats, drawn: Flo
 def updated(x: Floats, p: Floats, measured: float, dz: float, outlier: tuple[float, ...]) -> Floats:
     ranges = Ranges(
         np.array([0]), np.array([2]), np.array([measured]), np.array([dz]), np.zeros(1),
-        np.ones(1), np.array([-1]),
+        np.ones(1), np.array([-1]), np.zeros((1, 4)),
     )  # fmt: skip
     model = RangeModel(np.array([*outlier, 1.0, 9.0]), np.zeros((0, 2)))
     with Packed(x, p) as packed:
@@ -327,7 +327,7 @@ def test_variance_components_are_learned_from_innovations_and_their_uncertainty_
             measured = rng.normal() * np.sqrt((parts * np.exp(truth)).sum())
             ranges = Ranges(
                 np.array([0]), np.array([1]), np.array([measured]), np.zeros(1), np.zeros(1),
-                np.ones(1), np.array([-1]),
+                np.ones(1), np.array([-1]), np.zeros((1, 4)),
             )  # fmt: skip
             components.learn(known.mean, known.covariance, ranges, stats, np.zeros(1), np.ones(1))
         errors.append(known.mean - truth)
@@ -365,13 +365,13 @@ def test_the_nonlinearity_index_is_the_reference_implementation(nodes: int) -> N
 
 
 @pytest.mark.parametrize("on_one_spot", [False, True])
-def test_what_an_estimate_says_of_pairs_is_the_reference_implementation(on_one_spot: bool) -> None:
+def test_the_bearings_of_pairs_are_the_reference_implementation(on_one_spot: bool) -> None:
     x, p = states(1, 8)
     if on_one_spot:
         x[0, 5:7] = x[0, 0:2]
     rows = list(range(NODES))
-    got = mixture.pairs(x[0], p[0], np.array(rows))
-    assert got == pytest.approx(small.pairs(x[0], p[0], rows), rel=1e-9, abs=1e-12)
+    got = mixture.bearings(x[0], p[0], np.array(rows))
+    assert got == pytest.approx(small.bearings(x[0], p[0], rows), rel=1e-9, abs=1e-12)
 
 
 def test_cumulative_sums_are_the_reference_implementation_until_and_after_an_alarm() -> None:

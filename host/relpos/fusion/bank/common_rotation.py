@@ -38,7 +38,7 @@ LEFT = 1e-4, 1e-5
 """Variances (m^2, rad^2) of it that are left: the rest of a covariance keeps an inverse."""
 
 KNOWN = 1e-9, 1e-12
-"""Share of variances, and m^2 or rad^2, added to them: what is known exactly has an inverse, too."""
+"""Share of variances, and m^2 or rad^2, added to them: what is known exactly has an inverse."""
 
 
 def rigid_motion(x_m: Floats, y_m: Floats) -> Floats:
@@ -61,7 +61,7 @@ def estimate(mean: Floats, covariance: Floats, nodes: int) -> tuple[Floats, Floa
     own = covariance[np.ix_(poses, poses)]
     solved = np.linalg.solve(own + np.diag(KNOWN[0] * own.diagonal() + KNOWN[1]), g)
     s = np.linalg.inv(g.T @ solved)
-    return s @ solved.T, s
+    return np.asarray(s @ solved.T, np.float64), np.asarray(s, np.float64)
 
 
 def about_origin(s: Floats, x_m: float, y_m: float) -> Floats:
@@ -216,7 +216,7 @@ def take_out(hypotheses: Hypotheses, middle_m: Floats, taken: Floats) -> None:
 
 @compiled
 def put_back(hypotheses: Hypotheses, common: Floats) -> None:
-    """Add G S G^T to every covariance; ``common`` (6,) is S about the origin, as in ``take_out``."""
+    """Add G S G^T to every covariance; ``common`` (6,) is S about the origin (``take_out``)."""
     x, p = hypotheses.x, hypotheses.p
     nodes = hypotheses.sensitivity.shape[1]
     g, s = lanes.working_lines(RIGID * POSE * nodes), lanes.working_lines(6)

@@ -17,12 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import RelposError
-from relpos.fusion.bank.clocks import Clocks
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.detection_update import Attempts
 from relpos.fusion.bank.reporting import Report
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import PER_NODE, CommonIndex, StateIndex
+from relpos.fusion.clocks import Clocks
 from relpos.fusion.estimator import Estimate, Presence, refuse_unmoved, refuse_unranged
 from relpos.fusion.initial_poses import (
     HEADING_RESOLVED_RAD,
@@ -78,8 +78,6 @@ class Bank:
     zero_motion: ZeroMotionDetector = field(default_factory=ZeroMotionDetector)
     north: North = field(default_factory=North)
     clocks: Clocks = field(default_factory=Clocks)
-    _dated: Clocks = field(default_factory=Clocks)
-    """What of ``clocks`` the state knows; another, where it is a copy from before."""
     _velocity_m_s: dict[int, tuple[float, float]] = field(default_factory=dict)
     """Node -> velocity forward and left, by its newest displacement."""
     _row: dict[int, int] = field(default_factory=dict)
@@ -112,7 +110,7 @@ class Bank:
     @property
     def shared(self) -> tuple[object, ...]:
         """Objects that copies of the core refer to (:class:`~relpos.fusion.rewind.Core`)."""
-        return self.priors, self.settings, self.mounting, self.clocks
+        return self.priors, self.settings, self.mounting
 
     def check_run(self, counters: Mapping[str, int]) -> None:
         """Raise RelposError if the run cannot give relative positions."""
@@ -232,7 +230,7 @@ class Bank:
         ends = nodes_of(step.ranges)
         self._diffuse(ends, time_s, timeline)
         for node in ends:
-            self._meet(node).received(time_s)
+            self._meet(node).ranged(time_s)
         ranges: Sequence[Range] = step.ranges
         if not ends <= located.keys():
             for node in sorted(ends - located.keys()):
@@ -254,7 +252,9 @@ class Bank:
                 [known[a].sigma_height_m ** 2 + known[b].sigma_height_m ** 2 for a, b in pairs]
             )
             counts = self.range_correlation.effective_counts(pairs)
-            velocity = [self._velocity_at(a, time_s) + self._velocity_at(b, time_s) for a, b in pairs]
+            velocity = [
+                self._velocity_at(a, time_s) + self._velocity_at(b, time_s) for a, b in pairs
+            ]
             self.core.update(first, second, measured, dz, variance, counts, np.array(velocity))
             self._ranges_used += len(ranges)
         for attempts in rounds:
@@ -398,7 +398,6 @@ class Bank:
             self._counters["headings_doubted"] += 1
 
     def _estimate(self, time_s: float, timeline: Timeline) -> Estimate:
-        self._know_clocks()
         for known in self._known.values():
             known.close_epoch(self._epoch_s)
         since_s, self._epoch_s = self._epoch_s, time_s
@@ -406,25 +405,12 @@ class Bank:
         self.core.relocalisation.end_ambiguity(covariance)
         report = Report(
             time_s, self._row, self._known, self.core, mean, covariance, common,
-            self.initialiser, self.detection, self._dated,
+            self.initialiser, self.detection, self.clocks,
         )  # fmt: skip
         estimate = report.estimate(self.north.known())
         if since_s > -math.inf:
             self._slew_clocks(time_s - since_s, mean, covariance, timeline)
         return estimate
-
-    def _know_clocks(self) -> None:
-        """Take out of the state what ``clocks`` has put right since."""
-        these, known, now = self.core.hypotheses, self._dated, self.clocks
-        if known == now:
-            return
-        lateness = these.common_entry(CommonIndex.LATENESS)
-        these.shift_common(lateness, known.lateness_s - now.lateness_s)
-        known.lateness_s = now.lateness_s
-        for node, row in self._row.items():
-            before_s, now_s = known.offset_s.get(node, 0.0), now.offset_s.get(node, 0.0)
-            these.shift_common(these.clock_entry(row), before_s - now_s)
-            known.offset_s[node] = now_s
 
     def _slew_clocks(
         self, duration_s: float, mean: Floats, covariance: Floats, timeline: Timeline
@@ -436,10 +422,12 @@ class Bank:
         offset_s, sigmas_s = these.clock_offsets(mean, covariance)
         usual_s = float(np.median(offset_s)) if rows else 0.0
         offsets = {n: (offset_s[row] - usual_s, sigmas_s[row]) for n, row in rows.items()}
-        self.clocks.slew(duration_s, (float(mean[lateness]), sigma_s), offsets)
+        late_s, steps = self.clocks.slew(duration_s, (float(mean[lateness]), sigma_s), offsets)
+        these.shift_common(lateness, -late_s)
+        for node, step_s in steps.items():
+            these.shift_common(these.clock_entry(rows[node]), -step_s)
         # Otherwise whatever is dated back would come late.
         timeline.reorder_s = self.settings.reorder_s + self.clocks.longest_s
-        self._know_clocks()
 
 
 def make(
@@ -456,8 +444,7 @@ def make(
         max_lag_s=settings.max_lag_s,
         lazy=True,
     )
-    bank = Bank(priors, initialiser, settings, seed, mounting)
-    return Rewinder(bank, timeline, settings.late_s, redate=bank.clocks.redate)
+    return Rewinder(Bank(priors, initialiser, settings, seed, mounting), timeline, settings.late_s)
 
 
 def _velocity_m_s(

@@ -28,7 +28,7 @@ Of more, the common one is modelled."""
 
 SHADOW_SD_M, LATENESS_SD_S, CLOCK_SD_S = 0.3, 0.3, 0.3
 """Prior standard deviations of what a body adds to a range, of how late ranges are dated, and of
-each clock's offset. Larger ones are learned, too (``mission-late-1``: 0.99 m without, 0.13 with)."""
+each clock's offset. Larger ones are learned, too (``mission-late-1``: 0.99 m without, 0.13 so)."""
 
 MODEL_RETURN_SHARE = 0.002
 """Of the hypotheses without constants (or range biases), this share gets them back at each
@@ -179,6 +179,8 @@ class HypothesisSet:
     def take_out_common_rotation(self) -> tuple[Floats, Floats]:
         """Take the team's rigid motion out where it is large; return the poses' moments."""
         mean, covariance = self.moments(poses_alone=True)
+        if self.nodes < 2:
+            return mean, covariance
         gain, known = common_rotation.estimate(mean, covariance, self.nodes)
         if known[2, 2] < common_rotation.LEAST_RAD**2:
             return mean, covariance
@@ -237,7 +239,9 @@ class HypothesisSet:
         x = np.zeros((count, old + PER_NODE + 1))
         p = np.zeros((count, old + PER_NODE + 1, old + PER_NODE + 1))
         clock = at + COMMON + row
-        keep = np.delete(np.arange(old + PER_NODE + 1), [*range(at, at + PER_NODE), PER_NODE + clock])
+        keep = np.delete(
+            np.arange(old + PER_NODE + 1), [*range(at, at + PER_NODE), PER_NODE + clock]
+        )
         x[:, keep] = before
         p[np.ix_(np.arange(count), keep, keep)] = spread
         x[:, at : at + 3] = pose
@@ -345,23 +349,26 @@ class HypothesisSet:
         """Let a few hypotheses without constants, or without biases, have them again."""
         s, p = self.settings, self.arrays.p
         back = self.rng.random((2, self.count)) < MODEL_RETURN_SHARE
-        if 0.0 < s.constants and (back[0] > self.has_constants).any():
+        if s.constants > 0.0 and (back[0] > self.has_constants).any():
             which = np.flatnonzero(back[0] > self.has_constants)
             self.has_constants[which] = 1.0
             block, lane = self._at(which)
             for row in range(self.nodes):
-                drift, scale = self._place(row, StateIndex.DRIFT), self._place(row, StateIndex.SCALE)
+                drift, scale = (
+                    self._place(row, StateIndex.DRIFT),
+                    self._place(row, StateIndex.SCALE),
+                )
                 drifts = (1.0 - self.low_heading_noise[which]) * s.drift_rad_s**2
                 p[block, storage.triangle_place(drift, drift), lane] = drifts
                 p[block, storage.triangle_place(scale, scale), lane] = s.scale**2
-        if 0.0 < s.biased and (back[1] > self.has_bias).any():
+        if s.biased > 0.0 and (back[1] > self.has_bias).any():
             which = np.flatnonzero(back[1] > self.has_bias)
             self.has_bias[which] = 1.0
             self._allow_common(which)
 
     def shift_common(self, entry: int, by: float) -> None:
         """Add to an entry of what ranges have in common in every hypothesis that models it."""
-        self.arrays.x[:, entry] += by * storage.lay_out(self.has_bias > 0.0)
+        self.arrays.x[:, entry] += by * storage.lay_out((self.has_bias > 0.0).astype(np.float64))
 
     def set_scale(self, row: int, scale: float) -> None:
         """Start a user's step scale (true over reported) where it is modelled."""

@@ -295,9 +295,9 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
     """Update with ranges (R,) one after another; each hypothesis' log weight gets their evidence.
 
     What ranges have in common comes last in the state, its bias first, and a hypothesis whose bias
-    has no variance has none of it. An innovation that may be an outlier's is used by its probability r of
-    being none (probabilistic data association): the mean moves by r K nu, the covariance keeps
-    the spread between used and not used.
+    has no variance has none of it. An innovation that may be an outlier's is used by its
+    probability r of being none (probabilistic data association): the mean moves by r K nu, the
+    covariance keeps the spread between used and not used.
 
     ``stats`` (R, STATS, B, LANES) receives m, S, the range's log evidence, r, and by how much S
     grows with the logarithms of the three variance components of the first and of the second user

@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.bank import mixture as mixture_kernels
-from relpos.fusion.bank.clocks import Clocks
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.storage import PER_NODE, CommonIndex, StateIndex
+from relpos.fusion.clocks import Clocks
 from relpos.fusion.estimator import (
     ANY_ANGLE_RAD,
     Alternative,
@@ -164,7 +164,9 @@ class Report:
 
         def learned(index: CommonIndex) -> tuple[float, float]:
             entry = these.common_entry(index)
-            return float(self.mean[entry]), math.sqrt(max(float(self.covariance[entry, entry]), 0.0))
+            return float(self.mean[entry]), math.sqrt(
+                max(float(self.covariance[entry, entry]), 0.0)
+            )
 
         shadow, (lateness, sigma) = learned(CommonIndex.SHADOW), learned(CommonIndex.LATENESS)
         offsets, sigmas = these.clock_offsets(self.mean, self.covariance)
@@ -186,7 +188,8 @@ class Report:
         bearings = mixture_kernels.bearings(self.mean, self.covariance + self.common, rows)
         first, second = (rows[k] for k in np.triu_indices(len(rows), 1))
         distances = self.core.predicted_ranges(first, second, np.zeros(len(first)))
-        figures = np.column_stack([*distances, bearings]).tolist()
+        # Two on one spot, known exactly, are 0 m apart, whatever was added to divide by.
+        figures = np.column_stack([*np.round(distances, 9), bearings]).tolist()
         every = combinations(nodes, 2)
         return [PairEstimate(*two, *own) for two, own in zip(every, figures, strict=True)]
 

@@ -2,9 +2,9 @@
 
 One hypothesis is a mean (D,) and a covariance (D, D) over all users: five entries a user in the
 order of :class:`StateIndex`, then (where modelled) what many ranges have in common
-(:class:`CommonIndex`, and a clock offset a user), then the pairs' biases. ``x`` (B, D, LANES) and ``p``
-(B, D (D + 1) / 2, LANES) are B blocks of eight hypotheses (:mod:`relpos.fusion.bank.lanes`); of a
-covariance the lower triangle alone is stored, row by row. All users' poses (x, y, heading) come
+(:class:`CommonIndex`, and a clock offset a user), then the pairs' biases. ``x`` (B, D, LANES) and
+``p`` (B, D (D + 1) / 2, LANES) are B blocks of eight hypotheses (:mod:`.lanes`); of a covariance
+the lower triangle alone is stored, row by row. All users' poses (x, y, heading) come
 first, then all constants (drift, scale), then the biases, so that what a block does not model is
 at its end. :func:`pack` and :func:`unpack` convert.
 """

@@ -147,6 +147,10 @@ class LargeTeam:
         self._add([p.node for p in known], poses, sigmas[:, :, None] ** 2 * np.eye(3))
 
     @property
+    def clocks(self) -> None:
+        """Nothing is learned of time stamps."""
+
+    @property
     def shared(self) -> tuple[object, ...]:
         """Objects that copies of the core refer to (:class:`~relpos.fusion.rewind.Core`)."""
         return self.priors, self.settings, self.mountings
@@ -257,7 +261,7 @@ class LargeTeam:
         ends = nodes_of(step.ranges)
         self._diffuse(ends, step.time_s, timeline)
         for node in ends:
-            self._presence(node).received(step.time_s)
+            self._presence(node).ranged(step.time_s)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
         if located:
             self._update(located)

@@ -1,8 +1,8 @@
-"""What is learned of time stamps is put right where measurements come in.
+"""Time stamps are put right where measurements come in, as far as they are known to be off.
 
-The bank learns by how much ranges are dated late, and each clock's offset, from how ranges change
+A filter learns by how much ranges are dated late, and each clock's offset, from how ranges change
 while people walk. That is linear for fractions of a second alone. So what it has learned goes, bit
-by bit, into the time stamps of all later measurements, and out of the state.
+by bit, into the time stamps of all later measurements, and out of its state.
 """
 
 from __future__ import annotations
@@ -15,20 +15,19 @@ from relpos.measurements import Measurement, Range
 SLEW = 0.1
 """Seconds a second at most: consecutive reports of a node keep their order."""
 
-LEAST_S, LEAST_SIGMAS = 0.03, 3.0
-"""Smaller offsets, or less certain ones, stay in the state: a walker makes 3 cm in it."""
+LEAST_S, LEAST_SIGMAS = 0.1, 3.0
+"""Smaller offsets, or less certain ones, stay in the state: a walker makes 10 cm in it."""
 
 
 @dataclass(slots=True)
 class Clocks:
-    """By how much time stamps are put right: seconds that are subtracted.
-
-    One object for the bank and its copies: what has been dated once is not dated again.
-    """
+    """By how much time stamps are put right: seconds that are subtracted."""
 
     lateness_s: float = 0.0
     offset_s: dict[int, float] = field(default_factory=dict)
     """Node -> how far its clock is ahead."""
+    held: bool = False
+    """While measurements are repeated that have been dated already."""
 
     @property
     def longest_s(self) -> float:
@@ -40,17 +39,29 @@ class Clocks:
         off_s = self.offset_s.get(measurement.node, 0.0)
         if isinstance(measurement, Range):
             off_s += self.lateness_s
-        return measurement if off_s == 0.0 else replace(measurement, time_s=measurement.time_s - off_s)
+        return (
+            measurement if off_s == 0.0 else replace(measurement, time_s=measurement.time_s - off_s)
+        )
 
     def slew(
-        self, duration_s: float, lateness: tuple[float, float], offsets: Mapping[int, tuple[float, float]]
-    ) -> None:
-        """Take over a part of what has been learned beside it: values and deviations (s)."""
-        self.lateness_s += _step(duration_s, *lateness)
-        for node, learned in offsets.items():
-            step_s = _step(duration_s, *learned)
+        self,
+        duration_s: float,
+        lateness: tuple[float, float],
+        offsets: Mapping[int, tuple[float, float]],
+    ) -> tuple[float, dict[int, float]]:
+        """Take over a part of what has been learned beside it: values and deviations (s).
+
+        Returns these parts (s): of the lateness, and node -> of its clock's offset.
+        """
+        if self.held:
+            return 0.0, {}
+        late_s = _step(duration_s, *lateness)
+        steps = {node: _step(duration_s, *learned) for node, learned in offsets.items()}
+        self.lateness_s += late_s
+        for node, step_s in steps.items():
             if step_s != 0.0:
                 self.offset_s[node] = self.offset_s.get(node, 0.0) + step_s
+        return late_s, steps
 
 
 def _step(duration_s: float, value_s: float, sigma_s: float) -> float:

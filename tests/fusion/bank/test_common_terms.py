@@ -1,0 +1,136 @@
+"""What ranges have in common: bias, body shadow, lateness and clocks."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import relpos
+from reference import joint as reference
+from relpos.fusion.bank.core import BankCore
+from relpos.fusion.bank.settings import BankSettings
+from relpos.fusion.bank.storage import COMMON, PER_NODE, CommonIndex
+from relpos.fusion.clocks import LEAST_S, SLEW, Clocks
+from relpos.fusion.estimator import Estimate, Parameter, time_offsets
+from relpos.measurements import Motion, Range
+
+NODES = 3
+
+
+def last_parameters(
+    scenario: str, seed: int, **settings: float
+) -> dict[tuple[str, int], Parameter]:
+    run = relpos.simulate(scenario, seed, **settings)
+    result = relpos.fuse(run)
+    return {(p.name, p.node): p for p in result.estimates[-1].parameters if p.peer is None}
+
+
+def test_a_range_with_all_terms_is_the_reference_implementation() -> None:
+    settings = BankSettings(hypotheses=8, wrong_starts=0.0, biased=1.0, constants=0.0, outliers=0.0)
+    core = BankCore(settings, 3)
+    for n in range(NODES):
+        core.add_node((3.0 * n, 4.0 * n * n, 0.5 * n), 0.3, 0.1)
+    these = core.hypotheses
+    pair = np.array([0]), np.array([2])
+    entry = int(these.bias_entries(*pair)[0])
+    x, p = these.dense()
+    common = PER_NODE * NODES
+    x[:, common:] = np.random.default_rng(1).normal(size=(8, x.shape[1] - common)) * 0.1
+    these.store(x, p)
+    sigma2 = these.arrays.range_variance.ravel()[:8].copy()
+    velocity = np.array([[1.2, 0.1], [0.7, -0.2]])
+    slope = reference.common_terms(x[0], p[0], NODES, 0, 2, velocity)
+    slope[entry], slope[common] = slope[common], 0.0
+    assert (slope[common:] != 0.0).sum() >= 4
+    core.update(*pair, np.array([17.5]), np.zeros(1), None, None, velocity.reshape(1, 4))
+    after = these.dense()
+    share = core._sensors.model.outlier
+    for k in range(8):
+        slope_k = reference.common_terms(x[k], p[k], NODES, 0, 2, velocity)
+        slope_k[entry], slope_k[common] = 1.0, 0.0
+        outlier = float(share[0]), float(share[1]), float(share[2])
+        expected = reference.update(x[k], p[k], 0, 2, 17.5, 0.0, sigma2[k], outlier, slope_k)
+        assert after[0][k] == pytest.approx(expected[0], abs=1e-3)
+        assert after[1][k] == pytest.approx(expected[1], abs=1e-3)
+
+
+def test_a_new_node_and_a_new_pair_keep_what_is_known_of_the_others() -> None:
+    core = BankCore(BankSettings(hypotheses=8, biased=1.0), 3)
+    for n in range(2):
+        core.add_node((3.0 * n, 0.0, 0.0), 0.1, 0.1)
+    these = core.hypotheses
+    these.bias_entries(np.array([0]), np.array([1]))
+    x, p = these.dense()
+    x[:, PER_NODE * 2 :] = np.arange(x.shape[1] - PER_NODE * 2)
+    these.store(x, p)
+    core.add_node((9.0, 0.0, 0.0), 0.1, 0.1)
+    x, _ = these.dense()
+    assert x[0, PER_NODE * 3 : PER_NODE * 3 + COMMON].tolist() == [0.0, 1.0, 2.0]
+    assert [x[0, these.clock_entry(row)] for row in range(3)] == [3.0, 4.0, 0.0]
+    assert x[0, these.biases[0, 1]] == 5.0
+
+
+@pytest.mark.parametrize(
+    ("condition", "name", "node", "value"),
+    [
+        ("late-0.3", "range_lateness_s", 1, 0.3),
+        ("late-1", "range_lateness_s", 3, 1.0),
+        ("clock", "clock_offset_s", 2, 1.0),
+        ("shadow", "body_shadow_m", 1, 0.4),
+    ],
+)
+def test_what_ranges_have_in_common_is_learned_within_a_tenth(
+    condition: str, name: str, node: int, value: float
+) -> None:
+    run = relpos.simulate(f"mission-{condition}", 73, seconds=300)
+    result = relpos.fuse(run)
+    learned = {(p.name, p.node): p.value for p in result.estimates[-1].parameters}
+    assert learned[name, node] == pytest.approx(value, rel=0.1)
+    metrics = relpos.evaluate(result, run, bound=False).metrics
+    assert metrics.relative_distance_rmse_m < 0.22
+
+
+def test_where_nothing_is_off_nothing_is_learned_and_nothing_told() -> None:
+    learned = last_parameters("mission-base", 74, seconds=200)
+    for (name, _), p in learned.items():
+        if name in ("range_lateness_s", "clock_offset_s", "body_shadow_m"):
+            assert abs(p.value) < 0.06
+    told = Estimate(0.0, (), (), parameters=tuple(learned.values()))
+    assert time_offsets(told) == []
+
+
+def test_time_offsets_are_told_once_in_a_sentence_each() -> None:
+    late = [Parameter(9.0, n, None, "range_lateness_s", 0.32, 0.01) for n in (1, 2)]
+    clocks = [
+        Parameter(9.0, 1, None, "clock_offset_s", 0.02, 0.01),
+        Parameter(9.0, 2, None, "clock_offset_s", 1.01, 0.01),
+        Parameter(9.0, 3, None, "clock_offset_s", -0.5, 0.3),
+    ]
+    assert time_offsets(Estimate(9.0, (), (), parameters=(*late, *clocks))) == [
+        "ranges are dated 0.3 s late",
+        "the clock of node 2 is 1.0 s ahead",
+    ]
+
+
+def test_time_stamps_are_put_right_bit_by_bit_and_only_by_what_is_certain() -> None:
+    clocks = Clocks()
+    motion = Motion(10.0, 2, 1.0, 0.0, 0.0)
+    clocks.slew(1.0, (0.5 * LEAST_S, 0.0), {2: (0.3, 0.2)})
+    assert clocks.redate(motion) is motion
+    for _ in range(3):
+        clocks.slew(1.0, (0.4, 0.01), {2: (1.0, 0.01)})
+    assert clocks.redate(motion).time_s == pytest.approx(10.0 - 3 * SLEW)
+    measured = Range(10.0, 2, 1, 4.0)
+    assert clocks.redate(measured).time_s == pytest.approx(10.0 - 6 * SLEW)
+    assert dataclasses.replace(clocks.redate(measured), time_s=10.0) == measured
+    assert clocks.longest_s == pytest.approx(6 * SLEW)
+
+
+def test_the_shared_entries_are_named_in_their_order() -> None:
+    core = BankCore(BankSettings(hypotheses=8), 3)
+    core.add_node((0.0, 0.0, 0.0), 0.1, 0.1)
+    these = core.hypotheses
+    assert [these.common_entry(index) for index in CommonIndex] == [5, 6, 7]
+    assert these.clock_entry(0) == 8
