@@ -147,13 +147,14 @@ def test_a_heading_that_slips_is_found_again_within_twenty_seconds(seed: int) ->
     assert np.median(before) < 0.6
     assert np.median(after) < 1.0
     # Hypotheses that took the slip for a turn may find the heading before any alarm.
+    slips = bank.counters().get("slips", 0)
     doubted = [
         e.time_s
         for e in estimates
         for n in e.nodes
         if n.node == 3 and n.status is NodeStatus.AMBIGUOUS
     ]
-    assert bool(doubted) == (bank.counters().get("slips", 0) > 0)
+    assert doubted or not slips
 
 
 @pytest.mark.parametrize("seed", [2, 4])

@@ -159,7 +159,7 @@ class Report:
     def _common_parameters(self) -> list[Parameter]:
         """Return what ranges have in common; the team's figures stand beside every node."""
         these, clocks, nodes = self.core.hypotheses, self.clocks, sorted(self.row)
-        if not these.has_bias.any():
+        if not nodes or not these.has_bias.any():
             return []
 
         def learned(index: CommonIndex) -> tuple[float, float]:
