@@ -305,3 +305,12 @@ def test_a_node_that_does_not_answer_a_host_of_1970_is_no_wrong_key(monkeypatch)
     link = serial_port.Link(counter=HostCounter(lambda: 86_400.0))
     with pytest.raises(DeviceError, match="clock says 1970-01-02"):
         NodeDialogue(Silent(), 1, link).command(wire.CommandCode.PING, 0)
+
+
+def test_a_node_under_another_key_is_told_though_others_are_heard():
+    decoder = Decoder((KEY,))
+    for n in range(20):
+        decoder.feed(motion(n, 1.0 + n, key=KEY), 1.0 + n)
+        decoder.feed(motion(n, 1.0 + n, node=2), 1.0 + n)
+    (remark,) = decoder.remarks
+    assert "another key" in remark

@@ -158,7 +158,7 @@ def test_a_node_too_many_is_reported_once():
 
 
 @pytest.mark.parametrize("command", ["fuse", "monitor"])
-def test_a_command_that_listens_sends_beacons_to_the_nodes_it_receives(command):
+def test_a_command_that_listens_sends_beacons_to_the_nodes_it_receives(command, capsys):
     master, slave = pty.openpty()
     tty.setraw(slave)
     os.set_blocking(master, False)
@@ -178,3 +178,5 @@ def test_a_command_that_listens_sends_beacons_to_the_nodes_it_receives(command):
         os.close(master)
         os.close(slave)
     assert ids(wire.decode(request.data).values) == [3]
+    if command == "monitor":
+        assert "no team key" in capsys.readouterr().err

@@ -5,17 +5,21 @@ import math
 import threading
 
 import pytest
-from team_input import TeamInput, make_session, run_through
+from team_input import Album, TeamInput, make_session, run_through
 
 from relpos import fusion
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.fusion.linear_algebra import one_thread
+from relpos.link.authentication import KEYLESS
 from relpos.link.port import Link
+from relpos.live.assembly import SessionPlan, run_session
 from relpos.live.inputs import PacedInput, Received
 from relpos.live.requests import Request
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert
 from relpos.measurements import Event, Heading, Height, Motion, Range
+from relpos.protocol import messages as wire
+from relpos.runs import Description
 
 
 def deadreckoning(priors):
@@ -354,3 +358,20 @@ def test_nodes_received_first_share_one_start_with_a_common_start():
         run_through(session)
     assert [prior.node for prior in given] == [1, 2, 3]
     assert album.estimates
+
+
+@pytest.mark.parametrize("keyless", [True, False])
+def test_a_session_without_a_team_key_says_so_until_its_end(tmp_path, keyless):
+    key = wire.DEFAULT_KEY if keyless else bytes(range(16))
+    album, remarks = Album(), []
+    with EmulatedTeam(TeamConfig("straight", 2, 8.0, 3, beacons=True, key=key)) as team:
+        source = TeamInput(team)
+        source.link = Link(key=key)
+        plan = SessionPlan(
+            "walk", tmp_path, Description(), deadreckoning, "deadreckoning", priors=team.priors()
+        )
+        run_session(source, plan, [lambda _: album], remark=remarks.append)
+    assert remarks.count(KEYLESS) == keyless
+    assert {n.text for n in album.views[-1].notices if n.id == "no-key"} == {KEYLESS} & {
+        KEYLESS if keyless else ""
+    }

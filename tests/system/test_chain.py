@@ -314,6 +314,7 @@ def test_an_emulated_team_is_fused_live_by_another_process(tmp_path):
     assert figures["estimates"] > 30
     assert figures["counters"]["bad_checksums"] == 0
     received = load_run(tmp_path / "received")
+    assert "without a team key" in received.description.source
     # 4 s at 20 times real time, less what a busy machine cannot keep up with.
     assert 20.0 < received.measurements[-1].time_s < 100.0
     assert {m.node for m in received.motions} == {1, 2, 3}

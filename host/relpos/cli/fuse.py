@@ -381,6 +381,7 @@ def _fuse_port(
 ) -> None:
     from relpos.link.port import check_port
     from relpos.measurements import common_priors
+    from relpos.runs import Description
 
     if initial is Initial.TRUTH:
         raise DataError(f"{job.source}: a port has no truth to start from")
@@ -392,7 +393,15 @@ def _fuse_port(
     port = live.open_port(job.source, key_file, teach=teach, reopen=options.shown)
     if not as_json:
         output.remark(f"listening to {job.source}; Ctrl-C ends")
-    fuse_live(job, port, options, common=initial is Initial.COMMON, as_json=as_json)
+    how = "under the team's key" if key_file else "without a team key: anybody could have sent it"
+    fuse_live(
+        job,
+        port,
+        options,
+        description=Description(name=_base_name(job.source), source=f"received {how}"),
+        common=initial is Initial.COMMON,
+        as_json=as_json,
+    )
 
 
 def fuse_live(

@@ -188,7 +188,6 @@ def _recorders(
 
 def _about(source: Input, plan: SessionPlan, hello: Hello) -> About:
     """Return all that a replay needs beside the received bytes, except for the key."""
-    from relpos.protocol import messages as wire
     from relpos.recording.about import About
     from relpos.runs import InitialPose
 
@@ -200,7 +199,7 @@ def _about(source: Input, plan: SessionPlan, hello: Hello) -> About:
         settings=plan.settings,
         seed=plan.seed,
         initial="common" if plan.common else None,
-        own_key=link is not None and link.key != wire.DEFAULT_KEY,
+        own_key=link is not None and not link.keyless,
         newest_counters={} if link is None else link.counters_before,
         # The name of a port is not that of the recording.
         description=replace(

@@ -44,7 +44,9 @@ def list_nodes(
         now_s, monitor = deque(_watch(port, seconds, key_file, cable), maxlen=1)[0]
     rows = monitor.rows(now_s)
     if json:
-        output.print_json({"port": port, "listened_s": seconds, "nodes": rows})
+        output.print_json(
+            {"port": port, "listened_s": seconds, "team_key": key_file is not None, "nodes": rows}
+        )
         return
     if not rows:
         # The link has reported frames under another key.
@@ -114,6 +116,7 @@ def _watch(
 
     Beacons are sent meanwhile, so that what is seen is how the team works with a host.
     """
+    from relpos.link.authentication import KEYLESS
     from relpos.link.beacon import HostBeacons
     from relpos.link.port import observe, send
     from relpos.nodes.monitor import TeamMonitor
@@ -126,6 +129,8 @@ def _watch(
         return time.monotonic() - started_s
 
     with link_of(key_file) as link, closing(open_device(port, cable)) as device:
+        if link.keyless:
+            output.remark(KEYLESS)
         beacons = HostBeacons(link)
         for batch in observe(device, link, clock):
             elapsed_s = clock()

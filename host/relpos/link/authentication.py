@@ -29,6 +29,13 @@ MAX_JUMP = 1 << 24
 away may have missed. A node that is further ahead has to answer a challenge."""
 
 
+KEYLESS = (
+    "no team key (--key-file): anybody with such a radio can forge reports and command the nodes; "
+    "`relpos node set PORT key --key-file FILE --new` makes one"
+)
+"""Told wherever a team is heard under the key that every new node has."""
+
+
 class HostCounter:
     """Counters of the host's frames: the time in eighths of a second, or the last one plus 1.
 

@@ -28,7 +28,7 @@ UNSEEN_TURN_RAD_S_SQRT = 0.5
 MAX_KEPT = 10_000
 """Answers and raw samples stored until they are fetched: half an hour of one node's samples."""
 FOREIGN_BEFORE_REMARK = 5
-"""Frames under another key before a remark, while none arrives under this one."""
+"""Frames under another key before a remark; one or two may be damage."""
 REPLAYS_BEFORE_CHALLENGE = 5
 """One or two such frames may be an echo; more may mean that the node has lost its counter."""
 CHALLENGE_S = 5.0
@@ -126,7 +126,7 @@ class Decoder:
             return []
         except wire.FrameError as error:
             self.counts[type(error).__name__] += 1
-            foreign = isinstance(error, wire.FrameTagError) and not self.nodes
+            foreign = isinstance(error, wire.FrameTagError)
             if foreign and self.counts["FrameTagError"] == FOREIGN_BEFORE_REMARK:
                 self.remarks.append(
                     "frames under another key are rejected: give the team's key with --key-file, "

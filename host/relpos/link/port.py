@@ -72,6 +72,11 @@ class Link:
         self._unmarked = 0
         """Frames of nodes before the first mark of virtual time."""
 
+    @property
+    def keyless(self) -> bool:
+        """Whether the key is the one that every new node has, which everybody knows."""
+        return self.key == wire.DEFAULT_KEY
+
     def newest_counters(self) -> dict[int, int]:
         """Return the newest counter of each node heard, for the next session."""
         return {n: track.window.newest for n, track in self.decoder.nodes.items() if track.heard}

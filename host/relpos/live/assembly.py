@@ -7,13 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from relpos.link.authentication import KEYLESS
 from relpos.live.composer import Composer
 from relpos.live.files import FileSink
 from relpos.live.fusion_thread import FusionThread, MakeEstimator
 from relpos.live.inputs import Input
 from relpos.live.session import LiveSession, Outcome
 from relpos.live.sinks import Sink
-from relpos.live.team_view import Hello
+from relpos.live.team_view import Hello, Level
 from relpos.measurements import Prior
 from relpos.runs import Description
 
@@ -72,6 +73,10 @@ def run_session(
         lasts=plan.lasts,
         remark=remark,
     )
+    link = source.link
+    if source.is_now and not plan.emulated and link is not None and link.keyless:
+        remark(KEYLESS)
+        session.post("no-key", Level.INFO, KEYLESS)
     for count, _ in enumerate(session.run()):
         progress("received", count, None)
     progress("finishing", 0, 0)

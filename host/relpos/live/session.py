@@ -194,9 +194,9 @@ class LiveSession:
             except Exception as error:
                 self._sinks.remove(sink)
                 self._failed_sinks.append(sink)
-                self._post(f"sink-{id(sink)}", Level.ALARM, None)
+                self.post(f"sink-{id(sink)}", Level.ALARM, None)
                 name = type(sink).__name__
-                self._post(f"failed-{name}", Level.ALARM, f"{name} has failed and ended: {error!r}")
+                self.post(f"failed-{name}", Level.ALARM, f"{name} has failed and ended: {error!r}")
 
     def _update(self) -> None:
         """Do everything that is due at any time, whether anything was received or not."""
@@ -233,28 +233,26 @@ class LiveSession:
         virtual = self._source.link is not None and self._source.link.virtual_s is not None
         if slept_s > ASLEEP_S and not virtual and self._source.is_now:
             text = f"this computer slept for {slept_s:.0f} s, or was too busy to receive"
-            self._post("asleep", Level.WARNING, text)
+            self.post("asleep", Level.WARNING, text)
             self._notices.expire("asleep")
         self._composer.alarms.tick(now_s, listening=connected and self._connected)
         self._connected = connected
-        self._post("port", Level.ALARM, gone and f"{gone}; trying again each second")
+        self.post("port", Level.ALARM, gone and f"{gone}; trying again each second")
         if self._source.over() and not self._finishing:
             self._finishing = True
             self._fusion.finish()
-            self._post("over", Level.INFO, "end of the recording: this is the last picture")
+            self.post("over", Level.INFO, "end of the recording: this is the last picture")
         self._watch_fusion()
         silent = not self._composer.monitor.nodes and gone is None
         text = "no node is heard yet: are the nodes switched on?"
-        self._post("nobody", Level.INFO, text if silent else None)
-        self._feed(lambda sink: self._post(f"sink-{id(sink)}", Level.ALARM, sink.trouble()))
+        self.post("nobody", Level.INFO, text if silent else None)
+        self._feed(lambda sink: self.post(f"sink-{id(sink)}", Level.ALARM, sink.trouble()))
         self._notices.drop_expired(now_s)
 
     def _watch_fusion(self) -> None:
         failure = self._fusion.failure
         if failure is not None:
-            self._post(
-                "fusion", Level.ALARM, f"the fusion has failed: {failure}; receiving goes on"
-            )
+            self.post("fusion", Level.ALARM, f"the fusion has failed: {failure}; receiving goes on")
             return
         newest_s, first_s, behind_s = self._composer.newest_s, self._composer.first_s, 0.0
         if newest_s is not None and first_s is not None:
@@ -263,9 +261,9 @@ class LiveSession:
             f"the fusion is {behind_s:.0f} s behind: positions follow each wearer's own motion "
             "meanwhile"
         )
-        self._post("fusion", Level.WARNING, text if behind_s > BEHIND_S else None)
+        self.post("fusion", Level.WARNING, text if behind_s > BEHIND_S else None)
 
-    def _post(self, name: str, level: Level, text: str | None) -> None:
+    def post(self, name: str, level: Level, text: str | None) -> None:
         """Set the notice ``name``, or clear it where ``text`` is None."""
         if self._notices.post(name, level, text):
             self._changed = True
@@ -306,7 +304,7 @@ class LiveSession:
         """Count and tell it: whatever a visitor sends, the session goes on."""
         self._handler.counts["requests_failed"] += 1
         text = f"a visitor's request has failed: {error!r}"
-        self._post("request", Level.WARNING, text)
+        self.post("request", Level.WARNING, text)
         self._notices.expire("request")
 
     def _reply(self, request: Request) -> tuple[dict[str, object], int]:
