@@ -175,3 +175,26 @@ def test_one_epoch_a_round_of_reports_with_everybody_at_its_time() -> None:
         reached = steps[: steps.index(Epoch(time_s))]
         for node in (0, 1, 2):
             assert advances(reached, node)[-1].time_s == pytest.approx(time_s)
+
+
+def test_a_motion_takes_the_time_since_the_one_before_it() -> None:
+    steps = run(Timeline((1,)), [Motion(float(t), 1, 1.0, 0.0, 0.0) for t in (1, 3)])
+    assert [(a.time_s, a.duration_s) for a in advances(steps, 1)] == [(1.0, 1.0), (3.0, 2.0)]
+
+
+def test_a_motion_behind_its_successor_counts_whole_but_takes_no_time_of_its_own() -> None:
+    timeline = Timeline((1,), reorder_s=0.0)
+    rows = [Motion(t, 1, 1.0, 0.0, 0.0) for t in (1.0, 3.0, 2.0)]
+    durations = [a.duration_s for a in advances(run(timeline, rows), 1)]
+    assert durations == [1.0, 2.0, 0.0]
+
+
+def test_a_run_that_begins_before_zero_takes_its_first_motion_at_its_time() -> None:
+    rows: list[Measurement] = [Motion(-2.0, 1, 1.0, 0.0, 0.0), Motion(-1.0, 1, 4.0, 0.0, 0.0)]
+    rows.append(Range(-1.5, 1, 2, 3.0))
+    steps = run(Timeline((1, 2)), rows)
+    assert [(a.time_s, a.duration_s, a.dx_m) for a in advances(steps, 1)] == [
+        (-2.0, 0.0, 1.0),
+        (-1.5, 0.5, 2.0),
+        (-1.0, 0.5, 2.0),
+    ]

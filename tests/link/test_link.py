@@ -255,6 +255,47 @@ def test_a_restart_begins_new_totals_and_widens_the_next_motion():
     assert decoder.nodes[1].counts["restarts"] == 1
 
 
+def test_a_restart_widens_the_next_motion_by_what_a_person_can_do_meanwhile_and_no_other():
+    decoder = Decoder()
+    (first,) = motions(decoder.feed(motion_frame(7, boot=4, time_s=100), 100.0))
+    sigmas = first.sigma_x_m, first.sigma_y_m, first.sigma_theta_rad, first.sigma_x_alone_m
+    assert sigmas == (0.0, 0.0, 0.0, 0.0), "nothing was unseen before"
+    (widened,) = motions(decoder.feed(motion_frame(1024, boot=5, time_s=1), 104.0))
+    assert widened.sigma_x_m == pytest.approx(1.5 * 4.0)
+    assert widened.sigma_y_m == pytest.approx(1.5 * 4.0)
+    assert widened.sigma_x_alone_m == pytest.approx(1.5 * 4.0)
+    assert widened.sigma_theta_rad == pytest.approx(0.5 * math.sqrt(4.0))
+    (after,) = motions(decoder.feed(motion_frame(1025, boot=5, time_s=2), 105.0))
+    assert after.sigma_y_m == 0.0
+
+
+def test_a_restart_before_the_first_motion_widens_nothing():
+    decoder = Decoder()
+    status = dict.fromkeys(wire.STATUS.field, 0) | {"time_s": 1.0}
+    decoder.feed(wire.encode(wire.STATUS, 1, 4, 7, status), 1.0)
+    (motion,) = motions(decoder.feed(motion_frame(1024, boot=5, time_s=1), 9.0))
+    assert (motion.sigma_x_m, motion.sigma_y_m, motion.sigma_theta_rad) == (0.0, 0.0, 0.0)
+
+
+def test_variances_across_add_up_as_they_are_reported():
+    decoder = Decoder()
+    decoder.feed(motion_frame(0, time_s=1, variance_across_m2=0.25), 1.0)
+    frame = motion_frame(1, time_s=2, variance_across_m2=0.34, variance_along_m2=0.0)
+    (motion,) = motions(decoder.feed(frame, 2.0))
+    assert motion.sigma_y_m == pytest.approx(0.3, abs=1e-3)
+
+
+def test_motions_whose_clock_estimates_cross_keep_their_order_and_are_counted():
+    decoder = Decoder()
+    (first,) = motions(decoder.feed(motion_frame(0, time_s=1), 1.5))
+    # Half a second less delay: by this clock the first motion was half a second earlier.
+    (second,) = motions(decoder.feed(motion_frame(1, time_s=1.2), 1.2))
+    assert second.time_s == pytest.approx(first.time_s + 0.0005)
+    assert decoder.nodes[1].counts["clock_step"] == 1
+    decoder.feed(motion_frame(2, time_s=3), 3.0)
+    assert decoder.nodes[1].counts["clock_step"] == 1
+
+
 def test_a_restart_on_the_second_floor_leaves_the_node_there():
     decoder = Decoder()
     valid = wire.Quality.HEIGHT_VALID

@@ -1,5 +1,6 @@
 """The page's server from outside: who is let in, what is served, what it survives."""
 
+import asyncio
 import contextlib
 import json
 import socket
@@ -15,6 +16,7 @@ from websockets.sync.client import connect
 from relpos.errors import DeviceError, RelposError
 from relpos.live.team_view import Hello, Notice, Person, TeamView
 from relpos.view.access import Allowance, listen, make_certificate, own_address, parse_listen
+from relpos.view.server import SessionProxy
 from relpos.view.web import WebView
 
 PATIENCE_S = 60.0
@@ -350,3 +352,22 @@ def test_notices_and_names_of_any_kind_are_plain_json():
     text = view.to_json()
     assert "\n" not in text
     assert json.loads(text)["people"][0]["y_m"] is None
+
+
+def test_a_session_that_ends_ends_its_pages():
+    async def listen():
+        lines = asyncio.StreamReader()
+        session = SessionProxy(lines, None)
+        waiting = asyncio.create_task(session.until_hello())
+        await asyncio.sleep(0)
+        lines.feed_data(b'{"type":"names","names":{"1":"Kim"}}\n')
+        lines.feed_eof()
+        await session.listen()
+        async with asyncio.timeout(PATIENCE_S):
+            assert await waiting is None, "nobody waits for a session that is over"
+            assert await session.news(None, PATIENCE_S) is None
+        return session
+
+    session = asyncio.run(listen())
+    assert session.over
+    assert session.names == {"1": "Kim"}
