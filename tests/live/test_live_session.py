@@ -2,6 +2,8 @@
 
 import json
 import math
+import os
+import pty
 import threading
 
 import pytest
@@ -10,16 +12,19 @@ from team_input import Album, TeamInput, make_session, run_through
 from relpos import fusion
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.fusion.linear_algebra import one_thread
-from relpos.link.authentication import KEYLESS
+from relpos.link import xbee
+from relpos.link.authentication import KEYLESS, SeenCounters
+from relpos.link.decoder import Decoder
 from relpos.link.port import Link
 from relpos.live.assembly import SessionPlan, run_session
-from relpos.live.inputs import PacedInput, Received
+from relpos.live.composer import Composer
+from relpos.live.inputs import PacedInput, PortInput, Received
 from relpos.live.requests import Request
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert
 from relpos.measurements import Event, Heading, Height, Motion, Range
 from relpos.protocol import messages as wire
-from relpos.runs import Description
+from relpos.runs import Description, load_run, read_estimates
 
 
 def deadreckoning(priors):
@@ -247,7 +252,7 @@ def test_no_request_reply_name_or_view_ends_a_session():
     assert fragile.closed, "what a failed sink holds is written all the same"
     assert outcome.counters["requests_failed"] > 2
     texts = [notice.text for notice in album.views[-1].notices]
-    assert any("visitor's request has failed" in text for text in texts)
+    assert any(text.startswith("request failed: ") for text in texts)
     assert [person.name for person in album.views[-1].people] == ["Node 1", "Kim"]
 
 
@@ -375,3 +380,80 @@ def test_a_session_without_a_team_key_says_so_until_its_end(tmp_path, keyless):
     assert {n.text for n in album.views[-1].notices if n.id == "no-key"} == {KEYLESS} & {
         KEYLESS if keyless else ""
     }
+
+
+class Crumbling(Composer):
+    """Raises in everything that a measurement, an estimate or a view leads to."""
+
+    def _fail(self, *_, **__):
+        raise ZeroDivisionError("a figure of nobody")
+
+    add_observations = add_estimate = view = _fail
+
+
+def test_a_view_that_fails_costs_neither_estimates_nor_files(tmp_path, monkeypatch):
+    monkeypatch.setattr("relpos.live.assembly.Composer", Crumbling)
+    remarks = []
+    with EmulatedTeam(TeamConfig("straight", 2, 8.0, 3, beacons=True)) as team:
+        plan = SessionPlan(
+            "walk", tmp_path, Description(), deadreckoning, "deadreckoning", priors=team.priors()
+        )
+        outcome = run_session(TeamInput(team), plan, [lambda _: Album()], remark=remarks.append)
+    assert outcome.failure is None
+    assert outcome.counters["views_failed"] > 10
+    assert [line for line in remarks if "a figure of nobody" in line] == [remarks[1]]
+    assert len(read_estimates(tmp_path)) == outcome.estimates > 5
+    assert load_run(tmp_path / "received").motions
+
+
+def test_an_input_that_fails_in_an_unknown_way_leaves_the_files_whole(tmp_path):
+    class Burning(TeamInput):
+        def read(self, timeout_s):
+            if self.now_s() > 5.0:
+                raise KeyError("smoke")
+            return super().read(timeout_s)
+
+    with EmulatedTeam(TeamConfig("straight", 2, 8.0, 3, beacons=True)) as team:
+        plan = SessionPlan(
+            "walk", tmp_path, Description(), deadreckoning, "deadreckoning", priors=team.priors()
+        )
+        outcome = run_session(Burning(team), plan)
+    assert isinstance(outcome.failure, KeyError)
+    assert load_run(tmp_path / "received").motions[-1].time_s > 3.5
+
+
+def test_a_frame_that_cannot_be_decoded_is_counted_and_told_once(monkeypatch):
+    feed = Decoder.feed
+
+    def fail(self, data, arrival_s, rssi_dbm=None):
+        if self.counts["frames_failed"] < 2:
+            raise OverflowError("math range error")
+        return feed(self, data, arrival_s, rssi_dbm)
+
+    monkeypatch.setattr(Decoder, "feed", fail)
+    with EmulatedTeam(TeamConfig("straight", 2, 6.0, 3, beacons=True)) as team:
+        session, album = make_session(TeamInput(team), deadreckoning, priors=team.priors())
+        outcome = run_through(session)
+    assert outcome.counters["frames_failed"] == 2
+    assert [n.text for n in album.views[-1].notices if "math range error" in n.text] == [
+        "a frame could not be decoded: OverflowError('math range error')"
+    ]
+    assert album.estimates
+
+
+def test_a_full_disk_under_the_counters_file_ends_no_session(tmp_path):
+    master, slave = pty.openpty()
+    seen = SeenCounters(tmp_path / "gone" / "team.key.seen")
+    live = PortInput(os.ttyname(slave), Link(), seen, teach=False)
+    try:
+        for counter in range(3):
+            values = dict.fromkeys(wire.MOTION.field, 0) | {"time_s": 1.0 + counter}
+            data = wire.encode(wire.MOTION, 1, 0, counter, values)
+            os.write(master, xbee.encode(xbee.Receive16(1, -40, data)))
+            assert live.read(5.0) is not None
+        (remark,) = live.remarks()
+        assert "team.key.seen: cannot be written" in remark
+    finally:
+        live.close()
+        os.close(master)
+        os.close(slave)

@@ -182,10 +182,11 @@ class SeenCounters:
         merged = dict(self._saved)
         for node, counter in newest.items():
             merged[node] = max(counter, merged.get(node, -1))
+        self._saved_s = now_s
         temporary = self.path.with_name(self.path.name + ".new")
         try:
             temporary.write_text(json.dumps(merged), encoding="ascii")
             temporary.replace(self.path)
         except OSError as error:
             raise DataError(f"{self.path}: cannot be written: {error.strerror}") from error
-        self._saved, self._saved_s = merged, now_s
+        self._saved = merged

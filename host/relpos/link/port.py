@@ -91,15 +91,26 @@ class Link:
         for frame in self.parser.feed(data):
             if self._virtual_s is not None:
                 arrival_s = self._virtual_s
-            if isinstance(frame, xbee.Receive16 | xbee.Receive64):
-                observations += self.decoder.feed(frame.data, arrival_s, frame.rssi_dbm)
-            elif isinstance(frame, xbee.ReceivePacket):
-                observations += self.decoder.feed(frame.data, arrival_s)
+            if isinstance(frame, xbee.Receive16 | xbee.Receive64 | xbee.ReceivePacket):
+                observations += self._decode(frame, arrival_s)
             elif not self._is_mark(frame):
                 self.decoder.counts[type(frame).__name__] += 1
                 continue
             self._unmarked += self._virtual_s is None
         return observations
+
+    def _decode(
+        self, frame: xbee.Receive16 | xbee.Receive64 | xbee.ReceivePacket, arrival_s: float
+    ) -> list[Observation]:
+        rssi_dbm = None if isinstance(frame, xbee.ReceivePacket) else frame.rssi_dbm
+        try:
+            return self.decoder.feed(frame.data, arrival_s, rssi_dbm)
+        except Exception as error:  # No node ends a session: what is wrong with this frame is told.
+            counts = self.decoder.counts
+            counts["frames_failed"] += 1
+            if counts["frames_failed"] == 1:
+                self.decoder.remarks.append(f"a frame could not be decoded: {error!r}")
+            return []
 
     def _is_mark(self, frame: object) -> bool:
         """Set the virtual time if the frame marks one that an emulated team can have."""

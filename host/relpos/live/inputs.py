@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from relpos.errors import DeviceError
+from relpos.errors import DataError, DeviceError
 from relpos.link import port as serial_port
 from relpos.link.beacon import HostBeacons
 from relpos.link.port import READ_BYTES, Link
@@ -129,9 +129,18 @@ class PortInput:
             return None
         arrival_s = self.clock()
         received = Received(arrival_s, data, self._link.feed(data, arrival_s))
-        if self._seen is not None:
-            self._seen.save(self._link.newest_counters(), time.monotonic())
+        self._save_counters()
         return received
+
+    def _save_counters(self, *, at_once: bool = False) -> None:
+        """Store the newest frame counters; a full disk is a remark, and tried again."""
+        if self._seen is None:
+            return
+        try:
+            self._seen.save(self._link.newest_counters(), time.monotonic(), at_once=at_once)
+        except DataError as error:
+            if str(error) not in self._link.decoder.remarks:
+                self._link.decoder.remarks.append(str(error))
 
     def now_s(self) -> float:
         """Return the clock's time, or that of an emulated team which marks its own."""
@@ -172,8 +181,7 @@ class PortInput:
         if self._device is not None:
             self._device.close()
             self._device = None
-        if self._seen is not None:
-            self._seen.save(self._link.newest_counters(), time.monotonic(), at_once=True)
+        self._save_counters(at_once=True)
 
     def _bytes(self, timeout_s: float) -> bytes:
         """Return bytes that are there, or arrive within the time."""

@@ -13,11 +13,11 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 
-from relpos.errors import RelposError
 from relpos.fusion.estimator import Estimate, time_offsets
 from relpos.live.composer import Composer
 from relpos.live.fusion_thread import FusionThread
@@ -80,6 +80,7 @@ class LiveSession:
         self._composer = composer
         self._sinks = list(sinks)
         self._failed_sinks: list[Sink] = []
+        self._failed: Counter[str] = Counter()
         self._request_sources = [sink for sink in sinks if isinstance(sink, RequestSource)]
         self._seconds = seconds
         self._lasts = lasts
@@ -120,12 +121,13 @@ class LiveSession:
                     if received is not None:
                         self._add(received)
                         yield from received.observations
-                    self._update()
+                    with self._surviving("update"):
+                        self._update()
                     if self._seconds is not None and self._pace() - started_s > self._seconds:
                         return
                     if not self._lasts and (self._source.over() or self._fusion.failure):
                         return
-        except RelposError as error:
+        except Exception as error:
             self.outcome.failure = error
         finally:
             sys.setswitchinterval(before_s)
@@ -145,11 +147,10 @@ class LiveSession:
         self._collect_estimates()
         if self._shows:
             self._show()
-        self._source.close()
         self.outcome.failure = self.outcome.failure or self._fusion.failure
-        for sink in self._sinks:
+        for close in (self._source.close, *(sink.close for sink in self._sinks)):
             try:
-                sink.close()
+                close()
             except Exception as error:
                 self.outcome.failure = self.outcome.failure or error
         for sink in self._failed_sinks:
@@ -160,6 +161,7 @@ class LiveSession:
             **self._source.counters(),
             **self._fusion.counters(),
             **self._handler.counts,
+            **self._failed,
         }
         return self.outcome
 
@@ -177,10 +179,24 @@ class LiveSession:
             self._feed(lambda sink: sink.received(received.arrival_s, received.data))
         link = self._source.link
         decoder = link.decoder if link else None
-        self._composer.add_observations(now_s, received.observations, decoder)
+        with self._surviving("view"):
+            self._composer.add_observations(now_s, received.observations, decoder)
         if received.observations:
             self._submit(received.arrival_s, received.observations)
         self._changed = True
+
+    @contextmanager
+    def _surviving(self, what: str) -> Iterator[None]:
+        """Tell and count what is raised within: receiving, fusing and recording go on."""
+        try:
+            yield
+        except Exception as error:
+            self._failed[f"{what}s_failed"] += 1
+            text = f"{what} failed: {error!r}; the session goes on"
+            if self._failed[f"{what}s_failed"] == 1:
+                self._remark(text)
+            self.post(what, Level.ALARM, text)
+            self._notices.expire(what)
 
     def _submit(self, arrival_s: float, observations: Sequence[Observation]) -> None:
         self._fusion.submit(observations)
@@ -214,11 +230,13 @@ class LiveSession:
         for fused in self._fusion.poll():
             self.outcome.estimates += 1
             self.outcome.last = fused.estimate
-            self._composer.add_estimate(fused.estimate, fused.processed)
+            with self._surviving("view"):
+                self._composer.add_estimate(fused.estimate, fused.processed)
             self._feed(lambda sink, e=fused.estimate: sink.estimated(e))  # type: ignore[misc]
-            self._source.learn(fused.estimate)
+            with self._surviving("update"):
+                self._source.learn(fused.estimate)
             text = "; ".join(time_offsets(fused.estimate))
-            self._post("time-offsets", Level.WARNING, text or None)
+            self.post("time-offsets", Level.WARNING, text or None)
             self._changed = True
 
     # -- alarms and notices -----------------------------------------------------------------------
@@ -279,33 +297,23 @@ class LiveSession:
     def _show(self) -> None:
         self._changed = False
         self._viewed_s = self._pace()
-        view = self._composer.view(
-            self._source.now_s(), time.time(), self._arrived_unix_s, self._notices.all()
-        )
-        self._feed(lambda sink: sink.updated(view))
+        with self._surviving("view"):
+            view = self._composer.view(
+                self._source.now_s(), time.time(), self._arrived_unix_s, self._notices.all()
+            )
+            self._feed(lambda sink: sink.updated(view))
 
     # -- requests ---------------------------------------------------------------------------------
 
     def _handle_requests(self) -> None:
         for source in self._request_sources:
-            try:
+            with self._surviving("request"):
                 for request in source.requests():
-                    try:
+                    reply: tuple[dict[str, object], int] = {"error": "the session has failed"}, 500
+                    with self._surviving("request"):
                         reply = self._reply(request)
-                    except Exception as error:
-                        self._count_failed_request(error)
-                        reply = {"error": "the session could not do this"}, 500
                     source.respond(request, *reply)
                     self._changed = True
-            except Exception as error:
-                self._count_failed_request(error)
-
-    def _count_failed_request(self, error: Exception) -> None:
-        """Count and tell it: whatever a visitor sends, the session goes on."""
-        self._handler.counts["requests_failed"] += 1
-        text = f"a visitor's request has failed: {error!r}"
-        self.post("request", Level.WARNING, text)
-        self._notices.expire("request")
 
     def _reply(self, request: Request) -> tuple[dict[str, object], int]:
         body = request.body
