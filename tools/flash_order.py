@@ -2,7 +2,7 @@
 """Order the Uno's functions in flash so that few calls need the long form: tools/flash_order.py.
 
 A relative call (2 bytes) reaches 4 KB, any other takes 4. The linker shortens what is in reach
-(-mrelax), so the order of the functions is worth 600 bytes. This reads the map of the last
+(--relax), so the order of the functions is worth 600 bytes. This reads the map of the last
 `pio run -e uno`, looks for a better order by simulated annealing (always the same one), and writes
 firmware/order.ld. A function that is not in that file is placed behind the others: run this again,
 twice, when `pio run -e uno` grows by more than what was added.
@@ -26,24 +26,20 @@ BUILD = ROOT / ".build" / "pio" / "build" / "uno"
 ORDER = ROOT / "firmware" / "order.ld"
 REACH = 4090  # bytes, of 4094: the map's addresses move as calls get shorter
 HEAD = """\
-/* Written by tools/flash_order.py: do not edit. It says what this is for.
-   Goes before the linker's own script; what belongs at the start of the flash is repeated here. */
-SECTIONS
+/* Written by tools/flash_order.py: do not edit. firmware/link.py hands it to the linker, before the
+   linker's own script; what belongs at the start of the flash is repeated here. */
+.text :
 {
-  .text :
-  {
-    KEEP(*(.vectors))
-    *(.progmem.gcc*)
-    *(.trampolines*)
-    *(.progmem*)
-    . = ALIGN(2);
-    *(.jumptables*)
-    *(.lowtext*)
+  KEEP(*(.vectors))
+  *(.progmem.gcc*)
+  *(.trampolines*)
+  *(.progmem*)
+  . = ALIGN(2);
+  *(.jumptables*)
+  *(.lowtext*)
 """
 TAIL = """\
-  }
 }
-INSERT AFTER .rela.plt
 """
 
 
@@ -151,7 +147,7 @@ def main() -> int:
     read_calls(arguments.elf, found)
     order, before, after = order_of(found, arguments.steps)
     lines = list(dict.fromkeys(found[number].pattern for number in order))
-    ORDER.write_text(HEAD + "".join(f"    {line}\n" for line in lines) + TAIL)
+    ORDER.write_text(HEAD + "".join(f"  {line}\n" for line in lines) + TAIL)
     print(f"long calls: {before}, then {after}: {2 * (before - after)} bytes less")
     return 0
 

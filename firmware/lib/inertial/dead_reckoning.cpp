@@ -114,14 +114,6 @@ const float kSigmas[] PROGMEM = {
 
 const uint8_t kHoldTicks = 100;       // two seconds: a flag is seen by a report a second
 
-// By its bits: the boards' compiler assumes finite numbers (-ffinite-math-only), so
-// input is checked first.
-bool finite(float value) {
-  uint32_t bits;
-  memcpy(&bits, &value, sizeof bits);
-  return (bits & 0x7f800000) != 0x7f800000;
-}
-
 void count(uint16_t* counter) {
   if (*counter < 65535u) ++*counter;
 }
@@ -171,7 +163,7 @@ RELPOS_APART bool DeadReckoning::refuse(const ImuSample& sample, float dt_s) {
     }
   }
   if (saturated) count(&counters_.saturated_samples);
-  if (finite(sum) && dt_s > 0.0f && dt_s <= 0.2f) return false;
+  if (isfinite(sum) && dt_s > 0.0f && dt_s <= 0.2f) return false;
   count(&counters_.refused_samples);
   hold_[kHoldInput] = kHoldTicks;
   return true;
@@ -677,7 +669,7 @@ RELPOS_APART void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
   attitude_.matrix(rotation_);
   rotate(rotation_, field_ut, field);
   float strength = norm(field);
-  if (!finite(strength)) {
+  if (!isfinite(strength)) {
     clear(field);
     strength = 0.0f;
   }
