@@ -25,7 +25,7 @@ compile-kernels = @printf '%s\n' 'compiling the estimators, once'; \
 	$(PYTHON) -c 'from relpos import fusion; [fusion.warm_up(n) for n in fusion.SETTINGS]'
 title = @printf '\n\033[1m== %s\033[0m\n' "$(1)"
 
-.PHONY: help setup demo live test lint coverage bench bench-chain firmware docs pages wire clean soak \
+.PHONY: help setup demo live test lint coverage bench bench-chain firmware docs pages wire clean bare-root soak \
         system-demo system-avr system-browser system-soak firmware-tests board-builds python-tests
 
 help: ## this list
@@ -103,6 +103,9 @@ docs: $(DEVELOP) ## the documentation as a site, in out/docs
 pages: wire ## regenerate the pages that come from the sources
 	$(PYTHON) bench/reliability.py
 	$(PYTHON) bench/hardware.py
+
+bare-root: ## as root: README's commands in a bare Debian, SUITE=trixie RUN="demo test"
+	tools/bare_root.sh $(or $(SUITE),trixie) $(or $(RUN),demo test)
 
 clean: ## remove what was built; .venv stays
 	rm -rf .build .pio out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -6,15 +6,18 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from relpos.emulator import pozyx
+from relpos.emulator import ak8975, pozyx
 from relpos.emulator.avr.board import BOARDS
 from relpos.emulator.avr.budget import TICK_CYCLES, default_build_folder, find_firmware
 from relpos.emulator.avr.elf import read_firmware
 from relpos.emulator.avr.library import missing_parts
 from relpos.emulator.avr.service import Service
+from relpos.emulator.bus import I2cDevice
+from relpos.emulator.mpu9150 import Mpu9150
 from relpos.protocol import messages as wire
 
 MISSING = missing_parts()
@@ -80,6 +83,23 @@ def test_a_tag_that_never_lets_go_of_the_clock_costs_no_motion(
     ranges, service = serve(uno)
     assert ranges == 0
     assert sum(frame.message is wire.MOTION for frame in service.frames) >= SECONDS - 3
+
+
+def test_slow_inertial_chips_cost_no_motion(uno: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Their data sheets know no stretching: what a transaction's millisecond leaves is enough.
+    for chip in (Mpu9150, ak8975._HostSide):
+        start = chip.start
+
+        def slow(self: I2cDevice, read: bool, start: Any = start) -> bool:
+            self.stretch_us = 150
+            return bool(start(self, read))
+
+        monkeypatch.setattr(chip, "start", slow)
+    _, service = serve(uno)
+    assert sum(frame.message is wire.MOTION for frame in service.frames) >= SECONDS - 3
+    statuses = [frame.values for frame in service.frames if frame.message is wire.STATUS]
+    assert statuses[-1]["bus_errors"] <= 2
+    assert statuses[-1]["missed_ticks"] == 0
 
 
 def test_the_bus_at_100_khz_is_a_build_that_works(tmp_path: Path) -> None:

@@ -30,6 +30,8 @@ constexpr float kMostGapS = 60.0f;
 struct Total {
   uint8_t from, to, thousands;
 };
+static_assert(__is_standard_layout(Displacement) && __is_standard_layout(wire::Motion),
+              "a total is where its offset says");
 enum : uint8_t { kHeadingVariance = 5 };  // a hundred million
 const Total kTable[] RELPOS_FLASH = {
     {offsetof(Displacement, x_m), offsetof(wire::Motion, x_mm), 1},

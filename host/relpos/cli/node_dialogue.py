@@ -34,8 +34,7 @@ def link_of(key_file: Path | None) -> Iterator[Link]:
         yield link
     finally:
         if seen is not None:
-            lowered = link.decoder.brought_back
-            seen.save(link.newest_counters(), 0.0, at_once=True, lowered=lowered)
+            seen.save(link.newest_counters(), 0.0, at_once=True)
 
 
 def open_device(port: str, cable: bool) -> Any:
