@@ -6,6 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from relpos.cli.node_dialogue import connect
+from relpos.emulator.pty import PseudoTerminal
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DataError, DeviceError
 from relpos.link import port as serial_port
@@ -190,6 +192,8 @@ def test_counters_are_kept_beside_the_key_and_never_go_back(tmp_path):
     assert SeenCounters(seen.path).load() == {1: 10, 2: 20}
     seen.save({1: 12}, 1.0, at_once=True)
     assert SeenCounters(seen.path).load() == {1: 12, 2: 20}
+    seen.save({1: 3, 2: 4}, 2.0, at_once=True, lowered={2})
+    assert SeenCounters(seen.path).load() == {1: 12, 2: 4}
     seen.path.write_text("{")
     with pytest.raises(DataError, match=r"team\.key\.seen"):
         SeenCounters(seen.path).load()
@@ -261,6 +265,26 @@ def test_a_recorded_answer_brings_no_recorded_session_back():
     another = Decoder((KEY,), {1: 5000})
     assert [o for frame, at_s in heard for o in another.feed(frame, at_s + 1e-6)] == []
     assert another.nodes == {}
+
+
+def test_a_dialogue_finds_a_node_that_lost_its_counter_and_the_next_one_at_once(tmp_path):
+    key_file = tmp_path / "team.key"
+    write_new_key(key_file)
+    key = read_key(key_file)
+    SeenCounters.beside(key_file).save({1: 50_000}, 0.0, at_once=True)
+    config = TeamConfig("straight", 1, 600.0, 3, key=key)
+    with (
+        EmulatedTeam(config) as team,
+        PseudoTerminal(team, speed=5.0, mark_time=True) as terminal,
+    ):
+        terminal.start()
+        for known in (50_000, None):
+            assert known in (None, SeenCounters.beside(key_file).load()[1])
+            with connect(terminal.path, 1, key_file) as dialogue:
+                dialogue.demand(wire.CommandCode.PING, 0)
+            remarks = "".join(dialogue.link.decoder.remarks)
+            assert ("heard again" in remarks) == (known is not None)
+    assert SeenCounters.beside(key_file).load()[1] < 50_000
 
 
 def test_a_node_answers_the_challenge_of_a_host_that_remembers_a_higher_counter():

@@ -10,6 +10,9 @@ import zlib
 
 import pytest
 
+from relpos.errors import DataError
+from relpos.runs import read_estimates
+
 MOTION = "time_s,node,dx_m,dy_m,dtheta_rad\n"
 RANGES = "time_s,node,peer,range_m\n"
 
@@ -191,3 +194,12 @@ def test_a_hostile_file_is_one_line_soon_and_in_little_memory(outcomes, name):
         assert len(words) < 400
     assert took_s < MOST_S
     assert more_mb < MOST_MB
+
+
+@pytest.mark.parametrize("column", ["x_m", "sigma_major_m", "sigma_heading_rad", "time_s"])
+def test_an_estimate_of_absurd_figures_is_one_line(tmp_path, column):
+    row = {"time_s": "1", "node": "1", "x_m": "0", "y_m": "0", "sigma_major_m": "1"}
+    row |= {"sigma_minor_m": "1", "sigma_angle_rad": "0", "sigma_heading_rad": "1", column: "1e300"}
+    (tmp_path / "estimate.csv").write_text(",".join(row) + "\n" + ",".join(row.values()) + "\n")
+    with pytest.raises(DataError, match=f"line 2: column {column}: '1e300' is "):
+        read_estimates(tmp_path)

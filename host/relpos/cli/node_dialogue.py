@@ -34,7 +34,8 @@ def link_of(key_file: Path | None) -> Iterator[Link]:
         yield link
     finally:
         if seen is not None:
-            seen.save(link.newest_counters(), 0.0, at_once=True)
+            lowered = link.decoder.brought_back
+            seen.save(link.newest_counters(), 0.0, at_once=True, lowered=lowered)
 
 
 def open_device(port: str, cable: bool) -> Any:

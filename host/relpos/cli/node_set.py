@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from relpos.cli import output
 from relpos.cli.keys import KeyFile
 from relpos.cli.node_dialogue import Cable, Node, Port, connect
 from relpos.errors import DeviceError
@@ -160,6 +161,11 @@ def _set_key(
     from relpos.cli.node_dialogue import open_device  # isort: skip
 
     old = wire.DEFAULT_KEY if old_key_file is None else read_key(old_key_file)
+    if old == wire.DEFAULT_KEY and not cable:
+        output.remark(
+            "everybody knows the key of a new node: who listens now can read the one that it gets; "
+            "give the first key by the node's cable (--cable)"
+        )
     device = open_device(port, cable)
     try:
         key = write_new_key(key_file) if new else read_key(key_file)

@@ -11,7 +11,7 @@ import json
 import os
 import secrets
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -175,13 +175,23 @@ class SeenCounters:
             ) from error
         return dict(self._saved)
 
-    def save(self, newest: Mapping[int, int], now_s: float, *, at_once: bool = False) -> None:
-        """Write counters that have grown, at most every few seconds; DataError where that fails."""
+    def save(
+        self,
+        newest: Mapping[int, int],
+        now_s: float,
+        *,
+        at_once: bool = False,
+        lowered: Container[int] = (),
+    ) -> None:
+        """Write counters that have grown, at most every few seconds; DataError where that fails.
+
+        Those of the nodes in ``lowered`` are written as they are.
+        """
         if newest == self._saved or not (at_once or now_s - self._saved_s >= self.EVERY_S):
             return
         merged = dict(self._saved)
         for node, counter in newest.items():
-            merged[node] = max(counter, merged.get(node, -1))
+            merged[node] = counter if node in lowered else max(counter, merged.get(node, -1))
         self._saved_s = now_s
         temporary = self.path.with_name(self.path.name + ".new")
         try:

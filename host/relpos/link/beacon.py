@@ -108,11 +108,7 @@ class HostBeacons:
 
         ``now_s`` is on the clock of the link's arrival times.
         """
-        asked, challenges = b"", self._link.decoder.challenges
-        while challenges:
-            c = challenges.popleft()
-            asked += self._link.command(c.node, wire.CommandCode.PING, c.value, token=c.token)[1]
-        return asked + self._beacon(now_s)
+        return self._link.challenges() + self._beacon(now_s)
 
     def _beacon(self, now_s: float) -> bytes:
         if self._link.virtual_s is not None:

@@ -107,6 +107,8 @@ class Decoder:
         self._challenged: dict[int, tuple[float, Challenge | None]] = {}
         """When each node was challenged last, and what it has not answered yet."""
         self.challenges: deque[Challenge] = deque(maxlen=MAX_KEPT)
+        self.brought_back: set[int] = set()
+        """Nodes whose counters an answer has set, maybe below earlier ones."""
         self.nodes: dict[int, NodeTrack] = {}
         self.counts: Counter[str] = Counter()
         self.foreign_versions: dict[int, int] = {}
@@ -232,9 +234,10 @@ class Decoder:
             if not self._answers_challenge(frame):
                 self._reject(frame, track, verdict, arrival_s)
                 return None
+            self.brought_back.add(frame.node)
             self.remarks.append(
                 f"node {frame.node}: its frame counter had changed; it has answered and is heard "
-                "again"
+                "again. If its memory was erased, give the team a new key: old frames fit again"
             )
             # What came under the other counter may have been forged: begin anew, as at a restart.
             window, verdict = CounterWindow.after(frame.counter - 1), Verdict.NEW

@@ -15,7 +15,7 @@ import serial
 from relpos.calibration.sensors import SensorCalibration, checksum
 from relpos.errors import DeviceError
 from relpos.link.decoder import MAX_KEPT, Acknowledged
-from relpos.link.port import Line, Link, observe
+from relpos.link.port import Line, Link, observe, send
 from relpos.measurements import Observation, RawSample
 from relpos.protocol import messages as wire
 
@@ -62,6 +62,7 @@ class NodeDialogue:
     def listen(self) -> None:
         """Process what has arrived, or wait a moment for it; DeviceError where the port is gone."""
         self.observations.extend(next(self._batches))
+        send(self._port, self.link.challenges())
         acknowledged = self.link.decoder.acknowledged
         while acknowledged:
             answer = acknowledged.popleft()

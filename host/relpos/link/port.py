@@ -180,6 +180,14 @@ class Link:
         address = xbee.BROADCAST_16 if broadcast or node == wire.BROADCAST else node
         return xbee.encode(xbee.Transmit16(0, address, data), escaped=self._escaped)
 
+    def challenges(self) -> bytes:
+        """Return the bytes for nodes whose frame counters do not fit; see the decoder."""
+        data, waiting = b"", self.decoder.challenges
+        while waiting:
+            c = waiting.popleft()
+            data += self.command(c.node, wire.CommandCode.PING, c.value, token=c.token)[1]
+        return data
+
     def clock_fault(self) -> str | None:
         """Say in a line why nodes may refuse what this host sends; None where nothing is wrong."""
         return self._counter.clock_fault()

@@ -137,7 +137,12 @@ class PortInput:
         if self._seen is None:
             return
         try:
-            self._seen.save(self._link.newest_counters(), time.monotonic(), at_once=at_once)
+            self._seen.save(
+                self._link.newest_counters(),
+                time.monotonic(),
+                at_once=at_once,
+                lowered=self._link.decoder.brought_back,
+            )
         except DataError as error:
             if str(error) not in self._link.decoder.remarks:
                 self._link.decoder.remarks.append(str(error))

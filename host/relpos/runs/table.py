@@ -26,6 +26,8 @@ MOST_RATIO = 50
 """A gzipped file may unpack to the one and, on top, to so many times its size; recordings reach
 twenty."""
 _PART_BYTES = 1 << 20
+MOST = 1e100
+"""Of a number without bounds of its own."""
 
 Parser = Callable[[str], Any]
 
@@ -43,7 +45,17 @@ class Column:
 
 
 def number(text: str) -> float:
-    """Read a finite decimal number; NaN and infinity are refused: a recording has no such value."""
+    """Read a finite decimal number whose square is one, too.
+
+    NaN and infinity are refused: a recording has no such value.
+    """
+    value = _finite(text)
+    if abs(value) > MOST:
+        raise ValueError("is too large")
+    return value
+
+
+def _finite(text: str) -> float:
     try:
         value = math.nan if "_" in text else float(text)
     except ValueError:
@@ -63,7 +75,7 @@ def not_negative(text: str) -> float:
 
 def bounded(name: str) -> Parser:
     """Return the parser of a quantity that :data:`relpos.measurements.BOUNDS` names."""
-    return lambda text: within_bounds(name, number(text))
+    return lambda text: within_bounds(name, _finite(text))
 
 
 def within_bounds(name: str, value: float) -> float:
