@@ -122,14 +122,19 @@ def wrap_angle(angle_rad: Floats) -> Floats:
 
 
 def whole_seconds(tracks: Iterable[Track]) -> Floats:
-    """Every whole second from the first to the last row of any of the tracks."""
+    """Every whole second at which one of the tracks may have a value, in order.
+
+    What :func:`interpolate` knows lies at most a gap behind a row. Seconds further on are left out:
+    a row of a week later would make half a million of them.
+    """
     times = [t.time_s[np.isfinite(t.time_s)] for t in tracks]
-    times = [t for t in times if t.size]
-    if not times:
-        return np.empty(0)
-    first = math.ceil(min(float(t.min()) for t in times) - _TIME_SLACK_S)
-    last = math.floor(max(float(t.max()) for t in times) + _TIME_SLACK_S)
-    return np.arange(first, last + 1, dtype=np.float64)
+    rows: Floats = np.unique(np.concatenate([np.empty(0), *times]))
+    if not rows.size:
+        return rows
+    first = np.unique(np.ceil(rows - _TIME_SLACK_S))
+    seconds: Floats = np.unique(first[:, None] + np.arange(math.floor(MAX_GAP_S) + 1.0))
+    within: Floats = seconds[seconds <= rows[-1] + _TIME_SLACK_S]
+    return within
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relpos.evaluation.metrics import evaluate, over_seeds
-from relpos.tracks import PairTrack, Track
+from relpos.tracks import PairTrack, Track, interpolate, whole_seconds
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -235,3 +236,25 @@ def test_seeds_give_a_mean_with_its_standard_error() -> None:
     mean, error = over_seeds([1.0, 2.0, 3.0])
     assert mean == pytest.approx(2.0)
     assert error == pytest.approx(1.0 / math.sqrt(3.0))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_seconds_of_tracks_are_all_at_which_they_have_a_value_and_few_others(seed):
+    rng = np.random.default_rng(seed)
+    steps = rng.choice([0.02, 0.5, 1.0, 1.9, 2.0, 2.5, 7.0], (2, 60))
+    tracks = [Track(t, t, t, t) for t in np.cumsum(steps, axis=1) - 3.0 * rng.random()]
+    every = np.arange(-10.0, 500.0)
+    known = [np.isfinite(interpolate(t.time_s, t.x_m, every)) for t in tracks]
+    assert set(every[known[0] | known[1]]) <= set(whole_seconds(tracks))
+    assert np.all(np.diff(whole_seconds(tracks)) >= 1.0)
+
+
+def test_a_row_of_a_week_later_costs_neither_memory_nor_time():
+    time_s = np.append(np.arange(30.0), 604_000.0)
+    tracks = {n: Track(time_s, time_s, n + 0.0 * time_s, time_s) for n in range(20)}
+    assert whole_seconds(tracks.values()).size == 33
+    tracemalloc.start()
+    assert evaluate(tracks, tracks).epochs == 31
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak_bytes < 10e6
