@@ -117,7 +117,7 @@ def sense(truth: WearerTruth, rng: np.random.Generator, calibrated: bool) -> tup
             compass.transfer(bytes((ak8975.CNTL, ak8975.SINGLE)), b"", 0)
             compass.advance(now_us + 10_000)
             raw = np.frombuffer(compass.transfer(bytes((ak8975.HXL,)), b"", 6)[1], dtype="<i2")
-            value = raw * gain * ak8975.UT_PER_LSB
+            value = raw * gain * ak8975.Ak8975.ut_per_lsb
             latest = np.array([value[1], value[0], -value[2]])
         field_ut[k] = latest
     return imu, field_ut

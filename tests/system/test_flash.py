@@ -3,6 +3,7 @@
 import os
 import re
 import select
+import subprocess
 import termios
 import threading
 import tty
@@ -234,6 +235,23 @@ def test_several_boards_need_a_choice_and_a_missing_board_is_reported():
 def test_a_failed_upload_is_reported_with_its_cause(output, words):
     assert words in upload.why(output)
     assert "\n" not in upload.why(output)
+
+
+@pytest.mark.parametrize(
+    ("imu", "flags"), [("mpu9150", None), ("mpu9250", "-Wall -DRELPOS_IMU=MPU9250")]
+)
+def test_the_firmware_is_built_for_the_sensor_that_is_wired(monkeypatch, imu, flags):
+    asked = []
+
+    def run(command, **options):
+        asked.append(options["env"].get("PLATFORMIO_BUILD_FLAGS"))
+        return subprocess.CompletedProcess(command, 0, "30000 bytes of flash verified", "")
+
+    if flags:
+        monkeypatch.setenv("PLATFORMIO_BUILD_FLAGS", "-Wall")
+    monkeypatch.setattr(upload.subprocess, "run", run)
+    assert upload.upload(boards.BOARDS["uno"], "/dev/x", imu=imu) == 30000
+    assert asked == [flags]
 
 
 def test_a_missing_platformio_is_reported(tmp_path, monkeypatch):

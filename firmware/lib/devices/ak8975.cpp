@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "devices/flash.h"
+#include "devices/sensor.h"
 #include "inertial/calls.h"
 
 namespace relpos {
@@ -14,7 +15,9 @@ enum Register : uint8_t {
   kControl = 0x0A,
   kAdjustment = 0x10
 };
-enum Mode : uint8_t { kPowerDownMode = 0x00, kSingleMode = 0x01, kFuseRomMode = 0x0F };
+// The AK8963 measures with 14 bits of 0.6 uT or, as bit 4 asks and ST2 then repeats, 16 of 0.15 uT.
+constexpr uint8_t kWide = kSuccessor ? 0x10 : 0;
+enum Mode : uint8_t { kPowerDownMode = 0x00, kSingleMode = 0x01 | kWide, kFuseRomMode = 0x0F | kWide };
 
 constexpr uint8_t kIdentity = 0x48;
 constexpr uint8_t kDataReady = 0x01;     // ST1
@@ -24,7 +27,8 @@ constexpr uint8_t kMostFailures = 3;     // in a row, then set up anew
 // Readings in a row that a chip may repeat: it never repeats one while its wearer walks, and no heading
 // is needed while the wearer stands.
 constexpr uint8_t kMostRepeats = 5;
-constexpr float kUnit = 0.3f / 256.0f;   // 0.3 uT a count, adjusted by (ASA + 128) / 256
+// Microtesla a count, adjusted by (ASA + 128) / 256.
+constexpr float kUnit = (kSuccessor ? 0.15f : 0.3f) / 256.0f;
 
 // Each state's transaction: a register, and what is written to it or how many bytes are read. A table
 // and one call: a call a state would cost the Uno 140 bytes. From mode to mode only through power-down,
@@ -95,7 +99,7 @@ bool Ak8975::step(Board& board, float field_ut[3]) {
   state_ = State::kIdle;
   wait_ticks_ = kPeriodTicks - 2;
   failures_ = 0;
-  if (raw[7] != 0) {  // data error, overflow; all other bits of ST2 read as 0
+  if (raw[7] != kWide) {  // data error, overflow; all other bits of ST2 read as 0
     ++rejected_;
     return false;
   }

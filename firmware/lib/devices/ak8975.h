@@ -1,4 +1,4 @@
-// AsahiKasei AK8975: the magnetometer inside the MPU-9150, behind its bypass.
+// AsahiKasei AK8975: the magnetometer inside the MPU-9150, behind its bypass; or AK8963 (sensor.h).
 #pragma once
 
 #include <stdint.h>

@@ -2,6 +2,7 @@
 
 #include "inertial/calls.h"
 #include "devices/flash.h"
+#include "devices/sensor.h"
 
 namespace relpos {
 namespace {
@@ -11,6 +12,7 @@ enum Register : uint8_t {
   kConfig = 0x1A,
   kGyroConfig = 0x1B,
   kAccelConfig = 0x1C,
+  kAccelConfig2 = 0x1D,  // of the successors
   kIntPinConfig = 0x37,
   kIntEnable = 0x38,
   kIntStatus = 0x3A,
@@ -20,8 +22,9 @@ enum Register : uint8_t {
   kWhoAmI = 0x75
 };
 
-constexpr uint8_t kIdentity = 0x34;       // bits 6:1 of WHO_AM_I; the others are not specified
-constexpr uint8_t kIdentityMask = 0x7E;
+// Of the MPU-9150 bits 6:1 are specified; 0x71 is the MPU-9250, 0x73 the MPU-9255.
+constexpr uint8_t kIdentity = kSuccessor ? 0x71 : 0x68;
+constexpr uint8_t kIdentityMask = kSuccessor ? 0xFD : 0x7E;
 constexpr uint8_t kDataReady = 0x01;
 // Read with every sample: INT_PIN_CFG, INT_ENABLE, two more, then the sample. The first two
 // differ from their set-up where a chip has lost it, or at 0xFF, zeros or noise on the bus.
@@ -45,6 +48,9 @@ const Setting kSetup[] RELPOS_FLASH = {
     {kSampleRateDivider, 19, 1},     // 1 kHz / (1 + 19)
     {kGyroConfig, 0x10, 1},          // 1000 deg/s
     {kAccelConfig, 0x08, 1},         // 4 g
+#if RELPOS_IMU == MPU9250
+    {kAccelConfig2, 0x04, 1},        // its CONFIG filters the gyroscope alone
+#endif
     {kIntPinConfig, kPinConfig, 1},
     {kIntEnable, kDataReady, 1},
 };
@@ -81,7 +87,7 @@ Mpu9150::Event Mpu9150::step(Board& board, uint32_t now_us, uint32_t* wait_us) {
     if (position_ == 0) {
       uint8_t identity = 0;
       if (!board.read_registers(kAddress, kWhoAmI, &identity, 1)) return Event::kNothing;
-      if ((identity & kIdentityMask) >> 1 != kIdentity) return Event::kNothing;
+      if ((identity & kIdentityMask) != kIdentity) return Event::kNothing;
     }
     if (!board.write_register(kAddress, reg, flash_byte(&kSetup[position_].value))) {
       if (!fail()) *wait_us = kFailedUs;

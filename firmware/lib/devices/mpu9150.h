@@ -1,4 +1,5 @@
-// InvenSense MPU-9150: accelerometer and gyroscope at 50 Hz. Registers: MPU-9150 register map.
+// InvenSense MPU-9150: accelerometer and gyroscope at 50 Hz. Registers: MPU-9150 register map; also its
+// successors (sensor.h).
 #pragma once
 
 #include <stdint.h>

@@ -23,6 +23,13 @@ HEARD_WITHIN_S = 20.0
 first report comes a report period later."""
 
 
+class ImuName(StrEnum):
+    """An inertial sensor that the firmware is built for."""
+
+    MPU9150 = "mpu9150"
+    MPU9250 = "mpu9250"
+
+
 class BoardName(StrEnum):
     """A board that the firmware is built for."""
 
@@ -38,6 +45,9 @@ def flash(
     board: Annotated[
         BoardName | None, typer.Option(help="Refuse any other. (default: the one that answers)")
     ] = None,
+    imu: Annotated[
+        ImuName, typer.Option(help="The inertial sensor wired to it; MPU-9255: mpu9250.")
+    ] = ImuName.MPU9150,
     node_id: Annotated[
         int | None,
         typer.Option("--id", min=1, max=254, help="The node's number. (default: as it was)"),
@@ -73,7 +83,7 @@ def flash(
     if warning is not None:
         typer.echo(f"{found}: {warning}", err=True)
     with output.working("building and writing the firmware"):
-        size = upload.upload(kind, found)
+        size = upload.upload(kind, found, imu=str(imu))
     typer.echo("firmware written and verified" + (f" ({size} bytes)" if size else ""))
     if new and key_file is not None:
         write_new_key(key_file)

@@ -32,10 +32,6 @@ OVERFLOW = 0x08
 
 CONVERSION_US = 7_300
 """Typical conversion; the data sheet's most is 9 ms."""
-UT_PER_LSB = 0.3
-MOST_RAW = 4095
-OVERFLOW_UT = 2400.0
-"""Sum of the three magnitudes at which HOFL is set."""
 SELF_TEST_UT = (0.0, 0.0, -180.0)
 """Field that the self-test coil makes, in the chip's axes: inside the data sheet's window."""
 
@@ -46,6 +42,13 @@ class Ak8975(I2cDevice):
     ``accelerometer axes to chip axes``: chip x along accelerometer y, chip y along accelerometer
     x, chip z opposite to accelerometer z.
     """
+
+    ut_per_lsb = 0.3
+    most_raw = 4095
+    overflow_ut = 2400.0
+    """Sum of the three magnitudes at which HOFL is set."""
+    wide = 0
+    """The AK8963's bit for 16-bit output, in CNTL1 and ST2."""
 
     def __init__(
         self,
@@ -105,10 +108,11 @@ class Ak8975(I2cDevice):
         if self.spoil is not None:
             chip = self.spoil(chip)
         gain = (np.array(self._errors.adjustment) + 128.0) / 256.0
-        raw = np.clip(np.rint(chip / (UT_PER_LSB * gain)), -MOST_RAW - 1, MOST_RAW)
+        counts = np.rint(chip / (self.ut_per_lsb * gain))
+        raw = np.clip(counts, -self.most_raw - 1, self.most_raw)
         self._data = raw.astype("<i2").tobytes()
         self._st1 = DATA_READY
-        self._st2 = OVERFLOW if np.abs(chip).sum() >= OVERFLOW_UT else 0
+        self._st2 = OVERFLOW if np.abs(chip).sum() >= self.overflow_ut else 0
 
     def _set_mode(self, mode: int) -> None:
         if mode == POWER_DOWN:
@@ -135,9 +139,9 @@ class Ak8975(I2cDevice):
             return self._data[address - HXL]
         if address == ST2:
             value, self._st2, self._st1 = self._st2, 0, 0
-            return value
+            return value | self.wide
         if address == CNTL:
-            return self._mode
+            return self._mode | self.wide
         if address == ASTC:
             return self._astc
         if ASAX <= address < ASAX + 3 and self._mode == FUSE_ROM:
@@ -177,6 +181,23 @@ class Ak8975(I2cDevice):
     def _next(self) -> None:
         wrap = {0x0C: 0x00, 0x12: 0x10}
         self._pointer = wrap.get(self._pointer, self._pointer + 1)
+
+
+class Ak8963(Ak8975):
+    """The MPU-9250's compass: 14 bits of 0.6 uT, or 16 of 0.15 uT where bit 4 of CNTL1 is set.
+
+    Its continuous modes are not emulated.
+    """
+
+    ut_per_lsb = 0.6
+    most_raw = 8190
+    overflow_ut = 4912.0
+
+    def _write_register(self, address: int, value: int) -> None:
+        if address == CNTL:
+            self.wide = value & 0x10
+            self.ut_per_lsb, self.most_raw = (0.15, 32760) if self.wide else (0.6, 8190)
+        super()._write_register(address, value)
 
 
 class _HostSide(I2cDevice):

@@ -1,4 +1,4 @@
-"""InvenSense MPU-9150 (the MPU-6050 die) as registers, after its data sheet (docs/emulator.md).
+"""InvenSense MPU-9150 (the MPU-6050 die) and MPU-9250 as registers, after their data sheets.
 
 The chip feels :class:`Surroundings` through :class:`InertialErrors`, filters at 1 kHz as CONFIG
 says, samples at its own clock and quantises at the range that is configured at that moment, so
@@ -29,6 +29,8 @@ SMPLRT_DIV = 0x19
 CONFIG = 0x1A
 GYRO_CONFIG = 0x1B
 ACCEL_CONFIG = 0x1C
+ACCEL_CONFIG_2 = 0x1D
+"""Of the MPU-9250; on the MPU-9150 it has no function here."""
 FIFO_EN = 0x23
 I2C_MST_CTRL = 0x24
 I2C_SLV0_ADDR = 0x25
@@ -78,11 +80,15 @@ _WARM_UP_STEPS = 512
 _READ_ONLY = frozenset((*range(0x3A, 0x61), 0x72, 0x73, WHO_AM_I_REGISTER))
 
 
+Filtering = tuple[float, float, float]
+"""Bandwidths of accelerometer and gyroscope in Hz, further delay of both in seconds."""
+
+
 @cache
-def _filters(config: int) -> tuple[tuple[FloatArray, FloatArray], ...]:
-    """(b, a) of accelerometer and gyroscope for a DLPF_CFG at 1 kHz."""
+def _filters(filtering: Filtering) -> tuple[tuple[FloatArray, FloatArray], ...]:
+    """(b, a) of accelerometer and gyroscope at 1 kHz."""
     pairs = []
-    for bandwidth in (_ACCELEROMETER_BANDWIDTH_HZ[config], _GYROSCOPE_BANDWIDTH_HZ[config]):
+    for bandwidth in filtering[:2]:
         b, a = signal.butter(2, bandwidth, fs=1000.0)
         pairs.append((np.asarray(b), np.asarray(a)))
     return tuple(pairs)
@@ -110,11 +116,11 @@ class _Pipeline:
         self._walk_rng = np.random.default_rng([errors.seed, 1])
         self._walk = [np.zeros(3)]
         self._block = -1
-        self._config = -1
+        self._config: Filtering = (0.0, 0.0, 0.0)
         self._state: list[FloatArray] = []
         self._rows = np.zeros((0, 6))
 
-    def block(self, number: int, config: int) -> FloatArray:
+    def block(self, number: int, config: Filtering) -> FloatArray:
         """Filtered measurements (_BLOCK_STEPS, 6) of a block, in SI units."""
         if config == self._config and number == self._block:
             return self._rows
@@ -137,9 +143,9 @@ class _Pipeline:
         self._rows = raw
         return raw
 
-    def _raw(self, begin: int, end: int, config: int) -> FloatArray:
+    def _raw(self, begin: int, end: int, config: Filtering) -> FloatArray:
         steps = np.arange(begin, end)
-        times = np.asarray(steps * self.step_s - _EXTRA_DELAY_S[config], dtype=np.float64)
+        times = np.asarray(steps * self.step_s - config[2], dtype=np.float64)
         true = self._surroundings.inertial_at(times)
         rows: FloatArray = true @ self._gain + self._bias
         if self._sigma.any() or self._errors.gyroscope_walk_rad_s_rts:
@@ -165,6 +171,9 @@ class _Pipeline:
 
 class Mpu9150(I2cDevice):
     """The chip. ``auxiliary`` is the device behind its second bus: the magnetometer, at 0x0C."""
+
+    identity = WHO_AM_I
+    power_on_management = SLEEP
 
     def __init__(
         self,
@@ -201,8 +210,8 @@ class Mpu9150(I2cDevice):
 
     def _power_on_defaults(self) -> None:
         self._registers[:] = bytes(128)
-        self._registers[PWR_MGMT_1] = SLEEP
-        self._registers[WHO_AM_I_REGISTER] = WHO_AM_I
+        self._registers[PWR_MGMT_1] = self.power_on_management
+        self._registers[WHO_AM_I_REGISTER] = self.identity
         self._status = 0
         self._fifo = bytearray()
         self._last_popped = 0
@@ -227,7 +236,7 @@ class Mpu9150(I2cDevice):
     def _reschedule(self) -> None:
         """Configuration changed: samples are counted anew from here."""
         config = self._registers[CONFIG] & 7
-        self._config = config
+        self._config = self._filtering(config)
         fast = config in (0, 7)
         self._period = (1 + self._registers[SMPLRT_DIV]) * (1 if fast else _TICKS_PER_STEP)
         epoch = self._ticks_at(self.time_us)
@@ -237,6 +246,14 @@ class Mpu9150(I2cDevice):
         self._table: list[bytes] = []
         self._table_first = 0
         self._due_us = self._time_of(1) if self._running else 1 << 62
+
+    def _filtering(self, config: int) -> Filtering:
+        """What DLPF_CFG chooses."""
+        return (
+            _ACCELEROMETER_BANDWIDTH_HZ[config],
+            _GYROSCOPE_BANDWIDTH_HZ[config],
+            _EXTRA_DELAY_S[config],
+        )
 
     def _time_of(self, sample: int) -> int:
         """First whole microsecond at which ``sample`` is there."""
@@ -424,7 +441,7 @@ class Mpu9150(I2cDevice):
         self._registers[address] = value
         if not changed:
             return
-        if address in (SMPLRT_DIV, CONFIG, PWR_MGMT_1):
+        if address in (SMPLRT_DIV, CONFIG, ACCEL_CONFIG_2, PWR_MGMT_1):
             self._reschedule()
         elif address in (GYRO_CONFIG, ACCEL_CONFIG, PWR_MGMT_2):
             self._table = []

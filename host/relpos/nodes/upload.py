@@ -13,6 +13,8 @@ from relpos import paths
 from relpos.errors import DeviceError
 from relpos.nodes.boards import SWITCH, Board
 
+IMU = ("mpu9150", "mpu9250")
+"""Sensors that the firmware can be built for; the first by itself."""
 UPLOAD_WITHIN_S = 600.0
 """Online, PlatformIO fetches its compiler the first time."""
 _SILENT = ("not in sync", "not responding", "timeout", "getsync", "no response")
@@ -35,10 +37,11 @@ def platformio(root: Path, which: Callable[[str], str | None] = shutil.which) ->
     )
 
 
-def upload(board: Board, port: str, root: Path | None = None) -> int | None:
+def upload(board: Board, port: str, root: Path | None = None, imu: str = IMU[0]) -> int | None:
     """Build, write and verify the firmware. DeviceError with the cause where that fails.
 
-    ``root`` is the firmware's project (default: the one that came with this package).
+    ``root`` is the firmware's project (default: the one that came with this package), ``imu`` the
+    sensor that it is built for, one of :data:`IMU`.
 
     Returns the bytes that were verified, or None where the uploader does not print them.
     """
@@ -48,7 +51,7 @@ def upload(board: Board, port: str, root: Path | None = None) -> int | None:
         done = subprocess.run(
             [*command, "--upload-port", port],
             cwd=root,
-            env={**os.environ, **_environment(root)},
+            env={**os.environ, **_environment(root, imu)},
             capture_output=True,
             text=True,
             timeout=UPLOAD_WITHIN_S,
@@ -63,11 +66,18 @@ def upload(board: Board, port: str, root: Path | None = None) -> int | None:
     return int(verified[1]) if verified else None
 
 
-def _environment(root: Path) -> dict[str, str]:
-    """Return PlatformIO's build folder: in a repository its default, else in the user's cache."""
-    if root == paths.repository():
-        return {}
-    return {"PLATFORMIO_WORKSPACE_DIR": str(paths.build_folder() / "platformio")}
+def _environment(root: Path, imu: str) -> dict[str, str]:
+    """Return what PlatformIO is to know: the sensor, and its build folder.
+
+    That is in a repository its default, else in the user's cache.
+    """
+    environment = {}
+    if imu != IMU[0]:
+        flags = f"{os.environ.get('PLATFORMIO_BUILD_FLAGS', '')} -DRELPOS_IMU={imu.upper()}"
+        environment["PLATFORMIO_BUILD_FLAGS"] = flags.strip()
+    if root != paths.repository():
+        environment["PLATFORMIO_WORKSPACE_DIR"] = str(paths.build_folder() / "platformio")
+    return environment
 
 
 def why(printed: str) -> str:

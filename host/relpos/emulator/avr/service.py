@@ -17,13 +17,14 @@ import numpy as np
 
 from relpos.emulator.air import UwbModel
 from relpos.emulator.ak8975 import ADDRESS as AK8975_ADDRESS
-from relpos.emulator.ak8975 import Ak8975
+from relpos.emulator.ak8975 import Ak8963, Ak8975
 from relpos.emulator.avr.board import BoardKind
 from relpos.emulator.avr.elf import Firmware
 from relpos.emulator.avr.engine import QUANTUM_US, AvrEngine
 from relpos.emulator.bus import I2cBus
 from relpos.emulator.mpu9150 import ADDRESS as MPU9150_ADDRESS
 from relpos.emulator.mpu9150 import Mpu9150
+from relpos.emulator.mpu9250 import Mpu9250
 from relpos.emulator.pozyx import Pozyx, RangeResult
 from relpos.emulator.surroundings import (
     Surroundings,
@@ -58,8 +59,16 @@ COMMAND_PERIOD_US = 4_000_000
 class Service:
     """The board and everything around it; call ``run`` with rising virtual times."""
 
-    def __init__(self, kind: BoardKind, firmware: Firmware, seconds: float, seed: int) -> None:
-        """The same arguments give the same run to the byte."""
+    def __init__(
+        self,
+        kind: BoardKind,
+        firmware: Firmware,
+        seconds: float,
+        seed: int,
+        *,
+        successor: bool = False,
+    ) -> None:
+        """The same arguments give the same run to the byte. ``successor``: with an MPU-9250."""
         self._team, self._world = make_team("lab", TEAM, seconds + 1.0, seed)
         truth = self._team[0]
         surroundings = Surroundings(
@@ -71,8 +80,10 @@ class Service:
         )
         rng = np.random.default_rng([seed, 0xA7])
         self._air_rng = np.random.default_rng([seed, 0xA8])
-        compass = Ak8975(surroundings, draw_magnetic_errors(rng), lambda: inertial.bypassed())
-        inertial = Mpu9150(surroundings, draw_inertial_errors(rng), {AK8975_ADDRESS: compass})
+        magnetometer = Ak8963 if successor else Ak8975
+        sensor = Mpu9250 if successor else Mpu9150
+        compass = magnetometer(surroundings, draw_magnetic_errors(rng), lambda: inertial.bypassed())
+        inertial = sensor(surroundings, draw_inertial_errors(rng), {AK8975_ADDRESS: compass})
         bus = I2cBus()
         bus.attach(MPU9150_ADDRESS, inertial)
         bus.attach(AK8975_ADDRESS, compass.host_side())
