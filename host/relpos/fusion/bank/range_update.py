@@ -222,24 +222,11 @@ def _share_inlier(innovation: Lanes, s: Lanes, outlier: Floats) -> tuple[Lanes, 
 
 
 @inner
-def _add_term(block: Block, e: int, slope: Lanes, g: Floats) -> tuple[Lanes, Lanes]:
-    """Return what entry ``e`` of the state adds to a range, and to the innovation's variance.
-
-    ``g`` becomes the gain with it.
-    """
-    x, p, at_x, base, active = block
-    added = slope * (2.0 * load(g, e) + slope * load(p, base + row_place(e) + e))
-    for q in range(active):
-        store(g, q, load(g, q) + slope * load(p, base + place(e, q)))
-    return slope * load(x, at_x + e), added
-
-
-@inner
-def _add_common(
-    block: Block, users: tuple[int, int, int], bias: int, velocity: Floats,
-    sight: tuple[Lanes, Lanes, Lanes], g: Floats,
-) -> tuple[Lanes, Lanes]:  # fmt: skip
-    """Return what bias, shadow, lateness and clocks add to a range and to its variance.
+def _common_terms(
+    block: Block, users: tuple[int, int, int], velocity: Floats,
+    sight: tuple[Lanes, Lanes, Lanes], slope: Floats, entry: Indices,
+) -> None:  # fmt: skip
+    """Write the entries of what ranges have in common, and a range's slopes in them (5 lines).
 
     ``users`` are N and the two rows, ``velocity`` (4,) theirs as in :class:`Ranges`; ``sight`` is
     the direction gx, gy and whether they are apart: no range is negative, so that between two who
@@ -251,20 +238,36 @@ def _add_common(
     ci, si = lanes.cos_sin(load(block.x, block.at_x + POSE * first + 2))
     cj, sj = lanes.cos_sin(load(block.x, block.at_x + POSE * second + 2))
     nought = fill(0.0)
-    shadow = greater(nought - ux * ci - uy * si, nought) + greater(ux * cj + uy * sj, nought)
     own = ux * (ci * velocity[0] - si * velocity[1]) + uy * (si * velocity[0] + ci * velocity[1])
     peer = ux * (cj * velocity[2] - sj * velocity[3]) + uy * (sj * velocity[2] + cj * velocity[3])
     common = PER_NODE * nodes
-    clocks = common + COMMON
-    length, variance = _add_term(block, bias, seen, g)
-    more, wider = _add_term(block, common + CommonIndex.SHADOW, shadow, g)
-    length, variance = length + more, variance + wider
-    more, wider = _add_term(block, common + CommonIndex.LATENESS, own - peer, g)
-    length, variance = length + more, variance + wider
-    more, wider = _add_term(block, clocks + first, nought - peer, g)
-    length, variance = length + more, variance + wider
-    more, wider = _add_term(block, clocks + second, peer, g)
-    return length + more, variance + wider
+    store(slope, 0, seen)
+    shadow = greater(nought - ux * ci - uy * si, nought) + greater(ux * cj + uy * sj, nought)
+    entry[1] = common + CommonIndex.SHADOW
+    store(slope, 1, shadow)
+    entry[2] = common + CommonIndex.LATENESS
+    store(slope, 2, own - peer)
+    entry[3] = common + COMMON + first
+    store(slope, 3, nought - peer)
+    entry[4] = common + COMMON + second
+    store(slope, 4, peer)
+
+
+@inner
+def _add_terms(block: Block, slope: Floats, entry: Indices, g: Floats) -> tuple[Lanes, Lanes]:
+    """Return what entries of the state add to a range, and to the innovation's variance.
+
+    ``g`` becomes the gain with them.
+    """
+    x, p, at_x, base, active = block
+    length, variance = fill(0.0), fill(0.0)
+    for t in range(entry.shape[0]):
+        e, much = entry[t], load(slope, t)
+        length = length + much * load(x, at_x + e)
+        variance = variance + much * (2.0 * load(g, e) + much * load(p, base + row_place(e) + e))
+        for q in range(active):
+            store(g, q, load(g, q) + much * load(p, base + place(e, q)))
+    return length, variance
 
 
 @inner
@@ -306,6 +309,7 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
     x, p, log_weight = hypotheses.x, hypotheses.p, hypotheses.log_weight
     blocks, nodes = x.shape[0], hypotheses.sensitivity.shape[1]
     g, off = lanes.working_lines(x.shape[1]), lanes.working_lines(2 * x.shape[1])
+    slope, entry = lanes.working_lines(5), np.empty(5, dtype=np.int64)
     for b in range(blocks):
         block = block_of(x, p, b, nodes)
         biased = block.active > PER_NODE * nodes
@@ -326,10 +330,10 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
             innovation = ranges.range_m[r] - m
             if biased and ranges.bias[r] >= 0:
                 seen = select(m * m > FAR * variance, fill(1.0), fill(0.0))
-                length, added = _add_common(
-                    block, (nodes, first, second), ranges.bias[r], ranges.velocity_m_s[r],
-                    (gx, gy, seen), g,
-                )  # fmt: skip
+                users, sight = (nodes, first, second), (gx, gy, seen)
+                entry[0] = ranges.bias[r]
+                _common_terms(block, users, ranges.velocity_m_s[r], sight, slope, entry)
+                length, added = _add_terms(block, slope, entry, g)
                 innovation = innovation - length
                 v = v + added
             s = v + variance
@@ -347,9 +351,9 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
             store(stats, at + INLIER * blocks, inlier)
             store(stats, at + RANGE_SHARE * blocks, variance)
             store(stats, at + CURVATURE * blocks, curvature)
-            users = (b * nodes + first, b * nodes + second)
-            _carry_sensitivities(hypotheses.sensitivity, stats, at, users, (i, j), (gx, gy, kf), g)
-            for user, pose in ((users[0], i), (users[1], j)):
+            rows = (b * nodes + first, b * nodes + second)
+            _carry_sensitivities(hypotheses.sensitivity, stats, at, rows, (i, j), (gx, gy, kf), g)
+            for user, pose in ((rows[0], i), (rows[1], j)):
                 _bound_sensitivity(
                     hypotheses.sensitivity, 18 * user, p, block.base, pose, model.outlier[3]
                 )
