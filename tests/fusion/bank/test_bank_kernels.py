@@ -85,7 +85,7 @@ def advanced(x: Floats, p: Floats, motion: Floats, component: Floats, drawn: Flo
 def updated(x: Floats, p: Floats, measured: float, dz: float, outlier: tuple[float, ...]) -> Floats:
     ranges = Ranges(
         np.array([0]), np.array([2]), np.array([measured]), np.array([dz]), np.zeros(1),
-        np.ones(1), np.array([-1]), np.zeros((1, 4)),
+        np.ones(1), np.array([-1]), np.zeros((1, 4)), np.array([outlier[0]]),
     )  # fmt: skip
     model = RangeModel(np.array([*outlier, 1.0, 9.0]), np.zeros((0, 2)))
     with Packed(x, p) as packed:
@@ -327,7 +327,7 @@ def test_variance_components_are_learned_from_innovations_and_their_uncertainty_
             measured = rng.normal() * np.sqrt((parts * np.exp(truth)).sum())
             ranges = Ranges(
                 np.array([0]), np.array([1]), np.array([measured]), np.zeros(1), np.zeros(1),
-                np.ones(1), np.array([-1]), np.zeros((1, 4)),
+                np.ones(1), np.array([-1]), np.zeros((1, 4)), np.zeros(1),
             )  # fmt: skip
             components.learn(known.mean, known.covariance, ranges, stats, np.zeros(1), np.ones(1))
         errors.append(known.mean - truth)

@@ -145,12 +145,14 @@ class BankCore:
         dz_variance_m2: Floats | None = None,
         sample_count: Floats | None = None,
         velocity_m_s: Floats | None = None,
+        outlier_share: Floats | None = None,
     ) -> Floats:
         """Update with the ranges (R,) of one instant; return each one's inlier probability.
 
         ``dz_m`` are the antennas' differences of height, ``dz_variance_m2`` their variances (0
         by default), ``sample_count`` how many independent ranges each counts as (1 by default),
-        ``velocity_m_s`` (R, 4) those of the first and of the second, forward and left (0).
+        ``velocity_m_s`` (R, 4) those of the first and of the second, forward and left (0),
+        ``outlier_share`` the least probability of being an outlier (0).
         """
         several, these = len(first), self.hypotheses
         variance = np.zeros(several) if dz_variance_m2 is None else dz_variance_m2
@@ -158,12 +160,13 @@ class BankCore:
         self._check(first, second, range_m, dz_m, variance, counts)
         biases = these.bias_entries(first, second)
         velocity = np.zeros((several, 4)) if velocity_m_s is None else velocity_m_s
-        ranges = Ranges(first, second, range_m, dz_m, variance, counts, biases, velocity)
         outlier, known = self._sensors.model.outlier, self._sensors
+        usual = np.full(several, sensors.expect_outliers(known.outlier_counts, outlier))
+        shares = usual if outlier_share is None else np.maximum(usual, outlier_share)
+        ranges = Ranges(first, second, range_m, dz_m, variance, counts, biases, velocity, shares)
         outlier[3] = 1.0 / (1.0 - these.sampled_share)
         wary = self.relocalisation.since_fault <= OPEN_UPDATES and self.counters["slips"] > 0
         before = these.log_weight.copy()
-        sensors.expect_outliers(known.outlier_counts, outlier)
         stats = lanes.empty_lines(several, range_update.STATS, len(these.arrays.x))
         range_update.update(these.arrays, ranges, known.model, stats)
         inlier, fault, clamped = sensors.learn(

@@ -34,7 +34,7 @@ from relpos.fusion.models.detection import Detection
 from relpos.fusion.models.motion import reported_sigmas
 from relpos.fusion.models.north import North
 from relpos.fusion.models.odometry_faults import LOST_RAD, VAGUE_M, SpeedGate, ZeroMotionDetector
-from relpos.fusion.models.ranging import Mounting, RangeCorrelation
+from relpos.fusion.models.ranging import Mounting, OutlierPersistence, RangeCorrelation
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.measurements import Heading, Height, Prior, Range, nodes_of
@@ -74,6 +74,7 @@ class Bank:
     core: BankCore = field(init=False)
     detection: Detection = field(default_factory=Detection)
     range_correlation: RangeCorrelation = field(default_factory=RangeCorrelation)
+    outliers: OutlierPersistence = field(default_factory=OutlierPersistence)
     speed_gate: SpeedGate = field(default_factory=SpeedGate)
     zero_motion: ZeroMotionDetector = field(default_factory=ZeroMotionDetector)
     north: North = field(default_factory=North)
@@ -255,7 +256,11 @@ class Bank:
             velocity = [
                 self._velocity_at(a, time_s) + self._velocity_at(b, time_s) for a, b in pairs
             ]
-            self.core.update(first, second, measured, dz, variance, counts, np.array(velocity))
+            shares = self.outliers.shares(time_s, pairs)
+            inlier = self.core.update(
+                first, second, measured, dz, variance, counts, np.array(velocity), shares
+            )
+            self.outliers.learn(time_s, pairs, inlier)
             self._ranges_used += len(ranges)
         for attempts in rounds:
             self.core.update_detection(attempts, self.detection)

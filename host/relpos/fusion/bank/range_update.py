@@ -71,6 +71,8 @@ class Ranges(NamedTuple):
     """Entry of the state that holds the range's bias, or -1."""
     velocity_m_s: Floats
     """(R, 4): of the first, forward and left, and of the second; no motion is 0."""
+    outlier_share: Floats
+    """Probability of being an outlier (R,)."""
 
 
 class RangeModel(NamedTuple):
@@ -207,9 +209,11 @@ def _bound_sensitivity(sens: Floats, t: int, p: Floats, base: int, b: int, most:
 
 
 @inner
-def _share_inlier(innovation: Lanes, s: Lanes, outlier: Floats) -> tuple[Lanes, Lanes]:
+def _share_inlier(
+    innovation: Lanes, s: Lanes, share: float, outlier: Floats
+) -> tuple[Lanes, Lanes]:
     """Return an innovation's inlier probability and log evidence; ``s`` is its variance."""
-    share, wide, short = outlier[0], outlier[1], outlier[2]
+    wide, short = outlier[1], outlier[2]
     square = innovation * innovation
     per_sd = 1.0 / lanes.sqrt(s)
     good = (1.0 - share) * lanes.exp(-0.5 * square * per_sd * per_sd) * per_sd
@@ -337,7 +341,7 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
                 innovation = innovation - length
                 v = v + added
             s = v + variance
-            inlier, evidence = _share_inlier(innovation, s, model.outlier)
+            inlier, evidence = _share_inlier(innovation, s, ranges.outlier_share[r], model.outlier)
             count = ranges.sample_count[r]
             total = total + count * evidence
             per_heavy = 1.0 / (v + variance * (1.0 / count))
