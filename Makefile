@@ -61,8 +61,8 @@ firmware-tests: $(DEVELOP) | system-avr ## the C++ suites alone: here, under san
 	tools/pio test -e native -e native_sanitized -e uno_sim
 
 board-builds: $(DEVELOP) | system-avr
-	$(call title,Firmware for both boards)
-	tools/pio run -e uno -e megaatmega2560
+	$(call title,Firmware for both boards and both sensors)
+	tools/pio run -e uno -e megaatmega2560 -e uno_mpu9250
 
 coverage: $(DEVELOP) | system-avr system-browser ## share of lines that tests reach: firmware/lib, host/relpos
 	$(call title,Firmware suites on this computer, line by line)
@@ -83,7 +83,7 @@ soak: board-builds $(FUZZ) | system-soak ## fuzzing and whatever else takes long
 	$(call title,Long runs)
 	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist worksteal -m soak -rP
 
-firmware: board-builds ## both boards: flash, RAM, cycles, beside Mahony and Madgwick
+firmware: board-builds ## both boards and sensors: flash, RAM, cycles, beside Mahony and Madgwick
 	$(call title,Budget: cycles and stack on simavr)
 	$(PYTHON) -m relpos.emulator.avr.budget --seconds 100 --filters
 

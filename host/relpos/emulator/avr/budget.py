@@ -32,7 +32,9 @@ from relpos.errors import RelposError
 
 TICK_CYCLES = 320_000
 """One 50 Hz tick at 16 MHz."""
-ENVIRONMENTS = {"uno": "uno", "mega": "megaatmega2560"}
+SUCCESSOR = "uno-mpu9250"
+"""The Uno with firmware for the MPU-9150's successors."""
+ENVIRONMENTS = {"uno": "uno", "mega": "megaatmega2560", SUCCESSOR: "uno_mpu9250"}
 STEP_US = 250_000
 
 
@@ -53,6 +55,7 @@ BUDGETS = {
     # The Mega holds the same firmware: its own limits less its boot loader and the same reserve.
     "mega": Budget(248 * 1024, 8192 - (2048 - 1920), 0.45, 0.25),
 }
+BUDGETS[SUCCESSOR] = BUDGETS["uno"]
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,8 @@ def measure(
 ) -> Cost:
     """Run the firmware for so many seconds of normal service and measure what it takes."""
     firmware = read_firmware(elf)
-    with Service(BOARDS[board], firmware, seconds, seed) as service:
+    kind = BOARDS[board.partition("-")[0]]
+    with Service(kind, firmware, seconds, seed, successor=board == SUCCESSOR) as service:
         until_us = 0
         while until_us < seconds * 1e6:
             until_us = min(until_us + STEP_US, round(seconds * 1e6))
@@ -151,7 +155,7 @@ def measure(
         ticks=counters.ticks,
         mean_tick_cycles=mean,
         worst_tick_cycles=worst,
-        worst_tick_at_s=counters.worst_tick_at_cycle / BOARDS[board].frequency_hz,
+        worst_tick_at_s=counters.worst_tick_at_cycle / kind.frequency_hz,
         work=work,
         faults=tuple(past),
     )
@@ -232,7 +236,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m relpos.emulator.avr.budget", description=__doc__
     )
-    parser.add_argument("--board", action="append", choices=sorted(BOARDS), help="default: both")
+    parser.add_argument("--board", action="append", choices=sorted(BUDGETS), help="default: all")
     parser.add_argument(
         "--seconds", type=float, default=60.0, help="length of the walk (default 60)"
     )
@@ -242,7 +246,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--filters", action="store_true", help="the plan of the RAM, and filters alone on the chip"
     )
     given = parser.parse_args(arguments)
-    boards: list[str] = given.board or list(BOARDS)
+    boards: list[str] = given.board or list(BUDGETS)
     folder: Path = given.build or default_build_folder()
     try:
         if not 5.0 <= given.seconds <= 3600.0:
