@@ -146,13 +146,13 @@ Observation = Motion | Range | Height | Heading | Status | Event | Step
 
 BOUNDS: Mapping[str, tuple[float, float]] = {
     "time_s": (-86_400.0, 604_800.0),
-    "dx_m": (-1e4, 1e4),
-    "dy_m": (-1e4, 1e4),
+    "dx_m": (-1e3, 1e3),
+    "dy_m": (-1e3, 1e3),
     "dtheta_rad": (-1e4, 1e4),
-    "sigma_x_m": (0.0, 1e6),
-    "sigma_y_m": (0.0, 1e6),
+    "sigma_x_m": (0.0, 2e3),
+    "sigma_y_m": (0.0, 2e3),
     "sigma_theta_rad": (0.0, 1e3),
-    "sigma_x_alone_m": (0.0, 1e6),
+    "sigma_x_alone_m": (0.0, 2e3),
     "range_m": (-1e4, 1e4),
     "rss_dbm": (-1e3, 1e3),
     "height_m": (-1e4, 1e4),
@@ -176,6 +176,9 @@ files refuse what is beyond, estimators count it (``beyond_bounds``); docs/run-f
 """
 
 
+LEAST_SIGMA = 1e-6
+"""Least standard deviation (m, rad) of a measurement above 0, which means that it is not stated."""
+
 _bounded_fields: dict[type, tuple[tuple[str, float, float], ...]] = {}
 
 
@@ -187,7 +190,9 @@ def out_of_bounds(row: Observation | Truth) -> str | None:
         _bounded_fields[kind] = tuple((name, *BOUNDS[name]) for name in names if name in BOUNDS)
     for name, low, high in _bounded_fields[kind]:
         value = getattr(row, name)
-        if value is not None and not isinstance(value, str) and not low <= value <= high:
+        if value is None or isinstance(value, str):
+            continue
+        if not low <= value <= high or (0.0 < value < LEAST_SIGMA and name.startswith("sigma")):
             return name
     return None
 

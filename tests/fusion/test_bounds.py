@@ -38,6 +38,9 @@ def test_a_value_beyond_its_bounds_is_refused_and_one_at_them_is_not(row, name):
         assert refusal(replace(row, **{name: beyond})) == "beyond_bounds"
     assert out_of_bounds(replace(row, **{name: low})) is None
     assert out_of_bounds(replace(row, **{name: high})) is None
+    if name.startswith("sigma"):
+        assert refusal(replace(row, **{name: 1e-300})) == "beyond_bounds"
+        assert refusal(replace(row, **{name: 1e-6})) is None
     for none in (math.nan, math.inf, -math.inf):
         with pytest.raises(DataError, match="not a finite number"):
             refusal(replace(row, **{name: none}))

@@ -16,7 +16,7 @@ from relpos.link import port as serial_port
 from relpos.link import xbee
 from relpos.link.clock import NodeClock
 from relpos.link.decoder import Decoder
-from relpos.measurements import Heading, Height, Motion, Range, Status
+from relpos.measurements import Heading, Height, Motion, Range, Status, out_of_bounds
 from relpos.protocol import messages as wire
 
 MOTION_ZERO = dict.fromkeys(wire.MOTION.field, 0)
@@ -267,6 +267,14 @@ def test_a_restart_widens_the_next_motion_by_what_a_person_can_do_meanwhile_and_
     assert widened.sigma_theta_rad == pytest.approx(0.5 * math.sqrt(4.0))
     (after,) = motions(decoder.feed(motion_frame(1025, boot=5, time_s=2), 105.0))
     assert after.sigma_y_m == 0.0
+
+
+def test_a_restart_after_days_widens_within_the_bounds_of_a_motion():
+    decoder = Decoder()
+    decoder.feed(motion_frame(7, boot=4, time_s=100), 100.0)
+    (motion,) = motions(decoder.feed(motion_frame(1024, boot=5, time_s=1), 500_000.0))
+    assert out_of_bounds(motion) is None
+    assert motion.sigma_x_m == pytest.approx(900.0)
 
 
 def test_a_restart_before_the_first_motion_widens_nothing():

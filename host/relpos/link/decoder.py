@@ -25,6 +25,8 @@ UNSEEN_SPEED_M_S = 1.5
 UNSEEN_TURN_RAD_S_SQRT = 0.5
 """Possible motion of a wearer while the node restarts: brisk walking (Bohannon 1997: 1.3 to
 1.5 m/s), and turning as a random walk that loses the heading after some ten seconds."""
+UNSEEN_S = 600.0
+"""After a longer silence nobody is further away and still in reach of the radio."""
 MAX_KEPT = 10_000
 """Answers and raw samples stored until they are fetched: half an hour of one node's samples."""
 FOREIGN_BEFORE_REMARK = 5
@@ -268,13 +270,14 @@ class Decoder:
 
         The height goes on from the last one: the wearer does not fly while the node restarts.
         """
+        silence_s = min(arrival_s - track.arrival_s, UNSEEN_S)
         return NodeTrack(
             frame.boot,
             window=window,
             counts=track.counts,
             arrival_s=arrival_s,
             motion_s=track.motion_s,
-            unseen_s=arrival_s - track.arrival_s if track.totals is not None else 0.0,
+            unseen_s=silence_s if track.totals is not None else 0.0,
             height_m=track.height_m,
             restart_height_m=track.height_m,
         )

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from relpos.errors import DataError
-from relpos.measurements import BOUNDS
+from relpos.measurements import BOUNDS, LEAST_SIGMA
 
 MOST_LINE_BYTES = 64 << 20
 """A GeoJSON file is one line."""
@@ -81,6 +81,8 @@ def bounded(name: str) -> Parser:
 def within_bounds(name: str, value: float) -> float:
     """Return the value of the quantity ``name``; ValueError where it is beyond its bounds."""
     low, high = BOUNDS.get(name, (-math.inf, math.inf))
+    if name.startswith("sigma") and 0.0 < value < LEAST_SIGMA:
+        raise ValueError(f"is less than {LEAST_SIGMA:g}, and not 0")
     if low <= value <= high:
         return value
     if low == 0.0 and value < 0.0:
