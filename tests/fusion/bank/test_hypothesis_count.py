@@ -55,7 +55,7 @@ def test_a_good_team_is_followed_by_one_hypothesis_and_as_well() -> None:
         alone.append(np.mean(np.array(counts) == 1))
         assert bank.counters()["hypotheses_shrunk"] >= len(hypothesis_count.STEPS)
         # 0.109 m with 200 throughout (600 s, seed 0).
-        assert figures.relative_distance_rmse_m < 0.125
+        assert figures.relative_distance_rmse_m < 0.135
     # When that is certain differs: after 197 to 393 s on four seeds.
     assert np.mean(alone) > 0.15
 

@@ -12,6 +12,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from statistics import median
 
 import numpy as np
 import numpy.typing as npt
@@ -425,12 +426,14 @@ class Bank:
         lateness = these.common_entry(CommonIndex.LATENESS)
         sigma_s = math.sqrt(max(float(covariance[lateness, lateness]), 0.0))
         offset_s, sigmas_s = these.clock_offsets(mean, covariance)
-        usual_s = float(np.median(offset_s)) if rows else 0.0
+        usual_s = median(offset_s.tolist()) if rows else 0.0
         offsets = {n: (offset_s[row] - usual_s, sigmas_s[row]) for n, row in rows.items()}
         late_s, steps = self.clocks.slew(duration_s, (float(mean[lateness]), sigma_s), offsets)
-        these.shift_common(lateness, -late_s)
-        for node, step_s in steps.items():
-            these.shift_common(these.clock_entry(rows[node]), -step_s)
+        steps_s = {lateness: late_s}
+        steps_s |= {these.clock_entry(rows[node]): step_s for node, step_s in steps.items()}
+        for entry, step_s in steps_s.items():
+            if step_s != 0.0:
+                these.shift_common(entry, -step_s)
         # Otherwise whatever is dated back would come late.
         timeline.reorder_s = self.settings.reorder_s + self.clocks.longest_s
 

@@ -169,18 +169,20 @@ class Report:
             )
 
         shadow, (lateness, sigma) = learned(CommonIndex.SHADOW), learned(CommonIndex.LATENESS)
+        late = lateness + clocks.lateness_s, sigma
         offsets, sigmas = these.clock_offsets(self.mean, self.covariance)
-        offset = {n: offsets[self.row[n]] + clocks.offset_s.get(n, 0.0) for n in nodes}
+        offset = {n: float(offsets[self.row[n]]) + clocks.offset_s.get(n, 0.0) for n in nodes}
         # Ranges say how clocks differ, and most are right.
         usual = median(offset.values())
-        rows = []
+        parameters = []
         for node in nodes:
-            rows += [
-                (node, "body_shadow_m", *shadow),
-                (node, "range_lateness_s", lateness + clocks.lateness_s, sigma),
-                (node, "clock_offset_s", offset[node] - usual, float(sigmas[self.row[node]])),
+            own = offset[node] - usual, float(sigmas[self.row[node]])
+            parameters += [
+                Parameter(self.time_s, node, None, "body_shadow_m", *shadow),
+                Parameter(self.time_s, node, None, "range_lateness_s", *late),
+                Parameter(self.time_s, node, None, "clock_offset_s", *own),
             ]
-        return [Parameter(self.time_s, node, None, *figures) for node, *figures in rows]
+        return parameters
 
     def _pairs(self) -> list[PairEstimate]:
         nodes = sorted(self.row)
