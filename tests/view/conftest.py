@@ -1,4 +1,4 @@
-"""One browser for all of these tests, and pages that are watched while they are open."""
+"""One browser for each file of these tests, and pages that are watched while they are open."""
 
 from __future__ import annotations
 
@@ -15,9 +15,12 @@ from walking_team import WalkingTeam
 expect.set_options(timeout=60_000)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """The system's Chromium; skipped where there is none."""
+    """The system's Chromium; skipped where there is none.
+
+    Playwright's event loop goes on until it is closed: tests of other files need their own.
+    """
     if chromium() is None:
         pytest.skip(NO_BROWSER)
     with sync_playwright() as playwright, browser_of(playwright) as started:
