@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.bank import lanes
-from relpos.fusion.bank.lanes import LANES, Lanes, fill, greater, load, store
+from relpos.fusion.bank.lanes import Lanes, fill, greater, load, store
 from relpos.fusion.bank.storage import PER_NODE, POSE, Hypotheses, block_of, place, row_place
 from relpos.fusion.compiled import compiled, inner
 
@@ -275,12 +275,3 @@ def full(entries: Floats) -> Floats:
     s = np.zeros((RIGID, RIGID))
     s[np.tril_indices(RIGID)] = entries
     return s + np.tril(s, -1).T
-
-
-def lay_out_motion(motion: Floats, blocks: int) -> Floats:
-    """Lay out rigid motions (K, 3) as (B, 3, LANES)."""
-    laid = np.zeros((blocks * LANES, RIGID))
-    laid[: len(motion)] = motion
-    lined = lanes.empty_lines(blocks, RIGID)
-    lined[...] = laid.reshape(blocks, LANES, RIGID).transpose(0, 2, 1)
-    return lined

@@ -410,7 +410,7 @@ class Bank:
         mean, covariance, common = self.core.moments()
         self.core.relocalisation.end_ambiguity(covariance)
         report = Report(
-            time_s, self._row, self._known, self.core, mean, covariance, common,
+            time_s, self._row, self._known, self.core, mean, covariance, covariance + common,
             self.initialiser, self.detection, self.clocks,
         )  # fmt: skip
         estimate = report.estimate(self.north.known())

@@ -198,8 +198,7 @@ class HypothesisSet:
         motion = off @ gain.T
         motion -= weight @ motion
         if self.count > 1:
-            laid = common_rotation.lay_out_motion(motion, blocks)
-            common_rotation.align(self.arrays, middle, laid)
+            common_rotation.align(self.arrays, middle, storage.lay_out(motion))
         between = np.einsum("k,ki,kj->ij", weight, motion, motion)
         self.common += common_rotation.about_origin(own + between, *middle)
         return self.moments(poses_alone=True)

@@ -58,8 +58,8 @@ class Report:
     mean: Floats
     covariance: Floats
     """Moments of the mixture, (D,) and (D, D), without the team's rigid motion."""
-    common: Floats
-    """What that adds to the covariance (D, D)."""
+    world_covariance: Floats
+    """As ``covariance``, with it (D, D)."""
     initialiser: Initialiser
     detection: Detection
     clocks: Clocks
@@ -122,7 +122,7 @@ class Report:
             status = NodeStatus.AMBIGUOUS
         at = PER_NODE * row
         x, y, heading = self.mean[at : at + 3].tolist()
-        own = (self.covariance + self.common)[at : at + 3, at : at + 3].tolist()
+        own = self.world_covariance[at : at + 3, at : at + 3].tolist()
         return NodeEstimate(
             node, x, y, math.remainder(heading, math.tau), own[0][0], own[1][1], own[0][1],
             min(math.sqrt(own[2][2]), ANY_ANGLE_RAD), status, presence.height_m,
@@ -187,7 +187,7 @@ class Report:
     def _pairs(self) -> list[PairEstimate]:
         nodes = sorted(self.row)
         rows = np.array([self.row[node] for node in nodes], dtype=np.int64)
-        bearings = mixture_kernels.bearings(self.mean, self.covariance + self.common, rows)
+        bearings = mixture_kernels.bearings(self.mean, self.world_covariance, rows)
         first, second = (rows[k] for k in np.triu_indices(len(rows), 1))
         distances = self.core.predicted_ranges(first, second, np.zeros(len(first)))
         # Two on one spot, known exactly, are 0 m apart, whatever was added to divide by.
@@ -247,7 +247,7 @@ class Report:
         for i, node in enumerate(located, sought):
             at = PER_NODE * self.row[node]
             poses[:, i] = self.mean[at : at + 3]
-            spread[:, i] = (self.covariance + self.common)[at : at + 2, at : at + 2]
+            spread[:, i] = self.world_covariance[at : at + 2, at : at + 2]
         return nodes, poses, spread
 
     def _sought_pairs(self, mixture: PoseMixture) -> list[PairEstimate]:
