@@ -168,10 +168,13 @@ RELPOS_UNCLONED bool Xbee::finish() {
     return false;
   }
   part_ = Part::kNone;
-  if (type_ == kTransmitStatus) {
-    if (payload_[0] == frame_id_ && payload_[1] == 0) undelivered_ = false;
+  if (is_payload(type_)) return true;
+  if (type_ != kTransmitStatus) {
+    ++bad_frames_;  // asked for by nobody: the module reports its own restart
+  } else if (payload_[0] == frame_id_ && payload_[1] == 0) {
+    undelivered_ = false;
   }
-  return is_payload(type_);
+  return false;
 }
 
 }  // namespace relpos

@@ -221,8 +221,8 @@ void Node::run_imu(uint32_t now_us) {
     tick(now_us);
     const uint32_t took_us = board_.now_us() - start_us;
     board_.mark(0);
-    if (took_us > worst_tick_us_) {
-      worst_tick_us_ = took_us > 0xFFFF ? 0xFFFF : static_cast<uint16_t>(took_us);
+    if (took_us > work_.worst_tick_us) {
+      work_.worst_tick_us = took_us > 0xFFFF ? 0xFFFF : static_cast<uint16_t>(took_us);
     }
   }
   // A new set-up closes and opens the bypass: the magnetometer has to be found again.
@@ -237,7 +237,7 @@ RELPOS_APART void Node::tick(uint32_t now_us) {
   uint32_t step_us = sample_clock_.step_us(now_us);
   if (sampled_ && step_us > SampleClock::kGapUs) {
     const uint32_t missed = (step_us + SampleClock::kNominalUs / 2) / SampleClock::kNominalUs - 1;
-    missed_ticks_ = static_cast<uint16_t>(missed_ticks_ + missed);
+    work_.missed_ticks = static_cast<uint16_t>(work_.missed_ticks + missed);
     quality_ |= flag(wire::Quality::kImuGap);
     if (step_us > kMostStepUs) {
       totals_.rebase(dead_reckoning_.displacement(), static_cast<float>(step_us) * 1e-6f);
@@ -294,7 +294,7 @@ void Node::note_step() {
   PendingStep step;
   step.time_ms = static_cast<uint16_t>(clock_.ms() - age_ms);
   step.length_mm = static_cast<uint16_t>(scaled(now.last_step_length_m, 1000));
-  if (!steps_.push(step)) ++dropped_steps_;
+  if (!steps_.push(step)) ++lost_.dropped_steps;
 }
 
 // ---- ranging ----
@@ -307,15 +307,15 @@ RELPOS_SHARED void Node::run_ranging(uint32_t now_us) {
   } else if (pozyx_.step(board_, now_us, &wait, &result) == Pozyx::Event::kDone) {
     plan_.done(result.success);
     if (result.success) {
-      ++ranging_successes_;
+      ++work_.ranging_successes;
       PendingRange pending;
       pending.time_ms = clock_.ms();
       pending.range_mm = result.range_mm;
       pending.rss_dbm = result.rss_dbm;
       pending.peer = result.peer;
-      if (raw_reports_ != 0 || !ranges_.push(pending)) ++dropped_ranges_;
+      if (raw_reports_ != 0 || !ranges_.push(pending)) ++lost_.dropped_ranges;
     } else {
-      ++ranging_failures_;
+      ++work_.ranging_failures;
       ranging_error_ = result.error;
     }
     wait = 0;
@@ -352,7 +352,7 @@ RELPOS_APART void Node::receive_packet() {
   wire::Header header;
   const wire::FrameStatus status = wire::open(frame, length, key_, &header);
   if (status != wire::FrameStatus::kGood) {
-    ++*(status == wire::FrameStatus::kBadTag ? &refused_frames_ : &bad_frames_);
+    ++*(status == wire::FrameStatus::kBadTag ? &lost_.refused_frames : &bad_frames_);
     return;
   }
   if (header.node != id_ && header.node != wire::kBroadcast) return;
@@ -363,7 +363,7 @@ RELPOS_APART void Node::receive_packet() {
   }
   uint32_t* mark = beacon ? &beacon_mark_ : &marks_.command;
   if (header.counter <= *mark) {
-    ++refused_frames_;
+    ++lost_.refused_frames;
     return;
   }
   *mark = header.counter;
@@ -428,6 +428,9 @@ wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_forc
   if (code >= wire::CommandCode::kSetRawReports && code <= wire::CommandCode::kReadCalibration) {
     return apply_calibration(code, value, in_force);
   }
+  if (code == wire::CommandCode::kAccessBus) {
+    return access_bus(reinterpret_cast<uint8_t*>(in_force));
+  }
   if (code == wire::CommandCode::kRestoreDefaults) {
     Storage::restore_defaults(&settings_);
     store_.save(Record::kSettings);
@@ -475,6 +478,22 @@ wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_forc
   if (code == wire::CommandCode::kSetStatusPeriodMs) status_ms_ = now_ms();
   if (settings_.step_reports == 0) steps_.clear();
   return wire::CommandResult::kDone;
+}
+
+// One transaction, for `relpos node check`. The value's bytes are address, register, a parameter, and how
+// many are written (low half) and read; then the last two that were read, and how long it took.
+wire::CommandResult Node::access_bus(uint8_t* bytes) {
+  uint8_t answer[17] = {};
+  const uint8_t counts = bytes[3];
+  bytes[3] = 0;  // a Pozyx's peer has two bytes
+  uint8_t* last = answer + (counts >> 4);
+  const uint16_t start_us = static_cast<uint16_t>(board_.now_us());
+  const BusStatus status =
+      board_.transfer(bytes[0], bytes + 1, counts & 3, nullptr, 0, answer + 2, counts >> 4);
+  const uint16_t took_us = static_cast<uint16_t>(board_.now_us()) - start_us;
+  memcpy(bytes, last, 2);
+  memcpy(bytes + 2, &took_us, 2);
+  return status == BusStatus::kOk ? wire::CommandResult::kDone : wire::CommandResult::kNoAnswer;
 }
 
 RELPOS_APART void Node::report_raw(uint16_t reports) {
@@ -550,7 +569,7 @@ bool Node::radio_free() {
   if (!awaiting_status_) return true;
   if (static_cast<uint16_t>(now_ms() - sent_ms_) < kTransmitStatusMs) return false;
   awaiting_status_ = false;
-  ++radio_failures_;
+  ++lost_.radio_failures;
   return true;
 }
 
@@ -579,7 +598,7 @@ RELPOS_APART bool Node::send_next() {
 
 void Node::send(wire::MessageType type, uint8_t body_bytes) {
   if (body_bytes == 0) {  // a value out of its range: nothing is better than something wrong
-    ++radio_failures_;
+    ++lost_.radio_failures;
     return;
   }
   wire::Header header;
@@ -635,7 +654,7 @@ uint8_t Node::fill_ranges(uint8_t* body) {
     const PendingRange pending = ranges_.pop();
     const uint32_t age_ms = message.time_ms - pending.time_ms;
     if (age_ms > 0xFFFF) {
-      ++dropped_ranges_;
+      ++lost_.dropped_ranges;
       continue;
     }
     wire::RangeEntry& entry = message.entries[message.count++];
@@ -661,20 +680,19 @@ uint8_t Node::fill_status(uint8_t* body) {
   status.battery_mv = board_.supply_mv();
   supply_low_ = static_cast<uint16_t>(status.battery_mv - 1) < kSupplyLowMv - 1;  // 0: not measured
   status.bus_errors = board_.bus_errors();
-  status.ranging_successes = ranging_successes_;
-  status.ranging_failures = ranging_failures_;
-  status.worst_tick_us = worst_tick_us_;
-  status.missed_ticks = missed_ticks_;
+  static_assert(offsetof(wire::Status, missed_ticks) - offsetof(wire::Status, ranging_successes) ==
+                        sizeof work_ - sizeof work_.missed_ticks &&
+                    offsetof(wire::Status, refused_frames) - offsetof(wire::Status, dropped_ranges) ==
+                        sizeof lost_ - sizeof lost_.refused_frames,
+                "counters in the message's order");
+  memcpy(&status.ranging_successes, &work_, sizeof work_);
+  memcpy(&status.dropped_ranges, &lost_, sizeof lost_);
   status.free_stack_bytes = board_.free_stack();
   status.bad_frames = static_cast<uint16_t>(bad_frames_ + xbee_.bad_frames());
-  status.dropped_ranges = dropped_ranges_;
-  status.dropped_steps = dropped_steps_;
   const UartErrors uart = board_.uart_errors();
   status.damaged_bytes = uart.damaged;
   status.lost_bytes = uart.lost;
   status.ranging_error = ranging_error_;
-  status.radio_failures = radio_failures_;
-  status.refused_frames = refused_frames_;
   status.range_offset_mm = settings_.range_offset_mm;
   uint8_t health = 0;
   if (!imu_silent()) health |= flag(wire::Health::kImu);
@@ -689,7 +707,7 @@ uint8_t Node::fill_status(uint8_t* body) {
     if (byte != 0) health |= flag(wire::Health::kKeySet);
   }
   status.health = health;
-  worst_tick_us_ = 0;
+  work_.worst_tick_us = 0;
   return wire::encode(status, body);
 }
 

@@ -67,8 +67,6 @@ struct NodeState : Persistent {
   uint32_t last_field_ms_;
   uint32_t updates_;  // of the dead reckoning since its reset
   uint16_t seen_steps_;
-  uint16_t missed_ticks_;
-  uint16_t worst_tick_us_;
   uint8_t quality_;  // gathered since the last motion message
   bool field_seen_;
   bool sampled_;  // ever
@@ -76,10 +74,13 @@ struct NodeState : Persistent {
   RangingPlan plan_;
   Barometer barometer_;
   uint16_t looked_ms_;  // at the Pozyx between exchanges
-  uint16_t ranging_successes_;
-  uint16_t ranging_failures_;
-  uint16_t dropped_ranges_;
-  uint16_t dropped_steps_;
+  // In the order of the status, which copies each as one.
+  struct {
+    uint16_t ranging_successes, ranging_failures, worst_tick_us, missed_ticks;
+  } work_;
+  struct {
+    uint16_t dropped_ranges, dropped_steps, radio_failures, refused_frames;
+  } lost_;
   uint8_t ranging_error_;  // of the newest exchange that failed
   uint16_t raw_ms_;  // of the last report, low bits as in the next ones
   uint16_t raw_reports_;  // still to be sent
@@ -91,8 +92,6 @@ struct NodeState : Persistent {
   uint32_t counter_;      // of the next frame
   uint32_t beacon_mark_;  // newest counter of a beacon; not kept over a restart
   uint16_t bad_frames_;   // behind a good XBee checksum
-  uint16_t refused_frames_;
-  uint16_t radio_failures_;
   uint8_t next_command_;
   bool awaiting_status_;
   uint8_t frame_[wire::kFrameBytes];
@@ -127,6 +126,7 @@ class Node : private NodeState {
   void obey(const wire::Header& header, const uint8_t* body, uint8_t length);
   wire::CommandResult apply(uint8_t command, int32_t value, int32_t* in_force);
   void report_raw(uint16_t reports);
+  wire::CommandResult access_bus(uint8_t* bytes);
   wire::CommandResult apply_calibration(wire::CommandCode code, int32_t value, int32_t* in_force);
   void configure_inertial();
   bool answer_due() const;

@@ -269,7 +269,7 @@ static_assert(offsetof(Command, command) - offsetof(Command, token) ==
 
 #endif
 uint8_t encode(const Command& message, uint8_t* body) {
-  if (message.command > 17) return 0;
+  if (message.command > 18) return 0;
   const uint8_t length = static_cast<uint8_t>(7);
 #if defined(__AVR__)
   static_assert(sizeof message == 7, "as on the wire");
@@ -289,7 +289,7 @@ bool decode(const uint8_t* body, uint8_t length, Command* message) {
   const uint8_t* in = take(kCommand, 2, body, message);
   (void)in;
 #endif
-  if (message->command > 17) return false;
+  if (message->command > 18) return false;
   return true;
 }
 
@@ -303,7 +303,7 @@ static_assert(offsetof(Acknowledgement, value) - offsetof(Acknowledgement, token
 
 #endif
 uint8_t encode(const Acknowledgement& message, uint8_t* body) {
-  if (message.result > 3) return 0;
+  if (message.result > 4) return 0;
   const uint8_t length = static_cast<uint8_t>(8);
 #if defined(__AVR__)
   static_assert(sizeof message == 8, "as on the wire");
@@ -323,7 +323,7 @@ bool decode(const uint8_t* body, uint8_t length, Acknowledgement* message) {
   const uint8_t* in = take(kAcknowledgement, 1, body, message);
   (void)in;
 #endif
-  if (message->result > 3) return false;
+  if (message->result > 4) return false;
   return true;
 }
 

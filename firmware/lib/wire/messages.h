@@ -9,7 +9,7 @@ namespace wire {
 
 constexpr uint8_t kMagic = 181;
 constexpr uint8_t kProtocolVersion = 3;
-constexpr uint16_t kFingerprint = 7962;  // seed of the CRC
+constexpr uint16_t kFingerprint = 31604;  // seed of the CRC
 constexpr uint8_t kFrameBytes = 66;  // the longest frame
 constexpr uint8_t kMostBody = 47;
 constexpr uint8_t kHeaderBytes = 9;
@@ -102,6 +102,7 @@ enum class CommandCode : uint8_t {
   kSetRangeOffsetMm = 15,
   kRestoreDefaults = 16,
   kSetKey = 17,
+  kAccessBus = 18,
 };
 
 // How a command ended.
@@ -110,6 +111,7 @@ enum class CommandResult : uint8_t {
   kUnknownCommand = 1,
   kOutOfRange = 2,
   kBusy = 3,
+  kNoAnswer = 4,
 };
 
 // Dead reckoning since the node's start, as running totals: the host takes differences, so a lost frame loses no motion.
@@ -178,7 +180,7 @@ struct Status {
   uint16_t worst_tick_us;  // Longest 50 Hz tick since the last status; 1000000 = 1 s
   uint16_t missed_ticks;  // 50 Hz ticks that came too late to be kept; wraps
   uint16_t free_stack_bytes;  // Bytes between heap end and deepest stack so far; B
-  uint16_t bad_frames;  // Received frames that failed a check; wraps
+  uint16_t bad_frames;  // Received frames that failed a check, or that the module sends unasked (its restart); wraps
   uint16_t dropped_ranges;  // Ranges dropped because the radio was busy; wraps
   uint16_t dropped_steps;  // Steps dropped because the radio was busy; wraps
   uint16_t radio_failures;  // Frames that the radio reported as not delivered; wraps

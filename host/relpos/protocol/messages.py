@@ -111,6 +111,7 @@ class CommandCode(enum.IntEnum):
     SET_RANGE_OFFSET_MM = 15
     RESTORE_DEFAULTS = 16
     SET_KEY = 17
+    ACCESS_BUS = 18
 
 
 class CommandResult(enum.IntEnum):
@@ -120,6 +121,7 @@ class CommandResult(enum.IntEnum):
     UNKNOWN_COMMAND = 1
     OUT_OF_RANGE = 2
     BUSY = 3
+    NO_ANSWER = 4
 
 
 HEADER = (
@@ -318,7 +320,12 @@ STATUS = Message(
         Quantity(
             "free_stack_bytes", "u16", "Bytes between heap end and deepest stack so far", unit="B"
         ),
-        Quantity("bad_frames", "u16", "Received frames that failed a check", wraps=True),
+        Quantity(
+            "bad_frames",
+            "u16",
+            "Received frames that failed a check, or that the module sends unasked (its restart)",
+            wraps=True,
+        ),
         Quantity("dropped_ranges", "u16", "Ranges dropped because the radio was busy", wraps=True),
         Quantity("dropped_steps", "u16", "Steps dropped because the radio was busy", wraps=True),
         Quantity(

@@ -125,6 +125,7 @@ struct World : FakeBoard {
   uint8_t key[wire::kKeyBytes] = {};   // the host's, and what the node's frames are opened with
   uint32_t host_counter = 1000;
   uint32_t exchange_us = 0;            // of UWB
+  uint32_t bus_us = 0;                 // of a transaction
   uint32_t exchange_at_us[64] = {};    // since exchanges was cleared
   uint8_t exchanges = 0;
   uint32_t pressure_mpa = 101325000;
@@ -157,6 +158,7 @@ struct World : FakeBoard {
   BusStatus i2c_transfer(uint8_t address, const uint8_t* first, uint8_t first_count,
                          const uint8_t* second, uint8_t second_count, uint8_t* read,
                          uint8_t read_count) override {
+    now += bus_us;
     for (uint8_t i = 0; i < read_count; ++i) read[i] = 0;
     if (address == 0x68 && inertial_present) {
       if (first_count == 1 && first[0] == 0x75) read[0] = 0x68;
@@ -951,6 +953,27 @@ TEST(an_unknown_command_is_answered_as_unknown) {
   CHECK_EQUAL(7, team.answer().token);
   CHECK_EQUAL(200, team.answer().command);
   CHECK_EQUAL(result(wire::CommandResult::kUnknownCommand), team.answer().result);
+}
+
+TEST(a_transaction_for_the_host_answers_what_was_read_and_how_long_it_took) {
+  Team team;
+  team.run_ms(2000);
+  team.world.bus_us = 148;
+  // Address, register, parameter, bytes written and read.
+  wire::Acknowledgement answer = ask(team, team.node, wire::CommandCode::kAccessBus, 0x11007568);
+  CHECK_EQUAL(result(wire::CommandResult::kDone), answer.result);
+  CHECK_EQUAL(0x68, answer.value >> 8 & 0xFF);
+  CHECK_EQUAL(148, answer.value >> 16);
+  // The last two of a range's eleven bytes: -80 dBm.
+  const int32_t row = static_cast<int32_t>(0xB302C74B);
+  answer = ask(team, team.node, wire::CommandCode::kAccessBus, row);
+  CHECK_EQUAL(0xFFB0, answer.value & 0xFFFF);
+  answer = ask(team, team.node, wire::CommandCode::kAccessBus, 0x11007569);
+  CHECK_EQUAL(result(wire::CommandResult::kNoAnswer), answer.result);
+  // The most that can be asked for at once.
+  const int32_t most = static_cast<int32_t>(0xFFFFFF68);
+  answer = ask(team, team.node, wire::CommandCode::kAccessBus, most);
+  CHECK_EQUAL(result(wire::CommandResult::kDone), answer.result);
 }
 
 TEST(settings_survive_a_restart_and_a_torn_copy) {

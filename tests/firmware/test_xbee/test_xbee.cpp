@@ -195,11 +195,11 @@ TEST(only_a_frame_that_is_reported_as_delivered_is_delivered) {
   CHECK_EQUAL(0, bench.xbee.bad_frames());
 }
 
-TEST(frames_of_other_types_are_passed_over) {
+TEST(frames_of_other_types_are_counted_and_passed_over) {
   Bench bench;
   CHECK_EQUAL(0, bench.receive(kAtResponse, sizeof kAtResponse));
   CHECK_EQUAL(0, bench.receive(kZigbeeStatus, sizeof kZigbeeStatus));
-  CHECK_EQUAL(0, bench.xbee.bad_frames());
+  CHECK_EQUAL(2, bench.xbee.bad_frames());
   // One that no buffer of the node could hold: 0x120 bytes of 0x00 after the type 0x97.
   const uint8_t head[] = {0x7e, 0x01, 0x21, 0x97};
   const uint8_t none = 0x00;
@@ -207,9 +207,9 @@ TEST(frames_of_other_types_are_passed_over) {
   CHECK_EQUAL(0, bench.receive(head, sizeof head));
   for (uint16_t i = 0; i < 0x120; ++i) CHECK_EQUAL(0, bench.receive(&none, 1));
   CHECK_EQUAL(0, bench.receive(&checksum, 1));
-  CHECK_EQUAL(0, bench.xbee.bad_frames());
+  CHECK_EQUAL(3, bench.xbee.bad_frames());
   CHECK_EQUAL(1, bench.receive(kReceive16, sizeof kReceive16));
-  CHECK_EQUAL(0, bench.xbee.bad_frames());
+  CHECK_EQUAL(3, bench.xbee.bad_frames());
 }
 
 TEST(garbage_between_frames_loses_none) {
