@@ -25,6 +25,7 @@ class TeamInput:
 
     name = "emulated"
     is_now = True
+    recorded_unix_s = None
 
     def __init__(self, team: EmulatedTeam, until_s: float | None = None) -> None:
         self.team = team

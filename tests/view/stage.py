@@ -53,6 +53,8 @@ class Stage:
         self.rate_hz = 5.0
         self.at_s = 40.0
         self.frozen = False
+        self.recorded_unix_s: float | None = None
+        """Unix time of second 0 of a recording that is played; None: the team is live."""
         self.mute = False
         """The server is connected, but not a word comes."""
         self.sent: dict[int, float] = {}
@@ -72,6 +74,8 @@ class Stage:
 
     def reset(self, team: WalkingTeam) -> None:
         """Begin anew with a team that is well."""
+        if self.recorded_unix_s is not None:
+            self.play_recording(None)
         with self._lock:
             self.team = team
             self.frozen = self.mute = False
@@ -79,6 +83,12 @@ class Stage:
             self.acknowledged.clear()
         if self.web is None:
             self.open()
+
+    def play_recording(self, recorded_unix_s: float | None) -> None:
+        """As if a recording of that time were played behind the same address."""
+        self.shut()
+        self.recorded_unix_s = recorded_unix_s
+        self.open()
 
     def begin_another_session(self) -> None:
         """As if relpos had been started anew behind the same address."""
@@ -95,7 +105,14 @@ class Stage:
             access = Access(access.port, access.hosts, self._token)
         self._token = access.token
         self.access = access
-        hello = Hello("Drill at the old mill", "/dev/ttyUSB0", "bank", self.started_unix_s)
+        hello = Hello(
+            "Drill at the old mill",
+            "/dev/ttyUSB0",
+            "bank",
+            self.started_unix_s,
+            replay=self.recorded_unix_s is not None,
+            recorded_unix_s=self.recorded_unix_s,
+        )
         self.web: WebView | None = WebView(listener, access, hello)
 
     def shut(self) -> None:

@@ -287,7 +287,14 @@ def _fuse_mcap(
         priors = api.priors_of(run, start)
         job.prepare(priors)
         again = Replay(recording, key)
-        source = PacedInput(job.source, again, speed=options.pace, link=again.link)
+        began_ns = recording.started_unix_ns
+        source = PacedInput(
+            job.source,
+            again,
+            speed=options.pace,
+            link=again.link,
+            recorded_unix_s=None if began_ns is None else began_ns * 1e-9,
+        )
         fuse_live(job, source, options, description=run.description, priors=priors, as_json=as_json)
         return
     counted = {name: round(count) for name, count in replay.counters().items()}

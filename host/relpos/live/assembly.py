@@ -60,7 +60,15 @@ def run_session(
     for the user, ``progress`` a stage ("received", "finishing") and a count.
     """
     started_unix_s = time.time() - source.now_s()
-    hello = Hello(plan.name, source.name, plan.estimator, started_unix_s, plan.emulated)
+    hello = Hello(
+        plan.name,
+        source.name,
+        plan.estimator,
+        started_unix_s,
+        plan.emulated,
+        replay=not source.is_now,
+        recorded_unix_s=source.recorded_unix_s,
+    )
     fusion = FusionThread(plan.make_estimator, plan.priors, common=plan.common)
     files = FileSink(plan.out, plan.description, keep_received=source.is_now)
     nodes = plan.description.nodes

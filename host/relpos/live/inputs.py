@@ -46,6 +46,8 @@ class Input(Protocol):
     name: str
     is_now: bool
     """Whether the team is live, so that presses and headings of phones belong to it."""
+    recorded_unix_s: float | None
+    """Unix time of a recording's second 0; None where it does not say, and of what is live."""
 
     @property
     def link(self) -> Link | None:
@@ -85,6 +87,7 @@ class PortInput:
     """
 
     is_now = True
+    recorded_unix_s: float | None = None
 
     def __init__(
         self,
@@ -265,9 +268,11 @@ class PacedInput:
         *,
         speed: float = 1.0,
         link: Link | None = None,
+        recorded_unix_s: float | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.name = name
+        self.recorded_unix_s = recorded_unix_s
         self.link = link
         self._items = iter(items)
         self._speed = speed

@@ -184,13 +184,19 @@ def _pair_json(pair: Pair) -> str:
 
 @dataclass(frozen=True)
 class Hello:
-    """The first message to a page: the session and its limits."""
+    """The first message to a page: the session and its limits.
+
+    ``replay``: a recording is played; ``recorded_unix_s`` is the Unix time of its second 0, None
+    where it does not say.
+    """
 
     name: str
     source: str
     estimator: str
     started_unix_s: float
     emulated: bool = False
+    replay: bool = False
+    recorded_unix_s: float | None = None
     limits: Mapping[str, float] = field(
         default_factory=lambda: {
             "still_warning_s": STILL_WARNING_S,

@@ -80,13 +80,13 @@ const still = (node, alert, still_s, more = {}) => ({ node, name: `N${node}`, al
 test("a warning that becomes an alarm has to be acknowledged anew", () => {
   const alarms = new Alarms();
   equal(alarms.update([still(1, "still_warning", 20)]).raised.length, 1);
-  equal(alarms.sounding, "warning");
+  equal(alarms.sounding, "medium");
   equal(alarms.update([still(1, "still_warning", 21)]).raised.length, 0);
   alarms.acknowledge(1);
   equal(alarms.sounding, null);
   equal(alarms.update([still(1, "still_warning", 22)]).raised.length, 0);
   equal(alarms.update([still(1, "still_alarm", 30)]).raised.length, 1);
-  equal(alarms.sounding, "alarm");
+  equal(alarms.sounding, "high");
   equal(alarms.list()[0].seconds, 30);
 });
 

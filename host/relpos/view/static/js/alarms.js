@@ -1,5 +1,7 @@
 // The active alarms, and which of them are acknowledged.
 
+import { isFresh } from "./age.js";
+
 const KINDS = {
   still_warning: { kind: "still", level: "warning" },
   still_alarm: { kind: "still", level: "alarm" },
@@ -30,6 +32,7 @@ export class Alarms {
         name: person.name,
         ...of,
         seconds: of.kind === "lost" ? person.seen_s : person.still_s,
+        newsS: isFresh(person) ? 0 : person.seen_s,
         // Acknowledged here at once; on other pages when the server says so.
         acknowledged: person.acknowledged === true || (same ? before.acknowledged : false),
       };
@@ -55,11 +58,11 @@ export class Alarms {
     return [...this.active.values()].sort((a, b) => rank(a) - rank(b) || b.seconds - a.seconds);
   }
 
-  /** The sound to play: "alarm", "warning" or null. */
+  /** The sound to play: "high", "medium" or null. */
   get sounding() {
     const open = this.list().filter((alarm) => !alarm.acknowledged);
     if (open.length === 0) return null;
-    return open.some((alarm) => alarm.level === "alarm") ? "alarm" : "warning";
+    return open.some((alarm) => alarm.level === "alarm") ? "high" : "medium";
   }
 
   clear() {

@@ -1,5 +1,6 @@
 // Guidance to a person: arrow, distance and instruction, large enough for gloves and smoke.
 
+import { isFresh, reachM } from "./age.js";
 import { degrees } from "./angles.js";
 import { arrow, make, setAttribute, setText } from "./dom.js";
 import { Announcer, guidance, spoken, Trend, TREND_WORDS } from "./finding.js";
@@ -82,21 +83,27 @@ export class FindView {
     if (!aloud) globalThis.speechSynthesis?.cancel();
   }
 
-  update(team, { connected = true } = {}) {
+  update(team, connected = true) {
     if (!this.open) return;
     const [seeker, target] = [team.person(this.from), team.person(this.to)];
     const name = (person, node) => person?.name ?? `Node ${node}`;
     const targetName = name(target, this.to);
-    setText(this.title, `${name(seeker, this.from)} → ${targetName}`);
-    setAttribute(this.title, "aria-label", `Guiding ${name(seeker, this.from)} to ${targetName}`);
+    const last = target !== null && !isFresh(target);
+    const fresh = isFresh(seeker);
+    setText(this.title, `${name(seeker, this.from)} → ${targetName}${last ? ": last place" : ""}`);
+    setAttribute(this.section, "data-last", String(last || !fresh));
+    setAttribute(this.title, "aria-label", `Guiding ${name(seeker, this.from)} to ${last ? "the last place of " : ""}${targetName}`);
     const relation = team.relation(this.from, this.to);
-    const guide = guidance(relation, this.previous);
+    const guide = guidance(relation, this.previous, { last, fresh });
     this.previous = guide.key;
     this.arrow.point(guide.arrowRad);
     setText(this.distance, relation ? distance(relation.distanceM, relation.sigmaM) : "?");
     setText(this.order, guide.words);
-    if (relation && team.timeS !== null) this.trend.add(team.timeS, relation.distanceM);
+    // Nearer to a place is not warmer: the person may have gone on.
+    if (last || !fresh) this.trend = new Trend();
+    else if (relation && team.timeS !== null) this.trend.add(team.timeS, relation.distanceM);
     const trend = this.trend.direction;
+    this.trendLine.hidden = last || !fresh;
     setAttribute(this.trendLine, "data-trend", trend ?? "none");
     setText(this.trendSign, TREND_SIGNS[trend] ?? "");
     setText(this.trendWords, TREND_WORDS[trend] ?? "warmer or colder: walk to find out");
@@ -106,7 +113,7 @@ export class FindView {
     this.caution.hidden = caution === "";
     const key = `${guide.key} ${caution.replace(/\d+/g, "")}`;
     if (this.announcer.due(Date.now(), { key, distanceM: relation?.distanceM ?? 0, trend })) {
-      this.say(`${spoken(targetName, relation, guide, trend)} ${caution}`.trim());
+      this.say(`${spoken(last ? `last place of ${targetName}` : targetName, relation, guide, trend)} ${caution}`.trim());
     }
   }
 
@@ -138,12 +145,12 @@ export function accuracyWords(seeker, target, relation) {
 /** Reasons for caution; empty where there are none. */
 export function cautions(team, seeker, target, connected) {
   const words = [];
-  if (!connected) words.push("No connection: this position is old.");
+  if (!connected) words.push("No connection: all of this is old.");
   for (const person of [target, seeker]) {
     if (!person) continue;
     if (person.status === "unlocated") words.push(`${person.name} is not located.`);
     else if (person.status === "lost" || person.status === "stale") {
-      words.push(`${person.name}: last heard ${ago(person.seen_s)}; guiding to the last known position.`);
+      words.push(`${person.name}: last heard ${ago(person.seen_s)}, last known place, on foot up to ${distance(reachM(person), 9)} from there.`);
     } else if (person.status === "ambiguous") {
       const here = team.possible().here.get(person.node);
       words.push(here < 0.97

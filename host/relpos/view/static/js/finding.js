@@ -41,11 +41,16 @@ export function isThere(relation) {
   return relation.distanceM < Math.max(1.5, 1.5 * relation.sigmaM);
 }
 
-/** The instruction for the seeker: {key, words, arrowRad}; `arrowRad` is null while unknown. */
-export function guidance(relation, previous = null) {
+/**
+ * The instruction for the seeker: {key, words, arrowRad}; `arrowRad` is null while unknown. `last`:
+ * it leads to a last known place; `fresh`: the seeker's own position is of now.
+ */
+export function guidance(relation, previous = null, { last = false, fresh = true } = {}) {
   if (!relation) return { key: "unknown", words: "position unknown", arrowRad: null };
+  if (!fresh) return { key: "old", words: "no guidance: the seeker is not heard", arrowRad: null };
   if (isThere(relation)) {
-    return { key: "there", words: "within reach: search here", arrowRad: relation.relativeRad };
+    const words = last ? "last place reached: search from here" : "within reach: search here";
+    return { key: "there", words, arrowRad: relation.relativeRad };
   }
   if (relation.relativeRad === null) {
     const words = relation.headingKnown

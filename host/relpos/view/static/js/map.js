@@ -1,5 +1,6 @@
 // The team on a canvas. Draws when something has changed, and then once a frame at most.
 
+import { isFresh, reachM } from "./age.js";
 import { inkOn, personColour } from "./colours.js";
 import { placeLabels, placeWhereFree } from "./labels.js";
 import { isPlaced, VAGUE_RAD } from "./relation.js";
@@ -37,6 +38,8 @@ export class TeamMap {
     this.layers = { tracks: "all", ranges: "auto" };
     this.alarms = new Map();
     this.dark = false;
+    /** Whether everything is old: then nothing has a person's colour. */
+    this.old = false;
     this.still = matchMedia("(prefers-reduced-motion: reduce)");
     this.goal = null;
     this.glidedMs = 0;
@@ -99,7 +102,7 @@ export class TeamMap {
   }
 
   colourOf(node) {
-    return personColour(node, this.dark);
+    return this.old ? this.colours.soft : personColour(node, this.dark);
   }
 
   // -- where the camera is -----------------------------------------------------------------------
@@ -223,6 +226,7 @@ export class TeamMap {
     for (const ring of rings) this.drawRing(ring, 1);
     const links = this.drawLinks();
     for (const person of people) this.drawEllipse(person);
+    for (const person of people) this.drawReach(person);
     this.drawFind();
     // Who is in trouble is drawn last, on top.
     const ordered = [...people].sort((a, b) => this.rank(a) - this.rank(b));
@@ -232,7 +236,7 @@ export class TeamMap {
     this.drawNorth();
     if (gliding) this.invalidate();
     else if (again) setTimeout(() => this.invalidate(), 160);
-    const pulsing = [...this.alarms.values()].some((a) => !a.acknowledged) && !this.still.matches;
+    const pulsing = !this.old && [...this.alarms.values()].some((a) => !a.acknowledged) && !this.still.matches;
     if (pulsing && !this.pulse) {
       this.pulse = setTimeout(() => {
         this.pulse = null;
@@ -427,7 +431,7 @@ export class TeamMap {
     const { context, unit } = this;
     const colour = this.colourOf(person.node);
     this.pathEllipse(person);
-    const gone = person.status === "lost" || person.status === "stale";
+    const gone = !isFresh(person);
     if (!gone) {
       context.fillStyle = colour;
       context.globalAlpha = this.dark ? 0.2 : 0.13;
@@ -438,6 +442,23 @@ export class TeamMap {
     context.lineWidth = 1.25 * unit;
     // The position is unknown by now: an outline, no area that hides the others.
     if (gone) context.setLineDash([3 * unit, 5 * unit]);
+    context.stroke();
+    context.setLineDash([]);
+    context.globalAlpha = 1;
+  }
+
+  /** Where somebody who is not heard may be by now: as far from the last place as people walk. */
+  drawReach(person) {
+    const radius = (reachM(person) + (person.sigma_major_m ?? 0)) * this.view.scale;
+    if (isFresh(person) || radius < 16 * this.unit) return;
+    const { context, unit } = this;
+    const [px, py] = toScreen(this.view, person.x_m, person.y_m);
+    context.strokeStyle = this.colourOf(person.node);
+    context.globalAlpha = 0.8;
+    context.lineWidth = 1.5 * unit;
+    context.setLineDash([2 * unit, 6 * unit]);
+    context.beginPath();
+    context.arc(px, py, radius, 0, 2 * Math.PI);
     context.stroke();
     context.setLineDash([]);
     context.globalAlpha = 1;
@@ -463,13 +484,13 @@ export class TeamMap {
     const [px, py] = toScreen(view, person.x_m, person.y_m);
     const colour = this.colourOf(person.node);
     const radius = 11 * unit;
-    const gone = person.status === "lost" || person.status === "stale";
+    const gone = !isFresh(person);
     const alarm = this.alarms.get(person.node);
     if (alarm) {
-      const swing = this.still.matches || alarm.acknowledged
+      const swing = this.old || this.still.matches || alarm.acknowledged
         ? 0.5 : 0.5 - 0.5 * Math.cos((2 * Math.PI * (now % PULSE_MS)) / PULSE_MS);
       context.strokeStyle = alarm.level === "alarm" ? colours.alarm : colours.warning;
-      context.lineWidth = (alarm.acknowledged ? 3 : 5) * unit;
+      context.lineWidth = (this.old || alarm.acknowledged ? 3 : 5) * unit;
       context.beginPath();
       context.arc(px, py, radius + (6 + 8 * swing) * unit, 0, 2 * Math.PI);
       context.stroke();
@@ -498,7 +519,8 @@ export class TeamMap {
     context.textAlign = "center";
     context.textBaseline = "middle";
     context.fillText(String(person.node), px, py + 0.5 * unit);
-    if (person.health !== "green") {
+    // The sign is the node's; whether a silent one works nobody knows.
+    if (!gone && person.health !== "green") {
       this.drawSign(person.health, px + 0.95 * radius, py - 0.95 * radius, 6.5 * unit);
     }
   }
@@ -561,9 +583,10 @@ export class TeamMap {
   stateOf(person, here) {
     const alarm = this.alarms.get(person.node);
     if (alarm) return alarm.kind === "lost"
-      ? `lost ${seconds(person.seen_s)}` : `still ${seconds(person.still_s)}`;
+      ? `lost ${seconds(person.seen_s)}`
+      : isFresh(person) ? `still ${seconds(person.still_s)}` : `was still, not heard ${seconds(person.seen_s)}`;
     if (person.status === "lost") return `lost ${seconds(person.seen_s)}`;
-    if (person.status === "stale") return `no news ${seconds(person.seen_s)}`;
+    if (person.status === "stale") return `not heard ${seconds(person.seen_s)}`;
     if (person.status === "ambiguous") return probabilityHere(here.get(person.node));
     return "";
   }
@@ -844,7 +867,11 @@ export class TeamMap {
   describe() {
     const people = this.team.list();
     const placed = people.filter(isPlaced);
-    const parts = [`${placed.length} of ${people.length} people located`];
+    const located = placed.filter(isFresh);
+    const parts = [`${located.length} of ${people.length} people located`];
+    if (placed.length > located.length) {
+      parts.push(`last places of ${placed.filter((p) => !isFresh(p)).map((p) => p.name).join(", ")}`);
+    }
     if (this.camera.mode === "follow") {
       parts.push(`following ${this.team.person(this.camera.node)?.name ?? "no one"}`);
     }

@@ -1,26 +1,27 @@
 // The list of people beside the map, and the map as a table.
 
+import { isFresh, reachM } from "./age.js";
 import { inkOn } from "./colours.js";
 import { arrow, healthSign, make, setAttribute, setText } from "./dom.js";
 import { isPlaced, VAGUE_RAD } from "./relation.js";
 import {
   ago, compass, compassShort, dbm, distance, HEALTH_WORDS, percent, plusMinus, probability, seconds,
-  STATUS_WORDS, UNKNOWN, volts, whereabouts, directionWords,
+  STATUS_WORDS, timeOfDay, UNKNOWN, volts, whereabouts, directionWords,
 } from "./words.js";
 
-/** A person's state in words; empty while all is well. */
+/** A person's state in words. */
 export function stateWords(person, alarm, here) {
   const words = [];
   if (alarm?.kind === "lost" || person.status === "lost") words.push(`Lost: last heard ${ago(person.seen_s)}`);
-  else if (person.status === "stale") words.push(`No report: last heard ${ago(person.seen_s)}`);
+  else if (person.status === "stale") words.push(`Not heard: last news ${ago(person.seen_s)}`);
   else if (person.status === "unlocated") words.push("Not located yet");
   else if (person.status === "ambiguous") {
     words.push(here < 0.97 ? `Ambiguous: ${probability(here)} where shown` : "Ambiguous");
   }
-  if (alarm?.kind === "still") words.push(`Has not moved for ${seconds(person.still_s)}`);
-  else if (person.moving === false && person.still_s >= 3 && person.status !== "lost") {
+  if (alarm?.kind === "still") words.push(`${isFresh(person) ? "Has" : "Had"} not moved for ${seconds(person.still_s)}`);
+  else if (person.moving === false && person.still_s >= 3 && isFresh(person)) {
     words.push(`Stands still, ${seconds(person.still_s)}`);
-  }
+  } else if (person.moving && isFresh(person)) words.push("Moves");
   return words.join(" · ");
 }
 
@@ -42,7 +43,7 @@ class Card {
     this.spacer = make("span", { class: "spacer soft" });
     this.state = make("p", { class: "state" });
     this.facts = {};
-    const facts = ["Seen", "Supply", "Radio", "Loss", "Ranging", "Hears"].map((word) => {
+    const facts = ["Supply", "Radio", "Loss", "Ranging", "Hears"].map((word) => {
       const value = make("dd");
       this.facts[word] = value;
       return make("div", {}, make("dt", { text: word }), value);
@@ -59,8 +60,9 @@ class Card {
       this.state, make("dl", { class: "facts" }, ...facts), this.reasons);
   }
 
-  show(person, { colour, me, meName, relation, northRad, alarm, here, selected, followed }) {
+  show(person, { colour, me, meName, relation, northRad, alarm, here, selected, followed, heardMs, meFresh }) {
     const { element } = this;
+    const fresh = isFresh(person);
     setAttribute(element, "data-status", person.status);
     setAttribute(element, "data-health", person.health);
     setAttribute(element, "data-alert", alarm?.level ?? null);
@@ -74,26 +76,27 @@ class Card {
     setText(this.label, me ? `${person.name} (me)` : person.name);
     setAttribute(this.name, "aria-pressed", String(selected));
     this.sign.show(person.health);
-    setText(this.health, HEALTH_WORDS[person.health] ?? person.health);
+    setText(this.health, fresh || person.health === "unknown" ? HEALTH_WORDS[person.health] ?? person.health : "node silent");
     this.where.hidden = me || meName === null;
     this.spacer.hidden = !this.where.hidden;
     setText(this.spacer, me ? "distances are from here" : "");
     if (!this.where.hidden) {
       this.arrow.point(relation?.relativeRad ?? null);
       setText(this.far, relation ? distance(relation.distanceM, relation.sigmaM) : UNKNOWN);
-      setText(this.sigma, relation ? plusMinus(relation.sigmaM) : "");
+      setText(this.sigma, !relation ? "" : fresh && meFresh ? plusMinus(relation.sigmaM) : lastPlace(fresh ? null : heardMs));
       setText(this.direction, !relation ? "position unknown"
         : directionWords(relation));
       setText(this.compass, relation ? compassShort(relation.bearingRad, northRad) : "");
     }
     setText(this.state, stateWords(person, alarm, here));
     const facts = {
-      Seen: ago(person.seen_s), Supply: volts(person.battery_v), Radio: dbm(person.rssi_dbm),
+      Supply: volts(person.battery_v), Radio: dbm(person.rssi_dbm),
       Loss: percent(person.loss), Ranging: percent(person.ranging),
       Hears: Number.isFinite(person.neighbours) ? String(person.neighbours) : UNKNOWN,
     };
     for (const [word, value] of Object.entries(facts)) setText(this.facts[word], value);
-    setText(this.reasons, (person.reasons ?? []).join("; "));
+    // That a node is silent is said above.
+    setText(this.reasons, (person.reasons ?? []).filter((reason) => fresh || !reason.startsWith("silent")).join("; "));
     setAttribute(this.followButton, "aria-pressed", String(followed));
     setAttribute(this.followButton, "aria-label", `Follow ${person.name}`);
     setAttribute(this.findButton, "aria-label", `Find ${person.name}`);
@@ -139,9 +142,16 @@ export class PeopleList {
         here: here.get(person.node),
         selected: person.node === look.selected,
         followed: person.node === look.followed,
+        heardMs: team.heardMs(person.node),
+        meFresh: isFresh(team.person(look.me)),
       });
     });
   }
+}
+
+/** Where a distance leads that is not one of now. */
+function lastPlace(heardMs) {
+  return heardMs === null ? "to the last place" : `to the last place, ${timeOfDay(heardMs)}`;
 }
 
 function trouble(alarms, person) {
@@ -159,17 +169,18 @@ export function tableRow(team, person, me) {
       const other = team.person(node === person.node ? peer : node);
       return `${other?.name ?? "?"} ${rangeM.toFixed(1)}`;
     });
-  const faces = Number.isFinite(person.heading_rad) && (person.sigma_heading_rad ?? 0) < VAGUE_RAD;
+  const faces = isFresh(person) && Number.isFinite(person.heading_rad) && (person.sigma_heading_rad ?? 0) < VAGUE_RAD;
   const placed = isPlaced(person);
   return [
     person.name,
-    [STATUS_WORDS[person.status] ?? person.status, person.moving === false ? `still ${seconds(person.still_s)}` : "",
-      `node ${HEALTH_WORDS[person.health] ?? ""}`].filter(Boolean).join(", "),
+    [STATUS_WORDS[person.status] ?? person.status, isFresh(person) ? "" : `last heard ${ago(person.seen_s)}`,
+      person.moving === false ? `still ${seconds(person.still_s)}` : "",
+      HEALTH_WORDS[person.health] ?? ""].filter(Boolean).join(", "),
     placed ? number(person.x_m) : UNKNOWN,
     placed ? number(person.y_m) : UNKNOWN,
-    placed ? number(person.sigma_major_m) : UNKNOWN,
+    placed ? number(person.sigma_major_m + reachM(person)) : UNKNOWN,
     placed && faces ? compass(person.heading_rad, team.northRad) : UNKNOWN,
-    me === null ? UNKNOWN : me === person.node ? "me" : whereabouts(team.relation(me, person.node), team.northRad),
+    me === null ? UNKNOWN : me === person.node ? "me" : `${whereabouts(team.relation(me, person.node), team.northRad)}${isFresh(person) ? "" : " (last place)"}`,
     ranges.join(", ") || UNKNOWN,
   ];
 }

@@ -1,5 +1,6 @@
 // The wearer's page: joins the modules.
 
+import { isFresh, startBeat } from "./age.js";
 import { Alarms } from "./alarms.js";
 import { degrees } from "./angles.js";
 import { AlarmBanner, showNotices } from "./banner.js";
@@ -9,10 +10,11 @@ import { CompassSharing } from "./compass_sharing.js";
 import { Connection } from "./connection.js";
 import { arrow, byId, make, postJson, setAttribute, setText, storage } from "./dom.js";
 import { FindView } from "./find_view.js";
+import { LinkBanner } from "./link_banner.js";
 import { stateWords } from "./people.js";
 import { PressQueue, UNDO_MS } from "./queue.js";
 import { Siren } from "./sound.js";
-import { connectionWords, dataAgeS, showConnection } from "./status_line.js";
+import { connectionWords, dataAgeS, replayWords, showConnection } from "./status_line.js";
 import { Team } from "./team.js";
 import { isDark, themeSwitch } from "./theme_switch.js";
 import { ScreenLock } from "./wake_lock.js";
@@ -38,6 +40,7 @@ let lastPress = null;
 let trouble = null;
 
 const siren = new Siren(showSound);
+const link = new LinkBanner(byId("link"), byId("alarm-voice"), () => sound());
 const banner = new AlarmBanner(byId("alarms"), {
   acknowledge,
   show: (node) => {
@@ -75,19 +78,42 @@ function handle(message) {
     alarms.clear();
     trouble = null;
     introduce();
-    document.title = `${team.session.name ?? "team"} · wearer`;
+    document.title = `${team.session.name ?? "team"} · wearer${team.replayed ? " · REPLAY" : ""}`;
+    setAttribute(document.documentElement, "data-replay", team.replayed ? "true" : null);
   } else if (kind === "picture") {
     receivedMs = Date.now();
     const { raised, cleared } = alarms.update(team.list());
     if (raised.length) setText(byId("alarm-voice"), raised.map((a) => `${a.level}: ${words(a)}`).join(". "));
     if (cleared.length) setText(byId("voice"), cleared.map((a) => `${a.name}: all clear`).join(". "));
-    siren.sound(alarms.sounding);
+    link.update(0, receivedMs);
+    if (team.replayed && raised.length) siren.sound(null);
+    sound();
     banner.update(alarms);
-    findView.update(team, { connected: true });
+    findView.update(team);
     if (performance.now() - listMs > LIST_MS) showTeam();
   } else if (kind === "unknown") {
     trouble = { level: "warning", text: "The server's version differs from this page's: reload the page." };
   }
+}
+
+function sound() {
+  const kind = link.sounding ? "link" : alarms.sounding;
+  siren.sound(kind && team.replayed ? "replay" : kind);
+}
+
+/** The age of what is shown counts on while nothing comes. */
+function beat() {
+  showAge();
+  if (receivedMs === null) return;
+  const lagS = Math.max(0, Date.now() - receivedMs) / 1000;
+  link.update(lagS, receivedMs);
+  if (!link.lost) return;
+  team.age(lagS);
+  alarms.update(team.list());
+  banner.update(alarms);
+  sound();
+  findView.update(team, false);
+  showTeam();
 }
 
 function words(alarm) {
@@ -125,7 +151,9 @@ function showTeam() {
     setText(row.name, person.name);
     row.arrow.point(relation?.relativeRad ?? null);
     setText(row.far, relation ? `${distance(relation.distanceM, relation.sigmaM)} ` : "–");
-    setText(row.sigma, relation ? plusMinus(relation.sigmaM) : "");
+    const fresh = isFresh(person) && isFresh(team.person(me?.node));
+    setAttribute(row.element, "data-status", person.status);
+    setText(row.sigma, !relation ? "" : fresh ? plusMinus(relation.sigmaM) : "to the last place");
     setText(row.where, !relation ? (me ? "position unknown" : "say who you are first")
       : relation.relativeRad === null
         ? `${directionWords(relation)} · ${compass(relation.bearingRad, team.northRad)}`
@@ -150,7 +178,7 @@ function makeOther(node) {
 }
 
 function colourOf(node) {
-  return personColour(node, isDark());
+  return link.lost ? "#777777" : personColour(node, isDark());
 }
 
 function showMe() {
@@ -167,14 +195,14 @@ function showMe() {
 
 function showAge() {
   const age = dataAgeS({ unixS: team.unixS, arrivedUnixS: team.arrivedUnixS, receivedMs, nowMs: Date.now() });
-  const status = connectionWords(connection.state, age, connection.retryS);
+  const status = team.replayed ? replayWords(connection.state, team.session, team.timeS)
+    : connectionWords(connection.state, age, connection.retryS);
   showConnection({ line: byId("connection"), words: byId("connection-words"), age: byId("age"), retry: byId("retry") }, status);
-  document.body.dataset.connection = status.state;
 }
 
 async function acknowledge(node) {
   alarms.acknowledge(node);
-  siren.sound(alarms.sounding);
+  sound();
   banner.update(alarms);
   try {
     await postJson("/api/acknowledge", { node });
@@ -188,7 +216,7 @@ async function acknowledge(node) {
 function startFinding(node) {
   if (!me) return open("me");
   findView.start(me.node, node);
-  findView.update(team, { connected: connection.state === "live" });
+  findView.update(team, !link.lost);
   scrollTo(0, 0);
   return undefined;
 }
@@ -498,12 +526,11 @@ showSound();
 showLock();
 showCompass();
 setInterval(() => {
-  showAge();
   showQueue();
-  if (findView.open && connection.state !== "live") findView.update(team, { connected: false });
   compareClocks();
   sendPresses();
   sendHeadings();
   if (page === "me") fetchWearers();
 }, 1000);
+startBeat(beat);
 connection.start();

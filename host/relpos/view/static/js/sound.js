@@ -1,15 +1,43 @@
-// The sound of alarms: WebAudio, which browsers allow after the first touch or key, and
-// vibration where there is some.
+// The sounds of alarms: pulses as in IEC 60601-1-8, vibration where there is some. WebAudio, which
+// browsers allow after the first touch or key.
 
-const PATTERNS = {
-  // [seconds from the start, hertz, seconds]; as a PASS alarm: a warning chirps, an alarm wails.
-  warning: { every: 2.5, beeps: [[0, 1500, 0.12], [0.2, 1500, 0.12]] },
-  alarm: {
-    every: 1.2,
-    beeps: [[0, 2000, 0.18], [0.2, 2900, 0.18], [0.4, 2000, 0.18], [0.6, 2900, 0.18]],
-  },
+/** Pulses: [seconds from the start, hertz]; each lasts `pulseS`, the burst comes again after `everyS`. */
+export const PATTERNS = {
+  high: burst(523, 0.16, 10, [0, 0.26, 0.52, 0.98, 1.24, 2.1, 2.36, 2.62, 3.08, 3.34]),
+  medium: burst(392, 0.2, 25, [0, 0.42, 0.84]),
+  low: burst(330, 0.22, 30, [0, 0.5]),
+  // No alarm of a person: two long falling tones.
+  link: { pulseS: 0.45, everyS: 6, level: 0.5, pulses: [[0, 587], [0.5, 294]] },
+  // What happened then: one soft tone, once.
+  replay: { pulseS: 0.35, everyS: null, level: 0.12, pulses: [[0, 220]] },
 };
-const VIBRATION = { warning: [120, 80, 120], alarm: [400, 100, 400, 100, 400] };
+const VIBRATION = { high: [200, 80, 200, 80, 200, 250, 200, 80, 200], medium: [200, 150, 200, 150, 200], low: [200], link: [600] };
+/** At least four harmonics: a sound with several is located by ear, and not lost behind a mask. */
+const HARMONICS = [0, 1, 0.7, 0.6, 0.5, 0.4, 0.3];
+
+function burst(hertz, pulseS, everyS, starts) {
+  return { pulseS, everyS, level: 0.5, pulses: starts.map((at) => [at, hertz]) };
+}
+
+/** Schedule one burst of `kind` in an audio context. */
+export function schedule(context, kind, startS) {
+  const { pulseS, pulses, level } = PATTERNS[kind];
+  const wave = context.createPeriodicWave(new Float32Array(HARMONICS.length), new Float32Array(HARMONICS));
+  for (const [at, hertz] of pulses) {
+    const [from, to] = [startS + at, startS + at + pulseS];
+    const oscillator = context.createOscillator();
+    const gain = context.createGain();
+    oscillator.setPeriodicWave(wave);
+    oscillator.frequency.value = hertz;
+    gain.gain.setValueAtTime(0, from);
+    gain.gain.linearRampToValueAtTime(level, from + 0.02);
+    gain.gain.setValueAtTime(level, to - 0.02);
+    gain.gain.linearRampToValueAtTime(0, to);
+    oscillator.connect(gain).connect(context.destination);
+    oscillator.start(from);
+    oscillator.stop(to + 0.01);
+  }
+}
 
 export class Siren {
   constructor(onChange) {
@@ -42,6 +70,8 @@ export class Siren {
     } catch {
       // Not a gesture after all: the next one will do, and the page says "locked" until then.
     }
+    // What has been waiting is heard at once.
+    this.restart();
     this.onChange();
   }
 
@@ -51,7 +81,7 @@ export class Siren {
     this.onChange();
   }
 
-  /** "alarm", "warning" or null. */
+  /** A key of PATTERNS, or null. */
   sound(kind) {
     if (kind === this.kind) return;
     this.kind = kind;
@@ -67,26 +97,13 @@ export class Siren {
     }
     const once = () => this.once(this.kind);
     once();
-    this.timer = setInterval(once, PATTERNS[this.kind].every * 1000);
+    const { everyS } = PATTERNS[this.kind];
+    if (everyS !== null) this.timer = setInterval(once, everyS * 1000);
   }
 
   once(kind) {
     // Without a touch before, browsers refuse and complain.
-    if (navigator.userActivation?.hasBeenActive) navigator.vibrate?.(VIBRATION[kind]);
-    if (this.state !== "on") return;
-    const start = this.context.currentTime + 0.02;
-    for (const [at, hertz, seconds] of PATTERNS[kind].beeps) {
-      const oscillator = this.context.createOscillator();
-      const gain = this.context.createGain();
-      oscillator.type = "square";
-      oscillator.frequency.value = hertz;
-      gain.gain.setValueAtTime(0, start + at);
-      gain.gain.linearRampToValueAtTime(kind === "alarm" ? 0.5 : 0.25, start + at + 0.01);
-      gain.gain.setValueAtTime(kind === "alarm" ? 0.5 : 0.25, start + at + seconds - 0.01);
-      gain.gain.linearRampToValueAtTime(0, start + at + seconds);
-      oscillator.connect(gain).connect(this.context.destination);
-      oscillator.start(start + at);
-      oscillator.stop(start + at + seconds + 0.01);
-    }
+    if (navigator.userActivation?.hasBeenActive && VIBRATION[kind]) navigator.vibrate?.(VIBRATION[kind]);
+    if (this.state === "on") schedule(this.context, kind, this.context.currentTime + 0.02);
   }
 }

@@ -1,10 +1,11 @@
 // The state of the connection and the age of the data: a view never looks newer than it is.
 
+import { LINK_LOST_S } from "./age.js";
 import { setAttribute, setText } from "./dom.js";
-import { seconds } from "./words.js";
+import { seconds, timeOfDay } from "./words.js";
 
 /** Age in seconds from which the data are called old even while messages arrive. */
-export const OLD_S = 5;
+export const OLD_S = LINK_LOST_S;
 
 const WORDS = {
   connecting: "Connecting",
@@ -13,6 +14,7 @@ const WORDS = {
   waiting: "Not connected",
   refused: "Access denied: open the address with the token that relpos prints",
   old: "Old data",
+  replay: "REPLAY",
 };
 
 /**
@@ -34,6 +36,16 @@ export function connectionWords(state, ageS, retryS) {
   if (ageS !== null) age = ageS < 1.5 ? "data now" : `data ${seconds(ageS)} old`;
   else if (state === "live") age = "no data yet";
   return { state: shown, words, age };
+}
+
+/** {state, words, age} of a recording that is played: its own clock, never now's. */
+export function replayWords(state, session, timeS) {
+  if (state !== "live") return connectionWords(state, null, null);
+  const unixS = session.recorded_unix_s;
+  const age = timeS === null ? "" : Number.isFinite(unixS)
+    ? `${new Date(1000 * unixS).toLocaleDateString()} ${timeOfDay(1000 * (unixS + timeS))}`
+    : `second ${Math.floor(timeS)} of the recording`;
+  return { state: "replay", words: WORDS.replay, age };
 }
 
 export function showConnection({ line, words, age, retry }, status) {

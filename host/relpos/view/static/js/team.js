@@ -1,5 +1,6 @@
 // The newest view of the team, and what follows from it; fed by the server's messages (protocol 1).
 
+import { aged } from "./age.js";
 import { pairKey, relation } from "./relation.js";
 import { Track } from "./tracks.js";
 
@@ -7,6 +8,7 @@ export const PROTOCOL = 1;
 
 /** Less probable positions are not shown: they would be clutter. */
 const MIN_PROBABILITY = 0.03;
+const RANGE_AGE_S = 10; // as the session drops them
 const ONE_PLACE_M = 0.7; // as in the host's fusion/modes.py
 
 export class Team {
@@ -17,6 +19,9 @@ export class Team {
   }
 
   clear() {
+    /** As they were in the newest view, and as they are `lagS` later. */
+    this.viewed = new Map();
+    this.viewedRanges = [];
     this.people = new Map();
     this.pairs = new Map();
     this.ranges = [];
@@ -70,9 +75,10 @@ export class Team {
     this.northRad = picture.north_rad ?? null;
     this.sigmaNorthRad = picture.sigma_north_rad ?? null;
     this.notices = picture.notices ?? [];
-    this.ranges = picture.ranges ?? [];
+    this.viewedRanges = picture.ranges ?? [];
     this.alternatives = picture.alternatives ?? [];
-    this.people = new Map((picture.people ?? []).map((person) => [person.node, named(person)]));
+    this.viewed = new Map((picture.people ?? []).map((person) => [person.node, named(person)]));
+    this.age(0);
     this.pairs = new Map((picture.pairs ?? []).map((pair) => [pairKey(pair[0], pair[1]), pair]));
     this.order = [...this.people.keys()].sort((a, b) => a - b);
     this.pictures += 1;
@@ -82,6 +88,26 @@ export class Team {
         this.trackOf(person.node).add(picture.time_s, person.x_m, person.y_m);
       }
     }
+  }
+
+  /** Make everything `lagS` older than it was in the newest view. */
+  age(lagS) {
+    this.people = new Map([...this.viewed].map(([node, person]) => [node, aged(person, lagS)]));
+    this.ranges = lagS > 0
+      ? this.viewedRanges.map(([a, b, rangeM, ageS]) => [a, b, rangeM, ageS + lagS]).filter(([, , , ageS]) => ageS <= RANGE_AGE_S)
+      : this.viewedRanges;
+  }
+
+  /** Whether this is a recording, not now. */
+  get replayed() {
+    return this.session?.replay === true;
+  }
+
+  /** Time of day in ms at which a person was last heard; in a replay the recording's, null where unknown. */
+  heardMs(node) {
+    const seenS = this.viewed.get(node)?.seen_s;
+    const startS = this.replayed ? this.session.recorded_unix_s : this.unixS - this.timeS;
+    return Number.isFinite(seenS) && Number.isFinite(startS) ? 1000 * (startS + this.timeS - seenS) : null;
   }
 
   trackOf(node) {

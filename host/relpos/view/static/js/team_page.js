@@ -1,14 +1,16 @@
 // The team's page: joins the modules.
 
+import { isFresh, startBeat } from "./age.js";
 import { Alarms } from "./alarms.js";
 import { AlarmBanner, showNotices } from "./banner.js";
 import { Connection } from "./connection.js";
 import { byId, make, postJson, setAttribute, setText, storage } from "./dom.js";
 import { FindView } from "./find_view.js";
+import { LinkBanner } from "./link_banner.js";
 import { TeamMap } from "./map.js";
 import { alternativeWords, PeopleList, updateTable } from "./people.js";
 import { Siren } from "./sound.js";
-import { connectionWords, dataAgeS, showConnection } from "./status_line.js";
+import { connectionWords, dataAgeS, replayWords, showConnection } from "./status_line.js";
 import { Team } from "./team.js";
 import { isDark, themeSwitch } from "./theme_switch.js";
 import { alarmText } from "./words.js";
@@ -28,6 +30,7 @@ let trouble = null;
 const siren = new Siren(showSound);
 const map = new TeamMap(byId("map"), team, { onPick: select, onCamera: showCamera });
 map.covers = [byId("map-tools")];
+const link = new LinkBanner(byId("link"), byId("alarm-voice"), linkChanged);
 const banner = new AlarmBanner(byId("alarms"), { acknowledge, show: find });
 const list = new PeopleList(byId("people"), { select, follow, find });
 const findView = new FindView(byId("find"), {
@@ -46,7 +49,9 @@ function handle(message) {
     trouble = null;
     alarms.clear();
     setText(byId("session"), [team.session.name, team.session.emulated ? "(emulated)" : ""].join(" "));
-    document.title = `${team.session.name ?? "team"} · relpos live`;
+    document.title = `${team.session.name ?? "team"} · relpos ${team.replayed ? "REPLAY" : "live"}`;
+    setAttribute(document.documentElement, "data-replay", team.replayed ? "true" : null);
+    map.readTheme();
     setText(byId("limit-warning"), String(team.limits.still_warning_s));
     setText(byId("limit-alarm"), String(team.limits.still_alarm_s));
     map.layer.forget();
@@ -56,7 +61,8 @@ function handle(message) {
     receivedMs = Date.now();
     takeAlarms();
     map.alarms = alarms.active;
-    findView.update(team, { connected: true });
+    link.update(0, receivedMs);
+    findView.update(team);
   } else if (kind === "unknown") {
     trouble = { level: "warning", text: "The server's version differs from this page's: reload the page." };
   }
@@ -71,8 +77,37 @@ function takeAlarms() {
     setText(byId("news-voice"), cleared
       .map((a) => `${a.name} ${a.kind === "lost" ? "is heard again" : "moves again"}`).join(". "));
   }
-  siren.sound(alarms.sounding);
+  if (team.replayed && raised.length) siren.sound(null);
+  sound();
   banner.update(alarms);
+}
+
+function sound() {
+  const kind = link.sounding ? "link" : alarms.sounding;
+  siren.sound(kind && team.replayed ? "replay" : kind);
+}
+
+/** What was true a moment ago: all of it looks like it, and its age counts on. */
+function linkChanged(lost) {
+  map.old = lost;
+  tableMs = -Infinity;
+  map.readTheme();
+  if (!lost) team.age(0);
+  sound();
+}
+
+function beat() {
+  if (receivedMs === null) return showAge();
+  const lagS = Math.max(0, Date.now() - receivedMs) / 1000;
+  link.update(lagS, receivedMs);
+  if (!link.lost) return showAge();
+  team.age(lagS);
+  alarms.update(team.list());
+  banner.update(alarms);
+  sound();
+  findView.update(team, false);
+  map.invalidate();
+  return show();
 }
 
 // -- display ---------------------------------------------------------------------------------------
@@ -102,7 +137,9 @@ function show() {
     notices.unshift({ level: "warning", text: `${connection.unreadable} messages of the server were unreadable.` });
   }
   showNotices(byId("notices"), notices);
-  setText(byId("count"), team.people.size ? `(${team.people.size})` : "");
+  const heard = team.list().filter(isFresh).length;
+  const all = team.people.size;
+  setText(byId("count"), !all ? "" : heard === all ? `(${all})` : `(${heard} of ${all} heard)`);
   fillMe();
   list.update(team, {
     colourOf: (node) => map.colourOf(node),
@@ -133,15 +170,12 @@ function age() {
 }
 
 function showAge() {
-  const status = connectionWords(connection.state, age(), connection.retryS);
+  const status = team.replayed ? replayWords(connection.state, team.session, team.timeS)
+    : connectionWords(connection.state, age(), connection.retryS);
   showConnection(
     { line: byId("connection"), words: byId("connection-words"), age: byId("age"), retry: byId("retry") },
     status,
   );
-  document.body.dataset.connection = status.state;
-  if (connection.state !== "live" && connection.state !== "silent" && team.pictures) {
-    findView.update(team, { connected: false });
-  }
 }
 
 function showCamera() {
@@ -223,7 +257,7 @@ function nearest(node) {
 function startFinding(from, to) {
   map.find = { from, to };
   findView.start(from, to);
-  findView.update(team, { connected: connection.state === "live" });
+  findView.update(team, !link.lost);
   map.invalidate();
 }
 
@@ -237,7 +271,7 @@ function stopFinding() {
 
 async function acknowledge(node) {
   alarms.acknowledge(node);
-  siren.sound(alarms.sounding);
+  sound();
   banner.update(alarms);
   map.invalidate();
   // The button is gone: on to the next alarm's, or back to the map.
@@ -303,9 +337,5 @@ themeSwitch(byId("theme"), () => {
 const savedMe = store.getItem("relpos.me");
 map.me = savedMe ? Number(savedMe) : null;
 showSound();
-setInterval(() => {
-  showAge();
-  // The age counts on while nothing arrives.
-  if (connection.state !== "live") map.invalidate();
-}, 1000);
+startBeat(beat);
 connection.start();

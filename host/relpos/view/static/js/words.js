@@ -134,19 +134,21 @@ export function probabilityHere(p) {
   return Number.isFinite(p) && p < 0.97 ? `${probability(p)} here` : "ambiguous";
 }
 
-export const HEALTH_WORDS = { green: "well", yellow: "weak", red: "failing" };
+/** Of the node, not of its wearer. */
+export const HEALTH_WORDS = { green: "node OK", yellow: "node weak", red: "node failing", unknown: "node unknown" };
 
 export const STATUS_WORDS = {
   ok: "located",
   ambiguous: "ambiguous",
   unlocated: "not located",
-  stale: "no report",
-  lost: "lost",
+  stale: "not heard, last place",
+  lost: "lost, last place",
 };
 
 /** The text of an alarm from `alarms.js`. */
 export function alarmText(alarm) {
   if (alarm.kind === "lost") return `${alarm.name} is lost: not heard for ${seconds(alarm.seconds)}`;
+  if (alarm.newsS) return `${alarm.name} had not moved for ${seconds(alarm.seconds)}; last heard ${ago(alarm.newsS)}`;
   return `${alarm.name} has not moved for ${seconds(alarm.seconds)}`;
 }
 
