@@ -126,6 +126,7 @@ def test_the_wearers_page_counts_up_when_the_link_is_lost(visit: Any, stage: Sta
     page = visit("/phone", viewport={"width": 390, "height": 844}, expect_gone=True)
     page.get_by_role("button", name="Anna").click()
     page.get_by_role("button", name="This is me").click()
+    expect(page.locator("#press")).to_be_visible()
     page.get_by_role("button", name="Team").click()
     expect(page.locator("#others .state").first).to_have_text("Moves")
     stage.mute = True
