@@ -15,7 +15,7 @@ extern "C" {
 struct inertial_row {  // what replay.py reads back, one a sample
   double x_m, y_m, heading_rad;
   double variance_along_m2, variance_across_m2, variance_heading_rad2, path_m;
-  double last_step_length_m, magnetic_heading_rad, forward_rad;
+  double last_step_length_m, magnetic_heading_rad, forward_rad, scale_error_m;
   uint32_t steps, last_step_tick, flags, moving;
 };
 
@@ -52,8 +52,8 @@ void inertial_run(DeadReckoning* reckoning, const float* imu, const float* field
                               d.variance_along_m2 + d.scale_error_m * d.scale_error_m,
                               d.variance_across_m2, d.variance_heading_rad2, d.path_m,
                               d.last_step_length_m, d.magnetic_heading_rad,
-                              reckoning->forward().offset_rad(), d.steps, d.last_step_tick,
-                              d.quality_flags, d.moving};
+                              reckoning->forward().offset_rad(), d.scale_error_m, d.steps,
+                              d.last_step_tick, d.quality_flags, d.moving};
     rows[i] = row;
   }
 }

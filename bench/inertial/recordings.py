@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import csv
+import math
 from pathlib import Path
 
 import numpy as np
 import replay
 from numpy.typing import NDArray
-from replay import Array, Recording
+from replay import RATE_HZ, Array, Recording
 
 Track = NDArray[np.complex128]  # places as complex metres
+TILT_TIME_S = 3.0  # of the attitude that gives the vertical: over a stride, under a turn
 CORRIDOR = ("Data__test1Data__kar_to_rita", "Data__test2Data__rita_to_kar")  # of walk_chest
 
 
@@ -59,3 +61,24 @@ def fitted(estimate: Track, places: Track, *, scale: bool = False) -> Track:
         power = np.nansum(np.abs(moved) ** 2)
         return np.asarray(places[0] + moved * (turn / power if power > 0.0 else 1.0))
     return np.asarray(places[0] + moved * (turn / abs(turn) if abs(turn) > 0.0 else 1.0))
+
+
+def upwards(recording: Recording) -> Array:
+    """The vertical (n, 3) in sensor axes: the gyroscope carries it, gravity corrects it."""
+    force, rate = recording.imu[:, :3], recording.imu[:, 3:]
+    up = force[:25].mean(axis=0)
+    up /= np.linalg.norm(up)
+    out = np.empty_like(force)
+    axes = np.cross(np.eye(3), rate[:, None, :])  # (n, 3, 3): axes @ up is the cross product
+    turns = np.eye(3) - axes / RATE_HZ
+    share = 1.0 / (RATE_HZ * TILT_TIME_S)
+    for i, turn in enumerate(turns):
+        up = (1.0 - share) * (turn @ up) + share * force[i] / 9.81
+        up /= math.sqrt(up @ up)
+        out[i] = up
+    return out
+
+
+def gyro_heading_rad(recording: Recording) -> Array:
+    """Yaw (n,) from the raw gyroscope about the vertical: no bias, no correction."""
+    return np.cumsum(np.sum(recording.imu[:, 3:] * upwards(recording), axis=1)) / RATE_HZ

@@ -6,14 +6,19 @@ on the board); ``reckon`` replays samples through it.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import ctypes
 import functools
 import gzip
 import hashlib
+import io
 import os
+import re
+import shutil
 import subprocess
 import tomllib
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from relpos.calibration.steps import LEG_OF_STATURE, posterior_scale
+from relpos.calibration.steps import LEG_OF_STATURE
 
 Array = NDArray[np.float64]
 
@@ -37,6 +42,7 @@ ROW = np.dtype(
         *((name, "f8") for name in ("x_m", "y_m", "heading_rad", "variance_along_m2")),
         *((name, "f8") for name in ("variance_across_m2", "variance_heading_rad2", "path_m")),
         *((name, "f8") for name in ("last_step_length_m", "magnetic_heading_rad", "forward_rad")),
+        ("scale_error_m", "f8"),
         *((name, "u4") for name in ("steps", "last_step_tick", "flags", "moving")),
     ]
 )
@@ -57,34 +63,75 @@ def data_folder() -> Path:
     return Path(os.environ.get("RELPOS_DATA", ROOT.parent / "shared" / "data"))
 
 
+TUNABLE = ("kTurn_rad", "kSmallRise_m", "kWalkRatio_m_s")
+_tuned = False  # whether the build with constants that can be set is in force
+
+
 @functools.cache
-def build() -> ctypes.CDLL:
-    """Compile (cached by content) and load the library."""
-    sources = [Path(__file__).with_name("c_abi.cpp"), *sorted(LIBRARY.glob("*.cpp"))]
+def build(*, tunable: bool = False) -> ctypes.CDLL:
+    """Compile (cached by content) and load the library.
+
+    With ``tunable`` the constants of `TUNABLE` are variables of the library; nothing else differs.
+    """
+    sources = {p: p.read_text() for p in (*LIBRARY.glob("*.cpp"), *LIBRARY.glob("*.h"))}
+    sources[Path(__file__).with_name("c_abi.cpp")] = (
+        Path(__file__).with_name("c_abi.cpp").read_text()
+    )
+    if tunable:
+        text = "\n".join(sources.values())
+        values = {n: re.findall(rf"const float {n} = ([\d.]+)f;", text) for n in TUNABLE}
+        for path, source in sources.items():
+            for name in TUNABLE:
+                source = re.sub(rf"const float {name} = [\d.]+f;", "", source)
+            sources[path] = source
+        head = "".join(f'extern "C" float {name};\n' for name in TUNABLE)
+        sources[LIBRARY / "attitude.h"] = head + sources[LIBRARY / "attitude.h"]
+        for name, (value,) in values.items():
+            sources[LIBRARY / "attitude.cpp"] += f"float {name} = {value}f;\n"
     flags = ["-std=gnu++11", "-O2", "-fPIC", "-shared", "-Wall", "-Wextra", "-Werror"]
     flags += ["-ffp-contract=off", "-Wdouble-promotion"]
     digest = hashlib.sha256(" ".join(flags).encode())
-    for path in [*sources, *sorted(LIBRARY.glob("*.h"))]:
-        digest.update(path.read_bytes())
+    for path in sorted(sources):
+        digest.update(sources[path].encode())
     target = ROOT / ".build" / "inertial" / f"inertial-{digest.hexdigest()[:16]}.so"
     if not target.exists():
-        target.parent.mkdir(parents=True, exist_ok=True)
+        folder = target.with_suffix(f".{os.getpid()}.d")
+        (folder / "inertial").mkdir(parents=True)
+        for path, source in sources.items():
+            (folder / "inertial" / path.name).write_text(source)
         scratch = target.with_suffix(f".{os.getpid()}")
-        command = [
-            "g++",
-            *flags,
-            f"-I{LIBRARY}",
-            f"-I{LIBRARY.parent}",
-            *map(str, sources),
-            "-o",
-            str(scratch),
-        ]
-        subprocess.run(command, check=True)
+        code = [str(folder / "inertial" / p.name) for p in sorted(sources) if p.suffix == ".cpp"]
+        include = [f"-I{folder / 'inertial'}", f"-I{folder}"]
+        subprocess.run(["g++", *flags, *include, *code, "-o", str(scratch)], check=True)
         scratch.replace(target)
+        shutil.rmtree(folder)
     library = ctypes.CDLL(str(target))
     library.inertial_create.restype = ctypes.c_void_p
     library.inertial_default_gain.restype = ctypes.c_float
     return library
+
+
+def default_gain() -> float:
+    """The step gain of a new node."""
+    return float(build().inertial_default_gain())
+
+
+@contextlib.contextmanager
+def constants(values: Mapping[str, float]) -> Iterator[None]:
+    """While it lasts `reckon` uses these values of constants of `TUNABLE`."""
+    global _tuned
+    library = build(tunable=True)
+    variables = {name: ctypes.c_float.in_dll(library, name) for name in values}
+    before = {name: variable.value for name, variable in variables.items()}
+    for name, value in values.items():
+        variables[name].value = value
+    _tuned = True
+    try:
+        yield
+    finally:
+        _tuned = False
+        for name, value in before.items():
+            variables[name].value = value
 
 
 @dataclass
@@ -100,26 +147,35 @@ class Recording:
 
     @property
     def leg_length_m(self) -> float:
-        """From the stature, the population's where it is not known."""
-        return LEG_OF_STATURE * float(self.meta.get("stature_m", DEFAULT_STATURE_M))
+        """The run's own, else from the stature, the population's where neither is known."""
+        stature_m = float(self.meta.get("stature_m", DEFAULT_STATURE_M))
+        return float(self.meta.get("leg_length_m", LEG_OF_STATURE * stature_m))
 
     def times_of(self, event: str) -> Array:
         """Times of the events of that name, in order."""
         return np.array([time for time, name, _ in self.events if name == event])
 
     @property
-    def trial_s(self) -> tuple[float, float]:
-        """Beginning and end of the trial, cut to the recording."""
-        begins, ends = self.times_of("trial_start"), self.times_of("trial_end")
-        begin = max(float(self.time_s[0]), float(begins.min()) if len(begins) else -np.inf)
-        return begin, min(float(self.time_s[-1]), float(ends.max()) if len(ends) else np.inf)
+    def trials_s(self) -> list[tuple[float, float]]:
+        """Beginnings and ends of the trial or the bouts, cut to the recording."""
+        begins = np.append(self.times_of("trial_start"), self.times_of("bout_start"))
+        ends = np.append(self.times_of("trial_end"), self.times_of("bout_end"))
+        first, last = float(self.time_s[0]), float(self.time_s[-1])
+        if len(begins) != len(ends) or len(begins) == 0:
+            return [(first, last)]
+        return [(max(first, b), min(last, e)) for b, e in zip(begins, ends, strict=True)]
+
+    def during_trials(self, times_s: Array, margin_s: float = 0.0) -> Array:
+        """Those of the times that lie in a trial or bout, or ``margin_s`` around it."""
+        inside = np.zeros(len(times_s), bool)
+        for begin, end in self.trials_s:
+            inside |= (times_s >= begin - margin_s) & (times_s <= end + margin_s)
+        return times_s[inside]
 
     @property
     def contacts_s(self) -> Array:
-        """Foot contacts inside the trial and the recording."""
-        begin, end = self.trial_s
-        contacts = self.times_of("foot_contact")
-        return contacts[(contacts >= begin) & (contacts <= end)]
+        """Foot contacts inside the trials and the recording."""
+        return self.during_trials(self.times_of("foot_contact"))
 
 
 @dataclass
@@ -161,7 +217,8 @@ class Reckoning:
 def load(folder: Path) -> Recording:
     """Read a run directory's inertial data, low-passed to 20 Hz and resampled to 50 Hz."""
     with gzip.open(folder / "imu.csv.gz", "rt") as stream:
-        raw = np.loadtxt(stream, delimiter=",", skiprows=1, ndmin=2)
+        text = re.sub(r",(?=[,\n])", ",nan", stream.read())  # a field that was not measured
+    raw = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=1, ndmin=2)
     meta = tomllib.loads((folder / "run.toml").read_text())
     events: list[tuple[float, str, str]] = []
     if (folder / "events.csv").exists():
@@ -193,7 +250,7 @@ def reckon(
     ``dt_s`` is one span for all samples or (n,) of them. Gain and scale sigma are the library's
     own where they are None.
     """
-    library = build()
+    library = build(tunable=_tuned)
     count = len(imu)
     samples = np.ascontiguousarray(imu, dtype=np.float32)
     magnetic = np.ascontiguousarray(
@@ -295,24 +352,10 @@ def score_steps(recording: Recording, step_times_s: Array) -> StepScore:
     inside the trial (shifted, 0.3 s around it) that no contact is left for.
     """
     tolerance_s = 0.3
-    begin, end = recording.trial_s
     contacts = recording.contacts_s
     scores = []
     for offset_s in np.arange(-0.5, 0.505, 0.02):
-        shifted = step_times_s + offset_s
-        inside = shifted[(shifted >= begin - tolerance_s) & (shifted <= end + tolerance_s)]
+        inside = recording.during_trials(step_times_s + offset_s, tolerance_s)
         found = pairs_within(inside, contacts, tolerance_s)
         scores.append(StepScore(len(contacts), found, len(inside) - found, float(offset_s)))
     return max(scores, key=lambda score: (score.found - score.extra, -abs(score.offset_s)))
-
-
-def calibrate(recording: Recording, true_distance_m: float, *, believed: bool = True) -> float:
-    """Step gain after a walk of known length, as ``relpos deadreckon --calibrate-from`` has it.
-
-    Without ``believed`` the gain is taken as the walk asks for it.
-    """
-    walked_m = reckon(recording.imu, leg_length_m=recording.leg_length_m).distance_m
-    asked = true_distance_m / walked_m
-    return float(build().inertial_default_gain()) * (
-        posterior_scale([asked]) if believed else asked
-    )

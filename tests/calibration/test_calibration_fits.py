@@ -156,25 +156,32 @@ def test_a_calibration_that_no_node_can_hold_is_refused():
 
 def test_the_weight_of_one_walk_falls_with_its_deviation():
     asked = np.array([1.02, 1.05, 1.10, 1.20, 1.40])
-    shares = [np.log(steps.posterior_scale([a])) / np.log(a) for a in asked]
+    shares = [np.log(steps.posterior_scale([a], [35])) / np.log(a) for a in asked]
     assert all(a > b for a, b in itertools.pairwise(shares))
-    assert 0.6 < shares[0] < 0.7
-    assert shares[-1] < 0.05
-    assert steps.posterior_scale([1.0]) == 1.0
+    assert 0.75 < shares[0] < 0.85
+    assert shares[-1] < 0.25
+    assert steps.posterior_scale([1.0], [35]) == 1.0
+
+
+def test_a_walk_of_a_hundred_steps_weighs_more_than_one_of_seven():
+    few, many = (steps.posterior_scale([1.1], [count]) for count in (7, 110))
+    assert 1.01 < few < 1.06 < many < 1.1
 
 
 def test_walks_that_agree_have_a_large_weight():
-    one, three = steps.posterior_scale([1.15]), steps.posterior_scale([1.15, 1.14, 1.16])
-    assert 1.0 < one < 1.06
-    assert three > 1.09
+    one = steps.posterior_scale([1.15], [35])
+    three = steps.posterior_scale([1.15, 1.14, 1.16], [35, 35, 35])
+    assert 1.05 < one < 1.12 < three < 1.15
     # One walk that was not of the stated distance is an outlier.
-    assert steps.posterior_scale([1.04, 1.05, 1.60]) == steps.posterior_scale([1.04, 1.05, 1.055])
+    assert steps.posterior_scale([1.04, 1.05, 1.60], [35] * 3) == steps.posterior_scale(
+        [1.04, 1.05, 1.055], [35] * 3
+    )
 
 
 @pytest.mark.parametrize("scales", [[], [0.0], [-1.0], [float("nan")]])
 def test_a_scale_that_is_none_is_refused(scales):
     with pytest.raises(DataError):
-        steps.posterior_scale(scales)
+        steps.posterior_scale(scales, [35] * len(scales))
 
 
 def test_people_scatter_about_the_population_whatever_the_node_was_set_to():

@@ -153,11 +153,12 @@ def test_a_gap_is_silence_and_not_motion(walker):
 
 def test_a_calibration_walk_sets_the_gain_by_the_weight_of_one_walk(walker):
     recording = recorded(walker, even(100.0))
-    before_m = play(1, recording, WearerSettings(0.9)).distance_m
+    before = play(1, recording, WearerSettings(0.9))
+    before_m = before.distance_m
     found = calibrate(1, [recording], [1.05 * before_m], 0.9)
     # With the gain that the firmware begins with.
     assert found.measured_m == pytest.approx((before_m,), rel=1e-3)
-    assert found.scale == pytest.approx(posterior_scale([1.05]), abs=1e-3)
+    assert found.scale == pytest.approx(posterior_scale([1.05], [len(before.steps)]), abs=1e-3)
     after_m = play(1, recording, WearerSettings(0.9, found.gain_permille)).distance_m
     assert after_m / before_m == pytest.approx(found.scale, abs=0.005)
     # Walks that agree are believed more than one of them.

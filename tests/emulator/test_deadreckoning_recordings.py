@@ -14,8 +14,8 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "bench" / "inertial"))
 
 import evaluate  # noqa: E402
-import floors  # noqa: E402
 import replay  # noqa: E402
+import walks  # noqa: E402
 
 import recordings  # noqa: E402
 
@@ -85,79 +85,81 @@ def test_alignment_spends_the_first_leg_and_nothing_else():
     assert long["median_percent"] == pytest.approx(100.0 * np.median(ends))
 
 
-def test_a_recording_that_lost_samples_is_distinguished_from_a_sound_one():
-    time = np.arange(0.0, 30.0, 0.02)
-    contacts = np.arange(5.0, 26.0, 0.6)
-
-    def walk(shift_s):
-        # An impact 0.1 s after each contact; on the way back earlier by shift_s.
-        impacts = contacts + 0.1 - shift_s * (contacts > 17.0)
-        vertical = 3.0 * np.exp(-(((time[:, None] - impacts) / 0.08) ** 2)).sum(axis=1)
-        recording = walk_with(contacts, end_s=26.0, begin_s=4.5)
-        recording.events += [(15.0, "uturn_start", ""), (16.5, "uturn_end", "")]
-        return floors.Walk(recording, np.zeros((0, 3)), vertical, [])
-
-    assert floors.is_intact(walk(0.0), floors.ceiling_of(walk(0.0)))
-    assert not floors.is_intact(walk(0.2), floors.ceiling_of(walk(0.2)))
-
-
 # --- the walks -----------------------------------------------------------------------------------
 
 
+MOST_PERCENT = {  # mean absolute, from the stature alone, constants fitted without the set
+    "5m back, elderly": 14.0,
+    "5m back, young": 7.0,
+    "author back": 7.0,
+    "daily lowerback, under 0.6 m/s (slow)": 25.0,
+    "lowerback 20m": 6.0,
+    "mocap virtual": 7.0,
+    "phone strides": 7.0,
+    "treadmill stroke lumbar": 15.5,
+    "treadmill stroke lumbar, under 0.6 m/s (slow)": 35.0,
+}
+
+
 @pytest.fixture(scope="module")
-def lowerback():
-    return evaluate.lowerback("all", verbose=False)
+def found():
+    return walks.find(replay.data_folder())
+
+
+@pytest.fixture(scope="module")
+def rows(found):
+    # The page's own grid is five times as large.
+    fit = walks.Fit(found, {name: values[1::2] for name, values in walks.CONSTANTS.items()})
+    return {g: evaluate.judge(g, w, fit) for g, w in walks.groups_of(found)}
 
 
 @needs("walk_lowerback_20m")
-def test_twenty_metres_are_twenty_metres_from_the_stature_alone(lowerback):
-    assert lowerback["walks"] == 74
-    assert lowerback["distance_error_percent_mean_abs"] < 5.0
-    assert lowerback["distance_error_percent_worst"] < 35.0
-    assert abs(lowerback["intact_distance_error_percent_mean"]) < 1.5
-    assert lowerback["intact_distance_error_percent_mean_abs"] < 3.8
+def test_people_who_were_left_out_walk_as_far_as_they_walked(rows):
+    for group, most in MOST_PERCENT.items():
+        assert rows[group].mean_abs < most, group
+        # Shuffled steps are a third too long; the node says that it does not know them.
+        assert rows[group].flagged >= (90.0 if "slow" in group else 0.0), group
 
 
 @needs("walk_lowerback_20m")
-def test_one_calibration_walk_brings_a_person_to_scale(lowerback):
-    assert lowerback["calibrated_distance_error_percent_mean_abs"] < 4.7
-    # Where no samples are lost the pendulum with given contacts reaches 3.4 %.
-    assert lowerback["intact_calibrated_distance_error_percent_mean_abs"] < 3.3
+def test_steps_are_found_one_to_one(rows):
+    for group in ("lowerback 20m", "treadmill stroke lumbar"):
+        assert rows[group].steps_found > 97.0
+        assert rows[group].steps_extra < 3.0
 
 
 @needs("walk_lowerback_20m")
-def test_steps_are_found_one_to_one(lowerback):
-    assert lowerback["steps_found_percent"] > 97.2
-    assert lowerback["steps_extra_percent"] < 2.3
-    assert lowerback["intact_steps_found_percent"] > 98.4
-    assert lowerback["intact_steps_extra_percent"] < 1.4
+def test_one_calibration_walk_brings_a_person_to_scale(rows):
+    assert rows["lowerback 20m"].calibrated < 5.5
+    assert rows["treadmill stroke lumbar"].calibrated < 14.0
 
 
 @needs("walk_lowerback_20m")
-def test_a_u_turn_is_half_a_turn(lowerback):
-    assert lowerback["turn_error_deg_median_abs"] < 2.5
-    assert lowerback["intact_turn_error_deg_mean_abs"] < 3.7
-    assert lowerback["legs_error_deg_median_abs"] < 3.5
+def test_a_u_turn_is_half_a_turn(rows):
+    assert rows["lowerback 20m"].turn_deg < 2.5
 
 
 @needs("walk_lowerback_20m")
-def test_the_claimed_variance_along_is_honest(lowerback):
-    assert 0.4 < lowerback["nees_along"] < 2.0  # 0.5 to 2 is the aim, 0.51 is reached
-    assert lowerback["nees_along_low"] < lowerback["nees_along"] < lowerback["nees_along_high"]
+def test_no_set_errs_by_more_than_the_node_says(rows):
+    for group in MOST_PERCENT:
+        assert rows[group].nees < 2.0, group
+    for group in ("lowerback 20m", "5m back, elderly", "treadmill stroke lumbar"):
+        assert rows[group].nees > 0.5, group
 
 
-@needs("walk_daily_lowerback")
-def test_slow_indoor_activity_is_not_taken_for_walking():
-    figures = evaluate.daily(verbose=False)
-    assert abs(figures["slow_summed_error_percent"]) < 10.0
-    assert figures["slow_mean_abs_error_per_bout_percent"] < 25.0
-    assert abs(figures["straight_summed_error_percent"]) < 8.0
+@needs("walk_lowerback_20m")
+def test_a_person_who_is_left_out_changes_no_constant(found):
+    found = [walk for walk in found if walk.data_set == "walk_lowerback_20m"]
+    grid = {name: values[:1] for name, values in walks.CONSTANTS.items()}
+    chosen = walks.Fit(found, grid).without(lambda walk: walk.person == "1")
+    others = [walk for walk in found if walk.person != "1"]
+    assert walks.Fit(others, grid).without(lambda walk: False) == chosen
 
 
 @needs("walk_chest")
 def test_the_same_corridor_is_as_long_both_ways():
-    figures = evaluate.chest(verbose=False)
-    assert abs(figures["corridor_ratio_percent"]) < 0.7
+    figures = evaluate.chest()
+    assert abs(figures["corridor_ratio_percent"]) < 0.8
     for way in ("there", "back"):
         assert 164 <= figures[f"corridor_{way}_steps"] <= 169
     assert figures["K_calibration_worst_from_mean_percent"] < 2.0
@@ -167,12 +169,11 @@ def test_the_same_corridor_is_as_long_both_ways():
 
 
 @needs("walk_handheld_waypoints")
-def test_a_handheld_phone_leads_from_waypoint_to_waypoint():
-    figures = evaluate.waypoints(verbose=False)
-    assert figures["walks"] == 70
-    assert figures["median_percent"] < 9.2
-    assert figures["best_turn_median_percent"] < 6.8
-    assert figures["magnetometer_median_percent"] < 9.2
+def test_a_handheld_phone_leads_from_waypoint_to_waypoint(found):
+    figures = evaluate.waypoints([w for w in found if w.data_set == "walk_handheld_waypoints"])
+    assert figures["plain"]["walks"] == 70
+    assert figures["plain"]["median_percent"] < 8.5
+    assert figures["magnetometer"]["median_percent"] < 8.5
 
 
 @needs("walk_handheld_waypoints")

@@ -47,7 +47,7 @@ def test_a_learned_scale_becomes_the_nodes_gain_and_a_new_gain_version(conversat
     conversation.learn(1, 1.10)
     conversation.run(8.0)
     (remark,) = conversation.sender.remarks
-    assert remark == "node 1: step gain 2.343 (x1.100, learned from ranges)", "2.130 in a new node"
+    assert remark == "node 1: step gain 2.354 (x1.100, learned from ranges)", "2.140 in a new node"
     assert conversation.sender.sent == 1
     assert conversation.motions[1].gain_version == (before + 1) % 256
     assert conversation.motions[2].gain_version == before

@@ -16,8 +16,8 @@ namespace {
 
 const float kDefaults[] PROGMEM = {
     0.93f,          // 0.53 of the stature (Zijlstra and Hof 1997); here of 1.75 m
-    2.13f,          // odd people of walk_lowerback_20m
-    0.07f,          // 0.05 to 0.09 uncalibrated, 0.03 calibrated
+    2.14f,          // all people of docs/walkers.md
+    0.10f,          // what people differ by (docs/walkers.md)
     39.0f,          // just under 4 g
     17.4f,          // just under 1000 deg/s
     kPi / 180.0f,   // 1 deg/s: what a warmed-up, once zeroed MPU-9150 keeps
@@ -57,12 +57,12 @@ const float kFirstStep = 0.6f;        // a walk's first step, from both feet to 
 const float kOddStepSigma = 0.3f;     // that one, and what the walk ratio shortened
 const float kTurnSigma_m = 0.2f;      // of a step on the spot
 // Longest step for its time, length times duration: people walk at 0.30 to 0.42 m s at any speed
-// (walk ratio; walk_lowerback_20m, Sekiya and Nagasaki 1998). A long slow arc is bending or lifting.
-const float kWalkRatio_m_s = 0.5f;
+// (walk ratio; Sekiya and Nagasaki 1998). A long slow arc is bending, lifting or shuffling.
+const float kWalkRatio_m_s = 0.45f;
 const float kIrregular = 0.7f;        // share left by turning under which a step is flagged
 // Relative scale error of flagged steps: shuffling, turning on the spot, steps aside and lifting look
-// alike on the torso and are a quarter to a whole too long (bench/inertial/simulated.py).
-const float kIrregularScale = 0.35f;
+// alike on the torso (docs/walkers.md: walks under 0.6 m/s).
+const float kIrregularScale = 0.25f;
 const float kLateralSigma_m = 0.06f;  // the torso sways 2 to 4 cm and feet are placed as wide
 const float kVerticalSigma_m = 0.02f; // level floor: mid-stance heights repeat within 1 to 2 cm
 const float kLost = 0.5f;             // of the pendulum's length: the inertial motion ran away
@@ -336,16 +336,17 @@ RELPOS_APART void DeadReckoning::on_stance(const Stance& stance) {
   }
   closing_m_ = 0.0f;
   const float heading = displacement_.heading_rad;
-  float mean = heading, turn = 0.0f;
+  float mean = heading, turn = 0.0f, stride_turn = 0.0f;
   if (step_ticks_ > 0 && !stance.first) {
     mean = stance_heading_rad_ + heading_sum_rad_ / static_cast<float>(step_ticks_);
     turn = turn_between(stance_heading_rad_, displacement_.heading_rad);
+    stride_turn = turn + turn_rad_;
   }
   stance_heading_rad_ = heading;
   heading_sum_rad_ = 0.0f;
   direct(mean, step_heading_);
 
-  const float share = turning_share(turn);
+  const float share = turning_share(stride_turn);
   const float interval_s = stance.interval_s;
   float length =
       share * pendulum_step_m(stance.excursion_m, config_.leg_length_m, config_.step_gain);
@@ -367,7 +368,7 @@ RELPOS_APART void DeadReckoning::on_stance(const Stance& stance) {
   step_length_m_ = length;
   step_sigma_m_ = sigma * length + kStepSigma_m + kTurnSigma_m * (1.0f - share);
 
-  if (stance.first || fabsf(turn + turn_rad_) > kStraight_rad) straight_steps_ = 0;
+  if (stance.first || fabsf(stride_turn) > kStraight_rad) straight_steps_ = 0;
   turn_rad_ = turn;
   add(&straight_s_, interval_s);
   ++straight_steps_;

@@ -28,7 +28,7 @@ const float kDueFrom = 0.8f, kDueUntil = 1.4f;  // of the period
 const float kDueRange_m_s2 = 1.0f;
 const uint8_t kWalk = 3;           // steps that make a walk, whose end is a footfall
 
-const float kTurn_rad = 0.6f;      // see turning_share
+const float kTurn_rad = 1.15f;     // see turning_share
 
 const float kForwardMemory_s = 12.0f;  // about twenty steps: a body-fixed axis, yet free to move
 const uint8_t kForwardSteps = 4;       // two strides: the sway of left and right cancels
@@ -139,12 +139,13 @@ RELPOS_SHARED bool GaitDetector::update(float vertical_m_s2, float dt_s, Stance*
 
 float pendulum_step_m(float excursion_m, float leg_length_m, float gain) {
   const float length = gain * cube_root(leg_length_m * leg_length_m * excursion_m);
-  return excursion_m < kSmallRise_m ? length * sqrtf(excursion_m * (1.0f / kSmallRise_m)) : length;
+  return excursion_m < kSmallRise_m ? length * excursion_m * (1.0f / kSmallRise_m) : length;
 }
 
-RELPOS_APART float turning_share(float yaw_rad) {
-  const float turn = yaw_rad * (1.0f / kTurn_rad);
-  return 1.0f / (1.0f + turn * turn);
+RELPOS_APART float turning_share(float stride_rad) {
+  const float turn = stride_rad * (1.0f / kTurn_rad);
+  const float square = turn * turn;
+  return 1.0f / (1.0f + square * square);
 }
 
 RELPOS_SHARED void ForwardFinder::reset() {

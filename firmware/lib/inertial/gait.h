@@ -47,8 +47,9 @@ class GaitDetector {
 // docs/deadreckoning.md. Under kSmallRise_m the rise is sway and bending as much as stepping.
 const float kSmallRise_m = 0.02f;
 float pendulum_step_m(float excursion_m, float leg_length_m, float gain);
-// What turning leaves of a step's length: 1 straight ahead, a half at 0.6 rad a step.
-float turning_share(float yaw_rad);
+// What turning leaves of a step's length: 1 straight ahead and in bends, a half at 1.15 rad a stride.
+// Of a stride, because the trunk swings by up to 0.3 rad from step to step.
+float turning_share(float stride_rad);
 
 // Forward axis on the body. The pendulum trades height against speed: the torso gains forward
 // speed while it sinks and loses it while it rises, so horizontal acceleration times downward

@@ -37,6 +37,7 @@ constexpr uint16_t kMostRawReports = 3000; // ten minutes: a lost host does not 
 // 20 deg/s (data sheet limits).
 constexpr float kCalibratedLimit_m_s2 = 37.0f;
 constexpr float kCalibratedLimitRadS = 16.5f;
+constexpr float kWearersScale = 0.05f;  // relative error of a gain that was set
 
 // What a command may set: where it stands in the settings, and its limits.
 struct Choice {
@@ -202,6 +203,8 @@ RELPOS_UNCLONED void Node::configure_inertial() {
   InertialConfig& config = dead_reckoning_.config();
   config.leg_length_m = static_cast<float>(settings_.leg_length_mm) * 1e-3f;
   config.step_gain = static_cast<float>(settings_.step_gain_permille) * 1e-3f;
+  // A gain that was set comes from this wearer's walks or ranges.
+  if (settings_.step_gain_permille != kPopulationGainPermille) config.scale_sigma = kWearersScale;
   const int16_t sigma = settings_.calibration[wire::kGyroBiasSigma];
   if (sigma != 0) {
     config.gyro_bias_sigma_rad_s = sigma * wire::kCalibrationUnit;

@@ -13,7 +13,8 @@ static_assert(__is_trivial(Persistent), "records are copied byte by byte");
 static_assert(sizeof(Preferences) == 18 && sizeof(Settings) == 62 && sizeof(Marks) == 8,
               "the stored bytes are those of the struct on every board");
 constexpr uint8_t kLayout = 3;  // of all records; another one is not read
-const Preferences kDefaults RELPOS_FLASH = {6, 0, kLedHealth, 0, 930, 2130, 1000, 2000, 10000, 0, 0, 0};
+const Preferences kDefaults RELPOS_FLASH = {
+    6, 0, kLedHealth, 0, 930, kPopulationGainPermille, 1000, 2000, 10000, 0, 0, 0};
 constexpr uint16_t kSeed = 0xFFFF - kLayout;
 
 static_assert(kStorageBytes <= 256, "a place is a byte");

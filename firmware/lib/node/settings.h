@@ -9,6 +9,7 @@
 namespace relpos {
 
 constexpr uint8_t kDefaultNodeId = 1;  // where none is stored
+constexpr uint16_t kPopulationGainPermille = 2140;  // a new node's step gain
 
 enum LedMode : uint8_t { kLedOff = 0, kLedOn = 1, kLedHealth = 2 };
 

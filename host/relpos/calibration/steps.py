@@ -2,8 +2,9 @@
 
 A step's length is gain x (l^2 h)^(1/3) with leg length l and the torso's rise h
 (docs/deadreckoning.md): proportional to the gain, so a walk of known length gives the gain by
-division. Its weight follows from prior knowledge: people differ by 7 %, one walk repeats to 5 %,
-and now and then a walk is faulty (lost samples, another distance): `posterior_scale`.
+division. Its weight follows from what is known before: people differ by 10 %, a walk repeats the
+better the longer it is, and now and then one is faulty: `posterior_scale`. Scales that an estimator
+learns from ranges have the same prior in the estimator and are taken as they are.
 """
 
 from __future__ import annotations
@@ -18,24 +19,24 @@ from relpos.errors import DataError
 LEG_OF_STATURE = 0.53
 """Leg length (hip joint to floor) over stature: Winter, Biomechanics and Motor Control of Human
 Movement; 0.530 there."""
-POPULATION_GAIN_PERMILLE = 2130
-"""A new node's gain: from the people with odd numbers in walk_lowerback_20m."""
-PERSON_SPREAD = 0.07
-"""Relative standard deviation of gains between people and sensor positions."""
-WALK_SPREAD = 0.05
-"""Relative error of one walk of 20 m in the same person (walk_lowerback_20m: 3.4 % where no sample
-was lost)."""
-OUTLIER_SCALE = 0.10
-"""Relative change at which a single walk is as likely faulty as the person is unusual."""
+POPULATION_GAIN_PERMILLE = 2140
+"""A new node's gain: from the people of docs/walkers.md."""
+PERSON_SPREAD = 0.10
+"""Relative standard deviation of gains between people and sensor positions: .05 healthy, .14 after
+a stroke or over eighty (docs/walkers.md)."""
+WALK_SPREAD = 0.03
+"""Relative error that a walk repeats in all its steps."""
+STEP_SPREAD = 0.25
+"""What single steps add, over the root of their number: .09 in walks of seven steps, .045 in 35."""
+FAULTY_SCALE = 0.025
+"""Times the root of the steps: change at which a walk is as likely faulty (samples lost, started or
+stopped elsewhere) as the person is unusual."""
 MIN_GAIN_PERMILLE, MAX_GAIN_PERMILLE = 300, 5000
 """Limits of the firmware."""
 MIN_STEPS = 8
 """Fewer steps are dominated by starting and stopping."""
 MAX_CHANGE = 1.6
 """People's gains differ by 10 %; a larger factor comes from another distance."""
-STEP_SPREAD = 0.08
-"""Random part of a step's length, relative (docs/deadreckoning.md); its
-effect on a walk's length falls with the root of the steps."""
 
 
 def leg_length_m(stature_m: float) -> float:
@@ -61,23 +62,21 @@ def scaled_gain_permille(gain_permille: int, step_scale: float) -> int:
     return gain
 
 
-def posterior_scale(scales: Sequence[float]) -> float:
-    """Return the factor on the population's gain after walks with ``scales`` (n,).
+def posterior_scale(scales: Sequence[float], steps: Sequence[int]) -> float:
+    """Return the factor on the population's gain after walks with ``scales`` and ``steps`` (n,).
 
-    Normal prior of `PERSON_SPREAD` over the logarithm, the walks' median with `WALK_SPREAD` over
-    root n, and a heavy tail: the variance of one walk grows with the fourth power of its scale's
-    logarithm, and this part falls with the square of the number of walks. DataError where a
-    scale is not positive. On every ordered pair of walks of one person in walk_lowerback_20m, a
-    fifth of which lost samples, the mean absolute error of the other walk is 4.4 %, against 6.2 %
-    with the plain scale and 4.9 % without calibration.
+    Normal prior of `PERSON_SPREAD` over the logarithm; the median of the walks with the variance of
+    their mean; and a heavy tail: the variance of one walk grows with the fourth power of its
+    scale's logarithm, and this part falls with the square of the number of walks. DataError where
+    a scale or a number of steps is not positive.
     """
-    if not scales or not all(math.isfinite(s) and s > 0.0 for s in scales):
+    if not scales or not all(math.isfinite(s) and s > 0.0 for s in scales) or min(steps) < 1:
         raise DataError("a step scale is not a positive number")
-    count = len(scales)
+    count, total = len(scales), sum(steps)
     log_scale = statistics.median(math.log(s) for s in scales)
-    tail = 1.0 + (log_scale / OUTLIER_SCALE) ** 4 / count**2
-    weight = PERSON_SPREAD**2 / (PERSON_SPREAD**2 + WALK_SPREAD**2 * tail / count)
-    return math.exp(weight * log_scale)
+    variance = WALK_SPREAD**2 / count + STEP_SPREAD**2 / total
+    variance *= 1.0 + (log_scale / FAULTY_SCALE) ** 4 * (count / total) ** 2 / count**2
+    return math.exp(PERSON_SPREAD**2 / (PERSON_SPREAD**2 + variance) * log_scale)
 
 
 @dataclass(frozen=True)
@@ -97,8 +96,8 @@ class WalkFit:
 
     @property
     def sigma(self) -> float:
-        """Relative standard deviation of the scale from the random part of step lengths."""
-        return STEP_SPREAD / math.sqrt(self.steps)
+        """Relative standard deviation of the walk's scale about the wearer's."""
+        return math.hypot(WALK_SPREAD, STEP_SPREAD / math.sqrt(self.steps))
 
 
 def fit_walk(gain_permille: int, steps: int, measured_m: float, true_m: float) -> WalkFit:
@@ -121,5 +120,5 @@ def fit_walk(gain_permille: int, steps: int, measured_m: float, true_m: float) -
         )
     # The prior is the population's gain, not the node's present one.
     asked = scale * gain_permille / POPULATION_GAIN_PERMILLE
-    gain = scaled_gain_permille(POPULATION_GAIN_PERMILLE, posterior_scale([asked]))
+    gain = scaled_gain_permille(POPULATION_GAIN_PERMILLE, posterior_scale([asked], [steps]))
     return WalkFit(gain_permille, gain, steps, measured_m, true_m)

@@ -295,7 +295,8 @@ def calibrate(
                 f"the calibration walk's true_distance_m is {distance_m:g}: it must be positive"
             )
     settings = WearerSettings(leg_length_m, POPULATION_GAIN_PERMILLE)
-    measured_m = tuple(play(node, part, settings, board).distance_m for part in recordings)
+    played = [play(node, part, settings, board) for part in recordings]
+    measured_m = tuple(walk.distance_m for walk in played)
     if min(measured_m) <= 0.0:
         raise DataError(f"node {node}: no step is found in the calibration walk")
     asked = [true / measured for true, measured in zip(true_m, measured_m, strict=True)]
@@ -305,7 +306,7 @@ def calibrate(
                 f"node {node}: the calibration walk comes out as {measured:.2f} m and not as "
                 f"{true:g} m: is true_distance_m right?"
             )
-    scale = posterior_scale(asked)
+    scale = posterior_scale(asked, [len(walk.steps) for walk in played])
     return Calibration(scaled_gain_permille(POPULATION_GAIN_PERMILLE, scale), scale, measured_m)
 
 
