@@ -170,7 +170,9 @@ class Stage:
                 web.named(self.team.names)
             elif request.kind == "acknowledge":
                 self.acknowledged.append(request.body["node"])
-                self.team.acknowledged.add(request.body["node"])
+                self.team.acknowledged[request.body["node"]] = request.body["by"]
+            elif request.kind == "shelve":
+                self.team.shelved_s[request.body["node"]] = request.body["seconds"]
             web.respond(request, reply)
 
 

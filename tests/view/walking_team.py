@@ -39,7 +39,8 @@ class WalkingTeam:
     spread_m: float = 2.0
     lost_since: dict[int, float] = field(default_factory=dict)
     still_since: dict[int, float] = field(default_factory=dict)
-    acknowledged: set[int] = field(default_factory=set)
+    acknowledged: dict[int, str] = field(default_factory=dict)
+    shelved_s: dict[int, float] = field(default_factory=dict)
     names: dict[int, str] = field(default_factory=dict)
     ambiguous: int | None = None
     ring: int | None = None
@@ -87,7 +88,7 @@ class WalkingTeam:
         elif still_s >= STILL_WARNING_S:
             alert = Alert.STILL_WARNING
         else:
-            self.acknowledged.discard(node)
+            self.acknowledged.pop(node, None)
         status = "ok" if lost_s <= 3.0 else "stale" if lost_s <= 10.0 else "lost"
         if node == self.ambiguous and status == "ok":
             status = "ambiguous"
@@ -101,7 +102,9 @@ class WalkingTeam:
             sigma_minor_m=0.25 + 0.02 * node + grown_m, sigma_angle_rad=0.4 * node,
             sigma_heading_rad=0.08 + 0.02 * node, status=status, motion_s=time_s - lost_s,
             seen_s=0.2 + lost_s, moving=still_s <= 0.0, still_s=still_s, alert=alert,
-            acknowledged=node in self.acknowledged, health=health, reasons=reasons,
+            acknowledged=node in self.acknowledged,
+            acknowledged_by=self.acknowledged.get(node, ""),
+            shelved_s=self.shelved_s.get(node, 0.0), health=health, reasons=reasons,
             battery_v=5.02 - 0.03 * node, rssi_dbm=-52.0 - 3 * node, loss=0.005 * node,
             ranging=0.93 - 0.02 * node, neighbours=self.size - 1,
         )  # fmt: skip

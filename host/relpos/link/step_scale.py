@@ -81,8 +81,8 @@ class StepScaleSender:
             if change.attempts >= ATTEMPTS:
                 del self._changes[node]
                 self.remarks.append(
-                    f"node {node}: no answer, step gain not changed "
-                    f"(x{change.scale:.3f}, learned from ranges)"
+                    f"node {node}: steps are counted {_percent(change.scale)}; it does not "
+                    "answer, so they stay so"
                 )
                 continue
             change.attempts += 1
@@ -112,12 +112,13 @@ class StepScaleSender:
         if answer.result == wire.CommandResult.DONE and answer.value == change.value:
             self.sent += 1
             self.remarks.append(
-                f"node {answer.node}: step gain {change.value / 1000:.3f} "
-                f"(x{change.scale:.3f}, learned from ranges)"
+                f"node {answer.node}: steps were counted {_percent(change.scale)} and are right "
+                f"now, by the measured ranges (step gain {change.value / 1000:.3f}); nothing to do"
             )
         else:
             self.remarks.append(
-                f"node {answer.node} refuses a step gain of {change.value / 1000:.3f} "
+                f"node {answer.node}: steps are counted {_percent(change.scale)}; it refuses a "
+                f"step gain of {change.value / 1000:.3f} "
                 f"({answer.result.name.lower().replace('_', ' ')})"
             )
 
@@ -133,3 +134,9 @@ class StepScaleSender:
             return
         change.value, change.attempts = gain, 0
         change.token, change.next_s = self._link.next_token(), -math.inf
+
+
+def _percent(scale: float) -> str:
+    """Return how wrong a step's length is that has to be multiplied by ``scale``."""
+    off = 100.0 * (1.0 / scale - 1.0)
+    return f"{abs(off):.0f} % too {'long' if off > 0 else 'short'}"

@@ -31,6 +31,8 @@ LOOSE_M = 0.1
 """The node's deviation of a second in which the body moves without steps is up to 0.3 m
 (kLooseNoise in the firmware), at rest 0.02 m; it grows with the root of the time."""
 AWAKE_REPORTS = 3
+MAX_SHELVED_S = 900.0
+"""A shelved alarm comes back by itself: forgotten for longer, it would be lost."""
 MAX_TICK_S = 1.0
 """The session ticks twenty times a second; it was not receiving in the rest of a longer gap."""
 REPORT_S = 1.5
@@ -49,6 +51,9 @@ class _WearerState:
     awake: int = 0
     alert: Alert | None = None
     acknowledged: bool = False
+    acknowledged_by: str = ""
+    shelved_s: float = 0.0
+    """Seconds until the wearer's alarms are shown again."""
 
     def still_s(self) -> float:
         """Return the time without movement, as far as it is known."""
@@ -66,6 +71,8 @@ class Condition:
     silent_s: float
     alert: Alert | None
     acknowledged: bool
+    acknowledged_by: str = ""
+    shelved_s: float = 0.0
 
 
 def moved(motion: Motion, duration_s: float = 1.0) -> bool:
@@ -87,6 +94,8 @@ class Alarms:
     """Every wearer's condition; motions carry their own time, ``tick`` gets the session's."""
 
     def __init__(self) -> None:
+        self.changes: list[tuple[int, Alert | None, Alert | None]] = []
+        """Alerts that have come or gone: node, before, after; emptied by the reader."""
         self._states: dict[int, _WearerState] = {}
         self._ticked_s: float | None = None
 
@@ -119,25 +128,43 @@ class Alarms:
         passed_s = 0.0 if self._ticked_s is None else max(now_s - self._ticked_s, 0.0)
         self._ticked_s = now_s
         passed_s = min(passed_s, MAX_TICK_S)
-        for state in self._states.values():
+        for node, state in self._states.items():
             if listening:
                 state.silent_s += passed_s
                 state.since_report_s += passed_s
+            state.shelved_s = max(state.shelved_s - passed_s, 0.0)
+            before = state.alert
             self._update_alert(state)
+            if state.alert is not before:
+                self.changes.append((node, before, state.alert))
 
-    def acknowledge(self, node: int) -> bool:
+    def shelve(self, node: int, for_s: float) -> bool:
+        """Silence the node's alarms for so long, at most :data:`MAX_SHELVED_S`; 0 ends it."""
+        state = self._states.get(node)
+        if state is None:
+            return False
+        state.shelved_s = min(max(for_s, 0.0), MAX_SHELVED_S)
+        return True
+
+    def acknowledge(self, node: int, by: str = "") -> bool:
         """Mark the node's alert as seen; return False where there is none."""
         state = self._states.get(node)
         if state is None or state.alert is None:
             return False
-        state.acknowledged = True
+        state.acknowledged, state.acknowledged_by = True, by
         return True
 
     def condition(self, node: int) -> Condition:
         """Return the condition of the node's wearer."""
         state = self._states.get(node) or _WearerState()
         return Condition(
-            state.moving, state.still_s(), state.silent_s, state.alert, state.acknowledged
+            state.moving,
+            state.still_s(),
+            state.silent_s,
+            state.alert,
+            state.acknowledged,
+            state.acknowledged_by,
+            state.shelved_s,
         )
 
     @staticmethod
@@ -151,4 +178,4 @@ class Alarms:
         elif still_s >= STILL_WARNING_S:
             alert = Alert.STILL_WARNING
         if alert is not state.alert:
-            state.alert, state.acknowledged = alert, False
+            state.alert, state.acknowledged, state.acknowledged_by = alert, False, ""

@@ -131,6 +131,10 @@ class Composer:
             alternatives=() if estimate is None else _ghosts(estimate),
         )
 
+    def name(self, node: int) -> str:
+        """Return the name of the node's wearer."""
+        return self.names.get(node, f"Node {node}")
+
     def _count_heard(
         self, now_s: float, decoder: Decoder, observations: Sequence[Observation]
     ) -> None:
@@ -211,7 +215,7 @@ class Composer:
         health = self._health(node, now_s)
         return Person(
             node=node,
-            name=self.names.get(node, f"Node {node}"),
+            name=self.name(node),
             status=_status(at, seen_s, condition),
             motion_s=self.nowcast.newest_s(node),
             seen_s=seen_s,
@@ -219,6 +223,8 @@ class Composer:
             still_s=condition.still_s,
             alert=condition.alert,
             acknowledged=condition.acknowledged,
+            acknowledged_by=condition.acknowledged_by,
+            shelved_s=condition.shelved_s,
             health=health.colour,
             reasons=health.reasons,
             battery_v=health.battery_v,

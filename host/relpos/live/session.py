@@ -25,7 +25,7 @@ from relpos.live.inputs import Input, Received
 from relpos.live.notices import NoticeBoard
 from relpos.live.requests import Request, RequestHandler, RequestSource
 from relpos.live.sinks import Sink
-from relpos.live.team_view import Level
+from relpos.live.team_view import Alert, Level, LogEntry
 from relpos.measurements import Observation
 
 VIEW_S = 0.05
@@ -37,6 +37,16 @@ BEHIND_S = 5.0
 """Delay of the fusion from which a notice says so; it always waits two or three seconds."""
 ASLEEP_S = 5.0
 """The receive thread runs twenty times a second; a longer gap was sleep, or another program."""
+RAISED = {
+    Alert.STILL_WARNING: "has not moved for 20 s",
+    Alert.STILL_ALARM: "has not moved for 30 s",
+    Alert.LOST: "is not heard any more",
+}
+CLEARED = {
+    Alert.STILL_WARNING: "moves again",
+    Alert.STILL_ALARM: "moves again",
+    Alert.LOST: "is heard again",
+}
 SWITCH_S = 0.001
 """Python's thread switch interval: a packet does not wait for the fusion."""
 
@@ -222,6 +232,7 @@ class LiveSession:
         for text in self._source.remarks():
             self._remark(text)
             self._notices.post_remark(text)
+            self.log("note", text)
             self._changed = True
         self._watch(now_s)
         self._show_if_due()
@@ -254,6 +265,7 @@ class LiveSession:
             self.post("asleep", Level.WARNING, text)
             self._notices.expire("asleep")
         self._composer.alarms.tick(now_s, listening=connected and self._connected)
+        self._log_alarms()
         self._connected = connected
         self.post("port", Level.ALARM, gone and f"{gone}; trying again each second")
         if self._source.over() and not self._finishing:
@@ -285,6 +297,24 @@ class LiveSession:
         """Set the notice ``name``, or clear it where ``text`` is None."""
         if self._notices.post(name, level, text):
             self._changed = True
+            if text is not None:
+                self.log("note" if level is Level.INFO else str(level), text)
+
+    # -- the log ----------------------------------------------------------------------------------
+
+    def log(self, kind: str, text: str, node: int | None = None, by: str = "") -> None:
+        """Write a line of the log to every sink."""
+        entry = LogEntry(self._source.now_s(), time.time(), kind, text, node, by)
+        self._feed(lambda sink: sink.logged(entry))
+
+    def _log_alarms(self) -> None:
+        changes, self._composer.alarms.changes = self._composer.alarms.changes, []
+        for node, before, after in changes:
+            name = self._composer.name(node)
+            if after is not None:
+                self.log("alarm", f"{name} {RAISED[after]}", node)
+            elif before is not None:
+                self.log("cleared", f"{name} {CLEARED[before]}", node)
 
     # -- views ------------------------------------------------------------------------------------
 
@@ -319,10 +349,21 @@ class LiveSession:
         body = request.body
         match request.kind:
             case "acknowledge":
-                return {"acknowledged": self._composer.alarms.acknowledge(body["node"])}, 200
+                node, by = body["node"], body.get("by", "")
+                seen = self._composer.alarms.acknowledge(node, by)
+                if seen:
+                    self.log("acknowledged", f"alarm of {self._composer.name(node)}", node, by)
+                return {"acknowledged": seen}, 200
+            case "shelve":
+                node, by, for_s = body["node"], body.get("by", ""), body["seconds"]
+                done = self._composer.alarms.shelve(node, for_s)
+                text = f"alarms of {self._composer.name(node)} for {for_s:.0f} s"
+                self.log("shelved", text, node, by)
+                return {"shelved": done}, 200
             case "name":
                 self._handler.names[body["node"]] = body["name"]
                 self._composer.names[body["node"]] = body["name"]
+                self.log("name", f"node {body['node']} is {body['name']}", body["node"])
                 self._feed(lambda sink: sink.named(dict(self._handler.names)))
                 return {"node": body["node"], "name": body["name"]}, 200
         if not self._source.is_now:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from relpos.fusion.estimator import Estimate
-    from relpos.live.team_view import TeamView
+    from relpos.live.team_view import LogEntry, TeamView
     from relpos.measurements import Observation
 
 
@@ -34,6 +34,9 @@ class Sink:
 
     def named(self, names: dict[int, str]) -> None:
         """Note all names that wearers have given their nodes so far."""
+
+    def logged(self, entry: LogEntry) -> None:
+        """Add a line to the session's log."""
 
     def trouble(self) -> str | None:
         """Return what the user must know ("disk full: ..."); None when all is well."""

@@ -48,12 +48,29 @@ class Notice:
 
 
 @dataclass(frozen=True, slots=True)
+class LogEntry:
+    """A line of the session's log: what happened, to whom, by whom.
+
+    ``kind`` is ``note``, ``warning``, ``alarm``, ``cleared``, ``acknowledged``, ``shelved`` or
+    ``name``; ``node`` is None where it concerns nobody in particular.
+    """
+
+    time_s: float
+    unix_s: float
+    kind: str
+    text: str
+    node: int | None = None
+    by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Person:
     """One node's wearer.
 
     The pose is the newest (nowcast): it contains all motion up to ``motion_s``. ``status`` is one
     of ``ok``, ``ambiguous``, ``unlocated``, ``stale``, ``lost``. ``loss`` and ``ranging`` are
     fractions. ``acknowledged``: a user has confirmed the alert.
+    ``shelved_s``: seconds for which the person's alarms are silenced.
     """
 
     node: int
@@ -73,6 +90,8 @@ class Person:
     still_s: float = 0.0
     alert: Alert | None = None
     acknowledged: bool = False
+    acknowledged_by: str = ""
+    shelved_s: float = 0.0
     health: str = "green"
     reasons: tuple[str, ...] = ()
     battery_v: float | None = None

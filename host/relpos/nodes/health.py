@@ -29,6 +29,10 @@ BATTERY_RED_V = 4.2
 RSSI_YELLOW_DBM = -86
 """An XBee Series 1 hears down to -92 dBm (data sheet, from memory: check); a body that turns takes
 more than the 6 dB that are left."""
+STARTING_S = 8.0
+"""Sensors answer within a second of power-on; the first status of a node comes before they do, and
+the next one 10 s later."""
+STARTING = "starting"
 FRESH_START_S = 60.0
 """How long an unwanted restart is reported."""
 MIN_STACK_BYTES = 48
@@ -88,7 +92,9 @@ def _reasons(f: HealthInputs) -> Iterator[tuple[Health, str]]:
         yield red, f"silent for {f.silent_s:.0f} s"
     elif not f.status:
         yield yellow, "no status heard yet"
-    if f.imu is False:
+    if f.imu is False and (f.uptime_s or 0.0) < STARTING_S:
+        yield yellow, STARTING
+    elif f.imu is False:
         yield red, "inertial sensor missing"
     if f.loss is not None and f.loss > LOSS_YELLOW:
         yield (red if f.loss > LOSS_RED else yellow), f"{100 * f.loss:.0f} % of frames lost"

@@ -60,6 +60,7 @@ ALLOWED = {
     "headings": (50.0, 4000.0),
     "name": (2.0, 100.0),
     "acknowledge": (2.0, 100.0),
+    "shelve": (2.0, 20.0),
 }
 """Items that a visitor may send, per second and at once: a phone sends what it gathered offline."""
 
@@ -92,6 +93,7 @@ class SessionProxy:
         self.view: str | None = None
         self.tracks = Tracks()
         self.names: dict[str, str] = {}
+        self.log: list[dict[str, Any]] = []
         self._news = asyncio.Event()
         self.over = False
 
@@ -118,6 +120,8 @@ class SessionProxy:
             case "points":
                 for node, point in message["points"].items():
                     self.tracks.add(int(node), *point)
+            case "log":
+                self.log += message["entries"]
             case "names":
                 self.names = message["names"]
             case "answer":
@@ -262,6 +266,7 @@ class Pages:
             Route("/api/presses", self.presses, methods=["POST"]),
             Route("/api/headings", self.headings, methods=["POST"]),
             Route("/api/acknowledge", self.acknowledge, methods=["POST"]),
+            Route("/api/shelve", self.shelve, methods=["POST"]),
         ]
         app = Starlette(
             routes=[
@@ -308,8 +313,12 @@ class Pages:
             await socket.send_text(hello)
             await socket.send_text(self.session.tracks.to_json())
             seen: str | None = None
+            told = 0
             while not gone.done() and not self.session.over:
                 newest = await self.session.news(seen, PING_S)
+                if told < len(self.session.log):
+                    entries, told = self.session.log[told:], len(self.session.log)
+                    await socket.send_text(to_json({"type": "log", "entries": entries}))
                 await socket.send_text(newest if newest is not None else '{"type":"ping"}')
                 seen = newest if newest is not None else seen
         except (WebSocketDisconnect, RuntimeError):
@@ -389,7 +398,14 @@ class Pages:
 
     async def acknowledge(self, request: Request) -> Response:
         """Silence somebody's alarm until its reason has gone."""
-        return await self._ask(request, "acknowledge", {"node": _node(await _body(request))})
+        body = await _body(request)
+        return await self._ask(request, "acknowledge", {"node": _node(body), "by": _by(body)})
+
+    async def shelve(self, request: Request) -> Response:
+        """Silence all alarms of a person for a while."""
+        body = await _body(request)
+        asked = {"node": _node(body), "by": _by(body), "seconds": _number(body, "seconds")}
+        return await self._ask(request, "shelve", asked)
 
     async def _ask(
         self, request: Request, kind: str, body: Mapping[str, Any], items: int = 1
@@ -433,6 +449,11 @@ def _node(body: Mapping[str, Any]) -> int:
     if not isinstance(node, int) or isinstance(node, bool) or not 0 < node < 255:
         raise BadRequestError("node: not a number from 1 to 254")
     return node
+
+
+def _by(body: Mapping[str, Any]) -> str:
+    """Who asks, as the page says; empty where it does not."""
+    return "" if body.get("by") in (None, "") else _text(body, "by", 40)
 
 
 def _number(row: Mapping[str, Any], name: str) -> float:

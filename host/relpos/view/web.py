@@ -13,13 +13,14 @@ import socket
 import time
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from relpos.extras import missing_extra
 from relpos.fusion.estimator import NodeStatus
 from relpos.live.requests import Request
 from relpos.live.sinks import Sink
-from relpos.live.team_view import Hello, TeamView, to_json
+from relpos.live.team_view import Hello, LogEntry, TeamView, to_json
 from relpos.live.tracks import Tracks
 from relpos.view.access import Access
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from relpos.fusion.estimator import Estimate
 
 RESTART_AFTER_S = 1.0
+MAX_LOG = 5000
 MAX_WAITING_BYTES = 1 << 24
 """A serving process that leaves so much unread is stuck, and started again."""
 SHOWN_STATUSES = (NodeStatus.OK, NodeStatus.STALE)
@@ -54,6 +56,7 @@ class WebView(Sink):
         self._door = listener
         self._tracks = Tracks()
         self._names: dict[int, str] = {}
+        self._log: deque[dict[str, Any]] = deque(maxlen=MAX_LOG)
         self._newest: bytes | None = None
         self._out: deque[bytes] = deque()
         self._out_bytes = 0
@@ -84,6 +87,11 @@ class WebView(Sink):
         """Send it on, or keep it until the one before has left."""
         self._newest = view.to_json().encode() + b"\n"
         self._work()
+
+    def logged(self, entry: LogEntry) -> None:
+        """Send it to the pages, which show the log."""
+        self._log.append(asdict(entry))
+        self._say(to_json({"type": "log", "entries": [self._log[-1]]}))
 
     def trouble(self) -> str | None:
         """Return that the server was restarted, for half a minute."""
@@ -150,7 +158,13 @@ class WebView(Sink):
         self._in = b""
         self._out.clear()
         self._out_bytes = 0
-        for line in (self.hello.to_json(), self._tracks.to_json(), _names_message(self._names)):
+        log = to_json({"type": "log", "entries": list(self._log)})
+        for line in (
+            self.hello.to_json(),
+            self._tracks.to_json(),
+            _names_message(self._names),
+            log,
+        ):
             self._say(line)
 
     def _say(self, line: str) -> None:

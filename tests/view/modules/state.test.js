@@ -80,7 +80,7 @@ const still = (node, alert, still_s, more = {}) => ({ node, name: `N${node}`, al
 test("a warning that becomes an alarm has to be acknowledged anew", () => {
   const alarms = new Alarms();
   equal(alarms.update([still(1, "still_warning", 20)]).raised.length, 1);
-  equal(alarms.sounding, "medium");
+  equal(alarms.sounding, "low");
   equal(alarms.update([still(1, "still_warning", 21)]).raised.length, 0);
   alarms.acknowledge(1);
   equal(alarms.sounding, null);
@@ -104,6 +104,45 @@ test("a person who moves again is announced once", () => {
   equal(cleared.map((a) => a.node), [1]);
   equal(alarms.update([still(1, null, 0), still(2, "lost", 0)]).cleared.length, 0);
   equal(alarms.list().map((a) => a.node), [2]);
+});
+
+test("silence of everybody at once is one alarm, and high: nobody can call for help", () => {
+  const alarms = new Alarms();
+  const all = [1, 2, 3, 4, 5].map((node) => still(node, "lost", 0, { seen_s: 12 }));
+  alarms.update(all);
+  equal(alarms.rows().map((r) => [r.kind, r.level, r.nodes.length]), [["nobody", "high", 5]]);
+  // One is heard: the others were lost together.
+  alarms.update([...all.slice(1), still(1, null, 0)]);
+  equal(alarms.rows().map((r) => [r.kind, r.level, r.nodes.length]), [["together", "medium", 4]]);
+  // Those who fell silent one by one are told one by one.
+  alarms.update([still(1, null, 0), ...all.slice(1).map((p, k) => ({ ...p, seen_s: 12 + 20 * k }))]);
+  equal(alarms.rows().map((r) => r.kind), ["lost", "lost", "lost", "lost"]);
+});
+
+test("a flood of alarms hides nobody who lies still", () => {
+  let ms = 0;
+  const alarms = new Alarms(() => ms);
+  const people = [];
+  for (let node = 1; node <= 12; node += 1) {
+    people.push(still(node, node === 7 ? "still_alarm" : "still_warning", 25 + node));
+    ms += 20_000;
+    alarms.update(people);
+  }
+  ok(alarms.flood);
+  equal(alarms.rows().map((r) => [r.kind, r.nodes.length]), [["still", 1], ["flood", 11]]);
+  equal(alarms.sounding, "high");
+  alarms.acknowledge(7);
+  equal(alarms.sounding, null);
+  ms += 600_000;
+  ok(!alarms.flood);
+});
+
+test("a shelved alarm is silent and comes back by itself", () => {
+  const alarms = new Alarms();
+  equal(alarms.update([still(1, "still_alarm", 40, { shelved_s: 12 })]).raised.length, 0);
+  equal([alarms.sounding, alarms.rows().length], [null, 0]);
+  alarms.update([still(1, "still_alarm", 52, { shelved_s: 0 })]);
+  equal([alarms.sounding, alarms.rows().length], ["high", 1]);
 });
 
 test("the worst alarm comes first", () => {

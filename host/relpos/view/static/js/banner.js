@@ -1,14 +1,12 @@
-// The top of the page: alarms of people, notices of the session.
+// The top of the page: alarms of people, warnings of the session.
 
 import { make, setAttribute, setText } from "./dom.js";
-import { alarmText } from "./words.js";
+import { alarmText, seconds } from "./words.js";
 
+/** More rows than that, unless they are high, share one. */
 const MAX_ROWS = 4;
 
-/**
- * One row an alarm, the same element while it lasts, so that its button stays under the finger; at
- * most four, the worst ones. The others, and the acknowledged ones, share a line each.
- */
+/** One line an alarm, the same element while it lasts, so that its button stays under the finger. */
 export class AlarmBanner {
   constructor(section, { acknowledge, show }) {
     this.section = section;
@@ -16,12 +14,10 @@ export class AlarmBanner {
     this.show = show;
     this.rows = new Map();
     this.list = make("div", { class: "rows" });
-    this.more = make("p", { class: "alarm more", "data-level": "warning", "data-acknowledged": "false" });
+    this.more = make("p", { class: "alarm more", "data-acknowledged": "false" });
     this.moreText = make("span", { class: "text" });
     this.all = make("button", { type: "button", text: "Acknowledge all" });
-    this.all.addEventListener("click", () => {
-      for (const node of this.open) acknowledge(node);
-    });
+    this.all.addEventListener("click", () => this.acknowledge(this.open));
     this.more.append(this.moreText, make("span", { class: "buttons" }, this.all));
     this.known = make("p", { class: "alarm known", "data-acknowledged": "true" });
     this.known.append(make("span", { class: "kind", text: "known" }));
@@ -32,62 +28,72 @@ export class AlarmBanner {
   }
 
   update(alarms) {
-    const list = alarms.list();
-    const open = list.filter((alarm) => !alarm.acknowledged);
-    const known = list.filter((alarm) => alarm.acknowledged);
-    this.open = open.map((alarm) => alarm.node);
-    const shown = open.slice(0, MAX_ROWS);
-    const others = open.slice(MAX_ROWS);
-    for (const [node, row] of this.rows) {
-      if (!shown.some((alarm) => alarm.node === node)) {
+    const rows = alarms.rows();
+    const known = alarms.list().filter((alarm) => alarm.acknowledged || alarm.shelvedS);
+    this.open = rows.flatMap((row) => row.nodes);
+    const shown = rows.filter((row, k) => k < MAX_ROWS || row.level === "high");
+    const others = rows.slice(shown.length);
+    for (const [key, row] of this.rows) {
+      if (!shown.some((alarm) => alarm.key === key)) {
         row.element.remove();
-        this.rows.delete(node);
+        this.rows.delete(key);
       }
     }
-    for (const alarm of shown) {
-      let row = this.rows.get(alarm.node);
+    shown.forEach((alarm, place) => {
+      let row = this.rows.get(alarm.key);
       if (!row) {
-        row = this.make(alarm.node);
-        this.rows.set(alarm.node, row);
-        this.list.append(row.element);
+        row = this.make();
+        this.rows.set(alarm.key, row);
       }
+      // Moved only where it is out of place: moving takes the focus.
+      if (this.list.children[place] !== row.element) this.list.insertBefore(row.element, this.list.children[place] ?? null);
+      const name = alarm.alarms.map((a) => a.name).join(", ");
+      row.nodes = alarm.nodes;
+      setAttribute(row.element, "data-node", alarm.key);
       setAttribute(row.element, "data-level", alarm.level);
       setText(row.kind, alarm.level);
       setText(row.text, alarmText(alarm));
-      setAttribute(row.button, "aria-label", `Acknowledge: ${alarm.name}`);
-      setAttribute(row.find, "aria-label", `Find ${alarm.name}`);
-    }
-    this.more.hidden = open.length < 2;
-    setAttribute(this.more, "data-level", others.some((a) => a.level === "alarm") ? "alarm" : "warning");
-    setText(this.moreText, others.length ? `and ${others.length} more: ${others.map((a) => a.name).join(", ")}` : "");
+      setAttribute(row.button, "aria-label", `Acknowledge: ${name}`);
+      setAttribute(row.find, "aria-label", `Find ${name}`);
+      row.find.hidden = alarm.nodes.length > 1;
+    });
+    this.more.hidden = this.rows.size < 2 && !others.length;
+    setAttribute(this.more, "data-level", rows[0]?.level ?? "low");
+    setText(this.moreText, others.length
+      ? `and ${others.length} more: ${others.flatMap((row) => row.alarms).map((a) => a.name).join(", ")}`
+      : `${this.open.length} open`);
     this.known.hidden = known.length === 0;
-    setText(this.knownText, known.map(alarmText).join(" · "));
-    this.section.hidden = list.length === 0;
+    setText(this.knownText, known.map(knownText).join(" · "));
+    this.section.hidden = !rows.length && !known.length;
   }
 
-  make(node) {
-    const kind = make("span", { class: "kind" });
-    const text = make("span", { class: "text" });
-    const button = make("button", { type: "button", text: "Acknowledge" });
-    button.addEventListener("click", () => this.acknowledge(node));
-    const find = make("button", { type: "button", text: "Find" });
-    find.addEventListener("click", () => this.show(node));
-    const element = make("div", { class: "alarm", "data-node": node, "data-acknowledged": "false" },
-      kind, text, make("span", { class: "buttons" }, find, button));
-    return { element, kind, text, button, find };
+  make() {
+    const row = { nodes: [] };
+    row.kind = make("span", { class: "kind" });
+    row.text = make("span", { class: "text" });
+    row.button = make("button", { type: "button", text: "Acknowledge" });
+    row.button.addEventListener("click", () => this.acknowledge(row.nodes));
+    row.find = make("button", { type: "button", text: "Find" });
+    row.find.addEventListener("click", () => this.show(row.nodes[0]));
+    row.element = make("div", { class: "alarm", "data-acknowledged": "false" },
+      row.kind, row.text, make("span", { class: "buttons" }, row.find, row.button));
+    return row;
   }
 }
 
-const KINDS = { info: "Note", warning: "Warning", alarm: "Alarm" };
+function knownText(alarm) {
+  const how = alarm.shelvedS ? `shelved, back in ${seconds(alarm.shelvedS)}` : alarm.by ? `seen by ${alarm.by}` : "seen";
+  return `${alarmText(alarm)} (${how})`;
+}
 
-/** Warnings and alarms have a line each; notes share one, the newest first. */
+const KINDS = { warning: "Warning", alarm: "Alarm" };
+
+/** Warnings and alarms of the session have a line each; notes are in the log alone. */
 export function showNotices(section, notices) {
-  const key = JSON.stringify(notices.map((n) => [n.level, n.text]));
+  const lines = notices.filter((notice) => notice.level !== "info");
+  const key = JSON.stringify(lines.map((n) => [n.level, n.text]));
   if (section.dataset.shown === key) return;
   section.dataset.shown = key;
-  const notes = notices.filter((notice) => notice.level === "info").map((notice) => notice.text);
-  const lines = notices.filter((notice) => notice.level !== "info");
-  if (notes.length) lines.push({ level: "info", text: notes.reverse().join(" · ") });
   section.replaceChildren(...lines.map((notice) => make("p", { "data-level": notice.level },
     make("span", { class: "kind", text: KINDS[notice.level] ?? notice.level }),
     make("span", { class: "text", text: notice.text }))));

@@ -36,12 +36,14 @@ const SVG = "http://www.w3.org/2000/svg";
 // Shapes differ where colours do: a disc, a triangle, an octagon, as on signs.
 const SHAPES = {
   unknown: "M1.5 1.5h17v17h-17z",
+  starting: "M10 1.5a8.5 8.5 0 1 0 0 17 8.5 8.5 0 0 0 0-17z",
   green: "M10 1.5a8.5 8.5 0 1 0 0 17 8.5 8.5 0 0 0 0-17z",
   yellow: "M10 1.5 19.5 18.5H.5z",
   red: "M6.3 1h7.4L19 6.3v7.4L13.7 19H6.3L1 13.7V6.3z",
 };
 const MARKS = {
   unknown: "M6 10h8",
+  starting: "M10 5v5l3 3",
   green: "m5.6 10.3 3 3 5.8-6.3",
   yellow: "M10 7v5.2M10 15v.8",
   red: "m6.6 6.6 6.8 6.8m0-6.8-6.8 6.8",

@@ -487,9 +487,9 @@ export class TeamMap {
     const gone = !isFresh(person);
     const alarm = this.alarms.get(person.node);
     if (alarm) {
-      const swing = this.old || this.still.matches || alarm.acknowledged
+      const swing = this.old || this.still.matches || alarm.acknowledged || alarm.level === "low"
         ? 0.5 : 0.5 - 0.5 * Math.cos((2 * Math.PI * (now % PULSE_MS)) / PULSE_MS);
-      context.strokeStyle = alarm.level === "alarm" ? colours.alarm : colours.warning;
+      context.strokeStyle = alarm.level === "high" ? colours.alarm : colours.warning;
       context.lineWidth = (this.old || alarm.acknowledged ? 3 : 5) * unit;
       context.beginPath();
       context.arc(px, py, radius + (6 + 8 * swing) * unit, 0, 2 * Math.PI);
@@ -621,7 +621,7 @@ export class TeamMap {
       this.write(item.name, x, y, 13.5, true, colours.ink);
       if (item.state) {
         const level = this.alarms.get(item.id)?.level;
-        const colour = level === "alarm" ? colours.alarm : colours.ink;
+        const colour = level === "high" ? colours.alarm : colours.ink;
         this.write(item.state, x, y + 14.5 * unit, 12, true, colour);
       }
     }

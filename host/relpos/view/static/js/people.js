@@ -9,6 +9,9 @@ import {
   STATUS_WORDS, timeOfDay, UNKNOWN, volts, whereabouts, directionWords,
 } from "./words.js";
 
+/** An alarm of somebody who is known to be well: a sentry, a node on a table. */
+const SHELVE_S = 600;
+
 /** A person's state in words. */
 export function stateWords(person, alarm, here) {
   const words = [];
@@ -39,8 +42,7 @@ class Card {
     this.direction = make("span", { class: "direction" });
     this.compass = make("span", { class: "compass" });
     this.where = make("div", { class: "where" }, this.arrow.element,
-      make("p", {}, this.far, " ", this.sigma), make("p", {}, this.direction, " ", this.compass));
-    this.spacer = make("span", { class: "spacer soft" });
+      make("p", {}, this.far, " ", this.sigma), make("p", {}, this.direction));
     this.state = make("p", { class: "state" });
     this.facts = {};
     const facts = ["Supply", "Radio", "Loss", "Ranging", "Hears"].map((word) => {
@@ -49,15 +51,19 @@ class Card {
       return make("div", {}, make("dt", { text: word }), value);
     });
     this.reasons = make("p", { class: "reasons" });
+    this.shelveButton = make("button", { type: "button", text: "Shelve alarms 10 min" });
+    this.shelveButton.addEventListener("click", () => actions.shelve(node, this.shelved ? 0 : SHELVE_S));
     this.followButton = make("button", { type: "button", "aria-pressed": "false", text: "Follow" });
     this.findButton = make("button", { type: "button", text: "Find" });
     this.name.addEventListener("click", () => actions.select(node));
     this.followButton.addEventListener("click", () => actions.follow(node));
     this.findButton.addEventListener("click", () => actions.find(node));
+    this.details = make("div", { class: "details" }, this.compass, this.reasons,
+      make("dl", { class: "facts" }, ...facts), make("div", { class: "buttons" }, this.followButton, this.shelveButton));
     this.element = make("li", { class: "person", "data-node": node },
       make("div", { class: "who" }, this.name, make("span", { class: "health" }, this.sign.element, this.health)),
-      make("div", { class: "middle" }, this.where, this.spacer, this.findButton, this.followButton),
-      this.state, make("dl", { class: "facts" }, ...facts), this.reasons);
+      this.where, this.findButton,
+      this.state, this.details);
   }
 
   show(person, { colour, me, meName, relation, northRad, alarm, here, selected, followed, heardMs, meFresh }) {
@@ -78,8 +84,10 @@ class Card {
     this.sign.show(person.health);
     setText(this.health, fresh || person.health === "unknown" ? HEALTH_WORDS[person.health] ?? person.health : "node silent");
     this.where.hidden = me || meName === null;
-    this.spacer.hidden = !this.where.hidden;
-    setText(this.spacer, me ? "distances are from here" : "");
+    this.shelved = person.shelved_s > 0;
+    setText(this.shelveButton, this.shelved ? `Alarms shelved, ${seconds(person.shelved_s)} left: end` : "Shelve alarms 10 min");
+    this.details.hidden = !selected;
+    setAttribute(this.name, "aria-expanded", String(selected));
     if (!this.where.hidden) {
       this.arrow.point(relation?.relativeRad ?? null);
       setText(this.far, relation ? distance(relation.distanceM, relation.sigmaM) : UNKNOWN);
@@ -156,7 +164,7 @@ function lastPlace(heardMs) {
 
 function trouble(alarms, person) {
   const alarm = alarms.active.get(person.node);
-  return alarm ? (alarm.level === "alarm" ? 2 : 1) : 0;
+  return alarm ? ["low", "medium", "high"].indexOf(alarm.level) + 1 : 0;
 }
 
 const number = (value) => (Number.isFinite(value) ? value.toFixed(1) : UNKNOWN);

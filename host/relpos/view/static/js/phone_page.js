@@ -200,12 +200,13 @@ function showAge() {
   showConnection({ line: byId("connection"), words: byId("connection-words"), age: byId("age"), retry: byId("retry") }, status);
 }
 
-async function acknowledge(node) {
-  alarms.acknowledge(node);
+async function acknowledge(nodes) {
+  const by = me?.name ?? "a phone";
+  for (const node of nodes) alarms.acknowledge(node, by);
   sound();
   banner.update(alarms);
   try {
-    await postJson("/api/acknowledge", { node });
+    for (const node of nodes) await postJson("/api/acknowledge", { node, by });
   } catch (error) {
     trouble = { level: "warning", text: `Acknowledged only on this phone: ${error.message}` };
   }
@@ -463,7 +464,8 @@ function open(name) {
 }
 
 function showSound() {
-  const state = { on: "Sound on", muted: "Sound off", locked: "Enable sound" }[siren.state];
+  const state = { on: "Sound on", muted: "Sound off for 2 min", locked: "NO SOUND: enable" }[siren.state];
+  setAttribute(byId("sound"), "data-state", siren.state);
   setText(byId("sound"), state);
   setAttribute(byId("sound"), "aria-pressed", String(siren.state === "on"));
 }
@@ -511,7 +513,7 @@ for (const button of document.querySelectorAll("nav button")) {
 byId("compass").addEventListener("click", () => (sharing.on ? sharing.stop() : sharing.start()));
 byId("wake").addEventListener("click", () => lock.set(!lock.on));
 byId("sound").addEventListener("click", () => {
-  if (siren.state === "locked") siren.unlock();
+  if (siren.state === "locked") siren.test();
   else siren.mute(!siren.muted);
 });
 byId("retry").addEventListener("click", () => connection.wake());

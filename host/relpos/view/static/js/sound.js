@@ -11,6 +11,7 @@ export const PATTERNS = {
   // What happened then: one soft tone, once.
   replay: { pulseS: 0.35, everyS: null, level: 0.12, pulses: [[0, 220]] },
 };
+const MUTE_MS = 120_000;
 const VIBRATION = { high: [200, 80, 200, 80, 200, 250, 200, 80, 200], medium: [200, 150, 200, 150, 200], low: [200], link: [600] };
 /** At least four harmonics: a sound with several is located by ear, and not lost behind a mask. */
 const HARMONICS = [0, 1, 0.7, 0.6, 0.5, 0.4, 0.3];
@@ -43,7 +44,8 @@ export class Siren {
   constructor(onChange) {
     this.onChange = onChange;
     this.context = null;
-    this.muted = false;
+    this.mutedUntilMs = 0;
+    this.unmuting = null;
     this.kind = null;
     this.timer = null;
     // The sound's own button decides for itself.
@@ -52,6 +54,11 @@ export class Siren {
     };
     addEventListener("pointerdown", unlock);
     addEventListener("keydown", unlock);
+  }
+
+  /** Whether sound is off for a while. */
+  get muted() {
+    return Date.now() < this.mutedUntilMs;
   }
 
   /** "on", "muted", or "locked" until the first touch or key. */
@@ -75,10 +82,24 @@ export class Siren {
     this.onChange();
   }
 
+  /** Seconds until the sound is back. */
+  get mutedS() {
+    return Math.max(0, Math.ceil((this.mutedUntilMs - Date.now()) / 1000));
+  }
+
+  /** Off for two minutes at most: it comes back by itself. */
   mute(muted) {
-    this.muted = muted;
+    clearTimeout(this.unmuting);
+    this.mutedUntilMs = muted ? Date.now() + MUTE_MS : 0;
+    if (muted) this.unmuting = setTimeout(() => this.mute(false), MUTE_MS);
     this.restart();
     this.onChange();
+  }
+
+  /** Let it be heard once that there is sound. */
+  async test() {
+    await this.unlock();
+    if (this.kind === null) this.once("low");
   }
 
   /** A key of PATTERNS, or null. */

@@ -8,6 +8,7 @@ export const PROTOCOL = 1;
 
 /** Less probable positions are not shown: they would be clutter. */
 const MIN_PROBABILITY = 0.03;
+const STARTING = ["starting", "no status heard yet"]; // nodes/health.py
 const RANGE_AGE_S = 10; // as the session drops them
 const ONE_PLACE_M = 0.7; // as in the host's fusion/modes.py
 
@@ -59,6 +60,8 @@ export class Team {
       case "picture":
         this.handleView(message);
         return "picture";
+      case "log":
+        return "log";
       case "ping":
         return "ping";
       default:
@@ -126,6 +129,11 @@ export class Team {
 
   person(node) {
     return this.people.get(node) ?? null;
+  }
+
+  /** A text of the session with the names of its people in place of their nodes' numbers. */
+  withNames(text) {
+    return text.replace(/\b[Nn]ode (\d+)\b/g, (words, node) => this.person(Number(node))?.name ?? words);
   }
 
   /** How `from` sees `to` (numbers); null where either is unknown. */
@@ -202,5 +210,6 @@ function isSamePlace(a, b) {
 }
 
 function named(person) {
-  return person.name ? person : { ...person, name: `Node ${person.node}` };
+  const health = STARTING.includes(person.reasons?.[0]) ? "starting" : person.health;
+  return { ...person, health, name: person.name || `Node ${person.node}` };
 }

@@ -7,17 +7,20 @@ import { Connection } from "./connection.js";
 import { byId, make, postJson, setAttribute, setText, storage } from "./dom.js";
 import { FindView } from "./find_view.js";
 import { LinkBanner } from "./link_banner.js";
+import { LogView, showUnseen } from "./log_view.js";
 import { TeamMap } from "./map.js";
 import { alternativeWords, PeopleList, updateTable } from "./people.js";
 import { Siren } from "./sound.js";
 import { connectionWords, dataAgeS, replayWords, showConnection } from "./status_line.js";
 import { Team } from "./team.js";
 import { isDark, themeSwitch } from "./theme_switch.js";
-import { alarmText } from "./words.js";
+import { alarmText, duration } from "./words.js";
 
 const LIST_MS = 200; // five times a second is enough for the eye
 const TABLE_MS = 1000; // screen readers read the table
 
+/** Who answers here, in the log and on the other pages. */
+const BY = "the commander";
 const store = storage();
 const team = new Team();
 const alarms = new Alarms();
@@ -32,7 +35,8 @@ const map = new TeamMap(byId("map"), team, { onPick: select, onCamera: showCamer
 map.covers = [byId("map-tools")];
 const link = new LinkBanner(byId("link"), byId("alarm-voice"), linkChanged);
 const banner = new AlarmBanner(byId("alarms"), { acknowledge, show: find });
-const list = new PeopleList(byId("people"), { select, follow, find });
+const list = new PeopleList(byId("people"), { select, follow, find, shelve });
+const log = new LogView(byId("log"), { onNew: () => showUnseen(byId("show-log"), log.unseen) });
 const findView = new FindView(byId("find"), {
   close: stopFinding,
   next: (by) => find(neighbour(findView.to, by, findView.from)),
@@ -48,6 +52,7 @@ function handle(message) {
     receivedMs = null;
     trouble = null;
     alarms.clear();
+    log.clear();
     setText(byId("session"), [team.session.name, team.session.emulated ? "(emulated)" : ""].join(" "));
     document.title = `${team.session.name ?? "team"} · relpos ${team.replayed ? "REPLAY" : "live"}`;
     setAttribute(document.documentElement, "data-replay", team.replayed ? "true" : null);
@@ -55,6 +60,9 @@ function handle(message) {
     setText(byId("limit-warning"), String(team.limits.still_warning_s));
     setText(byId("limit-alarm"), String(team.limits.still_alarm_s));
     map.layer.forget();
+  } else if (kind === "log") {
+    log.add(message.entries);
+    if (byId("log-dialog").open) log.look(team);
   } else if (kind === "tracks") {
     map.layer.forget();
   } else if (kind === "picture") {
@@ -97,6 +105,7 @@ function linkChanged(lost) {
 }
 
 function beat() {
+  if (siren.state === "muted") showSound();
   if (receivedMs === null) return showAge();
   const lagS = Math.max(0, Date.now() - receivedMs) / 1000;
   link.update(lagS, receivedMs);
@@ -136,9 +145,10 @@ function show() {
   if (connection.unreadable) {
     notices.unshift({ level: "warning", text: `${connection.unreadable} messages of the server were unreadable.` });
   }
-  showNotices(byId("notices"), notices);
+  showNotices(byId("notices"), notices.map((notice) => ({ ...notice, text: team.withNames(notice.text) })));
   const heard = team.list().filter(isFresh).length;
   const all = team.people.size;
+  byId("people").dataset.many = String(all > 8);
   setText(byId("count"), !all ? "" : heard === all ? `(${all})` : `(${heard} of ${all} heard)`);
   fillMe();
   list.update(team, {
@@ -192,8 +202,9 @@ function showCamera() {
 
 function showSound() {
   const button = byId("sound");
-  const words = { on: "Sound on", muted: "Sound off", locked: "Enable sound" };
+  const words = { on: "Sound on", muted: `Sound off, ${duration(siren.mutedS)} left`, locked: "NO SOUND: enable" };
   setText(button, words[siren.state]);
+  setAttribute(button, "data-state", siren.state);
   setAttribute(button, "aria-pressed", String(siren.state === "on"));
 }
 
@@ -269,17 +280,26 @@ function stopFinding() {
   map.invalidate();
 }
 
-async function acknowledge(node) {
-  alarms.acknowledge(node);
+async function acknowledge(nodes) {
+  for (const node of nodes) alarms.acknowledge(node, BY);
   sound();
   banner.update(alarms);
   map.invalidate();
   // The button is gone: on to the next alarm's, or back to the map.
   (byId("alarms").querySelector(".rows .buttons button:last-child") ?? byId("map")).focus();
   try {
-    await postJson("/api/acknowledge", { node });
+    for (const node of nodes) await postJson("/api/acknowledge", { node, by: BY });
   } catch (error) {
     trouble = { level: "warning", text: `Acknowledged only on this page: ${error.message}` };
+    refresh(true);
+  }
+}
+
+async function shelve(node, forS) {
+  try {
+    await postJson("/api/shelve", { node, seconds: forS, by: BY });
+  } catch (error) {
+    trouble = { level: "warning", text: `Not shelved: ${error.message}` };
     refresh(true);
   }
 }
@@ -308,8 +328,20 @@ for (const layer of ["tracks", "ranges"]) {
   });
 }
 byId("sound").addEventListener("click", () => {
-  if (siren.state === "locked") siren.unlock();
+  if (siren.state === "locked") siren.test();
   else siren.mute(!siren.muted);
+});
+byId("show-log").addEventListener("click", () => {
+  byId("log-dialog").showModal();
+  log.look(team);
+});
+byId("menu").addEventListener("click", () => {
+  const open = byId("tools").classList.toggle("open");
+  setAttribute(byId("menu"), "aria-expanded", String(open));
+});
+byId("sheet").addEventListener("click", () => {
+  const open = byId("side").classList.toggle("open");
+  setAttribute(byId("sheet"), "aria-expanded", String(open));
 });
 byId("help").addEventListener("click", () => byId("help-dialog").showModal());
 byId("phones").addEventListener("click", async () => {

@@ -135,7 +135,7 @@ export function probabilityHere(p) {
 }
 
 /** Of the node, not of its wearer. */
-export const HEALTH_WORDS = { green: "node OK", yellow: "node weak", red: "node failing", unknown: "node unknown" };
+export const HEALTH_WORDS = { green: "node OK", yellow: "node weak", red: "node failing", unknown: "node unknown", starting: "node starting" };
 
 export const STATUS_WORDS = {
   ok: "located",
@@ -145,8 +145,12 @@ export const STATUS_WORDS = {
   lost: "lost, last place",
 };
 
-/** The text of an alarm from `alarms.js`. */
+/** The text of an alarm, or of several with one cause, from `alarms.js`. */
 export function alarmText(alarm) {
+  const names = (alarm.alarms ?? []).map((a) => a.name).join(", ");
+  if (alarm.kind === "nobody") return `Nothing heard from anybody for ${seconds(alarm.seconds)}: is the coordinator gone?`;
+  if (alarm.kind === "together") return `${alarm.alarms.length} lost together for ${seconds(alarm.seconds)}: ${names}`;
+  if (alarm.kind === "flood") return `Many alarms. Less urgent, ${alarm.alarms.length}: ${names}`;
   if (alarm.kind === "lost") return `${alarm.name} is lost: not heard for ${seconds(alarm.seconds)}`;
   if (alarm.newsS) return `${alarm.name} had not moved for ${seconds(alarm.seconds)}; last heard ${ago(alarm.newsS)}`;
   return `${alarm.name} has not moved for ${seconds(alarm.seconds)}`;

@@ -1,0 +1,46 @@
+// The session's log: what happened, to whom, by whom, the newest first.
+
+import { make, setText } from "./dom.js";
+import { timeOfDay } from "./words.js";
+
+const KINDS = {
+  note: "note", warning: "warning", alarm: "ALARM", cleared: "over", acknowledged: "seen", shelved: "shelved", name: "name",
+};
+const MOST = 5000;
+
+export class LogView {
+  constructor(list, { onNew }) {
+    this.list = list;
+    this.onNew = onNew;
+    this.clear();
+  }
+
+  clear() {
+    this.entries = [];
+    this.seen = 0;
+  }
+
+  add(entries) {
+    this.entries = [...this.entries, ...entries].slice(-MOST);
+    this.onNew();
+  }
+
+  /** How many lines have come since the log was last looked at. */
+  get unseen() {
+    return this.entries.length - this.seen;
+  }
+
+  /** Show it, with the names that people have by now. */
+  look(team) {
+    this.seen = this.entries.length;
+    this.list.replaceChildren(...this.entries.map((entry) => make("li", { "data-kind": entry.kind },
+      make("time", { text: timeOfDay(1000 * entry.unix_s) }), make("span", { class: "kind", text: KINDS[entry.kind] ?? entry.kind }),
+      make("span", { text: `${team.withNames(entry.text)}${entry.by ? `, by ${entry.by}` : ""}` }))).reverse());
+    this.onNew();
+  }
+}
+
+/** The button that opens the log, with the number of lines that nobody has looked at. */
+export function showUnseen(button, count) {
+  setText(button, count ? `Log (${count})` : "Log");
+}
