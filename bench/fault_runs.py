@@ -30,6 +30,7 @@ from relpos.simulation.world import RadioChannel, UwbChannel
 NODES = 3
 NODE = 2
 """The node that faults of one node affect."""
+TEAM_KEY = bytes(range(16))
 SECONDS = 65.0
 BEGIN_S = 25.0
 END_S = 45.0
@@ -173,7 +174,7 @@ class _Tap:
     """Frames that a link's decoder takes, by looking at what it has counted as received."""
 
     def __init__(self, key: bytes) -> None:
-        self.link = Link()
+        self.link = Link(key=key)
         self._key = key
         self._parser = xbee.Parser()
 
@@ -185,7 +186,8 @@ class _Tap:
             observations = self.link.feed(xbee.encode(packet), arrival_s)
             frame = None
             if self._received() > taken and isinstance(packet, xbee.Receive16 | xbee.Receive64):
-                frame = wire.decode(packet.data, self._key)
+                key = wire.node_key(self._key, packet.data[3])
+                frame = wire.decode(packet.data, key)
             yield observations, frame
 
     def _received(self) -> int:
@@ -201,9 +203,11 @@ def record(
     board: str = "native",
 ) -> Record:
     """Let a team walk with those faults; the same arguments give the same record."""
-    with EmulatedTeam(
-        TeamConfig(GOOD_CONDITIONS, nodes, seconds, seed, board, faults=faults, beacons=True)
-    ) as team:
+    key = TEAM_KEY if any("key=stolen" in str(fault) for fault in faults) else wire.DEFAULT_KEY
+    config = TeamConfig(
+        GOOD_CONDITIONS, nodes, seconds, seed, board, faults=faults, beacons=True, key=key
+    )
+    with EmulatedTeam(config) as team:
         tap = _Tap(team.key)
         errors = {number: node.errors for number, node in team.nodes.items()}
         kept = Record(

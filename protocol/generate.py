@@ -86,6 +86,8 @@ def header_text() -> str:
         f"constexpr uint8_t kKeyBytes = {wire.KEY_BYTES};",
         f"constexpr uint8_t kCoordinator = {wire.COORDINATOR};",
         f"constexpr uint8_t kBroadcast = {wire.BROADCAST};",
+        f"constexpr uint8_t kCableOptions = {wire.CABLE_OPTIONS};",
+        f"constexpr uint32_t kMostJump = {wire.MAX_COMMAND_JUMP};  // of a counter coming down",
         "",
         "#if defined(__AVR__)",
         "typedef __uint24 Uint24;  // as long as on the wire",
@@ -370,25 +372,28 @@ def page_text() -> str:
         "(the first two bytes of SHA-256 over the canonical text of all fields). A peer with "
         "another layout fails the check instead of being misread.",
         "",
-        "**Tag.** SipHash-2-4, 8 bytes, under the team's 16-byte key, over everything before it. A "
-        "node that was never given a key has one of zeros, which everybody knows: it tells damage, "
-        "not enemies. `relpos node set key` gives it a secret one.",
+        "**Tag.** SipHash-2-4, 8 bytes, over everything before it, under the key of the node in "
+        "the header (255: the beacons' key): the first 16 bytes of HMAC-SHA-256 under the team's "
+        'key over the 15 bytes "relpos node key" and that node\'s. A node holds its own key and '
+        "the beacons'. Before it was given one, both are zeros, which everybody knows: they tell "
+        "damage, not enemies.",
         "",
         "**Counter.** Grows with every frame of a sender and never goes back: a node reserves "
         "blocks of counts in its EEPROM ahead of their use. The host accepts from each node what "
         "is newer than all before by at most 2^24, or within the last 64 counts and not seen yet "
         "(frames overtake each other). A node whose counter does not fit, such as one whose memory "
         "was erased, gets a PING with 48 bits that nobody foresees; its answer sets its counter. "
-        "A node accepts from the host only what is newer. The host's counter is the "
-        "time: eighths of a second since 2024, or the last one plus 1 where that is more, so "
-        "that a host needs no memory. A node keeps the newest counter of a command in the EEPROM; "
-        "that of beacons begins anew with a restart, so an old beacon may be taken until the next "
-        "genuine one, a second later.",
+        "The host's counter is the time, eighths of a second since 2024 modulo 2^32, or its last "
+        "one plus 1: a host needs no memory. A node obeys what is ahead of its newest, kept in the "
+        f"EEPROM under whichever key, by at most 2^{wire.MAX_COMMAND_JUMP.bit_length() - 1}, four "
+        "years; else it answers counter_refused with its newest, and the host goes on from there, "
+        "whichever clock is wrong. That of beacons begins anew with a restart and with each "
+        "command: an old beacon may be taken until the next genuine one, a second later.",
         "",
-        "**New key.** A `new_key` frame carries it XOR a mask: SipHash-2-4 under the old key over "
-        "the six bytes 0, block number (0, then 1), counter of the frame(4). Who has listened "
-        "since before the old key was secret can read the new one: the first key is given over "
-        "the cable.",
+        "**New key.** A `new_key` frame carries the node's own key and the beacons' XOR four "
+        "blocks of SipHash-2-4 under its old key over the eight bytes 0, block number, token(2), "
+        "counter of the frame(4). A node without a key takes it only from its cable, where the "
+        f"host sets the receive options 0x{wire.CABLE_OPTIONS:02x}, which no module does.",
         "",
         "**Lost frames.** Motion travels as running totals since the node's start (`boot` counts "
         "the starts); the difference of any two received frames is the motion between them.",

@@ -317,14 +317,17 @@ def test_a_stranger_without_the_key_is_refused_by_host_and_nodes():
     assert {f.node for _, f in result.run.frames} == set(result.run.walkers)
 
 
-def test_a_stranger_with_the_key_is_another_node_and_touches_none():
-    result = outcome(fault_runs.example(_fault("radio:foreign"), key="right"))
-    strangers = {f.node for _, f in result.run.frames} - set(result.run.walkers)
-    assert len(strangers) == 1
-    # What it says of distances is booked to its own number; the others' are what they measured.
-    assert {r.node for _, r in result.run.ranges()} == strangers | set(result.run.walkers)
+def test_with_all_that_a_stolen_node_holds_nobody_speaks_for_or_commands_another():
+    result = outcome(fault_runs.example(_fault("radio:foreign"), key="stolen"))
+    assert {f.node for _, f in result.run.frames} == set(result.run.walkers)
+    assert result.run.counts["FrameTagError"] >= 60
+    assert result.restarts == 0, "a command was obeyed"
+    assert_motion_is_untouched(result)
     assert_every_range_is_true(result)
-    assert len(result.run.range_errors_m()) == len(result.clean.range_errors_m())
+    for node in set(result.run.walkers) - {max(result.run.walkers)}:
+        assert result.run.grown(node, "refused_frames") >= 30
+        at_s = [t for t, r in result.run.ranges() if r.node == node and BEGIN_S < t < END_S]
+        assert len(at_s) >= 10, "ranging goes on without the true beacons"
 
 
 def _fault(name):

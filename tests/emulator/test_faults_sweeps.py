@@ -87,7 +87,7 @@ class Bench:
         frame = None
         for key in (OLD_KEY, NEW_KEY):
             try:
-                frame = wire.decode(sent.data, key)
+                frame = wire.decode(sent.data, wire.node_key(key, sent.data[3]))
                 break
             except wire.FrameTagError:
                 continue
@@ -347,7 +347,7 @@ def store_settings(bench):
 
 def store_key(bench):
     bench.node.command(bench.coordinator, wire.CommandCode.SET_TEAM_SIZE, 3, 8, 1_000_000)
-    bench.node.set_key(bench.coordinator, NEW_KEY, 9, 3_000_000)
+    bench.node.set_key(NEW_KEY, 9, 3_000_000)
 
 
 @cache

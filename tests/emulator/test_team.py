@@ -143,7 +143,7 @@ def beacons_of(team, node, seconds):
 
     def tap(left_us, data):
         received.extend(
-            (left_us * 1e-6, wire.decode(frame.data, team.key))
+            (left_us * 1e-6, wire.decode(frame.data, wire.node_key(team.key, frame.data[3])))
             for frame in parser.feed(data)
             if isinstance(frame, Receive16) and frame.data[2] == wire.BEACON.number
         )

@@ -22,7 +22,6 @@ import fuzz_builds
 
 from relpos.link import port as serial_port
 from relpos.link import xbee
-from relpos.link.authentication import HostCounter
 from relpos.link.decoder import Decoder
 from relpos.measurements import Observation
 from relpos.protocol import messages as wire
@@ -54,13 +53,18 @@ def crc_fits(data: bytes) -> bool:
     return crc == int.from_bytes(data[-10:-8], "little")
 
 
+def key_of(frame: bytes) -> bytes:
+    """The key of the node in whose name a frame is."""
+    return wire.node_key(KEY, frame[3] if len(frame) > 3 else wire.BROADCAST)
+
+
 class CheckedDecoder(Decoder):
     """A decoder of which every frame is watched."""
 
     def __init__(self, totals: Counter[str]) -> None:
         super().__init__((KEY,))
         self._totals = totals
-        self.genuine = {data for _, _, key, data in GOLDEN if key == KEY}
+        self.genuine: set[bytes] = set()
         self._taken: set[tuple[int, int]] = set()
 
     def state(self) -> object:
@@ -98,13 +102,15 @@ class CheckedDecoder(Decoder):
     def feed(self, data: bytes, arrival_s: float, rssi_dbm: int | None = None) -> list[Observation]:
         """As the decoder's; BrokenPromiseError where it does what it must not."""
         try:
-            frame = wire.decode(data, KEY)
+            frame = wire.decode(data, key_of(data))
         except wire.FrameError:
             frame = None
         if frame is not None:
             require(data in self.genuine, "a frame without a genuine tag is accepted")
             values = (frame.message, frame.node, frame.boot, frame.counter, frame.values)
-            require(wire.encode(*values, KEY) == data, "decoded, it is encoded as another one")
+            require(
+                wire.encode(*values, key_of(data)) == data, "decoded, it is encoded as another one"
+            )
         received = self.received()
         before = repr(self.state())
         observations = super().feed(data, arrival_s, rssi_dbm)
@@ -140,9 +146,7 @@ class Script:
         self._counters: Counter[int] = Counter()
         flags = self.u8()
         self._escaped = flags & 3 != 0
-        self.link = serial_port.Link(
-            key=KEY, counter=HostCounter(lambda: 0.0), escaped=self._escaped
-        )
+        self.link = serial_port.Link(key=KEY, clock=lambda: 0.0, escaped=self._escaped)
         self.decoder = self.link.decoder = CheckedDecoder(totals)
         self._genuine = self.decoder.genuine
         self._chunk = flags >> 2
@@ -197,9 +201,9 @@ class Script:
 
     # -- frames --
 
-    def _seal(self, raw: bytes, key: bytes = KEY) -> bytes:
-        data = wire.seal(raw, key)
-        if key == KEY:
+    def _seal(self, raw: bytes, key: bytes | None = None) -> bytes:
+        data = wire.seal(raw, key or key_of(raw))
+        if key is None:
             self._genuine.add(data)
         self._sent.append(data)
         return data
@@ -215,7 +219,7 @@ class Script:
 
     def _motion(self, node: int, counter: int) -> bytes:
         values = dict.fromkeys(wire.MOTION.field, 0)
-        data = wire.encode(wire.MOTION, node, 0, counter, values, KEY)
+        data = wire.encode(wire.MOTION, node, 0, counter, values, wire.node_key(KEY, node))
         self._genuine.add(data)
         return data
 

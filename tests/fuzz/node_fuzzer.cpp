@@ -158,8 +158,8 @@ Bytes api_frame(const uint8_t* data, size_t length) {
   return out;
 }
 
-Bytes received_frame(const Bytes& payload) {  // RX16 from the coordinator
-  Bytes data = {0x81, 0, 0, 0x28, 0};
+Bytes received_frame(const Bytes& payload, bool by_cable = false) {  // RX16 from the coordinator
+  Bytes data = {0x81, 0, 0, 0x28, by_cable ? wire::kCableOptions : uint8_t{0}};
   data.insert(data.end(), payload.begin(), payload.end());
   return api_frame(data.data(), data.size());
 }
@@ -222,6 +222,7 @@ struct World : FakeBoard {
   uint32_t busy_polls = 0;
   bool active = false;  // wrote to the EEPROM or the line
   bool restart_asked = false;
+  bool cable = false;  // what comes now comes by it
   std::vector<Bytes> received;
 
   World() { memset(eeprom, 0xFF, sizeof eeprom); }
@@ -365,7 +366,6 @@ class Script {
     world_.busy_polls = 0;
     world_.space = 255;
     pass_ms(1500);
-    if (state().marks_.command > 0xFFFFFF00) return;
     const uint64_t obeyed = totals.obeyed;
     deliver(received_frame(sealed(wire::MessageType::kCommand, wire::kBroadcast,
                                   state().marks_.command + 1, Bytes{0x34, 0x12, 0, 0, 0, 0, 0})));
@@ -425,7 +425,9 @@ class Script {
     const uint8_t* body = frame.data() + wire::kHeaderBytes;
     for (size_t i = 0; i < pending_.size(); ++i) {
       if (pending_[i].token != (body[0] | body[1] << 8) || pending_[i].command != body[2]) continue;
-      if (pending_[i].counter > answered_) answered_ = pending_[i].counter;
+      if (answered_ == 0 || pending_[i].counter - answered_ - 1 < wire::kMostJump) {
+        answered_ = pending_[i].counter;
+      }
       pending_.erase(pending_.begin() + static_cast<long>(i));
       return;
     }
@@ -433,9 +435,9 @@ class Script {
   // A frame under way when the key was changed left under the old one.
   const uint8_t* sending_key(const Bytes& frame) {
     wire::Header header;
-    const bool present = wire::open(frame.data(), static_cast<uint8_t>(frame.size()), state().key_,
+    const bool present = wire::open(frame.data(), static_cast<uint8_t>(frame.size()), state().keys_,
                                     &header) == wire::FrameStatus::kGood;
-    return present ? state().key_ : former_key_;
+    return present ? state().keys_ : former_key_;
   }
 
   // Until nothing more happens at this moment.
@@ -469,7 +471,8 @@ class Script {
 
   // Bytes from the module: node, parser and codecs take them, up to the end of one payload after the
   // other. What none of the genuine frames is must change nothing in the node but its counts.
-  void deliver(const Bytes& bytes) {
+  void deliver(const Bytes& bytes, bool by_cable = false) {
+    world_.cable = by_cable;
     Bytes part;
     for (const uint8_t byte : bytes) {
       part.push_back(byte);
@@ -504,9 +507,13 @@ class Script {
   void take_payload(const Bytes& payload) {
     wire::Header header;
     const Bytes exact(payload);
-    const bool good = wire::open(exact.data(), static_cast<uint8_t>(exact.size()), state().key_,
-                                 &header) == wire::FrameStatus::kGood;
-    const bool genuine = find_genuine(payload, state().key_) != nullptr;
+    const bool by_beacons_key =
+        exact.size() > wire::kTypeAt &&
+        exact[wire::kTypeAt] == static_cast<uint8_t>(wire::MessageType::kBeacon);
+    const uint8_t* key = by_beacons_key ? state().keys_ + wire::kKeyBytes : state().keys_;
+    const bool good = wire::open(exact.data(), static_cast<uint8_t>(exact.size()), key, &header) ==
+                      wire::FrameStatus::kGood;
+    const bool genuine = find_genuine(payload, key) != nullptr;
     if (good && !genuine) fail("a frame without a genuine tag is opened");
     if (!good && genuine && payload.size() <= wire::kFrameBytes) fail("a genuine frame is refused");
     totals.opened += good;
@@ -520,7 +527,8 @@ class Script {
                                   header.type == wire::MessageType::kNewKey);
     const uint32_t mark = beacon ? before.beacon_mark_ : before.marks_.command;
     const bool meant = good && (header.node == before.id_ || header.node == wire::kBroadcast);
-    const bool obeyed = meant && (beacon || command) && header.counter > mark;
+    const bool follows = mark == 0 || header.counter - mark - 1 < wire::kMostJump;
+    const bool obeyed = meant && (beacon || command) && follows;
     poll();
     if (!obeyed) {
       ++totals.refused;
@@ -528,13 +536,15 @@ class Script {
       return;
     }
     ++totals.obeyed;
-    if (command && answered_ != 0 && header.counter <= answered_) {
+    if (command && answered_ != 0 && header.counter - answered_ - 1 >= wire::kMostJump) {
       fail("a command that was answered is taken again");
     }
-    if (memcmp(before.key_, state().key_, sizeof before.key_) != 0) {
-      memcpy(former_key_, before.key_, sizeof former_key_);
-      answered_ = 0;
-      for (Asked& each : pending_) each.counter = 0;  // still to be answered, under the old key
+    const uint8_t none[wire::kKeyBytes] = {};
+    if (memcmp(before.keys_, state().keys_, sizeof before.keys_) != 0) {
+      if (memcmp(before.keys_, none, sizeof none) == 0 && !world_.cable) {
+        fail("a first key is taken from the radio");
+      }
+      memcpy(former_key_, before.keys_, sizeof former_key_);
     } else if (command && before.reboot_step_ == 0 &&
                payload.size() == wire::kOverhead + wire::kCommandBytes) {
       const uint8_t* body = payload.data() + wire::kHeaderBytes;
@@ -547,7 +557,9 @@ class Script {
     NodeState a = before, b = state();
     memcpy(&b.xbee_, &a.xbee_, sizeof a.xbee_);
     b.bad_frames_ = a.bad_frames_;
-    b.refused_frames_ = a.refused_frames_;
+    b.lost_.refused_frames = a.lost_.refused_frames;
+    b.refused_token_ = a.refused_token_;  // told with the newest counter
+    b.refusal_due_ = a.refusal_due_;
     if (memcmp(&a, &b, sizeof a) == 0) return;
     const uint8_t* x = reinterpret_cast<const uint8_t*>(&a);
     const uint8_t* y = reinterpret_cast<const uint8_t*>(&b);
@@ -581,7 +593,8 @@ class Script {
 
   Bytes sealed(wire::MessageType type, uint8_t node, uint32_t counter, const Bytes& body,
                const uint8_t* key = nullptr) {
-    if (key == nullptr) key = state().key_;
+    const bool beacon = type == wire::MessageType::kBeacon;
+    if (key == nullptr) key = beacon ? state().keys_ + wire::kKeyBytes : state().keys_;
     Genuine made;
     memcpy(made.key, key, sizeof made.key);
     made.frame.assign(wire::kHeaderBytes, 0);
@@ -613,7 +626,7 @@ class Script {
   }
   uint32_t next_counter() {
     const uint32_t mark = state().marks_.command;
-    return mark < 0xFFFFFF00 ? mark + 1 : mark;
+    return mark + 1;
   }
   uint8_t addressee() {
     const uint8_t choice = u8();
@@ -679,9 +692,9 @@ class Script {
     if (frame->size() > 100) frame->resize(100);
   }
 
-  void frame_from_module(const Bytes& frame) {
+  void frame_from_module(const Bytes& frame, bool by_cable = false) {
     ++totals.frames;
-    deliver(received_frame(frame));
+    deliver(received_frame(frame, by_cable), by_cable);
   }
 
   void operation(uint8_t code) {
@@ -719,7 +732,7 @@ class Script {
         Bytes frame = fresh();
         mutate(&frame);
         redo_crc(&frame);
-        totals.forged += find_genuine(frame, state().key_) == nullptr;
+        totals.forged += find_genuine(frame, state().keys_) == nullptr;
         frame_from_module(frame);
         break;
       }
@@ -744,7 +757,9 @@ class Script {
         for (uint8_t& byte : key) byte = u8();
         if ((key[0] & 1) != 0) {
           ++totals.genuine;
-          frame_from_module(sealed(wire::MessageType::kNewKey, addressee(), next_counter(), body(18)));
+          frame_from_module(
+              sealed(wire::MessageType::kNewKey, addressee(), next_counter(), body(34)),
+              (key[0] & 2) != 0);
         } else {
           ++totals.forged;
           frame_from_module(sealed(wire::MessageType::kCommand, addressee(), next_counter(), body(7), key));
@@ -795,7 +810,7 @@ class Script {
   }
 
   void count_mutant(const Bytes& frame) {
-    if (find_genuine(frame, state().key_) != nullptr) {
+    if (find_genuine(frame, state().keys_) != nullptr) {
       ++totals.genuine;  // changed to and fro, or into another genuine one
       return;
     }
@@ -820,7 +835,7 @@ class Script {
   std::vector<Asked> pending_;
   uint32_t newest_sent_ = 0, answered_ = 0;
   bool have_sent_ = false;
-  uint8_t former_key_[wire::kKeyBytes] = {};
+  uint8_t former_key_[wire::kKeyBytes] = {};  // the node's own
   alignas(16) uint8_t place_[sizeof(Node)];
 };
 

@@ -1,6 +1,9 @@
 """Key files, counters, and what a frame that is old, foreign or forged may do on the host."""
 
+import hashlib
+import hmac
 import stat
+from collections import deque
 
 import pytest
 from hypothesis import given, settings
@@ -33,7 +36,8 @@ ZERO = dict.fromkeys(wire.MOTION.field, 0)
 
 
 def motion(counter, time_s, node=1, boot=0, key=wire.DEFAULT_KEY):
-    return wire.encode(wire.MOTION, node, boot, counter, ZERO | {"time_s": time_s}, key)
+    values = ZERO | {"time_s": time_s}
+    return wire.encode(wire.MOTION, node, boot, counter, values, wire.node_key(key, node))
 
 
 def test_the_hosts_counter_is_the_time_and_never_stands_or_goes_back():
@@ -47,7 +51,39 @@ def test_the_hosts_counter_is_the_time_and_never_stands_or_goes_back():
     assert counter.next() == first + 101
     now[0] += 7200.0
     assert counter.next() == first + 8 * 3600
-    assert HostCounter(lambda: 2_240_000_000.0).next() < 1 << 32  # the year 2040
+
+
+def test_counters_go_on_past_2041():
+    last_s = 1_704_067_200 + (1 << 32) / 8
+    now = [last_s - 1.0]
+    counter = HostCounter(lambda: now[0])
+    assert counter.next() == (1 << 32) - 8
+    now[0] = last_s + 1.0
+    assert counter.next() == 8
+    now[0] = last_s - 1.0
+    assert counter.next() == 9
+    assert counter.follow((1 << 32) - 1) is None, "overtaken on the way"
+    assert counter.next() == 10
+
+
+@pytest.mark.parametrize(
+    ("own_s", "newest_s", "said"),
+    [
+        (1.8e9, 1.8e9 + 315e6, "3645.8 days ahead"),
+        (1.8e9 + 315e6, 1.8e9, "3645.8 days behind"),
+        (1.8e9, 1.8e9 + 3599.0, None),
+        (0.0, 1.8e9, "clock says 1970-01-01"),
+    ],
+)
+def test_told_the_newest_counter_a_host_goes_on_from_it_and_says_whose_clock_is_wrong(
+    own_s, newest_s, said
+):
+    newest = int((newest_s - 1_704_067_200) * 8)
+    counter = HostCounter(lambda: own_s)
+    counter.next()
+    fault = counter.follow(newest)
+    assert fault is None if said is None else said in fault
+    assert [counter.next() for _ in range(3)] == [newest + 1, newest + 2, newest + 3]
 
 
 @given(st.lists(st.integers(0, 400), max_size=300))
@@ -126,22 +162,51 @@ def test_a_forged_restart_does_not_end_the_real_one():
     assert decoder.nodes[1].boot == 1
 
 
-def test_a_new_key_travels_hidden_and_comes_out_whole():
-    link = serial_port.Link(key=KEY, counter=HostCounter(lambda: 1.8e9))
-    new = bytes(range(100, 116))
-    token, data = link.new_key(3, new)
-    (request,) = xbee.Parser().feed(data)
-    assert new not in request.data
-    frame = wire.decode(request.data, KEY)
-    assert (frame.message, frame.node, frame.values["token"]) == (wire.NEW_KEY, 3, token)
-    masked = b"".join(frame.values[f"masked_{k}"].to_bytes(4, "little") for k in range(4))
-    mask = wire.key_mask(KEY, frame.counter)
+def test_new_keys_travel_hidden_and_come_out_whole():
+    link = serial_port.Link(key=KEY, clock=lambda: 1.8e9)
+    new = bytes(range(100, 132))
+    (request,) = xbee.Parser().feed(link.new_keys(3, new, token=77))
+    assert new[:16] not in request.data
+    old = wire.node_key(KEY, 3)
+    frame = wire.decode(request.data, old)
+    assert (frame.message, frame.node, frame.values["token"]) == (wire.NEW_KEY, 3, 77)
+    masked = b"".join(frame.values[f"masked_{k}"].to_bytes(4, "little") for k in range(8))
+    mask = wire.masked_keys(old, 77, frame.counter, bytes(32))
+    mask = b"".join(mask[f"masked_{k}"].to_bytes(4, "little") for k in range(8))
     assert bytes(a ^ b for a, b in zip(masked, mask, strict=True)) == new
-    # Meanwhile the node may answer under either key.
-    link.accept_keys(new, KEY)
-    assert link.decoder.feed(motion(0, 1.0, key=KEY), 1.0) is not None
-    link.decoder.feed(motion(1, 2.0, key=new), 2.0)
+    # Meanwhile a node may answer under either key.
+    link.accept_keys(new[:16], KEY)
+    link.decoder.feed(motion(0, 1.0, key=KEY), 1.0)
+    link.decoder.feed(motion(1, 2.0, key=new[:16]), 2.0)
     assert link.decoder.nodes[1].counts["received"] == 2
+
+
+def test_a_nodes_key_says_nothing_of_the_teams_or_anothers():
+    """The published construction, from the standard's own module, and no key twice."""
+    said = hmac.new(KEY, b"relpos node key\x03", hashlib.sha256).digest()
+    assert wire.node_key(KEY, 3) == said[:16]
+    keys = {wire.node_key(KEY, node) for node in range(256)} | {KEY, wire.DEFAULT_KEY}
+    assert len(keys) == 258
+    assert {wire.node_key(wire.DEFAULT_KEY, node) for node in range(256)} == {wire.DEFAULT_KEY}
+
+
+def test_a_stolen_node_speaks_and_commands_for_nobody_else():
+    """An attacker has all that node 3 holds: its own key and the beacon's."""
+    held = wire.node_key(KEY, 3), wire.node_key(KEY, wire.BROADCAST)
+    decoder = Decoder((KEY,))
+    for n in range(10):
+        for node in (1, 2, 3):
+            decoder.feed(motion(n, 1.0 + n, node, key=KEY), 1.0 + n)
+    before = repr({n: decoder.nodes[n] for n in (1, 2)})
+    for n in range(10, 40):
+        for node in (1, 2, 4):
+            for key in held:
+                frame = wire.encode(wire.MOTION, node, 0, n, ZERO | {"time_s": 1.0 + n}, key)
+                assert decoder.feed(frame, 1.0 + n) == []
+    assert repr({n: decoder.nodes[n] for n in (1, 2)}) == before
+    assert set(decoder.nodes) == {1, 2, 3}
+    told = [line for line in decoder.remarks if "somebody else" in line]
+    assert [line.split(":")[0] for line in told] == ["node 1", "node 2"]
 
 
 def test_ranges_come_without_both_ends_offsets():
@@ -202,7 +267,8 @@ def test_counters_are_kept_beside_the_key_and_never_go_back(tmp_path):
 def answer(counter, challenge, command=wire.CommandCode.PING, boot=0, **other):
     values = {"token": challenge.token, "command": command, "value": challenge.value} | other
     values["result"] = wire.CommandResult.DONE
-    return wire.encode(wire.ACKNOWLEDGEMENT, challenge.node, boot, counter, values, KEY)
+    key = wire.node_key(KEY, challenge.node)
+    return wire.encode(wire.ACKNOWLEDGEMENT, challenge.node, boot, counter, values, key)
 
 
 def test_one_frame_of_the_last_counter_silences_no_node():
@@ -302,16 +368,61 @@ def test_a_node_answers_the_challenge_of_a_host_that_remembers_a_higher_counter(
     assert any("node 1: its frame counter had changed" in line for line in link.decoder.remarks)
 
 
-@pytest.mark.parametrize(("clock_s", "day"), [(0.0, "1970-01-01"), (3e9, "2065-01-24")])
+@pytest.mark.parametrize(("clock_s", "day"), [(0.0, "1970-01-01"), (1.6e9, "2020-09-13")])
 def test_a_clock_that_cannot_be_right_is_told_as_that(clock_s, day):
-    link = serial_port.Link(counter=HostCounter(lambda: clock_s))
+    link = serial_port.Link(clock=lambda: clock_s)
     for _ in range(3):
         link.command(1, wire.CommandCode.PING, 0)
     (remark,) = link.decoder.remarks
     assert f"clock says {day}" in remark
     assert "set the clock" in remark
     assert HostCounter(lambda: clock_s).next() == 1
-    assert HostCounter(lambda: 1.8e9).clock_fault() is None
+    assert serial_port.Link(clock=lambda: 1.8e9).clock_fault() is None
+
+
+def obey(team, link, size):
+    """Send a command as a dialogue does; return how often, until the node has done it."""
+    token = link.next_token()
+    for attempt in range(1, 6):
+        team.send(link.command(1, wire.CommandCode.SET_TEAM_SIZE, size, token=token)[1])
+        for time_us, data in team.run(team.time_us + 700_000):
+            link.feed(data, time_us * 1e-6)
+        answers, link.decoder.acknowledged = list(link.decoder.acknowledged), deque()
+        if any((a.token, a.result) == (token, wire.CommandResult.DONE) for a in answers):
+            return attempt
+    return None
+
+
+def test_no_wrong_clock_locks_a_node_out_and_the_reason_is_told():
+    """1970, ten years ahead, steps of a day, and 2050, each followed by a host that is right."""
+    now = [1.8e9]
+    with EmulatedTeam(TeamConfig("straight", 1, 60.0, 3, key=KEY)) as team:
+        team.run(5_000_000)
+
+        def command(*clocks_s):
+            link = serial_port.Link(key=KEY, clock=lambda: now[0])
+            attempts = []
+            for clock_s in clocks_s:
+                now[0] = clock_s
+                attempts.append(obey(team, link, 2 + len(attempts)))
+            return attempts, "".join(link.decoder.remarks)
+
+        assert command(1.8e9) == ([1], "")
+        attempts, said = command(1.8e9 + 315e6)
+        assert attempts == [2]
+        assert "3645.8 days behind" in said
+        assert command(1.8e9) == ([2], ""), "once more, as counters went on by themselves"
+        attempts, said = command(0.0)
+        assert attempts == [2]
+        assert "clock says 1970-01-01" in said
+        attempts, said = command(1.8e9 + 60.0, 1.8e9 + 86_460.0, 1.8e9 + 61.0, 1.8e9 + 62.0)
+        assert (attempts, said) == ([1, 1, 1, 1], "")
+        attempts, said = command(1.8e9 + 63.0)
+        assert attempts == [2]
+        assert "1.0 days ahead" in said
+        for year_2050_s in (2.53e9, 2.53e9 + 60.0):
+            assert command(year_2050_s)[0] == [2]
+        assert command(1.8e9 + 64.0)[0] == [2], "a day behind, as before"
 
 
 def test_a_node_that_does_not_answer_a_host_of_1970_is_no_wrong_key(monkeypatch):
@@ -326,7 +437,7 @@ def test_a_node_that_does_not_answer_a_host_of_1970_is_no_wrong_key(monkeypatch)
         def write(self, data):
             return len(data)
 
-    link = serial_port.Link(counter=HostCounter(lambda: 86_400.0))
+    link = serial_port.Link(clock=lambda: 86_400.0)
     with pytest.raises(DeviceError, match="clock says 1970-01-02"):
         NodeDialogue(Silent(), 1, link).command(wire.CommandCode.PING, 0)
 

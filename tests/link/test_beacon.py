@@ -7,12 +7,13 @@ import tty
 import pytest
 
 from relpos.cli.node_watch import _watch
+from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DataError
 from relpos.link import xbee
-from relpos.link.authentication import HostCounter
 from relpos.link.beacon import FORGET_S, MAX_NODES, BeaconSchedule, HostBeacons
 from relpos.link.port import Link
 from relpos.live.inputs import PortInput
+from relpos.measurements import Status
 from relpos.protocol import messages as wire
 
 
@@ -117,7 +118,7 @@ def motion(node, counter):
 
 
 def test_a_host_reports_the_nodes_that_it_receives():
-    link = Link(counter=HostCounter(lambda: 2e9))
+    link = Link(clock=lambda: 2e9)
     beacons = HostBeacons(link)
     assert beacons.due(0.0) == b""
     link.feed(motion(6, 1) + motion(2, 1), 0.5)
@@ -180,3 +181,20 @@ def test_a_command_that_listens_sends_beacons_to_the_nodes_it_receives(command, 
     assert ids(wire.decode(request.data).values) == [3]
     if command == "monitor":
         assert "no team key" in capsys.readouterr().err
+
+
+def test_beacons_of_a_host_ten_years_ahead_lock_no_later_host_out():
+    """Emulated nodes; their status tells whether they take the beacons."""
+    with EmulatedTeam(TeamConfig("straight", 2, 120.0, 3, key=bytes(range(16)))) as team:
+        for ahead_s, least in ((315e6, 20.0), (0.0, 45.0)):
+            link = Link(key=team.key, clock=lambda ahead_s=ahead_s: 1.8e9 + ahead_s)
+            beacons, begun_s, health = HostBeacons(link), team.time_us * 1e-6, {}
+            while team.time_us < (begun_s + least) * 1e6:
+                for time_us, data in team.run(team.time_us + 20_000):
+                    for o in link.feed(data, time_us * 1e-6):
+                        if isinstance(o, Status) and o.name == "health":
+                            health[o.node] = int(o.value) & wire.Health.BEACON
+                team.send(beacons.due(team.time_us * 1e-6))
+            assert list(health.values()) == [wire.Health.BEACON] * 2
+        told = [line for line in link.decoder.remarks if "days ahead" in line]
+        assert told == [], "no command was refused: nothing is wrong with this host's clock"

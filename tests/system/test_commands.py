@@ -7,15 +7,16 @@ from relpos.emulator.pty import PseudoTerminal
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link import xbee
 from relpos.link.dialogue import NodeDialogue
+from relpos.link.port import Link
 from relpos.protocol import messages as wire
 from relpos.simulation.team import SCENARIOS
 
 
 @contextmanager
-def team_at_port(nodes=1, seed=1, scenario="straight"):
+def team_at_port(nodes=1, seed=1, scenario="straight", key=wire.DEFAULT_KEY):
     """A team and the port behind which it is, at eight times real time."""
     with (
-        EmulatedTeam(TeamConfig(scenario, nodes, 900.0, seed)) as team,
+        EmulatedTeam(TeamConfig(scenario, nodes, 900.0, seed, key=key)) as team,
         PseudoTerminal(team, speed=8.0) as terminal,
         terminal.open_port() as port,
     ):
@@ -35,8 +36,9 @@ def test_a_node_whose_radio_has_another_address_is_reached():
 def test_commands_are_done_once_though_two_in_five_frames_are_lost():
     straight = SCENARIOS["straight"]
     lossy = replace(straight.world, radio=replace(straight.world.radio, loss_probability=0.4))
-    with team_at_port(seed=4, scenario=replace(straight, world=lossy)) as (team, port):
-        dialogue = NodeDialogue(port, 1, clock=port.virtual_time_s)
+    old = bytes(range(1, 17))
+    with team_at_port(seed=4, scenario=replace(straight, world=lossy), key=old) as (team, port):
+        dialogue = NodeDialogue(port, 1, Link(key=old), clock=port.virtual_time_s)
         before = gain_version(dialogue)
         for gain in (1900, 2000, 2100):
             assert dialogue.demand(wire.CommandCode.SET_STEP_GAIN_PERMILLE, gain) == gain
@@ -49,6 +51,9 @@ def test_commands_are_done_once_though_two_in_five_frames_are_lost():
         assert dialogue.set_key(key)
         assert dialogue.setting(wire.CommandCode.SET_STEP_GAIN_PERMILLE) == 2100
         assert not dialogue.set_key(key)
+        # Another number has another key: it is given first, then the number.
+        dialogue.set_node_id(9)
+        assert dialogue.setting(wire.CommandCode.SET_STEP_GAIN_PERMILLE) == 2100
     assert team.radio.counts["lost"] > 5
 
 

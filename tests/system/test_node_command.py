@@ -14,16 +14,18 @@ from typer.testing import CliRunner
 from relpos.cli import node_watch
 from relpos.cli.main import app
 from relpos.emulator.avr.library import missing_parts
+from relpos.link.authentication import write_new_key
 from relpos.link.port import open_port
 
 RELPOS = [sys.executable, "-m", "relpos.cli.main"]
 
 
 @contextmanager
-def emulated(nodes, board="native", speed=4, seed=3):
+def emulated(nodes, board="native", speed=4, seed=3, key=None):
     """Path of the pseudo-terminal behind which the team is."""
     command = [*RELPOS, "emulate", "--nodes", nodes, "--scenario", "straight", "--board", board]
     command += ["--speed", speed, "--seconds", 600, "--seed", seed]
+    command += [] if key is None else ["--key-file", key]
     emulator = subprocess.Popen(
         [*map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
@@ -122,20 +124,30 @@ def test_a_number_is_changed_over_the_air_though_the_radio_keeps_its_address():
         assert "there is a node 1 already" in taken.stderr
 
 
+def test_a_first_key_needs_the_cable(port, tmp_path):
+    done = node("set", port, "key", "--key-file", tmp_path / "team.key", "--new")
+    assert done.exit_code == 1
+    assert "by radio everybody could read its first one" in done.stderr.replace("\n", " ")
+    assert not (tmp_path / "team.key").exists()
+
+
 @pytest.mark.soak
-def test_a_new_key_is_made_given_and_asked_for(tmp_path):
-    file = tmp_path / "team.key"
-    with emulated(1) as path:
-        done = node("set", path, "key", "--key-file", file, "--new")
+def test_a_team_gets_a_new_key_in_one_step_and_is_asked_for_it(tmp_path):
+    old, file = tmp_path / "old.key", tmp_path / "team.key"
+    write_new_key(old)
+    with emulated(2, key=old) as path:
+        change = ("set", path, "key", "--key-file", file, "--old-key-file", old)
+        done = node(*change, "--new")
         assert done.exit_code == 0, done.stderr
         assert file.stat().st_mode & 0o777 == 0o600
-        assert "answers under it" in done.stdout
-        again = node("set", path, "key", "--key-file", file)
-        assert "already" in again.stdout
+        assert done.stdout.count("answers under it") == 2
+        assert "by cable" in done.stderr
+        again = node(*change)
+        assert again.stdout.count("already") == 2
         stranger = node("set", path, "--node", 1)
         assert stranger.exit_code == 1
         assert "--key-file" in stranger.stderr
-        shown = node("set", path, "--key-file", file)
+        shown = node("set", path, "--node", 2, "--key-file", file)
         assert shown.exit_code == 0, shown.stderr
         assert "leg-length" in shown.stdout
         unheard = node("list", path, "--seconds", 3)
@@ -143,10 +155,13 @@ def test_a_new_key_is_made_given_and_asked_for(tmp_path):
         assert "under another key" in unheard.stderr
         assert file.read_text().strip() not in done.stdout + done.stderr
         listed = node("list", path, "--seconds", 5, "--key-file", file, "--json")
-        assert json.loads(listed.stdout)["nodes"][0]["key_set"] is True
-        overwritten = node("set", path, "key", "--key-file", file, "--new")
+        assert [row["key_set"] for row in json.loads(listed.stdout)["nodes"]] == [True, True]
+        overwritten = node(*change, "--new")
         assert overwritten.exit_code == 1
         assert "not overwritten" in overwritten.stderr
+        renamed = node("set", path, "--node", 2, "--key-file", file, "id", 7)
+        assert renamed.exit_code == 0, renamed.stderr
+        assert node("set", path, "--node", 7, "--key-file", file).exit_code == 0
 
 
 @pytest.mark.soak

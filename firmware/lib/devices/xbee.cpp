@@ -156,8 +156,8 @@ RELPOS_SHARED void Xbee::take_data(uint8_t byte) {
     const uint8_t header = header_bytes(type_);
     if (index_ >= header) {
       payload_[payload_length_++] = byte;
-    } else if (index_ + 2U < header) {  // the source, the most significant byte first
-      source_ = static_cast<uint16_t>(static_cast<uint16_t>(source_ << 8) | byte);
+    } else {
+      options_ = byte;  // the header's last
     }
   }
 }

@@ -12,9 +12,9 @@ namespace relpos {
 // the UART; of what comes only RF payloads are kept. Zeroed memory is the start: make it as `Xbee()`.
 class Xbee {
  public:
-  // Of what comes down a beacon is the longest. A whole frame's room would cost 21 bytes of RAM.
-  static constexpr uint8_t kMostPayload = wire::kOverhead + wire::kBeaconBytes;
-  static_assert(wire::kBeaconBytes >= wire::kCommandBytes && wire::kBeaconBytes >= wire::kNewKeyBytes,
+  // Of what comes down new keys are the longest. A whole frame's room would cost 13 bytes of RAM.
+  static constexpr uint8_t kMostPayload = wire::kOverhead + wire::kNewKeyBytes;
+  static_assert(wire::kNewKeyBytes >= wire::kCommandBytes && wire::kNewKeyBytes >= wire::kBeaconBytes,
                 "the longest");
 
   bool busy() const { return sending_; }
@@ -23,11 +23,12 @@ class Xbee {
   // The module has not reported that the last request was delivered.
   bool undelivered() const { return undelivered_; }
   // Pushes what fits into the UART and reads what has come, up to the end of the first RF payload.
-  // True where there is one: received(), received_length() and source() hold until the next step.
+  // True where there is one: received(), received_length() and by_cable() hold until the next step.
   bool step(Board& board);
   const uint8_t* received() const { return payload_; }
   uint8_t received_length() const { return payload_length_; }
-  uint16_t source() const { return source_; }            // of a 64-bit address the low part
+  // The host speaks in the module's place: no module sets these options, and no sender can.
+  bool by_cable() const { return options_ == wire::kCableOptions; }
   uint16_t bad_frames() const { return bad_frames_; }    // checksum, length, broken off; wraps
 
  private:
@@ -57,7 +58,7 @@ class Xbee {
   uint8_t payload_length_;
   uint16_t length_;  // of the incoming frame data
   uint16_t index_;   // in it
-  uint16_t source_;
+  uint8_t options_;
   uint16_t bad_frames_;
   uint8_t payload_[kMostPayload];
 };

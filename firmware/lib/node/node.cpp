@@ -353,30 +353,39 @@ RELPOS_APART void Node::receive_packet() {
   const uint8_t* frame = xbee_.received();
   const uint8_t length = xbee_.received_length();
   wire::Header header;
-  const wire::FrameStatus status = wire::open(frame, length, key_, &header);
+  const bool beacon = frame[wire::kTypeAt] == static_cast<uint8_t>(wire::MessageType::kBeacon);
+  const wire::FrameStatus status =
+      wire::open(frame, length, beacon ? keys_ + wire::kKeyBytes : keys_, &header);
   if (status != wire::FrameStatus::kGood) {
     ++*(status == wire::FrameStatus::kBadTag ? &lost_.refused_frames : &bad_frames_);
     return;
   }
   if (header.node != id_ && header.node != wire::kBroadcast) return;
-  const bool beacon = header.type == wire::MessageType::kBeacon;
   if (!beacon && header.type != wire::MessageType::kCommand &&
       header.type != wire::MessageType::kNewKey) {
     return;
   }
   uint32_t* mark = beacon ? &beacon_mark_ : &marks_.command;
-  if (header.counter <= *mark) {
+  const uint8_t* body = frame + wire::kHeaderBytes;
+  const uint8_t body_bytes = static_cast<uint8_t>(length - wire::kOverhead);
+  // Modulo 2^32: counters never end. Nothing was ever taken: whatever comes first is new.
+  const uint32_t skipped = header.counter - *mark - 1;
+  if (*mark != 0 && skipped >= wire::kMostJump) {
     ++lost_.refused_frames;
+    // The host goes on from the mark that it is told, whatever its clock says.
+    if (!beacon && header.counter != *mark && body_bytes >= sizeof refused_token_) {
+      memcpy(&refused_token_, body, sizeof refused_token_);
+      refusal_due_ = true;
+    }
     return;
   }
   *mark = header.counter;
-  const uint8_t* body = frame + wire::kHeaderBytes;
-  const uint8_t body_bytes = static_cast<uint8_t>(length - wire::kOverhead);
   if (beacon) {
     wire::Beacon message;
     if (wire::decode(body, body_bytes, &message)) plan_.beacon(now_ms(), message, id_);
     pozyx_due_us_ = board_.now_us();
   } else if (reboot_step_ == 0) {
+    beacon_mark_ = 0;  // so a host whose beacons are refused brings them back
     obey(header, body, body_bytes);
     store_.save(Record::kMarks);  // before the answer, also to a repetition
   }
@@ -414,16 +423,25 @@ void Node::obey(const wire::Header& header, const uint8_t* body, uint8_t length)
   done.value = command.value;
   wire::CommandResult result = wire::CommandResult::kUnknownCommand;
   if (new_key) {
-    wire::unmask_key(key_, header.counter, body + sizeof command.token, key_);
-    marks_.command = 0;  // nothing under the old key is taken any more
-    store_.save(Record::kKey);
-    result = wire::CommandResult::kDone;
+    result = wire::CommandResult::kCableOnly;
+    if (xbee_.by_cable() || has_key()) {  // else everybody could read it, or give one
+      wire::unmask_keys(header.counter, body, keys_);
+      store_.save(Record::kKeys);
+      result = wire::CommandResult::kDone;
+    }
   } else if (known) {
     result = apply(command.command, command.value, &done.value);
   }
   done.result = static_cast<uint8_t>(result);
   done.known = true;
   done.answer_due = true;
+}
+
+RELPOS_APART bool Node::has_key() const {
+  for (uint8_t i = 0; i < wire::kKeyBytes; ++i) {
+    if (keys_[i] != 0) return true;
+  }
+  return false;
 }
 
 wire::CommandResult Node::apply(uint8_t command, int32_t value, int32_t* in_force) {
@@ -533,6 +551,7 @@ wire::CommandResult Node::apply_calibration(wire::CommandCode code, int32_t valu
 }
 
 bool Node::answer_due() const {
+  if (refusal_due_) return true;
   for (const DoneCommand& done : commands_) {
     if (done.answer_due) return true;
   }
@@ -609,7 +628,7 @@ void Node::send(wire::MessageType type, uint8_t body_bytes) {
   header.node = id_;
   header.boot = boot_;
   header.counter = counter_++;
-  const uint8_t length = wire::seal(header, body_bytes, key_, frame_);
+  const uint8_t length = wire::seal(header, body_bytes, keys_, frame_);
   if (marks_.counter_end - counter_ < kCountersLeft) reserve_counters();
   awaiting_status_ = true;
   sent_ms_ = now_ms();
@@ -706,9 +725,7 @@ uint8_t Node::fill_status(uint8_t* body) {
   status.neighbours = plan_.neighbours();
   status.team = plan_.team();
   if (status.team != 0) health |= flag(wire::Health::kBeacon);
-  for (const uint8_t byte : key_) {
-    if (byte != 0) health |= flag(wire::Health::kKeySet);
-  }
+  if (has_key()) health |= flag(wire::Health::kKeySet);
   status.health = health;
   work_.worst_tick_us = 0;
   return wire::encode(status, body);
@@ -749,6 +766,15 @@ uint8_t Node::fill_samples(uint8_t* body) {
 }
 
 uint8_t Node::fill_answer(uint8_t* body) {
+  if (refusal_due_) {
+    refusal_due_ = false;
+    wire::Acknowledgement answer;
+    answer.token = refused_token_;
+    answer.command = 0xFF;  // whichever it was: it was not read
+    answer.result = static_cast<uint8_t>(wire::CommandResult::kCounterRefused);
+    answer.value = static_cast<int32_t>(marks_.command);
+    return wire::encode(answer, body);
+  }
   for (DoneCommand& done : commands_) {
     if (!done.answer_due) continue;
     done.answer_due = false;

@@ -90,8 +90,10 @@ struct NodeState : Persistent {
   uint16_t status_ms_;
   uint16_t sent_ms_;
   uint32_t counter_;      // of the next frame
-  uint32_t beacon_mark_;  // newest counter of a beacon; not kept over a restart
+  uint32_t beacon_mark_;  // newest counter of a beacon; not kept over a restart or a command
   uint16_t bad_frames_;   // behind a good XBee checksum
+  uint16_t refused_token_;  // of a command whose counter does not follow, while that is to be told
+  bool refusal_due_;
   uint8_t next_command_;
   bool awaiting_status_;
   uint8_t frame_[wire::kFrameBytes];
@@ -124,6 +126,7 @@ class Node : private NodeState {
 
   void receive_packet();
   void obey(const wire::Header& header, const uint8_t* body, uint8_t length);
+  bool has_key() const;
   wire::CommandResult apply(uint8_t command, int32_t value, int32_t* in_force);
   void report_raw(uint16_t reports);
   wire::CommandResult access_bus(uint8_t* bytes);

@@ -17,18 +17,19 @@ const Preferences kDefaults RELPOS_FLASH = {
     6, 0, kLedHealth, 0, 930, kPopulationGainPermille, 1000, 2000, 10000, 0, 0, 0};
 constexpr uint16_t kSeed = 0xFFFF - kLayout;
 
-static_assert(kStorageBytes <= 256, "a place is a byte");
-static_assert(sizeof(Marks) + wire::kKeyBytes + sizeof(Settings) <= sizeof(Persistent) &&
-                  sizeof(Persistent) < sizeof(Marks) + wire::kKeyBytes + sizeof(Settings) + 4,
+static_assert(kStoredRecords == 54 && kStorageBytes - kStoredRecords <= 256, "a place is a byte");
+constexpr uint8_t kRecordBytes = sizeof(Marks) + sizeof(Settings) + sizeof(Persistent::keys_);
+static_assert(kRecordBytes <= sizeof(Persistent) && sizeof(Persistent) < kRecordBytes + 4,
               "no gaps between the records");
-const uint8_t kSizes[kRecords] RELPOS_FLASH = {wire::kKeyBytes, sizeof(Marks), sizeof(Settings)};
+const uint8_t kSizes[kRecords] RELPOS_FLASH = {sizeof(Marks), sizeof(Settings),
+                                               sizeof(Persistent::keys_)};
 
-void read(Board& board, uint8_t at, uint8_t count, void* to) {
+void read(Board& board, uint16_t at, uint8_t count, void* to) {
   for (uint8_t i = 0; i < count; ++i) static_cast<uint8_t*>(to)[i] = board.storage_read(at++);
 }
 
 // A copy of a record: layout, its bytes, CRC.
-RELPOS_APART bool intact(Board& board, uint8_t at, uint8_t size) {
+RELPOS_APART bool intact(Board& board, uint16_t at, uint8_t size) {
   if (board.storage_read(at) != kLayout) return false;
   uint16_t crc = kSeed;
   for (; size != 0; --size) {
@@ -54,14 +55,14 @@ void Storage::restore_defaults(Settings* settings) {
 
 void Storage::load(Board& board, Persistent* all) {
   uint8_t* image = reinterpret_cast<uint8_t*>(all);
-  uint8_t at = kStoredRecords;
+  uint16_t at = kStoredRecords;
   for (uint8_t record = 0; record < kRecords; ++record) {
     const uint8_t size = flash_byte(&kSizes[record]);
-    const uint8_t next = static_cast<uint8_t>(at + stored_bytes(size));
+    const uint16_t next = at + stored_bytes(size);
     bool good = false;
-    for (; !good && at != next; at = static_cast<uint8_t>(at + size + 3)) {
+    for (; !good && at != next; at += size + 3) {
       good = intact(board, at, size);
-      if (good) read(board, static_cast<uint8_t>(at + 1), size, image);
+      if (good) read(board, at + 1, size, image);
     }
     if (!good) {
       memset(image, 0, size);
@@ -96,7 +97,7 @@ void Storage::step(Board& board, const Persistent& all) {
     value = static_cast<uint8_t>(left_ == 2 ? crc_ : crc_ >> 8);
   } else {
     const uint8_t* image = reinterpret_cast<const uint8_t*>(&all);
-    uint8_t at = kStoredRecords;
+    uint8_t at = 0;
     uint8_t bit = 1;
     const uint8_t* size = kSizes;
     // The record under way, else the first one due.
@@ -114,7 +115,7 @@ void Storage::step(Board& board, const Persistent& all) {
       left_ = stored_bytes(bytes);
       // Never over the only good copy: power cuts before may have left one.
       at_ = at;
-      if (intact(board, at, bytes)) at_ = static_cast<uint8_t>(at + bytes + 3);
+      if (intact(board, kStoredRecords + at, bytes)) at_ = static_cast<uint8_t>(at + bytes + 3);
     }
     end = static_cast<uint8_t>(at + stored_bytes(bytes));
     // In a copy, from its end: the CRC's two bytes, the record's, the layout.
@@ -128,7 +129,7 @@ void Storage::step(Board& board, const Persistent& all) {
       value = static_cast<uint8_t>(behind == 2 ? crc_ : crc_ >> 8);
     }
   }
-  board.storage_write(at_, value);
+  board.storage_write(record_ == kRecords ? at_ : kStoredRecords + at_, value);
   --left_;
   if (++at_ == end) at_ = static_cast<uint8_t>(end - 2 * left_);  // the other copy, or done
 }

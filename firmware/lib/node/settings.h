@@ -35,18 +35,18 @@ struct Settings : Preferences {
 // Against frames that are sent again.
 struct Marks {
   uint32_t counter_end;  // this node's counters below may have been used
-  uint32_t command;      // newest counter of a command that was obeyed
+  uint32_t command;      // newest counter of a command that was obeyed, under whichever key
 };
 
 // What the EEPROM keeps a copy of; in memory all the time. Each part is a record of its own, behind
 // each other in this order in both places.
 struct Persistent {
-  uint8_t key_[wire::kKeyBytes];  // all zero where none was given
-  Marks marks_;  // behind the key: begun anew under a new one, and never kept under the old one
+  Marks marks_;
   Settings settings_;
+  uint8_t keys_[2 * wire::kKeyBytes];  // its own, then the beacon's; all zero where none was given
 };
 
-enum class Record : uint8_t { kKey, kMarks, kSettings };
+enum class Record : uint8_t { kMarks, kSettings, kKeys };
 constexpr uint8_t kRecords = 3;
 
 // A record is stored twice: layout, its bytes, CRC(2).
@@ -59,11 +59,10 @@ enum StorageAddress : uint16_t {
   kStoredBootCount = 2,
   kStoredReboot = 3,            // token(2), key(2), boot count, boot count ^ 0xFF of the last
                                 // restart on command
-  kStoredRecords = 16,
-  // A calibration before its COMMIT.
-  kStoredStaging = kStoredRecords + stored_bytes(sizeof(Marks)) + stored_bytes(wire::kKeyBytes) +
-                   stored_bytes(sizeof(Settings)),
-  kStorageBytes = kStoredStaging + sizeof(Settings::calibration)
+  kStoredStaging = 10,          // a calibration before its COMMIT
+  kStoredRecords = kStoredStaging + sizeof(Settings::calibration),  // where version 0.2 has them
+  kStorageBytes = kStoredRecords + stored_bytes(sizeof(Marks)) + stored_bytes(sizeof(Settings)) +
+                  stored_bytes(sizeof(Persistent::keys_))
 };
 
 // Two copies with a CRC each: a power cut while one is written leaves the other, the old one or the
@@ -85,7 +84,7 @@ class Storage {
   uint8_t due_;     // records that wait, one bit each
   uint8_t left_;    // bytes of what is being written
   uint8_t record_;  // it; kRecords: a staged word
-  uint8_t at_;      // the next byte's place
+  uint8_t at_;      // the next byte's place, from the records' start; a staged word's whole one
   uint16_t crc_;    // of the record, or the staged word
 };
 

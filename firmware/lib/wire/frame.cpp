@@ -18,9 +18,9 @@ enum HeaderOffset : uint8_t {
   kAtCounter,
   kAfterHeader = kAtCounter + 4
 };
-static_assert(kAfterHeader == kHeaderBytes, "the header's layout and its size must agree");
+static_assert(kAtType == kTypeAt && kAfterHeader == kHeaderBytes, "the header's layout and its size must agree");
 static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "numbers are copied as they are");
-static_assert(kKeyBytes == 2 * kTagBytes, "a key is masked by two blocks");
+static_assert(2 * kKeyBytes == 4 * kTagBytes, "two keys are masked by four blocks");
 
 }  // namespace
 
@@ -75,14 +75,14 @@ FrameStatus open(const uint8_t* frame, uint8_t length, const uint8_t* key, Heade
   return FrameStatus::kGood;
 }
 
-void unmask_key(const uint8_t* old_key, uint32_t counter, const uint8_t* masked, uint8_t* key) {
-  uint8_t mask[kKeyBytes];
-  for (uint8_t block = 0; block < 2; ++block) {
-    uint8_t input[2 + sizeof counter] = {0, block};
-    memcpy(input + 2, &counter, sizeof counter);
-    siphash24(old_key, input, sizeof input, mask + block * kTagBytes);
+void unmask_keys(uint32_t counter, const uint8_t* body, uint8_t* keys) {
+  uint8_t mask[2 * kKeyBytes];
+  uint8_t input[8] = {0, 0, body[0], body[1]};
+  memcpy(input + 4, &counter, sizeof counter);
+  for (; input[1] < 4; ++input[1]) {
+    siphash24(keys, input, sizeof input, mask + input[1] * kTagBytes);
   }
-  for (uint8_t i = 0; i < kKeyBytes; ++i) key[i] = masked[i] ^ mask[i];
+  for (uint8_t i = 0; i < sizeof mask; ++i) keys[i] = body[2 + i] ^ mask[i];
 }
 
 }  // namespace wire

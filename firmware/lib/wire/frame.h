@@ -27,6 +27,8 @@ enum class FrameStatus : uint8_t {
 // CRC-16/CCITT, polynomial 0x1021, most significant bit first, no final inversion.
 uint16_t crc16(const uint8_t* data, uint8_t count, uint16_t seed = kFingerprint);
 
+constexpr uint8_t kTypeAt = 2;  // in a frame
+
 // Bytes of a frame besides its body.
 constexpr uint8_t kOverhead = kHeaderBytes + kCrcBytes + kTagBytes;
 
@@ -39,8 +41,9 @@ uint8_t seal(const Header& header, uint8_t body_length, const uint8_t* key, uint
 // the caller's to check.
 FrameStatus open(const uint8_t* frame, uint8_t length, const uint8_t* key, Header* header);
 
-// A KEY frame's key: masked (kKeyBytes), XOR two SipHash blocks of the old key (docs/protocol.md).
-void unmask_key(const uint8_t* old_key, uint32_t counter, const uint8_t* masked, uint8_t* key);
+// A NEW_KEY frame's body (token, both keys XOR four SipHash blocks; docs/protocol.md) over the keys
+// in force, the node's own before the beacon's.
+void unmask_keys(uint32_t counter, const uint8_t* body, uint8_t keys[2 * kKeyBytes]);
 
 }  // namespace wire
 }  // namespace relpos

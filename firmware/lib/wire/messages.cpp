@@ -303,7 +303,7 @@ static_assert(offsetof(Acknowledgement, value) - offsetof(Acknowledgement, token
 
 #endif
 uint8_t encode(const Acknowledgement& message, uint8_t* body) {
-  if (message.result > 4) return 0;
+  if (message.result > 6) return 0;
   const uint8_t length = static_cast<uint8_t>(8);
 #if defined(__AVR__)
   static_assert(sizeof message == 8, "as on the wire");
@@ -323,7 +323,7 @@ bool decode(const uint8_t* body, uint8_t length, Acknowledgement* message) {
   const uint8_t* in = take(kAcknowledgement, 1, body, message);
   (void)in;
 #endif
-  if (message->result > 4) return false;
+  if (message->result > 6) return false;
   return true;
 }
 
@@ -384,17 +384,17 @@ bool decode(const uint8_t* body, uint8_t length, Beacon* message) {
 #if !defined(__AVR__)
 const Field kNewKey[] = {
     {offsetof(NewKey, token), 2, 2},
-    {offsetof(NewKey, masked_0), 16, 16},
+    {offsetof(NewKey, masked_0), 32, 32},
 };
-static_assert(offsetof(NewKey, masked_3) - offsetof(NewKey, masked_0) ==
-                  12,
+static_assert(offsetof(NewKey, masked_7) - offsetof(NewKey, masked_0) ==
+                  28,
               "no gaps: copied as one");
 
 #endif
 uint8_t encode(const NewKey& message, uint8_t* body) {
-  const uint8_t length = static_cast<uint8_t>(18);
+  const uint8_t length = static_cast<uint8_t>(34);
 #if defined(__AVR__)
-  static_assert(sizeof message == 18, "as on the wire");
+  static_assert(sizeof message == 34, "as on the wire");
   memcpy(body, &message, length);
 #else
   uint8_t* out = put(kNewKey, 2, &message, body);
@@ -404,7 +404,7 @@ uint8_t encode(const NewKey& message, uint8_t* body) {
 }
 
 bool decode(const uint8_t* body, uint8_t length, NewKey* message) {
-  if (length != 18) return false;
+  if (length != 34) return false;
 #if defined(__AVR__)
   memcpy(message, body, length);
 #else

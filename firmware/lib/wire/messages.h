@@ -9,7 +9,7 @@ namespace wire {
 
 constexpr uint8_t kMagic = 181;
 constexpr uint8_t kProtocolVersion = 3;
-constexpr uint16_t kFingerprint = 31604;  // seed of the CRC
+constexpr uint16_t kFingerprint = 63840;  // seed of the CRC
 constexpr uint8_t kFrameBytes = 66;  // the longest frame
 constexpr uint8_t kMostBody = 47;
 constexpr uint8_t kHeaderBytes = 9;
@@ -18,6 +18,8 @@ constexpr uint8_t kTagBytes = 8;
 constexpr uint8_t kKeyBytes = 16;
 constexpr uint8_t kCoordinator = 0;
 constexpr uint8_t kBroadcast = 255;
+constexpr uint8_t kCableOptions = 165;
+constexpr uint32_t kMostJump = 1073741824;  // of a counter coming down
 
 #if defined(__AVR__)
 typedef __uint24 Uint24;  // as long as on the wire
@@ -105,13 +107,15 @@ enum class CommandCode : uint8_t {
   kAccessBus = 18,
 };
 
-// How a command ended.
+// How a command ended; COUNTER_REFUSED tells the newest one, CABLE_ONLY is a first key's.
 enum class CommandResult : uint8_t {
   kDone = 0,
   kUnknownCommand = 1,
   kOutOfRange = 2,
   kBusy = 3,
   kNoAnswer = 4,
+  kCounterRefused = 5,
+  kCableOnly = 6,
 };
 
 // Dead reckoning since the node's start, as running totals: the host takes differences, so a lost frame loses no motion.
@@ -300,16 +304,20 @@ uint8_t encode(const Beacon& message, uint8_t* body);
 // False, and the message untouched or half-filled, where length or a value is wrong.
 bool decode(const uint8_t* body, uint8_t length, Beacon* message);
 
-// A new team key for one node, hidden under the old one; answered like a command SET_KEY.
+// A node's own new key and the beacon's, hidden under its old one; answered like SET_KEY.
 struct NewKey {
   uint16_t token;  // Chosen by the host, returned in the acknowledgement
-  uint32_t masked_0;  // Key words XOR the mask
-  uint32_t masked_1;  // Key words XOR the mask
-  uint32_t masked_2;  // Key words XOR the mask
-  uint32_t masked_3;  // Key words XOR the mask
+  uint32_t masked_0;  // Words of both keys XOR the mask
+  uint32_t masked_1;  // Words of both keys XOR the mask
+  uint32_t masked_2;  // Words of both keys XOR the mask
+  uint32_t masked_3;  // Words of both keys XOR the mask
+  uint32_t masked_4;  // Words of both keys XOR the mask
+  uint32_t masked_5;  // Words of both keys XOR the mask
+  uint32_t masked_6;  // Words of both keys XOR the mask
+  uint32_t masked_7;  // Words of both keys XOR the mask
 };
 
-constexpr uint8_t kNewKeyBytes = 18;  // the longest body
+constexpr uint8_t kNewKeyBytes = 34;  // the longest body
 
 // Writes the body, returns its length; 0 where a value is outside
 // its range; body is then half-written.

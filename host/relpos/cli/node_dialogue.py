@@ -51,12 +51,22 @@ def open_device(port: str, cable: bool) -> Any:
 
 @contextmanager
 def connect(
-    port: str, node: int | None, key_file: Path | None = None, *, cable: bool = False
+    port: str,
+    node: int | None,
+    key_file: Path | None = None,
+    *,
+    cable: bool = False,
+    number: int | None = None,
 ) -> Iterator[NodeDialogue]:
-    """A dialogue with the node, or with the only one that is heard."""
+    """A dialogue with the node, or with the only one that is heard.
+
+    ``number`` is the one that it gets: it may have that one's key already.
+    """
     from relpos.link.dialogue import open_dialogue
 
     with link_of(key_file) as link:
+        if node is not None and number is not None:
+            link.decoder.extra_keys[node] = (link.key_of(number),)
         device = open_device(port, cable)
         try:
             yield open_dialogue(device, node, link)

@@ -37,12 +37,12 @@ def set_node(
     node: Node = None,
     key_file: KeyFile = None,
     new: Annotated[
-        bool, typer.Option("--new", help="key: make a new random key in FILE first.")
+        bool, typer.Option("--new", help="key: make a new random team key in FILE first.")
     ] = False,
     old_key_file: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="key: the one that the node has. (default: the key of zeros)"
+            metavar="FILE", help="key: the team's until now. (default: none, which needs --cable)"
         ),
     ] = None,
     cable: Cable = False,
@@ -51,7 +51,7 @@ def set_node(
 
     `relpos node set PORT --node 3 stature 1.78 led off`
 
-    `relpos node set PORT --node 3 key --key-file team.key --new`
+    `relpos node set PORT key --key-file new.key --new --old-key-file team.key` (every node heard)
     """
     from relpos.nodes.settings import parse_changes
 
@@ -71,7 +71,7 @@ def set_node(
         changes = parse_changes(rest)
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="NAME VALUE") from None
-    with connect(port, node, key_file, cable=cable) as dialogue:
+    with connect(port, node, key_file, cable=cable, number=number) as dialogue:
         if not changes and number is None and not defaults:
             _show(dialogue)
             return
@@ -154,17 +154,19 @@ def _set_key(
     cable: bool,
 ) -> None:
     from relpos.link.authentication import read_key, write_new_key
-    from relpos.link.dialogue import open_dialogue
+    from relpos.link.dialogue import NEEDS_CABLE, NodeDialogue, open_dialogue
     from relpos.link.port import Link
     from relpos.protocol import messages as wire
 
     from relpos.cli.node_dialogue import open_device  # isort: skip
 
     old = wire.DEFAULT_KEY if old_key_file is None else read_key(old_key_file)
-    if old == wire.DEFAULT_KEY and not cable:
+    if new and old == wire.DEFAULT_KEY and not cable:
+        raise DeviceError(NEEDS_CABLE.format(node="N" if node is None else node))
+    if old_key_file is not None and not cable:
         output.remark(
-            "everybody knows the key of a new node: who listens now can read the one that it gets; "
-            "give the first key by the node's cable (--cable)"
+            f"who holds {old_key_file} and listens can read the new keys: after a theft of that "
+            "file give them by cable (--cable); a stolen node does not hold it"
         )
     device = open_device(port, cable)
     try:
@@ -172,12 +174,26 @@ def _set_key(
         link = Link(key=old)
         # A node that already has the new key is received, too.
         link.accept_keys(old, key)
-        dialogue = open_dialogue(device, node, link)
-        changed = dialogue.set_key(key)
-        typer.echo(
-            f"node {dialogue.node} {'now has' if changed else 'had'} the key of {key_file}"
-            + (" and answers under it" if changed else " already")
-        )
+        if node is not None or cable:
+            dialogue = open_dialogue(device, node, link)
+            nodes = [dialogue.node]
+        else:
+            dialogue = NodeDialogue(device, 0, link)
+            nodes = dialogue.heard()
+        failed: list[str] = []
+        for dialogue.node in nodes:
+            link.accept_keys(old, key)
+            try:
+                changed = dialogue.set_key(key)
+            except DeviceError as error:
+                failed.append(str(error))
+                continue
+            typer.echo(
+                f"node {dialogue.node} {'now has' if changed else 'had'} a key of {key_file}"
+                + (" and answers under it" if changed else " already")
+            )
+        if failed or not nodes:
+            raise DeviceError("\n".join(failed) or f"{port}: no node is heard")
     finally:
         device.close()
 

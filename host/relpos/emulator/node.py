@@ -205,18 +205,16 @@ class EmulatedNode:
     ) -> None:
         """Hand the node a command as its radio module would, without loss: set up beforehand."""
         values = {"token": token, "command": int(code), "value": value}
+        key = wire.node_key(key, self.node)
         data = wire.encode(wire.COMMAND, self.node, 0, token, values, key)
         self.hand(coordinator, data, at_us)
 
-    def set_key(self, coordinator: XbeeModule, key: bytes, token: int, at_us: int) -> None:
-        """Set the team's key in a node that still has the default one, likewise."""
-        mask = wire.key_mask(wire.DEFAULT_KEY, token)
-        words = [a ^ b for a, b in zip(key, mask, strict=True)]
-        values = {"token": token} | {
-            f"masked_{k}": int.from_bytes(bytes(words[4 * k : 4 * k + 4]), "little")
-            for k in range(4)
-        }
-        self.hand(coordinator, wire.encode(wire.NEW_KEY, self.node, 0, token, values), at_us)
+    def set_key(self, key: bytes, token: int, at_us: int) -> None:
+        """Give a node without a key those of the team's ``key`` over its cable, likewise."""
+        keys = wire.node_key(key, self.node) + wire.node_key(key, wire.BROADCAST)
+        values = wire.masked_keys(wire.DEFAULT_KEY, token, token, keys)
+        data = wire.encode(wire.NEW_KEY, self.node, 0, token, values)
+        self._clock.at(at_us, lambda now_us: self.radio.deliver_by_cable(data, now_us))
 
     def hand(self, coordinator: XbeeModule, data: bytes, at_us: int) -> None:
         """Let the node's radio module deliver ``data`` as if it came from the coordinator."""

@@ -139,7 +139,7 @@ class EmulatedTeam:
         self._walker_of_module[node.radio] = walker
         if self.key != wire.DEFAULT_KEY:
             at_us = errors.power_on_us + SET_UP_AFTER_US - 200_000
-            node.set_key(self.coordinator, self.key, 0xFE00, at_us)
+            node.set_key(self.key, 0xFE00, at_us)
         if configured:
             at_us = errors.power_on_us + SET_UP_AFTER_US
             leg_mm = round(LEG_OF_STATURE * walker.person.stature_m * 1000.0)
@@ -177,7 +177,8 @@ class EmulatedTeam:
         self.clock.at(now_us + round(BEACON_PERIOD_S * 1e6), self._send_beacon)
         self._beacon_counter += 1
         values = self._beacons.values(now_us * 1e-6)
-        data = wire.encode(wire.BEACON, wire.BROADCAST, 0, self._beacon_counter, values, self.key)
+        key = wire.node_key(self.key, wire.BROADCAST)
+        data = wire.encode(wire.BEACON, wire.BROADCAST, 0, self._beacon_counter, values, key)
         self.send(api.encode(api.Transmit16(0, api.BROADCAST_16, data)))
 
     def stream(self) -> Iterator[tuple[int, bytes]]:

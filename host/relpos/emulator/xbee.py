@@ -23,6 +23,7 @@ from relpos.link.xbee import (
     UnknownFrame,
     encode,
 )
+from relpos.protocol.messages import CABLE_OPTIONS
 
 DELIVERED = 0
 NO_ACKNOWLEDGEMENT = 1
@@ -246,6 +247,10 @@ class XbeeModule:
         else:
             frame = Receive16(source.address, rssi_dbm, data, options)
         self._emit(time_us, frame)
+
+    def deliver_by_cable(self, data: bytes, time_us: int) -> None:
+        """Data from a host on the board's USB cable, in the module's place."""
+        self._emit(time_us, Receive16(0, 0, data, CABLE_OPTIONS))
 
     def _emit(self, time_us: int, frame: ApiFrame) -> None:
         data = encode(frame, escaped=self._escaped)

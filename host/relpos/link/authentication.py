@@ -21,9 +21,12 @@ from relpos.protocol import messages as wire
 EPOCH_UNIX_S = 1_704_067_200
 """2024-01-01 UTC: where the host's counter begins."""
 COUNTS_PER_S = 8
-"""Frames a second that a host may send without end; 32 bits last until 2041."""
+"""Frames a second that a host may send without end. The 32 bits wrap in 2041, which nothing minds:
+nodes compare counters modulo 2^32, and told theirs, the host goes on from it."""
 WINDOW = 64
 """How far behind the newest a frame may be and still be accepted, once."""
+WRAP = 1 << 32
+DAY_S, HOUR_S = 86_400.0, 3600.0
 MAX_JUMP = 1 << 24
 """How far ahead of the newest a frame may be: a node's frames of a month, which a host that was
 away may have missed. A node that is further ahead has to answer a challenge."""
@@ -31,39 +34,66 @@ away may have missed. A node that is further ahead has to answer a challenge."""
 
 KEYLESS = (
     "no team key (--key-file): anybody with such a radio can forge reports and command the nodes; "
-    "`relpos node set PORT key --key-file FILE --new` makes one"
+    "`relpos node set PORT key --key-file FILE --new --cable` makes one"
 )
 """Told wherever a team is heard under the key that every new node has."""
 
 
 class HostCounter:
-    """Counters of the host's frames: the time in eighths of a second, or the last one plus 1.
+    """Counters of the host's frames to one addressee: eighths of a second, or the last one plus 1.
 
     ``clock`` gives Unix time in seconds. Two hosts of a team, or one that was restarted, need no
-    common memory while their clocks are right to a few seconds. A clock that cannot be right
-    counts as none; :meth:`clock_fault` says so.
+    common memory while their clocks are right to a few seconds. Where a clock is wrong, the node
+    says what it took last, and :meth:`follow` goes on from that.
     """
 
     def __init__(self, clock: Callable[[], float] = time.time) -> None:
         self._clock = clock
-        self._last = 0
+        self._last: int | None = None
 
     def next(self) -> int:
         """Return the next frame's counter."""
-        now = 0 if self.clock_fault() else int((self._clock() - EPOCH_UNIX_S) * COUNTS_PER_S)
-        self._last = max(now, self._last + 1)
+        now = self._now()
+        if self._last is None or (now - self._last - 1) % WRAP < wire.MAX_COMMAND_JUMP:
+            self._last = now
+        else:
+            self._last = (self._last + 1) % WRAP
+        self._last = self._last or 1  # 0 is a node's that has obeyed nothing yet
         return self._last
 
-    def clock_fault(self) -> str | None:
-        """Say in a line what is wrong with this computer's clock; None where nothing is."""
-        now_s = self._clock()
-        if EPOCH_UNIX_S <= now_s < EPOCH_UNIX_S + (1 << 32) / COUNTS_PER_S:
+    def follow(self, newest: int) -> str | None:
+        """Go on from the newest counter that a node says it took; say what is wrong, if anything.
+
+        A refusal of a frame that another one overtook changes nothing.
+        """
+        if self._last is not None and (self._last - newest) % WRAP <= wire.MAX_COMMAND_JUMP:
             return None
-        day = time.strftime("%Y-%m-%d", time.gmtime(min(max(now_s, 0.0), 1e11)))
+        self._last = newest
+        fault = clock_fault(self._clock())
+        ahead_s = (newest - self._now()) / COUNTS_PER_S
+        if fault is not None or abs(ahead_s) < HOUR_S:
+            return fault
+        day = time.strftime("%Y-%m-%d", time.gmtime(self._clock()))
+        how = "ahead of" if ahead_s > 0.0 else "behind"
         return (
-            f"this computer's clock says {day}, which cannot be: nodes refuse commands and beacons "
-            "that seem older than earlier ones; set the clock"
+            f"the host that commanded it last had a clock {abs(ahead_s) / DAY_S:.1f} days {how} "
+            f"this computer's, which says {day}: one of them is wrong; commands go on all the same"
         )
+
+    def _now(self) -> int:
+        now_s = self._clock()
+        return 0 if clock_fault(now_s) else int((now_s - EPOCH_UNIX_S) * COUNTS_PER_S) % WRAP
+
+
+def clock_fault(now_s: float) -> str | None:
+    """Say in a line what is wrong with a computer's clock (Unix time); None where nothing is."""
+    if now_s >= EPOCH_UNIX_S:
+        return None
+    day = time.strftime("%Y-%m-%d", time.gmtime(max(now_s, 0.0)))
+    return (
+        f"this computer's clock says {day}, which cannot be: nodes refuse commands and beacons "
+        "that seem older than earlier ones, until they have told theirs; set the clock"
+    )
 
 
 class Verdict(enum.Enum):

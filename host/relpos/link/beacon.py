@@ -25,6 +25,8 @@ SUPERFRAME_S = 2.0
 FORGET_S = 30.0
 """Silence after which a node loses its slot. It sends a motion a second: also
 where half of the frames are lost, 30 in a row are lost once in 2^31 s."""
+PATIENCE_S = 10.0
+"""With beacons that a node could have taken, before it is asked; its status comes as often."""
 
 
 class BeaconSchedule:
@@ -95,13 +97,16 @@ class HostBeacons:
     """Sends beacons to the nodes that ``link`` hears, unless an emulated team sends its own.
 
     Such a team marks virtual time, which a host cannot follow. A node without a free slot gets a
-    remark in the decoder, once. Nodes whose frame counters do not fit get the decoder's challenges.
+    remark in the decoder, once. Nodes whose frame counters do not fit get the decoder's challenges,
+    those that take no beacon a PING: a host whose clock was ahead may have made ours look old, and
+    any command ends that.
     """
 
     def __init__(self, link: Link, schedule: BeaconSchedule | None = None) -> None:
         self._link = link
         self.schedule = schedule or BeaconSchedule()
         self._remarked: set[int] = set()
+        self._asked_s: dict[int, float] = {}
 
     def due(self, now_s: float) -> bytes:
         """Return bytes for the coordinator's port, empty where nothing is due.
@@ -126,4 +131,13 @@ class HostBeacons:
                 f"node {', '.join(map(str, sorted(new)))}: no slot left, a team has {MAX_NODES}; "
                 "it disturbs the others: switch it off"
             )
-        return self._link.frame(wire.BEACON, wire.BROADCAST, values)
+        return self._link.frame(wire.BEACON, wire.BROADCAST, values) + self._pings(now_s)
+
+    def _pings(self, now_s: float) -> bytes:
+        data = b""
+        for node, track in self._link.decoder.nodes.items():
+            asked_s = self._asked_s.setdefault(node, now_s)
+            if track.without_beacon_s is not None and track.without_beacon_s > asked_s + PATIENCE_S:
+                self._asked_s[node] = now_s
+                data += self._link.command(node, wire.CommandCode.PING, 0)[1]
+        return data

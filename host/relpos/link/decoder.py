@@ -53,6 +53,8 @@ class NodeTrack:
     motion_s: float | None = None
     arrival_s: float = 0.0
     rssi_dbm: int | None = None
+    without_beacon_s: float | None = None
+    """When its newest status arrived, if that says that it takes no beacon."""
     unseen_s: float = 0.0
     height_m: float = 0.0
     """Newest height over the node's first; a restarted node begins at 0 again."""
@@ -91,7 +93,8 @@ class Decoder:
     ``counts`` holds every rejected frame by its reason, ``nodes`` each node's own counts:
     ``received``, ``lost``, ``duplicate``, ``replayed``, ``late_motion``, ``restarts``.
 
-    ``keys``: a frame is accepted whose tag fits one of them (two while a node's key changes).
+    ``keys`` are teams' keys: a frame is accepted whose tag fits its node's key under one of them
+    (two while a node's key changes), or one of ``extra_keys`` of that node.
     ``newest_counters``: of each node, from an earlier session; frames up to it are rejected.
     ``range_offsets_m`` holds each node's range offset from its status; ranges come out with both
     ends' offsets subtracted.
@@ -103,6 +106,10 @@ class Decoder:
         newest_counters: Mapping[int, int] | None = None,
     ) -> None:
         self.keys = tuple(keys)
+        self.extra_keys: dict[int, tuple[bytes, ...]] = {}
+        self.refused_counters: dict[int, int] = {}
+        """Newest counters that nodes took, where they refused a later command's."""
+        self._forged: Counter[int] = Counter()
         self.range_offsets_m: dict[int, float] = {}
         self._newest_counters = dict(newest_counters or {})
         self._misfits: Counter[int] = Counter()
@@ -130,12 +137,8 @@ class Decoder:
             return []
         except wire.FrameError as error:
             self.counts[type(error).__name__] += 1
-            foreign = isinstance(error, wire.FrameTagError)
-            if foreign and self.counts["FrameTagError"] == FOREIGN_BEFORE_REMARK:
-                self.remarks.append(
-                    "frames under another key are rejected: give the team's key with --key-file, "
-                    "or they are another team's"
-                )
+            if isinstance(error, wire.FrameTagError):
+                self._note_forged(data[3])
             return []
         if frame.node in (wire.COORDINATOR, wire.BROADCAST) or frame.message in DOWN:
             self.counts["not_from_a_node"] += 1
@@ -149,6 +152,8 @@ class Decoder:
         track.arrival_s = arrival_s
         values = frame.values
         if frame.message is wire.ACKNOWLEDGEMENT:
+            if values["result"] == wire.CommandResult.COUNTER_REFUSED:
+                self.refused_counters[frame.node] = values["value"] % (1 << 32)
             self.acknowledged.append(
                 Acknowledged(
                     frame.node,
@@ -167,6 +172,7 @@ class Decoder:
         elif frame.message is wire.STATUS:
             time_s = track.clock.to_host_s(values["time_s"])
             self.range_offsets_m[frame.node] = values["range_offset_m"]
+            track.without_beacon_s = None if values["health"] & wire.Health.BEACON else arrival_s
             observations += [
                 Status(time_s, frame.node, name, float(value))
                 for name, value in values.items()
@@ -203,12 +209,28 @@ class Decoder:
         )
 
     def _open(self, data: bytes) -> wire.Frame:
-        for key in self.keys[:-1]:
+        node = data[3] if len(data) > 3 else wire.BROADCAST
+        keys = [wire.node_key(key, node) for key in self.keys] + [*self.extra_keys.get(node, ())]
+        for key in keys[:-1]:
             try:
                 return wire.decode(data, key)
             except wire.FrameTagError:
                 continue
-        return wire.decode(data, self.keys[-1])
+        return wire.decode(data, keys[-1])
+
+    def _note_forged(self, node: int) -> None:
+        """Count a frame in a node's name under another key; remark on several."""
+        heard = node in self.nodes
+        self._forged[node if heard else wire.BROADCAST] += 1
+        if self._forged[node if heard else wire.BROADCAST] != FOREIGN_BEFORE_REMARK:
+            return
+        self.remarks.append(
+            f"node {node}: frames in its name under another key are rejected: somebody else sends "
+            "them, such as a stolen node"
+            if heard
+            else "frames under another key are rejected: give the team's key with --key-file, "
+            "or they are another team's"
+        )
 
     def _ranges(self, node: int, track: NodeTrack, values: Mapping[str, Any]) -> list[Observation]:
         """Return ranges with both ends' offsets, from their antenna delays, subtracted."""

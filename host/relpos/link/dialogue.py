@@ -30,6 +30,10 @@ only the latter. Where half of all frames are lost, all of them fail once in a t
 BUSY_ATTEMPTS = 6
 SILENT_S = 6.0
 """A node that is on reports its motion every second."""
+NEEDS_CABLE = (
+    "node {node} has no key yet: by radio everybody could read its first one. Connect its USB "
+    "cable (the shield's switch in position USB) and repeat with --cable and that cable's port"
+)
 IMPOSSIBLE = -(2**31)
 """A value outside every setting's range."""
 RAW_REPORTS_PER_S = 5
@@ -69,6 +73,13 @@ class NodeDialogue:
             if answer.node == self.node:
                 self._answers[answer.token] = answer
 
+    def heard(self) -> list[int]:
+        """Return the nodes heard within :data:`SILENT_S`."""
+        until_s = time.monotonic() + SILENT_S
+        while time.monotonic() < until_s:
+            self.listen()
+        return sorted(self.link.decoder.nodes)
+
     def totals(self) -> Mapping[str, Any] | None:
         """Return the values (SI) of the node's newest motion message; None before the first."""
         track = self.link.decoder.nodes.get(self.node)
@@ -98,7 +109,8 @@ class NodeDialogue:
             if further:
                 data += self.link.command(self.node, code, value, token=token, broadcast=True)[1]
             answer = self._send(token, data, ANSWER_S / 2 if further else ANSWER_S)
-            if answer is not None:
+            # The node refuses a counter, not the command: the link goes on from the node's.
+            if answer is not None and answer.result != wire.CommandResult.COUNTER_REFUSED:
                 return answer
         raise DeviceError(
             f"node {self.node} does not answer {code.name}: is it switched on and in reach, is its "
@@ -161,15 +173,24 @@ class NodeDialogue:
     # -- number, defaults, key --------------------------------------------------------------------
 
     def set_node_id(self, node: int) -> None:
-        """Give the node another number; it restarts, and the dialogue goes on under that number.
+        """Give the node another number, and the key of that number first; it restarts.
 
-        DeviceError where that number is in use, or the node is not heard under it.
+        The dialogue goes on under that number. Where it broke off in between, it can be repeated
+        with the new number's key among the decoder's ``extra_keys``. DeviceError where that number
+        is in use, or the node is not heard under it.
         """
         if node == self.node:
             return
         if node in self.link.decoder.nodes or self._is_in_use(node):
             raise DeviceError(f"there is a node {node} already: numbers must differ")
-        self.demand(wire.CommandCode.SET_NODE_ID, node)
+        if not self.link.keyless:
+            self._give_keys(self.link.key, node)
+        try:
+            self.demand(wire.CommandCode.SET_NODE_ID, node)
+        except DeviceError:  # where its answers were lost, it speaks under the new number now
+            if node not in self.link.decoder.nodes:
+                raise
+        self.link.node_keys.pop(self.node, None)
         before, self.node = self.node, node
         until_s = time.monotonic() + SILENT_S
         while self.boot() is None and time.monotonic() < until_s:
@@ -196,29 +217,43 @@ class NodeDialogue:
             raise DeviceError(f"node {self.node} was not heard again: switch it off and on")
 
     def set_key(self, key: bytes) -> bool:
-        """Give the node this key in place of the dialogue's; return False where it had it already.
+        """Give the node its key and the beacon's of the team's new ``key``.
 
-        The dialogue then uses the new key. DeviceError where the node answers under neither.
+        Return False where it had them already. The dialogue then uses the new key. DeviceError
+        where the node answers under neither, or needs its cable.
         """
-        old = self.link.key
-        if key == old:
+        changed = self._give_keys(key, self.node)
+        self.link.node_keys.pop(self.node, None)
+        self.link.accept_keys(key)
+        return changed
+
+    def _give_keys(self, team_key: bytes, node: int) -> bool:
+        """Give the node the keys of number ``node``; return False where it had them already.
+
+        The link then holds its key in ``node_keys``. DeviceError: see :meth:`set_key`.
+        """
+        link, node_keys = self.link, self.link.node_keys
+        old, new = link.key_of(self.node), wire.node_key(team_key, node)
+        if old == new:
             self.demand(wire.CommandCode.PING, 0)
             return False
-        self.link.accept_keys(key, old)
+        link.decoder.extra_keys[self.node] = (old, new)
+        node_keys[self.node] = new
         if self._answers_under_present_key():
-            self.link.accept_keys(key)
             return False
+        node_keys[self.node] = old
+        if old == wire.DEFAULT_KEY and not getattr(self._port, "by_cable", False):
+            raise DeviceError(NEEDS_CABLE.format(node=self.node))
+        keys = new + wire.node_key(team_key, wire.BROADCAST)
         token = self._next_token()
         for _ in range(FURTHER_ATTEMPTS):
-            self.link.accept_keys(old, key)
-            _, data = self.link.new_key(self.node, key, token=token)
-            answer = self._send(token, data)
+            answer = self._send(token, link.new_keys(self.node, keys, token=token))
             # It answers under the new key, also where that answer is lost: the old key is gone.
-            self.link.accept_keys(key, old)
-            if answer is not None or self._answers_under_present_key():
-                self.link.accept_keys(key)
+            node_keys[self.node] = new
+            done = answer is not None and answer.result == wire.CommandResult.DONE
+            if done or self._answers_under_present_key():
                 return True
-        self.link.accept_keys(old)
+            node_keys[self.node] = old
         raise DeviceError(
             f"node {self.node} does not answer: neither under the key that it should have nor "
             "under the new one." + self._heard()

@@ -12,7 +12,7 @@ import serial
 
 from relpos.errors import DeviceError
 from relpos.link import xbee
-from relpos.link.authentication import HostCounter
+from relpos.link.authentication import HostCounter, clock_fault
 from relpos.link.decoder import Decoder
 from relpos.measurements import BOUNDS, Observation
 from relpos.protocol import messages as wire
@@ -48,15 +48,16 @@ class Line(Protocol):
 class Link:
     """XBee bytes to observations, and commands to bytes; without I/O.
 
-    ``key`` is the team's. ``counter`` counts sent frames, ``newest_counters`` are the nodes' from
-    an earlier session (see :mod:`relpos.link.authentication`).
+    ``key`` is the team's. ``clock`` gives Unix time, from which sent frames are counted;
+    ``newest_counters`` are the nodes' from an earlier session (see
+    :mod:`relpos.link.authentication`).
     """
 
     def __init__(
         self,
         *,
         key: bytes = wire.DEFAULT_KEY,
-        counter: HostCounter | None = None,
+        clock: Callable[[], float] = time.time,
         newest_counters: Mapping[int, int] | None = None,
         escaped: bool = True,
     ) -> None:
@@ -64,11 +65,15 @@ class Link:
         self.decoder = Decoder((key,), newest_counters)
         self.key = key
         self.counters_before = dict(newest_counters or {})
-        self._counter = counter or HostCounter()
+        self.node_keys: dict[int, bytes] = {}
+        """Of nodes that have another key than the team's gives them, while that changes."""
+        self._clock = clock
+        self._counters: dict[int, HostCounter] = {}
         self._escaped = escaped
         self._token = 0
         self._virtual_s: float | None = None
-        self._fault_told = False
+        self._faults_told: set[int] = set()
+        """Addressees whose counters a wrong clock has met; remarked on once."""
         self._unmarked = 0
         """Frames of nodes before the first mark of virtual time."""
 
@@ -144,22 +149,21 @@ class Link:
         values = {"token": token, "command": code, "value": value}
         return token, self.frame(wire.COMMAND, node, values, broadcast=broadcast)
 
-    def new_key(self, node: int, key: bytes, *, token: int | None = None) -> tuple[int, bytes]:
-        """Return token and serial bytes that give ``node`` a new ``key``, masked by the old one.
+    def new_keys(self, node: int, keys: bytes, *, token: int) -> bytes:
+        """Return serial bytes that give ``node`` its own and the beacon's key, masked by the old.
 
-        The node answers under the new key: see :meth:`accept_keys`.
+        The node answers under the new key.
         """
-        token = self.next_token() if token is None else token
-        counter = self._counter.next()
-        mask = wire.key_mask(self.key, counter)
-        masked = bytes(a ^ b for a, b in zip(key, mask, strict=True))
-        words = {
-            f"masked_{k}": int.from_bytes(masked[4 * k : 4 * k + 4], "little") for k in range(4)
-        }
-        return token, self._sealed(wire.NEW_KEY, node, counter, {"token": token} | words, False)
+        counter = self._next_counter(node)
+        values = wire.masked_keys(self.key_of(node), token, counter, keys)
+        return self._sealed(wire.NEW_KEY, node, counter, values, False)
+
+    def key_of(self, node: int) -> bytes:
+        """Return the key of frames to a node, or of beacons (:data:`wire.BROADCAST`)."""
+        return self.node_keys.get(node) or wire.node_key(self.key, node)
 
     def accept_keys(self, *keys: bytes) -> None:
-        """Send under the first key from now on, and accept frames under any of them."""
+        """Send under the first team's key from now on, and accept frames under any of them."""
         self.key = keys[0]
         self.decoder.keys = keys
 
@@ -167,16 +171,25 @@ class Link:
         self, message: Message, node: int, values: Mapping[str, Any], *, broadcast: bool = False
     ) -> bytes:
         """Return the serial bytes of a message to ``node``; ``broadcast``: see :meth:`command`."""
-        return self._sealed(message, node, self._counter.next(), values, broadcast)
+        return self._sealed(message, node, self._next_counter(node), values, broadcast)
+
+    def _next_counter(self, node: int) -> int:
+        counter = self._counters.setdefault(node, HostCounter(self._clock))
+        newest = self.decoder.refused_counters.pop(node, None)
+        wrong = None if newest is None else counter.follow(newest)
+        if wrong is not None and node not in self._faults_told:
+            self._faults_told.add(node)
+            self.decoder.remarks.append(f"node {node}: {wrong}")
+        return counter.next()
 
     def _sealed(
         self, message: Message, node: int, counter: int, values: Mapping[str, Any], broadcast: bool
     ) -> bytes:
         fault = self.clock_fault()
-        if fault and not self._fault_told:
-            self._fault_told = True
+        if fault and not self._faults_told:
+            self._faults_told.add(node)
             self.decoder.remarks.append(fault)
-        data = wire.encode(message, node, 0, counter, values, self.key)
+        data = wire.encode(message, node, 0, counter, values, self.key_of(node))
         address = xbee.BROADCAST_16 if broadcast or node == wire.BROADCAST else node
         return xbee.encode(xbee.Transmit16(0, address, data), escaped=self._escaped)
 
@@ -190,7 +203,7 @@ class Link:
 
     def clock_fault(self) -> str | None:
         """Say in a line why nodes may refuse what this host sends; None where nothing is wrong."""
-        return self._counter.clock_fault()
+        return clock_fault(self._clock())
 
     def next_token(self) -> int:
         """Return a token that the last 65,534 commands did not have."""

@@ -102,7 +102,7 @@ class StepScaleSender:
         change = self._changes.get(answer.node)
         if change is None or answer.token != change.token:
             return
-        if answer.result == wire.CommandResult.BUSY:
+        if answer.result in (wire.CommandResult.BUSY, wire.CommandResult.COUNTER_REFUSED):
             change.token, change.next_s = self._link.next_token(), -math.inf
             return
         if change.value == IMPOSSIBLE and answer.result == wire.CommandResult.OUT_OF_RANGE:

@@ -24,6 +24,9 @@ class CablePort:
     lost. ``heard`` counts the node's frames.
     """
 
+    by_cable = True
+    """First keys may be given: nobody listens."""
+
     def __init__(self, port: str) -> None:
         self.port = port
         self.heard = 0
@@ -49,7 +52,9 @@ class CablePort:
         """Pass what a coordinator would transmit to the node."""
         for frame in self._from_host.feed(data):
             if isinstance(frame, xbee.Transmit16):
-                received = xbee.Receive16(wire.COORDINATOR, CABLE_DBM, frame.data)
+                received = xbee.Receive16(
+                    wire.COORDINATOR, CABLE_DBM, frame.data, wire.CABLE_OPTIONS
+                )
                 self._device.write(xbee.encode(received))
         return len(data)
 

@@ -18,8 +18,10 @@ from __future__ import annotations
 
 import binascii
 import enum
+import functools
 import hashlib
 import hmac
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -38,6 +40,12 @@ DEFAULT_KEY = bytes(KEY_BYTES)
 """Of a node that was never given one: everybody knows it, so it keeps nobody out."""
 COORDINATOR = 0
 BROADCAST = 255
+CABLE_OPTIONS = 0xA5
+"""Receive options of a frame that the host hands a node over its USB cable, in the module's place.
+No module sets them, and no sender on the air can."""
+MAX_COMMAND_JUMP = 1 << 30
+"""How far ahead of the newest the counter of a command or beacon may be: four years of the host's
+clock. Longer no node lies unused under one key."""
 
 
 class ResetCause(enum.IntEnum):
@@ -115,13 +123,15 @@ class CommandCode(enum.IntEnum):
 
 
 class CommandResult(enum.IntEnum):
-    """How a command ended."""
+    """How a command ended; COUNTER_REFUSED tells the newest one, CABLE_ONLY is a first key's."""
 
     DONE = 0
     UNKNOWN_COMMAND = 1
     OUT_OF_RANGE = 2
     BUSY = 3
     NO_ANSWER = 4
+    COUNTER_REFUSED = 5
+    CABLE_ONLY = 6
 
 
 HEADER = (
@@ -489,10 +499,10 @@ BEACON = Message(
 NEW_KEY = Message(
     19,
     "new_key",
-    "A new team key for one node, hidden under the old one; answered like a command SET_KEY.",
+    "A node's own new key and the beacon's, hidden under its old one; answered like SET_KEY.",
     (
         Quantity("token", "u16", "Chosen by the host, returned in the acknowledgement"),
-        *(Quantity(f"masked_{k}", "u32", "Key words XOR the mask") for k in range(4)),
+        *(Quantity(f"masked_{k}", "u32", "Words of both keys XOR the mask") for k in range(8)),
     ),
 )
 
@@ -648,12 +658,29 @@ def tag(data: bytes, key: bytes) -> bytes:
     return bytes(siphash24.siphash24(data, key=key).digest())
 
 
-def key_mask(key: bytes, counter: int) -> bytes:
-    """What a new key is XORed with in a :data:`NEW_KEY` frame of that counter: 16 bytes.
+@functools.lru_cache(maxsize=1024)
+def node_key(team_key: bytes, node: int) -> bytes:
+    """The key of frames from and to ``node``; of :data:`BROADCAST`, the beacons'.
 
-    Two SipHash blocks of the old ``key`` over 0, block number, counter: no frame begins with 0.
+    The first 16 bytes of HMAC-SHA-256 (FIPS 198-1) under the team's key, so that nobody learns the
+    team's key or another node's from a node. Without a team key, all have :data:`DEFAULT_KEY`.
     """
-    return b"".join(tag(bytes((0, k)) + counter.to_bytes(4, "little"), key) for k in (0, 1))
+    if team_key == DEFAULT_KEY:
+        return DEFAULT_KEY
+    return hmac.digest(team_key, b"relpos node key" + bytes((node,)), "sha256")[:KEY_BYTES]
+
+
+def masked_keys(old_key: bytes, token: int, counter: int, keys: bytes) -> dict[str, int]:
+    """The values of a :data:`NEW_KEY` frame that gives ``keys``: a node's own, then the beacon's.
+
+    They are XORed with four SipHash blocks of ``old_key`` over 0, block number, token (2 bytes),
+    counter (4): no frame begins with 0.
+    """
+    said = token.to_bytes(2, "little") + counter.to_bytes(4, "little")
+    mask = b"".join(tag(bytes((0, block)) + said, old_key) for block in range(4))
+    masked = bytes(a ^ b for a, b in zip(keys, mask, strict=True))
+    words = struct.unpack("<8I", masked)
+    return {"token": token} | {f"masked_{k}": word for k, word in enumerate(words)}
 
 
 @dataclass(frozen=True, slots=True)

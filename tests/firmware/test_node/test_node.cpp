@@ -115,7 +115,7 @@ struct World : FakeBoard {
   // A frame of the host's.
   void down(wire::MessageType type, const uint8_t* body, uint8_t length, uint8_t node,
             uint32_t counter) {
-    uint8_t data[80] = {0x81, 0, 0, 0x28, 0};
+    uint8_t data[80] = {0x81, 0, 0, 0x28, by_cable ? wire::kCableOptions : uint8_t{0}};
     uint8_t* frame = data + 5;
     memcpy(frame + wire::kHeaderBytes, body, length);
     const wire::Header header = {type, node == kId ? to : node, 0, counter};
@@ -123,6 +123,7 @@ struct World : FakeBoard {
     give(data, static_cast<uint8_t>(5 + length));
   }
   uint8_t key[wire::kKeyBytes] = {};   // the host's, and what the node's frames are opened with
+  bool by_cable = false;
   uint32_t host_counter = 1000;
   uint32_t exchange_us = 0;            // of UWB
   uint32_t bus_us = 0;                 // of a transaction
@@ -336,6 +337,24 @@ bool in_force(Team& team, Node& node, const Words& words) {
     if (answer.value != words.word[i]) return false;
   }
   return true;
+}
+
+void send_beacon(Team& team, uint8_t count) {
+  wire::Beacon beacon = {};
+  beacon.period_ms = 2000;
+  beacon.count = count;
+  for (uint8_t i = 0; i < count; ++i) beacon.entries[i].node = static_cast<uint8_t>(kId + i);
+  uint8_t body[wire::kBeaconBytes];
+  const uint8_t length = wire::encode(beacon, body);
+  team.world.down(wire::MessageType::kBeacon, body, length, wire::kBroadcast,
+                  ++team.world.host_counter);
+}
+
+// Nodes in the beacon that is in force, as the next status says.
+uint8_t beacon_team(Team& team) {
+  team.run_ms(1200);
+  wire::Status status = {};
+  return team.read(wire::MessageType::kStatus, &status) ? status.team : 0xFF;
 }
 
 }  // namespace
@@ -1258,7 +1277,6 @@ TEST(a_replayed_forged_or_foreign_frame_touches_nothing) {
   down(5000);
   CHECK_EQUAL(1, team.sent(wire::MessageType::kAcknowledgement));
   down(5000);  // the same again
-  down(4999);  // an older one
   team.world.key[3] ^= 1;
   down(6000);  // another team's
   team.world.key[3] ^= 1;
@@ -1268,8 +1286,46 @@ TEST(a_replayed_forged_or_foreign_frame_touches_nothing) {
   team.run_ms(12000);
   wire::Status status;
   CHECK(team.read(wire::MessageType::kStatus, &status));
-  CHECK_EQUAL(3, status.refused_frames);
+  CHECK_EQUAL(2, status.refused_frames);
   CHECK_EQUAL(0, status.bad_frames);
+}
+
+TEST(a_counter_that_does_not_follow_is_refused_with_the_newest_and_the_next_one_is_obeyed) {
+  for (const uint32_t obeyed : {5000u, 0xFFFFFFFEu, 0xFFFFFFFFu}) {
+    for (const uint32_t skipped : {0xFFFFFFFEu, 0x80000000u, wire::kMostJump}) {
+      Team team;
+      team.world.host_counter = obeyed - 1;
+      CHECK_EQUAL(result(wire::CommandResult::kDone),
+                  ask(team, team.node, wire::CommandCode::kSetTeamSize, 9).result);
+      team.world.host_counter = obeyed + skipped;
+      team.world.count = 0;
+      team.world.command(77, code(wire::CommandCode::kSetTeamSize), 4);
+      team.run_ms(300);
+      CHECK_EQUAL(1, team.sent(wire::MessageType::kAcknowledgement));
+      CHECK_EQUAL(77, team.answer().token);
+      CHECK_EQUAL(result(wire::CommandResult::kCounterRefused), team.answer().result);
+      CHECK_EQUAL(obeyed, static_cast<uint32_t>(team.answer().value));
+      team.world.host_counter = obeyed;
+      CHECK_EQUAL(9, ask(team, team.node, wire::CommandCode::kSetTeamSize, 0).value);
+      team.world.host_counter = obeyed + 1 + wire::kMostJump - 1;  // the next is one further
+      CHECK_EQUAL(result(wire::CommandResult::kDone),
+                  ask(team, team.node, wire::CommandCode::kSetTeamSize, 5).result);
+    }
+  }
+}
+
+TEST(a_command_brings_back_beacons_that_a_host_of_the_future_had_made_old) {
+  Team team;
+  ask(team, team.node, wire::CommandCode::kSetStatusPeriodMs, 1000);
+  team.world.host_counter = 0x50000000;
+  send_beacon(team, 1);
+  CHECK_EQUAL(1, beacon_team(team));
+  team.world.host_counter = 5000;
+  send_beacon(team, 2);
+  CHECK_EQUAL(1, beacon_team(team));
+  ask(team, team.node, wire::CommandCode::kPing, 0);
+  send_beacon(team, 2);
+  CHECK_EQUAL(2, beacon_team(team));
 }
 
 TEST(a_command_is_not_obeyed_again_after_a_restart) {
@@ -1369,83 +1425,152 @@ TEST(counters_go_on_in_the_next_block_and_wear_the_storage_little) {
   for (uint16_t count : team.world.writes) CHECK(count <= newest / 1024 + 1);
 }
 
-TEST(a_new_key_is_taken_kept_and_the_old_one_is_dead) {
+// The body of a frame that gives a node these keys; masking and unmasking are the same.
+void fill_new_keys(const uint8_t* old_key, uint32_t counter, const uint8_t* key,
+                   const uint8_t* beacon_key, uint8_t* body) {
+  body[0] = 7;
+  body[1] = 0;
+  memcpy(body + 2, key, wire::kKeyBytes);
+  memcpy(body + 2 + wire::kKeyBytes, beacon_key, wire::kKeyBytes);
+  uint8_t keys[2 * wire::kKeyBytes];
+  memcpy(keys, old_key, wire::kKeyBytes);
+  wire::unmask_keys(counter, body, keys);
+  memcpy(body + 2, keys, sizeof keys);
+}
+
+struct NewKeys {
+  uint8_t own[wire::kKeyBytes], beacon[wire::kKeyBytes], none[wire::kKeyBytes] = {};
+  uint8_t body[wire::kNewKeyBytes];
+  NewKeys() {
+    for (uint8_t i = 0; i < sizeof own; ++i) {
+      own[i] = static_cast<uint8_t>(17 * i + 3);
+      beacon[i] = static_cast<uint8_t>(5 * i + 1);
+    }
+  }
+  // Gives them as a host does, and waits for the answer, which comes under them.
+  void give(Team& team, uint32_t counter, bool by_cable = true) {
+    fill_new_keys(team.world.key, counter, own, beacon, body);
+    team.world.by_cable = by_cable;
+    team.world.down(wire::MessageType::kNewKey, body, sizeof body, kId, counter);
+    team.world.by_cable = false;
+    memcpy(team.world.key, own, sizeof own);
+    team.run_ms(500);
+  }
+};
+
+TEST(new_keys_are_taken_kept_and_the_old_ones_are_dead) {
   Team team;
-  wire::NewKey message = {7, 0, 0, 0, 0};
-  uint8_t body[wire::kNewKeyBytes], key[wire::kKeyBytes];
-  for (uint8_t i = 0; i < sizeof key; ++i) key[i] = static_cast<uint8_t>(17 * i + 3);
-  uint8_t masked[wire::kKeyBytes];
-  wire::unmask_key(team.world.key, 9000, key, masked);  // XOR both ways
-  memcpy(&message.masked_0, masked, sizeof masked);
-  wire::encode(message, body);
-  team.world.down(wire::MessageType::kNewKey, body, sizeof body, kId, 9000);
-  team.world.begin_poll();
-  uint8_t old_key[wire::kKeyBytes];
-  memcpy(old_key, team.world.key, sizeof old_key);
-  memcpy(team.world.key, key, sizeof key);  // the answer comes under the new one
-  team.run_ms(500);
+  NewKeys keys;
+  keys.give(team, 9000);
   CHECK_EQUAL(1, team.sent(wire::MessageType::kAcknowledgement));
   CHECK_EQUAL(code(wire::CommandCode::kSetKey), team.answer().command);
   CHECK_EQUAL(result(wire::CommandResult::kDone), team.answer().result);
-  // A host that begins with the new key counts anew.
-  team.world.command(8, code(wire::CommandCode::kPing), 0);
-  team.run_ms(300);
-  CHECK_EQUAL(2, team.sent(wire::MessageType::kAcknowledgement));
+  team.world.host_counter = 9000;
   Node again(team.world);
   again.begin(team.world.now, wire::ResetCause::kPowerOn, 0);
   team.run(again, 300);
-  memcpy(team.world.key, old_key, sizeof key);
+  memcpy(team.world.key, keys.none, sizeof keys.none);
   team.world.command(9, code(wire::CommandCode::kPing), 0);
   team.run(again, 300);
-  CHECK_EQUAL(2, team.sent(wire::MessageType::kAcknowledgement));
-  memcpy(team.world.key, key, sizeof key);
+  CHECK_EQUAL(1, team.sent(wire::MessageType::kAcknowledgement));
+  memcpy(team.world.key, keys.own, sizeof keys.own);
   team.world.command(10, code(wire::CommandCode::kPing), 0);
   team.run(again, 300);
-  CHECK_EQUAL(3, team.sent(wire::MessageType::kAcknowledgement));
+  CHECK_EQUAL(2, team.sent(wire::MessageType::kAcknowledgement));
   team.run(again, 12000);
   wire::Status status;
   CHECK(team.read(wire::MessageType::kStatus, &status));
   CHECK(status.health & static_cast<uint8_t>(wire::Health::kKeySet));
 }
 
-TEST(a_power_cut_while_a_key_is_stored_leaves_the_old_key_or_the_new_one) {
-  uint8_t key[wire::kKeyBytes], masked[wire::kKeyBytes];
-  for (uint8_t i = 0; i < sizeof key; ++i) key[i] = static_cast<uint8_t>(17 * i + 3);
-  const uint8_t old_key[wire::kKeyBytes] = {};
-  wire::unmask_key(old_key, 9000, key, masked);
-  wire::NewKey message = {7, 0, 0, 0, 0};
-  memcpy(&message.masked_0, masked, sizeof masked);
-  uint8_t body[wire::kNewKeyBytes];
-  wire::encode(message, body);
+TEST(a_first_key_comes_by_cable_and_the_next_ones_by_radio_too) {
+  Team team;
+  NewKeys keys;
+  keys.give(team, 9000, false);
+  memcpy(team.world.key, keys.none, sizeof keys.none);
+  team.run_ms(1500);  // without a transmit status the answer was the last frame for a while
+  CHECK_EQUAL(result(wire::CommandResult::kDone),
+              (team.world.host_counter = 9000, ask(team, team.node, wire::CommandCode::kPing, 0).result));
+  keys.give(team, 9100);
+  CHECK_EQUAL(result(wire::CommandResult::kDone), team.answer().result);
+  keys.own[5] ^= 1;
+  keys.give(team, 9200, false);
+  CHECK_EQUAL(result(wire::CommandResult::kDone), team.answer().result);
+}
+
+TEST(after_keys_a_b_and_a_again_no_old_command_is_obeyed) {
+  Team team;
+  NewKeys a, b;
+  b.own[0] ^= 1;
+  a.give(team, 9000);
+  team.world.host_counter = 9000;
+  ask(team, team.node, wire::CommandCode::kSetTeamSize, 9);
+  b.give(team, 9100);
+  a.give(team, 9200);
+  team.world.host_counter = 9000;  // the command of then, once more
+  team.world.count = 0;
+  team.world.command(99, code(wire::CommandCode::kSetTeamSize), 4);
+  team.run_ms(300);
+  CHECK_EQUAL(result(wire::CommandResult::kCounterRefused), team.answer().result);
+  team.world.host_counter = 9200;
+  CHECK_EQUAL(9, ask(team, team.node, wire::CommandCode::kSetTeamSize, 0).value);
+}
+
+TEST(a_beacon_comes_under_its_own_key_which_commands_nothing) {
+  Team team;
+  NewKeys keys;
+  keys.give(team, 9000);
+  team.world.host_counter = 9001;
+  ask(team, team.node, wire::CommandCode::kSetStatusPeriodMs, 1000);
+  send_beacon(team, 3);  // under the node's own key
+  CHECK_EQUAL(0, beacon_team(team));
+  memcpy(team.world.key, keys.beacon, sizeof keys.beacon);
+  send_beacon(team, 3);
+  team.world.command(8, code(wire::CommandCode::kSetTeamSize), 4);
+  team.run_ms(300);
+  memcpy(team.world.key, keys.own, sizeof keys.own);
+  CHECK_EQUAL(3, beacon_team(team));
+  CHECK_EQUAL(6, ask(team, team.node, wire::CommandCode::kSetTeamSize, 0).value);
+}
+
+TEST(a_power_cut_while_keys_are_stored_leaves_the_old_ones_or_the_new_ones) {
+  NewKeys keys;
+  fill_new_keys(keys.none, 9000, keys.own, keys.beacon, keys.body);
   uint8_t command[wire::kCommandBytes];
   const wire::Command request = {6, code(wire::CommandCode::kSetTeamSize), 9};
   wire::encode(request, command);
   bool old_seen = false, new_seen = false;
-  for (uint32_t cut = 0; cut < 70; ++cut) {
+  for (uint32_t cut = 0; cut < 100; ++cut) {
     Team team;
     team.world.down(wire::MessageType::kCommand, command, sizeof command, kId, 8000);
     team.run_ms(500);
     team.world.writes_left = cut;
-    team.world.down(wire::MessageType::kNewKey, body, sizeof body, kId, 9000);
+    team.world.by_cable = true;
+    team.world.down(wire::MessageType::kNewKey, keys.body, sizeof keys.body, kId, 9000);
     team.run_ms(500);
     team.world.writes_left = 0xFFFFFFFF;
     Node again(team.world);
     again.begin(team.world.now, wire::ResetCause::kPowerOn, 0);
     team.run(again, 300);
     // What was obeyed before is not obeyed again, whichever key is in force.
-    memcpy(team.world.key, old_key, sizeof key);
+    memcpy(team.world.key, keys.none, sizeof keys.none);
     team.world.count = 0;
     team.world.down(wire::MessageType::kCommand, command, sizeof command, kId, 8000);
     team.run(again, 300);
-    CHECK_EQUAL(0, team.sent(wire::MessageType::kAcknowledgement));
+    CHECK(team.sent(wire::MessageType::kAcknowledgement) == 0 ||
+          team.answer().result == result(wire::CommandResult::kCounterRefused));
     team.world.host_counter = 10000;
+    uint8_t seen = 0;
     for (uint8_t which = 0; which < 2; ++which) {
-      memcpy(team.world.key, which == 0 ? old_key : key, sizeof key);
+      memcpy(team.world.key, which == 0 ? keys.none : keys.own, sizeof keys.own);
       team.world.count = 0;
       team.world.command(8, code(wire::CommandCode::kPing), 0);
       team.run(again, 300);
-      if (team.sent(wire::MessageType::kAcknowledgement) == 1) (which == 0 ? old_seen : new_seen) = true;
+      if (team.sent(wire::MessageType::kAcknowledgement) == 0) continue;
+      ++seen;
+      (which == 0 ? old_seen : new_seen) = true;
     }
+    CHECK_EQUAL(1, seen);
   }
   CHECK(old_seen && new_seen);
 }

@@ -23,7 +23,6 @@ from .spec import FaultSpec
 
 RESTART_XBEE_US = 100_000
 FOREIGN_ADDRESS = 0x5A5A
-FOREIGN_ID = 200
 
 
 class _FaultyAir:
@@ -148,20 +147,22 @@ def _air_damage(spec: FaultSpec, rng: Rng) -> Callable[[bytes, int], list[tuple[
 
 
 def _foreign_sender(hooks: Hooks, spec: FaultSpec, rng: Rng) -> None:
-    """A module of no team in the middle. With the team's key it is a node left switched on."""
+    """A module in the middle that has a key of its own, or all that a stolen node holds."""
     team = hooks.team
     module = XbeeModule(
         FOREIGN_ADDRESS, 0x40000000 + FOREIGN_ADDRESS, team.radio, lambda _time, _data: None
     )
-    right = spec.choice("key") == "right"
-    key = team.key if right else rng.bytes(wire.KEY_BYTES)
+    stolen = max(team.nodes) if spec.choice("key") == "stolen" else None
+    own = rng.bytes(wire.KEY_BYTES) if stolen is None else wire.node_key(team.key, stolen)
+    beacons = own if stolen is None else wire.node_key(team.key, wire.BROADCAST)
+    others = [node for node in team.nodes if node != stolen]
     sent = [0]
 
     def send(now_us: int) -> None:
         if spec.to_us is not None and now_us >= spec.to_us:
             return
-        ids = [FOREIGN_ID] if right else list(team.nodes)
-        data = _foreign_frame(sent[0], ids[sent[0] % len(ids)], now_us, right, key)
+        count = sent[0]
+        data = _foreign_frame(count, others[count % len(others)], now_us, own, beacons)
         sent[0] += 1
         team.radio.send(
             Transmission(module, BROADCAST, False, data, now_us, lambda _time, _status: None)
@@ -171,25 +172,23 @@ def _foreign_sender(hooks: Hooks, spec: FaultSpec, rng: Rng) -> None:
     hooks.clock.at(spec.from_us, send)
 
 
-def _foreign_frame(count: int, node: int, now_us: int, right: bool, key: bytes) -> bytes:
+def _foreign_frame(count: int, node: int, now_us: int, own: bytes, beacons: bytes) -> bytes:
     """In turn each frame that would do harm if it were believed."""
     time_s = now_us * 1e-6
     far = dict.fromkeys(wire.MOTION.field, 0) | {
         "time_s": time_s, "x_m": 50.0 * count, "path_m": 50.0 * count, "state": 2,
     }  # fmt: skip
     entry = {"peer": 1 + node % 3, "range_m": 0.5, "rss_dbm": -80, "age_s": 0.0, "quality": 0}
-    up = (
-        (wire.MOTION, node, far),
-        (wire.RANGES, node, {"time_s": time_s, "ranges": [entry]}),
-    )
     command = {"token": 0x7000 + count % 0x1000, "command": wire.CommandCode.REBOOT, "value": 0}
     beacon = {"phase_s": 0.5, "period_s": 0.3, "round": 7, "nodes": [{"node": 77}]}
-    down = (
-        (wire.COMMAND, wire.BROADCAST, command),
-        (wire.BEACON, wire.BROADCAST, beacon),
+    choices = (
+        (wire.MOTION, node, far, own),
+        (wire.RANGES, node, {"time_s": time_s, "ranges": [entry]}, own),
+        (wire.COMMAND, node, command, own),
+        (wire.COMMAND, wire.BROADCAST, command, beacons),
+        (wire.BEACON, wire.BROADCAST, beacon, beacons),
     )
-    choices = up if right else up + down
-    message, about, values = choices[count % len(choices)]
+    message, about, values, key = choices[count % len(choices)]
     return wire.encode(message, about, 0, 0x40000000 + count, values, key)
 
 

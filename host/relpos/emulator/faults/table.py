@@ -345,10 +345,10 @@ FAULTS: tuple[Fault, ...] = (
         "radio",
         "foreign",
         "a foreign module sends motion, ranges, commands and beacons in every node's name",
-        "with another key: refused and counted by node and host, nothing changes. "
-        "With the team's key: only the foreign module's own id appears besides",
+        "with another key: refused and counted by node and host, nothing changes. With what a "
+        "stolen node holds: the same, but for its beacons, after which the team ranges without",
         (
-            Key("key", "whose", "wrong", choices=("wrong", "right")),
+            Key("key", "whose", "wrong", choices=("wrong", "stolen")),
             Key("rate", "frames a second", 5.0, "1/s", 0.1, 20.0),
         ),
         team=True,
