@@ -9,6 +9,7 @@ from relpos.errors import DataError
 from relpos.link.port import Link
 from relpos.live.inputs import Received
 from relpos.measurements import Observation
+from relpos.protocol.messages import PROTOCOL_VERSION
 from relpos.recording import topics
 from relpos.recording.reader import Recording
 
@@ -17,8 +18,8 @@ from relpos.recording.reader import Recording
 class Replay:
     """The inputs of a session in its order, through the link again.
 
-    Without the team's ``key`` (None), or where no bytes were recorded, they are what was decoded
-    when it was recorded. ``link`` is None then, and ``remarks`` says why.
+    Without the team's ``key`` (None), where no bytes were recorded, or other than this version's,
+    they are what was decoded when it was recorded. ``link`` is None then, and ``remarks`` says why.
     """
 
     recording: Recording
@@ -36,6 +37,13 @@ class Replay:
             )
             return
         about = self.recording.about
+        if about is not None and about.protocol not in (0, PROTOCOL_VERSION):
+            self.remarks = (
+                f"{self.recording.path}: recorded by relpos {about.version} under protocol version "
+                f"{about.protocol}, this is {PROTOCOL_VERSION}: the measurements are those that "
+                "were decoded when it was recorded",
+            )
+            return
         self.link = Link(key=self.key, newest_counters=about.newest_counters if about else None)
 
     def __iter__(self) -> Iterator[Received]:
