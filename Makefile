@@ -62,7 +62,7 @@ firmware-tests: $(DEVELOP) | system-avr ## the C++ suites alone: here, under san
 
 board-builds: $(DEVELOP) | system-avr
 	$(call title,Firmware for both boards and both sensors)
-	tools/pio run -e uno -e megaatmega2560 -e uno_mpu9250
+	tools/pio run -e uno -e megaatmega2560 -e uno_mpu9250 -e megaatmega2560_mpu9250
 
 coverage: $(DEVELOP) | system-avr system-browser ## share of lines that tests reach: firmware/lib, host/relpos
 	$(call title,Firmware suites on this computer, line by line)

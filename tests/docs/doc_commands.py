@@ -29,6 +29,7 @@ SHELLS = ("sh", "bash", "shell", "console")
 
 PARSED = {
     "node flash": "wants a board on USB; tests/system/test_flash.py plays one",
+    "node check": "a node lies still for a minute; tests/nodes/test_node_check.py checks one",
     "node calibrate": "somebody turns the node or walks; tests/system/test_calibration.py does",
     "figures": "computes for minutes; tests/evaluation/test_figures.py draws small ones",
 }

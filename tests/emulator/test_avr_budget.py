@@ -83,10 +83,13 @@ def test_a_firmware_that_is_not_built_is_one_line_that_says_how(
     assert "run `make firmware`" in capsys.readouterr().err
 
 
+BOARDS = ("uno", "mega", "uno-mpu9250")  # the fourth, which has room: `make firmware`
+
+
 @pytest.fixture(scope="module")
 def built() -> Path:
     """PlatformIO's build folder with all boards' firmware as the sources now are."""
-    environments = [word for name in budget.ENVIRONMENTS.values() for word in ("-e", name)]
+    environments = [word for name in BOARDS for word in ("-e", budget.ENVIRONMENTS[name])]
     result = subprocess.run(
         [sys.executable, str(ROOT / "tools" / "pio"), "run", *environments],
         capture_output=True,
@@ -98,7 +101,7 @@ def built() -> Path:
     return budget.default_build_folder()
 
 
-@pytest.mark.parametrize("board", budget.BUDGETS)
+@pytest.mark.parametrize("board", BOARDS)
 def test_the_whole_firmware_stays_within_its_budgets(built: Path, board: str) -> None:
     cost = measure(board, find_firmware(board, built), 20.0)
     assert cost.faults == (), cost

@@ -16,8 +16,12 @@ from relpos.emulator.avr.budget import BUDGETS, TICK_CYCLES, default_build_folde
 from relpos.emulator.avr.elf import read_firmware
 from relpos.emulator.avr.library import missing_parts
 from relpos.emulator.avr.service import Service
+from relpos.emulator.mpu9150 import Mpu9150
 from relpos.emulator.mpu9250 import Mpu9250
 from relpos.emulator.surroundings import MagneticErrors
+from relpos.emulator.team import EmulatedTeam, TeamConfig
+from relpos.link.port import Link
+from relpos.measurements import Motion, Status
 from relpos.protocol import messages as wire
 
 MISSING = missing_parts()
@@ -109,3 +113,51 @@ def test_firmware_built_for_the_mpu_9150_reports_the_successor_as_missing() -> N
 def test_an_unknown_sensor_is_refused_by_the_build(tmp_path: Path) -> None:
     with pytest.raises(AssertionError, match="RELPOS_IMU is MPU9150 or MPU9250"):
         _built(PLATFORMIO_BUILD_DIR=str(tmp_path), PLATFORMIO_BUILD_FLAGS="-DRELPOS_IMU=MPU6500")
+
+
+def _team_health(**imu: str) -> list[wire.Health]:
+    """What two nodes report after a walk of some seconds."""
+    link = Link()
+    with EmulatedTeam(TeamConfig("straight", 2, 16.0, 1, **imu)) as team:  # type: ignore[arg-type]
+        seen = [o for at, data in team.stream() for o in link.feed(data, at * 1e-6)]
+    statuses = [o for o in seen if isinstance(o, Status) and o.name == "health"]
+    newest = {status.node: wire.Health(int(status.value)) for status in statuses}
+    moved = {o.node for o in seen if isinstance(o, Motion) and o.dx_m > 0.3}
+    sensors = wire.Health.IMU | wire.Health.MAGNETOMETER
+    assert moved == {node for node, health in newest.items() if health & sensors == sensors}
+    return list(newest.values())
+
+
+def test_an_emulated_team_has_it() -> None:
+    assert all(wire.Health.IMU in health for health in _team_health(imu="mpu9250"))
+
+
+def test_a_team_with_firmware_for_the_other_sensor_reports_it_missing() -> None:
+    for imu, built_for in (("mpu9250", "mpu9150"), ("mpu9150", "mpu9250")):
+        for health in _team_health(imu=imu, built_for=built_for):
+            assert not health & (wire.Health.IMU | wire.Health.MAGNETOMETER)
+            assert wire.Health.POZYX in health
+
+
+@pytest.mark.parametrize("make", [Mpu9150, Mpu9250])
+def test_self_tests_move_each_axis_by_what_the_factory_measured(make: type[Mpu9150]) -> None:
+    """As the makers' drivers reckon: ranges of 250 deg/s and 8 g (MPU-9250: 2 g)."""
+    successor = make is Mpu9250
+    host = Host((MPU, make(constant(), None, {}))).at(100_000)
+    host.write(MPU, 0x6B, 1)
+    host.write(MPU, 0x1C, 0x00 if successor else 0x10)
+    before = np.array(words(host.at(200_000).read(MPU, 0x3B, 14)))
+    host.write(MPU, 0x1B, 0xE0)
+    host.write(MPU, 0x1C, 0xE0 if successor else 0xF0)
+    moved = np.array(words(host.at(300_000).read(MPU, 0x3B, 14))) - before
+    if successor:
+        codes = np.array([*host.read(MPU, 0x0D, 3), *host.read(MPU, 0x00, 3)], dtype=float)
+        expected = 2620.0 * 1.01 ** (codes - 1.0)
+    else:
+        x, y, z, a = host.read(MPU, 0x0D, 4)
+        force = [x >> 3 & 28 | a >> 4 & 3, y >> 3 & 28 | a >> 2 & 3, z >> 3 & 28 | a & 3]
+        expected = np.array(
+            [4096 * 0.34 * (0.92 / 0.34) ** ((code - 1) / 30) for code in force]
+            + [s * 25 * 131 * 1.046 ** ((c & 31) - 1) for s, c in ((1, x), (-1, y), (1, z))]
+        )
+    assert moved[[0, 1, 2, 4, 5, 6]] == pytest.approx(expected, rel=0.01)

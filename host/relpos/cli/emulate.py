@@ -8,6 +8,7 @@ import typer
 
 from relpos.cli.demo import Board, Faults, check_faults
 from relpos.cli.keys import KeyFile, team_key
+from relpos.cli.node_flash import ImuName
 
 
 def emulate(
@@ -21,6 +22,9 @@ def emulate(
         float | None,
         typer.Option(min=1.0, help="End after so many seconds. (default: Ctrl-C ends)"),
     ] = None,
+    imu: Annotated[
+        ImuName, typer.Option(help="The inertial sensor, and what the firmware is built for.")
+    ] = ImuName.MPU9150,
     fault: Faults = None,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same bytes.")] = 0,
     key_file: KeyFile = None,
@@ -40,5 +44,6 @@ def emulate(
         str(board),
         check_faults(fault, nodes),
         key=team_key(key_file),
+        imu=str(imu),
     )
     serve_team(config, speed, typer.echo)

@@ -186,7 +186,9 @@ class Ak8975(I2cDevice):
 class Ak8963(Ak8975):
     """The MPU-9250's compass: 14 bits of 0.6 uT, or 16 of 0.15 uT where bit 4 of CNTL1 is set.
 
-    Its continuous modes are not emulated.
+    Its continuous modes are not emulated. Compared with the maker's own self-test for it: that
+    reads 16 from ST2 at 16 bits and asks for -3200 to -800 along z; and with LibDriver's and
+    M5Stack's drivers: 0.6 and 0.15 uT, CNTL1, ASA.
     """
 
     ut_per_lsb = 0.6

@@ -90,6 +90,8 @@ class I2cBus:
         self.transactions = 0
         self.counts: Counter[tuple[int, BusStatus]] = Counter()
         self.stuck = False
+        self.rise_ns = 0
+        """Of both lines; it makes each of a byte's nine bits longer for a master that looks."""
         self._active: I2cDevice | None = None
         self._address = 0
         self._open = False
@@ -191,9 +193,10 @@ class I2cBus:
         self.stop()
 
     def take_stretch_us(self) -> int:
-        """How long the addressed chip holds the clock after the last condition or byte."""
+        """How much longer the last condition or byte takes: the clock is held, or rises late."""
+        late_us = 9 * self.rise_ns // 1000
         device = self._active
         if device is None or not device.stretch_us:
-            return 0
+            return late_us
         stretch, device.stretch_us = device.stretch_us, 0
-        return stretch
+        return stretch + late_us

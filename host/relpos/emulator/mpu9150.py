@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cache
+from typing import ClassVar
 
 import numpy as np
 from scipy import signal
@@ -25,6 +26,8 @@ from .surroundings import FloatArray, InertialErrors, Surroundings
 ADDRESS = 0x68
 WHO_AM_I = 0x68
 
+SELF_TEST = 0x0D
+"""X, Y, Z and A: factory codes of the self-tests, five bits an axis (on the MPU-9250 eight)."""
 SMPLRT_DIV = 0x19
 CONFIG = 0x1A
 GYRO_CONFIG = 0x1B
@@ -174,6 +177,7 @@ class Mpu9150(I2cDevice):
 
     identity = WHO_AM_I
     power_on_management = SLEEP
+    factory_codes: ClassVar[Mapping[int, int]] = {0x0D: 0xAF, 0x0E: 0x91, 0x0F: 0x74, 0x10: 0x39}
 
     def __init__(
         self,
@@ -187,6 +191,8 @@ class Mpu9150(I2cDevice):
         self.auxiliary: Mapping[int, I2cDevice] = {} if auxiliary is None else auxiliary
         self.spoil: Callable[[bytes, int], bytes | None] | None = None
         """Fault: (a sample's 14 bytes, its time) -> what is shown for it; None: no new sample."""
+        self.self_test_gain = 1.0
+        """What its self-test moves the axes by, over what the factory measured."""
         self.time_us = 0
         self._registers = bytearray(128)
         self._pointer = 0
@@ -212,6 +218,8 @@ class Mpu9150(I2cDevice):
         self._registers[:] = bytes(128)
         self._registers[PWR_MGMT_1] = self.power_on_management
         self._registers[WHO_AM_I_REGISTER] = self.identity
+        for address, code in self.factory_codes.items():
+            self._registers[address] = code
         self._status = 0
         self._fifo = bytearray()
         self._last_popped = 0
@@ -323,6 +331,13 @@ class Mpu9150(I2cDevice):
         if not self._registers[PWR_MGMT_1] & 0x08:
             words[:, 3] = (self._surroundings.temperature_c - 35.0) * 340.0
         words[:, 4:] = values[:, 3:] * gyroscope
+        force_g, rate_deg_s = self._self_test_response()
+        for axis in range(3):
+            if self._registers[ACCEL_CONFIG] >> (7 - axis) & 1:
+                words[:, axis] += self.self_test_gain * force_g[axis] * 9.80665 * accelerometer
+            if self._registers[GYRO_CONFIG] >> (7 - axis) & 1:
+                rate_rad_s = np.radians(rate_deg_s[axis])
+                words[:, 4 + axis] += self.self_test_gain * rate_rad_s * gyroscope
         standby = self._registers[PWR_MGMT_2]
         for bit, column in ((5, 0), (4, 1), (3, 2), (2, 4), (1, 5), (0, 6)):
             if standby >> bit & 1:
@@ -330,6 +345,23 @@ class Mpu9150(I2cDevice):
         packed = np.clip(np.rint(words), -32768, 32767).astype(">i2").tobytes()
         self._table = [packed[k : k + 14] for k in range(0, len(packed), 14)]
         self._table_first = first
+
+    def _self_test_response(self) -> tuple[list[float], list[float]]:
+        """What the factory measured: force in g and rate in deg/s an axis (register map, 13 to 16).
+
+        Also i2cdevlib's names of the fields and Linux' users of the same die, the MPU-6050.
+        """
+        codes = [self.factory_codes[SELF_TEST + axis] for axis in range(3)]
+        low = self.factory_codes[SELF_TEST + 3]
+        force = [codes[axis] >> 3 & 0x1C | low >> (4 - 2 * axis) & 3 for axis in range(3)]
+        rate = [code & 0x1F for code in codes]
+        return (
+            [0.34 * (0.92 / 0.34) ** ((code - 1) / 30.0) for code in force],
+            [
+                25.0 * 1.046 ** (code - 1) * (-1 if axis == 1 else 1)
+                for axis, code in enumerate(rate)
+            ],
+        )
 
     # -- FIFO -------------------------------------------------------------------------------
 

@@ -2,9 +2,15 @@
 
 CONFIG filters the gyroscope alone, ACCEL_CONFIG_2 the accelerometer; power-on finds it awake. Its
 compass is the AK8963 (:class:`relpos.emulator.ak8975.Ak8963`).
+
+Compared with two public drivers that share no code, LibDriver's mpu9250 and M5Stack's: registers,
+bandwidths, identity 0x71, ranges, self-tests. 0x73 of the MPU-9255: atabakp's driver.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
 
 from .mpu9150 import ACCEL_CONFIG_2, Filtering, Mpu9150
 
@@ -19,9 +25,19 @@ class Mpu9250(Mpu9150):
 
     identity = 0x71
     power_on_management = 0x01
+    factory_codes: ClassVar[Mapping[int, int]] = {
+        0x00: 0x61, 0x01: 0x58, 0x02: 0x6A, 0x0D: 0x70, 0x0E: 0x7C, 0x0F: 0x66,
+    }  # fmt: skip
 
     def _filtering(self, config: int) -> Filtering:
         chosen = self._registers[ACCEL_CONFIG_2]
         unfiltered = chosen & 0x08
         accelerometer = _UNFILTERED_HZ if unfiltered else _ACCELEROMETER_BANDWIDTH_HZ[chosen & 7]
         return accelerometer, _GYROSCOPE_BANDWIDTH_HZ[config], 0.0
+
+    def _self_test_response(self) -> tuple[list[float], list[float]]:
+        def counts(address: int) -> float:
+            return float(2620.0 * 1.01 ** (self.factory_codes[address] - 1))
+
+        force_g = [counts(0x0D + axis) / 16384.0 for axis in range(3)]
+        return force_g, [counts(axis) / 131.0 for axis in range(3)]

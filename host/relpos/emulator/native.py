@@ -63,9 +63,10 @@ def _sources(library: Path) -> list[Path]:
     )
 
 
-def build(library: Path | None = None, output: Path | None = None) -> Path:
+def build(library: Path | None = None, output: Path | None = None, imu: str = "mpu9150") -> Path:
     """Compile ``firmware/lib`` where its content has changed; returns the shared library.
 
+    ``imu`` is the sensor that it is for, as in ``relpos node flash --imu``.
     Raises DeviceError where the compiler is missing, or with its first complaint.
     """
     library = library or paths.firmware_project() / "firmware" / "lib"
@@ -75,7 +76,8 @@ def build(library: Path | None = None, output: Path | None = None) -> Path:
     if not any(path.parent.name == "native" for path in units):
         raise DeviceError("the firmware has no native board (firmware/lib/board/native)")
     compiler = os.environ.get("CXX", "g++")
-    digest = hashlib.sha256(" ".join((compiler, *_COMPILE)).encode())
+    options = (*_COMPILE, f"-DRELPOS_IMU={imu.upper()}")
+    digest = hashlib.sha256(" ".join((compiler, *options)).encode())
     for path in sources:
         digest.update(path.relative_to(library).as_posix().encode() + b"\0")
         digest.update(path.read_bytes() + b"\0")
@@ -90,7 +92,7 @@ def build(library: Path | None = None, output: Path | None = None) -> Path:
         output.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=output) as folder:
             made = Path(folder) / target.name
-            command = [compiler, *_COMPILE, *_WARNINGS, "-I", str(library), "-o", str(made)]
+            command = [compiler, *options, *_WARNINGS, "-I", str(library), "-o", str(made)]
             result = subprocess.run(
                 [*command, *map(str, units)], capture_output=True, text=True, check=False
             )

@@ -13,7 +13,8 @@ from . import ak8975, mpu9150, pozyx
 from .air import VirtualClock
 from .bus import I2cBus
 from .engine import Engine, NodeClockError
-from .native import EEPROM_BYTES, NativeEngine
+from .mpu9250 import Mpu9250
+from .native import EEPROM_BYTES, NativeEngine, build
 from .pozyx import PressureErrors, UwbMedium
 from .surroundings import (
     InertialErrors,
@@ -25,12 +26,28 @@ from .surroundings import (
 from .xbee import Air, XbeeModule, line_time_us
 
 
+class ImuKind(StrEnum):
+    """Inertial sensor and compass: what is wired, or what the firmware is built for."""
+
+    MPU9150 = "mpu9150"
+    MPU9250 = "mpu9250"
+
+
 class BoardKind(StrEnum):
     """What executes the firmware: this computer, or a simulated AVR."""
 
     NATIVE = "native"
     UNO = "uno"
     MEGA = "mega"
+
+
+@dataclass(frozen=True)
+class Hardware:
+    """What a node is made of; ``built_for``: the sensor that its firmware expects (default: it)."""
+
+    board: BoardKind
+    imu: ImuKind = ImuKind.MPU9150
+    built_for: ImuKind | None = None
 
 
 @dataclass(frozen=True)
@@ -107,7 +124,7 @@ class EmulatedNode:
     def __init__(
         self,
         node: int,
-        board: BoardKind | str,
+        hardware: Hardware | BoardKind | str,
         surroundings: Surroundings,
         errors: NodeErrors,
         clock: VirtualClock,
@@ -115,14 +132,19 @@ class EmulatedNode:
         air: Air,
         eeprom: bytearray | None = None,
     ) -> None:
+        if not isinstance(hardware, Hardware):
+            hardware = Hardware(BoardKind(hardware))
         self.node = node
         self.surroundings = surroundings
         self.errors = errors
         self.eeprom = prepared_eeprom(node) if eeprom is None else eeprom
         self.bus = I2cBus()
         auxiliary: dict[int, ak8975.Ak8975] = {}
-        self.mpu = mpu9150.Mpu9150(surroundings, errors.inertial, auxiliary)
-        self.magnetometer = ak8975.Ak8975(surroundings, errors.magnetic, self.mpu.bypassed)
+        successor = hardware.imu is ImuKind.MPU9250
+        sensor = Mpu9250 if successor else mpu9150.Mpu9150
+        compass = ak8975.Ak8963 if successor else ak8975.Ak8975
+        self.mpu = sensor(surroundings, errors.inertial, auxiliary)
+        self.magnetometer = compass(surroundings, errors.magnetic, self.mpu.bypassed)
         auxiliary[ak8975.ADDRESS] = self.magnetometer
         self.tag = pozyx.Pozyx(
             node, medium, surroundings, errors.pressure, power_on_us=errors.power_on_us
@@ -132,14 +154,14 @@ class EmulatedNode:
         self.bus.attach(ak8975.ADDRESS, self.magnetometer.host_side())
         self.bus.attach(pozyx.ADDRESS, self.tag)
         self.radio = XbeeModule(node, 0x40000000 + node, air, self._from_radio)
-        self.engine = make_engine(BoardKind(board), self.bus, self.eeprom, node, errors)
+        self.engine = make_engine(hardware, self.bus, self.eeprom, node, errors)
         self.engine.on_transmit = self._to_radio
         self.hold_frames = False
         """Whether bytes of the native board go to the radio as they leave, so that a restart can
         cut a frame; else frame by frame."""
         self._leaving: list[tuple[int, bytes]] = []
         self._stopped_until_us = 0
-        self._paced_by_engine = BoardKind(board) is not BoardKind.NATIVE
+        self._paced_by_engine = hardware.board is not BoardKind.NATIVE
         self._clock = clock
         self._due_us = max(self.engine.next_due_us, clock.now_us)
         clock.at(self._due_us, self._run)
@@ -228,9 +250,10 @@ class EmulatedNode:
 
 
 def make_engine(
-    board: BoardKind, bus: I2cBus, eeprom: bytearray, node: int, errors: NodeErrors
+    hardware: Hardware, bus: I2cBus, eeprom: bytearray, node: int, errors: NodeErrors
 ) -> Engine:
     """Return the board; DeviceError or SimulatorError where what it needs is not there."""
+    board, imu = hardware.board, hardware.built_for or hardware.imu
     if board is BoardKind.NATIVE:
         return NativeEngine(
             bus,
@@ -238,13 +261,15 @@ def make_engine(
             node,
             clock=errors.clock,
             power_on_us=errors.power_on_us,
+            library=build(imu=str(imu)),
             stored_id=True,
         )
     # Only here: the simulator's library is needed by AVR boards alone.
     from .avr import BOARDS, AvrEngine, read_firmware
     from .avr.budget import default_build_folder, find_firmware
 
-    firmware = read_firmware(find_firmware(str(board), default_build_folder()))
+    name = f"{board}-mpu9250" if imu is ImuKind.MPU9250 else str(board)
+    firmware = read_firmware(find_firmware(name, default_build_folder()))
     return AvrEngine(
         BOARDS[str(board)],
         firmware,

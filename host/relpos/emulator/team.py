@@ -26,7 +26,15 @@ from .air import STEP_US, RadioAir, UwbAir, UwbModel, VirtualClock
 from .faults import FaultSpec, parse_faults
 from .faults.boards import faulty_clock
 from .faults.injection import inject
-from .node import BoardKind, EmulatedNode, NodeErrors, draw_node_errors, draw_uncalibrated_errors
+from .node import (
+    BoardKind,
+    EmulatedNode,
+    Hardware,
+    ImuKind,
+    NodeErrors,
+    draw_node_errors,
+    draw_uncalibrated_errors,
+)
 from .pozyx import Pozyx
 from .surroundings import Surroundings
 from .xbee import XbeeModule, line_time_us
@@ -66,6 +74,9 @@ class TeamConfig:
     collisions: bool = True
     configured: bool = True
     node_errors: Callable[[int, int], NodeErrors] | None = None
+    imu: ImuKind | str = ImuKind.MPU9150
+    built_for: ImuKind | str | None = None
+    """The sensor that the firmware is built for, where that is not ``imu``."""
 
     def errors_of(self, node: int) -> NodeErrors:
         """How the node's chips and clock differ from the ideal."""
@@ -109,7 +120,7 @@ class EmulatedTeam:
         try:
             for walker in walkers:
                 errors = faulty_clock(config.errors_of(walker.node), walker.node, specs)
-                self._add(walker, config.board, errors, config.configured)
+                self._add(walker, config, errors)
             inject(self, specs, seed)
             if config.beacons:
                 self._beacons = BeaconSchedule(self.walkers)
@@ -119,9 +130,7 @@ class EmulatedTeam:
             self.close()
             raise
 
-    def _add(
-        self, walker: WalkerTruth, board: BoardKind | str, errors: NodeErrors, configured: bool
-    ) -> None:
+    def _add(self, walker: WalkerTruth, config: TeamConfig, errors: NodeErrors) -> None:
         surroundings = Surroundings(
             rate_hz=RATE_HZ,
             specific_force_m_s2=walker.specific_force_m_s2,
@@ -129,8 +138,10 @@ class EmulatedTeam:
             magnetic_field_ut=walker.magnetic_field_ut,
             pressure_pa=walker.pressure_pa,
         )
+        built_for = None if config.built_for is None else ImuKind(config.built_for)
+        hardware = Hardware(BoardKind(config.board), ImuKind(config.imu), built_for)
         node = EmulatedNode(
-            walker.node, board, surroundings, errors, self.clock, self.uwb, self.radio
+            walker.node, hardware, surroundings, errors, self.clock, self.uwb, self.radio
         )
         self.nodes[walker.node] = node
         self.uwb.tags.append(node.tag)
@@ -140,7 +151,7 @@ class EmulatedTeam:
         if self.key != wire.DEFAULT_KEY:
             at_us = errors.power_on_us + SET_UP_AFTER_US - 200_000
             node.set_key(self.key, 0xFE00, at_us)
-        if configured:
+        if config.configured:
             at_us = errors.power_on_us + SET_UP_AFTER_US
             leg_mm = round(LEG_OF_STATURE * walker.person.stature_m * 1000.0)
             settings = (

@@ -73,11 +73,15 @@ class NodeDialogue:
             if answer.node == self.node:
                 self._answers[answer.token] = answer
 
-    def heard(self) -> list[int]:
-        """Return the nodes heard within :data:`SILENT_S`."""
-        until_s = time.monotonic() + SILENT_S
+    def pause(self, seconds: float) -> None:
+        """Process what arrives for that long."""
+        until_s = time.monotonic() + seconds
         while time.monotonic() < until_s:
             self.listen()
+
+    def heard(self) -> list[int]:
+        """Return the nodes heard within :data:`SILENT_S`."""
+        self.pause(SILENT_S)
         return sorted(self.link.decoder.nodes)
 
     def totals(self) -> Mapping[str, Any] | None:

@@ -32,9 +32,13 @@ from relpos.errors import RelposError
 
 TICK_CYCLES = 320_000
 """One 50 Hz tick at 16 MHz."""
-SUCCESSOR = "uno-mpu9250"
-"""The Uno with firmware for the MPU-9150's successors."""
-ENVIRONMENTS = {"uno": "uno", "mega": "megaatmega2560", SUCCESSOR: "uno_mpu9250"}
+ENVIRONMENTS = {
+    "uno": "uno",
+    "mega": "megaatmega2560",
+    "uno-mpu9250": "uno_mpu9250",
+    "mega-mpu9250": "megaatmega2560_mpu9250",
+}
+"""PlatformIO's, of each board with each sensor."""
 STEP_US = 250_000
 
 
@@ -55,7 +59,7 @@ BUDGETS = {
     # The Mega holds the same firmware: its own limits less its boot loader and the same reserve.
     "mega": Budget(248 * 1024, 8192 - (2048 - 1920), 0.45, 0.25),
 }
-BUDGETS[SUCCESSOR] = BUDGETS["uno"]
+BUDGETS |= {f"{board}-mpu9250": budget for board, budget in BUDGETS.items()}
 
 
 @dataclass(frozen=True)
@@ -122,7 +126,7 @@ def measure(
     """Run the firmware for so many seconds of normal service and measure what it takes."""
     firmware = read_firmware(elf)
     kind = BOARDS[board.partition("-")[0]]
-    with Service(kind, firmware, seconds, seed, successor=board == SUCCESSOR) as service:
+    with Service(kind, firmware, seconds, seed, successor="-" in board) as service:
         until_us = 0
         while until_us < seconds * 1e6:
             until_us = min(until_us + STEP_US, round(seconds * 1e6))

@@ -1,0 +1,172 @@
+"""`relpos node check`: a healthy node is right in every line, and each fault is named by one."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from tests.support.emulated_line import EmulatedLine
+from typer.testing import CliRunner
+
+from relpos.cli import node_dialogue
+from relpos.cli.main import app
+from relpos.emulator.avr.library import missing_parts
+from relpos.emulator.faults import FAULTS
+from relpos.emulator.pozyx import FUNCTION_STRETCH_US
+from relpos.emulator.team import EmulatedTeam, TeamConfig
+from relpos.errors import DeviceError
+from relpos.link import dialogue, port
+from relpos.link.authentication import HostCounter
+from relpos.link.dialogue import open_dialogue
+from relpos.link.port import Link
+from relpos.nodes.bringup import Finding, NodeCheck, bus_access, check, radio
+from relpos.nodes.bringup import finding as finding_names
+
+MISSING = missing_parts()
+ROOT = Path(__file__).resolve().parents[2]
+SPACING_M = 5.0
+SEED = 3
+
+
+@contextmanager
+def emulated(
+    monkeypatch: pytest.MonkeyPatch, *faults: str, **team: object
+) -> Iterator[EmulatedLine]:
+    """The port of two nodes on a bench, on whose clock the check runs."""
+    config = TeamConfig("bench", 2, 120.0, SEED, faults=faults, **team)  # type: ignore[arg-type]
+    with EmulatedTeam(config) as made:
+        line = EmulatedLine(made)
+        line.clock_of(monkeypatch, dialogue, port, bus_access, check, radio)
+        made.run(3_000_000)
+        yield line
+
+
+@contextmanager
+def checked(monkeypatch: pytest.MonkeyPatch, *faults: str, **team: object) -> Iterator[NodeCheck]:
+    """A check of node 1."""
+    with emulated(monkeypatch, *faults, **team) as line:
+        link = Link(counter=HostCounter(lambda: 1.8e9 + line.team.time_us * 1e-6))
+        yield NodeCheck(open_dialogue(line, 1, link), distance_m=SPACING_M)
+
+
+@pytest.mark.parametrize("imu", ["mpu9150", "mpu9250"])
+def test_a_healthy_node_is_right_in_every_line(monkeypatch: pytest.MonkeyPatch, imu: str) -> None:
+    with checked(monkeypatch, imu=imu) as node:
+        findings = list(node.findings())
+    assert [finding for finding in findings if not finding.right] == []
+    parts = {finding.part for finding in findings}
+    assert parts == {value for name, value in vars(finding_names).items() if name.isupper()}
+    assert node.figures["range_m"] == pytest.approx(SPACING_M, abs=1.0)
+    assert node.figures["sample_rate_hz"] == pytest.approx(50.0, rel=0.015)
+
+
+@pytest.mark.parametrize(
+    ("fault", "part", "words"),
+    [
+        ("imu:off", "inertial sensor", "no answer"),
+        ("imu:stuck", "samples", "never change"),
+        ("imu:garbage:value=random", "inertial sensor", "differently"),
+        ("imu:garbage:value=zeros", "inertial sensor", "0x00"),
+        ("imu:garbage:value=ones", "inertial sensor", "0xFF"),
+        ("imu:wrong:value=25", "gyroscope", "at rest"),
+        ("imu:slow", "samples", "2[45].* a second"),
+        ("imu:delayed", "samples", "ms late"),
+        ("imu:intermittent", "inertial sensor", "not answered"),
+        ("imu:brownout:from=22", "inertial sensor", "has restarted"),
+        ("magnetometer:off", "compass", "no answer"),
+        ("magnetometer:stuck", "compass", "never change"),
+        ("magnetometer:garbage:value=random", "compass", "differently"),
+        ("magnetometer:wrong", "compass", "a field of"),
+        ("magnetometer:slow", "compass", "not ready in time"),
+        ("magnetometer:intermittent", "compass", "not answered"),
+        ("pozyx:off", "Pozyx", "no answer"),
+        ("pozyx:stuck", "ranging", "no new distance"),
+        ("pozyx:garbage:value=random", "Pozyx", "differently"),
+        ("pozyx:wrong", "ranging", "laid out: 5 m"),
+        ("pozyx:slow", "ranging", "takes over"),
+        ("pozyx:delayed", "ranging", "takes over"),
+        ("pozyx:intermittent", "Pozyx", "not answered"),
+        ("pozyx:inverted", "ranging", "success as failure"),
+        ("pozyx:brownout:from=6", "Pozyx", "has restarted"),
+        ("xbee:stuck", "XBee radio", "takes no command"),
+        ("xbee:wrong", "XBee radio", "not confirmed"),
+        ("xbee:slow", "XBee radio", "not confirmed"),
+        ("xbee:delayed", "XBee radio", "round trip takes 3"),
+        ("xbee:intermittent", "XBee radio", "to be repeated"),
+        ("xbee:bitflip", "XBee radio", "to be repeated"),
+        ("xbee:truncate", "XBee radio", "to be repeated"),
+        ("xbee:duplicate", "XBee radio", "to be repeated"),
+        ("xbee:brownout:from=12", "XBee radio", "unasked"),
+        ("bus:stuck:line=scl", "I2C bus", "no chip answers"),
+        ("bus:stuck:line=sda,from=12", "I2C bus", "failed during the check"),
+        ("bus:nack", "I2C bus", "at several chips"),
+        ("bus:nack:part=data", "I2C bus", "at several chips"),
+    ],
+)
+def test_each_fault_is_named(
+    monkeypatch: pytest.MonkeyPatch, fault: str, part: str, words: str
+) -> None:
+    keys = fault.split(":")[2:]
+    spec = ":".join((*fault.split(":")[:2], ",".join((*keys, "node=1"))))
+    found: list[Finding] = []
+    with checked(monkeypatch, spec) as node:
+        for finding in node.findings():
+            found.append(finding)
+            if finding.right is False and finding.part == part and re.search(words, finding.found):
+                assert finding.remedy
+                return
+    pytest.fail(str(found))
+
+
+def test_each_fault_of_a_part_that_is_checked_has_a_test() -> None:
+    marks = test_each_fault_is_named.pytestmark  # type: ignore[attr-defined]
+    tested = {":".join(case[0].split(":")[:2]) for case in marks[0].args[1]}
+    parts = ("imu", "magnetometer", "pozyx", "xbee", "bus")
+    # A module that is off, or whose line is noise, is not heard at all.
+    unheard = {"xbee:off", "xbee:garbage"}
+    assert tested | unheard == {fault.name for fault in FAULTS if fault.target in parts}
+
+
+@pytest.mark.parametrize("fault", ["xbee:off", "xbee:garbage"])
+def test_a_node_that_is_not_heard_is_told(monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
+    with (
+        pytest.raises(DeviceError, match="node 1 is not heard"),
+        checked(monkeypatch, f"{fault}:node=1"),
+    ):
+        pass
+
+
+@pytest.mark.skipif(MISSING is not None, reason=str(MISSING))
+def test_the_page_shows_a_builders_session_on_a_simulated_uno_with_weak_pull_ups(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    built = subprocess.run(
+        [ROOT / "tools" / "pio", "run", "-e", "uno"], capture_output=True, text=True, check=False
+    )
+    assert built.returncode == 0, built.stdout[-2000:] + built.stderr[-2000:]
+    report = tmp_path / "report.json"
+    with emulated(monkeypatch, board="uno") as line:
+        line.team.nodes[1].bus.rise_ns = 700
+        monkeypatch.setattr(node_dialogue, "open_device", lambda *_: line)
+        done = CliRunner().invoke(
+            app,
+            ["node", "check", "PORT", "--node", "1", "--distance", "5", "--report", str(report)],
+        )
+    assert done.exit_code == 1
+    page = (ROOT / "docs" / "nodes.md").read_text()
+    shown = page.partition("<!-- check -->\n```\n")[2].partition("```\n<!-- /check -->")[0]
+    # In words to the letter; figures depend on the compiler a little.
+    number = re.compile(r"\d+(?:\.\d+)?")
+    assert number.sub("#", done.stdout) == number.sub("#", shown)
+    measured, printed = ([float(word) for word in number.findall(s)] for s in (done.stdout, shown))
+    assert measured == pytest.approx(printed, rel=0.15, abs=3.0)
+    written = json.loads(report.read_text())
+    assert [line["part"] for line in written["findings"] if not line["right"]] == ["I2C bus"]
+    assert written["figures"]["bus_rise_ns"] == pytest.approx(700.0, rel=0.1)
+    for stretch_us in written["figures"]["pozyx_stretch_us"]:
+        assert stretch_us == pytest.approx(FUNCTION_STRETCH_US, abs=10.0)
