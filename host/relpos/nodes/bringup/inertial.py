@@ -222,7 +222,7 @@ def _lag_s(dialogue: NodeDialogue, bus: BusAccess, response: float) -> float:
         dialogue.pause(SETTLE_S)
         before = bus.word(ADDRESS, RATE_WORDS[0])
         begun = bus.write(ADDRESS, GYRO_CONFIG, ON)
-        lag_s = 0.0
+        lag_s = 0.0  # where a repeated command makes the first look too late, it says nothing
         while begun is not None and before is not None:
             now = bus.transfer(ADDRESS, RATE_WORDS[0], read=2)
             if not now.answered:
@@ -233,4 +233,4 @@ def _lag_s(dialogue: NodeDialogue, bus: BusAccess, response: float) -> float:
                 break
             lag_s = since_s
         lags.append(lag_s)
-    return min(lags)
+    return max(lags)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from statistics import median
 
@@ -15,6 +16,8 @@ PINGS = 24
 FIRST_PINGS = 4
 HELD_S = 0.5
 """A round trip takes a tenth of a second."""
+LOST_SHARE = 0.15
+"""Of the node's frames: below it no command had to wait because an answer was lost."""
 REPEATED_SHARE = 0.25
 """At 2 % loss each way one in 25 is repeated."""
 UNCONFIRMED_SHARE = 0.3
@@ -23,6 +26,8 @@ UNCONFIRMED_SHARE = 0.3
 def radio_findings(dialogue: NodeDialogue, figures: dict[str, object]) -> Iterator[Finding]:
     """Ping the node; where that is wrong, nothing else can be checked by radio."""
     trips: list[float] = []
+    counts = dialogue.link.decoder.nodes[dialogue.node].counts
+    before = Counter(counts)
     for _ in range(PINGS):
         begin_s = time.monotonic()
         try:
@@ -41,7 +46,8 @@ def radio_findings(dialogue: NodeDialogue, figures: dict[str, object]) -> Iterat
             break
     repeated = sum(trip > 0.9 * ANSWER_S for trip in trips)
     figures |= {"round_trip_s": median(trips), "repeated_commands": [repeated, len(trips)]}
-    if min(trips) > HELD_S:
+    lost, received = (counts[name] - before[name] for name in ("lost", "received"))
+    if min(trips) > HELD_S and lost < LOST_SHARE * (lost + received):
         yield Finding(
             RADIO,
             False,

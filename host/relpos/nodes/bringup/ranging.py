@@ -21,7 +21,7 @@ TESTED = 0x3F
 """Its sensors, its processor, its pressure sensor and UWB (register ST_RESULT)."""
 PLAUSIBLE_PA = (60_000.0, 110_000.0)
 """From 4,000 m to below the sea."""
-EXCHANGES = 8
+EXCHANGES = 10
 GIVE_UP_S = 1.5
 LATE_S = 0.06
 """An exchange takes 20 to 30 ms."""
@@ -194,4 +194,6 @@ def _range(bus: BusAccess, found: BusFindings, peer: int) -> Exchange | None:
     on_since_s = call.at_s - (after | row(5) << 16) * 1e-3
     distance_m = (row(7) | row(9) << 16) * 1e-3
     rss = int.from_bytes(row(11).to_bytes(2, "little"), "little", signed=True)
+    if outcome == GOOD and row(3) != after:
+        return None  # the peer has ranged meanwhile: what was read is not one exchange's
     return Exchange(outcome, late_s, code, stretch_us, distance_m, rss, on_since_s)
