@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -64,6 +65,24 @@ def test_a_firmware_that_does_nothing_is_not_within_budget(
     place(Builder(tmp_path).elf("int main(void) { for (;;); }"), tmp_path)
     assert main(["--board", "uno", "--seconds", "5", "--build", str(tmp_path)]) == 1
     assert "uno: only 0 ticks in 5 s" in capsys.readouterr().err
+
+
+def test_what_another_compiler_has_built_is_measured_beside_ours(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    elf = Builder(tmp_path).elf("int main(void) { for (;;); }")
+    folders = [tmp_path / "ours", tmp_path / "theirs"]
+    for folder in folders:
+        place(elf, folder)
+    theirs = folders[1] / "uno" / "firmware.elf"
+    version = rb"GCC: \(GNU\) [0-9.]+"
+    theirs.write_bytes(re.sub(version, b"GCC: (GNU) 7.3.0", theirs.read_bytes()))
+    monkeypatch.setattr(budget, "build_folders", lambda: folders)
+    assert main(["--board", "uno", "--seconds", "5"]) == 1
+    captured = capsys.readouterr()
+    ours, other = re.findall(r"Firmware on simavr, avr-gcc ([0-9.]+)", captured.out)
+    assert other == "7.3.0" != ours
+    assert captured.err.count("uno: only 0 ticks in 5 s") == 2
 
 
 def test_a_firmware_that_crashes_is_one_line(

@@ -11,6 +11,7 @@ inertial library and two published orientation filters take alone on the Uno's c
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -96,16 +97,28 @@ class Cost:
         return self.mean_tick_cycles / TICK_CYCLES
 
 
-def default_build_folder() -> Path:
-    """Where PlatformIO builds: tools/pio into .build/pio, a user's own pio into .pio.
+def build_folders() -> list[Path]:
+    """Where PlatformIO has built: tools/pio in .build/pio, a user's own, other compiler in .pio.
 
     SimulatorError in an installed package, which has neither.
     """
     root = paths.repository()
     if root is None:
         raise SimulatorError(NOT_INSTALLED)
-    ours = paths.build_folder() / "pio" / "build"
-    return ours if ours.is_dir() else root / ".pio" / "build"
+    theirs = root / ".pio" / "build"
+    here = [f for f in (paths.build_folder() / "pio" / "build", theirs) if f.is_dir()]
+    return here or [theirs]
+
+
+def default_build_folder() -> Path:
+    """The first of :func:`build_folders`."""
+    return build_folders()[0]
+
+
+def compiler(elf: Path) -> str:
+    """Return what the program was compiled with, as its compiler has written it there."""
+    found = re.search(rb"GCC: \(GNU\) ([0-9.]+)", elf.read_bytes())
+    return f"avr-gcc {found[1].decode()}" if found else "an unknown compiler"
 
 
 def find_firmware(board: str, folder: Path) -> Path:
@@ -165,9 +178,9 @@ def measure(
     )
 
 
-def table(costs: Sequence[Cost]) -> Table:
+def table(costs: Sequence[Cost], compiled_with: str) -> Table:
     """Costs beside budgets, one column a board."""
-    shown = Table(title="Firmware on simavr")
+    shown = Table(title=f"Firmware on simavr, {compiled_with}")
     shown.add_column("")
     for cost in costs:
         shown.add_column(cost.board, justify="right")
@@ -251,26 +264,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     given = parser.parse_args(arguments)
     boards: list[str] = given.board or list(BUDGETS)
-    folder: Path = given.build or default_build_folder()
+    console = Console()
+    more: list[Table] = []
+    faults: list[str] = []
     try:
+        folders: list[Path] = [given.build] if given.build else build_folders()
         if not 5.0 <= given.seconds <= 3600.0:
             raise SimulatorError(f"a walk lasts 5 to 3600 seconds, not {given.seconds:g}")
-        files = {board: find_firmware(board, folder) for board in boards}
-        costs = _measure_all(files, given.seconds, given.seed)
-        more = []
+        for folder in folders:
+            # A user's own build has the boards that the user has built.
+            here = [
+                b for b in boards if folder == folders[0] or (folder / ENVIRONMENTS[b]).is_dir()
+            ]
+            files = {board: find_firmware(board, folder) for board in here}
+            if not files:
+                continue
+            costs = _measure_all(files, given.seconds, given.seed)
+            console.print(table(costs, compiler(files[here[0]])))
+            for cost in costs:
+                console.print(f"{cost.board}: {cost.work}", highlight=False)
+            faults += [f"{cost.board}: {fault}" for cost in costs for fault in cost.faults]
+            if given.filters and folder == folders[0]:
+                more = [plan_table(cost) for cost in costs if cost.board == "uno"]
         if given.filters:
-            more = [plan_table(cost) for cost in costs if cost.board == "uno"]
             more.append(filters.comparison(given.seconds, given.seed))
     except RelposError as error:
         print(f"budget: {error}", file=sys.stderr)
         return 1
-    console = Console()
-    console.print(table(costs))
-    for cost in costs:
-        console.print(f"{cost.board}: {cost.work}", highlight=False)
     for shown in more:
         console.print(shown)
-    faults = [f"{cost.board}: {fault}" for cost in costs for fault in cost.faults]
     for fault in faults:
         print(f"budget: {fault}", file=sys.stderr)
     return 1 if faults else 0
