@@ -114,7 +114,7 @@ def test_notes_are_in_the_log_with_names_and_in_no_ones_way(visit: Any, stage: S
     stage.team.notices = (Notice("n", Level.INFO, note, 1.0), disk_full())
     assert stage.web is not None
     stage.web.logged(LogEntry(1.0, 1.7e9, "note", note, 3))
-    stage.web.logged(LogEntry(2.0, 1.7e9, "acknowledged", "alarm of Ben", 2, "Anna"))
+    stage.web.logged(LogEntry(2.0, 1.7e9, "acknowledge", "alarm of Ben", 2, "Anna"))
     page = visit()
     wait_live(page)
     expect(page.locator("#notices p")).to_have_count(1)

@@ -444,6 +444,7 @@ def fuse_live(
         emulated=emulated is not None,
         seconds=options.seconds,
         lasts=options.watched or (options.shown and source.is_now),
+        mission=options.mission,
     )
     session = live.run(source, plan, options)
     failure = session.failure

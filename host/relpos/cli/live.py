@@ -16,7 +16,7 @@ from relpos.cli import output
 from relpos.cli.keys import make_link
 
 if TYPE_CHECKING:
-    from relpos.live.assembly import MakeSink, SessionPlan
+    from relpos.live.assembly import MakeSink, MissionPlan, SessionPlan
     from relpos.live.inputs import Input
     from relpos.live.session import Outcome
     from relpos.live.sinks import Sink
@@ -113,6 +113,8 @@ class Options:
     """The terminal is drawn upon: nothing else may be printed until the session is over."""
     record: Path | None = None
     foxglove: str | None = None
+    mission: MissionPlan | None = None
+    """Its key signs its devices' tokens."""
 
     @property
     def shown(self) -> bool:
@@ -241,16 +243,19 @@ def cot_sink(url: str, pins: Sequence[str], *, replayed: bool) -> MakeSink:
 def _open_page(options: Options, hello: Hello) -> WebView:
     """Serve the page, print its address, and open it on a desktop."""
     from relpos.view import access as doors
+    from relpos.view.devices import Role
     from relpos.view.web import WebView
 
     door, access = doors.listen(options.view_listen)
+    access = replace(access, key=None if options.mission is None else options.mission.folder.key)
     if options.https:
         access = replace(access, certificate=doors.make_certificate(access.hosts))
     page = WebView(door, access, hello)
     output.remark(f"the team's page: {access.url()}")
     if access.reachable:
-        output.remark(f"the wearers' page, for their phones: {access.url('/phone')}")
-        output.remark(doors.qr_terminal(access.url("/phone")))
+        if options.mission is None:
+            output.remark(f"the wearers' page, for their phones: {access.url('/phone')}")
+        output.remark(doors.qr_terminal(access.url("/phone", role=Role.ACKNOWLEDGE)))
     else:
         output.remark("for phones and other computers: --view-listen 0.0.0.0")
     wanted = options.open_browser

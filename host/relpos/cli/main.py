@@ -23,6 +23,7 @@ from relpos.cli import (
     evaluate,
     figures,
     fuse,
+    mission,
     node,
     report,
     simulate,
@@ -83,6 +84,7 @@ def main(
 app.command("demo", epilog=help_text())(demo.demo)
 app.command("emulate", epilog=help_text())(emulate.emulate)
 app.command("fuse", cls=fuse.FuseCommand)(fuse.fuse)
+app.command("mission")(mission.mission)
 app.command("simulate")(simulate.simulate)
 app.command("evaluate")(evaluate.evaluate)
 app.command("convert")(convert.convert)

@@ -245,6 +245,19 @@ class Decoder:
             ranges.append(Range(time_s, node, entry["peer"], range_m, float(entry["rss_dbm"])))
         return ranges
 
+    def expect_from_start(self) -> None:
+        """Forget earlier sessions' counters: what is read next is of before they were stored."""
+        self._newest_counters.clear()
+
+    def expect_after(self, counters: Mapping[int, int]) -> None:
+        """Reject frames up to these counters from now on, as from an earlier session."""
+        for node, newest in counters.items():
+            track = self.nodes.get(node)
+            if track is None:
+                self._newest_counters[node] = newest
+            elif track.window.newest < newest:
+                track.window = CounterWindow.after(newest)
+
     def _track(self, frame: wire.Frame, arrival_s: float) -> NodeTrack | None:
         """Return the node's track and store the counter if the frame is new; else None."""
         track = self.nodes.get(frame.node)

@@ -62,6 +62,16 @@ class _WearerState:
         return self.report_s - self.still_since_s + min(self.since_report_s, REPORT_S)
 
 
+@dataclass
+class KnownAlert:
+    """An alert of a session before: when it was raised, and who has seen it."""
+
+    alert: Alert
+    raised_s: float
+    seen: bool = False
+    by: str = ""
+
+
 @dataclass(frozen=True, slots=True)
 class Condition:
     """A wearer's movement, silence and alert."""
@@ -98,6 +108,18 @@ class Alarms:
         """Alerts that have come or gone: node, before, after; emptied by the reader."""
         self._states: dict[int, _WearerState] = {}
         self._ticked_s: float | None = None
+
+    def remember(self, node: int, heard_s: float, now_s: float, known: KnownAlert | None) -> None:
+        """Go on from a session before: last heard at ``heard_s``, with that alert."""
+        state = self._states.setdefault(node, _WearerState())
+        state.silent_s = max(now_s - heard_s, 0.0)
+        state.report_s = state.still_since_s = heard_s
+        if known is None:
+            return
+        state.alert, state.acknowledged, state.acknowledged_by = known.alert, known.seen, known.by
+        if known.alert is not Alert.LOST:
+            limit_s = STILL_ALARM_S if known.alert is Alert.STILL_ALARM else STILL_WARNING_S
+            state.still_since_s = min(known.raised_s - limit_s, heard_s)
 
     def mark_heard(self, node: int) -> None:
         """Note that any frame came from the node."""

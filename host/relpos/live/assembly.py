@@ -12,6 +12,7 @@ from relpos.live.composer import Composer
 from relpos.live.files import FileSink
 from relpos.live.fusion_thread import FusionThread, MakeEstimator
 from relpos.live.inputs import Input
+from relpos.live.mission import JOURNAL, Journal, Mission, MissionFiles, Resumed
 from relpos.live.session import LiveSession, Outcome
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Hello, Level
@@ -20,6 +21,14 @@ from relpos.runs import Description
 
 MakeSink = Callable[[Hello], Sink]
 """Makes a sink once the name, source and start of the session are known."""
+
+
+@dataclass(frozen=True)
+class MissionPlan:
+    """A mission that the session belongs to, and what its sessions so far have left behind."""
+
+    folder: Mission
+    resumed: Resumed
 
 
 @dataclass(frozen=True)
@@ -44,6 +53,7 @@ class SessionPlan:
     emulated: bool = False
     seconds: float | None = None
     lasts: bool = False
+    mission: MissionPlan | None = None
 
 
 def run_session(
@@ -72,15 +82,23 @@ def run_session(
     fusion = FusionThread(plan.make_estimator, plan.priors, common=plan.common)
     files = FileSink(plan.out, plan.description, keep_received=source.is_now)
     nodes = plan.description.nodes
+    sinks: list[Sink] = [files, *(make(hello) for make in make_sinks)]
+    kept = plan.mission
+    journal = None if kept is None else Journal(kept.folder.path / JOURNAL)
     session = LiveSession(
         source,
         fusion,
         Composer({node: info.name for node, info in nodes.items() if info.name}),
-        [files, *(make(hello) for make in make_sinks)],
+        sinks,
         seconds=plan.seconds,
         lasts=plan.lasts,
         remark=remark,
     )
+    if kept is not None and journal is not None:
+        session.keep(journal, kept.resumed)
+        session.add_sink(MissionFiles(kept.folder, journal, kept.resumed.since_s))
+        for sink in sinks:
+            sink.resumed(kept.resumed.tracks)
     link = source.link
     if source.is_now and not plan.emulated and link is not None and link.keyless:
         remark(KEYLESS)

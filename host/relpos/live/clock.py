@@ -14,12 +14,12 @@ def _read_s() -> float:
 
 
 class SessionClock:
-    """Seconds since its creation, sleep included; ``started_unix_s`` is the Unix time of zero."""
+    """Seconds since ``started_unix_s``, or its creation, sleep included."""
 
-    def __init__(self) -> None:
-        self._zero_s = _read_s()
-        self.started_unix_s = time.time()
+    def __init__(self, started_unix_s: float | None = None) -> None:
+        self.started_unix_s = time.time() if started_unix_s is None else started_unix_s
+        self._zero_s = _read_s() - (time.time() - self.started_unix_s)
 
     def __call__(self) -> float:
-        """Return the seconds since creation."""
+        """Return the seconds since then."""
         return _read_s() - self._zero_s

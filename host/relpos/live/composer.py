@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from relpos.fusion.estimator import Estimate, MagneticNorth, NodeEstimate, NodeStatus
-from relpos.live.alarms import Alarms, Condition
+from relpos.live.alarms import Alarms, Condition, KnownAlert
 from relpos.live.nowcast import Nowcast
 from relpos.live.team_view import (
     Alert,
@@ -130,6 +130,11 @@ class Composer:
             ranges=self._measured(now_s),
             alternatives=() if estimate is None else _ghosts(estimate),
         )
+
+    def remember(self, node: int, heard_s: float, now_s: float, alert: KnownAlert | None) -> None:
+        """Go on with a person of a session before, heard from now or not: nobody is left out."""
+        self.monitor.nodes.setdefault(node, NodeMonitor(node, heard_s=heard_s))
+        self.alarms.remember(node, heard_s, now_s, alert)
 
     def name(self, node: int) -> str:
         """Return the name of the node's wearer."""

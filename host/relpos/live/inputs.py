@@ -9,7 +9,7 @@ from __future__ import annotations
 import select
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -33,11 +33,15 @@ REOPEN_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """Bytes that arrived together, and the observations in them; a recorded run has no bytes."""
+    """Bytes that arrived together, and the observations in them; a recorded run has no bytes.
+
+    ``again``: read from the recording of a session before, which has recorded it already.
+    """
 
     arrival_s: float
     data: bytes
     observations: Sequence[Observation]
+    again: bool = False
 
 
 class Input(Protocol):
@@ -81,9 +85,9 @@ class Input(Protocol):
 class PortInput:
     """A live team behind a serial port; sends it beacons.
 
-    With ``teach`` the nodes get the step scales that the estimator learns. With ``reopen`` a port
-    that vanishes is tried again each second; otherwise it is a DeviceError, as is a port that
-    cannot be opened at first.
+    What came before (``earlier``) is read first. With ``teach`` the nodes get the step scales that
+    the estimator learns. With ``reopen`` a port that vanishes is tried again each second; otherwise
+    it is a DeviceError, as is a port that cannot be opened at first.
     """
 
     is_now = True
@@ -98,7 +102,10 @@ class PortInput:
         clock: SessionClock | None = None,
         teach: bool = True,
         reopen: bool = False,
+        earlier: Iterable[Received] = (),
     ) -> None:
+        self._earlier: Iterator[Received] | None = iter(earlier)
+        self._earlier_s: float | None = None
         self.name = port
         self._link: Link = link
         self.clock = clock or SessionClock()
@@ -119,6 +126,12 @@ class PortInput:
 
     def read(self, timeout_s: float) -> Received | None:
         """Send what is due to the nodes, then wait for bytes."""
+        if self._earlier is not None:
+            received = next(self._earlier, None)
+            self._earlier_s = None if received is None else received.arrival_s
+            if received is not None:
+                return received
+            self._earlier = None
         if self._device is None and not self._open_again():
             time.sleep(min(timeout_s, REOPEN_S))
             return None
@@ -131,9 +144,9 @@ class PortInput:
         if not data:
             return None
         arrival_s = self.clock()
-        received = Received(arrival_s, data, self._link.feed(data, arrival_s))
+        came = Received(arrival_s, data, self._link.feed(data, arrival_s))
         self._save_counters()
-        return received
+        return came
 
     def _save_counters(self, *, at_once: bool = False) -> None:
         """Store the newest frame counters; a full disk is a remark, and tried again."""
@@ -153,7 +166,9 @@ class PortInput:
     def now_s(self) -> float:
         """Return the clock's time, or that of an emulated team which marks its own."""
         virtual_s = self._link.virtual_s
-        return self.clock() if virtual_s is None else virtual_s
+        if virtual_s is not None:
+            return virtual_s
+        return self.clock() if self._earlier_s is None else self._earlier_s
 
     def learn(self, estimate: Estimate) -> None:
         """Begin to send newly learned step scales to the nodes."""

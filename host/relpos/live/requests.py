@@ -57,6 +57,10 @@ class RequestHandler:
         self.counts: Counter[str] = Counter()
         """What was refused, and what failed, by name."""
 
+    def accept(self, ids: Sequence[str]) -> None:
+        """Note presses that a session before has accepted."""
+        self._accepted.update(dict.fromkeys(ids))
+
     def presses(self, request: Request) -> tuple[dict[str, Any], list[Observation]]:
         """Return the reply and the presses that are new."""
         new: list[Observation] = []

@@ -13,20 +13,23 @@ import signal
 import sys
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from typing import Any
 
 from relpos.fusion.estimator import Estimate, time_offsets
+from relpos.live.alarms import KnownAlert
 from relpos.live.composer import Composer
 from relpos.live.fusion_thread import FusionThread
 from relpos.live.inputs import Input, Received
+from relpos.live.mission import Journal, Resumed
 from relpos.live.notices import NoticeBoard
 from relpos.live.requests import Request, RequestHandler, RequestSource
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert, Level, LogEntry
-from relpos.measurements import Observation
+from relpos.measurements import Event, Observation
 
 VIEW_S = 0.05
 """At most twenty views a second: smooth for a walking person, and a twentieth of a second old."""
@@ -47,6 +50,9 @@ CLEARED = {
     Alert.STILL_ALARM: "moves again",
     Alert.LOST: "is heard again",
 }
+EVENTS = ("acknowledge", "shelve", "name", "device")
+"""Requests that change what a mission keeps."""
+LOGGED = ("acknowledge", "shelve", "name")
 SWITCH_S = 0.001
 """Python's thread switch interval: a packet does not wait for the fusion."""
 
@@ -108,6 +114,28 @@ class LiveSession:
         # Without a sink that shows it, no view is composed.
         self._shows = any(type(s).updated is not Sink.updated for s in self._sinks)
         self._finishing = False
+        self._journal: Journal | None = None
+        self._unconfirmed: deque[tuple[int, RequestSource, Request, dict[str, Any], int]] = deque()
+        """Answers that wait until the disk holds what they confirm."""
+        self._alerts: dict[int, KnownAlert] = {}
+        self._again_s = -math.inf
+        """Up to then estimates are those of a session before."""
+
+    def keep(self, journal: Journal, resumed: Resumed) -> None:
+        """Write what is confirmed to a mission's journal, and go on from what stands there."""
+        for event in resumed.events:
+            if event["kind"] == "log":
+                self._feed(lambda sink, e=event: sink.logged(LogEntry(**e["entry"])))  # type: ignore[misc]
+            else:
+                self._apply(event)
+        for node, heard_s in resumed.heard_s.items():
+            self._composer.remember(node, heard_s, resumed.since_s, self._alerts.get(node))
+        self._again_s = resumed.since_s
+        self._journal = journal
+
+    def add_sink(self, sink: Sink) -> None:
+        """Feed one more sink from now on."""
+        self._sinks.append(sink)
 
     def stop(self) -> None:
         """End the session soon; from any thread or signal handler."""
@@ -185,13 +213,18 @@ class LiveSession:
         now_s = self._source.now_s()
         self._arrived_unix_s = time.time()
         self.outcome.received += len(received.observations)
-        if received.data:
+        if received.again:
+            # What was between the sessions is no sleep.
+            self._watched_s = None
+        elif received.data:
             self._feed(lambda sink: sink.received(received.arrival_s, received.data))
         link = self._source.link
         decoder = link.decoder if link else None
         with self._surviving("view"):
             self._composer.add_observations(now_s, received.observations, decoder)
-        if received.observations:
+        if received.again:
+            self._fusion.submit(received.observations)
+        elif received.observations:
             self._submit(received.arrival_s, received.observations)
         self._changed = True
 
@@ -229,6 +262,7 @@ class LiveSession:
         now_s = self._source.now_s()
         self._collect_estimates()
         self._handle_requests()
+        self._confirm()
         for text in self._source.remarks():
             self._remark(text)
             self._notices.post_remark(text)
@@ -243,7 +277,8 @@ class LiveSession:
             self.outcome.last = fused.estimate
             with self._surviving("view"):
                 self._composer.add_estimate(fused.estimate, fused.processed)
-            self._feed(lambda sink, e=fused.estimate: sink.estimated(e))  # type: ignore[misc]
+            if fused.estimate.time_s > self._again_s:
+                self._feed(lambda sink, e=fused.estimate: sink.estimated(e))  # type: ignore[misc]
             with self._surviving("update"):
                 self._source.learn(fused.estimate)
             text = "; ".join(time_offsets(fused.estimate))
@@ -310,6 +345,7 @@ class LiveSession:
     def _log_alarms(self) -> None:
         changes, self._composer.alarms.changes = self._composer.alarms.changes, []
         for node, before, after in changes:
+            self._happen({"kind": "alert", "node": node, "alert": after})
             name = self._composer.name(node)
             if after is not None:
                 self.log("alarm", f"{name} {RAISED[after]}", node)
@@ -342,30 +378,27 @@ class LiveSession:
                     reply: tuple[dict[str, object], int] = {"error": "the session has failed"}, 500
                     with self._surviving("request"):
                         reply = self._reply(request)
-                    source.respond(request, *reply)
+                    number = 0 if self._journal is None else self._journal.newest
+                    self._unconfirmed.append((number, source, request, *reply))
                     self._changed = True
+
+    def _confirm(self) -> None:
+        """Answer what the disk holds by now: nothing that was confirmed is ever lost."""
+        while self._unconfirmed:
+            number, source, request, reply, status = self._unconfirmed[0]
+            if self._journal is not None and not self._journal.is_safe(number):
+                return
+            self._unconfirmed.popleft()
+            source.respond(request, reply, status)
 
     def _reply(self, request: Request) -> tuple[dict[str, object], int]:
         body = request.body
-        match request.kind:
-            case "acknowledge":
-                node, by = body["node"], body.get("by", "")
-                seen = self._composer.alarms.acknowledge(node, by)
-                if seen:
-                    self.log("acknowledged", f"alarm of {self._composer.name(node)}", node, by)
-                return {"acknowledged": seen}, 200
-            case "shelve":
-                node, by, for_s = body["node"], body.get("by", ""), body["seconds"]
-                done = self._composer.alarms.shelve(node, for_s)
-                text = f"alarms of {self._composer.name(node)} for {for_s:.0f} s"
-                self.log("shelved", text, node, by)
-                return {"shelved": done}, 200
-            case "name":
-                self._handler.names[body["node"]] = body["name"]
-                self._composer.names[body["node"]] = body["name"]
-                self.log("name", f"node {body['node']} is {body['name']}", body["node"])
-                self._feed(lambda sink: sink.named(dict(self._handler.names)))
-                return {"node": body["node"], "name": body["name"]}, 200
+        if request.kind in EVENTS:
+            node, by = body.get("node"), body.get("by", "")
+            done = self._happen({"kind": request.kind, **body})
+            if done and request.kind in LOGGED:
+                self.log(request.kind, self._words(request.kind, body), node, by)
+            return {"acknowledged": done} if request.kind == "acknowledge" else body, 200
         if not self._source.is_now:
             return {"error": "this is a recording: it takes no presses or headings"}, 409
         handle = self._handler.presses if request.kind == "presses" else self._handler.headings
@@ -373,7 +406,54 @@ class LiveSession:
         if new:
             self._composer.add_reported(new)
             self._submit(self._source.now_s(), new)
+        if request.kind == "presses" and new:
+            self._happen({"kind": "presses", "ids": reply["accepted"]})
+            for press in new:
+                if isinstance(press, Event):
+                    name = self._composer.name(press.node)
+                    self.log("landmark", f"{name} is at landmark {press.value}", press.node)
         return reply, 200
+
+    def _words(self, kind: str, body: dict[str, Any]) -> str:
+        if kind == "name":
+            return f"node {body['node']} is {body['name']}"
+        name = self._composer.name(body["node"])
+        if kind == "shelve":
+            return f"alarms of {name} for {body['seconds']:.0f} s"
+        return f"alarm of {name}"
+
+    # -- events: what the journal holds -----------------------------------------------------------
+
+    def _happen(self, event: dict[str, Any]) -> bool:
+        """Apply an event, and write it to the journal where there is one."""
+        event = {**event, "time_s": self._source.now_s(), "unix_s": time.time()}
+        done = self._apply(event)
+        if done and self._journal is not None:
+            self._journal.add(event)
+        return done
+
+    def _apply(self, event: dict[str, Any]) -> bool:
+        """Apply an event of now, or of a session before; return whether it changed anything."""
+        node = event.get("node", 0)
+        match event["kind"]:
+            case "name":
+                self._handler.names[node] = self._composer.names[node] = event["name"]
+                self._feed(lambda sink: sink.named(dict(self._handler.names)))
+            case "alert" if event["alert"] is None:
+                self._alerts.pop(node, None)
+            case "alert":
+                self._alerts[node] = KnownAlert(Alert(event["alert"]), event["time_s"])
+            case "acknowledge":
+                if node in self._alerts:
+                    self._alerts[node].seen, self._alerts[node].by = True, event.get("by", "")
+                return self._composer.alarms.acknowledge(node, event.get("by", ""))
+            case "shelve":
+                return self._composer.alarms.shelve(node, event["seconds"])
+            case "presses":
+                self._handler.accept(event["ids"])
+            case "device":
+                self._feed(lambda sink: sink.admitted(event))
+        return True
 
 
 @contextmanager

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from relpos.fusion.estimator import Estimate
     from relpos.live.team_view import LogEntry, TeamView
+    from relpos.live.tracks import Tracks
     from relpos.measurements import Observation
 
 
@@ -37,6 +38,12 @@ class Sink:
 
     def logged(self, entry: LogEntry) -> None:
         """Add a line to the session's log."""
+
+    def resumed(self, tracks: Tracks) -> None:
+        """Go on with the tracks of a mission's sessions before."""
+
+    def admitted(self, event: dict[str, Any]) -> None:
+        """Note that a device was let in (``id``, ``role``) or shut out (``revoked``)."""
 
     def trouble(self) -> str | None:
         """Return what the user must know ("disk full: ..."); None when all is well."""

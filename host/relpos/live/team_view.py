@@ -51,7 +51,7 @@ class Notice:
 class LogEntry:
     """A line of the session's log: what happened, to whom, by whom.
 
-    ``kind`` is ``note``, ``warning``, ``alarm``, ``cleared``, ``acknowledged``, ``shelved`` or
+    ``kind`` is ``note``, ``warning``, ``alarm``, ``cleared``, ``acknowledge``, ``shelve`` or
     ``name``; ``node`` is None where it concerns nobody in particular.
     """
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import ipaddress
 import re
 import secrets
@@ -13,6 +15,7 @@ from urllib.parse import urlencode
 
 from relpos.errors import DeviceError, RelposError
 from relpos.extras import missing_extra
+from relpos.view.devices import Gate, Role
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8460
@@ -36,10 +39,17 @@ class Access:
     hosts: tuple[str, ...]
     token: str = field(default_factory=lambda: secrets.token_urlsafe(TOKEN_BYTES))
     certificate: Certificate | None = None
+    key: bytes | None = None
+    """A mission's: then devices have tokens of their own (:mod:`relpos.view.devices`)."""
 
     @property
     def cookie(self) -> str:
-        """Name of the cookie: cookies are shared by all ports of a host, sessions are not."""
+        """Name of the cookie: cookies are shared by all ports of a host, sessions are not.
+
+        A mission's holds at another port, too.
+        """
+        if self.key is not None:
+            return f"relpos-{hashlib.sha256(self.key).hexdigest()[:8]}"
         return f"relpos-{self.port}"
 
     @property
@@ -47,12 +57,13 @@ class Access:
         """Whether anybody but this computer can reach it."""
         return not _is_loopback(self.hosts[0])
 
-    def url(self, path: str = "/", host: str | None = None) -> str:
-        """Address of a page, token included."""
+    def url(self, path: str = "/", host: str | None = None, role: Role = Role.COMMAND) -> str:
+        """Address of a page with the session's token, or a mission's with a code for one device."""
+        token = self.token if self.key is None else Gate(self.key).invite(role)
         scheme = "http" if self.certificate is None else "https"
         host = host or self.hosts[0]
         host = f"[{host}]" if ":" in host else host
-        return f"{scheme}://{host}:{self.port}{path}?{urlencode({'token': self.token})}"
+        return f"{scheme}://{host}:{self.port}{path}?{urlencode({'token': token})}"
 
     def is_own(self, host: str) -> bool:
         """Return whether a Host header names this computer.
@@ -125,7 +136,16 @@ def listen(address: str | None) -> tuple[socket.socket, Access]:
                 f"{host}:{port}: cannot listen there: {error.strerror or error}"
             ) from None
         listener = _bind(family, (where[0], 0, *where[2:]))
-    return listener, Access(int(listener.getsockname()[1]), _hosts(host))
+    return listener, Access(int(listener.getsockname()[1]), hosts_of(host))
+
+
+def free_port(host: str, wanted: int) -> int:
+    """Return the wanted port where it is free, else another one that is."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    for port in (wanted, 0):
+        with contextlib.suppress(OSError), _bind(family, (host, port)) as probe:
+            return int(probe.getsockname()[1])
+    return wanted
 
 
 def _bind(family: int, where: tuple[object, ...]) -> socket.socket:
@@ -146,7 +166,7 @@ def _bind(family: int, where: tuple[object, ...]) -> socket.socket:
     return listener
 
 
-def _hosts(host: str) -> tuple[str, ...]:
+def hosts_of(host: str) -> tuple[str, ...]:
     """Names that lead here, the one to print first."""
     if host not in ("0.0.0.0", "::", ""):
         return (host,)

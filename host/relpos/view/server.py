@@ -13,7 +13,6 @@ import asyncio
 import contextlib
 import json
 import math
-import re
 import signal
 import socket
 import tempfile
@@ -22,28 +21,26 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qsl, urlencode, urlsplit
 
 import uvicorn
 from starlette.applications import Starlette
-from starlette.datastructures import MutableHeaders
 from starlette.requests import HTTPConnection, Request
 from starlette.responses import (
     FileResponse,
-    HTMLResponse,
     JSONResponse,
     PlainTextResponse,
-    RedirectResponse,
     Response,
 )
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from relpos.live.team_view import to_json
 from relpos.live.tracks import Tracks
 from relpos.view.access import Access, Allowance, qr_svg
+from relpos.view.devices import Device, Role
+from relpos.view.guard import TokenMiddleware, role_of
 
 STATIC = Path(__file__).parent / "static"
 PING_S = 2.0
@@ -53,32 +50,15 @@ MAX_LINE_BYTES = 1 << 26
 MAX_BODY_BYTES = 1 << 20
 MAX_ITEMS = 2000
 """Presses, or headings, of one request."""
-COOKIE_S = 24 * 3600
-"""A mission; each session has its own token."""
 ALLOWED = {
     "presses": (20.0, 4000.0),
     "headings": (50.0, 4000.0),
     "name": (2.0, 100.0),
     "acknowledge": (2.0, 100.0),
     "shelve": (2.0, 20.0),
+    "device": (2.0, 50.0),
 }
 """Items that a visitor may send, per second and at once: a phone sends what it gathered offline."""
-
-REFUSED = """<!doctype html><html lang="en"><meta charset="utf-8">
-<meta name="viewport" content="width=device-width"><title>relpos</title>
-<h1>This address needs the session's token</h1>
-<p>The whole address, with the token, is printed in the terminal in which
-<code>relpos</code> runs, and shown as a QR code there and on the team's page. Each session has
-its own token.</p></html>"""
-
-NOT_OURS = "This name is not this computer's: use the address that relpos has printed."
-
-CONTENT_POLICY = (
-    "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
-    # Safari before 15.4 does not take 'self' for a socket of the same host.
-    "connect-src 'self' ws://{host} wss://{host}; object-src 'none'; base-uri 'none'; "
-    "form-action 'none'; frame-ancestors 'none'"
-)
 
 
 class SessionProxy:
@@ -94,6 +74,8 @@ class SessionProxy:
         self.tracks = Tracks()
         self.names: dict[str, str] = {}
         self.log: list[dict[str, Any]] = []
+        self.devices: dict[str, dict[str, Any]] = {}
+        """Every device that was ever let in, by its id, in a mission."""
         self._news = asyncio.Event()
         self.over = False
 
@@ -120,6 +102,9 @@ class SessionProxy:
             case "points":
                 for node, point in message["points"].items():
                     self.tracks.add(int(node), *point)
+            case "device":
+                event = message["event"]
+                self.devices.setdefault(event["id"], {}).update(event)
             case "log":
                 self.log += message["entries"]
             case "names":
@@ -169,80 +154,6 @@ class SessionProxy:
             self._answers.pop(number, None)
 
 
-class TokenMiddleware:
-    """Requires the token: in the address once, in a cookie from then on."""
-
-    def __init__(self, app: ASGIApp, access: Access) -> None:
-        self._app = app
-        self._access = access
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, refuse it, or set the cookie and redirect."""
-        if scope["type"] not in ("http", "websocket"):
-            await self._app(scope, receive, send)
-            return
-        asking = HTTPConnection(scope)
-        send = _with_headers(send, asking) if scope["type"] == "http" else send
-        if not self._access.is_own(asking.headers.get("host", "")):
-            if scope["type"] == "http":
-                await PlainTextResponse(NOT_OURS, 421)(scope, receive, send)
-            else:
-                await send({"type": "websocket.close", "code": 4421})
-            return
-        given = asking.query_params.get("token")
-        by_address = self._access.fits(given)
-        allowed = by_address or self._access.fits(asking.cookies.get(self._access.cookie))
-        allowed = allowed and _own_page(asking)
-        if scope["type"] == "websocket":
-            if allowed:
-                await self._app(scope, receive, send)
-            else:
-                # Before it is accepted: the server answers 403.
-                await send({"type": "websocket.close", "code": 4401})
-            return
-        if not allowed:
-            response: Response = HTMLResponse(REFUSED, 401)
-        elif by_address and scope["path"] in ("/", "/phone"):
-            # The address bar, histories and screenshots then show no token.
-            rest = [(k, v) for k, v in parse_qsl(asking.url.query) if k != "token"]
-            response = RedirectResponse(scope["path"] + ("?" + urlencode(rest)) * bool(rest), 303)
-        else:
-            await self._app(scope, receive, send)
-            return
-        if allowed:
-            response.set_cookie(
-                self._access.cookie,
-                self._access.token,
-                max_age=COOKIE_S,
-                httponly=True,
-                samesite="lax",
-                secure=self._access.certificate is not None,
-            )
-        await response(scope, receive, send)
-
-
-def _own_page(asking: HTTPConnection) -> bool:
-    """Return whether the request is from our own page, by its Origin header."""
-    origin = asking.headers.get("origin")
-    return origin is None or urlsplit(origin).netloc == asking.headers.get("host")
-
-
-def _with_headers(send: Send, asking: HTTPConnection) -> Send:
-    host = asking.headers.get("host", "")
-    host = host if re.fullmatch(r"[\w.:\[\]-]+", host, re.ASCII) else "localhost"
-
-    async def sending(message: Message) -> None:
-        if message["type"] == "http.response.start":
-            headers = MutableHeaders(scope=message)
-            headers["Content-Security-Policy"] = CONTENT_POLICY.format(host=host)
-            headers["X-Content-Type-Options"] = "nosniff"
-            headers["Referrer-Policy"] = "no-referrer"
-            headers.setdefault("Cache-Control", "no-cache")
-        await send(message)
-
-    return sending
-
-
 class BadRequestError(Exception):
     """A request that makes no sense, in words."""
 
@@ -267,6 +178,9 @@ class Pages:
             Route("/api/headings", self.headings, methods=["POST"]),
             Route("/api/acknowledge", self.acknowledge, methods=["POST"]),
             Route("/api/shelve", self.shelve, methods=["POST"]),
+            Route("/api/invite", self.invite),
+            Route("/api/devices", self.devices),
+            Route("/api/revoke", self.revoke, methods=["POST"]),
         ]
         app = Starlette(
             routes=[
@@ -279,7 +193,7 @@ class Pages:
             ],
             exception_handlers={BadRequestError: _refuse},
         )
-        return TokenMiddleware(app, self._access)
+        return TokenMiddleware(app, self._access, self.session)
 
     @staticmethod
     def page(name: str) -> Any:
@@ -291,15 +205,15 @@ class Pages:
         return serve
 
     async def qr(self, _: Request) -> Response:
-        """The phone page's address, token included, as a QR code."""
+        """The phone page's address, token included, as a QR code; a mission's is new each time."""
         if not self._access.reachable:
             return PlainTextResponse(
                 "No phone can reach this session: it listens on this computer alone. "
                 "Start it with --view-listen 0.0.0.0 for others to see it.",
                 404,
             )
-        if self._code is None:
-            self._code = qr_svg(self._access.url("/phone"))
+        if self._code is None or self._access.key is not None:
+            self._code = qr_svg(self._access.url("/phone", role=Role.ACKNOWLEDGE))
         return Response(self._code, media_type="image/svg+xml")
 
     async def follow(self, socket: WebSocket) -> None:
@@ -312,9 +226,10 @@ class Pages:
                 return
             await socket.send_text(hello)
             await socket.send_text(self.session.tracks.to_json())
+            await socket.send_text(to_json({"type": "you", "role": str(role_of(socket))}))
             seen: str | None = None
             told = 0
-            while not gone.done() and not self.session.over:
+            while not gone.done() and not self.session.over and not self._is_revoked(socket):
                 newest = await self.session.news(seen, PING_S)
                 if told < len(self.session.log):
                     entries, told = self.session.log[told:], len(self.session.log)
@@ -327,6 +242,35 @@ class Pages:
             gone.cancel()
             with contextlib.suppress(RuntimeError, WebSocketDisconnect):
                 await socket.close(1001)
+
+    def _is_revoked(self, asking: HTTPConnection) -> bool:
+        device: Device | None = asking.scope.get("device")
+        return device is not None and bool(
+            self.session.devices.get(device.id, {}).get("revoked", False)
+        )
+
+    async def invite(self, request: Request) -> Response:
+        """A code for one more device: its address, and how many devices there are."""
+        if self._access.key is None:
+            return JSONResponse({"error": "only a mission has devices: relpos mission"}, 404)
+        role = request.query_params.get("role", str(Role.ACKNOWLEDGE))
+        if role not in list(Role):
+            raise BadRequestError(f"role: none of {', '.join(Role)}")
+        url = self._access.url("/phone" if role == Role.ACKNOWLEDGE else "/", role=Role(role))
+        return JSONResponse({"url": url, "svg": qr_svg(url)})
+
+    async def devices(self, request: Request) -> Response:
+        """All devices that were let in."""
+        own: Device | None = request.scope.get("device")
+        return JSONResponse({"own": own and own.id, "devices": list(self.session.devices.values())})
+
+    async def revoke(self, request: Request) -> Response:
+        """Shut a device out, for good."""
+        body = await _body(request)
+        device = _text(body, "id", 40)
+        if device not in self.session.devices:
+            raise BadRequestError("id: no device of this mission")
+        return await self._ask(request, "device", {"id": device, "revoked": True})
 
     async def view(self, _: Request) -> Response:
         """Return the newest view."""

@@ -56,6 +56,7 @@ class WebView(Sink):
         self._door = listener
         self._tracks = Tracks()
         self._names: dict[int, str] = {}
+        self._devices: list[dict[str, Any]] = []
         self._log: deque[dict[str, Any]] = deque(maxlen=MAX_LOG)
         self._newest: bytes | None = None
         self._out: deque[bytes] = deque()
@@ -92,6 +93,16 @@ class WebView(Sink):
         """Send it to the pages, which show the log."""
         self._log.append(asdict(entry))
         self._say(to_json({"type": "log", "entries": [self._log[-1]]}))
+
+    def admitted(self, event: dict[str, Any]) -> None:
+        """Tell the server of a device that was let in or shut out."""
+        self._devices.append(event)
+        self._say(to_json({"type": "device", "event": event}))
+
+    def resumed(self, tracks: Tracks) -> None:
+        """Go on with the tracks of the sessions before."""
+        self._tracks = tracks
+        self._say(tracks.to_json())
 
     def trouble(self) -> str | None:
         """Return that the server was restarted, for half a minute."""
@@ -164,6 +175,7 @@ class WebView(Sink):
             self._tracks.to_json(),
             _names_message(self._names),
             log,
+            *(to_json({"type": "device", "event": event}) for event in self._devices),
         ):
             self._say(line)
 

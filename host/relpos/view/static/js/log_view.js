@@ -4,7 +4,7 @@ import { make, setText } from "./dom.js";
 import { timeOfDay } from "./words.js";
 
 const KINDS = {
-  note: "note", warning: "warning", alarm: "ALARM", cleared: "over", acknowledged: "seen", shelved: "shelved", name: "name",
+  note: "note", warning: "warning", alarm: "ALARM", cleared: "over", acknowledge: "seen", shelve: "shelved", name: "name", landmark: "landmark",
 };
 const MOST = 5000;
 

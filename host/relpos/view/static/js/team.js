@@ -61,7 +61,8 @@ export class Team {
         this.handleView(message);
         return "picture";
       case "log":
-        return "log";
+      case "you":
+        return message.type;
       case "ping":
         return "ping";
       default:

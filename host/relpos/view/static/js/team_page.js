@@ -4,6 +4,7 @@ import { isFresh, startBeat } from "./age.js";
 import { Alarms } from "./alarms.js";
 import { AlarmBanner, showNotices } from "./banner.js";
 import { Connection } from "./connection.js";
+import { DevicesDialog } from "./devices.js";
 import { byId, make, postJson, setAttribute, setText, storage } from "./dom.js";
 import { FindView } from "./find_view.js";
 import { LinkBanner } from "./link_banner.js";
@@ -60,6 +61,8 @@ function handle(message) {
     setText(byId("limit-warning"), String(team.limits.still_warning_s));
     setText(byId("limit-alarm"), String(team.limits.still_alarm_s));
     map.layer.forget();
+  } else if (kind === "you") {
+    setAttribute(document.documentElement, "data-role", message.role);
   } else if (kind === "log") {
     log.add(message.entries);
     if (byId("log-dialog").open) log.look(team);
@@ -344,16 +347,6 @@ byId("sheet").addEventListener("click", () => {
   setAttribute(byId("sheet"), "aria-expanded", String(open));
 });
 byId("help").addEventListener("click", () => byId("help-dialog").showModal());
-byId("phones").addEventListener("click", async () => {
-  byId("phones-dialog").showModal();
-  const answer = await fetch("/qr.svg").catch(() => null);
-  const image = byId("qr");
-  const status = byId("qr-trouble");
-  image.hidden = !answer?.ok;
-  status.hidden = Boolean(answer?.ok);
-  if (answer?.ok) image.src = "/qr.svg";
-  else setText(status, answer ? await answer.text() : "The server does not answer.");
-});
 byId("as-table").addEventListener("click", () => {
   const view = byId("table-view");
   view.hidden = !view.hidden;
@@ -369,5 +362,6 @@ themeSwitch(byId("theme"), () => {
 const savedMe = store.getItem("relpos.me");
 map.me = savedMe ? Number(savedMe) : null;
 showSound();
+new DevicesDialog();
 startBeat(beat);
 connection.start();

@@ -1,0 +1,168 @@
+"""``relpos mission``: a mission that survives its sessions."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from relpos.cli import live, output
+from relpos.cli.estimators import BANK, EstimatorName
+from relpos.cli.fuse import Initial, Job, fuse_live
+from relpos.cli.keys import KeyFile, make_link
+
+if TYPE_CHECKING:
+    from relpos.link.port import Link
+    from relpos.live.inputs import Received
+    from relpos.live.mission import Mission, Resumed
+    from relpos.recording.reader import Recording
+
+
+def mission(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The mission's folder.")],
+    source: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="SOURCE", help="Serial port or pyserial URL. (default: the one before)"
+        ),
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="The mission's name.")] = None,
+    initial: Annotated[
+        Initial, typer.Option(help="Where the nodes start in the first session.")
+    ] = Initial.UNKNOWN,
+    estimator: EstimatorName = BANK,
+    view_listen: live.ViewListen = "0.0.0.0",
+    https: live.Https = False,
+    open_browser: live.OpenBrowser = None,
+    seconds: Annotated[float | None, typer.Option(min=0.0, help="End after so many.")] = None,
+    invite: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ROLE",
+            help="Print an address for one more device: look, acknowledge or command.",
+        ),
+    ] = None,
+    key_file: KeyFile = None,
+) -> None:
+    """Begin a mission, or go on with the one in FOLDER.
+
+    Everything is in the folder: recordings, names, board, alarms and who has acknowledged them,
+    the log, devices. After a crash, a power cut or Ctrl-C the same command goes on: with the same
+    map, on the same address, and for the devices that were let in. The page's address lets in one
+    device within five minutes; --invite prints another while the mission runs.
+    """
+    from relpos.link.port import check_port
+    from relpos.live.mission import Mission
+    from relpos.view.access import DEFAULT_PORT, free_port, parse_listen
+
+    if invite is not None:
+        _print_invitation(Mission.open(folder), invite, view_listen)
+        return
+    found = Mission.open(folder, source, name)
+    with found.lock():
+        check_port(found.about.source)
+        host, port = parse_listen(view_listen or "0.0.0.0")
+        if found.about.port is not None and ":" not in (view_listen or "").strip("[]"):
+            port = found.about.port
+        elif port in (0, DEFAULT_PORT):
+            port = free_port(host, port)
+        found.about.port = port
+        listen = f"{host}:{port}" if ":" not in host else f"[{host}]:{port}"
+        options = live.Options(True, listen, https, open_browser, seconds)
+        _run(found, options, estimator, key_file, common=initial is Initial.COMMON)
+
+
+def _run(
+    found: Mission,
+    options: live.Options,
+    estimator: str,
+    key_file: Path | None,
+    *,
+    common: bool,
+) -> None:
+    """Run one session of the mission."""
+    from relpos.live.assembly import MissionPlan
+    from relpos.live.clock import SessionClock
+    from relpos.live.inputs import PortInput
+    from relpos.runs import Description
+
+    about, resumed = found.about, found.resume()
+    about.sessions, about.ended_unix_s = about.sessions + 1, None
+    job = Job(about.source, estimator, {}, 0, found.path / f"session-{about.sessions}")
+    job.prepare(resumed.priors)
+    link, seen = make_link(key_file)
+    known = {} if seen is None else dict(seen.load())
+    if resumed.since_s > 0.0:
+        # What is read again came before the counters that were stored.
+        link.decoder.expect_from_start()
+    port = PortInput(
+        about.source,
+        link,
+        seen,
+        clock=SessionClock(about.started_unix_s),
+        reopen=True,
+        earlier=_earlier(found, resumed, link, known),
+    )
+    found.save()
+    if resumed.events:
+        output.remark(f"the mission {about.name} goes on: session {about.sessions}")
+    options = replace(
+        options, record=found.recording(about.sessions), mission=MissionPlan(found, resumed)
+    )
+    options.check()
+    fuse_live(
+        job,
+        port,
+        options,
+        description=Description(name=about.name, source="received in a mission"),
+        priors=resumed.priors,
+        common=common and not resumed.priors,
+        as_json=False,
+    )
+    about.ended_unix_s = time.time()
+    found.save()
+
+
+def _earlier(
+    found: Mission, resumed: Resumed, link: Link, counters: dict[int, int]
+) -> Iterator[Received]:
+    """Yield what was recorded since the checkpoint, and a little before."""
+    from relpos.errors import DataError
+    from relpos.live.mission import WARM_UP_S, read_again
+    from relpos.recording import open_recording
+
+    if resumed.since_s > 0.0:
+        chosen: list[Recording] = []
+        for path in reversed(found.recordings()):
+            try:
+                recording = open_recording(path)
+            except DataError:
+                continue
+            chosen.insert(0, recording)
+            first_ns = recording.files[0].first_ns
+            began_s = 0.0 if first_ns is None else first_ns * 1e-9 - found.about.started_unix_s
+            if began_s <= resumed.arrived_s - WARM_UP_S:
+                break
+        for recording in chosen:
+            yield from read_again(recording.inputs(), link.feed, resumed)
+    link.decoder.expect_after(counters)
+
+
+def _print_invitation(found: Mission, role: str, view_listen: str | None) -> None:
+    from relpos.errors import RelposError
+    from relpos.view import access as doors
+    from relpos.view.devices import Role
+
+    if role not in list(Role):
+        raise RelposError(f"--invite {role}: none of {', '.join(Role)}")
+    if found.about.port is None:
+        raise RelposError(f"{found.path}: no session has run yet")
+    host, _ = doors.parse_listen(view_listen or "0.0.0.0")
+    door = doors.Access(found.about.port, doors.hosts_of(host), key=found.key)
+    url = door.url("/phone" if role == Role.ACKNOWLEDGE else "/", role=Role(role))
+    typer.echo(url)
+    output.remark(doors.qr_terminal(url))

@@ -1,0 +1,195 @@
+"""A mission's folder: what was confirmed survives the session, and the next one goes on."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from pathlib import Path
+
+import pytest
+from team_input import TeamInput, make_session
+
+from relpos import fusion
+from relpos.emulator.team import EmulatedTeam, TeamConfig
+from relpos.errors import DataError
+from relpos.live.inputs import Received
+from relpos.live.mission import JOURNAL, Journal, Mission, MissionFiles, read_again
+from relpos.live.requests import Request
+from relpos.live.sinks import Sink
+from relpos.live.team_view import Alert
+from relpos.live.tracks import Tracks
+
+
+class Visitors(Sink):
+    """Asks what it is told to, and keeps the answers."""
+
+    def __init__(self):
+        self.asks = []
+        self.answers = []
+        self.lines = []
+        self.names = {}
+
+    def requests(self):
+        asks, self.asks = self.asks, []
+        return asks
+
+    def respond(self, request, reply, status=200):
+        self.answers.append((request.kind, reply, status))
+
+    def logged(self, entry):
+        self.lines.append(entry.text)
+
+    def named(self, names):
+        self.names = names
+
+    def ask(self, kind, **body):
+        self.asks.append(Request(1, kind, time.time(), body))
+
+
+class Again(TeamInput):
+    """A team whose session before is read first."""
+
+    def __init__(self, team, earlier):
+        super().__init__(team)
+        self._earlier = earlier(self.link)
+
+    def read(self, timeout_s):
+        received = next(self._earlier, None)
+        return super().read(timeout_s) if received is None else received
+
+
+def play(session, until):
+    for _ in session.run():
+        if until():
+            session.stop()
+
+
+def made(team, source, resumed, mission, visitors):
+    journal = Journal(mission.path / JOURNAL)
+    session, album = make_session(
+        source, lambda p: fusion.make("bank", p), visitors, priors=resumed.priors, paced=True
+    )
+    session.keep(journal, resumed)
+    session.add_sink(MissionFiles(mission, journal, resumed.since_s))
+    return session, album, journal
+
+
+def test_a_session_that_was_killed_goes_on_with_the_same_map_names_and_alarms(tmp_path):
+    folder = tmp_path / "mill"
+    mission = Mission.open(folder, "emulated", "Old mill")
+    config = TeamConfig("paper", 3, 70.0, 3, beacons=True, faults=["node:off:node=2,from=8,to=200"])
+    with EmulatedTeam(config) as team:
+        source, visitors = TeamInput(team), Visitors()
+        resumed = mission.resume()
+        resumed.priors = tuple(team.priors())
+        session, album, _ = made(team, source, resumed, mission, visitors)
+        visitors.ask("name", node=1, name="Anna", by="")
+
+        def lost_and_seen():
+            views = album.views
+            lost = views and any(p.alert is Alert.LOST for p in views[-1].people)
+            if lost and not any(kind == "acknowledge" for kind, *_ in visitors.answers):
+                visitors.ask("acknowledge", node=2, by="Anna")
+            return source.now_s() > 34.0
+
+        play(session, lost_and_seen)
+        # Killed: nothing is finished or closed. What was confirmed is on the disk already.
+        assert ("acknowledge", {"acknowledged": True}, 200) in visitors.answers
+        kinds = [event["kind"] for event in Mission.open(folder).events()]
+        assert {"name", "alert", "acknowledge", "log"} <= set(kinds)
+        recorded = [(s, Received(s, data, ())) for s, data in album.bytes]
+        last = {n.node: n for n in album.estimates[-1].nodes}
+        team.run(team.time_us + 10_000_000)
+
+        again = Mission.open(folder).resume()
+        assert 30.0 < again.since_s < 34.1
+        source = Again(team, lambda link: read_again(recorded, link.feed, again))
+        visitors = Visitors()
+        session, album, _ = made(team, source, again, mission, visitors)
+        play(session, lambda: source.now_s() > 56.0)
+        session.finish()
+        first, final = album.views[0], album.views[-1]
+        assert [p.node for p in first.people] == [1, 2, 3], "nobody is left out"
+        assert first.people[0].name == "Anna"
+        assert visitors.names == {1: "Anna"}
+        assert any("is not heard" in line for line in visitors.lines)
+        two = final.people[1]
+        assert (two.alert, two.acknowledged, two.acknowledged_by) == (Alert.LOST, True, "Anna")
+        assert two.seen_s == pytest.approx(final.time_s - 8.0, abs=3.0)
+        assert (two.x_m, two.y_m) == (
+            pytest.approx(last[2].x_m, abs=3.0),
+            pytest.approx(last[2].y_m, abs=3.0),
+        )
+        estimate = album.estimates[-1]
+        for n in estimate.nodes:
+            if n.node != 2:
+                x_m, y_m, _ = team.position_m(n.node, estimate.time_s)
+                assert math.hypot(n.x_m - x_m, n.y_m - y_m) < 3.0, "the same map"
+        assert min(e.time_s for e in album.estimates) > again.since_s
+
+
+def test_an_event_is_confirmed_once_the_disk_has_it(tmp_path, monkeypatch):
+    path = tmp_path / JOURNAL
+    full = True
+    fsync = os.fsync
+
+    def sync(handle):
+        if full:
+            raise OSError(28, "No space left on device")
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", sync)
+    journal = Journal(path)
+    number = journal.add({"kind": "name", "node": 1, "name": "Anna"})
+    while journal.trouble is None:
+        time.sleep(0.01)
+    assert not journal.is_safe(number)
+    full = False
+    while not journal.is_safe(number):
+        time.sleep(0.01)
+    journal.close()
+    assert [json.loads(line)["name"] for line in path.read_text().splitlines()] == ["Anna"]
+    assert journal.trouble is None
+
+
+def test_a_line_that_a_power_cut_left_half_costs_no_other_line(tmp_path):
+    mission = Mission.open(tmp_path / "m", "/dev/null")
+    (mission.path / JOURNAL).write_text('{"kind":"name","node":1,"name":"Anna"}\n{"kind":"na')
+    journal = Journal(mission.path / JOURNAL)
+    journal.add({"kind": "name", "node": 2, "name": "Ben"})
+    journal.close()
+    assert [event["name"] for event in mission.events()] == ["Anna", "Ben"]
+
+
+def test_one_session_at_a_time_has_a_mission(tmp_path):
+    mission = Mission.open(tmp_path / "m", "/dev/null")
+    with mission.lock(), pytest.raises(DataError, match="another session"), mission.lock():
+        pass
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path):
+    (tmp_path / "precious.txt").write_text("mine")
+    with pytest.raises(DataError, match="neither a mission nor empty"):
+        Mission.open(tmp_path, "/dev/null")
+    with pytest.raises(DataError, match="to begin one, name the port"):
+        Mission.open(tmp_path / "new")
+
+
+@pytest.mark.parametrize("damage", ["", "{", '{"name": 3}', "[]", '{"time_s": "x"}'])
+def test_a_damaged_checkpoint_costs_the_map_and_no_more(tmp_path: Path, damage: str):
+    mission = Mission.open(tmp_path / "m", "/dev/null", "Mill")
+    (mission.path / "checkpoint.json").write_text(damage)
+    (mission.path / "tracks.csv").write_text("1,2.0,3.0,4.0\nrubbish\n1,3.0")
+    resumed = Mission.open(mission.path).resume()
+    assert resumed.priors == ()
+    assert resumed.tracks.of(1) == [(2.0, 3.0, 4.0)]
+    assert isinstance(resumed.tracks, Tracks)
+
+
+def test_only_its_owner_can_read_the_key(tmp_path):
+    mission = Mission.open(tmp_path / "m", "/dev/null")
+    assert (mission.path / "secret.key").stat().st_mode & 0o077 == 0
+    assert Mission.open(mission.path).key == mission.key
+    assert len(mission.key) == 32

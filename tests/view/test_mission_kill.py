@@ -1,0 +1,126 @@
+"""Kills: the session, the page's server, the browser, all of them, while something is under way."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+from stage import wait_for
+
+from relpos.live.mission import Mission
+
+BACK_S = 5.0
+RELPOS = [sys.executable, "-m", "relpos.cli.main"]
+
+
+def output_of(process: subprocess.Popen[str], pattern: str) -> str:
+    """The first line that fits."""
+    assert process.stdout
+    for line in process.stdout:
+        if found := re.search(pattern, line):
+            return found[0]
+    raise AssertionError(f"no {pattern}: the program has ended")
+
+
+class Field:
+    """An emulated team of its own process, and a mission over it that can be killed."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.team = self.run("emulate", "--nodes", "3")
+        self.port = output_of(self.team, "/dev/\\S+")
+        self.address = self.start(self.port, "--name", "Old mill", "--initial", "common")
+
+    def run(self, *arguments: str) -> subprocess.Popen[str]:
+        command = [*RELPOS, *arguments]
+        options: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        return subprocess.Popen(command, text=True, start_new_session=True, **options)
+
+    def start(self, *more: str) -> str:
+        listen = ("--view-listen", "127.0.0.1") if not more else ("--view-listen", "127.0.0.1:0")
+        self.session = self.run("mission", str(self.folder), *more, *listen, "--no-open")
+        return output_of(self.session, "http://\\S+")
+
+    def kill(self, what: str) -> None:
+        if what == "server":
+            children = Path(f"/proc/{self.session.pid}/task/{self.session.pid}/children")
+            for child in children.read_text().split():
+                if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text():
+                    os.kill(int(child), signal.SIGKILL)
+            return
+        os.killpg(self.session.pid, signal.SIGKILL)
+        self.session.wait()
+        self.start()
+
+    def close(self) -> None:
+        for process in (self.session, self.team):
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+@pytest.fixture
+def field(tmp_path: Path) -> Iterator[Field]:
+    """A mission under way."""
+    made = Field(tmp_path / "mission")
+    yield made
+    made.close()
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("killed", ["session", "server", "all"])
+def test_what_was_confirmed_is_there_again_five_seconds_after_a_kill(
+    browser: Any, field: Field, killed: str
+) -> None:
+    context = browser.new_context()
+    page: Page = context.new_page()
+    page.goto(field.address)
+    expect(page.locator("#people li")).to_have_count(3)
+
+    def post(path: str, body: dict[str, Any]) -> int:
+        asked = """([path, body]) => fetch(path, { method: "POST", body: JSON.stringify(body),
+            headers: { "content-type": "application/json" } }).then((a) => a.status)"""
+        return int(page.evaluate(asked, [path, body]))
+
+    assert post("/api/name", {"node": 2, "name": "Ben"}) == 200
+    assert post("/api/shelve", {"node": 3, "seconds": 600, "by": "Anna"}) == 200
+    press = {"id": "p1", "landmark": "7", "unix_ms": time.time() * 1000}
+    clocks = {"node": 2, "clock_offset_ms": 0, "sent_unix_ms": time.time() * 1000}
+    assert post("/api/presses", {**clocks, "presses": [press]}) == 200
+    time.sleep(4.0)
+    before = page.locator("#map-words").inner_text()
+    assert "3 of 3 people located" in before
+    page.evaluate("window.same_page = true")
+    field.kill(killed)
+    # The session is back once it has printed its address.
+    back_s = time.monotonic()
+    if killed == "all":
+        page.close()
+        page = context.new_page()
+        page.goto(field.address.partition("?")[0])
+    else:
+        wait_for(lambda: page.locator("#link").is_hidden() and "live" in str(
+            page.locator("#connection").get_attribute("data-state")))  # fmt: skip
+        assert page.evaluate("window.same_page")
+    expect(page.locator("#people li[data-node='2'] .label")).to_have_text(re.compile("Ben"))
+    took_s = time.monotonic() - back_s
+    print(f"{killed}: back after {took_s:.1f} s")
+    assert took_s < BACK_S
+    page.locator("#show-log").click()
+    for words in ("node 2 is Ben", "alarms of", "is at landmark 7"):
+        expect(page.locator("#log")).to_contain_text(words.replace("node 2", "Ben"))
+    page.keyboard.press("Escape")
+    wait_for(lambda: "3 of 3 people located" in page.locator("#map-words").inner_text())
+    # Sent again by a phone that had no answer: it counts once.
+    assert post("/api/presses", {**clocks, "presses": [press]}) == 200
+    presses = [e for e in Mission.open(field.folder).events() if e["kind"] == "presses"]
+    assert [e["ids"] for e in presses] == [["p1"]]
+    context.close()
