@@ -21,10 +21,12 @@ from relpos.emulator.pozyx import FUNCTION_STRETCH_US
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DeviceError
 from relpos.link import dialogue, port
+from relpos.link.decoder import Acknowledged
 from relpos.link.dialogue import open_dialogue
 from relpos.link.port import Link
 from relpos.nodes.bringup import Finding, NodeCheck, bus_access, check, radio
 from relpos.nodes.bringup import finding as finding_names
+from relpos.protocol import messages as wire
 
 MISSING = missing_parts()
 ROOT = Path(__file__).resolve().parents[2]
@@ -64,56 +66,56 @@ def test_a_healthy_node_is_right_in_every_line(monkeypatch: pytest.MonkeyPatch, 
     assert node.figures["sample_rate_hz"] == pytest.approx(50.0, rel=0.02)
 
 
-@pytest.mark.parametrize(
-    ("fault", "part", "words"),
-    [
-        ("imu:off", "inertial sensor", "no answer"),
-        ("imu:stuck", "samples", "never change"),
-        ("imu:garbage:value=random", "inertial sensor", "differently"),
-        ("imu:garbage:value=zeros", "inertial sensor", "0x00"),
-        ("imu:garbage:value=ones", "inertial sensor", "0xFF"),
-        ("imu:wrong:value=25", "gyroscope", "at rest"),
-        ("imu:slow", "samples", "2[45].* a second"),
-        ("imu:delayed", "samples", "ms late"),
-        ("imu:intermittent", "inertial sensor", "not answered"),
-        ("imu:brownout:from=34", "inertial sensor", "has restarted"),
-        ("magnetometer:off", "compass", "no answer"),
-        ("magnetometer:stuck", "compass", "never change"),
-        ("magnetometer:garbage:value=random", "compass", "differently"),
-        ("magnetometer:wrong", "compass", "a field of"),
-        ("magnetometer:slow", "compass", "not ready in time"),
-        ("magnetometer:intermittent", "compass", "not answered"),
-        ("pozyx:off", "Pozyx", "no answer"),
-        ("pozyx:stuck", "ranging", "no new distance"),
-        ("pozyx:garbage:value=random", "Pozyx", "differently"),
-        ("pozyx:wrong", "ranging", "laid out: 5 m"),
-        ("pozyx:slow", "ranging", "takes over"),
-        ("pozyx:delayed", "ranging", "takes over"),
-        ("pozyx:intermittent", "Pozyx", "not answered"),
-        ("pozyx:inverted", "ranging", "success as failure"),
-        ("pozyx:brownout:from=6", "Pozyx", "has restarted"),
-        ("xbee:stuck", "XBee radio", "takes no command"),
-        ("xbee:wrong", "XBee radio", "not confirmed"),
-        ("xbee:slow", "XBee radio", "not confirmed"),
-        ("xbee:delayed", "XBee radio", "round trip takes 3"),
-        ("xbee:intermittent", "XBee radio", "to be repeated"),
-        ("xbee:bitflip", "XBee radio", "to be repeated"),
-        ("xbee:truncate", "XBee radio", "to be repeated"),
-        ("xbee:duplicate", "XBee radio", "to be repeated"),
-        ("xbee:brownout:from=12", "XBee radio", "unasked"),
-        ("bus:stuck:line=scl", "I2C bus", "no chip answers"),
-        ("bus:stuck:line=sda,from=34", "I2C bus", "failed during the check"),
-        ("bus:nack", "I2C bus", "at several chips"),
-        ("bus:nack:part=data", "I2C bus", "at several chips"),
-    ],
+CASES = (
+    ("imu:off", "inertial sensor", "no answer"),
+    ("imu:stuck", "samples", "never change"),
+    ("imu:garbage:value=random", "inertial sensor", "differently"),
+    ("imu:garbage:value=zeros", "inertial sensor", "0x00"),
+    ("imu:garbage:value=ones", "inertial sensor", "0xFF"),
+    ("imu:wrong:value=25", "gyroscope", "at rest"),
+    ("imu:slow", "samples", "2[45].* a second"),
+    ("imu:delayed", "samples", "ms late"),
+    ("imu:intermittent", "inertial sensor", "not answered"),
+    ("imu:brownout:from=34", "inertial sensor", "has restarted"),
+    ("magnetometer:off", "compass", "no answer"),
+    ("magnetometer:stuck", "compass", "never change"),
+    ("magnetometer:garbage:value=random", "compass", "differently"),
+    ("magnetometer:wrong", "compass", "a field of"),
+    ("magnetometer:slow", "compass", "not ready in time"),
+    ("magnetometer:intermittent", "compass", "not answered"),
+    ("pozyx:off", "Pozyx", "no answer"),
+    ("pozyx:stuck", "ranging", "no new distance"),
+    ("pozyx:garbage:value=random", "Pozyx", "differently"),
+    ("pozyx:wrong", "ranging", "laid out: 5 m"),
+    ("pozyx:slow", "ranging", "takes over"),
+    ("pozyx:delayed", "ranging", "takes over"),
+    ("pozyx:intermittent", "Pozyx", "not answered"),
+    ("pozyx:inverted", "ranging", "success as failure"),
+    ("pozyx:brownout:from=6", "Pozyx", "has restarted"),
+    ("xbee:stuck", "XBee radio", "takes no command"),
+    ("xbee:wrong", "XBee radio", "not confirmed"),
+    ("xbee:slow", "XBee radio", "not confirmed"),
+    ("xbee:delayed", "XBee radio", "round trip takes 3"),
+    ("xbee:intermittent", "XBee radio", "to be repeated"),
+    ("xbee:bitflip", "XBee radio", "to be repeated"),
+    ("xbee:truncate", "XBee radio", "to be repeated"),
+    ("xbee:duplicate", "XBee radio", "to be repeated"),
+    ("xbee:brownout:from=12", "XBee radio", "unasked"),
+    ("bus:stuck:line=scl", "I2C bus", "no chip answers"),
+    ("bus:stuck:line=sda,from=34", "I2C bus", "failed during the check"),
+    ("bus:nack", "I2C bus", "at several chips"),
+    ("bus:nack:part=data", "I2C bus", "at several chips"),
 )
-def test_each_fault_is_named(
-    monkeypatch: pytest.MonkeyPatch, fault: str, part: str, words: str
-) -> None:
+"""A fault, and the line that names it: its part, and words of what was found."""
+
+
+def find(monkeypatch: pytest.MonkeyPatch, case: tuple[str, str, str], imu: str) -> None:
+    """Check a node with that fault until the line comes."""
+    fault, part, words = case
     keys = fault.split(":")[2:]
     spec = ":".join((*fault.split(":")[:2], ",".join((*keys, "node=1"))))
     found: list[Finding] = []
-    with checked(monkeypatch, spec) as node:
+    with checked(monkeypatch, spec, imu=imu) as node:
         for finding in node.findings():
             found.append(finding)
             if finding.right is False and finding.part == part and re.search(words, finding.found):
@@ -122,9 +124,54 @@ def test_each_fault_is_named(
     pytest.fail(str(found))
 
 
+@pytest.mark.parametrize("case", CASES, ids=[case[0] for case in CASES])
+def test_each_fault_is_named(monkeypatch: pytest.MonkeyPatch, case: tuple[str, str, str]) -> None:
+    find(monkeypatch, case, "mpu9150")
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("case", [c for c in CASES if c[0].startswith(("imu", "magnetometer"))])
+def test_each_fault_of_the_successor_is_named(
+    monkeypatch: pytest.MonkeyPatch, case: tuple[str, str, str]
+) -> None:
+    find(monkeypatch, case, "mpu9250")
+
+
+@pytest.mark.parametrize(("imu", "built_for"), [("mpu9250", "mpu9150"), ("mpu9150", "mpu9250")])
+def test_firmware_for_the_other_sensor_is_told(
+    monkeypatch: pytest.MonkeyPatch, imu: str, built_for: str
+) -> None:
+    with checked(monkeypatch, imu=imu, built_for=built_for) as node:
+        told = next(f for f in node.findings() if f.right is False)
+    assert told.part == finding_names.IMU
+    assert told.remedy == f"relpos node flash --imu {imu}"
+
+
+@pytest.mark.parametrize(("address", "part"), [(0x68, "inertial sensor"), (0x4B, "Pozyx")])
+def test_a_chip_at_its_other_address_is_told(
+    monkeypatch: pytest.MonkeyPatch, address: int, part: str
+) -> None:
+    with checked(monkeypatch) as node:
+        chips = node._bus._dialogue._port.team.nodes[1].bus.devices  # type: ignore[attr-defined]
+        chips[address ^ 1] = chips.pop(address)
+        told = next(f for f in node.findings() if f.right is False)
+    assert (told.part, told.found) == (part, f"no answer at 0x{address:02X}")
+    assert re.search("AD0|jumper", told.remedy)
+
+
+def test_firmware_that_knows_no_transactions_is_told() -> None:
+    class Old:
+        node = 3
+
+        def command(self, code: wire.CommandCode, value: int) -> Acknowledged:
+            return Acknowledged(3, 1, code, wire.CommandResult.UNKNOWN_COMMAND, value)
+
+    with pytest.raises(DeviceError, match="node flash"):
+        bus_access.BusAccess(Old()).byte(0x68, 0x75)  # type: ignore[arg-type]
+
+
 def test_each_fault_of_a_part_that_is_checked_has_a_test() -> None:
-    marks = test_each_fault_is_named.pytestmark  # type: ignore[attr-defined]
-    tested = {":".join(case[0].split(":")[:2]) for case in marks[0].args[1]}
+    tested = {":".join(case[0].split(":")[:2]) for case in CASES}
     parts = ("imu", "magnetometer", "pozyx", "xbee", "bus")
     # A module that is off, or whose line is noise, is not heard at all.
     unheard = {"xbee:off", "xbee:garbage"}

@@ -120,6 +120,9 @@ class CommandCode(enum.IntEnum):
     RESTORE_DEFAULTS = 16
     SET_KEY = 17
     ACCESS_BUS = 18
+    """One I2C transaction. The value's bytes, lowest first: address, register, a parameter, and how
+    many bytes are written (low half: 1 the register, 2 the parameter, too, 3 a zero behind it) and
+    read. The answer's: the last two that were read, and the microseconds that it took."""
 
 
 class CommandResult(enum.IntEnum):
