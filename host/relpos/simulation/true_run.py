@@ -203,7 +203,7 @@ def of_lab(seed: int, overrides: Mapping[str, str | float] | None = None) -> Tru
         np.where(late, blocked, clear),
         drift_rad_s=everyone * math.radians(settings.noise_scale * settings.heading_drift_deg_s),
         log_scale=everyone * settings.noise_scale * settings.scale_error,
-        drifting_s=1.0 * moving,
+        drifting_s=moving.astype(np.float64),
     )
 
 
