@@ -11,13 +11,22 @@ from relpos.cli import output
 
 
 def simulate(
+    more: Annotated[list[str] | None, typer.Argument(metavar="[DIR]...", hidden=True)] = None,
+    *,
     scenario: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="NAME",
             help="paper, paper-p1, paper-a, paper-h, paper-h2, lab or mission-CONDITION.",
         ),
-    ],
+    ] = None,
+    recordings: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="DIR...",
+            help="Instead: a team of real walkers, a recording (or a quoted pattern) a wearer.",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same run.")],
     out: Annotated[Path, typer.Option(metavar="RUN", help="The run directory to write.")],
     settings: Annotated[
@@ -29,7 +38,17 @@ def simulate(
     chosen = output.parse_settings(settings or [])
     from relpos import api
 
-    run = api.simulate(scenario, seed, **chosen)
+    if (scenario is None) == (recordings is None):
+        raise typer.BadParameter("give either --scenario NAME or --recordings DIR DIR...")
+    if recordings is not None:
+        from relpos.emulator.recorded_team import record_team
+
+        with output.working("running the firmware over the recordings"):
+            run = record_team([*recordings, *(more or ())], seed, chosen)
+    elif more:
+        raise typer.BadParameter(f"{more[0]}: directories go with --recordings")
+    else:
+        run = api.simulate(str(scenario), seed, **chosen)
     api.save(run, out)
     output.remark(
         f"{len(run.motions)} motions and {len(run.ranges)} ranges of {len(run.node_ids)} nodes "

@@ -329,7 +329,7 @@ def reckon_run(
     walks = [(walk, walk.load_imu()) for walk in calibration]
     played: dict[int, NodeResult] = {}
     for node, recording in recordings.items():
-        leg_m = _leg_length_m(run, node, stature_m)
+        leg_m = leg_length_m(run, node, stature_m)
         calibrated = None
         if walks:
             own, lengths_m = [], []
@@ -361,7 +361,8 @@ def reckon_run(
     return played
 
 
-def _leg_length_m(run: Run, node: int, stature_m: float | None) -> float | None:
+def leg_length_m(run: Run, node: int, stature_m: float | None = None) -> float | None:
+    """The run's own, or 0.53 of ``stature_m`` or of its stature; None where nothing is known."""
     info = run.description.nodes.get(node)
     if stature_m is None and info is not None and info.leg_length_m is not None:
         return info.leg_length_m
