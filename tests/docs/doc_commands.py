@@ -31,6 +31,7 @@ PARSED = {
     "node flash": "wants a board on USB; tests/system/test_flash.py plays one",
     "node check": "a node lies still for a minute; tests/nodes/test_node_check.py checks one",
     "node calibrate": "somebody turns the node or walks; tests/system/test_calibration.py does",
+    "mission": "runs until it is stopped; tests/view/test_mission_kill.py stops one",
     "figures": "computes for minutes; tests/evaluation/test_figures.py draws small ones",
 }
 """Subcommands that are parsed alone, and why."""
