@@ -62,7 +62,7 @@ class Strips:
 
     def predict(self, moved: Floats) -> None:
         """Move everybody."""
-        self.filter.predict(self.everybody, moved)
+        self.filter.predict(self.everybody, np.pad(moved, ((0, 0), (0, 1))))
 
     def update(self, node: Indices, peer: Indices, measured: Floats) -> None:
         """Work in the ranges."""
@@ -74,7 +74,7 @@ class Strips:
 
     def variance(self, node: Indices, peer: Indices) -> Floats:
         """Far pairs by the chain."""
-        return along(self.filter._dense().reshape(len(self.everybody), 3, -1, 3),
+        return along(self.filter._dense().reshape(len(self.everybody), 5, -1, 5),
                      self.filter.pose, node, peer)  # fmt: skip
 
 

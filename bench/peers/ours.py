@@ -96,7 +96,8 @@ class Strips:
         way = np.maximum(np.hypot(motion[:, 0], motion[:, 1]), 1e-9)
         share = motion[:, :2] / way[:, None]
         seen = np.hypot(share * sigma[:, :1], share[:, ::-1] * sigma[:, 1:2])
-        self.filter.predict(self.rows, np.concatenate([motion, seen, sigma[:, 2:]], axis=1))
+        still = np.zeros((len(motion), 1))
+        self.filter.predict(self.rows, np.concatenate([motion, seen, sigma[:, 2:], still], axis=1))
 
     def update(self, ranges: Instant) -> None:
         """All ranges of the instant at once."""

@@ -28,8 +28,9 @@ from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Displacement
 from relpos.measurements import Measurement, Motion, Prior, Range
 
-LARGE_TEAM = 30
-"""From more nodes on one sparse filter, strip by strip (crossover: ``docs/fusion.md``)."""
+LARGE_TEAM = 20
+"""From more nodes on one sparse filter, strip by strip: with 20 it has the bank's error at a fifth
+of the time (``docs/notebook/large-teams.md``)."""
 
 KEPT_S = 20.0
 """What is younger is kept: a bank's newest estimate is never older."""
@@ -78,7 +79,14 @@ class SwitchingEstimator:
         initialiser = HypothesisInitialiser(seed=self._seed, large_team=True)
         s = self._settings
         settings = large_teams.LargeTeamSettings(
-            s.outliers_short, s.jump_m, s.jump_rad, s.reorder_s, s.max_lag_s, s.late_s
+            s.outliers_short,
+            s.jump_m,
+            s.jump_rad,
+            s.drift_rad_s,
+            s.scale,
+            s.reorder_s,
+            s.max_lag_s,
+            s.late_s,
         )
         return large_teams.make(priors, initialiser, settings, self._mountings, start_s)
 

@@ -16,6 +16,7 @@ from relpos.evaluation import metrics
 from relpos.fusion import Estimate, NodeStatus, switching
 from relpos.fusion.large_teams.estimator import LargeTeam
 from relpos.fusion.models.motion_variances import ALONG, WHITE
+from relpos.fusion.switching import LARGE_TEAM
 from relpos.measurements import Measurement, Motion, Prior, Range
 
 CROWD = CrowdSettings(nodes=60, seconds=50)
@@ -82,6 +83,15 @@ def test_pairs_in_reach_are_listed_in_order_and_no_others(
     assert not far & set(listed)
 
 
+def off_in_the_team(estimate: Estimate, truth: np.ndarray) -> dict[int, float]:
+    """Each located node's error (m), after the best rigid motion of all: the frame is arbitrary."""
+    located = [n for n in estimate.nodes if n.status is not NodeStatus.UNLOCATED]
+    poses = np.array([(n.x_m, n.y_m) for n in located])
+    real = truth[[n.node - 1 for n in located], :2]
+    square = metrics.aligned_squared_distances(poses, real)
+    return {n.node: math.sqrt(s) for n, s in zip(located, square, strict=True)}
+
+
 def test_nodes_without_a_prior_join_at_their_true_position(crowd: Crowd) -> None:
     known = [p for p in crowd.priors() if p.node % 6]
     estimates, made = estimates_of(known, crowd.measurements())
@@ -92,17 +102,15 @@ def test_nodes_without_a_prior_join_at_their_true_position(crowd: Crowd) -> None
     truth = crowd.poses[-1]
     joined = [n for n in located if n.node % 6 == 0]
     assert joined
-    off = [math.hypot(n.x_m - truth[n.node - 1, 0], n.y_m - truth[n.node - 1, 1]) for n in joined]
-    assert max(off) < 1.0
+    off = off_in_the_team(last, truth)
+    assert max(off[n.node] for n in joined) < 0.5
     assert made.counters()["joined"] == len(joined)
 
 
 def test_a_node_that_is_elsewhere_than_its_prior_is_inflated_and_found(crowd: Crowd) -> None:
     wrong = [replace(p, x_m=p.x_m + (6.0 if p.node == 20 else 0.0)) for p in crowd.priors()]
     estimates, made = estimates_of(wrong, crowd.measurements())
-    node = next(n for n in estimates[-1].nodes if n.node == 20)
-    truth = crowd.poses[-1, 19]
-    assert math.hypot(node.x_m - truth[0], node.y_m - truth[1]) < 0.6
+    assert off_in_the_team(estimates[-1], crowd.poses[-1])[20] < 0.3
     assert made.counters()["jumps"] >= 1
 
 
@@ -200,3 +208,29 @@ def test_a_node_of_a_large_team_whose_motion_is_missing_is_found_by_its_ranges()
     own = [k for k, pair in enumerate(score.pair_ids) if 3 in pair]
     error_m = (score.pair_distance_m - score.pair_true_distance_m)[late][:, own]
     assert np.nanmean(np.abs(error_m)) < 0.6
+
+
+@pytest.mark.parametrize(
+    ("condition", "wrong"),
+    [
+        ("base", {"drift_deg_min": 6.0, "step_scale": 0.85}),
+        ("late-0.3", {}),
+        ("shadow", {}),
+    ],
+)
+def test_what_the_team_has_in_common_is_learned_and_told(
+    condition: str, wrong: dict[str, float]
+) -> None:
+    run = relpos.simulate(
+        f"mission-{condition}", 21, nodes=LARGE_TEAM + 1, seconds=60.0, range_rate_hz=0.35, **wrong
+    )
+    result = relpos.fuse(run)
+    scored = relpos.evaluate(result, run, bound=False).metrics
+    assert scored.relative_distance_rmse_m < 0.13
+    assert 0.6 < scored.nees_distance < 1.5
+    learned = {p.name: p.value for p in result.estimates[-1].parameters}
+    assert learned["range_lateness_s"] == pytest.approx(
+        0.3 if condition == "late-0.3" else 0.0, abs=0.05
+    )
+    # The simulator's shadow grows with the square of how far somebody is behind: its half.
+    assert learned["body_shadow_m"] == pytest.approx(0.4 if condition == "shadow" else 0.0, abs=0.1)

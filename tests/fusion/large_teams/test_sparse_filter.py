@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -9,11 +11,16 @@ import pytest
 from crowd import Crowd, CrowdSettings, side_of, simulate_crowd
 from reference import neighbourhood as dense
 from relpos.fusion.large_teams.kernels import RangeModel
-from relpos.fusion.large_teams.sparse_filter import JITTER_M2, NeighbourhoodFilter
+from relpos.fusion.large_teams.sparse_filter import (
+    JITTER_CONSTANT,
+    JITTER_M2,
+    NeighbourhoodFilter,
+)
 
 Floats = npt.NDArray[np.float64]
 
 SIGMA_M = 0.1
+DRIFT_AND_SCALE = (0.05, 0.1)
 
 
 def covariance_of(filter_: NeighbourhoodFilter) -> Floats:
@@ -28,20 +35,24 @@ def pairs_within(pose: Floats, reach_m: float) -> tuple[npt.NDArray[np.int64], .
     return i.astype(np.int64), j.astype(np.int64)
 
 
-def started(pose: Floats, width_m: float, sigma: float = 0.3) -> tuple[NeighbourhoodFilter, Floats]:
-    """Give a filter over independent starts, and the same as one dense covariance."""
-    count = len(pose)
-    each = np.tile(np.diag([sigma**2, sigma**2, 0.1**2]), (count, 1, 1))
+def dense_start(pose: Floats, variance: Sequence[float]) -> tuple[Floats, Floats]:
+    """Give states (N, 5) at poses (N, 3), and their covariance of variances (5,)."""
+    jitter = 3 * [JITTER_M2] + 2 * [JITTER_CONSTANT]
+    return np.pad(pose, ((0, 0), (0, 2))), np.diag(np.tile(np.add(variance, jitter), len(pose)))
+
+
+def started(
+    pose: Floats, width_m: float, sigma: float = 0.3
+) -> tuple[NeighbourhoodFilter, Floats, Floats]:
+    """Give a filter over independent starts, and the same as dense states and covariance."""
     made = NeighbourhoodFilter(width_m, RangeModel(SIGMA_M))
-    made.add(pose.copy(), each)
-    whole = np.zeros((3 * count, 3 * count))
-    for i in range(count):
-        whole[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = each[i] + JITTER_M2 * np.eye(3)
-    return made, whole
+    variance = [sigma**2, sigma**2, 0.1**2]
+    made.add(pose.copy(), np.tile(np.diag(variance), (len(pose), 1, 1)), DRIFT_AND_SCALE)
+    return made, *dense_start(pose, [*variance, *np.square(DRIFT_AND_SCALE)])
 
 
 def random_moves(rng: np.random.Generator, count: int) -> Floats:
-    moved = np.abs(rng.normal(0.3, 0.2, (count, 6)))
+    moved = np.abs(rng.normal(0.3, 0.2, (count, 7)))
     moved[:, :3] = rng.normal(0.0, 0.5, (count, 3))
     return moved
 
@@ -49,7 +60,7 @@ def random_moves(rng: np.random.Generator, count: int) -> Floats:
 def test_within_one_strip_it_is_the_dense_filter() -> None:
     rng = np.random.default_rng(1)
     pose = np.column_stack([rng.uniform(0, 12, (9, 2)), rng.uniform(-3, 3, 9)])
-    made, covariance = started(pose, width_m=50.0)
+    made, pose, covariance = started(pose, width_m=50.0)
     node, peer = np.triu_indices(9, 1)
     for _ in range(4):
         for _ in range(2):
@@ -60,27 +71,28 @@ def test_within_one_strip_it_is_the_dense_filter() -> None:
         measured = true + rng.normal(0.0, SIGMA_M, node.size)
         made.update(node, peer, measured)
         dense.update(pose, covariance, node, peer, measured, SIGMA_M)
-    assert np.allclose(made.pose, pose, atol=1e-7)
+    assert np.abs(pose[:, 3:]).max() > 0.01
+    assert np.allclose(made.state, pose, atol=1e-7)
     assert np.allclose(covariance_of(made), covariance, rtol=1e-6, atol=1e-10)
 
 
 def test_a_chain_of_strips_is_exact_where_the_ranges_form_one() -> None:
     rng = np.random.default_rng(2)
     pose = np.column_stack([rng.uniform(0, 60, 40), rng.uniform(0, 8, 40), rng.uniform(-3, 3, 40)])
-    made, covariance = started(pose, width_m=10.0)
+    made, pose, covariance = started(pose, width_m=10.0)
     assert len(made._layout.sizes) >= 5
     node, peer = pairs_within(pose, 10.0)
     measured = np.hypot(*(pose[node, :2] - pose[peer, :2]).T) + rng.normal(0, SIGMA_M, node.size)
     made.update(node, peer, measured)
     dense.update(pose, covariance, node, peer, measured, SIGMA_M)
-    assert np.allclose(made.pose, pose, atol=1e-7)
+    assert np.allclose(made.state, pose, atol=1e-7)
     assert np.allclose(covariance_of(made), covariance, atol=1e-9)
 
 
 def test_time_passes_within_the_strips_as_in_the_dense_filter() -> None:
     rng = np.random.default_rng(3)
     pose = np.column_stack([rng.uniform(0, 30, 12), rng.uniform(0, 8, 12), rng.uniform(-3, 3, 12)])
-    made, covariance = started(pose, width_m=11.0)
+    made, pose, covariance = started(pose, width_m=11.0)
     node, peer = pairs_within(pose, 11.0)
     measured = np.hypot(*(pose[node, :2] - pose[peer, :2]).T)
     made.update(node, peer, measured)
@@ -90,7 +102,7 @@ def test_time_passes_within_the_strips_as_in_the_dense_filter() -> None:
     moved = random_moves(rng, who.size)
     made.predict(who, moved)
     dense.advance(pose, covariance, who, moved)
-    assert np.allclose(made.pose, pose)
+    assert np.allclose(made.state, pose)
     got = made.pairs(node, peer)
     expected = dense.spread(pose, covariance, node, peer)
     assert np.allclose(got, expected, atol=1e-9)
@@ -99,7 +111,7 @@ def test_time_passes_within_the_strips_as_in_the_dense_filter() -> None:
 def test_a_node_that_walks_into_the_next_strip_takes_its_covariance_along() -> None:
     rng = np.random.default_rng(4)
     pose = np.column_stack([rng.uniform(0, 60, 50), rng.uniform(0, 8, 50), rng.uniform(-3, 3, 50)])
-    made, _ = started(pose, width_m=10.0)
+    made, *_ = started(pose, width_m=10.0)
     node, peer = pairs_within(pose, 10.0)
     measured = np.hypot(*(pose[node, :2] - pose[peer, :2]).T)
     made.update(node, peer, measured)
@@ -113,7 +125,7 @@ def test_a_node_that_walks_into_the_next_strip_takes_its_covariance_along() -> N
     assert (made._layout.strip != strip).sum() >= 2
     layout = made._layout
     close = np.abs(layout.strip[:, None] - layout.strip) <= 1
-    kept = np.repeat(np.repeat(close, 3, axis=0), 3, axis=1)
+    kept = np.repeat(np.repeat(close, 5, axis=0), 5, axis=1)
     assert np.allclose(covariance_of(made)[kept], before[kept], atol=1e-12)
 
 
@@ -122,12 +134,12 @@ def play(crowd: Crowd) -> dict[str, float]:
     count = crowd.settings.nodes
     made = NeighbourhoodFilter(crowd.settings.max_range_m, RangeModel(crowd.settings.sigma_range_m))
     made.add(crowd.poses[0].copy(), np.zeros((count, 3, 3)))
-    pose, covariance = crowd.poses[0].copy(), JITTER_M2 * np.eye(3 * count)
+    pose, covariance = dense_start(crowd.poses[0], 5 * [0.0])
     everybody = np.arange(count)
     squares: dict[str, list[float]] = {"filter": [], "dense": [], "nees": [], "nees_all": []}
     one, two = np.triu_indices(count, 1)
     for t, motion in enumerate(crowd.motions, 1):
-        moved = np.concatenate([motion, crowd.sigmas[t - 1]], axis=1)
+        moved = np.column_stack([motion, crowd.sigmas[t - 1], np.ones(count)])
         made.predict(everybody, moved)
         dense.advance(pose, covariance, everybody, moved)
         if t % crowd.settings.range_period_s:
@@ -168,7 +180,7 @@ def dense_spread_along(
     for a, b, sign in ((one, one, 1), (two, two, 1), (one, two, -1), (two, one, -1)):
         for p in range(2):
             for q in range(2):
-                total += sign * u[:, p] * u[:, q] * covariance[3 * a + p, 3 * b + q]
+                total += sign * u[:, p] * u[:, q] * covariance[5 * a + p, 5 * b + q]
     return total
 
 
@@ -188,7 +200,7 @@ def test_in_a_crowd_it_is_within_a_tenth_of_the_dense_filter_and_honest(
 def test_far_pairs_come_from_the_chain_and_ranges_beyond_a_strip_are_taken() -> None:
     rng = np.random.default_rng(5)
     pose = np.column_stack([np.arange(8) * 10.0, rng.uniform(0, 3, 8), np.zeros(8)])
-    made, _ = started(pose, width_m=10.0)
+    made, *_ = started(pose, width_m=10.0)
     # 35 m reach over three strips: the strips have to give way, the range has to count.
     true = float(np.hypot(*(pose[0, :2] - pose[3, :2])))
     before = made.pairs(np.array([0]), np.array([3]))[1, 0]

@@ -4,7 +4,7 @@ Each hypothesis holds the poses, step scales, heading drifts and range biases of
 their joint covariance, and a draw of the variance components; weights and resampling select among
 hypotheses (a Rao-Blackwellised particle filter: Doucet, de Freitas, Murphy and Russell 2000, for
 the relative localisation problem of the paper in ``README.md``). ``fusion.make("bank")`` uses it
-for teams of up to thirty users, and the smoother begins from it.
+for teams of up to twenty users, and the smoother begins from it.
 
 Begin reading with ``estimator.py`` (measurements in, estimates out) and ``core.py`` (one epoch as
 arrays); then ``hypothesis_set.py`` (storage and resampling), ``adaptive_count.py`` and

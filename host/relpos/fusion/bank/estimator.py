@@ -32,7 +32,7 @@ from relpos.fusion.initial_poses import (
     PoseMixture,
 )
 from relpos.fusion.models.detection import Detection
-from relpos.fusion.models.motion import reported_sigmas
+from relpos.fusion.models.motion import reported_sigmas, velocity_m_s
 from relpos.fusion.models.north import North
 from relpos.fusion.models.odometry_faults import LOST_RAD, VAGUE_M, SpeedGate, ZeroMotionDetector
 from relpos.fusion.models.ranging import Mounting, OutlierPersistence, RangeCorrelation
@@ -194,7 +194,7 @@ class Bank:
             known.received(time_s)
             way_m = math.hypot(dx_m, dy_m)
             self.range_correlation.move(node, way_m, turn_rad)
-            self._velocity_m_s[node] = _velocity_m_s(dx_m, dy_m, turn_rad, duration_s)
+            self._velocity_m_s[node] = velocity_m_s(dx_m, dy_m, turn_rad, duration_s)
             # How it turned meanwhile its ranges cannot say.
             moves[k, :2] *= known.undiffused(time_s, duration_s)
             vague = None if reported is None else _vagueness(a)
@@ -453,16 +453,6 @@ def make(
         lazy=True,
     )
     return Rewinder(Bank(priors, initialiser, settings, seed, mounting), timeline, settings.late_s)
-
-
-def _velocity_m_s(
-    dx_m: float, dy_m: float, turn_rad: float, duration_s: float
-) -> tuple[float, float]:
-    """Return the velocity, forward and left at its end, of a displacement given at its begin."""
-    if duration_s <= 0.0:
-        return 0.0, 0.0
-    c, s = math.cos(turn_rad) / duration_s, math.sin(turn_rad) / duration_s
-    return c * dx_m + s * dy_m, c * dy_m - s * dx_m
 
 
 def _vagueness(step: Advance) -> tuple[float, float] | None:

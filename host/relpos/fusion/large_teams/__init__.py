@@ -1,4 +1,4 @@
-"""The filter for large teams: 30 to 1,000 nodes, from recordings and simulations.
+"""The filter for large teams: 20 to 1,000 nodes, from recordings and simulations.
 
 The bank's work grows with the square of the team for every hypothesis. Where dozens of nodes range
 their neighbours, their poses are rarely ambiguous, and one joint Gaussian that keeps only the

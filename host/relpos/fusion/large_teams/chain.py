@@ -11,8 +11,8 @@ B_k = P_kk^-1 P_k,k+1 and V_k+1 = P_k+1,k+1 - P_k+1,k B_k the chain's informatio
     L_kk = V_k^-1 + B_k V_k+1^-1 B_k^T,    L_k,k+1 = -B_k V_k+1^-1
 
 and the blocks of (L + A)^-1 follow from one block Cholesky sweep forwards and one of selected
-inversion backwards. Headings follow the positions of their strip by regression, h | p ~ K p +
-noise, which a range does not change: K = P_hp P_pp^-1, P_hp <- K P_pp,
+inversion backwards. All other states follow the positions of their strip by regression,
+h | p ~ K p + noise, which a range does not change: K = P_hp P_pp^-1, P_hp <- K P_pp,
 P_hh <- K P_pp K^T + (P_hh - K P_ph).
 
 BLAS and LAPACK work on whole blocks; symmetric ones are kept as their lower halves.
@@ -32,9 +32,9 @@ Floats = npt.NDArray[np.float64]
 
 
 def update(layout: StripLayout, covariance: Floats, information: Floats, push: Floats) -> Floats:
-    """Add information to a covariance, in place; return how the poses change (N, 3).
+    """Add information to a covariance, in place; return how the states change (N, 5, C).
 
-    ``push`` (2 N,) is the information's right-hand side, strip by strip; it is overwritten.
+    ``push`` (2 N, C) are right-hand sides, strip by strip; they are overwritten.
     """
     diagonal, following = layout.views(covariance, COVARIANCE)
     added, added_next = layout.views(information, INFORMATION)
@@ -52,7 +52,7 @@ def update(layout: StripLayout, covariance: Floats, information: Floats, push: F
         if carried is not None:
             push[starts[k + 1] : starts[k + 2]] -= carried.push
         eliminated.append(one)
-    moved = np.empty((len(layout.strip), 3))
+    moved = np.empty((len(layout.strip), COVARIANCE, push.shape[1]))
     _back_substitute(layout, eliminated, diagonal, following, moved)
     return moved
 
@@ -63,13 +63,13 @@ class _Eliminated(NamedTuple):
     factor: Floats
     """Cholesky factor of the strip's information, given the strips before it."""
     right: Floats
-    """The factor's inverse times the right-hand side."""
+    """The factor's inverse times the right-hand sides."""
     ahead: Floats
     """The factor's inverse times the information between this strip and the next."""
     regression: Floats
-    """K^T of the headings on the positions."""
+    """K^T of the other states on the positions."""
     rest: Floats
-    """What the positions leave of the headings' covariance."""
+    """What the positions leave of the other states' covariance."""
 
 
 class _Carried(NamedTuple):
@@ -94,33 +94,36 @@ def _eliminate(
     """
     m = 2 * n
     prior = _lower(_copy(block[:m, :m]))
-    both = np.empty((m, n + (0 if to_next is None else to_next[0].shape[1])), order="F")
-    both[:, :n] = block[:m, m:]
+    others = len(block) - m
+    both = np.empty((m, others + (0 if to_next is None else to_next[0].shape[1])), order="F")
+    both[:, :others] = block[:m, m:]
     if to_next is not None:
-        both[:, n:] = to_next[0]
+        both[:, others:] = to_next[0]
     both = _solve_lower(prior, both)
-    rest = _minus_square(both[:, :n], block[m:, m:])
-    given = np.empty((0, 0)) if to_next is None else _lower(_minus_square(both[:, n:], to_next[1]))
+    rest = _minus_square(both[:, :others], block[m:, m:])
+    given = np.empty((0, 0))
+    if to_next is not None:
+        given = _lower(_minus_square(both[:, others:], to_next[1]))
     both = _solve_lower(prior, both, transposed=True)
     joined = _inverse(prior) if before is None else before.information
     joined += added
     ahead = coupling = np.empty((m, 0))
     if to_next is not None:
         # Y^T = B L_V^-T, then B V^-1 = Y^T L_V^-1.
-        y = blas.dtrsm(1.0, given, both[:, n:], side=1, lower=1, trans_a=1, overwrite_b=1)
+        y = blas.dtrsm(1.0, given, both[:, others:], side=1, lower=1, trans_a=1, overwrite_b=1)
         joined = blas.dsyrk(1.0, y, 1.0, joined, lower=1, overwrite_c=1)
         coupling = blas.dtrsm(-1.0, given, y, side=1, lower=1, overwrite_b=1)
         coupling += to_next[2]
     factor = _lower(joined)
-    right = blas.dtrsv(factor, push, lower=1)
+    right = _solve_lower(factor, _copy(push))
     carried = None
     if to_next is not None:
         ahead = _solve_lower(factor, coupling)
         carried = _Carried(
             blas.dsyrk(-1.0, ahead, 1.0, _inverse(given), trans=1, lower=1, overwrite_c=1),
-            blas.dgemv(1.0, ahead, right, trans=1),
+            blas.dgemm(1.0, ahead, right, trans_a=1),
         )
-    return _Eliminated(factor, right, ahead, both[:, :n], rest), carried
+    return _Eliminated(factor, right, ahead, both[:, :others], rest), carried
 
 
 def _back_substitute(
@@ -130,7 +133,7 @@ def _back_substitute(
     following: list[Floats],
     moved: Floats,
 ) -> None:
-    """Fill the posterior blocks and the changes of the poses, from the last strip to the first."""
+    """Fill the posterior blocks and the changes of the states, from the last strip to the first."""
     last = len(eliminated) - 1
     step = later = np.empty((0, 0))
     for k in range(last, -1, -1):
@@ -139,28 +142,29 @@ def _back_substitute(
         m = 2 * n
         if k < last:
             p = 2 * int(layout.sizes[k + 1])
-            right -= blas.dgemv(1.0, ahead, step)
+            right -= blas.dgemm(1.0, ahead, step)
             slope = _solve_lower(factor, ahead, transposed=True)
             cross = blas.dsymm(-1.0, later, slope, side=1, lower=1)
             later = blas.dgemm(-1.0, cross, slope, 1.0, _inverse(factor), trans_b=1, overwrite_c=1)
-            headings = blas.dgemm(1.0, cross, eliminated[k + 1].regression)
+            others = blas.dgemm(1.0, cross, eliminated[k + 1].regression)
             block = following[k]
             block[:m, :p] = cross
-            block[:m, p:] = headings
+            block[:m, p:] = others
             block[m:, :p] = blas.dgemm(1.0, regression, cross, trans_a=1)
-            block[m:, p:] = blas.dgemm(1.0, regression, headings, trans_a=1)
+            block[m:, p:] = blas.dgemm(1.0, regression, others, trans_a=1)
         else:
             later = _inverse(factor)
-        step = blas.dtrsv(factor, right, lower=1, trans=1)
+        step = _solve_lower(factor, right, transposed=True)
         block = diagonal[k]
-        headings = blas.dsymm(1.0, later, regression, lower=1)
+        others = blas.dsymm(1.0, later, regression, lower=1)
         block[:m, :m] = later
-        block[m:, :m] = headings.T
-        block[m:, m:] = blas.dgemm(1.0, regression, headings, 1.0, rest, trans_a=1)
+        block[m:, :m] = others.T
+        block[m:, m:] = blas.dgemm(1.0, regression, others, 1.0, rest, trans_a=1)
         block[:] = np.tril(block) + np.tril(block, -1).T
         nodes = layout.nodes_of(k)
-        moved[nodes, 0], moved[nodes, 1] = step[:n], step[n:]
-        moved[nodes, 2] = blas.dgemv(1.0, regression, step, trans=1)
+        moved[nodes, :2] = step.reshape(2, n, -1).swapaxes(0, 1)
+        followed = blas.dgemm(1.0, regression, step, trans_a=1)
+        moved[nodes, 2:] = followed.reshape(COVARIANCE - 2, n, -1).swapaxes(0, 1)
 
 
 def _lower(matrix: Floats) -> Floats:

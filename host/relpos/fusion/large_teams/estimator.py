@@ -11,29 +11,33 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from relpos.errors import RelposError
+from relpos.fusion.clocks import Clocks
 from relpos.fusion.estimator import (
     ANY_ANGLE_RAD,
     Estimate,
     NodeEstimate,
     PairEstimate,
+    Parameter,
     Presence,
     refuse_unmoved,
     refuse_unranged,
     unlocated,
 )
 from relpos.fusion.initial_poses import Found, Initialiser
-from relpos.fusion.large_teams.kernels import RangeModel
-from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter
+from relpos.fusion.large_teams.kernels import NEAREST_M, RangeModel, Ranges
+from relpos.fusion.large_teams.range_terms import RangeSlopes
+from relpos.fusion.large_teams.sparse_filter import LATENESS, SHADOW, NeighbourhoodFilter
 from relpos.fusion.large_teams.variance_components import VarianceComponents
 from relpos.fusion.models.motion import reported_sigmas
 from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_variances
-from relpos.fusion.models.ranging import Mounting
+from relpos.fusion.models.ranging import Mounting, OutlierPersistence, RangeCorrelation
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.measurements import Height, Prior, Range, nodes_of
@@ -49,6 +53,8 @@ class LargeTeamSettings:
     outliers_short: float
     jump_m: float
     jump_rad: float
+    drift_rad_s: float
+    scale: float
     reorder_s: float
     max_lag_s: float
     late_s: float
@@ -70,6 +76,7 @@ def make(
         start_s=start_s,
         reorder_s=settings.reorder_s,
         max_lag_s=settings.max_lag_s,
+        lazy=True,
     )
     return Rewinder(LargeTeam(priors, initialiser, settings, mountings), timeline, settings.late_s)
 
@@ -98,11 +105,25 @@ REACH_FADE = 0.999
 LEAST_REACH_M = 5.0
 """Nodes nearer than this are listed as pairs, however short the ranges are."""
 
+TOGETHER_S = 0.05
+"""Ranges of so many seconds correct the team together: one correction costs as much as a hundred
+ranges. In the meantime people walk on, so that each range is brought forward by how the estimated
+distance has changed since; what a heading error of 10 degrees does to that is 0.02 m."""
+
 MOSTLY_OUTLYING = 0.5
 """From this fraction of outliers on a node's pose, and not its ranges, is taken to be wrong."""
 
 FORGET = 0.3
 """Weight of an instant in that fraction: at a range every 2 s, three instants or so."""
+
+
+class _Collected(NamedTuple):
+    """A range that is not used yet."""
+
+    measured: Range
+    excess_m: float
+    """By how much it exceeded the distance that was estimated at its instant."""
+    slopes: tuple[float, float]
 
 
 @dataclass(slots=True)
@@ -114,14 +135,22 @@ class LargeTeam:
     settings: LargeTeamSettings
     mountings: Mapping[int, Mounting]
     filter: NeighbourhoodFilter = field(init=False)
+    clocks: Clocks = field(default_factory=Clocks)
     _nodes: list[int] = field(default_factory=list)
     _row: dict[int, int] = field(default_factory=dict)
     _known: dict[int, Presence] = field(default_factory=dict)
     _pending: list[Advance] = field(default_factory=list)
+    _collected: list[_Collected] = field(default_factory=list)
+    """Ranges not used yet."""
+    _collected_s: float = math.inf
+    """When the first of them was measured."""
     _own: Counter[str] = field(default_factory=Counter)
     _outlying: Floats = field(default_factory=lambda: np.empty(0))
     """Fraction of outliers in each node's latest ranges."""
     _components: VarianceComponents = field(default_factory=VarianceComponents)
+    _slopes: RangeSlopes = field(default_factory=RangeSlopes)
+    _outliers: OutlierPersistence = field(default_factory=OutlierPersistence)
+    _correlation: RangeCorrelation = field(default_factory=RangeCorrelation)
     _sigma_count: float = SIGMA_R_COUNT
     _reach_m: float = 0.0
     _moved: bool = False
@@ -147,10 +176,6 @@ class LargeTeam:
         self._add([p.node for p in known], poses, sigmas[:, :, None] ** 2 * np.eye(3))
 
     @property
-    def clocks(self) -> None:
-        """Nothing is learned of time stamps."""
-
-    @property
     def shared(self) -> tuple[object, ...]:
         """Objects that copies of the core refer to (:class:`~relpos.fusion.rewind.Core`)."""
         return self.priors, self.settings, self.mountings
@@ -164,6 +189,8 @@ class LargeTeam:
                 self._pending.append(step)
             case Ranging():
                 self._predict()
+                if step.time_s > self._collected_s + TOGETHER_S:
+                    self._correct()
                 self._use_ranges(step, timeline)
             case Sensed(measurement=Height() as height):
                 known = self._presence(height.node)
@@ -173,8 +200,10 @@ class LargeTeam:
                 self._own["headings_unused"] += 1
             case Epoch():
                 self._predict()
+                self._correct()
                 self._diffuse(self._row, step.time_s, timeline)
                 self._add_found(self.initialiser.find(step.time_s))
+                self._slew_clocks(step.time_s, timeline)
                 return self._estimate(step.time_s)
         return None
 
@@ -207,7 +236,7 @@ class LargeTeam:
     def _add(self, nodes: Sequence[int], poses: Floats, covariances: Floats) -> None:
         if not nodes:
             return
-        self.filter.add(poses, covariances)
+        self.filter.add(poses, covariances, (self.settings.drift_rad_s, self.settings.scale))
         for node in nodes:
             self._row[node] = len(self._nodes)
             self._nodes.append(node)
@@ -217,12 +246,25 @@ class LargeTeam:
         self._outlying = np.append(self._outlying, np.zeros(len(nodes)))
         self._components.add(poses)
 
+    def _slew_clocks(self, time_s: float, timeline: Timeline) -> None:
+        """Let what has been learned of time stamps go into those of later ranges."""
+        if self._epoch_s > -math.inf:
+            learned = (
+                float(self.filter.terms[LATENESS]),
+                float(self.filter.sigma_of_terms()[LATENESS]),
+            )
+            late_s, _ = self.clocks.slew(time_s - self._epoch_s, learned, {})
+            self.filter.terms[LATENESS] -= late_s
+        timeline.reorder_s = self.settings.reorder_s + self.clocks.longest_s
+
     # -- motion --------------------------------------------------------------------------------
 
     def _predict(self) -> None:
         """Apply the displacements since the last call."""
         steps, self._pending = self._pending, []
         for a in steps:
+            self._slopes.move(a)
+            self._correlation.move(a.node, math.hypot(a.dx_m, a.dy_m), a.dtheta_rad)
             if a.node not in self._row:
                 self.initialiser.advance(a)
         steps = [a for a in steps if a.node in self._row]
@@ -235,7 +277,7 @@ class LargeTeam:
             [[self._known[a.node].undiffused(a.time_s, a.duration_s)] for a in steps]
         )
         reported = np.array([reported_sigmas(a) for a in steps])
-        dx, dy, turn, _ = moves.T
+        dx, dy, turn, duration_s = moves.T
         variance = base_variances(moves, reported) * self._components.factor[rows]
         self._components.add_turns(rows, turn)
         # Along the path, and a tenth of that across, both in the frame of the body.
@@ -244,7 +286,10 @@ class LargeTeam:
         sigma_x = np.sqrt(along * (dx * dx + ACROSS * dy * dy) / square)
         sigma_y = np.sqrt(along * (dy * dy + ACROSS * dx * dx) / square)
         sigma_turn = np.sqrt(variance[:, TURN] + variance[:, WHITE])
-        self.filter.predict(rows, np.column_stack([moves[:, :3], sigma_x, sigma_y, sigma_turn]))
+        # Who reports nothing at all stands, and the heading with it.
+        moving_s = np.where((square > 1e-12) | (turn != 0.0), duration_s, 0.0)
+        moved = np.column_stack([moves[:, :3], sigma_x, sigma_y, sigma_turn, moving_s])
+        self.filter.predict(rows, moved)
 
     def _diffuse(self, nodes: Iterable[int], time_s: float, timeline: Timeline) -> None:
         """Let nodes whose motion is missing be anywhere that they can have walked to."""
@@ -264,22 +309,48 @@ class LargeTeam:
             self._presence(node).ranged(step.time_s)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
         if located:
-            self._update(located)
+            self._collect(step.time_s, located)
         self._seek(step)
 
-    def _update(self, ranges: Sequence[Range]) -> None:
-        node = np.array([self._row[r.node] for r in ranges], dtype=np.int64)
-        peer = np.array([self._row[r.peer] for r in ranges], dtype=np.int64)
-        measured = np.array([r.range_m for r in ranges])
-        height = np.array([self._height(r.peer) - self._height(r.node) for r in ranges])
-        horizontal = np.sqrt(np.maximum(measured**2 - height**2, 0.0))
+    def _collect(self, time_s: float, ranges: Sequence[Range]) -> None:
+        """Put ranges aside, as excesses over the distances that are estimated at their instant."""
+        rows = np.array([(self._row[r.node], self._row[r.peer]) for r in ranges])
+        off = self.filter.antennas_m(rows[:, 1]) - self.filter.antennas_m(rows[:, 0])
+        distance = np.hypot(off[:, 0], off[:, 1])
+        sight = (off / np.maximum(distance, NEAREST_M)[:, None]).tolist()
+        headings = self.filter.pose[rows, 2].tolist()
+        for k, r in enumerate(ranges):
+            height_m = self._height(r.peer) - self._height(r.node)
+            horizontal_m = math.sqrt(max(r.range_m**2 - height_m**2, 0.0))
+            node, peer = (r.node, headings[k][0]), (r.peer, headings[k][1])
+            slopes = self._slopes.of((sight[k][0], sight[k][1]), node, peer)
+            self._collected.append(_Collected(r, horizontal_m - float(distance[k]), slopes))
+            self._reach_m = max(self._reach_m * REACH_FADE, r.range_m)
+        self._collected_s = min(self._collected_s, time_s)
         self._ranges_used += len(ranges)
+
+    def _correct(self) -> None:
+        """Use the ranges that were collected."""
+        if not self._collected:
+            return
+        time_s, pairs = (
+            self._collected_s,
+            [(c.measured.node, c.measured.peer) for c in self._collected],
+        )
+        node, peer = (np.array([self._row[n] for n in ends]) for ends in zip(*pairs, strict=True))
+        slopes = np.array([c.slopes for c in self._collected])
+        excess = np.array([c.excess_m for c in self._collected])
+        self._collected, self._collected_s = [], math.inf
         f = self.filter
         if not math.isfinite(f.width_m):
-            f.widen(float(measured.max()) * REACH_SLACK)
-        self._reach_m = max(self._reach_m * REACH_FADE, float(measured.max()))
+            f.widen(self._reach_m * REACH_SLACK)
+        horizontal = excess + f.antenna_pairs(node, peer)[0]
         before, prior = f.pose.copy(), f.marginals()
-        inlier = f.update(node, peer, horizontal)
+        counts = self._correlation.effective_counts(pairs)
+        shares = self._outliers.shares(time_s, pairs)
+        inlier = f.update_with_terms(Ranges(node, peer, horizontal, counts, shares, slopes))
+        self._outliers.learn(time_s, pairs, inlier)
+        horizontal -= slopes @ f.terms
         both = np.concatenate([node, peer])
         self._components.update(before, prior, f.pose, f.marginals(), both)
         self._own["ranges_distrusted"] += int((inlier < 0.5).sum())
@@ -365,7 +436,21 @@ class LargeTeam:
                     known.sigma_height_m,
                 )
             )  # fmt: skip
-        return Estimate(time_s, tuple(nodes), self._pairs())
+        return Estimate(time_s, tuple(nodes), self._pairs(), parameters=self._parameters(time_s))
+
+    def _parameters(self, time_s: float) -> tuple[Parameter, ...]:
+        """Return what ranges have in common; the team's figures stand beside every node."""
+        (shadow_m, late_s), sigmas = (
+            self.filter.terms.tolist(),
+            self.filter.sigma_of_terms().tolist(),
+        )
+        learned = (
+            ("body_shadow_m", shadow_m, sigmas[SHADOW]),
+            ("range_lateness_s", late_s + self.clocks.lateness_s, sigmas[LATENESS]),
+        )
+        return tuple(
+            Parameter(time_s, node, None, *one) for node in sorted(self._row) for one in learned
+        )
 
     def _pairs(self) -> tuple[PairEstimate, ...]:
         """Return the pairs within reach of each other, in the order of ids."""

@@ -17,32 +17,44 @@ Indices = npt.NDArray[np.int64]
 NEAREST_M = 1e-3
 """Below this distance a direction means nothing; it keeps divisions finite."""
 
+LEVERS = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 1))
+"""Component (x, y, heading) and what it depends on (heading, drift, scale), the heading last."""
+
 ENTRIES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
 """Components (x, y, heading) of the six distinct entries of a pose's covariance."""
 
 
 @compiled
 def move(
-    pose: Floats, lever: Floats, noise: Floats, variance: Floats, node: Indices, moved: Floats
+    state: Floats, lever: Floats, noise: Floats, headings: Floats, node: Indices, moved: Floats
 ) -> None:
     """Move nodes by pieces of reported displacements, one after the other.
 
-    ``pose`` (N, 3) is moved in place. ``moved`` (E, 6): forward, left, turn and their standard
-    deviations. The turn's noise enters before the displacement (people turn, then move). What the
-    covariance has to be changed by is collected per node: ``lever`` (N, 2) is the derivative of
-    the position by the heading of the last update, ``noise`` (N, 6) the covariance xx, xy, yy,
-    xh, yh, hh added since. ``variance`` (N,) is the heading's at the last update.
+    ``state`` (N, 5) is moved in place. ``moved`` (E, 7): forward, left, turn, their standard
+    deviations, and for how long (s) the node moved. The turn's noise enters before the
+    displacement (people turn, then move). What the covariance has to be changed by is collected
+    per node: ``lever`` (N, 3, 3) is the derivative of the pose by heading, drift and scale of the
+    last update (but for the heading's by itself), ``noise`` (N, 6) the covariance xx, xy, yy, xh,
+    yh, hh added since. ``headings`` (N, 3) are the heading's variance at the last update, its
+    covariance with the drift, and the drift's variance.
 
     A heading error e of variance v turns the displacement d: on average it is shorter by
     exp(-v/2), and varies along itself by d^2 (1 - exp(-v))^2 / 2, the second-order terms.
     """
     for e in range(len(node)):
         i = node[e]
-        forward, left, turn = moved[e, 0], moved[e, 1], moved[e, 2]
-        c, s = math.cos(pose[i, 2]), math.sin(pose[i, 2])
+        scale = math.exp(state[i, 4])
+        forward, left = scale * moved[e, 0], scale * moved[e, 1]
+        # Half of the drift before the displacement, half after it.
+        half = 0.5 * moved[e, 6]
+        heading = state[i, 2] - half * state[i, 3]
+        lever[i, 2, 1] -= half
+        c, s = math.cos(heading), math.sin(heading)
         # The turn's noise first: it turns this displacement, too.
         noise[i, 5] += moved[e, 5] * moved[e, 5]
-        spread = variance[i] + noise[i, 5]
+        gained = lever[i, 2, 1]
+        spread = headings[i, 0] + gained * (2.0 * headings[i, 1] + gained * headings[i, 2])
+        spread += noise[i, 5]
         shrunk = math.exp(-0.5 * spread)
         dx, dy = c * forward - s * left, s * forward + c * left
         along = 0.5 * (1.0 - shrunk * shrunk) ** 2
@@ -58,11 +70,16 @@ def move(
         noise[i, 2] += s * s * sx + c * c * sy + along * dy * dy
         noise[i, 3] += hx * hh
         noise[i, 4] += hy * hh
-        lever[i, 0] += hx
-        lever[i, 1] += hy
-        pose[i, 0] += shrunk * dx
-        pose[i, 1] += shrunk * dy
-        pose[i, 2] += turn
+        lever[i, 0, 0] += hx
+        lever[i, 1, 0] += hy
+        lever[i, 0, 1] += hx * lever[i, 2, 1]
+        lever[i, 1, 1] += hy * lever[i, 2, 1]
+        lever[i, 0, 2] += shrunk * dx
+        lever[i, 1, 2] += shrunk * dy
+        lever[i, 2, 1] -= half
+        state[i, 0] += shrunk * dx
+        state[i, 1] += shrunk * dy
+        state[i, 2] = heading + moved[e, 2] - half * state[i, 3]
 
 
 def propagate(covariance: Floats, layout: StripLayout, lever: Floats, noise: Floats) -> None:
@@ -76,10 +93,10 @@ def propagate(covariance: Floats, layout: StripLayout, lever: Floats, noise: Flo
     blocks += zip(following, nodes, nodes[1:], strict=False)
     for block, rows, columns in blocks:
         n, p = len(rows), len(columns)
-        for axis in range(2):
-            block[axis * n : axis * n + n] += lever[rows, axis, None] * block[2 * n :]
-        for axis in range(2):
-            block[:, axis * p : axis * p + p] += lever[columns, axis] * block[:, 2 * p :]
+        for axis, by in LEVERS:
+            down, right = slice((2 + by) * n, (3 + by) * n), slice((2 + by) * p, (3 + by) * p)
+            block[axis * n : axis * n + n] += lever[rows, axis, by, None] * block[down]
+            block[:, axis * p : axis * p + p] += lever[columns, axis, by] * block[:, right]
     for block, rows in zip(diagonal, nodes, strict=True):
         own = len(rows) * np.arange(3)[:, None] + np.arange(len(rows))
         for (a, b), added in zip(ENTRIES, noise[rows].T, strict=True):
@@ -141,6 +158,21 @@ def pair_moments(
     return result
 
 
+class Ranges(NamedTuple):
+    """The ranges (E,) of one instant."""
+
+    node: Indices
+    """Row of the node at one end."""
+    peer: Indices
+    measured_m: Floats
+    counts: Floats
+    """How many independent ranges each is worth."""
+    outlier_share: Floats
+    """Probability that it is an outlier, at least."""
+    slopes: Floats
+    """(E, T): derivative by what all ranges have in common."""
+
+
 class RangeModel(NamedTuple):
     """Noise of all ranges, and their outliers."""
 
@@ -156,50 +188,66 @@ class RangeModel(NamedTuple):
 def range_information(
     layout: StripLayout,
     pairs: Floats,
-    node: Indices,
-    peer: Indices,
-    measured: Floats,
+    ranges: Ranges,
     model: RangeModel,
-) -> tuple[Floats, Floats, Floats]:
+    carried: Floats,
+) -> tuple[Floats, Floats, Floats, Floats]:
     """Return the ranges of one instant as information about positions, at the present poses.
 
-    ``pairs`` (4, E) are :func:`pair_moments`, ``measured`` (E,) in m. The result is the blocks of
-    the information matrix A, the right-hand side b (2N,) strip by strip as the blocks' rows, and
-    each range's probability of not being an outlier, by which its information is multiplied.
+    ``pairs`` (4, E) are :func:`pair_moments`; ``carried`` (N, 5, T) is how the states depend on the
+    T terms that all ranges have in common. The result is the blocks of the information matrix A,
+    right-hand sides (2N, 1 + T) strip by strip as the blocks' rows, each range's probability of not
+    being an outlier, by which its information is multiplied, and a line for each range: weight,
+    slopes ux, uy, innovation, and the innovation's derivatives by the T terms. The right-hand sides
+    are those of the innovations and of these derivatives.
 
     Second order, finite where two nodes meet: with c the variance across, m^2 = d^2 + c, the
     range's variance is a d^2 / m^2 + c^2 / 2m^2 and its slope d / m.
     """
     blocks, sizes, strip, slot = layout.information, layout.sizes, layout.strip, layout.slot
-    information, push = np.zeros(blocks.total), np.zeros(2 * len(strip))
-    inlier = np.empty(len(node))
+    terms = carried.shape[2]
+    information, push = np.zeros(blocks.total), np.zeros((2 * len(strip), 1 + terms))
+    lines = np.zeros((len(ranges.node), 4 + terms))
+    inlier = np.empty(len(ranges.node))
     short = model.outliers_short
-    for e in range(len(node)):
-        i, j = node[e], peer[e]
+    for e in range(len(ranges.node)):
+        i, j = ranges.node[e], ranges.peer[e]
         distance, along, across, bearing = pairs[0, e], pairs[1, e], pairs[2, e], pairs[3, e]
         square = distance * distance + across + NEAREST_M * NEAREST_M
         middle = math.sqrt(square)
-        innovation = measured[e] - middle
-        noise = model.sigma_m * model.sigma_m + 0.5 * across * across / square
+        innovation = ranges.measured_m[e] - middle
+        outliers = max(model.outliers, ranges.outlier_share[e])
+        curved = 0.5 * across * across / square
+        noise = model.sigma_m * model.sigma_m + curved
         slope = distance / middle
         expected = slope * slope * along + noise
         wide = expected + model.outlier_m * model.outlier_m
         side = 2.0 * (1.0 - short) if innovation > 0.0 else 2.0 * short
-        usual = (1.0 - model.outliers) * math.exp(-0.5 * (innovation * innovation / expected))
+        usual = (1.0 - outliers) * math.exp(-0.5 * (innovation * innovation / expected))
         usual /= math.sqrt(expected)
-        odd = model.outliers * side * math.exp(-0.5 * innovation * innovation / wide)
+        odd = outliers * side * math.exp(-0.5 * innovation * innovation / wide)
         odd /= math.sqrt(wide)
         # Where both vanish, the range is an outlier.
         inlier[e] = usual / (usual + odd + 1e-300)
         if inlier[e] < 1e-3 or abs(strip[i] - strip[j]) > 1:
             continue
-        weight = inlier[e] / noise
+        weight = inlier[e] / (model.sigma_m * model.sigma_m / ranges.counts[e] + curved)
         ux, uy = slope * math.cos(bearing), slope * math.sin(bearing)
+        line = lines[e]
+        line[0], line[1], line[2], line[3] = weight, ux, uy, innovation
+        for t in range(terms):
+            change_x, change_y = (
+                carried[j, 0, t] - carried[i, 0, t],
+                carried[j, 1, t] - carried[i, 1, t],
+            )
+            line[4 + t] = ranges.slopes[e, t] + ux * change_x + uy * change_y
         # The range grows with the peer along u and with the node against it.
         for who, sign in ((i, -1.0), (j, 1.0)):
             at = 2 * layout.first[strip[who]] + slot[who]
-            push[at] += sign * (weight * innovation) * ux
-            push[at + sizes[strip[who]]] += sign * (weight * innovation) * uy
+            for t in range(1 + terms):
+                much = sign * weight * line[3 + t]
+                push[at, t] += much * ux
+                push[at + sizes[strip[who]], t] += much * uy
         for one, two, sign in ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0)):
             if one > two and strip[one] != strip[two]:
                 continue  # adjacent strips have one block
@@ -208,4 +256,4 @@ def range_information(
             information[base + down] += sign * weight * ux * uy
             information[base + right] += sign * weight * ux * uy
             information[base + down + right] += sign * weight * uy * uy
-    return information, push, inlier
+    return information, push, inlier, lines

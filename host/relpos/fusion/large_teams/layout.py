@@ -2,7 +2,7 @@
 
 The area is divided into parallel strips. A buffer holds, strip after strip, block (k, k) of strip
 k and then, strip after strip, block (k, k + 1) between it and the following one, each in columns
-(Fortran's order) over the states x of all its nodes, then y, then heading.
+(Fortran's order) over the states x of all its nodes, then y, heading, drift and scale.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import numpy.typing as npt
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-COVARIANCE, INFORMATION = 3, 2
-"""States of a node in the blocks: a covariance has poses, information positions alone."""
+COVARIANCE, INFORMATION = 5, 2
+"""States of a node in the blocks: a covariance has all, information positions alone."""
 
 
 class Blocks(NamedTuple):
@@ -50,7 +50,7 @@ class StripLayout(NamedTuple):
     def states(self) -> list[Indices]:
         """Return, for each strip, the rows of its block in a covariance kept node by node."""
         return [
-            (3 * self.nodes_of(k) + np.arange(3)[:, None]).reshape(-1)
+            (COVARIANCE * self.nodes_of(k) + np.arange(COVARIANCE)[:, None]).reshape(-1)
             for k in range(len(self.sizes))
         ]
 

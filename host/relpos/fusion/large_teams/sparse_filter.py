@@ -25,14 +25,21 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.large_teams import chain, kernels
-from relpos.fusion.large_teams.kernels import RangeModel
+from relpos.fusion.large_teams.kernels import RangeModel, Ranges
 from relpos.fusion.large_teams.layout import COVARIANCE, StripLayout, lay_out
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-JITTER_M2 = 1e-8
-"""Least variance of an initial pose, (0.1 mm)^2 and as many rad^2: an exact one has no inverse."""
+JITTER_M2, JITTER_CONSTANT = 1e-8, 1e-12
+"""Least variances of an initial pose, (0.1 mm)^2 and as many rad^2, and of drift and scale: what is
+exact has no inverse."""
+
+TERMS_SD = (0.3, 0.3)
+"""Standard deviations of the terms beforehand: m, s."""
+
+TERMS = len(TERMS_SD)
+SHADOW, LATENESS = range(TERMS)
 
 DIRECTIONS = 12
 """So many directions of the strips are tried."""
@@ -46,22 +53,32 @@ MARGIN_M = 0.5
 
 @dataclass(slots=True)
 class NeighbourhoodFilter:
-    """Poses and covariance of a large team, arrays in and out.
+    """States and covariance of a large team, arrays in and out.
 
-    ``pose`` (N, 3) world metres and radians; ``width_m`` is the least width of a strip: the reach
-    of the radio. Nodes are numbered 0 to N - 1 in the order in which they were added.
+    ``state`` (N, 5) is x, y (m), heading (rad), the heading's drift (rad/s) and the logarithm of
+    the step scale, the last two as in the bank (``StateIndex``); ``width_m`` is the least width of
+    a strip: the reach of the radio. Nodes are numbered 0 to N - 1 in the order in which they were
+    added.
     """
 
     width_m: float
     model: RangeModel = field(default_factory=RangeModel)
-    pose: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    state: Floats = field(default_factory=lambda: np.empty((0, COVARIANCE)))
     antenna_m: Floats = field(default_factory=lambda: np.empty((0, 2)))
     """Where the antenna of each node is: forward and left of the point that moves, (N, 2)."""
+    terms: Floats = field(default_factory=lambda: np.zeros(TERMS))
+    """What all ranges have in common: the body's shadow (m) and the lateness of time stamps (s)."""
+    _carried: Floats = field(default_factory=lambda: np.empty((0, COVARIANCE, TERMS)))
+    """V (N, 5, T): derivative of the states by the terms."""
+    terms_information: Floats = field(
+        default_factory=lambda: np.diag(np.power(TERMS_SD, -2.0).astype(np.float64))
+    )
     counters: Counter[str] = field(default_factory=Counter)
     """How often nodes changed strips, and strips were laid out anew or widened."""
-    _lever: Floats = field(default_factory=lambda: np.empty((0, 2)))
+    _lever: Floats = field(default_factory=lambda: np.empty((0, 3, 3)))
     _noise: Floats = field(default_factory=lambda: np.empty((0, 6)))
-    _variance: Floats = field(default_factory=lambda: np.empty(0))
+    _heading: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    """Variances of heading and of drift at the last update, and their covariance between (N, 3)."""
     _behind: bool = False
     _axis: Floats = field(default_factory=lambda: np.array([1.0, 0.0]))
     _origin_m: float = 0.0
@@ -70,26 +87,38 @@ class NeighbourhoodFilter:
     _cell: Indices = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     """Interval of ``width_m`` along the axis that each node belongs to; its strip skips gaps."""
 
+    @property
+    def pose(self) -> Floats:
+        """Poses (N, 3), a view."""
+        return self.state[:, :3]
+
     # -- nodes ---------------------------------------------------------------------------------
 
-    def add(self, pose: Floats, covariance: Floats) -> None:
-        """Add nodes with poses (E, 3) and covariances (E, 3, 3), independent of all others."""
-        count = self.pose.shape[0]
+    def add(
+        self, pose: Floats, covariance: Floats, sigma_constants: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
+        """Add nodes with poses (E, 3) and covariances (E, 3, 3), independent of all others.
+
+        ``sigma_constants`` are the standard deviations of drift and scale, which begin with 0.
+        """
+        count, more = self.state.shape[0], pose.shape[0]
         full = self._dense() if count else np.empty((0, 0))
-        self.pose = np.concatenate([self.pose, pose])
-        more = pose.shape[0]
+        self.state = np.concatenate([self.state, np.pad(pose, ((0, 0), (0, 2)))])
         self.antenna_m = np.concatenate([self.antenna_m, np.zeros((more, 2))])
-        self._lever = np.zeros((count + more, 2))
+        self._carried = np.concatenate([self._carried, np.zeros((more, COVARIANCE, TERMS))])
+        self._lever = np.zeros((count + more, 3, 3))
         self._noise = np.zeros((count + more, 6))
-        self._variance = np.zeros(count + more)
-        whole = np.zeros((3 * (count + more), 3 * (count + more)))
-        whole[: 3 * count, : 3 * count] = full
+        whole = np.zeros((COVARIANCE * (count + more), COVARIANCE * (count + more)))
+        whole[: len(full), : len(full)] = full
         for i, each in enumerate(covariance, count):
-            whole[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = each + JITTER_M2 * np.eye(3)
+            at = COVARIANCE * i
+            whole[at : at + 3, at : at + 3] = each + JITTER_M2 * np.eye(3)
+            for entry, sigma in enumerate(sigma_constants, at + 3):
+                whole[entry, entry] = sigma**2 + JITTER_CONSTANT
         self._lay_out(whole)
 
     def _lay_out(self, whole: Floats) -> None:
-        """Choose the strips' direction and cut the covariance (3N, 3N) into blocks."""
+        """Choose the strips' direction and cut the covariance (5N, 5N) into blocks."""
         # Along the direction whose strips cost least: their work grows with the cube of their size.
         position = self.pose[:, :2]
         best = math.inf
@@ -114,16 +143,16 @@ class NeighbourhoodFilter:
             diagonal[k][:] = whole[np.ix_(at, at)]
             if k + 1 < len(states):
                 following[k][:] = whole[np.ix_(at, states[k + 1])]
-        self._variance = whole.diagonal()[2::3].copy()
+        self._heading = self._heading_moments()
 
     def _dense(self, reach: int | None = None) -> Floats:
-        """Return the whole covariance (3N, 3N), node by node: far blocks by the chain.
+        """Return the whole covariance (5N, 5N), node by node: far blocks by the chain.
 
         With ``reach`` only strips so many apart at most; the other blocks are 0.
         """
         self._catch_up()
-        layout, count = self._layout, self.pose.shape[0]
-        whole = np.zeros((3 * count, 3 * count))
+        layout, size = self._layout, self.state.size
+        whole = np.zeros((size, size))
         diagonal, following = layout.views(self._covariance, COVARIANCE)
         states = layout.states()
         onward = [np.linalg.solve(d, c) for d, c in zip(diagonal[1:], following[1:], strict=False)]
@@ -139,32 +168,59 @@ class NeighbourhoodFilter:
     # -- time ----------------------------------------------------------------------------------
 
     def predict(self, node: Indices, moved: Floats) -> None:
-        """Move nodes (E,) by displacements and their standard deviations (E, 6).
+        """Move nodes (E,) by displacements (E, 7), body frame, metres, radians and seconds.
 
-        Forward, left, turn, then the three sigmas; body frame, metres and radians.
+        Forward, left, turn, then the three standard deviations, then how long the node moved.
         """
-        kernels.move(self.pose, self._lever, self._noise, self._variance, node, moved)
+        kernels.move(self.state, self._lever, self._noise, self._heading, node, moved)
         self._behind = True
 
     def _catch_up(self) -> None:
         if not self._behind:
             return
-        self._variance += self._noise[:, 5]
+        for axis, by in kernels.LEVERS:
+            self._carried[:, axis] += self._lever[:, axis, by, None] * self._carried[:, 2 + by]
         kernels.propagate(self._covariance, self._layout, self._lever, self._noise)
         self._behind = False
+        self._heading = self._heading_moments()
 
     # -- ranges --------------------------------------------------------------------------------
 
     def update(self, node: Indices, peer: Indices, measured_m: Floats) -> Floats:
         """Use the ranges (E,) of one instant; return their probabilities of being no outliers."""
+        same = np.ones(len(node))
+        slopes = np.zeros((len(node), TERMS))
+        return self.update_with_terms(Ranges(node, peer, measured_m, same, 0.0 * same, slopes))
+
+    def update_with_terms(self, ranges: Ranges) -> Floats:
+        """As :meth:`update`, ranges that have terms in common (slopes (E, 3)).
+
+        They are estimated in a second stage (Friedland 1969), which is exact for constants: with V
+        the derivative of the states by them, an innovation depends on them by its slopes plus H V,
+        and V changes by the gain times that. What they are not known to adds nothing to the
+        covariance.
+        """
         self._catch_up()
+        node, peer = ranges.node, ranges.peer
         self._change_strips(node, peer)
+        measured_m = ranges.measured_m - ranges.slopes @ self.terms
         pairs = self.antenna_pairs(node, peer)
-        information, push, inlier = kernels.range_information(
-            self._layout, pairs, node, peer, measured_m, self.model
+        information, push, inlier, lines = kernels.range_information(
+            self._layout, pairs, ranges._replace(measured_m=measured_m), self.model, self._carried
         )
-        self.pose += chain.update(self._layout, self._covariance, information, push)
-        self._variance = self.marginals()[:, 3].copy()
+        moved = chain.update(self._layout, self._covariance, information, push)
+        self.state += moved[:, :, 0]
+        self._carried -= moved[:, :, 1:]
+        weight, ux, uy = lines[:, :3].T
+        change = moved[peer] - moved[node]
+        # R^-1 (y - H K y), which is (R + H P H^T)^-1 y, of innovations and their derivatives.
+        whitened = lines[:, 3:] - ux[:, None] * change[:, 0] - uy[:, None] * change[:, 1]
+        told = lines[:, 4:].T @ (weight[:, None] * whitened)
+        self.terms_information += told[:, 1:]
+        step = np.linalg.solve(self.terms_information, told[:, 0])
+        self.terms = self.terms + step
+        self.state += self._carried @ step
+        self._heading = self._heading_moments()
         return inlier
 
     def pairs(self, node: Indices, peer: Indices) -> Floats:
@@ -177,22 +233,36 @@ class NeighbourhoodFilter:
         if not self.antenna_m.any():
             return self.pairs(node, peer)
         self._catch_up()
-        pose = self.pose.copy()
-        c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        pose[:, 0] += c * self.antenna_m[:, 0] - s * self.antenna_m[:, 1]
-        pose[:, 1] += s * self.antenna_m[:, 0] + c * self.antenna_m[:, 1]
+        pose = self.antennas_m(np.arange(len(self.state)))
         return kernels.pair_moments(self._covariance, self._layout, pose, node, peer)
+
+    def antennas_m(self, rows: Indices) -> Floats:
+        """Return where the antennas of nodes (E,) are now: (E, 2)."""
+        x, y, heading = self.pose[rows].T
+        forward, left = self.antenna_m[rows].T
+        c, s = np.cos(heading), np.sin(heading)
+        return np.column_stack([x + c * forward - s * left, y + s * forward + c * left])
 
     def marginals(self) -> Floats:
         """Return the variances xx, yy, the covariance xy, and the heading's variance: (N, 4)."""
         self._catch_up()
         result = np.empty((self.pose.shape[0], 4))
         for k, block in enumerate(self._layout.views(self._covariance, COVARIANCE)[0]):
-            n = len(block) // 3
+            n = len(block) // COVARIANCE
             x, y = block[:n], block[n : 2 * n, n : 2 * n]
             result[self._layout.nodes_of(k)] = np.column_stack(
-                (x.diagonal(), y.diagonal(), x.diagonal(n), block.diagonal()[2 * n :])
+                (x.diagonal(), y.diagonal(), x.diagonal(n), block.diagonal()[2 * n : 3 * n])
             )
+        return result
+
+    def _heading_moments(self) -> Floats:
+        result = np.empty((len(self.state), 3))
+        for k, block in enumerate(self._layout.views(self._covariance, COVARIANCE)[0]):
+            n = len(block) // COVARIANCE
+            own = block.diagonal()
+            cross = block[2 * n : 3 * n, 3 * n : 4 * n].diagonal()
+            both = (own[2 * n : 3 * n], cross, own[3 * n : 4 * n])
+            result[self._layout.nodes_of(k)] = np.column_stack(both)
         return result
 
     def inflate(self, nodes: Indices, sigma_m: float, sigma_rad: float) -> None:
@@ -201,6 +271,10 @@ class NeighbourhoodFilter:
         self._noise[nodes, 2] += sigma_m**2
         self._noise[nodes, 5] += sigma_rad**2
         self._behind = True
+
+    def sigma_of_terms(self) -> Floats:
+        """Return the terms' standard deviations (T,)."""
+        return np.asarray(np.sqrt(np.linalg.inv(self.terms_information).diagonal()), np.float64)
 
     # -- strips --------------------------------------------------------------------------------
 

@@ -28,6 +28,16 @@ from dataclasses import dataclass
 from relpos.fusion.timeline import Advance
 
 
+def velocity_m_s(
+    dx_m: float, dy_m: float, turn_rad: float, duration_s: float
+) -> tuple[float, float]:
+    """Return the velocity, forward and left at its end, of a displacement given at its begin."""
+    if duration_s <= 0.0:
+        return 0.0, 0.0
+    c, s = math.cos(turn_rad) / duration_s, math.sin(turn_rad) / duration_s
+    return c * dx_m + s * dy_m, c * dy_m - s * dx_m
+
+
 def reported_sigmas(step: Advance) -> tuple[float, float, float]:
     """Return a piece's reported deviations of forward (m), left (m), turn (rad); NaN where none.
 

@@ -1,0 +1,45 @@
+"""What ranges have in common beside distances: how a range depends on it.
+
+A body shadows who is behind it; a range that is dated late was measured where people were then. The
+slopes are those of the bank (``fusion/bank/range_update.py``), whose common bias is left out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from relpos.fusion.models.motion import velocity_m_s
+from relpos.fusion.timeline import Advance
+
+
+@dataclass(slots=True)
+class RangeSlopes:
+    """Slopes of ranges in the body's shadow and in the lateness of time stamps."""
+
+    _velocity_m_s: dict[int, tuple[float, float]] = field(default_factory=dict)
+    """Node -> velocity forward and left, by its newest displacement."""
+
+    def move(self, step: Advance) -> None:
+        """Note how fast a node moves."""
+        moves = step.dx_m, step.dy_m, step.dtheta_rad, step.duration_s
+        self._velocity_m_s[step.node] = velocity_m_s(*moves)
+
+    def of(
+        self, sight: tuple[float, float], node: tuple[int, float], peer: tuple[int, float]
+    ) -> tuple[float, float]:
+        """Return a range's two slopes: ``sight`` is the direction from the node to the peer.
+
+        ``node`` and ``peer`` are ids and headings (rad).
+        """
+        away, towards = self._along(sight, *node), self._along(sight, *peer)
+        return max(-away[0], 0.0) + max(towards[0], 0.0), away[1] - towards[1]
+
+    def _along(
+        self, sight: tuple[float, float], node: int, heading_rad: float
+    ) -> tuple[float, float]:
+        """Return the shares along ``sight`` of a node's facing, and of its velocity (m/s)."""
+        c, s = math.cos(heading_rad), math.sin(heading_rad)
+        forward, left = self._velocity_m_s.get(node, (0.0, 0.0))
+        ahead, aside = sight[0] * c + sight[1] * s, sight[1] * c - sight[0] * s
+        return ahead, ahead * forward + aside * left
