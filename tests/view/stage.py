@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from playwright.sync_api import Browser, Page, Playwright, sync_playwright
 from walking_team import WalkingTeam
 
+from relpos.live.board import BOARD_EVENTS, Board
 from relpos.live.requests import RequestHandler
 from relpos.live.team_view import Hello
 from relpos.measurements import Event, Heading, Observation
@@ -61,6 +62,7 @@ class Stage:
         """When each view was sent, in Unix time."""
         self.observed: list[Observation] = []
         self.acknowledged: list[int] = []
+        self.board = Board()
         self.started_unix_s = time.time() - self.at_s
         self._listen_port = port
         self._token = token
@@ -81,6 +83,9 @@ class Stage:
             self.frozen = self.mute = False
             self.observed.clear()
             self.acknowledged.clear()
+            self.board = Board()
+            if self.web is not None:
+                self.web.boarded(self.board.to_message())
         if self.web is None:
             self.open()
 
@@ -173,6 +178,10 @@ class Stage:
                 self.team.acknowledged[request.body["node"]] = request.body["by"]
             elif request.kind == "shelve":
                 self.team.shelved_s[request.body["node"]] = request.body["seconds"]
+            elif request.kind in BOARD_EVENTS:
+                event = {"nodes": list(range(1, self.team.size + 1)), **request.body}
+                self.board.apply({"kind": request.kind, "unix_s": time.time(), **event})
+                web.boarded(self.board.to_message())
             web.respond(request, reply)
 
 

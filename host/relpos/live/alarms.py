@@ -108,6 +108,9 @@ class Alarms:
         """Alerts that have come or gone: node, before, after; emptied by the reader."""
         self._states: dict[int, _WearerState] = {}
         self._ticked_s: float | None = None
+        self.waiting: set[int] = set()
+        """Who is not in, and may sit still."""
+        self.mayday: set[int] = set()
 
     def remember(self, node: int, heard_s: float, now_s: float, known: KnownAlert | None) -> None:
         """Go on from a session before: last heard at ``heard_s``, with that alert."""
@@ -117,7 +120,7 @@ class Alarms:
         if known is None:
             return
         state.alert, state.acknowledged, state.acknowledged_by = known.alert, known.seen, known.by
-        if known.alert is not Alert.LOST:
+        if known.alert in (Alert.STILL_ALARM, Alert.STILL_WARNING):
             limit_s = STILL_ALARM_S if known.alert is Alert.STILL_ALARM else STILL_WARNING_S
             state.still_since_s = min(known.raised_s - limit_s, heard_s)
 
@@ -156,7 +159,7 @@ class Alarms:
                 state.since_report_s += passed_s
             state.shelved_s = max(state.shelved_s - passed_s, 0.0)
             before = state.alert
-            self._update_alert(state)
+            self._update_alert(node, state)
             if state.alert is not before:
                 self.changes.append((node, before, state.alert))
 
@@ -189,11 +192,12 @@ class Alarms:
             state.shelved_s,
         )
 
-    @staticmethod
-    def _update_alert(state: _WearerState) -> None:
-        still_s = state.still_s()
+    def _update_alert(self, node: int, state: _WearerState) -> None:
+        still_s = 0.0 if node in self.waiting else state.still_s()
         alert: Alert | None = None
-        if still_s >= STILL_ALARM_S:
+        if node in self.mayday:
+            alert = Alert.MAYDAY
+        elif still_s >= STILL_ALARM_S:
             alert = Alert.STILL_ALARM
         elif state.silent_s >= LOST_S:
             alert = Alert.LOST

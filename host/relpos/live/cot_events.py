@@ -215,6 +215,8 @@ def _remarks(person: Person, exercise: bool) -> ET.Element:
     words = []
     if exercise:
         words.append("EXERCISE")
+    if person.alert is Alert.MAYDAY:
+        words.append("MAYDAY")
     if person.alert is Alert.STILL_ALARM:
         words.append(f"LIES STILL for {person.still_s:.0f} s")
     if not _located(person):

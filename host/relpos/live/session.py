@@ -21,6 +21,7 @@ from typing import Any
 
 from relpos.fusion.estimator import Estimate, time_offsets
 from relpos.live.alarms import KnownAlert
+from relpos.live.board import BOARD_EVENTS, Board, BoardError
 from relpos.live.composer import Composer
 from relpos.live.fusion_thread import FusionThread
 from relpos.live.inputs import Input, Received
@@ -44,11 +45,13 @@ RAISED = {
     Alert.STILL_WARNING: "has not moved for 20 s",
     Alert.STILL_ALARM: "has not moved for 30 s",
     Alert.LOST: "is not heard any more",
+    Alert.MAYDAY: "calls MAYDAY",
 }
 CLEARED = {
     Alert.STILL_WARNING: "moves again",
     Alert.STILL_ALARM: "moves again",
     Alert.LOST: "is heard again",
+    Alert.MAYDAY: "has no MAYDAY any more",
 }
 EVENTS = ("acknowledge", "shelve", "name", "device")
 """Requests that change what a mission keeps."""
@@ -118,6 +121,9 @@ class LiveSession:
         self._unconfirmed: deque[tuple[int, RequestSource, Request, dict[str, Any], int]] = deque()
         """Answers that wait until the disk holds what they confirm."""
         self._alerts: dict[int, KnownAlert] = {}
+        self._board = Board()
+        self._journal_open = False
+        """Whether an event is of now: those of a session before were logged then."""
         self._again_s = -math.inf
         """Up to then estimates are those of a session before."""
 
@@ -399,6 +405,8 @@ class LiveSession:
             if done and request.kind in LOGGED:
                 self.log(request.kind, self._words(request.kind, body), node, by)
             return {"acknowledged": done} if request.kind == "acknowledge" else body, 200
+        if request.kind in BOARD_EVENTS:
+            return self._change_board(request.kind, body)
         if not self._source.is_now:
             return {"error": "this is a recording: it takes no presses or headings"}, 409
         handle = self._handler.presses if request.kind == "presses" else self._handler.headings
@@ -414,6 +422,19 @@ class LiveSession:
                     self.log("landmark", f"{name} is at landmark {press.value}", press.node)
         return reply, 200
 
+    def _change_board(self, kind: str, body: dict[str, Any]) -> tuple[dict[str, object], int]:
+        everybody = sorted(self._composer.monitor.nodes)
+        body = {"by": "", "nodes": everybody, **body}
+        try:
+            self._happen({"kind": kind, **body})
+        except BoardError as error:
+            return {"error": str(error)}, 400
+        if kind == "mayday" and body.get("on"):
+            # Who else is in trouble is asked at once.
+            start = {"action": "start", "emergency": True, "within_s": 300.0}
+            self._happen({"kind": "rollcall", "by": body["by"], "nodes": everybody, **start})
+        return {"done": True}, 200
+
     def _words(self, kind: str, body: dict[str, Any]) -> str:
         if kind == "name":
             return f"node {body['node']} is {body['name']}"
@@ -427,6 +448,7 @@ class LiveSession:
     def _happen(self, event: dict[str, Any]) -> bool:
         """Apply an event, and write it to the journal where there is one."""
         event = {**event, "time_s": self._source.now_s(), "unix_s": time.time()}
+        self._journal_open = True
         done = self._apply(event)
         if done and self._journal is not None:
             self._journal.add(event)
@@ -449,6 +471,14 @@ class LiveSession:
                 return self._composer.alarms.acknowledge(node, event.get("by", ""))
             case "shelve":
                 return self._composer.alarms.shelve(node, event["seconds"])
+            case kind if kind in BOARD_EVENTS:
+                words = self._board.apply(event)
+                alarms = self._composer.alarms
+                alarms.waiting, alarms.mayday = self._board.waiting, set(self._board.mayday)
+                self._feed(lambda sink: sink.boarded(self._board.to_message()))
+                if words and self._journal_open:
+                    whom = f"{self._composer.name(node)}: " if node else ""
+                    self.log(kind, whom + words, node or None, event.get("by", ""))
             case "presses":
                 self._handler.accept(event["ids"])
             case "device":

@@ -39,6 +39,9 @@ class Sink:
     def logged(self, entry: LogEntry) -> None:
         """Add a line to the session's log."""
 
+    def boarded(self, board: dict[str, Any]) -> None:
+        """Show the accountability board, which has changed."""
+
     def resumed(self, tracks: Tracks) -> None:
         """Go on with the tracks of a mission's sessions before."""
 

@@ -35,6 +35,7 @@ class Alert(StrEnum):
     STILL_WARNING = "still_warning"
     STILL_ALARM = "still_alarm"
     LOST = "lost"
+    MAYDAY = "mayday"
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,6 +36,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from relpos.live.board import BOARD_EVENTS
 from relpos.live.team_view import to_json
 from relpos.live.tracks import Tracks
 from relpos.view.access import Access, Allowance, qr_svg
@@ -57,6 +58,7 @@ ALLOWED = {
     "acknowledge": (2.0, 100.0),
     "shelve": (2.0, 20.0),
     "device": (2.0, 50.0),
+    **dict.fromkeys(BOARD_EVENTS, (5.0, 100.0)),
 }
 """Items that a visitor may send, per second and at once: a phone sends what it gathered offline."""
 
@@ -74,6 +76,7 @@ class SessionProxy:
         self.tracks = Tracks()
         self.names: dict[str, str] = {}
         self.log: list[dict[str, Any]] = []
+        self.board = '{"type":"board"}'
         self.devices: dict[str, dict[str, Any]] = {}
         """Every device that was ever let in, by its id, in a mission."""
         self._news = asyncio.Event()
@@ -102,6 +105,8 @@ class SessionProxy:
             case "points":
                 for node, point in message["points"].items():
                     self.tracks.add(int(node), *point)
+            case "board":
+                self.board = line.rstrip("\n")
             case "device":
                 event = message["event"]
                 self.devices.setdefault(event["id"], {}).update(event)
@@ -178,6 +183,7 @@ class Pages:
             Route("/api/headings", self.headings, methods=["POST"]),
             Route("/api/acknowledge", self.acknowledge, methods=["POST"]),
             Route("/api/shelve", self.shelve, methods=["POST"]),
+            *(Route(f"/api/{kind}", self.change_board, methods=["POST"]) for kind in BOARD_EVENTS),
             Route("/api/invite", self.invite),
             Route("/api/devices", self.devices),
             Route("/api/revoke", self.revoke, methods=["POST"]),
@@ -228,9 +234,12 @@ class Pages:
             await socket.send_text(self.session.tracks.to_json())
             await socket.send_text(to_json({"type": "you", "role": str(role_of(socket))}))
             seen: str | None = None
-            told = 0
+            told, board = 0, ""
             while not gone.done() and not self.session.over and not self._is_revoked(socket):
                 newest = await self.session.news(seen, PING_S)
+                if board is not self.session.board:
+                    board = self.session.board
+                    await socket.send_text(board)
                 if told < len(self.session.log):
                     entries, told = self.session.log[told:], len(self.session.log)
                     await socket.send_text(to_json({"type": "log", "entries": entries}))
@@ -344,6 +353,23 @@ class Pages:
         """Silence somebody's alarm until its reason has gone."""
         body = await _body(request)
         return await self._ask(request, "acknowledge", {"node": _node(body), "by": _by(body)})
+
+    async def change_board(self, request: Request) -> Response:
+        """Change the board: an entry, a roll call, a MAYDAY, an evacuation.
+
+        A wearer's phone may answer a roll call and an evacuation, and call MAYDAY.
+        """
+        kind = request.url.path.rpartition("/")[2]
+        body = await _body(request)
+        answers = ("answer", "delivered", "acknowledged")
+        own = (kind == "mayday" and body.get("on") is True) or (
+            kind in ("rollcall", "evacuate") and body.get("action") in answers
+        )
+        if not own and not role_of(request).allows(Role.COMMAND):
+            return JSONResponse({"error": "only a commander may do that"}, 403)
+        if "node" in body:
+            body["node"] = _node(body)
+        return await self._ask(request, kind, {**body, "by": _by(body)})
 
     async def shelve(self, request: Request) -> Response:
         """Silence all alarms of a person for a while."""

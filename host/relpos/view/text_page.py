@@ -109,7 +109,7 @@ def alarming(view: TeamView) -> frozenset[str | int]:
 
 def unattended(view: TeamView) -> list[Person]:
     """Return people with an alarm that is not acknowledged, in the order of the page."""
-    ranks = (Alert.STILL_ALARM, Alert.LOST)
+    ranks = (Alert.MAYDAY, Alert.STILL_ALARM, Alert.LOST)
     waiting = [p for p in view.people if p.alert in ranks and not p.acknowledged]
     return sorted(waiting, key=lambda person: ranks.index(person.alert))
 
@@ -141,6 +141,8 @@ def _alarms(view: TeamView, options: RenderOptions, most: int) -> list[Text]:
         where = _where(person, me, view, options)
         seen = " (seen to)" if person.acknowledged else ""
         match person.alert:
+            case Alert.MAYDAY:
+                alarms.append((-1, f"!! MAYDAY {person.name}{where}{seen}", _STYLES[Level.ALARM]))
             case Alert.STILL_ALARM:
                 lies = "lay still, moves again" if person.moving else _still(person)
                 words = f"!! {person.name} {lies}{where}{seen}"
@@ -244,6 +246,8 @@ def _person(person: Person, me: Person | None, view: TeamView, options: RenderOp
 
 def _urgency(person: Person) -> int:
     match person.alert:
+        case Alert.MAYDAY:
+            return -1
         case Alert.STILL_ALARM:
             return 0
         case Alert.LOST:

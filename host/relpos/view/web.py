@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from relpos.extras import missing_extra
 from relpos.fusion.estimator import NodeStatus
+from relpos.live.board import Board
 from relpos.live.requests import Request
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Hello, LogEntry, TeamView, to_json
@@ -56,6 +57,7 @@ class WebView(Sink):
         self._door = listener
         self._tracks = Tracks()
         self._names: dict[int, str] = {}
+        self._board = to_json(Board().to_message())
         self._devices: list[dict[str, Any]] = []
         self._log: deque[dict[str, Any]] = deque(maxlen=MAX_LOG)
         self._newest: bytes | None = None
@@ -98,6 +100,11 @@ class WebView(Sink):
         """Tell the server of a device that was let in or shut out."""
         self._devices.append(event)
         self._say(to_json({"type": "device", "event": event}))
+
+    def boarded(self, board: dict[str, Any]) -> None:
+        """Send the board to the pages."""
+        self._board = to_json(board)
+        self._say(self._board)
 
     def resumed(self, tracks: Tracks) -> None:
         """Go on with the tracks of the sessions before."""
@@ -175,6 +182,7 @@ class WebView(Sink):
             self._tracks.to_json(),
             _names_message(self._names),
             log,
+            self._board,
             *(to_json({"type": "device", "event": event}) for event in self._devices),
         ):
             self._say(line)

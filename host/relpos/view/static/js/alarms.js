@@ -4,6 +4,7 @@ import { isFresh } from "./age.js";
 
 /** Priorities as in IEC 60601-1-8: help at once, soon, be aware. */
 const KINDS = {
+  mayday: { kind: "mayday", level: "high" },
   still_alarm: { kind: "still", level: "high" },
   lost: { kind: "lost", level: "medium" },
   still_warning: { kind: "still", level: "low" },

@@ -5,6 +5,7 @@ import { timeOfDay } from "./words.js";
 
 const KINDS = {
   note: "note", warning: "warning", alarm: "ALARM", cleared: "over", acknowledge: "seen", shelve: "shelved", name: "name", landmark: "landmark",
+  board: "board", rollcall: "roll call", mayday: "MAYDAY", evacuate: "EVACUATE",
 };
 const MOST = 5000;
 

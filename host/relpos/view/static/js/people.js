@@ -1,6 +1,7 @@
 // The list of people beside the map, and the map as a table.
 
 import { isFresh, reachM } from "./age.js";
+import { hold } from "./board_view.js";
 import { inkOn } from "./colours.js";
 import { arrow, healthSign, make, setAttribute, setText } from "./dom.js";
 import { isPlaced, VAGUE_RAD } from "./relation.js";
@@ -53,13 +54,15 @@ class Card {
     this.reasons = make("p", { class: "reasons" });
     this.shelveButton = make("button", { type: "button", text: "Shelve alarms 10 min" });
     this.shelveButton.addEventListener("click", () => actions.shelve(node, this.shelved ? 0 : SHELVE_S));
+    this.maydayButton = make("button", { type: "button", class: "mayday", text: "MAYDAY (hold)" });
+    hold(this.maydayButton, () => actions.mayday(node));
     this.followButton = make("button", { type: "button", "aria-pressed": "false", text: "Follow" });
     this.findButton = make("button", { type: "button", text: "Find" });
     this.name.addEventListener("click", () => actions.select(node));
     this.followButton.addEventListener("click", () => actions.follow(node));
     this.findButton.addEventListener("click", () => actions.find(node));
     this.details = make("div", { class: "details" }, this.compass, this.reasons,
-      make("dl", { class: "facts" }, ...facts), make("div", { class: "buttons" }, this.followButton, this.shelveButton));
+      make("dl", { class: "facts" }, ...facts), make("div", { class: "buttons" }, this.followButton, this.maydayButton, this.shelveButton));
     this.element = make("li", { class: "person", "data-node": node },
       make("div", { class: "who" }, this.name, make("span", { class: "health" }, this.sign.element, this.health)),
       this.where, this.findButton,

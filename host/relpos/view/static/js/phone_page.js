@@ -3,6 +3,7 @@
 import { isFresh, startBeat } from "./age.js";
 import { Alarms } from "./alarms.js";
 import { degrees } from "./angles.js";
+import { hold } from "./board_view.js";
 import { AlarmBanner, showNotices } from "./banner.js";
 import { measureOffset } from "./clock.js";
 import { inkOn, personColour } from "./colours.js";
@@ -80,6 +81,8 @@ function handle(message) {
     introduce();
     document.title = `${team.session.name ?? "team"} · wearer${team.replayed ? " · REPLAY" : ""}`;
     setAttribute(document.documentElement, "data-replay", team.replayed ? "true" : null);
+  } else if (kind === "board") {
+    showOrders(message);
   } else if (kind === "picture") {
     receivedMs = Date.now();
     const { raised, cleared } = alarms.update(team.list());
@@ -94,6 +97,36 @@ function handle(message) {
   } else if (kind === "unknown") {
     trouble = { level: "warning", text: "The server's version differs from this page's: reload the page." };
   }
+}
+
+/** What the commander asks of me: to leave, to answer a roll call. */
+function showOrders(board) {
+  const node = me?.node;
+  const { evacuation, roll_call: call } = board;
+  const section = byId("orders");
+  const answer = (kind, body) => postJson(`/api/${kind}`, { ...body, node, by: me.name }).catch((error) => {
+    trouble = { level: "warning", text: `Not sent: ${error.message}` };
+    showTeam();
+  });
+  const button = (text, action) => {
+    const element = make("button", { type: "button", class: "main", text });
+    element.addEventListener("click", action);
+    return element;
+  };
+  const lines = [];
+  if (node && evacuation?.nodes.includes(node)) {
+    const seen = evacuation.acknowledged[node];
+    if (!evacuation.delivered[node] && !seen) answer("evacuate", { action: "delivered" });
+    lines.push(make("p", { class: "evacuation" }, seen ? "EVACUATE: understood" : "EVACUATE: leave now",
+      ...(seen ? [] : [button("Understood", () => answer("evacuate", { action: "acknowledged" }))])));
+  }
+  if (node && call && call.ended_unix_s === null && call.nodes.includes(node) && !call.answers[node]) {
+    lines.push(make("p", { class: "roll" }, "Roll call",
+      button("I am all right", () => answer("rollcall", { action: "answer", answer: "confirmed" }))));
+  }
+  section.replaceChildren(...lines);
+  section.hidden = !lines.length;
+  if (lines.length) navigator.vibrate?.([400, 200, 400]);
 }
 
 function sound() {
@@ -493,6 +526,12 @@ function showCompass() {
   }
 }
 
+hold(byId("mayday"), () => {
+  if (!me) return open("me");
+  return postJson("/api/mayday", { node: me.node, on: true, by: me.name }).then(
+    () => setText(byId("last"), "MAYDAY was sent"),
+    (error) => setText(byId("last"), `MAYDAY NOT SENT: ${error.message}. Use the radio.`));
+});
 makePad();
 field.addEventListener("input", () => {
   field.value = field.value.replace(/\D/g, "");

@@ -62,6 +62,7 @@ export class Team {
         return "picture";
       case "log":
       case "you":
+      case "board":
         return message.type;
       case "ping":
         return "ping";

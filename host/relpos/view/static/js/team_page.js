@@ -3,6 +3,7 @@
 import { isFresh, startBeat } from "./age.js";
 import { Alarms } from "./alarms.js";
 import { AlarmBanner, showNotices } from "./banner.js";
+import { BoardView } from "./board_view.js";
 import { Connection } from "./connection.js";
 import { DevicesDialog } from "./devices.js";
 import { byId, make, postJson, setAttribute, setText, storage } from "./dom.js";
@@ -36,13 +37,17 @@ const map = new TeamMap(byId("map"), team, { onPick: select, onCamera: showCamer
 map.covers = [byId("map-tools")];
 const link = new LinkBanner(byId("link"), byId("alarm-voice"), linkChanged);
 const banner = new AlarmBanner(byId("alarms"), { acknowledge, show: find });
-const list = new PeopleList(byId("people"), { select, follow, find, shelve });
+const list = new PeopleList(byId("people"), { select, follow, find, shelve, mayday: (node) => board.mayday(node, true) });
 const log = new LogView(byId("log"), { onNew: () => showUnseen(byId("show-log"), log.unseen) });
 const findView = new FindView(byId("find"), {
   close: stopFinding,
   next: (by) => find(neighbour(findView.to, by, findView.from)),
   swap: () => startFinding(findView.to, findView.from),
 });
+const board = new BoardView(team, { by: () => BY, find, say: (text) => {
+  trouble = { level: "warning", text };
+  refresh(true);
+} });
 const connection = new Connection({ onMessage: handle, onState: () => refresh(true) });
 
 // -- messages --------------------------------------------------------------------------------------
@@ -61,6 +66,8 @@ function handle(message) {
     setText(byId("limit-warning"), String(team.limits.still_warning_s));
     setText(byId("limit-alarm"), String(team.limits.still_alarm_s));
     map.layer.forget();
+  } else if (kind === "board") {
+    board.handle(message);
   } else if (kind === "you") {
     setAttribute(document.documentElement, "data-role", message.role);
   } else if (kind === "log") {
@@ -148,6 +155,7 @@ function show() {
   if (connection.unreadable) {
     notices.unshift({ level: "warning", text: `${connection.unreadable} messages of the server were unreadable.` });
   }
+  board.update();
   showNotices(byId("notices"), notices.map((notice) => ({ ...notice, text: team.withNames(notice.text) })));
   const heard = team.list().filter(isFresh).length;
   const all = team.people.size;

@@ -151,6 +151,7 @@ export function alarmText(alarm) {
   if (alarm.kind === "nobody") return `Nothing heard from anybody for ${seconds(alarm.seconds)}: is the coordinator gone?`;
   if (alarm.kind === "together") return `${alarm.alarms.length} lost together for ${seconds(alarm.seconds)}: ${names}`;
   if (alarm.kind === "flood") return `Many alarms. Less urgent, ${alarm.alarms.length}: ${names}`;
+  if (alarm.kind === "mayday") return `MAYDAY: ${alarm.name}`;
   if (alarm.kind === "lost") return `${alarm.name} is lost: not heard for ${seconds(alarm.seconds)}`;
   if (alarm.newsS) return `${alarm.name} had not moved for ${seconds(alarm.seconds)}; last heard ${ago(alarm.newsS)}`;
   return `${alarm.name} has not moved for ${seconds(alarm.seconds)}`;

@@ -1,0 +1,188 @@
+// The accountability board: who is in, roll call, MAYDAY, evacuation. What people say, not what is measured.
+
+import { byId, make, postJson, setAttribute, setText } from "./dom.js";
+import { ago, duration, seconds, timeOfDay } from "./words.js";
+
+const STATES = { "": "not said", standby: "standby", entered: "entered", withdrawing: "withdrawing", out: "out" };
+const EARLY_S = 60;
+
+export class BoardView {
+  /** `by()` is who acts here, `say(text)` tells what went wrong. */
+  constructor(team, { by, say, find }) {
+    this.team = team;
+    this.by = by;
+    this.say = say;
+    this.find = find;
+    this.board = { people: {}, mayday: {}, roll_call: null, evacuation: null };
+    this.rows = new Map();
+    this.dialog = byId("board-dialog");
+    byId("show-board").addEventListener("click", () => {
+      // Beside what is on top: alarms and a lost link stay in view.
+      this.dialog.show();
+      this.update();
+    });
+    this.dialog.addEventListener("keydown", (event) => {
+      if (event.key === "Escape") this.dialog.close();
+    });
+    const all = (state) => Promise.all(team.order.map((node) => this.post("board", { node, state })));
+    byId("all-standby").addEventListener("click", () => all("standby"));
+    byId("all-entered").addEventListener("click", () => all("entered"));
+    byId("roll-start").addEventListener("click", () => this.post("rollcall", { action: "start", within_s: Number(byId("roll-minutes").value) * 60 }));
+    byId("roll-end").addEventListener("click", () => this.post("rollcall", { action: "end" }));
+    hold(byId("evacuate-all"), () => this.post("evacuate", { action: "order" }));
+    hold(byId("evacuate-team"), () => this.post("evacuate", { action: "order", nodes: this.ofTeam(byId("board-team").value) }));
+    byId("evacuate-end").addEventListener("click", () => this.post("evacuate", { action: "end" }));
+  }
+
+  handle(board) {
+    this.board = board;
+    this.update();
+  }
+
+  ofTeam(name) {
+    return this.team.order.filter((node) => (this.board.people?.[node]?.team ?? "") === name);
+  }
+
+  async post(kind, body) {
+    try {
+      await postJson(`/api/${kind}`, { ...body, by: this.by() });
+    } catch (error) {
+      this.say(`The board has not changed: ${error.message}`);
+    }
+  }
+
+  /** Call MAYDAY for a person. */
+  mayday(node, on) {
+    this.post("mayday", { node, on });
+    if (on) this.find(node);
+  }
+
+  update(nowMs = Date.now()) {
+    this.showRollCall(nowMs);
+    this.showEvacuation();
+    const { people = {}, evacuation, roll_call: call } = this.board;
+    const inside = this.team.order.filter((node) => ["entered", "withdrawing"].includes(people[node]?.state));
+    setText(byId("show-board"), inside.length ? `Board (${inside.length} in)` : "Board");
+    if (!this.dialog.open) return;
+    const teams = [...new Set(Object.values(people).map((place) => place.team).filter(Boolean))].sort();
+    const select = byId("board-team");
+    if (select.dataset.shown !== teams.join()) {
+      select.dataset.shown = teams.join();
+      select.replaceChildren(...teams.map((name) => make("option", { value: name, text: name })));
+    }
+    byId("evacuate-team").disabled = select.disabled = !teams.length;
+    for (const person of this.team.list()) {
+      const row = this.rows.get(person.node) ?? this.make(person.node);
+      const place = people[person.node] ?? {};
+      setText(row.name, person.name);
+      setAttribute(row.element, "data-state", place.state ?? "");
+      for (const name of ["team", "sector", "task", "state", "air"]) {
+        const value = name === "air" ? place.air_bar ?? "" : place[name] ?? "";
+        if (document.activeElement !== row[name] && row[name].value !== String(value)) row[name].value = value;
+      }
+      setText(row.time, Number.isFinite(place.entered_unix_s)
+        ? `${timeOfDay(1000 * place.entered_unix_s)}, ${duration(nowMs / 1000 - place.entered_unix_s)}` : "–");
+      setText(row.contact, ago(person.seen_s));
+      setText(row.airAge, Number.isFinite(place.air_unix_s) ? `entered ${timeOfDay(1000 * place.air_unix_s)}, not measured` : "");
+      const answer = call?.answers?.[person.node];
+      const called = call && call.ended_unix_s === null && call.nodes.includes(person.node);
+      row.here.hidden = row.missing.hidden = !called;
+      setAttribute(row.here, "aria-pressed", String(answer?.answer === "confirmed"));
+      setAttribute(row.missing, "aria-pressed", String(answer?.answer === "missing"));
+      setText(row.answer, answer ? `${answer.answer} by ${answer.by || "somebody"}` : called ? "not answered" : "");
+      const mayday = this.board.mayday?.[person.node];
+      setText(row.mayday, mayday ? "End MAYDAY" : "MAYDAY (hold)");
+      row.hasMayday = Boolean(mayday);
+      setAttribute(row.element, "data-mayday", String(row.hasMayday));
+      const out = evacuation?.nodes.includes(person.node);
+      row.tick.hidden = !out;
+      const seen = evacuation?.acknowledged?.[person.node];
+      setText(row.order, !out ? "" : seen ? `understood, by ${seen.by || "somebody"} ${timeOfDay(1000 * seen.unix_s)}`
+        : evacuation.delivered?.[person.node] ? `on the phone ${timeOfDay(1000 * evacuation.delivered[person.node])}, no answer yet` : "radio order: no answer yet");
+    }
+  }
+
+  make(node) {
+    const field = (name, attributes) => {
+      const input = make(name === "state" ? "select" : "input", { "aria-label": `${name} of node ${node}`, ...attributes });
+      input.addEventListener("change", () => this.post("board", name === "air"
+        ? { node, air_bar: input.value === "" ? null : Number(input.value) } : { node, [name]: input.value }));
+      return input;
+    };
+    const row = { name: make("span"), time: make("td"), contact: make("td"), airAge: make("span", { class: "soft" }),
+      answer: make("span"), order: make("span"), team: field("team", { size: 6, maxlength: 40 }), sector: field("sector", { size: 6, maxlength: 40 }),
+      task: field("task", { size: 10, maxlength: 40 }), state: field("state", {}), air: field("air", { type: "number", min: 0, max: 400, step: 5 }) };
+    row.state.append(...Object.entries(STATES).map(([value, text]) => make("option", { value, text })));
+    const button = (text, action) => {
+      const element = make("button", { type: "button", text });
+      element.addEventListener("click", action);
+      return element;
+    };
+    row.here = button("Confirmed", () => this.post("rollcall", { action: "answer", node, answer: "confirmed" }));
+    row.missing = button("Missing", () => this.post("rollcall", { action: "answer", node, answer: "missing" }));
+    row.tick = button("Understood", () => this.post("evacuate", { action: "acknowledged", node }));
+    row.mayday = make("button", { type: "button" });
+    hold(row.mayday, () => this.mayday(node, !row.hasMayday));
+    row.element = make("tr", { "data-node": node }, make("th", { scope: "row" }, row.name), make("td", {}, row.team), make("td", {}, row.sector),
+      make("td", {}, row.task), make("td", {}, row.state), row.time, row.contact, make("td", {}, row.air, " bar ", row.airAge),
+      make("td", {}, row.here, row.missing, row.answer), make("td", {}, row.mayday), make("td", {}, row.order, row.tick));
+    byId("board-rows").append(row.element);
+    this.rows.set(node, row);
+    return row;
+  }
+
+  showRollCall(nowMs) {
+    const call = this.board.roll_call;
+    const open = Boolean(call) && call.ended_unix_s === null;
+    byId("roll-end").hidden = !open;
+    const line = byId("roll-line");
+    line.hidden = !call;
+    if (!call) return;
+    const answers = Object.values(call.answers);
+    const confirmed = answers.filter((answer) => answer.answer === "confirmed").length;
+    const leftS = call.started_unix_s + call.within_s - nowMs / 1000;
+    setAttribute(line, "data-state", !open ? call.outcome : leftS < 0 ? "over" : leftS < EARLY_S ? "soon" : "open");
+    const kind = call.emergency ? "Emergency roll call" : "Roll call";
+    const count = `${confirmed} of ${call.nodes.length} confirmed, ${answers.length - confirmed} missing`;
+    setText(line, !open ? `${kind} ${call.outcome}: ${count}, ended ${timeOfDay(1000 * call.ended_unix_s)}`
+      : `${kind}: ${count}, ${leftS < 0 ? `${seconds(-leftS)} over time` : `${seconds(leftS)} left`}`);
+  }
+
+  showEvacuation() {
+    const order = this.board.evacuation;
+    byId("evacuate-end").hidden = !order;
+    const line = byId("evacuation-line");
+    line.hidden = !order;
+    if (!order) return;
+    const done = Object.keys(order.acknowledged).length;
+    setText(line, `EVACUATION ordered ${timeOfDay(1000 * order.unix_s)}: ${done} of ${order.nodes.length} have understood. A radio order: phones show it where there are some.`);
+  }
+}
+
+const HOLD_MS = 1000;
+
+/** Act after a hold of a second, by finger, mouse or key: never by a slip. */
+export function hold(button, action) {
+  let timer = null;
+  const stop = () => {
+    clearTimeout(timer);
+    timer = null;
+    button.classList.remove("holding");
+  };
+  const start = () => {
+    if (timer !== null) return;
+    button.classList.add("holding");
+    timer = setTimeout(() => {
+      stop();
+      action();
+    }, HOLD_MS);
+  };
+  button.addEventListener("pointerdown", start);
+  for (const end of ["pointerup", "pointerleave", "pointercancel", "blur", "keyup"]) button.addEventListener(end, stop);
+  button.addEventListener("keydown", (event) => {
+    if (event.key === "Enter" || event.key === " ") {
+      event.preventDefault();
+      start();
+    }
+  });
+}

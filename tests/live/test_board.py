@@ -1,0 +1,122 @@
+"""The accountability board: what people have said, and nothing else."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from relpos.live.alarms import Alarms
+from relpos.live.board import Board, BoardError
+from relpos.live.team_view import Alert
+from relpos.measurements import Motion
+
+
+def event(kind, unix_s=1000.0, by="Anna", **body):
+    return {"kind": kind, "unix_s": unix_s, "by": by, **body}
+
+
+def test_the_time_in_counts_from_entering_and_ends_with_leaving():
+    board = Board()
+    board.apply(event("board", node=2, state="entered", team="A"))
+    board.apply(event("board", 1300.0, node=2, state="withdrawing"))
+    assert board.people[2].entered_unix_s == 1000.0
+    board.apply(event("board", 1400.0, node=2, state="out"))
+    assert board.people[2].entered_unix_s is None
+    assert board.people[2].team == "A"
+    assert board.waiting == {2}
+
+
+def test_air_is_what_somebody_has_entered_at_a_time():
+    board = Board()
+    board.apply(event("board", 1500.0, node=2, air_bar=250))
+    assert (board.people[2].air_bar, board.people[2].air_unix_s) == (250, 1500.0)
+
+
+def test_a_roll_call_is_complete_once_everybody_was_confirmed_by_somebody():
+    board = Board()
+    board.apply(event("rollcall", action="start", nodes=[1, 2, 3], within_s=600.0))
+    for node in (1, 2):
+        board.apply(event("rollcall", action="answer", node=node, answer="confirmed"))
+    assert "incomplete" in board.apply(event("rollcall", action="end"))
+    assert board.roll_call.outcome == "incomplete"
+    board.apply(event("rollcall", action="start", nodes=[1, 2], within_s=600.0))
+    board.apply(event("rollcall", action="answer", node=1, answer="confirmed"))
+    board.apply(event("rollcall", action="answer", node=2, answer="missing"))
+    board.apply(event("rollcall", action="end"))
+    assert board.roll_call.outcome == "missing"
+    board.apply(event("rollcall", action="start", nodes=[1], within_s=600.0))
+    board.apply(event("rollcall", action="answer", node=1, answer="confirmed"))
+    board.apply(event("rollcall", action="end"))
+    assert board.roll_call.outcome == "complete"
+
+
+def test_an_evacuation_knows_for_each_whether_it_was_shown_and_understood():
+    board = Board()
+    board.apply(event("evacuate", action="order", nodes=[1, 2]))
+    board.apply(event("evacuate", 1001.0, action="delivered", node=1))
+    board.apply(event("evacuate", 1005.0, by="Ben", action="acknowledged", node=1))
+    order = board.evacuation
+    assert (list(order.delivered), order.acknowledged[1]["by"]) == ([1], "Ben")
+    assert 2 not in order.acknowledged
+    board.apply(event("evacuate", action="end"))
+    assert board.evacuation is None
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        event("board", node=1, state="gone"),
+        event("board", node=1, team="x" * 41),
+        event("board", node=1, team=3),
+        event("board", node=1, air_bar=1e9),
+        event("board", node=1, air_bar=math.nan),
+        event("board", node=1, air_bar="full"),
+        event("rollcall", action="end"),
+        event("rollcall", action="start", nodes=3),
+        event("rollcall", action="start", nodes=[1], within_s=math.nan),
+        event("rollcall", action="start", nodes=[1], within_s="x"),
+        event("mayday", node=1, on=False),
+        event("evacuate", action="acknowledged", node=1),
+        event("evacuate", action="dance"),
+    ],
+    ids=str,
+)
+def test_a_request_that_makes_no_sense_changes_nothing(bad):
+    board = Board()
+    with pytest.raises(BoardError):
+        board.apply(bad)
+    assert board == Board()
+
+
+def test_the_same_events_give_the_same_board():
+    events = [
+        event("board", node=1, state="standby"),
+        event("mayday", node=2, on=True),
+        event("rollcall", action="start", nodes=[1, 2], emergency=True),
+        event("rollcall", action="answer", node=1, answer="confirmed"),
+        event("evacuate", action="order", nodes=[1, 2]),
+    ]
+    boards = [Board(), Board()]
+    for board in boards:
+        for one in events:
+            board.apply(one)
+    assert boards[0].to_message() == boards[1].to_message()
+
+
+def test_who_waits_may_sit_still_and_a_mayday_is_above_all():
+    alarms = Alarms()
+    for second in range(60):
+        for node in (1, 2):
+            alarms.add_motion(Motion(float(second), node, 0.0, 0.0, 0.0, moving=False))
+        alarms.waiting = {1}
+        alarms.tick(float(second), listening=True)
+    assert alarms.condition(1).alert is None
+    assert alarms.condition(2).alert is Alert.STILL_ALARM
+    alarms.mayday = {1}
+    alarms.tick(60.0, listening=True)
+    assert alarms.condition(1).alert is Alert.MAYDAY
+    alarms.mayday.clear()
+    alarms.waiting.clear()
+    alarms.tick(60.5, listening=True)
+    assert alarms.condition(1).alert is Alert.STILL_ALARM
