@@ -25,7 +25,7 @@ compile-kernels = @printf '%s\n' 'compiling the estimators, once'; \
 	$(PYTHON) -c 'from relpos import fusion; [fusion.warm_up(n) for n in fusion.SETTINGS]'
 title = @printf '\n\033[1m== %s\033[0m\n' "$(1)"
 
-.PHONY: help setup demo live test lint coverage bench bench-chain firmware docs pages wire clean bare-root soak \
+.PHONY: help setup demo live test lint coverage bench bench-chain firmware docs pages wire clean bare-root soak fuzz \
         system-demo system-avr system-browser system-soak firmware-tests board-builds python-tests
 
 help: ## this list
@@ -79,9 +79,15 @@ python-tests: $(DEVELOP) | system-avr system-browser
 	$(call title,Python tests)
 	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist loadfile --no-loadscope-reorder --durations 10
 
-soak: board-builds $(FUZZ) | system-soak ## fuzzing and whatever else takes long: an hour
+soak: board-builds $(FUZZ) | system-soak ## whatever takes long: an hour, then HOURS=0.5 of random faults
 	$(call title,Long runs)
 	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist worksteal -m soak -rP
+	$(call title,The whole system under random faults)
+	$(PYTHON) tests/soak/soak.py --hours $(or $(HOURS),0.5)
+
+fuzz: $(FUZZ) | system-soak ## every parser of foreign bytes, guided by coverage; MINUTES=5 for each
+	$(call title,Fuzzing)
+	$(PYTHON) tests/fuzz/parser_fuzzer.py --minutes $(or $(MINUTES),5)
 
 firmware: board-builds ## both boards and sensors: flash, RAM, cycles, beside Mahony and Madgwick
 	$(call title,Budget: cycles and stack on simavr)

@@ -30,7 +30,7 @@ from relpos.live.notices import NoticeBoard
 from relpos.live.requests import Request, RequestHandler, RequestSource
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert, Level, LogEntry
-from relpos.measurements import Event, Observation
+from relpos.measurements import Event, Heading, Observation
 
 VIEW_S = 0.05
 """At most twenty views a second: smooth for a walking person, and a twentieth of a second old."""
@@ -411,6 +411,11 @@ class LiveSession:
             return {"error": "this is a recording: it takes no presses or headings"}, 409
         handle = self._handler.presses if request.kind == "presses" else self._handler.headings
         reply, new = handle(request)
+        # A node that nobody hears would become a person of the team.
+        heard = self._composer.monitor.nodes
+        unheard = [o for o in new if isinstance(o, Heading) and o.node not in heard]
+        self._handler.counts["headings_of_unheard_nodes"] += len(unheard)
+        new = [o for o in new if o not in unheard]
         if new:
             self._composer.add_reported(new)
             self._submit(self._source.now_s(), new)

@@ -1,0 +1,290 @@
+"""Coverage-guided fuzzing of everything on the host that reads foreign bytes.
+
+    python tests/fuzz/parser_fuzzer.py [--minutes 1] [--target NAME ...]
+
+Each parser gets inputs that libFuzzer (by atheris) derives from valid ones, in a process of its own
+with a limit of memory and of time an input. A parser may refuse in its own errors and do nothing
+else. The corpus is kept in .build/fuzz/corpus, a finding in .build/fuzz/findings; once it is mended
+it belongs to tests/fuzz/findings, which test_parser_fuzz.py reads.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+KEPT = ROOT / ".build" / "fuzz" / "corpus"
+FOUND = ROOT / ".build" / "fuzz" / "findings"
+FINDINGS = Path(__file__).with_name("findings")
+MOST_MB = 1536
+MOST_S = 10
+
+sys.path += [str(ROOT / "tests" / "live"), str(ROOT / "tests" / "fuzz")]
+
+
+OPEN = contextlib.ExitStack()
+"""What stays open while a target is called."""
+
+
+class Target:
+    """A parser: its valid inputs, the modules whose branches are followed, and a call."""
+
+    def __init__(self, read: Callable[[bytes], None], seeds: list[bytes], *modules: str) -> None:
+        self.read, self.seeds, self.modules = read, seeds, modules
+
+
+def a_run(folder: Path) -> dict[str, bytes]:
+    """The files of a small valid run with estimates."""
+    from relpos import api
+    from relpos.runs import save_run, write_estimates
+
+    simulated = api.simulate("paper", seed=1)
+    save_run(simulated, folder / "run")
+    write_estimates(folder / "run", api.fuse(simulated, "deadreckoning").estimates)
+    return {p.name: p.read_bytes()[:3000] for p in (folder / "run").iterdir() if p.is_file()}
+
+
+def files(folder: Path) -> Target:
+    """A run directory of which one file is foreign: its name, a zero byte, its content."""
+    from relpos.errors import RelposError
+    from relpos.runs import load_run, read_estimates
+
+    valid = a_run(folder)
+    place = folder / "foreign"
+    place.mkdir()
+    for name, content in valid.items():
+        (place / name).write_bytes(content)
+
+    def read(data: bytes) -> None:
+        number, content = data[:1], data[1:]
+        name = sorted(valid)[number[0] % len(valid)] if number else "run.toml"
+        (place / name).write_bytes(content)
+        try:
+            for reader in (load_run, read_estimates):
+                with contextlib.suppress(RelposError):
+                    reader(place)
+        finally:
+            (place / name).write_bytes(valid[name])
+
+    seeds = [bytes((k,)) + valid[name] for k, name in enumerate(sorted(valid))]
+    return Target(read, seeds, "relpos.runs")
+
+
+def toml(folder: Path) -> Target:
+    """The description of a run."""
+    from relpos.errors import RelposError
+    from relpos.runs.description import parse_description
+
+    def read(data: bytes) -> None:
+        with contextlib.suppress(RelposError):
+            parse_description("run.toml", data.decode("utf-8", "replace"))
+
+    person = b'[node.1]\nname = "Kim"\nx_m = 0.0\ny_m = 1.0\nsigma_m = 1.0\n'
+    seeds = [b'name = "a"\nstature_m = 1.8\n' + person, a_run(folder)["run.toml"]]
+    return Target(read, seeds, "relpos.runs.description")
+
+
+def mcap(folder: Path) -> Target:
+    """A recording."""
+    import lzma
+
+    from relpos.errors import RelposError
+    from relpos.recording import open_recording
+    from relpos.recording.replay import Replay
+
+    path = folder / "foreign.mcap"
+
+    def read(data: bytes) -> None:
+        path.write_bytes(data)
+        with contextlib.suppress(RelposError):
+            recording = open_recording(path)
+            replay = Replay(recording, bytes(16))
+            recording.run_of(replay.observations())
+
+    golden = lzma.decompress((ROOT / "tests" / "golden" / "0.2.0.mcap.xz").read_bytes())
+    return Target(read, [golden[:20_000], golden[-8_000:]], "relpos.recording")
+
+
+def settings(_: Path) -> Target:
+    """What is typed: settings of nodes, faults, settings of estimators, key files."""
+    from relpos import fusion
+    from relpos.emulator.faults import parse_fault
+    from relpos.errors import RelposError
+    from relpos.nodes.settings import parse_changes
+
+    def read(data: bytes) -> None:
+        words = data.decode("utf-8", "replace").split("\n")
+        with contextlib.suppress(ValueError):
+            parse_changes(words)
+        for word in words:
+            with contextlib.suppress(RelposError):
+                parse_fault(word, [1, 2, 3])
+            name, _, value = word.partition("=")
+            with contextlib.suppress(RelposError):
+                fusion.check("bank", {name: value})
+
+    seeds = [
+        b"stature\n1.78\nled\noff\nreport-period=0.5",
+        b"radio:foreign:from=25,to=45,key=stolen",
+        b"pair_bias_m=0.3\nimu:wrong:node=2,value=1e3",
+    ]
+    return Target(read, seeds, "relpos.nodes.settings", "relpos.emulator.faults", "relpos.fusion")
+
+
+def http(folder: Path) -> Target:
+    """Requests of guests: a route, and its body."""
+    import json
+
+    from house import BODIES, WELL, open_house
+
+    house = OPEN.enter_context(open_house(folder))
+    routes = sorted(BODIES)
+
+    def read(data: bytes) -> None:
+        path = routes[data[0] % len(routes)] if data else routes[0]
+        answer = house.send("POST", path, data[1:])
+        assert answer.status_code in WELL, answer.text
+        assert not house.live._failed, house.live._failed
+
+    seeds = [bytes((k,)) + json.dumps(BODIES[r]).encode() for k, r in enumerate(routes)]
+    return Target(read, seeds, "relpos.view.server", "relpos.live")
+
+
+def link(_: Path) -> Target:
+    """Scripts of frames: link_fuzzer.py."""
+    import random
+    from collections import Counter
+
+    import link_fuzzer
+
+    source = random.Random(1)
+    seeds = [source.randbytes(source.randrange(20, 600)) for _ in range(100)]
+    return Target(
+        lambda data: link_fuzzer.run_one(data, Counter()), seeds, "relpos.link", "relpos.protocol"
+    )
+
+
+NODE = "node"
+TARGETS = {make.__name__: make for make in (files, toml, mcap, settings, http, link)}
+
+
+def follow_branches(modules: tuple[str, ...]) -> None:
+    """Let libFuzzer see the branches of these modules' functions."""
+    import atheris
+
+    for module_name, module in list(sys.modules.items()):
+        if not any(module_name == m or module_name.startswith(m + ".") for m in modules):
+            continue
+        for name, value in list(vars(module).items()):
+            if getattr(value, "__module__", None) != module_name:
+                continue
+            if isinstance(value, type):
+                for inner, method in list(vars(value).items()):
+                    if hasattr(method, "__code__"):
+                        with contextlib.suppress(AttributeError, TypeError):
+                            setattr(value, inner, atheris.instrument_func(method))
+            elif hasattr(value, "__code__"):
+                setattr(module, name, atheris.instrument_func(value))
+
+
+def run_target(name: str, options: list[str]) -> None:
+    """In a process of its own; libFuzzer ends it."""
+    import atheris
+
+    with tempfile.TemporaryDirectory() as folder:
+        target = TARGETS[name](Path(folder))
+        corpus = KEPT / name
+        corpus.mkdir(parents=True, exist_ok=True)
+        for number, seed in enumerate(target.seeds):
+            (corpus / f"seed-{number}").write_bytes(seed)
+        follow_branches(target.modules)
+        atheris.Setup([sys.argv[0], *options, str(corpus)], target.read)
+        atheris.Fuzz()
+
+
+def fuzz(name: str, seconds: int) -> bool:
+    """Fuzz one parser; print its line. Return whether nothing was found."""
+    FOUND.mkdir(parents=True, exist_ok=True)
+    options = [
+        f"-max_total_time={seconds}", f"-rss_limit_mb={MOST_MB}", f"-timeout={MOST_S}",
+        "-max_len=24000", "-print_final_stats=1", f"-artifact_prefix={FOUND}/{name}-",
+    ]  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, __file__, "--child", name, *options],
+        capture_output=True, text=True, errors="replace", check=False,
+        env=os.environ | {"NUMBA_DISABLE_JIT": "0"},
+    )  # fmt: skip
+    said = done.stdout + done.stderr
+    runs = re.findall(r"number_of_executed_units:\s*(\d+)", said)
+    executed = re.findall(r"^#(\d+)\s.*cov: (\d+)", said, re.M)
+    count, cover = (runs or ["?"])[-1], (executed or [("?", "?")])[-1][1]
+    print(f"{name}: {count} inputs, {cover} branches, {'well' if not done.returncode else 'FOUND'}")
+    if done.returncode:
+        print(said[-3000:])
+        print(f"again: python {Path(__file__).relative_to(ROOT)} --child {name} FILE")
+    return not done.returncode
+
+
+def node(seconds: int) -> bool:
+    """Fuzz the firmware under sanitizers: node_fuzzer.cpp, by coverage where there is clang."""
+    import random
+    import shutil
+    import time
+
+    import fuzz_builds
+
+    begun_s, corpus = time.monotonic(), KEPT / NODE
+    corpus.mkdir(parents=True, exist_ok=True)
+    guided = shutil.which("clang++") is not None
+    program = fuzz_builds.build(fuzz_builds.GUIDED if guided else fuzz_builds.RANDOM)
+    if not any(corpus.iterdir()):
+        source = random.Random(1)
+        for number in range(200):
+            (corpus / str(number)).write_bytes(source.randbytes(source.randrange(20, 600)))
+    frames = 0
+    while True:
+        arguments = [f"-max_total_time={seconds}", "-max_len=800", "-print_final_stats=1", corpus]
+        if not guided:
+            arguments = [200_000, random.randrange(1 << 30)]
+        done = subprocess.run(
+            [program, *map(str, arguments)], capture_output=True, text=True, errors="replace",
+            check=False, env=os.environ | {"RELPOS_FUZZ_FRAMES": str(1 << 62)},
+        )  # fmt: skip
+        said = done.stdout + done.stderr
+        if done.returncode:
+            print(f"{NODE}: FOUND by {' '.join(map(str, arguments))}\n{said[-3000:]}")
+            return False
+        if guided:
+            units = re.findall(r"number_of_executed_units:\s*(\d+)", said)
+            print(f"{NODE}: {units[-1] if units else '?'} scripts by coverage, well")
+            return True
+        frames += fuzz_builds.totals(said)["frames"]
+        if time.monotonic() - begun_s > seconds:
+            print(f"{NODE}: {frames} frames at random (no clang++), well")
+            return True
+
+
+def main() -> int:
+    """Every target, one after the other."""
+    if sys.argv[1:2] == ["--child"]:
+        run_target(sys.argv[2], sys.argv[3:])
+        return 0
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--minutes", type=float, default=1.0, help="for each parser")
+    parser.add_argument("--target", nargs="*", choices=[*TARGETS, NODE], default=[*TARGETS, NODE])
+    arguments = parser.parse_args()
+    seconds = round(60 * arguments.minutes)
+    well = [node(seconds) if name == NODE else fuzz(name, seconds) for name in arguments.target]
+    return not all(well)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
