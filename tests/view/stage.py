@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from playwright.sync_api import Browser, Page, Playwright, sync_playwright
 from walking_team import WalkingTeam
@@ -63,6 +64,7 @@ class Stage:
         self.observed: list[Observation] = []
         self.acknowledged: list[int] = []
         self.board = Board()
+        self.on_replay: Callable[[dict[str, Any]], None] = lambda _: None
         self.started_unix_s = time.time() - self.at_s
         self._listen_port = port
         self._token = token
@@ -178,6 +180,8 @@ class Stage:
                 self.team.acknowledged[request.body["node"]] = request.body["by"]
             elif request.kind == "shelve":
                 self.team.shelved_s[request.body["node"]] = request.body["seconds"]
+            elif request.kind == "replay":
+                self.on_replay(request.body)
             elif request.kind in BOARD_EVENTS:
                 event = {"nodes": list(range(1, self.team.size + 1)), **request.body}
                 self.board.apply({"kind": request.kind, "unix_s": time.time(), **event})

@@ -152,7 +152,7 @@ def run(source: Input, plan: SessionPlan, options: Options) -> Outcome:
     from relpos.live.assembly import run_session
 
     made: list[Recorder | FoxgloveServer] = []
-    page: list[MakeSink] = [lambda hello: _open_page(options, hello)] if options.view else []
+    page: list[MakeSink] = [lambda hello: open_page(options, hello)] if options.view else []
     sinks = [*page, *options.sinks, *_recorders(options, source, plan, made)]
     later: list[str] = []
     try:
@@ -240,7 +240,7 @@ def cot_sink(url: str, pins: Sequence[str], *, replayed: bool) -> MakeSink:
     return make
 
 
-def _open_page(options: Options, hello: Hello) -> WebView:
+def open_page(options: Options, hello: Hello) -> WebView:
     """Serve the page, print its address, and open it on a desktop."""
     from relpos.view import access as doors
     from relpos.view.devices import Role

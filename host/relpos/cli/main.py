@@ -25,6 +25,7 @@ from relpos.cli import (
     fuse,
     mission,
     node,
+    replay,
     report,
     simulate,
 )
@@ -85,6 +86,7 @@ app.command("demo", epilog=help_text())(demo.demo)
 app.command("emulate", epilog=help_text())(emulate.emulate)
 app.command("fuse", cls=fuse.FuseCommand)(fuse.fuse)
 app.command("mission")(mission.mission)
+app.command("replay")(replay.replay)
 app.command("simulate")(simulate.simulate)
 app.command("evaluate")(evaluate.evaluate)
 app.command("convert")(convert.convert)

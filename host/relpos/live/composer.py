@@ -128,7 +128,7 @@ class Composer:
             people=tuple(self._person(node, now_s) for node in people),
             pairs=() if estimate is None else self._pairs(estimate),
             ranges=self._measured(now_s),
-            alternatives=() if estimate is None else _ghosts(estimate),
+            alternatives=() if estimate is None else ghosts_of(estimate),
         )
 
     def remember(self, node: int, heard_s: float, now_s: float, alert: KnownAlert | None) -> None:
@@ -282,7 +282,7 @@ def _status(at: NodeEstimate | None, seen_s: float | None, condition: Condition)
     return located
 
 
-def _ghosts(estimate: Estimate) -> tuple[Ghosts, ...]:
+def ghosts_of(estimate: Estimate) -> tuple[Ghosts, ...]:
     """Return the alternatives by probability, at the time of the estimate (no nowcast)."""
     rows: dict[int, list[GhostPerson]] = {}
     probabilities: dict[int, float] = {}

@@ -42,6 +42,9 @@ class Sink:
     def boarded(self, board: dict[str, Any]) -> None:
         """Show the accountability board, which has changed."""
 
+    def timed(self, timeline: dict[str, Any]) -> None:
+        """Show where a recording that is played stands."""
+
     def resumed(self, tracks: Tracks) -> None:
         """Go on with the tracks of a mission's sessions before."""
 

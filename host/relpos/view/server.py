@@ -57,6 +57,7 @@ ALLOWED = {
     "name": (2.0, 100.0),
     "acknowledge": (2.0, 100.0),
     "shelve": (2.0, 20.0),
+    "replay": (30.0, 300.0),
     "device": (2.0, 50.0),
     **dict.fromkeys(BOARD_EVENTS, (5.0, 100.0)),
 }
@@ -77,6 +78,7 @@ class SessionProxy:
         self.names: dict[str, str] = {}
         self.log: list[dict[str, Any]] = []
         self.board = '{"type":"board"}'
+        self.timeline = ""
         self.devices: dict[str, dict[str, Any]] = {}
         """Every device that was ever let in, by its id, in a mission."""
         self._news = asyncio.Event()
@@ -105,6 +107,8 @@ class SessionProxy:
             case "points":
                 for node, point in message["points"].items():
                     self.tracks.add(int(node), *point)
+            case "timeline":
+                self.timeline = line.rstrip("\n")
             case "board":
                 self.board = line.rstrip("\n")
             case "device":
@@ -184,6 +188,7 @@ class Pages:
             Route("/api/acknowledge", self.acknowledge, methods=["POST"]),
             Route("/api/shelve", self.shelve, methods=["POST"]),
             *(Route(f"/api/{kind}", self.change_board, methods=["POST"]) for kind in BOARD_EVENTS),
+            Route("/api/replay", self.replay, methods=["POST"]),
             Route("/api/invite", self.invite),
             Route("/api/devices", self.devices),
             Route("/api/revoke", self.revoke, methods=["POST"]),
@@ -234,9 +239,12 @@ class Pages:
             await socket.send_text(self.session.tracks.to_json())
             await socket.send_text(to_json({"type": "you", "role": str(role_of(socket))}))
             seen: str | None = None
-            told, board = 0, ""
+            told, board, timeline = 0, "", ""
             while not gone.done() and not self.session.over and not self._is_revoked(socket):
                 newest = await self.session.news(seen, PING_S)
+                if timeline is not self.session.timeline:
+                    timeline = self.session.timeline
+                    await socket.send_text(timeline)
                 if board is not self.session.board:
                     board = self.session.board
                     await socket.send_text(board)
@@ -370,6 +378,15 @@ class Pages:
         if "node" in body:
             body["node"] = _node(body)
         return await self._ask(request, kind, {**body, "by": _by(body)})
+
+    async def replay(self, request: Request) -> Response:
+        """Move a recording that is played: a moment, a speed, play or pause, the next event."""
+        body = await _body(request)
+        asked: dict[str, Any] = {}
+        asked |= {name: _number(body, name) for name in ("at_s", "speed", "step") if name in body}
+        if "playing" in body:
+            asked["playing"] = float(body["playing"] is True)
+        return await self._ask(request, "replay", asked)
 
     async def shelve(self, request: Request) -> Response:
         """Silence all alarms of a person for a while."""

@@ -57,6 +57,7 @@ class WebView(Sink):
         self._door = listener
         self._tracks = Tracks()
         self._names: dict[int, str] = {}
+        self._timeline = '{"type":"ping"}'
         self._board = to_json(Board().to_message())
         self._devices: list[dict[str, Any]] = []
         self._log: deque[dict[str, Any]] = deque(maxlen=MAX_LOG)
@@ -105,6 +106,11 @@ class WebView(Sink):
         """Send the board to the pages."""
         self._board = to_json(board)
         self._say(self._board)
+
+    def timed(self, timeline: dict[str, Any]) -> None:
+        """Send the time line to the pages."""
+        self._timeline = to_json(timeline)
+        self._say(self._timeline)
 
     def resumed(self, tracks: Tracks) -> None:
         """Go on with the tracks of the sessions before."""
@@ -183,6 +189,7 @@ class WebView(Sink):
             _names_message(self._names),
             log,
             self._board,
+            self._timeline,
             *(to_json({"type": "device", "event": event}) for event in self._devices),
         ):
             self._say(line)

@@ -520,7 +520,7 @@ export class TeamMap {
     context.textBaseline = "middle";
     context.fillText(String(person.node), px, py + 0.5 * unit);
     // The sign is the node's; whether a silent one works nobody knows.
-    if (!gone && person.health !== "green") {
+    if (!gone && (person.health === "yellow" || person.health === "red")) {
       this.drawSign(person.health, px + 0.95 * radius, py - 0.95 * radius, 6.5 * unit);
     }
   }

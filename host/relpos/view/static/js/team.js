@@ -63,6 +63,7 @@ export class Team {
       case "log":
       case "you":
       case "board":
+      case "timeline":
         return message.type;
       case "ping":
         return "ping";
@@ -72,6 +73,9 @@ export class Team {
   }
 
   handleView(picture) {
+    // A recording that was moved to another moment: its tracks begin there.
+    const step = picture.time_s - (this.timeS ?? picture.time_s);
+    if (this.replayed && (step < -0.01 || step > 15)) this.tracks = new Map();
     this.seq = picture.seq;
     this.timeS = picture.time_s;
     this.unixS = picture.unix_s;

@@ -16,6 +16,7 @@ import { Siren } from "./sound.js";
 import { connectionWords, dataAgeS, replayWords, showConnection } from "./status_line.js";
 import { Team } from "./team.js";
 import { isDark, themeSwitch } from "./theme_switch.js";
+import { Timeline } from "./timeline.js";
 import { alarmText, duration } from "./words.js";
 
 const LIST_MS = 200; // five times a second is enough for the eye
@@ -48,6 +49,10 @@ const board = new BoardView(team, { by: () => BY, find, say: (text) => {
   trouble = { level: "warning", text };
   refresh(true);
 } });
+const timeline = new Timeline((text) => {
+  trouble = { level: "warning", text };
+  refresh(true);
+});
 const connection = new Connection({ onMessage: handle, onState: () => refresh(true) });
 
 // -- messages --------------------------------------------------------------------------------------
@@ -66,6 +71,8 @@ function handle(message) {
     setText(byId("limit-warning"), String(team.limits.still_warning_s));
     setText(byId("limit-alarm"), String(team.limits.still_alarm_s));
     map.layer.forget();
+  } else if (kind === "timeline") {
+    timeline.handle(message);
   } else if (kind === "board") {
     board.handle(message);
   } else if (kind === "you") {
@@ -80,6 +87,7 @@ function handle(message) {
     takeAlarms();
     map.alarms = alarms.active;
     link.update(0, receivedMs);
+    timeline.show(team.timeS);
     findView.update(team);
   } else if (kind === "unknown") {
     trouble = { level: "warning", text: "The server's version differs from this page's: reload the page." };

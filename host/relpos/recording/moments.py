@@ -1,0 +1,169 @@
+"""Any moment of a recording, found by its blocks' times: nothing before it is read.
+
+The table of blocks comes from the heads of the blocks themselves, so that a file that was cut off
+has one as well. Several recordings of one mission are one, on the mission's clock.
+"""
+
+from __future__ import annotations
+
+import struct
+from bisect import bisect_right
+from collections import OrderedDict
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Metadata
+
+from relpos.errors import DataError
+from relpos.fusion.estimator import Estimate, NodeEstimate
+from relpos.recording import topics
+from relpos.recording.about import About
+from relpos.recording.container import MESSAGE_HEAD, Piece, Walk, parse, records_in, unpack
+from relpos.runs.description import Description
+
+BACK_S = 10.0
+"""How old ranges may be that are shown."""
+KEPT_BLOCKS = 400
+"""Unpacked blocks in memory: about a minute and a half of a large team."""
+_UNREADABLE = (KeyError, ValueError, TypeError, AttributeError, struct.error)
+
+
+@dataclass(frozen=True)
+class _Block:
+    start_ns: int
+    end_ns: int
+    file: int
+    piece: Piece
+
+
+@dataclass(frozen=True)
+class Message:
+    """A decoded message, and the session's time at which it was written."""
+
+    time_s: float
+    topic: str
+    data: bytes
+
+
+class Moments:
+    """The moments of recordings that belong together. DataError where one is none of ours."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self._paths = list(paths)
+        self._files = [path.open("rb") for path in paths]
+        self._walks = [Walk(file) for file in self._files]
+        self._topics: list[dict[int, str]] = []
+        self._blocks: list[_Block] = []
+        self._kept: OrderedDict[int, list[Message]] = OrderedDict()
+        about: About | None = None
+        for number, walk in enumerate(self._walks):
+            metadata: dict[str, dict[str, str]] = {}
+            names: dict[int, str] = {}
+            for piece in walk:
+                if piece.opcode == Opcode.METADATA:
+                    record = parse(Metadata, walk.payload(piece))
+                    metadata[record.name] = record.metadata
+                elif piece.opcode == Opcode.CHANNEL:
+                    channel = parse(Channel, walk.payload(piece))
+                    names[channel.id] = channel.topic
+                elif piece.opcode == Opcode.CHUNK:
+                    start_ns, end_ns = struct.unpack("<QQ", walk.payload(piece, 16))
+                    self._blocks.append(_Block(start_ns, end_ns, number, piece))
+            self._topics.append(names)
+            found = About.read(str(paths[number]), metadata)
+            about = found if found is not None else about
+        if about is None or not self._blocks:
+            raise DataError(f"{paths[0]}: no recording of relpos, or nothing in it")
+        self.started_unix_s = about.started_unix_ns * 1e-9
+        self.description: Description = about.description
+        self._blocks.sort(key=lambda block: block.end_ns)
+        self._ends = [block.end_ns for block in self._blocks]
+        self.from_s = self._session_s(min(block.start_ns for block in self._blocks))
+        self.to_s = self._session_s(self._ends[-1])
+
+    def again(self) -> Moments:
+        """Return the same with files of their own, for another thread."""
+        return Moments(self._paths)
+
+    def close(self) -> None:
+        """Close the files."""
+        for file in self._files:
+            file.close()
+
+    def _session_s(self, log_ns: int) -> float:
+        return log_ns * 1e-9 - self.started_unix_s
+
+    def between(
+        self, from_s: float, to_s: float, wanted: Collection[str] | None = None
+    ) -> Iterator[Message]:
+        """Yield the messages of that time, in order."""
+        first = bisect_right(self._ends, int((from_s + self.started_unix_s) * 1e9) - 1)
+        until_ns = int((to_s + self.started_unix_s) * 1e9)
+        for index in range(first, len(self._blocks)):
+            if self._blocks[index].start_ns > until_ns:
+                break
+            for message in self._messages(index):
+                if from_s <= message.time_s <= to_s and (wanted is None or message.topic in wanted):
+                    yield message
+
+    def _messages(self, index: int) -> list[Message]:
+        if index in self._kept:
+            self._kept.move_to_end(index)
+            return self._kept[index]
+        block = self._blocks[index]
+        names, walk = self._topics[block.file], self._walks[block.file]
+        messages = []
+        try:
+            raw = unpack(parse(Chunk, walk.payload(block.piece)))
+            for opcode, content in records_in(raw):
+                if opcode == Opcode.MESSAGE:
+                    channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(content)
+                    data = bytes(content[MESSAGE_HEAD.size :])
+                    messages.append(Message(self._session_s(log_ns), names.get(channel, ""), data))
+        except ValueError:
+            messages = []  # A damaged block: what it held is missing, nothing else.
+        self._kept[index] = messages
+        while len(self._kept) > KEPT_BLOCKS:
+            self._kept.popitem(last=False)
+        return messages
+
+    def estimate_at(self, time_s: float) -> Estimate | None:
+        """Return the newest estimate that was there by then, however old; None before the first."""
+        until_s = time_s
+        for back_s in (1.5, BACK_S, 100.0, 1e3, 1e5):
+            found = self._estimate(time_s - back_s, until_s)
+            if found is not None:
+                return found
+            until_s = time_s - back_s + 1.5
+        return None
+
+    def _estimate(self, from_s: float, to_s: float) -> Estimate | None:
+        wanted = set(topics.LISTS.values())
+        found: Estimate | None = None
+        for message in self.between(from_s, to_s, wanted):
+            decoded = _decoded(topics.decode_list, message)
+            if decoded is None:
+                continue
+            at_s, kind, rows = decoded
+            if kind is NodeEstimate:
+                found = Estimate(at_s, rows, ())
+            elif found is not None and found.time_s == at_s:
+                found = replace(found, **{topics.LIST_NAMES[kind]: rows})
+        return found
+
+    def rows(self, from_s: float, to_s: float, *kinds: type) -> Iterator[tuple[float, Any]]:
+        """Yield decoded rows of those kinds, with the time at which they were there."""
+        for message in self.between(from_s, to_s, {topics.ROWS[kind] for kind in kinds}):
+            row = _decoded(topics.decode_row, message)
+            if row is not None:
+                yield message.time_s, row
+
+
+def _decoded(decode: Any, message: Message) -> Any:
+    try:
+        return decode(message.topic, message.data)
+    except _UNREADABLE:
+        return None

@@ -1,0 +1,137 @@
+"""Any moment of a recording: found by its blocks' times, with alarms and silence as they were."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from sessions import about, play, session
+
+from relpos.errors import DataError
+from relpos.live.requests import Request
+from relpos.live.sinks import Sink
+from relpos.live.team_view import Alert
+from relpos.measurements import Motion
+from relpos.recording import open_recording
+from relpos.recording.moments import Moments
+from relpos.recording.player import History, Player
+from relpos.recording.recorder import Recorder
+
+SEEK_S = 0.3
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A recording of three nodes, cut off like one of a laptop without power."""
+    path = tmp_path_factory.mktemp("moments") / "walk.mcap"
+    recorder = Recorder(path, about())
+    play(recorder, session())
+    recorder.close()
+    cut = path.with_name("cut.mcap")
+    cut.write_bytes(path.read_bytes()[: path.stat().st_size * 9 // 10])
+    return path, cut
+
+
+def test_the_estimate_of_a_moment_is_the_newest_that_was_recorded_by_then(recorded):
+    path, _ = recorded
+    estimates = list(open_recording(path).estimates())
+    moments = Moments([path])
+    for estimate in estimates[2:-1:5]:
+        found = moments.estimate_at(estimate.time_s + 4.0)
+        assert found is not None
+        assert found in estimates
+        assert found.time_s >= estimate.time_s
+    assert moments.estimate_at(moments.to_s + 5000.0) == estimates[-1], "a last place stays"
+    assert moments.estimate_at(moments.from_s - 1.0) is None
+
+
+def test_a_recording_that_was_cut_off_has_its_moments_and_seeks_as_fast(recorded):
+    _, cut = recorded
+    moments = Moments([cut])
+    assert moments.to_s > 20.0
+    slowest_s = 0.0
+    for step in range(20):
+        at_s = moments.from_s + (step * 7 % 20) / 20 * (moments.to_s - moments.from_s)
+        fresh = moments.again()
+        began_s = time.process_time()
+        fresh.estimate_at(at_s)
+        slowest_s = max(slowest_s, time.process_time() - began_s)
+        fresh.close()
+    assert slowest_s < SEEK_S
+
+
+def test_what_is_no_recording_is_refused(tmp_path):
+    path = tmp_path / "x.mcap"
+    path.write_bytes(b"rubbish" * 100)
+    with pytest.raises(DataError, match="no recording of relpos"):
+        Moments([path])
+
+
+class Page(Sink):
+    """A page that asks."""
+
+    def __init__(self):
+        self.views = []
+        self.lines = []
+        self.asks = []
+        self.answers = []
+        self.timeline = {}
+
+    def updated(self, view):
+        self.views.append(view)
+
+    def logged(self, entry):
+        self.lines.append(entry)
+
+    def timed(self, timeline):
+        self.timeline = timeline
+
+    def requests(self):
+        asks, self.asks = self.asks, []
+        return asks
+
+    def respond(self, request, reply, status=200):
+        self.answers.append((reply, status))
+
+
+def test_a_recording_is_moved_to_any_moment_and_to_its_events(recorded):
+    path, _ = recorded
+    page = Page()
+    player = Player(Moments([path]), [page])
+    while not player.history.complete:
+        time.sleep(0.01)
+    for body in ({"playing": False}, {"at_s": 12.0}):
+        page.asks.append(Request(1, "replay", 0.0, body))
+    player.run(0.1)
+    assert page.views[-1].time_s == 12.0
+    assert page.timeline["playing"] is False
+    assert [p.node for p in page.views[-1].people] == [1, 2, 3]
+    assert all(p.seen_s < 3.0 for p in page.views[-1].people)
+    ticks = [at_s for at_s, _, _ in page.timeline["ticks"]]
+    for at_s in [t for t in ticks if t > 12.5][:2]:
+        page.asks.append(Request(2, "replay", 0.0, {"step": 1}))
+        player.run(0.05)
+        assert page.views[-1].time_s == at_s
+    page.asks.append(Request(3, "name", 0.0, {"node": 1, "name": "x"}))
+    player.run(0.05)
+    assert page.answers[-1][1] == 409
+
+
+def test_alerts_of_a_moment_are_those_that_were_then():
+    class Rows:
+        started_unix_s, from_s, to_s = 0.0, 0.0, 60.0
+
+        def rows(self, *_):
+            for second in range(60):
+                if second < 45:
+                    moving = second < 10
+                    yield float(second), Motion(float(second), 2, 0.0, 0.0, 0.0, moving=moving)
+                yield float(second), Motion(float(second), 3, 1.0, 0.0, 0.0, moving=True)
+
+    history = History()
+    history.read(Rows(), {2: "Ben"}, ())
+    assert history.alert(2, 20.0)[1] is None
+    assert history.alert(2, 31.0)[1] is Alert.STILL_WARNING
+    assert history.alert(2, 42.0)[1] is Alert.STILL_ALARM
+    assert history.heard(2, 59.0) == 44.0
+    assert any(e.text.startswith("Ben") for e in history.events)
