@@ -79,4 +79,46 @@ TEST(what_is_no_number_is_refused_and_counted) {
   CHECK_NEAR(x_m, reckoning.displacement().x_m, 1e-6f);
 }
 
+#if defined(__AVR__)
+const uint32_t kRandomSteps = 400;
+#else
+const uint32_t kRandomSteps = 200000;
+#endif
+
+// Whatever the sensors say, up to their limits and beyond, at whatever intervals.
+TEST(random_motion_leaves_every_variance_positive_and_growing) {
+  reckoning.reset();
+  uint32_t random = 12345;
+  float along = 0.0f, across = 0.0f, heading = 0.0f;
+  for (uint32_t step = 0; step < kRandomSteps; ++step) {
+    ImuSample sample;
+    float* values = sample.acceleration_m_s2;
+    const uint8_t mood = static_cast<uint8_t>(step / 100 % 4);  // still, walking, shaken, at the limits
+    float size[2] = {0.05f, 0.01f};
+    if (mood == 1) size[0] = 3.0f, size[1] = 1.0f;
+    if (mood == 2) size[0] = 20.0f, size[1] = 8.0f;
+    if (mood == 3) size[0] = 60.0f, size[1] = 40.0f;
+    for (uint8_t k = 0; k < 6; ++k) {
+      random = random * 1664525u + 1013904223u;
+      const float unit = static_cast<float>(random >> 8) * 1.1920929e-7f - 1.0f;
+      if (k == 3) values = sample.angular_rate_rad_s - 3;
+      values[k] = unit * size[k / 3];
+    }
+    sample.acceleration_m_s2[step / 5000 % 3] += kGravity;
+    reckoning.update(sample, (random & 31) == 0 ? 0.15f : kTick_s);
+    if ((random & 15) == 0) {
+      const float field_ut[3] = {sample.angular_rate_rad_s[0], 20.0f, -40.0f};
+      reckoning.magnetometer(field_ut);
+    }
+    const Displacement& d = reckoning.displacement();
+    CHECK(d.variance_along_m2 >= along && d.variance_across_m2 >= across &&
+          d.variance_heading_rad2 >= heading);  // false for NaN, too
+    along = d.variance_along_m2;
+    across = d.variance_across_m2;
+    heading = d.variance_heading_rad2;
+    CHECK(!isinf(along + across + heading));
+    CHECK(!isnan(d.x_m + d.y_m + d.heading_rad + d.path_m));
+  }
+}
+
 RUN_TESTS()

@@ -1,0 +1,144 @@
+"""Random steps and geometry that gives an estimator nothing: covariances stay positive, no NaN."""
+
+import contextlib
+import math
+import random
+
+import pytest
+
+from relpos import api, fusion
+from relpos.errors import RelposError
+from relpos.fusion.estimator import NodeStatus
+from relpos.measurements import Heading, Height, Motion, Range, common_priors
+from relpos.runs import Description
+from relpos.runs.description import InitialPose
+from relpos.runs.run import assemble
+
+
+def one_spot(rng, node):
+    return 0.0, 0.0
+
+
+def one_line(rng, node):
+    return 3.0 * node, 0.0
+
+
+def anywhere(rng, node):
+    return rng.uniform(-50.0, 50.0), rng.uniform(-50.0, 50.0)
+
+
+def steps(rng, nodes, place, ranges, count):
+    """Motions of all nodes second by second, and what else comes in between."""
+    places = {node: place(rng, node) for node in nodes}
+    for step in range(count):
+        node, time_s = nodes[step % len(nodes)], 1.0 + step / len(nodes)
+        stands = rng.random() < 0.3
+        dx_m, turn = (0.0, 0.0) if stands else (rng.gauss(0.7, 0.5), rng.gauss(0.0, 0.6))
+        sigma_m = rng.choice([0.0, 1e-6, 0.05, 0.05, 0.05, 50.0])
+        yield Motion(time_s, node, dx_m, 0.0, turn, sigma_m, sigma_m, rng.choice([0.0, 0.02, 3.0]))
+        kind = rng.random()
+        if kind < 0.5 and len(nodes) > 1:
+            peer = rng.choice([n for n in nodes if n != node])
+            true_m = math.dist(places[node], places[peer])
+            yield Range(time_s, node, peer, ranges(rng, true_m))
+        elif kind < 0.55:
+            yield Height(time_s, node, rng.uniform(-5.0, 5.0), rng.choice([1e-6, 0.5]))
+        elif kind < 0.6:
+            sigma_rad = rng.choice([1e-6, 0.4, 10.0])
+            yield Heading(time_s, node, rng.uniform(-4.0, 4.0), sigma_rad, "phone")
+
+
+def as_measured(rng, true_m):
+    return max(true_m + rng.gauss(0.0, 0.1), 0.0)
+
+
+def nothing(rng, true_m):
+    return 0.0
+
+
+def any_distance(rng, true_m):
+    return rng.choice([0.0, 1e-3, 1.0, 30.0, 200.0])
+
+
+def check(estimate):
+    for node in estimate.nodes:
+        if node.status is NodeStatus.UNLOCATED:
+            continue
+        xx, yy, xy = node.variance_x_m2, node.variance_y_m2, node.covariance_xy_m2
+        numbers = (node.x_m, node.y_m, node.heading_rad, xx, yy, xy, node.sigma_heading_rad)
+        assert all(map(math.isfinite, numbers)), node
+        assert min(xx, yy) > 0.0, node
+        assert node.sigma_heading_rad >= 0.0, node
+        assert xx * yy - xy * xy >= -1e-9 * xx * yy, node
+    for pair in estimate.pairs:
+        assert math.isfinite(pair.distance_m), pair
+        assert pair.sigma_distance_m >= 0.0, pair
+
+
+CASES = {
+    "one spot": ((1, 2, 3), one_spot, as_measured),
+    "one line": ((1, 2, 3, 4), one_line, as_measured),
+    "one node": ((7,), anywhere, as_measured),
+    "ranges of zero": ((1, 2, 3), anywhere, nothing),
+    "any range": ((1, 2, 3), anywhere, any_distance),
+}
+
+
+def rows_of(case, count, seed):
+    nodes, place, ranges = CASES[case]
+    return common_priors(nodes), list(steps(random.Random(seed), nodes, place, ranges, count))
+
+
+def run(estimator, case, count, seed):
+    priors, rows = rows_of(case, count, seed)
+    made = fusion.make(estimator, priors)
+    estimates = 0
+    for row in rows:
+        for estimate in made.process(row):
+            check(estimate)
+            estimates += 1
+    assert estimates
+    with contextlib.suppress(RelposError):  # says in words what these measurements cannot tell
+        for estimate in made.finish():
+            check(estimate)
+
+
+def smooth(case, count, seed):
+    priors, rows = rows_of(case, count, seed)
+    description = Description(initial_pose=InitialPose.COMMON, priors=priors)
+    with contextlib.suppress(RelposError):
+        for estimate in api.fuse(assemble("random", description, rows), smooth=True).estimates:
+            check(estimate)
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("estimator", ["bank", "particle"])
+def test_random_steps_leave_every_covariance_positive(estimator, case):
+    run(estimator, case, 60, 1)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(("estimator", "count"), [("bank", 5_000), ("particle", 100_000)])
+def test_long_random_walks_leave_every_covariance_positive(estimator, count, case):
+    for seed in range(count // 1_000):
+        run(estimator, case, 1_000, seed)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("case", CASES)
+def test_random_walks_are_smoothed_to_positive_covariances(case):
+    for seed in range(3):
+        smooth(case, 300, seed)
+
+
+@pytest.mark.parametrize("place", [one_spot, one_line], ids=lambda place: place.__name__)
+@pytest.mark.parametrize("count", [33, pytest.param(1000, marks=pytest.mark.soak)])
+def test_a_large_team_in_one_spot_or_line_stays_finite(place, count):
+    nodes, rng = tuple(range(1, count + 1)), random.Random(1)
+    made = fusion.make("bank", common_priors(nodes))
+    for row in steps(rng, nodes, place, as_measured, 2 * count):
+        for estimate in made.process(row):
+            check(estimate)
+    for estimate in made.finish():
+        check(estimate)
