@@ -227,6 +227,22 @@ def test_an_emulated_or_replayed_team_says_so() -> None:
     assert all("EXERCISE" in event.words("remarks") for event in events.values())
 
 
+def test_a_lost_member_stays_on_the_map_as_a_marker_until_it_is_heard_again(
+    schedule: Schedule,
+) -> None:
+    gone = {1: {"status": "lost", "seen_s": 60.0, "alert": Alert.LOST}}
+    events = due(schedule, team_view(1, changes=gone), 0.0)
+    marker = events["test.1-last"]
+    assert marker.type == "b-m-p-s-m"
+    assert "last known" in marker.attributes("contact")["callsign"]
+    assert marker.stale_s > marker.start_s + 3600.0, "clients delete what is stale"
+    assert events["test.1"].stale_s < events["test.1"].time_s
+    assert "test.1-last" not in due(schedule, team_view(2, changes=gone), 2.0)
+    assert "test.1-last" in due(schedule, team_view(3, changes=gone), 62.0)
+    assert due(schedule, team_view(4), 64.0)["test.1-last"].type == "t-x-d-d"
+    assert "test.1-last" not in due(schedule, team_view(5), 66.0)
+
+
 def test_a_name_that_xml_cannot_hold_is_sent_without_the_rest(schedule: Schedule) -> None:
     event = due(schedule, team_view(1, changes={1: {"name": "A\x00\x1b\ud800b"}}), 0.0)["test.1"]
     assert event.attributes("contact")["callsign"] == "Ab"

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from relpos.cli import output
 from relpos.cli.demo import Board, Faults, check_faults
 from relpos.cli.keys import KeyFile, team_key
 from relpos.cli.node_flash import ImuName
@@ -14,7 +15,12 @@ from relpos.cli.node_flash import ImuName
 def emulate(
     nodes: Annotated[int, typer.Option(min=1, max=20, help="How many people.")],
     board: Annotated[Board, typer.Option(help="What runs the firmware.")] = Board.NATIVE,
-    scenario: Annotated[str, typer.Option(metavar="NAME", help="Where they walk.")] = "paper",
+    scenario: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", help="paper, lab, straight (walks); bench, turntable (tests)."
+        ),
+    ] = "paper",
     speed: Annotated[
         float, typer.Option(min=0.0, help="1 is real time; 0 is as fast as possible.")
     ] = 1.0,
@@ -46,4 +52,10 @@ def emulate(
         key=team_key(key_file),
         imu=str(imu),
     )
-    serve_team(config, speed, typer.echo)
+    output.remark(f"starting {nodes} emulated people; the first time their firmware is built")
+
+    def announce(path: str) -> None:
+        typer.echo(path)
+        output.remark(f"in another terminal: relpos fuse {path} --view; Ctrl-C ends")
+
+    serve_team(config, speed, announce)

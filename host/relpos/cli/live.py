@@ -14,6 +14,7 @@ import typer
 
 from relpos.cli import output
 from relpos.cli.keys import make_link
+from relpos.errors import RelposError
 
 if TYPE_CHECKING:
     from relpos.live.assembly import MakeSink, MissionPlan, SessionPlan
@@ -133,6 +134,8 @@ class Options:
 
     def check(self) -> None:
         """Raise DataError or RelposError at once where an option cannot work."""
+        if self.view_listen is not None and not self.view:
+            raise RelposError("--view-listen: no page is served without --view")
         if self.record is not None or self.foxglove is not None:
             from relpos import recording
 

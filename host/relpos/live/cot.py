@@ -23,7 +23,7 @@ from relpos.errors import DataError
 from relpos.extras import missing_extra
 from relpos.fusion.estimator import Estimate
 from relpos.geodesy import MapFrame, Pin, place
-from relpos.live.cot_events import Callsigns, Moved, emergency, member, serialized
+from relpos.live.cot_events import Callsigns, Moved, emergency, last_known, member, serialized
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert, Person, TeamView
 
@@ -31,6 +31,7 @@ EVERY_S = 1.0
 """Each member is sent at most this often."""
 LOST_EVERY_S = 10.0
 """A lost member: often enough for a client that has just joined."""
+LAST_KNOWN_EVERY_S = 60.0
 ALARM_EVERY_S = 10.0
 TICK_S = 0.2
 CONNECT_WITHIN_S = 10.0
@@ -77,6 +78,7 @@ class Schedule:
         self._exercise = exercise
         self._sent_s: dict[int, float] = {}
         self._alarm_sent_s: dict[int, float] = {}
+        self._marked_s: dict[int, float] = {}
         self._moved: dict[int, Moved] = {}
         self._seen_seq: dict[int, int] = {}
 
@@ -89,12 +91,29 @@ class Schedule:
     ) -> Iterator[ET.Element]:
         """Yield the events due at ``now_s``: at most one a second of each member."""
         for person in view.people:
+            marker = self._marker(person, view, frame, now_s)
+            if marker is not None:
+                yield marker
             if now_s - self._sent_s.get(person.node, -EVERY_S) < EVERY_S:
                 continue
             event = self._event(person, view, frame, now_s, sigma_z_m.get(person.node))
             if event is not None:
                 self._sent_s[person.node] = now_s
                 yield event
+
+    def _marker(
+        self, person: Person, view: TeamView, frame: MapFrame, now_s: float
+    ) -> ET.Element | None:
+        """Return the marker of a lost member's place where it is due, or its deletion."""
+        node, marked_s = person.node, self._marked_s.get(person.node)
+        lost = person.status == "lost"
+        if lost and (marked_s is None or now_s - marked_s >= LAST_KNOWN_EVERY_S):
+            self._marked_s[node] = now_s
+            return last_known(person, view, frame, self._calls, exercise=self._exercise)
+        if not lost and marked_s is not None:
+            del self._marked_s[node]
+            return last_known(person, view, frame, self._calls, over=True, exercise=self._exercise)
+        return None
 
     def _event(
         self,

@@ -34,6 +34,10 @@ from relpos.live.team_view import Alert, Person, TeamView
 STALE_S = 15.0
 """Nodes report every second and count as lost after ten: then TAK clients grey the member out."""
 ALARM_STALE_S = 600.0
+LAST_KNOWN = "b-m-p-s-m"
+"""A spot on the map."""
+DELETION = "t-x-d-d"
+LAST_KNOWN_STALE_S = 86_400.0
 """An emergency is not forgotten because the link to the server broke."""
 MEMBER = "a-f-G-U-C"
 EMERGENCY = "b-a-o-tbl"
@@ -139,6 +143,45 @@ def emergency(
     )
     now_s = view.unix_s
     return _timed(event, now_s, now_s, now_s + (STALE_S if over else ALARM_STALE_S))
+
+
+def last_known(
+    person: Person,
+    view: TeamView,
+    frame: MapFrame,
+    calls: Callsigns,
+    *,
+    over: bool = False,
+    exercise: bool = False,
+) -> ET.Element | None:
+    """Return a marker at a lost member's last known place, or with ``over`` its deletion.
+
+    Clients delete a member some minutes after it is stale; the marker stays for a day. None without
+    a position.
+    """
+    if person.seen_s is None or not _located(person):
+        return None
+    import pytak
+
+    uid = f"{calls.uid(person.node)}-last"
+    seen = datetime.fromtimestamp(view.unix_s - person.seen_s).astimezone().strftime("%H:%M:%S")
+    details = [
+        ET.Element("contact", callsign=text(f"{person.name}, last known {seen}")),
+        ET.Element("link", uid=uid if over else calls.uid(person.node), type=MEMBER,
+                   relation="none" if over else "p-p"),
+        _remarks(person, exercise),
+    ]  # fmt: skip
+    if over:
+        details.append(ET.Element("__forcedelete"))
+    event: ET.Element = pytak.cot_event(
+        uid=uid,
+        cot_type=DELETION if over else LAST_KNOWN,
+        how="m-s" if exercise else "h-e",
+        point=_point(person, frame, None),
+        detail=pytak.cot_detail(*details, flow_tag=False),
+    )
+    now_s = view.unix_s
+    return _timed(event, now_s, now_s, now_s + (STALE_S if over else LAST_KNOWN_STALE_S))
 
 
 def serialized(event: ET.Element) -> bytes:

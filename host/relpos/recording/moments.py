@@ -26,8 +26,8 @@ from relpos.runs.description import Description
 
 BACK_S = 10.0
 """How old ranges may be that are shown."""
-KEPT_BLOCKS = 400
-"""Unpacked blocks in memory: about a minute and a half of a large team."""
+KEPT_BYTES = 32 << 20
+"""Unpacked blocks in memory: minutes of a large team."""
 _UNREADABLE = (KeyError, ValueError, TypeError, AttributeError, struct.error)
 
 
@@ -58,6 +58,7 @@ class Moments:
         self._topics: list[dict[int, str]] = []
         self._blocks: list[_Block] = []
         self._kept: OrderedDict[int, list[Message]] = OrderedDict()
+        self._kept_bytes = 0
         about: About | None = None
         for number, walk in enumerate(self._walks):
             metadata: dict[str, dict[str, str]] = {}
@@ -126,8 +127,10 @@ class Moments:
         except ValueError:
             messages = []  # A damaged block: what it held is missing, nothing else.
         self._kept[index] = messages
-        while len(self._kept) > KEPT_BLOCKS:
-            self._kept.popitem(last=False)
+        self._kept_bytes += sum(len(message.data) for message in messages)
+        while self._kept_bytes > KEPT_BYTES and len(self._kept) > 1:
+            _, dropped = self._kept.popitem(last=False)
+            self._kept_bytes -= sum(len(message.data) for message in dropped)
         return messages
 
     def estimate_at(self, time_s: float) -> Estimate | None:

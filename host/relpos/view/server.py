@@ -198,6 +198,8 @@ class Pages:
                 Route("/", self.page("index.html")),
                 Route("/phone", self.page("phone.html")),
                 Route("/qr.svg", self.qr),
+                # Asked for by browsers whatever a page says.
+                Route("/favicon.ico", self.page("icon.svg")),
                 *api,
                 WebSocketRoute("/ws", self.follow),
                 Mount("/static", StaticFiles(directory=STATIC)),
