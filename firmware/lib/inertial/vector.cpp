@@ -72,8 +72,9 @@ int32_t rounded(float x) {
 }
 
 RELPOS_SHARED void direct(float angle_rad, float out[2]) {
-  out[kX] = cosf(angle_rad);
-  out[kY] = sinf(angle_rad);
+  const double angle = angle_rad;
+  out[kX] = static_cast<float>(cos(angle));
+  out[kY] = static_cast<float>(sin(angle));
 }
 
 }  // namespace relpos

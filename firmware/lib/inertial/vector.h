@@ -3,6 +3,7 @@
 #ifndef RELPOS_INERTIAL_VECTOR_H
 #define RELPOS_INERTIAL_VECTOR_H
 
+#include <math.h>
 #include <stdint.h>
 
 #include "calls.h"
@@ -38,6 +39,11 @@ float cube_root(float x);
 int32_t rounded(float x);
 // The unit vector of a direction.
 void direct(float angle_rad, float out[2]);
+// The direction of a vector's first two. Both by functions of double, the AVR's own: on a PC those of
+// float differ in the last digit from one C library to the next, and so would every emulated walk.
+inline float bearing(const float* vector) {
+  return static_cast<float>(atan2(static_cast<double>(vector[1]), static_cast<double>(vector[0])));
+}
 
 }  // namespace relpos
 

@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import fft
+from numpy import fft  # scipy's differs in the last digits from 1.17 to 1.18: no walk is the same
+from scipy.fft import next_fast_len
 from scipy.interpolate import CubicSpline
 
 from relpos.simulation.walker import RATE_HZ
@@ -122,7 +123,7 @@ def make_grid(seconds: float) -> Grid:
     """Grid for ``seconds`` from time zero."""
     count = math.floor(seconds * RATE_HZ + 1e-9) + 1
     pad = round(PAD_S * RATE_HZ)
-    total = fft.next_fast_len(count + 2 * pad, real=True)
+    total = next_fast_len(count + 2 * pad, real=True)
     return Grid((np.arange(total) - pad) / RATE_HZ, pad, count, Spectral(total, pad))
 
 
