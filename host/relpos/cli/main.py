@@ -26,6 +26,7 @@ from relpos.cli import (
     mission,
     node,
     replay,
+    recordings,
     report,
     simulate,
 )
@@ -95,6 +96,7 @@ app.command("report")(report.report)
 app.command("deadreckon")(deadreckon.deadreckon)
 app.command("doctor")(doctor.doctor)
 app.add_typer(node.app, name="node")
+app.add_typer(recordings.app, name="recordings")
 
 
 if __name__ == "__main__":
