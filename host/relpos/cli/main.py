@@ -25,8 +25,8 @@ from relpos.cli import (
     fuse,
     mission,
     node,
-    replay,
     recordings,
+    replay,
     report,
     simulate,
 )
