@@ -125,6 +125,7 @@ def _run(
     )
     about.ended_unix_s = time.time()
     found.save()
+    output.remark(f"to see it once more: relpos replay {found.path}")
 
 
 def _earlier(
