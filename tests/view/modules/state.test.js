@@ -59,6 +59,17 @@ test("a position that jumps leaves no line", () => {
   equal(track.points.map((p) => p[3]), [true, false, true, false]);
 });
 
+test("no line crosses the map where somebody was lost and found elsewhere", () => {
+  const track = new Track();
+  track.add(0, 0, 0);
+  track.add(1, 1, 0);
+  track.add(40, 30, 0);
+  track.add(41, 31, 0);
+  // Who stood for a minute goes on from there.
+  track.add(101, 31.5, 0);
+  equal(track.points.map((p) => p[3]), [true, false, true, false, false]);
+});
+
 test("hours of walking stay bounded and keep their newest part whole", () => {
   const track = new Track();
   for (let k = 0; k < 20000; k += 1) track.add(k, k, 0);

@@ -3,6 +3,7 @@
 const MIN_STEP_M = 0.3; // less is the position's own jitter
 const FASTEST_M_S = 5; // faster than that the picture has changed its mind, not the person its place
 const MIN_JUMP_M = 3;
+const GAP_S = 10; // as long as the session waits before it calls somebody lost
 export const MAX_POINTS = 3000;
 
 /** The track of one person: `points` of [time_s, x_m, y_m, starts], the last `starts` a line. */
@@ -29,8 +30,9 @@ export class Track {
       if (t < last[0]) return false;
       const step = Math.hypot(x - last[1], y - last[2]);
       if (step < MIN_STEP_M) return false;
-      // A gap in time is drawn as a line: a person who was lost has walked there on some path.
-      starts = step > Math.max(MIN_JUMP_M, FASTEST_M_S * (t - last[0]));
+      // Nobody knows the path of somebody who was lost meanwhile: no line is drawn across the map.
+      const passed = t - last[0];
+      starts = step > (passed > GAP_S ? MIN_JUMP_M : Math.max(MIN_JUMP_M, FASTEST_M_S * passed));
     }
     this.points.push([t, x, y, starts]);
     if (this.points.length > MAX_POINTS) this.thin();
