@@ -25,7 +25,7 @@ compile-kernels = @printf '%s\n' 'compiling the estimators, once'; \
 	$(PYTHON) -c 'from relpos import fusion; [fusion.warm_up(n) for n in fusion.SETTINGS]'
 title = @printf '\n\033[1m== %s\033[0m\n' "$(1)"
 
-.PHONY: help setup demo live test lint coverage bench bench-chain firmware docs pages wire clean bare-root soak fuzz \
+.PHONY: help setup demo live test lint coverage bench bench-chain firmware docs pages wire clean bare-root soak fuzz mutants \
         system-demo system-avr system-browser system-soak firmware-tests board-builds python-tests
 
 help: ## this list
@@ -84,6 +84,9 @@ soak: board-builds $(FUZZ) | system-soak ## whatever takes long: an hour, then H
 	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist worksteal -m soak -rP
 	$(call title,The whole system under random faults)
 	$(PYTHON) tests/soak/soak.py --hours $(or $(HOURS),0.5)
+
+mutants: $(DEVELOP) ## small faults in trusted code, which a test has to notice; COUNT=20 of each room
+	$(PYTHON) tests/mutants/mutants.py --count $(or $(COUNT),20)
 
 fuzz: $(FUZZ) | system-soak ## every parser of foreign bytes, guided by coverage; MINUTES=5 for each
 	$(call title,Fuzzing)
