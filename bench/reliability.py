@@ -22,8 +22,8 @@ HEAD = f"""# What goes wrong, and what then?
 | promise | measured | by |
 |---|---|---|
 | nothing from outside ends a session | 2026-11-23: 77 random episodes, 0 open | `make soak` |
-| parsers fail in their own errors alone | 580,000 inputs by coverage: 0 findings | `make fuzz` |
-| tests notice faults in what is trusted | 13 of 14 in the frame's checks, the last equivalent | `make mutants` |
+| parsers fail in their own errors alone | 473,000 inputs by coverage: 0 findings | `make fuzz` |
+| tests notice faults in what is trusted | frame: 13 of 14 killed, one equivalent | `make mutants` |
 | no clock, theft or replay locks out or commands | [security](security.md) | `make test` |
 
 Others publish: PX4 a [failure command](https://docs.px4.io/main/en/debug/failure_injection), whose
