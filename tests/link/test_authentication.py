@@ -53,6 +53,17 @@ def test_the_hosts_counter_is_the_time_and_never_stands_or_goes_back():
     assert counter.next() == first + 8 * 3600
 
 
+def test_a_refusal_of_a_frame_that_another_overtook_changes_no_counter():
+    counter = HostCounter(lambda: 1.8e9)
+    sent = counter.next()
+    for newest in (sent, sent - 1, sent - wire.MAX_COMMAND_JUMP):
+        assert counter.follow(newest) is None
+    assert counter.next() == sent + 1
+    further = (sent - wire.MAX_COMMAND_JUMP - 10) % (1 << 32)
+    counter.follow(further)
+    assert counter.next() == further + 1
+
+
 def test_counters_go_on_past_2041():
     last_s = 1_704_067_200 + (1 << 32) / 8
     now = [last_s - 1.0]
@@ -102,6 +113,7 @@ def test_the_window_takes_each_counter_once_and_nothing_older(counters):
         assert verdict is expected
         if verdict in (Verdict.NEW, Verdict.LATE):
             window.add(counter)
+            assert window._seen < 1 << WINDOW, "it needs no more memory with time"
             taken.add(counter)
             newest = max(newest, counter)
 
