@@ -6,7 +6,8 @@
 prints, for each condition of ``relpos.simulation.missions`` and each estimator: distance, aligned
 and body-frame RMSE (m) and distance NEES, means over the seeds; of the pair-seconds with status
 ok the shares whose distance errs by more than three sigmas and by more than 2 m (%); the worst
-seed's distance RMSE; and the time of a run. ``ekf`` is :class:`PlainEkf`.
+seed's distance RMSE; and the time of a run. ``ekf`` is :class:`PlainEkf`; ``smoother`` begins from
+the bank, which is ``large teams`` from 21 nodes on.
 """
 
 from __future__ import annotations
@@ -130,9 +131,12 @@ class PlainEkf(Rewinder):
 
 def case(condition: str, estimator: str, settings: dict[str, str]) -> study.Case:
     """Make one line of the table."""
-    name, given = (EKF, {}) if estimator == "ekf" else (estimator, settings)
+    name, given = {"ekf": (EKF, {}), "smoother": ("bank", settings)}.get(
+        estimator, (estimator, settings)
+    )
     label = f"{condition:18}{estimator:9}"
-    return study.Case(label, f"{missions.PREFIX}-{condition}", {}, name, given)
+    scenario = f"{missions.PREFIX}-{condition}"
+    return study.Case(label, scenario, {}, name, given, smooth=estimator == "smoother")
 
 
 def main() -> None:

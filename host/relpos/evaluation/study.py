@@ -41,6 +41,8 @@ class Case:
     overrides: Mapping[str, str | float] = field(default_factory=dict)
     estimator: str = "particle"
     settings: Mapping[str, object] = field(default_factory=dict)
+    smooth: bool = False
+    """Whether the whole run is smoothed, beginning from the estimator."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,8 @@ class Score:
 def score(case: Case, seed: int) -> Score:
     """Run one case on one seed."""
     run = simulate(case.scenario, seed, case.overrides)
-    estimator = fusion.make(case.estimator, run.priors, case.settings, seed + ESTIMATOR_SEED)
+    make = fusion.make_smoother if case.smooth else fusion.make
+    estimator = make(case.estimator, run.priors, case.settings, seed + ESTIMATOR_SEED)
     started = time.perf_counter()
     failure = ""
     try:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+import relpos
 from reference import smoother as reference
 from relpos import fusion, tracks
 from relpos.errors import RelposError
@@ -307,3 +308,15 @@ def test_wild_ranges_do_not_bend_the_track() -> None:
     score = _score(run, _smoothed(run, "deadreckoning"))
     assert score.relative_distance_rmse_m < 0.15
     assert math.isfinite(score.nees_distance)
+
+
+@pytest.mark.parametrize("condition", ["gap-5", "late-0.3", "shadow"])
+def test_a_smoothed_mission_is_better_than_the_online_one_and_says_so(condition: str) -> None:
+    run = relpos.simulate(f"mission-{condition}", 650, seconds=120.0, nodes=5)
+    scores = [
+        relpos.evaluate(relpos.fuse(run, smooth=smooth), run, bound=False).metrics
+        for smooth in (False, True)
+    ]
+    online, smoothed = (s.relative_distance_rmse_m for s in scores)
+    assert smoothed < 0.8 * online
+    assert 0.5 < scores[1].nees_distance < 2.5

@@ -26,6 +26,7 @@ from relpos.fusion.estimator import (
     PairEstimate,
     Parameter,
 )
+from relpos.fusion.smoother.as_learned import as_learned
 from relpos.fusion.smoother.graph import Graph, build_graph
 from relpos.fusion.smoother.problem import Problem
 from relpos.fusion.smoother.solution import Solution, smooth
@@ -72,7 +73,10 @@ class Smoother:
         """Smooth the whole run; RelposError if the data were unfit."""
         self._estimates += self.online.finish()
         graph, counted = build_graph(
-            self._measurements, self.priors, self.heights_m, self.antennas_m
+            as_learned(self._measurements, self._estimates),
+            self.priors,
+            self.heights_m,
+            self.antennas_m,
         )
         self._own["ranges_after_the_last_motion"] += counted["ranges_after_the_last_motion"]
         graph = _with_frame(graph, self._estimates)
@@ -180,7 +184,7 @@ def _estimates(
     knots, nodes = poses.shape[:2]
     blocks = solution.covariance.diagonal.reshape(knots, nodes, 3, nodes, 3)
     alone = blocks[:, np.arange(nodes), :, np.arange(nodes), :].transpose(1, 0, 2, 3)
-    news = graph.has_report.copy()
+    news = graph.has_report & (graph.unseen_m2 == 0.0)
     for chord, pair in zip(graph.ranges.chord, graph.ranges.pair, strict=True):
         news[chord, pair] = True
     begun = np.logical_or.accumulate(news, axis=0) | (graph.prior_weight[:, 0] > 1e-3)

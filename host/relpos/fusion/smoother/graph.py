@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from relpos.errors import RelposError
 from relpos.fusion.models.detection import Round, Rounds
+from relpos.fusion.models.motion import unseen_variance
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Timeline
 from relpos.measurements import Heading, Height, Measurement, Prior
 
@@ -26,6 +27,12 @@ Integers = npt.NDArray[np.int64]
 
 STILL_M = 0.02
 """A chord shorter than this is a standing node's noise: no path, no direction."""
+
+GAP = 2.5
+"""A report that lasts so many times the node's usual one covers a gap."""
+
+PARTS = 8
+"""Figures of an open chord."""
 
 UNKNOWN_M = 1e3
 UNKNOWN_RAD = 10.0
@@ -92,6 +99,12 @@ class Graph:
     sigma_m: Floats
     sigma_rad: Floats
     """(K - 1, N) reported standard deviations of chords, 0 where none are."""
+    unseen_m2: Floats
+    """(K - 1, N) variance of each coordinate of what a node may have walked beside its path, where
+    one report covers several of the usual ones: the sum of a gap."""
+    reports: Floats
+    """(K - 1, N) in how many reports' parts a chord lies, in equal parts: 1 for a whole report, 2
+    for two halves. The noise of consecutive chords is correlated where reports are parted."""
     has_report: npt.NDArray[np.bool_]
     """(K - 1, N)"""
     ranges: Ranges
@@ -137,7 +150,9 @@ class _Builder:
 
     heights: dict[int, float]
     partial: dict[int, list[float]] = field(default_factory=dict)
-    """Of the open chord: x, y, turn in the frame of its beginning, and variances of both."""
+    """Of the open chord: x, y, turn in the frame of its beginning, variances of both, the
+    longest duration (s) of a report in it, the sum of the shares of reports, and that of their
+    squares."""
     height_now: dict[int, float] = field(default_factory=dict)
     chords: list[dict[int, list[float]]] = field(default_factory=list)
     heights_at: list[dict[int, float]] = field(default_factory=list)
@@ -152,7 +167,7 @@ class _Builder:
         match step:
             case Advance():
                 self.seen.add(step.node)
-                part = self.partial.setdefault(step.node, [0.0] * 5)
+                part = self.partial.setdefault(step.node, [0.0] * PARTS)
                 c, s = math.cos(part[2]), math.sin(part[2])
                 part[0] += c * step.dx_m - s * step.dy_m
                 part[1] += s * step.dx_m + c * step.dy_m
@@ -160,6 +175,9 @@ class _Builder:
                 alone = step.sigma_x_m if step.sigma_x_alone_m is None else step.sigma_x_alone_m
                 part[3] += (alone or 0.0) ** 2
                 part[4] += (step.sigma_theta_rad or 0.0) ** 2
+                part[5] = max(part[5], step.duration_s / max(step.fraction, 1e-9))
+                part[6] += step.fraction
+                part[7] += step.fraction**2
             case Ranging():
                 for one in step.ranges:
                     self.seen |= {one.node, one.peer}
@@ -198,7 +216,7 @@ def build_graph(
     antennas_m: Mapping[int, tuple[float, float]] | None = None,
     *,
     reorder_s: float = 0.5,
-    max_lag_s: float = 5.0,
+    max_lag_s: float = math.inf,
 ) -> tuple[Graph, Counter[str]]:
     """Put a run's measurements in order, and count what was dropped.
 
@@ -233,7 +251,7 @@ def _finished(
         first_s = builder.times[0] - 1.0
     time_s = np.array([first_s, *builder.times])
     slots = time_s.size - 1
-    chord = np.zeros((slots, len(names), 5))
+    chord = np.zeros((slots, len(names), PARTS))
     has_report = np.zeros((slots, len(names)), dtype=bool)
     height = np.zeros((time_s.size, len(names)))
     for k in range(slots):
@@ -267,6 +285,8 @@ def _finished(
         walks,
         np.sqrt(chord[..., 3]),
         np.sqrt(chord[..., 4]),
+        _unseen(np.diff(time_s), chord[..., 5], has_report),
+        chord[..., 6] / np.where(has_report, chord[..., 7], 1.0) + ~has_report,
         has_report,
         ranges._replace(pair_index=np.asarray(pair_index, dtype=np.int64).ravel()),
         np.array([entry.range_m for entry in kept]),
@@ -313,6 +333,16 @@ def _placed(
     offset = places - fraction[:, None] * ends
     dz_m = np.array([entry.dz_m for entry in entries])
     return Ranges(slot, pair, fraction, offset, antenna_m, dz_m, np.full(slot.size, -1))
+
+
+def _unseen(duration_s: Floats, report_s: Floats, has_report: npt.NDArray[np.bool_]) -> Floats:
+    """Return ``Graph.unseen_m2`` for the longest report of each chord, (K - 1, N)."""
+    usual_s = np.array(
+        [np.median(own[has]) if has.any() else math.inf
+         for own, has in zip(report_s.T, has_report.T, strict=True)]
+    )  # fmt: skip
+    walked_m2 = 0.5 * np.array([unseen_variance(s) for s in duration_s])
+    return np.where(report_s > GAP * usual_s, walked_m2[:, None], 0.0)
 
 
 def _usual_length(length_m: Floats, walks: npt.NDArray[np.bool_], half: int = 3) -> Floats:

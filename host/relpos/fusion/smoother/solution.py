@@ -58,6 +58,10 @@ SETTLED_COMPONENTS, SETTLED_DETECTION = 0.02, 0.1
 deviations."""
 
 
+PARTED, MOST_PARTED = 1.1, 2.0
+"""From so many reports in a chord on its noise is corrected, and by at most so much."""
+
+
 def smooth(
     problem: Problem, state: State, components: VarianceComponents | None = None
 ) -> Solution:
@@ -97,6 +101,12 @@ def smooth(
     state = problem.optimise(state, weights, steps=20, tolerance=1e-7)
     at = linearise(problem, state, components, bases, weights)
     cost = negative_evidence(problem, at, components, bases)
+    parted = np.minimum(problem.graph.reports, MOST_PARTED)[..., None]
+    if parted.max() > PARTED:
+        # Over several chords the noise grows as that of whole reports.
+        weights = weights._replace(motion=weights.motion / parted)
+        state = problem.optimise(state, weights, steps=20, tolerance=1e-7)
+        at = linearise(problem, state, components, bases, weights)
     return Solution(state, widened(at), components, cost, inliers)
 
 

@@ -103,10 +103,8 @@ class VarianceComponents:
         across = parts[..., Motion.ACROSS_LENGTH] + parts[..., Motion.ACROSS_TIME]
         turn = parts[..., Motion.TURN_TURN] + parts[..., Motion.TURN_WALKING]
         turn = turn + parts[..., Motion.TURN_TIME]
-        return np.stack(
-            [np.maximum(along, graph.sigma_m**2), across, np.maximum(turn, graph.sigma_rad**2)],
-            axis=-1,
-        )
+        along, turn = np.maximum(along, graph.sigma_m**2), np.maximum(turn, graph.sigma_rad**2)
+        return np.stack([along + graph.unseen_m2, across + graph.unseen_m2, turn], axis=-1)
 
     def constant_weights(self, problem: Problem) -> Floats:
         """1 / prior variances of the constants, (G,)."""
@@ -227,6 +225,7 @@ def linearise(
     shares = parts * graph.has_report[..., None] * w
     # Where a reported deviation is the greater one, no component matters.
     shares[..., AXIS == 0] *= (parts[..., AXIS == 0].sum(axis=-1) >= graph.sigma_m**2)[..., None]
+    shares[..., AXIS < 2] *= (graph.unseen_m2 == 0.0)[..., None]
     shares[..., AXIS == 2] *= (parts[..., AXIS == 2].sum(axis=-1) >= graph.sigma_rad**2)[..., None]
     residual = problem.motion_residuals(state)[..., AXIS]
     count = nodes * AXIS.size

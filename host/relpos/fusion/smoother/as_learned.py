@@ -1,0 +1,70 @@
+"""Measurements without the errors that the online estimator has learned of them.
+
+At the end of a run it knows by how much ranges are dated late, how far each clock is ahead, and
+what a body adds to a range. Smoothing begins from measurements without these.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.clocks import Clocks
+from relpos.fusion.estimator import Estimate, NodeStatus
+from relpos.measurements import Measurement, Range
+
+Floats = npt.NDArray[np.float64]
+
+SURE = 3.0
+"""What is smaller than so many of its standard deviations is left in."""
+
+
+def as_learned(
+    measurements: Sequence[Measurement], estimates: Sequence[Estimate]
+) -> list[Measurement]:
+    """Return measurements at their true times, and ranges without the bodies' shadows."""
+    clocks, shadow_m = Clocks(), 0.0
+    for p in estimates[-1].parameters if estimates else ():
+        if abs(p.value) <= SURE * p.sigma:
+            continue
+        if p.name == "range_lateness_s":
+            clocks.lateness_s = p.value
+        elif p.name == "clock_offset_s":
+            clocks.offset_s[p.node] = p.value
+        elif p.name == "body_shadow_m":
+            shadow_m = p.value
+    dated = [clocks.redate(m) for m in measurements]
+    if shadow_m == 0.0:
+        return dated
+    tracks = _tracks(estimates)
+    return [_unshadowed(m, tracks, shadow_m) if isinstance(m, Range) else m for m in dated]
+
+
+def _tracks(estimates: Sequence[Estimate]) -> dict[int, Floats]:
+    """Return each node's times (s), x, y (m) and unwrapped headings (rad): (4, T)."""
+    rows: dict[int, list[tuple[float, ...]]] = {}
+    for e in estimates:
+        for n in e.nodes:
+            if n.status is not NodeStatus.UNLOCATED:
+                rows.setdefault(n.node, []).append((e.time_s, n.x_m, n.y_m, n.heading_rad))
+    tracks = {node: np.array(own).T for node, own in rows.items()}
+    for track in tracks.values():
+        track[3] = np.unwrap(track[3])
+    return tracks
+
+
+def _unshadowed(measured: Range, tracks: dict[int, Floats], shadow_m: float) -> Range:
+    """Return a range without what the bodies of both wearers add: as the bank models it."""
+    if measured.node not in tracks or measured.peer not in tracks:
+        return measured
+    (x, y, heading), (peer_x, peer_y, peer_heading) = (
+        [float(np.interp(measured.time_s, track[0], row)) for row in track[1:]]
+        for track in (tracks[measured.node], tracks[measured.peer])
+    )
+    bearing = math.atan2(peer_y - y, peer_x - x)
+    behind = max(-math.cos(bearing - heading), 0.0) + max(math.cos(bearing - peer_heading), 0.0)
+    return replace(measured, range_m=max(measured.range_m - shadow_m * behind, 0.0))
