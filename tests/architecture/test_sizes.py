@@ -2,6 +2,7 @@
 
 import ast
 import tomllib
+from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -47,3 +48,9 @@ def too_much() -> dict[str, set[str]]:
 def test_nothing_is_longer_than_a_reader_can_hold_but_what_is_listed_with_a_reason(what):
     assert too_much()[what] == set(EXCEPTIONS[what])
     assert all(len(reason.split()) > 2 for reason in EXCEPTIONS[what].values())
+
+
+def test_every_test_file_has_a_name_of_its_own():
+    # pytest imports them by their names alone: of two that are alike one is not collected.
+    names = Counter(path.name for path in Path(__file__).parents[1].rglob("test_*.py"))
+    assert not [name for name, times in names.items() if times > 1]

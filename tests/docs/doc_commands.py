@@ -32,7 +32,6 @@ PARSED = {
     "node check": "a node lies still for a minute; tests/nodes/test_node_check.py checks one",
     "node calibrate": "somebody turns the node or walks; tests/system/test_calibration.py does",
     "mission": "runs until it is stopped; tests/view/test_mission_kill.py stops one",
-    "replay": "runs until it is stopped; tests/recording/test_moments.py plays one",
     "figures": "computes for minutes; tests/evaluation/test_figures.py draws small ones",
 }
 """Subcommands that are parsed alone, and why."""

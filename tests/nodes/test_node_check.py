@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from tests.support.emulated_line import EmulatedLine
 from typer.testing import CliRunner
 
 from relpos.cli import node_dialogue
@@ -27,6 +26,7 @@ from relpos.link.port import Link
 from relpos.nodes.bringup import Finding, NodeCheck, bus_access, check, radio
 from relpos.nodes.bringup import finding as finding_names
 from relpos.protocol import messages as wire
+from support.emulated_line import EmulatedLine
 
 MISSING = missing_parts()
 ROOT = Path(__file__).resolve().parents[2]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import zipfile
@@ -77,7 +78,7 @@ def test_no_file_under_the_gpl_is_in_the_wheel(wheel):
     with zipfile.ZipFile(wheel) as archive:
         for name in archive.namelist():
             if not name.endswith(("METADATA", "RECORD")):
-                assert b"GPL-3" not in archive.read(name), name
+                assert not re.search(rb"SPDX-License-Identifier: .*GPL", archive.read(name)), name
 
 
 def test_the_wheel_names_version_licence_python_and_extras(wheel):

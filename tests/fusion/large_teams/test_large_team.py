@@ -222,7 +222,7 @@ def test_what_the_team_has_in_common_is_learned_and_told(
     condition: str, wrong: dict[str, float]
 ) -> None:
     run = relpos.simulate(
-        f"mission-{condition}", 21, nodes=LARGE_TEAM + 1, seconds=60.0, range_rate_hz=0.35, **wrong
+        f"mission-{condition}", 21, nodes=LARGE_TEAM + 1, seconds=45.0, range_rate_hz=0.3, **wrong
     )
     result = relpos.fuse(run)
     scored = relpos.evaluate(result, run, bound=False).metrics
