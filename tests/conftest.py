@@ -12,8 +12,8 @@ DURATIONS = "relpos/durations"
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """One more than cores: while a test waits for a browser or a process, the cores stay busy."""
-    return 1 + (os.cpu_count() or 1)
+    """Two more than cores: while tests wait for browsers and processes, the cores stay busy."""
+    return 2 + (os.cpu_count() or 1)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
