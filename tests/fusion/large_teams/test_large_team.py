@@ -215,7 +215,7 @@ def test_a_node_of_a_large_team_whose_motion_is_missing_is_found_by_its_ranges()
     [
         ("base", {"drift_deg_min": 6.0, "step_scale": 0.85}),
         ("late-0.3", {}),
-        ("shadow", {}),
+        pytest.param("shadow", {}, marks=pytest.mark.soak),
     ],
 )
 def test_what_the_team_has_in_common_is_learned_and_told(

@@ -310,7 +310,7 @@ def test_wild_ranges_do_not_bend_the_track() -> None:
     assert math.isfinite(score.nees_distance)
 
 
-@pytest.mark.parametrize("condition", ["gap-5", "late-0.3"])
+@pytest.mark.parametrize("condition", ["gap-5", pytest.param("late-0.3", marks=pytest.mark.soak)])
 def test_a_smoothed_mission_is_better_than_the_online_one_and_says_so(condition: str) -> None:
     run = relpos.simulate(f"mission-{condition}", 650, seconds=100.0, nodes=4)
     scores = [
