@@ -339,11 +339,14 @@ bool in_force(Team& team, Node& node, const Words& words) {
   return true;
 }
 
-void send_beacon(Team& team, uint8_t count) {
+void send_beacon(Team& team, uint8_t count, uint8_t first_id = kId, uint16_t phase_ms = 0,
+                 uint8_t round = 0, uint16_t period_ms = 2000) {
   wire::Beacon beacon = {};
-  beacon.period_ms = 2000;
+  beacon.phase_ms = phase_ms;
+  beacon.period_ms = period_ms;
+  beacon.round = round;
   beacon.count = count;
-  for (uint8_t i = 0; i < count; ++i) beacon.entries[i].node = static_cast<uint8_t>(kId + i);
+  for (uint8_t i = 0; i < count; ++i) beacon.entries[i].node = static_cast<uint8_t>(first_id + i);
   uint8_t body[wire::kBeaconBytes];
   const uint8_t length = wire::encode(beacon, body);
   team.world.down(wire::MessageType::kBeacon, body, length, wire::kBroadcast,
@@ -402,16 +405,7 @@ TEST(of_more_than_seven_each_ranges_the_half_that_comes_after_it) {
 struct Slots {
   static void hear(Team& team, uint16_t phase_ms, uint8_t round, uint8_t count,
                    uint8_t first_id = 1, uint16_t period_ms = 2000) {
-    wire::Beacon beacon;
-    beacon.phase_ms = phase_ms;
-    beacon.period_ms = period_ms;
-    beacon.round = round;
-    beacon.count = count;
-    for (uint8_t i = 0; i < count; ++i) beacon.entries[i].node = static_cast<uint8_t>(first_id + i);
-    uint8_t body[wire::kBeaconBytes];
-    const uint8_t length = wire::encode(beacon, body);
-    team.world.down(wire::MessageType::kBeacon, body, length, wire::kBroadcast,
-                    ++team.world.host_counter);
+    send_beacon(team, count, first_id, phase_ms, round, period_ms);
   }
 };
 

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, field
 
 from relpos.fusion.models.motion import velocity_m_s
+from relpos.fusion.models.ranging import shadow_slope
 from relpos.fusion.timeline import Advance
 
 
@@ -32,14 +33,12 @@ class RangeSlopes:
 
         ``node`` and ``peer`` are ids and headings (rad).
         """
-        away, towards = self._along(sight, *node), self._along(sight, *peer)
-        return max(-away[0], 0.0) + max(towards[0], 0.0), away[1] - towards[1]
+        lateness = self._along(sight, *node) - self._along(sight, *peer)
+        return shadow_slope(sight, node[1], peer[1]), lateness
 
-    def _along(
-        self, sight: tuple[float, float], node: int, heading_rad: float
-    ) -> tuple[float, float]:
-        """Return the shares along ``sight`` of a node's facing, and of its velocity (m/s)."""
+    def _along(self, sight: tuple[float, float], node: int, heading_rad: float) -> float:
+        """Return the velocity (m/s) of a node along ``sight``."""
         c, s = math.cos(heading_rad), math.sin(heading_rad)
         forward, left = self._velocity_m_s.get(node, (0.0, 0.0))
         ahead, aside = sight[0] * c + sight[1] * s, sight[1] * c - sight[0] * s
-        return ahead, ahead * forward + aside * left
+        return ahead * forward + aside * left

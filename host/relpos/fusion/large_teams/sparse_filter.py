@@ -193,7 +193,7 @@ class NeighbourhoodFilter:
         return self.update_with_terms(Ranges(node, peer, measured_m, same, 0.0 * same, slopes))
 
     def update_with_terms(self, ranges: Ranges) -> Floats:
-        """As :meth:`update`, ranges that have terms in common (slopes (E, 3)).
+        """As :meth:`update`, ranges that have T terms in common (slopes (E, T)).
 
         They are estimated in a second stage (Friedland 1969), which is exact for constants: with V
         the derivative of the states by them, an innovation depends on them by its slopes plus H V,

@@ -75,6 +75,17 @@ fixed 0.95 gives 0.36 m in ``mission-nlos`` (0.65 without any), but costs 8 % in
 it is 0.45 m, and nothing there."""
 
 
+def shadow_slope(sight: tuple[float, float], heading_rad: float, peer_heading_rad: float) -> float:
+    """Return a range's slope in the body's shadow: how far each end is behind the other's wearer.
+
+    ``sight`` is the direction from the node to the peer. The bank's kernels have the same equation
+    (``fusion/bank/range_update.py``).
+    """
+    ahead = sight[0] * math.cos(heading_rad) + sight[1] * math.sin(heading_rad)
+    peer_ahead = sight[0] * math.cos(peer_heading_rad) + sight[1] * math.sin(peer_heading_rad)
+    return max(-ahead, 0.0) + max(peer_ahead, 0.0)
+
+
 @dataclass(slots=True)
 class OutlierPersistence:
     """How probable an outlier is after the pair's last range: a two-state Markov chain a pair.

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from relpos.fusion.clocks import Clocks
 from relpos.fusion.estimator import Estimate, NodeStatus
+from relpos.fusion.models.ranging import shadow_slope
 from relpos.measurements import Measurement, Range
 
 Floats = npt.NDArray[np.float64]
@@ -66,5 +67,6 @@ def _unshadowed(measured: Range, tracks: dict[int, Floats], shadow_m: float) -> 
         for track in (tracks[measured.node], tracks[measured.peer])
     )
     bearing = math.atan2(peer_y - y, peer_x - x)
-    behind = max(-math.cos(bearing - heading), 0.0) + max(math.cos(bearing - peer_heading), 0.0)
-    return replace(measured, range_m=max(measured.range_m - shadow_m * behind, 0.0))
+    sight = math.cos(bearing), math.sin(bearing)
+    added_m = shadow_m * shadow_slope(sight, heading, peer_heading)
+    return replace(measured, range_m=max(measured.range_m - added_m, 0.0))
