@@ -15,7 +15,7 @@ PYTHON := $(VENV)/bin/python
 RUN := $(VENV)/.relpos-run
 DEVELOP := $(VENV)/.relpos-develop
 FUZZ := $(VENV)/.relpos-fuzz
-# The peers pin numpy below 2: an environment of their own, lest they take ours back.
+# An environment of their own, lest the peers' bounds change ours. particles 0.4 wants numpy below 2.
 BENCH_VENV := .venv-bench
 PEERS := $(BENCH_VENV)/.relpos-bench
 
@@ -39,7 +39,7 @@ demo: $(RUN) | system-demo ## six emulated nodes through a serial port into the 
 live: $(RUN) | system-demo ## the same team in real time behind the live page; LIVE="--seconds 600 --nodes 20"
 	$(VENV)/bin/relpos demo --view --seconds 1800 --out out/live $(LIVE)
 
-test: lint wire-check board-builds python-tests ## every check, the C++ suites among them; pytest last
+test: board-builds python-tests ## every check: the C++ suites, lint and wire-check are tests among the others
 
 lint: $(DEVELOP) ## ruff, its formatter, mypy
 	$(call title,Lint: ruff)
@@ -136,8 +136,8 @@ $(DEVELOP): pyproject.toml | $(PYTHON)
 	@touch $@ $(RUN)
 
 $(FUZZ): $(DEVELOP)
-	$(call title,Installing the fuzzer for Python)
-	$(PIP) --editable '.[fuzz]'
+	$(call title,Installing what long runs need: a fuzzer, Rerun)
+	$(PIP) --editable '.[fuzz,rerun]'
 	@touch $@
 
 $(PEERS): pyproject.toml | system-demo

@@ -7,8 +7,8 @@ its node's pose contains that motion (``motion_s``), a ranges report when all of
 those that newer ones of the same pair have replaced, are among the view's.
 
 Prints the median and the 99th percentile of both, of the part from the view's making to its
-arrival (``page``), how old the newest fused estimate is, and the computer's load, which is part of
-the answer.
+arrival (``page``), how old the newest fused estimate is, processor and memory of the session and
+its server, and the computer's load, which is part of the answer. A phone gets what a browser gets.
 
     python bench/live_latency.py --nodes 20 --seconds 120
 """
@@ -34,6 +34,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
+from pathlib import Path
 
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
@@ -67,6 +68,7 @@ def follow(url: str, pipe: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     got: list[tuple[float, str]] = []
     with contextlib.suppress(WebSocketException, OSError), connect(url) as socket:
+        pipe.send("connected")
         for message in socket:
             got.append((time.monotonic(), str(message)))
             if pipe.poll():
@@ -184,7 +186,8 @@ def main() -> int:
         session = subprocess.Popen(
             [
                 sys.executable, "-m", "relpos.cli.main", "fuse", os.ttyname(theirs), "--view",
-                "--no-open", "--no-teach", "--estimator", wanted.estimator, "--out", out,
+                "--no-open", "--no-report", "--no-teach", "--estimator", wanted.estimator,
+                "--out", out,
             ],
             stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
         )  # fmt: skip
@@ -202,10 +205,14 @@ def main() -> int:
                 process = context.Process(target=follow, args=(url, end), daemon=True)
                 process.start()
                 clients.append((pipe, process))
-            time.sleep(3.0)
+            for pipe, _ in clients:
+                pipe.recv()
             # Discard beacons and commands of the session, so that the buffer does not fill up.
             threading.Thread(target=_swallow, args=(ours,), daemon=True).start()
+            before = usage(session.pid)
             packets = play(stream, ours)
+            spent = [after - first for after, first in zip(usage(session.pid), before, strict=True)]
+            memory_mb = resident_mb(session.pid)
             load = os.getloadavg()[0]
             time.sleep(1.0)
             for pipe, _ in clients:
@@ -217,6 +224,11 @@ def main() -> int:
                 session.wait(120.0)
             session.kill()
     print(f"load {load:.1f} on {os.cpu_count()} cores; {wanted.browsers} browsers")
+    ran_s = packets[-1].written_s - packets[0].written_s
+    print(
+        f"session {100 * spent[0] / ran_s:.0f} %, page's server {100 * spent[1] / ran_s:.0f} % of "
+        f"a core; together {memory_mb:.0f} MB"
+    )
     failed = False
     for what in ("motion", "ranges", "page", "fused"):
         values = [v for result in results for v in result[what]]
@@ -231,6 +243,28 @@ def main() -> int:
     missing = sum(len(result["missing"]) for result in results)
     print(f"never shown: {missing} motions")
     return int(failed or missing > 0)
+
+
+def family(pid: int) -> list[int]:
+    """The session's process, and its servers'."""
+    return [pid, *map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())]
+
+
+def usage(pid: int) -> tuple[float, float]:
+    """Processor seconds so far of the session, and of its servers."""
+    ticks = []
+    for process in family(pid):
+        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+        ticks.append((int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK"))
+    return ticks[0], sum(ticks[1:])
+
+
+def resident_mb(pid: int) -> float:
+    """Memory of them all."""
+    pages = 0
+    for process in family(pid):
+        pages += int(Path(f"/proc/{process}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def _swallow(port: int) -> None:

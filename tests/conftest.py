@@ -1,13 +1,28 @@
-"""The order of the files: the longest first, so that no worker is left alone at the end."""
+"""The order of the files: the longest first, so that no worker is left alone at the end.
+
+Examples of Hypothesis have no time limit: they would fail where the machine is busy.
+"""
 
 from __future__ import annotations
 
 import os
 
 import pytest
+from hypothesis import settings
+
+settings.register_profile("relpos", deadline=None)
+settings.load_profile("relpos")
 
 DURATIONS = "relpos/durations"
 """Key in pytest's cache: file -> seconds that its tests took the last time."""
+
+LONG = (
+    "tests/view/",
+    "tests/firmware/",
+    "tests/nodes/test_node_check",
+    "tests/architecture/test_lint",
+)
+"""What takes minutes: in a fresh clone, where nothing was measured, it comes first."""
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -19,7 +34,11 @@ def pytest_xdist_auto_num_workers() -> int:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     durations = config.cache.get(DURATIONS, {})  # type: ignore[union-attr]
     # Tests of a file stay together and share its fixtures (--dist loadfile); a new one may be long.
-    items.sort(key=lambda item: -durations.get(_file_of(item.nodeid), 60.0))
+    items.sort(key=lambda item: -durations.get(_file_of(item.nodeid), _guess_s(item.nodeid)))
+
+
+def _guess_s(nodeid: str) -> float:
+    return 120.0 if nodeid.startswith(LONG) else 60.0
 
 
 def _file_of(nodeid: str) -> str:

@@ -65,7 +65,7 @@ CONTENDERS = (
               _filter(ours.JointAlone), True),
     Contender(JOINT, "relpos joint, watching and learning", "5 N + 1, of which 3 N live",
               _filter(ours.Joint), True),
-    Contender(JOINT, "relpos strips (large teams)", "3 N: x, y, heading",
+    Contender(JOINT, "relpos large teams", "5 N: with heading drift, step scale",
               _filter(ours.Strips), True),
     Contender(JOINT, "filterpy EKF", "3 N", _filter(kalman_peers.FilterpyEKF)),
     Contender(JOINT, "filterpy UKF", "3 N", _filter(kalman_peers.FilterpyUKF)),

@@ -71,7 +71,8 @@ class JointAlone(Joint):
         count = ranges.node.size
         those = range_update.Ranges(
             ranges.node, ranges.peer, ranges.range_m, np.zeros(count), np.zeros(count),
-            np.ones(count), np.full(count, -1),
+            np.ones(count), np.full(count, -1), np.zeros((count, 4)),
+            np.full(count, self.outlier[0]),
         )  # fmt: skip
         model = range_update.RangeModel(self.outlier, np.zeros((0, 2)))
         stats = lanes.empty_lines(count, range_update.STATS, 1)
@@ -79,7 +80,7 @@ class JointAlone(Joint):
 
 
 class Strips:
-    """The filter for large teams: 3 states a user, noise known."""
+    """The filter for large teams, noise known."""
 
     def __init__(self, case: Case, seed: int) -> None:
         from relpos.fusion.large_teams.kernels import RangeModel

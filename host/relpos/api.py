@@ -52,7 +52,7 @@ def save(run: Run, path: Path | str) -> None:
 def simulate(scenario: str = "paper", seed: int = 0, **settings: float | str) -> Run:
     """Simulate a run with its truth; the same arguments give the same run.
 
-    ``scenario`` is one of ``relpos simulate`` (paper, paper-p1, paper-a, paper-h, paper-h2, lab),
+    ``scenario`` is one of ``relpos simulate`` (paper, lab, mission-base, building, ...),
     ``settings`` its keys. RelposError for an unknown one, or for a value out of range.
     """
     from relpos.simulation.scenarios import simulate_run
@@ -127,8 +127,8 @@ def plot(
     """Draw one of the report's figures, as a Matplotlib figure (``savefig`` writes it).
 
     ``figure`` is one of tracks, error, error-distribution, distances, consistency, status,
-    detection, residuals, parameters, height and health. RelposError for another name, and where
-    the run has nothing for it.
+    detection, residuals, parameters, section, height and health. RelposError for another name,
+    and where the run has nothing for it.
     """
     from relpos.evaluation import report as reports
 

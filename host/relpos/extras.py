@@ -18,6 +18,8 @@ PURPOSES = {
     "recording": "recordings as MCAP and Foxglove (`--record`, `--foxglove`)",
     "report": "pictures and reports (`relpos report`, `relpos figures`)",
     "exchange": "maps, GPX and Cursor-on-Target (`relpos convert`, `--cot`)",
+    "ros": "ROS 2 bags (`relpos convert --to rosbag2`)",
+    "recordings": "public recordings in MATLAB and Excel files (`relpos recordings get`)",
 }
 """Purpose of each extra for users; the others are for developers of relpos."""
 

@@ -22,7 +22,8 @@ class Motion:
     sigmas are standard deviations where the source knows them: the squares of ``sigma_x_m`` of
     consecutive motions add up to the variance of the way. What all of a wearer's steps err by
     together, their scale, makes each share in that sum larger than the motion's own error is;
-    ``sigma_x_alone_m`` is that, for an estimator that corrects the way as it goes.
+    ``sigma_x_alone_m`` is that, for an estimator that corrects the way as it goes. ``steps`` are
+    those that make up the displacement.
     """
 
     time_s: float
@@ -36,6 +37,7 @@ class Motion:
     gain_version: int | None = None
     moving: bool | None = None
     sigma_x_alone_m: float | None = None
+    steps: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +155,7 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     "sigma_y_m": (0.0, 2e3),
     "sigma_theta_rad": (0.0, 1e3),
     "sigma_x_alone_m": (0.0, 2e3),
+    "steps": (0.0, 65_535.0),
     "range_m": (-1e3, 1e3),
     "rss_dbm": (-1e3, 1e3),
     "height_m": (-1e4, 1e4),
@@ -202,7 +205,8 @@ class RawSample:
     """What a node's sensors showed before any calibration, over one report.
 
     Mean specific force and angular rate (x, y, z) over ``samples`` inertial samples that end at
-    ``time_s``, and the newest magnetic field meanwhile; None where a sensor gave nothing.
+    ``time_s``, and the newest of ``field_readings`` magnetic fields meanwhile; None where a sensor
+    gave nothing.
     """
 
     time_s: float
@@ -211,3 +215,4 @@ class RawSample:
     acceleration_m_s2: tuple[float, float, float] | None
     angular_rate_rad_s: tuple[float, float, float] | None
     magnetic_field_ut: tuple[float, float, float] | None
+    field_readings: int

@@ -84,7 +84,7 @@ def samples_of(kind):
         force = attitude.inv().apply(GRAVITY) * 1.01 + bias + 0.003 * rng.standard_normal(3)
         field = attitude.inv().apply(EARTH_UT) + (30.0, 5.0, -12.0) + 0.3 * rng.standard_normal(3)
         shown = rate + gyro + 0.0003 * rng.standard_normal(3)
-        out.append(RawSample(time_s, 1, 10, tuple(force), tuple(shown), tuple(field)))
+        out.append(RawSample(time_s, 1, 10, tuple(force), tuple(shown), tuple(field), 1))
 
     sides = [(0, 0, 0), (np.pi, 0, 0), (1.57, 0, 0), (-1.57, 0, 0), (0, 1.57, 0), (0, -1.57, 0)]
     for part in kind:

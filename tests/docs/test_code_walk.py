@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import groupby
 from pathlib import Path
 
@@ -119,13 +119,30 @@ class Trace:
             sys.setprofile(before)
             threading.setprofile(None)
 
-    def during(self, act: Callable[[], object]) -> list[tuple[str, str]]:
-        """What is called while ``act`` runs, in another thread than the traced ones."""
+    def during(
+        self, act: Callable[[], object], until: Callable[[], bool] = lambda: True
+    ) -> list[tuple[str, str]]:
+        """What is called while ``act`` runs, in another thread than the traced ones.
+
+        And after it, ``until`` that has been called, or in vain.
+        """
         self.calls = []
         self.on = True
         act()
+        with suppress(AssertionError):
+            wait_for(until)
         self.on = False
         return self.calls
+
+    def walked(self, title: str) -> bool:
+        """Whether the functions of a walk have been called in its order."""
+        return missing_call(title, self.calls) is None
+
+
+def missing_call(title: str, calls: list[tuple[str, str]]) -> str | None:
+    """The first function of a walk that is not called after those before it."""
+    called = iter(name for _, name in calls)
+    return next((name for name in python_names(title) if name not in called), None)
 
 
 class Phone:
@@ -195,15 +212,22 @@ def traces(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[tuple[str
             for _, data in chunks[begin:end]:
                 os.write(master, data)
             wait_for(lambda: thread.failure is not None or thread.newest_s >= newest_s[end - 1])
-            time.sleep(0.3)  # for the receive thread to show it
+
+        def walk(title: str, act: Callable[[], object]) -> None:
+            found[title] = trace.during(act, lambda: trace.walked(title))
+
+        def shown_thrice() -> bool:
+            return [name for _, name in trace.calls].count("view.web.WebView.updated") >= 3
 
         def drive() -> None:
             try:
-                write(0, ranges)
-                found["idle"] = trace.during(lambda: time.sleep(0.7))
-                found["One range"] = trace.during(lambda: write(ranges, step))
-                found["One step"] = trace.during(lambda: write(step, len(chunks)))
-                found["One landmark press"] = trace.during(lambda: (phone.press(), time.sleep(0.5)))
+                # What this still causes is shown by the third view.
+                trace.during(lambda: write(0, ranges), shown_thrice)
+                found["idle"] = trace.during(lambda: time.sleep(0.7), shown_thrice)
+                walk("One range", lambda: write(ranges, step))
+                trace.during(lambda: None, shown_thrice)
+                walk("One step", lambda: write(step, len(chunks)))
+                walk("One landmark press", phone.press)
             finally:
                 session.stop()
 
@@ -240,8 +264,7 @@ def test_functions_are_called_in_the_order_of_the_walk(
 ) -> None:
     names, calls = python_names(title), traces[title]
     assert len(names) >= 3
-    called = iter(name for _, name in calls)
-    missing = next((name for name in names if name not in called), None)
+    missing = missing_call(title, calls)
     assert missing is None, f"{missing} is not called after those before it"
     # What a session also calls while nothing comes in has no first call that counts.
     idle = {name for _, name in traces["idle"]}

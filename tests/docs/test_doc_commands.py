@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections import defaultdict
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -249,6 +250,9 @@ def test_a_shown_command_runs(command, port, radio, monkeypatch):
     name, _, _ = subcommand(command.words)
     if name == "emulate":  # serves until Ctrl-C, as the one behind `port` does
         monkeypatch.setattr(PseudoTerminal, "serve", lambda _: None)
+    if "--install-completion" in command.words:  # into the start-up file of whatever shell
+        monkeypatch.setenv("HOME", str(Path.cwd()))
+        monkeypatch.setattr("shellingham.detect_shell", lambda: ("bash", "/bin/bash"))
     words = with_things(shortened(command.words), radio if name == "node radio" else port)
     done = relpos(*words[1:])
     assert done.exit_code == 0, f"{shlex.join(words)}\n{done.output}"

@@ -174,7 +174,8 @@ int main(void) {
     assert out[14:] == b"\x02"  # twi.c: address was not acknowledged
     counters = board.board.counters()
     assert counters.ticks == 2
-    assert counters.tick_cycles_max / 16 == pytest.approx(524, rel=0.03)
+    # With gcc 5.4; gcc 14.2 makes its interrupt quicker: 507.
+    assert counters.tick_cycles_max / 16 == pytest.approx(524, rel=0.05)
     board.close()
 
 

@@ -12,7 +12,8 @@ from itertools import pairwise
 
 import pytest
 
-from relpos.emulator.avr.budget import default_build_folder
+from relpos.emulator.avr import read_firmware
+from relpos.emulator.avr.budget import default_build_folder, find_firmware
 from relpos.emulator.avr.library import missing_parts
 from relpos.emulator.bus import BusStatus
 from relpos.emulator.engine import NodeClockError
@@ -24,9 +25,8 @@ from relpos.protocol import messages as wire
 
 pytestmark = pytest.mark.skipif(missing_parts() is not None, reason=str(missing_parts()))
 
-READS_AFTER_CYCLES = 1200
-"""From a pass's look at the clock to its reading of the receiver: a division of 32 bits, pushing
-what is sent. 1000 is too little on the Uno, any of 1100 to 1400 serves on both."""
+RECEIVE_RING = 64
+"""Bytes (firmware/lib/board/arduino/uart.cpp)."""
 SUM_ERROR = 5e-6
 """Relative, of variances: sums of thousands of ticks in single precision (6e-8 an addition);
 measured 4e-7 to 3e-6 in 45 s."""
@@ -98,15 +98,16 @@ class Sent:
                 self.frames.append(wire.decode(request.data))
 
 
-def written_down(board, seconds):
+def written_down(kind, seconds):
     """What node 1 of two met on a simulated board, and the frames it sent."""
-    with EmulatedTeam(TeamConfig("paper", 2, seconds, 4, board)) as team:
+    with EmulatedTeam(TeamConfig("paper", 2, seconds, 4, kind)) as team:
         node = team.nodes[1]
         bus, sent = Bus(node.bus), Sent()
         pass_on = node.engine.on_transmit
         node.engine.on_transmit = lambda at_us, data: (sent(at_us, data), pass_on(at_us, data))
         board = node.engine.board
-        board.trace()
+        variables = read_firmware(find_firmware(kind, default_build_folder())).variables
+        board.trace(next(at for name, at in variables.items() if "received_tail" in name))
         for k, (code, value) in enumerate(
             (
                 (wire.CommandCode.SET_STEP_REPORTS, 1),
@@ -127,37 +128,40 @@ def written_down(board, seconds):
 
 
 def passes(looks, marks):
-    """(cycle, microseconds) of the passes among the looks: those inside a tick time the tick."""
+    """(cycle, microseconds, bytes of its line that it took) of the passes among the looks.
+
+    Looks inside a tick time the tick.
+    """
     ticks = [(a, b) for (a, begin), (b, _) in pairwise(marks) if begin == 1]
     ends = [end for _, end in ticks]
     found = []
     turns, before = 0, 0
-    for at, count in looks:
+    for at, count, tail in looks:
         turns += count < before
         before = count
         k = bisect_left(ends, at)
         if k == len(ticks):
             break  # the last whole tick ends it: a pass may have been broken off
         if at < ticks[k][0]:
-            found.append((at, (turns << 16 | count) * 4 & 0xFFFFFFFF))
-    return found
+            found.append((at, (turns << 16 | count) * 4 & 0xFFFFFFFF, tail))
+    return [
+        (at, now_us, (later - tail) % RECEIVE_RING)
+        for (at, now_us, tail), (_, _, later) in pairwise(found)
+    ]
 
 
 def played(bus, passed, received):
     """The frames that the native build sends, asked the same at the same times."""
-    (_, first_us), *passed = passed
+    (_, first_us, _), *passed = passed
     engine = NativeEngine(
         bus, prepared_eeprom(1), 1, clock=NodeClockError(offset_us=first_us), stored_id=True
     )
     sent = Sent()
     engine.on_transmit = sent
     received = deque(received)
-    for k, (cycle, now_us) in enumerate(passed):
-        arrived = bytearray()
-        while received and received[0][0] <= cycle + READS_AFTER_CYCLES:
-            arrived.append(received.popleft()[1])
-        if arrived:
-            engine.receive(bytes(arrived))
+    for k, (cycle, now_us, taken) in enumerate(passed):
+        if taken:
+            engine.receive(bytes(received.popleft()[1] for _ in range(taken)))
         try:
             engine.poll(cycle // 16, now_us)
         except AssertionError as error:

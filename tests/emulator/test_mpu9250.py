@@ -66,9 +66,11 @@ def test_its_compass_has_14_or_16_bits(wide: int, ut_per_lsb: float) -> None:
     assert data[7] == wide
 
 
-def _served(elf: Path, *, successor: bool) -> tuple[Service, tuple[str, ...]]:
-    with Service(BOARDS["uno"], read_firmware(elf), 24.0, 1, successor=successor) as service:
-        service.run(24_000_000)
+def _served(
+    elf: Path, *, successor: bool, seconds: float = 12.0
+) -> tuple[Service, tuple[str, ...]]:
+    with Service(BOARDS["uno"], read_firmware(elf), seconds, 1, successor=successor) as service:
+        service.run(round(seconds * 1e6))
         _, faults = service.work_done()
         counters = service.engine.board.counters()
         assert counters.tick_cycles_max < BUDGETS["uno"].worst_tick_share * TICK_CYCLES
@@ -80,8 +82,8 @@ def _health(service: Service) -> wire.Health:
     return wire.Health(statuses[-1]["health"])
 
 
-def _built(**environment: str) -> None:
-    command = [ROOT / "tools" / "pio", "run", "-e", "uno"]
+def _built(name: str, **environment: str) -> None:
+    command = [ROOT / "tools" / "pio", "run", "-e", name]
     done = subprocess.run(
         command, env={**os.environ, **environment}, capture_output=True, text=True, check=False
     )
@@ -89,11 +91,11 @@ def _built(**environment: str) -> None:
 
 
 @needs_avr
-def test_firmware_built_for_it_walks_ranges_and_stays_in_its_budget(tmp_path: Path) -> None:
-    _built(PLATFORMIO_BUILD_DIR=str(tmp_path), PLATFORMIO_BUILD_FLAGS="-DRELPOS_IMU=MPU9250")
-    elf = find_firmware("uno", tmp_path)
+def test_firmware_built_for_it_walks_ranges_and_stays_in_its_budget() -> None:
+    _built("uno_mpu9250")
+    elf = find_firmware("uno-mpu9250", default_build_folder())
     assert read_firmware(elf).flash_bytes <= BUDGETS["uno"].flash_bytes
-    service, faults = _served(elf, successor=True)
+    service, faults = _served(elf, successor=True, seconds=24.0)
     assert faults == ()
     assert wire.Health.IMU in _health(service)
     assert wire.Health.MAGNETOMETER in _health(service)
@@ -104,7 +106,7 @@ def test_firmware_built_for_it_walks_ranges_and_stays_in_its_budget(tmp_path: Pa
 
 @needs_avr
 def test_firmware_built_for_the_mpu_9150_reports_the_successor_as_missing() -> None:
-    _built()
+    _built("uno")
     service, _ = _served(find_firmware("uno", default_build_folder()), successor=True)
     assert wire.Health.IMU not in _health(service)
 
@@ -112,7 +114,11 @@ def test_firmware_built_for_the_mpu_9150_reports_the_successor_as_missing() -> N
 @needs_avr
 def test_an_unknown_sensor_is_refused_by_the_build(tmp_path: Path) -> None:
     with pytest.raises(AssertionError, match="RELPOS_IMU is MPU9150 or MPU9250"):
-        _built(PLATFORMIO_BUILD_DIR=str(tmp_path), PLATFORMIO_BUILD_FLAGS="-DRELPOS_IMU=MPU6500")
+        _built(
+            "uno",
+            PLATFORMIO_BUILD_DIR=str(tmp_path),
+            PLATFORMIO_BUILD_FLAGS="-DRELPOS_IMU=MPU6500",
+        )
 
 
 def _team_health(**imu: str) -> list[wire.Health]:

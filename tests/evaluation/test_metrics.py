@@ -62,7 +62,7 @@ def best_fit_by_trying_angles(p: np.ndarray, q: np.ndarray) -> float:
 
 
 @given(SEEDS)
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_all_figures_are_what_the_sentences_of_the_run_format_give(seed: int) -> None:
     truth, estimate = random_team(seed), random_team(seed + 1)
     rng = np.random.default_rng(seed)
@@ -103,7 +103,7 @@ def test_all_figures_are_what_the_sentences_of_the_run_format_give(seed: int) ->
 
 
 @given(SEEDS, st.floats(-10, 10), st.floats(-100, 100), st.floats(-100, 100))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_the_frame_of_the_estimate_changes_nothing(
     seed: int, angle: float, x: float, y: float
 ) -> None:

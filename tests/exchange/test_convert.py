@@ -412,6 +412,7 @@ def test_geojson_is_what_the_rfc_asks_for(tmp_path: Path) -> None:
         assert math.remainder(course - expected, 360.0) == pytest.approx(0.0, abs=1e-2)
     (last,) = features(path, kind="position", node=2)
     assert last["properties"]["status"] == "ok"
+    assert last["properties"]["height_m"] == pytest.approx(estimates()[-1].nodes[1].z_m, abs=1e-3)
     assert features(path, kind="region", node=2)[0]["geometry"]["type"] == "Polygon"
 
 

@@ -119,6 +119,9 @@ def test_frames_are_found_again_after_garbage_and_in_any_pieces(escaped):
         found += parser.feed(stream[:cut])
         stream = stream[cut:]
     assert found == frames
+    counts = parser.counts
+    assert (counts.bad_checksums, counts.bad_lengths, counts.broken_off) == (0, 0, 0)
+    assert counts.skipped_bytes > 300
 
 
 def test_a_stray_delimiter_costs_only_itself():
@@ -246,6 +249,13 @@ def test_late_and_doubled_frames_move_no_node():
     assert (counts["duplicate"], counts["late_motion"], counts["lost"]) == (1, 1, 0)
 
 
+def test_a_motion_has_the_steps_since_the_one_before_also_of_a_lost_one():
+    decoder = Decoder()
+    decoder.feed(motion_frame(7, boot=4, time_s=100, steps=65_530), 100.0)
+    (motion,) = motions(decoder.feed(motion_frame(9, boot=4, time_s=102, steps=2), 102.0))
+    assert motion.steps == 8
+
+
 def test_a_restart_begins_new_totals_and_widens_the_next_motion():
     decoder = Decoder()
     decoder.feed(motion_frame(7, boot=4, time_s=100, x_m=50.0), 100.0)
@@ -335,17 +345,19 @@ def test_a_damaged_or_foreign_frame_changes_nothing():
     good = motion_frame(1, time_s=2, x_m=3)
     assert decoder.feed(good[:-1] + bytes((good[-1] ^ 1,)), 2.0) == []
     assert decoder.feed(b"\x00another system", 2.0) == []
-    assert decoder.feed(bytes((wire.MAGIC, 1, 1, 9)), 2.0) == []
+    for foreign in ((wire.MAGIC, 1, 1, 9), (wire.MAGIC, 1, 1, 9), (wire.MAGIC, 1)):
+        assert decoder.feed(bytes(foreign), 2.0) == []
     assert decoder.feed(good[:20] + bytes((good[20] ^ 1,)) + good[21:], 2.0) == []
     forged = wire.encode(wire.MOTION, 1, 0, 1, MOTION_ZERO | {"time_s": 2}, bytes(range(16)))
     assert decoder.feed(forged, 2.0) == []
     assert repr(decoder.nodes) == before
     assert decoder.foreign_versions == {9: 1}
+    assert len(decoder.remarks) == 1
     assert decoder.counts == {
         "FrameTagError": 2,
         "FrameCrcError": 1,
         "NotOursError": 1,
-        "ForeignVersionError": 1,
+        "ForeignVersionError": 3,
     }
     assert len(motions(decoder.feed(good, 2.0))) == 1
 

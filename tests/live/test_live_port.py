@@ -16,6 +16,7 @@ from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DeviceError
 from relpos.link import xbee
 from relpos.link.port import Link
+from relpos.live import inputs
 from relpos.live.inputs import PortInput
 from relpos.measurements import Motion
 
@@ -34,6 +35,10 @@ class Socket:
 
     def pull(self) -> None:
         self.path.unlink()
+        self.end()
+
+    def end(self) -> None:
+        """As a program that is killed: the name stays."""
         os.close(self._ours)
         os.close(self._theirs)
 
@@ -117,6 +122,30 @@ def test_a_port_that_is_pulled_out_is_reported_and_read_again_once_it_is_back(so
     assert outcome.failure is None
     assert motions() >= wanted
     assert not port_notices()
+
+
+@pytest.mark.parametrize("by_link", [True, False])
+def test_the_next_terminal_with_the_same_number_is_not_taken_for_the_port(
+    socket, by_link, monkeypatch
+):
+    monkeypatch.setattr(inputs, "REOPEN_S", 0.0)
+    terminal = socket.path.readlink()
+    name = str(socket.path if by_link else terminal)
+    source = PortInput(name, Link(), teach=False, reopen=True)
+    socket.end()
+    source.read(0.0)
+    kept = []
+    while not terminal.exists():  # the lowest free number: ours, or that of a test beside this one
+        kept += pty.openpty()
+    source.read(0.0)
+    assert "does not come back" in source.trouble()
+    socket.path.unlink()
+    socket.plug()
+    source.read(0.0)
+    assert (source.trouble() is None) == by_link, "a new link leads to the successor"
+    source.close()
+    for end in kept:
+        os.close(end)
 
 
 def test_a_port_that_is_not_to_be_opened_again_ends_the_session(socket, stream):

@@ -83,7 +83,7 @@ requests = st.sampled_from(sorted(BODIES)).flatmap(
 @pytest.mark.parametrize("bodies", [400, pytest.param(40_000, marks=pytest.mark.soak)])
 def test_no_body_of_any_route_ends_a_session(house, bodies):
     @given(requests)
-    @settings(max_examples=bodies, deadline=None, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=bodies, suppress_health_check=list(HealthCheck))
     def visit(sent):
         path, content = sent
         answer = house.send("POST", path, content)

@@ -65,6 +65,7 @@ EXPLAINED = {
     "if (length < kOverhead || length > kFrameBytes) return FrameStatus::kBadLength;": (
         "no message has an empty body"
     ),
+    "return cls(newest, (1 << WINDOW) - 1)": "bits beyond the window are never looked at",
     "if (sampled_ && step_us > SampleClock::kGapUs) {": "a microsecond of a gap",
 }
 """Line without spaces -> why no test can see its mutant."""

@@ -7,7 +7,9 @@ import re
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -23,10 +25,12 @@ from relpos.link import dialogue, port
 from relpos.link.decoder import Acknowledged
 from relpos.link.dialogue import open_dialogue
 from relpos.link.port import Link
-from relpos.nodes.bringup import Finding, NodeCheck, bus_access, check, radio
+from relpos.nodes import cable as cable_module
+from relpos.nodes.bringup import NodeCheck, bus_access, check, radio
 from relpos.nodes.bringup import finding as finding_names
+from relpos.nodes.cable import CablePort
 from relpos.protocol import messages as wire
-from support.emulated_line import EmulatedLine
+from support.emulated_line import EmulatedCable, EmulatedLine
 
 MISSING = missing_parts()
 ROOT = Path(__file__).resolve().parents[2]
@@ -48,22 +52,57 @@ def emulated(
 
 
 @contextmanager
-def checked(monkeypatch: pytest.MonkeyPatch, *faults: str, **team: object) -> Iterator[NodeCheck]:
-    """A check of node 1."""
+def checked(
+    monkeypatch: pytest.MonkeyPatch, *faults: str, cable: bool = True, **team: object
+) -> Iterator[NodeCheck]:
+    """A check of node 1, over its cable or by radio."""
     with emulated(monkeypatch, *faults, **team) as line:
         link = Link(clock=lambda: 1.8e9 + line.team.time_us * 1e-6)
-        yield NodeCheck(open_dialogue(line, 1, link), distance_m=SPACING_M)
+        device = plugged_in(monkeypatch, line) if cable else line
+        node = open_dialogue(device, 1, link)
+        yield NodeCheck(node, cable=cable, peer=2 if cable else None, distance_m=SPACING_M)
 
 
-@pytest.mark.parametrize("imu", ["mpu9150", "mpu9250"])
-def test_a_healthy_node_is_right_in_every_line(monkeypatch: pytest.MonkeyPatch, imu: str) -> None:
-    with checked(monkeypatch, imu=imu) as node:
+def plugged_in(monkeypatch: pytest.MonkeyPatch, line: EmulatedLine) -> CablePort:
+    """The cable of node 1."""
+    with monkeypatch.context() as patched:
+        patched.setattr(cable_module, "open_port", lambda _: EmulatedCable(line.team, 1))
+        return CablePort("PORT")
+
+
+@pytest.mark.parametrize(
+    ("imu", "cable"),
+    [
+        ("mpu9150", False),
+        ("mpu9250", True),
+        pytest.param("mpu9150", True, marks=pytest.mark.soak),
+        pytest.param("mpu9250", False, marks=pytest.mark.soak),
+    ],
+)
+def test_a_healthy_node_is_right_in_every_line(
+    monkeypatch: pytest.MonkeyPatch, imu: str, cable: bool
+) -> None:
+    with checked(monkeypatch, imu=imu, cable=cable) as node:
         findings = list(node.findings())
-    assert [finding for finding in findings if not finding.right] == []
+    assert [finding for finding in findings if finding.right is False] == []
+    unchecked = [finding.part for finding in findings if finding.right is None]
+    assert unchecked == ([finding_names.RADIO] if cable else [])
     parts = {finding.part for finding in findings}
     assert parts == {value for name, value in vars(finding_names).items() if name.isupper()}
     assert node.figures["range_m"] == pytest.approx(SPACING_M, abs=1.0)
     assert node.figures["sample_rate_hz"] == pytest.approx(50.0, rel=0.02)
+
+
+def test_a_builder_checks_a_node_over_its_cable_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    with emulated(monkeypatch, "xbee:off:node=1") as line:
+        monkeypatch.setattr(node_dialogue, "open_device", lambda *_: plugged_in(monkeypatch, line))
+        done = CliRunner().invoke(app, ["node", "check", "PORT", "--cable"])
+    assert done.exit_code == 0, done.stdout + done.stderr
+    assert "WRONG" not in done.stdout
+    assert "started by external" in done.stdout
+    assert "-      XBee radio" in done.stdout
+    assert re.search("-      ranging .*--peer", done.stdout)
+    assert done.stdout.endswith("node 1 is ready\n")
 
 
 CASES = (
@@ -91,7 +130,7 @@ CASES = (
     ("pozyx:delayed", "ranging", "takes over"),
     ("pozyx:intermittent", "Pozyx", "not answered"),
     ("pozyx:inverted", "ranging", "success as failure"),
-    ("pozyx:brownout:from=6", "Pozyx", "has restarted"),
+    ("pozyx:brownout:from=16", "Pozyx", "has restarted"),
     ("xbee:stuck", "XBee radio", "takes no command"),
     ("xbee:wrong", "XBee radio", "not confirmed"),
     ("xbee:slow", "XBee radio", "not confirmed"),
@@ -102,31 +141,58 @@ CASES = (
     ("xbee:duplicate", "XBee radio", "to be repeated"),
     ("xbee:brownout:from=12", "XBee radio", "unasked"),
     ("bus:stuck:line=scl", "I2C bus", "no chip answers"),
-    ("bus:stuck:line=sda,from=34", "I2C bus", "failed during the check"),
+    ("bus:stuck:line=sda,from=30", "I2C bus", "failed during the check"),
     ("bus:nack", "I2C bus", "at several chips"),
     ("bus:nack:part=data", "I2C bus", "at several chips"),
 )
 """A fault, and the line that names it: its part, and words of what was found."""
+BY_RADIO = [case for case in CASES if case[0].startswith("xbee")]
+BY_CABLE = [case for case in CASES if case not in BY_RADIO]
+LATER_BY_RADIO = {"from=30": "from=34"}
+"""That check takes longer."""
 
 
-def find(monkeypatch: pytest.MonkeyPatch, case: tuple[str, str, str], imu: str) -> None:
-    """Check a node with that fault until the line comes."""
+def find(
+    monkeypatch: pytest.MonkeyPatch,
+    case: tuple[str, str, str],
+    imu: str = "mpu9150",
+    cable: bool = True,
+) -> None:
+    """Check a node with that fault until the line comes, before which none is wrong."""
     fault, part, words = case
     keys = fault.split(":")[2:]
     spec = ":".join((*fault.split(":")[:2], ",".join((*keys, "node=1"))))
-    found: list[Finding] = []
-    with checked(monkeypatch, spec, imu=imu) as node:
-        for finding in node.findings():
-            found.append(finding)
-            if finding.right is False and finding.part == part and re.search(words, finding.found):
-                assert finding.remedy
-                return
-    pytest.fail(str(found))
+    with checked(monkeypatch, spec, imu=imu, cable=cable) as node:
+        named = next((f for f in node.findings() if f.right is False), None)
+    assert named is not None
+    assert named.part == part, named
+    assert re.search(words, named.found), named
+    assert named.remedy
 
 
-@pytest.mark.parametrize("case", CASES, ids=[case[0] for case in CASES])
-def test_each_fault_is_named(monkeypatch: pytest.MonkeyPatch, case: tuple[str, str, str]) -> None:
-    find(monkeypatch, case, "mpu9150")
+@pytest.mark.parametrize("case", BY_CABLE, ids=[case[0] for case in BY_CABLE])
+def test_each_fault_of_chips_and_bus_is_named(
+    monkeypatch: pytest.MonkeyPatch, case: tuple[str, str, str]
+) -> None:
+    find(monkeypatch, case)
+
+
+@pytest.mark.parametrize("case", BY_RADIO, ids=[case[0] for case in BY_RADIO])
+def test_each_fault_of_the_radio_is_named(
+    monkeypatch: pytest.MonkeyPatch, case: tuple[str, str, str]
+) -> None:
+    find(monkeypatch, case, cable=False)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("case", BY_CABLE, ids=[case[0] for case in BY_CABLE])
+def test_each_fault_of_chips_and_bus_is_named_by_radio_too(
+    monkeypatch: pytest.MonkeyPatch, case: tuple[str, str, str]
+) -> None:
+    fault, *words = case
+    for by_cable, by_radio in LATER_BY_RADIO.items():
+        fault = fault.replace(by_cable, by_radio)
+    find(monkeypatch, (fault, *words), cable=False)
 
 
 @pytest.mark.soak
@@ -152,7 +218,8 @@ def test_a_chip_at_its_other_address_is_told(
     monkeypatch: pytest.MonkeyPatch, address: int, part: str
 ) -> None:
     with checked(monkeypatch) as node:
-        chips = node._bus._dialogue._port.team.nodes[1].bus.devices  # type: ignore[attr-defined]
+        cable = node._bus._dialogue._port._device  # type: ignore[attr-defined]
+        chips = cable.team.nodes[1].bus.devices
         chips[address ^ 1] = chips.pop(address)
         told = next(f for f in node.findings() if f.right is False)
     assert (told.part, told.found) == (part, f"no answer at 0x{address:02X}")
@@ -182,7 +249,7 @@ def test_each_fault_of_a_part_that_is_checked_has_a_test() -> None:
 def test_a_node_that_is_not_heard_is_told(monkeypatch: pytest.MonkeyPatch, fault: str) -> None:
     with (
         pytest.raises(DeviceError, match="node 1 is not heard"),
-        checked(monkeypatch, f"{fault}:node=1"),
+        checked(monkeypatch, f"{fault}:node=1", cable=False),
     ):
         pass
 
@@ -196,7 +263,15 @@ def test_the_page_shows_a_builders_session_on_a_simulated_uno_with_weak_pull_ups
     )
     assert built.returncode == 0, built.stdout[-2000:] + built.stderr[-2000:]
     report = tmp_path / "report.json"
-    with emulated(monkeypatch, board="uno") as line:
+    add = EmulatedTeam._add
+
+    def add_peer(team: EmulatedTeam, walker: Any, config: TeamConfig, errors: object) -> None:
+        """The node that is only ranged with runs on this computer: half the time."""
+        board = "uno" if walker.node == 1 else "native"
+        add(team, walker, replace(config, board=board), errors)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(EmulatedTeam, "_add", add_peer)
+    with emulated(monkeypatch) as line:
         line.team.nodes[1].bus.rise_ns = 700
         monkeypatch.setattr(node_dialogue, "open_device", lambda *_: line)
         done = CliRunner().invoke(

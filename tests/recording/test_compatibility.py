@@ -48,6 +48,8 @@ RECORDED = {
         "status.csv": "abe17bb2026d3566eaa68a1d432e0a2990f5cdcfc2428f9552335c91a3e1768a",
     }
 }
+LATER_COLUMNS = {"motion.csv": 1}
+"""Columns at the end that no recorded version wrote."""
 
 
 @pytest.mark.parametrize("version", OLD_FRAMES)
@@ -88,8 +90,10 @@ def test_a_recording_of_an_earlier_version_gives_the_measurements_of_then_to_the
     assert f"recorded by relpos {version} under protocol version 2" in remark
     save_run(replay.recording.run_of(replay.observations()), tmp_path / "run")
     for name, digest in RECORDED[version].items():
-        written = (tmp_path / "run" / name).read_bytes()
-        assert hashlib.sha256(written).hexdigest() == digest, name
+        rows = (tmp_path / "run" / name).read_bytes().splitlines()
+        later = LATER_COLUMNS.get(name, 0)
+        then = [row.rsplit(b",", later)[0] if later else row for row in rows]
+        assert hashlib.sha256(b"".join(row + b"\n" for row in then)).hexdigest() == digest, name
 
 
 def test_a_recording_of_an_earlier_version_is_fused(recorded, tmp_path):

@@ -80,7 +80,9 @@ def server():
 
 @pytest.fixture
 def viewer(server):
-    with connect(server.address, subprotocols=["foxglove.sdk.v1"], max_size=None) as socket:
+    with connect(
+        server.address, subprotocols=["foxglove.sdk.v1"], max_size=None, ping_interval=None
+    ) as socket:
         yield Viewer(socket)
 
 

@@ -12,7 +12,7 @@ from relpos.live.requests import Request
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert
 from relpos.measurements import Motion
-from relpos.recording import open_recording
+from relpos.recording import open_recording, topics
 from relpos.recording.moments import Moments
 from relpos.recording.player import History, Player
 from relpos.recording.recorder import Recorder
@@ -58,6 +58,18 @@ def test_a_recording_that_was_cut_off_has_its_moments_and_seeks_as_fast(recorded
         slowest_s = max(slowest_s, time.process_time() - began_s)
         fresh.close()
     assert slowest_s < SEEK_S
+
+
+def test_a_moment_costs_the_lists_of_one_estimate_however_long_ago_it_was(recorded, monkeypatch):
+    path, _ = recorded
+    decoded = []
+    real = topics.decode_list
+    monkeypatch.setattr(topics, "decode_list", lambda *a: decoded.append(a[0]) or real(*a))
+    moments = Moments([path])
+    for at_s in (moments.from_s + 12.0, moments.to_s, moments.to_s + 5000.0):
+        decoded.clear()
+        assert moments.estimate_at(at_s) is not None
+        assert len(decoded) <= len(topics.LISTS)
 
 
 def test_what_is_no_recording_is_refused(tmp_path):

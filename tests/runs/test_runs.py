@@ -171,9 +171,7 @@ def test_the_same_table_twice_is_refused(tmp_path: Path) -> None:
 
 
 @given(data=st.binary(max_size=200))
-@settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_only_documented_errors_leave_the_reader(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "motion.csv").write_bytes(MOTION.encode() + data)
     (tmp_path / "imu.csv").write_bytes(IMU_HEADER.encode() + data)
@@ -409,7 +407,8 @@ def test_the_output_files_have_the_columns_of_the_run_format(tmp_path: Path) -> 
     headers = {p.name: p.read_text().splitlines()[0] for p in tmp_path.iterdir()}
     assert headers == {
         "estimate.csv": "time_s,node,x_m,y_m,z_m,heading_rad,sigma_major_m,sigma_minor_m,"
-        "sigma_angle_rad,sigma_z_m,sigma_heading_rad,status",
+        "sigma_angle_rad,sigma_z_m,sigma_heading_rad,status,episode,episode_probability,"
+        "floor,floor_probability",
         "pairs.csv": "time_s,node,peer,distance_m,sigma_distance_m,bearing_rad,sigma_bearing_rad,"
         "status",
         "alternatives.csv": "time_s,alternative,probability,node,x_m,y_m,heading_rad,"

@@ -1,4 +1,4 @@
-"""An emulated team as a serial port of this process, on its own clock: no test waits for it."""
+"""An emulated team as serial ports of this process, on its own clock: no test waits for it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from types import SimpleNamespace
 import pytest
 
 from relpos.emulator.team import EmulatedTeam
-from relpos.link.port import READ_TIMEOUT_S
+from relpos.emulator.xbee import line_time_us
+from relpos.link.port import BAUD, READ_TIMEOUT_S
+from relpos.protocol.messages import ResetCause
 
 STEP_US = 2_000
 
@@ -28,11 +30,14 @@ class EmulatedLine:
     def read(self, size: int = 1) -> bytes:
         until_us = self.team.time_us + round(READ_TIMEOUT_S * 1e6)
         while not self._waiting and self.team.time_us < until_us:
-            for _, data in self.team.run(self.team.time_us + STEP_US):
-                self._waiting += data
+            self._run()
         data = bytes(self._waiting[:size])
         del self._waiting[:size]
         return data
+
+    def _run(self) -> None:
+        for _, data in self.team.run(self.team.time_us + STEP_US):
+            self._waiting += data
 
     def write(self, data: bytes) -> int:
         self.team.send(data)
@@ -49,3 +54,28 @@ class EmulatedLine:
 
         for module in modules:
             monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=now_s, time=now_s))
+
+
+class EmulatedCable(EmulatedLine):
+    """The USB port of one node: its switch takes the UART from the module; opening restarts it."""
+
+    def __init__(self, team: EmulatedTeam, node: int) -> None:
+        super().__init__(team)
+        board = team.nodes[node]
+        self._to_board = board.radio.on_serial
+        self._free_us = team.time_us
+        board.radio.on_serial = lambda _left_us, _data: None
+        board.engine.on_transmit = self._sent
+        board.restart(team.time_us, ResetCause.EXTERNAL)
+
+    def _sent(self, left_us: int, data: bytes) -> None:
+        at_us = max(left_us, self.team.time_us)
+        self.team.clock.at(at_us, lambda _now_us: self._waiting.extend(data))
+
+    def _run(self) -> None:
+        self.team.run(self.team.time_us + STEP_US)
+
+    def write(self, data: bytes) -> int:
+        self._free_us = max(self._free_us, self.team.time_us) + line_time_us(len(data), BAUD)
+        self._to_board(self._free_us, data)
+        return len(data)

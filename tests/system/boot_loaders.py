@@ -46,18 +46,26 @@ def build_optiboot(folder: Path) -> Firmware:
     return Firmware(bytes(image), 0, 0x100, b"", {})
 
 
-def read_hex(path: Path, folder: Path) -> bytes:
-    """What an Intel HEX file holds, from its first address on."""
-    binary = folder / f"{path.stem}.bin"
-    convert = ["avr-objcopy", "-I", "ihex", "-O", "binary", "--gap-fill", "0xff"]
-    subprocess.run([*convert, str(path), str(binary)], check=True)
-    return binary.read_bytes()
+def place_hex(path: Path, image: bytearray) -> None:
+    """Put what an Intel HEX file holds where it belongs.
+
+    Not by avr-objcopy: Debian 13's refuses the Mega's loader.
+    """
+    base = 0
+    for line in path.read_text().split():
+        count, at, kind = int(line[1:3], 16), int(line[3:7], 16), int(line[7:9], 16)
+        data = bytes.fromhex(line[9 : 9 + 2 * count])
+        if kind == 2:  # extended segment address
+            base = int.from_bytes(data, "big") << 4
+        elif kind == 4:  # extended linear address
+            base = int.from_bytes(data, "big") << 16
+        elif kind == 0:
+            image[base + at : base + at + count] = data
 
 
-def mega_loader(folder: Path) -> Firmware:
+def mega_loader() -> Firmware:
     """The Mega's, as Debian ships it."""
-    loader = read_hex(MEGA_LOADER, folder)
     image = bytearray(b"\xff" * 0x40000)
     image[: len(NO_PROGRAM)] = NO_PROGRAM
-    image[MEGA_ADDRESS : MEGA_ADDRESS + len(loader)] = loader
+    place_hex(MEGA_LOADER, image)
     return Firmware(bytes(image), 0, 0x200, b"", {})

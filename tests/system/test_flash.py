@@ -6,24 +6,33 @@ import select
 import subprocess
 import termios
 import threading
+import time
 import tty
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import pytest
 from boot_loaders import ADDRESSES, MEGA_LOADER, build_optiboot, mega_loader, needs
 from typer.testing import CliRunner
 
+from relpos.cli import node_flash
 from relpos.cli.main import app
 from relpos.emulator.avr.board import BOARDS as SIMULATED
 from relpos.emulator.avr.board import Board, ResetCause
 from relpos.errors import DeviceError
+from relpos.link import dialogue
+from relpos.link import port as link_port
 from relpos.link.port import open_port
 from relpos.nodes import boards, upload
 
 MILLISECOND_CYCLES = 16_000
 ANSWER_MS = 20
 """What a boot loader answers, it answers within about so long: a page of flash takes 4.5 ms."""
+PATIENT_MS = 10
+"""In which a boot loader that waits for the host grows a millisecond older: it gives up after one
+second of its own, however long a busy computer takes."""
+PATIENCE_S = 300.0
 UCSR0A, UBRR0, U2X0 = 0xC0, 0xC4, 0x02
 SPEEDS = {getattr(termios, f"B{baud}"): baud for baud in (9600, 38400, 115200)}
 
@@ -56,14 +65,19 @@ class Arduino(threading.Thread):
         """Whether the cable reaches the UART, and both ends have the same speed to 3 %."""
         control, divisor = self.board.data(UCSR0A, 1)[0], self.board.data(UBRR0, 2)
         bit_cycles = (8 if control & U2X0 else 16) * (int.from_bytes(divisor, "little") + 1)
-        host = SPEEDS[termios.tcgetattr(self.terminal)[5]]
-        return self.connected and 0.97 < self.board.frequency_hz / bit_cycles / host < 1.03
+        baud = self.board.frequency_hz / bit_cycles
+        return self.connected and 0.97 < baud / self.host_baud() < 1.03
+
+    def host_baud(self):
+        return SPEEDS[termios.tcgetattr(self.terminal)[5]]
 
     def run(self):
         try:
-            was_open = False
+            was_open = answering = False
             while not self.stop.wait(0.0005):
-                events = dict(self.poll.poll(0)).get(self.terminal, 0)
+                waits = self.host_baud() == boards.BOOT_BAUD and not answering
+                patience_ms = PATIENT_MS if waits else 0
+                events = dict(self.poll.poll(patience_ms)).get(self.terminal, 0)
                 is_open = not events & select.POLLHUP
                 if is_open and not was_open:
                     self.board.reset(ResetCause.EXTERNAL)
@@ -74,10 +88,10 @@ class Arduino(threading.Thread):
                         self.board.receive(data, self.board.cycle)
                 if not is_open:
                     continue
-                # Slow to run out of patience, quick to answer, however busy this computer is.
                 for _ in range(ANSWER_MS if events & select.POLLIN else 1):
                     self.board.run(self.board.cycle + MILLISECOND_CYCLES)
                     sent = bytes(value for _, value in self.board.take_sent())
+                    answering = bool(sent)
                     if sent and self.understands():
                         os.write(self.terminal, sent)
                         break
@@ -104,8 +118,20 @@ def plugged(kind, firmware, *, connected=True):
         board.set_reset_vector(ADDRESSES[kind])
         arduino = Arduino(board, terminal, connected)
         arduino.start()
+        until_s = time.monotonic() + PATIENCE_S
+
+        def now_s():
+            """The board's time: a host waits for as long as it would for a real one."""
+            assert arduino.is_alive()
+            assert time.monotonic() < until_s
+            return board.cycle / board.frequency_hz
+
         try:
-            yield Plugged(path, board)
+            with pytest.MonkeyPatch.context() as patched:
+                clock = SimpleNamespace(monotonic=now_s, time=now_s)
+                for module in (dialogue, link_port, node_flash):
+                    patched.setattr(module, "time", clock)
+                yield Plugged(path, board)
         finally:
             arduino.stop.set()
             arduino.join()
@@ -149,7 +175,7 @@ def test_the_wrong_board_is_refused_before_anything_is_written(optiboot):
 @pytest.mark.skipif(not MEGA_LOADER.is_file(), reason="no boot loader of the Mega is installed")
 def test_a_mega_is_known_by_its_own_boot_loader(tmp_path):
     with (
-        plugged("mega", mega_loader(tmp_path)) as mega,
+        plugged("mega", mega_loader()) as mega,
         closing(open_port(mega.path, 115200)) as device,
     ):
         assert boards.check(device, None).name == "mega"
@@ -160,7 +186,7 @@ def test_a_mega_is_known_by_its_own_boot_loader(tmp_path):
 @pytest.mark.parametrize("of_2011", [True, False])
 @pytest.mark.skipif(not MEGA_LOADER.is_file(), reason="no boot loader of the Mega is installed")
 def test_a_boot_loader_that_leaves_the_watchdog_armed_is_told(tmp_path, of_2011):
-    program = mega_loader(tmp_path)
+    program = mega_loader()
     if of_2011:  # as that one: without the instruction that feeds the watchdog
         program = replace(program, flash=program.flash.replace(b"\xa8\x95", b"\0\0"))
     with (
@@ -177,7 +203,7 @@ def test_a_boot_loader_that_leaves_the_watchdog_armed_is_told(tmp_path, of_2011)
 @pytest.mark.soak
 @pytest.mark.skipif(not MEGA_LOADER.is_file(), reason="no boot loader of the Mega is installed")
 def test_a_mega_becomes_a_node_as_well(tmp_path):
-    with plugged("mega", mega_loader(tmp_path)) as mega:
+    with plugged("mega", mega_loader()) as mega:
         done = relpos_node("flash", mega.path, "--id", 5)
     assert done.exit_code == 0, done.stdout + done.stderr
     assert "Arduino mega (ATmega2560)" in done.stdout

@@ -11,11 +11,15 @@ from contextlib import contextmanager, suppress
 import pytest
 from typer.testing import CliRunner
 
-from relpos.cli import node_watch
+from relpos.cli import node_dialogue, node_set, node_watch
 from relpos.cli.main import app
 from relpos.emulator.avr.library import missing_parts
+from relpos.emulator.team import EmulatedTeam, TeamConfig
+from relpos.link import dialogue
+from relpos.link import port as link_port
 from relpos.link.authentication import write_new_key
 from relpos.link.port import open_port
+from support.emulated_line import EmulatedLine
 
 RELPOS = [sys.executable, "-m", "relpos.cli.main"]
 
@@ -42,12 +46,27 @@ def port():
         yield path
 
 
+@pytest.fixture(scope="module")
+def line():
+    with EmulatedTeam(TeamConfig("straight", 3, 600.0, 3)) as team:
+        yield EmulatedLine(team)
+
+
+@pytest.fixture
+def team(line, monkeypatch):
+    """Name of a port behind which a team is on its own clock, which is the commands', too."""
+    for module in (node_dialogue, node_watch):
+        monkeypatch.setattr(module, "open_device", lambda *_: line)
+    line.clock_of(monkeypatch, dialogue, link_port, node_set, node_watch)
+    return line.port
+
+
 def node(*arguments):
     return CliRunner().invoke(app, ["node", *map(str, arguments)])
 
 
-def test_list_shows_every_node(port):
-    done = node("list", port, "--seconds", 2, "--json")
+def test_list_shows_every_node(team):
+    done = node("list", team, "--seconds", 14, "--json")
     assert done.exit_code == 0, done.stderr
     rows = json.loads(done.stdout)["nodes"]
     assert [row["node"] for row in rows] == [1, 2, 3]
@@ -56,14 +75,13 @@ def test_list_shows_every_node(port):
         assert row["battery_v"] == pytest.approx(5.0, abs=0.03)
         assert row["uptime_s"] >= 0
         assert -100 < row["rssi_dbm"] < -20
-    table = node("list", port, "--seconds", 2).stdout
+    table = node("list", team, "--seconds", 14).stdout
     assert "firmware" in table
     assert "power on" in table
 
 
-def test_monitor_prints_plain_tables_where_there_is_no_terminal(port, monkeypatch):
-    monkeypatch.setattr(node_watch, "PLAIN_TABLE_EVERY_S", 1.2)
-    done = node("monitor", port, "--seconds", 2)
+def test_monitor_prints_plain_tables_where_there_is_no_terminal(team):
+    done = node("monitor", team, "--seconds", 8)
     assert done.exit_code == 0, done.stderr
     assert done.stdout.count("neighbours") == 2  # one while it runs, one at the end
     assert "\x1b" not in done.stdout
@@ -94,15 +112,15 @@ def test_monitor_is_a_live_table_on_a_terminal(port):
     assert re.search(r"5\.0\d V", text)
 
 
-def test_settings_are_shown_before_and_after_and_survive_a_restart(port):
-    done = node("set", port, "--node", 2, "stature", 1.9, "led", "off", "ranging-period=4")
+def test_settings_are_shown_before_and_after_and_survive_a_restart(team):
+    done = node("set", team, "--node", 2, "stature", 1.9, "led", "off", "ranging-period=4")
     assert done.exit_code == 0, done.stderr
     assert re.search(r"led\W+health\W+off", done.stdout)
     assert re.search(r"ranging-period\W+2 s\W+4 s", done.stdout)
-    rebooted = node("reboot", port, "--node", 2)
+    rebooted = node("reboot", team, "--node", 2)
     assert rebooted.exit_code == 0, rebooted.stderr
     assert "has restarted" in rebooted.stdout
-    shown = node("set", port, "--node", 2).stdout
+    shown = node("set", team, "--node", 2).stdout
     assert re.search(r"leg-length\W+1\.007 m", shown)
     assert re.search(r"led\W+off", shown)
     assert re.search(r"ranging-period\W+4 s", shown)
@@ -124,8 +142,8 @@ def test_a_number_is_changed_over_the_air_though_the_radio_keeps_its_address():
         assert "there is a node 1 already" in taken.stderr
 
 
-def test_a_first_key_needs_the_cable(port, tmp_path):
-    done = node("set", port, "key", "--key-file", tmp_path / "team.key", "--new")
+def test_a_first_key_needs_the_cable(team, tmp_path):
+    done = node("set", team, "key", "--key-file", tmp_path / "team.key", "--new")
     assert done.exit_code == 1
     assert "by radio everybody could read its first one" in done.stderr.replace("\n", " ")
     assert not (tmp_path / "team.key").exists()
@@ -216,14 +234,14 @@ def test_a_port_that_another_program_has_is_reported(port):
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_several_nodes_want_a_choice(port):
-    done = node("reboot", port)
+def test_several_nodes_want_a_choice(team):
+    done = node("reboot", team)
     assert done.exit_code == 1
     assert "Heard: 1, 2, 3" in done.stderr
 
 
-def test_a_value_that_will_not_do_is_wrong_usage(port):
-    done = node("set", port, "--node", 2, "led", "blue")
+def test_a_value_that_will_not_do_is_wrong_usage(team):
+    done = node("set", team, "--node", 2, "led", "blue")
     assert done.exit_code == 2
     assert "off, on, health" in done.stderr
 

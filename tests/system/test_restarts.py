@@ -10,12 +10,11 @@ from pathlib import Path
 import pytest
 from boot_loaders import (
     MEGA_ADDRESS,
-    MEGA_LOADER,
     OPTIBOOT_ADDRESS,
     ROOT,
     build_optiboot,
+    mega_loader,
     needs,
-    read_hex,
 )
 
 from relpos.emulator.avr.board import BOARDS, Board, ResetCause
@@ -89,7 +88,7 @@ LOADERS: dict[tuple[str, str], tuple[int, Callable[[Path], bytes]]] = {
         MEGA_ADDRESS,
         lambda folder: compiled(MEGA_OF_2011, "mega", MEGA_ADDRESS, folder),
     ),
-    ("mega", "current"): (MEGA_ADDRESS, lambda folder: read_hex(MEGA_LOADER, folder)),
+    ("mega", "current"): (MEGA_ADDRESS, lambda _: mega_loader().flash[MEGA_ADDRESS:]),
 }
 CLEARING = (("uno", "Optiboot 4.4"), ("mega", "current"))
 """They clear MCUSR: the supply and the button cannot be told from each other."""

@@ -184,6 +184,9 @@ class Stage:
                 self.on_replay(request.body)
             elif request.kind in BOARD_EVENTS:
                 event = {"nodes": list(range(1, self.team.size + 1)), **request.body}
+                if request.kind == "marker" and "node" in event:
+                    x_m, y_m, _ = self.team.pose(event["node"], self.at_s)
+                    event = {"x_m": x_m, "y_m": y_m, **event}
                 self.board.apply({"kind": request.kind, "unix_s": time.time(), **event})
                 web.boarded(self.board.to_message())
             web.respond(request, reply)

@@ -613,7 +613,15 @@ def test_a_table_states_what_the_map_shows(visit, stage: Stage):
     assert all(name in cells[6] for name in near)
 
 
-@pytest.mark.parametrize(("width", "height"), [(320, 568), (390, 844), (1280, 720), (3840, 2160)])
+@pytest.mark.parametrize(
+    ("width", "height"),
+    [
+        (320, 568),
+        pytest.param(390, 844, marks=pytest.mark.soak),
+        (1280, 720),
+        pytest.param(3840, 2160, marks=pytest.mark.soak),
+    ],
+)
 def test_it_fits_screens_from_a_small_phone_to_a_wall(visit, stage: Stage, width: int, height: int):
     stage.team.still_since = {2: stage.at_s - 60.0}
     page = visit(viewport={"width": width, "height": height})

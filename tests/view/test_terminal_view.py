@@ -424,6 +424,7 @@ def test_a_terminal_that_is_gone_is_reported_and_ends_nothing() -> None:
 
 def test_a_file_gets_plain_pages(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("relpos.view.terminal.PLAIN_S", 0.05)
+    monkeypatch.setenv("TERM", "xterm")  # a dumb one has no plus-minus sign
     with (tmp_path / "log.txt").open("w", encoding="utf-8") as file:
         view = TerminalView(me=2, stream=file)
         view.updated(team_view())

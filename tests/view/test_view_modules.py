@@ -11,7 +11,12 @@ from stage import Browser, Page
 
 HERE = Path(__file__).parent / "modules"
 STATIC = Path(__file__).parents[2] / "host" / "relpos" / "view" / "static"
-TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html"}
+TYPES = {
+    ".js": "text/javascript",
+    ".css": "text/css",
+    ".html": "text/html",
+    ".json": "application/json",
+}
 TESTS = [
     (path.name, sentence)
     for path in sorted(HERE.glob("*.test.js"))

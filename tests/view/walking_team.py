@@ -97,7 +97,7 @@ class WalkingTeam:
             health, reasons = "red", (f"silent for {lost_s:.0f} s",)
         grown_m = 0.25 * lost_s
         return Person(
-            node, self.name(node), x_m, y_m, 0.0, heading_rad,
+            node, self.name(node), x_m, y_m, z_m=0.0, heading_rad=heading_rad,
             sigma_major_m=0.45 + 0.05 * node + grown_m,
             sigma_minor_m=0.25 + 0.02 * node + grown_m, sigma_angle_rad=0.4 * node,
             sigma_heading_rad=0.08 + 0.02 * node, status=status, motion_s=time_s - lost_s,

@@ -25,7 +25,7 @@ def convert(
     out: Annotated[
         Path,
         typer.Option(
-            metavar="PATH", help="Output: a file for mcap, geojson, gpx; else a directory."
+            metavar="PATH", help="Output: a file for mcap, geojson, gpx, rrd; else a directory."
         ),
     ],
     source_format: Annotated[
@@ -61,7 +61,7 @@ def convert(
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
 ) -> None:
-    """Convert a recording or an estimate: MCAP, TUM (evo), GeoJSON, GPX, CSV with names.
+    """Convert a recording or an estimate: MCAP, TUM (evo), GeoJSON, GPX, CSV, ROS 2, Rerun.
 
     With --landmarks, the landmark presses of the wearers and a table of surveyed positions become
     the truth of the run. docs/exchange.md describes the formats.

@@ -50,7 +50,8 @@ def demo(
     scenario: Annotated[
         str,
         typer.Option(
-            metavar="NAME", help="paper, lab, straight (walks); bench, turntable (tests)."
+            metavar="NAME",
+            help="paper, lab, building, straight (walks); bench, turntable (tests).",
         ),
     ] = "paper",
     fault: Faults = None,

@@ -18,7 +18,8 @@ def emulate(
     scenario: Annotated[
         str,
         typer.Option(
-            metavar="NAME", help="paper, lab, straight (walks); bench, turntable (tests)."
+            metavar="NAME",
+            help="paper, lab, building, straight (walks); bench, turntable (tests).",
         ),
     ] = "paper",
     speed: Annotated[

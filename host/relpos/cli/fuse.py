@@ -150,6 +150,7 @@ def fuse(
         screen=terminal,
         record=record,
         foxglove=foxglove,
+        debrief=report is not False,
     )
     options.check()
     job = Job(source, estimator, chosen, seed, out or _default_out(source), smooth=smooth)
@@ -431,8 +432,11 @@ def fuse_live(
 
     description = description or Description(name=_base_name(job.source))
     nodes = description.nodes
+    name = description.name or _base_name(job.source)
+    # A port's name ("6") says nothing to who looks at the page.
+    unnamed = source.is_now and emulated is None and name == _base_name(job.source)
     plan = SessionPlan(
-        description.name or _base_name(job.source),
+        f"{datetime.now().astimezone():%Y-%m-%d %H:%M}" if unnamed else name,
         job.out,
         description,
         lambda known: job.make(known, nodes),
@@ -455,8 +459,31 @@ def fuse_live(
         raise failure
     last = [session.last] if session.last is not None else []
     _print_outcome(
-        job, FusionSummary(plan.name, session.counters, last, session.estimates), as_json=as_json
+        job, FusionSummary(name, session.counters, last, session.estimates), as_json=as_json
     )
+    wanted = options.view and options.debrief and not as_json
+    if wanted and source.is_now and session.estimates and can_report():
+        _debrief(job, options)
+
+
+def _debrief(job: Job, options: live.Options) -> None:
+    """Write the page of a session that was shown, its log included, and open it on a desktop."""
+    from relpos import api
+    from relpos.errors import RelposError
+    from relpos.evaluation import report as reports
+    from relpos.evaluation.result import read_result
+    from relpos.runs.log import read_log
+
+    page = job.out / "index.html"
+    try:
+        with output.working("writing the debrief"):
+            run, result = api.load(job.out / "received"), read_result(job.out)
+            reports.write(reports.gather(run, result, log=read_log(job.out)), page)
+    except RelposError as error:
+        output.remark(f"no debrief page: {error}")
+        return
+    output.remark(f"debrief: {page}")
+    live.open_browser(options, page.resolve().as_uri())
 
 
 @dataclass(frozen=True)
@@ -498,10 +525,17 @@ def _print_outcome(
             }
         )
         return
-    output.print_last_pairs(f"{outcome.name}: {job.estimator}", outcome.estimates)
+    seconds = [] if evaluation is None else evaluation.metrics.time_s.tolist()
+    output.print_last_pairs(
+        f"{outcome.name}: {job.estimator}",
+        outcome.estimates,
+        seconds[-1] if seconds else None,
+    )
     if evaluation is not None:
         output.print_metrics(f"{outcome.name}: scored", evaluation.metrics, reckoned)
         output.print_iso(evaluation.iso)
+        if evaluation.vertical is not None and evaluation.vertical.has_floors:
+            output.print_vertical(evaluation.vertical)
         if evaluation.bound is not None:
             output.print_bound(evaluation.bound)
     for text in time_offsets(outcome.estimates[-1]) if outcome.estimates else ():

@@ -114,6 +114,8 @@ class Options:
     """The terminal is drawn upon: nothing else may be printed until the session is over."""
     record: Path | None = None
     foxglove: str | None = None
+    debrief: bool = True
+    """Whether a session on a port that was shown ends with its page."""
     mission: MissionPlan | None = None
     """Its key signs its devices' tokens."""
 
@@ -243,14 +245,20 @@ def cot_sink(url: str, pins: Sequence[str], *, replayed: bool) -> MakeSink:
     return make
 
 
-def open_page(options: Options, hello: Hello) -> WebView:
-    """Serve the page, print its address, and open it on a desktop."""
+def open_page(options: Options, hello: Hello, folder: Path | None = None) -> WebView:
+    """Serve the page, print its address, and open it on a desktop.
+
+    ``folder`` is that of a mission that is played once more.
+    """
     from relpos.view import access as doors
     from relpos.view.devices import Role
     from relpos.view.web import WebView
 
     door, access = doors.listen(options.view_listen)
-    access = replace(access, key=None if options.mission is None else options.mission.folder.key)
+    if options.mission is not None:
+        mission = options.mission.folder
+        access, folder = replace(access, key=mission.key), mission.path
+    access = replace(access, folder=folder)
     if options.https:
         access = replace(access, certificate=doors.make_certificate(access.hosts))
     page = WebView(door, access, hello)
@@ -261,12 +269,17 @@ def open_page(options: Options, hello: Hello) -> WebView:
         output.remark(doors.qr_terminal(access.url("/phone", role=Role.ACKNOWLEDGE)))
     else:
         output.remark("for phones and other computers: --view-listen 0.0.0.0")
+    open_browser(options, access.url())
+    return page
+
+
+def open_browser(options: Options, url: str) -> None:
+    """Open an address where that is wanted, and visible."""
     wanted = options.open_browser
     if wanted or (wanted is None and _has_desktop()):
         import webbrowser
 
-        webbrowser.open(access.url())
-    return page
+        webbrowser.open(url)
 
 
 def _has_desktop() -> bool:

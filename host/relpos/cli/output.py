@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from relpos.evaluation.metrics import Metrics
     from relpos.evaluation.regions import Ambiguity
     from relpos.evaluation.scoring import Evaluation
+    from relpos.evaluation.vertical import Vertical
     from relpos.fusion.estimator import Estimate
 
 T = TypeVar("T")
@@ -152,6 +153,8 @@ def print_evaluation(score: Evaluation) -> None:
     if score.ambiguity is not None:
         print_ambiguity(score.ambiguity)
     print_iso(score.iso)
+    if score.vertical is not None:
+        print_vertical(score.vertical)
     if score.bound is not None:
         print_bound(score.bound)
 
@@ -191,6 +194,12 @@ def print_iso(iso: Assessment) -> None:
     console.print(table)
 
 
+def print_vertical(found: Vertical) -> None:
+    """Print heights, floors and stairs against the truth, a figure a line."""
+    for name, words in found.lines():
+        print(f"{name:<25}{words}")
+
+
 def print_metrics(title: str, metrics: Metrics, baseline: Metrics | None = None) -> None:
     """Print a table per pair, the team's figures and how they go over time."""
     from rich.console import Console
@@ -198,6 +207,8 @@ def print_metrics(title: str, metrics: Metrics, baseline: Metrics | None = None)
 
     # A pipe has no width, and 80 columns are too narrow for the table.
     console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+    if metrics.time_s.size:
+        title += f", the end at {metrics.time_s[-1]:.0f} s"
     table = Table(title=title, caption=f"{metrics.epochs} whole seconds scored")
     table.add_column("pair")
     columns = ["estimated (end)", "true (end)", "error (end)", "RMSE", "mean error", "body frame"]
@@ -284,8 +295,10 @@ def print_ambiguity(ambiguity: Ambiguity) -> None:
     )
 
 
-def print_last_pairs(title: str, estimates: Sequence[Estimate]) -> None:
-    """Print the relative positions at the end, with their uncertainty."""
+def print_last_pairs(
+    title: str, estimates: Sequence[Estimate], scored_s: float | None = None
+) -> None:
+    """Print the relative positions at the end, or at the last second that is scored."""
     from rich.console import Console
     from rich.table import Table
 
@@ -294,6 +307,8 @@ def print_last_pairs(title: str, estimates: Sequence[Estimate]) -> None:
         console.print(f"{title}: nothing could be estimated")
         return
     last = estimates[-1]
+    if scored_s is not None:
+        last = min(reversed(estimates), key=lambda estimate: abs(estimate.time_s - scored_s))
     console.print(f"{title}, at {last.time_s:.1f} s")
     table = Table()
     for column in ("pair", "distance", "sigma", "bearing", "sigma "):

@@ -17,7 +17,8 @@ def simulate(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="paper, paper-p1, paper-a, paper-h, paper-h2, lab or mission-CONDITION.",
+            help="paper, paper-p1, paper-a, paper-h, paper-h2, lab, mission-CONDITION, building "
+            "or building-CONDITION.",
         ),
     ] = None,
     recordings: Annotated[

@@ -143,7 +143,7 @@ class UwbAir:
             self.counts["absent"] += 1
         else:
             measured = self._world.measure_range(
-                self._rng, self._distance_m(initiator, responder, time_us)
+                self._rng, *(self._position_m(tag, time_us) for tag in (initiator, responder))
             )
             if measured is None:
                 self.counts["undetected"] += 1

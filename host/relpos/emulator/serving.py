@@ -70,7 +70,7 @@ def record_team(config: TeamConfig) -> Run:
                 if port.exhausted:
                     break
             terminal.join()
-        priors = team.priors()
+        priors, building = team.priors(), team.world.building
         return Run(
             name=f"{config.scenario}-{config.board}-{config.seed}",
             description=Description(
@@ -83,7 +83,9 @@ def record_team(config: TeamConfig) -> Run:
                     node: NodeInfo(stature_m=walker.person.stature_m)
                     for node, walker in team.walkers.items()
                 },
+                floors_m=() if building is None else building.floors_m,
             ),
+            events=tuple(team.episodes()),
             measurements=tuple(sorted(measurements, key=lambda m: m.time_s)),
             statuses=tuple(sorted(statuses, key=lambda s: s.time_s)),
             steps=tuple(sorted(steps, key=lambda s: s.time_s)),

@@ -16,7 +16,7 @@ from relpos.calibration.steps import LEG_OF_STATURE
 from relpos.errors import DataError
 from relpos.link import xbee as api
 from relpos.link.beacon import BEACON_PERIOD_S, BeaconSchedule
-from relpos.measurements import Prior, Truth
+from relpos.measurements import Event, Prior, Truth
 from relpos.protocol import messages as wire
 from relpos.simulation.team import Scenario, make_team
 from relpos.simulation.walker import RATE_HZ, WalkerTruth
@@ -235,8 +235,9 @@ class EmulatedTeam:
                                walker.heading_rad))  # fmt: skip
 
     def truth(self, period_s: float = TRUTH_PERIOD_S) -> list[Truth]:
-        """True poses of all nodes, by time."""
+        """True poses of all nodes, by time; in a building heights over the start's."""
         rows = []
+        indoors = self.world.building is not None
         stride = max(round(period_s * RATE_HZ), 1)
         for node, walker in self.walkers.items():
             rows += [
@@ -246,10 +247,22 @@ class EmulatedTeam:
                     float(walker.position_m[k, 0]),
                     float(walker.position_m[k, 1]),
                     math.remainder(float(walker.heading_rad[k]), 2.0 * math.pi),
-                    float(walker.position_m[k, 2]),
+                    float(walker.position_m[k, 2])
+                    - (walker.person.sensor_height_m if indoors else 0.0),
                 )
                 for k in range(0, len(walker.time_s), stride)
             ]
+        return sorted(rows, key=lambda row: row.time_s)
+
+    def episodes(self) -> list[Event]:
+        """What everybody truly does, by time; empty where there are no stairs."""
+        rows = []
+        for node, walker in self.walkers.items() if self.world.building is not None else ():
+            rows.append(Event(0.0, node, "episode", "level"))
+            for flight in walker.flights:
+                word = "up" if flight.storeys > 0 else "down"
+                rows.append(Event(flight.begin_s, node, "episode", word))
+                rows.append(Event(flight.end_s, node, "episode", "level"))
         return sorted(rows, key=lambda row: row.time_s)
 
     def priors(self) -> list[Prior]:

@@ -14,7 +14,7 @@ length of (e_x, e_y), its vertical one v that of e_z, its spherical one s that o
 * coverage (8.12), relative accuracy (8.13) and latency (8.14).
 
 Variances and covariances divide by the number of errors, so that RMS^2 = mean^2 + variance.
-Floor and zone detection (8.2, 8.3) need a map, which this system does without.
+Floor detection (8.2) is in :mod:`relpos.evaluation.vertical`; zone detection (8.3) needs a map.
 
 **Frames.** The standard expects positions in the building's frame. A relative estimate has none of
 its own, so errors can be stated in three ways, and every figure says in which:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from relpos import tracks
 from relpos.errors import DataError
-from relpos.evaluation import consistency, iso18305, metrics, regions, summary
+from relpos.evaluation import consistency, iso18305, metrics, regions, summary, vertical
 
 if TYPE_CHECKING:
     from relpos.evaluation.bounds import Bound, Totals
@@ -25,7 +25,7 @@ class Evaluation:
     ``metrics`` are the run format's four, per pair and over time; ``iso`` those of ISO/IEC 18305.
     ``nees_position`` and ``nees_heading`` need the start of every node, so that absolute poses can
     be compared with the truth; ``ambiguity`` is None where no node was ambiguous; ``bound`` is
-    that of a simulated run, as totals and over time.
+    that of a simulated run, as totals and over time; ``vertical`` is None without true heights.
     """
 
     run: str
@@ -36,6 +36,7 @@ class Evaluation:
     nees_heading: consistency.Nees | None = None
     ambiguity: regions.Ambiguity | None = None
     bound_over_time: Bound | None = None
+    vertical: vertical.Vertical | None = None
 
     @property
     def bound(self) -> Totals | None:
@@ -52,6 +53,7 @@ class Evaluation:
             "alternatives": summary.ambiguity_as_json(self.ambiguity),
             "iso_18305": summary.iso_as_json(self.iso),
             "bound": None if (bound := self.bound) is None else asdict(bound),
+            "vertical": summary.vertical_as_json(self.vertical),
         }
 
     def __str__(self) -> str:
@@ -70,6 +72,11 @@ class Evaluation:
             words = f"  horizontal error        mean {_metres(flat.mean_m)}, RMS "
             words += f"{_metres(flat.rms_m)}, CE50 {_metres(flat.e50_m)}, CE95 "
             lines.append(words + f"{_metres(flat.e95_m)} ({frame.replace('_', ' ')})")
+        if self.vertical is not None:
+            lines.append(
+                f"  vertical error          {_metres(self.vertical.relative_rmse_m)} RMSE between "
+                f"two, VE95 {_metres(self.vertical.ve95_m)}"
+            )
         bound = self.bound
         if bound is not None:
             lines.append(
@@ -117,6 +124,7 @@ def evaluate(run: Run, result: Result, *, bound: bool = True) -> Evaluation:
             estimates, truth, run.ranges, starts_known=bool(priors) and not _common(run, priors)
         ),
         bound_of(run) if bound else None,
+        vertical.score(estimates, truth, run.description.floors_m, run.events),
     )
 
 

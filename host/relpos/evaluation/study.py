@@ -19,8 +19,9 @@ import numpy.typing as npt
 
 from relpos import fusion, tracks
 from relpos.errors import RelposError
-from relpos.evaluation import bounds, metrics
+from relpos.evaluation import bounds, metrics, vertical
 from relpos.evaluation.executors import run_all
+from relpos.evaluation.vertical import Vertical
 from relpos.simulation.scenarios import simulate
 
 Floats = npt.NDArray[np.float64]
@@ -67,6 +68,7 @@ class Score:
     failure: str = ""
     ok_over_3_sigma: float = math.nan
     ok_over_2_m: float = math.nan
+    vertical: Vertical | None = None
 
 
 def score(case: Case, seed: int) -> Score:
@@ -82,9 +84,10 @@ def score(case: Case, seed: int) -> Score:
     except RelposError as error:
         estimates, failure = [], str(error)
     busy_s = time.perf_counter() - started
+    truth = tracks.true_tracks(run.truth)
     result = metrics.evaluate(
         tracks.estimated_tracks(estimates),
-        tracks.true_tracks(run.truth),
+        truth,
         tracks.estimated_pairs(estimates),
     )
     return Score(
@@ -101,6 +104,7 @@ def score(case: Case, seed: int) -> Score:
         failure,
         result.ok_over_3_sigma,
         result.ok_over_2_m,
+        vertical.score(estimates, truth, run.floors_m, run.events),
     )
 
 

@@ -10,6 +10,7 @@ from relpos.evaluation import consistency
 from relpos.evaluation.iso18305 import Accuracy, Assessment, Frame, Latency, Magnitudes
 from relpos.evaluation.metrics import Metrics
 from relpos.evaluation.regions import Ambiguity
+from relpos.evaluation.vertical import Vertical
 
 FIGURES = (
     "relative_distance_rmse_m",
@@ -107,6 +108,16 @@ def latency_as_json(latency: Latency | None) -> dict[str, float | None] | None:
         return None
     return {
         name: figure(getattr(latency, name)) for name in latency.__slots__ if name != "computing_s"
+    }
+
+
+def vertical_as_json(found: Vertical | None) -> dict[str, Any] | None:
+    """Return the figures of heights, floors and stairs; None where the truth has no height."""
+    if found is None:
+        return None
+    values = {name: getattr(found, name) for name in found.__slots__}
+    return {
+        name: figure(value) if isinstance(value, float) else value for name, value in values.items()
     }
 
 

@@ -41,7 +41,9 @@ _SUFFIXES = {
     ".json": Format.GEOJSON,
     ".gpx": Format.GPX,
 }
-_FILES = (Format.MCAP, Format.GEOJSON, Format.GPX)
+_ONE_WAY = (Format.ROSBAG2, Format.RRD)
+"""Formats that are written for other tools alone."""
+_FILES = (Format.MCAP, Format.GEOJSON, Format.GPX, Format.RRD)
 """Formats that are one file; the others are directories."""
 
 
@@ -64,6 +66,8 @@ class Hints:
 def read(source: Path, hints: Hints) -> Content:
     """Read whatever ``source`` is; DataError where it is nothing that is known."""
     form = hints.format or _format_of(source)
+    if form in _ONE_WAY:
+        raise DataError(f"{source}: {form} is written, not read; convert its source instead")
     if form is Format.MCAP:
         return _started(_read_mcap(source), hints)
     if form in (Format.RUN, Format.CSV):
@@ -285,6 +289,8 @@ def _make_room(out: Path, form: Format, *, overwrite: bool) -> None:
     if not overwrite:
         raise DataError(f"{out}: is there already and not empty (--overwrite replaces it)")
     old = list(out.glob("*.tum")) if form is Format.TUM else []
+    if form is Format.ROSBAG2:
+        old = [out / "metadata.yaml", *out.glob("*.mcap")]
     if form in (Format.RUN, Format.CSV):
         names = ("run.toml", "imu.csv", "landmarks.csv", *TABLE_NAMES, *_ESTIMATE_TABLES)
         old = [out / f"{name}{packed}" for name in names for packed in ("", ".gz")]
@@ -324,9 +330,7 @@ def _write_mcap(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
         part.replace(out)
     finally:
         part.unlink(missing_ok=True)
-    if content.start_unix_s is None:
-        remarks.append("its clock begins in 1970: say when the run's second 0 was (--start)")
-    return [out], remarks
+    return [out], [*remarks, *_undated(content)]
 
 
 def _write_tum(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
@@ -398,6 +402,28 @@ def _write_gpx(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
     return files, remarks
 
 
+def _write_rosbag2(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
+    from relpos.exchange.rosbag2 import write_rosbag2
+
+    if not any(out.iterdir()):
+        out.rmdir()  # The library makes it itself.
+    write_rosbag2(out, content)
+    return sorted(out.iterdir()), _undated(content)
+
+
+def _write_rrd(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
+    from relpos.exchange.rrd import write_rrd
+
+    write_rrd(out, content)
+    return [out], []
+
+
+def _undated(content: Content) -> list[str]:
+    if content.start_unix_s is not None:
+        return []
+    return ["its clock begins in 1970: say when the run's second 0 was (--start)"]
+
+
 _WRITERS: dict[Format, Callable[[Content, Path, Sequence[Pin]], _Written]] = {
     Format.RUN: _write_run,
     Format.MCAP: _write_mcap,
@@ -405,4 +431,6 @@ _WRITERS: dict[Format, Callable[[Content, Path, Sequence[Pin]], _Written]] = {
     Format.GEOJSON: _write_geojson,
     Format.GPX: _write_gpx,
     Format.CSV: _write_csv,
+    Format.ROSBAG2: _write_rosbag2,
+    Format.RRD: _write_rrd,
 }

@@ -14,6 +14,8 @@ class Format(StrEnum):
     GEOJSON = "geojson"
     GPX = "gpx"
     CSV = "csv"
+    ROSBAG2 = "rosbag2"
+    RRD = "rrd"
 
 
 class Kind(StrEnum):

@@ -79,6 +79,7 @@ def _last_positions(content: Content, frame: MapFrame) -> list[dict[str, Any]]:
             "course_deg": _course(n.heading_rad, frame),
             "sigma_major_m": _rounded(n.sigma_major_m),
             "sigma_minor_m": _rounded(n.sigma_minor_m),
+            **_vertical(n),
         }
         where = _positions([Point(time_s, node, n.x_m, n.y_m, n.z_m)], frame)[0]
         features.append(_feature("Point", where, {"kind": "position", **who, **figures}))
@@ -87,6 +88,14 @@ def _last_positions(content: Content, frame: MapFrame) -> list[dict[str, Any]]:
             about = {"kind": "region", **who, "probability": REGION}
             features.append(_feature("Polygon", [ring], about))
     return features
+
+
+def _vertical(n: NodeEstimate) -> dict[str, float | int | None]:
+    """Return height over the start and floor, where the estimator knows of them."""
+    found: dict[str, float | int | None] = {}
+    if n.z_m or n.sigma_z_m:
+        found |= {"height_m": _rounded(n.z_m), "sigma_height_m": _rounded(n.sigma_z_m)}
+    return found if n.floor is None else found | {"floor": n.floor}
 
 
 def _region(n: NodeEstimate, frame: MapFrame) -> list[list[float]]:

@@ -21,6 +21,7 @@ from relpos.fusion.estimator import (
     NodeEstimate,
     NodeStatus,
     Presence,
+    Vertical,
     pairs_of,
     refuse_unmoved,
 )
@@ -130,8 +131,8 @@ class DeadReckoning:
                 case Ranging():
                     self._own["ranges_unused"] += len(step.ranges)
                 case Sensed(measurement=Height() as height):
-                    self._nodes[height.node].presence.height_m = height.height_m
-                    self._nodes[height.node].presence.sigma_height_m = height.sigma_m or 0.0
+                    vertical = Vertical(height.height_m, height.sigma_m or 0.0)
+                    self._nodes[height.node].presence.vertical = vertical
                 case Sensed():
                     self._own["headings_unused"] += 1
                 case Epoch():
@@ -149,7 +150,7 @@ class DeadReckoning:
                     name, node.x_m, node.y_m, math.remainder(node.heading_rad, 2.0 * math.pi),
                     float(p[0, 0]), float(p[1, 1]), float(p[0, 1]), math.sqrt(float(p[2, 2])),
                     node.presence.status if node.placed else NodeStatus.UNLOCATED,
-                    node.presence.height_m, node.presence.sigma_height_m,
+                    *node.presence.vertical,
                 )
             )  # fmt: skip
         self._epoch_s = time_s

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from math import atan2, hypot, inf, pi, sqrt
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from relpos.errors import RelposError
 from relpos.fusion.models.motion import unseen_variance
@@ -34,6 +34,32 @@ class NodeStatus(StrEnum):
     LOST = "lost"
 
 
+class Episode(StrEnum):
+    """What a node's wearer does, as far as height tells; the words of ``estimate.csv``."""
+
+    LEVEL = "level"
+    UP = "up"
+    DOWN = "down"
+    LIFT = "lift"
+    DISTURBED = "disturbed"
+    FALLING = "falling"
+
+
+class Vertical(NamedTuple):
+    """What is known of a node's height; the last fields of :class:`NodeEstimate`."""
+
+    z_m: float = 0.0
+    sigma_z_m: float = 0.0
+    episode: Episode | None = None
+    episode_probability: float | None = None
+    floor: int | None = None
+    floor_probability: float | None = None
+
+
+AT_THE_START = Vertical()
+"""Nobody has reported any height."""
+
+
 def ellipse_axes(xx: float, yy: float, xy: float) -> tuple[float, float, float]:
     """Return a covariance's deviations along its long and short axis, and the long one's angle."""
     middle, radius = 0.5 * (xx + yy), hypot(0.5 * (xx - yy), xy)
@@ -47,7 +73,8 @@ class NodeEstimate:
 
     The 2 x 2 position covariance is given by its three distinct entries in m^2. An
     ``unlocated`` node carries the mean of what is known of it and a covariance to match; its
-    numbers are no position to rely on.
+    numbers are no position to rely on. Episode and floor (0 is the start's) are None where nothing
+    is known of them.
     """
 
     node: int
@@ -61,6 +88,15 @@ class NodeEstimate:
     status: NodeStatus
     z_m: float = 0.0
     sigma_z_m: float = 0.0
+    episode: Episode | None = None
+    episode_probability: float | None = None
+    floor: int | None = None
+    floor_probability: float | None = None
+
+    @property
+    def vertical(self) -> Vertical:
+        """Its height, episode and floor."""
+        return Vertical(*(getattr(self, name) for name in Vertical._fields))
 
     @property
     def sigma_major_m(self) -> float:
@@ -221,8 +257,7 @@ of them (``mission-gap-20``, 300 s: 0.76 m where it begins at the last report, 0
 class Presence:
     """What every estimator keeps of a node beside its pose: its height, and its last motion."""
 
-    height_m: float = 0.0
-    sigma_height_m: float = 0.0
+    vertical: Vertical = AT_THE_START
     news_s: float = -inf
     silent_epochs: int = 0
     diffused_s: float = -inf
@@ -288,12 +323,10 @@ def time_offsets(estimate: Estimate) -> list[str]:
     return list(dict.fromkeys(told))
 
 
-def unlocated(node: int, height_m: float = 0.0, sigma_height_m: float = 0.0) -> NodeEstimate:
+def unlocated(node: int, vertical: Vertical = AT_THE_START) -> NodeEstimate:
     """Return the estimate of a node of which nothing but its height is known."""
-    return NodeEstimate(
-        node, 0.0, 0.0, 0.0, inf, inf, 0.0, ANY_ANGLE_RAD, NodeStatus.UNLOCATED,
-        height_m, sigma_height_m,
-    )  # fmt: skip
+    status = NodeStatus.UNLOCATED
+    return NodeEstimate(node, 0.0, 0.0, 0.0, inf, inf, 0.0, ANY_ANGLE_RAD, status, *vertical)
 
 
 def refuse_unmoved(moved: bool) -> None:

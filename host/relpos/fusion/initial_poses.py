@@ -121,7 +121,7 @@ def sought_node(initialiser: Initialiser, node: int, presence: Presence) -> Node
     """Return what the initialiser knows of a node that it seeks."""
     mixture = initialiser.mixture
     if mixture is None or node not in mixture.nodes:
-        return unlocated(node, presence.height_m, presence.sigma_height_m)
+        return unlocated(node, presence.vertical)
     n = mixture.nodes.index(node)
     own = slice(POSE * n, POSE * (n + 1))
     belief = belief_of(
@@ -134,5 +134,5 @@ def sought_node(initialiser: Initialiser, node: int, presence: Presence) -> Node
     return NodeEstimate(
         node, belief.x_m, belief.y_m, belief.heading_rad, float(spread[0, 0]),
         float(spread[1, 1]), float(spread[0, 1]), belief.sigma_heading_rad, status,
-        presence.height_m, presence.sigma_height_m,
+        *presence.vertical,
     )  # fmt: skip

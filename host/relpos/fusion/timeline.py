@@ -64,6 +64,8 @@ class Advance(NamedTuple):
     sigma_y_m: float | None = None
     sigma_theta_rad: float | None = None
     sigma_x_alone_m: float | None = None
+    steps: float | None = None
+    """The piece's share of the steps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -484,17 +486,18 @@ def _advance(track: _Track, node: int, until_s: float, steps: list[Advance]) -> 
             track.left = rest, rest_share
             track.reached_s = until_s
         part = sqrt(share)
-        sigmas = (
-            None if sigma is None else sigma * part
-            for sigma in (
-                chord.sigma_x_m, chord.sigma_y_m, chord.sigma_theta_rad, chord.sigma_x_alone_m,
-            )
-        )  # fmt: skip
         steps.append(
             Advance(
-                end_s, node, duration_s, piece.dx_m, piece.dy_m, piece.dtheta_rad, share, *sigmas
+                end_s, node, duration_s, piece.dx_m, piece.dy_m, piece.dtheta_rad, share,
+                _times(chord.sigma_x_m, part), _times(chord.sigma_y_m, part),
+                _times(chord.sigma_theta_rad, part), _times(chord.sigma_x_alone_m, part),
+                _times(chord.steps, share),
             )
-        )
+        )  # fmt: skip
+
+
+def _times(value: float | None, factor: float) -> float | None:
+    return None if value is None else value * factor
 
 
 _time_of = itemgetter(0)

@@ -206,6 +206,7 @@ class Decoder:
             vector("acceleration", "m_s2", 1.0 / count) if count else None,
             vector("angular_rate", "rad_s", 1.0 / count) if count else None,
             vector("field", "ut", 1.0) if values["field_readings"] else None,
+            values["field_readings"],
         )
 
     def _open(self, data: bytes) -> wire.Frame:
@@ -393,6 +394,7 @@ class Decoder:
                 values["gain_version"],
                 values["state"] == wire.MotionState.MOVING,
                 math.sqrt(along_m2 + scale_m**2),
+                round(total("steps")),
             )
         ]
         if quality & wire.Quality.HEIGHT_VALID:

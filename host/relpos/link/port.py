@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -23,6 +24,8 @@ BAUD = 38_400
 READ_TIMEOUT_S = 0.05
 """Longest wait for bytes; bounds the delay with which silence is noticed."""
 READ_BYTES = 4096
+PSEUDO_TERMINALS = ("/dev/pts/", "/dev/ttys")
+"""Of Linux and macOS."""
 UNMARKED_FRAMES = 10
 """A reader that joins an emulated team in the middle gets a few frames before the first mark."""
 
@@ -257,6 +260,21 @@ def open_port(port: str, baud: int = BAUD) -> serial.Serial:
 def _cannot_open(port: str, error: Exception) -> DeviceError:
     reason = _reason(error) if "://" in port or Path(port).exists() else "no such device"
     return DeviceError(f"{port}: cannot open the serial port: {reason}")
+
+
+def incarnation(port: str) -> object:
+    """Return what tells the pseudo-terminal behind the name ``port`` from the next one there.
+
+    None for any other port. Numbers of pseudo-terminals are given again at once, and to whoever
+    asks: only a link to one that was made anew is known to lead to its successor.
+    """
+    if not os.path.realpath(port).startswith(PSEUDO_TERMINALS):
+        return None
+    try:
+        found = os.lstat(port)
+    except OSError:
+        return port
+    return (found.st_ino, found.st_ctime_ns) if stat.S_ISLNK(found.st_mode) else port
 
 
 def send(device: Line, data: bytes) -> None:

@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from relpos.said import Said
+
 STATES = ("", "standby", "entered", "withdrawing", "out")
 """Empty: nobody has said; alarms are raised as for somebody who is in."""
 WAITING = ("standby", "out")
@@ -19,7 +21,40 @@ TEXTS = ("team", "sector", "task")
 MAX_TEXT = 40
 MAX_AIR_BAR = 400.0
 ROLL_CALL_S = 900.0
-BOARD_EVENTS = ("board", "rollcall", "mayday", "evacuate")
+_COUNTS = {"whom": "", "confirmed": 0, "missing": 0, "called": 0}
+OUTCOMES = {
+    "complete": Said(
+        "roll-complete",
+        "{whom}roll call complete: {confirmed} confirmed, {missing} missing of {called}",
+        **_COUNTS,
+    ),
+    "incomplete": Said(
+        "roll-incomplete",
+        "{whom}roll call incomplete: {confirmed} confirmed, {missing} missing of {called}",
+        **_COUNTS,
+    ),
+    "missing": Said(
+        "roll-missing",
+        "{whom}roll call missing: {confirmed} confirmed, {missing} missing of {called}",
+        **_COUNTS,
+    ),
+}
+STATE_WORDS = {
+    "standby": Said("standby", "{whom}state standby", whom=""),
+    "entered": Said("entered", "{whom}state entered", whom=""),
+    "withdrawing": Said("withdrawing", "{whom}state withdrawing", whom=""),
+    "out": Said("out", "{whom}state out", whom=""),
+}
+BOARD_EVENTS = ("board", "rollcall", "mayday", "evacuate", "marker", "plan")
+SIGNS = {
+    "entrance": Said("marked-entrance", "{whom}marker set: entrance", whom=""),
+    "exit": Said("marked-exit", "{whom}marker set: exit", whom=""),
+    "hydrant": Said("marked-hydrant", "{whom}marker set: hydrant", whom=""),
+    "hazard": Said("marked-hazard", "{whom}marker set: hazard", whom=""),
+    "found": Said("marked-found", "{whom}marker set: found", whom=""),
+}
+MOST_MARKERS = 500
+FARTHEST_M = 1e5
 
 
 class BoardError(ValueError):
@@ -65,6 +100,25 @@ class Evacuation:
 
 
 @dataclass
+class Marker:
+    """A sign on the map, in the common frame."""
+
+    sign: str
+    x_m: float
+    y_m: float
+    by: str
+    unix_s: float
+
+
+@dataclass
+class Plan:
+    """An image under the map; each point is its pixel (right, down) and its place on the map."""
+
+    image: str
+    points: list[list[float]] = field(default_factory=list)
+
+
+@dataclass
 class Board:
     """The board; see the module."""
 
@@ -72,6 +126,8 @@ class Board:
     mayday: dict[int, dict[str, Any]] = field(default_factory=dict)
     roll_call: RollCall | None = None
     evacuation: Evacuation | None = None
+    markers: dict[str, Marker] = field(default_factory=dict)
+    plan: Plan | None = None
 
     def to_message(self) -> dict[str, Any]:
         """Return the message ``board`` of the page's protocol."""
@@ -113,6 +169,8 @@ class Board:
             place.entered_unix_s = event["unix_s"]
         elif changes.get("state") in WAITING:
             place.entered_unix_s = None
+        if list(changes) == ["state"] and changes["state"]:
+            return STATE_WORDS[changes["state"]]
         return ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in changes.items())
 
     def _rollcall(self, event: Mapping[str, Any]) -> str:
@@ -124,7 +182,14 @@ class Board:
                 raise BoardError("within_s: not from 0 to 7200 s")
             emergency = bool(event.get("emergency"))
             self.roll_call = RollCall(event["unix_s"], within_s, event["by"], emergency, nodes)
-            return f"{'emergency ' * emergency}roll call of {len(nodes)}"
+            if emergency:
+                return Said(
+                    "emergency-roll",
+                    "{whom}emergency roll call of {count}",
+                    whom="",
+                    count=len(nodes),
+                )
+            return Said("roll", "{whom}roll call of {count}", whom="", count=len(nodes))
         if call is None or call.ended_unix_s is not None:
             raise BoardError("no roll call is under way")
         if action == "answer":
@@ -136,7 +201,9 @@ class Board:
             call.answers[event["node"]] = {
                 "answer": event["answer"], "by": event["by"], "unix_s": event["unix_s"],
             }  # fmt: skip
-            return f"roll call: {event['answer']}"
+            if event["answer"] == "confirmed":
+                return Said("confirmed", "{whom}roll call: confirmed", whom="")
+            return Said("missing-person", "{whom}roll call: missing", whom="")
         if action != "end":
             raise BoardError("action: start, answer or end")
         said = [call.answers.get(node, {}).get("answer") for node in call.nodes]
@@ -145,28 +212,65 @@ class Board:
             "complete" if all(answer == "confirmed" for answer in said)
             else "incomplete" if None in said else "missing"
         )  # fmt: skip
-        counted = f"{said.count('confirmed')} confirmed, {said.count('missing')} missing"
-        return f"roll call {call.outcome}: {counted} of {len(said)}"
+        return OUTCOMES[call.outcome].filled(
+            confirmed=said.count("confirmed"), missing=said.count("missing"), called=len(said)
+        )
+
+    def _marker(self, event: Mapping[str, Any]) -> str:
+        name = event["id"]
+        if not isinstance(name, str) or not 0 < len(name) <= MAX_TEXT:
+            raise BoardError(f"id: not 1 to {MAX_TEXT} characters")
+        if event.get("action") == "remove":
+            if self.markers.pop(name, None) is None:
+                raise BoardError("no such marker")
+            return Said("unmarked", "{whom}marker removed", whom="")
+        if event.get("sign") not in SIGNS or event.get("action") != "set":
+            raise BoardError(f"sign: none of {', '.join(SIGNS)}")
+        if len(self.markers) >= MOST_MARKERS:
+            raise BoardError(f"more than {MOST_MARKERS} markers")
+        x_m, y_m = _numbers([event.get("x_m"), event.get("y_m")])
+        self.markers[name] = Marker(event["sign"], x_m, y_m, event["by"], event["unix_s"])
+        return SIGNS[event["sign"]]
+
+    def _plan(self, event: Mapping[str, Any]) -> str:
+        action = event.get("action")
+        if action == "set" and isinstance(event.get("image"), str):
+            self.plan = Plan(event["image"])
+            return Said("plan", "{whom}a plan lies under the map", whom="")
+        if self.plan is None:
+            raise BoardError("there is no plan")
+        if action == "remove":
+            self.plan = None
+            return Said("no-plan", "{whom}the plan is removed", whom="")
+        points = event.get("points")
+        if action != "align" or not isinstance(points, list) or len(points) > 3:
+            raise BoardError("action: set, align (with two or three points) or remove")
+        self.plan.points = [_numbers(point, 4) for point in points]
+        return Said("aligned", "{whom}the plan is aligned", whom="") if len(points) > 1 else ""
 
     def _mayday(self, event: Mapping[str, Any]) -> str:
         if event.get("on"):
             self.mayday[event["node"]] = {"by": event["by"], "unix_s": event["unix_s"]}
-            return "MAYDAY"
+            return Said("mayday-of", "{whom}MAYDAY", whom="")
         if self.mayday.pop(event["node"], None) is None:
             raise BoardError("no MAYDAY of that person")
-        return "MAYDAY is over"
+        return Said("mayday-over", "{whom}MAYDAY is over", whom="")
 
     def _evacuate(self, event: Mapping[str, Any]) -> str:
         order, action = self.evacuation, event.get("action")
         if action == "order":
             nodes = [node for node in event["nodes"] if isinstance(node, int)]
-            self.evacuation = Evacuation(event["unix_s"], event["by"], nodes)
-            return f"EVACUATE {len(nodes)}: order by radio and on phones"
+            if order is None:
+                order = self.evacuation = Evacuation(event["unix_s"], event["by"], [])
+            # Who was called out before, and has answered, stays called out.
+            order.nodes = sorted({*order.nodes, *nodes})
+            text = "{whom}EVACUATE {count}: order by radio and on phones"
+            return Said("evacuate", text, whom="", count=len(nodes))
         if order is None:
             raise BoardError("no evacuation is ordered")
         if action == "end":
             self.evacuation = None
-            return "evacuation is over"
+            return Said("evacuated", "{whom}evacuation is over", whom="")
         if event["node"] not in order.nodes:
             raise BoardError("that person is not called out")
         if action == "delivered":
@@ -175,4 +279,15 @@ class Board:
         if action != "acknowledged":
             raise BoardError("action: order, delivered, acknowledged or end")
         order.acknowledged[event["node"]] = {"by": event["by"], "unix_s": event["unix_s"]}
-        return "evacuation understood"
+        return Said("understood", "{whom}evacuation understood", whom="")
+
+
+def _numbers(values: Any, count: int = 2) -> list[float]:
+    """Return that many finite numbers. BoardError."""
+    good = isinstance(values, list) and len(values) == count
+    if not good or not all(
+        isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= FARTHEST_M
+        for v in values
+    ):
+        raise BoardError(f"not {count} numbers up to {FARTHEST_M:.0f}")
+    return [float(value) for value in values]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from relpos.fusion.estimator import Estimate, MagneticNorth, NodeEstimate, NodeStatus
 from relpos.live.alarms import Alarms, Condition, KnownAlert
@@ -253,11 +253,16 @@ def _shown_north(shown: MagneticNorth | None, known: MagneticNorth | None) -> Ma
     return MagneticNorth(shown.bearing_rad, known.sigma_rad)
 
 
-def _pose(at: NodeEstimate) -> dict[str, float]:
+def _pose(at: NodeEstimate) -> dict[str, Any]:
     return {
         "x_m": at.x_m,
         "y_m": at.y_m,
         "z_m": at.z_m,
+        "sigma_z_m": at.sigma_z_m,
+        "episode": at.episode and str(at.episode),
+        "episode_probability": at.episode_probability,
+        "floor": at.floor,
+        "floor_probability": at.floor_probability,
         "heading_rad": at.heading_rad,
         "sigma_major_m": at.sigma_major_m,
         "sigma_minor_m": at.sigma_minor_m,

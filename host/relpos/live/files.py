@@ -7,9 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from relpos.fusion.estimator import Estimate
+from relpos.live.log_files import log_row
 from relpos.live.sinks import Sink
+from relpos.live.team_view import LogEntry
 from relpos.measurements import Observation, Step
 from relpos.runs import Description, EstimateFiles, NodeInfo, RunFiles
+from relpos.runs.appending import AppendedTable
+from relpos.runs.log import LOG_COLUMNS, LOG_FILE
 
 
 class FileSink(Sink):
@@ -23,6 +27,7 @@ class FileSink(Sink):
     ) -> None:
         self._description = description
         self._estimates = EstimateFiles(directory)
+        self._log = AppendedTable(directory / LOG_FILE, LOG_COLUMNS, wanted=False)
         self._received = RunFiles(directory / "received", description) if keep_received else None
         self._undescribed: OSError | None = None
         """Why the newest names are not in run.toml yet."""
@@ -57,14 +62,18 @@ class FileSink(Sink):
         """Write an estimate."""
         self._estimates.write(estimate)
 
+    def logged(self, entry: LogEntry) -> None:
+        """Write a line of the log."""
+        self._log.add([log_row(entry)])
+
     def trouble(self) -> str | None:
         """Write what has waited long enough; return the first file that cannot be, and why."""
         if self._received is not None:
             self._received.tick()
-        for table in self._estimates.tables:
+        for table in (*self._estimates.tables, self._log):
             table.tick()
         received = () if self._received is None else self._received.tables
-        for table in (*self._estimates.tables, *received):
+        for table in (*self._estimates.tables, self._log, *received):
             if table.error is not None:
                 why = table.error.strerror or str(table.error)
                 lost = f"; {table.lost_rows} rows are lost" * bool(table.lost_rows)
@@ -82,6 +91,9 @@ class FileSink(Sink):
             if self._received is not None:
                 self._received.close()
         finally:
-            self._estimates.close()
+            try:
+                self._log.close()
+            finally:
+                self._estimates.close()
         if self._undescribed is not None:
             raise self._undescribed

@@ -116,6 +116,7 @@ class PortInput:
         self._remarked = 0
         self._device: serial.Serial | None = serial_port.open_port(port)
         self._waits_on = _descriptor(self._device)
+        self._terminal = serial_port.incarnation(port)
         self._trouble: str | None = None
         self._try_at_s = 0.0
 
@@ -248,7 +249,14 @@ class PortInput:
         if time.monotonic() < self._try_at_s:
             return False
         try:
+            terminal = serial_port.incarnation(self.name)
+            if terminal is not None and terminal == self._terminal:
+                raise DeviceError(
+                    f"{self.name}: the port vanished: a pseudo-terminal does not come back; start "
+                    "anew at the one that relpos emulate prints now"
+                )
             self._device = serial_port.open_port(self.name)
+            self._terminal = terminal
         except DeviceError as error:
             self._trouble = str(error)
             self._try_at_s = time.monotonic() + REOPEN_S

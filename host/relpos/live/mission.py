@@ -142,6 +142,14 @@ class Mission:
                     resumed.tracks.add(int(node), float(time_s), float(x_m), float(y_m))
         return resumed
 
+    def is_running(self) -> bool:
+        """Return whether a session has this mission now."""
+        try:
+            with self.lock():
+                return False
+        except (DataError, OSError):
+            return True
+
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
         """Keep the folder for one session; DataError where another one has it."""

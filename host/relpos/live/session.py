@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from relpos.fusion.estimator import Estimate, time_offsets
+from relpos.fusion.estimator import Estimate, NodeStatus, time_offsets
 from relpos.live.alarms import KnownAlert
 from relpos.live.board import BOARD_EVENTS, Board, BoardError
 from relpos.live.composer import Composer
@@ -31,6 +31,7 @@ from relpos.live.requests import Request, RequestHandler, RequestSource
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert, Level, LogEntry
 from relpos.measurements import Event, Heading, Observation
+from relpos.said import Said, said_of
 
 VIEW_S = 0.05
 """At most twenty views a second: smooth for a walking person, and a twentieth of a second old."""
@@ -42,16 +43,17 @@ BEHIND_S = 5.0
 ASLEEP_S = 5.0
 """The receive thread runs twenty times a second; a longer gap was sleep, or another program."""
 RAISED = {
-    Alert.STILL_WARNING: "has not moved for 20 s",
-    Alert.STILL_ALARM: "has not moved for 30 s",
-    Alert.LOST: "is not heard any more",
-    Alert.MAYDAY: "calls MAYDAY",
+    Alert.STILL_WARNING: Said("still-20", "{name} has not moved for 20 s", name=""),
+    Alert.STILL_ALARM: Said("still-30", "{name} has not moved for 30 s", name=""),
+    Alert.LOST: Said("lost", "{name} is not heard any more", name=""),
+    Alert.MAYDAY: Said("mayday", "{name} calls MAYDAY", name=""),
 }
+MOVES = Said("moves", "{name} moves again", name="")
 CLEARED = {
-    Alert.STILL_WARNING: "moves again",
-    Alert.STILL_ALARM: "moves again",
-    Alert.LOST: "is heard again",
-    Alert.MAYDAY: "has no MAYDAY any more",
+    Alert.STILL_WARNING: MOVES,
+    Alert.STILL_ALARM: MOVES,
+    Alert.LOST: Said("heard", "{name} is heard again", name=""),
+    Alert.MAYDAY: Said("no-mayday", "{name} has no MAYDAY any more", name=""),
 }
 EVENTS = ("acknowledge", "shelve", "name", "device")
 """Requests that change what a mission keeps."""
@@ -117,6 +119,8 @@ class LiveSession:
         # Without a sink that shows it, no view is composed.
         self._shows = any(type(s).updated is not Sink.updated for s in self._sinks)
         self._finishing = False
+        self._ending = False
+        """A user of the page has ended it; who asked is answered first."""
         self._journal: Journal | None = None
         self._unconfirmed: deque[tuple[int, RequestSource, Request, dict[str, Any], int]] = deque()
         """Answers that wait until the disk holds what they confirm."""
@@ -168,6 +172,8 @@ class LiveSession:
                     with self._surviving("update"):
                         self._update()
                     if self._seconds is not None and self._pace() - started_s > self._seconds:
+                        return
+                    if self._ending and not self._unconfirmed:
                         return
                     if not self._lasts and (self._source.over() or self._fusion.failure):
                         return
@@ -302,20 +308,29 @@ class LiveSession:
         # The clock of an emulated team jumps between its packets without any sleep.
         virtual = self._source.link is not None and self._source.link.virtual_s is not None
         if slept_s > ASLEEP_S and not virtual and self._source.is_now:
-            text = f"this computer slept for {slept_s:.0f} s, or was too busy to receive"
+            text = Said(
+                "asleep",
+                "this computer slept for {seconds:.0f} s, or was too busy to receive",
+                seconds=slept_s,
+            )
             self.post("asleep", Level.WARNING, text)
             self._notices.expire("asleep")
         self._composer.alarms.tick(now_s, listening=connected and self._connected)
         self._log_alarms()
         self._connected = connected
-        self.post("port", Level.ALARM, gone and f"{gone}; trying again each second")
+        self.post(
+            "port",
+            Level.ALARM,
+            gone and Said("port", "{trouble}; trying again each second", trouble=gone),
+        )
         if self._source.over() and not self._finishing:
             self._finishing = True
             self._fusion.finish()
-            self.post("over", Level.INFO, "end of the recording: this is the last picture")
+            text = Said("over", "end of the recording: this is the last picture")
+            self.post("over", Level.INFO, text)
         self._watch_fusion()
         silent = not self._composer.monitor.nodes and gone is None
-        text = "no node is heard yet: are the nodes switched on?"
+        text = Said("nobody", "no node is heard yet: are the nodes switched on?")
         self.post("nobody", Level.INFO, text if silent else None)
         self._feed(lambda sink: self.post(f"sink-{id(sink)}", Level.ALARM, sink.trouble()))
         self._notices.drop_expired(now_s)
@@ -323,14 +338,21 @@ class LiveSession:
     def _watch_fusion(self) -> None:
         failure = self._fusion.failure
         if failure is not None:
-            self.post("fusion", Level.ALARM, f"the fusion has failed: {failure}; receiving goes on")
+            text = Said(
+                "fusion-failed",
+                "the fusion has failed: {failure}; receiving goes on",
+                failure=str(failure),
+            )
+            self.post("fusion", Level.ALARM, text)
             return
         newest_s, first_s, behind_s = self._composer.newest_s, self._composer.first_s, 0.0
         if newest_s is not None and first_s is not None:
             behind_s = newest_s - max(self._fusion.newest_s, first_s)
-        text = (
-            f"the fusion is {behind_s:.0f} s behind: positions follow each wearer's own motion "
-            "meanwhile"
+        text = Said(
+            "behind",
+            "the fusion is {seconds:.0f} s behind: positions follow each wearer's own motion "
+            "meanwhile",
+            seconds=behind_s,
         )
         self.post("fusion", Level.WARNING, text if behind_s > BEHIND_S else None)
 
@@ -345,7 +367,9 @@ class LiveSession:
 
     def log(self, kind: str, text: str, node: int | None = None, by: str = "") -> None:
         """Write a line of the log to every sink."""
-        entry = LogEntry(self._source.now_s(), time.time(), kind, text, node, by)
+        entry = LogEntry(
+            self._source.now_s(), time.time(), kind, str(text), node, by, said_of(text)
+        )
         self._feed(lambda sink: sink.logged(entry))
 
     def _log_alarms(self) -> None:
@@ -354,9 +378,9 @@ class LiveSession:
             self._happen({"kind": "alert", "node": node, "alert": after})
             name = self._composer.name(node)
             if after is not None:
-                self.log("alarm", f"{name} {RAISED[after]}", node)
+                self.log("alarm", RAISED[after].filled(name=name), node)
             elif before is not None:
-                self.log("cleared", f"{name} {CLEARED[before]}", node)
+                self.log("cleared", CLEARED[before].filled(name=name), node)
 
     # -- views ------------------------------------------------------------------------------------
 
@@ -407,6 +431,11 @@ class LiveSession:
             return {"acknowledged": done} if request.kind == "acknowledge" else body, 200
         if request.kind in BOARD_EVENTS:
             return self._change_board(request.kind, body)
+        if request.kind == "end":
+            by = str(body.get("by", ""))
+            self.post("ended", Level.WARNING, Said("ended", "the session was ended by {by}", by=by))
+            self._ending = True
+            return {"done": True}, 200
         if not self._source.is_now:
             return {"error": "this is a recording: it takes no presses or headings"}, 409
         handle = self._handler.presses if request.kind == "presses" else self._handler.headings
@@ -424,12 +453,24 @@ class LiveSession:
             for press in new:
                 if isinstance(press, Event):
                     name = self._composer.name(press.node)
-                    self.log("landmark", f"{name} is at landmark {press.value}", press.node)
+                    text = Said(
+                        "landmark",
+                        "{name} is at landmark {landmark}",
+                        name=name,
+                        landmark=press.value,
+                    )
+                    self.log("landmark", text, press.node)
         return reply, 200
 
     def _change_board(self, kind: str, body: dict[str, Any]) -> tuple[dict[str, object], int]:
         everybody = sorted(self._composer.monitor.nodes)
         body = {"by": "", "nodes": everybody, **body}
+        if kind == "marker" and "x_m" not in body and body.get("action") == "set":
+            # "Here", of a wearer's phone.
+            at = self._composer.nowcast.node(body.get("node", 0))
+            if at is None or at.status not in (NodeStatus.OK, NodeStatus.STALE):
+                return {"error": "where you are is not known yet"}, 409
+            body |= {"x_m": at.x_m, "y_m": at.y_m}
         try:
             self._happen({"kind": kind, **body})
         except BoardError as error:
@@ -442,11 +483,16 @@ class LiveSession:
 
     def _words(self, kind: str, body: dict[str, Any]) -> str:
         if kind == "name":
-            return f"node {body['node']} is {body['name']}"
+            return Said("named", "node {node} is {name}", node=str(body["node"]), name=body["name"])
         name = self._composer.name(body["node"])
         if kind == "shelve":
-            return f"alarms of {name} for {body['seconds']:.0f} s"
-        return f"alarm of {name}"
+            return Said(
+                "shelved",
+                "alarms of {name} for {seconds:.0f} s",
+                name=name,
+                seconds=body["seconds"],
+            )
+        return Said("acknowledged", "alarm of {name}", name=name)
 
     # -- events: what the journal holds -----------------------------------------------------------
 
@@ -483,7 +529,8 @@ class LiveSession:
                 self._feed(lambda sink: sink.boarded(self._board.to_message()))
                 if words and self._journal_open:
                     whom = f"{self._composer.name(node)}: " if node else ""
-                    self.log(kind, whom + words, node or None, event.get("by", ""))
+                    text = words.filled(whom=whom) if isinstance(words, Said) else whom + words
+                    self.log(kind, text, node or None, event.get("by", ""))
             case "presses":
                 self._handler.accept(event["ids"])
             case "device":

@@ -15,6 +15,8 @@ from enum import StrEnum
 from functools import lru_cache
 from typing import Any
 
+from relpos.said import said_of
+
 PROTOCOL = 1
 STILL_WARNING_S = 20.0
 STILL_ALARM_S = 30.0
@@ -62,6 +64,8 @@ class LogEntry:
     text: str
     node: int | None = None
     by: str = ""
+    said: Mapping[str, Any] | None = None
+    """Key and values of the text for pages in other languages (:mod:`relpos.said`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +73,9 @@ class Person:
     """One node's wearer.
 
     The pose is the newest (nowcast): it contains all motion up to ``motion_s``. ``status`` is one
-    of ``ok``, ``ambiguous``, ``unlocated``, ``stale``, ``lost``. ``loss`` and ``ranging`` are
-    fractions. ``acknowledged``: a user has confirmed the alert.
+    of ``ok``, ``ambiguous``, ``unlocated``, ``stale``, ``lost``; ``episode`` one of ``level``,
+    ``up``, ``down``, ``lift``, ``disturbed``, ``falling``; ``floor`` 0 is the start's. ``loss`` and
+    ``ranging`` are fractions. ``acknowledged``: a user has confirmed the alert.
     ``shelved_s``: seconds for which the person's alarms are silenced.
     """
 
@@ -79,11 +84,16 @@ class Person:
     x_m: float | None = None
     y_m: float | None = None
     z_m: float | None = None
+    sigma_z_m: float | None = None
     heading_rad: float | None = None
     sigma_major_m: float | None = None
     sigma_minor_m: float | None = None
     sigma_angle_rad: float | None = None
     sigma_heading_rad: float | None = None
+    episode: str | None = None
+    episode_probability: float | None = None
+    floor: int | None = None
+    floor_probability: float | None = None
     status: str = "unlocated"
     motion_s: float | None = None
     seen_s: float | None = None
@@ -181,8 +191,13 @@ class TeamView:
             "north_rad": _plain(self.north_rad),
             "sigma_north_rad": _plain(self.sigma_north_rad),
             "ambiguous": self.ambiguous,
-            "notices": [_fields(notice) for notice in self.notices],
-            "people": [_fields(person) for person in self.people],
+            "notices": [
+                {**_fields(notice), "said": said_of(notice.text)} for notice in self.notices
+            ],
+            "people": [
+                {**_fields(person), "said": [said_of(reason) for reason in person.reasons]}
+                for person in self.people
+            ],
             "ranges": [(m.node, m.peer, _plain(m.range_m), round(m.age_s, 2)) for m in self.ranges],
             "alternatives": [
                 {
@@ -217,6 +232,8 @@ class Hello:
     emulated: bool = False
     replay: bool = False
     recorded_unix_s: float | None = None
+    live_port: int | None = None
+    """Where the mission's page is while its recording is played."""
     limits: Mapping[str, float] = field(
         default_factory=lambda: {
             "still_warning_s": STILL_WARNING_S,

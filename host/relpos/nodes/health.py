@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 
+from relpos.said import Said
+
 SILENT_S = 5.0
 """A node reports its motion every second; five in a row are lost once in 10^8 at 2 % loss."""
 LOSS_YELLOW = 0.10
@@ -89,40 +91,45 @@ def assess(inputs: HealthInputs) -> tuple[Health, list[str]]:
 def _reasons(f: HealthInputs) -> Iterator[tuple[Health, str]]:
     red, yellow = Health.RED, Health.YELLOW
     if f.silent_s > SILENT_S:
-        yield red, f"silent for {f.silent_s:.0f} s"
+        yield red, Said("silent", "silent for {seconds:.0f} s", seconds=f.silent_s)
     elif not f.status:
-        yield yellow, "no status heard yet"
+        yield yellow, Said("no-status", "no status heard yet")
     if f.imu is False and (f.uptime_s or 0.0) < STARTING_S:
-        yield yellow, STARTING
+        yield yellow, Said("starting", STARTING)
     elif f.imu is False:
-        yield red, "inertial sensor missing"
+        yield red, Said("no-imu", "inertial sensor missing")
     if f.loss is not None and f.loss > LOSS_YELLOW:
-        yield (red if f.loss > LOSS_RED else yellow), f"{100 * f.loss:.0f} % of frames lost"
+        colour = red if f.loss > LOSS_RED else yellow
+        yield colour, Said("loss", "{percent:.0f} % of frames lost", percent=100 * f.loss)
     # 0: this board does not measure it.
     if f.battery_v and f.battery_v < BATTERY_YELLOW_V:
-        yield (red if f.battery_v < BATTERY_RED_V else yellow), f"supply {f.battery_v:.2f} V"
+        colour = red if f.battery_v < BATTERY_RED_V else yellow
+        yield colour, Said("supply", "supply {volts:.2f} V", volts=f.battery_v)
     if f.unwanted_start is not None and (f.uptime_s or 0.0) < FRESH_START_S:
-        yield yellow, f"restarted ({f.unwanted_start})"
+        yield yellow, Said("restarted", "restarted ({cause})", cause=f.unwanted_start)
     for there, what in (
         (f.magnetometer, "magnetometer"),
         (f.pozyx, "Pozyx"),
         (f.pressure, "pressure sensor"),
     ):
         if there is False:
-            yield yellow, f"{what} missing"
+            yield yellow, Said("missing", "{part} missing", part=what)
     if f.beacon is False:
-        yield yellow, "receives no beacon"
+        yield yellow, Said("no-beacon", "receives no beacon")
     if (
         f.ranging is not None
         and f.exchanges >= MIN_EXCHANGES
         and f.ranging < RANGING_YELLOW
         and f.pozyx is not False
     ):
-        yield yellow, f"{100 * f.ranging:.0f} % of rangings succeed"
+        yield (
+            yellow,
+            Said("ranging", "{percent:.0f} % of rangings succeed", percent=100 * f.ranging),
+        )
     if f.neighbours == 0 and (f.team or 0) > 1:
-        yield yellow, "no peer in range"
+        yield yellow, Said("no-peer", "no peer in range")
     if f.rssi_dbm is not None and f.rssi_dbm < RSSI_YELLOW_DBM:
-        yield yellow, f"weak radio ({f.rssi_dbm:.0f} dBm)"
+        yield yellow, Said("radio", "weak radio ({dbm:.0f} dBm)", dbm=f.rssi_dbm)
     if f.missed_ticks > 0:
         yield yellow, f"{f.missed_ticks} ticks missed"
     if f.refused_frames > 0:

@@ -28,6 +28,7 @@ BACK_S = 10.0
 """How old ranges may be that are shown."""
 KEPT_BYTES = 32 << 20
 """Unpacked blocks in memory: minutes of a large team."""
+_LISTS = frozenset(topics.LISTS.values())
 _UNREADABLE = (KeyError, ValueError, TypeError, AttributeError, struct.error)
 
 
@@ -59,6 +60,8 @@ class Moments:
         self._blocks: list[_Block] = []
         self._kept: OrderedDict[int, list[Message]] = OrderedDict()
         self._kept_bytes = 0
+        self._without: set[int] = set()
+        """Blocks that were seen to hold no estimate."""
         about: About | None = None
         for number, walk in enumerate(self._walks):
             metadata: dict[str, dict[str, str]] = {}
@@ -134,28 +137,29 @@ class Moments:
         return messages
 
     def estimate_at(self, time_s: float) -> Estimate | None:
-        """Return the newest estimate that was there by then, however old; None before the first."""
-        until_s = time_s
-        for back_s in (1.5, BACK_S, 100.0, 1e3, 1e5):
-            found = self._estimate(time_s - back_s, until_s)
-            if found is not None:
-                return found
-            until_s = time_s - back_s + 1.5
-        return None
+        """Return the newest estimate that was there by then, however old; None before the first.
 
-    def _estimate(self, from_s: float, to_s: float) -> Estimate | None:
-        wanted = set(topics.LISTS.values())
-        found: Estimate | None = None
-        for message in self.between(from_s, to_s, wanted):
-            decoded = _decoded(topics.decode_list, message)
-            if decoded is None:
+        From that moment backwards: of a recording's lists those of one estimate alone are decoded.
+        """
+        until_ns = int((time_s + self.started_unix_s) * 1e9)
+        last = min(bisect_right(self._ends, until_ns), len(self._blocks) - 1)
+        later: list[Any] = []
+        for index in range(last, -1, -1):
+            if index in self._without or self._blocks[index].start_ns > until_ns:
                 continue
-            at_s, kind, rows = decoded
-            if kind is NodeEstimate:
-                found = Estimate(at_s, rows, ())
-            elif found is not None and found.time_s == at_s:
-                found = replace(found, **{topics.LIST_NAMES[kind]: rows})
-        return found
+            lists = [m for m in self._messages(index) if m.topic in _LISTS]
+            if not lists:
+                self._without.add(index)
+            for message in reversed(lists):
+                decoded = None if message.time_s > time_s else _decoded(topics.decode_list, message)
+                if decoded is None:
+                    continue
+                if decoded[1] is NodeEstimate:
+                    at_s, _, nodes = decoded
+                    parts = {topics.LIST_NAMES[kind]: r for at, kind, r in later if at == at_s}
+                    return replace(Estimate(at_s, nodes, ()), **parts)
+                later.append(decoded)
+        return None
 
     def rows(self, from_s: float, to_s: float, *kinds: type) -> Iterator[tuple[float, Any]]:
         """Yield decoded rows of those kinds, with the time at which they were there."""

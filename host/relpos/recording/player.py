@@ -6,6 +6,7 @@ reading of the whole recording, in a thread, while the page is open already.
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from array import array
@@ -34,6 +35,8 @@ from relpos.measurements import Event, Motion, Range, Status
 from relpos.recording.moments import BACK_S, Moments
 
 SHOW_S = 0.2
+SWITCH_S = 0.001
+"""Python's thread switch interval, as in a live session."""
 SPEEDS = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 TICK_KINDS = ("alarm", "landmark", "rollcall", "mayday", "evacuate", "note", "warning")
 
@@ -113,6 +116,8 @@ class Player:
 
     def run(self, seconds: float | None = None) -> None:
         """Play until ``seconds`` are over, or Ctrl-C."""
+        # A seek does not wait for the thread that reads the recording.
+        sys.setswitchinterval(SWITCH_S)
         began_s = before_s = time.monotonic()
         shown_s = 0.0
         self.tell()

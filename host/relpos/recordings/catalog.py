@@ -5,7 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from relpos.recordings import handheld, lowerback
+from relpos.recordings import (
+    daily,
+    handheld,
+    lowerback,
+    mocap,
+    museum,
+    phone_strides,
+    ranges,
+    still,
+    treadmill,
+)
 from relpos.recordings.tables import Archive, ConvertedRun
 
 Convert = Callable[[Archive], Iterator[ConvertedRun]]
@@ -57,6 +67,9 @@ SOURCES = (
         "github.com/mobilise-d/mobgap",
         "Apache-2.0",
         "lower back, slow indoor activity",
+        "34aa8aebe62649609679bb450996b8427e3638e6",
+        daily.convert,
+        "7e2eb993d1a09666f2a7a8b3f422009a2817485489452251742b491f27233ce5",
     ),
     Source(
         "walk_chest",
@@ -70,6 +83,9 @@ SOURCES = (
         "github.com/SintMaartenskliniek/MovingReality",
         "MIT",
         "lower back on a treadmill, after a stroke",
+        "a7d943f567705d06fce4229d9a24207f55a2b177",
+        treadmill.convert,
+        "ad612af050c995b37ecc07bd381f195f5c59cd3ba9a36a323a5df9fba3ea1738",
     ),
     Source("walk_5m_back", "github.com/Marpino/Walking-dataset", "none stated", "back, 5 m"),
     Source("walk_author_back", "github.com/Marpino/Walking-dataset", "none stated", "back, loops"),
@@ -77,39 +93,84 @@ SOURCES = (
         "walk_mocap_virtual",
         "github.com/NikonPic/imu_gait_analysis",
         "none stated",
-        "motion capture, virtual IMU; stairs_mocap_virtual too",
+        "motion capture, virtual IMU: level",
+        "3eb8c391097c4ae9147d234b376fe3bba2b82109",
+        mocap.walks,
+        "a47b9c3fbf9ec1eef15efee454f56ab2912c30dc1af98c40f5d6ac47b0a8145f",
+    ),
+    Source(
+        "stairs_mocap_virtual",
+        "github.com/NikonPic/imu_gait_analysis",
+        "none stated",
+        "motion capture, virtual IMU: stairs",
+        "3eb8c391097c4ae9147d234b376fe3bba2b82109",
+        mocap.stairs,
+        "ea884004eb9784eddd8ea690bc1316f6d44aa59a0cc32b737e6fcc6f7731dc83",
     ),
     Source(
         "walk_phone_strides",
         "github.com/Archeries/StrideLengthEstimation",
         "none stated",
         "phone before the chest, every stride",
+        "c96f67c79a81a8f2098eee051dd41c0c1ba1d102",
+        phone_strides.convert,
+        "b458981d6944bfb308b3b17c79aa7dff3b19233a296e0c9db2c691fef7bf4101",
     ),
     Source(
         "walk_phone_museum",
-        "zenodo.org/records/8362205",
-        "see there",
+        "github.com/Kenny5269/2023_IPIN_Competition_Track03",
+        "see zenodo.org/records/8362205",
         "phone in the hand, surveyed points (IPIN 2023 track 3)",
+        "da1b24b67f48a48a5e69ef35c1fd33d3f03b1592",
+        museum.convert,
+        "61e0af4fbc776ef5549b94204021273aaead34dc9d10e078b4d6ddc2b09c56a9",
     ),
     Source(
         "still_mpu9150_8chips",
         "github.com/hcarlsso/Self-Calibration-Inertial-Sensor-Arrays-BCD.jl",
         "MIT",
         "eight chips at rest",
+        "2f2a8b179882f05b2343e1be6e861af50d583b3d",
+        still.chips,
+        "efe0666a073a0149f70576ecdc95744139a63464f7236f61fa75869501635960",
     ),
     Source(
-        "still_mpu6050_10min", "github.com/sunsided/sensor-fusion", "EUPL-1.2", "a chip at rest"
+        "still_mpu6050_10min",
+        "github.com/sunsided/sensor-fusion",
+        "EUPL-1.2",
+        "a chip at rest",
+        "f16045a9d1d4f9037a183f436fe3c098a38ad99d",
+        still.ten_minutes,
+        "f6fc5b3c8f3e4104ac8ae09837a14d8b74ae253962da8852d7b608d6d16609c7",
     ),
     Source(
         "uwb_errors_outdoor",
         "github.com/cucudasluv/UWB-dataset",
         "Apache-2.0",
         "ranges and true distances outdoors",
+        "c12599812e556324eadc763e409ea8f51098dda6",
+        ranges.outdoor,
+        "fc06757ee933c0f5650f0900b149d4b1f9e6e733b089590254d83c64b03cee1b",
     ),
     Source(
         "uwb_errors_university",
         "github.com/JaronFontaine/UWB-dataset-from-an-office-industrial-and-university-environment",
         "none stated",
         "ranges and true distances in rooms and through walls",
+        "f5b270d12d7129a95426e0f738b28449fa3cb6c1",
+        ranges.university,
+        "d4f9ef334fcefd7d9bdf9842ed850cda2beb6305342580b15e1fe21fc807fcf9",
+    ),
+    Source(
+        "two_robots_vio",
+        "github.com/y2d2/UPF_RPE",
+        "GPL-3.0",
+        "two robots, visual-inertial odometry and UWB, Vicon",
+    ),
+    Source(
+        "four_robots_uwb",
+        "github.com/TIERS/uwb-cooperative-mrs-localization",
+        "MIT",
+        "four robots, six UWB links, OptiTrack; motion synthesised",
     ),
 )

@@ -63,6 +63,8 @@ class Description:
     true_turn_deg: float | None = None
     simulated: Simulated | None = None
     """The ``[simulated]`` table: the bound of such a run can be computed."""
+    floors_m: tuple[float, ...] = ()
+    """Heights of the floors over the start's, from the lowest on. For evaluation alone."""
 
 
 MOST_BYTES = 1 << 20
@@ -125,6 +127,7 @@ def parse_description(path: Path | str, text: str) -> Description:
         nodes=nodes,
         mount=reader.text(document, "mount"),
         simulated=reader.simulated(document),
+        floors_m=reader.floors(document),
         **{key: reader.number(document, key) for key in _PLAIN_NUMBERS},
     )
 
@@ -164,6 +167,8 @@ def description_text(description: Description) -> str:
             value = getattr(info, key)
             if value is not None:
                 lines.append(f"{key} = {_toml(value)}")
+    if description.floors_m:
+        lines += ["", "[building]", f"floors_m = {_toml(description.floors_m)}"]
     if description.simulated is not None:
         made = description.simulated
         lines += ["", "[simulated]", f"scenario = {_toml(made.scenario)}", f"seed = {made.seed}"]
@@ -259,6 +264,19 @@ class _Reader:
         if not isinstance(settings, dict):
             raise self._fail("simulated.", "settings", settings, "is not a table")
         return Simulated(scenario, seed, {key: str(value) for key, value in settings.items()})
+
+    def floors(self, document: Mapping[str, Any]) -> tuple[float, ...]:
+        table = document.get("building", {})
+        if not isinstance(table, dict):
+            raise self._fail("", "building", table, "is not a table")
+        value = table.get("floors_m", [])
+        if not isinstance(value, list):
+            raise self._fail("building.", "floors_m", value, "is not a list of heights")
+        floors_m = tuple(self.needed_number({"z_m": z}, "z_m", "building.") for z in value)
+        if floors_m and (0.0 not in floors_m or sorted(set(floors_m)) != list(floors_m)):
+            words = "does not go from the lowest floor over the start's, 0.0, to the highest"
+            raise self._fail("building.", "floors_m", value, words)
+        return floors_m
 
     def tables(
         self, document: Mapping[str, Any], key: str

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 from relpos.errors import DataError
 from relpos.fusion.estimator import (
     Alternative,
+    Episode,
     Estimate,
     NodeEstimate,
     NodeStatus,
@@ -38,6 +39,13 @@ def _status(text: str) -> NodeStatus:
         return NodeStatus(text)
     except ValueError:
         raise ValueError(f"is none of {', '.join(NodeStatus)}") from None
+
+
+def _episode(text: str) -> Episode:
+    try:
+        return Episode(text)
+    except ValueError:
+        raise ValueError(f"is none of {', '.join(Episode)}") from None
 
 
 def _shape(text: str) -> Shape:
@@ -68,6 +76,10 @@ _ESTIMATE_TABLE = (
     Column("sigma_z_m", not_negative, optional=True),
     Column("sigma_heading_rad", not_negative, optional=True),
     Column("status", _status, optional=True),
+    Column("episode", _episode, optional=True),
+    Column("episode_probability", not_negative, optional=True),
+    Column("floor", int, optional=True),
+    Column("floor_probability", not_negative, optional=True),
 )
 _PAIR_TABLE = (
     Column("time_s", bounded("time_s")),
@@ -245,7 +257,8 @@ def _pair_estimate(row: dict[str, Any]) -> PairEstimate:
 
 def _node_estimate(row: dict[str, Any]) -> NodeEstimate:
     """Undo the ellipse: its axes and angle back to the three entries of the covariance."""
-    known = {name: _nan_if_none(row[name]) for name in ESTIMATE_COLUMNS[2:-1]}
+    figures = ESTIMATE_COLUMNS[2 : ESTIMATE_COLUMNS.index("status")]
+    known = {name: _nan_if_none(row[name]) for name in figures}
     along, across = known["sigma_major_m"] ** 2, known["sigma_minor_m"] ** 2
     c, s = math.cos(known["sigma_angle_rad"]), math.sin(known["sigma_angle_rad"])
     return NodeEstimate(
@@ -260,6 +273,7 @@ def _node_estimate(row: dict[str, Any]) -> NodeEstimate:
         status=row["status"] or NodeStatus.OK,
         z_m=known["z_m"],
         sigma_z_m=known["sigma_z_m"],
+        **{name: row[name] for name in ESTIMATE_COLUMNS[-4:]},
     )
 
 

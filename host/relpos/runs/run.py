@@ -49,6 +49,7 @@ from relpos.runs.table import (
     numbered_rows,
     read_text,
     whole,
+    within_bounds,
 )
 
 UNKNOWN_HEADING_SIGMA_RAD = math.pi
@@ -421,6 +422,7 @@ _TABLES = (
             Column("gain_version", whole, optional=True),
             Column("moving", flag, optional=True),
             _quantity("sigma_x_alone_m", optional=True),
+            Column("steps", lambda text: int(within_bounds("steps", whole(text))), optional=True),
         ),
     ),
     _Table(

@@ -201,6 +201,9 @@ def walk(
     )
     torso = shaken_attitude(spectral, roll, pitch, yaw, shocks[3:])
     position = _sensor_path(person, track, torso.trunk, moved, sway)
+    if plan.flights:
+        ground_m = np.interp(t, plan.knot_time_s, plan.knot_ground_m)
+        position[:, 2] += spectral.derivatives(ground_m, 1, smooth_s=0.18)[0]
     velocity, acceleration = differentiate(spectral, position)
 
     inner = grid.inner
@@ -222,4 +225,5 @@ def walk(
         pressure_pa=world.pressure_pa(position[:, 2]),
         steps=true_steps(t, progress.phase, progress.path_m, grid),
         walk_start_s=plan.walk_start_s,
+        flights=plan.flights,
     )

@@ -175,6 +175,8 @@ class SimulatedRun:
     events: tuple[Event, ...] = ()
     landmarks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Surveyed places by their ids, (x, y) in metres."""
+    floors_m: tuple[float, ...] = ()
+    """Heights of a building's floors over the start's, from the lowest on."""
 
 
 def settings_of(scenario: str, overrides: Mapping[str, str | float] | None = None) -> PaperSettings:
@@ -410,11 +412,11 @@ def simulate_paper(
 def true_rows(
     times: Floats, positions: Floats, heading: Floats, height: Floats | None = None
 ) -> tuple[Truth, ...]:
-    """Rows of ``truth.csv`` of poses (T,), (N, T, 2), (N, T) at heights (N,), where given."""
+    """Rows of ``truth.csv`` of poses (T,), (N, T, 2), (N, T) at heights (N, T), where given."""
     return tuple(
         Truth(float(t), i + 1, float(positions[i, k, 0]), float(positions[i, k, 1]),
               math.remainder(float(heading[i, k]), 2.0 * math.pi),
-              None if height is None else float(height[i]))
+              None if height is None else float(height[i, k]))
         for k, t in enumerate(times)
         for i in range(len(positions))
     )  # fmt: skip

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from relpos.errors import RelposError
-from relpos.simulation import missions, paper
+from relpos.simulation import building, missions, paper
 from relpos.simulation.lab import simulate_lab
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ LAB = "lab"
 BOUNDED = (*paper.SCENARIOS, LAB)
 """Those whose Cramer-Rao bound can be computed (:mod:`relpos.evaluation.bounds`)."""
 
-NAMES = (*BOUNDED, *missions.NAMES)
+NAMES = (*BOUNDED, *missions.NAMES, *building.NAMES)
 
 
 def simulate(
@@ -31,6 +31,8 @@ def simulate(
         return simulate_lab(seed, overrides)
     if scenario in missions.NAMES:
         return missions.simulate_mission(scenario, seed, overrides)
+    if scenario in building.NAMES:
+        return building.simulate_building(scenario, seed, overrides)
     return paper.simulate_paper(scenario, seed, overrides)
 
 
@@ -51,6 +53,7 @@ def simulate_run(
             heading_known=any(math.isfinite(p.sigma_rad) for p in simulated.priors),
             priors=simulated.priors,
             simulated=Simulated(scenario, seed, chosen),
+            floors_m=simulated.floors_m,
         ),
         measurements=simulated.measurements,
         events=simulated.events,

@@ -7,17 +7,21 @@ evaluation read the same truth.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from relpos.errors import DataError
+from relpos.simulation import pressure
 from relpos.simulation.bench import BENCH, SPACING_M, lie_still
 from relpos.simulation.gait import walk
+from relpos.simulation.pressure import AirSettings
+from relpos.simulation.sensing import RATE_HZ
 from relpos.simulation.spectral import make_grid
+from relpos.simulation.storeys import STOREY_M, Building, Place
 from relpos.simulation.turntable import TURNTABLE, turn_by_hand
-from relpos.simulation.walker import Route, WalkerTruth, make_person, make_plan
+from relpos.simulation.walker import Route, RouteStairs, WalkerTruth, make_person, make_plan
 from relpos.simulation.world import MagneticField, UwbChannel, World
 
 MAX_WALKERS = 20
@@ -43,7 +47,25 @@ class Scenario:
     """0: all face along the first leg; else uniform within plus or minus this."""
     mount_sd_rad: float = math.radians(3.0)
     world: World = field(default_factory=World)
+    air: Mapping[str, float] | None = None
+    """Of a building: changes to :class:`~relpos.simulation.pressure.AirSettings`."""
 
+
+_HOUSE = Scenario(
+    name="building",
+    # Stairs in the middle of both short sides, storeys on the long ones in turn.
+    path_m=(24.0, 12.0),
+    speed_m_s=(0.6, 1.0),
+    spacing_m=5.0,
+    pause_every_s=120.0,
+    world=World(
+        name="building",
+        size_m=(24.0, 12.0),
+        uwb=UwbChannel(max_range_m=30.0),
+        building=Building(tuple(STOREY_M * k for k in range(4)), ()),
+    ),
+    air={},
+)
 
 SCENARIOS = {
     "paper": Scenario(
@@ -79,6 +101,11 @@ SCENARIOS = {
         distance_limit_m=40.0,
         world=World(name="straight", size_m=(60.0, 20.0)),
     ),
+    "building": _HOUSE,
+    "building-fan": replace(
+        _HOUSE, name="building-fan", air={"fan_pa": 25.0, "fan_s": 120.0, "fan_off_s": 200.0}
+    ),
+    "building-weather": replace(_HOUSE, name="building-weather", air={"weather_pa_h": 200.0}),
 }
 """By name. `paper` with the paper's own pace: replace(SCENARIOS["paper"], speed_m_s=(0.5, 0.5))."""
 
@@ -137,7 +164,59 @@ def make_team(
             until_s,
             scenario.pause_every_s,
             scenario.distance_limit_m,
+            _stairs(route, scenario),
         )
         team.append(walk(walk_rng, node, person, route, plan, grid, world, heading))
         start_s += scenario.spacing_m / person.speed_m_s
+    if scenario.air is not None:
+        team = in_air(team, dict(scenario.air), seed)
     return team, world
+
+
+RISERS, TREAD_M = 20, 0.28
+"""Of a storey."""
+
+
+def _stairs(route: Route, scenario: Scenario) -> RouteStairs | None:
+    """Flights in the middle of the route's second and fourth side."""
+    building = scenario.world.building
+    if building is None:
+        return None
+    width, depth = scenario.path_m
+    way_m = np.arange(0.0, route.lap_m + width, 0.01)
+    place_m, _ = route.at(way_m)
+    half_m = 0.5 * RISERS * TREAD_M
+    begins_m = []
+    for x in (width, 0.0):
+        off_m = np.hypot(*(place_m - (x, 0.5 * depth)).T)
+        # The first lap begins in a corner that later laps round.
+        begins_m.append(float(way_m[int(off_m[way_m < route.lap_m].argmin())]) - half_m)
+    storeys = len(building.floors_m)
+    storey_m = building.floors_m[1] - building.floors_m[0]
+    return RouteStairs(tuple(begins_m), route.lap_m, storeys, storey_m, RISERS, TREAD_M)
+
+
+def in_air(team: list[WalkerTruth], changes: dict[str, float], seed: int) -> list[WalkerTruth]:
+    """Add to the walkers' pressure what the air of a building does."""
+    settings = AirSettings(**changes)  # type: ignore[arg-type]
+    time_s = team[0].time_s
+    ticks_s = np.arange(math.floor(time_s[-1] * RATE_HZ) + 2) / RATE_HZ
+    weather_rng, fan_rng, *own = np.random.default_rng([seed, 0xA1]).spawn(2 + len(team))
+    weather = pressure.weather_pa(settings, ticks_s, weather_rng)
+    fan = pressure.fan_pa(settings, ticks_s, fan_rng)
+    moved = []
+    for walker, rng in zip(team, own, strict=True):
+        columns = (walker.position_m[:, 0], walker.position_m[:, 2])
+        x, z = (np.interp(ticks_s, time_s, c) for c in columns)
+        place = np.full(ticks_s.size, int(Place.STOREY))
+        for k, flight in enumerate(walker.flights):
+            climbs = (ticks_s >= flight.begin_s) & (ticks_s < flight.end_s)
+            place[climbs] = Place.EAST if k % 2 == 0 else Place.WEST
+        feet_m = z - walker.person.sensor_height_m
+        at = pressure.Surroundings(feet_m, feet_m, place, x)
+        over = weather + pressure.field_pa(settings, at, ticks_s, fan, 0.0)
+        over += pressure.doors_pa(settings, ticks_s, rng) * (place == Place.STOREY)
+        moved.append(
+            replace(walker, pressure_pa=walker.pressure_pa + np.interp(time_s, ticks_s, over))
+        )
+    return moved

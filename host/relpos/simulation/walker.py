@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -88,6 +88,15 @@ class StepTruth:
 
 
 @dataclass(frozen=True, slots=True)
+class Flight:
+    """When somebody climbs stairs by so many storeys, below 0 down."""
+
+    begin_s: float
+    end_s: float
+    storeys: int
+
+
+@dataclass(frozen=True, slots=True)
 class WalkerTruth:
     """Physical truth of one wearer at 200 Hz, noise-free; what the emulated chips sample.
 
@@ -110,6 +119,7 @@ class WalkerTruth:
     pressure_pa: FloatArray
     steps: StepTruth
     walk_start_s: float
+    flights: tuple[Flight, ...] = field(default=(), kw_only=True)
 
     def position_at(self, time_s: float) -> FloatArray:
         """Position (3,) at any time, held at the ends: exact to 0.1 mm between samples."""
@@ -206,6 +216,32 @@ class Plan:
     step_strength: FloatArray
     """Vertical excursion of each step against what its length asks, about 1."""
     walk_start_s: float
+    knot_ground_m: FloatArray
+    """Height of the feet."""
+    flights: tuple[Flight, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class RouteStairs:
+    """Flights on a route, one storey each: up until the top floor, then down, and so on."""
+
+    begins_m: tuple[float, ...]
+    """Path lengths in the first lap at which they begin."""
+    lap_m: float
+    storeys: int
+    storey_m: float
+    risers: int
+    tread_m: float
+
+    def begin_m(self, count: int) -> float:
+        """Path length at which the flight after ``count`` others begins."""
+        laps, place = divmod(count, len(self.begins_m))
+        return self.begins_m[place] + laps * self.lap_m
+
+    def direction(self, count: int) -> int:
+        """Whether that leads up or down."""
+        top = self.storeys - 1
+        return 1 if count % (2 * top) < top else -1
 
 
 def make_plan(
@@ -216,6 +252,7 @@ def make_plan(
     until_s: float,
     pause_every_s: float,
     distance_limit_m: float | None,
+    stairs: RouteStairs | None = None,
 ) -> Plan:
     """Decide every step until ``until_s``.
 
@@ -227,6 +264,8 @@ def make_plan(
     # Mean speed on a lap is what the person chose: the straights make up for the bends.
     straight_speed = person.speed_m_s * float(np.mean(1.0 / slow))
     times, phases, paths = [-1e3, walk_start_s], [0.0, 0.0], [0.0, 0.0]
+    grounds: list[float] = [0.0, 0.0]
+    flights: list[Flight] = []
     strength: list[float] = []
     time_s, phase, path, wander = walk_start_s, 0.0, 0.0, 0.0
     since_stand = 0
@@ -244,9 +283,22 @@ def make_plan(
             times.append(time_s + (1e6 if finished else float(rng.uniform(1.5, 5.0))))
             phases.append(phase)
             paths.append(path)
+            grounds.append(grounds[-1])
             time_s = times[-1]
             pause_at = next_pause()
             since_stand = 0
+            continue
+        if stairs is not None and path >= stairs.begin_m(len(flights)):
+            up = stairs.direction(len(flights))
+            lasts_s, lift = _climb(rng, person, stairs)
+            flights.append(Flight(time_s, time_s + float(lasts_s.sum()), up))
+            for each_s in lasts_s.tolist():
+                time_s, path, phase = time_s + each_s, path + stairs.tread_m, phase + 1.0
+                times.append(time_s)
+                phases.append(phase)
+                paths.append(path)
+                grounds.append(grounds[-1] + up * stairs.storey_m / stairs.risers)
+            strength += [lift] * stairs.risers
             continue
         wander = 0.9 * wander + 0.04 * math.sqrt(1 - 0.9**2) * rng.standard_normal()
         bend = 0.25 * min(route.curvature(path + 0.3) * 0.7, 1.0)
@@ -268,6 +320,7 @@ def make_plan(
         times.append(time_s)
         phases.append(phase)
         paths.append(path)
+        grounds.append(grounds[-1])
         strength.append(
             (1.0 + side * 2.0 * person.asymmetry) * math.exp(0.06 * rng.standard_normal())
         )
@@ -277,4 +330,20 @@ def make_plan(
         np.array(paths),
         np.array(strength),
         walk_start_s,
+        np.array(grounds),
+        tuple(flights),
     )
+
+
+def _climb(
+    rng: np.random.Generator, person: Person, stairs: RouteStairs
+) -> tuple[FloatArray, float]:
+    """Durations (k,) of a flight's steps, and their excursion against what their length asks.
+
+    Cadence as Riener, Rabuffetti and Frigo 2002; the bounce beside the climb is open.
+    """
+    cadence, bounce_m = rng.uniform(1.1, 1.9), rng.uniform(0.008, 0.045)
+    half = stairs.tread_m / (2.0 * person.pendulum_gain)
+    asked_m = person.leg_length_m - math.sqrt(person.leg_length_m**2 - half**2)
+    lasts_s = np.exp(0.03 * rng.standard_normal(stairs.risers)) / cadence
+    return lasts_s, float(bounce_m / asked_m)

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from relpos.simulation.storeys import SLAB_EXCESS_M, Building
+
 FloatArray = NDArray[np.float64]
 
 GRAVITY_M_S2 = 9.80665
@@ -45,8 +47,12 @@ class UwbChannel:
         fall = self.detection_near - self.detection_far
         return self.detection_near - fall * distance_m / self.max_range_m
 
-    def measure_range(self, rng: np.random.Generator, distance_m: float) -> float | None:
+    def measure_range(
+        self, rng: np.random.Generator, distance_m: float, loss_db: float = 0.0
+    ) -> float | None:
         """One attempt over the true ``distance_m``: the range in metres, or None if not received.
+
+        ``loss_db`` is what stands in between: the reach shrinks by 20 dB a decade.
 
         A range is never negative: what noise pushes below zero a tag reports as zero distance.
         Every attempt draws the same count of numbers from ``rng``, received or not, so that one
@@ -58,7 +64,7 @@ class UwbChannel:
             rng.random(),
             rng.random(),
         )
-        if detected >= self.detection_probability(distance_m):
+        if detected >= self.detection_probability(distance_m * 10.0 ** (loss_db / 20.0)):
             return None
         measured = distance_m + self.bias_m + self.noise_sigma_m * normal
         if blocked < self.nlos_probability:
@@ -149,14 +155,22 @@ class World:
     radio: RadioChannel = field(default_factory=RadioChannel)
     magnetic: MagneticField = field(default_factory=MagneticField)
     floor_pressure_pa: float = 101_325.0
+    building: Building | None = None
 
     def detection_probability(self, distance_m: float) -> float:
         """See `UwbChannel.detection_probability`."""
         return self.uwb.detection_probability(distance_m)
 
-    def measure_range(self, rng: np.random.Generator, distance_m: float) -> float | None:
-        """See `UwbChannel.measure_range`."""
-        return self.uwb.measure_range(rng, distance_m)
+    def measure_range(
+        self, rng: np.random.Generator, first_m: FloatArray, second_m: FloatArray
+    ) -> float | None:
+        """Range between tags at two places (3,); see `UwbChannel.measure_range`."""
+        distance_m = math.dist(first_m, second_m)
+        if self.building is None:
+            return self.uwb.measure_range(rng, distance_m)
+        slabs = self.building.slabs_between(first_m, second_m)
+        measured = self.uwb.measure_range(rng, distance_m, slabs * self.building.slab_db)
+        return None if measured is None else measured + slabs * sum(SLAB_EXCESS_M) / 2.0
 
     def transmit(self, rng: np.random.Generator) -> float | None:
         """See `RadioChannel.transmit`."""

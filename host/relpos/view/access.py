@@ -11,6 +11,7 @@ import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from urllib.parse import urlencode
 
 from relpos.errors import DeviceError, RelposError
@@ -41,6 +42,9 @@ class Access:
     certificate: Certificate | None = None
     key: bytes | None = None
     """A mission's: then devices have tokens of their own (:mod:`relpos.view.devices`)."""
+
+    folder: Path | None = None
+    """A mission's: plans are kept there."""
 
     @property
     def cookie(self) -> str:

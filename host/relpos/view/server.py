@@ -42,6 +42,7 @@ from relpos.live.tracks import Tracks
 from relpos.view.access import Access, Allowance, qr_svg
 from relpos.view.devices import Device, Role
 from relpos.view.guard import TokenMiddleware, role_of
+from relpos.view.plans import MAX_IMAGE_BYTES, PlanImages
 
 STATIC = Path(__file__).parent / "static"
 PING_S = 2.0
@@ -59,6 +60,7 @@ ALLOWED = {
     "shelve": (2.0, 20.0),
     "replay": (30.0, 300.0),
     "device": (2.0, 50.0),
+    "end": (0.2, 5.0),
     **dict.fromkeys(BOARD_EVENTS, (5.0, 100.0)),
 }
 """Items that a visitor may send, per second and at once: a phone sends what it gathered offline."""
@@ -174,6 +176,7 @@ class Pages:
         self.session = session
         self._access = access
         self._code: str | None = None
+        self._plans = PlanImages(access.folder)
         self._allowances = {kind: Allowance(*most) for kind, most in ALLOWED.items()}
 
     def app(self) -> ASGIApp:
@@ -188,7 +191,10 @@ class Pages:
             Route("/api/acknowledge", self.acknowledge, methods=["POST"]),
             Route("/api/shelve", self.shelve, methods=["POST"]),
             *(Route(f"/api/{kind}", self.change_board, methods=["POST"]) for kind in BOARD_EVENTS),
+            Route("/api/image", self.add_plan, methods=["POST"]),
+            Route("/api/image/{name}", self.image),
             Route("/api/replay", self.replay, methods=["POST"]),
+            Route("/api/end", self.end, methods=["POST"]),
             Route("/api/invite", self.invite),
             Route("/api/devices", self.devices),
             Route("/api/revoke", self.revoke, methods=["POST"]),
@@ -375,11 +381,33 @@ class Pages:
         own = (kind == "mayday" and body.get("on") is True) or (
             kind in ("rollcall", "evacuate") and body.get("action") in answers
         )
+        own = own or (kind == "marker" and body.get("action") == "set")
         if not own and not role_of(request).allows(Role.COMMAND):
             return JSONResponse({"error": "only a commander may do that"}, 403)
         if "node" in body:
             body["node"] = _node(body)
         return await self._ask(request, kind, {**body, "by": _by(body)})
+
+    async def add_plan(self, request: Request) -> Response:
+        """Keep an image, and lay it under the map."""
+        if not role_of(request).allows(Role.COMMAND):
+            return JSONResponse({"error": "only a commander may do that"}, 403)
+        if not self._allowances["plan"].take("everybody", 1):
+            return JSONResponse({"error": "too many at once; try again in a minute"}, 429)
+        too_much = f"an image of more than {MAX_IMAGE_BYTES >> 20} MB"
+        data = await _received(request, MAX_IMAGE_BYTES, too_much)
+        try:
+            name = self._plans.keep(data)
+        except (OSError, ValueError) as error:
+            raise BadRequestError(str(error)) from None
+        return await self._ask(request, "plan", {"action": "set", "image": name, "by": ""})
+
+    async def image(self, request: Request) -> Response:
+        """An image that was laid under the map."""
+        found = self._plans.find(request.path_params["name"])
+        if found is None:
+            return PlainTextResponse("no such image", 404)
+        return Response(found[0], media_type=found[1])
 
     async def replay(self, request: Request) -> Response:
         """Move a recording that is played: a moment, a speed, play or pause, the next event."""
@@ -395,6 +423,11 @@ class Pages:
         body = await _body(request)
         asked = {"node": _node(body), "by": _by(body), "seconds": _number(body, "seconds")}
         return await self._ask(request, "shelve", asked)
+
+    async def end(self, request: Request) -> Response:
+        """End the session; a mission goes on with the next one."""
+        body = await _body(request)
+        return await self._ask(request, "end", {"by": _by(body)})
 
     async def _ask(
         self, request: Request, kind: str, body: Mapping[str, Any], items: int = 1
@@ -418,12 +451,18 @@ async def _refuse(_: Request, error: Exception) -> Response:
     return JSONResponse({"error": str(error)}, 400)
 
 
-async def _body(request: Request) -> dict[str, Any]:
+async def _received(request: Request, limit: int, too_much: str) -> bytes:
+    """Return what a request brings; BadRequestError as soon as it is more than ``limit`` bytes."""
     data = b""
     async for part in request.stream():
         data += part
-        if len(data) > MAX_BODY_BYTES:
-            raise BadRequestError(f"more than {MAX_BODY_BYTES} bytes")
+        if len(data) > limit:
+            raise BadRequestError(too_much)
+    return data
+
+
+async def _body(request: Request) -> dict[str, Any]:
+    data = await _received(request, MAX_BODY_BYTES, f"more than {MAX_BODY_BYTES} bytes")
     try:
         body = json.loads(data)
     except (ValueError, RecursionError):  # The latter by lists within lists.

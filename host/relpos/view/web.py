@@ -23,6 +23,7 @@ from relpos.live.requests import Request
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Hello, LogEntry, TeamView, to_json
 from relpos.live.tracks import Tracks
+from relpos.said import Said
 from relpos.view.access import Access
 
 if TYPE_CHECKING:
@@ -120,7 +121,7 @@ class WebView(Sink):
     def trouble(self) -> str | None:
         """Return that the server was restarted, for half a minute."""
         if self.restarts and time.monotonic() - self._started_s < 30.0:
-            return "the page's server failed and was restarted"
+            return Said("page-failed", "the page's server failed and was restarted")
         return None
 
     def close(self) -> None:

@@ -75,7 +75,7 @@ def test_a_new_node_and_a_new_pair_keep_what_is_known_of_the_others() -> None:
 @pytest.mark.parametrize(
     ("condition", "name", "node", "value"),
     [
-        ("late-0.3", "range_lateness_s", 1, 0.3),
+        pytest.param("late-0.3", "range_lateness_s", 1, 0.3, marks=pytest.mark.soak),
         ("late-1", "range_lateness_s", 3, 1.0),
         ("clock", "clock_offset_s", 2, 1.0),
         ("shadow", "body_shadow_m", 1, 0.4 * 0.9),

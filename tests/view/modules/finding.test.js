@@ -8,7 +8,7 @@ const seen = (distanceM, deg, more = {}) => ({
 
 test("orders are those that one gives to a walker", () => {
   equal([0, 20, -40, 100, -100, 170, -179].map((deg) => turnOrder(radians(deg))),
-    ["ahead", "ahead", "bear right", "left", "right", "around", "around"]);
+    ["ahead", "ahead", "bear-right", "left", "right", "around", "around"]);
 });
 
 test("an order does not flutter at its border", () => {
@@ -17,13 +17,13 @@ test("an order does not flutter at its border", () => {
   order = turnOrder(radians(27), order);
   equal(order, "ahead");
   order = turnOrder(radians(33), order);
-  equal(order, "bear left");
-  equal(turnOrder(radians(23), order), "bear left");
+  equal(order, "bear-left");
+  equal(turnOrder(radians(23), order), "bear-left");
   equal(turnOrder(radians(17), order), "ahead");
 });
 
 test("from ahead to the other side the order changes hands", () => {
-  equal(turnOrder(radians(-40), "bear left"), "bear right");
+  equal(turnOrder(radians(-40), "bear-left"), "bear-right");
 });
 
 test("within reach the instruction is to search, not to turn", () => {

@@ -20,9 +20,9 @@ test("the clock's hours go clockwise from straight ahead", () => {
 });
 
 test("the compass has east along x and north along y", () => {
-  equal([0, 90, 180, -90, 45, -135].map((deg) => compassPoint(radians(deg)).short),
-    ["E", "N", "W", "S", "NE", "SW"]);
-  equal(compassPoint(radians(700)).words, "east");
+  equal([0, 90, 180, -90, 45, -135].map((deg) => compassPoint(radians(deg))),
+    ["e", "n", "w", "s", "ne", "sw"]);
+  equal(compassPoint(radians(700)), "e");
 });
 
 test("somebody to the right of me is at a negative angle", () => {

@@ -182,15 +182,18 @@ class Board:
         """Values written to GPIOR0 since the last call, as (cycle, value)."""
         return self._take(self._library.relpos_avr_take_marks)
 
-    def trace(self) -> None:
-        """From now on keep what take_looks and take_heard give; they have to be called."""
-        self._library.relpos_avr_trace(self._alive())
+    def trace(self, watched: int) -> None:
+        """From now on keep what take_looks and take_heard give; they have to be called.
 
-    def take_looks(self) -> list[tuple[int, int]]:
-        """Looks at timer 1's overflow flag, as (cycle, timer as the program read it last)."""
+        ``watched`` is the address of a byte of RAM.
+        """
+        self._library.relpos_avr_trace(self._alive(), watched)
+
+    def take_looks(self) -> list[tuple[int, int, int]]:
+        """Looks at timer 1's overflow flag: (cycle, timer as the program read it last, watched)."""
         taken = self._take(self._library.relpos_avr_take_looks)
-        pairs = zip(taken[::2], taken[1::2], strict=True)
-        return [(cycle, low | high << 8) for (cycle, low), (_, high) in pairs]
+        looks = zip(taken[::3], taken[1::3], taken[2::3], strict=True)
+        return [(cycle, low | high << 8, byte) for (cycle, low), (_, high), (_, byte) in looks]
 
     def take_heard(self) -> list[tuple[int, int]]:
         """Bytes that the program fetched from the receiver, as (cycle, byte)."""

@@ -64,6 +64,8 @@ def _parse(raw: bytes) -> Firmware:
         raise ValueError(f"made for machine {machine}, not AVR")
     program_offset, section_offset = struct.unpack_from("<II", raw, 28)
     program_size, program_count, section_size, section_count = struct.unpack_from("<HHHH", raw, 42)
+    if section_offset + section_count * section_size > len(raw):
+        raise ValueError("the file is truncated")
 
     flash = bytearray()
     eeprom = bytearray()

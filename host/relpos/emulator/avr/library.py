@@ -95,7 +95,7 @@ def load() -> ctypes.CDLL:
         "receive": (None, [board, text, u32, u64, u8]),
         "take_sent": (u32, [board, u64s, out, u32]),
         "take_marks": (u32, [board, u64s, out, u32]),
-        "trace": (None, [board]),
+        "trace": (None, [board, u16]),
         "take_looks": (u32, [board, u64s, out, u32]),
         "take_heard": (u32, [board, u64s, out, u32]),
         "eeprom_size": (u32, [board]),

@@ -132,8 +132,7 @@ class Service:
             if 1 <= destination <= TEAM:
                 here = self._team[0].position_at(now_us * 1e-6)
                 there = self._team[destination - 1].position_at(now_us * 1e-6)
-                distance = float(np.linalg.norm(here - there))
-                measured = self._world.measure_range(self._air_rng, distance)
+                measured = self._world.measure_range(self._air_rng, here, there)
                 if measured is not None:
                     result = RangeResult(round(measured * 1000), RSS_DBM)
             self.counts["exchanges"] += 1

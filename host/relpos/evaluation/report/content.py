@@ -56,6 +56,8 @@ class Content:
     baseline: Baseline | None = None
     words: Sequence[str] = field(default=())
     """Further sentences for the page, as the command that made it."""
+    log: Sequence[Mapping[str, str]] = field(default=())
+    """The session's log, as of ``log.csv``."""
 
     @property
     def nodes(self) -> tuple[int, ...]:
@@ -128,6 +130,7 @@ def gather(
     evaluation: Evaluation | None = None,
     baseline: Baseline | None = None,
     words: Sequence[str] = (),
+    log: Sequence[Mapping[str, str]] = (),
 ) -> Content:
     """Gather the content of a report; the parts that are not passed are computed.
 
@@ -155,6 +158,7 @@ def gather(
         bound or scoring.bound_of(run),
         baseline if baseline is not None else reckon(run, result),
         words,
+        log,
     )
 
 

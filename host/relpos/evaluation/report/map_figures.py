@@ -1,4 +1,4 @@
-"""The figures of positions: tracks on a map, and height over time."""
+"""The figures of positions: tracks on a map, a section through the building, height over time."""
 
 from __future__ import annotations
 
@@ -180,6 +180,70 @@ def heights(content: Content) -> Picture | None:
         draw,
         (9.6, 3.2),
     )
+
+
+STOREYS_M = 2.0
+"""A section is drawn where somebody's height changes by more."""
+
+
+def section(content: Content) -> Picture | None:
+    """Draw the building from the side: height over the place along the longer side."""
+    seen = {n: t for n, t in content.fused.items() if np.isfinite(t.x_m + t.z_m).any()}
+    if not any(np.ptp(t.z_m[np.isfinite(t.z_m)]) > STOREYS_M for t in seen.values()):
+        return None
+    onto = content.truth or seen
+    moving = alignment(seen, onto)
+    true = {n: t for n, t in content.truth.items() if np.isfinite(t.z_m).any()}
+    points = np.concatenate([p[np.isfinite(p).all(axis=1)] for p in _points(onto)])
+    _, axes_m = np.linalg.eigh(np.cov(points.T))
+    # From left to right as on the map.
+    side = axes_m[:, -1] * (1.0 if axes_m[0, -1] >= 0.0 else -1.0)
+    floors_m = content.run.description.floors_m
+    places = {node: k for k, node in enumerate(content.nodes)}
+
+    def draw(figure: Figure) -> None:
+        axes = figure.add_subplot()
+        _draw_floors(axes, floors_m)
+        for node, track in true.items():
+            along = np.column_stack((track.x_m, track.y_m)) @ side
+            x, y = broken_at_gaps(track.time_s, along, track.z_m)
+            label = "truth" if node == min(true) else None
+            axes.plot(x, y, color=TRUTH, linewidth=4.0, zorder=1, label=label)
+        for node, track in seen.items():
+            colour, line = of_node(places[node])
+            along = moving(np.column_stack((track.x_m, track.y_m))) @ side
+            x, y = broken_at_gaps(track.time_s, along, track.z_m)
+            axes.plot(
+                x, y, color=colour, linestyle=line, linewidth=0.9, alpha=0.8,
+                label=content.name(node),
+            )  # fmt: skip
+            last = np.flatnonzero(np.isfinite(along + track.z_m))
+            if last.size:
+                axes.plot(along[last[-1]], track.z_m[last[-1]], "o", color=colour, markersize=5)
+        axes.set(xlabel="along the longer side (m)", ylabel="height over the start (m)")
+        axes.legend(loc="center left", bbox_to_anchor=(1.05, 0.5))
+
+    return Picture(
+        "section",
+        "Section",
+        "From the side: estimated height over the place along the longer side. Dots mark the end"
+        + (", grey lines the truth" if true else "")
+        + (", dotted ones the floors." if floors_m else "."),
+        f"Side view of the ways of {len(seen)} people through the building.",
+        draw,
+        (9.6, 4.2),
+    )
+
+
+def _draw_floors(axes: Axes, floors_m: Sequence[float]) -> None:
+    """Draw the true floors of a simulated building, numbered from the start's."""
+    for floor_m in floors_m:
+        axes.axhline(floor_m, color=GREY, linewidth=0.7, linestyle=":", zorder=0.5)
+        number = list(floors_m).index(floor_m) - list(floors_m).index(0.0)
+        axes.annotate(
+            f"floor {number}", (1.0, floor_m), xycoords=("axes fraction", "data"),
+            xytext=(3, 0), textcoords="offset points", va="center", fontsize=8, color=GREY,
+        )  # fmt: skip
 
 
 def _moved(ways: Tracks, onto: Tracks) -> dict[int, Floats]:

@@ -25,8 +25,9 @@ SECTIONS: Sequence[tuple[str, str, tuple[str, ...], tuple[str, ...]]] = (
     ("consistency", "Consistency", ("consistency", "status"), ("nees",)),
     ("ranging", "Ranging", ("detection", "residuals"), ("ranges",)),
     ("learned", "Learned on the way", ("parameters",), ("learned",)),
-    ("height", "Height", ("height",), ()),
+    ("height", "Height", ("section", "height"), ("vertical",)),
     ("health", "Links and nodes", ("health",), ("health", "reasons", "counters")),
+    ("log", "Log", (), ("log",)),
 )
 """Sections of the page: id, title, pictures, tables. Empty ones are left out."""
 
@@ -37,6 +38,7 @@ def page(content: Content, drawn: Mapping[str, tuple[Picture, str]]) -> str:
         "main": tables.main_figures(content),
         "iso": tables.iso(content),
         "latency": tables.latency(content),
+        "vertical": tables.vertical(content),
         "nodes": tables.nodes(content),
         "pairs": tables.pairs(content),
         "nees": tables.consistency(content),
@@ -46,6 +48,7 @@ def page(content: Content, drawn: Mapping[str, tuple[Picture, str]]) -> str:
         "reasons": tables.reasons(content),
         "counters": tables.counters(content),
         "located": tables.located(content),
+        "log": tables.log(content),
     }
     sections, links = [], []
     for key, title, pictures, names in SECTIONS:

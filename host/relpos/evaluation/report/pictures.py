@@ -11,7 +11,7 @@ from relpos.evaluation.report.accuracy_figures import distances, error_distribut
 from relpos.evaluation.report.consistency_figures import consistency, status
 from relpos.evaluation.report.content import Content
 from relpos.evaluation.report.drawing import Picture
-from relpos.evaluation.report.map_figures import heights, tracks
+from relpos.evaluation.report.map_figures import heights, section, tracks
 from relpos.evaluation.report.node_figures import health, parameters
 from relpos.evaluation.report.ranging_figures import detection, residuals
 
@@ -25,6 +25,7 @@ PICTURES: Mapping[str, Callable[[Content], Picture | None]] = {
     "detection": detection,
     "residuals": residuals,
     "parameters": parameters,
+    "section": section,
     "height": heights,
     "health": health,
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from html import escape
 
 import numpy as np
@@ -223,6 +224,15 @@ def _variances(accuracy: Accuracy) -> str:
     return ", ".join(value(v, "", 3) for v in parts if math.isfinite(v)) + " m²"
 
 
+def vertical(content: Content) -> Table | None:
+    """Heights, floors and stairs against the truth."""
+    found = None if content.evaluation is None else content.evaluation.vertical
+    if found is None:
+        return None
+    rows = [(escape(name), escape(words)) for name, words in found.lines()]
+    return Table("Heights, floors and stairs", ("figure", "value"), rows)
+
+
 def latency(content: Content) -> Table | None:
     """Return the table of the delay of estimates."""
     seen = content.result.latency
@@ -431,6 +441,23 @@ def reasons(content: Content) -> Table | None:
         if one.reasons
     ]
     return Table("Why not green (reports)", ["node", "reasons"], rows) if rows else None
+
+
+def log(content: Content) -> Table | None:
+    """Return what happened, by time."""
+    rows = [
+        [clock_of(row["unix_s"]), escape(row["kind"]), escape(row["text"]), escape(row["by"])]
+        for row in content.log
+    ]
+    return Table("What happened", ["time", "kind", "what", "by"], rows) if rows else None
+
+
+def clock_of(unix_s: str) -> str:
+    """Return the time of day, here, of a Unix time."""
+    try:
+        return f"{datetime.fromtimestamp(float(unix_s)).astimezone():%H:%M:%S}"
+    except (ValueError, OverflowError, OSError):
+        return ""
 
 
 def most_first(counts: Mapping[str, int]) -> list[tuple[str, int]]:

@@ -27,6 +27,7 @@ from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import StateIndex
 from relpos.fusion.models.detection import Detection
 from relpos.fusion.models.odometry_faults import CusumDetector
+from relpos.fusion.models.ranging import slant_height
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -163,7 +164,8 @@ class BankCore:
         outlier, known = self._sensors.model.outlier, self._sensors
         usual = np.full(several, sensors.expect_outliers(known.outlier_counts, outlier))
         shares = usual if outlier_share is None else np.maximum(usual, outlier_share)
-        ranges = Ranges(first, second, range_m, dz_m, variance, counts, biases, velocity, shares)
+        slant_m = slant_height(dz_m, variance)
+        ranges = Ranges(first, second, range_m, slant_m, variance, counts, biases, velocity, shares)
         outlier[3] = 1.0 / (1.0 - these.sampled_share)
         wary = self.relocalisation.since_fault <= OPEN_UPDATES and self.counters["slips"] > 0
         before = these.log_weight.copy()

@@ -24,7 +24,13 @@ from relpos.fusion.bank.reporting import Report
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import PER_NODE, CommonIndex, StateIndex
 from relpos.fusion.clocks import Clocks
-from relpos.fusion.estimator import Estimate, Presence, refuse_unmoved, refuse_unranged
+from relpos.fusion.estimator import (
+    Estimate,
+    Presence,
+    Vertical,
+    refuse_unmoved,
+    refuse_unranged,
+)
 from relpos.fusion.initial_poses import (
     HEADING_RESOLVED_RAD,
     Found,
@@ -35,9 +41,15 @@ from relpos.fusion.models.detection import Detection
 from relpos.fusion.models.motion import reported_sigmas, velocity_m_s
 from relpos.fusion.models.north import North
 from relpos.fusion.models.odometry_faults import LOST_RAD, VAGUE_M, SpeedGate, ZeroMotionDetector
-from relpos.fusion.models.ranging import Mounting, OutlierPersistence, RangeCorrelation
+from relpos.fusion.models.ranging import (
+    Mounting,
+    OutlierPersistence,
+    RangeCorrelation,
+    slant_height,
+)
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
+from relpos.fusion.vertical.filter import VerticalFilter
 from relpos.measurements import Heading, Height, Prior, Range, nodes_of
 
 Floats = npt.NDArray[np.float64]
@@ -79,6 +91,7 @@ class Bank:
     speed_gate: SpeedGate = field(default_factory=SpeedGate)
     zero_motion: ZeroMotionDetector = field(default_factory=ZeroMotionDetector)
     north: North = field(default_factory=North)
+    vertical: VerticalFilter = field(default_factory=VerticalFilter)
     clocks: Clocks = field(default_factory=Clocks)
     _velocity_m_s: dict[int, tuple[float, float]] = field(default_factory=dict)
     """Node -> velocity forward and left, by its newest displacement."""
@@ -126,6 +139,7 @@ class Bank:
     def update(self, step: Step, timeline: Timeline) -> Estimate | None:
         """Process one step of the timeline; an estimate at the end of an epoch."""
         if isinstance(step, Advance):
+            self.vertical.move(step)
             if step.node in self._row:
                 # It waits until a range or heading needs it, or the epoch ends.
                 self._pending.append(step)
@@ -148,6 +162,7 @@ class Bank:
             self._sense(step)
         else:
             self._advance()
+            self._climb(step.time_s)
             self._diffuse(self._row, step.time_s, timeline)
             self._admit(self.initialiser.find(step.time_s))
             return self._estimate(step.time_s, timeline)
@@ -167,7 +182,8 @@ class Bank:
             known = self._known[node] = _Known()
             worn = self.mounting.get(node)
             if worn is not None and worn.height_m is not None:
-                known.worn_m = known.height_m = worn.height_m
+                known.worn_m = worn.height_m
+                known.vertical = Vertical(worn.height_m)
         return known
 
     def _lever_m(self, node: int) -> tuple[float, float]:
@@ -233,26 +249,24 @@ class Bank:
         self._diffuse(ends, time_s, timeline)
         for node in ends:
             self._meet(node).ranged(time_s)
+        for one in step.ranges:
+            self.vertical.ranged(one)
         ranges: Sequence[Range] = step.ranges
         if not ends <= located.keys():
             for node in sorted(ends - located.keys()):
                 self._seek(node)
-            heights = {n: k.height_m for n, k in self._known.items()}
+            heights = {n: k.vertical.z_m for n, k in self._known.items()}
             self.initialiser.update(time_s, step.ranges, self._places(), heights)
             # A search may be long; finding no pose in it is no fault of the data.
             self._ranges_used += len(step.ranges)
             ranges = [r for r in step.ranges if r.node in located and r.peer in located]
         measured = np.array([r.range_m for r in ranges])
         pairs = [(r.node, r.peer) for r in ranges]
-        first, second, dz = self._pairs(pairs)
+        first, second, dz, variance = self._pairs(pairs)
         if ranges:
             self.core.relocalisation.relocalise_lost(first, second, measured)
         rounds = self._attempts(time_s, ranges, timeline)
         if ranges:
-            known = self._known
-            variance = np.array(
-                [known[a].sigma_height_m ** 2 + known[b].sigma_height_m ** 2 for a, b in pairs]
-            )
             counts = self.range_correlation.effective_counts(pairs)
             velocity = [
                 self._velocity_at(a, time_s) + self._velocity_at(b, time_s) for a, b in pairs
@@ -271,6 +285,22 @@ class Bank:
         """Return a node's velocity forward and left (m/s); 0 where its motion is missing."""
         missing = self._known[node].diffused_s >= time_s
         return (0.0, 0.0) if missing else self._velocity_m_s.get(node, (0.0, 0.0))
+
+    def _climb(self, time_s: float) -> None:
+        """Update heights at the end of an epoch; take back what stairs have added to motion."""
+        if not self.vertical.active:
+            return
+        for back in self.vertical.close(time_s):
+            self._counters["stairs_corrected"] += 1
+            row = self._row.get(back.node)
+            if row is None:
+                step = Advance(time_s, back.node, 0.0, back.dx_m, back.dy_m, 0.0)
+                self.initialiser.advance(step)
+            else:
+                self.core.move(np.array([row]), np.array([[back.dx_m, back.dy_m, 0.0, 0.0]]))
+        for node, known in self._known.items():
+            vertical = self.vertical.of(node, time_s)
+            known.vertical = vertical._replace(z_m=known.worn_m + vertical.z_m)
 
     def _diffuse(self, nodes: Iterable[int], time_s: float, timeline: Timeline) -> None:
         """Let nodes whose motion is missing be anywhere that they can have walked to.
@@ -349,12 +379,14 @@ class Bank:
         self.core.hypotheses.split_heading(self._row[step.node], abs(gone))
         self._counters["headings_sought"] += 1
 
-    def _pairs(self, pairs: Sequence[tuple[int, int]]) -> tuple[Indices, Indices, Floats]:
+    def _pairs(self, pairs: Sequence[tuple[int, int]]) -> tuple[Indices, Indices, Floats, Floats]:
+        """Return the rows of pairs, their differences of height (m) and those's variances."""
         row, known = self._row, self._known
         rows = np.array([(row[a], row[b]) for a, b in pairs], dtype=np.int64).reshape(-1, 2)
         first, second = np.ascontiguousarray(rows.T)
-        dz = np.array([known[b].height_m - known[a].height_m for a, b in pairs])
-        return first, second, dz
+        heights = [(known[a].vertical, known[b].vertical) for a, b in pairs]
+        dz = np.array([b.z_m - a.z_m for a, b in heights])
+        return first, second, dz, np.array([a.sigma_z_m**2 + b.sigma_z_m**2 for a, b in heights])
 
     def _attempts(
         self, time_s: float, ranges: Sequence[Range], timeline: Timeline
@@ -366,7 +398,8 @@ class Bank:
             for late in timeline.catch_up({n for p in pairs for n in p}, time_s):
                 self.update(late, timeline)
             self._advance()
-            rows = self._pairs(pairs)
+            first, second, dz, variance = self._pairs(pairs)
+            rows = first, second, slant_height(dz, variance)
             received = np.arange(len(pairs)) < len(done.received)
             attempted = np.ones(len(pairs))
             attempted[len(done.received) :] = self.detection.update(
@@ -378,9 +411,7 @@ class Bank:
     def _sense(self, step: Sensed) -> None:
         measured = step.measurement
         if isinstance(measured, Height):
-            known = self._known[measured.node]
-            known.height_m = known.worn_m + measured.height_m
-            known.sigma_height_m = measured.sigma_m or 0.0
+            self.vertical.measure(measured, step.time_s)
         elif isinstance(measured, Heading) and measured.node in self._row:
             self._advance()
             self._turn(step.time_s, measured, self._row[measured.node])

@@ -62,8 +62,9 @@ class Ranges(NamedTuple):
     second: Indices
     range_m: Floats
     dz_m: Floats
-    """Height difference of the antennas."""
+    """Height difference of the antennas, root mean square."""
     dz_variance_m2: Floats
+    """Of the height difference, Gaussian."""
     sample_count: Floats
     """How many independent ranges each counts as: the variance that the gain sees is divided by
     it, the evidence multiplied."""
@@ -330,7 +331,9 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
                 range_gain(block, i, j, gx, gy, g)
             curvature = v - gx * (load(g, j) - load(g, i)) - gy * (load(g, j + 1) - load(g, i + 1))
             if ranges.dz_variance_m2[r] > 0.0:
-                v = v + (dz * dz * ranges.dz_variance_m2[r]) / (m * m)
+                # Var(dz^2) / (4 m^2) with the second order.
+                lifted = ranges.dz_variance_m2[r]
+                v = v + (dz * dz - 0.5 * lifted) * lifted / (m * m)
             innovation = ranges.range_m[r] - m
             if biased and ranges.bias[r] >= 0:
                 seen = select(m * m > FAR * variance, fill(1.0), fill(0.0))

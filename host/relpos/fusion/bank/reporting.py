@@ -125,8 +125,7 @@ class Report:
         own = self.world_covariance[at : at + 3, at : at + 3].tolist()
         return NodeEstimate(
             node, x, y, math.remainder(heading, math.tau), own[0][0], own[1][1], own[0][1],
-            min(math.sqrt(own[2][2]), ANY_ANGLE_RAD), status, presence.height_m,
-            presence.sigma_height_m,
+            min(math.sqrt(own[2][2]), ANY_ANGLE_RAD), status, *presence.vertical,
         )  # fmt: skip
 
     def _parameters(self) -> tuple[Parameter, ...]:

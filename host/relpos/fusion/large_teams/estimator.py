@@ -40,6 +40,7 @@ from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_varia
 from relpos.fusion.models.ranging import Mounting, OutlierPersistence, RangeCorrelation
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
+from relpos.fusion.vertical.filter import VerticalFilter
 from relpos.measurements import Height, Prior, Range, nodes_of
 
 Floats = npt.NDArray[np.float64]
@@ -124,6 +125,8 @@ class _Collected(NamedTuple):
     excess_m: float
     """By how much it exceeded the distance that was estimated at its instant."""
     slopes: tuple[float, float]
+    variance_m2: float
+    """What uncertain heights add to the range's."""
 
 
 @dataclass(slots=True)
@@ -135,6 +138,7 @@ class LargeTeam:
     settings: LargeTeamSettings
     mountings: Mapping[int, Mounting]
     filter: NeighbourhoodFilter = field(init=False)
+    vertical: VerticalFilter = field(default_factory=VerticalFilter)
     clocks: Clocks = field(default_factory=Clocks)
     _nodes: list[int] = field(default_factory=list)
     _row: dict[int, int] = field(default_factory=dict)
@@ -185,6 +189,7 @@ class LargeTeam:
         match step:
             case Advance():
                 self._moved = True
+                self.vertical.move(step)
                 self._presence(step.node).received(step.time_s)
                 self._pending.append(step)
             case Ranging():
@@ -193,14 +198,15 @@ class LargeTeam:
                     self._correct()
                 self._use_ranges(step, timeline)
             case Sensed(measurement=Height() as height):
-                known = self._presence(height.node)
-                known.height_m, known.sigma_height_m = height.height_m, height.sigma_m or 0.0
+                self._presence(height.node)
+                self.vertical.measure(height, step.time_s)
             case Sensed():
                 self._presence(step.measurement.node)
                 self._own["headings_unused"] += 1
             case Epoch():
                 self._predict()
                 self._correct()
+                self._climb(step.time_s)
                 self._diffuse(self._row, step.time_s, timeline)
                 self._add_found(self.initialiser.find(step.time_s))
                 self._slew_clocks(step.time_s, timeline)
@@ -231,7 +237,18 @@ class LargeTeam:
     def _height(self, node: int) -> float:
         mounting = self.mountings.get(node)
         tag_m = 0.0 if mounting is None or mounting.height_m is None else mounting.height_m
-        return tag_m + self._known[node].height_m
+        return tag_m + self._known[node].vertical.z_m
+
+    def _climb(self, time_s: float) -> None:
+        """Update heights at the end of an epoch; take back what stairs have added to motion."""
+        if not self.vertical.active:
+            return
+        for back in self.vertical.close(time_s):
+            self._own["stairs_corrected"] += 1
+            self._pending.append(Advance(time_s, back.node, 0.0, back.dx_m, back.dy_m, 0.0))
+        self._predict()
+        for node, known in self._known.items():
+            known.vertical = self.vertical.of(node, time_s)
 
     def _add(self, nodes: Sequence[int], poses: Floats, covariances: Floats) -> None:
         if not nodes:
@@ -307,6 +324,8 @@ class LargeTeam:
         self._diffuse(ends, step.time_s, timeline)
         for node in ends:
             self._presence(node).ranged(step.time_s)
+        for measured in step.ranges:
+            self.vertical.ranged(measured)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
         if located:
             self._collect(step.time_s, located)
@@ -321,10 +340,14 @@ class LargeTeam:
         headings = self.filter.pose[rows, 2].tolist()
         for k, r in enumerate(ranges):
             height_m = self._height(r.peer) - self._height(r.node)
-            horizontal_m = math.sqrt(max(r.range_m**2 - height_m**2, 0.0))
+            variance_m2 = sum(self._known[end].vertical.sigma_z_m ** 2 for end in (r.node, r.peer))
+            horizontal_m = math.sqrt(max(r.range_m**2 - height_m**2 - variance_m2, 0.0))
+            # Var(dz^2) / (4 r^2), as in the bank (``fusion/bank/range_update.py``).
+            lifted_m2 = (height_m**2 + 0.5 * variance_m2) * variance_m2 / r.range_m**2
             node, peer = (r.node, headings[k][0]), (r.peer, headings[k][1])
             slopes = self._slopes.of((sight[k][0], sight[k][1]), node, peer)
-            self._collected.append(_Collected(r, horizontal_m - float(distance[k]), slopes))
+            excess_m = horizontal_m - float(distance[k])
+            self._collected.append(_Collected(r, excess_m, slopes, lifted_m2))
             self._reach_m = max(self._reach_m * REACH_FADE, r.range_m)
         self._collected_s = min(self._collected_s, time_s)
         self._ranges_used += len(ranges)
@@ -340,13 +363,15 @@ class LargeTeam:
         node, peer = (np.array([self._row[n] for n in ends]) for ends in zip(*pairs, strict=True))
         slopes = np.array([c.slopes for c in self._collected])
         excess = np.array([c.excess_m for c in self._collected])
+        lifted = np.array([c.variance_m2 for c in self._collected])
         self._collected, self._collected_s = [], math.inf
         f = self.filter
         if not math.isfinite(f.width_m):
             f.widen(self._reach_m * REACH_SLACK)
         horizontal = excess + f.antenna_pairs(node, peer)[0]
         before, prior = f.pose.copy(), f.marginals()
-        counts = self._correlation.effective_counts(pairs)
+        # A range of twice the variance counts half.
+        counts = self._correlation.effective_counts(pairs) / (1.0 + lifted / f.model.sigma_m**2)
         shares = self._outliers.shares(time_s, pairs)
         inlier = f.update_with_terms(Ranges(node, peer, horizontal, counts, shares, slopes))
         self._outliers.learn(time_s, pairs, inlier)
@@ -425,15 +450,14 @@ class LargeTeam:
             known = self._known[node]
             row = self._row.get(node)
             if row is None:
-                nodes.append(unlocated(node, known.height_m, known.sigma_height_m))
+                nodes.append(unlocated(node, known.vertical))
                 continue
             xx, yy, xy, hh = own[row]
             x, y, heading = pose[row]
             nodes.append(
                 NodeEstimate(
                     node, x, y, math.remainder(heading, 2.0 * math.pi), xx, yy, xy,
-                    min(math.sqrt(hh), ANY_ANGLE_RAD), known.status, known.height_m,
-                    known.sigma_height_m,
+                    min(math.sqrt(hh), ANY_ANGLE_RAD), known.status, *known.vertical,
                 )
             )  # fmt: skip
         return Estimate(time_s, tuple(nodes), self._pairs(), parameters=self._parameters(time_s))

@@ -52,6 +52,12 @@ class RangeNoise:
         return self.outliers / self.outlier_span_m / peak
 
 
+def slant_height(dz_m: Floats, variance_m2: Floats) -> Floats:
+    """Return the root mean square of a difference of heights: what makes a range slant."""
+    slant: Floats = np.sqrt(dz_m * dz_m + variance_m2)
+    return slant
+
+
 DECORRELATION_M = 0.45
 """Path length of both nodes together over which a range's error changes. Most of it is multipath,
 which belongs to the place and not to the moment: in the recordings of robots, consecutive errors

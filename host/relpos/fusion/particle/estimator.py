@@ -15,6 +15,7 @@ from relpos.fusion.estimator import (
     Estimate,
     NodeEstimate,
     Presence,
+    Vertical,
     pairs_of,
     refuse_unmoved,
     refuse_unranged,
@@ -118,8 +119,8 @@ class ParticleFilter:
                     self._predict()
                     self._update(step)
                 case Sensed(measurement=Height() as height):
-                    self._known[height.node].height_m = height.height_m
-                    self._known[height.node].sigma_height_m = height.sigma_m or 0.0
+                    vertical = Vertical(height.height_m, height.sigma_m or 0.0)
+                    self._known[height.node].vertical = vertical
                 case Sensed():
                     self._own["headings_unused"] += 1
                 case Epoch():
@@ -148,7 +149,7 @@ class ParticleFilter:
         if any(node in self.initialiser for node in nodes):
             # The search may end without a result; the ranges are usable all the same.
             self._ranges_used += len(step.ranges)
-            heights = {node: known.height_m for node, known in self._known.items()}
+            heights = {node: known.vertical.z_m for node, known in self._known.items()}
             self.initialiser.update(step.time_s, step.ranges, self._positions(), heights)
         located = [r for r in step.ranges if r.node in self._row and r.peer in self._row]
         if located:
@@ -158,7 +159,10 @@ class ParticleFilter:
                 np.array([self._row[r.peer] for r in located]),
                 np.array([r.range_m for r in located]),
                 np.array(
-                    [self._known[r.node].height_m - self._known[r.peer].height_m for r in located]
+                    [
+                        self._known[r.node].vertical.z_m - self._known[r.peer].vertical.z_m
+                        for r in located
+                    ]
                 ),
             )
 
@@ -208,7 +212,7 @@ class ParticleFilter:
             nodes.append(
                 NodeEstimate(
                     node, x_m, y_m, math.atan2(s, c), xx, yy, xy, _spread_rad(math.hypot(c, s)),
-                    known.status, known.height_m, known.sigma_height_m,
+                    known.status, *known.vertical,
                 )
             )  # fmt: skip
         return Estimate(time_s, tuple(nodes), pairs_of(nodes))

@@ -31,6 +31,7 @@ from relpos.fusion.smoother.graph import Graph, build_graph
 from relpos.fusion.smoother.problem import Problem
 from relpos.fusion.smoother.solution import Solution, smooth
 from relpos.fusion.smoother.variance_components import VarianceComponents
+from relpos.fusion.vertical.offline import as_climbed
 from relpos.measurements import Measurement, Prior
 
 Floats = npt.NDArray[np.float64]
@@ -72,8 +73,9 @@ class Smoother:
     def finish(self) -> list[Estimate]:
         """Smooth the whole run; RelposError if the data were unfit."""
         self._estimates += self.online.finish()
+        nodes = [prior.node for prior in self.priors]
         graph, counted = build_graph(
-            as_learned(self._measurements, self._estimates),
+            as_climbed(as_learned(self._measurements, self._estimates), nodes),
             self.priors,
             self.heights_m,
             self.antennas_m,
@@ -189,11 +191,13 @@ def _estimates(
         news[chord, pair] = True
     begun = np.logical_or.accumulate(news, axis=0) | (graph.prior_weight[:, 0] > 1e-3)
     silent = np.zeros(nodes, dtype=int)
+    vertical = {(e.time_s, n.node): n.vertical[1:] for e in online for n in e.nodes}
     ambiguous = {
         n.node for n in (online[-1].nodes if online else ()) if n.status is NodeStatus.AMBIGUOUS
     }
     ranged = np.isin(np.arange(nodes), graph.pairs) | (graph.prior_weight[:, 0] > 1e-3)
     for k in range(1, knots):
+        time_s = float(graph.time_s[k])
         silent = (silent + 1) * ~news[k - 1]
         rows = []
         for n, name in enumerate(graph.node_ids):
@@ -215,10 +219,9 @@ def _estimates(
                     math.remainder(float(poses[k, n, 2]), 2.0 * math.pi),
                     float(p[0, 0]), float(p[1, 1]), float(p[0, 1]),
                     min(math.sqrt(max(float(p[2, 2]), 0.0)), ANY_ANGLE_RAD), status,
-                    float(graph.height_m[k, n]),
+                    float(graph.height_m[k, n]), *vertical.get((time_s, name), ()),
                 )
             )  # fmt: skip
-        time_s = float(graph.time_s[k])
         shown = [n for n, node in enumerate(rows) if node.status is not NodeStatus.UNLOCATED]
         pairs = _pairs(graph.node_ids, poses[k], blocks[k], shown)
         yield Estimate(time_s, tuple(rows), pairs, (), _parameters(problem, solution, time_s))

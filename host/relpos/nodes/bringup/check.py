@@ -43,6 +43,8 @@ STATUS_MARGIN_S = 3.0
 MOST_SUPPLY_V = 5.5
 MOST_TICK_S = 0.009
 """45 % of the 20 ms between two ticks, the firmware's own limit."""
+MOST_MISSED = 2
+"""Samples of some 1500: one of a chip that delays them hid the delay."""
 UNKNOWN_STACK = 0xFFFF
 MARK_REGISTER, MARK = 0x63, 0x5A
 """A register of the inertial sensor that the firmware never writes; lost with its supply."""
@@ -82,6 +84,8 @@ class NodeCheck:
                     IMU, None, "nor anything else: the radio first, or by cable (--cable)"
                 )
                 return
+        else:
+            yield Finding(RADIO, None, "has no part in it: the switch gives its line to the cable")
         first, heard = self._status(), self._heard()
         yield from self._noted(self._board(first))
         found = probe(self._bus)
@@ -208,9 +212,8 @@ class NodeCheck:
         others = set(self._dialogue.link.decoder.nodes) - {self._dialogue.node}
         peer = self._peer or min(others, default=None)
         if peer is None:
-            yield Finding(
-                RANGING, None, "no second node is heard: switch one on, or name it with --peer"
-            )
+            heard = "none is heard by cable" if self._cable else "no second node is heard"
+            yield Finding(RANGING, None, f"{heard}: switch one on and name it with --peer")
             return
         self._dialogue.demand(wire.CommandCode.SET_RAW_REPORTS, RAW_REPORTS)
         # The newest motion is a second old at most.
@@ -226,16 +229,10 @@ class NodeCheck:
         """What happened during the check that no part was asked for."""
         if not (first and last):
             return
-        mark = self._bus.byte(IMU_ADDRESS, MARK_REGISTER)
         missed = int(last["missed_ticks"] - first["missed_ticks"]) & 0xFFFF
-        if mark != MARK and SAMPLES not in self._wrong:
-            yield Finding(
-                IMU,
-                False,
-                "has restarted during the check",
-                "its supply dips: 3.3 V at its pins, contacts",
-            )
-        elif missed and SAMPLES not in self._wrong:
+        if SAMPLES not in self._wrong:
+            yield from self._restarted()
+        if missed > MOST_MISSED and not self._wrong & {IMU, SAMPLES}:
             yield Finding(SAMPLES, False, f"{missed} are missing", "a loose contact")
         errors = int(last["bus_errors"] - first["bus_errors"]) & 0xFFFF
         if errors > self._bus.failed and not self._wrong & {IMU, COMPASS, POZYX, SAMPLES, RANGING}:
@@ -246,11 +243,24 @@ class NodeCheck:
                 "SDA, SCL and GND: loose contacts, long wires; pull-ups (docs/hardware.md)",
             )
 
+    def _restarted(self) -> Iterator[Finding]:
+        if self._bus.byte(IMU_ADDRESS, MARK_REGISTER) != MARK:
+            yield Finding(
+                IMU,
+                False,
+                "has restarted during the check",
+                "its supply dips: 3.3 V at its pins, contacts",
+            )
+
     def _self_tests(self, found: BusFindings) -> Iterator[Finding]:
         if IMU in self._wrong:
             return
         identity = found.chips[IMU].identity or 0
         if SAMPLES not in self._wrong:
-            yield from inertial.self_tests(self._dialogue, self._bus, identity, self.figures)
+            tested = list(inertial.self_tests(self._dialogue, self._bus, identity, self.figures))
+            yield from self._restarted()
+            if IMU in self._wrong:  # what they gave is not the sensor's
+                return
+            yield from tested
         if not self._wrong & {COMPASS, SAMPLES}:
             yield compass.self_test(self._bus, identity, self.figures)

@@ -62,8 +62,11 @@ class Recording:
         return np.mean(fields, axis=0) if fields else None
 
     def field_readings(self) -> int:
-        """Return how many reports had a reading of the field."""
-        return sum(sample.magnetic_field_ut is not None for sample in self.samples)
+        """Return how many readings of the field came.
+
+        One a report; or none and two by turns, where a reading falls together with a report.
+        """
+        return sum(sample.field_readings for sample in self.samples)
 
 
 def record(dialogue: NodeDialogue) -> Recording:

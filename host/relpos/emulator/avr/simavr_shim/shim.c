@@ -63,7 +63,7 @@ struct relpos_avr {
 	uint32_t static_end, lowest_sp;
 	uint64_t tick_began;
 	record_list marks, sent, looks, heard;
-	int tracing;
+	uint16_t watched; /* data address that looks show; 0: not tracing */
 	/* TWI */
 	avr_int_vector_t *twi_vector;
 	twi_phase phase;
@@ -400,7 +400,7 @@ static uint8_t udr_read(avr_t *avr, avr_io_addr_t address, void *param)
 	show_damage(e);
 	if (!e->received_count) avr->data[A_UCSRA] &= (uint8_t)~RXC;
 	avr->data[A_UCSRA] &= (uint8_t)~DOR;
-	if (e->tracing) append(e, &e->heard, avr->cycle, v);
+	if (e->watched) append(e, &e->heard, avr->cycle, v);
 	levels(e);
 	return avr->data[address] = v;
 }
@@ -556,6 +556,7 @@ static uint8_t tifr1_read(avr_t *avr, avr_io_addr_t address, void *param)
 	relpos_avr *e = param;
 	append(e, &e->looks, avr->cycle, avr->data[A_TCNT1L]);
 	append(e, &e->looks, avr->cycle, avr->data[A_TCNT1L + 1]);
+	append(e, &e->looks, avr->cycle, avr->data[e->watched]);
 	return avr->data[address];
 }
 
@@ -822,9 +823,9 @@ uint32_t relpos_avr_take_marks(relpos_avr *e, uint64_t *cycles, uint8_t *values,
 	return take(&e->marks, cycles, values, room);
 }
 
-void relpos_avr_trace(relpos_avr *e)
+void relpos_avr_trace(relpos_avr *e, uint16_t watched)
 {
-	e->tracing = 1;
+	e->watched = watched;
 	hook_read(e, A_TIFR1, tifr1_read);
 }
 

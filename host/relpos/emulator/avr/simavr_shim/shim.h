@@ -71,9 +71,9 @@ uint32_t relpos_avr_take_sent(relpos_avr *, uint64_t *cycles, uint8_t *bytes, ui
 uint32_t relpos_avr_take_marks(relpos_avr *, uint64_t *cycles, uint8_t *values, uint32_t room);
 
 /* From now on keep what relpos_avr_take_looks() and relpos_avr_take_heard() give. */
-void relpos_avr_trace(relpos_avr *);
-/* Take up to `room` records of reads of TIFR1: each is two, the low and the high byte of timer 1 as the
- * program read it last. */
+void relpos_avr_trace(relpos_avr *, uint16_t watched);
+/* Take up to `room` records of reads of TIFR1: each is three, the low and the high byte of timer 1 as the
+ * program read it last, and the byte of RAM that is watched. */
 uint32_t relpos_avr_take_looks(relpos_avr *, uint64_t *cycles, uint8_t *values, uint32_t room);
 /* Take up to `room` bytes that the program fetched from the receiver. */
 uint32_t relpos_avr_take_heard(relpos_avr *, uint64_t *cycles, uint8_t *values, uint32_t room);

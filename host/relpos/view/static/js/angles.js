@@ -20,22 +20,12 @@ export function clockHour(relativeRad) {
   return ((hour % 12) + 12) % 12 || 12;
 }
 
-const POINTS = [
-  ["N", "north"],
-  ["NE", "north-east"],
-  ["E", "east"],
-  ["SE", "south-east"],
-  ["S", "south"],
-  ["SW", "south-west"],
-  ["W", "west"],
-  ["NW", "north-west"],
-];
+const POINTS = ["n", "ne", "e", "se", "s", "sw", "w", "nw"];
 
-/** The nearest of eight compass points: {short: "NE", words: "north-east"}. */
+/** The nearest of eight compass points: "ne"; `words.js` puts it into words. */
 export function compassPoint(bearingRad, northRad = Math.PI / 2) {
   const eighth = Math.round((northRad - bearingRad) / (TAU / 8));
-  const [short, words] = POINTS[((eighth % 8) + 8) % 8];
-  return { short, words };
+  return POINTS[((eighth % 8) + 8) % 8];
 }
 
 export function degrees(rad) {

@@ -1,7 +1,8 @@
 // The top of the page: alarms of people, warnings of the session.
 
 import { make, setAttribute, setText } from "./dom.js";
-import { alarmText, seconds } from "./words.js";
+import { said, t } from "./i18n.js";
+import { alarmText, levelWords, seconds } from "./words.js";
 
 /** More rows than that, unless they are high, share one. */
 const MAX_ROWS = 4;
@@ -16,11 +17,11 @@ export class AlarmBanner {
     this.list = make("div", { class: "rows" });
     this.more = make("p", { class: "alarm more", "data-acknowledged": "false" });
     this.moreText = make("span", { class: "text" });
-    this.all = make("button", { type: "button", text: "Acknowledge all" });
+    this.all = make("button", { type: "button", "data-t": "acknowledge.all" });
     this.all.addEventListener("click", () => this.acknowledge(this.open));
     this.more.append(this.moreText, make("span", { class: "buttons" }, this.all));
     this.known = make("p", { class: "alarm known", "data-acknowledged": "true" });
-    this.known.append(make("span", { class: "kind", text: "known" }));
+    this.known.append(make("span", { class: "kind", "data-t": "known" }));
     this.knownText = make("span", { class: "text" });
     this.known.append(this.knownText);
     this.open = [];
@@ -51,17 +52,17 @@ export class AlarmBanner {
       row.nodes = alarm.nodes;
       setAttribute(row.element, "data-node", alarm.key);
       setAttribute(row.element, "data-level", alarm.level);
-      setText(row.kind, alarm.level);
+      setText(row.kind, levelWords(alarm.level));
       setText(row.text, alarmText(alarm));
-      setAttribute(row.button, "aria-label", `Acknowledge: ${name}`);
-      setAttribute(row.find, "aria-label", `Find ${name}`);
+      setAttribute(row.button, "aria-label", t("acknowledge.name", { name }));
+      setAttribute(row.find, "aria-label", t("find.name", { name }));
       row.find.hidden = alarm.nodes.length > 1;
     });
     this.more.hidden = this.rows.size < 2 && !others.length;
     setAttribute(this.more, "data-level", rows[0]?.level ?? "low");
     setText(this.moreText, others.length
-      ? `and ${others.length} more: ${others.flatMap((row) => row.alarms).map((a) => a.name).join(", ")}`
-      : `${this.open.length} open`);
+      ? t("alarms.more", { count: others.length, names: others.flatMap((row) => row.alarms).map((a) => a.name).join(", ") })
+      : t("alarms.open", { count: this.open.length }));
     this.known.hidden = known.length === 0;
     setText(this.knownText, known.map(knownText).join(" · "));
     this.section.hidden = !rows.length && !known.length;
@@ -71,9 +72,9 @@ export class AlarmBanner {
     const row = { nodes: [] };
     row.kind = make("span", { class: "kind" });
     row.text = make("span", { class: "text" });
-    row.button = make("button", { type: "button", text: "Acknowledge" });
+    row.button = make("button", { type: "button", "data-t": "acknowledge" });
     row.button.addEventListener("click", () => this.acknowledge(row.nodes));
-    row.find = make("button", { type: "button", text: "Find" });
+    row.find = make("button", { type: "button", "data-t": "find" });
     row.find.addEventListener("click", () => this.show(row.nodes[0]));
     row.element = make("div", { class: "alarm", "data-acknowledged": "false" },
       row.kind, row.text, make("span", { class: "buttons" }, row.find, row.button));
@@ -82,11 +83,9 @@ export class AlarmBanner {
 }
 
 function knownText(alarm) {
-  const how = alarm.shelvedS ? `shelved, back in ${seconds(alarm.shelvedS)}` : alarm.by ? `seen by ${alarm.by}` : "seen";
+  const how = alarm.shelvedS ? t("known.shelved", { time: seconds(alarm.shelvedS) }) : alarm.by ? t("known.by", { name: alarm.by }) : t("known.seen");
   return `${alarmText(alarm)} (${how})`;
 }
-
-const KINDS = { warning: "Warning", alarm: "Alarm" };
 
 /** Warnings and alarms of the session have a line each; notes are in the log alone. */
 export function showNotices(section, notices) {
@@ -95,6 +94,6 @@ export function showNotices(section, notices) {
   if (section.dataset.shown === key) return;
   section.dataset.shown = key;
   section.replaceChildren(...lines.map((notice) => make("p", { "data-level": notice.level },
-    make("span", { class: "kind", text: KINDS[notice.level] ?? notice.level }),
+    make("span", { class: "kind", text: t(`notice.${notice.level}`) }),
     make("span", { class: "text", text: notice.text }))));
 }

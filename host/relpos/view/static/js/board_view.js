@@ -1,9 +1,11 @@
 // The accountability board: who is in, roll call, MAYDAY, evacuation. What people say, not what is measured.
 
 import { byId, make, postJson, setAttribute, setText } from "./dom.js";
-import { ago, duration, seconds, timeOfDay } from "./words.js";
+import { has, t, timeOfDay } from "./i18n.js";
+import { ago, duration, seconds } from "./words.js";
 
-const STATES = { "": "not said", standby: "standby", entered: "entered", withdrawing: "withdrawing", out: "out" };
+const STATES = ["", "standby", "entered", "withdrawing", "out"];
+const FIELDS = ["team", "sector", "task", "state", "air"];
 const EARLY_S = 60;
 
 export class BoardView {
@@ -47,7 +49,7 @@ export class BoardView {
     try {
       await postJson(`/api/${kind}`, { ...body, by: this.by() });
     } catch (error) {
-      this.say(`The board has not changed: ${error.message}`);
+      this.say(t("board.failed", { error: error.message }));
     }
   }
 
@@ -62,7 +64,7 @@ export class BoardView {
     this.showEvacuation();
     const { people = {}, evacuation, roll_call: call } = this.board;
     const inside = this.team.order.filter((node) => ["entered", "withdrawing"].includes(people[node]?.state));
-    setText(byId("show-board"), inside.length ? `Board (${inside.length} in)` : "Board");
+    setText(byId("show-board"), inside.length ? t("board.in", { count: inside.length }) : t("board"));
     if (!this.dialog.open) return;
     const teams = [...new Set(Object.values(people).map((place) => place.team).filter(Boolean))].sort();
     const select = byId("board-team");
@@ -76,35 +78,38 @@ export class BoardView {
       const place = people[person.node] ?? {};
       setText(row.name, person.name);
       setAttribute(row.element, "data-state", place.state ?? "");
-      for (const name of ["team", "sector", "task", "state", "air"]) {
+      for (const name of FIELDS) {
+        setAttribute(row[name], "aria-label", t(`board.${name}.of`, { node: person.node }));
         const value = name === "air" ? place.air_bar ?? "" : place[name] ?? "";
         if (document.activeElement !== row[name] && row[name].value !== String(value)) row[name].value = value;
       }
       setText(row.time, Number.isFinite(place.entered_unix_s)
         ? `${timeOfDay(1000 * place.entered_unix_s)}, ${duration(nowMs / 1000 - place.entered_unix_s)}` : "–");
       setText(row.contact, ago(person.seen_s));
-      setText(row.airAge, Number.isFinite(place.air_unix_s) ? `entered ${timeOfDay(1000 * place.air_unix_s)}, not measured` : "");
+      setText(row.airAge, Number.isFinite(place.air_unix_s) ? t("board.air.entered", { time: timeOfDay(1000 * place.air_unix_s) }) : "");
       const answer = call?.answers?.[person.node];
       const called = call && call.ended_unix_s === null && call.nodes.includes(person.node);
       row.here.hidden = row.missing.hidden = !called;
       setAttribute(row.here, "aria-pressed", String(answer?.answer === "confirmed"));
       setAttribute(row.missing, "aria-pressed", String(answer?.answer === "missing"));
-      setText(row.answer, answer ? `${answer.answer} by ${answer.by || "somebody"}` : called ? "not answered" : "");
+      setText(row.answer, answer ? t(`roll.${answer.answer}.by`, { name: answer.by || t("somebody") }) : called ? t("roll.waiting") : "");
       const mayday = this.board.mayday?.[person.node];
-      setText(row.mayday, mayday ? "End MAYDAY" : "MAYDAY (hold)");
+      setText(row.mayday, t(mayday ? "mayday.end" : "mayday.hold"));
       row.hasMayday = Boolean(mayday);
       setAttribute(row.element, "data-mayday", String(row.hasMayday));
       const out = evacuation?.nodes.includes(person.node);
       row.tick.hidden = !out;
+      row.evacuate.hidden = out;
+      setAttribute(row.evacuate, "aria-label", t("evacuate.name", { name: person.name }));
       const seen = evacuation?.acknowledged?.[person.node];
-      setText(row.order, !out ? "" : seen ? `understood, by ${seen.by || "somebody"} ${timeOfDay(1000 * seen.unix_s)}`
-        : evacuation.delivered?.[person.node] ? `on the phone ${timeOfDay(1000 * evacuation.delivered[person.node])}, no answer yet` : "radio order: no answer yet");
+      setText(row.order, !out ? "" : seen ? t("evacuate.understood.by", { name: seen.by || t("somebody"), time: timeOfDay(1000 * seen.unix_s) })
+        : evacuation.delivered?.[person.node] ? t("evacuate.delivered", { time: timeOfDay(1000 * evacuation.delivered[person.node]) }) : t("evacuate.radio"));
     }
   }
 
   make(node) {
     const field = (name, attributes) => {
-      const input = make(name === "state" ? "select" : "input", { "aria-label": `${name} of node ${node}`, ...attributes });
+      const input = make(name === "state" ? "select" : "input", attributes);
       input.addEventListener("change", () => this.post("board", name === "air"
         ? { node, air_bar: input.value === "" ? null : Number(input.value) } : { node, [name]: input.value }));
       return input;
@@ -112,20 +117,22 @@ export class BoardView {
     const row = { name: make("span"), time: make("td"), contact: make("td"), airAge: make("span", { class: "soft" }),
       answer: make("span"), order: make("span"), team: field("team", { size: 6, maxlength: 40 }), sector: field("sector", { size: 6, maxlength: 40 }),
       task: field("task", { size: 10, maxlength: 40 }), state: field("state", {}), air: field("air", { type: "number", min: 0, max: 400, step: 5 }) };
-    row.state.append(...Object.entries(STATES).map(([value, text]) => make("option", { value, text })));
-    const button = (text, action) => {
-      const element = make("button", { type: "button", text });
+    row.state.append(...STATES.map((value) => make("option", { value, "data-t": `board.state.${value || "none"}` })));
+    const button = (key, action) => {
+      const element = make("button", { type: "button", "data-t": key });
       element.addEventListener("click", action);
       return element;
     };
-    row.here = button("Confirmed", () => this.post("rollcall", { action: "answer", node, answer: "confirmed" }));
-    row.missing = button("Missing", () => this.post("rollcall", { action: "answer", node, answer: "missing" }));
-    row.tick = button("Understood", () => this.post("evacuate", { action: "acknowledged", node }));
+    row.here = button("roll.answer.confirmed", () => this.post("rollcall", { action: "answer", node, answer: "confirmed" }));
+    row.missing = button("roll.answer.missing", () => this.post("rollcall", { action: "answer", node, answer: "missing" }));
+    row.evacuate = button("evacuate.one", () => {});
+    hold(row.evacuate, () => this.post("evacuate", { action: "order", nodes: [node] }));
+    row.tick = button("evacuate.understood", () => this.post("evacuate", { action: "acknowledged", node }));
     row.mayday = make("button", { type: "button" });
     hold(row.mayday, () => this.mayday(node, !row.hasMayday));
     row.element = make("tr", { "data-node": node }, make("th", { scope: "row" }, row.name), make("td", {}, row.team), make("td", {}, row.sector),
       make("td", {}, row.task), make("td", {}, row.state), row.time, row.contact, make("td", {}, row.air, " bar ", row.airAge),
-      make("td", {}, row.here, row.missing, row.answer), make("td", {}, row.mayday), make("td", {}, row.order, row.tick));
+      make("td", {}, row.here, row.missing, row.answer), make("td", {}, row.mayday), make("td", {}, row.evacuate, row.order, row.tick));
     byId("board-rows").append(row.element);
     this.rows.set(node, row);
     return row;
@@ -142,10 +149,9 @@ export class BoardView {
     const confirmed = answers.filter((answer) => answer.answer === "confirmed").length;
     const leftS = call.started_unix_s + call.within_s - nowMs / 1000;
     setAttribute(line, "data-state", !open ? call.outcome : leftS < 0 ? "over" : leftS < EARLY_S ? "soon" : "open");
-    const kind = call.emergency ? "Emergency roll call" : "Roll call";
-    const count = `${confirmed} of ${call.nodes.length} confirmed, ${answers.length - confirmed} missing`;
-    setText(line, !open ? `${kind} ${call.outcome}: ${count}, ended ${timeOfDay(1000 * call.ended_unix_s)}`
-      : `${kind}: ${count}, ${leftS < 0 ? `${seconds(-leftS)} over time` : `${seconds(leftS)} left`}`);
+    const count = t("roll.count", { confirmed, called: call.nodes.length, missing: answers.length - confirmed });
+    const state = open ? (leftS < 0 ? "over" : "left") : call.outcome;
+    setText(line, t(`roll.${call.emergency ? "emergency." : ""}${state}`, { count, time: open ? seconds(Math.abs(leftS)) : timeOfDay(1000 * call.ended_unix_s) }));
   }
 
   showEvacuation() {
@@ -155,7 +161,7 @@ export class BoardView {
     line.hidden = !order;
     if (!order) return;
     const done = Object.keys(order.acknowledged).length;
-    setText(line, `EVACUATION ordered ${timeOfDay(1000 * order.unix_s)}: ${done} of ${order.nodes.length} have understood. A radio order: phones show it where there are some.`);
+    setText(line, t("evacuate.line", { time: timeOfDay(1000 * order.unix_s), done, all: order.nodes.length }));
   }
 }
 

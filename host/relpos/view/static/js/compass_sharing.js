@@ -1,12 +1,10 @@
 // Shares the phone's compass; explains why it cannot.
 
+import { t } from "./i18n.js";
 import { headingOfEvent, meanHeading } from "./compass.js";
 
 const EVERY_MS = 1000;
 const MAX_KEPT = 120; // two minutes without connection; older headings are of no use
-
-export const NOT_SECURE =
-  "Browsers share the compass only over HTTPS: start relpos with --https and open its address.";
 
 export class CompassSharing {
   constructor(onChange) {
@@ -23,8 +21,8 @@ export class CompassSharing {
 
   /** Why the compass cannot be shared; empty where it can be tried. */
   static obstacle() {
-    if (!globalThis.isSecureContext) return NOT_SECURE;
-    if (!("DeviceOrientationEvent" in globalThis)) return "This browser has no compass.";
+    if (!globalThis.isSecureContext) return t("compass.insecure");
+    if (!("DeviceOrientationEvent" in globalThis)) return t("compass.none");
     return "";
   }
 
@@ -36,18 +34,18 @@ export class CompassSharing {
       // iOS: asked for from a touch, once.
       const answer = await ask.call(globalThis.DeviceOrientationEvent).catch(() => "denied");
       if (answer !== "granted") {
-        this.status = "Access to the compass is denied: allow motion and orientation in the browser's settings.";
+        this.status = t("compass.denied");
         return this.onChange();
       }
     }
     this.on = true;
-    this.status = "Waiting for the compass";
+    this.status = t("compass.waiting");
     addEventListener("deviceorientationabsolute", this.heard);
     addEventListener("deviceorientation", this.heard);
     this.timer = setInterval(() => this.collect(), EVERY_MS);
     this.silence = setTimeout(() => {
       if (!this.newest) {
-        this.status = "This phone sends no compass readings.";
+        this.status = t("compass.silent");
         this.onChange();
       }
     }, 5000);

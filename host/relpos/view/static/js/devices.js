@@ -1,7 +1,7 @@
 // The dialog that lets devices in: of a mission, one by one and with a role; else by one code.
 
 import { byId, make, postJson, setText } from "./dom.js";
-import { timeOfDay } from "./words.js";
+import { t, timeOfDay } from "./i18n.js";
 
 const LOOK_MS = 2000;
 /** A code is good for five minutes: it is renewed before. */
@@ -39,10 +39,10 @@ export class DevicesDialog {
       setText(byId("invite-url"), url);
       return this.show(null);
     }
-    if (this.mission) return this.show(answer.status === 403 ? "Only a commander lets others in." : "The server does not answer.");
+    if (this.mission) return this.show(answer.status === 403 ? t("phones.commander") : t("server.silent"));
     const code = answer ? await fetch("/qr.svg").catch(() => null) : null;
     if (code?.ok) this.image.src = "/qr.svg";
-    return this.show(code?.ok ? null : code ? await code.text() : "The server does not answer.");
+    return this.show(code?.ok ? null : t(code?.status === 404 ? "phones.unreachable" : "server.silent"));
   }
 
   show(trouble) {
@@ -60,13 +60,12 @@ export class DevicesDialog {
     if ((this.count !== null && devices.length > this.count) || Date.now() - this.invitedMs > RENEW_MS) await this.invite();
     this.count = devices.length;
     byId("devices").replaceChildren(...devices.filter((device) => !device.revoked).map((device) => {
-      const remove = make("button", { type: "button", text: "Shut out", "aria-label": `Shut out ${device.id}` });
+      const remove = make("button", { type: "button", "data-t": "phones.revoke", "aria-label": t("phones.revoke.name", { name: device.id }) });
       remove.addEventListener("click", async () => {
         await postJson("/api/revoke", { id: device.id }).catch(() => {});
         this.look();
       });
-      return make("li", {}, `${device.role}, since ${timeOfDay(1000 * device.admitted_unix_s)}`,
-        device.id === own ? " (this one)" : "", device.id === own ? "" : remove);
+      return make("li", {}, t(device.id === own ? "phones.own" : "phones.device", { role: t(`role.${device.role}`), time: timeOfDay(1000 * device.admitted_unix_s) }), device.id === own ? "" : remove);
     }));
   }
 }

@@ -1,5 +1,9 @@
 // Small helpers around the document.
 
+import { fill, t } from "./i18n.js";
+
+export { storage } from "./storage.js";
+
 /** The element of that id; it is an error of the page if there is none. */
 export function byId(id) {
   const found = document.getElementById(id);
@@ -20,13 +24,14 @@ export function setAttribute(element, name, value) {
   }
 }
 
-/** An element with attributes ("class", "aria-label", ...; "text") and children. */
+/** An element with attributes ("class", "aria-label", ...; "text"; keys as in i18n.js) and children. */
 export function make(tag, attributes = {}, ...children) {
   const element = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
     if (name === "text") element.textContent = value;
     else if (value !== null && value !== undefined) element.setAttribute(name, value);
   }
+  fill(element);
   element.append(...children);
   return element;
 }
@@ -92,23 +97,6 @@ export function arrow(className) {
   };
 }
 
-/** localStorage where it may be used; private windows and file permissions can forbid it. */
-export function storage() {
-  try {
-    localStorage.setItem("relpos.probe", "1");
-    localStorage.removeItem("relpos.probe");
-    return localStorage;
-  } catch {
-    const kept = new Map();
-    return {
-      lasting: false,
-      getItem: (key) => kept.get(key) ?? null,
-      setItem: (key, value) => kept.set(key, String(value)),
-      removeItem: (key) => kept.delete(key),
-    };
-  }
-}
-
 export async function postJson(address, body) {
   const answer = await fetch(address, {
     method: "POST",
@@ -117,7 +105,7 @@ export async function postJson(address, body) {
   });
   if (!answer.ok) {
     const reply = await answer.json().catch(() => null);
-    throw new Error(reply?.error ?? `the server answered ${answer.status}`);
+    throw new Error(reply?.error ?? t("server.answered", { status: answer.status }));
   }
   return answer.json();
 }

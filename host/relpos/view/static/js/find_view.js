@@ -3,8 +3,10 @@
 import { isFresh, reachM } from "./age.js";
 import { degrees } from "./angles.js";
 import { arrow, make, setAttribute, setText } from "./dom.js";
-import { Announcer, guidance, spoken, Trend, TREND_WORDS } from "./finding.js";
-import { ago, distance, plusMinus, probability } from "./words.js";
+import { Announcer, guidance, isThere, spoken, Trend } from "./finding.js";
+import { apartWords, floorsApart } from "./floors.js";
+import { current, number, t } from "./i18n.js";
+import { ago, distance, nodeName, plusMinus, probability } from "./words.js";
 
 const TREND_SIGNS = { warmer: "▲", colder: "▼", same: "=" };
 
@@ -25,27 +27,28 @@ export class FindView {
     this.arrow = arrow("big-arrow");
     this.distance = make("p", { class: "distance" });
     this.order = make("p", { class: "order" });
+    this.floor = make("p", { class: "floor" });
     this.trendSign = make("span", { "aria-hidden": "true" });
     this.trendWords = make("span");
     this.trendLine = make("p", { class: "trend", "data-trend": "none" }, this.trendSign, this.trendWords);
     this.sure = make("p", { class: "sure" });
     this.caution = make("p", { class: "caution" });
     this.voice = make("p", { class: "unseen", role: "status", "aria-live": "polite", "aria-atomic": "true" });
-    const button = (text, action, attributes = {}) => {
-      const element = make("button", { type: "button", text, ...attributes });
+    const button = (key, action, attributes = {}) => {
+      const element = make("button", { type: "button", "data-t": key, ...attributes });
       element.addEventListener("click", action);
       return element;
     };
-    this.aloudButton = button("Read aloud", () => this.setAloud(!this.aloud), { "aria-pressed": "false" });
+    this.aloudButton = button("find.aloud", () => this.setAloud(!this.aloud), { "aria-pressed": "false" });
     this.aloudButton.hidden = !("speechSynthesis" in globalThis);
     const buttons = [
-      button("Close", actions.close, { class: "main" }),
-      button("Next person", () => actions.next(1)),
-      ...(actions.swap ? [button("Swap", actions.swap, { "aria-label": "Swap who seeks and who is sought" })] : []),
+      button("close.button", actions.close, { class: "main" }),
+      button("find.next", () => actions.next(1)),
+      ...(actions.swap ? [button("find.swap", actions.swap, { "data-t-label": "find.swap.label" })] : []),
       this.aloudButton,
     ];
     section.append(
-      this.title, this.arrow.element, this.distance, this.order, this.trendLine, this.sure,
+      this.title, this.arrow.element, this.distance, this.order, this.floor, this.trendLine, this.sure,
       this.caution, make("div", { class: "actions" }, ...buttons), this.voice,
     );
     section.addEventListener("keydown", (event) => {
@@ -86,15 +89,20 @@ export class FindView {
   update(team, connected = true) {
     if (!this.open) return;
     const [seeker, target] = [team.person(this.from), team.person(this.to)];
-    const name = (person, node) => person?.name ?? `Node ${node}`;
+    const name = (person, node) => person?.name ?? nodeName(node);
     const targetName = name(target, this.to);
     const last = target !== null && !isFresh(target);
     const fresh = isFresh(seeker);
-    setText(this.title, `${name(seeker, this.from)} → ${targetName}${last ? ": last place" : ""}`);
+    setText(this.title, `${name(seeker, this.from)} → ${last ? t("find.last", { name: targetName }) : targetName}`);
     setAttribute(this.section, "data-last", String(last || !fresh));
-    setAttribute(this.title, "aria-label", `Guiding ${name(seeker, this.from)} to ${last ? "the last place of " : ""}${targetName}`);
+    setAttribute(this.title, "aria-label", t(last ? "find.guiding-last" : "find.guiding", { from: name(seeker, this.from), to: targetName }));
     const relation = team.relation(this.from, this.to);
-    const guide = guidance(relation, this.previous, { last, fresh });
+    const floor = fresh ? apartWords(floorsApart(seeker, target)) : "";
+    let guide = guidance(relation, this.previous, { last, fresh });
+    // Right above each other nobody is within reach.
+    if (floor && relation && isThere(relation)) guide = { key: floor, words: floor, arrowRad: null };
+    setText(this.floor, guide.words === floor ? "" : floor);
+    this.floor.hidden = this.floor.textContent === "";
     this.previous = guide.key;
     this.arrow.point(guide.arrowRad);
     setText(this.distance, relation ? distance(relation.distanceM, relation.sigmaM) : "?");
@@ -106,14 +114,14 @@ export class FindView {
     this.trendLine.hidden = last || !fresh;
     setAttribute(this.trendLine, "data-trend", trend ?? "none");
     setText(this.trendSign, TREND_SIGNS[trend] ?? "");
-    setText(this.trendWords, TREND_WORDS[trend] ?? "warmer or colder: walk to find out");
+    setText(this.trendWords, t(`find.${trend ?? "walk"}`));
     setText(this.sure, accuracyWords(seeker, target, relation));
     const caution = cautions(team, seeker, target, connected);
     setText(this.caution, caution);
     this.caution.hidden = caution === "";
-    const key = `${guide.key} ${caution.replace(/\d+/g, "")}`;
+    const key = `${guide.key} ${floor} ${caution.replace(/\d+/g, "")}`;
     if (this.announcer.due(Date.now(), { key, distanceM: relation?.distanceM ?? 0, trend })) {
-      this.say(`${spoken(last ? `last place of ${targetName}` : targetName, relation, guide, trend)} ${caution}`.trim());
+      this.say(`${spoken(last ? t("find.last.spoken", { name: targetName }) : targetName, relation, guide, trend)} ${this.floor.textContent} ${caution}`.trim());
     }
   }
 
@@ -122,7 +130,7 @@ export class FindView {
     if (!this.aloud) return;
     const synthesis = globalThis.speechSynthesis;
     // Voices of the device alone: others would be fetched from somewhere.
-    const voice = synthesis.getVoices().find((v) => v.localService && v.lang.startsWith("en"));
+    const voice = synthesis.getVoices().find((v) => v.localService && v.lang.startsWith(current()));
     if (!voice) return;
     const words = new SpeechSynthesisUtterance(text);
     words.voice = voice;
@@ -134,8 +142,8 @@ export class FindView {
 /** Standard deviations of distance, direction and both positions, in words. */
 export function accuracyWords(seeker, target, relation) {
   if (!relation) return "";
-  const parts = [`distance ${plusMinus(relation.sigmaM)}`];
-  if (relation.relativeRad !== null) parts.push(`direction ±${Math.round(degrees(relation.sigmaRad))}°`);
+  const parts = [t("find.distance", { sigma: plusMinus(relation.sigmaM) })];
+  if (relation.relativeRad !== null) parts.push(t("find.direction", { sigma: `±${number(degrees(relation.sigmaRad))}°` }));
   for (const person of [seeker, target]) {
     if (Number.isFinite(person.sigma_major_m)) parts.push(`${person.name} ${plusMinus(person.sigma_major_m)}`);
   }
@@ -145,17 +153,17 @@ export function accuracyWords(seeker, target, relation) {
 /** Reasons for caution; empty where there are none. */
 export function cautions(team, seeker, target, connected) {
   const words = [];
-  if (!connected) words.push("No connection: all of this is old.");
+  if (!connected) words.push(t("caution.link"));
   for (const person of [target, seeker]) {
     if (!person) continue;
-    if (person.status === "unlocated") words.push(`${person.name} is not located.`);
+    if (person.status === "unlocated") words.push(t("caution.unlocated", { name: person.name }));
     else if (person.status === "lost" || person.status === "stale") {
-      words.push(`${person.name}: last heard ${ago(person.seen_s)}, last known place, on foot up to ${distance(reachM(person), 9)} from there.`);
+      words.push(t("caution.last", { name: person.name, ago: ago(person.seen_s), distance: distance(reachM(person), 9) }));
     } else if (person.status === "ambiguous") {
       const here = team.possible().here.get(person.node);
       words.push(here < 0.97
-        ? `${person.name} may be elsewhere: ${probability(here)} where shown.`
-        : `${person.name}: position not certain yet.`);
+        ? t("caution.elsewhere", { name: person.name, probability: probability(here) })
+        : t("caution.uncertain", { name: person.name }));
     }
   }
   return words.join(" ");

@@ -1,5 +1,6 @@
 // Guiding one person to another: which way to turn, and whether it gets warmer.
 
+import { t } from "./i18n.js";
 import { side, spokenDistance } from "./words.js";
 
 const AHEAD_RAD = (25 * Math.PI) / 180;
@@ -8,20 +9,11 @@ const AROUND_RAD = (140 * Math.PI) / 180;
 // Hysteresis: an instruction holds until the direction is this far beyond its limit.
 const HOLD_RAD = (7 * Math.PI) / 180;
 
-const ORDERS = {
-  ahead: "go straight ahead",
-  "bear left": "bear left",
-  "bear right": "bear right",
-  left: "turn left",
-  right: "turn right",
-  around: "turn around",
-};
-
 function order(relativeRad, slack) {
   const size = Math.abs(relativeRad) - slack;
   const hand = relativeRad > 0 ? "left" : "right";
   if (size <= AHEAD_RAD) return "ahead";
-  if (size <= BEAR_RAD) return `bear ${hand}`;
+  if (size <= BEAR_RAD) return `bear-${hand}`;
   if (size <= AROUND_RAD) return hand;
   return "around";
 }
@@ -46,20 +38,16 @@ export function isThere(relation) {
  * it leads to a last known place; `fresh`: the seeker's own position is of now.
  */
 export function guidance(relation, previous = null, { last = false, fresh = true } = {}) {
-  if (!relation) return { key: "unknown", words: "position unknown", arrowRad: null };
-  if (!fresh) return { key: "old", words: "no guidance: the seeker is not heard", arrowRad: null };
+  if (!relation) return { key: "unknown", words: t("position.unknown"), arrowRad: null };
+  if (!fresh) return { key: "old", words: t("find.old"), arrowRad: null };
   if (isThere(relation)) {
-    const words = last ? "last place reached: search from here" : "within reach: search here";
-    return { key: "there", words, arrowRad: relation.relativeRad };
+    return { key: "there", words: t(last ? "find.there-last" : "find.there"), arrowRad: relation.relativeRad };
   }
   if (relation.relativeRad === null) {
-    const words = relation.headingKnown
-      ? "direction unknown: keep moving"
-      : "walk a few steps straight on: your direction is not known yet";
-    return { key: "vague", words, arrowRad: null };
+    return { key: "vague", words: t(relation.headingKnown ? "find.moving" : "find.vague"), arrowRad: null };
   }
   const key = turnOrder(relation.relativeRad, previous);
-  return { key, words: ORDERS[key], arrowRad: relation.relativeRad };
+  return { key, words: t(`find.${key}`), arrowRad: relation.relativeRad };
 }
 
 const TREND_S = 6;
@@ -101,21 +89,14 @@ export class Trend {
   }
 }
 
-export const TREND_WORDS = {
-  warmer: "warmer: getting closer",
-  colder: "colder: getting farther away",
-  same: "distance unchanged",
-};
-
 /** The text that is read aloud. */
 export function spoken(targetName, relation, guide, trend) {
-  if (!relation) return `${targetName}: position unknown.`;
+  if (!relation) return `${targetName}: ${t("position.unknown")}.`;
   const parts = [`${targetName}, ${spokenDistance(relation.distanceM)}`];
   parts.push(guide.arrowRad === null || guide.key === "there"
     ? guide.words
     : `${side(guide.arrowRad)}: ${guide.words}`);
-  if (trend === "warmer") parts.push("getting closer");
-  if (trend === "colder") parts.push("getting farther away");
+  if (trend === "warmer" || trend === "colder") parts.push(t(`find.${trend}.spoken`));
   return `${parts.join(", ")}.`;
 }
 

@@ -2,7 +2,8 @@
 
 import { LINK_LOST_S } from "./age.js";
 import { make, setAttribute, setText } from "./dom.js";
-import { seconds, timeOfDay } from "./words.js";
+import { t, timeOfDay } from "./i18n.js";
+import { seconds } from "./words.js";
 
 const SILENCE_MS = 120_000;
 
@@ -15,12 +16,12 @@ export class LinkBanner {
     this.lost = false;
     this.silentUntilMs = 0;
     this.text = make("span", { class: "text" });
-    this.button = make("button", { type: "button", text: "Silence for 2 min" });
+    this.button = make("button", { type: "button", "data-t": "link.silence" });
     this.button.addEventListener("click", () => {
       this.silentUntilMs = Date.now() + SILENCE_MS;
       this.onChange(this.lost);
     });
-    section.replaceChildren(make("span", { class: "kind", text: "No connection" }), this.text, this.button);
+    section.replaceChildren(make("span", { class: "kind", "data-t": "link.lost" }), this.text, this.button);
     section.hidden = true;
   }
 
@@ -32,8 +33,7 @@ export class LinkBanner {
   update(lagS, receivedMs) {
     const lost = lagS !== null && lagS >= LINK_LOST_S;
     if (lost) {
-      setText(this.text, `for ${seconds(lagS)}: all below is old, of ${timeOfDay(receivedMs)}. ` +
-        "Positions are last places; alarms cannot arrive. It is tried again by itself.");
+      setText(this.text, t("link.text", { time: seconds(lagS), of: timeOfDay(receivedMs) }));
       this.button.hidden = !this.sounding;
     }
     if (lost === this.lost) return;
@@ -41,9 +41,9 @@ export class LinkBanner {
     this.silentUntilMs = 0;
     this.section.hidden = !lost;
     setAttribute(document.documentElement, "data-link", lost ? "lost" : null);
-    setText(this.voice, lost ? "Connection lost: all values are old." : "Connection is back.");
-    const title = document.title.replace(/^NO CONNECTION · /, "");
-    document.title = lost ? `NO CONNECTION · ${title}` : title;
+    setText(this.voice, t(lost ? "link.lost.spoken" : "link.back.spoken"));
+    if (lost) this.title = document.title;
+    document.title = lost ? `${t("link.title")} · ${this.title}` : this.title ?? document.title;
     this.onChange(lost);
   }
 }

@@ -1,12 +1,8 @@
 // The session's log: what happened, to whom, by whom, the newest first.
 
 import { make, setText } from "./dom.js";
-import { timeOfDay } from "./words.js";
+import { has, said, t, timeOfDay } from "./i18n.js";
 
-const KINDS = {
-  note: "note", warning: "warning", alarm: "ALARM", cleared: "over", acknowledge: "seen", shelve: "shelved", name: "name", landmark: "landmark",
-  board: "board", rollcall: "roll call", mayday: "MAYDAY", evacuate: "EVACUATE",
-};
 const MOST = 5000;
 
 export class LogView {
@@ -35,13 +31,17 @@ export class LogView {
   look(team) {
     this.seen = this.entries.length;
     this.list.replaceChildren(...this.entries.map((entry) => make("li", { "data-kind": entry.kind },
-      make("time", { text: timeOfDay(1000 * entry.unix_s) }), make("span", { class: "kind", text: KINDS[entry.kind] ?? entry.kind }),
-      make("span", { text: `${team.withNames(entry.text)}${entry.by ? `, by ${entry.by}` : ""}` }))).reverse());
+      make("time", { text: timeOfDay(1000 * entry.unix_s) }), make("span", { class: "kind", text: has(`log.${entry.kind}`) ? t(`log.${entry.kind}`) : entry.kind }),
+      make("span", { text: entry.by ? t("log.by", { text: words(entry, team), name: entry.by }) : words(entry, team) }))).reverse());
     this.onNew();
   }
 }
 
+function words(entry, team) {
+  return team.withNames(said(entry.said, entry.text));
+}
+
 /** The button that opens the log, with the number of lines that nobody has looked at. */
 export function showUnseen(button, count) {
-  setText(button, count ? `Log (${count})` : "Log");
+  setText(button, count ? t("log.count", { count }) : t("log"));
 }

@@ -8,7 +8,8 @@ import { TrackLayer } from "./track_layer.js";
 import {
   clampScale, fit, gridStep, headingUp, isLoose, pan, scaleBar, toMap, toScreen, zoomAt,
 } from "./transform.js";
-import { distance, plusMinusDegrees, probability, seconds, probabilityHere } from "./words.js";
+import { number, t } from "./i18n.js";
+import { distance, nodeName, plusMinusDegrees, probability, probabilityHere, seconds } from "./words.js";
 
 const TAIL_S = 30;
 const MINUTE_S = 60;
@@ -36,6 +37,8 @@ export class TeamMap {
     this.selected = null;
     this.find = null;
     this.layers = { tracks: "all", ranges: "auto" };
+    /** The switch of floors (`floors.js`), where the page has one. */
+    this.floors = null;
     this.alarms = new Map();
     this.dark = false;
     /** Whether everything is old: then nothing has a person's colour. */
@@ -219,21 +222,26 @@ export class TeamMap {
     context.fillStyle = colours.ground;
     context.fillRect(0, 0, view.width, view.height);
     this.drawGrid();
+    this.ground?.drawPlan();
     const again = this.drawTracks();
     const { here, places, rings } = this.team.possible();
-    const people = this.team.list().filter(isPlaced);
+    const placed = this.team.list().filter(isPlaced);
+    const people = placed.filter((p) => !this.floors || this.floors.isHere(p) || this.rank(p) >= 3);
     for (const place of places) this.drawGhost(place);
     for (const ring of rings) this.drawRing(ring, 1);
     const links = this.drawLinks();
+    for (const person of placed) if (!people.includes(person)) this.floors.drawElsewhere(this, person);
     for (const person of people) this.drawEllipse(person);
     for (const person of people) this.drawReach(person);
     this.drawFind();
+    this.ground?.drawMarkers();
     // Who is in trouble is drawn last, on top.
     const ordered = [...people].sort((a, b) => this.rank(a) - this.rank(b));
     for (const person of ordered) this.drawMarker(person, now);
     this.drawLabels(ordered.reverse(), links, places, here, rings);
     this.drawScale();
     this.drawNorth();
+    this.floors?.drawSection(this);
     if (gliding) this.invalidate();
     else if (again) setTimeout(() => this.invalidate(), 160);
     const pulsing = !this.old && [...this.alarms.values()].some((a) => !a.acknowledged) && !this.still.matches;
@@ -404,7 +412,7 @@ export class TeamMap {
       context.stroke();
       const length = Math.hypot(bx - ax, by - ay);
       if (length < 70 * unit) continue;
-      const text = `${rangeM.toFixed(1)}`;
+      const text = number(rangeM, 1);
       const [width, height] = [this.width(text, 11, false) + 4 * unit, 13 * unit];
       const places = [0.5, 0.38, 0.62, 0.28, 0.72].map((t) => [
         ax + t * (bx - ax) - width / 2, ay + t * (by - ay) - height / 2, width, height,
@@ -583,10 +591,9 @@ export class TeamMap {
   stateOf(person, here) {
     const alarm = this.alarms.get(person.node);
     if (alarm) return alarm.kind === "lost"
-      ? `lost ${seconds(person.seen_s)}`
-      : isFresh(person) ? `still ${seconds(person.still_s)}` : `was still, not heard ${seconds(person.seen_s)}`;
-    if (person.status === "lost") return `lost ${seconds(person.seen_s)}`;
-    if (person.status === "stale") return `not heard ${seconds(person.seen_s)}`;
+      ? t("map.lost", { time: seconds(person.seen_s) })
+      : isFresh(person) ? t("map.still", { time: seconds(person.still_s) }) : t("map.was-still", { time: seconds(person.seen_s) });
+    if (person.status === "lost" || person.status === "stale") return t(`map.${person.status}`, { time: seconds(person.seen_s) });
     if (person.status === "ambiguous") return probabilityHere(here.get(person.node));
     return "";
   }
@@ -630,7 +637,7 @@ export class TeamMap {
     for (const place of places) {
       if (place.shape === "ring") continue;
       const [x, y] = toScreen(view, place.x_m, place.y_m);
-      const name = this.team.person(place.node)?.name ?? `Node ${place.node}`;
+      const name = this.team.person(place.node)?.name ?? nodeName(place.node);
       const text = `${shorten(name, 12)} ${probability(place.probability)}?`;
       const [w, h] = [this.width(text, 12, true) + 4 * unit, 15 * unit];
       const gap = 12 * unit;
@@ -646,7 +653,7 @@ export class TeamMap {
     for (const ring of rings) {
       const person = this.team.person(ring.node);
       const [x, y] = toScreen(view, ring.x_m, ring.y_m);
-      const text = `${person?.name ?? `Node ${ring.node}`}: on this ring`;
+      const text = t("map.ring", { name: person?.name ?? nodeName(ring.node) });
       const [w, h] = [this.width(text, 13, true) + 4 * unit, 17 * unit];
       const r = ring.sigma_major_m * view.scale;
       wanted.push({
@@ -736,7 +743,7 @@ export class TeamMap {
       context.lineTo(x + pixels, y - 6 * unit);
       context.stroke();
     }
-    const text = metres < 1 ? `${Math.round(metres * 100)} cm` : `${metres} m`;
+    const text = metres < 1 ? `${number(metres * 100)} cm` : `${number(metres)} m`;
     this.write(text, x + 5 * unit, y - 19 * unit, 13, true, colours.ink);
     this.scaleText = text;
   }
@@ -760,7 +767,7 @@ export class TeamMap {
     context.stroke();
     context.fill();
     context.restore();
-    const text = this.team.northRad === null ? "map N" : "N";
+    const text = this.team.northRad === null ? t("compass.map", { point: t("compass.n") }) : t("compass.n");
     this.write(text, x - this.width(text, 12, true) / 2, y + 22 * unit, 12, true, colours.ink);
   }
 
@@ -854,6 +861,10 @@ export class TeamMap {
   }
 
   pick(px, py) {
+    if (this.onPlace) {
+      this.onPlace(...toMap(this.view, px, py));
+      return;
+    }
     let [best, least] = [null, 26 * this.unit];
     for (const person of this.team.list().filter(isPlaced)) {
       const [x, y] = toScreen(this.view, person.x_m, person.y_m);
@@ -868,16 +879,18 @@ export class TeamMap {
     const people = this.team.list();
     const placed = people.filter(isPlaced);
     const located = placed.filter(isFresh);
-    const parts = [`${located.length} of ${people.length} people located`];
+    const parts = [t("map.located", { located: located.length, count: people.length })];
     if (placed.length > located.length) {
-      parts.push(`last places of ${placed.filter((p) => !isFresh(p)).map((p) => p.name).join(", ")}`);
+      parts.push(t("map.last", { names: placed.filter((p) => !isFresh(p)).map((p) => p.name).join(", ") }));
     }
     if (this.camera.mode === "follow") {
-      parts.push(`following ${this.team.person(this.camera.node)?.name ?? "no one"}`);
+      parts.push(t("map.following", { name: this.team.person(this.camera.node)?.name ?? nodeName(this.camera.node) }));
     }
-    parts.push(this.up === "heading" ? `${this.headingPerson()?.name ?? "heading"} up`
-      : this.team.northRad === null ? "map north up" : `magnetic north up ${plusMinusDegrees(this.team.sigmaNorthRad)}`);
-    parts.push(`about ${distance(this.view.width / this.view.scale, 1)} across`);
+    parts.push(this.up === "heading" ? t("map.heading-up", { name: this.headingPerson()?.name ?? "" })
+      : this.team.northRad === null ? t("map.north-up") : t("map.magnetic-up", { sigma: plusMinusDegrees(this.team.sigmaNorthRad) }));
+    const signs = this.ground?.shown ?? [];
+    if (signs.length) parts.push(t("map.markers", { names: signs.map(({ sign }) => t(`marker.${sign}`)).join(", ") }));
+    parts.push(t("map.across", { distance: distance(this.view.width / this.view.scale, 1) }));
     return `${parts.join(", ")}.`;
   }
 }

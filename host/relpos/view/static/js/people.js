@@ -4,10 +4,12 @@ import { isFresh, reachM } from "./age.js";
 import { hold } from "./board_view.js";
 import { inkOn } from "./colours.js";
 import { arrow, healthSign, make, setAttribute, setText } from "./dom.js";
+import { floorOf } from "./floors.js";
+import { number as figure, t, said } from "./i18n.js";
 import { isPlaced, VAGUE_RAD } from "./relation.js";
 import {
-  ago, compass, compassShort, dbm, distance, HEALTH_WORDS, percent, plusMinus, probability, seconds,
-  STATUS_WORDS, timeOfDay, UNKNOWN, volts, whereabouts, directionWords,
+  ago, compass, compassShort, dbm, directionWords, distance, healthWords, nodeName, percent, plusMinus, probability,
+  seconds, statusWords, timeOfDay, UNKNOWN, volts, whereabouts,
 } from "./words.js";
 
 /** An alarm of somebody who is known to be well: a sentry, a node on a table. */
@@ -16,16 +18,17 @@ const SHELVE_S = 600;
 /** A person's state in words. */
 export function stateWords(person, alarm, here) {
   const words = [];
-  if (alarm?.kind === "lost" || person.status === "lost") words.push(`Lost: last heard ${ago(person.seen_s)}`);
-  else if (person.status === "stale") words.push(`Not heard: last news ${ago(person.seen_s)}`);
-  else if (person.status === "unlocated") words.push("Not located yet");
+  if (alarm?.kind === "lost" || person.status === "lost") words.push(t("state.lost", { ago: ago(person.seen_s) }));
+  else if (person.status === "stale") words.push(t("state.stale", { ago: ago(person.seen_s) }));
+  else if (person.status === "unlocated") words.push(t("state.unlocated"));
   else if (person.status === "ambiguous") {
-    words.push(here < 0.97 ? `Ambiguous: ${probability(here)} where shown` : "Ambiguous");
+    words.push(here < 0.97 ? t("state.ambiguous-here", { probability: probability(here) }) : t("state.ambiguous"));
   }
-  if (alarm?.kind === "still") words.push(`${isFresh(person) ? "Has" : "Had"} not moved for ${seconds(person.still_s)}`);
+  if (alarm?.kind === "still") words.push(t(isFresh(person) ? "state.still" : "state.was-still", { time: seconds(person.still_s) }));
   else if (person.moving === false && person.still_s >= 3 && isFresh(person)) {
-    words.push(`Stands still, ${seconds(person.still_s)}`);
-  } else if (person.moving && isFresh(person)) words.push("Moves");
+    words.push(t("state.stands", { time: seconds(person.still_s) }));
+  } else if (person.moving && isFresh(person)) words.push(t("state.moves"));
+  if (floorOf(person) !== null) words.push(t("state.floor", { floor: floorOf(person) }));
   return words.join(" · ");
 }
 
@@ -46,18 +49,18 @@ class Card {
       make("p", {}, this.far, " ", this.sigma), make("p", {}, this.direction));
     this.state = make("p", { class: "state" });
     this.facts = {};
-    const facts = ["Supply", "Radio", "Loss", "Ranging", "Hears"].map((word) => {
+    const facts = ["supply", "radio", "loss", "ranging", "hears"].map((word) => {
       const value = make("dd");
       this.facts[word] = value;
-      return make("div", {}, make("dt", { text: word }), value);
+      return make("div", {}, make("dt", { "data-t": `fact.${word}` }), value);
     });
     this.reasons = make("p", { class: "reasons" });
-    this.shelveButton = make("button", { type: "button", text: "Shelve alarms 10 min" });
+    this.shelveButton = make("button", { type: "button" });
     this.shelveButton.addEventListener("click", () => actions.shelve(node, this.shelved ? 0 : SHELVE_S));
-    this.maydayButton = make("button", { type: "button", class: "mayday", text: "MAYDAY (hold)" });
+    this.maydayButton = make("button", { type: "button", class: "mayday", "data-t": "mayday.hold" });
     hold(this.maydayButton, () => actions.mayday(node));
-    this.followButton = make("button", { type: "button", "aria-pressed": "false", text: "Follow" });
-    this.findButton = make("button", { type: "button", text: "Find" });
+    this.followButton = make("button", { type: "button", "aria-pressed": "false", "data-t": "follow" });
+    this.findButton = make("button", { type: "button", "data-t": "find" });
     this.name.addEventListener("click", () => actions.select(node));
     this.followButton.addEventListener("click", () => actions.follow(node));
     this.findButton.addEventListener("click", () => actions.find(node));
@@ -82,35 +85,36 @@ class Card {
       this.disc.style.color = inkOn(colour);
     }
     setText(this.disc, String(person.node));
-    setText(this.label, me ? `${person.name} (me)` : person.name);
+    setText(this.label, me ? t("name.me", { name: person.name }) : person.name);
     setAttribute(this.name, "aria-pressed", String(selected));
     this.sign.show(person.health);
-    setText(this.health, fresh || person.health === "unknown" ? HEALTH_WORDS[person.health] ?? person.health : "node silent");
+    setText(this.health, fresh || person.health === "unknown" ? healthWords(person.health) : t("health.silent"));
     this.where.hidden = me || meName === null;
     this.shelved = person.shelved_s > 0;
-    setText(this.shelveButton, this.shelved ? `Alarms shelved, ${seconds(person.shelved_s)} left: end` : "Shelve alarms 10 min");
+    setText(this.shelveButton, this.shelved ? t("shelved.left", { time: seconds(person.shelved_s) }) : t("shelve"));
     this.details.hidden = !selected;
     setAttribute(this.name, "aria-expanded", String(selected));
     if (!this.where.hidden) {
       this.arrow.point(relation?.relativeRad ?? null);
       setText(this.far, relation ? distance(relation.distanceM, relation.sigmaM) : UNKNOWN);
       setText(this.sigma, !relation ? "" : fresh && meFresh ? plusMinus(relation.sigmaM) : lastPlace(fresh ? null : heardMs));
-      setText(this.direction, !relation ? "position unknown"
+      setText(this.direction, !relation ? t("position.unknown")
         : directionWords(relation));
       setText(this.compass, relation ? compassShort(relation.bearingRad, northRad) : "");
     }
     setText(this.state, stateWords(person, alarm, here));
     const facts = {
-      Supply: volts(person.battery_v), Radio: dbm(person.rssi_dbm),
-      Loss: percent(person.loss), Ranging: percent(person.ranging),
-      Hears: Number.isFinite(person.neighbours) ? String(person.neighbours) : UNKNOWN,
+      supply: volts(person.battery_v), radio: dbm(person.rssi_dbm),
+      loss: percent(person.loss), ranging: percent(person.ranging),
+      hears: Number.isFinite(person.neighbours) ? String(person.neighbours) : UNKNOWN,
     };
     for (const [word, value] of Object.entries(facts)) setText(this.facts[word], value);
     // That a node is silent is said above.
-    setText(this.reasons, (person.reasons ?? []).filter((reason) => fresh || !reason.startsWith("silent")).join("; "));
+    setText(this.reasons, (person.reasons ?? []).map((reason, k) => [reason, person.said?.[k]]).filter(([reason]) => fresh || !reason.startsWith("silent"))
+      .map(([reason, key]) => said(key, reason)).join("; "));
     setAttribute(this.followButton, "aria-pressed", String(followed));
-    setAttribute(this.followButton, "aria-label", `Follow ${person.name}`);
-    setAttribute(this.findButton, "aria-label", `Find ${person.name}`);
+    setAttribute(this.followButton, "aria-label", t("follow.name", { name: person.name }));
+    setAttribute(this.findButton, "aria-label", t("find.name", { name: person.name }));
   }
 }
 
@@ -162,7 +166,7 @@ export class PeopleList {
 
 /** Where a distance leads that is not one of now. */
 function lastPlace(heardMs) {
-  return heardMs === null ? "to the last place" : `to the last place, ${timeOfDay(heardMs)}`;
+  return heardMs === null ? t("last.place") : t("last.place.at", { time: timeOfDay(heardMs) });
 }
 
 function trouble(alarms, person) {
@@ -170,7 +174,7 @@ function trouble(alarms, person) {
   return alarm ? ["low", "medium", "high"].indexOf(alarm.level) + 1 : 0;
 }
 
-const number = (value) => (Number.isFinite(value) ? value.toFixed(1) : UNKNOWN);
+const number = (value) => (Number.isFinite(value) ? figure(value, 1) : UNKNOWN);
 
 /** The cells of one person's row: what the map draws, in words. */
 export function tableRow(team, person, me) {
@@ -178,20 +182,22 @@ export function tableRow(team, person, me) {
     .filter(([node, peer]) => node === person.node || peer === person.node)
     .map(([node, peer, rangeM]) => {
       const other = team.person(node === person.node ? peer : node);
-      return `${other?.name ?? "?"} ${rangeM.toFixed(1)}`;
+      return `${other?.name ?? "?"} ${figure(rangeM, 1)}`;
     });
   const faces = isFresh(person) && Number.isFinite(person.heading_rad) && (person.sigma_heading_rad ?? 0) < VAGUE_RAD;
   const placed = isPlaced(person);
+  const from = me === null ? "" : whereabouts(team.relation(me, person.node), team.northRad);
   return [
     person.name,
-    [STATUS_WORDS[person.status] ?? person.status, isFresh(person) ? "" : `last heard ${ago(person.seen_s)}`,
-      person.moving === false ? `still ${seconds(person.still_s)}` : "",
-      HEALTH_WORDS[person.health] ?? ""].filter(Boolean).join(", "),
+    [statusWords(person.status), isFresh(person) ? "" : t("table.heard", { ago: ago(person.seen_s) }),
+      person.moving === false ? t("map.still", { time: seconds(person.still_s) }) : "",
+      healthWords(person.health)].filter(Boolean).join(", "),
     placed ? number(person.x_m) : UNKNOWN,
     placed ? number(person.y_m) : UNKNOWN,
     placed ? number(person.sigma_major_m + reachM(person)) : UNKNOWN,
     placed && faces ? compass(person.heading_rad, team.northRad) : UNKNOWN,
-    me === null ? UNKNOWN : me === person.node ? "me" : `${whereabouts(team.relation(me, person.node), team.northRad)}${isFresh(person) ? "" : " (last place)"}`,
+    me === null ? UNKNOWN : me === person.node ? t("me")
+      : isFresh(person) ? from : t("table.from-last", { where: from }),
     ranges.join(", ") || UNKNOWN,
   ];
 }
@@ -212,17 +218,19 @@ export function updateTable(body, team, me) {
 /** The other possible places in words; empty while nothing is ambiguous. */
 export function alternativeWords(team) {
   const { here, places, rings } = team.possible();
-  const name = (node) => team.person(node)?.name ?? `Node ${node}`;
-  const words = rings.map((ring) => `${name(ring.node)} is somewhere on a ring of ${distance(ring.sigma_major_m)} about x ${number(ring.x_m)}, y ${number(ring.y_m)}.`);
+  const name = (node) => team.person(node)?.name ?? nodeName(node);
+  const placed = (place) => ({
+    name: name(place.node), probability: probability(place.probability), radius: distance(place.sigma_major_m),
+    x: number(place.x_m), y: number(place.y_m),
+  });
+  const words = rings.map((ring) => t("other.ring", placed(ring)));
   const listed = new Set();
   for (const place of places) {
     if (!listed.has(place.node) && here.has(place.node)) {
-      words.push(`${name(place.node)} is where shown with ${probability(here.get(place.node))}.`);
+      words.push(t("other.shown", { name: name(place.node), probability: probability(here.get(place.node)) }));
     }
     listed.add(place.node);
-    words.push(place.shape === "ring"
-      ? `With ${probability(place.probability)} ${name(place.node)} is on a ring of ${distance(place.sigma_major_m)} about x ${number(place.x_m)}, y ${number(place.y_m)}.`
-      : `With ${probability(place.probability)} ${name(place.node)} is at x ${number(place.x_m)}, y ${number(place.y_m)}.`);
+    words.push(t(place.shape === "ring" ? "other.on-ring" : "other.at", placed(place)));
   }
   return words.join(" ");
 }

@@ -11,15 +11,16 @@ import { CompassSharing } from "./compass_sharing.js";
 import { Connection } from "./connection.js";
 import { arrow, byId, make, postJson, setAttribute, setText, storage } from "./dom.js";
 import { FindView } from "./find_view.js";
+import { languageSwitch, number, said, t } from "./i18n.js";
 import { LinkBanner } from "./link_banner.js";
 import { stateWords } from "./people.js";
-import { PressQueue, UNDO_MS } from "./queue.js";
+import { PressQueue, randomId, UNDO_MS } from "./queue.js";
 import { Siren } from "./sound.js";
 import { connectionWords, dataAgeS, replayWords, showConnection } from "./status_line.js";
 import { Team } from "./team.js";
 import { isDark, themeSwitch } from "./theme_switch.js";
 import { ScreenLock } from "./wake_lock.js";
-import { alarmText, clock, compass, distance, plusMinus, side, timeOfDay, directionWords } from "./words.js";
+import { alarmText, clock, compass, directionWords, distance, levelWords, nodeName, plusMinus, side, timeOfDay } from "./words.js";
 
 const CLOCK_EVERY_MS = 60_000;
 const LIST_MS = 250;
@@ -39,6 +40,7 @@ let sendTrouble = "";
 let listMs = -Infinity;
 let lastPress = null;
 let trouble = null;
+let orders = null;
 
 const siren = new Siren(showSound);
 const link = new LinkBanner(byId("link"), byId("alarm-voice"), () => sound());
@@ -79,15 +81,15 @@ function handle(message) {
     alarms.clear();
     trouble = null;
     introduce();
-    document.title = `${team.session.name ?? "team"} · wearer${team.replayed ? " · REPLAY" : ""}`;
+    document.title = t(team.replayed ? "title.wearer.replay" : "title.wearer", { name: team.session.name ?? "" });
     setAttribute(document.documentElement, "data-replay", team.replayed ? "true" : null);
   } else if (kind === "board") {
     showOrders(message);
   } else if (kind === "picture") {
     receivedMs = Date.now();
     const { raised, cleared } = alarms.update(team.list());
-    if (raised.length) setText(byId("alarm-voice"), raised.map((a) => `${a.level}: ${words(a)}`).join(". "));
-    if (cleared.length) setText(byId("voice"), cleared.map((a) => `${a.name}: all clear`).join(". "));
+    if (raised.length) setText(byId("alarm-voice"), raised.map((a) => `${levelWords(a.level)}: ${words(a)}`).join(". "));
+    if (cleared.length) setText(byId("voice"), cleared.map((a) => t("cleared.phone", { name: a.name })).join(". "));
     link.update(0, receivedMs);
     if (team.replayed && raised.length) siren.sound(null);
     sound();
@@ -95,21 +97,22 @@ function handle(message) {
     findView.update(team);
     if (performance.now() - listMs > LIST_MS) showTeam();
   } else if (kind === "unknown") {
-    trouble = { level: "warning", text: "The server's version differs from this page's: reload the page." };
+    trouble = { level: "warning", text: t("server.version") };
   }
 }
 
 /** What the commander asks of me: to leave, to answer a roll call. */
 function showOrders(board) {
+  orders = board;
   const node = me?.node;
   const { evacuation, roll_call: call } = board;
   const section = byId("orders");
   const answer = (kind, body) => postJson(`/api/${kind}`, { ...body, node, by: me.name }).catch((error) => {
-    trouble = { level: "warning", text: `Not sent: ${error.message}` };
+    trouble = { level: "warning", text: t("sent.failed", { error: error.message }) };
     showTeam();
   });
-  const button = (text, action) => {
-    const element = make("button", { type: "button", class: "main", text });
+  const button = (key, action) => {
+    const element = make("button", { type: "button", class: "main", "data-t": key });
     element.addEventListener("click", action);
     return element;
   };
@@ -117,12 +120,12 @@ function showOrders(board) {
   if (node && evacuation?.nodes.includes(node)) {
     const seen = evacuation.acknowledged[node];
     if (!evacuation.delivered[node] && !seen) answer("evacuate", { action: "delivered" });
-    lines.push(make("p", { class: "evacuation" }, seen ? "EVACUATE: understood" : "EVACUATE: leave now",
-      ...(seen ? [] : [button("Understood", () => answer("evacuate", { action: "acknowledged" }))])));
+    lines.push(make("p", { class: "evacuation" }, t(seen ? "evacuate.seen" : "evacuate.now"),
+      ...(seen ? [] : [button("evacuate.understood", () => answer("evacuate", { action: "acknowledged" }))])));
   }
   if (node && call && call.ended_unix_s === null && call.nodes.includes(node) && !call.answers[node]) {
-    lines.push(make("p", { class: "roll" }, "Roll call",
-      button("I am all right", () => answer("rollcall", { action: "answer", answer: "confirmed" }))));
+    lines.push(make("p", { class: "roll" }, t("roll"),
+      button("roll.well", () => answer("rollcall", { action: "answer", answer: "confirmed" }))));
   }
   section.replaceChildren(...lines);
   section.hidden = !lines.length;
@@ -150,13 +153,13 @@ function beat() {
 }
 
 function words(alarm) {
-  return alarm.node === me?.node && alarm.kind === "still" ? "You have not moved: move, or acknowledge" : alarmText(alarm);
+  return alarm.node === me?.node && alarm.kind === "still" ? t("alarm.me") : alarmText(alarm);
 }
 
 function showTeam() {
   listMs = performance.now();
   showAge();
-  showNotices(byId("notices"), [...(trouble ? [trouble] : []), ...team.notices]);
+  showNotices(byId("notices"), [...(trouble ? [trouble] : []), ...team.notices.map((notice) => ({ ...notice, text: said(notice.said, notice.text) }))]);
   byId("team-empty").hidden = team.pictures > 0;
   showMe();
   const list = team.list()
@@ -186,14 +189,14 @@ function showTeam() {
     setText(row.far, relation ? `${distance(relation.distanceM, relation.sigmaM)} ` : "–");
     const fresh = isFresh(person) && isFresh(team.person(me?.node));
     setAttribute(row.element, "data-status", person.status);
-    setText(row.sigma, !relation ? "" : fresh ? plusMinus(relation.sigmaM) : "to the last place");
-    setText(row.where, !relation ? (me ? "position unknown" : "say who you are first")
+    setText(row.sigma, !relation ? "" : fresh ? plusMinus(relation.sigmaM) : t("last.place"));
+    setText(row.where, !relation ? (t(me ? "position.unknown" : "who.first"))
       : relation.relativeRad === null
         ? `${directionWords(relation)} · ${compass(relation.bearingRad, team.northRad)}`
         : `${clock(relation.relativeRad)}, ${side(relation.relativeRad)}`);
     setText(row.state, stateWords(person, alarm, here.get(person.node)));
     row.find.disabled = !me;
-    setAttribute(row.find, "aria-label", `Find ${person.name}`);
+    setAttribute(row.find, "aria-label", t("find.name", { name: person.name }));
   });
 }
 
@@ -201,7 +204,7 @@ function makeOther(node) {
   const row = {
     arrow: arrow("small-arrow"), disc: make("span", { class: "disc", text: String(node) }), name: make("span"),
     far: make("span", { class: "far" }), sigma: make("span", { class: "soft" }), where: make("p"),
-    state: make("p", { class: "state" }), find: make("button", { type: "button", text: "Find" }),
+    state: make("p", { class: "state" }), find: make("button", { type: "button", "data-t": "find" }),
   };
   row.find.addEventListener("click", () => startFinding(node));
   row.element = make("li", { class: "other", "data-node": node }, row.arrow.element,
@@ -216,7 +219,7 @@ function colourOf(node) {
 
 function showMe() {
   const name = (me && team.person(me.node)?.name) ?? me?.name;
-  setText(byId("my-name"), me ? name : "Who are you?");
+  setText(byId("my-name"), me ? name : t("who"));
   const disc = byId("disc");
   disc.hidden = !me;
   if (me) {
@@ -234,14 +237,14 @@ function showAge() {
 }
 
 async function acknowledge(nodes) {
-  const by = me?.name ?? "a phone";
+  const by = me?.name ?? t("phone.some");
   for (const node of nodes) alarms.acknowledge(node, by);
   sound();
   banner.update(alarms);
   try {
     for (const node of nodes) await postJson("/api/acknowledge", { node, by });
   } catch (error) {
-    trouble = { level: "warning", text: `Acknowledged only on this phone: ${error.message}` };
+    trouble = { level: "warning", text: t("acknowledge.failed", { error: error.message }) };
   }
 }
 
@@ -280,28 +283,28 @@ function addDigit(digit) {
 
 function makePad() {
   const pad = byId("pad");
-  const button = (text, action, attributes = {}) => {
-    const key = make("button", { type: "button", text, ...attributes });
+  const button = (action, attributes) => {
+    const key = make("button", { type: "button", ...attributes });
     key.addEventListener("click", action);
     pad.append(key);
   };
-  for (const digit of "123456789") button(digit, () => addDigit(digit));
-  button("Clear", () => {
+  for (const digit of "123456789") button(() => addDigit(digit), { text: digit });
+  button(() => {
     field.value = "";
     field.dispatchEvent(new Event("input"));
-  }, { class: "word" });
-  button("0", () => addDigit("0"));
-  button("⌫", () => {
+  }, { class: "word", "data-t": "pad.clear" });
+  button(() => addDigit("0"), { text: "0" });
+  button(() => {
     field.value = field.value.slice(0, -1);
     field.dispatchEvent(new Event("input"));
-  }, { "aria-label": "Delete the last digit" });
+  }, { text: "⌫", "data-t-label": "pad.delete" });
 }
 
 function showPress() {
   const ready = me !== null && field.value !== "";
   const press = byId("press");
   press.disabled = !ready;
-  setText(press, !me ? "Who are you?" : field.value ? `I am at ${field.value}` : "I am here");
+  setText(press, !me ? t("who") : field.value ? t("press.at", { landmark: field.value }) : t("press.here"));
 }
 
 function pressNow() {
@@ -316,16 +319,16 @@ function pressNow() {
   field.dispatchEvent(new Event("input"));
   siren.unlock();
   navigator.vibrate?.(60);
-  setText(byId("voice"), `Landmark ${landmark} pressed`);
+  setText(byId("voice"), t("press.done", { landmark }));
   showQueue();
 }
 
 function undo() {
   const undone = queue.undo();
-  setText(byId("voice"), undone ? `Landmark ${undone.landmark} undone` : "Too late to undo");
+  setText(byId("voice"), undone ? t("press.undone", { landmark: undone.landmark }) : t("press.late"));
   if (undone) {
     lastPress = null;
-    setText(byId("last"), `Landmark ${undone.landmark} at ${timeOfDay(undone.unix_ms)} was undone`);
+    setText(byId("last"), t("press.undone.at", { landmark: undone.landmark, time: timeOfDay(undone.unix_ms) }));
   }
   showQueue();
 }
@@ -336,22 +339,21 @@ function showQueue() {
   const live = connection.state === "live";
   setAttribute(line, "data-state", waiting ? "waiting" : queue.acknowledged ? "sent" : "empty");
   const held = queue.newest && queue.isHeld(queue.newest);
-  const count = (n) => (n === 1 ? "1 press" : `${n} presses`);
   let text;
   if (waiting) {
-    text = `${count(waiting)} stored on this phone, ${live ? (held ? "sent in a moment" : "being sent") : "sent once connected"}`;
+    text = t(live ? (held ? "queue.held" : "queue.sending") : "queue.offline", { count: waiting });
     if (sendTrouble) text += ` (${sendTrouble})`;
   } else {
-    text = queue.acknowledged ? `${count(queue.acknowledged)} received by the laptop` : "No presses yet";
+    text = queue.acknowledged ? t("queue.received", { count: queue.acknowledged }) : t("queue.empty");
   }
-  if (store.lasting === false && waiting) text += ". This browser stores nothing: do not close the page";
+  if (store.lasting === false && waiting) text += `. ${t("queue.lasting")}`;
   setText(line, text);
   const leftMs = held ? UNDO_MS - (Date.now() - queue.newest.unix_ms) : 0;
   byId("undo").hidden = !held;
   if (held) {
-    setText(byId("undo"), `Undo ${queue.newest.landmark} (${Math.ceil(leftMs / 1000)})`);
+    setText(byId("undo"), t("press.undo", { landmark: queue.newest.landmark, seconds: Math.ceil(leftMs / 1000) }));
   }
-  if (lastPress) setText(byId("last"), `Last: ${lastPress.landmark} at ${timeOfDay(lastPress.unix_ms)}`);
+  if (lastPress) setText(byId("last"), t("press.last", { landmark: lastPress.landmark, time: timeOfDay(lastPress.unix_ms) }));
 }
 
 async function sendPresses() {
@@ -381,7 +383,7 @@ async function sendHeadings() {
     sharing.sent += headings.length;
   } catch (error) {
     sharing.putBack(headings);
-    sharing.status = `Not sent: ${error.message}`;
+    sharing.status = t("sent.failed", { error: error.message });
   }
   showCompass();
 }
@@ -397,13 +399,18 @@ async function compareClocks(now = false) {
     });
     if (found) {
       offset = { ...found, atMs: Date.now() };
-      setText(byId("clock-status"), `The laptop's clock is ${Math.abs(found.offsetMs).toFixed(0)} ms ${found.offsetMs < 0 ? "behind" : "ahead of"} this phone's, within ${(found.roundTripMs / 2).toFixed(0)} ms.`);
+      showClock();
     }
   } catch {
     // Not connected after all; tried again with the next tick.
   } finally {
     comparing = false;
   }
+}
+
+function showClock() {
+  const values = offset && { offset: number(Math.abs(offset.offsetMs)), within: number(offset.roundTripMs / 2) };
+  setText(byId("clock-status"), t(!offset ? "clock.none" : offset.offsetMs < 0 ? "clock.behind" : "clock.ahead", values ?? {}));
 }
 
 /** Send my name to a session that does not know it yet. */
@@ -446,7 +453,7 @@ async function fetchWearers() {
     disc.style.background = colour;
     disc.style.color = inkOn(colour);
     const text = make("span", {}, wearer.name);
-    if (wearer.taken && wearer.node !== me?.node) text.append(make("span", { class: "taken", text: "has a phone" }));
+    if (wearer.taken && wearer.node !== me?.node) text.append(make("span", { class: "taken", "data-t": "who.taken" }));
     const button = make("button", { type: "button", "data-wearer": wearer.node, "aria-pressed": String(wearer.node === chosen) }, disc, text);
     button.addEventListener("click", () => choose(wearer));
     return make("li", {}, button);
@@ -467,17 +474,17 @@ function choose(wearer) {
 
 byId("name-form").addEventListener("submit", async (event) => {
   event.preventDefault();
-  const name = byId("name").value.trim() || `Node ${chosen}`;
+  const name = byId("name").value.trim() || nodeName(chosen);
   rememberMe({ node: chosen, name, session: null });
   showPress();
   showMe();
   try {
     await postJson("/api/name", { node: chosen, name });
     rememberMe({ ...me, session: team.session?.started_unix_s ?? null });
-    setText(byId("name-status"), `You are ${name}, node ${me.node}.`);
+    setText(byId("name-status"), t("who.done", { name, node: me.node }));
     open("landmarks");
   } catch (error) {
-    setText(byId("name-status"), `Stored on this phone, not sent to the laptop: ${error.message}`);
+    setText(byId("name-status"), t("who.stored", { error: error.message }));
   }
   fetchWearers();
   showTeam();
@@ -497,9 +504,8 @@ function open(name) {
 }
 
 function showSound() {
-  const state = { on: "Sound on", muted: "Sound off for 2 min", locked: "NO SOUND: enable" }[siren.state];
   setAttribute(byId("sound"), "data-state", siren.state);
-  setText(byId("sound"), state);
+  setText(byId("sound"), t(`sound.phone.${siren.state}`));
   setAttribute(byId("sound"), "aria-pressed", String(siren.state === "on"));
 }
 
@@ -508,29 +514,38 @@ function showLock() {
   setAttribute(button, "aria-pressed", String(lock.on));
   button.disabled = !lock.possible;
   setText(byId("wake-status"), !lock.possible
-    ? "Browsers keep the screen on only over HTTPS: change the phone's screen timeout instead."
-    : lock.trouble || (lock.on ? "The screen stays on while this page is open." : ""));
+    ? t("wake.insecure")
+    : lock.trouble || (lock.on ? t("wake.on") : ""));
 }
 
 function showCompass() {
   setAttribute(byId("compass"), "aria-pressed", String(sharing.on));
-  setText(byId("compass"), sharing.on ? "Sharing compass" : "Share compass");
+  setText(byId("compass"), t(sharing.on ? "compass.sharing" : "compass.share"));
   const status = byId("compass-status");
   if (sharing.status) setText(status, sharing.status);
   else if (sharing.on && sharing.newest) {
-    const deg = ((450 - degrees(sharing.newest.heading_rad)) % 360).toFixed(0);
-    setText(status, `Heading ${deg}° from magnetic north, ±${degrees(sharing.newest.sigma_rad).toFixed(0)}°; ${sharing.sent} sent.`);
+    const heading = number((450 - degrees(sharing.newest.heading_rad)) % 360);
+    setText(status, t("compass.heading", { heading, sigma: number(degrees(sharing.newest.sigma_rad)), sent: sharing.sent }));
   } else {
-    setText(status, CompassSharing.obstacle() ||
-      "Hold or wear the phone pointing ahead, flat or upright, screen towards you.");
+    setText(status, CompassSharing.obstacle() || t("compass.hold"));
   }
 }
 
 hold(byId("mayday"), () => {
   if (!me) return open("me");
   return postJson("/api/mayday", { node: me.node, on: true, by: me.name }).then(
-    () => setText(byId("last"), "MAYDAY was sent"),
-    (error) => setText(byId("last"), `MAYDAY NOT SENT: ${error.message}. Use the radio.`));
+    () => setText(byId("last"), t("mayday.sent")),
+    (error) => setText(byId("last"), t("mayday.failed", { error: error.message })));
+});
+byId("marker-place").addEventListener("click", async () => {
+  if (!me) return open("me");
+  const sign = byId("marker-sign").value;
+  try {
+    await postJson("/api/marker", { action: "set", id: randomId(), sign, node: me.node, by: me.name });
+    return setText(byId("last"), t("marker.done", { sign: t(`marker.${sign}`) }));
+  } catch (error) {
+    return setText(byId("last"), t("sent.failed", { error: error.message }));
+  }
 });
 makePad();
 field.addEventListener("input", () => {
@@ -556,16 +571,29 @@ byId("sound").addEventListener("click", () => {
   else siren.mute(!siren.muted);
 });
 byId("retry").addEventListener("click", () => connection.wake());
-themeSwitch(byId("theme"), () => {
+const showTheme = themeSwitch(byId("theme"), () => {
   showMe();
   showTeam();
 });
+setText(byId("last"), t("press.counts"));
 open(page);
-showPress();
-showQueue();
-showSound();
-showLock();
-showCompass();
+const showSettings = () => {
+  showPress();
+  showQueue();
+  showSound();
+  showLock();
+  showCompass();
+  showClock();
+};
+showSettings();
+languageSwitch(byId("language"), () => {
+  showTheme();
+  showSettings();
+  if (!lastPress) setText(byId("last"), t("press.counts"));
+  banner.update(alarms);
+  if (orders) showOrders(orders);
+  showTeam();
+});
 setInterval(() => {
   showQueue();
   compareClocks();

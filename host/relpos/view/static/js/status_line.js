@@ -2,20 +2,11 @@
 
 import { LINK_LOST_S } from "./age.js";
 import { setAttribute, setText } from "./dom.js";
-import { seconds, timeOfDay } from "./words.js";
+import { date, t, timeOfDay } from "./i18n.js";
+import { seconds } from "./words.js";
 
 /** Age in seconds from which the data are called old even while messages arrive. */
 export const OLD_S = LINK_LOST_S;
-
-const WORDS = {
-  connecting: "Connecting",
-  live: "Live",
-  silent: "Server silent",
-  waiting: "Not connected",
-  refused: "Access denied: open the address with the token that relpos prints",
-  old: "Old data",
-  replay: "REPLAY",
-};
 
 /**
  * Age in seconds of the newest packet in the view: its age by the server's clock when it was sent,
@@ -31,10 +22,10 @@ export function dataAgeS({ unixS, arrivedUnixS, receivedMs, nowMs }) {
 export function connectionWords(state, ageS, retryS) {
   const old = ageS !== null && ageS > OLD_S;
   const shown = state === "live" && old ? "old" : state;
-  const words = shown === "waiting" && retryS ? `${WORDS.waiting}, next try in ${retryS} s` : WORDS[shown];
+  const words = shown === "waiting" && retryS ? t("connection.retry", { seconds: retryS }) : t(`connection.${shown}`);
   let age = "";
-  if (ageS !== null) age = ageS < 1.5 ? "data now" : `data ${seconds(ageS)} old`;
-  else if (state === "live") age = "no data yet";
+  if (ageS !== null) age = ageS < 1.5 ? t("data.now") : t("data.old", { time: seconds(ageS) });
+  else if (state === "live") age = t("data.none");
   return { state: shown, words, age };
 }
 
@@ -43,9 +34,9 @@ export function replayWords(state, session, timeS) {
   if (state !== "live") return connectionWords(state, null, null);
   const unixS = session.recorded_unix_s;
   const age = timeS === null ? "" : Number.isFinite(unixS)
-    ? `${new Date(1000 * unixS).toLocaleDateString()} ${timeOfDay(1000 * (unixS + timeS))}`
-    : `second ${Math.floor(timeS)} of the recording`;
-  return { state: "replay", words: WORDS.replay, age };
+    ? `${date(1000 * unixS)} ${timeOfDay(1000 * (unixS + timeS))}`
+    : t("replay.second", { second: Math.floor(timeS) });
+  return { state: "replay", words: t("connection.replay"), age };
 }
 
 export function showConnection({ line, words, age, retry }, status) {

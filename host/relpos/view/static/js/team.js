@@ -1,6 +1,7 @@
 // The newest view of the team, and what follows from it; fed by the server's messages (protocol 1).
 
 import { aged } from "./age.js";
+import { nodeName } from "./words.js";
 import { pairKey, relation } from "./relation.js";
 import { Track } from "./tracks.js";
 
@@ -217,5 +218,5 @@ function isSamePlace(a, b) {
 
 function named(person) {
   const health = STARTING.includes(person.reasons?.[0]) ? "starting" : person.health;
-  return { ...person, health, name: person.name || `Node ${person.node}` };
+  return { ...person, health, name: !person.name || person.name === `Node ${person.node}` ? nodeName(person.node) : person.name };
 }

@@ -3,11 +3,14 @@
 import { isFresh, startBeat } from "./age.js";
 import { Alarms } from "./alarms.js";
 import { AlarmBanner, showNotices } from "./banner.js";
-import { BoardView } from "./board_view.js";
+import { BoardView, hold } from "./board_view.js";
 import { Connection } from "./connection.js";
 import { DevicesDialog } from "./devices.js";
 import { byId, make, postJson, setAttribute, setText, storage } from "./dom.js";
+import { Ground } from "./ground.js";
+import { languageSwitch, said, t } from "./i18n.js";
 import { FindView } from "./find_view.js";
+import { Floors } from "./floors.js";
 import { LinkBanner } from "./link_banner.js";
 import { LogView, showUnseen } from "./log_view.js";
 import { TeamMap } from "./map.js";
@@ -17,13 +20,13 @@ import { connectionWords, dataAgeS, replayWords, showConnection } from "./status
 import { Team } from "./team.js";
 import { isDark, themeSwitch } from "./theme_switch.js";
 import { Timeline } from "./timeline.js";
-import { alarmText, duration } from "./words.js";
+import { alarmText, duration, levelWords } from "./words.js";
 
 const LIST_MS = 200; // five times a second is enough for the eye
 const TABLE_MS = 1000; // screen readers read the table
 
 /** Who answers here, in the log and on the other pages. */
-const BY = "the commander";
+const by = () => t("commander");
 const store = storage();
 const team = new Team();
 const alarms = new Alarms();
@@ -35,7 +38,11 @@ let trouble = null;
 
 const siren = new Siren(showSound);
 const map = new TeamMap(byId("map"), team, { onPick: select, onCamera: showCamera });
-map.covers = [byId("map-tools")];
+map.floors = new Floors(team, () => {
+  map.floors.update();
+  map.invalidate();
+});
+map.covers = [byId("map-tools"), byId("floors"), byId("section")];
 const link = new LinkBanner(byId("link"), byId("alarm-voice"), linkChanged);
 const banner = new AlarmBanner(byId("alarms"), { acknowledge, show: find });
 const list = new PeopleList(byId("people"), { select, follow, find, shelve, mayday: (node) => board.mayday(node, true) });
@@ -45,7 +52,11 @@ const findView = new FindView(byId("find"), {
   next: (by) => find(neighbour(findView.to, by, findView.from)),
   swap: () => startFinding(findView.to, findView.from),
 });
-const board = new BoardView(team, { by: () => BY, find, say: (text) => {
+const board = new BoardView(team, { by, find, say: (text) => {
+  trouble = { level: "warning", text };
+  refresh(true);
+} });
+const ground = new Ground(map, team, { by, say: (text) => {
   trouble = { level: "warning", text };
   refresh(true);
 } });
@@ -64,17 +75,19 @@ function handle(message) {
     trouble = null;
     alarms.clear();
     log.clear();
-    setText(byId("session"), [team.session.name, team.session.emulated ? "(emulated)" : ""].join(" "));
-    document.title = `${team.session.name ?? "team"} · relpos ${team.replayed ? "REPLAY" : "live"}`;
+    setText(byId("session"), team.session.emulated ? t("session.emulated", { name: team.session.name }) : team.session.name);
+    document.title = t(team.replayed ? "title.replay" : "title.live", { name: team.session.name ?? "" });
     setAttribute(document.documentElement, "data-replay", team.replayed ? "true" : null);
+    byId("end").hidden = team.replayed;
+    showWayToLive(team.session.live_port);
     map.readTheme();
-    setText(byId("limit-warning"), String(team.limits.still_warning_s));
-    setText(byId("limit-alarm"), String(team.limits.still_alarm_s));
+    showLegend();
     map.layer.forget();
   } else if (kind === "timeline") {
     timeline.handle(message);
   } else if (kind === "board") {
     board.handle(message);
+    ground.handle(message);
   } else if (kind === "you") {
     setAttribute(document.documentElement, "data-role", message.role);
   } else if (kind === "log") {
@@ -90,7 +103,7 @@ function handle(message) {
     timeline.show(team.timeS);
     findView.update(team);
   } else if (kind === "unknown") {
-    trouble = { level: "warning", text: "The server's version differs from this page's: reload the page." };
+    trouble = { level: "warning", text: t("server.version") };
   }
   if (kind !== "ping") map.invalidate();
   refresh(kind === "hello");
@@ -98,10 +111,10 @@ function handle(message) {
 
 function takeAlarms() {
   const { raised, cleared } = alarms.update(team.list());
-  if (raised.length) setText(byId("alarm-voice"), raised.map((a) => `${a.level}: ${alarmText(a)}`).join(". "));
+  if (raised.length) setText(byId("alarm-voice"), raised.map((a) => `${levelWords(a.level)}: ${alarmText(a)}`).join(". "));
   if (cleared.length) {
     setText(byId("news-voice"), cleared
-      .map((a) => `${a.name} ${a.kind === "lost" ? "is heard again" : "moves again"}`).join(". "));
+      .map((a) => t(a.kind === "lost" ? "cleared.lost" : "cleared.still", { name: a.name })).join(". "));
   }
   if (team.replayed && raised.length) siren.sound(null);
   sound();
@@ -161,14 +174,15 @@ function show() {
   const notices = [...team.notices];
   if (trouble) notices.unshift(trouble);
   if (connection.unreadable) {
-    notices.unshift({ level: "warning", text: `${connection.unreadable} messages of the server were unreadable.` });
+    notices.unshift({ level: "warning", text: t("server.unreadable", { count: connection.unreadable }) });
   }
   board.update();
-  showNotices(byId("notices"), notices.map((notice) => ({ ...notice, text: team.withNames(notice.text) })));
+  showUnseen(byId("show-log"), log.unseen);
+  showNotices(byId("notices"), notices.map((notice) => ({ ...notice, text: team.withNames(said(notice.said, notice.text)) })));
   const heard = team.list().filter(isFresh).length;
   const all = team.people.size;
   byId("people").dataset.many = String(all > 8);
-  setText(byId("count"), !all ? "" : heard === all ? `(${all})` : `(${heard} of ${all} heard)`);
+  setText(byId("count"), !all ? "" : heard === all ? `(${all})` : t("count.heard", { heard, all }));
   fillMe();
   list.update(team, {
     colourOf: (node) => map.colourOf(node),
@@ -177,9 +191,10 @@ function show() {
     followed: map.camera.mode === "follow" ? map.camera.node : null,
     alarms,
   });
+  map.floors.update();
   showCamera();
   const missing = team.list().filter((p) => p.status === "unlocated").map((p) => p.name);
-  setText(byId("map-hint"), missing.length ? `Not located yet: ${missing.join(", ")}` : "");
+  setText(byId("map-hint"), missing.length ? t("map.unlocated", { names: missing.join(", ") }) : "");
   if (performance.now() - tableMs > TABLE_MS) showTable();
 }
 
@@ -189,7 +204,7 @@ function showTable() {
   if (byId("table-view").hidden) return;
   updateTable(byId("table"), team, map.me);
   const from = team.person(map.me)?.name;
-  setText(byId("from-title"), from ? `From ${from}` : "From me");
+  setText(byId("from-title"), from ? t("table.from.name", { name: from }) : t("table.from.me"));
   setText(byId("table-caption"), map.describe());
   setText(byId("table-alternatives"), alternativeWords(team));
 }
@@ -213,7 +228,7 @@ function showCamera() {
   const follow = byId("follow");
   const name = team.person(mode === "follow" ? node : map.selected ?? map.me)?.name;
   setAttribute(follow, "aria-pressed", String(mode === "follow"));
-  setText(follow, name ? `Follow ${name}` : "Follow");
+  setText(follow, name ? t("follow.name", { name }) : t("follow"));
   follow.disabled = !name;
   const up = byId("heading-up");
   setAttribute(up, "aria-pressed", String(map.up === "heading"));
@@ -221,8 +236,7 @@ function showCamera() {
 
 function showSound() {
   const button = byId("sound");
-  const words = { on: "Sound on", muted: `Sound off, ${duration(siren.mutedS)} left`, locked: "NO SOUND: enable" };
-  setText(button, words[siren.state]);
+  setText(button, t(`sound.${siren.state}`, { time: duration(siren.mutedS) }));
   setAttribute(button, "data-state", siren.state);
   setAttribute(button, "aria-pressed", String(siren.state === "on"));
 }
@@ -232,7 +246,7 @@ function fillMe() {
   const wanted = ["", ...team.list().map((p) => `${p.node} ${p.name}`)].join("\n");
   if (select.dataset.people !== wanted) {
     select.dataset.people = wanted;
-    select.replaceChildren(make("option", { value: "", text: "none" }),
+    select.replaceChildren(make("option", { value: "", "data-t": "nobody" }),
       ...team.list().map((p) => make("option", { value: p.node, text: p.name })));
   }
   // Until a person is chosen, directions are relative to the first one.
@@ -300,25 +314,25 @@ function stopFinding() {
 }
 
 async function acknowledge(nodes) {
-  for (const node of nodes) alarms.acknowledge(node, BY);
+  for (const node of nodes) alarms.acknowledge(node, by());
   sound();
   banner.update(alarms);
   map.invalidate();
   // The button is gone: on to the next alarm's, or back to the map.
   (byId("alarms").querySelector(".rows .buttons button:last-child") ?? byId("map")).focus();
   try {
-    for (const node of nodes) await postJson("/api/acknowledge", { node, by: BY });
+    for (const node of nodes) await postJson("/api/acknowledge", { node, by: by() });
   } catch (error) {
-    trouble = { level: "warning", text: `Acknowledged only on this page: ${error.message}` };
+    trouble = { level: "warning", text: t("acknowledge.failed", { error: error.message }) };
     refresh(true);
   }
 }
 
 async function shelve(node, forS) {
   try {
-    await postJson("/api/shelve", { node, seconds: forS, by: BY });
+    await postJson("/api/shelve", { node, seconds: forS, by: by() });
   } catch (error) {
-    trouble = { level: "warning", text: `Not shelved: ${error.message}` };
+    trouble = { level: "warning", text: t("shelve.failed", { error: error.message }) };
     refresh(true);
   }
 }
@@ -362,6 +376,14 @@ byId("sheet").addEventListener("click", () => {
   const open = byId("side").classList.toggle("open");
   setAttribute(byId("sheet"), "aria-expanded", String(open));
 });
+hold(byId("end"), async () => {
+  try {
+    await postJson("/api/end", { by: by() });
+  } catch (error) {
+    trouble = { level: "warning", text: t("end.failed", { error: error.message }) };
+    refresh(true);
+  }
+});
 byId("help").addEventListener("click", () => byId("help-dialog").showModal());
 byId("as-table").addEventListener("click", () => {
   const view = byId("table-view");
@@ -369,9 +391,32 @@ byId("as-table").addEventListener("click", () => {
   setAttribute(byId("as-table"), "aria-pressed", String(!view.hidden));
   showTable();
 });
-themeSwitch(byId("theme"), () => {
+/** The mission whose recording is played goes on beside it. */
+function showWayToLive(port) {
+  const link = byId("to-live");
+  link.hidden = !port;
+  if (port) link.href = `${location.protocol}//${location.hostname}:${port}/`;
+}
+
+function showLegend() {
+  setText(byId("legend-alarms"), t("legend.alarms.is", { warning: team.limits.still_warning_s, alarm: team.limits.still_alarm_s }));
+}
+
+const showTheme = themeSwitch(byId("theme"), () => {
   map.readTheme(isDark());
   listMs = 0;
+  refresh(true);
+});
+
+languageSwitch(byId("language"), () => {
+  showTheme();
+  showSound();
+  showLegend();
+  byId("notices").dataset.shown = "";
+  banner.update(alarms);
+  board.update();
+  if (byId("log-dialog").open) log.look(team);
+  map.invalidate();
   refresh(true);
 });
 

@@ -1,6 +1,7 @@
 // The switch between light (sunlight) and dark.
 
 import { setAttribute, setText, storage } from "./dom.js";
+import { t } from "./i18n.js";
 
 /** Which theme is shown; theme.js has set it. */
 export function isDark() {
@@ -11,9 +12,9 @@ export function isDark() {
 export function themeSwitch(button, changed) {
   const store = storage();
   const show = () => {
-    const next = isDark() ? "Light" : "Dark";
-    setText(button.querySelector(".word"), next);
-    setAttribute(button, "aria-label", `${next} theme`);
+    const next = isDark() ? "light" : "dark";
+    setText(button.querySelector(".word"), t(`theme.${next}`));
+    setAttribute(button, "aria-label", t(`theme.${next}.label`));
     changed();
   };
   button.addEventListener("click", () => {
@@ -24,4 +25,5 @@ export function themeSwitch(button, changed) {
   });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", show);
   show();
+  return show;
 }

@@ -1,6 +1,7 @@
 // The time line of a recording that is played: play, pause, speed, any moment, the next event.
 
 import { byId, make, postJson, setAttribute, setText } from "./dom.js";
+import { said, t } from "./i18n.js";
 import { duration } from "./words.js";
 
 export class Timeline {
@@ -9,7 +10,7 @@ export class Timeline {
     this.line = null;
     this.dragging = false;
     this.slider = byId("moment");
-    const post = (body) => postJson("/api/replay", body).catch((error) => say(`The recording does not move: ${error.message}`));
+    const post = (body) => postJson("/api/replay", body).catch((error) => say(t("replay.stuck", { error: error.message })));
     byId("play").addEventListener("click", () => post({ playing: !this.line.playing }));
     byId("event-before").addEventListener("click", () => post({ step: -1 }));
     byId("event-after").addEventListener("click", () => post({ step: 1 }));
@@ -35,15 +36,15 @@ export class Timeline {
     const ticks = this.line?.ticks?.length !== line.ticks.length;
     this.line = line;
     byId("timeline").hidden = false;
-    setText(byId("play"), line.playing ? "Pause" : "Play");
+    setText(byId("play"), t(line.playing ? "replay.pause" : "replay.play"));
     setAttribute(this.slider, "min", line.from_s);
     setAttribute(this.slider, "max", line.to_s);
     byId("speed").value = String(line.speed);
     byId("event-before").disabled = byId("event-after").disabled = line.reading;
     if (!ticks) return;
     const span = Math.max(line.to_s - line.from_s, 1);
-    byId("ticks").replaceChildren(...line.ticks.map(([atS, kind, text]) => {
-      const tick = make("span", { class: "tick", "data-kind": kind, title: text });
+    byId("ticks").replaceChildren(...line.ticks.map(([atS, kind, text, key]) => {
+      const tick = make("span", { class: "tick", "data-kind": kind, title: said(key, text) });
       tick.style.left = `${(100 * (atS - line.from_s)) / span}%`;
       return tick;
     }));
@@ -52,7 +53,7 @@ export class Timeline {
   show(timeS) {
     if (!this.line || this.dragging || timeS === null) return;
     this.slider.value = String(timeS);
-    const words = `${duration(timeS - this.line.from_s)} of ${duration(this.line.to_s - this.line.from_s)}`;
+    const words = t("replay.of", { at: duration(timeS - this.line.from_s), all: duration(this.line.to_s - this.line.from_s) });
     setText(byId("moment-words"), words);
     setAttribute(this.slider, "aria-valuetext", words);
   }

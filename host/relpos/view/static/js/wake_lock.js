@@ -1,5 +1,7 @@
 // Keeping the screen on: browsers allow it over HTTPS alone, and let go when the page is hidden.
 
+import { t } from "./i18n.js";
+
 export class ScreenLock {
   constructor(onChange) {
     this.onChange = onChange;
@@ -34,7 +36,7 @@ export class ScreenLock {
       this.held.addEventListener("release", () => this.onChange());
       this.trouble = "";
     } catch (error) {
-      this.trouble = `The phone refuses: ${error.message}`;
+      this.trouble = t("wake.refused", { error: error.message });
     }
     this.onChange();
   }

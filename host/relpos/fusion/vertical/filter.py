@@ -1,0 +1,465 @@
+"""The vertical filter of a team: reported heights and motion in; heights, episodes, floors out.
+
+It works in intervals of about a second, which end with epochs. What happened in one is decided
+``LAG_S`` later, when smoothing knows how it went on: a flight of stairs is recognised after a few
+steps, a fan's pressure after a metre. Until then a height is the last decided one and what has
+probably been climbed since.
+
+On stairs dead reckoning claims a level step's length, twice the true one. The surplus is taken back
+along the reported direction (:class:`Correction`).
+
+Before anybody reports a height there is nothing here: the team is taken to be on one level.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.estimator import Episode, Vertical
+from relpos.fusion.timeline import Advance
+from relpos.fusion.vertical import episodes
+from relpos.fusion.vertical.episodes import (
+    PRESSURE,
+    STAIRS,
+    UNDER_WAY,
+    Beliefs,
+    Interval,
+    Mode,
+    Update,
+)
+from relpos.fusion.vertical.floors import CERTAIN, Floors, most_probable
+from relpos.fusion.vertical.heights import START_M, UNKNOWN_M, UNSEEN_M, UNSEEN_S, Heights, Z
+from relpos.fusion.vertical.track import Moved, Track
+from relpos.measurements import Height, Range
+
+Floats = npt.NDArray[np.float64]
+
+INTERVAL_S = 0.75
+"""Shortest interval: of estimates ten times a second only some close one."""
+
+LAG_S = 6.0
+"""What happened so long ago is decided."""
+
+LATE_S = 60.0
+"""Who reports a first height so long after the first of all joins late."""
+
+TREAD_M, RISER_M, STEEPER = 0.28, 0.175, 1.0
+"""A usual tread, and by how much it is shorter per metre of a higher riser. Builders keep
+2 risers + tread = 0.63 m, and many stairs are as they are: this is in between."""
+LEAST_TREAD_M = 0.22
+TWO_STEPS_M = 0.26
+"""A rise by so much is two steps."""
+
+LEAST_CORRECTION_M = 0.02
+
+LEAST_CLIMB_M = 0.45
+"""Less than three steps within ``LAG_S`` are told as level: gusts, a threshold."""
+
+WITNESS_S = 5.0
+"""Pressure that jumps at one node may do so at others for so long."""
+STANDS_STEPS = 0.3
+"""Who makes fewer steps in an interval stands, and sees what the pressure does alone."""
+
+MANY, ALIKE_M = 3, 0.12
+"""So many others whose heights rise alike, up to a deviation, show what the pressure does, too."""
+
+FAN_DOUBT_M = 0.5
+"""Variance of a climb per metre that the pressure changed for others: 1 m2 for a fan of 25 Pa."""
+
+PRESSED_SHARE = 0.6
+"""Who leaves a stairwell whose pressure differs by more or less than on entering may have climbed
+this share of the difference less: a standard deviation."""
+
+NEAR_M, VAGUE_M, SURE_M = 1.5, 1.0, 0.5
+"""A range so short tells on which floor somebody of a vague height is, from one of a sure height
+(standard deviations)."""
+
+SETTLES_S = 3.0
+"""After so long on the level a node is where it stays."""
+
+
+class Correction(NamedTuple):
+    """A displacement to be made now, in the node's heading frame; it takes surplus back."""
+
+    node: int
+    dx_m: float
+    dy_m: float
+
+
+class Decided(NamedTuple):
+    """What was decided of one node between two of its heights."""
+
+    node: int
+    begin_s: float
+    end_s: float
+    factor: float
+    """Of the displacements."""
+    z_m: float
+
+
+@dataclass(slots=True)
+class _Interval:
+    """An interval of N nodes that is not decided yet."""
+
+    begin_s: float
+    end_s: float
+    taken_s: Floats
+    """Times of each node's heights before it and at its end (2, N)."""
+    reported: Interval
+    update: Update
+    rise_m: Floats
+    way_m: Floats
+    moved: npt.NDArray[np.complex128]
+    silent_s: Floats
+    again: npt.NDArray[np.bool_]
+    """Whose height came after a while without."""
+    factor: Floats
+    """By what the displacements have been multiplied so far."""
+
+
+@dataclass(slots=True)
+class VerticalFilter:
+    """See the module's text. Feed :meth:`move` and :meth:`measure`; :meth:`close` epochs."""
+
+    heights: Heights = field(default_factory=Heights)
+    floors: Floors = field(default_factory=Floors)
+    decided: list[Decided] | None = None
+    """Everything decided, where somebody wants it."""
+    _row: dict[int, int] = field(default_factory=dict)
+    _tracks: dict[int, Track] = field(default_factory=dict)
+    _beliefs: Beliefs = field(default_factory=lambda: episodes.begin(np.empty(0), np.empty(0)))
+    _decided: Beliefs = field(default_factory=lambda: episodes.begin(np.empty(0), np.empty(0)))
+    """Belief before the open intervals."""
+    _open: list[_Interval] = field(default_factory=list)
+    _smoothed: list[Floats] = field(default_factory=list)
+    """Probabilities of the modes in each open interval."""
+    _first_s: float = math.inf
+    _closed_s: float = -math.inf
+    _witnessed: dict[int, float] = field(default_factory=dict)
+    """Row -> when its pressure was last seen to be disturbed, while it stood."""
+    _level_s: Floats = field(default_factory=lambda: np.empty(0))
+    """How long each has been level since it last changed its height."""
+    _level_steps: Floats = field(default_factory=lambda: np.empty(0))
+    _pressed_m: Floats = field(default_factory=lambda: np.empty(0))
+    """What the pressure did to each since it was last on a known floor."""
+    _heights_before: Floats = field(default_factory=lambda: np.empty(0))
+    """Newest heights at the end of the last interval."""
+    _walked: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+    _stands: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+    """In the last interval."""
+    _settled: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+
+    @property
+    def active(self) -> bool:
+        """Whether anybody has reported a height."""
+        return self._first_s < math.inf
+
+    # -- measurements --------------------------------------------------------------------------
+
+    def move(self, step: Advance) -> None:
+        """Add a piece of motion."""
+        if not self.active:
+            return
+        self._track(step.node).move(step)
+
+    def measure(self, measured: Height, time_s: float) -> None:
+        """Add a reported height, at its time in the order of steps."""
+        node = measured.node
+        if not self.active:
+            self._first_s = self._closed_s = time_s
+        track = self._track(node)
+        track.height_m, track.height_s = measured.height_m, time_s
+        track.sigma_m = measured.sigma_m or track.sigma_m
+        if node not in self._row:
+            self._add(node, track, late=time_s > self._first_s + LATE_S)
+
+    def _track(self, node: int) -> Track:
+        track = self._tracks.get(node)
+        if track is None:
+            track = self._tracks[node] = Track(episodes.SIGMA_HEIGHT_M)
+        return track
+
+    def _add(self, node: int, track: Track, *, late: bool) -> None:
+        self._decide(math.inf)
+        self._row[node] = len(self._row)
+        track.take()
+        self.heights.add(track.height_m, track.sigma_m, late=late)
+        self.floors.add(late=late)
+        first = episodes.begin(np.array([track.height_m]), np.array([track.sigma_m**2]))
+        self._beliefs = Beliefs(
+            *(np.concatenate(both) for both in zip(self._beliefs, first, strict=True))
+        )
+        self._decided = self._beliefs
+        self._level_s = np.append(self._level_s, 0.0)
+        self._level_steps = np.append(self._level_steps, 0.0)
+        self._heights_before = np.append(self._heights_before, track.height_m)
+        self._walked = np.append(self._walked, False)
+        self._stands = np.append(self._stands, False)
+        # Otherwise heights are over a common ground, and it does not start where the others do.
+        at_start = not late and abs(track.height_m) <= 1.0
+        self._settled = np.append(self._settled, at_start)
+        self._pressed_m = np.append(self._pressed_m, 0.0)
+
+    def ranged(self, measured: Range) -> None:
+        """Use a short range: the two are on one floor. Others teach no height on one floor."""
+        if measured.range_m > NEAR_M:
+            return
+        for vague, sure in ((measured.node, measured.peer), (measured.peer, measured.node)):
+            if vague not in self._row or sure not in self._row:
+                return
+            a, b = self._row[vague], self._row[sure]
+            variance = self.heights.covariance[:, Z, Z]
+            if variance[a] > VAGUE_M**2 and variance[b] < SURE_M**2:
+                z_m = float(self.heights.mean[b, Z])
+                spread_m2 = (0.5 * measured.range_m) ** 2
+                self.heights.observe(a, z_m, float(variance[b]) + spread_m2)
+                self._settled[a] = False
+                self._level_s[a] = 0.0
+
+    # -- intervals -----------------------------------------------------------------------------
+
+    def close(self, time_s: float) -> list[Correction]:
+        """End an epoch; return what motion has to be corrected by, now."""
+        if not self._row or time_s < self._closed_s + INTERVAL_S:
+            return []
+        self._observe(time_s)
+        self._smoothed = episodes.smooth([one.update for one in self._open])
+        corrections = self._corrections()
+        self._decide(time_s - LAG_S)
+        return corrections
+
+    def finish(self) -> None:
+        """Decide what is still open."""
+        self._decide(math.inf)
+
+    def _observe(self, time_s: float) -> None:
+        """Add the interval that ends now."""
+        begin_s, self._closed_s = self._closed_s, time_s
+        tracks = [self._tracks[node] for node in self._row]
+        news = np.array([track.height_s > track.taken_s for track in tracks])
+        height = np.array([track.height_m for track in tracks])
+        taken_s = np.array([[t.taken_s for t in tracks], [t.height_s for t in tracks]])
+        since_s = taken_s[1] - taken_s[0]
+        moved = [t.take() if new else Moved() for t, new in zip(tracks, news, strict=True)]
+        steps = np.array([one.steps for one in moved])
+        variance = np.array([track.sigma_m**2 for track in tracks])
+        again = news & (since_s > UNSEEN_S)
+        if again.any():
+            # How it came there nobody has seen.
+            self._beliefs = episodes.begin_again(self._beliefs, again, height, variance)
+        reported = Interval(
+            time_s - begin_s, np.where(again | ~news, 1.0, since_s), steps,
+            np.where(news, height, np.nan), variance, self._witnesses(time_s),
+            self._common_rise(height, news, steps), self._walked,
+        )  # fmt: skip
+        before = self._height_means()
+        update = episodes.update(self._beliefs, reported)
+        self._beliefs = update.beliefs
+        unseen_s = time_s - np.array([max(track.height_s, begin_s) for track in tracks])
+        absent = np.array([time_s - track.height_s > UNSEEN_S for track in tracks])
+        self._open.append(
+            _Interval(
+                begin_s, time_s, taken_s, reported, update, self._height_means() - before,
+                np.array([one.way_m for one in moved]),
+                np.array([one.displacement_m for one in moved]),
+                np.where(absent, unseen_s, 0.0), again, np.ones(len(tracks)),
+            )
+        )  # fmt: skip
+        lasting = (Mode.DISTURBED, Mode.COMMON)
+        disturbed = update.beliefs.probability[:, lasting].sum(axis=1) > 0.5
+        seen = np.flatnonzero(disturbed & news & (steps < STANDS_STEPS)).tolist()
+        is_first = any(self._witnessed.get(row, -math.inf) < time_s - WITNESS_S for row in seen)
+        self._witnessed.update(dict.fromkeys(seen, time_s))
+        if is_first:
+            self._repeat()
+        # One who fell, or who rides a lift, is no witness of the weather.
+        under_way = update.beliefs.probability[:, UNDER_WAY].sum(axis=1) > 0.5
+        self._stands = (steps < STANDS_STEPS) & ~under_way
+        self._walked = np.where(news, steps > STANDS_STEPS, self._walked)
+        self._heights_before = np.where(news, height, self._heights_before)
+
+    def _witnesses(self, time_s: float) -> npt.NDArray[np.bool_]:
+        """Return who has somebody else whose pressure is disturbed (N,)."""
+        recent = [row for row, seen_s in self._witnessed.items() if seen_s > time_s - WITNESS_S]
+        witnessed = np.full(len(self._row), bool(recent))
+        if len(recent) == 1:
+            witnessed[recent[0]] = False
+        return witnessed
+
+    def _repeat(self) -> None:
+        """Go over the open intervals again: somebody who stands has seen disturbed pressure."""
+        self._beliefs = self._decided
+        for one in self._open:
+            reported = one.reported._replace(witnessed=self._witnesses(one.end_s))
+            self._beliefs = episodes.begin_again(
+                self._beliefs, one.again, reported.height_m, reported.variance_m2
+            )
+            before = self._height_means()
+            one.update = episodes.update(self._beliefs, reported)
+            self._beliefs = one.update.beliefs
+            one.rise_m = self._height_means() - before
+
+    def _common_rise(self, height_m: Floats, news: npt.NDArray[np.bool_], steps: Floats) -> Floats:
+        """Return by how much all others rose (N,): those who stand, or many alike; else NaN."""
+        stands = news & self._stands & (steps < STANDS_STEPS)
+        rise = height_m - self._heights_before
+        common = _others_mean(rise, stands, 1)
+        alike = _others_mean(rise, news, MANY)
+        mean_m = rise[news].mean() if news.any() else 0.0
+        spread = _others_mean((rise - mean_m) ** 2, news, MANY)
+        return np.where(np.isnan(common) & (spread < ALIKE_M**2), alike, common)
+
+    def _height_means(self) -> Floats:
+        mean: Floats = (self._beliefs.probability * self._beliefs.mean_m).sum(axis=1)
+        return mean
+
+    def _corrections(self) -> list[Correction]:
+        """Take back what the open intervals claim too much of, as far as that is known."""
+        stairs = np.array([p[:, STAIRS].sum(axis=1) for p in self._smoothed])
+        rise = np.abs(sum(p * one.rise_m for p, one in zip(stairs, self._open, strict=True)))
+        way = sum(p * one.way_m for p, one in zip(stairs, self._open, strict=True))
+        steps = sum(p * one.reported.steps for p, one in zip(stairs, self._open, strict=True))
+        true_m = way_on_stairs(steps, rise, way)
+        on_stairs = np.where(way > 0.1, np.minimum(true_m / np.maximum(way, 0.1), 1.0), 1.0)
+        factor = 1.0 - stairs * (1.0 - on_stairs)
+        total = sum((f - one.factor) * one.moved for f, one in zip(factor, self._open, strict=True))
+        worth = np.abs(total) >= LEAST_CORRECTION_M
+        for f, one in zip(factor, self._open, strict=True):
+            one.factor = np.where(worth, f, one.factor)
+        corrections = []
+        for node, row in self._row.items():
+            if worth[row]:
+                now = complex(total[row]) / self._tracks[node].heading
+                corrections.append(Correction(node, now.real, now.imag))
+        return corrections
+
+    def _decide(self, until_s: float) -> None:
+        """Decide what happened in the intervals that ended by then."""
+        count = sum(one.end_s <= until_s for one in self._open)
+        for one, modes in zip(self._open[:count], self._smoothed[:count], strict=True):
+            self._apply(one, modes)
+            self._decided = one.update.beliefs
+        del self._open[:count], self._smoothed[:count]
+
+    def _apply(self, one: _Interval, modes: Floats) -> None:
+        """Let what happened in an interval move the heights."""
+        duration_s = one.end_s - one.begin_s
+        disturbed = modes[:, PRESSURE].sum(axis=1)
+        moving = 1.0 - modes[:, Mode.LEVEL] - disturbed
+        heights = self.heights
+        heights.advance(duration_s, one.rise_m, moving, disturbed, one.silent_s)
+        # Who climbs while others see the pressure change may climb that much less.
+        resting = np.maximum((1.0 - moving).sum(), 1.0)
+        fan_m = abs(float((disturbed * one.rise_m).sum())) / resting
+        heights.moved(moving * (2.0 * one.reported.variance_m2 + FAN_DOUBT_M * fan_m))
+        heights.correct(one.reported.height_m, one.reported.variance_m2)
+        moves = (moving > 0.5) | one.again
+        self._level_s = np.where(moves, 0.0, self._level_s + duration_s)
+        self._level_steps = np.where(moves, 0.0, self._level_steps + one.reported.steps)
+        self._settled &= ~moves
+        self._pressed_m = np.where(self._settled, 0.0, self._pressed_m + disturbed * one.rise_m)
+        self._locate()
+        if self.decided is not None:
+            for node, row in self._row.items():
+                begin_s, end_s = one.taken_s[:, row].tolist()
+                if begin_s < end_s:
+                    z_m, factor = float(heights.mean[row, Z]), float(one.factor[row])
+                    self.decided.append(Decided(node, begin_s, end_s, factor, z_m))
+
+    def _locate(self) -> None:
+        """Find the floors of those who have changed their height."""
+        open_ = np.flatnonzero(~self._settled)
+        if not open_.size:
+            return
+        heights, floors = self.heights, self.floors
+        doubt_m2 = (PRESSED_SHARE * self._pressed_m) ** 2
+        z_m, variance_m2 = heights.mean[open_, Z], heights.covariance[open_, Z, Z] + doubt_m2[open_]
+        floors.probability[open_] = floors.where(z_m, variance_m2, self._level_steps[open_])
+        for row in open_[self._level_s[open_] >= SETTLES_S].tolist():
+            floor, probability = most_probable(floors.probability[row])
+            if floor is None or probability < CERTAIN:
+                continue
+            self._settled[row] = True
+            heights.covariance[row, Z, Z] += doubt_m2[row]
+            z_m, variance_m2 = float(heights.mean[row, Z]), float(heights.covariance[row, Z, Z])
+            floor_m, floor_m2 = floors.height_of(floor)
+            heights.observe(row, floor_m, floor_m2 + WORN_M2)
+            floors.learn(floor, z_m, variance_m2)
+
+    # -- what is known -------------------------------------------------------------------------
+
+    def of(self, node: int, time_s: float) -> Vertical:
+        """Return what is known of a node."""
+        row = self._row.get(node)
+        if row is None:
+            return self._unmeasured(time_s)
+        z_m, variance_m2 = self.heights.mean[row, Z], self.heights.covariance[row, Z, Z]
+        variance_m2 += (PRESSED_SHARE * self._pressed_m[row]) ** 2
+        climbed = 0.0
+        for one, modes in zip(self._open, self._smoothed, strict=True):
+            moving = 1.0 - modes[row, Mode.LEVEL] - modes[row, PRESSURE].sum()
+            rise = one.rise_m[row]
+            z_m += moving * rise
+            climbed += modes[row, STAIRS].sum() * rise
+            variance_m2 += moving * (1.0 - moving) * rise * rise
+            variance_m2 += UNSEEN_M**2 * one.silent_s[row]
+        # With the news of one more interval, where there is one.
+        modes = self._smoothed[-2:][0] if self._smoothed else self._beliefs.probability
+        told = episodes.episodes_of(modes[row])
+        if abs(climbed) < LEAST_CLIMB_M:
+            told[episodes.EPISODES.index(Episode.LEVEL)] += told[_CLIMBS].sum()
+            told[_CLIMBS] = 0.0
+        k = int(np.argmax(told))
+        where = self.floors.probability[row]
+        if not self._settled[row] or any(p[row, Mode.LEVEL] < 0.5 for p in self._smoothed):
+            steps = self._level_steps[row]
+            for one, modes in zip(self._open, self._smoothed, strict=True):
+                steps = steps * modes[row, Mode.LEVEL] + one.reported.steps[row]
+            where = self.floors.where(z_m, variance_m2, steps)
+        floor, certain = most_probable(where)
+        probability = None if floor is None else certain
+        return Vertical(
+            float(z_m), math.sqrt(variance_m2), episodes.EPISODES[k], float(told[k]), floor,
+            probability,
+        )  # fmt: skip
+
+    def _unmeasured(self, time_s: float) -> Vertical:
+        """A node that never reported a height: it may have climbed since the start."""
+        if not self.active:
+            return Vertical()
+        grown = START_M**2 + UNSEEN_M**2 * max(time_s - self._first_s, 0.0)
+        return Vertical(0.0, min(math.sqrt(grown), UNKNOWN_M))
+
+
+def _others_mean(values: Floats, counted: npt.NDArray[np.bool_], least: int) -> Floats:
+    """Return for each (N,) the mean over all others that are counted; NaN for fewer."""
+    kept = np.where(counted, values, 0.0)
+    others = counted.sum() - counted
+    mean: Floats = (kept.sum() - kept) / np.where(others >= least, others, math.nan)
+    return mean
+
+
+_CLIMBS = np.array([e in (Episode.UP, Episode.DOWN) for e in episodes.EPISODES])
+
+WORN_M2 = 0.1**2
+"""Variance of a node's height over its floor's."""
+
+
+def way_on_stairs(steps: Floats, rise_m: Floats, way_m: Floats) -> Floats:
+    """Return the true way (m) of steps that rise by so much and are claimed to go so far.
+
+    The rise tells how many of the steps were on stairs: landings and the first steps behind a
+    flight are level.
+    """
+    rise_of_one = rise_m / np.maximum(steps, 1e-9)
+    treads = 1.0 + np.clip((rise_of_one - TWO_STEPS_M) / 0.04 + 0.5, 0.0, 1.0)
+    riser = rise_of_one / treads
+    climbs = np.minimum(riser / RISER_M, 1.0)
+    tread = np.clip(TREAD_M - STEEPER * np.maximum(riser - RISER_M, 0.0), LEAST_TREAD_M, TREAD_M)
+    way: Floats = way_m * (1.0 - climbs) + climbs * steps * treads * tread
+    return way

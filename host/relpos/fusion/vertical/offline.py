@@ -1,0 +1,62 @@
+"""A whole run as measured, with heights decided and without what dead reckoning adds on stairs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Timeline
+from relpos.fusion.vertical.filter import Decided, VerticalFilter
+from relpos.measurements import Height, Measurement, Motion
+
+
+def as_climbed(measurements: Sequence[Measurement], nodes: Iterable[int]) -> list[Measurement]:
+    """Return measurements with heights and ways on stairs as the vertical filter decides them.
+
+    ``nodes`` are known from the start. Without reported heights nothing changes.
+    """
+    if not any(isinstance(m, Height) for m in measurements):
+        return list(measurements)
+    timeline, vertical = Timeline(nodes), VerticalFilter(decided=[])
+    for step in timeline.push_all(measurements, final=True):
+        if isinstance(step, Advance):
+            vertical.move(step)
+        elif isinstance(step, Sensed) and isinstance(step.measurement, Height):
+            vertical.measure(step.measurement, step.time_s)
+        elif isinstance(step, Ranging):
+            for measured in step.ranges:
+                vertical.ranged(measured)
+        elif isinstance(step, Epoch):
+            vertical.close(step.time_s)
+    vertical.finish()
+    of: dict[int, list[Decided]] = {}
+    for one in vertical.decided or ():
+        of.setdefault(one.node, []).append(one)
+    before: dict[int, float] = {}
+    changed: list[Measurement] = []
+    for m in sorted(measurements, key=lambda m: m.time_s):
+        own = of.get(m.node, ())
+        if isinstance(m, Motion) and own:
+            factor = _factor(own, before.get(m.node, -math.inf), m.time_s)
+            changed.append(replace(m, dx_m=factor * m.dx_m, dy_m=factor * m.dy_m))
+            before[m.node] = m.time_s
+        elif isinstance(m, Height) and own:
+            z_m = float(np.interp(m.time_s, [d.end_s for d in own], [d.z_m for d in own]))
+            changed.append(replace(m, height_m=z_m))
+        else:
+            changed.append(m)
+    return changed
+
+
+def _factor(own: Sequence[Decided], begin_s: float, end_s: float) -> float:
+    """Return the mean factor of a displacement between two times."""
+    begin_s = max(begin_s, end_s - 10.0)
+    less = 0.0
+    for one in own:
+        overlap_s = min(end_s, one.end_s) - max(begin_s, one.begin_s)
+        if overlap_s > 0.0:
+            less += overlap_s * (1.0 - one.factor)
+    return 1.0 - less / max(end_s - begin_s, 1e-9)

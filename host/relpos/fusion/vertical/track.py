@@ -1,0 +1,82 @@
+"""What a node has reported lately: motion by its time, and the newest height."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from relpos.fusion.timeline import Advance
+
+STEP_M = 0.56
+"""A step on stairs as dead reckoning claims it; where steps are not reported, way is taken so."""
+
+HEIGHT_LATE_S = 0.4
+"""A reported height is that of so long before (``firmware/lib/node/barometer.cpp``)."""
+
+
+class Moved(NamedTuple):
+    """Motion since some time: steps, length of the way, displacement in the node's own frame."""
+
+    steps: float = 0.0
+    way_m: float = 0.0
+    displacement_m: complex = 0j
+
+    def to(self, later: Moved, share: float = 1.0) -> Moved:
+        """Return a share of what lies between this and a later one."""
+        return Moved(*(share * (b - a) for a, b in zip(self, later, strict=True)))  # type: ignore[arg-type]
+
+    def plus(self, more: Moved) -> Moved:
+        """Return the sum."""
+        return Moved(*(a + b for a, b in zip(self, more, strict=True)))  # type: ignore[arg-type]
+
+
+NOT_MOVED = Moved()
+
+
+@dataclass(slots=True)
+class Track:
+    """One node's reports since it was taken from last."""
+
+    sigma_m: float
+    """Standard deviation of its heights."""
+    height_m: float = math.nan
+    height_s: float = -math.inf
+    taken_s: float = -math.inf
+    """Time of the height that was taken last."""
+    heading: complex = 1.0 + 0j
+    """In the frame of its own dead reckoning."""
+    _reached: Moved = NOT_MOVED
+    _taken: Moved = NOT_MOVED
+    _points: deque[tuple[float, Moved]] = field(default_factory=deque)
+    """Totals at the ends of pieces that are not taken wholly."""
+
+    def move(self, step: Advance) -> None:
+        """Add a piece of motion."""
+        way_m = math.hypot(step.dx_m, step.dy_m)
+        steps = way_m / STEP_M if step.steps is None else step.steps
+        x, y, z = self._reached
+        moved = z + self.heading * complex(step.dx_m, step.dy_m)
+        if not self._points:
+            self._points.append((step.time_s - step.duration_s, self._reached))
+        self._reached = Moved(x + steps, y + way_m, moved)
+        self._points.append((step.time_s, self._reached))
+        self.heading *= cmath.rect(1.0, step.dtheta_rad)
+
+    def take(self) -> Moved:
+        """Return the motion up to the newest height."""
+        until_s, points = self.height_s - HEIGHT_LATE_S, self._points
+        while len(points) > 1 and points[1][0] <= until_s:
+            points.popleft()
+        total = self._taken
+        if points and points[0][0] <= until_s:
+            (begin_s, total), *rest = points
+            if rest:
+                end_s, after = rest[0]
+                share = (until_s - begin_s) / max(end_s - begin_s, 1e-9)
+                total = total.plus(total.to(after, share))
+        since = self._taken.to(total)
+        self._taken, self.taken_s = total, self.height_s
+        return since

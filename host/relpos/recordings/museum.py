@@ -1,0 +1,79 @@
+"""github.com/Kenny5269/2023_IPIN_Competition_Track03: phone in the hand (zenodo 8362205).
+
+Logs of the app GetSensorData: lines of kind, the app's seconds, the sensor's seconds and values;
+POSI where the walker pressed a button at a surveyed point. Sensors come each at its own times: rows
+are the accelerometer's, from a second before the first point to a second behind the last; the other
+sensors are interpolated. Points are metres east and north of the first one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from relpos.errors import DataError
+from relpos.recordings.tables import Archive, Array, ConvertedRun, described, imu_lines
+
+FOLDER = "01 Logfiles/01 IPIN2023_T3_TrainingTrials (training)/IPIN2023_T3_TrainingTrial"
+WALKS = ("01", "02", "03", "05", "21", "23", "24", "26")
+TRIALS = (
+    *(f"{walk}_{repetition}" for walk in WALKS for repetition in ("01", "04")),
+    "51_02",
+)
+MARGIN_S = 1.0
+LONGEST_S = 152.0
+EQUATOR_M, FLATTENING = 6378137.0, 1.0 / 298.257223563
+"""WGS84."""
+
+
+def convert(archive: Archive) -> Iterator[ConvertedRun]:
+    """The first and the last repetition of eight training walks, and one over the stairs."""
+    for trial in TRIALS:
+        walk, repetition = trial.split("_")
+        text = archive.read(f"{FOLDER}{walk}_repetition{repetition}.txt")
+        yield _run(f"T{walk}_R{repetition}", text)
+
+
+def _run(name: str, text: str) -> ConvertedRun:
+    lines = [line.split(";") for line in text.splitlines()]
+    tables = {
+        kind: np.array([row[1:6] for row in lines if row[0] == kind], np.float64)
+        for kind in ("ACCE", "GYRO", "MAGN", "POSI")
+    }
+    if not all(map(len, tables.values())):
+        raise DataError(f"{name}: no sensors or points: the source has changed")
+    acceleration, points = tables["ACCE"], tables["POSI"]
+    points_s = points[:, 0] + np.median(acceleration[:, 1] - acceleration[:, 0])
+    begin_s = points_s[0] - MARGIN_S
+    end_s = min(begin_s + LONGEST_S, points_s[-1] + MARGIN_S)
+    points, points_s = points[points_s <= end_s], points_s[points_s <= end_s]
+    sensor_s = acceleration[:, 1]
+    rows = acceleration[(sensor_s >= begin_s) & (sensor_s <= end_s)]
+    columns = [rows[:, 2:5]]
+    for kind in ("GYRO", "MAGN"):
+        table = tables[kind]
+        columns += [np.interp(rows[:, 1], table[:, 1], v)[:, None] for v in table[:, 2:5].T]
+    truth = [
+        f"{time - rows[0, 1]:.4f},1,{x:.5g},{y:.5g},"
+        for time, (x, y) in zip(points_s, _plane(points[:, 2:4]), strict=True)
+    ]
+    description = described(
+        f"walk_phone_museum/{name}",
+        "IPIN 2023 track 3 (zenodo 8362205)",
+        'mount = "phone in the hand, screen up"',
+    )
+    imu = imu_lines(rows[:, 1] - rows[0, 1], np.hstack(columns))
+    return ConvertedRun(name, description, imu, truth=truth)
+
+
+def _plane(degrees: Array) -> Array:
+    """Metres east and north of the first of (n, 2) latitudes and longitudes."""
+    eccentricity2 = FLATTENING * (2.0 - FLATTENING)
+    latitude = math.radians(degrees[0, 0])
+    w = 1.0 - eccentricity2 * math.sin(latitude) ** 2
+    across_m = EQUATOR_M / math.sqrt(w)
+    north, east = np.radians(degrees - degrees[0]).T
+    along_m = across_m * (1.0 - eccentricity2) / w
+    return np.column_stack([across_m * math.cos(latitude) * east, along_m * north])

@@ -1,0 +1,174 @@
+"""Heights, episodes and floors from outside: what a vertical filter makes of somebody's way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from climbing import FALL, FAN_ON, Outcome, Part, follow, lift, stairs, stand, walk
+
+from relpos.fusion.estimator import Episode, Vertical
+from relpos.measurements import Range
+
+BESIDE = [walk(200)]
+"""Somebody else, who stays on the level."""
+
+
+def _episodes(told: Sequence[Vertical]) -> list[Episode]:
+    """Return what is told one after another, each once, without the level."""
+    found: list[Episode] = []
+    last = None
+    for one in told:
+        if one.episode not in (last, None, Episode.LEVEL):
+            found.append(one.episode)
+        last = one.episode
+    return found
+
+
+def _error_m(outcome: Outcome, node: int = 1) -> np.ndarray:
+    return np.array([v.z_m for v in outcome.told[node]]) - outcome.z_m[node]
+
+
+@pytest.mark.parametrize("with_steps", [True, False])
+@pytest.mark.parametrize("seed", range(3))
+def test_two_flights_are_found_and_not_taken_for_level_way(seed: int, with_steps: bool) -> None:
+    life = [walk(30), stairs(1.75), Part(2, 1.5, 1.2), stairs(1.75), walk(60)]
+    outcome = follow({1: life, 2: BESIDE}, seed=seed, with_steps=with_steps)
+    assert set(_episodes(outcome.told[1])) == {Episode.UP}
+    assert 0.95 < outcome.claimed_m[1] / outcome.true_m[1] < 1.05
+    assert np.abs(_error_m(outcome)).max() < 0.5
+    assert outcome.told[1][-1].floor == 1
+    assert outcome.told[1][-1].floor_probability > 0.9
+
+
+@pytest.mark.parametrize(("riser_m", "tread_m"), [(0.15, 0.30), (0.175, 0.28), (0.20, 0.25)])
+def test_the_way_on_stairs_is_right_for_usual_treads(riser_m: float, tread_m: float) -> None:
+    life = [stand(10), *[stairs(3.5, riser_m, tread_m)] * 3, stand(20)]
+    outcome = follow({1: life, 2: BESIDE})
+    assert 0.85 < outcome.claimed_m[1] / outcome.true_m[1] < 1.15
+
+
+def test_two_steps_at_a_time_are_stairs_as_well() -> None:
+    outcome = follow({1: [walk(30), Part(7, 1.5, 0.84, 0.5, claims=1.25), walk(60)], 2: BESIDE})
+    assert _episodes(outcome.told[1]) == [Episode.UP]
+    assert abs(_error_m(outcome)[-1]) < 0.5
+
+
+@pytest.mark.parametrize("rise_m", [7.0, -3.5])
+def test_a_lift_is_a_lift_and_moves_its_rider(rise_m: float) -> None:
+    outcome = follow({1: [walk(30), stand(5), lift(rise_m), stand(3), walk(60)], 2: BESIDE})
+    assert _episodes(outcome.told[1]) == [Episode.LIFT]
+    assert outcome.told[1][-1].floor == round(rise_m / 3.5)
+    assert np.abs(_error_m(outcome)).max() < 0.8
+    assert abs(_error_m(outcome)[-1]) < 0.4
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_fan_moves_nobody_to_another_floor(seed: int) -> None:
+    stands, goes = (
+        [walk(30), FAN_ON, stand(60)],
+        [walk(30), Part(10, 1.8, 1.3, 0.0, -0.21), walk(60)],
+    )
+    outcome = follow({1: goes, 2: stands, 3: goes, 4: [walk(40), stand(60)]}, seed=seed)
+    for node in (1, 2, 3, 4):
+        assert {v.floor for v in outcome.told[node]} == {0}
+        assert np.abs(_error_m(outcome, node)).max() < 1.0
+    assert Episode.DISTURBED in _episodes(outcome.told[2])
+
+
+def test_a_fan_that_all_walk_through_moves_nobody() -> None:
+    lives = {n: [walk(30), Part(10, 1.5 + 0.1 * n, 1.3, 0.0, -0.21), walk(60)] for n in range(1, 7)}
+    outcome = follow(lives)
+    for node in range(1, 7):
+        assert {v.floor for v in outcome.told[node]} == {0}
+
+
+def test_a_door_is_no_lift() -> None:
+    shuts, opens = Part(1, pressure_m=0.8), Part(1, pressure_m=-0.8)
+    outcome = follow({1: [stand(30), shuts, stand(30), opens, stand(20)], 2: BESIDE})
+    assert set(_episodes(outcome.told[1])) == {Episode.DISTURBED}
+    assert abs(_error_m(outcome)[-1]) < 0.3
+
+
+def test_a_fall_down_stairs_is_followed_and_told_within_three_seconds() -> None:
+    before = [walk(30), stairs(3.5), walk(20), stairs(-1.75)]
+    outcome = follow({1: [*before, FALL, stand(40)], 2: BESIDE})
+    falls_s = sum(part.seconds for part in before)
+    told = outcome.told[1][falls_s : falls_s + 4]
+    assert Episode.FALLING in {v.episode for v in told}
+    assert np.abs(_error_m(outcome)[falls_s + 3 :]).max() < 0.5
+
+
+def test_weather_is_no_climb() -> None:
+    outcome = follow(
+        {1: [walk(300), stairs(3.5), walk(600)], 2: [walk(900)], 3: [walk(900)]},
+        weather_m_s=0.0023,
+    )
+    assert np.abs(_error_m(outcome)).max() < 0.5
+    assert _episodes(outcome.told[1]) == [Episode.UP]
+    assert outcome.told[1][-1].floor == 1
+
+
+def test_a_group_that_climbs_together_climbs() -> None:
+    lives = {n: [walk(30 + 2 * n), stairs(3.5), walk(60 - 2 * n)] for n in range(1, 6)}
+    outcome = follow(lives)
+    for node in range(1, 6):
+        assert _episodes(outcome.told[node]) == [Episode.UP]
+        assert outcome.told[node][-1].floor == 1
+
+
+def test_a_stop_half_way_up_is_between_floors() -> None:
+    outcome = follow({1: [walk(30), stairs(1.75), stand(15)], 2: BESIDE})
+    at_the_landing = outcome.told[1][sum(p.seconds for p in (walk(30), stairs(1.75))) + 10]
+    assert at_the_landing.floor is None
+
+
+def test_somebody_who_crawls_stays_on_the_floor() -> None:
+    crawl = [walk(30), Part(4, 0.5, 0.2, -0.22), Part(40, 0.5, 0.3), Part(3, rise_m=0.3), walk(30)]
+    outcome = follow({1: crawl, 2: BESIDE})
+    told = outcome.told[1]
+    assert {v.floor for v in told} <= {0, None}
+    assert sum(v.floor is None for v in told) < 8
+
+
+def test_who_joins_late_is_anywhere() -> None:
+    outcome = follow({1: BESIDE, 2: BESIDE}, begins_s={2: 100.0})
+    assert outcome.told[2][-1].sigma_z_m > 3.0
+    assert outcome.told[2][-1].floor_probability < 0.5
+    assert outcome.told[1][-1].sigma_z_m < 0.5
+
+
+def test_a_short_range_tells_the_floor_of_who_joined_late() -> None:
+    outcome = follow({1: [walk(30), stairs(3.5), walk(100)], 2: BESIDE}, begins_s={2: 100.0})
+    vertical = outcome.filter
+    vertical.ranged(Range(200.0, 1, 2, 1.2))
+    assert vertical.of(2, 200.0).sigma_z_m < 1.0
+    assert abs(vertical.of(2, 200.0).z_m - vertical.of(1, 200.0).z_m) < 0.5
+    assert vertical.of(1, 200.0).sigma_z_m < 0.5
+
+
+def test_the_variance_says_that_a_sensor_died() -> None:
+    outcome = follow({1: BESIDE, 2: BESIDE}, silent={2: (40.0, 500.0)})
+    sigma = [v.sigma_z_m for v in outcome.told[2]]
+    assert sigma[38] < 0.3
+    assert sigma[100] > 1.0
+
+
+@pytest.mark.filterwarnings("error")
+def test_nobody_reporting_for_a_while_is_no_error() -> None:
+    gap = (20.0, 40.0)
+    outcome = follow({1: [walk(60)], 2: [walk(60)]}, silent={1: gap, 2: gap})
+    assert abs(_error_m(outcome)[-1]) < 0.5
+
+
+def test_what_was_climbed_without_pressure_is_known_once_it_is_back() -> None:
+    outcome = follow({1: BESIDE, 2: [walk(30), stairs(3.5), walk(60)]}, silent={2: (25.0, 60.0)})
+    assert abs(_error_m(outcome, 2)[-1]) < 0.7
+    assert outcome.told[2][-1].floor == 1
+
+
+def test_before_any_height_there_is_nothing() -> None:
+    outcome = follow({1: BESIDE, 2: BESIDE}, begins_s={1: 1e9, 2: 1e9})
+    assert outcome.told[1][-1] == Vertical()
+    assert not outcome.filter.active

@@ -1,0 +1,64 @@
+"""axe-core finds nothing serious on the pages, in both themes and with every dialog open."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+from stage import Stage
+from test_languages import troubled
+
+axe_package = pytest.importorskip("axe_playwright_python")
+AXE = (Path(axe_package.__file__).parent / "axe.min.js").read_text("utf-8")
+SERIOUS = ("serious", "critical")
+
+
+def findings(page: Page) -> list[str]:
+    """What axe-core calls serious or critical: rule, and where."""
+    page.evaluate(AXE)
+    found = page.evaluate("axe.run(document, { resultTypes: ['violations'] })")
+    return [
+        f"{violation['id']}: {node['target']} {node['failureSummary']}"
+        for violation in found["violations"]
+        if violation["impact"] in SERIOUS
+        for node in violation["nodes"][:3]
+    ]
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_the_team_page_has_no_serious_finding(visit: Any, theatre: Stage, theme: Any) -> None:
+    theatre.reset(troubled())
+    page = visit(viewport={"width": 1366, "height": 768}, color_scheme=theme, expect_gone=True)
+    expect(page.locator("#alarms .alarm").first).to_be_visible()
+    page.locator(".person .name").first.click()
+    found = findings(page)
+    for opener, dialog in (("show-log", "log"), ("help", "help"), ("phones", "phones")):
+        page.locator(f"#{opener}").click()
+        found += findings(page)
+        page.locator(f"#{dialog}-dialog form button").last.click()
+    page.locator("#show-board").click()
+    expect(page.locator("#board-rows tr")).to_have_count(6)
+    assert [*found, *findings(page)] == []
+
+
+def test_a_button_without_a_name_would_be_found(visit: Any, stage: Stage) -> None:
+    page = visit()
+    page.locator("#help").evaluate("button => button.textContent = ''")
+    assert any(finding.startswith("button-name") for finding in findings(page))
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_the_phone_page_has_no_serious_finding(visit: Any, theatre: Stage, theme: Any) -> None:
+    theatre.reset(troubled())
+    page = visit("/phone", viewport={"width": 390, "height": 844}, color_scheme=theme)
+    page.locator("[data-wearer='2']").click()
+    found = findings(page)
+    page.locator("#name-form button").click()
+    expect(page.locator("#press")).to_be_visible()
+    found += findings(page)
+    page.locator("nav button[data-page='team']").click()
+    found += findings(page)
+    page.locator(".other button").first.click()
+    assert [*found, *findings(page)] == []
