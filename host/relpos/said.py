@@ -33,6 +33,11 @@ class Said(str):
         return Said(self.key, self.template, **{**self.values, **values})
 
 
+def refusal(text: str) -> dict[str, Any]:
+    """Return the answer to a request that is refused, for a page to translate."""
+    return {"error": str(text), "said": said_of(text)}
+
+
 def said_of(text: str) -> dict[str, Any] | None:
     """Return the key and the values of a text for a page; None where it has none."""
     return {"key": text.key, "values": text.values} if isinstance(text, Said) else None

@@ -34,11 +34,12 @@ def output_of(process: subprocess.Popen[str], pattern: str) -> str:
 class Field:
     """An emulated team of its own process, and a mission over it that can be killed."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, started: bool = True) -> None:
         self.folder = folder
         self.team = self.run("emulate", "--nodes", "3")
         self.port = output_of(self.team, "/dev/\\S+")
-        self.address = self.start(self.port, "--name", "Old mill", "--initial", "common")
+        if started:
+            self.address = self.start(self.port, "--name", "Old mill", "--initial", "common")
 
     def run(self, *arguments: str) -> subprocess.Popen[str]:
         command = [*RELPOS, *arguments]

@@ -13,6 +13,7 @@ from relpos.cli.estimators import BANK
 
 if TYPE_CHECKING:
     from relpos.emulator.team import TeamConfig
+    from relpos.live.session import Outcome
 
 
 class Board(StrEnum):
@@ -87,7 +88,7 @@ def demo(
             sinks=[live.terminal_sink(None)] if terminal else [],
             screen=terminal,
         )
-        _fuse_emulated(config, job, options, as_json=json)
+        fuse_emulated(config, job, options, as_json=json)
         return
     from relpos.emulator.serving import record_team
 
@@ -97,9 +98,9 @@ def demo(
     fuse.fuse_recording(job, run, as_json=json, report=fuse.can_report())
 
 
-def _fuse_emulated(
+def fuse_emulated(
     config: TeamConfig, job: fuse.Job, options: live.Options, *, as_json: bool
-) -> None:
+) -> Outcome:
     """Emulate a team in real time and fuse what its port sends, as from a real one."""
     from relpos.emulator.process import EmulatorProcess
     from relpos.runs import Description
@@ -108,7 +109,7 @@ def _fuse_emulated(
         emulator = EmulatorProcess(config)
     with emulator:
         job.prepare(emulator.priors)
-        fuse.fuse_live(
+        return fuse.fuse_live(
             job,
             live.open_port(emulator.port, None, teach=True, reopen=False),
             options,

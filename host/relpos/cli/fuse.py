@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from relpos.fusion.estimator import Estimate, Estimator
     from relpos.live.assembly import MakeSink
     from relpos.live.inputs import Input
+    from relpos.live.session import Outcome
     from relpos.measurements import Measurement, Prior
     from relpos.runs import Description, NodeInfo, Run
 
@@ -159,9 +160,9 @@ def fuse(
     elif sources.is_recording(source):
         sources_of = {name: context.get_parameter_source(name) for name in context.params}
         given = {name for name, how in sources_of.items() if how and how.name != "DEFAULT"}
-        _fuse_mcap(job, given, initial, options, key_file, as_json=json, report=report)
+        fuse_mcap(job, given, initial, options, key_file, as_json=json, report=report)
     elif options.shown:
-        _replay_run(job, initial, options, as_json=json)
+        replay_run(job, initial, options, as_json=json)
     else:
         _fuse_run(job, initial, as_json=json, report=_is_wanted(report, as_json=json))
 
@@ -220,7 +221,9 @@ def _fuse_run(job: Job, initial: Initial | None, *, as_json: bool, report: bool)
     fuse_recording(job, api.load(job.source), initial, as_json=as_json, report=report)
 
 
-def _replay_run(job: Job, initial: Initial | None, options: live.Options, *, as_json: bool) -> None:
+def replay_run(
+    job: Job, initial: Initial | None, options: live.Options, *, as_json: bool
+) -> Outcome:
     """Show a run directory as if it happened now."""
     from relpos import api
     from relpos.live.inputs import PacedInput, run_items
@@ -229,7 +232,7 @@ def _replay_run(job: Job, initial: Initial | None, options: live.Options, *, as_
     run.check_usable(needs_ranges=job.estimator != DEADRECKONING)
     priors = api.priors_of(run, initial)
     job.prepare(priors)
-    fuse_live(
+    return fuse_live(
         job,
         PacedInput(job.source, run_items(run), speed=options.pace),
         options,
@@ -239,7 +242,7 @@ def _replay_run(job: Job, initial: Initial | None, options: live.Options, *, as_
     )
 
 
-def _fuse_mcap(
+def fuse_mcap(
     job: Job,
     given: Set[str],
     initial: Initial | None,
@@ -248,7 +251,7 @@ def _fuse_mcap(
     *,
     as_json: bool,
     report: bool | None,
-) -> None:
+) -> Outcome | None:
     """Repeat a recorded session; the command line replaces its settings."""
     from relpos import api
     from relpos.live.fusion_thread import common_start
@@ -296,8 +299,9 @@ def _fuse_mcap(
             link=again.link,
             recorded_unix_s=None if began_ns is None else began_ns * 1e-9,
         )
-        fuse_live(job, source, options, description=run.description, priors=priors, as_json=as_json)
-        return
+        return fuse_live(
+            job, source, options, description=run.description, priors=priors, as_json=as_json
+        )
     counted = {name: round(count) for name, count in replay.counters().items()}
     fuse_recording(
         job,
@@ -307,6 +311,7 @@ def _fuse_mcap(
         as_json=as_json,
         report=_is_wanted(report, as_json=as_json),
     )
+    return None
 
 
 def _is_wanted(report: bool | None, *, as_json: bool) -> bool:
@@ -422,7 +427,7 @@ def fuse_live(
     common: bool = False,
     as_json: bool,
     emulated: Callable[[], bool] | None = None,
-) -> None:
+) -> Outcome:
     """Fuse measurements of ``source`` as they arrive; write, show and print the result.
 
     ``emulated`` returns whether the walk of an emulated team is over, which ends its port.
@@ -464,6 +469,7 @@ def fuse_live(
     wanted = options.view and options.debrief and not as_json
     if wanted and source.is_now and session.estimates and can_report():
         _debrief(job, options)
+    return session
 
 
 def _debrief(job: Job, options: live.Options) -> None:

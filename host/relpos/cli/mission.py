@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -12,14 +13,18 @@ import typer
 
 from relpos.cli import live, output
 from relpos.cli.estimators import BANK, EstimatorName
-from relpos.cli.fuse import Initial, Job, fuse_live
+from relpos.cli.fuse import Initial, Job, fuse_live, fuse_mcap, replay_run
 from relpos.cli.keys import KeyFile, make_link
 
 if TYPE_CHECKING:
     from relpos.link.port import Link
     from relpos.live.inputs import Received
     from relpos.live.mission import Mission, Resumed
+    from relpos.live.session import Outcome
     from relpos.recording.reader import Recording
+
+DEMO_NODES = 6
+DEMO_S = 1800.0
 
 
 def mission(
@@ -27,7 +32,8 @@ def mission(
     source: Annotated[
         str | None,
         typer.Argument(
-            metavar="SOURCE", help="Serial port or pyserial URL. (default: the one before)"
+            metavar="SOURCE",
+            help="Serial port or pyserial URL. (default: the one before, else chosen on the page)",
         ),
     ] = None,
     name: Annotated[str | None, typer.Option(help="The mission's name.")] = None,
@@ -53,18 +59,21 @@ def mission(
     Everything is in the folder: recordings, names, board, alarms and who has acknowledged them,
     the log, devices. After a crash, a power cut or Ctrl-C the same command goes on: with the same
     map, on the same address, and for the devices that were let in. The page's address lets in one
-    device within five minutes; --invite prints another while the mission runs.
+    device within five minutes; --invite prints another while the mission runs. Without a SOURCE
+    the commander chooses one on the page (port, recording, run directory, demo), starts and ends.
     """
     from relpos.link.port import check_port
-    from relpos.live.mission import Mission
+    from relpos.live.mission import ABOUT, Mission
     from relpos.view.access import DEFAULT_PORT, free_port, parse_listen
 
     if invite is not None:
         _print_invitation(Mission.open(folder), invite, view_listen)
         return
-    found = Mission.open(folder, source, name)
+    known = (folder / ABOUT).exists()
+    found = Mission.open(folder, source if known else source or "", name)
     with found.lock():
-        check_port(found.about.source)
+        if found.about.source:
+            check_port(found.about.source)
         host, port = parse_listen(view_listen or "0.0.0.0")
         if found.about.port is not None and ":" not in (view_listen or "").strip("[]"):
             port = found.about.port
@@ -73,7 +82,72 @@ def mission(
         found.about.port = port
         listen = f"{host}:{port}" if ":" not in host else f"[{host}]:{port}"
         options = live.Options(True, listen, https, open_browser, seconds)
-        _run(found, options, estimator, key_file, common=initial is Initial.COMMON)
+        if found.about.source:
+            _run(found, options, estimator, key_file, common=initial is Initial.COMMON)
+        else:
+            _run_chosen(found, options, estimator, key_file)
+
+
+def _run_chosen(
+    found: Mission, options: live.Options, estimator: str, key_file: Path | None
+) -> None:
+    """Run sessions that are started and ended on the page, until Ctrl-C or the options' end."""
+    from relpos.cli.waiting import choose
+    from relpos.errors import RelposError
+
+    Job("", estimator, {}, 0, found.path).prepare()
+    end_s = math.inf if options.seconds is None else time.monotonic() + options.seconds
+    trouble = ""
+    while (left_s := end_s - time.monotonic()) > 0.0:
+        choice = choose(found, options, trouble, left_s)
+        if choice is None:
+            return
+        found.about.name = choice.name
+        left_s = end_s - time.monotonic()
+        options = replace(
+            options, open_browser=False, seconds=None if math.isinf(left_s) else max(left_s, 0.0)
+        )
+        outcome: Outcome | None
+        try:
+            if choice.is_port:
+                found.about.source = choice.source
+                outcome = _run(found, options, estimator, key_file, common=choice.common)
+            else:
+                outcome = _exercise(found, choice.source, options, estimator, key_file)
+        except RelposError as error:
+            trouble = str(error)
+            output.remark(trouble)
+            continue
+        trouble = ""
+        if outcome is None or not outcome.ended_on_page:
+            return
+
+
+def _exercise(
+    found: Mission, source: str, options: live.Options, estimator: str, key_file: Path | None
+) -> Outcome | None:
+    """Show a demo, a recording or a run; nothing of it enters the mission but its devices."""
+    from relpos import sources
+    from relpos.cli import demo
+    from relpos.cli.waiting import DEMO
+    from relpos.emulator.team import TeamConfig
+    from relpos.live.assembly import MissionPlan
+    from relpos.live.mission import Resumed
+
+    exercise = found.exercise(source)
+    devices = [event for event in found.events() if event["kind"] == "device"]
+    options = replace(
+        options,
+        debrief=False,
+        mission=MissionPlan(exercise, Resumed(devices)),
+    )
+    job = Job(source, estimator, {}, 0, exercise.path / "session-1")
+    if source == DEMO:
+        team = TeamConfig("paper", DEMO_NODES, DEMO_S, 0, str(demo.Board.NATIVE), ())
+        return demo.fuse_emulated(team, job, options, as_json=False)
+    if sources.is_recording(source):
+        return fuse_mcap(job, set(), None, options, key_file, as_json=False, report=False)
+    return replay_run(job, None, options, as_json=False)
 
 
 def _run(
@@ -83,7 +157,7 @@ def _run(
     key_file: Path | None,
     *,
     common: bool,
-) -> None:
+) -> Outcome:
     """Run one session of the mission."""
     from relpos.live.assembly import MissionPlan
     from relpos.live.clock import SessionClock
@@ -114,7 +188,7 @@ def _run(
         options, record=found.recording(about.sessions), mission=MissionPlan(found, resumed)
     )
     options.check()
-    fuse_live(
+    outcome = fuse_live(
         job,
         port,
         options,
@@ -126,6 +200,7 @@ def _run(
     about.ended_unix_s = time.time()
     found.save()
     output.remark(f"to see it once more: relpos replay {found.path}")
+    return outcome
 
 
 def _earlier(

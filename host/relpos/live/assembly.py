@@ -78,6 +78,7 @@ def run_session(
         plan.emulated,
         replay=not source.is_now,
         recorded_unix_s=source.recorded_unix_s,
+        mission=plan.mission is not None,
     )
     fusion = FusionThread(plan.make_estimator, plan.priors, common=plan.common)
     files = FileSink(plan.out, plan.description, keep_received=source.is_now)

@@ -118,13 +118,17 @@ class Mission:
         return [file for file in files if file.exists()]
 
     def events(self) -> Iterator[dict[str, Any]]:
-        """Yield the journal's events; a last line that a power cut left half is left out."""
-        with contextlib.suppress(FileNotFoundError), (self.path / JOURNAL).open("rb") as lines:
-            for line in lines:
-                with contextlib.suppress(ValueError):
-                    event = json.loads(line)
-                    if isinstance(event, dict) and "kind" in event:
-                        yield event
+        """Yield the journal's events, and the devices of its exercises."""
+        yield from _events(self.path / JOURNAL)
+        for folder in sorted(self.path.glob("exercise-*")):
+            yield from (event for event in _events(folder / JOURNAL) if event["kind"] == "device")
+
+    def exercise(self, source: str) -> Mission:
+        """Begin an exercise: a mission of its own in a folder below, with the same devices."""
+        number = 1 + len(list(self.path.glob("exercise-*")))
+        path = self.path / f"exercise-{number}"
+        path.mkdir()
+        return Mission(path, About(self.about.name, source, time.time(), sessions=1), self.key)
 
     def resume(self) -> Resumed:
         """Return what the sessions so far have left behind."""
@@ -324,6 +328,16 @@ def read_again(
         observations: Sequence[Any] = (entered,) if data is None else feed(data, arrival_s)
         known = tuple(o for o in observations if o.time_s > since_s)
         yield Received(arrival_s, b"", known, again=True)
+
+
+def _events(journal: Path) -> Iterator[dict[str, Any]]:
+    """Yield a journal's events; a last line that a power cut left half is left out."""
+    with contextlib.suppress(FileNotFoundError), journal.open("rb") as lines:
+        for line in lines:
+            with contextlib.suppress(ValueError):
+                event = json.loads(line)
+                if isinstance(event, dict) and "kind" in event:
+                    yield event
 
 
 def _ends_line(path: Path) -> bool:

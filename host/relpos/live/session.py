@@ -31,7 +31,7 @@ from relpos.live.requests import Request, RequestHandler, RequestSource
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert, Level, LogEntry
 from relpos.measurements import Event, Heading, Observation
-from relpos.said import Said, said_of
+from relpos.said import Said, refusal, said_of
 
 VIEW_S = 0.05
 """At most twenty views a second: smooth for a walking person, and a twentieth of a second old."""
@@ -70,6 +70,7 @@ class Outcome:
     last: Estimate | None = None
     received: int = 0
     failure: Exception | None = None
+    ended_on_page: bool = False
     counters: dict[str, float] = field(default_factory=dict)
 
 
@@ -434,8 +435,10 @@ class LiveSession:
         if request.kind == "end":
             by = str(body.get("by", ""))
             self.post("ended", Level.WARNING, Said("ended", "the session was ended by {by}", by=by))
-            self._ending = True
+            self._ending = self.outcome.ended_on_page = True
             return {"done": True}, 200
+        if request.kind in ("sources", "start"):
+            return refusal(Said("running", "a session runs already: end it first")), 409
         if not self._source.is_now:
             return {"error": "this is a recording: it takes no presses or headings"}, 409
         handle = self._handler.presses if request.kind == "presses" else self._handler.headings

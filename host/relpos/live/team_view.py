@@ -234,6 +234,10 @@ class Hello:
     recorded_unix_s: float | None = None
     live_port: int | None = None
     """Where the mission's page is while its recording is played."""
+    mission: bool = False
+    """Whether it is of a mission, which goes on after its end."""
+    waiting: bool = False
+    """Whether no session runs yet: a commander chooses its source on the page."""
     limits: Mapping[str, float] = field(
         default_factory=lambda: {
             "still_warning_s": STILL_WARNING_S,

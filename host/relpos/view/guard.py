@@ -32,7 +32,9 @@ class Session(Protocol):
         """Hand a request on; None where no answer comes in time."""
 
 
-COMMANDS = ("/api/invite", "/api/devices", "/api/revoke", "/api/end")
+COMMANDS = (
+    "/api/invite", "/api/devices", "/api/revoke", "/api/end", "/api/sources", "/api/start",
+)  # fmt: skip
 MISSION_COOKIE_S = 30 * 24 * 3600
 COOKIE_S = 24 * 3600
 """A mission; each session has its own token."""

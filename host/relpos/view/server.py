@@ -12,7 +12,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import math
 import signal
 import socket
 import tempfile
@@ -40,6 +39,18 @@ from relpos.live.board import BOARD_EVENTS
 from relpos.live.team_view import to_json
 from relpos.live.tracks import Tracks
 from relpos.view.access import Access, Allowance, qr_svg
+from relpos.view.bodies import (
+    BadRequestError,
+    by_of,
+    clocks_of,
+    items_of,
+    node_of,
+    number_of,
+    read_body,
+    read_received,
+    sigma_of,
+    text_of,
+)
 from relpos.view.devices import Device, Role
 from relpos.view.guard import TokenMiddleware, role_of
 from relpos.view.plans import MAX_IMAGE_BYTES, PlanImages
@@ -49,9 +60,6 @@ PING_S = 2.0
 ANSWER_S = 5.0
 """Timeout of the session's answer to a request; then the phone gets an error and asks again."""
 MAX_LINE_BYTES = 1 << 26
-MAX_BODY_BYTES = 1 << 20
-MAX_ITEMS = 2000
-"""Presses, or headings, of one request."""
 ALLOWED = {
     "presses": (20.0, 4000.0),
     "headings": (50.0, 4000.0),
@@ -61,6 +69,8 @@ ALLOWED = {
     "replay": (30.0, 300.0),
     "device": (2.0, 50.0),
     "end": (0.2, 5.0),
+    "sources": (2.0, 20.0),
+    "start": (0.5, 5.0),
     **dict.fromkeys(BOARD_EVENTS, (5.0, 100.0)),
 }
 """Items that a visitor may send, per second and at once: a phone sends what it gathered offline."""
@@ -165,10 +175,6 @@ class SessionProxy:
             self._answers.pop(number, None)
 
 
-class BadRequestError(Exception):
-    """A request that makes no sense, in words."""
-
-
 class Pages:
     """What is served, of one session."""
 
@@ -195,6 +201,8 @@ class Pages:
             Route("/api/image/{name}", self.image),
             Route("/api/replay", self.replay, methods=["POST"]),
             Route("/api/end", self.end, methods=["POST"]),
+            Route("/api/sources", self.sources),
+            Route("/api/start", self.start, methods=["POST"]),
             Route("/api/invite", self.invite),
             Route("/api/devices", self.devices),
             Route("/api/revoke", self.revoke, methods=["POST"]),
@@ -291,8 +299,8 @@ class Pages:
 
     async def revoke(self, request: Request) -> Response:
         """Shut a device out, for good."""
-        body = await _body(request)
-        device = _text(body, "id", 40)
+        body = await read_body(request)
+        device = text_of(body, "id", 40)
         if device not in self.session.devices:
             raise BadRequestError("id: no device of this mission")
         return await self._ask(request, "device", {"id": device, "revoked": True})
@@ -328,47 +336,47 @@ class Pages:
 
     async def name(self, request: Request) -> Response:
         """Call a node by its wearer's name."""
-        body = await _body(request)
+        body = await read_body(request)
         name = body.get("name")
         if isinstance(name, str):
             # White space of any kind becomes one space; other characters have to be printable.
             body["name"] = " ".join(name.split())
         return await self._ask(
-            request, "name", {"node": _node(body), "name": _text(body, "name", 40)}
+            request, "name", {"node": node_of(body), "name": text_of(body, "name", 40)}
         )
 
     async def presses(self, request: Request) -> Response:
         """Landmark presses of a phone; those accepted need not be sent again."""
-        body = await _body(request)
+        body = await read_body(request)
         presses = [
             {
-                "id": _text(press, "id", 64),
-                "landmark": _text(press, "landmark", 64),
-                "unix_ms": _number(press, "unix_ms"),
+                "id": text_of(press, "id", 64),
+                "landmark": text_of(press, "landmark", 64),
+                "unix_ms": number_of(press, "unix_ms"),
             }
-            for press in _items(body, "presses")
+            for press in items_of(body, "presses")
         ]
-        asked = {**_clocks(body), "presses": presses}
+        asked = {**clocks_of(body), "presses": presses}
         return await self._ask(request, "presses", asked, len(presses))
 
     async def headings(self, request: Request) -> Response:
         """Compass headings of a phone, already in the common convention (counter-clockwise)."""
-        body = await _body(request)
+        body = await read_body(request)
         headings = [
             {
-                "unix_ms": _number(row, "unix_ms"),
-                "heading_rad": _number(row, "heading_rad"),
-                "sigma_rad": _sigma(row),
+                "unix_ms": number_of(row, "unix_ms"),
+                "heading_rad": number_of(row, "heading_rad"),
+                "sigma_rad": sigma_of(row),
             }
-            for row in _items(body, "headings")
+            for row in items_of(body, "headings")
         ]
-        asked = {**_clocks(body), "headings": headings}
+        asked = {**clocks_of(body), "headings": headings}
         return await self._ask(request, "headings", asked, len(headings))
 
     async def acknowledge(self, request: Request) -> Response:
         """Silence somebody's alarm until its reason has gone."""
-        body = await _body(request)
-        return await self._ask(request, "acknowledge", {"node": _node(body), "by": _by(body)})
+        body = await read_body(request)
+        return await self._ask(request, "acknowledge", {"node": node_of(body), "by": by_of(body)})
 
     async def change_board(self, request: Request) -> Response:
         """Change the board: an entry, a roll call, a MAYDAY, an evacuation.
@@ -376,7 +384,7 @@ class Pages:
         A wearer's phone may answer a roll call and an evacuation, and call MAYDAY.
         """
         kind = request.url.path.rpartition("/")[2]
-        body = await _body(request)
+        body = await read_body(request)
         answers = ("answer", "delivered", "acknowledged")
         own = (kind == "mayday" and body.get("on") is True) or (
             kind in ("rollcall", "evacuate") and body.get("action") in answers
@@ -385,8 +393,8 @@ class Pages:
         if not own and not role_of(request).allows(Role.COMMAND):
             return JSONResponse({"error": "only a commander may do that"}, 403)
         if "node" in body:
-            body["node"] = _node(body)
-        return await self._ask(request, kind, {**body, "by": _by(body)})
+            body["node"] = node_of(body)
+        return await self._ask(request, kind, {**body, "by": by_of(body)})
 
     async def add_plan(self, request: Request) -> Response:
         """Keep an image, and lay it under the map."""
@@ -395,7 +403,7 @@ class Pages:
         if not self._allowances["plan"].take("everybody", 1):
             return JSONResponse({"error": "too many at once; try again in a minute"}, 429)
         too_much = f"an image of more than {MAX_IMAGE_BYTES >> 20} MB"
-        data = await _received(request, MAX_IMAGE_BYTES, too_much)
+        data = await read_received(request, MAX_IMAGE_BYTES, too_much)
         try:
             name = self._plans.keep(data)
         except (OSError, ValueError) as error:
@@ -411,23 +419,33 @@ class Pages:
 
     async def replay(self, request: Request) -> Response:
         """Move a recording that is played: a moment, a speed, play or pause, the next event."""
-        body = await _body(request)
+        body = await read_body(request)
         asked: dict[str, Any] = {}
-        asked |= {name: _number(body, name) for name in ("at_s", "speed", "step") if name in body}
+        asked |= {name: number_of(body, name) for name in ("at_s", "speed", "step") if name in body}
         if "playing" in body:
             asked["playing"] = float(body["playing"] is True)
         return await self._ask(request, "replay", asked)
 
     async def shelve(self, request: Request) -> Response:
         """Silence all alarms of a person for a while."""
-        body = await _body(request)
-        asked = {"node": _node(body), "by": _by(body), "seconds": _number(body, "seconds")}
+        body = await read_body(request)
+        asked = {"node": node_of(body), "by": by_of(body), "seconds": number_of(body, "seconds")}
         return await self._ask(request, "shelve", asked)
 
     async def end(self, request: Request) -> Response:
         """End the session; a mission goes on with the next one."""
-        body = await _body(request)
-        return await self._ask(request, "end", {"by": _by(body)})
+        body = await read_body(request)
+        return await self._ask(request, "end", {"by": by_of(body)})
+
+    async def sources(self, request: Request) -> Response:
+        """What a session can be started with."""
+        return await self._ask(request, "sources", {})
+
+    async def start(self, request: Request) -> Response:
+        """Start a session with a source."""
+        body = await read_body(request)
+        asked = {"source": text_of(body, "source", 400), "name": text_of(body, "name", 60)}
+        return await self._ask(request, "start", {**asked, "common": body.get("common") is True})
 
     async def _ask(
         self, request: Request, kind: str, body: Mapping[str, Any], items: int = 1
@@ -449,84 +467,6 @@ async def _until_gone(socket: WebSocket) -> None:
 
 async def _refuse(_: Request, error: Exception) -> Response:
     return JSONResponse({"error": str(error)}, 400)
-
-
-async def _received(request: Request, limit: int, too_much: str) -> bytes:
-    """Return what a request brings; BadRequestError as soon as it is more than ``limit`` bytes."""
-    data = b""
-    async for part in request.stream():
-        data += part
-        if len(data) > limit:
-            raise BadRequestError(too_much)
-    return data
-
-
-async def _body(request: Request) -> dict[str, Any]:
-    data = await _received(request, MAX_BODY_BYTES, f"more than {MAX_BODY_BYTES} bytes")
-    try:
-        body = json.loads(data)
-    except (ValueError, RecursionError):  # The latter by lists within lists.
-        raise BadRequestError("not JSON") from None
-    if not isinstance(body, dict):
-        raise BadRequestError("not a JSON object")
-    return body
-
-
-def _node(body: Mapping[str, Any]) -> int:
-    node = body.get("node")
-    if not isinstance(node, int) or isinstance(node, bool) or not 0 < node < 255:
-        raise BadRequestError("node: not a number from 1 to 254")
-    return node
-
-
-def _by(body: Mapping[str, Any]) -> str:
-    """Who asks, as the page says; empty where it does not."""
-    return "" if body.get("by") in (None, "") else _text(body, "by", 40)
-
-
-def _number(row: Mapping[str, Any], name: str) -> float:
-    value = row.get(name)
-    try:
-        number = math.nan if isinstance(value, bool | str) else float(value)  # type: ignore[arg-type]
-    except (TypeError, OverflowError):
-        number = math.nan
-    if not math.isfinite(number):
-        raise BadRequestError(f"{name}: not a number")
-    return number
-
-
-def _sigma(row: Mapping[str, Any]) -> float | None:
-    if row.get("sigma_rad") is None:
-        return None
-    sigma_rad = _number(row, "sigma_rad")
-    if sigma_rad <= 0.0:
-        raise BadRequestError("sigma_rad: not above 0")
-    return sigma_rad
-
-
-def _text(row: Mapping[str, Any], name: str, most: int) -> str:
-    value = row.get(name)
-    if not isinstance(value, str) or not 0 < len(value) <= most or not value.isprintable():
-        raise BadRequestError(f"{name}: not 1 to {most} printable characters")
-    return value
-
-
-def _items(body: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
-    items = body.get(name)
-    if not isinstance(items, list) or not all(isinstance(item, dict) for item in items):
-        raise BadRequestError(f"{name}: not a list of objects")
-    if len(items) > MAX_ITEMS:
-        raise BadRequestError(f"{name}: more than {MAX_ITEMS} at once")
-    return items
-
-
-def _clocks(body: Mapping[str, Any]) -> dict[str, Any]:
-    sent = None if body.get("sent_unix_ms") is None else _number(body, "sent_unix_ms")
-    return {
-        "node": _node(body),
-        "clock_offset_ms": _number(body, "clock_offset_ms"),
-        "sent_unix_ms": sent,
-    }
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 // Small helpers around the document.
 
-import { fill, t } from "./i18n.js";
+import { fill, said, t } from "./i18n.js";
 
 export { storage } from "./storage.js";
 
@@ -105,7 +105,7 @@ export async function postJson(address, body) {
   });
   if (!answer.ok) {
     const reply = await answer.json().catch(() => null);
-    throw new Error(reply?.error ?? t("server.answered", { status: answer.status }));
+    throw new Error(said(reply?.said, reply?.error) ?? t("server.answered", { status: answer.status }));
   }
   return answer.json();
 }

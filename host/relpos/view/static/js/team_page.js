@@ -16,6 +16,7 @@ import { LogView, showUnseen } from "./log_view.js";
 import { TeamMap } from "./map.js";
 import { alternativeWords, PeopleList, updateTable } from "./people.js";
 import { Siren } from "./sound.js";
+import { SourceView } from "./source_view.js";
 import { connectionWords, dataAgeS, replayWords, showConnection } from "./status_line.js";
 import { Team } from "./team.js";
 import { isDark, themeSwitch } from "./theme_switch.js";
@@ -64,6 +65,7 @@ const timeline = new Timeline((text) => {
   trouble = { level: "warning", text };
   refresh(true);
 });
+const source = new SourceView();
 const connection = new Connection({ onMessage: handle, onState: () => refresh(true) });
 
 // -- messages --------------------------------------------------------------------------------------
@@ -78,7 +80,13 @@ function handle(message) {
     setText(byId("session"), team.session.emulated ? t("session.emulated", { name: team.session.name }) : team.session.name);
     document.title = t(team.replayed ? "title.replay" : "title.live", { name: team.session.name ?? "" });
     setAttribute(document.documentElement, "data-replay", team.replayed ? "true" : null);
-    byId("end").hidden = team.replayed;
+    byId("end").hidden = team.replayed && !team.session.mission;
+    source.show(Boolean(team.session.waiting));
+    setAttribute(document.documentElement, "data-waiting", team.session.waiting ? "true" : null);
+    if (team.session.waiting) {
+      link.update(0, null);
+      document.querySelectorAll("dialog[open]").forEach((dialog) => dialog.close());
+    }
     showWayToLive(team.session.live_port);
     map.readTheme();
     showLegend();
@@ -214,7 +222,8 @@ function age() {
 }
 
 function showAge() {
-  const status = team.replayed ? replayWords(connection.state, team.session, team.timeS)
+  const idle = team.session?.waiting && connection.state === "live";
+  const status = idle ? { state: "connecting", words: t("source.title"), age: "" } : team.replayed ? replayWords(connection.state, team.session, team.timeS)
     : connectionWords(connection.state, age(), connection.retryS);
   showConnection(
     { line: byId("connection"), words: byId("connection-words"), age: byId("age"), retry: byId("retry") },
