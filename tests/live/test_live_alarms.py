@@ -5,8 +5,10 @@ import math
 import pytest
 
 from relpos.live.alarms import LOST_S, Alarms, moved
+from relpos.live.composer import Composer
 from relpos.live.team_view import Alert
 from relpos.measurements import Motion
+from relpos.simulation.building import simulate_building
 
 
 def still(time_s, node=1):
@@ -166,3 +168,26 @@ def test_motion_without_the_nodes_flag_is_decided_by_displacement():
     assert moved(Motion(1.0, 1, 0.0, 0.0, math.radians(30.0)))
     assert not moved(Motion(1.0, 1, 0.01, 0.0, 0.0, 0.3, 0.3, 0.1))
     assert not moved(still(1.0), 60.0)
+
+
+def test_a_fall_down_stairs_sounds_within_three_seconds_until_somebody_walks_again():
+    run = simulate_building("building-fall", 205, {"seconds": 120.0, "fall_s": 10.0})
+    falls_s = next(e.time_s for e in run.events if e.value == "falling")
+    ends_s = next(e.time_s for e in run.events if e.value == "lying")
+    composer = Composer()
+    raised = {}
+    for m in run.measurements:
+        if m.time_s > ends_s + 20.0:
+            break
+        composer.add_observations(m.time_s, [m], None)
+        composer.alarms.tick(m.time_s, listening=True)
+        for node, _, alert in composer.alarms.changes:
+            raised.setdefault((node, alert), m.time_s)
+        composer.alarms.changes.clear()
+    assert list(raised) == [(2, Alert.FALL)]
+    assert falls_s < raised[2, Alert.FALL] <= ends_s + 3.0
+    for k in range(1, 4):
+        assert composer.alarms.condition(2).alert is Alert.FALL
+        composer.add_observations(ends_s + 20.0 + k, [walk(ends_s + 20.0 + k, node=2)], None)
+        composer.alarms.tick(ends_s + 20.0 + k, listening=True)
+    assert composer.alarms.condition(2).alert is None

@@ -1,10 +1,13 @@
-"""Alerts for wearers who lie still or whose node is silent.
+"""Alerts for wearers who lie still, who fall, or whose node is silent.
 
 *Still*, as in PASS devices (NFPA 1982): a warning after 20 s without motion, an alarm after 30 s.
 Turning, bending or shuffling counts as motion: the node's dead reckoning shows it as a
 displacement, a turn, or an uncertainty that only a moving body causes. Any movement ends the
 warning. The alarm, as a PASS device's, survives a twitch: :data:`AWAKE_REPORTS` reports of movement
 in a row end it.
+
+*Fallen*: the height fell without steps, faster than a lift's and not for long
+(:class:`~relpos.fusion.vertical.falls.FallDetector`). It ends as the alarm of lying still does.
 
 *Lost*: no frame for :data:`LOST_S` while the session was receiving. Time in which the port was
 gone or the computer slept does not count. For the same reason the time without motion starts
@@ -14,10 +17,11 @@ again after a gap, unless it had led to an alarm.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from relpos.fusion.vertical.falls import FallDetector
 from relpos.live.team_view import STILL_ALARM_S, STILL_WARNING_S, Alert
-from relpos.measurements import Motion
+from relpos.measurements import Height, Motion
 
 LOST_S = 10.0
 """As long as the estimators' ``lost``: ten reports in a row. With 2 % loss never by chance, with a
@@ -49,6 +53,8 @@ class _WearerState:
     since_report_s: float = 0.0
     moving: bool | None = None
     awake: int = 0
+    falls: FallDetector = field(default_factory=FallDetector)
+    fallen: bool = False
     alert: Alert | None = None
     acknowledged: bool = False
     acknowledged_by: str = ""
@@ -120,6 +126,7 @@ class Alarms:
         if known is None:
             return
         state.alert, state.acknowledged, state.acknowledged_by = known.alert, known.seen, known.by
+        state.fallen = known.alert is Alert.FALL
         if known.alert in (Alert.STILL_ALARM, Alert.STILL_WARNING):
             limit_s = STILL_ALARM_S if known.alert is Alert.STILL_ALARM else STILL_WARNING_S
             state.still_since_s = min(known.raised_s - limit_s, heard_s)
@@ -136,17 +143,27 @@ class Alarms:
         covered_s = 0.0 if state.report_s is None else motion.time_s - state.report_s
         state.report_s = motion.time_s
         state.since_report_s = 0.0
+        state.falls.step(motion.steps or 0)
         # A first report covers all motion since the node's start.
         state.moving = bool(motion.moving) if first else moved(motion, covered_s)
         if state.moving:
             state.awake += 1
+            awake = state.awake >= AWAKE_REPORTS
+            state.fallen &= not awake
             # A twitch ends neither the alarm nor its count.
-            if state.alert is not Alert.STILL_ALARM or state.awake >= AWAKE_REPORTS:
+            if state.alert is not Alert.STILL_ALARM or awake:
                 state.still_since_s = motion.time_s
         else:
             state.awake = 0
             if first or (covered_s > GAP_S and state.alert is not Alert.STILL_ALARM):
                 state.still_since_s = motion.time_s
+
+    def add_height(self, height: Height) -> None:
+        """Add a reported height."""
+        state = self._states.setdefault(height.node, _WearerState())
+        if state.falls.measure(height):
+            # The fall itself moved the body.
+            state.fallen, state.awake = True, 0
 
     def tick(self, now_s: float, *, listening: bool) -> None:
         """Advance to ``now_s``; ``listening`` says whether frames could arrive meanwhile."""
@@ -199,6 +216,8 @@ class Alarms:
             alert = Alert.MAYDAY
         elif still_s >= STILL_ALARM_S:
             alert = Alert.STILL_ALARM
+        elif state.fallen and node not in self.waiting:
+            alert = Alert.FALL
         elif state.silent_s >= LOST_S:
             alert = Alert.LOST
         elif still_s >= STILL_WARNING_S:

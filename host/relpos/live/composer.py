@@ -20,7 +20,7 @@ from relpos.live.team_view import (
     Person,
     TeamView,
 )
-from relpos.measurements import Motion, Observation, Range
+from relpos.measurements import Height, Motion, Observation, Range
 from relpos.nodes.monitor import NodeMonitor, TeamMonitor
 
 if TYPE_CHECKING:
@@ -91,6 +91,8 @@ class Composer:
             elif isinstance(observation, Range):
                 self._range(observation)
                 self._newer(observation.time_s)
+            elif isinstance(observation, Height):
+                self.alarms.add_height(observation)
             if decoder is None:
                 self.alarms.mark_heard(observation.node)
 

@@ -126,7 +126,7 @@ class Schedule:
         node = person.node
         alarm_s = self._alarm_sent_s.get(node)
         # A member who lay still and then falls silent has not got up.
-        lies = person.alert in (Alert.STILL_ALARM, Alert.MAYDAY) or (
+        lies = person.alert in (Alert.STILL_ALARM, Alert.FALL, Alert.MAYDAY) or (
             alarm_s is not None and person.alert is Alert.LOST
         )
         if lies and (alarm_s is None or now_s - alarm_s >= ALARM_EVERY_S):

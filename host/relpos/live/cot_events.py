@@ -262,6 +262,8 @@ def _remarks(person: Person, exercise: bool) -> ET.Element:
         words.append("MAYDAY")
     if person.alert is Alert.STILL_ALARM:
         words.append(f"LIES STILL for {person.still_s:.0f} s")
+    if person.alert is Alert.FALL:
+        words.append("FELL")
     if person.floor is not None:
         words.append(f"floor {person.floor}")
     if not _located(person):

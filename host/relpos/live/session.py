@@ -45,6 +45,7 @@ ASLEEP_S = 5.0
 RAISED = {
     Alert.STILL_WARNING: Said("still-20", "{name} has not moved for 20 s", name=""),
     Alert.STILL_ALARM: Said("still-30", "{name} has not moved for 30 s", name=""),
+    Alert.FALL: Said("fell", "{name} fell", name=""),
     Alert.LOST: Said("lost", "{name} is not heard any more", name=""),
     Alert.MAYDAY: Said("mayday", "{name} calls MAYDAY", name=""),
 }
@@ -52,6 +53,7 @@ MOVES = Said("moves", "{name} moves again", name="")
 CLEARED = {
     Alert.STILL_WARNING: MOVES,
     Alert.STILL_ALARM: MOVES,
+    Alert.FALL: MOVES,
     Alert.LOST: Said("heard", "{name} is heard again", name=""),
     Alert.MAYDAY: Said("no-mayday", "{name} has no MAYDAY any more", name=""),
 }

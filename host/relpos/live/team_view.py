@@ -36,6 +36,7 @@ class Alert(StrEnum):
 
     STILL_WARNING = "still_warning"
     STILL_ALARM = "still_alarm"
+    FALL = "fall"
     LOST = "lost"
     MAYDAY = "mayday"
 

@@ -109,7 +109,7 @@ def alarming(view: TeamView) -> frozenset[str | int]:
 
 def unattended(view: TeamView) -> list[Person]:
     """Return people with an alarm that is not acknowledged, in the order of the page."""
-    ranks = (Alert.MAYDAY, Alert.STILL_ALARM, Alert.LOST)
+    ranks = (Alert.MAYDAY, Alert.STILL_ALARM, Alert.FALL, Alert.LOST)
     waiting = [p for p in view.people if p.alert in ranks and not p.acknowledged]
     return sorted(waiting, key=lambda person: ranks.index(person.alert))
 
@@ -146,6 +146,9 @@ def _alarms(view: TeamView, options: RenderOptions, most: int) -> list[Text]:
             case Alert.STILL_ALARM:
                 lies = "lay still, moves again" if person.moving else _still(person)
                 words = f"!! {person.name} {lies}{where}{seen}"
+                alarms.append((0 if not seen else 2, words, _STYLES[Level.ALARM]))
+            case Alert.FALL:
+                words = f"!! {person.name} FELL{where}{seen}"
                 alarms.append((0 if not seen else 2, words, _STYLES[Level.ALARM]))
             case Alert.LOST:
                 words = f"!! {person.name} is LOST: silent for {_ago(person.seen_s)}{where}{seen}"
@@ -248,7 +251,7 @@ def _urgency(person: Person) -> int:
     match person.alert:
         case Alert.MAYDAY:
             return -1
-        case Alert.STILL_ALARM:
+        case Alert.STILL_ALARM | Alert.FALL:
             return 0
         case Alert.LOST:
             return 1
@@ -262,6 +265,8 @@ def _state(person: Person) -> str:
         return "LOST"
     if person.alert is Alert.STILL_ALARM and not person.moving:
         return f"STILL {person.still_s:.0f} s"
+    if person.alert is Alert.FALL:
+        return "FELL"
     if person.status == "unlocated":
         return "not located"
     if person.status in ("ambiguous", "stale"):

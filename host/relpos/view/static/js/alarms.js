@@ -6,6 +6,7 @@ import { isFresh } from "./age.js";
 const KINDS = {
   mayday: { kind: "mayday", level: "high" },
   still_alarm: { kind: "still", level: "high" },
+  fall: { kind: "fall", level: "high" },
   lost: { kind: "lost", level: "medium" },
   still_warning: { kind: "still", level: "low" },
 };

@@ -590,6 +590,7 @@ export class TeamMap {
 
   stateOf(person, here) {
     const alarm = this.alarms.get(person.node);
+    if (alarm?.kind === "fall") return t("state.fell");
     if (alarm) return alarm.kind === "lost"
       ? t("map.lost", { time: seconds(person.seen_s) })
       : isFresh(person) ? t("map.still", { time: seconds(person.still_s) }) : t("map.was-still", { time: seconds(person.seen_s) });

@@ -24,6 +24,7 @@ export function stateWords(person, alarm, here) {
   else if (person.status === "ambiguous") {
     words.push(here < 0.97 ? t("state.ambiguous-here", { probability: probability(here) }) : t("state.ambiguous"));
   }
+  if (alarm?.kind === "fall") words.push(t("state.fell"));
   if (alarm?.kind === "still") words.push(t(isFresh(person) ? "state.still" : "state.was-still", { time: seconds(person.still_s) }));
   else if (person.moving === false && person.still_s >= 3 && isFresh(person)) {
     words.push(t("state.stands", { time: seconds(person.still_s) }));

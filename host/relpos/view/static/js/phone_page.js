@@ -153,7 +153,8 @@ function beat() {
 }
 
 function words(alarm) {
-  return alarm.node === me?.node && alarm.kind === "still" ? t("alarm.me") : alarmText(alarm);
+  const own = alarm.node === me?.node ? { still: "alarm.me", fall: "alarm.me-fall" }[alarm.kind] : null;
+  return own ? t(own) : alarmText(alarm);
 }
 
 function showTeam() {
