@@ -148,11 +148,14 @@ def test_a_short_range_tells_the_floor_of_who_joined_late() -> None:
     assert vertical.of(1, 200.0).sigma_z_m < 0.5
 
 
-def test_the_variance_says_that_a_sensor_died() -> None:
-    outcome = follow({1: BESIDE, 2: BESIDE}, silent={2: (40.0, 500.0)})
-    sigma = [v.sigma_z_m for v in outcome.told[2]]
-    assert sigma[38] < 0.3
-    assert sigma[100] > 1.0
+def test_the_variance_and_the_floor_say_that_a_sensor_died() -> None:
+    outcome = follow({1: [stand(300)], 2: [stand(300)]}, silent={2: (40.0, 500.0)})
+    before, soon, later = (outcome.told[2][k] for k in (38, 100, 299))
+    assert before.sigma_z_m < 0.3
+    assert soon.sigma_z_m > 1.0
+    sure = [v.floor_probability or 0.0 for v in (before, soon, later)]
+    assert sure[0] > 0.95 > sure[1] > sure[2]
+    assert sure[2] < 0.5
 
 
 @pytest.mark.filterwarnings("error")

@@ -359,9 +359,11 @@ class VerticalFilter:
         heights.moved(moving * (2.0 * one.reported.variance_m2 + FAN_DOUBT_M * fan_m))
         heights.correct(one.reported.height_m, one.reported.variance_m2)
         moves = (moving > 0.5) | one.again
-        self._level_s = np.where(moves, 0.0, self._level_s + duration_s)
+        # Without heights nobody sees a wearer change floors: none is sure, or teaches its height.
+        unseen = moves | (one.silent_s > 0.0)
+        self._level_s = np.where(unseen, 0.0, self._level_s + duration_s)
         self._level_steps = np.where(moves, 0.0, self._level_steps + one.reported.steps)
-        self._settled &= ~moves
+        self._settled &= ~unseen
         self._pressed_m = np.where(self._settled, 0.0, self._pressed_m + disturbed * one.rise_m)
         self._locate()
         if self.decided is not None:

@@ -8,6 +8,8 @@ import { toScreen } from "./transform.js";
 
 /** A floor that is less probable is shown as not known. */
 const LEAST = 0.5;
+/** From this standard deviation of the height on no floor is known; between floors it is less. */
+const VAGUE_M = 1.5;
 const PALE = 0.45;
 /** Height of the section that is shown at least. */
 const LEAST_M = 4;
@@ -15,6 +17,11 @@ const LEAST_M = 4;
 /** The floor that a person is on, 0 being the start's; null where it is not known. */
 export function floorOf(person) {
   return Number.isInteger(person?.floor) && (person.floor_probability ?? 1) >= LEAST ? person.floor : null;
+}
+
+/** Whether nobody can say the floor: a node without pressure, or one that joined late. */
+export function floorUnknown(person) {
+  return floorOf(person) === null && person.sigma_z_m > VAGUE_M;
 }
 
 /** By how many floors `to` is above `from`; null where it is not known. */
