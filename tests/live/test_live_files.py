@@ -72,52 +72,60 @@ def test_appended_estimates_are_those_that_are_written_at_once(tmp_path):
     assert (tmp_path / "a" / "parameters.csv").read_text().count("step_scale") == 2
 
 
-class FullDisk(io.RawIOBase):
-    """Takes ``room`` bytes in all."""
+class FullDisk(io.FileIO):
+    """A file on a disk that takes ``room`` bytes in all."""
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.room, self.taken = path, 40, b""
+    room = 0
 
     def write(self, data) -> int:
-        part = bytes(data)[: self.room - len(self.taken)]
+        part = bytes(data)[: FullDisk.room]
         if not part:
-            raise OSError(errno.ENOSPC, "No space left on device", str(self.path))
-        self.taken += part
-        return len(part)
+            raise OSError(errno.ENOSPC, "No space left on device", str(self.name))
+        FullDisk.room -= len(part)
+        return super().write(part)
 
 
-def test_a_full_disk_is_reported_and_nothing_is_missing_once_there_is_room(tmp_path, monkeypatch):
-    disk = FullDisk(tmp_path / "table.csv")
-    monkeypatch.setattr(Path, "open", lambda path, *_, **__: path.touch() or disk)
-    table = AppendedTable(tmp_path / "table.csv", ["time_s", "node"])
+@pytest.fixture
+def table(tmp_path, monkeypatch):
+    """One on a disk with room for its header and a few rows."""
+    monkeypatch.setattr(Path, "open", lambda path, mode, **_: FullDisk(path, mode))
+    FullDisk.room = 42
+    return AppendedTable(tmp_path / "table.csv", ["time_s", "node"], wanted=False)
+
+
+def test_a_full_disk_is_reported_and_nothing_is_missing_once_there_is_room(table):
     for k in range(50):
         table.add([(k, 1)])
         table.flush()
     assert table.error is not None
     assert table.error.strerror == "No space left on device"
-    disk.room = 10_000
+    FullDisk.room = 10_000
     table.add([(50, 1)])
     table.flush()
     assert table.error is None
     table.close()
     expected = "time_s,node\n" + "".join(f"{k},1\n" for k in range(51))
-    assert disk.taken.decode() == expected
+    assert table.path.read_bytes().decode() == expected
 
 
-def test_a_disk_that_stays_full_is_an_error_at_the_end(tmp_path, monkeypatch):
-    disk = FullDisk(tmp_path / "table.csv")
-    monkeypatch.setattr(Path, "open", lambda path, *_, **__: path.touch() or disk)
-    table = AppendedTable(tmp_path / "table.csv", ["time_s", "node"])
+def test_a_disk_that_stays_full_is_an_error_at_the_end(table):
     table.add((k, 1) for k in range(50))
     with pytest.raises(OSError, match="No space left"):
         table.close()
 
 
-def test_rows_beyond_the_buffer_are_counted(tmp_path, monkeypatch):
-    disk = FullDisk(tmp_path / "table.csv")
-    monkeypatch.setattr(Path, "open", lambda path, *_, **__: path.touch() or disk)
+@pytest.mark.parametrize("room", range(0, 60, 3))
+def test_a_table_on_a_full_disk_has_whole_lines_or_is_not_there(table, room):
+    FullDisk.room = room
+    for k in range(50):
+        table.add([(k, 1)])
+        table.flush()
+    lines = table.path.read_bytes().split(b"\n") if table.path.exists() else [b"time_s,node", b""]
+    assert lines == [b"time_s,node", *(b"%d,1" % k for k in range(len(lines) - 2)), b""]
+
+
+def test_rows_beyond_the_buffer_are_counted(table, monkeypatch):
     monkeypatch.setattr("relpos.runs.appending.MOST_WAITING_BYTES", 100)
-    table = AppendedTable(tmp_path / "table.csv", ["time_s", "node"])
     for k in range(100):
         table.add([(k, 1)])
         table.flush()

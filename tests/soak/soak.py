@@ -1,11 +1,12 @@
 """The whole system under random faults, watched by the oracle.
 
-    python tests/soak/soak.py [--hours 0.5] [--seed N] [--estimator bank]
+    python tests/soak/soak.py [--hours 0.5] [--seed N] [--estimator bank] [--kills]
 
 Each episode is one seed: a team of 2 to 10 emulated nodes with faults of the whole vocabulary, and
 hosts one after the other at its port: with right and wrong clocks, with and without memory, under
-full disks, replayed and altered frames, commands, and guests of the page. With
-``--seed`` one episode is run: the command that a violation prints.
+full disks, replayed and altered frames, commands, and guests of the page. Each tenth kills real
+processes (kills.py), with ``--kills`` each. With ``--seed`` one episode is run: the command that a
+violation prints.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+import kills
 from oracle import Air, CheckedDecoder, Watch, check_outcome, require
 
 from relpos import fusion
@@ -251,6 +253,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, help="one episode")
     parser.add_argument("--first", type=int, default=1, help="seed of the first episode")
     parser.add_argument("--estimator", default="bank")
+    parser.add_argument("--kills", action="store_true", help="episodes of kills alone")
     arguments = parser.parse_args()
     began_s = time.monotonic()
     seed = arguments.first if arguments.seed is None else arguments.seed
@@ -258,13 +261,17 @@ def main() -> int:
     while True:
         with tempfile.TemporaryDirectory() as folder:
             try:
-                line = episode(seed, arguments.estimator, Path(folder))
+                if arguments.kills or seed % 10 == 0:
+                    line = kills.episode(seed, Path(folder))
+                else:
+                    line = episode(seed, arguments.estimator, Path(folder))
                 print(f"seed {seed}: {line}", flush=True)
             except Exception:
                 traceback.print_exc()
                 command = f"python tests/soak/soak.py --seed {seed}"
                 if arguments.estimator != "bank":
                     command += f" --estimator {arguments.estimator}"
+                command += " --kills" * arguments.kills
                 print(f"seed {seed}: VIOLATION; again: {command}", flush=True)
                 broken.append(seed)
         done += 1

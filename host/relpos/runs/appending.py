@@ -11,6 +11,7 @@ import csv
 import errno
 import io
 import math
+import os
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -83,18 +84,41 @@ class AppendedTable:
         self._text.truncate()
         try:
             if self._file is None:
-                self._file = self.path.open("wb", buffering=0)
+                self._file = self._begun()
             elif not self.path.exists():
                 # Somebody deleted it: rows would go nowhere without any error.
                 raise FileNotFoundError(errno.ENOENT, "was deleted", str(self.path))
-            while self._waiting:
-                # A disk that is nearly full takes a part.
-                self._waiting = self._waiting[self._file.write(self._waiting) or 0 :]
+            self._write(self._file)
         except OSError as error:
             error.filename = error.filename or str(self.path)
             self.error = error
             return
         self.error = None
+
+    def _begun(self) -> BinaryIO:
+        """Return the file with its header: a process killed meanwhile leaves none without."""
+        beside = self.path.with_name(self.path.name + ".new")
+        header, rest = self._waiting.split(b"\n", 1)
+        with beside.open("wb", buffering=0) as file:
+            if file.write(header + b"\n") != len(header) + 1:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        beside.replace(self.path)
+        self._waiting = rest
+        return self.path.open("ab", buffering=0)
+
+    def _write(self, file: BinaryIO) -> None:
+        """Write what waits; of what a disk that is nearly full takes, whole lines stay."""
+        done = 0
+        try:
+            while done < len(self._waiting):
+                done += file.write(self._waiting[done:]) or 0
+        except OSError:
+            whole = self._waiting.rfind(b"\n", 0, done) + 1
+            file.truncate(file.seek(whole - done, io.SEEK_CUR))
+            done = whole
+            raise
+        finally:
+            self._waiting = self._waiting[done:]
 
     def close(self) -> None:
         """Write what waits and end; OSError where it does not go."""
