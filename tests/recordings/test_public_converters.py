@@ -7,7 +7,7 @@ import pytest
 import scipy.io
 
 from relpos.errors import DataError
-from relpos.recordings import daily, mocap, museum, phone_strides, ranges, still, treadmill
+from relpos.recordings import back, daily, mocap, museum, phone_strides, ranges, still, treadmill
 from relpos.recordings.tables import Archive
 
 
@@ -195,6 +195,37 @@ def test_a_foot_that_stands_each_second_tells_its_strides():
     instants, lengths_m = treadmill.strides(foot)
     assert instants == pytest.approx([75, 175, 275, 375], abs=2)
     assert lengths_m == pytest.approx([1.0] * 3, abs=0.01)
+
+
+def test_a_sheet_of_seven_sensors_becomes_the_back_and_its_feet(source):
+    openpyxl = pytest.importorskip("openpyxl", reason="needs the extra 'recordings'")
+    kinds = [f"{kind}_read_{axis}" for kind in ("Acc", "Gyro", "Mag") for axis in "xyz"]
+    header = [f" {kind}_{sensor}" for sensor in (1, 6, 7) for kind in kinds]
+    swing = np.zeros(300)
+    swing[150:200] = np.sin(2.0 * np.pi * np.arange(50) / 50.0)  # 1 m: to and fro once
+    force = swing * 1e4 * 2.0 * np.pi / 0.25 / 9.80665
+
+    def written(header):
+        book, stream = openpyxl.Workbook(), io.BytesIO()
+        book.active.append(header)
+        for k in range(300):
+            turning = (-1) ** k * 10000.0 * (150 <= k < 200)
+            foot = [force[k], 0, 10000, 0, turning, 0, 0, 0, 0]
+            book.active.append([*foot, *foot, -9826, 1193, -610, 219, 189, 30, 189, -392, 132])
+        book.save(stream)
+        return stream.getvalue()
+
+    sheet = written(header)
+    archive = source({f"Dataset/Additional/Marzia/{n}.xlsx": sheet for n in back.AUTHOR[:1]})
+    first = next(back.author(archive))
+    rates = "0.038223,0.032987,0.005236"
+    assert first.imu[0] == f"0.0000,1,-9.636,1.1699,-0.59821,{rates},18.9,-39.2,13.2"
+    marks = [line.split(",")[2:] for line in first.events]
+    assert [mark for mark, _ in marks] == ["stride_length_left_m", "stride_length_right_m"]
+    assert [float(length_m) for _, length_m in marks] == pytest.approx([1.0, 1.0], abs=0.02)
+    changed = {f"Dataset/Additional/Marzia/{n}.xlsx": written(header[1:]) for n in back.AUTHOR[:1]}
+    with pytest.raises(DataError, match=r"2\.xlsx: 'Acc_read_x_1'.*the source has changed"):
+        list(back.author(source(changed)))
 
 
 def test_a_treadmill_table_without_its_columns_has_changed(source):

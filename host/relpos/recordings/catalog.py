@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from relpos.recordings import (
+    back,
     daily,
     handheld,
     lowerback,
@@ -87,8 +88,24 @@ SOURCES = (
         treadmill.convert,
         "ad612af050c995b37ecc07bd381f195f5c59cd3ba9a36a323a5df9fba3ea1738",
     ),
-    Source("walk_5m_back", "github.com/Marpino/Walking-dataset", "none stated", "back, 5 m"),
-    Source("walk_author_back", "github.com/Marpino/Walking-dataset", "none stated", "back, loops"),
+    Source(
+        "walk_5m_back",
+        "github.com/Marpino/Walking-dataset",
+        "none stated",
+        "back, 5 m, elderly and young",
+        "4458e4a9928c7e17a824de0727b822f02e095817",
+        back.people,
+        "6737f810419453a4af67993c30df75e252fdf7ff1210710bcf4820391476b1a2",
+    ),
+    Source(
+        "walk_author_back",
+        "github.com/Marpino/Walking-dataset",
+        "none stated",
+        "back, lines and loops",
+        "4458e4a9928c7e17a824de0727b822f02e095817",
+        back.author,
+        "129393abd01d0037cd03b7cd1a3129c89b8c0e874bde56eb195f06934fb19859",
+    ),
     Source(
         "walk_mocap_virtual",
         "github.com/NikonPic/imu_gait_analysis",

@@ -1,8 +1,7 @@
 """github.com/SintMaartenskliniek/MovingReality: lumbar Xsens at 100 Hz, treadmill, after a stroke.
 
-What is true are the strides of both foot-worn sensors: the foot stands still on the belt at
-mid-stance, where the mean angular rate is least; between two of these instants the acceleration
-without gravity is integrated twice, and the speed that is left over is taken out evenly.
+What is true are the strides of both foot-worn sensors; on the belt the foot stands still at
+mid-stance, see `strides`.
 """
 
 from __future__ import annotations
@@ -11,17 +10,13 @@ import itertools
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from relpos.errors import DataError
+from relpos.recordings.strides import RATE_HZ, stances, way_m
 from relpos.recordings.tables import Archive, Array, ConvertedRun, described, imu_lines
 
-RATE_HZ = 100.0
 FIELD_UT = 45.0  # the field comes in units of the earth's
 BOUT_S, LEAD_S = 60.0, 4.0
-# A stance: less than this, or than a quarter of the trial's mean (a fast foot is never so still).
-STILL_RAD_S, STILL_SHARE = 0.6, 0.25
-APART = 15  # samples: a shorter interruption of a stance is none
 STATURES_M = {
     "01": 1.775, "02": 1.71, "04": 1.63, "05": 1.83, "07": 1.83, "08": 1.72, "10": 1.88, "11": 1.7
 }  # fmt: skip
@@ -102,15 +97,6 @@ def _run(person: str, trial: str, begin: int, tables: dict[str, Array]) -> Conve
 
 def strides(foot: Array) -> tuple[Array, Array]:
     """Mid-stance instants as samples, and the horizontal way between each two of them."""
-    speed = np.linalg.norm(foot[:, 3:6], axis=1)
-    smooth = uniform_filter1d(uniform_filter1d(speed, 5), 9)
-    still = np.flatnonzero(smooth < max(STILL_RAD_S, STILL_SHARE * float(speed.mean())))
-    stances = np.split(still, np.flatnonzero(np.diff(still) > APART) + 1)
-    instants = [int(s[0] + smooth[s[0] : s[-1] + 1].argmin()) for s in stances if len(s)]
-    lengths_m = []
-    for begin, end in itertools.pairwise(instants):
-        force = foot[begin : end + 1, 9:11]
-        velocity = np.vstack([[0.0, 0.0], np.cumsum(force[1:] + force[:-1], axis=0) / 2 / RATE_HZ])
-        velocity -= np.linspace(0.0, 1.0, len(velocity))[:, None] * velocity[-1]
-        lengths_m.append(float(np.hypot(*velocity.sum(axis=0)) / RATE_HZ))
+    instants = [stillest for _, stillest, _ in stances(foot[:, 3:6])]
+    lengths_m = [way_m(foot[begin : end + 1, 9:11]) for begin, end in itertools.pairwise(instants)]
     return np.array(instants, np.float64), np.array(lengths_m, np.float64)
