@@ -158,6 +158,36 @@ def http(folder: Path) -> Target:
     return Target(read, seeds, "relpos.view.server", "relpos.live")
 
 
+def websocket(folder: Path) -> Target:
+    """A guest's WebSocket, zero bytes between: path, query, four headers, what it sends."""
+    from house import open_house
+
+    house = OPEN.enter_context(open_house(folder))
+    names = (b"host", b"origin", b"cookie", b"accept")
+
+    def read(data: bytes) -> None:
+        parts = data.split(b"\0")
+        parts += [b""] * (6 - len(parts))
+        path, query, *rest = parts
+        head = [(name, value) for name, value in zip(names, rest, strict=False) if value]
+        messages = [
+            {"bytes": part} if part[:1] == b"b" else {"text": part.decode()}
+            for part in rest[len(names) :]
+            if part[:1] == b"b" or part.isascii()
+        ]
+        house.meet(path.decode("utf-8", "replace"), query, head, messages)
+        assert not house.live._failed, house.live._failed
+
+    cookie = b"; ".join(b"%s=%s" % (a.encode(), b.encode()) for a, b in house.cookies.items())
+    host, token = b"localhost:8460", cookie.partition(b"=")[2]
+    seeds = [
+        b"\0".join((b"/ws", b"", host, b"http://" + host, cookie, b"", b"{}", b"b\xff", b"[[")),
+        b"\0".join((b"/ws", b"token=" + token, b"[::1]:8460", b"", b"", b"*/*", b"hello")),
+        b"\0".join((b"/static/page.js", b"token=a", host, b"null", b"a=b; c", b"", b"b")),
+    ]
+    return Target(read, seeds, "relpos.view.server", "relpos.view.guard", "relpos.view.access")
+
+
 def link(_: Path) -> Target:
     """Scripts of frames: link_fuzzer.py."""
     import random
@@ -173,7 +203,7 @@ def link(_: Path) -> Target:
 
 
 NODE = "node"
-TARGETS = {make.__name__: make for make in (files, toml, mcap, settings, http, link)}
+TARGETS = {make.__name__: make for make in (files, toml, mcap, settings, http, websocket, link)}
 
 
 def follow_branches(modules: tuple[str, ...]) -> None:

@@ -14,6 +14,7 @@ from relpos.live.files import FileSink
 from relpos.live.inputs import PacedInput
 from relpos.live.requests import Request
 from relpos.live.team_view import to_json
+from relpos.live.tracks import Tracks
 from relpos.measurements import common_priors
 from relpos.runs import Description
 from relpos.view.access import Access
@@ -21,7 +22,7 @@ from relpos.view.server import ALLOWED, Pages
 
 STARTED_UNIX_S = time.time() - 100.0
 BASE = "http://localhost:8460"
-WELL = {200, 400, 405}
+WELL = {200, 400, 404, 405, 409}
 PRESS = {"id": "a", "landmark": "17", "unix_ms": 1e3 * STARTED_UNIX_S}
 HEADING = {"unix_ms": 1e3 * STARTED_UNIX_S, "heading_rad": 1.0, "sigma_rad": 0.2}
 CLOCKS = {"node": 1, "clock_offset_ms": 3.0, "sent_unix_ms": 1e3 * STARTED_UNIX_S}
@@ -30,6 +31,18 @@ BODIES = {
     "/api/acknowledge": {"node": 1},
     "/api/presses": {**CLOCKS, "presses": [PRESS]},
     "/api/headings": {**CLOCKS, "headings": [HEADING]},
+    "/api/shelve": {"node": 1, "seconds": 60.0, "by": "Kim"},
+    "/api/board": {"node": 1, "team": "A", "state": "entered", "air_bar": 200.0},
+    "/api/rollcall": {"action": "start", "within_s": 300.0, "node": 1, "answer": "confirmed"},
+    "/api/mayday": {"node": 1, "on": True},
+    "/api/evacuate": {"action": "order", "node": 1},
+    "/api/marker": {"action": "set", "id": "a", "sign": "exit", "x_m": 1.0, "y_m": 2.0},
+    "/api/plan": {"action": "set", "image": "a.png", "points": [[1.0, 2.0, 3.0, 4.0]]},
+    "/api/image": {"a": "no image"},
+    "/api/replay": {"at_s": 1.0, "speed": 2.0, "playing": True},
+    "/api/end": {"by": "Kim"},
+    "/api/start": {"source": "/dev/ttyUSB0"},
+    "/api/revoke": {"id": "a"},
 }
 
 
@@ -59,6 +72,12 @@ class DirectSession(SimpleNamespace):
         self.live._update()
         return json.loads(to_json(self.phones.answers.pop()))
 
+    async def until_hello(self):
+        return "{}"
+
+    async def news(self, seen, within_s):
+        await asyncio.sleep(0.0)
+
 
 class Phones:
     def __init__(self):
@@ -80,6 +99,39 @@ class Visitors(FileSink, Phones):
         Phones.__init__(self)
 
 
+async def _meet(app, path, query, head, messages):
+    """What a guest's WebSocket gets that sends so and leaves; whatever fails is raised."""
+    waiting = [
+        {"type": "websocket.connect"},
+        *({"type": "websocket.receive", **message} for message in messages),
+        {"type": "websocket.disconnect", "code": 1001},
+    ]
+    scope = {"type": "websocket", "path": path, "query_string": query, "headers": head,
+             "scheme": "ws", "root_path": "", "subprotocols": []}  # fmt: skip
+    tasks, sent = [], []
+
+    def begun(loop, work, **options):
+        tasks.append(asyncio.Task(work, loop=loop, **options))
+        return tasks[-1]
+
+    async def receive():
+        return waiting.pop(0)
+
+    async def send(message):
+        sent.append(message["type"])
+
+    loop = asyncio.get_running_loop()
+    loop.set_task_factory(begun)
+    try:
+        await app(scope, receive, send)
+    finally:
+        loop.set_task_factory(None)
+    for task in tasks:
+        if task.done() and not task.cancelled():
+            task.result()
+    return sent
+
+
 @contextmanager
 def open_house(directory):
     """The server and the session; ``send(method, path, content)`` is a guest's request."""
@@ -88,14 +140,25 @@ def open_house(directory):
         NowInput(), lambda p: fusion.make("deadreckoning", p), visitors, priors=common_priors((1,))
     )
     session = DirectSession(
-        live=live, phones=visitors, hello=None, view=None, names={}, over=False, tracks=None
+        live=live,
+        phones=visitors,
+        hello=None,
+        view=None,
+        names={},
+        over=False,
+        tracks=Tracks(),
+        devices={},
+        log=[],
+        board="{}",
+        timeline="",
     )
     access = Access(8460, ("localhost",))
     pages = Pages(session, access)
-    for kind, allowance in pages._allowances.items():
-        assert kind in ALLOWED
+    assert pages._allowances.keys() == ALLOWED.keys()
+    for allowance in pages._allowances.values():
         allowance._burst = 1e12
-    transport = httpx.ASGITransport(pages.app(), raise_app_exceptions=True)
+    app = pages.app()
+    transport = httpx.ASGITransport(app, raise_app_exceptions=True)
     cookies = {access.cookie: access.token}
     with asyncio.Runner() as runner:
         client = httpx.AsyncClient(transport=transport, base_url=BASE, cookies=cookies)
@@ -103,5 +166,10 @@ def open_house(directory):
         def send(method, path, content):
             return runner.run(client.request(method, path, content=content))
 
-        yield SimpleNamespace(send=send, live=live, album=album, directory=directory)
+        def meet(path, query, head, messages):
+            return runner.run(_meet(app, path, query, head, messages))
+
+        yield SimpleNamespace(
+            send=send, meet=meet, live=live, album=album, directory=directory, cookies=cookies
+        )
         runner.run(client.aclose())

@@ -5,7 +5,7 @@ import time
 
 import pytest
 from house import BODIES, CLOCKS, PRESS, STARTED_UNIX_S, WELL, open_house
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from relpos.measurements import out_of_bounds
@@ -83,6 +83,8 @@ requests = st.sampled_from(sorted(BODIES)).flatmap(
 @pytest.mark.parametrize("bodies", [400, pytest.param(40_000, marks=pytest.mark.soak)])
 def test_no_body_of_any_route_ends_a_session(house, bodies):
     @given(requests)
+    @example(("/api/replay", b"{}"))
+    @example(("/api/rollcall", b'{"action": "start", "within_s": 1' + b"0" * 400 + b"}"))
     @settings(max_examples=bodies, suppress_health_check=list(HealthCheck))
     def visit(sent):
         path, content = sent
@@ -104,6 +106,14 @@ def test_no_method_of_any_route_ends_a_session(house, method, path):
     assert answer.status_code in {200, 307, 404, 405, 503}
     assert b"import" not in answer.content[:2000] or "static" not in path
     assert not house.live._failed
+
+
+@pytest.mark.parametrize("message", [{"text": "[" * 1000}, {"bytes": b"\xff"}, {"text": "\ud800"}])
+def test_whatever_a_browser_sends_by_its_socket_is_ignored(house, message):
+    cookie = "; ".join("=".join(pair) for pair in house.cookies.items()).encode()
+    head = [(b"host", b"localhost:8460"), (b"cookie", cookie)]
+    sent = house.meet("/ws", b"", head, [message])
+    assert sent[:2] == ["websocket.accept", "websocket.send"]
 
 
 def test_what_visitors_sent_is_a_run_that_loads(house):

@@ -145,7 +145,7 @@ class Board:
             return do(event)
         except BoardError:
             raise
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise BoardError(f"not a request that the board knows: {error!r}") from None
 
     def _board(self, event: Mapping[str, Any]) -> str:

@@ -441,6 +441,8 @@ class LiveSession:
             return {"done": True}, 200
         if request.kind in ("sources", "start"):
             return refusal(Said("running", "a session runs already: end it first")), 409
+        if request.kind not in ("presses", "headings"):
+            return {"error": f"this session takes no request of the kind {request.kind}"}, 409
         if not self._source.is_now:
             return {"error": "this is a recording: it takes no presses or headings"}, 409
         handle = self._handler.presses if request.kind == "presses" else self._handler.headings

@@ -460,9 +460,9 @@ class Pages:
 
 
 async def _until_gone(socket: WebSocket) -> None:
-    with contextlib.suppress(WebSocketDisconnect, RuntimeError):
-        while True:
-            await socket.receive_text()
+    """Wait until the browser has left; whatever it sends is nothing to us."""
+    while (await socket.receive())["type"] != "websocket.disconnect":
+        pass
 
 
 async def _refuse(_: Request, error: Exception) -> Response:
