@@ -7,6 +7,7 @@ import time
 import pytest
 from sessions import about, play, session
 
+from relpos.cli.smoothing import Smoothing
 from relpos.errors import DataError
 from relpos.live.requests import Request
 from relpos.live.sinks import Sink
@@ -147,3 +148,24 @@ def test_alerts_of_a_moment_are_those_that_were_then():
     assert history.alert(2, 42.0)[1] is Alert.STILL_ALARM
     assert history.heard(2, 59.0) == 44.0
     assert any(e.text.startswith("Ben") for e in history.events)
+
+
+@pytest.mark.soak
+def test_the_smoothed_tracks_come_to_the_page_once_they_are_computed(recorded):
+    path, _ = recorded
+    page, shown = Page(), []
+    page.smoothed = shown.append
+    smoothing = Smoothing([path])
+    player = Player(Moments([path]), [page], smoothed=smoothing)
+    player.run(0.1)
+    assert page.timeline["smoothing"] is True
+    end_s = time.monotonic() + 120.0
+    while not shown and time.monotonic() < end_s:
+        player.run(0.2)
+    smoothing.close()
+    assert page.timeline["smoothing"] is False
+    assert len(shown) == 1
+    for node in (1, 2, 3):
+        times = [time_s for time_s, _, _ in shown[0].of(node)]
+        assert times == sorted(times)
+        assert times[-1] > 30.0

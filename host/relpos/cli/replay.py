@@ -31,9 +31,11 @@ def replay(
 ) -> None:
     """Play a recording on the page: pause, speed, any moment, the next alarm or landmark.
 
-    Positions are those that the session had then; nothing is computed anew.
+    Positions are those that the session had then. The smoothed tracks, by the whole recording, are
+    computed meanwhile and drawn beside them once they are there.
     """
     from relpos import recording
+    from relpos.cli.smoothing import Smoothing
     from relpos.errors import DataError
     from relpos.live.board import Board, BoardError
     from relpos.live.mission import Mission
@@ -69,9 +71,13 @@ def replay(
     options = live.Options(True, view_listen, open_browser=open_browser)
     page = live.open_page(options, hello, source if source.is_dir() else None)
     page.boarded(board.to_message())
+    # A mission that goes on has no end yet to smooth from.
+    smoothing = None if live_port else Smoothing(paths)
     try:
-        Player(moments, [page], entries).run(seconds)
+        Player(moments, [page], entries, smoothing).run(seconds)
     finally:
+        if smoothing is not None:
+            smoothing.close()
         page.close()
         moments.close()
 

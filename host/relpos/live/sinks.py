@@ -45,6 +45,9 @@ class Sink:
     def timed(self, timeline: dict[str, Any]) -> None:
         """Show where a recording that is played stands."""
 
+    def smoothed(self, tracks: Tracks) -> None:
+        """Show where everybody was by the whole recording, once that is known."""
+
     def resumed(self, tracks: Tracks) -> None:
         """Go on with the tracks of a mission's sessions before."""
 

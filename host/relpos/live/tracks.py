@@ -44,10 +44,10 @@ class Tracks:
         points = self._points.get(node, array("d"))
         return list(zip(points[::3], points[1::3], points[2::3], strict=True))
 
-    def to_json(self) -> str:
-        """Return the message ``tracks`` of the page's protocol."""
+    def to_json(self, kind: str = "tracks") -> str:
+        """Return the message ``tracks``, or ``smoothed``, of the page's protocol."""
         tracks = {str(node): self.of(node) for node in sorted(self._points)}
-        return to_json({"type": "tracks", "tracks": tracks})
+        return to_json({"type": kind, "tracks": tracks})
 
     @classmethod
     def from_message(cls, message: Mapping[str, Any]) -> Tracks:

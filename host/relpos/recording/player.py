@@ -11,7 +11,7 @@ import threading
 import time
 from array import array
 from bisect import bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -91,10 +91,17 @@ class History:
 
 
 class Player:
-    """Shows a recording to ``sinks``, and does what their users ask (kind ``replay``)."""
+    """Shows a recording to ``sinks``, and does what their users ask (kind ``replay``).
+
+    ``smoothed`` returns the smoothed tracks once they are computed, None before.
+    """
 
     def __init__(
-        self, moments: Moments, sinks: Sequence[Sink], log: Iterable[LogEntry] = ()
+        self,
+        moments: Moments,
+        sinks: Sequence[Sink],
+        log: Iterable[LogEntry] = (),
+        smoothed: Callable[[], Tracks | None] | None = None,
     ) -> None:
         self.moments = moments
         self._sinks = sinks
@@ -105,6 +112,7 @@ class Player:
         self.speed = 1.0
         self._seq = 0
         self._told = False
+        self._smoothed = smoothed
         self._reader = threading.Thread(
             target=self._read, args=(list(log),), name="history", daemon=True
         )
@@ -136,6 +144,12 @@ class Player:
                     for entry in self.history.events:
                         sink.logged(entry)
                 self.tell()
+            tracks = self._smoothed() if self._smoothed else None
+            if tracks is not None:
+                self._smoothed = None
+                for sink in self._sinks:
+                    sink.smoothed(tracks)
+                self.tell()
             if asked or now_s - shown_s >= SHOW_S:
                 shown_s = now_s
                 view = self.view(self.at_s)
@@ -149,7 +163,7 @@ class Player:
         message = {
             "type": "timeline", "from_s": self.moments.from_s, "to_s": self.moments.to_s,
             "playing": self.playing, "speed": self.speed, "ticks": ticks,
-            "reading": not self.history.complete,
+            "reading": not self.history.complete, "smoothing": self._smoothed is not None,
         }  # fmt: skip
         for sink in self._sinks:
             sink.timed(message)

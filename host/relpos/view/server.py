@@ -89,8 +89,8 @@ class SessionProxy:
         self.tracks = Tracks()
         self.names: dict[str, str] = {}
         self.log: list[dict[str, Any]] = []
-        self.board = '{"type":"board"}'
-        self.timeline = ""
+        self.kept = {"board": '{"type":"board"}'}
+        """The newest message of each of these kinds."""
         self.devices: dict[str, dict[str, Any]] = {}
         """Every device that was ever let in, by its id, in a mission."""
         self._news = asyncio.Event()
@@ -119,10 +119,8 @@ class SessionProxy:
             case "points":
                 for node, point in message["points"].items():
                     self.tracks.add(int(node), *point)
-            case "timeline":
-                self.timeline = line.rstrip("\n")
-            case "board":
-                self.board = line.rstrip("\n")
+            case "timeline" | "board" | "smoothed" as kind:
+                self.kept[kind] = line.rstrip("\n")
             case "device":
                 event = message["event"]
                 self.devices.setdefault(event["id"], {}).update(event)
@@ -255,15 +253,13 @@ class Pages:
             await socket.send_text(self.session.tracks.to_json())
             await socket.send_text(to_json({"type": "you", "role": str(role_of(socket))}))
             seen: str | None = None
-            told, board, timeline = 0, "", ""
+            told, kept = 0, dict[str, str]()
             while not gone.done() and not self.session.over and not self._is_revoked(socket):
                 newest = await self.session.news(seen, PING_S)
-                if timeline is not self.session.timeline:
-                    timeline = self.session.timeline
-                    await socket.send_text(timeline)
-                if board is not self.session.board:
-                    board = self.session.board
-                    await socket.send_text(board)
+                for kind, line in list(self.session.kept.items()):
+                    if kept.get(kind) is not line:
+                        kept[kind] = line
+                        await socket.send_text(line)
                 if told < len(self.session.log):
                     entries, told = self.session.log[told:], len(self.session.log)
                     await socket.send_text(to_json({"type": "log", "entries": entries}))

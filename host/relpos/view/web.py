@@ -58,8 +58,8 @@ class WebView(Sink):
         self._door = listener
         self._tracks = Tracks()
         self._names: dict[int, str] = {}
-        self._timeline = '{"type":"ping"}'
-        self._board = to_json(Board().to_message())
+        self._kept = {"board": to_json(Board().to_message())}
+        """The newest message of each of these kinds."""
         self._devices: list[dict[str, Any]] = []
         self._log: deque[dict[str, Any]] = deque(maxlen=MAX_LOG)
         self._newest: bytes | None = None
@@ -105,13 +105,19 @@ class WebView(Sink):
 
     def boarded(self, board: dict[str, Any]) -> None:
         """Send the board to the pages."""
-        self._board = to_json(board)
-        self._say(self._board)
+        self._keep("board", to_json(board))
 
     def timed(self, timeline: dict[str, Any]) -> None:
         """Send the time line to the pages."""
-        self._timeline = to_json(timeline)
-        self._say(self._timeline)
+        self._keep("timeline", to_json(timeline))
+
+    def smoothed(self, tracks: Tracks) -> None:
+        """Send the smoothed tracks to the pages."""
+        self._keep("smoothed", tracks.to_json("smoothed"))
+
+    def _keep(self, kind: str, line: str) -> None:
+        self._kept[kind] = line
+        self._say(line)
 
     def resumed(self, tracks: Tracks) -> None:
         """Go on with the tracks of the sessions before."""
@@ -189,8 +195,7 @@ class WebView(Sink):
             self._tracks.to_json(),
             _names_message(self._names),
             log,
-            self._board,
-            self._timeline,
+            *self._kept.values(),
             *(to_json({"type": "device", "event": event}) for event in self._devices),
         ):
             self._say(line)

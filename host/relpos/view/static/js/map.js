@@ -36,7 +36,7 @@ export class TeamMap {
     this.me = null;
     this.selected = null;
     this.find = null;
-    this.layers = { tracks: "all", ranges: "auto" };
+    this.layers = { tracks: "all", ranges: "auto", smoothed: true };
     /** The switch of floors (`floors.js`), where the page has one. */
     this.floors = null;
     this.alarms = new Map();
@@ -224,6 +224,7 @@ export class TeamMap {
     this.drawGrid();
     this.ground?.drawPlan();
     const again = this.drawTracks();
+    if (this.layers.smoothed) this.drawSmoothed();
     const { here, places, rings } = this.team.possible();
     const placed = this.team.list().filter(isPlaced);
     const people = placed.filter((p) => !this.floors || this.floors.isHere(p) || this.rank(p) >= 3);
@@ -328,11 +329,27 @@ export class TeamMap {
     return again;
   }
 
+  /** What the whole recording says of the ways so far: dashed beside the live ones. */
+  drawSmoothed() {
+    const { context, unit } = this;
+    const nowS = this.team.timeS ?? 0;
+    const fromS = this.layers.tracks === "all" ? -Infinity : nowS - MINUTE_S;
+    if (this.layers.tracks === "off") return;
+    context.lineWidth = 2 * unit;
+    context.setLineDash([7 * unit, 5 * unit]);
+    for (const [node, track] of this.team.smoothed) {
+      this.pathTrack(track, track.since(fromS), track.since(nowS));
+      context.strokeStyle = this.colourOf(node);
+      context.stroke();
+    }
+    context.setLineDash([]);
+  }
+
   /** The track from its point `first` on as the current path. */
-  pathTrack(track, first) {
+  pathTrack(track, first, end = track.points.length) {
     const { context, view } = this;
     context.beginPath();
-    for (let k = first; k < track.points.length; k += 1) {
+    for (let k = first; k < end; k += 1) {
       const [, x, y, starts] = track.points[k];
       const [px, py] = toScreen(view, x, y);
       if (k === first || starts) context.moveTo(px, py);

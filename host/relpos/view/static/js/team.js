@@ -31,6 +31,8 @@ export class Team {
     this.possibleOf = null;
     this.notices = [];
     this.tracks = new Map();
+    /** By the whole recording; empty until they are computed. */
+    this.smoothed = new Map();
     this.ambiguous = false;
     /** Bearing of magnetic north in the common frame; null while unknown. */
     this.northRad = null;
@@ -58,6 +60,13 @@ export class Team {
           this.trackOf(Number(node)).restore(points);
         }
         return "tracks";
+      case "smoothed":
+        this.smoothed = new Map(Object.entries(message.tracks).map(([node, points]) => {
+          const track = new Track();
+          track.restore(points);
+          return [Number(node), track];
+        }));
+        return "smoothed";
       case "picture":
         this.handleView(message);
         return "picture";

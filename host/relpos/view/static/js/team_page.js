@@ -65,6 +65,10 @@ const timeline = new Timeline((text) => {
   trouble = { level: "warning", text };
   refresh(true);
 });
+byId("smoothed").addEventListener("change", (event) => {
+  map.layers.smoothed = event.target.checked;
+  map.invalidate();
+});
 const source = new SourceView();
 const connection = new Connection({ onMessage: handle, onState: () => refresh(true) });
 
@@ -93,6 +97,8 @@ function handle(message) {
     map.layer.forget();
   } else if (kind === "timeline") {
     timeline.handle(message);
+  } else if (kind === "smoothed") {
+    timeline.ready(team.smoothed.size > 0);
   } else if (kind === "board") {
     board.handle(message);
     ground.handle(message);

@@ -10,6 +10,7 @@ export class Timeline {
     this.line = null;
     this.dragging = false;
     this.slider = byId("moment");
+    this.smoothed = false;
     const post = (body) => postJson("/api/replay", body).catch((error) => say(t("replay.stuck", { error: error.message })));
     byId("play").addEventListener("click", () => post({ playing: !this.line.playing }));
     byId("event-before").addEventListener("click", () => post({ step: -1 }));
@@ -41,6 +42,8 @@ export class Timeline {
     setAttribute(this.slider, "max", line.to_s);
     byId("speed").value = String(line.speed);
     byId("event-before").disabled = byId("event-after").disabled = line.reading;
+    byId("smoothed-field").hidden = !this.smoothed && !line.smoothing;
+    setText(byId("smoothed-words"), t(this.smoothed ? "replay.smoothed" : "replay.smoothing"));
     if (!ticks) return;
     const span = Math.max(line.to_s - line.from_s, 1);
     byId("ticks").replaceChildren(...line.ticks.map(([atS, kind, text, key]) => {
@@ -48,6 +51,13 @@ export class Timeline {
       tick.style.left = `${(100 * (atS - line.from_s)) / span}%`;
       return tick;
     }));
+  }
+
+  /** The smoothed tracks have come, or there are none. */
+  ready(some) {
+    this.smoothed = some;
+    byId("smoothed").disabled = !some;
+    if (this.line) this.handle({ ...this.line, smoothing: false });
   }
 
   show(timeS) {
