@@ -51,6 +51,8 @@ UNDER_WAY = (*LIFTS, Mode.FALLING)
 """The wearer rises or falls without a step."""
 PRESSURE = (Mode.DISTURBED, Mode.JUMP, Mode.COMMON)
 """The pressure changes, the wearer's height does not."""
+LASTING = (Mode.DISTURBED, Mode.COMMON)
+"""Of these, those that last."""
 
 _EPISODES: dict[Episode, tuple[Mode, ...]] = {
     Episode.LEVEL: (Mode.LEVEL,),
@@ -219,8 +221,9 @@ def _rise(interval: Interval) -> tuple[Floats, Floats]:
         up = mode in (Mode.LIFT_UP_BEGINS, Mode.LIFT_UP)
         mean[:, mode] = (LIFT_M_S if up else -LIFT_M_S) * dt
         variance[:, mode] += (SIGMA_LIFT_M_S * dt) ** 2
-    mean[:, Mode.COMMON] = np.where(np.isfinite(interval.common_m), interval.common_m, 0.0)
-    variance[:, Mode.COMMON] += (COMMON_M_S * dt) ** 2
+    unknown = np.isnan(interval.common_m)
+    mean[:, Mode.COMMON] = np.where(unknown, 0.0, interval.common_m)
+    variance[:, Mode.COMMON] += (np.where(unknown, FAN_M_S, COMMON_M_S) * dt) ** 2
     variance[:, Mode.DISTURBED] += (FAN_M_S * dt) ** 2
     variance[:, Mode.JUMP] += JUMP_M**2
     mean[:, Mode.FALLING] = -FALL_M_S * dt
@@ -256,7 +259,6 @@ def update(beliefs: Beliefs, interval: Interval) -> Update:
     walks = np.clip((rate_hz - STANDS_STEPS_S) / (WALKS_STEPS_S - STANDS_STEPS_S), 0.0, 1.0)
     likelihood = np.exp(-0.5 * square) / np.sqrt(total)
     likelihood[:, UNDER_WAY] *= np.exp(walks * math.log(STEPS_PENALTY))[:, None]
-    likelihood[:, Mode.COMMON] *= np.isfinite(interval.common_m)
     likelihood[:, BEGINNINGS] *= np.where(interval.walked, LIFT_AFTER_WALK, 1.0)[:, None]
     likelihood = np.where(measured, np.maximum(likelihood, 1e-200), 1.0)
     gain = np.where(measured, variance / total, 0.0)

@@ -24,6 +24,7 @@ from relpos.fusion.estimator import Episode, Vertical
 from relpos.fusion.timeline import Advance
 from relpos.fusion.vertical import episodes
 from relpos.fusion.vertical.episodes import (
+    LASTING,
     PRESSURE,
     STAIRS,
     UNDER_WAY,
@@ -270,8 +271,7 @@ class VerticalFilter:
                 np.where(absent, unseen_s, 0.0), again, np.ones(len(tracks)),
             )
         )  # fmt: skip
-        lasting = (Mode.DISTURBED, Mode.COMMON)
-        disturbed = update.beliefs.probability[:, lasting].sum(axis=1) > 0.5
+        disturbed = update.beliefs.probability[:, LASTING].sum(axis=1) > 0.5
         seen = np.flatnonzero(disturbed & news & (steps < STANDS_STEPS)).tolist()
         is_first = any(self._witnessed.get(row, -math.inf) < time_s - WITNESS_S for row in seen)
         self._witnessed.update(dict.fromkeys(seen, time_s))
@@ -305,8 +305,12 @@ class VerticalFilter:
             one.rise_m = self._height_means() - before
 
     def _common_rise(self, height_m: Floats, news: npt.NDArray[np.bool_], steps: Floats) -> Floats:
-        """Return by how much all others rose (N,): those who stand, or many alike; else NaN."""
-        stands = news & self._stands & (steps < STANDS_STEPS)
+        """Return by how much all others rose (N,): those who stand, or many alike; else NaN.
+
+        Who stood while the pressure began to change goes on to show it when walking off.
+        """
+        sees = self._beliefs.probability[:, LASTING].sum(axis=1) > 0.5
+        stands = news & (sees | (self._stands & (steps < STANDS_STEPS)))
         rise = height_m - self._heights_before
         common = _others_mean(rise, stands, 1)
         alike = _others_mean(rise, news, MANY)
@@ -353,10 +357,12 @@ class VerticalFilter:
         moving = 1.0 - modes[:, Mode.LEVEL] - disturbed
         heights = self.heights
         heights.advance(duration_s, one.rise_m, moving, disturbed, one.silent_s)
-        # Who climbs while others see the pressure change may climb that much less.
+        # Who walks and does not see the pressure change as others do may climb that much more or
+        # less.
         resting = np.maximum((1.0 - moving).sum(), 1.0)
         fan_m = abs(float((disturbed * one.rise_m).sum())) / resting
-        heights.moved(moving * (2.0 * one.reported.variance_m2 + FAN_DOUBT_M * fan_m))
+        walks = np.maximum(moving, (1.0 - disturbed) * (one.reported.steps > STANDS_STEPS))
+        heights.moved(moving * 2.0 * one.reported.variance_m2 + walks * FAN_DOUBT_M * fan_m)
         heights.correct(one.reported.height_m, one.reported.variance_m2)
         moves = (moving > 0.5) | one.again
         # Without heights nobody sees a wearer change floors: none is sure, or teaches its height.
