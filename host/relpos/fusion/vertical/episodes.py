@@ -41,23 +41,30 @@ class Mode(IntEnum):
     DOWN_TWO = 11
     COMMON = 12
     """The pressure changes for all: as those see it who stand."""
+    UP_COMMON = 13
+    """It does while the wearer climbs."""
+    DOWN_COMMON = 14
 
 
 MODES = len(Mode)
-STAIRS = (Mode.UP, Mode.DOWN, Mode.UP_TWO, Mode.DOWN_TWO)
+CLIMBS_COMMON = (Mode.UP_COMMON, Mode.DOWN_COMMON)
+STAIRS = (Mode.UP, Mode.DOWN, Mode.UP_TWO, Mode.DOWN_TWO, *CLIMBS_COMMON)
+RISERS = (1.0, -1.0, 2.0, -2.0, 1.0, -1.0)
+"""That a step goes up in each of them."""
 LIFTS = (Mode.LIFT_UP_BEGINS, Mode.LIFT_UP, Mode.LIFT_DOWN_BEGINS, Mode.LIFT_DOWN)
 BEGINNINGS = (Mode.LIFT_UP_BEGINS, Mode.LIFT_DOWN_BEGINS)
 UNDER_WAY = (*LIFTS, Mode.FALLING)
 """The wearer rises or falls without a step."""
 PRESSURE = (Mode.DISTURBED, Mode.JUMP, Mode.COMMON)
 """The pressure changes, the wearer's height does not."""
+COMMON = (Mode.COMMON, *CLIMBS_COMMON)
 LASTING = (Mode.DISTURBED, Mode.COMMON)
 """Of these, those that last."""
 
 _EPISODES: dict[Episode, tuple[Mode, ...]] = {
     Episode.LEVEL: (Mode.LEVEL,),
-    Episode.UP: (Mode.UP, Mode.UP_TWO),
-    Episode.DOWN: (Mode.DOWN, Mode.DOWN_TWO),
+    Episode.UP: (Mode.UP, Mode.UP_TWO, Mode.UP_COMMON),
+    Episode.DOWN: (Mode.DOWN, Mode.DOWN_TWO, Mode.DOWN_COMMON),
     Episode.LIFT: LIFTS,
     Episode.DISTURBED: PRESSURE,
     Episode.FALLING: (Mode.FALLING,),
@@ -116,6 +123,14 @@ _RATES_HZ: dict[tuple[Mode, Mode], float] = {
     (Mode.DOWN_TWO, Mode.LEVEL): 1 / 7,
     (Mode.DOWN_TWO, Mode.DOWN): 1 / 20,
     (Mode.DOWN_TWO, Mode.FALLING): 1 / 500,
+    (Mode.COMMON, Mode.UP_COMMON): 1 / 90,
+    (Mode.COMMON, Mode.DOWN_COMMON): 1 / 90,
+    (Mode.UP, Mode.UP_COMMON): 1 / 400,
+    (Mode.DOWN, Mode.DOWN_COMMON): 1 / 400,
+    (Mode.UP_COMMON, Mode.UP): 1 / 6,
+    (Mode.DOWN_COMMON, Mode.DOWN): 1 / 6,
+    (Mode.UP_COMMON, Mode.COMMON): 1 / 7,
+    (Mode.DOWN_COMMON, Mode.COMMON): 1 / 7,
     (Mode.COMMON, Mode.LEVEL): 1 / 6,
     (Mode.COMMON, Mode.UP): 1 / 100,
     (Mode.COMMON, Mode.DOWN): 1 / 100,
@@ -148,7 +163,8 @@ def _transition(duration_s: float, witnessed: bool) -> Floats:
     """Return the probabilities (MODES, MODES) from row to column over an interval."""
     rates = np.zeros((MODES, MODES))
     for (before, after), rate_hz in _RATES_HZ.items():
-        rates[before, after] = rate_hz * (WITNESSED if witnessed and after is Mode.COMMON else 1.0)
+        begins = after in COMMON and before not in COMMON
+        rates[before, after] = rate_hz * (WITNESSED if witnessed and begins else 1.0)
     leaves = rates.sum(axis=1)
     share = np.where(leaves > 0.0, (1.0 - np.exp(-leaves * duration_s)) / leaves, 0.0)
     matrix: Floats = rates * share[:, None]
@@ -214,7 +230,7 @@ def _rise(interval: Interval) -> tuple[Floats, Floats]:
     steps, dt = interval.steps, interval.since_s
     mean = np.zeros((len(steps), MODES))
     variance = np.repeat(LEVEL_M**2 * dt[:, None], MODES, axis=1)
-    for mode, risers in zip(STAIRS, (1.0, -1.0, 2.0, -2.0), strict=True):
+    for mode, risers in zip(STAIRS, RISERS, strict=True):
         mean[:, mode] = risers * RISER_M * steps
         variance[:, mode] += (SIGMA_RISER_M * risers) ** 2 * (steps**2 + 1.0)
     for mode in LIFTS:
@@ -222,8 +238,9 @@ def _rise(interval: Interval) -> tuple[Floats, Floats]:
         mean[:, mode] = (LIFT_M_S if up else -LIFT_M_S) * dt
         variance[:, mode] += (SIGMA_LIFT_M_S * dt) ** 2
     unknown = np.isnan(interval.common_m)
-    mean[:, Mode.COMMON] = np.where(unknown, 0.0, interval.common_m)
-    variance[:, Mode.COMMON] += (np.where(unknown, FAN_M_S, COMMON_M_S) * dt) ** 2
+    for mode in (Mode.COMMON, *CLIMBS_COMMON):
+        mean[:, mode] += np.where(unknown, 0.0, interval.common_m)
+        variance[:, mode] += (np.where(unknown, FAN_M_S, COMMON_M_S) * dt) ** 2
     variance[:, Mode.DISTURBED] += (FAN_M_S * dt) ** 2
     variance[:, Mode.JUMP] += JUMP_M**2
     mean[:, Mode.FALLING] = -FALL_M_S * dt

@@ -24,6 +24,7 @@ from relpos.fusion.estimator import Episode, Vertical
 from relpos.fusion.timeline import Advance
 from relpos.fusion.vertical import episodes
 from relpos.fusion.vertical.episodes import (
+    CLIMBS_COMMON,
     LASTING,
     PRESSURE,
     STAIRS,
@@ -121,6 +122,13 @@ class _Interval:
     """Whose height came after a while without."""
     factor: Floats
     """By what the displacements have been multiplied so far."""
+
+    def pressed_m(self, modes: Floats) -> Floats:
+        """Return how much of a climber's rise is the pressure's (N,), by the modes (N, MODES)."""
+        pressed: Floats = modes[:, CLIMBS_COMMON].sum(axis=1) * np.nan_to_num(
+            self.reported.common_m
+        )
+        return pressed
 
 
 @dataclass(slots=True)
@@ -325,7 +333,12 @@ class VerticalFilter:
     def _corrections(self) -> list[Correction]:
         """Take back what the open intervals claim too much of, as far as that is known."""
         stairs = np.array([p[:, STAIRS].sum(axis=1) for p in self._smoothed])
-        rise = np.abs(sum(p * one.rise_m for p, one in zip(stairs, self._open, strict=True)))
+        rise = np.abs(
+            sum(
+                p * one.rise_m - one.pressed_m(modes)
+                for p, one, modes in zip(stairs, self._open, self._smoothed, strict=True)
+            )
+        )
         way = sum(p * one.way_m for p, one in zip(stairs, self._open, strict=True))
         steps = sum(p * one.reported.steps for p, one in zip(stairs, self._open, strict=True))
         true_m = way_on_stairs(steps, rise, way)
@@ -356,7 +369,8 @@ class VerticalFilter:
         disturbed = modes[:, PRESSURE].sum(axis=1)
         moving = 1.0 - modes[:, Mode.LEVEL] - disturbed
         heights = self.heights
-        heights.advance(duration_s, one.rise_m, moving, disturbed, one.silent_s)
+        pressed_m = one.pressed_m(modes)
+        heights.advance(duration_s, one.rise_m, moving, disturbed, one.silent_s, pressed_m)
         # Who walks and does not see the pressure change as others do may climb that much more or
         # less.
         resting = np.maximum((1.0 - moving).sum(), 1.0)
@@ -370,7 +384,8 @@ class VerticalFilter:
         self._level_s = np.where(unseen, 0.0, self._level_s + duration_s)
         self._level_steps = np.where(moves, 0.0, self._level_steps + one.reported.steps)
         self._settled &= ~unseen
-        self._pressed_m = np.where(self._settled, 0.0, self._pressed_m + disturbed * one.rise_m)
+        pressed_m = pressed_m + disturbed * one.rise_m
+        self._pressed_m = np.where(self._settled, 0.0, self._pressed_m + pressed_m)
         self._locate()
         if self.decided is not None:
             for node, row in self._row.items():
@@ -412,8 +427,9 @@ class VerticalFilter:
         for one, modes in zip(self._open, self._smoothed, strict=True):
             moving = 1.0 - modes[row, Mode.LEVEL] - modes[row, PRESSURE].sum()
             rise = one.rise_m[row]
-            z_m += moving * rise
-            climbed += modes[row, STAIRS].sum() * rise
+            pressed_m = one.pressed_m(modes)[row]
+            z_m += moving * rise - pressed_m
+            climbed += modes[row, STAIRS].sum() * rise - pressed_m
             variance_m2 += moving * (1.0 - moving) * rise * rise
             variance_m2 += UNSEEN_M**2 * one.silent_s[row]
         # With the news of one more interval, where there is one.

@@ -64,20 +64,26 @@ class Heights:
         self.covariance = np.concatenate([self.covariance, first[None]])
 
     def advance(
-        self, duration_s: float, rise_m: Floats, moving: Floats, disturbed: Floats, silent: Floats
+        self,
+        duration_s: float,
+        rise_m: Floats,
+        moving: Floats,
+        disturbed: Floats,
+        silent: Floats,
+        pressed_m: Floats,
     ) -> None:
         """Go on by an interval.
 
         ``rise_m`` (N,) is how much the reported height rose, ``moving`` and ``disturbed`` (N,) the
         probabilities that the wearer did, or the pressure alone; ``silent`` (N,) for how much of
-        the interval (s) no height came.
+        the interval (s) no height came. ``pressed_m`` of a climber's rise is the pressure's.
         """
         level = 1.0 - moving - disturbed
         drifting = level > 0.8
         if drifting.any():
             self.common_m += float(rise_m[drifting].sum() / max(drifting.sum(), 0.5 * len(level)))
-        self.mean[:, Z] += moving * rise_m
-        self.mean[:, SLOW] += disturbed * rise_m
+        self.mean[:, Z] += moving * rise_m - pressed_m
+        self.mean[:, SLOW] += disturbed * rise_m + pressed_m
         kept = math.exp(-duration_s / FAST_S)
         self.mean[:, FAST] *= kept
         p, square = self.covariance, rise_m * rise_m
