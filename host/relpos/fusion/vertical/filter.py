@@ -60,8 +60,8 @@ TWO_STEPS_M = 0.26
 LEAST_CORRECTION_M = 0.02
 
 LEAST_CLIMB_M = 0.85
-"""Less within ``LAG_S`` is told as level: gusts, a door of 10 Pa. Seeds 100 to 102 of doors and heat:
-0.45 m tells 8.0 false flights an hour, 0.7 m 4.5, 0.9 m 2.0 and finds 96 % of the true ones."""
+"""Less within ``LAG_S`` is told as level: gusts, a door of 10 Pa. With doors and heat (seeds 100 to
+102) 0.45 m tells 8.0 false flights an hour, 0.7 m 4.5, 0.9 m 2.0, and finds 96 % of true ones."""
 
 WITNESS_S = 5.0
 """Pressure that jumps at one node may do so at others for so long."""
