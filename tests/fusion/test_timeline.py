@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from relpos.errors import DataError
 from relpos.fusion.timeline import Advance, Displacement, Epoch, Ranging, Step, Timeline
-from relpos.measurements import Measurement, Motion, Range
+from relpos.measurements import Heading, Measurement, Motion, Range
 
 Pose = tuple[float, float, float]
 
@@ -198,3 +198,59 @@ def test_a_run_that_begins_before_zero_takes_its_first_motion_at_its_time() -> N
         (-1.5, 0.5, 2.0),
         (-1.0, 0.5, 2.0),
     ]
+
+
+def rounds(count: int) -> list[Measurement]:
+    """Of two nodes, in order of time: a range, two headings, their motions at 1.75, 2.75 s ..."""
+    of_all: list[Measurement] = []
+    for k in range(1, 1 + count):
+        of_all += [
+            Range(k + 0.25, 1, 2, 3.0),
+            Heading(k + 0.5, 2, 0.2, 0.1, "phone"), Heading(k + 0.5, 1, 0.1, 0.1, "phone"),
+            Motion(k + 0.75, 1, 0.5, 0.0, 0.1), Motion(k + 0.75, 2, 0.5, 0.0, 0.1),
+        ]  # fmt: skip
+    return of_all
+
+
+def test_taking_in_gives_the_steps_of_pushing_and_says_when_there_are_any() -> None:
+    taking, pushing = (Timeline((1, 2), 0.75, keep_late=True) for _ in range(2))
+    for measurement in rounds(6):
+        certain = taking.take_in(measurement)
+        steps = list(taking.push_all(()))
+        assert steps == pushing.push(measurement)
+        assert certain or not steps
+    assert taking.finish() == pushing.finish()
+    assert not taking.late, "what comes in order is called late"
+
+
+def test_only_what_may_give_steps_is_worked_off() -> None:
+    timeline = Timeline((1, 2), 0.75)
+    steps: list[Step] = []
+    for measurement in rounds(6):
+        if timeline.take_in(measurement):
+            steps += timeline.push_all(())
+    assert [s.time_s for s in steps if isinstance(s, Epoch)] == [1.75, 2.75, 3.75, 4.75, 5.75]
+
+
+def test_measurements_of_one_instant_give_the_same_steps_in_any_order() -> None:
+    ordered = rounds(4)
+    backwards = sorted(ordered, key=lambda m: (m.time_s, -m.node, -ordered.index(m)))
+    assert run(Timeline((1, 2), 0.75), backwards) == run(Timeline((1, 2), 0.75), ordered)
+
+
+def test_what_is_as_old_as_the_bound_is_waited_for_no_longer() -> None:
+    timeline = Timeline((1,), reorder_s=0.5)
+    assert timeline.push(Motion(1.0, 1, 1.0, 0.0, 0.0)) == []
+    assert timeline.push(Motion(1.5, 1, 1.0, 0.0, 0.0)) != []
+
+
+def test_a_late_displacement_is_late_from_its_beginning() -> None:
+    timeline = Timeline((1, 2), reorder_s=0.0, max_lag_s=1.0, keep_late=True)
+    for time_s in (1.0, 2.0, 3.0, 6.0, 9.0):
+        timeline.push(Motion(time_s, 1, 1.0, 0.0, 0.0))
+    for time_s in (3.0, 8.0, 5.0):
+        timeline.push(Motion(time_s, 2, 1.0, 0.0, 0.0))
+    timeline.push(Motion(10.0, 1, 1.0, 0.0, 0.0))
+    timeline.push(Motion(2.0, 2, 1.0, 0.0, 0.0))
+    found = [(late.since_s, late.time_s) for late in timeline.late]
+    assert found == [(0.0, 3.0), (3.0, 8.0), (3.0, 5.0), (-math.inf, 2.0)]

@@ -152,7 +152,7 @@ def open_house(directory):
         board="{}",
         timeline="",
     )
-    access = Access(8460, ("localhost",))
+    access = Access(8460, ("localhost",), token="a-token-of-this-house")
     pages = Pages(session, access)
     assert pages._allowances.keys() == ALLOWED.keys()
     for allowance in pages._allowances.values():

@@ -85,6 +85,8 @@ def test_no_body_of_any_route_ends_a_session(house, bodies):
     @given(requests)
     @example(("/api/replay", b"{}"))
     @example(("/api/rollcall", b'{"action": "start", "within_s": 1' + b"0" * 400 + b"}"))
+    @example(("/api/board", b'{"node": 1, "x": 1e999}'))
+    @example(("/api/board", b'{"node": 1, "x": ' + b"[" * 900 + b"]" * 900 + b"}"))
     @settings(max_examples=bodies, suppress_health_check=list(HealthCheck))
     def visit(sent):
         path, content = sent
@@ -106,6 +108,16 @@ def test_no_method_of_any_route_ends_a_session(house, method, path):
     assert answer.status_code in {200, 307, 404, 405, 503}
     assert b"import" not in answer.content[:2000] or "static" not in path
     assert not house.live._failed
+
+
+@pytest.mark.parametrize(
+    ("host", "origin"),
+    [(b"localhost:8460", b"http://localhos[:8460"), (b"[::1", b""), (b"[localhost]", b""),
+     (b"[1.2.3.4]:8460", b""), (b"", b"")],
+)  # fmt: skip
+def test_a_host_or_origin_that_is_no_address_is_refused(house, host, origin):
+    head = [(b"host", host), (b"origin", origin)]
+    assert house.meet("/ws", b"token=a-token-of-this-house", head, []) == ["websocket.close"]
 
 
 @pytest.mark.parametrize("message", [{"text": "[" * 1000}, {"bytes": b"\xff"}, {"text": "\ud800"}])

@@ -74,14 +74,20 @@ class Access:
 
         A name of somebody else's that leads here (DNS rebinding) would make their page ours.
         """
-        name = host.rpartition(":")[0] if re.search(r":\d*$", host) else host
-        name = name.strip("[]").lower().removesuffix(".local")
-        if name in ("localhost", *(h.lower().removesuffix(".local") for h in self.hosts)):
+        found = re.fullmatch(r"(?:\[(.*)\]|([^\[\]:]*))(?::\d*)?", host)
+        if found is None:
+            return False
+        name = (found[1] or found[2] or "").lower().removesuffix(".local")
+        if not found[1] and name in (
+            "localhost",
+            socket.gethostname().lower(),
+            *(h.lower().removesuffix(".local") for h in self.hosts),
+        ):
             return True
         try:
-            return bool(ipaddress.ip_address(name))
+            return ipaddress.ip_address(name).version == (6 if found[1] else 4)
         except ValueError:
-            return name == socket.gethostname().lower()
+            return False
 
     def fits(self, token: str | None) -> bool:
         """Whether it is this session's; takes the same time whatever it is."""

@@ -9,7 +9,10 @@ from typing import Any
 
 from starlette.requests import Request
 
+from relpos.live.team_view import to_json
+
 MAX_BODY_BYTES = 1 << 20
+MAX_DEPTH = 8
 MAX_ITEMS = 2000
 """Presses, or headings, of one request."""
 
@@ -33,11 +36,27 @@ async def read_body(request: Request) -> dict[str, Any]:
     data = await read_received(request, MAX_BODY_BYTES, f"more than {MAX_BODY_BYTES} bytes")
     try:
         body = json.loads(data)
+        if _depth_exceeds(body, MAX_DEPTH):
+            raise BadRequestError("nested too deeply")
+        to_json(body)  # Python reads NaN, Infinity and 1e999, which JSON has not.
     except (ValueError, RecursionError):  # The latter by lists within lists.
         raise BadRequestError("not JSON") from None
     if not isinstance(body, dict):
         raise BadRequestError("not a JSON object")
     return body
+
+
+def _depth_exceeds(document: Any, most: int) -> bool:
+    """Return whether more than so many lists and objects are within each other."""
+    level = [document]
+    for _ in range(most + 1):
+        level = [
+            inner
+            for outer in level
+            if isinstance(outer, dict | list)
+            for inner in (outer.values() if isinstance(outer, dict) else outer)
+        ]
+    return bool(level)
 
 
 def node_of(body: Mapping[str, Any]) -> int:

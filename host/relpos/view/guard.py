@@ -6,7 +6,7 @@ import re
 import time
 from collections.abc import Mapping
 from typing import Any, Protocol
-from urllib.parse import parse_qsl, urlencode, urlsplit
+from urllib.parse import parse_qsl, urlencode
 
 from starlette.datastructures import MutableHeaders
 from starlette.requests import HTTPConnection
@@ -121,7 +121,11 @@ class TokenMiddleware:
             response: Response = HTMLResponse(REFUSED, 401)
         elif new and scope["path"] in ("/", "/phone"):
             # The address bar, histories and screenshots then show no token.
-            rest = [(k, v) for k, v in parse_qsl(asking.url.query) if k != "token"]
+            rest = [
+                (k, v)
+                for k, v in parse_qsl(scope["query_string"].decode("latin-1"))
+                if k != "token"
+            ]
             response = RedirectResponse(scope["path"] + ("?" + urlencode(rest)) * bool(rest), 303)
         else:
             await self._app(scope, receive, send)
@@ -146,7 +150,7 @@ def role_of(asking: HTTPConnection) -> Role:
 
 def needed_role(asking: HTTPConnection) -> Role:
     """Return the role that a request needs: looking needs none but the first."""
-    if asking.url.path in COMMANDS:
+    if asking.scope["path"] in COMMANDS:
         return Role.COMMAND
     posts = asking.scope["type"] == "http" and asking.scope["method"] == "POST"
     return Role.ACKNOWLEDGE if posts else Role.LOOK
@@ -155,7 +159,7 @@ def needed_role(asking: HTTPConnection) -> Role:
 def _own_page(asking: HTTPConnection) -> bool:
     """Return whether the request is from our own page, by its Origin header."""
     origin = asking.headers.get("origin")
-    return origin is None or urlsplit(origin).netloc == asking.headers.get("host")
+    return origin is None or origin.partition("://")[2] == asking.headers.get("host")
 
 
 def _with_headers(send: Send, asking: HTTPConnection) -> Send:
