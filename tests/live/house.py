@@ -14,11 +14,10 @@ from relpos.live.files import FileSink
 from relpos.live.inputs import PacedInput
 from relpos.live.requests import Request
 from relpos.live.team_view import to_json
-from relpos.live.tracks import Tracks
 from relpos.measurements import common_priors
 from relpos.runs import Description
 from relpos.view.access import Access
-from relpos.view.server import ALLOWED, Pages
+from relpos.view.server import ALLOWED, Pages, SessionProxy
 
 STARTED_UNIX_S = time.time() - 100.0
 BASE = "http://localhost:8460"
@@ -61,8 +60,12 @@ class NowInput(PacedInput):
         return time.time() - STARTED_UNIX_S
 
 
-class DirectSession(SimpleNamespace):
+class DirectSession(SessionProxy):
     """What the serving process sees of the session, without the two processes between them."""
+
+    def __init__(self, live, phones):
+        super().__init__(None, None)
+        self.live, self.phones = live, phones
 
     async def ask(self, kind, body):
         line = to_json({"id": 1, "kind": kind, "unix_s": time.time(), "body": body}).encode()
@@ -139,19 +142,7 @@ def open_house(directory):
     live, album = make_session(
         NowInput(), lambda p: fusion.make("deadreckoning", p), visitors, priors=common_priors((1,))
     )
-    session = DirectSession(
-        live=live,
-        phones=visitors,
-        hello=None,
-        view=None,
-        names={},
-        over=False,
-        tracks=Tracks(),
-        devices={},
-        log=[],
-        board="{}",
-        timeline="",
-    )
+    session = DirectSession(live, visitors)
     access = Access(8460, ("localhost",), token="a-token-of-this-house")
     pages = Pages(session, access)
     assert pages._allowances.keys() == ALLOWED.keys()

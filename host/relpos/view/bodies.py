@@ -9,8 +9,6 @@ from typing import Any
 
 from starlette.requests import Request
 
-from relpos.live.team_view import to_json
-
 MAX_BODY_BYTES = 1 << 20
 MAX_DEPTH = 8
 MAX_ITEMS = 2000
@@ -38,7 +36,6 @@ async def read_body(request: Request) -> dict[str, Any]:
         body = json.loads(data)
         if _depth_exceeds(body, MAX_DEPTH):
             raise BadRequestError("nested too deeply")
-        to_json(body)  # Python reads NaN, Infinity and 1e999, which JSON has not.
     except (ValueError, RecursionError):  # The latter by lists within lists.
         raise BadRequestError("not JSON") from None
     if not isinstance(body, dict):

@@ -449,7 +449,10 @@ class Pages:
         visitor = request.client.host if request.client else ""
         if not self._allowances[kind].take(visitor, max(items, 1)):
             return JSONResponse({"error": "too many at once; try again in a minute"}, 429)
-        answer = await self.session.ask(kind, body)
+        try:
+            answer = await self.session.ask(kind, body)
+        except ValueError:  # Python reads NaN and 1e999, and does not write them.
+            raise BadRequestError("a number that JSON does not have") from None
         if answer is None:
             return JSONResponse({"error": "the session does not answer; try again"}, 503)
         return JSONResponse(answer["reply"], answer.get("status", 200))
