@@ -14,12 +14,15 @@ from team_input import TeamInput, make_session
 from relpos import fusion
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DataError
+from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
+from relpos.live.fusion_thread import FusionThread
 from relpos.live.inputs import Received
 from relpos.live.mission import JOURNAL, Journal, Mission, MissionFiles, read_again
 from relpos.live.requests import Request
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert
 from relpos.live.tracks import Tracks
+from relpos.measurements import Motion
 
 
 class Visitors(Sink):
@@ -193,3 +196,51 @@ def test_only_its_owner_can_read_the_key(tmp_path):
     assert (mission.path / "secret.key").stat().st_mode & 0o077 == 0
     assert Mission.open(mission.path).key == mission.key
     assert len(mission.key) == 32
+
+
+class Failing:
+    """Estimates at every fourth second, and fails at second 6, or at 6 and 8."""
+
+    def __init__(self, fails_s):
+        self.fails_s = fails_s
+        self.processed_s = []
+
+    def process(self, measurement):
+        if measurement.time_s in self.fails_s:
+            raise ZeroDivisionError("a matrix")
+        self.processed_s.append(measurement.time_s)
+        if measurement.time_s % 4:
+            return []
+        at = NodeEstimate(1, measurement.time_s, 0.0, 0.1, 0.5, 0.4, 0.0, 0.2, NodeStatus.OK)
+        return [Estimate(measurement.time_s, (at,), ())]
+
+    def finish(self):
+        return []
+
+    def counters(self):
+        return {}
+
+
+@pytest.mark.parametrize("fails_s", [(6.0,), (6.0, 8.0)])
+def test_an_estimator_that_fails_in_a_mission_goes_on_from_its_last_estimate_but_once(fails_s):
+    made = []
+
+    def make(priors):
+        made.append((tuple(priors), Failing(fails_s)))
+        return made[-1][1]
+
+    thread = FusionThread(make, restarts=True)
+    for second in range(1, 13):
+        thread.submit([Motion(float(second), 1, 1.0, 0.0, 0.0, 0.1, 0.1, 0.1)])
+    thread.finish()
+    assert thread.join(20.0)
+    (_, first), (priors, second) = made
+    assert first.processed_s == [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert [(p.node, p.x_m) for p in priors] == [(1, 4.0)]
+    times = [fused.estimate.time_s for fused in thread.poll()]
+    if len(fails_s) == 1:
+        assert second.processed_s == [5.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0]
+        assert (times, thread.failure) == ([4.0, 8.0, 12.0], None)
+    else:
+        assert isinstance(thread.failure, ZeroDivisionError)
+        assert times == [4.0]

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Page, expect
 from stage import wait_for
+from test_plan_and_markers import click, png
 
 from relpos.live.mission import Mission
 
@@ -162,4 +163,49 @@ def test_what_was_confirmed_is_there_again_five_seconds_after_a_kill(
     presses = [e for e in Mission.open(field.folder).events() if e["kind"] == "presses"]
     assert sorted(len(e["ids"]) for e in presses) == [1, 1]
     assert ["p1"] in [e["ids"] for e in presses]
+    context.close()
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("killed", ["session", "server"])
+def test_a_plan_that_is_being_aligned_is_aligned_after_a_kill_with_plan_and_markers_kept(
+    browser: Any, field: Field, tmp_path: Path, killed: str
+) -> None:
+    context = browser.new_context(viewport={"width": 1366, "height": 768})
+    page: Page = context.new_page()
+    page.goto(field.address)
+    expect(page.locator("#people li")).to_have_count(3)
+    page.locator("#layers summary").click()
+    (tmp_path / "plan.png").write_bytes(png(600, 400))
+    page.locator("#plan-file").set_input_files(tmp_path / "plan.png")
+    expect(page.locator("#plan-align")).to_be_enabled()
+    page.locator("#marker-place").click()
+    page.keyboard.press("Enter")
+    expect(page.locator("#markers li")).to_have_count(1)
+    page.locator("#layers summary").click()
+    page.locator("#plan-align").click()
+    status = page.locator("#ground-status")
+    click(page, 400, 300)
+    expect(status).to_contain_text("is on the map")
+    click(page, 400, 300)
+    expect(status).to_contain_text("2")
+    field.kill(killed)
+    back_s = time.monotonic()
+    wait_for(lambda: page.locator("#link").is_hidden() and "live" in str(
+        page.locator("#connection").get_attribute("data-state")))  # fmt: skip
+    print(f"{killed}: back after {time.monotonic() - back_s:.1f} s")
+    assert time.monotonic() - back_s < BACK_S
+    # The points that were clicked so far are still there.
+    expect(status).to_contain_text("2")
+    click(page, 700, 500)
+    expect(status).to_contain_text("is on the map")
+    click(page, 700, 500)
+    plans = [e for e in Mission.open(field.folder).events() if e["kind"] == "plan"]
+    wait_for(lambda: any("points" in e for e in Mission.open(field.folder).events()))
+    assert [e["action"] for e in plans][:1] == ["set"]
+    expect(page.locator("#markers li")).to_have_count(1)
+    other: Page = context.new_page()
+    other.goto(field.address.partition("?")[0])
+    expect(other.locator("#plan-remove")).to_be_enabled()
+    expect(other.locator("#markers li")).to_have_count(1)
     context.close()

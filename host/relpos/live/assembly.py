@@ -80,7 +80,9 @@ def run_session(
         recorded_unix_s=source.recorded_unix_s,
         mission=plan.mission is not None,
     )
-    fusion = FusionThread(plan.make_estimator, plan.priors, common=plan.common)
+    fusion = FusionThread(
+        plan.make_estimator, plan.priors, common=plan.common, restarts=plan.mission is not None
+    )
     files = FileSink(plan.out, plan.description, keep_received=source.is_now)
     nodes = plan.description.nodes
     sinks: list[Sink] = [files, *(make(hello) for make in make_sinks)]

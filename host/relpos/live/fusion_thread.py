@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from relpos.errors import RelposError
-from relpos.fusion.estimator import Estimate, Estimator
+from relpos.fusion.estimator import Estimate, Estimator, NodeStatus
 from relpos.fusion.linear_algebra import one_thread
 from relpos.measurements import (
     Heading,
@@ -30,6 +30,9 @@ from relpos.measurements import (
 
 GATHER_S = 3.0
 """A node reports its motion every second; with two losses in a row it has still been received."""
+
+RESTART_S = 10.0
+"""An estimator that fails again so soon fails for good."""
 
 MakeEstimator = Callable[[Sequence[Prior]], Estimator]
 
@@ -55,18 +58,41 @@ def common_start(observations: Sequence[Observation]) -> list[Prior]:
     return list(common_priors(nodes))
 
 
+def known_poses(estimate: Estimate) -> list[Prior]:
+    """Return where everybody was whose place was one; others are found anew by ranges."""
+    return [
+        Prior(n.node, n.x_m, n.y_m, n.heading_rad, n.sigma_major_m, n.sigma_heading_rad)
+        for n in estimate.nodes
+        if n.status in (NodeStatus.OK, NodeStatus.STALE, NodeStatus.LOST)
+    ]
+
+
 class FusionThread:
     """Runs the estimator that ``make(priors)`` returns, in its own thread.
+
+    With ``restarts`` an estimator that fails is made anew where the team was by its last estimate.
 
     With ``common`` all nodes received in the first :data:`GATHER_S` start at one common pose;
     observations wait until these nodes are known.
     """
 
     def __init__(
-        self, make: MakeEstimator, priors: Sequence[Prior] = (), *, common: bool = False
+        self,
+        make: MakeEstimator,
+        priors: Sequence[Prior] = (),
+        *,
+        common: bool = False,
+        restarts: bool = False,
     ) -> None:
         self._make = make
         self._priors = tuple(priors)
+        self._restarts = restarts
+        self.restarted: list[Exception] = []
+        """Why the estimator was made anew."""
+        self._restarted_s = -math.inf
+        self._last: Estimate | None = None
+        self._since: list[Measurement] = []
+        """What was processed after the last estimate."""
         self._gathering: list[Observation] | None = [] if common else None
         self._processed = 0
         self._inbox: queue.SimpleQueue[Sequence[Observation] | None] = queue.SimpleQueue()
@@ -161,10 +187,30 @@ class FusionThread:
         if not isinstance(observation, Motion | Range | Height | Heading):
             return
         measurement: Measurement = observation
-        self._emit(self._estimator.process(measurement))
+        try:
+            estimates = self._estimator.process(measurement)
+        except Exception as error:
+            self._restart(error, measurement.time_s)
+        else:
+            self._since.append(measurement)
+            self._emit(estimates)
         if isinstance(measurement, Motion | Range):
             self.newest_s = max(self.newest_s, measurement.time_s)
 
+    def _restart(self, error: Exception, time_s: float) -> None:
+        """Make the estimator anew without the measurement that it failed on; else raise."""
+        last = self._last
+        if not self._restarts or last is None or time_s < self._restarted_s + RESTART_S:
+            raise error
+        self._restarted_s = time_s
+        self._estimator = self._make(known_poses(last))
+        for measurement in self._since:
+            self._emit(self._estimator.process(measurement))
+        self.restarted.append(error)
+
     def _emit(self, estimates: Sequence[Estimate]) -> None:
+        if estimates:
+            self._last = estimates[-1]
+            self._since = [m for m in self._since if m.time_s > self._last.time_s]
         for estimate in estimates:
             self._outbox.append(FusedEstimate(estimate, self._processed))

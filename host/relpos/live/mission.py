@@ -23,6 +23,7 @@ from typing import Any
 
 from relpos.errors import DataError
 from relpos.fusion.estimator import Estimate, NodeStatus
+from relpos.live.fusion_thread import known_poses
 from relpos.live.inputs import Received
 from relpos.live.sinks import Sink
 from relpos.live.team_view import LogEntry, TeamView, to_json
@@ -277,12 +278,7 @@ class MissionFiles(Sink):
         if estimate.time_s < self._checkpoint_s + CHECKPOINT_S:
             return
         self._checkpoint_s = estimate.time_s
-        # A place among several, or none, is found anew by ranges to those who are known.
-        priors = [
-            asdict(Prior(n.node, n.x_m, n.y_m, n.heading_rad, n.sigma_major_m, n.sigma_heading_rad))
-            for n in estimate.nodes
-            if n.status in (NodeStatus.OK, NodeStatus.STALE, NodeStatus.LOST)
-        ]
+        priors = [asdict(prior) for prior in known_poses(estimate)]
         try:
             if self._lines:
                 with (self._path / TRACKS).open("a", encoding="utf-8") as file:

@@ -348,6 +348,15 @@ class LiveSession:
             )
             self.post("fusion", Level.ALARM, text)
             return
+        while self._fusion.restarted:
+            error = self._fusion.restarted.pop()
+            text = Said(
+                "fusion-restarted",
+                "the fusion has failed ({failure}) and was started again",
+                failure=repr(error),
+            )
+            self.post("fusion-restarted", Level.ALARM, text)
+            self._notices.expire("fusion-restarted")
         newest_s, first_s, behind_s = self._composer.newest_s, self._composer.first_s, 0.0
         if newest_s is not None and first_s is not None:
             behind_s = newest_s - max(self._fusion.newest_s, first_s)
