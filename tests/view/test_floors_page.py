@@ -48,6 +48,15 @@ def test_floors_are_switched_and_people_elsewhere_are_not_selected_away(visit, s
     words = "Floor 2: Dmitri, Emil. Floor 1: Chloé. Floor 0: Anna, Ben"
     expect(section).to_have_attribute("aria-label", words)
     shot(page, "floors")
+    # A name of the chosen floor is everybody's, and goes with the mission.
+    page.get_by_label("Name of this floor").fill("attic")
+    page.keyboard.press("Enter")
+    expect(buttons.nth(1)).to_have_text("attic (2)")
+    expect(page.locator("#people li[data-node='4'] .state")).to_contain_text("attic")
+    assert stage.board.floors == {2: "attic"}
+    shot(page, "named-floor")
+    page.get_by_label("Name of this floor").fill("")
+    page.keyboard.press("Enter")
     # Nobody is left on the floor that is shown: it stays shown until another is chosen.
     stage.team.floors = dict.fromkeys(range(1, 7), 0)
     expect(buttons).to_have_text(["All floors", "Floor 2 (0)", "Floor 0 (6)"])

@@ -45,7 +45,7 @@ STATE_WORDS = {
     "withdrawing": Said("withdrawing", "{whom}state withdrawing", whom=""),
     "out": Said("out", "{whom}state out", whom=""),
 }
-BOARD_EVENTS = ("board", "rollcall", "mayday", "evacuate", "marker", "plan")
+BOARD_EVENTS = ("board", "rollcall", "mayday", "evacuate", "marker", "plan", "floor")
 SIGNS = {
     "entrance": Said("marked-entrance", "{whom}marker set: entrance", whom=""),
     "exit": Said("marked-exit", "{whom}marker set: exit", whom=""),
@@ -55,6 +55,7 @@ SIGNS = {
 }
 MOST_MARKERS = 500
 FARTHEST_M = 1e5
+MOST_FLOORS = 100
 
 
 class BoardError(ValueError):
@@ -128,6 +129,8 @@ class Board:
     evacuation: Evacuation | None = None
     markers: dict[str, Marker] = field(default_factory=dict)
     plan: Plan | None = None
+    floors: dict[int, str] = field(default_factory=dict)
+    """What people call a floor; 0 is the start's."""
 
     def to_message(self) -> dict[str, Any]:
         """Return the message ``board`` of the page's protocol."""
@@ -247,6 +250,21 @@ class Board:
             raise BoardError("action: set, align (with two or three points) or remove")
         self.plan.points = [_numbers(point, 4) for point in points]
         return Said("aligned", "{whom}the plan is aligned", whom="") if len(points) > 1 else ""
+
+    def _floor(self, event: Mapping[str, Any]) -> str:
+        floor, name = event.get("floor"), event.get("name")
+        if not isinstance(floor, int) or abs(floor) > MOST_FLOORS:
+            raise BoardError(f"floor: not a number from -{MOST_FLOORS} to {MOST_FLOORS}")
+        if not isinstance(name, str) or len(name) > MAX_TEXT or not (name + " ").isprintable():
+            raise BoardError(f"name: not at most {MAX_TEXT} printable characters")
+        if name.strip():
+            self.floors[floor] = name.strip()
+            words = Said("floor-named", "{whom}floor {floor} is {name}", whom="", floor="", name="")
+            return words.filled(floor=str(floor), name=name.strip())
+        self.floors.pop(floor, None)
+        return Said("floor-unnamed", "{whom}floor {floor} has no name", whom="", floor="").filled(
+            floor=str(floor)
+        )
 
     def _mayday(self, event: Mapping[str, Any]) -> str:
         if event.get("on"):

@@ -57,7 +57,8 @@ LEAST_TREAD_M = 0.22
 TWO_STEPS_M = 0.26
 """A rise by so much is two steps."""
 
-LEAST_CORRECTION_M = 0.02
+LEAST_CORRECTION_M = 0.05
+"""One outlier of the pressure claims 0.02 m on level ground."""
 
 LEAST_CLIMB_M = 0.85
 """Less within ``LAG_S`` is told as level: gusts, a door of 10 Pa. With doors and heat (seeds 100 to

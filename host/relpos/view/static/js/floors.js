@@ -14,6 +14,19 @@ const PALE = 0.45;
 /** Height of the section that is shown at least. */
 const LEAST_M = 4;
 
+/** What people call a floor. */
+let names = {};
+export function nameFloors(given = {}) {
+  names = given;
+}
+
+/** "basement", or "floor -1" where nobody has named it. */
+export function floorWords(floor) {
+  return names[floor] ?? t("state.floor", { floor });
+}
+
+const titleOf = (floor) => names[floor] ?? t("floors.title", { floor });
+
 /** The floor that a person is on, 0 being the start's; null where it is not known. */
 export function floorOf(person) {
   return Number.isInteger(person?.floor) && (person.floor_probability ?? 1) >= LEAST ? person.floor : null;
@@ -42,10 +55,16 @@ export function floorsOf(people) {
 }
 
 export class Floors {
-  /** `changed` is called when another floor is chosen. */
-  constructor(team, changed) {
+  /** `changed` is called when another floor is chosen, `name` gets a floor and what it is called. */
+  constructor(team, changed, name) {
     this.team = team;
     this.changed = changed;
+    /** What the chosen floor is called: a field below the buttons. */
+    this.field = make("input", { type: "text", maxlength: "40" });
+    this.field.addEventListener("change", () => {
+      name(this.chosen, this.field.value);
+      this.field.blur();
+    });
     /** The chosen floor; null: all. */
     this.chosen = null;
     this.buttons = byId("floors");
@@ -56,6 +75,7 @@ export class Floors {
 
   choose(floor) {
     this.chosen = floor;
+    this.field.value = names[floor] ?? "";
     this.changed();
   }
 
@@ -71,20 +91,23 @@ export class Floors {
     if (this.chosen !== null && !floors.includes(this.chosen)) floors.push(this.chosen);
     floors.sort((a, b) => b - a);
     this.buttons.hidden = this.section.hidden = floors.length < 2 && this.chosen === null;
-    const wanted = floors.map((f) => `${f}:${people.filter((p) => floorOf(p) === f).length}`).join() + document.documentElement.lang;
-    if (this.buttons.dataset.floors !== wanted) {
+    const wanted = floors.map((f) => `${f}:${people.filter((p) => floorOf(p) === f).length}`).join() + document.documentElement.lang + JSON.stringify(names);
+    this.field.hidden = this.chosen === null;
+    setAttribute(this.field, "aria-label", t("floors.name"));
+    setAttribute(this.field, "placeholder", t("floors.name"));
+    if (this.buttons.dataset.floors !== wanted && document.activeElement !== this.field) {
       this.buttons.dataset.floors = wanted;
       const focused = document.activeElement?.dataset?.floor;
       this.buttons.replaceChildren(this.button(null, t("floors.all")), ...floors.map((floor) => this.button(
-        floor, t("floors.count", { floor, count: people.filter((p) => floorOf(p) === floor).length }),
-      )));
+        floor, t("floors.count", { floor: titleOf(floor), count: people.filter((p) => floorOf(p) === floor).length }),
+      )), this.field);
       if (focused !== undefined) this.buttons.querySelector(`[data-floor="${focused}"]`)?.focus();
     }
-    for (const button of this.buttons.children) {
+    for (const button of this.buttons.querySelectorAll("button")) {
       setAttribute(button, "aria-pressed", String(button.dataset.floor === String(this.chosen)));
     }
     setAttribute(this.canvas, "aria-label", floors.map((floor) => t("floors.on", {
-      floor, names: people.filter((p) => floorOf(p) === floor).map((p) => p.name).join(", "),
+      floor: titleOf(floor), names: people.filter((p) => floorOf(p) === floor).map((p) => p.name).join(", "),
     })).join(". "));
   }
 
@@ -155,7 +178,7 @@ export class Floors {
       context.stroke();
       context.fillStyle = colours.soft;
       context.textAlign = "left";
-      context.fillText(number(floor), 3 * unit, up(z) - 8 * unit);
+      context.fillText(names[floor] ?? number(floor), 3 * unit, up(z) - 8 * unit);
     }
     people.forEach((person, k) => {
       const colour = map.colourOf(person.node);

@@ -4,7 +4,7 @@ import { isFresh, reachM } from "./age.js";
 import { hold } from "./board_view.js";
 import { inkOn } from "./colours.js";
 import { arrow, healthSign, make, setAttribute, setText } from "./dom.js";
-import { floorOf, floorUnknown } from "./floors.js";
+import { floorOf, floorUnknown, floorWords } from "./floors.js";
 import { number as figure, t, said } from "./i18n.js";
 import { isPlaced, VAGUE_RAD } from "./relation.js";
 import {
@@ -29,7 +29,7 @@ export function stateWords(person, alarm, here) {
   else if (person.moving === false && person.still_s >= 3 && isFresh(person)) {
     words.push(t("state.stands", { time: seconds(person.still_s) }));
   } else if (person.moving && isFresh(person)) words.push(t("state.moves"));
-  if (floorOf(person) !== null) words.push(t("state.floor", { floor: floorOf(person) }));
+  if (floorOf(person) !== null) words.push(floorWords(floorOf(person)));
   else if (floorUnknown(person)) words.push(t("state.floor-unknown"));
   return words.join(" · ");
 }

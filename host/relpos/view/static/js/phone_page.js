@@ -11,6 +11,7 @@ import { CompassSharing } from "./compass_sharing.js";
 import { Connection } from "./connection.js";
 import { arrow, byId, make, postJson, setAttribute, setText, storage } from "./dom.js";
 import { FindView } from "./find_view.js";
+import { nameFloors } from "./floors.js";
 import { languageSwitch, number, said, t } from "./i18n.js";
 import { LinkBanner } from "./link_banner.js";
 import { stateWords } from "./people.js";
@@ -85,6 +86,7 @@ function handle(message) {
     setAttribute(document.documentElement, "data-replay", team.replayed ? "true" : null);
   } else if (kind === "board") {
     showOrders(message);
+    nameFloors(message.floors);
   } else if (kind === "picture") {
     receivedMs = Date.now();
     const { raised, cleared } = alarms.update(team.list());

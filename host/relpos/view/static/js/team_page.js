@@ -10,7 +10,7 @@ import { byId, make, postJson, setAttribute, setText, storage } from "./dom.js";
 import { Ground } from "./ground.js";
 import { languageSwitch, said, t } from "./i18n.js";
 import { FindView } from "./find_view.js";
-import { Floors } from "./floors.js";
+import { Floors, nameFloors } from "./floors.js";
 import { LinkBanner } from "./link_banner.js";
 import { LogView, showUnseen } from "./log_view.js";
 import { TeamMap } from "./map.js";
@@ -42,7 +42,7 @@ const map = new TeamMap(byId("map"), team, { onPick: select, onCamera: showCamer
 map.floors = new Floors(team, () => {
   map.floors.update();
   map.invalidate();
-});
+}, (floor, name) => ground.post("floor", { floor, name }));
 map.covers = [byId("map-tools"), byId("floors"), byId("section")];
 const link = new LinkBanner(byId("link"), byId("alarm-voice"), linkChanged);
 const banner = new AlarmBanner(byId("alarms"), { acknowledge, show: find });
@@ -102,6 +102,7 @@ function handle(message) {
   } else if (kind === "board") {
     board.handle(message);
     ground.handle(message);
+    nameFloors(message.floors);
   } else if (kind === "you") {
     setAttribute(document.documentElement, "data-role", message.role);
   } else if (kind === "log") {
