@@ -17,7 +17,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-WRITE_EVERY_S = 0.5
+WRITE_EVERY_S = 0.2
 MOST_WAITING_BYTES = 64 << 20
 """Half an hour of twenty nodes. What comes while so much waits is lost, and counted."""
 
@@ -59,7 +59,7 @@ class AppendedTable:
         return self._file is not None
 
     def add(self, rows: Iterable[Iterable[object]]) -> None:
-        """Append rows; on disk with the next call, or that of :meth:`tick`, after half a second."""
+        """Append rows; on disk with the next call or that of :meth:`tick`, within 0.2 s."""
         for row in rows:
             if len(self._waiting) > MOST_WAITING_BYTES:
                 self.lost_rows += 1
