@@ -73,6 +73,7 @@ EXPLAINED = {
         "equal periods"
     ),
     "and sorted_s - slowest.reported_s <= lag_s": "a short cut: all are asked behind it",
+    "if (i > j) {": "an element of the diagonal, swapped",
     "if (sampled_ && step_us > SampleClock::kGapUs) {": "a microsecond of a gap",
 }
 """Line without spaces -> why no test can see its mutant."""

@@ -82,7 +82,7 @@ TEST(what_is_no_number_is_refused_and_counted) {
 #if defined(__AVR__)
 const uint32_t kRandomSteps = 400;
 #else
-const uint32_t kRandomSteps = 200000;
+const uint32_t kRandomSteps = 1000000;
 #endif
 
 // Whatever the sensors say, up to their limits and beyond, at whatever intervals.
