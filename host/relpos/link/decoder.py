@@ -18,6 +18,7 @@ from relpos.link.authentication import CounterWindow, Verdict
 from relpos.link.clock import NodeClock
 from relpos.measurements import Heading, Height, Motion, Observation, Range, RawSample, Status, Step
 from relpos.protocol import messages as wire
+from relpos.said import Said
 
 MAGNETIC_SIGMA_RAD = math.radians(25.0)
 """Indoor magnetic heading, one sample (the dead-reckoning filter weighs it alike)."""
@@ -133,7 +134,16 @@ class Decoder:
             self.counts["ForeignVersionError"] += 1
             if error.node is not None and error.node not in self.foreign_versions:
                 self.foreign_versions[error.node] = error.version
-                self.remarks.append(str(error))
+                self.remarks.append(
+                    Said(
+                        "version",
+                        "node {node} speaks protocol version {version}, this host speaks {own}: "
+                        "flash the firmware that belongs to this version",
+                        node=str(error.node),
+                        version=error.version,
+                        own=wire.PROTOCOL_VERSION,
+                    )
+                )
             return []
         except wire.FrameError as error:
             self.counts[type(error).__name__] += 1
@@ -226,11 +236,18 @@ class Decoder:
         if self._forged[node if heard else wire.BROADCAST] != FOREIGN_BEFORE_REMARK:
             return
         self.remarks.append(
-            f"node {node}: frames in its name under another key are rejected: somebody else sends "
-            "them, such as a stolen node"
+            Said(
+                "forged",
+                "node {node}: frames in its name under another key are rejected: somebody else "
+                "sends them, such as a stolen node",
+                node=str(node),
+            )
             if heard
-            else "frames under another key are rejected: give the team's key with --key-file, "
-            "or they are another team's"
+            else Said(
+                "other-key",
+                "frames under another key are rejected: give the team's key with --key-file, "
+                "or they are another team's",
+            )
         )
 
     def _ranges(self, node: int, track: NodeTrack, values: Mapping[str, Any]) -> list[Observation]:
@@ -274,8 +291,13 @@ class Decoder:
                 return None
             self.brought_back.add(frame.node)
             self.remarks.append(
-                f"node {frame.node}: its frame counter had changed; it has answered and is heard "
-                "again. If its memory was erased, give the team a new key: old frames fit again"
+                Said(
+                    "counter-back",
+                    "node {node}: its frame counter had changed; it has answered and is heard "
+                    "again. If its memory was erased, give the team a new key: old frames fit "
+                    "again",
+                    node=str(frame.node),
+                )
             )
             # What came under the other counter may have been forged: begin anew, as at a restart.
             window, verdict = CounterWindow.after(frame.counter - 1), Verdict.NEW
@@ -332,8 +354,12 @@ class Decoder:
             return
         if node not in self._challenged:
             self.remarks.append(
-                f"node {node}: frame counters that do not follow its last: old frames are sent "
-                "again, or its memory was erased; asked it for an answer, which brings it back"
+                Said(
+                    "counter-off",
+                    "node {node}: frame counters that do not follow its last: old frames are sent "
+                    "again, or its memory was erased; asked it for an answer, which brings it back",
+                    node=str(node),
+                )
             )
         # Keyed, and of a time that nobody can set: an old answer fits no new challenge. A replay
         # of the session makes the same one.

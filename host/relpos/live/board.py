@@ -157,12 +157,19 @@ class Board:
         for name in TEXTS:
             text = changes.get(name, "")
             if not isinstance(text, str) or len(text) > MAX_TEXT or not text.isprintable():
-                raise BoardError(f"{name}: not at most {MAX_TEXT} printable characters")
+                raise BoardError(
+                    Said(
+                        "long-text",
+                        "{field}: not at most {most} printable characters",
+                        field=name,
+                        most=MAX_TEXT,
+                    )
+                )
         if changes.get("state", "") not in STATES:
             raise BoardError(f"state: none of {', '.join(STATES[1:])}")
         air = changes.get("air_bar")
         if air is not None and not (isinstance(air, int | float) and 0.0 <= air <= MAX_AIR_BAR):
-            raise BoardError(f"air_bar: not from 0 to {MAX_AIR_BAR:.0f}")
+            raise BoardError(Said("air", "air: not from 0 to {most:.0f} bar", most=MAX_AIR_BAR))
         self.people[event["node"]] = place
         for name, value in changes.items():
             setattr(place, name, value)
@@ -194,7 +201,7 @@ class Board:
                 )
             return Said("roll", "{whom}roll call of {count}", whom="", count=len(nodes))
         if call is None or call.ended_unix_s is not None:
-            raise BoardError("no roll call is under way")
+            raise BoardError(Said("no-roll", "no roll call is under way"))
         if action == "answer":
             if (
                 event.get("answer") not in ("confirmed", "missing")
@@ -225,12 +232,12 @@ class Board:
             raise BoardError(f"id: not 1 to {MAX_TEXT} characters")
         if event.get("action") == "remove":
             if self.markers.pop(name, None) is None:
-                raise BoardError("no such marker")
+                raise BoardError(Said("no-marker", "no such marker"))
             return Said("unmarked", "{whom}marker removed", whom="")
         if event.get("sign") not in SIGNS or event.get("action") != "set":
             raise BoardError(f"sign: none of {', '.join(SIGNS)}")
         if len(self.markers) >= MOST_MARKERS:
-            raise BoardError(f"more than {MOST_MARKERS} markers")
+            raise BoardError(Said("many-markers", "more than {most} markers", most=MOST_MARKERS))
         x_m, y_m = _numbers([event.get("x_m"), event.get("y_m")])
         self.markers[name] = Marker(event["sign"], x_m, y_m, event["by"], event["unix_s"])
         return SIGNS[event["sign"]]
@@ -241,7 +248,7 @@ class Board:
             self.plan = Plan(event["image"])
             return Said("plan", "{whom}a plan lies under the map", whom="")
         if self.plan is None:
-            raise BoardError("there is no plan")
+            raise BoardError(Said("without-plan", "there is no plan"))
         if action == "remove":
             self.plan = None
             return Said("no-plan", "{whom}the plan is removed", whom="")
@@ -271,7 +278,7 @@ class Board:
             self.mayday[event["node"]] = {"by": event["by"], "unix_s": event["unix_s"]}
             return Said("mayday-of", "{whom}MAYDAY", whom="")
         if self.mayday.pop(event["node"], None) is None:
-            raise BoardError("no MAYDAY of that person")
+            raise BoardError(Said("not-mayday", "no MAYDAY of that person"))
         return Said("mayday-over", "{whom}MAYDAY is over", whom="")
 
     def _evacuate(self, event: Mapping[str, Any]) -> str:
@@ -285,12 +292,12 @@ class Board:
             text = "{whom}EVACUATE {count}: order by radio and on phones"
             return Said("evacuate", text, whom="", count=len(nodes))
         if order is None:
-            raise BoardError("no evacuation is ordered")
+            raise BoardError(Said("no-evacuation", "no evacuation is ordered"))
         if action == "end":
             self.evacuation = None
             return Said("evacuated", "{whom}evacuation is over", whom="")
         if event["node"] not in order.nodes:
-            raise BoardError("that person is not called out")
+            raise BoardError(Said("not-called", "that person is not called out"))
         if action == "delivered":
             order.delivered.setdefault(event["node"], event["unix_s"])
             return ""

@@ -49,6 +49,7 @@ RAISED = {
     Alert.LOST: Said("lost", "{name} is not heard any more", name=""),
     Alert.MAYDAY: Said("mayday", "{name} calls MAYDAY", name=""),
 }
+RECORDED = Said("recorded", "this is a recording: it takes no presses or headings")
 MOVES = Said("moves", "{name} moves again", name="")
 CLEARED = {
     Alert.STILL_WARNING: MOVES,
@@ -453,7 +454,7 @@ class LiveSession:
         if request.kind not in ("presses", "headings"):
             return {"error": f"this session takes no request of the kind {request.kind}"}, 409
         if not self._source.is_now:
-            return {"error": "this is a recording: it takes no presses or headings"}, 409
+            return refusal(RECORDED), 409
         handle = self._handler.presses if request.kind == "presses" else self._handler.headings
         reply, new = handle(request)
         # A node that nobody hears would become a person of the team.
@@ -485,12 +486,12 @@ class LiveSession:
             # "Here", of a wearer's phone.
             at = self._composer.nowcast.node(body.get("node", 0))
             if at is None or at.status not in (NodeStatus.OK, NodeStatus.STALE):
-                return {"error": "where you are is not known yet"}, 409
+                return refusal(Said("where", "where you are is not known yet")), 409
             body |= {"x_m": at.x_m, "y_m": at.y_m}
         try:
             self._happen({"kind": kind, **body})
         except BoardError as error:
-            return {"error": str(error)}, 400
+            return refusal(error.args[0]), 400
         if kind == "mayday" and body.get("on"):
             # Who else is in trouble is asked at once.
             start = {"action": "start", "emergency": True, "within_s": 300.0}

@@ -9,6 +9,8 @@ from typing import Any
 
 from starlette.requests import Request
 
+from relpos.said import Said
+
 MAX_BODY_BYTES = 1 << 20
 MAX_DEPTH = 8
 MAX_ITEMS = 2000
@@ -95,7 +97,9 @@ def text_of(row: Mapping[str, Any], name: str, most: int) -> str:
     """Return a text of 1 to ``most`` printable characters."""
     value = row.get(name)
     if not isinstance(value, str) or not 0 < len(value) <= most or not value.isprintable():
-        raise BadRequestError(f"{name}: not 1 to {most} printable characters")
+        raise BadRequestError(
+            Said("text", "{field}: not 1 to {most} printable characters", field=name, most=most)
+        )
     return value
 
 

@@ -19,6 +19,7 @@ from starlette.responses import (
 )
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from relpos.said import Said, refusal
 from relpos.view.access import Access
 from relpos.view.devices import Device, Gate, Role
 
@@ -46,6 +47,7 @@ REFUSED = """<!doctype html><html lang="en"><meta charset="utf-8">
 <code>relpos</code> runs, and shown as a QR code there and on the team's page. Each session has
 its own token.</p></html>"""
 
+FORBIDDEN = Said("forbidden", "this device may not do that: ask the commander")
 NOT_OURS = "This name is not this computer's: use the address that relpos has printed."
 
 CONTENT_POLICY = (
@@ -107,8 +109,7 @@ class TokenMiddleware:
         token, new = await self._admit(asking)
         allowed = token is not None and _own_page(asking)
         if allowed and not role_of(asking).allows(needed_role(asking)):
-            refusal = {"error": "this device may not do that: ask the commander"}
-            await JSONResponse(refusal, 403)(scope, receive, send)
+            await JSONResponse(refusal(FORBIDDEN), 403)(scope, receive, send)
             return
         if scope["type"] == "websocket":
             if allowed:

@@ -8,6 +8,8 @@ import os
 import re
 from pathlib import Path
 
+from relpos.said import Said
+
 MAX_IMAGE_BYTES = 8 << 20
 TYPES = {
     "png": ("image/png", b"\x89PNG\r\n\x1a\n"),
@@ -28,7 +30,7 @@ class PlanImages:
         """Keep an image, and return its name. ValueError where it is none, OSError."""
         kinds = [kind for kind, (_, head) in TYPES.items() if data.startswith(head)]
         if not kinds:
-            raise ValueError("neither PNG nor JPEG nor WebP")
+            raise ValueError(Said("image-kind", "neither PNG nor JPEG nor WebP"))
         name = f"{hashlib.sha256(data).hexdigest()[:16]}.{kinds[0]}"
         if self._folder is None:
             self._kept = {name: data}

@@ -38,6 +38,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from relpos.live.board import BOARD_EVENTS
 from relpos.live.team_view import to_json
 from relpos.live.tracks import Tracks
+from relpos.said import Said, refusal
 from relpos.view.access import Access, Allowance, qr_svg
 from relpos.view.bodies import (
     BadRequestError,
@@ -52,13 +53,15 @@ from relpos.view.bodies import (
     text_of,
 )
 from relpos.view.devices import Device, Role
-from relpos.view.guard import TokenMiddleware, role_of
+from relpos.view.guard import FORBIDDEN, TokenMiddleware, role_of
 from relpos.view.plans import MAX_IMAGE_BYTES, PlanImages
 
 STATIC = Path(__file__).parent / "static"
 PING_S = 2.0
 ANSWER_S = 5.0
 """Timeout of the session's answer to a request; then the phone gets an error and asks again."""
+TOO_MANY = Said("too-many", "too many at once; try again in a minute")
+NO_ANSWER = Said("no-answer", "the session does not answer; try again")
 MAX_LINE_BYTES = 1 << 26
 ALLOWED = {
     "presses": (20.0, 4000.0),
@@ -387,7 +390,7 @@ class Pages:
         )
         own = own or (kind == "marker" and body.get("action") == "set")
         if not own and not role_of(request).allows(Role.COMMAND):
-            return JSONResponse({"error": "only a commander may do that"}, 403)
+            return JSONResponse(refusal(FORBIDDEN), 403)
         if "node" in body:
             body["node"] = node_of(body)
         return await self._ask(request, kind, {**body, "by": by_of(body)})
@@ -395,15 +398,17 @@ class Pages:
     async def add_plan(self, request: Request) -> Response:
         """Keep an image, and lay it under the map."""
         if not role_of(request).allows(Role.COMMAND):
-            return JSONResponse({"error": "only a commander may do that"}, 403)
+            return JSONResponse(refusal(FORBIDDEN), 403)
         if not self._allowances["plan"].take("everybody", 1):
-            return JSONResponse({"error": "too many at once; try again in a minute"}, 429)
-        too_much = f"an image of more than {MAX_IMAGE_BYTES >> 20} MB"
+            return JSONResponse(refusal(TOO_MANY), 429)
+        too_much = Said(
+            "image-large", "an image of more than {most} MB", most=MAX_IMAGE_BYTES >> 20
+        )
         data = await read_received(request, MAX_IMAGE_BYTES, too_much)
         try:
             name = self._plans.keep(data)
         except (OSError, ValueError) as error:
-            raise BadRequestError(str(error)) from None
+            raise BadRequestError(error.args[0]) from None
         return await self._ask(request, "plan", {"action": "set", "image": name, "by": ""})
 
     async def image(self, request: Request) -> Response:
@@ -448,13 +453,13 @@ class Pages:
     ) -> Response:
         visitor = request.client.host if request.client else ""
         if not self._allowances[kind].take(visitor, max(items, 1)):
-            return JSONResponse({"error": "too many at once; try again in a minute"}, 429)
+            return JSONResponse(refusal(TOO_MANY), 429)
         try:
             answer = await self.session.ask(kind, body)
         except ValueError:  # Python reads NaN and 1e999, and does not write them.
             raise BadRequestError("a number that JSON does not have") from None
         if answer is None:
-            return JSONResponse({"error": "the session does not answer; try again"}, 503)
+            return JSONResponse(refusal(NO_ANSWER), 503)
         return JSONResponse(answer["reply"], answer.get("status", 200))
 
 
@@ -465,7 +470,7 @@ async def _until_gone(socket: WebSocket) -> None:
 
 
 async def _refuse(_: Request, error: Exception) -> Response:
-    return JSONResponse({"error": str(error)}, 400)
+    return JSONResponse(refusal(error.args[0]), 400)
 
 
 @dataclass(frozen=True)

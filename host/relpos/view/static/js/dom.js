@@ -97,6 +97,12 @@ export function arrow(className) {
   };
 }
 
+/** Why a request was refused, in the page's language; undefined where the answer does not say. */
+export async function refusal(answer) {
+  const reply = await answer?.json().catch(() => null);
+  return said(reply?.said, reply?.error);
+}
+
 export async function postJson(address, body) {
   const answer = await fetch(address, {
     method: "POST",
@@ -104,8 +110,7 @@ export async function postJson(address, body) {
     body: JSON.stringify(body),
   });
   if (!answer.ok) {
-    const reply = await answer.json().catch(() => null);
-    throw new Error(said(reply?.said, reply?.error) ?? t("server.answered", { status: answer.status }));
+    throw new Error(await refusal(answer) ?? t("server.answered", { status: answer.status }));
   }
   return answer.json();
 }

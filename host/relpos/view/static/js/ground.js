@@ -1,6 +1,6 @@
 // What lies on the ground of the map: a plan, and markers; and the tools that put them there.
 
-import { byId, make, postJson, setText } from "./dom.js";
+import { byId, make, postJson, refusal, setText } from "./dom.js";
 import { t, timeOfDay } from "./i18n.js";
 import { align, provisional, toPixel, toPlace } from "./plan.js";
 import { randomId } from "./queue.js";
@@ -60,7 +60,7 @@ export class Ground {
     if (!file) return;
     const answer = await fetch("/api/image", { method: "POST", body: file }).catch(() => null);
     input.value = "";
-    if (!answer?.ok) this.say(t("sent.failed", { error: (await answer?.json().catch(() => null))?.error ?? t("server.silent") }));
+    if (!answer?.ok) this.say(t("sent.failed", { error: await refusal(answer) ?? t("server.silent") }));
   }
 
   /** Two points, each first on the plan and then on the map; a third one says how well it fits. */
