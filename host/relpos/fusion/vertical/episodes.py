@@ -251,9 +251,9 @@ def _rise(interval: Interval) -> tuple[Floats, Floats]:
 def update(beliefs: Beliefs, interval: Interval) -> Update:
     """Add an interval; beliefs about nodes without news stay."""
     dt = round(interval.duration_s, 3)
-    transition = np.where(
-        interval.witnessed[:, None, None], _transition(dt, True), _transition(dt, False)
-    )
+    # A change that nobody can measure is no common one: each may be behind a door.
+    witnessed = interval.witnessed & np.isfinite(interval.common_m)
+    transition = np.where(witnessed[:, None, None], _transition(dt, True), _transition(dt, False))
     measured = np.isfinite(interval.height_m)[:, None]
     transition[~measured[:, 0]] = np.eye(MODES)
     # Mixing: where each mode's filter begins.
