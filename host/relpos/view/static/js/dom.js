@@ -97,6 +97,26 @@ export function arrow(className) {
   };
 }
 
+const FOCUSABLE = "button:not(:disabled), input:not(:disabled), select, summary, a[href], [tabindex='0']";
+
+/**
+ * Follow the focus; the function that is returned moves it on where its element has gone: to the
+ * nearest one that is left, else to `fallback`.
+ */
+export function followFocus(fallback) {
+  let path = [];
+  document.addEventListener("focusin", (event) => {
+    path = event.composedPath().filter((element) => element instanceof Element);
+  });
+  return () => {
+    if (document.activeElement !== document.body || !path.length) return;
+    if (path[0].isConnected && path[0].checkVisibility()) return;
+    const near = path.slice(1).filter((element) => element.isConnected && !element.contains(fallback))
+      .map((element) => [...element.querySelectorAll(FOCUSABLE)].find((one) => one.checkVisibility())).find(Boolean);
+    (near ?? fallback).focus();
+  };
+}
+
 /** Why a request was refused, in the page's language; undefined where the answer does not say. */
 export async function refusal(answer) {
   const reply = await answer?.json().catch(() => null);

@@ -6,7 +6,7 @@ import { AlarmBanner, showNotices } from "./banner.js";
 import { BoardView, hold } from "./board_view.js";
 import { Connection } from "./connection.js";
 import { DevicesDialog } from "./devices.js";
-import { byId, make, postJson, setAttribute, setText, storage } from "./dom.js";
+import { byId, followFocus, make, postJson, setAttribute, setText, storage } from "./dom.js";
 import { Ground } from "./ground.js";
 import { languageSwitch, said, t } from "./i18n.js";
 import { FindView } from "./find_view.js";
@@ -70,6 +70,7 @@ byId("smoothed").addEventListener("change", (event) => {
   map.invalidate();
 });
 const source = new SourceView();
+const keepFocus = followFocus(byId("map"));
 const connection = new Connection({ onMessage: handle, onState: () => refresh(true) });
 
 // -- messages --------------------------------------------------------------------------------------
@@ -211,6 +212,7 @@ function show() {
   const missing = team.list().filter((p) => p.status === "unlocated").map((p) => p.name);
   setText(byId("map-hint"), missing.length ? t("map.unlocated", { names: missing.join(", ") }) : "");
   if (performance.now() - tableMs > TABLE_MS) showTable();
+  keepFocus();
 }
 
 function showTable() {
