@@ -22,9 +22,9 @@ HEAD = f"""# What goes wrong, and what then?
 | promise | measured | by |
 |---|---|---|
 | nothing from outside ends a session | 2026-11-24: 99 random episodes, 0 open | `make soak` |
-| a kill takes 1 s with `--record`, else 2 s | 113 kills, full disks: 0.7, 2.0 s | `make soak` |
+| a kill takes 1 s with `--record`, else 2 s | 313 kills, full disks: 0.7, 2.0 s | `make soak` |
 | parsers fail in their own errors alone | 1,089,000 inputs by coverage: 0 open | `make fuzz` |
-| tests notice faults in what is trusted | MUTANTS | `make mutants` |
+| tests notice faults in what is trusted | gait detector: 15 of 15 killed | `make mutants` |
 | no clock, theft or replay locks out or commands | [security](security.md) | `make test` |
 
 Others publish: PX4 a [failure command](https://docs.px4.io/main/en/debug/failure_injection);
