@@ -315,12 +315,8 @@ class VerticalFilter:
             one.rise_m = self._height_means() - before
 
     def _common_rise(self, height_m: Floats, news: npt.NDArray[np.bool_], steps: Floats) -> Floats:
-        """Return by how much all others rose (N,): those who stand, or many alike; else NaN.
-
-        Who stood while the pressure began to change goes on to show it when walking off.
-        """
-        sees = self._beliefs.probability[:, LASTING].sum(axis=1) > 0.5
-        stands = news & (sees | (self._stands & (steps < STANDS_STEPS)))
+        """Return by how much all others rose (N,): those who stand, or many alike; else NaN."""
+        stands = news & self._stands & (steps < STANDS_STEPS)
         rise = height_m - self._heights_before
         common = _others_mean(rise, stands, 1)
         alike = _others_mean(rise, news, MANY)
