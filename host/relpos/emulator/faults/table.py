@@ -85,7 +85,7 @@ def _s(meaning: str, default: float) -> Key:
 _FLAGGED = "IMU_GAP flagged, nothing integrated, the gap charged as variance; back within 3 s"
 _GYRO_ONLY = "dead reckoning goes on by the gyroscope, no magnetic heading is reported"
 _NO_RANGES = "motion unharmed; failures counted, no wrong range; ranges again within two periods"
-_RADIO = "0 motion lost: the running totals of the next frame that arrives hold all"
+_RADIO = "0 motion lost: the next frame's totals hold all"
 
 FAULTS: tuple[Fault, ...] = (
     Fault("imu", "off", "no supply: does not answer, restarts with reset registers", _FLAGGED),
