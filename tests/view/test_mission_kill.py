@@ -56,14 +56,24 @@ class Field:
         if what == "browser":
             return  # The test closes it.
         if what == "server":
-            children = Path(f"/proc/{self.session.pid}/task/{self.session.pid}/children")
-            for child in children.read_text().split():
-                if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text():
-                    os.kill(int(child), signal.SIGKILL)
+            killed = self.servers()
+            for server in killed:
+                os.kill(server, signal.SIGKILL)
+            # Its connections end with it; a page that still looks live is one that is back.
+            wait_for(lambda: bool(self.servers() - killed))
             return
         os.killpg(self.session.pid, signal.SIGKILL)
         self.session.wait()
         self.start()
+
+    def servers(self) -> set[int]:
+        """Processes of the page's server."""
+        children = Path(f"/proc/{self.session.pid}/task/{self.session.pid}/children")
+        return {
+            int(child)
+            for child in children.read_text().split()
+            if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()
+        }
 
     def close(self) -> None:
         for process in (self.session, self.team):
