@@ -81,7 +81,8 @@ class Heights:
         level = 1.0 - moving - disturbed
         drifting = level > 0.8
         if drifting.any():
-            self.common_m += float(rise_m[drifting].sum() / max(drifting.sum(), 0.5 * len(level)))
+            count = max(float(drifting.sum()), 0.5 * len(level))
+            self.common_m += float(rise_m[drifting].sum()) / count
         self.mean[:, Z] += moving * rise_m - pressed_m
         self.mean[:, SLOW] += disturbed * rise_m + pressed_m
         kept = math.exp(-duration_s / FAST_S)
