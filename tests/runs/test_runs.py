@@ -134,6 +134,20 @@ def test_a_malformed_row_names_file_line_and_column(
     assert complaint in message
 
 
+@pytest.mark.parametrize("row", ["1", "1,1,0", "1,1,0,0,1e", "1,1,0,0,-"])
+def test_a_last_row_that_a_kill_cut_off_is_left_out_and_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, row: str
+) -> None:
+    whole = "time_s,node,dx_m,dy_m,dtheta_rad\n0,1,0,0,0\n"
+    assert len(load_run(write(tmp_path, motion_csv=whole + row)).motions) == 1
+    assert "motion.csv: line 3 was cut off" in caplog.text
+
+
+def test_a_wrong_cell_before_the_end_of_a_row_is_not_cut_off(tmp_path: Path) -> None:
+    text = "time_s,node,dx_m,dy_m,dtheta_rad\n0,1,0,0,0\n1,1,abc,0,0"
+    assert "line 3: column dx_m: 'abc' is not a number" in fault(write(tmp_path, motion_csv=text))
+
+
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import gzip
 import io
+import logging
 import math
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -18,6 +19,8 @@ from typing import Any
 
 from relpos.errors import DataError
 from relpos.measurements import BOUNDS, LEAST_SIGMA
+
+_LOG = logging.getLogger(__name__)
 
 MOST_LINE_BYTES = 64 << 20
 """A GeoJSON file is one line."""
@@ -187,9 +190,38 @@ def numbered_rows(
         for cells in reader:
             if not any(cell.strip() for cell in cells):
                 continue
-            yield reader.line_num, _parse_row(path, reader.line_num, header, cells, places)
+            try:
+                row = _parse_row(path, reader.line_num, header, cells, places)
+            except DataError:
+                if not _is_cut_off(text, reader.line_num, header, cells, places):
+                    raise
+                _LOG.warning("%s: line %d was cut off: left out", path, reader.line_num)
+                return
+            yield reader.line_num, row
     except csv.Error as error:
         raise DataError(f"{path}: line {reader.line_num}: not CSV: {error}") from None
+
+
+def _is_cut_off(
+    text: str,
+    line: int,
+    header: Sequence[str],
+    cells: Sequence[str],
+    places: Sequence[tuple[Column, int | None]],
+) -> bool:
+    """Whether this row is the last, without a line end, and whole up to where it stops.
+
+    A session that is killed while it writes leaves such a row.
+    """
+    if text.endswith(("\n", "\r")) or line < len(text.splitlines()):
+        return False
+    end = len(cells) - 1
+    before = [(column, place) for column, place in places if place is not None and place < end]
+    try:
+        _parse_row(Path(), line, header, cells[:end], before)
+    except DataError:
+        return False
+    return True
 
 
 def find_columns(
