@@ -190,8 +190,8 @@ def test_a_port_that_does_not_exist_is_one_clear_line_before_anything_is_prepare
     one_clear_line(relpos("fuse", "nonsense://port"))
 
 
-def test_a_truncated_table_is_one_clear_line(tmp_path: Path) -> None:
-    motion = MOTION_HEADER + "1,1,0.5,0,0\n2,1,0.5,0"
+def test_a_row_without_its_last_cell_is_one_clear_line(tmp_path: Path) -> None:
+    motion = MOTION_HEADER + "1,1,0.5,0,0\n2,1,0.5,0\n"
     message = one_clear_line(relpos("fuse", a_run(tmp_path / "r", "1,1,2,3\n", motion)))
     assert "motion.csv: line 3: column dtheta_rad is empty" in message
 
