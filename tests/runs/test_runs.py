@@ -85,10 +85,15 @@ def test_optional_cells_may_be_empty(tmp_path: Path) -> None:
 
 
 def test_unsorted_rows_are_sorted_and_equal_times_keep_their_order(tmp_path: Path) -> None:
-    text = "time_s,node,peer,range_m\n2,1,2,1\n1,1,2,2\n1,1,2,3\n-0.5,1,2,4\n"
+    text = "time_s,node,peer,range_m\n2.1,1,2,1\n1,1,2,2\n1,1,2,3\n-0.5,1,2,4\n"
     run = load_run(write(tmp_path, ranges_csv=text))
     assert [r.range_m for r in run.ranges] == [4.0, 2.0, 3.0, 1.0]
-    assert run.counters["unsorted_rows"] == 2
+    assert run.counters["unsorted_rows"] == 3
+
+
+def test_rows_a_little_out_of_order_as_sessions_write_them_are_not_counted(tmp_path: Path) -> None:
+    text = "time_s,node,peer,range_m\n2,1,2,1\n1.2,1,2,2\n1.1,1,2,3\n"
+    assert "unsorted_rows" not in load_run(write(tmp_path, ranges_csv=text)).counters
 
 
 def test_a_gzipped_file_is_read_like_a_plain_one(tmp_path: Path) -> None:
@@ -134,18 +139,39 @@ def test_a_malformed_row_names_file_line_and_column(
     assert complaint in message
 
 
-@pytest.mark.parametrize("row", ["1", "1,1,0", "1,1,0,0,1e", "1,1,0,0,-"])
-def test_a_last_row_that_a_kill_cut_off_is_left_out_and_told(
+@pytest.mark.parametrize(
+    "row", ["1", "1,1,0", "1,1,0,0,1e", "1,1,0,0,-", '1,1,0,"', '1,1,0,0,"0', "1,1,0,0,0"]
+)
+def test_a_last_row_that_a_kill_cut_off_is_left_out_told_and_counted(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, row: str
 ) -> None:
-    whole = "time_s,node,dx_m,dy_m,dtheta_rad\n0,1,0,0,0\n"
-    assert len(load_run(write(tmp_path, motion_csv=whole + row)).motions) == 1
+    whole = "time_s,node,dx_m,dy_m,dtheta_rad,sigma_x_m\n0,1,0,0,0,1\n"
+    run = load_run(write(tmp_path, motion_csv=whole + row))
+    assert len(run.motions) == run.counters["rows_cut_off"] == 1
     assert "motion.csv: line 3 was cut off" in caplog.text
+
+
+def test_a_kill_in_the_middle_of_a_character_loses_that_row_alone(tmp_path: Path) -> None:
+    text = 'time_s,node,event,value\n0,1,landmark,"é, 1"\n1,1,landmark,"é'.encode()
+    (tmp_path / "events.csv").write_bytes(text[:-1])
+    run = load_run(tmp_path)
+    assert [e.value for e in run.events] == ["é, 1"]
+    assert run.counters["rows_cut_off"] == 1
+
+
+@pytest.mark.parametrize("row", ["1,1,0,0,0", "1,1,0,0,0,", '1,1,0,0,"0"', ",,,", " "])
+def test_a_last_row_that_merely_has_no_line_end_is_as_any_other(tmp_path: Path, row: str) -> None:
+    text = "time_s,node,dx_m,dy_m,dtheta_rad,sigma_x_m\n0,1,0,0,0\n"
+    run = load_run(write(tmp_path, motion_csv=text + row))
+    assert len(run.motions) == 1 + row.startswith("1")
+    assert not run.counters
 
 
 def test_a_wrong_cell_before_the_end_of_a_row_is_not_cut_off(tmp_path: Path) -> None:
     text = "time_s,node,dx_m,dy_m,dtheta_rad\n0,1,0,0,0\n1,1,abc,0,0"
     assert "line 3: column dx_m: 'abc' is not a number" in fault(write(tmp_path, motion_csv=text))
+    quoted = text.replace("abc", '0,"a"b')
+    assert "line 3: not CSV" in fault(write(tmp_path, motion_csv=quoted))
 
 
 @pytest.mark.parametrize(

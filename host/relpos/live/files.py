@@ -68,12 +68,11 @@ class FileSink(Sink):
 
     def trouble(self) -> str | None:
         """Write what has waited long enough; return the first file that cannot be, and why."""
-        if self._received is not None:
-            self._received.tick()
-        for table in (*self._estimates.tables, self._log):
-            table.tick()
         received = () if self._received is None else self._received.tables
-        for table in (*self._estimates.tables, self._log, *received):
+        tables = (*self._estimates.tables, self._log, *received)
+        for table in tables:
+            table.tick()
+        for table in tables:
             if table.error is not None:
                 why = table.error.strerror or str(table.error)
                 lost = f"; {table.lost_rows} rows are lost" * bool(table.lost_rows)

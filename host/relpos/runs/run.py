@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import heapq
 import math
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import accumulate
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -59,6 +57,9 @@ PRIOR_FROM_TRUTH_WITHIN_S = 2.0
 """A first truth pose later than this after a node's start says nothing of its start. The same
 2 s as the metrics allow between two rows that are interpolated."""
 
+ARRIVES_WITHIN_S = 1.0
+"""A session writes rows as they arrive: nine ranges in ten within a tenth of a second, all but lost
+frames' within this."""
 
 SPARSE_S, CRAWLING_M_S = 2.0, 0.005
 """A walk whose times are milliseconds: rows seconds apart (up to 500 a second), at the thousandth
@@ -72,8 +73,8 @@ class Run:
     ``truth`` is for evaluation alone. ``counters`` says how many rows of note were met:
     ``ranges_failed`` (a range of 0 or less, kept as the failure marker it is),
     ``landmarks_unknown`` (presses of a landmark without a survey), ``landmarks_repeated`` (pressed
-    twice in passing), ``landmarks_of_strangers`` (by nodes without other data) and
-    ``unsorted_rows``.
+    twice in passing), ``landmarks_of_strangers`` (by nodes without other data), ``unsorted_rows``
+    (by more than :data:`ARRIVES_WITHIN_S`) and ``rows_cut_off`` (at a table's end, by a kill).
     """
 
     name: str
@@ -296,8 +297,7 @@ def write_imu(directory: Path, recordings: Mapping[int, ImuRecording]) -> None:
 class RunFiles:
     """A run directory that grows as observations come, for sessions of any length.
 
-    Each table is held back by :data:`REORDER_S` and written in the order of time; what comes later
-    than that is appended where it came. Tables that an earlier run left here are removed. ``Run``
+    Rows stand in the order of arrival. Tables that an earlier run left here are removed. ``Run``
     directories of it load like any other.
     """
 
@@ -316,10 +316,6 @@ class RunFiles:
             for table in _TABLES
             if table.make_class is not Truth
         }
-        self._waiting: list[tuple[float, int, Observation]] = []
-        self._count = 0
-        self._newest_s = -math.inf
-        self._written_s = -math.inf
 
     def describe(self, description: Description) -> None:
         """Replace the description of the run."""
@@ -328,18 +324,8 @@ class RunFiles:
     def write(self, observations: Iterable[Observation]) -> None:
         """Add observations, in the order of their arrival."""
         for observation in observations:
-            self._count += 1
-            heapq.heappush(self._waiting, (observation.time_s, self._count, observation))
-            self._newest_s = max(self._newest_s, observation.time_s)
-            self._written_s = time.monotonic()
-        self._release(self._newest_s - REORDER_S)
-
-    def tick(self) -> None:
-        """Write what has waited long enough, also while nothing comes."""
-        if time.monotonic() - self._written_s > REORDER_S:
-            self._release(math.inf)
-        for table in self.tables:
-            table.tick()
+            table, names = self._files[type(observation)]
+            table.add(([getattr(observation, name) for name in names],))
 
     @property
     def tables(self) -> tuple[AppendedTable, ...]:
@@ -348,19 +334,7 @@ class RunFiles:
 
     def close(self) -> None:
         """Write what waits; OSError where something could not be written."""
-        self._release(math.inf)
         close_all(self.tables)
-
-    def _release(self, until_s: float) -> None:
-        while self._waiting and self._waiting[0][0] <= until_s:
-            observation = heapq.heappop(self._waiting)[2]
-            table, names = self._files[type(observation)]
-            table.add(([getattr(observation, name) for name in names],))
-
-
-REORDER_S = 1.0
-"""Nine ranges in ten are reported within a tenth of a second, all but lost frames' within this.
-With the half second of the files, a kill loses no more than a second and a half."""
 
 
 @dataclass(frozen=True)
@@ -387,15 +361,17 @@ class _Table:
         if path is None:
             return []
         rows: list[Any] = []
-        for line, cells in numbered_rows(path, read_text(path), self.columns):
+        for line, cells in numbered_rows(path, read_text(path), self.columns, counters):
             row = self.make(*cells)
             if isinstance(row, Range) and row.node == row.peer:
                 raise DataError(
                     f"{path}: line {line}: column peer: node {row.node} ranges to itself"
                 )
             rows.append(row)
+        newest = accumulate((row.time_s for row in rows), max)
         counters["unsorted_rows"] += sum(
-            after.time_s < before.time_s for before, after in pairwise(rows)
+            row.time_s < before_s - ARRIVES_WITHIN_S
+            for row, before_s in zip(rows, newest, strict=True)
         )
         rows.sort(key=attrgetter("time_s"))
         return rows

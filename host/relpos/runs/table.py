@@ -12,6 +12,7 @@ import io
 import logging
 import math
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -150,6 +151,8 @@ def read_text(path: Path, most_bytes: int | None = None) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
+        if "unexpected end" in error.reason:  # a kill cut a character off
+            return data[: error.start].decode("utf-8-sig")
         line = data.count(b"\n", 0, error.start) + 1
         raise DataError(f"{path}: line {line}: not UTF-8 text") from None
 
@@ -178,50 +181,68 @@ def read_rows(path: Path, columns: Sequence[Column]) -> Iterator[tuple[Any, ...]
 
 
 def numbered_rows(
-    path: Path, text: str, columns: Sequence[Column]
+    path: Path, text: str, columns: Sequence[Column], counters: Counter[str] | None = None
 ) -> Iterator[tuple[int, tuple[Any, ...]]]:
-    """Like :func:`read_rows` on text at hand, with the number of the line each row ends on."""
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    """Like :func:`read_rows` on text at hand, with the number of the line each row ends on.
+
+    A last row that a kill cut off is left out, told, and counted as ``rows_cut_off``.
+    """
+    end = max(text.rfind("\n"), text.rfind("\r")) + 1 or len(text)
+    reader = csv.reader(io.StringIO(text[:end], newline=""), strict=True)
+    line = 1
     try:
         header = next(reader, None)
         if header is None:
             raise DataError(f"{path}: empty, not even a header line")
         places = find_columns(path, header, columns)
+        width = len(header)
         for cells in reader:
-            if not any(cell.strip() for cell in cells):
-                continue
-            try:
-                row = _parse_row(path, reader.line_num, header, cells, places)
-            except DataError:
-                if not _is_cut_off(text, reader.line_num, header, cells, places):
-                    raise
-                _LOG.warning("%s: line %d was cut off: left out", path, reader.line_num)
+            line = reader.line_num
+            if any(cell.strip() for cell in cells):
+                yield line, _parse_row(path, line, header, cells, places)
+                width = len(cells)
+        line = reader.line_num + 1
+        if text[end:].strip(" \t,"):
+            row = _row_without_end(path, line, text[end:], width, header, places)
+            if row is not None:
+                yield line, row
                 return
-            yield reader.line_num, row
+            _LOG.warning("%s: line %d was cut off: left out", path, line)
+            if counters is not None:
+                counters["rows_cut_off"] += 1
     except csv.Error as error:
-        raise DataError(f"{path}: line {reader.line_num}: not CSV: {error}") from None
+        line = max(line, reader.line_num)
+        raise DataError(f"{path}: line {line}: not CSV: {error}") from None
 
 
-def _is_cut_off(
-    text: str,
+def _row_without_end(
+    path: Path,
     line: int,
+    text: str,
+    width: int,
     header: Sequence[str],
-    cells: Sequence[str],
     places: Sequence[tuple[Column, int | None]],
-) -> bool:
-    """Whether this row is the last, without a line end, and whole up to where it stops.
+) -> tuple[Any, ...] | None:
+    """Return the row of a last line that does not end; None where it stops short.
 
-    A session that is killed while it writes leaves such a row.
+    A session that is killed while it writes leaves such a row: right as far as it goes.
     """
-    if text.endswith(("\n", "\r")) or line < len(text.splitlines()):
-        return False
-    end = len(cells) - 1
-    before = [(column, place) for column, place in places if place is not None and place < end]
     try:
-        _parse_row(Path(), line, header, cells[:end], before)
+        (cells,) = csv.reader([text], strict=True)
+    except csv.Error as error:
+        if "unexpected end" in str(error):
+            return None
+        raise
+    try:
+        row = _parse_row(path, line, header, cells, places)
     except DataError:
-        return False
-    return True
+        last = len(cells) - 1
+        before = [(column, place) for column, place in places if place is not None and place < last]
+        _parse_row(path, line, header, cells[:last], before)
+        if last >= len(header):
+            raise
+        return None
+    return None if len(cells) < width else row
 
 
 def find_columns(
