@@ -111,15 +111,15 @@ class Page:
             require(answer.status_code == 503, "a guest gets a view", answer.text)
         return False
 
-    def name(self, node: int, name: str) -> bool:
-        """Return whether the name was confirmed."""
+    def name(self, node: int, name: str) -> int:
+        """Return the answer's status; 503 without one."""
         try:
             body = {"node": node, "name": name}
             status = self._client.post(f"{self.base}/api/name", json=body).status_code
         except httpx.TransportError:
-            return False
+            return 503
         require(status in (200, 429, 503), "a name is taken or refused in words", status)
-        return status == 200
+        return status
 
     def heard_s(self) -> float:
         """Return when anybody was heard last, in the session's time; 0 before."""
@@ -142,7 +142,8 @@ class Host:
         self._rng, self._folder, self._mission = rng, folder, mission
         self._disk = disk
         self._ballast = disk / "ballast"
-        self._names: dict[int, str] = {}
+        self._names: dict[int, set[str]] = {}
+        """The confirmed name of each node, and those after it that had no answer."""
         self._cookies: httpx.Cookies | None = None
         self._outputs: list[str] = []
         self.kills = self.restarts = 0
@@ -209,8 +210,10 @@ class Host:
             dice = self._rng.random()
             if dice < 0.1:
                 node, name = self._rng.randrange(1, 3), f"Kim {self._rng.randrange(100)}"
-                if page.name(node, name):
-                    self._names[node] = name
+                if (status := page.name(node, name)) == 200:
+                    self._names[node] = {name}
+                elif status == 503 and node in self._names:
+                    self._names[node].add(name)
             elif dice < 0.13 and session.kill_server():
                 self.restarts += 1
                 wait_for("the page is back after its server's kill", page.look)
@@ -239,7 +242,7 @@ class Host:
         def named() -> bool:
             page.look()
             shown = {person["node"]: person["name"] for person in page.view["people"]}
-            return all(shown.get(node, name) == name for node, name in self._names.items())
+            return all(shown[node] in names for node, names in self._names.items() if node in shown)
 
         wait_for(f"confirmed names are there after a kill: {self._names}", named)
 
@@ -251,7 +254,10 @@ class Host:
             recording = open_recording(path)
             newest_s = max((s for s, e in recording.inputs() if isinstance(e, Serial)), default=0.0)
             if path.stem.endswith(f"-{number + 1 if self._mission else number}"):
-                self._check_lost("recording", page.heard_s() - newest_s, RECORDED_S)
+                # By the computer's clock: an emulated team has one of its own.
+                began_s = recording.about.started_unix_ns * 1e-9
+                lost_s = page.view["arrived_unix_s"] - began_s - newest_s
+                self._check_lost("recording", lost_s, RECORDED_S)
         out = folder / f"session-{number + 1}" if self._mission else folder / f"out-{number}"
         if out.is_dir():
             with contextlib.suppress(FileNotFoundError):

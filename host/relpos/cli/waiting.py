@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from relpos.cli import live
+from relpos.cli import live, output
 from relpos.errors import RelposError
 from relpos.said import Said, refusal
 
@@ -78,7 +78,12 @@ def choose(mission: Mission, options: live.Options, trouble: str, seconds: float
         try:
             while time.monotonic() < end_s:
                 for request in page.requests():
-                    choice = _answer(request, page, mission, journal, trouble)
+                    try:
+                        choice = _answer(request, page, mission, journal, trouble)
+                    except Exception as error:
+                        output.remark(f"request failed: {error!r}; the mission goes on")
+                        page.respond(request, refusal("the mission's page has failed"), 500)
+                        continue
                     if choice is not None:
                         return choice
                 time.sleep(LOOK_S)
@@ -105,8 +110,8 @@ def _answer(
         choice = Choice(**body)
         try:
             choice.check()
-        except RelposError as error:
-            page.respond(request, refusal(str(error)), 400)
+        except (RelposError, OSError) as error:
+            page.respond(request, refusal(said(error)), 400)
             return None
         page.respond(request, {"done": True})
         return choice
