@@ -28,3 +28,11 @@ class FusionInterrupted(KeyboardInterrupt):
     def __init__(self, result: Any) -> None:
         super().__init__()
         self.result = result
+
+
+def words_of(error: Exception) -> str:
+    """Return an error in words: of a file's, with its name."""
+    if not isinstance(error, OSError):
+        return str(error)
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror or error}"

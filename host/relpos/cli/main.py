@@ -31,7 +31,7 @@ from relpos.cli import (
     simulate,
 )
 from relpos.emulator.faults import help_text
-from relpos.errors import RelposError
+from relpos.errors import RelposError, words_of
 from relpos.version import __version__
 
 
@@ -51,8 +51,7 @@ class Commands(TyperGroup):
         except KeyboardInterrupt:
             _fail("interrupted")
         except OSError as error:
-            where = f"{error.filename}: " if error.filename else ""
-            _fail(f"{where}{error.strerror or error}")
+            _fail(words_of(error))
 
 
 def _fail(words: str) -> None:

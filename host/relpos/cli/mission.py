@@ -93,7 +93,7 @@ def _run_chosen(
 ) -> None:
     """Run sessions that are started and ended on the page, until Ctrl-C or the options' end."""
     from relpos.cli.waiting import choose
-    from relpos.errors import RelposError
+    from relpos.errors import RelposError, words_of
 
     Job("", estimator, {}, 0, found.path).prepare()
     end_s = math.inf if options.seconds is None else time.monotonic() + options.seconds
@@ -114,8 +114,9 @@ def _run_chosen(
                 outcome = _run(found, options, estimator, key_file, common=choice.common)
             else:
                 outcome = _exercise(found, choice.source, options, estimator, key_file)
-        except RelposError as error:
-            trouble = str(error)
+        except Exception as error:
+            known = isinstance(error, RelposError | OSError)
+            trouble = words_of(error) if known else f"the session has failed: {error!r}"
             output.remark(trouble)
             continue
         trouble = ""
@@ -165,6 +166,9 @@ def _run(
     from relpos.runs import Description
 
     about, resumed = found.about, found.resume()
+    jumped = found.keep_time(resumed)
+    if jumped is not None:
+        output.remark(jumped)
     about.sessions, about.ended_unix_s = about.sessions + 1, None
     job = Job(about.source, estimator, {}, 0, found.path / f"session-{about.sessions}")
     job.prepare(resumed.priors)

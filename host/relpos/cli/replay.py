@@ -39,7 +39,7 @@ def replay(
     from relpos.errors import DataError
     from relpos.live.board import Board, BoardError
     from relpos.live.mission import Mission
-    from relpos.live.team_view import Hello, LogEntry
+    from relpos.live.team_view import Hello
     from relpos.recording.moments import Moments
     from relpos.recording.player import Player
 
@@ -52,7 +52,7 @@ def replay(
     if source.is_dir():
         mission = Mission.open(source)
         paths, name = mission.recordings(), mission.about.name
-        entries = [LogEntry(**e["entry"]) for e in mission.events() if e["kind"] == "log"]
+        entries = [e["entry"] for e in mission.events() if e["kind"] == "log"]
         for event in mission.events():
             if event["kind"] in ("marker", "plan"):
                 with contextlib.suppress(BoardError):

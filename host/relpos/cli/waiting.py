@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from relpos.cli import live, output
-from relpos.errors import RelposError
+from relpos.errors import RelposError, words_of
 from relpos.said import Said, refusal
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def choose(mission: Mission, options: live.Options, trouble: str, seconds: float
     """
     from relpos.live.assembly import MissionPlan
     from relpos.live.mission import JOURNAL, Journal, Resumed
-    from relpos.live.team_view import Hello, LogEntry
+    from relpos.live.team_view import Hello
 
     about = mission.about
     hello = Hello(about.name, "", "", time.time(), mission=True, waiting=True)
@@ -72,7 +72,7 @@ def choose(mission: Mission, options: live.Options, trouble: str, seconds: float
         if event["kind"] == "device":
             page.admitted(event)
         elif event["kind"] == "log":
-            page.logged(LogEntry(**event["entry"]))
+            page.logged(event["entry"])
     end_s = time.monotonic() + seconds
     with contextlib.suppress(KeyboardInterrupt), contextlib.closing(page):
         try:
@@ -111,7 +111,7 @@ def _answer(
         try:
             choice.check()
         except (RelposError, OSError) as error:
-            page.respond(request, refusal(said(error)), 400)
+            page.respond(request, refusal(words_of(error)), 400)
             return None
         page.respond(request, {"done": True})
         return choice

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import queue
 import secrets
@@ -28,7 +29,8 @@ from relpos.live.inputs import Received
 from relpos.live.sinks import Sink
 from relpos.live.team_view import LogEntry, TeamView, to_json
 from relpos.live.tracks import Tracks
-from relpos.measurements import Prior
+from relpos.measurements import BOUNDS, Prior
+from relpos.runs.table import read_text, within_bounds
 
 ABOUT, JOURNAL, CHECKPOINT, TRACKS, SECRET = (
     "mission.json",
@@ -42,6 +44,8 @@ WARM_UP_S = 12.0
 """How far before the checkpoint the recording is read again: a status comes each ten seconds, and
 without the totals before it no motion is known."""
 SYNC_S = 0.4
+MOST_ABOUT_BYTES = MOST_LINE_BYTES = 1 << 20
+KEY_BYTES = 32
 
 
 @dataclass
@@ -54,6 +58,22 @@ class About:
     sessions: int = 0
     port: int | None = None
     ended_unix_s: float | None = None
+
+    @classmethod
+    def read(cls, text: str) -> About:
+        """Return what a file says. ValueError or KeyError where it is none of ours."""
+        found = _object(text)
+        about = cls(**{f.name: found[f.name] for f in fields(cls)})
+        if not (
+            isinstance(about.name, str)
+            and isinstance(about.source, str)
+            and _is_number(about.started_unix_s)
+            and type(about.sessions) is int
+            and (about.port is None or (type(about.port) is int and 0 < about.port < 65536))
+            and (about.ended_unix_s is None or _is_number(about.ended_unix_s))
+        ):
+            raise ValueError("values of another kind")
+        return about
 
 
 @dataclass
@@ -74,40 +94,64 @@ class Resumed:
 class Mission:
     """The folder of a mission. DataError where it is none, or cannot be written."""
 
-    def __init__(self, path: Path, about: About, key: bytes) -> None:
+    def __init__(self, path: Path, about: About, key: bytes | None = None) -> None:
         self.path = path
         self.about = about
-        self.key = key
+        self._key = key
 
     @classmethod
     def open(cls, path: Path, source: str | None = None, name: str | None = None) -> Mission:
         """Open the mission in that folder, or begin one; ``source`` replaces the one before."""
         if (path / ABOUT).exists():
+            _check_own_files(path)
             try:
-                found = json.loads((path / ABOUT).read_text("utf-8"))
-                about = About(**{f.name: found[f.name] for f in fields(About)})
-                key = (path / SECRET).read_bytes()
-            except (OSError, ValueError, KeyError, TypeError) as error:
+                about = About.read(read_text(path / ABOUT, MOST_ABOUT_BYTES))
+            except (ValueError, KeyError) as error:
                 raise DataError(f"{path}: not a mission's folder: {error}") from None
             about.source = source or about.source
             about.name = name or about.name
-            return cls(path, about, key)
+            return cls(path, about)
         if source is None:
             raise DataError(f"{path}: no mission there; to begin one, name the port, too")
-        if path.exists() and any(path.iterdir()):
+        # A kill in the middle of this leaves some of them.
+        begun = {SECRET, SECRET + ".new", ABOUT + ".new"}
+        if path.exists() and any(file.name not in begun for file in path.iterdir()):
             raise DataError(f"{path}: neither a mission nor empty")
         path.mkdir(parents=True, exist_ok=True)
-        key = secrets.token_bytes(32)
-        handle = os.open(path / SECRET, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(handle, "wb") as file:
-            file.write(key)
-        mission = cls(path, About(name or path.name, source, time.time()), key)
+        _check_own_files(path)
+        mission = cls(path, About(name or path.name, source, time.time()))
+        assert mission.key
         mission.save()
         return mission
 
+    @property
+    def key(self) -> bytes:
+        """What signs the devices' tokens; made where there is none, or only half of one."""
+        if self._key is None:
+            try:
+                self._key = (self.path / SECRET).read_bytes()
+            except FileNotFoundError:
+                self._key = b""
+            if len(self._key) != KEY_BYTES:
+                self._key = secrets.token_bytes(KEY_BYTES)
+                _replace(self.path / SECRET, self._key, mode=0o600)
+        return self._key
+
+    def keep_time(self, resumed: Resumed) -> str | None:
+        """Let the mission's clock go on where the computer's has jumped since; say so then."""
+        now_s = time.time() - self.about.started_unix_s
+        if resumed.arrived_s <= now_s <= BOUNDS["time_s"][1]:
+            return None
+        jumped_s = now_s - resumed.arrived_s
+        self.about.started_unix_s += jumped_s
+        return (
+            f"by this computer's clock the session before was {jumped_s / 3600.0:.1f} h ago: the "
+            "mission's time goes on without them"
+        )
+
     def save(self) -> None:
         """Write what it is."""
-        _replace(self.path / ABOUT, json.dumps(asdict(self.about), indent=1))
+        _replace(self.path / ABOUT, json.dumps(asdict(self.about), indent=1).encode())
 
     def recording(self, session: int) -> Path:
         """Return the file in which a session is recorded."""
@@ -119,46 +163,53 @@ class Mission:
         return [file for file in files if file.exists()]
 
     def events(self) -> Iterator[dict[str, Any]]:
-        """Yield the journal's events, and the devices of its exercises."""
+        """Yield the journal's events, and the devices of its exercises.
+
+        Lines that are none of ours are left out; a log's ``entry`` is a :class:`LogEntry`.
+        """
         yield from _events(self.path / JOURNAL)
         for folder in sorted(self.path.glob("exercise-*")):
             yield from (event for event in _events(folder / JOURNAL) if event["kind"] == "device")
 
     def exercise(self, source: str) -> Mission:
         """Begin an exercise: a mission of its own in a folder below, with the same devices."""
-        number = 1 + len(list(self.path.glob("exercise-*")))
-        path = self.path / f"exercise-{number}"
+        number = 1
+        while (path := self.path / f"exercise-{number}").exists():
+            number += 1
         path.mkdir()
         return Mission(path, About(self.about.name, source, time.time(), sessions=1), self.key)
 
     def resume(self) -> Resumed:
         """Return what the sessions so far have left behind."""
         resumed = Resumed(list(self.events()))
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-            found = json.loads((self.path / CHECKPOINT).read_text("utf-8"))
-            rows = [Prior(**row) for row in found["priors"]]
-            resumed.heard_s = {int(node): float(at_s) for node, at_s in found["heard_s"].items()}
-            resumed.arrived_s = float(found["arrived_s"])
-            resumed.since_s, resumed.priors = float(found["time_s"]), tuple(rows)
-        with contextlib.suppress(OSError), (self.path / TRACKS).open(encoding="utf-8") as lines:
-            for line in lines:
-                with contextlib.suppress(ValueError):
-                    node, time_s, x_m, y_m = line.split(",")
-                    resumed.tracks.add(int(node), float(time_s), float(x_m), float(y_m))
+        with contextlib.suppress(DataError, ValueError, KeyError, TypeError, AttributeError):
+            found = _object(read_text(self.path / CHECKPOINT, MOST_ABOUT_BYTES))
+            rows = tuple(prior for row in found["priors"] for prior in _priors(row))
+            heard_s = {int(node): _bounded("time_s", at) for node, at in found["heard_s"].items()}
+            arrived_s, since_s = (_bounded("time_s", found[k]) for k in ("arrived_s", "time_s"))
+            resumed.heard_s, resumed.arrived_s = heard_s, arrived_s
+            resumed.since_s, resumed.priors = since_s, rows
+        for line in _lines(self.path / TRACKS):
+            with contextlib.suppress(ValueError):
+                node, *point = line.decode().split(",")
+                time_s, x_m, y_m = map(_bounded, ("time_s", "x_m", "y_m"), map(float, point))
+                resumed.tracks.add(int(node), time_s, x_m, y_m)
         return resumed
 
     def is_running(self) -> bool:
         """Return whether a session has this mission now."""
         try:
-            with self.lock():
+            with self.lock(make=False):
                 return False
-        except (DataError, OSError):
+        except DataError:
             return True
+        except OSError:  # There is none, or it cannot be opened: a copy, or evidence.
+            return False
 
     @contextlib.contextmanager
-    def lock(self) -> Iterator[None]:
+    def lock(self, *, make: bool = True) -> Iterator[None]:
         """Keep the folder for one session; DataError where another one has it."""
-        with (self.path / "lock").open("w") as file:
+        with (self.path / "lock").open("a" if make else "r") as file:
             with contextlib.suppress(ImportError):
                 import fcntl
 
@@ -291,7 +342,7 @@ class MissionFiles(Sink):
                 "heard_s": heard_s,
                 "priors": priors,
             }
-            _replace(self._path / CHECKPOINT, json.dumps(found), sync=False)
+            _replace(self._path / CHECKPOINT, json.dumps(found).encode(), sync=False)
             self._trouble = None
         except OSError as error:
             self._trouble = f"{self._path}: {error.strerror or error}: checkpoints are not written"
@@ -326,14 +377,74 @@ def read_again(
         yield Received(arrival_s, b"", known, again=True)
 
 
+_KINDS: Mapping[str, tuple[type, ...]] = {
+    "node": (int, type(None)), "time_s": (int, float), "unix_s": (int, float), "name": (str,),
+    "by": (str,), "id": (str,), "role": (str,), "seconds": (int, float), "ids": (list,),
+    "alert": (str, type(None)), "kind": (str,), "text": (str,), "said": (dict, type(None)),
+}  # fmt: skip
+"""What the values of an event, and of a log's entry, have to be."""
+_NEEDED = {"device": {"id"}, "log": {"entry"}, "name": {"node", "name"}, "alert": {"node", "alert"}}
+
+
 def _events(journal: Path) -> Iterator[dict[str, Any]]:
     """Yield a journal's events; a last line that a power cut left half is left out."""
-    with contextlib.suppress(FileNotFoundError), journal.open("rb") as lines:
-        for line in lines:
-            with contextlib.suppress(ValueError):
-                event = json.loads(line)
-                if isinstance(event, dict) and "kind" in event:
-                    yield event
+    for line in _lines(journal):
+        with contextlib.suppress(ValueError, KeyError, TypeError):
+            event = _judged(_object(line))
+            if not _NEEDED.get(event["kind"], set()) <= event.keys():
+                continue
+            if event["kind"] == "log":
+                event["entry"] = LogEntry(**_judged(event["entry"]))
+            yield event
+
+
+def _judged(event: dict[str, Any]) -> dict[str, Any]:
+    """Return an event. KeyError, TypeError or ValueError where a session cannot use it."""
+    to_json(event)  # No NaN, which no page could be sent.
+    if not all(isinstance(event[k], kinds) for k, kinds in _KINDS.items() if k in event):
+        raise ValueError("values of another kind")
+    return event
+
+
+def _object(text: str | bytes) -> dict[str, Any]:
+    """Return a JSON object; ValueError."""
+    try:
+        found = json.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    if not isinstance(found, dict):
+        raise ValueError("not an object")
+    return found
+
+
+def _is_number(value: object) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
+
+
+def _bounded(name: str, value: Any) -> Any:
+    if not _is_number(value):
+        raise ValueError(f"{name}: not a number")
+    return within_bounds(name, value)
+
+
+def _priors(row: dict[str, Any]) -> Iterator[Prior]:
+    """Yield the pose, if it is one: another's stays known without it."""
+    with contextlib.suppress(ValueError):
+        yield Prior(**{name: _bounded(name, value) for name, value in row.items()})
+
+
+def _lines(path: Path) -> Iterator[bytes]:
+    """Yield the lines of a file, none where there is none; one that is too long ends them."""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        while line := file.readline(MOST_LINE_BYTES):
+            yield line
+
+
+def _check_own_files(folder: Path) -> None:
+    """Raise DataError where writing here would write elsewhere: somebody else made the folder."""
+    for path in folder.rglob("*"):
+        if path.is_symlink() or not (path.is_file() or path.is_dir()):
+            raise DataError(f"{path}: a link or a device: not a mission's folder")
 
 
 def _ends_line(path: Path) -> bool:
@@ -342,11 +453,13 @@ def _ends_line(path: Path) -> bool:
         return file.read(1) == b"\n"
 
 
-def _replace(path: Path, text: str, *, sync: bool = True) -> None:
+def _replace(path: Path, data: bytes, *, sync: bool = True, mode: int = 0o666) -> None:
     """Write a file as a whole: it is the old one or the new one, whatever happens."""
     beside = path.with_name(path.name + ".new")
-    with beside.open("w", encoding="utf-8") as file:
-        file.write(text)
+    beside.unlink(missing_ok=True)
+    handle = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    with os.fdopen(handle, "wb") as file:
+        file.write(data)
         if sync:
             file.flush()
             os.fsync(file.fileno())

@@ -139,8 +139,9 @@ class LiveSession:
         """Write what is confirmed to a mission's journal, and go on from what stands there."""
         for event in resumed.events:
             if event["kind"] == "log":
-                self._feed(lambda sink, e=event: sink.logged(LogEntry(**e["entry"])))  # type: ignore[misc]
-            else:
+                self._feed(lambda sink, e=event: sink.logged(e["entry"]))  # type: ignore[misc]
+                continue
+            with self._surviving("event"):
                 self._apply(event)
         for node, heard_s in resumed.heard_s.items():
             self._composer.remember(node, heard_s, resumed.since_s, self._alerts.get(node))

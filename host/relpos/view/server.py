@@ -105,6 +105,8 @@ class SessionProxy:
             while line := await self._lines.readline():
                 self._handle(line.decode())
         self.over = True
+        for waiting in self._answers.values():
+            waiting.cancel()
         self._notify()
 
     def _handle(self, line: str) -> None:
@@ -172,6 +174,10 @@ class SessionProxy:
                 return await answer
         except (TimeoutError, ConnectionError):
             return None
+        except asyncio.CancelledError:
+            if not answer.cancelled():
+                raise
+            return None  # The session has ended.
         finally:
             self._answers.pop(number, None)
 
