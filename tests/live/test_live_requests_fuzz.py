@@ -86,6 +86,8 @@ def test_no_body_of_any_route_ends_a_session(house, bodies):
     @example(("/api/replay", b"{}"))
     @example(("/api/rollcall", b'{"action": "start", "within_s": 1' + b"0" * 400 + b"}"))
     @example(("/api/board", b'{"node": 1, "x": 1e999}'))
+    @example(("/api/mayday", b'{"node": 1, "on": true, "x": "' + b"x" * 300_000 + b'"}'))
+    @example(("/api/rollcall", b'{"action": "start", "nodes": [' + b"7," * 200_000 + b"8]}"))
     @example(("/api/board", b'{"node": 1, "x": ' + b"[" * 900 + b"]" * 900 + b"}"))
     @settings(max_examples=bodies, suppress_health_check=list(HealthCheck))
     def visit(sent):

@@ -221,11 +221,12 @@ def test_a_press_is_accepted_when_the_session_has_it(stage):
         ("name", b'{"node": 1, "name": "\\ud800"}', "printable"),
         ("name", {"node": 1, "name": "a\x1bb"}, "printable"),
         ("acknowledge", {"node": True}, "node"),
-        ("acknowledge", b"[" * 100_000, "not JSON"),
-        ("acknowledge", b'{"node":' * 100_000, "not JSON"),
+        ("presses", b"[" * 100_000, "not JSON"),
+        ("presses", b'{"node":' * 100_000, "not JSON"),
         ("presses", b'{"node": 1, "presses": [], "clock_offset_ms": 1' + b"0" * 400 + b"}",
          "clock_offset_ms"),
-        ("acknowledge", b"x" * (1 << 20) + b"x", "bytes"),
+        ("presses", b"x" * (1 << 20) + b"x", "bytes"),
+        ("acknowledge", b" " * 4097, "bytes"),
     ],
 )  # fmt: skip
 def test_an_invalid_request_is_refused_in_words(stage, path, body, why):

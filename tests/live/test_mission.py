@@ -191,6 +191,94 @@ def test_a_damaged_checkpoint_costs_the_map_and_no_more(tmp_path: Path, damage: 
     assert isinstance(resumed.tracks, Tracks)
 
 
+@pytest.mark.parametrize("x_m", [math.nan, math.inf, 1e300, "x", None, True])
+def test_a_place_that_is_none_costs_that_place_and_no_other(tmp_path: Path, x_m: object):
+    mission = Mission.open(tmp_path / "m", "/dev/null", "Mill")
+    rows = [{"node": k, "x_m": x, "y_m": 0.0, "heading_rad": 0.0} for k, x in ((1, x_m), (2, 3.0))]
+    found = {"time_s": 5.0, "arrived_s": 6.0, "heard_s": {"1": 4.0}, "priors": rows}
+    (mission.path / "checkpoint.json").write_text(json.dumps(found))
+    (mission.path / "tracks.csv").write_text("1,2.0,nan,4.0\n1,3.0,inf,4.0\n1,4.0,1.0,1.0\n")
+    resumed = mission.resume()
+    assert [prior.node for prior in resumed.priors] == [2]
+    assert resumed.tracks.of(1) == [(4.0, 1.0, 1.0)]
+
+
+STRANGE = [
+    "[" * 100_000, "7", '{"kind": 3}', '{"kind": "log"}', '{"kind": "log", "entry": 5}',
+    '{"kind": "log", "entry": {"time_s": NaN, "unix_s": 1, "kind": "note", "text": "a"}}',
+    '{"kind": "log", "entry": {"time_s": 1, "unix_s": 1, "kind": "note", "text": 5}}',
+    '{"kind": "log", "entry": {"time_s": 1, "unix_s": 1, "kind": "note", "text": "", "new": 1}}',
+    '{"kind": "device"}', '{"kind": "name", "node": 1}', '{"kind": "name", "node": 1, "name": 5}',
+    '{"kind": "alert", "node": 1, "alert": "x"}', '{"kind": "rollcall", "action": "answer"}',
+    '{"kind": "shelve", "node": 1}', '{"kind": "presses"}', '{"kind": "board", "node": [1]}',
+]  # fmt: skip
+
+
+def test_lines_of_a_journal_that_are_none_of_ours_cost_no_other_and_no_mission(tmp_path):
+    mission = Mission.open(tmp_path / "m", "/dev/null")
+    known = '{"kind": "name", "node": 1, "name": "Anna"}'
+    (mission.path / JOURNAL).write_text("\n".join([*STRANGE, known]))
+    with EmulatedTeam(TeamConfig("paper", 2, 5.0, 1)) as team:
+        visitors = Visitors()
+        session, _ = make_session(
+            TeamInput(team), lambda p: fusion.make("deadreckoning", p), visitors
+        )
+        session.keep(Journal(mission.path / JOURNAL), mission.resume())
+    assert visitors.names == {1: "Anna"}
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["[" * 100_000, "[]", "{}", '{"name": 1}', "null", '{"name": "a", "source": "", "sessions": 1, '
+     '"started_unix_s": NaN, "port": null, "ended_unix_s": null}'],
+)  # fmt: skip
+def test_a_description_that_is_none_of_ours_is_one_line(tmp_path, text):
+    (tmp_path / "mission.json").write_text(text)
+    with pytest.raises(DataError, match="not a mission's folder"):
+        Mission.open(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["lock", "journal.jsonl", "plans", "mission.json.new"])
+def test_a_strangers_folder_does_not_lead_to_other_files(tmp_path, name):
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    path = Mission.open(tmp_path / "m", "/dev/null").path
+    (path / name).symlink_to(precious)
+    with pytest.raises(DataError, match="a link or a device"):
+        Mission.open(path)
+    assert precious.read_text() == "mine"
+
+
+def test_a_folder_that_was_begun_and_killed_or_lost_its_key_goes_on(tmp_path):
+    (tmp_path / "secret.key").write_bytes(b"half")
+    (tmp_path / "mission.json.new").write_text("{")
+    assert len(Mission.open(tmp_path, "/dev/null").key) == 32
+    (tmp_path / "secret.key").write_bytes(b"")
+    key = Mission.open(tmp_path).key
+    assert len(key) == 32, "without one anybody could sign"
+    assert Mission.open(tmp_path).key == key
+
+
+def test_whoever_looks_at_a_copy_takes_it_for_no_running_session_and_writes_nothing(tmp_path):
+    mission = Mission.open(tmp_path / "m", "/dev/null")
+    assert not mission.is_running()
+    assert not (mission.path / "lock").exists()
+    with mission.lock():
+        assert mission.is_running()
+
+
+@pytest.mark.parametrize("jumped_s", [-86_400.0, 8 * 86_400.0, 1.7e9])
+def test_a_clock_that_jumped_between_two_sessions_is_told_and_locks_nobody_out(tmp_path, jumped_s):
+    mission = Mission.open(tmp_path / "m", "/dev/null")
+    resumed = mission.resume()
+    resumed.arrived_s = 100.0
+    mission.about.started_unix_s = time.time() - 160.0
+    assert mission.keep_time(resumed) is None
+    mission.about.started_unix_s -= jumped_s
+    assert f"{(60.0 + jumped_s) / 3600.0:.1f} h ago" in mission.keep_time(resumed)
+    assert time.time() - mission.about.started_unix_s == pytest.approx(100.0, abs=10.0)
+
+
 def test_only_its_owner_can_read_the_key(tmp_path):
     mission = Mission.open(tmp_path / "m", "/dev/null")
     assert (mission.path / "secret.key").stat().st_mode & 0o077 == 0

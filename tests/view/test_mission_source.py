@@ -46,6 +46,8 @@ def test_only_a_commander_starts_and_a_path_of_a_guest_is_never_opened(
         assert spy.status_code == 400
         nothing = client.post("/api/start", json={**body, "source": str(tmp_path / "none")})
         assert "no such port" in nothing.json()["error"]
+        too_long = client.post("/api/start", json={**body, "source": "a" * 300})
+        assert "name too long" in too_long.json()["error"]
         assert client.post("/api/rollcall", json={"action": "start"}).status_code == 409
         assert client.post("/api/start", json=body).status_code == 200
     room.join(60.0)

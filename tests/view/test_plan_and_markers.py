@@ -111,6 +111,21 @@ def test_the_board_keeps_markers_and_the_plan_and_refuses_what_makes_no_sense() 
     assert list(board.markers) == ["a"]
 
 
+@pytest.mark.parametrize("image", ["../x.png", "x.svg", "x" * 41 + ".png", 5, "\ud800.png"])
+def test_a_plan_is_an_image_that_was_uploaded(image: object) -> None:
+    board = Board()
+    with pytest.raises(BoardError):
+        board.apply({"kind": "plan", "action": "set", "image": image})
+    assert board.plan is None
+
+
+def test_a_call_is_of_nodes_and_of_each_once() -> None:
+    board, event = Board(), {"action": "start", "by": "", "unix_s": 1.0}
+    board.apply({"kind": "rollcall", **event, "nodes": [3, 1, 3, True, 0, 255, 10**9, "2", None]})
+    assert board.roll_call is not None
+    assert board.roll_call.nodes == [1, 3]
+
+
 def test_a_mission_has_its_plans_in_its_folder_and_takes_images_alone(tmp_path: Path) -> None:
     mission = Mission.open(tmp_path / "mission", "/dev/ttyUSB0")
     images = PlanImages(mission.path)
@@ -118,6 +133,8 @@ def test_a_mission_has_its_plans_in_its_folder_and_takes_images_alone(tmp_path: 
     # Another process, after a restart.
     assert PlanImages(mission.path).find(name) == (png(8, 8), "image/png")
     assert images.find("../secret.key") is None
+    (mission.path / "plans" / ("0" * 16 + ".png")).symlink_to(mission.path / "secret.key")
+    assert images.find("0" * 16 + ".png") is None
     for rubbish in (b"", b"<svg onload='x'>", b"GIF89a"):
         with pytest.raises(ValueError, match="neither PNG"):
             images.keep(rubbish)

@@ -7,6 +7,7 @@ journal gives it back; a request that makes no sense is refused with a sentence 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -55,6 +56,7 @@ SIGNS = {
 }
 MOST_MARKERS = 500
 FARTHEST_M = 1e5
+IMAGE = r"[\w-]{1,40}\.(png|jpg|webp)"
 MOST_FLOORS = 100
 
 
@@ -168,7 +170,7 @@ class Board:
         if changes.get("state", "") not in STATES:
             raise BoardError(f"state: none of {', '.join(STATES[1:])}")
         air = changes.get("air_bar")
-        if air is not None and not (isinstance(air, int | float) and 0.0 <= air <= MAX_AIR_BAR):
+        if air is not None and not (type(air) in (int, float) and 0.0 <= air <= MAX_AIR_BAR):
             raise BoardError(Said("air", "air: not from 0 to {most:.0f} bar", most=MAX_AIR_BAR))
         self.people[event["node"]] = place
         for name, value in changes.items():
@@ -186,7 +188,7 @@ class Board:
     def _rollcall(self, event: Mapping[str, Any]) -> str:
         call, action = self.roll_call, event.get("action")
         if action == "start":
-            nodes = [node for node in event["nodes"] if isinstance(node, int)]
+            nodes = _nodes(event["nodes"])
             within_s = float(event.get("within_s", ROLL_CALL_S))
             if not 0.0 < within_s <= 7200.0:
                 raise BoardError("within_s: not from 0 to 7200 s")
@@ -244,7 +246,7 @@ class Board:
 
     def _plan(self, event: Mapping[str, Any]) -> str:
         action = event.get("action")
-        if action == "set" and isinstance(event.get("image"), str):
+        if action == "set" and re.fullmatch(IMAGE, event["image"], re.ASCII):
             self.plan = Plan(event["image"])
             return Said("plan", "{whom}a plan lies under the map", whom="")
         if self.plan is None:
@@ -260,7 +262,7 @@ class Board:
 
     def _floor(self, event: Mapping[str, Any]) -> str:
         floor, name = event.get("floor"), event.get("name")
-        if not isinstance(floor, int) or abs(floor) > MOST_FLOORS:
+        if type(floor) is not int or abs(floor) > MOST_FLOORS:
             raise BoardError(f"floor: not a number from -{MOST_FLOORS} to {MOST_FLOORS}")
         if not isinstance(name, str) or len(name) > MAX_TEXT or not (name + " ").isprintable():
             raise BoardError(f"name: not at most {MAX_TEXT} printable characters")
@@ -284,7 +286,7 @@ class Board:
     def _evacuate(self, event: Mapping[str, Any]) -> str:
         order, action = self.evacuation, event.get("action")
         if action == "order":
-            nodes = [node for node in event["nodes"] if isinstance(node, int)]
+            nodes = _nodes(event["nodes"])
             if order is None:
                 order = self.evacuation = Evacuation(event["unix_s"], event["by"], [])
             # Who was called out before, and has answered, stays called out.
@@ -305,6 +307,11 @@ class Board:
             raise BoardError("action: order, delivered, acknowledged or end")
         order.acknowledged[event["node"]] = {"by": event["by"], "unix_s": event["unix_s"]}
         return Said("understood", "{whom}evacuation understood", whom="")
+
+
+def _nodes(values: Any) -> list[int]:
+    """Return the numbers of nodes among the values, each once."""
+    return sorted({node for node in values if type(node) is int and 0 < node < 255})
 
 
 def _numbers(values: Any, count: int = 2) -> list[float]:

@@ -69,6 +69,10 @@ class LogEntry:
     """Key and values of the text for pages in other languages (:mod:`relpos.said`)."""
 
 
+MAX_LOG = 5000
+"""Newest lines of the log that a page is given."""
+
+
 @dataclass(frozen=True, slots=True)
 class Person:
     """One node's wearer.

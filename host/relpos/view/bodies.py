@@ -12,6 +12,9 @@ from starlette.requests import Request
 from relpos.said import Said
 
 MAX_BODY_BYTES = 1 << 20
+"""Of presses and headings, which a phone has gathered."""
+MAX_EVENT_BYTES = 4096
+"""Of others: a mission's journal keeps them."""
 MAX_DEPTH = 8
 MAX_ITEMS = 2000
 """Presses, or headings, of one request."""
@@ -31,9 +34,9 @@ async def read_received(request: Request, limit: int, too_much: str) -> bytes:
     return data
 
 
-async def read_body(request: Request) -> dict[str, Any]:
+async def read_body(request: Request, most: int = MAX_EVENT_BYTES) -> dict[str, Any]:
     """Return the JSON object that a request brings."""
-    data = await read_received(request, MAX_BODY_BYTES, f"more than {MAX_BODY_BYTES} bytes")
+    data = await read_received(request, most, f"more than {most} bytes")
     try:
         body = json.loads(data)
         if _depth_exceeds(body, MAX_DEPTH):

@@ -53,4 +53,5 @@ class PlanImages:
         if data is None and self._folder is not None:
             with contextlib.suppress(OSError):
                 data = (self._folder / name).read_bytes()
-        return None if data is None else (data, TYPES[found[1]][0])
+        kind, head = TYPES[found[1]]
+        return None if data is None or not data.startswith(head) else (data, kind)

@@ -16,6 +16,7 @@ import signal
 import socket
 import tempfile
 import time
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,12 +36,14 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from relpos.errors import words_of
 from relpos.live.board import BOARD_EVENTS
-from relpos.live.team_view import to_json
+from relpos.live.team_view import MAX_LOG, to_json
 from relpos.live.tracks import Tracks
 from relpos.said import Said, refusal
 from relpos.view.access import Access, Allowance, qr_svg
 from relpos.view.bodies import (
+    MAX_BODY_BYTES,
     BadRequestError,
     by_of,
     clocks_of,
@@ -91,7 +94,9 @@ class SessionProxy:
         self.view: str | None = None
         self.tracks = Tracks()
         self.names: dict[str, str] = {}
-        self.log: list[dict[str, Any]] = []
+        self.log: deque[dict[str, Any]] = deque(maxlen=MAX_LOG)
+        self.logged = 0
+        """Lines ever; the newest are in ``log``."""
         self.kept = {"board": '{"type":"board"}'}
         """The newest message of each of these kinds."""
         self.devices: dict[str, dict[str, Any]] = {}
@@ -131,6 +136,7 @@ class SessionProxy:
                 self.devices.setdefault(event["id"], {}).update(event)
             case "log":
                 self.log += message["entries"]
+                self.logged += len(message["entries"])
             case "names":
                 self.names = message["names"]
             case "answer":
@@ -269,8 +275,8 @@ class Pages:
                     if kept.get(kind) is not line:
                         kept[kind] = line
                         await socket.send_text(line)
-                if told < len(self.session.log):
-                    entries, told = self.session.log[told:], len(self.session.log)
+                if new := self.session.logged - told:
+                    entries, told = list(self.session.log)[-new:], self.session.logged
                     await socket.send_text(to_json({"type": "log", "entries": entries}))
                 await socket.send_text(newest if newest is not None else '{"type":"ping"}')
                 seen = newest if newest is not None else seen
@@ -352,7 +358,7 @@ class Pages:
 
     async def presses(self, request: Request) -> Response:
         """Landmark presses of a phone; those accepted need not be sent again."""
-        body = await read_body(request)
+        body = await read_body(request, MAX_BODY_BYTES)
         presses = [
             {
                 "id": text_of(press, "id", 64),
@@ -366,7 +372,7 @@ class Pages:
 
     async def headings(self, request: Request) -> Response:
         """Compass headings of a phone, already in the common convention (counter-clockwise)."""
-        body = await read_body(request)
+        body = await read_body(request, MAX_BODY_BYTES)
         headings = [
             {
                 "unix_ms": number_of(row, "unix_ms"),
@@ -413,8 +419,10 @@ class Pages:
         data = await read_received(request, MAX_IMAGE_BYTES, too_much)
         try:
             name = self._plans.keep(data)
-        except (OSError, ValueError) as error:
+        except ValueError as error:
             raise BadRequestError(error.args[0]) from None
+        except OSError as error:
+            return JSONResponse(refusal(words_of(error)), 507)
         return await self._ask(request, "plan", {"action": "set", "image": name, "by": ""})
 
     async def image(self, request: Request) -> Response:

@@ -21,7 +21,7 @@ from relpos.fusion.estimator import NodeStatus
 from relpos.live.board import Board
 from relpos.live.requests import Request
 from relpos.live.sinks import Sink
-from relpos.live.team_view import Hello, LogEntry, TeamView, to_json
+from relpos.live.team_view import MAX_LOG, Hello, LogEntry, TeamView, to_json
 from relpos.live.tracks import Tracks
 from relpos.said import Said
 from relpos.view.access import Access
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from relpos.fusion.estimator import Estimate
 
 RESTART_AFTER_S = 1.0
-MAX_LOG = 5000
 MAX_WAITING_BYTES = 1 << 24
 """A serving process that leaves so much unread is stuck, and started again."""
 SHOWN_STATUSES = (NodeStatus.OK, NodeStatus.STALE)
