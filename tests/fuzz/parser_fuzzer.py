@@ -98,6 +98,8 @@ def mcap(folder: Path) -> Target:
 
     from relpos.errors import RelposError
     from relpos.recording import open_recording
+    from relpos.recording.moments import Moments
+    from relpos.recording.player import Player
     from relpos.recording.replay import Replay
 
     path = folder / "foreign.mcap"
@@ -108,6 +110,11 @@ def mcap(folder: Path) -> Target:
             recording = open_recording(path)
             replay = Replay(recording, bytes(16))
             recording.run_of(replay.observations())
+        with contextlib.suppress(RelposError), contextlib.closing(Moments([path])) as moments:
+            player = Player(moments, [])
+            player.wait()
+            assert player.history.complete
+            player.view(moments.to_s).to_json()
 
     golden = lzma.decompress((ROOT / "tests" / "golden" / "0.2.0.mcap.xz").read_bytes())
     return Target(read, [golden[:20_000], golden[-8_000:]], "relpos.recording")

@@ -46,6 +46,22 @@ def test_the_estimate_of_a_moment_is_the_newest_that_was_recorded_by_then(record
     assert moments.estimate_at(moments.from_s - 1.0) is None
 
 
+@pytest.mark.parametrize("name", [b"/motion", b"started_unix_ns", b"relpos_version"])
+def test_a_recording_whose_head_is_damaged_is_refused_in_one_line(recorded, tmp_path, name):
+    data = recorded[0].read_bytes()
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(data.replace(name, b"\xff" * len(name), 1))
+    with pytest.raises(DataError, match="damaged"):
+        Moments([path])
+
+
+def test_a_recording_that_is_a_device_is_refused(tmp_path):
+    path = tmp_path / "endless.mcap"
+    path.symlink_to("/dev/zero")
+    with pytest.raises(DataError, match="not a regular file"):
+        Moments([path])
+
+
 def test_a_recording_that_was_cut_off_has_its_moments_and_seeks_as_fast(recorded):
     _, cut = recorded
     moments = Moments([cut])

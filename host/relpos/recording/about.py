@@ -11,6 +11,7 @@ from relpos.runs.description import Description, description_text, parse_descrip
 
 METADATA = "relpos"
 DESCRIPTION = "run.toml"
+MOST = (1 << 63) - 1
 
 
 @dataclass(frozen=True)
@@ -67,12 +68,15 @@ class About:
         try:
             counters: dict[str, int] = json.loads(values.get("newest_counters", "{}"))
             settings: dict[str, str] = json.loads(values.get("settings", "{}"))
+            started_unix_ns, seed = int(values["started_unix_ns"]), int(values.get("seed", "0"))
+            if max(started_unix_ns, seed) > MOST or min(started_unix_ns, seed) < 0:
+                raise ValueError(f"a start or a seed that is none of 0 to {MOST}")
             return cls(
-                started_unix_ns=int(values["started_unix_ns"]),
+                started_unix_ns=started_unix_ns,
                 source=values.get("source", ""),
                 estimator=values.get("estimator", "bank"),
                 settings={str(key): str(value) for key, value in settings.items()},
-                seed=int(values.get("seed", "0")),
+                seed=seed,
                 initial=values.get("initial") or None,
                 own_key=values.get("own_key") == "true",
                 newest_counters={int(node): int(n) for node, n in counters.items()},
@@ -83,5 +87,5 @@ class About:
                 protocol=int(values.get("protocol_version", "0")),
                 part=int(values.get("part", "1")),
             )
-        except (KeyError, ValueError, TypeError, AttributeError) as error:
+        except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
             raise DataError(f"{where}: what it says of its session is damaged: {error!r}") from None

@@ -21,7 +21,16 @@ from relpos.errors import DataError
 from relpos.fusion.estimator import Estimate, NodeEstimate
 from relpos.recording import topics
 from relpos.recording.about import About
-from relpos.recording.container import MESSAGE_HEAD, Piece, Walk, parse, records_in, unpack
+from relpos.recording.container import (
+    HEAD_BYTES,
+    MESSAGE_HEAD,
+    Piece,
+    Walk,
+    parse,
+    records_in,
+    unpack,
+)
+from relpos.recording.reader import UNREADABLE, opened, parsed
 from relpos.runs.description import Description
 
 BACK_S = 10.0
@@ -29,7 +38,6 @@ BACK_S = 10.0
 KEPT_BYTES = 32 << 20
 """Unpacked blocks in memory: minutes of a large team."""
 _LISTS = frozenset(topics.LISTS.values())
-_UNREADABLE = (KeyError, ValueError, TypeError, AttributeError, struct.error)
 
 
 @dataclass(frozen=True)
@@ -54,7 +62,7 @@ class Moments:
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self._paths = list(paths)
-        self._files = [path.open("rb") for path in paths]
+        self._files = [opened(path) for path in paths]
         self._walks = [Walk(file) for file in self._files]
         self._topics: list[dict[int, str]] = []
         self._blocks: list[_Block] = []
@@ -68,12 +76,12 @@ class Moments:
             names: dict[int, str] = {}
             for piece in walk:
                 if piece.opcode == Opcode.METADATA:
-                    record = parse(Metadata, walk.payload(piece))
+                    record = parsed(paths[number], Metadata, walk.payload(piece))
                     metadata[record.name] = record.metadata
                 elif piece.opcode == Opcode.CHANNEL:
-                    channel = parse(Channel, walk.payload(piece))
+                    channel = parsed(paths[number], Channel, walk.payload(piece))
                     names[channel.id] = channel.topic
-                elif piece.opcode == Opcode.CHUNK:
+                elif piece.opcode == Opcode.CHUNK and piece.length >= HEAD_BYTES + 16:
                     start_ns, end_ns = struct.unpack("<QQ", walk.payload(piece, 16))
                     self._blocks.append(_Block(start_ns, end_ns, number, piece))
             self._topics.append(names)
@@ -172,5 +180,5 @@ class Moments:
 def _decoded(decode: Any, message: Message) -> Any:
     try:
         return decode(message.topic, message.data)
-    except _UNREADABLE:
+    except UNREADABLE:
         return None

@@ -122,6 +122,10 @@ class Player:
         # The thread has files of its own: two positions in one would meet.
         self.history.read(self.moments.again(), self.names, log)
 
+    def wait(self) -> None:
+        """Wait until the whole recording is read."""
+        self._reader.join()
+
     def run(self, seconds: float | None = None) -> None:
         """Play until ``seconds`` are over, or Ctrl-C."""
         # A seek does not wait for the thread that reads the recording.

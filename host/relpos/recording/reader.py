@@ -128,7 +128,7 @@ class Recording:
         newest = -1
         for file in self.files:
             names = {number: channel.topic for number, channel in file.channels.items()}
-            with _opened(file.path) as stream:
+            with opened(file.path) as stream:
                 walk = Walk(stream)
                 for piece in walk:
                     if piece.opcode == Opcode.CHUNK:
@@ -187,7 +187,7 @@ class Recording:
     def _decoded(self, entry: Entry, decode: Any) -> Any:
         try:
             return decode(entry)
-        except _UNREADABLE as error:
+        except UNREADABLE as error:
             raise DataError(
                 f"{self.path}: message {entry.sequence} on {entry.topic}: not what it should be "
                 f"({error!r})"
@@ -247,7 +247,9 @@ _OBSERVED = {
 _PHONE = {topics.ROWS[kind] for kind in topics.PHONE_KINDS}
 
 
-_UNREADABLE = (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError)
+UNREADABLE = (
+    ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError, struct.error,
+)  # fmt: skip
 """What a message raises that is not what it should be; the last by lists within lists."""
 
 
@@ -255,7 +257,8 @@ def _row(entry: Entry) -> Any:
     return topics.decode_row(entry.topic, entry.data)
 
 
-def _opened(path: Path) -> Any:
+def opened(path: Path) -> Any:
+    """Open a recording; DataError where it is none."""
     try:
         if path.exists() and not path.is_file():
             raise DataError(f"{path}: cannot be read: not a regular file")
@@ -266,17 +269,17 @@ def _opened(path: Path) -> Any:
 
 def _look_through(path: Path) -> _File:
     found = _File(path, {}, {}, 0, 0, closed=False, first_ns=None, last_ns=None)
-    with _opened(path) as stream:
+    with opened(path) as stream:
         start = stream.read(len(MAGIC))
         if start != MAGIC[: len(start)]:
             raise DataError(f"{path}: no MCAP file")
         walk = Walk(stream)
         for piece in walk:
             if piece.opcode == Opcode.METADATA:
-                record = _parsed(path, Metadata, walk.payload(piece))
+                record = parsed(path, Metadata, walk.payload(piece))
                 found.metadata[record.name] = record.metadata
             elif piece.opcode == Opcode.CHANNEL:
-                channel = _parsed(path, Channel, walk.payload(piece))
+                channel = parsed(path, Channel, walk.payload(piece))
                 found.channels[channel.id] = channel
             elif piece.opcode == Opcode.CHUNK:
                 _look_into(found, walk.payload(piece))
@@ -301,7 +304,8 @@ def _look_into(found: _File, payload: bytes) -> None:
     found.last_ns = max(chunk.message_end_time, found.last_ns or 0)
 
 
-def _parsed(path: Path, kind: Any, payload: bytes) -> Any:
+def parsed(path: Path, kind: Any, payload: bytes) -> Any:
+    """Return a record of that class; DataError where it is damaged."""
     try:
         return parse(kind, payload)
     except ValueError as error:
