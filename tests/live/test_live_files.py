@@ -11,7 +11,7 @@ from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, Paramete
 from relpos.live.files import FileSink
 from relpos.measurements import Event, Heading, Height, Motion, Range, Status, Step
 from relpos.runs import Description, load_run, read_estimates, write_estimates
-from relpos.runs.appending import AppendedTable
+from relpos.runs.appending import AppendedTable, write_rows
 from relpos.runs.description import read_description, write_description
 
 OBSERVATIONS = [
@@ -90,6 +90,11 @@ def table(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "open", lambda path, mode, **_: FullDisk(path, mode))
     FullDisk.room = 42
     return AppendedTable(tmp_path / "table.csv", ["time_s", "node"], wanted=False)
+
+
+def test_a_table_that_a_full_disk_does_not_take_is_named():
+    with pytest.raises(OSError, match="No space left on device: '/dev/full'"):
+        write_rows(Path("/dev/full"), ["time_s"], [[1.0]])
 
 
 def test_a_full_disk_is_reported_and_nothing_is_missing_once_there_is_room(table):

@@ -24,10 +24,14 @@ MOST_WAITING_BYTES = 64 << 20
 
 def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write one CSV file; None and NaN become empty cells, a bool 0 or 1, floats in full."""
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows([_cell(value) for value in row] for row in rows)
+    try:
+        with path.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(header)
+            writer.writerows([_cell(value) for value in row] for row in rows)
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
 
 
 class AppendedTable:
