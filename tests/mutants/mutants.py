@@ -54,7 +54,7 @@ ROOMS = {
     ),
     "bank updates": Room(
         tuple(HOST + f"fusion/bank/{kind}_update.py" for kind in ("heading", "range", "detection")),
-        ("tests/fusion/bank/test_bank_kernels.py",),
+        ("tests/fusion/bank/test_bank_kernels.py", "tests/fusion/bank/test_common_terms.py"),
     ),
     "frame": Room((LIB + "wire/frame.cpp",), ("test_wire", "test_node")),
     "node": Room((LIB + "node/node.cpp", LIB + "node/settings.cpp"), ("test_node",)),
@@ -71,6 +71,9 @@ EXPLAINED = {
     ),
     "const float early_s = kEarly * (period_s_ < kFirstPeriod_s ? period_s_ : kFirstPeriod_s);": (
         "equal periods"
+    ),
+    "while (steps_.count() > 0 && message.count < wire::kMostSteps) {": (
+        "no more steps wait than a message holds"
     ),
     "and sorted_s - slowest.reported_s <= lag_s": "a short cut: all are asked behind it",
     "if (i > j) {": "an element of the diagonal, swapped",

@@ -82,15 +82,24 @@ def advanced(x: Floats, p: Floats, motion: Floats, component: Floats, drawn: Flo
         motion_update.advance(packed, rows, motion, Noise(drawn, SHARE, CROSS))
 
 
-def updated(x: Floats, p: Floats, measured: float, dz: float, outlier: tuple[float, ...]) -> Floats:
+def updated(
+    x: Floats, p: Floats, measured: float, dz: float, outlier: tuple[float, ...],
+    lever_m: Floats | None = None, sensitivity: Floats | None = None,
+) -> Floats:  # fmt: skip
     ranges = Ranges(
         np.array([0]), np.array([2]), np.array([measured]), np.array([dz]), np.zeros(1),
         np.ones(1), np.array([-1]), np.zeros((1, 4)), np.array([outlier[0]]),
     )  # fmt: skip
-    model = RangeModel(np.array([*outlier, 1.0, 9.0]), np.zeros((0, 2)))
+    levers_m = np.zeros((0, 2)) if lever_m is None else lever_m
+    model = RangeModel(np.array([*outlier, 1.0, 9.0]), levers_m)
     with Packed(x, p) as packed:
         stats = lanes.empty_lines(1, range_update.STATS, len(packed.x))
+        if sensitivity is not None:
+            packed.sensitivity[: len(packed.x)] = in_lanes(sensitivity)
         range_update.update(packed, ranges, model, stats)
+        if sensitivity is not None:
+            carried = np.moveaxis(packed.sensitivity[: len(packed.x)], -1, 1)
+            sensitivity[...] = carried.reshape(-1, *sensitivity.shape[1:])[: len(x)]
     return out_of_lanes(packed.log_weight, len(x))
 
 
@@ -149,6 +158,81 @@ def test_a_range_is_the_reference_implementation(measured: float, dz: float) -> 
     assert x == pytest.approx(np.array([e[0] for e in expected]), abs=1e-10)
     assert p == pytest.approx(np.array([e[1] for e in expected]), abs=1e-10)
     assert evidence == pytest.approx(np.array([e[2] for e in expected]), abs=1e-9)
+
+
+@pytest.mark.parametrize("dz", [0.0, 1.5])
+def test_a_range_between_antennas_is_one_between_people_who_stand_there(dz: float) -> None:
+    count = 2 * lanes.LANES + 1
+    x, p = states(count, 6)
+    lever_m = np.array([[0.1, -0.2], [0.3, 0.1], [-0.15, 0.25]])
+    there, to_antennas = x.copy(), np.repeat(np.eye(SIZE)[None], count, axis=0)
+    for node, (ahead, left) in enumerate(lever_m):
+        at = PER_NODE * node
+        c, s = np.cos(x[:, at + 2]), np.sin(x[:, at + 2])
+        east, north = c * ahead - s * left, s * ahead + c * left
+        there[:, at] += east
+        there[:, at + 1] += north
+        to_antennas[:, at, at + 2], to_antennas[:, at + 1, at + 2] = -north, east
+    spread = to_antennas @ p @ to_antennas.transpose(0, 2, 1)
+    before, back = (x.copy(), there.copy()), np.linalg.inv(to_antennas)
+    weights = updated(x, p, 6.0, dz, OUTLIER, lever_m)
+    expected = updated(there, spread, 6.0, dz, OUTLIER)
+    assert weights == pytest.approx(expected, abs=1e-9)
+    moved = (back @ (there - before[1])[..., None])[..., 0]
+    assert x - before[0] == pytest.approx(moved, abs=1e-9)
+    assert p == pytest.approx(back @ spread @ back.transpose(0, 2, 1), abs=1e-9)
+
+
+def test_each_hypothesis_carries_its_own_sensitivities() -> None:
+    count = 2 * lanes.LANES + 1
+    x, p = states(count, 7)
+    p += np.eye(SIZE) * (np.arange(SIZE) < PER_NODE * NODES)
+    carried = np.random.default_rng(8).normal(size=(count, NODES, COMPONENTS, 6)) * 0.01
+    alone = carried.copy()
+    for k in range(count):
+        one = slice(k, k + 1)
+        updated(x[one].copy(), p[one].copy(), 6.0, 0.0, OUTLIER, sensitivity=alone[one])
+    before = carried.copy()
+    updated(x, p, 6.0, 0.0, OUTLIER, sensitivity=carried)
+    assert carried == pytest.approx(alone, rel=1e-12)
+    assert np.array_equal(carried[:, 1], before[:, 1]), "who takes no part"
+    assert (carried[:, [0, 2]] != before[:, [0, 2]]).any(axis=(1, 2, 3)).all()
+
+
+def test_two_ranges_at_once_are_one_after_the_other() -> None:
+    x, p = states(2 * lanes.LANES, 9)
+    ends, measured = (np.array([0, 1]), np.array([2, 0])), np.array([6.0, 4.0])
+
+    def stats_of(rows: slice) -> Floats:
+        number = len(measured[rows])
+        ranges = Ranges(
+            ends[0][rows], ends[1][rows], measured[rows], np.zeros(number), np.zeros(number),
+            np.ones(number), np.full(number, -1), np.zeros((number, 4)),
+            np.full(number, OUTLIER[0]),
+        )  # fmt: skip
+        model = RangeModel(np.array([*OUTLIER, 1.0, 9.0]), np.zeros((0, 2)))
+        with Packed(x, p) as packed:
+            stats = lanes.empty_lines(number, range_update.STATS, len(packed.x))
+            range_update.update(packed, ranges, model, stats)
+        return stats
+
+    before = x.copy(), p.copy()
+    after = np.concatenate([stats_of(slice(0, 1)), stats_of(slice(1, 2))])
+    moved = x.copy()
+    x[...], p[...] = before
+    assert stats_of(slice(0, 2)) == pytest.approx(after, rel=1e-9, abs=1e-12)
+    assert x == pytest.approx(moved, rel=1e-9)
+
+
+def test_no_component_explains_more_than_the_covariance() -> None:
+    x, p = states(1, 10)
+    p += np.eye(SIZE) * (np.arange(SIZE) < PER_NODE * NODES)
+    carried = np.zeros((1, NODES, COMPONENTS, 6))
+    # Of the three position entries and the heading's three: xx, xy, yy, xh, yh, hh.
+    carried[..., 0] = carried[..., 2] = carried[..., 5] = 100.0
+    updated(x, p, 6.0, 0.0, OUTLIER, sensitivity=carried)
+    assert carried[0, 1, :, 0] == pytest.approx(100.0)
+    assert (np.abs(carried[0, [0, 2]]) < 15.0).all()
 
 
 def test_the_mixtures_moments_are_the_reference_implementation() -> None:
