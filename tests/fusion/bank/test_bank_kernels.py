@@ -214,9 +214,16 @@ def test_two_ranges_at_once_are_one_after_the_other() -> None:
         with Packed(x, p) as packed:
             stats = lanes.empty_lines(number, range_update.STATS, len(packed.x))
             range_update.update(packed, ranges, model, stats)
+        evidence = stats[:, range_update.EVIDENCE].sum(axis=0)
+        assert evidence == pytest.approx(packed.log_weight)
         return stats
 
     before = x.copy(), p.copy()
+    p *= 1e-6
+    well_known = stats_of(slice(0, 1))[0]
+    spread_m2 = well_known[range_update.VARIANCE] - 0.04
+    assert (np.abs(well_known[range_update.CURVATURE]) < 1e-3 * spread_m2).all()
+    x[...], p[...] = before
     after = np.concatenate([stats_of(slice(0, 1)), stats_of(slice(1, 2))])
     moved = x.copy()
     x[...], p[...] = before
