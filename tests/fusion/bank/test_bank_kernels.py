@@ -199,6 +199,35 @@ def test_each_hypothesis_carries_its_own_sensitivities() -> None:
     assert (carried[:, [0, 2]] != before[:, [0, 2]]).any(axis=(1, 2, 3)).all()
 
 
+def test_a_range_turns_with_the_map_it_lies_on() -> None:
+    count, angle = lanes.LANES, 0.7
+    x, p = states(count, 11)
+    p += np.eye(SIZE) * (np.arange(SIZE) < PER_NODE * NODES)
+    turn = np.eye(SIZE)
+    c, s = np.cos(angle), np.sin(angle)
+    for at in range(0, PER_NODE * NODES, PER_NODE):
+        turn[at : at + 2, at : at + 2] = [[c, -s], [s, c]]
+    entries = np.triu_indices(3)
+    order = [0, 1, 3, 2, 4, 5]  # xx, xy, yy, xh, yh, hh of the kernels
+    root = np.random.default_rng(12).normal(size=(count, NODES, COMPONENTS, 3, 3)) * 0.05
+    explained = root @ root.swapaxes(-1, -2)
+
+    def after(by: Floats) -> tuple[Floats, Floats, Floats]:
+        mine, spread = x @ by.T, by @ p @ by.T
+        carried = (by[:3, :3] @ explained @ by[:3, :3].T)[..., entries[0], entries[1]][..., order]
+        updated(mine, spread, 6.0, 0.0, OUTLIER, sensitivity=carried)
+        parts = np.empty_like(explained)
+        for k, entry in enumerate(order):
+            row, column = entries[0][entry], entries[1][entry]
+            parts[..., row, column] = parts[..., column, row] = carried[..., k]
+        return mine, spread, parts
+
+    turned, plain = after(turn), after(np.eye(SIZE))
+    assert turned[0] == pytest.approx(plain[0] @ turn.T)
+    assert turned[1] == pytest.approx(turn @ plain[1] @ turn.T)
+    assert turned[2] == pytest.approx(turn[:3, :3] @ plain[2] @ turn[:3, :3].T)
+
+
 def test_two_ranges_at_once_are_one_after_the_other() -> None:
     x, p = states(2 * lanes.LANES, 9)
     ends, measured = (np.array([0, 1]), np.array([2, 0])), np.array([6.0, 4.0])
