@@ -338,7 +338,8 @@ def test_a_ranges_predicted_moments_are_those_of_sampled_places(distance: float)
 
 def test_two_nodes_that_meet_break_nothing() -> None:
     x, p = np.zeros((1, SIZE)), np.zeros((1, SIZE, SIZE))
-    p[0, 0, 0] = p[0, 1, 1] = 0.5
+    p[0, 0, 0] = p[0, 1, 1] = 0.3
+    assert predicted(x, p)[0] == pytest.approx(np.sqrt(0.3))
     updated(x, p, 0.3, 0.0, OUTLIER)
     assert np.isfinite(x).all()
     assert np.isfinite(p).all()
