@@ -21,9 +21,9 @@ HEAD = f"""# What goes wrong, and what then?
 
 | promise | measured 2026-11-24 | by |
 |---|---|---|
-| nothing from outside ends a session | 99 random episodes, 40,000 bodies: 0 open | `make soak` |
+| nothing from outside ends a session | 99 random episodes, 160,000 bodies: 0 open | `make soak` |
 | no forged, altered, replayed frame counts | 10,000,033 frames: 0 taken | `make soak` |
-| a kill takes 1 s with `--record`, else 2 s | 224 kills: 1.001, 0.3 s | `soak.py --kills` |
+| a kill takes 1 s with `--record`, else 2 s | 269 kills: 1.001, 0.3 s | `soak.py --kills` |
 | parsers fail in their own errors alone | 1,089,000 inputs by coverage: 0 open | `make fuzz` |
 | tests notice faults in what is trusted | killed: gait 15 of 15 | `make mutants` |
 | no clock, theft or replay locks out or commands | [security](security.md) | `make test` |

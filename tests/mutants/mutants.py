@@ -72,6 +72,9 @@ EXPLAINED = {
     "const float early_s = kEarly * (period_s_ < kFirstPeriod_s ? period_s_ : kFirstPeriod_s);": (
         "equal periods"
     ),
+    "g, off = lanes.working_lines(x.shape[1]), lanes.working_lines(2 * x.shape[1])": (
+        "more working space than is used"
+    ),
     "while (steps_.count() > 0 && message.count < wire::kMostSteps) {": (
         "no more steps wait than a message holds"
     ),
