@@ -17,7 +17,7 @@ import numpy as np
 from relpos.errors import DataError
 from relpos.extras import missing_extra
 from relpos.recordings.strides import RATE_HZ, stances, way_m
-from relpos.recordings.tables import Archive, Array, ConvertedRun, described, imu_lines
+from relpos.recordings.tables import Archive, Array, ConvertedRun, described, event_lines, imu_lines
 
 G_M_S2 = 9.80665
 SCALES = np.repeat([G_M_S2 / 10000.0, math.pi / 18000.0, 0.1], 3)  # to m/s2, rad/s, uT
@@ -71,7 +71,7 @@ def _run(archive: Archive, name: str, file: str, *lines: str) -> ConvertedRun:
     )
     back = tables["back"]
     imu = imu_lines(np.arange(len(back), dtype=np.float64) / RATE_HZ, back)
-    events = [f"{time:.4f},1,{event},{value}" for time, event, value in sorted(marks)]
+    events = event_lines(marks)
     return ConvertedRun(name.partition("/")[2], description, imu, events)
 
 

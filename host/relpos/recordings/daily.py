@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import scipy.io
 
-from relpos.recordings.tables import Archive, ConvertedRun, described, imu_lines
+from relpos.recordings.tables import Archive, ConvertedRun, described, event_lines, imu_lines
 
 RATE_HZ = 100.0
 G_M_S2 = 9.80665
@@ -50,7 +50,7 @@ def _run(name: str, about: Any, sensor: Any, bouts: list[Any]) -> ConvertedRun:
         marks.append((bout.End, "bout_end", ""))
         feet = zip(bout.InitialContact_Event, bout.InitialContact_LeftRight, strict=True)
         marks += [(t, "foot_contact", foot.lower()) for t, foot in feet if np.isfinite(t)]
-    events = [f"{time:.3f},1,{event},{value}" for time, event, value in sorted(marks)]
+    events = event_lines(marks, digits=3)
     description = described(
         f"walk_daily_lowerback/{name}",
         "github.com/mobilise-d/mobgap example_data (Apache-2.0)",

@@ -118,6 +118,11 @@ def imu_lines(times_s: Array, samples: Array, digits: int = 5, node: int = 1) ->
     ]
 
 
+def event_lines(marks: Iterable[tuple[float, str, str]], digits: int = 4) -> list[str]:
+    """Lines of events.csv of node 1, in their order, of (time, event, value)."""
+    return [f"{time:.{digits}f},1,{event},{value}" for time, event, value in sorted(marks)]
+
+
 def described(name: str, source: str, *lines: str) -> str:
     """The text of run.toml."""
     return "\n".join([f'name = "{name}"', f'source = "{source}"', *lines]) + "\n"

@@ -13,7 +13,7 @@ import numpy as np
 
 from relpos.errors import DataError
 from relpos.recordings.strides import RATE_HZ, stances, way_m
-from relpos.recordings.tables import Archive, Array, ConvertedRun, described, imu_lines
+from relpos.recordings.tables import Archive, Array, ConvertedRun, described, event_lines, imu_lines
 
 FIELD_UT = 45.0  # the field comes in units of the earth's
 BOUT_S, LEAD_S = 60.0, 4.0
@@ -82,7 +82,7 @@ def _run(person: str, trial: str, begin: int, tables: dict[str, Array]) -> Conve
         (lead / RATE_HZ, "bout_start", f"{way_m:.3f}"),
         ((end - first) / RATE_HZ, "bout_end", ""),
     ]
-    events = [f"{time:.4f},1,{event},{value}" for time, event, value in sorted(marks)]
+    events = event_lines(marks)
     description = described(
         f"walk_treadmill_stroke_lumbar/pp{person}_{trial}",
         "github.com/SintMaartenskliniek/MovingReality (MIT)",
