@@ -89,10 +89,12 @@ def update(
     sigma2: float,
     outlier: tuple[float, float, float],
     more: Floats | None = None,
+    again: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Floats, Floats, float]:
     """One range; gives the state and the log evidence (without the constant 2 pi).
 
-    ``more`` (D,) is the slope of what is added to the distance.
+    ``more`` (D,) is the slope of what is added to the distance; ``again`` the part of the outlier
+    share that repeats the last outlier, and how far that was off.
     """
     mean, variance, gain = predict_range(x, p, first, second, dz)
     if more is not None:
@@ -102,7 +104,8 @@ def update(
     nu, s = measured - mean, variance + sigma2
     good = (1.0 - share) * np.exp(-0.5 * nu**2 / s) / np.sqrt(s)
     side = 2.0 * (1.0 - short if nu > 0.0 else short)
-    bad = share * side * np.exp(-0.5 * nu**2 / (s + wide)) / np.sqrt(s + wide)
+    bad = (share - again[0]) * side * np.exp(-0.5 * nu**2 / (s + wide)) / np.sqrt(s + wide)
+    bad += again[0] * np.exp(-0.5 * (nu - again[1]) ** 2 / (s + 0.09)) / np.sqrt(s + 0.09)
     inlier = good / (good + bad)
     k = gain / s
     # Used with probability inlier: the mixture's mean and its full covariance.

@@ -265,6 +265,11 @@ class Presence:
     ranges_s: tuple[float, ...] = (-inf,) * PLACING_RANGES
     """Times of its last ranges."""
 
+    @property
+    def uneven_m2(self) -> float:
+        """Variance (m^2, along any one direction) of where it is within its report."""
+        return 0.0
+
     def received(self, time_s: float) -> None:
         """Note that the node reported motion up to ``time_s``."""
         if time_s > self.news_s:

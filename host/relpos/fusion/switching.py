@@ -79,14 +79,7 @@ class SwitchingEstimator:
         initialiser = HypothesisInitialiser(seed=self._seed, large_team=True)
         s = self._settings
         settings = large_teams.LargeTeamSettings(
-            s.outliers_short,
-            s.jump_m,
-            s.jump_rad,
-            s.drift_rad_s,
-            s.scale,
-            s.reorder_s,
-            s.max_lag_s,
-            s.late_s,
+            s.drift_rad_s, s.scale, s.reorder_s, s.max_lag_s, s.late_s
         )
         return large_teams.make(priors, initialiser, settings, self._mountings, start_s)
 

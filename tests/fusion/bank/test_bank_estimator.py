@@ -8,6 +8,7 @@ import pytest
 from relpos import fusion, tracks
 from relpos.errors import RelposError
 from relpos.evaluation import metrics
+from relpos.fusion import settings
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.estimator import Estimate
@@ -88,3 +89,14 @@ def test_a_state_that_is_no_longer_finite_is_an_error() -> None:
     core.hypotheses.arrays.x[0, 0, 0] = np.nan
     with pytest.raises(RelposError, match="no longer finite"):
         core.hypotheses.moments()
+
+
+def test_a_setting_that_is_none_any_more_is_told_once_and_left_out(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    settings.tell_former.cache_clear()
+    for _ in range(2):
+        fusion.check("bank", {"jump_m": "5", "jumps": "0.01"})
+    (told,) = caplog.messages
+    assert told == "bank: jump_m is no setting any more, and left out; it is 3"
+    assert "jump_m" not in {info.key for info in fusion.settings_of("bank")}

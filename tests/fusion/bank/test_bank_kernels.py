@@ -17,12 +17,13 @@ from relpos.fusion.bank.storage import PER_NODE, Hypotheses, StateIndex
 from relpos.fusion.models import odometry_faults as slips
 from relpos.fusion.models.detection import STEP_M
 from relpos.fusion.models.motion_variances import COMPONENTS, base_variances
+from relpos.fusion.models.ranging import OUTLIERS_SHORT
 
 Floats = np.ndarray
 NODES = 3
 SIZE = PER_NODE * NODES + 1
 CROSS, SHARE = 0.04, 0.5
-OUTLIER = (0.05, 9.0, 0.1)
+OUTLIER = (0.05, 9.0, OUTLIERS_SHORT)
 
 
 def states(count: int, seed: int) -> tuple[Floats, Floats]:
@@ -85,13 +86,14 @@ def advanced(x: Floats, p: Floats, motion: Floats, component: Floats, drawn: Flo
 def updated(
     x: Floats, p: Floats, measured: float, dz: float, outlier: tuple[float, ...],
     lever_m: Floats | None = None, sensitivity: Floats | None = None,
+    again: tuple[float, float] = (0.0, 0.0),
 ) -> Floats:  # fmt: skip
     ranges = Ranges(
         np.array([0]), np.array([2]), np.array([measured]), np.array([dz]), np.zeros(1),
-        np.ones(1), np.array([-1]), np.zeros((1, 4)), np.array([outlier[0]]),
+        np.ones(1), np.array([-1]), np.zeros((1, 4)), np.array([[outlier[0], *again]]),
     )  # fmt: skip
     levers_m = np.zeros((0, 2)) if lever_m is None else lever_m
-    model = RangeModel(np.array([*outlier, 1.0, 9.0]), levers_m)
+    model = RangeModel(np.array([*outlier[:2], 1.0, 9.0]), levers_m)
     with Packed(x, p) as packed:
         stats = lanes.empty_lines(1, range_update.STATS, len(packed.x))
         if sensitivity is not None:
@@ -148,13 +150,25 @@ def test_a_displacement_is_the_reference_implementation() -> None:
     assert p == pytest.approx(np.array([b for _, b in expected]), abs=1e-12)
 
 
-@pytest.mark.parametrize(("measured", "dz"), [(4.0, 0.0), (6.5, 1.2), (30.0, 0.0)])
-def test_a_range_is_the_reference_implementation(measured: float, dz: float) -> None:
+@pytest.mark.parametrize(
+    ("measured", "dz", "again"),
+    [
+        (4.0, 0.0, (0.0, 0.0)),
+        (6.5, 1.2, (0.0, 0.0)),
+        (30.0, 0.0, (0.0, 0.0)),
+        (7.0, 0.0, (0.3, 2.0)),
+    ],
+)
+def test_a_range_is_the_reference_implementation(
+    measured: float, dz: float, again: tuple[float, float]
+) -> None:
     x, p = states(6, 3)
+    outlier = (max(OUTLIER[0], 1.2 * again[0]), *OUTLIER[1:])
     expected = [
-        reference.update(a, b, 0, 2, measured, dz, 0.04, OUTLIER) for a, b in zip(x, p, strict=True)
+        reference.update(a, b, 0, 2, measured, dz, 0.04, outlier, again=again)
+        for a, b in zip(x, p, strict=True)
     ]
-    evidence = updated(x, p, measured, dz, OUTLIER)
+    evidence = updated(x, p, measured, dz, outlier, again=again)
     assert x == pytest.approx(np.array([e[0] for e in expected]), abs=1e-10)
     assert p == pytest.approx(np.array([e[1] for e in expected]), abs=1e-10)
     assert evidence == pytest.approx(np.array([e[2] for e in expected]), abs=1e-9)
@@ -237,9 +251,9 @@ def test_two_ranges_at_once_are_one_after_the_other() -> None:
         ranges = Ranges(
             ends[0][rows], ends[1][rows], measured[rows], np.zeros(number), np.zeros(number),
             np.ones(number), np.full(number, -1), np.zeros((number, 4)),
-            np.full(number, OUTLIER[0]),
+            np.tile([OUTLIER[0], 0.0, 0.0], (number, 1)),
         )  # fmt: skip
-        model = RangeModel(np.array([*OUTLIER, 1.0, 9.0]), np.zeros((0, 2)))
+        model = RangeModel(np.array([*OUTLIER[:2], 1.0, 9.0]), np.zeros((0, 2)))
         with Packed(x, p) as packed:
             stats = lanes.empty_lines(number, range_update.STATS, len(packed.x))
             range_update.update(packed, ranges, model, stats)
@@ -451,7 +465,7 @@ def test_variance_components_are_learned_from_innovations_and_their_uncertainty_
             measured = rng.normal() * np.sqrt((parts * np.exp(truth)).sum())
             ranges = Ranges(
                 np.array([0]), np.array([1]), np.array([measured]), np.zeros(1), np.zeros(1),
-                np.ones(1), np.array([-1]), np.zeros((1, 4)), np.zeros(1),
+                np.ones(1), np.array([-1]), np.zeros((1, 4)), np.zeros((1, 3)),
             )  # fmt: skip
             components.learn(known.mean, known.covariance, ranges, stats, np.zeros(1), np.ones(1))
         errors.append(known.mean - truth)

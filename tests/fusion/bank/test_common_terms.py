@@ -14,6 +14,7 @@ from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import COMMON, PER_NODE, CommonIndex
 from relpos.fusion.clocks import LEAST_S, SLEW, Clocks
 from relpos.fusion.estimator import Estimate, Parameter, time_offsets
+from relpos.fusion.models.ranging import OUTLIERS_SHORT
 from relpos.measurements import Motion, Range
 
 NODES = 3
@@ -50,7 +51,7 @@ def test_a_range_with_all_terms_is_the_reference_implementation() -> None:
     for k in range(8):
         slope_k = reference.common_terms(x[k], p[k], NODES, 0, 2, velocity)
         slope_k[entry], slope_k[common] = 1.0, 0.0
-        outlier = float(share[0]), float(share[1]), float(share[2])
+        outlier = float(share[0]), float(share[1]), OUTLIERS_SHORT
         expected = reference.update(x[k], p[k], 0, 2, 17.5, 0.0, sigma2[k], outlier, slope_k)
         assert after[0][k] == pytest.approx(expected[0], abs=1e-3)
         assert after[1][k] == pytest.approx(expected[1], abs=1e-3)

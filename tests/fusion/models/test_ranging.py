@@ -14,7 +14,12 @@ from relpos.fusion.bank import lanes, range_update, storage
 from relpos.fusion.bank.range_update import RangeModel, Ranges
 from relpos.fusion.bank.storage import PER_NODE, Hypotheses
 from relpos.fusion.estimator import Estimate
-from relpos.fusion.models.ranging import OUTLIERS_LAST_S, OutlierPersistence, RangeCorrelation
+from relpos.fusion.models.ranging import (
+    ALIKE,
+    OUTLIERS_LAST_S,
+    OutlierPersistence,
+    RangeCorrelation,
+)
 from relpos.measurements import Height, Measurement, Motion, Prior, Range
 from relpos.simulation.paper import simulate_paper
 
@@ -45,9 +50,9 @@ def updated(
     )  # fmt: skip
     ranges = Ranges(
         np.array([0]), np.array([1]), np.array([measured]), np.array([dz]), np.zeros(1),
-        np.ones(1), np.array([-1]), np.zeros((1, 4)), np.array([1e-9]),
+        np.ones(1), np.array([-1]), np.zeros((1, 4)), np.array([[1e-9, 0.0, 0.0]]),
     )  # fmt: skip
-    model = RangeModel(np.array([1e-9, 9.0, 0.1, 1.0, 9.0]), levers_m)
+    model = RangeModel(np.array([1e-9, 9.0, 1.0, 9.0]), levers_m)
     range_update.update(hypotheses, ranges, model, lanes.empty_lines(1, range_update.STATS, 1))
     after = storage.unpack(*stored, 2, 1)
     return after[0][0], after[1][0]
@@ -236,19 +241,28 @@ def outlier_chain(go_on: float, share: float, count: int) -> np.ndarray:
 def test_how_outliers_go_on_is_learned(go_on: float, share: float) -> None:
     persistence = OutlierPersistence()
     for k, outlier in enumerate(outlier_chain(go_on, share, 2000)):
-        persistence.learn(0.1 * k, [(2, 1)], np.array([0.02 if outlier else 0.99]))
-    persistence.learn(200.0, [(1, 2)], np.array([0.0]))
-    assert persistence.shares(200.0, [(1, 2)])[0] == pytest.approx(go_on, abs=0.07)
+        persistence.learn(0.1 * k, [(2, 1)], np.array([0.02 if outlier else 0.99]), np.ones(1))
+    persistence.learn(200.0, [(1, 2)], np.array([0.0]), np.ones(1))
+    assert persistence.expected(200.0, [(1, 2)])[0, 0] == pytest.approx(go_on, abs=0.07)
 
 
 def test_an_outlier_says_less_with_time_and_nothing_of_other_pairs() -> None:
     persistence = OutlierPersistence()
-    assert persistence.shares(0.0, [(1, 2)])[0] == 0.0
-    persistence.learn(10.0, [(1, 2)], np.array([0.0]))
+    assert persistence.expected(0.0, [(1, 2)])[0, 0] == 0.0
+    persistence.learn(10.0, [(1, 2)], np.array([0.0]), np.array([2.0]))
     now, later, other = (
-        float(persistence.shares(time_s, [pair])[0])
+        float(persistence.expected(time_s, [pair])[0, 0])
         for time_s, pair in ((10.0, (2, 1)), (10.0 + OUTLIERS_LAST_S, (1, 2)), (10.0, (1, 3)))
     )
     assert now > 0.5
+    assert persistence.expected(10.0, [(1, 2)])[0, 1:].tolist() == [ALIKE * now, 2.0]
     assert later == pytest.approx(now * np.exp(-1.0))
     assert other == 0.0
+
+
+def test_outliers_that_were_too_short_are_not_expected_again() -> None:
+    persistence = OutlierPersistence()
+    persistence.learn(10.0, [(1, 2)], np.array([0.0]), np.array([-2.0]))
+    share, again, _ = persistence.expected(10.0, [(1, 2)])[0]
+    assert share > 0.5
+    assert again == 0.0

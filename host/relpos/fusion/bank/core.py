@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 
 import numpy as np
@@ -26,7 +27,7 @@ from relpos.fusion.bank.sensors import Sensors
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import StateIndex
 from relpos.fusion.models.detection import Detection
-from relpos.fusion.models.odometry_faults import CusumDetector
+from relpos.fusion.models.odometry_faults import JUMP_M, CusumDetector
 from relpos.fusion.models.ranging import slant_height
 
 Floats = npt.NDArray[np.float64]
@@ -62,7 +63,7 @@ class BankCore:
         """How long each user has gone straight ahead."""
         self._alarm: tuple[int, tuple[Indices, Indices, Floats]] | None = None
         prior, expected = settings.outlier_m**2, settings.outliers * OUTLIER_RANGES
-        outlier = np.array([0.0, prior, settings.outliers_short, 0.0, prior])
+        outlier = np.array([0.0, prior, 0.0, prior])
         counts = np.array([expected, OUTLIER_RANGES - expected, expected * prior])
         components = self.hypotheses.components
         self._sensors = Sensors(
@@ -91,6 +92,11 @@ class BankCore:
             surprise=np.append(known.surprise, 0.0), cusum=cusum,
         )  # fmt: skip
         return row
+
+    @property
+    def range_variance_m2(self) -> float:
+        """The variance of a range, as learned."""
+        return math.exp(float(self.hypotheses.components.mean[-1]))
 
     def _check(self, first: Indices, second: Indices, *values: Floats) -> None:
         """Raise ``IndexError`` or ``ValueError``: kernels check no bounds."""
@@ -146,14 +152,17 @@ class BankCore:
         dz_variance_m2: Floats | None = None,
         sample_count: Floats | None = None,
         velocity_m_s: Floats | None = None,
-        outlier_share: Floats | None = None,
-    ) -> Floats:
-        """Update with the ranges (R,) of one instant; return each one's inlier probability.
+        outliers: Floats | None = None,
+    ) -> tuple[Floats, Floats]:
+        """Update with the ranges (R,) of one instant; return what of each is an outlier.
+
+        That is its inlier probability (R,), and by how much it is off if it is none (m).
 
         ``dz_m`` are the antennas' differences of height, ``dz_variance_m2`` their variances (0
         by default), ``sample_count`` how many independent ranges each counts as (1 by default),
         ``velocity_m_s`` (R, 4) those of the first and of the second, forward and left (0),
-        ``outlier_share`` the least probability of being an outlier (0).
+        ``outliers`` (R, 3) the least probability of being an outlier, the part of it that repeats
+        the pair's last one, and by how much that was off (m; 0).
         """
         several, these = len(first), self.hypotheses
         variance = np.zeros(several) if dz_variance_m2 is None else dz_variance_m2
@@ -163,15 +172,16 @@ class BankCore:
         velocity = np.zeros((several, 4)) if velocity_m_s is None else velocity_m_s
         outlier, known = self._sensors.model.outlier, self._sensors
         usual = np.full(several, sensors.expect_outliers(known.outlier_counts, outlier))
-        shares = usual if outlier_share is None else np.maximum(usual, outlier_share)
+        shares = np.zeros((several, 3)) if outliers is None else outliers.copy()
+        shares[:, 0] = np.maximum(usual, shares[:, 0])
         slant_m = slant_height(dz_m, variance)
         ranges = Ranges(first, second, range_m, slant_m, variance, counts, biases, velocity, shares)
-        outlier[3] = 1.0 / (1.0 - these.sampled_share)
+        outlier[2] = 1.0 / (1.0 - these.sampled_share)
         wary = self.relocalisation.since_fault <= OPEN_UPDATES and self.counters["slips"] > 0
         before = these.log_weight.copy()
         stats = lanes.empty_lines(several, range_update.STATS, len(these.arrays.x))
         range_update.update(these.arrays, ranges, known.model, stats)
-        inlier, fault, clamped = sensors.learn(
+        outlying, fault, clamped = sensors.learn(
             these.arrays, ranges, known, these.draws, these.perturbed,
             stats.reshape(several, range_update.STATS, -1), before, wary,
         )  # fmt: skip
@@ -179,7 +189,7 @@ class BankCore:
             self.counters["levels_clamped"] += clamped
         if fault >= 0 and self.settings.hypotheses > 1:
             self._alarm = (fault, (first, second, range_m))
-        return inlier
+        return outlying
 
     def update_heading(self, row: int, heading_rad: float, sigma_rad: float) -> None:
         """Update with an absolute heading of a user."""
@@ -229,7 +239,7 @@ class BankCore:
         if self._alarm is not None:
             self.counters["slips"] += 1
             row, ranges = self._alarm
-            relocalisation.relocalise(row, ranges, self.settings.jump_m)
+            relocalisation.relocalise(row, ranges, JUMP_M)
             self._alarm = None
         elif these.count > self.adaptive.ceiling and not relocalisation.open:
             these.resample(these.weights(), self.adaptive.ceiling)

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from relpos.errors import RelposError
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.detection_update import Attempts
-from relpos.fusion.bank.reporting import Report
+from relpos.fusion.bank.reporting import Report, unknown_headings
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import PER_NODE, CommonIndex, StateIndex
 from relpos.fusion.clocks import Clocks
@@ -38,7 +38,8 @@ from relpos.fusion.initial_poses import (
     PoseMixture,
 )
 from relpos.fusion.models.detection import Detection
-from relpos.fusion.models.motion import reported_sigmas, velocity_m_s
+from relpos.fusion.models.handedness import Handedness
+from relpos.fusion.models.motion import WithinReport, reported_sigmas, velocity_m_s
 from relpos.fusion.models.north import North
 from relpos.fusion.models.odometry_faults import LOST_RAD, VAGUE_M, SpeedGate, ZeroMotionDetector
 from relpos.fusion.models.ranging import (
@@ -70,6 +71,11 @@ class _Known(Presence):
 
     worn_m: float = 0.0
     """Height of the tag over the floor at the start."""
+    within: WithinReport = field(default_factory=WithinReport)
+
+    @property
+    def uneven_m2(self) -> float:
+        return self.within.variance_m2
 
 
 @dataclass(slots=True)
@@ -93,6 +99,7 @@ class Bank:
     north: North = field(default_factory=North)
     vertical: VerticalFilter = field(default_factory=VerticalFilter)
     clocks: Clocks = field(default_factory=Clocks)
+    handedness: Handedness = field(default_factory=Handedness)
     _velocity_m_s: dict[int, tuple[float, float]] = field(default_factory=dict)
     """Node -> velocity forward and left, by its newest displacement."""
     _row: dict[int, int] = field(default_factory=dict)
@@ -210,7 +217,10 @@ class Bank:
             known.received(time_s)
             way_m = math.hypot(dx_m, dy_m)
             self.range_correlation.move(node, way_m, turn_rad)
+            self.handedness.turn(node, turn_rad)
             self._velocity_m_s[node] = velocity_m_s(dx_m, dy_m, turn_rad, duration_s)
+            usual = speed_gate.usual_m_s.get(node, 0.0)
+            known.within.move(way_m, duration_s, fraction, usual)
             # How it turned meanwhile its ranges cannot say.
             moves[k, :2] *= known.undiffused(time_s, duration_s)
             vague = None if reported is None else _vagueness(a)
@@ -267,19 +277,31 @@ class Bank:
             self.core.relocalisation.relocalise_lost(first, second, measured)
         rounds = self._attempts(time_s, ranges, timeline)
         if ranges:
-            counts = self.range_correlation.effective_counts(pairs)
+            counts = self._counts(pairs)
             velocity = [
                 self._velocity_at(a, time_s) + self._velocity_at(b, time_s) for a, b in pairs
             ]
-            shares = self.outliers.shares(time_s, pairs)
-            inlier = self.core.update(
-                first, second, measured, dz, variance, counts, np.array(velocity), shares
+            outliers = self.outliers.expected(time_s, pairs)
+            inlier, excess_m = self.core.update(
+                first, second, measured, dz, variance, counts, np.array(velocity), outliers
             )
-            self.outliers.learn(time_s, pairs, inlier)
+            self.outliers.learn(time_s, pairs, inlier, excess_m)
             self._ranges_used += len(ranges)
         for attempts in rounds:
             self.core.update_detection(attempts, self.detection)
         self.core.end_instant()
+
+    def _counts(self, pairs: Sequence[tuple[int, int]]) -> Floats:
+        """Return as how many independent ranges each of ``pairs`` counts (R,)."""
+        known = self._known
+        uneven = [
+            known[a].within.range_variance_m2() + known[b].within.range_variance_m2()
+            for a, b in pairs
+        ]
+        variance = self.core.range_variance_m2
+        alone = self.range_correlation.effective_counts(pairs)
+        counts: Floats = variance * alone / (variance + alone * np.array(uneven))
+        return counts
 
     def _velocity_at(self, node: int, time_s: float) -> tuple[float, float]:
         """Return a node's velocity forward and left (m/s); 0 where its motion is missing."""
@@ -443,6 +465,7 @@ class Bank:
         report = Report(
             time_s, self._row, self._known, self.core, mean, covariance, covariance + common,
             self.initialiser, self.detection, self.clocks,
+            self.handedness.unsure(unknown_headings(self._row, covariance), self._row),
         )  # fmt: skip
         estimate = report.estimate(self.north.known())
         if since_s > -math.inf:

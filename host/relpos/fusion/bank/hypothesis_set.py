@@ -17,6 +17,7 @@ from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import COMMON, PER_NODE, CommonIndex, Hypotheses, StateIndex
 from relpos.fusion.bank.variance_components import Draws, VarianceComponents
 from relpos.fusion.models.motion_variances import COMPONENTS
+from relpos.fusion.models.odometry_faults import JUMP_M
 from relpos.fusion.resampling import systematic
 
 Floats = npt.NDArray[np.float64]
@@ -249,10 +250,10 @@ class HypothesisSet:
         for entry, sigma in ((0, sigma_m), (1, sigma_m), (2, sigma_rad)):
             p[:, at + entry, at + entry] = sigma**2
         wrong, s = self.wrong_start > 0.0, self.settings
-        off = math.sqrt(0.5) * s.jump_m * self.rng.standard_normal((wrong.sum(), 2))
+        off = math.sqrt(0.5) * JUMP_M * self.rng.standard_normal((wrong.sum(), 2))
         x[wrong, at : at + 2] += off
         for entry in (StateIndex.X, StateIndex.Y):
-            p[wrong, at + entry, at + entry] += 0.5 * s.jump_m**2
+            p[wrong, at + entry, at + entry] += 0.5 * JUMP_M**2
         drift, scale = at + StateIndex.DRIFT, at + StateIndex.SCALE
         p[:, drift, drift] = self.has_constants * (1.0 - self.low_heading_noise) * s.drift_rad_s**2
         p[:, scale, scale] = self.has_constants * s.scale**2

@@ -42,6 +42,7 @@ from relpos.fusion.bank.storage import (
     row_place,
 )
 from relpos.fusion.compiled import compiled, inner
+from relpos.fusion.models.ranging import AGAIN_M, OUTLIERS_SHORT
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -72,16 +73,17 @@ class Ranges(NamedTuple):
     """Entry of the state that holds the range's bias, or -1."""
     velocity_m_s: Floats
     """(R, 4): of the first, forward and left, and of the second; no motion is 0."""
-    outlier_share: Floats
-    """Probability of being an outlier (R,)."""
+    outliers: Floats
+    """(R, 3): probability of being an outlier, the part of it that repeats the pair's last one, and
+    by how much that was too long (m)."""
 
 
 class RangeModel(NamedTuple):
     """What is known of all ranges."""
 
     outlier: Floats
-    """(5,): share of outliers, their variance (m^2), the share of these that are too short, the
-    whole motion noise over its part in the covariances, the variance expected beforehand (m^2)."""
+    """(4,): share of outliers, their variance (m^2), the whole motion noise over its part in the
+    covariances, the variance expected beforehand (m^2)."""
     lever_m: Floats
     """Antennas (N, 2), forward and left of the poses; (0, 2) where all are zero."""
 
@@ -211,16 +213,24 @@ def _bound_sensitivity(sens: Floats, t: int, p: Floats, base: int, b: int, most:
 
 @inner
 def _share_inlier(
-    innovation: Lanes, s: Lanes, share: float, outlier: Floats
+    innovation: Lanes, s: Lanes, expected: Floats, outlier: Floats
 ) -> tuple[Lanes, Lanes]:
-    """Return an innovation's inlier probability and log evidence; ``s`` is its variance."""
-    wide, short = outlier[1], outlier[2]
+    """Return an innovation's inlier probability and log evidence; ``s`` is its variance.
+
+    ``expected`` (3,) is a row of :attr:`Ranges.outliers`.
+    """
+    share, again, last_m = expected[0], expected[1], expected[2]
+    wide = outlier[1]
     square = innovation * innovation
     per_sd = 1.0 / lanes.sqrt(s)
     good = (1.0 - share) * lanes.exp(-0.5 * square * per_sd * per_sd) * per_sd
     per_wide = 1.0 / lanes.sqrt(s + wide)
-    side = select(innovation > 0.0, fill(2.0 * (1.0 - short)), fill(2.0 * short))
-    bad = share * side * lanes.exp(-0.5 * square * per_wide * per_wide) * per_wide
+    side = select(innovation > 0.0, fill(2.0 * (1.0 - OUTLIERS_SHORT)), fill(2.0 * OUTLIERS_SHORT))
+    bad = (share - again) * side * lanes.exp(-0.5 * square * per_wide * per_wide) * per_wide
+    if again > 0.0:
+        per_sd = 1.0 / lanes.sqrt(s + AGAIN_M * AGAIN_M)
+        off = (innovation - last_m) * per_sd
+        bad = bad + again * lanes.exp(-0.5 * off * off) * per_sd
     # Where both vanish, it is certainly an outlier.
     both = good + bad + 1e-300
     return good / both, lanes.log(both)
@@ -344,7 +354,7 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
                 innovation = innovation - length
                 v = v + added
             s = v + variance
-            inlier, evidence = _share_inlier(innovation, s, ranges.outlier_share[r], model.outlier)
+            inlier, evidence = _share_inlier(innovation, s, ranges.outliers[r], model.outlier)
             count = ranges.sample_count[r]
             total = total + count * evidence
             per_heavy = 1.0 / (v + variance * (1.0 / count))
@@ -362,6 +372,6 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
             _carry_sensitivities(hypotheses.sensitivity, stats, at, rows, (i, j), (gx, gy, kf), g)
             for user, pose in ((rows[0], i), (rows[1], j)):
                 _bound_sensitivity(
-                    hypotheses.sensitivity, 18 * user, p, block.base, pose, model.outlier[3]
+                    hypotheses.sensitivity, 18 * user, p, block.base, pose, model.outlier[2]
                 )
         store(log_weight, b, load(log_weight, b) + total)

@@ -20,6 +20,7 @@ from relpos.fusion.models.odometry_faults import (
     BELIEVING,
     HEADING_CELL_RAD,
     HYPOTHESES,
+    JUMP_M,
     LOST_M,
     LOST_RAD,
     perturb,
@@ -196,9 +197,9 @@ class Relocalisation:
         edges[-1] = 1.0
         for k in which:
             row = int(np.searchsorted(edges, these.rng.random(), side="right"))
-            offset = these.rng.standard_normal(3).tolist()
+            offset_m = math.sqrt(0.5) * JUMP_M * these.rng.standard_normal(2)
             one = np.array([k])
-            for entry, sigma in enumerate((s.jump_m, s.jump_m, s.jump_rad)):
-                these.shift(row, entry, np.array([math.sqrt(0.5) * offset[entry] * sigma]), one)
-                these.inflate(row, entry, 0.5 * sigma**2, one)
+            for entry in (StateIndex.X, StateIndex.Y):
+                these.shift(row, entry, offset_m[entry : entry + 1], one)
+                these.inflate(row, entry, 0.5 * JUMP_M**2, one)
         self._counters["jumps"] += len(which)

@@ -64,6 +64,8 @@ class Report:
     detection: Detection
     clocks: Clocks
     """What of the time stamps has been put right, beside the state."""
+    unsure: Collection[int] = ()
+    """Nodes whose heading is not known relative to any other's, or may be mirrored."""
 
     def estimate(self, north: MagneticNorth | None) -> Estimate:
         """Make the estimate."""
@@ -98,21 +100,13 @@ class Report:
 
         What all have in common, the team's place and its rotation, does not count.
         """
-        nodes = sorted(self.row)
-        if len(nodes) < 2:
+        if len(self.row) < 2:
             return set()
-        place = PER_NODE * np.array([self.row[node] for node in nodes]) + StateIndex.HEADING
-        own = self.covariance[np.ix_(place, place)]
-        apart = own.diagonal()[:, None] + own.diagonal() - 2.0 * own
-        np.fill_diagonal(apart, np.inf)
-        unturned = apart.min(axis=1) > VAGUE_RAD**2
-        near = dict.fromkeys(nodes, math.inf)
+        near = dict.fromkeys(self.row, math.inf)
         for pair in pairs:
             for node in (pair.node, pair.peer):
                 near[node] = min(near[node], pair.sigma_distance_m)
-        return {
-            node for node, bad in zip(nodes, unturned, strict=True) if bad or near[node] > VAGUE_M
-        }
+        return {node for node in self.row if node in self.unsure or near[node] > VAGUE_M}
 
     def _node(self, node: int, vague: Collection[int]) -> NodeEstimate:
         row, presence = self.row[node], self.presence[node]
@@ -187,10 +181,13 @@ class Report:
         nodes = sorted(self.row)
         rows = np.array([self.row[node] for node in nodes], dtype=np.int64)
         bearings = mixture_kernels.bearings(self.mean, self.world_covariance, rows)
-        first, second = (rows[k] for k in np.triu_indices(len(rows), 1))
-        distances = self.core.predicted_ranges(first, second, np.zeros(len(first)))
+        i, k = np.triu_indices(len(rows), 1)
+        first, second = rows[i], rows[k]
+        distances, sigmas = self.core.predicted_ranges(first, second, np.zeros(len(first)))
+        own_m2 = np.array([self.presence[node].uneven_m2 for node in nodes])
+        sigmas = np.sqrt(sigmas**2 + own_m2[i] + own_m2[k])
         # Two on one spot, known exactly, are 0 m apart, whatever was added to divide by.
-        figures = np.column_stack([*np.round(distances, 9), bearings]).tolist()
+        figures = np.column_stack([np.round(distances, 9), np.round(sigmas, 9), bearings]).tolist()
         every = combinations(nodes, 2)
         return [PairEstimate(*two, *own) for two, own in zip(every, figures, strict=True)]
 
@@ -270,6 +267,21 @@ class Report:
             return ()
         nodes, poses, spread = self._whole_team(mixture)
         return alternatives_of(self.time_s, nodes, mixture.weights, poses, spread)
+
+
+def unknown_headings(row: Mapping[int, int], covariance: Floats) -> set[int]:
+    """Return the nodes whose heading is too uncertain relative to every other's.
+
+    ``covariance`` (D, D) is without the team's rotation.
+    """
+    if len(row) < 2:
+        return set()
+    place = PER_NODE * np.array(list(row.values())) + StateIndex.HEADING
+    own = covariance[np.ix_(place, place)]
+    apart = own.diagonal()[:, None] + own.diagonal() - 2.0 * own
+    np.fill_diagonal(apart, np.inf)
+    unknown = apart.min(axis=1) > VAGUE_RAD**2
+    return {node for node, bad in zip(row, unknown, strict=True) if bad}
 
 
 def _pair_of_mixture(

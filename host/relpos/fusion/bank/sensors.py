@@ -60,10 +60,10 @@ class Sensors(NamedTuple):
 def expect_outliers(counts: Floats, outlier: Floats) -> float:
     """Return the expected share of outliers; it and their variance are written to ``outlier``.
 
-    ``counts`` are :attr:`Sensors.outlier_counts`, ``outlier`` (5,) is ``RangeModel.outlier``.
+    ``counts`` are :attr:`Sensors.outlier_counts`, ``outlier`` (4,) is ``RangeModel.outlier``.
     """
     outliers, others, squares = counts.tolist()
-    prior = float(outlier[4])
+    prior = float(outlier[3])
     share: float = min(max(outliers / (outliers + others), 0.005), 0.5)
     learned = (squares + OUTLIERS_EXPECTED * prior) / (outliers + OUTLIERS_EXPECTED)
     outlier[0], outlier[1] = share, min(max(learned, prior / 9.0), 9.0 * prior)
@@ -113,14 +113,14 @@ def temper(log_weight: Floats, before: Floats) -> None:
 def learn(
     hypotheses: Hypotheses, ranges: Ranges, sensors: Sensors, draws: Draws, perturbed: Floats,
     stats: Floats, before: Floats, wary: bool,
-) -> tuple[Floats, int, int]:  # fmt: skip
+) -> tuple[tuple[Floats, Floats], int, int]:  # fmt: skip
     """Learn from the innovations of an instant's ranges (R,) what they say of the sensors.
 
     ``stats`` (R, STATS, >= K) are of the update, ``before`` (K,) the log weights before it. Then
     the evidence is tempered, and the variance components are drawn again. ``perturbed`` (K,)
     counts down the updates for which a hypothesis teaches nothing; ``wary`` lowers the threshold
-    of the fault detector. Returns each range's inlier probability (R,), the row with an odometry
-    fault or -1, and how many variance components were clamped.
+    of the fault detector. Returns each range's inlier probability, its excess if it is none (R,),
+    the row with an odometry fault or -1, and how many variance components were clamped.
     """
     log_weight = hypotheses.log_weight
     count, several = before.shape[0], ranges.first.shape[0]
@@ -131,12 +131,15 @@ def learn(
     weight = np.empty_like(log_weight)
     mixture.normalise(log_weight, count, weight)
     weights = weight.reshape(-1)
-    inlier = np.empty(several)
+    inlier, off_m = np.empty(several), np.empty(several)
     for r in range(several):
-        each = stats[r, INLIER]
-        inlier[r] = 0.0
+        each, expected_m = stats[r, INLIER], stats[r, MEAN]
+        inlier[r], off_m[r], outlying = 0.0, 0.0, 1e-300
         for k in range(count):
             inlier[r] += weights[k] * each[k]
+            outlying += weights[k] * (1.0 - each[k])
+            off_m[r] += weights[k] * (1.0 - each[k]) * (ranges.range_m[r] - expected_m[k])
+        off_m[r] /= outlying
     counts = np.empty(count)
     for k in range(count):
         counts[k] = 1.0 if perturbed[k] <= 0.0 else 0.0
@@ -154,4 +157,4 @@ def learn(
             surprise[row] += 0.2 * (1.0 - inlier[r] - surprise[row])
     temper(log_weight, before)
     components.spread(draws, sensors.mean, sensors.covariance, hypotheses)
-    return inlier, fault, clamped
+    return (inlier, off_m), fault, clamped

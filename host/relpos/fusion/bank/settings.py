@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 from relpos.fusion.settings import setting
 
@@ -11,15 +13,14 @@ from relpos.fusion.settings import setting
 class BankSettings:
     """What ``--set`` may change; one set for all scenarios and recordings."""
 
+    FORMER: ClassVar[Mapping[str, float]] = {"outliers_short": 0.1, "jump_m": 3.0, "jump_rad": 0.0}
+
     hypotheses: int = setting(200, "at most so many hypotheses (K)", 1, 100_000)
     sampled: float = setting(0.5, "share of the heading noise that is drawn", 0.0, 1.0)
     outliers: float = setting(0.1, "share of ranges that are outliers, beforehand", 0.0, 0.9)
     outlier_m: float = setting(3.0, "how far outliers are off, beforehand", 0.1, 100.0)
-    outliers_short: float = setting(0.1, "share of the outliers that are too short", 0.0, 1.0)
     jumps: float = setting(0.002, "share of jump hypotheses an epoch, in quiet", 0.0, 1.0)
     jumps_most: float = setting(0.05, "share of jump hypotheses an epoch, at most", 0.0, 1.0)
-    jump_m: float = setting(3.0, "how far a jump may lead", 0.0, 100.0)
-    jump_rad: float = setting(0.3, "how far a jump may turn", 0.0, 3.2)
     wrong_starts: float = setting(0.1, "share of hypotheses that doubt the given starts", 0.0, 0.9)
     scale: float = setting(0.1, "prior standard deviation of the step scale", 0.0, 1.0)
     drift_rad_s: float = setting(0.005, "prior standard deviation of heading drift", 0.0, 1.0)

@@ -37,6 +37,7 @@ from relpos.fusion.large_teams.sparse_filter import LATENESS, SHADOW, Neighbourh
 from relpos.fusion.large_teams.variance_components import VarianceComponents
 from relpos.fusion.models.motion import reported_sigmas
 from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_variances
+from relpos.fusion.models.odometry_faults import JUMP_M
 from relpos.fusion.models.ranging import Mounting, OutlierPersistence, RangeCorrelation
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
@@ -51,9 +52,6 @@ Indices = npt.NDArray[np.int64]
 class LargeTeamSettings:
     """The bank's settings that a large team uses, too (``fusion/bank/settings.py``)."""
 
-    outliers_short: float
-    jump_m: float
-    jump_rad: float
     drift_rad_s: float
     scale: float
     reorder_s: float
@@ -113,6 +111,8 @@ distance has changed since; what a heading error of 10 degrees does to that is 0
 
 MOSTLY_OUTLYING = 0.5
 """From this fraction of outliers on a node's pose, and not its ranges, is taken to be wrong."""
+TURNED_RAD = 0.3
+"""How uncertain its heading is then."""
 
 FORGET = 0.3
 """Weight of an instant in that fraction: at a range every 2 s, three instants or so."""
@@ -162,7 +162,7 @@ class LargeTeam:
     _epoch_s: float = -math.inf
 
     def __post_init__(self) -> None:
-        model = RangeModel(SIGMA_R_M, OUTLIERS, OUTLIER_M, self.settings.outliers_short)
+        model = RangeModel(SIGMA_R_M, OUTLIERS, OUTLIER_M)
         self.filter = NeighbourhoodFilter(math.inf, model)
         known: list[Prior] = []
         for p in sorted(self.priors, key=lambda p: p.node):
@@ -372,10 +372,10 @@ class LargeTeam:
         before, prior = f.pose.copy(), f.marginals()
         # A range of twice the variance counts half.
         counts = self._correlation.effective_counts(pairs) / (1.0 + lifted / f.model.sigma_m**2)
-        shares = self._outliers.shares(time_s, pairs)
-        inlier = f.update_with_terms(Ranges(node, peer, horizontal, counts, shares, slopes))
-        self._outliers.learn(time_s, pairs, inlier)
+        outliers = self._outliers.expected(time_s, pairs)
+        inlier = f.update_with_terms(Ranges(node, peer, horizontal, counts, outliers, slopes))
         horizontal -= slopes @ f.terms
+        self._outliers.learn(time_s, pairs, inlier, horizontal - f.antenna_pairs(node, peer)[0])
         both = np.concatenate([node, peer])
         self._components.update(before, prior, f.pose, f.marginals(), both)
         self._own["ranges_distrusted"] += int((inlier < 0.5).sum())
@@ -403,7 +403,7 @@ class LargeTeam:
         self._outlying[some] += FORGET * (outliers[some] / count[some] - self._outlying[some])
         wrong = np.flatnonzero((self._outlying > MOSTLY_OUTLYING) & (count >= 2))
         if wrong.size:
-            self.filter.inflate(wrong, self.settings.jump_m, self.settings.jump_rad)
+            self.filter.inflate(wrong, JUMP_M, TURNED_RAD)
             self._outlying[wrong] = 0.0
             self._own["jumps"] += int(wrong.size)
 

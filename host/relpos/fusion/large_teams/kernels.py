@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from relpos.fusion.compiled import compiled, inlined
 from relpos.fusion.large_teams.layout import COVARIANCE, INFORMATION, Blocks, StripLayout
+from relpos.fusion.models.ranging import AGAIN_M, OUTLIERS_SHORT
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -167,8 +168,9 @@ class Ranges(NamedTuple):
     measured_m: Floats
     counts: Floats
     """How many independent ranges each is worth."""
-    outlier_share: Floats
-    """Probability that it is an outlier, at least."""
+    outliers: Floats
+    """(E, 3): probability that it is an outlier, at least; the part of it that repeats the pair's
+    last one, and by how much that was too long (m)."""
     slopes: Floats
     """(E, T): derivative by what all ranges have in common."""
 
@@ -180,8 +182,6 @@ class RangeModel(NamedTuple):
     outliers: float = 0.0
     """Fraction of outliers."""
     outlier_m: float = 3.0
-    outliers_short: float = 0.1
-    """Fraction of the outliers that are too short."""
 
 
 @compiled
@@ -209,24 +209,26 @@ def range_information(
     information, push = np.zeros(blocks.total), np.zeros((2 * len(strip), 1 + terms))
     lines = np.zeros((len(ranges.node), 4 + terms))
     inlier = np.empty(len(ranges.node))
-    short = model.outliers_short
     for e in range(len(ranges.node)):
         i, j = ranges.node[e], ranges.peer[e]
         distance, along, across, bearing = pairs[0, e], pairs[1, e], pairs[2, e], pairs[3, e]
         square = distance * distance + across + NEAREST_M * NEAREST_M
         middle = math.sqrt(square)
         innovation = ranges.measured_m[e] - middle
-        outliers = max(model.outliers, ranges.outlier_share[e])
+        outliers, again = max(model.outliers, ranges.outliers[e, 0]), ranges.outliers[e, 1]
         curved = 0.5 * across * across / square
         noise = model.sigma_m * model.sigma_m + curved
         slope = distance / middle
         expected = slope * slope * along + noise
         wide = expected + model.outlier_m * model.outlier_m
-        side = 2.0 * (1.0 - short) if innovation > 0.0 else 2.0 * short
+        side = 2.0 * (1.0 - OUTLIERS_SHORT if innovation > 0.0 else OUTLIERS_SHORT)
         usual = (1.0 - outliers) * math.exp(-0.5 * (innovation * innovation / expected))
         usual /= math.sqrt(expected)
-        odd = outliers * side * math.exp(-0.5 * innovation * innovation / wide)
+        odd = (outliers - again) * side * math.exp(-0.5 * innovation * innovation / wide)
         odd /= math.sqrt(wide)
+        if again > 0.0:
+            off, like = innovation - ranges.outliers[e, 2], expected + AGAIN_M * AGAIN_M
+            odd += again * math.exp(-0.5 * off * off / like) / math.sqrt(like)
         # Where both vanish, the range is an outlier.
         inlier[e] = usual / (usual + odd + 1e-300)
         if inlier[e] < 1e-3 or abs(strip[i] - strip[j]) > 1:

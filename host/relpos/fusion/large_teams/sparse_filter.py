@@ -190,7 +190,8 @@ class NeighbourhoodFilter:
         """Use the ranges (E,) of one instant; return their probabilities of being no outliers."""
         same = np.ones(len(node))
         slopes = np.zeros((len(node), TERMS))
-        return self.update_with_terms(Ranges(node, peer, measured_m, same, 0.0 * same, slopes))
+        outliers = np.zeros((len(node), 3))
+        return self.update_with_terms(Ranges(node, peer, measured_m, same, outliers, slopes))
 
     def update_with_terms(self, ranges: Ranges) -> Floats:
         """As :meth:`update`, ranges that have T terms in common (slopes (E, T)).

@@ -1,0 +1,94 @@
+"""A team that is believed to be its own mirror image: distances fit, left and right do not."""
+
+from __future__ import annotations
+
+import cmath
+import math
+
+import numpy as np
+import pytest
+
+from relpos import fusion
+from relpos.fusion.estimator import Estimate, NodeStatus
+from relpos.measurements import Measurement, Motion, Prior, Range
+
+PEOPLE, SECONDS, STRAIGHT_S, SIGMA_M = 4, 60, 20, 0.1
+
+
+def walks(seed: int) -> tuple[np.ndarray, np.ndarray, list[Measurement]]:
+    """All go straight on for ``STRAIGHT_S``, then turn about: places and headings (T, N)."""
+    rng = np.random.default_rng(seed)
+    turns = 0.4 * rng.normal(size=(SECONDS, PEOPLE))
+    turns[:STRAIGHT_S] = 0.0
+    headings = rng.uniform(-math.pi, math.pi, PEOPLE) + np.vstack([np.zeros(PEOPLE), turns]).cumsum(
+        axis=0
+    )
+    places = np.empty((SECONDS + 1, PEOPLE), dtype=complex)
+    places[0] = rng.uniform(-8.0, 8.0, PEOPLE) + 1j * rng.uniform(-8.0, 8.0, PEOPLE)
+    places[1:] = places[0] + (0.7 * np.exp(1j * headings[1:])).cumsum(axis=0)
+    rows: list[Measurement] = []
+    for t in range(SECONDS):
+        for n in range(PEOPLE):
+            step = 0.7 * cmath.rect(1.0 + 0.03 * rng.normal(), turns[t, n])
+            rows.append(Motion(t + 1.0, n + 1, step.real, step.imag, float(turns[t, n])))
+        for a in range(PEOPLE):
+            for b in range(a + 1, PEOPLE):
+                far_m = abs(places[t + 1, b] - places[t + 1, a]) + SIGMA_M * rng.normal()
+                rows.append(Range(t + 1.0, a + 1, b + 1, float(abs(far_m))))
+    return places, headings, rows
+
+
+def seen(places: np.ndarray, headings: np.ndarray) -> np.ndarray:
+    """Where everybody sees everybody else (N, N): ahead and left, as complex numbers."""
+    return (places[None, :] - places[:, None]) * np.exp(-1j * headings[:, None])
+
+
+def is_mirrored_and_ok(estimate: Estimate, truth: np.ndarray) -> bool:
+    """Whether left and right are exchanged in an estimate that says to be right."""
+    nodes = estimate.nodes
+    if len(nodes) < PEOPLE or any(n.status is not NodeStatus.OK for n in nodes):
+        return False
+    own = seen(
+        np.array([complex(n.x_m, n.y_m) for n in nodes]), np.array([n.heading_rad for n in nodes])
+    )
+    return bool(np.abs(own.conj() - truth).sum() < 0.5 * np.abs(own - truth).sum())
+
+
+def longest_s(seconds: list[int]) -> int:
+    """How many of some rising seconds follow each other at most."""
+    longest = run = 0
+    for k, second in enumerate(seconds):
+        run = run + 1 if k and second == seconds[k - 1] + 1 else 1
+        longest = max(longest, run)
+    return longest
+
+
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 12))]
+)
+@pytest.mark.parametrize("start", ["unknown", "vague", "mirrored"])
+def test_a_mirrored_team_is_never_ok_for_more_than_five_seconds(start: str, seed: int) -> None:
+    places, headings, rows = walks(seed)
+    told, turned = places[0], headings[0]
+    sigma_m, sigma_rad, since_s = 6.0, 1.2, 0
+    if start == "mirrored":
+        # Told and wrong: nothing can tell before anybody has turned.
+        told, turned, sigma_m, sigma_rad, since_s = told.conj(), -turned, 1.0, 0.3, STRAIGHT_S
+    else:
+        rng = np.random.default_rng(100 + seed)
+        told = told + sigma_m * (rng.normal(size=PEOPLE) + 1j * rng.normal(size=PEOPLE))
+        turned = turned + sigma_rad * rng.normal(size=PEOPLE)
+    priors = [
+        Prior(n + 1, told[n].real, told[n].imag, turned[n], sigma_m, sigma_rad)
+        for n in range(PEOPLE)
+    ]
+    bank = fusion.make("bank", () if start == "unknown" else priors, seed=seed)
+    estimates = [e for m in rows for e in bank.process(m)] + bank.finish()
+    wrong = [
+        round(e.time_s)
+        for e in estimates
+        if e.time_s == round(e.time_s)
+        and is_mirrored_and_ok(e, seen(places[round(e.time_s)], headings[round(e.time_s)]))
+    ]
+    assert (STRAIGHT_S - 1 in wrong) == (start == "mirrored")
+    assert longest_s([second for second in wrong if second > since_s]) <= 5
