@@ -39,7 +39,7 @@ from relpos.fusion.initial_poses import (
 )
 from relpos.fusion.models.detection import Detection
 from relpos.fusion.models.handedness import Handedness
-from relpos.fusion.models.motion import WithinReport, reported_sigmas, velocity_m_s
+from relpos.fusion.models.motion import WALK_S, WithinReport, reported_sigmas, velocity_m_s
 from relpos.fusion.models.north import North
 from relpos.fusion.models.odometry_faults import LOST_RAD, VAGUE_M, SpeedGate, ZeroMotionDetector
 from relpos.fusion.models.ranging import (
@@ -48,6 +48,7 @@ from relpos.fusion.models.ranging import (
     RangeCorrelation,
     slant_height,
 )
+from relpos.fusion.models.unseen_walk import UnseenWalk
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.fusion.vertical.filter import VerticalFilter
@@ -72,6 +73,7 @@ class _Known(Presence):
     worn_m: float = 0.0
     """Height of the tag over the floor at the start."""
     within: WithinReport = field(default_factory=WithinReport)
+    unseen: UnseenWalk | None = None
 
     @property
     def uneven_m2(self) -> float:
@@ -222,7 +224,12 @@ class Bank:
             usual = speed_gate.usual_m_s.get(node, 0.0)
             known.within.move(way_m, duration_s, fraction, usual)
             # How it turned meanwhile its ranges cannot say.
-            moves[k, :2] *= known.undiffused(time_s, duration_s)
+            if known.unseen is not None and duration_s > WALK_S * fraction:
+                # So long a report says nothing of where its end led to.
+                moves[k, :2] = 0.0
+                self._walk_unseen(node, time_s)
+            else:
+                moves[k, :2] *= known.undiffused(time_s, duration_s)
             vague = None if reported is None else _vagueness(a)
             if reported is not None and vague is not None:
                 reported[k] = math.nan
@@ -282,11 +289,16 @@ class Bank:
                 self._velocity_at(a, time_s) + self._velocity_at(b, time_s) for a, b in pairs
             ]
             outliers = self.outliers.expected(time_s, pairs)
+            before = self._unseen(ends, time_s)
             inlier, excess_m = self.core.update(
                 first, second, measured, dz, variance, counts, np.array(velocity), outliers
             )
             self.outliers.learn(time_s, pairs, inlier, excess_m)
             self._ranges_used += len(ranges)
+            for (walk, place, spread), (_, moved, left) in zip(
+                before, self._unseen(ends, time_s), strict=True
+            ):
+                walk.correct(moved - place, spread, left)
         for attempts in rounds:
             self.core.update_detection(attempts, self.detection)
         self.core.end_instant()
@@ -330,10 +342,52 @@ class Bank:
         Their ranges are used all the same. Where the motion comes late, the rewinder repeats both.
         """
         for node in sorted(self._row.keys() & nodes):
-            unseen_m2 = self._known[node].diffuse(time_s, timeline.reported_s(node))
-            if unseen_m2 > 0.0:
-                self.core.relocalisation.diffuse(self._row[node], unseen_m2)
-                self._counters["diffusions"] += 1
+            known, reported_s = self._known[node], timeline.reported_s(node)
+            since_s = max(known.diffused_s, reported_s)
+            if not -math.inf < since_s < time_s:
+                continue
+            if known.unseen is None or known.unseen.since_s != reported_s:
+                known.unseen = UnseenWalk(reported_s, self._last_velocity_m_s(node))
+            known.diffused_s = since_s
+            self._walk_unseen(node, time_s)
+
+    def _walk_unseen(self, node: int, time_s: float) -> None:
+        """Let a node walk on without a report."""
+        known = self._known[node]
+        if known.unseen is None or known.diffused_s >= time_s:
+            return
+        duration_s = time_s - known.diffused_s
+        self.range_correlation.move(node, known.unseen.speed_m_s * duration_s, 0.0)
+        way_m, unknown = known.unseen.walk(duration_s)
+        self.core.relocalisation.diffuse(self._row[node], way_m, unknown)
+        known.diffused_s = time_s
+        self._counters["diffusions"] += 1
+
+    def _last_velocity_m_s(self, node: int) -> Floats:
+        """Return a node's velocity by its last report, in world axes."""
+        mean, _ = self.core.hypotheses.moments(poses_alone=True)
+        heading = float(mean[PER_NODE * self._row[node] + StateIndex.HEADING])
+        forward, left = self._velocity_m_s.get(node, (0.0, 0.0))
+        c, s = math.cos(heading), math.sin(heading)
+        return np.array([c * forward - s * left, s * forward + c * left])
+
+    def _unseen(
+        self, nodes: Iterable[int], time_s: float
+    ) -> list[tuple[UnseenWalk, Floats, Floats]]:
+        """Return who of ``nodes`` walks unseen now, with its place (2,) and covariance (2, 2)."""
+        walks = [
+            (node, known.unseen)
+            for node, known in ((n, self._known[n]) for n in sorted(self._row.keys() & nodes))
+            if known.unseen is not None and known.diffused_s == time_s
+        ]
+        if not walks:
+            return []
+        mean, covariance = self.core.hypotheses.moments(poses_alone=True)
+        found = []
+        for node, walk in walks:
+            at = PER_NODE * self._row[node]
+            found.append((walk, mean[at : at + 2], covariance[at : at + 2, at : at + 2]))
+        return found
 
     def _seek(self, node: int) -> None:
         if node not in self.initialiser:

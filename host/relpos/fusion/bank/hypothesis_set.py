@@ -230,6 +230,15 @@ class HypothesisSet:
         place, (block, lane) = self._place(row, entry), self._at(which)
         self.arrays.p[block, storage.triangle_place(place, place), lane] += variance
 
+    def diffuse(self, row: int, way_m: Floats, covariance: Floats) -> None:
+        """Move a user by ``way_m`` (2,), and add to the covariance (2, 2) of its place, in all."""
+        first = self._place(row, StateIndex.X)
+        for e in (StateIndex.X, StateIndex.Y):
+            self.arrays.x[:, first + e] += way_m[e]
+            for f in range(e + 1):
+                at = storage.triangle_place(first + e, first + f)
+                self.arrays.p[:, at] += covariance[e, f]
+
     # -- adding --------------------------------------------------------------------------------
 
     def add_node(self, pose: tuple[float, float, float], sigma_m: float, sigma_rad: float) -> int:

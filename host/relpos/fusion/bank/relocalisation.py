@@ -87,14 +87,16 @@ class Relocalisation:
             self.lost[row] = total
             self.ambiguous.add(row)
 
-    def diffuse(self, row: int, variance_m2: float) -> None:
-        """Know less of where a user is (m^2, both axes); lost where that grows without a range.
+    def diffuse(self, row: int, way_m: Floats, covariance: Floats) -> None:
+        """Let a user walk unseen: a way (2,), and the covariance (2, 2) of what is not known of it.
 
-        Every hypothesis widens: a filter that hears its ranges follows the user.
+        Every hypothesis widens: a filter that hears its ranges follows the user. Lost where that
+        grows without a range.
         """
-        for entry in (StateIndex.X, StateIndex.Y):
-            self._hypotheses.inflate(row, entry, 0.5 * variance_m2)
-        total_m2 = self.diffused_m2[row] = self.diffused_m2.get(row, 0.0) + variance_m2
+        self._hypotheses.diffuse(row, way_m, covariance)
+        total_m2 = self.diffused_m2[row] = self.diffused_m2.get(row, 0.0) + float(
+            covariance.trace()
+        )
         if self._hypotheses.settings.hypotheses > 1 and total_m2 > LOST_M**2:
             self.lost[row] = math.sqrt(total_m2), self.lost.get(row, (0.0, 0.0))[1]
             self.ambiguous.add(row)
