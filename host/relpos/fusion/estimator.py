@@ -270,6 +270,10 @@ class Presence:
         """Variance (m^2, along any one direction) of where it is within its report."""
         return 0.0
 
+    def facing(self, time_s: float, heading_rad: float, sigma_rad: float) -> tuple[float, float]:
+        """Return its heading and the deviation, which are known but for what it turned unseen."""
+        return heading_rad, sigma_rad
+
     def received(self, time_s: float) -> None:
         """Note that the node reported motion up to ``time_s``."""
         if time_s > self.news_s:

@@ -59,3 +59,14 @@ def test_a_position_that_something_else_made_certain_leaves_a_velocity_with_a_va
         walk.correct(np.array([0.3, 0.0]), 1e-3 * np.eye(2), 1e-5 * np.eye(2))
         assert (np.linalg.eigvalsh(walk._variance) > 0.0).all()
         assert np.hypot(*walk.velocity_m_s) < 30.0
+
+
+def test_who_walks_faces_the_way_and_who_stands_may_have_turned() -> None:
+    walk = UnseenWalk(0.0, np.array([0.0, 1.0]))
+    heading, sigma = walk.facing(20.0, 0.0, 0.1)
+    assert heading == pytest.approx(math.pi / 2)
+    assert sigma < 0.5
+    assert walk.facing(0.1, 0.3, 0.1)[0] == 0.3
+    heading, sigma = UnseenWalk(0.0, np.zeros(2)).facing(20.0, 0.3, 0.1)
+    assert heading == 0.3
+    assert sigma > math.radians(45.0)

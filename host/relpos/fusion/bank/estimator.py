@@ -79,6 +79,11 @@ class _Known(Presence):
     def uneven_m2(self) -> float:
         return self.within.variance_m2
 
+    def facing(self, time_s: float, heading_rad: float, sigma_rad: float) -> tuple[float, float]:
+        if self.unseen is None or self.diffused_s < time_s:
+            return heading_rad, sigma_rad
+        return self.unseen.facing(time_s, heading_rad, sigma_rad)
+
 
 @dataclass(slots=True)
 class Bank:

@@ -106,7 +106,13 @@ class Report:
         for pair in pairs:
             for node in (pair.node, pair.peer):
                 near[node] = min(near[node], pair.sigma_distance_m)
-        return {node for node in self.row if node in self.unsure or near[node] > VAGUE_M}
+        return {
+            node
+            for node in self.row
+            if node in self.unsure
+            or near[node] > VAGUE_M
+            or self.presence[node].facing(self.time_s, 0.0, 0.0)[1] > VAGUE_RAD
+        }
 
     def _node(self, node: int, vague: Collection[int]) -> NodeEstimate:
         row, presence = self.row[node], self.presence[node]
@@ -117,9 +123,10 @@ class Report:
         at = PER_NODE * row
         x, y, heading = self.mean[at : at + 3].tolist()
         own = self.world_covariance[at : at + 3, at : at + 3].tolist()
+        heading, sigma = presence.facing(self.time_s, heading, math.sqrt(own[2][2]))
         return NodeEstimate(
             node, x, y, math.remainder(heading, math.tau), own[0][0], own[1][1], own[0][1],
-            min(math.sqrt(own[2][2]), ANY_ANGLE_RAD), status, *presence.vertical,
+            min(sigma, ANY_ANGLE_RAD), status, *presence.vertical,
         )  # fmt: skip
 
     def _parameters(self) -> tuple[Parameter, ...]:

@@ -30,6 +30,13 @@ MOST_EXPLAINED = 0.95
 """Share of the velocity's variance that a position may explain."""
 
 
+TURNS_RAD2_S = 0.12
+"""Variance by which a heading may change in a second: a right angle in twenty."""
+
+WALKING_M_S, ASIDE_RAD = 0.3, 0.2
+"""Who walks at least so fast faces the way, give or take so much."""
+
+
 def _last() -> Floats:
     return LAST_M2_S2 * np.eye(2)
 
@@ -65,6 +72,16 @@ class UnseenWalk:
         self.velocity_m_s = kept * self.velocity_m_s
         size, axes = np.linalg.eigh(grown)
         return way_m, (axes * np.maximum(size, 0.0)) @ axes.T
+
+    def facing(self, time_s: float, heading_rad: float, sigma_rad: float) -> tuple[float, float]:
+        """Return the heading and its deviation: of the last report, or the way that is walked."""
+        turned = math.hypot(sigma_rad, math.sqrt(TURNS_RAD2_S * max(time_s - self.since_s, 0.0)))
+        east, north = self.velocity_m_s.tolist()
+        speed = math.hypot(east, north)
+        walking = math.hypot(ASIDE_RAD, math.sqrt(0.5 * self._variance.trace()) / max(speed, 1e-9))
+        if speed > WALKING_M_S and walking < turned:
+            return math.atan2(north, east), walking
+        return heading_rad, turned
 
     def correct(self, moved_m: Floats, before: Floats, after: Floats) -> None:
         """Learn from what ranges moved the position by (2,), its covariances (2, 2) around it."""
