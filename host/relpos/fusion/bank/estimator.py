@@ -387,7 +387,7 @@ class Bank:
         ]
         if not walks:
             return []
-        mean, covariance = self.core.hypotheses.moments(poses_alone=True)
+        mean, covariance = self.core.hypotheses.relative_moments()
         found = []
         for node, walk in walks:
             at = PER_NODE * self._row[node]

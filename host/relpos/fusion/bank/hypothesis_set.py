@@ -204,6 +204,18 @@ class HypothesisSet:
         self.common += common_rotation.about_origin(own + between, *middle)
         return self.moments(poses_alone=True)
 
+    def relative_moments(self) -> tuple[Floats, Floats]:
+        """Return the poses' moments without the team's rigid motion, which no range corrects."""
+        mean, covariance = self.moments(poses_alone=True)
+        if self.nodes < 2:
+            return mean, covariance
+        _, known = common_rotation.estimate(mean, covariance, self.nodes)
+        entries = storage.order(self.nodes, len(mean))[: storage.POSE * self.nodes]
+        x_m, y_m = mean[entries[0::3]], mean[entries[1::3]]
+        g = common_rotation.rigid_motion(x_m - x_m.mean(), y_m - y_m.mean())
+        covariance[np.ix_(entries, entries)] -= g @ known @ g.T
+        return mean, covariance
+
     def put_back_common_rotation(self) -> None:
         """Put back what was taken out: an absolute heading is to measure it."""
         if self.common[2, 2] > 0.0:
