@@ -249,8 +249,9 @@ LOST_EPOCHS = 10
 
 
 PLACING_RANGES = 3
-"""So many ranges place a node whose motion is missing: what it walks unseen begins at the oldest
-of them (``mission-gap-20``, 300 s: 0.76 m where it begins at the last report, 0.44 so)."""
+"""So many ranges place a node of a large team whose motion is missing: what it walks unseen begins
+at the oldest of them (``mission-gap-20``, 300 s: 0.76 m where it begins at the last report, 0.44
+so). The bank knows its velocity beside (``models/unseen_walk.py``)."""
 
 
 @dataclass(slots=True)

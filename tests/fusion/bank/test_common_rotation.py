@@ -90,6 +90,19 @@ def test_the_mixtures_moments_are_kept_with_what_was_taken_out() -> None:
     assert (rest + common)[both] == pytest.approx(covariance[both], rel=0.02, abs=0.02)
 
 
+def test_relative_moments_have_the_distances_and_no_rigid_motion() -> None:
+    these = team(64, 0.03).hypotheses
+    mean, covariance = these.moments(poses_alone=True)
+    _, relative = these.relative_moments()
+    poses = (PER_NODE * np.arange(NODES)[:, None] + np.arange(3)).ravel()
+    assert np.linalg.eigvalsh(relative[np.ix_(poses, poses)]).min() > -1e-6
+    assert np.trace(relative) < 0.5 * np.trace(covariance)
+    slope = np.zeros(len(mean))
+    off = mean[PER_NODE : PER_NODE + 2] - mean[:2]
+    slope[PER_NODE : PER_NODE + 2], slope[:2] = off, -off
+    assert slope @ relative @ slope == pytest.approx(slope @ covariance @ slope)
+
+
 def test_an_absolute_heading_still_corrects_the_team() -> None:
     core = team()
     mean, covariance, common = core.moments()

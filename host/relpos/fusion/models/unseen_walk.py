@@ -26,6 +26,9 @@ LAST_M2_S2 = 0.1
 """Variance along each axis of the velocity that was reported last."""
 
 
+LEAST_M2 = 1e-6
+"""Added to a position's variance: of two people all but their distance may have been taken out."""
+
 MOST_EXPLAINED = 0.95
 """Share of the velocity's variance that a position may explain."""
 
@@ -85,7 +88,7 @@ class UnseenWalk:
 
     def correct(self, moved_m: Floats, before: Floats, after: Floats) -> None:
         """Learn from what ranges moved the position by (2,), its covariances (2, 2) around it."""
-        gain = np.linalg.solve(before, self._cross.T).T
+        gain = np.linalg.solve(before + LEAST_M2 * np.eye(2), self._cross.T).T
         # Other things correct the position, too: what is said to be common may be too much.
         explained = np.linalg.eigvals(np.linalg.solve(self._variance, gain @ before @ gain.T))
         gain *= min(1.0, math.sqrt(MOST_EXPLAINED / max(float(explained.real.max()), 1e-12)))
