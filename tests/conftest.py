@@ -32,7 +32,7 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    durations = config.cache.get(DURATIONS, {})  # type: ignore[union-attr]
+    durations = config.cache.get(DURATIONS, {}) if config.cache is not None else {}
     # Tests of a file stay together and share its fixtures (--dist loadfile); a new one may be long.
     items.sort(key=lambda item: -durations.get(_file_of(item.nodeid), _guess_s(item.nodeid)))
 
@@ -56,8 +56,9 @@ class _Stopwatch:
 
     def pytest_sessionfinish(self) -> None:
         """Keep what this run measured; a run of a few files keeps the others' figures."""
-        before = self.config.cache.get(DURATIONS, {})  # type: ignore[union-attr]
-        self.config.cache.set(DURATIONS, before | self.seconds)  # type: ignore[union-attr]
+        if self.config.cache is not None:
+            before = self.config.cache.get(DURATIONS, {})
+            self.config.cache.set(DURATIONS, before | self.seconds)
 
 
 def pytest_configure(config: pytest.Config) -> None:

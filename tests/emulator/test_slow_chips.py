@@ -103,6 +103,7 @@ def test_slow_inertial_chips_cost_no_motion(uno: Path, monkeypatch: pytest.Monke
     assert statuses[-1]["missed_ticks"] == 0
 
 
+@pytest.mark.soak  # builds the firmware anew
 def test_the_bus_at_100_khz_is_a_build_that_works(tmp_path: Path) -> None:
     build(
         {

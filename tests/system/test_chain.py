@@ -322,7 +322,8 @@ def test_an_emulated_team_is_fused_live_by_another_process(tmp_path):
     assert 15.0 < received.measurements[-1].time_s < 20.0 * (seconds + 1)
     assert {m.node for m in received.motions} == {1, 2, 3}
     with EmulatedTeam(TeamConfig("paper", 3, 300.0, 4, beacons=True)) as team:
-        sent = end_poses((t * 1e-6, data) for t, data in team.run(300_000_000))[1]
+        until_us = 1_000_000 * round(received.measurements[-1].time_s + 10.0)
+        sent = end_poses((t * 1e-6, data) for t, data in team.run(until_us))[1]
     in_run = Counter((r.node, r.peer, round(r.range_m, 3)) for r in received.ranges)
     assert in_run.total() > 20
     assert not in_run - Counter((n, p, round(r, 3)) for n, p, r in sent.elements())

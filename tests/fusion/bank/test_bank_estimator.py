@@ -45,8 +45,8 @@ def test_the_bank_is_near_the_bound_without_knowing_the_noise(
     ("overrides", "limit_m"),
     [
         ({"nlos_probability": 0.2}, 0.4),
-        ({"start_shift_m": 4.0}, 0.6),
-        ({"noisy_factor": 3.0}, 0.55),
+        pytest.param({"start_shift_m": 4.0}, 0.6, marks=pytest.mark.soak),
+        pytest.param({"noisy_factor": 3.0}, 0.55, marks=pytest.mark.soak),
         ({"scale_error": 0.1, "heading_drift_deg_s": 0.5}, 0.25),
     ],
 )

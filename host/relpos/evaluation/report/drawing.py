@@ -59,9 +59,11 @@ def svg(figure: Figure) -> str:
 
     written = io.StringIO()
     with mpl.rc_context(STYLE):
+        # Laid out once, and not again by each way of saving it.
+        if (engine := figure.get_layout_engine()) is not None:
+            engine.execute(figure)
+            figure.set_layout_engine(None)
         figure.savefig(written, format="svg", metadata={"Date": None, "Creator": None})
-    # Laid out once: what is drawn of it after this is the same, and quicker.
-    figure.set_layout_engine("none")
     return _numbered(_shorter(written.getvalue()))
 
 

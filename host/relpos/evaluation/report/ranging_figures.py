@@ -169,7 +169,7 @@ def _draw_residuals(
     side = axes.inset_axes((0.84, 0.0, 0.16, 1.0), sharey=axes)
     side.hist(
         values, bins=np.linspace(*limits, 31).tolist(), orientation="horizontal", color=FUSED,
-        alpha=0.55,
+        alpha=0.55, histtype="stepfilled",
     )  # fmt: skip
     side.axis("off")
     axes.set_title(
