@@ -54,8 +54,9 @@ class Packed:
         sensitivity[...] = 0.0
         log_weight, variance = np.zeros(self.count), np.full(self.count, 0.04)
         self.arrays = Hypotheses(
-            x, p, in_lanes(log_weight), sensitivity, in_lanes(self.component), in_lanes(variance)
-        )
+            x, p, in_lanes(log_weight), sensitivity, in_lanes(self.component), in_lanes(variance),
+            in_lanes(np.zeros(self.count)),
+        )  # fmt: skip
         return self.arrays
 
     def __exit__(self, *_: object) -> None:
@@ -556,7 +557,7 @@ def test_variance_components_are_drawn_by_what_is_known_of_them() -> None:
     component, variance = lanes.empty_lines(2, 2, COMPONENTS), lanes.empty_lines(2)
     arrays = Hypotheses(
         nothing[None], nothing[None], nothing, lanes.empty_lines(2, 2, COMPONENTS, 6), component,
-        variance,
+        variance, lanes.empty_lines(2),
     )  # fmt: skip
     components.spread(components.Draws(laid, low_noise, 0.5), mean, covariance, arrays)
     sd = np.minimum(0.5 * np.sqrt(covariance.diagonal()), components.SPREAD_MOST)

@@ -46,7 +46,7 @@ def updated(
     ones = np.ones((1, 2, 3, lanes.LANES))
     hypotheses = Hypotheses(
         *stored, np.zeros((1, lanes.LANES)), np.zeros((1, 2, 3, 6, lanes.LANES)), ones,
-        np.full((1, lanes.LANES), sigma**2),
+        np.full((1, lanes.LANES), sigma**2), np.zeros((1, lanes.LANES)),
     )  # fmt: skip
     ranges = Ranges(
         np.array([0]), np.array([1]), np.array([measured]), np.array([dz]), np.zeros(1),

@@ -94,7 +94,8 @@ class AdaptiveCount:
         weight, effective = these.normalise()
         weights = weight.reshape(-1)[: these.count]
         constants, biased = float(weights @ these.has_constants), float(weights @ these.has_bias)
-        least = max(min(constants, 1.0 - constants), min(biased, 1.0 - biased))
+        heights = float(weights @ these.has_heights)
+        least = max(min(share, 1.0 - share) for share in (constants, biased, heights))
         return (
             float(these.components.covariance[-1, -1]) <= hypothesis_count.KNOWN**2
             and effective >= hypothesis_count.EVEN * these.count
@@ -142,8 +143,11 @@ class AdaptiveCount:
         """Go on with fewer hypotheses; the mixture's moments are unchanged."""
         these = self._hypotheses
         s = these.settings
-        mean, covariance = these.moments(unperturbed)
-        these.log_weight[:] -= np.where(these.perturbed > 0.0, PERTURBED_LOSS, 0.0)
+        heights = float(unperturbed.reshape(-1)[: these.count] @ these.has_heights) > 0.5
+        # What a pair's entry is has to be the same in all.
+        left_out = (these.perturbed > 0.0) | (these.has_heights != heights)
+        these.log_weight[:] -= np.where(left_out, PERTURBED_LOSS, 0.0)
+        mean, covariance = these.moments()
         before, weight = these.sampled_share, these.weights()
         chosen = systematic(weight, count, these.rng)
         after = hypothesis_count.sampled_share(s.sampled, count, s.hypotheses)

@@ -80,7 +80,7 @@ def update_detection(
         for u in range(attempts.first.shape[0]):
             i, j = POSE * attempts.first[u], POSE * attempts.second[u]
             received, attempted = attempts.received[u], attempts.attempted[u]
-            m, v, gx, gy = predict_range(block, i, j, attempts.dz_m[u])
+            m, v, gx, gy = predict_range(block, i, j, fill(attempts.dz_m[u] ** 2))
             sd = lanes.sqrt(greater(v, nought))
             place, aside = per_step * m, per_step * sd
             middle = _outcome(place, received, attempted, curve)

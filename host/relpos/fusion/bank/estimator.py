@@ -197,6 +197,7 @@ class Bank:
             worn = self.mounting.get(node)
             if worn is not None and worn.height_m is not None:
                 known.worn_m = worn.height_m
+                self.core.hypotheses.know_heights()
                 known.vertical = Vertical(worn.height_m)
         return known
 
@@ -493,6 +494,7 @@ class Bank:
         measured = step.measurement
         if isinstance(measured, Height):
             self.vertical.measure(measured, step.time_s)
+            self.core.hypotheses.know_heights()
         elif isinstance(measured, Heading) and measured.node in self._row:
             self._advance()
             self._turn(step.time_s, measured, self._row[measured.node])

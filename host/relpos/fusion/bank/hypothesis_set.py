@@ -33,6 +33,11 @@ each clock's offset. Far larger ones are learned, too (``mission-late-1``: 0.99 
 0.3 of each learns them sooner (0.13 m), but takes the biases of pairs that are not calibrated for
 shadows: eight seeds of three walkers have 0.10 m with these, 0.20 with 0.3, 0.07 without any."""
 
+HEIGHTS_SHARE, STOREY_M2 = 0.5, 9.0
+"""Where nobody's height is known, in this share of the hypotheses with biases a pair has in place of
+a bias the square of its difference of height: a constant, in which the square of a range is linear.
+Its prior deviation is that of one storey."""
+
 MODEL_RETURN_SHARE = 0.002
 """Of the hypotheses without constants (or range biases), this share gets them back at each
 resampling: none may be left when they begin to matter. ``mission-split-hard`` 611: 2.49 m without,
@@ -75,6 +80,7 @@ class HypothesisSet:
         self.arrays = Hypotheses(
             x, p, np.zeros((blocks, LANES)), lanes.empty_lines(blocks, 0, COMPONENTS, 6),
             lanes.empty_lines(blocks, 0, COMPONENTS), lanes.empty_lines(blocks),
+            np.zeros((blocks, LANES)),
         )  # fmt: skip
         self.components = VarianceComponents()
         self._normals: Floats = rng.standard_normal((count, 1))
@@ -82,6 +88,9 @@ class HypothesisSet:
         """1 where step scale and heading drift are modelled (K,)."""
         self.has_bias = np.sort(self._share_of_all(round(settings.biased * count)))
         """1 where range biases are (K,)."""
+        self.heights_share = HEIGHTS_SHARE
+        self.has_heights = self.has_bias * (rng.random(count) < HEIGHTS_SHARE)
+        """1 where those of pairs are squares of differences of height instead (K,)."""
         self.low_heading_noise = self._share_of_all(int(settings.steady * count))
         """1 where headings are taken to be those of wheels or a camera (K,)."""
         # Reported initial poses may all be wrong at once.
@@ -356,17 +365,48 @@ class HypothesisSet:
         priors = {self.common_entry(CommonIndex.SHADOW): SHADOW_SD_M}
         priors[self.common_entry(CommonIndex.LATENESS)] = LATENESS_SD_S
         priors |= {self.clock_entry(row): CLOCK_SD_S for row in range(self.nodes)}
-        priors |= dict.fromkeys(self.biases.values(), self.settings.pair_bias_m)
         block, lane = self._at(which)
         p, has = self.arrays.p, self.has_bias[which]
         for entry, sigma in priors.items():
             p[block, storage.triangle_place(entry, entry), lane] = has * sigma**2
-        # The bias of a pair is the common one and its own part.
-        biased = [self.common_entry(CommonIndex.BIAS), *self.biases.values()]
-        for n, entry in enumerate(biased):
-            for other in biased[: n + 1]:
-                place = storage.triangle_place(entry, other)
-                p[block, place, lane] += has * self.settings.bias_m**2
+        common = self.common_entry(CommonIndex.BIAS)
+        p[block, storage.triangle_place(common, common), lane] = has * self.settings.bias_m**2
+        self._begin_pairs(which)
+
+    def _begin_pairs(self, which: Indices) -> None:
+        """Let what a pair has of its own begin anew in hypotheses ``which`` (M,).
+
+        The bias of a pair is the common one and its own part.
+        """
+        block, lane = self._at(which)
+        x, p = self.arrays.x, self.arrays.p
+        heights, common = self.has_heights[which], self.common_entry(CommonIndex.BIAS)
+        every = np.arange(x.shape[1])
+        for entry in self.biases.values():
+            x[block, entry, lane] = (1.0 - heights) * x[block, common, lane]
+            for other in every:
+                inherited = p[block, storage.triangle_place(common, other), lane]
+                p[block, storage.triangle_place(entry, other), lane] = (1.0 - heights) * inherited
+        for entry in self.biases.values():
+            for other in self.biases.values():
+                inherited = p[block, storage.triangle_place(common, common), lane]
+                p[block, storage.triangle_place(entry, other), lane] = (1.0 - heights) * inherited
+            place = storage.triangle_place(entry, entry)
+            p[block, place, lane] += self._own_variance(which)
+        self.arrays = self.arrays._replace(has_heights=storage.lay_out(self.has_heights))
+
+    def _own_variance(self, which: Indices | slice = slice(None)) -> Floats:
+        """Return the prior variance of what a pair has of its own (M,), m^2 or m^4."""
+        heights, own = self.has_heights[which], self.settings.pair_bias_m**2
+        variance: Floats = self.has_bias[which] * (own + heights * (STOREY_M2**2 - own))
+        return variance
+
+    def know_heights(self) -> None:
+        """Have no hypothesis any more in which heights are unknown: they are reported."""
+        which = np.flatnonzero(self.has_heights)
+        self.heights_share, self.has_heights[:] = 0.0, 0.0
+        if which.size:
+            self._begin_pairs(which)
 
     def _return_to_models(self) -> None:
         """Let a few hypotheses without constants, or without biases, have them again."""
@@ -387,6 +427,7 @@ class HypothesisSet:
         if s.biased > 0.0 and (back[1] > self.has_bias).any():
             which = np.flatnonzero(back[1] > self.has_bias)
             self.has_bias[which] = 1.0
+            self.has_heights[which] = self.rng.random(which.size) < self.heights_share
             self._allow_common(which)
 
     def shift_common(self, entry: int, by: float) -> None:
@@ -423,11 +464,12 @@ class HypothesisSet:
         common = self.common_entry(CommonIndex.BIAS)
         x = lanes.empty_lines(len(x0), size + 1)
         p = lanes.empty_lines(len(x0), old + size + 1)
-        x[:, :size], x[:, size] = x0, x0[:, common]
+        inherits = 1.0 - self.arrays.has_heights
+        x[:, :size], x[:, size] = x0, inherits * x0[:, common]
         p[:, :old] = p0
-        p[:, old:-1] = p0[:, storage.triangle_place(common, np.arange(size))]
-        own = self.has_bias * self.settings.pair_bias_m**2
-        p[:, -1] = p0[:, storage.triangle_place(common, common)] + storage.lay_out(own)
+        shared = p0[:, storage.triangle_place(common, np.arange(size))]
+        p[:, old:-1] = inherits[:, None] * shared
+        p[:, -1] = inherits * shared[:, common] + storage.lay_out(self._own_variance())
         self.arrays = self.arrays._replace(x=x, p=p)
         self.biases[pair] = size
         return size
@@ -444,7 +486,8 @@ class HypothesisSet:
         """Draw hypotheses by their weights; log components are jittered (Liu and West 2001)."""
         chosen = systematic(weight, self.count if count is None else count, self.rng)
         # Those that model the same side by side: kernels skip what a whole block lacks.
-        models = 2.0 * self.has_bias[chosen] + self.has_constants[chosen]
+        models = self.has_heights[chosen] + self.has_bias[chosen]
+        models = 2.0 * models + self.has_constants[chosen]
         self._select(chosen[np.argsort(models, kind="stable")])
         # Children of one parent differ in their components, too.
         self._normals *= math.sqrt(1.0 - JITTER**2)
@@ -471,6 +514,7 @@ class HypothesisSet:
         sensitivity = np.einsum("bl,b...l->...", blocks, self.arrays.sensitivity)
         constants, bias = self.has_constants.any(), self.has_bias.any()
         low_noise = float(weight @ self.low_heading_noise)
+        heights = weight @ self.has_heights > 0.5
         count = len(chosen)
         self._select(chosen)
         self.store(x, np.repeat(p[None], count, axis=0))
@@ -479,6 +523,8 @@ class HypothesisSet:
         # The moments have something of the constants wherever any hypothesis has.
         self.has_constants = np.full(count, float(constants))
         self.has_bias = np.full(count, float(bias))
+        self.has_heights = np.full(count, float(heights))
+        self.arrays = self.arrays._replace(has_heights=storage.lay_out(self.has_heights))
         # Between the two, where that is open: a nearly linear mixture leaves it so for long.
         self.low_heading_noise = np.full(count, low_noise)
         if count == 1:
@@ -497,6 +543,8 @@ class HypothesisSet:
         self.count = len(chosen)
         self._normals = self._normals[chosen]
         self.has_constants, self.has_bias = self.has_constants[chosen], self.has_bias[chosen]
+        self.has_heights = self.has_heights[chosen]
+        self.arrays = self.arrays._replace(has_heights=storage.lay_out(self.has_heights))
         self.low_heading_noise = self.low_heading_noise[chosen]
         self.perturbed, self.wrong_start = self.perturbed[chosen], self.wrong_start[chosen]
 

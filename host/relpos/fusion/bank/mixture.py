@@ -59,10 +59,10 @@ def predicted_ranges(
     sigma = np.empty(first.shape[0])
     ranges, variances = lanes.working_lines(blocks), lanes.working_lines(blocks)
     for u in range(first.shape[0]):
-        middle = fill(0.0)
+        middle, dz2 = fill(0.0), fill(dz_m[u] * dz_m[u])
         for b in range(blocks):
             block = Block(x, p, b * size, b * p.shape[1], 0)
-            m, v, _, _ = predict_range(block, POSE * first[u], POSE * second[u], dz_m[u])
+            m, v, _, _ = predict_range(block, POSE * first[u], POSE * second[u], dz2)
             store(ranges, b, m)
             store(variances, b, v)
             middle = middle + load(weight, b) * m

@@ -90,7 +90,7 @@ class RangeModel(NamedTuple):
 
 @inner
 def _second_order(
-    ux: Lanes, uy: Lanes, xx: Lanes, xy: Lanes, yy: Lanes, dz: float
+    ux: Lanes, uy: Lanes, xx: Lanes, xy: Lanes, yy: Lanes, dz2: Lanes
 ) -> tuple[Lanes, Lanes, Lanes, Lanes]:
     """Give a range's mean m, variance v, and the two gains' factors gx, gy."""
     flat2 = ux * ux + uy * uy
@@ -102,9 +102,9 @@ def _second_order(
     c = greater(xx + yy - a, nought)
     # A division costs as much as ten products.
     m2, square = flat2 + c, c * c
-    if dz != 0.0:
-        tilt = (dz * dz) / (flat2 + (dz * dz + TINY))
-        m2 = m2 + (dz * dz + tilt * a)
+    if some(dz2 > 0.0):
+        tilt = dz2 / (flat2 + dz2 + TINY)
+        m2 = m2 + (dz2 + tilt * a)
         square = square + tilt * tilt * a * a
     m = lanes.sqrt(m2) + TINY
     v = (a * flat2 + 0.5 * square) / (m2 + TINY)
@@ -113,7 +113,7 @@ def _second_order(
 
 
 @inner
-def predict_range(block: Block, i: int, j: int, dz: float) -> tuple[Lanes, Lanes, Lanes, Lanes]:
+def predict_range(block: Block, i: int, j: int, dz2: Lanes) -> tuple[Lanes, Lanes, Lanes, Lanes]:
     """As ``_second_order``, between users whose poses begin at ``i`` and ``j``."""
     x, p, at_x, base, _ = block
     ux = load(x, at_x + j) - load(x, at_x + i)
@@ -124,12 +124,12 @@ def predict_range(block: Block, i: int, j: int, dz: float) -> tuple[Lanes, Lanes
     yy = load(p, i_y + 1) + load(p, j_y + 1) - 2.0 * load(p, base + place(i + 1, j + 1))
     xy = load(p, i_y) + load(p, j_y)
     xy = xy - load(p, base + place(i, j + 1)) - load(p, base + place(i + 1, j))
-    return _second_order(ux, uy, xx, xy, yy, dz)
+    return _second_order(ux, uy, xx, xy, yy, dz2)
 
 
 @inner
 def _predict_by_lever(
-    block: Block, i: int, j: int, dz: float, levers_m: tuple[Floats, Floats], off: Floats,
+    block: Block, i: int, j: int, dz2: Lanes, levers_m: tuple[Floats, Floats], off: Floats,
     g: Floats,
 ) -> tuple[Lanes, Lanes, Lanes, Lanes]:  # fmt: skip
     """As ``predict_range``, between antennas with lever arms; ``g`` (D, LANES) gets P h.
@@ -157,7 +157,7 @@ def _predict_by_lever(
     xy = xy + yi * load(off, n + i + 2)
     yy = load(off, n + j + 1) - load(off, n + i + 1)
     yy = yy + xj * load(off, n + j + 2) - xi * load(off, n + i + 2)
-    m, v, gx, gy = _second_order(ux, uy, xx, xy, yy, dz)
+    m, v, gx, gy = _second_order(ux, uy, xx, xy, yy, dz2)
     for q in range(active):
         store(g, q, gx * load(off, q) + gy * load(off, n + q))
     return m, v, gx, gy
@@ -269,14 +269,16 @@ def _common_terms(
 
 
 @inner
-def _add_terms(block: Block, slope: Floats, entry: Indices, g: Floats) -> tuple[Lanes, Lanes]:
-    """Return what entries of the state add to a range, and to the innovation's variance.
+def _add_terms(
+    block: Block, slope: Floats, entry: Indices, terms: int, g: Floats
+) -> tuple[Lanes, Lanes]:
+    """Return what the first ``terms`` entries of the state add to a range, and to the innovation's variance.
 
     ``g`` becomes the gain with them.
     """
     x, p, at_x, base, active = block
     length, variance = fill(0.0), fill(0.0)
-    for t in range(entry.shape[0]):
+    for t in range(terms):
         e, much = entry[t], load(slope, t)
         length = length + much * load(x, at_x + e)
         variance = variance + much * (2.0 * load(g, e) + much * load(p, base + row_place(e) + e))
@@ -324,33 +326,51 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
     x, p, log_weight = hypotheses.x, hypotheses.p, hypotheses.log_weight
     blocks, nodes = x.shape[0], hypotheses.sensitivity.shape[1]
     g, off = lanes.working_lines(x.shape[1]), lanes.working_lines(2 * x.shape[1])
-    slope, entry = lanes.working_lines(5), np.empty(5, dtype=np.int64)
+    slope, entry = lanes.working_lines(6), np.empty(6, dtype=np.int64)
+    own = PER_NODE * nodes + COMMON + nodes
     for b in range(blocks):
         block = block_of(x, p, b, nodes)
         biased = block.active > PER_NODE * nodes
         variance = load(hypotheses.range_variance, b)
+        has_heights = load(hypotheses.has_heights, b)
+        heights = biased and some(has_heights > 0.0)
         total = fill(0.0)
         for r in range(ranges.first.shape[0]):
             first, second, dz = ranges.first[r], ranges.second[r], ranges.dz_m[r]
             i, j = POSE * first, POSE * second
+            # Of a pair's own entry (m^2); what is common to all comes before.
+            heights_here = heights and ranges.bias[r] >= own
+            dz2, lifted = fill(dz * dz), fill(0.0)
+            if heights_here:
+                lifted = has_heights * greater(load(x, block.at_x + ranges.bias[r]), lifted)
+                dz2 = dz2 + lifted
             if model.lever_m.shape[0] > 0:
                 levers = (model.lever_m[first], model.lever_m[second])
-                m, v, gx, gy = _predict_by_lever(block, i, j, dz, levers, off, g)
+                m, v, gx, gy = _predict_by_lever(block, i, j, dz2, levers, off, g)
             else:
-                m, v, gx, gy = predict_range(block, i, j, dz)
+                m, v, gx, gy = predict_range(block, i, j, dz2)
                 range_gain(block, i, j, gx, gy, g)
             curvature = v - gx * (load(g, j) - load(g, i)) - gy * (load(g, j + 1) - load(g, i + 1))
             if ranges.dz_variance_m2[r] > 0.0:
                 # Var(dz^2) / (4 m^2) with the second order.
-                lifted = ranges.dz_variance_m2[r]
-                v = v + (dz * dz - 0.5 * lifted) * lifted / (m * m)
+                vague = ranges.dz_variance_m2[r]
+                v = v + (dz * dz - 0.5 * vague) * vague / (m * m)
             innovation = ranges.range_m[r] - m
             if biased and ranges.bias[r] >= 0:
                 seen = select(m * m > FAR * variance, fill(1.0), fill(0.0))
                 users, sight = (nodes, first, second), (gx, gy, seen)
                 entry[0] = ranges.bias[r]
                 _common_terms(block, users, ranges.velocity_m_s[r], sight, slope, entry)
-                length, added = _add_terms(block, slope, entry, g)
+                terms = 5
+                if heights_here:
+                    # m^2 is linear in the square of the height: its slope is that of the chord.
+                    chord = has_heights / (m + greater(fill(ranges.range_m[r]), fill(0.0)))
+                    entry[5], terms = PER_NODE * nodes + CommonIndex.BIAS, 6
+                    store(slope, 5, has_heights * seen)
+                    store(slope, 0, chord + (1.0 - has_heights) * seen)
+                    # What the mean has of it is in m.
+                    innovation = innovation + chord * lifted
+                length, added = _add_terms(block, slope, entry, terms, g)
                 innovation = innovation - length
                 v = v + added
             s = v + variance

@@ -79,6 +79,8 @@ class Hypotheses(NamedTuple):
     """(B, N, 3, LANES): variance components by which each user's base variances are multiplied."""
     range_variance: Floats
     """Variance of a range (B, LANES), m^2."""
+    has_heights: Floats
+    """(B, LANES): 1 where a pair's entry is no bias but the square of its difference of height."""
 
 
 class Block(NamedTuple):
