@@ -115,7 +115,7 @@ def update(
 
 
 def common_terms(
-    x: Floats, p: Floats, nodes: int, first: int, second: int, velocity: Floats
+    x: Floats, p: Floats, nodes: int, first: int, second: int, velocity: Floats, dz: float = 0.0
 ) -> Floats:
     """Slope (D,) of bias, shadow, lateness and clocks, before the pairs' biases, of a range.
 
@@ -123,7 +123,7 @@ def common_terms(
     """
     i, j, common = PER_NODE * first, PER_NODE * second, PER_NODE * nodes
     off = x[j : j + 2] - x[i : i + 2]
-    sight = off / predict_range(x, p, first, second, 0.0)[0]
+    sight = off / predict_range(x, p, first, second, dz)[0]
     ahead = [np.array([np.cos(h), np.sin(h)]) for h in (x[i + HEADING], x[j + HEADING])]
     moving = [
         v[0] * a + v[1] * np.array([-a[1], a[0]]) for v, a in zip(velocity, ahead, strict=True)

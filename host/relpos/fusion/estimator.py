@@ -160,10 +160,10 @@ class Alternative:
 class Parameter:
     """One learned constant; ``peer`` is given where it belongs to a pair.
 
-    Names: ``step_scale`` (true over reported length), ``heading_drift_rad_s``,
-    ``range_bias_m``, ``detection_range_m``, ``body_shadow_m`` (what a body in between adds to a
-    range), ``range_lateness_s`` (by how much ranges are dated late), ``clock_offset_s`` (how far a
-    node's clock is ahead of most others').
+    Names: ``step_scale`` (true over reported length), ``heading_drift_rad_s``, ``range_bias_m``,
+    ``height_difference_m`` (of a pair, where no heights are reported), ``detection_range_m``,
+    ``body_shadow_m`` (what a body in between adds to a range), ``range_lateness_s`` (by how much
+    ranges are dated late), ``clock_offset_s`` (how far a node's clock is ahead of most others').
     """
 
     time_s: float

@@ -96,7 +96,7 @@ def test_a_setting_that_is_none_any_more_is_told_once_and_left_out(
 ) -> None:
     settings.tell_former.cache_clear()
     for _ in range(2):
-        fusion.check("bank", {"jump_m": "5", "jumps": "0.01"})
+        fusion.check("bank", {"jump_m": "5", "jumps_most": "0.01"})
     (told,) = caplog.messages
     assert told == "bank: jump_m is no setting any more, and left out; it is 3"
     assert "jump_m" not in {info.key for info in fusion.settings_of("bank")}

@@ -40,6 +40,10 @@ def test_a_range_with_all_terms_is_the_reference_implementation() -> None:
     common = PER_NODE * NODES
     x[:, common:] = np.random.default_rng(1).normal(size=(8, x.shape[1] - common)) * 0.1
     these.store(x, p)
+    heights = these.has_heights
+    assert 0.0 < heights.sum() < 8.0
+    x[:, entry] += 7.0 * heights
+    these.store(x, p)
     sigma2 = these.arrays.range_variance.ravel()[:8].copy()
     velocity = np.array([[1.2, 0.1], [0.7, -0.2]])
     slope = reference.common_terms(x[0], p[0], NODES, 0, 2, velocity)
@@ -49,12 +53,21 @@ def test_a_range_with_all_terms_is_the_reference_implementation() -> None:
     after = these.dense()
     share = core._sensors.model.outlier
     for k in range(8):
-        slope_k = reference.common_terms(x[k], p[k], NODES, 0, 2, velocity)
-        slope_k[entry], slope_k[common] = 1.0, 0.0
         outlier = float(share[0]), float(share[1]), OUTLIERS_SHORT
-        expected = reference.update(x[k], p[k], 0, 2, 17.5, 0.0, sigma2[k], outlier, slope_k)
-        assert after[0][k] == pytest.approx(expected[0], abs=1e-3)
-        assert after[1][k] == pytest.approx(expected[1], abs=1e-3)
+        square = heights[k] * x[k, entry]
+        slope_k = reference.common_terms(x[k], p[k], NODES, 0, 2, velocity, np.sqrt(square))
+        slope_k[entry], slope_k[common] = 1.0, 0.0
+        if heights[k]:
+            mean, *_ = reference.predict_range(x[k], p[k], 0, 2, np.sqrt(square))
+            # r^2 - m^2 = (r + m) (r - m).
+            slope_k[entry], slope_k[common] = 1.0 / (17.5 + mean), 1.0
+        # What is in the mean already is not to be added again.
+        measured = 17.5 + slope_k[entry] * square
+        expected = reference.update(
+            x[k], p[k], 0, 2, measured, np.sqrt(square), sigma2[k], outlier, slope_k
+        )
+        assert after[0][k] == pytest.approx(expected[0], rel=1e-3, abs=1e-3)
+        assert after[1][k] == pytest.approx(expected[1], rel=1e-3, abs=1e-3)
 
 
 def test_a_new_node_and_a_new_pair_keep_what_is_known_of_the_others() -> None:

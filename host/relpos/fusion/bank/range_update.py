@@ -272,9 +272,9 @@ def _common_terms(
 def _add_terms(
     block: Block, slope: Floats, entry: Indices, terms: int, g: Floats
 ) -> tuple[Lanes, Lanes]:
-    """Return what the first ``terms`` entries of the state add to a range, and to the innovation's variance.
+    """Return what entries of the state add to a range, and to the innovation's variance.
 
-    ``g`` becomes the gain with them.
+    These are the first ``terms`` of ``entry``; ``g`` becomes the gain with them.
     """
     x, p, at_x, base, active = block
     length, variance = fill(0.0), fill(0.0)

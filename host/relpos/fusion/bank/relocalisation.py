@@ -177,7 +177,7 @@ class Relocalisation:
         self._counters["motions_doubted"] += 1
 
     def perturb_some(self, surprise: Sequence[float], usual: float) -> None:
-        """Perturb a user's pose in some hypotheses; the more, the worse its ranges fit.
+        """Perturb a user's pose in some hypotheses where its ranges do not fit.
 
         ``surprise`` (N,) is each user's share of odd ranges, ``usual`` the ordinary one.
         """
@@ -185,12 +185,10 @@ class Relocalisation:
         s = these.settings
         if not these.nodes or these.count < 2:
             return
-        quiet = s.jumps / these.nodes
-        rate = [
-            quiet + (s.jumps_most - quiet) * min(max((much - usual) / 0.35, 0.0), 1.0)
-            for much in surprise
-        ]
+        rate = [s.jumps_most * min(max((much - usual) / 0.35, 0.0), 1.0) for much in surprise]
         total = sum(rate)
+        if total <= 0.0:
+            return
         which = np.flatnonzero(these.rng.random(these.count) < total)
         if not which.size:
             return

@@ -141,12 +141,7 @@ class Report:
                 Parameter(time_s, node, None, "step_scale", grow, grow * sigma_scale),
                 Parameter(time_s, node, None, "heading_drift_rad_s", means[drift], sigma_drift),
             ]
-        named = {row: node for node, row in self.row.items()}
-        for (a, b), entry in sorted(self.core.hypotheses.biases.items()):
-            node, peer = sorted((named[a], named[b]))
-            sigma = math.sqrt(max(variances[entry], 0.0))
-            parameters.append(Parameter(time_s, node, peer, "range_bias_m", means[entry], sigma))
-        parameters += self._common_parameters()
+        parameters += [*self._pair_parameters(), *self._common_parameters()]
         if self.detection.known:
             # One curve for the team; every node has it.
             curve = self.detection.range_m, self.detection.range_sigma_m
@@ -155,6 +150,23 @@ class Report:
                 for node in sorted(self.row)
             ]
         return tuple(parameters)
+
+    def _pair_parameters(self) -> list[Parameter]:
+        """Return the pairs' range biases, or differences of height where hypotheses have these."""
+        named, parameters = {row: node for node, row in self.row.items()}, []
+        heights, learned = self.core.hypotheses.pairs_learned()
+        for (a, b), (value, variance) in sorted(learned.items()):
+            name, sigma = "range_bias_m", math.sqrt(max(variance, 0.0))
+            if heights:
+                # d(h^2) = 2 h dh; of next to nothing the square's own deviation is left.
+                name, square_m2 = "height_difference_m", max(value, 0.0)
+                value = math.sqrt(square_m2)
+                sigma = (
+                    math.sqrt(square_m2 + sigma) - value if value < sigma else sigma / (2 * value)
+                )
+            node, peer = sorted((named[a], named[b]))
+            parameters.append(Parameter(self.time_s, node, peer, name, value, sigma))
+        return parameters
 
     def _common_parameters(self) -> list[Parameter]:
         """Return what ranges have in common; the team's figures stand beside every node."""

@@ -13,14 +13,15 @@ from relpos.fusion.settings import setting
 class BankSettings:
     """What ``--set`` may change; one set for all scenarios and recordings."""
 
-    FORMER: ClassVar[Mapping[str, float]] = {"outliers_short": 0.1, "jump_m": 3.0, "jump_rad": 0.0}
+    FORMER: ClassVar[Mapping[str, float]] = {
+        "outliers_short": 0.1, "jump_m": 3.0, "jump_rad": 0.0, "jumps": 0.0
+    }  # fmt: skip
 
     hypotheses: int = setting(200, "at most so many hypotheses (K)", 1, 100_000)
     sampled: float = setting(0.5, "share of the heading noise that is drawn", 0.0, 1.0)
     outliers: float = setting(0.1, "share of ranges that are outliers, beforehand", 0.0, 0.9)
     outlier_m: float = setting(3.0, "how far outliers are off, beforehand", 0.1, 100.0)
-    jumps: float = setting(0.002, "share of jump hypotheses an epoch, in quiet", 0.0, 1.0)
-    jumps_most: float = setting(0.05, "share of jump hypotheses an epoch, at most", 0.0, 1.0)
+    jumps_most: float = setting(0.05, "share of jump hypotheses an instant, at most", 0.0, 1.0)
     wrong_starts: float = setting(0.1, "share of hypotheses that doubt the given starts", 0.0, 0.9)
     scale: float = setting(0.1, "prior standard deviation of the step scale", 0.0, 1.0)
     drift_rad_s: float = setting(0.005, "prior standard deviation of heading drift", 0.0, 1.0)
