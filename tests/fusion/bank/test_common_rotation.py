@@ -79,6 +79,27 @@ def test_what_is_taken_out_is_the_largest_rigid_motion_that_a_covariance_contain
         assert left[k] == pytest.approx(p[k] - g @ s @ g.T, abs=1e-6)
 
 
+@pytest.mark.parametrize("rounding", [1e-10, 1e-8])
+def test_nothing_is_taken_out_of_a_covariance_that_rounding_has_spoiled(rounding: float) -> None:
+    """Of a rigid motion alone, some kilometres wide, whose correlations are off by that much."""
+    these = team(32).hypotheses
+    x, p = these.dense()
+    poses = (PER_NODE * np.arange(NODES)[:, None] + np.arange(3)).ravel()
+    x[:, poses] *= 1e3
+    rng = np.random.default_rng(1)
+    for k in range(32):
+        g = reference.rigid_motion(x[k], NODES, np.zeros(2))
+        p[k] = g @ np.diag([1e6, 1e6, 10.0]) @ g.T
+        sigmas = np.sqrt(p[k].diagonal())
+        error = np.tril(rng.normal(size=p[k].shape) * rounding, -1)
+        p[k] += (error + error.T) * np.outer(sigmas, sigmas)
+    these.store(x, p)
+    these.take_out_common_rotation()
+    left = these.dense()[1]
+    assert np.isfinite(left).all()
+    assert (left.diagonal(axis1=1, axis2=2) >= 0.0).all()
+
+
 def test_the_mixtures_moments_are_kept_with_what_was_taken_out() -> None:
     core = team(64, 0.03)
     these = core.hypotheses

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.bank import lanes
-from relpos.fusion.bank.lanes import Lanes, fill, greater, load, store
+from relpos.fusion.bank.lanes import Lanes, fill, greater, load, select, store
 from relpos.fusion.bank.storage import PER_NODE, POSE, Hypotheses, block_of, place, row_place
 from relpos.fusion.compiled import compiled, inner
 
@@ -100,6 +100,22 @@ def _add_rigid(p: Floats, base: int, entries: int, g: Floats, s: Floats, sign: f
         for q in range(i + 1):
             at = base + row_place(i) + q
             store(p, at, load(p, at) + sign * _product(g, i, s, g, q))
+
+
+@inner
+def _remains_positive(p: Floats, base: int, nodes: int, g: Floats, s: Floats) -> Lanes:
+    """Return 1 where every user's own place and heading keep a covariance without G S G^T."""
+    sound, nought = fill(1.0), fill(0.0)
+    for n in range(nodes):
+        i = POSE * n
+        xx = load(p, base + row_place(i) + i) - _product(g, i, s, g, i)
+        xy = load(p, base + row_place(i + 1) + i) - _product(g, i + 1, s, g, i)
+        yy = load(p, base + row_place(i + 1) + i + 1) - _product(g, i + 1, s, g, i + 1)
+        hh = load(p, base + row_place(i + 2) + i + 2) - _product(g, i + 2, s, g, i + 2)
+        sound = select(xx > 0.0, sound, nought)
+        sound = select(xx * yy > xy * xy, sound, nought)
+        sound = select(hh > 0.0, sound, nought)
+    return sound
 
 
 @inner
@@ -200,7 +216,10 @@ def take_out(hypotheses: Hypotheses, middle_m: Floats, taken: Floats) -> None:
         for row in range(RIGID):
             own = place(row, row)
             store(s, own, load(s, own) - (LEFT[0] if row < 2 else LEFT[1]))
+        # Where rounding has left a covariance that contains none such, nothing is taken out.
+        sound = _remains_positive(p, block.base, nodes, g, s)
         for t in range(6):
+            store(s, t, select(sound > 0.0, load(s, t), nought))
             store(taken, 6 * b + t, load(s, t))
         _add_rigid(p, block.base, entries, g, s, -1.0)
         for n in range(nodes):
