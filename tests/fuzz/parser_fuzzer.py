@@ -1,11 +1,13 @@
-"""Coverage-guided fuzzing of everything on the host that reads foreign bytes.
+"""Coverage-guided fuzzing of everything that reads foreign bytes, on the host and on the node.
 
-    python tests/fuzz/parser_fuzzer.py [--minutes 1] [--target NAME ...]
+    python tests/fuzz/parser_fuzzer.py [--minutes 1 | --runs N] [--target NAME ...]
 
-Each parser gets inputs that libFuzzer (by atheris) derives from valid ones, in a process of its own
-with a limit of memory and of time an input. A parser may refuse in its own errors and do nothing
-else. The corpus is kept in .build/fuzz/corpus, a finding in .build/fuzz/findings; once it is mended
-it belongs to tests/fuzz/findings, which test_parser_fuzz.py reads.
+Each parser gets inputs that libFuzzer (on the host by atheris) derives from valid ones, in a
+process of its own with a limit of memory and of time an input. A parser may refuse in its own
+errors and do nothing else. The firmware's, "wire" (line, frames, bodies, EEPROM) and "node" (the
+whole node), run under sanitizers. The corpus is kept in .build/fuzz/corpus, a finding in
+.build/fuzz/findings; once it is mended it belongs to tests/fuzz/findings, which
+test_parser_fuzz.py reads.
 """
 
 from __future__ import annotations
@@ -13,7 +15,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import random
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -209,7 +213,8 @@ def link(_: Path) -> Target:
     )
 
 
-NODE = "node"
+FIRMWARE = {"wire": 100, "node": 800}
+"""Of each fuzzer of the firmware, NAME_fuzzer.cpp, the most bytes of an input."""
 TARGETS = {make.__name__: make for make in (files, toml, mcap, settings, http, websocket, link)}
 
 
@@ -247,66 +252,60 @@ def run_target(name: str, options: list[str]) -> None:
         atheris.Fuzz()
 
 
-def fuzz(name: str, seconds: int) -> bool:
+def fuzz(name: str, ending: str) -> bool:
     """Fuzz one parser; print its line. Return whether nothing was found."""
     FOUND.mkdir(parents=True, exist_ok=True)
     options = [
-        f"-max_total_time={seconds}", f"-rss_limit_mb={MOST_MB}", f"-timeout={MOST_S}",
-        "-max_len=24000", "-print_final_stats=1", f"-artifact_prefix={FOUND}/{name}-",
+        ending, f"-rss_limit_mb={MOST_MB}", f"-timeout={MOST_S}",
+        f"-max_len={FIRMWARE.get(name, 24_000)}", "-print_final_stats=1",
+        f"-artifact_prefix={FOUND}/{name}-",
     ]  # fmt: skip
+    if name in FIRMWARE:
+        command, environment = firmware(name), FIRMWARE_ENVIRONMENT
+        again = f"{command[0]} FILE" if command else ""
+    else:
+        command, environment = [sys.executable, __file__, "--child", name], {}
+        again = f"python {Path(__file__).relative_to(ROOT)} --child {name} FILE"
+    if not command:
+        print(f"{name}: not fuzzed, there is no clang++ (make soak tries the node at random)")
+        return True
     done = subprocess.run(
-        [sys.executable, __file__, "--child", name, *options],
+        [*command, *options],
         capture_output=True, text=True, errors="replace", check=False,
-        env=os.environ | {"NUMBA_DISABLE_JIT": "0"},
+        env=os.environ | environment,
     )  # fmt: skip
     said = done.stdout + done.stderr
     runs = re.findall(r"number_of_executed_units:\s*(\d+)", said)
     executed = re.findall(r"^#(\d+)\s.*cov: (\d+)", said, re.M)
+    parts = re.findall(r"^line \d+, .*$", said, re.M)
     count, cover = (runs or ["?"])[-1], (executed or [("?", "?")])[-1][1]
-    print(f"{name}: {count} inputs, {cover} branches, {'well' if not done.returncode else 'FOUND'}")
+    well = "well" if not done.returncode else "FOUND"
+    print(f"{name}: {count} inputs, {cover} branches, {', '.join([*parts, well])}", flush=True)
     if done.returncode:
         print(said[-3000:])
-        print(f"again: python {Path(__file__).relative_to(ROOT)} --child {name} FILE")
+        print(f"again: {again}")
     return not done.returncode
 
 
-def node(seconds: int) -> bool:
-    """Fuzz the firmware under sanitizers: node_fuzzer.cpp, by coverage where there is clang."""
-    import random
-    import shutil
-    import time
+FIRMWARE_ENVIRONMENT = {
+    "ASAN_OPTIONS": "malloc_context_size=1:quarantine_size_mb=16",
+    "RELPOS_FUZZ_FRAMES": str(1 << 62),
+}
 
+
+def firmware(name: str) -> list[str]:
+    """Build a fuzzer of the firmware; its command and corpus. Nothing without clang++."""
     import fuzz_builds
 
-    begun_s, corpus = time.monotonic(), KEPT / NODE
+    if shutil.which("clang++") is None:
+        return []
+    corpus = KEPT / name
     corpus.mkdir(parents=True, exist_ok=True)
-    guided = shutil.which("clang++") is not None
-    program = fuzz_builds.build(fuzz_builds.GUIDED if guided else fuzz_builds.RANDOM)
     if not any(corpus.iterdir()):
-        source = random.Random(1)
+        source, most = random.Random(1), FIRMWARE[name]
         for number in range(200):
-            (corpus / str(number)).write_bytes(source.randbytes(source.randrange(20, 600)))
-    frames = 0
-    while True:
-        arguments = [f"-max_total_time={seconds}", "-max_len=800", "-print_final_stats=1", corpus]
-        if not guided:
-            arguments = [200_000, random.randrange(1 << 30)]
-        done = subprocess.run(
-            [program, *map(str, arguments)], capture_output=True, text=True, errors="replace",
-            check=False, env=os.environ | {"RELPOS_FUZZ_FRAMES": str(1 << 62)},
-        )  # fmt: skip
-        said = done.stdout + done.stderr
-        if done.returncode:
-            print(f"{NODE}: FOUND by {' '.join(map(str, arguments))}\n{said[-3000:]}")
-            return False
-        if guided:
-            units = re.findall(r"number_of_executed_units:\s*(\d+)", said)
-            print(f"{NODE}: {units[-1] if units else '?'} scripts by coverage, well")
-            return True
-        frames += fuzz_builds.totals(said)["frames"]
-        if time.monotonic() - begun_s > seconds:
-            print(f"{NODE}: {frames} frames at random (no clang++), well")
-            return True
+            (corpus / str(number)).write_bytes(source.randbytes(source.randrange(1, most)))
+    return [str(fuzz_builds.build(fuzz_builds.GUIDED, f"{name}_fuzzer.cpp")), str(corpus)]
 
 
 def main() -> int:
@@ -316,10 +315,14 @@ def main() -> int:
         return 0
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=1.0, help="for each parser")
-    parser.add_argument("--target", nargs="*", choices=[*TARGETS, NODE], default=[*TARGETS, NODE])
+    parser.add_argument("--runs", type=int, help="inputs of each parser, however long it takes")
+    names = [*TARGETS, *FIRMWARE]
+    parser.add_argument("--target", nargs="*", choices=names, default=names)
     arguments = parser.parse_args()
-    seconds = round(60 * arguments.minutes)
-    well = [node(seconds) if name == NODE else fuzz(name, seconds) for name in arguments.target]
+    ending = f"-max_total_time={round(60 * arguments.minutes)}"
+    if arguments.runs is not None:
+        ending = f"-runs={arguments.runs}"
+    well = [fuzz(name, ending) for name in arguments.target]
     return not all(well)
 
 

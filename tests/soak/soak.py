@@ -1,12 +1,14 @@
 """The whole system under random faults, watched by the oracle.
 
     python tests/soak/soak.py [--hours 0.5] [--seed N] [--estimator bank] [--kills]
+    python tests/soak/soak.py --emulated-hours 8 --nodes 10 [--seconds 4800]
 
 Each episode is one seed: a team of 2 to 10 emulated nodes with faults of the whole vocabulary, and
 hosts one after the other at its port: with right and wrong clocks, with and without memory, under
 full disks, replayed and altered frames, commands, and guests of the page. Each tenth kills real
 processes (kills.py), with ``--kills`` each. With ``--seed`` one episode is run: the command that a
-violation prints.
+violation prints. ``--emulated-hours`` counts the team's own time, which goes on as quickly as the
+computer can.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -48,6 +51,8 @@ from relpos.simulation.team import SCENARIOS
 
 RIGHT_UNIX_S = 1.8e9
 CLOCKS_S = (0.0, 0.0, 0.0, 315e6, -1.8e9, 86_400.0, -3600.0)
+BLOCK_S = 90.0
+"""Up to five faults begin in each."""
 MEMORY_MB = 300
 """By how much the least of ten episodes in a row may be more than that of the first ten."""
 
@@ -173,11 +178,13 @@ def guests(rng: random.Random):
 
 
 def random_faults(rng: random.Random, nodes: int, seconds: float) -> list[str]:
-    """SPECs of the vocabulary for that team."""
+    """SPECs of the vocabulary for that team, up to five in each BLOCK_S."""
     specs = []
-    for fault in rng.sample(list(FAULTS), rng.randrange(0, 6)):
+    starts = [block * BLOCK_S for block in range(max(round(seconds / BLOCK_S), 1))]
+    chosen = [(s, fault) for s in starts for fault in rng.sample(list(FAULTS), rng.randrange(6))]
+    for start_s, fault in chosen:
         names = fault.key_names()
-        from_s = rng.uniform(3.0, seconds)
+        from_s = start_s + rng.uniform(3.0, min(seconds, BLOCK_S))
         values: dict[str, object] = {
             "node": rng.randrange(1, nodes + 1),
             "from": f"{from_s:.2f}",
@@ -197,11 +204,24 @@ def sessions(rng: random.Random, seconds: float) -> Iterator[float]:
         yield min(at_s, seconds)
 
 
-def episode(seed: int, estimator: str, out: Path) -> str:
-    """Run one; a line about it. ViolationError where a promise is broken."""
+@dataclass(frozen=True)
+class Done:
+    """An episode without a violation: a line about it, and the team's time that passed."""
+
+    line: str
+    team_s: float
+
+
+def episode(
+    seed: int, estimator: str, out: Path, nodes: int | None = None, seconds: float | None = None
+) -> Done:
+    """Run one, of that many nodes and seconds or of random ones.
+
+    ViolationError where a promise is broken.
+    """
     rng = random.Random(seed)
-    nodes = rng.choice((2, 3, 3, 4, 5, 6, 10))
-    seconds = rng.uniform(25.0, 90.0)
+    any_nodes, any_seconds = rng.choice((2, 3, 3, 4, 5, 6, 10)), rng.uniform(25.0, 90.0)
+    nodes, seconds = nodes or any_nodes, seconds or any_seconds
     keyed = rng.random() < 0.7
     config = TeamConfig(
         rng.choice([name for name in SCENARIOS if name not in ("turntable", "bench")]),
@@ -240,39 +260,40 @@ def episode(seed: int, estimator: str, out: Path) -> str:
             hosts += 1
             estimates += watch.estimates
     frames = len(air.accepted)
-    return (
+    line = (
         f"{nodes} nodes, {seconds:.0f} s, {len(config.faults)} faults, {hosts} hosts, "
         f"{frames} frames, {estimates} estimates"
     )
+    return Done(line, seconds)
 
 
 def main() -> int:
     """Run episodes until the time is over, or the one that is asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--hours", type=float, default=0.5)
+    parser.add_argument("--hours", type=float, help="by the clock; 0.5 where nothing is said")
+    parser.add_argument("--emulated-hours", type=float, help="by the team's clock")
+    parser.add_argument("--nodes", type=int, help="of each team")
+    parser.add_argument("--seconds", type=float, help="of each team")
     parser.add_argument("--seed", type=int, help="one episode")
     parser.add_argument("--first", type=int, default=1, help="seed of the first episode")
     parser.add_argument("--estimator", default="bank")
     parser.add_argument("--kills", action="store_true", help="episodes of kills alone")
-    arguments = parser.parse_args()
-    began_s = time.monotonic()
-    seed = arguments.first if arguments.seed is None else arguments.seed
+    given = parser.parse_args()
+    began_s, team_s = time.monotonic(), 0.0
+    seed = given.first if given.seed is None else given.seed
     done, broken, used_mb = 0, [], []
     while True:
         with tempfile.TemporaryDirectory() as folder:
             try:
-                if arguments.kills or seed % 10 == 0:
+                if given.kills or seed % 10 == 0:
                     line = kills.episode(seed, Path(folder))
                 else:
-                    line = episode(seed, arguments.estimator, Path(folder))
+                    one = episode(seed, given.estimator, Path(folder), given.nodes, given.seconds)
+                    line, team_s = one.line, team_s + one.team_s
                 print(f"seed {seed}: {line}", flush=True)
             except Exception:
                 traceback.print_exc()
-                command = f"python tests/soak/soak.py --seed {seed}"
-                if arguments.estimator != "bank":
-                    command += f" --estimator {arguments.estimator}"
-                command += " --kills" * arguments.kills
-                print(f"seed {seed}: VIOLATION; again: {command}", flush=True)
+                print(f"seed {seed}: VIOLATION; again: {again(seed, given)}", flush=True)
                 broken.append(seed)
         done += 1
         gc.collect()
@@ -284,11 +305,29 @@ def main() -> int:
             break
         seed += 1
         past_h = (time.monotonic() - began_s) / 3600.0
-        if arguments.seed is not None or past_h >= arguments.hours:
+        if given.seed is not None or over(given, past_h, team_s / 3600.0):
             break
-    past_h = (time.monotonic() - began_s) / 3600.0
-    print(f"{done} episodes in {60 * past_h:.0f} min, {len(broken)} violations {broken or ''}")
+    print(
+        f"{done} episodes, {team_s / 3600.0:.2f} h of teams in {60 * past_h:.0f} min, "
+        f"at most {max(used_mb)} MB, {len(broken)} violations {broken or ''}"
+    )
     return 1 if broken else 0
+
+
+def over(given: argparse.Namespace, past_h: float, team_h: float) -> bool:
+    """Whether the time that was asked for is over."""
+    if given.emulated_hours is not None:
+        return team_h >= given.emulated_hours
+    return past_h >= (0.5 if given.hours is None else given.hours)
+
+
+def again(seed: int, given: argparse.Namespace) -> str:
+    """The command that repeats an episode."""
+    command = f"python tests/soak/soak.py --seed {seed} --estimator {given.estimator}"
+    for name in ("nodes", "seconds"):
+        if (value := getattr(given, name)) is not None:
+            command += f" --{name} {value}"
+    return command + " --kills" * given.kills
 
 
 if __name__ == "__main__":
