@@ -1510,6 +1510,19 @@ TEST(after_keys_a_b_and_a_again_no_old_command_is_obeyed) {
   CHECK_EQUAL(9, ask(team, team.node, wire::CommandCode::kSetTeamSize, 0).value);
 }
 
+TEST(after_an_erased_memory_the_same_keys_bring_no_old_command_back) {
+  Team erased;
+  NewKeys keys;
+  keys.give(erased, 9100);
+  erased.world.host_counter = 9000;  // a command from before, under the same keys
+  erased.world.count = 0;
+  erased.world.command(99, code(wire::CommandCode::kSetTeamSize), 4);
+  erased.run_ms(300);
+  CHECK_EQUAL(result(wire::CommandResult::kCounterRefused), erased.answer().result);
+  erased.world.host_counter = 9100;
+  CHECK_EQUAL(6, ask(erased, erased.node, wire::CommandCode::kSetTeamSize, 0).value);
+}
+
 TEST(a_beacon_comes_under_its_own_key_which_commands_nothing) {
   Team team;
   NewKeys keys;
