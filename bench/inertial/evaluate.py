@@ -68,13 +68,18 @@ def errors(found: Sequence[Score]) -> Array:
     return percent([score.error for score in found])
 
 
-def judge(group: str, members: Sequence[Walk], fit: Fit, verbose: bool = False) -> Row:
+def judge(
+    group: str, members: Sequence[Walk], fit: Fit, biases_rad_s: Array, verbose: bool = False
+) -> Row:
     """The figures of a group."""
     choice = fit.without_set(members[0].data_set)
     with walking.choose(choice):
         results = [walk.reckon(choice.gain) for walk in members]
         found = [s for w, r in zip(members, results, strict=True) for s in walking.scores(w, r)]
         again = walking.calibrated(members, choice.gain)
+        turned = np.array(
+            [t for w in members for t in walking.turn_errors(w, choice.gain, biases_rad_s)]
+        )
     alone = []
     for person in sorted({walk.person for walk in members}):
         alone += person_left_out([w for w in members if w.person == person], fit)
@@ -87,7 +92,6 @@ def judge(group: str, members: Sequence[Walk], fit: Fit, verbose: bool = False) 
     ]
     count = sum(score.contacts for score in steps)
     turns = [walking.turn_error(w, r) for w, r in zip(members, results, strict=True)]
-    turned = np.array([turn for turn in turns if turn])
     loops = [
         abs(r.rows["x_m"][-1] + 1j * r.rows["y_m"][-1]) / w.parts[0].true_m
         for w, r in zip(members, results, strict=True)
@@ -327,7 +331,8 @@ def main() -> None:
         return
     found = walking.find(replay.data_folder())
     fit = Fit(found)
-    rows = [judge(g, w, fit, options.verbose) for g, w in walking.groups_of(found)]
+    biases_rad_s = walking.chip_biases_rad_s(replay.data_folder())
+    rows = [judge(g, w, fit, biases_rad_s, options.verbose) for g, w in walking.groups_of(found)]
     print(table(rows))
     print(track_table(rows, found, fit))
     if (replay.data_folder() / "walk_chest").is_dir():

@@ -63,7 +63,7 @@ def data_folder() -> Path:
     return Path(os.environ.get("RELPOS_DATA", ROOT.parent / "shared" / "data"))
 
 
-TUNABLE = ("kTurn_rad", "kSmallRise_m", "kWalkRatio_m_s")
+TUNABLE = ("kTurn_rad", "kSmallRise_m", "kWalkRatio_m_s", "kLimpShare")
 _tuned = False  # whether the build with constants that can be set is in force
 
 

@@ -9,6 +9,7 @@ left out (`Fit`), so that no figure comes from people the constants have seen.
 from __future__ import annotations
 
 import contextlib
+import gzip
 import itertools
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,6 +26,7 @@ from relpos.calibration.steps import posterior_scale
 SLOW_M_S = 0.6  # below it steps are shuffled: reported apart, and to be flagged
 DENSE_S = 0.5  # truth rows closer than this are a track, others are surveyed points
 LOOP_M = 1.0  # ends nearer to the beginning than this are a loop
+LOST_TURN_DEG = 30.0  # less than a U-turn by this: nobody leaves a corridor so, samples are missing
 SETTLE_S = 1.0  # over which a heading is averaged: a stride
 CALIBRATED_SIGMA = 0.05  # scale error left after one calibration walk
 IRREGULAR = 1 << 8  # flag of the library: a step was doubtful or irregular, last two seconds
@@ -78,10 +80,16 @@ class Walk:
             name += f", under {SLOW_M_S} m/s (slow)" if moved < SLOW_M_S * taken_s else ""
         return name
 
-    def reckon(self, gain: float | None = None, sigma: float | None = None) -> Reckoning:
-        """The library's answer, with the constants in force."""
+    def reckon(
+        self,
+        gain: float | None = None,
+        sigma: float | None = None,
+        bias_rad_s: Array | None = None,
+    ) -> Reckoning:
+        """The library's answer, with the constants in force; ``bias_rad_s`` (3,) is added."""
+        imu = self.recording.imu
         return replay.reckon(
-            self.recording.imu,
+            imu if bias_rad_s is None else imu + np.concatenate([np.zeros(3), bias_rad_s]),
             leg_length_m=self.recording.leg_length_m,
             step_gain=gain,
             scale_sigma=sigma,
@@ -205,12 +213,42 @@ def turn_error(walk: Walk, result: Reckoning) -> tuple[float, float] | None:
     return float(error), float(error**2 / (np.degrees(1.0) ** 2 * variance + 2.0 * 2.0**2))
 
 
+def turn_errors(walk: Walk, gain: float, biases_rad_s: Array) -> list[tuple[float, float]]:
+    """`turn_error` s with a node's chip: others than the sensors of the recordings, and not zeroed.
+
+    Of three of the chips whose turn-on ``biases_rad_s`` (n, 3) were measured. None where samples
+    of the turn are missing: a gyroscope turns by 180 degrees with its wearer.
+    """
+    if walk.turn_deg is None:
+        return []
+    if len(starts := walk.recording.times_of("uturn_start")):
+        times_s = [starts[0] - SETTLE_S, walk.recording.times_of("uturn_end")[0] + SETTLE_S]
+        heading_rad = recordings.gyro_heading_rad(walk.recording)
+        raw_deg = np.degrees(np.diff(np.interp(times_s, walk.recording.time_s, heading_rad))[0])
+        if abs(raw_deg) < abs(walk.turn_deg) - LOST_TURN_DEG:
+            return []
+    first = sum(map(ord, walk.recording.name))
+    chosen = [biases_rad_s[(first + 3 * k) % len(biases_rad_s)] for k in range(3)]
+    found = [turn_error(walk, walk.reckon(gain, bias_rad_s=bias)) for bias in chosen]
+    return [turn for turn in found if turn]
+
+
+def chip_biases_rad_s(root: Path) -> Array:
+    """Turn-on biases (n, 3) of the chips of ``still_mpu9150_8chips``, one where it is not there."""
+    folder = root / "still_mpu9150_8chips" / "exp1"
+    if not folder.is_dir():
+        return np.zeros((1, 3))
+    with gzip.open(folder / "imu.csv.gz", "rt") as stream:
+        columns = np.genfromtxt(stream, delimiter=",", skip_header=1, usecols=(1, 5, 6, 7))
+    nodes = np.unique(columns[:, 0])
+    return np.array([np.median(columns[columns[:, 0] == n, 1:], axis=0) for n in nodes])
+
+
 # --- constants with a set or a person left out ----------------------------------------------------
 
 CONSTANTS = {
     "kTurn_rad": (1.0, 1.15, 1.3, 1.5, 1.7),
-    "kWalkRatio_m_s": (0.41, 0.43, 0.45, 0.47, 0.5),
-    "kSmallRise_m": (0.016, 0.02, 0.024),
+    "kLimpShare": (0.0, 0.5, 1.0, 1.5),
 }
 """Values tried, by the firmware's name for them (gait.cpp, gait.h, dead_reckoning.cpp)."""
 

@@ -17,7 +17,7 @@ namespace {
 const float kDefaults[] PROGMEM = {
     0.93f,          // 0.53 of the stature (Zijlstra and Hof 1997); here of 1.75 m
     2.14f,          // all people of docs/walkers.md
-    0.10f,          // what people differ by (docs/walkers.md)
+    0.06f,          // what people differ by whose steps are not flagged (docs/walkers.md)
     39.0f,          // just under 4 g
     17.4f,          // just under 1000 deg/s
     kPi / 180.0f,   // 1 deg/s: what a warmed-up, once zeroed MPU-9150 keeps
@@ -59,7 +59,19 @@ const float kTurnSigma_m = 0.2f;      // of a step on the spot
 // Longest step for its time, length times duration: people walk at 0.30 to 0.42 m s at any speed
 // (walk ratio; Sekiya and Nagasaki 1998). A long slow arc is bending, lifting or shuffling.
 const float kWalkRatio_m_s = 0.45f;
-const float kIrregular = 0.7f;        // share left by turning under which a step is flagged
+const float kLongStep = 1.3f;         // times that: a step that asks for more is flagged
+const float kIrregular = 0.35f;       // share left by turning under which a step is flagged
+// A limp: rises of left and right differ by this share of their sum, over the last ten steps. Who vaults
+// over one leg or hikes a hip rises more than the legs' arcs do (walk_treadmill_stroke_lumbar; 0.05 in
+// healthy people), so that its steps are shorter by kLimpShare times the limp.
+const float kLimp = 0.1f;
+const float kLimpGain = 0.1f;
+const float kLimpShare = 1.0f;
+// Stairs: a step that ends so much higher or lower. Its length is that of comfortable stairs, two
+// rises and one tread 0.63 m (Blondel 1675).
+const float kClimb_m = 0.08f;
+const float kBlondel_m = 0.63f;
+const float kShortestTread_m = 0.2f;
 // Relative scale error of flagged steps: shuffling, turning on the spot, steps aside and lifting look
 // alike on the torso (docs/walkers.md: walks under 0.6 m/s).
 const float kIrregularScale = 0.25f;
@@ -79,7 +91,7 @@ const float kStraightSigma_rad_s = 0.6f * kDegree;
 const float kSettled_s = 1.0f, kStill_s = 5.0f;  // standing, of which 5 s make a measurement
 const float kStillSigma_m_s = 0.1f;   // sway of 2 cm/s that stays the same over several updates
 const float kLooseSigma_m_s = 0.5f;   // moving without steps: shuffling, bending
-const float kLooseNoise_m2_s = 0.1f;  // 0.3 m in a second may go unseen without a step
+const float kLooseNoise_m2_s = 0.05f;  // 0.2 m in a second may go unseen without a step
 // Every fifth tick; no visible loss. Every sixth, 0.8 % of a tick cheaper, the slow bouts of
 // walk_daily_lowerback err by 25.0 % each instead of 22.0.
 const float kPredict_s = 0.09f;
@@ -355,13 +367,32 @@ RELPOS_APART void DeadReckoning::on_stance(const Stance& stance) {
     length *= kFirstStep;
     sigma = kOddStepSigma;
   }
-  step_speed_m_s_ = length / interval_s;
   bool irregular = stance.weak || share < kIrregular || stance.excursion_m < kSmallRise_m;
-  const float most_m = kWalkRatio_m_s / interval_s;
+  if (stance.first) {
+    limp_ = 0.0f;
+    rise_m_ = stance.excursion_m;
+  }
+  const float unlike = (stance.excursion_m - rise_m_) / (stance.excursion_m + rise_m_);
+  rise_m_ = stance.excursion_m;
+  limp_ = -limp_;  // the other foot
+  follow(&limp_, unlike, kLimpGain);
+  const float limp = fabsf(limp_);
+  if (limp > kLimp) {
+    length *= 1.0f - kLimpShare * limp;
+    irregular = true;
+  }
+  step_speed_m_s_ = length / interval_s;
+  float most_m = kWalkRatio_m_s / interval_s;
+  if (length > kLongStep * most_m) irregular = true;
+  const float climb_m = fabsf(position_m_[kZ]);
+  if (velocity_known_ && climb_m > kClimb_m) {
+    irregular = true;
+    most_m = kBlondel_m - 2.0f * climb_m;
+    if (most_m < kShortestTread_m) most_m = kShortestTread_m;
+  }
   if (length > most_m) {
     length = most_m;
     sigma = kOddStepSigma;
-    irregular = true;
   }
   step_irregular_ = irregular;
   if (irregular) hold_[kHoldDoubt] = kHoldTicks;

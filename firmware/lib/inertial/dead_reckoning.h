@@ -133,6 +133,7 @@ class DeadReckoning {
   float mounting_rad_;             // where the forward axis has settled, from the heading axis
   float walk_[2];   // walking direction in the navigation frame: heading and forward axis
   float turn_rad_;  // over the last step
+  float limp_, rise_m_;  // how unlike left and right rise, signed by the foot; the last step's rise
   float straight_heading_rad_, straight_s_;  // of the stretch that may be straight
   float straight_rate_rad_s_;
 

@@ -28,7 +28,7 @@ const float kDueFrom = 0.8f, kDueUntil = 1.4f;  // of the period
 const float kDueRange_m_s2 = 1.0f;
 const uint8_t kWalk = 3;           // steps that make a walk, whose end is a footfall
 
-const float kTurn_rad = 1.15f;     // see turning_share
+const float kTurn_rad = 1.3f;      // see turning_share
 
 const float kForwardMemory_s = 12.0f;  // about twenty steps: a body-fixed axis, yet free to move
 const uint8_t kForwardSteps = 4;       // two strides: the sway of left and right cancels
