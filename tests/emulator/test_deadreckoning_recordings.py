@@ -90,12 +90,13 @@ def test_alignment_spends_the_first_leg_and_nothing_else():
 
 MOST_PERCENT = {  # mean absolute, from the stature alone, constants fitted without the set
     "5m back, elderly": 14.0,
-    "5m back, young": 7.0,
-    "author back": 7.0,
+    "5m back, young": 8.0,
+    "author back": 5.0,
     "daily lowerback, under 0.6 m/s (slow)": 25.0,
     "lowerback 20m": 6.0,
     "mocap virtual": 7.0,
     "phone strides": 7.0,
+    "stairs mocap virtual": 30.0,
     "treadmill stroke lumbar": 15.5,
     "treadmill stroke lumbar, under 0.6 m/s (slow)": 35.0,
 }
@@ -109,8 +110,9 @@ def found():
 @pytest.fixture(scope="module")
 def rows(found):
     # The page's own grid is five times as large.
-    fit = walks.Fit(found, {name: values[1::2] for name, values in walks.CONSTANTS.items()})
-    return {g: evaluate.judge(g, w, fit) for g, w in walks.groups_of(found)}
+    fit = walks.Fit(found, {name: values[::2] for name, values in walks.CONSTANTS.items()})
+    biases_rad_s = walks.chip_biases_rad_s(replay.data_folder())
+    return {g: evaluate.judge(g, w, fit, biases_rad_s) for g, w in walks.groups_of(found)}
 
 
 @needs("walk_lowerback_20m")
@@ -143,8 +145,20 @@ def test_a_u_turn_is_half_a_turn(rows):
 def test_no_set_errs_by_more_than_the_node_says(rows):
     for group in MOST_PERCENT:
         assert rows[group].nees < 2.0, group
-    for group in ("lowerback 20m", "5m back, elderly", "treadmill stroke lumbar"):
-        assert rows[group].nees > 0.5, group
+    most_cautious = ("mocap virtual", "author back", "daily lowerback, under 0.6 m/s (slow)")
+    for group in MOST_PERCENT:
+        assert rows[group].nees > (0.2 if group in most_cautious else 0.45), group
+    for row in rows.values():
+        assert row.turn_nees is None or 0.5 < row.turn_nees < 2.0, row.group
+
+
+@needs("walk_treadmill_stroke_lumbar")
+def test_who_limps_is_flagged_and_left_out_walks_shorter(rows, found):
+    # The firmware's own constants: of all but the person, not of all but the set.
+    assert rows["treadmill stroke lumbar"].person_left_out < 13.5
+    limping = [w for w in found if w.person == "pp07"]
+    flags = np.concatenate([w.reckon().rows["flags"][1500:] for w in limping])
+    assert np.mean(flags & walks.IRREGULAR > 0) > 0.9
 
 
 @needs("walk_lowerback_20m")
@@ -159,7 +173,7 @@ def test_a_person_who_is_left_out_changes_no_constant(found):
 @needs("walk_chest")
 def test_the_same_corridor_is_as_long_both_ways():
     figures = evaluate.chest()
-    assert abs(figures["corridor_ratio_percent"]) < 0.8
+    assert abs(figures["corridor_ratio_percent"]) < 0.9
     for way in ("there", "back"):
         assert 164 <= figures[f"corridor_{way}_steps"] <= 169
     assert figures["K_calibration_worst_from_mean_percent"] < 2.0

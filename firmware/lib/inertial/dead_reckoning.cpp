@@ -67,11 +67,10 @@ const float kIrregular = 0.35f;       // share left by turning under which a ste
 const float kLimp = 0.1f;
 const float kLimpGain = 0.1f;
 const float kLimpShare = 1.0f;
-// Stairs: a step that ends so much higher or lower. Its length is that of comfortable stairs, two
-// rises and one tread 0.63 m (Blondel 1675).
-const float kClimb_m = 0.08f;
+// Stairs: a step that ends so much higher or lower; more is a lost vertical. Its length is that of
+// comfortable stairs, two rises and one tread 0.63 m (Blondel 1675). From 0.05 m on level walks are hit.
+const float kClimb_m = 0.08f, kHighest_m = 0.22f;
 const float kBlondel_m = 0.63f;
-const float kShortestTread_m = 0.2f;
 // Relative scale error of flagged steps: shuffling, turning on the spot, steps aside and lifting look
 // alike on the torso (docs/walkers.md: walks under 0.6 m/s).
 const float kIrregularScale = 0.25f;
@@ -385,10 +384,9 @@ RELPOS_APART void DeadReckoning::on_stance(const Stance& stance) {
   float most_m = kWalkRatio_m_s / interval_s;
   if (length > kLongStep * most_m) irregular = true;
   const float climb_m = fabsf(position_m_[kZ]);
-  if (velocity_known_ && climb_m > kClimb_m) {
+  if (velocity_known_ && climb_m > kClimb_m && climb_m < kHighest_m) {
     irregular = true;
     most_m = kBlondel_m - 2.0f * climb_m;
-    if (most_m < kShortestTread_m) most_m = kShortestTread_m;
   }
   if (length > most_m) {
     length = most_m;
