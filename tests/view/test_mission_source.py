@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from pathlib import Path
 from typing import Any
@@ -91,9 +92,26 @@ def test_a_mission_is_started_ended_and_a_recording_of_it_played_on_the_page(
         page.locator("#source-start").click()
         expect(page.locator("html")).to_have_attribute("data-replay", "true")
         expect(page.locator("#people li")).to_have_count(3)
+        # By its time line: any moment, and what happened.
+        expect(page.locator("#moment-words")).to_have_text(re.compile(" of "))
+        page.locator("#play").click()
+        expect(page.locator("#play")).to_have_text("Play")
+        page.locator("#moment").focus()
+        page.keyboard.press("Home")
+        expect(page.locator("#moment-words")).to_have_text(re.compile("^0.0 s of "))
+        # Who is let in meanwhile stays in.
+        invited = output_of(
+            field.run("mission", str(field.folder), "--invite", "look"), "http://\\S+"
+        )
+        guest = browser.new_page()
+        guest.goto(re.sub("//[^:/]+:", "//127.0.0.1:", invited))
+        expect(guest.locator("#people li")).to_have_count(3)
+        guest.close()
         hold_end(page)
         expect(page.locator("#source-form")).to_be_visible()
-        assert Mission.open(field.folder).about.source == field.port
+        kept = Mission.open(field.folder)
+        assert kept.about.source == field.port
+        assert [e["role"] for e in kept.events() if e["kind"] == "device"][-1] == "look"
         phone.close()
         context.close()
     finally:

@@ -160,7 +160,7 @@ def fuse(
     elif sources.is_recording(source):
         sources_of = {name: context.get_parameter_source(name) for name in context.params}
         given = {name for name, how in sources_of.items() if how and how.name != "DEFAULT"}
-        fuse_mcap(job, given, initial, options, key_file, as_json=json, report=report)
+        _fuse_mcap(job, given, initial, options, key_file, as_json=json, report=report)
     elif options.shown:
         replay_run(job, initial, options, as_json=json)
     else:
@@ -242,7 +242,7 @@ def replay_run(
     )
 
 
-def fuse_mcap(
+def _fuse_mcap(
     job: Job,
     given: Set[str],
     initial: Initial | None,
@@ -251,7 +251,7 @@ def fuse_mcap(
     *,
     as_json: bool,
     report: bool | None,
-) -> Outcome | None:
+) -> None:
     """Repeat a recorded session; the command line replaces its settings."""
     from relpos import api
     from relpos.live.fusion_thread import common_start
@@ -299,9 +299,8 @@ def fuse_mcap(
             link=again.link,
             recorded_unix_s=None if began_ns is None else began_ns * 1e-9,
         )
-        return fuse_live(
-            job, source, options, description=run.description, priors=priors, as_json=as_json
-        )
+        fuse_live(job, source, options, description=run.description, priors=priors, as_json=as_json)
+        return
     counted = {name: round(count) for name, count in replay.counters().items()}
     fuse_recording(
         job,
@@ -311,7 +310,6 @@ def fuse_mcap(
         as_json=as_json,
         report=_is_wanted(report, as_json=as_json),
     )
-    return None
 
 
 def _is_wanted(report: bool | None, *, as_json: bool) -> bool:

@@ -257,7 +257,7 @@ def open_page(options: Options, hello: Hello, folder: Path | None = None) -> Web
     door, access = doors.listen(options.view_listen)
     if options.mission is not None:
         mission = options.mission.folder
-        access, folder = replace(access, key=mission.key), mission.path
+        access, folder = replace(access, key=mission.key), folder or mission.path
     access = replace(access, folder=folder)
     if options.https:
         access = replace(access, certificate=doors.make_certificate(access.hosts))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Iterator
@@ -13,10 +14,11 @@ import typer
 
 from relpos.cli import live, output
 from relpos.cli.estimators import BANK, EstimatorName
-from relpos.cli.fuse import Initial, Job, fuse_live, fuse_mcap, replay_run
+from relpos.cli.fuse import Initial, Job, fuse_live, replay_run
 from relpos.cli.keys import KeyFile, make_link
 
 if TYPE_CHECKING:
+    from relpos.cli.waiting import Choice
     from relpos.link.port import Link
     from relpos.live.inputs import Received
     from relpos.live.mission import Mission, Resumed
@@ -107,34 +109,33 @@ def _run_chosen(
         options = replace(
             options, open_browser=False, seconds=None if math.isinf(left_s) else max(left_s, 0.0)
         )
-        outcome: Outcome | None
         try:
             if choice.is_port:
                 found.about.source = choice.source
                 outcome = _run(found, options, estimator, key_file, common=choice.common)
             else:
-                outcome = _exercise(found, choice.source, options, estimator, key_file)
+                outcome = _exercise(found, choice, options, estimator)
         except Exception as error:
             known = isinstance(error, RelposError | OSError)
             trouble = words_of(error) if known else f"the session has failed: {error!r}"
             output.remark(trouble)
             continue
         trouble = ""
-        if outcome is None or not outcome.ended_on_page:
+        if not outcome.ended_on_page:
             return
 
 
-def _exercise(
-    found: Mission, source: str, options: live.Options, estimator: str, key_file: Path | None
-) -> Outcome | None:
+def _exercise(found: Mission, choice: Choice, options: live.Options, estimator: str) -> Outcome:
     """Show a demo, a recording or a run; nothing of it enters the mission but its devices."""
-    from relpos import sources
     from relpos.cli import demo
-    from relpos.cli.waiting import DEMO
+    from relpos.cli.replay import play
+    from relpos.cli.waiting import DEMO, device_event
     from relpos.emulator.team import TeamConfig
     from relpos.live.assembly import MissionPlan
-    from relpos.live.mission import Resumed
+    from relpos.live.mission import JOURNAL, Journal, Resumed
+    from relpos.live.session import Outcome
 
+    source = choice.source
     exercise = found.exercise(source)
     devices = [event for event in found.events() if event["kind"] == "device"]
     options = replace(
@@ -142,12 +143,14 @@ def _exercise(
         debrief=False,
         mission=MissionPlan(exercise, Resumed(devices)),
     )
+    if choice.is_recorded:
+        with contextlib.closing(Journal(exercise.path / JOURNAL)) as journal:
+            ended = play(Path(source), options, lambda body: journal.keep(device_event(body)))
+        return Outcome(ended_on_page=ended)
     job = Job(source, estimator, {}, 0, exercise.path / "session-1")
     if source == DEMO:
         team = TeamConfig("paper", DEMO_NODES, DEMO_S, 0, str(demo.Board.NATIVE), ())
         return demo.fuse_emulated(team, job, options, as_json=False)
-    if sources.is_recording(source):
-        return fuse_mcap(job, set(), None, options, key_file, as_json=False, report=False)
     return replay_run(job, None, options, as_json=False)
 
 

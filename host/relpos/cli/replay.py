@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,7 +14,6 @@ from relpos.cli import live, output
 
 if TYPE_CHECKING:
     from relpos.live.team_view import LogEntry
-    from relpos.recording.moments import Moments
 
 
 def replay(
@@ -34,68 +34,100 @@ def replay(
     Positions are those that the session had then. The smoothed tracks, by the whole recording, are
     computed meanwhile and drawn beside them once they are there.
     """
-    from relpos import recording
+    if log is not None:
+        _write(log, Played.open(source), pins or ())
+        return
+    play(source, live.Options(True, view_listen, open_browser=open_browser, seconds=seconds))
+
+
+@dataclass(frozen=True)
+class Played:
+    """A recording, or all those of a mission with what stands in its journal."""
+
+    paths: list[Path]
+    name: str
+    entries: list[LogEntry]
+    board: dict[str, Any]
+    live_port: int | None = None
+
+    @classmethod
+    def open(cls, source: Path) -> Played:
+        """Read what there is; DataError."""
+        from relpos import recording
+        from relpos.errors import DataError
+        from relpos.live.board import Board, BoardError
+        from relpos.live.mission import Mission
+
+        recording.check(None)
+        board = Board()
+        if not source.is_dir():
+            return cls([source], source.stem, [], board.to_message())
+        mission = Mission.open(source)
+        entries: list[LogEntry] = []
+        for event in mission.events():
+            if event["kind"] == "log":
+                entries.append(event["entry"])
+            elif event["kind"] in ("marker", "plan"):
+                with contextlib.suppress(BoardError):
+                    board.apply(event)
+        paths = mission.recordings()
+        if not paths:
+            raise DataError(f"{source}: nothing is recorded yet")
+        live_port = mission.about.port if mission.is_running() else None
+        return cls(paths, mission.about.name, entries, board.to_message(), live_port)
+
+
+def play(
+    source: Path, options: live.Options, admit: Callable[[dict[str, Any]], None] | None = None
+) -> bool:
+    """Play it on the page until the options' end or Ctrl-C; return whether the page ended it.
+
+    With ``admit``, of a mission, which keeps the devices that are let in meanwhile.
+    """
     from relpos.cli.smoothing import Smoothing
-    from relpos.errors import DataError
-    from relpos.live.board import Board, BoardError
-    from relpos.live.mission import Mission
     from relpos.live.team_view import Hello
     from relpos.recording.moments import Moments
     from relpos.recording.player import Player
 
-    recording.check(None)
-    entries: list[LogEntry] = []
-    paths = [source]
-    name = source.stem
-    live_port = None
-    board = Board()
-    if source.is_dir():
-        mission = Mission.open(source)
-        paths, name = mission.recordings(), mission.about.name
-        entries = [e["entry"] for e in mission.events() if e["kind"] == "log"]
-        for event in mission.events():
-            if event["kind"] in ("marker", "plan"):
-                with contextlib.suppress(BoardError):
-                    board.apply(event)
-        live_port = mission.about.port if mission.is_running() else None
-        if not paths:
-            raise DataError(f"{source}: nothing is recorded yet")
-    moments = Moments(paths)
-    if log is not None:
-        _write(log, moments, name, entries, pins or ())
-        return
+    played = Played.open(source)
+    moments = Moments(played.paths)
+    # The mission whose page this is does not go on beside it.
+    live_port = None if admit else played.live_port
     hello = Hello(
-        name, str(source), "as recorded", moments.started_unix_s, replay=True,
-        recorded_unix_s=moments.started_unix_s, live_port=live_port,
+        played.name, str(source), "as recorded", moments.started_unix_s, replay=True,
+        recorded_unix_s=moments.started_unix_s, live_port=live_port, mission=admit is not None,
     )  # fmt: skip
-    options = live.Options(True, view_listen, open_browser=open_browser)
     page = live.open_page(options, hello, source if source.is_dir() else None)
-    page.boarded(board.to_message())
+    if options.mission is not None:
+        for event in options.mission.resumed.events:
+            page.admitted(event)
+    page.boarded(played.board)
     # A mission that goes on has no end yet to smooth from.
-    smoothing = None if live_port else Smoothing(paths)
+    smoothing = None if live_port else Smoothing(played.paths)
+    player = Player(moments, [page], played.entries, smoothing, admit)
     try:
-        Player(moments, [page], entries, smoothing).run(seconds)
+        with contextlib.suppress(KeyboardInterrupt):
+            player.run(options.seconds)
     finally:
         if smoothing is not None:
             smoothing.close()
         page.close()
         moments.close()
+    return player.ended
 
 
-def _write(
-    path: Path, moments: Moments, name: str, known: list[LogEntry], pins: Sequence[str]
-) -> None:
+def _write(path: Path, played: Played, pins: Sequence[str]) -> None:
     """Write the log: KML by its suffix, else CSV."""
     from relpos.exchange.content import PLACED
     from relpos.geodesy import parse_pin, place
     from relpos.live.log_files import log_row, write_kml
+    from relpos.recording.moments import Moments
     from relpos.recording.player import History
     from relpos.runs.appending import write_rows
     from relpos.runs.log import LOG_COLUMNS
 
-    if known:
-        entries = known
-    else:
+    moments, name, entries = Moments(played.paths), played.name, played.entries
+    if not entries:
         history = History()
         history.read(moments, {}, ())
         entries = history.events

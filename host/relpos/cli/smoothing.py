@@ -13,38 +13,46 @@ from relpos.live.tracks import Tracks
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
+    from multiprocessing.context import SpawnProcess
 
 NICE = 10
 """Playing and seeking come first."""
 
 
 class Smoothing:
-    """Smooths recordings, each by itself; called, it returns the tracks once they are there.
+    """Smooths recordings, each by itself, from the first call on; returns the tracks once there.
 
     None means not yet; no tracks, that none could be computed.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe(duplex=False)
-        self._process = context.Process(
-            target=_smooth, args=(list(paths), theirs), name="relpos smoother", daemon=True
-        )
-        self._process.start()
-        theirs.close()
+        self._paths = list(paths)
+        self._process: SpawnProcess | None = None
 
     def __call__(self) -> Tracks | None:
         """Return the tracks, or None."""
+        if self._process is None:
+            self._start()
         try:
             return self._pipe.recv() if self._pipe.poll() else None
         except EOFError:
             return Tracks()
 
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe(duplex=False)
+        self._process = context.Process(
+            target=_smooth, args=(self._paths, theirs), name="relpos smoother", daemon=True
+        )
+        self._process.start()
+        theirs.close()
+
     def close(self) -> None:
         """End it."""
-        self._pipe.close()
-        self._process.kill()
-        self._process.join()
+        if self._process is not None:
+            self._pipe.close()
+            self._process.kill()
+            self._process.join()
 
 
 def _smooth(paths: list[Path], pipe: Connection) -> None:

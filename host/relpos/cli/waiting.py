@@ -32,6 +32,14 @@ class Choice:
     common: bool
 
     @property
+    def is_recorded(self) -> bool:
+        """Whether it is a recording, or a mission, that can be played with a time line."""
+        from relpos import sources
+        from relpos.live.mission import ABOUT
+
+        return sources.is_recording(self.source) or (Path(self.source) / ABOUT).is_file()
+
+    @property
     def is_port(self) -> bool:
         """Whether a live team is behind it, whose session belongs to the mission."""
         from relpos import sources
@@ -40,7 +48,6 @@ class Choice:
 
     def check(self) -> None:
         """Raise RelposError where nothing can be opened there."""
-        from relpos import sources
         from relpos.link.port import check_port
 
         scheme, url, _ = self.source.partition("://")
@@ -48,9 +55,7 @@ class Choice:
             raise RelposError(f"{self.source}: neither a path nor {'://, '.join(SCHEMES)}://")
         if self.is_port:
             check_port(self.source)
-        elif not (
-            self.source == DEMO or sources.is_recording(self.source) or Path(self.source).is_dir()
-        ):
+        elif not (self.source == DEMO or self.is_recorded or Path(self.source).is_dir()):
             raise RelposError(f"{self.source}: no such port, recording or run directory")
 
 
@@ -98,10 +103,8 @@ def _answer(
     """Answer a request; return the choice that starts a session."""
     body: dict[str, Any] = request.body
     if request.kind == "device":
-        event = {"kind": "device", **body, "time_s": 0.0, "unix_s": time.time()}
-        number = journal.add(event)
-        while not journal.is_safe(number) and journal.trouble is None:
-            time.sleep(LOOK_S / 10)
+        event = device_event(body)
+        journal.keep(event)
         page.admitted(event)
         page.respond(request, body)
     elif request.kind == "sources":
@@ -118,6 +121,11 @@ def _answer(
     else:
         page.respond(request, refusal(Said("not-running", "no session runs yet")), 409)
     return None
+
+
+def device_event(body: dict[str, Any]) -> dict[str, Any]:
+    """Return the journal's event of a device that was let in or shut out without a session."""
+    return {"kind": "device", **body, "time_s": 0.0, "unix_s": time.time()}
 
 
 def _sources(mission: Mission, trouble: str) -> dict[str, Any]:

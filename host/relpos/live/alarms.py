@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from relpos.fusion.vertical.falls import FallDetector
 from relpos.live.team_view import STILL_ALARM_S, STILL_WARNING_S, Alert
 from relpos.measurements import Height, Motion
+from relpos.said import Said
 
 LOST_S = 10.0
 """As long as the estimators' ``lost``: ten reports in a row. With 2 % loss never by chance, with a
@@ -41,6 +42,23 @@ MAX_TICK_S = 1.0
 """The session ticks twenty times a second; it was not receiving in the rest of a longer gap."""
 REPORT_S = 1.5
 """How long after the newest report stillness is assumed to last: until the next one is due."""
+
+RAISED = {
+    Alert.STILL_WARNING: Said("still-20", "{name} has not moved for 20 s", name=""),
+    Alert.STILL_ALARM: Said("still-30", "{name} has not moved for 30 s", name=""),
+    Alert.FALL: Said("fell", "{name} fell", name=""),
+    Alert.LOST: Said("lost", "{name} is not heard any more", name=""),
+    Alert.MAYDAY: Said("mayday", "{name} calls MAYDAY", name=""),
+}
+MOVES = Said("moves", "{name} moves again", name="")
+CLEARED = {
+    Alert.STILL_WARNING: MOVES,
+    Alert.STILL_ALARM: MOVES,
+    Alert.FALL: MOVES,
+    Alert.LOST: Said("heard", "{name} is heard again", name=""),
+    Alert.MAYDAY: Said("no-mayday", "{name} has no MAYDAY any more", name=""),
+}
+"""Texts of the log."""
 
 
 @dataclass(slots=True)

@@ -44,6 +44,7 @@ WARM_UP_S = 12.0
 """How far before the checkpoint the recording is read again: a status comes each ten seconds, and
 without the totals before it no motion is known."""
 SYNC_S = 0.4
+KEEP_LOOK_S = 0.005
 MOST_ABOUT_BYTES = MOST_LINE_BYTES = 1 << 20
 KEY_BYTES = 32
 
@@ -237,6 +238,14 @@ class Journal:
         self._put += 1
         self._waiting.put((self._put, to_json(event) + "\n"))
         return self._put
+
+    def keep(self, event: Mapping[str, Any]) -> None:
+        """Append an event and wait for the disk; DataError where it cannot be written."""
+        number = self.add(event)
+        while not self.is_safe(number):
+            if self.trouble is not None:
+                raise DataError(self.trouble)
+            time.sleep(KEEP_LOOK_S)
 
     @property
     def newest(self) -> int:

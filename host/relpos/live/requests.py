@@ -14,12 +14,15 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from relpos.measurements import Event, Heading, Observation, out_of_bounds
+from relpos.said import Said
 
 EARLY_S = 1.0
 LATE_S = 60.0
 """A request arrives at most this long before (misjudged clocks) and after (a slow network) the
 time at which it was sent by the offset; otherwise the offset is wrong."""
 MAX_ACCEPTED = 100_000
+RECORDED = Said("recorded", "this is a recording: it takes no presses or headings")
+AT_LANDMARK = Said("landmark", "{name} is at landmark {landmark}", name="", landmark="")
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,14 +20,20 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from relpos.fusion.estimator import Estimate, NodeStatus, time_offsets
-from relpos.live.alarms import KnownAlert
+from relpos.live.alarms import CLEARED, RAISED, KnownAlert
 from relpos.live.board import BOARD_EVENTS, Board, BoardError
 from relpos.live.composer import Composer
 from relpos.live.fusion_thread import FusionThread
 from relpos.live.inputs import Input, Received
 from relpos.live.mission import Journal, Resumed
 from relpos.live.notices import NoticeBoard
-from relpos.live.requests import Request, RequestHandler, RequestSource
+from relpos.live.requests import (
+    AT_LANDMARK,
+    RECORDED,
+    Request,
+    RequestHandler,
+    RequestSource,
+)
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert, Level, LogEntry
 from relpos.measurements import Event, Heading, Observation
@@ -42,22 +48,6 @@ BEHIND_S = 5.0
 """Delay of the fusion from which a notice says so; it always waits two or three seconds."""
 ASLEEP_S = 5.0
 """The receive thread runs twenty times a second; a longer gap was sleep, or another program."""
-RAISED = {
-    Alert.STILL_WARNING: Said("still-20", "{name} has not moved for 20 s", name=""),
-    Alert.STILL_ALARM: Said("still-30", "{name} has not moved for 30 s", name=""),
-    Alert.FALL: Said("fell", "{name} fell", name=""),
-    Alert.LOST: Said("lost", "{name} is not heard any more", name=""),
-    Alert.MAYDAY: Said("mayday", "{name} calls MAYDAY", name=""),
-}
-RECORDED = Said("recorded", "this is a recording: it takes no presses or headings")
-MOVES = Said("moves", "{name} moves again", name="")
-CLEARED = {
-    Alert.STILL_WARNING: MOVES,
-    Alert.STILL_ALARM: MOVES,
-    Alert.FALL: MOVES,
-    Alert.LOST: Said("heard", "{name} is heard again", name=""),
-    Alert.MAYDAY: Said("no-mayday", "{name} has no MAYDAY any more", name=""),
-}
 EVENTS = ("acknowledge", "shelve", "name", "device")
 """Requests that change what a mission keeps."""
 LOGGED = ("acknowledge", "shelve", "name")
@@ -471,12 +461,7 @@ class LiveSession:
             for press in new:
                 if isinstance(press, Event):
                     name = self._composer.name(press.node)
-                    text = Said(
-                        "landmark",
-                        "{name} is at landmark {landmark}",
-                        name=name,
-                        landmark=press.value,
-                    )
+                    text = AT_LANDMARK.filled(name=name, landmark=press.value)
                     self.log("landmark", text, press.node)
         return reply, 200
 

@@ -19,6 +19,7 @@ from mcap.records import Channel, Chunk, Metadata
 
 from relpos.errors import DataError
 from relpos.fusion.estimator import Estimate, NodeEstimate
+from relpos.measurements import Event, Motion, Range, Status
 from relpos.recording import topics
 from relpos.recording.about import About
 from relpos.recording.container import (
@@ -38,6 +39,8 @@ BACK_S = 10.0
 KEPT_BYTES = 32 << 20
 """Unpacked blocks in memory: minutes of a large team."""
 _LISTS = frozenset(topics.LISTS.values())
+_READ = _LISTS | {topics.ROWS[kind] for kind in (Motion, Event, Status, Range)}
+"""Everything else (bytes of the port, drawings) is most of a recording."""
 
 
 @dataclass(frozen=True)
@@ -108,17 +111,15 @@ class Moments:
     def _session_s(self, log_ns: int) -> float:
         return log_ns * 1e-9 - self.started_unix_s
 
-    def between(
-        self, from_s: float, to_s: float, wanted: Collection[str] | None = None
-    ) -> Iterator[Message]:
-        """Yield the messages of that time, in order."""
+    def between(self, from_s: float, to_s: float, wanted: Collection[str]) -> Iterator[Message]:
+        """Yield the messages of that time and of those topics, in order."""
         first = bisect_right(self._ends, int((from_s + self.started_unix_s) * 1e9) - 1)
         until_ns = int((to_s + self.started_unix_s) * 1e9)
         for index in range(first, len(self._blocks)):
             if self._blocks[index].start_ns > until_ns:
                 break
             for message in self._messages(index):
-                if from_s <= message.time_s <= to_s and (wanted is None or message.topic in wanted):
+                if from_s <= message.time_s <= to_s and message.topic in wanted:
                     yield message
 
     def _messages(self, index: int) -> list[Message]:
@@ -133,8 +134,10 @@ class Moments:
             for opcode, content in records_in(raw):
                 if opcode == Opcode.MESSAGE:
                     channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(content)
-                    data = bytes(content[MESSAGE_HEAD.size :])
-                    messages.append(Message(self._session_s(log_ns), names.get(channel, ""), data))
+                    topic = names.get(channel, "")
+                    if topic in _READ:
+                        data = bytes(content[MESSAGE_HEAD.size :])
+                        messages.append(Message(self._session_s(log_ns), topic, data))
         except ValueError:
             messages = []  # A damaged block: what it held is missing, nothing else.
         self._kept[index] = messages
@@ -170,7 +173,7 @@ class Moments:
         return None
 
     def rows(self, from_s: float, to_s: float, *kinds: type) -> Iterator[tuple[float, Any]]:
-        """Yield decoded rows of those kinds, with the time at which they were there."""
+        """Yield decoded rows (motions, ranges, statuses, events) with the time they were there."""
         for message in self.between(from_s, to_s, {topics.ROWS[kind] for kind in kinds}):
             row = _decoded(topics.decode_row, message)
             if row is not None:

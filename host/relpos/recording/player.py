@@ -6,6 +6,7 @@ reading of the whole recording, in a thread, while the page is open already.
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
@@ -16,9 +17,9 @@ from dataclasses import asdict
 from typing import Any
 
 from relpos.fusion.estimator import NodeStatus, PairEstimate
-from relpos.live.alarms import Alarms
+from relpos.live.alarms import RAISED, Alarms
 from relpos.live.composer import STALE_S, ghosts_of
-from relpos.live.requests import Request, RequestSource
+from relpos.live.requests import AT_LANDMARK, RECORDED, Request, RequestSource
 from relpos.live.sinks import Sink
 from relpos.live.team_view import (
     STILL_ALARM_S,
@@ -33,8 +34,11 @@ from relpos.live.team_view import (
 from relpos.live.tracks import Tracks
 from relpos.measurements import Event, Motion, Range, Status
 from relpos.recording.moments import BACK_S, Moments
+from relpos.said import Said, refusal, said_of
 
 SHOW_S = 0.2
+TICK_S = 0.2
+"""How exactly alarms of a recording are dated."""
 SWITCH_S = 0.001
 """Python's thread switch interval, as in a live session."""
 SPEEDS = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
@@ -66,25 +70,34 @@ class History:
     def read(self, moments: Moments, names: dict[int, str], known: Sequence[LogEntry]) -> None:
         """Read everything once; ``known`` is a mission's log, else the alerts make one."""
         alarms, log = Alarms(), list(known)
+
+        def name_of(node: int) -> str:
+            return names.get(node, f"Node {node}")
+
+        def note(time_s: float, kind: str, words: Said, node: int) -> None:
+            unix_s = moments.started_unix_s + time_s
+            log.append(LogEntry(time_s, unix_s, kind, str(words), node, said=said_of(words)))
+
         kinds = (Motion, Event, Status)
+        ticked_s = -math.inf
         for time_s, row in moments.rows(moments.from_s, moments.to_s, *kinds):
             if isinstance(row, Event):
                 if not known:
-                    words = f"{names.get(row.node, f'Node {row.node}')} is at landmark {row.value}"
-                    unix_s = moments.started_unix_s + time_s
-                    log.append(LogEntry(time_s, unix_s, "landmark", words, row.node))
+                    words = AT_LANDMARK.filled(name=name_of(row.node), landmark=row.value)
+                    note(time_s, "landmark", words, row.node)
                 continue
             self.heard_s.setdefault(row.node, array("d")).append(time_s)
             alarms.mark_heard(row.node)
             if isinstance(row, Motion):
                 alarms.add_motion(row)
+            if time_s < ticked_s + TICK_S:
+                continue
+            ticked_s = time_s
             alarms.tick(time_s, listening=True)
             for node, _, after in alarms.changes:
                 self.alerts.setdefault(node, []).append((time_s, after))
                 if after is not None and not known:
-                    words = f"{names.get(node, f'Node {node}')}: {after.replace('_', ' ')}"
-                    unix_s = moments.started_unix_s + time_s
-                    log.append(LogEntry(time_s, unix_s, "alarm", words, node))
+                    note(time_s, "alarm", RAISED[after].filled(name=name_of(node)), node)
             alarms.changes.clear()
         self.events = sorted(log, key=lambda entry: entry.time_s)
         self.complete = True
@@ -93,7 +106,9 @@ class History:
 class Player:
     """Shows a recording to ``sinks``, and does what their users ask (kind ``replay``).
 
-    ``smoothed`` returns the smoothed tracks once they are computed, None before.
+    ``smoothed`` returns the smoothed tracks once they are computed, None before. ``admit`` keeps a
+    device that a mission's page lets in or shuts out. Afterwards ``ended`` is whether somebody on
+    the page has ended it.
     """
 
     def __init__(
@@ -102,7 +117,10 @@ class Player:
         sinks: Sequence[Sink],
         log: Iterable[LogEntry] = (),
         smoothed: Callable[[], Tracks | None] | None = None,
+        admit: Callable[[dict[str, Any]], None] | None = None,
     ) -> None:
+        self.ended = False
+        self._admit = admit
         self.moments = moments
         self._sinks = sinks
         self.names = {n: i.name for n, i in moments.description.nodes.items() if i.name}
@@ -127,13 +145,13 @@ class Player:
         self._reader.join()
 
     def run(self, seconds: float | None = None) -> None:
-        """Play until ``seconds`` are over, or Ctrl-C."""
+        """Play until ``seconds`` are over, the page ends it, or Ctrl-C."""
         # A seek does not wait for the thread that reads the recording.
         sys.setswitchinterval(SWITCH_S)
         began_s = before_s = time.monotonic()
         shown_s = 0.0
         self.tell()
-        while seconds is None or before_s - began_s < seconds:
+        while not self.ended and (seconds is None or before_s - began_s < seconds):
             now_s = time.monotonic()
             if self.playing:
                 self.at_s = min(self.at_s + (now_s - before_s) * self.speed, self.moments.to_s)
@@ -148,7 +166,9 @@ class Player:
                     for entry in self.history.events:
                         sink.logged(entry)
                 self.tell()
-            tracks = self._smoothed() if self._smoothed else None
+            # Smoothing begins once the recording is read, which comes first.
+            wanted = self._smoothed if self.history.complete else None
+            tracks = wanted() if wanted else None
             if tracks is not None:
                 self._smoothed = None
                 for sink in self._sinks:
@@ -163,7 +183,9 @@ class Player:
 
     def tell(self) -> None:
         """Tell the pages where the recording is, and its events."""
-        ticks = [[e.time_s, e.kind, e.text] for e in self.history.events if e.kind in TICK_KINDS]
+        ticks = [
+            [e.time_s, e.kind, e.text, e.said] for e in self.history.events if e.kind in TICK_KINDS
+        ]
         message = {
             "type": "timeline", "from_s": self.moments.from_s, "to_s": self.moments.to_s,
             "playing": self.playing, "speed": self.speed, "ticks": ticks,
@@ -187,8 +209,16 @@ class Player:
 
     def _reply(self, request: Request) -> tuple[dict[str, Any], int]:
         body = request.body
+        if request.kind == "device" and self._admit is not None:
+            self._admit(body)
+            for sink in self._sinks:
+                sink.admitted(body)
+            return body, 200
+        if request.kind == "end":
+            self.ended = True
+            return {"done": True}, 200
         if request.kind != "replay":
-            return {"error": "this is a recording: it takes no more"}, 409
+            return refusal(RECORDED), 409
         if "at_s" in body:
             self.at_s = min(max(float(body["at_s"]), self.moments.from_s), self.moments.to_s)
         if "speed" in body:

@@ -13,12 +13,10 @@ import asyncio
 import contextlib
 import json
 import signal
-import socket
 import tempfile
 import time
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +56,7 @@ from relpos.view.bodies import (
 from relpos.view.devices import Device, Role
 from relpos.view.guard import FORBIDDEN, TokenMiddleware, role_of
 from relpos.view.plans import MAX_IMAGE_BYTES, PlanImages
+from relpos.view.web import ServerConfig
 
 STATIC = Path(__file__).parent / "static"
 PING_S = 2.0
@@ -485,16 +484,6 @@ async def _until_gone(socket: WebSocket) -> None:
 
 async def _refuse(_: Request, error: Exception) -> Response:
     return JSONResponse(refusal(error.args[0]), 400)
-
-
-@dataclass(frozen=True)
-class ServerConfig:
-    """What a serving process is started with."""
-
-    listener: socket.socket
-    """Listens already: browsers that come while it is restarted wait."""
-    channel: socket.socket
-    access: Access
 
 
 def run(config: ServerConfig) -> None:

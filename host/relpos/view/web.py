@@ -13,7 +13,8 @@ import socket
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from relpos.extras import missing_extra
@@ -45,12 +46,9 @@ class WebView(Sink):
     """
 
     def __init__(self, listener: socket.socket, access: Access, hello: Hello) -> None:
-        try:
-            import starlette  # noqa: F401
-            import uvicorn  # noqa: F401
-            import websockets  # noqa: F401
-        except ImportError as error:
-            raise missing_extra(error.name or "starlette", "view") from None
+        for library in ("starlette", "uvicorn", "websockets"):
+            if find_spec(library) is None:
+                raise missing_extra(library, "view")
         self.access = access
         self.hello = hello
         self.restarts = 0
@@ -169,16 +167,14 @@ class WebView(Sink):
     # -- the serving process ----------------------------------------------------------------------
 
     def _start(self) -> None:
-        from relpos.view import server
-
         if self._channel is not None:
             self._channel.close()
         ours, theirs = socket.socketpair()
         ours.setblocking(False)
         self._started_s = time.monotonic()
         self._process = multiprocessing.get_context("spawn").Process(
-            target=server.run,
-            args=(server.ServerConfig(self._door, theirs, self.access),),
+            target=_serve,
+            args=(ServerConfig(self._door, theirs, self.access),),
             name="relpos view",
             daemon=True,
         )
@@ -249,6 +245,23 @@ class WebView(Sink):
             if not data:
                 raise ConnectionResetError
             self._in += data
+
+
+@dataclass(frozen=True)
+class ServerConfig:
+    """What a serving process is started with."""
+
+    listener: socket.socket
+    """Listens already: browsers that come while it is restarted wait."""
+    channel: socket.socket
+    access: Access
+
+
+def _serve(config: ServerConfig) -> None:
+    """Body of the serving process, which alone needs the libraries."""
+    from relpos.view import server
+
+    server.run(config)
 
 
 def _names_message(names: dict[int, str]) -> str:
