@@ -33,6 +33,7 @@ class FusionInterrupted(KeyboardInterrupt):
 def words_of(error: Exception) -> str:
     """Return an error in words: of a file's, with its name."""
     if not isinstance(error, OSError):
-        return str(error)
+        # The text itself: a page may know it by its key.
+        return error.args[0] if error.args and isinstance(error.args[0], str) else str(error)
     where = f"{error.filename}: " if error.filename else ""
     return f"{where}{error.strerror or error}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from string import Formatter
 from typing import Any
 
@@ -35,9 +36,23 @@ class Said(str):
 
 def refusal(text: str) -> dict[str, Any]:
     """Return the answer to a request that is refused, for a page to translate."""
-    return {"error": str(text), "said": said_of(text)}
+    said = text if isinstance(text, Said) else Said("refused", "refused: {why}", why=text)
+    return {"error": str(text), "said": said_of(said)}
 
 
 def said_of(text: str) -> dict[str, Any] | None:
-    """Return the key and the values of a text for a page; None where it has none."""
-    return {"key": text.key, "values": text.values} if isinstance(text, Said) else None
+    """Return the key and the values of a text for a page; None where it has none.
+
+    A value that is such a text itself is translated, too.
+    """
+    if not isinstance(text, Said):
+        return None
+    return {"key": text.key, "values": {k: said_of(v) or v for k, v in text.values.items()}}
+
+
+def joined(texts: Iterable[Said]) -> Said:
+    """Return several texts as one."""
+    first, *rest = texts
+    for text in rest:
+        first = Said("also", "{one}; {other}", one=first, other=text)
+    return first

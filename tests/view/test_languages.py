@@ -121,6 +121,63 @@ def test_the_session_says_in_english_what_the_english_catalogue_says() -> None:
     assert said == {key: text for key, text in english.items() if key.startswith("said.")}
 
 
+def untranslated(path: Path) -> list[str]:
+    """Texts of a file that reach a page without a key: line and text."""
+    found = []
+
+    def look(node: ast.AST | None) -> None:
+        """Report what is written out in an expression, except within ``Said`` and its like."""
+        if node is None:
+            return
+        if isinstance(node, ast.Call):
+            name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+            if name in ("Said", "filled", "of_node", "joined", "words_of", "getattr"):
+                return
+        if isinstance(node, ast.Compare | ast.Subscript):
+            return
+        text = "".join(
+            part.value
+            for part in (node.values if isinstance(node, ast.JoinedStr) else [node])
+            if isinstance(part, ast.Constant) and isinstance(part.value, str)
+        )
+        if re.search(r"[a-z]{2}", text):
+            found.append(f"{path.name}:{node.lineno}: {text}")  # type: ignore[attr-defined]
+            return
+        for child in ast.iter_child_nodes(node):
+            look(child)
+
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            called, of = node.func.attr, ast.unparse(node.func.value)
+            if called == "append" and of.endswith("remarks"):
+                look(node.args[0])
+            elif called == "post" and of == "self" and len(node.args) == 3:
+                look(node.args[2])
+            elif called == "log" and of == "self" and path.parent.name == "live":
+                look(node.args[1])
+        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]).endswith("trouble"):
+            look(node.value)
+        elif isinstance(node, ast.FunctionDef) and node.name in ("trouble", "waits_for"):
+            for inner in ast.walk(node):
+                if isinstance(inner, ast.Return):
+                    look(inner.value)
+    return found
+
+
+def test_no_text_of_the_session_reaches_a_page_without_a_key() -> None:
+    sources = ROOT / "host" / "relpos"
+    rooms = [path for room in ("live", "link", "view") for path in (sources / room).rglob("*.py")]
+    recording = [sources / "recording" / f"{name}.py" for name in ("recorder", "viewer", "player")]
+    assert [text for path in (*rooms, *recording) for text in untranslated(path)] == []
+
+
+def test_a_text_without_a_key_would_be_found(tmp_path: Path) -> None:
+    path = tmp_path / "live" / "x.py"
+    path.parent.mkdir()
+    path.write_text('self._trouble = f"{file}: no room"\nself.post("x", 1, "it is late")\n')
+    assert [found.partition(": ")[2] for found in untranslated(path)] == [": no room", "it is late"]
+
+
 def test_a_text_of_the_session_is_a_string_with_a_key() -> None:
     text = Said("supply", "supply {volts:.2f} V", volts=4.3449)
     assert text == "supply 4.34 V"

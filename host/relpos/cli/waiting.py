@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from relpos.view.web import WebView
 
 DEMO = "demo"
+FAILED = Said("page-broken", "the mission's page has failed")
 SCHEMES = ("socket", "rfc2217")
 """Of pyserial's URLs; others (spy://) write files, which a page must not."""
 LOOK_S = 0.05
@@ -87,7 +88,7 @@ def choose(mission: Mission, options: live.Options, trouble: str, seconds: float
                         choice = _answer(request, page, mission, journal, trouble)
                     except Exception as error:
                         output.remark(f"request failed: {error!r}; the mission goes on")
-                        page.respond(request, refusal("the mission's page has failed"), 500)
+                        page.respond(request, refusal(FAILED), 500)
                         continue
                     if choice is not None:
                         return choice

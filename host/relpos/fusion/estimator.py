@@ -11,11 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from math import atan2, hypot, inf, pi, sqrt
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from relpos.errors import RelposError
 from relpos.fusion.models.motion import unseen_variance
 from relpos.measurements import Measurement
+from relpos.said import Said
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage of a long task, and how many of how many parts of it are done.
@@ -319,18 +320,33 @@ TOLD_S = 0.1
 """Time stamps that are off by less are nothing to tell: a walker makes 10 cm in it."""
 
 
-def time_offsets(estimate: Estimate) -> list[str]:
+def time_offsets(estimate: Estimate) -> list[Said]:
     """Return what the user should know of time stamps that are off, a sentence each."""
     told = []
     for p in estimate.parameters:
         if abs(p.value) < max(TOLD_S, 3.0 * p.sigma):
             continue
-        way = ("late", "ahead") if p.value > 0.0 else ("early", "behind")
-        if p.name == "range_lateness_s":
-            told.append(f"ranges are dated {abs(p.value):.1f} s {way[0]}")
-        elif p.name == "clock_offset_s":
-            told.append(f"the clock of node {p.node} is {abs(p.value):.1f} s {way[1]}")
+        words = _OFFSETS.get((p.name, p.value > 0.0))
+        if words is not None:
+            told.append(words.filled(seconds=abs(p.value), node=str(p.node)))
     return list(dict.fromkeys(told))
+
+
+_SOME: Mapping[str, Any] = {"seconds": 0.0, "node": ""}
+_OFFSETS = {
+    ("range_lateness_s", True): Said(
+        "ranges-late", "ranges are dated {seconds:.1f} s late", **_SOME
+    ),
+    ("range_lateness_s", False): Said(
+        "ranges-early", "ranges are dated {seconds:.1f} s early", **_SOME
+    ),
+    ("clock_offset_s", True): Said(
+        "clock-ahead", "the clock of node {node} is {seconds:.1f} s ahead", **_SOME
+    ),
+    ("clock_offset_s", False): Said(
+        "clock-behind", "the clock of node {node} is {seconds:.1f} s behind", **_SOME
+    ),
+}
 
 
 def unlocated(node: int, vertical: Vertical = AT_THE_START) -> NodeEstimate:

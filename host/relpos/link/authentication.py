@@ -17,6 +17,7 @@ from pathlib import Path
 
 from relpos.errors import DataError
 from relpos.protocol import messages as wire
+from relpos.said import Said
 
 EPOCH_UNIX_S = 1_704_067_200
 """2024-01-01 UTC: where the host's counter begins."""
@@ -32,9 +33,10 @@ MAX_JUMP = 1 << 24
 away may have missed. A node that is further ahead has to answer a challenge."""
 
 
-KEYLESS = (
+KEYLESS = Said(
+    "keyless",
     "no team key (--key-file): anybody with such a radio can forge reports and command the nodes; "
-    "`relpos node set PORT key --key-file FILE --new --cable` makes one"
+    "`relpos node set PORT key --key-file FILE --new --cable` makes one",
 )
 """Told wherever a team is heard under the key that every new node has."""
 
@@ -74,10 +76,20 @@ class HostCounter:
         if fault is not None or abs(ahead_s) < HOUR_S:
             return fault
         day = time.strftime("%Y-%m-%d", time.gmtime(self._clock()))
-        how = "ahead of" if ahead_s > 0.0 else "behind"
-        return (
-            f"the host that commanded it last had a clock {abs(ahead_s) / DAY_S:.1f} days {how} "
-            f"this computer's, which says {day}: one of them is wrong; commands go on all the same"
+        if ahead_s > 0.0:
+            return Said(
+                "host-ahead",
+                "the host that commanded it last had a clock {days:.1f} days ahead of this "
+                "computer's, which says {day}: one of them is wrong; commands go on all the same",
+                days=ahead_s / DAY_S,
+                day=day,
+            )
+        return Said(
+            "host-behind",
+            "the host that commanded it last had a clock {days:.1f} days behind this computer's, "
+            "which says {day}: one of them is wrong; commands go on all the same",
+            days=-ahead_s / DAY_S,
+            day=day,
         )
 
     def _now(self) -> int:
@@ -90,10 +102,17 @@ def clock_fault(now_s: float) -> str | None:
     if now_s >= EPOCH_UNIX_S:
         return None
     day = time.strftime("%Y-%m-%d", time.gmtime(max(now_s, 0.0)))
-    return (
-        f"this computer's clock says {day}, which cannot be: nodes refuse commands and beacons "
-        "that seem older than earlier ones, until they have told theirs; set the clock"
+    return Said(
+        "clock-wrong",
+        "this computer's clock says {day}, which cannot be: nodes refuse commands and beacons "
+        "that seem older than earlier ones, until they have told theirs; set the clock",
+        day=day,
     )
+
+
+def of_node(node: int, text: str) -> Said:
+    """Return a remark as one about a node."""
+    return Said("of-node", "node {node}: {text}", node=str(node), text=text)
 
 
 class Verdict(enum.Enum):

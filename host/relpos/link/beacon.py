@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from relpos.errors import DataError
 from relpos.protocol import messages as wire
+from relpos.said import Said
 
 if TYPE_CHECKING:
     from relpos.link.port import Link
@@ -128,8 +129,13 @@ class HostBeacons:
         if new:
             self._remarked |= new
             self._link.decoder.remarks.append(
-                f"node {', '.join(map(str, sorted(new)))}: no slot left, a team has {MAX_NODES}; "
-                "it disturbs the others: switch it off"
+                Said(
+                    "no-slot",
+                    "node {nodes}: no slot left, a team has {most}; it disturbs the others: "
+                    "switch it off",
+                    nodes=", ".join(map(str, sorted(new))),
+                    most=MAX_NODES,
+                )
             )
         return self._link.frame(wire.BEACON, wire.BROADCAST, values) + self._pings(now_s)
 

@@ -13,11 +13,12 @@ import serial
 
 from relpos.errors import DeviceError
 from relpos.link import xbee
-from relpos.link.authentication import HostCounter, clock_fault
+from relpos.link.authentication import HostCounter, clock_fault, of_node
 from relpos.link.decoder import Decoder
 from relpos.measurements import BOUNDS, Observation
 from relpos.protocol import messages as wire
 from relpos.protocol.schema import Message
+from relpos.said import Said
 
 BAUD = 38_400
 """0.2 % off on the ATmega at 16 MHz, where 115200 is 2.1 % off; the coordinator uses the same."""
@@ -117,7 +118,10 @@ class Link:
             counts = self.decoder.counts
             counts["frames_failed"] += 1
             if counts["frames_failed"] == 1:
-                self.decoder.remarks.append(f"a frame could not be decoded: {error!r}")
+                text = Said(
+                    "undecodable", "a frame could not be decoded: {error}", error=repr(error)
+                )
+                self.decoder.remarks.append(text)
             return []
 
     def _is_mark(self, frame: object) -> bool:
@@ -182,7 +186,7 @@ class Link:
         wrong = None if newest is None else counter.follow(newest)
         if wrong is not None and node not in self._faults_told:
             self._faults_told.add(node)
-            self.decoder.remarks.append(f"node {node}: {wrong}")
+            self.decoder.remarks.append(of_node(node, wrong))
         return counter.next()
 
     def _sealed(
@@ -259,7 +263,14 @@ def open_port(port: str, baud: int = BAUD) -> serial.Serial:
 
 def _cannot_open(port: str, error: Exception) -> DeviceError:
     reason = _reason(error) if "://" in port or Path(port).exists() else "no such device"
-    return DeviceError(f"{port}: cannot open the serial port: {reason}")
+    return DeviceError(
+        Said(
+            "port-closed",
+            "{port}: cannot open the serial port: {reason}",
+            port=port,
+            reason=reason,
+        )
+    )
 
 
 def incarnation(port: str) -> object:
@@ -289,7 +300,14 @@ def send(device: Line, data: bytes) -> None:
 
 def vanished(device: Line, error: Exception) -> DeviceError:
     """Return the error for an open port that fails."""
-    return DeviceError(f"{device.port}: the port vanished: {_reason(error)}")
+    return DeviceError(
+        Said(
+            "port-gone",
+            "{port}: the port vanished: {reason}",
+            port=str(device.port),
+            reason=_reason(error),
+        )
+    )
 
 
 def _reason(error: Exception) -> str:

@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING
 
 from relpos.calibration.steps import MAX_CHANGE, scaled_gain_permille
 from relpos.errors import DataError
+from relpos.link.authentication import of_node
 from relpos.protocol import messages as wire
+from relpos.said import Said
 
 if TYPE_CHECKING:
     from relpos.link.decoder import Acknowledged
@@ -81,8 +83,12 @@ class StepScaleSender:
             if change.attempts >= ATTEMPTS:
                 del self._changes[node]
                 self.remarks.append(
-                    f"node {node}: steps are counted {_percent(change.scale)}; it does not "
-                    "answer, so they stay so"
+                    Said(
+                        "steps-unanswered",
+                        "node {node}: steps are counted {off}; it does not answer, so they stay so",
+                        node=str(node),
+                        off=_percent(change.scale),
+                    )
                 )
                 continue
             change.attempts += 1
@@ -112,14 +118,26 @@ class StepScaleSender:
         if answer.result == wire.CommandResult.DONE and answer.value == change.value:
             self.sent += 1
             self.remarks.append(
-                f"node {answer.node}: steps were counted {_percent(change.scale)} and are right "
-                f"now, by the measured ranges (step gain {change.value / 1000:.3f}); nothing to do"
+                Said(
+                    "steps-right",
+                    "node {node}: steps were counted {off} and are right now, by the measured "
+                    "ranges (step gain {gain:.3f}); nothing to do",
+                    node=str(answer.node),
+                    off=_percent(change.scale),
+                    gain=change.value / 1000,
+                )
             )
         else:
             self.remarks.append(
-                f"node {answer.node}: steps are counted {_percent(change.scale)}; it refuses a "
-                f"step gain of {change.value / 1000:.3f} "
-                f"({answer.result.name.lower().replace('_', ' ')})"
+                Said(
+                    "steps-refused",
+                    "node {node}: steps are counted {off}; it refuses a step gain of {gain:.3f} "
+                    "({result})",
+                    node=str(answer.node),
+                    off=_percent(change.scale),
+                    gain=change.value / 1000,
+                    result=answer.result.name.lower().replace("_", " "),
+                )
             )
 
     def _set_gain(self, node: int, change: _GainChange, before_permille: int) -> None:
@@ -127,7 +145,7 @@ class StepScaleSender:
             gain = scaled_gain_permille(before_permille, change.scale)
         except DataError as error:
             del self._changes[node]
-            self.remarks.append(f"node {node}: {error}")
+            self.remarks.append(of_node(node, str(error)))
             return
         if gain == before_permille:
             del self._changes[node]
@@ -136,7 +154,9 @@ class StepScaleSender:
         change.token, change.next_s = self._link.next_token(), -math.inf
 
 
-def _percent(scale: float) -> str:
+def _percent(scale: float) -> Said:
     """Return how wrong a step's length is that has to be multiplied by ``scale``."""
     off = 100.0 * (1.0 / scale - 1.0)
-    return f"{abs(off):.0f} % too {'long' if off > 0 else 'short'}"
+    if off > 0.0:
+        return Said("too-long", "{percent:.0f} % too long", percent=off)
+    return Said("too-short", "{percent:.0f} % too short", percent=-off)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from relpos.said import Said
+from relpos.said import Said, joined
 
 STATES = ("", "standby", "entered", "withdrawing", "out")
 """Empty: nobody has said; alarms are raised as for somebody who is in."""
@@ -47,6 +47,13 @@ STATE_WORDS = {
     "out": Said("out", "{whom}state out", whom=""),
 }
 BOARD_EVENTS = ("board", "rollcall", "mayday", "evacuate", "marker", "plan", "floor")
+EDITS = {
+    "team": Said("edit-team", "team {text}", text=""),
+    "sector": Said("edit-sector", "sector {text}", text=""),
+    "task": Said("edit-task", "task {text}", text=""),
+    "state": Said("edit-state", "state {text}", text=""),
+    "air_bar": Said("edit-air", "air {text} bar", text=""),
+}
 SIGNS = {
     "entrance": Said("marked-entrance", "{whom}marker set: entrance", whom=""),
     "exit": Said("marked-exit", "{whom}marker set: exit", whom=""),
@@ -143,9 +150,9 @@ class Board:
         """The people who are not in."""
         return {node for node, place in self.people.items() if place.state in WAITING}
 
-    def apply(self, event: Mapping[str, Any]) -> str:
-        """Apply an event; return what to log, empty for what is not worth a line. BoardError."""
-        do: Callable[[Mapping[str, Any]], str] = getattr(self, f"_{event['kind']}")
+    def apply(self, event: Mapping[str, Any]) -> Said | None:
+        """Apply an event; return what to log, None for what is not worth a line. BoardError."""
+        do: Callable[[Mapping[str, Any]], Said | None] = getattr(self, f"_{event['kind']}")
         try:
             return do(event)
         except BoardError:
@@ -153,7 +160,7 @@ class Board:
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise BoardError(f"not a request that the board knows: {error!r}") from None
 
-    def _board(self, event: Mapping[str, Any]) -> str:
+    def _board(self, event: Mapping[str, Any]) -> Said | None:
         place = self.people.get(event["node"], Place())
         changes = {name: event[name] for name in (*TEXTS, "state", "air_bar") if name in event}
         for name in TEXTS:
@@ -183,9 +190,12 @@ class Board:
             place.entered_unix_s = None
         if list(changes) == ["state"] and changes["state"]:
             return STATE_WORDS[changes["state"]]
-        return ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in changes.items())
+        if not changes:
+            return None
+        edits = [EDITS[name].filled(text=str(value)) for name, value in changes.items()]
+        return Said("edited", "{whom}{changes}", whom="", changes=joined(edits))
 
-    def _rollcall(self, event: Mapping[str, Any]) -> str:
+    def _rollcall(self, event: Mapping[str, Any]) -> Said:
         call, action = self.roll_call, event.get("action")
         if action == "start":
             nodes = _nodes(event["nodes"])
@@ -228,7 +238,7 @@ class Board:
             confirmed=said.count("confirmed"), missing=said.count("missing"), called=len(said)
         )
 
-    def _marker(self, event: Mapping[str, Any]) -> str:
+    def _marker(self, event: Mapping[str, Any]) -> Said:
         name = event["id"]
         if not isinstance(name, str) or not 0 < len(name) <= MAX_TEXT:
             raise BoardError(f"id: not 1 to {MAX_TEXT} characters")
@@ -244,7 +254,7 @@ class Board:
         self.markers[name] = Marker(event["sign"], x_m, y_m, event["by"], event["unix_s"])
         return SIGNS[event["sign"]]
 
-    def _plan(self, event: Mapping[str, Any]) -> str:
+    def _plan(self, event: Mapping[str, Any]) -> Said | None:
         action = event.get("action")
         if action == "set" and re.fullmatch(IMAGE, event["image"], re.ASCII):
             self.plan = Plan(event["image"])
@@ -258,9 +268,9 @@ class Board:
         if action != "align" or not isinstance(points, list) or len(points) > 3:
             raise BoardError("action: set, align (with two or three points) or remove")
         self.plan.points = [_numbers(point, 4) for point in points]
-        return Said("aligned", "{whom}the plan is aligned", whom="") if len(points) > 1 else ""
+        return Said("aligned", "{whom}the plan is aligned", whom="") if len(points) > 1 else None
 
-    def _floor(self, event: Mapping[str, Any]) -> str:
+    def _floor(self, event: Mapping[str, Any]) -> Said:
         floor, name = event.get("floor"), event.get("name")
         if type(floor) is not int or abs(floor) > MOST_FLOORS:
             raise BoardError(f"floor: not a number from -{MOST_FLOORS} to {MOST_FLOORS}")
@@ -275,7 +285,7 @@ class Board:
             floor=str(floor)
         )
 
-    def _mayday(self, event: Mapping[str, Any]) -> str:
+    def _mayday(self, event: Mapping[str, Any]) -> Said:
         if event.get("on"):
             self.mayday[event["node"]] = {"by": event["by"], "unix_s": event["unix_s"]}
             return Said("mayday-of", "{whom}MAYDAY", whom="")
@@ -283,7 +293,7 @@ class Board:
             raise BoardError(Said("not-mayday", "no MAYDAY of that person"))
         return Said("mayday-over", "{whom}MAYDAY is over", whom="")
 
-    def _evacuate(self, event: Mapping[str, Any]) -> str:
+    def _evacuate(self, event: Mapping[str, Any]) -> Said | None:
         order, action = self.evacuation, event.get("action")
         if action == "order":
             nodes = _nodes(event["nodes"])
@@ -302,7 +312,7 @@ class Board:
             raise BoardError(Said("not-called", "that person is not called out"))
         if action == "delivered":
             order.delivered.setdefault(event["node"], event["unix_s"])
-            return ""
+            return None
         if action != "acknowledged":
             raise BoardError("action: order, delivered, acknowledged or end")
         order.acknowledged[event["node"]] = {"by": event["by"], "unix_s": event["unix_s"]}

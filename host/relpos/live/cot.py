@@ -26,6 +26,7 @@ from relpos.geodesy import MapFrame, Pin, place
 from relpos.live.cot_events import Callsigns, Moved, emergency, last_known, member, serialized
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert, Person, TeamView
+from relpos.said import Said
 
 EVERY_S = 1.0
 """Each member is sent at most this often."""
@@ -216,7 +217,11 @@ class PinnedFrame:
             for k, pin in enumerate(self._pins)
             if pin.node is not None and k not in self._pinned_xy
         ]
-        return f"no map yet: the pinned node {', '.join(waiting)} is not located"
+        return Said(
+            "no-map",
+            "no map yet: the pinned node {nodes} is not located",
+            nodes=", ".join(waiting),
+        )
 
     def _place(self) -> None:
         pins = [
@@ -285,7 +290,7 @@ class CotSender(Sink):
     def trouble(self) -> str | None:
         """Return why nothing is sent; None when all is well."""
         problem = self._trouble or self._map.waits_for()
-        return f"Cursor-on-Target: {problem}" if problem else None
+        return Said("cot", "Cursor-on-Target: {problem}", problem=problem) if problem else None
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -301,7 +306,9 @@ class CotSender(Sink):
         try:
             asyncio.run(self._work())
         except Exception as error:  # the session goes on and shows the trouble
-            self._trouble = f"{self._shown}: ended: {_reason(error)}"
+            self._trouble = Said(
+                "cot-ended", "{url}: ended: {reason}", url=self._shown, reason=_reason(error)
+            )
 
     async def _work(self) -> None:
         wait_s = RETRY_FIRST_S
@@ -309,11 +316,14 @@ class CotSender(Sink):
             began_s = time.monotonic()
             try:
                 await self._connected()
-            except (OSError, SyntaxError, ValueError, asyncio.IncompleteReadError) as error:
-                self._trouble = f"{self._shown}: {_reason(error)}; trying again"
             except Exception as error:
                 # pytak's own exceptions have no common base.
-                self._trouble = f"{self._shown}: {_reason(error)}; trying again"
+                self._trouble = Said(
+                    "cot-again",
+                    "{url}: {reason}; trying again",
+                    url=self._shown,
+                    reason=_reason(error),
+                )
             if time.monotonic() - began_s > RETRY_LAST_S:
                 wait_s = RETRY_FIRST_S
             until_s = time.monotonic() + wait_s

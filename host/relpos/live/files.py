@@ -14,6 +14,7 @@ from relpos.measurements import Observation, Step
 from relpos.runs import Description, EstimateFiles, NodeInfo, RunFiles
 from relpos.runs.appending import AppendedTable
 from relpos.runs.log import LOG_COLUMNS, LOG_FILE
+from relpos.said import Said
 
 
 class FileSink(Sink):
@@ -75,11 +76,24 @@ class FileSink(Sink):
         for table in tables:
             if table.error is not None:
                 why = table.error.strerror or str(table.error)
-                lost = f"; {table.lost_rows} rows are lost" * bool(table.lost_rows)
-                return f"{table.path}: {why}: its rows wait in memory{lost}"
+                if not table.lost_rows:
+                    return Said(
+                        "rows-wait",
+                        "{file}: {why}: its rows wait in memory",
+                        file=str(table.path),
+                        why=why,
+                    )
+                return Said(
+                    "rows-lost",
+                    "{file}: {why}: its rows wait in memory; {count} rows are lost",
+                    file=str(table.path),
+                    why=why,
+                    count=table.lost_rows,
+                )
         if self._undescribed is not None:
             why = self._undescribed.strerror or str(self._undescribed)
-            return f"{self._undescribed.filename}: {why}: names wait in memory"
+            file = str(self._undescribed.filename)
+            return Said("names-wait", "{file}: {why}: names wait in memory", file=file, why=why)
         return None
 
     def close(self) -> None:

@@ -13,13 +13,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from relpos.errors import DataError, DeviceError
+from relpos.errors import DataError, DeviceError, words_of
 from relpos.link import port as serial_port
 from relpos.link.beacon import HostBeacons
 from relpos.link.port import READ_BYTES, Link
 from relpos.link.step_scale import StepScaleSender
 from relpos.live.clock import SessionClock
 from relpos.measurements import Event, Heading, Height, Motion, Observation, Range, Status, Step
+from relpos.said import Said
 
 if TYPE_CHECKING:
     import serial
@@ -239,7 +240,7 @@ class PortInput:
     def _lose(self, error: DeviceError) -> None:
         if not self._reopen:
             raise error
-        self._trouble = str(error)
+        self._trouble = words_of(error)
         if self._device is not None:
             self._device.close()
             self._device = None
@@ -252,13 +253,17 @@ class PortInput:
             terminal = serial_port.incarnation(self.name)
             if terminal is not None and terminal == self._terminal:
                 raise DeviceError(
-                    f"{self.name}: the port vanished: a pseudo-terminal does not come back; start "
-                    "anew at the one that relpos emulate prints now"
+                    Said(
+                        "terminal-gone",
+                        "{port}: the port vanished: a pseudo-terminal does not come back; start "
+                        "anew at the one that relpos emulate prints now",
+                        port=self.name,
+                    )
                 )
             self._device = serial_port.open_port(self.name)
             self._terminal = terminal
         except DeviceError as error:
-            self._trouble = str(error)
+            self._trouble = words_of(error)
             self._try_at_s = time.monotonic() + REOPEN_S
             return False
         self._waits_on = _descriptor(self._device)

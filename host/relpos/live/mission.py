@@ -31,6 +31,7 @@ from relpos.live.team_view import LogEntry, TeamView, to_json
 from relpos.live.tracks import Tracks
 from relpos.measurements import BOUNDS, Prior
 from relpos.runs.table import read_text, within_bounds
+from relpos.said import Said
 
 ABOUT, JOURNAL, CHECKPOINT, TRACKS, SECRET = (
     "mission.json",
@@ -280,7 +281,12 @@ class Journal:
             try:
                 self._write("".join(lines))
             except OSError as error:
-                self.trouble = f"{self._path}: {error.strerror or error}: nothing is confirmed"
+                self.trouble = Said(
+                    "journal",
+                    "{file}: {reason}: nothing is confirmed",
+                    file=str(self._path),
+                    reason=error.strerror or str(error),
+                )
                 if over:
                     return
                 time.sleep(SYNC_S)
@@ -354,7 +360,12 @@ class MissionFiles(Sink):
             _replace(self._path / CHECKPOINT, json.dumps(found).encode(), sync=False)
             self._trouble = None
         except OSError as error:
-            self._trouble = f"{self._path}: {error.strerror or error}: checkpoints are not written"
+            self._trouble = Said(
+                "checkpoints",
+                "{file}: {reason}: checkpoints are not written",
+                file=str(self._path),
+                reason=error.strerror or str(error),
+            )
 
     def logged(self, entry: LogEntry) -> None:
         """Append a line to the journal."""

@@ -37,7 +37,7 @@ from relpos.live.requests import (
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert, Level, LogEntry
 from relpos.measurements import Event, Heading, Observation
-from relpos.said import Said, refusal, said_of
+from relpos.said import Said, joined, refusal, said_of
 
 VIEW_S = 0.05
 """At most twenty views a second: smooth for a walking person, and a twentieth of a second old."""
@@ -48,6 +48,7 @@ BEHIND_S = 5.0
 """Delay of the fusion from which a notice says so; it always waits two or three seconds."""
 ASLEEP_S = 5.0
 """The receive thread runs twenty times a second; a longer gap was sleep, or another program."""
+FAILED = Said("session-failed", "the session has failed")
 EVENTS = ("acknowledge", "shelve", "name", "device")
 """Requests that change what a mission keeps."""
 LOGGED = ("acknowledge", "shelve", "name")
@@ -242,7 +243,12 @@ class LiveSession:
             yield
         except Exception as error:
             self._failed[f"{what}s_failed"] += 1
-            text = f"{what} failed: {error!r}; the session goes on"
+            text = Said(
+                "failed",
+                "{what} failed: {error}; the session goes on",
+                what=what,
+                error=repr(error),
+            )
             if self._failed[f"{what}s_failed"] == 1:
                 self._remark(text)
             self.post(what, Level.ALARM, text)
@@ -262,7 +268,13 @@ class LiveSession:
                 self._failed_sinks.append(sink)
                 self.post(f"sink-{id(sink)}", Level.ALARM, None)
                 name = type(sink).__name__
-                self.post(f"failed-{name}", Level.ALARM, f"{name} has failed and ended: {error!r}")
+                text = Said(
+                    "sink-failed",
+                    "{name} has failed and ended: {error}",
+                    name=name,
+                    error=repr(error),
+                )
+                self.post(f"failed-{name}", Level.ALARM, text)
 
     def _update(self) -> None:
         """Do everything that is due at any time, whether anything was received or not."""
@@ -288,8 +300,8 @@ class LiveSession:
                 self._feed(lambda sink, e=fused.estimate: sink.estimated(e))  # type: ignore[misc]
             with self._surviving("update"):
                 self._source.learn(fused.estimate)
-            text = "; ".join(time_offsets(fused.estimate))
-            self.post("time-offsets", Level.WARNING, text or None)
+            offsets = time_offsets(fused.estimate)
+            self.post("time-offsets", Level.WARNING, joined(offsets) if offsets else None)
             self._changed = True
 
     # -- alarms and notices -----------------------------------------------------------------------
@@ -409,7 +421,7 @@ class LiveSession:
         for source in self._request_sources:
             with self._surviving("request"):
                 for request in source.requests():
-                    reply: tuple[dict[str, object], int] = {"error": "the session has failed"}, 500
+                    reply: tuple[dict[str, object], int] = refusal(FAILED), 500
                     with self._surviving("request"):
                         reply = self._reply(request)
                     number = 0 if self._journal is None else self._journal.newest
@@ -443,7 +455,7 @@ class LiveSession:
         if request.kind in ("sources", "start"):
             return refusal(Said("running", "a session runs already: end it first")), 409
         if request.kind not in ("presses", "headings"):
-            return {"error": f"this session takes no request of the kind {request.kind}"}, 409
+            return refusal(f"this session takes no request of the kind {request.kind}"), 409
         if not self._source.is_now:
             return refusal(RECORDED), 409
         handle = self._handler.presses if request.kind == "presses" else self._handler.headings
@@ -532,8 +544,7 @@ class LiveSession:
                 self._feed(lambda sink: sink.boarded(self._board.to_message()))
                 if words and self._journal_open:
                     whom = f"{self._composer.name(node)}: " if node else ""
-                    text = words.filled(whom=whom) if isinstance(words, Said) else whom + words
-                    self.log(kind, text, node or None, event.get("by", ""))
+                    self.log(kind, words.filled(whom=whom), node or None, event.get("by", ""))
             case "presses":
                 self._handler.accept(event["ids"])
             case "device":

@@ -23,6 +23,7 @@ from relpos.recording.encoder import Encoder, Item, ItemSink, Line, names_of
 from relpos.recording.output import NO_ROOM, Disk, Output
 from relpos.recording.schemas import all_topics
 from relpos.runs.description import NodeInfo, description_text
+from relpos.said import Said
 
 if TYPE_CHECKING:
     pass
@@ -149,7 +150,12 @@ class Recorder(ItemSink):
                 done = self._work(closing=give_up_s is not None)
             except Exception as error:
                 # A fault of ours must neither end the session nor go unseen.
-                self._trouble = f"{self.path}: recording has failed: {error!r}"
+                self._trouble = Said(
+                    "recording-failed",
+                    "{file}: recording has failed: {error}",
+                    file=str(self.path),
+                    error=repr(error),
+                )
                 break
             if give_up_s is not None and (done or time.monotonic() > give_up_s):
                 break
@@ -162,14 +168,19 @@ class Recorder(ItemSink):
             left = len(self._queue)
             self._bounds = Bounds(0, 0)
         if left or self._output.waiting:
-            self._trouble = (
-                f"{self._trouble or self.path}; the end of the session is not recorded: "
-                f"{left} reads and estimates, and what came in the moment before"
+            self._trouble = Said(
+                "recording-end",
+                "{trouble}; the end of the session is not recorded: {count} reads and estimates, "
+                "and what came in the moment before",
+                trouble=self._trouble or str(self.path),
+                count=left,
             )
         elif not closed and self._trouble is None:
-            self._trouble = (
-                f"{self.path}: no room for the summary that viewers seek by, or the disk did not "
-                "confirm it; everything else is in there, and `relpos convert` makes it whole"
+            self._trouble = Said(
+                "recording-summary",
+                "{file}: no room for the summary that viewers seek by, or the disk did not "
+                "confirm it; everything else is in there, and `relpos convert` makes it whole",
+                file=str(self.path),
             )
 
     def _work(self, *, closing: bool) -> bool:
@@ -214,24 +225,32 @@ class Recorder(ItemSink):
             self._refused_since_s = None
             self.log("info", f"the disk takes the recording again after {waited_s:.0f} s")
         late_s = self._output.late_s()
-        self._trouble = (
-            f"the disk has not confirmed the recording {self.path} for {late_s:.0f} s: a power "
-            "failure now would lose as much"
-            if late_s > LATE_S
-            else None
+        late = Said(
+            "disk-late",
+            "the disk has not confirmed the recording {file} for {seconds:.0f} s: a power failure "
+            "now would lose as much",
+            file=str(self.path),
+            seconds=late_s,
         )
+        self._trouble = late if late_s > LATE_S else None
         return True
 
     def _report(self, error: OSError, since_s: float) -> None:
-        reason = "disk full" if error.errno in NO_ROOM else error.strerror or str(error)
+        reason = error.strerror or str(error)
         inputs, others = self._lost
-        lost = (
-            f"{inputs} reads of the port and {others} estimates are lost"
-            if inputs or others
-            else "nothing is lost yet"
+        lost = Said(
+            "recording-lost",
+            "{inputs} reads of the port and {others} estimates are lost",
+            inputs=inputs,
+            others=others,
         )
-        self._trouble = (
-            f"{reason}: the recording {self.path} waits for room since {since_s:.0f} s; {lost}"
+        self._trouble = Said(
+            "recording-waits",
+            "{reason}: the recording {file} waits for room since {seconds:.0f} s; {lost}",
+            reason=Said("disk-full", "disk full") if error.errno in NO_ROOM else reason,
+            file=str(self.path),
+            seconds=since_s,
+            lost=lost if inputs or others else Said("nothing-lost", "nothing is lost yet"),
         )
 
     def _encode_next(self) -> None:

@@ -11,6 +11,7 @@ from relpos.errors import DataError, DeviceError
 from relpos.recording.about import About
 from relpos.recording.encoder import Encoder, Item, ItemSink, names_of
 from relpos.recording.schemas import all_topics
+from relpos.said import Said
 
 if TYPE_CHECKING:
     pass
@@ -79,7 +80,9 @@ class FoxgloveServer(ItemSink):
                     self._send(*self._queue.popleft())
             except Exception as error:
                 # A fault of ours must neither end the session nor go unseen.
-                self._trouble = f"Foxglove is not served any more: {error!r}"
+                self._trouble = Said(
+                    "foxglove", "Foxglove is not served any more: {error}", error=repr(error)
+                )
                 return
 
     def _send(self, at_s: float, item: Item) -> None:

@@ -20,9 +20,11 @@ from typing import Any, TextIO
 from relpos.live.requests import Request
 from relpos.live.sinks import Sink
 from relpos.live.team_view import TeamView
+from relpos.said import Said
 from relpos.view.keys import has_keys, raw_keys
 from relpos.view.text_page import RenderOptions, alarming, page, unattended
 
+TROUBLE = Said("terminal", "terminal view: {reason}", reason="")
 DRAW_S = 0.5
 """Two pages a second, a few hundred bytes each."""
 PLAIN_S = 5.0
@@ -109,9 +111,9 @@ class TerminalView(Sink):
                 if self._view is not None and not self._stop.is_set():
                     self._draw(self._view)
         except OSError as error:
-            self._trouble = f"terminal view: {error.strerror or error}"
+            self._trouble = TROUBLE.filled(reason=error.strerror or str(error))
         except Exception as error:  # the session goes on and shows the trouble
-            self._trouble = f"terminal view: failed: {error!r}"
+            self._trouble = TROUBLE.filled(reason=repr(error))
         finally:
             if self._screen:
                 with suppress(OSError, ValueError):

@@ -62,6 +62,8 @@ export function t(key, values = {}) {
   if (typeof message === "object") message = message[format(Intl.PluralRules, {}).select(values.count)] ?? message.other;
   return message.replace(/\{(\w+)\}/g, (_, name) => {
     const value = values[name] ?? "";
+    // A text within a text.
+    if (typeof value === "object") return said(value, "");
     return typeof value === "number" ? format(Intl.NumberFormat, { maximumFractionDigits: 2, useGrouping: false }).format(value) : String(value);
   });
 }
