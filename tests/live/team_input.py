@@ -70,6 +70,12 @@ class TeamInput:
     def learn(self, estimate) -> None:
         pass
 
+    def call_out(self, nodes) -> None:
+        self.called = sorted(nodes)
+
+    def called_out(self) -> list[int]:
+        return []
+
     def remarks(self) -> list[str]:
         new, self.link.decoder.remarks = self.link.decoder.remarks, []
         return new

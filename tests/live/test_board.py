@@ -54,11 +54,14 @@ def test_a_roll_call_is_complete_once_everybody_was_confirmed_by_somebody():
 def test_an_evacuation_knows_for_each_whether_it_was_shown_and_understood():
     board = Board()
     board.apply(event("evacuate", action="order", nodes=[1, 2]))
+    board.apply(event("evacuate", 1001.0, action="lit", node=2))
     board.apply(event("evacuate", 1001.0, action="delivered", node=1))
+    assert board.called_out == [1, 2]
     board.apply(event("evacuate", 1005.0, by="Ben", action="acknowledged", node=1))
     order = board.evacuation
     assert (list(order.delivered), order.acknowledged[1]["by"]) == ([1], "Ben")
     assert 2 not in order.acknowledged
+    assert (order.lit, board.called_out) == ({2: 1001.0}, [2])
     board.apply(event("evacuate", action="end"))
     assert board.evacuation is None
 

@@ -150,6 +150,16 @@ def test_acknowledging_silences_this_alert_and_no_other(watching):
     assert not watching.alarms.condition(1).acknowledged
 
 
+def test_a_mayday_is_heard_although_the_person_was_shelved_and_is_not_shelved_again(watching):
+    watching.report(still, 22)
+    assert watching.alarms.shelve(1, 600.0)
+    watching.alarms.mayday = {1}
+    watching.report(still, 1)
+    condition = watching.alarms.condition(1)
+    assert (condition.alert, condition.shelved_s) == (Alert.MAYDAY, 0.0)
+    assert not watching.alarms.shelve(1, 600.0)
+
+
 def test_a_motionless_alarm_stays_when_the_radio_falls_silent(watching):
     watching.report(still, 35)
     watching.report(None, 30)

@@ -123,6 +123,12 @@ class SoakInput:
     def learn(self, estimate):
         pass
 
+    def call_out(self, nodes):
+        pass
+
+    def called_out(self):
+        return []
+
     def remarks(self):
         new, self.link.decoder.remarks = self.link.decoder.remarks, []
         return new

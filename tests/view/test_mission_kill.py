@@ -92,7 +92,8 @@ def field(tmp_path: Path) -> Iterator[Field]:
 def wearer(context: Any, field: Field) -> Page:
     """A wearer's phone with a token of its own."""
     invited = field.run("mission", str(field.folder), "--invite", "acknowledge")
-    phone: Page = context.browser.new_page(viewport={"width": 390, "height": 844})
+    own = context.browser.new_context(viewport={"width": 390, "height": 844})
+    phone: Page = own.new_page()
     phone.set_default_timeout(60_000)
     address = re.sub("//[^:/]+:", "//127.0.0.1:", output_of(invited, "http://\\S+"))
     phone.goto(address)
@@ -102,15 +103,17 @@ def wearer(context: Any, field: Field) -> Page:
     return phone
 
 
-@pytest.mark.soak
-@pytest.mark.parametrize("killed", ["session", "server", "browser", "all"])
-def test_what_was_confirmed_is_there_again_five_seconds_after_a_kill(
-    browser: Any, field: Field, killed: str
-) -> None:
-    context = browser.new_context()
-    page: Page = context.new_page()
-    page.goto(field.address)
-    expect(page.locator("#people li")).to_have_count(3)
+def is_live(page: Page) -> bool:
+    """Whether a page has found its session again."""
+    state = page.locator("#connection").get_attribute("data-state")
+    return page.locator("#link").is_hidden() and "live" in str(state)
+
+
+def begin_everything(page: Page, phone: Page, folder: Path) -> Any:
+    """Name, press, evacuation, MAYDAY with its roll call, marker; a plan of one aligned point.
+
+    The phone presses a landmark without connection. Returns what posts to the session.
+    """
 
     def post(path: str, body: dict[str, Any]) -> int:
         asked = """([path, body]) => fetch(path, { method: "POST", body: JSON.stringify(body),
@@ -118,76 +121,20 @@ def test_what_was_confirmed_is_there_again_five_seconds_after_a_kill(
         return int(page.evaluate(asked, [path, body]))
 
     assert post("/api/name", {"node": 2, "name": "Ben"}) == 200
-    assert post("/api/shelve", {"node": 3, "seconds": 600, "by": "Anna"}) == 200
-    press = {"id": "p1", "landmark": "7", "unix_ms": time.time() * 1000}
-    clocks = {"node": 2, "clock_offset_ms": 0, "sent_unix_ms": time.time() * 1000}
-    assert post("/api/presses", {**clocks, "presses": [press]}) == 200
-    assert post("/api/rollcall", {"action": "start", "within_s": 600, "by": "Anna"}) == 200
+    assert post("/api/shelve", {"node": 1, "seconds": 600, "by": "Anna"}) == 200
+    assert post("/api/presses", {**clocks(), "presses": [PRESS]}) == 200
+    assert post("/api/evacuate", {"action": "order", "nodes": [2], "by": "Anna"}) == 200
+    # An alarm that nobody has acknowledged starts the roll call.
+    assert post("/api/mayday", {"node": 3, "on": True, "by": "Anna"}) == 200
     answer = {"action": "answer", "node": 1, "answer": "confirmed", "by": "Anna"}
     assert post("/api/rollcall", answer) == 200
-    assert post("/api/evacuate", {"action": "order", "nodes": [2], "by": "Anna"}) == 200
-    phone = wearer(context, field)
-    time.sleep(4.0)
-    expect(page.locator("#evacuation-line")).to_contain_text("0 of 1")
-    # An alarm that nobody has acknowledged; its emergency roll call replaces the other one.
-    if killed in ("session", "browser"):
-        assert post("/api/mayday", {"node": 3, "on": True, "by": "Anna"}) == 200
-        expect(page.locator("#alarms")).to_contain_text("MAYDAY")
-    # A phone without connection presses a landmark, and the kill comes meanwhile.
-    phone.context.set_offline(True)
-    phone.locator("#landmark").fill("9")
-    phone.locator("#press").click()
-    before = page.locator("#map-words").inner_text()
-    assert "3 of 3 people located" in before
-    page.evaluate("window.same_page = true")
-    field.kill(killed)
-    # The session is back once it has printed its address.
-    back_s = time.monotonic()
-    phone.context.set_offline(False)
-    if killed in ("all", "browser"):
-        page.close()
-        page = context.new_page()
-        page.goto(field.address.partition("?")[0])
-    else:
-        wait_for(lambda: page.locator("#link").is_hidden() and "live" in str(
-            page.locator("#connection").get_attribute("data-state")))  # fmt: skip
-        assert page.evaluate("window.same_page")
-    expect(page.locator("#people li[data-node='2'] .label")).to_have_text(re.compile("Ben"))
-    took_s = time.monotonic() - back_s
-    print(f"{killed}: back after {took_s:.1f} s")
-    assert took_s < BACK_S
-    expect(page.locator("#evacuation-line")).to_contain_text("0 of 1")
-    if killed in ("session", "browser"):
-        expect(page.locator("#alarms .alarm").first).to_contain_text("MAYDAY")
-        expect(page.locator("#roll-line")).to_contain_text("Emergency roll call")
-    else:
-        expect(page.locator("#roll-line")).to_contain_text("1 of 3 confirmed")
-    expect(phone.locator("#queue")).to_contain_text("1 press received by the laptop")
-    page.locator("#show-log").click()
-    for words in ("node 2 is Ben", "alarms of", "is at landmark 7", "is at landmark 9"):
-        expect(page.locator("#log")).to_contain_text(words.replace("node 2", "Ben"))
+    expect(page.locator("#alarms")).to_contain_text("MAYDAY")
+    page.locator("#show-board").click()
+    expect(page.locator("#board-rows tr[data-node='2']")).to_contain_text("its LED is on")
     page.keyboard.press("Escape")
-    wait_for(lambda: "3 of 3 people located" in page.locator("#map-words").inner_text())
-    # Sent again by a phone that had no answer: it counts once.
-    assert post("/api/presses", {**clocks, "presses": [press]}) == 200
-    presses = [e for e in Mission.open(field.folder).events() if e["kind"] == "presses"]
-    assert sorted(len(e["ids"]) for e in presses) == [1, 1]
-    assert ["p1"] in [e["ids"] for e in presses]
-    context.close()
-
-
-@pytest.mark.soak
-@pytest.mark.parametrize("killed", ["session", "server"])
-def test_a_plan_that_is_being_aligned_is_aligned_after_a_kill_with_plan_and_markers_kept(
-    browser: Any, field: Field, tmp_path: Path, killed: str
-) -> None:
-    context = browser.new_context(viewport={"width": 1366, "height": 768})
-    page: Page = context.new_page()
-    page.goto(field.address)
-    expect(page.locator("#people li")).to_have_count(3)
     page.locator("#layers summary").click()
-    (tmp_path / "plan.png").write_bytes(png(600, 400))
-    page.locator("#plan-file").set_input_files(tmp_path / "plan.png")
+    (folder / "plan.png").write_bytes(png(600, 400))
+    page.locator("#plan-file").set_input_files(folder / "plan.png")
     expect(page.locator("#plan-align")).to_be_enabled()
     page.locator("#marker-place").click()
     page.keyboard.press("Enter")
@@ -199,23 +146,127 @@ def test_a_plan_that_is_being_aligned_is_aligned_after_a_kill_with_plan_and_mark
     expect(status).to_contain_text("is on the map")
     click(page, 400, 300)
     expect(status).to_contain_text("2")
+    phone.context.set_offline(True)
+    phone.locator("#landmark").fill("9")
+    phone.locator("#press").click()
+    assert "3 of 3 people located" in page.locator("#map-words").inner_text()
+    return post
+
+
+PRESS = {"id": "p1", "landmark": "7", "unix_ms": time.time() * 1000}
+
+
+def clocks() -> dict[str, Any]:
+    """Of a phone whose clock is right."""
+    return {"node": 2, "clock_offset_ms": 0, "sent_unix_ms": time.time() * 1000}
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("killed", ["session", "server", "browser", "all"])
+def test_what_was_confirmed_is_there_again_five_seconds_after_a_kill(
+    browser: Any, field: Field, tmp_path: Path, killed: str
+) -> None:
+    context = browser.new_context(viewport={"width": 1366, "height": 768})
+    page: Page = context.new_page()
+    page.goto(field.address)
+    expect(page.locator("#people li")).to_have_count(3)
+    phone = wearer(context, field)
+    wait_for(lambda: "3 of 3 people located" in page.locator("#map-words").inner_text())
+    begin_everything(page, phone, tmp_path)
+    page.evaluate("window.same_page = true")
     field.kill(killed)
+    # The session is back once it has printed its address.
     back_s = time.monotonic()
-    wait_for(lambda: page.locator("#link").is_hidden() and "live" in str(
-        page.locator("#connection").get_attribute("data-state")))  # fmt: skip
-    print(f"{killed}: back after {time.monotonic() - back_s:.1f} s")
-    assert time.monotonic() - back_s < BACK_S
-    # The points that were clicked so far are still there.
+    phone.context.set_offline(False)
+    closed = killed in ("all", "browser")
+    if closed:
+        page.close()
+        page = context.new_page()
+        page.goto(field.address.partition("?")[0])
+        # The phone's page, too: it keeps what it has not sent.
+        others = phone.context
+        phone.close()
+        phone = others.new_page()
+        phone.goto(field.address.partition("?")[0] + "phone")
+    else:
+        wait_for(lambda: is_live(page))
+        assert page.evaluate("window.same_page")
+    expect(page.locator("#people li[data-node='2'] .label")).to_have_text(re.compile("Ben"))
+    took_s = time.monotonic() - back_s
+    print(f"{killed}: back after {took_s:.1f} s")
+    assert took_s < BACK_S
+    expect(page.locator("#evacuation-line")).to_contain_text("0 of 1")
+    expect(page.locator("#alarms .alarm").first).to_contain_text("MAYDAY")
+    expect(page.locator("#roll-line")).to_contain_text("Emergency roll call")
+    expect(page.locator("#roll-line")).to_contain_text("1 of 3 confirmed")
+    expect(phone.locator("#queue")).to_contain_text(re.compile("received by the laptop|No press"))
+    status = page.locator("#ground-status")
+    if closed:
+        # The plan was confirmed, its first point was not: it is aligned anew.
+        page.locator("#layers summary").click()
+        page.locator("#plan-align").click()
+        click(page, 400, 300)
+        expect(status).to_contain_text("is on the map")
+        click(page, 400, 300)
     expect(status).to_contain_text("2")
     click(page, 700, 500)
     expect(status).to_contain_text("is on the map")
     click(page, 700, 500)
-    plans = [e for e in Mission.open(field.folder).events() if e["kind"] == "plan"]
     wait_for(lambda: any("points" in e for e in Mission.open(field.folder).events()))
-    assert [e["action"] for e in plans][:1] == ["set"]
     expect(page.locator("#markers li")).to_have_count(1)
-    other: Page = context.new_page()
-    other.goto(field.address.partition("?")[0])
-    expect(other.locator("#plan-remove")).to_be_enabled()
-    expect(other.locator("#markers li")).to_have_count(1)
+    page.locator("#show-log").click()
+    for words in ("Ben is Ben", "alarms of", "is at landmark 7", "is at landmark 9"):
+        expect(page.locator("#log")).to_contain_text(words)
+    page.keyboard.press("Escape")
+    wait_for(lambda: "3 of 3 people located" in page.locator("#map-words").inner_text())
+    api = field.address.partition("?")[0] + "api/"
+    (shelved,) = [p for p in page.request.get(api + "picture").json()["people"] if p["node"] == 1]
+    assert 400.0 < shelved["shelved_s"] < 600.0
+    # Sent again by a phone that had no answer: it counts once.
+    sent = page.request.post(api + "presses", data={**clocks(), "presses": [PRESS]})
+    assert sent.status == 200
+    presses = [e for e in Mission.open(field.folder).events() if e["kind"] == "presses"]
+    assert sorted(len(e["ids"]) for e in presses) == [1, 1]
+    assert ["p1"] in [e["ids"] for e in presses]
     context.close()
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("killed", ["session", "server", "all"])
+def test_a_page_that_waits_for_a_source_goes_on_five_seconds_after_a_kill(
+    browser: Any, tmp_path: Path, killed: str
+) -> None:
+    field = Field(tmp_path / "mission", started=False)
+    try:
+        address = field.start()
+        context = browser.new_context()
+        page: Page = context.new_page()
+        page.goto(address)
+        expect(page.locator("#source-form")).to_be_visible()
+        page.locator("#source-path").fill(field.port)
+        page.evaluate("window.same_page = true")
+        field.kill(killed)
+        back_s = time.monotonic()
+        if killed == "all":
+            page.close()
+            page = context.new_page()
+            page.goto(address.partition("?")[0])
+            page.locator("#source-path").fill(field.port)
+        wait_for(lambda: page.locator("#link").is_hidden())
+        expect(page.locator("#source-form")).to_be_visible()
+        took_s = time.monotonic() - back_s
+        print(f"waiting, {killed}: back after {took_s:.1f} s")
+        assert took_s < BACK_S
+        if killed != "all":
+            assert page.evaluate("window.same_page")
+            assert page.locator("#source-path").input_value() == field.port
+        page.locator("#source-start").click()
+        wait_for(lambda: Mission.open(field.folder).about.source == field.port)
+        # What was chosen is on the disk before it is confirmed.
+        os.killpg(field.session.pid, signal.SIGKILL)
+        field.session.wait()
+        field.start()
+        expect(page.locator("#people li")).to_have_count(3)
+        context.close()
+    finally:
+        field.close()

@@ -104,14 +104,12 @@ def _run_chosen(
         choice = choose(found, options, trouble, left_s)
         if choice is None:
             return
-        found.about.name = choice.name
         left_s = end_s - time.monotonic()
         options = replace(
             options, open_browser=False, seconds=None if math.isinf(left_s) else max(left_s, 0.0)
         )
         try:
             if choice.is_port:
-                found.about.source = choice.source
                 outcome = _run(found, options, estimator, key_file, common=choice.common)
             else:
                 outcome = _exercise(found, choice, options, estimator)

@@ -117,6 +117,10 @@ def _answer(
         except (RelposError, OSError) as error:
             page.respond(request, refusal(words_of(error)), 400)
             return None
+        mission.about.name = choice.name
+        if choice.is_port:
+            mission.about.source = choice.source
+        mission.save()
         page.respond(request, {"done": True})
         return choice
     else:

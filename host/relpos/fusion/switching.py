@@ -5,8 +5,7 @@ ever ambiguous. So :class:`SwitchingEstimator` replaces the
 :class:`~relpos.fusion.bank.estimator.Bank` of a team of more than ``LARGE_TEAM`` by a
 :class:`~relpos.fusion.large_teams.estimator.LargeTeam`: at once if the priors name so many nodes,
 else when so many have been received. The last estimates are then the priors; nodes that are not
-located yet join later. A team of ``LOCATED_TEAM`` or more is handed over once the bank has located
-all of them: its hypotheses have done their work then.
+located yet join later.
 
 If too few of a large team are located, a *nucleus* comes first: the best connected node and some of
 its neighbours, whose initial poses a bank finds. Once most of them are found, all others join them.
@@ -32,8 +31,6 @@ from relpos.measurements import Measurement, Motion, Prior, Range
 LARGE_TEAM = 20
 """From more nodes on one sparse filter, strip by strip: with 20 it has the bank's error at a fifth
 of the time (``docs/notebook/large-teams.md``)."""
-
-LOCATED_TEAM = 20
 
 KEPT_S = 20.0
 """What is younger is kept: a bank's newest estimate is never older."""
@@ -107,10 +104,7 @@ class SwitchingEstimator:
             if time_s < self._first_range_s:
                 self._first_range_s = time_s
         if len(self._met) <= LARGE_TEAM:
-            estimates = self._feed(measurement)
-            if estimates and len(self._met) >= LOCATED_TEAM and self._located() == len(self._met):
-                estimates += self._hand_over()
-            return estimates
+            return self._feed(measurement)
         if self._is_large():
             return self._feed(measurement) + self._hand_over()
         return self._begin(measurement)

@@ -199,9 +199,12 @@ class Alarms:
                 self.changes.append((node, before, state.alert))
 
     def shelve(self, node: int, for_s: float) -> bool:
-        """Silence the node's alarms for so long, at most :data:`MAX_SHELVED_S`; 0 ends it."""
+        """Silence the node's alarms for so long, at most :data:`MAX_SHELVED_S`; 0 ends it.
+
+        False where there is no such node, or its wearer calls MAYDAY: that is never silenced.
+        """
         state = self._states.get(node)
-        if state is None:
+        if state is None or node in self.mayday:
             return False
         state.shelved_s = min(max(for_s, 0.0), MAX_SHELVED_S)
         return True
@@ -231,7 +234,7 @@ class Alarms:
         still_s = 0.0 if node in self.waiting else state.still_s()
         alert: Alert | None = None
         if node in self.mayday:
-            alert = Alert.MAYDAY
+            alert, state.shelved_s = Alert.MAYDAY, 0.0
         elif still_s >= STILL_ALARM_S:
             alert = Alert.STILL_ALARM
         elif state.fallen and node not in self.waiting:

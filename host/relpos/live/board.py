@@ -100,11 +100,15 @@ class RollCall:
 
 @dataclass
 class Evacuation:
-    """An order to leave: given by radio, and shown on the wearers' phones, which answer."""
+    """An order to leave: given by radio, by the nodes' LEDs and on the wearers' phones.
+
+    ``lit``: when a node confirmed its LED, ``delivered``: when a phone showed it. People answer.
+    """
 
     unix_s: float
     by: str
     nodes: list[int]
+    lit: dict[int, float] = field(default_factory=dict)
     delivered: dict[int, float] = field(default_factory=dict)
     acknowledged: dict[int, dict[str, Any]] = field(default_factory=dict)
 
@@ -144,6 +148,12 @@ class Board:
     def to_message(self) -> dict[str, Any]:
         """Return the message ``board`` of the page's protocol."""
         return {"type": "board", **asdict(self)}
+
+    @property
+    def called_out(self) -> list[int]:
+        """The people who are to leave, and have not said that they understand."""
+        order = self.evacuation
+        return [] if order is None else [n for n in order.nodes if n not in order.acknowledged]
 
     @property
     def waiting(self) -> set[int]:
@@ -301,7 +311,7 @@ class Board:
                 order = self.evacuation = Evacuation(event["unix_s"], event["by"], [])
             # Who was called out before, and has answered, stays called out.
             order.nodes = sorted({*order.nodes, *nodes})
-            text = "{whom}EVACUATE {count}: order by radio and on phones"
+            text = "{whom}EVACUATE {count}: order by radio, LED and phone"
             return Said("evacuate", text, whom="", count=len(nodes))
         if order is None:
             raise BoardError(Said("no-evacuation", "no evacuation is ordered"))
@@ -310,11 +320,12 @@ class Board:
             return Said("evacuated", "{whom}evacuation is over", whom="")
         if event["node"] not in order.nodes:
             raise BoardError(Said("not-called", "that person is not called out"))
-        if action == "delivered":
-            order.delivered.setdefault(event["node"], event["unix_s"])
+        if action in ("lit", "delivered"):
+            times = order.lit if action == "lit" else order.delivered
+            times.setdefault(event["node"], event["unix_s"])
             return None
         if action != "acknowledged":
-            raise BoardError("action: order, delivered, acknowledged or end")
+            raise BoardError("action: order, lit, delivered, acknowledged or end")
         order.acknowledged[event["node"]] = {"by": event["by"], "unix_s": event["unix_s"]}
         return Said("understood", "{whom}evacuation understood", whom="")
 

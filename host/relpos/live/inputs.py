@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Protocol
 from relpos.errors import DataError, DeviceError, words_of
 from relpos.link import port as serial_port
 from relpos.link.beacon import HostBeacons
+from relpos.link.led_orders import LedOrders
 from relpos.link.port import READ_BYTES, Link
 from relpos.link.step_scale import StepScaleSender
 from relpos.live.clock import SessionClock
@@ -67,6 +68,12 @@ class Input(Protocol):
     def learn(self, estimate: Estimate) -> None:
         """Pass on what the newest estimate has learned of the wearers' steps."""
 
+    def call_out(self, nodes: Iterable[int]) -> None:
+        """Show these nodes' wearers that they are to leave, and nobody else."""
+
+    def called_out(self) -> list[int]:
+        """Return the nodes that have confirmed it since the last call."""
+
     def remarks(self) -> list[str]:
         """Return new messages for the user, each once."""
 
@@ -113,6 +120,7 @@ class PortInput:
         self._seen = seen
         self._reopen = reopen
         self._scales = StepScaleSender(link) if teach else None
+        self._leds = LedOrders(link)
         self._beacons = HostBeacons(link)
         self._remarked = 0
         self._device: serial.Serial | None = serial_port.open_port(port)
@@ -179,6 +187,14 @@ class PortInput:
                 if p.name == "step_scale":
                     self._scales.learn(p.node, p.value, p.sigma, p.time_s)
 
+    def call_out(self, nodes: Iterable[int]) -> None:
+        """Light these nodes' LEDs."""
+        self._leds.call_out(nodes)
+
+    def called_out(self) -> list[int]:
+        """Return the nodes whose LEDs have been lit since the last call."""
+        return self._leds.lit()
+
     def remarks(self) -> list[str]:
         """Return new remarks of the decoder and of the step scales."""
         if self._scales is not None:
@@ -230,12 +246,15 @@ class PortInput:
         # An emulated team in virtual time sends beacons of its own.
         now_s = self.clock()
         serial_port.send(self._device, self._beacons.due(now_s))
-        if self._scales is None:
-            return
         answers = self._link.decoder.acknowledged
         while answers:
-            self._scales.handle(answers.popleft())
-        serial_port.send(self._device, self._scales.due(now_s))
+            answer = answers.popleft()
+            self._leds.handle(answer)
+            if self._scales is not None:
+                self._scales.handle(answer)
+        serial_port.send(self._device, self._leds.due(now_s))
+        if self._scales is not None:
+            serial_port.send(self._device, self._scales.due(now_s))
 
     def _lose(self, error: DeviceError) -> None:
         if not self._reopen:
@@ -337,6 +356,13 @@ class PacedInput:
 
     def learn(self, estimate: Estimate) -> None:
         """Ignore: a recording has no nodes to send to."""
+
+    def call_out(self, nodes: Iterable[int]) -> None:
+        """Ignore: a recording has no nodes to send to."""
+
+    def called_out(self) -> list[int]:
+        """Return nothing."""
+        return []
 
     def remarks(self) -> list[str]:
         """Return new remarks of the decoder, where bytes were recorded."""

@@ -136,6 +136,10 @@ class LiveSession:
                 self._apply(event)
         for node, heard_s in resumed.heard_s.items():
             self._composer.remember(node, heard_s, resumed.since_s, self._alerts.get(node))
+        for event in resumed.events:
+            if event["kind"] == "shelve":
+                with self._surviving("event"):
+                    self._apply(event)
         self._again_s = resumed.since_s
         self._journal = journal
 
@@ -287,6 +291,9 @@ class LiveSession:
             self._notices.post_remark(text)
             self.log("note", text)
             self._changed = True
+        for node in self._source.called_out():
+            if node in self._board.called_out:
+                self._happen({"kind": "evacuate", "action": "lit", "node": node})
         self._watch(now_s)
         self._show_if_due()
 
@@ -536,11 +543,13 @@ class LiveSession:
                     self._alerts[node].seen, self._alerts[node].by = True, event.get("by", "")
                 return self._composer.alarms.acknowledge(node, event.get("by", ""))
             case "shelve":
-                return self._composer.alarms.shelve(node, event["seconds"])
+                left_s = event["seconds"] - (time.time() - event["unix_s"])
+                return self._composer.alarms.shelve(node, left_s)
             case kind if kind in BOARD_EVENTS:
                 words = self._board.apply(event)
                 alarms = self._composer.alarms
                 alarms.waiting, alarms.mayday = self._board.waiting, set(self._board.mayday)
+                self._source.call_out(self._board.called_out)
                 self._feed(lambda sink: sink.boarded(self._board.to_message()))
                 if words and self._journal_open:
                     whom = f"{self._composer.name(node)}: " if node else ""

@@ -39,7 +39,7 @@ from relpos.live.board import BOARD_EVENTS
 from relpos.live.team_view import MAX_LOG, to_json
 from relpos.live.tracks import Tracks
 from relpos.said import Said, refusal
-from relpos.view.access import Access, Allowance, qr_svg
+from relpos.view.access import Access, Allowance, ServerConfig, qr_svg
 from relpos.view.bodies import (
     MAX_BODY_BYTES,
     BadRequestError,
@@ -56,7 +56,6 @@ from relpos.view.bodies import (
 from relpos.view.devices import Device, Role
 from relpos.view.guard import FORBIDDEN, TokenMiddleware, role_of
 from relpos.view.plans import MAX_IMAGE_BYTES, PlanImages
-from relpos.view.web import ServerConfig
 
 STATIC = Path(__file__).parent / "static"
 PING_S = 2.0

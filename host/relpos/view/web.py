@@ -13,7 +13,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +25,7 @@ from relpos.live.sinks import Sink
 from relpos.live.team_view import MAX_LOG, Hello, LogEntry, TeamView, to_json
 from relpos.live.tracks import Tracks
 from relpos.said import Said
-from relpos.view.access import Access
+from relpos.view.access import Access, ServerConfig
 
 if TYPE_CHECKING:
     from multiprocessing.context import SpawnProcess
@@ -245,16 +245,6 @@ class WebView(Sink):
             if not data:
                 raise ConnectionResetError
             self._in += data
-
-
-@dataclass(frozen=True)
-class ServerConfig:
-    """What a serving process is started with."""
-
-    listener: socket.socket
-    """Listens already: browsers that come while it is restarted wait."""
-    channel: socket.socket
-    access: Access
 
 
 def _serve(config: ServerConfig) -> None:

@@ -103,7 +103,8 @@ export class BoardView {
       setAttribute(row.evacuate, "aria-label", t("evacuate.name", { name: person.name }));
       const seen = evacuation?.acknowledged?.[person.node];
       setText(row.order, !out ? "" : seen ? t("evacuate.understood.by", { name: seen.by || t("somebody"), time: timeOfDay(1000 * seen.unix_s) })
-        : evacuation.delivered?.[person.node] ? t("evacuate.delivered", { time: timeOfDay(1000 * evacuation.delivered[person.node]) }) : t("evacuate.radio"));
+        : ["delivered", "lit"].filter((way) => evacuation[way]?.[person.node]).map((way) => t(`evacuate.${way}`, { time: timeOfDay(1000 * evacuation[way][person.node]) })).join("; ")
+          || t("evacuate.radio"));
     }
   }
 

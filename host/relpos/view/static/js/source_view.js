@@ -41,13 +41,15 @@ export class SourceView {
     if (found === this.shown) return;
     const first = this.shown === "";
     this.shown = found;
-    const chosen = this.chosen ?? before;
+    // What was typed stays chosen, whatever is plugged in meanwhile.
+    const typed = this.chosen === PATH || (first && byId("source-path").value);
+    const chosen = typed ? PATH : this.chosen ?? before;
     const known = ports.some((port) => port.source === chosen);
     byId("source-ports").replaceChildren(make("legend", { "data-t": "source" }),
       ...ports.map((port) => this.option(port.source, [port.source, port.text].filter((text) => text && text !== "n/a").join(" · "))),
       this.option(DEMO, null, "source.demo"),
       this.option(PATH, null, "source.other"));
-    this.choose(known || chosen === DEMO ? chosen : chosen ? PATH : ports[0]?.source ?? DEMO);
+    this.choose(known || chosen === DEMO ? chosen : chosen || typed ? PATH : ports[0]?.source ?? DEMO);
     if (!first) return;
     byId("source-name").value = name;
     if (chosen && !known && chosen !== DEMO) byId("source-path").value = chosen;

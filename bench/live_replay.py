@@ -6,7 +6,7 @@ recording is still being read for its events, and afterwards. A seek ends when a
 has the picture of that moment. Memory is that of the page's process and of its JavaScript heap, in
 Chromium, where there is one. Prints the computer's load, which is part of the answer.
 
-    python bench/replay.py [--people 20] [--minutes 60] [--seeks 60]
+    python bench/live_replay.py [--people 20] [--minutes 60] [--seeks 60]
 """
 
 from __future__ import annotations

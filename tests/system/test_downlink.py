@@ -1,22 +1,24 @@
-"""Learned step scales on their way back to the nodes."""
+"""What goes down to the nodes in a session: learned step scales, and orders to leave."""
 
 from dataclasses import replace
 
 import pytest
 
 from relpos.emulator.team import EmulatedTeam, TeamConfig
+from relpos.link.led_orders import LED_HEALTH, LED_ON, LedOrders
 from relpos.link.port import Link
 from relpos.link.step_scale import ATTEMPTS, KNOWN_WELL, StepScaleSender
 from relpos.measurements import Motion
+from relpos.protocol import messages as wire
 from relpos.simulation.team import SCENARIOS
 
 
 class Conversation:
     """A team in memory with a sender at its port; keeps the newest motion of each node."""
 
-    def __init__(self, team):
+    def __init__(self, team, sender=StepScaleSender):
         self.team, self.link = team, Link()
-        self.sender = StepScaleSender(self.link)
+        self.sender = sender(self.link)
         self.motions = {}
 
     def run(self, until_s, step_us=50_000):
@@ -33,6 +35,54 @@ class Conversation:
 
     def learn(self, node, scale, sigma=0.01):
         self.sender.learn(node, scale, sigma, self.team.time_us * 1e-6)
+
+
+def test_who_is_called_out_has_the_led_on_until_nobody_calls():
+    straight = SCENARIOS["straight"]
+    lossy = replace(straight.world, radio=replace(straight.world.radio, loss_probability=0.3))
+    with EmulatedTeam(TeamConfig(replace(straight, world=lossy), 2, 60.0, 4)) as team:
+        conversation = Conversation(team, LedOrders)
+        conversation.run(3.0)
+        conversation.sender.call_out([1, 77])
+        conversation.run(12.0)
+        # Node 77 is not there: it is asked seldom, and nobody waits for it.
+        assert conversation.sender.lit() == [1]
+        assert conversation.sender.lit() == []
+        assert _led(conversation, 1, 20.0) == LED_ON
+        assert _led(conversation, 2, 28.0) == LED_HEALTH
+        conversation.sender.call_out([])
+        conversation.run(34.0)
+        assert conversation.sender.lit() == []
+        assert _led(conversation, 1, 42.0) == LED_HEALTH
+
+
+def _led(conversation, node, until_s):
+    """A node's LED setting: what it answers to a value out of range is the one in force."""
+    answers = []
+    sender, conversation.sender = conversation.sender, Asking(conversation.link, node, answers)
+    conversation.run(until_s)
+    conversation.sender = sender
+    return answers[-1].value
+
+
+class Asking:
+    """Asks a node again and again for its LED setting."""
+
+    def __init__(self, link, node, answers):
+        self.link, self.node, self.answers = link, node, answers
+        self.next_s, self.tokens = 0.0, set()
+
+    def due(self, now_s):
+        if now_s < self.next_s:
+            return b""
+        self.next_s = now_s + 1.0
+        token, data = self.link.command(self.node, wire.CommandCode.SET_LED, 99)
+        self.tokens.add(token)
+        return data
+
+    def handle(self, answer):
+        if answer.token in self.tokens:
+            self.answers.append(answer)
 
 
 @pytest.fixture
