@@ -48,7 +48,8 @@ def test_the_log_of_a_replay_is_written_by_its_suffix_with_places_by_a_pin(
     at = SimpleNamespace(node=2, x_m=100.0, y_m=0.0, status=NodeStatus.OK)
     moments = SimpleNamespace(from_s=0.0, estimate_at=lambda _: SimpleNamespace(nodes=[at]))
     path = tmp_path / f"log.{suffix}"
-    replay._write(path, moments, "mill", ENTRIES, ["48.0,11.0,90"])  # type: ignore[arg-type]
+    played = replay.Played([], "mill", ENTRIES, {})
+    replay._write(path, played, moments, ["48.0,11.0,90"])  # type: ignore[arg-type]
     if suffix == "csv":
         with path.open(newline="") as file:
             rows = list(csv.DictReader(file))

@@ -14,6 +14,7 @@ from relpos.cli import live, output
 
 if TYPE_CHECKING:
     from relpos.live.team_view import LogEntry
+    from relpos.recording.moments import Moments
 
 
 def replay(
@@ -35,7 +36,10 @@ def replay(
     computed meanwhile and drawn beside them once they are there.
     """
     if log is not None:
-        _write(log, Played.open(source), pins or ())
+        from relpos.recording.moments import Moments
+
+        played = Played.open(source)
+        _write(log, played, Moments(played.paths), pins or ())
         return
     play(source, live.Options(True, view_listen, open_browser=open_browser, seconds=seconds))
 
@@ -116,17 +120,16 @@ def play(
     return player.ended
 
 
-def _write(path: Path, played: Played, pins: Sequence[str]) -> None:
+def _write(path: Path, played: Played, moments: Moments, pins: Sequence[str]) -> None:
     """Write the log: KML by its suffix, else CSV."""
     from relpos.exchange.content import PLACED
     from relpos.geodesy import parse_pin, place
     from relpos.live.log_files import log_row, write_kml
-    from relpos.recording.moments import Moments
     from relpos.recording.player import History
     from relpos.runs.appending import write_rows
     from relpos.runs.log import LOG_COLUMNS
 
-    moments, name, entries = Moments(played.paths), played.name, played.entries
+    name, entries = played.name, played.entries
     if not entries:
         history = History()
         history.read(moments, {}, ())
