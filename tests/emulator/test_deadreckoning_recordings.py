@@ -14,10 +14,10 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "bench" / "inertial"))
 
 import evaluate  # noqa: E402
+import replay  # noqa: E402
 import walks  # noqa: E402
 
 import recordings  # noqa: E402
-import replay  # noqa: E402
 
 
 def needs(data_set):
