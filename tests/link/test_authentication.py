@@ -79,12 +79,24 @@ def test_counters_go_on_past_2041():
     assert counter.next() == 10
 
 
+def test_a_clock_is_followed_as_far_as_a_node_follows_and_no_further():
+    furthest_s = wire.MAX_COMMAND_JUMP / 8
+    now = [1.8e9]
+    counter = HostCounter(lambda: now[0])
+    first = counter.next()
+    now[0] += furthest_s
+    assert counter.next() == first + wire.MAX_COMMAND_JUMP
+    now[0] += furthest_s + 1 / 8
+    assert counter.next() == first + wire.MAX_COMMAND_JUMP + 1
+
+
 @pytest.mark.parametrize(
     ("own_s", "newest_s", "said"),
     [
         (1.8e9, 1.8e9 + 315e6, "3645.8 days ahead"),
         (1.8e9 + 315e6, 1.8e9, "3645.8 days behind"),
         (1.8e9, 1.8e9 + 3599.0, None),
+        (1.8e9, 1.8e9 + 3600.0, "0.0 days ahead"),
         (0.0, 1.8e9, "clock says 1970-01-01"),
     ],
 )

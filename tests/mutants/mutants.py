@@ -65,6 +65,7 @@ EXPLAINED = {
     "if (length < kOverhead || length > kFrameBytes) return FrameStatus::kBadLength;": (
         "no message has an empty body"
     ),
+    "if counter > self.newest:": "the newest once more: its bit is set already",
     "return cls(newest, (1 << WINDOW) - 1)": "bits beyond the window are never looked at",
     "if (from > to) add_scaled(at(to, to), at(to, from), factor, 1);": (
         "no state is mixed with itself"
