@@ -818,6 +818,30 @@ TEST(a_slow_line_drops_the_oldest_ranges_counts_them_and_keeps_the_motion) {
   CHECK(team.sent(wire::MessageType::kMotion) >= 25);
 }
 
+TEST(every_step_is_reported_at_its_own_time) {
+  Team team;
+  team.world.command(1, code(wire::CommandCode::kSetStepReports), 1);
+  team.run_ms(5000);
+  team.world.walking = true;
+  team.run_ms(12000);
+  const float period_ms = 1000.0f * 2.0f * 3.14159f / 12.0f;  // of the world's walk
+  float last_ms = 0.0f;
+  uint16_t intervals = 0;
+  for (uint16_t i = 0; i < team.world.count; ++i) {
+    const Sent& sent = team.world.frames[i];
+    wire::Steps steps;
+    if (sent.header.type != wire::MessageType::kSteps) continue;
+    CHECK(wire::decode(sent.body, sent.length, &steps));
+    for (uint8_t k = 0; k < steps.count; ++k) {
+      const float time_ms = static_cast<float>(steps.time_ms) - steps.entries[k].age_ms;
+      if (last_ms > 0.0f) CHECK_NEAR(period_ms, time_ms - last_ms, 45.0f);  // two ticks
+      intervals += last_ms > 0.0f;
+      last_ms = time_ms;
+    }
+  }
+  CHECK(intervals > 10);
+}
+
 TEST(steps_that_are_dropped_are_not_counted_as_ranges) {
   Team team;
   team.world.command(1, code(wire::CommandCode::kSetStepReports), 1);
