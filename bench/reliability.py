@@ -19,16 +19,19 @@ PAGE = Path(__file__).parents[1] / "docs" / "reliability.md"
 
 HEAD = f"""# What goes wrong, and what then?
 
-| promise | measured 2026-11-24 | by |
+| promise | measured 2026-11-25 | by |
 |---|---|---|
-| nothing from outside ends a session | 99 random episodes, 160,000 bodies: 0 open | `make soak` |
+| nothing from outside ends a session | 99 random episodes, an hour of ten nodes, \
+160,000 bodies: 0 open | `make soak` |
 | no forged, altered, replayed frame counts | 10,000,033 frames: 0 taken | `make soak` |
 | a kill takes 1 s with `--record`, else 2 s | 269 kills: 1.001, 0.3 s | `soak.py --kills` |
-| parsers fail in their own errors alone | 1,089,000 inputs by coverage: 0 open | `make fuzz` |
-| tests notice faults in what is trusted | killed: gait 15 of 15; bank 27 of 32 | `make mutants` |
+| parsers fail in their own errors alone | by coverage: node 26,896,482, \
+host 1,089,000: 0 open | `make fuzz` |
+| tests notice faults in what is trusted | killed: gait 15 of 15, authentication 28 of 28, \
+bank 27 of 32 | `make mutants` |
 | no clock, theft or replay locks out or commands | [security](security.md) | `make test` |
 
-Others publish (read 2026-11-24): PX4
+Others publish (looked up in 2026): PX4
 [`mavsdk_test_runner.py`](https://docs.px4.io/main/en/test_and_ci/integration_testing_mavsdk);
 ArduPilot [`run_coverage.py`](https://ardupilot.org/dev/docs/coverage-analysis.html); MAVLink
 [signing](https://mavlink.io/en/guide/message_signing.html), 48-bit tags, one key; Klipper

@@ -30,6 +30,8 @@ FOUND = ROOT / ".build" / "fuzz" / "findings"
 FINDINGS = Path(__file__).with_name("findings")
 MOST_MB = 1536
 MOST_S = 10
+INTERRUPTED = 72
+"""libFuzzer's exit code after a signal."""
 
 sys.path += [str(ROOT / "tests" / "live"), str(ROOT / "tests" / "fuzz")]
 
@@ -279,12 +281,12 @@ def fuzz(name: str, ending: str) -> bool:
     executed = re.findall(r"^#(\d+)\s.*cov: (\d+)", said, re.M)
     parts = re.findall(r"^line \d+, .*$", said, re.M)
     count, cover = (runs or ["?"])[-1], (executed or [("?", "?")])[-1][1]
-    well = "well" if not done.returncode else "FOUND"
+    well = {0: "well", INTERRUPTED: "stopped"}.get(done.returncode, "FOUND")
     print(f"{name}: {count} inputs, {cover} branches, {', '.join([*parts, well])}", flush=True)
-    if done.returncode:
+    if well == "FOUND":
         print(said[-3000:])
         print(f"again: {again}")
-    return not done.returncode
+    return well != "FOUND"
 
 
 FIRMWARE_ENVIRONMENT = {
