@@ -1,13 +1,17 @@
 """How the estimators do on missions that nobody planned, condition by condition.
 
     python bench/missions.py [--seeds 3] [--first 0] [--only TEXT] [--estimators bank,ekf]
-                             [--set KEY=VALUE] [--workers N]
+                             [--set KEY=VALUE] [--workers N] [--regrouping]
 
 prints, for each condition of ``relpos.simulation.missions`` and each estimator: distance, aligned
 and body-frame RMSE (m) and distance NEES, means over the seeds; of the pair-seconds with status
 ok the shares whose distance errs by more than three sigmas and by more than 2 m (%); the worst
-seed's distance RMSE; and the time of a run. ``ekf`` is :class:`PlainEkf`; ``smoother`` begins from
-the bank, which is ``large teams`` from 21 nodes on.
+seed's distance RMSE; processor seconds of a run; and the body-frame RMSE over that of ``ekf``,
+where that runs, too. ``ekf`` is :class:`PlainEkf`; ``smoother`` begins from the bank, which is
+``large teams`` from 21 nodes on.
+
+``--regrouping`` prints instead, for the splits, how long after all have met again the team is right
+(aligned error below 1 m) and said to be (everybody is ok) for ten seconds.
 """
 
 from __future__ import annotations
@@ -16,10 +20,13 @@ import argparse
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 
 import numpy as np
+import numpy.typing as npt
 
-from relpos.evaluation import study
+from relpos import fusion, tracks
+from relpos.evaluation import metrics, study
 from relpos.evaluation.executors import executor
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, PairEstimate
 from relpos.fusion.rewind import Rewinder
@@ -139,6 +146,72 @@ def case(condition: str, estimator: str, settings: dict[str, str]) -> study.Case
     return study.Case(label, scenario, {}, name, given, smooth=estimator == "smoother")
 
 
+def row_of(made: study.Outcome, plain: study.Outcome | None) -> str:
+    """Return a line of the table; ``plain`` is what the plain EKF made of the same runs."""
+    ratio = made.body_frame_m.mean / plain.body_frame_m.mean if plain else math.nan
+    return (
+        f"{made.case.label:27}{made.distance_m.mean:9.2f}{made.aligned_m.mean:9.2f}"
+        f"{made.body_frame_m.mean:8.2f}{ratio:7.2f}{made.nees.mean:8.2f}"
+        f"{100 * made.ok_over_3_sigma.mean:8.1f}{100 * made.ok_over_2_m.mean:7.1f}"
+        f"{made.distance_m.worst:8.2f}{made.busy_s.mean:7.1f}"
+        + "".join(f"  {reason}" for reason in made.failures[:1])
+    )
+
+
+WAIT_S, HELD_S, RIGHT_M = 120.0, 10, 1.0
+"""A run is followed for so long after a regrouping; right is an aligned error below ``RIGHT_M``,
+and said so where everybody is ok, both for ``HELD_S``."""
+
+
+def regrouped_s(truth: Mapping[int, tracks.Track], since_s: float, reach_m: float) -> float:
+    """Return when each of one half is in reach of the other half, as it will be from then on."""
+    times = np.arange(since_s, max(t.time_s[-1] for t in truth.values()))
+    place = np.array([
+        [np.interp(times, t.time_s, axis) for axis in (t.x_m, t.y_m)] for t in truth.values()
+    ])  # fmt: skip
+    half = len(place) // 2
+    apart = np.hypot(*np.moveaxis(place[:half, None] - place[None, half:], 2, 0))
+    met = (apart.min(axis=1) < reach_m).all(axis=0) & (apart.min(axis=0) < reach_m).all(axis=0)
+    return float(times[np.argmax(met)])
+
+
+def right_after_s(condition: str, settings: dict[str, str], seed: int) -> tuple[float, float]:
+    """Return how long after a regrouping a team is right, and right and said to be (s; or nan)."""
+    one = case(condition, "bank", settings)
+    mission = missions.settings_of(one.scenario)
+    run = missions.simulate_mission(one.scenario, seed)
+    truth = tracks.true_tracks(run.truth)
+    met_s = regrouped_s(truth, 0.25 * mission.seconds + mission.split_s, mission.max_range_m)
+    estimator = fusion.make("bank", run.priors, settings, seed + study.ESTIMATOR_SEED)
+    some = [m for m in run.measurements if m.time_s < met_s + WAIT_S]
+    estimates = [e for m in some for e in estimator.process(m)]
+    estimates = [e for e in [*estimates, *estimator.finish()] if e.time_s > met_s]
+    made = metrics.evaluate(
+        tracks.estimated_tracks(estimates), truth, tracks.estimated_pairs(estimates)
+    )
+    right = made.position_rmse_over_time_m < RIGHT_M
+    ok = np.array([all(n.status is NodeStatus.OK for n in e.nodes) for e in estimates])
+    at = np.searchsorted([e.time_s for e in estimates], made.time_s).clip(0, len(ok) - 1)
+
+    def held(good: npt.NDArray[np.bool_]) -> float:
+        lasting = np.convolve(good, np.ones(HELD_S), "valid") == HELD_S
+        return float(made.time_s[np.argmax(lasting)]) - met_s if lasting.any() else math.nan
+
+    return held(right), held(right & ok[at])
+
+
+def print_regrouping(seeds: range, settings: dict[str, str], pool: Executor) -> None:
+    """Print, for each mission with a split, when the team is right again."""
+    for condition in (c for c in missions.CONDITIONS if "split" in c):
+        jobs = [pool.submit(right_after_s, condition, settings, seed) for seed in seeds]
+        both = np.array([job.result() for job in jobs])
+        for label, after_s in zip(("right", "and said to be"), both.T, strict=True):
+            told = " ".join(f"{s:.0f}" for s in after_s)
+            print(
+                f"{condition:18}{label:16}{(after_s <= 60.0).sum()} of {len(seeds)} in 60 s: {told}"
+            )
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -148,31 +221,26 @@ def main() -> None:
     parser.add_argument("--estimators", default="bank,ekf")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--workers", type=int, default=None)
+    parser.add_argument("--regrouping", action="store_true", help="when splits are right again")
     given = parser.parse_args()
     settings = dict(pair.split("=", 1) for pair in given.set)
-    cases = [
-        case(condition, estimator, settings)
-        for condition in missions.CONDITIONS
-        if any(text in condition for text in given.only.split(","))
-        for estimator in given.estimators.split(",")
-    ]
     seeds = range(given.first, given.first + given.seeds)
-    print(f"seeds {seeds[0]} to {seeds[-1]}; m, means; shares of the ok pair-seconds in %")
-    print(
-        f"{'':27}{'distance':>9}{'aligned':>9}{'body':>8}{'NEES':>8}{'>3 sig':>8}{'>2 m':>7}"
-        f"{'worst':>8}{'s/run':>7}"
-    )
     with executor(workers=given.workers) as pool:
-        for one in cases:
-            (made,) = study.run([one], seeds, pool)
-            print(
-                f"{one.label:27}{made.distance_m.mean:9.2f}{made.aligned_m.mean:9.2f}"
-                f"{made.body_frame_m.mean:8.2f}{made.nees.mean:8.2f}"
-                f"{100 * made.ok_over_3_sigma.mean:8.1f}{100 * made.ok_over_2_m.mean:7.1f}"
-                f"{made.distance_m.worst:8.2f}{made.busy_s.mean:7.1f}"
-                + "".join(f"  {reason}" for reason in made.failures[:1]),
-                flush=True,
-            )
+        if given.regrouping:
+            print_regrouping(seeds, settings, pool)
+            return
+        print(f"seeds {seeds[0]} to {seeds[-1]}; m, means; shares of the ok pair-seconds in %")
+        print(
+            f"{'':27}{'distance':>9}{'aligned':>9}{'body':>8}{'/ekf':>7}{'NEES':>8}{'>3 sig':>8}"
+            f"{'>2 m':>7}{'worst':>8}{'s/run':>7}"
+        )
+        for condition in missions.CONDITIONS:
+            if not any(text in condition for text in given.only.split(",")):
+                continue
+            names = given.estimators.split(",")
+            made = {n: study.run([case(condition, n, settings)], seeds, pool)[0] for n in names}
+            for outcome in made.values():
+                print(row_of(outcome, made.get("ekf")), flush=True)
 
 
 if __name__ == "__main__":

@@ -50,7 +50,7 @@ class Case:
 class Score:
     """The result of one run; NaN where a figure is undefined or the estimator gave up.
 
-    ``busy_s`` is the wall time of the estimator alone. ``time_s`` (T,) are the whole seconds
+    ``busy_s`` is the processor time of the estimator alone. ``time_s`` (T,) are the whole seconds
     that could be scored, ``distance_over_time_m`` and ``aligned_over_time_m`` (T,) the root mean
     squares over pairs and nodes there. ``failure`` is why the estimator gave up, if it did.
     """
@@ -76,14 +76,14 @@ def score(case: Case, seed: int) -> Score:
     run = simulate(case.scenario, seed, case.overrides)
     make = fusion.make_smoother if case.smooth else fusion.make
     estimator = make(case.estimator, run.priors, case.settings, seed + ESTIMATOR_SEED)
-    started = time.perf_counter()
+    started = time.process_time()
     failure = ""
     try:
         estimates = [e for m in run.measurements for e in estimator.process(m)]
         estimates += estimator.finish()
     except RelposError as error:
         estimates, failure = [], str(error)
-    busy_s = time.perf_counter() - started
+    busy_s = time.process_time() - started
     truth = tracks.true_tracks(run.truth)
     result = metrics.evaluate(
         tracks.estimated_tracks(estimates),
@@ -173,7 +173,7 @@ class Outcome:
 
     @property
     def busy_s(self) -> Statistic:
-        """The estimator's wall time."""
+        """The estimator's processor time."""
         return Statistic.of([s.busy_s for s in self.scores])
 
     @property
