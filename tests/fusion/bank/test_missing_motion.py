@@ -40,7 +40,7 @@ def test_a_node_without_any_news_is_not_ok_after_three_seconds_and_its_sigma_wal
             continue
         (node,) = (n for n in e.nodes if n.node == 3)
         silent_s = e.time_s - gone_s
-        if silent_s > 4.0:
+        if silent_s > 3.0:
             assert node.status is not NodeStatus.OK
         if silent_s > 2.0:
             assert 0.4 * silent_s**0.5 < node.sigma_major_m < 2.0 * silent_s
