@@ -150,6 +150,12 @@ def test_twenty_people_are_visible_at_once_beside_a_map_of_half_the_laptops_scre
     box = page.locator("#map").bounding_box()
     assert box
     assert box["width"] * box["height"] >= 0.5 * 1366 * 768
+    # With three alarms open, too.
+    stage.team.lost_since = {5: stage.at_s - 12.0}
+    stage.team.still_since = {2: stage.at_s - 52.0, 3: stage.at_s - 24.0}
+    expect(page.locator("#alarms .rows .alarm")).to_have_count(3)
+    for k in range(20):
+        expect(people.nth(k)).to_be_in_viewport(ratio=1)
 
 
 @pytest.mark.parametrize("size", [6, 20])
