@@ -136,8 +136,8 @@ $(DEVELOP): pyproject.toml | $(PYTHON)
 	@touch $@ $(RUN)
 
 $(FUZZ): $(DEVELOP)
-	$(call title,Installing what long runs need: a fuzzer, Rerun)
-	$(PIP) --editable '.[fuzz,rerun]'
+	$(call title,Installing what long runs need: a fuzzer, Rerun, a parser of TAK)
+	$(PIP) --editable '.[fuzz,rerun]' takproto
 	@touch $@
 
 $(PEERS): pyproject.toml | system-demo

@@ -243,6 +243,29 @@ def test_a_lost_member_stays_on_the_map_as_a_marker_until_it_is_heard_again(
     assert "test.1-last" not in due(schedule, team_view(5), 66.0)
 
 
+@pytest.mark.soak  # `make soak` installs it
+def test_takproto_reads_members_alarms_markers_and_deletions(schedule: Schedule) -> None:
+    takproto = pytest.importorskip("takproto", reason="make soak installs it")
+    from relpos.live.cot_events import serialized
+
+    still = {"alert": Alert.STILL_ALARM, "still_s": 31.0, "moving": False}
+    gone = {"status": "lost", "seen_s": 60.0, "alert": Alert.LOST}
+    kinds = set()
+    for second, changes in ((0.0, {3: still, 1: gone}), (64.0, {})):
+        for sent in schedule.due(team_view(1 + int(second), changes=changes), FRAME, second, {}):
+            mine = Received(serialized(sent))
+            read = takproto.parse_proto(takproto.xml2proto(serialized(sent))).cotEvent
+            assert (read.uid, read.type, read.how) == (mine.uid, mine.type, mine.how)
+            assert (read.lat, read.lon) == pytest.approx((mine.lat, mine.lon), abs=1e-9)
+            times = (read.sendTime, read.startTime, read.staleTime)
+            ours = (mine.time_s, mine.start_s, mine.stale_s)
+            assert [t / 1000.0 for t in times] == pytest.approx(ours, abs=0.002)
+            if read.type == "a-f-G-U-C":
+                assert read.detail.contact.callsign == mine.attributes("contact")["callsign"]
+            kinds.add(read.type)
+    assert kinds >= {"a-f-G-U-C", "b-a-o-tbl", "b-a-o-can", "b-m-p-s-m", "t-x-d-d"}
+
+
 def test_a_name_that_xml_cannot_hold_is_sent_without_the_rest(schedule: Schedule) -> None:
     event = due(schedule, team_view(1, changes={1: {"name": "A\x00\x1b\ud800b"}}), 0.0)["test.1"]
     assert event.attributes("contact")["callsign"] == "Ab"
