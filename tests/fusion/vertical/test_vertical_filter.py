@@ -175,3 +175,32 @@ def test_before_any_height_there_is_nothing() -> None:
     outcome = follow({1: BESIDE, 2: BESIDE}, begins_s={1: 1e9, 2: 1e9})
     assert outcome.told[1][-1] == Vertical()
     assert not outcome.filter.active
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_fan_that_starts_on_the_stairs_claims_no_wrong_floor(seed: int) -> None:
+    hidden = stairs(3.5)._replace(pressure_m=-0.17)
+    life = [walk(30), hidden, walk(100)]
+    fan = Part(hidden.seconds, pressure_m=-0.17)
+    other = [stand(30), fan, stand(100)]
+    outcome = follow({1: life, 2: other, 3: other}, seed=seed)
+    assert np.abs(_error_m(outcome))[60:].max() < 1.0
+    assert not any(
+        v.floor != 1 and (v.floor_probability or 0.0) > 0.9 for v in outcome.told[1][60:]
+    )
+
+
+def test_who_came_to_a_floor_unseen_is_found_there() -> None:
+    outcome = follow({1: [walk(30), Part(1, rise_m=3.5), walk(100)], 2: [walk(131)]})
+    assert outcome.told[1][-1].floor == 1
+    assert abs(_error_m(outcome)[-1]) < 0.7
+
+
+def test_a_climb_is_over_the_floor_where_it_began_and_teaches_one_storey() -> None:
+    up, down = stairs(3.0), stairs(-3.0)
+    life = [walk(20), up, walk(30), up, walk(30), down, walk(30), down, walk(30)]
+    outcome = follow({1: life, 2: BESIDE})
+    floors = outcome.filter.floors
+    assert abs(floors.height_of(2, 0.0)[0] - 6.0) < 0.5
+    assert abs(_error_m(outcome)[-1]) < 0.3
+    assert outcome.told[1][-1].floor == 0

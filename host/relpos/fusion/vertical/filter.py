@@ -34,8 +34,18 @@ from relpos.fusion.vertical.episodes import (
     Mode,
     Update,
 )
-from relpos.fusion.vertical.floors import CERTAIN, Floors, most_probable
-from relpos.fusion.vertical.heights import START_M, UNKNOWN_M, UNSEEN_M, UNSEEN_S, Heights, Z
+from relpos.fusion.vertical.floors import CERTAIN, LOWEST, SPACING_M, Floors, Over, most_probable
+from relpos.fusion.vertical.heights import (
+    FAST,
+    FAST_S,
+    SLOW,
+    START_M,
+    UNKNOWN_M,
+    UNSEEN_M,
+    UNSEEN_S,
+    Heights,
+    Z,
+)
 from relpos.fusion.vertical.track import Moved, Track
 from relpos.measurements import Height, Range
 
@@ -72,16 +82,18 @@ STANDS_STEPS = 0.3
 MANY, ALIKE_M = 3, 0.12
 """So many others whose heights rise alike, up to a deviation, show what the pressure does, too."""
 
-FAN_DOUBT_M = 0.5
-"""Variance of a climb per metre that the pressure changed for others: 1 m2 for a fan of 25 Pa."""
-
-PRESSED_SHARE = 0.6
-"""Who leaves a stairwell whose pressure differs by more or less than on entering may have climbed
-this share of the difference less: a standard deviation."""
+DOUBTED = 0.6
+"""What of a rise is the wearer's and what the pressure's is doubtful by this share (a standard
+deviation) of what the pressure did to a node more or less than to the others."""
+POSTURE_M = 0.4
+"""Who is on a known floor may kneel, crawl or lie, no more."""
 
 NEAR_M, VAGUE_M, SURE_M = 1.5, 1.0, 0.5
 """A range so short tells on which floor somebody of a vague height is, from one of a sure height
 (standard deviations)."""
+
+LOST_M = 2.5
+"""Whose pressure differs from the others' by more than any door's or fan's is on another floor."""
 
 SETTLES_S = 3.0
 """After so long on the level a node is where it stays."""
@@ -127,9 +139,14 @@ class _Interval:
 
     def pressed_m(self, modes: Floats) -> Floats:
         """Return how much of a climber's rise is the pressure's (N,), by the modes (N, MODES)."""
-        pressed: Floats = modes[:, CLIMBS_COMMON].sum(axis=1) * np.nan_to_num(
-            self.reported.common_m
-        )
+        reported = self.reported
+        stairs_m = episodes.RISER_M * reported.steps
+        pressed = np.zeros_like(stairs_m)
+        for mode, sign in zip(CLIMBS_COMMON, (1.0, -1.0), strict=True):
+            # What nobody else shows is what steps do not make.
+            unknown_m = self.rise_m - sign * stairs_m
+            of_all = np.where(np.isnan(reported.common_m), unknown_m, reported.common_m)
+            pressed += modes[:, mode] * of_all
         return pressed
 
 
@@ -156,8 +173,13 @@ class VerticalFilter:
     _level_s: Floats = field(default_factory=lambda: np.empty(0))
     """How long each has been level since it last changed its height."""
     _level_steps: Floats = field(default_factory=lambda: np.empty(0))
-    _pressed_m: Floats = field(default_factory=lambda: np.empty(0))
-    """What the pressure did to each since it was last on a known floor."""
+    _base: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """The floor that each was known to be on last; heights are over it."""
+    _over: Over = field(default_factory=lambda: Over(np.empty(0), np.empty(0)))
+    """Where pressure alone says that they are."""
+    _doubt_m: Floats = field(default_factory=lambda: np.empty(0))
+    """Standard deviation, signed, of what each climbed since: a rise that is the wearer's for one
+    and the pressure's for another is taken from the other. What cancels was no climb."""
     _heights_before: Floats = field(default_factory=lambda: np.empty(0))
     """Newest heights at the end of the last interval."""
     _walked: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
@@ -214,7 +236,12 @@ class VerticalFilter:
         # Otherwise heights are over a common ground, and it does not start where the others do.
         at_start = not late and abs(track.height_m) <= 1.0
         self._settled = np.append(self._settled, at_start)
-        self._pressed_m = np.append(self._pressed_m, 0.0)
+        self._base = np.append(self._base, 0)
+        self._doubt_m = np.append(self._doubt_m, 0.0)
+        self._over = Over(
+            np.append(self._over.mean_m, track.height_m),
+            np.append(self._over.variance_m2, UNKNOWN_M**2),
+        )
 
     def ranged(self, measured: Range) -> None:
         """Use a short range: the two are on one floor. Others teach no height on one floor."""
@@ -226,7 +253,8 @@ class VerticalFilter:
             a, b = self._row[vague], self._row[sure]
             variance = self.heights.covariance[:, Z, Z]
             if variance[a] > VAGUE_M**2 and variance[b] < SURE_M**2:
-                z_m = float(self.heights.mean[b, Z])
+                below_m = self.floors.height_of(int(self._base[a]), 0.0)[0]
+                z_m = self._height(b)[0] - below_m
                 spread_m2 = (0.5 * measured.range_m) ** 2
                 self.heights.observe(a, z_m, float(variance[b]) + spread_m2)
                 self._settled[a] = False
@@ -369,12 +397,7 @@ class VerticalFilter:
         heights = self.heights
         pressed_m = one.pressed_m(modes)
         heights.advance(duration_s, one.rise_m, moving, disturbed, one.silent_s, pressed_m)
-        # Who walks and does not see the pressure change as others do may climb that much more or
-        # less.
-        resting = np.maximum((1.0 - moving).sum(), 1.0)
-        fan_m = abs(float((disturbed * one.rise_m).sum())) / resting
-        walks = np.maximum(moving, (1.0 - disturbed) * (one.reported.steps > STANDS_STEPS))
-        heights.moved(moving * 2.0 * one.reported.variance_m2 + walks * FAN_DOUBT_M * fan_m)
+        heights.moved(moving * 2.0 * one.reported.variance_m2)
         heights.correct(one.reported.height_m, one.reported.variance_m2)
         moves = (moving > 0.5) | one.again
         # Without heights nobody sees a wearer change floors: none is sure, or teaches its height.
@@ -382,35 +405,70 @@ class VerticalFilter:
         self._level_s = np.where(unseen, 0.0, self._level_s + duration_s)
         self._level_steps = np.where(moves, 0.0, self._level_steps + one.reported.steps)
         self._settled &= ~unseen
+        walks = (moving > 0.5) | (one.reported.steps > STANDS_STEPS)
+        others_m = (disturbed * one.rise_m).sum() / np.maximum((1.0 - moving).sum(), 1.0)
         pressed_m = pressed_m + disturbed * one.rise_m
-        self._pressed_m = np.where(self._settled, 0.0, self._pressed_m + pressed_m)
+        self._doubt_m *= np.where(self._settled, math.exp(-duration_s / FAST_S), 1.0)
+        self._doubt_m += _doubted_m(moving, one.rise_m, pressed_m - walks * others_m)
+        # Who walks while the pressure rises for others, but not here, may have climbed.
+        self._settled &= (np.abs(self._doubt_m) < LEAST_CLIMB_M) | ~walks
+        kept = np.where(self._settled & ~walks, POSTURE_M, math.inf)
+        self._doubt_m = np.clip(self._doubt_m, -kept, kept)
         self._locate()
         if self.decided is not None:
             for node, row in self._row.items():
                 begin_s, end_s = one.taken_s[:, row].tolist()
                 if begin_s < end_s:
-                    z_m, factor = float(heights.mean[row, Z]), float(one.factor[row])
+                    z_m, factor = self._height(row)[0], float(one.factor[row])
                     self.decided.append(Decided(node, begin_s, end_s, factor, z_m))
 
     def _locate(self) -> None:
         """Find the floors of those who have changed their height."""
+        heights, floors = self.heights, self.floors
+        bias_m = heights.mean[:, FAST] + heights.mean[:, SLOW]
+        slow_m2 = heights.covariance[:, SLOW, SLOW]
+        known = np.where(self._settled & (slow_m2 < VAGUE_M**2), bias_m, np.nan)
+        pressed_m = np.zeros(len(bias_m))
+        for row in range(len(bias_m)):
+            others = np.delete(known, row)
+            others = others[np.isfinite(others)]
+            if others.size:
+                pressed_m[row] = np.median(others)
+        # Of the bias, and of a height that is no longer reported.
+        over_m2 = slow_m2 + np.maximum(heights.covariance.sum(axis=(1, 2)), 0.0)
+        self._over = Over(heights.over_m - pressed_m, over_m2)
+        lost = np.abs(bias_m - pressed_m) > LOST_M + np.sqrt(slow_m2)
+        self._settled &= ~lost
+        self._doubt_m = np.where(lost, SPACING_M, self._doubt_m)
         open_ = np.flatnonzero(~self._settled)
         if not open_.size:
             return
-        heights, floors = self.heights, self.floors
-        doubt_m2 = (PRESSED_SHARE * self._pressed_m) ** 2
-        z_m, variance_m2 = heights.mean[open_, Z], heights.covariance[open_, Z, Z] + doubt_m2[open_]
-        floors.probability[open_] = floors.where(z_m, variance_m2, self._level_steps[open_])
+        floors.probability[open_] = floors.where(
+            self._base[open_],
+            heights.mean[open_, Z],
+            heights.covariance[open_, Z, Z] + self._doubt_m[open_] ** 2,
+            self._level_steps[open_],
+            Over(*(v[open_] for v in self._over)),
+        )
         for row in open_[self._level_s[open_] >= SETTLES_S].tolist():
             floor, probability = most_probable(floors.probability[row])
             if floor is None or probability < CERTAIN:
                 continue
-            self._settled[row] = True
-            heights.covariance[row, Z, Z] += doubt_m2[row]
-            z_m, variance_m2 = float(heights.mean[row, Z]), float(heights.covariance[row, Z, Z])
-            floor_m, floor_m2 = floors.height_of(floor)
-            heights.observe(row, floor_m, floor_m2 + WORN_M2)
-            floors.learn(floor, z_m, variance_m2)
+            base, doubt_m = int(self._base[row]), float(self._doubt_m[row])
+            climbed_m, variance_m2 = heights.mean[row, Z], heights.covariance[row, Z, Z]
+            floors.learn(base, floor, float(climbed_m), float(variance_m2), doubt_m)
+            heights.doubt(row, doubt_m)
+            between_m = floors.climbs(self._base[row])[0][floor - LOWEST]
+            heights.rebase(row, float(between_m))
+            heights.observe(row, 0.0, WORN_M2)
+            self._settled[row], self._base[row], self._doubt_m[row] = True, floor, 0.0
+
+    def _height(self, row: int, more_m: float = 0.0) -> tuple[float, float]:
+        """Return the height of one who has risen by more, without doubts, and its variance."""
+        z_m, variance_m2 = self.floors.height_of(
+            int(self._base[row]), float(self.heights.mean[row, Z]) + more_m
+        )
+        return z_m, variance_m2 + float(self.heights.covariance[row, Z, Z])
 
     # -- what is known -------------------------------------------------------------------------
 
@@ -419,17 +477,19 @@ class VerticalFilter:
         row = self._row.get(node)
         if row is None:
             return self._unmeasured(time_s)
-        z_m, variance_m2 = self.heights.mean[row, Z], self.heights.covariance[row, Z, Z]
-        variance_m2 += (PRESSED_SHARE * self._pressed_m[row]) ** 2
-        climbed = 0.0
+        climbed = risen_m = unseen_m2 = 0.0
+        doubt_m = self._doubt_m[row]
         for one, modes in zip(self._open, self._smoothed, strict=True):
             moving = 1.0 - modes[row, Mode.LEVEL] - modes[row, PRESSURE].sum()
             rise = one.rise_m[row]
             pressed_m = one.pressed_m(modes)[row]
-            z_m += moving * rise - pressed_m
+            risen_m += moving * rise - pressed_m
             climbed += modes[row, STAIRS].sum() * rise - pressed_m
-            variance_m2 += moving * (1.0 - moving) * rise * rise
-            variance_m2 += UNSEEN_M**2 * one.silent_s[row]
+            undecided_m = math.sqrt(max(moving * (1.0 - moving), 0.0)) * rise
+            doubt_m += -undecided_m if moving > 0.5 else undecided_m
+            unseen_m2 += UNSEEN_M**2 * one.silent_s[row]
+        z_m, variance_m2 = self._height(row, risen_m)
+        variance_m2 += unseen_m2 + doubt_m**2
         # With the news of one more interval, where there is one.
         modes = self._smoothed[-2:][0] if self._smoothed else self._beliefs.probability
         told = episodes.episodes_of(modes[row])
@@ -437,13 +497,21 @@ class VerticalFilter:
             told[episodes.EPISODES.index(Episode.LEVEL)] += told[_CLIMBS].sum()
             told[_CLIMBS] = 0.0
         k = int(np.argmax(told))
-        where = self.floors.probability[row]
-        if not self._settled[row] or any(p[row, Mode.LEVEL] < 0.5 for p in self._smoothed):
-            steps = self._level_steps[row]
+        where, steps = self.floors.probability[row], self._level_steps[row]
+        stays = self._settled[row] and all(p[row, Mode.LEVEL] >= 0.5 for p in self._smoothed)
+        if not stays:
             for one, modes in zip(self._open, self._smoothed, strict=True):
                 steps = steps * modes[row, Mode.LEVEL] + one.reported.steps[row]
-            where = self.floors.where(z_m, variance_m2, steps)
+            own_m2 = self.heights.covariance[row, Z, Z] + unseen_m2 + doubt_m**2
+            climbed_m = self.heights.mean[row, Z] + risen_m
+            over = Over(self._over.mean_m[row] + risen_m, self._over.variance_m2[row])
+            where = self.floors.where(self._base[row], climbed_m, own_m2, steps, over)
         floor, certain = most_probable(where)
+        if stays:
+            variance_m2 += float(where[:-1] @ (self.floors.mean_m - z_m) ** 2)
+        else:
+            z_m, variance_m2 = self.floors.drawn_to(z_m, variance_m2, where, steps)
+        variance_m2 += self.floors.scale2 * z_m**2
         probability = None if floor is None else certain
         return Vertical(
             float(z_m), math.sqrt(variance_m2), episodes.EPISODES[k], float(told[k]), floor,
@@ -456,6 +524,19 @@ class VerticalFilter:
             return Vertical()
         grown = START_M**2 + UNSEEN_M**2 * max(time_s - self._first_s, 0.0)
         return Vertical(0.0, min(math.sqrt(grown), UNKNOWN_M))
+
+
+def _doubted_m(moving: Floats, rise_m: Floats, pressed_m: Floats) -> Floats:
+    """Return what was climbed more in an interval if modes err (N,): a standard deviation, signed.
+
+    Of a rise that is said to be the pressure's as much may have been climbed; what is said to be
+    climbed may have been the pressure's.
+    """
+    climbed = moving > 0.5
+    undecided_m = np.sqrt(np.maximum(moving * (1.0 - moving), 0.0)) * rise_m
+    undecided_m = np.where(climbed, -undecided_m, undecided_m)
+    pressed_m = DOUBTED * pressed_m
+    return np.where(np.abs(undecided_m) > np.abs(pressed_m), undecided_m, pressed_m)
 
 
 def _others_mean(values: Floats, counted: npt.NDArray[np.bool_], least: int) -> Floats:

@@ -1,23 +1,33 @@
-"""On which floor everybody is; the floors' heights are learned from where people stay.
+"""On which floor everybody is; the floors' heights are learned from climbs between them.
 
 Floor 0 is where the team started. A node changes its floor through stairs or lifts alone, may be
-between floors, and is never forced onto one.
+between floors, and is never forced onto one. Heights here are in barometers' metres, which warm air
+and the stack effect make longer or shorter for all alike. Climbs cannot tell that from other
+storeys: so a height over the start may be less sure than the floor.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 
 LOWEST, HIGHEST = -8, 40
 """Floors that are considered."""
 
 SPACING_M, SIGMA_SPACING_M, SIGMA_STOREY_M = 3.5, 0.4, 0.3
 """Storey height: the building's, and how far each is from it; together 3.5 +- 0.5 m."""
+
+SIGMA_SCALE = 0.02
+"""Of the barometers' metre: 6 K."""
+SHARED, SHARED_CLIMBS = 0.2, 5
+"""This share of a climb's doubt (a standard deviation) is the same for all: a stack effect, a fire.
+The first so many climbs weigh no more than what is taken for granted."""
 
 GROUND_M = 0.05
 WORN_M = 0.2
@@ -29,8 +39,23 @@ that it halves with so many level steps."""
 LEAST_BETWEEN = 0.01
 """Mezzanines, and floors at heights of their own."""
 
-CERTAIN = 0.95
+HIDDEN, HIDDEN_M = 0.05, 1.2
+"""In so many climbs the pressure did something that was not told from climbing: a door of 10 Pa, a
+fan; a standard deviation."""
+
+PRESSED_M = 1.1
+"""What the pressure does to one node and not to the others passes: the height over the start that
+it shows is that of the floor but for a door, a hot room, the stack effect; a standard deviation."""
+
+CERTAIN = 0.9
 """From this probability on a node's floor teaches the floor's height, and the node's."""
+
+
+class Over(NamedTuple):
+    """Heights over the start that pressure alone shows, less what it does to others; variances."""
+
+    mean_m: Floats
+    variance_m2: Floats
 
 
 def _first_covariance() -> Floats:
@@ -52,6 +77,9 @@ class Floors:
     covariance: Floats = field(default_factory=_first_covariance)
     probability: Floats = field(default_factory=lambda: np.empty((0, HIGHEST - LOWEST + 2)))
     """(N, F + 1); the last is between floors."""
+    scale2: float = SIGMA_SCALE**2
+    """Variance of the barometers' metre."""
+    _climbs: int = SHARED_CLIMBS
 
     def add(self, *, late: bool) -> None:
         """Add a node on floor 0, or anywhere."""
@@ -62,28 +90,72 @@ class Floors:
             first[:] = 1.0 / (floors + 1)
         self.probability = np.vstack([self.probability, first])
 
-    def where(self, z_m: Floats, variance_m2: Floats, steps: Floats) -> Floats:
-        """Return where nodes that have moved are (..., F + 1), by heights and level steps (...)."""
-        z_m, variance_m2, steps = (np.asarray(v)[..., None] for v in (z_m, variance_m2, steps))
-        total = variance_m2 + np.diag(self.covariance) + WORN_M**2
-        density = np.exp(-0.5 * (z_m - self.mean_m) ** 2 / total) / np.sqrt(2.0 * np.pi * total)
+    def climbs(self, base: Indices) -> tuple[Floats, Floats]:
+        """Return what climbs from floors (...,) to all floors measure (..., F), mean, variance."""
+        k, j = base[..., None] - LOWEST, np.arange(len(self.mean_m))
+        p = self.covariance
+        return self.mean_m[j] - self.mean_m[k], p[j, j] + p[k, k] - 2.0 * p[j, k]
+
+    def where(
+        self, base: Indices, climbed_m: Floats, variance_m2: Floats, steps: Floats, over: Over
+    ) -> Floats:
+        """Return where nodes are (..., F + 1) that climbed from floors, then made level steps."""
+        climbed_m, variance_m2, steps = (
+            np.asarray(v)[..., None] for v in (climbed_m, variance_m2, steps)
+        )
+        mean_m, floors_m2 = self.climbs(base)
+        total = variance_m2 + floors_m2 + WORN_M**2
+        off_m = climbed_m - mean_m
+        density = (1.0 - HIDDEN) * _gaussian(off_m, total)
+        density += HIDDEN * _gaussian(off_m, total + HIDDEN_M**2)
+        start_m, start_m2 = self.climbs(np.zeros_like(base))
+        over_m, over_m2 = (np.asarray(v)[..., None] for v in over)
+        total = start_m2 + over_m2 + PRESSED_M**2
+        likelihood = np.exp(-0.5 * (over_m - start_m) ** 2 / total)
+        density *= likelihood / likelihood.max(axis=-1, keepdims=True)
         landing = np.maximum(BETWEEN * 0.5 ** (steps / BETWEEN_STEPS), LEAST_BETWEEN)
         weight = np.concatenate([density, landing / SPACING_M], axis=-1)
         probability: Floats = weight / weight.sum(axis=-1, keepdims=True)
         return probability
 
-    def height_of(self, floor: int) -> tuple[float, float]:
-        """Return a floor's height (m) and its variance (m^2)."""
-        k = floor - LOWEST
-        return float(self.mean_m[k]), float(self.covariance[k, k])
+    def height_of(self, base: int, climbed_m: float) -> tuple[float, float]:
+        """Return the height (m) of somebody who climbed from a floor, and its variance (m^2)."""
+        k = base - LOWEST
+        return float(self.mean_m[k]) + climbed_m, float(self.covariance[k, k])
 
-    def learn(self, floor: int, z_m: float, variance_m2: float) -> None:
-        """Learn that somebody on a floor is at a height."""
-        k = floor - LOWEST
-        gain = self.covariance[:, k].copy()
-        total = gain[k] + variance_m2 + WORN_M**2
-        self.mean_m += gain * ((z_m - self.mean_m[k]) / total)
+    def drawn_to(
+        self, z_m: float, variance_m2: float, probability: Floats, steps: float
+    ) -> tuple[float, float]:
+        """Return height and variance of one who is on floors so probably (F + 1).
+
+        Who walks on the level is on one, or at a height of its own.
+        """
+        walks = 1.0 - 0.5 ** (steps / BETWEEN_STEPS)
+        floors = walks * probability[:-1]
+        own = 1.0 - float(floors.sum())
+        mean_m = float(floors @ self.mean_m) + own * z_m
+        spread = floors @ ((self.mean_m - mean_m) ** 2 + np.diag(self.covariance) + WORN_M**2)
+        return mean_m, float(spread) + own * (variance_m2 + (z_m - mean_m) ** 2)
+
+    def learn(
+        self, base: int, floor: int, climbed_m: float, variance_m2: float, doubt_m: float
+    ) -> None:
+        """Learn from a climb between two floors, of a variance and a doubt (a deviation)."""
+        if floor == base:
+            return
+        k, j = base - LOWEST, floor - LOWEST
+        gain = self.covariance[:, j] - self.covariance[:, k]
+        total = gain[j] - gain[k] + variance_m2 + doubt_m**2 + WORN_M**2
+        self.mean_m += gain * ((climbed_m - self.mean_m[j] + self.mean_m[k]) / total)
         self.covariance -= np.outer(gain, gain) / total
+        self._climbs += 1
+        shared2 = SIGMA_SCALE**2 + (SHARED * doubt_m / (SPACING_M * (floor - base))) ** 2
+        self.scale2 += (shared2 - self.scale2) / self._climbs
+
+
+def _gaussian(off_m: Floats, variance_m2: Floats) -> Floats:
+    density: Floats = np.exp(-0.5 * off_m**2 / variance_m2) / np.sqrt(2.0 * np.pi * variance_m2)
+    return density
 
 
 def most_probable(probability: Floats) -> tuple[int | None, float]:
