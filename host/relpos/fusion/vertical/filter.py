@@ -428,16 +428,18 @@ class VerticalFilter:
         bias_m = heights.mean[:, FAST] + heights.mean[:, SLOW]
         slow_m2 = heights.covariance[:, SLOW, SLOW]
         known = np.where(self._settled & (slow_m2 < VAGUE_M**2), bias_m, np.nan)
-        pressed_m = np.zeros(len(bias_m))
+        pressed_m, shown = np.zeros(len(bias_m)), np.zeros(len(bias_m), dtype=np.bool_)
         for row in range(len(bias_m)):
             others = np.delete(known, row)
             others = others[np.isfinite(others)]
             if others.size:
                 pressed_m[row] = np.median(others)
+            # Some who were all misled by a fan do not outvote those who were not.
+            shown[row] = 2 * others.size >= len(bias_m) - 1
         # Of the bias, and of a height that is no longer reported.
         over_m2 = slow_m2 + np.maximum(heights.covariance.sum(axis=(1, 2)), 0.0)
         self._over = Over(heights.over_m - pressed_m, over_m2)
-        lost = np.abs(bias_m - pressed_m) > LOST_M + np.sqrt(slow_m2)
+        lost = shown & (np.abs(bias_m - pressed_m) > LOST_M + np.sqrt(slow_m2))
         self._settled &= ~lost
         self._doubt_m = np.where(lost, SPACING_M, self._doubt_m)
         open_ = np.flatnonzero(~self._settled)
