@@ -95,6 +95,9 @@ NEAR_M, VAGUE_M, SURE_M = 1.5, 1.0, 0.5
 LOST_M = 2.5
 """Whose pressure differs from the others' by more than any door's or fan's is on another floor."""
 
+BLOWN_M = 2.1
+"""Where the others do not show what a fan does: 25 Pa."""
+
 SETTLES_S = 3.0
 """After so long on the level a node is where it stays."""
 
@@ -407,6 +410,10 @@ class VerticalFilter:
         self._settled &= ~unseen
         walks = (moving > 0.5) | (one.reported.steps > STANDS_STEPS)
         others_m = (disturbed * one.rise_m).sum() / np.maximum((1.0 - moving).sum(), 1.0)
+        if len(moving) > MANY:
+            # All climb together, or a fan blows while all walk.
+            alike_m = float(np.median(one.rise_m))
+            others_m = np.where(np.abs(alike_m) > np.abs(others_m), alike_m, others_m)
         pressed_m = pressed_m + disturbed * one.rise_m
         self._doubt_m *= np.where(self._settled, math.exp(-duration_s / FAST_S), 1.0)
         self._doubt_m += _doubted_m(moving, one.rise_m, pressed_m - walks * others_m)
@@ -432,12 +439,13 @@ class VerticalFilter:
         for row in range(len(bias_m)):
             others = np.delete(known, row)
             others = others[np.isfinite(others)]
-            if others.size:
-                pressed_m[row] = np.median(others)
             # Some who were all misled by a fan do not outvote those who were not.
-            shown[row] = 2 * others.size >= len(bias_m) - 1
+            shown[row] = others.size > 0 and 2 * others.size >= len(bias_m) - 1
+            if shown[row]:
+                pressed_m[row] = np.median(others)
         # Of the bias, and of a height that is no longer reported.
         over_m2 = slow_m2 + np.maximum(heights.covariance.sum(axis=(1, 2)), 0.0)
+        over_m2 += np.where(shown, 0.0, BLOWN_M**2)
         self._over = Over(heights.over_m - pressed_m, over_m2)
         lost = shown & (np.abs(bias_m - pressed_m) > LOST_M + np.sqrt(slow_m2))
         self._settled &= ~lost
