@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 
@@ -18,8 +19,8 @@ from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.fusion.smoother.detection import learn_curve, update_factors
 from relpos.fusion.smoother.estimator import Smoother
 from relpos.fusion.smoother.graph import build_graph
-from relpos.fusion.smoother.kernels import State
-from relpos.fusion.smoother.problem import Problem, Weights
+from relpos.fusion.smoother.kernels import State, two_states
+from relpos.fusion.smoother.problem import Inliers, Problem, Weights
 from relpos.fusion.smoother.variance_components import (
     VarianceComponents,
     linearise,
@@ -27,6 +28,7 @@ from relpos.fusion.smoother.variance_components import (
     weights_of,
 )
 from relpos.measurements import Height, Motion, Prior, Range
+from relpos.simulation.missions import simulate_mission
 from relpos.simulation.paper import SimulatedRun, simulate_paper
 
 Floats = npt.NDArray[np.float64]
@@ -157,7 +159,7 @@ def test_the_covariance_blocks_are_those_of_the_dense_inverse() -> None:
 def test_the_components_move_the_solution_as_small_changes_of_them_do() -> None:
     problem, state, _ = _problem()
     components = VarianceComponents.first(problem.nodes)
-    inliers = np.ones(problem.graph.range_m.size)
+    inliers = Inliers.all_of(problem.graph)
     bases = motion_bases(problem, state, components)
     weights = weights_of(problem, components, bases, inliers)
     equations = problem.normal_equations(state, weights)
@@ -185,7 +187,7 @@ def test_missed_attempts_say_farther_and_received_ones_nearer() -> None:
     state = problem.first_state(graph.dead_reckoned(graph.prior))
     components = VarianceComponents.first(problem.nodes)
     bases = motion_bases(problem, state, components)
-    weights = weights_of(problem, components, bases, np.ones(graph.range_m.size))
+    weights = weights_of(problem, components, bases, Inliers.all_of(graph))
     state = problem.optimise(state, weights)
     distance = problem.attempt_distances(state)
     covariance = problem.normal_equations(state, weights).covariance()
@@ -320,3 +322,47 @@ def test_a_smoothed_mission_is_better_than_the_online_one_and_says_so(condition:
     online, smoothed = (s.relative_distance_rmse_m for s in scores)
     assert smoothed < 0.8 * online
     assert 0.5 < scores[1].nees_distance < 2.5
+
+
+def test_inlier_probabilities_are_those_of_all_sequences_of_states() -> None:
+    density = np.random.default_rng(4).uniform(0.1, 3.0, (5, 3))
+    chain, share, go_on = np.array([0, 0, 0, 2, 2]), 0.2, 0.7
+    begin = share * (1.0 - go_on) / (1.0 - share)
+    total, good, followed = 0.0, np.zeros(5), 0.0
+    for states in itertools.product((0, 1), repeat=5):
+        chance, again = 1.0, 0
+        for m, now in enumerate(states):
+            first = m == 0 or chain[m] != chain[m - 1]
+            before = 0 if first else states[m - 1]
+            bad = share if first else (go_on if before else begin)
+            chance *= (bad if now else 1.0 - bad) * density[m, now + now * before]
+            again += now * before
+        total += chance
+        good += chance * (1.0 - np.array(states))
+        followed += chance * again
+    found = np.empty(5)
+    expected, log_likelihood = two_states(density, chain, share, go_on, found)
+    assert found == pytest.approx(good / total)
+    assert expected == pytest.approx(followed / total)
+    assert log_likelihood == pytest.approx(math.log(total))
+
+
+def test_ranges_without_sight_do_not_bend_a_track() -> None:
+    """A third of them is 0.5 to 3 m too long, for 20 s at a time; the bank has 0.3 m."""
+    run = simulate_mission("mission-nlos", 810, {"seconds": 100, "nodes": 5})
+    made = Smoother(fusion.make("bank", run.priors, {"hypotheses": 50}, 1), (), run.priors)
+    estimates = [e for m in run.measurements for e in made.process(m)] + made.finish()
+    found = metrics.evaluate(
+        tracks.estimated_tracks(estimates),
+        tracks.true_tracks(run.truth),
+        tracks.estimated_pairs(estimates),
+    )
+    assert found.relative_distance_rmse_m < 0.2
+
+
+def test_who_sends_no_reports_any_more_may_walk_on() -> None:
+    motions = [Motion(float(t), n, 1.0, 0.0, 0.0) for t in range(1, 9) for n in (1, 2)]
+    graph, _ = build_graph([m for m in motions if m.node == 1 or m.time_s < 5.5])
+    assert (graph.unseen_m2[5:, 1] > 0.1).all()
+    assert not graph.unseen_m2[:5, 1].any()
+    assert not graph.unseen_m2[:, 0].any()

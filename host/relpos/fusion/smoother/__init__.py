@@ -5,5 +5,5 @@ over all poses and the hidden constants is solved by Levenberg-Marquardt on bloc
 normal equations; variance components are estimated by maximum marginal likelihood between the
 solutions. Begin reading at :mod:`~relpos.fusion.smoother.estimator` (the interface), then
 ``solution`` (the alternation), ``graph`` (the run in arrays), ``problem`` (residuals and normal
-equations), ``variance_components`` and ``detection``.
+equations), ``inliers``, ``variance_components`` and ``detection``.
 """

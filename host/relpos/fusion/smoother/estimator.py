@@ -29,7 +29,7 @@ from relpos.fusion.estimator import (
 from relpos.fusion.smoother.as_learned import as_learned
 from relpos.fusion.smoother.graph import Graph, build_graph
 from relpos.fusion.smoother.problem import Problem
-from relpos.fusion.smoother.solution import Solution, smooth
+from relpos.fusion.smoother.solution import Solution, beginnings, smooth
 from relpos.fusion.smoother.variance_components import VarianceComponents
 from relpos.fusion.vertical.offline import as_climbed
 from relpos.measurements import Measurement, Prior
@@ -84,14 +84,17 @@ class Smoother:
         graph = _with_frame(graph, self._estimates)
         problem = Problem(graph)
         attempts = [self._estimates, *(_replay(e, self._measurements) for e in self.others)]
-        for estimates in attempts:
-            poses = _poses(graph, estimates)
-            self.solutions.append(smooth(problem, problem.first_state(poses)))
+        for k, estimates in enumerate(attempts):
+            state = problem.first_state(_poses(graph, estimates))
+            self.solutions += [
+                smooth(problem, state, inliers=believed)
+                for believed in (beginnings(problem, state) if k == 0 else [None])
+            ]
         self.solutions.sort(key=lambda s: s.cost)
         best = _without_needless_constants(problem, self.solutions[0])
         self.solutions.insert(0, best)
-        self._own["smoother_attempts"] += len(attempts)
-        self._own["smoother_outliers"] += int(np.sum(best.inliers < 0.5))
+        self._own["smoother_attempts"] += len(self.solutions) - 1
+        self._own["smoother_outliers"] += int(np.sum(best.inliers.ranges < 0.5))
         return list(_estimates(problem, best, self._estimates))
 
     def counters(self) -> Mapping[str, int]:
@@ -106,7 +109,7 @@ def _without_needless_constants(problem: Problem, best: Solution) -> Solution:
         components = VarianceComponents.first(
             problem.nodes, calibrated=calibrated, to_scale=to_scale
         )
-        simpler = smooth(problem, best.state, components)
+        simpler = smooth(problem, best.state, components, best.inliers)
         if simpler.cost < least:
             chosen, least = simpler, simpler.cost
     return chosen

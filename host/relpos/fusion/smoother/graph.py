@@ -101,7 +101,7 @@ class Graph:
     """(K - 1, N) reported standard deviations of chords, 0 where none are."""
     unseen_m2: Floats
     """(K - 1, N) variance of each coordinate of what a node may have walked beside its path, where
-    one report covers several of the usual ones: the sum of a gap."""
+    one report covers several of the usual ones, the sum of a gap, or none came any more."""
     reports: Floats
     """(K - 1, N) in how many reports' parts a chord lies, in equal parts: 1 for a whole report, 2
     for two halves. The noise of consecutive chords is correlated where reports are parted."""
@@ -342,7 +342,8 @@ def _unseen(duration_s: Floats, report_s: Floats, has_report: npt.NDArray[np.boo
          for own, has in zip(report_s.T, has_report.T, strict=True)]
     )  # fmt: skip
     walked_m2 = 0.5 * np.array([unseen_variance(s) for s in duration_s])
-    return np.where(report_s > GAP * usual_s, walked_m2[:, None], 0.0)
+    ended = has_report.any(axis=0) & ~np.logical_or.accumulate(has_report[::-1], axis=0)[::-1]
+    return np.where((report_s > GAP * usual_s) | ended, walked_m2[:, None], 0.0)
 
 
 def _usual_length(length_m: Floats, walks: npt.NDArray[np.bool_], half: int = 3) -> Floats:

@@ -327,3 +327,46 @@ def range_variances(state: State, ranges: Ranges, covariance: Covariance) -> Flo
             total += constants[common, common] + constants[own, own] + 2.0 * constants[common, own]
         result[m] = total
     return result
+
+
+@compiled
+def two_states(
+    density: Floats, chain: Integers, share: float, go_on: float, probability: Floats
+) -> tuple[float, float]:
+    """Forward-backward passes of two-state Markov chains; fills ``probability`` (M,) of state 0.
+
+    ``density`` (M, 3): in state 0, in state 1 after state 0, in state 1 after state 1. ``chain``
+    (M,) tells the chains, one after another. State 1 has the stationary probability ``share`` and
+    follows itself with ``go_on``. Returns how often it is expected to do so, and the log
+    likelihood.
+    """
+    count = chain.size
+    begin = share * (1.0 - go_on) / (1.0 - share)
+    first, second, scale = np.empty(count), np.empty(count), np.empty(count)
+    log_likelihood = 0.0
+    for m in range(count):
+        if m > 0 and chain[m] == chain[m - 1]:
+            first[m] = (1.0 - begin) * first[m - 1] + (1.0 - go_on) * second[m - 1]
+            second[m] = begin * first[m - 1] * density[m, 1]
+            second[m] += go_on * second[m - 1] * density[m, 2]
+        else:
+            first[m], second[m] = 1.0 - share, share * density[m, 1]
+        first[m] *= density[m, 0]
+        scale[m] = first[m] + second[m]
+        first[m] /= scale[m]
+        second[m] /= scale[m]
+        log_likelihood += math.log(scale[m])
+    followed = 0.0
+    late_first, late_second = 1.0, 1.0
+    for m in range(count - 1, -1, -1):
+        if m == count - 1 or chain[m] != chain[m + 1]:
+            late_first, late_second = 1.0, 1.0
+        else:
+            good = density[m + 1, 0] * late_first / scale[m + 1]
+            again = go_on * density[m + 1, 2] * late_second / scale[m + 1]
+            bad = density[m + 1, 1] * late_second / scale[m + 1]
+            followed += second[m] * again
+            late_first = (1.0 - begin) * good + begin * bad
+            late_second = (1.0 - go_on) * good + again
+        probability[m] = first[m] * late_first
+    return followed, log_likelihood

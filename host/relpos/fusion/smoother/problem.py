@@ -23,6 +23,24 @@ class Weights(NamedTuple):
     constants: Floats
 
 
+class Inliers(NamedTuple):
+    """What ranges and reports are: as noise has them, or outliers and odometry faults."""
+
+    ranges: Floats
+    """(M,) probability of each range to be no outlier."""
+    reports: Floats
+    """(K - 1, N) probability of each chord to be no fault."""
+    followed: float = 0.0
+    """Expected number of outliers that follow another."""
+    log_likelihood: float = 0.0
+    """Of all ranges and reports."""
+
+    @classmethod
+    def all_of(cls, graph: Graph) -> Inliers:
+        """Take everything for an inlier."""
+        return cls(np.ones(graph.range_m.size), np.ones(graph.has_report.shape))
+
+
 class DetectionFactors(NamedTuple):
     """What each attempt's outcome says of its distance, as a Gaussian (Q,); weight 0: nothing."""
 

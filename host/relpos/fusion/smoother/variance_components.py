@@ -15,11 +15,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion.models.odometry_faults import JUMP_M
+from relpos.fusion.models.ranging import GO_ON, GO_ON_RANGES
 from relpos.fusion.smoother import kernels
 from relpos.fusion.smoother.block_solver import Covariance
 from relpos.fusion.smoother.graph import Graph
 from relpos.fusion.smoother.kernels import State
-from relpos.fusion.smoother.problem import Problem, Weights
+from relpos.fusion.smoother.problem import Inliers, Problem, Weights
 
 Floats = npt.NDArray[np.float64]
 
@@ -61,13 +63,21 @@ CALIBRATED_PAIR_BIAS = 0.03**2
 """Of ranges whose antenna delays were calibrated: the common bias, and a pair's (m^2)."""
 
 
+MOST_GO_ON = 0.98
+
+FAULT = np.array([JUMP_M**2, JUMP_M**2, math.pi**2 / 3.0])
+"""Variances of a faulty report along, across (m^2) and of its turn, which is anything (rad^2)."""
+
+
 @dataclass
 class VarianceComponents:
     """What the alternation estimates; ``motion`` (N, 7) by :class:`Motion`."""
 
     motion: Floats
-    range_m2: float = 0.3**2
+    range_m2: float = 0.15**2
     outliers: float = 0.05
+    outliers_go_on: float = GO_ON
+    """Probability that a pair's next range is an outlier, too."""
     scale: float = FIRST_SCALE
     drift_rad2_s2: float = FIRST_DRIFT
     common_bias_m2: float = 0.3**2
@@ -146,43 +156,16 @@ def weights_of(
     problem: Problem,
     components: VarianceComponents,
     bases: Floats,
-    inliers: Floats,
+    inliers: Inliers,
     widened_m: float = 0.0,
 ) -> Weights:
     """1 / variance of everything; outliers count nothing, ranges are ``widened_m`` wider."""
+    variance, usual = components.variances(problem.graph, bases), inliers.reports[..., None]
     return Weights(
-        1.0 / components.variances(problem.graph, bases),
-        inliers / (components.range_inflation * components.range_m2 + widened_m**2),
+        usual / variance + (1.0 - usual) / (variance + FAULT),
+        inliers.ranges / (components.range_inflation * components.range_m2 + widened_m**2),
         components.constant_weights(problem),
     )
-
-
-# -- ranges ----------------------------------------------------------------------------------------
-
-SPAN_M = 10.0
-"""An outlier may be anywhere within this."""
-
-
-def range_densities(
-    problem: Problem, state: State, components: VarianceComponents, widened_m: float = 0.0
-) -> tuple[Floats, float]:
-    """Density of each range's residual as an inlier (M,), and as an outlier, by their shares."""
-    variance = components.range_m2 + widened_m**2
-    measured = problem.graph.range_m
-    predicted = problem.range_residuals(state) + problem.range_m
-    good = np.exp(-0.5 * (predicted - measured) ** 2 / variance)
-    good += np.exp(-0.5 * (predicted + measured) ** 2 / variance)
-    good /= math.sqrt(2.0 * math.pi * variance)
-    span = max(SPAN_M, 10.0 * math.sqrt(variance))
-    return (1.0 - components.outliers) * good, components.outliers / span
-
-
-def inlier_probabilities(
-    problem: Problem, state: State, components: VarianceComponents, widened_m: float = 0.0
-) -> Floats:
-    """Probability of each range to be no outlier, (M,)."""
-    good, outlier = range_densities(problem, state, components, widened_m)
-    return good / (good + outlier)
 
 
 # -- motion: Newton steps --------------------------------------------------------------------------
@@ -312,7 +295,7 @@ scale, and a wide prior would let it say anything."""
 
 
 def update_components(
-    problem: Problem, at: Linearisation, components: VarianceComponents, inliers: Floats
+    problem: Problem, at: Linearisation, components: VarianceComponents, sorted_out: Inliers
 ) -> float:
     """Move every component towards the greatest marginal likelihood; return the largest change.
 
@@ -324,6 +307,7 @@ def update_components(
     with p = v - ..., Zhou et al. 2019 show ascent; the quotient itself is Foerstner's).
     """
     change = _step_motion(problem, at, components)
+    inliers = sorted_out.ranges
     if not inliers.size:
         return change
     residual_m = problem.range_residuals(at.state)
@@ -354,7 +338,10 @@ def update_components(
     components.pair_bias_m2 = fixed_point(
         components.pair_bias_m2, slice(2 * n + 1, None), first_bias
     )
-    components.outliers = float((np.sum(1.0 - inliers) + 0.5) / (inliers.size + 50.0))
+    outliers = float(np.sum(1.0 - inliers))
+    components.outliers = (outliers + 0.5) / (inliers.size + 50.0)
+    up, down = sorted_out.followed + GO_ON * GO_ON_RANGES, outliers + GO_ON_RANGES
+    components.outliers_go_on = min(up / down, MOST_GO_ON)
     return change
 
 
