@@ -1,7 +1,7 @@
 """How the estimators do on missions that nobody planned, condition by condition.
 
     python bench/missions.py [--seeds 3] [--first 0] [--only TEXT] [--estimators bank,ekf]
-                             [--set KEY=VALUE] [--workers N] [--regrouping]
+                             [--set KEY=VALUE] [--workers N] [--seconds S] [--regrouping]
 
 prints, for each condition of ``relpos.simulation.missions`` and each estimator: distance, aligned
 and body-frame RMSE (m) and distance NEES, means over the seeds; of the pair-seconds with status
@@ -136,14 +136,17 @@ class PlainEkf(Rewinder):
         super().__init__(JointEkf(priors), Timeline([p.node for p in priors]))
 
 
-def case(condition: str, estimator: str, settings: dict[str, str]) -> study.Case:
-    """Make one line of the table."""
+def case(
+    condition: str, estimator: str, settings: dict[str, str], seconds: float | None = None
+) -> study.Case:
+    """Make one line of the table; ``seconds`` are the missions' own where None."""
     name, given = {"ekf": (EKF, {}), "smoother": ("bank", settings)}.get(
         estimator, (estimator, settings)
     )
     label = f"{condition:18}{estimator:9}"
     scenario = f"{missions.PREFIX}-{condition}"
-    return study.Case(label, scenario, {}, name, given, smooth=estimator == "smoother")
+    overrides = {} if seconds is None else {"seconds": seconds}
+    return study.Case(label, scenario, overrides, name, given, smooth=estimator == "smoother")
 
 
 def row_of(made: study.Outcome, plain: study.Outcome | None) -> str:
@@ -220,6 +223,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="conditions whose name has this text, or a,b")
     parser.add_argument("--estimators", default="bank,ekf")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--seconds", type=float, default=None, help="length of each mission")
     parser.add_argument("--workers", type=int, default=None)
     parser.add_argument("--regrouping", action="store_true", help="when splits are right again")
     given = parser.parse_args()
@@ -238,7 +242,10 @@ def main() -> None:
             if not any(text in condition for text in given.only.split(",")):
                 continue
             names = given.estimators.split(",")
-            made = {n: study.run([case(condition, n, settings)], seeds, pool)[0] for n in names}
+            made = {
+                n: study.run([case(condition, n, settings, given.seconds)], seeds, pool)[0]
+                for n in names
+            }
             for outcome in made.values():
                 print(row_of(outcome, made.get("ekf")), flush=True)
 

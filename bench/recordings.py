@@ -1,12 +1,13 @@
 """An estimator on the real recordings, against dead reckoning from the true start.
 
-    python bench/recordings.py [--estimator bank] [--seeds 4] [--set KEY=VALUE ...]
+    python bench/recordings.py [--estimator bank] [--seeds 4] [--set KEY=VALUE ...] [--smooth]
                                [--after 0] [--only known] [--biases]
 
 For every run of two_robots_vio and four_robots_uwb: distance, aligned and body-frame RMSE (m,
 mean over seeds) from known and from unknown starts, distance NEES, and when unknown starts were
-resolved. ``--after`` leaves the first seconds out of the score. ``--biases`` prints, from known
-starts, each pair's learned range bias beside the median residual against the truth.
+resolved. ``--smooth`` adds the smoother. ``--after`` leaves the first seconds out of the score.
+``--biases`` prints, from known starts, each pair's learned range bias beside the median residual
+against the truth.
 """
 
 from __future__ import annotations
@@ -37,12 +38,18 @@ RUNS = (
 )
 
 
+SMOOTHED = "smoothed "
+"""Before an estimator's name: the smoother that begins from it."""
+
+
 def fuse(
     name: str, estimator: str, initial: InitialPose, settings: Mapping[str, str], seed: int
 ) -> tuple[Run, list[Estimate]]:
     """Fuse one recording."""
     run = load_run(DATA / name)
-    made = fusion.make(estimator, run.priors_for(initial), settings, seed, run.nodes)
+    make = fusion.make_smoother if estimator.startswith(SMOOTHED) else fusion.make
+    estimator = estimator.removeprefix(SMOOTHED)
+    made = make(estimator, run.priors_for(initial), settings, seed, run.nodes)
     return run, [e for m in run.measurements for e in made.process(m)] + made.finish()
 
 
@@ -110,18 +117,21 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", default="", help="known or unknown starts alone")
     parser.add_argument("--estimator", default="bank")
+    parser.add_argument("--smooth", action="store_true")
     parser.add_argument("--biases", action="store_true")
     given = parser.parse_args()
     settings = dict(item.split("=", 1) for item in given.set)
     if given.biases:
         print_biases(given.seeds, settings)
         return
-    cases = (
-        ("dead reckoning", "deadreckoning", InitialPose.FROM_TRUTH, {}, 1),
-        ("known start", given.estimator, InitialPose.FROM_TRUTH, settings, given.seeds),
-        ("unknown start", given.estimator, InitialPose.UNKNOWN, settings, given.seeds),
-    )
-    print(f"{'':34}{'':15}{'dist':>6}{'align':>7}{'body':>7}{'NEES':>7}  resolved at s")
+    cases = [("dead reckoning", "deadreckoning", InitialPose.FROM_TRUTH, {}, 1)]
+    for kind in ("", SMOOTHED) if given.smooth else ("",):
+        made = kind + given.estimator
+        cases += [
+            (f"{kind}known start", made, InitialPose.FROM_TRUTH, settings, given.seeds),
+            (f"{kind}unknown start", made, InitialPose.UNKNOWN, settings, given.seeds),
+        ]
+    print(f"{'':34}{'':23}{'dist':>6}{'align':>7}{'body':>7}{'NEES':>7}  resolved at s")
     with ProcessPoolExecutor(given.workers) as pool:
         for name in RUNS:
             for label, estimator, initial, chosen, seeds in cases:
@@ -138,7 +148,7 @@ def main() -> None:
                 mean = results.mean(axis=0)
                 when = " ".join(f"{t:.0f}" for t in sorted(results[:, 4])) if "un" in label else ""
                 print(
-                    f"{name:34}{label:15}{mean[0]:6.2f}{mean[1]:7.2f}{mean[2]:7.2f}{mean[3]:7.2f}"
+                    f"{name:34}{label:23}{mean[0]:6.2f}{mean[1]:7.2f}{mean[2]:7.2f}{mean[3]:7.2f}"
                     f"  {when}",
                     flush=True,
                 )

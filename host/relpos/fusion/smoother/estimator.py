@@ -26,6 +26,7 @@ from relpos.fusion.estimator import (
     PairEstimate,
     Parameter,
 )
+from relpos.fusion.models.unseen_walk import TURNS_RAD2_S, WALKING_M_S
 from relpos.fusion.smoother.as_learned import as_learned
 from relpos.fusion.smoother.graph import Graph, build_graph
 from relpos.fusion.smoother.problem import Problem
@@ -39,6 +40,9 @@ Floats = npt.NDArray[np.float64]
 SURE_M = 1.0
 """A node that the online estimator left ambiguous, and that smoothing does not place within
 this, stays ambiguous."""
+
+FACING_KNOTS, WAY_RAD = 2, 0.5
+"""Over so many knots before and after the way is taken, and how well a gap's way is known."""
 
 SIMPLER_BY = 3.0
 """How much more (logarithmic) evidence a team without biases or scales must have: errors that last
@@ -187,6 +191,7 @@ def _estimates(
     """Turn a solution into the rows of the run format, one epoch after another."""
     graph, poses = problem.graph, solution.state.poses
     knots, nodes = poses.shape[:2]
+    facing = _facing(graph, poses)
     blocks = solution.covariance.diagonal.reshape(knots, nodes, 3, nodes, 3)
     alone = blocks[:, np.arange(nodes), :, np.arange(nodes), :].transpose(1, 0, 2, 3)
     news = graph.has_report & (graph.unseen_m2 == 0.0)
@@ -205,6 +210,9 @@ def _estimates(
         rows = []
         for n, name in enumerate(graph.node_ids):
             p = alone[k, n]
+            heading, sigma_rad = facing.get(
+                (k, n), (float(poses[k, n, 2]), math.sqrt(max(float(p[2, 2]), 0.0)))
+            )
             spread = math.sqrt(max(float(p[0, 0] + p[1, 1]), 0.0))
             located = bool(begun[k - 1, n] and ranged[n])
             status = NodeStatus.OK
@@ -219,15 +227,37 @@ def _estimates(
             rows.append(
                 NodeEstimate(
                     name, float(poses[k, n, 0]), float(poses[k, n, 1]),
-                    math.remainder(float(poses[k, n, 2]), 2.0 * math.pi),
+                    math.remainder(heading, 2.0 * math.pi),
                     float(p[0, 0]), float(p[1, 1]), float(p[0, 1]),
-                    min(math.sqrt(max(float(p[2, 2]), 0.0)), ANY_ANGLE_RAD), status,
+                    min(sigma_rad, ANY_ANGLE_RAD), status,
                     float(graph.height_m[k, n]), *vertical.get((time_s, name), ()),
                 )
             )  # fmt: skip
         shown = [n for n, node in enumerate(rows) if node.status is not NodeStatus.UNLOCATED]
         pairs = _pairs(graph.node_ids, poses[k], blocks[k], shown)
         yield Estimate(time_s, tuple(rows), pairs, (), _parameters(problem, solution, time_s))
+
+
+def _facing(graph: Graph, poses: Floats) -> dict[tuple[int, int], tuple[float, float]]:
+    """Return headings (rad) within gaps of the reports, and deviations, by knot and row of a node.
+
+    A gap's turns are known by their sum alone: who walks faces the way, and who stands may have
+    turned (:mod:`relpos.fusion.models.unseen_walk`).
+    """
+    result, time_s, gap = {}, graph.time_s, graph.unseen_m2 > 0.0
+    going_on = np.vstack([gap[1:], np.ones(gap.shape[1], dtype=bool)])
+    for chord, row in np.argwhere(gap & going_on):
+        knot, n = int(chord) + 1, int(row)
+        first, last = max(knot - FACING_KNOTS, 0), min(knot + FACING_KNOTS, len(poses) - 1)
+        way_m, duration_s = poses[last, n] - poses[first, n], time_s[last] - time_s[first]
+        east, north = (way_m[:2] / duration_s).tolist()
+        if math.hypot(east, north) > WALKING_M_S:
+            result[knot, n] = math.atan2(north, east), WAY_RAD
+        else:
+            begun = int(np.flatnonzero(~gap[:chord, n]).max(initial=-1)) + 1
+            turned_rad = math.sqrt(TURNS_RAD2_S * float(time_s[knot] - time_s[begun]))
+            result[knot, n] = float(poses[knot, n, 2]), turned_rad
+    return result
 
 
 def _pairs(
