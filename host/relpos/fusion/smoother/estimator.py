@@ -88,11 +88,10 @@ class Smoother:
         graph = _with_frame(graph, self._estimates)
         problem = Problem(graph)
         attempts = [self._estimates, *(_replay(e, self._measurements) for e in self.others)]
-        for k, estimates in enumerate(attempts):
+        for estimates in attempts:
             state = problem.first_state(_poses(graph, estimates))
             self.solutions += [
-                smooth(problem, state, inliers=believed)
-                for believed in (beginnings(problem, state) if k == 0 else [None])
+                smooth(problem, state, inliers=believed) for believed in beginnings(problem, state)
             ]
         self.solutions.sort(key=lambda s: s.cost)
         best = _without_needless_constants(problem, self.solutions[0])

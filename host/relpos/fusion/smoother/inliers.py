@@ -54,10 +54,13 @@ def _ranges(
     density = np.empty((pair.size, 3))
     density[:, 0] = _normal(excess_m, variance) + _normal(predicted + measured, variance)
     density[:, 1:] = 1.0 / max(SPAN_M, 10.0 * math.sqrt(variance))
-    # As far off as the last one; what stands in between makes a range too long, never too short.
-    alike = _normal(np.diff(excess_m), AGAIN_M**2 + 2.0 * variance)
-    density[1:, 2] += np.where(excess_m[:-1] > 0.0, ALIKE, 0.0) * (alike - density[1:, 1])
-    share, go_on = components.outliers, max(components.outliers_go_on, components.outliers)
+    share = go_on = components.outliers
+    # Between two nodes alone nothing tells ranges without sight from an odometry that is wrong.
+    if len(problem.graph.pairs) > 1:
+        go_on = max(components.outliers_go_on, share)
+        # As far off as the last one: what stands in between makes ranges too long, never too short.
+        alike = _normal(np.diff(excess_m), AGAIN_M**2 + 2.0 * variance)
+        density[1:, 2] += np.where(excess_m[:-1] > 0.0, ALIKE, 0.0) * (alike - density[1:, 1])
     probability, inlier = np.empty(pair.size), np.empty(pair.size)
     followed, log_likelihood = kernels.two_states(density, pair[order], share, go_on, inlier)
     probability[order] = inlier

@@ -58,16 +58,14 @@ deviations."""
 
 
 def beginnings(problem: Problem, state: State) -> Iterator[Inliers | None]:
-    """Give what may be believed of a first state: its outliers and faults, its outliers, nothing.
+    """Give what may be believed of a first state: its outliers and odometry faults, or nothing.
 
-    A good state is bent by ranges without sight where it is not believed (``mission-nlos``, seed
-    810: 0.59 and 0.16 m); but an online estimator's corrections look like faults of reports.
+    A fault is hardly found where it is not believed; but corrections of the online estimator look
+    like faults, and what it takes for outliers may be its own error.
     """
     components = VarianceComponents.first(problem.nodes)
     bases = motion_bases(problem, state, components)
-    first = inlier_probabilities(problem, state, components, bases)
-    yield first
-    yield first._replace(reports=np.ones(first.reports.shape))
+    yield inlier_probabilities(problem, state, components, bases)
     yield None
 
 
