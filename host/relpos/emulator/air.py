@@ -128,7 +128,7 @@ class UwbAir:
         self._rng = rng
         self._under_way: list[_Exchange] = []
         self._places: dict[tuple[int, int], tuple[FloatArray, float]] = {}
-        """Pair -> positions (2, 3) at the last exchange, the lower node first, and the place."""
+        """Pair -> position of the second from the first at the last exchange, and the place."""
         self.body: Callable[[Pozyx, Pozyx, int], bool] | None = None
         """Whether a wearer's body is between two tags."""
         self.on_end: Callable[[ExchangeRecord], None] | None = None
@@ -153,7 +153,7 @@ class UwbAir:
                 self._rng,
                 first_m,
                 second_m,
-                place=self._place((initiator_id, destination), first_m, second_m),
+                place=self._place(initiator_id, destination, second_m - first_m),
                 body=self.body is not None and self.body(*ends, time_us),
             )
             if measured is None:
@@ -191,16 +191,17 @@ class UwbAir:
 
         self._clock.at(exchange.end_us, end)
 
-    def _place(self, pair: tuple[int, int], first_m: FloatArray, second_m: FloatArray) -> float:
-        """Return the pair's standard normal: as last time where neither has moved."""
+    def _place(self, first: int, second: int, line_m: FloatArray) -> float:
+        """Return the pair's standard normal: as last time where it has not moved."""
         if not self._world.uwb.as_tables:
             return 0.0
-        ends_m = np.stack((first_m, second_m) if pair[0] < pair[1] else (second_m, first_m))
-        key = min(pair), max(pair)
-        before_m, last = self._places.get(key, (ends_m, self._rng.standard_normal()))
-        moved_m = float(np.linalg.norm(ends_m - before_m, axis=1).sum())
+        pair, line_m = (first, second), line_m
+        if second < first:
+            pair, line_m = (second, first), -line_m
+        before_m, last = self._places.get(pair, (line_m, self._rng.standard_normal()))
+        moved_m = float(np.linalg.norm(line_m - before_m))
         place = range_errors.next_place(last, moved_m, self._rng)
-        self._places[key] = ends_m, place
+        self._places[pair] = line_m, place
         return place
 
     def _find(self, initiator: Pozyx, destination: int, time_us: int) -> Pozyx | None:

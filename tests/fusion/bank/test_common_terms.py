@@ -148,4 +148,4 @@ def test_the_shared_entries_are_named_in_their_order() -> None:
     core.add_node((0.0, 0.0, 0.0), 0.1, 0.1)
     these = core.hypotheses
     assert [these.common_entry(index) for index in CommonIndex] == [5, 6, 7, 8]
-    assert these.clock_entry(0) == 9
+    assert these.clock_entry(0) == 8

@@ -124,7 +124,7 @@ class _Collected(NamedTuple):
     measured: Range
     excess_m: float
     """By how much it exceeded the distance that was estimated at its instant."""
-    slopes: tuple[float, float, float]
+    slopes: tuple[float, float]
     variance_m2: float
     """What uncertain heights add to the range's."""
 
