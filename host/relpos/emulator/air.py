@@ -11,7 +11,6 @@ from enum import StrEnum
 
 import numpy as np
 
-from relpos.simulation import range_errors
 from relpos.simulation.world import FloatArray, World
 
 from .pozyx import (
@@ -127,10 +126,6 @@ class UwbAir:
         self._position_m = position_m
         self._rng = rng
         self._under_way: list[_Exchange] = []
-        self._places: dict[tuple[int, int], tuple[FloatArray, float]] = {}
-        """Pair -> position of the second from the first at the last exchange, and the place."""
-        self.body: Callable[[Pozyx, Pozyx, int], bool] | None = None
-        """Whether a wearer's body is between two tags."""
         self.on_end: Callable[[ExchangeRecord], None] | None = None
         """Called with each exchange when it is over: for measurements and tests."""
         self.spoil: Callable[[Pozyx, float | None, int], tuple[float | None, bool]] | None = None
@@ -147,14 +142,8 @@ class UwbAir:
         if responder is None:
             self.counts["absent"] += 1
         else:
-            ends = initiator, responder
-            first_m, second_m = (self._position_m(tag, time_us) for tag in ends)
             measured = self._world.measure_range(
-                self._rng,
-                first_m,
-                second_m,
-                place=self._place(initiator_id, destination, second_m - first_m),
-                body=self.body is not None and self.body(*ends, time_us),
+                self._rng, *(self._position_m(tag, time_us) for tag in (initiator, responder))
             )
             if measured is None:
                 self.counts["undetected"] += 1
@@ -190,19 +179,6 @@ class UwbAir:
                 self.on_end(ExchangeRecord(time_us, now_us, initiator_id, destination, outcome))
 
         self._clock.at(exchange.end_us, end)
-
-    def _place(self, first: int, second: int, line_m: FloatArray) -> float:
-        """Return the pair's standard normal: as last time where it has not moved."""
-        if not self._world.uwb.as_tables:
-            return 0.0
-        pair, line_m = (first, second), line_m
-        if second < first:
-            pair, line_m = (second, first), -line_m
-        before_m, last = self._places.get(pair, (line_m, self._rng.standard_normal()))
-        moved_m = float(np.linalg.norm(line_m - before_m))
-        place = range_errors.next_place(last, moved_m, self._rng)
-        self._places[pair] = line_m, place
-        return place
 
     def _find(self, initiator: Pozyx, destination: int, time_us: int) -> Pozyx | None:
         for tag in self.tags:

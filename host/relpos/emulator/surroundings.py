@@ -117,8 +117,8 @@ def draw_inertial_errors(rng: np.random.Generator) -> InertialErrors:
     Typical spread, from the MPU-6050/9150 data sheets as remembered and to be checked on
     hardware: accelerometer bias sd 20 mg (specified +-80 mg), scale sd 1 % (specified +-3 %),
     cross axis sd 0.5 % (2 %), noise 400 ug/rtHz; gyroscope bias sd 2 deg/s (20 deg/s), scale sd
-    1 % (3 %), noise 0.0085 deg/s/rtHz (still_mpu9150_8chips), walk 0.002 deg/s/rts; sample clock
-    from the gyroscope's PLL sd 0.3 %, never past the specified 1 %.
+    1 % (3 %), noise 0.005 deg/s/rtHz, walk 0.002 deg/s/rts; sample clock from the gyroscope's
+    PLL sd 0.3 %, never past the specified 1 %.
     """
     degree = np.pi / 180.0
 
@@ -133,7 +133,7 @@ def draw_inertial_errors(rng: np.random.Generator) -> InertialErrors:
         accelerometer_noise_m_s2_rthz=400e-6 * STANDARD_GRAVITY_M_S2,
         gyroscope_gain=gain(),
         gyroscope_bias_rad_s=2.0 * degree * rng.standard_normal(3),
-        gyroscope_noise_rad_s_rthz=0.0085 * degree,
+        gyroscope_noise_rad_s_rthz=0.005 * degree,
         gyroscope_walk_rad_s_rts=0.002 * degree,
         sample_clock_ppm=float(np.clip(3000.0 * rng.standard_normal(), -10_000.0, 10_000.0)),
         seed=int(rng.integers(1 << 62)),

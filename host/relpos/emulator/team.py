@@ -51,10 +51,6 @@ BYTES_PER_SAMPLE = 280.0
 """Of a prepared walk (27 numbers of truth, 6 once more for the chip); measured, 20 walkers, 2 h."""
 
 
-FACES_AWAY = -0.5
-"""Cosine of the direction from which on the wearer's body is in the way: 120 degrees."""
-
-
 @dataclass(frozen=True)
 class TeamConfig:
     """Who is emulated, and how.
@@ -109,7 +105,6 @@ class EmulatedTeam:
         uwb_rng, radio_rng = (np.random.default_rng([seed, k, 0xA17]) for k in (1, 2))
         model = UwbModel(collisions=config.collisions)
         self.uwb = UwbAir(self.clock, self.world, self._tag_position_m, uwb_rng, model)
-        self.uwb.body = self._body_between
         self.radio = RadioAir(self.clock, self.world, self._module_distance_m, radio_rng)
         self._output: list[tuple[int, bytes]] = []
         self.host_fault: Callable[[int], int | None] | None = None
@@ -286,15 +281,6 @@ class EmulatedTeam:
 
     def _tag_position_m(self, tag: Pozyx, time_us: int) -> FloatArray:
         return self._walker_of_tag[tag].position_at(time_us * 1e-6)
-
-    def _body_between(self, first: Pozyx, second: Pozyx, time_us: int) -> bool:
-        """Whether one of two wearers, tags on the chest, faces away from the other."""
-        here, there = self._walker_of_tag[first], self._walker_of_tag[second]
-        k = min(round(time_us * 1e-6 * RATE_HZ), len(here.heading_rad) - 1)
-        x, y = (there.position_m[k] - here.position_m[k])[:2].tolist()
-        bearing = math.atan2(y, x)
-        ahead = math.cos(bearing - here.heading_rad[k]), -math.cos(bearing - there.heading_rad[k])
-        return min(ahead) < FACES_AWAY
 
     def _module_distance_m(self, one: XbeeModule, other: XbeeModule, time_us: int) -> float:
         return math.dist(

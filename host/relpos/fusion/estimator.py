@@ -164,8 +164,7 @@ class Parameter:
     Names: ``step_scale`` (true over reported length), ``heading_drift_rad_s``, ``range_bias_m``,
     ``height_difference_m`` (of a pair, where no heights are reported), ``detection_range_m``,
     ``body_shadow_m`` (what a body in between adds to a range), ``range_lateness_s`` (by how much
-    ranges are dated late), ``range_growth_m`` (what they are too long by per logarithm of the
-    distance), ``clock_offset_s`` (how far a node's clock is ahead of most others').
+    ranges are dated late), ``clock_offset_s`` (how far a node's clock is ahead of most others').
     """
 
     time_s: float

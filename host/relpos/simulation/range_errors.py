@@ -9,8 +9,6 @@ bias that grows with distance, because a weaker first path is detected later; wh
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import numpy.typing as npt
 
@@ -59,14 +57,10 @@ def places(moved_m: Floats, rng: np.random.Generator) -> Floats:
 
     A first-order process: places nearer than ``PLACE_SIZE_M`` are alike.
     """
+    kept = np.exp(-moved_m / PLACE_SIZE_M)
+    fresh = np.sqrt(1.0 - kept**2) * rng.standard_normal(len(moved_m))
     out = np.empty(len(moved_m))
     last = rng.standard_normal()
-    for k, way_m in enumerate(moved_m.tolist()):
-        out[k] = last = next_place(last, way_m, rng)
+    for k, (share, new) in enumerate(zip(kept, fresh, strict=True)):
+        out[k] = last = share * last + new
     return out
-
-
-def next_place(last: float, moved_m: float, rng: np.random.Generator) -> float:
-    """Return the pair's place after the one before and a relative movement."""
-    kept = math.exp(-moved_m / PLACE_SIZE_M)
-    return kept * last + math.sqrt(1.0 - kept * kept) * float(rng.standard_normal())

@@ -74,7 +74,7 @@ SCENARIOS = {
         speed_m_s=(0.5, 1.1),
         spacing_m=8.0,
         pause_every_s=120.0,
-        world=World(name="paper", size_m=(20.0, 10.0), uwb=UwbChannel(as_tables=True)),
+        world=World(name="paper", size_m=(20.0, 10.0)),
     ),
     "lab": Scenario(
         name="lab",

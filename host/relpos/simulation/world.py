@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from relpos.simulation import range_errors
 from relpos.simulation.storeys import SLAB_EXCESS_M, Building
 
 FloatArray = NDArray[np.float64]
@@ -34,8 +33,6 @@ class UwbChannel:
     """
 
     max_range_m: float = 15.0
-    as_tables: bool = False
-    """Errors of real modules (`range_errors`) instead of white noise."""
     detection_near: float = 0.95
     detection_far: float = 0.5
     noise_sigma_m: float = 0.1
@@ -51,18 +48,11 @@ class UwbChannel:
         return self.detection_near - fall * distance_m / self.max_range_m
 
     def measure_range(
-        self,
-        rng: np.random.Generator,
-        distance_m: float,
-        loss_db: float = 0.0,
-        *,
-        place: float = 0.0,
-        body: bool = False,
+        self, rng: np.random.Generator, distance_m: float, loss_db: float = 0.0
     ) -> float | None:
         """One attempt over the true ``distance_m``: the range in metres, or None if not received.
 
-        ``loss_db`` is what stands in between: the reach shrinks by 20 dB a decade. ``place`` (a
-        standard normal) and ``body`` are those of `range_errors`.
+        ``loss_db`` is what stands in between: the reach shrinks by 20 dB a decade.
 
         A range is never negative: what noise pushes below zero a tag reports as zero distance.
         Every attempt draws the same count of numbers from ``rng``, received or not, so that one
@@ -76,11 +66,7 @@ class UwbChannel:
         )
         if detected >= self.detection_probability(distance_m * 10.0 ** (loss_db / 20.0)):
             return None
-        error_m = self.noise_sigma_m * normal
-        if self.as_tables:
-            at_m, drawn = np.array([distance_m]), (np.array([place]), np.array([normal]))
-            error_m = float(range_errors.errors_m(at_m, *drawn, body=body)[0])
-        measured = distance_m + self.bias_m + error_m
+        measured = distance_m + self.bias_m + self.noise_sigma_m * normal
         if blocked < self.nlos_probability:
             low, high = self.nlos_bias_m
             measured += low + (high - low) * excess
@@ -176,21 +162,14 @@ class World:
         return self.uwb.detection_probability(distance_m)
 
     def measure_range(
-        self,
-        rng: np.random.Generator,
-        first_m: FloatArray,
-        second_m: FloatArray,
-        *,
-        place: float = 0.0,
-        body: bool = False,
+        self, rng: np.random.Generator, first_m: FloatArray, second_m: FloatArray
     ) -> float | None:
         """Range between tags at two places (3,); see `UwbChannel.measure_range`."""
         distance_m = math.dist(first_m, second_m)
         if self.building is None:
-            return self.uwb.measure_range(rng, distance_m, place=place, body=body)
+            return self.uwb.measure_range(rng, distance_m)
         slabs = self.building.slabs_between(first_m, second_m)
-        loss_db = slabs * self.building.slab_db
-        measured = self.uwb.measure_range(rng, distance_m, loss_db, place=place, body=body)
+        measured = self.uwb.measure_range(rng, distance_m, slabs * self.building.slab_db)
         return None if measured is None else measured + slabs * sum(SLAB_EXCESS_M) / 2.0
 
     def transmit(self, rng: np.random.Generator) -> float | None:

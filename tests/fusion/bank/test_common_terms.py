@@ -81,9 +81,9 @@ def test_a_new_node_and_a_new_pair_keep_what_is_known_of_the_others() -> None:
     these.store(x, p)
     core.add_node((9.0, 0.0, 0.0), 0.1, 0.1)
     x, _ = these.dense()
-    assert x[0, PER_NODE * 3 : PER_NODE * 3 + COMMON].tolist() == [0.0, 1.0, 2.0, 3.0]
-    assert [x[0, these.clock_entry(row)] for row in range(3)] == [4.0, 5.0, 0.0]
-    assert x[0, these.biases[0, 1]] == 6.0
+    assert x[0, PER_NODE * 3 : PER_NODE * 3 + COMMON].tolist() == [0.0, 1.0, 2.0]
+    assert [x[0, these.clock_entry(row)] for row in range(3)] == [3.0, 4.0, 0.0]
+    assert x[0, these.biases[0, 1]] == 5.0
 
 
 @pytest.mark.parametrize(
@@ -147,5 +147,5 @@ def test_the_shared_entries_are_named_in_their_order() -> None:
     core = BankCore(BankSettings(hypotheses=8), 3)
     core.add_node((0.0, 0.0, 0.0), 0.1, 0.1)
     these = core.hypotheses
-    assert [these.common_entry(index) for index in CommonIndex] == [5, 6, 7, 8]
+    assert [these.common_entry(index) for index in CommonIndex] == [5, 6, 7]
     assert these.clock_entry(0) == 8

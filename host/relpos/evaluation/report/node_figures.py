@@ -35,7 +35,7 @@ MOST_BANDS = 6
 """Bands of more nodes than this would only cover each other."""
 
 
-TEAM_WIDE = ("detection_range_m", "body_shadow_m", "range_lateness_s", "range_growth_m")
+TEAM_WIDE = ("detection_range_m", "body_shadow_m", "range_lateness_s")
 """Parameters of the whole team, though they are reported for each node."""
 
 
@@ -45,7 +45,6 @@ _PARAMETER_WORDS: Mapping[str, tuple[str, float]] = {
     "detection_range_m": ("detection range (m)", 1.0),
     "body_shadow_m": ("body shadow (m)", 1.0),
     "range_lateness_s": ("ranges dated late (s)", 1.0),
-    "range_growth_m": ("ranges longer by distance (m)", 1.0),
     "clock_offset_s": ("clock ahead (s)", 1.0),
 }
 

@@ -365,7 +365,6 @@ _UNITS: Mapping[str, tuple[str, str, float, int]] = {
     "detection_range_m": ("detection range", "m", 1.0, 1),
     "body_shadow_m": ("body shadow", "m", 1.0, 2),
     "range_lateness_s": ("ranges dated late", "s", 1.0, 2),
-    "range_growth_m": ("ranges longer by distance (a factor of e)", "m", 1.0, 2),
     "clock_offset_s": ("clock ahead", "s", 1.0, 2),
 }
 

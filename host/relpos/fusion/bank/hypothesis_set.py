@@ -33,10 +33,6 @@ each clock's offset. Far larger ones are learned, too (``mission-late-1``: 0.99 
 0.3 of each learns them sooner (0.13 m), but takes the biases of pairs that are not calibrated for
 shadows: eight seeds of three walkers have 0.10 m with these, 0.20 with 0.3, 0.07 without any."""
 
-GROWTH_SD_M = 0.1
-"""Of what ranges are too long by per logarithm of the distance: .11 in two public tables, 0 where
-modules correct it."""
-
 HEIGHTS_SHARE, STOREY_M2 = 0.5, 9.0
 """Where nobody's height is known, in this share of the hypotheses with biases a pair has instead of
 its bias the square of its difference of height: a constant, in which a range's square is linear.
@@ -65,7 +61,7 @@ JITTER = 0.1
 class HypothesisSet:
     """K weighted hypotheses about N users, as arrays that kernels work on.
 
-    Users are *rows* 0 ... N-1 in the order of ``add_node``. The state has D = 6 N + 4 + pairs
+    Users are *rows* 0 ... N-1 in the order of ``add_node``. The state has D = 6 N + 3 + pairs
     entries: five a user (:class:`~relpos.fusion.bank.storage.StateIndex`), what ranges have in
     common (:class:`~relpos.fusion.bank.storage.CommonIndex`), each user's clock offset, and the
     range bias of each pair when it is first ranged.
@@ -388,7 +384,6 @@ class HypothesisSet:
         """Let hypotheses ``which`` (M,) of those with biases have what ranges have in common."""
         priors = {self.common_entry(CommonIndex.SHADOW): SHADOW_SD_M}
         priors[self.common_entry(CommonIndex.LATENESS)] = LATENESS_SD_S
-        priors[self.common_entry(CommonIndex.GROWTH)] = GROWTH_SD_M
         priors |= {self.clock_entry(row): CLOCK_SD_S for row in range(self.nodes)}
         block, lane = self._at(which)
         p, has = self.arrays.p, self.has_bias[which]

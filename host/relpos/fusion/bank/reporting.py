@@ -192,7 +192,6 @@ class Report:
             parameters += [
                 Parameter(self.time_s, node, None, "body_shadow_m", *shadow),
                 Parameter(self.time_s, node, None, "range_lateness_s", *late),
-                Parameter(self.time_s, node, None, "range_growth_m", *learned(CommonIndex.GROWTH)),
                 Parameter(self.time_s, node, None, "clock_offset_s", *own),
             ]
         return parameters

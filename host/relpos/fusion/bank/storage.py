@@ -46,14 +46,12 @@ class CommonIndex(IntEnum):
     """The team's entries after the users', before their clock offsets.
 
     ``BIAS`` (m) lengthens every range, ``SHADOW`` (m) those that pass through a body, ``LATENESS``
-    (s) is by how much ranges are dated late, ``GROWTH`` (m) what ranges are too long by per
-    logarithm of the distance.
+    (s) is by how much ranges are dated late.
     """
 
     BIAS = 0
     SHADOW = 1
     LATENESS = 2
-    GROWTH = 3
 
 
 COMMON = len(CommonIndex)

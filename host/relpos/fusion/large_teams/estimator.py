@@ -33,7 +33,7 @@ from relpos.fusion.estimator import (
 from relpos.fusion.initial_poses import Found, Initialiser
 from relpos.fusion.large_teams.kernels import NEAREST_M, RangeModel, Ranges
 from relpos.fusion.large_teams.range_terms import RangeSlopes
-from relpos.fusion.large_teams.sparse_filter import GROWTH, LATENESS, SHADOW, NeighbourhoodFilter
+from relpos.fusion.large_teams.sparse_filter import LATENESS, SHADOW, NeighbourhoodFilter
 from relpos.fusion.large_teams.variance_components import VarianceComponents
 from relpos.fusion.models.motion import reported_sigmas
 from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_variances
@@ -345,7 +345,7 @@ class LargeTeam:
             # Var(dz^2) / (4 r^2), as in the bank (``fusion/bank/range_update.py``).
             lifted_m2 = (height_m**2 + 0.5 * variance_m2) * variance_m2 / r.range_m**2
             node, peer = (r.node, headings[k][0]), (r.peer, headings[k][1])
-            slopes = self._slopes.of((sight[k][0], sight[k][1]), r.range_m, node, peer)
+            slopes = self._slopes.of((sight[k][0], sight[k][1]), node, peer)
             excess_m = horizontal_m - float(distance[k])
             self._collected.append(_Collected(r, excess_m, slopes, lifted_m2))
             self._reach_m = max(self._reach_m * REACH_FADE, r.range_m)
@@ -464,14 +464,13 @@ class LargeTeam:
 
     def _parameters(self, time_s: float) -> tuple[Parameter, ...]:
         """Return what ranges have in common; the team's figures stand beside every node."""
-        (shadow_m, late_s, growth_m), sigmas = (
+        (shadow_m, late_s), sigmas = (
             self.filter.terms.tolist(),
             self.filter.sigma_of_terms().tolist(),
         )
         learned = (
             ("body_shadow_m", shadow_m, sigmas[SHADOW]),
             ("range_lateness_s", late_s + self.clocks.lateness_s, sigmas[LATENESS]),
-            ("range_growth_m", growth_m, sigmas[GROWTH]),
         )
         return tuple(
             Parameter(time_s, node, None, *one) for node in sorted(self._row) for one in learned

@@ -35,11 +35,11 @@ JITTER_M2, JITTER_CONSTANT = 1e-8, 1e-12
 """Least variances of an initial pose, (0.1 mm)^2 and as many rad^2, and of drift and scale: what is
 exact has no inverse."""
 
-TERMS_SD = (0.3, 0.3, 0.1)
-"""Standard deviations of the terms beforehand: m, s, m."""
+TERMS_SD = (0.3, 0.3)
+"""Standard deviations of the terms beforehand: m, s."""
 
 TERMS = len(TERMS_SD)
-SHADOW, LATENESS, GROWTH = range(TERMS)
+SHADOW, LATENESS = range(TERMS)
 
 DIRECTIONS = 12
 """So many directions of the strips are tried."""
@@ -67,7 +67,7 @@ class NeighbourhoodFilter:
     antenna_m: Floats = field(default_factory=lambda: np.empty((0, 2)))
     """Where the antenna of each node is: forward and left of the point that moves, (N, 2)."""
     terms: Floats = field(default_factory=lambda: np.zeros(TERMS))
-    """What ranges have in common: the body's shadow (m), lateness of stamps (s), growth (m)."""
+    """What all ranges have in common: the body's shadow (m) and the lateness of time stamps (s)."""
     _carried: Floats = field(default_factory=lambda: np.empty((0, COVARIANCE, TERMS)))
     """V (N, 5, T): derivative of the states by the terms."""
     terms_information: Floats = field(

@@ -85,17 +85,6 @@ fixed 0.95 gives 0.36 m in ``mission-nlos`` (0.65 without any), but costs 8 % in
 it is 0.45 m, and nothing there."""
 
 
-NEAREST_M, UNBIASED_M = 0.4, 3.8
-"""What ranges are too long by grows with the logarithm of the distance: a weaker first path is
-detected later. It is 0 at ``UNBIASED_M`` and stays the same nearer than ``NEAREST_M``; 0.11 m times
-the logarithm in two public tables of DW1000 ranges (``simulation/range_errors.py``)."""
-
-
-def growth_slope(distance_m: float) -> float:
-    """Return a range's slope in what ranges are too long by per logarithm of the distance."""
-    return math.log(max(distance_m, NEAREST_M) / UNBIASED_M)
-
-
 def shadow_slope(sight: tuple[float, float], heading_rad: float, peer_heading_rad: float) -> float:
     """Return a range's slope in the body's shadow: how far each end is behind the other's wearer.
 

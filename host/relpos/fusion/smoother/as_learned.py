@@ -1,7 +1,7 @@
 """Measurements without the errors that the online estimator has learned of them.
 
 At the end of a run it knows by how much ranges are dated late, how far each clock is ahead, and
-what a body or the distance adds to a range. Smoothing begins from measurements without these.
+what a body adds to a range. Smoothing begins from measurements without these.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from relpos.fusion.clocks import Clocks
 from relpos.fusion.estimator import Estimate, NodeStatus
-from relpos.fusion.models.ranging import growth_slope, shadow_slope
+from relpos.fusion.models.ranging import shadow_slope
 from relpos.measurements import Measurement, Range
 
 Floats = npt.NDArray[np.float64]
@@ -27,8 +27,8 @@ SURE = 3.0
 def as_learned(
     measurements: Sequence[Measurement], estimates: Sequence[Estimate]
 ) -> list[Measurement]:
-    """Return measurements at their true times, ranges without shadows and growth with distance."""
-    clocks, shadow_m, growth_m = Clocks(), 0.0, 0.0
+    """Return measurements at their true times, and ranges without the bodies' shadows."""
+    clocks, shadow_m = Clocks(), 0.0
     for p in estimates[-1].parameters if estimates else ():
         if abs(p.value) <= SURE * p.sigma:
             continue
@@ -38,9 +38,7 @@ def as_learned(
             clocks.offset_s[p.node] = p.value
         elif p.name == "body_shadow_m":
             shadow_m = p.value
-        elif p.name == "range_growth_m":
-            growth_m = p.value
-    dated = [_ungrown(clocks.redate(m), growth_m) for m in measurements]
+    dated = [clocks.redate(m) for m in measurements]
     if shadow_m == 0.0:
         return dated
     tracks = _tracks(estimates)
@@ -58,14 +56,6 @@ def _tracks(estimates: Sequence[Estimate]) -> dict[int, Floats]:
     for track in tracks.values():
         track[3] = np.unwrap(track[3])
     return tracks
-
-
-def _ungrown(measured: Measurement, growth_m: float) -> Measurement:
-    """Return a range without what it is too long by for its distance."""
-    if growth_m == 0.0 or not isinstance(measured, Range) or measured.range_m <= 0.0:
-        return measured
-    added_m = growth_m * growth_slope(measured.range_m)
-    return replace(measured, range_m=max(measured.range_m - added_m, 0.0))
 
 
 def _unshadowed(measured: Range, tracks: dict[int, Floats], shadow_m: float) -> Range:
