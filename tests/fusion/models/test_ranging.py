@@ -190,15 +190,15 @@ def test_tags_at_different_heights_make_slant_ranges() -> None:
 
 def test_heights_from_pressure_add_to_those_of_the_tags() -> None:
     worn = {1: Worn(height_m=1.5), 2: Worn(height_m=1.0), 3: Worn(height_m=1.0)}
-    lifted = replace(worn[1], height_m=3.5)
+    lifted = replace(worn[1], height_m=5.0)
     measurements, priors, truth = team(150, 3, n1=lifted, n2=worn[2], n3=worn[3])
     measurements += [
-        Height(float(t), node, 2.0 * (node == 1), 0.1) for t in range(150) for node in worn
+        Height(float(t), node, 3.5 * (node == 1), 0.1) for t in range(150) for node in worn
     ]
     measurements.sort(key=lambda m: m.time_s)
     estimates = fused(measurements, priors, worn)
     assert distance_rmse(estimates, truth) < 0.1
-    assert estimates[-1].nodes[0].z_m == pytest.approx(3.5, abs=0.1)
+    assert estimates[-1].nodes[0].z_m == pytest.approx(5.0, abs=0.1)
 
 
 def test_range_biases_are_found_and_reported_with_their_pairs() -> None:

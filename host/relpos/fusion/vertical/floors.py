@@ -111,8 +111,8 @@ class Floors:
         start_m, start_m2 = self.climbs(np.zeros_like(base))
         over_m, over_m2 = (np.asarray(v)[..., None] for v in over)
         total = start_m2 + over_m2 + PRESSED_M**2
-        likelihood = np.exp(-0.5 * (over_m - start_m) ** 2 / total)
-        density *= likelihood / likelihood.max(axis=-1, keepdims=True)
+        log_likelihood = -0.5 * (over_m - start_m) ** 2 / total
+        density *= np.exp(log_likelihood - log_likelihood.max(axis=-1, keepdims=True))
         landing = np.maximum(BETWEEN * 0.5 ** (steps / BETWEEN_STEPS), LEAST_BETWEEN)
         weight = np.concatenate([density, landing / SPACING_M], axis=-1)
         probability: Floats = weight / weight.sum(axis=-1, keepdims=True)
