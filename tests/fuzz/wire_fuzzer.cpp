@@ -17,12 +17,13 @@ namespace {
 
 const uint8_t kKey[wire::kKeyBytes] = {1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16};
 
-uint64_t lines, frames, bodies, images;
+uint64_t lines, frames, bodies, images, chances;
 
 void print_totals() {
-  printf("line %llu, frames %llu, bodies %llu, eeprom %llu\n",
+  printf("line %llu, frames %llu, bodies %llu, eeprom %llu (CRC by chance %llu)\n",
          static_cast<unsigned long long>(lines), static_cast<unsigned long long>(frames),
-         static_cast<unsigned long long>(bodies), static_cast<unsigned long long>(images));
+         static_cast<unsigned long long>(bodies), static_cast<unsigned long long>(images),
+         static_cast<unsigned long long>(chances));
   fflush(stdout);
 }
 
@@ -142,9 +143,11 @@ void load_and_save(const Bytes& input) {
   }
   uint8_t* copy = memory.bytes + relpos::kStoredRecords;
   Bytes expected[relpos::kRecords];
+  bool was_intact[relpos::kRecords];  // the first copy, which is read first
   for (size_t k = 0; k < relpos::kRecords; ++k) {
     for (size_t twin = 0; twin < 2; ++twin, copy += kSizes[k] + 3) {
       if ((right >> (2 * k + twin) & 1) != 0) make_intact(copy, kSizes[k]);
+      if (twin == 0) was_intact[k] = intact(copy, kSizes[k]);
       if (!expected[k].empty() || !intact(copy, kSizes[k])) continue;
       expected[k].assign(copy + 1, copy + 1 + kSizes[k]);
     }
@@ -177,7 +180,11 @@ void load_and_save(const Bytes& input) {
   for (size_t k = 0; k < relpos::kRecords; ++k) {
     const bool is_new = part_of(after, k) == part_of(changed, k);
     const bool is_old = part_of(after, k) == part_of(all, k);
-    if (!is_new && (whole || !is_old)) fail("a record is neither the old one nor the new one");
+    if (is_new || (is_old && !whole)) continue;
+    // A copy that was damaged before, and is cut while it is written, fits its CRC once in 65,536.
+    const bool by_chance = k == record && !whole && !was_intact[k];
+    if (!by_chance) fail("a record is neither the old one nor the new one");
+    ++chances;
   }
 }
 
