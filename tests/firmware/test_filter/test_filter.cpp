@@ -10,7 +10,10 @@ using relpos::ErrorFilter;
 using relpos::ForwardFinder;
 using relpos::GaitDetector;
 using relpos::Stance;
+using relpos::State;
 using relpos::kAttitude;
+using relpos::kBias;
+using relpos::kPosition;
 using relpos::kReference;
 using relpos::kStates;
 using relpos::kVelocity;
@@ -48,6 +51,74 @@ void find(float rhythm) {
     const float a[2] = {0.0f, sinf(rhythm * phase)};
     finder.update(a, -0.2f * sinf(phase), kTick_s);
     if (tick % 28 == 27) finder.step();
+  }
+}
+
+// The filter once more, as the textbook has it: a full covariance of all states and the reference.
+const uint8_t kAll = kStates + 1;
+float dense[kAll][kAll];
+
+// P' = M P M' of the map x_to += factor[i][j] x_from of two groups of three.
+void dense_map(State to, State from, const float factor[9]) {
+  for (uint8_t side = 0; side < 2; ++side) {
+    for (uint8_t k = 0; k < kAll; ++k) {
+      for (uint8_t i = 0; i < 3; ++i) {
+        float& element = side == 0 ? dense[to + i][k] : dense[k][to + i];
+        for (uint8_t j = 0; j < 3; ++j) {
+          element += factor[3 * i + j] * (side == 0 ? dense[from + j][k] : dense[k][from + j]);
+        }
+      }
+    }
+  }
+}
+
+void dense_widen(State group, float variance) {
+  for (uint8_t i = 0; i < 3; ++i) dense[group + i][group + i] += variance;
+}
+
+bool turns(uint8_t i) { return (i >= 2 && i < 6) || i == kReference; }  // heading, bias, reference
+
+// Of the reference only the correlations with heading and bias are kept.
+void dense_forget() {
+  for (uint8_t i = 0; i < kStates; ++i) {
+    if (!turns(i)) dense[i][kReference] = dense[kReference][i] = 0.0f;
+  }
+}
+
+// A Kalman update, after Schmidt (1966) where the measurement leaves some states as they are.
+float dense_update(State group, const float h[kAll], float innovation, float variance,
+                   float correction[kAll]) {
+  float ph[kAll], total = variance;
+  for (uint8_t i = 0; i < kAll; ++i) {
+    ph[i] = 0.0f;
+    for (uint8_t j = 0; j < kAll; ++j) ph[i] += dense[i][j] * h[j];
+  }
+  for (uint8_t i = 0; i < kAll; ++i) total += h[i] * ph[i];
+  for (uint8_t i = 0; i < kAll; ++i) {
+    const bool fixed = group != kBias && turns(i) == (group != kAttitude);
+    correction[i] = fixed ? 0.0f : ph[i] / total * innovation;
+    for (uint8_t j = 0; j < kAll; ++j) {
+      const bool both = fixed && turns(j) == (group != kAttitude);
+      if (!both) dense[i][j] -= ph[i] * ph[j] / total;
+    }
+  }
+  dense_forget();
+  return total;
+}
+
+uint32_t dice = 1;
+
+float thrown(float to) {
+  dice = dice * 1664525u + 1013904223u;
+  return to * (static_cast<float>(dice >> 8) / 8388608.0f - 1.0f);
+}
+
+void check_alike(const ErrorFilter& filter) {
+  for (uint8_t i = 0; i < kStates; ++i) {
+    for (uint8_t j = 0; j < kStates; ++j) {
+      const float scale = sqrtf(dense[i][i] * dense[j][j]);
+      CHECK_NEAR(dense[i][j], filter.covariance(i, j), 1e-4f * scale);
+    }
   }
 }
 
@@ -122,6 +193,78 @@ TEST(a_bias_of_the_gyroscope_widens_the_attitude_alone) {
     CHECK_NEAR(-1e-2f, filter.covariance(kAttitude + i, 3 + i), 1e-6f);
     CHECK_NEAR(1e-2f, filter.covariance(3 + i, 3 + i), 1e-6f);
     CHECK_NEAR(1e-2f, filter.covariance(kVelocity + i, kVelocity + i), 1e-8f);
+  }
+}
+
+TEST(the_packed_filter_does_what_the_full_matrix_does) {
+  const float kTilt = 1e-3f, kBiases = 1e-5f, kVelocities = 1e-2f, kNorth = 0.09f;
+  ErrorFilter filter;
+  filter.reset(kTilt, kBiases, kVelocities);
+  filter.widen(kAttitude + 2, 0.04f, 1);
+  filter.set_reference(kNorth);
+  for (uint8_t i = 0; i < kAll; ++i) {
+    for (uint8_t j = 0; j < kAll; ++j) dense[i][j] = 0.0f;
+  }
+  dense_widen(kBias, kBiases);
+  dense_widen(kVelocity, kVelocities);
+  dense[0][0] = dense[1][1] = kTilt;
+  dense[2][2] = 0.04f;
+  dense[kReference][kReference] = kNorth;
+  const float half_s[9] = {0.05f, 0.0f, 0.0f, 0.0f, 0.05f, 0.0f, 0.0f, 0.0f, 0.05f};
+  float half_owed_s = 0.0f;
+  for (uint8_t round = 0; round < 40; ++round) {
+    float rotation[9], turn[9], impulse[3];
+    for (uint8_t i = 0; i < 9; ++i) turn[i] = -0.1f * (rotation[i] = thrown(1.0f));
+    filter.predict_attitude(rotation, 0.1f);
+    dense_map(kAttitude, kBias, turn);
+    dense_widen(kAttitude, 0.1f * 6.8538919e-6f);  // (0.15 deg)^2 a second
+    dense_widen(kBias, 0.1f * 4.8738787e-9f);      // (0.004 deg/s)^2 a second
+    for (uint8_t i = 0; i < 3; ++i) impulse[i] = thrown(1.0f);
+    filter.predict_motion(impulse, 0.1f);
+    if (half_owed_s > 0.0f) dense_map(kPosition, kVelocity, half_s);
+    dense_map(kPosition, kVelocity, half_s);
+    const float cross[9] = {0.0f, impulse[2], -impulse[1], -impulse[2], 0.0f,
+                            impulse[0], impulse[1], -impulse[0], 0.0f};
+    dense_map(kVelocity, kAttitude, cross);
+    dense_forget();
+    dense_widen(kVelocity, 0.1f * 0.0625f);
+    half_owed_s = 0.05f;
+    if (round % 3 == 2) continue;
+    filter.settle();
+    filter.settle();
+    dense_map(kPosition, kVelocity, half_s);
+    half_owed_s = 0.0f;
+    check_alike(filter);
+    const State group = static_cast<State>(3 * (round % 4));
+    float direction[3], h[kAll], correction[kAll], expected[kAll];
+    const float yaw = group == kAttitude ? 1.0f : group == kBias ? 0.0f : thrown(1.0f);
+    for (uint8_t i = 0; i < kAll; ++i) h[i] = 0.0f;
+    for (uint8_t i = 0; i < 3; ++i) {
+      direction[i] = group == kAttitude ? 0.0f : thrown(1.0f);
+      h[group + i] = direction[i];
+    }
+    h[2] += yaw;
+    if (group == kAttitude) h[kReference] = -1.0f;
+    const float variance = group == kBias ? 1e-5f : 0.02f;
+    const float total = dense_update(group, h, 0.3f, variance, expected);
+    CHECK_NEAR(total, filter.update(group, direction, yaw, 0.3f, variance, correction),
+               1e-4f * total);
+    for (uint8_t i = 0; i < kAll; ++i) {
+      const float scale = sqrtf(dense[i][i] + 1e-9f);
+      CHECK_NEAR(expected[i], correction[i], 1e-3f * scale);
+    }
+    check_alike(filter);
+    CHECK_NEAR(direction[0] * direction[0] * dense[group][group] +
+                   2.0f * direction[0] * direction[1] * dense[group][group + 1] +
+                   direction[1] * direction[1] * dense[group + 1][group + 1],
+               filter.along(group, direction), 1e-4f * dense[group][group] + 1e-4f);
+  }
+  CHECK_EQUAL(0, filter.repairs());
+  filter.restart(kPosition, 0.5f);
+  for (uint8_t i = 0; i < kStates; ++i) {
+    for (uint8_t j = kPosition; j < kStates; ++j) {
+      CHECK_NEAR(i == j ? 0.5f : 0.0f, filter.covariance(i, j), 0.0f);
+    }
   }
 }
 
