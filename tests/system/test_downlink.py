@@ -6,8 +6,9 @@ import pytest
 
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link.led_orders import LED_HEALTH, LED_ON, LedOrders
+from relpos.link.orders import ATTEMPTS
 from relpos.link.port import Link
-from relpos.link.step_scale import ATTEMPTS, KNOWN_WELL, StepScaleSender
+from relpos.link.step_scale import KNOWN_WELL, StepScaleSender
 from relpos.measurements import Motion
 from relpos.protocol import messages as wire
 from relpos.simulation.team import SCENARIOS

@@ -3,20 +3,17 @@
 A node's step length is proportional to its gain (docs/deadreckoning.md). An estimator that learns
 ``step_scale`` (true over reported length) gives the factor. The motion's ``gain_version`` marks a
 change, after which the estimator learns again.
-
-Pure: bytes out, answers in, the time is an argument. Nothing blocks: a command is repeated with its
-token until it is answered, between the port's other traffic.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from relpos.calibration.steps import MAX_CHANGE, scaled_gain_permille
 from relpos.errors import DataError
 from relpos.link.authentication import of_node
+from relpos.link.orders import Orders
 from relpos.protocol import messages as wire
 from relpos.said import Said
 
@@ -31,31 +28,17 @@ KNOWN_WELL = 0.025
 """Largest standard deviation of a scale that is sent; the estimator learns the remainder."""
 AGAIN_AFTER_S = 120.0
 """Until the next change of the same node, in measurement time: the estimator learns again."""
-REPEAT_S = 1.0
-"""A full frame each way takes 50 ms, storing the settings on the node 0.4 s."""
-ATTEMPTS = 14
-"""As in a dialogue: at 50 % loss all attempts fail once in a thousand times."""
 IMPOSSIBLE = -(2**31)
 """Out of the setting's range: changes nothing, and the answer brings the gain in force."""
-
-
-@dataclass(slots=True)
-class _GainChange:
-    """A dialogue that reads the gain in force, then sets the new one."""
-
-    scale: float
-    token: int
-    value: int = IMPOSSIBLE
-    attempts: int = 0
-    next_s: float = -math.inf
 
 
 class StepScaleSender:
     """Sends learned step scales to nodes over ``link``; ``remarks`` are messages for the user."""
 
     def __init__(self, link: Link) -> None:
-        self._link = link
-        self._changes: dict[int, _GainChange] = {}
+        self._orders = Orders(link, wire.CommandCode.SET_STEP_GAIN_PERMILLE)
+        self._scales: dict[int, float] = {}
+        """Of the nodes that a dialogue is under way with: it reads the gain, then sets it."""
         self._settled_s: dict[int, float] = {}
         self.remarks: list[str] = []
         self.sent = 0
@@ -63,7 +46,7 @@ class StepScaleSender:
 
     def learn(self, node: int, scale: float, sigma: float, time_s: float) -> None:
         """Begin to send a node's learned step scale, if the change is large and certain enough."""
-        if node in self._changes:
+        if node in self._scales:
             return
         if time_s < self._settled_s.get(node, -math.inf) + AGAIN_AFTER_S:
             return
@@ -71,51 +54,33 @@ class StepScaleSender:
         if not 1.0 / MAX_CHANGE <= scale <= MAX_CHANGE:
             return
         if sigma <= KNOWN_WELL and abs(math.log(scale)) >= WORTH_SENDING:
-            self._changes[node] = _GainChange(scale, self._link.next_token())
+            self._scales[node] = scale
+            self._orders.send(node, IMPOSSIBLE)
             self._settled_s[node] = time_s
 
     def due(self, now_s: float) -> bytes:
         """Return bytes due for the coordinator's port, by any clock that does not go back."""
-        data = b""
-        for node, change in list(self._changes.items()):
-            if now_s < change.next_s:
-                continue
-            if change.attempts >= ATTEMPTS:
-                del self._changes[node]
-                self.remarks.append(
-                    Said(
-                        "steps-unanswered",
-                        "node {node}: steps are counted {off}; it does not answer, so they stay so",
-                        node=str(node),
-                        off=_percent(change.scale),
-                    )
+        for node in self._orders.give_up(now_s):
+            self.remarks.append(
+                Said(
+                    "steps-unanswered",
+                    "node {node}: steps are counted {off}; it does not answer, so they stay so",
+                    node=str(node),
+                    off=_percent(self._scales.pop(node)),
                 )
-                continue
-            change.attempts += 1
-            change.next_s = now_s + REPEAT_S
-            # A node whose radio module has another address hears only broadcasts.
-            data += self._link.command(
-                node,
-                wire.CommandCode.SET_STEP_GAIN_PERMILLE,
-                change.value,
-                token=change.token,
-                broadcast=change.attempts % 2 == 0,
-            )[1]
-        return data
+            )
+        return self._orders.due(now_s)
 
     def handle(self, answer: Acknowledged) -> None:
         """Process a node's answer; answers to other commands are ignored."""
-        change = self._changes.get(answer.node)
-        if change is None or answer.token != change.token:
+        value = self._orders.answered(answer)
+        if value is None:
             return
-        if answer.result in (wire.CommandResult.BUSY, wire.CommandResult.COUNTER_REFUSED):
-            change.token, change.next_s = self._link.next_token(), -math.inf
+        if value == IMPOSSIBLE and answer.result == wire.CommandResult.OUT_OF_RANGE:
+            self._set_gain(answer.node, answer.value)
             return
-        if change.value == IMPOSSIBLE and answer.result == wire.CommandResult.OUT_OF_RANGE:
-            self._set_gain(answer.node, change, answer.value)
-            return
-        del self._changes[answer.node]
-        if answer.result == wire.CommandResult.DONE and answer.value == change.value:
+        off = _percent(self._scales.pop(answer.node))
+        if answer.result == wire.CommandResult.DONE and answer.value == value:
             self.sent += 1
             self.remarks.append(
                 Said(
@@ -123,8 +88,8 @@ class StepScaleSender:
                     "node {node}: steps were counted {off} and are right now, by the measured "
                     "ranges (step gain {gain:.3f}); nothing to do",
                     node=str(answer.node),
-                    off=_percent(change.scale),
-                    gain=change.value / 1000,
+                    off=off,
+                    gain=value / 1000,
                 )
             )
         else:
@@ -134,24 +99,23 @@ class StepScaleSender:
                     "node {node}: steps are counted {off}; it refuses a step gain of {gain:.3f} "
                     "({result})",
                     node=str(answer.node),
-                    off=_percent(change.scale),
-                    gain=change.value / 1000,
+                    off=off,
+                    gain=value / 1000,
                     result=answer.result.name.lower().replace("_", " "),
                 )
             )
 
-    def _set_gain(self, node: int, change: _GainChange, before_permille: int) -> None:
+    def _set_gain(self, node: int, before_permille: int) -> None:
         try:
-            gain = scaled_gain_permille(before_permille, change.scale)
+            gain = scaled_gain_permille(before_permille, self._scales[node])
         except DataError as error:
-            del self._changes[node]
+            del self._scales[node]
             self.remarks.append(of_node(node, str(error)))
             return
         if gain == before_permille:
-            del self._changes[node]
+            del self._scales[node]
             return
-        change.value, change.attempts = gain, 0
-        change.token, change.next_s = self._link.next_token(), -math.inf
+        self._orders.send(node, gain)
 
 
 def _percent(scale: float) -> Said:
