@@ -10,19 +10,27 @@ from pathlib import Path
 
 import pytest
 from team_input import TeamInput, make_session
+from typer.testing import CliRunner
 
 from relpos import fusion
+from relpos.cli import main
+from relpos.cli import mission as command
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DataError
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
+from relpos.link import xbee
 from relpos.live.fusion_thread import FusionThread
 from relpos.live.inputs import Received
 from relpos.live.mission import JOURNAL, Journal, Mission, MissionFiles, read_again
 from relpos.live.requests import Request
+from relpos.live.session import Outcome
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert
 from relpos.live.tracks import Tracks
 from relpos.measurements import Motion
+from relpos.protocol import messages as wire
+from relpos.recording import make_recorder
+from relpos.recording.about import About
 
 
 class Visitors(Sink):
@@ -333,3 +341,27 @@ def test_an_estimator_that_fails_in_a_mission_goes_on_from_its_last_estimate_but
     else:
         assert isinstance(thread.failure, ZeroDivisionError)
         assert times == [4.0]
+
+
+def test_a_start_at_one_pose_outlives_a_kill_before_the_first_checkpoint(tmp_path, monkeypatch):
+    values = dict.fromkeys(wire.MOTION.field, 0) | {"time_s": 1.0}
+    sent = xbee.encode(xbee.Receive16(1, -40, wire.encode(wire.MOTION, 1, 0, 1, values)))
+    sessions = []
+
+    def session(job, source, options, *, common, **_):
+        again = [] if source._earlier is None else list(source._earlier)
+        sessions.append((common, sum(isinstance(o, Motion) for r in again for o in r.observations)))
+        if len(sessions) == 1:
+            recorder = make_recorder(options.record, About(round(time.time() * 1e9)))
+            recorder.received(0.5, sent)
+            recorder.close()
+        else:
+            (tmp_path / "mill" / "checkpoint.json").write_text("{}")
+        source.close()
+        return Outcome()
+
+    monkeypatch.setattr(command, "fuse_live", session)
+    again = ["mission", str(tmp_path / "mill"), "--estimator", "deadreckoning", "--no-open"]
+    for asked in ([*again, "loop://", "--initial", "common"], again, again):
+        CliRunner().invoke(main.app, asked, catch_exceptions=False)
+    assert sessions == [(True, 0), (True, 1), (False, 0)]

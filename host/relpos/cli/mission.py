@@ -170,14 +170,13 @@ def _run(
     jumped = found.keep_time(resumed)
     if jumped is not None:
         output.remark(jumped)
-    about.sessions, about.ended_unix_s = about.sessions + 1, None
+    # A session that was killed before its first checkpoint begins once more as it was begun.
+    common = (common and not resumed.priors) or (about.common and resumed.begins)
+    about.sessions, about.ended_unix_s, about.common = about.sessions + 1, None, common
     job = Job(about.source, estimator, {}, 0, found.path / f"session-{about.sessions}")
     job.prepare(resumed.priors)
     link, seen = make_link(key_file)
     known = {} if seen is None else dict(seen.load())
-    if resumed.since_s > 0.0:
-        # What is read again came before the counters that were stored.
-        link.decoder.expect_from_start()
     port = PortInput(
         about.source,
         link,
@@ -199,7 +198,7 @@ def _run(
         options,
         description=Description(name=about.name, source="received in a mission"),
         priors=resumed.priors,
-        common=common and not resumed.priors,
+        common=common,
         as_json=False,
     )
     about.ended_unix_s = time.time()
@@ -216,7 +215,9 @@ def _earlier(
     from relpos.live.mission import WARM_UP_S, read_again
     from relpos.recording import open_recording
 
-    if resumed.since_s > 0.0:
+    if resumed.begins or resumed.since_s > 0.0:
+        # What is read again came before the counters that were stored.
+        link.decoder.expect_from_start()
         chosen: list[Recording] = []
         for path in reversed(found.recordings()):
             try:

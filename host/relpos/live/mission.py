@@ -60,11 +60,13 @@ class About:
     sessions: int = 0
     port: int | None = None
     ended_unix_s: float | None = None
+    common: bool = False
+    """Whether the nodes started at one pose."""
 
     @classmethod
     def read(cls, text: str) -> About:
         """Return what a file says. ValueError or KeyError where it is none of ours."""
-        found = _object(text)
+        found = {"common": False} | _object(text)  # Earlier versions have none.
         about = cls(**{f.name: found[f.name] for f in fields(cls)})
         if not (
             isinstance(about.name, str)
@@ -73,6 +75,7 @@ class About:
             and type(about.sessions) is int
             and (about.port is None or (type(about.port) is int and 0 < about.port < 65536))
             and (about.ended_unix_s is None or _is_number(about.ended_unix_s))
+            and type(about.common) is bool
         ):
             raise ValueError("values of another kind")
         return about
@@ -84,6 +87,8 @@ class Resumed:
 
     events: list[dict[str, Any]] = field(default_factory=list)
     priors: tuple[Prior, ...] = ()
+    begins: bool = True
+    """Whether there is no checkpoint yet, so that everything recorded is read again."""
     since_s: float = 0.0
     """Time of the checkpoint; 0 without one."""
     heard_s: dict[int, float] = field(default_factory=dict)
@@ -183,7 +188,7 @@ class Mission:
 
     def resume(self) -> Resumed:
         """Return what the sessions so far have left behind."""
-        resumed = Resumed(list(self.events()))
+        resumed = Resumed(list(self.events()), begins=not (self.path / CHECKPOINT).exists())
         with contextlib.suppress(DataError, ValueError, KeyError, TypeError, AttributeError):
             found = _object(read_text(self.path / CHECKPOINT, MOST_ABOUT_BYTES))
             rows = tuple(prior for row in found["priors"] for prior in _priors(row))
