@@ -20,6 +20,7 @@ from relpos.recording import make_recorder, open_recording, save_recording
 from relpos.recording.output import Disk
 from relpos.recording.recorder import Bounds, Recorder
 from relpos.recording.topics import Serial
+from support.small_disk import small_disk
 
 PATIENCE_S = 120.0
 A_SECOND = 50
@@ -328,18 +329,12 @@ def test_a_block_that_the_disk_did_not_confirm_is_written_again(tmp_path):
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can mount a small disk")
 def test_recording_goes_on_after_a_real_full_disk(tmp_path):
-    mount = tmp_path / "disk"
-    mount.mkdir()
-    if subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=1m", "relpos", str(mount)],
-        capture_output=True,
-        check=False,
-    ).returncode:
-        pytest.skip("no mounting here")
-    try:
-        ballast = mount / "ballast"
+    with small_disk(tmp_path / "disk", 1) as disk:
+        if not disk.is_mount():
+            pytest.skip("no mounting here")
+        ballast = disk / "ballast"
         ballast.write_bytes(bytes(900_000))
-        path = mount / "walk.mcap"
+        path = disk / "walk.mcap"
         recorder = make_recorder(path, about())
         steps = session()
         play(recorder, steps)
@@ -351,5 +346,3 @@ def test_recording_goes_on_after_a_real_full_disk(tmp_path):
         recorder.close()
         assert [s.arrival_s for s in serials(path)] == [arrival_s for arrival_s, *_ in steps]
         assert open_recording(path).closed
-    finally:
-        subprocess.run(["umount", str(mount)], check=False)

@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,6 +26,7 @@ from relpos.measurements import Motion
 from relpos.recording import open_recording
 from relpos.recording.topics import Serial
 from relpos.runs import load_run, read_estimates
+from support.small_disk import small_disk
 
 PATIENCE_S = 90.0
 """For what has no promise of its own on a busy computer."""
@@ -285,25 +286,11 @@ class Host:
         self.team.kill()
 
 
-@contextlib.contextmanager
-def small_disk(folder: Path) -> Iterator[Path]:
-    """A disk that can be filled where this user may mount one, else a plain folder."""
-    folder.mkdir()
-    options = ["-t", "tmpfs", "-o", f"size={DISK_MB}m", "relpos", str(folder)]
-    with contextlib.suppress(OSError):
-        subprocess.run(["mount", *options], capture_output=True, check=False)
-    try:
-        yield folder
-    finally:
-        if folder.is_mount():
-            subprocess.run(["umount", str(folder)], check=False)
-
-
 def episode(seed: int, out: Path) -> str:
     """Run one; a line about it. ViolationError where a promise is broken."""
     rng = random.Random(seed)
     mission, sessions = rng.random() < 0.5, rng.randrange(3, 6)
-    with small_disk(out / "disk") as disk:
+    with small_disk(out / "disk", DISK_MB) as disk:
         host = Host(rng, out, disk, mission)
         try:
             for number in range(sessions):
