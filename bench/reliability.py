@@ -28,7 +28,8 @@ HEAD = f"""# What goes wrong, and what then?
 | parsers fail in their own errors alone | by coverage: node 103,754,564, \
 host 1,089,000: 0 open | `make fuzz` |
 | tests notice faults in what is trusted | killed: gait 15 of 15, authentication 28 of 28, \
-protocol 19 of 20, link 15 of 20, timeline 14 of 19, filter 16 of 18, bank 20 of 20 | `make mutants` |
+protocol 19 of 20, link 15 of 20, timeline 14 of 19, filter 16 of 18, \
+bank 20 of 20 | `make mutants` |
 | no clock, theft or replay locks out or commands | [security](security.md) | `make test` |
 
 Others publish (looked up in 2026): PX4
