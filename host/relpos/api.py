@@ -201,6 +201,7 @@ def _make(
 ) -> Estimator:
     from relpos import fusion
     from relpos.fusion import plugins
+    from relpos.fusion.post import referring
 
     if isinstance(estimator, str):
         make = fusion.make_smoother if smooth else fusion.make
@@ -211,10 +212,11 @@ def _make(
         )
     if isinstance(estimator, type) or not hasattr(estimator, "process"):
         assert callable(estimator)
-        return plugins.make(name, estimator, priors, settings, seed, run.nodes)
+        made = plugins.make(name, estimator, priors, settings, seed, run.nodes)
+        return referring(made, run.nodes)
     if settings:
         raise RelposError(f"{name}: settings belong to a name or a class, not to an object")
-    return plugins.guard(name, estimator)
+    return referring(plugins.guard(name, estimator), run.nodes)
 
 
 def _result(given: Result | Sequence[Estimate] | Path | str) -> Result:

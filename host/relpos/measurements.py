@@ -40,6 +40,11 @@ class Motion:
     steps: int | None = None
 
 
+def at_rest(motion: Motion) -> Motion:
+    """Return the motion of a node that cannot move, whatever its dead reckoning makes of noise."""
+    return Motion(motion.time_s, motion.node, 0.0, 0.0, 0.0, moving=False, steps=0)
+
+
 @dataclass(frozen=True, slots=True)
 class Range:
     """One UWB two-way-ranging result between ``node`` (the initiator) and ``peer``."""

@@ -201,3 +201,10 @@ def test_a_fall_down_stairs_sounds_within_three_seconds_until_somebody_walks_aga
         composer.add_observations(ends_s + 20.0 + k, [walk(ends_s + 20.0 + k, node=2)], None)
         composer.alarms.tick(ends_s + 20.0 + k, listening=True)
     assert composer.alarms.condition(2).alert is None
+
+
+def test_a_node_at_the_command_post_is_not_motionless():
+    node = WatchedWearer()
+    node.alarms.posts = frozenset({1})
+    node.report(lambda time_s: Motion(time_s, 1, 0.0, 0.0, 0.0, moving=False), 120)
+    assert [alert for _, alert in node.changes if alert is not None] == []

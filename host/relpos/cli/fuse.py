@@ -77,6 +77,7 @@ def fuse(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the estimator's randomness.")] = 0,
     smooth: Annotated[bool, typer.Option("--smooth", help="Smooth over the whole run.")] = False,
+    post: live.Post = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -154,7 +155,7 @@ def fuse(
         debrief=report is not False,
     )
     options.check()
-    job = Job(source, estimator, chosen, seed, out or _default_out(source), smooth=smooth)
+    job = Job(source, estimator, chosen, seed, out or _default_out(source), smooth, post)
     if sources.is_port(source):
         _fuse_port(job, initial, options, key_file, teach=teach, as_json=json)
     elif sources.is_recording(source):
@@ -177,6 +178,14 @@ class Job:
     seed: int
     out: Path
     smooth: bool = False
+    post: int | None = None
+
+    def described(self, run: Run) -> Run:
+        """Return a run whose description says what the command line says of its nodes."""
+        if self.post is not None and self.post not in run.node_ids:
+            known = ", ".join(map(str, run.node_ids))
+            raise DataError(f"--post {self.post}: no such node in {self.source}: {known}")
+        return replace(run, description=run.description.with_post(self.post))
 
     def make(
         self, priors: Sequence[Prior], nodes: Mapping[int, NodeInfo] | None = None
@@ -218,7 +227,8 @@ def _base_name(source: str) -> str:
 def _fuse_run(job: Job, initial: Initial | None, *, as_json: bool, report: bool) -> None:
     from relpos import api
 
-    fuse_recording(job, api.load(job.source), initial, as_json=as_json, report=report)
+    run = job.described(api.load(job.source))
+    fuse_recording(job, run, initial, as_json=as_json, report=report)
 
 
 def replay_run(
@@ -228,7 +238,7 @@ def replay_run(
     from relpos import api
     from relpos.live.inputs import PacedInput, run_items
 
-    run = api.load(job.source)
+    run = job.described(api.load(job.source))
     run.check_usable(needs_ranges=job.estimator != DEADRECKONING)
     priors = api.priors_of(run, initial)
     job.prepare(priors)
@@ -282,7 +292,7 @@ def _fuse_mcap(
     for words in (*recording.remarks, *replay.remarks):
         output.remark(words)
     observations = replay.observations()
-    run = recording.run_of(observations)
+    run = job.described(recording.run_of(observations))
     start: str | Sequence[Prior] | None = initial
     if initial is None and about is not None and about.initial == Initial.COMMON:
         start = common_start(observations)
@@ -409,7 +419,9 @@ def _fuse_port(
         job,
         port,
         options,
-        description=Description(name=_base_name(job.source), source=f"received {how}"),
+        description=Description(name=_base_name(job.source), source=f"received {how}").with_post(
+            job.post
+        ),
         common=initial is Initial.COMMON,
         as_json=as_json,
     )

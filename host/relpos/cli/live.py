@@ -69,6 +69,14 @@ PIN_HELP = (
 )
 Pins = Annotated[list[str] | None, typer.Option("--pin", metavar=PINS, help=PIN_HELP)]
 
+Post = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        metavar="NODE",
+        help="The command post's node: nobody wears it; its pressure is the weather.",
+    ),
+]
 Record = Annotated[
     Path | None,
     typer.Option(metavar="FILE.mcap", help="Record all received data, for replay and Foxglove."),

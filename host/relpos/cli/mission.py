@@ -43,6 +43,7 @@ def mission(
         Initial, typer.Option(help="Where the nodes start in the first session.")
     ] = Initial.UNKNOWN,
     estimator: EstimatorName = BANK,
+    post: live.Post = None,
     view_listen: live.ViewListen = "0.0.0.0",
     https: live.Https = False,
     open_browser: live.OpenBrowser = None,
@@ -73,6 +74,7 @@ def mission(
         return
     known = (folder / ABOUT).exists()
     found = Mission.open(folder, source if known else source or "", name)
+    found.about.post = post or found.about.post
     with found.lock():
         if found.about.source:
             check_port(found.about.source)
@@ -196,7 +198,9 @@ def _run(
         job,
         port,
         options,
-        description=Description(name=about.name, source="received in a mission"),
+        description=Description(name=about.name, source="received in a mission").with_post(
+            about.post
+        ),
         priors=resumed.priors,
         common=common,
         as_json=False,

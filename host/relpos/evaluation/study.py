@@ -22,6 +22,7 @@ from relpos.errors import RelposError
 from relpos.evaluation import bounds, metrics, vertical
 from relpos.evaluation.executors import run_all
 from relpos.evaluation.vertical import Vertical
+from relpos.runs import NodeInfo
 from relpos.simulation.scenarios import simulate
 
 Floats = npt.NDArray[np.float64]
@@ -75,7 +76,8 @@ def score(case: Case, seed: int) -> Score:
     """Run one case on one seed."""
     run = simulate(case.scenario, seed, case.overrides)
     make = fusion.make_smoother if case.smooth else fusion.make
-    estimator = make(case.estimator, run.priors, case.settings, seed + ESTIMATOR_SEED)
+    nodes = {node: NodeInfo(post=True) for node in run.posts}
+    estimator = make(case.estimator, run.priors, case.settings, seed + ESTIMATOR_SEED, nodes)
     started = time.process_time()
     failure = ""
     try:

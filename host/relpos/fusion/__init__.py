@@ -36,6 +36,7 @@ from relpos.fusion.estimator import (
 from relpos.fusion.linear_algebra import one_thread
 from relpos.fusion.models.ranging import Mounting
 from relpos.fusion.particle.settings import ParticleSettings
+from relpos.fusion.post import posts_of, referring
 from relpos.fusion.settings import SettingInfo, describe, parse
 from relpos.measurements import Heading, Height, Motion, Prior, Range
 
@@ -63,12 +64,23 @@ def make(
     """Make an estimator by its name, from ``--set`` keys and values.
 
     Nodes without a prior start unknown. ``nodes`` tells how each is worn (``run.nodes``): the
-    bank uses heights and antenna offsets, the other two are as the paper has them. Estimators of
+    bank uses heights and antenna offsets, the other two are as the paper has them. All take a node
+    of the command post for one that lies still. Estimators of
     others go by ``module:Class`` or by a registered name (:mod:`relpos.fusion.plugins`).
     RelposError for an unknown name or key and for a value that is out of range.
     """
     given = settings or {}
     check(name)
+    return referring(_make(name, priors, given, seed, nodes), nodes)
+
+
+def _make(
+    name: str,
+    priors: Sequence[Prior],
+    given: Mapping[str, object],
+    seed: int,
+    nodes: Mapping[int, Mounting] | None,
+) -> Estimator:
     with one_thread():
         match str(name):
             case "bank":
@@ -127,7 +139,7 @@ def make_smoother(
     seeds = [seed + k * 1_000_003 for k in range(attempts)]
     online, *others = (make(name, priors, settings, one, nodes) for one in seeds)
     worn = nodes or {}
-    return Smoother(
+    smoother = Smoother(
         online,
         others,
         priors,
@@ -137,7 +149,9 @@ def make_smoother(
             for node, info in worn.items()
             if info.antenna_offset_m is not None
         },
+        posts_of(nodes),
     )
+    return referring(smoother, nodes)
 
 
 SMOOTHER_ATTEMPTS = 4

@@ -135,6 +135,8 @@ class Alarms:
         self.waiting: set[int] = set()
         """Who is not in, and may sit still."""
         self.mayday: set[int] = set()
+        self.posts: frozenset[int] = frozenset()
+        """Nodes that lie at the command post."""
 
     def remember(self, node: int, heard_s: float, now_s: float, known: KnownAlert | None) -> None:
         """Go on from a session before: last heard at ``heard_s``, with that alert."""
@@ -231,13 +233,14 @@ class Alarms:
         )
 
     def _update_alert(self, node: int, state: _WearerState) -> None:
-        still_s = 0.0 if node in self.waiting else state.still_s()
+        rests = node in self.waiting or node in self.posts
+        still_s = 0.0 if rests else state.still_s()
         alert: Alert | None = None
         if node in self.mayday:
             alert, state.shelved_s = Alert.MAYDAY, 0.0
         elif still_s >= STILL_ALARM_S:
             alert = Alert.STILL_ALARM
-        elif state.fallen and node not in self.waiting:
+        elif state.fallen and not rests:
             alert = Alert.FALL
         elif state.silent_s >= LOST_S:
             alert = Alert.LOST

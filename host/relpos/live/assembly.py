@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from relpos.fusion.post import posts_of
 from relpos.link.authentication import KEYLESS
 from relpos.live.composer import Composer
 from relpos.live.files import FileSink
@@ -91,7 +92,10 @@ def run_session(
     session = LiveSession(
         source,
         fusion,
-        Composer({node: info.name for node, info in nodes.items() if info.name}),
+        Composer(
+            {node: info.name for node, info in nodes.items() if info.name},
+            posts=posts_of(nodes),
+        ),
         sinks,
         seconds=plan.seconds,
         lasts=plan.lasts,

@@ -20,7 +20,7 @@ from relpos.live.team_view import (
     Person,
     TeamView,
 )
-from relpos.measurements import Height, Motion, Observation, Range
+from relpos.measurements import Height, Motion, Observation, Range, at_rest
 from relpos.nodes.monitor import NodeMonitor, TeamMonitor
 
 if TYPE_CHECKING:
@@ -55,12 +55,20 @@ class _Health:
 class Composer:
     """Gathers everything that happens, in order, and composes the view of any moment.
 
-    ``names`` replace node numbers on display and may change at any time.
+    ``names`` replace node numbers on display and may change at any time; ``posts`` are nodes at
+    the command post, which nobody wears.
     """
 
-    def __init__(self, names: Mapping[int, str] | None = None, start_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        names: Mapping[int, str] | None = None,
+        start_s: float = 0.0,
+        posts: frozenset[int] = frozenset(),
+    ) -> None:
         self.names: dict[int, str] = dict(names or {})
+        self.posts = posts
         self.alarms = Alarms()
+        self.alarms.posts = posts
         self.nowcast = Nowcast(start_s)
         self.monitor = TeamMonitor()
         self._ranges: dict[tuple[int, int], Range] = {}
@@ -85,7 +93,9 @@ class Composer:
         for observation in observations:
             self._submitted += 1
             if isinstance(observation, Motion):
-                self.nowcast.add_motion(observation, self._submitted)
+                still = observation.node in self.posts
+                motion = at_rest(observation) if still else observation
+                self.nowcast.add_motion(motion, self._submitted)
                 self.alarms.add_motion(observation)
                 self._newer(observation.time_s)
             elif isinstance(observation, Range):
@@ -239,6 +249,7 @@ class Composer:
             loss=health.loss,
             ranging=health.ranging,
             neighbours=health.neighbours,
+            post=node in self.posts,
             **({} if at is None else _pose(at)),
         )
 

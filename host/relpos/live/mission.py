@@ -62,11 +62,13 @@ class About:
     ended_unix_s: float | None = None
     common: bool = False
     """Whether the nodes started at one pose."""
+    post: int | None = None
+    """The command post's node."""
 
     @classmethod
     def read(cls, text: str) -> About:
         """Return what a file says. ValueError or KeyError where it is none of ours."""
-        found = {"common": False} | _object(text)  # Earlier versions have none.
+        found = {"common": False, "post": None} | _object(text)  # Earlier versions have none.
         about = cls(**{f.name: found[f.name] for f in fields(cls)})
         if not (
             isinstance(about.name, str)
@@ -76,6 +78,7 @@ class About:
             and (about.port is None or (type(about.port) is int and 0 < about.port < 65536))
             and (about.ended_unix_s is None or _is_number(about.ended_unix_s))
             and type(about.common) is bool
+            and (about.post is None or (type(about.post) is int and about.post > 0))
         ):
             raise ValueError("values of another kind")
         return about

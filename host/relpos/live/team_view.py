@@ -81,7 +81,8 @@ class Person:
     of ``ok``, ``ambiguous``, ``unlocated``, ``stale``, ``lost``; ``episode`` one of ``level``,
     ``up``, ``down``, ``lift``, ``disturbed``, ``falling``; ``floor`` 0 is the start's. ``loss`` and
     ``ranging`` are fractions. ``acknowledged``: a user has confirmed the alert.
-    ``shelved_s``: seconds for which the person's alarms are silenced.
+    ``shelved_s``: seconds for which the person's alarms are silenced. ``post``: nobody wears the
+    node, it lies at the command post.
     """
 
     node: int
@@ -115,6 +116,7 @@ class Person:
     loss: float | None = None
     ranging: float | None = None
     neighbours: int | None = None
+    post: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from dataclasses import asdict
 from typing import Any
 
 from relpos.fusion.estimator import NodeStatus, PairEstimate
+from relpos.fusion.post import posts_of
 from relpos.live.alarms import RAISED, Alarms
 from relpos.live.composer import STALE_S, ghosts_of
 from relpos.live.requests import AT_LANDMARK, RECORDED, Request, RequestSource
@@ -124,6 +125,7 @@ class Player:
         self.moments = moments
         self._sinks = sinks
         self.names = {n: i.name for n, i in moments.description.nodes.items() if i.name}
+        self.posts = posts_of(moments.description.nodes)
         self.history = History()
         self.at_s = moments.from_s
         self.playing = True
@@ -275,7 +277,7 @@ class Player:
         still_s = time_s - since_s + limit_s[alert] if alert in limit_s else 0.0
         person = Person(
             node, self.names.get(node, f"Node {node}"), status=str(status), seen_s=seen_s,
-            still_s=still_s, alert=alert, health="unknown",
+            still_s=still_s, alert=alert, health="unknown", post=node in self.posts,
         )  # fmt: skip
         if at is None:
             return person

@@ -7,7 +7,7 @@ import math
 import tomllib
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,8 @@ class NodeInfo:
     height_m: float | None = None
     antenna_offset_m: tuple[float, float] | None = None
     """The antenna's place (forward, left) of the point whose motion is reported."""
+    post: bool = False
+    """Nobody wears it: it lies still at the command post."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,13 @@ class Description:
     """The ``[simulated]`` table: the bound of such a run can be computed."""
     floors_m: tuple[float, ...] = ()
     """Heights of the floors over the start's, from the lowest on. For evaluation alone."""
+
+    def with_post(self, node: int | None) -> Description:
+        """Return a description in which a node lies at the command post."""
+        if node is None:
+            return self
+        info = replace(self.nodes.get(node, NodeInfo()), post=True)
+        return replace(self, nodes={**self.nodes, node: info})
 
 
 MOST_BYTES = 1 << 20
@@ -115,6 +124,7 @@ def parse_description(path: Path | str, text: str) -> Description:
             leg_length_m=reader.number(table, "leg_length_m", where),
             height_m=reader.number(table, "height_m", where),
             antenna_offset_m=reader.offset(table, "antenna_offset_m", where),
+            post=reader.flag(table, "post", where),
         )
         for node, table, where in reader.tables(document, "nodes")
     }
@@ -167,6 +177,7 @@ def description_text(description: Description) -> str:
             value = getattr(info, key)
             if value is not None:
                 lines.append(f"{key} = {_toml(value)}")
+        lines += ["post = true"] * info.post
     if description.floors_m:
         lines += ["", "[building]", f"floors_m = {_toml(description.floors_m)}"]
     if description.simulated is not None:

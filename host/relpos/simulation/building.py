@@ -161,6 +161,7 @@ def simulate_building(
         tuple(row for row in rows if row.time_s >= on_s.get(row.node, 0.0)),
         events=_episodes(climbs, on_s),
         floors_m=building.floors_m,
+        posts=(settings.nodes + 1,) * settings.post,
     )
 
 

@@ -177,6 +177,8 @@ class SimulatedRun:
     """Surveyed places by their ids, (x, y) in metres."""
     floors_m: tuple[float, ...] = ()
     """Heights of a building's floors over the start's, from the lowest on."""
+    posts: tuple[int, ...] = ()
+    """Nodes at the command post."""
 
 
 def settings_of(scenario: str, overrides: Mapping[str, str | float] | None = None) -> PaperSettings:

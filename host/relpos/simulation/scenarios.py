@@ -40,7 +40,7 @@ def simulate_run(
     scenario: str, seed: int = 0, overrides: Mapping[str, str | float] | None = None
 ) -> Run:
     """Simulate a run as :func:`relpos.runs.load_run` would read it, with how it was made."""
-    from relpos.runs import Description, Landmark, Run, Simulated
+    from relpos.runs import Description, Landmark, NodeInfo, Run, Simulated
 
     chosen = {key: str(value) for key, value in (overrides or {}).items()}
     simulated = simulate(scenario, seed, chosen)
@@ -52,6 +52,7 @@ def simulate_run(
             # Everybody's heading at the start is given in the one frame of the rectangle.
             heading_known=any(math.isfinite(p.sigma_rad) for p in simulated.priors),
             priors=simulated.priors,
+            nodes={node: NodeInfo(post=True) for node in simulated.posts},
             simulated=Simulated(scenario, seed, chosen),
             floors_m=simulated.floors_m,
         ),

@@ -49,6 +49,7 @@ from relpos.fusion.models.ranging import (
     slant_height,
 )
 from relpos.fusion.models.unseen_walk import UnseenWalk
+from relpos.fusion.post import posts_of
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.fusion.vertical.filter import VerticalFilter
@@ -104,7 +105,7 @@ class Bank:
     speed_gate: SpeedGate = field(default_factory=SpeedGate)
     zero_motion: ZeroMotionDetector = field(default_factory=ZeroMotionDetector)
     north: North = field(default_factory=North)
-    vertical: VerticalFilter = field(default_factory=VerticalFilter)
+    vertical: VerticalFilter = field(init=False)
     clocks: Clocks = field(default_factory=Clocks)
     handedness: Handedness = field(default_factory=Handedness)
     _velocity_m_s: dict[int, tuple[float, float]] = field(default_factory=dict)
@@ -123,6 +124,7 @@ class Bank:
     def __post_init__(self) -> None:
         s = self.settings
         self.core = BankCore(s, self.seed)
+        self.vertical = VerticalFilter(posts=posts_of(self.mounting))
         for p in sorted(self.priors, key=lambda p: p.node):
             if p.node in self._known:
                 raise RelposError(f"node {p.node} has two initial poses")
@@ -347,7 +349,7 @@ class Bank:
 
         Their ranges are used all the same. Where the motion comes late, the rewinder repeats both.
         """
-        for node in sorted(self._row.keys() & nodes):
+        for node in sorted((self._row.keys() - self.vertical.posts) & set(nodes)):
             known, reported_s = self._known[node], timeline.reported_s(node)
             since_s = max(known.diffused_s, reported_s)
             if not -math.inf < since_s < time_s:

@@ -39,6 +39,7 @@ from relpos.fusion.models.motion import reported_sigmas
 from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_variances
 from relpos.fusion.models.odometry_faults import JUMP_M
 from relpos.fusion.models.ranging import Mounting, OutlierPersistence, RangeCorrelation
+from relpos.fusion.post import posts_of
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.fusion.vertical.filter import VerticalFilter
@@ -138,7 +139,7 @@ class LargeTeam:
     settings: LargeTeamSettings
     mountings: Mapping[int, Mounting]
     filter: NeighbourhoodFilter = field(init=False)
-    vertical: VerticalFilter = field(default_factory=VerticalFilter)
+    vertical: VerticalFilter = field(init=False)
     clocks: Clocks = field(default_factory=Clocks)
     _nodes: list[int] = field(default_factory=list)
     _row: dict[int, int] = field(default_factory=dict)
@@ -162,6 +163,7 @@ class LargeTeam:
     _epoch_s: float = -math.inf
 
     def __post_init__(self) -> None:
+        self.vertical = VerticalFilter(posts=posts_of(self.mountings))
         model = RangeModel(SIGMA_R_M, OUTLIERS, OUTLIER_M)
         self.filter = NeighbourhoodFilter(math.inf, model)
         known: list[Prior] = []
@@ -310,7 +312,7 @@ class LargeTeam:
 
     def _diffuse(self, nodes: Iterable[int], time_s: float, timeline: Timeline) -> None:
         """Let nodes whose motion is missing be anywhere that they can have walked to."""
-        for node in sorted(self._row.keys() & nodes):
+        for node in sorted((self._row.keys() - self.vertical.posts) & set(nodes)):
             unseen_m2 = self._known[node].diffuse(time_s, timeline.reported_s(node))
             if unseen_m2 > 0.0:
                 rows = np.array([self._row[node]])

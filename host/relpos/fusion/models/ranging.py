@@ -34,6 +34,10 @@ class Mounting(Protocol):
     def antenna_offset_m(self) -> tuple[float, float] | None:
         """The antenna's place (forward, left) of the point whose motion is reported."""
 
+    @property
+    def post(self) -> bool:
+        """Whether nobody wears it: it lies still at the command post."""
+
 
 @dataclass(frozen=True, slots=True)
 class RangeNoise:

@@ -62,6 +62,7 @@ class Smoother:
     priors: Sequence[Prior] = ()
     heights_m: Mapping[int, float] = field(default_factory=dict)
     antennas_m: Mapping[int, tuple[float, float]] = field(default_factory=dict)
+    posts: frozenset[int] = frozenset()
     solutions: list[Solution] = field(default_factory=list)
     """All attempts of :meth:`finish`, the best first."""
     _measurements: list[Measurement] = field(default_factory=list)
@@ -79,7 +80,7 @@ class Smoother:
         self._estimates += self.online.finish()
         nodes = [prior.node for prior in self.priors]
         graph, counted = build_graph(
-            as_climbed(as_learned(self._measurements, self._estimates), nodes),
+            as_climbed(as_learned(self._measurements, self._estimates), nodes, self.posts),
             self.priors,
             self.heights_m,
             self.antennas_m,

@@ -46,6 +46,7 @@ from relpos.fusion.vertical.heights import (
     Heights,
     Z,
 )
+from relpos.fusion.vertical.stairs import way_on_stairs
 from relpos.fusion.vertical.track import Moved, Track
 from relpos.measurements import Height, Range
 
@@ -59,13 +60,6 @@ LAG_S = 6.0
 
 LATE_S = 60.0
 """Who reports a first height so long after the first of all joins late."""
-
-TREAD_M, RISER_M, STEEPER = 0.28, 0.175, 1.0
-"""A usual tread, and by how much it is shorter per metre of a higher riser. Builders keep
-2 risers + tread = 0.63 m, and many stairs are as they are: this is in between."""
-LEAST_TREAD_M = 0.22
-TWO_STEPS_M = 0.26
-"""A rise by so much is two steps."""
 
 LEAST_CORRECTION_M = 0.05
 """One outlier of the pressure claims 0.02 m on level ground."""
@@ -155,8 +149,12 @@ class _Interval:
 
 @dataclass(slots=True)
 class VerticalFilter:
-    """See the module's text. Feed :meth:`move` and :meth:`measure`; :meth:`close` epochs."""
+    """See the module's text. Feed :meth:`move` and :meth:`measure`; :meth:`close` epochs.
 
+    ``posts`` lie at the start's height, in air of their own: they tell nothing of the others'.
+    """
+
+    posts: frozenset[int] = frozenset()
     heights: Heights = field(default_factory=Heights)
     floors: Floors = field(default_factory=Floors)
     decided: list[Decided] | None = None
@@ -208,6 +206,8 @@ class VerticalFilter:
         node = measured.node
         if not self.active:
             self._first_s = self._closed_s = time_s
+        if node in self.posts:
+            return
         track = self._track(node)
         track.height_m, track.height_s = measured.height_m, time_s
         track.sigma_m = measured.sigma_m or track.sigma_m
@@ -251,15 +251,17 @@ class VerticalFilter:
         if measured.range_m > NEAR_M:
             return
         for vague, sure in ((measured.node, measured.peer), (measured.peer, measured.node)):
-            if vague not in self._row or sure not in self._row:
-                return
-            a, b = self._row[vague], self._row[sure]
-            variance = self.heights.covariance[:, Z, Z]
-            if variance[a] > VAGUE_M**2 and variance[b] < SURE_M**2:
+            if vague not in self._row or sure not in self._row.keys() | self.posts:
+                continue
+            a, variance = self._row[vague], self.heights.covariance[:, Z, Z]
+            z_m, variance_m2 = 0.0, START_M**2
+            if sure in self._row:
+                b = self._row[sure]
+                z_m, variance_m2 = self._height(b)[0], float(variance[b])
+            if variance[a] > VAGUE_M**2 and variance_m2 < SURE_M**2:
                 below_m = self.floors.height_of(int(self._base[a]), 0.0)[0]
-                z_m = self._height(b)[0] - below_m
                 spread_m2 = (0.5 * measured.range_m) ** 2
-                self.heights.observe(a, z_m, float(variance[b]) + spread_m2)
+                self.heights.observe(a, z_m - below_m, variance_m2 + spread_m2)
                 self._settled[a] = False
                 self._level_s[a] = 0.0
 
@@ -486,7 +488,8 @@ class VerticalFilter:
         """Return what is known of a node."""
         row = self._row.get(node)
         if row is None:
-            return self._unmeasured(time_s)
+            at_post = node in self.posts and self.active
+            return AT_POST if at_post else self._unmeasured(time_s)
         climbed = risen_m = unseen_m2 = 0.0
         doubt_m = self._doubt_m[row]
         for one, modes in zip(self._open, self._smoothed, strict=True):
@@ -557,22 +560,10 @@ def _others_mean(values: Floats, counted: npt.NDArray[np.bool_], least: int) -> 
     return mean
 
 
+AT_POST = Vertical(0.0, START_M, Episode.LEVEL, 1.0, 0, 1.0)
+"""Where a node of the command post is."""
+
 _CLIMBS = np.array([e in (Episode.UP, Episode.DOWN) for e in episodes.EPISODES])
 
 WORN_M2 = 0.1**2
 """Variance of a node's height over its floor's."""
-
-
-def way_on_stairs(steps: Floats, rise_m: Floats, way_m: Floats) -> Floats:
-    """Return the true way (m) of steps that rise by so much and are claimed to go so far.
-
-    The rise tells how many of the steps were on stairs: landings and the first steps behind a
-    flight are level.
-    """
-    rise_of_one = rise_m / np.maximum(steps, 1e-9)
-    treads = 1.0 + np.clip((rise_of_one - TWO_STEPS_M) / 0.04 + 0.5, 0.0, 1.0)
-    riser = rise_of_one / treads
-    climbs = np.minimum(riser / RISER_M, 1.0)
-    tread = np.clip(TREAD_M - STEEPER * np.maximum(riser - RISER_M, 0.0), LEAST_TREAD_M, TREAD_M)
-    way: Floats = way_m * (1.0 - climbs) + climbs * steps * treads * tread
-    return way

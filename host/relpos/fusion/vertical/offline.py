@@ -13,14 +13,19 @@ from relpos.fusion.vertical.filter import Decided, VerticalFilter
 from relpos.measurements import Height, Measurement, Motion
 
 
-def as_climbed(measurements: Sequence[Measurement], nodes: Iterable[int]) -> list[Measurement]:
+def as_climbed(
+    measurements: Sequence[Measurement],
+    nodes: Iterable[int],
+    posts: frozenset[int] = frozenset(),
+) -> list[Measurement]:
     """Return measurements with heights and ways on stairs as the vertical filter decides them.
 
-    ``nodes`` are known from the start. Without reported heights nothing changes.
+    ``nodes`` are known from the start, ``posts`` lie at the command post. Without reported heights
+    nothing changes.
     """
     if not any(isinstance(m, Height) for m in measurements):
         return list(measurements)
-    timeline, vertical = Timeline(nodes), VerticalFilter(decided=[])
+    timeline, vertical = Timeline(nodes), VerticalFilter(posts=posts, decided=[])
     for step in timeline.push_all(measurements, final=True):
         if isinstance(step, Advance):
             vertical.move(step)
