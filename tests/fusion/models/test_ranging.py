@@ -28,6 +28,7 @@ from relpos.simulation.paper import simulate_paper
 class Worn:
     height_m: float | None = None
     antenna_offset_m: tuple[float, float] | None = None
+    post: bool = False
 
 
 def slant(x: np.ndarray, levers_m: np.ndarray, dz: float) -> float:
