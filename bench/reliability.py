@@ -27,9 +27,9 @@ HEAD = f"""# What goes wrong, and what then?
 | a kill takes 1 s with `--record`, else 2 s | 269 kills: 1.001, 0.3 s | `soak.py --kills` |
 | parsers fail in their own errors alone | by coverage: node 103,754,564, \
 host 1,089,000: 0 open | `make fuzz` |
-| tests notice faults in what is trusted | killed: gait 15 of 15, authentication 28 of 28, \
-protocol 19 of 20, link 15 of 20, timeline 14 of 19, filter 16 of 18, \
-bank 20 of 20 | `make mutants` |
+| tests notice faults in what is trusted | killed: gait 15/15, authentication 28/28, \
+protocol 19/20, link 15/20, timeline 14/19, filter 16/18, \
+bank 20/20 | `make mutants` |
 | no clock, theft or replay locks out or commands | [security](security.md) | `make test` |
 
 Others publish (looked up in 2026): PX4

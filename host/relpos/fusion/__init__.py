@@ -65,8 +65,8 @@ def make(
 
     Nodes without a prior start unknown. ``nodes`` tells how each is worn (``run.nodes``): the
     bank uses heights and antenna offsets, the other two are as the paper has them. All take a node
-    of the command post for one that lies still. Estimators of
-    others go by ``module:Class`` or by a registered name (:mod:`relpos.fusion.plugins`).
+    of the command post for one that lies still. Estimators of others go by ``module:Class`` or by a
+    registered name (:mod:`relpos.fusion.plugins`).
     RelposError for an unknown name or key and for a value that is out of range.
     """
     given = settings or {}
@@ -134,10 +134,11 @@ def make_smoother(
     """
     from relpos.fusion.smoother.estimator import Smoother
 
+    check(name)
     attempts = 1 if name == "deadreckoning" else SMOOTHER_ATTEMPTS
     # The others' seeds are far from what a user would choose as the next one.
     seeds = [seed + k * 1_000_003 for k in range(attempts)]
-    online, *others = (make(name, priors, settings, one, nodes) for one in seeds)
+    online, *others = (_make(name, priors, settings or {}, one, nodes) for one in seeds)
     worn = nodes or {}
     smoother = Smoother(
         online,

@@ -349,7 +349,7 @@ class Bank:
 
         Their ranges are used all the same. Where the motion comes late, the rewinder repeats both.
         """
-        for node in sorted((self._row.keys() - self.vertical.posts) & set(nodes)):
+        for node in sorted((self._row.keys() & nodes) - self.vertical.posts):
             known, reported_s = self._known[node], timeline.reported_s(node)
             since_s = max(known.diffused_s, reported_s)
             if not -math.inf < since_s < time_s:

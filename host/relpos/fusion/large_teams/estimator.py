@@ -312,7 +312,7 @@ class LargeTeam:
 
     def _diffuse(self, nodes: Iterable[int], time_s: float, timeline: Timeline) -> None:
         """Let nodes whose motion is missing be anywhere that they can have walked to."""
-        for node in sorted((self._row.keys() - self.vertical.posts) & set(nodes)):
+        for node in sorted((self._row.keys() & nodes) - self.vertical.posts):
             unseen_m2 = self._known[node].diffuse(time_s, timeline.reported_s(node))
             if unseen_m2 > 0.0:
                 rows = np.array([self._row[node]])

@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.estimator import Episode, Vertical
+from relpos.fusion.models.pressure import FAST_S
 from relpos.fusion.timeline import Advance
 from relpos.fusion.vertical import episodes
 from relpos.fusion.vertical.episodes import (
@@ -37,7 +38,6 @@ from relpos.fusion.vertical.episodes import (
 from relpos.fusion.vertical.floors import CERTAIN, LOWEST, SPACING_M, Floors, Over, most_probable
 from relpos.fusion.vertical.heights import (
     FAST,
-    FAST_S,
     SLOW,
     START_M,
     UNKNOWN_M,
@@ -251,7 +251,7 @@ class VerticalFilter:
         if measured.range_m > NEAR_M:
             return
         for vague, sure in ((measured.node, measured.peer), (measured.peer, measured.node)):
-            if vague not in self._row or sure not in self._row.keys() | self.posts:
+            if vague not in self._row or (sure not in self._row and sure not in self.posts):
                 continue
             a, variance = self._row[vague], self.heights.covariance[:, Z, Z]
             z_m, variance_m2 = 0.0, START_M**2

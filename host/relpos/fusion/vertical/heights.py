@@ -20,6 +20,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion.models.pressure import FAST_M, FAST_S
+
 Floats = npt.NDArray[np.float64]
 
 Z, FAST, SLOW = 0, 1, 2
@@ -30,9 +32,6 @@ START_M = 0.1
 UNKNOWN_M = 5.0
 """Of the height of a node that joins later."""
 
-FAST_M, FAST_S = 0.2, 90.0
-"""Fast bias. Phones that came back to a surveyed point after a minute or more were off by 0.30 m
-(IPIN 2023, 264 returns, RMS): twice this bias's variance."""
 SLOW_M = 0.005
 """Slow bias, m/sqrt(s)."""
 LEVEL_M = 0.003
