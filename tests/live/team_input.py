@@ -121,14 +121,17 @@ class Album(Sink):
         self.closed = True
 
 
-def make_session(source, make, *sinks, priors=(), common=False, paced=False, **options):
+def make_session(
+    source, make, *sinks, priors=(), common=False, paced=False, posts=frozenset(), **options
+):
     """A session over ``source`` with an estimator made by ``make(priors)``, and its album."""
     album = Album()
     fusion = FusionThread(make, priors, common=common)
     source.paced_by = fusion if paced else None
     # As many pictures a second of the team's time as a session makes in real time.
     pace = source.now_s if isinstance(source, TeamInput) else time.monotonic
-    return LiveSession(source, fusion, Composer(), [album, *sinks], pace=pace, **options), album
+    composer = Composer(posts=posts)
+    return LiveSession(source, fusion, composer, [album, *sinks], pace=pace, **options), album
 
 
 def run_through(session):

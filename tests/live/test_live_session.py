@@ -298,6 +298,9 @@ class Phones(Sink):
     def named(self, names):
         self.names = names
 
+    def boarded(self, message):
+        self.board = message
+
 
 def press(number, unix_s, name="a"):
     body = {
@@ -334,6 +337,21 @@ def test_presses_names_and_acknowledgements_reach_record_and_view(monkeypatch):
     assert phones.answers[1][1] == {"accepted": ["a"]}
     assert phones.answers[3][1] == {"acknowledged": False}, "there was no alarm"
     assert [person.name for person in album.views[-1].people] == ["Node 1", "Kim"]
+
+
+def test_nobody_at_the_command_post_is_called_or_ordered_out():
+    with EmulatedTeam(TeamConfig("straight", 3, 20.0, 3, beacons=True)) as team:
+        source = TeamInput(team)
+        phones = Phones(
+            source,
+            (10.0, Request(1, "rollcall", 10.0, {"action": "start"})),
+            (11.0, Request(2, "evacuate", 11.0, {"action": "order"})),
+        )
+        session, album = make_session(source, deadreckoning, phones, posts=frozenset({3}))
+        run_through(session)
+    assert phones.board["roll_call"]["nodes"] == [1, 2]
+    assert phones.board["evacuation"]["nodes"] == [1, 2]
+    assert [person.name for person in album.views[-1].people][2] == "Command post"
 
 
 def test_a_recording_is_played_and_takes_no_presses():

@@ -164,6 +164,9 @@ def test_alerts_of_a_moment_are_those_that_were_then():
     assert history.alert(2, 42.0)[1] is Alert.STILL_ALARM
     assert history.heard(2, 59.0) == 44.0
     assert any(e.text.startswith("Ben") for e in history.events)
+    posts = History()
+    posts.read(Rows(), {}, (), frozenset({2}))
+    assert posts.alert(2, 42.0)[1] is None, "the command post's node lies still"
 
 
 @pytest.mark.soak

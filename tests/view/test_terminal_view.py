@@ -92,6 +92,16 @@ def test_a_person_who_needs_help_is_on_top_in_words() -> None:
     assert seen[2].endswith("(seen to)")
 
 
+def test_the_command_posts_node_is_no_person() -> None:
+    silent = {"post": True, "alert": Alert.LOST, "status": "lost", "seen_s": 75.0}
+    assert "post" in row_of("node 4", lines(team_view(changes={4: {"post": True}})))
+    shown = lines(team_view(changes={4: silent}))
+    assert "3 people" in shown[0]
+    assert shown[1].startswith("! node 4 is silent for 1 min: no reference")
+    assert "silent" in row_of("node 4", shown)
+    assert not any("LOST" in line for line in shown)
+
+
 def test_a_person_who_moves_again_is_not_shown_as_lying() -> None:
     shown = lines(team_view(changes={3: {**STILL, "moving": True, "still_s": 0.0}}), me=2)
     assert shown[1].startswith("!! Li & Söhne lay still, moves again")

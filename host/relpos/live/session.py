@@ -485,7 +485,7 @@ class LiveSession:
         return reply, 200
 
     def _change_board(self, kind: str, body: dict[str, Any]) -> tuple[dict[str, object], int]:
-        everybody = sorted(self._composer.monitor.nodes)
+        everybody = sorted(self._composer.monitor.nodes.keys() - self._composer.posts)
         body = {"by": "", "nodes": everybody, **body}
         if kind == "marker" and "x_m" not in body and body.get("action") == "set":
             # "Here", of a wearer's phone.

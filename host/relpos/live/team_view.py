@@ -23,6 +23,14 @@ STILL_ALARM_S = 30.0
 """As PASS devices do (NFPA 1982: pre-alarm after 20 s without motion, alarm after 30 s)."""
 
 
+POST_NAME = "Command post"
+
+
+def default_name(node: int, *, post: bool = False) -> str:
+    """Return what a node is called that nobody has named."""
+    return POST_NAME if post else f"Node {node}"
+
+
 class Level(StrEnum):
     """How urgent a notice is."""
 

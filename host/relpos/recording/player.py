@@ -31,6 +31,7 @@ from relpos.live.team_view import (
     Pair,
     Person,
     TeamView,
+    default_name,
 )
 from relpos.live.tracks import Tracks
 from relpos.measurements import Event, Motion, Range, Status
@@ -68,12 +69,19 @@ class History:
         place = bisect_right(changes, time_s, key=lambda change: change[0])
         return changes[place - 1] if place else (0.0, None)
 
-    def read(self, moments: Moments, names: dict[int, str], known: Sequence[LogEntry]) -> None:
+    def read(
+        self,
+        moments: Moments,
+        names: dict[int, str],
+        known: Sequence[LogEntry],
+        posts: frozenset[int] = frozenset(),
+    ) -> None:
         """Read everything once; ``known`` is a mission's log, else the alerts make one."""
         alarms, log = Alarms(), list(known)
+        alarms.posts = posts
 
         def name_of(node: int) -> str:
-            return names.get(node, f"Node {node}")
+            return names.get(node) or default_name(node, post=node in alarms.posts)
 
         def note(time_s: float, kind: str, words: Said, node: int) -> None:
             unix_s = moments.started_unix_s + time_s
@@ -140,7 +148,7 @@ class Player:
 
     def _read(self, log: list[LogEntry]) -> None:
         # The thread has files of its own: two positions in one would meet.
-        self.history.read(self.moments.again(), self.names, log)
+        self.history.read(self.moments.again(), self.names, log, self.posts)
 
     def wait(self) -> None:
         """Wait until the whole recording is read."""
@@ -275,9 +283,11 @@ class Player:
             status = NodeStatus.STALE
         limit_s = {Alert.STILL_ALARM: STILL_ALARM_S, Alert.STILL_WARNING: STILL_WARNING_S}
         still_s = time_s - since_s + limit_s[alert] if alert in limit_s else 0.0
+        post = node in self.posts
         person = Person(
-            node, self.names.get(node, f"Node {node}"), status=str(status), seen_s=seen_s,
-            still_s=still_s, alert=alert, health="unknown", post=node in self.posts,
+            node, self.names.get(node) or default_name(node, post=post),
+            status=str(status), seen_s=seen_s, still_s=still_s, alert=alert, health="unknown",
+            post=post,
         )  # fmt: skip
         if at is None:
             return person

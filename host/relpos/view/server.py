@@ -340,6 +340,7 @@ class Pages:
                     "taken": str(person["node"]) in self.session.names,
                 }
                 for person in people
+                if not person["post"]
             ]
         )
 

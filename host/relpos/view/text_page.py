@@ -110,13 +110,13 @@ def alarming(view: TeamView) -> frozenset[str | int]:
 def unattended(view: TeamView) -> list[Person]:
     """Return people with an alarm that is not acknowledged, in the order of the page."""
     ranks = (Alert.MAYDAY, Alert.STILL_ALARM, Alert.FALL, Alert.LOST)
-    waiting = [p for p in view.people if p.alert in ranks and not p.acknowledged]
+    waiting = [p for p in view.people if p.alert in ranks and not p.acknowledged and not p.post]
     return sorted(waiting, key=lambda person: ranks.index(person.alert))
 
 
 def find_me(view: TeamView, wanted: int | None) -> Person | None:
     """Return the person whose view it is: the wanted one, else the first."""
-    people = view.people
+    people = sorted(view.people, key=lambda person: person.post)
     return next((p for p in people if p.node == wanted), people[0] if people else None)
 
 
@@ -124,7 +124,7 @@ def _title(view: TeamView, options: RenderOptions) -> Text:
     minutes, seconds = divmod(max(int(view.time_s), 0), 60)
     hours, minutes = divmod(minutes, 60)
     clock = f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes:02d}:{seconds:02d}"
-    count = len(view.people)
+    count = sum(not person.post for person in view.people)
     words = f"{options.title}  {clock}  {count} {'person' if count == 1 else 'people'}"
     if view.fused_s is None:
         words += "  no position yet"
@@ -150,6 +150,9 @@ def _alarms(view: TeamView, options: RenderOptions, most: int) -> list[Text]:
             case Alert.FALL:
                 words = f"!! {person.name} FELL{where}{seen}"
                 alarms.append((0 if not seen else 2, words, _STYLES[Level.ALARM]))
+            case Alert.LOST if person.post:
+                words = f"! {person.name} is silent for {_ago(person.seen_s)}: no reference"
+                alarms.append((3, words, _STYLES[Level.WARNING]))
             case Alert.LOST:
                 words = f"!! {person.name} is LOST: silent for {_ago(person.seen_s)}{where}{seen}"
                 alarms.append((1 if not seen else 2, words, _STYLES[Level.ALARM]))
@@ -254,13 +257,15 @@ def _urgency(person: Person) -> int:
         case Alert.STILL_ALARM | Alert.FALL:
             return 0
         case Alert.LOST:
-            return 1
+            return 2 if person.post else 1
         case Alert.STILL_WARNING:
             return 2
     return 3
 
 
 def _state(person: Person) -> str:
+    if person.post:
+        return "silent" if person.status in ("stale", "lost") else "post"
     if person.alert is Alert.LOST or person.status == "lost":
         return "LOST"
     if person.alert is Alert.STILL_ALARM and not person.moving:

@@ -11,9 +11,9 @@ export function isFresh(person) {
   return person != null && person.status !== "stale" && person.status !== "lost";
 }
 
-/** How far from the last known place a person may be by now, in metres; 0 while heard. */
+/** How far from the last known place a person may be by now, in metres; 0 while heard, and for a node that nobody wears. */
 export function reachM(person) {
-  return isFresh(person) ? 0 : WALKING_M_S * Math.max(person.seen_s ?? 0, 0);
+  return isFresh(person) || person.post ? 0 : WALKING_M_S * Math.max(person.seen_s ?? 0, 0);
 }
 
 /** The person as known `lagS` after the view came: older by that, and only a last place once the link is lost. */

@@ -10,6 +10,8 @@ const KINDS = {
   lost: { kind: "lost", level: "medium" },
   still_warning: { kind: "still", level: "low" },
 };
+/** Nobody wears the command post's node: its silence leaves heights without their reference. */
+const POST = { lost: { kind: "post", level: "low" } };
 const RANK = { high: 0, medium: 1, low: 2 };
 const FLOOD = 10;
 const FLOOD_MS = 600_000;
@@ -37,9 +39,9 @@ export class Alarms {
     const raised = [];
     const cleared = [];
     const seen = new Set();
-    this.people = people.length;
+    this.people = people.filter((person) => !person.post).length;
     for (const person of people) {
-      const of = KINDS[person.alert];
+      const of = (person.post ? POST : KINDS)[person.alert];
       if (!of) continue;
       seen.add(person.node);
       const before = this.active.get(person.node);
@@ -48,7 +50,7 @@ export class Alarms {
         node: person.node,
         name: person.name,
         ...of,
-        seconds: of.kind === "lost" ? person.seen_s : person.still_s,
+        seconds: person.alert === "lost" ? person.seen_s : person.still_s,
         newsS: isFresh(person) ? 0 : person.seen_s,
         // Acknowledged here at once; on other pages when the server says so.
         acknowledged: person.acknowledged === true || (same ? before.acknowledged : false),
@@ -98,7 +100,7 @@ export class Alarms {
   rows() {
     const rows = [];
     const lost = this.open.filter((alarm) => alarm.kind === "lost");
-    const silent = [...this.active.values()].filter((alarm) => alarm.newsS || alarm.kind === "lost");
+    const silent = [...this.active.values()].filter((alarm) => alarm.kind !== "post" && (alarm.newsS || alarm.kind === "lost"));
     const seconds = lost.map((alarm) => alarm.seconds);
     const together = lost.length >= MANY && Math.max(...seconds) - Math.min(...seconds) <= TOGETHER_S;
     const nobody = lost.length > 1 && silent.length === this.people;

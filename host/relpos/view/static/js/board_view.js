@@ -26,7 +26,7 @@ export class BoardView {
     this.dialog.addEventListener("keydown", (event) => {
       if (event.key === "Escape") this.dialog.close();
     });
-    const all = (state) => Promise.all(team.order.map((node) => this.post("board", { node, state })));
+    const all = (state) => Promise.all(team.wearers().map(({ node }) => this.post("board", { node, state })));
     byId("all-standby").addEventListener("click", () => all("standby"));
     byId("all-entered").addEventListener("click", () => all("entered"));
     byId("roll-start").addEventListener("click", () => this.post("rollcall", { action: "start", within_s: Number(byId("roll-minutes").value) * 60 }));
@@ -42,7 +42,7 @@ export class BoardView {
   }
 
   ofTeam(name) {
-    return this.team.order.filter((node) => (this.board.people?.[node]?.team ?? "") === name);
+    return this.team.wearers().map(({ node }) => node).filter((node) => (this.board.people?.[node]?.team ?? "") === name);
   }
 
   async post(kind, body) {
@@ -63,7 +63,7 @@ export class BoardView {
     this.showRollCall(nowMs);
     this.showEvacuation();
     const { people = {}, evacuation, roll_call: call } = this.board;
-    const inside = this.team.order.filter((node) => ["entered", "withdrawing"].includes(people[node]?.state));
+    const inside = this.team.wearers().filter(({ node }) => ["entered", "withdrawing"].includes(people[node]?.state));
     setText(byId("show-board"), inside.length ? t("board.in", { count: inside.length }) : t("board"));
     if (!this.dialog.open) return;
     const teams = [...new Set(Object.values(people).map((place) => place.team).filter(Boolean))].sort();
@@ -73,7 +73,7 @@ export class BoardView {
       select.replaceChildren(...teams.map((name) => make("option", { value: name, text: name })));
     }
     byId("evacuate-team").disabled = select.disabled = !teams.length;
-    for (const person of this.team.list()) {
+    for (const person of this.team.wearers()) {
       const row = this.rows.get(person.node) ?? this.make(person.node);
       const place = people[person.node] ?? {};
       setText(row.name, person.name);

@@ -3,6 +3,7 @@
 import { inkOn } from "./colours.js";
 import { byId, make, setAttribute, setText } from "./dom.js";
 import { number, t } from "./i18n.js";
+import { pathMarker, signOf } from "./marker.js";
 import { isPlaced } from "./relation.js";
 import { toScreen } from "./transform.js";
 
@@ -91,7 +92,8 @@ export class Floors {
     if (this.chosen !== null && !floors.includes(this.chosen)) floors.push(this.chosen);
     floors.sort((a, b) => b - a);
     this.buttons.hidden = this.section.hidden = floors.length < 2 && this.chosen === null;
-    const wanted = floors.map((f) => `${f}:${people.filter((p) => floorOf(p) === f).length}`).join() + document.documentElement.lang + JSON.stringify(names);
+    const count = (floor) => this.team.wearers().filter((p) => floorOf(p) === floor).length;
+    const wanted = floors.map((f) => `${f}:${count(f)}`).join() + document.documentElement.lang + JSON.stringify(names);
     this.field.hidden = this.chosen === null;
     setAttribute(this.field, "aria-label", t("floors.name"));
     setAttribute(this.field, "placeholder", t("floors.name"));
@@ -99,7 +101,7 @@ export class Floors {
       this.buttons.dataset.floors = wanted;
       const focused = document.activeElement?.dataset?.floor;
       this.buttons.replaceChildren(this.button(null, t("floors.all")), ...floors.map((floor) => this.button(
-        floor, t("floors.count", { floor: titleOf(floor), count: people.filter((p) => floorOf(p) === floor).length }),
+        floor, t("floors.count", { floor: titleOf(floor), count: count(floor) }),
       )), this.field);
       if (focused !== undefined) this.buttons.querySelector(`[data-floor="${focused}"]`)?.focus();
     }
@@ -127,8 +129,7 @@ export class Floors {
     context.strokeStyle = map.colourOf(person.node);
     context.fillStyle = colours.ground;
     context.lineWidth = 2.5 * unit;
-    context.beginPath();
-    context.arc(px, py, 9 * unit, 0, 2 * Math.PI);
+    pathMarker(context, person, px, py, 9 * unit);
     context.fill();
     context.stroke();
     context.globalAlpha = 0.8;
@@ -136,7 +137,7 @@ export class Floors {
     context.font = map.font(11, true);
     context.textBaseline = "middle";
     context.textAlign = "center";
-    context.fillText(String(person.node), px, py + 0.5 * unit);
+    context.fillText(signOf(person), px, py + 0.5 * unit);
     context.textAlign = "left";
     context.fillText(`${apart > 0 ? "▲" : "▼"}${number(Math.abs(apart))}`, px + 12 * unit, py);
     context.globalAlpha = 1;
@@ -184,13 +185,12 @@ export class Floors {
       const colour = map.colourOf(person.node);
       context.globalAlpha = this.isHere(person) ? 1 : PALE;
       context.fillStyle = colour;
-      context.beginPath();
-      context.arc(across(places[k]), up(person.z_m), 9 * unit, 0, 2 * Math.PI);
+      pathMarker(context, person, across(places[k]), up(person.z_m), 9 * unit);
       context.fill();
       context.globalAlpha = 1;
       context.fillStyle = this.isHere(person) ? inkOn(colour) : colours.ink;
       context.textAlign = "center";
-      context.fillText(String(person.node), across(places[k]), up(person.z_m) + 0.5 * unit);
+      context.fillText(signOf(person), across(places[k]), up(person.z_m) + 0.5 * unit);
     });
   }
 }

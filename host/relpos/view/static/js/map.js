@@ -3,6 +3,7 @@
 import { isFresh, reachM } from "./age.js";
 import { inkOn, personColour } from "./colours.js";
 import { placeLabels, placeWhereFree } from "./labels.js";
+import { pathMarker, signOf } from "./marker.js";
 import { isPlaced, VAGUE_RAD } from "./relation.js";
 import { TrackLayer } from "./track_layer.js";
 import {
@@ -158,7 +159,7 @@ export class TeamMap {
 
   /** Whose heading is up: mine, else that of who is followed, else the first one's. */
   headingPerson() {
-    const node = this.me ?? this.camera.node ?? this.team.order[0];
+    const node = this.me ?? this.camera.node ?? this.team.wearers()[0]?.node;
     return this.team.person(node);
   }
 
@@ -529,9 +530,8 @@ export class TeamMap {
     }
     const known = Number.isFinite(person.heading_rad) &&
       (person.sigma_heading_rad ?? 0) < VAGUE_RAD;
-    if (known && !gone) this.drawHeading(person, px, py, radius, colour);
-    context.beginPath();
-    context.arc(px, py, radius, 0, 2 * Math.PI);
+    if (known && !gone && !person.post) this.drawHeading(person, px, py, radius, colour);
+    pathMarker(context, person, px, py, radius);
     context.fillStyle = gone ? colours.ground : colour;
     context.fill();
     context.strokeStyle = gone ? colour : colours.ground;
@@ -540,10 +540,10 @@ export class TeamMap {
     context.stroke();
     context.setLineDash([]);
     context.fillStyle = gone ? colours.ink : inkOn(colour);
-    context.font = this.font(person.node > 99 ? 9.5 : 12, true);
+    context.font = this.font(signOf(person).length > 2 ? 9.5 : 12, true);
     context.textAlign = "center";
     context.textBaseline = "middle";
-    context.fillText(String(person.node), px, py + 0.5 * unit);
+    context.fillText(signOf(person), px, py + 0.5 * unit);
     // The sign is the node's; whether a silent one works nobody knows.
     if (!gone && (person.health === "yellow" || person.health === "red")) {
       this.drawSign(person.health, px + 0.95 * radius, py - 0.95 * radius, 6.5 * unit);
@@ -608,6 +608,7 @@ export class TeamMap {
   stateOf(person, here) {
     const alarm = this.alarms.get(person.node);
     if (alarm?.kind === "fall") return t("state.fell");
+    if (alarm?.kind === "post") return t("map.stale", { time: seconds(person.seen_s) });
     if (alarm) return alarm.kind === "lost"
       ? t("map.lost", { time: seconds(person.seen_s) })
       : isFresh(person) ? t("map.still", { time: seconds(person.still_s) }) : t("map.was-still", { time: seconds(person.seen_s) });
@@ -894,7 +895,7 @@ export class TeamMap {
 
   /** What the map shows, in a sentence. */
   describe() {
-    const people = this.team.list();
+    const people = this.team.wearers();
     const placed = people.filter(isPlaced);
     const located = placed.filter(isFresh);
     const parts = [t("map.located", { located: located.length, count: people.length })];

@@ -6,6 +6,7 @@ import { inkOn } from "./colours.js";
 import { arrow, healthSign, make, setAttribute, setText } from "./dom.js";
 import { floorOf, floorUnknown, floorWords } from "./floors.js";
 import { number as figure, t, said } from "./i18n.js";
+import { signOf } from "./marker.js";
 import { isPlaced, VAGUE_RAD } from "./relation.js";
 import {
   ago, compass, compassShort, dbm, directionWords, distance, healthWords, nodeName, percent, plusMinus, probability,
@@ -17,6 +18,7 @@ const SHELVE_S = 600;
 
 /** A person's state in words. */
 export function stateWords(person, alarm, here) {
+  if (person.post) return isFresh(person) ? t("post.state") : t("state.stale", { ago: ago(person.seen_s) });
   const words = [];
   if (alarm?.kind === "lost" || person.status === "lost") words.push(t("state.lost", { ago: ago(person.seen_s) }));
   else if (person.status === "stale") words.push(t("state.stale", { ago: ago(person.seen_s) }));
@@ -86,7 +88,10 @@ class Card {
       this.disc.style.background = colour;
       this.disc.style.color = inkOn(colour);
     }
-    setText(this.disc, String(person.node));
+    setText(this.disc, signOf(person));
+    setAttribute(element, "data-post", person.post ? "true" : null);
+    // Nobody wears it: neither lies it too still, nor can it call.
+    this.maydayButton.hidden = Boolean(person.post);
     setText(this.label, me ? t("name.me", { name: person.name }) : person.name);
     setAttribute(this.name, "aria-pressed", String(selected));
     this.sign.show(person.health);
@@ -130,7 +135,8 @@ export class PeopleList {
   /** `look` is {colourOf, me, selected, followed, alarms}. */
   update(team, look) {
     const { here } = team.possible();
-    const people = [...team.list()].sort((a, b) => trouble(look.alarms, b) - trouble(look.alarms, a) || a.node - b.node);
+    const people = [...team.list()].sort((a, b) => trouble(look.alarms, b) - trouble(look.alarms, a)
+      || Number(a.post ?? false) - Number(b.post ?? false) || a.node - b.node);
     for (const [node, card] of this.cards) {
       if (!team.people.has(node)) {
         card.element.remove();
@@ -186,13 +192,13 @@ export function tableRow(team, person, me) {
       const other = team.person(node === person.node ? peer : node);
       return `${other?.name ?? "?"} ${figure(rangeM, 1)}`;
     });
-  const faces = isFresh(person) && Number.isFinite(person.heading_rad) && (person.sigma_heading_rad ?? 0) < VAGUE_RAD;
+  const faces = isFresh(person) && !person.post && Number.isFinite(person.heading_rad) && (person.sigma_heading_rad ?? 0) < VAGUE_RAD;
   const placed = isPlaced(person);
   const from = me === null ? "" : whereabouts(team.relation(me, person.node), team.northRad);
   return [
     person.name,
-    [statusWords(person.status), isFresh(person) ? "" : t("table.heard", { ago: ago(person.seen_s) }),
-      person.moving === false ? t("map.still", { time: seconds(person.still_s) }) : "",
+    [person.post ? t("post") : statusWords(person.status), isFresh(person) ? "" : t("table.heard", { ago: ago(person.seen_s) }),
+      person.moving === false && !person.post ? t("map.still", { time: seconds(person.still_s) }) : "",
       healthWords(person.health)].filter(Boolean).join(", "),
     placed ? number(person.x_m) : UNKNOWN,
     placed ? number(person.y_m) : UNKNOWN,

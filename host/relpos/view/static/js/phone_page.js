@@ -14,6 +14,7 @@ import { FindView } from "./find_view.js";
 import { nameFloors } from "./floors.js";
 import { languageSwitch, number, said, t } from "./i18n.js";
 import { LinkBanner } from "./link_banner.js";
+import { signOf } from "./marker.js";
 import { stateWords } from "./people.js";
 import { PressQueue, randomId, UNDO_MS } from "./queue.js";
 import { Siren } from "./sound.js";
@@ -187,6 +188,8 @@ function showTeam() {
     setAttribute(row.element, "data-alert", alarm?.level ?? null);
     row.disc.style.background = colourOf(person.node);
     row.disc.style.color = inkOn(colourOf(person.node));
+    setAttribute(row.element, "data-post", person.post ? "true" : null);
+    setText(row.disc, signOf(person));
     setText(row.name, person.name);
     row.arrow.point(relation?.relativeRad ?? null);
     setText(row.far, relation ? `${distance(relation.distanceM, relation.sigmaM)} ` : "–");

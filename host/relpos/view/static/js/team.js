@@ -1,6 +1,7 @@
 // The newest view of the team, and what follows from it; fed by the server's messages (protocol 1).
 
 import { aged } from "./age.js";
+import { t } from "./i18n.js";
 import { nodeName } from "./words.js";
 import { pairKey, relation } from "./relation.js";
 import { Track } from "./tracks.js";
@@ -10,6 +11,7 @@ export const PROTOCOL = 1;
 /** Less probable positions are not shown: they would be clutter. */
 const MIN_PROBABILITY = 0.03;
 const STARTING = ["starting", "no status heard yet"]; // nodes/health.py
+const POST_NAME = "Command post"; // team_view.py
 const RANGE_AGE_S = 10; // as the session drops them
 const ONE_PLACE_M = 0.7; // as in the host's fusion/modes.py
 
@@ -103,7 +105,7 @@ export class Team {
     this.pictures += 1;
     for (const person of this.people.values()) {
       // Only located people leave a track.
-      if (person.status === "ok" || person.status === "stale") {
+      if (!person.post && (person.status === "ok" || person.status === "stale")) {
         this.trackOf(person.node).add(picture.time_s, person.x_m, person.y_m);
       }
     }
@@ -141,6 +143,11 @@ export class Team {
   /** All people, by number. */
   list() {
     return this.order.map((node) => this.people.get(node));
+  }
+
+  /** Who is worn by somebody: all but the command post's node. */
+  wearers() {
+    return this.list().filter((person) => !person.post);
   }
 
   person(node) {
@@ -227,5 +234,6 @@ function isSamePlace(a, b) {
 
 function named(person) {
   const health = STARTING.includes(person.reasons?.[0]) ? "starting" : person.health;
-  return { ...person, health, name: !person.name || person.name === `Node ${person.node}` ? nodeName(person.node) : person.name };
+  const own = person.name && person.name !== `Node ${person.node}` && person.name !== POST_NAME;
+  return { ...person, health, name: own ? person.name : person.post ? t("post") : nodeName(person.node) };
 }

@@ -130,7 +130,7 @@ function takeAlarms() {
   if (raised.length) setText(byId("alarm-voice"), raised.map((a) => `${levelWords(a.level)}: ${alarmText(a)}`).join(". "));
   if (cleared.length) {
     setText(byId("news-voice"), cleared
-      .map((a) => t(a.kind === "lost" ? "cleared.lost" : "cleared.still", { name: a.name })).join(". "));
+      .map((a) => t(a.kind === "lost" || a.kind === "post" ? "cleared.lost" : "cleared.still", { name: a.name })).join(". "));
   }
   if (team.replayed && raised.length) siren.sound(null);
   sound();
@@ -195,8 +195,8 @@ function show() {
   board.update();
   showUnseen(byId("show-log"), log.unseen);
   showNotices(byId("notices"), notices.map((notice) => ({ ...notice, text: team.withNames(said(notice.said, notice.text)) })));
-  const heard = team.list().filter(isFresh).length;
-  const all = team.people.size;
+  const heard = team.wearers().filter(isFresh).length;
+  const all = team.wearers().length;
   byId("people").dataset.many = String(all > 8);
   setText(byId("count"), !all ? "" : heard === all ? `(${all})` : t("count.heard", { heard, all }));
   fillMe();
@@ -268,7 +268,7 @@ function fillMe() {
       ...team.list().map((p) => make("option", { value: p.node, text: p.name })));
   }
   // Until a person is chosen, directions are relative to the first one.
-  if (map.me === null && store.getItem("relpos.me") === null) map.me = team.order[0] ?? null;
+  if (map.me === null && store.getItem("relpos.me") === null) map.me = team.wearers()[0]?.node ?? null;
   const value = map.me === null ? "" : String(map.me);
   if (select.value !== value) select.value = value;
 }
@@ -297,7 +297,7 @@ function setMe(node) {
 
 /** The next node by number after `node`, without `but`. */
 function neighbour(node, by, but) {
-  const others = team.order.filter((n) => n !== but);
+  const others = team.wearers().map((p) => p.node).filter((n) => n !== but);
   const at = others.indexOf(node);
   return others[(at + by + others.length) % others.length] ?? node;
 }
@@ -309,7 +309,8 @@ function find(node) {
 
 /** The nearest person, who seeks where none is chosen. */
 function nearest(node) {
-  const near = team.order
+  const near = team.wearers()
+    .map((p) => p.node)
     .filter((n) => n !== node)
     .map((n) => [n, team.relation(n, node)?.distanceM ?? Infinity])
     .sort((a, b) => a[1] - b[1]);
