@@ -32,9 +32,14 @@ def pytest_xdist_auto_num_workers() -> int:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    durations = config.cache.get(DURATIONS, {}) if config.cache is not None else {}
+    cache = _cache_of(config)
+    durations = cache.get(DURATIONS, {}) if cache is not None else {}
     # Tests of a file stay together and share its fixtures (--dist loadfile); a new one may be long.
     items.sort(key=lambda item: -durations.get(_file_of(item.nodeid), _guess_s(item.nodeid)))
+
+
+def _cache_of(config: pytest.Config) -> pytest.Cache | None:
+    return getattr(config, "cache", None)  # Absent with `-p no:cacheprovider`.
 
 
 def _guess_s(nodeid: str) -> float:
@@ -56,9 +61,9 @@ class _Stopwatch:
 
     def pytest_sessionfinish(self) -> None:
         """Keep what this run measured; a run of a few files keeps the others' figures."""
-        if self.config.cache is not None:
-            before = self.config.cache.get(DURATIONS, {})
-            self.config.cache.set(DURATIONS, before | self.seconds)
+        cache = _cache_of(self.config)
+        if cache is not None:
+            cache.set(DURATIONS, cache.get(DURATIONS, {}) | self.seconds)
 
 
 def pytest_configure(config: pytest.Config) -> None:
