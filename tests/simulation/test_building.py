@@ -92,6 +92,14 @@ def test_dead_reckoning_claims_twice_the_way_on_stairs_and_the_true_one_on_the_l
         assert low < claimed_m / way_m < high, words
 
 
+@pytest.mark.parametrize("stairs", range(3))
+def test_nobody_moves_faster_than_people_walk(stairs: int) -> None:
+    truth = made("calm", 600.0, stairs=stairs).truth
+    for node in {row.node for row in truth}:
+        at = np.array([(row.x_m, row.y_m) for row in truth if row.node == node])
+        assert np.hypot(*np.diff(at, axis=0).T).max() < 1.15
+
+
 def test_a_step_on_stairs_rises_by_a_riser_or_by_two() -> None:
     run = made("stairs", two_share=0.5)
     risers_m = []

@@ -164,6 +164,7 @@ class Climber:
         factor = CLAIMED_TWO if two else (CLAIMED_UP if up else CLAIMED_DOWN)
         stop = self.rng.random() < PAUSE_SHARE
         stop_s = float(self.rng.uniform(2.0, 15.0)) if stop else 0.0
+        self.walk(leg.points_m[0], 0.15)
         self._face(leg.points_m[1] - leg.points_m[0])
         ticks = max(2, round(count / cadence_hz * RATE_HZ))
         bottom_m = self.feet_m

@@ -20,6 +20,7 @@ from relpos.fusion.models.detection import (
     Rounds,
     Statistics,
     add_attempts,
+    on_one_floor,
 )
 from relpos.measurements import Range
 from relpos.simulation.paper import simulate_paper
@@ -219,3 +220,23 @@ def test_distances_that_are_no_numbers_are_counted_within_the_arrays() -> None:
             add_attempts(attempts, Detection().curve, learned)
     assert not room[[0, 3]].any()
     assert not room[1:3, 2:-2].any()
+
+
+def test_a_pair_that_may_be_a_storey_apart_counts_neither_as_received_nor_as_missed() -> None:
+    rounds = Rounds()
+    below = {3: (3.5, 0.1), 4: (0.2, 0.1), 5: (0.0, 5.0)}
+
+    def level(pairs: Sequence[tuple[int, int]]) -> np.ndarray:
+        heights = [(below.get(a, (0.0, 0.1)), below.get(b, (0.0, 0.1))) for a, b in pairs]
+        dz = np.array([b[0] - a[0] for a, b in heights])
+        return on_one_floor(dz, np.array([a[1] ** 2 + b[1] ** 2 for a, b in heights]))
+
+    everybody = [(1, peer) for peer in (2, 3, 4, 5)]
+    found = []
+    for time_s, pairs in enumerate([everybody, [(1, 2)], everybody]):
+        found += rounds.add(
+            float(time_s), [Range(float(time_s), a, b, 3.0) for a, b in pairs], always, level
+        )
+    assert found[0].received == ((1, 2), (1, 4))
+    assert found[1].received == ((1, 2),)
+    assert found[1].missed == ((1, 4),)

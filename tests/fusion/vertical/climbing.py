@@ -102,9 +102,9 @@ def follow(
             z[node][k] = now[node]
             true[node] += part.way_m
             way_m = part.way_m * part.claims
-            claimed[node] += way_m
             steps = part.steps if with_steps else None
-            vertical.move(Advance(time_s, node, 1.0, way_m, 0.0, 0.0, steps=steps))
+            made = vertical.move(Advance(time_s, node, 1.0, way_m, 0.0, 0.0, steps=steps))
+            claimed[node] += complex(made.dx_m, made.dy_m)
             kept = math.exp(-1.0 / 90.0)
             bias[node] = kept * bias[node] + bias_m * math.sqrt(1 - kept**2) * rng.standard_normal()
             start_s = (begins_s or {}).get(node, 0.0)

@@ -37,7 +37,7 @@ from relpos.fusion.initial_poses import (
     Initialiser,
     PoseMixture,
 )
-from relpos.fusion.models.detection import Detection
+from relpos.fusion.models.detection import Detection, on_one_floor
 from relpos.fusion.models.handedness import Handedness
 from relpos.fusion.models.motion import WALK_S, WithinReport, reported_sigmas, velocity_m_s
 from relpos.fusion.models.north import North
@@ -155,7 +155,7 @@ class Bank:
     def update(self, step: Step, timeline: Timeline) -> Estimate | None:
         """Process one step of the timeline; an estimate at the end of an epoch."""
         if isinstance(step, Advance):
-            self.vertical.move(step)
+            step = self.vertical.move(step)
             if step.node in self._row:
                 # It waits until a range or heading needs it, or the epoch ends.
                 self._pending.append(step)
@@ -336,10 +336,10 @@ class Bank:
             self._counters["stairs_corrected"] += 1
             row = self._row.get(back.node)
             if row is None:
-                step = Advance(time_s, back.node, 0.0, back.dx_m, back.dy_m, 0.0)
-                self.initialiser.advance(step)
+                self.initialiser.advance(back)
             else:
-                self.core.move(np.array([row]), np.array([[back.dx_m, back.dy_m, 0.0, 0.0]]))
+                moves = np.array([[back.dx_m, back.dy_m, 0.0, 0.0]])
+                self.core.move(np.array([row]), moves, np.array([reported_sigmas(back)]))
         for node, known in self._known.items():
             vertical = self.vertical.of(node, time_s)
             known.vertical = vertical._replace(z_m=known.worn_m + vertical.z_m)
@@ -477,7 +477,8 @@ class Bank:
     ) -> list[Attempts]:
         """Return the attempts of each round that ends here; the detection curve learns them."""
         rounds = []
-        for done in self.detection.rounds.add(time_s, ranges, timeline.reported_s):
+        learned = self.detection.rounds
+        for done in learned.add(time_s, ranges, timeline.reported_s, self._on_one_floor):
             pairs = done.received + done.missed
             for late in timeline.catch_up({n for p in pairs for n in p}, time_s):
                 self.update(late, timeline)
@@ -491,6 +492,10 @@ class Bank:
             )
             rounds.append(Attempts(*rows, received, attempted))
         return rounds
+
+    def _on_one_floor(self, pairs: Sequence[tuple[int, int]]) -> npt.NDArray[np.bool_]:
+        _, _, dz, variance = self._pairs(pairs)
+        return on_one_floor(dz, variance)
 
     def _sense(self, step: Sensed) -> None:
         measured = step.measurement

@@ -191,7 +191,7 @@ class LargeTeam:
         match step:
             case Advance():
                 self._moved = True
-                self.vertical.move(step)
+                step = self.vertical.move(step)
                 self._presence(step.node).received(step.time_s)
                 self._pending.append(step)
             case Ranging():
@@ -247,7 +247,7 @@ class LargeTeam:
             return
         for back in self.vertical.close(time_s):
             self._own["stairs_corrected"] += 1
-            self._pending.append(Advance(time_s, back.node, 0.0, back.dx_m, back.dy_m, 0.0))
+            self._pending.append(back)
         self._predict()
         for node, known in self._known.items():
             known.vertical = self.vertical.of(node, time_s)

@@ -12,6 +12,8 @@ slowly (``MEMORY``), because surroundings change.
 
 A missed attempt has other causes than distance, so it counts with care:
 
+* a slab attenuates, and what is above or below the other says nothing of the plane: pairs that
+  may be a storey apart count neither as received nor as missed (``on_one_floor``);
 * a pair counts as attempted only where one of the two took part in another range of the same
   round and the other is alive (it ranged, or moved of late), and only once a range of the pair was
   received at all: pairs that never range each other tell nothing;
@@ -33,7 +35,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import chain
+from itertools import chain, compress
 from typing import NamedTuple
 
 import numpy as np
@@ -56,6 +58,15 @@ LENGTH = 201
 
 ALIVE_S = 2.5
 """A node whose newest motion is not older is alive: two reports in a row may be lost."""
+
+ONE_FLOOR_M = 1.75
+"""Half a storey: whose heights differ by less, and surely so, are on one floor."""
+
+
+def on_one_floor(dz_m: Floats, variance_m2: Floats) -> npt.NDArray[np.bool_]:
+    """Return which pairs are on one floor, by their differences of height and those's variances."""
+    near: npt.NDArray[np.bool_] = np.abs(dz_m) + np.sqrt(variance_m2) < ONE_FLOOR_M
+    return near
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,11 +97,16 @@ class Rounds:
     _directed: set[Pair] = field(default_factory=set)
 
     def add(
-        self, time_s: float, ranges: Sequence[Range], reported_s: Callable[[int], float]
+        self,
+        time_s: float,
+        ranges: Sequence[Range],
+        reported_s: Callable[[int], float],
+        level: Callable[[Sequence[Pair]], npt.NDArray[np.bool_]] | None = None,
     ) -> list[Round]:
         """Return the rounds that end with these ranges of one instant: none, one or two.
 
-        ``reported_s`` returns the time of a node's newest motion, -inf where there was none.
+        ``reported_s`` returns the time of a node's newest motion, -inf where there was none;
+        ``level`` which pairs are on one floor: all, where nobody's height is known.
         """
         rounds = []
         directed = {(r.node, r.peer) for r in ranges}
@@ -98,14 +114,19 @@ class Rounds:
         turns = in_turns if self._turns is None else self._turns
         self._turns = turns + 0.1 * (in_turns - turns)
         if self._open and (self._turns < 0.5 or not directed.isdisjoint(self._directed)):
-            rounds.append(self._close(time_s, reported_s))
+            rounds.append(self._close(time_s, reported_s, level))
         self._directed |= directed
         self._open |= {pair if pair[0] < pair[1] else pair[::-1] for pair in directed}
         if self._turns < 0.5:
-            rounds.append(self._close(time_s, reported_s))
+            rounds.append(self._close(time_s, reported_s, level))
         return rounds
 
-    def _close(self, time_s: float, reported_s: Callable[[int], float]) -> Round:
+    def _close(
+        self,
+        time_s: float,
+        reported_s: Callable[[int], float],
+        level: Callable[[Sequence[Pair]], npt.NDArray[np.bool_]] | None,
+    ) -> Round:
         received = self._open
         self.ever_received |= received
         busy = Counter(chain.from_iterable(received))
@@ -119,9 +140,12 @@ class Rounds:
                 missed.append(pair)
         missed.sort()
         self._open, self._directed = set(), set()
-        ordered = tuple(sorted(received))
+        ordered = sorted(received)
+        if level is not None:
+            ordered = list(compress(ordered, level(ordered)))
+            missed = list(compress(missed, level(missed)))
         observable = tuple([busy[a] > 1 or busy[b] > 1 for a, b in ordered])
-        return Round(time_s, ordered, tuple(missed), observable)
+        return Round(time_s, tuple(ordered), tuple(missed), observable)
 
 
 # -- the statistics of attempts --------------------------------------------------------------------

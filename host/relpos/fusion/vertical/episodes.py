@@ -48,8 +48,10 @@ class Mode(IntEnum):
 
 MODES = len(Mode)
 CLIMBS_COMMON = (Mode.UP_COMMON, Mode.DOWN_COMMON)
-STAIRS = (Mode.UP, Mode.DOWN, Mode.UP_TWO, Mode.DOWN_TWO, *CLIMBS_COMMON)
-RISERS = (1.0, -1.0, 2.0, -2.0, 1.0, -1.0)
+UP = (Mode.UP, Mode.UP_TWO, Mode.UP_COMMON)
+DOWN = (Mode.DOWN, Mode.DOWN_TWO, Mode.DOWN_COMMON)
+STAIRS = (*UP, *DOWN)
+RISERS = (1.0, 2.0, 1.0, -1.0, -2.0, -1.0)
 """That a step goes up in each of them."""
 LIFTS = (Mode.LIFT_UP_BEGINS, Mode.LIFT_UP, Mode.LIFT_DOWN_BEGINS, Mode.LIFT_DOWN)
 BEGINNINGS = (Mode.LIFT_UP_BEGINS, Mode.LIFT_DOWN_BEGINS)
@@ -63,8 +65,8 @@ LASTING = (Mode.DISTURBED, Mode.COMMON)
 
 _EPISODES: dict[Episode, tuple[Mode, ...]] = {
     Episode.LEVEL: (Mode.LEVEL,),
-    Episode.UP: (Mode.UP, Mode.UP_TWO, Mode.UP_COMMON),
-    Episode.DOWN: (Mode.DOWN, Mode.DOWN_TWO, Mode.DOWN_COMMON),
+    Episode.UP: UP,
+    Episode.DOWN: DOWN,
     Episode.LIFT: LIFTS,
     Episode.DISTURBED: PRESSURE,
     Episode.FALLING: (Mode.FALLING,),

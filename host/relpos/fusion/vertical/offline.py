@@ -45,8 +45,8 @@ def as_climbed(
     for m in sorted(measurements, key=lambda m: m.time_s):
         own = of.get(m.node, ())
         if isinstance(m, Motion) and own:
-            factor = _factor(own, before.get(m.node, -math.inf), m.time_s)
-            changed.append(replace(m, dx_m=factor * m.dx_m, dy_m=factor * m.dy_m))
+            share = _share(own, before.get(m.node, -math.inf), m.time_s)
+            changed.append(replace(m, dx_m=share * m.dx_m, dy_m=share * m.dy_m))
             before[m.node] = m.time_s
         elif isinstance(m, Height) and own:
             z_m = float(np.interp(m.time_s, [d.end_s for d in own], [d.z_m for d in own]))
@@ -56,12 +56,12 @@ def as_climbed(
     return changed
 
 
-def _factor(own: Sequence[Decided], begin_s: float, end_s: float) -> float:
-    """Return the mean factor of a displacement between two times."""
+def _share(own: Sequence[Decided], begin_s: float, end_s: float) -> float:
+    """Return the true share of a displacement between two times."""
     begin_s = max(begin_s, end_s - 10.0)
     less = 0.0
     for one in own:
         overlap_s = min(end_s, one.end_s) - max(begin_s, one.begin_s)
         if overlap_s > 0.0:
-            less += overlap_s * (1.0 - one.factor)
+            less += overlap_s * (1.0 - one.share)
     return 1.0 - less / max(end_s - begin_s, 1e-9)

@@ -1,4 +1,4 @@
-"""The true way on stairs, of which dead reckoning claims a level step's length each step."""
+"""How much of its way somebody on stairs truly goes; dead reckoning claims level steps."""
 
 from __future__ import annotations
 
@@ -13,18 +13,34 @@ TREAD_M, RISER_M, STEEPER = 0.28, 0.175, 1.0
 LEAST_TREAD_M = 0.22
 TWO_STEPS_M = 0.26
 """A rise by so much is two steps."""
+STEP_M = 0.56
+"""A step as dead reckoning claims it, where too few tell."""
+FEW_STEPS = 3.0
+MOST = 1.3
+"""Of the claimed way of an interval: what pressure took too much before is given back."""
 
 
-def way_on_stairs(steps: Floats, rise_m: Floats, way_m: Floats) -> Floats:
-    """Return the true way (m) of steps that rise by so much and are claimed to go so far.
+def true_shares(
+    steps: Floats, way_m: Floats, rise_m: Floats, up: Floats, down: Floats
+) -> tuple[Floats, Floats]:
+    """Return which share of its claimed way each of N nodes truly went in I intervals, (I, N).
 
-    The rise tells how many of the steps were on stairs: landings and the first steps behind a
-    flight are level.
+    ``steps``, ``way_m`` and ``rise_m`` (I, N) are what was reported, ``up`` and ``down`` (I, N) the
+    probabilities of a flight. The second value (N,) is the share while on a flight.
+
+    The surplus follows the rise: each riser is a step that is claimed to be a level one. So it need
+    not be known in which second a flight began, and steps on landings count in full.
     """
-    rise_of_one = rise_m / np.maximum(steps, 1e-9)
+    stairs = up + down
+    count = (stairs * steps).sum(axis=0)
+    climbed_m = (up - down) * rise_m
+    rise_of_one = np.abs(climbed_m.sum(axis=0)) / np.maximum(count, 1e-9)
     treads = 1.0 + np.clip((rise_of_one - TWO_STEPS_M) / 0.04 + 0.5, 0.0, 1.0)
-    riser = rise_of_one / treads
-    climbs = np.minimum(riser / RISER_M, 1.0)
-    tread = np.clip(TREAD_M - STEEPER * np.maximum(riser - RISER_M, 0.0), LEAST_TREAD_M, TREAD_M)
-    way: Floats = way_m * (1.0 - climbs) + climbs * steps * treads * tread
-    return way
+    # Of steps that rise by less some were on a landing.
+    riser = np.maximum(rise_of_one / treads, RISER_M)
+    tread = np.clip(TREAD_M - STEEPER * (riser - RISER_M), LEAST_TREAD_M, TREAD_M)
+    taken = steps.sum(axis=0)
+    step_m = np.where(taken > FEW_STEPS, way_m.sum(axis=0) / np.maximum(taken, FEW_STEPS), STEP_M)
+    surplus_m = np.maximum(step_m - treads * tread, 0.0)
+    shares = 1.0 - climbed_m * surplus_m / (treads * riser) / np.maximum(way_m, 0.2)
+    return np.clip(shares, 0.0, MOST), 1.0 - surplus_m / np.maximum(step_m, 1e-9)

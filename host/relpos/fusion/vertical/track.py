@@ -23,6 +23,8 @@ class Moved(NamedTuple):
     steps: float = 0.0
     way_m: float = 0.0
     displacement_m: complex = 0j
+    made_m: complex = 0j
+    """As the plane has been moved by it."""
 
     def to(self, later: Moved, share: float = 1.0) -> Moved:
         """Return a share of what lies between this and a later one."""
@@ -48,22 +50,28 @@ class Track:
     """Time of the height that was taken last."""
     heading: complex = 1.0 + 0j
     """In the frame of its own dead reckoning."""
+    expected: float = 1.0
+    """Of a displacement: how much of it is true, by what the node did last."""
     _reached: Moved = NOT_MOVED
     _taken: Moved = NOT_MOVED
     _points: deque[tuple[float, Moved]] = field(default_factory=deque)
     """Totals at the ends of pieces that are not taken wholly."""
 
-    def move(self, step: Advance) -> None:
-        """Add a piece of motion."""
+    def move(self, step: Advance) -> Advance:
+        """Add a piece of motion; return it as it is expected to be true."""
         way_m = math.hypot(step.dx_m, step.dy_m)
         steps = way_m / STEP_M if step.steps is None else step.steps
-        x, y, z = self._reached
-        moved = z + self.heading * complex(step.dx_m, step.dy_m)
+        x, y, reported, made = self._reached
+        moved = self.heading * complex(step.dx_m, step.dy_m)
         if not self._points:
             self._points.append((step.time_s - step.duration_s, self._reached))
-        self._reached = Moved(x + steps, y + way_m, moved)
+        factor = self.expected
+        self._reached = Moved(x + steps, y + way_m, reported + moved, made + factor * moved)
         self._points.append((step.time_s, self._reached))
         self.heading *= cmath.rect(1.0, step.dtheta_rad)
+        if factor == 1.0:
+            return step
+        return step._replace(dx_m=factor * step.dx_m, dy_m=factor * step.dy_m)
 
     def take(self) -> Moved:
         """Return the motion up to the newest height."""
