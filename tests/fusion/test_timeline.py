@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from relpos.errors import DataError
-from relpos.fusion.timeline import Advance, Displacement, Epoch, Ranging, Step, Timeline
-from relpos.measurements import Heading, Measurement, Motion, Range
+from relpos.fusion.timeline import Advance, Displacement, Epoch, Ranging, Sensed, Step, Timeline
+from relpos.measurements import Heading, Height, Measurement, Motion, Range
 
 Pose = tuple[float, float, float]
 
@@ -254,3 +254,85 @@ def test_a_late_displacement_is_late_from_its_beginning() -> None:
     timeline.push(Motion(2.0, 2, 1.0, 0.0, 0.0))
     found = [(late.since_s, late.time_s) for late in timeline.late]
     assert found == [(0.0, 3.0), (3.0, 8.0), (3.0, 5.0), (-math.inf, 2.0)]
+
+
+def moved(time_s: float, node: int) -> Motion:
+    return Motion(time_s, node, 1.0, 0.0, 0.0)
+
+
+def test_what_is_sensed_at_one_instant_comes_by_node_heights_first() -> None:
+    expected = [
+        Height(1.5, 1, 0.2), Height(1.5, 1, 0.3), Heading(1.5, 1, 0.4, 0.1, "phone"),
+        Height(1.5, 2, 0.1), Heading(1.5, 2, -0.4, 0.1, "phone"),
+    ]  # fmt: skip
+    for given_so in (expected, expected[::-1]):
+        steps = run(Timeline((1, 2)), [moved(1.0, 1), *given_so, moved(2.0, 1), moved(2.0, 2)])
+        assert [s.measurement for s in steps if isinstance(s, Sensed)] == expected
+
+
+def test_a_motion_that_its_successor_overtook_while_both_wait_takes_its_place() -> None:
+    timeline = Timeline((1, 2), reorder_s=0.0, max_lag_s=10.0)
+    rows = [moved(t, 1) for t in (1.0, 5.0, 4.0, 2.0)]
+    found = advances(run(timeline, [*rows, moved(6.0, 2)]), 1)
+    assert [(a.time_s, a.duration_s) for a in found] == [
+        (1.0, 1.0),
+        (2.0, 1.0),
+        (4.0, 2.0),
+        (5.0, 1.0),
+    ]
+    assert not timeline.counters
+
+
+def test_the_first_of_a_nodes_motions_may_be_overtaken_too() -> None:
+    timeline = Timeline((1, 2), reorder_s=0.0, max_lag_s=10.0)
+    found = advances(run(timeline, [moved(t, 1) for t in (5.0, 3.0)]), 1)
+    assert [(a.time_s, a.duration_s) for a in found] == [(3.0, 3.0), (5.0, 2.0)]
+    assert not timeline.counters
+
+
+def test_a_second_motion_of_an_instant_counts_whole_and_as_late() -> None:
+    timeline = Timeline((1,), reorder_s=0.0, keep_late=True)
+    steps = run(timeline, [moved(1.0, 1), moved(1.0, 1), moved(2.0, 1)])
+    assert end_of(steps, 1) == (3.0, 0.0, 0.0)
+    assert timeline.counters == {"motions_late": 1}
+    assert [(late.since_s, late.time_s) for late in timeline.late] == [(-math.inf, 1.0)]
+
+
+def test_a_range_behind_the_frontier_or_at_it_is_late_at_its_time() -> None:
+    timeline = Timeline((1, 2), reorder_s=0.0, keep_late=True)
+    for measurement in (moved(4.0, 1), moved(4.0, 2), Range(4.0, 1, 2, 3.0)):
+        timeline.push(measurement)
+    assert [late.time_s for late in timeline.late] == [4.0]
+    timeline.push(Range(3.0, 1, 2, 3.0))
+    timeline.push(Height(2.0, 1, 3.0))
+    assert [late.time_s for late in timeline.late] == [4.0, 3.0, 2.0]
+    assert all(late.since_s == math.nextafter(late.time_s, 0.0) for late in timeline.late)
+    assert timeline.counters == {"ranges_late": 1, "sensed_late": 1}
+
+
+def test_a_silent_node_is_waited_for_as_long_as_the_bound() -> None:
+    timeline = Timeline((1, 2), max_lag_s=3.0, reorder_s=0.0)
+    given_out = [bool(timeline.push(moved(t, 1))) for t in (1.0, 2.0, 3.0, 3.5)]
+    assert given_out == [False, False, False, True]
+
+
+@pytest.mark.parametrize(("lazy", "at_range"), [(False, {1, 2, 3}), (True, {1, 2})])
+def test_a_lazy_timeline_moves_only_whom_a_range_concerns_until_the_epoch(
+    lazy: bool, at_range: set[int]
+) -> None:
+    timeline = Timeline((1, 2, 3), lazy=lazy)
+    rows: list[Measurement] = [moved(k + 0.1 * n, n) for k in (1, 2, 3) for n in (1, 2, 3)]
+    steps = run(timeline, sorted([*rows, Range(1.5, 1, 2, 3.0)], key=lambda m: m.time_s))
+    at = next(k for k, s in enumerate(steps) if isinstance(s, Ranging))
+    assert {s.node for s in steps[:at] if isinstance(s, Advance) and s.time_s == 1.5} == at_range
+    epoch = next(k for k, s in enumerate(steps) if isinstance(s, Epoch) and s.time_s > 1.5)
+    assert [end_of(steps[:epoch], n)[0] for n in (1, 2, 3)] == pytest.approx([2.0, 1.9, 1.8])
+    assert timeline.catch_up((9,), 5.0) == []
+
+
+def test_a_lazy_timeline_moves_whom_a_heading_concerns_and_not_for_a_height() -> None:
+    for sensed, moves in ((Heading(1.5, 2, 0.1, 0.1, "phone"), [1.5]), (Height(1.5, 2, 3.0), [])):
+        rows = [moved(1.0, 1), moved(1.0, 2), sensed, moved(2.0, 1), moved(2.0, 2)]
+        steps = run(Timeline((1, 2), lazy=True), rows)
+        at = next(k for k, s in enumerate(steps) if isinstance(s, Sensed))
+        assert [a.time_s for a in advances(steps[:at], 2) if a.time_s > 1.0] == moves

@@ -307,6 +307,15 @@ def test_one_frame_of_the_last_counter_silences_no_node():
     assert decoder.nodes[1].window.newest == 10
 
 
+@pytest.mark.parametrize(("counter", "asked"), [(500, 0), (100, 1), ((1 << 32) - 1, 1)])
+def test_a_node_is_asked_for_counters_that_do_not_fit_and_not_for_an_echo(counter, asked):
+    decoder = Decoder((KEY,))
+    decoder.feed(motion(500, 1.0, key=KEY), 1.0)
+    for _ in range(20):
+        decoder.feed(motion(counter, 1.0, key=KEY), 1.5)
+    assert len(decoder.challenges) == len(decoder.remarks) == asked
+
+
 def test_a_node_may_have_sent_for_a_month_while_no_host_listened():
     decoder = Decoder((KEY,), {1: 1000})
     assert decoder.feed(motion(1000 + MAX_JUMP, 1.0, key=KEY), 1.0)

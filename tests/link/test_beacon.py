@@ -49,6 +49,14 @@ def test_a_late_beacon_carries_the_time_at_which_it_leaves():
     assert schedule.due(5.2) is None, "missed beacons are not made up for"
 
 
+def test_a_beacon_that_leaves_when_the_next_is_due_takes_its_turn():
+    schedule = BeaconSchedule([1])
+    assert schedule.due(0.0)
+    assert schedule.due(2.0)
+    assert schedule.due(2.5) is None
+    assert schedule.due(3.0)
+
+
 def test_the_round_wraps_after_256_superframes():
     schedule = BeaconSchedule([1])
     assert schedule.due(511.0)["round"] == 255

@@ -16,7 +16,7 @@ from relpos.link import port as serial_port
 from relpos.link import xbee
 from relpos.link.clock import NodeClock
 from relpos.link.decoder import Decoder
-from relpos.measurements import Heading, Height, Motion, Range, Status, out_of_bounds
+from relpos.measurements import Heading, Height, Motion, Range, Status, Step, out_of_bounds
 from relpos.protocol import messages as wire
 
 MOTION_ZERO = dict.fromkeys(wire.MOTION.field, 0)
@@ -303,6 +303,15 @@ def test_variances_across_add_up_as_they_are_reported():
     assert motion.sigma_y_m == pytest.approx(0.3, abs=1e-3)
 
 
+def test_an_error_of_scale_is_one_from_the_start_and_its_square_grows_with_it():
+    decoder = Decoder()
+    decoder.feed(motion_frame(0, time_s=1, scale_error_m=0.3), 1.0)
+    frame = motion_frame(1, time_s=2, scale_error_m=0.5, variance_along_m2=0.09)
+    (motion,) = motions(decoder.feed(frame, 2.0))
+    assert motion.sigma_x_m == pytest.approx(math.sqrt(0.5**2 - 0.3**2 + 0.09), abs=1e-3)
+    assert motion.sigma_x_alone_m == pytest.approx(math.hypot(0.5 - 0.3, 0.3), abs=1e-3)
+
+
 def test_motions_whose_clock_estimates_cross_keep_their_order_and_are_counted():
     decoder = Decoder()
     (first,) = motions(decoder.feed(motion_frame(0, time_s=1), 1.5))
@@ -360,6 +369,25 @@ def test_a_damaged_or_foreign_frame_changes_nothing():
         "ForeignVersionError": 3,
     }
     assert len(motions(decoder.feed(good, 2.0))) == 1
+
+
+def test_what_only_a_host_sends_and_what_only_a_host_is_called_are_no_nodes():
+    decoder = Decoder()
+    command = {"token": 1, "command": 4, "value": 930}
+    assert decoder.feed(wire.encode(wire.COMMAND, 1, 0, 1, command), 1.0) == []
+    for node in (wire.COORDINATOR, wire.BROADCAST):
+        assert decoder.feed(motion_frame(1, node=node, time_s=1), 1.0) == []
+    assert decoder.counts == {"not_from_a_node": 3}
+    assert decoder.nodes == {}
+
+
+def test_steps_are_dated_back_by_their_ages():
+    steps = [{"length_m": 0.7, "age_s": 1.5}, {"length_m": 0.8, "age_s": 0.9}]
+    values = {"time_s": 10.0, "steps": steps}
+    assert Decoder().feed(wire.encode(wire.STEPS, 1, 0, 0, values), 110.0) == [
+        Step(pytest.approx(108.5), 1, pytest.approx(0.7)),
+        Step(pytest.approx(109.1), 1, pytest.approx(0.8)),
+    ]
 
 
 def test_a_range_is_dated_back_by_its_age():

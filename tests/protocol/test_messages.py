@@ -152,6 +152,17 @@ def test_a_count_that_does_not_fit_the_length_is_refused_despite_a_good_crc_and_
         wire.decode(sealed(wire.RANGES.number, bytes(4) + b"\xff" + bytes(8)))
 
 
+def test_what_is_too_short_or_too_long_for_any_frame_is_told_as_that():
+    whole = sealed(wire.MOTION.number, bytes(wire.FRAME_BYTES))
+    least = len(sealed(wire.MOTION.number, b""))
+    for length in (*range(2, least), wire.FRAME_BYTES + 1):
+        with pytest.raises(wire.FrameLengthError, match=f"a frame of {length} bytes"):
+            wire.decode(whole[:length])
+    for length in (least, wire.FRAME_BYTES):
+        with pytest.raises(wire.FrameCrcError):
+            wire.decode(whole[:length])
+
+
 def test_a_value_out_of_its_range_is_refused_despite_a_good_crc_and_tag():
     zero_range = bytes(4) + b"\x01" + b"\x02" + bytes(3) + bytes(4)
     with pytest.raises(wire.FrameValueError, match="range_m"):
