@@ -1,14 +1,23 @@
 """Random steps and geometry that gives an estimator nothing: covariances stay positive, no NaN."""
 
 import contextlib
+import itertools
 import math
 import random
 
+import numpy as np
 import pytest
 
 from relpos import api, fusion
 from relpos.errors import RelposError
+from relpos.fusion.bank.core import BankCore
+from relpos.fusion.bank.settings import BankSettings
+from relpos.fusion.bank.storage import unpack
 from relpos.fusion.estimator import NodeStatus
+from relpos.fusion.smoother.graph import build_graph
+from relpos.fusion.smoother.problem import Problem
+from relpos.fusion.smoother.solution import smooth as optimum
+from relpos.fusion.timeline import refusal
 from relpos.measurements import Heading, Height, Motion, Range, common_priors
 from relpos.runs import Description
 from relpos.runs.description import InitialPose
@@ -121,9 +130,9 @@ def test_random_steps_leave_every_covariance_positive(estimator, case):
     run(estimator, case, 60, 1)
 
 
-@pytest.mark.soak
+@pytest.mark.soak  # a million motions of one node in the particle filter
 @pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize(("estimator", "count"), [("bank", 5_000), ("particle", 195_000)])
+@pytest.mark.parametrize(("estimator", "count"), [("bank", 5_000), ("particle", 200_000)])
 def test_long_random_walks_leave_every_covariance_positive(estimator, count, case):
     for seed in range(count // 1_000):
         run(estimator, case, 1_000, seed)
@@ -150,3 +159,95 @@ def test_a_large_team_in_one_spot_or_line_stays_finite(place, count):
             check(estimate)
     for estimate in made.finish():
         check(estimate)
+
+
+# -- a million steps of each filter --------------------------------------------------------------
+
+EVERY = 50
+"""Rounds between two looks at every covariance."""
+STEPS = 200_000
+"""A step is one motion of one node; five cases make a million of the bank and of the smoother."""
+RUN = 1_000
+"""Steps from one beginning."""
+
+
+def check_matrices(covariances):
+    """Symmetric and positive to rounding, as correlations: (K, D, D)."""
+    assert np.isfinite(covariances).all()
+    deviations = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    scale = deviations[:, :, None] * deviations[:, None, :]
+    known = scale > 0.0
+    assert not covariances[~known].any(), "correlated with what is known exactly"
+    correlations = np.divide(covariances, scale, out=np.zeros_like(scale), where=known)
+    assert np.abs(correlations - correlations.swapaxes(1, 2)).max() < 1e-9
+    assert np.linalg.eigvalsh(correlations).min() > -1e-6
+
+
+def walk_the_core(case, count, seed):
+    """The bank's kernels below its reports: motion, ranges of an instant, headings, resampling."""
+    nodes, place, ranges = CASES[case]
+    rng = random.Random(seed)
+    core = BankCore(BankSettings(hypotheses=8), seed)
+    places = {node: place(rng, node) for node in nodes}
+    for node in nodes:
+        core.add_node((*places[node], 0.0), 0.1, 0.1)
+    rows = np.arange(len(nodes))
+    pairs = list(itertools.combinations(rows.tolist(), 2))
+    for k in range(1, 1 + count // len(nodes)):
+        moves = np.array(
+            [
+                (0.0, 0.0, 0.0, 1.0)
+                if rng.random() < 0.3
+                else (rng.gauss(0.7, 0.5), 0.0, rng.gauss(0.0, 0.6), 1.0)
+                for _ in nodes
+            ]
+        )
+        sigma_m = [rng.choice([0.0, 1e-6, 0.05, 0.05, 50.0]) for _ in nodes]
+        sigmas = np.array([(s, s, rng.choice([0.0, 0.02, 3.0])) for s in sigma_m])
+        core.move(rows, moves, sigmas)
+        if pairs and rng.random() < 0.5:
+            some = rng.sample(pairs, rng.randrange(1, 1 + len(pairs)))
+            first, second = np.array(some).T.copy()
+            true_m = [math.dist(places[nodes[i]], places[nodes[j]]) for i, j in some]
+            range_m = np.array([ranges(rng, m) for m in true_m])
+            core.update(first, second, range_m, np.zeros(len(some)))
+        if rng.random() < 0.1:
+            core.update_heading(
+                rng.choice(rows.tolist()), rng.uniform(-4.0, 4.0), rng.choice([1e-6, 0.4])
+            )
+        core.end_instant()
+        if k % EVERY == 0:
+            check_matrices(hypotheses_of(core, len(nodes)))
+            mean, covariance, shared = core.moments()
+            assert np.isfinite(mean).all()
+            check_matrices(covariance[None])
+            check_matrices((covariance + shared)[None])
+
+
+def hypotheses_of(core, nodes):
+    these = core.hypotheses
+    means, covariances = unpack(these.arrays.x, these.arrays.p, nodes, these.count)
+    assert np.isfinite(means).all()
+    assert np.isfinite(these.arrays.log_weight).all()
+    return covariances
+
+
+def smooth_alone(case, count, seed):
+    """The smoother from dead reckoning on, every pose's joint covariance looked at."""
+    priors, rows = rows_of(case, count, seed)
+    problem = Problem(build_graph([row for row in rows if refusal(row) is None], priors)[0])
+    solution = optimum(
+        problem, problem.first_state(problem.graph.dead_reckoned(problem.graph.prior))
+    )
+    assert np.isfinite(solution.state.poses).all()
+    check_matrices(solution.covariance.diagonal)
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("walk", [walk_the_core, smooth_alone])
+@pytest.mark.parametrize(
+    ("runs", "steps"), [(1, 240), pytest.param(STEPS // RUN, RUN, marks=pytest.mark.soak)]
+)
+def test_random_steps_leave_every_matrix_symmetric_and_positive(walk, case, runs, steps):
+    for seed in range(runs):
+        walk(case, steps, seed)

@@ -294,6 +294,7 @@ def test_a_second_motion_of_an_instant_counts_whole_and_as_late() -> None:
     timeline = Timeline((1,), reorder_s=0.0, keep_late=True)
     steps = run(timeline, [moved(1.0, 1), moved(1.0, 1), moved(2.0, 1)])
     assert end_of(steps, 1) == (3.0, 0.0, 0.0)
+    assert [s.time_s for s in steps if isinstance(s, Epoch)] == [1.0, 2.0]
     assert timeline.counters == {"motions_late": 1}
     assert [(late.since_s, late.time_s) for late in timeline.late] == [(-math.inf, 1.0)]
 
@@ -303,6 +304,10 @@ def test_a_range_behind_the_frontier_or_at_it_is_late_at_its_time() -> None:
     for measurement in (moved(4.0, 1), moved(4.0, 2), Range(4.0, 1, 2, 3.0)):
         timeline.push(measurement)
     assert [late.time_s for late in timeline.late] == [4.0]
+    timeline.late.clear()
+    assert timeline.push(Range(4.0, 1, 2, 3.1)) == [], "once more of the instant handed out"
+    assert timeline.counters == {"ranges_duplicate": 1}
+    timeline.counters.clear()
     timeline.push(Range(3.0, 1, 2, 3.0))
     timeline.push(Height(2.0, 1, 3.0))
     assert [late.time_s for late in timeline.late] == [4.0, 3.0, 2.0]
@@ -314,6 +319,7 @@ def test_a_silent_node_is_waited_for_as_long_as_the_bound() -> None:
     timeline = Timeline((1, 2), max_lag_s=3.0, reorder_s=0.0)
     given_out = [bool(timeline.push(moved(t, 1))) for t in (1.0, 2.0, 3.0, 3.5)]
     assert given_out == [False, False, False, True]
+    assert Timeline((1, 2), max_lag_s=3.0, reorder_s=0.0).push(moved(3.0, 1)) == []
 
 
 @pytest.mark.parametrize(("lazy", "at_range"), [(False, {1, 2, 3}), (True, {1, 2})])
@@ -336,3 +342,86 @@ def test_a_lazy_timeline_moves_whom_a_heading_concerns_and_not_for_a_height() ->
         steps = run(Timeline((1, 2), lazy=True), rows)
         at = next(k for k, s in enumerate(steps) if isinstance(s, Sensed))
         assert [a.time_s for a in advances(steps[:at], 2) if a.time_s > 1.0] == moves
+
+
+def test_everything_is_handed_out_when_the_bound_is_over_however_much_came_before() -> None:
+    timeline = Timeline((1,), reorder_s=0.5)
+    for k in range(1, 51):
+        timeline.push(moved(0.125 * k, 1))
+    assert timeline.frontier_s == 0.125 * 50 - 0.5
+
+
+def test_what_came_before_something_older_is_held_back_for_its_own_time() -> None:
+    timeline = Timeline((1,), reorder_s=1.0)
+    steps = [s for t in (2.0, 1.0, 2.5, 1.75) for s in timeline.push(moved(t, 1))]
+    assert [s.time_s for s in steps if isinstance(s, Epoch)] == [1.0]
+    assert [a.time_s for a in advances(timeline.finish(), 1)] == [1.75, 2.0, 2.5]
+    assert not timeline.counters
+    assert timeline.finish() == [], "a run ends once"
+
+
+def test_sensed_values_that_wait_come_in_order_of_time() -> None:
+    timeline = Timeline((1, 2), reorder_s=0.0)
+    rows = [moved(4.0, 1), Height(3.0, 1, 1.0), Height(2.0, 1, 1.0), moved(4.0, 2)]
+    sensed = [s.time_s for s in run(timeline, rows) if isinstance(s, Sensed)]
+    assert sensed == [2.0, 3.0]
+
+
+def test_a_motion_is_placed_behind_one_that_was_begun_but_never_before_it() -> None:
+    timeline = Timeline((1, 2), reorder_s=0.0, max_lag_s=10.0)
+    rows = [Range(1.5, 1, 2, 3.0), moved(5.0, 1), moved(7.0, 1), moved(2.0, 2)]
+    steps = [s for m in rows for s in timeline.push(m)]
+    assert [a.time_s for a in advances(steps, 1)] == [1.5, 2.0]
+    steps += timeline.push(moved(6.0, 1))
+    assert not timeline.counters
+    steps += [*timeline.push(moved(3.0, 1)), *timeline.finish()]
+    found = [(a.time_s, a.duration_s) for a in advances(steps, 1)]
+    assert found == [(1.5, 1.5), (2.0, 0.5), (5.0, 3.0), (6.0, 1.0), (7.0, 1.0), (3.0, 0.0)]
+    assert end_of(steps, 1) == pytest.approx((4.0, 0.0, 0.0))
+    assert timeline.counters == {"motions_late": 1}
+
+
+def test_a_motion_at_the_time_that_its_node_has_reached_is_late_though_another_waits() -> None:
+    timeline = Timeline((1, 2), reorder_s=0.0, max_lag_s=10.0)
+    for row in (moved(2.0, 1), moved(2.0, 2), moved(5.0, 1), moved(2.0, 1)):
+        timeline.push(row)
+    assert timeline.counters == {"motions_late": 1}
+
+
+def test_a_late_motion_before_one_that_waits_is_late_from_where_its_node_is() -> None:
+    timeline = Timeline((1, 2), reorder_s=0.0, max_lag_s=5.0, keep_late=True)
+    for row in (moved(3.0, 1), moved(3.0, 2), moved(9.0, 1), moved(10.0, 2)):
+        timeline.push(row)
+    timeline.late.clear()
+    timeline.push(moved(8.0, 2))
+    assert [(late.since_s, late.time_s) for late in timeline.late] == [(3.0, 8.0)]
+
+
+def test_a_node_that_was_only_ranged_is_waited_for() -> None:
+    timeline = Timeline(reorder_s=0.0)
+    assert timeline.push(Range(0.5, 1, 2, 3.0)) == []
+    assert timeline.push(moved(1.0, 1)) == []
+    assert timeline.push(moved(1.0, 2)) != []
+
+
+def test_a_node_has_reported_nothing_before_its_first_motion() -> None:
+    timeline = Timeline((1,), reorder_s=0.0)
+    timeline.push(Range(0.5, 1, 2, 3.0))
+    timeline.push(moved(2.0, 3))
+    never = -math.inf
+    assert [timeline.reported_s(node) for node in (1, 2, 3, 9)] == [never, never, 2.0, never]
+
+
+def test_taking_in_says_that_a_silent_node_is_waited_for_no_longer() -> None:
+    timeline = Timeline((1, 2), reorder_s=0.5, max_lag_s=3.0)
+    times = (1.0, 1.5, 1.25, 3.375, 3.5, 3.625)
+    certain = [timeline.take_in(moved(t, 1)) for t in times]
+    assert certain == [False, False, False, False, False, True]
+
+
+def test_taking_in_says_at_once_what_is_as_old_as_the_bound_and_nothing_of_what_is_not() -> None:
+    timeline = Timeline((1,), reorder_s=0.5)
+    assert not timeline.take_in(moved(1.0, 1))
+    assert timeline.take_in(moved(1.5, 1))
+    assert list(timeline.push_all(()))
+    assert not timeline.take_in(moved(1.25, 1))

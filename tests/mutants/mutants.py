@@ -80,6 +80,12 @@ EXPLAINED = {
         "no more steps wait than a message holds"
     ),
     "and sorted_s - slowest.reported_s <= lag_s": "a short cut: all are asked behind it",
+    "self._pushed += 1": "an order, not a number",
+    "if ordered and entry < ordered[-1]:": "no two entries are equal",
+    "if time_s < self._first_s:": "the same time",
+    "if time_s > self._newest_s:": "the same time",
+    "if motion.time_s > track.reported_s:": "the same time",
+    "add_scaled(ph + kAttitude + kZ, reference_, -1.0f, kReferenced);": "kAttitude is 0",
     "if (i > j) {": "an element of the diagonal, swapped",
     "if (sampled_ && step_us > SampleClock::kGapUs) {": "a microsecond of a gap",
 }
