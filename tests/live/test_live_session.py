@@ -400,6 +400,19 @@ def test_a_session_without_a_team_key_says_so_until_its_end(tmp_path, keyless):
     }
 
 
+def test_the_page_says_who_is_spoken_for_by_a_stolen_node():
+    key, faults = bytes(range(16)), ["radio:foreign:from=3,to=15,key=stolen"]
+    with EmulatedTeam(
+        TeamConfig("straight", 3, 16.0, 3, beacons=True, key=key, faults=faults)
+    ) as team:
+        source = TeamInput(team)
+        source.link = Link(key=key)
+        session, album = make_session(source, deadreckoning, priors=team.priors())
+        run_through(session)
+    told = {notice.text for view in album.views for notice in view.notices}
+    assert {text[:7] for text in told if "such as a stolen node" in text} == {"node 1:", "node 2:"}
+
+
 class Crumbling(Composer):
     """Raises in everything that a measurement, an estimate or a view leads to."""
 
