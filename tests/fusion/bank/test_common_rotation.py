@@ -98,6 +98,7 @@ def test_nothing_is_taken_out_of_a_covariance_that_rounding_has_spoiled(rounding
     left = these.dense()[1]
     assert np.isfinite(left).all()
     assert (left.diagonal(axis1=1, axis2=2) >= 0.0).all()
+    assert np.isfinite(these.arrays.sensitivity).all(), "it has no inverse, and projects nothing"
 
 
 def test_the_mixtures_moments_are_kept_with_what_was_taken_out() -> None:

@@ -227,6 +227,8 @@ def take_out(hypotheses: Hypotheses, middle_m: Floats, taken: Floats) -> None:
             for i in range(POSE):
                 for q in range(POSE):
                     much = _product(g, POSE * n + i, s, solved, POSE * n + q)
+                    # Of what has no inverse, ``solved`` may be infinite: 0 times it is no number.
+                    much = select(sound > 0.0, much, nought)
                     store(j, POSE * i + q, (1.0 if i == q else 0.0) - much)
             for part in range(3):
                 at = 18 * (b * nodes + n) + 6 * part
