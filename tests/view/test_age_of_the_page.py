@@ -54,6 +54,15 @@ COLOURED = """() => {
     }
     return [checked, found];
 }"""
+OVERLAPPING = """() => {
+    const seen = [...document.querySelectorAll(".bar > *, .tools > *")]
+        .filter((e) => e.checkVisibility() && e.textContent.trim())
+        .map((e) => [e.id || e.tagName, e.getBoundingClientRect()]);
+    return seen.flatMap(([a, p], k) => seen.slice(k + 1)
+        .filter(([, q]) => p.left + 1 < q.right && q.left + 1 < p.right &&
+            p.top + 1 < q.bottom && q.top + 1 < p.bottom)
+        .map(([b]) => `${a} and ${b}`));
+}"""
 LIVE_WORDS = re.compile(r"\b(now|live|moves|node OK|located|warmer|colder)\b", re.IGNORECASE)
 
 
@@ -106,6 +115,7 @@ def test_four_seconds_after_the_link_is_lost_no_value_looks_live(
     shown = texts(page, "#people li, #table, #find .order, #find .trend, #alarms, #table-caption")
     assert not LIVE_WORDS.search(shown.replace("0 of 6 people located", "")), shown
     expect(page.locator("#connection")).not_to_have_attribute("data-state", "live")
+    assert page.evaluate(OVERLAPPING) == []
     expect(page.locator("#count")).to_have_text("(0 of 6 heard)")
     expect(page.locator("#find .order")).to_contain_text("no guidance")
     for person in page.locator("#people li").all():

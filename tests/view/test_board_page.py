@@ -32,6 +32,8 @@ def wearer(visit: Any, name: str) -> Page:
 def test_the_commander_keeps_the_board_and_everybody_sees_it(visit: Any, stage: Stage) -> None:
     page, other = visit(viewport={"width": 1366, "height": 768}), visit()
     page.locator("#show-board").click()
+    close = page.locator("#board-dialog").get_by_role("button", name="Close").bounding_box()
+    assert close["y"] + close["height"] <= 768
     page.locator("#all-standby").click()
     wait_for(lambda: stage.board.waiting == {1, 2, 3, 4, 5, 6})
     row(page, 2).get_by_label("state of node 2").select_option("entered")

@@ -138,6 +138,7 @@ def test_a_code_that_was_used_lets_nobody_in_and_the_next_one_does(mill: list[Mi
     path = invited["url"].partition(str(page.access.port))[2]
     assert path.startswith("/phone?token=")
     assert "<svg" in invited["svg"]
+    assert invited["reachable"] is False, "this page listens on its computer alone"
     assert page.ask("GET", path, httpx.Cookies()).status_code == 303
     assert page.ask("GET", path, httpx.Cookies()).status_code == 401
     other = page.ask("GET", "/api/invite?role=acknowledge", commander).json()["url"]

@@ -299,7 +299,8 @@ class Pages:
         if role not in list(Role):
             raise BadRequestError(f"role: none of {', '.join(Role)}")
         url = self._access.url("/phone" if role == Role.ACKNOWLEDGE else "/", role=Role(role))
-        return JSONResponse({"url": url, "svg": qr_svg(url)})
+        reachable = self._access.reachable
+        return JSONResponse({"url": url, "svg": qr_svg(url), "reachable": reachable})
 
     async def devices(self, request: Request) -> Response:
         """All devices that were let in."""

@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from relpos.errors import RelposError
 from relpos.fusion.clocks import Clocks
@@ -482,6 +481,8 @@ class LargeTeam:
         """Return the pairs within reach of each other, in the order of ids."""
         if len(self._row) < 2:
             return ()
+        from scipy.spatial import cKDTree  # 7 MB, which smaller teams do not need
+
         ids = np.array(self._nodes)
         near = cKDTree(self.filter.pose[:, :2]).query_pairs(
             max(self._reach_m, LEAST_REACH_M), output_type="ndarray"

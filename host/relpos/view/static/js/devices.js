@@ -34,10 +34,10 @@ export class DevicesDialog {
     byId("mission-devices").hidden = !this.mission;
     byId("session-token").hidden = this.mission;
     if (this.mission && answer.ok) {
-      const { url, svg } = await answer.json();
+      const { url, svg, reachable } = await answer.json();
       this.image.src = `data:image/svg+xml;utf8,${encodeURIComponent(svg)}`;
       setText(byId("invite-url"), url);
-      return this.show(null);
+      return this.show(reachable ? null : t("phones.unreachable"));
     }
     if (this.mission) return this.show(answer.status === 403 ? t("phones.commander") : t("server.silent"));
     const code = answer ? await fetch("/qr.svg").catch(() => null) : null;

@@ -38,7 +38,9 @@ export class LogView {
 }
 
 function words(entry, team) {
-  return team.withNames(said(entry.said, entry.text));
+  const text = said(entry.said, entry.text);
+  // Who was named keeps the number: else "Ben is Ben".
+  return entry.kind === "name" ? text : team.withNames(text);
 }
 
 /** The button that opens the log, with the number of lines that nobody has looked at. */

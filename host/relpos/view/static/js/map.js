@@ -383,7 +383,7 @@ export class TeamMap {
     context.font = this.font(11, true);
     context.textAlign = "center";
     context.textBaseline = "middle";
-    context.fillText(String(place.node), px, py + 0.5 * unit);
+    context.fillText(signOf(this.team.person(place.node) ?? place), px, py + 0.5 * unit);
     context.globalAlpha = 1;
   }
 

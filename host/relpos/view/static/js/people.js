@@ -9,7 +9,7 @@ import { number as figure, t, said } from "./i18n.js";
 import { signOf } from "./marker.js";
 import { isPlaced, VAGUE_RAD } from "./relation.js";
 import {
-  ago, compass, compassShort, dbm, directionWords, distance, healthWords, nodeName, percent, plusMinus, probability,
+  ago, compass, dbm, directionWords, distance, healthWords, nodeName, percent, plusMinus, probability,
   seconds, statusWords, timeOfDay, UNKNOWN, volts, whereabouts,
 } from "./words.js";
 
@@ -107,7 +107,7 @@ class Card {
       setText(this.sigma, !relation ? "" : fresh && meFresh ? plusMinus(relation.sigmaM) : lastPlace(fresh ? null : heardMs));
       setText(this.direction, !relation ? t("position.unknown")
         : directionWords(relation));
-      setText(this.compass, relation ? compassShort(relation.bearingRad, northRad) : "");
+      setText(this.compass, relation ? compass(relation.bearingRad, northRad) : "");
     }
     setText(this.state, stateWords(person, alarm, here));
     const facts = {

@@ -98,12 +98,6 @@ export function compass(bearingRad, northRad) {
     : t(`compass.${compassPoint(bearingRad, northRad)}.long`);
 }
 
-/** "NE", or "map NE". */
-export function compassShort(bearingRad, northRad) {
-  return northRad === null ? t("compass.map", { point: t(`compass.${compassPoint(bearingRad)}`) })
-    : t(`compass.${compassPoint(bearingRad, northRad)}`);
-}
-
 /** The direction in short: "2 o'clock"; "close by" or "direction unknown" where it is too vague. */
 export function directionWords(relation) {
   if (relation.relativeRad !== null) return clock(relation.relativeRad);
