@@ -174,6 +174,9 @@ def main() -> int:
     parser.add_argument("--nodes", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=120.0)
     parser.add_argument("--estimator", default="bank")
+    parser.add_argument(
+        "--initial", default="unknown", help="common: everybody's one start is known"
+    )
     parser.add_argument("--browsers", type=int, default=1, help="how many follow at once")
     parser.add_argument("--seed", type=int, default=1)
     wanted = parser.parse_args()
@@ -187,7 +190,7 @@ def main() -> int:
             [
                 sys.executable, "-m", "relpos.cli.main", "fuse", os.ttyname(theirs), "--view",
                 "--no-open", "--no-report", "--no-teach", "--estimator", wanted.estimator,
-                "--out", out,
+                "--initial", wanted.initial, "--out", out,
             ],
             stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
         )  # fmt: skip
@@ -227,7 +230,7 @@ def main() -> int:
     ran_s = packets[-1].written_s - packets[0].written_s
     print(
         f"session {100 * spent[0] / ran_s:.0f} %, page's server {100 * spent[1] / ran_s:.0f} % of "
-        f"a core; together {memory_mb:.0f} MB"
+        f"a core; {memory_mb[0]:.0f} MB and {memory_mb[1]:.0f} MB"
     )
     failed = False
     for what in ("motion", "ranges", "page", "fused"):
@@ -259,12 +262,13 @@ def usage(pid: int) -> tuple[float, float]:
     return ticks[0], sum(ticks[1:])
 
 
-def resident_mb(pid: int) -> float:
-    """Memory of them all."""
-    pages = 0
+def resident_mb(pid: int) -> tuple[float, float]:
+    """Memory of the session, and of its servers; what they share is counted once, in parts."""
+    parts = []
     for process in family(pid):
-        pages += int(Path(f"/proc/{process}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+        rollup = Path(f"/proc/{process}/smaps_rollup").read_text()
+        parts.append(1.024e-3 * int(rollup.split("Pss:")[1].split()[0]))
+    return parts[0], sum(parts[1:])
 
 
 def _swallow(port: int) -> None:
