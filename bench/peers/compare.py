@@ -243,7 +243,7 @@ def over_nodes(sizes: Sequence[int], seconds: int, budget_s: float) -> list[Poin
         return cases[nodes]
 
     series: dict[str, Callable[[int], Run]] = {
-        "relpos strips (large teams)": lambda _: _filter(ours.Strips),
+        "relpos large teams": lambda _: _filter(ours.Strips),
         "relpos joint (one hypothesis)": lambda _: _filter(ours.JointAlone),
         "relpos bank, through its interface": lambda _: _interface("bank"),
         "filterpy EKF": lambda _: _filter(kalman_peers.FilterpyEKF),
