@@ -19,6 +19,7 @@ from relpos.fusion.models.ranging import (
     OUTLIERS_LAST_S,
     OutlierPersistence,
     RangeCorrelation,
+    slab_variance,
 )
 from relpos.measurements import Height, Measurement, Motion, Prior, Range
 from relpos.simulation.paper import simulate_paper
@@ -267,3 +268,8 @@ def test_outliers_that_were_too_short_are_not_expected_again() -> None:
     share, again, _ = persistence.expected(10.0, [(1, 2)])[0]
     assert share > 0.5
     assert again == 0.0
+
+
+def test_a_range_between_known_floors_is_less_certain() -> None:
+    variance_m2 = slab_variance([(0, 0), (0, 1), (3, 1), (None, 1), (0, None)])
+    assert np.sqrt(variance_m2) == pytest.approx([0.0, 0.3, 0.6, 0.0, 0.0])

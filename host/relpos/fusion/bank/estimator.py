@@ -46,6 +46,7 @@ from relpos.fusion.models.ranging import (
     Mounting,
     OutlierPersistence,
     RangeCorrelation,
+    slab_variance,
     slant_height,
 )
 from relpos.fusion.models.unseen_walk import UnseenWalk
@@ -318,9 +319,12 @@ class Bank:
             known[a].within.range_variance_m2() + known[b].within.range_variance_m2()
             for a, b in pairs
         ]
+        more_m2 = np.array(uneven) + slab_variance(
+            [(known[a].vertical.floor, known[b].vertical.floor) for a, b in pairs]
+        )
         variance = self.core.range_variance_m2
         alone = self.range_correlation.effective_counts(pairs)
-        counts: Floats = variance * alone / (variance + alone * np.array(uneven))
+        counts: Floats = variance * alone / (variance + alone * more_m2)
         return counts
 
     def _velocity_at(self, node: int, time_s: float) -> tuple[float, float]:

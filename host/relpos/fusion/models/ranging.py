@@ -13,7 +13,7 @@ sqrt(|x_i - x_j|^2 + h^2).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -60,6 +60,19 @@ def slant_height(dz_m: Floats, variance_m2: Floats) -> Floats:
     """Return the root mean square of a difference of heights: what makes a range slant."""
     slant: Floats = np.sqrt(dz_m * dz_m + variance_m2)
     return slant
+
+
+SIGMA_SLAB_M = 0.3
+"""A slab of 0.2 m of concrete makes a range longer by 0.26 to 0.39 m (ITU-R P.2040), an opening not
+at all. Building, calm, seeds 300 to 303, without and with it: aligned 3D 0.93 and 0.87 m, distances
+of ok pairs beyond three sigmas 2.8 and 1.8 %. A mean of 0.3 m taken off was no better (0.87, 2.1),
+and wrong in an atrium."""
+
+
+def slab_variance(floors: Sequence[tuple[int | None, int | None]]) -> Floats:
+    """Return how much less certain ranges between floors are (m^2)."""
+    slabs = np.array([0.0 if a is None or b is None else abs(a - b) for a, b in floors])
+    return (SIGMA_SLAB_M * slabs) ** 2
 
 
 DECORRELATION_M = 0.45
