@@ -33,7 +33,8 @@ help: ## this list
 
 setup: $(DEVELOP) ## everything Python in .venv; the command is then .venv/bin/relpos
 
-demo: $(RUN) | system-demo ## six emulated nodes through a serial port into the fusion, shown; report in out/demo
+demo: $(RUN) | system-demo ## six emulated nodes through a serial port into the fusion: in a building, then on the level
+	$(VENV)/bin/relpos demo --scenario building --out out/demo-building
 	$(VENV)/bin/relpos demo --out out/demo
 
 live: $(RUN) | system-demo ## the same team in real time behind the live page; LIVE="--seconds 600 --nodes 20"
