@@ -48,10 +48,7 @@ ROOMS = {
         (HOST + "link/decoder.py", HOST + "link/beacon.py", HOST + "link/xbee.py"),
         ("tests/link", "tests/soak"),
     ),
-    "timeline": Room(
-        (HOST + "fusion/timeline.py",),
-        ("tests/fusion/test_timeline.py", "tests/fusion/test_bounds.py"),
-    ),
+    "timeline": Room((HOST + "fusion/timeline.py",), ("tests/fusion/test_timeline.py",)),
     "bank updates": Room(
         tuple(HOST + f"fusion/bank/{kind}_update.py" for kind in ("heading", "range", "detection")),
         ("tests/fusion/bank/test_bank_kernels.py", "tests/fusion/bank/test_common_terms.py"),
