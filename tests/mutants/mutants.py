@@ -18,12 +18,13 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-PATIENCE_S = 240
+PATIENCE_S = 240.0
 LEAST_KILLED = 0.85
 
 
@@ -170,7 +171,7 @@ def mutants_of(room: Room) -> list[Mutant]:
     ]
 
 
-def complaint(copy_of: Path, room: Room) -> str:
+def complaint(copy_of: Path, room: Room, patience_s: float = PATIENCE_S) -> str:
     """What the room's tests say in that copy where they fail, or do not end; else nothing."""
     if room.sources[0].endswith(".py"):
         command = [
@@ -187,7 +188,7 @@ def complaint(copy_of: Path, room: Room) -> str:
         command = [str(copy_of / "tools" / "pio"), "test", "-e", "native_sanitized", *chosen]
     environment = os.environ | {"PYTHONPATH": str(copy_of / "host"), "PYTHONDONTWRITEBYTECODE": "1"}
     try:
-        done = subprocess.run(command, cwd=copy_of, capture_output=True, timeout=PATIENCE_S,
+        done = subprocess.run(command, cwd=copy_of, capture_output=True, timeout=patience_s,
                               check=False, env=environment)  # fmt: skip
     except subprocess.TimeoutExpired:
         return "they do not end"
@@ -198,8 +199,10 @@ def run_room(name: str, count: int, seed: int, copy_of: Path) -> tuple[int, int]
     """(killed, tried) of a sample of the room's mutants."""
     room = ROOMS[name]
     found = mutants_of(room)
+    began_s = time.monotonic()
     if words := complaint(copy_of, room):
         raise SystemExit(f"{name}: its tests fail without any mutant: {words}")
+    patience_s = min(20.0 + 8.0 * (time.monotonic() - began_s), PATIENCE_S)
     sample = random.Random(seed).sample(found, min(count, len(found)))
     killed = explained = 0
     for mutant in sample:
@@ -207,7 +210,7 @@ def run_room(name: str, count: int, seed: int, copy_of: Path) -> tuple[int, int]
         before = place.read_text()
         place.write_text(mutant.text)
         try:
-            noticed = complaint(copy_of, room) != ""
+            noticed = complaint(copy_of, room, patience_s) != ""
         finally:
             place.write_text(before)
         line = (ROOT / mutant.path).read_text().splitlines()[mutant.line - 1].strip()
