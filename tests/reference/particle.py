@@ -12,7 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.models.ranging import RangeNoise
-from relpos.fusion.particle.kernels import DUAL_DRAWS, FAR_OUT, MIN_BANDWIDTH_M, NodeRanges
+from relpos.fusion.particle.kernels import (
+    DUAL_DRAWS,
+    FAR_OUT,
+    LEAST_MASS,
+    MIN_BANDWIDTH_M,
+    NodeRanges,
+)
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -132,7 +138,7 @@ def dual_step(
         slot = ((uniforms[k, -1] + np.arange(fresh)) * (count / fresh)).astype(np.int64) % count
         corrected[k, slot] = 0.0
         rest = corrected[k].sum()
-        corrected[k] *= (1.0 - alpha) / rest if rest > 0.0 else 0.0
+        corrected[k] *= (1.0 - alpha) / rest if rest > LEAST_MASS else 0.0
         corrected[k, slot] = alpha * weight / weight.sum()
         corrected[k] /= corrected[k].sum()
         poses[:, k, slot] = np.stack([points[0], points[1], heading])

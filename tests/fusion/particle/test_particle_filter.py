@@ -13,6 +13,7 @@ from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.fusion.models.motion import MotionNoise
 from relpos.fusion.models.ranging import RangeNoise
 from relpos.fusion.particle import kernels
+from relpos.fusion.particle.particle_set import ParticleSet
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Measurement, Motion, Prior, Range
 from relpos.simulation.paper import simulate_paper
@@ -77,6 +78,29 @@ def test_ranges_no_particle_can_explain_leave_finite_weights() -> None:
     poses, weights = particles(rng, 1, 30)
     new = corrected(ranges_of([(0, 0.0, 0.0, 1e4)], 1), poses, weights, RangeNoise(0.01))
     assert new.sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("rest", [0.0, 1e-320, 1e-300])
+def test_weights_stay_weights_where_the_dual_step_replaces_all_that_had_any(rest: float) -> None:
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        team = ParticleSet(4, 0.5, RangeNoise(0.1, 0.0), rng)
+        for _ in range(2):
+            team.add(np.zeros((3, 4)))
+        team.weights[:] = rest
+        team.weights[:, 0] = 1.0
+        row = np.zeros(1, dtype=np.int64)
+        team.update(row, row + 1, np.array([200.0]), np.zeros(1))
+        assert team.weights.sum(axis=1) == pytest.approx(1.0)
+
+
+def test_particles_that_coincide_leave_a_variance() -> None:
+    made = fusion.make("particle", [Prior(1, 0, 0, 0, 0.0, 0.0), Prior(2, 4, 0, 0, 0.0, 0.0)])
+    rows = [Motion(1.0 + k, n, 0.0, 0.0, 0.0) for k in range(3) for n in (1, 2)]
+    estimates = [e for row in rows for e in made.process(row)]
+    for node in (node for estimate in estimates for node in estimate.nodes):
+        assert (node.variance_x_m2, node.variance_y_m2) == (1e-6, 1e-6)
+    assert estimates
 
 
 def test_an_outlier_share_bounds_what_one_range_can_do() -> None:

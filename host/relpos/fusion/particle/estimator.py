@@ -23,6 +23,7 @@ from relpos.fusion.estimator import (
 from relpos.fusion.initial_poses import POSE, Found, Initialiser, sought_node
 from relpos.fusion.models.motion import MotionNoise
 from relpos.fusion.models.ranging import RangeNoise
+from relpos.fusion.particle.kernels import MIN_BANDWIDTH_M
 from relpos.fusion.particle.particle_set import ParticleSet
 from relpos.fusion.particle.settings import ParticleSettings
 from relpos.fusion.resampling import systematic
@@ -209,6 +210,8 @@ class ParticleFilter:
                 nodes.append(sought_node(self.initialiser, node, known))
                 continue
             x_m, y_m, xx, yy, xy, c, s = moments[self._row[node]]
+            # Particles that coincide say where somebody is, not that it is known exactly.
+            xx, yy = max(xx, MIN_BANDWIDTH_M**2), max(yy, MIN_BANDWIDTH_M**2)
             nodes.append(
                 NodeEstimate(
                     node, x_m, y_m, math.atan2(s, c), xx, yy, xy, _spread_rad(math.hypot(c, s)),

@@ -323,6 +323,9 @@ def _plain(
     return -0.5 * nearest - FAR_OUT
 
 
+LEAST_MASS = 1e-290
+"""Particles that weigh less together count as none."""
+
 DUAL_DRAWS = 5
 """Uniforms per dual particle: whose ring, radius (two), angle, heading."""
 
@@ -404,7 +407,8 @@ def dual_step(
         rest = 0.0
         for m in range(count):
             rest += new[m]
-        keep = (1.0 - alpha) / rest if rest > 0.0 else 0.0
+        # Where those that are left have next to no weight, its inverse would overflow.
+        keep = (1.0 - alpha) / rest if rest > LEAST_MASS else 0.0
         mass = keep * rest + alpha
         for m in range(count):
             new[m] *= keep / mass
