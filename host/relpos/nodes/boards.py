@@ -201,6 +201,17 @@ class _Stk500v2:
         """Whether it answers: "AVRISP_2" and its length, eleven bytes."""
         return _synced(lambda: self.talk(b"\x01", 11) is not None)
 
+    def page(self, at: int) -> bytes | None:
+        """Return a page of the flash; asked again where an answer is late or damaged."""
+        address = (at // 2 | 1 << 31).to_bytes(4, "big")
+        for _ in range(SYNC_ATTEMPTS):
+            if self.talk(b"\x06" + address, 2) is None:
+                continue
+            read = self.talk(bytes((0x14, _PAGE >> 8, _PAGE & 0xFF, 0x20)), _PAGE + 3)
+            if read is not None:
+                return read[2:-1]
+        return None
+
 
 def _stk500v2_signature(device: serial.Serial) -> bytes | None:
     """Return the signature from an STK500v2 boot loader; None where none answers."""
@@ -227,13 +238,10 @@ def warning(device: serial.Serial, board: Board) -> str | None:
     loader = _Stk500v2(device)
     code = bytearray()
     for at in range(_MEGA_LOADER, _MEGA_FLASH, _PAGE):
-        address = (at // 2 | 1 << 31).to_bytes(4, "big")
-        page = None
-        if loader.talk(b"\x06" + address, 2) is not None:
-            page = loader.talk(bytes((0x14, _PAGE >> 8, _PAGE & 0xFF, 0x20)), _PAGE + 3)
+        page = loader.page(at)
         if page is None:
             return None  # an upload will tell
-        code += page[2:-1]
+        code += page
     if any(code[at : at + 2] == _WDR for at in range(0, len(code), 2)):
         return None
     return (
