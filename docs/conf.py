@@ -31,6 +31,8 @@ html_title = f"relpos {version}"
 html_copy_source = False
 html_show_sphinx = False
 html_theme_options = {"navigation_with_keys": True}
+html_static_path = ["print"]
+html_css_files = ["print.css"]
 
 
 def _commands(_: Any, document: str, source: list[str]) -> None:
