@@ -89,7 +89,7 @@ def test_sound_can_be_off_for_two_minutes_and_says_so_meanwhile(visit: Any, stag
     button.click()
     expect(button).to_have_text("Sound on")
     button.click()
-    expect(button).to_have_text(re.compile(r"Sound off, (2:00 min|1\d\d s) left"))
+    expect(button).to_have_text(re.compile(r"Sound off, (2:00\smin|1\d\d\ss) left"))
     page.clock.fast_forward(121_000)
     expect(button).to_have_text("Sound on")
 
@@ -180,3 +180,13 @@ def test_the_map_keeps_three_fifths_of_a_phone_with_three_alarms_open(
     last.scroll_into_view_if_needed()
     expect(last).to_be_in_viewport()
     assert page.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0
+
+
+def test_what_is_left_out_of_a_flood_is_counted_by_people(visit: Any, stage: Stage) -> None:
+    stage.frozen = True
+    stage.team = WalkingTeam(size=12)
+    stage.team.still_since = dict.fromkeys(range(1, 10), stage.at_s - 40.0)
+    stage.team.lost_since = {10: stage.at_s - 12.0, 11: stage.at_s - 30.0}
+    page = visit()
+    expect(page.locator("#alarms .rows .alarm")).to_have_count(9)
+    expect(page.locator("#alarms .more")).to_contain_text("and 2 more: ")

@@ -98,7 +98,7 @@ def test_a_mission_is_started_ended_and_a_recording_of_it_played_on_the_page(
         expect(page.locator("#play")).to_have_text("Play")
         page.locator("#moment").focus()
         page.keyboard.press("Home")
-        expect(page.locator("#moment-words")).to_have_text(re.compile("^0.0 s of "))
+        expect(page.locator("#moment-words")).to_have_text(re.compile(r"^0.0\ss of "))
         # Who is let in meanwhile stays in.
         invited = output_of(
             field.run("mission", str(field.folder), "--invite", "look"), "http://\\S+"

@@ -40,7 +40,7 @@ def test_a_recording_is_moved_by_its_time_line(visit: Any, stage: Stage) -> None
     })  # fmt: skip
     expect(line).to_be_visible()
     expect(page.locator(".tick")).to_have_count(2)
-    expect(page.locator("#moment-words")).to_have_text(re.compile("of 100 s"))
+    expect(page.locator("#moment-words")).to_have_text(re.compile(r"of 100\ss"))
     page.locator("#play").click()
     page.locator("#event-after").click()
     page.locator("#speed").select_option("10")

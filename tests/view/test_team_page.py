@@ -26,6 +26,11 @@ COUNT_FRAMES = """() => {
 }"""
 
 
+POINTS = (
+    "north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west",
+)  # fmt: skip
+
+
 def rgb(css: str) -> list[int]:
     return [int(n) for n in re.findall(r"\d+", css)[:3]]
 
@@ -117,7 +122,7 @@ def test_north_is_up_and_named_once_compasses_have_reported_it(visit, stage: Sta
     x, y, _ = stage.team.pose(1, stage.at_s)
     ox, oy, _ = stage.team.pose(4, stage.at_s)
     clockwise = (stage.team.north_rad - math.atan2(oy - y, ox - x)) % math.tau
-    point = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")[round(clockwise / math.tau * 8) % 8]
+    point = POINTS[round(clockwise / math.tau * 8) % 8]
     expect(card(page, 4).locator(".compass")).to_have_text(point)
 
 
@@ -233,7 +238,7 @@ def test_distance_and_direction_from_me_are_those_of_the_team(visit, stage: Stag
         shown = f"{digits / 10:.1f} m" if near else f"{digits} m"
         expect(card(page, other).locator(".far")).to_have_text(shown)
         expect(card(page, other).locator(".direction")).to_have_text(f"{hour % 12 or 12} o'clock")
-        word = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")[point % 8]
+        word = POINTS[point % 8]
         # The frame is the team's own; its y axis need not be north.
         expect(card(page, other).locator(".compass")).to_have_text(f"map {word}")
 
@@ -440,7 +445,7 @@ def test_a_server_that_is_gone_is_reported_and_found_again_without_reloading(vis
     stage.shut()
     connection = page.locator("#connection")
     expect(connection).to_contain_text("Not connected")
-    expect(connection).to_contain_text(re.compile(r"data \d+ s old"))
+    expect(connection).to_contain_text(re.compile(r"data \d+\ss old"))
     expect(page.locator("#people li")).to_have_count(6)
     stage.open()
     expect(connection).to_have_attribute("data-state", "live")

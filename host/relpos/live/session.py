@@ -308,7 +308,8 @@ class LiveSession:
             with self._surviving("update"):
                 self._source.learn(fused.estimate)
             offsets = time_offsets(fused.estimate)
-            self.post("time-offsets", Level.WARNING, joined(offsets) if offsets else None)
+            # The estimator takes it into account: there is nothing to do.
+            self.post("time-offsets", Level.INFO, joined(offsets) if offsets else None)
             self._changed = True
 
     # -- alarms and notices -----------------------------------------------------------------------

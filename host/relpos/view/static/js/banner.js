@@ -34,6 +34,7 @@ export class AlarmBanner {
     this.open = rows.flatMap((row) => row.nodes);
     const shown = rows.filter((row, k) => k < MAX_ROWS || row.level === "high");
     const others = rows.slice(shown.length);
+    const hidden = others.flatMap((row) => row.alarms).map((a) => a.name);
     for (const [key, row] of this.rows) {
       if (!shown.some((alarm) => alarm.key === key)) {
         row.element.remove();
@@ -61,7 +62,7 @@ export class AlarmBanner {
     this.more.hidden = this.rows.size < 2 && !others.length;
     setAttribute(this.more, "data-level", rows[0]?.level ?? "low");
     setText(this.moreText, others.length
-      ? t("alarms.more", { count: others.length, names: others.flatMap((row) => row.alarms).map((a) => a.name).join(", ") })
+      ? t("alarms.more", { count: hidden.length, names: hidden.join(", ") })
       : t("alarms.open", { count: this.open.length }));
     this.known.hidden = known.length === 0;
     setText(this.knownText, known.map(knownText).join(" · "));

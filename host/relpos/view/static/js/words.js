@@ -35,11 +35,11 @@ export function spokenDistance(m) {
 export function duration(s) {
   if (!Number.isFinite(s)) return UNKNOWN;
   const positive = Math.max(0, s);
-  if (positive < 9.95) return `${number(positive, positive < 0.95 ? 1 : 0)} s`;
-  if (positive < 120) return `${Math.round(positive)} s`;
+  if (positive < 9.95) return `${number(positive, positive < 0.95 ? 1 : 0)}${NBSP}s`;
+  if (positive < 120) return `${Math.round(positive)}${NBSP}s`;
   const minutes = Math.floor(positive / 60);
-  if (minutes < 120) return `${minutes}:${two(positive % 60)} min`;
-  return `${Math.floor(minutes / 60)}:${two(minutes % 60)} h`;
+  if (minutes < 120) return `${minutes}:${two(positive % 60)}${NBSP}min`;
+  return `${Math.floor(minutes / 60)}:${two(minutes % 60)}${NBSP}h`;
 }
 
 function two(n) {
@@ -49,7 +49,7 @@ function two(n) {
 /** Full seconds, so that the figure does not flicker. */
 export function seconds(s) {
   if (!Number.isFinite(s)) return UNKNOWN;
-  return s < 120 ? `${Math.floor(Math.max(s, 0))} s` : duration(s);
+  return s < 120 ? `${Math.floor(Math.max(s, 0))}${NBSP}s` : duration(s);
 }
 
 /** Time since the last report: "now" within two reports. */
