@@ -169,6 +169,18 @@ def test_a_session_knows_what_an_earlier_one_received():
     assert second.decoder.nodes[1].counts["lost"] == 0
 
 
+@pytest.mark.parametrize(("stored", "refused"), [(20, range(21)), (3, [10])])
+def test_a_session_told_of_an_earlier_one_while_it_hears_takes_the_higher_counter(stored, refused):
+    decoder = Decoder()
+    decoder.feed(motion(10, 1.0), 1.0)
+    decoder.expect_after({1: stored, 2: 7})
+    for n in refused:
+        assert decoder.feed(motion(n, 12.0 + n), 12.0) == [], n
+    assert len(decoder.feed(motion(refused[-1] + 1, 50.0), 50.0)) == 1
+    assert decoder.feed(motion(7, 1.0, node=2), 50.0) == []
+    assert len(decoder.feed(motion(8, 2.0, node=2), 50.0)) == 1
+
+
 def test_frames_without_the_key_are_refused_and_not_remembered():
     decoder = Decoder((KEY,))
     for n in range(20):

@@ -121,6 +121,7 @@ def test_frames_are_found_again_after_garbage_and_in_any_pieces(escaped):
     assert found == frames
     counts = parser.counts
     assert (counts.bad_checksums, counts.bad_lengths, counts.broken_off) == (0, 0, 0)
+    assert counts.frames == len(frames)
     assert counts.skipped_bytes > 300
 
 
@@ -142,6 +143,13 @@ def test_a_broken_frame_costs_only_itself_when_escaped():
         damaged = bytearray(good)
         damaged[index] ^= 0x04
         assert xbee.Parser().feed(bytes(damaged) + good * 2)[-1:] == expected
+
+
+@pytest.mark.parametrize(("length", "bad"), [(0, 1), (1, 0), (128, 0), (129, 1), (256 + 5, 1)])
+def test_a_length_that_no_frame_has_is_told_by_both_its_bytes(length, bad):
+    parser = xbee.Parser(escaped=False)
+    assert parser.feed(b"\x7e" + length.to_bytes(2, "big")) == []
+    assert parser.counts.bad_lengths == bad
 
 
 # --- totals to motion --------------------------------------------------------------------------

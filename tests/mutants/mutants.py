@@ -78,6 +78,7 @@ EXPLAINED = {
         "no more steps wait than a message holds"
     ),
     "and sorted_s - slowest.reported_s <= lag_s": "a short cut: all are asked behind it",
+    "length = plain[0] << 8 | plain[1]": "whatever has a first byte is too long",
     "self._pushed += 1": "an order, not a number",
     "if ordered and entry < ordered[-1]:": "no two entries are equal",
     "if time_s < self._first_s:": "the same time",
