@@ -156,6 +156,21 @@ def test_a_forged_frame_adds_no_node_to_the_team():
     assert beacons.due(1.0) == b""
 
 
+def test_a_node_that_takes_no_beacon_is_asked_once_in_ten_seconds():
+    link = Link(clock=lambda: 2e9)
+    beacons, asked_s = HostBeacons(link), []
+    for k in range(1, 31):
+        values = dict.fromkeys(wire.STATUS.field, 0) | {"time_s": float(k)}
+        values["health"] = wire.Health.BEACON if k > 26 else 0
+        data = wire.encode(wire.STATUS, 6, 0, k, values)
+        link.feed(xbee.encode(xbee.Receive16(6, -60, data)), float(k))
+        for request in xbee.Parser().feed(beacons.due(float(k))):
+            if request.destination == 6:
+                assert wire.decode(request.data).values["command"] == wire.CommandCode.PING
+                asked_s.append(k)
+    assert asked_s == [12, 23]
+
+
 def test_a_node_too_many_is_reported_once():
     link = Link()
     beacons = HostBeacons(link)
