@@ -21,18 +21,20 @@ HEAD = f"""# What goes wrong, and what then?
 
 | promise | measured 2026-11-25 | by |
 |---|---|---|
-| nothing from outside ends a session | 152 random episodes, eight hours of ten nodes, \
-160,000 bodies: 0 open | `make soak` |
+| nothing from outside ends a session | 152 random episodes, ten nodes for 8 h, 1.5 h \
+with `bank`, 4,800 s at once, 160,000 bodies: 0 open | `make soak` |
 | no forged, altered, replayed frame counts | 10,000,033 frames: 0 taken | `make soak` |
 | a kill takes 1 s with `--record`, else 2 s | 269 kills: 1.001, 0.3 s | `soak.py --kills` |
 | parsers fail in their own errors alone | by coverage: node 103,754,564, \
 host 1,089,000: 0 open | `make fuzz` |
+| covariances stay positive, numbers finite | 10^6 motions each: bank, smoother, particle filter; \
+node: 10^6 samples: 0 open | `make soak` |
 | tests notice faults in what is trusted | killed: gait 15/15, authentication 28/28, \
-protocol 19/20, link 15/20, timeline 14/19, filter 16/18, \
+protocol 20/20, link 20/20, timeline 19/19, filter 16/18, \
 bank 20/20 | `make mutants` |
 | no clock, theft or replay locks out or commands | [security](security.md) | `make test` |
 
-Others publish (looked up in 2026): PX4
+Others (looked up in 2026): PX4
 [`mavsdk_test_runner.py`](https://docs.px4.io/main/en/test_and_ci/integration_testing_mavsdk);
 ArduPilot [`run_coverage.py`](https://ardupilot.org/dev/docs/coverage-analysis.html); MAVLink
 [signing](https://mavlink.io/en/guide/message_signing.html), 48-bit tags, one key; Klipper
@@ -40,18 +42,19 @@ ArduPilot [`run_coverage.py`](https://ardupilot.org/dev/docs/coverage-analysis.h
 
 ## Each fault
 
-By `bench/reliability.py` (`make pages`). Faults of `relpos emulate --fault`, defined in
-`host/relpos/emulator/faults/table.py`; each has a test (`tests/emulator/test_faults_behaviour.py`).
+By `bench/reliability.py` (`make pages`). Faults of `relpos emulate --fault`
+(`host/relpos/emulator/faults/table.py`), each with a test
+(`tests/emulator/test_faults_behaviour.py`).
 
-{fault_runs.NODES} native boards walk for {fault_runs.SECONDS:g} s, seed {fault_runs.SEED}, all in
-reach of all, no frame lost otherwise. What lasts, lasts from {fault_runs.BEGIN_S:g} to
-{fault_runs.END_S:g} s, at node {fault_runs.NODE}. The same team without fault is the comparison.
+{fault_runs.NODES} native boards walk {fault_runs.SECONDS:g} s, seed {fault_runs.SEED}, all in
+reach, no frame lost otherwise. What lasts, lasts from {fault_runs.BEGIN_S:g} to
+{fault_runs.END_S:g} s, at node {fault_runs.NODE}; compared with the same team without.
 
-- **time to recover**: from the fault's end to the host's first whole report of what was disturbed.
-- **motion lost**: path that the host never got (negative: more was reported than without the
-  fault); at a restart with its duration.
+- **time to recover**: from the fault's end to the first whole report of what was disturbed.
+- **motion lost**: path that the host never got (negative: more than without the fault);
+  at a restart with its duration.
 - **worst range**: largest error in the team (noise alone: {{noise:.2f}} m).
-- **seen**: counters, flags and the link's counts beyond those without the fault.
+- **seen**: counters, flags, link counts beyond those without it.
 
 """
 COLUMNS = (
