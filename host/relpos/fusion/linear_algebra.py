@@ -7,12 +7,27 @@ team are multiplied faster, too.
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import Lock
 
 from threadpoolctl import threadpool_limits
 
+_LOCK = Lock()
+_USERS: list[threadpool_limits] = []
+"""One entry for each context that is open; the first knows how it was before."""
 
-def one_thread() -> AbstractContextManager[object]:
-    """Return a context in which BLAS uses one thread; afterwards it is as before."""
-    limits: AbstractContextManager[object] = threadpool_limits(limits=1, user_api="blas")
-    return limits
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let BLAS use one thread; after the last of all threads' contexts it is as before."""
+    with _LOCK:
+        _USERS.append(threadpool_limits(limits=1, user_api="blas"))
+    try:
+        yield
+    finally:
+        with _LOCK:
+            if len(_USERS) > 1:
+                del _USERS[1]
+            else:
+                _USERS.pop().restore_original_limits()
