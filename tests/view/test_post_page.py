@@ -79,5 +79,7 @@ def test_a_phone_leads_to_the_command_post_and_nobody_says_this_is_me(
     expect(phone.get_by_role("button", name="Command post")).to_have_count(0)
     phone.get_by_role("button", name="Ben").click()
     phone.get_by_role("button", name="This is me").click()
+    # The answer leads to the landmarks.
+    expect(phone.get_by_role("heading", name="Landmarks")).to_be_visible()
     phone.locator("[data-page='team']").click()
     expect(phone.get_by_role("button", name="Find Command post")).to_be_visible()
