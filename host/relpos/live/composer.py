@@ -19,7 +19,7 @@ from relpos.live.team_view import (
     Pair,
     Person,
     TeamView,
-    default_name,
+    name_of,
 )
 from relpos.measurements import Height, Motion, Observation, Range, at_rest
 from relpos.nodes.monitor import NodeMonitor, TeamMonitor
@@ -151,7 +151,7 @@ class Composer:
 
     def name(self, node: int) -> str:
         """Return the name of the node's wearer."""
-        return self.names.get(node) or default_name(node, post=node in self.posts)
+        return name_of(node, self.names, self.posts)
 
     def _count_heard(
         self, now_s: float, decoder: Decoder, observations: Sequence[Observation]

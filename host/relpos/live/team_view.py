@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from functools import lru_cache
@@ -26,9 +26,9 @@ STILL_ALARM_S = 30.0
 POST_NAME = "Command post"
 
 
-def default_name(node: int, *, post: bool = False) -> str:
-    """Return what a node is called that nobody has named."""
-    return POST_NAME if post else f"Node {node}"
+def name_of(node: int, names: Mapping[int, str], posts: Collection[int]) -> str:
+    """Return the name that a node was given, or what it is called without one."""
+    return names.get(node) or (POST_NAME if node in posts else f"Node {node}")
 
 
 class Level(StrEnum):

@@ -31,7 +31,7 @@ from relpos.live.team_view import (
     Pair,
     Person,
     TeamView,
-    default_name,
+    name_of,
 )
 from relpos.live.tracks import Tracks
 from relpos.measurements import Event, Motion, Range, Status
@@ -80,8 +80,8 @@ class History:
         alarms, log = Alarms(), list(known)
         alarms.posts = posts
 
-        def name_of(node: int) -> str:
-            return names.get(node) or default_name(node, post=node in alarms.posts)
+        def name(node: int) -> str:
+            return name_of(node, names, posts)
 
         def note(time_s: float, kind: str, words: Said, node: int) -> None:
             unix_s = moments.started_unix_s + time_s
@@ -92,7 +92,7 @@ class History:
         for time_s, row in moments.rows(moments.from_s, moments.to_s, *kinds):
             if isinstance(row, Event):
                 if not known:
-                    words = AT_LANDMARK.filled(name=name_of(row.node), landmark=row.value)
+                    words = AT_LANDMARK.filled(name=name(row.node), landmark=row.value)
                     note(time_s, "landmark", words, row.node)
                 continue
             self.heard_s.setdefault(row.node, array("d")).append(time_s)
@@ -106,7 +106,7 @@ class History:
             for node, _, after in alarms.changes:
                 self.alerts.setdefault(node, []).append((time_s, after))
                 if after is not None and not known:
-                    note(time_s, "alarm", RAISED[after].filled(name=name_of(node)), node)
+                    note(time_s, "alarm", RAISED[after].filled(name=name(node)), node)
             alarms.changes.clear()
         self.events = sorted(log, key=lambda entry: entry.time_s)
         self.complete = True
@@ -283,11 +283,9 @@ class Player:
             status = NodeStatus.STALE
         limit_s = {Alert.STILL_ALARM: STILL_ALARM_S, Alert.STILL_WARNING: STILL_WARNING_S}
         still_s = time_s - since_s + limit_s[alert] if alert in limit_s else 0.0
-        post = node in self.posts
         person = Person(
-            node, self.names.get(node) or default_name(node, post=post),
-            status=str(status), seen_s=seen_s, still_s=still_s, alert=alert, health="unknown",
-            post=post,
+            node, name_of(node, self.names, self.posts), status=str(status), seen_s=seen_s,
+            still_s=still_s, alert=alert, health="unknown", post=node in self.posts,
         )  # fmt: skip
         if at is None:
             return person

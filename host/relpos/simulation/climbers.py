@@ -156,7 +156,7 @@ class Climber:
         self.episode = "level"
 
     def flight(self, leg: Leg) -> None:
-        """Climb one flight, or go down, in one go or with a stop halfway."""
+        """Walk to a flight and climb it, or go down, in one go or with a stop halfway."""
         up = leg.rise_m > 0.0
         two = self.rng.random() < self.settings.two_share
         count = math.ceil(leg.risers / 2) if two else leg.risers

@@ -103,13 +103,11 @@ class Stairwell:
             angle = np.linspace(math.pi, math.pi + turn, 8 * risers)
             circle = np.column_stack([np.cos(angle), np.sin(angle)]) * SPIRAL_M
             legs = [
-                Leg(self._at([(foot, 0.0)])),
                 Leg(self._at(circle + np.array([foot + SPIRAL_M, 0.0])), storey_m, risers),
             ]
         elif self.kind is StairKind.STRAIGHT:
             top = foot + risers * self.tread_m
             legs = [
-                Leg(self._at([(foot, -HALF_M)])),
                 Leg(self._at([(foot, -HALF_M), (top, -HALF_M)]), storey_m, risers),
                 Leg(self._at([(top + 0.6, -HALF_M), (top + 0.6, HALF_M), (0.6, HALF_M)])),
             ]
@@ -118,9 +116,8 @@ class Stairwell:
             rise_m, top = storey_m * half / risers, foot + half * self.tread_m
             end = top - (risers - half) * self.tread_m
             legs = [
-                Leg(self._at([(foot, -HALF_M)])),
                 Leg(self._at([(foot, -HALF_M), (top, -HALF_M)]), rise_m, half),
-                Leg(self._at([(top + 0.6, -HALF_M), (top + 0.6, HALF_M), (top, HALF_M)])),
+                Leg(self._at([(top + 0.6, -HALF_M), (top + 0.6, HALF_M)])),
                 Leg(self._at([(top, HALF_M), (end, HALF_M)]), storey_m - rise_m, risers - half),
                 Leg(self._at([(0.6, HALF_M)])),
             ]

@@ -319,12 +319,12 @@ class Bank:
             known[a].within.range_variance_m2() + known[b].within.range_variance_m2()
             for a, b in pairs
         ]
-        more_m2 = np.array(uneven) + slab_variance(
+        own_m2 = np.array(uneven) + slab_variance(
             [(known[a].vertical.floor, known[b].vertical.floor) for a, b in pairs]
         )
         variance = self.core.range_variance_m2
         alone = self.range_correlation.effective_counts(pairs)
-        counts: Floats = variance * alone / (variance + alone * more_m2)
+        counts: Floats = variance * alone / (variance + alone * own_m2)
         return counts
 
     def _velocity_at(self, node: int, time_s: float) -> tuple[float, float]:
@@ -481,8 +481,8 @@ class Bank:
     ) -> list[Attempts]:
         """Return the attempts of each round that ends here; the detection curve learns them."""
         rounds = []
-        learned = self.detection.rounds
-        for done in learned.add(time_s, ranges, timeline.reported_s, self._on_one_floor):
+        ended = self.detection.rounds.add(time_s, ranges, timeline.reported_s, self._on_one_floor)
+        for done in ended:
             pairs = done.received + done.missed
             for late in timeline.catch_up({n for p in pairs for n in p}, time_s):
                 self.update(late, timeline)

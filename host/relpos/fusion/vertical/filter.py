@@ -5,9 +5,9 @@ It works in intervals of about a second, which end with epochs. What happened in
 steps, a fan's pressure after a metre. Until then a height is the last decided one and what has
 probably been climbed since.
 
-On stairs dead reckoning claims a level step's length, twice the true one. The surplus is taken back
-along the reported direction: now less than a step at once, since what somebody does on
-stairs is expected of the next steps, too.
+On stairs dead reckoning claims a level step's length, twice the true one. Who is on stairs is
+expected to stay there, so that motion is shortened as it comes; what was claimed before a flight
+was recognised is taken back along the reported direction.
 
 Before anybody reports a height there is nothing here: the team is taken to be on one level.
 """
@@ -362,7 +362,7 @@ class VerticalFilter:
 
     def _corrections(self, time_s: float) -> list[Advance]:
         """Take back what the open intervals claim too much of, as far as that is known."""
-        shares, on_stairs = true_shares(
+        shares, expected = true_shares(
             np.array([one.reported.steps for one in self._open]),
             np.array([one.way_m for one in self._open]),
             np.array(
@@ -373,9 +373,9 @@ class VerticalFilter:
             ),
             *(np.array([p[:, way].sum(axis=1) for p in self._smoothed]) for way in (UP, DOWN)),
         )
-        now = self._smoothed[-1][:, STAIRS].sum(axis=1)
-        expected = 1.0 - now * (1.0 - on_stairs)
-        total = sum(f * one.moved - one.made for f, one in zip(shares, self._open, strict=True))
+        total = sum(
+            share * one.moved - one.made for share, one in zip(shares, self._open, strict=True)
+        )
         worth = np.abs(total) >= LEAST_CORRECTION_M
         for share, one in zip(shares, self._open, strict=True):
             one.share = share

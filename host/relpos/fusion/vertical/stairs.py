@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion.vertical.track import STEP_M
+
 Floats = npt.NDArray[np.float64]
 
 TREAD_M, RISER_M, STEEPER = 0.28, 0.175, 1.0
@@ -13,10 +15,9 @@ TREAD_M, RISER_M, STEEPER = 0.28, 0.175, 1.0
 LEAST_TREAD_M = 0.22
 TWO_STEPS_M = 0.26
 """A rise by so much is two steps."""
-STEP_M = 0.56
-"""A step as dead reckoning claims it, where too few tell."""
 FEW_STEPS = 3.0
-MOST = 1.3
+"""So few do not tell how long a step is claimed to be."""
+MOST_SHARE = 1.3
 """Of the claimed way of an interval: what pressure took too much before is given back."""
 
 
@@ -26,7 +27,7 @@ def true_shares(
     """Return which share of its claimed way each of N nodes truly went in I intervals, (I, N).
 
     ``steps``, ``way_m`` and ``rise_m`` (I, N) are what was reported, ``up`` and ``down`` (I, N) the
-    probabilities of a flight. The second value (N,) is the share while on a flight.
+    probabilities of a flight. The second value (N,) is the share to be expected of the next way.
 
     The surplus follows the rise: each riser is a step that is claimed to be a level one. So it need
     not be known in which second a flight began, and steps on landings count in full.
@@ -43,4 +44,5 @@ def true_shares(
     step_m = np.where(taken > FEW_STEPS, way_m.sum(axis=0) / np.maximum(taken, FEW_STEPS), STEP_M)
     surplus_m = np.maximum(step_m - treads * tread, 0.0)
     shares = 1.0 - climbed_m * surplus_m / (treads * riser) / np.maximum(way_m, 0.2)
-    return np.clip(shares, 0.0, MOST), 1.0 - surplus_m / np.maximum(step_m, 1e-9)
+    expected = 1.0 - stairs[-1] * surplus_m / np.maximum(step_m, 1e-9)
+    return np.clip(shares, 0.0, MOST_SHARE), expected

@@ -51,7 +51,7 @@ class Track:
     heading: complex = 1.0 + 0j
     """In the frame of its own dead reckoning."""
     expected: float = 1.0
-    """Of a displacement: how much of it is true, by what the node did last."""
+    """Share of the next displacement that is true, by what the node did last."""
     _reached: Moved = NOT_MOVED
     _taken: Moved = NOT_MOVED
     _points: deque[tuple[float, Moved]] = field(default_factory=deque)
@@ -65,13 +65,13 @@ class Track:
         moved = self.heading * complex(step.dx_m, step.dy_m)
         if not self._points:
             self._points.append((step.time_s - step.duration_s, self._reached))
-        factor = self.expected
-        self._reached = Moved(x + steps, y + way_m, reported + moved, made + factor * moved)
+        share = self.expected
+        self._reached = Moved(x + steps, y + way_m, reported + moved, made + share * moved)
         self._points.append((step.time_s, self._reached))
         self.heading *= cmath.rect(1.0, step.dtheta_rad)
-        if factor == 1.0:
+        if share == 1.0:
             return step
-        return step._replace(dx_m=factor * step.dx_m, dy_m=factor * step.dy_m)
+        return step._replace(dx_m=share * step.dx_m, dy_m=share * step.dy_m)
 
     def take(self) -> Moved:
         """Return the motion up to the newest height."""
