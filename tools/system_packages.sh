@@ -66,13 +66,19 @@ find_missing() { # GROUP
             want_package libelf-dev /usr/include/libelf.h
             ;;
         browser)
-            # Ubuntu's is a snap behind an empty package; the tests that need one skip and say so.
-            if ! command -v chromium >/dev/null 2>&1 && ! command -v google-chrome >/dev/null 2>&1; then
-                case $(apt-cache policy chromium 2>/dev/null | sed -n 's/^ *Candidate: *//p') in
+            # The shell without windows is enough. Ubuntu has a snap behind an empty package alone;
+            # the tests that need a browser skip there and say so.
+            found=
+            for name in chromium-headless-shell chromium google-chrome; do
+                command -v "$name" >/dev/null 2>&1 && found=$name
+            done
+            for name in chromium-headless-shell chromium; do
+                [ -z "$found" ] || break
+                case $(apt-cache policy "$name" 2>/dev/null | sed -n 's/^ *Candidate: *//p') in
                     '' | '(none)' | *snap*) ;;
-                    *) missing="$missing chromium" ;;
+                    *) missing="$missing $name" found=$name ;;
                 esac
-            fi
+            done
             ;;
         soak)
             want_command clang++ clang

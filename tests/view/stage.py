@@ -20,7 +20,8 @@ from relpos.measurements import Event, Heading, Observation
 from relpos.view.access import Access, listen
 from relpos.view.web import WebView
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+# The shell without windows does the same work with two thirds of the processor time.
+BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 NO_BROWSER = "no Chromium is installed: `apt-get install chromium`"
 
 

@@ -42,6 +42,7 @@ def test_the_session_is_ended_by_a_hold_and_never_by_a_slip(visit: Any, stage: S
     page = visit()
     asked: list[str] = []
     page.on("request", lambda request: asked.append(request.url))
+    expect(page.locator("#connection")).to_have_attribute("data-state", "live")
     page.locator("#show-log").click()
     page.locator("#end").click()
     page.wait_for_timeout(300)

@@ -146,6 +146,8 @@ def test_the_others_are_shown_from_the_wearer(visit, stage: Stage):
     expect(page.locator("#others")).to_be_visible()
 
 
+# As if the phone's owner had allowed them.
+SENSORS = ["accelerometer", "gyroscope", "magnetometer"]
 TURN = """([alpha, beta, gamma]) => {
     window.turning = setInterval(() => dispatchEvent(new DeviceOrientationEvent(
         "deviceorientationabsolute", { absolute: true, alpha, beta, gamma })), 100);
@@ -153,7 +155,7 @@ TURN = """([alpha, beta, gamma]) => {
 
 
 def test_a_shared_compass_is_a_heading_from_east_counter_clockwise(visit, stage: Stage):
-    page = visit("/phone", **PHONE)
+    page = visit("/phone", **PHONE, permissions=SENSORS)
     choose(page, "Ben")
     page.get_by_role("button", name="Me", exact=True).click()
     page.get_by_role("button", name="Share compass").click()
