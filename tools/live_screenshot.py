@@ -39,14 +39,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("docs/images/live.png"))
     parser.add_argument("--dark", action="store_true")
     wanted = parser.parse_args()
-    browser = next(
-        (
-            p
-            for n in ("chromium-headless-shell", "chromium", "google-chrome")
-            if (p := shutil.which(n))
-        ),
-        None,
-    )
+    names = ("chromium-headless-shell", "chromium", "google-chrome")
+    browser = next((path for name in names if (path := shutil.which(name))), None)
     if browser is None:
         raise SystemExit("no Chromium is installed: `apt-get install chromium`")
     with tempfile.TemporaryDirectory() as directory:

@@ -647,9 +647,8 @@ def test_it_fits_screens_from_a_small_phone_to_a_wall(visit, stage: Stage, width
     box = page.locator("#map").bounding_box()
     assert box["width"] >= 300
     assert box["height"] >= 200
-    buttons = page.locator(
-        "#people button:visible, .tools button:visible, #map-tools button:visible"
-    )
+    places = ("#people", ".tools", "#map-tools")
+    buttons = page.locator(", ".join(f"{place} button:visible" for place in places))
     heights = [button.bounding_box()["height"] for button in buttons.all()[:16]]
     assert len(heights) > 10
     assert min(heights) >= 40
