@@ -1,5 +1,7 @@
 """Recordings played into the emulated chip, on the production firmware."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -125,6 +127,20 @@ def test_a_sample_beyond_the_chips_range_is_clipped_and_counted(walker):
 def test_a_recording_without_magnetometer_is_played(walker):
     replay = play(1, recorded(walker, even(100.0), magnetic=False), WearerSettings())
     assert len(replay.steps) > 60
+
+
+def test_pressure_becomes_heights_and_a_recording_without_has_none(walker, reference):
+    times_s = even(100.0)
+    # 10 m up from second 20 to second 40: at 98,000 Pa and 15 degrees rho g is 11.62 Pa/m.
+    climbed_m = np.interp(times_s, [20.0, 40.0], [0.0, 10.0])
+    recording = replace(recorded(walker, times_s, 5.0), pressure_pa=98_000.0 - 11.62 * climbed_m)
+    replay = play(3, recording, WearerSettings())
+    assert replay.motions[0].dx_m == reference.motions[0].dx_m
+    at_s, height_m = np.transpose([(h.time_s - 5.0, h.height_m) for h in replay.heights])
+    assert {h.node for h in replay.heights} == {3}
+    assert np.abs(height_m[(at_s > 3.0) & (at_s < 20.0)]).max() < 0.1
+    assert height_m[at_s > 42.0] == pytest.approx(10.0, abs=0.15)
+    assert reference.heights == ()
 
 
 def test_longer_legs_walk_further_in_the_same_recording(walker):

@@ -7,7 +7,17 @@ import pytest
 import scipy.io
 
 from relpos.errors import DataError
-from relpos.recordings import back, daily, mocap, museum, phone_strides, ranges, still, treadmill
+from relpos.recordings import (
+    back,
+    daily,
+    hamburg,
+    mocap,
+    museum,
+    phone_strides,
+    ranges,
+    still,
+    treadmill,
+)
 from relpos.recordings.tables import Archive
 
 
@@ -78,6 +88,39 @@ def test_a_log_of_a_phone_is_cut_around_its_points(source):
     north_m = float(first.truth[1].split(",")[3])
     assert first.truth[0] == "1.0000,1,0,0,"
     assert north_m == pytest.approx(11.12, abs=0.01)  # 1e-4 of the 10,000 km / 90 of a degree
+
+
+def test_a_log_with_pressure_keeps_the_floors_of_its_points(source):
+    lines = ["POSI;1.0;1;49.46;11.11;0;100", "POSI;4.0;2;49.4601;11.11;-2;100"]
+    for k in range(11):
+        lines += [f"{kind};{0.5 * k};{0.5 * k};0;0;9.8;3" for kind in ("ACCE", "GYRO", "MAGN")]
+        lines.append(f"PRES;{0.5 * k};{0.5 * k};{980 + 0.1 * k};3")
+    files = {}
+    for trial in museum.FLOOR_TRIALS:
+        walk, repetition = trial.split("_")
+        files[f"{museum.FOLDER}{walk}_repetition{repetition}.txt"] = "\n".join(lines)
+    first, *others = museum.heights(source(files))
+    assert len(others) == 49
+    table = first.tables()["imu.csv"].splitlines()
+    assert table[0].endswith(",mz_ut,pressure_pa")
+    assert table[1] == "0.0000,1,0,0,9.8,0,0,9.8,0,0,9.8,98000.0"
+    assert list(first.events) == ["1.0000,1,floor,0", "4.0000,1,floor,-2"]
+
+
+def test_points_of_a_plan_keep_their_heights(source):
+    files = {}
+    for folder in hamburg.WALKS.values():
+        for kind in ("acc", "gyr", "mag"):
+            files[f"SensorLog/{folder}/{kind}.csv"] = "1e12 1 2 3\n1.00000000001e12 4 5 6\n"
+        files[f"SensorLog/{folder}/bar.csv"] = "1e12 1013.25\n1.00000000001e12 1013.20\n"
+        files[f"SensorLog/{folder}/ref.csv"] = "1e12 500 700 1.3\n1.000000009e12 503 704 7.6"
+    _, run = hamburg.convert(source(files))
+    assert run.name == "zero2four"
+    assert run.imu[1] == "0.0100,1,4,5,6,4,5,6,4,5,6,101320.0"
+    assert run.others["truth.csv"][1:] == ["0.000,1,0.0,0.0,,0.0", "9.000,1,3.0,4.0,,6.3"]
+    files[f"SensorLog/{folder}/bar.csv"] = "1e12 1013.25\n"
+    with pytest.raises(DataError, match="the source has changed"):
+        list(hamburg.convert(source(files)))
 
 
 def matlab(**variables):

@@ -17,6 +17,7 @@ from relpos.errors import DataError
 
 if TYPE_CHECKING:
     from relpos.emulator.deadreckoning import NodeResult
+    from relpos.measurements import Measurement
     from relpos.runs import Run
 
 
@@ -36,7 +37,9 @@ def deadreckon(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Write motion.csv, steps.csv and summary.json there."),
+        typer.Option(
+            metavar="DIR", help="Write motion.csv, steps.csv, height.csv and summary.json there."
+        ),
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
 ) -> None:
@@ -64,13 +67,14 @@ def deadreckon(
     nodes = {str(node): _figures(part) for node, part in sorted(played.items())}
     if out is not None:
         parts = [part.output for part in played.values()]
+        measured: list[Measurement] = []
+        for reported in parts:
+            measured += (*reported.motions, *reported.heights)
         save_run(
             Run(
                 name=recording.name,
                 description=replace(recording.description, source=f"relpos deadreckon {run}"),
-                measurements=tuple(
-                    sorted((m for part in parts for m in part.motions), key=lambda m: m.time_s)
-                ),
+                measurements=tuple(sorted(measured, key=lambda m: m.time_s)),
                 steps=tuple(
                     sorted((s for part in parts for s in part.steps), key=lambda s: s.time_s)
                 ),

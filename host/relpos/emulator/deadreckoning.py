@@ -22,7 +22,7 @@ from relpos.calibration.steps import (
 )
 from relpos.errors import DataError, DeviceError
 from relpos.link.decoder import Decoder
-from relpos.measurements import Motion, Step
+from relpos.measurements import Height, Motion, Step
 from relpos.protocol import messages as wire
 from relpos.runs import Run
 from relpos.runs.imu import ImuRecording
@@ -68,12 +68,14 @@ class WearerSettings:
 class FirmwareOutput:
     """What one node reported, on the recording's clock; ``counts`` are the frames by name.
 
-    ``clipped`` samples of the recording were beyond the range that the firmware had configured.
+    ``heights`` are empty where the recording has no pressure. ``clipped`` samples of the recording
+    were beyond the range that the firmware had configured.
     """
 
     motions: tuple[Motion, ...]
     steps: tuple[Step, ...]
     counts: Mapping[str, int]
+    heights: tuple[Height, ...] = ()
     clipped: int = 0
 
     @property
@@ -123,28 +125,36 @@ def surroundings_of(recording: ImuRecording) -> Surroundings:
     silent = [(float(time_s[k]) + period_s, float(time_s[k + 1])) for k in gaps]
     silent.append((float(time_s[-1]) + period_s, float(grid_s[-1]) + 3600.0))
     magnetic = np.full((len(grid_s), 3), np.nan)
-    known = np.isfinite(rows[:, 6:]).all(axis=1)
+    known = np.isfinite(rows[:, 6:9]).all(axis=1)
     if known.any():
         for axis in range(3):
             magnetic[:, axis] = np.interp(inside, time_s[known], rows[known, 6 + axis])
+    pressure_pa = np.full(len(grid_s), STANDARD_PRESSURE_PA)
+    known = np.isfinite(rows[:, 9])
+    if known.any():
+        pressure_pa = np.interp(inside, time_s[known], rows[known, 9])
     return Surroundings(
         rate_hz=grid_hz,
         specific_force_m_s2=inertial[:, :3],
         angular_rate_rad_s=inertial[:, 3:],
         magnetic_field_ut=magnetic,
-        pressure_pa=np.full(len(grid_s), STANDARD_PRESSURE_PA),
+        pressure_pa=pressure_pa,
         silent_us=tuple((round(a * 1e6), round(b * 1e6)) for a, b in silent),
     )
 
 
 def _increasing(recording: ImuRecording) -> tuple[FloatArray, FloatArray]:
-    """Times and (n, 9) rows, of samples at the same time the first."""
+    """Times and (n, 10) rows, of samples at the same time the first."""
     keep = np.concatenate(([True], np.diff(recording.time_s) > 1e-6))
+    pressure_pa = recording.pressure_pa
+    if pressure_pa is None:
+        pressure_pa = np.full(len(keep), np.nan)
     rows = np.concatenate(
         (
             recording.acceleration_m_s2,
             recording.angular_rate_rad_s,
             recording.magnetic_field_ut,
+            pressure_pa[:, None],
         ),
         axis=1,
     )
@@ -166,6 +176,7 @@ class _Recorder:
     def __init__(self) -> None:
         self.decoder = Decoder()
         self.motions: list[Motion] = []
+        self.heights: list[Height] = []
         self.steps: list[Step] = []
 
     def send(self, sent: Transmission) -> None:
@@ -180,6 +191,8 @@ class _Recorder:
         for observation in self.decoder.feed(sent.data, arrival_s):
             if isinstance(observation, Motion):
                 self.motions.append(observation)
+            elif isinstance(observation, Height):
+                self.heights.append(observation)
             elif isinstance(observation, Step):
                 self.steps.append(observation)
         sent.report(sent.time_us, DELIVERED)
@@ -260,10 +273,15 @@ def play(
         if motion.time_s > LEAD_S or motion.dx_m or motion.dy_m or motion.dtheta_rad
     )
     steps = tuple(replace(step, node=node, time_s=at(step.time_s)) for step in recorder.steps)
+    heights = tuple(
+        replace(height, node=node, time_s=at(height.time_s))
+        for height in recorder.heights
+        if recording.pressure_pa is not None and height.time_s > LEAD_S
+    )
     counts = dict(recorder.decoder.counts)
     for track in recorder.decoder.nodes.values():
         counts.update(track.counts)
-    return FirmwareOutput(motions, steps, counts, int(beyond.sum()))
+    return FirmwareOutput(motions, steps, counts, heights, int(beyond.sum()))
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from relpos.recordings import (
     back,
     daily,
+    hamburg,
     handheld,
     lowerback,
     mocap,
@@ -141,6 +142,24 @@ SOURCES = (
         "da1b24b67f48a48a5e69ef35c1fd33d3f03b1592",
         museum.convert,
         "61e0af4fbc776ef5549b94204021273aaead34dc9d10e078b4d6ddc2b09c56a9",
+    ),
+    Source(
+        "height_phone_museum",
+        "github.com/Kenny5269/2023_IPIN_Competition_Track03",
+        "see zenodo.org/records/8362205",
+        "phone in the hand, pressure, floors of surveyed points (IPIN 2023 track 3)",
+        "da1b24b67f48a48a5e69ef35c1fd33d3f03b1592",
+        museum.heights,
+        "e979ff98eb96114f03e7004dc99b54574c0ec66d7ea8ee3e81a6d8d7d62be391",
+    ),
+    Source(
+        "height_phone_hamburg",
+        "github.com/Hossein-Shoushtari/IPIN21Data",
+        "none stated",
+        "phone before the chest, pressure, heights of points on three floors",
+        "715aee024e994289c3465e0ceb30777a31080cff",
+        hamburg.convert,
+        "d91eb84cbf91f7389ef601603a6efe25307537c076de3abf455de9f8b1f45392",
     ),
     Source(
         "still_mpu9150_8chips",

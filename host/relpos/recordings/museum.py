@@ -14,7 +14,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from relpos.errors import DataError
-from relpos.recordings.tables import Archive, Array, ConvertedRun, described, imu_lines
+from relpos.recordings.tables import (
+    Archive,
+    Array,
+    ConvertedRun,
+    described,
+    event_lines,
+    imu_lines,
+)
 
 FOLDER = "01 Logfiles/01 IPIN2023_T3_TrainingTrials (training)/IPIN2023_T3_TrainingTrial"
 WALKS = ("01", "02", "03", "05", "21", "23", "24", "26")
@@ -22,6 +29,15 @@ TRIALS = (
     *(f"{walk}_{repetition}" for walk in WALKS for repetition in ("01", "04")),
     "51_02",
 )
+FLOOR_TRIALS = (
+    *(f"{walk:02d}_{k:02d}" for walk in (*range(1, 6), *range(21, 28)) for k in range(1, 5)),
+    "51_02",
+    "52_01",
+)
+"""All on one floor, but the last two."""
+VALUES = {"PRES": 4}
+"""End of a line's values, where it is not 6."""
+PA_OF_MBAR = 100.0
 MARGIN_S = 1.0
 LONGEST_S = 152.0
 EQUATOR_M, FLATTENING = 6378137.0, 1.0 / 298.257223563
@@ -31,41 +47,56 @@ EQUATOR_M, FLATTENING = 6378137.0, 1.0 / 298.257223563
 def convert(archive: Archive) -> Iterator[ConvertedRun]:
     """The first and the last repetition of eight training walks, and one over the stairs."""
     for trial in TRIALS:
-        walk, repetition = trial.split("_")
-        text = archive.read(f"{FOLDER}{walk}_repetition{repetition}.txt")
-        yield _run(f"T{walk}_R{repetition}", text)
+        yield _run("walk_phone_museum", trial, archive, ("GYRO", "MAGN"), LONGEST_S)
 
 
-def _run(name: str, text: str) -> ConvertedRun:
+def heights(archive: Archive) -> Iterator[ConvertedRun]:
+    """Training walks whole, with pressure, and as events the floors of the points."""
+    for trial in FLOOR_TRIALS:
+        yield _run("height_phone_museum", trial, archive, ("GYRO", "MAGN", "PRES"), math.inf)
+
+
+def _run(
+    folder: str, trial: str, archive: Archive, kinds: tuple[str, ...], longest_s: float
+) -> ConvertedRun:
+    walk, repetition = trial.split("_")
+    name = f"T{walk}_R{repetition}"
+    text = archive.read(f"{FOLDER}{walk}_repetition{repetition}.txt")
     lines = [line.split(";") for line in text.splitlines()]
     tables = {
-        kind: np.array([row[1:6] for row in lines if row[0] == kind], np.float64)
-        for kind in ("ACCE", "GYRO", "MAGN", "POSI")
+        kind: np.array(
+            [row[1 : VALUES.get(kind, 6)] for row in lines if row[0] == kind], np.float64
+        )
+        for kind in ("ACCE", "POSI", *kinds)
     }
     if not all(map(len, tables.values())):
         raise DataError(f"{name}: no sensors or points: the source has changed")
     acceleration, points = tables["ACCE"], tables["POSI"]
     points_s = points[:, 0] + np.median(acceleration[:, 1] - acceleration[:, 0])
     begin_s = points_s[0] - MARGIN_S
-    end_s = min(begin_s + LONGEST_S, points_s[-1] + MARGIN_S)
+    end_s = min(begin_s + longest_s, points_s[-1] + MARGIN_S)
     points, points_s = points[points_s <= end_s], points_s[points_s <= end_s]
     sensor_s = acceleration[:, 1]
     rows = acceleration[(sensor_s >= begin_s) & (sensor_s <= end_s)]
     columns = [rows[:, 2:5]]
-    for kind in ("GYRO", "MAGN"):
+    for kind in kinds:
         table = tables[kind]
-        columns += [np.interp(rows[:, 1], table[:, 1], v)[:, None] for v in table[:, 2:5].T]
+        values = table[:, 2:3] * PA_OF_MBAR if kind == "PRES" else table[:, 2:5]
+        columns += [np.interp(rows[:, 1], table[:, 1], v)[:, None] for v in values.T]
+    times_s = points_s - rows[0, 1]
     truth = [
-        f"{time - rows[0, 1]:.4f},1,{x:.5g},{y:.5g},"
-        for time, (x, y) in zip(points_s, _plane(points[:, 2:4]), strict=True)
+        f"{time:.4f},1,{x:.5g},{y:.5g},"
+        for time, (x, y) in zip(times_s, _plane(points[:, 2:4]), strict=True)
     ]
+    floors = [(t, "floor", f"{f:.0f}") for t, f in zip(times_s, points[:, 4], strict=True)]
     description = described(
-        f"walk_phone_museum/{name}",
+        f"{folder}/{name}",
         "IPIN 2023 track 3 (zenodo 8362205)",
         'mount = "phone in the hand, screen up"',
     )
     imu = imu_lines(rows[:, 1] - rows[0, 1], np.hstack(columns))
-    return ConvertedRun(name, description, imu, truth=truth)
+    events = event_lines(floors) if "PRES" in kinds else ()
+    return ConvertedRun(name, description, imu, events=events, truth=truth)
 
 
 def _plane(degrees: Array) -> Array:

@@ -15,7 +15,9 @@ import numpy.typing as npt
 from relpos.errors import DataError
 
 Array = npt.NDArray[np.float64]
-IMU_COLUMNS = "time_s,node,ax_m_s2,ay_m_s2,az_m_s2,gx_rad_s,gy_rad_s,gz_rad_s,mx_ut,my_ut,mz_ut"
+IMU_COLUMNS = (
+    "time_s,node,ax_m_s2,ay_m_s2,az_m_s2,gx_rad_s,gy_rad_s,gz_rad_s,mx_ut,my_ut,mz_ut,pressure_pa"
+)
 EVENT_COLUMNS = "time_s,node,event,value"
 TRUTH_COLUMNS = "time_s,node,x_m,y_m,heading_rad"
 
@@ -58,7 +60,7 @@ class Archive:
 
 @dataclass(frozen=True)
 class ConvertedRun:
-    """The text of a run directory's files; ``imu`` are lines below `IMU_COLUMNS`.
+    """The text of a run directory's files; ``imu`` are lines below the first of `IMU_COLUMNS`.
 
     ``others``: further tables, file name -> lines with the header. A table of range errors is no
     run: its description is a text.
@@ -73,8 +75,9 @@ class ConvertedRun:
 
     def tables(self) -> dict[str, str]:
         """File name -> text."""
+        width = self.imu[0].count(",") + 1 if self.imu else 0
         parts = {
-            "imu.csv": (IMU_COLUMNS, self.imu),
+            "imu.csv": (",".join(IMU_COLUMNS.split(",")[:width]), self.imu),
             "events.csv": (EVENT_COLUMNS, self.events),
             "truth.csv": (TRUTH_COLUMNS, self.truth),
         }
@@ -110,10 +113,13 @@ def number(value: float, digits: int = 6) -> str:
 
 
 def imu_lines(times_s: Array, samples: Array, digits: int = 5, node: int = 1) -> list[str]:
-    """Lines of imu.csv: ``samples`` (n, 6) or, with the magnetic field, (n, 9)."""
+    """Lines of imu.csv: ``samples`` (n, 6), with the field (n, 9), and with pressure (n, 10)."""
     none = ",,," if samples.shape[1] == 6 else ""
     return [
-        f"{t:.4f},{node}," + ",".join(number(v, digits) for v in row) + none
+        f"{t:.4f},{node},"
+        + ",".join(number(v, digits) for v in row[:9])
+        + none
+        + "".join(f",{pressure_pa:.1f}" for pressure_pa in row[9:])
         for t, row in zip(times_s.tolist(), samples.tolist(), strict=True)
     ]
 

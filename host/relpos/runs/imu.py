@@ -27,6 +27,7 @@ _COLUMNS = (
     *(Column(f"{axis}_rad_s", number) for axis in ("gx", "gy", "gz")),
     # A magnetometer is slower than the rest or not there at all: its cells may be empty.
     *(Column(f"{axis}_ut", number, optional=True) for axis in ("mx", "my", "mz")),
+    Column("pressure_pa", number, optional=True),
 )
 
 
@@ -35,13 +36,15 @@ class ImuRecording:
     """One node's raw inertial data in sensor axes, sorted by time.
 
     ``time_s`` is (n,); ``acceleration_m_s2`` (specific force), ``angular_rate_rad_s`` and
-    ``magnetic_field_ut`` are (n, 3), the last NaN where no sample was taken.
+    ``magnetic_field_ut`` are (n, 3), the last NaN where no sample was taken, as is the air's
+    ``pressure_pa`` (n,); None: no barometer.
     """
 
     time_s: npt.NDArray[np.float64]
     acceleration_m_s2: npt.NDArray[np.float64]
     angular_rate_rad_s: npt.NDArray[np.float64]
     magnetic_field_ut: npt.NDArray[np.float64]
+    pressure_pa: npt.NDArray[np.float64] | None = None
 
 
 def read_imu(directory: Path) -> dict[int, ImuRecording]:
@@ -57,12 +60,15 @@ def read_imu(directory: Path) -> dict[int, ImuRecording]:
     for node in np.unique(table[:, 1]):
         rows = table[table[:, 1] == node]
         rows = rows[np.argsort(rows[:, 0], kind="stable")]
-        recordings[int(node)] = ImuRecording(rows[:, 0], rows[:, 2:5], rows[:, 5:8], rows[:, 8:11])
+        pressure_pa = rows[:, 11] if np.isfinite(rows[:, 11]).any() else None
+        recordings[int(node)] = ImuRecording(
+            rows[:, 0], rows[:, 2:5], rows[:, 5:8], rows[:, 8:11], pressure_pa
+        )
     return recordings
 
 
 def _read_fast(path: Path, text: str) -> npt.NDArray[np.float64] | None:
-    """Read the (n, 11) table, or None where anything is unusual and deserves a closer look."""
+    """Read the (n, 12) table, or None where anything is unusual and deserves a closer look."""
     if '"' in text:
         return None
     header_line, _, body = text.partition("\n")
