@@ -122,6 +122,13 @@ def test_a_member_is_a_friendly_unit_where_it_is(schedule: Schedule) -> None:
     assert events["test.2"].le == UNKNOWN
 
 
+def test_the_command_posts_node_is_no_unit(schedule: Schedule) -> None:
+    events = due(schedule, team_view(1, changes={3: {"post": True}}), 0.0)
+    assert events["test.3"].type == "a-f-G-I"
+    assert events["test.3"].attributes("__group")["role"] == "HQ"
+    assert events["test.1"].attributes("__group")["role"] == "Team Member"
+
+
 def test_the_circle_holds_ninety_per_cent() -> None:
     noise = np.random.default_rng(1).normal(size=(400_000, 2))
     for major_m, minor_m in ((1.0, 1.0), (2.0, 0.9), (3.0, 0.2), (0.5, 0.0)):

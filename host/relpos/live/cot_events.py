@@ -3,7 +3,8 @@
 The attributes of an event (base schema 2.0), and what this project puts there:
 
 - ``uid`` is the member's in every session; an emergency's has ``-9-1-1`` added, as in ATAK;
-- ``type`` a-f-G-U-C, a friendly unit on the ground; b-a-o-tbl an emergency, b-a-o-can its end;
+- ``type`` a-f-G-U-C, a friendly unit on the ground; a-f-G-I, an installation, the command post's
+  node, which nobody wears; b-a-o-tbl an emergency, b-a-o-can its end;
 - ``how`` m-g while the position is measured and fresh: TAK clients show a moving member.
   h-e, estimated, where it is ambiguous or the member is stale or lost. m-s, simulated, and
   EXERCISE in the remarks, where the team is emulated or replayed;
@@ -40,6 +41,7 @@ DELETION = "t-x-d-d"
 LAST_KNOWN_STALE_S = 86_400.0
 """An emergency is not forgotten because the link to the server broke."""
 MEMBER = "a-f-G-U-C"
+POST = "a-f-G-I"
 EMERGENCY = "b-a-o-tbl"
 EMERGENCY_OVER = "b-a-o-can"
 UNKNOWN = "9999999.0"
@@ -91,7 +93,7 @@ def member(
     details = [
         ET.Element("contact", callsign=text(person.name)),
         ET.Element("uid", Droid=text(person.name)),
-        ET.Element("__group", name="Red", role="Team Member"),
+        ET.Element("__group", name="Red", role="HQ" if person.post else "Team Member"),
         _remarks(person, exercise),
     ]
     if person.heading_rad is not None and fresh:
@@ -100,7 +102,7 @@ def member(
         details.append(ET.Element("track", course=f"{course_deg:.1f}", speed=f"{speed_m_s:.2f}"))
     event: ET.Element = pytak.cot_event(
         uid=calls.uid(person.node),
-        cot_type=MEMBER,
+        cot_type=POST if person.post else MEMBER,
         how="m-s" if exercise else "m-g" if fresh else "h-e",
         point=_point(person, frame, sigma_z_m),
         detail=pytak.cot_detail(*details, flow_tag=False),
