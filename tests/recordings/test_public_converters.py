@@ -1,6 +1,7 @@
 """Each converter, given a small made-up archive in its source's own layout."""
 
 import io
+import pickle
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ import scipy.io
 from relpos.errors import DataError
 from relpos.recordings import (
     back,
+    chest,
     daily,
+    four_robots,
     hamburg,
     mocap,
     museum,
@@ -17,6 +20,7 @@ from relpos.recordings import (
     ranges,
     still,
     treadmill,
+    two_robots,
 )
 from relpos.recordings.tables import Archive
 
@@ -280,3 +284,80 @@ def test_a_treadmill_table_without_its_columns_has_changed(source):
                 files[f"{folder}/MT_{sensor}.txt"] = "// Xsens\nPacketCounter\tAcc_X\n1\t9.8\n"
     with pytest.raises(DataError, match=r"exported003.*Acc_Y.*the source has changed"):
         list(treadmill.convert(source(files)))
+
+
+def test_a_chest_log_is_named_by_its_path_and_a_short_one_is_left_out(source):
+    line = "0{n},{stamp},9.8,0.1,0.2,0.01,0.02,0.03,-0.5,0.2,1,18,-78,-17"
+    log = "\n".join(line.format(n=k, stamp=281696 + 100 * k) for k in range(1000))
+    text = f"{chest.COLUMNS},Roll,Pitch,Yaw\n{log}\n"
+    raw = "Robust Adaptive Kalman Filter Algorithm/RawData/"
+    files = {"Data/test 1/out-000.txt": text, f"{raw}25.02/Lpath.txt": text}
+    first, second = chest.convert(source(files | {f"{raw}short.txt": text[:5000]}))
+    assert (first.name, second.name) == ("Data__test_1__out-000", "L__25.02__Lpath")
+    assert first.imu[1] == "0.0100,1,9.8,0.1,0.2,0.01,0.02,0.03,-22.5,9,45"
+    with pytest.raises(DataError, match="the source has changed"):
+        list(chest.convert(source({f"{raw}short.txt": "other,columns\n"})))
+
+
+class Frame:
+    """Stands for the source's own classes; pickled by its attributes."""
+
+    def __init__(self, poses):
+        self.sampled_t, self.sampled_T = 100.0 + 0.1 * np.arange(len(poses)), poses
+
+
+class Robot:
+    def __init__(self, poses):
+        self.vicon_frame = self.vio_frame = Frame(poses)
+
+
+class Uwb:
+    def __init__(self, count):
+        self.sampled_t = [np.float64(100.0 + 0.1 * k) for k in range(count)]
+        self.sampled_d = [np.float64(3.0 + k) for k in range(count)]
+
+
+def harm():
+    raise AssertionError("a function of the pickle was run")
+
+
+class Harmful:
+    def __reduce__(self):
+        return harm, ()
+
+
+def test_robots_drive_along_y_of_their_markers_and_nothing_of_the_pickle_runs(source):
+    poses = np.tile(np.eye(4), (22, 1, 1))
+    poses[:, 1, 3] = -0.1 * np.arange(22)  # 1 m/s towards -y
+    run = {"tb2": Robot(poses), "tb3": Robot(poses), "uwb": Uwb(22), "more": Harmful()}
+    packed = pickle.dumps(run)
+    files = {two_robots.FOLDER + path: packed for path in two_robots.RUNS.values()}
+    runs = list(two_robots.convert(source(files)))
+    assert [r.name for r in runs] == list(two_robots.RUNS)
+    tables = runs[0].tables()
+    assert tables["truth.csv"].split()[3] == "0.5000,1,0,-0.5,4.71239"  # 270 degrees
+    assert tables["motion.csv"].split()[1:4:2] == ["1.1000,1,0,-1.1,0", "2.1000,1,0,-1,0"]
+    assert tables["ranges.csv"].split()[2] == "1.0000,1,2,13"
+    with pytest.raises(DataError, match="the source has changed"):
+        list(two_robots.convert(source(dict.fromkeys(files, b"no pickle"))))
+
+
+def test_four_robots_keep_their_ranges_and_truth_and_get_noisy_motion(source):
+    count = 701
+    way = np.stack([np.arange(count) / 70.0, np.zeros(count)], axis=1)
+    arrays = {}
+    for n in four_robots.ROBOTS:
+        arrays[f"optitrack_turtle{n:02d}_pose_np"] = way
+        arrays[f"optitrack_turtle{n:02d}_orientation_np"] = np.zeros(count)
+        for peer in four_robots.ROBOTS:
+            arrays[f"uwb_range_{n}_{peer}_np"] = np.full(count, 10.0 * peer + n)
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    (run,) = four_robots.convert(source({four_robots.FILE: stream.getvalue()}))
+    tables = {name: text.split()[1:] for name, text in run.tables().items()}
+    assert tables["truth.csv"][4] == "0.5714,1,0.0571429,0,0"
+    assert tables["ranges.csv"][:2] == ["0.0000,1,3,13", "0.0000,1,4,14"]
+    motion = np.array([line.split(",") for line in tables["motion.csv"]], float)
+    assert len(motion) == 400
+    assert motion[:, 2].mean() == pytest.approx(0.1, abs=0.003)
+    assert motion[:, 2:].std(axis=0) == pytest.approx([0.0112, 0.01, 0.0087], rel=0.15)

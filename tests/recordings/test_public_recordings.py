@@ -97,8 +97,6 @@ def test_a_source_that_moved_gives_one_clear_line(monkeypatch, tmp_path):
     monkeypatch.setattr(download, "SOURCES", moved)
     with pytest.raises(DataError, match=r"127\.0\.0\.1:9.*efused"):
         download.get("walk_lowerback_20m", tmp_path / "out")
-    with pytest.raises(DataError, match="no converter yet"):
-        download.get("walk_chest", tmp_path / "out")
     with pytest.raises(DataError, match="recordings list"):
         download.get("walk_on_the_moon", tmp_path / "out")
 

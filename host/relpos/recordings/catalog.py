@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 from relpos.recordings import (
     back,
+    chest,
     daily,
+    four_robots,
     hamburg,
     handheld,
     lowerback,
@@ -17,6 +19,7 @@ from relpos.recordings import (
     ranges,
     still,
     treadmill,
+    two_robots,
 )
 from relpos.recordings.tables import Archive, ConvertedRun
 
@@ -27,23 +30,21 @@ Convert = Callable[[Archive], Iterator[ConvertedRun]]
 class Source:
     """One set: its repository at a commit, and what `get` makes of it.
 
-    ``sha256`` is that of all converted tables (`tables.digest`); without a converter the set is
-    listed only.
+    ``sha256`` is that of all converted tables (`tables.digest`).
     """
 
     name: str
     repository: str
     licence: str
     holds: str
-    commit: str = ""
-    convert: Convert | None = None
+    commit: str
+    convert: Convert
     sha256: str = ""
 
     @property
     def address(self) -> str:
-        """What is downloaded, or the page of the source."""
-        page = f"https://{self.repository}"
-        return f"{page}/archive/{self.commit}.zip" if self.commit else page
+        """What is downloaded."""
+        return f"https://{self.repository}/archive/{self.commit}.zip"
 
 
 SOURCES = (
@@ -76,9 +77,13 @@ SOURCES = (
     Source(
         "walk_chest",
         "github.com/eternalamit5/"
-        "An-improved-wearable-multi-sensor-fusion-Pedestrian-Dead-Reckoning-system",
+        "An-improved-wearable-multi-sensor-fusion-Pedestrian-Dead-Reckoning-system"
+        "-for-indoor-localisation",
         "MIT",
         "chest, one corridor both ways",
+        "aeefcea257df5357807e58f0efd8198d212903d0",
+        chest.convert,
+        "3d4cc710121ebb1f77e9fa29232e2e0c09f16ca8c3ad294d292378e4ff7137fd",
     ),
     Source(
         "walk_treadmill_stroke_lumbar",
@@ -202,11 +207,17 @@ SOURCES = (
         "github.com/y2d2/UPF_RPE",
         "GPL-3.0",
         "two robots, visual-inertial odometry and UWB, Vicon",
+        "1ba55b0c427d8d42afdb65299104711eae815251",
+        two_robots.convert,
+        "d020c4d4f34ed3852846d0a8cb2a8a4da60626b8bded1d50c89f24e36428f895",
     ),
     Source(
         "four_robots_uwb",
         "github.com/TIERS/uwb-cooperative-mrs-localization",
         "MIT",
         "four robots, six UWB links, OptiTrack; motion synthesised",
+        "06897d1008463a0c7eb8f499d358298fee8f53ad",
+        four_robots.convert,
+        "e38cd514f9a3b9da1cbfddc818843bfe9068913b63aea0d055925ee1687840ab",
     ),
 )

@@ -18,13 +18,9 @@ TIMEOUT_S = 60.0
 
 
 def source_of(name: str) -> Source:
-    """The source of that name; DataError where it is unknown or has no converter."""
+    """The source of that name; DataError where there is none."""
     for source in SOURCES:
         if source.name == name:
-            if source.convert is None:
-                raise DataError(
-                    f"{name}: there is no converter yet; its source is {source.address}"
-                )
             return source
     raise DataError(f"no recordings '{name}': `relpos recordings list` shows them")
 
@@ -36,7 +32,6 @@ def get(name: str, out: Path, mirror: Path | None = None) -> int:
     written then.
     """
     source = source_of(name)
-    assert source.convert is not None
     if out.exists() and any(out.iterdir()):
         raise DataError(f"{out}: not empty; choose another folder with --out")
     with tempfile.TemporaryDirectory(prefix="relpos-recordings-") as scratch:
