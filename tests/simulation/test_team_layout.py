@@ -10,7 +10,7 @@ from relpos.errors import DataError
 from relpos.measurements import Event, Motion, Truth
 from relpos.runs import Description, Run
 from relpos.simulation import recorded_team
-from relpos.simulation.recorded_team import TeamSettings, Wearer, make_team, true_track
+from relpos.simulation.recorded_team import TeamSettings, Wearer, make_team, true_tracks
 
 
 def exact_motions(track, phase_s=0.3):
@@ -25,31 +25,44 @@ def exact_motions(track, phase_s=0.3):
 
 
 @pytest.fixture
-def there_and_back(monkeypatch):
-    monkeypatch.setattr(recorded_team, "_turn_sense", lambda *_: 1.0)
+def there_and_back():
     marks = [(5.0, "trial_start"), (17.0, "uturn_start"), (19.0, "uturn_end"), (33.0, "trial_end")]
     events = [Event(t, 1, name, "") for t, name in marks]
     events += [Event(float(t), 1, "foot_contact", "left") for t in np.arange(5.6, 33.0, 0.6)]
     return Run("walk", Description(true_distance_m=20.0), events=tuple(events))
 
 
-def test_a_walk_there_and_back_ends_where_it_began(there_and_back):
-    track = true_track(there_and_back)
-    places, headings = track.at(np.array([5.0, 17.0, 19.0, 31.5]))
-    assert places[1] == pytest.approx(10.0)
-    assert places[2] == pytest.approx(10.0)
-    assert abs(places[3]) < 1.5  # the last second and a half may turn round again
-    assert headings[[0, -1]] == pytest.approx([0.0, math.pi])
+def exact_wearer(run):
+    tracks = true_tracks(run)
+    return Wearer([m for track in tracks for m in exact_motions(track)], tracks)
+
+
+def test_there_and_back_are_two_straight_tracks_and_the_turn_is_none(there_and_back):
+    there, back = true_tracks(there_and_back)
+    assert there.time_s[[0, -1]] == pytest.approx([5.0, 17.0])
+    # the last second and a half may turn round again
+    assert back.time_s[[0, -1]] == pytest.approx([19.0, 31.5])
+    assert there.place_m[[0, -1]] == pytest.approx([0.0, 10.0])
+    assert back.place_m[0] == 0.0
+    assert 8.5 < back.place_m[-1].real < 9.5
+    assert not np.r_[there.heading_rad, back.heading_rad].any()
+
+
+def test_the_body_is_halfway_over_the_first_step_when_its_foot_comes_down(there_and_back):
+    (there, _), steps = true_tracks(there_and_back), np.arange(5.6, 16.0, 0.6)
+    lengths = np.abs(np.diff(there.at(np.r_[5.0, steps])[0]))
+    assert lengths[1:] == pytest.approx(np.full(len(lengths) - 1, lengths[1]))
+    assert lengths[0] == pytest.approx(0.5 * lengths[1])
 
 
 def test_a_recording_without_a_track_is_refused_with_what_it_needs():
     with pytest.raises(DataError, match=r"truth\.csv"):
-        true_track(Run("walk"))
+        true_tracks(Run("walk"))
 
 
 def test_surveyed_points_are_joined_straight_and_faced():
     points = [(0.0, 0.0, 0.0), (4.0, 4.0, 0.0), (8.0, 4.0, 4.0), (9.0, 4.0, 4.0)]
-    track = true_track(Run("walk", truth=tuple(Truth(t, 1, x, y) for t, x, y in points)))
+    (track,) = true_tracks(Run("walk", truth=tuple(Truth(t, 1, x, y) for t, x, y in points)))
     places, headings = track.at(np.array([2.0, 6.0, 8.5]))
     assert places == pytest.approx([2.0, 4.0 + 2.0j, 4.0 + 4.0j])
     assert headings == pytest.approx([0.0, math.pi / 2, math.pi / 2])
@@ -57,8 +70,7 @@ def test_surveyed_points_are_joined_straight_and_faced():
 
 def test_exact_reports_lead_along_the_truth(there_and_back, monkeypatch):
     monkeypatch.setattr(recorded_team, "TURN_SIGMA_RAD", 0.0)
-    track = true_track(there_and_back)
-    wearers = [Wearer(exact_motions(track), [track]) for _ in range(3)]
+    wearers = [exact_wearer(there_and_back) for _ in range(3)]
     run = make_team(wearers, TeamSettings(seconds=40.0), 4, "test")
     for prior in run.description.priors:
         place, heading = complex(prior.x_m, prior.y_m), prior.heading_rad
@@ -75,8 +87,7 @@ def test_exact_reports_lead_along_the_truth(there_and_back, monkeypatch):
 
 
 def test_ranges_are_those_of_the_truth_and_walls_lose_and_lengthen_them(there_and_back):
-    track = true_track(there_and_back)
-    wearers = [Wearer(exact_motions(track), [track]) for _ in range(4)]
+    wearers = [exact_wearer(there_and_back) for _ in range(4)]
     errors, counts = [], []
     for walls in (0, 1):
         run = make_team(wearers, TeamSettings(seconds=300.0, area_m=30.0, walls=walls), 2, "test")

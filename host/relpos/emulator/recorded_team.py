@@ -14,7 +14,7 @@ import numpy as np
 from relpos.errors import DataError
 from relpos.runs import Run, load_run
 from relpos.runs.imu import ImuRecording
-from relpos.simulation.recorded_team import Wearer, make_team, settings_of, true_track
+from relpos.simulation.recorded_team import Wearer, make_team, settings_of, true_tracks
 
 from .deadreckoning import WearerSettings, leg_length_m, play
 from .surroundings import FloatArray
@@ -108,7 +108,7 @@ def record_team(
         runs = runs_of(wearer)
         # Wearers begin with different recordings, or two of the same folder would walk alike.
         runs = runs[number % len(runs) :] + runs[: number % len(runs)]
-        tracks, recordings = [true_track(run) for run in runs], []
+        tracks, recordings = [true_tracks(run) for run in runs], []
         for run in runs:
             nodes = list(run.load_imu().values())
             if len(nodes) != 1:
@@ -117,7 +117,9 @@ def record_team(
         mission, placed = one_mission(recordings, settings.seconds)
         leg_m = leg_length_m(runs[0], next(iter(runs[0].load_imu())))
         motions = play(1, mission, WearerSettings(leg_m)).motions
-        team.append(Wearer(motions, [tracks[k].later(shift_s) for k, shift_s in placed]))
+        team.append(
+            Wearer(motions, [track.later(shift_s) for k, shift_s in placed for track in tracks[k]])
+        )
     chosen = "".join(f" --set {key}={value}" for key, value in (overrides or {}).items())
     source = f"relpos simulate --recordings {' '.join(wearers)} --seed {seed}{chosen}"
     return make_team(team, settings, seed, source)

@@ -35,7 +35,7 @@ TURNING_ROUND_S = 1.5
 """Who has walked there and back begins to turn round again so long before the trial's end."""
 PAUSE_S = 2.0
 TURN_SIGMA_RAD = math.radians(3.0)
-"""Error of a drawn turn on the spot (median U-turn of docs/walkers.md: 2 degrees)."""
+"""Error of a drawn turn on the spot (U-turns of docs/walkers.md: 2 degrees in the middle)."""
 START_M, START_RAD = 0.3, math.radians(10.0)
 """How well a start is known: a first leg between surveyed points says the heading to 12 degrees."""
 
@@ -96,14 +96,15 @@ class Wearer:
     tracks: Sequence[Track]
 
 
-def true_track(run: Run) -> Track:
-    """The true track of a recording with one wearer.
+def true_tracks(run: Run) -> list[Track]:
+    """The true tracks of a recording with one wearer.
 
     From surveyed points or a track, from a walk there and back (``uturn_start``), or from a
-    straight bout; distance follows the foot contacts. DataError where nothing says the track.
+    straight bout; distance follows the foot contacts. How wide a turn was nobody measured: there
+    and back are two tracks. DataError where nothing says the track.
     """
     if len(run.truth) > 1:
-        return _through([(t.time_s, complex(t.x_m, t.y_m)) for t in run.truth])
+        return [_through([(t.time_s, complex(t.x_m, t.y_m)) for t in run.truth])]
     times = {name: [e.time_s for e in run.events if e.event == name] for name in _MARKS}
     length_m = run.description.true_distance_m
     if times["uturn_start"] and length_m is not None:
@@ -111,16 +112,10 @@ def true_track(run: Run) -> Track:
         turn = times["uturn_start"][0], times["uturn_end"][0]
         there = _leg(begin, turn[0], times["foot_contact"], 0.5 * length_m)
         back = _leg(turn[1], end, times["foot_contact"], 0.5 * length_m)
-        far = there[-1][1]
-        points = [*there, *((t, far - place) for t, place in back)]
-        heading = np.interp([t for t, _ in points], turn, (0.0, _turn_sense(run, *turn) * math.pi))
-        time_s = np.array([t for t, _ in points])
-        whole = Track(time_s, np.array([place for _, place in points]), heading)
-        return whole.until(end - TURNING_ROUND_S)
+        return [there, back.until(end - TURNING_ROUND_S)]
     if len(times["bout_start"]) == len(times["bout_end"]) == 1 and length_m is not None:
-        points = _leg(times["bout_start"][0], times["bout_end"][0], times["foot_contact"], length_m)
-        time_s = np.array([t for t, _ in points])
-        return Track(time_s, np.array([p for _, p in points]), np.zeros(len(points)))
+        bout = times["bout_start"][0], times["bout_end"][0]
+        return [_leg(*bout, times["foot_contact"], length_m)]
     raise DataError(
         f"{run.name}: nothing says the track: a recording for a team needs truth.csv, a walk there "
         "and back (trial_start, uturn_start, uturn_end, trial_end) or one straight bout, and "
@@ -133,13 +128,18 @@ _MARKS = (
 )  # fmt: skip
 
 
-def _leg(
-    begin_s: float, end_s: float, contacts_s: Sequence[float], length_m: float
-) -> list[tuple[float, complex]]:
-    """Times and places of a straight leg, each contact as far as the one before."""
-    inside = sorted({t for t in contacts_s if begin_s < t < end_s})
-    times = [begin_s, *inside, end_s]
-    return [(t, complex(length_m * k / (len(times) - 1))) for k, t in enumerate(times)]
+def _leg(begin_s: float, end_s: float, contacts_s: Sequence[float], length_m: float) -> Track:
+    """The track of a straight leg: every step as long as the next.
+
+    The part before the first contact brings the body over half a step, from above both feet to
+    between them; a shorter part, such as that before a turn, counts by its duration.
+    """
+    times = [begin_s, *sorted({t for t in contacts_s if begin_s < t < end_s}), end_s]
+    parts_s = np.diff(times)
+    steps = np.minimum(parts_s / np.median(parts_s), 1.0)
+    steps[0] = min(steps[0], 0.5)
+    places = length_m * np.r_[0.0, np.cumsum(steps)] / steps.sum()
+    return Track(np.array(times), places.astype(complex), np.zeros(len(times)))
 
 
 def _through(points: Sequence[tuple[float, complex]]) -> Track:
@@ -161,14 +161,6 @@ def _through(points: Sequence[tuple[float, complex]]) -> Track:
     every = np.union1d(time_s, knots_s)
     x, y = (np.interp(every, time_s, part) for part in (place_m.real, place_m.imag))
     return Track(every, x + 1j * y, np.interp(every, knots_s, knots))
-
-
-def _turn_sense(run: Run, begin_s: float, end_s: float) -> float:
-    """1 where the wearer turned left, by the gyroscope about the mean force; else -1."""
-    (imu,) = run.load_imu().values()
-    inside = (imu.time_s >= begin_s) & (imu.time_s <= end_s)
-    up = imu.acceleration_m_s2[inside].mean(axis=0)
-    return math.copysign(1.0, float((imu.angular_rate_rad_s[inside] @ up).sum()))
 
 
 # --- a wearer's mission --------------------------------------------------------------------------
