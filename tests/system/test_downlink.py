@@ -8,7 +8,7 @@ from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link.led_orders import LED_HEALTH, LED_ON, LedOrders
 from relpos.link.orders import ATTEMPTS
 from relpos.link.port import Link
-from relpos.link.step_scale import KNOWN_WELL, StepScaleSender
+from relpos.link.step_scale import IMPOSSIBLE, KNOWN_WELL, StepScaleSender
 from relpos.measurements import Motion
 from relpos.protocol import messages as wire
 from relpos.simulation.team import SCENARIOS
@@ -58,26 +58,31 @@ def test_who_is_called_out_has_the_led_on_until_nobody_calls():
 
 
 def _led(conversation, node, until_s):
-    """A node's LED setting: what it answers to a value out of range is the one in force."""
+    return _in_force(conversation, node, (wire.CommandCode.SET_LED, 99), until_s)
+
+
+def _in_force(conversation, node, order, until_s):
+    """A node's setting: what it answers to a value out of range is the one in force."""
     answers = []
-    sender, conversation.sender = conversation.sender, Asking(conversation.link, node, answers)
+    asking = Asking(conversation.link, node, order, answers)
+    sender, conversation.sender = conversation.sender, asking
     conversation.run(until_s)
     conversation.sender = sender
     return answers[-1].value
 
 
 class Asking:
-    """Asks a node again and again for its LED setting."""
+    """Gives a node an order again and again."""
 
-    def __init__(self, link, node, answers):
-        self.link, self.node, self.answers = link, node, answers
+    def __init__(self, link, node, order, answers):
+        self.link, self.node, self.order, self.answers = link, node, order, answers
         self.next_s, self.tokens = 0.0, set()
 
     def due(self, now_s):
         if now_s < self.next_s:
             return b""
         self.next_s = now_s + 1.0
-        token, data = self.link.command(self.node, wire.CommandCode.SET_LED, 99)
+        token, data = self.link.command(self.node, *self.order)
         self.tokens.add(token)
         return data
 
@@ -99,12 +104,14 @@ def test_a_learned_scale_becomes_the_nodes_gain_and_a_new_gain_version(conversat
     conversation.run(8.0)
     (remark,) = conversation.sender.remarks
     assert remark == (
-        "node 1: steps were counted 9 % too short and are right now, by the measured ranges "
-        "(step gain 2.354); nothing to do"
-    ), "2.140 in a new node"
+        "node 1: steps were counted 9 % too short and are right now, by the measured ranges; "
+        "nothing to do"
+    )
     assert conversation.sender.sent == 1
     assert conversation.motions[1].gain_version == (before + 1) % 256
     assert conversation.motions[2].gain_version == before
+    order = (wire.CommandCode.SET_STEP_GAIN_PERMILLE, IMPOSSIBLE)
+    assert _in_force(conversation, 1, order, 12.0) == 2354, "2140 in a new node"
 
 
 @pytest.mark.parametrize(

@@ -158,6 +158,24 @@ def test_twenty_people_are_visible_at_once_beside_a_map_of_half_the_laptops_scre
         expect(people.nth(k)).to_be_in_viewport(ratio=1)
 
 
+def test_eleven_alarms_leave_a_phone_half_its_map_and_say_how_many_they_are(
+    visit: Any, stage: Stage
+) -> None:
+    stage.team = WalkingTeam(size=20)
+    stage.team.still_since = dict.fromkeys(range(1, 12), stage.at_s - 52.0)
+    page = visit(viewport={"width": 390, "height": 844})
+    wait_live(page)
+    count = page.get_by_text("11 open")
+    expect(count).to_be_in_viewport(ratio=1)
+    expect(page.locator("#alarms .rows .alarm").first).to_be_in_viewport(ratio=1)
+    assert page.locator("#map").bounding_box()["height"] >= 0.5 * 844
+    stage.mute = True
+    banner = page.locator(".link")
+    expect(banner).to_be_visible()
+    assert banner.bounding_box()["height"] <= 0.15 * 844
+    expect(count).to_be_in_viewport(ratio=1)
+
+
 @pytest.mark.parametrize("size", [6, 20])
 def test_the_map_keeps_three_fifths_of_a_phone_with_three_alarms_open(
     visit: Any, stage: Stage, size: int

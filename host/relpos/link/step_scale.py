@@ -86,10 +86,9 @@ class StepScaleSender:
                 Said(
                     "steps-right",
                     "node {node}: steps were counted {off} and are right now, by the measured "
-                    "ranges (step gain {gain:.3f}); nothing to do",
+                    "ranges; nothing to do",
                     node=str(answer.node),
                     off=off,
-                    gain=value / 1000,
                 )
             )
         else:
