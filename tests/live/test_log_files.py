@@ -17,6 +17,8 @@ from relpos.errors import DataError
 from relpos.fusion.estimator import NodeStatus
 from relpos.live.log_files import write_kml
 from relpos.live.team_view import LogEntry
+from relpos.measurements import Event
+from relpos.recording.player import History
 from relpos.runs import Description
 from relpos.runs.log import LOG_COLUMNS, read_log
 
@@ -61,6 +63,15 @@ def test_the_log_of_a_replay_is_written_by_its_suffix_with_places_by_a_pin(
     # x points east: 100 m there are 100 / (111.32 km cos 48 deg) degrees.
     assert latitude == pytest.approx(48.0, abs=1e-5)
     assert longitude == pytest.approx(11.0 + 100.0 / 74625.0, abs=1e-5)
+
+
+def test_what_is_true_of_a_simulated_walker_is_no_landmark_in_its_log() -> None:
+    marks = [Event(0.0, 1, "episode", "up"), Event(2.0, 1, "landmark", "7")]
+    rows = [(mark.time_s, mark) for mark in marks]
+    moments = SimpleNamespace(started_unix_s=0.0, from_s=0.0, to_s=3.0, rows=lambda *_: rows)
+    history = History()
+    history.read(moments, {1: "Ben"}, ())  # type: ignore[arg-type]
+    assert [entry.text for entry in history.events] == ["Ben is at landmark 7"]
 
 
 def test_a_shown_session_on_a_port_ends_with_its_debrief_page_and_log(

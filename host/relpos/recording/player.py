@@ -36,6 +36,7 @@ from relpos.live.team_view import (
 from relpos.live.tracks import Tracks
 from relpos.measurements import Event, Motion, Range, Status
 from relpos.recording.moments import BACK_S, Moments
+from relpos.runs.landmarks import PRESS
 from relpos.said import Said, refusal, said_of
 
 SHOW_S = 0.2
@@ -91,7 +92,8 @@ class History:
         ticked_s = -math.inf
         for time_s, row in moments.rows(moments.from_s, moments.to_s, *kinds):
             if isinstance(row, Event):
-                if not known:
+                # Of a simulated run: what is true (episodes, foot contacts) is no news.
+                if row.event == PRESS and not known:
                     words = AT_LANDMARK.filled(name=name(row.node), landmark=row.value)
                     note(time_s, "landmark", words, row.node)
                 continue
