@@ -18,7 +18,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from relpos.simulation.spectral import Grid, slow_noise
 from relpos.simulation.torso import (
@@ -92,7 +92,7 @@ def _track(rng: np.random.Generator, route: Route, path_m: FloatArray) -> _Track
     span = max(float(path_m[-1]), 1.0) + 4.0
     side_s = np.arange(-2.0, span + 2.0, 0.25)
     aside = slow_noise(rng, side_s, 0.06, 3.0) * (1.0 - np.exp(-((np.maximum(side_s, 0) / 3) ** 2)))
-    spline = CubicSpline(side_s, aside)
+    spline = scipy.interpolate.CubicSpline(side_s, aside)
     centre, bearing = route.at(path_m)
     slope = np.asarray(spline(path_m, 1), dtype=np.float64)
     return _Track(centre, bearing, np.asarray(spline(path_m), dtype=np.float64), np.arctan(slope))

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy import fft  # scipy's differs in the last digits from 1.17 to 1.18: no walk is the same
-from scipy.fft import next_fast_len
-from scipy.interpolate import CubicSpline
 
 from relpos.simulation.walker import RATE_HZ
 from relpos.simulation.world import FloatArray
@@ -123,7 +122,7 @@ def make_grid(seconds: float) -> Grid:
     """Grid for ``seconds`` from time zero."""
     count = math.floor(seconds * RATE_HZ + 1e-9) + 1
     pad = round(PAD_S * RATE_HZ)
-    total = next_fast_len(count + 2 * pad, real=True)
+    total = scipy.fft.next_fast_len(count + 2 * pad, real=True)
     return Grid((np.arange(total) - pad) / RATE_HZ, pad, count, Spectral(total, pad))
 
 
@@ -148,5 +147,7 @@ def slow_noise(
             knots[i - warm] = slow
     # Variance of the cascade driven by unit white noise.
     gain = (1 - decay) ** 4 * (1 + decay**2) / (1 - decay**2) ** 3
-    spline = CubicSpline(first + knot_s * np.arange(count), knots * (sd / math.sqrt(gain)))
+    spline = scipy.interpolate.CubicSpline(
+        first + knot_s * np.arange(count), knots * (sd / math.sqrt(gain))
+    )
     return np.asarray(spline(time_s), dtype=np.float64)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from relpos.simulation.spectral import Grid, Spectral, slow_noise
 from relpos.simulation.walker import RATE_HZ, StepTruth
@@ -206,7 +206,7 @@ def field_along(world: World, position_m: FloatArray) -> FloatArray:
     index = np.arange(0, len(position_m) + 9, 10)
     index[-1] = len(position_m) - 1
     index = np.unique(np.minimum(index, len(position_m) - 1))
-    spline = CubicSpline(index, world.magnetic.field_ut(position_m[index]))
+    spline = scipy.interpolate.CubicSpline(index, world.magnetic.field_ut(position_m[index]))
     return np.asarray(spline(np.arange(len(position_m))), dtype=np.float64)
 
 

@@ -7,12 +7,15 @@ worn and turned about the vertical in steps of 45 degrees, where a heading can b
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from relpos.simulation.walker import RATE_HZ, StepTruth, WalkerTruth, make_person
 from relpos.simulation.world import GRAVITY_M_S2, FloatArray, World
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 TURNTABLE = "turntable"
 LYING_S = 12.0
@@ -41,6 +44,8 @@ WORN = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
 
 def _script(seconds: float, rng: np.random.Generator) -> list[tuple[float, float, Rotation, bool]]:
     """(duration of the turn, of the rest behind it, attitude then, in the hands?) in order."""
+    from scipy.spatial.transform import Rotation
+
     tilt = Rotation.from_rotvec(0.03 * rng.standard_normal(3))
     moves = [(0.0, LYING_S, tilt, False)]
 
@@ -75,6 +80,8 @@ def turn_by_hand(node: int, seconds: float, seed: int, world: World) -> WalkerTr
     agree exactly. The node is not carried anywhere: its position stays, but for the hands'
     trembling, which is in the specific force alone (some millimetres).
     """
+    from scipy.spatial.transform import Rotation
+
     rng = np.random.default_rng([seed, node, 0x7AB])
     person = make_person(rng, (1.0, 1.0), 0.0)
     n = math.ceil(seconds * RATE_HZ) + 1

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from relpos.errors import DataError
 from relpos.simulation.world import FloatArray
@@ -172,14 +172,14 @@ class Route:
         first = corners_m[0] + self._initial_m * np.array(
             [math.cos(direction[0]), math.sin(direction[0])]
         )
-        spline = CubicSpline(s, heading)
+        spline = scipy.interpolate.CubicSpline(s, heading)
         # Three-point Gauss between the nodes: exact far below the strapdown test's bound.
         mid, half = (s[1:] + s[:-1]) / 2, (s[1:] - s[:-1]) / 2
         integral = np.zeros(len(s) - 1, dtype=np.complex128)
         for node, weight in ((-math.sqrt(0.6), 5 / 9), (0.0, 8 / 9), (math.sqrt(0.6), 5 / 9)):
             integral += weight * half * np.exp(1j * spline(mid + node * half))
         place = np.concatenate([[0.0], np.cumsum(integral)])
-        self._table = CubicSpline(
+        self._table = scipy.interpolate.CubicSpline(
             s, np.column_stack([first[0] + place.real, first[1] + place.imag, heading])
         )
         self._s, self._bend = s, bend
