@@ -70,6 +70,14 @@ test("no line crosses the map where somebody was lost and found elsewhere", () =
   equal(track.points.map((p) => p[3]), [true, false, true, false, false]);
 });
 
+test("a track of hours, thinned to a point every sixteen seconds, is restored as a line", () => {
+  const track = new Track();
+  track.restore(Array.from({ length: 1000 }, (_, k) => [16 * k, 12 * k, 0]));
+  equal(track.points.filter((p) => p[3]).length, 1);
+  track.add(16 * 999 + 40, 12 * 999 + 30, 0);
+  ok(track.points.at(-1)[3], "who is lost now is still lost");
+});
+
 test("hours of walking stay bounded and keep their newest part whole", () => {
   const track = new Track();
   for (let k = 0; k < 20000; k += 1) track.add(k, k, 0);

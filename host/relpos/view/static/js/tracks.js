@@ -18,11 +18,13 @@ export class Track {
   restore(points) {
     this.points = [];
     this.redrawn += 1;
-    for (const [t, x, y] of points) this.add(t, x, y);
+    // Those of hours are thinned: they lie far apart without anybody having been lost.
+    const apartS = points.length > 1 ? (points.at(-1)[0] - points[0][0]) / (points.length - 1) : 0;
+    for (const [t, x, y] of points) this.add(t, x, y, Math.max(GAP_S, 3 * apartS));
   }
 
-  /** Go on to a point; false where it is too near to be one. */
-  add(t, x, y) {
+  /** Go on to a point; false where it is too near to be one. Who is not heard for `gapS` was lost. */
+  add(t, x, y, gapS = GAP_S) {
     if (!Number.isFinite(x) || !Number.isFinite(y)) return false;
     const last = this.points[this.points.length - 1];
     let starts = true;
@@ -32,7 +34,7 @@ export class Track {
       if (step < MIN_STEP_M) return false;
       // Nobody knows the path of somebody who was lost meanwhile: no line is drawn across the map.
       const passed = t - last[0];
-      starts = step > (passed > GAP_S ? MIN_JUMP_M : Math.max(MIN_JUMP_M, FASTEST_M_S * passed));
+      starts = step > (passed > gapS ? MIN_JUMP_M : Math.max(MIN_JUMP_M, FASTEST_M_S * passed));
     }
     this.points.push([t, x, y, starts]);
     if (this.points.length > MAX_POINTS) this.thin();
