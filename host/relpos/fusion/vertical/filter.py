@@ -421,10 +421,9 @@ class VerticalFilter:
         self._settled &= ~unseen
         walks = (moving > 0.5) | (one.reported.steps > STANDS_STEPS)
         others_m = (disturbed * one.rise_m).sum() / np.maximum((1.0 - moving).sum(), 1.0)
-        if len(moving) > MANY:
-            # All climb together, or a fan blows while all walk.
-            alike_m = float(np.median(one.rise_m))
-            others_m = np.where(np.abs(alike_m) > np.abs(others_m), alike_m, others_m)
+        # All others climb together, or a fan blows while they walk.
+        alike_m = np.nan_to_num(one.reported.common_m)
+        others_m = np.where(np.abs(alike_m) > np.abs(others_m), alike_m, others_m)
         pressed_m = pressed_m + disturbed * one.rise_m
         self._doubt_m *= np.where(self._settled, math.exp(-duration_s / FAST_S), 1.0)
         self._doubt_m += _doubted_m(moving, one.rise_m, pressed_m - walks * others_m)
