@@ -117,13 +117,14 @@ def update(
 def common_terms(
     x: Floats, p: Floats, nodes: int, first: int, second: int, velocity: Floats, dz: float = 0.0
 ) -> Floats:
-    """Slope (D,) of bias, shadow, lateness and clocks, before the pairs' biases, of a range.
+    """Slope (D,) of what ranges have in common, before the pairs' biases, of a range.
 
     ``velocity`` (2, 2) is forward and left of the first and of the second.
     """
     i, j, common = PER_NODE * first, PER_NODE * second, PER_NODE * nodes
     off = x[j : j + 2] - x[i : i + 2]
-    sight = off / predict_range(x, p, first, second, dz)[0]
+    distance = predict_range(x, p, first, second, dz)[0]
+    sight = off / distance
     ahead = [np.array([np.cos(h), np.sin(h)]) for h in (x[i + HEADING], x[j + HEADING])]
     moving = [
         v[0] * a + v[1] * np.array([-a[1], a[0]]) for v, a in zip(velocity, ahead, strict=True)
@@ -132,8 +133,9 @@ def common_terms(
     slope[common] = 1.0
     slope[common + 1] = max(-sight @ ahead[0], 0.0) + max(sight @ ahead[1], 0.0)
     slope[common + 2] = -sight @ (moving[1] - moving[0])
-    slope[common + 3 + first] = -sight @ moving[1]
-    slope[common + 3 + second] = sight @ moving[1]
+    slope[common + 3] = np.log(max(distance, 1.0) / 5.0)
+    slope[common + 4 + first] = -sight @ moving[1]
+    slope[common + 4 + second] = sight @ moving[1]
     return slope
 
 

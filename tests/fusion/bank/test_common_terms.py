@@ -1,21 +1,23 @@
-"""What ranges have in common: bias, body shadow, lateness and clocks."""
+"""What ranges have in common: bias, body shadow, lateness, growth and clocks."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 
 import relpos
 from reference import joint as reference
+from relpos import tracks
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import COMMON, PER_NODE, CommonIndex
 from relpos.fusion.clocks import LEAST_S, SLEW, Clocks
 from relpos.fusion.estimator import Estimate, Parameter, time_offsets
 from relpos.fusion.models.ranging import OUTLIERS_SHORT
-from relpos.measurements import Motion, Range
+from relpos.measurements import Measurement, Motion, Range
 
 NODES = 3
 
@@ -81,9 +83,9 @@ def test_a_new_node_and_a_new_pair_keep_what_is_known_of_the_others() -> None:
     these.store(x, p)
     core.add_node((9.0, 0.0, 0.0), 0.1, 0.1)
     x, _ = these.dense()
-    assert x[0, PER_NODE * 3 : PER_NODE * 3 + COMMON].tolist() == [0.0, 1.0, 2.0]
-    assert [x[0, these.clock_entry(row)] for row in range(3)] == [3.0, 4.0, 0.0]
-    assert x[0, these.biases[0, 1]] == 5.0
+    assert x[0, PER_NODE * 3 : PER_NODE * 3 + COMMON].tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert [x[0, these.clock_entry(row)] for row in range(3)] == [4.0, 5.0, 0.0]
+    assert x[0, these.biases[0, 1]] == 6.0
 
 
 @pytest.mark.parametrize(
@@ -105,6 +107,30 @@ def test_what_ranges_have_in_common_is_learned_within_a_tenth(
     assert learned[name, node] == pytest.approx(value, rel=0.1)
     metrics = relpos.evaluate(result, run, bound=False).metrics
     assert metrics.relative_distance_rmse_m < 0.22
+
+
+@pytest.mark.parametrize(("smooth", "distance_m"), [(False, 0.16), (True, 0.10)])
+def test_ranges_that_grow_with_the_logarithm_of_the_distance_make_no_distance_longer(
+    smooth: bool, distance_m: float
+) -> None:
+    run = relpos.simulate("mission-base", 75, seconds=200)
+    truth = tracks.true_tracks(run.truth)
+
+    def place(node: int, time_s: float) -> list[float]:
+        own = truth[node]
+        return [float(np.interp(time_s, own.time_s, axis)) for axis in (own.x_m, own.y_m)]
+
+    def grown(m: Measurement) -> Measurement:
+        if not isinstance(m, Range) or m.range_m <= 0.0:
+            return m
+        true_m = math.dist(place(m.node, m.time_s), place(m.peer, m.time_s))
+        return dataclasses.replace(m, range_m=m.range_m + 0.2 * math.log(max(true_m, 1.0) / 5.0))
+
+    off = dataclasses.replace(run, measurements=[grown(m) for m in run.measurements])
+    metrics = relpos.evaluate(relpos.fuse(off, smooth=smooth), run, bound=False).metrics
+    assert metrics.relative_distance_rmse_m < distance_m
+    assert metrics.nees_distance is not None
+    assert 0.5 < metrics.nees_distance < 1.6
 
 
 def test_where_nothing_is_off_nothing_is_learned_and_nothing_told() -> None:
@@ -147,5 +173,5 @@ def test_the_shared_entries_are_named_in_their_order() -> None:
     core = BankCore(BankSettings(hypotheses=8), 3)
     core.add_node((0.0, 0.0, 0.0), 0.1, 0.1)
     these = core.hypotheses
-    assert [these.common_entry(index) for index in CommonIndex] == [5, 6, 7]
-    assert these.clock_entry(0) == 8
+    assert [these.common_entry(index) for index in CommonIndex] == [5, 6, 7, 8]
+    assert these.clock_entry(0) == 9

@@ -18,6 +18,7 @@ from relpos.fusion.bank.storage import COMMON, PER_NODE, CommonIndex, Hypotheses
 from relpos.fusion.bank.variance_components import Draws, VarianceComponents
 from relpos.fusion.models.motion_variances import COMPONENTS
 from relpos.fusion.models.odometry_faults import JUMP_M
+from relpos.fusion.models.ranging import GROWTH_SD_M
 from relpos.fusion.resampling import systematic
 
 Floats = npt.NDArray[np.float64]
@@ -61,7 +62,7 @@ JITTER = 0.1
 class HypothesisSet:
     """K weighted hypotheses about N users, as arrays that kernels work on.
 
-    Users are *rows* 0 ... N-1 in the order of ``add_node``. The state has D = 6 N + 3 + pairs
+    Users are *rows* 0 ... N-1 in the order of ``add_node``. The state has D = 6 N + 4 + pairs
     entries: five a user (:class:`~relpos.fusion.bank.storage.StateIndex`), what ranges have in
     common (:class:`~relpos.fusion.bank.storage.CommonIndex`), each user's clock offset, and the
     range bias of each pair when it is first ranged.
@@ -384,6 +385,7 @@ class HypothesisSet:
         """Let hypotheses ``which`` (M,) of those with biases have what ranges have in common."""
         priors = {self.common_entry(CommonIndex.SHADOW): SHADOW_SD_M}
         priors[self.common_entry(CommonIndex.LATENESS)] = LATENESS_SD_S
+        priors[self.common_entry(CommonIndex.GROWTH)] = GROWTH_SD_M
         priors |= {self.clock_entry(row): CLOCK_SD_S for row in range(self.nodes)}
         block, lane = self._at(which)
         p, has = self.arrays.p, self.has_bias[which]

@@ -13,7 +13,7 @@ What many ranges have in common enters to first order. With the direction u from
 second, the velocities v and the headings n (a body shadows who is behind it)
 
     E rho = m + bias + shadow (max(-u n_i, 0) + max(u n_j, 0)) - lateness u (v_j - v_i)
-              - (clock_i - clock_j) u v_j
+              - (clock_i - clock_j) u v_j + growth log(m / 5 m)
 
 as the first, whose clock dates the range, sees the second where it was when that clock was right.
 Reference implementation: :mod:`reference.joint`.
@@ -42,7 +42,12 @@ from relpos.fusion.bank.storage import (
     row_place,
 )
 from relpos.fusion.compiled import compiled, inner
-from relpos.fusion.models.ranging import AGAIN_M, OUTLIERS_SHORT
+from relpos.fusion.models.ranging import (
+    AGAIN_M,
+    GROWTH_LEAST_M,
+    GROWTH_USUAL_M,
+    OUTLIERS_SHORT,
+)
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -239,16 +244,16 @@ def _share_inlier(
 @inner
 def _common_terms(
     block: Block, users: tuple[int, int, int], velocity: Floats,
-    sight: tuple[Lanes, Lanes, Lanes], slope: Floats, entry: Indices,
+    sight: tuple[Lanes, Lanes, Lanes, Lanes], slope: Floats, entry: Indices,
 ) -> None:  # fmt: skip
-    """Write the entries of what ranges have in common, and a range's slopes in them (5 lines).
+    """Write the entries of what ranges have in common, and a range's slopes in them (6 lines).
 
     ``users`` are N and the two rows, ``velocity`` (4,) theirs as in :class:`Ranges`; ``sight`` is
-    the direction gx, gy and whether they are apart: no range is negative, so that between two who
-    stand together noise alone looks like a bias, and nothing is added there.
+    the direction gx, gy, the distance, and whether they are apart: no range is negative, so that
+    between two who stand together noise alone looks like a bias, and nothing is added there.
     """
     nodes, first, second = users
-    ux, uy, seen = sight
+    ux, uy, distance, seen = sight
     ux, uy = seen * ux, seen * uy
     ci, si = lanes.cos_sin(load(block.x, block.at_x + POSE * first + 2))
     cj, sj = lanes.cos_sin(load(block.x, block.at_x + POSE * second + 2))
@@ -266,6 +271,9 @@ def _common_terms(
     store(slope, 3, nought - peer)
     entry[4] = common + COMMON + second
     store(slope, 4, peer)
+    entry[5] = common + CommonIndex.GROWTH
+    far = greater(distance, fill(GROWTH_LEAST_M)) * (1.0 / GROWTH_USUAL_M)
+    store(slope, 5, seen * lanes.log(far))
 
 
 @inner
@@ -326,7 +334,7 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
     x, p, log_weight = hypotheses.x, hypotheses.p, hypotheses.log_weight
     blocks, nodes = x.shape[0], hypotheses.sensitivity.shape[1]
     g, off = lanes.working_lines(x.shape[1]), lanes.working_lines(2 * x.shape[1])
-    slope, entry = lanes.working_lines(6), np.empty(6, dtype=np.int64)
+    slope, entry = lanes.working_lines(7), np.empty(7, dtype=np.int64)
     own = PER_NODE * nodes + COMMON + nodes
     for b in range(blocks):
         block = block_of(x, p, b, nodes)
@@ -358,15 +366,15 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
             innovation = ranges.range_m[r] - m
             if biased and ranges.bias[r] >= 0:
                 seen = select(m * m > FAR * variance, fill(1.0), fill(0.0))
-                users, sight = (nodes, first, second), (gx, gy, seen)
+                users, sight = (nodes, first, second), (gx, gy, m, seen)
                 entry[0] = ranges.bias[r]
                 _common_terms(block, users, ranges.velocity_m_s[r], sight, slope, entry)
-                terms = 5
+                terms = 6
                 if heights_here:
                     # m^2 is linear in the square of the height: its slope is that of the chord.
                     chord = has_heights / (m + greater(fill(ranges.range_m[r]), fill(0.0)))
-                    entry[5], terms = PER_NODE * nodes + CommonIndex.BIAS, 6
-                    store(slope, 5, has_heights * seen)
+                    entry[6], terms = PER_NODE * nodes + CommonIndex.BIAS, 7
+                    store(slope, 6, has_heights * seen)
                     store(slope, 0, chord + (1.0 - has_heights) * seen)
                     # What the mean has of it is in m.
                     innovation = innovation + chord * lifted

@@ -46,12 +46,14 @@ class CommonIndex(IntEnum):
     """The team's entries after the users', before their clock offsets.
 
     ``BIAS`` (m) lengthens every range, ``SHADOW`` (m) those that pass through a body, ``LATENESS``
-    (s) is by how much ranges are dated late.
+    (s) is by how much ranges are dated late, ``GROWTH`` (m) by how much they grow with distance
+    (:func:`~relpos.fusion.models.ranging.growth_slope`).
     """
 
     BIAS = 0
     SHADOW = 1
     LATENESS = 2
+    GROWTH = 3
 
 
 COMMON = len(CommonIndex)

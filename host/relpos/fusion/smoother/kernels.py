@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.compiled import compiled
+from relpos.fusion.models.ranging import GROWTH_LEAST_M, growth_slope
 from relpos.fusion.smoother.block_solver import Covariance, Equations
 from relpos.fusion.smoother.graph import Chords, Ranges
 
@@ -25,8 +26,8 @@ class State(NamedTuple):
     poses: Floats
     """(K, N, 3): x, y (m), unwrapped heading (rad)."""
     constants: Floats
-    """(2 N + 1 + P,): each node's log of true over reported length, each node's heading drift
-    (rad/s), the common range bias, each pair's own bias (m)."""
+    """(2 N + P + 2,): each node's log of true over reported length, each node's heading drift
+    (rad/s), the common range bias, each pair's own bias (m), the ranges' growth (m)."""
 
 
 @compiled
@@ -160,15 +161,28 @@ def add_component_columns(
                 corner[nodes + i, column] += f * j[a, 7]
 
 
-@compiled
-def _range_derivative(state: State, ranges: Ranges, m: int, row: Floats) -> float:
-    """Distance of range m without biases; its derivative goes into ``row`` (12).
+class _Slopes(NamedTuple):
+    """Derivatives of one predicted range."""
 
-    Order: node i before (x, y, h), i after, j before, j after.
-    """
-    poses, slot, dz_m = state.poses, ranges.chord[m], ranges.dz_m[m]
+    row: Floats
+    """(12,) by the poses of node i before (x, y, h), i after, j before, j after."""
+    entry: Integers
+    constant: Floats
+    """(3,) constants, and the derivatives by them: common bias, the pair's, growth."""
+
+
+@compiled
+def _no_slopes() -> _Slopes:
+    return _Slopes(np.zeros(12), np.zeros(3, dtype=np.int64), np.zeros(3))
+
+
+@compiled
+def _predict_range(state: State, ranges: Ranges, m: int, slopes: _Slopes) -> float:
+    """Return range m as predicted and fill its derivatives; without a pair none by constants."""
+    poses, constants, slot, dz_m = state.poses, state.constants, ranges.chord[m], ranges.dz_m[m]
     i, j = ranges.pair[m, 0], ranges.pair[m, 1]
     offset, antenna_m = ranges.offset_m[m], ranges.antenna_m
+    row, entry, constant = slopes
     f, g = ranges.fraction[m], 1.0 - ranges.fraction[m]
     x0, y0 = 0.0, 0.0
     for side in range(2):
@@ -198,19 +212,26 @@ def _range_derivative(state: State, ranges: Ranges, m: int, row: Floats) -> floa
         row[at + 5] = sign * (ux * row[at + 3] + uy * row[at + 4])
         row[at], row[at + 1] = sign * g * ux, sign * g * uy
         row[at + 3], row[at + 4] = sign * f * ux, sign * f * uy
-    return distance
+    if ranges.pair_index[m] < 0:
+        return distance
+    common = 2 * poses.shape[1]
+    entry[0], entry[1], entry[2] = common, common + 1 + ranges.pair_index[m], constants.size - 1
+    constant[0], constant[1], constant[2] = 1.0, 1.0, growth_slope(distance)
+    predicted = distance
+    for c in range(3):
+        predicted += constant[c] * constants[entry[c]]
+    if distance > GROWTH_LEAST_M:
+        for p in range(12):
+            row[p] *= 1.0 + constants[entry[2]] / distance
+    return predicted
 
 
 @compiled
 def range_residuals(state: State, ranges: Ranges, measured_m: Floats) -> Floats:
     """Predicted less measured ranges, (M,)."""
-    constants, pair_index, common = state.constants, ranges.pair_index, 2 * state.poses.shape[1]
-    result = np.empty(measured_m.size)
-    row = np.empty(12)
+    result, slopes = np.empty(measured_m.size), _no_slopes()
     for m in range(measured_m.size):
-        result[m] = _range_derivative(state, ranges, m, row) - measured_m[m]
-        if pair_index[m] >= 0:
-            result[m] += constants[common] + constants[common + 1 + pair_index[m]]
+        result[m] = _predict_range(state, ranges, m, slopes) - measured_m[m]
     return result
 
 
@@ -220,18 +241,15 @@ def add_ranges(
 ) -> None:
     """Add the ranges' normal equations; ``weight`` (M,) is 1 / variance."""
     a, e, border, corner, gradient, corner_gradient = equations
-    constants, pairs, pair_index = state.constants, ranges.pair, ranges.pair_index
-    common = 2 * state.poses.shape[1]
-    row = np.empty(12)
+    pairs, slopes = ranges.pair, _no_slopes()
+    row, entry, constant = slopes
     for m in range(measured_m.size):
         w = weight[m]
         if w <= 0.0:
             continue
-        k, own = ranges.chord[m], common + 1 + pair_index[m]
-        biased = pair_index[m] >= 0
-        r = _range_derivative(state, ranges, m, row) - measured_m[m]
-        if biased:
-            r += constants[common] + constants[own]
+        k = ranges.chord[m]
+        r = _predict_range(state, ranges, m, slopes) - measured_m[m]
+        modelled = constant.size if ranges.pair_index[m] >= 0 else 0
         for p in range(12):
             value = w * row[p]
             if value == 0.0:
@@ -239,9 +257,8 @@ def add_ranges(
             late_p = (p // 3) % 2
             at_p = 3 * pairs[m, p // 6] + p % 3
             gradient[k + late_p, at_p] += value * r
-            if biased:
-                border[k + late_p, at_p, common] += value
-                border[k + late_p, at_p, own] += value
+            for c in range(modelled):
+                border[k + late_p, at_p, entry[c]] += value * constant[c]
             for q in range(12):
                 late_q = (q // 3) % 2
                 at_q = 3 * pairs[m, q // 6] + q % 3
@@ -249,14 +266,11 @@ def add_ranges(
                     a[k + late_p, at_p, at_q] += value * row[q]
                 elif late_p == 1:
                     e[k, at_p, at_q] += value * row[q]
-        if not biased:
-            continue
-        corner[common, common] += w
-        corner[own, own] += w
-        corner[common, own] += w
-        corner[own, common] += w
-        corner_gradient[common] += w * r
-        corner_gradient[own] += w * r
+        for c in range(modelled):
+            value = w * constant[c]
+            corner_gradient[entry[c]] += value * r
+            for d in range(modelled):
+                corner[entry[c], entry[d]] += value * constant[d]
 
 
 @compiled
@@ -296,14 +310,14 @@ def motion_variances(state: State, chords: Chords, covariance: Covariance) -> Fl
 def range_variances(state: State, ranges: Ranges, covariance: Covariance) -> Floats:
     """Posterior variances (M,) of the predicted ranges, biases included where they have any."""
     diagonal, below, with_constants, constants, _ = covariance
-    pairs, pair_index, common = ranges.pair, ranges.pair_index, 2 * state.poses.shape[1]
+    pairs, slopes = ranges.pair, _no_slopes()
+    row, entry, constant = slopes
     result = np.empty(ranges.chord.size)
-    row = np.empty(12)
     for m in range(ranges.chord.size):
         k = ranges.chord[m]
-        _range_derivative(state, ranges, m, row)
+        _predict_range(state, ranges, m, slopes)
+        modelled = constant.size if ranges.pair_index[m] >= 0 else 0
         total = 0.0
-        own, biased = common + 1 + pair_index[m], pair_index[m] >= 0
         for p in range(12):
             if row[p] == 0.0:
                 continue
@@ -319,12 +333,12 @@ def range_variances(state: State, ranges: Ranges, covariance: Covariance) -> Flo
                     inner += row[q] * below[k, at_p, at_q]
                 else:
                     inner += row[q] * below[k, at_q, at_p]
-            if biased:
-                inner += 2.0 * with_constants[k + late_p, at_p, common]
-                inner += 2.0 * with_constants[k + late_p, at_p, own]
+            for c in range(modelled):
+                inner += 2.0 * constant[c] * with_constants[k + late_p, at_p, entry[c]]
             total += row[p] * inner
-        if biased:
-            total += constants[common, common] + constants[own, own] + 2.0 * constants[common, own]
+        for c in range(modelled):
+            for d in range(modelled):
+                total += constant[c] * constant[d] * constants[entry[c], entry[d]]
         result[m] = total
     return result
 

@@ -58,7 +58,7 @@ class Problem:
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
         self.nodes = len(graph.node_ids)
-        self.constants = 2 * self.nodes + 1 + len(graph.pairs)
+        self.constants = 2 * self.nodes + 2 + len(graph.pairs)
         self.range_m = graph.range_m.copy()
         self.detection = self.no_detection()
 

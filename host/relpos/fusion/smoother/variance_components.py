@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.models.odometry_faults import JUMP_M
-from relpos.fusion.models.ranging import GO_ON, GO_ON_RANGES
+from relpos.fusion.models.ranging import GO_ON, GO_ON_RANGES, GROWTH_SD_M
 from relpos.fusion.smoother import kernels
 from relpos.fusion.smoother.block_solver import Covariance
 from relpos.fusion.smoother.graph import Graph
@@ -60,7 +60,8 @@ FIRST_DRIFT = math.radians(0.05) ** 2
 FIRST_PAIR_BIAS = 0.1**2
 CALIBRATED_BIAS = 0.05**2
 CALIBRATED_PAIR_BIAS = 0.03**2
-"""Of ranges whose antenna delays were calibrated: the common bias, and a pair's (m^2)."""
+CALIBRATED_GROWTH = 0.01**2
+"""Of ranges whose antenna delays were calibrated: the common bias, a pair's, the growth (m^2)."""
 
 
 MOST_GO_ON = 0.98
@@ -82,6 +83,7 @@ class VarianceComponents:
     drift_rad2_s2: float = FIRST_DRIFT
     common_bias_m2: float = 0.3**2
     pair_bias_m2: float = FIRST_PAIR_BIAS
+    growth_m2: float = GROWTH_SD_M**2
     range_inflation: float = 1.0
     """Factor of the ranges' variance because their errors last: (1 + r) / (1 - r) for a correlation
     r of a pair's consecutive errors."""
@@ -98,6 +100,7 @@ class VarianceComponents:
         result = cls(np.tile(FIRST_MOTION, (nodes, 1)), calibrated=calibrated, to_scale=to_scale)
         if calibrated:
             result.common_bias_m2, result.pair_bias_m2 = CALIBRATED_BIAS, CALIBRATED_PAIR_BIAS
+            result.growth_m2 = CALIBRATED_GROWTH
         if to_scale:
             result.scale = CALIBRATED_SCALE
         return result
@@ -125,6 +128,7 @@ class VarianceComponents:
                 np.full(n, self.drift_rad2_s2),
                 [self.common_bias_m2],
                 np.full(len(problem.graph.pairs), self.pair_bias_m2),
+                [self.growth_m2],
             )
         )
 
@@ -335,9 +339,7 @@ def update_components(
     first_bias = CALIBRATED_PAIR_BIAS if components.calibrated else FIRST_PAIR_BIAS
     components.scale = fixed_point(components.scale, slice(0, n), first_scale)
     components.drift_rad2_s2 = fixed_point(components.drift_rad2_s2, slice(n, 2 * n), FIRST_DRIFT)
-    components.pair_bias_m2 = fixed_point(
-        components.pair_bias_m2, slice(2 * n + 1, None), first_bias
-    )
+    components.pair_bias_m2 = fixed_point(components.pair_bias_m2, slice(2 * n + 1, -1), first_bias)
     outliers = float(np.sum(1.0 - inliers))
     components.outliers = (outliers + 0.5) / (inliers.size + 50.0)
     up, down = sorted_out.followed + GO_ON * GO_ON_RANGES, outliers + GO_ON_RANGES
