@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Sequence
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ from relpos.fusion.initialisation.kernels import (
 from relpos.fusion.initialisation.search import HypothesisSearch
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Measurement, Motion, Prior, Range
-from relpos.runs import load_run
+from relpos.runs import NodeInfo, load_run
 from relpos.simulation.paper import simulate_paper
 
 Floats = npt.NDArray[np.float64]
@@ -341,6 +342,23 @@ def test_a_copy_of_a_search_goes_on_as_the_search_does() -> None:
     first, second = (one.mixture for one in copies)
     assert first.weights.tolist() == second.weights.tolist()
     assert first.poses.tolist() == second.poses.tolist()
+
+
+def test_ranges_of_nodes_that_were_found_are_between_their_antennas() -> None:
+    places, offset_m = (0, 5 + 2j, -3 + 4j), (0.5, 0.0)
+    walk = Walk(places, (0.3, 0.5, 2.0), *wander(120, 3, seed=6))
+    antenna = walk.place + complex(*offset_m) * np.exp(1j * walk.heading)
+    measurements = [
+        replace(m, range_m=float(abs(antenna[int(m.time_s), m.node - 1]
+                                     - antenna[int(m.time_s), m.peer - 1])))
+        if isinstance(m, Range) else m
+        for m in walk.measurements
+    ]  # fmt: skip
+    worn = {n: NodeInfo(antenna_offset_m=offset_m) for n in (1, 2, 3)}
+    estimator = fusion.make("bank", (), {}, 0, worn)
+    last = [e for m in measurements for e in estimator.process(m)] + estimator.finish()
+    off = [abs(walk.seen(120, p.node, p.peer)) - p.distance_m for p in last[-1].pairs]
+    assert max(map(abs, off)) < 0.15
 
 
 # -- real recordings -------------------------------------------------------------------------------

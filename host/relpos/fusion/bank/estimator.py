@@ -430,7 +430,10 @@ class Bank:
             return
         mixture = found.mixture
         beside = self._nearest(mixture) if self._row else None
-        rows = [self.core.add_node((0.0, 0.0, 0.0), 1.0, 1.0) for _ in mixture.nodes]
+        rows = [
+            self.core.add_node((0.0, 0.0, 0.0), 1.0, 1.0, self._lever_m(node))
+            for node in mixture.nodes
+        ]
         self._row.update(zip(mixture.nodes, rows, strict=True))
         self.core.adaptive.grow()
         these = self.core.hypotheses
