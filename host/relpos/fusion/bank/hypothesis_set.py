@@ -90,7 +90,7 @@ class HypothesisSet:
         """1 where step scale and heading drift are modelled (K,)."""
         self.has_bias = np.sort(self._share_of_all(round(settings.biased * count)))
         """1 where range biases are (K,)."""
-        self.heights_share = HEIGHTS_SHARE
+        self.heights_known = False
         self.has_heights = self.has_bias * (rng.random(count) < HEIGHTS_SHARE)
         """1 where those of pairs are squares of differences of height instead (K,)."""
         self.low_heading_noise = self._share_of_all(int(settings.steady * count))
@@ -423,7 +423,7 @@ class HypothesisSet:
     def know_heights(self) -> None:
         """Have no hypothesis any more in which heights are unknown: they are reported."""
         which = np.flatnonzero(self.has_heights)
-        self.heights_share, self.has_heights[:] = 0.0, 0.0
+        self.heights_known, self.has_heights[:] = True, 0.0
         if which.size:
             self._begin_pairs(which)
 
@@ -446,7 +446,8 @@ class HypothesisSet:
         if s.biased > 0.0 and (back[1] > self.has_bias).any():
             which = np.flatnonzero(back[1] > self.has_bias)
             self.has_bias[which] = 1.0
-            self.has_heights[which] = self.rng.random(which.size) < self.heights_share
+            drawn = self.rng.random(which.size) < HEIGHTS_SHARE
+            self.has_heights[which] = drawn & (not self.heights_known)
             self._allow_common(which)
 
     def shift_common(self, entry: int, by: float) -> None:

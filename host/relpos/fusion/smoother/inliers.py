@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.models.ranging import AGAIN_M, ALIKE
+from relpos.fusion.normal import normal_density
 from relpos.fusion.smoother import kernels
 from relpos.fusion.smoother.kernels import State
 from relpos.fusion.smoother.problem import Inliers, Problem
@@ -52,24 +53,21 @@ def _ranges(
     predicted = (problem.range_residuals(state) + problem.range_m)[order]
     excess_m = measured - predicted
     density = np.empty((pair.size, 3))
-    density[:, 0] = _normal(excess_m, variance) + _normal(predicted + measured, variance)
+    density[:, 0] = normal_density(excess_m, variance) + normal_density(
+        predicted + measured, variance
+    )
     density[:, 1:] = 1.0 / max(SPAN_M, 10.0 * math.sqrt(variance))
     share = go_on = components.outliers
     # Between two nodes alone nothing tells ranges without sight from an odometry that is wrong.
     if len(problem.graph.pairs) > 1:
         go_on = max(components.outliers_go_on, share)
         # As far off as the last one: what stands in between makes ranges too long, never too short.
-        alike = _normal(np.diff(excess_m), AGAIN_M**2 + 2.0 * variance)
+        alike = normal_density(np.diff(excess_m), AGAIN_M**2 + 2.0 * variance)
         density[1:, 2] += np.where(excess_m[:-1] > 0.0, ALIKE, 0.0) * (alike - density[1:, 1])
     probability, inlier = np.empty(pair.size), np.empty(pair.size)
     followed, log_likelihood = kernels.two_states(density, pair[order], share, go_on, inlier)
     probability[order] = inlier
     return probability, followed, log_likelihood
-
-
-def _normal(off: Floats, variance: float) -> Floats:
-    density: Floats = np.exp(-0.5 * off**2 / variance) / math.sqrt(2.0 * math.pi * variance)
-    return density
 
 
 def _reports(problem: Problem, state: State, variance: Floats) -> tuple[Floats, float]:

@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion.normal import normal_density
+
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
@@ -106,8 +108,8 @@ class Floors:
         mean_m, floors_m2 = self.climbs(base)
         total = variance_m2 + floors_m2 + WORN_M**2
         off_m = climbed_m - mean_m
-        density = (1.0 - HIDDEN) * _gaussian(off_m, total)
-        density += HIDDEN * _gaussian(off_m, total + HIDDEN_M**2)
+        density = (1.0 - HIDDEN) * normal_density(off_m, total)
+        density += HIDDEN * normal_density(off_m, total + HIDDEN_M**2)
         start_m, start_m2 = self.climbs(np.zeros_like(base))
         over_m, over_m2 = (np.asarray(v)[..., None] for v in over)
         total = start_m2 + over_m2 + PRESSED_M**2
@@ -151,11 +153,6 @@ class Floors:
         self._climbs += 1
         shared2 = SIGMA_SCALE**2 + (SHARED * doubt_m / (SPACING_M * (floor - base))) ** 2
         self.scale2 += (shared2 - self.scale2) / self._climbs
-
-
-def _gaussian(off_m: Floats, variance_m2: Floats) -> Floats:
-    density: Floats = np.exp(-0.5 * off_m**2 / variance_m2) / np.sqrt(2.0 * np.pi * variance_m2)
-    return density
 
 
 def most_probable(probability: Floats) -> tuple[int | None, float]:
