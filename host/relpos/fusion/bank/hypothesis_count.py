@@ -54,7 +54,7 @@ an epoch of 2 s, in place of 2."""
 
 WORK = 1.6e8
 """Hypotheses times entries cubed at most (what an epoch costs, where every user ranges a few): six
-people with biases of all pairs have 1016 of 54 entries, ten without 640, twenty the usual 200."""
+people with biases of all pairs have 961 of 55 entries, ten without 640, twenty the usual 200."""
 
 CHECKED_AFTER = 4
 """The strong nonlinearity is checked after so many instants of ranges."""
