@@ -58,13 +58,16 @@ def test_biases_of_uncalibrated_pairs_are_found() -> None:
     run, estimates, _ = fused("four_robots_uwb/run1")
     truth = tracks.true_tracks(run.truth)
     residuals = defaultdict(list)
+    growth_m = next(p.value for p in estimates[-1].parameters if p.name == "range_growth_m")
     for r in run.ranges:
         if r.range_m > 0.0:
             ends = [
                 np.array([np.interp(r.time_s, t.time_s, axis) for axis in (t.x_m, t.y_m)])
                 for t in (truth[r.node], truth[r.peer])
             ]
-            residuals[r.node, r.peer].append(r.range_m - np.hypot(*(ends[1] - ends[0])))
+            distance_m = np.hypot(*(ends[1] - ends[0]))
+            grown_m = growth_m * np.log(max(distance_m, 1.0) / 5.0)
+            residuals[r.node, r.peer].append(r.range_m - distance_m - grown_m)
     found = {
         (p.node, p.peer): p.value
         for p in estimates[-1].parameters

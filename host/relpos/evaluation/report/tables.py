@@ -364,6 +364,7 @@ _UNITS: Mapping[str, tuple[str, str, float, int]] = {
     "heading_drift_rad_s": ("heading drift", "°/min", 60.0 * math.degrees(1.0), 2),
     "detection_range_m": ("detection range", "m", 1.0, 1),
     "body_shadow_m": ("body shadow", "m", 1.0, 2),
+    "range_growth_m": ("growth of ranges", "m", 1.0, 2),
     "range_lateness_s": ("ranges dated late", "s", 1.0, 2),
     "clock_offset_s": ("clock ahead", "s", 1.0, 2),
 }

@@ -181,6 +181,7 @@ class Report:
             )
 
         shadow, (lateness, sigma) = learned(CommonIndex.SHADOW), learned(CommonIndex.LATENESS)
+        growth = learned(CommonIndex.GROWTH)
         late = lateness + clocks.lateness_s, sigma
         offsets, sigmas = these.clock_offsets(self.mean, self.covariance)
         offset = {n: float(offsets[self.row[n]]) + clocks.offset_s.get(n, 0.0) for n in nodes}
@@ -191,6 +192,7 @@ class Report:
             own = offset[node] - usual, float(sigmas[self.row[node]])
             parameters += [
                 Parameter(self.time_s, node, None, "body_shadow_m", *shadow),
+                Parameter(self.time_s, node, None, "range_growth_m", *growth),
                 Parameter(self.time_s, node, None, "range_lateness_s", *late),
                 Parameter(self.time_s, node, None, "clock_offset_s", *own),
             ]

@@ -291,7 +291,9 @@ def _parameters(problem: Problem, solution: Solution, time_s: float) -> tuple[Pa
     n, names = problem.nodes, problem.graph.node_ids
     value, spread = solution.state.constants, solution.covariance.constants
     rows = []
+    growth = float(value[-1]), math.sqrt(spread[-1, -1])
     for k, name in enumerate(names):
+        rows.append(Parameter(time_s, name, None, "range_growth_m", *growth))
         grow = math.exp(float(value[k]))
         rows.append(
             Parameter(time_s, name, None, "step_scale", grow, grow * math.sqrt(spread[k, k]))
