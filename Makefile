@@ -25,8 +25,8 @@ compile-kernels = @printf '%s\n' 'compiling the estimators, once'; \
 	$(PYTHON) -c 'from relpos import fusion; [fusion.warm_up(n) for n in fusion.SETTINGS]'
 title = @printf '\n\033[1m== %s\033[0m\n' "$(1)"
 
-.PHONY: help setup demo live test lint coverage bench bench-chain firmware docs pages wire clean bare-root soak fuzz mutants \
-        system-demo system-avr system-browser system-soak firmware-tests board-builds python-tests
+.PHONY: help setup demo live test lint coverage bench bench-chain bench-teams firmware docs pages wire clean bare-root soak fuzz \
+        mutants system-demo system-avr system-browser system-soak firmware-tests board-builds python-tests
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -103,6 +103,9 @@ bench: $(PEERS) ## relpos beside filterpy, Stone Soup, particles, pfilter, GTSAM
 
 bench-chain: board-builds ## how fast boards and teams are emulated, and the particle filter through its interface
 	@for file in bench/bench_*.py; do echo "== $$file"; $(PYTHON) "$$file"; done
+
+bench-teams: board-builds ## teams of real walkers, from the recordings in RELPOS_DATA (half an hour)
+	$(PYTHON) bench/recorded_teams.py --seconds 300 --seeds 3
 
 docs: $(DEVELOP) ## the documentation as a site, in out/docs
 	$(call title,Documentation)
