@@ -31,7 +31,7 @@ host 1,089,000: 0 open | `make fuzz` |
 node: 10^6 samples: 0 open | `make soak` |
 | tests notice faults in what is trusted | killed: gait 15/15, authentication 28/28, \
 protocol 20/20, link 20/20, timeline 19/19, filter 17/17, \
-bank 20/20 | `make mutants` |
+bank 20/20, frame 19/19, node 19/19 | `make mutants` |
 | no clock, theft or replay locks out or commands | [security](security.md) | `make test` |
 
 Others (looked up in 2026): PX4

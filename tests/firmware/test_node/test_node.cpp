@@ -519,7 +519,7 @@ TEST(the_led_distinguishes_the_states) {
     Team team;
     team.world.magnetometer_present = true;
     team.world.inertial_present = state != kSensorMissing;
-    team.world.supply = state >= kSupplyLow ? 4400 : 5000;
+    team.world.supply = state >= kSupplyLow ? 4499 : 4500;
     uint16_t before = 0;
     uint32_t lit_before_us = 0;
     for (uint8_t part = 0; part < 12; ++part) {
@@ -909,6 +909,18 @@ TEST(a_missing_tag_stops_only_the_ranges) {
   team.run_ms(12000);
   CHECK_EQUAL(0, team.sent(wire::MessageType::kRanges));
   CHECK(team.sent(wire::MessageType::kMotion) >= 10);
+}
+
+TEST(a_node_whose_imu_falls_silent_is_starting_again) {
+  Team team;
+  team.run_ms(20000);
+  wire::Motion motion;
+  CHECK(team.read(wire::MessageType::kMotion, &motion));
+  CHECK_EQUAL(static_cast<uint8_t>(wire::MotionState::kStanding), motion.state);
+  team.world.inertial_present = false;
+  team.run_ms(3000);
+  CHECK(team.read(wire::MessageType::kMotion, &motion));
+  CHECK_EQUAL(static_cast<uint8_t>(wire::MotionState::kStarting), motion.state);
 }
 
 TEST(an_imu_that_was_away_gives_a_gap_a_reset_and_a_larger_variance) {
