@@ -259,7 +259,7 @@ def test_every_motion_epoch_is_estimated_once() -> None:
     assert [e.time_s for e in estimates] == [float(k) for k in range(1, 41)]
     assert all(len(e.nodes) == 3 and len(e.pairs) == 3 for e in estimates)
     names = {p.name for p in estimates[-1].parameters}
-    assert names == {"step_scale", "heading_drift_rad_s", "range_bias_m"}
+    assert names == {"step_scale", "heading_drift_rad_s", "range_bias_m", "range_growth_m"}
 
 
 def test_the_same_seed_gives_the_same_track() -> None:
