@@ -27,8 +27,8 @@ LONG = (
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Three a core: while tests wait for browsers and processes, the cores stay busy."""
-    return 3 * (os.cpu_count() or 1)
+    """Four a core: while tests wait for browsers and processes, the cores stay busy."""
+    return 4 * (os.cpu_count() or 1)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
