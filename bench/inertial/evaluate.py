@@ -16,7 +16,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-import pictures
 import replay
 import walks as walking
 from replay import Array
@@ -342,6 +341,8 @@ def main() -> None:
     if options.page is not None:
         write_page(options.page, rows, found, fit)
     if options.pictures is not None:
+        import pictures
+
         pictures.draw(options.pictures)
 
 

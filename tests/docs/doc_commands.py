@@ -62,9 +62,15 @@ class Command:
         return f"{self.page}:{self.line}: {shlex.join(self.words)}"
 
 
+@cache
+def tokens(page: Path) -> list[Token]:
+    """A page as Markdown's parser sees it."""
+    return MarkdownIt().enable("table").parse(page.read_text(encoding="utf-8"))
+
+
 def blocks(page: Path) -> Iterator[Token]:
     """The page's code blocks, fenced and indented, also inside lists and tables."""
-    for token in MarkdownIt().enable("table").parse(page.read_text(encoding="utf-8")):
+    for token in tokens(page):
         if token.type in ("fence", "code_block"):
             yield token
 
@@ -88,7 +94,7 @@ def commands(page: Path) -> Iterator[Command]:
 def mentions(page: Path) -> Iterator[Command]:
     """Commands of relpos in running text, between backticks: often in part only."""
     name = page.relative_to(ROOT).as_posix()
-    for token in MarkdownIt().enable("table").parse(page.read_text(encoding="utf-8")):
+    for token in tokens(page):
         for child in token.children or ():
             if child.type == "code_inline" and child.content.startswith("relpos "):
                 yield Command(name, (token.map or [0])[0] + 1, tuple(split(child.content)))
