@@ -365,3 +365,16 @@ def test_a_start_at_one_pose_outlives_a_kill_before_the_first_checkpoint(tmp_pat
     for asked in ([*again, "loop://", "--initial", "common"], again, again):
         CliRunner().invoke(main.app, asked, catch_exceptions=False)
     assert sessions == [(True, 0), (True, 1), (False, 0)]
+
+
+def test_a_file_that_a_running_session_replaces_meanwhile_is_no_foreign_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Mission.open(tmp_path / "m", "/dev/null")
+    listed = Path.rglob
+
+    def rglob(path: Path, pattern: str) -> list[Path]:
+        return [*listed(path, pattern), path / "mission.json.new"]
+
+    monkeypatch.setattr(Path, "rglob", rglob)
+    Mission.open(tmp_path / "m", "/dev/null")

@@ -215,7 +215,7 @@ def test_what_was_confirmed_is_there_again_five_seconds_after_a_kill(
     wait_for(lambda: any("points" in e for e in Mission.open(field.folder).events()))
     expect(page.locator("#markers li")).to_have_count(1)
     page.locator("#show-log").click()
-    for words in ("Ben is Ben", "alarms of", "is at landmark 7", "is at landmark 9"):
+    for words in ("node 2 is Ben", "alarms of", "is at landmark 7", "is at landmark 9"):
         expect(page.locator("#log")).to_contain_text(words)
     page.keyboard.press("Escape")
     wait_for(lambda: "3 of 3 people located" in page.locator("#map-words").inner_text())

@@ -15,6 +15,7 @@ import math
 import os
 import queue
 import secrets
+import stat
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -471,8 +472,11 @@ def _lines(path: Path) -> Iterator[bytes]:
 def _check_own_files(folder: Path) -> None:
     """Raise DataError where writing here would write elsewhere: somebody else made the folder."""
     for path in folder.rglob("*"):
-        if path.is_symlink() or not (path.is_file() or path.is_dir()):
-            raise DataError(f"{path}: a link or a device: not a mission's folder")
+        # A session that runs replaces its files meanwhile.
+        with contextlib.suppress(FileNotFoundError):
+            mode = path.lstat().st_mode
+            if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                raise DataError(f"{path}: a link or a device: not a mission's folder")
 
 
 def _ends_line(path: Path) -> bool:
