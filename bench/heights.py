@@ -52,19 +52,13 @@ class Figures:
     def line(self, name: str) -> str:
         """One row of the table."""
         apart = np.abs(self.returns_m)
-        returns = " / ".join(
-            f"{v:.2f}" for v in (np.median(apart), np.sqrt(np.mean(apart**2)), *quantile(apart))
-        )
+        spread = np.median(apart), np.sqrt(np.mean(apart**2)), np.quantile(apart, 0.9)
+        returns = " / ".join(f"{value:.2f}" for value in spread)
         error = f"{np.sqrt(np.mean(np.square(self.errors_m))):.2f}" if self.errors_m else ""
         right, unsaid = self.floors.count(0), self.floors.count(None)
         floors = f"{right}, {unsaid}, {len(self.floors) - right - unsaid}" if self.floors else ""
         cells = (floors, share(self.changes), share(self.false_changes), error)
         return f"| {name} | {returns} | {' | '.join(cells)} |"
-
-
-def quantile(values: np.ndarray) -> list[float]:
-    """The 90th percentile, in a list."""
-    return [float(np.quantile(values, 0.9))]
 
 
 def share(found: list[bool]) -> str:

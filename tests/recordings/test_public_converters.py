@@ -75,17 +75,19 @@ def test_a_university_range_keeps_its_rooms(source):
         list(ranges.outdoor(Archive(source({})._path)))
 
 
+def logs(lines, trials):
+    """The same log for every trial."""
+    names = (trial.replace("_", "_repetition") for trial in trials)
+    return {f"{museum.FOLDER}{name}.txt": "\n".join(lines) for name in names}
+
+
 def test_a_log_of_a_phone_is_cut_around_its_points(source):
     lines = ["% made up", "POSI;10.0;1;49.46;11.11;0;100", "POSI;20.0;2;49.4601;11.11;0;100"]
     for k in range(60):
         app, sensor = 0.5 * k, 100.0 + 0.5 * k
         lines += [f"ACCE;{app};{sensor};0;0;9.8;3", f"GYRO;{app};{sensor - 0.25};{k};0;0;3"]
         lines.append(f"MAGN;{app};{sensor};20;0;-40;3")
-    files = {}
-    for trial in museum.TRIALS:
-        walk, repetition = trial.split("_")
-        files[f"{museum.FOLDER}{walk}_repetition{repetition}.txt"] = "\n".join(lines)
-    first, *others = museum.convert(source(files))
+    first, *others = museum.convert(source(logs(lines, museum.TRIALS)))
     assert len(others) == 16
     assert len(first.imu) == 25  # 9 s to 21 s
     assert first.imu[0] == "0.0000,1,0,0,9.8,18.5,0,0,20,0,-40"  # between two of the gyroscope
@@ -99,11 +101,7 @@ def test_a_log_with_pressure_keeps_the_floors_of_its_points(source):
     for k in range(11):
         lines += [f"{kind};{0.5 * k};{0.5 * k};0;0;9.8;3" for kind in ("ACCE", "GYRO", "MAGN")]
         lines.append(f"PRES;{0.5 * k};{0.5 * k};{980 + 0.1 * k};3")
-    files = {}
-    for trial in museum.FLOOR_TRIALS:
-        walk, repetition = trial.split("_")
-        files[f"{museum.FOLDER}{walk}_repetition{repetition}.txt"] = "\n".join(lines)
-    first, *others = museum.heights(source(files))
+    first, *others = museum.heights(source(logs(lines, museum.FLOOR_TRIALS)))
     assert len(others) == 49
     table = first.tables()["imu.csv"].splitlines()
     assert table[0].endswith(",mz_ut,pressure_pa")

@@ -12,7 +12,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from relpos.recordings.tables import TRUTH_COLUMNS, Archive, ConvertedRun, described, number
+from relpos.recordings.tables import (
+    MOTION_COLUMNS,
+    RANGE_COLUMNS,
+    TRUTH_COLUMNS,
+    Archive,
+    ConvertedRun,
+    described,
+    number,
+)
 
 FILE = "script/data_fit/data/4robots_data_01.npz"
 ROBOTS = (1, 3, 4, 5)
@@ -64,7 +72,7 @@ def convert(archive: Archive) -> Iterator[ConvertedRun]:
         ),
         others={
             "truth.csv": [TRUTH_COLUMNS, *truth],
-            "motion.csv": ["time_s,node,dx_m,dy_m,dtheta_rad", *motion],
-            "ranges.csv": ["time_s,node,peer,range_m", *ranges],
+            "motion.csv": [MOTION_COLUMNS, *motion],
+            "ranges.csv": [RANGE_COLUMNS, *ranges],
         },
     )

@@ -12,10 +12,17 @@ from collections.abc import Iterator
 import numpy as np
 
 from relpos.errors import DataError
-from relpos.recordings.tables import Archive, Array, ConvertedRun, described, imu_lines
+from relpos.recordings.tables import (
+    PA_OF_MBAR,
+    TRUTH_COLUMNS,
+    Archive,
+    Array,
+    ConvertedRun,
+    described,
+    imu_lines,
+)
 
 WALKS = {"eight": "EightExperiment", "zero2four": "Zero2fourExperiment"}
-PA_OF_MBAR = 100.0
 
 
 def convert(archive: Archive) -> Iterator[ConvertedRun]:
@@ -29,7 +36,7 @@ def convert(archive: Archive) -> Iterator[ConvertedRun]:
             raise DataError(f"{folder}: sensors of different lengths: the source has changed")
         begin_ms = acc[0, 0]
         samples = np.hstack([acc[:, 1:], gyr[:, 1:], mag[:, 1:], bar[:, 1:] * PA_OF_MBAR])
-        truth = ["time_s,node,x_m,y_m,heading_rad,z_m"]
+        truth = [f"{TRUTH_COLUMNS},z_m"]
         for time_ms, *place_m in points:
             x, y, z = np.array(place_m) - points[0, 1:]
             truth.append(f"{(time_ms - begin_ms) / 1e3:.3f},1,{x:.1f},{y:.1f},,{z:.1f}")

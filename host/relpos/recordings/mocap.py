@@ -15,7 +15,15 @@ from scipy.signal import butter, filtfilt
 from scipy.spatial.transform import Rotation
 
 from relpos.errors import DataError
-from relpos.recordings.tables import Archive, Array, ConvertedRun, described, imu_lines, number
+from relpos.recordings.tables import (
+    TRUTH_COLUMNS,
+    Archive,
+    Array,
+    ConvertedRun,
+    described,
+    imu_lines,
+    number,
+)
 
 RATE_HZ = 200.0
 LOW_PASS_HZ, ORDER = 14.0, 4
@@ -85,7 +93,7 @@ def _run(name: str, person: str, leg_m: float, markers: Array) -> ConvertedRun:
     x, y = attitude.apply([1.0, 0.0, 0.0]).T[:2]
     heading = np.unwrap(np.arctan2(y, x))
     poses = np.column_stack([smooth_m[:, :2], heading, smooth_m[:, 2]])[EDGE:-EDGE:10]
-    truth = ["time_s,node,x_m,y_m,heading_rad,z_m"]
+    truth = [f"{TRUTH_COLUMNS},z_m"]
     for k, pose in enumerate(poses):
         truth.append(f"{k * 10 / RATE_HZ:.4f},1," + ",".join(number(v, 5) for v in pose))
     way_m = np.hypot(*np.diff(poses[::2, :2], axis=0).T).sum()

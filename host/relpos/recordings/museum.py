@@ -15,6 +15,7 @@ import numpy as np
 
 from relpos.errors import DataError
 from relpos.recordings.tables import (
+    PA_OF_MBAR,
     Archive,
     Array,
     ConvertedRun,
@@ -37,7 +38,6 @@ FLOOR_TRIALS = (
 """All on one floor, but the last two."""
 VALUES = {"PRES": 4}
 """End of a line's values, where it is not 6."""
-PA_OF_MBAR = 100.0
 MARGIN_S = 1.0
 LONGEST_S = 152.0
 EQUATOR_M, FLATTENING = 6378137.0, 1.0 / 298.257223563

@@ -20,6 +20,9 @@ IMU_COLUMNS = (
 )
 EVENT_COLUMNS = "time_s,node,event,value"
 TRUTH_COLUMNS = "time_s,node,x_m,y_m,heading_rad"
+MOTION_COLUMNS = "time_s,node,dx_m,dy_m,dtheta_rad"
+RANGE_COLUMNS = "time_s,node,peer,range_m"
+PA_OF_MBAR = 100.0
 
 
 class Archive:

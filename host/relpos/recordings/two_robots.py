@@ -15,6 +15,8 @@ import numpy as np
 
 from relpos.errors import DataError
 from relpos.recordings.tables import (
+    MOTION_COLUMNS,
+    RANGE_COLUMNS,
     TRUTH_COLUMNS,
     Archive,
     Array,
@@ -64,7 +66,7 @@ def convert(archive: Archive) -> Iterator[ConvertedRun]:
     for name, path in RUNS.items():
         try:
             run = _Arrays(io.BytesIO(archive.read_bytes(FOLDER + path))).load()
-        except (pickle.UnpicklingError, EOFError, TypeError) as error:
+        except (pickle.UnpicklingError, EOFError, TypeError, KeyError) as error:
             raise DataError(f"two_robots_vio: {path}: the source has changed ({error})") from None
         uwb = run["uwb"]
         stamps_s = np.array(uwb.sampled_t, float)
@@ -89,8 +91,8 @@ def convert(archive: Archive) -> Iterator[ConvertedRun]:
             ),
             others={
                 "truth.csv": [TRUTH_COLUMNS, *_in_time(truth)],
-                "motion.csv": ["time_s,node,dx_m,dy_m,dtheta_rad", *_in_time(motion)],
-                "ranges.csv": ["time_s,node,peer,range_m", *ranges],
+                "motion.csv": [MOTION_COLUMNS, *_in_time(motion)],
+                "ranges.csv": [RANGE_COLUMNS, *ranges],
             },
         )
 
