@@ -7,6 +7,7 @@ import json
 import math
 import os
 import pty
+import select
 import signal
 import subprocess
 import sys
@@ -415,9 +416,10 @@ def test_an_interrupt_ends_listening_and_keeps_what_was_received(tmp_path: Path)
             os.write(ours, ranges_bytes(1, second, 2, 1.5))
             # Ten times the real pace: what counts is that it is read as it comes.
             time.sleep(0.1)
-        time.sleep(0.5)
+        while select.select([theirs], [], [], 0.0)[0]:
+            time.sleep(0.05)
         listening.send_signal(signal.SIGINT)
-        stdout, stderr = listening.communicate(timeout=20)
+        stdout, stderr = listening.communicate(timeout=120)
     finally:
         listening.kill()
         os.close(ours)

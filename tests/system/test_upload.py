@@ -64,10 +64,10 @@ def test_upload_writes_and_verifies_the_firmware_through_the_bootloader(tmp_path
                 cwd=ROOT,
                 capture_output=True,
                 text=True,
-                timeout=120,
+                timeout=600,
                 check=False,
             )
-            handed_over = serial_board.handed_over.wait(timeout=10)
+            handed_over = serial_board.handed_over.wait(timeout=60)
         finally:
             serial_board.stop.set()
             serial_board.join()

@@ -201,4 +201,18 @@ def wait_for(condition: Callable[[], bool], within_s: float = 60.0) -> None:
         time.sleep(0.05)
 
 
-__all__ = ["Browser", "Page", "Stage", "browser_of", "chromium", "sync_playwright", "wait_for"]
+def until_held(page: Page) -> None:
+    """Wait until a button that is held down has acted, which it does by itself."""
+    wait_for(lambda: page.locator(".holding").count() == 0)
+
+
+__all__ = [
+    "Browser",
+    "Page",
+    "Stage",
+    "browser_of",
+    "chromium",
+    "sync_playwright",
+    "until_held",
+    "wait_for",
+]

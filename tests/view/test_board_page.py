@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from playwright.sync_api import Page, expect
-from stage import Stage, wait_for
+from stage import Stage, until_held, wait_for
 
 
 def row(page: Page, node: int) -> Any:
@@ -17,7 +17,7 @@ def hold(page: Page, button: Any) -> None:
     box = button.bounding_box()
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.mouse.down()
-    page.wait_for_timeout(1300)
+    until_held(page)
     page.mouse.up()
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
-from stage import Stage, wait_for
+from stage import Stage, until_held, wait_for
 
 from relpos.live.team_view import Hello
 
@@ -16,7 +16,7 @@ def hold(page: Page, selector: str) -> None:
     """By key: it is held as the mouse is."""
     page.locator(selector).focus()
     page.keyboard.down("Enter")
-    page.wait_for_timeout(1200)
+    until_held(page)
     page.keyboard.up("Enter")
 
 

@@ -10,11 +10,16 @@ from typing import Any
 import httpx
 import pytest
 from playwright.sync_api import Page, expect
+from stage import until_held
 from test_mission_kill import Field, output_of, wearer
+from typer.testing import CliRunner
 
 from relpos.cli import live, waiting
+from relpos.cli.main import app
+from relpos.link.port import check_port
 from relpos.live.mission import Mission
-from relpos.view.access import DEFAULT_HOST, Access, free_port
+from relpos.live.session import Outcome
+from relpos.view.access import DEFAULT_HOST, Access, listen
 from relpos.view.devices import Role
 
 
@@ -22,16 +27,16 @@ def test_only_a_commander_starts_and_a_path_of_a_guest_is_never_opened(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mission = Mission.open(tmp_path / "mission", "", "Mill")
-    port = free_port(DEFAULT_HOST, 0)
+    door = listen(f"{DEFAULT_HOST}:0")
     opened: list[str] = []
     monkeypatch.setattr("relpos.link.port.check_port", opened.append)
     chosen: list[waiting.Choice | None] = []
-    options = live.Options(True, f"{DEFAULT_HOST}:{port}", open_browser=False)
+    options = live.Options(True, open_browser=False, door=door)
     room = threading.Thread(target=lambda: chosen.append(waiting.choose(mission, options, "", 60)))
     room.start()
-    access = Access(port, (DEFAULT_HOST,), key=mission.key)
+    access = Access(door[1].port, (DEFAULT_HOST,), key=mission.key)
     body = {"source": "/dev/ttyUSB9", "name": "Old mill", "common": True}
-    with httpx.Client(base_url=f"http://{DEFAULT_HOST}:{port}", timeout=60.0) as client:
+    with httpx.Client(base_url=f"http://{DEFAULT_HOST}:{access.port}", timeout=60.0) as client:
         transport = httpx.HTTPTransport(retries=9)
         for role in (Role.LOOK, Role.ACKNOWLEDGE, Role.COMMAND):
             with httpx.Client(transport=transport, timeout=60.0) as entering:
@@ -56,13 +61,68 @@ def test_only_a_commander_starts_and_a_path_of_a_guest_is_never_opened(
     assert opened == ["/dev/ttyUSB9"]
     roles = [e["role"] for e in mission.events() if e["kind"] == "device"]
     assert sorted(roles) == ["acknowledge", "command", "look"], "kept for the session"
+    # A kill before the session has begun loses nothing of what was chosen.
+    about = Mission.open(mission.path).about
+    assert (about.source, about.name, about.common) == ("/dev/ttyUSB9", "Old mill", True)
+
+
+def test_a_mission_without_a_source_keeps_its_address_whoever_takes_the_usual_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served: list[int] = []
+
+    def choose(_: Mission, options: live.Options, *__: object) -> None:
+        assert options.door is not None
+        served.append(options.door[1].port)
+
+    def start() -> str:
+        words = ["mission", str(tmp_path / "mission"), "--view-listen", DEFAULT_HOST]
+        return CliRunner().invoke(app, words).output
+
+    monkeypatch.setattr(waiting, "choose", choose)
+    usual, _ = listen(None)
+    start()
+    usual.close()
+    start()
+    assert served[0] == served[1]
+    # A server that is about to go.
+    old, _ = listen(f"{DEFAULT_HOST}:{served[0]}")
+    threading.Timer(0.5, old.close).start()
+    start()
+    assert served[2] == served[0]
+    with listen(f"{DEFAULT_HOST}:{served[0]}")[0]:
+        monkeypatch.setattr("relpos.cli.mission.PATIENCE_S", 0.0)
+        assert f"was at port {served[0]}" in start()
+    assert served[3] != served[0]
+
+
+def test_a_mission_waits_for_its_coordinator_and_goes_on_once_it_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = tmp_path / "coordinator"
+    Mission.open(tmp_path / "mission", str(port), "Mill")
+    begun: list[str] = []
+
+    def run(found: Mission, *_: object, **__: object) -> Outcome:
+        check_port(found.about.source)
+        begun.append(found.about.source)
+        return Outcome()
+
+    monkeypatch.setattr("relpos.cli.mission._run", run)
+    plugging = threading.Timer(3.0, port.touch)
+    plugging.start()
+    words = ["mission", str(tmp_path / "mission"), "--view-listen", f"{DEFAULT_HOST}:0"]
+    said = CliRunner().invoke(app, words).output
+    assert "no such device" in said
+    assert "the team's page" in said, "meanwhile another source can be chosen"
+    assert begun == [str(port)]
 
 
 def hold_end(page: Page) -> None:
     page.locator("#show-log").click()
     page.locator("#end").focus()
     page.keyboard.down("Enter")
-    page.wait_for_timeout(1300)
+    until_held(page)
     page.keyboard.up("Enter")
 
 

@@ -467,7 +467,8 @@ def fuse_live(
     )
     session = live.run(source, plan, options)
     failure = session.failure
-    walk_is_over = emulated is not None and emulated() and isinstance(failure, DeviceError)
+    # Only a port that has vanished asks whether the walk is over, which may take seconds.
+    walk_is_over = isinstance(failure, DeviceError) and emulated is not None and emulated()
     if failure is not None and not walk_is_over:
         if isinstance(failure, DeviceError):
             raise DeviceError(f"{failure}; what was received is in {job.out}")
@@ -492,11 +493,14 @@ def _debrief(job: Job, options: live.Options) -> None:
 
     page = job.out / "index.html"
     try:
-        with output.working("writing the debrief"):
+        with output.working("writing the debrief (Ctrl-C: not now)"):
             run, result = api.load(job.out / "received"), read_result(job.out)
             reports.write(reports.gather(run, result, log=read_log(job.out)), page)
     except RelposError as error:
         output.remark(f"no debrief page: {error}")
+        return
+    except KeyboardInterrupt:
+        output.remark(f"for the debrief: relpos report {job.out / 'received'} --estimate {job.out}")
         return
     output.remark(f"debrief: {page}")
     live.open_browser(options, page.resolve().as_uri())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import socket
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from relpos.recording.about import About
     from relpos.recording.recorder import Recorder
     from relpos.recording.viewer import FoxgloveServer
+    from relpos.view.access import Access
     from relpos.view.web import WebView
 
 View = Annotated[bool, typer.Option("--view", help="Serve the live page, for browsers.")]
@@ -90,6 +92,7 @@ Foxglove = Annotated[
 ]
 FOXGLOVE_AT = "127.0.0.1:8765"
 """The viewer's own default; this computer alone, because its protocol has no password."""
+STAGES = {"finishing": "fusing the rest (Ctrl-C: drop it)"}
 ADDRESS = re.compile(r"[\w.\-\[\]:]*:\d+|\d+")
 
 
@@ -126,6 +129,8 @@ class Options:
     """Whether a session on a port that was shown ends with its page."""
     mission: MissionPlan | None = None
     """Its key signs its devices' tokens."""
+    door: tuple[socket.socket, Access] | None = None
+    """Where all pages of a mission are served, one after the other."""
 
     @property
     def shown(self) -> bool:
@@ -171,7 +176,7 @@ def run(source: Input, plan: SessionPlan, options: Options) -> Outcome:
     try:
         if options.screen:
             return run_session(source, plan, sinks, remark=later.append)
-        with output.progress() as progress:
+        with output.progress(STAGES) as progress:
             return run_session(source, plan, sinks, remark=output.remark, progress=progress)
     finally:
         # The page is closed when a recording reports what it could not write at its end.
@@ -262,14 +267,17 @@ def open_page(options: Options, hello: Hello, folder: Path | None = None) -> Web
     from relpos.view.devices import Role
     from relpos.view.web import WebView
 
-    door, access = doors.listen(options.view_listen)
+    if options.door is None:
+        listener, access = doors.listen(options.view_listen)
+    else:
+        listener, access = options.door[0].dup(), options.door[1]
     if options.mission is not None:
         mission = options.mission.folder
         access, folder = replace(access, key=mission.key), folder or mission.path
     access = replace(access, folder=folder)
     if options.https:
         access = replace(access, certificate=doors.make_certificate(access.hosts))
-    page = WebView(door, access, hello)
+    page = WebView(listener, access, hello)
     output.remark(f"the team's page: {access.url()}")
     if access.reachable:
         if options.mission is None:

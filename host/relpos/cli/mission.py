@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 DEMO_NODES = 6
 DEMO_S = 1800.0
+PATIENCE_S = 5.0
+"""How long a mission waits for its page's port."""
 
 
 def mission(
@@ -67,7 +69,7 @@ def mission(
     """
     from relpos.link.port import check_port
     from relpos.live.mission import ABOUT, Mission
-    from relpos.view.access import DEFAULT_PORT, free_port, parse_listen
+    from relpos.view.access import DEFAULT_PORT, listen
 
     if invite is not None:
         _print_invitation(Mission.open(folder), invite, view_listen)
@@ -76,42 +78,59 @@ def mission(
     found = Mission.open(folder, source if known else source or "", name)
     found.about.post = post or found.about.post
     with found.lock():
-        if found.about.source:
-            check_port(found.about.source)
-        host, port = parse_listen(view_listen or "0.0.0.0")
-        if found.about.port is not None and ":" not in (view_listen or "").strip("[]"):
-            port = found.about.port
-        elif port in (0, DEFAULT_PORT):
-            port = free_port(host, port)
-        found.about.port = port
-        listen = f"{host}:{port}" if ":" not in host else f"[{host}]:{port}"
-        options = live.Options(True, listen, https, open_browser, seconds)
-        if found.about.source:
-            _run(found, options, estimator, key_file, common=initial is Initial.COMMON)
-        else:
-            _run_chosen(found, options, estimator, key_file)
+        if source:
+            check_port(source)
+        before = found.about.port
+        # The page's server outlives a session that was killed, for a moment.
+        patience_s = 0.0 if before is None else PATIENCE_S
+        door, access = listen(view_listen or "0.0.0.0", before or DEFAULT_PORT, patience_s)
+        with door:
+            if before not in (None, access.port):
+                output.remark(f"the page was at port {before}: devices open its new address")
+            # On the disk before anybody has the address.
+            found.about.port = access.port
+            found.save()
+            options = live.Options(
+                True, view_listen, https, open_browser, seconds, door=(door, access)
+            )
+            common = initial is Initial.COMMON
+            if source:
+                _run(found, options, estimator, key_file, common=common)
+            else:
+                _run_chosen(found, options, estimator, key_file, common=common)
 
 
 def _run_chosen(
-    found: Mission, options: live.Options, estimator: str, key_file: Path | None
+    found: Mission,
+    options: live.Options,
+    estimator: str,
+    key_file: Path | None,
+    *,
+    common: bool,
 ) -> None:
-    """Run sessions that are started and ended on the page, until Ctrl-C or the options' end."""
-    from relpos.cli.waiting import choose
+    """Run sessions that are started and ended on the page, until Ctrl-C or the options' end.
+
+    A mission with a source goes on at once, or as soon as its port is there.
+    """
+    from relpos.cli.waiting import Choice, choose
     from relpos.errors import RelposError, words_of
+
+    source = found.about.source
+    choice = Choice(source, found.about.name, common) if source else None
 
     Job("", estimator, {}, 0, found.path).prepare()
     end_s = math.inf if options.seconds is None else time.monotonic() + options.seconds
-    trouble = ""
+    trouble, awaited = "", ""
     while (left_s := end_s - time.monotonic()) > 0.0:
-        choice = choose(found, options, trouble, left_s)
+        if choice is None:
+            choice = choose(found, options, trouble, left_s, awaited)
+            options = replace(options, open_browser=False)
         if choice is None:
             return
         left_s = end_s - time.monotonic()
-        options = replace(
-            options, open_browser=False, seconds=None if math.isinf(left_s) else max(left_s, 0.0)
-        )
+        options = replace(options, seconds=None if math.isinf(left_s) else max(left_s, 0.0))
         try:
-            if choice.is_port:
+            if choice.source == found.about.source:
                 outcome = _run(found, options, estimator, key_file, common=choice.common)
             else:
                 outcome = _exercise(found, choice, options, estimator)
@@ -119,8 +138,10 @@ def _run_chosen(
             known = isinstance(error, RelposError | OSError)
             trouble = words_of(error) if known else f"the session has failed: {error!r}"
             output.remark(trouble)
+            awaited = choice.source if choice.source == found.about.source else ""
+            choice = None
             continue
-        trouble = ""
+        choice, trouble, awaited = None, "", ""
         if not outcome.ended_on_page:
             return
 

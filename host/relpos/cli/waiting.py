@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from relpos.cli import live, output
-from relpos.errors import RelposError, words_of
+from relpos.errors import DeviceError, RelposError, words_of
 from relpos.said import Said, refusal
 
 if TYPE_CHECKING:
@@ -47,6 +47,17 @@ class Choice:
 
         return self.source != DEMO and sources.is_port(self.source)
 
+    @property
+    def is_missing(self) -> bool:
+        """Whether there is no such port."""
+        from relpos.link.port import check_port
+
+        try:
+            check_port(self.source)
+        except DeviceError:
+            return True
+        return False
+
     def check(self) -> None:
         """Raise RelposError where nothing can be opened there."""
         from relpos.link.port import check_port
@@ -60,10 +71,13 @@ class Choice:
             raise RelposError(f"{self.source}: no such port, recording or run directory")
 
 
-def choose(mission: Mission, options: live.Options, trouble: str, seconds: float) -> Choice | None:
+def choose(
+    mission: Mission, options: live.Options, trouble: str, seconds: float, awaited: str = ""
+) -> Choice | None:
     """Serve the page until a source is chosen; None after ``seconds``, and after Ctrl-C.
 
-    ``trouble`` is why the session before has failed.
+    ``trouble`` is why the session before has failed; the port ``awaited``, if it is missing, is
+    chosen once it is there.
     """
     from relpos.live.assembly import MissionPlan
     from relpos.live.mission import JOURNAL, Journal, Resumed
@@ -80,6 +94,8 @@ def choose(mission: Mission, options: live.Options, trouble: str, seconds: float
         elif event["kind"] == "log":
             page.logged(event["entry"])
     end_s = time.monotonic() + seconds
+    waited = Choice(awaited, about.name, common=False)
+    is_missing = bool(awaited) and waited.is_missing
     with contextlib.suppress(KeyboardInterrupt), contextlib.closing(page):
         try:
             while time.monotonic() < end_s:
@@ -92,6 +108,8 @@ def choose(mission: Mission, options: live.Options, trouble: str, seconds: float
                         continue
                     if choice is not None:
                         return choice
+                if is_missing and not waited.is_missing:
+                    return waited
                 time.sleep(LOOK_S)
         finally:
             journal.close()
@@ -119,7 +137,7 @@ def _answer(
             return None
         mission.about.name = choice.name
         if choice.is_port:
-            mission.about.source = choice.source
+            mission.about.source, mission.about.common = choice.source, choice.common
         mission.save()
         page.respond(request, {"done": True})
         return choice

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import errno
 import hashlib
 import ipaddress
 import re
@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlencode
 
 from relpos.errors import DeviceError, RelposError
@@ -20,6 +21,7 @@ from relpos.view.devices import Gate, Role
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8460
+LOOK_S = 0.1
 TOKEN_BYTES = 16
 """128 bits: they cannot be guessed, and the QR code stays coarse enough for a wet screen."""
 
@@ -127,48 +129,49 @@ class Allowance:
         return allowed
 
 
-def parse_listen(address: str) -> tuple[str, int]:
+def parse_listen(address: str) -> tuple[str, int | None]:
     """Split HOST:PORT, HOST or :PORT; RelposError where it is none of them."""
     found = re.fullmatch(r"(?:\[([0-9a-fA-F:.]+)\]|([^:\s/\[\]]*))(?::(\d{1,5}))?", address)
-    number = DEFAULT_PORT if found is None or found[3] is None else int(found[3])
-    if found is None or number > 65535:
+    number = None if found is None or found[3] is None else int(found[3])
+    if found is None or (number or 0) > 65535:
         raise RelposError(f"--view-listen {address}: not HOST:PORT, like 0.0.0.0:{DEFAULT_PORT}")
     return found[1] or found[2] or DEFAULT_HOST, number
 
 
-def listen(address: str | None) -> tuple[socket.socket, Access]:
+def listen(
+    address: str | None, usual: int = DEFAULT_PORT, patience_s: float = 0.0
+) -> tuple[socket.socket, Access]:
     """Listen at HOST:PORT, or on this computer alone where none is given.
 
-    A port that was asked for and is taken is a DeviceError; the usual one taken gives another.
+    A port that is taken may become free within ``patience_s``. One that was asked for and stays
+    taken is a DeviceError; where none was asked for, it is the ``usual`` one, or another.
     """
-    host, port = parse_listen(address) if address is not None else (DEFAULT_HOST, DEFAULT_PORT)
+    host, asked = parse_listen(address or DEFAULT_HOST)
+    port = usual if asked is None else asked
     try:
         family, _, _, _, where = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
     except OSError as error:
         raise DeviceError(f"{host}: cannot listen there: {error.strerror or error}") from None
-    try:
-        listener = _bind(family, where)
-    except OSError as error:
-        if address is not None:
-            raise DeviceError(
-                f"{host}:{port}: cannot listen there: {error.strerror or error}"
-            ) from None
-        listener = _bind(family, (where[0], 0, *where[2:]))
+    end_s = time.monotonic() + patience_s
+    while True:
+        try:
+            listener = _bind(family, where)
+            break
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE and time.monotonic() < end_s:
+                time.sleep(LOOK_S)
+            elif asked is None and where[1] != 0:
+                where = (where[0], 0, *where[2:])
+            else:
+                raise DeviceError(
+                    f"{host}:{port}: cannot listen there: {error.strerror or error}"
+                ) from None
     return listener, Access(int(listener.getsockname()[1]), hosts_of(host))
 
 
-def free_port(host: str, wanted: int) -> int:
-    """Return the wanted port where it is free, else another one that is."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    for port in (wanted, 0):
-        with contextlib.suppress(OSError), _bind(family, (host, port)) as probe:
-            return int(probe.getsockname()[1])
-    return wanted
-
-
-def _bind(family: int, where: tuple[object, ...]) -> socket.socket:
+def _bind(family: int, where: tuple[Any, ...]) -> socket.socket:
     listener = socket.socket(family, socket.SOCK_STREAM)
     try:
         exclusive = getattr(socket, "SO_EXCLUSIVEADDRUSE", None)

@@ -1,0 +1,43 @@
+"""The end of a session: after Ctrl-C nobody waits for what is not needed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from relpos.cli import fuse, live
+from relpos.live.session import Outcome
+
+TEAM: Any = SimpleNamespace(name="/dev/pts/9", is_now=True)
+
+
+def test_a_session_that_is_ended_does_not_ask_whether_its_emulated_walk_is_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live, "run", lambda *_: Outcome())
+    asked: list[bool] = []
+
+    def over() -> bool:  # It waits for the emulator's process.
+        asked.append(True)
+        return True
+
+    job = fuse.Job("emulated", "bank", {}, 0, tmp_path)
+    fuse.fuse_live(job, TEAM, live.Options(), as_json=False, emulated=over)
+    assert asked == []
+
+
+def test_a_second_ctrl_c_leaves_the_debrief_for_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(live, "run", lambda *_: Outcome(estimates=1))
+    monkeypatch.setattr("relpos.api.load", interrupted)
+    job = fuse.Job("emulated", "bank", {}, 0, tmp_path)
+    fuse.fuse_live(job, TEAM, live.Options(view=True), as_json=False)
+    said = capsys.readouterr().err
+    assert f"relpos report {tmp_path / 'received'} --estimate {tmp_path}" in said
