@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import stat
 import time
 from pathlib import Path
 
@@ -164,6 +165,14 @@ def test_an_event_is_confirmed_once_the_disk_has_it(tmp_path, monkeypatch):
     journal.close()
     assert [json.loads(line)["name"] for line in path.read_text().splitlines()] == ["Anna"]
     assert journal.trouble is None
+
+
+def test_what_was_saved_is_the_new_file_after_a_power_cut_not_the_one_before(tmp_path, monkeypatch):
+    mission = Mission.open(tmp_path / "m", "/dev/null")
+    synced = []
+    monkeypatch.setattr(os, "fsync", lambda h: synced.append(stat.S_ISDIR(os.fstat(h).st_mode)))
+    mission.save()
+    assert synced == [False, True], "what is in it, then that it has taken the other's place"
 
 
 def test_a_line_that_a_power_cut_left_half_costs_no_other_line(tmp_path):

@@ -1,4 +1,4 @@
-"""Kills: the session, the page's server, the browser, all of them, while something is under way."""
+"""Kills: session, page's server, browser, estimator, all, while something is under way."""
 
 from __future__ import annotations
 
@@ -39,14 +39,19 @@ class Field:
 
     def __init__(self, folder: Path, *, started: bool = True) -> None:
         self.folder = folder
+        self.fails = folder.with_name("fails")
+        """Makes the estimator fail."""
         self.team = self.run("emulate", "--nodes", "3")
         self.port = output_of(self.team, "/dev/\\S+")
         if started:
-            self.address = self.start(self.port, "--name", "Old mill", "--initial", "common")
+            estimator = f"{Path(__file__).with_name('failing_estimator.py')}:make"
+            words = ("--name", "Old mill", "--initial", "common", "--estimator", estimator)
+            self.address = self.start(self.port, *words)
 
     def run(self, *arguments: str) -> subprocess.Popen[str]:
         command = [*RELPOS, *arguments]
         options: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        options["env"] = {**os.environ, "RELPOS_FAILS": str(self.fails)}
         return subprocess.Popen(command, text=True, start_new_session=True, **options)
 
     def start(self, *more: str) -> str:
@@ -57,6 +62,10 @@ class Field:
     def kill(self, what: str) -> None:
         if what == "browser":
             return  # The test closes it.
+        if what == "estimator":
+            self.fails.touch()
+            wait_for(lambda: not self.fails.exists())
+            return
         if what == "server":
             killed = self.servers()
             for server in killed:
@@ -167,7 +176,7 @@ def clocks() -> dict[str, Any]:
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("killed", ["session", "server", "browser", "all"])
+@pytest.mark.parametrize("killed", ["session", "server", "browser", "estimator", "all"])
 def test_what_was_confirmed_is_there_again_five_seconds_after_a_kill(
     browser: Any, field: Field, tmp_path: Path, killed: str
 ) -> None:
@@ -220,7 +229,8 @@ def test_what_was_confirmed_is_there_again_five_seconds_after_a_kill(
     wait_for(lambda: any("points" in e for e in Mission.open(field.folder).events()))
     expect(page.locator("#markers li")).to_have_count(1)
     page.locator("#show-log").click()
-    for words in ("node 2 is Ben", "alarms of", "is at landmark 7", "is at landmark 9"):
+    logged = ["node 2 is Ben", "alarms of", "is at landmark 7", "is at landmark 9"]
+    for words in [*logged, *["the fusion has failed"] * (killed == "estimator")]:
         expect(page.locator("#log")).to_contain_text(words)
     page.keyboard.press("Escape")
     wait_for(lambda: "3 of 3 people located" in page.locator("#map-words").inner_text())

@@ -496,3 +496,10 @@ def _replace(path: Path, data: bytes, *, sync: bool = True, mode: int = 0o666) -
             file.flush()
             os.fsync(file.fileno())
     beside.replace(path)
+    if sync and os.name == "posix":
+        # Without this a power cut may bring the old one back.
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
