@@ -85,6 +85,12 @@ def test_a_node_without_trouble_stays_green(changes):
     assert assess(but(**changes))[0] is Health.GREEN
 
 
+def test_a_node_whose_parts_have_not_answered_yet_is_starting_and_lacks_none_of_them():
+    nothing = dict.fromkeys(("imu", "magnetometer", "pozyx", "pressure", "beacon"), False)
+    assert assess(but(**nothing, uptime_s=1.0)) == (Health.YELLOW, ["starting"])
+    assert len(assess(but(**nothing, uptime_s=11.0))[1]) == 5
+
+
 def test_the_worst_comes_first():
     colour, reasons = assess(but(silent_s=9.0, pozyx=False))
     assert colour is Health.RED

@@ -32,8 +32,8 @@ RSSI_YELLOW_DBM = -86
 """An XBee Series 1 hears down to -92 dBm (data sheet, from memory: check); a body that turns takes
 more than the 6 dB that are left."""
 STARTING_S = 8.0
-"""Sensors answer within a second of power-on; the first status of a node comes before they do, and
-the next one 10 s later."""
+"""Sensors answer within a second of power-on, a beacon comes soon after; the first status of a node
+comes before they do, and the next one 10 s later."""
 STARTING = "starting"
 FRESH_START_S = 60.0
 """How long an unwanted restart is reported."""
@@ -94,10 +94,18 @@ def _reasons(f: HealthInputs) -> Iterator[tuple[Health, str]]:
         yield red, Said("silent", "silent for {seconds:.0f} s", seconds=f.silent_s)
     elif not f.status:
         yield yellow, Said("no-status", "no status heard yet")
-    if f.imu is False and (f.uptime_s or 0.0) < STARTING_S:
-        yield yellow, Said("starting", STARTING)
-    elif f.imu is False:
-        yield red, Said("no-imu", "inertial sensor missing")
+    parts = (f.magnetometer, "magnetometer"), (f.pozyx, "Pozyx"), (f.pressure, "pressure sensor")
+    missing = [what for there, what in parts if there is False]
+    if f.uptime_s is not None and f.uptime_s < STARTING_S:
+        if missing or f.imu is False or f.beacon is False:
+            yield yellow, Said("starting", STARTING)
+    else:
+        if f.imu is False:
+            yield red, Said("no-imu", "inertial sensor missing")
+        for what in missing:
+            yield yellow, Said("missing", "{part} missing", part=what)
+        if f.beacon is False:
+            yield yellow, Said("no-beacon", "receives no beacon")
     if f.loss is not None and f.loss > LOSS_YELLOW:
         colour = red if f.loss > LOSS_RED else yellow
         yield colour, Said("loss", "{percent:.0f} % of frames lost", percent=100 * f.loss)
@@ -107,15 +115,6 @@ def _reasons(f: HealthInputs) -> Iterator[tuple[Health, str]]:
         yield colour, Said("supply", "supply {volts:.2f} V", volts=f.battery_v)
     if f.unwanted_start is not None and (f.uptime_s or 0.0) < FRESH_START_S:
         yield yellow, Said("restarted", "restarted ({cause})", cause=f.unwanted_start)
-    for there, what in (
-        (f.magnetometer, "magnetometer"),
-        (f.pozyx, "Pozyx"),
-        (f.pressure, "pressure sensor"),
-    ):
-        if there is False:
-            yield yellow, Said("missing", "{part} missing", part=what)
-    if f.beacon is False:
-        yield yellow, Said("no-beacon", "receives no beacon")
     if (
         f.ranging is not None
         and f.exchanges >= MIN_EXCHANGES
