@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from relpos.fusion.vertical import episodes
-from relpos.fusion.vertical.episodes import Beliefs, Interval, Mode, Update
+from relpos.fusion.vertical.episodes import Beliefs, Interval, Update
 from relpos.fusion.vertical.heights import UNSEEN_S
+from relpos.fusion.vertical.modes import Mode
 from relpos.measurements import Height
 
 LEAST_FALL_M = 0.9
@@ -53,17 +54,16 @@ class FallDetector:
         if self._beliefs is None or since_s > UNSEEN_S:
             self._begin(height_m, variance_m2)
             return False
-        nobody = np.array([False])
         interval = Interval(
             since_s, np.array([since_s]), np.array([steps]), height_m, variance_m2,
-            nobody, np.array([np.nan]), np.array([self._walked]),
+            np.array([self._walked]),
         )  # fmt: skip
         update = episodes.update(self._beliefs, interval)
         self._beliefs, self._walked = update.beliefs, steps > 0.0
         self._recent.append((update, rise_m))
         fell = episodes.smooth([one for one, _ in self._recent])
         fallen_m = -sum(
-            float(modes[0, Mode.FALLING]) * rise
+            float(modes[0, 0, Mode.FALLING]) * rise
             for modes, (_, rise) in zip(fell, self._recent, strict=True)
         )
         if fallen_m < LEAST_FALL_M:
@@ -72,5 +72,5 @@ class FallDetector:
         return True
 
     def _begin(self, height_m: episodes.Floats, variance_m2: episodes.Floats) -> None:
-        self._beliefs = episodes.begin(height_m, variance_m2)
+        self._beliefs = episodes.begin(height_m, variance_m2, airs=1)
         self._recent.clear()

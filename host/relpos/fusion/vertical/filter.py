@@ -25,19 +25,8 @@ from relpos.fusion.estimator import Episode, Vertical
 from relpos.fusion.models.pressure import FAST_S
 from relpos.fusion.timeline import Advance
 from relpos.fusion.vertical import episodes
-from relpos.fusion.vertical.episodes import (
-    CLIMBS_COMMON,
-    DOWN,
-    LASTING,
-    PRESSURE,
-    STAIRS,
-    UNDER_WAY,
-    UP,
-    Beliefs,
-    Interval,
-    Mode,
-    Update,
-)
+from relpos.fusion.vertical.air import common_rise
+from relpos.fusion.vertical.episodes import Beliefs, Interval, Update
 from relpos.fusion.vertical.floors import CERTAIN, LOWEST, SPACING_M, Floors, Over, most_probable
 from relpos.fusion.vertical.heights import (
     FAST,
@@ -49,6 +38,7 @@ from relpos.fusion.vertical.heights import (
     Heights,
     Z,
 )
+from relpos.fusion.vertical.modes import DOWN, FOLLOWS, PRESSURE, STAIRS, UP, Air, Mode
 from relpos.fusion.vertical.stairs import true_shares
 from relpos.fusion.vertical.track import Moved, Track
 from relpos.measurements import Height, Range
@@ -75,13 +65,8 @@ LEAST_CLIMB_M = 0.85
 """Less within ``LAG_S`` is told as level: gusts, a door of 10 Pa. With doors and heat (seeds 100 to
 102) 0.45 m tells 8.0 false flights an hour, 0.7 m 4.5, 0.9 m 2.0, and finds 96 % of true ones."""
 
-WITNESS_S = 5.0
-"""Pressure that jumps at one node may do so at others for so long."""
 STANDS_STEPS = 0.3
 """Who makes fewer steps in an interval stands, and sees what the pressure does alone."""
-
-MANY, ALIKE_M = 3, 0.12
-"""So many others whose heights rise alike, up to a deviation, show what the pressure does, too."""
 
 DOUBTED = 0.6
 """What of a rise is the wearer's and what the pressure's is doubtful by this share (a standard
@@ -135,17 +120,33 @@ class _Interval:
     share: Floats = field(init=False)
     """Of the displacements that is true."""
 
-    def pressed_m(self, modes: Floats) -> Floats:
-        """Return how much of a climber's rise is the pressure's (N,), by the modes (N, MODES)."""
-        reported = self.reported
-        stairs_m = episodes.RISER_M * reported.steps
-        pressed = np.zeros_like(stairs_m)
-        for mode, sign in zip(CLIMBS_COMMON, (1.0, -1.0), strict=True):
-            # What nobody else shows is what steps do not make.
-            unknown_m = self.rise_m - sign * stairs_m
-            of_all = np.where(np.isnan(reported.common_m), unknown_m, reported.common_m)
-            pressed += modes[:, mode] * of_all
-        return pressed
+    def happened(self, probability: Floats) -> Happened:
+        """Return what did, by the probabilities (N, AIRS, MODES)."""
+        mode = probability.sum(axis=1)
+        blown = probability[:, Air.BLOWN]
+        pressed = mode[:, PRESSURE].sum(axis=1)
+        common_m = common_rise(self.update.blown, blown)
+        felt = blown @ FOLLOWS
+        climbed = felt - blown[:, Mode.LEVEL] - blown[:, Mode.JUMP]
+        return Happened(
+            1.0 - mode[:, Mode.LEVEL] - pressed,
+            pressed + blown[:, Mode.LEVEL],
+            felt * common_m,
+            climbed * common_m,
+        )
+
+
+class Happened(NamedTuple):
+    """What N nodes and the air probably did in an interval."""
+
+    moving: Floats
+    """Probability that the wearer rose or fell."""
+    disturbed: Floats
+    """That the pressure did alone."""
+    common_m: Floats
+    """How much the air let all heights rise."""
+    pressed_m: Floats
+    """How much of that is in the rises of those who moved."""
 
 
 @dataclass(slots=True)
@@ -167,11 +168,10 @@ class VerticalFilter:
     """Belief before the open intervals."""
     _open: list[_Interval] = field(default_factory=list)
     _smoothed: list[Floats] = field(default_factory=list)
-    """Probabilities of the modes in each open interval."""
+    """Probabilities of airs and modes in each open interval."""
+    _happened: list[Happened] = field(default_factory=list)
     _first_s: float = math.inf
     _closed_s: float = -math.inf
-    _witnessed: dict[int, float] = field(default_factory=dict)
-    """Row -> when its pressure was last seen to be disturbed, while it stood."""
     _level_s: Floats = field(default_factory=lambda: np.empty(0))
     """How long each has been level since it last changed its height."""
     _level_steps: Floats = field(default_factory=lambda: np.empty(0))
@@ -182,10 +182,7 @@ class VerticalFilter:
     _doubt_m: Floats = field(default_factory=lambda: np.empty(0))
     """Standard deviation, signed, of what each climbed since: a rise that is the wearer's for one
     and the pressure's for another is taken from the other. What cancels was no climb."""
-    _heights_before: Floats = field(default_factory=lambda: np.empty(0))
-    """Newest heights at the end of the last interval."""
     _walked: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
-    _stands: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
     """In the last interval."""
     _settled: npt.NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
 
@@ -232,9 +229,7 @@ class VerticalFilter:
         self._decided = self._beliefs
         self._level_s = np.append(self._level_s, 0.0)
         self._level_steps = np.append(self._level_steps, 0.0)
-        self._heights_before = np.append(self._heights_before, track.height_m)
         self._walked = np.append(self._walked, False)
-        self._stands = np.append(self._stands, False)
         # Otherwise heights are over a common ground, and it does not start where the others do.
         at_start = not late and abs(track.height_m) <= 1.0
         self._settled = np.append(self._settled, at_start)
@@ -272,6 +267,9 @@ class VerticalFilter:
             return []
         self._observe(time_s)
         self._smoothed = episodes.smooth([one.update for one in self._open])
+        self._happened = [
+            one.happened(p) for one, p in zip(self._open, self._smoothed, strict=True)
+        ]
         corrections = self._corrections(time_s)
         self._decide(time_s - LAG_S)
         return corrections
@@ -297,8 +295,7 @@ class VerticalFilter:
             self._beliefs = episodes.begin_again(self._beliefs, again, height, variance)
         reported = Interval(
             time_s - begin_s, np.where(again | ~news, 1.0, since_s), steps,
-            np.where(news, height, np.nan), variance, self._witnesses(time_s),
-            self._common_rise(height, news, steps), self._walked,
+            np.where(news, height, np.nan), variance, self._walked,
         )  # fmt: skip
         before = self._height_means()
         update = episodes.update(self._beliefs, reported)
@@ -313,51 +310,10 @@ class VerticalFilter:
                 np.where(absent, unseen_s, 0.0), again, np.array([one.made_m for one in moved]),
             )
         )  # fmt: skip
-        disturbed = update.beliefs.probability[:, LASTING].sum(axis=1) > 0.5
-        seen = np.flatnonzero(disturbed & news & (steps < STANDS_STEPS)).tolist()
-        is_first = any(self._witnessed.get(row, -math.inf) < time_s - WITNESS_S for row in seen)
-        self._witnessed.update(dict.fromkeys(seen, time_s))
-        if is_first:
-            self._repeat()
-        # One who fell, or who rides a lift, is no witness of the weather.
-        under_way = update.beliefs.probability[:, UNDER_WAY].sum(axis=1) > 0.5
-        self._stands = (steps < STANDS_STEPS) & ~under_way
         self._walked = np.where(news, steps > STANDS_STEPS, self._walked)
-        self._heights_before = np.where(news, height, self._heights_before)
-
-    def _witnesses(self, time_s: float) -> npt.NDArray[np.bool_]:
-        """Return who has somebody else whose pressure is disturbed (N,)."""
-        recent = [row for row, seen_s in self._witnessed.items() if seen_s > time_s - WITNESS_S]
-        witnessed = np.full(len(self._row), bool(recent))
-        if len(recent) == 1:
-            witnessed[recent[0]] = False
-        return witnessed
-
-    def _repeat(self) -> None:
-        """Go over the open intervals again: somebody who stands has seen disturbed pressure."""
-        self._beliefs = self._decided
-        for one in self._open:
-            reported = one.reported._replace(witnessed=self._witnesses(one.end_s))
-            self._beliefs = episodes.begin_again(
-                self._beliefs, one.again, reported.height_m, reported.variance_m2
-            )
-            before = self._height_means()
-            one.update = episodes.update(self._beliefs, reported)
-            self._beliefs = one.update.beliefs
-            one.rise_m = self._height_means() - before
-
-    def _common_rise(self, height_m: Floats, news: npt.NDArray[np.bool_], steps: Floats) -> Floats:
-        """Return by how much all others rose (N,): those who stand, or many alike; else NaN."""
-        stands = news & self._stands & (steps < STANDS_STEPS)
-        rise = height_m - self._heights_before
-        common = _others_mean(rise, stands, 1)
-        alike = _others_mean(rise, news, MANY)
-        mean_m = rise[news].mean() if news.any() else 0.0
-        spread = _others_mean((rise - mean_m) ** 2, news, MANY)
-        return np.where(np.isnan(common) & (spread < ALIKE_M**2), alike, common)
 
     def _height_means(self) -> Floats:
-        mean: Floats = (self._beliefs.probability * self._beliefs.mean_m).sum(axis=1)
+        mean: Floats = (self._beliefs.probability * self._beliefs.mean_m).sum(axis=(1, 2))
         return mean
 
     def _corrections(self, time_s: float) -> list[Advance]:
@@ -367,11 +323,14 @@ class VerticalFilter:
             np.array([one.way_m for one in self._open]),
             np.array(
                 [
-                    one.rise_m - one.pressed_m(modes)
-                    for one, modes in zip(self._open, self._smoothed, strict=True)
+                    one.rise_m - happened.pressed_m
+                    for one, happened in zip(self._open, self._happened, strict=True)
                 ]
             ),
-            *(np.array([p[:, way].sum(axis=1) for p in self._smoothed]) for way in (UP, DOWN)),
+            *(
+                np.array([p[:, :, way].sum(axis=(1, 2)) for p in self._smoothed])
+                for way in (UP, DOWN)
+            ),
         )
         total = sum(
             share * one.moved - one.made for share, one in zip(shares, self._open, strict=True)
@@ -398,18 +357,16 @@ class VerticalFilter:
     def _decide(self, until_s: float) -> None:
         """Decide what happened in the intervals that ended by then."""
         count = sum(one.end_s <= until_s for one in self._open)
-        for one, modes in zip(self._open[:count], self._smoothed[:count], strict=True):
-            self._apply(one, modes)
+        for one, happened in zip(self._open[:count], self._happened[:count], strict=True):
+            self._apply(one, happened)
             self._decided = one.update.beliefs
-        del self._open[:count], self._smoothed[:count]
+        del self._open[:count], self._smoothed[:count], self._happened[:count]
 
-    def _apply(self, one: _Interval, modes: Floats) -> None:
+    def _apply(self, one: _Interval, happened: Happened) -> None:
         """Let what happened in an interval move the heights."""
         duration_s = one.end_s - one.begin_s
-        disturbed = modes[:, PRESSURE].sum(axis=1)
-        moving = 1.0 - modes[:, Mode.LEVEL] - disturbed
         heights = self.heights
-        pressed_m = one.pressed_m(modes)
+        moving, disturbed, common_m, pressed_m = happened
         heights.advance(duration_s, one.rise_m, moving, disturbed, one.silent_s, pressed_m)
         heights.moved(moving * 2.0 * one.reported.variance_m2)
         heights.correct(one.reported.height_m, one.reported.variance_m2)
@@ -420,13 +377,9 @@ class VerticalFilter:
         self._level_steps = np.where(moves, 0.0, self._level_steps + one.reported.steps)
         self._settled &= ~unseen
         walks = (moving > 0.5) | (one.reported.steps > STANDS_STEPS)
-        others_m = (disturbed * one.rise_m).sum() / np.maximum((1.0 - moving).sum(), 1.0)
-        # All others climb together, or a fan blows while they walk.
-        alike_m = np.nan_to_num(one.reported.common_m)
-        others_m = np.where(np.abs(alike_m) > np.abs(others_m), alike_m, others_m)
         pressed_m = pressed_m + disturbed * one.rise_m
         self._doubt_m *= np.where(self._settled, math.exp(-duration_s / FAST_S), 1.0)
-        self._doubt_m += _doubted_m(moving, one.rise_m, pressed_m - walks * others_m)
+        self._doubt_m += _doubted_m(moving, one.rise_m, pressed_m - walks * common_m)
         # Who walks while the pressure rises for others, but not here, may have climbed.
         self._settled &= (np.abs(self._doubt_m) < LEAST_CLIMB_M) | ~walks
         kept = np.where(self._settled & ~walks, POSTURE_M, math.inf)
@@ -500,12 +453,11 @@ class VerticalFilter:
             return AT_POST if at_post else self._unmeasured(time_s)
         climbed = risen_m = unseen_m2 = 0.0
         doubt_m = self._doubt_m[row]
-        for one, modes in zip(self._open, self._smoothed, strict=True):
-            moving = 1.0 - modes[row, Mode.LEVEL] - modes[row, PRESSURE].sum()
+        for one, modes, happened in zip(self._open, self._smoothed, self._happened, strict=True):
+            moving, pressed_m = float(happened.moving[row]), float(happened.pressed_m[row])
             rise = one.rise_m[row]
-            pressed_m = one.pressed_m(modes)[row]
             risen_m += moving * rise - pressed_m
-            climbed += modes[row, STAIRS].sum() * rise - pressed_m
+            climbed += modes[row, :, STAIRS].sum() * rise - pressed_m
             undecided_m = math.sqrt(max(moving * (1.0 - moving), 0.0)) * rise
             doubt_m += -undecided_m if moving > 0.5 else undecided_m
             unseen_m2 += UNSEEN_M**2 * one.silent_s[row]
@@ -519,10 +471,12 @@ class VerticalFilter:
             told[_CLIMBS] = 0.0
         k = int(np.argmax(told))
         where, steps = self.floors.probability[row], self._level_steps[row]
-        stays = self._settled[row] and all(p[row, Mode.LEVEL] >= 0.5 for p in self._smoothed)
+        stays = self._settled[row] and all(
+            p[row, : Air.BLOWN, Mode.LEVEL].sum() >= 0.5 for p in self._smoothed
+        )
         if not stays:
             for one, modes in zip(self._open, self._smoothed, strict=True):
-                steps = steps * modes[row, Mode.LEVEL] + one.reported.steps[row]
+                steps = steps * modes[row, : Air.BLOWN, Mode.LEVEL].sum() + one.reported.steps[row]
             own_m2 = self.heights.covariance[row, Z, Z] + unseen_m2 + doubt_m**2
             climbed_m = self.heights.mean[row, Z] + risen_m
             over = Over(self._over.mean_m[row] + risen_m, self._over.variance_m2[row])
@@ -558,14 +512,6 @@ def _doubted_m(moving: Floats, rise_m: Floats, pressed_m: Floats) -> Floats:
     undecided_m = np.where(climbed, -undecided_m, undecided_m)
     pressed_m = DOUBTED * pressed_m
     return np.where(np.abs(undecided_m) > np.abs(pressed_m), undecided_m, pressed_m)
-
-
-def _others_mean(values: Floats, counted: npt.NDArray[np.bool_], least: int) -> Floats:
-    """Return for each (N,) the mean over all others that are counted; NaN for fewer."""
-    kept = np.where(counted, values, 0.0)
-    others = counted.sum() - counted
-    mean: Floats = (kept.sum() - kept) / np.where(others >= least, others, math.nan)
-    return mean
 
 
 AT_POST = Vertical(0.0, START_M, Episode.LEVEL, 1.0, 0, 1.0)

@@ -1,0 +1,83 @@
+"""What a team's heights say of the air together.
+
+In air that is blown all heights rise alike, by an unknown common rise. Given that rise, nodes are
+independent: so the probability of the team's heights is a product over nodes for each rise, and
+what the others say to one node is the product without its own.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from relpos.fusion.normal import normal_density
+from relpos.fusion.vertical.modes import FOLLOWS, Air
+
+Floats = npt.NDArray[np.float64]
+
+FAN_M_S = 0.25
+"""Pressure of a fan, in metres a second: 25 Pa within 10 s are 0.21."""
+
+RISES = np.linspace(-3.0, 3.0, 41)
+"""Common rises that are considered, over their deviation."""
+_LOG_PRIOR = -0.5 * RISES**2 - np.log(np.exp(-0.5 * RISES**2).sum())
+
+
+class Expected(NamedTuple):
+    """What each of N nodes reported in an interval against what its modes expect, (N, MODES)."""
+
+    off_m: Floats
+    """How much more the height rose than in a mode in calm air; NaN without news."""
+    variance_m2: Floats
+    duration_s: float
+
+
+class Others(NamedTuple):
+    """What the others say to each of N nodes."""
+
+    evidence: Floats
+    """How probable they find each air (N, AIRS), relative to the most probable."""
+    rise_m: Floats
+    """The common rise in blown air (N,)."""
+    rise_m2: Floats
+    """Its variance."""
+
+
+def of_others(in_calm: Floats, blown: Expected, modes: Floats) -> Others:
+    """Return what the others say; ``in_calm`` (N, AIRS) is how probable each finds its own height.
+
+    ``modes`` (N, MODES) are the probabilities of each one's modes in blown air.
+    """
+    own = np.log(np.maximum(in_calm, 1e-200))
+    evidence = own.sum(axis=0) - own
+    rises_m, by_rise = _by_rise(blown, modes)
+    others = by_rise.sum(axis=0) - by_rise + _LOG_PRIOR
+    highest = others.max(axis=1)
+    density = np.exp(others - highest[:, None])
+    mass = density.sum(axis=1)
+    evidence[:, Air.BLOWN] = np.log(mass) + highest
+    rise_m = density @ rises_m / mass
+    return Others(
+        np.exp(np.maximum(evidence - evidence.max(axis=1, keepdims=True), -70.0)),
+        rise_m,
+        density @ rises_m**2 / mass - rise_m**2,
+    )
+
+
+def common_rise(blown: Expected, modes: Floats) -> float:
+    """Return how much the air let all heights rise (m), if it was blown, by what each did."""
+    rises_m, by_rise = _by_rise(blown, modes)
+    together = by_rise.sum(axis=0) + _LOG_PRIOR
+    density = np.exp(together - together.max())
+    return float(density @ rises_m / density.sum())
+
+
+def _by_rise(blown: Expected, modes: Floats) -> tuple[Floats, Floats]:
+    """Return common rises (R,) and how probable each of N nodes finds them, as logarithms (N, R)."""
+    rises_m = RISES * FAN_M_S * blown.duration_s
+    off_m = np.nan_to_num(blown.off_m)[:, :, None] - FOLLOWS[:, None] * rises_m
+    density = (modes[:, :, None] * normal_density(off_m, blown.variance_m2[:, :, None])).sum(axis=1)
+    news = np.isfinite(blown.off_m[:, :1])
+    return rises_m, np.log(np.where(news, np.maximum(density, 1e-200), 1.0))
