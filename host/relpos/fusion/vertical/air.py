@@ -75,7 +75,7 @@ def common_rise(blown: Expected, modes: Floats) -> float:
 
 
 def _by_rise(blown: Expected, modes: Floats) -> tuple[Floats, Floats]:
-    """Return common rises (R,) and how probable each of N nodes finds them, as logarithms (N, R)."""
+    """Return common rises (R,) and how probable each node finds them (N, R): logarithms."""
     rises_m = RISES * FAN_M_S * blown.duration_s
     off_m = np.nan_to_num(blown.off_m)[:, :, None] - FOLLOWS[:, None] * rises_m
     density = (modes[:, :, None] * normal_density(off_m, blown.variance_m2[:, :, None])).sum(axis=1)
