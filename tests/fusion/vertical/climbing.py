@@ -54,6 +54,13 @@ def lift(rise_m: float) -> Part:
     return Part(seconds, rise_m=rise_m / seconds)
 
 
+def blown(life: Sequence[Part], from_s: int) -> list[Part]:
+    """Return a life second by second, with a fan that reaches its pressure in ten of them."""
+    seconds = [part._replace(seconds=1) for part in life for _ in range(part.seconds)]
+    fan = range(from_s, from_s + 10)
+    return [p._replace(pressure_m=-0.21) if k in fan else p for k, p in enumerate(seconds)]
+
+
 FAN_ON = Part(10, pressure_m=-0.21)
 FALL = Part(2, rise_m=-0.85)
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from climbing import FALL, FAN_ON, Outcome, Part, follow, lift, stairs, stand, walk
+from climbing import FALL, FAN_ON, Outcome, Part, blown, follow, lift, stairs, stand, walk
 
 from relpos.fusion.estimator import Episode, Vertical
 from relpos.measurements import Range
@@ -82,6 +82,21 @@ def test_a_fan_that_all_walk_through_moves_nobody() -> None:
     outcome = follow(lives)
     for node in range(1, 7):
         assert {v.floor for v in outcome.told[node]} == {0}
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("starts_s", [36, 38, 42])
+def test_a_fan_that_starts_while_most_climb_and_all_walk_moves_nobody_else(
+    seed: int, starts_s: int
+) -> None:
+    climbs = {n: [walk(30 + n), stairs(3.5), walk(60)] for n in range(1, 5)}
+    lives = {**climbs, 5: [walk(105)], 6: [walk(105)]}
+    outcome = follow({n: blown(life, starts_s) for n, life in lives.items()}, seed=seed)
+    for node, floor in zip(range(1, 7), [1] * 4 + [0] * 2, strict=True):
+        assert outcome.told[node][-1].floor == floor
+        assert np.abs(_error_m(outcome, node)).max() < 1.0
+        sure = {v.floor for v in outcome.told[node] if (v.floor_probability or 0.0) > 0.9}
+        assert sure <= {0, floor, None}
 
 
 def test_a_door_is_no_lift() -> None:

@@ -81,9 +81,6 @@ NEAR_M, VAGUE_M, SURE_M = 1.5, 1.0, 0.5
 LOST_M = 2.5
 """Whose pressure differs from the others' by more than any door's or fan's is on another floor."""
 
-BLOWN_M = 2.1
-"""Where the others do not show what a fan does: 25 Pa."""
-
 SETTLES_S = 3.0
 """After so long on the level a node is where it stays."""
 
@@ -408,7 +405,6 @@ class VerticalFilter:
                 pressed_m[row] = np.median(others)
         # Of the bias, and of a height that is no longer reported.
         over_m2 = slow_m2 + np.maximum(heights.covariance.sum(axis=(1, 2)), 0.0)
-        over_m2 += np.where(shown, 0.0, BLOWN_M**2)
         self._over = Over(heights.over_m - pressed_m, over_m2)
         lost = shown & (np.abs(bias_m - pressed_m) > LOST_M + np.sqrt(slow_m2))
         self._settled &= ~lost
