@@ -62,6 +62,7 @@ def test_an_emulated_team_is_seen_walking_lost_found_and_pressing_a_landmark(
 ) -> None:
     running, address = session
     context = browser.new_context(viewport={"width": 1200, "height": 760})
+    context.set_default_timeout(60_000)
     page, phone = context.new_page(), context.new_page()
     hosts, complaints = set(), []
     for opened in (page, phone):

@@ -181,6 +181,7 @@ def test_what_was_confirmed_is_there_again_five_seconds_after_a_kill(
     browser: Any, field: Field, tmp_path: Path, killed: str
 ) -> None:
     context = browser.new_context(viewport={"width": 1366, "height": 768})
+    context.set_default_timeout(60_000)
     page: Page = context.new_page()
     page.goto(field.address)
     expect(page.locator("#people li")).to_have_count(3)
@@ -255,6 +256,7 @@ def test_a_page_that_waits_for_a_source_goes_on_five_seconds_after_a_kill(
     try:
         address = field.start()
         context = browser.new_context()
+        context.set_default_timeout(60_000)
         page: Page = context.new_page()
         page.goto(address)
         expect(page.locator("#source-form")).to_be_visible()

@@ -136,6 +136,7 @@ def test_a_mission_is_started_ended_and_a_recording_of_it_played_on_the_page(
             "mission", str(field.folder), "--view-listen", "127.0.0.1:0", "--no-open"
         )
         context = browser.new_context(viewport={"width": 1366, "height": 768})
+        context.set_default_timeout(60_000)
         page: Page = context.new_page()
         page.goto(output_of(field.session, "http://\\S+"))
         page.locator("#source-path").fill(field.port)

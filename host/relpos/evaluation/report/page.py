@@ -111,6 +111,14 @@ def _duration(seconds: float) -> str:
     return f"{minutes} min {left} s" if minutes else f"{left} s"
 
 
+TILE_WORDS = {
+    Frame.AS_GIVEN: "in the truth's frame: the whole team may have drifted",
+    Frame.PER_RUN: "of the run, laid on the truth once",
+    Frame.PER_EPOCH: "of the team's shape, each second",
+}
+"""What a tile says to who does not know ISO/IEC 18305."""
+
+
 def _tiles(content: Content) -> str:
     """Return the tiles with the main figures."""
     tiles: list[tuple[str, str, str]] = []
@@ -135,8 +143,8 @@ def _tiles(content: Content) -> str:
             tiles.append(
                 (
                     tables.value(one.horizontal.e95_m, "m"),
-                    "CE95",
-                    tables.FRAME_WORDS[frame],
+                    "95 % of errors are less (CE95)",
+                    TILE_WORDS[frame],
                 )
             )
         nees = scored.nees_distance
