@@ -200,6 +200,18 @@ def test_missed_attempts_say_farther_and_received_ones_nearer() -> None:
     assert pull[~graph.attempts.missed].max() < 1e-4
 
 
+def test_the_silence_of_somebody_a_storey_higher_says_nothing_of_the_plane() -> None:
+    run = simulate_paper("paper-h", 3, {"seconds": 100})
+    above = run.priors[0].node
+    graph, _ = build_graph([Height(0.0, above, 3.5), *run.measurements], run.priors)
+    level, _ = build_graph(run.measurements, run.priors)
+    row = level.node_ids.index(above)
+    for one, others_alone in ((level, False), (graph, True)):
+        missed = one.attempts.ranges.pair[one.attempts.missed]
+        assert missed.size > 0
+        assert (missed != row).all() == others_alone
+
+
 @pytest.mark.parametrize("scale_error", [0.0, 0.1])
 def test_step_scales_are_sought_where_there_are_any(scale_error: float) -> None:
     options = {"seconds": 120, "nodes": 4, "scale_error": scale_error}

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import RelposError
-from relpos.fusion.models.detection import Round, Rounds
+from relpos.fusion.models.detection import Round, Rounds, on_one_floor
 from relpos.fusion.models.motion import unseen_variance
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Timeline
 from relpos.measurements import Heading, Height, Measurement, Prior
@@ -182,7 +182,9 @@ class _Builder:
                 for one in step.ranges:
                     self.seen |= {one.node, one.peer}
                     self.ranges.append(self._entry(step.time_s, one.node, one.peer, one.range_m))
-                for done in self.rounds.add(step.time_s, step.ranges, reported_s):
+                for done in self.rounds.add(
+                    step.time_s, step.ranges, reported_s, self._on_one_floor
+                ):
                     entries = [
                         self._entry(step.time_s, node, peer, 0.0)
                         for node, peer in done.received + done.missed
@@ -204,6 +206,10 @@ class _Builder:
             places += self.partial.get(one, [0.0, 0.0])[:2]
         dz_m = self._height(node) - self._height(peer)
         return _Entry(len(self.times), time_s, node, peer, range_m, dz_m, tuple(places))
+
+    def _on_one_floor(self, pairs: Sequence[tuple[int, int]]) -> npt.NDArray[np.bool_]:
+        dz_m = np.array([self._height(a) - self._height(b) for a, b in pairs])
+        return on_one_floor(dz_m, np.zeros(dz_m.size))
 
     def _height(self, node: int) -> float:
         return self.heights.get(node, 0.0) + self.height_now.get(node, 0.0)
