@@ -86,6 +86,16 @@ def test_exact_reports_lead_along_the_truth(there_and_back, monkeypatch):
             assert abs(place - complex(x, y)) < 0.45  # truth is given at whole seconds
 
 
+def test_wearers_walk_and_report_until_the_end_of_the_run(there_and_back):
+    wearers = [exact_wearer(there_and_back) for _ in range(2)]
+    run = make_team(wearers, TeamSettings(seconds=120.0), 4, "test")
+    for node in (1, 2):
+        times = [m.time_s for m in run.motions if m.node == node]
+        assert max(np.diff([0.0, *times, 120.0])) < 4.0
+        places = [(t.x_m, t.y_m) for t in run.truth if t.node == node]
+        assert max(np.hypot(*(np.array(places)[10:] - np.array(places)[:-10]).T)[-20:]) > 2.0
+
+
 def test_ranges_are_those_of_the_truth_and_walls_lose_and_lengthen_them(there_and_back):
     wearers = [exact_wearer(there_and_back) for _ in range(4)]
     errors, counts = [], []

@@ -182,7 +182,7 @@ def _pieces(track: Track, motions: Sequence[Motion], piece_m: float) -> list[tup
 def _join(
     node: int, wearer: Wearer, settings: TeamSettings, rng: np.random.Generator
 ) -> tuple[list[Motion], Track]:
-    """One wearer's motions and true track, piece by piece.
+    """One wearer's motions and true track, piece by piece, all of them again until the run's end.
 
     What the node reports outside of the truth is left out: who stands there may turn.
     """
@@ -198,7 +198,9 @@ def _join(
     motions: list[Motion] = []
     knots: list[tuple[float, complex, float]] = [(0.0, place, heading)]
     phase_s = float(rng.uniform(0.1, 0.9))
-    for track, begin, end in pieces:
+    for track, begin, end in itertools.cycle(pieces):
+        if now_s >= settings.seconds:
+            break
         inside = track.time_s[(track.time_s > begin) & (track.time_s < end)]
         times = np.r_[begin, inside, end]
         places, headings = track.at(times)
