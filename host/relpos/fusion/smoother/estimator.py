@@ -29,6 +29,7 @@ from relpos.fusion.estimator import (
 from relpos.fusion.models.unseen_walk import TURNS_RAD2_S, WALKING_M_S
 from relpos.fusion.smoother.as_learned import as_learned
 from relpos.fusion.smoother.graph import Graph, build_graph
+from relpos.fusion.smoother.lasting import without_lasting_errors
 from relpos.fusion.smoother.problem import Problem
 from relpos.fusion.smoother.solution import Solution, beginnings, smooth
 from relpos.fusion.smoother.variance_components import VarianceComponents
@@ -95,7 +96,8 @@ class Smoother:
                 smooth(problem, state, inliers=believed) for believed in beginnings(problem, state)
             ]
         self.solutions.sort(key=lambda s: s.cost)
-        best = _without_needless_constants(problem, self.solutions[0])
+        best = without_lasting_errors(problem, self.solutions[0])
+        best = _without_needless_constants(problem, best)
         self.solutions.insert(0, best)
         self._own["smoother_attempts"] += len(self.solutions) - 1
         self._own["smoother_outliers"] += int(np.sum(best.inliers.ranges < 0.5))

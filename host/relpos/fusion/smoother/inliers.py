@@ -12,7 +12,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.models.ranging import AGAIN_M, ALIKE
+from relpos.fusion.models.ranging import AGAIN_M, ALIKE, OUTLIERS_SHORT
 from relpos.fusion.normal import normal_density
 from relpos.fusion.smoother import kernels
 from relpos.fusion.smoother.kernels import State
@@ -61,6 +61,8 @@ def _ranges(
     # Between two nodes alone nothing tells ranges without sight from an odometry that is wrong.
     if len(problem.graph.pairs) > 1:
         go_on = max(components.outliers_go_on, share)
+        side = np.where(excess_m > 0.0, 1.0 - OUTLIERS_SHORT, OUTLIERS_SHORT)
+        density[:, 1:] *= 2.0 * side[:, None]
         # As far off as the last one: what stands in between makes ranges too long, never too short.
         alike = normal_density(np.diff(excess_m), AGAIN_M**2 + 2.0 * variance)
         density[1:, 2] += np.where(excess_m[:-1] > 0.0, ALIKE, 0.0) * (alike - density[1:, 1])

@@ -274,6 +274,35 @@ def add_ranges(
 
 
 @compiled
+def add_range_columns(
+    state: State,
+    ranges: Ranges,
+    weight: Floats,
+    added: tuple[Integers, Integers],
+    columns: Floats,
+    corner: Floats,
+) -> None:
+    """Add the derivative of the gradient by lengths that are added to some predicted ranges.
+
+    ``added`` are the ranges (L,) and which length is added to each: a column of ``columns``
+    (K, b, R) and of ``corner`` (G, R). ``weight`` (M,) is 1 / variance of all ranges.
+    """
+    chosen, column = added
+    pairs, slopes = ranges.pair, _no_slopes()
+    row, entry, constant = slopes
+    for n in range(chosen.size):
+        m, at = chosen[n], column[n]
+        k = ranges.chord[m]
+        _predict_range(state, ranges, m, slopes)
+        for p in range(12):
+            late, place = (p // 3) % 2, 3 * pairs[m, p // 6] + p % 3
+            columns[k + late, place, at] += weight[m] * row[p]
+        if ranges.pair_index[m] >= 0:
+            for c in range(constant.size):
+                corner[entry[c], at] += weight[m] * constant[c]
+
+
+@compiled
 def motion_variances(state: State, chords: Chords, covariance: Covariance) -> Floats:
     """Posterior variances (K - 1, N, 3) of the chords' residuals."""
     diagonal, below, with_constants, constants, _ = covariance
