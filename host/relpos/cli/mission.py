@@ -127,10 +127,11 @@ def _run_chosen(
             options = replace(options, open_browser=False)
         if choice is None:
             return
+        is_own = choice.source == found.about.source
         left_s = end_s - time.monotonic()
         options = replace(options, seconds=None if math.isinf(left_s) else max(left_s, 0.0))
         try:
-            if choice.source == found.about.source:
+            if is_own:
                 outcome = _run(found, options, estimator, key_file, common=choice.common)
             else:
                 outcome = _exercise(found, choice, options, estimator)
@@ -138,7 +139,7 @@ def _run_chosen(
             known = isinstance(error, RelposError | OSError)
             trouble = words_of(error) if known else f"the session has failed: {error!r}"
             output.remark(trouble)
-            awaited = choice.source if choice.source == found.about.source else ""
+            awaited = choice.source if is_own else ""
             choice = None
             continue
         choice, trouble, awaited = None, "", ""

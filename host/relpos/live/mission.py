@@ -31,6 +31,7 @@ from relpos.live.sinks import Sink
 from relpos.live.team_view import LogEntry, TeamView, to_json
 from relpos.live.tracks import Tracks
 from relpos.measurements import BOUNDS, Prior
+from relpos.runs.appending import sync_folder
 from relpos.runs.table import read_text, within_bounds
 from relpos.said import Said
 
@@ -496,10 +497,5 @@ def _replace(path: Path, data: bytes, *, sync: bool = True, mode: int = 0o666) -
             file.flush()
             os.fsync(file.fileno())
     beside.replace(path)
-    if sync and os.name == "posix":
-        # Without this a power cut may bring the old one back.
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+    if sync:
+        sync_folder(path.parent)

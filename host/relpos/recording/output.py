@@ -18,6 +18,7 @@ from threading import Condition, Thread
 
 from relpos.errors import DataError
 from relpos.recording import container
+from relpos.runs.appending import sync_folder
 
 NO_ROOM = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 SYNC_EVERY_S = 0.4
@@ -217,7 +218,7 @@ class Output:
             if self._disk.write(handle, memoryview(start)) < len(start):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             self._disk.sync(handle)
-            _sync_directory(path.parent)
+            sync_folder(path.parent)
         except OSError:
             os.close(handle)
             path.unlink(missing_ok=True)
@@ -285,13 +286,3 @@ class Output:
         except OSError:
             return False
         return complete
-
-
-def _sync_directory(directory: Path) -> None:
-    """Synchronise a directory, so that a new file keeps its name; not every system can."""
-    with contextlib.suppress(OSError):
-        handle = os.open(directory, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)

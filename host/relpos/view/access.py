@@ -22,6 +22,7 @@ from relpos.view.devices import Gate, Role
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8460
 LOOK_S = 0.1
+"""How often a taken port is tried again."""
 TOKEN_BYTES = 16
 """128 bits: they cannot be guessed, and the QR code stays coarse enough for a wet screen."""
 

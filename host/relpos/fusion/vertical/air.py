@@ -25,13 +25,14 @@ RISES = np.linspace(-3.0, 3.0, 41)
 _LOG_PRIOR = -0.5 * RISES**2 - np.log(np.exp(-0.5 * RISES**2).sum())
 
 
-class Expected(NamedTuple):
-    """What each of N nodes reported in an interval against what its modes expect, (N, MODES)."""
+class Innovations(NamedTuple):
+    """Of N nodes' heights in each mode (N, MODES), before any common rise."""
 
-    off_m: Floats
-    """How much more the height rose than in a mode in calm air; NaN without news."""
+    mean_m: Floats
+    """NaN without news."""
     variance_m2: Floats
     duration_s: float
+    """Of the interval."""
 
 
 class Others(NamedTuple):
@@ -45,7 +46,7 @@ class Others(NamedTuple):
     """Its variance."""
 
 
-def of_others(in_calm: Floats, blown: Expected, modes: Floats) -> Others:
+def of_others(in_calm: Floats, blown: Innovations, modes: Floats) -> Others:
     """Return what the others say; ``in_calm`` (N, AIRS) is how probable each finds its own height.
 
     ``modes`` (N, MODES) are the probabilities of each one's modes in blown air.
@@ -66,7 +67,7 @@ def of_others(in_calm: Floats, blown: Expected, modes: Floats) -> Others:
     )
 
 
-def common_rise(blown: Expected, modes: Floats) -> float:
+def common_rise(blown: Innovations, modes: Floats) -> float:
     """Return how much the air let all heights rise (m), if it was blown, by what each did."""
     rises_m, by_rise = _by_rise(blown, modes)
     together = by_rise.sum(axis=0) + _LOG_PRIOR
@@ -74,10 +75,10 @@ def common_rise(blown: Expected, modes: Floats) -> float:
     return float(density @ rises_m / density.sum())
 
 
-def _by_rise(blown: Expected, modes: Floats) -> tuple[Floats, Floats]:
+def _by_rise(blown: Innovations, modes: Floats) -> tuple[Floats, Floats]:
     """Return common rises (R,) and how probable each node finds them (N, R): logarithms."""
     rises_m = RISES * FAN_M_S * blown.duration_s
-    off_m = np.nan_to_num(blown.off_m)[:, :, None] - FOLLOWS[:, None] * rises_m
+    off_m = np.nan_to_num(blown.mean_m)[:, :, None] - FOLLOWS[:, None] * rises_m
     density = (modes[:, :, None] * normal_density(off_m, blown.variance_m2[:, :, None])).sum(axis=1)
-    news = np.isfinite(blown.off_m[:, :1])
+    news = np.isfinite(blown.mean_m[:, :1])
     return rises_m, np.log(np.where(news, np.maximum(density, 1e-200), 1.0))

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from relpos.fusion.estimator import Episode
 from relpos.fusion.normal import normal_density
-from relpos.fusion.vertical.air import FAN_M_S, Expected, of_others
+from relpos.fusion.vertical.air import FAN_M_S, Innovations, of_others
 from relpos.fusion.vertical.modes import (
     AIRS,
     BEGINNINGS,
@@ -110,7 +110,8 @@ class Update(NamedTuple):
     """(N, airs * MODES), with what the others say of the air."""
     transition: Floats
     """(N, airs * MODES, airs * MODES)"""
-    blown: Expected
+    blown: Innovations
+    """In blown air."""
 
 
 def begin(height_m: Floats, variance_m2: Floats, airs: int = AIRS) -> Beliefs:
@@ -193,7 +194,7 @@ def update(beliefs: Beliefs, interval: Interval) -> Update:
     usual = _usual(interval)[:, None]
     height_m, noise_m2 = interval.height_m[:, None, None], interval.variance_m2[:, None, None]
     off_m, total = height_m - mean, variance + noise_m2
-    blown = Expected(off_m[:, -1], total[:, -1], interval.duration_s)
+    blown = Innovations(off_m[:, -1], total[:, -1], interval.duration_s)
     evidence = np.ones((nodes, airs))
     if airs == AIRS:
         own = np.where(news, usual * normal_density(np.nan_to_num(off_m), total), 1.0)

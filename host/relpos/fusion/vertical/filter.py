@@ -145,6 +145,11 @@ class Happened(NamedTuple):
     pressed_m: Floats
     """How much of that is in the rises of those who moved."""
 
+    @property
+    def level(self) -> Floats:
+        """Probability that neither changed."""
+        return 1.0 - self.moving - self.disturbed
+
 
 @dataclass(slots=True)
 class VerticalFilter:
@@ -161,8 +166,6 @@ class VerticalFilter:
     _row: dict[int, int] = field(default_factory=dict)
     _tracks: dict[int, Track] = field(default_factory=dict)
     _beliefs: Beliefs = field(default_factory=lambda: episodes.begin(np.empty(0), np.empty(0)))
-    _decided: Beliefs = field(default_factory=lambda: episodes.begin(np.empty(0), np.empty(0)))
-    """Belief before the open intervals."""
     _open: list[_Interval] = field(default_factory=list)
     _smoothed: list[Floats] = field(default_factory=list)
     """Probabilities of airs and modes in each open interval."""
@@ -223,7 +226,6 @@ class VerticalFilter:
         self._beliefs = Beliefs(
             *(np.concatenate(both) for both in zip(self._beliefs, first, strict=True))
         )
-        self._decided = self._beliefs
         self._level_s = np.append(self._level_s, 0.0)
         self._level_steps = np.append(self._level_steps, 0.0)
         self._walked = np.append(self._walked, False)
@@ -356,7 +358,6 @@ class VerticalFilter:
         count = sum(one.end_s <= until_s for one in self._open)
         for one, happened in zip(self._open[:count], self._happened[:count], strict=True):
             self._apply(one, happened)
-            self._decided = one.update.beliefs
         del self._open[:count], self._smoothed[:count], self._happened[:count]
 
     def _apply(self, one: _Interval, happened: Happened) -> None:
@@ -467,12 +468,11 @@ class VerticalFilter:
             told[_CLIMBS] = 0.0
         k = int(np.argmax(told))
         where, steps = self.floors.probability[row], self._level_steps[row]
-        stays = self._settled[row] and all(
-            p[row, : Air.BLOWN, Mode.LEVEL].sum() >= 0.5 for p in self._smoothed
-        )
+        level = [float(happened.level[row]) for happened in self._happened]
+        stays = self._settled[row] and all(p >= 0.5 for p in level)
         if not stays:
-            for one, modes in zip(self._open, self._smoothed, strict=True):
-                steps = steps * modes[row, : Air.BLOWN, Mode.LEVEL].sum() + one.reported.steps[row]
+            for one, p in zip(self._open, level, strict=True):
+                steps = steps * p + one.reported.steps[row]
             own_m2 = self.heights.covariance[row, Z, Z] + unseen_m2 + doubt_m**2
             climbed_m = self.heights.mean[row, Z] + risen_m
             over = Over(self._over.mean_m[row] + risen_m, self._over.variance_m2[row])

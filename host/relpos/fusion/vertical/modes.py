@@ -1,7 +1,7 @@
 """What wearers and the air may do, and how often one follows the other: two Markov chains.
 
-Each wearer has a mode. The air is one for all: a barometer cannot tell a fan from a flight of
-stairs, but no two people walk down in step for long, and a fan takes all heights down alike.
+Each wearer has a mode. The air is one for all: one barometer cannot tell a fan from a flight of
+stairs, a team's can, because a fan changes all heights alike.
 """
 
 from __future__ import annotations
@@ -100,12 +100,8 @@ _RATES_HZ: dict[tuple[int, int], float] = {
 }
 """How often a mode turns into another (assumed: flights of 5 to 10 s, a landing of 1 to 3 s)."""
 
-_IN_AIR_HZ: dict[Air, dict[tuple[int, int], float]] = {
-    Air.CALM: {},
-    Air.TOGETHER: {(Mode.LEVEL, Mode.UP): 1 / 4, (Mode.LEVEL, Mode.DOWN): 1 / 4},
-    Air.BLOWN: {},
-}
-"""Of these, what is otherwise in an air. A crew sets out within some seconds."""
+_TOGETHER_HZ = {**_RATES_HZ, (Mode.LEVEL, Mode.UP): 1 / 4, (Mode.LEVEL, Mode.DOWN): 1 / 4}
+"""The same while a crew sets out: all do within some seconds."""
 
 _AIR_RATES_HZ: dict[tuple[int, int], float] = {
     (Air.CALM, Air.TOGETHER): 1 / 120,
@@ -133,9 +129,10 @@ def _chain(rates_hz: Mapping[tuple[int, int], float], count: int, dt_s: float) -
 @lru_cache(maxsize=64)
 def transition(dt_s: float, airs: int) -> Floats:
     """Return the probabilities (airs * MODES, airs * MODES) over an interval."""
+    usual = _chain(_RATES_HZ, MODES, dt_s)
     if airs == 1:
-        return _chain(_RATES_HZ, MODES, dt_s)
-    of_mode = np.stack([_chain({**_RATES_HZ, **_IN_AIR_HZ[air]}, MODES, dt_s) for air in Air])
+        return usual
+    of_mode = np.stack([usual, _chain(_TOGETHER_HZ, MODES, dt_s), usual])
     of_air = _chain(_AIR_RATES_HZ, AIRS, dt_s)
     both: Floats = of_air[:, None, :, None] * of_mode.transpose(1, 0, 2)[None]
     return both.reshape(AIRS * MODES, AIRS * MODES)
