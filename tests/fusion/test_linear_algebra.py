@@ -1,5 +1,6 @@
 """The number of threads of the linear algebra does not show in an estimate."""
 
+import os
 import subprocess
 import sys
 
@@ -44,3 +45,18 @@ def test_an_estimate_is_the_same_with_one_thread_and_with_two(smooth: bool) -> N
         with threadpool_limits(limits=limit, user_api="blas"):
             estimates.append(relpos.fuse(run, smooth=smooth).estimates)
     assert estimates[0] == estimates[1]
+
+
+def test_scipys_library_has_one_thread_too_where_it_is_first_used_within_the_context() -> None:
+    script = (
+        "from threadpoolctl import threadpool_info\n"
+        "from relpos.fusion.linear_algebra import one_thread\n"
+        "with one_thread():\n"
+        "    import scipy.linalg\n"
+        "    print({pool['num_threads'] for pool in threadpool_info()})\n"
+    )
+    several = {**os.environ, "OPENBLAS_NUM_THREADS": "2"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=several, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "{1}"

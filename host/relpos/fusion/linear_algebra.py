@@ -21,6 +21,9 @@ _USERS: list[threadpool_limits] = []
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Let BLAS use one thread; after the last of all threads' contexts it is as before."""
+    # Compiled kernels multiply by SciPy's library. Loaded later, it would not be limited.
+    import scipy.linalg.cython_blas  # noqa: F401
+
     with _LOCK:
         _USERS.append(threadpool_limits(limits=1, user_api="blas"))
     try:
