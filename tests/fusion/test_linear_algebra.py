@@ -10,12 +10,18 @@ from threadpoolctl import threadpool_limits
 import relpos
 
 CONTEXTS = """
+from concurrent.futures import Future, ThreadPoolExecutor
 from threadpoolctl import threadpool_info, threadpool_limits
-import numpy
+import scipy.linalg
 from relpos.fusion.linear_algebra import one_thread
 
 def threads():
     return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+def here(function, *arguments):
+    done = Future()
+    done.set_result(function(*arguments))
+    return done
 
 with threadpool_limits(limits=2, user_api="blas"):
     first, second = one_thread(), one_thread()
@@ -26,6 +32,17 @@ with threadpool_limits(limits=2, user_api="blas"):
     assert threads() == {1}
     second.__exit__(None, None, None)
     assert threads() == {2}
+
+    with ThreadPoolExecutor(1) as another:
+        for opens, closes in [(another.submit, here), (here, another.submit)]:
+            first, second = one_thread(), one_thread()
+            opens(first.__enter__).result()
+            assert threads() == {1}
+            closes(second.__enter__).result()
+            opens(first.__exit__, None, None, None).result()
+            assert threads() == {1}
+            closes(second.__exit__, None, None, None).result()
+            assert threads() == {2}
 """
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import Lock
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import OpenBLASController, threadpool_limits
 
 _LOCK = Lock()
 _USERS: list[threadpool_limits] = []
@@ -25,6 +25,7 @@ def one_thread() -> Iterator[None]:
     import scipy.linalg.cython_blas  # noqa: F401
 
     with _LOCK:
+        _take_control()
         _USERS.append(threadpool_limits(limits=1, user_api="blas"))
     try:
         yield
@@ -33,4 +34,10 @@ def one_thread() -> Iterator[None]:
             if len(_USERS) > 1:
                 del _USERS[1]
             else:
+                _take_control()
                 _USERS.pop().restore_original_limits()
+
+
+def _take_control() -> None:
+    """Let this thread set the limits: otherwise only the thread that set them first can."""
+    OpenBLASController.clear_controlling_thread(force=True)
