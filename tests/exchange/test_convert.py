@@ -470,6 +470,21 @@ def test_a_track_has_a_gap_where_a_node_was_not_located(tmp_path: Path, form: st
         assert shapes == ["LineString", "Point", "LineString"]
 
 
+@pytest.mark.parametrize(("off_m", "pieces"), [(2.0, 1), (6.0, 3)])
+def test_no_line_crosses_the_map_where_somebody_was_located_anew(
+    tmp_path: Path, off_m: float, pieces: int
+) -> None:
+    lost = [
+        replace(e, nodes=tuple(replace(n, x_m=n.x_m + off_m) for n in e.nodes))
+        if 10.0 <= e.time_s < 20.0
+        else e
+        for e in estimates()
+    ]
+    write_estimates(tmp_path / "fused", lost)
+    convert(tmp_path / "fused", "--pin", PIN, "--to", "geojson", "--out", tmp_path / "map.geojson")
+    assert len(features(tmp_path / "map.geojson", kind="track", node=3)) == pieces
+
+
 def test_truth_in_another_frame_is_left_out_of_the_map(tmp_path: Path) -> None:
     save_run(replace(run(priors=False), landmarks=LANDMARKS), tmp_path / "yard")
     write_estimates(tmp_path / "fused", estimates())

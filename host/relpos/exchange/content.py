@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 PLACED = (NodeStatus.OK, NodeStatus.STALE, NodeStatus.LOST)
 """With any other status the numbers are the mean of what is possible, and no position."""
 
+MIN_JUMP_M = 3.0
+FASTEST_M_S = 5.0
+"""As on the page (``view/static/js/tracks.js``): what goes further has been located anew."""
+
 
 @dataclass(frozen=True)
 class Content:
@@ -113,7 +117,10 @@ def points_of(content: Content, kind: Kind) -> dict[int, list[Point]]:
 
 
 def stretches_of(content: Content, kind: Kind) -> dict[int, list[list[Point]]]:
-    """Return every node's rows that are positions, cut where it was not located in between."""
+    """Return every node's rows that are positions, cut where it was not located or located anew.
+
+    Nobody knows the way from where somebody was believed to be to where they are found.
+    """
     return {node: [p for p in pieces if p] for node, pieces in _pieces(content, kind, placed=True)}
 
 
@@ -135,10 +142,16 @@ def _pieces(
                 if placed and n.status not in PLACED:
                     cut.append([])
                 elif math.isfinite(n.x_m + n.y_m):
-                    cut[-1].append(
-                        Point(estimate.time_s, n.node, n.x_m, n.y_m, n.z_m, n.heading_rad)
-                    )
+                    p = Point(estimate.time_s, n.node, n.x_m, n.y_m, n.z_m, n.heading_rad)
+                    if placed and cut[-1] and _jumps(cut[-1][-1], p):
+                        cut.append([])
+                    cut[-1].append(p)
     return ((node, pieces[node]) for node in sorted(pieces))
+
+
+def _jumps(before: Point, after: Point) -> bool:
+    walked_m = FASTEST_M_S * (after.time_s - before.time_s)
+    return math.hypot(after.x_m - before.x_m, after.y_m - before.y_m) > max(MIN_JUMP_M, walked_m)
 
 
 def as_truth(points: Iterable[Point]) -> tuple[Truth, ...]:
