@@ -11,7 +11,7 @@ from rooms import ROOT, Edges, imports_between_rooms
 
 PICTURE = ROOT / "docs" / "images" / "rooms.svg"
 BOX, GAP_X, GAP_Y, MARGIN = (146, 34), 34, 46, 20
-EVERYWHERE = {"errors", "extras", "paths", "version"}
+EVERYWHERE = {"errors", "extras", "files", "paths", "version"}
 
 
 def floors(edges: Edges) -> list[list[str]]:

@@ -2,6 +2,7 @@
 
 import errno
 import io
+import resource
 import shutil
 from pathlib import Path
 
@@ -143,13 +144,13 @@ def test_a_description_that_cannot_be_written_leaves_the_one_before(tmp_path):
         write_description(path, Description(name="\ud800"))
     assert read_description(path).name == "walk"
 
-    class FullDisk(type(path)):
-        def write_bytes(self, data):
-            super().write_bytes(data[: len(data) // 2])
-            raise OSError(errno.ENOSPC, "No space left on device", str(self))
-
-    with pytest.raises(OSError, match="No space"):
-        write_description(FullDisk(path), Description(name="another"))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10, before[1]))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            write_description(path, Description(name="another"))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert read_description(path).name == "walk"
     assert [file.name for file in tmp_path.iterdir()] == ["run.toml"]
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from relpos.errors import DataError
+from relpos.files import write_whole
 from relpos.protocol import messages as wire
 from relpos.said import Said
 
@@ -242,10 +243,8 @@ class SeenCounters:
         for node, counter in newest.items():
             merged[node] = counter if node in lowered else max(counter, merged.get(node, -1))
         self._saved_s = now_s
-        temporary = self.path.with_name(self.path.name + ".new")
         try:
-            temporary.write_text(json.dumps(merged), encoding="ascii")
-            temporary.replace(self.path)
+            write_whole(self.path, json.dumps(merged).encode())
         except OSError as error:
             raise DataError(f"{self.path}: cannot be written: {error.strerror}") from error
         self._saved = merged

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from relpos.errors import DataError
+from relpos.files import write_whole
 from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.live.fusion_thread import known_poses
 from relpos.live.inputs import Received
@@ -31,7 +32,6 @@ from relpos.live.sinks import Sink
 from relpos.live.team_view import LogEntry, TeamView, to_json
 from relpos.live.tracks import Tracks
 from relpos.measurements import BOUNDS, Prior
-from relpos.runs.appending import sync_folder
 from relpos.runs.table import read_text, within_bounds
 from relpos.said import Said
 
@@ -146,7 +146,7 @@ class Mission:
                 self._key = b""
             if len(self._key) != KEY_BYTES:
                 self._key = secrets.token_bytes(KEY_BYTES)
-                _replace(self.path / SECRET, self._key, mode=0o600)
+                write_whole(self.path / SECRET, self._key, sync=True, mode=0o600)
         return self._key
 
     def keep_time(self, resumed: Resumed) -> str | None:
@@ -163,7 +163,7 @@ class Mission:
 
     def save(self) -> None:
         """Write what it is."""
-        _replace(self.path / ABOUT, json.dumps(asdict(self.about), indent=1).encode())
+        write_whole(self.path / ABOUT, json.dumps(asdict(self.about), indent=1).encode(), sync=True)
 
     def recording(self, session: int) -> Path:
         """Return the file in which a session is recorded."""
@@ -367,7 +367,7 @@ class MissionFiles(Sink):
                 "heard_s": heard_s,
                 "priors": priors,
             }
-            _replace(self._path / CHECKPOINT, json.dumps(found).encode(), sync=False)
+            write_whole(self._path / CHECKPOINT, json.dumps(found).encode())
             self._trouble = None
         except OSError as error:
             self._trouble = Said(
@@ -484,18 +484,3 @@ def _ends_line(path: Path) -> bool:
     with path.open("rb") as file:
         file.seek(-1, os.SEEK_END)
         return file.read(1) == b"\n"
-
-
-def _replace(path: Path, data: bytes, *, sync: bool = True, mode: int = 0o666) -> None:
-    """Write a file as a whole: it is the old one or the new one, whatever happens."""
-    beside = path.with_name(path.name + ".new")
-    beside.unlink(missing_ok=True)
-    handle = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-    with os.fdopen(handle, "wb") as file:
-        file.write(data)
-        if sync:
-            file.flush()
-            os.fsync(file.fileno())
-    beside.replace(path)
-    if sync:
-        sync_folder(path.parent)

@@ -17,8 +17,8 @@ from pathlib import Path
 from threading import Condition, Thread
 
 from relpos.errors import DataError
+from relpos.files import sync_folder
 from relpos.recording import container
-from relpos.runs.appending import sync_folder
 
 NO_ROOM = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 SYNC_EVERY_S = 0.4

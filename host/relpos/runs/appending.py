@@ -7,7 +7,6 @@ during the session, or after a crash, finds at most the last one broken.
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import errno
 import io
@@ -152,13 +151,3 @@ def _cell(value: object) -> object:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
     return value
-
-
-def sync_folder(folder: Path) -> None:
-    """Let a new or replaced file keep its place after a power cut; not every system can."""
-    with contextlib.suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)

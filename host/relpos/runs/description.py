@@ -6,13 +6,13 @@ import json
 import math
 import tomllib
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 from relpos.errors import DataError
+from relpos.files import write_whole
 from relpos.measurements import Prior
 from relpos.runs.table import read_text, within_bounds
 
@@ -147,15 +147,7 @@ def write_description(path: Path, description: Description) -> None:
 
     A failure (a full disk, text that cannot be encoded) leaves the file that was there.
     """
-    new = path.with_name(path.name + ".new")
-    data = description_text(description).encode()
-    try:
-        new.write_bytes(data)
-        new.replace(path)
-    except OSError:
-        with suppress(OSError):
-            new.unlink()
-        raise
+    write_whole(path, description_text(description).encode())
 
 
 def description_text(description: Description) -> str:

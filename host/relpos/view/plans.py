@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import re
 from pathlib import Path
 
+from relpos.files import write_whole
 from relpos.said import Said
 
 MAX_IMAGE_BYTES = 8 << 20
@@ -36,12 +36,7 @@ class PlanImages:
             self._kept = {name: data}
             return name
         self._folder.mkdir(exist_ok=True)
-        beside = self._folder / f"{name}.new"
-        with beside.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(self._folder / name)
+        write_whole(self._folder / name, data, sync=True)
         return name
 
     def find(self, name: str) -> tuple[bytes, str] | None:
