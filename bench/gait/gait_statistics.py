@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from relpos.simulation.team import SCENARIOS, make_team
 from relpos.simulation.world import FloatArray
@@ -59,11 +59,11 @@ def gait_statistics(force: FloatArray, rate: FloatArray, rate_hz: float) -> Gait
     step = float(frequency[band][np.argmax(power[band])])
     horizontal = force - np.outer(force @ up, up)
     horizontal = horizontal - horizontal.mean(axis=0)
-    sos = signal.butter(2, (0.85 * step, 1.15 * step), "band", fs=rate_hz, output="sos")
-    moving = signal.sosfiltfilt(sos, horizontal, axis=0)
+    sos = scipy.signal.butter(2, (0.85 * step, 1.15 * step), "band", fs=rate_hz, output="sos")
+    moving = scipy.signal.sosfiltfilt(sos, horizontal, axis=0)
     fore = np.linalg.svd(moving, full_matrices=False)[2][0]
     left = np.cross(up, fore)
-    correlation = signal.correlate(vertical, vertical, "full", "fft")[len(vertical) - 1 :]
+    correlation = scipy.signal.correlate(vertical, vertical, "full", "fft")[len(vertical) - 1 :]
     correlation = correlation / correlation[0]
     lag = rate_hz / step
 
@@ -90,7 +90,7 @@ def gait_statistics(force: FloatArray, rate: FloatArray, rate_hz: float) -> Gait
 
 def _spectrum(values: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:
     segment = min(len(values), round(10 * rate_hz))
-    frequency, power = signal.welch(
+    frequency, power = scipy.signal.welch(
         values - values.mean(), rate_hz, nperseg=segment, nfft=8 * segment
     )
     return np.asarray(frequency), np.asarray(power)
@@ -143,8 +143,8 @@ def simulated_walks(
     part = slice(round(8.0 * 200), None)
     return [
         gait_statistics(
-            signal.decimate(w.specific_force_m_s2[part], 2, ftype="fir", axis=0),
-            signal.decimate(w.angular_rate_rad_s[part], 2, ftype="fir", axis=0),
+            scipy.signal.decimate(w.specific_force_m_s2[part], 2, ftype="fir", axis=0),
+            scipy.signal.decimate(w.angular_rate_rad_s[part], 2, ftype="fir", axis=0),
             100.0,
         )
         for w in team

@@ -18,7 +18,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from gait_statistics import (
     GaitStatistics,
@@ -206,7 +206,7 @@ DENSITY_HZ = np.arange(0.0, 25.01, 0.25)
 def _density(force: FloatArray, rate_hz: float) -> FloatArray:
     mean = force.mean(axis=0)
     vertical = force @ mean / np.linalg.norm(mean)
-    frequency, power = signal.welch(
+    frequency, power = scipy.signal.welch(
         vertical - vertical.mean(), rate_hz, nperseg=min(len(vertical), round(4 * rate_hz))
     )
     return np.asarray(np.interp(DENSITY_HZ, frequency, power))
@@ -243,7 +243,7 @@ def simulated_walking(
         )[0]
         part = slice(6 * 200, -5 * 200)
         force, rate = (
-            signal.decimate(values[part], 2, ftype="fir", axis=0)
+            scipy.signal.decimate(values[part], 2, ftype="fir", axis=0)
             for values in (walker.specific_force_m_s2, walker.angular_rate_rad_s)
         )
         out.append(Walking(gait_statistics(force, rate, 100.0), _density(force, 100.0)))

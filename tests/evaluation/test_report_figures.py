@@ -6,10 +6,10 @@ import math
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from relpos import tracks
 from relpos.evaluation import report
@@ -74,7 +74,7 @@ def content(
     return report.gather(run, Result("ours", estimates_of(fused)))
 
 
-def lines(figure: Figure, panel: int) -> dict[str, np.ndarray]:
+def lines(figure: Any, panel: int) -> dict[str, np.ndarray]:
     return {
         str(line.get_label()): np.asarray(line.get_data(), dtype=float)
         for line in figure.axes[panel].get_lines()

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from matplotlib.image import imread
 from typer.testing import CliRunner
 
 from relpos.cli.main import app
@@ -46,6 +45,9 @@ def test_a_guided_calibration_makes_the_field_round_and_is_kept_over_a_restart(t
         done = calibrate(port, "--node", 1, "--out", tmp_path)
         assert done.exit_code == 0, done.stderr
         assert "stored, restarted and read back" in done.stdout
+        # Half a second in each of all workers, for a test of the long runs.
+        from matplotlib.image import imread
+
         assert imread(tmp_path / "node-1-magnetometer.png").shape[0] > 500
         device = open_port(port)
         try:
