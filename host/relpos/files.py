@@ -23,7 +23,8 @@ def write_whole(path: Path, data: bytes, *, sync: bool = False, mode: int = 0o66
                 file.flush()
                 os.fsync(file.fileno())
         beside.replace(path)
-    except OSError:
+    except OSError as error:
+        error.filename = error.filename or str(path)
         with contextlib.suppress(OSError):
             beside.unlink()
         raise
