@@ -260,7 +260,7 @@ def records_in(raw: bytes) -> Iterator[tuple[int, memoryview]]:
             raise ValueError("damaged: a record is cut off")
         opcode, length = struct.unpack_from("<BQ", raw, at)
         at += HEAD_BYTES + length
-        if at > len(raw):
+        if at > len(raw) or (opcode == Opcode.MESSAGE and length < MESSAGE_HEAD.size):
             raise ValueError("damaged: a record is cut off")
         yield opcode, view[at - length : at]
 

@@ -17,7 +17,17 @@ from relpos.fusion.estimator import Estimate, NodeEstimate
 from relpos.measurements import Observation
 from relpos.recording import topics
 from relpos.recording.about import About
-from relpos.recording.container import MAGIC, MESSAGE_HEAD, Entry, Walk, parse, records_in, unpack
+from relpos.recording.container import (
+    HEAD_BYTES,
+    MAGIC,
+    MESSAGE_HEAD,
+    Entry,
+    Piece,
+    Walk,
+    parse,
+    records_in,
+    unpack,
+)
 from relpos.recording.output import part_path
 from relpos.recording.schemas import all_topics
 from relpos.runs.landmarks import Landmark
@@ -131,17 +141,11 @@ class Recording:
             with opened(file.path) as stream:
                 walk = Walk(stream)
                 for piece in walk:
-                    if piece.opcode == Opcode.CHUNK:
-                        try:
-                            raw = unpack(parse(Chunk, walk.payload(piece)))
-                        except ValueError:
-                            continue  # Counted when the file was looked through.
-                    elif piece.opcode == Opcode.MESSAGE:
-                        raw = struct.pack("<BQ", piece.opcode, piece.length - 9)
-                        raw += walk.payload(piece)
-                    else:
-                        continue
-                    for opcode, content in records_in(raw):
+                    try:
+                        records = _records_of(piece, walk)
+                    except ValueError:
+                        continue  # Counted when the file was looked through.
+                    for opcode, content in records:
                         if opcode != Opcode.MESSAGE:
                             continue
                         number, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(content)
@@ -283,9 +287,21 @@ def _look_through(path: Path) -> _File:
                 found.channels[channel.id] = channel
             elif piece.opcode == Opcode.CHUNK:
                 _look_into(found, walk.payload(piece))
+            elif piece.opcode == Opcode.MESSAGE:
+                found.damaged += piece.length < HEAD_BYTES + MESSAGE_HEAD.size
         found.unread = 0 if walk.complete else walk.size - walk.end
         found.closed = walk.complete
     return found
+
+
+def _records_of(piece: Piece, walk: Walk) -> list[tuple[int, memoryview]]:
+    """The records of a chunk, or the message that stands alone; ValueError where damaged."""
+    raw = b""
+    if piece.opcode == Opcode.CHUNK:
+        raw = unpack(parse(Chunk, walk.payload(piece)))
+    elif piece.opcode == Opcode.MESSAGE:
+        raw = struct.pack("<BQ", piece.opcode, piece.length - HEAD_BYTES) + walk.payload(piece)
+    return list(records_in(raw))
 
 
 def _look_into(found: _File, payload: bytes) -> None:
