@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -48,3 +50,18 @@ def test_a_node_without_any_news_is_not_ok_after_three_seconds_and_its_sigma_wal
         at_s = float(round(e.time_s))
         distance_m = float(np.linalg.norm(true[at_s, 3] - true[at_s, 1]))
         assert abs(pair.distance_m - distance_m) < 3.0 * pair.sigma_distance_m + 1.0
+
+
+def test_reports_that_say_nothing_of_where_they_lead_do_not_hold_up_the_estimate() -> None:
+    run = relpos.simulate("paper-p1", 3, seconds=60)
+    lost = [
+        replace(m, sigma_x_m=30.0, sigma_y_m=30.0, sigma_theta_rad=10.0)
+        if isinstance(m, Motion)
+        else m
+        for m in run.measurements
+    ]
+    result = relpos.fuse(replace(run, measurements=tuple(lost)))
+    ended_s = result.estimates[-1].time_s
+    # Each search costs as much as a hundred ranges.
+    assert result.counters["nodes_sought_again"] <= ended_s * len(run.node_ids) / 5.0
+    assert all(n.status is not NodeStatus.OK for e in result.estimates[5:] for n in e.nodes)

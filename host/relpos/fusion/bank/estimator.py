@@ -290,7 +290,7 @@ class Bank:
         pairs = [(r.node, r.peer) for r in ranges]
         first, second, dz, variance = self._pairs(pairs)
         if ranges:
-            self.core.relocalisation.relocalise_lost(first, second, measured)
+            self.core.relocalisation.relocalise_lost(time_s, first, second, measured)
         rounds = self._attempts(time_s, ranges, timeline)
         if ranges:
             counts = self._counts(pairs)

@@ -39,6 +39,10 @@ FOUND_M, FOUND_RAD = 1.0, 0.4
 ODD_M = 0.3
 """How far a doubtful displacement may be off, whether it is left out or not."""
 
+REST_S = 5.0
+"""A user that is lost by every report is sought anew after so long: a search costs as much as a
+hundred ranges, and the one before has to be resolved."""
+
 FAULT_UPDATES = 10.0
 """As ``PERTURBED_UPDATES``, of all hypotheses after an odometry fault."""
 
@@ -59,6 +63,8 @@ class Relocalisation:
         """Row -> variance of its walk without a report since it was last ranged."""
         self.since_fault = 0
         """Instants of ranges since the last relocalisation."""
+        self._sought_s: dict[int, float] = {}
+        """Row -> when it was sought."""
 
     @property
     def open(self) -> bool:
@@ -101,14 +107,18 @@ class Relocalisation:
             self.lost[row] = math.sqrt(total_m2), self.lost.get(row, (0.0, 0.0))[1]
             self.ambiguous.add(row)
 
-    def relocalise_lost(self, first: Indices, second: Indices, range_m: Floats) -> None:
+    def relocalise_lost(
+        self, time_s: float, first: Indices, second: Indices, range_m: Floats
+    ) -> None:
         """Place lost users on the rings of the ranges (R,) that the next update will use."""
         for row in list(self.diffused_m2):
             if (first == row).any() or (second == row).any():
                 del self.diffused_m2[row]
         for row, (sigma_m, sigma_rad) in sorted(self.lost.items()):
-            if (first == row).any() or (second == row).any():
+            rests = time_s < self._sought_s.get(row, -math.inf) + REST_S
+            if not rests and ((first == row).any() or (second == row).any()):
                 del self.lost[row]
+                self._sought_s[row] = time_s
                 self._counters["nodes_sought_again"] += 1
                 lost = (sigma_m > LOST_M, sigma_rad > LOST_RAD)
                 self.relocalise(row, (first, second, range_m), sigma_m, lost)
