@@ -165,6 +165,7 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
     "rss_dbm": (-1e3, 1e3),
     "height_m": (-1e4, 1e4),
     "sigma_m": (0.0, 1e4),
+    "pressure_pa": (0.0, 1e6),
     "heading_rad": (-1e3, 1e3),
     "sigma_rad": (0.0, 1e3),
     "length_m": (-1e2, 1e2),

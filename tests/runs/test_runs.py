@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import math
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -339,6 +340,24 @@ def test_inertial_data_are_sorted_and_split_by_node(tmp_path: Path) -> None:
     assert imu[1].time_s.tolist() == [0.0, 0.02]
     assert imu[1].acceleration_m_s2[1].tolist() == [1.0, 2.0, 3.0]
     assert imu[1].magnetic_field_ut[0].tolist() == [3.0, 2.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("time_s", "pressure_pa", "told"),
+    [
+        ("0.02", "99999999999", "column pressure_pa: '99999999999' is not between 0 and 1e+06"),
+        ("0.02", "-1", "column pressure_pa: '-1' is negative"),
+        ("1e9", "101325", "column time_s: '1e9' is not between"),
+    ],
+)
+def test_an_inertial_recording_is_refused_beyond_its_bounds(
+    tmp_path: Path, time_s: str, pressure_pa: str, told: str
+) -> None:
+    header = IMU_HEADER.rstrip("\n") + ",pressure_pa\n"
+    good = "0.00,1,1,2,3,4,5,6,7,8,9,101325\n"
+    text = header + good + f"{time_s},1,1,2,3,4,5,6,7,8,9,{pressure_pa}\n"
+    with pytest.raises(DataError, match=r"imu.csv: line 3: " + re.escape(told)):
+        load_run(write(tmp_path, imu_csv=text)).load_imu()
 
 
 def test_a_slow_or_absent_magnetometer_leaves_gaps(tmp_path: Path) -> None:

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from relpos.measurements import BOUNDS
 from relpos.runs.table import (
     Column,
+    bounded,
     find_columns,
     find_table,
     node_id,
@@ -21,13 +23,13 @@ from relpos.runs.table import (
 )
 
 _COLUMNS = (
-    Column("time_s", number),
+    Column("time_s", bounded("time_s")),
     Column("node", node_id),
     *(Column(f"{axis}_m_s2", number) for axis in ("ax", "ay", "az")),
     *(Column(f"{axis}_rad_s", number) for axis in ("gx", "gy", "gz")),
     # A magnetometer is slower than the rest or not there at all: its cells may be empty.
     *(Column(f"{axis}_ut", number, optional=True) for axis in ("mx", "my", "mz")),
-    Column("pressure_pa", number, optional=True),
+    Column("pressure_pa", bounded("pressure_pa"), optional=True),
 )
 
 
@@ -89,11 +91,19 @@ def _read_fast(path: Path, text: str) -> npt.NDArray[np.float64] | None:
         return None
     table = np.full((values.shape[0], len(_COLUMNS)), np.nan)
     table[:, [k for k, place in enumerate(places) if place is not None]] = values
-    return table
+    return table if _are_within_bounds(table) else None
 
 
 def _are_node_ids(nodes: npt.NDArray[np.float64]) -> bool:
     return bool(((nodes >= 0) & (nodes == np.floor(nodes))).all())
+
+
+def _are_within_bounds(table: npt.NDArray[np.float64]) -> bool:
+    for k, column in enumerate(_COLUMNS):
+        low, high = BOUNDS.get(column.name, (-np.inf, np.inf))
+        if ((table[:, k] < low) | (table[:, k] > high)).any():
+            return False
+    return True
 
 
 def _read_exactly(path: Path, text: str) -> npt.NDArray[np.float64]:
