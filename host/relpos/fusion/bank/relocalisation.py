@@ -42,8 +42,8 @@ ODD_M = 0.3
 SOUGHT, SOUGHT_IN_S = 8, 10.0
 """A user is sought so often in so long at most: where every report says that it is lost, searches
 would take longer than the session, as each costs as much as a hundred ranges. After an outage
-several in a row are worth theirs (nodes off for 40 and 30 s, three seeds: with one in five seconds
-errors are 15 to 27 % more)."""
+several in a row are worth theirs (two inertial sensors off for 40 and 30 s, two seeds: with one in
+five seconds errors are 15 and 27 % more)."""
 
 FAULT_UPDATES = 10.0
 """As ``PERTURBED_UPDATES``, of all hypotheses after an odometry fault."""
