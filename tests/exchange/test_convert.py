@@ -17,6 +17,7 @@ from geographiclib.geodesic import Geodesic
 
 from relpos import tracks
 from relpos.evaluation import metrics
+from relpos.exchange import content
 from relpos.fusion.estimator import NodeStatus
 from relpos.measurements import Event, Truth
 from relpos.runs import load_run, read_estimates, save_run, write_estimates
@@ -483,6 +484,13 @@ def test_no_line_crosses_the_map_where_somebody_was_located_anew(
     write_estimates(tmp_path / "fused", lost)
     convert(tmp_path / "fused", "--pin", PIN, "--to", "geojson", "--out", tmp_path / "map.geojson")
     assert len(features(tmp_path / "map.geojson", kind="track", node=3)) == pieces
+
+
+def test_the_page_cuts_a_track_at_the_same_jump() -> None:
+    page = Path(content.__file__).parents[1] / "view" / "static" / "js" / "tracks.js"
+    figures = dict(re.findall(r"^const (\w+) = ([\d.]+);", page.read_text("utf-8"), re.MULTILINE))
+    assert float(figures["MIN_JUMP_M"]) == content.MIN_JUMP_M
+    assert float(figures["FASTEST_M_S"]) == content.FASTEST_M_S
 
 
 def test_truth_in_another_frame_is_left_out_of_the_map(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ PLACED = (NodeStatus.OK, NodeStatus.STALE, NodeStatus.LOST)
 
 MIN_JUMP_M = 3.0
 FASTEST_M_S = 5.0
-"""As on the page (``view/static/js/tracks.js``): what goes further has been located anew."""
+"""Who has gone further has been located anew: the page's figures (``view/static/js/tracks.js``)."""
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,12 @@ import csv
 import errno
 import io
 import math
-import os
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import BinaryIO
+
+from relpos.files import write_whole
 
 WRITE_EVERY_S = 0.2
 MOST_WAITING_BYTES = 64 << 20
@@ -101,12 +102,8 @@ class AppendedTable:
 
     def _begun(self) -> BinaryIO:
         """Return the file with its header: a process killed meanwhile leaves none without."""
-        beside = self.path.with_name(self.path.name + ".new")
         header, rest = self._waiting.split(b"\n", 1)
-        with beside.open("wb", buffering=0) as file:
-            if file.write(header + b"\n") != len(header) + 1:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        beside.replace(self.path)
+        write_whole(self.path, header + b"\n")
         self._waiting = rest
         return self.path.open("ab", buffering=0)
 
