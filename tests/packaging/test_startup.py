@@ -48,6 +48,20 @@ def test_help_imports_nothing_heavy(arguments):
     assert done.stdout.splitlines()[-1] == "HEAVY []"
 
 
+def test_the_page_s_serving_process_imports_no_estimator():
+    # Beside a session of twenty nodes it would be another 35 MB, and restart later.
+    program = (
+        "import sys\nimport relpos.cli.main, relpos.view.process, relpos.view.server\n"
+        "print(sorted({'numba', 'numpy', 'scipy'} & set(sys.modules)))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=os.environ | {"PYTHONPATH": str(ROOT / "host")},
+        capture_output=True, text=True, timeout=PATIENCE_S, check=True,
+    )  # fmt: skip
+    assert done.stdout == "[]\n"
+
+
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
 def test_bash_completes_commands_and_values(shell_environment):
     completed = {

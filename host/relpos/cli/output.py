@@ -71,6 +71,8 @@ class Progress:
         from rich.console import Console
 
         self._console = Console(stderr=True)
+        # Asking each time takes a live session of 130 calls a second a hundredth of a core.
+        self._in_terminal = self._console.is_terminal
         self._stage: str | None = None
         self._bar: Any = None
         self._started_s = self._printed_s = 0.0
@@ -82,12 +84,12 @@ class Progress:
         if stage != self._stage:
             self.close()
             self._stage, self._started_s, self._printed_s = stage, now_s, now_s
-            if total is not None and total < FEW_PARTS and not self._console.is_terminal:
+            if total is not None and total < FEW_PARTS and not self._in_terminal:
                 # Only a stage that really takes long is announced: a quick failure stays one line.
                 self._late = Timer(PROGRESS_AFTER_S, remark, args=(f"{stage} ...",))
                 self._late.daemon = True
                 self._late.start()
-        if self._console.is_terminal:
+        if self._in_terminal:
             self._draw(stage, done, total, now_s)
         elif done and now_s - self._printed_s > PLAIN_PROGRESS_EVERY_S:
             self._printed_s = now_s

@@ -37,9 +37,6 @@ from relpos.fusion.estimator import Estimate
 from relpos.fusion.timeline import Epoch, Step, Timeline, refusal
 from relpos.measurements import Measurement
 
-QUIET_S = 30.0
-"""After so long without a late measurement, copies are made more rarely."""
-
 
 class Core(Protocol):
     """The filter behind a timeline: steps in, estimates out.
@@ -83,16 +80,15 @@ class _Copy:
 class Rewinder:
     """The estimator around ``core`` and ``timeline``; it yields one estimate for each epoch.
 
-    ``window_s`` is how late a measurement may be, ``spacing_s`` how far apart copies are while
-    measurements come late (eight times as far after ``QUIET_S`` without any), ``every_s`` how often
-    it may rewind, ``most_s`` how much a call replays. A replay does not repeat estimates that were
-    returned already; times of estimates always increase.
+    ``window_s`` is how late a measurement may be, ``spacing_s`` how far apart copies are,
+    ``every_s`` how often it may rewind, ``most_s`` how much a call replays. A replay does not
+    repeat estimates that were returned already; times of estimates always increase.
     """
 
     core: Core
     timeline: Timeline
     window_s: float = 5.0
-    spacing_s: float = 1.0
+    spacing_s: float = 3.0
     every_s: float = 0.25
     most_s: float = 0.02
     _own: Counter[str] = field(default_factory=Counter)
@@ -214,12 +210,10 @@ class Rewinder:
         self._copy_if_due(overdue_s=self.spacing_s)
 
     def _copy_if_due(self, overdue_s: float = 0.0) -> None:
-        quiet = self._newest_s - self._rewound_s > QUIET_S
-        spacing_s = self.spacing_s * (8.0 if quiet else 1.0) + overdue_s
         frontier_s = self.timeline.frontier_s
         if frontier_s == -math.inf:  # nothing was handed out yet: there is nothing to go back to
             return
-        if self._copies and frontier_s >= self._copies[-1].frontier_s + spacing_s:
+        if self._copies and frontier_s >= self._copies[-1].frontier_s + self.spacing_s + overdue_s:
             self._copy()
 
     def _copy(self) -> None:

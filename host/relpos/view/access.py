@@ -97,16 +97,6 @@ class Access:
         return token is not None and secrets.compare_digest(token.encode(), self.token.encode())
 
 
-@dataclass(frozen=True)
-class ServerConfig:
-    """What a serving process is started with."""
-
-    listener: socket.socket
-    """Listens already: browsers that come while it is restarted wait."""
-    channel: socket.socket
-    access: Access
-
-
 class Allowance:
     """What each visitor may send: ``burst`` items at once, and ``per_s`` again every second."""
 

@@ -13,6 +13,7 @@ import asyncio
 import contextlib
 import json
 import signal
+import socket
 import tempfile
 import time
 from collections import deque
@@ -39,7 +40,7 @@ from relpos.live.board import BOARD_EVENTS
 from relpos.live.team_view import MAX_LOG, to_json
 from relpos.live.tracks import Tracks
 from relpos.said import Said, refusal
-from relpos.view.access import Access, Allowance, ServerConfig, qr_svg
+from relpos.view.access import Access, Allowance, qr_svg
 from relpos.view.bodies import (
     MAX_BODY_BYTES,
     BadRequestError,
@@ -487,19 +488,19 @@ async def _refuse(_: Request, error: Exception) -> Response:
     return JSONResponse(refusal(error.args[0]), 400)
 
 
-def run(config: ServerConfig) -> None:
-    """Serve until the session ends. The body of the process."""
+def run(listener: socket.socket, channel: socket.socket, access: Access) -> None:
+    """Serve until the session ends."""
     # Ctrl-C in the terminal reaches this process, too; the session decides when it is over.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    asyncio.run(_serve(config))
+    asyncio.run(_serve(listener, channel, access))
 
 
-async def _serve(config: ServerConfig) -> None:
-    lines, out = await asyncio.open_connection(sock=config.channel, limit=MAX_LINE_BYTES)
+async def _serve(listener: socket.socket, channel: socket.socket, access: Access) -> None:
+    lines, out = await asyncio.open_connection(sock=channel, limit=MAX_LINE_BYTES)
     session = SessionProxy(lines, out)
-    with _certificate_files(config.access) as files:
+    with _certificate_files(access) as files:
         uvicorn_config = uvicorn.Config(
-            Pages(session, config.access).app(),
+            Pages(session, access).app(),
             log_level="warning",
             access_log=False,
             lifespan="off",
@@ -512,7 +513,7 @@ async def _serve(config: ServerConfig) -> None:
         )
         uvicorn_config.load()
     server = _Server(uvicorn_config)
-    serving = asyncio.create_task(server.serve(sockets=[config.listener]))
+    serving = asyncio.create_task(server.serve(sockets=[listener]))
     await session.listen()
     server.should_exit = True
     await serving

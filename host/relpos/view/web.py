@@ -25,7 +25,8 @@ from relpos.live.sinks import Sink
 from relpos.live.team_view import MAX_LOG, Hello, LogEntry, TeamView, to_json
 from relpos.live.tracks import Tracks
 from relpos.said import Said
-from relpos.view.access import Access, ServerConfig
+from relpos.view.access import Access
+from relpos.view.process import serve
 
 if TYPE_CHECKING:
     from multiprocessing.context import SpawnProcess
@@ -173,8 +174,8 @@ class WebView(Sink):
         ours.setblocking(False)
         self._started_s = time.monotonic()
         self._process = multiprocessing.get_context("spawn").Process(
-            target=_serve,
-            args=(ServerConfig(self._door, theirs, self.access),),
+            target=serve,
+            args=(self._door, theirs, self.access),
             name="relpos view",
             daemon=True,
         )
@@ -245,13 +246,6 @@ class WebView(Sink):
             if not data:
                 raise ConnectionResetError
             self._in += data
-
-
-def _serve(config: ServerConfig) -> None:
-    """Body of the serving process, which alone needs the libraries."""
-    from relpos.view import server
-
-    server.run(config)
 
 
 def _names_message(names: dict[int, str]) -> str:

@@ -262,6 +262,22 @@ class HypothesisSet:
                 at = storage.triangle_place(first + e, first + f)
                 self.arrays.p[:, at] += covariance[e, f]
 
+    def decorrelate(
+        self, places: Indices, covariance: Floats, which: Indices | None = None
+    ) -> None:
+        """Have stored entries ``places`` (E,) independent of all others in ``which`` (M,), or all.
+
+        ``covariance`` (M, E, E) is theirs.
+        """
+        p = self.arrays.p
+        everything = storage.triangle_place(places[:, None], np.arange(self.arrays.x.shape[1]))
+        own = storage.triangle_place(places[:, None], places)
+        if which is None:
+            p[:, everything], p[:, own] = 0.0, storage.lay_out(covariance)
+        else:
+            block, lane = (at[:, None, None] for at in self._at(which))
+            p[block, everything, lane], p[block, own, lane] = 0.0, covariance
+
     # -- adding --------------------------------------------------------------------------------
 
     def add_node(self, pose: tuple[float, float, float], sigma_m: float, sigma_rad: float) -> int:
@@ -316,18 +332,17 @@ class HypothesisSet:
         share = np.exp(log_weights - log_weights.max())
         share /= share.sum()
         chosen = self.rng.permutation(systematic(share, self.count, self.rng))
-        pose = (PER_NODE * rows[:, None] + np.arange(3)).ravel()
-        x, p = self.dense()
-        x[:, pose] = poses.reshape(len(share), -1)[chosen]
-        p[:, pose, :] = 0.0
-        p[:, :, pose] = 0.0
+        pose = (storage.POSE * rows[:, None] + np.arange(storage.POSE)).ravel()
+        x, p, place = self.arrays.x, self.arrays.p, storage.triangle_place
+        x[:, pose] = storage.lay_out(poses.reshape(len(share), -1)[chosen])
+        self.decorrelate(pose, covariances[chosen])
         if beside is not None:
-            own = (PER_NODE * rows[:, None] + np.arange(2)).ravel()
-            common = np.tile(PER_NODE * beside + np.arange(2), len(rows))
-            p[:, own, :] = p[:, common, :]
-            p[:, :, own] = p[:, :, common]
-        p[np.ix_(np.arange(self.count), pose, pose)] += covariances[chosen]
-        self.store(x, p)
+            own = pose.reshape(-1, storage.POSE)[:, :2].ravel()
+            its = np.tile(storage.POSE * beside + np.arange(2), len(rows))
+            others = np.setdiff1d(np.arange(x.shape[1]), pose)
+            p[:, place(own[:, None], others)] = p[:, place(its[:, None], others)]
+            i, j = np.tril_indices(len(own))
+            p[:, place(own[i], own[j])] += p[:, place(its[i], its[j])]
 
     def split_heading(self, row: int, moved_m: float) -> None:
         """Spread a user's unknown heading round the circle, one direction a hypothesis.
@@ -336,14 +351,12 @@ class HypothesisSet:
         """
         order = self.rng.permutation(self.count)
         width = 2.0 * math.pi / self.count
-        x, p = self.dense()
-        heading = PER_NODE * row + StateIndex.HEADING
-        x[:, heading] = width * (order + self.rng.random(self.count))
-        p[:, heading] = p[:, :, heading] = 0.0
-        p[:, heading, heading] = max(1.5 * width, 0.12) ** 2
-        for place in (PER_NODE * row + StateIndex.X, PER_NODE * row + StateIndex.Y):
-            p[:, place, place] += 0.5 * moved_m**2
-        self.store(x, p)
+        heading = self._place(row, StateIndex.HEADING)
+        self.arrays.x[:, heading] = storage.lay_out(width * (order + self.rng.random(self.count)))
+        variance = np.full((self.count, 1, 1), max(1.5 * width, 0.12) ** 2)
+        self.decorrelate(np.array([heading]), variance)
+        for entry in (StateIndex.X, StateIndex.Y):
+            self.inflate(row, entry, 0.5 * moved_m**2)
 
     def common_entry(self, index: CommonIndex) -> int:
         """Return the entry of the state that ranges have in common."""

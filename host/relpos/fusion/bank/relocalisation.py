@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from relpos.fusion.bank.adaptive_count import AdaptiveCount
 from relpos.fusion.bank.hypothesis_set import PERTURBED_UPDATES, HypothesisSet
-from relpos.fusion.bank.storage import PER_NODE, StateIndex
+from relpos.fusion.bank.lanes import LANES
+from relpos.fusion.bank.storage import PER_NODE, POSE, StateIndex
 from relpos.fusion.models.odometry_faults import (
     BELIEVING,
     HEADING_CELL_RAD,
@@ -149,18 +150,15 @@ class Relocalisation:
         sights = np.flatnonzero((first == row) | (second == row))
         sight = sights[np.arange(len(which)) % len(sights)]
         peer = np.where(first[sight] == row, second[sight], first[sight])
-        x, p = these.dense()
-        own, at = PER_NODE * row + np.arange(3), which[:, None]
-        peers = x[at, PER_NODE * peer[:, None] + np.arange(2)]
-        made = perturb(x[at, own], peers, range_m[sight], place_m, these.rng)
-        x[at, own] = made.poses
+        at, lane = which[:, None] // LANES, which[:, None] % LANES
+        own, beside = POSE * row + np.arange(POSE), POSE * peer[:, None] + np.arange(2)
+        x = these.arrays.x
+        made = perturb(x[at, own, lane], x[at, beside, lane], range_m[sight], place_m, these.rng)
+        x[at, own, lane] = made.poses
         # What was lost is no longer correlated with anything else.
         for kept, part in zip(made.kept.T, (np.array([0, 1]), np.array([2])), strict=True):
-            some = which[~kept]
-            p[np.ix_(some, own[part])] = 0.0
-            p[some[:, None], :, own[part]] = 0.0
-            p[np.ix_(some, own[part], own[part])] = made.covariances[~kept][:, part[:, None], part]
-        these.store(x, p)
+            lost_there = made.covariances[~kept][:, part[:, None], part]
+            these.decorrelate(own[part], lost_there, which[~kept])
         # Neither the perturbed nor the others may say how noisy anything is.
         these.perturbed[:] = FAULT_UPDATES
 

@@ -31,6 +31,6 @@ class BankSettings:
     pair_bias_m: float = setting(0.1, "prior standard deviation of a pair's part", 0.0, 10.0)
     biased: float = setting(0.5, "share of hypotheses with range biases", 0.0, 1.0)
     spread: float = setting(0.5, "spread of the hypotheses' levels of noise", 0.0, 3.0)
-    max_lag_s: float = setting(1.5, "how long a silent node is waited for", 0.0, 60.0)
+    max_lag_s: float = setting(2.5, "how long a silent node is waited for", 0.0, 60.0)
     reorder_s: float = setting(0.3, "how long everything waits for what is under way", 0.0, 60.0)
     late_s: float = setting(5.0, "how late measurements may be put in their place", 0.0, 60.0)
