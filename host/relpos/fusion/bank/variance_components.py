@@ -181,10 +181,13 @@ def _prior_weights(log_weight: Floats, counts: Floats) -> tuple[Floats, float]:
 
 
 @inner
-def _innovation(range_m: float, stats: Floats, weight: Floats, slope: Floats) -> _Innovation:
+def _innovation(
+    range_m: float, stats: Floats, weight: Floats, begun: Floats, slope: Floats
+) -> _Innovation:
     """Return a range's innovation; update ``weight`` (K,) with its evidence.
 
-    ``slope`` (7,) receives dS / dtheta. An ``inlier`` of -1 says that no hypothesis counts.
+    ``slope`` (2, 7) receives dS / dtheta by these weights, and by ``begun`` (K,), those before the
+    instant. An ``inlier`` of -1 says that no hypothesis counts.
     """
     count = weight.shape[0]
     means, variances, curvatures = stats[MEAN], stats[VARIANCE], stats[CURVATURE]
@@ -198,10 +201,11 @@ def _innovation(range_m: float, stats: Floats, weight: Floats, slope: Floats) ->
         variance += weight[k] * (variances[k] - curvatures[k] + off * off)
         curvature += weight[k] * curvatures[k]
     for q in range(7):
-        slope[q] = 0.0
+        slope[0, q], slope[1, q] = 0.0, 0.0
         share = stats[SHARES + q]
         for k in range(count):
-            slope[q] += weight[k] * share[k]
+            slope[0, q] += weight[k] * share[k]
+            slope[1, q] += begun[k] * share[k]
     for k in range(count):
         if weight[k] > 0.0:
             peak = max(peak, evidence[k])
@@ -253,29 +257,32 @@ def learn(
     weight, whole = _prior_weights(log_weight, counts)
     if whole <= 0.0:
         return 0
-    slope, gain = np.empty(7), np.empty(size)
-    place = np.empty(7, dtype=np.int64)
+    slopes, gain, place = np.empty((2, 7)), np.empty(size), np.empty(7, dtype=np.int64)
+    begun, known = weight.copy(), mean.copy()
     for q in range(size):
         covariance[q, q] += RANDOM_WALK
     for n in range(ranges.range_m.shape[0]):
-        innovation = _innovation(ranges.range_m[n], stats[n], weight, slope)
+        innovation = _innovation(ranges.range_m[n], stats[n], weight, begun, slopes)
         if innovation.inlier < 0.0:
             return 0
-        variance = innovation.variance
-        # S is homogeneous in all variances, so its sensitivities cannot sum to more than it is;
-        # they may, where knowledge leaked from users that the sensitivities do not follow.
-        explained = 0.0
-        for q in range(6):
-            explained += slope[q]
-        if explained > variance - slope[6]:
-            for q in range(6):
-                slope[q] *= (variance - slope[6]) / explained
-            explained = variance - slope[6]
         for q in range(3):
             place[q] = COMPONENTS * ranges.first[n] + q
             place[3 + q] = COMPONENTS * ranges.second[n] + q
         place[6] = size - 1
-        own = (explained + slope[6]) / variance
+        # S is homogeneous in all variances, so its sensitivities cannot sum to more than it is;
+        # they may, where knowledge leaked from users that the sensitivities do not follow.
+        slope, explained, most = slopes[1], 0.0, innovation.variance - slopes[0, 6]
+        for q in range(6):
+            explained += slopes[0, q]
+        kept = min(most / explained, 1.0) if explained > 0.0 else 1.0
+        # The instant's other ranges have taught since: what the components explain has changed
+        # with their mean, and with that alone (the weights moved to draws that say the same).
+        variance, own = most - kept * explained, 0.0
+        for q in range(7):
+            slope[q] *= math.exp(mean[place[q]] - known[place[q]]) * (kept if q < 6 else 1.0)
+            own += slope[q]
+        variance += own
+        own /= variance
         if own < LEAST_SHARE:
             continue
         rest = max(1.0 - own, 0.0)
