@@ -219,3 +219,22 @@ def test_a_climb_is_over_the_floor_where_it_began_and_teaches_one_storey() -> No
     assert abs(floors.height_of(2, 0.0)[0] - 6.0) < 0.5
     assert abs(_error_m(outcome)[-1]) < 0.3
     assert outcome.told[1][-1].floor == 0
+
+
+def test_climbs_that_agree_make_heights_surer_than_climbs_that_do_not() -> None:
+    there_and_back = [stairs(3.5), walk(20), stairs(-3.5), walk(20)]
+    life = [walk(20), *there_and_back * 8, stairs(3.5), walk(20)]
+    sigma_m = {}
+    for bias_m in (0.1, 0.6):
+        outcome = follow({1: life, 2: BESIDE}, bias_m=bias_m)
+        sigma_m[bias_m] = outcome.told[1][-1].sigma_z_m
+        assert abs(_error_m(outcome)[-1]) < 2.0 * sigma_m[bias_m]
+    assert sigma_m[0.1] < 0.65 * sigma_m[0.6]
+
+
+def test_who_climbs_is_told_as_high_as_he_is_by_now() -> None:
+    errors_m = []
+    for seed in range(4):
+        outcome = follow({1: [walk(30), lift(21.0), walk(30)], 2: BESIDE}, seed=seed)
+        errors_m.append(_error_m(outcome)[36:50].mean())
+    assert abs(np.mean(errors_m)) < 0.2, "a height is that of 0.4 s before"

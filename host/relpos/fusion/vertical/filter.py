@@ -40,7 +40,7 @@ from relpos.fusion.vertical.heights import (
 )
 from relpos.fusion.vertical.modes import DOWN, FOLLOWS, PRESSURE, STAIRS, UP, Air, Mode
 from relpos.fusion.vertical.stairs import true_shares
-from relpos.fusion.vertical.track import Moved, Track
+from relpos.fusion.vertical.track import HEIGHT_LATE_S, Moved, Track
 from relpos.measurements import Height, Range
 
 Floats = npt.NDArray[np.float64]
@@ -70,7 +70,8 @@ STANDS_STEPS = 0.3
 
 DOUBTED = 0.6
 """What of a rise is the wearer's and what the pressure's is doubtful by this share (a standard
-deviation) of what the pressure did to a node more or less than to the others."""
+deviation) of what the pressure did to a node more or less than to the others. So is a rise that no
+height shows yet."""
 POSTURE_M = 0.4
 """Who is on a known floor may kneel, crawl or lie, no more."""
 
@@ -366,7 +367,7 @@ class VerticalFilter:
         heights = self.heights
         moving, disturbed, common_m, pressed_m = happened
         heights.advance(duration_s, one.rise_m, moving, disturbed, one.silent_s, pressed_m)
-        heights.moved(moving * 2.0 * one.reported.variance_m2)
+        heights.moved(moving**2 * 2.0 * one.reported.variance_m2)
         heights.correct(one.reported.height_m, one.reported.variance_m2)
         moves = (moving > 0.5) | one.again
         # Without heights nobody sees a wearer change floors: none is sure, or teaches its height.
@@ -430,7 +431,7 @@ class VerticalFilter:
             heights.doubt(row, doubt_m)
             between_m = floors.climbs(self._base[row])[0][floor - LOWEST]
             heights.rebase(row, float(between_m))
-            heights.observe(row, 0.0, WORN_M2)
+            heights.observe(row, 0.0, floors.scatter * WORN_M2)
             self._settled[row], self._base[row], self._doubt_m[row] = True, floor, 0.0
 
     def _height(self, row: int, more_m: float = 0.0) -> tuple[float, float]:
@@ -458,8 +459,11 @@ class VerticalFilter:
             undecided_m = math.sqrt(max(moving * (1.0 - moving), 0.0)) * rise
             doubt_m += -undecided_m if moving > 0.5 else undecided_m
             unseen_m2 += UNSEEN_M**2 * one.silent_s[row]
-        z_m, variance_m2 = self._height(row, risen_m)
-        variance_m2 += unseen_m2 + doubt_m**2
+        ahead_m = self._ahead_m(node, row, time_s)
+        z_m, variance_m2 = self._height(row, risen_m + ahead_m)
+        # On a known floor it is posture, which climbs do not show.
+        doubted = 1.0 if self._settled[row] else self.floors.scatter
+        variance_m2 += unseen_m2 + doubted * doubt_m**2 + (DOUBTED * ahead_m) ** 2
         # With the news of one more interval, where there is one.
         modes = self._smoothed[-2:][0] if self._smoothed else self._beliefs.probability
         told = episodes.episodes_of(modes[row])
@@ -481,13 +485,23 @@ class VerticalFilter:
         if stays:
             variance_m2 += float(where[:-1] @ (self.floors.mean_m - z_m) ** 2)
         else:
-            z_m, variance_m2 = self.floors.drawn_to(z_m, variance_m2, where, steps)
+            walked = steps * (level or [1.0])[-1]
+            z_m, variance_m2 = self.floors.drawn_to(z_m, variance_m2, where, walked)
         variance_m2 += self.floors.scale2 * z_m**2
         probability = None if floor is None else certain
         return Vertical(
             float(z_m), math.sqrt(variance_m2), episodes.EPISODES[k], float(told[k]), floor,
             probability,
         )  # fmt: skip
+
+    def _ahead_m(self, node: int, row: int, time_s: float) -> float:
+        """Return what a node rises until a time that no reported height shows yet."""
+        if not self._open:
+            return 0.0
+        one, happened = self._open[-1], self._happened[-1]
+        late_s = min(time_s - self._tracks[node].height_s, INTERVAL_S * 2) + HEIGHT_LATE_S
+        rise_m = happened.moving[row] * one.rise_m[row] - happened.pressed_m[row]
+        return float(late_s * rise_m / one.reported.since_s[row])
 
     def _unmeasured(self, time_s: float) -> Vertical:
         """A node that never reported a height: it may have climbed since the start."""
@@ -515,5 +529,5 @@ AT_POST = Vertical(0.0, START_M, Episode.LEVEL, 1.0, 0, 1.0)
 
 _CLIMBS = np.array([e in (Episode.UP, Episode.DOWN) for e in episodes.EPISODES])
 
-WORN_M2 = 0.1**2
+WORN_M2 = 0.15**2
 """Variance of a node's height over its floor's."""
