@@ -183,7 +183,7 @@ class HypothesisSet:
         constants = storage.POSE * self.nodes + storage.CONSTANTS * row
         return constants + entry - storage.POSE
 
-    def _at(self, which: Indices | None) -> tuple[Indices, Indices]:
+    def at(self, which: Indices | None) -> tuple[Indices, Indices]:
         """Block and lane of the hypotheses ``which``, or of all."""
         which = np.arange(self.count) if which is None else which
         return which // LANES, which % LANES
@@ -245,12 +245,12 @@ class HypothesisSet:
 
     def shift(self, row: int, entry: int, by: Floats, which: Indices | None = None) -> None:
         """Add ``by`` (M,) to an entry of a user in the hypotheses ``which`` (M,), or in all."""
-        block, lane = self._at(which)
+        block, lane = self.at(which)
         self.arrays.x[block, self._place(row, entry), lane] += by
 
     def inflate(self, row: int, entry: int, variance: float, which: Indices | None = None) -> None:
         """Add to the variance of an entry of a user in the hypotheses ``which``, or in all."""
-        place, (block, lane) = self._place(row, entry), self._at(which)
+        place, (block, lane) = self._place(row, entry), self.at(which)
         self.arrays.p[block, storage.triangle_place(place, place), lane] += variance
 
     def diffuse(self, row: int, way_m: Floats, covariance: Floats) -> None:
@@ -275,7 +275,7 @@ class HypothesisSet:
         if which is None:
             p[:, everything], p[:, own] = 0.0, storage.lay_out(covariance)
         else:
-            block, lane = (at[:, None, None] for at in self._at(which))
+            block, lane = (at[:, None, None] for at in self.at(which))
             p[block, everything, lane], p[block, own, lane] = 0.0, covariance
 
     # -- adding --------------------------------------------------------------------------------
@@ -400,7 +400,7 @@ class HypothesisSet:
         priors[self.common_entry(CommonIndex.LATENESS)] = LATENESS_SD_S
         priors[self.common_entry(CommonIndex.GROWTH)] = GROWTH_SD_M
         priors |= {self.clock_entry(row): CLOCK_SD_S for row in range(self.nodes)}
-        block, lane = self._at(which)
+        block, lane = self.at(which)
         p, has = self.arrays.p, self.has_bias[which]
         for entry, sigma in priors.items():
             p[block, storage.triangle_place(entry, entry), lane] = has * sigma**2
@@ -413,7 +413,7 @@ class HypothesisSet:
 
         The bias of a pair is the common one and its own part.
         """
-        block, lane = self._at(which)
+        block, lane = self.at(which)
         x, p = self.arrays.x, self.arrays.p
         inherits, common = 1.0 - self.has_heights[which], self.common_entry(CommonIndex.BIAS)
         own = list(self.biases.values())
@@ -447,7 +447,7 @@ class HypothesisSet:
         if s.constants > 0.0 and (back[0] > self.has_constants).any():
             which = np.flatnonzero(back[0] > self.has_constants)
             self.has_constants[which] = 1.0
-            block, lane = self._at(which)
+            block, lane = self.at(which)
             for row in range(self.nodes):
                 drift, scale = (
                     self._place(row, StateIndex.DRIFT),

@@ -15,7 +15,6 @@ import numpy.typing as npt
 
 from relpos.fusion.bank.adaptive_count import AdaptiveCount
 from relpos.fusion.bank.hypothesis_set import PERTURBED_UPDATES, HypothesisSet
-from relpos.fusion.bank.lanes import LANES
 from relpos.fusion.bank.storage import PER_NODE, POSE, StateIndex
 from relpos.fusion.models.odometry_faults import (
     BELIEVING,
@@ -150,7 +149,7 @@ class Relocalisation:
         sights = np.flatnonzero((first == row) | (second == row))
         sight = sights[np.arange(len(which)) % len(sights)]
         peer = np.where(first[sight] == row, second[sight], first[sight])
-        at, lane = which[:, None] // LANES, which[:, None] % LANES
+        at, lane = (a[:, None] for a in these.at(which))
         own, beside = POSE * row + np.arange(POSE), POSE * peer[:, None] + np.arange(2)
         x = these.arrays.x
         made = perturb(x[at, own, lane], x[at, beside, lane], range_m[sight], place_m, these.rng)
