@@ -10,14 +10,15 @@ import pytest
 
 import relpos
 from reference import joint as reference
-from relpos import tracks
+from relpos import fusion, tracks
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.settings import BankSettings
-from relpos.fusion.bank.storage import COMMON, PER_NODE, CommonIndex
+from relpos.fusion.bank.storage import COMMON, PER_NODE, CommonIndex, StateIndex
 from relpos.fusion.clocks import LEAST_S, SLEW, Clocks
 from relpos.fusion.estimator import Estimate, Parameter, time_offsets
 from relpos.fusion.models.ranging import OUTLIERS_SHORT
 from relpos.measurements import Measurement, Motion, Range
+from relpos.simulation.paper import simulate_paper
 
 NODES = 3
 
@@ -177,3 +178,27 @@ def test_the_shared_entries_are_named_in_their_order() -> None:
     these = core.hypotheses
     assert [these.common_entry(index) for index in CommonIndex] == [5, 6, 7, 8]
     assert these.clock_entry(0) == 9
+
+
+def test_a_model_that_hardly_any_weight_had_comes_back_after_hypotheses_are_joined() -> None:
+    core = BankCore(BankSettings(biased=0.5), 3)
+    for n in range(NODES):
+        core.add_node((3.0 * n, 0.0, 0.0), 0.1, 0.1)
+    these = core.hypotheses
+    these.log_weight[:] -= 60.0 * np.maximum(these.has_bias, these.has_constants)
+    core.adaptive._shrink(10, these.unperturbed_weights())
+    core.adaptive.grow()
+    for _ in range(40):
+        these.resample(these.weights())
+    _, p = these.dense()
+    for entry, prior in ((these.clock_entry(1), 0.07), (StateIndex.SCALE, 0.1)):
+        assert p[:, entry, entry].max() == pytest.approx(prior**2)
+
+
+def test_nothing_is_told_of_clocks_that_no_hypothesis_models() -> None:
+    run = simulate_paper("paper-p1", 33, {"seconds": 80})
+    bank = fusion.make("bank", run.priors, {"hypotheses": 50}, seed=1)
+    estimates = [e for m in run.measurements for e in bank.process(m)] + bank.finish()
+    told = [[p for p in e.parameters if p.name == "clock_offset_s"] for e in estimates]
+    assert [] in told
+    assert all(p.sigma > 0.0 for each in told for p in each)

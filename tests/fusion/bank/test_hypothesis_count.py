@@ -139,7 +139,8 @@ def _epochs(core: BankCore, first: int, count: int) -> None:
 
 
 def test_a_copy_is_exact_across_a_change_of_number() -> None:
-    core = BankCore(BankSettings(), seed=5)
+    # Models that a few of the many get back would change moments.
+    core = BankCore(BankSettings(constants=0.0, biased=0.0), seed=5)
     for x_m, y_m in ((0.0, 0.0), (4.0, 0.0), (0.0, 3.0)):
         core.add_node((x_m, y_m, 0.0), 0.01, 0.01)
     many = deepcopy(core)

@@ -369,11 +369,12 @@ class HypothesisSet:
     def clock_offsets(self, mean: Floats, covariance: Floats) -> tuple[Floats, Floats]:
         """Return the users' clock offsets (N,) by the moments, and their deviations (s).
 
-        These are without what all offsets share: ranges say how clocks differ, and no more.
+        These are relative to the mean of all: ranges say how clocks differ, and no more.
         """
         entries = PER_NODE * self.nodes + COMMON + np.arange(self.nodes)
-        shared = float(self.weights() @ self.has_bias) * CLOCK_SD_S**2 / max(self.nodes, 1)
-        return mean[entries], np.sqrt(np.maximum(covariance[entries, entries] - shared, 0.0))
+        own = np.eye(self.nodes) - 1.0 / max(self.nodes, 1)
+        spread = (own @ covariance[np.ix_(entries, entries)] @ own).diagonal()
+        return mean[entries], np.sqrt(np.maximum(spread, 0.0))
 
     def pairs_learned(self) -> tuple[bool, dict[tuple[int, int], tuple[float, float]]]:
         """Return each pair of rows' own constant and its variance, and whether it is a height.
@@ -541,22 +542,20 @@ class HypothesisSet:
 
         ``weight`` (K,) are the weights so far; the new ones are equal.
         """
-        laid = np.zeros(len(self.arrays.x) * LANES)
-        laid[: self.count] = weight
-        blocks = laid.reshape(-1, LANES)
-        sensitivity = np.einsum("bl,b...l->...", blocks, self.arrays.sensitivity)
-        constants, bias = self.has_constants.any(), self.has_bias.any()
+        each = storage.of_each(self.arrays.sensitivity, self.count)
+        sensitivity = np.einsum("k,k...->...", weight, each)
         low_noise = float(weight @ self.low_heading_noise)
-        heights = weight @ self.has_heights > 0.5
+        # What most do not model has no variance left to learn with: it has to be given back.
+        models = self.has_constants, self.has_bias, self.has_heights
+        constants, bias, heights = (float(weight @ has > 0.5) for has in models)
         count = len(chosen)
         self._select(chosen)
         self.store(x, np.repeat(p[None], count, axis=0))
         self.arrays.sensitivity[...] = sensitivity[..., None]
         self.perturbed = np.zeros(count)
-        # The moments have something of the constants wherever any hypothesis has.
-        self.has_constants = np.full(count, float(constants))
-        self.has_bias = np.full(count, float(bias))
-        self.has_heights = np.full(count, float(heights))
+        self.has_constants = np.full(count, constants)
+        self.has_bias = np.full(count, bias)
+        self.has_heights = np.full(count, heights)
         self.arrays = self.arrays._replace(has_heights=storage.lay_out(self.has_heights))
         # Between the two, where that is open: a nearly linear mixture leaves it so for long.
         self.low_heading_noise = np.full(count, low_noise)

@@ -22,8 +22,6 @@ Floats = npt.NDArray[np.float64]
 
 SURE = 3.0
 """What is smaller than so many of its standard deviations is left in."""
-LEAST_S = 0.01
-"""So are shorter times: a walker makes 1 cm in it, and knots a picosecond apart are none."""
 
 
 def as_learned(
@@ -32,8 +30,7 @@ def as_learned(
     """Return measurements at their true times, and ranges without the bodies' shadows."""
     clocks, shadow_m = Clocks(), 0.0
     for p in estimates[-1].parameters if estimates else ():
-        least = LEAST_S if p.name.endswith("_s") else 0.0
-        if abs(p.value) <= max(SURE * p.sigma, least):
+        if abs(p.value) <= SURE * p.sigma:
             continue
         if p.name == "range_lateness_s":
             clocks.lateness_s = p.value
