@@ -78,7 +78,7 @@ coverage: $(DEVELOP) | system-avr system-browser ## share of lines that tests re
 # One BLAS thread a worker: more of them than cores only wait for each other.
 python-tests: $(DEVELOP) | system-avr system-browser
 	$(call title,Python tests)
-	@# In a new clone, compile the tests once: eight workers that begin together would each do it.
+	@# In a new clone, compile the tests once: workers that begin together would each do it.
 	@[ -d tests/__pycache__ ] || $(VENV)/bin/pytest --collect-only -qq >/dev/null
 	OPENBLAS_NUM_THREADS=1 $(VENV)/bin/pytest -n auto --dist loadfile --no-loadscope-reorder --durations 10
 

@@ -19,12 +19,12 @@ from stage import Browser, wait_for
 
 @pytest.fixture
 def session(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A live session in which node 4's radio is off for sixteen seconds."""
+    """A live session in which node 4's radio is off for 25 seconds."""
     command = [
         Path(sys.executable).with_name("relpos"), "demo", "--view", "--no-open", "--nodes", "4",
         "--view-listen", "127.0.0.1:0", "--seconds", "300", "--out", tmp_path / "out",
         # Lost for so long that a busy machine sees it.
-        "--fault", "xbee:off:node=4,from=25,to=50",
+        "--fault", "xbee:off:node=4,from=15,to=40",
     ]  # fmt: skip
     running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:

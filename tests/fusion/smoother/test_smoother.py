@@ -360,7 +360,7 @@ def test_wild_ranges_do_not_bend_the_track() -> None:
 
 @pytest.mark.parametrize("condition", ["gap-5", pytest.param("late-0.3", marks=pytest.mark.soak)])
 def test_a_smoothed_mission_is_better_than_the_online_one_and_says_so(condition: str) -> None:
-    run = relpos.simulate(f"mission-{condition}", 650, seconds=100.0, nodes=4)
+    run = relpos.simulate(f"mission-{condition}", 650, seconds=70.0, nodes=4)
     scores = [
         relpos.evaluate(relpos.fuse(run, smooth=smooth), run, bound=False).metrics
         for smooth in (False, True)

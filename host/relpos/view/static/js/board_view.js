@@ -23,8 +23,9 @@ export class BoardView {
       this.dialog.show();
       this.update();
     });
-    this.dialog.addEventListener("keydown", (event) => {
-      if (event.key === "Escape") this.dialog.close();
+    // On the body, too: the focus is there for a moment when the button that had it has gone.
+    document.addEventListener("keydown", ({ key, target }) => {
+      if (key === "Escape" && (target === document.body || this.dialog.contains(target))) this.dialog.close();
     });
     const all = (state) => Promise.all(team.wearers().map(({ node }) => this.post("board", { node, state })));
     byId("all-standby").addEventListener("click", () => all("standby"));
