@@ -96,17 +96,20 @@ def update_cusum(
     """One step of the cumulative sums: those, the usual nu^2/S, and who slipped or -1."""
     usual = min(max(base, slips.BASE_LEAST), slips.BASE_MOST)
     rise, fall = 0.5 * (1.0 - 1.0 / slips.GROWN) / usual, 0.5 * math.log(slips.GROWN)
-    delta = [
-        min(rise * one - fall, slips.CLIP) * min(3.0 * weight, 1.0) - slips.CLIP * outliers
-        for one, weight in zip(square, worth, strict=True)
-    ]
+    delta = [min(rise * one - fall, slips.CLIP) for one in square]
     if max(sums) < 0.25 * slips.ALARM:
         for one in square:
             base += slips.BASE_SHARE * (min(one, 4.0) - base)
     after = []
     for row, so_far in enumerate(sums):
-        own = [one for pair, one in zip(pairs, delta, strict=True) if row in pair]
-        after.append(max(so_far + median(own), 0.0) if own else so_far)
+        own = [k for k, pair in enumerate(pairs) if row in pair]
+        if not own:
+            after.append(so_far)
+            continue
+        half = max(len(own) // 2, 1)
+        count = min(3.0 * sum(worth[k] for k in own), half)
+        added = count * median(delta[k] for k in own) - slips.CLIP * outliers * half
+        after.append(max(so_far + added, 0.0))
     ranged = {row for pair in pairs for row in pair}
     row = max(sorted(ranged), key=lambda row: after[row])
     if after[row] < alarm:

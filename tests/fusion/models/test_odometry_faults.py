@@ -7,7 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from relpos import fusion
+from relpos import fusion, tracks
+from relpos.evaluation import metrics
+from relpos.evaluation.study import ESTIMATOR_SEED
 from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.fusion.models.odometry_faults import (
     ALARM,
@@ -18,6 +20,7 @@ from relpos.fusion.models.odometry_faults import (
     update_cusum,
 )
 from relpos.measurements import Measurement, Motion, Prior, Range
+from relpos.simulation.paper import simulate_paper
 
 PAIRS = [(a, b) for a in range(4) for b in range(a + 1, 4)]
 
@@ -26,10 +29,13 @@ def detector_of(nodes: int) -> CusumDetector:
     return CusumDetector(np.zeros(nodes), np.ones(1))
 
 
-def update(detector: CusumDetector, square: dict[tuple[int, int], float]) -> int:
+def update(
+    detector: CusumDetector, square: dict[tuple[int, int], float], effective: float = 1.0
+) -> int:
     first, second = np.ascontiguousarray(np.array(list(square), dtype=np.int64).T)
     values = np.array(list(square.values()))
-    return update_cusum(detector, first, second, values, np.ones(len(values)), 0.02, False)
+    each = np.full(len(values), effective)
+    return update_cusum(detector, first, second, values, each, 0.02, False)
 
 
 def test_the_node_that_fits_no_other_is_named_and_not_its_peers() -> None:
@@ -40,6 +46,33 @@ def test_the_node_that_fits_no_other_is_named_and_not_its_peers() -> None:
         if named >= 0:
             break
     assert named == 2
+
+
+def test_a_node_that_fits_none_of_ten_is_named_after_a_few_instants_though_all_stand() -> None:
+    detector = detector_of(11)
+    crowd = [(a, b) for a in range(11) for b in range(a + 1, 11)]
+    named = [
+        update(detector, {p: 1000.0 if 4 in p else 1.0 for p in crowd}, 0.05) for _ in range(4)
+    ]
+    assert 4 in named
+    assert set(named) == {-1, 4}
+
+
+@pytest.mark.parametrize("seed", [40003, 61001])
+def test_one_carried_out_of_a_crowd_is_not_believed_at_its_mirror_image(seed: int) -> None:
+    # Of twenty most stand on one spot, so that ranges leave two places.
+    settings = {"nodes": 20, "seconds": 60, "kidnap_m": 5, "kidnap_s": 15}
+    run = simulate_paper("paper-p1", seed, settings)
+    bank = fusion.make("bank", run.priors, seed=seed + ESTIMATOR_SEED)
+    estimates = [e for m in run.measurements for e in bank.process(m)] + bank.finish()
+    noticed = [e for e in estimates if e.time_s >= 25.0]
+    made = metrics.evaluate(
+        tracks.estimated_tracks(noticed),
+        tracks.true_tracks(run.truth),
+        tracks.estimated_pairs(noticed),
+    )
+    assert made.ok_over_2_m == 0.0
+    assert made.relative_distance_rmse_m < 0.3
 
 
 def test_innovations_as_usual_raise_no_alarm() -> None:

@@ -11,9 +11,10 @@ hide it, and hypotheses that are perturbed all the time cost accuracy, so:
 
       delta = (e (1 - 1/4) - log 4) / 2,
 
-  is summed up as long as the sum is positive (CUSUM: Page 1954). A node's delta is the median
-  over its ranges of one instant, which tells a node that fits none of several peers from the
-  peers that fit all others; each delta is clipped, so that one outlier raises no alarm.
+  is summed up as long as the sum is positive (CUSUM: Page 1954). Of a node's ranges of one
+  instant the median is taken, which tells a node that fits none of several peers from the peers
+  that fit all others, and counts for half of them, as so many are at least as odd. Each delta is
+  clipped, so that one outlier raises no alarm.
 
 * An alarm is **answered** by many hypotheses that perturb this node: its place (on the ring of
   a peer that ranged it), its heading (anywhere round the circle), or both. The ranges then
@@ -101,11 +102,9 @@ def update_cusum(
     usual = min(max(base[0], BASE_LEAST), BASE_MOST)
     rise, fall = 0.5 * (1.0 - 1.0 / GROWN) / usual, 0.5 * math.log(GROWN)
     ranges = first.shape[0]
-    # The filter whitens what repeats itself, except for nodes that stand.
     delta = np.empty(ranges)
     for r in range(ranges):
-        ratio = min(rise * square[r] - fall, CLIP) * min(3.0 * effective[r], 1.0)
-        delta[r] = ratio - CLIP * outliers
+        delta[r] = min(rise * square[r] - fall, CLIP)
     high = 0.0
     for row in range(sums.shape[0]):
         high = max(high, sums[row])
@@ -115,7 +114,7 @@ def update_cusum(
     own = np.empty(2 * ranges)
     highest, faulty = 0.0, 0
     for row in range(sums.shape[0]):
-        several = 0
+        several, independent = 0, 0.0
         for r in range(ranges):
             for end in (first[r], second[r]):
                 if end == row:
@@ -126,9 +125,13 @@ def update_cusum(
                         at -= 1
                     own[at] = delta[r]
                     several += 1
+                    independent += effective[r]
         if several:
             median = 0.5 * (own[(several - 1) // 2] + own[several // 2])
-            sums[row] = max(sums[row] + median, 0.0)
+            # The filter whitens what repeats itself, except for nodes that stand.
+            half = max(several // 2, 1)
+            median *= min(3.0 * independent, half)
+            sums[row] = max(sums[row] + median - CLIP * outliers * half, 0.0)
             # Only one that is ranged now can be placed anew.
             if sums[row] > highest:
                 highest, faulty = sums[row], row
