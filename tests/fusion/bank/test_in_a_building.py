@@ -12,7 +12,7 @@ from relpos.tracks import true_tracks
 
 @pytest.fixture(scope="module")
 def score() -> vertical.Vertical:
-    run = simulate_building("building", 43, {"seconds": 300.0})
+    run = simulate_building("building", 43, {"seconds": 600.0})
     estimator = fusion.make("bank", run.priors, {}, seed=43)
     estimates = [e for m in run.measurements for e in estimator.process(m)]
     estimates += estimator.finish()
