@@ -39,6 +39,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     durations = cache.get(DURATIONS, {}) if cache is not None else {}
     # Tests of a file stay together and share its fixtures (--dist loadfile); a new one may be long.
     items.sort(key=lambda item: -durations.get(_file_of(item.nodeid), _guess_s(item.nodeid)))
+    # A worker keeps its browser from one file to the next.
+    items.sort(key=lambda item: not item.nodeid.startswith("tests/view/"))
 
 
 def _cache_of(config: pytest.Config) -> pytest.Cache | None:

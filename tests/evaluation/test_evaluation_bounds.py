@@ -137,9 +137,10 @@ class _Dense:
         return np.array(result)
 
 
-@pytest.mark.parametrize("off_grid", [False, True])
-@pytest.mark.parametrize("constants", [False, True])
-@pytest.mark.parametrize("start", [0.0, 0.4])
+@pytest.mark.parametrize(
+    ("off_grid", "constants", "start"),
+    [(False, False, 0.0), (True, False, 0.4), (False, True, 0.4), (True, True, 0.0)],
+)
 def test_the_recursion_is_the_inverse_of_the_whole_information(
     off_grid: bool, constants: bool, start: float
 ) -> None:

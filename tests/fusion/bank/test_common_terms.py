@@ -111,7 +111,8 @@ def test_what_ranges_have_in_common_is_learned_within_a_tenth(
 
 
 @pytest.mark.parametrize(
-    ("smooth", "seconds", "distance_m"), [(False, 200, 0.16), (True, 80, 0.10)]
+    ("smooth", "seconds", "distance_m"),
+    [(False, 200, 0.16), pytest.param(True, 80, 0.10, marks=pytest.mark.soak)],
 )
 def test_ranges_that_grow_with_the_logarithm_of_the_distance_make_no_distance_longer(
     smooth: bool, seconds: float, distance_m: float
