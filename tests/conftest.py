@@ -29,7 +29,7 @@ LONG = (
 def pytest_xdist_auto_num_workers() -> int:
     """Three a core: while tests wait for browsers and processes, the cores stay busy.
 
-    Each costs its imports, its collecting and its kernels: four took 8 % more processor time.
+    Each more costs its imports, its collecting and its kernels, some six seconds of processor time.
     """
     return 3 * (os.cpu_count() or 1)
 

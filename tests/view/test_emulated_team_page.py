@@ -1,4 +1,4 @@
-"""Both pages over the whole chain: six emulated boards, serial port, fusion, server, browser."""
+"""Both pages over the whole chain: emulated boards, serial port, fusion, server, browser."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from stage import Browser, wait_for
 
 @pytest.fixture
 def session(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A live session in which node 4's radio is off for 25 seconds."""
+    """A live session in which node 3's radio is off for 20 seconds."""
     command = [
-        Path(sys.executable).with_name("relpos"), "demo", "--view", "--no-open", "--nodes", "4",
+        Path(sys.executable).with_name("relpos"), "demo", "--view", "--no-open", "--nodes", "3",
         "--view-listen", "127.0.0.1:0", "--seconds", "300", "--out", tmp_path / "out",
         # Lost for so long that a busy machine sees it.
-        "--fault", "xbee:off:node=4,from=15,to=40",
+        "--fault", "xbee:off:node=3,from=15,to=35",
     ]  # fmt: skip
     running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
@@ -71,7 +71,7 @@ def test_an_emulated_team_is_seen_walking_lost_found_and_pressing_a_landmark(
         opened.on("console", lambda m: complaints.append(m.text) if m.type == "error" else None)
     page.add_init_script(LISTEN)
     page.goto(address)
-    expect(page.locator("#people li")).to_have_count(4)
+    expect(page.locator("#people li")).to_have_count(3)
     page.get_by_role("button", name="Table").click()
     wait_for(lambda: "Node 1" in positions(page))
     before = positions(page)
@@ -94,9 +94,9 @@ def test_an_emulated_team_is_seen_walking_lost_found_and_pressing_a_landmark(
     def announced(words: str) -> bool:
         return any(words in text for text in page.evaluate("window.announced"))
 
-    wait_for(lambda: announced("Node 4 is lost: not heard for"), 120.0)
-    wait_for(lambda: announced("Node 4 is heard again"), 120.0)
-    expect(page.locator("#alarms [data-node='4']")).to_have_count(0)
+    wait_for(lambda: announced("Node 3 is lost: not heard for"), 120.0)
+    wait_for(lambda: announced("Node 3 is heard again"), 120.0)
+    expect(page.locator("#alarms [data-node='3']")).to_have_count(0)
     after = positions(page)
     moved = [name for name in before if name in after and before[name] != after[name]]
     assert "Node 1" in moved

@@ -54,6 +54,7 @@ def test_the_bank_adapts_to_unknown_settings(overrides: dict[str, float], limit_
     assert _run("paper-p1", 0, overrides).relative_distance_rmse_m < limit_m
 
 
+@pytest.mark.soak  # In 200 s: test_people_are_not_lost_to_low_heading_noise.
 def test_white_heading_noise_and_a_short_reach_leave_the_team_in_shape() -> None:
     figures = _run("paper-h", 1)
     assert figures.relative_distance_rmse_m < 1.27
