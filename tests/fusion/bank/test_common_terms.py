@@ -43,7 +43,7 @@ def test_a_range_with_all_terms_is_the_reference_implementation() -> None:
     common = PER_NODE * NODES
     x[:, common:] = np.random.default_rng(1).normal(size=(8, x.shape[1] - common)) * 0.1
     these.store(x, p)
-    heights = these.has_heights
+    heights = these.models.heights
     assert 0.0 < heights.sum() < 8.0
     x[:, entry] += 7.0 * heights
     these.store(x, p)
@@ -186,7 +186,7 @@ def test_a_model_that_hardly_any_weight_had_comes_back_after_hypotheses_are_join
     for n in range(NODES):
         core.add_node((3.0 * n, 0.0, 0.0), 0.1, 0.1)
     these = core.hypotheses
-    these.log_weight[:] -= 60.0 * np.maximum(these.has_bias, these.has_constants)
+    these.log_weight[:] -= 60.0 * np.maximum(these.models.bias, these.models.constants)
     core.adaptive._shrink(10, these.unperturbed_weights())
     core.adaptive.grow()
     for _ in range(40):

@@ -181,7 +181,7 @@ def test_people_are_not_lost_to_low_heading_noise() -> None:
     bank = make(run.priors, HypothesisInitialiser(), BankSettings(steady=1.0), 1, {})
     estimates = [e for m in run.measurements for e in bank.process(m)] + bank.finish()
     core = _core(bank)
-    assert float(core.hypotheses.weights() @ core.hypotheses.low_heading_noise) < 0.1
+    assert float(core.hypotheses.weights() @ core.hypotheses.models.low_heading_noise) < 0.1
     figures = metrics.evaluate(
         tracks.estimated_tracks(estimates),
         tracks.true_tracks(run.truth),

@@ -93,9 +93,9 @@ class AdaptiveCount:
         these = self._hypotheses
         weight, effective = these.normalise()
         weights = weight.reshape(-1)[: these.count]
-        constants, biased = float(weights @ these.has_constants), float(weights @ these.has_bias)
-        heights = float(weights @ these.has_heights)
-        least = max(min(share, 1.0 - share) for share in (constants, biased, heights))
+        models = these.models
+        shares = [float(weights @ each) for each in (models.constants, models.bias, models.heights)]
+        least = max(min(share, 1.0 - share) for share in shares)
         return (
             float(these.components.covariance[-1, -1]) <= hypothesis_count.KNOWN**2
             and effective >= hypothesis_count.EVEN * these.count
@@ -143,9 +143,9 @@ class AdaptiveCount:
         """Go on with fewer hypotheses; the mixture's moments are unchanged."""
         these = self._hypotheses
         s = these.settings
-        heights = float(unperturbed.reshape(-1)[: these.count] @ these.has_heights) > 0.5
+        heights = float(unperturbed.reshape(-1)[: these.count] @ these.models.heights) > 0.5
         # What a pair's entry is has to be the same in all.
-        left_out = (these.perturbed > 0.0) | (these.has_heights != heights)
+        left_out = (these.perturbed > 0.0) | (these.models.heights != heights)
         these.log_weight[:] -= np.where(left_out, PERTURBED_LOSS, 0.0)
         mean, covariance = these.moments()
         before, weight = these.sampled_share, these.weights()

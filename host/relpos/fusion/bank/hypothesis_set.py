@@ -11,6 +11,12 @@ import numpy.typing as npt
 from relpos.errors import RelposError
 from relpos.fusion.bank import common_rotation, hypothesis_count, lanes, mixture, storage
 from relpos.fusion.bank import variance_components as components
+from relpos.fusion.bank.hypothesis_models import (
+    HEIGHTS_SHARE,
+    RETURN_SHARE,
+    STOREY_M2,
+    Models,
+)
 from relpos.fusion.bank.lanes import LANES
 from relpos.fusion.bank.mixture import PERTURBED_LOSS
 from relpos.fusion.bank.settings import BankSettings
@@ -34,19 +40,7 @@ each clock's offset. Far larger ones are learned, too (``mission-late-1``: 0.99 
 0.3 of each learns them sooner (0.13 m), but takes the biases of pairs that are not calibrated for
 shadows: eight seeds of three walkers have 0.10 m with these, 0.20 with 0.3, 0.07 without any."""
 
-HEIGHTS_SHARE, STOREY_M2 = 0.5, 9.0
-"""Where nobody's height is known, in this share of the hypotheses with biases a pair has instead of
-its bias the square of its difference of height: a constant, in which a range's square is linear.
-Its prior deviation is that of one storey (``mission-floors-no-heights``, seeds 640 to 642: 0.30 m,
-NEES 3.2 without, 0.13 m, 0.9 so; ``paper``, 23010 to 23019: 0.794 +- 0.029 m, 0.798 +- 0.022)."""
-
-MODEL_RETURN_SHARE = 0.002
-"""Of the hypotheses without constants (or range biases), this share gets them back at each
-resampling: none may be left when they begin to matter. ``mission-split-hard`` 611: 2.49 m without,
-1.63 with; more than that costs where there are none (``paper-h``: 0.83 with it, 0.90 with ten times
-as much)."""
-
-RETURN_SHARE = 0.06
+USUAL_NOISE_SHARE = 0.06
 """Of the hypotheses with low heading noise, this share returns to the usual noise at each
 resampling. People who walk straight on seem to have little; when they turn, some hypotheses have
 to be left that expect it (``paper``, seeds 9100 to 9109: 0.77 m, without it 0.82 with a worst of
@@ -86,17 +80,11 @@ class HypothesisSet:
         )  # fmt: skip
         self.components = VarianceComponents()
         self._normals: Floats = rng.standard_normal((count, 1))
-        self.has_constants = self._share_of_all(round(settings.constants * count))
-        """1 where step scale and heading drift are modelled (K,)."""
-        self.has_bias = np.sort(self._share_of_all(round(settings.biased * count)))
-        """1 where range biases are (K,)."""
         self.heights_known = False
-        self.has_heights = self.has_bias * (rng.random(count) < HEIGHTS_SHARE)
-        """1 where those of pairs are squares of differences of height instead (K,)."""
-        self.low_heading_noise = self._share_of_all(int(settings.steady * count))
-        """1 where headings are taken to be those of wheels or a camera (K,)."""
+        self.models = Models.draw(settings, count, rng)
         # Reported initial poses may all be wrong at once.
-        self.wrong_start = self._share_of_all(int(settings.wrong_starts * count))
+        many = int(settings.wrong_starts * count)
+        self.wrong_start = (rng.permutation(count) < many).astype(np.float64)
         self.perturbed: Floats = PERTURBED_UPDATES * self.wrong_start
         """For so many instants of ranges a hypothesis teaches nothing about noise (K,)."""
         self.biases: dict[tuple[int, int], int] = {}
@@ -105,9 +93,6 @@ class HypothesisSet:
         self.common: Floats = np.zeros((common_rotation.RIGID, common_rotation.RIGID))
         """Covariance of the rigid motion of the whole team that has been taken out."""
         self.spread_components()
-
-    def _share_of_all(self, many: int) -> Floats:
-        return (self.rng.permutation(self.count) < many).astype(np.float64)
 
     # -- reading -------------------------------------------------------------------------------
 
@@ -303,11 +288,12 @@ class HypothesisSet:
         for entry in (StateIndex.X, StateIndex.Y):
             p[wrong, at + entry, at + entry] += 0.5 * JUMP_M**2
         drift, scale = at + StateIndex.DRIFT, at + StateIndex.SCALE
-        p[:, drift, drift] = self.has_constants * (1.0 - self.low_heading_noise) * s.drift_rad_s**2
-        p[:, scale, scale] = self.has_constants * s.scale**2
+        models = self.models
+        p[:, drift, drift] = models.constants * (1.0 - models.low_heading_noise) * s.drift_rad_s**2
+        p[:, scale, scale] = models.constants * s.scale**2
         self.nodes += 1
         clock = self.clock_entry(row)
-        p[:, clock, clock] = self.has_bias * CLOCK_SD_S**2
+        p[:, clock, clock] = models.bias * CLOCK_SD_S**2
         self.store(x, p)
         self.biases = {pair: place + PER_NODE + 1 for pair, place in self.biases.items()}
         self.components.add_node()
@@ -384,8 +370,8 @@ class HypothesisSet:
         if not self.biases:
             return False, {}
         weight = self.weights()
-        heights = bool(weight @ self.has_heights > 0.5)
-        weight = weight * (self.has_heights == heights)
+        heights = bool(weight @ self.models.heights > 0.5)
+        weight = weight * (self.models.heights == heights)
         weight /= weight.sum()
         entries = np.array(list(self.biases.values()), dtype=np.int64)
         own = self.arrays.p[:, storage.triangle_place(entries, entries)]
@@ -402,7 +388,7 @@ class HypothesisSet:
         priors[self.common_entry(CommonIndex.GROWTH)] = GROWTH_SD_M
         priors |= {self.clock_entry(row): CLOCK_SD_S for row in range(self.nodes)}
         block, lane = self.at(which)
-        p, has = self.arrays.p, self.has_bias[which]
+        p, has = self.arrays.p, self.models.bias[which]
         for entry, sigma in priors.items():
             p[block, storage.triangle_place(entry, entry), lane] = has * sigma**2
         common = self.common_entry(CommonIndex.BIAS)
@@ -416,7 +402,7 @@ class HypothesisSet:
         """
         block, lane = self.at(which)
         x, p = self.arrays.x, self.arrays.p
-        inherits, common = 1.0 - self.has_heights[which], self.common_entry(CommonIndex.BIAS)
+        inherits, common = 1.0 - self.models.heights[which], self.common_entry(CommonIndex.BIAS)
         own = list(self.biases.values())
         for entry in own:
             x[block, entry, lane] = inherits * x[block, common, lane]
@@ -426,51 +412,54 @@ class HypothesisSet:
                 p[block, place, lane] = inherits * p[block, shared, lane]
             place = storage.triangle_place(entry, entry)
             p[block, place, lane] += self._own_variance(which)
-        self.arrays = self.arrays._replace(has_heights=storage.lay_out(self.has_heights))
+        self._lay_out_models()
+
+    def _lay_out_models(self) -> None:
+        self.arrays = self.arrays._replace(has_heights=storage.lay_out(self.models.heights))
 
     def _own_variance(self, which: Indices | slice = slice(None)) -> Floats:
         """Return the prior variance of what a pair has of its own (M,), m^2 or m^4."""
-        heights, own = self.has_heights[which], self.settings.pair_bias_m**2
-        variance: Floats = self.has_bias[which] * (own + heights * (STOREY_M2**2 - own))
+        heights, own = self.models.heights[which], self.settings.pair_bias_m**2
+        variance: Floats = self.models.bias[which] * (own + heights * (STOREY_M2**2 - own))
         return variance
 
     def know_heights(self) -> None:
         """Have no hypothesis any more in which heights are unknown: they are reported."""
-        which = np.flatnonzero(self.has_heights)
-        self.heights_known, self.has_heights[:] = True, 0.0
+        which = np.flatnonzero(self.models.heights)
+        self.heights_known, self.models.heights[:] = True, 0.0
         if which.size:
             self._begin_pairs(which)
 
     def _return_to_models(self) -> None:
         """Let a few hypotheses without constants, or without biases, have them again."""
-        s, p = self.settings, self.arrays.p
-        back = self.rng.random((2, self.count)) < MODEL_RETURN_SHARE
-        if s.constants > 0.0 and (back[0] > self.has_constants).any():
-            which = np.flatnonzero(back[0] > self.has_constants)
-            self.has_constants[which] = 1.0
+        s, p, models = self.settings, self.arrays.p, self.models
+        back = self.rng.random((2, self.count)) < RETURN_SHARE
+        which = np.flatnonzero(back[0] > models.constants)
+        if s.constants > 0.0 and which.size:
+            models.constants[which] = 1.0
             block, lane = self.at(which)
             for row in range(self.nodes):
                 drift, scale = (
                     self._place(row, StateIndex.DRIFT),
                     self._place(row, StateIndex.SCALE),
                 )
-                drifts = (1.0 - self.low_heading_noise[which]) * s.drift_rad_s**2
+                drifts = (1.0 - models.low_heading_noise[which]) * s.drift_rad_s**2
                 p[block, storage.triangle_place(drift, drift), lane] = drifts
                 p[block, storage.triangle_place(scale, scale), lane] = s.scale**2
-        if s.biased > 0.0 and (back[1] > self.has_bias).any():
-            which = np.flatnonzero(back[1] > self.has_bias)
-            self.has_bias[which] = 1.0
+        which = np.flatnonzero(back[1] > models.bias)
+        if s.biased > 0.0 and which.size:
+            models.bias[which] = 1.0
             drawn = self.rng.random(which.size) < HEIGHTS_SHARE
-            self.has_heights[which] = drawn & (not self.heights_known)
+            models.heights[which] = drawn & (not self.heights_known)
             self._allow_common(which)
 
     def shift_common(self, entry: int, by: float) -> None:
         """Add to an entry of what ranges have in common in every hypothesis that models it."""
-        self.arrays.x[:, entry] += by * storage.lay_out((self.has_bias > 0.0).astype(np.float64))
+        self.arrays.x[:, entry] += by * storage.lay_out((self.models.bias > 0.0).astype(np.float64))
 
     def set_scale(self, row: int, scale: float) -> None:
         """Start a user's step scale (true over reported) where it is modelled."""
-        scales = storage.lay_out(self.has_constants * math.log(scale))
+        scales = storage.lay_out(self.models.constants * math.log(scale))
         self.arrays.x[:, self._place(row, StateIndex.SCALE)] = scales
 
     def bias_entries(self, first: Indices, second: Indices) -> Indices:
@@ -479,7 +468,7 @@ class HypothesisSet:
         A pair's bias is the common one plus its own part, so a new pair begins with what is known
         of the common one. Where there are too many pairs, only the common one is modelled.
         """
-        if not self.has_bias.any():
+        if not self.models.bias.any():
             return np.full(len(first), -1, dtype=np.int64)
         common = self.common_entry(CommonIndex.BIAS)
         entries = np.full(len(first), common, dtype=np.int64)
@@ -520,14 +509,14 @@ class HypothesisSet:
         """Draw hypotheses by their weights; log components are jittered (Liu and West 2001)."""
         chosen = systematic(weight, self.count if count is None else count, self.rng)
         # Those that model the same side by side: kernels skip what a whole block lacks.
-        models = self.has_heights[chosen] + self.has_bias[chosen]
-        models = 2.0 * models + self.has_constants[chosen]
-        self._select(chosen[np.argsort(models, kind="stable")])
+        models = self.models
+        order = 4.0 * (models.heights + models.bias) + 2.0 * models.constants
+        self._select(chosen[np.argsort(order[chosen], kind="stable")])
         # Children of one parent differ in their components, too.
         self._normals *= math.sqrt(1.0 - JITTER**2)
         self._normals += JITTER * self.rng.standard_normal(self._normals.shape)
-        if self.low_heading_noise.any():
-            self.low_heading_noise *= self.rng.random(self.count) >= RETURN_SHARE
+        if self.models.low_heading_noise.any():
+            self.models.low_heading_noise *= self.rng.random(self.count) >= USUAL_NOISE_SHARE
         self._return_to_models()
         self._equalise()
         self._counters["resampled"] += 1
@@ -544,21 +533,13 @@ class HypothesisSet:
         """
         each = storage.of_each(self.arrays.sensitivity, self.count)
         sensitivity = np.einsum("k,k...->...", weight, each)
-        low_noise = float(weight @ self.low_heading_noise)
-        # What most do not model has no variance left to learn with: it has to be given back.
-        models = self.has_constants, self.has_bias, self.has_heights
-        constants, bias, heights = (float(weight @ has > 0.5) for has in models)
-        count = len(chosen)
+        models, count = self.models.merge(weight, len(chosen)), len(chosen)
         self._select(chosen)
         self.store(x, np.repeat(p[None], count, axis=0))
         self.arrays.sensitivity[...] = sensitivity[..., None]
         self.perturbed = np.zeros(count)
-        self.has_constants = np.full(count, constants)
-        self.has_bias = np.full(count, bias)
-        self.has_heights = np.full(count, heights)
-        self.arrays = self.arrays._replace(has_heights=storage.lay_out(self.has_heights))
-        # Between the two, where that is open: a nearly linear mixture leaves it so for long.
-        self.low_heading_noise = np.full(count, low_noise)
+        self.models = models
+        self._lay_out_models()
         if count == 1:
             self._normals = np.zeros_like(self._normals)
         self._equalise()
@@ -574,10 +555,8 @@ class HypothesisSet:
         )
         self.count = len(chosen)
         self._normals = self._normals[chosen]
-        self.has_constants, self.has_bias = self.has_constants[chosen], self.has_bias[chosen]
-        self.has_heights = self.has_heights[chosen]
-        self.arrays = self.arrays._replace(has_heights=storage.lay_out(self.has_heights))
-        self.low_heading_noise = self.low_heading_noise[chosen]
+        self.models = self.models.select(chosen)
+        self._lay_out_models()
         self.perturbed, self.wrong_start = self.perturbed[chosen], self.wrong_start[chosen]
 
     def _equalise(self) -> None:
@@ -593,7 +572,7 @@ class HypothesisSet:
                 component=lanes.empty_lines(blocks, self.nodes, COMPONENTS),
                 range_variance=lanes.empty_lines(blocks),
             )
-        normals, low = storage.lay_out(self._normals), storage.lay_out(self.low_heading_noise)
-        self.draws = Draws(normals, low, self.settings.spread)
+        low_noise = storage.lay_out(self.models.low_heading_noise)
+        self.draws = Draws(storage.lay_out(self._normals), low_noise, self.settings.spread)
         known = self.components
         components.spread(self.draws, known.mean, known.covariance, self.arrays)

@@ -171,7 +171,7 @@ class Report:
     def _common_parameters(self) -> list[Parameter]:
         """Return what ranges have in common; the team's figures stand beside every node."""
         these, clocks, nodes = self.core.hypotheses, self.clocks, sorted(self.row)
-        if not nodes or not these.has_bias.any():
+        if not nodes or not these.models.bias.any():
             return []
 
         def learned(index: CommonIndex) -> tuple[float, float]:
