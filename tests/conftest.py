@@ -29,7 +29,7 @@ LONG = (
 def pytest_xdist_auto_num_workers() -> int:
     """Three a core: while tests wait for browsers and processes, the cores stay busy.
 
-    Each more costs its imports, its collecting and its kernels, some six seconds of processor time.
+    Each more costs its imports, its collecting and its kernels: four seconds of processor time.
     """
     return 3 * (os.cpu_count() or 1)
 
@@ -39,8 +39,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     durations = cache.get(DURATIONS, {}) if cache is not None else {}
     # Tests of a file stay together and share its fixtures (--dist loadfile); a new one may be long.
     items.sort(key=lambda item: -durations.get(_file_of(item.nodeid), _guess_s(item.nodeid)))
-    # A worker keeps its browser from one file to the next.
-    items.sort(key=lambda item: not item.nodeid.startswith("tests/view/"))
 
 
 def _cache_of(config: pytest.Config) -> pytest.Cache | None:

@@ -1,4 +1,4 @@
-"""One browser for these tests, and pages that are watched while they are open."""
+"""One browser for each file of these tests, and pages that are watched while they are open."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from walking_team import WalkingTeam
 expect.set_options(timeout=60_000)
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     """The system's Chromium; skipped where there is none.
 
-    Playwright's event loop goes on until it is closed: tests of other folders need their own.
+    Playwright's event loop goes on until it is closed: tests of other files need their own.
     """
     if chromium() is None:
         pytest.skip(NO_BROWSER)
