@@ -58,7 +58,8 @@ class Models:
     def merge(self, weight: Floats, count: int) -> Models:
         """Return what ``count`` hypotheses model that stand for all, whose weights are (K,).
 
-        That is what most model: what they do not has no variance left to learn with.
+        That is what most of them model. What most do not has no variance left to learn with: it
+        has to be given back later.
         """
 
         def most(model: Floats) -> Floats:

@@ -510,7 +510,7 @@ class HypothesisSet:
         chosen = systematic(weight, self.count if count is None else count, self.rng)
         # Those that model the same side by side: kernels skip what a whole block lacks.
         models = self.models
-        order = 4.0 * (models.heights + models.bias) + 2.0 * models.constants
+        order = 2.0 * (models.heights + models.bias) + models.constants
         self._select(chosen[np.argsort(order[chosen], kind="stable")])
         # Children of one parent differ in their components, too.
         self._normals *= math.sqrt(1.0 - JITTER**2)
