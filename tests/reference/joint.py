@@ -139,6 +139,20 @@ def common_terms(
     return slope
 
 
+def pass_bias(
+    x: Floats, p: Floats, entry: int, common: int, kept: float, variance: float
+) -> tuple[Floats, Floats]:
+    """Return the state after a pair's bias has kept so much of itself, towards the common one.
+
+    A first-order process about the common bias, with the stationary ``variance``.
+    """
+    transition = np.eye(x.size)
+    transition[entry, entry], transition[entry, common] = kept, 1.0 - kept
+    spread = transition @ p @ transition.T
+    spread[entry, entry] += (1.0 - kept**2) * variance
+    return transition @ x, spread
+
+
 def detection(
     x: Floats,
     p: Floats,

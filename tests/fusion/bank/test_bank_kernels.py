@@ -55,7 +55,7 @@ class Packed:
         log_weight, variance = np.zeros(self.count), np.full(self.count, 0.04)
         self.arrays = Hypotheses(
             x, p, in_lanes(log_weight), sensitivity, in_lanes(self.component), in_lanes(variance),
-            in_lanes(np.zeros(self.count)),
+            in_lanes(np.zeros(self.count)), in_lanes(np.zeros(self.count)),
         )  # fmt: skip
         return self.arrays
 
@@ -91,7 +91,7 @@ def updated(
 ) -> Floats:  # fmt: skip
     ranges = Ranges(
         np.array([0]), np.array([2]), np.array([measured]), np.array([dz]), np.zeros(1),
-        np.ones(1), np.array([-1]), np.zeros((1, 4)), np.array([[outlier[0], *again]]),
+        np.ones(1), np.zeros(1), np.array([-1]), np.zeros((1, 4)), np.array([[outlier[0], *again]]),
     )  # fmt: skip
     levers_m = np.zeros((0, 2)) if lever_m is None else lever_m
     model = RangeModel(np.array([*outlier[:2], 1.0, 9.0]), levers_m)
@@ -251,7 +251,7 @@ def test_two_ranges_at_once_are_one_after_the_other() -> None:
         number = len(measured[rows])
         ranges = Ranges(
             ends[0][rows], ends[1][rows], measured[rows], np.zeros(number), np.zeros(number),
-            np.ones(number), np.full(number, -1), np.zeros((number, 4)),
+            np.ones(number), np.zeros(number), np.full(number, -1), np.zeros((number, 4)),
             np.tile([OUTLIER[0], 0.0, 0.0], (number, 1)),
         )  # fmt: skip
         model = RangeModel(np.array([*OUTLIER[:2], 1.0, 9.0]), np.zeros((0, 2)))
@@ -466,7 +466,7 @@ def test_variance_components_are_learned_from_innovations_and_their_uncertainty_
             measured = rng.normal() * np.sqrt((parts * np.exp(truth)).sum())
             ranges = Ranges(
                 np.array([0]), np.array([1]), np.array([measured]), np.zeros(1), np.zeros(1),
-                np.ones(1), np.array([-1]), np.zeros((1, 4)), np.zeros((1, 3)),
+                np.ones(1), np.zeros(1), np.array([-1]), np.zeros((1, 4)), np.zeros((1, 3)),
             )  # fmt: skip
             components.learn(known.mean, known.covariance, ranges, stats, np.zeros(1), np.ones(1))
         errors.append(known.mean - truth)
@@ -557,7 +557,7 @@ def test_variance_components_are_drawn_by_what_is_known_of_them() -> None:
     component, variance = lanes.empty_lines(2, 2, COMPONENTS), lanes.empty_lines(2)
     arrays = Hypotheses(
         nothing[None], nothing[None], nothing, lanes.empty_lines(2, 2, COMPONENTS, 6), component,
-        variance, lanes.empty_lines(2),
+        variance, lanes.empty_lines(2), lanes.empty_lines(2),
     )  # fmt: skip
     components.spread(components.Draws(laid, low_noise, 0.5), mean, covariance, arrays)
     sd = np.minimum(0.5 * np.sqrt(covariance.diagonal()), components.SPREAD_MOST)

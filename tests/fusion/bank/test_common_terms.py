@@ -12,11 +12,12 @@ import relpos
 from reference import joint as reference
 from relpos import fusion, tracks
 from relpos.fusion.bank.core import BankCore
+from relpos.fusion.bank.hypothesis_models import LEAST_SHARE, LEAST_WEIGHT, RangeErrors
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import COMMON, PER_NODE, CommonIndex, StateIndex
 from relpos.fusion.clocks import LEAST_S, SLEW, Clocks
 from relpos.fusion.estimator import Estimate, Parameter, time_offsets
-from relpos.fusion.models.ranging import OUTLIERS_SHORT
+from relpos.fusion.models.ranging import OUTLIERS_SHORT, PASSING_SHARE, Repeats
 from relpos.measurements import Measurement, Motion, Range
 from relpos.simulation.paper import simulate_paper
 
@@ -43,8 +44,9 @@ def test_a_range_with_all_terms_is_the_reference_implementation() -> None:
     common = PER_NODE * NODES
     x[:, common:] = np.random.default_rng(1).normal(size=(8, x.shape[1] - common)) * 0.1
     these.store(x, p)
-    heights = these.models.heights
+    heights, passing = (these.models.has(k) for k in (RangeErrors.HEIGHT, RangeErrors.PASSING))
     assert 0.0 < heights.sum() < 8.0
+    assert 0.0 < passing.sum() < 8.0
     x[:, entry] += 7.0 * heights
     these.store(x, p)
     sigma2 = these.arrays.range_variance.ravel()[:8].copy()
@@ -52,22 +54,26 @@ def test_a_range_with_all_terms_is_the_reference_implementation() -> None:
     slope = reference.common_terms(x[0], p[0], NODES, 0, 2, velocity)
     slope[entry], slope[common] = slope[common], 0.0
     assert (slope[common:] != 0.0).sum() >= 4
-    core.update(*pair, np.array([17.5]), np.zeros(1), None, None, velocity.reshape(1, 4))
+    repeats = Repeats(np.ones(1), np.array([0.6]))
+    core.update(*pair, np.array([17.5]), np.zeros(1), None, repeats, velocity.reshape(1, 4))
     after = these.dense()
     share = core._sensors.model.outlier
     for k in range(8):
         outlier = float(share[0]), float(share[1]), OUTLIERS_SHORT
         square = heights[k] * x[k, entry]
-        slope_k = reference.common_terms(x[k], p[k], NODES, 0, 2, velocity, np.sqrt(square))
+        x_k, p_k = x[k], p[k]
+        if passing[k]:
+            x_k, p_k = reference.pass_bias(x_k, p_k, entry, common, 0.6, PASSING_SHARE * sigma2[k])
+        slope_k = reference.common_terms(x_k, p_k, NODES, 0, 2, velocity, np.sqrt(square))
         slope_k[entry], slope_k[common] = 1.0, 0.0
         if heights[k]:
-            mean, *_ = reference.predict_range(x[k], p[k], 0, 2, np.sqrt(square))
+            mean, *_ = reference.predict_range(x_k, p_k, 0, 2, np.sqrt(square))
             # r^2 - m^2 = (r + m) (r - m).
             slope_k[entry], slope_k[common] = 1.0 / (17.5 + mean), 1.0
         # What is in the mean already is not to be added again.
         measured = 17.5 + slope_k[entry] * square
         expected = reference.update(
-            x[k], p[k], 0, 2, measured, np.sqrt(square), sigma2[k], outlier, slope_k
+            x_k, p_k, 0, 2, measured, np.sqrt(square), sigma2[k], outlier, slope_k
         )
         assert after[0][k] == pytest.approx(expected[0], rel=1e-3, abs=1e-3)
         assert after[1][k] == pytest.approx(expected[1], rel=1e-3, abs=1e-3)
@@ -196,10 +202,25 @@ def test_a_model_that_hardly_any_weight_had_comes_back_after_hypotheses_are_join
         assert p[:, entry, entry].max() == pytest.approx(prior**2)
 
 
+def test_each_kind_of_range_error_keeps_hypotheses_and_some_weight() -> None:
+    core = BankCore(BankSettings(biased=0.5), 3)
+    for n in range(NODES):
+        core.add_node((3.0 * n, 0.0, 0.0), 0.1, 0.1)
+    these = core.hypotheses
+    these.bias_entries(np.array([0]), np.array([1]))
+    these.log_weight[:] -= 60.0 * these.models.bias
+    for _ in range(5):
+        these.resample(these.weights())
+    numbers = np.bincount(these.models.range_errors)
+    assert (numbers[1:] >= LEAST_SHARE * these.count - 1).all()
+    assert these.models.share_of_kinds(these.weights())[1:] == pytest.approx(LEAST_WEIGHT, rel=0.1)
+
+
 def test_nothing_is_told_of_clocks_that_no_hypothesis_models() -> None:
     run = simulate_paper("paper-p1", 33, {"seconds": 80})
-    bank = fusion.make("bank", run.priors, {"hypotheses": 50}, seed=1)
-    estimates = [e for m in run.measurements for e in bank.process(m)] + bank.finish()
-    told = [[p for p in e.parameters if p.name == "clock_offset_s"] for e in estimates]
-    assert [] in told
-    assert all(p.sigma > 0.0 for each in told for p in each)
+    for biased in (0.0, 0.5):
+        bank = fusion.make("bank", run.priors, {"hypotheses": 50, "biased": biased}, seed=1)
+        estimates = [e for m in run.measurements for e in bank.process(m)] + bank.finish()
+        told = [p for e in estimates for p in e.parameters if p.name == "clock_offset_s"]
+        assert all(p.sigma > 0.0 for p in told)
+        assert bool(told) == (biased > 0.0)

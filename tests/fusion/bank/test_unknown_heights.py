@@ -7,6 +7,7 @@ import pytest
 
 import relpos
 from relpos.fusion.bank.core import BankCore
+from relpos.fusion.bank.hypothesis_models import RangeErrors
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import PER_NODE, CommonIndex
 
@@ -50,7 +51,7 @@ def test_a_pairs_height_is_learned_from_its_ranges_alone(true_m: float) -> None:
         core.update(*pair, np.array([np.hypot(6.0, true_m)]), np.zeros(1))
     these = core.hypotheses
     entry, x = these.biases[0, 1], these.dense()[0]
-    own = these.models.heights > 0.0
+    own = these.models.range_errors == RangeErrors.HEIGHT
     assert 0 < own.sum() < len(own)
     # What is common to all ranges may be a part of it.
     common = x[own, PER_NODE * 2 + CommonIndex.BIAS]

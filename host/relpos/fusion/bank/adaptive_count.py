@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.bank import hypothesis_count, storage
+from relpos.fusion.bank.hypothesis_models import RangeErrors
 from relpos.fusion.bank.hypothesis_set import HypothesisSet
 from relpos.fusion.bank.mixture import PERTURBED_LOSS
 from relpos.fusion.bank.storage import PER_NODE, POSE, StateIndex
@@ -94,7 +95,7 @@ class AdaptiveCount:
         weight, effective = these.normalise()
         weights = weight.reshape(-1)[: these.count]
         models = these.models
-        shares = [float(weights @ each) for each in (models.constants, models.bias, models.heights)]
+        shares = [weights @ models.constants, *models.share_of_kinds(weights)]
         least = max(min(share, 1.0 - share) for share in shares)
         return (
             float(these.components.covariance[-1, -1]) <= hypothesis_count.KNOWN**2
@@ -143,9 +144,10 @@ class AdaptiveCount:
         """Go on with fewer hypotheses; the mixture's moments are unchanged."""
         these = self._hypotheses
         s = these.settings
-        heights = float(unperturbed.reshape(-1)[: these.count] @ these.models.heights) > 0.5
+        has_heights = these.models.has(RangeErrors.HEIGHT)
+        heights = float(unperturbed.reshape(-1)[: these.count] @ has_heights) > 0.5
         # What a pair's entry is has to be the same in all.
-        left_out = (these.perturbed > 0.0) | (these.models.heights != heights)
+        left_out = (these.perturbed > 0.0) | (has_heights != heights)
         these.log_weight[:] -= np.where(left_out, PERTURBED_LOSS, 0.0)
         mean, covariance = these.moments()
         before, weight = these.sampled_share, these.weights()

@@ -28,7 +28,7 @@ from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import StateIndex
 from relpos.fusion.models.detection import Detection
 from relpos.fusion.models.odometry_faults import JUMP_M, CusumDetector
-from relpos.fusion.models.ranging import slant_height
+from relpos.fusion.models.ranging import Repeats, slant_height
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -150,7 +150,7 @@ class BankCore:
         range_m: Floats,
         dz_m: Floats,
         dz_variance_m2: Floats | None = None,
-        sample_count: Floats | None = None,
+        repeats: Repeats | None = None,
         velocity_m_s: Floats | None = None,
         outliers: Floats | None = None,
     ) -> tuple[Floats, Floats]:
@@ -159,14 +159,14 @@ class BankCore:
         That is its inlier probability (R,), and by how much it is off if it is none (m).
 
         ``dz_m`` are the antennas' differences of height, ``dz_variance_m2`` their variances (0
-        by default), ``sample_count`` how many independent ranges each counts as (1 by default),
+        by default), ``repeats`` what of the pairs' last errors they repeat (nothing by default),
         ``velocity_m_s`` (R, 4) those of the first and of the second, forward and left (0),
         ``outliers`` (R, 3) the least probability of being an outlier, the part of it that repeats
         the pair's last one, and by how much that was off (m; 0).
         """
         several, these = len(first), self.hypotheses
         variance = np.zeros(several) if dz_variance_m2 is None else dz_variance_m2
-        counts = np.ones(several) if sample_count is None else sample_count
+        counts, kept = repeats or Repeats(np.ones(several), np.zeros(several))
         self._check(first, second, range_m, dz_m, variance, counts)
         biases = these.bias_entries(first, second)
         velocity = np.zeros((several, 4)) if velocity_m_s is None else velocity_m_s
@@ -175,7 +175,9 @@ class BankCore:
         shares = np.zeros((several, 3)) if outliers is None else outliers.copy()
         shares[:, 0] = np.maximum(usual, shares[:, 0])
         slant_m = slant_height(dz_m, variance)
-        ranges = Ranges(first, second, range_m, slant_m, variance, counts, biases, velocity, shares)
+        ranges = Ranges(
+            first, second, range_m, slant_m, variance, counts, kept, biases, velocity, shares
+        )
         outlier[2] = 1.0 / (1.0 - these.sampled_share)
         wary = self.relocalisation.since_fault <= OPEN_UPDATES and self.counters["slips"] > 0
         before = these.log_weight.copy()

@@ -46,6 +46,7 @@ from relpos.fusion.models.ranging import (
     Mounting,
     OutlierPersistence,
     RangeCorrelation,
+    Repeats,
     slab_variance,
     slant_height,
 )
@@ -293,14 +294,14 @@ class Bank:
             self.core.relocalisation.relocalise_lost(time_s, first, second, measured)
         rounds = self._attempts(time_s, ranges, timeline)
         if ranges:
-            counts = self._counts(pairs)
+            repeats = self._repeats(pairs)
             velocity = [
                 self._velocity_at(a, time_s) + self._velocity_at(b, time_s) for a, b in pairs
             ]
             outliers = self.outliers.expected(time_s, pairs)
             before = self._unseen(ends, time_s)
             inlier, excess_m = self.core.update(
-                first, second, measured, dz, variance, counts, np.array(velocity), outliers
+                first, second, measured, dz, variance, repeats, np.array(velocity), outliers
             )
             self.outliers.learn(time_s, pairs, inlier, excess_m)
             self._ranges_used += len(ranges)
@@ -312,8 +313,8 @@ class Bank:
             self.core.update_detection(attempts, self.detection)
         self.core.end_instant()
 
-    def _counts(self, pairs: Sequence[tuple[int, int]]) -> Floats:
-        """Return as how many independent ranges each of ``pairs`` counts (R,)."""
+    def _repeats(self, pairs: Sequence[tuple[int, int]]) -> Repeats:
+        """Return what the ranges of ``pairs`` repeat; those that are less certain count less."""
         known = self._known
         uneven = [
             known[a].within.range_variance_m2() + known[b].within.range_variance_m2()
@@ -323,9 +324,8 @@ class Bank:
             [(known[a].vertical.floor, known[b].vertical.floor) for a, b in pairs]
         )
         variance = self.core.range_variance_m2
-        alone = self.range_correlation.effective_counts(pairs)
-        counts: Floats = variance * alone / (variance + alone * own_m2)
-        return counts
+        count, kept = self.range_correlation.repeats(pairs)
+        return Repeats(variance * count / (variance + count * own_m2), kept)
 
     def _velocity_at(self, node: int, time_s: float) -> tuple[float, float]:
         """Return a node's velocity forward and left (m/s); 0 where its motion is missing."""

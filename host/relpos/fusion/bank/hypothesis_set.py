@@ -11,12 +11,7 @@ import numpy.typing as npt
 from relpos.errors import RelposError
 from relpos.fusion.bank import common_rotation, hypothesis_count, lanes, mixture, storage
 from relpos.fusion.bank import variance_components as components
-from relpos.fusion.bank.hypothesis_models import (
-    HEIGHTS_SHARE,
-    RETURN_SHARE,
-    STOREY_M2,
-    Models,
-)
+from relpos.fusion.bank.hypothesis_models import RETURN_SHARE, STOREY_M2, Models, RangeErrors
 from relpos.fusion.bank.lanes import LANES
 from relpos.fusion.bank.mixture import PERTURBED_LOSS
 from relpos.fusion.bank.settings import BankSettings
@@ -76,7 +71,7 @@ class HypothesisSet:
         self.arrays = Hypotheses(
             x, p, np.zeros((blocks, LANES)), lanes.empty_lines(blocks, 0, COMPONENTS, 6),
             lanes.empty_lines(blocks, 0, COMPONENTS), lanes.empty_lines(blocks),
-            np.zeros((blocks, LANES)),
+            np.zeros((blocks, LANES)), np.zeros((blocks, LANES)),
         )  # fmt: skip
         self.components = VarianceComponents()
         self._normals: Floats = rng.standard_normal((count, 1))
@@ -370,8 +365,9 @@ class HypothesisSet:
         if not self.biases:
             return False, {}
         weight = self.weights()
-        heights = bool(weight @ self.models.heights > 0.5)
-        weight = weight * (self.models.heights == heights)
+        has_heights = self.models.has(RangeErrors.HEIGHT)
+        heights = bool(weight @ has_heights > 0.5)
+        weight = weight * (has_heights == heights)
         weight /= weight.sum()
         entries = np.array(list(self.biases.values()), dtype=np.int64)
         own = self.arrays.p[:, storage.triangle_place(entries, entries)]
@@ -402,7 +398,8 @@ class HypothesisSet:
         """
         block, lane = self.at(which)
         x, p = self.arrays.x, self.arrays.p
-        inherits, common = 1.0 - self.models.heights[which], self.common_entry(CommonIndex.BIAS)
+        has_heights = self.models.has(RangeErrors.HEIGHT)[which]
+        inherits, common = 1.0 - has_heights, self.common_entry(CommonIndex.BIAS)
         own = list(self.biases.values())
         for entry in own:
             x[block, entry, lane] = inherits * x[block, common, lane]
@@ -415,26 +412,31 @@ class HypothesisSet:
         self._lay_out_models()
 
     def _lay_out_models(self) -> None:
-        self.arrays = self.arrays._replace(has_heights=storage.lay_out(self.models.heights))
+        self.arrays = self.arrays._replace(
+            has_heights=storage.lay_out(self.models.has(RangeErrors.HEIGHT)),
+            has_passing=storage.lay_out(self.models.has(RangeErrors.PASSING)),
+        )
 
     def _own_variance(self, which: Indices | slice = slice(None)) -> Floats:
         """Return the prior variance of what a pair has of its own (M,), m^2 or m^4."""
-        heights, own = self.models.heights[which], self.settings.pair_bias_m**2
+        heights = self.models.has(RangeErrors.HEIGHT)[which]
+        own = self.settings.pair_bias_m**2
         variance: Floats = self.models.bias[which] * (own + heights * (STOREY_M2**2 - own))
         return variance
 
     def know_heights(self) -> None:
         """Have no hypothesis any more in which heights are unknown: they are reported."""
-        which = np.flatnonzero(self.models.heights)
-        self.heights_known, self.models.heights[:] = True, 0.0
+        which = np.flatnonzero(self.models.has(RangeErrors.HEIGHT))
+        self.heights_known = True
+        self.models.range_errors[which] = RangeErrors.CONSTANT
         if which.size:
             self._begin_pairs(which)
 
-    def _return_to_models(self) -> None:
-        """Let a few hypotheses without constants, or without biases, have them again."""
+    def _return_to_constants(self) -> None:
+        """Let a few hypotheses without constants have them again."""
         s, p, models = self.settings, self.arrays.p, self.models
-        back = self.rng.random((2, self.count)) < RETURN_SHARE
-        which = np.flatnonzero(back[0] > models.constants)
+        back = self.rng.random(self.count) < RETURN_SHARE
+        which = np.flatnonzero(back > models.constants)
         if s.constants > 0.0 and which.size:
             models.constants[which] = 1.0
             block, lane = self.at(which)
@@ -446,12 +448,6 @@ class HypothesisSet:
                 drifts = (1.0 - models.low_heading_noise[which]) * s.drift_rad_s**2
                 p[block, storage.triangle_place(drift, drift), lane] = drifts
                 p[block, storage.triangle_place(scale, scale), lane] = s.scale**2
-        which = np.flatnonzero(back[1] > models.bias)
-        if s.biased > 0.0 and which.size:
-            models.bias[which] = 1.0
-            drawn = self.rng.random(which.size) < HEIGHTS_SHARE
-            models.heights[which] = drawn & (not self.heights_known)
-            self._allow_common(which)
 
     def shift_common(self, entry: int, by: float) -> None:
         """Add to an entry of what ranges have in common in every hypothesis that models it."""
@@ -507,19 +503,46 @@ class HypothesisSet:
 
     def resample(self, weight: Floats, count: int | None = None) -> None:
         """Draw hypotheses by their weights; log components are jittered (Liu and West 2001)."""
-        chosen = systematic(weight, self.count if count is None else count, self.rng)
-        # Those that model the same side by side: kernels skip what a whole block lacks.
-        models = self.models
-        order = 2.0 * (models.heights + models.bias) + models.constants
-        self._select(chosen[np.argsort(order[chosen], kind="stable")])
+        count = self.count if count is None else count
+        kinds = self._kinds_of_range_errors()
+        chosen, kind, log_weight = self.models.resample(weight, kinds, count, self.rng)
+        self._select(chosen)
+        self._turn_into(kind)
         # Children of one parent differ in their components, too.
         self._normals *= math.sqrt(1.0 - JITTER**2)
         self._normals += JITTER * self.rng.standard_normal(self._normals.shape)
         if self.models.low_heading_noise.any():
             self.models.low_heading_noise *= self.rng.random(self.count) >= USUAL_NOISE_SHARE
-        self._return_to_models()
+        self._return_to_constants()
         self._equalise()
+        self.log_weight[:] = log_weight
         self._counters["resampled"] += 1
+
+    def _kinds_of_range_errors(self) -> list[RangeErrors]:
+        """Return those that are to have hypotheses; what began with biases cannot lose them."""
+        if self.settings.biased == 0.0:
+            return [RangeErrors.NOISE]
+        kinds = [] if self.models.bias.all() else [RangeErrors.NOISE]
+        kinds.append(RangeErrors.CONSTANT)
+        if self.biases:
+            kinds += [RangeErrors.PASSING] + [RangeErrors.HEIGHT] * (not self.heights_known)
+        else:
+            # Without entries of pairs, all that have biases are alike.
+            own = self.models.range_errors
+            own[own > RangeErrors.CONSTANT] = RangeErrors.CONSTANT
+        return kinds
+
+    def _turn_into(self, kind: Indices) -> None:
+        """Let hypotheses (K,) have other range errors than they have; their biases begin anew."""
+        changed = kind != self.models.range_errors
+        before = self.models.bias
+        self.models.range_errors[:] = kind
+        for which, begin in (
+            (np.flatnonzero(changed & (before == 0.0)), self._allow_common),
+            (np.flatnonzero(changed & (before > 0.0)), self._begin_pairs),
+        ):
+            if which.size:
+                begin(which)
 
     def redraw(self) -> None:
         """Draw all log components again."""

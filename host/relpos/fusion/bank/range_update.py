@@ -47,6 +47,7 @@ from relpos.fusion.models.ranging import (
     GROWTH_LEAST_M,
     GROWTH_USUAL_M,
     OUTLIERS_SHORT,
+    PASSING_SHARE,
 )
 
 Floats = npt.NDArray[np.float64]
@@ -74,6 +75,8 @@ class Ranges(NamedTuple):
     sample_count: Floats
     """How many independent ranges each counts as: the variance that the gain sees is divided by
     it, the evidence multiplied."""
+    kept: Floats
+    """What is left of a passing bias since the pair's last range."""
     bias: Indices
     """Entry of the state that holds the range's bias, or -1."""
     velocity_m_s: Floats
@@ -296,6 +299,23 @@ def _add_terms(
 
 
 @inner
+def _pass_walls(block: Block, entry: int, common: int, kept: Lanes, new: Lanes) -> None:
+    """Keep so much of a pair's bias, replace the rest by the common one, and add new variance."""
+    x, p, at_x, base, active = block
+    lost = 1.0 - kept
+    own, shared = load(x, at_x + entry), load(x, at_x + common)
+    store(x, at_x + entry, kept * own + lost * shared)
+    both = load(p, base + place(entry, common))
+    of_common, at = load(p, base + place(common, common)), base + place(entry, entry)
+    variance = kept * kept * load(p, at) + lost * (2.0 * kept * both + lost * of_common) + new
+    for q in range(active):
+        if q != entry:
+            here = base + place(entry, q)
+            store(p, here, kept * load(p, here) + lost * load(p, base + place(common, q)))
+    store(p, at, variance)
+
+
+@inner
 def _carry_sensitivities(
     sensitivity: Floats, stats: Floats, at: int, users: tuple[int, int], ends: tuple[int, int],
     slope: tuple[Lanes, Lanes, Lanes], g: Floats,
@@ -342,12 +362,20 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
         variance = load(hypotheses.range_variance, b)
         has_heights = load(hypotheses.has_heights, b)
         heights = biased and some(has_heights > 0.0)
+        has_passing = load(hypotheses.has_passing, b)
+        passing = biased and some(has_passing > 0.0)
+        common = PER_NODE * nodes + CommonIndex.BIAS
         total = fill(0.0)
         for r in range(ranges.first.shape[0]):
             first, second, dz = ranges.first[r], ranges.second[r], ranges.dz_m[r]
             i, j = POSE * first, POSE * second
-            # Of a pair's own entry (m^2); what is common to all comes before.
-            heights_here = heights and ranges.bias[r] >= own
+            # What is common to all comes before a pair's own entry.
+            own_entry = ranges.bias[r] >= own
+            if passing and own_entry:
+                lost = (1.0 - ranges.kept[r]) * has_passing
+                new = PASSING_SHARE * variance * (1.0 - ranges.kept[r] ** 2) * has_passing
+                _pass_walls(block, ranges.bias[r], common, 1.0 - lost, new)
+            heights_here = heights and own_entry
             dz2, lifted = fill(dz * dz), fill(0.0)
             if heights_here:
                 lifted = has_heights * greater(load(x, block.at_x + ranges.bias[r]), lifted)
@@ -373,7 +401,7 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
                 if heights_here:
                     # m^2 is linear in the square of the height: its slope is that of the chord.
                     chord = has_heights / (m + greater(fill(ranges.range_m[r]), fill(0.0)))
-                    entry[6], terms = PER_NODE * nodes + CommonIndex.BIAS, 7
+                    entry[6], terms = common, 7
                     store(slope, 6, has_heights * seen)
                     store(slope, 0, chord + (1.0 - has_heights) * seen)
                     # What the mean has of it is in m.

@@ -83,6 +83,8 @@ class Hypotheses(NamedTuple):
     """Variance of a range (B, LANES), m^2."""
     has_heights: Floats
     """(B, LANES): 1 where a pair's entry is no bias but the square of its difference of height."""
+    has_passing: Floats
+    """(B, LANES): 1 where a pair's bias passes as its users walk."""
 
 
 class Block(NamedTuple):

@@ -372,7 +372,7 @@ class LargeTeam:
         horizontal = excess + f.antenna_pairs(node, peer)[0]
         before, prior = f.pose.copy(), f.marginals()
         # A range of twice the variance counts half.
-        counts = self._correlation.effective_counts(pairs) / (1.0 + lifted / f.model.sigma_m**2)
+        counts = self._correlation.repeats(pairs).sample_count / (1.0 + lifted / f.model.sigma_m**2)
         outliers = self._outliers.expected(time_s, pairs)
         inlier = f.update_with_terms(Ranges(node, peer, horizontal, counts, outliers, slopes))
         horizontal -= slopes @ f.terms
