@@ -11,7 +11,13 @@ import numpy.typing as npt
 from relpos.errors import RelposError
 from relpos.fusion.bank import common_rotation, hypothesis_count, lanes, mixture, storage
 from relpos.fusion.bank import variance_components as components
-from relpos.fusion.bank.hypothesis_models import RETURN_SHARE, STOREY_M2, Models, RangeErrors
+from relpos.fusion.bank.hypothesis_models import (
+    RETURN_SHARE,
+    STOREY_M2,
+    USUAL_NOISE_SHARE,
+    Models,
+    RangeErrors,
+)
 from relpos.fusion.bank.lanes import LANES
 from relpos.fusion.bank.mixture import PERTURBED_LOSS
 from relpos.fusion.bank.settings import BankSettings
@@ -34,12 +40,6 @@ SHADOW_SD_M, LATENESS_SD_S, CLOCK_SD_S = 0.05, 0.1, 0.07
 each clock's offset. Far larger ones are learned, too (``mission-late-1``: 0.99 m without, 0.16 so).
 0.3 of each learns them sooner (0.13 m), but takes the biases of pairs that are not calibrated for
 shadows: eight seeds of three walkers have 0.10 m with these, 0.20 with 0.3, 0.07 without any."""
-
-USUAL_NOISE_SHARE = 0.06
-"""Of the hypotheses with low heading noise, this share returns to the usual noise at each
-resampling. People who walk straight on seem to have little; when they turn, some hypotheses have
-to be left that expect it (``paper``, seeds 9100 to 9109: 0.77 m, without it 0.82 with a worst of
-1.34)."""
 
 PERTURBED_UPDATES = 5.0
 """For so many instants of ranges a perturbed hypothesis teaches nothing about noise."""
@@ -537,12 +537,9 @@ class HypothesisSet:
         changed = kind != self.models.range_errors
         before = self.models.bias
         self.models.range_errors[:] = kind
-        for which, begin in (
-            (np.flatnonzero(changed & (before == 0.0)), self._allow_common),
-            (np.flatnonzero(changed & (before > 0.0)), self._begin_pairs),
-        ):
-            if which.size:
-                begin(which)
+        if changed.any():
+            self._allow_common(np.flatnonzero(changed & (before == 0.0)))
+            self._begin_pairs(np.flatnonzero(changed & (before > 0.0)))
 
     def redraw(self) -> None:
         """Draw all log components again."""

@@ -299,19 +299,27 @@ def _add_terms(
 
 
 @inner
-def _pass_walls(block: Block, entry: int, common: int, kept: Lanes, new: Lanes) -> None:
-    """Keep so much of a pair's bias, replace the rest by the common one, and add new variance."""
+def _pass_bias(block: Block, entry: int, common: int, kept: float, variance: Lanes) -> None:
+    """Let a pair's bias return to the common one, but for what is ``kept``, by a random process.
+
+    ``variance`` is that of the process, 0 where the bias does not pass.
+    """
+    lost = select(variance > 0.0, fill(1.0 - kept), fill(0.0))
+    kept_here, new = 1.0 - lost, variance * (1.0 - kept * kept)
     x, p, at_x, base, active = block
-    lost = 1.0 - kept
     own, shared = load(x, at_x + entry), load(x, at_x + common)
-    store(x, at_x + entry, kept * own + lost * shared)
+    store(x, at_x + entry, kept_here * own + lost * shared)
     both = load(p, base + place(entry, common))
     of_common, at = load(p, base + place(common, common)), base + place(entry, entry)
-    variance = kept * kept * load(p, at) + lost * (2.0 * kept * both + lost * of_common) + new
+    variance = (
+        kept_here * kept_here * load(p, at)
+        + lost * (2.0 * kept_here * both + lost * of_common)
+        + new
+    )
     for q in range(active):
         if q != entry:
             here = base + place(entry, q)
-            store(p, here, kept * load(p, here) + lost * load(p, base + place(common, q)))
+            store(p, here, kept_here * load(p, here) + lost * load(p, base + place(common, q)))
     store(p, at, variance)
 
 
@@ -362,8 +370,8 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
         variance = load(hypotheses.range_variance, b)
         has_heights = load(hypotheses.has_heights, b)
         heights = biased and some(has_heights > 0.0)
-        has_passing = load(hypotheses.has_passing, b)
-        passing = biased and some(has_passing > 0.0)
+        passing = load(hypotheses.has_passing, b) * (PASSING_SHARE * variance)
+        passes = biased and some(passing > 0.0)
         common = PER_NODE * nodes + CommonIndex.BIAS
         total = fill(0.0)
         for r in range(ranges.first.shape[0]):
@@ -371,10 +379,8 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
             i, j = POSE * first, POSE * second
             # What is common to all comes before a pair's own entry.
             own_entry = ranges.bias[r] >= own
-            if passing and own_entry:
-                lost = (1.0 - ranges.kept[r]) * has_passing
-                new = PASSING_SHARE * variance * (1.0 - ranges.kept[r] ** 2) * has_passing
-                _pass_walls(block, ranges.bias[r], common, 1.0 - lost, new)
+            if passes and own_entry:
+                _pass_bias(block, ranges.bias[r], common, ranges.kept[r], passing)
             heights_here = heights and own_entry
             dz2, lifted = fill(dz * dz), fill(0.0)
             if heights_here:
