@@ -224,6 +224,8 @@ def test_range_biases_are_found_and_reported_with_their_pairs() -> None:
         sigmas_m += [found[pair].sigma for pair in bias]
     assert np.mean(errors_m) < 0.125
     assert np.sqrt(np.mean(np.square(of_bias_m))) < 0.08
+    assert min(sigmas_m) > 0.002
+    assert max(sigmas_m[: len(bias)]) < 0.1
     assert 0.5 < np.mean(np.square(np.divide(of_bias_m, sigmas_m))) < 1.5
 
 

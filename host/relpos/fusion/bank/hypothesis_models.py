@@ -22,7 +22,6 @@ RETURN_SHARE = 0.002
 left when they begin to matter. ``mission-split-hard`` 611: 2.49 m without, 1.63 with; more than
 that costs where there are none (``paper-h``: 0.83 with it, 0.90 with ten times as much)."""
 
-
 USUAL_NOISE_SHARE = 0.06
 """Of the hypotheses with low heading noise, this share returns to the usual noise at each
 resampling. People who walk straight on seem to have little; when they turn, some hypotheses have

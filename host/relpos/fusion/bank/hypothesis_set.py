@@ -504,6 +504,10 @@ class HypothesisSet:
     def resample(self, weight: Floats, count: int | None = None) -> None:
         """Draw hypotheses by their weights; log components are jittered (Liu and West 2001)."""
         count = self.count if count is None else count
+        if not self.biases:
+            # Without entries of pairs, all that have biases are alike.
+            own = self.models.range_errors
+            self.models.range_errors = np.minimum(own, RangeErrors.CONSTANT)
         kinds = self._kinds_of_range_errors()
         chosen, kind, log_weight = self.models.resample(weight, kinds, count, self.rng)
         self._select(chosen)
@@ -526,20 +530,16 @@ class HypothesisSet:
         kinds.append(RangeErrors.CONSTANT)
         if self.biases:
             kinds += [RangeErrors.PASSING] + [RangeErrors.HEIGHT] * (not self.heights_known)
-        else:
-            # Without entries of pairs, all that have biases are alike.
-            own = self.models.range_errors
-            own[own > RangeErrors.CONSTANT] = RangeErrors.CONSTANT
         return kinds
 
     def _turn_into(self, kind: Indices) -> None:
         """Let hypotheses (K,) have other range errors than they have; their biases begin anew."""
-        changed = kind != self.models.range_errors
-        before = self.models.bias
-        self.models.range_errors[:] = kind
+        before = self.models.range_errors
+        changed, noise = kind != before, before == RangeErrors.NOISE
+        self.models.range_errors = kind
         if changed.any():
-            self._allow_common(np.flatnonzero(changed & (before == 0.0)))
-            self._begin_pairs(np.flatnonzero(changed & (before > 0.0)))
+            self._allow_common(np.flatnonzero(changed & noise))
+            self._begin_pairs(np.flatnonzero(changed & ~noise))
 
     def redraw(self) -> None:
         """Draw all log components again."""

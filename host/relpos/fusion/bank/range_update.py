@@ -311,16 +311,13 @@ def _pass_bias(block: Block, entry: int, common: int, kept: float, variance: Lan
     store(x, at_x + entry, kept_here * own + lost * shared)
     both = load(p, base + place(entry, common))
     of_common, at = load(p, base + place(common, common)), base + place(entry, entry)
-    variance = (
-        kept_here * kept_here * load(p, at)
-        + lost * (2.0 * kept_here * both + lost * of_common)
-        + new
-    )
+    spread = kept_here * kept_here * load(p, at)
+    spread = spread + lost * (2.0 * kept_here * both + lost * of_common) + new
     for q in range(active):
         if q != entry:
             here = base + place(entry, q)
             store(p, here, kept_here * load(p, here) + lost * load(p, base + place(common, q)))
-    store(p, at, variance)
+    store(p, at, spread)
 
 
 @inner
