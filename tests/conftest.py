@@ -5,6 +5,7 @@ Examples of Hypothesis have no time limit: they would fail where the machine is 
 
 from __future__ import annotations
 
+import gc
 import os
 
 import pytest
@@ -12,6 +13,9 @@ from hypothesis import settings
 
 settings.register_profile("relpos", deadline=None)
 settings.load_profile("relpos")
+
+# Nothing of what is imported and collected is ever freed: not to be searched again and again.
+gc.disable()
 
 DURATIONS = "relpos/durations"
 """Key in pytest's cache: file -> seconds that its tests took the last time."""
@@ -39,6 +43,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     durations = cache.get(DURATIONS, {}) if cache is not None else {}
     # Tests of a file stay together and share its fixtures (--dist loadfile); a new one may be long.
     items.sort(key=lambda item: -durations.get(_file_of(item.nodeid), _guess_s(item.nodeid)))
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 def _cache_of(config: pytest.Config) -> pytest.Cache | None:

@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.signal import butter, sosfiltfilt
 
 from relpos.calibration.steps import LEG_OF_STATURE
 
@@ -229,8 +229,8 @@ def load(folder: Path) -> Recording:
     time, values = raw[:, 0], raw[:, 2:11]
     rate = 1.0 / float(np.median(np.diff(time)))
     if rate > 2.2 * BANDWIDTH_HZ:
-        sos = butter(2, BANDWIDTH_HZ / (rate / 2.0), output="sos")
-        values = sosfiltfilt(sos, values, axis=0)
+        sos = scipy.signal.butter(2, BANDWIDTH_HZ / (rate / 2.0), output="sos")
+        values = scipy.signal.sosfiltfilt(sos, values, axis=0)
     grid = np.arange(time[0], time[-1], 1.0 / RATE_HZ)
     even = np.stack([np.interp(grid, time, column) for column in values.T], axis=1)
     return Recording(folder.name, grid, even[:, :6], even[:, 6:], meta, events)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from relpos.simulation.spectral import Grid, slow_noise
 from relpos.simulation.torso import (
@@ -190,7 +190,7 @@ def _track(
     path = progress.stepped_m + plan.slide.at(t)
     span = max(float(path[-1]), 1.0) + 4.0
     side_s = np.arange(-2.0, span + 2.0, 0.25)
-    aside = CubicSpline(side_s, slow_noise(rng, side_s, 0.06, 3.0))
+    aside = scipy.interpolate.CubicSpline(side_s, slow_noise(rng, side_s, 0.06, 3.0))
     slope = np.arctan(np.asarray(aside(path, 1), dtype=np.float64))
     facing = start_heading_rad + progress.turned_rad + plan.twist.at(t)
     facing = facing + bearing_rad(progress.stepped_m, plan.bends) + slope

@@ -7,8 +7,7 @@ from functools import cache
 from pathlib import Path
 
 import grimp
-from scipy.sparse import lil_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "host" / "relpos"
@@ -80,10 +79,10 @@ def circles_of(edges: Edges) -> list[list[str]]:
     """Groups of nodes of a directed graph each of which can be reached from the others."""
     names = sorted(edges)
     index = {name: k for k, name in enumerate(names)}
-    matrix = lil_array((len(names), len(names)), dtype=bool)
+    matrix = scipy.sparse.lil_array((len(names), len(names)), dtype=bool)
     for name, others in edges.items():
         for other in others:
             matrix[index[name], index[other]] = True
-    count, labels = connected_components(matrix, connection="strong")
+    count, labels = scipy.sparse.csgraph.connected_components(matrix, connection="strong")
     groups = [[n for n in names if labels[index[n]] == k] for k in range(count)]
     return [group for group in groups if len(group) > 1]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+import scipy
 
 from relpos.emulator import team as emulated
 from relpos.emulator.serving import record_team
@@ -28,7 +28,9 @@ def hydrostatic_pa(height_m):
 
     low, high = float(height_m.min()) - 1.0, float(height_m.max()) + 1.0
     up, down = (
-        solve_ivp(slope, (0.0, to), [GROUND_PA], rtol=1e-10, atol=1e-6, dense_output=True)
+        scipy.integrate.solve_ivp(
+            slope, (0.0, to), [GROUND_PA], rtol=1e-10, atol=1e-6, dense_output=True
+        )
         for to in (high, low)
     )
     return np.where(height_m >= 0.0, up.sol(height_m)[0], down.sol(height_m)[0])

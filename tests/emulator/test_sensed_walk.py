@@ -1,8 +1,8 @@
 """What the emulated chip says of a synthesised walk, integrated here by independent means."""
 
 import numpy as np
+import scipy
 from chips import GRAVITY, Host, words
-from scipy.spatial.transform import Rotation
 
 from relpos.emulator.mpu9150 import Mpu9150
 from relpos.emulator.surroundings import Surroundings
@@ -33,12 +33,12 @@ def test_its_rates_turn_as_the_torso_turns_and_its_forces_carry_gravity():
         ],
         dtype=float,
     )
-    attitude = Rotation.from_matrix(walker.attitude[0])
+    attitude = scipy.spatial.transform.Rotation.from_matrix(walker.attitude[0])
     up = np.zeros(3)
     for force, rate in zip(rows[:, :3] / 8192 * GRAVITY, rows[:, 4:] / 65.536, strict=True):
-        attitude = attitude * Rotation.from_rotvec(np.radians(rate) * 0.02)
+        attitude = attitude * scipy.spatial.transform.Rotation.from_rotvec(np.radians(rate) * 0.02)
         up += attitude.apply(force) / len(rows)
-    true = Rotation.from_matrix(walker.attitude[round(SECONDS * RATE_HZ)])
+    true = scipy.spatial.transform.Rotation.from_matrix(walker.attitude[round(SECONDS * RATE_HZ)])
     error = (attitude * true.inv()).as_rotvec()
     # Heading exactly, 0.01 rad in a minute being a gyroscope error of 0.01 deg/s; tilt carries
     # what the walker leans in the filter's 10 ms.

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
-from scipy.optimize import least_squares
+import scipy
 
 from relpos.evaluation import bounds
 from relpos.simulation import true_run
@@ -198,7 +198,7 @@ def test_the_best_estimator_scatters_as_the_bound_says() -> None:
             predicted = dense.distances(np.zeros(dense.size)) + slope @ errors
             return np.concatenate((errors, (predicted - ranges) / 0.03))
 
-        found = least_squares(
+        found = scipy.optimize.least_squares(
             residuals, np.zeros(dense.size), lambda _: np.vstack((np.eye(dense.size), slope / 0.03))
         ).x
         at = dense.positions(np.zeros(dense.size)) + by_position @ found

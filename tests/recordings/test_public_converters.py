@@ -5,7 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
-import scipy.io
+import scipy
 
 from relpos.errors import DataError
 from relpos.recordings import (

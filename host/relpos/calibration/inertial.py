@@ -14,8 +14,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import optimize
 
 from relpos.errors import DataError
 
@@ -202,7 +202,7 @@ def fit_accelerometer(
         corrected = (forces - parameters[:3]) * (1.0 + scale)
         return np.asarray(np.linalg.norm(corrected, axis=1) - gravity_m_s2)
 
-    solution = optimize.least_squares(misfits, np.zeros(free))
+    solution = scipy.optimize.least_squares(misfits, np.zeros(free))
     info = solution.jac.T @ solution.jac / FORCE_SIGMA_M_S2**2
     if np.linalg.cond(info) > 1e10:
         raise _too_similar()

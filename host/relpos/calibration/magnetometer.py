@@ -26,9 +26,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import linalg, optimize
-from scipy.spatial.transform import Rotation
 
 from relpos.errors import DataError
 
@@ -220,9 +219,9 @@ def _algebraic(
     constraint[:3, :3] += np.ones((3, 3)) - np.eye(3)
     a, b, d = scatter[:6, :6], scatter[:6, 6:], scatter[6:, 6:]
     try:
-        lower = linalg.solve(d, b.T, assume_a="sym")
-        values, vectors = linalg.eig(linalg.solve(constraint, a - b @ lower))
-    except (linalg.LinAlgError, ValueError) as error:
+        lower = scipy.linalg.solve(d, b.T, assume_a="sym")
+        values, vectors = scipy.linalg.eig(scipy.linalg.solve(constraint, a - b @ lower))
+    except (scipy.linalg.LinAlgError, ValueError) as error:
         raise _no_ellipsoid() from error
     quadric = np.real(vectors[:, int(np.argmax(np.real(values)))])
     rest = -lower @ quadric
@@ -277,7 +276,7 @@ def _geometric(
 
     start = np.concatenate((offset / radius, (root * radius)[_SYMMETRIC]))
     spread = float(np.median(np.abs(distances(start)))) * 1.4826
-    solution = optimize.least_squares(
+    solution = scipy.optimize.least_squares(
         distances, start, loss="huber", f_scale=max(2.0 * spread, 1e-4), x_scale="jac"
     )
     offset = solution.x[:3] * radius
@@ -321,11 +320,11 @@ def _aligned(result: MagnetometerFit, readings: FloatArray, up: FloatArray) -> M
     vertical = up[still] / norms[still, None]
 
     def misfits(parameters: FloatArray) -> FloatArray:
-        turned = Rotation.from_rotvec(parameters[:3]).apply(field)
+        turned = scipy.spatial.transform.Rotation.from_rotvec(parameters[:3]).apply(field)
         return np.asarray((turned * vertical).sum(axis=1) - parameters[3])
 
     start = np.array([0.0, 0.0, 0.0, float(np.median((field * vertical).sum(axis=1)))])
-    solution = optimize.least_squares(misfits, start, loss="huber", f_scale=0.05)
+    solution = scipy.optimize.least_squares(misfits, start, loss="huber", f_scale=0.05)
     noise = float(np.mean(misfits(solution.x) ** 2))
     try:
         sigma = np.sqrt(noise * np.diag(np.linalg.inv(solution.jac.T @ solution.jac)))
@@ -339,7 +338,7 @@ def _aligned(result: MagnetometerFit, readings: FloatArray, up: FloatArray) -> M
             f"magnetometer and accelerometer disagree by {math.degrees(turned_rad):.0f} degrees "
             "about directions: their axes differ from the firmware's"
         )
-    rotation = Rotation.from_rotvec(solution.x[:3]).as_matrix()
+    rotation = scipy.spatial.transform.Rotation.from_rotvec(solution.x[:3]).as_matrix()
     return MagnetometerFit(
         offset_ut=result.offset_ut,
         matrix=rotation @ result.matrix,

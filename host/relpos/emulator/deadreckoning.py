@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
+import scipy
 
 from relpos.calibration.steps import (
     LEG_OF_STATURE,
@@ -119,7 +119,7 @@ def surroundings_of(recording: ImuRecording) -> Surroundings:
     time_s = time_s - time_s[0] + LEAD_S
     grid_s = np.arange(int((time_s[-1] + TAIL_S) * grid_hz) + 1) / grid_hz
     inside = np.clip(grid_s, time_s[0], time_s[-1])
-    inertial: FloatArray = PchipInterpolator(time_s, rows[:, :6])(inside)
+    inertial: FloatArray = scipy.interpolate.PchipInterpolator(time_s, rows[:, :6])(inside)
     step_s = np.diff(time_s)
     gaps = np.flatnonzero(step_s > max(GAP_PERIODS * period_s, LEAST_GAP_S))
     silent = [(float(time_s[k]) + period_s, float(time_s[k + 1])) for k in gaps]

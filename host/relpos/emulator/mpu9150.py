@@ -13,12 +13,13 @@ DLPF_CFG 1 to 6: 2.0/2.2, 3.0/3.4, 4.9/5.1, 8.5/10.7, 13.8/22.5, 19.0/45).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from functools import cache
 from typing import ClassVar
 
 import numpy as np
-from scipy import signal
+from scipy.linalg.lapack import dtbtrs
 
 from .bus import BusStatus, I2cDevice
 from .surroundings import FloatArray, InertialErrors, Surroundings
@@ -77,6 +78,8 @@ _TICKS_PER_S = 8000
 _TICKS_PER_STEP = 8
 """The filter runs at 1 kHz."""
 _BLOCK_STEPS = 4096
+_FILLED = 1024
+"""Samples whose words are made at a time."""
 _WARM_UP_STEPS = 512
 """Steps before a block that settle a filter with no history: 16 time constants at 5 Hz."""
 
@@ -88,13 +91,36 @@ Filtering = tuple[float, float, float]
 
 
 @cache
-def _filters(filtering: Filtering) -> tuple[tuple[FloatArray, FloatArray], ...]:
-    """(b, a) of accelerometer and gyroscope at 1 kHz."""
-    pairs = []
-    for bandwidth in filtering[:2]:
-        b, a = signal.butter(2, bandwidth, fs=1000.0)
-        pairs.append((np.asarray(b), np.asarray(a)))
-    return tuple(pairs)
+def _filter(bandwidth_hz: float) -> tuple[FloatArray, FloatArray]:
+    """(b, a) of a second-order Butterworth at 1 kHz."""
+    k = math.tan(math.pi * bandwidth_hz / 1000.0)
+    damped = math.sqrt(2.0) * k
+    whole = 1.0 + damped + k * k
+    return (
+        np.array((k * k, 2.0 * k * k, k * k)) / whole,
+        np.array((1.0, 2.0 * (k * k - 1.0) / whole, (1.0 - damped + k * k) / whole)),
+    )
+
+
+def _filtered(
+    bandwidth_hz: float, raw: FloatArray, state: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Columns of filtered values, and the state (2, columns) after them.
+
+    By LAPACK: to import scipy.signal takes longer than a minute of a node.
+    """
+    b, a = _filter(bandwidth_hz)
+    driven = b[0] * raw
+    driven[1:] += b[1] * raw[:-1]
+    driven[2:] += b[2] * raw[:-2]
+    driven[:2] += state
+    rows: FloatArray = dtbtrs(np.repeat(a[:, None], len(raw), 1), driven, uplo="L", diag="U")[0]
+    return rows, np.array(
+        (
+            b[1] * raw[-1] - a[1] * rows[-1] + b[2] * raw[-2] - a[2] * rows[-2],
+            b[2] * raw[-1] - a[2] * rows[-1],
+        )
+    )
 
 
 class _Pipeline:
@@ -118,35 +144,32 @@ class _Pipeline:
         )
         self._walk_rng = np.random.default_rng([errors.seed, 1])
         self._walk = [np.zeros(3)]
-        self._block = -1
-        self._config: Filtering = (0.0, 0.0, 0.0)
-        self._state: list[FloatArray] = []
-        self._rows = np.zeros((0, 6))
+        self._blocks: dict[Filtering, tuple[int, FloatArray, list[FloatArray]]] = {}
+        """Of each configuration that was used: number of its last block, rows, filters' states."""
 
     def block(self, number: int, config: Filtering) -> FloatArray:
         """Filtered measurements (_BLOCK_STEPS, 6) of a block, in SI units."""
-        if config == self._config and number == self._block:
-            return self._rows
-        if config != self._config or number != self._block + 1:
-            self._config = config
-            begin = number * _BLOCK_STEPS
+        last, rows, states = self._blocks.get(config, (-2, np.zeros((0, 6)), []))
+        if number == last:
+            return rows
+        filters = tuple(zip(config[:2], (slice(3), slice(3, 6)), strict=True))
+        begin = number * _BLOCK_STEPS
+        if number != last + 1:
             raw = self._raw(begin - _WARM_UP_STEPS, begin, config)
-            self._state = []
-            for (b, a), columns in zip(_filters(config), (slice(3), slice(3, 6)), strict=True):
-                # Settled at the first value. Not lfilter_zi: its last digit is the library's.
+            states = []
+            for bandwidth_hz, columns in filters:
+                # Settled at the first value.
+                b, a = _filter(bandwidth_hz)
                 gain = b.sum() / a.sum()
                 start = np.array((gain - b[0], b[2] - a[2] * gain))[:, None] * raw[0, columns]
-                self._state.append(signal.lfilter(b, a, raw[:, columns], axis=0, zi=start)[1])
-        self._block = number
-        begin = number * _BLOCK_STEPS
-        raw = self._raw(begin, begin + _BLOCK_STEPS, config)
-        for k, columns in enumerate((slice(3), slice(3, 6))):
-            b, a = _filters(config)[k]
-            raw[:, columns], self._state[k] = signal.lfilter(
-                b, a, raw[:, columns], axis=0, zi=self._state[k]
-            )
-        self._rows = raw
-        return raw
+                states.append(_filtered(bandwidth_hz, raw[:, columns], start)[1])
+        rows = self._raw(begin, begin + _BLOCK_STEPS, config)
+        after = []
+        for (bandwidth_hz, columns), state in zip(filters, states, strict=True):
+            rows[:, columns], state = _filtered(bandwidth_hz, rows[:, columns], state)
+            after.append(state)
+        self._blocks[config] = number, rows, after
+        return rows
 
     def _raw(self, begin: int, end: int, config: Filtering) -> FloatArray:
         steps = np.arange(begin, end)
@@ -316,12 +339,13 @@ class Mpu9150(I2cDevice):
         self._status |= DATA_READY
 
     def _fill(self, sample: int) -> None:
-        """Make the words of every sample in the block that ``sample`` falls in."""
+        """Make the words of ``sample`` and of those after it, no farther than its block."""
         block = (self._epoch + sample * self._period) // _TICKS_PER_STEP // _BLOCK_STEPS
         block_ticks = _BLOCK_STEPS * _TICKS_PER_STEP
-        first = max(-((self._epoch - block * block_ticks) // self._period), 0)
         behind = -((self._epoch - (block + 1) * block_ticks) // self._period)
-        ticks = self._epoch + np.arange(first, behind) * self._period
+        # Until a driver has set it up, a chip samples at 8 kHz: few of them are ever read.
+        samples = np.arange(sample, min(behind, sample + _FILLED))
+        ticks = self._epoch + samples * self._period
         values = self._pipeline.block(block, self._config)[
             ticks // _TICKS_PER_STEP - block * _BLOCK_STEPS
         ]
@@ -346,7 +370,7 @@ class Mpu9150(I2cDevice):
                 words[:, column] = 0.0
         packed = np.clip(np.rint(words), -32768, 32767).astype(">i2").tobytes()
         self._table = [packed[k : k + 14] for k in range(0, len(packed), 14)]
-        self._table_first = first
+        self._table_first = sample
 
     def _self_test_response(self) -> tuple[list[float], list[float]]:
         """What the factory measured: force in g and rate in deg/s an axis (register map, 13 to 16).

@@ -17,6 +17,7 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 from relpos.errors import RelposError
 from relpos.fusion import kernel_cache, plugins
@@ -34,11 +35,14 @@ from relpos.fusion.estimator import (
     Shape,
 )
 from relpos.fusion.linear_algebra import one_thread
-from relpos.fusion.models.ranging import Mounting
 from relpos.fusion.particle.settings import ParticleSettings
 from relpos.fusion.post import posts_of, referring
 from relpos.fusion.settings import SettingInfo, describe, parse
 from relpos.measurements import Heading, Height, Motion, Prior, Range
+
+if TYPE_CHECKING:
+    # With numba behind it, which who only emulates or records does without.
+    from relpos.fusion.models.ranging import Mounting
 
 SETTINGS: Mapping[str, type] = {
     "bank": BankSettings,

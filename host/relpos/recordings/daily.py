@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import scipy.io
+import scipy
 
 from relpos.recordings.tables import Archive, ConvertedRun, described, event_lines, imu_lines
 

@@ -11,8 +11,7 @@ from collections.abc import Iterator
 from pathlib import PurePosixPath
 
 import numpy as np
-from scipy.signal import butter, filtfilt
-from scipy.spatial.transform import Rotation
+import scipy
 
 from relpos.errors import DataError
 from relpos.recordings.tables import (
@@ -78,11 +77,13 @@ def _run(name: str, person: str, leg_m: float, markers: Array) -> ConvertedRun:
     longest = max(runs, key=len)
     markers, seen = markers[longest], seen[longest]
     rotation, sacrum_m = _rigid_body(markers, seen)
-    low_pass = butter(ORDER, LOW_PASS_HZ / (RATE_HZ / 2.0))
+    low_pass = scipy.signal.butter(ORDER, LOW_PASS_HZ / (RATE_HZ / 2.0))
     quaternions = rotation.as_quat()
     quaternions *= np.cumprod(np.sign([1.0, *(quaternions[1:] * quaternions[:-1]).sum(1)]))[:, None]
-    attitude = Rotation.from_quat(filtfilt(*low_pass, quaternions, axis=0))
-    smooth_m = filtfilt(*low_pass, sacrum_m, axis=0)
+    attitude = scipy.spatial.transform.Rotation.from_quat(
+        scipy.signal.filtfilt(*low_pass, quaternions, axis=0)
+    )
+    smooth_m = scipy.signal.filtfilt(*low_pass, sacrum_m, axis=0)
     acceleration = np.gradient(np.gradient(smooth_m, axis=0), axis=0) * RATE_HZ**2
     force = attitude.inv().apply(acceleration + np.array([0.0, 0.0, G_M_S2]))
     rate = np.zeros_like(force)
@@ -107,7 +108,7 @@ def _run(name: str, person: str, leg_m: float, markers: Array) -> ConvertedRun:
     return ConvertedRun(PurePosixPath(name).name, description, imu, others={"truth.csv": truth})
 
 
-def _rigid_body(markers: Array, seen: Array) -> tuple[Rotation, Array]:
+def _rigid_body(markers: Array, seen: Array) -> tuple[scipy.spatial.transform.Rotation, Array]:
     """Attitude, and place of the sacrum, of the body that the markers span in the middle frame.
 
     The best rotation is Kabsch's; the body is level in that frame, its x axis forward.
@@ -127,5 +128,5 @@ def _rigid_body(markers: Array, seen: Array) -> tuple[Rotation, Array]:
     spread = np.einsum("tk,tki,tkj->tij", weights, body - centre_of_body[:, None], apart)
     u, _, v = np.linalg.svd(spread)
     v[:, 2] *= np.linalg.det(u @ v)[:, None]  # a rotation, no mirror image
-    rotation = Rotation.from_matrix((u @ v).transpose(0, 2, 1))
+    rotation = scipy.spatial.transform.Rotation.from_matrix((u @ v).transpose(0, 2, 1))
     return rotation, centre + rotation.apply(body[2:].mean(axis=0) - centre_of_body)

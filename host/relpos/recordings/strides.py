@@ -7,7 +7,7 @@ is integrated twice, and the speed that is left over is taken out evenly.
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
+import scipy
 
 from relpos.recordings.tables import Array
 
@@ -20,7 +20,8 @@ APART = 15  # samples: a shorter interruption of a stance is none
 def stances(rate_rad_s: Array) -> list[tuple[int, int, int]]:
     """Begin, stillest sample and end of each stance, of angular rates (n, 3)."""
     speed = np.linalg.norm(rate_rad_s, axis=1)
-    smooth = uniform_filter1d(uniform_filter1d(speed, 5), 9)
+    average = scipy.ndimage.uniform_filter1d
+    smooth = average(average(speed, 5), 9)
     still = np.flatnonzero(smooth < max(STILL_RAD_S, STILL_SHARE * float(speed.mean())))
     parts = np.split(still, np.flatnonzero(np.diff(still) > APART) + 1)
     return [

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 import numpy.typing as npt
@@ -141,10 +142,8 @@ def _wander(
     count: int, keeps_s: float, rng: np.random.Generator, start: float | None = None
 ) -> Floats:
     """Return an Ornstein-Uhlenbeck process (count,) of variance 1."""
-    from scipy.signal import lfilter
-
     kept = math.exp(-1.0 / (RATE_HZ * keeps_s))
     first = float(rng.standard_normal()) if start is None else start
     shocks = math.sqrt(1.0 - kept**2) * rng.standard_normal(count)
-    shocks[0] = 0.0
-    return np.asarray(lfilter([1.0], [1.0, -kept], shocks, zi=[first])[0])
+    shocks[0] = first
+    return np.array(list(accumulate(shocks.tolist(), lambda last, shock: kept * last + shock)))
