@@ -57,9 +57,8 @@ def checked(
 ) -> Iterator[NodeCheck]:
     """A check of node 1, over its cable or by radio."""
     with emulated(monkeypatch, *faults, **team) as line:
-        link = Link(clock=lambda: 1.8e9 + line.team.time_us * 1e-6)
         device = plugged_in(monkeypatch, line) if cable else line
-        node = open_dialogue(device, 1, link)
+        node = open_dialogue(device, 1, Link())
         yield NodeCheck(node, cable=cable, peer=2 if cable else None, distance_m=SPACING_M)
 
 

@@ -12,6 +12,7 @@ from relpos.link.port import BAUD, READ_TIMEOUT_S
 from relpos.protocol.messages import ResetCause
 
 STEP_US = 2_000
+BEGINS_UNIX_S = 1.8e9
 
 
 class EmulatedLine:
@@ -47,13 +48,14 @@ class EmulatedLine:
         pass
 
     def clock_of(self, monkeypatch: pytest.MonkeyPatch, *modules: object) -> None:
-        """Let the modules' ``time`` be the team's."""
+        """Let the modules' ``time`` be the team's: what is sent, to the byte, hangs on no other."""
 
         def now_s() -> float:
             return self.team.time_us * 1e-6
 
+        clock = SimpleNamespace(monotonic=now_s, time=lambda: BEGINS_UNIX_S + now_s())
         for module in modules:
-            monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=now_s, time=now_s))
+            monkeypatch.setattr(module, "time", clock)
 
 
 class EmulatedCable(EmulatedLine):

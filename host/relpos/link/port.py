@@ -52,8 +52,8 @@ class Line(Protocol):
 class Link:
     """XBee bytes to observations, and commands to bytes; without I/O.
 
-    ``key`` is the team's. ``clock`` gives Unix time, from which sent frames are counted;
-    ``newest_counters`` are the nodes' from an earlier session (see
+    ``key`` is the team's. ``clock`` gives Unix time (default: the computer's), from which sent
+    frames are counted; ``newest_counters`` are the nodes' from an earlier session (see
     :mod:`relpos.link.authentication`).
     """
 
@@ -61,7 +61,7 @@ class Link:
         self,
         *,
         key: bytes = wire.DEFAULT_KEY,
-        clock: Callable[[], float] = time.time,
+        clock: Callable[[], float] | None = None,
         newest_counters: Mapping[int, int] | None = None,
         escaped: bool = True,
     ) -> None:
@@ -71,7 +71,7 @@ class Link:
         self.counters_before = dict(newest_counters or {})
         self.node_keys: dict[int, bytes] = {}
         """Of nodes that have another key than the team's gives them, while that changes."""
-        self._clock = clock
+        self._clock = clock or time.time
         self._counters: dict[int, HostCounter] = {}
         self._escaped = escaped
         self._token = 0
