@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import gc
 import os
+from functools import cache
 
 import pytest
+import typer.testing
 from hypothesis import settings
 
 settings.register_profile("relpos", deadline=None)
@@ -16,6 +18,9 @@ settings.load_profile("relpos")
 
 # Nothing of what is imported and collected is ever freed: not to be searched again and again.
 gc.disable()
+
+# `CliRunner` would put the whole command line together for each call, which takes longer than most.
+typer.testing._get_command = cache(typer.testing._get_command)
 
 DURATIONS = "relpos/durations"
 """Key in pytest's cache: file -> seconds that its tests took the last time."""

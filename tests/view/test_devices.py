@@ -78,7 +78,7 @@ class Mill:
         base = f"http://127.0.0.1:{self.access.port}"
         with (
             ThreadPoolExecutor(1) as pool,
-            httpx.Client(base_url=base, cookies=cookies, timeout=60.0) as client,
+            httpx.Client(base_url=base, cookies=cookies, timeout=60.0, verify=False) as client,
         ):
             answer = pool.submit(client.request, method, path, **options)  # type: ignore[arg-type]
             while not answer.done():

@@ -41,7 +41,9 @@ class VirtualClock:
     def at(self, time_us: int, action: Action) -> None:
         """Call ``action(time)`` at ``time_us``, or now where that is past."""
         self._asked += 1
-        heapq.heappush(self._heap, (max(time_us, self.now_us), self._asked, action))
+        if time_us < self.now_us:
+            time_us = self.now_us
+        heapq.heappush(self._heap, (time_us, self._asked, action))
 
     def run(self, until_us: int) -> None:
         """Carry out everything due by ``until_us``; then that is the time."""
