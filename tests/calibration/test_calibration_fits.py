@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+import scipy
 
 from relpos.calibration import guide, inertial, magnetometer, picture, steps
 from relpos.calibration.sensors import SensorCalibration, checksum
@@ -15,10 +15,14 @@ EARTH_UT = np.array([0.0, 20.0, -43.6])  # 48 uT, dipping by 65 degrees
 GRAVITY = np.array([0.0, 0.0, 9.80665])
 
 
+def attitudes_of(count, seed):
+    return scipy.spatial.transform.Rotation.random(count, random_state=seed).inv()
+
+
 def turned(count, seed, noise_ut=0.3, offset=(40.0, -25.0, 10.0), spread=0.1):
     """Readings (n, 3), up (n, 3) and the truth of a node that is turned in all directions."""
     rng = np.random.default_rng(seed)
-    attitudes = Rotation.random(count, random_state=seed).inv()
+    attitudes = attitudes_of(count, seed)
     iron = np.eye(3) + spread * rng.standard_normal((3, 3))
     field = attitudes.apply(EARTH_UT) @ iron.T + offset
     return field + noise_ut * rng.standard_normal((count, 3)), attitudes.apply(GRAVITY), iron
@@ -32,7 +36,7 @@ def test_the_ellipsoid_is_found_and_turned_into_gravitys_axes(seed):
     assert fit.residual < 0.01 < fit.residual_before
     # What is corrected is the field's direction, not only its strength: up to 1 degree.
     scale = np.linalg.det(iron) ** (1 / 3)
-    clean = (Rotation.random(400, random_state=seed).inv()).apply(EARTH_UT) * scale
+    clean = attitudes_of(400, seed).apply(EARTH_UT) * scale
     angle = np.arccos(
         np.sum(fit.correct(field) * clean, axis=1)
         / np.linalg.norm(fit.correct(field), axis=1)
@@ -77,6 +81,7 @@ def samples_of(kind):
     rng = np.random.default_rng(7)
     bias, gyro = np.array([0.3, -0.2, 0.1]), np.radians([1.0, -2.0, 0.5])
     out, time_s = [], 0.0
+    rotation = scipy.spatial.transform.Rotation
 
     def add(attitude, rate):
         nonlocal time_s
@@ -90,15 +95,15 @@ def samples_of(kind):
     for part in kind:
         if part == "still":
             for _ in range(50):
-                add(Rotation.identity(), np.zeros(3))
+                add(rotation.identity(), np.zeros(3))
         elif part == "sides":
             for side in sides:
-                add(Rotation.from_rotvec(np.array(side) / 2), np.array([2.0, 0, 0]))
+                add(rotation.from_rotvec(np.array(side) / 2), np.array([2.0, 0, 0]))
                 for _ in range(15):
-                    add(Rotation.from_rotvec(side), np.zeros(3))
+                    add(rotation.from_rotvec(side), np.zeros(3))
         else:
             for k in range(400):
-                add(Rotation.random(random_state=k), np.array([0.0, 1.5, -1.0 + 0.01 * (k % 7)]))
+                add(rotation.random(random_state=k), np.array([0.0, 1.5, -1.0 + 0.01 * (k % 7)]))
     return out, bias, gyro
 
 
