@@ -99,8 +99,7 @@ def test_a_figure_is_mean_standard_error_and_worst() -> None:
     figure = Statistic.of([1.0, 2.0, math.nan, 6.0])
     assert (figure.mean, figure.worst, figure.count) == (3.0, 6.0, 3)
     assert figure.error == pytest.approx(math.sqrt(7.0 / 3.0))
-    assert figure.overlaps(3.0 + 1.96 * figure.error + 0.9, 0.5)
-    assert not figure.overlaps(3.0 + 1.96 * figure.error + 1.1, 0.5)
+    assert figure.half_width == pytest.approx(1.96 * figure.error, rel=1e-4)
 
 
 def test_the_bound_of_a_scenario_is_computed_once_for_all_its_estimators() -> None:

@@ -170,13 +170,12 @@ def _angle_rad(a: FloatArray, b: FloatArray) -> float:
 class AccelerometerFit:
     """Bias (3,) and scale (3,) with (force - bias) (1 + scale) = specific force.
 
-    ``sigma_*`` are standard deviations (3,); ``partial``: the scale was left at zero.
+    ``sigma_scale`` are standard deviations (3,); ``partial``: the scale was left at zero.
     ``residual_before_m_s2`` and ``residual_m_s2`` are RMS of |force| - g over the attitudes.
     """
 
     bias_m_s2: FloatArray
     scale: FloatArray
-    sigma_bias_m_s2: FloatArray
     sigma_scale: FloatArray
     residual_before_m_s2: float
     residual_m_s2: float
@@ -184,9 +183,7 @@ class AccelerometerFit:
     partial: bool
 
 
-def fit_accelerometer(
-    attitudes: list[Pose], gravity_m_s2: float = STANDARD_GRAVITY_M_S2
-) -> AccelerometerFit:
+def fit_accelerometer(attitudes: list[Pose]) -> AccelerometerFit:
     """Fit attitudes at rest; DataError where they are too few or too similar."""
     if len(attitudes) < MIN_POSES:
         raise DataError(
@@ -200,7 +197,7 @@ def fit_accelerometer(
     def misfits(parameters: FloatArray) -> FloatArray:
         scale = np.zeros(3) if partial else parameters[3:]
         corrected = (forces - parameters[:3]) * (1.0 + scale)
-        return np.asarray(np.linalg.norm(corrected, axis=1) - gravity_m_s2)
+        return np.asarray(np.linalg.norm(corrected, axis=1) - STANDARD_GRAVITY_M_S2)
 
     solution = scipy.optimize.least_squares(misfits, np.zeros(free))
     info = solution.jac.T @ solution.jac / FORCE_SIGMA_M_S2**2
@@ -217,10 +214,9 @@ def fit_accelerometer(
     return AccelerometerFit(
         bias_m_s2=solution.x[:3],
         scale=scale,
-        sigma_bias_m_s2=sigma[:3],
         sigma_scale=sigma_scale,
         residual_before_m_s2=float(
-            np.sqrt(np.mean((np.linalg.norm(forces, axis=1) - gravity_m_s2) ** 2))
+            np.sqrt(np.mean((np.linalg.norm(forces, axis=1) - STANDARD_GRAVITY_M_S2) ** 2))
         ),
         residual_m_s2=float(np.sqrt(np.mean(rest**2))),
         attitudes=len(attitudes),

@@ -83,16 +83,16 @@ class MagnetometerFit:
         return corrected
 
 
-def directions(count: int = DIRECTIONS) -> FloatArray:
-    """Unit vectors (count, 3), evenly over the sphere (Fibonacci lattice)."""
-    k = np.arange(count) + 0.5
-    z = 1.0 - 2.0 * k / count
+def _directions() -> FloatArray:
+    """Unit vectors (DIRECTIONS, 3), evenly over the sphere (Fibonacci lattice)."""
+    k = np.arange(DIRECTIONS) + 0.5
+    z = 1.0 - 2.0 * k / DIRECTIONS
     angle = np.pi * (1.0 + math.sqrt(5.0)) * k
     level = np.sqrt(1.0 - z * z)
     return np.column_stack((level * np.cos(angle), level * np.sin(angle), z))
 
 
-_PATCHES = directions()
+_PATCHES = _directions()
 
 
 def visited(vectors: FloatArray) -> NDArray[np.bool_]:

@@ -61,7 +61,6 @@ class Ak8975(I2cDevice):
         self._reachable = reachable
         self._rng = np.random.default_rng([self._errors.seed, 3])
         self.time_us = 0
-        self.refused_modes = 0
         self.conversion_us = CONVERSION_US
         self.spoil: Callable[[FloatArray], FloatArray] | None = None
         """Fault: field (3,) in the chip's axes, microtesla -> what is measured instead."""
@@ -119,7 +118,6 @@ class Ak8975(I2cDevice):
             self._mode, self._done_us = POWER_DOWN, None
         elif self._mode not in (POWER_DOWN, mode) or mode not in (SINGLE, SELF_TEST, FUSE_ROM):
             # Between two modes lies power-down; the chip is left there and does nothing.
-            self.refused_modes += 1
             self._mode, self._done_us = POWER_DOWN, None
         else:
             self._mode = mode

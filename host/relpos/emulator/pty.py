@@ -85,7 +85,6 @@ class PseudoTerminal:
         if speed < 0.0:
             raise DeviceError(f"the speed is not negative, unlike {speed:g}")
         self.device = device
-        self.interrupted_chunks = 0
         self._speed = 0.0 if speed == float("inf") else speed
         self._mark_time = mark_time
         try:
@@ -229,7 +228,6 @@ class PseudoTerminal:
             except BlockingIOError:
                 waited = True
                 if self._stop.is_set() or self._reader_gone():
-                    self.interrupted_chunks += 1
                     return True
                 select.select([], [self._master], [], _POLL_S)
         return waited

@@ -57,7 +57,7 @@ class Bound:
     distance has no derivative and no bound; there it is the mean over all directions,
     sqrt(trace / 2), which is 0 while both are exactly known. ``*_position_m`` are (T,): the root
     mean over the nodes of the covariance without its three directions of rigid motion, which is
-    the aligned position error to first order. ``*_constants`` are (N, 2): the standard
+    the aligned position error to first order. ``filtering_constants`` are (N, 2): the standard
     deviations of the hidden drift (rad/s) and log scale at the end, 0 where there is none.
     """
 
@@ -67,7 +67,6 @@ class Bound:
     smoothing_pair_m: Floats
     smoothing_position_m: Floats
     filtering_constants: Floats
-    smoothing_constants: Floats
 
     @cached_property
     def filtering_distance_m(self) -> Floats:
@@ -190,7 +189,6 @@ def of_true_run(true_run: TrueRun) -> Bound:
         *filtering,
         *smoothing,
         filtering_constants=system.constants(filtered[-1]),
-        smoothing_constants=system.constants(smoothed[-1]),
     )
 
 

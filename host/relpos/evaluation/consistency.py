@@ -1,4 +1,4 @@
-"""Whether an estimate is as uncertain as it says: NEES with its interval, honesty, coverage.
+"""Whether an estimate is as uncertain as it says: NEES with its interval, coverage.
 
 A normalised squared error is chi-square distributed where the estimate is honest, so its mean per
 degree of freedom is 1 (Bar-Shalom, Li, Kirubarajan 2001, sect. 5.4). How far from 1 chance may
@@ -76,12 +76,11 @@ def nees(runs: Sequence[Floats]) -> Nees:
     return Nees(mean, low, high, effective, values)
 
 
-def chi_square_interval(freedom: float, probability: float = 0.95) -> tuple[float, float]:
-    """Return the central interval of a mean of ``freedom`` independent squares."""
+def chi_square_interval(freedom: float) -> tuple[float, float]:
+    """Return the central 95 % interval of a mean of ``freedom`` independent squares."""
     from scipy.special import gammaincinv
 
-    tail = 0.5 * (1.0 - probability)
-    low, high = (2.0 * float(gammaincinv(0.5 * freedom, p)) for p in (tail, 1.0 - tail))
+    low, high = (2.0 * float(gammaincinv(0.5 * freedom, p)) for p in (0.025, 0.975))
     return low / freedom, high / freedom
 
 
@@ -129,36 +128,6 @@ def of_poses(estimates: Sequence[Estimate], truth: Mapping[int, Track]) -> tuple
         known = spread > 0.0
         heading[:, n] = np.where(known, (turn / np.where(known, spread, 1.0)) ** 2, np.nan)
     return position, heading
-
-
-@dataclass(frozen=True, slots=True)
-class Honesty:
-    """Root mean square error over root mean square reported deviation, of parameters.
-
-    ``low`` and ``high`` bound the quotient of an honest report in 95 of 100 cases.
-    """
-
-    ratio: float
-    low: float
-    high: float
-    count: int
-
-    def within(self, factor: float) -> bool:
-        """Whether the reported deviations are right within a factor."""
-        return 1.0 / factor <= self.ratio <= factor
-
-
-def honesty(errors: Floats, sigmas: Floats) -> Honesty:
-    """Compare independent errors (n,) with their reported standard deviations (n,)."""
-    good = np.isfinite(errors) & np.isfinite(sigmas) & (sigmas > 0.0)
-    count = int(good.sum())
-    if not count:
-        return Honesty(math.nan, math.nan, math.nan, 0)
-    ratio = math.sqrt(float(np.mean(errors[good] ** 2) / np.mean(sigmas[good] ** 2)))
-    # Unequal deviations are worth fewer errors: (sum s^2)^2 / sum s^4.
-    square = sigmas[good] ** 2
-    low, high = chi_square_interval(float(square.sum() ** 2 / np.sum(square**2)))
-    return Honesty(ratio, math.sqrt(low), math.sqrt(high), count)
 
 
 @dataclass(frozen=True, slots=True)

@@ -131,10 +131,6 @@ class Statistic:
         """Half of the 95 % confidence interval of the mean."""
         return CONFIDENCE_95 * self.error
 
-    def overlaps(self, mean: float, error: float) -> bool:
-        """Whether the 95 % interval meets that of another mean with its standard error."""
-        return abs(self.mean - mean) <= CONFIDENCE_95 * (self.error + error)
-
 
 @dataclass(frozen=True)
 class Outcome:

@@ -159,7 +159,6 @@ class Hidden:
     white_heading_rad: Mapping[int, float] = field(default_factory=dict)
     noisy_node: int | None = None
     kidnapped_node: int | None = None
-    kidnapped_s: float | None = None
     late_ranges: frozenset[tuple[float, int, int]] = frozenset()
 
 
@@ -427,7 +426,6 @@ def true_rows(
 def _hidden(
     settings: PaperSettings, drawn: Drawn, too_long: frozenset[tuple[float, int, int]]
 ) -> Hidden:
-    kidnapped = settings.kidnap_m > 0.0
     return Hidden(
         drawn.by_node("step_scale"),
         drawn.by_node("drift_rad_s"),
@@ -435,7 +433,6 @@ def _hidden(
         drawn.by_node("turn_noise"),
         drawn.by_node("white_rad"),
         drawn.noisy + 1 if settings.noisy_factor != 1.0 else None,
-        drawn.kidnapped + 1 if kidnapped else None,
-        settings.kidnap_s if kidnapped else None,
+        drawn.kidnapped + 1 if settings.kidnap_m > 0.0 else None,
         too_long,
     )

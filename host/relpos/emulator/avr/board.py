@@ -6,7 +6,6 @@ import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from enum import IntEnum
-from types import TracebackType
 from typing import Self
 
 from relpos.emulator.avr.elf import Firmware
@@ -212,10 +211,6 @@ class Board:
         self._library.relpos_avr_counters(self._alive(), self._counters)
         return Counters(*self._counters)
 
-    def clear_statistics(self) -> None:
-        """Forget deepest stack, ticks and bus time, to measure from here on."""
-        self._library.relpos_avr_clear_statistics(self._alive())
-
     @property
     def cycle(self) -> int:
         """Cycles since power-on, sleeping included."""
@@ -275,10 +270,5 @@ class Board:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

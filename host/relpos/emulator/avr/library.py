@@ -106,7 +106,6 @@ def load() -> ctypes.CDLL:
         "data_get": (None, [board, u16, out, u16]),
         "data_set": (None, [board, u16, u8]),
         "counters": (None, [board, u64s]),
-        "clear_statistics": (None, [board]),
         "ram_end": (u32, [board]),
         "flash_size": (u32, [board]),
     }

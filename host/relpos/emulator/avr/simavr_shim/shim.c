@@ -881,13 +881,6 @@ void relpos_avr_counters(const relpos_avr *e, uint64_t out[COUNTER_COUNT])
 	out[COUNTER_LOWEST_SP] = e->lowest_sp;
 }
 
-void relpos_avr_clear_statistics(relpos_avr *e)
-{
-	e->lowest_sp = e->avr->ramend;
-	e->counter[COUNTER_TICKS] = e->counter[COUNTER_TICK_CYCLES_SUM] = 0;
-	e->counter[COUNTER_TICK_CYCLES_MAX] = e->counter[COUNTER_TWI_BUSY_CYCLES] = 0;
-}
-
 void relpos_avr_set_supply(relpos_avr *e, uint32_t millivolts)
 {
 	e->avr->vcc = e->avr->avcc = e->avr->aref = millivolts;

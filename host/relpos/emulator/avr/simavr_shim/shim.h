@@ -29,7 +29,7 @@ enum { /* indices into the array filled by relpos_avr_counters() */
 	COUNTER_CYCLE = 0,
 	COUNTER_RESETS,            /* resets since creation: watchdog and relpos_avr_reset() */
 	COUNTER_WATCHDOG_RESETS,
-	COUNTER_LOWEST_SP,         /* lowest stack pointer since creation or relpos_avr_clear_statistics() */
+	COUNTER_LOWEST_SP,         /* lowest stack pointer since creation */
 	COUNTER_UART_OVERRUNS,     /* received bytes lost because the receiver was full */
 	COUNTER_UART_DEAF,         /* received bytes lost because the receiver was off */
 	COUNTER_TICKS,             /* completed marked regions (GPIOR0 1 ... 0) */
@@ -90,7 +90,6 @@ void relpos_avr_data_get(const relpos_avr *, uint16_t address, uint8_t *out, uin
 void relpos_avr_data_set(relpos_avr *, uint16_t address, uint8_t value);
 
 void relpos_avr_counters(const relpos_avr *, uint64_t out[COUNTER_COUNT]);
-void relpos_avr_clear_statistics(relpos_avr *);
 uint32_t relpos_avr_ram_end(const relpos_avr *);
 uint32_t relpos_avr_flash_size(const relpos_avr *);
 #endif
