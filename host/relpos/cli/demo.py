@@ -42,19 +42,20 @@ Faults = Annotated[
         "--fault", metavar="SPEC", help="A fault to inject; repeatable. See the list below."
     ),
 ]
+Scenario = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        help="paper, lab, building, straight (walks); bench, turntable (tests).",
+    ),
+]
 
 
 def demo(
     board: Annotated[Board, typer.Option(help="What runs the firmware.")] = Board.NATIVE,
     nodes: Annotated[int, typer.Option(min=2, max=20, help="How many people.")] = 6,
     seconds: Annotated[float, typer.Option(min=10.0, help="How long they walk.")] = 300.0,
-    scenario: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="paper, lab, building, straight (walks); bench, turntable (tests).",
-        ),
-    ] = "paper",
+    scenario: Scenario = "paper",
     fault: Faults = None,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same walk.")] = 0,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where the report goes.")] = Path(

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from relpos.cli import output
-from relpos.cli.demo import Board, Faults, check_faults
+from relpos.cli.demo import Board, Faults, Scenario, check_faults
 from relpos.cli.keys import KeyFile, team_key
 from relpos.cli.node_flash import ImuName
 
@@ -15,13 +15,7 @@ from relpos.cli.node_flash import ImuName
 def emulate(
     nodes: Annotated[int, typer.Option(min=1, max=20, help="How many people.")],
     board: Annotated[Board, typer.Option(help="What runs the firmware.")] = Board.NATIVE,
-    scenario: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="paper, lab, building, straight (walks); bench, turntable (tests).",
-        ),
-    ] = "paper",
+    scenario: Scenario = "paper",
     speed: Annotated[
         float, typer.Option(min=0.0, help="1 is real time; 0 is as fast as possible.")
     ] = 1.0,

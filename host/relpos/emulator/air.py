@@ -253,7 +253,7 @@ class RadioAir:
         done_us = sent.time_us
         common_s: float | None = None
         for receiver in receivers:
-            delay_s = self._world.transmit(self._rng)
+            delay_s = self._world.radio.transmit(self._rng)
             if delay_s is None:
                 self.counts["lost"] += 1
                 continue

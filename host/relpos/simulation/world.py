@@ -157,10 +157,6 @@ class World:
     floor_pressure_pa: float = 101_325.0
     building: Building | None = None
 
-    def detection_probability(self, distance_m: float) -> float:
-        """See `UwbChannel.detection_probability`."""
-        return self.uwb.detection_probability(distance_m)
-
     def measure_range(
         self, rng: np.random.Generator, first_m: FloatArray, second_m: FloatArray
     ) -> float | None:
@@ -171,10 +167,6 @@ class World:
         slabs = self.building.slabs_between(first_m, second_m)
         measured = self.uwb.measure_range(rng, distance_m, slabs * self.building.slab_db)
         return None if measured is None else measured + slabs * sum(SLAB_EXCESS_M) / 2.0
-
-    def transmit(self, rng: np.random.Generator) -> float | None:
-        """See `RadioChannel.transmit`."""
-        return self.radio.transmit(rng)
 
     def pressure_pa(self, height_m: FloatArray) -> FloatArray:
         """Air pressure at a height over the floor: the standard atmosphere's lapse."""

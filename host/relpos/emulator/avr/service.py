@@ -180,10 +180,8 @@ class Service:
 
     def _to_board(self, left_us: int, data: bytes) -> None:
         # The engine paces the bytes itself, from the first one on.
-        self._at(left_us - line_time_us(len(data), self.radio.baud), lambda _: self._deliver(data))
-
-    def _deliver(self, data: bytes) -> None:
-        self.engine.receive(data)
+        begins_us = left_us - line_time_us(len(data), self.radio.baud)
+        self._at(begins_us, lambda _: self.engine.receive(data))
 
     # -- what came of it ------------------------------------------------------------------------
 
