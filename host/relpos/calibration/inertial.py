@@ -170,13 +170,12 @@ def _angle_rad(a: FloatArray, b: FloatArray) -> float:
 class AccelerometerFit:
     """Bias (3,) and scale (3,) with (force - bias) (1 + scale) = specific force.
 
-    ``sigma_scale`` are standard deviations (3,); ``partial``: the scale was left at zero.
+    ``partial``: the scale was left at zero.
     ``residual_before_m_s2`` and ``residual_m_s2`` are RMS of |force| - g over the attitudes.
     """
 
     bias_m_s2: FloatArray
     scale: FloatArray
-    sigma_scale: FloatArray
     residual_before_m_s2: float
     residual_m_s2: float
     attitudes: int
@@ -214,7 +213,6 @@ def fit_accelerometer(attitudes: list[Pose]) -> AccelerometerFit:
     return AccelerometerFit(
         bias_m_s2=solution.x[:3],
         scale=scale,
-        sigma_scale=sigma_scale,
         residual_before_m_s2=float(
             np.sqrt(np.mean((np.linalg.norm(forces, axis=1) - STANDARD_GRAVITY_M_S2) ** 2))
         ),

@@ -23,7 +23,7 @@ is its best estimate.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -62,8 +62,7 @@ class MagnetometerFit:
     ``residual`` is the RMS of norm / radius - 1 after, ``residual_before`` of norm / mean norm - 1
     without any calibration. ``uncertainty`` is the standard deviation of a corrected reading in the
     worst direction, over the radius, from the parameters alone. ``dip_rad`` is how far the field
-    points below the horizon and ``turned_rad`` the rotation that gravity found; None where gravity
-    was not given or is not sufficient.
+    points below the horizon; None where gravity was not given or is not sufficient.
     """
 
     offset_ut: FloatArray
@@ -75,7 +74,6 @@ class MagnetometerFit:
     coverage: float
     readings: int
     dip_rad: float | None = None
-    turned_rad: float | None = None
 
     def correct(self, field_ut: FloatArray) -> FloatArray:
         """Corrected readings (n, 3)."""
@@ -339,15 +337,8 @@ def _aligned(result: MagnetometerFit, readings: FloatArray, up: FloatArray) -> M
             "about directions: their axes differ from the firmware's"
         )
     rotation = scipy.spatial.transform.Rotation.from_rotvec(solution.x[:3]).as_matrix()
-    return MagnetometerFit(
-        offset_ut=result.offset_ut,
+    return replace(
+        result,
         matrix=rotation @ result.matrix,
-        radius_ut=result.radius_ut,
-        residual=result.residual,
-        residual_before=result.residual_before,
-        uncertainty=result.uncertainty,
-        coverage=result.coverage,
-        readings=result.readings,
         dip_rad=-math.asin(max(-1.0, min(1.0, float(solution.x[3])))),
-        turned_rad=turned_rad,
     )

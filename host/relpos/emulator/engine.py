@@ -26,10 +26,6 @@ class NodeClockError:
     drift_ppm: float = 0.0
     offset_us: int = 0
 
-    def node_us(self, time_us: int) -> int:
-        """Node clock at virtual time ``time_us``, not wrapped."""
-        return time_us + round(time_us * self.drift_ppm * 1e-6) + self.offset_us
-
 
 class Engine(Protocol):
     """One board that executes the firmware in lock-step with the virtual clock."""
