@@ -8,7 +8,7 @@ may come in any order and repeatedly.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,12 +144,5 @@ def solve(samples: Sequence[RawSample], *, with_magnetometer: bool = True) -> Re
         return Result(still, gyro, accelerometer, None, fields, tuple(remarks))
     up = still.correct_acceleration(data.force_m_s2)
     fit = magnetometer.fit(data.field_ut, up)
-    calibration = SensorCalibration(
-        still.acceleration_bias_m_s2,
-        still.acceleration_scale,
-        still.gyro_bias_rad_s,
-        still.gyro_bias_sigma_rad_s,
-        fit.offset_ut,
-        fit.matrix,
-    )
+    calibration = replace(still, field_offset_ut=fit.offset_ut, field_matrix=fit.matrix)
     return Result(calibration, gyro, accelerometer, fit, fields, tuple(remarks))

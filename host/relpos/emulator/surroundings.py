@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from relpos.simulation.walker import RATE_HZ, WalkerTruth
+
 FloatArray = NDArray[np.float64]
 
 STANDARD_GRAVITY_M_S2 = 9.80665
@@ -35,6 +37,17 @@ class Surroundings:
     def __post_init__(self) -> None:
         both = np.concatenate((self.specific_force_m_s2, self.angular_rate_rad_s), axis=1)
         object.__setattr__(self, "inertial", np.ascontiguousarray(both, dtype=np.float64))
+
+    @classmethod
+    def of(cls, walker: WalkerTruth) -> Surroundings:
+        """What surrounds the board that a walker wears."""
+        return cls(
+            RATE_HZ,
+            walker.specific_force_m_s2,
+            walker.angular_rate_rad_s,
+            walker.magnetic_field_ut,
+            walker.pressure_pa,
+        )
 
     def magnetic_field_at(self, time_us: float) -> FloatArray:
         """Field (3,) in microtesla, linear between samples."""

@@ -131,13 +131,7 @@ class EmulatedTeam:
             raise
 
     def _add(self, walker: WalkerTruth, config: TeamConfig, errors: NodeErrors) -> None:
-        surroundings = Surroundings(
-            rate_hz=RATE_HZ,
-            specific_force_m_s2=walker.specific_force_m_s2,
-            angular_rate_rad_s=walker.angular_rate_rad_s,
-            magnetic_field_ut=walker.magnetic_field_ut,
-            pressure_pa=walker.pressure_pa,
-        )
+        surroundings = Surroundings.of(walker)
         built_for = None if config.built_for is None else ImuKind(config.built_for)
         hardware = Hardware(BoardKind(config.board), ImuKind(config.imu), built_for)
         node = EmulatedNode(

@@ -16,6 +16,7 @@ import uuid
 import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 from urllib.parse import urlparse
 
@@ -225,13 +226,7 @@ class PinnedFrame:
 
     def _place(self) -> None:
         pins = [
-            Pin(
-                pin.latitude_deg,
-                pin.longitude_deg,
-                pin.bearing_rad,
-                pin.altitude_m,
-                self._pinned_xy.get(k, pin.place_m),
-            )
+            replace(pin, place_m=self._pinned_xy.get(k, pin.place_m), node=None, time_s=None)
             for k, pin in enumerate(self._pins)
         ]
         try:

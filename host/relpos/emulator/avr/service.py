@@ -34,7 +34,6 @@ from relpos.emulator.xbee import DELIVERED, Transmission, XbeeModule, line_time_
 from relpos.link.beacon import BEACON_PERIOD_S, BeaconSchedule
 from relpos.protocol import messages as wire
 from relpos.simulation.team import make_team
-from relpos.simulation.walker import RATE_HZ
 
 POZYX_ADDRESS = 0x4B
 NODE = 1
@@ -69,14 +68,7 @@ class Service:
     ) -> None:
         """The same arguments give the same run to the byte. ``successor``: with an MPU-9250."""
         self._team, self._world = make_team("lab", TEAM, seconds + 1.0, seed)
-        truth = self._team[0]
-        surroundings = Surroundings(
-            rate_hz=RATE_HZ,
-            specific_force_m_s2=truth.specific_force_m_s2,
-            angular_rate_rad_s=truth.angular_rate_rad_s,
-            magnetic_field_ut=truth.magnetic_field_ut,
-            pressure_pa=truth.pressure_pa,
-        )
+        surroundings = Surroundings.of(self._team[0])
         rng = np.random.default_rng([seed, 0xA7])
         self._air_rng = np.random.default_rng([seed, 0xA8])
         magnetometer = Ak8963 if successor else Ak8975
