@@ -444,7 +444,7 @@ def test_a_session_sends_every_member(tmp_path: Path, udp_port: socket.socket) -
     receiver.start()
     url = f"udp://127.0.0.1:{udp_port.getsockname()[1]}"
     words = ["fuse", str(tmp_path / "walk"), "--cot", url, "--pin", "48.1,11.5,90"]
-    more = ["--speed", "4", "--out", str(tmp_path / "out"), "--seconds", "8", "--json"]
+    more = ["--speed", "2", "--out", str(tmp_path / "out"), "--seconds", "8", "--json"]
     done = CliRunner().invoke(app, [*words, *more])
     assert done.exit_code == 0, done.output
     until(lambda: len(events) >= 4, f"only {sorted(events)} arrived")
