@@ -73,11 +73,13 @@ class QuietWorld:
     class uwb:  # noqa: N801
         max_range_m = 30.0
 
+    class radio:  # noqa: N801
+        @staticmethod
+        def transmit(_rng):
+            return 0.005
+
     def measure_range(self, _rng, first_m, second_m):
         return math.dist(first_m, second_m)
-
-    def transmit(self, _rng):
-        return 0.005
 
 
 def exact_clocks(seed, node, power_on_us):
