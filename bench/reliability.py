@@ -26,7 +26,7 @@ with `bank`, 4,800 s at once, 160,000 bodies: 0 open | `make soak` |
 | no forged, altered, replayed frame counts | 10,000,033 frames: 0 taken | `make soak` |
 | a kill takes 1 s with `--record`, else 2 s | 269 kills: 1.001, 0.3 s | `soak.py --kills` |
 | parsers fail in their own errors alone | by coverage: node 103,754,564, \
-host 1,089,000: 0 open | `make fuzz` |
+host 27,634,597: 0 open | `make fuzz` |
 | covariances stay positive, numbers finite | 10^6 motions each: bank, smoother, particle filter; \
 node: 10^6 samples: 0 open | `make soak` |
 | tests notice faults in what is trusted | killed: gait 15/15, authentication 28/28, \
@@ -34,7 +34,7 @@ protocol 20/20, link 20/20, timeline 19/19, filter 17/17, \
 bank 20/20, frame 19/19, node 19/19 | `make mutants` |
 | no clock, theft or replay locks out or commands | [security](security.md) | `make test` |
 
-Others (looked up in 2026): PX4
+Others (2026): PX4
 [`mavsdk_test_runner.py`](https://docs.px4.io/main/en/test_and_ci/integration_testing_mavsdk);
 ArduPilot [`run_coverage.py`](https://ardupilot.org/dev/docs/coverage-analysis.html); MAVLink
 [signing](https://mavlink.io/en/guide/message_signing.html), 48-bit tags, one key; Klipper
