@@ -268,8 +268,7 @@ class NativeEngine:
     def run(self, until_us: int) -> None:
         """Make every pass that is due by ``until_us``: some 400 a second."""
         while (time_us := self.next_due_us) <= until_us:
-            since_us = int((time_us - self._bend_us) * self._rate)
-            wait_us = self.poll(time_us, (since_us + self._bend_node_us) & 0xFFFFFFFF)
+            wait_us = self.poll(time_us, self._node_us(time_us))
             if self._reset_asked:
                 self.reset(time_us, ResetCause.COMMAND)
             elif wait_us < LOOP_US:
