@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import scipy
 from chips import GRAVITY, Host, constant, of_signal, words
 
+from relpos.emulator import mpu9150
 from relpos.emulator.ak8975 import Ak8975
 from relpos.emulator.bus import BusStatus
 from relpos.emulator.mpu9150 import Mpu9150
@@ -177,6 +179,17 @@ def test_the_low_pass_delays_about_as_stated(config, stated_ms):
     host = configured(board(of_signal(2.0, force=lambda t: 2.0 * t)), config=config, divider=0)
     value = words(host.at(1_500_000).read(MPU, 0x3B, 2))[0] / 8192 * GRAVITY
     assert (1.5 - value / 2.0) * 1000 == pytest.approx(stated_ms, abs=3.0)
+
+
+@pytest.mark.parametrize("bandwidth_hz", [5.0, 42.0, 188.0])
+def test_the_low_pass_is_scipys_across_the_seam_of_two_blocks(bandwidth_hz):
+    raw = np.random.default_rng(5).standard_normal((1000, 3))
+    expected = scipy.signal.lfilter(*scipy.signal.butter(2, bandwidth_hz, fs=1000.0), raw, axis=0)
+    state, parts = np.zeros((2, 3)), []
+    for part in (raw[:400], raw[400:]):
+        filtered, state = mpu9150._filtered(bandwidth_hz, part, state)
+        parts.append(filtered)
+    np.testing.assert_allclose(np.concatenate(parts), expected, rtol=0.0, atol=1e-12)
 
 
 def test_noise_bias_and_scale_are_those_of_the_drawn_piece():
