@@ -36,11 +36,11 @@ LONG = (
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Three a core: while tests wait for browsers and processes, the cores stay busy.
+    """Two a core: while tests wait for browsers and processes, the cores stay busy.
 
-    Each more costs its imports, its collecting and its kernels: four seconds of processor time.
+    Each more costs its imports, its collecting and its kernels: eight seconds of processor time.
     """
-    return 3 * (os.cpu_count() or 1)
+    return 2 * (os.cpu_count() or 1)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

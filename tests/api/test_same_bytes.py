@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import relpos
+from relpos import fusion
 from relpos.fusion import kernel_cache
 from relpos.recording import save_recording
 
@@ -38,20 +39,27 @@ for source in ("walk", "walk.mcap"):
 
 
 @pytest.mark.parametrize(
-    "estimator",
-    ["bank", pytest.param("particle", marks=pytest.mark.soak)],
+    ("estimator", "missing"),
+    [
+        ("bank", "mixture.*"),
+        pytest.param("bank", "*", marks=pytest.mark.soak),
+        pytest.param("particle", "*", marks=pytest.mark.soak),
+    ],
 )
 def test_command_and_api_give_the_same_bytes_with_and_without_compiled_kernels(
-    tmp_path: Path, estimator: str
+    tmp_path: Path, estimator: str, missing: str
 ) -> None:
+    """``missing``: the kernels that are not in the cache at first."""
     run = relpos.simulate("paper-p1", 11, seconds=20, nodes=3)
     relpos.save(run, tmp_path / "walk")
     save_recording(tmp_path / "walk.mcap", run)
     cache = tmp_path / "cache"
     environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)}
     # Everybody's start is given: the kernels that seek it are not called, and need not be compiled.
-    kept = kernel_cache.folder_here(kernel_cache.FUSION / "initialisation")
-    shutil.copytree(kept, cache / kept.name)
+    for room in {"initialisation", *fusion.ROOMS[estimator]}:
+        kept = kernel_cache.folder_here(kernel_cache.FUSION / room)
+        without = () if room == "initialisation" else (missing, "complete")
+        shutil.copytree(kept, cache / kept.name, ignore=shutil.ignore_patterns(*without))
     for program in (FIRST_CALLS, WITH_A_KEPT_CACHE):
         code = f"ESTIMATOR = {estimator!r}\n{program}"
         subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True)

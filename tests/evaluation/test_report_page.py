@@ -144,7 +144,7 @@ def made(directory: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("report")
     fused = command(
         "fuse", directory, "--estimator", "particle", "--set", "particles=60", "--out",
-        out / "estimate", "--json",
+        out / "estimate", "--no-report", "--json",
     )  # fmt: skip
     assert fused.exit_code == 0, fused.stderr
     outcome = command(

@@ -88,6 +88,7 @@ def test_an_emulated_team_is_seen_walking_lost_found_and_pressing_a_landmark(
     phone.get_by_role("button", name="I am at 17").click()
     latest = time.time()
     expect(phone.locator("#queue")).to_have_text("1 press received by the laptop")
+    phone.close()
     view = page.evaluate("fetch('/api/picture').then((answer) => answer.json())")
     began = view["unix_s"] - view["time_s"]
 

@@ -215,3 +215,21 @@ def test_the_phones_page_works_on_the_smallest_screen_by_keyboard(visit, stage: 
         .filter((e) => e.checkVisibility() && !e.textContent.trim()
             && !e.getAttribute("aria-label") && !(e.labels && e.labels.length)).length""")
     assert nameless == 0
+
+
+def test_a_picture_that_changes_nothing_asks_for_no_frame(visit, stage: Stage):
+    page = visit("/phone", **PHONE)
+    choose(page, "Ben")
+    wait_clock(page)
+    stage.frozen = True
+    session = page.context.new_cdp_session(page)
+    session.send("Performance.enable")
+
+    def styled() -> float:
+        figures = session.send("Performance.getMetrics")["metrics"]
+        return next(f["value"] for f in figures if f["name"] == "RecalcStyleCount")
+
+    page.wait_for_timeout(1000)
+    first, before = max(stage.sent), styled()
+    wait_for(lambda: max(stage.sent) > first + 15)
+    assert styled() - before <= 3

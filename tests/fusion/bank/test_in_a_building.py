@@ -12,8 +12,8 @@ from relpos.tracks import true_tracks
 
 @pytest.fixture(scope="module")
 def score() -> vertical.Vertical:
-    run = simulate_building("building", 43, {"seconds": 600.0})
-    estimator = fusion.make("bank", run.priors, {}, seed=43)
+    run = simulate_building("building", 43, {"seconds": 450.0})
+    estimator = fusion.make("bank", run.priors, {"hypotheses": 50}, seed=43)
     estimates = [e for m in run.measurements for e in estimator.process(m)]
     estimates += estimator.finish()
     score = vertical.score(estimates, true_tracks(run.truth), run.floors_m, run.events)

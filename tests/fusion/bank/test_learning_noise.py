@@ -30,7 +30,7 @@ def test_all_ranges_of_an_instant_together_teach_what_their_noise_is(users: int)
     learned = []
     for seed in range(5):
         core, places = ring(users)
-        first, second = np.array(list(combinations(range(users), 2))).T
+        first, second = np.array(list(combinations(range(users), 2))).T.copy()
         distances = np.linalg.norm(places[first] - places[second], axis=1)
         noise = SIGMA_M * np.random.default_rng(seed).standard_normal(len(first))
         core.update(first, second, distances + noise, np.zeros(len(first)))
@@ -41,7 +41,7 @@ def test_all_ranges_of_an_instant_together_teach_what_their_noise_is(users: int)
 
 def test_ranges_teach_the_same_in_one_instant_as_in_many() -> None:
     users = 10
-    first, second = np.array(list(combinations(range(users), 2))).T
+    first, second = np.array(list(combinations(range(users), 2))).T.copy()
     noise = SIGMA_M * np.random.default_rng(1).standard_normal(len(first))
     together, places = ring(users)
     single, _ = ring(users)

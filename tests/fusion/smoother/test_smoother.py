@@ -278,7 +278,8 @@ def _paper_score(scenario: str, seed: int, seconds: int) -> metrics.Metrics:
     ("scenario", "seconds", "seeds"),
     [
         # One seed of ten ends in another optimum of the likelihood (ratios .92 to 1.8, mean 1.1).
-        ("paper-p1", 150, (31, 33)),
+        ("paper-p1", 150, (33,)),
+        pytest.param("paper-p1", 150, (31, 33), marks=pytest.mark.soak),
         pytest.param("paper-p1", 300, (11, 12), marks=pytest.mark.soak),
         pytest.param("paper", 300, (11, 12), marks=pytest.mark.soak),
     ],

@@ -11,7 +11,7 @@ from climbing import FALL, FAN_ON, Outcome, Part, blown, follow, lift, stairs, s
 from relpos.fusion.estimator import Episode, Vertical
 from relpos.measurements import Range
 
-BESIDE = [walk(200)]
+BESIDE = [walk(110)]
 """Somebody else, who stays on the level."""
 
 
@@ -117,7 +117,7 @@ def test_a_fall_down_stairs_is_followed_and_told_within_three_seconds() -> None:
 
 def test_weather_is_no_climb() -> None:
     outcome = follow(
-        {1: [walk(300), stairs(3.5), walk(600)], 2: [walk(900)], 3: [walk(900)]},
+        {1: [walk(150), stairs(3.5), walk(300)], 2: [walk(450)], 3: [walk(450)]},
         weather_m_s=0.0023,
     )
     assert np.abs(_error_m(outcome)).max() < 0.5
@@ -148,14 +148,14 @@ def test_somebody_who_crawls_stays_on_the_floor() -> None:
 
 
 def test_who_joins_late_is_anywhere() -> None:
-    outcome = follow({1: BESIDE, 2: BESIDE}, begins_s={2: 100.0})
+    outcome = follow({1: [walk(200)], 2: [walk(200)]}, begins_s={2: 100.0})
     assert outcome.told[2][-1].sigma_z_m > 3.0
     assert outcome.told[2][-1].floor_probability < 0.5
     assert outcome.told[1][-1].sigma_z_m < 0.5
 
 
 def test_a_short_range_tells_the_floor_of_who_joined_late() -> None:
-    outcome = follow({1: [walk(30), stairs(3.5), walk(100)], 2: BESIDE}, begins_s={2: 100.0})
+    outcome = follow({1: [walk(30), stairs(3.5), walk(100)], 2: [walk(200)]}, begins_s={2: 100.0})
     vertical = outcome.filter
     vertical.ranged(Range(200.0, 1, 2, 1.2))
     assert vertical.of(2, 200.0).sigma_z_m < 1.0

@@ -1,6 +1,6 @@
 // The top of the page: alarms of people, warnings of the session.
 
-import { make, setAttribute, setText } from "./dom.js";
+import { make, setAttribute, setHidden, setText } from "./dom.js";
 import { said, t } from "./i18n.js";
 import { alarmText, levelWords, seconds } from "./words.js";
 
@@ -57,16 +57,16 @@ export class AlarmBanner {
       setText(row.text, alarmText(alarm));
       setAttribute(row.button, "aria-label", t("acknowledge.name", { name }));
       setAttribute(row.find, "aria-label", t("find.name", { name }));
-      row.find.hidden = alarm.nodes.length > 1;
+      setHidden(row.find, alarm.nodes.length > 1);
     });
-    this.more.hidden = this.rows.size < 2 && !others.length;
+    setHidden(this.more, this.rows.size < 2 && !others.length);
     setAttribute(this.more, "data-level", rows[0]?.level ?? "low");
     setText(this.moreText, others.length
       ? t("alarms.more", { count: hidden.length, names: hidden.join(", ") })
       : t("alarms.open", { count: this.open.length }));
-    this.known.hidden = known.length === 0;
+    setHidden(this.known, known.length === 0);
     setText(this.knownText, known.map(knownText).join(" · "));
-    this.section.hidden = !rows.length && !known.length;
+    setHidden(this.section, !rows.length && !known.length);
   }
 
   make() {

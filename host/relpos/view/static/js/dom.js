@@ -24,6 +24,10 @@ export function setAttribute(element, name, value) {
   }
 }
 
+export function setHidden(element, hidden) {
+  if (element.hidden !== hidden) element.hidden = hidden;
+}
+
 /** An element with attributes ("class", "aria-label", ...; "text"; keys as in i18n.js) and children. */
 export function make(tag, attributes = {}, ...children) {
   const element = document.createElement(tag);

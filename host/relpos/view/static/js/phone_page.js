@@ -9,7 +9,7 @@ import { measureOffset } from "./clock.js";
 import { inkOn, personColour } from "./colours.js";
 import { CompassSharing } from "./compass_sharing.js";
 import { Connection } from "./connection.js";
-import { arrow, byId, make, postJson, setAttribute, setText, storage } from "./dom.js";
+import { arrow, byId, make, postJson, setAttribute, setHidden, setText, storage } from "./dom.js";
 import { FindView } from "./find_view.js";
 import { nameFloors } from "./floors.js";
 import { languageSwitch, number, said, t } from "./i18n.js";
@@ -131,7 +131,7 @@ function showOrders(board) {
       button("roll.well", () => answer("rollcall", { action: "answer", answer: "confirmed" }))));
   }
   section.replaceChildren(...lines);
-  section.hidden = !lines.length;
+  setHidden(section, !lines.length);
   if (lines.length) navigator.vibrate?.([400, 200, 400]);
 }
 
@@ -164,7 +164,7 @@ function showTeam() {
   listMs = performance.now();
   showAge();
   showNotices(byId("notices"), [...(trouble ? [trouble] : []), ...team.notices.map((notice) => ({ ...notice, text: said(notice.said, notice.text) }))]);
-  byId("team-empty").hidden = team.pictures > 0;
+  setHidden(byId("team-empty"), team.pictures > 0);
   showMe();
   const list = team.list()
     .filter((person) => person.node !== me?.node)
@@ -227,7 +227,7 @@ function showMe() {
   const name = (me && team.person(me.node)?.name) ?? me?.name;
   setText(byId("my-name"), me ? name : t("who"));
   const disc = byId("disc");
-  disc.hidden = !me;
+  setHidden(disc, !me);
   if (me) {
     setText(disc, String(me.node));
     disc.style.background = colourOf(me.node);
@@ -448,7 +448,7 @@ async function fetchWearers() {
     return;
   }
   const list = byId("wearers");
-  byId("wearers-empty").hidden = wearers.length > 0;
+  setHidden(byId("wearers-empty"), wearers.length > 0);
   const key = JSON.stringify([wearers, chosen, isDark()]);
   if (list.dataset.shown === key) return;
   list.dataset.shown = key;

@@ -1,7 +1,7 @@
 // The state of the connection and the age of the data: a view never looks newer than it is.
 
 import { LINK_LOST_S } from "./age.js";
-import { setAttribute, setText } from "./dom.js";
+import { setAttribute, setHidden, setText } from "./dom.js";
 import { date, t, timeOfDay } from "./i18n.js";
 import { seconds } from "./words.js";
 
@@ -43,5 +43,5 @@ export function showConnection({ line, words, age, retry }, status) {
   setAttribute(line, "data-state", status.state);
   setText(words, status.words);
   setText(age, status.age);
-  retry.hidden = status.state !== "waiting" && status.state !== "refused";
+  setHidden(retry, status.state !== "waiting" && status.state !== "refused");
 }
