@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from relpos.fusion.bank import mixture as mixture_kernels
 from relpos.fusion.bank.core import BankCore
+from relpos.fusion.bank.hypothesis_models import RangeErrors
 from relpos.fusion.bank.storage import PER_NODE, CommonIndex, StateIndex
 from relpos.fusion.clocks import Clocks
 from relpos.fusion.estimator import (
@@ -33,6 +34,7 @@ from relpos.fusion.estimator import (
 )
 from relpos.fusion.initial_poses import Initialiser, PoseMixture, sought_node
 from relpos.fusion.models.detection import Detection
+from relpos.fusion.models.ranging import RANGE_SCALE_SD
 from relpos.fusion.modes import alternatives_of, belief_of
 
 Floats = npt.NDArray[np.float64]
@@ -206,11 +208,18 @@ class Report:
         first, second = rows[i], rows[k]
         distances, sigmas = self.core.predicted_ranges(first, second, np.zeros(len(first)))
         own_m2 = np.array([self.presence[node].uneven_m2 for node in nodes])
-        sigmas = np.sqrt(sigmas**2 + own_m2[i] + own_m2[k])
+        scale_m = self._range_scale_sd() * distances
+        sigmas = np.sqrt(sigmas**2 + own_m2[i] + own_m2[k] + scale_m**2)
         # Two on one spot, known exactly, are 0 m apart, whatever was added to divide by.
         figures = np.column_stack([np.round(distances, 9), np.round(sigmas, 9), bearings]).tolist()
         every = combinations(nodes, 2)
         return [PairEstimate(*two, *own) for two, own in zip(every, figures, strict=True)]
+
+    def _range_scale_sd(self) -> float:
+        """Return the deviation of what ranges' biases share in proportion to distance."""
+        these = self.core.hypotheses
+        wide = these.models.has(RangeErrors.PASSING) if these.biases else these.models.bias
+        return RANGE_SCALE_SD * float(these.weights() @ wide)
 
     # -- ambiguous nodes -----------------------------------------------------------------------
 
