@@ -58,7 +58,7 @@ def test_command_and_api_give_the_same_bytes_with_and_without_compiled_kernels(
     # Everybody's start is given: the kernels that seek it are not called, and need not be compiled.
     for room in {"initialisation", *fusion.ROOMS[estimator]}:
         kept = kernel_cache.folder_here(kernel_cache.FUSION / room)
-        without = () if room == "initialisation" else (missing, "complete")
+        without = (missing, "complete") if room == estimator else ()
         shutil.copytree(kept, cache / kept.name, ignore=shutil.ignore_patterns(*without))
     for program in (FIRST_CALLS, WITH_A_KEPT_CACHE):
         code = f"ESTIMATOR = {estimator!r}\n{program}"

@@ -367,7 +367,9 @@ def test_wild_ranges_do_not_bend_the_track() -> None:
 def test_a_smoothed_mission_is_better_than_the_online_one_and_says_so(condition: str) -> None:
     run = relpos.simulate(f"mission-{condition}", 650, seconds=70.0, nodes=4)
     scores = [
-        relpos.evaluate(relpos.fuse(run, smooth=smooth), run, bound=False).metrics
+        relpos.evaluate(
+            relpos.fuse(run, smooth=smooth, settings={"hypotheses": 50}), run, bound=False
+        ).metrics
         for smooth in (False, True)
     ]
     online, smoothed = (s.relative_distance_rmse_m for s in scores)
