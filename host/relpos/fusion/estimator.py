@@ -164,7 +164,8 @@ class Parameter:
     Names: ``step_scale`` (true over reported length), ``heading_drift_rad_s``, ``range_bias_m``,
     ``height_difference_m`` (of a pair, where no heights are reported), ``detection_range_m``,
     ``body_shadow_m`` (what a body in between adds to a range), ``range_growth_m`` (by how much
-    ranges grow for each factor e of the distance, about 5 m), ``range_lateness_s`` (by how much
+    ranges grow for each factor e of the distance, about 5 m), ``range_scale`` (1, and by how much
+    ranges may err in proportion to the distance), ``range_lateness_s`` (by how much
     ranges are dated late), ``clock_offset_s`` (how far a node's clock is ahead of most others').
     """
 

@@ -35,7 +35,9 @@ MOST_BANDS = 6
 """Bands of more nodes than this would only cover each other."""
 
 
-TEAM_WIDE = ("detection_range_m", "body_shadow_m", "range_growth_m", "range_lateness_s")
+TEAM_WIDE = (
+    "detection_range_m", "body_shadow_m", "range_growth_m", "range_scale", "range_lateness_s",
+)  # fmt: skip
 """Parameters of the whole team, though they are reported for each node."""
 
 
@@ -45,6 +47,7 @@ _PARAMETER_WORDS: Mapping[str, tuple[str, float]] = {
     "detection_range_m": ("detection range (m)", 1.0),
     "body_shadow_m": ("body shadow (m)", 1.0),
     "range_growth_m": ("growth of ranges (m)", 1.0),
+    "range_scale": ("scale of ranges", 1.0),
     "range_lateness_s": ("ranges dated late (s)", 1.0),
     "clock_offset_s": ("clock ahead (s)", 1.0),
 }

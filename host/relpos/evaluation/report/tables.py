@@ -365,6 +365,7 @@ _UNITS: Mapping[str, tuple[str, str, float, int]] = {
     "detection_range_m": ("detection range", "m", 1.0, 1),
     "body_shadow_m": ("body shadow", "m", 1.0, 2),
     "range_growth_m": ("growth of ranges", "m", 1.0, 2),
+    "range_scale": ("scale of ranges", "", 1.0, 3),
     "range_lateness_s": ("ranges dated late", "s", 1.0, 2),
     "clock_offset_s": ("clock ahead", "s", 1.0, 2),
 }

@@ -189,12 +189,14 @@ class Report:
         offset = {n: float(offsets[self.row[n]]) + clocks.offset_s.get(n, 0.0) for n in nodes}
         # Ranges say how clocks differ, and most are right.
         usual = median(offset.values())
+        scale = 1.0, self._range_scale_sd()
         parameters = []
         for node in nodes:
             own = offset[node] - usual, float(sigmas[self.row[node]])
             parameters += [
                 Parameter(self.time_s, node, None, "body_shadow_m", *shadow),
                 Parameter(self.time_s, node, None, "range_growth_m", *growth),
+                Parameter(self.time_s, node, None, "range_scale", *scale),
                 Parameter(self.time_s, node, None, "range_lateness_s", *late),
                 Parameter(self.time_s, node, None, "clock_offset_s", *own),
             ]

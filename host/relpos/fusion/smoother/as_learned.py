@@ -45,6 +45,14 @@ def as_learned(
     return [_unshadowed(m, tracks, shadow_m) if isinstance(m, Range) else m for m in dated]
 
 
+def range_scale_sd(estimates: Sequence[Estimate]) -> float:
+    """Return the mean deviation of the ranges' scale: what no later range makes surer."""
+    every = [
+        next((p.sigma for p in e.parameters if p.name == "range_scale"), 0.0) for e in estimates
+    ]
+    return sum(every) / max(len(every), 1)
+
+
 def _tracks(estimates: Sequence[Estimate]) -> dict[int, Floats]:
     """Return each node's times (s), x, y (m) and unwrapped headings (rad): (4, T)."""
     rows: dict[int, list[tuple[float, ...]]] = {}
