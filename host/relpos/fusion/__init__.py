@@ -52,10 +52,13 @@ SETTINGS: Mapping[str, type] = {
 """Estimator name -> its settings."""
 
 ROOMS: Mapping[str, tuple[str, ...]] = {
-    "bank": ("bank", "initialisation"),
+    "bank": ("bank", "initialisation", "large_teams", "smoother"),
     "particle": ("particle", "initialisation"),
 }
 """Estimator name -> the rooms whose kernels it calls."""
+
+SELDOM = ("large_teams", "smoother")
+"""Rooms whose kernels are compiled with the others, but loaded where they are called."""
 
 
 def make(
@@ -189,7 +192,8 @@ def warm_up(name: str, progress: Progress | None = None) -> None:
         if process.wait() == 0:
             kernel_cache.mark_complete(room)
     for room in ROOMS.get(name, ()):
-        rehearse(room, _FEW_S)
+        if room not in SELDOM:
+            rehearse(room, _FEW_S)
 
 
 _ALL_S, _FEW_S = 25, 4
@@ -197,8 +201,11 @@ _ALL_S, _FEW_S = 25, 4
 
 
 def rehearse(room: str, seconds: int = _ALL_S) -> None:
-    """Call the kernels of a room, with a made-up team of six that walk at random."""
-    places = {node: cmath.rect(8.0, node) for node in range(1, 7)}
+    """Call the kernels of a room, with a made-up team that walks at random."""
+    from relpos.fusion.switching import LARGE_TEAM
+
+    size = LARGE_TEAM + 1 if room == "large_teams" else 6
+    places = {node: cmath.rect(8.0, node) for node in range(1, size + 1)}
     pairs = list(combinations(places, 2))
     if room == "initialisation":
         from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
@@ -211,8 +218,12 @@ def rehearse(room: str, seconds: int = _ALL_S) -> None:
         )
         initialiser.find(0.0)
         return
-    priors = [Prior(node, place.real, place.imag, 0.0, 0.1, 0.1) for node, place in places.items()]
-    estimator, rng, headings = make(room, priors), random.Random(1), dict.fromkeys(places, 0.0)
+    priors = [Prior(node, place.real, place.imag, 0.0, 1.0, 0.3) for node, place in places.items()]
+    if room == "smoother":
+        estimator = make_smoother("deadreckoning", priors)
+    else:
+        estimator = make("bank" if room == "large_teams" else room, priors)
+    rng, headings = random.Random(1), dict.fromkeys(places, 0.0)
     for k in range(1, seconds):
         for node in places:
             turn = rng.gauss(0.0, 0.5)
@@ -220,7 +231,8 @@ def rehearse(room: str, seconds: int = _ALL_S) -> None:
             headings[node] += turn
             estimator.process(Motion(float(k), node, 1.2, 0.0, turn, gain_version=0))
             estimator.process(Height(float(k), node, 0.0, 0.01))
-            estimator.process(Heading(float(k), node, headings[node], 0.2))
+            if k > seconds // 2:  # Without any before, the team turns as a whole.
+                estimator.process(Heading(float(k), node, headings[node], 0.2))
         for node, peer in pairs:
             distance_m = abs(places[peer] - places[node])
             estimator.process(Range(float(k), node, peer, abs(distance_m + rng.gauss(0.0, 0.1))))
