@@ -40,6 +40,9 @@ TEAM_WIDE = (
 )  # fmt: skip
 """Parameters of the whole team, though they are reported for each node."""
 
+NOT_LEARNED = "range_scale"
+"""It is 1 all the time, and has a deviation alone."""
+
 
 _PARAMETER_WORDS: Mapping[str, tuple[str, float]] = {
     "step_scale": ("step scale\n(true over reported)", 1.0),
@@ -47,7 +50,6 @@ _PARAMETER_WORDS: Mapping[str, tuple[str, float]] = {
     "detection_range_m": ("detection range (m)", 1.0),
     "body_shadow_m": ("body shadow (m)", 1.0),
     "range_growth_m": ("growth of ranges (m)", 1.0),
-    "range_scale": ("scale of ranges", 1.0),
     "range_lateness_s": ("ranges dated late (s)", 1.0),
     "clock_offset_s": ("clock ahead (s)", 1.0),
 }
@@ -57,7 +59,7 @@ def parameters(content: Content) -> Picture | None:
     """Draw the learned parameters over time, range biases apart."""
     rows: dict[str, dict[int, list[tuple[float, float, float]]]] = {}
     for p in content.result.parameters:
-        if p.peer is None:
+        if p.peer is None and p.name != NOT_LEARNED:
             of_name = rows.setdefault(p.name, {})
             of_name.setdefault(p.node, []).append((p.time_s, p.value, p.sigma))
     if not rows:
