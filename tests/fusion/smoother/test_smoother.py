@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -16,7 +17,8 @@ from reference import smoother as reference
 from relpos import fusion, tracks
 from relpos.errors import RelposError
 from relpos.evaluation import bounds, metrics
-from relpos.fusion.estimator import Estimate, NodeStatus
+from relpos.fusion.estimator import Estimate, Estimator, NodeStatus, Parameter
+from relpos.fusion.models.ranging import RANGE_SCALE_SD
 from relpos.fusion.smoother.detection import learn_curve, update_factors
 from relpos.fusion.smoother.estimator import Smoother
 from relpos.fusion.smoother.graph import build_graph
@@ -29,7 +31,7 @@ from relpos.fusion.smoother.variance_components import (
     motion_bases,
     weights_of,
 )
-from relpos.measurements import Height, Motion, Prior, Range
+from relpos.measurements import Height, Measurement, Motion, Prior, Range
 from relpos.simulation.missions import simulate_mission
 from relpos.simulation.paper import SimulatedRun, simulate_paper
 
@@ -250,6 +252,39 @@ def test_step_scales_are_sought_where_there_are_any(scale_error: float) -> None:
         smoother.process(measurement)
     smoother.finish()
     assert smoother.solutions[0].components.to_scale == (scale_error == 0.0)
+
+
+class _WithPassingBiases:
+    """An online estimator to which all ranges have biases that pass."""
+
+    def __init__(self, online: Estimator) -> None:
+        self._online = online
+
+    def process(self, measurement: Measurement) -> list[Estimate]:
+        return [self._told(estimate) for estimate in self._online.process(measurement)]
+
+    def finish(self) -> list[Estimate]:
+        return [self._told(estimate) for estimate in self._online.finish()]
+
+    def counters(self) -> Mapping[str, int]:
+        return self._online.counters()
+
+    @staticmethod
+    def _told(estimate: Estimate) -> Estimate:
+        scale = Parameter(estimate.time_s, 1, None, "range_scale", 1.0, RANGE_SCALE_SD)
+        return replace(estimate, parameters=(*estimate.parameters, scale))
+
+
+def test_nothing_is_left_out_where_the_online_estimator_saw_biases_that_pass() -> None:
+    run = simulate_paper("paper-p1", 8, {"seconds": 120, "nodes": 4, "scale_error": 0.0})
+    smoother = Smoother(
+        _WithPassingBiases(fusion.make("deadreckoning", run.priors)), (), run.priors
+    )
+    for measurement in run.measurements:
+        smoother.process(measurement)
+    estimates = smoother.finish()
+    assert not smoother.solutions[0].components.to_scale
+    assert all(p.sigma_distance_m >= RANGE_SCALE_SD * p.distance_m for p in estimates[-1].pairs)
 
 
 def _smoothed(run: SimulatedRun, online: str = "bank") -> list[Estimate]:

@@ -51,7 +51,8 @@ SIMPLER_BY = 3.0
 make evidence look stronger than it is, and what is left out makes the rest look surer."""
 
 UNBIASED_SHARE = 0.1
-"""Nothing is left out where the online estimator gave more weight than this to biases that pass.
+"""Nothing is left out where the online estimator gave more weight than this, in the mean over the
+run, to biases that lengthen ranges in proportion.
 
 Teams in an office (``bench/recorded_teams.py``, lower back, seeds 1 and 4; phones, seed 0) have
 0.39, 0.40 and 1.14 m, NEES 1.2, 1.3 and 1.8; 0.41, 0.67 and 1.30 m, NEES 1.5, 4.5 and 3.1 where
@@ -105,12 +106,13 @@ class Smoother:
             ]
         self.solutions.sort(key=lambda s: s.cost)
         best = without_lasting_errors(problem, self.solutions[0])
-        if range_scale_sd(self._estimates) < UNBIASED_SHARE * RANGE_SCALE_SD:
+        scale_sd = range_scale_sd(self._estimates)
+        if scale_sd < UNBIASED_SHARE * RANGE_SCALE_SD:
             best = _without_needless_constants(problem, best)
         self.solutions.insert(0, best)
         self._own["smoother_attempts"] += len(self.solutions) - 1
         self._own["smoother_outliers"] += int(np.sum(best.inliers.ranges < 0.5))
-        return list(_estimates(problem, best, self._estimates))
+        return list(_estimates(problem, best, self._estimates, scale_sd))
 
     def counters(self) -> Mapping[str, int]:
         """Count what the online estimator counts, and the smoother's own."""
@@ -197,7 +199,7 @@ def _carried(pose: Floats, reckoned_there: Floats, reckoned_here: Floats) -> Flo
 
 
 def _estimates(
-    problem: Problem, solution: Solution, online: Sequence[Estimate]
+    problem: Problem, solution: Solution, online: Sequence[Estimate], scale_sd: float
 ) -> Iterable[Estimate]:
     """Turn a solution into the rows of the run format, one epoch after another."""
     graph, poses = problem.graph, solution.state.poses
@@ -215,7 +217,6 @@ def _estimates(
         n.node for n in (online[-1].nodes if online else ()) if n.status is NodeStatus.AMBIGUOUS
     }
     ranged = np.isin(np.arange(nodes), graph.pairs) | (graph.prior_weight[:, 0] > 1e-3)
-    scale_sd = range_scale_sd(online)
     for k in range(1, knots):
         time_s = float(graph.time_s[k])
         silent = (silent + 1) * ~news[k - 1]
