@@ -2,7 +2,7 @@
 
 import { isFresh, reachM } from "./age.js";
 import { degrees } from "./angles.js";
-import { arrow, make, setAttribute, setText } from "./dom.js";
+import { arrow, make, setAttribute, setHidden, setText } from "./dom.js";
 import { Announcer, guidance, isThere, spoken, Trend } from "./finding.js";
 import { apartWords, floorsApart } from "./floors.js";
 import { current, number, t } from "./i18n.js";
@@ -102,7 +102,7 @@ export class FindView {
     // Right above each other nobody is within reach.
     if (floor && relation && isThere(relation)) guide = { key: floor, words: floor, arrowRad: null };
     setText(this.floor, guide.words === floor ? "" : floor);
-    this.floor.hidden = this.floor.textContent === "";
+    setHidden(this.floor, this.floor.textContent === "");
     this.previous = guide.key;
     this.arrow.point(guide.arrowRad);
     setText(this.distance, relation ? distance(relation.distanceM, relation.sigmaM) : "?");
@@ -111,14 +111,14 @@ export class FindView {
     if (last || !fresh) this.trend = new Trend();
     else if (relation && team.timeS !== null) this.trend.add(team.timeS, relation.distanceM);
     const trend = this.trend.direction;
-    this.trendLine.hidden = last || !fresh;
+    setHidden(this.trendLine, last || !fresh);
     setAttribute(this.trendLine, "data-trend", trend ?? "none");
     setText(this.trendSign, TREND_SIGNS[trend] ?? "");
     setText(this.trendWords, t(`find.${trend ?? "walk"}`));
     setText(this.sure, accuracyWords(seeker, target, relation));
     const caution = cautions(team, seeker, target, connected);
     setText(this.caution, caution);
-    this.caution.hidden = caution === "";
+    setHidden(this.caution, caution === "");
     const key = `${guide.key} ${floor} ${caution.replace(/\d+/g, "")}`;
     if (this.announcer.due(Date.now(), { key, distanceM: relation?.distanceM ?? 0, trend })) {
       this.say(`${spoken(last ? t("find.last.spoken", { name: targetName }) : targetName, relation, guide, trend)} ${this.floor.textContent} ${caution}`.trim());
