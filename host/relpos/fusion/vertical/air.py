@@ -78,7 +78,7 @@ def common_rise(blown: Innovations, modes: Floats) -> float:
 def _by_rise(blown: Innovations, modes: Floats) -> tuple[Floats, Floats]:
     """Return common rises (R,) and how probable each node finds them (N, R): logarithms."""
     rises_m = RISES * FAN_M_S * blown.duration_s
-    off_m = np.nan_to_num(blown.mean_m)[:, :, None] - FOLLOWS[:, None] * rises_m
+    news = np.isfinite(blown.mean_m)
+    off_m = np.where(news, blown.mean_m, 0.0)[:, :, None] - FOLLOWS[:, None] * rises_m
     density = (modes[:, :, None] * normal_density(off_m, blown.variance_m2[:, :, None])).sum(axis=1)
-    news = np.isfinite(blown.mean_m[:, :1])
-    return rises_m, np.log(np.where(news, np.maximum(density, 1e-200), 1.0))
+    return rises_m, np.log(np.where(news[:, :1], np.maximum(density, 1e-200), 1.0))
