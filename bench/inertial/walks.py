@@ -239,7 +239,7 @@ def chip_biases_rad_s(root: Path) -> Array:
     if not folder.is_dir():
         return np.zeros((1, 3))
     with gzip.open(folder / "imu.csv.gz", "rt") as stream:
-        columns = np.genfromtxt(stream, delimiter=",", skip_header=1, usecols=(1, 5, 6, 7))
+        columns = np.loadtxt(stream, delimiter=",", skiprows=1, usecols=(1, 5, 6, 7))
     nodes = np.unique(columns[:, 0])
     return np.array([np.median(columns[columns[:, 0] == n, 1:], axis=0) for n in nodes])
 
