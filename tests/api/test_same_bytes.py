@@ -41,7 +41,7 @@ for source in ("walk", "walk.mcap"):
 @pytest.mark.parametrize(
     ("estimator", "missing"),
     [
-        ("bank", "mixture.*"),
+        ("bank", "variance_components.*"),
         pytest.param("bank", "*", marks=pytest.mark.soak),
         pytest.param("particle", "*", marks=pytest.mark.soak),
     ],

@@ -1,6 +1,7 @@
 """`relpos doctor`: what it says of a computer and a port that are not as they should be."""
 
 import json
+import time
 from datetime import UTC, datetime
 from functools import partial
 
@@ -251,6 +252,8 @@ class Wire:
         return len(self.waiting)
 
     def read(self, size):
+        if not self.waiting:
+            time.sleep(0.005)  # a port waits for its bytes
         data = bytes(self.waiting[:size])
         del self.waiting[:size]
         return data

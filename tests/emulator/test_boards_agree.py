@@ -190,7 +190,7 @@ def digits(frame):
 )
 def test_native_and_avr_agree_in_every_message_within_its_last_digit(board):
     _firmware_is_built()
-    bus, passed, received, theirs = written_down(board, 45.0)
+    bus, passed, received, theirs = written_down(board, 30.0)
     ours = played(bus, passed, received)
     assert [(f.message.name, f.boot, f.counter) for f in ours] == [
         (f.message.name, f.boot, f.counter) for f in theirs

@@ -82,17 +82,23 @@ def _health(service: Service) -> wire.Health:
     return wire.Health(statuses[-1]["health"])
 
 
-def _built(name: str, **environment: str) -> None:
-    command = [ROOT / "tools" / "pio", "run", "-e", name]
+def _built(*names: str, **environment: str) -> None:
+    command = [ROOT / "tools" / "pio", "run", *(word for name in names for word in ("-e", name))]
     done = subprocess.run(
         command, env={**os.environ, **environment}, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
 
 
+@pytest.fixture(scope="module")
+def built() -> None:
+    """The firmware for both sensors, as the sources now are."""
+    _built("uno", "uno_mpu9250")
+
+
 @needs_avr
+@pytest.mark.usefixtures("built")
 def test_firmware_built_for_it_walks_ranges_and_stays_in_its_budget() -> None:
-    _built("uno_mpu9250")
     elf = find_firmware("uno-mpu9250", default_build_folder())
     assert read_firmware(elf).flash_bytes <= BUDGETS["uno"].flash_bytes
     service, faults = _served(elf, successor=True, seconds=24.0)
@@ -105,8 +111,8 @@ def test_firmware_built_for_it_walks_ranges_and_stays_in_its_budget() -> None:
 
 
 @needs_avr
+@pytest.mark.usefixtures("built")
 def test_firmware_built_for_the_mpu_9150_reports_the_successor_as_missing() -> None:
-    _built("uno")
     service, _ = _served(find_firmware("uno", default_build_folder()), successor=True)
     assert wire.Health.IMU not in _health(service)
 

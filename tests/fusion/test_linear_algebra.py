@@ -56,7 +56,7 @@ def test_blas_has_one_thread_until_the_last_context_ends_and_as_many_as_before_b
 
 @pytest.mark.parametrize("smooth", [False, True])
 def test_an_estimate_is_the_same_with_one_thread_and_with_two(smooth: bool) -> None:
-    run = relpos.simulate("paper-p1", 3, seconds=20)
+    run = relpos.simulate("paper-p1", 3, seconds=12)
     estimates = []
     for limit in (1, 2):
         with threadpool_limits(limits=limit, user_api="blas"):

@@ -80,7 +80,7 @@ def motion_rows(folder, rows):
 
 
 def gzip_bomb(folder):
-    with gzip.open(folder / "motion.csv.gz", "wb") as file:
+    with gzip.open(folder / "motion.csv.gz", "wb", compresslevel=1) as file:
         for _ in range(600):
             file.write(b"\n" * (1 << 20))
     return folder

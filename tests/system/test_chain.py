@@ -65,18 +65,21 @@ def team_bytes():
 
 
 @pytest.mark.parametrize(
-    ("nodes", "seed"),
-    [(4, 101), *(pytest.param(6, seed, marks=pytest.mark.soak) for seed in (101, 102))],
+    ("nodes", "seconds", "seed"),
+    [
+        (4, 80.0, 101),
+        *(pytest.param(6, 120.0, seed, marks=pytest.mark.soak) for seed in (101, 102)),
+    ],
 )
-def test_the_fusion_beats_dead_reckoning_in_every_demo(nodes, seed):
-    config = TeamConfig(board="native", nodes=nodes, seconds=120.0, scenario="paper", seed=seed)
+def test_the_fusion_beats_dead_reckoning_in_every_demo(nodes, seconds, seed):
+    config = TeamConfig(board="native", nodes=nodes, seconds=seconds, scenario="paper", seed=seed)
     run = record_team(config)
     plain, fused = (
         relpos.evaluate(relpos.fuse(run, name, seed=seed), run, bound=False)
         for name in ("deadreckoning", "bank")
     )
     plain_m, fused_m = (s.metrics.relative_distance_rmse_m for s in (plain, fused))
-    assert 1.0 < plain_m < 8.0, "torso dead reckoning of two minutes"
+    assert 1.0 < plain_m < 8.0, "torso dead reckoning of one to two minutes"
     # Seeds 0 to 4 gave factors of 4 to 24, their mean 11.5; below three the bank fails its purpose.
     assert plain_m / fused_m > 3.0
     assert plain_m / fused_m < 25.0, "more would be suspicious"
@@ -301,8 +304,8 @@ def test_a_foreign_protocol_version_is_named_to_the_user(tmp_path, team_bytes, p
 
 
 def test_an_emulated_team_is_fused_live_by_another_process(tmp_path):
-    for seconds in (4, 12, 36):  # a busy machine does not keep up with 20 times real time
-        emulator = start("emulate", "--nodes", 3, "--speed", 20, "--seconds", 300, "--seed", 4)
+    for seconds in (4, 12, 36):  # a busy machine does not keep up with 12 times real time
+        emulator = start("emulate", "--nodes", 3, "--speed", 12, "--seconds", 300, "--seed", 4)
         try:
             path = emulator.stdout.readline().strip()
             figures = figures_of(
@@ -320,7 +323,7 @@ def test_an_emulated_team_is_fused_live_by_another_process(tmp_path):
     assert figures["counters"]["bad_checksums"] == 0
     received = load_run(tmp_path / str(seconds) / "received")
     assert "without a team key" in received.description.source
-    assert 15.0 < received.measurements[-1].time_s < 20.0 * (seconds + 1)
+    assert 15.0 < received.measurements[-1].time_s < 12.0 * (seconds + 1)
     assert {m.node for m in received.motions} == {1, 2, 3}
     with EmulatedTeam(TeamConfig("paper", 3, 300.0, 4, beacons=True)) as team:
         until_us = 1_000_000 * round(received.measurements[-1].time_s + 10.0)
@@ -345,9 +348,9 @@ def assert_evaluate_agrees(run, out, fused):
 
 def test_a_simulated_run_is_scored_alike_by_fuse_and_by_evaluate(tmp_path):
     run, out = tmp_path / "run", tmp_path / "out"
-    simulated = start("simulate", "--scenario", "paper", "--seed", 3, "--out", run)
-    _, stderr = simulated.communicate(timeout=PATIENCE_S)
-    assert simulated.returncode == 0, stderr
+    words = ["simulate", "--scenario", "paper", "--seed", "3", "--set", "seconds=200"]
+    simulated = CliRunner().invoke(main.app, [*words, "--out", str(run)], catch_exceptions=False)
+    assert simulated.exit_code == 0, simulated.stderr
     fused = figures_of("fuse", run, "--estimator", "particle", "--out", out)
     plain_m = fused["dead_reckoning"]["relative_distance_rmse_m"]
     assert fused["relative_distance_rmse_m"] < plain_m

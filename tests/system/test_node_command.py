@@ -42,7 +42,7 @@ def emulated(nodes, board="native", speed=4, seed=3, key=None):
 
 @pytest.fixture(scope="module")
 def port():
-    with emulated(3, speed=10) as path:
+    with emulated(2) as path:
         yield path
 
 

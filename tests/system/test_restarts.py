@@ -96,7 +96,8 @@ CLEARING = (("uno", "Optiboot 4.4"), ("mega", "current"))
 
 @pytest.fixture(scope="module", autouse=True)
 def _built():
-    environments = [word for name in ENVIRONMENTS.values() for word in ("-e", name)]
+    kinds = sorted({kind for kind, _ in LOADERS})
+    environments = [word for kind in kinds for word in ("-e", ENVIRONMENTS[kind])]
     done = subprocess.run(
         [ROOT / "tools" / "pio", "run", *environments], cwd=ROOT, capture_output=True, check=False
     )

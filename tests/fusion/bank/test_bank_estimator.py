@@ -55,7 +55,8 @@ def test_the_bank_is_near_the_bound_without_knowing_the_noise(
     ],
 )
 def test_the_bank_adapts_to_unknown_settings(overrides: dict[str, float], limit_m: float) -> None:
-    assert _run("paper-p1", 0, overrides).relative_distance_rmse_m < limit_m
+    figures = _run("paper-p1", 0, {**overrides, "seconds": 300.0})
+    assert figures.relative_distance_rmse_m < limit_m
 
 
 @pytest.mark.soak  # In 200 s: test_people_are_not_lost_to_low_heading_noise.
@@ -63,11 +64,6 @@ def test_white_heading_noise_and_a_short_reach_leave_the_team_in_shape() -> None
     figures = _run("paper-h", 1)
     assert figures.relative_distance_rmse_m < 1.27
     assert figures.nees_distance < 2.5
-
-
-def test_the_same_seed_gives_the_same_estimates() -> None:
-    first, second = (_run("paper", 3, {"seconds": 60.0}) for _ in range(2))
-    assert first.relative_distance_rmse_m == second.relative_distance_rmse_m
 
 
 def test_a_run_without_motion_is_refused() -> None:

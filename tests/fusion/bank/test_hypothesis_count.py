@@ -67,7 +67,7 @@ def test_the_dice_of_shrinking_and_growing_are_those_of_the_seed() -> None:
 
 
 def test_a_team_whose_headings_are_poor_keeps_all_of_them() -> None:
-    _, counts, bank, _ = _run("paper-h", {"seconds": 200.0})
+    _, counts, bank, _ = _run("paper-h", {"seconds": 120.0})
     assert min(counts) == BankSettings().hypotheses
     assert bank.counters().get("hypotheses_shrunk", 0) == 0
 

@@ -14,7 +14,7 @@ from relpos.measurements import Motion, Range
 
 @pytest.mark.parametrize("gap_s", [pytest.param(2, marks=pytest.mark.soak), 5])
 def test_ranges_show_where_a_node_is_while_its_motion_is_missing(gap_s: int) -> None:
-    run = relpos.simulate("mission-base", 41, seconds=180, gap_s=gap_s)
+    run = relpos.simulate("mission-base", 41, seconds=120, gap_s=gap_s)
     score = relpos.evaluate(relpos.fuse(run), run, bound=False)
     assert score.metrics.relative_distance_rmse_m < 0.35
     assert 0.5 < score.metrics.nees_distance < 1.4

@@ -183,28 +183,26 @@ def test_the_noise_of_each_nodes_steps_is_learned(crowd: Crowd) -> None:
 
 
 def test_a_large_team_without_priors_is_located() -> None:
-    crowd = simulate_crowd(CrowdSettings(nodes=60, seconds=90), 6)
+    crowd = simulate_crowd(CrowdSettings(nodes=40, seconds=90), 6)
     estimates, made = estimates_of([], crowd.measurements())
-    assert len(estimates[9].nodes) == 60  # who is not found yet is listed as such
+    assert len(estimates[9].nodes) == 40  # who is not found yet is listed as such
     last = estimates[-1]
     located = [n for n in last.nodes if n.status is NodeStatus.OK]
-    assert len(located) >= 55
+    assert len(located) >= 37
     found = np.array([(n.x_m, n.y_m) for n in located])
     truth = crowd.poses[-1][[n.node - 1 for n in located], :2]
     assert np.sqrt(metrics.aligned_squared_distances(found, truth).mean()) < 0.5
-    assert made.counters()["joined"] >= 49
+    assert made.counters()["joined"] >= 31
 
 
 def test_a_node_of_a_large_team_whose_motion_is_missing_is_found_by_its_ranges() -> None:
-    run = relpos.simulate(
-        "mission-thirty-one", 5, seconds=60, range_rate_hz=0.15, drift_deg_min=0, step_scale=1
-    )
-    gap = [m for m in run.measurements if isinstance(m, Motion) and m.node == 3 and m.time_s > 40]
+    run = relpos.simulate("mission-base", 5, nodes=LARGE_TEAM + 4, seconds=50, range_rate_hz=0.15)
+    gap = [m for m in run.measurements if isinstance(m, Motion) and m.node == 3 and m.time_s > 33]
     kept = [m for m in run.measurements if m not in gap]
     result = relpos.fuse(run, measurements=kept)
     assert result.counters["diffusions"] > 0
     score = relpos.evaluate(result, run, bound=False).metrics
-    late = score.time_s > 45
+    late = score.time_s > 38
     own = [k for k, pair in enumerate(score.pair_ids) if 3 in pair]
     error_m = (score.pair_distance_m - score.pair_true_distance_m)[late][:, own]
     assert np.nanmean(np.abs(error_m)) < 0.6

@@ -176,7 +176,7 @@ def test_learning_after_a_copy_does_not_change_the_copy() -> None:
 
 
 def test_the_bank_reports_the_detection_range() -> None:
-    run = simulate_paper("paper-h2", 2, {"seconds": 200.0})
+    run = simulate_paper("paper-h2", 2, {"seconds": 100.0})
     bank = fusion.make("bank", run.priors, {}, 1)
     estimates = [e for m in run.measurements for e in bank.process(m)] + bank.finish()
     found = [p for p in estimates[-1].parameters if p.name == "detection_range_m"]

@@ -61,7 +61,7 @@ def test_a_node_that_fits_none_of_ten_is_named_after_a_few_instants_though_all_s
 @pytest.mark.parametrize("seed", [40003, pytest.param(61001, marks=pytest.mark.soak)])
 def test_one_carried_out_of_a_crowd_is_not_believed_at_its_mirror_image(seed: int) -> None:
     # Of twenty most stand on one spot, so that ranges leave two places.
-    settings = {"nodes": 20, "seconds": 60, "kidnap_m": 5, "kidnap_s": 15}
+    settings = {"nodes": 20, "seconds": 35, "kidnap_m": 5, "kidnap_s": 15}
     run = simulate_paper("paper-p1", seed, settings)
     bank = fusion.make("bank", run.priors, seed=seed + ESTIMATOR_SEED)
     estimates = [e for m in run.measurements for e in bank.process(m)] + bank.finish()

@@ -244,7 +244,7 @@ def test_the_silence_of_somebody_a_storey_higher_says_nothing_of_the_plane() -> 
 
 @pytest.mark.parametrize("scale_error", [0.0, 0.1])
 def test_step_scales_are_sought_where_there_are_any(scale_error: float) -> None:
-    options = {"seconds": 120, "nodes": 4, "scale_error": scale_error}
+    options = {"seconds": 80, "nodes": 4, "scale_error": scale_error}
     run = simulate_paper("paper-p1", 8, options)
     smoother = fusion.make_smoother("deadreckoning", run.priors)
     assert isinstance(smoother, Smoother)
@@ -276,7 +276,7 @@ class _WithPassingBiases:
 
 
 def test_nothing_is_left_out_where_the_online_estimator_saw_biases_that_pass() -> None:
-    run = simulate_paper("paper-p1", 8, {"seconds": 120, "nodes": 4, "scale_error": 0.0})
+    run = simulate_paper("paper-p1", 8, {"seconds": 80, "nodes": 4, "scale_error": 0.0})
     smoother = Smoother(
         _WithPassingBiases(fusion.make("deadreckoning", run.priors)), (), run.priors
     )
@@ -438,7 +438,7 @@ def test_inlier_probabilities_are_those_of_all_sequences_of_states() -> None:
 @pytest.mark.parametrize("seed", [810, pytest.param(814, marks=pytest.mark.soak)])
 def test_ranges_without_sight_do_not_bend_a_track(seed: int) -> None:
     """A third of them is 0.5 to 3 m too long, for 20 s at a time; the bank has 0.3 m."""
-    run = simulate_mission("mission-nlos", seed, {"seconds": 100, "nodes": 5})
+    run = simulate_mission("mission-nlos", seed, {"seconds": 70, "nodes": 5})
     made = Smoother(fusion.make("bank", run.priors, {"hypotheses": 50}, 1), (), run.priors)
     estimates = [e for m in run.measurements for e in made.process(m)] + made.finish()
     found = metrics.evaluate(
