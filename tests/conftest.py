@@ -1,5 +1,7 @@
 """The order of the files: the longest first, so that no worker is left alone at the end.
 
+Files whose tests wait for a browser take turns with those that compute: both keep the cores busy.
+
 Examples of Hypothesis have no time limit: they would fail where the machine is busy.
 """
 
@@ -47,7 +49,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     cache = _cache_of(config)
     durations = cache.get(DURATIONS, {}) if cache is not None else {}
     # Tests of a file stay together and share its fixtures (--dist loadfile); a new one may be long.
-    items.sort(key=lambda item: -durations.get(_file_of(item.nodeid), _guess_s(item.nodeid)))
+    files = {_file_of(item.nodeid): _guess_s(item.nodeid) for item in items} | durations
+    longest_first = sorted(files, key=lambda file: -files[file])
+    place: dict[str, int] = {}
+    for waits in (True, False):
+        alike = [file for file in longest_first if file.startswith("tests/view/") is waits]
+        place |= {file: turn for turn, file in enumerate(alike)}
+    items.sort(key=lambda item: place[_file_of(item.nodeid)])
 
 
 def pytest_collection_finish() -> None:

@@ -24,7 +24,7 @@ def session(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
         Path(sys.executable).with_name("relpos"), "demo", "--view", "--no-open", "--nodes", "3",
         "--view-listen", "127.0.0.1:0", "--seconds", "300", "--out", tmp_path / "out",
         # Lost for so long that a busy machine sees it.
-        "--fault", "xbee:off:node=3,from=15,to=35",
+        "--fault", "xbee:off:node=3,from=8,to=28",
     ]  # fmt: skip
     running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
