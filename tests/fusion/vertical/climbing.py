@@ -86,9 +86,13 @@ def follow(
     weather_m_s: float = 0.0,
     begins_s: Mapping[int, float] | None = None,
     silent: Mapping[int, tuple[float, float]] | None = None,
+    stuck_s: Mapping[int, float] | None = None,
     with_steps: bool = True,
 ) -> Outcome:
-    """Let a team live; the shorter lives end standing."""
+    """Let a team live; the shorter lives end standing. Heights come to the centimetre.
+
+    From ``stuck_s`` on a node repeats its last height.
+    """
     rng = np.random.default_rng(seed)
     vertical = VerticalFilter()
     seconds = max(sum(part.seconds for part in life) for life in lives.values())
@@ -97,7 +101,7 @@ def follow(
     }
     told: dict[int, list[Vertical]] = {node: [] for node in lives}
     z = {node: np.zeros(seconds) for node in lives}
-    bias, now, pressure = (dict.fromkeys(lives, 0.0) for _ in range(3))
+    bias, now, pressure, shown = (dict.fromkeys(lives, 0.0) for _ in range(4))
     claimed, true = dict.fromkeys(lives, 0j), dict.fromkeys(lives, 0.0)
     for k in range(seconds):
         time_s = float(k + 1)
@@ -121,7 +125,9 @@ def follow(
                 h = now[node] - late_m + pressure[node] + bias[node] + noise + weather_m_s * time_s
                 if start_s:
                     h -= z[node][int(start_s)] + weather_m_s * start_s
-                vertical.measure(Height(time_s, node, h), time_s)
+                if time_s < (stuck_s or {}).get(node, math.inf):
+                    shown[node] = round(h, 2)
+                vertical.measure(Height(time_s, node, shown[node]), time_s)
         for back in vertical.close(time_s):
             claimed[back.node] += complex(back.dx_m, back.dy_m)
         for node in lives:

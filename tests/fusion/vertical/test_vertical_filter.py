@@ -173,6 +173,20 @@ def test_the_variance_and_the_floor_say_that_a_sensor_died() -> None:
     assert sure[2] < 0.5
 
 
+def test_a_height_that_never_changes_while_its_wearer_walks_is_no_height() -> None:
+    lives = {1: [walk(60), stairs(3.5), walk(200)], 2: [walk(60), stairs(3.5), walk(200)]}
+    stuck = follow(lives, stuck_s={2: 50.0}).told[2]
+    dead = follow(lives, silent={2: (50.0, 1e9)}).told[2]
+    assert stuck[45].sigma_z_m < 0.3
+    for at_s in (70, 100, 250):
+        assert stuck[at_s].sigma_z_m > 0.9 * dead[at_s].sigma_z_m
+        assert (stuck[at_s].floor_probability or 0.0) < (dead[at_s].floor_probability or 0.0) + 0.02
+    assert stuck[250].sigma_z_m > 2.0
+    # Who stands still may well have one height.
+    stands = follow({1: [walk(300)], 2: [walk(60), stand(240)]}, stuck_s={2: 60.0}).told[2]
+    assert stands[-1].sigma_z_m < 0.5
+
+
 @pytest.mark.filterwarnings("error")
 def test_nobody_reporting_for_a_while_is_no_error() -> None:
     gap = (20.0, 40.0)

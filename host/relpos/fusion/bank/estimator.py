@@ -507,7 +507,7 @@ class Bank:
     def _sense(self, step: Sensed) -> None:
         measured = step.measurement
         if isinstance(measured, Height):
-            self.vertical.measure(measured, step.time_s)
+            self._counters["heights_stuck"] += not self.vertical.measure(measured, step.time_s)
             self.core.hypotheses.know_heights()
         elif isinstance(measured, Heading) and measured.node in self._row:
             self._advance()

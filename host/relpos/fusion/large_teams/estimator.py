@@ -200,7 +200,7 @@ class LargeTeam:
                 self._use_ranges(step, timeline)
             case Sensed(measurement=Height() as height):
                 self._presence(height.node)
-                self.vertical.measure(height, step.time_s)
+                self._own["heights_stuck"] += not self.vertical.measure(height, step.time_s)
             case Sensed():
                 self._presence(step.measurement.node)
                 self._own["headings_unused"] += 1

@@ -198,18 +198,20 @@ class VerticalFilter:
         """Add a piece of motion; return it without what stairs probably add to it."""
         return self._track(step.node).move(step) if self.active else step
 
-    def measure(self, measured: Height, time_s: float) -> None:
-        """Add a reported height, at its time in the order of steps."""
+    def measure(self, measured: Height, time_s: float) -> bool:
+        """Add a reported height, at its time in the order of steps; False from a stuck sensor."""
         node = measured.node
         if not self.active:
             self._first_s = self._closed_s = time_s
         if node in self.posts:
-            return
+            return True
         track = self._track(node)
-        track.height_m, track.height_s = measured.height_m, time_s
-        track.sigma_m = measured.sigma_m or track.sigma_m
-        if node not in self._row:
+        unseen_s = track.report(measured.height_m, time_s, measured.sigma_m)
+        if unseen_s > 0.0:
+            self.heights.doubt(self._row[node], UNSEEN_M * math.sqrt(unseen_s))
+        elif node not in self._row:
             self._add(node, track, late=time_s > self._first_s + LATE_S)
+        return track.height_s == time_s
 
     def _track(self, node: int) -> Track:
         track = self._tracks.get(node)
