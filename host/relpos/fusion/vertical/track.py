@@ -14,9 +14,10 @@ STEP_M = 0.56
 """A step on stairs as dead reckoning claims it; where steps are not reported, way is taken so."""
 
 STUCK_REPORTS, STUCK_STEPS = 8, 12
-"""A sensor that shows one height to the digit in so many reports, over so many steps, is stuck: of
-the emulated chips' heights 4 % are the ones before, and never more than three in a row are alike
-(four teams, 300 s). ``building-stuck``, seeds 920 to 923: NEES 1.3, 34 before."""
+"""A sensor that shows one height to the digit in so many reports, over so many steps, is stuck if
+most of its heights had changed before (exact heights of a plan never do): of the emulated chips'
+heights 4 % are the ones before, and never more than three in a row are alike (four teams, 300 s).
+``building-stuck``, seeds 920 to 923: NEES 1.3, 34 before."""
 
 HEIGHT_LATE_S = 0.4
 """A reported height is that of so long before (``firmware/lib/node/barometer.cpp``)."""
@@ -61,6 +62,9 @@ class Track:
     _same_since_s: float = -math.inf
     _same_steps: float = 0.0
     """Reports in a row of one height, when the first came, and the steps until then."""
+    _reports: int = 0
+    _changes: int = 0
+    """Reports in all, and how many showed another height than the one before."""
     _reached: Moved = NOT_MOVED
     _taken: Moved = NOT_MOVED
     _points: deque[tuple[float, Moved]] = field(default_factory=deque)
@@ -70,9 +74,12 @@ class Track:
         """Add a height; return for how long there was none, where the sensor proves stuck (s)."""
         if height_m != self.height_m:
             self._same, self._same_since_s, self._same_steps = 0, time_s, self._reached.steps
+            self._changes += 1
         self._same += 1
+        self._reports += 1
         walked = self._reached.steps - self._same_steps >= STUCK_STEPS
-        if walked and self._same >= STUCK_REPORTS:
+        varied = self._changes > max(0.5 * (self._reports - self._same), STUCK_REPORTS)
+        if walked and varied and self._same >= STUCK_REPORTS:
             unseen_s, self.height_s = self.height_s - self._same_since_s, self._same_since_s
             return unseen_s
         self.height_m, self.height_s = height_m, time_s
