@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 
+import relpos
 from relpos import fusion
 from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.measurements import Measurement, Motion, Prior, Range
@@ -92,3 +93,18 @@ def test_a_mirrored_team_is_never_ok_for_more_than_five_seconds(start: str, seed
     ]
     assert (STRAIGHT_S - 1 in wrong) == (start == "mirrored")
     assert longest_s([second for second in wrong if second > since_s]) <= 5
+
+
+def test_noise_alone_does_not_choose_between_a_team_and_its_mirror_image() -> None:
+    # From one spot: first turns are made where nobody has gone anywhere, and the ways are straight.
+    conditions = {"nodes": 5, "start_m": 0.5, "start_deg": 10, "pause_s": 30, "max_range_m": 60}
+    noise = {"heading_noise_deg": 4.0, "turn_noise": 0.15, "range_rate_hz": 3.0}
+    run = relpos.simulate("mission-base", 1, seconds=40, sigma_range_m=0.3, **conditions, **noise)
+    result = relpos.fuse(run, initial="unknown")
+    score = relpos.evaluate(result, run, bound=False).metrics
+    known_s = [
+        round(e.time_s) for e in result.estimates if all(n.status is NodeStatus.OK for n in e.nodes)
+    ]
+    assert known_s
+    at = np.isin(score.time_s.round(), known_s)
+    assert score.position_rmse_over_time_m[at].max() < 1.5

@@ -225,6 +225,20 @@ class MeasurementLog:
         far = [math.hypot(x, y) for x, y, _, _ in track.samples]
         return max([*far, float(np.hypot(*track.pose[:2]))])
 
+    def has_heading(self, node: int) -> bool:
+        """Whether the node's heading was known when it was added."""
+        return bool(self._priors[node].precision[2] > 0.0)
+
+    def bend_m(self, node: int) -> float:
+        """Return how far the node's way has been from a straight one: half of its width."""
+        track = self._tracks[node]
+        x, y = np.array([*(sample[:2] for sample in track.samples), track.pose[:2]]).T
+        far = int(np.argmax(x * x + y * y))
+        distance_m = math.hypot(x[far], y[far])
+        if distance_m == 0.0:
+            return 0.0
+        return 0.5 * float(np.ptp(x[far] * y - y[far] * x)) / distance_m
+
     # -- ranges --------------------------------------------------------------------------------
 
     def update(
