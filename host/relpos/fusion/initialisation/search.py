@@ -55,8 +55,8 @@ BENT_M = 0.7
 Until somebody has gone such a way, noise alone chooses between left and right, and may have 99 % of
 the weight on the wrong one. Of 77 teams drawn at random that were resolved in 90 s
 (``bench/missions.py``: ``mixed``, seeds 0 to 89 and 100 to 160, eight users at most) seven were
-mirrored, by 7 to 26 m, and none with this. They are resolved after 26 and 30 s in the median (seeds
-from 100), two robots after 37 and 44 s; with 1 m after 53 s.
+mirrored, by 7 to 26 m, and none of as many with this. They are resolved after 26 and 30 s in the
+median (seeds from 100), two robots after 37 and 44 s; with 1 m after 53 s.
 """
 
 _REPORTED_VARIANCE = 0.7
