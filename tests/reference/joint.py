@@ -46,7 +46,7 @@ def advance(
     x[b : b + 2] += mean
     x[b + HEADING] += turn - dt * x[b + DRIFT]
     p = jacobian @ p @ jacobian.T
-    for constant, walk in ((DRIFT, 3e-9), (SCALE, 3e-7)):
+    for constant, walk in ((DRIFT, 3e-9), (SCALE, 2e-5)):
         if p[b + constant, b + constant] > 0.0:
             p[b + constant, b + constant] += walk * dt
     length = float(whole @ whole)

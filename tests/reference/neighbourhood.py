@@ -12,6 +12,9 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+SCALE_WALK = 2e-5
+"""1/s"""
+
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
@@ -20,6 +23,12 @@ NEAREST_M = 1e-3
 
 
 PER_NODE = 5
+
+
+def wander(covariance: Floats, node: Indices, duration_s: Floats) -> None:
+    """Let step scales walk at random, at the end of all displacements of an instant."""
+    for i, moved_s in zip(node, duration_s, strict=True):
+        covariance[PER_NODE * i + 4, PER_NODE * i + 4] += SCALE_WALK * moved_s
 
 
 def advance(state: Floats, covariance: Floats, node: Indices, moved: Floats) -> None:

@@ -25,7 +25,7 @@ def motion_residuals(
 
 
 def range_residuals(poses: Floats, bias_m: Floats, ranges: Ranges, measured_m: Floats) -> Floats:
-    """Predicted less measured ranges, (M,)."""
+    """Predicted less measured ranges, (M,); ``bias_m``: common, growth, then each pair's."""
     ends = []
     for side in (0, 1):
         node = ranges.pair[:, side]
@@ -40,8 +40,8 @@ def range_residuals(poses: Floats, bias_m: Floats, ranges: Ranges, measured_m: F
             + np.exp(1j * between[:, 2]) * lever
         )
     slant = np.hypot(np.abs(ends[0] - ends[1]), ranges.dz_m)
-    grown = bias_m[-1] * np.log(np.maximum(slant, 1.0) / 5.0)
-    result: Floats = slant + bias_m[0] + bias_m[1 + ranges.pair_index] + grown - measured_m
+    grown = bias_m[1] * np.log(np.maximum(slant, 1.0) / 5.0)
+    result: Floats = slant + bias_m[0] + bias_m[2 + ranges.pair_index] + grown - measured_m
     return result
 
 

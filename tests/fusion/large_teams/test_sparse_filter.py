@@ -63,10 +63,13 @@ def test_within_one_strip_it_is_the_dense_filter() -> None:
     made, pose, covariance = started(pose, width_m=50.0)
     node, peer = np.triu_indices(9, 1)
     for _ in range(4):
+        moved_s = np.zeros(9)
         for _ in range(2):
             moved = 0.3 * random_moves(rng, 9)
             made.predict(np.arange(9), moved)
             dense.advance(pose, covariance, np.arange(9), moved)
+            moved_s += moved[:, 6]
+        dense.wander(covariance, np.arange(9), moved_s)
         true = np.hypot(*(pose[node, :2] - pose[peer, :2]).T)
         measured = true + rng.normal(0.0, SIGMA_M, node.size)
         made.update(node, peer, measured)
@@ -102,6 +105,7 @@ def test_time_passes_within_the_strips_as_in_the_dense_filter() -> None:
     moved = random_moves(rng, who.size)
     made.predict(who, moved)
     dense.advance(pose, covariance, who, moved)
+    dense.wander(covariance, who, moved[:, 6])
     assert np.allclose(made.state, pose)
     got = made.pairs(node, peer)
     expected = dense.spread(pose, covariance, node, peer)
@@ -142,6 +146,7 @@ def play(crowd: Crowd) -> dict[str, float]:
         moved = np.column_stack([motion, crowd.sigmas[t - 1], np.ones(count)])
         made.predict(everybody, moved)
         dense.advance(pose, covariance, everybody, moved)
+        dense.wander(covariance, everybody, moved[:, 6])
         if t % crowd.settings.range_period_s:
             continue
         k = t // crowd.settings.range_period_s - 1

@@ -52,7 +52,10 @@ def _problem(seed: int = 3) -> tuple[Problem, State, Weights]:
     measurements.sort(key=lambda m: m.time_s)
     priors = [Prior(1, 0, 0, 0), Prior(2, 4, 1, 0.5, 0.1, 0.1), Prior(3, 1, 6, -1, 1.0, 0.5)]
     graph, _ = build_graph(measurements, priors, {1: 0.4}, {3: (0.2, -0.1)})
-    problem = Problem(graph)
+    # Step scales of three parts.
+    later = 3 * np.minimum(np.arange(graph.time_s.size - 1) // 4, 2)
+    chords = graph.chords._replace(scale_at=graph.chords.scale_at + later)
+    problem = Problem(replace(graph, chords=chords))
     shape = (graph.time_s.size, 3, 3)
     start = graph.dead_reckoned(graph.prior) + 0.2 * rng.standard_normal(shape)
     state = State(start, 0.05 * rng.standard_normal(problem.constants))
@@ -64,6 +67,21 @@ def _problem(seed: int = 3) -> tuple[Problem, State, Weights]:
     return problem, state, weights
 
 
+def _scales(problem: Problem, state: State) -> Floats:
+    """Logarithms of the step scales of all chords, (K - 1, N)."""
+    n = problem.nodes
+    return np.array([state.constants[at : at + n] for at in problem.graph.chords.scale_at])
+
+
+def _independent(problem: Problem, state: State) -> Floats:
+    """Constants, and in place of the later parts' scales their steps by the parts' time."""
+    n, time_s, chords = problem.nodes, problem.graph.time_s, problem.graph.chords
+    scales = np.array([state.constants[at : at + n] for at in np.unique(chords.scale_at)])
+    part_s = (time_s[-1] - time_s[0]) / len(scales)
+    steps = np.diff(scales, axis=0) / math.sqrt(part_s)
+    return np.concatenate((state.constants[: chords.scale_at[0] + n], steps.ravel()))
+
+
 def test_the_residuals_are_those_of_the_reference() -> None:
     problem, state, _ = _problem()
     graph, n = problem.graph, problem.nodes
@@ -71,11 +89,11 @@ def test_the_residuals_are_those_of_the_reference() -> None:
     assert np.abs(graph.ranges.offset_m).max() > 1e-3
     assert np.abs(graph.ranges.dz_m).max() > 0.1
     motion = reference.motion_residuals(
-        state.poses, state.constants[:n], state.constants[n : 2 * n], graph.chords
+        state.poses, _scales(problem, state), state.constants[:n], graph.chords
     )
     assert problem.motion_residuals(state) == pytest.approx(motion, abs=1e-12)
     ranges = reference.range_residuals(
-        state.poses, state.constants[2 * n :], graph.ranges, graph.range_m
+        state.poses, state.constants[n:], graph.ranges, graph.range_m
     )
     assert problem.range_residuals(state) == pytest.approx(ranges, abs=1e-12)
 
@@ -91,7 +109,7 @@ def _stacked(problem: Problem, state: State) -> tuple[Floats, Callable[[Floats],
                 problem.motion_residuals(at).ravel(),
                 problem.range_residuals(at),
                 problem.prior_residuals(at).ravel(),
-                at.constants,
+                _independent(problem, at),
             ]
         )
 

@@ -31,15 +31,15 @@ from relpos.fusion.bank.storage import (
     row_place,
 )
 from relpos.fusion.compiled import compiled, inner
+from relpos.fusion.models.motion import SCALE_WALK
 from relpos.fusion.models.motion_variances import COMPONENTS, WHITE, base_variances
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 DRIFT_WALK = 3e-9
-SCALE_WALK = 3e-7
-"""Random walks of the two constants, rad^2/s^2 and 1 per second of moving: 0.06 deg/s and 1 % in
-five minutes. Without them resampling makes the reported sd up to twice too small."""
+"""Random walk of the drift, rad^2/s^2 per second of moving: 0.06 deg/s in five minutes. Without it
+resampling makes the reported sd up to twice too small."""
 
 CROSS = 0.04
 """Variance across the way relative to along it: steps err in length, turns err apart from that."""

@@ -115,7 +115,8 @@ TURNED_RAD = 0.3
 """How uncertain its heading is then."""
 
 FORGET = 0.3
-"""Weight of an instant in that fraction: at a range every 2 s, three instants or so."""
+"""Weight of an instant in that fraction: at a range every 2 s, three instants or so; of one with a
+single range half of it."""
 
 
 class _Collected(NamedTuple):
@@ -401,8 +402,9 @@ class LargeTeam:
         count = np.bincount(rows, minlength=self._outlying.size)
         outliers = np.bincount(rows, weights=1.0 - inlier, minlength=self._outlying.size)
         some = count > 0
-        self._outlying[some] += FORGET * (outliers[some] / count[some] - self._outlying[some])
-        wrong = np.flatnonzero((self._outlying > MOSTLY_OUTLYING) & (count >= 2))
+        weight = FORGET * np.minimum(0.5 * count[some], 1.0)
+        self._outlying[some] += weight * (outliers[some] / count[some] - self._outlying[some])
+        wrong = np.flatnonzero((self._outlying > MOSTLY_OUTLYING) & some)
         if wrong.size:
             self.filter.inflate(wrong, JUMP_M, TURNED_RAD)
             self._outlying[wrong] = 0.0

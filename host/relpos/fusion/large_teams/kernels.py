@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from relpos.fusion.compiled import compiled, inlined
 from relpos.fusion.large_teams.layout import COVARIANCE, INFORMATION, Blocks, StripLayout
+from relpos.fusion.models.motion import SCALE_WALK
 from relpos.fusion.models.ranging import AGAIN_M, OUTLIERS_SHORT
 
 Floats = npt.NDArray[np.float64]
@@ -21,8 +22,8 @@ NEAREST_M = 1e-3
 LEVERS = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2), (2, 1))
 """Component (x, y, heading) and what it depends on (heading, drift, scale), the heading last."""
 
-ENTRIES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
-"""Components (x, y, heading) of the six distinct entries of a pose's covariance."""
+ENTRIES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (4, 4))
+"""States (x, y, heading, drift, scale) between which moving adds covariance."""
 
 
 @compiled
@@ -35,9 +36,9 @@ def move(
     deviations, and for how long (s) the node moved. The turn's noise enters before the
     displacement (people turn, then move). What the covariance has to be changed by is collected
     per node: ``lever`` (N, 3, 3) is the derivative of the pose by heading, drift and scale of the
-    last update (but for the heading's by itself), ``noise`` (N, 6) the covariance xx, xy, yy, xh,
-    yh, hh added since. ``headings`` (N, 3) are the heading's variance at the last update, its
-    covariance with the drift, and the drift's variance.
+    last update (but for the heading's by itself), ``noise`` (N, 7) the covariance xx, xy, yy, xh,
+    yh, hh, and the scale's variance, added since. ``headings`` (N, 3) are the heading's variance at
+    the last update, its covariance with the drift, and the drift's variance.
 
     A heading error e of variance v turns the displacement d: on average it is shorter by
     exp(-v/2), and varies along itself by d^2 (1 - exp(-v))^2 / 2, the second-order terms.
@@ -71,6 +72,7 @@ def move(
         noise[i, 2] += s * s * sx + c * c * sy + along * dy * dy
         noise[i, 3] += hx * hh
         noise[i, 4] += hy * hh
+        noise[i, 6] += SCALE_WALK * moved[e, 6]
         lever[i, 0, 0] += hx
         lever[i, 1, 0] += hy
         lever[i, 0, 1] += hx * lever[i, 2, 1]
@@ -99,7 +101,7 @@ def propagate(covariance: Floats, layout: StripLayout, lever: Floats, noise: Flo
             block[axis * n : axis * n + n] += lever[rows, axis, by, None] * block[down]
             block[:, axis * p : axis * p + p] += lever[columns, axis, by] * block[:, right]
     for block, rows in zip(diagonal, nodes, strict=True):
-        own = len(rows) * np.arange(3)[:, None] + np.arange(len(rows))
+        own = len(rows) * np.arange(COVARIANCE)[:, None] + np.arange(len(rows))
         for (a, b), added in zip(ENTRIES, noise[rows].T, strict=True):
             block[own[a], own[b]] += added
             block[own[b], own[a]] = block[own[a], own[b]]

@@ -27,6 +27,14 @@ from dataclasses import dataclass
 
 from relpos.fusion.timeline import Advance
 
+SCALE_WALK = 2e-5
+"""Random walk of a step scale's logarithm, 1 per second of moving: 11 % in ten minutes.
+
+Teams that begin to crawl (``mission-crawl``, 400 s, seeds 0 to 7): NEES 2.5 with 3e-7, 1.4 with
+1e-5, 1.0 with 2e-5. Scales that are constant (``paper-p1`` with 10 %, 24 seeds): .205 m with each,
+.212 with 3e-5. docs/notebook/bank.md.
+"""
+
 
 def velocity_m_s(
     dx_m: float, dy_m: float, turn_rad: float, duration_s: float

@@ -301,26 +301,29 @@ def _pairs(
 
 
 def _parameters(problem: Problem, solution: Solution, time_s: float) -> tuple[Parameter, ...]:
-    """The constants of the whole run; the same at every epoch."""
+    """The constants of the whole run, and the step scales of this part of it."""
     n, names = problem.nodes, problem.graph.node_ids
     value, spread = solution.state.constants, solution.covariance.constants
     rows = []
-    growth = float(value[-1]), math.sqrt(spread[-1, -1])
+    growth = float(value[n + 1]), math.sqrt(spread[n + 1, n + 1])
+    chord = max(int(np.searchsorted(problem.graph.time_s, time_s)) - 1, 0)
+    scale_at = int(problem.graph.chords.scale_at[chord])
     for k, name in enumerate(names):
         rows.append(Parameter(time_s, name, None, "range_growth_m", *growth))
-        grow = math.exp(float(value[k]))
+        own = scale_at + k
+        grow = math.exp(float(value[own]))
         rows.append(
-            Parameter(time_s, name, None, "step_scale", grow, grow * math.sqrt(spread[k, k]))
+            Parameter(time_s, name, None, "step_scale", grow, grow * math.sqrt(spread[own, own]))
         )
         rows.append(
             Parameter(
-                time_s, name, None, "heading_drift_rad_s", float(value[n + k]),
-                math.sqrt(spread[n + k, n + k]),
+                time_s, name, None, "heading_drift_rad_s", float(value[k]),
+                math.sqrt(spread[k, k]),
             )
         )  # fmt: skip
-    common = 2 * n
+    common = n
     for k, (i, j) in enumerate(problem.graph.pairs):
-        own = common + 1 + k
+        own = common + 2 + k
         variance = spread[common, common] + spread[own, own] + 2.0 * spread[common, own]
         rows.append(
             Parameter(

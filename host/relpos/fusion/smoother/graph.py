@@ -31,6 +31,9 @@ STILL_M = 0.02
 GAP = 2.5
 """A report that lasts so many times the node's usual one covers a gap."""
 
+SCALE_PART_S, MOST_SCALE_PARTS = 120.0, 10
+"""A node has one step scale for so long (s), or for longer, so that a run has at most so many."""
+
 PARTS = 8
 """Figures of an open chord."""
 
@@ -51,6 +54,8 @@ class Chords(NamedTuple):
     turn_rad: Floats
     turn_share: Floats
     """(N,) share of its turn that a node's chord follows: 1 where it turns first, then walks."""
+    scale_at: Integers
+    """(K - 1,) where the chords' step scales begin among the constants, one of each node."""
 
 
 class Ranges(NamedTuple):
@@ -119,12 +124,26 @@ class Graph:
     height_m: Floats
     """(K, N) height of every node over its own start, 0 where none is measured."""
 
+    def independent_constants(self) -> Floats:
+        """Return the matrix (G, G) that makes independent quantities of the constants.
+
+        Scales walk at random from one part of the run to the next; in their place are their steps,
+        by the square root of a part's time (s). All others are independent as they are.
+        """
+        nodes, first = len(self.node_ids), int(self.chords.scale_at[0])
+        count = int(self.chords.scale_at[-1]) + nodes
+        parts = (count - first) // nodes
+        result = np.eye(count) - np.eye(count, k=-nodes)
+        result[: first + nodes] = np.eye(first + nodes, count)
+        result[first + nodes :] /= math.sqrt((self.time_s[-1] - self.time_s[0]) / parts)
+        return result
+
     def dead_reckoned(self, start: Floats) -> Floats:
         """Compose the reported chords from poses (N, 3): (K, N, 3), headings unwrapped."""
         knots, nodes = self.time_s.size, len(self.node_ids)
         poses = np.empty((knots, nodes, 3))
         poses[0] = start
-        _, length_m, direction_rad, turn_rad, _ = self.chords
+        _, length_m, direction_rad, turn_rad, _, _ = self.chords
         poses[1:, :, 2] = start[:, 2] + np.cumsum(turn_rad, axis=0)
         angle = poses[:-1, :, 2] + direction_rad
         poses[1:, :, 0] = start[:, 0] + np.cumsum(length_m * np.cos(angle), axis=0)
@@ -286,7 +305,14 @@ def _finished(
     return Graph(
         names,
         time_s,
-        Chords(np.diff(time_s), length, direction, turn, _turn_share(length, direction, turn)),
+        Chords(
+            np.diff(time_s),
+            length,
+            direction,
+            turn,
+            _turn_share(length, direction, turn),
+            len(names) + 2 + len(pairs) + len(names) * _scale_parts(time_s),
+        ),
         _usual_length(length, walks),
         walks,
         np.sqrt(chord[..., 3]),
@@ -302,6 +328,14 @@ def _finished(
         weight,
         height,
     )
+
+
+def _scale_parts(time_s: Floats) -> Integers:
+    """Return in which part of the run, 0 and up, every chord lies."""
+    whole_s = time_s[-1] - time_s[0]
+    parts = min(math.ceil(whole_s / SCALE_PART_S), MOST_SCALE_PARTS)
+    part: Integers = ((time_s[:-1] - time_s[0]) * (parts / whole_s)).astype(np.int64)
+    return part
 
 
 def _attempts(

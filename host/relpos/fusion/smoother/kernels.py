@@ -26,8 +26,9 @@ class State(NamedTuple):
     poses: Floats
     """(K, N, 3): x, y (m), unwrapped heading (rad)."""
     constants: Floats
-    """(2 N + P + 2,): each node's log of true over reported length, each node's heading drift
-    (rad/s), the common range bias, each pair's own bias (m), the ranges' growth (m)."""
+    """(N + 2 + P + S N,): each node's heading drift (rad/s), the common range bias and growth, each
+    pair's own bias (m), and in each of S parts of the run each node's log of true over reported
+    length."""
 
 
 @compiled
@@ -39,16 +40,16 @@ def motion_residuals(state: State, chords: Chords) -> Floats:
     ``turn_share``.
     """
     poses, constants = state
-    duration_s, length_m, direction_rad, turn_rad, turn_share = chords
+    duration_s, length_m, direction_rad, turn_rad, turn_share, scale_at = chords
     knots, nodes = poses.shape[0], poses.shape[1]
     result = np.empty((knots - 1, nodes, 3))
     for k in range(knots - 1):
         for i in range(nodes):
             turn = poses[k + 1, i, 2] - poses[k, i, 2] - turn_rad[k, i]
-            turn -= constants[nodes + i] * duration_s[k]
+            turn -= constants[i] * duration_s[k]
             angle = poses[k, i, 2] + turn_share[i] * turn + direction_rad[k, i]
             c, s = math.cos(angle), math.sin(angle)
-            shrink = math.exp(-constants[i])
+            shrink = math.exp(-constants[scale_at[k] + i])
             dx, dy = poses[k + 1, i, 0] - poses[k, i, 0], poses[k + 1, i, 1] - poses[k, i, 1]
             result[k, i, 0] = shrink * (c * dx + s * dy) - length_m[k, i]
             result[k, i, 1] = shrink * (c * dy - s * dx)
@@ -62,11 +63,10 @@ def _motion_derivative(
 ) -> None:
     """Chord k of node i: residuals (3) and derivatives (3, 8) by both poses, log scale, drift."""
     before, after = state.poses[k, i], state.poses[k + 1, i]
-    nodes = state.poses.shape[1]
     duration_s, share = chords.duration_s[k], chords.turn_share[i]
-    turn = after[2] - before[2] - chords.turn_rad[k, i] - state.constants[nodes + i] * duration_s
+    turn = after[2] - before[2] - chords.turn_rad[k, i] - state.constants[i] * duration_s
     angle = before[2] + share * turn + chords.direction_rad[k, i]
-    shrink = math.exp(-state.constants[i])
+    shrink = math.exp(-state.constants[chords.scale_at[k] + i])
     c, s = shrink * math.cos(angle), shrink * math.sin(angle)
     dx, dy = after[0] - before[0], after[1] - before[1]
     along, across = c * dx + s * dy, c * dy - s * dx
@@ -99,7 +99,7 @@ def add_motions(state: State, chords: Chords, weight: Floats, equations: Equatio
             _motion_derivative(state, chords, k, i, r, j)
             r0, r1, r2 = r[0], r[1], r[2]
             w0, w1, w2 = weight[k, i, 0], weight[k, i, 1], weight[k, i, 2]
-            at = 3 * i
+            at, places = 3 * i, (chords.scale_at[k] + i, i)
             for p in range(8):
                 v0, v1, v2 = w0 * j[0, p], w1 * j[1, p], w2 * j[2, p]
                 slope = v0 * r0 + v1 * r1 + v2 * r2
@@ -107,26 +107,24 @@ def add_motions(state: State, chords: Chords, weight: Floats, equations: Equatio
                     gradient[k, at + p] += slope
                 elif p < 6:
                     gradient[k + 1, at + p - 3] += slope
-                elif p == 6:
-                    corner_gradient[i] += slope
                 else:
-                    corner_gradient[nodes + i] += slope
+                    corner_gradient[places[p - 6]] += slope
                 for q in range(8):
                     value = v0 * j[0, q] + v1 * j[1, q] + v2 * j[2, q]
                     if p < 3:
                         if q < 3:
                             a[k, at + p, at + q] += value
                         elif q >= 6:
-                            border[k, at + p, (q - 6) * nodes + i] += value
+                            border[k, at + p, places[q - 6]] += value
                     elif p < 6:
                         if q < 3:
                             e[k, at + p - 3, at + q] += value
                         elif q < 6:
                             a[k + 1, at + p - 3, at + q - 3] += value
                         else:
-                            border[k + 1, at + p - 3, (q - 6) * nodes + i] += value
+                            border[k + 1, at + p - 3, places[q - 6]] += value
                     elif q >= 6:
-                        corner[(p - 6) * nodes + i, (q - 6) * nodes + i] += value
+                        corner[places[p - 6], places[q - 6]] += value
 
 
 @compiled
@@ -157,8 +155,8 @@ def add_component_columns(
                 for p in range(3):
                     columns[k, at + p, column] += f * j[a, p]
                     columns[k + 1, at + p, column] += f * j[a, 3 + p]
-                corner[i, column] += f * j[a, 6]
-                corner[nodes + i, column] += f * j[a, 7]
+                corner[chords.scale_at[k] + i, column] += f * j[a, 6]
+                corner[i, column] += f * j[a, 7]
 
 
 class _Slopes(NamedTuple):
@@ -214,8 +212,8 @@ def _predict_range(state: State, ranges: Ranges, m: int, slopes: _Slopes) -> flo
         row[at + 3], row[at + 4] = sign * f * ux, sign * f * uy
     if ranges.pair_index[m] < 0:
         return distance
-    common = 2 * poses.shape[1]
-    entry[0], entry[1], entry[2] = common, common + 1 + ranges.pair_index[m], constants.size - 1
+    common = poses.shape[1]
+    entry[0], entry[1], entry[2] = common, common + 2 + ranges.pair_index[m], common + 1
     constant[0], constant[1], constant[2] = 1.0, 1.0, growth_slope(distance)
     predicted = distance
     for c in range(3):
@@ -312,20 +310,20 @@ def motion_variances(state: State, chords: Chords, covariance: Covariance) -> Fl
     for k in range(knots - 1):
         for i in range(nodes):
             _motion_derivative(state, chords, k, i, r, j)
-            at = 3 * i
+            at, places = 3 * i, (chords.scale_at[k] + i, i)
             for p in range(3):
                 for q in range(3):
                     own[p, q] = diagonal[k, at + p, at + q]
                     own[3 + p, 3 + q] = diagonal[k + 1, at + p, at + q]
                     own[3 + p, q] = own[q, 3 + p] = below[k, at + p, at + q]
             for c in range(2):
-                column = c * nodes + i
+                column = places[c]
                 for p in range(3):
                     own[p, 6 + c] = own[6 + c, p] = with_constants[k, at + p, column]
                     own[3 + p, 6 + c] = with_constants[k + 1, at + p, column]
                     own[6 + c, 3 + p] = own[3 + p, 6 + c]
                 for d in range(2):
-                    own[6 + c, 6 + d] = constants[column, d * nodes + i]
+                    own[6 + c, 6 + d] = constants[column, places[d]]
             for axis in range(3):
                 total = 0.0
                 for p in range(8):

@@ -16,7 +16,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class Weights(NamedTuple):
-    """1 / variance of chords (K - 1, N, 3), ranges (M,) and constants (G,)."""
+    """1 / variance of chords (K - 1, N, 3), ranges (M,), ``Problem.independent`` constants (G,)."""
 
     motion: Floats
     ranges: Floats
@@ -58,7 +58,8 @@ class Problem:
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
         self.nodes = len(graph.node_ids)
-        self.constants = 2 * self.nodes + 2 + len(graph.pairs)
+        self.independent = graph.independent_constants()
+        self.constants = len(self.independent)
         self.range_m = graph.range_m.copy()
         self.detection = self.no_detection()
 
@@ -117,7 +118,7 @@ class Problem:
         total = np.sum(weights.motion * self.motion_residuals(state) ** 2)
         total += np.sum(weights.ranges * self.range_residuals(state) ** 2)
         total += np.sum(self.graph.prior_weight * self.prior_residuals(state) ** 2)
-        total += np.sum(weights.constants * state.constants**2)
+        total += np.sum(weights.constants * (self.independent @ state.constants) ** 2)
         if self.detection.weight.any():
             residual = kernels.range_residuals(
                 state, self.graph.attempts.ranges, self.detection.mean_m
@@ -128,13 +129,14 @@ class Problem:
     def normal_equations(self, state: State, weights: Weights) -> Equations:
         """Linearise everything at a state."""
         graph, knots, b = self.graph, self.graph.time_s.size, 3 * self.nodes
+        precision = self.independent.T @ (weights.constants[:, None] * self.independent)
         equations = Equations(
             a=np.zeros((knots, b, b)),
             e=np.zeros((knots - 1, b, b)),
             border=np.zeros((knots, b, self.constants)),
-            corner=np.diag(weights.constants),
+            corner=precision,
             gradient=np.zeros((knots, b)),
-            corner_gradient=weights.constants * state.constants,
+            corner_gradient=precision @ state.constants,
         )
         kernels.add_motions(state, graph.chords, weights.motion, equations)
         kernels.add_ranges(state, graph.ranges, self.range_m, weights.ranges, equations)

@@ -133,10 +133,12 @@ def negative_evidence(
     state = at.state
     total = -inlier_probabilities(problem, state, components, bases).log_likelihood
     prior = components.constant_weights(problem)
-    total += 0.5 * np.sum(prior * state.constants**2 - np.log(prior))
+    constants = problem.independent @ state.constants
+    total += 0.5 * np.sum(prior * constants**2 - np.log(prior))
     # A chord's noise is so wide in reported metres; as a density of where it ends, in true ones,
     # it is exp(2 c) times as wide. Without this every longer team would be likelier.
-    total += 2.0 * bases.shape[0] * float(np.sum(state.constants[: problem.nodes]))
+    scales = problem.graph.chords.scale_at[:, None] + np.arange(problem.nodes)
+    total += 2.0 * float(np.sum(state.constants[scales]))
     total += detection.negative_log_probability(problem, state)
     weight = problem.graph.prior_weight
     total += 0.5 * np.sum(weight * problem.prior_residuals(state) ** 2)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion.models.motion import SCALE_WALK
 from relpos.fusion.models.odometry_faults import JUMP_M
 from relpos.fusion.models.ranging import GO_ON, GO_ON_RANGES, GROWTH_SD_M
 from relpos.fusion.smoother import kernels
@@ -54,7 +55,7 @@ LEAST_MOTION = np.array([0.005**2, 0.001**2, 0.002**2, 0.001**2, 0.005**2, 2e-4*
 """Lower limits; far below all sensors, and no trouble for the digits."""
 
 FIRST_SCALE = 0.1**2
-CALIBRATED_SCALE = 0.005**2
+CALIBRATED_SCALE, CALIBRATED_WALK = 0.005**2, 5e-8
 """Of steps whose length was calibrated."""
 FIRST_DRIFT = math.radians(0.05) ** 2
 FIRST_PAIR_BIAS = 0.1**2
@@ -80,6 +81,8 @@ class VarianceComponents:
     outliers_go_on: float = GO_ON
     """Probability that a pair's next range is an outlier, too."""
     scale: float = FIRST_SCALE
+    scale_walk: float = SCALE_WALK
+    """Variance that the logarithm of a scale gathers (1/s)."""
     drift_rad2_s2: float = FIRST_DRIFT
     common_bias_m2: float = 0.3**2
     pair_bias_m2: float = FIRST_PAIR_BIAS
@@ -102,7 +105,7 @@ class VarianceComponents:
             result.common_bias_m2, result.pair_bias_m2 = CALIBRATED_BIAS, CALIBRATED_PAIR_BIAS
             result.growth_m2 = CALIBRATED_GROWTH
         if to_scale:
-            result.scale = CALIBRATED_SCALE
+            result.scale, result.scale_walk = CALIBRATED_SCALE, CALIBRATED_WALK
         return result
 
     def copy(self) -> VarianceComponents:
@@ -120,15 +123,15 @@ class VarianceComponents:
         return np.stack([along + graph.unseen_m2, across + graph.unseen_m2, turn], axis=-1)
 
     def constant_weights(self, problem: Problem) -> Floats:
-        """1 / prior variances of the constants, (G,)."""
-        n = problem.nodes
+        """1 / prior variances of ``Problem.independent`` of the constants, (G,)."""
+        n, pairs = problem.nodes, len(problem.graph.pairs)
         return 1.0 / np.concatenate(
             (
-                np.full(n, self.scale),
                 np.full(n, self.drift_rad2_s2),
-                [self.common_bias_m2],
-                np.full(len(problem.graph.pairs), self.pair_bias_m2),
-                [self.growth_m2],
+                [self.common_bias_m2, self.growth_m2],
+                np.full(pairs, self.pair_bias_m2),
+                np.full(n, self.scale),
+                np.full(problem.constants - 2 * n - 2 - pairs, self.scale_walk),
             )
         )
 
@@ -326,8 +329,8 @@ def update_components(
     components.range_m2 = new_v
     components.range_inflation = _range_inflation(problem, at, residual_m, posterior_m2, inliers)
 
-    n, constants = problem.nodes, at.state.constants
-    spread = np.diag(at.covariance.constants)
+    constants = problem.independent @ at.state.constants
+    spread = np.diag(problem.independent @ at.covariance.constants @ problem.independent.T)
 
     def fixed_point(old: float, part: slice, first: float) -> float:
         up = float(np.sum(constants[part] ** 2)) + COUNT_CONSTANTS * first
@@ -336,10 +339,14 @@ def update_components(
         return min(max(new, 1e-4 * first), 4.0 * first)
 
     first_scale = CALIBRATED_SCALE if components.to_scale else FIRST_SCALE
+    first_walk = CALIBRATED_WALK if components.to_scale else SCALE_WALK
     first_bias = CALIBRATED_PAIR_BIAS if components.calibrated else FIRST_PAIR_BIAS
-    components.scale = fixed_point(components.scale, slice(0, n), first_scale)
-    components.drift_rad2_s2 = fixed_point(components.drift_rad2_s2, slice(n, 2 * n), FIRST_DRIFT)
-    components.pair_bias_m2 = fixed_point(components.pair_bias_m2, slice(2 * n + 1, -1), first_bias)
+    n, scales = problem.nodes, int(problem.graph.chords.scale_at[0])
+    drift, first, walk = slice(0, n), slice(scales, scales + n), slice(scales + n, None)
+    components.drift_rad2_s2 = fixed_point(components.drift_rad2_s2, drift, FIRST_DRIFT)
+    components.pair_bias_m2 = fixed_point(components.pair_bias_m2, slice(n + 2, scales), first_bias)
+    components.scale = fixed_point(components.scale, first, first_scale)
+    components.scale_walk = fixed_point(components.scale_walk, walk, first_walk)
     outliers = float(np.sum(1.0 - inliers))
     components.outliers = (outliers + 0.5) / (inliers.size + 50.0)
     up, down = sorted_out.followed + GO_ON * GO_ON_RANGES, outliers + GO_ON_RANGES

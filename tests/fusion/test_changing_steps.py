@@ -1,0 +1,27 @@
+"""A team that begins to crawl: its steps are no longer what they were."""
+
+from __future__ import annotations
+
+import pytest
+
+import relpos
+
+BANK = {"seconds": 240}
+SMOOTHER = {"seconds": 160, "nodes": 3, "scale_change": 0.6}
+LARGE_TEAM = {"seconds": 100, "nodes": 21, "range_rate_hz": 0.3}
+
+
+@pytest.mark.parametrize(
+    ("given", "seed", "smooth", "most_m"),
+    [(BANK, 7, False, 0.3), (SMOOTHER, 4, True, 0.2), (LARGE_TEAM, 1, False, 0.3)],
+    ids=["bank", "smoother", "large team"],
+)
+def test_who_begins_to_crawl_is_neither_far_off_nor_surer_than_right(
+    given: dict[str, float], seed: int, smooth: bool, most_m: float
+) -> None:
+    """With constant scales: 0.53, 0.34 and 0.47 m; NEES 5.0, 0.6 and 5.8."""
+    run = relpos.simulate("mission-crawl", seed, **given)
+    result = relpos.fuse(run, smooth=smooth)
+    scored = relpos.evaluate(result, run, bound=False).metrics
+    assert scored.relative_distance_rmse_m < most_m
+    assert scored.nees_distance < 2.5
