@@ -229,7 +229,7 @@ class Bank:
             known.received(time_s)
             way_m = math.hypot(dx_m, dy_m)
             self.range_correlation.move(node, way_m, turn_rad)
-            self.handedness.turn(node, turn_rad)
+            self.handedness.move(node, dx_m, dy_m, turn_rad)
             self._velocity_m_s[node] = velocity_m_s(dx_m, dy_m, turn_rad, duration_s)
             usual = speed_gate.usual_m_s.get(node, 0.0)
             known.within.move(way_m, duration_s, fraction, usual)

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from relpos.fusion.initial_poses import POSE, UNKNOWN
 from relpos.fusion.initialisation.kernels import Priors, Problem, Ranges, Tracks
+from relpos.fusion.models.handedness import bend_m
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Range
 
@@ -230,14 +231,10 @@ class MeasurementLog:
         return bool(self._priors[node].precision[2] > 0.0)
 
     def bend_m(self, node: int) -> float:
-        """Return how far the node's way has been from a straight one: half of its width."""
+        """Return how far the node's way has been from a straight one (m)."""
         track = self._tracks[node]
-        x, y = np.array([*(sample[:2] for sample in track.samples), track.pose[:2]]).T
-        far = int(np.argmax(x * x + y * y))
-        distance_m = math.hypot(x[far], y[far])
-        if distance_m == 0.0:
-            return 0.0
-        return 0.5 * float(np.ptp(x[far] * y - y[far] * x)) / distance_m
+        places = [complex(x, y) for x, y, _, _ in track.samples]
+        return bend_m([*places, complex(*track.pose[:2])])
 
     # -- ranges --------------------------------------------------------------------------------
 

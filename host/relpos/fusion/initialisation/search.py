@@ -26,6 +26,7 @@ from relpos.fusion.initialisation.hypotheses import Hypotheses, fitted, pose_col
 from relpos.fusion.initialisation.kernels import Problem
 from relpos.fusion.initialisation.measurement_log import MeasurementLog, SensorModel
 from relpos.fusion.initialisation.proposals import Proposals
+from relpos.fusion.models.handedness import BENT_M
 from relpos.fusion.modes import belief_of, best_mode, relative_poses
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Range
@@ -48,16 +49,6 @@ of these (the second times the distance): joint filters are then near enough to 
 
 MOVED_M = 0.5
 """A node that has not been farther from its start has no heading to be known."""
-
-BENT_M = 0.7
-"""A way so far from a straight one has no mirror image with the same ranges.
-
-Until somebody has gone such a way, noise alone chooses between left and right, and may have 99 % of
-the weight on the wrong one. Of 77 teams drawn at random that were resolved in 90 s
-(``bench/missions.py``: ``mixed``, seeds 0 to 89 and 100 to 160, eight users at most) seven were
-mirrored, by 7 to 26 m, and none of as many with this. They are resolved after 26 and 30 s in the
-median (seeds from 100), two robots after 37 and 44 s; with 1 m after 53 s.
-"""
 
 _REPORTED_VARIANCE = 0.7
 """Variances that are reported, relative to the search's own, whose range errors are assumed too
