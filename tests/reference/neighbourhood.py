@@ -12,9 +12,6 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-SCALE_WALK = 2e-5
-"""1/s"""
-
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
@@ -23,6 +20,9 @@ NEAREST_M = 1e-3
 
 
 PER_NODE = 5
+
+SCALE_WALK = 2e-5
+"""Variance that the logarithm of a moving node's step scale gathers (1/s)."""
 
 
 def wander(covariance: Floats, node: Indices, duration_s: Floats) -> None:

@@ -55,7 +55,7 @@ class SensingSettings:
     turn_noise: float = setting(0.06, "relative noise of a turn", 0.0, 1.0)
     drift_deg_min: float = setting(0.0, "heading drift, its sign drawn", 0.0, 600.0)
     step_scale: float = setting(1.0, "true length of a step over the reported one", 0.1, 10.0)
-    scale_change: float = setting(1.0, "by what it changes in the middle of the run", 0.1, 10.0)
+    scale_change: float = setting(1.0, "factor of step_scale in the second half", 0.1, 10.0)
     range_rate_hz: float = setting(0.7, "ranges a second and pair", 0.0, 50.0)
     sigma_range_m: float = setting(0.1, "noise of a range", 0.0, 100.0)
     max_range_m: float = setting(30.0, "reach", 1.0, 1e5)

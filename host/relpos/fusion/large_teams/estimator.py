@@ -404,7 +404,7 @@ class LargeTeam:
         some = count > 0
         weight = FORGET * np.minimum(0.5 * count[some], 1.0)
         self._outlying[some] += weight * (outliers[some] / count[some] - self._outlying[some])
-        wrong = np.flatnonzero((self._outlying > MOSTLY_OUTLYING) & some)
+        wrong = np.flatnonzero(self._outlying > MOSTLY_OUTLYING)
         if wrong.size:
             self.filter.inflate(wrong, JUMP_M, TURNED_RAD)
             self._outlying[wrong] = 0.0

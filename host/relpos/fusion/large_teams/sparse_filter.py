@@ -76,7 +76,7 @@ class NeighbourhoodFilter:
     counters: Counter[str] = field(default_factory=Counter)
     """How often nodes changed strips, and strips were laid out anew or widened."""
     _lever: Floats = field(default_factory=lambda: np.empty((0, 3, 3)))
-    _noise: Floats = field(default_factory=lambda: np.empty((0, 7)))
+    _noise: Floats = field(default_factory=lambda: np.empty((0, len(kernels.ENTRIES))))
     _heading: Floats = field(default_factory=lambda: np.empty((0, 3)))
     """Variances of heading and of drift at the last update, and their covariance between (N, 3)."""
     _behind: bool = False
@@ -107,7 +107,7 @@ class NeighbourhoodFilter:
         self.antenna_m = np.concatenate([self.antenna_m, np.zeros((more, 2))])
         self._carried = np.concatenate([self._carried, np.zeros((more, COVARIANCE, TERMS))])
         self._lever = np.zeros((count + more, 3, 3))
-        self._noise = np.zeros((count + more, 7))
+        self._noise = np.zeros((count + more, len(kernels.ENTRIES)))
         whole = np.zeros((COVARIANCE * (count + more), COVARIANCE * (count + more)))
         whole[: len(full), : len(full)] = full
         for i, each in enumerate(covariance, count):

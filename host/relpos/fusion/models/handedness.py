@@ -72,7 +72,7 @@ class Handedness:
         self._open |= unknown
         if unknown:
             self._ways.clear()
-        elif self._open and any(bend_m(way.places_m) > BENT_M for way in self._ways.values()):
+        elif any(bend_m(way.places_m) > BENT_M for way in self._ways.values()):
             self._open.clear()
             self._ways.clear()
         return self._open | unknown if len(nodes) - len(self._open) < PLACED else set(unknown)

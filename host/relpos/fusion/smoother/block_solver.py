@@ -1,7 +1,7 @@
 """Normal equations of a team's whole track: block Cholesky, solution and covariance.
 
 K knots in time, N nodes, poses (x, y, heading): a block of b = 3 N unknowns a knot, and a border
-of G constants (per node log scale and heading drift, one common range bias, pair biases):
+of G constants (``kernels.State``):
 
     [ A_0  E_0'              B_0 ]
     [ E_0  A_1  E_1'         B_1 ]          A (K, b, b), E (K - 1, b, b), B (K, b, G), C (G, G)

@@ -302,10 +302,10 @@ def _pairs(
 
 def _parameters(problem: Problem, solution: Solution, time_s: float) -> tuple[Parameter, ...]:
     """The constants of the whole run, and the step scales of this part of it."""
-    n, names = problem.nodes, problem.graph.node_ids
+    places, names = problem.places, problem.graph.node_ids
     value, spread = solution.state.constants, solution.covariance.constants
     rows = []
-    growth = float(value[n + 1]), math.sqrt(spread[n + 1, n + 1])
+    growth = float(value[places.growth]), math.sqrt(spread[places.growth, places.growth])
     chord = max(int(np.searchsorted(problem.graph.time_s, time_s)) - 1, 0)
     scale_at = int(problem.graph.chords.scale_at[chord])
     for k, name in enumerate(names):
@@ -321,9 +321,8 @@ def _parameters(problem: Problem, solution: Solution, time_s: float) -> tuple[Pa
                 math.sqrt(spread[k, k]),
             )
         )  # fmt: skip
-    common = n
-    for k, (i, j) in enumerate(problem.graph.pairs):
-        own = common + 2 + k
+    common = places.common_bias
+    for own, (i, j) in enumerate(problem.graph.pairs, places.pair_bias.start):
         variance = spread[common, common] + spread[own, own] + 2.0 * spread[common, own]
         rows.append(
             Parameter(

@@ -48,6 +48,18 @@ class DetectionFactors(NamedTuple):
     weight: Floats
 
 
+class Places(NamedTuple):
+    """Where ``State.constants`` and ``Problem.independent`` of them have each kind."""
+
+    drift: slice
+    common_bias: int
+    growth: int
+    pair_bias: slice
+    first_scale: slice
+    scale_step: slice
+    """In ``State.constants`` the scales of the later parts."""
+
+
 class Problem:
     """The factors of a graph, with what has been learned of the ranges meanwhile.
 
@@ -60,6 +72,11 @@ class Problem:
         self.nodes = len(graph.node_ids)
         self.independent = graph.independent_constants()
         self.constants = len(self.independent)
+        n, scales = self.nodes, int(graph.chords.scale_at[0])
+        self.places = Places(
+            slice(0, n), n, n + 1, slice(n + 2, scales),
+            slice(scales, scales + n), slice(scales + n, None),
+        )  # fmt: skip
         self.range_m = graph.range_m.copy()
         self.detection = self.no_detection()
 

@@ -55,7 +55,8 @@ LEAST_MOTION = np.array([0.005**2, 0.001**2, 0.002**2, 0.001**2, 0.005**2, 2e-4*
 """Lower limits; far below all sensors, and no trouble for the digits."""
 
 FIRST_SCALE = 0.1**2
-CALIBRATED_SCALE, CALIBRATED_WALK = 0.005**2, 5e-8
+CALIBRATED_SCALE = 0.005**2
+CALIBRATED_WALK = SCALE_WALK * CALIBRATED_SCALE / FIRST_SCALE
 """Of steps whose length was calibrated."""
 FIRST_DRIFT = math.radians(0.05) ** 2
 FIRST_PAIR_BIAS = 0.1**2
@@ -124,16 +125,12 @@ class VarianceComponents:
 
     def constant_weights(self, problem: Problem) -> Floats:
         """1 / prior variances of ``Problem.independent`` of the constants, (G,)."""
-        n, pairs = problem.nodes, len(problem.graph.pairs)
-        return 1.0 / np.concatenate(
-            (
-                np.full(n, self.drift_rad2_s2),
-                [self.common_bias_m2, self.growth_m2],
-                np.full(pairs, self.pair_bias_m2),
-                np.full(n, self.scale),
-                np.full(problem.constants - 2 * n - 2 - pairs, self.scale_walk),
-            )
-        )
+        variance, at = np.empty(problem.constants), problem.places
+        variance[at.drift] = self.drift_rad2_s2
+        variance[at.common_bias], variance[at.growth] = self.common_bias_m2, self.growth_m2
+        variance[at.pair_bias] = self.pair_bias_m2
+        variance[at.first_scale], variance[at.scale_step] = self.scale, self.scale_walk
+        return 1.0 / variance
 
 
 UNREST = 2.0
@@ -341,12 +338,11 @@ def update_components(
     first_scale = CALIBRATED_SCALE if components.to_scale else FIRST_SCALE
     first_walk = CALIBRATED_WALK if components.to_scale else SCALE_WALK
     first_bias = CALIBRATED_PAIR_BIAS if components.calibrated else FIRST_PAIR_BIAS
-    n, scales = problem.nodes, int(problem.graph.chords.scale_at[0])
-    drift, first, walk = slice(0, n), slice(scales, scales + n), slice(scales + n, None)
-    components.drift_rad2_s2 = fixed_point(components.drift_rad2_s2, drift, FIRST_DRIFT)
-    components.pair_bias_m2 = fixed_point(components.pair_bias_m2, slice(n + 2, scales), first_bias)
-    components.scale = fixed_point(components.scale, first, first_scale)
-    components.scale_walk = fixed_point(components.scale_walk, walk, first_walk)
+    places = problem.places
+    components.drift_rad2_s2 = fixed_point(components.drift_rad2_s2, places.drift, FIRST_DRIFT)
+    components.pair_bias_m2 = fixed_point(components.pair_bias_m2, places.pair_bias, first_bias)
+    components.scale = fixed_point(components.scale, places.first_scale, first_scale)
+    components.scale_walk = fixed_point(components.scale_walk, places.scale_step, first_walk)
     outliers = float(np.sum(1.0 - inliers))
     components.outliers = (outliers + 0.5) / (inliers.size + 50.0)
     up, down = sorted_out.followed + GO_ON * GO_ON_RANGES, outliers + GO_ON_RANGES
