@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+import relpos
 from reference import initialisation as reference
 from relpos import fusion, tracks
 from relpos.evaluation import metrics
@@ -239,6 +240,38 @@ def test_on_a_straight_course_the_mirror_image_is_listed_and_a_turn_removes_it()
     last = estimates[-1]
     assert status(last, 2) is NodeStatus.OK
     assert off_m(last, walk, 60, 1, 2) < 0.3
+
+
+@pytest.mark.parametrize(
+    ("seed", "settings"),
+    [
+        (5, {"pause_s": 30, "way_noise_m": 0.03, "turn_noise": 0.15, "step_scale": 1.15,
+             "max_range_m": 15, "clock_off_s": -0.5, "lost_s": 15}),
+        (12, {"area_m": 60, "way_noise_m": 0.15, "max_range_m": 60, "range_late_s": 0.2,
+              "floors": 2, "start_m": 0.5, "compass_deg": 20}),
+    ],
+)  # fmt: skip
+def test_noise_that_prefers_the_mirror_image_resolves_nobody(
+    seed: int, settings: dict[str, float]
+) -> None:
+    noise = {"heading_noise_deg": 4, "range_rate_hz": 0.3, "sigma_range_m": 0.3}
+    run = relpos.simulate("mission-base", seed, seconds=40, nodes=4, **noise, **settings)
+    truth = tracks.true_tracks(run.truth)
+
+    def off_m(told: Floats, true: Floats) -> float:
+        told, true = told - told.mean(), true - true.mean()
+        turn = np.exp(1j * np.angle(np.vdot(true, told)))
+        return float(np.sqrt((np.abs(told - true * turn) ** 2).mean()))
+
+    for e in relpos.fuse(run, initial="unknown").estimates:
+        if len(e.nodes) == 4 and all(n.status is NodeStatus.OK for n in e.nodes):
+            told = np.array([complex(n.x_m, n.y_m) for n in e.nodes])
+            walked = [truth[n.node] for n in e.nodes]
+            true = np.array([
+                np.interp(e.time_s, t.time_s, t.x_m) + 1j * np.interp(e.time_s, t.time_s, t.y_m)
+                for t in walked
+            ])  # fmt: skip
+            assert off_m(told, true) < 2.0 * off_m(told.conj(), true)
 
 
 def test_while_the_first_stands_alone_the_other_walks_on_a_ring() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -62,7 +63,7 @@ class Hypotheses:
 
     def merge(self, most: int) -> None:
         """Keep one of those that have met, drop those without evidence, and weigh the rest."""
-        score = -0.5 * self.fits.costs + self.fits.log_volumes
+        score = log_evidence(self.fits)
         order = np.argsort(-score)
         order = order[score[order] > score[order[0]] - _LEAST_LOG_EVIDENCE]
         size, poses = POSE * self.nodes, self.poses
@@ -79,6 +80,21 @@ class Hypotheses:
         self.fits = Fits(*(each[index] for each in self.fits))
         weights = np.exp(score[index] - score[index[0]])
         self.weights = weights / weights.sum()
+
+    def mirror_image(self, pose: Floats) -> Floats:
+        """Return parameters (1, D) of the best one, reflected about the line that ``pose`` faces.
+
+        ``pose`` (3,) is where the line begins, and its direction. Turns' errors begin at 0.
+        """
+        parameters = self.fits.parameters[:1].copy()
+        by_node = parameters[:, :-1].reshape(self.nodes, -1)
+        origin, facing = complex(pose[0], pose[1]), cmath.rect(1.0, pose[2])
+        off = by_node[:, 0] + 1j * by_node[:, 1] - origin
+        image = origin + facing**2 * off.conj()
+        by_node[:, 0], by_node[:, 1] = image.real, image.imag
+        by_node[:, 2] = 2.0 * pose[2] - by_node[:, 2]
+        by_node[:, PER_NODE:] = 0.0
+        return parameters
 
     # -- nodes and turns -----------------------------------------------------------------------
 
@@ -148,6 +164,12 @@ class Hypotheses:
         )
         self.weights = self.weights[which] / self.weights[which].sum()
         self.nodes = len(nodes)
+
+
+def log_evidence(fits: Fits) -> Floats:
+    """Return the log evidence (M,) of the neighbourhoods of fits (Laplace)."""
+    evidence: Floats = -0.5 * fits.costs + fits.log_volumes
+    return evidence
 
 
 def fitted(parameters: Floats, iterations: int, problem: Problem) -> Fits:

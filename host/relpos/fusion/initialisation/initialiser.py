@@ -174,7 +174,9 @@ class HypothesisInitialiser:
         if not search.nodes:
             return None
         search.solve()
-        agreed = [] if search.may_be_mirrored() else search.resolved(AGREED)
+        agreed = search.resolved(AGREED)
+        if agreed and search.may_be_mirrored():
+            agreed = []
         self._agreed_epochs = Counter({n: self._agreed_epochs[n] + 1 for n in agreed})
         found = {n for n in agreed if self._agreed_epochs[n] >= AGREED_EPOCHS}
         if search.frame is not None:

@@ -19,7 +19,6 @@ import numpy.typing as npt
 
 from relpos.fusion.initial_poses import POSE, UNKNOWN
 from relpos.fusion.initialisation.kernels import Priors, Problem, Ranges, Tracks
-from relpos.fusion.models.handedness import bend_m
 from relpos.fusion.timeline import Advance
 from relpos.measurements import Range
 
@@ -225,16 +224,6 @@ class MeasurementLog:
         track = self._tracks[node]
         far = [math.hypot(x, y) for x, y, _, _ in track.samples]
         return max([*far, float(np.hypot(*track.pose[:2]))])
-
-    def has_heading(self, node: int) -> bool:
-        """Whether the node's heading was known when it was added."""
-        return bool(self._priors[node].precision[2] > 0.0)
-
-    def bend_m(self, node: int) -> float:
-        """Return how far the node's way has been from a straight one (m)."""
-        track = self._tracks[node]
-        places = [complex(x, y) for x, y, _, _ in track.samples]
-        return bend_m([*places, complex(*track.pose[:2])])
 
     # -- ranges --------------------------------------------------------------------------------
 
