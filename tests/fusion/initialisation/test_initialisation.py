@@ -258,20 +258,18 @@ def test_noise_that_prefers_the_mirror_image_resolves_nobody(
     run = relpos.simulate("mission-base", seed, seconds=40, nodes=4, **noise, **settings)
     truth = tracks.true_tracks(run.truth)
 
-    def off_m(told: Floats, true: Floats) -> float:
-        told, true = told - told.mean(), true - true.mean()
-        turn = np.exp(1j * np.angle(np.vdot(true, told)))
-        return float(np.sqrt((np.abs(told - true * turn) ** 2).mean()))
-
     for e in relpos.fuse(run, initial="unknown").estimates:
         if len(e.nodes) == 4 and all(n.status is NodeStatus.OK for n in e.nodes):
-            told = np.array([complex(n.x_m, n.y_m) for n in e.nodes])
+            told = np.array([(n.x_m, n.y_m) for n in e.nodes])
             walked = [truth[n.node] for n in e.nodes]
             true = np.array([
-                np.interp(e.time_s, t.time_s, t.x_m) + 1j * np.interp(e.time_s, t.time_s, t.y_m)
-                for t in walked
+                [np.interp(e.time_s, t.time_s, axis) for axis in (t.x_m, t.y_m)] for t in walked
             ])  # fmt: skip
-            assert off_m(told, true) < 2.0 * off_m(told.conj(), true)
+            off_m2, image_off_m2 = (
+                metrics.aligned_squared_distances(places, true).mean()
+                for places in (told, told * (1.0, -1.0))
+            )
+            assert off_m2 < 4.0 * image_off_m2
 
 
 def test_while_the_first_stands_alone_the_other_walks_on_a_ring() -> None:

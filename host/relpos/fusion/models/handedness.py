@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import cmath
-from collections.abc import Collection, Sequence, Set
+from collections.abc import Collection, Set
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,15 +23,6 @@ PLACED = 3
 """So many nodes that are known place all others, on the right side."""
 
 
-def bend_m(way_m: Sequence[complex]) -> float:
-    """Return how far a way that begins at 0 has been from a straight one: half of its width."""
-    places = np.array(way_m, dtype=complex)
-    if not places.any():
-        return 0.0
-    far = places[np.argmax(np.abs(places))]
-    return 0.5 * float(np.ptp((places * far.conjugate() / abs(far)).imag))
-
-
 @dataclass(slots=True)
 class _Way:
     """What a node has gone, in the frame of its beginning."""
@@ -45,6 +36,14 @@ class _Way:
         self.facing *= cmath.rect(1.0, turn_rad)
         if abs(self.now_m - self.places_m[-1]) > APART_M:
             self.places_m.append(self.now_m)
+
+    def bend_m(self) -> float:
+        """Return how far it has been from a straight one: half of its width."""
+        places = np.array(self.places_m)
+        far = places[np.argmax(np.abs(places))]
+        if far == 0.0:
+            return 0.0
+        return 0.5 * float(np.ptp((places * far.conjugate() / abs(far)).imag))
 
 
 @dataclass(slots=True)
@@ -70,7 +69,7 @@ class Handedness:
         self._open |= unknown
         if unknown:
             self._ways.clear()
-        elif any(bend_m(way.places_m) > BENT_M for way in self._ways.values()):
+        elif any(way.bend_m() > BENT_M for way in self._ways.values()):
             self._open.clear()
             self._ways.clear()
         return self._open | unknown if len(nodes) - len(self._open) < PLACED else set(unknown)
