@@ -8,8 +8,8 @@ prints, for each condition of ``relpos.simulation.missions`` and each estimator:
 and body-frame RMSE (m) and distance NEES, means over the seeds; of the pair-seconds with status
 ok the shares whose distance errs by more than three sigmas and by more than 2 m (%); the worst
 seed's distance RMSE; processor seconds of a run; and the body-frame RMSE over that of ``ekf``,
-where that runs, too. ``ekf`` is :class:`PlainEkf`; ``smoother`` begins from the bank, which is
-``large teams`` from 21 nodes on.
+where that runs, too. ``ekf`` is :class:`PlainEkf`, and ``exact`` :class:`ExactFilter`, for teams of
+two: what is possible. ``smoother`` begins from the bank, which is ``large teams`` from 21 nodes on.
 
 ``--mixed`` prints instead a line for each seed, whose team, sensors and conditions are all drawn
 (:func:`mixed`): how they do together, where nobody chose what meets what.
@@ -34,12 +34,15 @@ from relpos import fusion, tracks
 from relpos.evaluation import metrics, study
 from relpos.evaluation.executors import executor
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus, PairEstimate
+from relpos.fusion.resampling import systematic
 from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Step, Timeline
 from relpos.measurements import Prior
 from relpos.simulation import missions
 
-EKF = f"{__file__}:PlainEkf"
+TOLD = {"ekf": f"{__file__}:PlainEkf", "exact": f"{__file__}:ExactFilter"}
+"""Estimators that are told the true noise."""
+PARTICLES = 20_000
 
 
 class JointEkf:
@@ -75,18 +78,23 @@ class JointEkf:
             return self._estimate(step.time_s)
         return None
 
+    def _noise_of(self, step: Advance) -> tuple[float, float, float]:
+        """Return the variances of x, y (m^2), and of the heading (rad^2) of a displacement."""
+        s = self.noise
+        place = s.way_noise_m**2 * math.hypot(step.dx_m, step.dy_m)
+        turn = math.radians(s.heading_noise_deg) ** 2 * step.duration_s
+        turn += (s.turn_noise * step.dtheta_rad) ** 2 / max(step.fraction, 1e-9)
+        return place, place, turn
+
     def _move(self, step: Advance) -> None:
-        at, s = self.row[step.node], self.noise
+        at = self.row[step.node]
         c, n = math.cos(self.mean[at + 2]), math.sin(self.mean[at + 2])
         x, y = c * step.dx_m - n * step.dy_m, n * step.dx_m + c * step.dy_m
         jacobian = np.eye(len(self.mean))
         jacobian[at : at + 2, at + 2] = -y, x
         self.mean[at : at + 3] += x, y, step.dtheta_rad
         self.covariance = jacobian @ self.covariance @ jacobian.T
-        place = s.way_noise_m**2 * math.hypot(x, y)
-        turn = math.radians(s.heading_noise_deg) ** 2 * step.duration_s
-        turn += (s.turn_noise * step.dtheta_rad) ** 2 / max(step.fraction, 1e-9)
-        for entry, variance in enumerate((place, place, turn)):
+        for entry, variance in enumerate(self._noise_of(step)):
             self.covariance[at + entry, at + entry] += variance
 
     def _range(self, a: int, b: int, range_m: float) -> None:
@@ -134,6 +142,60 @@ class JointEkf:
         return Counter()
 
 
+class JointParticles(JointEkf):
+    """Two users' poses as particles, told the true noise: near their exact posterior."""
+
+    def __init__(self, priors: Sequence[Prior]) -> None:
+        super().__init__(priors)
+        self.rng = np.random.default_rng(0)
+        self.poses = np.repeat(self.mean[None], PARTICLES, axis=0)
+        self.log_weight = np.zeros(PARTICLES)
+
+    def _move(self, step: Advance) -> None:
+        at, noise = self.row[step.node], self._noise_of(step)
+        heading = self.poses[:, at + 2].copy()
+        c, s = np.cos(heading), np.sin(heading)
+        moved = c * step.dx_m - s * step.dy_m, s * step.dx_m + c * step.dy_m, step.dtheta_rad
+        for entry, (by, variance) in enumerate(zip(moved, noise, strict=True)):
+            drawn = self.rng.standard_normal(PARTICLES)
+            self.poses[:, at + entry] += by + math.sqrt(variance) * drawn
+
+    def _range(self, a: int, b: int, range_m: float) -> None:
+        distance = np.hypot(*(self.poses[:, b : b + 2] - self.poses[:, a : a + 2]).T)
+        self.log_weight -= 0.5 * ((range_m - distance) / self.noise.sigma_range_m) ** 2
+        weight = self._weights()
+        if 1.0 / (weight**2).sum() < 0.5 * PARTICLES:
+            self.poses = self.poses[systematic(weight, PARTICLES, self.rng)]
+            self.log_weight[:] = 0.0
+
+    def _weights(self) -> npt.NDArray[np.float64]:
+        weight = np.exp(self.log_weight - self.log_weight.max())
+        normalised: npt.NDArray[np.float64] = weight / weight.sum()
+        return normalised
+
+    def _estimate(self, time_s: float) -> Estimate:
+        """Report the mean distance, and the mean poses so far apart: those lie inside of arcs."""
+        weight = self._weights()
+        self.mean = weight @ self.poses
+        each = np.hypot(*(self.poses[:, 3:5] - self.poses[:, :2]).T)
+        distance = float(weight @ each)
+        off = self.mean[3:5] - self.mean[:2]
+        off *= 0.5 * (distance / np.hypot(*off) - 1.0)
+        self.mean[:2], self.mean[3:5] = self.mean[:2] - off, self.mean[3:5] + off
+        spread = self.poses - self.mean
+        self.covariance = (spread.T * weight) @ spread
+        whole = super()._estimate(time_s)
+        sigma = math.sqrt(weight @ (each - distance) ** 2)
+        return replace(whole, pairs=(replace(whole.pairs[0], sigma_distance_m=sigma),))
+
+
+class ExactFilter(Rewinder):
+    """The estimator around :class:`JointParticles`."""
+
+    def __init__(self, priors: Sequence[Prior] = ()) -> None:
+        super().__init__(JointParticles(priors), Timeline([p.node for p in priors]))
+
+
 class PlainEkf(Rewinder):
     """The estimator around :class:`JointEkf`."""
 
@@ -145,9 +207,8 @@ def case(
     condition: str, estimator: str, settings: dict[str, str], seconds: float | None = None
 ) -> study.Case:
     """Make one line of the table; ``seconds`` are the missions' own where None."""
-    name, given = {"ekf": (EKF, {}), "smoother": ("bank", settings)}.get(
-        estimator, (estimator, settings)
-    )
+    name = TOLD.get(estimator, "bank" if estimator == "smoother" else estimator)
+    given = {} if estimator in TOLD else settings
     label = f"{condition:18}{estimator:9}"
     scenario = f"{missions.PREFIX}-{condition}"
     overrides = {} if seconds is None else {"seconds": seconds}

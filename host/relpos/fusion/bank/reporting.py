@@ -80,6 +80,8 @@ class Report:
         pairs = self._pairs()
         vague = self._vague(pairs)
         nodes = [self._node(node, vague) for node in sorted(self.row)]
+        if len(pairs) == 1:
+            nodes = self._moved_apart(nodes[0], nodes[1], pairs[0])
         alternatives: tuple[Alternative, ...] = ()
         if ambiguous:
             nodes = [self._at_mode(n) if self.row[n.node] in ambiguous else n for n in nodes]
@@ -130,6 +132,31 @@ class Report:
             node, x, y, math.remainder(heading, math.tau), own[0][0], own[1][1], own[0][1],
             min(sigma, ANY_ANGLE_RAD), status, *presence.vertical,
         )  # fmt: skip
+
+    def _moved_apart(
+        self, one: NodeEstimate, other: NodeEstimate, pair: PairEstimate
+    ) -> list[NodeEstimate]:
+        """Report a team of two as far apart as their distance is known to be.
+
+        The mean of all places on an arc lies inside it, so that means are nearer to each other
+        than people are: ``mission-two-hour``, 0.35 m so, 0.24 moved. All pairs of six moved so
+        made the body-frame error of ``mission-line`` a tenth greater.
+        """
+        i, j = PER_NODE * self.row[one.node], PER_NODE * self.row[other.node]
+        off_m = self.mean[j : j + 2] - self.mean[i : i + 2]
+        distance_m = float(np.hypot(*off_m))
+        if distance_m == 0.0:
+            return [one, other]
+        slope = np.zeros(len(self.mean))
+        slope[j : j + 2] = off_m / distance_m
+        slope[i : i + 2] = -slope[j : j + 2]
+        along_m2 = max(float(slope @ self.covariance @ slope), 0.0)
+        gain = along_m2 / (along_m2 + pair.sigma_distance_m**2 + 1e-12)
+        east_m, north_m = 0.5 * gain * (pair.distance_m / distance_m - 1.0) * off_m
+        return [
+            replace(one, x_m=one.x_m - east_m, y_m=one.y_m - north_m),
+            replace(other, x_m=other.x_m + east_m, y_m=other.y_m + north_m),
+        ]
 
     def _parameters(self) -> tuple[Parameter, ...]:
         means, variances = self.mean.tolist(), self.covariance.diagonal().tolist()
