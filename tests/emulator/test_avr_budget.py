@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,8 +12,6 @@ from relpos.emulator.avr import budget
 from relpos.emulator.avr.budget import find_firmware, main, measure
 
 pytestmark = pytest.mark.skipif(MISSING is not None, reason=f"{MISSING} is not installed")
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def place(elf: Path, folder: Path) -> None:
@@ -112,22 +108,7 @@ def test_a_firmware_that_is_not_built_is_one_line_that_says_how(
 BOARDS = ("uno", "mega", "uno-mpu9250")  # the fourth, which has room: `make firmware`
 
 
-@pytest.fixture(scope="module")
-def built() -> Path:
-    """PlatformIO's build folder with all boards' firmware as the sources now are."""
-    environments = [word for name in BOARDS for word in ("-e", budget.ENVIRONMENTS[name])]
-    result = subprocess.run(
-        [sys.executable, str(ROOT / "tools" / "pio"), "run", *environments],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=ROOT,
-    )
-    assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-2000:]
-    return budget.default_build_folder()
-
-
 @pytest.mark.parametrize("board", BOARDS)
-def test_the_whole_firmware_stays_within_its_budgets(built: Path, board: str) -> None:
-    cost = measure(board, find_firmware(board, built), 20.0)
+def test_the_whole_firmware_stays_within_its_budgets(board: str) -> None:
+    cost = measure(board, find_firmware(board, budget.default_build_folder()), 20.0)
     assert cost.faults == (), cost

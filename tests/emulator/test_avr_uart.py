@@ -17,15 +17,10 @@ from relpos.protocol import messages as wire
 
 MISSING = missing_parts()
 pytestmark = pytest.mark.skipif(MISSING is not None, reason=str(MISSING))
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
 def uno() -> Path:
-    """The Uno's program as the sources now are."""
-    command = [ROOT / "tools" / "pio", "run", "-e", "uno"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     return find_firmware("uno", default_build_folder())
 
 

@@ -28,17 +28,7 @@ SECONDS = 15.0
 
 @pytest.fixture(scope="module")
 def uno() -> Path:
-    """The Uno's program as the sources now are."""
-    build({})
     return find_firmware("uno", default_build_folder())
-
-
-def build(environment: dict[str, str]) -> None:
-    command = [sys.executable, str(ROOT / "tools" / "pio"), "run", "-e", "uno"]
-    done = subprocess.run(
-        command, env={**os.environ, **environment}, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
 
 
 def serve(elf: Path) -> tuple[int, Service]:
@@ -109,12 +99,18 @@ def test_slow_inertial_chips_cost_no_motion(uno: Path, monkeypatch: pytest.Monke
 
 @pytest.mark.soak  # builds the firmware anew
 def test_the_bus_at_100_khz_is_a_build_that_works(tmp_path: Path) -> None:
-    build(
-        {
+    built = subprocess.run(
+        [sys.executable, str(ROOT / "tools" / "pio"), "run", "-e", "uno"],
+        env={
+            **os.environ,
             "PLATFORMIO_BUILD_DIR": str(tmp_path),
             "PLATFORMIO_BUILD_FLAGS": "-DRELPOS_TWI_HZ=100000",
-        }
+        },
+        capture_output=True,
+        text=True,
+        check=False,
     )
+    assert built.returncode == 0, built.stdout[-2000:] + built.stderr[-2000:]
     with Service(BOARDS["uno"], read_firmware(find_firmware("uno", tmp_path)), 15.0, 1) as service:
         service.run(15_000_000)
         words, faults = service.work_done()

@@ -11,14 +11,13 @@ import pytest
 from boot_loaders import (
     MEGA_ADDRESS,
     OPTIBOOT_ADDRESS,
-    ROOT,
     build_optiboot,
     mega_loader,
     needs,
 )
 
 from relpos.emulator.avr.board import BOARDS, Board, ResetCause
-from relpos.emulator.avr.budget import ENVIRONMENTS, default_build_folder, find_firmware
+from relpos.emulator.avr.budget import default_build_folder, find_firmware
 from relpos.emulator.avr.elf import read_firmware
 from relpos.link import xbee
 from relpos.protocol import messages as wire
@@ -92,16 +91,6 @@ LOADERS: dict[tuple[str, str], tuple[int, Callable[[Path], bytes]]] = {
 }
 CLEARING = (("uno", "Optiboot 4.4"), ("mega", "current"))
 """They clear MCUSR: the supply and the button cannot be told from each other."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _built():
-    kinds = sorted({kind for kind, _ in LOADERS})
-    environments = [word for kind in kinds for word in ("-e", ENVIRONMENTS[kind])]
-    done = subprocess.run(
-        [ROOT / "tools" / "pio", "run", *environments], cwd=ROOT, capture_output=True, check=False
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
 
 
 class Started:
