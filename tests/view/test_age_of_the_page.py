@@ -118,11 +118,11 @@ def test_four_seconds_after_the_link_is_lost_no_value_looks_live(
     assert page.evaluate(OVERLAPPING) == []
     expect(page.locator("#count")).to_have_text("(0 of 6 heard)")
     expect(page.locator("#find .order")).to_contain_text("no guidance")
-    for person in page.locator("#people li").all():
-        state = person.locator(".state")
-        before = state.inner_text()
-        assert "last news" in before
-        expect(state).not_to_have_text(before)
+    states = page.locator("#people li .state").all()
+    before = [state.inner_text() for state in states]
+    assert all("last news" in text for text in before)
+    for state, text in zip(states, before, strict=True):
+        expect(state).not_to_have_text(text)
     if how == "server gone":
         stage.open()
     stage.mute = False

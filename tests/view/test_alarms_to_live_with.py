@@ -145,6 +145,7 @@ def test_twenty_people_are_visible_at_once_beside_a_map_of_half_the_laptops_scre
     wait_live(page)
     people = page.locator("#people li")
     expect(people).to_have_count(20)
+    expect(page.locator("#count")).to_have_text("(20)")
     for k in range(20):
         expect(people.nth(k)).to_be_in_viewport(ratio=1)
         assert NAMES[k].split()[0][:5] in people.nth(k).inner_text()
