@@ -18,6 +18,9 @@ from relpos.evaluation import bounds, executors, study
 from relpos.evaluation.figures import FIGURES, Work, page, save
 from relpos.evaluation.figures.sheet import key
 
+OWN = f"{Path(__file__).parents[1] / 'fusion' / 'own_estimators.py'}:Adder"
+WRITTEN = ("detection", "tracks-lab")
+
 
 class Invented(Work):
     """Figures of numbers that are made up: a case's RMSE is a function of the case."""
@@ -91,22 +94,32 @@ def test_cases_that_two_figures_share_are_computed_once(monkeypatch: pytest.Monk
     assert len(asked) == len(set(asked)) == 2
 
 
-def test_the_command_writes_pictures_numbers_and_one_page_that_needs_no_other_file(
-    tmp_path: Path,
-) -> None:
-    names = ["detection", "tracks-lab"]
-    chosen = [word for name in names for word in ("--figure", name)]
-    made = CliRunner().invoke(
-        app, ["figures", *chosen, "--seeds", "2", "--workers", "1", "--out", str(tmp_path / "f")]
-    )
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the command writes, with an estimator of one's own."""
+    folder = tmp_path_factory.mktemp("figures") / "f"
+    chosen = [word for name in WRITTEN for word in ("--figure", name)]
+    options = ["--estimator", OWN, "--seeds", "2", "--workers", "1"]
+    made = CliRunner().invoke(app, ["figures", *chosen, *options, "--out", str(folder)])
     assert made.exit_code == 0, made.output
-    for name in names:
+    return folder
+
+
+def test_the_command_writes_pictures_numbers_and_one_page_that_needs_no_other_file(
+    written: Path,
+) -> None:
+    for name in WRITTEN:
         for kind in ("svg", "png", "csv"):
-            assert (tmp_path / "f" / f"{name}.{kind}").stat().st_size > 500
-    words = (tmp_path / "f" / "index.html").read_text()
-    assert words.count("src='data:image/svg+xml;base64,") == len(names)
+            assert (written / f"{name}.{kind}").stat().st_size > 500
+    words = (written / "index.html").read_text()
+    assert words.count("src='data:image/svg+xml;base64,") == len(WRITTEN)
     assert not re.search(r"(src|href)=['\"](?!data:)", words)
     assert "--seeds 2" in words
+
+
+def test_an_estimator_of_ones_own_is_drawn_beside_ours(written: Path) -> None:
+    assert "Adder" in (written / "tracks-lab.svg").read_text()
+    assert OWN in (written / "tracks-lab.csv").read_text()
 
 
 def test_an_unknown_figure_is_wrong_usage_that_names_the_known_ones(tmp_path: Path) -> None:

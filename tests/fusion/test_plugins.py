@@ -132,16 +132,6 @@ def test_an_unknown_name_is_wrong_usage_that_names_the_known_ones(directory: Pat
     assert "particle" in made.stderr
 
 
-def test_figures_draw_it_beside_ours(tmp_path: Path) -> None:
-    made = command(
-        "figures", "--figure", "tracks-lab", "--estimator", f"{OWN}:Adder", "--seeds", 2,
-        "--workers", 1, "--out", tmp_path,
-    )  # fmt: skip
-    assert made.exit_code == 0, made.output
-    assert "Adder" in (tmp_path / "tracks-lab.svg").read_text()
-    assert f"{OWN}:Adder" in (tmp_path / "tracks-lab.csv").read_text()
-
-
 def test_figures_report_a_plugin_that_cannot_be_loaded_before_anything_is_drawn(
     tmp_path: Path,
 ) -> None:
