@@ -22,6 +22,7 @@ def findings(page: Page) -> list[str]:
     # The themes differ in nothing but colours.
     for theme, rules in (("light", {}), ("dark", {"runOnly": COLOURS})):
         page.emulate_media(color_scheme=theme)  # type: ignore[arg-type]
+        expect(page.locator("html")).to_have_attribute("data-theme", theme)
         violations = page.evaluate(
             """(given) => axe.run(document, { resultTypes: ["violations"], ...given })
                 .then((found) => found.violations)""",

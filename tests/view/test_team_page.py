@@ -563,7 +563,6 @@ NAMELESS = """() => [...document.querySelectorAll(
     .map((e) => e.outerHTML.slice(0, 120))"""
 TWICE = """() => { const ids = [...document.querySelectorAll("[id]")].map((e) => e.id);
     return ids.filter((id, k) => ids.indexOf(id) !== k); }"""
-GROUND = "getComputedStyle(document.body).backgroundColor"
 # Contrast of every visible text with what is painted behind it.
 PALE = """() => {
     const parse = (css) => (css.match(/[\\d.]+/g) || []).map(Number);
@@ -594,7 +593,7 @@ def test_everything_has_a_name_and_enough_contrast(visit, stage: Stage):
     stage.team.still_since = {2: stage.at_s - 60.0, 4: stage.at_s - 22.0}
     stage.team.health = {3: ("yellow", ("weak radio",))}
     stage.team.notices = (disk_full(),)
-    page = visit(color_scheme="light", reduced_motion="reduce")
+    page = visit(reduced_motion="reduce")
     wait_live(page)
     page.locator("#layers summary").click()
     page.get_by_role("button", name="Table").click()
@@ -605,11 +604,10 @@ def test_everything_has_a_name_and_enough_contrast(visit, stage: Stage):
     assert page.evaluate(NAMELESS) == []
     assert page.evaluate(TWICE) == []
     assert page.evaluate("document.documentElement.lang") == "en"
-    ground = page.evaluate(GROUND)
-    assert page.evaluate(PALE) == []
-    page.emulate_media(color_scheme="dark")
-    assert page.evaluate(GROUND) != ground
-    assert page.evaluate(PALE) == []
+    for theme in ("light", "dark"):
+        page.emulate_media(color_scheme=theme)
+        expect(page.locator("html")).to_have_attribute("data-theme", theme)
+        assert page.evaluate(PALE) == []
 
 
 def test_a_table_states_what_the_map_shows(visit, stage: Stage):
@@ -665,14 +663,15 @@ def test_it_fits_screens_from_a_small_phone_to_a_wall(visit, stage: Stage, width
 def test_the_theme_follows_the_system_until_somebody_chooses(visit, stage: Stage):
     page = visit(color_scheme="dark")
     wait_live(page)
-    assert rgb(page.evaluate(GROUND)) == [11, 16, 22]
+    ground = "getComputedStyle(document.body).backgroundColor"
+    assert rgb(page.evaluate(ground)) == [11, 16, 22]
     page.emulate_media(color_scheme="light")
-    wait_for(lambda: rgb(page.evaluate(GROUND)) == [255, 255, 255])
+    wait_for(lambda: rgb(page.evaluate(ground)) == [255, 255, 255])
     page.get_by_role("button", name="Dark theme").click()
-    assert rgb(page.evaluate(GROUND)) == [11, 16, 22]
+    assert rgb(page.evaluate(ground)) == [11, 16, 22]
     page.reload()
     wait_live(page)
-    assert rgb(page.evaluate(GROUND)) == [11, 16, 22]
+    assert rgb(page.evaluate(ground)) == [11, 16, 22]
     wait_for(lambda: page.evaluate(PIXELS, [[-300, 250]])[0][0] < 40)
 
 
