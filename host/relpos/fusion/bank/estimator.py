@@ -20,7 +20,8 @@ import numpy.typing as npt
 from relpos.errors import RelposError
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.detection_update import Attempts
-from relpos.fusion.bank.reporting import Report, unknown_headings
+from relpos.fusion.bank.mirrored import open_nodes
+from relpos.fusion.bank.reporting import Report
 from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import PER_NODE, CommonIndex, StateIndex
 from relpos.fusion.clocks import Clocks
@@ -537,10 +538,10 @@ class Bank:
         since_s, self._epoch_s = self._epoch_s, time_s
         mean, covariance, common = self.core.moments()
         self.core.relocalisation.end_ambiguity(covariance)
+        unsure = self.handedness.unsure(*open_nodes(self._row, self.core, covariance))
         report = Report(
             time_s, self._row, self._known, self.core, mean, covariance, covariance + common,
-            self.initialiser, self.detection, self.clocks,
-            self.handedness.unsure(unknown_headings(self._row, covariance), self._row),
+            self.initialiser, self.detection, self.clocks, unsure,
         )  # fmt: skip
         estimate = report.estimate(self.north.known())
         if since_s > -math.inf:

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from relpos.fusion.bank import mixture as mixture_kernels
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.hypothesis_models import RangeErrors
+from relpos.fusion.bank.mirrored import VAGUE_RAD
 from relpos.fusion.bank.storage import PER_NODE, CommonIndex, StateIndex
 from relpos.fusion.clocks import Clocks
 from relpos.fusion.estimator import (
@@ -39,9 +40,8 @@ from relpos.fusion.modes import alternatives_of, belief_of
 
 Floats = npt.NDArray[np.float64]
 
-VAGUE_M, VAGUE_RAD = 2.0, math.radians(45.0)
-"""A user whose distance to every peer, or whose heading relative to every peer's, has a larger
-standard deviation is ambiguous."""
+VAGUE_M = 2.0
+"""A user whose distance to every peer has a larger standard deviation is ambiguous."""
 
 MOST_LISTED = 200
 """Hypotheses that alternatives are made of after an odometry fault."""
@@ -326,21 +326,6 @@ class Report:
             return ()
         nodes, poses, spread = self._whole_team(mixture)
         return alternatives_of(self.time_s, nodes, mixture.weights, poses, spread)
-
-
-def unknown_headings(row: Mapping[int, int], covariance: Floats) -> set[int]:
-    """Return the nodes whose heading is too uncertain relative to every other's.
-
-    ``covariance`` (D, D) is without the team's rotation.
-    """
-    if len(row) < 2:
-        return set()
-    place = PER_NODE * np.array(list(row.values())) + StateIndex.HEADING
-    own = covariance[np.ix_(place, place)]
-    apart = own.diagonal()[:, None] + own.diagonal() - 2.0 * own
-    np.fill_diagonal(apart, np.inf)
-    unknown = apart.min(axis=1) > VAGUE_RAD**2
-    return {node for node, bad in zip(row, unknown, strict=True) if bad}
 
 
 def _pair_of_mixture(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import cmath
-from collections.abc import Collection, Set
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -48,28 +48,34 @@ class _Way:
 
 @dataclass(slots=True)
 class Handedness:
-    """Remembers whose heading was unknown, until somebody's way has bent.
+    """Remembers whose heading or side was open, until a way beside it has bent.
 
     A team that goes straight on has the same distances as its mirror image, so that what they say
-    of unknown headings may be said of the image. The first bent way tells them apart; who turns on
-    the spot tells nothing.
+    of unknown headings, or of who has left a line, may be said of the image. The first bent way of
+    those whose distance is known tells them apart; who turns on the spot tells nothing.
     """
 
     _open: set[int] = field(default_factory=set)
     _ways: dict[int, _Way] = field(default_factory=dict)
-    """Node -> its way since all headings are known."""
+    """Node -> its way since nothing has been open."""
 
     def move(self, node: int, dx_m: float, dy_m: float, turn_rad: float) -> None:
         """Add a node's reported displacement (m, forward and left) and turn."""
         if self._open:
             self._ways.setdefault(node, _Way()).move(dx_m, dy_m, turn_rad)
 
-    def unsure(self, unknown: Set[int], nodes: Collection[int]) -> set[int]:
-        """Return who may be its mirror image, of ``nodes`` with ``unknown`` headings among them."""
+    def unsure(self, unknown: Set[int], near: Mapping[int, Set[int]]) -> set[int]:
+        """Return who may be its mirror image.
+
+        ``unknown`` are those whose heading or side is open now, ``near`` each node's peers whose
+        distance to it is known.
+        """
         self._open |= unknown
         if unknown:
             self._ways.clear()
-        elif any(way.bend_m() > BENT_M for way in self._ways.values()):
-            self._open.clear()
+        bent = {node for node, way in self._ways.items() if way.bend_m() > BENT_M}
+        self._open -= {n for n in self._open if bent & {n, *near.get(n, ())}}
+        if not self._open:
             self._ways.clear()
-        return self._open | unknown if len(nodes) - len(self._open) < PLACED else set(unknown)
+        placing = near.keys() - self._open
+        return {n for n in self._open if len(placing & near.get(n, set())) < PLACED} | unknown
