@@ -133,7 +133,9 @@ def crosses_a_line(seed: int) -> tuple[np.ndarray, np.ndarray, list[Measurement]
 
 
 # Of twelve seeds these and 5 were told wrong; 5 still is: no hypothesis is on the right side.
-@pytest.mark.parametrize("seed", [1, 2, 3, 8, 9])
+@pytest.mark.parametrize(
+    "seed", [2, 3, *(pytest.param(seed, marks=pytest.mark.soak) for seed in (1, 8, 9))]
+)
 def test_who_leaves_a_line_is_not_told_on_the_wrong_side(seed: int) -> None:
     places, headings, rows = crosses_a_line(seed)
     priors = [Prior(n + 1, z.real, z.imag, headings[n]) for n, z in enumerate(places[0])]
