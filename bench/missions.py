@@ -6,7 +6,8 @@
 
 prints, for each condition of ``relpos.simulation.missions`` and each estimator: distance, aligned
 and body-frame RMSE (m) and distance NEES, means over the seeds; of the pair-seconds with status
-ok the shares whose distance errs by more than three sigmas and by more than 2 m (%); the worst
+ok the shares whose distance errs by more than three sigmas and by more than 2 m, and of the
+triangles of ok pairs the share that is told mirrored (%); the worst
 seed's distance RMSE; processor seconds of a run; and the body-frame RMSE over that of ``ekf``,
 where that runs, too. ``ekf`` is :class:`PlainEkf`, and ``exact`` :class:`ExactFilter`, for teams of
 two: what is possible. ``smoother`` begins from the bank, which is ``large teams`` from 21 nodes on.
@@ -222,6 +223,7 @@ def row_of(made: study.Outcome, plain: study.Outcome | None) -> str:
         f"{made.case.label:27}{made.distance_m.mean:9.2f}{made.aligned_m.mean:9.2f}"
         f"{made.body_frame_m.mean:8.2f}{ratio:7.2f}{made.nees.mean:8.2f}"
         f"{100 * made.ok_over_3_sigma.mean:8.1f}{100 * made.ok_over_2_m.mean:7.1f}"
+        f"{100 * made.ok_wrong_side.mean:8.2f}"
         f"{made.distance_m.worst:8.2f}{made.busy_s.mean:7.1f}"
         + "".join(f"  {reason}" for reason in made.failures[:1])
     )
@@ -349,7 +351,7 @@ def main() -> None:
         print(f"seeds {seeds[0]} to {seeds[-1]}; m, means; shares of the ok pair-seconds in %")
         print(
             f"{'':27}{'distance':>9}{'aligned':>9}{'body':>8}{'/ekf':>7}{'NEES':>8}{'>3 sig':>8}"
-            f"{'>2 m':>7}{'worst':>8}{'s/run':>7}"
+            f"{'>2 m':>7}{'mirror':>8}{'worst':>8}{'s/run':>7}"
         )
         if given.mixed:
             for name in given.estimators.split(","):

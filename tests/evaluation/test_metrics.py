@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relpos.evaluation.metrics import evaluate, over_seeds
+from relpos.evaluation.sides import share_on_wrong_side
 from relpos.tracks import PairTrack, Track, interpolate, whole_seconds
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -258,3 +259,17 @@ def test_a_row_of_a_week_later_costs_neither_memory_nor_time():
     _, peak_bytes = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak_bytes < 10e6
+
+
+def test_a_triangle_counts_as_mirrored_where_its_pairs_are_ok_and_it_is_no_line() -> None:
+    truth = np.repeat(np.array([[0.0, 10.0, 5.0 + 4.0j, 80.0]]), 5, axis=0)
+    told = truth.copy()
+    told[1:4, 2] = 5.0 - 4.0j
+    told[4, 2] = 5.0 - 0.5j
+    ok = np.ones((5, 4, 4), dtype=bool)
+    ok[3, 0, 2] = ok[3, 2, 0] = False
+    # The first three are the triangle of each of them; the fourth has one with two of them.
+    assert share_on_wrong_side(told, truth, ok) == pytest.approx((2 * 4 + 1) / (4 * 4 + 1))
+    # A rotated team is none.
+    assert share_on_wrong_side(1j * truth + 3.0, truth, ok) == 0.0
+    assert math.isnan(share_on_wrong_side(told[:, :2], truth[:, :2], ok[:, :2, :2]))

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from relpos.evaluation.sides import share_on_wrong_side
 from relpos.tracks import Pair, Pairs, PairTrack, Tracks, align, interpolate, sample, whole_seconds
 
 Floats = npt.NDArray[np.float64]
@@ -70,6 +71,8 @@ class Metrics:
     ok_over_3_sigma: float = math.nan
     ok_over_2_m: float = math.nan
     """Of the pair-seconds with status ok, the shares whose distance errs by more."""
+    ok_wrong_side: float = math.nan
+    """Of the triangles whose pairs are ok, the share that is told mirrored."""
 
     @property
     def epochs(self) -> int:
@@ -124,6 +127,9 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
         there = known[epoch]
         position_squared[epoch, there] = aligned_squared_distances(p[epoch, there], q[epoch, there])
 
+    told = np.zeros((at_s.size, count, count), dtype=np.bool_)
+    for k, (i, j) in enumerate(pair_indices):
+        told[:, i, j] = told[:, j, i] = ok[:, k] == 1.0
     error_m = estimated_m - true_m
     relied_on = ok == 1.0
     figures = np.concatenate((error_m, position_squared, nees), axis=1)
@@ -156,6 +162,9 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
         pair_true_distance_m=true_m[scored],
         ok_over_3_sigma=_share_above(nees[relied_on], 3.0**2),
         ok_over_2_m=_share_above(np.abs(error_m[relied_on]), 2.0),
+        ok_wrong_side=share_on_wrong_side(
+            p[..., 0] + 1j * p[..., 1], q[..., 0] + 1j * q[..., 1], told
+        ),
         nees_left_out=sum(_certain_rows(_of_pair(pairs or {}, pair)) for pair in pair_ids),
     )
 

@@ -69,6 +69,7 @@ class Score:
     failure: str = ""
     ok_over_3_sigma: float = math.nan
     ok_over_2_m: float = math.nan
+    ok_wrong_side: float = math.nan
     vertical: Vertical | None = None
 
 
@@ -106,6 +107,7 @@ def score(case: Case, seed: int) -> Score:
         failure,
         result.ok_over_3_sigma,
         result.ok_over_2_m,
+        result.ok_wrong_side,
         vertical.score(estimates, truth, run.floors_m, run.events),
     )
 
@@ -168,6 +170,11 @@ class Outcome:
     def ok_over_2_m(self) -> Statistic:
         """Of the pair-seconds with status ok, the share that errs by more than 2 m."""
         return Statistic.of([s.ok_over_2_m for s in self.scores])
+
+    @property
+    def ok_wrong_side(self) -> Statistic:
+        """Of the triangles whose pairs are ok, the share that is told mirrored."""
+        return Statistic.of([s.ok_wrong_side for s in self.scores])
 
     @property
     def busy_s(self) -> Statistic:

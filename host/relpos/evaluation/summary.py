@@ -32,6 +32,7 @@ def as_json(metrics: Metrics) -> dict[str, Any]:
         "nees_left_out": metrics.nees_left_out,
         "ok_over_3_sigma": figure(metrics.ok_over_3_sigma),
         "ok_over_2_m": figure(metrics.ok_over_2_m),
+        "ok_wrong_side": figure(metrics.ok_wrong_side),
         "pairs": [
             {
                 "node": node,
