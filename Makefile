@@ -65,7 +65,7 @@ board-builds: $(DEVELOP) | system-avr
 	$(call title,Firmware for both boards and both sensors)
 	tools/pio run -e uno -e megaatmega2560 -e uno_mpu9250 -e megaatmega2560_mpu9250
 
-coverage: $(DEVELOP) | system-avr system-browser ## share of lines that tests reach: firmware/lib, host/relpos
+coverage: board-builds | system-browser ## share of lines that tests reach: firmware/lib, host/relpos
 	$(call title,Firmware suites on this computer, line by line)
 	rm -rf .build/pio/build/native_coverage
 	tools/pio test -e native_coverage
