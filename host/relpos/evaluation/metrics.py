@@ -127,11 +127,11 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
         there = known[epoch]
         position_squared[epoch, there] = aligned_squared_distances(p[epoch, there], q[epoch, there])
 
-    told = np.zeros((at_s.size, count, count), dtype=np.bool_)
-    for k, (i, j) in enumerate(pair_indices):
-        told[:, i, j] = told[:, j, i] = ok[:, k] == 1.0
     error_m = estimated_m - true_m
     relied_on = ok == 1.0
+    between = np.zeros((at_s.size, count, count), dtype=np.bool_)
+    for k, (i, j) in enumerate(pair_indices):
+        between[:, i, j] = between[:, j, i] = relied_on[:, k] & np.isfinite(error_m[:, k])
     figures = np.concatenate((error_m, position_squared, nees), axis=1)
     scored = np.flatnonzero(np.isfinite(figures).any(axis=1))
     return Metrics(
@@ -163,7 +163,7 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
         ok_over_3_sigma=_share_above(nees[relied_on], 3.0**2),
         ok_over_2_m=_share_above(np.abs(error_m[relied_on]), 2.0),
         ok_wrong_side=share_on_wrong_side(
-            p[..., 0] + 1j * p[..., 1], q[..., 0] + 1j * q[..., 1], told
+            p[..., 0] + 1j * p[..., 1], q[..., 0] + 1j * q[..., 1], between
         ),
         nees_left_out=sum(_certain_rows(_of_pair(pairs or {}, pair)) for pair in pair_ids),
     )

@@ -11,7 +11,7 @@ Complexes = npt.NDArray[np.complex128]
 Floats = npt.NDArray[np.float64]
 
 ASIDE_M = 0.7
-"""Who is nearer to the line of the two others is on no side."""
+"""Who is nearer to the line of the two others is on no side; no estimator knows of this bound."""
 
 
 def share_on_wrong_side(

@@ -225,6 +225,11 @@ class BankCore:
         weight, _ = these.normalise()
         return mixture.predicted_ranges(these.arrays.x, these.arrays.p, weight, first, second, dz_m)
 
+    def distances(self, rows: Indices) -> tuple[Floats, Floats]:
+        """Return means and standard deviations (P,) of the distances of every two of ``rows``."""
+        i, k = np.triu_indices(len(rows), 1)
+        return self.predicted_ranges(rows[i], rows[k], np.zeros(len(i)))
+
     def end_instant(self) -> None:
         """Resize, relocalise, resample where the weights are uneven, and perturb a few."""
         these, relocalisation = self.hypotheses, self.relocalisation

@@ -538,10 +538,14 @@ class Bank:
         since_s, self._epoch_s = self._epoch_s, time_s
         mean, covariance, common = self.core.moments()
         self.core.relocalisation.end_ambiguity(covariance)
-        unsure = self.handedness.unsure(*open_nodes(self._row, self.core, covariance))
+        rows = np.array([self._row[node] for node in sorted(self._row)], dtype=np.int64)
+        distances = self.core.distances(rows)
+        unsure = self.handedness.unsure(
+            *open_nodes(self._row, self.core.hypotheses, covariance, distances[1])
+        )
         report = Report(
             time_s, self._row, self._known, self.core, mean, covariance, covariance + common,
-            self.initialiser, self.detection, self.clocks, unsure,
+            self.initialiser, self.detection, self.clocks, distances, unsure,
         )  # fmt: skip
         estimate = report.estimate(self.north.known())
         if since_s > -math.inf:

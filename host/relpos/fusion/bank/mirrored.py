@@ -1,8 +1,9 @@
 """Which located nodes the hypotheses leave open between the team and its mirror image.
 
-Both have the same distances. Who has no heading relative to the others may be on either side; and
-of three who walk in a line for a while nothing tells to which side they leave it, if their headings
-are not known well enough. :class:`~relpos.fusion.models.handedness.Handedness` remembers them.
+Both have the same distances (flip ambiguity). Who has no heading relative to the others may be on
+either side; and of three who walk in a line for a while nothing tells to which side they leave it,
+if their headings are not known well enough.
+:class:`~relpos.fusion.models.handedness.Handedness` remembers them.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.bank import storage
-from relpos.fusion.bank.core import BankCore
+from relpos.fusion.bank.hypothesis_set import HypothesisSet
 from relpos.fusion.bank.storage import PER_NODE, StateIndex
 from relpos.fusion.estimator import VAGUE_PAIR_M
 
@@ -81,17 +82,18 @@ def open_sides(
 
 
 def open_nodes(
-    row: Mapping[int, int], core: BankCore, covariance: Floats
+    row: Mapping[int, int], these: HypothesisSet, covariance: Floats, sigma_m: Floats
 ) -> tuple[set[int], dict[int, set[int]]]:
     """Return who is open, and of each located node those whose distance to it is known.
 
-    ``covariance`` (D, D) is without the team's rotation.
+    ``covariance`` (D, D) is without the team's rotation, ``sigma_m`` (P,) the deviations of the
+    distances of every two nodes, in order.
     """
-    nodes, rows = list(row), np.array(list(row.values()), dtype=np.int64)
+    nodes = sorted(row)
     if len(nodes) < 2:
         return set(), {node: set() for node in nodes}
-    these, (i, k) = core.hypotheses, np.triu_indices(len(rows), 1)
-    _, sigma_m = core.predicted_ranges(rows[i], rows[k], np.zeros(len(i)))
+    rows = np.array([row[node] for node in nodes], dtype=np.int64)
+    i, k = np.triu_indices(len(rows), 1)
     near = np.zeros((len(rows), len(rows)), dtype=np.bool_)
     near[i, k] = near[k, i] = sigma_m < VAGUE_PAIR_M
     is_open = unknown_headings(covariance, rows)

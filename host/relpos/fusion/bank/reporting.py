@@ -66,6 +66,8 @@ class Report:
     detection: Detection
     clocks: Clocks
     """What of the time stamps has been put right, beside the state."""
+    distances: tuple[Floats, Floats]
+    """Means and deviations (P,) of the distances of every two located nodes, in order (m)."""
     unsure: Collection[int] = ()
     """Nodes whose heading is not known relative to any other's, or may be mirrored."""
 
@@ -234,8 +236,7 @@ class Report:
         rows = np.array([self.row[node] for node in nodes], dtype=np.int64)
         bearings = mixture_kernels.bearings(self.mean, self.world_covariance, rows)
         i, k = np.triu_indices(len(rows), 1)
-        first, second = rows[i], rows[k]
-        distances, sigmas = self.core.predicted_ranges(first, second, np.zeros(len(first)))
+        distances, sigmas = self.distances
         own_m2 = np.array([self.presence[node].uneven_m2 for node in nodes])
         scale_m = self._range_scale_sd() * distances
         sigmas = np.sqrt(sigmas**2 + own_m2[i] + own_m2[k] + scale_m**2)

@@ -74,7 +74,7 @@ class Handedness:
         if unknown:
             self._ways.clear()
         bent = {node for node, way in self._ways.items() if way.bend_m() > BENT_M}
-        self._open -= {n for n in self._open if bent & {n, *near.get(n, ())}}
+        self._open -= bent | {n for n in self._open if bent & near.get(n, set())}
         if not self._open:
             self._ways.clear()
         placing = near.keys() - self._open
