@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion.models.motion import SCALES_TELL
+
 Floats = npt.NDArray[np.float64]
 
 X, Y, HEADING, DRIFT, SCALE = range(5)
@@ -88,11 +90,13 @@ def update(
     dz: float,
     sigma2: float,
     outlier: tuple[float, float, float],
+    nodes: int,
     more: Floats | None = None,
     again: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Floats, Floats, float]:
     """One range; gives the state and the log evidence (without the constant 2 pi).
 
+    Where it does not tell of all step scales in common, their mean stays (partial update).
     ``more`` (D,) is the slope of what is added to the distance; ``again`` the part of the outlier
     share that repeats the last outlier, and how far that was off.
     """
@@ -109,9 +113,25 @@ def update(
     inlier = good / (good + bad)
     k = gain / s
     # Used with probability inlier: the mixture's mean and its full covariance.
-    x = x + inlier * k * nu
+    # (I - K h^T) P (I - K h^T)^T + K S K^T with less than the whole gain, by that of the whole.
+    held = held_gain(p, gain, variance, nodes) / s
+    x = x + inlier * (k - held) * nu
     p = p - inlier * s * np.outer(k, k) + inlier * (1.0 - inlier) * nu**2 * np.outer(k, k)
+    p = p + inlier * s * np.outer(held, held)
     return x, p, float(np.log(good + bad))
+
+
+def held_gain(p: Floats, gain: Floats, variance: float, nodes: int) -> Floats:
+    """Return P h (D,) as far as it is not used: of the step scales' mean, without evidence."""
+    scales = np.zeros(len(gain))
+    scales[SCALE : PER_NODE * nodes : PER_NODE] = 1.0
+    mean = scales / nodes
+    if not mean @ p @ mean:
+        return 0.0 * scales
+    # The slope of a range in what all scales have in common, by regression.
+    slope = (mean @ gain) / (mean @ p @ mean)
+    used = max(1.0 - SCALES_TELL * variance / slope**2, 0.0)
+    return (1.0 - used) * (mean @ gain) * scales
 
 
 def common_terms(

@@ -166,7 +166,7 @@ def test_a_range_is_the_reference_implementation(
     x, p = states(6, 3)
     outlier = (max(OUTLIER[0], 1.2 * again[0]), *OUTLIER[1:])
     expected = [
-        reference.update(a, b, 0, 2, measured, dz, 0.04, outlier, again=again)
+        reference.update(a, b, 0, 2, measured, dz, 0.04, outlier, NODES, again=again)
         for a, b in zip(x, p, strict=True)
     ]
     evidence = updated(x, p, measured, dz, outlier, again=again)

@@ -73,7 +73,7 @@ def test_a_range_with_all_terms_is_the_reference_implementation() -> None:
         # What is in the mean already is not to be added again.
         measured = 17.5 + slope_k[entry] * square
         expected = reference.update(
-            x_k, p_k, 0, 2, measured, np.sqrt(square), sigma2[k], outlier, slope_k
+            x_k, p_k, 0, 2, measured, np.sqrt(square), sigma2[k], outlier, NODES, slope_k
         )
         assert after[0][k] == pytest.approx(expected[0], rel=1e-3, abs=1e-3)
         assert after[1][k] == pytest.approx(expected[1], rel=1e-3, abs=1e-3)
@@ -146,11 +146,11 @@ def test_ranges_that_grow_with_the_logarithm_of_the_distance_make_no_distance_lo
 def test_distances_are_less_sure_where_walls_may_be_a_scale_of_ranges() -> None:
     conditions = {"nodes": 5, "area_m": 30, "walls": 1, "max_range_m": 30, "range_rate_hz": 2.0}
     over = []
-    for seed in (703, 707):
+    for seed in (707, 708):
         run = relpos.simulate("mission-base", seed, seconds=90, sigma_range_m=0.05, **conditions)
         over.append(relpos.evaluate(relpos.fuse(run), run, bound=False).metrics.ok_over_3_sigma)
-    # 0.128 without a deviation in proportion to the distance.
-    assert np.mean(over) < 0.08
+    # 0.100 without a deviation in proportion to the distance.
+    assert np.mean(over) < 0.06
 
 
 def test_where_nothing_is_off_nothing_is_learned_and_nothing_told() -> None:

@@ -27,9 +27,10 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.bank import lanes
-from relpos.fusion.bank.lanes import Lanes, fill, greater, load, select, some, store
+from relpos.fusion.bank.lanes import Lanes, fill, greater, lesser, load, select, some, store
 from relpos.fusion.bank.storage import (
     COMMON,
+    CONSTANTS,
     PER_NODE,
     POSE,
     TINY,
@@ -42,6 +43,7 @@ from relpos.fusion.bank.storage import (
     row_place,
 )
 from relpos.fusion.compiled import compiled, inner
+from relpos.fusion.models.motion import SCALES_TELL
 from relpos.fusion.models.ranging import (
     AGAIN_M,
     GROWTH_LEAST_M,
@@ -343,6 +345,42 @@ def _carry_sensitivities(
         store(stats, at + (SHARES + 3 + part) * blocks, grown)
 
 
+@inner
+def _correct(
+    block: Block, nodes: int, g: Floats, predicted: Lanes, factors: tuple[Lanes, Lanes, Lanes]
+) -> None:
+    """Update with a range, but for all step scales in common where it tells nothing of them.
+
+    Where all walk side by side, the noise of their headings alone makes a range change with the
+    common scale, and shorter steps explain that noise better. So their mean is partly updated
+    (partial-update Schmidt-Kalman filter, Brink 2017). ``predicted`` is the predicted range's
+    variance, ``factors`` those of ``g``: of the means, of the covariances, and without outliers.
+    """
+    x, p, at_x, base, active = block
+    move, shrink, gain_factor = factors
+    correct(block, g, move, shrink)
+    if active <= POSE * nodes:
+        return
+    begin, per = POSE * nodes + 1, 1.0 / nodes
+    gain, variance = fill(0.0), fill(0.0)
+    for i in range(begin, begin + CONSTANTS * nodes, CONSTANTS):
+        gain = gain + per * load(g, i)
+        row = base + row_place(i)
+        for j in range(begin, i, CONSTANTS):
+            variance = variance + 2.0 * load(p, row + j)
+        variance = variance + load(p, row + i)
+    # Of the mean of all scales, as it was before the range.
+    variance = per * per * variance + shrink * gain * gain
+    slope = gain / (variance + TINY)
+    held = gain * lesser(SCALES_TELL * predicted / (slope * slope + TINY), fill(1.0))
+    back, spread = held * move, held * held * gain_factor
+    for i in range(begin, begin + CONSTANTS * nodes, CONSTANTS):
+        store(x, at_x + i, load(x, at_x + i) - back)
+        row = base + row_place(i)
+        for j in range(begin, i + 1, CONSTANTS):
+            store(p, row + j, load(p, row + j) + spread)
+
+
 @compiled
 def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Floats) -> None:
     """Update with ranges (R,) one after another; each hypothesis' log weight gets their evidence.
@@ -419,7 +457,7 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
             per_heavy = 1.0 / (v + variance * (1.0 / count))
             kf = inlier * per_heavy
             shrink = kf * (1.0 - (1.0 - inlier) * (innovation * innovation) * per_heavy)
-            correct(block, g, kf * innovation, shrink)
+            _correct(block, nodes, g, v, (kf * innovation, shrink, kf))
             at = r * STATS * blocks + b
             store(stats, at, ranges.range_m[r] - innovation)
             store(stats, at + VARIANCE * blocks, s)
