@@ -96,7 +96,7 @@ def update(
 ) -> tuple[Floats, Floats, float]:
     """One range; gives the state and the log evidence (without the constant 2 pi).
 
-    Where it does not tell of all step scales in common, their mean stays (partial update).
+    Where it does not tell of both users' common step scale, that stays (partial update).
     ``more`` (D,) is the slope of what is added to the distance; ``again`` the part of the outlier
     share that repeats the last outlier, and how far that was off.
     """
@@ -114,24 +114,27 @@ def update(
     k = gain / s
     # Used with probability inlier: the mixture's mean and its full covariance.
     # (I - K h^T) P (I - K h^T)^T + K S K^T with less than the whole gain, by that of the whole.
-    held = held_gain(p, gain, variance, nodes) / s
+    held = held_gain(p, gain, variance, (first, second), nodes) / s
     x = x + inlier * (k - held) * nu
     p = p - inlier * s * np.outer(k, k) + inlier * (1.0 - inlier) * nu**2 * np.outer(k, k)
     p = p + inlier * s * np.outer(held, held)
     return x, p, float(np.log(good + bad))
 
 
-def held_gain(p: Floats, gain: Floats, variance: float, nodes: int) -> Floats:
-    """Return P h (D,) as far as it is not used: of the step scales' mean, without evidence."""
-    scales = np.zeros(len(gain))
+def held_gain(
+    p: Floats, gain: Floats, variance: float, users: tuple[int, int], nodes: int
+) -> Floats:
+    """Return P h (D,) as far as it is not used: of two users' common step scale, by regression."""
+    mean, scales = np.zeros(len(gain)), np.zeros(len(gain))
+    for user in users:
+        mean[PER_NODE * user + SCALE] = 0.5
     scales[SCALE : PER_NODE * nodes : PER_NODE] = 1.0
-    mean = scales / nodes
     if not mean @ p @ mean:
         return 0.0 * scales
-    # The slope of a range in what all scales have in common, by regression.
     slope = (mean @ gain) / (mean @ p @ mean)
     used = max(1.0 - SCALES_TELL * variance / slope**2, 0.0)
-    return (1.0 - used) * (mean @ gain) * scales
+    held: Floats = (1.0 - used) * slope * (p @ mean) * scales
+    return held
 
 
 def common_terms(

@@ -347,38 +347,43 @@ def _carry_sensitivities(
 
 @inner
 def _correct(
-    block: Block, nodes: int, g: Floats, predicted: Lanes, factors: tuple[Lanes, Lanes, Lanes]
-) -> None:
-    """Update with a range, but for all step scales in common where it tells nothing of them.
+    block: Block, users: tuple[int, int, int], g: Floats, predicted: Lanes,
+    factors: tuple[Lanes, Lanes, Lanes], along: Floats,
+) -> None:  # fmt: skip
+    """Update with a range, but for its users' common step scale where it tells nothing of that.
 
-    Where all walk side by side, the noise of their headings alone makes a range change with the
-    common scale, and shorter steps explain that noise better. So their mean is partly updated
-    (partial-update Schmidt-Kalman filter, Brink 2017). ``predicted`` is the predicted range's
-    variance, ``factors`` those of ``g``: of the means, of the covariances, and without outliers.
+    Where both walk side by side, the noise of their headings alone makes the range change with
+    their common scale, and shorter steps explain that noise better. So it is partly updated, and
+    the other scales as far as they follow from it (partial-update Schmidt-Kalman filter, Brink
+    2017). ``users`` are N and the two rows, ``predicted`` is the predicted range's variance,
+    ``factors`` are those of ``g``: of the means, of the covariances, and without outliers;
+    ``along`` is scratch.
     """
     x, p, at_x, base, active = block
     move, shrink, gain_factor = factors
     correct(block, g, move, shrink)
+    nodes, first, second = users
     if active <= POSE * nodes:
         return
-    begin, per = POSE * nodes + 1, 1.0 / nodes
-    gain, variance = fill(0.0), fill(0.0)
-    for i in range(begin, begin + CONSTANTS * nodes, CONSTANTS):
-        gain = gain + per * load(g, i)
-        row = base + row_place(i)
-        for j in range(begin, i, CONSTANTS):
-            variance = variance + 2.0 * load(p, row + j)
-        variance = variance + load(p, row + i)
-    # Of the mean of all scales, as it was before the range.
-    variance = per * per * variance + shrink * gain * gain
-    slope = gain / (variance + TINY)
-    held = gain * lesser(SCALES_TELL * predicted / (slope * slope + TINY), fill(1.0))
+    begin = POSE * nodes + 1
+    i, j = begin + CONSTANTS * first, begin + CONSTANTS * second
+    gain = 0.5 * (load(g, i) + load(g, j))
+    # Covariances with the mean of both scales, as they were before the range.
+    for k in range(nodes):
+        q = begin + CONSTANTS * k
+        both = load(p, base + place(q, i)) + load(p, base + place(q, j))
+        store(along, k, 0.5 * both + shrink * gain * load(g, q))
+    variance = 0.5 * (load(along, first) + load(along, second)) + TINY
+    slope = gain / variance
+    held = slope * lesser(SCALES_TELL * predicted / (slope * slope + TINY), fill(1.0))
     back, spread = held * move, held * held * gain_factor
-    for i in range(begin, begin + CONSTANTS * nodes, CONSTANTS):
-        store(x, at_x + i, load(x, at_x + i) - back)
-        row = base + row_place(i)
-        for j in range(begin, i + 1, CONSTANTS):
-            store(p, row + j, load(p, row + j) + spread)
+    for k in range(nodes):
+        q, own = begin + CONSTANTS * k, load(along, k)
+        store(x, at_x + q, load(x, at_x + q) - back * own)
+        row = base + row_place(q)
+        for m in range(k + 1):
+            r = row + begin + CONSTANTS * m
+            store(p, r, load(p, r) + spread * own * load(along, m))
 
 
 @compiled
@@ -457,7 +462,7 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
             per_heavy = 1.0 / (v + variance * (1.0 / count))
             kf = inlier * per_heavy
             shrink = kf * (1.0 - (1.0 - inlier) * (innovation * innovation) * per_heavy)
-            _correct(block, nodes, g, v, (kf * innovation, shrink, kf))
+            _correct(block, (nodes, first, second), g, v, (kf * innovation, shrink, kf), off)
             at = r * STATS * blocks + b
             store(stats, at, ranges.range_m[r] - innovation)
             store(stats, at + VARIANCE * blocks, s)
