@@ -35,15 +35,15 @@ Teams that begin to crawl (``mission-crawl``, 400 s, seeds 0 to 7): NEES 2.5 wit
 .212 with 3e-5. docs/notebook/bank.md.
 """
 
-SCALES_TELL = 25.0
+SCALES_TELL = 12.0
 """A range tells of its users' common step scale where the square of its slope in that is so many
 times the variance of its prediction.
 
 Where they walk side by side, a common scale changes their ranges by the noise of headings alone,
 and shorter steps always explain that noise better: the scale shrank for as long as they did so.
 With 0, 12 and 25, the scale after eight minutes side by side (``mission-base``, ``abreast``, 4
-seeds) was .80, .93, 1.00; with 4 degrees of heading noise .56, .80, .96. A minute after a team has
-begun to crawl it is within 1 % with each. docs/notebook/bank.md.
+seeds) was .80, .93, 1.00; with 4 degrees of heading noise .56, .80, .96. ``paper-h`` with a scale of
+10 %, 8 seeds, .1 and .5 deg/s: .80, .89, .90 m and .83, .83, .91. docs/notebook/bank.md.
 """
 
 
