@@ -42,8 +42,8 @@ times the variance of its prediction.
 Where they walk side by side, a common scale changes their ranges by the noise of headings alone,
 and shorter steps always explain that noise better: the scale shrank for as long as they did so.
 With 0, 12 and 25, the scale after eight minutes side by side (``mission-base``, ``abreast``, 4
-seeds) was .80, .93, 1.00; with 4 degrees of heading noise .56, .80, .96. ``paper-h`` with a scale of
-10 %, 8 seeds, .1 and .5 deg/s: .80, .89, .90 m and .83, .83, .91. docs/notebook/bank.md.
+seeds) was .80, .93, 1.00; with 4 degrees of heading noise .56, .80, .96. ``paper-h`` with a scale
+of 10 %, 8 seeds, .1 and .5 deg/s: .80, .89, .90 m and .83, .83, .91. docs/notebook/bank.md.
 """
 
 
