@@ -146,11 +146,11 @@ def test_ranges_that_grow_with_the_logarithm_of_the_distance_make_no_distance_lo
 def test_distances_are_less_sure_where_walls_may_be_a_scale_of_ranges() -> None:
     conditions = {"nodes": 5, "area_m": 30, "walls": 1, "max_range_m": 30, "range_rate_hz": 2.0}
     over = []
-    for seed in (707, 708):
+    for seed in (701, 703, 707, 708):
         run = relpos.simulate("mission-base", seed, seconds=90, sigma_range_m=0.05, **conditions)
         over.append(relpos.evaluate(relpos.fuse(run), run, bound=False).metrics.ok_over_3_sigma)
-    # 0.100 without a deviation in proportion to the distance.
-    assert np.mean(over) < 0.06
+    # 0.114 without a deviation in proportion to the distance.
+    assert np.mean(over) < 0.08
 
 
 def test_where_nothing_is_off_nothing_is_learned_and_nothing_told() -> None:
