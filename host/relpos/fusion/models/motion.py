@@ -35,15 +35,15 @@ Teams that begin to crawl (``mission-crawl``, 400 s, seeds 0 to 7): NEES 2.5 wit
 .212 with 3e-5. docs/notebook/bank.md.
 """
 
-SCALES_TELL = 12.0
+SCALES_TELL = 5.0
 """A range tells of its users' common step scale where the square of its slope in that is so many
 times the variance of its prediction.
 
 Where they walk side by side, a common scale changes their ranges by the noise of headings alone,
 and shorter steps always explain that noise better: the scale shrank for as long as they did so.
-With 0, 12 and 25, the scale after eight minutes side by side (``mission-base``, ``abreast``, 4
-seeds) was .80, .93, 1.00; with 4 degrees of heading noise .56, .80, .96. ``paper-h`` with a scale
-of 10 %, 8 seeds, .1 and .5 deg/s: .80, .89, .90 m and .83, .83, .91. docs/notebook/bank.md.
+With 0, 5 and 12, the error of four people who fan out after six minutes side by side has a NEES of
+5.4, 1.5 and 1.4; ``paper-h`` with a scale of 10 %, 24 seeds, .1 and .5 deg/s: .82, .82, .85 m and
+.90, .90, .94. docs/notebook/bank.md.
 """
 
 
