@@ -346,7 +346,7 @@ def _carry_sensitivities(
 
 
 @inner
-def _correct(
+def _correct_partly(
     block: Block, users: tuple[int, int, int], g: Floats, predicted: Lanes,
     factors: tuple[Lanes, Lanes, Lanes], along: Floats,
 ) -> None:  # fmt: skip
@@ -462,7 +462,7 @@ def update(hypotheses: Hypotheses, ranges: Ranges, model: RangeModel, stats: Flo
             per_heavy = 1.0 / (v + variance * (1.0 / count))
             kf = inlier * per_heavy
             shrink = kf * (1.0 - (1.0 - inlier) * (innovation * innovation) * per_heavy)
-            _correct(block, (nodes, first, second), g, v, (kf * innovation, shrink, kf), off)
+            _correct_partly(block, (nodes, first, second), g, v, (kf * innovation, shrink, kf), off)
             at = r * STATS * blocks + b
             store(stats, at, ranges.range_m[r] - innovation)
             store(stats, at + VARIANCE * blocks, s)
