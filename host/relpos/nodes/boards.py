@@ -20,6 +20,8 @@ BOOT_S = 0.05
 SYNC_S = 0.2
 SYNC_ATTEMPTS = 5
 """Optiboot waits for a second."""
+ANSWER_S = 1.0
+"""Silence of a boot loader that has answered before: a busy computer hears it late."""
 _MEGA_LOADER, _MEGA_FLASH, _PAGE = 0x3E000, 0x40000, 256
 _WDR = b"\xa8\x95"
 SWITCH = (
@@ -151,7 +153,7 @@ def _stk500_signature(device: serial.Serial) -> bytes | None:
     Atmel AVR061: 0x30 0x20 requests sync, 0x75 0x20 the signature; answers are enclosed in 0x14
     and 0x10.
     """
-    if not _synced(lambda: _exchange(device, b"\x30\x20", 2) == b"\x14\x10"):
+    if not _synced(lambda: _exchange(device, b"\x30\x20", 2, SYNC_S) == b"\x14\x10"):
         return None
     answer = _exchange(device, b"\x75\x20", 5)
     if len(answer) == 5 and answer[0] == 0x14 and answer[4] == 0x10:
@@ -163,13 +165,18 @@ def _synced(answered: Callable[[], bool]) -> bool:
     return any(answered() for _ in range(SYNC_ATTEMPTS))
 
 
-def _exchange(device: serial.Serial, request: bytes, answer_bytes: int) -> bytes:
+def _exchange(
+    device: serial.Serial, request: bytes, answer_bytes: int, silence_s: float = ANSWER_S
+) -> bytes:
+    """Return what is answered until it is whole, or nothing has come for ``silence_s``."""
     device.reset_input_buffer()
     device.write(request)
     answer = b""
-    until_s = time.monotonic() + SYNC_S
+    until_s = time.monotonic() + silence_s
     while len(answer) < answer_bytes and time.monotonic() < until_s:
-        answer += device.read(answer_bytes - len(answer))
+        if received := device.read(answer_bytes - len(answer)):
+            answer += received
+            until_s = time.monotonic() + silence_s
     return answer
 
 
@@ -183,12 +190,12 @@ class _Stk500v2:
         self._device = device
         self._sequence = 0
 
-    def talk(self, message: bytes, answer_bytes: int) -> bytes | None:
+    def talk(self, message: bytes, answer_bytes: int, silence_s: float = ANSWER_S) -> bytes | None:
         """Return the answer's bytes from its command on; None where it is none, or a failure."""
         self._sequence = self._sequence % 255 + 1
         frame = bytes((0x1B, self._sequence, 0, len(message), 0x0E)) + message
         request = frame + bytes((_xor(frame),))
-        answer = _exchange(self._device, request, 6 + answer_bytes)
+        answer = _exchange(self._device, request, 6 + answer_bytes, silence_s)
         good = (
             len(answer) == 6 + answer_bytes
             and answer[:2] == frame[:2]
@@ -199,7 +206,7 @@ class _Stk500v2:
 
     def signs_on(self) -> bool:
         """Whether it answers: "AVRISP_2" and its length, eleven bytes."""
-        return _synced(lambda: self.talk(b"\x01", 11) is not None)
+        return _synced(lambda: self.talk(b"\x01", 11, SYNC_S) is not None)
 
     def page(self, at: int) -> bytes | None:
         """Return a page of the flash; asked again where an answer is late or damaged."""
