@@ -1,6 +1,7 @@
 """The order of the files: the longest first, so that no worker is left alone at the end.
 
-Files whose tests wait for a browser take turns with those that compute: both keep the cores busy.
+Files whose tests wait, for browsers, boards and clocks, are spread evenly among those that compute:
+both together keep the cores busy from the first minute to the last.
 
 Examples of Hypothesis have no time limit: they would fail where the machine is busy.
 """
@@ -10,6 +11,7 @@ from __future__ import annotations
 import gc
 import os
 from functools import cache
+from itertools import accumulate
 
 import pytest
 import typer.testing
@@ -35,6 +37,16 @@ LONG = (
 )
 """What takes minutes: in a fresh clone, where nothing was measured, it comes first."""
 
+WAITING = (
+    "tests/view/",
+    "tests/system/",
+    "tests/nodes/",
+    "tests/live/",
+    "tests/docs/test_doc_commands",
+    "tests/recording/test_recording_crash",
+)
+"""What leaves a core idle for half of its time."""
+
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
@@ -51,10 +63,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     # Tests of a file stay together and share its fixtures (--dist loadfile); a new one may be long.
     files = {_file_of(item.nodeid): _guess_s(item.nodeid) for item in items} | durations
     longest_first = sorted(files, key=lambda file: -files[file])
-    place: dict[str, int] = {}
+    place: dict[str, float] = {}  # Share of what waits, or of what computes, that begins before.
     for waits in (True, False):
-        alike = [file for file in longest_first if file.startswith("tests/view/") is waits]
-        place |= {file: turn for turn, file in enumerate(alike)}
+        alike = [file for file in longest_first if file.startswith(WAITING) is waits]
+        before = accumulate((files[file] for file in alike), initial=0.0)
+        whole = sum(files[file] for file in alike)
+        place |= {file: begun / (whole or 1) for file, begun in zip(alike, before, strict=False)}
     items.sort(key=lambda item: place[_file_of(item.nodeid)])
 
 
