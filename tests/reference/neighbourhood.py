@@ -94,6 +94,25 @@ def update(
         h[e, PER_NODE * place] += sign * slope * np.cos(bearing)
         h[e, PER_NODE * place + 1] += sign * slope * np.sin(bearing)
     noise = sigma_m**2 + 0.5 * (across / middle) ** 2
-    gain = np.linalg.solve(h @ covariance @ h.T + np.diag(noise), h @ covariance).T
-    state += (gain @ (measured - middle)).reshape(state.shape)
+    whitened = np.linalg.solve(h @ covariance @ h.T + np.diag(noise), np.eye(len(node)))
+    gain = covariance @ h.T @ whitened
+    moved = (gain @ (measured - middle)).reshape(state.shape)
+    pull = (h.T @ whitened @ (measured - middle)).reshape(state.shape)
+    state += moved
     covariance -= gain @ h @ covariance
+    turn_ways(state, covariance, moved[:, 2], pull[:, :2])
+
+
+def turn_ways(state: Floats, covariance: Floats, turn_rad: Floats, pull: Floats) -> None:
+    """Turn what positions owe to step scales as headings were corrected (N,), in place.
+
+    Scales move as if the gain of ``pull`` (N, 2) had been that of the way turned half.
+    """
+    for i, turn in enumerate(turn_rad):
+        at = PER_NODE * i
+        way = covariance[at : at + 2, at + 4] / covariance[at + 4, at + 4]
+        f = np.eye(covariance.shape[0])
+        f[at : at + 2, at + 4] = turn * np.array([-way[1], way[0]])
+        before = covariance[at : at + 2, at + 4].copy()
+        covariance[:] = f @ covariance @ f.T
+        state[i, 4] += 0.5 * (covariance[at : at + 2, at + 4] - before) @ pull[i]

@@ -25,6 +25,7 @@ DRIFT_AND_SCALE = (0.05, 0.1)
 
 def covariance_of(filter_: NeighbourhoodFilter) -> Floats:
     """All blocks, far ones by the chain."""
+    filter_._catch_up()
     return filter_._dense()
 
 
@@ -75,6 +76,9 @@ def test_within_one_strip_it_is_the_dense_filter() -> None:
         made.update(node, peer, measured)
         dense.update(pose, covariance, node, peer, measured, SIGMA_M)
     assert np.abs(pose[:, 3:]).max() > 0.01
+    # Ways are turned by the next motion, even if it is none.
+    made.predict(np.arange(9), np.zeros((9, 7)))
+    dense.advance(pose, covariance, np.arange(9), np.zeros((9, 7)))
     assert np.allclose(made.state, pose, atol=1e-7)
     assert np.allclose(covariance_of(made), covariance, rtol=1e-6, atol=1e-10)
 
