@@ -23,6 +23,10 @@ PIP := $(PYTHON) -m pip --disable-pip-version-check install --progress-bar on
 # Part of the installation, so that no first start, and no test, waits for it.
 compile-kernels = @printf '%s\n' 'compiling the estimators, once'; \
 	$(PYTHON) -c 'from relpos import fusion; [fusion.warm_up(n) for n in fusion.SETTINGS]'
+# What both boards' firmware is made of; PlatformIO takes three seconds to see that nothing changed.
+FIRMWARE := platformio.ini tools/pio $(shell find firmware tools/platformio tools/*.py -type f -not -name '*.pyc')
+BOARDS := .build/pio/.relpos-boards
+build-boards = tools/pio run -e uno -e megaatmega2560 -e uno_mpu9250 -e megaatmega2560_mpu9250
 title = @printf '\n\033[1m== %s\033[0m\n' "$(1)"
 
 .PHONY: help setup demo live test lint coverage bench bench-chain bench-teams firmware docs pages wire clean bare-root soak fuzz \
@@ -40,7 +44,7 @@ demo: $(RUN) | system-demo ## six emulated nodes through a serial port into the 
 live: $(RUN) | system-demo ## the same team in real time behind the live page; LIVE="--seconds 600 --nodes 20"
 	$(VENV)/bin/relpos demo --view --seconds 1800 --out out/live $(LIVE)
 
-test: board-builds python-tests ## every check: the C++ suites, lint and wire-check are tests among the others
+test: $(BOARDS) python-tests ## every check: the C++ suites, lint and wire-check are tests among the others
 
 lint: $(DEVELOP) ## ruff, its formatter, mypy
 	$(call title,Lint: ruff)
@@ -63,7 +67,12 @@ firmware-tests: $(DEVELOP) | system-avr ## the C++ suites alone: here, under san
 
 board-builds: $(DEVELOP) | system-avr
 	$(call title,Firmware for both boards and both sensors)
-	tools/pio run -e uno -e megaatmega2560 -e uno_mpu9250 -e megaatmega2560_mpu9250
+	$(build-boards)
+
+$(BOARDS): $(FIRMWARE) $(DEVELOP) | system-avr
+	$(call title,Firmware for both boards and both sensors)
+	$(build-boards)
+	@touch $@
 
 coverage: board-builds | system-browser ## share of lines that tests reach: firmware/lib, host/relpos
 	$(call title,Firmware suites on this computer, line by line)
