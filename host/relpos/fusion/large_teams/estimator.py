@@ -382,7 +382,8 @@ class LargeTeam:
         self._components.update(before, prior, f.pose, f.marginals(), both)
         self._own["ranges_distrusted"] += int((inlier < 0.5).sum())
         self._learn_sigma(node, peer, horizontal, inlier)
-        self._inflate(both, np.concatenate([inlier, inlier]))
+        news = 1.0 - outliers[:, 0]
+        self._inflate(both, np.tile(inlier, 2), np.tile(news, 2))
 
     def _learn_sigma(self, node: Indices, peer: Indices, measured: Floats, inlier: Floats) -> None:
         """Learn the range sigma by online expectation maximisation.
@@ -397,11 +398,14 @@ class LargeTeam:
         self.filter.model = model._replace(sigma_m=sigma_m)
         self._sigma_count = min(self._sigma_count + total, SIGMA_R_MEMORY)
 
-    def _inflate(self, rows: Indices, inlier: Floats) -> None:
-        """Inflate nodes most of whose ranges are outliers: carried nodes, odometry faults."""
-        count = np.bincount(rows, minlength=self._outlying.size)
-        outliers = np.bincount(rows, weights=1.0 - inlier, minlength=self._outlying.size)
-        some = count > 0
+    def _inflate(self, rows: Indices, inlier: Floats, news: Floats) -> None:
+        """Inflate nodes most of whose ranges are outliers: carried nodes, odometry faults.
+
+        ``news`` is how probably each was expected to be none: walls are no news of a node.
+        """
+        count = np.bincount(rows, weights=news, minlength=self._outlying.size)
+        outliers = np.bincount(rows, weights=news * (1.0 - inlier), minlength=self._outlying.size)
+        some = count > 0.0
         weight = FORGET * np.minimum(0.5 * count[some], 1.0)
         self._outlying[some] += weight * (outliers[some] / count[some] - self._outlying[some])
         wrong = np.flatnonzero(self._outlying > MOSTLY_OUTLYING)
