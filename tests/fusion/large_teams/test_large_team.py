@@ -131,6 +131,14 @@ def test_walls_that_stay_between_two_people_move_neither() -> None:
     assert 0.5 < scored.nees_distance < 1.6
 
 
+def test_rooms_through_whose_walls_everybody_ranges_grow_little() -> None:
+    """While ranges had no bias in common and none that grows with the distance, 0.52 m."""
+    run = relpos.simulate("mission-walls", 12, seconds=100, nodes=21)
+    scored = relpos.evaluate(relpos.fuse(run), run, bound=False).metrics
+    assert scored.relative_distance_rmse_m < 0.42
+    assert 0.7 < scored.nees_distance < 1.4
+
+
 def test_late_ranges_give_the_estimates_of_ranges_in_time(crowd: Crowd) -> None:
     measurements = [m for m in crowd.measurements() if m.time_s <= 16.0]
     late = [m for m in measurements if isinstance(m, Range) and m.time_s == 10.0]

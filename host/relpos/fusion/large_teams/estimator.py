@@ -32,7 +32,12 @@ from relpos.fusion.estimator import (
 from relpos.fusion.initial_poses import Found, Initialiser
 from relpos.fusion.large_teams.kernels import NEAREST_M, RangeModel, Ranges
 from relpos.fusion.large_teams.range_terms import RangeSlopes
-from relpos.fusion.large_teams.sparse_filter import LATENESS, SHADOW, NeighbourhoodFilter
+from relpos.fusion.large_teams.sparse_filter import (
+    GROWTH,
+    LATENESS,
+    SHADOW,
+    NeighbourhoodFilter,
+)
 from relpos.fusion.large_teams.variance_components import VarianceComponents
 from relpos.fusion.models.motion import reported_sigmas
 from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_variances
@@ -125,7 +130,7 @@ class _Collected(NamedTuple):
     measured: Range
     excess_m: float
     """By how much it exceeded the distance that was estimated at its instant."""
-    slopes: tuple[float, float]
+    slopes: tuple[float, ...]
     variance_m2: float
     """What uncertain heights add to the range's."""
 
@@ -347,8 +352,9 @@ class LargeTeam:
             # Var(dz^2) / (4 r^2), as in the bank (``fusion/bank/range_update.py``).
             lifted_m2 = (height_m**2 + 0.5 * variance_m2) * variance_m2 / r.range_m**2
             node, peer = (r.node, headings[k][0]), (r.peer, headings[k][1])
-            slopes = self._slopes.of((sight[k][0], sight[k][1]), node, peer)
-            excess_m = horizontal_m - float(distance[k])
+            apart_m = float(distance[k])
+            slopes = self._slopes.of((sight[k][0], sight[k][1]), apart_m, node, peer)
+            excess_m = horizontal_m - apart_m
             self._collected.append(_Collected(r, excess_m, slopes, lifted_m2))
             self._reach_m = max(self._reach_m * REACH_FADE, r.range_m)
         self._collected_s = min(self._collected_s, time_s)
@@ -471,13 +477,12 @@ class LargeTeam:
 
     def _parameters(self, time_s: float) -> tuple[Parameter, ...]:
         """Return what ranges have in common; the team's figures stand beside every node."""
-        (shadow_m, late_s), sigmas = (
-            self.filter.terms.tolist(),
-            self.filter.sigma_of_terms().tolist(),
-        )
+        terms, sigmas = self.filter.terms.tolist(), self.filter.sigma_of_terms().tolist()
+        late_s = terms[LATENESS] + self.clocks.lateness_s
         learned = (
-            ("body_shadow_m", shadow_m, sigmas[SHADOW]),
-            ("range_lateness_s", late_s + self.clocks.lateness_s, sigmas[LATENESS]),
+            ("body_shadow_m", terms[SHADOW], sigmas[SHADOW]),
+            ("range_lateness_s", late_s, sigmas[LATENESS]),
+            ("range_growth_m", terms[GROWTH], sigmas[GROWTH]),
         )
         return tuple(
             Parameter(time_s, node, None, *one) for node in sorted(self._row) for one in learned

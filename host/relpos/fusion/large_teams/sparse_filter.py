@@ -27,6 +27,7 @@ import numpy.typing as npt
 from relpos.fusion.large_teams import chain, kernels
 from relpos.fusion.large_teams.kernels import RangeModel, Ranges
 from relpos.fusion.large_teams.layout import COVARIANCE, StripLayout, lay_out
+from relpos.fusion.models.ranging import GROWTH_SD_M
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -35,11 +36,11 @@ JITTER_M2, JITTER_CONSTANT = 1e-8, 1e-12
 """Least variances of an initial pose, (0.1 mm)^2 and as many rad^2, and of drift and scale: what is
 exact has no inverse."""
 
-TERMS_SD = (0.3, 0.3)
-"""Standard deviations of the terms beforehand: m, s."""
+TERMS_SD = (0.3, 0.3, 0.3, GROWTH_SD_M)
+"""Standard deviations of the terms beforehand: m, s, m, m."""
 
 TERMS = len(TERMS_SD)
-SHADOW, LATENESS = range(TERMS)
+SHADOW, LATENESS, BIAS, GROWTH = range(TERMS)
 
 DIRECTIONS = 12
 """So many directions of the strips are tried."""
@@ -67,7 +68,8 @@ class NeighbourhoodFilter:
     antenna_m: Floats = field(default_factory=lambda: np.empty((0, 2)))
     """Where the antenna of each node is: forward and left of the point that moves, (N, 2)."""
     terms: Floats = field(default_factory=lambda: np.zeros(TERMS))
-    """What all ranges have in common: the body's shadow (m) and the lateness of time stamps (s)."""
+    """What all ranges have in common: the body's shadow (m), the lateness of time stamps (s), their
+    bias (m) and its growth with the distance (m)."""
     _carried: Floats = field(default_factory=lambda: np.empty((0, COVARIANCE, TERMS)))
     """V (N, 5, T): derivative of the states by the terms."""
     terms_information: Floats = field(

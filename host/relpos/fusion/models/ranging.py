@@ -20,8 +20,6 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.compiled import inner
-
 Floats = npt.NDArray[np.float64]
 
 
@@ -96,7 +94,6 @@ in sight 1.1, 1.0 and .84; ``mission-shadow``, seed 640, .88, .73 and .52, where
 that is wanted (docs/notebook/missions.md)."""
 
 
-@inner
 def growth_slope(distance_m: float) -> float:
     """Return a range's slope in the growth; ``fusion/bank/range_update.py`` has it of lanes."""
     return math.log(max(distance_m, GROWTH_LEAST_M) / GROWTH_USUAL_M)

@@ -11,13 +11,15 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.compiled import compiled
+from relpos.fusion.compiled import compiled, inner
 from relpos.fusion.models.ranging import GROWTH_LEAST_M, growth_slope
 from relpos.fusion.smoother.block_solver import Covariance, Equations
 from relpos.fusion.smoother.graph import Chords, Ranges
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
+
+_growth_slope = inner(growth_slope)
 
 
 class State(NamedTuple):
@@ -214,7 +216,7 @@ def _predict_range(state: State, ranges: Ranges, m: int, slopes: _Slopes) -> flo
         return distance
     common = poses.shape[1]
     entry[0], entry[1], entry[2] = common, common + 2 + ranges.pair_index[m], common + 1
-    constant[0], constant[1], constant[2] = 1.0, 1.0, growth_slope(distance)
+    constant[0], constant[1], constant[2] = 1.0, 1.0, _growth_slope(distance)
     predicted = distance
     for c in range(3):
         predicted += constant[c] * constants[entry[c]]
@@ -350,19 +352,19 @@ def range_variances(state: State, ranges: Ranges, covariance: Covariance) -> Flo
                 continue
             late_p = (p // 3) % 2
             at_p = 3 * pairs[m, p // 6] + p % 3
-            inner = 0.0
+            part = 0.0
             for q in range(12):
                 late_q = (q // 3) % 2
                 at_q = 3 * pairs[m, q // 6] + q % 3
                 if late_p == late_q:
-                    inner += row[q] * diagonal[k + late_p, at_p, at_q]
+                    part += row[q] * diagonal[k + late_p, at_p, at_q]
                 elif late_p == 1:
-                    inner += row[q] * below[k, at_p, at_q]
+                    part += row[q] * below[k, at_p, at_q]
                 else:
-                    inner += row[q] * below[k, at_q, at_p]
+                    part += row[q] * below[k, at_q, at_p]
             for c in range(modelled):
-                inner += 2.0 * constant[c] * with_constants[k + late_p, at_p, entry[c]]
-            total += row[p] * inner
+                part += 2.0 * constant[c] * with_constants[k + late_p, at_p, entry[c]]
+            total += row[p] * part
         for c in range(modelled):
             for d in range(modelled):
                 total += constant[c] * constant[d] * constants[entry[c], entry[d]]
