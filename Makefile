@@ -26,8 +26,12 @@ compile-kernels = @printf '%s\n' 'compiling the estimators, once'; \
 # What both boards' firmware is made of; PlatformIO takes three seconds to see that nothing changed.
 FIRMWARE := platformio.ini tools/pio $(shell find firmware tools/platformio tools/*.py -type f -not -name '*.pyc')
 BOARDS := .build/pio/.relpos-boards
-build-boards = tools/pio run -e uno -e megaatmega2560 -e uno_mpu9250 -e megaatmega2560_mpu9250
 title = @printf '\n\033[1m== %s\033[0m\n' "$(1)"
+define build-boards
+$(call title,Firmware for both boards and both sensors)
+tools/pio run -e uno -e megaatmega2560 -e uno_mpu9250 -e megaatmega2560_mpu9250
+@touch $(BOARDS)
+endef
 
 .PHONY: help setup demo live test lint coverage bench bench-chain bench-teams firmware docs pages wire clean bare-root soak fuzz \
         mutants system-demo system-avr system-browser system-soak firmware-tests board-builds python-tests
@@ -66,13 +70,10 @@ firmware-tests: $(DEVELOP) | system-avr ## the C++ suites alone: here, under san
 	tools/pio test -e native -e native_sanitized -e uno_sim
 
 board-builds: $(DEVELOP) | system-avr
-	$(call title,Firmware for both boards and both sensors)
 	$(build-boards)
 
 $(BOARDS): $(FIRMWARE) $(DEVELOP) | system-avr
-	$(call title,Firmware for both boards and both sensors)
 	$(build-boards)
-	@touch $@
 
 coverage: board-builds | system-browser ## share of lines that tests reach: firmware/lib, host/relpos
 	$(call title,Firmware suites on this computer, line by line)
