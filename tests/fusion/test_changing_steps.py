@@ -52,9 +52,12 @@ def test_a_crowd_side_by_side_is_told_to_have_walked_as_far_as_it_did() -> None:
     assert walked == pytest.approx(walked_truly, rel=0.1)
 
 
-def test_those_who_walk_side_by_side_are_smoothed_as_near_as_they_are_said_to_be() -> None:
-    """While the spread of step scales could grow: 0.26 m, NEES 4.3."""
-    run = relpos.simulate("mission-base", 3, **{**ABREAST, "seconds": 120})
+@pytest.mark.parametrize("seed", [3, 7])
+def test_those_who_walk_side_by_side_are_smoothed_as_near_as_they_are_said_to_be(
+    seed: int,
+) -> None:
+    """While the spread of step scales could grow: 0.20 and 0.29 m, NEES 2.8 and 4.3."""
+    run = relpos.simulate("mission-base", seed, **ABREAST)
     scored = relpos.evaluate(relpos.fuse(run, smooth=True), run, bound=False).metrics
     assert scored.relative_distance_rmse_m < 0.19
     assert scored.nees_distance < 2.0

@@ -6,14 +6,12 @@ import pytest
 
 from relpos.nodes import boards
 
-SIGNS_ON, LOADS_ADDRESS, READS_FLASH = 0x01, 0x06, 0x14
+LOADS_ADDRESS, READS_FLASH = 0x06, 0x14
 READ_S, CHUNK = 0.15, 64
 
 
 class LateMega:
     """A Mega's boot loader whose answers reach a busy computer in pieces."""
-
-    port = "late"
 
     def __init__(self, flash):
         self.flash, self.at, self.answer, self.now_s = flash, 0, b"", 0.0
@@ -24,9 +22,7 @@ class LateMega:
     def write(self, frame):
         command, told = frame[5], frame[5:-1]
         body = bytes((command, 0))
-        if command == SIGNS_ON:
-            body += b"\x08AVRISP_2"
-        elif command == LOADS_ADDRESS:
+        if command == LOADS_ADDRESS:
             self.at = 2 * (int.from_bytes(told[1:5], "big") & 0x7FFFFFFF)
         elif command == READS_FLASH:
             size = int.from_bytes(told[1:3], "big")
