@@ -11,7 +11,7 @@ cd "$(dirname "$0")/.."
 venv=.build/versions/$python-$resolution
 uv venv --quiet --clear --python "$python" "$venv"
 # The oldest libraries of relpos, with today's tools for tests.
-uv pip install --quiet --python "$venv" --resolution "$resolution" --editable '.[all]'
+uv pip install --quiet --python "$venv" --resolution "$resolution" --editable '.[all,cluster]'
 uv pip install --quiet --python "$venv" pytest pytest-xdist hypothesis httpx digi-xbee
 uv pip list --quiet --python "$venv" | grep -iE '^(numpy|numba|scipy|matplotlib|typer|construct|rich) '
 export NUMBA_CACHE_DIR="$PWD/$venv/kernels" OPENBLAS_NUM_THREADS=1

@@ -137,7 +137,7 @@ def make_smoother(
     """Make a smoother of the whole run that begins from the online estimator ``name``.
 
     It gives all its estimates at the end. An estimator whose estimates depend on the seed is run
-    ``SMOOTHER_ATTEMPTS`` times, so that one wrong turn of it does not decide.
+    up to ``SMOOTHER_ATTEMPTS`` times, so that one wrong turn of it does not decide.
     """
     from relpos.fusion.smoother.estimator import Smoother
 

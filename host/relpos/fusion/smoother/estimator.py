@@ -2,7 +2,7 @@
 
 It passes everything on to an online estimator, keeps it, and smooths when the run has ended. The
 online estimates are where the optimisation begins; because they may have been in a wrong mode, it
-begins from several and the one that explains the run best is taken.
+begins from further runs of the estimator until two have ended at the same best solution.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 
 import numpy as np
 import numpy.typing as npt
@@ -46,6 +47,11 @@ this, stays ambiguous."""
 FACING_KNOTS, WAY_RAD = 2, 0.5
 """Over so many knots before and after the way is taken, and how well a gap's way is known."""
 
+SAME = 0.1
+"""Costs that differ by less are those of one solution.
+
+TODO"""
+
 SIMPLER_BY = 3.0
 """How much more (logarithmic) evidence a team without biases or scales must have: errors that last
 make evidence look stronger than it is, and what is left out makes the rest look surer."""
@@ -64,7 +70,7 @@ class Smoother:
     """An :class:`~relpos.fusion.estimator.Estimator` that gives everything at the end.
 
     ``online`` is the estimator whose estimates begin the first attempt; ``others`` make those of
-    further attempts (they see the whole run again).
+    further attempts (they see the whole run again), until one ends where the best had ended.
     """
 
     online: Estimator
@@ -98,12 +104,18 @@ class Smoother:
         self._own["ranges_after_the_last_motion"] += counted["ranges_after_the_last_motion"]
         graph = _with_frame(graph, self._estimates)
         problem = Problem(graph)
-        attempts = [self._estimates, *(_replay(e, self._measurements) for e in self.others)]
-        for estimates in attempts:
+        others = (_replay(estimator, self._measurements) for estimator in self.others)
+        least = math.inf
+        for estimates in chain([self._estimates], others):
             state = problem.first_state(_poses(graph, estimates))
-            self.solutions += [
+            found = [
                 smooth(problem, state, inliers=believed) for believed in beginnings(problem, state)
             ]
+            self.solutions += found
+            cost = min(s.cost for s in found)
+            if abs(cost - least) < SAME:
+                break
+            least = min(cost, least)
         self.solutions.sort(key=lambda s: s.cost)
         best = without_lasting_errors(problem, self.solutions[0])
         scale_sd = range_scale_sd(self._estimates)
