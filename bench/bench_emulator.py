@@ -23,7 +23,7 @@ from relpos.emulator.node import BoardKind
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DeviceError
 from relpos.link.port import Link, observe, open_port
-from relpos.measurements import Heading, Height, Motion, Range
+from relpos.measurements import Measurement
 
 
 def measure(board: str, nodes: int, seconds: float, scenario: str, seed: int) -> str:
@@ -65,7 +65,7 @@ def measure_chain(board: str, nodes: int, seconds: float, scenario: str, seed: i
             start_s = time.perf_counter()
             for batch in observe(port, link):
                 for observation in batch:
-                    if isinstance(observation, Motion | Range | Height | Heading):
+                    if isinstance(observation, Measurement):
                         estimates += len(estimator.process(observation))
     except DeviceError:
         pass  # the walk has ended, and the port with it

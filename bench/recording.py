@@ -19,7 +19,7 @@ from pathlib import Path
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.fusion import make
 from relpos.link.port import Link
-from relpos.measurements import Heading, Height, Motion, Range
+from relpos.measurements import Measurement
 from relpos.recording import make_recorder, open_recording
 from relpos.recording.about import About
 
@@ -46,7 +46,7 @@ def main() -> None:
             estimates = [
                 estimate
                 for o in observations
-                if isinstance(o, Motion | Range | Height | Heading)
+                if isinstance(o, Measurement)
                 for estimate in estimator.process(o)
             ]
             steps.append((time_us * 1e-6, data, observations, estimates))

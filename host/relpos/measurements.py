@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
+from typing import get_args
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,11 +145,17 @@ def common_priors(nodes: Iterable[int]) -> tuple[Prior, ...]:
     return tuple(Prior(node, 0.0, 0.0, 0.0, COMMON_M, COMMON_RAD) for node in sorted(nodes))
 
 
-Measurement = Motion | Range | Height | Heading
+Reading = Height | Heading
+"""What a node measures of itself, besides its motion."""
+
+Measurement = Motion | Range | Reading
 """Input of an estimator."""
 
-Observation = Motion | Range | Height | Heading | Status | Event | Step
+Observation = Measurement | Status | Event | Step
 """Output of a link, a recording or an emulated team."""
+
+MEASUREMENTS: tuple[type, ...] = get_args(Measurement)
+"""At one time they come in this order."""
 
 
 BOUNDS: Mapping[str, tuple[float, float]] = {

@@ -7,7 +7,7 @@ from math import isclose
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.fusion import make
 from relpos.link.port import Link
-from relpos.measurements import Heading, Height, Motion, Range
+from relpos.measurements import Measurement
 from relpos.recording.about import About
 
 START_NS = 1_790_000_000_123_456_789
@@ -32,7 +32,7 @@ def session(nodes=3, seconds=40.0, seed=2):
         estimates = [
             estimate
             for o in observations
-            if isinstance(o, Motion | Range | Height | Heading)
+            if isinstance(o, Measurement)
             for estimate in estimator.process(o)
         ]
         steps.append((arrival_s, data, tuple(observations), tuple(estimates)))

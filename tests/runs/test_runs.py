@@ -6,14 +6,17 @@ import gzip
 import math
 import os
 import re
-from dataclasses import replace
+from dataclasses import MISSING, fields, replace
+from itertools import count
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import relpos
 from relpos.errors import DataError
 from relpos.fusion.estimator import (
     Alternative,
@@ -24,7 +27,9 @@ from relpos.fusion.estimator import (
     Parameter,
     Shape,
 )
-from relpos.measurements import Heading, Height, Motion, Prior, Range, Step
+from relpos.live.inputs import run_items
+from relpos.measurements import Heading, Height, Motion, Observation, Prior, Range, Step
+from relpos.recording import topics
 from relpos.runs import (
     InitialPose,
     load_run,
@@ -32,6 +37,7 @@ from relpos.runs import (
     save_run,
     write_estimates,
 )
+from relpos.runs.run import assemble
 
 MOTION = "time_s,node,dx_m,dy_m,dtheta_rad\n1,1,0.5,0,0\n1,2,0.4,0.1,-0.2\n"
 RANGES = "time_s,node,peer,range_m\n0.5,1,2,3.25\n"
@@ -50,6 +56,31 @@ def fault(directory: Path) -> str:
         load_run(directory)
     assert "\n" not in str(caught.value)
     return str(caught.value)
+
+
+def example_of(kind: type) -> Observation:
+    """Return an observation of node 1 at second 1, of any kind."""
+    whole = count(1)
+    hints = get_type_hints(kind)
+    values = {float: lambda: 1.0, int: lambda: next(whole), str: lambda: "some"}
+    return kind(**{f.name: values[hints[f.name]]() for f in fields(kind) if f.default is MISSING})
+
+
+@pytest.mark.parametrize("kind", get_args(Observation))
+def test_every_kind_of_observation_is_saved_loaded_played_recorded_and_fused(
+    kind: type, tmp_path: Path
+) -> None:
+    row = example_of(kind)
+    run = relpos.simulate("paper-p1", 1, seconds=3)
+    observed = assemble("one", run.description, [*run.measurements, row])
+    save_run(observed, tmp_path)
+    loaded = load_run(tmp_path)
+    played = [one for item in run_items(loaded) for one in item.observations]
+    assert row in played
+    assert kind in topics.ROWS
+    for name in ("bank", "particle", "deadreckoning"):
+        assert relpos.fuse(loaded, name).estimates
+    assert relpos.fuse(loaded, smooth=True).estimates
 
 
 def test_rows_become_measurements_in_time_order(tmp_path: Path) -> None:

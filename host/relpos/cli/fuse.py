@@ -266,7 +266,6 @@ def _fuse_mcap(
     from relpos import api
     from relpos.live.fusion_thread import common_start
     from relpos.live.inputs import PacedInput
-    from relpos.measurements import Heading, Height, Motion, Range
     from relpos.recording import open_recording
     from relpos.recording.replay import Replay
 
@@ -316,7 +315,7 @@ def _fuse_mcap(
         job,
         replace(run, counters={**run.counters, **counted}),
         start,
-        [o for o in observations if isinstance(o, Motion | Range | Height | Heading)],
+        [o for o in observations if isinstance(o, Measurement)],
         as_json=as_json,
         report=_is_wanted(report, as_json=as_json),
     )

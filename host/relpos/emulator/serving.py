@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from relpos.link.port import Link, observe
-from relpos.measurements import Event, Heading, Height, Motion, Range, Status, Step
+from relpos.measurements import Event, Measurement, Status, Step
 from relpos.runs import Description, NodeInfo, Run
 
 from .pty import PseudoTerminal, require_pseudo_terminals
@@ -53,7 +53,7 @@ def record_team(config: TeamConfig) -> Run:
     """
     require_pseudo_terminals()
     link = Link()
-    measurements: list[Motion | Range | Height | Heading] = []
+    measurements: list[Measurement] = []
     statuses: list[Status] = []
     steps: list[Step] = []
     with EmulatedTeam(replace(config, beacons=True)) as team:

@@ -134,7 +134,7 @@ class DeadReckoning:
                     vertical = Vertical(height.height_m, height.sigma_m or 0.0)
                     self._nodes[height.node].presence.vertical = vertical
                 case Sensed():
-                    self._own["headings_unused"] += 1
+                    self._own[step.unused] += 1
                 case Epoch():
                     estimates.append(self._estimate(step.time_s))
         return estimates

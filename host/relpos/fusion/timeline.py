@@ -34,11 +34,12 @@ from typing import NamedTuple
 
 from relpos.errors import DataError
 from relpos.measurements import (
-    Heading,
+    MEASUREMENTS,
     Height,
     Measurement,
     Motion,
     Range,
+    Reading,
     nodes_of,
     out_of_bounds,
 )
@@ -78,10 +79,15 @@ class Ranging:
 
 @dataclass(frozen=True, slots=True)
 class Sensed:
-    """A height or a heading, after the advances up to its time."""
+    """A node's reading, after the advances up to its time."""
 
     time_s: float
-    measurement: Height | Heading
+    measurement: Reading
+
+    @property
+    def unused(self) -> str:
+        """Name of the counter where an estimator has no use for it."""
+        return f"{type(self.measurement).__name__.lower()}s_unused"
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,10 +160,9 @@ def refusal(measurement: Measurement) -> str | None:
 _range_order = attrgetter("node", "peer", "range_m")
 
 
-def _sensed_order(measured: Height | Heading) -> tuple[int, bool, float]:
-    if isinstance(measured, Height):
-        return measured.node, False, measured.height_m
-    return measured.node, True, measured.heading_rad
+def _sensed_order(measured: Reading) -> tuple[int, int, str]:
+    # Any fixed order will do for what one node reads twice at one time.
+    return measured.node, MEASUREMENTS.index(type(measured)), repr(measured)
 
 
 @dataclass(frozen=True, slots=True)
@@ -368,7 +373,7 @@ class Timeline:
                 return
             motions: set[int] = set()
             ranges: list[Range] = []
-            sensed: list[Height | Heading] = []
+            sensed: list[Reading] = []
             if time_s > self.frontier_s:
                 self._ranged.clear()
             count = 0
@@ -396,7 +401,7 @@ class Timeline:
                     self.frontier_s = time_s
                     concerned = nodes_of(ranges)
                     # A height says nothing of where anybody is.
-                    concerned |= {m.node for m in sensed if isinstance(m, Heading)}
+                    concerned |= {m.node for m in sensed if not isinstance(m, Height)}
                     yield from self.catch_up(concerned, time_s)
             for one in sensed:
                 yield Sensed(time_s, one)

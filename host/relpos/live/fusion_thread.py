@@ -18,8 +18,6 @@ from relpos.errors import RelposError
 from relpos.fusion.estimator import Estimate, Estimator, NodeStatus
 from relpos.fusion.linear_algebra import one_thread
 from relpos.measurements import (
-    Heading,
-    Height,
     Measurement,
     Motion,
     Observation,
@@ -184,18 +182,17 @@ class FusionThread:
     def _process(self, observation: Observation) -> None:
         assert self._estimator is not None
         self._processed += 1
-        if not isinstance(observation, Motion | Range | Height | Heading):
+        if not isinstance(observation, Measurement):
             return
-        measurement: Measurement = observation
         try:
-            estimates = self._estimator.process(measurement)
+            estimates = self._estimator.process(observation)
         except Exception as error:
-            self._restart(error, measurement.time_s)
+            self._restart(error, observation.time_s)
         else:
-            self._since.append(measurement)
+            self._since.append(observation)
             self._emit(estimates)
-        if isinstance(measurement, Motion | Range):
-            self.newest_s = max(self.newest_s, measurement.time_s)
+        if isinstance(observation, Motion | Range):
+            self.newest_s = max(self.newest_s, observation.time_s)
 
     def _restart(self, error: Exception, time_s: float) -> None:
         """Make the estimator anew without the measurement that it failed on; else raise."""

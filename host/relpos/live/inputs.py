@@ -20,7 +20,7 @@ from relpos.link.led_orders import LedOrders
 from relpos.link.port import READ_BYTES, Link
 from relpos.link.step_scale import StepScaleSender
 from relpos.live.clock import SessionClock
-from relpos.measurements import Event, Heading, Height, Motion, Observation, Range, Status, Step
+from relpos.measurements import MEASUREMENTS, Event, Observation, Status, Step
 from relpos.said import Said
 
 if TYPE_CHECKING:
@@ -391,6 +391,6 @@ class PacedInput:
 def run_items(run: Run) -> list[Received]:
     """Return a run's observations, each arriving at the time of its measurement."""
     observations: list[Observation] = [*run.measurements, *run.events, *run.statuses, *run.steps]
-    order = (Status, Motion, Range, Height, Heading, Step, Event)
+    order = (Status, *MEASUREMENTS, Step, Event)
     observations.sort(key=lambda o: (o.time_s, order.index(type(o))))
     return [Received(o.time_s, b"", (o,)) for o in observations]

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import accumulate
+from itertools import accumulate, chain
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import numpy as np
 
 from relpos.errors import DataError
 from relpos.measurements import (
+    MEASUREMENTS,
     Event,
     Heading,
     Height,
@@ -205,14 +206,12 @@ def assemble(
 
     Presses at surveyed ``landmarks`` make the truth where the rows hold none.
     """
-    by_kind: dict[type, list[Any]] = {kind: [] for kind in _KINDS}
-    for row in rows:
-        by_kind[type(row)].append(row)
+    by_kind = _by_kind(rows)
     for same in by_kind.values():
         same.sort(key=attrgetter("time_s"))
     counted = Counter(counters or {})
     measurements = sorted(
-        (row for kind in _KINDS[:4] for row in by_kind[kind]), key=attrgetter("time_s")
+        (row for kind in MEASUREMENTS for row in by_kind[kind]), key=attrgetter("time_s")
     )
     counted["ranges_failed"] += sum(row.range_m <= 0.0 for row in by_kind[Range])
     run = Run(
@@ -243,22 +242,13 @@ def save_run(run: Run, path: Path | str) -> None:
     directory.mkdir(parents=True, exist_ok=True)
     description = replace(run.description, name=run.name)
     write_description(directory / "run.toml", description)
-    content: dict[str, Sequence[Any]] = {
-        "motion.csv": run.motions,
-        "ranges.csv": run.ranges,
-        "height.csv": [m for m in run.measurements if isinstance(m, Height)],
-        "heading.csv": [m for m in run.measurements if isinstance(m, Heading)],
-        "events.csv": run.events,
-        "status.csv": run.statuses,
-        "steps.csv": run.steps,
-        "truth.csv": run.truth,
-    }
+    by_kind = _by_kind(chain(run.measurements, run.events, run.statuses, run.steps, run.truth))
     for table in _TABLES:
-        if content[table.name]:
+        if rows := by_kind[table.make_class]:
             write_rows(
                 directory / table.name,
                 table.names,
-                ([getattr(row, name) for name in table.names] for row in content[table.name]),
+                ([getattr(row, name) for name in table.names] for row in rows),
             )
     if run.landmarks:
         write_rows(
@@ -456,8 +446,12 @@ _TABLES = (
 TABLE_NAMES = tuple(table.name for table in _TABLES)
 """The files of a run directory that hold rows by time and node."""
 
-_KINDS = (Motion, Range, Height, Heading, Event, Status, Step, Truth)
-"""The first four are measurements; at one time they come in this order."""
+
+def _by_kind(rows: Iterable[Observation | Truth]) -> dict[type, list[Any]]:
+    by_kind: dict[type, list[Any]] = {table.make_class: [] for table in _TABLES}
+    for row in rows:
+        by_kind[type(row)].append(row)
+    return by_kind
 
 
 def _priors_from_truth(run: Run) -> dict[int, Prior]:

@@ -42,7 +42,7 @@ from relpos.fusion.models.detection import Detection, on_one_floor
 from relpos.fusion.models.handedness import Handedness
 from relpos.fusion.models.motion import WALK_S, WithinReport, reported_sigmas, velocity_m_s
 from relpos.fusion.models.north import North
-from relpos.fusion.models.odometry_faults import LOST_RAD, VAGUE_M, SpeedGate, ZeroMotionDetector
+from relpos.fusion.models.odometry_faults import SpeedGate, ZeroMotionDetector, vagueness
 from relpos.fusion.models.ranging import (
     Mounting,
     OutlierPersistence,
@@ -241,7 +241,7 @@ class Bank:
                 self._walk_unseen(node, time_s)
             else:
                 moves[k, :2] *= known.undiffused(time_s, duration_s)
-            vague = None if reported is None else _vagueness(a)
+            vague = None if reported is None else vagueness(a)
             if reported is not None and vague is not None:
                 reported[k] = math.nan
                 self.core.relocalisation.inflate_covariance(int(rows[k]), *vague)
@@ -514,7 +514,7 @@ class Bank:
             self._advance()
             self._turn(step.time_s, measured, self._row[measured.node])
         else:
-            self._counters["headings_unused"] += 1
+            self._counters[step.unused] += 1
 
     def _turn(self, time_s: float, measured: Heading, row: int) -> None:
         """Update with an absolute heading, as far as north is known."""
@@ -587,13 +587,3 @@ def make(
         lazy=True,
     )
     return Rewinder(Bank(priors, initialiser, settings, seed, mounting), timeline, settings.late_s)
-
-
-def _vagueness(step: Advance) -> tuple[float, float] | None:
-    """Standard deviations (m, rad) of a piece whose report says to know next to nothing."""
-    sigma_m, _, sigma_rad = (0.0 if math.isnan(s) else s for s in reported_sigmas(step))
-    sigma_m = min(sigma_m, step.sigma_y_m or 0.0)
-    whole = math.sqrt(max(step.fraction, 1e-9))
-    if sigma_m / whole > VAGUE_M or sigma_rad / whole > LOST_RAD:
-        return sigma_m, sigma_rad
-    return None

@@ -209,7 +209,7 @@ class LargeTeam:
                 self._own["heights_stuck"] += not self.vertical.measure(height, step.time_s)
             case Sensed():
                 self._presence(step.measurement.node)
-                self._own["headings_unused"] += 1
+                self._own[step.unused] += 1
             case Epoch():
                 self._predict()
                 self._correct()

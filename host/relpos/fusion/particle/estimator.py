@@ -123,7 +123,7 @@ class ParticleFilter:
                     vertical = Vertical(height.height_m, height.sigma_m or 0.0)
                     self._known[height.node].vertical = vertical
                 case Sensed():
-                    self._own["headings_unused"] += 1
+                    self._own[step.unused] += 1
                 case Epoch():
                     self._predict()
                     self._add_found(self.initialiser.find(step.time_s))

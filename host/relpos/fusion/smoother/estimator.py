@@ -50,7 +50,8 @@ FACING_KNOTS, WAY_RAD = 2, 0.5
 SAME = 0.1
 """Costs that differ by less are those of one solution.
 
-TODO"""
+In one of 69 missions a further run found a likelier solution than that of the two that agreed
+(``docs/notebook/smoother.md``)."""
 
 SIMPLER_BY = 3.0
 """How much more (logarithmic) evidence a team without biases or scales must have: errors that last

@@ -20,7 +20,7 @@ from relpos.errors import RelposError
 from relpos.fusion.models.detection import Round, Rounds, on_one_floor
 from relpos.fusion.models.motion import unseen_variance
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Timeline
-from relpos.measurements import Heading, Height, Measurement, Prior
+from relpos.measurements import Height, Measurement, Prior
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -180,7 +180,7 @@ class _Builder:
     rounds: Rounds = field(default_factory=Rounds)
     attempts: list[tuple[Round, list[_Entry]]] = field(default_factory=list)
     seen: set[int] = field(default_factory=set)
-    unused_headings: int = 0
+    unused: Counter[str] = field(default_factory=Counter)
 
     def add(self, step: object, reported_s: Callable[[int], float]) -> None:
         match step:
@@ -211,8 +211,8 @@ class _Builder:
                     self.attempts.append((done, entries))
             case Sensed(measurement=Height() as height):
                 self.height_now[height.node] = height.height_m
-            case Sensed(measurement=Heading()):
-                self.unused_headings += 1
+            case Sensed():
+                self.unused[step.unused] += 1
             case Epoch():
                 self.times.append(step.time_s)
                 self.chords.append(self.partial)
@@ -255,9 +255,7 @@ def build_graph(
             builder.add(step, timeline.reported_s)
     for step in timeline.finish():
         builder.add(step, timeline.reported_s)
-    counters = Counter(timeline.counters)
-    if builder.unused_headings:
-        counters["headings_unused"] += builder.unused_headings
+    counters = timeline.counters + builder.unused
     if not builder.times:
         raise RelposError("no motion was received: nothing can be smoothed")
     return _finished(builder, priors, antennas_m or {}, counters), counters
