@@ -266,6 +266,7 @@ def _fuse_mcap(
     from relpos import api
     from relpos.live.fusion_thread import common_start
     from relpos.live.inputs import PacedInput
+    from relpos.measurements import Measurement
     from relpos.recording import open_recording
     from relpos.recording.replay import Replay
 
