@@ -28,7 +28,7 @@ from relpos.fusion.estimator import (
     Shape,
 )
 from relpos.live.inputs import run_items
-from relpos.measurements import Heading, Height, Motion, Observation, Prior, Range, Step
+from relpos.measurements import BOUNDS, Heading, Height, Motion, Observation, Prior, Range, Step
 from relpos.recording import topics
 from relpos.runs import (
     InitialPose,
@@ -78,6 +78,8 @@ def test_every_kind_of_observation_is_saved_loaded_played_recorded_and_fused(
     played = [one for item in run_items(loaded) for one in item.observations]
     assert row in played
     assert kind in topics.ROWS
+    numbers = {name for name, of in get_type_hints(kind).items() if of in (float, float | None)}
+    assert numbers <= BOUNDS.keys()
     for name in ("bank", "particle", "deadreckoning"):
         assert relpos.fuse(loaded, name).estimates
     assert relpos.fuse(loaded, smooth=True).estimates

@@ -102,6 +102,8 @@ class Smoother:
             self.heights_m,
             self.antennas_m,
         )
+        unused = {name: count for name, count in counted.items() if name.endswith("_unused")}
+        self._own.update(unused)
         self._own["ranges_after_the_last_motion"] += counted["ranges_after_the_last_motion"]
         graph = _with_frame(graph, self._estimates)
         problem = Problem(graph)
