@@ -248,3 +248,11 @@ def test_what_the_team_has_in_common_is_learned_and_told(
     )
     # The simulator's shadow grows with the square of how far somebody is behind: its half.
     assert learned["body_shadow_m"] == pytest.approx(0.4 if condition == "shadow" else 0.0, abs=0.1)
+
+
+def test_a_large_team_on_two_floors_without_heights_is_no_surer_than_right() -> None:
+    """While the slant between floors counted as noise: 0.24 m, NEES 4.1."""
+    run = relpos.simulate("mission-floors-no-heights", 1, nodes=LARGE_TEAM + 1, seconds=80.0)
+    scored = relpos.evaluate(relpos.fuse(run), run, bound=False).metrics
+    assert scored.relative_distance_rmse_m < 0.26
+    assert 0.4 < scored.nees_distance < 2.0

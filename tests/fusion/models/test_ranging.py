@@ -120,6 +120,21 @@ def test_ranges_repeated_at_rest_add_little_information_and_moving_makes_them_in
     assert 2.0 < total[25] < total[100] < 2.0 * total[25]
 
 
+@pytest.mark.parametrize(("lasting", "least", "most"), [(0.0, 0.99, 1.0), (0.7, 0.02, 0.12)])
+def test_ranges_whose_errors_last_count_less(lasting: float, least: float, most: float) -> None:
+    """A pair's own error, ``lasting`` of the standard deviation, beside white noise and a walk."""
+    rng = np.random.default_rng(3)
+    correlation = RangeCorrelation()
+    pairs = [(a, b) for a in range(1, 9) for b in range(a + 1, 9)]
+    own = lasting * rng.standard_normal(len(pairs))
+    passing = np.zeros(len(pairs))
+    for _ in range(200):
+        passing = 0.3 * passing + 0.3 * rng.standard_normal(len(pairs))
+        white = math.sqrt(0.9 - lasting**2) * rng.standard_normal(len(pairs))
+        correlation.learn(pairs, own + passing + white, np.ones(len(pairs)))
+    assert least <= correlation.repeats([(1, 2)]).sample_count[0] <= most
+
+
 def team(
     seconds: int, seed: int, bias: dict[tuple[int, int], float] | float = 0.0, **geometry: Worn
 ) -> tuple[list[Measurement], list[Prior], dict[int, list[complex]]]:

@@ -153,10 +153,11 @@ class BankCore:
         repeats: Repeats | None = None,
         velocity_m_s: Floats | None = None,
         outliers: Floats | None = None,
-    ) -> tuple[Floats, Floats]:
+    ) -> tuple[Floats, Floats, Floats]:
         """Update with the ranges (R,) of one instant; return what of each is an outlier.
 
-        That is its inlier probability (R,), and by how much it is off if it is none (m).
+        That is its inlier probability (R,), and by how much it is off if it is none (m). Then its
+        innovation over its deviation.
 
         ``dz_m`` are the antennas' differences of height, ``dz_variance_m2`` their variances (0
         by default), ``repeats`` what of the pairs' last errors they repeat (nothing by default),

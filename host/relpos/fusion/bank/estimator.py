@@ -20,6 +20,7 @@ import numpy.typing as npt
 from relpos.errors import RelposError
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.detection_update import Attempts
+from relpos.fusion.bank.hypothesis_set import PAIR_BIASES
 from relpos.fusion.bank.mirrored import open_nodes
 from relpos.fusion.bank.reporting import Report
 from relpos.fusion.bank.settings import BankSettings
@@ -301,10 +302,12 @@ class Bank:
             ]
             outliers = self.outliers.expected(time_s, pairs)
             before = self._unseen(ends, time_s)
-            inlier, excess_m = self.core.update(
+            inlier, excess_m, innovation = self.core.update(
                 first, second, measured, dz, variance, repeats, np.array(velocity), outliers
             )
             self.outliers.learn(time_s, pairs, inlier, excess_m)
+            if len(located) > PAIR_BIASES:
+                self.range_correlation.learn(pairs, innovation, inlier)
             self._ranges_used += len(ranges)
             for (walk, place, spread), (_, moved, left) in zip(
                 before, self._unseen(ends, time_s), strict=True

@@ -376,14 +376,18 @@ class LargeTeam:
         f = self.filter
         if not math.isfinite(f.width_m):
             f.widen(self._reach_m * REACH_SLACK)
-        horizontal = excess + f.antenna_pairs(node, peer)[0]
+        apart_m, spread_m2 = f.antenna_pairs(node, peer)[:2]
+        horizontal = excess + apart_m
         before, prior = f.pose.copy(), f.marginals()
         # A range of twice the variance counts half.
         counts = self._correlation.repeats(pairs).sample_count / (1.0 + lifted / f.model.sigma_m**2)
+        innovation = excess - slopes @ f.terms
         outliers = self._outliers.expected(time_s, pairs)
         inlier = f.update_with_terms(Ranges(node, peer, horizontal, counts, outliers, slopes))
         horizontal -= slopes @ f.terms
         self._outliers.learn(time_s, pairs, inlier, horizontal - f.antenna_pairs(node, peer)[0])
+        deviation = np.sqrt(spread_m2 + f.model.sigma_m**2)
+        self._correlation.learn(pairs, innovation / deviation, inlier)
         both = np.concatenate([node, peer])
         self._components.update(before, prior, f.pose, f.marginals(), both)
         self._own["ranges_distrusted"] += int((inlier < 0.5).sum())

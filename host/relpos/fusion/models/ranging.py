@@ -212,12 +212,33 @@ class Repeats(NamedTuple):
     """What share is left of a bias that passes as users walk, within [0, 1]."""
 
 
+LASTING_FROM, LASTING_COST = 0.02, 30.0
+"""Share of the innovations' variance that errors have which last and are not modelled, above which
+ranges count less, and by how much: 1 / (1 + cost * excess).
+
+Without heights on two floors the share is 0.03 to 0.5, elsewhere at most 0.02 (14 to 24 people).
+Chosen on seeds 11 and 12, NEES of 14, 20 and 24 people there with costs of 20, 40 and 80: 1.3, 0.9
+and 0.6; seeds 30 to 32 with and without it: ``docs/notebook/large-teams.md``."""
+
+LASTING_MEAN, LASTING_RANGES, LASTING_MOST = 20.0, 1000.0, 3.0
+"""A pair's mean is over so many ranges, the team's share over so many, and innovations count up to
+so many standard deviations."""
+
+
 @dataclass(slots=True)
 class RangeCorrelation:
-    """What ranges repeat, by the pair's path since its last one."""
+    """What ranges repeat: by the pair's path since its last one, and as far as errors last.
+
+    Where pairs have no biases of their own (teams of more than six), what lasts, such as the
+    slant between floors of unknown height, shows in innovations: the product of a range's with
+    the mean of its pair's earlier ones is the variance of what lasts, in the mean over the team.
+    """
 
     _path_m: dict[int, float] = field(default_factory=dict)
     _last_m: dict[tuple[int, int], float] = field(default_factory=dict)
+    _mean: dict[tuple[int, int], float] = field(default_factory=dict)
+    _product: float = 0.0
+    _square: float = LASTING_RANGES
 
     def move(self, node: int, length_m: float, dtheta_rad: float) -> None:
         """Add a displacement to a node's path."""
@@ -233,5 +254,19 @@ class RangeCorrelation:
             paths.append(now - self._last_m.get(key, -math.inf))
             self._last_m[key] = now
         path_m = np.array(paths)
+        lasting = max(self._product / self._square - LASTING_FROM, 0.0)
         rho = STILL * np.exp(-path_m / DECORRELATION_M)
-        return Repeats((1.0 - rho) / (1.0 + rho), np.exp(-path_m / PASSING_M))
+        count = np.minimum((1.0 - rho) / (1.0 + rho), 1.0 / (1.0 + LASTING_COST * lasting))
+        return Repeats(count, np.exp(-path_m / PASSING_M))
+
+    def learn(self, pairs: Iterable[tuple[int, int]], innovation: Floats, inlier: Floats) -> None:
+        """Learn from innovations over their deviations, and inlier probabilities (R,)."""
+        fade = 1.0 - 1.0 / LASTING_RANGES
+        for pair, off, good in zip(pairs, innovation.tolist(), inlier.tolist(), strict=True):
+            if good < 0.5:
+                continue
+            key, now = (min(pair), max(pair)), max(-LASTING_MOST, min(off, LASTING_MOST))
+            mean = self._mean.get(key, 0.0)
+            self._product = fade * self._product + mean * now
+            self._square = fade * self._square + now**2
+            self._mean[key] = mean + (now - mean) / LASTING_MEAN
