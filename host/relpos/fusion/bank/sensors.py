@@ -72,8 +72,8 @@ def expect_outliers(counts: Floats, outlier: Floats) -> float:
 @inner
 def _innovations(
     ranges: Ranges, stats: Floats, before: Floats, perturbed: Floats
-) -> tuple[Floats, Floats]:
-    """Return nu/sqrt(S) and max(nu^2 - S, 0) (m^2) of each range, under the mixture before it."""
+) -> tuple[Floats, Floats, Floats]:
+    """Return nu^2/S, nu/sqrt(S), max(nu^2 - S, 0) (m^2) of each range, of the mixture before it."""
     count, several = before.shape[0], ranges.first.shape[0]
     prior = np.empty(count)
     most, total = -np.inf, 0.0
@@ -84,7 +84,7 @@ def _innovations(
         total += prior[k]
     for k in range(count):
         prior[k] /= total
-    normal, excess = np.empty(several), np.empty(several)
+    square, normal, excess = np.empty(several), np.empty(several), np.empty(several)
     for r in range(several):
         mean, variance = stats[r, MEAN], stats[r, VARIANCE]
         middle = 0.0
@@ -95,9 +95,10 @@ def _innovations(
             off = mean[k] - middle
             spread += prior[k] * (variance[k] + off * off)
         off = ranges.range_m[r] - middle
-        normal[r] = off / math.sqrt(spread)
+        square[r] = off * off / spread
+        normal[r] = math.copysign(math.sqrt(square[r]), off)
         excess[r] = max(off * off - spread, 0.0)
-    return normal, excess
+    return square, normal, excess
 
 
 @compiled
@@ -125,11 +126,9 @@ def learn(
     log_weight = hypotheses.log_weight
     count, several = before.shape[0], ranges.first.shape[0]
     first, second = ranges.first, ranges.second
-    innovation, excess = _innovations(ranges, stats, before, perturbed)
+    square, innovation, excess = _innovations(ranges, stats, before, perturbed)
     share = sensors.model.outlier[0]
-    fault = update_cusum(
-        sensors.cusum, first, second, innovation**2, ranges.sample_count, share, wary
-    )
+    fault = update_cusum(sensors.cusum, first, second, square, ranges.sample_count, share, wary)
     weight = np.empty_like(log_weight)
     mixture.normalise(log_weight, count, weight)
     weights = weight.reshape(-1)
