@@ -381,13 +381,12 @@ class LargeTeam:
         before, prior = f.pose.copy(), f.marginals()
         # A range of twice the variance counts half.
         counts = self._correlation.repeats(pairs).sample_count / (1.0 + lifted / f.model.sigma_m**2)
-        innovation = excess - slopes @ f.terms
+        innovation = (excess - slopes @ f.terms) / np.sqrt(spread_m2 + f.model.sigma_m**2)
         outliers = self._outliers.expected(time_s, pairs)
         inlier = f.update_with_terms(Ranges(node, peer, horizontal, counts, outliers, slopes))
         horizontal -= slopes @ f.terms
         self._outliers.learn(time_s, pairs, inlier, horizontal - f.antenna_pairs(node, peer)[0])
-        deviation = np.sqrt(spread_m2 + f.model.sigma_m**2)
-        self._correlation.learn(pairs, innovation / deviation, inlier)
+        self._correlation.learn(pairs, innovation, inlier)
         both = np.concatenate([node, peer])
         self._components.update(before, prior, f.pose, f.marginals(), both)
         self._own["ranges_distrusted"] += int((inlier < 0.5).sum())

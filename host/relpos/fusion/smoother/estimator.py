@@ -96,15 +96,13 @@ class Smoother:
         """Smooth the whole run; RelposError if the data were unfit."""
         self._estimates += self.online.finish()
         nodes = [prior.node for prior in self.priors]
-        graph, counted = build_graph(
+        graph, unused = build_graph(
             as_climbed(as_learned(self._measurements, self._estimates), nodes, self.posts),
             self.priors,
             self.heights_m,
             self.antennas_m,
         )
-        unused = {name: count for name, count in counted.items() if name.endswith("_unused")}
         self._own.update(unused)
-        self._own["ranges_after_the_last_motion"] += counted["ranges_after_the_last_motion"]
         graph = _with_frame(graph, self._estimates)
         problem = Problem(graph)
         others = (_replay(estimator, self._measurements) for estimator in self.others)

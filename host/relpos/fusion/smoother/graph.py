@@ -243,7 +243,7 @@ def build_graph(
     reorder_s: float = 0.5,
     max_lag_s: float = math.inf,
 ) -> tuple[Graph, Counter[str]]:
-    """Put a run's measurements in order, and count what was dropped.
+    """Put a run's measurements in order, and count what smoothing does not use.
 
     ``heights_m`` are the tags' known heights, ``antennas_m`` their places on the body. Raises
     RelposError where there is no motion at all.
@@ -255,17 +255,15 @@ def build_graph(
             builder.add(step, timeline.reported_s)
     for step in timeline.finish():
         builder.add(step, timeline.reported_s)
-    counters = timeline.counters + builder.unused
     if not builder.times:
         raise RelposError("no motion was received: nothing can be smoothed")
-    return _finished(builder, priors, antennas_m or {}, counters), counters
+    return _finished(builder, priors, antennas_m or {}), builder.unused
 
 
 def _finished(
     builder: _Builder,
     priors: Sequence[Prior],
     antennas_m: Mapping[int, tuple[float, float]],
-    counters: Counter[str],
 ) -> Graph:
     names = tuple(sorted(builder.seen | {p.node for p in priors}))
     row = {node: k for k, node in enumerate(names)}
@@ -284,7 +282,7 @@ def _finished(
         for node, value in builder.heights_at[k].items():
             height[k + 1, row[node]] = value
     kept = [entry for entry in builder.ranges if entry.chord < slots]
-    counters["ranges_after_the_last_motion"] += len(builder.ranges) - len(kept)
+    builder.unused["ranges_after_the_last_motion"] += len(builder.ranges) - len(kept)
 
     length = np.hypot(chord[..., 0], chord[..., 1])
     direction = np.where(length > 0.0, np.arctan2(chord[..., 1], chord[..., 0]), 0.0)
