@@ -88,7 +88,7 @@ class Rewinder:
     core: Core
     timeline: Timeline
     window_s: float = 5.0
-    spacing_s: float = 3.0
+    spacing_s: float = 5.0
     every_s: float = 0.25
     most_s: float = 0.02
     _own: Counter[str] = field(default_factory=Counter)

@@ -25,7 +25,7 @@ from relpos.fusion.bank.range_update import RangeModel, Ranges
 from relpos.fusion.bank.relocalisation import OPEN_UPDATES, Relocalisation
 from relpos.fusion.bank.sensors import Sensors
 from relpos.fusion.bank.settings import BankSettings
-from relpos.fusion.bank.storage import StateIndex
+from relpos.fusion.bank.storage import StateIndex, every_pair
 from relpos.fusion.models.detection import Detection
 from relpos.fusion.models.odometry_faults import JUMP_M, CusumDetector
 from relpos.fusion.models.ranging import Repeats, slant_height
@@ -228,7 +228,7 @@ class BankCore:
 
     def distances(self, rows: Indices) -> tuple[Floats, Floats]:
         """Return means and standard deviations (P,) of the distances of every two of ``rows``."""
-        i, k = np.triu_indices(len(rows), 1)
+        i, k = every_pair(len(rows))
         return self.predicted_ranges(rows[i], rows[k], np.zeros(len(i)))
 
     def end_instant(self) -> None:

@@ -396,19 +396,21 @@ class HypothesisSet:
 
         The bias of a pair is the common one and its own part.
         """
-        block, lane = self.at(which)
+        block, lane = (at[:, None] for at in self.at(which))
         x, p = self.arrays.x, self.arrays.p
-        has_heights = self.models.has(RangeErrors.HEIGHT)[which]
-        inherits, common = 1.0 - has_heights, self.common_entry(CommonIndex.BIAS)
-        own = list(self.biases.values())
+        inherits = 1.0 - self.models.has(RangeErrors.HEIGHT)[which, None]
+        common, own = self.common_entry(CommonIndex.BIAS), list(self.biases.values())
+        others = np.arange(x.shape[1])
+        # Of each entry, the one that it begins as.
+        before = np.where(np.isin(others, own), common, others)
+        shared = inherits * p[block, storage.triangle_place(common, before), lane]
+        x[block, own, lane] = inherits * x[block, common, lane]
         for entry in own:
-            x[block, entry, lane] = inherits * x[block, common, lane]
-            for other in range(x.shape[1]):
-                shared = storage.triangle_place(common, common if other in own else other)
-                place = storage.triangle_place(entry, other)
-                p[block, place, lane] = inherits * p[block, shared, lane]
-            place = storage.triangle_place(entry, entry)
-            p[block, place, lane] += self._own_variance(which)
+            p[block, storage.triangle_place(entry, others), lane] = shared
+        if own:
+            own_variance = self._own_variance(which)[:, None]
+            at = np.array(own)
+            p[block, storage.triangle_place(at, at), lane] += own_variance
         self._lay_out_models()
 
     def _lay_out_models(self) -> None:

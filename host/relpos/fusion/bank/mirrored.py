@@ -66,7 +66,8 @@ def open_sides(
     three = np.argsort(apart_m, axis=1, kind="stable")[:, :3]
     corners, at = places_m[:, three], middle[three]
     area = ((corners[..., 1] - corners[..., 0]).conj() * (corners[..., 2] - corners[..., 0])).imag
-    longest_m = np.abs(at - np.roll(at, 1, axis=1)).max(axis=1)
+    before = [2, 0, 1]
+    longest_m = np.abs(at - at[:, before]).max(axis=1)
     height_m = area / np.maximum(longest_m, 1e-9)
     is_left = height_m > 0.0
     left, right = weight @ is_left, weight @ ~is_left
@@ -75,7 +76,7 @@ def open_sides(
     between_m = on_left_m - on_right_m
     within_m2 = weight @ (height_m - np.where(is_left, on_left_m, on_right_m)) ** 2
     is_open = np.minimum(left, right) > LEAST_WEIGHT
-    is_open &= near[three, np.roll(three, 1, axis=1)].all(axis=1)
+    is_open &= near[three, three[:, before]].all(axis=1)
     is_open &= between_m > np.maximum(2.0 * ASIDE_M, APART * np.sqrt(within_m2))
     sides[three[is_open].ravel()] = True
     return sides
@@ -93,7 +94,7 @@ def open_nodes(
     if len(nodes) < 2:
         return set(), {node: set() for node in nodes}
     rows = np.array([row[node] for node in nodes], dtype=np.int64)
-    i, k = np.triu_indices(len(rows), 1)
+    i, k = storage.every_pair(len(rows))
     near = np.zeros((len(rows), len(rows)), dtype=np.bool_)
     near[i, k] = near[k, i] = sigma_m < VAGUE_PAIR_M
     is_open = unknown_headings(covariance, rows)

@@ -205,11 +205,12 @@ class Relocalisation:
         these.perturbed[which] = PERTURBED_UPDATES
         edges = np.cumsum(rate) / total
         edges[-1] = 1.0
-        for k in which:
-            row = int(np.searchsorted(edges, these.rng.random(), side="right"))
-            offset_m = math.sqrt(0.5) * JUMP_M * these.rng.standard_normal(2)
-            one = np.array([k])
+        drawn = [(these.rng.random(), these.rng.standard_normal(2)) for _ in which]
+        rows = np.searchsorted(edges, [place for place, _ in drawn], side="right")
+        offsets_m = math.sqrt(0.5) * JUMP_M * np.array([offset for _, offset in drawn])
+        for row in set(rows.tolist()):
+            its = rows == row
             for entry in (StateIndex.X, StateIndex.Y):
-                these.shift(row, entry, offset_m[entry : entry + 1], one)
-                these.inflate(row, entry, 0.5 * JUMP_M**2, one)
+                these.shift(row, entry, offsets_m[its, entry], which[its])
+                these.inflate(row, entry, 0.5 * JUMP_M**2, which[its])
         self._counters["jumps"] += len(which)

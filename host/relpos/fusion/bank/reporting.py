@@ -20,7 +20,7 @@ from relpos.fusion.bank import mixture as mixture_kernels
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.hypothesis_models import RangeErrors
 from relpos.fusion.bank.mirrored import VAGUE_RAD
-from relpos.fusion.bank.storage import PER_NODE, CommonIndex, StateIndex
+from relpos.fusion.bank.storage import PER_NODE, CommonIndex, StateIndex, every_pair
 from relpos.fusion.clocks import Clocks
 from relpos.fusion.estimator import (
     ANY_ANGLE_RAD,
@@ -235,7 +235,7 @@ class Report:
         nodes = sorted(self.row)
         rows = np.array([self.row[node] for node in nodes], dtype=np.int64)
         bearings = mixture_kernels.bearings(self.mean, self.world_covariance, rows)
-        i, k = np.triu_indices(len(rows), 1)
+        i, k = every_pair(len(rows))
         distances, sigmas = self.distances
         own_m2 = np.array([self.presence[node].uneven_m2 for node in nodes])
         scale_m = self._range_scale_sd() * distances

@@ -125,7 +125,8 @@ def lay_out(values: Floats) -> Floats:
 
 def of_each(laid: Floats, count: int) -> Floats:
     """Give numbers (B, ..., LANES) of each hypothesis, (K, ...)."""
-    rows = np.moveaxis(laid, -1, 1).reshape(-1, *laid.shape[1:-1])
+    last = laid.ndim - 1
+    rows = laid.transpose(0, last, *range(1, last)).reshape(-1, *laid.shape[1:last])
     return np.ascontiguousarray(rows[:count])
 
 
@@ -134,6 +135,13 @@ def triangle_place(i: IndicesOrInt, j: IndicesOrInt) -> Indices:
     later = np.maximum(i, j)
     place: Indices = later * (later + 1) // 2 + np.minimum(i, j)
     return place
+
+
+@lru_cache(maxsize=64)
+def every_pair(count: int) -> tuple[Indices, Indices]:
+    """Return the first and the second of every two of ``count``, in order."""
+    first, second = np.triu_indices(count, 1)
+    return first, second
 
 
 def pack(x: Floats, p: Floats, nodes: int) -> tuple[Floats, Floats]:
@@ -155,10 +163,11 @@ def select_hypotheses(of: Floats, chosen: Indices) -> Floats:
     """Give the hypotheses ``chosen`` (M,) of an array (B, R, LANES) as another."""
     count, rows = chosen.shape[0], of.shape[1]
     given = lanes.working_lines((count + LANES - 1) // LANES * rows).reshape(-1, rows, LANES)
-    for k in range(given.shape[0] * LANES):
-        parent = chosen[min(k, count - 1)]
+    for b in range(given.shape[0]):
         for t in range(rows):
-            given[k // LANES, t, k % LANES] = of[parent // LANES, t, parent % LANES]
+            for lane in range(LANES):
+                parent = chosen[min(b * LANES + lane, count - 1)]
+                given[b, t, lane] = of[parent // LANES, t, parent % LANES]
     return given
 
 
