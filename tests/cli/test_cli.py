@@ -73,6 +73,16 @@ def test_help_names_the_commands_scripts_rely_on() -> None:
         assert command in shown
 
 
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [("simulate", "[DIR]..."), ("doctor", "[PORT]"), ("node set", "[NAME VALUE]...")],
+)
+def test_usage_puts_what_may_be_left_out_in_one_pair_of_brackets(command, arguments) -> None:
+    usage = next(x for x in relpos(*command.split(), "--help").stdout.splitlines() if "Usage" in x)
+    assert "[[" not in usage
+    assert usage.strip().endswith(arguments)
+
+
 def test_help_does_not_wait_for_numerical_libraries() -> None:
     program = (
         "import sys\nfrom typer.testing import CliRunner\nfrom relpos.cli import main\n"

@@ -20,7 +20,7 @@ def doctor(
     port: Annotated[
         str | None,
         typer.Argument(
-            metavar="[PORT]", help="Port of the coordinator, whose XBee settings are checked."
+            metavar="PORT", help="Port of the coordinator, whose XBee settings are checked."
         ),
     ] = None,
     key_file: KeyFile = None,

@@ -27,7 +27,7 @@ def set_node(
     words: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[NAME VALUE]...",
+            metavar="NAME VALUE",
             help="What to set; without any, what is set is shown. Names: id, report-period, "
             "ranging-period, status-period (s), leg-length, stature, range-offset (m), step-gain, "
             "team-size, step-reports (off, on), led (off, on, health); without a value: key, "

@@ -11,7 +11,7 @@ from relpos.cli import output
 
 
 def simulate(
-    more: Annotated[list[str] | None, typer.Argument(metavar="[DIR]...", hidden=True)] = None,
+    more: Annotated[list[str] | None, typer.Argument(metavar="DIR", hidden=True)] = None,
     *,
     scenario: Annotated[
         str | None,
