@@ -124,7 +124,7 @@ class Mission:
             about.name = name or about.name
             return cls(path, about)
         if source is None:
-            raise DataError(f"{path}: no mission there; to begin one, name the port, too")
+            raise DataError(f"{path}: no mission (relpos mission begins one), nor a recording")
         # A kill in the middle of this leaves some of them.
         begun = {SECRET, SECRET + ".new", ABOUT + ".new"}
         if path.exists() and any(file.name not in begun for file in path.iterdir()):
