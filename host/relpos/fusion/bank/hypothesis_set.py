@@ -399,7 +399,8 @@ class HypothesisSet:
         block, lane = (at[:, None] for at in self.at(which))
         x, p = self.arrays.x, self.arrays.p
         inherits = 1.0 - self.models.has(RangeErrors.HEIGHT)[which, None]
-        common, own = self.common_entry(CommonIndex.BIAS), list(self.biases.values())
+        common = self.common_entry(CommonIndex.BIAS)
+        own = np.array(list(self.biases.values()), dtype=np.int64)
         others = np.arange(x.shape[1])
         # Of each entry, the one that it begins as.
         before = np.where(np.isin(others, own), common, others)
@@ -407,10 +408,7 @@ class HypothesisSet:
         x[block, own, lane] = inherits * x[block, common, lane]
         for entry in own:
             p[block, storage.triangle_place(entry, others), lane] = shared
-        if own:
-            own_variance = self._own_variance(which)[:, None]
-            at = np.array(own)
-            p[block, storage.triangle_place(at, at), lane] += own_variance
+        p[block, storage.triangle_place(own, own), lane] += self._own_variance(which)[:, None]
         self._lay_out_models()
 
     def _lay_out_models(self) -> None:
