@@ -75,12 +75,20 @@ def test_help_names_the_commands_scripts_rely_on() -> None:
 
 @pytest.mark.parametrize(
     ("command", "arguments"),
-    [("simulate", "[DIR]..."), ("doctor", "[PORT]"), ("node set", "[NAME VALUE]...")],
+    [
+        ("simulate", "[dirs]..."),
+        ("doctor", "[port]"),
+        ("mission", "[source]"),
+        ("node flash", "[port]"),
+        ("node radio", "[port]"),
+        ("node set", "[settings]..."),
+    ],
 )
 def test_usage_puts_what_may_be_left_out_in_one_pair_of_brackets(command, arguments) -> None:
     usage = next(x for x in relpos(*command.split(), "--help").stdout.splitlines() if "Usage" in x)
     assert "[[" not in usage
-    assert usage.strip().endswith(arguments)
+    # Versions of Typer differ in the case.
+    assert usage.strip().lower().endswith(arguments)
 
 
 def test_help_does_not_wait_for_numerical_libraries() -> None:

@@ -194,7 +194,9 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "precious.txt").write_text("mine")
     with pytest.raises(DataError, match="neither a mission nor empty"):
         Mission.open(tmp_path, "/dev/null")
-    with pytest.raises(DataError, match=r"no mission .* nor a recording"):
+    with pytest.raises(
+        DataError, match=r"no mission \(relpos mission begins one\), nor a recording"
+    ):
         Mission.open(tmp_path / "new")
 
 

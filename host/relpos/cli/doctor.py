@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 def doctor(
     port: Annotated[
         str | None,
-        typer.Argument(
-            metavar="PORT", help="Port of the coordinator, whose XBee settings are checked."
-        ),
+        typer.Argument(help="Port of the coordinator, whose XBee settings are checked."),
     ] = None,
     key_file: KeyFile = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where recordings will go.")] = Path(

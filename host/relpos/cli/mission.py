@@ -36,7 +36,6 @@ def mission(
     source: Annotated[
         str | None,
         typer.Argument(
-            metavar="SOURCE",
             help="Serial port or pyserial URL. (default: the one before, else chosen on the page)",
         ),
     ] = None,

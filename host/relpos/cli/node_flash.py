@@ -40,7 +40,7 @@ class BoardName(StrEnum):
 def flash(
     port: Annotated[
         str | None,
-        typer.Argument(metavar="PORT", help="The board's. (default: the only board on USB)"),
+        typer.Argument(help="The board's. (default: the only board on USB)"),
     ] = None,
     board: Annotated[
         BoardName | None, typer.Option(help="Refuse any other. (default: the one that answers)")

@@ -25,7 +25,6 @@ def radio(
     port: Annotated[
         str | None,
         typer.Argument(
-            metavar="PORT",
             help="A module in a USB adapter. Without it the lines for X-CTU are printed.",
         ),
     ] = None,

@@ -24,14 +24,13 @@ KEY, ID, DEFAULTS = "key", "id", "defaults"
 
 def set_node(
     port: Port,
-    words: Annotated[
+    settings: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="NAME VALUE",
-            help="What to set; without any, what is set is shown. Names: id, report-period, "
-            "ranging-period, status-period (s), leg-length, stature, range-offset (m), step-gain, "
-            "team-size, step-reports (off, on), led (off, on, health); without a value: key, "
-            "defaults.",
+            help="NAME VALUE, repeated; without any, what is set is shown. Names: id, "
+            "report-period, ranging-period, status-period (s), leg-length, stature, "
+            "range-offset (m), step-gain, team-size, step-reports (off, on), "
+            "led (off, on, health); without a value: key, defaults.",
         ),
     ] = None,
     node: Node = None,
@@ -55,7 +54,7 @@ def set_node(
     """
     from relpos.nodes.settings import parse_changes
 
-    rest = list(words or [])
+    rest = list(settings or [])
     if rest[:1] == [KEY]:
         if rest[1:] or key_file is None:
             raise typer.BadParameter("give the key's file, and nothing else", param_hint=KEY)

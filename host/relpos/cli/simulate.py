@@ -11,7 +11,7 @@ from relpos.cli import output
 
 
 def simulate(
-    more: Annotated[list[str] | None, typer.Argument(metavar="DIR", hidden=True)] = None,
+    dirs: Annotated[list[str] | None, typer.Argument(hidden=True)] = None,
     *,
     scenario: Annotated[
         str | None,
@@ -45,9 +45,9 @@ def simulate(
         from relpos.emulator.recorded_team import record_team
 
         with output.working("running the firmware over the recordings"):
-            run = record_team([*recordings, *(more or ())], seed, chosen)
-    elif more:
-        raise typer.BadParameter(f"{more[0]}: directories go with --recordings")
+            run = record_team([*recordings, *(dirs or ())], seed, chosen)
+    elif dirs:
+        raise typer.BadParameter(f"{dirs[0]}: directories go with --recordings")
     else:
         run = api.simulate(str(scenario), seed, **chosen)
     api.save(run, out)
