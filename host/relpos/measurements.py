@@ -135,6 +135,11 @@ class Prior:
     sigma_m: float = 0.0
     sigma_rad: float = 0.0
 
+    @property
+    def is_known(self) -> bool:
+        """Whether place and heading have finite standard deviations."""
+        return math.isfinite(self.sigma_m) and math.isfinite(self.sigma_rad)
+
 
 COMMON_M, COMMON_RAD = 0.5, math.radians(10.0)
 """People who start in one place stand half a metre and ten degrees apart (standard deviations)."""

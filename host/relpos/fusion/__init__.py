@@ -4,8 +4,8 @@ This module is the registry: :func:`make` finds an estimator by its name. The fi
 ``models/`` are the common ground that every room may import: what an estimator takes and returns
 (``estimator``), the order of measurements in time (``timeline``, ``rewind``), models of what is
 measured. The rooms know only the common ground, never each other: ``bank/`` (the default, several
-hypotheses of a joint filter), ``initialisation/`` (unknown starts), ``large_teams/`` (from 30
-nodes on), ``particle/`` (the paper's filter) and ``smoother/`` (a whole run, afterwards).
+hypotheses of a joint filter), ``initialisation/`` (unknown starts), ``large_teams/`` (more than
+20 nodes), ``particle/`` (the paper's filter) and ``smoother/`` (a whole run, afterwards).
 ``switching`` joins them. Begin reading at ``estimator`` and ``timeline``, then in one room.
 """
 

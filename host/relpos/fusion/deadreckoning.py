@@ -25,6 +25,7 @@ from relpos.fusion.estimator import (
     pairs_of,
     refuse_unmoved,
 )
+from relpos.fusion.initial_poses import by_node
 from relpos.fusion.settings import setting
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Timeline
 from relpos.measurements import Height, Measurement, Prior, Range
@@ -84,13 +85,10 @@ class DeadReckoning:
             reorder_s=self.settings.reorder_s,
             max_lag_s=self.settings.max_lag_s,
         )
-        for p in self.priors:
-            if p.node in self._nodes:
-                raise RelposError(f"node {p.node} has two initial poses")
-            placed = math.isfinite(p.sigma_m) and math.isfinite(p.sigma_rad)
-            sigma = (p.sigma_m, p.sigma_m, p.sigma_rad) if placed else (0.0, 0.0, 0.0)
+        for p in by_node(self.priors):
+            sigma = (p.sigma_m, p.sigma_m, p.sigma_rad) if p.is_known else (0.0, 0.0, 0.0)
             self._nodes[p.node] = _Node(
-                p.x_m, p.y_m, p.heading_rad, np.diag(np.square(sigma)), placed
+                p.x_m, p.y_m, p.heading_rad, np.diag(np.square(sigma)), p.is_known
             )
 
     def process(self, measurement: Measurement) -> list[Estimate]:

@@ -1,7 +1,7 @@
 """What a joint filter needs to know about finding initial poses.
 
 A filter hands everything about nodes that it has not located to an :class:`Initialiser`, and adds
-a node once the initialiser has :class:`Found` it. The filters know this protocol only;
+a node once the initialiser has found it. The filters know this protocol only;
 :mod:`relpos.fusion.initialisation` implements it, and :mod:`relpos.fusion.switching` joins them.
 """
 
@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from relpos.errors import RelposError
 from relpos.fusion.estimator import NodeEstimate, NodeStatus, Presence, unlocated
 from relpos.fusion.modes import belief_of
 from relpos.fusion.timeline import Advance
-from relpos.measurements import Range
+from relpos.measurements import Prior, Range
 
 Floats = npt.NDArray[np.float64]
 
@@ -68,13 +70,6 @@ class PoseMixture:
         ).sigma_heading_rad
 
 
-@dataclass(frozen=True, slots=True)
-class Found:
-    """Nodes whose poses have been found at an epoch."""
-
-    mixture: PoseMixture
-
-
 class Initialiser(Protocol):
     """Finds the poses of nodes that are not located, from their motion and ranges."""
 
@@ -85,10 +80,8 @@ class Initialiser(Protocol):
     def __contains__(self, node: int) -> bool:
         """Whether the node is sought."""
 
-    def add(
-        self, node: int, mean: Sequence[float] = (0.0, 0.0, 0.0), sigma: Sequence[float] = UNKNOWN
-    ) -> None:
-        """Seek a node; ``mean`` and ``sigma`` (inf: unknown) describe its pose (m, m, rad)."""
+    def add(self, node: int, prior: Prior | None = None) -> None:
+        """Seek a node; of its pose nothing is known, or what ``prior`` has a finite sigma of."""
 
     def advance(self, step: Advance, *, faulty: bool = False) -> None:
         """Move a sought node; of a ``faulty`` displacement only the turn is used."""
@@ -106,8 +99,8 @@ class Initialiser(Protocol):
         ``heights``: node -> m.
         """
 
-    def find(self, time_s: float) -> Found | None:
-        """Search at the end of an epoch; return the nodes found, which are sought no more."""
+    def find(self, time_s: float) -> PoseMixture | None:
+        """Search at the end of an epoch; return the poses found, which are sought no more."""
 
     def cost_s(self) -> float:
         """Return about how many seconds of a processor ``find`` takes."""
@@ -115,6 +108,15 @@ class Initialiser(Protocol):
     @property
     def mixture(self) -> PoseMixture | None:
         """Hypotheses about the sought nodes that are tied to a known one; None without any."""
+
+
+def by_node(priors: Iterable[Prior]) -> list[Prior]:
+    """Return priors in the order of their nodes; RelposError where one has two."""
+    ordered = sorted(priors, key=lambda p: p.node)
+    for one, other in pairwise(ordered):
+        if one.node == other.node:
+            raise RelposError(f"node {one.node} has two initial poses")
+    return ordered
 
 
 def sought_node(initialiser: Initialiser, node: int, presence: Presence) -> NodeEstimate:

@@ -118,7 +118,7 @@ class SwitchingEstimator:
     def _located(self) -> int:
         """Return how many nodes a large team could begin from."""
         if self._last is None:
-            return sum(math.isfinite(p.sigma_m + p.sigma_rad) for p in self._priors)
+            return sum(p.is_known for p in self._priors)
         return sum(n.status in (NodeStatus.OK, NodeStatus.STALE) for n in self._last.nodes)
 
     def _begin(self, measurement: Measurement) -> list[Estimate]:

@@ -17,7 +17,6 @@ from statistics import median
 import numpy as np
 import numpy.typing as npt
 
-from relpos.errors import RelposError
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.detection_update import Attempts
 from relpos.fusion.bank.hypothesis_set import PAIR_BIASES
@@ -35,9 +34,9 @@ from relpos.fusion.estimator import (
 )
 from relpos.fusion.initial_poses import (
     HEADING_RESOLVED_RAD,
-    Found,
     Initialiser,
     PoseMixture,
+    by_node,
 )
 from relpos.fusion.models.detection import Detection, on_one_floor
 from relpos.fusion.models.handedness import Handedness
@@ -129,18 +128,14 @@ class Bank:
         s = self.settings
         self.core = BankCore(s, self.seed)
         self.vertical = VerticalFilter(posts=posts_of(self.mounting))
-        for p in sorted(self.priors, key=lambda p: p.node):
-            if p.node in self._known:
-                raise RelposError(f"node {p.node} has two initial poses")
+        for p in by_node(self.priors):
             self._meet(p.node)
-            if math.isfinite(p.sigma_m) and math.isfinite(p.sigma_rad):
+            if p.is_known:
                 self._row[p.node] = self.core.add_node(
                     (p.x_m, p.y_m, p.heading_rad), p.sigma_m, p.sigma_rad, self._lever_m(p.node)
                 )
             else:
-                self.initialiser.add(
-                    p.node, (p.x_m, p.y_m, p.heading_rad), (p.sigma_m, p.sigma_m, p.sigma_rad)
-                )
+                self.initialiser.add(p.node, p)
 
     @property
     def shared(self) -> tuple[object, ...]:
@@ -428,11 +423,10 @@ class Bank:
             for node, i, v in zip(self._row, at, variance, strict=True)
         }
 
-    def _admit(self, found: Found | None) -> None:
+    def _admit(self, mixture: PoseMixture | None) -> None:
         """Add nodes whose pose has been found to the core."""
-        if found is None:
+        if mixture is None:
             return
-        mixture = found.mixture
         beside = self._nearest(mixture) if self._row else None
         rows = [
             self.core.add_node((0.0, 0.0, 0.0), 1.0, 1.0, self._lever_m(node))

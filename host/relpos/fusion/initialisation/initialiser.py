@@ -16,10 +16,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.initial_poses import UNKNOWN, Found, PoseMixture
+from relpos.fusion.initial_poses import PoseMixture
 from relpos.fusion.initialisation.search import MOVED_M, HypothesisSearch
 from relpos.fusion.timeline import Advance
-from relpos.measurements import Range
+from relpos.measurements import Prior, Range
 
 Floats = npt.NDArray[np.float64]
 
@@ -94,12 +94,13 @@ class HypothesisInitialiser:
     def __contains__(self, node: int) -> bool:
         return node in self._unlocated or node in self.search.nodes
 
-    def add(
-        self, node: int, mean: Sequence[float] = (0.0, 0.0, 0.0), sigma: Sequence[float] = UNKNOWN
-    ) -> None:
-        """Seek a node; ``mean`` and ``sigma`` (inf: unknown) describe its pose (m, m, rad)."""
-        self._unlocated[node] = _UnlocatedNode(np.array(mean, float), np.array(sigma, float))
-        if math.isfinite(sigma[0]):
+    def add(self, node: int, prior: Prior | None = None) -> None:
+        """Seek a node; of its pose nothing is known, or what ``prior`` has a finite sigma of."""
+        p = prior or Prior(node, 0.0, 0.0, 0.0, math.inf, math.inf)
+        mean = np.array((p.x_m, p.y_m, p.heading_rad), float)
+        sigma = np.array((p.sigma_m, p.sigma_m, p.sigma_rad), float)
+        self._unlocated[node] = _UnlocatedNode(mean, sigma)
+        if math.isfinite(p.sigma_m):
             self._has_frame = True
 
     def advance(self, step: Advance, *, faulty: bool = False) -> None:
@@ -165,8 +166,8 @@ class HypothesisInitialiser:
         self.search.frame = node
         self._has_frame = True
 
-    def find(self, time_s: float) -> Found | None:
-        """Search at the end of an epoch; return the nodes found, which are sought no more.
+    def find(self, time_s: float) -> PoseMixture | None:
+        """Search at the end of an epoch; return the poses found, which are sought no more.
 
         Nodes that start together are returned together, once all of them are resolved.
         """
@@ -199,7 +200,7 @@ class HypothesisInitialiser:
         self.counters["starts_found"] += len(found)
         self.resolved, self._standing = self.resolved - found, self._standing - found
         order = sorted(found, key=lambda n: (n != search.frame, n))
-        return Found(search.release(order))
+        return search.release(order)
 
     def cost_s(self) -> float:
         """Return about how many seconds of a processor ``find`` takes."""

@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from relpos.errors import RelposError
 from relpos.fusion.clocks import Clocks
 from relpos.fusion.estimator import (
     ANY_ANGLE_RAD,
@@ -29,7 +28,7 @@ from relpos.fusion.estimator import (
     refuse_unranged,
     unlocated,
 )
-from relpos.fusion.initial_poses import Found, Initialiser
+from relpos.fusion.initial_poses import Initialiser, PoseMixture, by_node
 from relpos.fusion.large_teams.kernels import NEAREST_M, RangeModel, Ranges
 from relpos.fusion.large_teams.range_terms import RangeSlopes
 from relpos.fusion.large_teams.sparse_filter import (
@@ -172,16 +171,12 @@ class LargeTeam:
         model = RangeModel(SIGMA_R_M, OUTLIERS, OUTLIER_M)
         self.filter = NeighbourhoodFilter(math.inf, model)
         known: list[Prior] = []
-        for p in sorted(self.priors, key=lambda p: p.node):
-            if p.node in self._known:
-                raise RelposError(f"node {p.node} has two initial poses")
+        for p in by_node(self.priors):
             self._known[p.node] = Presence()
-            if math.isfinite(p.sigma_m) and math.isfinite(p.sigma_rad):
+            if p.is_known:
                 known.append(p)
             else:
-                self.initialiser.add(
-                    p.node, (p.x_m, p.y_m, p.heading_rad), (p.sigma_m, p.sigma_m, p.sigma_rad)
-                )
+                self.initialiser.add(p.node, p)
         poses = np.array([(p.x_m, p.y_m, p.heading_rad) for p in known]).reshape(-1, 3)
         sigmas = np.array([(p.sigma_m, p.sigma_m, p.sigma_rad) for p in known]).reshape(-1, 3)
         self._add([p.node for p in known], poses, sigmas[:, :, None] ** 2 * np.eye(3))
@@ -444,13 +439,13 @@ class LargeTeam:
         self.initialiser.update(step.time_s, ranges, located, heights)
         self._ranges_used += len(ranges)
 
-    def _add_found(self, found: Found | None) -> None:
+    def _add_found(self, found: PoseMixture | None) -> None:
         """Add the nodes whose poses have been found to the filter, each as one Gaussian."""
         if found is None:
             return
-        moments = [found.mixture.moments(k) for k in range(len(found.mixture.nodes))]
+        moments = [found.moments(k) for k in range(len(found.nodes))]
         poses, covariances = (np.stack(each) for each in zip(*moments, strict=True))
-        self._add(found.mixture.nodes, poses, covariances)
+        self._add(found.nodes, poses, covariances)
         self._own["joined"] += len(moments)
 
     # -- estimates -----------------------------------------------------------------------------

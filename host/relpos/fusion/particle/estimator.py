@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from relpos.errors import RelposError
 from relpos.fusion.estimator import (
     ANY_ANGLE_RAD,
     Estimate,
@@ -20,7 +19,7 @@ from relpos.fusion.estimator import (
     refuse_unmoved,
     refuse_unranged,
 )
-from relpos.fusion.initial_poses import POSE, Found, Initialiser, sought_node
+from relpos.fusion.initial_poses import POSE, Initialiser, PoseMixture, by_node, sought_node
 from relpos.fusion.models.motion import MotionNoise
 from relpos.fusion.models.ranging import RangeNoise
 from relpos.fusion.particle.kernels import MIN_BANDWIDTH_M
@@ -65,21 +64,15 @@ class ParticleFilter:
         self._timeline = Timeline(
             [p.node for p in self.priors], reorder_s=s.reorder_s, max_lag_s=s.max_lag_s
         )
-        for prior in sorted(self.priors, key=lambda p: p.node):
-            if prior.node in self._known:
-                raise RelposError(f"node {prior.node} has two initial poses")
+        for prior in by_node(self.priors):
             self._known[prior.node] = Presence()
-            if math.isfinite(prior.sigma_m) and math.isfinite(prior.sigma_rad):
+            if prior.is_known:
                 pose = np.array([prior.x_m, prior.y_m, prior.heading_rad])[:, None]
                 sigma = np.array([prior.sigma_m, prior.sigma_m, prior.sigma_rad])[:, None]
                 drawn = pose + sigma * self._rng.standard_normal((3, s.particles))
                 self._row[prior.node] = self._particles.add(drawn)
             else:
-                self.initialiser.add(
-                    prior.node,
-                    (prior.x_m, prior.y_m, prior.heading_rad),
-                    (prior.sigma_m, prior.sigma_m, prior.sigma_rad),
-                )
+                self.initialiser.add(prior.node, prior)
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         """Take one measurement; return the estimates it completes."""
@@ -182,11 +175,11 @@ class ParticleFilter:
             for node, row in self._row.items()
         }
 
-    def _add_found(self, found: Found | None) -> None:
+    def _add_found(self, mixture: PoseMixture | None) -> None:
         """Draw the particles of nodes that the initialiser has found."""
-        if found is None:
+        if mixture is None:
             return
-        mixture, count = found.mixture, self.settings.particles
+        count = self.settings.particles
         chosen = systematic(mixture.weights, count, self._rng)
         # Not Cholesky's factor: the pose of the frame's node is exact, its covariance zero.
         variances, axes = np.linalg.eigh(mixture.covariances)
