@@ -47,7 +47,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -57,9 +57,9 @@ from relpos.measurements import Event, Measurement, Prior, Range
 from relpos.simulation.paper import (
     DISTANCE_NOISE,
     HEADING_PATTERN,
-    Drawn,
     Hidden,
     SimulatedRun,
+    by_node,
     report_motions,
     round_rectangle,
     true_rows,
@@ -196,17 +196,18 @@ def walk(settings: LabSettings, rng: np.random.Generator) -> Walk:
     return Walk(times, path, *round_rectangle(path, *_TEAM.path_m))
 
 
-def odometry(settings: LabSettings, rng: np.random.Generator) -> Drawn:
+def odometry(settings: LabSettings, rng: np.random.Generator) -> Hidden:
     """Draw the hidden constants of each wearer's odometry."""
     count, factor = settings.nodes, settings.noise_scale
     pattern = np.resize(np.array(HEADING_PATTERN), count)
     pattern /= pattern.mean()
-    return Drawn(
-        np.exp(factor * settings.scale_error * rng.standard_normal(count)),
-        factor * math.radians(settings.heading_drift_deg_s) * rng.standard_normal(count),
-        factor * settings.distance_noise * np.resize(np.array(DISTANCE_NOISE), count),
-        factor * settings.turn_noise * pattern,
-        factor * math.radians(settings.heading_noise_deg) * pattern,
+    drift_rad_s = math.radians(settings.heading_drift_deg_s)
+    return Hidden(
+        by_node(np.exp(factor * settings.scale_error * rng.standard_normal(count))),
+        by_node(factor * drift_rad_s * rng.standard_normal(count)),
+        by_node(factor * settings.distance_noise * np.resize(np.array(DISTANCE_NOISE), count)),
+        by_node(factor * settings.turn_noise * pattern),
+        by_node(factor * math.radians(settings.heading_noise_deg) * pattern),
     )
 
 
@@ -272,9 +273,9 @@ def simulate_lab(seed: int = 0, overrides: Mapping[str, str | float] | None = No
     settings = parse(LabSettings, overrides or {}, "scenario lab")
     walk_rng, hidden_rng, motion_rng, range_rng, press_rng = _streams(seed)
     truth = walk(settings, walk_rng)
-    drawn = odometry(settings, hidden_rng)
+    hidden = odometry(settings, hidden_rng)
     attempts = attempt(settings, truth, range_rng)
-    motions = report_motions(drawn, truth.time_s, truth.position_m, truth.heading_rad, motion_rng)
+    motions = report_motions(hidden, truth.time_s, truth.position_m, truth.heading_rad, motion_rng)
     ranges, late = [], set()
     for k in np.flatnonzero(attempts.heard):
         key = (
@@ -288,10 +289,7 @@ def simulate_lab(seed: int = 0, overrides: Mapping[str, str | float] | None = No
         Prior(i + 1, float(x), float(y), float(truth.heading_rad[i, 0]))
         for i, (x, y) in enumerate(truth.position_m[:, 0])
     )
-    hidden = Hidden(
-        drawn.by_node("step_scale"), drawn.by_node("drift_rad_s"), drawn.by_node("distance_noise"),
-        drawn.by_node("turn_noise"), drawn.by_node("white_rad"), late_ranges=frozenset(late),
-    )  # fmt: skip
+    hidden = replace(hidden, late_ranges=frozenset(late))
     places = landmarks()
     return SimulatedRun(
         "lab", tuple(measurements), priors,

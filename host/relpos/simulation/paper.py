@@ -24,13 +24,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import RelposError
+from relpos.fusion.settings import parse, setting
 from relpos.measurements import Event, Measurement, Motion, Prior, Range, Truth
 
 Floats = npt.NDArray[np.float64]
@@ -56,71 +57,42 @@ class Start(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PaperSettings:
-    """What ``--set`` may change; the defaults are scenario P.
+    """What ``--set`` may change; the defaults are scenario P."""
 
-    Users repeat the six noise levels when there are more of them. ``turn_noise`` is the mean
-    over the six users of the relative error of a turn; ``heading_noise_deg`` the white error a
-    step of user 1 (the others by ``HEADING_PATTERN``). ``start`` is what is known of the starts
-    (:class:`Start`); ``start_shift_m`` moves every user's prior (which does not say so)
-    by this distance into a random direction. ``nlos_probability`` of the ranges are too long by
-    ``nlos_min_m`` to ``nlos_max_m``. ``max_range_m`` 0 means unlimited.
+    nodes: int = setting(6, "people; more than six repeat the six noise levels", 2, 1000)
+    seconds: float = setting(600.0, "length of the run", 1.0, 1e6)
+    length_m: float = setting(20.0, "long side of the rectangle", 0.1, 1e4)
+    width_m: float = setting(10.0, "short side of the rectangle", 0.1, 1e4)
+    speed_m_s: float = setting(0.5, "walking speed", 0.01, 100.0)
+    spacing_s: float = setting(16.0, "time between the starts of two", 0.0, 1e5)
+    motion_period_s: float = setting(1.0, "time between motions", 0.01, 60.0)
+    range_period_s: float = setting(2.0, "time between ranges of a pair", 0.01, 60.0)
+    distance_noise_scale: float = setting(1.0, "factor on the noise of step lengths", 0.0, 1e6)
+    turn_noise: float = setting(0.18, "relative error of a turn, mean of the six", 0.0, 1e6)
+    heading_noise_deg: float = setting(0.0, "white error a step of user 1", 0.0, 1e6)
+    sigma_range_m: float = setting(1.0, "standard deviation of a range", 0.0, 1e6)
+    max_range_m: float = setting(15.0, "reading range; 0: unlimited", 0.0, 1e6)
+    detection: float = setting(0.5, "probability that a range is received", 0.0, 1.0)
+    start_shift_m: float = setting(0.0, "error of every prior, which does not say so", 0.0, 1e6)
+    nlos_probability: float = setting(0.0, "share of ranges that are too long", 0.0, 1.0)
+    nlos_min_m: float = setting(2.0, "by so much at least", 0.0, 1e6)
+    nlos_max_m: float = setting(6.0, "by so much at most", 0.0, 1e6)
+    # The one word among numbers: it is parsed apart, and its bounds are not read.
+    start: Start = field(
+        default=Start.KNOWN, metadata={"text": "what is known of starts", "low": 0.0, "high": 0.0}
+    )
+    kidnap_m: float = setting(0.0, "one user (drawn) is carried so far", 0.0, 1e4)
+    """Into a random direction, without any odometry of it; there the user walks on round a
+    rectangle that is shifted by as much."""
+    kidnap_s: float = setting(300.0, "when that happens", 0.0, 1e6)
+    noisy_user: int = setting(0, "whose motion noise is larger; 0: one is drawn", 0, 1000)
+    noisy_factor: float = setting(1.0, "by this factor, without stating it", 0.0, 100.0)
+    scale_error: float = setting(0.0, "spread of the hidden step scale", 0.0, 1.0)
+    """The true length of every step is exp(N(0, this)) times the reported one, one draw a user."""
+    heading_drift_deg_s: float = setting(0.0, "spread of the hidden heading drift", 0.0, 90.0)
+    """One draw a user, who drifts while walking."""
+    drift_while_waiting: int = setting(0, "1: and while waiting", 0, 1)
 
-    At ``kidnap_s`` one user (drawn) is carried ``kidnap_m`` into a random direction without any
-    odometry of it, and walks on from there on a rectangle that is shifted by as much. The motion
-    noise of ``noisy_user`` (0: one is drawn) is multiplied by ``noisy_factor``, without stating it.
-
-    Hidden constants, one draw a user: the true length of every step is exp(N(0, scale_error))
-    times the reported one, and headings drift by N(0, heading_drift_deg_s) while the user walks
-    (one who waits has zero increments; with ``drift_while_waiting`` 1 they drift then, too).
-    """
-
-    nodes: int = 6
-    seconds: float = 600.0
-    length_m: float = 20.0
-    width_m: float = 10.0
-    speed_m_s: float = 0.5
-    spacing_s: float = 16.0
-    motion_period_s: float = 1.0
-    range_period_s: float = 2.0
-    distance_noise_scale: float = 1.0
-    turn_noise: float = 0.18
-    heading_noise_deg: float = 0.0
-    sigma_range_m: float = 1.0
-    max_range_m: float = 15.0
-    detection: float = 0.5
-    start_shift_m: float = 0.0
-    nlos_probability: float = 0.0
-    nlos_min_m: float = 2.0
-    nlos_max_m: float = 6.0
-    start: Start = Start.KNOWN
-    kidnap_m: float = 0.0
-    kidnap_s: float = 300.0
-    noisy_user: int = 0
-    noisy_factor: float = 1.0
-    scale_error: float = 0.0
-    heading_drift_deg_s: float = 0.0
-    drift_while_waiting: int = 0
-
-
-_BOUNDS: Mapping[str, tuple[float, float]] = {
-    "nodes": (2, 1000),
-    "seconds": (1.0, 1e6),
-    "length_m": (0.1, 1e4),
-    "width_m": (0.1, 1e4),
-    "speed_m_s": (0.01, 100.0),
-    "spacing_s": (0.0, 1e5),
-    "motion_period_s": (0.01, 60.0),
-    "range_period_s": (0.01, 60.0),
-    "detection": (0.0, 1.0),
-    "nlos_probability": (0.0, 1.0),
-    "kidnap_m": (0.0, 1e4),
-    "noisy_user": (0, 1000),
-    "noisy_factor": (0.0, 100.0),
-    "scale_error": (0.0, 1.0),
-    "heading_drift_deg_s": (0.0, 90.0),
-    "drift_while_waiting": (0, 1),
-}
-_WHOLE = ("nodes", "noisy_user", "drift_while_waiting")
 
 _WHITE_HEADING: Mapping[str, float] = {
     "turn_noise": 0.0,
@@ -148,8 +120,8 @@ class Hidden:
     heading gains over the true one (the constants of the same names in ``parameters.csv``).
     ``distance_noise`` and ``turn_noise`` are the relative standard deviations of a step's length
     and of a turn, ``white_heading_rad`` that of a step's heading, as they were drawn from: with
-    the noisy user's factor. ``late_ranges`` are the (time, node, peer) of ranges that are too
-    long.
+    the noisy user's factor. ``carried_m`` is how far the kidnapped node is carried, along x and
+    y, ``late_ranges`` are the (time, node, peer) of ranges that are too long.
     """
 
     step_scale: Mapping[int, float] = field(default_factory=dict)
@@ -159,6 +131,7 @@ class Hidden:
     white_heading_rad: Mapping[int, float] = field(default_factory=dict)
     noisy_node: int | None = None
     kidnapped_node: int | None = None
+    carried_m: tuple[float, float] = (0.0, 0.0)
     late_ranges: frozenset[tuple[float, int, int]] = frozenset()
 
 
@@ -187,29 +160,12 @@ def settings_of(scenario: str, overrides: Mapping[str, str | float] | None = Non
     """
     if scenario not in SCENARIOS:
         raise RelposError(f"unknown scenario '{scenario}': one of {', '.join(SCENARIOS)}")
-    changes: dict[str, float | int | Start] = dict(SCENARIOS[scenario])
-    known = {f.name for f in fields(PaperSettings)}
-    for key, text in (overrides or {}).items():
-        if key not in known:
-            raise RelposError(
-                f"scenario {scenario} has no setting '{key}': one of {', '.join(sorted(known))}"
-            )
-        if key == "start":
-            if text not in list(Start):
-                raise RelposError(f"setting start: '{text}' is not one of {', '.join(Start)}")
-            changes[key] = Start(str(text))
-            continue
-        try:
-            value = float(text)
-        except ValueError:
-            raise RelposError(f"setting {key}: '{text}' is not a number") from None
-        low, high = _BOUNDS.get(key, (0.0, 1e6))
-        if not low <= value <= high:
-            raise RelposError(f"setting {key}: {text} is not within {low:g} to {high:g}")
-        if key in _WHOLE and value != int(value):
-            raise RelposError(f"setting {key}: {text} is not a whole number")
-        changes[key] = int(value) if key in _WHOLE else value
-    settings = replace(PaperSettings(), **changes)  # type: ignore[arg-type]
+    given = {**SCENARIOS[scenario], **(overrides or {})}
+    start = given.pop("start", Start.KNOWN)
+    if start not in list(Start):
+        raise RelposError(f"setting start: '{start}' is not one of {', '.join(Start)}")
+    settings = parse(PaperSettings, given, f"scenario {scenario}")
+    settings = replace(settings, start=Start(str(start)))
     if settings.nlos_max_m < settings.nlos_min_m:
         raise RelposError("setting nlos_max_m is less than nlos_min_m")
     if settings.noisy_user > settings.nodes:
@@ -252,26 +208,17 @@ def round_rectangle(path_m: Floats, length: float, width: float) -> tuple[Floats
     return positions, heading
 
 
-@dataclass(frozen=True, slots=True)
-class Drawn:
-    """The hidden side of a run's odometry as arrays by user, (N,); see :class:`Hidden`."""
-
-    step_scale: Floats
-    drift_rad_s: Floats
-    distance_noise: Floats
-    turn_noise: Floats
-    white_rad: Floats
-    noisy: int = 0
-    kidnapped: int = 0
-    carried_m: Floats = field(default_factory=lambda: np.zeros(2))
-    """Where the kidnapped user is put, relative to where it was, (2,)."""
-
-    def by_node(self, name: str) -> dict[int, float]:
-        """One of the arrays with the nodes' ids, from 1 on."""
-        return {k + 1: float(value) for k, value in enumerate(getattr(self, name))}
+def by_node(values: Floats) -> dict[int, float]:
+    """Values by user (N,) with the nodes' ids, from 1 on."""
+    return {k + 1: float(value) for k, value in enumerate(values)}
 
 
-def _draw(settings: PaperSettings, rng: np.random.Generator) -> Drawn:
+def by_user(values: Mapping[int, float]) -> Floats:
+    """The inverse of :func:`by_node`, as a column (N, 1)."""
+    return np.array(list(values.values()))[:, None]
+
+
+def _draw(settings: PaperSettings, rng: np.random.Generator) -> Hidden:
     # Everything is drawn, used or not: no setting changes the random numbers of another.
     count = settings.nodes
     scale, drift = rng.standard_normal(count), rng.standard_normal(count)
@@ -283,20 +230,23 @@ def _draw(settings: PaperSettings, rng: np.random.Generator) -> Drawn:
     pattern = np.resize(np.array(HEADING_PATTERN), count)
     factor = np.ones(count)
     factor[noisy] = settings.noisy_factor
-    return Drawn(
-        np.exp(settings.scale_error * scale),
-        math.radians(settings.heading_drift_deg_s) * drift,
-        np.resize(np.array(DISTANCE_NOISE), count) * settings.distance_noise_scale * factor,
-        settings.turn_noise * pattern / 2.33 * factor,
-        math.radians(settings.heading_noise_deg) * pattern * factor,
-        noisy,
-        kidnapped,
-        settings.kidnap_m * np.array([math.cos(direction), math.sin(direction)]),
+    way_m = settings.kidnap_m
+    return Hidden(
+        by_node(np.exp(settings.scale_error * scale)),
+        by_node(math.radians(settings.heading_drift_deg_s) * drift),
+        by_node(
+            np.resize(np.array(DISTANCE_NOISE), count) * settings.distance_noise_scale * factor
+        ),
+        by_node(settings.turn_noise * pattern / 2.33 * factor),
+        by_node(math.radians(settings.heading_noise_deg) * pattern * factor),
+        noisy + 1 if settings.noisy_factor != 1.0 else None,
+        kidnapped + 1 if way_m > 0.0 else None,
+        (way_m * math.cos(direction), way_m * math.sin(direction)),
     )
 
 
 def report_motions(
-    drawn: Drawn,
+    hidden: Hidden,
     times: Floats,
     positions: Floats,
     heading: Floats,
@@ -314,12 +264,12 @@ def report_motions(
         distance > 0.0, np.arctan2(chord[..., 1], chord[..., 0]) - heading[:, 1:], 0.0
     )
     shape = distance.shape
-    measured = distance * (1.0 + drawn.distance_noise[:, None] * rng.standard_normal(shape))
-    measured /= drawn.step_scale[:, None]
-    turned = turn * (1.0 + drawn.turn_noise[:, None] * rng.standard_normal(shape))
-    turned += drawn.white_rad[:, None] * rng.standard_normal(shape) * (distance > 0.0)
+    measured = distance * (1.0 + by_user(hidden.distance_noise) * rng.standard_normal(shape))
+    measured /= by_user(hidden.step_scale)
+    turned = turn * (1.0 + by_user(hidden.turn_noise) * rng.standard_normal(shape))
+    turned += by_user(hidden.white_heading_rad) * rng.standard_normal(shape) * (distance > 0.0)
     drifts = (distance > 0.0) | drift_while_waiting
-    turned += drawn.drift_rad_s[:, None] * np.diff(times) * drifts
+    turned += by_user(hidden.heading_drift_rad_s) * np.diff(times) * drifts
     dx, dy = measured * np.cos(turned + direction), measured * np.sin(turned + direction)
     return [
         Motion(float(times[k + 1]), i + 1, float(dx[i, k]), float(dy[i, k]), float(turned[i, k]))
@@ -330,7 +280,7 @@ def report_motions(
 
 def _ranges(
     settings: PaperSettings,
-    drawn: Drawn,
+    hidden: Hidden,
     times: Floats,
     positions: Floats,
     rng: np.random.Generator,
@@ -346,7 +296,9 @@ def _ranges(
             for i in range(settings.nodes)
         ]
     )
-    at[drawn.kidnapped] += drawn.carried_m[:, None] * (instants >= settings.kidnap_s)
+    if hidden.kidnapped_node is not None:
+        carried_m = np.array(hidden.carried_m)[:, None]
+        at[hidden.kidnapped_node - 1] += carried_m * (instants >= settings.kidnap_s)
     distance = np.hypot(*(at[first] - at[second]).transpose(1, 0, 2))
     noise = settings.sigma_range_m * rng.standard_normal(distance.shape)
     heard = rng.random(distance.shape) < settings.detection
@@ -395,19 +347,21 @@ def simulate_paper(
     motion_rng, range_rng, shift_rng, hidden_rng = (
         np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)
     )
-    drawn = _draw(settings, hidden_rng)
+    hidden = _draw(settings, hidden_rng)
     times, positions, heading = true_poses(settings)
     motions = report_motions(
-        drawn, times, positions, heading, motion_rng,
+        hidden, times, positions, heading, motion_rng,
         drift_while_waiting=bool(settings.drift_while_waiting),
     )  # fmt: skip
-    ranges, too_long = _ranges(settings, drawn, times, positions, range_rng)
+    ranges, late = _ranges(settings, hidden, times, positions, range_rng)
     priors = _priors(settings, positions, heading, shift_rng)
-    positions[drawn.kidnapped] += drawn.carried_m * (times >= settings.kidnap_s)[:, None]
+    if hidden.kidnapped_node is not None:
+        carried = (times >= settings.kidnap_s)[:, None]
+        positions[hidden.kidnapped_node - 1] += np.array(hidden.carried_m) * carried
     measurements: list[Measurement] = sorted([*motions, *ranges], key=lambda m: m.time_s)
     truth = true_rows(times, positions, heading)
-    return SimulatedRun(scenario, tuple(measurements), priors, truth,
-                        _hidden(settings, drawn, too_long))  # fmt: skip
+    hidden = replace(hidden, late_ranges=late)
+    return SimulatedRun(scenario, tuple(measurements), priors, truth, hidden)
 
 
 def true_rows(
@@ -421,18 +375,3 @@ def true_rows(
         for k, t in enumerate(times)
         for i in range(len(positions))
     )  # fmt: skip
-
-
-def _hidden(
-    settings: PaperSettings, drawn: Drawn, too_long: frozenset[tuple[float, int, int]]
-) -> Hidden:
-    return Hidden(
-        drawn.by_node("step_scale"),
-        drawn.by_node("drift_rad_s"),
-        drawn.by_node("distance_noise"),
-        drawn.by_node("turn_noise"),
-        drawn.by_node("white_rad"),
-        drawn.noisy + 1 if settings.noisy_factor != 1.0 else None,
-        drawn.kidnapped + 1 if settings.kidnap_m > 0.0 else None,
-        too_long,
-    )

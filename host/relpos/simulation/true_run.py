@@ -16,6 +16,7 @@ from relpos.simulation.paper import (
     PaperSettings,
     SimulatedRun,
     Start,
+    by_user,
     settings_of,
     simulate_paper,
     true_poses,
@@ -123,9 +124,6 @@ def of_paper(settings: PaperSettings, run: SimulatedRun) -> TrueRun:
         positions[row] = [(t.x_m, t.y_m) for t in run.truth if t.node == hidden.kidnapped_node]
         sigma_m[row, max(when, 1) - 1] = settings.kidnap_m / math.sqrt(2.0)
 
-    def of_user(values: Mapping[int, float]) -> Floats:
-        return np.array([values[node + 1] for node in range(settings.nodes)])[:, None]
-
     drifts = settings.heading_drift_deg_s > 0.0
     if drifts and not settings.drift_while_waiting:
         duration_s = np.diff(times) * moving
@@ -137,10 +135,10 @@ def of_paper(settings: PaperSettings, run: SimulatedRun) -> TrueRun:
     return TrueRun(
         times,
         positions,
-        of_user(hidden.distance_noise) * moving,
+        by_user(hidden.distance_noise) * moving,
         np.hypot(
-            turn * of_user(hidden.turn_noise),
-            of_user(hidden.white_heading_rad) * moving,
+            turn * by_user(hidden.turn_noise),
+            by_user(hidden.white_heading_rad) * moving,
         ),
         sigma_m,
         np.array([r.time_s for r in kept]),
@@ -170,9 +168,6 @@ def of_lab(seed: int, overrides: Mapping[str, str | float] | None = None) -> Tru
     heading = np.unwrap([[t.heading_rad or 0.0 for t in rows[n]] for n in nodes], axis=1)
     moving = np.linalg.norm(np.diff(positions, axis=1), axis=-1) > 0.0
 
-    def of_user(values: Mapping[int, float]) -> Floats:
-        return np.array([values[n] for n in nodes])[:, None]
-
     hidden, everyone = run.hidden, np.ones(settings.nodes)
     clear = 1.0 / settings.sigma_range_m**2
     delays = (
@@ -192,10 +187,10 @@ def of_lab(seed: int, overrides: Mapping[str, str | float] | None = None) -> Tru
     return TrueRun(
         np.array([t.time_s for t in rows[1]]),
         positions,
-        of_user(hidden.distance_noise) * moving,
+        by_user(hidden.distance_noise) * moving,
         np.hypot(
-            np.diff(heading, axis=1) * of_user(hidden.turn_noise),
-            of_user(hidden.white_heading_rad) * moving,
+            np.diff(heading, axis=1) * by_user(hidden.turn_noise),
+            by_user(hidden.white_heading_rad) * moving,
         ),
         np.zeros(moving.shape),
         np.array([r.time_s for r in kept]),
