@@ -14,6 +14,7 @@ DLPF_CFG 1 to 6: 2.0/2.2, 3.0/3.4, 4.9/5.1, 8.5/10.7, 13.8/22.5, 19.0/45).
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable, Mapping
 from functools import cache
 from typing import ClassVar
@@ -572,11 +573,5 @@ def _swapped(data: bytes, control: int) -> bytes:
 
 
 def _inside(time_us: int, spans: tuple[tuple[int, int], ...]) -> bool:
-    low, high = 0, len(spans)
-    while low < high:
-        middle = (low + high) // 2
-        if spans[middle][1] <= time_us:
-            low = middle + 1
-        else:
-            high = middle
-    return low < len(spans) and spans[low][0] <= time_us
+    first = bisect_right(spans, time_us, key=lambda span: span[1])
+    return first < len(spans) and spans[first][0] <= time_us

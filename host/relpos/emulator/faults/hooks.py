@@ -103,17 +103,12 @@ class Hooks:
     def __init__(self, team: Team) -> None:
         self.team = team
         self.clock = team.clock
-        self._chips: dict[tuple[int, int], FaultyChip] = {}
-        self._spoils: list[Spoil] = []
-        self._lines: dict[XbeeModule, list[LineFault]] = {}
 
     def chip(self, node: EmulatedNode, address: int) -> FaultyChip:
         """The chip at that address of the node's bus."""
-        chip = self._chips.get((node.node, address))
-        if chip is None:
-            chip = FaultyChip(node.bus.devices[address])
-            self._chips[node.node, address] = chip
-            node.bus.devices[address] = chip
+        chip = node.bus.devices[address]
+        if not isinstance(chip, FaultyChip):
+            chip = node.bus.devices[address] = FaultyChip(chip)
         return chip
 
     def at_end(self, spec: FaultSpec, action: Callable[[int], None]) -> None:
@@ -123,32 +118,26 @@ class Hooks:
 
     def line(self, module: XbeeModule, fault: LineFault) -> None:
         """Pass what goes over the module's serial line through ``fault``, after earlier ones."""
-        faults = self._lines.setdefault(module, [])
-        faults.append(fault)
+        before = module.line_fault
 
-        def apply_all(data: bytes, to_module: bool) -> bytes:
-            for one in faults:
-                data = one(data, to_module)
-            return data
+        def both(data: bytes, to_module: bool) -> bytes:
+            return fault(data if before is None else before(data, to_module), to_module)
 
-        module.line_fault = apply_all
+        module.line_fault = both
 
     def air(self, spoil: Spoil) -> None:
         """Pass what goes over the air through ``spoil``, after earlier ones."""
-        spoils = self._spoils
-        spoils.append(spoil)
+        before = self.team.radio.spoil
 
-        def apply_all(
+        def both(
             sender: XbeeModule, receiver: XbeeModule, data: bytes, arrival_us: int
         ) -> list[tuple[int, bytes]]:
             frames = [(arrival_us, data)]
-            for one in spoils:
-                frames = [
-                    out for at_us, frame in frames for out in one(sender, receiver, frame, at_us)
-                ]
-            return frames
+            if before is not None:
+                frames = before(sender, receiver, data, arrival_us)
+            return [out for at, frame in frames for out in spoil(sender, receiver, frame, at)]
 
-        self.team.radio.spoil = apply_all
+        self.team.radio.spoil = both
 
     def silence(self, module: XbeeModule, gone: Callable[[int], bool]) -> None:
         """Let the module neither send nor receive anything while ``gone(time)``."""
