@@ -107,7 +107,7 @@ fuzz: $(FUZZ) | system-soak ## every parser of foreign bytes, guided by coverage
 
 firmware: board-builds ## both boards and sensors: flash, RAM, cycles, beside Mahony and Madgwick
 	$(call title,Budget: cycles and stack on simavr)
-	$(PYTHON) -m relpos.emulator.avr.budget --seconds 100 --filters
+	$(PYTHON) bench/avr_budget.py --seconds 100 --filters
 
 bench: $(PEERS) ## relpos beside filterpy, Stone Soup, particles, pfilter, GTSAM; BENCH=--quick or --full
 	$(call title,Relpos and its peers on the same measurements)

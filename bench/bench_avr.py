@@ -9,9 +9,9 @@ import sys
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 
+from avr.service import Service
 from relpos.emulator.avr import BOARDS, read_firmware
-from relpos.emulator.avr.budget import default_build_folder, find_firmware
-from relpos.emulator.avr.service import Service
+from relpos.emulator.avr.elf import default_build_folder, find_firmware
 from relpos.errors import RelposError
 
 SECONDS = 30.0

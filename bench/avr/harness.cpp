@@ -15,7 +15,7 @@ struct Record {
   float field_ut[3];
   uint8_t field_is_new;
 };
-static_assert(sizeof(Record) == 37, "host/relpos/emulator/avr/filters.py packs it so");
+static_assert(sizeof(Record) == 37, "bench/avr/filters.py packs it so");
 
 Record record;
 volatile uint8_t came;

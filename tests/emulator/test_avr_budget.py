@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from avr_programs import MISSING, Builder
 
-from relpos.emulator.avr import budget
-from relpos.emulator.avr.budget import find_firmware, main, measure
+import avr_budget as budget
+from avr_budget import main, measure
+from relpos.emulator.avr.elf import default_build_folder, find_firmware
 
 pytestmark = pytest.mark.skipif(MISSING is not None, reason=f"{MISSING} is not installed")
 
@@ -110,5 +111,5 @@ BOARDS = ("uno", "mega", "uno-mpu9250")  # the fourth, which has room: `make fir
 
 @pytest.mark.parametrize("board", BOARDS)
 def test_the_whole_firmware_stays_within_its_budgets(board: str) -> None:
-    cost = measure(board, find_firmware(board, budget.default_build_folder()), 20.0)
+    cost = measure(board, find_firmware(board, default_build_folder()), 20.0)
     assert cost.faults == (), cost

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from avr_programs import MISSING
 
-from relpos.emulator.avr import filters
+from avr import filters
 
 pytestmark = pytest.mark.skipif(MISSING is not None, reason=f"{MISSING} is not installed")
 

@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from relpos.emulator.avr.budget import default_build_folder
+from relpos.emulator.avr.elf import default_build_folder
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link import xbee
 from relpos.protocol import messages as wire

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from avr.service import Service
 from relpos.emulator.avr.board import BOARDS
-from relpos.emulator.avr.budget import default_build_folder, find_firmware
-from relpos.emulator.avr.elf import read_firmware
+from relpos.emulator.avr.elf import default_build_folder, find_firmware, read_firmware
 from relpos.emulator.avr.library import missing_parts
-from relpos.emulator.avr.service import Service
 from relpos.protocol import messages as wire
 
 MISSING = missing_parts()

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from relpos.emulator.avr.budget import default_build_folder
+from relpos.emulator.avr.elf import default_build_folder
 from relpos.emulator.avr.library import missing_parts
 from relpos.emulator.engine import NodeClockError
 from relpos.emulator.node import BoardKind, NodeErrors

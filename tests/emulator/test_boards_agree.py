@@ -13,7 +13,7 @@ from itertools import pairwise
 import pytest
 
 from relpos.emulator.avr import read_firmware
-from relpos.emulator.avr.budget import default_build_folder, find_firmware
+from relpos.emulator.avr.elf import default_build_folder, find_firmware
 from relpos.emulator.avr.library import missing_parts
 from relpos.emulator.bus import BusStatus
 from relpos.emulator.engine import NodeClockError

@@ -3,7 +3,7 @@
 import pytest
 
 from fault_runs import NODE, record
-from relpos.emulator.avr.budget import default_build_folder
+from relpos.emulator.avr.elf import default_build_folder
 from relpos.emulator.avr.library import missing_parts
 from relpos.protocol import messages as wire
 

@@ -13,7 +13,7 @@ import pytest
 
 from fault_runs import GOOD_CONDITIONS
 from relpos.emulator.air import VirtualClock
-from relpos.emulator.avr.budget import default_build_folder
+from relpos.emulator.avr.elf import default_build_folder
 from relpos.emulator.avr.library import missing_parts
 from relpos.emulator.bus import BusStatus
 from relpos.emulator.faults.boards import cut_native

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from chips import GRAVITY, Host, constant, of_signal, words
 
+from avr.service import Service
+from avr_budget import BUDGETS, TICK_CYCLES
 from relpos.emulator.ak8975 import Ak8963
 from relpos.emulator.avr.board import BOARDS
-from relpos.emulator.avr.budget import BUDGETS, TICK_CYCLES, default_build_folder, find_firmware
-from relpos.emulator.avr.elf import read_firmware
+from relpos.emulator.avr.elf import default_build_folder, find_firmware, read_firmware
 from relpos.emulator.avr.library import missing_parts
-from relpos.emulator.avr.service import Service
 from relpos.emulator.mpu9150 import Mpu9150
 from relpos.emulator.mpu9250 import Mpu9250
 from relpos.emulator.surroundings import MagneticErrors

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
+from avr.service import Service
+from avr_budget import TICK_CYCLES
 from relpos.emulator import ak8975, pozyx
 from relpos.emulator.avr.board import BOARDS
-from relpos.emulator.avr.budget import TICK_CYCLES, default_build_folder, find_firmware
-from relpos.emulator.avr.elf import read_firmware
+from relpos.emulator.avr.elf import default_build_folder, find_firmware, read_firmware
 from relpos.emulator.avr.library import missing_parts
-from relpos.emulator.avr.service import Service
 from relpos.emulator.bus import I2cDevice
 from relpos.emulator.mpu9150 import Mpu9150
 from relpos.protocol import messages as wire

@@ -17,8 +17,7 @@ from boot_loaders import (
 )
 
 from relpos.emulator.avr.board import BOARDS, Board, ResetCause
-from relpos.emulator.avr.budget import default_build_folder, find_firmware
-from relpos.emulator.avr.elf import read_firmware
+from relpos.emulator.avr.elf import default_build_folder, find_firmware, read_firmware
 from relpos.link import xbee
 from relpos.protocol import messages as wire
 

@@ -266,7 +266,7 @@ def make_engine(
         )
     # Only here: the simulator's library is needed by AVR boards alone.
     from .avr import BOARDS, AvrEngine, read_firmware
-    from .avr.budget import default_build_folder, find_firmware
+    from .avr.elf import default_build_folder, find_firmware
 
     name = f"{board}-mpu9250" if imu is ImuKind.MPU9250 else str(board)
     firmware = read_firmware(find_firmware(name, default_build_folder()))

@@ -2,8 +2,8 @@
 
 simavr simulates the processor; a shim in C (`simavr_shim/`, GPL, not in the wheel) drives it, and
 `board.py` wraps the shim. `engine.py` makes a board one of the emulator's engines, in lock-step
-with the virtual clock. `budget.py`, with `service.py` and `filters.py`, measures what the firmware
-needs of flash, RAM, stack and time; the tests hold it to that. Begin with `engine.py`.
+with the virtual clock. `bench/avr_budget.py` measures what the firmware needs of flash, RAM, stack
+and time; the tests hold it to that. Begin with `engine.py`.
 """
 
 from relpos.emulator.avr.board import BOARDS, Board, BoardKind, Counters

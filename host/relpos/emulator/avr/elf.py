@@ -1,4 +1,4 @@
-"""What an AVR .elf puts into flash, RAM and EEPROM.
+"""Where an AVR .elf is, and what it puts into flash, RAM and EEPROM.
 
 avr-ld keeps the three address spaces apart by offsets: data memory from 0x800000, EEPROM from
 0x810000, fuses and other marks above that; program memory is at 0.
@@ -11,7 +11,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from relpos.emulator.avr.library import SimulatorError
+from relpos import paths
+from relpos.emulator.avr.library import NOT_INSTALLED, SimulatorError
+
+ENVIRONMENTS = {
+    "uno": "uno",
+    "mega": "megaatmega2560",
+    "uno-mpu9250": "uno_mpu9250",
+    "mega-mpu9250": "megaatmega2560_mpu9250",
+}
+"""PlatformIO's, of each board with each sensor."""
 
 _DATA = 0x800000
 _EEPROM = 0x810000
@@ -42,6 +51,32 @@ class Firmware:
     def flash_bytes(self) -> int:
         """Bytes of program memory used."""
         return len(self.flash)
+
+
+def build_folders() -> list[Path]:
+    """Where PlatformIO has built: tools/pio in .build/pio, a user's own, other compiler in .pio.
+
+    SimulatorError in an installed package, which has neither.
+    """
+    root = paths.repository()
+    if root is None:
+        raise SimulatorError(NOT_INSTALLED)
+    theirs = root / ".pio" / "build"
+    here = [f for f in (paths.build_folder() / "pio" / "build", theirs) if f.is_dir()]
+    return here or [theirs]
+
+
+def default_build_folder() -> Path:
+    """The first of :func:`build_folders`."""
+    return build_folders()[0]
+
+
+def find_firmware(board: str, folder: Path) -> Path:
+    """The board's .elf under PlatformIO's build folder; SimulatorError where it is not built."""
+    path = folder / ENVIRONMENTS[board] / "firmware.elf"
+    if not path.is_file():
+        raise SimulatorError(f"there is no firmware for the {board} at {path}: run `make firmware`")
+    return path
 
 
 def read_firmware(path: Path) -> Firmware:

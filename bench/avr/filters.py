@@ -1,6 +1,6 @@
 """Single filters on the simulated Uno: the inertial library, Mahony's and Madgwick's.
 
-Each is a program of ``bench/avr`` around ``harness.cpp``, compiled with the firmware's flags and
+Each is a program of this folder around ``harness.cpp``, compiled with the firmware's flags and
 fed with samples over the UART; only the update lies between the cycle marks.
 """
 
@@ -27,8 +27,8 @@ from relpos.simulation.walker import RATE_HZ as SIMULATED_HZ
 
 Array = NDArray[np.float64]
 
-ROOT = Path(__file__).resolve().parents[4]
-PROGRAMS = ROOT / "bench" / "avr"
+PROGRAMS = Path(__file__).resolve().parent
+ROOT = PROGRAMS.parents[1]
 INERTIAL = ROOT / "firmware" / "lib" / "inertial"
 TICK_CYCLES = 320_000
 TICK_HZ = 50
@@ -75,7 +75,7 @@ def board_flags() -> list[str]:
 
 
 def build(name: str) -> Firmware:
-    """``bench/avr/NAME.cpp`` in its harness; SimulatorError where it does not compile."""
+    """``NAME.cpp`` in its harness; SimulatorError where it does not compile."""
     sources = [PROGRAMS / "harness.cpp", PROGRAMS / f"{name}.cpp"]
     if name == "relpos":
         sources += sorted(INERTIAL.glob("*.cpp"))
@@ -86,7 +86,7 @@ def build(name: str) -> Firmware:
 
 
 def ram_parts() -> dict[str, int]:
-    """Bytes of each part of the node on the Uno, by the names of ``bench/avr/ram_parts.cpp``."""
+    """Bytes of each part of the node on the Uno, by the names of ``ram_parts.cpp``."""
     with tempfile.TemporaryDirectory() as folder:
         unit = Path(folder) / "parts.o"
         _compile(["-fno-lto", "-c", str(PROGRAMS / "ram_parts.cpp"), "-o", str(unit)])

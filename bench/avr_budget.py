@@ -1,6 +1,6 @@
 """What the whole firmware costs on each board, measured on the simulator.
 
-    python -m relpos.emulator.avr.budget [--board uno] [--seconds 60] [--filters]
+    python bench/avr_budget.py [--board uno] [--seconds 60] [--filters]
 
 The firmware .elf runs with register-level chips under a walking member of a team of six: every
 report, ranging round, magnetometer reading and command of normal service happens. Exit status 1
@@ -23,23 +23,14 @@ from rich.console import Console
 from rich.progress import Progress, TimeElapsedColumn
 from rich.table import Table
 
-from relpos import paths
-from relpos.emulator.avr import filters
-from relpos.emulator.avr.board import BOARDS
-from relpos.emulator.avr.elf import read_firmware
-from relpos.emulator.avr.library import NOT_INSTALLED, SimulatorError
-from relpos.emulator.avr.service import Service
+from avr import filters
+from avr.service import Service
+from relpos.emulator.avr import BOARDS, SimulatorError, read_firmware
+from relpos.emulator.avr.elf import ENVIRONMENTS, build_folders, find_firmware
 from relpos.errors import RelposError
 
 TICK_CYCLES = 320_000
 """One 50 Hz tick at 16 MHz."""
-ENVIRONMENTS = {
-    "uno": "uno",
-    "mega": "megaatmega2560",
-    "uno-mpu9250": "uno_mpu9250",
-    "mega-mpu9250": "megaatmega2560_mpu9250",
-}
-"""PlatformIO's, of each board with each sensor."""
 STEP_US = 250_000
 
 
@@ -97,36 +88,10 @@ class Cost:
         return self.mean_tick_cycles / TICK_CYCLES
 
 
-def build_folders() -> list[Path]:
-    """Where PlatformIO has built: tools/pio in .build/pio, a user's own, other compiler in .pio.
-
-    SimulatorError in an installed package, which has neither.
-    """
-    root = paths.repository()
-    if root is None:
-        raise SimulatorError(NOT_INSTALLED)
-    theirs = root / ".pio" / "build"
-    here = [f for f in (paths.build_folder() / "pio" / "build", theirs) if f.is_dir()]
-    return here or [theirs]
-
-
-def default_build_folder() -> Path:
-    """The first of :func:`build_folders`."""
-    return build_folders()[0]
-
-
 def compiler(elf: Path) -> str:
     """Return what the program was compiled with, as its compiler has written it there."""
     found = re.search(rb"GCC: \(GNU\) ([0-9.]+)", elf.read_bytes())
     return f"avr-gcc {found[1].decode()}" if found else "an unknown compiler"
-
-
-def find_firmware(board: str, folder: Path) -> Path:
-    """The board's .elf under PlatformIO's build folder; SimulatorError where it is not built."""
-    path = folder / ENVIRONMENTS[board] / "firmware.elf"
-    if not path.is_file():
-        raise SimulatorError(f"there is no firmware for the {board} at {path}: run `make firmware`")
-    return path
 
 
 def measure(
@@ -250,9 +215,7 @@ def plan_table(cost: Cost) -> Table:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, print, and return the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="python -m relpos.emulator.avr.budget", description=__doc__
-    )
+    parser = argparse.ArgumentParser(prog="python bench/avr_budget.py", description=__doc__)
     parser.add_argument("--board", action="append", choices=sorted(BUDGETS), help="default: all")
     parser.add_argument(
         "--seconds", type=float, default=60.0, help="length of the walk (default 60)"

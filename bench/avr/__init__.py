@@ -1,0 +1,1 @@
+"""Single filters, and the whole firmware in service, on simulated AVR boards."""
