@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar, Self, get_args
 
 DELIMITER = 0x7E
 ESCAPE = 0x7D
@@ -23,164 +23,124 @@ VIRTUAL_TIME = 0xF0
 8 bytes, microseconds. Digi's 802.15.4 modules have no frame of this type."""
 
 
+class _Frame:
+    """A type of frame: fields of a fixed length, in order, and at most one that takes the rest."""
+
+    __slots__ = ()
+    kind: ClassVar[int]
+    layout: ClassVar[str]
+    """Of the fields of a fixed length, as ``struct`` has it."""
+    fixed: ClassVar[tuple[str, ...]]
+    rest: ClassVar[str] = ""
+
+    def body(self) -> bytes:
+        """Everything after the type byte."""
+        values = (_as_sent(name, getattr(self, name)) for name in self.fixed)
+        return struct.pack(self.layout, *values) + (getattr(self, self.rest) if self.rest else b"")
+
+    @classmethod
+    def parse(cls, body: bytes) -> Self:
+        """Inverse of :meth:`body`. Raises struct.error where it is too short."""
+        sent = zip(cls.fixed, struct.unpack_from(cls.layout, body), strict=True)
+        values = {name: _as_sent(name, value) for name, value in sent}
+        if cls.rest:
+            values[cls.rest] = body[struct.calcsize(cls.layout) :]
+        return cls(**values)
+
+
+def _as_sent(name: str, value: Any) -> Any:
+    """A signal strength goes over the line as its magnitude, and back."""
+    return -value if name == "rssi_dbm" else value
+
+
 @dataclass(frozen=True, slots=True)
-class Transmit16:
+class Transmit16(_Frame):
     """TX request to a 16-bit address (0x01); ``frame_id`` 0 asks for no status."""
 
-    kind: ClassVar[int] = 0x01
+    kind = 0x01
+    layout, fixed, rest = ">BHB", ("frame_id", "destination", "options"), "data"
     frame_id: int
     destination: int
     data: bytes
     options: int = 0
 
-    def body(self) -> bytes:
-        """Everything after the type byte."""
-        return struct.pack(">BHB", self.frame_id, self.destination, self.options) + self.data
-
-    @classmethod
-    def parse(cls, body: bytes) -> Transmit16:
-        """Inverse of :meth:`body`. Raises struct.error where it is too short."""
-        frame_id, destination, options = struct.unpack_from(">BHB", body)
-        return cls(frame_id, destination, body[4:], options)
-
 
 @dataclass(frozen=True, slots=True)
-class Receive16:
+class Receive16(_Frame):
     """RX from a 16-bit address (0x81); ``rssi_dbm`` is negative, options bit 1 is broadcast."""
 
-    kind: ClassVar[int] = 0x81
+    kind = 0x81
+    layout, fixed, rest = ">HBB", ("source", "rssi_dbm", "options"), "data"
     source: int
     rssi_dbm: int
     data: bytes
     options: int = 0
 
-    def body(self) -> bytes:
-        """Everything after the type byte."""
-        return struct.pack(">HBB", self.source, -self.rssi_dbm, self.options) + self.data
-
-    @classmethod
-    def parse(cls, body: bytes) -> Receive16:
-        """Inverse of :meth:`body`. Raises struct.error where it is too short."""
-        source, magnitude, options = struct.unpack_from(">HBB", body)
-        return cls(source, -magnitude, body[4:], options)
-
 
 @dataclass(frozen=True, slots=True)
-class Receive64:
+class Receive64(_Frame):
     """RX from a 64-bit address (0x80): a node whose 16-bit address is off (MY = FFFF)."""
 
-    kind: ClassVar[int] = 0x80
+    kind = 0x80
+    layout, fixed, rest = ">QBB", ("source", "rssi_dbm", "options"), "data"
     source: int
     rssi_dbm: int
     data: bytes
     options: int = 0
 
-    def body(self) -> bytes:
-        """Everything after the type byte."""
-        return struct.pack(">QBB", self.source, -self.rssi_dbm, self.options) + self.data
-
-    @classmethod
-    def parse(cls, body: bytes) -> Receive64:
-        """Inverse of :meth:`body`. Raises struct.error where it is too short."""
-        source, magnitude, options = struct.unpack_from(">QBB", body)
-        return cls(source, -magnitude, body[10:], options)
-
 
 @dataclass(frozen=True, slots=True)
-class ReceivePacket:
+class ReceivePacket(_Frame):
     """RX of Zigbee, DigiMesh and newer 802.15.4 firmware (0x90); carries no signal strength."""
 
-    kind: ClassVar[int] = 0x90
+    kind = 0x90
+    layout, fixed, rest = ">QHB", ("source", "source_16", "options"), "data"
     source: int
     source_16: int
     data: bytes
     options: int = 0
 
-    def body(self) -> bytes:
-        """Everything after the type byte."""
-        return struct.pack(">QHB", self.source, self.source_16, self.options) + self.data
-
-    @classmethod
-    def parse(cls, body: bytes) -> ReceivePacket:
-        """Inverse of :meth:`body`. Raises struct.error where it is too short."""
-        source, source_16, options = struct.unpack_from(">QHB", body)
-        return cls(source, source_16, body[11:], options)
-
 
 @dataclass(frozen=True, slots=True)
-class TransmitStatus:
+class TransmitStatus(_Frame):
     """TX status (0x89): 0 ok, 1 not acknowledged, 2 channel busy, 3 purged, 0x74 too long."""
 
-    kind: ClassVar[int] = 0x89
+    kind = 0x89
+    layout, fixed = ">BB", ("frame_id", "status")
     frame_id: int
     status: int
 
-    def body(self) -> bytes:
-        """Everything after the type byte."""
-        return struct.pack(">BB", self.frame_id, self.status)
-
-    @classmethod
-    def parse(cls, body: bytes) -> TransmitStatus:
-        """Inverse of :meth:`body`. Raises struct.error where it is too short."""
-        return cls(*struct.unpack_from(">BB", body))
-
 
 @dataclass(frozen=True, slots=True)
-class AtCommand:
+class AtCommand(_Frame):
     """A command to the local module (0x08); without a value it queries the present one."""
 
-    kind: ClassVar[int] = 0x08
+    kind = 0x08
+    layout, fixed, rest = ">B2s", ("frame_id", "command"), "value"
     frame_id: int
     command: bytes
     value: bytes = b""
 
-    def body(self) -> bytes:
-        """Everything after the type byte."""
-        return struct.pack(">B2s", self.frame_id, self.command) + self.value
-
-    @classmethod
-    def parse(cls, body: bytes) -> AtCommand:
-        """Inverse of :meth:`body`. Raises struct.error where it is too short."""
-        frame_id, command = struct.unpack_from(">B2s", body)
-        return cls(frame_id, command, body[3:])
-
 
 @dataclass(frozen=True, slots=True)
-class AtResponse:
+class AtResponse(_Frame):
     """The local module's answer (0x88): status 0 ok, 1 error, 2 bad command, 3 bad parameter."""
 
-    kind: ClassVar[int] = 0x88
+    kind = 0x88
+    layout, fixed, rest = ">B2sB", ("frame_id", "command", "status"), "value"
     frame_id: int
     command: bytes
     status: int
     value: bytes = b""
 
-    def body(self) -> bytes:
-        """Everything after the type byte."""
-        return struct.pack(">B2sB", self.frame_id, self.command, self.status) + self.value
-
-    @classmethod
-    def parse(cls, body: bytes) -> AtResponse:
-        """Inverse of :meth:`body`. Raises struct.error where it is too short."""
-        frame_id, command, status = struct.unpack_from(">B2sB", body)
-        return cls(frame_id, command, status, body[4:])
-
 
 @dataclass(frozen=True, slots=True)
-class ModemStatus:
+class ModemStatus(_Frame):
     """An event of the local module (0x8A): 0 hardware reset, 1 watchdog reset, 2 associated."""
 
-    kind: ClassVar[int] = 0x8A
+    kind = 0x8A
+    layout, fixed = ">B", ("status",)
     status: int
-
-    def body(self) -> bytes:
-        """Everything after the type byte."""
-        return bytes((self.status,))
-
-    @classmethod
-    def parse(cls, body: bytes) -> ModemStatus:
-        """Inverse of :meth:`body`. Raises struct.error where it is too short."""
-        return cls(*struct.unpack_from(">B", body))
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,18 +162,8 @@ ApiFrame = (
     | ModemStatus
     | UnknownFrame
 )
-_KINDS = {
-    kind.kind: kind
-    for kind in (
-        Transmit16,
-        Receive16,
-        Receive64,
-        ReceivePacket,
-        TransmitStatus,
-        AtCommand,
-        AtResponse,
-        ModemStatus,
-    )
+_KINDS: dict[int, type[Any]] = {
+    kind.kind: kind for kind in get_args(ApiFrame) if kind is not UnknownFrame
 }
 
 
@@ -242,7 +192,8 @@ def interpret(frame_data: bytes) -> ApiFrame:
     kind = _KINDS.get(frame_data[0])
     if kind is not None:
         try:
-            return kind.parse(frame_data[1:])
+            known: ApiFrame = kind.parse(frame_data[1:])
+            return known
         except struct.error:
             pass
     return UnknownFrame(frame_data[0], frame_data[1:])
