@@ -21,7 +21,7 @@ MAX_NODES = 20
 BEACON_PERIOD_S = 1.0
 """A node keeps its slot for 5 s without a beacon. Where half of them are lost, five in a row are
 lost once a minute (2^6 - 2 beacons on average), and the slot is back two seconds later."""
-SUPERFRAME_S = 2.0
+SUPERFRAME_MS = 2000
 """The ranging period of the paper; each node has one window in it."""
 FORGET_S = 30.0
 """Silence after which a node loses its slot. It sends a motion a second: also
@@ -38,7 +38,7 @@ class BeaconSchedule:
     DataError where ``nodes`` are not different ids from 1 to 254, at most :data:`MAX_NODES`.
     """
 
-    def __init__(self, nodes: Iterable[int] = (), *, superframe_s: float = SUPERFRAME_S) -> None:
+    def __init__(self, nodes: Iterable[int] = ()) -> None:
         given = list(nodes)
         if len(set(given)) != len(given) or not all(
             wire.COORDINATOR < node < wire.BROADCAST for node in given
@@ -49,7 +49,6 @@ class BeaconSchedule:
         self._given = frozenset(given)
         self._order = sorted(given)
         self._heard_s: dict[int, float] = {}
-        self._superframe_ms = round(superframe_s * 1000.0)
         self._due_s: float | None = None
         self.left_out: tuple[int, ...] = ()
         """Nodes received without a free slot: they range without one and disturb the others."""
@@ -71,10 +70,10 @@ class BeaconSchedule:
 
     def values(self, now_s: float) -> dict[str, Any]:
         """Return the fields of a beacon that leaves at ``now_s``."""
-        superframe, phase_ms = divmod(round(now_s * 1000.0), self._superframe_ms)
+        superframe, phase_ms = divmod(round(now_s * 1000.0), SUPERFRAME_MS)
         return {
             "phase_s": phase_ms * 1e-3,
-            "period_s": self._superframe_ms * 1e-3,
+            "period_s": SUPERFRAME_MS * 1e-3,
             "round": superframe % 256,
             "nodes": [{"node": node} for node in self.team(now_s)],
         }
@@ -103,9 +102,9 @@ class HostBeacons:
     any command ends that.
     """
 
-    def __init__(self, link: Link, schedule: BeaconSchedule | None = None) -> None:
+    def __init__(self, link: Link) -> None:
         self._link = link
-        self.schedule = schedule or BeaconSchedule()
+        self.schedule = BeaconSchedule()
         self._remarked: set[int] = set()
         self._asked_s: dict[int, float] = {}
 

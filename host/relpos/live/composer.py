@@ -61,16 +61,13 @@ class Composer:
     """
 
     def __init__(
-        self,
-        names: Mapping[int, str] | None = None,
-        start_s: float = 0.0,
-        posts: frozenset[int] = frozenset(),
+        self, names: Mapping[int, str] | None = None, posts: frozenset[int] = frozenset()
     ) -> None:
         self.names: dict[int, str] = dict(names or {})
         self.posts = posts
         self.alarms = Alarms()
         self.alarms.posts = posts
-        self.nowcast = Nowcast(start_s)
+        self.nowcast = Nowcast()
         self.monitor = TeamMonitor()
         self._ranges: dict[tuple[int, int], Range] = {}
         self._pair_cache: dict[tuple[int, int], tuple[tuple[int, int], Pair]] = {}

@@ -242,14 +242,7 @@ class PinnedFrame:
 class CotSender(Sink):
     """Sends views as Cursor-on-Target to a TAK server, a multicast group or one screen."""
 
-    def __init__(
-        self,
-        url: str,
-        pins: Sequence[Pin],
-        *,
-        prefix: str | None = None,
-        exercise: bool = False,
-    ) -> None:
+    def __init__(self, url: str, pins: Sequence[Pin], *, exercise: bool = False) -> None:
         """Begin to connect; DataError or RelposError where that can never succeed."""
         self._shown = url
         self._url = check_url(url)
@@ -264,7 +257,7 @@ class CotSender(Sink):
         # Its loggers write to stderr; trouble() reports errors instead.
         for name in ("pytak.classes", "pytak.client_functions", "pytak"):
             logging.getLogger(name).disabled = True
-        self._schedule = Schedule(Callsigns(prefix or default_prefix()), exercise=exercise)
+        self._schedule = Schedule(Callsigns(default_prefix()), exercise=exercise)
         self._view: TeamView | None = None
         self._sigma_z_m: dict[int, float] = {}
         self._trouble: str | None = None

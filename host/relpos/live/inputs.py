@@ -9,7 +9,7 @@ from __future__ import annotations
 import select
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -316,14 +316,12 @@ class PacedInput:
         speed: float = 1.0,
         link: Link | None = None,
         recorded_unix_s: float | None = None,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.name = name
         self.recorded_unix_s = recorded_unix_s
         self.link = link
         self._items = iter(items)
         self._speed = speed
-        self._clock = clock
         self._next: Received | None = next(self._items, None)
         self._first_s = 0.0 if self._next is None else self._next.arrival_s
         self._started_s: float | None = None
@@ -347,8 +345,8 @@ class PacedInput:
 
     def _elapsed_s(self) -> float:
         if self._started_s is None:
-            self._started_s = self._clock()
-        return (self._clock() - self._started_s) * self._speed
+            self._started_s = time.monotonic()
+        return (time.monotonic() - self._started_s) * self._speed
 
     def now_s(self) -> float:
         """Return the recording's time."""

@@ -92,11 +92,10 @@ class _Track:
 class Nowcast:
     """Composes motions, in the order of the fusion's input, onto the newest estimates.
 
-    ``start_s`` is the time from which a node's first motion counts, as for the estimator.
+    A node's first motion counts from the start of the session, as for the estimator.
     """
 
-    def __init__(self, start_s: float = 0.0) -> None:
-        self._start_s = start_s
+    def __init__(self) -> None:
         self._tracks: dict[int, _Track] = {}
         self._noise = MotionNoise()
         self.estimate: Estimate | None = None
@@ -106,7 +105,7 @@ class Nowcast:
         """Add a motion, the ``number``-th observation submitted to the fusion."""
         track = self._tracks.get(motion.node)
         if track is None:
-            track = self._tracks[motion.node] = _Track(min(self._start_s, motion.time_s))
+            track = self._tracks[motion.node] = _Track(min(0.0, motion.time_s))
         chord = _Chord(track.reported_s, motion, number)
         track.reported_s = max(track.reported_s, motion.time_s)
         track.chords.append(chord)
@@ -121,7 +120,7 @@ class Nowcast:
         for node in estimate.nodes:
             track = self._tracks.get(node.node)
             if track is None:
-                track = self._tracks[node.node] = _Track(self._start_s)
+                track = self._tracks[node.node] = _Track(0.0)
             track.fused = node
             track.step_scale = scales.get(node.node, 1.0)
             track.version += 1

@@ -39,15 +39,14 @@ _FLAGS = {
 class WindowedCount:
     """Growth within the window of a count that wraps at 16 bits and restarts with a boot."""
 
-    def __init__(self, modulus: int = 65536) -> None:
-        self._modulus = modulus
+    def __init__(self) -> None:
         self._newest: tuple[int, int] | None = None
         self._growth: deque[tuple[float, int]] = deque()
 
     def update(self, time_s: float, boot: int, value: int) -> None:
         """Add the count's ``value`` at ``time_s`` in that boot."""
         if self._newest is not None and self._newest[0] == boot:
-            grown = (value - self._newest[1]) % self._modulus
+            grown = (value - self._newest[1]) % (1 << 16)
         else:
             # The count of a node that already runs is unknown before its first report; a new
             # boot's count starts at zero.

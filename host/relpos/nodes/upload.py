@@ -37,15 +37,13 @@ def platformio(root: Path, which: Callable[[str], str | None] = shutil.which) ->
     )
 
 
-def upload(board: Board, port: str, root: Path | None = None, imu: str = IMU[0]) -> int | None:
+def upload(board: Board, port: str, imu: str = IMU[0]) -> int | None:
     """Build, write and verify the firmware. DeviceError with the cause where that fails.
 
-    ``root`` is the firmware's project (default: the one that came with this package), ``imu`` the
-    sensor that it is built for, one of :data:`IMU`.
-
-    Returns the bytes that were verified, or None where the uploader does not print them.
+    ``imu`` is the sensor that it is built for, one of :data:`IMU`. Returns the bytes that were
+    verified, or None where the uploader does not print them.
     """
-    root = root or paths.firmware_project()
+    root = paths.firmware_project()
     command = [*platformio(root), "run", "-e", board.environment, "-t", "upload"]
     try:
         done = subprocess.run(

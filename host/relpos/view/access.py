@@ -64,12 +64,11 @@ class Access:
         """Whether anybody but this computer can reach it."""
         return not _is_loopback(self.hosts[0])
 
-    def url(self, path: str = "/", host: str | None = None, role: Role = Role.COMMAND) -> str:
+    def url(self, path: str = "/", role: Role = Role.COMMAND) -> str:
         """Address of a page with the session's token, or a mission's with a code for one device."""
         token = self.token if self.key is None else Gate(self.key).invite(role)
         scheme = "http" if self.certificate is None else "https"
-        host = host or self.hosts[0]
-        host = f"[{host}]" if ":" in host else host
+        host = f"[{self.hosts[0]}]" if ":" in self.hosts[0] else self.hosts[0]
         return f"{scheme}://{host}:{self.port}{path}?{urlencode({'token': token})}"
 
     def is_own(self, host: str) -> bool:
