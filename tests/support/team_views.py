@@ -6,7 +6,8 @@ from itertools import combinations
 from math import atan2, hypot, pi
 from typing import Any
 
-from relpos.live.team_view import Pair, Person, TeamView
+from relpos.fusion.estimator import PairEstimate
+from relpos.live.team_view import Person, TeamView
 
 UNIX_S = 1_780_000_000.0
 PLACES = {1: (0.0, 0.0), 2: (12.0, 5.0), 3: (-7.5, 20.25), 4: (3.0, -9.0)}
@@ -42,7 +43,7 @@ def team_view(
     """Everybody, each with ``changes`` of their own."""
     people = tuple(person(node, **(changes or {}).get(node, {})) for node in PLACES)
     pairs = tuple(
-        Pair(
+        PairEstimate(
             a.node,
             b.node,
             hypot(b.x_m - a.x_m, b.y_m - a.y_m),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from relpos.fusion.estimator import PairEstimate
 from relpos.live.team_view import (
     STILL_ALARM_S,
     STILL_WARNING_S,
@@ -18,7 +19,6 @@ from relpos.live.team_view import (
     Level,
     MeasuredRange,
     Notice,
-    Pair,
     Person,
     TeamView,
 )
@@ -121,7 +121,9 @@ class WalkingTeam:
                 sigma_m = 0.1 + 0.1 * ((a.node + b.node) % 4)
                 bearing_sd = min(sigma_m / max(distance_m, 0.1), 1.8)
                 pairs.append(
-                    Pair(a.node, b.node, distance_m, sigma_m, math.atan2(dy, dx), bearing_sd)
+                    PairEstimate(
+                        a.node, b.node, distance_m, sigma_m, math.atan2(dy, dx), bearing_sd
+                    )
                 )
                 received = not {a.node, b.node} & self.lost_since.keys()
                 if received and distance_m < 16.0:

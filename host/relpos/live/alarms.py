@@ -62,8 +62,8 @@ CLEARED = {
 
 
 @dataclass(slots=True)
-class _WearerState:
-    """One wearer's movement and silence."""
+class Condition:
+    """One wearer's movement, silence and alert."""
 
     silent_s: float = 0.0
     report_s: float | None = None
@@ -79,8 +79,9 @@ class _WearerState:
     shelved_s: float = 0.0
     """Seconds until the wearer's alarms are shown again."""
 
+    @property
     def still_s(self) -> float:
-        """Return the time without movement, as far as it is known."""
+        """The time without movement, as far as it is known."""
         if self.report_s is None or (self.moving and self.still_since_s == self.report_s):
             return 0.0
         return self.report_s - self.still_since_s + min(self.since_report_s, REPORT_S)
@@ -94,19 +95,6 @@ class KnownAlert:
     raised_s: float
     seen: bool = False
     by: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Condition:
-    """A wearer's movement, silence and alert."""
-
-    moving: bool | None
-    still_s: float
-    silent_s: float
-    alert: Alert | None
-    acknowledged: bool
-    acknowledged_by: str = ""
-    shelved_s: float = 0.0
 
 
 def moved(motion: Motion, duration_s: float = 1.0) -> bool:
@@ -130,7 +118,7 @@ class Alarms:
     def __init__(self) -> None:
         self.changes: list[tuple[int, Alert | None, Alert | None]] = []
         """Alerts that have come or gone: node, before, after; emptied by the reader."""
-        self._states: dict[int, _WearerState] = {}
+        self._states: dict[int, Condition] = {}
         self._ticked_s: float | None = None
         self.waiting: set[int] = set()
         """Who is not in, and may sit still."""
@@ -140,7 +128,7 @@ class Alarms:
 
     def remember(self, node: int, heard_s: float, now_s: float, known: KnownAlert | None) -> None:
         """Go on from a session before: last heard at ``heard_s``, with that alert."""
-        state = self._states.setdefault(node, _WearerState())
+        state = self._states.setdefault(node, Condition())
         state.silent_s = max(now_s - heard_s, 0.0)
         state.report_s = state.still_since_s = heard_s
         if known is None:
@@ -153,11 +141,11 @@ class Alarms:
 
     def mark_heard(self, node: int) -> None:
         """Note that any frame came from the node."""
-        self._states.setdefault(node, _WearerState()).silent_s = 0.0
+        self._states.setdefault(node, Condition()).silent_s = 0.0
 
     def add_motion(self, motion: Motion) -> None:
         """Add a motion report."""
-        state = self._states.setdefault(motion.node, _WearerState())
+        state = self._states.setdefault(motion.node, Condition())
         state.silent_s = 0.0
         first = state.report_s is None
         covered_s = 0.0 if state.report_s is None else motion.time_s - state.report_s
@@ -180,7 +168,7 @@ class Alarms:
 
     def add_height(self, height: Height) -> None:
         """Add a reported height."""
-        state = self._states.setdefault(height.node, _WearerState())
+        state = self._states.setdefault(height.node, Condition())
         if state.falls.measure(height):
             # The fall itself moved the body.
             state.fallen, state.awake = True, 0
@@ -221,20 +209,11 @@ class Alarms:
 
     def condition(self, node: int) -> Condition:
         """Return the condition of the node's wearer."""
-        state = self._states.get(node) or _WearerState()
-        return Condition(
-            state.moving,
-            state.still_s(),
-            state.silent_s,
-            state.alert,
-            state.acknowledged,
-            state.acknowledged_by,
-            state.shelved_s,
-        )
+        return self._states.get(node) or Condition()
 
-    def _update_alert(self, node: int, state: _WearerState) -> None:
+    def _update_alert(self, node: int, state: Condition) -> None:
         rests = node in self.waiting or node in self.posts
-        still_s = 0.0 if rests else state.still_s()
+        still_s = 0.0 if rests else state.still_s
         alert: Alert | None = None
         if node in self.mayday:
             alert, state.shelved_s = Alert.MAYDAY, 0.0

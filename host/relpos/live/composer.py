@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from relpos.fusion.estimator import Estimate, MagneticNorth, NodeEstimate, NodeStatus
+from relpos.fusion.estimator import Estimate, MagneticNorth, NodeEstimate, NodeStatus, PairEstimate
 from relpos.live.alarms import Alarms, Condition, KnownAlert
 from relpos.live.nowcast import Nowcast
 from relpos.live.team_view import (
@@ -16,7 +15,6 @@ from relpos.live.team_view import (
     Ghosts,
     MeasuredRange,
     Notice,
-    Pair,
     Person,
     TeamView,
     name_of,
@@ -40,19 +38,6 @@ NORTH_MOVES_RAD = math.radians(4.0)
 unreadable."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Health:
-    """A node's own health at ``assessed_s``."""
-
-    assessed_s: float
-    colour: str
-    reasons: tuple[str, ...]
-    battery_v: float | None
-    loss: float | None
-    ranging: float | None
-    neighbours: int | None
-
-
 class Composer:
     """Gathers everything that happens, in order, and composes the view of any moment.
 
@@ -70,8 +55,8 @@ class Composer:
         self.nowcast = Nowcast()
         self.monitor = TeamMonitor()
         self._ranges: dict[tuple[int, int], Range] = {}
-        self._pair_cache: dict[tuple[int, int], tuple[tuple[int, int], Pair]] = {}
-        self._health_cache: dict[int, _Health] = {}
+        self._pair_cache: dict[tuple[int, int], tuple[tuple[int, int], PairEstimate]] = {}
+        self._health_cache: dict[int, tuple[float, dict[str, Any]]] = {}
         self._north: MagneticNorth | None = None
         self._submitted = 0
         self._seq = 0
@@ -180,7 +165,7 @@ class Composer:
             for m in self._ranges.values()
         )
 
-    def _pairs(self, estimate: Estimate) -> tuple[Pair, ...]:
+    def _pairs(self, estimate: Estimate) -> tuple[PairEstimate, ...]:
         """Return all pairs; recompute those of nodes with new motion or a new estimate."""
         versions = {node.node: self.nowcast.version(node.node) for node in estimate.nodes}
         before, self._pair_cache = self._pair_cache, {}
@@ -189,37 +174,28 @@ class Composer:
             version = versions[ends[0]], versions[ends[1]]
             known = before.get(ends)
             if known is None or known[0] != version:
-                p = self.nowcast.pair(fused)
-                known = (
-                    version,
-                    Pair(
-                        *ends,
-                        p.distance_m,
-                        p.sigma_distance_m,
-                        p.bearing_rad,
-                        p.sigma_bearing_rad,
-                    ),
-                )
+                known = version, self.nowcast.pair(fused)
             self._pair_cache[ends] = known
         return tuple(pair for _, pair in self._pair_cache.values())
 
-    def _health(self, node: int, now_s: float) -> _Health:
+    def _health(self, node: int, now_s: float) -> dict[str, Any]:
         """Return the node's own health, at most :data:`HEALTH_S` old: it changes slowly."""
-        known = self._health_cache.get(node)
-        if known is None or now_s - known.assessed_s > HEALTH_S or now_s < known.assessed_s:
-            monitor = self.monitor.nodes.get(node) or NodeMonitor(node)
-            colour, reasons = monitor.health(now_s)
-            neighbours = monitor.status.get("neighbours")
-            known = self._health_cache[node] = _Health(
-                now_s,
-                colour.name.lower(),
-                tuple(reasons),
-                # 0: this board does not measure it.
-                monitor.status.get("battery_v") or None,
-                monitor.loss(now_s),
-                monitor.ranging(now_s)[0],
-                None if neighbours is None else int(neighbours),
-            )
+        assessed_s, known = self._health_cache.get(node, (-math.inf, {}))
+        if assessed_s <= now_s <= assessed_s + HEALTH_S:
+            return known
+        monitor = self.monitor.nodes.get(node) or NodeMonitor(node)
+        colour, reasons = monitor.health(now_s)
+        neighbours = monitor.status.get("neighbours")
+        known = {
+            "health": colour.name.lower(),
+            "reasons": tuple(reasons),
+            # 0: this board does not measure it.
+            "battery_v": monitor.status.get("battery_v") or None,
+            "loss": monitor.loss(now_s),
+            "ranging": monitor.ranging(now_s)[0],
+            "neighbours": None if neighbours is None else int(neighbours),
+        }
+        self._health_cache[node] = now_s, known
         return known
 
     def _person(self, node: int, now_s: float) -> Person:
@@ -227,7 +203,6 @@ class Composer:
         condition = self.alarms.condition(node)
         seen_s = None if monitor is None else now_s - monitor.heard_s
         at = self.nowcast.node(node)
-        health = self._health(node, now_s)
         return Person(
             node=node,
             name=self.name(node),
@@ -240,14 +215,9 @@ class Composer:
             acknowledged=condition.acknowledged,
             acknowledged_by=condition.acknowledged_by,
             shelved_s=condition.shelved_s,
-            health=health.colour,
-            reasons=health.reasons,
-            battery_v=health.battery_v,
             rssi_dbm=None if monitor is None else monitor.rssi_dbm,
-            loss=health.loss,
-            ranging=health.ranging,
-            neighbours=health.neighbours,
             post=node in self.posts,
+            **self._health(node, now_s),
             **({} if at is None else _pose(at)),
         )
 

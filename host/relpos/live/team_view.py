@@ -13,9 +13,13 @@ from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from relpos.said import said_of
+
+if TYPE_CHECKING:
+    # With the estimators behind it, which the page's process does without.
+    from relpos.fusion.estimator import PairEstimate
 
 PROTOCOL = 1
 STILL_WARNING_S = 20.0
@@ -128,18 +132,6 @@ class Person:
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
-    """``peer`` as seen from ``node``; the bearing is in the common frame."""
-
-    node: int
-    peer: int
-    distance_m: float
-    sigma_distance_m: float
-    bearing_rad: float
-    sigma_bearing_rad: float
-
-
-@dataclass(frozen=True, slots=True)
 class MeasuredRange:
     """The newest range of two nodes, and how long ago it was measured."""
 
@@ -190,7 +182,7 @@ class TeamView:
     ambiguous: bool = False
     notices: tuple[Notice, ...] = ()
     people: tuple[Person, ...] = ()
-    pairs: tuple[Pair, ...] = ()
+    pairs: tuple[PairEstimate, ...] = ()
     ranges: tuple[MeasuredRange, ...] = ()
     alternatives: tuple[Ghosts, ...] = ()
 
@@ -228,8 +220,8 @@ class TeamView:
 
 
 @lru_cache(maxsize=4096)
-def _pair_json(pair: Pair) -> str:
-    return _ENCODE([_plain(getattr(pair, name)) for name in Pair.__slots__])
+def _pair_json(pair: PairEstimate) -> str:
+    return _ENCODE([_plain(getattr(pair, name)) for name in pair.__slots__])
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ import time
 from array import array
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import replace
 from typing import Any
 
-from relpos.fusion.estimator import NodeStatus, PairEstimate
+from relpos.fusion.estimator import NodeStatus
 from relpos.fusion.post import posts_of
 from relpos.live.alarms import RAISED, Alarms
 from relpos.live.composer import STALE_S, ghosts_of
@@ -28,7 +28,6 @@ from relpos.live.team_view import (
     Alert,
     LogEntry,
     MeasuredRange,
-    Pair,
     Person,
     TeamView,
     name_of,
@@ -266,7 +265,7 @@ class Player:
             fused_s=None if estimate is None else estimate.time_s,
             ambiguous=estimate is not None and bool(estimate.alternatives),
             people=tuple(self._person(node, located.get(node), time_s) for node in nodes),
-            pairs=() if estimate is None else tuple(_pair(p) for p in estimate.pairs),
+            pairs=() if estimate is None else estimate.pairs,
             ranges=tuple(
                 MeasuredRange(*pair, r.range_m, max(time_s - r.time_s, 0.0))
                 for pair, r in newest.items()
@@ -291,14 +290,7 @@ class Player:
         )  # fmt: skip
         if at is None:
             return person
-        pose = {name: getattr(at, name) for name in _POSE}
-        return Person(**{**asdict(person), **pose, "alert": alert})
-
-
-def _pair(p: PairEstimate) -> Pair:
-    return Pair(
-        p.node, p.peer, p.distance_m, p.sigma_distance_m, p.bearing_rad, p.sigma_bearing_rad
-    )
+        return replace(person, **{name: getattr(at, name) for name in _POSE})
 
 
 _POSE = (
