@@ -26,7 +26,7 @@ from relpos.errors import DataError
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
 from relpos.geodesy import MapFrame, Pin
 from relpos.live.cot import CotSender, PinnedFrame, Schedule, check_url, default_prefix
-from relpos.live.cot_events import Callsigns, circle_90_m
+from relpos.live.cot_events import Events, circle_90_m
 from relpos.live.team_view import Alert, TeamView
 from relpos.runs import read_estimates
 from relpos.tracks import estimated_tracks
@@ -100,7 +100,7 @@ def due(schedule: Schedule, shown: TeamView, now_s: float) -> dict[str, Received
 
 @pytest.fixture
 def schedule() -> Schedule:
-    return Schedule(Callsigns("test"))
+    return Schedule(Events("test"))
 
 
 def test_a_member_is_a_friendly_unit_where_it_is(schedule: Schedule) -> None:
@@ -229,7 +229,7 @@ def test_an_emergency_needs_no_position(schedule: Schedule) -> None:
 
 
 def test_an_emulated_or_replayed_team_says_so() -> None:
-    events = due(Schedule(Callsigns("test"), exercise=True), team_view(), 0.0)
+    events = due(Schedule(Events("test", exercise=True)), team_view(), 0.0)
     assert {event.how for event in events.values()} == {"m-s"}
     assert all("EXERCISE" in event.words("remarks") for event in events.values())
 

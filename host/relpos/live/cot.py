@@ -24,7 +24,7 @@ from relpos.errors import DataError
 from relpos.extras import missing_extra
 from relpos.fusion.estimator import Estimate
 from relpos.geodesy import MapFrame, Pin, place
-from relpos.live.cot_events import Callsigns, Moved, emergency, last_known, member, serialized
+from relpos.live.cot_events import Events, Moved, serialized
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert, Person, TeamView
 from relpos.said import Said
@@ -75,9 +75,8 @@ def default_prefix() -> str:
 class Schedule:
     """Decides which events are due; its only state is what was sent before."""
 
-    def __init__(self, calls: Callsigns, *, exercise: bool = False) -> None:
-        self._calls = calls
-        self._exercise = exercise
+    def __init__(self, events: Events) -> None:
+        self._events = events
         self._sent_s: dict[int, float] = {}
         self._alarm_sent_s: dict[int, float] = {}
         self._marked_s: dict[int, float] = {}
@@ -111,10 +110,10 @@ class Schedule:
         lost = person.status == "lost"
         if lost and (marked_s is None or now_s - marked_s >= LAST_KNOWN_EVERY_S):
             self._marked_s[node] = now_s
-            return last_known(person, view, frame, self._calls, exercise=self._exercise)
+            return self._events.last_known(person, view, frame)
         if not lost and marked_s is not None:
             del self._marked_s[node]
-            return last_known(person, view, frame, self._calls, over=True, exercise=self._exercise)
+            return self._events.last_known(person, view, frame, over=True)
         return None
 
     def _event(
@@ -133,47 +132,22 @@ class Schedule:
         )
         if lies and (alarm_s is None or now_s - alarm_s >= ALARM_EVERY_S):
             self._alarm_sent_s[node] = now_s
-            return self._emergency(person, view, frame, sigma_z_m, over=False)
+            return self._events.emergency(person, view, frame, sigma_z_m=sigma_z_m)
         if not lies and alarm_s is not None:
             del self._alarm_sent_s[node]
-            return self._emergency(person, view, frame, sigma_z_m, over=True)
+            return self._events.emergency(person, view, frame, sigma_z_m=sigma_z_m, over=True)
         if self._seen_seq.get(node) == view.seq:
             return None
         if person.status == "lost" and now_s - self._sent_s.get(node, -1e9) < LOST_EVERY_S:
             return None
-        event = member(
-            person,
-            view,
-            frame,
-            self._calls,
-            sigma_z_m=sigma_z_m,
-            before=self._moved.get(node),
-            exercise=self._exercise,
+        event = self._events.member(
+            person, view, frame, sigma_z_m=sigma_z_m, before=self._moved.get(node)
         )
         if event is not None:
             self._seen_seq[node] = view.seq
             if person.motion_s is not None and person.x_m is not None and person.y_m is not None:
                 self._moved[node] = Moved(person.motion_s, person.x_m, person.y_m)
         return event
-
-    def _emergency(
-        self,
-        person: Person,
-        view: TeamView,
-        frame: MapFrame,
-        sigma_z_m: float | None,
-        *,
-        over: bool,
-    ) -> ET.Element:
-        return emergency(
-            person,
-            view,
-            frame,
-            self._calls,
-            over=over,
-            sigma_z_m=sigma_z_m,
-            exercise=self._exercise,
-        )
 
 
 class PinnedFrame:
@@ -257,7 +231,7 @@ class CotSender(Sink):
         # Its loggers write to stderr; trouble() reports errors instead.
         for name in ("pytak.classes", "pytak.client_functions", "pytak"):
             logging.getLogger(name).disabled = True
-        self._schedule = Schedule(Callsigns(default_prefix()), exercise=exercise)
+        self._schedule = Schedule(Events(default_prefix(), exercise))
         self._view: TeamView | None = None
         self._sigma_z_m: dict[int, float] = {}
         self._trouble: str | None = None

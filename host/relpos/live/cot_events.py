@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
@@ -54,17 +54,6 @@ _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]"
 
 
 @dataclass(frozen=True)
-class Callsigns:
-    """Identifiers of members on TAK; ``prefix`` keeps teams on one server apart."""
-
-    prefix: str
-
-    def uid(self, node: int) -> str:
-        """Return the member's uid, the same in every session of this team."""
-        return f"{self.prefix}.{node}"
-
-
-@dataclass(frozen=True)
 class Moved:
     """Position of a member at its last event, from which its speed follows."""
 
@@ -73,117 +62,141 @@ class Moved:
     y_m: float
 
 
-def member(
-    person: Person,
-    view: TeamView,
-    frame: MapFrame,
-    calls: Callsigns,
-    *,
-    sigma_z_m: float | None = None,
-    before: Moved | None = None,
-    exercise: bool = False,
-) -> ET.Element | None:
-    """Return the event of one member; None while its position is unknown or never received."""
-    if person.seen_s is None or not _located(person):
-        return None
-    import pytak
+@dataclass(frozen=True)
+class Events:
+    """Makes the events of a team; ``prefix`` keeps teams on one server apart."""
 
-    fresh = person.status == "ok"
-    seen_unix_s = view.unix_s - person.seen_s
-    details = [
-        ET.Element("contact", callsign=text(person.name)),
-        ET.Element("uid", Droid=text(person.name)),
-        ET.Element("__group", name="Red", role="HQ" if person.post else "Team Member"),
-        _remarks(person, exercise),
-    ]
-    if person.heading_rad is not None and fresh:
-        course_deg = frame.course_deg(person.heading_rad)
-        speed_m_s = _speed(person, before)
-        details.append(ET.Element("track", course=f"{course_deg:.1f}", speed=f"{speed_m_s:.2f}"))
-    event: ET.Element = pytak.cot_event(
-        uid=calls.uid(person.node),
-        cot_type=POST if person.post else MEMBER,
-        how="m-s" if exercise else "m-g" if fresh else "h-e",
-        point=_point(person, frame, sigma_z_m),
-        detail=pytak.cot_detail(*details, flow_tag=False),
-    )
-    return _timed(event, view.unix_s, seen_unix_s, seen_unix_s + STALE_S)
+    prefix: str
+    exercise: bool = False
 
+    def uid(self, node: int) -> str:
+        """Return the member's uid, the same in every session of this team."""
+        return f"{self.prefix}.{node}"
 
-def emergency(
-    person: Person,
-    view: TeamView,
-    frame: MapFrame,
-    calls: Callsigns,
-    *,
-    over: bool = False,
-    sigma_z_m: float | None = None,
-    exercise: bool = False,
-) -> ET.Element:
-    """Return the event that a member lies still, or with ``over`` does so no longer.
+    def member(
+        self,
+        person: Person,
+        view: TeamView,
+        frame: MapFrame,
+        *,
+        sigma_z_m: float | None = None,
+        before: Moved | None = None,
+    ) -> ET.Element | None:
+        """Return the event of one member; None while its position is unknown or never received."""
+        if person.seen_s is None or not _located(person):
+            return None
+        fresh = person.status == "ok"
+        seen_unix_s = view.unix_s - person.seen_s
+        details = [
+            ET.Element("contact", callsign=text(person.name)),
+            ET.Element("uid", Droid=text(person.name)),
+            ET.Element("__group", name="Red", role="HQ" if person.post else "Team Member"),
+            self._remarks(person),
+        ]
+        if person.heading_rad is not None and fresh:
+            course, speed = frame.course_deg(person.heading_rad), _speed(person, before)
+            details.append(ET.Element("track", course=f"{course:.1f}", speed=f"{speed:.2f}"))
+        event = self._event(
+            self.uid(person.node),
+            POST if person.post else MEMBER,
+            "m-g" if fresh else "h-e",
+            _point(person, frame, sigma_z_m),
+            details,
+        )
+        return _timed(event, view.unix_s, seen_unix_s, seen_unix_s + STALE_S)
 
-    A member without a position is placed at the pin, with an unknown error.
-    """
-    import pytak
+    def emergency(
+        self,
+        person: Person,
+        view: TeamView,
+        frame: MapFrame,
+        *,
+        over: bool = False,
+        sigma_z_m: float | None = None,
+    ) -> ET.Element:
+        """Return the event that a member lies still, or with ``over`` does so no longer.
 
-    name = text(person.name)
-    link = ET.Element("link", uid=calls.uid(person.node), type=MEMBER, relation="p-p")
-    emergency_tag = ET.Element("emergency", {"cancel": "true"} if over else {"type": "911 Alert"})
-    emergency_tag.text = name
-    event: ET.Element = pytak.cot_event(
-        uid=f"{calls.uid(person.node)}-9-1-1",
-        cot_type=EMERGENCY_OVER if over else EMERGENCY,
-        how="m-s" if exercise else "m-g" if person.status == "ok" else "h-e",
-        point=_point(person, frame, sigma_z_m),
-        detail=pytak.cot_detail(
-            link,
-            ET.Element("contact", callsign=f"{name}-Alert"),
-            emergency_tag,
-            _remarks(person, exercise),
-            flow_tag=False,
-        ),
-    )
-    now_s = view.unix_s
-    return _timed(event, now_s, now_s, now_s + (STALE_S if over else ALARM_STALE_S))
+        A member without a position is placed at the pin, with an unknown error.
+        """
+        name = text(person.name)
+        tag = ET.Element("emergency", {"cancel": "true"} if over else {"type": "911 Alert"})
+        tag.text = name
+        event = self._event(
+            f"{self.uid(person.node)}-9-1-1",
+            EMERGENCY_OVER if over else EMERGENCY,
+            "m-g" if person.status == "ok" else "h-e",
+            _point(person, frame, sigma_z_m),
+            [
+                ET.Element("link", uid=self.uid(person.node), type=MEMBER, relation="p-p"),
+                ET.Element("contact", callsign=f"{name}-Alert"),
+                tag,
+                self._remarks(person),
+            ],
+        )
+        now_s = view.unix_s
+        return _timed(event, now_s, now_s, now_s + (STALE_S if over else ALARM_STALE_S))
 
+    def last_known(
+        self, person: Person, view: TeamView, frame: MapFrame, *, over: bool = False
+    ) -> ET.Element | None:
+        """Return a marker at a lost member's last known place, or with ``over`` its deletion.
 
-def last_known(
-    person: Person,
-    view: TeamView,
-    frame: MapFrame,
-    calls: Callsigns,
-    *,
-    over: bool = False,
-    exercise: bool = False,
-) -> ET.Element | None:
-    """Return a marker at a lost member's last known place, or with ``over`` its deletion.
+        Clients delete a member some minutes after it is stale; the marker stays for a day. None
+        without a position.
+        """
+        if person.seen_s is None or not _located(person):
+            return None
+        uid = f"{self.uid(person.node)}-last"
+        seen = datetime.fromtimestamp(view.unix_s - person.seen_s).astimezone().strftime("%H:%M:%S")
+        details = [
+            ET.Element("contact", callsign=text(f"{person.name}, last known {seen}")),
+            ET.Element("link", uid=uid if over else self.uid(person.node), type=MEMBER,
+                       relation="none" if over else "p-p"),
+            self._remarks(person),
+        ]  # fmt: skip
+        if over:
+            details.append(ET.Element("__forcedelete"))
+        kind = DELETION if over else LAST_KNOWN
+        event = self._event(uid, kind, "h-e", _point(person, frame, None), details)
+        now_s = view.unix_s
+        return _timed(event, now_s, now_s, now_s + (STALE_S if over else LAST_KNOWN_STALE_S))
 
-    Clients delete a member some minutes after it is stale; the marker stays for a day. None without
-    a position.
-    """
-    if person.seen_s is None or not _located(person):
-        return None
-    import pytak
+    def _event(
+        self, uid: str, kind: str, how: str, point: ET.Element, details: Sequence[ET.Element]
+    ) -> ET.Element:
+        import pytak
 
-    uid = f"{calls.uid(person.node)}-last"
-    seen = datetime.fromtimestamp(view.unix_s - person.seen_s).astimezone().strftime("%H:%M:%S")
-    details = [
-        ET.Element("contact", callsign=text(f"{person.name}, last known {seen}")),
-        ET.Element("link", uid=uid if over else calls.uid(person.node), type=MEMBER,
-                   relation="none" if over else "p-p"),
-        _remarks(person, exercise),
-    ]  # fmt: skip
-    if over:
-        details.append(ET.Element("__forcedelete"))
-    event: ET.Element = pytak.cot_event(
-        uid=uid,
-        cot_type=DELETION if over else LAST_KNOWN,
-        how="m-s" if exercise else "h-e",
-        point=_point(person, frame, None),
-        detail=pytak.cot_detail(*details, flow_tag=False),
-    )
-    now_s = view.unix_s
-    return _timed(event, now_s, now_s, now_s + (STALE_S if over else LAST_KNOWN_STALE_S))
+        event: ET.Element = pytak.cot_event(
+            uid=uid,
+            cot_type=kind,
+            how="m-s" if self.exercise else how,
+            point=point,
+            detail=pytak.cot_detail(*details, flow_tag=False),
+        )
+        return event
+
+    def _remarks(self, person: Person) -> ET.Element:
+        """Return the remarks: what the symbol cannot show."""
+        words = []
+        if self.exercise:
+            words.append("EXERCISE")
+        if person.alert is Alert.MAYDAY:
+            words.append("MAYDAY")
+        if person.alert is Alert.STILL_ALARM:
+            words.append(f"LIES STILL for {person.still_s:.0f} s")
+        if person.alert is Alert.FALL:
+            words.append("FELL")
+        if person.floor is not None:
+            words.append(f"floor {person.floor}")
+        if not _located(person):
+            words.append("position unknown")
+        elif person.status == "ambiguous":
+            words.append("position ambiguous")
+        elif person.status in ("stale", "lost"):
+            words.append(f"{person.status}: last heard {person.seen_s or 0.0:.0f} s ago")
+        remarks = ET.Element("remarks")
+        remarks.text = text("; ".join([*words, *person.reasons]))
+        return remarks
 
 
 def serialized(event: ET.Element) -> bytes:
@@ -253,30 +266,6 @@ def _point(person: Person, frame: MapFrame, sigma_z_m: float | None) -> ET.Eleme
         float(latitude), float(longitude), **known, precision=DECIMALS
     )
     return there
-
-
-def _remarks(person: Person, exercise: bool) -> ET.Element:
-    """Return the remarks: what the symbol cannot show."""
-    words = []
-    if exercise:
-        words.append("EXERCISE")
-    if person.alert is Alert.MAYDAY:
-        words.append("MAYDAY")
-    if person.alert is Alert.STILL_ALARM:
-        words.append(f"LIES STILL for {person.still_s:.0f} s")
-    if person.alert is Alert.FALL:
-        words.append("FELL")
-    if person.floor is not None:
-        words.append(f"floor {person.floor}")
-    if not _located(person):
-        words.append("position unknown")
-    elif person.status == "ambiguous":
-        words.append("position ambiguous")
-    elif person.status in ("stale", "lost"):
-        words.append(f"{person.status}: last heard {person.seen_s or 0.0:.0f} s ago")
-    remarks = ET.Element("remarks")
-    remarks.text = text("; ".join([*words, *person.reasons]))
-    return remarks
 
 
 def _speed(person: Person, before: Moved | None) -> float:
