@@ -23,36 +23,29 @@ from relpos.measurements import Step
 from relpos.runs.appending import AppendedTable, close_all
 from relpos.runs.table import (
     Column,
+    Parser,
     bounded,
     find_table,
     node_id,
     not_negative,
     number,
-    read_rows,
+    numbered_rows,
+    read_text,
 )
 
 T = TypeVar("T")
 
 
-def _status(text: str) -> NodeStatus:
-    try:
-        return NodeStatus(text)
-    except ValueError:
-        raise ValueError(f"is none of {', '.join(NodeStatus)}") from None
+def _one_of(words: type[StrEnum]) -> Parser:
+    """Return the parser of a word that is one of these."""
 
+    def parse(text: str) -> StrEnum:
+        try:
+            return words(text)
+        except ValueError:
+            raise ValueError(f"is none of {', '.join(words)}") from None
 
-def _episode(text: str) -> Episode:
-    try:
-        return Episode(text)
-    except ValueError:
-        raise ValueError(f"is none of {', '.join(Episode)}") from None
-
-
-def _shape(text: str) -> Shape:
-    try:
-        return Shape(text)
-    except ValueError:
-        raise ValueError(f"is none of {', '.join(Shape)}") from None
+    return parse
 
 
 def _whole(text: str) -> int:
@@ -75,8 +68,8 @@ _ESTIMATE_TABLE = (
     Column("sigma_angle_rad", number, optional=True),
     Column("sigma_z_m", not_negative, optional=True),
     Column("sigma_heading_rad", not_negative, optional=True),
-    Column("status", _status, optional=True),
-    Column("episode", _episode, optional=True),
+    Column("status", _one_of(NodeStatus), optional=True),
+    Column("episode", _one_of(Episode), optional=True),
     Column("episode_probability", not_negative, optional=True),
     Column("floor", int, optional=True),
     Column("floor_probability", not_negative, optional=True),
@@ -89,7 +82,7 @@ _PAIR_TABLE = (
     Column("sigma_distance_m", not_negative, optional=True),
     Column("bearing_rad", number, optional=True),
     Column("sigma_bearing_rad", not_negative, optional=True),
-    Column("status", _status, optional=True),
+    Column("status", _one_of(NodeStatus), optional=True),
 )
 _ALTERNATIVE_TABLE = (
     Column("time_s", bounded("time_s")),
@@ -102,7 +95,7 @@ _ALTERNATIVE_TABLE = (
     Column("sigma_major_m", not_negative),
     Column("sigma_minor_m", not_negative),
     Column("sigma_angle_rad", number),
-    Column("shape", _shape),
+    Column("shape", _one_of(Shape)),
 )
 _PARAMETER_TABLE = (
     Column("time_s", bounded("time_s")),
@@ -245,7 +238,7 @@ def _by_time(
     path = find_table(directory, name)
     if path is not None:
         names = [column.name for column in columns]
-        for cells in read_rows(path, columns):
+        for _, cells in numbered_rows(path, read_text(path), columns):
             made.setdefault(cells[0], []).append(make(dict(zip(names, cells, strict=True))))
     return made
 

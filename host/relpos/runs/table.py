@@ -171,21 +171,14 @@ def _read_lines(path: Path, file: Any, most_bytes: int) -> bytearray:
     return data
 
 
-def read_rows(path: Path, columns: Sequence[Column]) -> Iterator[tuple[Any, ...]]:
-    """Yield one tuple of cells a row, in the order of ``columns``; None for a missing option.
-
-    Lines without any content are skipped. DataError names the first thing wrong.
-    """
-    for _, cells in numbered_rows(path, read_text(path), columns):
-        yield cells
-
-
 def numbered_rows(
     path: Path, text: str, columns: Sequence[Column], counters: Counter[str] | None = None
 ) -> Iterator[tuple[int, tuple[Any, ...]]]:
-    """Like :func:`read_rows` on text at hand, with the number of the line each row ends on.
+    """Yield the number of the line that a row ends on, and its cells in the order of ``columns``.
 
-    A last row that a kill cut off is left out, told, and counted as ``rows_cut_off``.
+    None stands for a missing option; lines without any content are skipped. A last row that a kill
+    cut off is left out, told, and counted as ``rows_cut_off``. DataError names the first thing
+    wrong.
     """
     end = max(text.rfind("\n"), text.rfind("\r")) + 1 or len(text)
     reader = csv.reader(io.StringIO(text[:end], newline=""), strict=True)
