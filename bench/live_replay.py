@@ -93,16 +93,15 @@ def write(path: Path, people: int, seconds: int) -> None:
     about, topics = About(time.time_ns()), all_topics()
     encoder = Encoder(about.started_unix_ns, {})
     block = container.Block(container.numbered(topics))
-    sequence, due_s = 0, BLOCK_S
+    due_s = BLOCK_S
     with path.open("wb") as file:
-        file.write(container.beginning("relpos", about.metadata(), topics))
+        file.write(container.beginning(about.metadata(), topics))
         for at_s, item in items(people, seconds):
             if at_s >= due_s and len(block):
                 file.write(block.pop())
                 due_s = at_s + BLOCK_S
             for message in encoder.messages(at_s, item):
-                sequence += 1
-                block.add(message.topic, message.log_ns, message.publish_ns, sequence, message.data)
+                block.add(message)
         file.write(block.pop())
     container.finish(path)
 

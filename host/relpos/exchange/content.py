@@ -58,8 +58,7 @@ class Content:
     @property
     def names(self) -> dict[int, str]:
         """The wearers' names, where there are any."""
-        infos = self.run.description.nodes
-        return {node: info.name for node, info in infos.items() if info.name}
+        return self.run.description.names
 
     def tracks_of(self, kind: Kind) -> dict[int, Track]:
         """Return each node's trajectory; a guess at a node not located yet is part of it."""

@@ -91,17 +91,13 @@ def run_session(
         plan.make_estimator, plan.priors, common=plan.common, restarts=plan.mission is not None
     )
     files = FileSink(plan.out, plan.description, keep_received=source.is_now)
-    nodes = plan.description.nodes
     sinks: list[Sink] = [files, *(make(hello) for make in make_sinks)]
     kept = plan.mission
     journal = None if kept is None else Journal(kept.folder.path / JOURNAL)
     session = LiveSession(
         source,
         fusion,
-        Composer(
-            {node: info.name for node, info in nodes.items() if info.name},
-            posts=posts_of(nodes),
-        ),
+        Composer(plan.description.names, posts_of(plan.description.nodes)),
         sinks,
         seconds=plan.seconds,
         lasts=plan.lasts,

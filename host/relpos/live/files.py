@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from relpos.fusion.estimator import Estimate
@@ -11,7 +10,7 @@ from relpos.live.log_files import log_row
 from relpos.live.sinks import Sink
 from relpos.live.team_view import LogEntry
 from relpos.measurements import Observation, Step
-from relpos.runs import Description, EstimateFiles, NodeInfo, RunFiles
+from relpos.runs import Description, EstimateFiles, RunFiles
 from relpos.runs.appending import AppendedTable
 from relpos.runs.log import LOG_COLUMNS, LOG_FILE
 from relpos.said import Said
@@ -37,10 +36,7 @@ class FileSink(Sink):
         """Store the wearers' names."""
         if self._received is None:
             return
-        nodes = dict(self._description.nodes)
-        for node, name in names.items():
-            nodes[node] = replace(nodes.get(node, NodeInfo()), name=name)
-        self._description = replace(self._description, nodes=nodes)
+        self._description = self._description.with_names(names)
         self._describe()
 
     def _describe(self) -> None:

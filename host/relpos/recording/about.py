@@ -7,7 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from relpos.errors import DataError
+from relpos.protocol import messages as wire
 from relpos.runs.description import Description, description_text, parse_description
+from relpos.version import __version__
 
 METADATA = "relpos"
 DESCRIPTION = "run.toml"
@@ -39,9 +41,6 @@ class About:
 
     def metadata(self) -> dict[str, dict[str, str]]:
         """Metadata records by name."""
-        from relpos.protocol import messages as wire
-        from relpos.version import __version__
-
         return {
             METADATA: {
                 "relpos_version": self.version or __version__,

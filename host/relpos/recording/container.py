@@ -39,7 +39,9 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from relpos.recording.topics import Message as SessionMessage
 from relpos.recording.topics import Topic
+from relpos.version import __version__
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD_BYTES = 9
@@ -70,13 +72,11 @@ def _bytes_of(builder: RecordBuilder) -> bytes:
 # -- writing ---------------------------------------------------------------------------------------
 
 
-def beginning(
-    library: str, metadata: Mapping[str, Mapping[str, str]], topics: Iterable[Topic]
-) -> bytes:
+def beginning(metadata: Mapping[str, Mapping[str, str]], topics: Iterable[Topic]) -> bytes:
     """Everything before the first block."""
     builder = RecordBuilder()
     builder.write(MAGIC)
-    Header("", library).write(builder)
+    Header("", f"relpos {__version__}").write(builder)
     for name, values in metadata.items():
         Metadata(name, dict(values)).write(builder)
     builder.write(channel_records(numbered(topics), topics))
@@ -106,24 +106,31 @@ def metadata_record(name: str, values: Mapping[str, str]) -> bytes:
 
 
 class Block:
-    """Messages that go to disk together; ``numbers``: topic -> channel."""
+    """Messages that go to disk together, numbered from 1 on; ``numbers``: topic -> channel."""
 
     def __init__(self, numbers: Mapping[str, int]) -> None:
         self._numbers = numbers
         self._messages = bytearray()
         self._index: dict[int, list[tuple[int, int]]] = {}
+        self._sequence = 0
 
     def __len__(self) -> int:
         return len(self._messages)
 
-    def add(self, topic: str, log_ns: int, publish_ns: int, sequence: int, data: bytes) -> None:
-        """Add a message; times are nanoseconds of Unix time."""
-        number = self._numbers[topic]
-        self._index.setdefault(number, []).append((log_ns, len(self._messages)))
+    def add(self, message: SessionMessage) -> None:
+        """Add a message."""
+        number = self._numbers[message.topic]
+        self._sequence = (self._sequence + 1) & 0xFFFFFFFF
+        self._index.setdefault(number, []).append((message.log_ns, len(self._messages)))
         self._messages += _MESSAGE.pack(
-            Opcode.MESSAGE, 22 + len(data), number, sequence & 0xFFFFFFFF, log_ns, publish_ns
+            Opcode.MESSAGE,
+            MESSAGE_HEAD.size + len(message.data),
+            number,
+            self._sequence,
+            message.log_ns,
+            message.publish_ns,
         )
-        self._messages += data
+        self._messages += message.data
 
     def pop(self) -> bytes:
         """Return the block's bytes, and empty the block."""

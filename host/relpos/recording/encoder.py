@@ -20,17 +20,6 @@ from relpos.measurements import (
 )
 from relpos.recording import topics
 from relpos.recording.scene import Scene, log_message
-from relpos.runs.description import Description
-
-
-@dataclass(frozen=True, slots=True)
-class Message:
-    """One message: when the session had it and what time it speaks of, in Unix time."""
-
-    topic: str
-    log_ns: int
-    publish_ns: int
-    data: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +60,7 @@ class Encoder:
             for _ in stranger.messages(0.0, item):
                 pass
 
-    def messages(self, at_s: float, item: Item) -> Iterator[Message]:
+    def messages(self, at_s: float, item: Item) -> Iterator[topics.Message]:
         """Messages of an item that the session had at ``at_s``."""
         match item:
             case topics.Serial():
@@ -82,7 +71,7 @@ class Encoder:
             case Line():
                 unix_ns = self._unix_ns(at_s)
                 data = log_message(unix_ns, item.level, item.text)
-                yield Message(topics.LOG, unix_ns, unix_ns, data)
+                yield topics.Message(topics.LOG, unix_ns, unix_ns, data)
             case Estimate():
                 for topic, data in (*topics.encode_estimate(item), *self._scene.draw(item)):
                     yield self._message(topic, at_s, item.time_s, data)
@@ -95,16 +84,11 @@ class Encoder:
                     of_s = getattr(observation, "time_s", at_s)
                     yield self._message(topic, at_s, of_s, data)
 
-    def _message(self, topic: str, at_s: float, of_s: float, data: bytes) -> Message:
-        return Message(topic, self._unix_ns(at_s), self._unix_ns(of_s), data)
+    def _message(self, topic: str, at_s: float, of_s: float, data: bytes) -> topics.Message:
+        return topics.Message(topic, self._unix_ns(at_s), self._unix_ns(of_s), data)
 
     def _unix_ns(self, time_s: float) -> int:
         return max(self._started_unix_ns + round(time_s * 1e9), 0)
-
-
-def names_of(description: Description) -> dict[int, str]:
-    """Return the name of each wearer, where it is known."""
-    return {node: info.name for node, info in description.nodes.items() if info.name}
 
 
 class ItemSink(Sink):

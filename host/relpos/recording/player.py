@@ -133,7 +133,7 @@ class Player:
         self._admit = admit
         self.moments = moments
         self._sinks = sinks
-        self.names = {n: i.name for n, i in moments.description.nodes.items() if i.name}
+        self.names = moments.description.names
         self.posts = posts_of(moments.description.nodes)
         self.history = History()
         self.at_s = moments.from_s

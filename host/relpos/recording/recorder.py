@@ -14,19 +14,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event, Lock, Thread
-from typing import TYPE_CHECKING
 
 from relpos.fusion.estimator import Estimate
 from relpos.recording import container, topics
 from relpos.recording.about import DESCRIPTION, About
-from relpos.recording.encoder import Encoder, Item, ItemSink, Line, names_of
+from relpos.recording.encoder import Encoder, Item, ItemSink, Line
 from relpos.recording.output import NO_ROOM, Disk, Output
 from relpos.recording.schemas import all_topics
-from relpos.runs.description import NodeInfo, description_text
+from relpos.runs.description import description_text
 from relpos.said import Said
-
-if TYPE_CHECKING:
-    pass
 
 TICK_S = 0.1
 BLOCK_S = 0.25
@@ -76,11 +72,10 @@ class Recorder(ItemSink):
         super().__init__()
         self._about = about
         self._bounds = bounds or Bounds()
-        self._encoder = Encoder(about.started_unix_ns, names_of(about.description))
+        self._encoder = Encoder(about.started_unix_ns, about.description.names)
         self._topics = all_topics()
         self._block = container.Block(container.numbered(self._topics))
         self._looked_s = self._block_began_s = time.monotonic()
-        self._sequence = 0
         self._queue: deque[tuple[int, float, Item | _Names]] = deque()
         self._lock = Lock()
         self._queued = 0
@@ -133,10 +128,7 @@ class Recorder(ItemSink):
     # -- the recorder's thread --------------------------------------------------------------------
 
     def _beginning(self, part: int) -> bytes:
-        from relpos.version import __version__
-
-        records = replace(self._about, part=part).metadata()
-        return container.beginning(f"relpos {__version__}", records, self._topics)
+        return container.beginning(replace(self._about, part=part).metadata(), self._topics)
 
     def _run(self) -> None:
         give_up_s: float | None = None
@@ -276,21 +268,15 @@ class Recorder(ItemSink):
 
     def _add(self, at_s: float, item: Item) -> None:
         for message in self._encoder.messages(at_s, item):
-            self._sequence += 1
-            self._block.add(
-                message.topic, message.log_ns, message.publish_ns, self._sequence, message.data
-            )
+            self._block.add(message)
 
     def _rename(self, names: Mapping[int, str]) -> None:
         """Write names as metadata between two blocks, where the newest counts."""
         if len(self._block):
             self._output.put(self._block.pop())
-        nodes = dict(self._about.description.nodes)
-        for node, name in names.items():
-            nodes[node] = replace(nodes.get(node, NodeInfo()), name=name)
-        description = replace(self._about.description, nodes=nodes)
+        description = self._about.description.with_names(names)
         self._about = replace(self._about, description=description)
-        self._encoder.rename(names_of(description))
+        self._encoder.rename(description.names)
         text = {"text": description_text(description)}
         self._output.put(container.metadata_record(DESCRIPTION, text))
 

@@ -12,7 +12,7 @@ from relpos.errors import DataError
 from relpos.fusion.estimator import Estimate
 from relpos.recording import container, topics
 from relpos.recording.about import DESCRIPTION, About
-from relpos.recording.encoder import Encoder, names_of
+from relpos.recording.encoder import Encoder
 from relpos.recording.reader import Recording
 from relpos.recording.schemas import all_topics
 from relpos.runs.description import description_text
@@ -50,8 +50,8 @@ def _write_run(
         started_unix_ns, source=run.name, description=replace(run.description, name=run.name)
     )
     every = all_topics()
-    out.write(_beginning(about, every))
-    writer = _Writer(out, Encoder(started_unix_ns, names_of(run.description)), every)
+    out.write(container.beginning(about.metadata(), every))
+    writer = _Writer(out, Encoder(started_unix_ns, run.description.names), every)
     for landmark in run.landmarks:
         writer.add_row(0.0, landmark)
     for time_s, item in _by_time(run, estimates):
@@ -79,7 +79,7 @@ def _write_again(out: IO[bytes], run: Run, source: Recording) -> list[str]:
     if run.description != (source.about.description if source.about else None):
         text = description_text(replace(run.description, name=run.name))
         out.write(container.metadata_record(DESCRIPTION, {"text": text}))
-    encoder = Encoder(source.started_unix_ns or 0, names_of(run.description))
+    encoder = Encoder(source.started_unix_ns or 0, run.description.names)
     writer = _Writer(out, encoder, (), numbers)
     known = source.run
     for landmark in run.landmarks:
@@ -90,12 +90,6 @@ def _write_again(out: IO[bytes], run: Run, source: Recording) -> list[str]:
             writer.add_row(row.time_s, row)
     writer.end()
     return [f"{lost} bytes could not be read and are left out"] * bool(lost)
-
-
-def _beginning(about: About, every: Sequence[topics.Topic]) -> bytes:
-    from relpos.version import __version__
-
-    return container.beginning(f"relpos {__version__}", about.metadata(), every)
 
 
 def _by_time(run: Run, estimates: Sequence[Estimate]) -> Iterator[tuple[float, Any]]:
@@ -118,7 +112,6 @@ class _Writer:
         self._out = out
         self._encoder = encoder
         self._block = container.Block(container.numbered(every) if numbers is None else numbers)
-        self._sequence = 0
 
     def add_row(self, time_s: float, row: Any) -> None:
         """Add an observation, a truth or a landmark."""
@@ -126,10 +119,7 @@ class _Writer:
 
     def add(self, time_s: float, item: Any) -> None:
         for message in self._encoder.messages(time_s, item):
-            self._sequence += 1
-            self._block.add(
-                message.topic, message.log_ns, message.publish_ns, self._sequence, message.data
-            )
+            self._block.add(message)
         if len(self._block) > BLOCK_BYTES:
             self.end()
 

@@ -63,6 +63,16 @@ class Topic:
 
 
 @dataclass(frozen=True, slots=True)
+class Message:
+    """One message: when the session had it and what time it speaks of, in Unix time."""
+
+    topic: str
+    log_ns: int
+    publish_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
 class Serial:
     """Bytes of the serial port as they were read, at ``arrival_s`` of the session."""
 

@@ -5,16 +5,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from threading import Event, Thread
-from typing import TYPE_CHECKING
 
 from relpos.errors import DataError, DeviceError
 from relpos.recording.about import About
-from relpos.recording.encoder import Encoder, Item, ItemSink, names_of
+from relpos.recording.encoder import Encoder, Item, ItemSink
 from relpos.recording.schemas import all_topics
 from relpos.said import Said
-
-if TYPE_CHECKING:
-    pass
 
 TICK_S = 0.05
 MOST_WAITING = 2000
@@ -29,7 +25,7 @@ class FoxgloveServer(ItemSink):
 
         super().__init__()
         host, port = parse_listen(listen)
-        self._encoder = Encoder(about.started_unix_ns, names_of(about.description))
+        self._encoder = Encoder(about.started_unix_ns, about.description.names)
         self._context = foxglove.Context()
         self._channels = {
             topic.name: foxglove.Channel(

@@ -68,6 +68,17 @@ class Description:
     floors_m: tuple[float, ...] = ()
     """Heights of the floors over the start's, from the lowest on. For evaluation alone."""
 
+    @property
+    def names(self) -> dict[int, str]:
+        """The wearers' names, where there are any."""
+        return {node: info.name for node, info in self.nodes.items() if info.name}
+
+    def with_names(self, names: Mapping[int, str]) -> Description:
+        """Return a description with new names of these nodes' wearers."""
+        known = {node: self.nodes.get(node, NodeInfo()) for node in names}
+        named = {node: replace(info, name=names[node]) for node, info in known.items()}
+        return replace(self, nodes={**self.nodes, **named})
+
     def with_post(self, node: int | None) -> Description:
         """Return a description in which a node lies at the command post."""
         if node is None:
