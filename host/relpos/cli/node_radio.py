@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from functools import partial
 from typing import Annotated
 
@@ -60,14 +59,11 @@ def radio(
         return
     with output.working("looking for the module"):
         written = modules.configure(partial(open_port, port), wanted)
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title="Coordinator" if coordinator else f"Module of node {node}")
-    for column in ("", "before", "now", "meaning"):
-        table.add_column(column)
+    columns = ("", "before", "now", "meaning")
+    title = "Coordinator" if coordinator else f"Module of node {node}"
+    table = output.table(columns, columns, title=title)
     for one in written:
         p = one.parameter
         table.add_row(p.command, f"{one.before:X}", f"{p.value:X}", p.meaning)
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
+    output.console().print(table)
     typer.echo("stored in the module and read back")

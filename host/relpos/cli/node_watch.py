@@ -38,8 +38,6 @@ def list_nodes(
     json: Annotated[bool, typer.Option("--json", help="Print JSON alone.")] = False,
 ) -> None:
     """List the nodes that are heard: id, firmware, uptime, last restart, supply, link, boots."""
-    from rich.console import Console
-
     with output.working(f"listening for {seconds:g} s"):
         now_s, monitor = deque(_watch(port, seconds, key_file, cable), maxlen=1)[0]
     rows = monitor.rows(now_s)
@@ -57,7 +55,7 @@ def list_nodes(
         )
     if monitor.foreign_frames:
         output.remark(f"not all are shown: {_foreign(monitor)}")
-    Console(width=None if sys.stdout.isatty() else 120).print(_list_table(rows))
+    output.console().print(_list_table(rows))
 
 
 def monitor(
@@ -154,21 +152,8 @@ def _foreign(monitor: TeamMonitor) -> str:
 
 
 def _list_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    from rich.table import Table
-
-    table = Table()
-    for column in (
-        "node",
-        "firmware",
-        "up",
-        "started by",
-        "boots",
-        "supply",
-        "RSSI",
-        "lost",
-        HEALTH,
-    ):
-        table.add_column(column, justify="left" if column in (HEALTH, "started by") else "right")
+    columns = ("node", "firmware", "up", "started by", "boots", "supply", "RSSI", "lost", HEALTH)
+    table = output.table(columns, (HEALTH, "started by"))
     for row in rows:
         table.add_row(
             str(row["node"]),
@@ -185,13 +170,9 @@ def _list_table(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def _monitor_table(rows: Sequence[Mapping[str, Any]], foreign: str) -> Table:
-    from rich.table import Table
-
     title = None if rows else "no node is heard yet"
-    table = Table(title=title, caption=foreign or None)
     columns = ("node", "supply", "RSSI", "lost", "seen", "frames", "ranging", "neighbours", HEALTH)
-    for column in columns:
-        table.add_column(column, justify="left" if column == HEALTH else "right")
+    table = output.table(columns, (HEALTH,), title=title, caption=foreign or None)
     for row in rows:
         ranging = _percent(row["ranging"])
         if row["exchanges"]:

@@ -6,7 +6,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from threading import Timer
@@ -15,6 +15,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import typer
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
     from relpos.evaluation.bounds import Totals
     from relpos.evaluation.consistency import Nees
     from relpos.evaluation.iso18305 import Assessment
@@ -47,6 +50,29 @@ def print_json(document: Mapping[str, Any]) -> None:
 def remark(words: str) -> None:
     """Print a remark beside the result, on stderr."""
     typer.echo(words, err=True)
+
+
+def console() -> Console:
+    """Return where tables go: a pipe has no width, and 80 columns are too narrow for them."""
+    from rich.console import Console
+
+    return Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+
+
+def table(
+    columns: Iterable[str],
+    left: Container[str],
+    *,
+    title: str | None = None,
+    caption: str | None = None,
+) -> Table:
+    """Return an empty table; the columns that are not ``left`` hold figures."""
+    from rich.table import Table
+
+    made = Table(title=title, caption=caption)
+    for column in columns:
+        made.add_column(column, justify="left" if column in left else "right")
+    return made
 
 
 def parse_settings(pairs: Sequence[str]) -> dict[str, str]:
@@ -171,20 +197,14 @@ FRAMES = {
 
 def print_iso(iso: Assessment) -> None:
     """Print the metrics of ISO/IEC 18305, a row for each way of alignment."""
-    from rich.console import Console
-    from rich.table import Table
-
     if not iso.known:
         return
-    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
-    table = Table(title="ISO/IEC 18305", caption=f"coverage {100.0 * iso.coverage:.1f} %")
-    table.add_column("aligned by")
-    columns = ["mean", "RMS", "CE50", "CE95", "VE50", "VE95", "SE50", "SE95"]
-    for column in columns:
-        table.add_column(column, justify="right")
+    columns = ["aligned by", "mean", "RMS", "CE50", "CE95", "VE50", "VE95", "SE50", "SE95"]
+    caption = f"coverage {100.0 * iso.coverage:.1f} %"
+    shown = table(columns, columns[:1], title="ISO/IEC 18305", caption=caption)
     for frame, one in iso.frames.items():
         flat = one.horizontal
-        table.add_row(
+        shown.add_row(
             FRAMES[frame],
             *(metres(v) for v in (flat.mean_m, flat.rms_m, flat.e50_m, flat.e95_m)),
             *(
@@ -193,7 +213,7 @@ def print_iso(iso: Assessment) -> None:
                 for v in (kind.e50_m, kind.e95_m)
             ),
         )
-    console.print(table)
+    console().print(shown)
 
 
 def print_vertical(found: Vertical) -> None:
@@ -204,20 +224,15 @@ def print_vertical(found: Vertical) -> None:
 
 def print_metrics(title: str, metrics: Metrics, baseline: Metrics | None = None) -> None:
     """Print a table per pair, the team's figures and how they go over time."""
-    from rich.console import Console
-    from rich.table import Table
-
-    # A pipe has no width, and 80 columns are too narrow for the table.
-    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+    out = console()
     if metrics.time_s.size:
         title += f", the end at {metrics.time_s[-1]:.0f} s"
-    table = Table(title=title, caption=f"{metrics.epochs} whole seconds scored")
-    table.add_column("pair")
-    columns = ["estimated (end)", "true (end)", "error (end)", "RMSE", "mean error", "body frame"]
-    for column in (*columns, "NEES"):
-        table.add_column(column, justify="right")
-    if baseline is not None:
-        table.add_column("dead reckoning RMSE", justify="right")
+    columns = [
+        "pair", "estimated (end)", "true (end)", "error (end)", "RMSE", "mean error", "body frame",
+        "NEES",
+    ]  # fmt: skip
+    columns += ["dead reckoning RMSE"] * (baseline is not None)
+    pairs = table(columns, ("pair",), title=title, caption=f"{metrics.epochs} whole seconds scored")
     for k, (pair, figures) in enumerate(metrics.pairs.items()):
         ends = [
             (float(e), float(t))
@@ -239,35 +254,32 @@ def print_metrics(title: str, metrics: Metrics, baseline: Metrics | None = None)
         if baseline is not None:
             other = baseline.pairs.get(pair)
             cells.append(metres(other.distance_rmse_m if other else math.nan))
-        table.add_row(f"{pair[0]} - {pair[1]}", *cells)
-    console.print(table)
-    console.print(f"relative distance RMSE   {metres(metrics.relative_distance_rmse_m)}")
-    console.print(f"aligned position RMSE    {metres(metrics.relative_position_rmse_m)}")
-    console.print(f"body-frame RMSE          {metres(metrics.body_frame_rmse_m)}")
+        pairs.add_row(f"{pair[0]} - {pair[1]}", *cells)
+    out.print(pairs)
+    out.print(f"relative distance RMSE   {metres(metrics.relative_distance_rmse_m)}")
+    out.print(f"aligned position RMSE    {metres(metrics.relative_position_rmse_m)}")
+    out.print(f"body-frame RMSE          {metres(metrics.body_frame_rmse_m)}")
     from relpos.evaluation import consistency
 
     chance = consistency.of_distances([metrics])
     left_out = f"; {metrics.nees_left_out} rows with sigma 0 left out" * bool(metrics.nees_left_out)
-    console.print(
+    out.print(
         f"NEES of the distance     {plain(metrics.nees_distance)} (1 is honest, "
         f"{plain(chance.low)} to {plain(chance.high)} by chance{left_out})"
     )
     if baseline is not None:
         factor = baseline.relative_distance_rmse_m / metrics.relative_distance_rmse_m
-        console.print(
+        out.print(
             f"dead reckoning           {metres(baseline.relative_distance_rmse_m)} relative "
             f"distance RMSE, {plain(factor)} times the fusion's"
         )
-    _print_over_time(console, metrics)
+    _print_over_time(out, metrics)
 
 
 def print_nees(position: Nees, heading: Nees) -> None:
     """Print the consistency of absolute poses, where estimate and truth have one frame."""
-    from rich.console import Console
-
-    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
     for what, nees in (("positions", position), ("headings", heading)):
-        console.print(
+        console().print(
             f"NEES of the {what:<12} {plain(nees.mean)} "
             f"({plain(nees.low)} to {plain(nees.high)} by chance)"
         )
@@ -275,14 +287,11 @@ def print_nees(position: Nees, heading: Nees) -> None:
 
 def print_bound(bound: Totals) -> None:
     """Print the Cramer-Rao bound: the least root mean square errors of any estimator."""
-    from rich.console import Console
-
-    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
     for what, distance, position in (
         ("on line", bound.filtering_distance_m, bound.filtering_position_m),
         ("smoothed", bound.smoothing_distance_m, bound.smoothing_position_m),
     ):
-        console.print(
+        console().print(
             f"bound {what:<18} {metres(distance)} relative distance, {metres(position)} aligned"
         )
 
@@ -301,64 +310,57 @@ def print_last_pairs(
     title: str, estimates: Sequence[Estimate], scored_s: float | None = None
 ) -> None:
     """Print the relative positions at the end, or at the last second that is scored."""
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+    out = console()
     if not estimates:
-        console.print(f"{title}: nothing could be estimated")
+        out.print(f"{title}: nothing could be estimated")
         return
     last = estimates[-1]
     if scored_s is not None:
         last = min(reversed(estimates), key=lambda estimate: abs(estimate.time_s - scored_s))
-    console.print(f"{title}, at {last.time_s:.1f} s")
-    table = Table()
-    for column in ("pair", "distance", "sigma", "bearing", "sigma "):
-        table.add_column(column, justify="left" if column == "pair" else "right")
+    out.print(f"{title}, at {last.time_s:.1f} s")
+    pairs = table(("pair", "distance", "sigma", "bearing", "sigma "), ("pair",))
     for pair in last.pairs:
-        table.add_row(
+        pairs.add_row(
             f"{pair.node} - {pair.peer}",
             metres(pair.distance_m),
             metres(pair.sigma_distance_m),
             degrees(pair.bearing_rad),
             degrees(pair.sigma_bearing_rad),
         )
-    console.print(table)
+    out.print(pairs)
     states = [f"{node.node} {node.status}" for node in last.nodes if node.status != "ok"]
     if states:
-        console.print(f"not located for sure: {', '.join(states)}")
+        out.print(f"not located for sure: {', '.join(states)}")
     if last.alternatives:
         shares = {a.alternative: a.probability for a in last.alternatives}
         rings = sorted({a.node for a in last.alternatives if a.shape == "ring"})
-        console.print(
+        out.print(
             f"{len(shares)} possible modes (alternatives.csv): "
             + ", ".join(f"{100.0 * share:.0f} %" for share in shares.values())
             + (f"; somewhere on a ring: {', '.join(map(str, rings))}" if rings else "")
         )
 
 
-def _print_over_time(console: Any, metrics: Metrics) -> None:
+def _print_over_time(out: Console, metrics: Metrics) -> None:
     import numpy as np
-    from rich.table import Table
 
     if metrics.time_s.size < 2:
         return
     edges = np.linspace(metrics.time_s[0], metrics.time_s[-1] + 1e-9, 7)
-    table = Table(title="over time")
-    for column in ("seconds", "distance RMSE", "aligned RMSE", "body frame", "NEES"):
-        table.add_column(column, justify="right")
+    columns = ("seconds", "distance RMSE", "aligned RMSE", "body frame", "NEES")
+    rows = table(columns, (), title="over time")
     for first, last in pairwise(edges):
         inside = (metrics.time_s >= first) & (metrics.time_s < last)
         if not inside.any():
             continue
-        table.add_row(
+        rows.add_row(
             f"{first:.0f} to {last:.0f}",
             metres(_root_mean_square(metrics.distance_rmse_over_time_m[inside])),
             metres(_root_mean_square(metrics.position_rmse_over_time_m[inside])),
             metres(_root_mean_square(metrics.body_frame_rmse_over_time_m[inside])),
             plain(_mean(metrics.nees_over_time[inside])),
         )
-    console.print(table)
+    out.print(rows)
 
 
 def _mean(values: Any) -> float:
