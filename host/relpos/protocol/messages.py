@@ -153,9 +153,7 @@ HEADER_BYTES = sum(f.byte_count for f in HEADER)
 
 
 def _time(meaning: str) -> Quantity:
-    return Quantity(
-        "time_s", "u32", meaning, raw_name="time_ms", unit="s", per_unit=1000, wraps=True
-    )
+    return Quantity("time_s", "u32", meaning, raw_name="time_ms", wraps=True)
 
 
 MOTION = Message(
@@ -170,8 +168,6 @@ MOTION = Message(
             "i32",
             "Total displacement along the heading at the start",
             raw_name="x_mm",
-            unit="m",
-            per_unit=1000,
             wraps=True,
         ),
         Quantity(
@@ -179,8 +175,6 @@ MOTION = Message(
             "i32",
             "Total displacement to the left of the heading at the start",
             raw_name="y_mm",
-            unit="m",
-            per_unit=1000,
             wraps=True,
         ),
         Quantity(
@@ -188,27 +182,15 @@ MOTION = Message(
             "i32",
             "Total turn, counter-clockwise, whole turns included",
             raw_name="heading_100urad",
-            unit="rad",
-            per_unit=10_000,
             wraps=True,
         ),
-        Quantity(
-            "path_m",
-            "u32",
-            "Total of the step lengths",
-            raw_name="path_mm",
-            unit="m",
-            per_unit=1000,
-            wraps=True,
-        ),
+        Quantity("path_m", "u32", "Total of the step lengths", raw_name="path_mm", wraps=True),
         Quantity("steps", "u16", "Total number of steps", wraps=True),
         Quantity(
             "variance_along_m2",
             "u32",
             "Total variance along the walking direction, without the scale error",
             raw_name="variance_along_mm2",
-            unit="m^2",
-            per_unit=1_000_000,
             wraps=True,
         ),
         Quantity(
@@ -216,8 +198,6 @@ MOTION = Message(
             "u32",
             "Total variance across the walking direction",
             raw_name="variance_across_mm2",
-            unit="m^2",
-            per_unit=1_000_000,
             wraps=True,
         ),
         Quantity(
@@ -225,8 +205,6 @@ MOTION = Message(
             "u32",
             "Total variance of the heading",
             raw_name="variance_heading_100urad2",
-            unit="rad^2",
-            per_unit=100_000_000,
             wraps=True,
         ),
         Quantity(
@@ -234,8 +212,6 @@ MOTION = Message(
             "u32",
             "Total standard deviation of the path from what all steps err by together",
             raw_name="scale_error_mm",
-            unit="m",
-            per_unit=1000,
             wraps=True,
         ),
         Quantity(
@@ -243,16 +219,12 @@ MOTION = Message(
             "i16",
             "Height over the start, from pressure; see HEIGHT_VALID",
             raw_name="height_cm",
-            unit="m",
-            per_unit=100,
         ),
         Quantity(
             "magnetic_heading_rad",
             "i16",
             "Heading of the body over magnetic north, counter-clockwise; see MAGNETOMETER_VALID",
             raw_name="magnetic_heading_100urad",
-            unit="rad",
-            per_unit=10_000,
             low=-31_416,
             high=31_416,
         ),
@@ -274,24 +246,13 @@ RANGES = Message(
         "range",
         (
             Quantity("peer", "u8", "The other node"),
-            Quantity(
-                "range_m",
-                "u24",
-                "Distance",
-                raw_name="range_mm",
-                unit="m",
-                per_unit=1000,
-                low=1,
-                high=200_000,
-            ),
+            Quantity("range_m", "u24", "Distance", raw_name="range_mm", low=1, high=200_000),
             Quantity("rss_dbm", "i8", "Signal strength", unit="dBm"),
             Quantity(
                 "age_s",
                 "u16",
                 "How long before the frame's time it was measured",
                 raw_name="age_ms",
-                unit="s",
-                per_unit=1000,
             ),
             Quantity("quality", "u8", "What weakens this range", values=RangeQuality),
         ),
@@ -311,12 +272,7 @@ STATUS = Message(
         Quantity("uptime_s", "u32", "Time since the start", unit="s"),
         Quantity("reset_cause", "u8", "Why the node started", values=ResetCause),
         Quantity(
-            "battery_v",
-            "u16",
-            "Supply voltage; 0 where it is not measured",
-            raw_name="battery_mv",
-            unit="V",
-            per_unit=1000,
+            "battery_v", "u16", "Supply voltage; 0 where it is not measured", raw_name="battery_mv"
         ),
         Quantity("bus_errors", "u16", "I2C transactions that failed", wraps=True),
         Quantity("ranging_successes", "u16", "Ranges obtained", wraps=True),
@@ -326,8 +282,6 @@ STATUS = Message(
             "u16",
             "Longest 50 Hz tick since the last status",
             raw_name="worst_tick_us",
-            unit="s",
-            per_unit=1_000_000,
         ),
         Quantity("missed_ticks", "u16", "50 Hz ticks that came too late to be kept", wraps=True),
         Quantity(
@@ -356,8 +310,6 @@ STATUS = Message(
             "This end's share of what its ranges are too long by (antenna delay); the host "
             "subtracts both ends' shares",
             raw_name="range_offset_mm",
-            unit="m",
-            per_unit=1000,
         ),
         Quantity(
             "damaged_bytes", "u16", "Bytes that arrived damaged at the UART: noise", wraps=True
@@ -389,12 +341,8 @@ STEPS = Message(
                 "u16",
                 "How long before the frame's time the mid-stance was",
                 raw_name="age_ms",
-                unit="s",
-                per_unit=1000,
             ),
-            Quantity(
-                "length_m", "u16", "Step length", raw_name="length_mm", unit="m", per_unit=1000
-            ),
+            Quantity("length_m", "u16", "Step length", raw_name="length_mm"),
         ),
         most=10,
     ),
@@ -413,8 +361,6 @@ SAMPLES = Message(
                 "i32",
                 "Sum of the specific force over the samples",
                 raw_name=f"acceleration_{axis}_10um_s2",
-                unit="m/s^2",
-                per_unit=100_000,
             )
             for axis in "xyz"
         ),
@@ -424,8 +370,6 @@ SAMPLES = Message(
                 "i32",
                 "Sum of the angular rate over the samples",
                 raw_name=f"angular_rate_{axis}_10urad_s",
-                unit="rad/s",
-                per_unit=100_000,
             )
             for axis in "xyz"
         ),
@@ -435,8 +379,6 @@ SAMPLES = Message(
                 "i32",
                 "Magnetic field, the newest reading since the previous report",
                 raw_name=f"field_{axis}_10pt",
-                unit="uT",
-                per_unit=100_000,
             )
             for axis in "xyz"
         ),
@@ -481,18 +423,9 @@ BEACON = Message(
             "u16",
             "Since the superframe began, when the frame leaves",
             raw_name="phase_ms",
-            unit="s",
-            per_unit=1000,
         ),
         Quantity(
-            "period_s",
-            "u16",
-            "Length of a superframe",
-            raw_name="period_ms",
-            unit="s",
-            per_unit=1000,
-            low=200,
-            high=60_000,
+            "period_s", "u16", "Length of a superframe", raw_name="period_ms", low=200, high=60_000
         ),
         Quantity("round", "u8", "Counts the superframes", wraps=True),
     ),

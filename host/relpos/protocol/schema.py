@@ -33,8 +33,27 @@ _WIDTHS: dict[str, tuple[Any, int, bool]] = {
 }
 
 
+SCALES = {
+    "mm": ("m", 1000),
+    "cm": ("m", 100),
+    "mm2": ("m^2", 1_000_000),
+    "10um_s2": ("m/s^2", 100_000),
+    "100urad": ("rad", 10_000),
+    "100urad2": ("rad^2", 100_000_000),
+    "10urad_s": ("rad/s", 100_000),
+    "ms": ("s", 1000),
+    "us": ("s", 1_000_000),
+    "mv": ("V", 1000),
+    "10pt": ("uT", 100_000),
+}
+"""How the name of a wire's integer ends -> the unit of its value, and how many make one."""
+
+
 class Quantity(cs.Adapter):  # type: ignore[type-arg]
-    """A construct integer with a name on both sides, a unit, a scale, limits and a meaning."""
+    """A construct integer with a name on both sides, a unit, a scale, limits and a meaning.
+
+    ``raw_name`` is the integer's where that counts another unit; :data:`SCALES` knows which.
+    """
 
     def __init__(
         self,
@@ -60,6 +79,9 @@ class Quantity(cs.Adapter):  # type: ignore[type-arg]
         self.wire = wire
         self.meaning = meaning
         self.raw_name = raw_name or name
+        if raw_name is not None:
+            ends = (scale for end, scale in SCALES.items() if raw_name.endswith(f"_{end}"))
+            unit, per_unit = next(ends)
         self.unit = unit
         self.per_unit = per_unit
         self.low = full_low if low is None else low
