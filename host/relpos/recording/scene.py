@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from foxglove import Schema
+from foxglove import messages as m
 
 from relpos.fusion.estimator import Alternative, Estimate, NodeEstimate, NodeStatus, Shape
 from relpos.measurements import Range
 from relpos.recording.topics import LOG, TEAM, TRANSFORMS
-
-if TYPE_CHECKING:
-    from foxglove import Schema
 
 FRAME = "team"
 SCALE_90 = math.sqrt(-2.0 * math.log(0.1))
@@ -40,16 +40,8 @@ COLOURS: Mapping[NodeStatus, tuple[float, float, float]] = {
 }
 
 
-def _messages() -> Any:
-    """Foxglove's message classes, loaded when they are used: help texts stay quick."""
-    from foxglove import messages
-
-    return messages
-
-
 def schemas() -> dict[str, Schema]:
     """Topic -> Foxglove's schema."""
-    m = _messages()
     return {
         TEAM: m.SceneUpdate.get_schema(),
         TRANSFORMS: m.FrameTransforms.get_schema(),
@@ -59,7 +51,6 @@ def schemas() -> dict[str, Schema]:
 
 def log_message(unix_ns: int, level: str, text: str) -> bytes:
     """A line for Foxglove's log panel; ``level`` is info, warning or alarm."""
-    m = _messages()
     levels = {"warning": m.LogLevel.Warning, "alarm": m.LogLevel.Error}
     message = m.Log(
         timestamp=_stamp(unix_ns),
@@ -91,7 +82,6 @@ class Scene:
 
     def draw(self, estimate: Estimate) -> Iterator[tuple[str, bytes]]:
         """Yield topics and messages that draw an estimate."""
-        m = _messages()
         unix_ns = self.started_unix_ns + round(estimate.time_s * 1e9)
         stamp = _stamp(unix_ns)
         drawn = {n.node: n for n in estimate.nodes if _can_be_drawn(n)}
@@ -162,7 +152,6 @@ class Scene:
             del trail[:-TRAIL_POINTS]
 
     def _trail(self, node: NodeEstimate) -> Any:
-        m = _messages()
         points = [*self._trails.get(node.node, ()), tuple(_xyz(node).values())]
         return m.LinePrimitive(
             type=m.LinePrimitiveLineType.LineStrip,
@@ -175,7 +164,6 @@ class Scene:
 
     def _links(self, time_s: float, drawn: Mapping[int, NodeEstimate]) -> Any:
         """Lines between nodes with a recent range; None without any."""
-        m = _messages()
         points: list[Any] = []
         for (node, peer), measured in self._ranges.items():
             if node in drawn and peer in drawn and time_s - measured.time_s <= RANGE_SHOWN_S:
@@ -209,17 +197,15 @@ def _xyz(node: NodeEstimate) -> dict[str, float]:
 
 
 def _stamp(unix_ns: int) -> Any:
-    return _messages().Timestamp(*divmod(max(unix_ns, 0), 1_000_000_000))
+    return m.Timestamp(*divmod(max(unix_ns, 0), 1_000_000_000))
 
 
 def _turned(angle_rad: float) -> Any:
-    m = _messages()
     half_rad = 0.5 * angle_rad if math.isfinite(angle_rad) else 0.0
     return m.Quaternion(x=0.0, y=0.0, z=math.sin(half_rad), w=math.cos(half_rad))
 
 
 def _pose(x_m: float, y_m: float, z_m: float, angle_rad: float = 0.0) -> Any:
-    m = _messages()
     return m.Pose(
         position=m.Vector3(x=_round(x_m), y=_round(y_m), z=_round(z_m)),
         orientation=_turned(angle_rad),
@@ -228,11 +214,10 @@ def _pose(x_m: float, y_m: float, z_m: float, angle_rad: float = 0.0) -> Any:
 
 def _colour(status: NodeStatus, opacity: float) -> Any:
     red, green, blue = COLOURS[status]
-    return _messages().Color(r=red, g=green, b=blue, a=opacity)
+    return m.Color(r=red, g=green, b=blue, a=opacity)
 
 
 def _flat_ellipse(pose: Any, major_m: float, minor_m: float, colour: Any) -> Any:
-    m = _messages()
     return m.CylinderPrimitive(
         pose=pose,
         size=m.Vector3(
@@ -252,7 +237,6 @@ def _ellipse(node: NodeEstimate) -> Any:
 
 
 def _body(node: NodeEstimate) -> Any:
-    m = _messages()
     return m.SpherePrimitive(
         pose=_pose(node.x_m, node.y_m, node.z_m),
         size=m.Vector3(x=0.5, y=0.5, z=0.5),
@@ -261,7 +245,6 @@ def _body(node: NodeEstimate) -> Any:
 
 
 def _heading(node: NodeEstimate) -> Any:
-    m = _messages()
     return m.ArrowPrimitive(
         pose=_pose(node.x_m, node.y_m, node.z_m, node.heading_rad),
         shaft_length=0.75,
@@ -273,7 +256,6 @@ def _heading(node: NodeEstimate) -> Any:
 
 
 def _label(node: NodeEstimate, text: str) -> Any:
-    m = _messages()
     words = text if node.status is NodeStatus.OK else f"{text} ({node.status})"
     return m.TextPrimitive(
         pose=_pose(node.x_m, node.y_m, node.z_m + 0.75),
@@ -287,7 +269,7 @@ def _label(node: NodeEstimate, text: str) -> Any:
 
 def _ghost_colour(row: Alternative) -> Any:
     red, green, blue = COLOURS[NodeStatus.AMBIGUOUS]
-    return _messages().Color(r=red, g=green, b=blue, a=0.0625 + 0.5 * row.probability)
+    return m.Color(r=red, g=green, b=blue, a=0.0625 + 0.5 * row.probability)
 
 
 def _ghost(row: Alternative) -> Any:
@@ -296,7 +278,6 @@ def _ghost(row: Alternative) -> Any:
 
 
 def _ring(row: Alternative) -> Any:
-    m = _messages()
     turns = (2.0 * math.pi * k / RING_POINTS for k in range(RING_POINTS))
     return m.LinePrimitive(
         type=m.LinePrimitiveLineType.LineLoop,
