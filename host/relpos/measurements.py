@@ -100,7 +100,7 @@ class Event:
     time_s: float
     node: int
     event: str
-    value: str
+    value: str = ""
 
 
 @dataclass(frozen=True, slots=True)

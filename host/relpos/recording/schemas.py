@@ -8,6 +8,7 @@ from functools import cache
 from typing import Any, get_type_hints
 
 from relpos.recording import scene, topics
+from relpos.runs.table import plain_type
 
 
 def _schema_of(kind: type, names: Iterable[str]) -> dict[str, Any]:
@@ -15,7 +16,7 @@ def _schema_of(kind: type, names: Iterable[str]) -> dict[str, Any]:
     properties: dict[str, Any] = {}
     required: list[str] = []
     for name in names:
-        optional, plain = topics.plain_type(hints.get(name, float))
+        optional, plain = plain_type(hints.get(name, float))
         word = {bool: "boolean", int: "integer", float: "number"}.get(plain, "string")
         properties[name] = {"type": word}
         # A float may be none at all (NaN), and is left out then.

@@ -13,11 +13,10 @@ from __future__ import annotations
 import base64
 import json
 import math
-import types
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 from relpos.fusion.estimator import (
     Alternative,
@@ -41,6 +40,7 @@ from relpos.measurements import (
     out_of_bounds,
 )
 from relpos.runs.landmarks import Landmark
+from relpos.runs.table import plain_type
 
 SERIAL = "/serial"
 LANDMARK = "/landmark"
@@ -279,10 +279,3 @@ def _makers(kind: type) -> dict[str, tuple[Any, Any]]:
         missing = None if optional else math.nan if plain is float else ...
         makers[name] = (plain, missing)
     return makers
-
-
-def plain_type(hint: Any) -> tuple[bool, Any]:
-    """Whether None is allowed, and the type beside it."""
-    if get_origin(hint) in (Union, types.UnionType):
-        return True, next(part for part in get_args(hint) if part is not type(None))
-    return False, hint

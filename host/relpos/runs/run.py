@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, replace
 from itertools import accumulate, chain
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 
@@ -41,14 +41,15 @@ from relpos.runs.imu import ImuRecording, read_imu
 from relpos.runs.landmarks import Landmark, read_landmarks, truth_from_presses
 from relpos.runs.table import (
     Column,
+    Parser,
     bounded,
+    bounded_whole,
     find_table,
     flag,
     node_id,
     numbered_rows,
+    plain_type,
     read_text,
-    whole,
-    within_bounds,
 )
 
 UNKNOWN_HEADING_SIGMA_RAD = math.pi
@@ -244,7 +245,7 @@ def save_run(run: Run, path: Path | str) -> None:
     write_description(directory / "run.toml", description)
     by_kind = _by_kind(chain(run.measurements, run.events, run.statuses, run.steps, run.truth))
     for table in _TABLES:
-        if rows := by_kind[table.make_class]:
+        if rows := by_kind[table.kind]:
             write_rows(
                 directory / table.name,
                 table.names,
@@ -299,12 +300,12 @@ class RunFiles:
                 (self._directory / name).unlink(missing_ok=True)
         self.describe(description)
         self._files = {
-            table.make_class: (
+            table.kind: (
                 AppendedTable(self._directory / table.name, table.names, wanted=False),
                 table.names,
             )
             for table in _TABLES
-            if table.make_class is not Truth
+            if table.kind is not Truth
         }
 
     def describe(self, description: Description) -> None:
@@ -329,21 +330,15 @@ class RunFiles:
 
 @dataclass(frozen=True)
 class _Table:
-    """One file of the run directory: its columns, and the class each row becomes."""
+    """One file of the run directory, whose columns are the fields of the class of its rows."""
 
     name: str
-    make: Callable[..., Any]
-    columns: tuple[Column, ...]
+    kind: type
 
     @property
     def names(self) -> list[str]:
-        """Names of the columns, which are those of the class's fields."""
-        return [column.name for column in self.columns]
-
-    @property
-    def make_class(self) -> type:
-        """The class of its rows."""
-        return self.make if isinstance(self.make, type) else Event
+        """Names of the columns."""
+        return [field.name for field in fields(self.kind)]
 
     def read(self, directory: Path, counters: Counter[str]) -> list[Any]:
         """Rows sorted by time, rows at the same time in the order of the file."""
@@ -351,8 +346,10 @@ class _Table:
         if path is None:
             return []
         rows: list[Any] = []
-        for line, cells in numbered_rows(path, read_text(path), self.columns, counters):
-            row = self.make(*cells)
+        defaults = [field.default for field in fields(self.kind)]
+        for line, cells in numbered_rows(path, read_text(path), _columns_of(self.kind), counters):
+            known = zip(cells, defaults, strict=True)
+            row = self.kind(*(default if cell is None else cell for cell, default in known))
             if isinstance(row, Range) and row.node == row.peer:
                 raise DataError(
                     f"{path}: line {line}: column peer: node {row.node} ranges to itself"
@@ -367,88 +364,38 @@ class _Table:
         return rows
 
 
-def _quantity(name: str, *, optional: bool = False) -> Column:
-    return Column(name, bounded(name), optional)
+def _columns_of(kind: type) -> list[Column]:
+    """Return a column a field: what has a default may be missing, and the type says how to read it.
 
+    A number is within the bounds of the quantity that the field is named after.
+    """
+    hints, columns = get_type_hints(kind), []
+    for one in fields(kind):
+        name, (_, plain) = one.name, plain_type(hints[one.name])
+        parsers: dict[type, Parser] = {
+            float: bounded(name), int: bounded_whole(name), bool: flag, str: str,
+        }  # fmt: skip
+        parse = node_id if name in ("node", "peer") else parsers[plain]
+        columns.append(Column(name, parse, one.default is not MISSING))
+    return columns
 
-_TIME_AND_NODE = (_quantity("time_s"), Column("node", node_id))
 
 _TABLES = (
-    _Table(
-        "motion.csv",
-        Motion,
-        (
-            *_TIME_AND_NODE,
-            _quantity("dx_m"),
-            _quantity("dy_m"),
-            _quantity("dtheta_rad"),
-            _quantity("sigma_x_m", optional=True),
-            _quantity("sigma_y_m", optional=True),
-            _quantity("sigma_theta_rad", optional=True),
-            Column("gain_version", whole, optional=True),
-            Column("moving", flag, optional=True),
-            _quantity("sigma_x_alone_m", optional=True),
-            Column("steps", lambda text: int(within_bounds("steps", whole(text))), optional=True),
-        ),
-    ),
-    _Table(
-        "ranges.csv",
-        Range,
-        (
-            *_TIME_AND_NODE,
-            Column("peer", node_id),
-            _quantity("range_m"),
-            _quantity("rss_dbm", optional=True),
-        ),
-    ),
-    _Table(
-        "height.csv",
-        Height,
-        (
-            *_TIME_AND_NODE,
-            _quantity("height_m"),
-            _quantity("sigma_m", optional=True),
-        ),
-    ),
-    _Table(
-        "heading.csv",
-        Heading,
-        (
-            *_TIME_AND_NODE,
-            _quantity("heading_rad"),
-            _quantity("sigma_rad", optional=True),
-            Column("source", str, optional=True),
-        ),
-    ),
-    _Table(
-        "events.csv",
-        lambda time_s, node, event, value: Event(time_s, node, event, value or ""),
-        (*_TIME_AND_NODE, Column("event", str), Column("value", str, optional=True)),
-    ),
-    _Table(
-        "status.csv",
-        Status,
-        (*_TIME_AND_NODE, Column("name", str), _quantity("value")),
-    ),
-    _Table("steps.csv", Step, (*_TIME_AND_NODE, _quantity("length_m"))),
-    _Table(
-        "truth.csv",
-        Truth,
-        (
-            *_TIME_AND_NODE,
-            _quantity("x_m"),
-            _quantity("y_m"),
-            _quantity("heading_rad", optional=True),
-            _quantity("z_m", optional=True),
-        ),
-    ),
+    _Table("motion.csv", Motion),
+    _Table("ranges.csv", Range),
+    _Table("height.csv", Height),
+    _Table("heading.csv", Heading),
+    _Table("events.csv", Event),
+    _Table("status.csv", Status),
+    _Table("steps.csv", Step),
+    _Table("truth.csv", Truth),
 )
 TABLE_NAMES = tuple(table.name for table in _TABLES)
 """The files of a run directory that hold rows by time and node."""
 
 
 def _by_kind(rows: Iterable[Observation | Truth]) -> dict[type, list[Any]]:
-    by_kind: dict[type, list[Any]] = {table.make_class: [] for table in _TABLES}
+    by_kind: dict[type, list[Any]] = {table.kind: [] for table in _TABLES}
     for row in rows:
         by_kind[type(row)].append(row)
     return by_kind

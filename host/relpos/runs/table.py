@@ -11,12 +11,13 @@ import gzip
 import io
 import logging
 import math
+import types
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Union, get_args, get_origin
 
 from relpos.errors import DataError
 from relpos.measurements import BOUNDS, LEAST_SIGMA
@@ -82,6 +83,11 @@ def bounded(name: str) -> Parser:
     return lambda text: within_bounds(name, _finite(text))
 
 
+def bounded_whole(name: str) -> Parser:
+    """Return the same of a quantity that is counted."""
+    return lambda text: int(within_bounds(name, whole(text)))
+
+
 def within_bounds(name: str, value: float) -> float:
     """Return the value of the quantity ``name``; ValueError where it is beyond its bounds."""
     low, high = BOUNDS.get(name, (-math.inf, math.inf))
@@ -92,6 +98,13 @@ def within_bounds(name: str, value: float) -> float:
     if low == 0.0 and value < 0.0:
         raise ValueError("is negative")
     raise ValueError(f"is not between {low:g} and {high:g}")
+
+
+def plain_type(hint: Any) -> tuple[bool, Any]:
+    """Return whether the type of a field allows None, and the type beside it."""
+    if get_origin(hint) in (Union, types.UnionType):
+        return True, next(part for part in get_args(hint) if part is not type(None))
+    return False, hint
 
 
 def whole(text: str) -> int:
