@@ -164,15 +164,7 @@ class NodeDialogue:
 
     def restart(self) -> int:
         """Restart the node and return its new boot counter; DeviceError if it stays silent."""
-        boot = self.boot()
-        self.demand(wire.CommandCode.REBOOT, 0)
-        if not self._restarted(boot):
-            raise DeviceError(
-                f"node {self.node} took the command but was not heard again: switch it off and on"
-            )
-        new_boot = self.boot()
-        assert new_boot is not None
-        return new_boot
+        return self._demand_restart(wire.CommandCode.REBOOT, 0, "took the command but ")
 
     # -- number, defaults, key --------------------------------------------------------------------
 
@@ -196,10 +188,7 @@ class NodeDialogue:
                 raise
         self.link.node_keys.pop(self.node, None)
         before, self.node = self.node, node
-        until_s = time.monotonic() + SILENT_S
-        while self.boot() is None and time.monotonic() < until_s:
-            self.listen()
-        if self.boot() is None:
+        if not self._restarted(None):
             raise DeviceError(
                 f"node {before} took the number {node} but was not heard with it: switch it off "
                 "and on"
@@ -215,10 +204,7 @@ class NodeDialogue:
 
     def restore_defaults(self) -> None:
         """Reset all but number and key; the node restarts. DeviceError if it stays silent."""
-        boot = self.boot()
-        self.demand(wire.CommandCode.RESTORE_DEFAULTS, 0)
-        if not self._restarted(boot):
-            raise DeviceError(f"node {self.node} was not heard again: switch it off and on")
+        self._demand_restart(wire.CommandCode.RESTORE_DEFAULTS, 0)
 
     def set_key(self, key: bytes) -> bool:
         """Give the node its key and the beacon's of the team's new ``key``.
@@ -272,6 +258,16 @@ class NodeDialogue:
             for broadcast in (False, True)
         )
         return self._send(token, data) is not None
+
+    def _demand_restart(self, code: wire.CommandCode, value: int, took: str = "") -> int:
+        """Demand what a node restarts after, and wait for that; return the new boot counter."""
+        boot = self.boot()
+        self.demand(code, value)
+        if not self._restarted(boot):
+            raise DeviceError(f"node {self.node} {took}was not heard again: switch it off and on")
+        new_boot = self.boot()
+        assert new_boot is not None
+        return new_boot
 
     def _restarted(self, boot: int | None) -> bool:
         """Wait until the node is heard with another boot; return whether it was."""
@@ -342,13 +338,8 @@ class NodeDialogue:
         words = calibration.to_words()
         for index, word in enumerate(words):
             self.demand(wire.CommandCode.SET_CALIBRATION, index << 16 | word & 0xFFFF)
-        boot = self.boot()
-        self.demand(wire.CommandCode.COMMIT_CALIBRATION, checksum(words))
-        if not self._restarted(boot):
-            raise DeviceError(
-                f"node {self.node} took the calibration but was not heard again: "
-                "switch it off and on"
-            )
+        commit = wire.CommandCode.COMMIT_CALIBRATION
+        self._demand_restart(commit, checksum(words), "took the calibration but ")
         if self.read_calibration().to_words() != words:
             raise DeviceError(
                 f"node {self.node} reads back another calibration than was written: its memory "

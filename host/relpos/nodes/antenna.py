@@ -71,9 +71,7 @@ def collect(dialogue: NodeDialogue, pair: tuple[int, int], count: int) -> Iterat
     Ends early where none arrives for :data:`SILENT_S`.
     """
     # Reports on their way may still be from before.
-    until_s = time.monotonic() + 0.2
-    while time.monotonic() < until_s:
-        dialogue.listen()
+    dialogue.pause(0.2)
     dialogue.observations.clear()
     collected = 0
     heard_s = time.monotonic()
