@@ -55,7 +55,7 @@ def line():
 @pytest.fixture
 def team(line, monkeypatch):
     """Name of a port behind which a team is on its own clock, which is the commands', too."""
-    for module in (node_dialogue, node_watch):
+    for module in (node_dialogue, node_set, node_watch):
         monkeypatch.setattr(module, "open_device", lambda *_: line)
     line.clock_of(monkeypatch, dialogue, link_port, node_set, node_watch)
     return line.port

@@ -394,4 +394,9 @@ def _print_ranges(when: str, fit: RangeFit) -> None:
 def _ranges(dialogue: NodeDialogue, pair: tuple[int, int], count: int) -> list[float]:
     from relpos.nodes.antenna import collect
 
-    return list(output.with_progress(collect(dialogue, pair, count), count, "ranges"))
+    ranges_m: list[float] = []
+    with output.progress() as show:
+        for range_m in collect(dialogue, pair, count):
+            show("ranges", len(ranges_m), count)
+            ranges_m.append(range_m)
+    return ranges_m

@@ -11,7 +11,7 @@ import typer
 
 from relpos.cli import output
 from relpos.cli.keys import KeyFile
-from relpos.cli.node_dialogue import Cable, Node, Port, connect
+from relpos.cli.node_dialogue import Cable, Node, Port, connect, open_device
 from relpos.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -155,8 +155,6 @@ def _set_key(
     from relpos.link.dialogue import NEEDS_CABLE, NodeDialogue, open_dialogue
     from relpos.link.port import Link
     from relpos.protocol import messages as wire
-
-    from relpos.cli.node_dialogue import open_device  # isort: skip
 
     old = wire.DEFAULT_KEY if old_key_file is None else read_key(old_key_file)
     if new and old == wire.DEFAULT_KEY and not cable:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Se
 from contextlib import contextmanager
 from itertools import pairwise
 from threading import Timer
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from relpos.evaluation.scoring import Evaluation
     from relpos.evaluation.vertical import Vertical
     from relpos.fusion.estimator import Estimate
-
-T = TypeVar("T")
 
 PROGRESS_AFTER_S = 1.0
 """A quicker stage shows nothing; the promise is two seconds."""
@@ -150,17 +148,6 @@ def progress(
     names = words or {}
     try:
         yield lambda stage, done, total: shown(names.get(stage, stage), done, total)
-    finally:
-        shown.close()
-
-
-def with_progress(items: Iterable[T], total: int | None, label: str) -> Iterator[T]:
-    """Yield the items and show the progress."""
-    shown = Progress()
-    try:
-        for done, item in enumerate(items):
-            shown(label, done, total)
-            yield item
     finally:
         shown.close()
 

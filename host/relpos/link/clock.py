@@ -32,7 +32,8 @@ class NodeClock:
 
     _points: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=MAX_POINTS))
     _offset_s: float = 0.0
-    _drift: float = 0.0
+    drift: float = 0.0
+    """Host seconds gained per node second, less one."""
     _reference_s: float = 0.0
     _newest_s: float | None = None
 
@@ -60,12 +61,7 @@ class NodeClock:
         if self._newest_s is None:
             raise ValueError("no frame of this node has arrived yet")
         unwrapped_s = self.unwrap(node_s)
-        return unwrapped_s + self._offset_s + self._drift * (unwrapped_s - self._reference_s)
-
-    @property
-    def drift(self) -> float:
-        """Host seconds gained per node second, less one."""
-        return self._drift
+        return unwrapped_s + self._offset_s + self.drift * (unwrapped_s - self._reference_s)
 
     def _fit(self) -> None:
         points = sorted(self._points)
@@ -79,7 +75,7 @@ class NodeClock:
 
     def _set(self, reference_s: float, drift: float, points: list[tuple[float, float]]) -> None:
         self._reference_s = reference_s
-        self._drift = drift
+        self.drift = drift
         self._offset_s = min(offset - drift * (s - reference_s) for s, offset in points)
 
 

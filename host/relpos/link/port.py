@@ -75,7 +75,8 @@ class Link:
         self._counters: dict[int, HostCounter] = {}
         self._escaped = escaped
         self._token = 0
-        self._virtual_s: float | None = None
+        self.virtual_s: float | None = None
+        """Virtual time of an emulated team that marks it; None for a real team."""
         self._faults_told: set[int] = set()
         """Addressees whose counters a wrong clock has met; remarked on once."""
         self._unmarked = 0
@@ -98,14 +99,14 @@ class Link:
         """
         observations: list[Observation] = []
         for frame in self.parser.feed(data):
-            if self._virtual_s is not None:
-                arrival_s = self._virtual_s
+            if self.virtual_s is not None:
+                arrival_s = self.virtual_s
             if isinstance(frame, xbee.Receive16 | xbee.Receive64 | xbee.ReceivePacket):
                 observations += self._decode(frame, arrival_s)
             elif not self._is_mark(frame):
                 self.decoder.counts[type(frame).__name__] += 1
                 continue
-            self._unmarked += self._virtual_s is None
+            self._unmarked += self.virtual_s is None
         return observations
 
     def _decode(
@@ -132,10 +133,10 @@ class Link:
         if (
             len(frame.data) != 8
             or self._unmarked >= UNMARKED_FRAMES
-            or not (self._virtual_s or 0.0) <= virtual_s <= BOUNDS["time_s"][1]
+            or not (self.virtual_s or 0.0) <= virtual_s <= BOUNDS["time_s"][1]
         ):
             return False
-        self._virtual_s = virtual_s
+        self.virtual_s = virtual_s
         return True
 
     def command(
@@ -216,11 +217,6 @@ class Link:
         """Return a token that the last 65,534 commands did not have."""
         self._token = self._token % 0xFFFF + 1
         return self._token
-
-    @property
-    def virtual_s(self) -> float | None:
-        """Virtual time of an emulated team that marks it; None for a real team."""
-        return self._virtual_s
 
     def summary(self) -> dict[str, float]:
         """Return the counts of the whole link: frames, losses, rejections."""

@@ -115,7 +115,7 @@ class PortInput:
         self._earlier: Iterator[Received] | None = iter(earlier)
         self._earlier_s: float | None = None
         self.name = port
-        self._link: Link = link
+        self.link = link
         self.clock = clock or SessionClock()
         self._seen = seen
         self._reopen = reopen
@@ -128,11 +128,6 @@ class PortInput:
         self._terminal = serial_port.incarnation(port)
         self._trouble: str | None = None
         self._try_at_s = 0.0
-
-    @property
-    def link(self) -> Link | None:
-        """The link to the team."""
-        return self._link
 
     def read(self, timeout_s: float) -> Received | None:
         """Send what is due to the nodes, then wait for bytes."""
@@ -154,7 +149,7 @@ class PortInput:
         if not data:
             return None
         arrival_s = self.clock()
-        came = Received(arrival_s, data, self._link.feed(data, arrival_s))
+        came = Received(arrival_s, data, self.link.feed(data, arrival_s))
         self._save_counters()
         return came
 
@@ -164,18 +159,18 @@ class PortInput:
             return
         try:
             self._seen.save(
-                self._link.newest_counters(),
+                self.link.newest_counters(),
                 time.monotonic(),
                 at_once=at_once,
-                lowered=self._link.decoder.brought_back,
+                lowered=self.link.decoder.brought_back,
             )
         except DataError as error:
-            if str(error) not in self._link.decoder.remarks:
-                self._link.decoder.remarks.append(str(error))
+            if str(error) not in self.link.decoder.remarks:
+                self.link.decoder.remarks.append(str(error))
 
     def now_s(self) -> float:
         """Return the clock's time, or that of an emulated team which marks its own."""
-        virtual_s = self._link.virtual_s
+        virtual_s = self.link.virtual_s
         if virtual_s is not None:
             return virtual_s
         return self.clock() if self._earlier_s is None else self._earlier_s
@@ -198,9 +193,9 @@ class PortInput:
     def remarks(self) -> list[str]:
         """Return new remarks of the decoder and of the step scales."""
         if self._scales is not None:
-            self._link.decoder.remarks += self._scales.remarks
+            self.link.decoder.remarks += self._scales.remarks
             self._scales.remarks.clear()
-        new = self._link.decoder.remarks[self._remarked :]
+        new = self.link.decoder.remarks[self._remarked :]
         self._remarked += len(new)
         return new
 
@@ -215,7 +210,7 @@ class PortInput:
     def counters(self) -> Mapping[str, float]:
         """Return the counts of the whole link so far."""
         sent = {"step_scales_sent": self._scales.sent} if self._scales else {}
-        return {**self._link.summary(), **sent}
+        return {**self.link.summary(), **sent}
 
     def close(self) -> None:
         """Close the port and store the newest frame counters."""
@@ -246,7 +241,7 @@ class PortInput:
         # An emulated team in virtual time sends beacons of its own.
         now_s = self.clock()
         serial_port.send(self._device, self._beacons.due(now_s))
-        answers = self._link.decoder.acknowledged
+        answers = self.link.decoder.acknowledged
         while answers:
             answer = answers.popleft()
             self._leds.handle(answer)

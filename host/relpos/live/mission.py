@@ -238,7 +238,8 @@ class Journal:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._waiting: queue.SimpleQueue[tuple[int, str] | None] = queue.SimpleQueue()
-        self._put = 0
+        self.newest = 0
+        """Number of the newest event."""
         self._safe = 0
         self.trouble: str | None = None
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
@@ -246,9 +247,9 @@ class Journal:
 
     def add(self, event: Mapping[str, Any]) -> int:
         """Append an event; return the number by which :meth:`is_safe` knows it."""
-        self._put += 1
-        self._waiting.put((self._put, to_json(event) + "\n"))
-        return self._put
+        self.newest += 1
+        self._waiting.put((self.newest, to_json(event) + "\n"))
+        return self.newest
 
     def keep(self, event: Mapping[str, Any]) -> None:
         """Append an event and wait for the disk; DataError where it cannot be written."""
@@ -257,11 +258,6 @@ class Journal:
             if self.trouble is not None:
                 raise DataError(self.trouble)
             time.sleep(KEEP_LOOK_S)
-
-    @property
-    def newest(self) -> int:
-        """Number of the newest event."""
-        return self._put
 
     def is_safe(self, number: int) -> bool:
         """Return whether the disk has confirmed that event and all before it."""

@@ -80,7 +80,8 @@ class Recorder(ItemSink):
         self._lock = Lock()
         self._queued = 0
         self._gap: topics.Gap | None = None
-        self._lost = (0, 0)
+        self.lost = (0, 0)
+        """Numbers of lost inputs and of lost estimates."""
         self._refused_since_s: float | None = None
         self._retry_s = 0.0
         # The first of everything takes a while in Python, and here nothing is late.
@@ -95,11 +96,6 @@ class Recorder(ItemSink):
     def named(self, names: Mapping[int, str]) -> None:
         """Add the names of the wearers."""
         self._put(self._arrival_s, _Names(dict(names)))
-
-    @property
-    def lost(self) -> tuple[int, int]:
-        """Numbers of lost inputs and of lost estimates."""
-        return self._lost
 
     @property
     def path(self) -> Path:
@@ -120,7 +116,7 @@ class Recorder(ItemSink):
                 self._gap = topics.Gap(
                     gap.from_s, at_s, gap.inputs + is_input, gap.others + (not is_input)
                 )
-                self._lost = (self._lost[0] + is_input, self._lost[1] + (not is_input))
+                self.lost = (self.lost[0] + is_input, self.lost[1] + (not is_input))
                 return
             self._queued += weight
             self._queue.append((weight, at_s, item))
@@ -229,7 +225,7 @@ class Recorder(ItemSink):
 
     def _report(self, error: OSError, since_s: float) -> None:
         reason = error.strerror or str(error)
-        inputs, others = self._lost
+        inputs, others = self.lost
         lost = Said(
             "recording-lost",
             "{inputs} reads of the port and {others} estimates are lost",
