@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from relpos.errors import DataError, DeviceError, words_of
 from relpos.link import port as serial_port
@@ -46,24 +46,24 @@ class Received:
     again: bool = False
 
 
-class Input(Protocol):
-    """A source of bytes and observations; see the module's text."""
+class Input:
+    """Base class of sources, whose methods do what suits a recording: it sends nothing."""
 
     name: str
-    is_now: bool
+    is_now = False
     """Whether the team is live, so that presses and headings of phones belong to it."""
-    recorded_unix_s: float | None
+    recorded_unix_s: float | None = None
     """Unix time of a recording's second 0; None where it does not say, and of what is live."""
-
-    @property
-    def link(self) -> Link | None:
-        """The link, its counts and clocks; None where only observations were recorded."""
+    link: Link | None = None
+    """The link, its counts and clocks; None where only observations were recorded."""
 
     def read(self, timeout_s: float) -> Received | None:
         """Return what arrives in time, else None; DeviceError where the port fails."""
+        raise NotImplementedError
 
     def now_s(self) -> float:
         """Return the session's time: the arrival clock's, or an emulated team's own."""
+        raise NotImplementedError
 
     def learn(self, estimate: Estimate) -> None:
         """Pass on what the newest estimate has learned of the wearers' steps."""
@@ -73,24 +73,33 @@ class Input(Protocol):
 
     def called_out(self) -> list[int]:
         """Return the nodes that have confirmed it since the last call."""
+        return []
 
     def remarks(self) -> list[str]:
         """Return new messages for the user, each once."""
+        if self.link is None:
+            return []
+        new = list(self.link.decoder.remarks)
+        self.link.decoder.remarks.clear()
+        return new
 
     def trouble(self) -> str | None:
         """Return why nothing can arrive at present; None where it can."""
+        return None
 
     def over(self) -> bool:
-        """Return whether the input has ended."""
+        """Return whether the input has ended; a silent port may speak again."""
+        return False
 
     def counters(self) -> Mapping[str, float]:
         """Return counts of errors on the way, by name."""
+        return {} if self.link is None else self.link.summary()
 
     def close(self) -> None:
         """Close the input."""
 
 
-class PortInput:
+class PortInput(Input):
     """A live team behind a serial port; sends it beacons.
 
     What came before (``earlier``) is read first. With ``teach`` the nodes get the step scales that
@@ -99,7 +108,7 @@ class PortInput:
     """
 
     is_now = True
-    recorded_unix_s: float | None = None
+    link: Link
 
     def __init__(
         self,
@@ -203,10 +212,6 @@ class PortInput:
         """Return why the port is not open."""
         return self._trouble
 
-    def over(self) -> bool:
-        """Return False: a silent port may speak again."""
-        return False
-
     def counters(self) -> Mapping[str, float]:
         """Return the counts of the whole link so far."""
         sent = {"step_scales_sent": self._scales.sent} if self._scales else {}
@@ -295,13 +300,11 @@ def _descriptor(device: serial.Serial) -> int | None:
         return None
 
 
-class PacedInput:
+class PacedInput(Input):
     """A recording played at the pace of its arrival times.
 
     ``items`` are in the order of arrival. ``speed`` 2 is twice as fast, 0 as fast as it is read.
     """
-
-    is_now = False
 
     def __init__(
         self,
@@ -347,38 +350,9 @@ class PacedInput:
         """Return the recording's time."""
         return self._now_s
 
-    def learn(self, estimate: Estimate) -> None:
-        """Ignore: a recording has no nodes to send to."""
-
-    def call_out(self, nodes: Iterable[int]) -> None:
-        """Ignore: a recording has no nodes to send to."""
-
-    def called_out(self) -> list[int]:
-        """Return nothing."""
-        return []
-
-    def remarks(self) -> list[str]:
-        """Return new remarks of the decoder, where bytes were recorded."""
-        if self.link is None:
-            return []
-        new = list(self.link.decoder.remarks)
-        self.link.decoder.remarks.clear()
-        return new
-
-    def trouble(self) -> str | None:
-        """Return None: a recording has no port to lose."""
-        return None
-
     def over(self) -> bool:
         """Return whether all of it has been read."""
         return self._next is None
-
-    def counters(self) -> Mapping[str, float]:
-        """Return the counts of the link, where bytes were recorded."""
-        return {} if self.link is None else self.link.summary()
-
-    def close(self) -> None:
-        """Nothing to close."""
 
 
 def run_items(run: Run) -> list[Received]:
