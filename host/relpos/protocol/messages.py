@@ -152,8 +152,19 @@ HEADER = (
 HEADER_BYTES = sum(f.byte_count for f in HEADER)
 
 
+def _total(name: str, wire: str, raw_name: str, meaning: str) -> Quantity:
+    return Quantity(name, wire, meaning, raw_name=raw_name, wraps=True)
+
+
 def _time(meaning: str) -> Quantity:
-    return Quantity("time_s", "u32", meaning, raw_name="time_ms", wraps=True)
+    return _total("time_s", "u32", "time_ms", meaning)
+
+
+def _vector(name: str, unit: str, raw_unit: str, meaning: str) -> tuple[Quantity, ...]:
+    return tuple(
+        Quantity(f"{name}_{axis}_{unit}", "i32", meaning, raw_name=f"{name}_{axis}_{raw_unit}")
+        for axis in "xyz"
+    )
 
 
 MOTION = Message(
@@ -163,56 +174,39 @@ MOTION = Message(
     "lost frame loses no motion.",
     (
         _time("Node clock at the end of the motion"),
-        Quantity(
-            "x_m",
-            "i32",
-            "Total displacement along the heading at the start",
-            raw_name="x_mm",
-            wraps=True,
-        ),
-        Quantity(
-            "y_m",
-            "i32",
-            "Total displacement to the left of the heading at the start",
-            raw_name="y_mm",
-            wraps=True,
-        ),
-        Quantity(
+        _total("x_m", "i32", "x_mm", "Total displacement along the heading at the start"),
+        _total("y_m", "i32", "y_mm", "Total displacement to the left of the heading at the start"),
+        _total(
             "heading_rad",
             "i32",
+            "heading_100urad",
             "Total turn, counter-clockwise, whole turns included",
-            raw_name="heading_100urad",
-            wraps=True,
         ),
-        Quantity("path_m", "u32", "Total of the step lengths", raw_name="path_mm", wraps=True),
+        _total("path_m", "u32", "path_mm", "Total of the step lengths"),
         Quantity("steps", "u16", "Total number of steps", wraps=True),
-        Quantity(
+        _total(
             "variance_along_m2",
             "u32",
+            "variance_along_mm2",
             "Total variance along the walking direction, without the scale error",
-            raw_name="variance_along_mm2",
-            wraps=True,
         ),
-        Quantity(
+        _total(
             "variance_across_m2",
             "u32",
+            "variance_across_mm2",
             "Total variance across the walking direction",
-            raw_name="variance_across_mm2",
-            wraps=True,
         ),
-        Quantity(
+        _total(
             "variance_heading_rad2",
             "u32",
+            "variance_heading_100urad2",
             "Total variance of the heading",
-            raw_name="variance_heading_100urad2",
-            wraps=True,
         ),
-        Quantity(
+        _total(
             "scale_error_m",
             "u32",
+            "scale_error_mm",
             "Total standard deviation of the path from what all steps err by together",
-            raw_name="scale_error_mm",
-            wraps=True,
         ),
         Quantity(
             "height_m",
@@ -355,32 +349,10 @@ SAMPLES = Message(
     "five times a second while SET_RAW_REPORTS asks for it. The node does not range meanwhile.",
     (
         _time("Node clock at the last sample"),
-        *(
-            Quantity(
-                f"acceleration_{axis}_m_s2",
-                "i32",
-                "Sum of the specific force over the samples",
-                raw_name=f"acceleration_{axis}_10um_s2",
-            )
-            for axis in "xyz"
-        ),
-        *(
-            Quantity(
-                f"angular_rate_{axis}_rad_s",
-                "i32",
-                "Sum of the angular rate over the samples",
-                raw_name=f"angular_rate_{axis}_10urad_s",
-            )
-            for axis in "xyz"
-        ),
-        *(
-            Quantity(
-                f"field_{axis}_ut",
-                "i32",
-                "Magnetic field, the newest reading since the previous report",
-                raw_name=f"field_{axis}_10pt",
-            )
-            for axis in "xyz"
+        *_vector("acceleration", "m_s2", "10um_s2", "Sum of the specific force over the samples"),
+        *_vector("angular_rate", "rad_s", "10urad_s", "Sum of the angular rate over the samples"),
+        *_vector(
+            "field", "ut", "10pt", "Magnetic field, the newest reading since the previous report"
         ),
         Quantity("samples", "u8", "Number of inertial samples since the previous report"),
         Quantity(
