@@ -235,7 +235,6 @@ class CotSender(Sink):
         self._view: TeamView | None = None
         self._sigma_z_m: dict[int, float] = {}
         self._trouble: str | None = None
-        self.sent = 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="cot", daemon=True)
         self._thread.start()
@@ -253,11 +252,6 @@ class CotSender(Sink):
         """Return why nothing is sent; None when all is well."""
         problem = self._trouble or self._map.waits_for()
         return Said("cot", "Cursor-on-Target: {problem}", problem=problem) if problem else None
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """Remarks on the placement of the map."""
-        return self._map.remarks
 
     def close(self) -> None:
         """Close the connection."""
@@ -310,7 +304,6 @@ class CotSender(Sink):
                     raise ConnectionError("the server has closed the connection")
                 for data in self._due():
                     await asyncio.wait_for(worker.send_data(data), SEND_WITHIN_S)
-                    self.sent += 1
                 if time.monotonic() - began_s >= settled_s:
                     self._trouble = None
                 await asyncio.sleep(TICK_S)

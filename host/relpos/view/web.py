@@ -69,10 +69,6 @@ class WebView(Sink):
         self._started_s = 0.0
         self._start()
 
-    def fileno(self) -> int:
-        """Return the descriptor on which requests arrive."""
-        return -1 if self._channel is None else self._channel.fileno()
-
     # -- as a sink --------------------------------------------------------------------------------
 
     def estimated(self, estimate: Estimate) -> None:
