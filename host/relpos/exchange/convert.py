@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
 
 from relpos.errors import DataError, RelposError
 from relpos.exchange.content import (
@@ -17,6 +18,7 @@ from relpos.exchange.content import (
     points_of,
 )
 from relpos.exchange.formats import Format, Kind
+from relpos.exchange.times import iso_of
 from relpos.geodesy import MapFrame, Pin, place
 from relpos.recording import is_recording, open_recording, save_recording
 from relpos.runs.estimates import read_estimates, write_estimates
@@ -157,27 +159,16 @@ def _read_tracks(source: Path, form: Format, base: Content, hints: Hints) -> Con
     else:
         frame, words = frame_of(base, hints.pins, Kind.TRUTH if base.run.truth else Kind.ESTIMATE)
         remarks += words
-        if form is Format.GPX:
-            from relpos.exchange import gpx
-            from relpos.exchange.times import iso_of
-
-            first_s = gpx.first_time(source)
-            if start_unix_s is None and first_s is not None:
-                start_unix_s = first_s
+        maps = _maps_of(form)
+        if form is Format.GPX and start_unix_s is None:
+            start_unix_s = maps.first_time(source)
+            if start_unix_s is not None:
+                first = iso_of(start_unix_s)
                 remarks.append(
-                    f"second 0 is {iso_of(first_s)}, the file's first time (--start says otherwise)"
+                    f"second 0 is {first}, the file's first time (--start says otherwise)"
                 )
-            points = gpx.read_gpx(
-                source, frame, start_unix_s or 0.0, node=hints.node, kind=hints.kind
-            )
-            landmarks = gpx.read_landmarks(source, frame)
-        else:
-            from relpos.exchange import geojson
-
-            points = geojson.read_geojson(
-                source, frame, node=hints.node, kind=hints.kind, start_unix_s=start_unix_s
-            )
-            landmarks = geojson.read_landmarks(source, frame)
+        points = maps.read_tracks(source, frame, start_unix_s, node=hints.node, kind=hints.kind)
+        landmarks = maps.read_landmarks(source, frame)
     if not points and not landmarks:
         raise DataError(f"{source}: neither tracks nor landmarks in it")
     run, estimates = base.run, base.estimates
@@ -192,6 +183,17 @@ def _read_tracks(source: Path, form: Format, base: Content, hints: Hints) -> Con
             raise DataError(f"{source}: {error}") from None
     untouched = base.recording if not points.get(Kind.ESTIMATE) else None
     return Content(run, estimates, start_unix_s, tuple(remarks), untouched)
+
+
+def _maps_of(form: Format) -> ModuleType:
+    """Return the module of a format of maps; what they offer has the same names in each."""
+    if form is Format.GPX:
+        from relpos.exchange import gpx
+
+        return gpx
+    from relpos.exchange import geojson
+
+    return geojson
 
 
 def frame_of(content: Content, pins: Sequence[Pin], kind: Kind) -> tuple[MapFrame, tuple[str, ...]]:
@@ -214,17 +216,11 @@ def with_landmarks(content: Content, path: Path, pins: Sequence[Pin]) -> Content
         )
     suffix = _SUFFIXES.get(path.suffix.lower())
     remarks: tuple[str, ...] = tuple(r for r in content.remarks if r not in own.remarks())
+    landmarks: Sequence[Landmark]
     if suffix in (Format.GEOJSON, Format.GPX):
         frame, words = frame_of(content, pins, Kind.TRUTH)
         remarks += words
-        if suffix is Format.GPX:
-            from relpos.exchange import gpx
-
-            landmarks = gpx.read_landmarks(path, frame)
-        else:
-            from relpos.exchange import geojson
-
-            landmarks = geojson.read_landmarks(path, frame)
+        landmarks = _maps_of(suffix).read_landmarks(path, frame)
     else:
         landmarks = read_landmarks(path)
     if not landmarks:
@@ -260,15 +256,15 @@ def write(
     What is there already is left alone unless ``overwrite``; then what an earlier conversion to
     the same format left is removed, because it is no part of this one.
     """
-    writer = _WRITERS[form]
     _make_room(out, form, overwrite=overwrite)
     if form in _FILES:
         out.parent.mkdir(parents=True, exist_ok=True)
-        return writer(content, out, pins)
+        is_map = form in (Format.GEOJSON, Format.GPX)
+        return _write_map(content, form, out, pins) if is_map else _WRITERS[form](content, out)
     new = not out.exists()
     out.mkdir(parents=True, exist_ok=True)
     try:
-        return writer(content, out, pins)
+        return _WRITERS[form](content, out)
     except RelposError:
         if new and not any(out.iterdir()):
             out.rmdir()
@@ -301,20 +297,20 @@ def _make_room(out: Path, form: Format, *, overwrite: bool) -> None:
 _Written = tuple[list[Path], list[str]]
 
 
-def _write_run(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
+def _write_run(content: Content, out: Path) -> _Written:
     save_run(content.run, out)
     if content.estimates:
         write_estimates(out, content.estimates, steps=content.run.steps)
     return sorted(path for path in out.iterdir() if path.is_file()), []
 
 
-def _write_csv(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
+def _write_csv(content: Content, out: Path) -> _Written:
     from relpos.exchange.tables import write_tables
 
     return write_tables(content, out), []
 
 
-def _write_mcap(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
+def _write_mcap(content: Content, out: Path) -> _Written:
     start_ns = 0 if content.start_unix_s is None else round(content.start_unix_s * 1e9)
     # Under its own name only when it is whole.
     part = out.with_name(f"{out.name}.part")
@@ -333,7 +329,7 @@ def _write_mcap(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
     return [out], [*remarks, *_undated(content)]
 
 
-def _write_tum(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
+def _write_tum(content: Content, out: Path) -> _Written:
     from relpos.exchange.tum import file_name, write_tum
 
     files: list[Path] = []
@@ -360,12 +356,7 @@ def _write_tum(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
     return files, remarks
 
 
-def _write_map(
-    content: Content,
-    out: Path,
-    pins: Sequence[Pin],
-    write_file: Callable[[Path, Content, Sequence[Kind], MapFrame], None],
-) -> _Written:
+def _write_map(content: Content, form: Format, out: Path, pins: Sequence[Pin]) -> _Written:
     kinds = [Kind.ESTIMATE] if content.estimates else []
     remarks: list[str] = []
     if content.run.truth:
@@ -383,26 +374,13 @@ def _write_map(
         # They are surveyed in the truth's frame.
         content = replace(content, run=replace(content.run, landmarks=()))
         remarks.append("so are the landmarks, which are surveyed in the truth's")
-    write_file(out, content, kinds, frame)
+    if form is Format.GPX and content.start_unix_s is None:
+        remarks.append("the points have no times: say when the run's second 0 was (--start)")
+    _maps_of(form).write_tracks(out, content, kinds, frame)
     return [out], [*words, *remarks]
 
 
-def _write_geojson(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
-    from relpos.exchange.geojson import write_geojson
-
-    return _write_map(content, out, pins, write_geojson)
-
-
-def _write_gpx(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
-    from relpos.exchange.gpx import write_gpx
-
-    files, remarks = _write_map(content, out, pins, write_gpx)
-    if content.start_unix_s is None:
-        remarks.append("the points have no times: say when the run's second 0 was (--start)")
-    return files, remarks
-
-
-def _write_rosbag2(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
+def _write_rosbag2(content: Content, out: Path) -> _Written:
     from relpos.exchange.rosbag2 import write_rosbag2
 
     if not any(out.iterdir()):
@@ -411,7 +389,7 @@ def _write_rosbag2(content: Content, out: Path, pins: Sequence[Pin]) -> _Written
     return sorted(out.iterdir()), _undated(content)
 
 
-def _write_rrd(content: Content, out: Path, pins: Sequence[Pin]) -> _Written:
+def _write_rrd(content: Content, out: Path) -> _Written:
     from relpos.exchange.rrd import write_rrd
 
     write_rrd(out, content)
@@ -424,12 +402,10 @@ def _undated(content: Content) -> list[str]:
     return ["its clock begins in 1970: say when the run's second 0 was (--start)"]
 
 
-_WRITERS: dict[Format, Callable[[Content, Path, Sequence[Pin]], _Written]] = {
+_WRITERS: dict[Format, Callable[[Content, Path], _Written]] = {
     Format.RUN: _write_run,
     Format.MCAP: _write_mcap,
     Format.TUM: _write_tum,
-    Format.GEOJSON: _write_geojson,
-    Format.GPX: _write_gpx,
     Format.CSV: _write_csv,
     Format.ROSBAG2: _write_rosbag2,
     Format.RRD: _write_rrd,

@@ -32,7 +32,7 @@ _DECIMALS = 9
 _CORNERS = 36
 
 
-def write_geojson(path: Path, content: Content, kinds: Iterable[Kind], frame: MapFrame) -> None:
+def write_tracks(path: Path, content: Content, kinds: Iterable[Kind], frame: MapFrame) -> None:
     """Write one FeatureCollection; altitudes only where the pin gave one."""
     features: list[dict[str, Any]] = []
     for kind in kinds:
@@ -144,13 +144,13 @@ def _nan(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-def read_geojson(
+def read_tracks(
     path: Path,
     frame: MapFrame,
+    start_unix_s: float | None,
     *,
     node: int | None = None,
     kind: Kind | None = None,
-    start_unix_s: float | None = None,
 ) -> dict[Kind, list[Point]]:
     """Read every track, ours or another tool's; ``node`` and ``kind`` say what the file does not.
 

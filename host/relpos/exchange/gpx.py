@@ -25,7 +25,7 @@ _DECIMALS = 9
 """A tenth of a millimetre."""
 
 
-def write_gpx(path: Path, content: Content, kinds: Iterable[Kind], frame: MapFrame) -> None:
+def write_tracks(path: Path, content: Content, kinds: Iterable[Kind], frame: MapFrame) -> None:
     """Write all tracks and landmarks; elevations only where the pin gave an altitude."""
     gpx = _library()
     document = gpx.GPX()
@@ -75,10 +75,10 @@ def first_time(path: Path) -> float | None:
     return min(times, default=None)
 
 
-def read_gpx(
+def read_tracks(
     path: Path,
     frame: MapFrame,
-    start_unix_s: float,
+    start_unix_s: float | None,
     *,
     node: int | None = None,
     kind: Kind | None = None,
@@ -103,7 +103,7 @@ def read_gpx(
                     raise DataError(f"{where}: a point has no time")
                 time = p.time.replace(tzinfo=p.time.tzinfo or UTC)
                 x_m, y_m, z_m = _world(where, p, frame)
-                time_s = round(time.timestamp() - start_unix_s, 6)
+                time_s = round(time.timestamp() - (start_unix_s or 0.0), 6)
                 points.setdefault(what, []).append(Point(time_s, whose, x_m, y_m, z_m))
     return points
 
