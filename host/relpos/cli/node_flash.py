@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from relpos.cli import output
-from relpos.cli.keys import KeyFile
+from relpos.cli.keys import KeyFile, team_key
 from relpos.errors import DataError, DeviceError
 
 if TYPE_CHECKING:
@@ -94,14 +94,12 @@ def _set_up(
     port: str, node_id: int | None, key_file: Path | None, old_key_file: Path | None
 ) -> None:
     """Set key and number of the node over its cable."""
-    from relpos.link.authentication import read_key
     from relpos.link.dialogue import NodeDialogue
     from relpos.link.port import Link
     from relpos.nodes.cable import CablePort
     from relpos.protocol import messages as wire
 
-    key = wire.DEFAULT_KEY if key_file is None else read_key(key_file)
-    old = wire.DEFAULT_KEY if old_key_file is None else read_key(old_key_file)
+    key, old = team_key(key_file), team_key(old_key_file)
     with closing(CablePort(port)) as cable:
         link = Link(key=old)
         link.accept_keys(old, key)

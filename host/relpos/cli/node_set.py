@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from relpos.cli import output
-from relpos.cli.keys import KeyFile
+from relpos.cli.keys import KeyFile, team_key
 from relpos.cli.node_dialogue import Cable, Node, Port, connect, open_device
 from relpos.errors import DeviceError
 
@@ -156,7 +156,7 @@ def _set_key(
     from relpos.link.port import Link
     from relpos.protocol import messages as wire
 
-    old = wire.DEFAULT_KEY if old_key_file is None else read_key(old_key_file)
+    old = team_key(old_key_file)
     if new and old == wire.DEFAULT_KEY and not cable:
         raise DeviceError(NEEDS_CABLE.format(node="N" if node is None else node))
     if old_key_file is not None and not cable:
