@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import cached_property
 
 import numpy as np
@@ -78,6 +78,12 @@ class Bound:
         """Root mean square over the pairs, (T,)."""
         return _rms(self.smoothing_pair_m, axis=1)
 
+    def of(self, *, smoothed: bool) -> tuple[Floats, Floats]:
+        """Return the bounds of distance and position, (T,), of smoothing or of filtering."""
+        if smoothed:
+            return self.smoothing_distance_m, self.smoothing_position_m
+        return self.filtering_distance_m, self.filtering_position_m
+
     def totals(self, first_s: float = -math.inf, last_s: float = math.inf) -> Totals:
         """Root mean squares over the times from ``first_s`` to ``last_s``."""
         there = (self.time_s >= first_s) & (self.time_s <= last_s)
@@ -112,18 +118,7 @@ class Totals:
 
 def over_seeds(totals: Iterable[Totals]) -> Totals:
     """Return the root mean squares over runs: the scenario's bound that a ratio divides by."""
-    rows = np.array(
-        [
-            (
-                t.filtering_distance_m,
-                t.filtering_position_m,
-                t.smoothing_distance_m,
-                t.smoothing_position_m,
-            )
-            for t in totals
-        ]
-    )
-    return Totals(*(float(value) for value in _rms(rows, axis=0)))
+    return Totals(*_rms(np.array([astuple(one) for one in totals]), axis=0).tolist())
 
 
 def of_simulated(

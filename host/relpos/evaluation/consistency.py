@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from relpos.evaluation.finite import mean_of_rows
 from relpos.evaluation.metrics import Metrics
 from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.tracks import Track, interpolate, whole_seconds, wrap_angle
@@ -58,7 +59,8 @@ def nees(runs: Sequence[Floats]) -> Nees:
     Each run is (T,) or (T, P) over time, NaN where there is nothing; simultaneous squares are
     averaged first. All NaN gives NaN.
     """
-    series = [s[np.isfinite(s)] for s in (_over_columns(np.asarray(run)) for run in runs)]
+    simultaneous = (run if run.ndim == 1 else mean_of_rows(run) for run in map(np.asarray, runs))
+    series = [s[np.isfinite(s)] for s in simultaneous]
     series = [s for s in series if s.size]
     values = int(sum(np.isfinite(run).sum() for run in runs))
     if not series:
@@ -160,19 +162,17 @@ def coverage(runs: Sequence[npt.NDArray[np.bool_]]) -> Coverage:
     if not spread:
         # All alike: nothing is seen of how long a hit lasts, so a run counts once.
         effective = float(len(series))
+    low, high = wilson_interval(np.array(share), np.array(effective))
+    return Coverage(share, max(float(low), 0.0), min(float(high), 1.0), effective)
+
+
+def wilson_interval(share: Floats, count: Floats) -> tuple[Floats, Floats]:
+    """Return Wilson's 95 % intervals (n,) of shares (n,) of so many independent cases (n,)."""
     z2 = 1.96**2
-    middle = (share + 0.5 * z2 / effective) / (1.0 + z2 / effective)
-    half = math.sqrt(z2 * (spread / effective + 0.25 * z2 / effective**2)) / (1.0 + z2 / effective)
-    return Coverage(share, max(middle - half, 0.0), min(middle + half, 1.0), effective)
-
-
-def _over_columns(run: Floats) -> Floats:
-    if run.ndim == 1:
-        return run
-    count = np.isfinite(run).sum(axis=1)
-    total = np.where(np.isfinite(run), run, 0.0).sum(axis=1)
-    result: Floats = np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0)
-    return result
+    middle = (share + 0.5 * z2 / count) / (1.0 + z2 / count)
+    half = np.sqrt(z2 * (share * (1.0 - share) / count + 0.25 * z2 / count**2))
+    half = half / (1.0 + z2 / count)
+    return middle - half, middle + half
 
 
 def _variance_of_mean(series: Floats) -> float:

@@ -39,6 +39,7 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
+from relpos.evaluation import finite
 from relpos.evaluation.metrics import MIN_NODES_FOR_SHAPE
 from relpos.tracks import MAX_GAP_S, Track, Tracks, align, interpolate, whole_seconds
 
@@ -184,7 +185,7 @@ def assess(
 def accuracy(frame: Frame, errors: Errors) -> Accuracy:
     """Sum up error vectors (n, 3)."""
     vectors = errors.error_m
-    mean = np.array([_mean(vectors[:, k]) for k in range(3)])
+    mean = np.array([finite.mean(vectors[:, k]) for k in range(3)])
     there = mean[np.isfinite(mean)]
     return Accuracy(
         frame,
@@ -319,8 +320,3 @@ def _covariance(vectors: Floats) -> Floats:
         whole = np.cov(solid.T, bias=True)
         result[2, :], result[:, 2] = whole[2, :], whole[:, 2]
     return result
-
-
-def _mean(values: Floats) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if finite.size else math.nan

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from relpos.evaluation.finite import mean, mean_of_rows, root_mean
 from relpos.evaluation.sides import share_on_wrong_side
 from relpos.tracks import Pair, Pairs, PairTrack, Tracks, align, interpolate, sample, whole_seconds
 
@@ -135,18 +136,18 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
     figures = np.concatenate((error_m, position_squared, nees), axis=1)
     scored = np.flatnonzero(np.isfinite(figures).any(axis=1))
     return Metrics(
-        relative_distance_rmse_m=_root_mean(error_m**2),
-        relative_position_rmse_m=_root_mean(position_squared),
-        body_frame_rmse_m=_root_mean(body_squared),
-        nees_distance=_mean(nees),
+        relative_distance_rmse_m=root_mean(error_m**2),
+        relative_position_rmse_m=root_mean(position_squared),
+        body_frame_rmse_m=root_mean(body_squared),
+        nees_distance=mean(nees),
         pairs={
             pair: PairMetrics(
                 epochs=int(np.isfinite(error_m[:, k]).sum()),
-                distance_rmse_m=_root_mean(error_m[:, k] ** 2),
-                distance_error_mean_m=_mean(error_m[:, k]),
+                distance_rmse_m=root_mean(error_m[:, k] ** 2),
+                distance_error_mean_m=mean(error_m[:, k]),
                 distance_error_max_m=_max_abs(error_m[:, k]),
-                body_frame_rmse_m=_root_mean(body_squared[:, k]),
-                nees_distance=_mean(nees[:, k]),
+                body_frame_rmse_m=root_mean(body_squared[:, k]),
+                nees_distance=mean(nees[:, k]),
             )
             for k, pair in enumerate(pair_ids)
         },
@@ -156,7 +157,7 @@ def evaluate(estimate: Tracks, truth: Tracks, pairs: Pairs | None = None) -> Met
         body_frame_rmse_over_time_m=_root_mean_rows(
             np.hstack((body_squared[..., 0], body_squared[..., 1]))
         )[scored],
-        nees_over_time=_mean_rows(nees)[scored],
+        nees_over_time=mean_of_rows(nees)[scored],
         pair_ids=pair_ids,
         pair_distance_m=estimated_m[scored],
         pair_true_distance_m=true_m[scored],
@@ -204,33 +205,16 @@ def _certain_rows(track: PairTrack | None) -> int:
     return 0 if track is None else int((track.sigma_distance_m <= 0.0).sum())
 
 
-def _mean(values: Floats) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if finite.size else math.nan
-
-
 def _share_above(values: Floats, limit: float) -> float:
-    finite = values[np.isfinite(values)]
-    return float((finite > limit).mean()) if finite.size else math.nan
-
-
-def _root_mean(squares: Floats) -> float:
-    return math.sqrt(_mean(squares)) if np.isfinite(squares).any() else math.nan
+    known = values[np.isfinite(values)]
+    return float((known > limit).mean()) if known.size else math.nan
 
 
 def _max_abs(values: Floats) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.abs(finite).max()) if finite.size else math.nan
-
-
-def _mean_rows(values: Floats) -> Floats:
-    count = np.isfinite(values).sum(axis=1)
-    total = np.where(np.isfinite(values), values, 0.0).sum(axis=1)
-    means = np.full(count.shape, np.nan)
-    np.divide(total, count, out=means, where=count > 0)
-    return means
+    known = values[np.isfinite(values)]
+    return float(np.abs(known).max()) if known.size else math.nan
 
 
 def _root_mean_rows(squares: Floats) -> Floats:
-    result: Floats = np.sqrt(_mean_rows(squares))
+    result: Floats = np.sqrt(mean_of_rows(squares))
     return result

@@ -10,6 +10,8 @@ from itertools import groupby
 import numpy as np
 import numpy.typing as npt
 
+from relpos.evaluation.consistency import wilson_interval
+from relpos.evaluation.finite import median
 from relpos.fusion.models.detection import LENGTH, STEP_M, Detection, Round
 from relpos.measurements import Measurement, Motion, Range
 from relpos.tracks import Pair, PairTrack, Track, Tracks, interpolate
@@ -88,16 +90,9 @@ def _at(track: Track, at_s: Floats) -> Floats:
     )
 
 
-def median(values: Floats) -> float:
-    """Median of what is finite; NaN of nothing."""
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if finite.size else math.nan
-
-
 def spread(values: Floats) -> float:
     """Standard deviation from the median absolute deviation: outliers do not count."""
-    finite = values[np.isfinite(values)]
-    return MAD_TO_SIGMA * median(np.abs(finite - median(finite))) if finite.size else math.nan
+    return MAD_TO_SIGMA * median(np.abs(values - median(values)))
 
 
 @dataclass(frozen=True)
@@ -208,10 +203,6 @@ def shares(values: Heard, edges_m: Floats) -> tuple[Floats, Floats, Floats, npt.
     inside = (place >= 0) & (place < edges_m.size - 1)
     tried = np.bincount(place[inside], minlength=edges_m.size - 1)
     found = np.bincount(place[inside & values.heard], minlength=edges_m.size - 1)
-    z2 = 1.96**2
     with np.errstate(invalid="ignore", divide="ignore"):
         share = np.where(tried > 0, found / tried, np.nan)
-        middle = (share + 0.5 * z2 / tried) / (1.0 + z2 / tried)
-        half = np.sqrt(z2 * (share * (1.0 - share) / tried + 0.25 * z2 / tried**2))
-        half = half / (1.0 + z2 / tried)
-    return share, middle - half, middle + half, tried.astype(np.int64)
+        return share, *wilson_interval(share, tried.astype(np.float64)), tried.astype(np.int64)

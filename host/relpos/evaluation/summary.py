@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from dataclasses import fields, is_dataclass
 from typing import Any
 
+import numpy as np
+
 from relpos.evaluation import consistency
-from relpos.evaluation.iso18305 import Accuracy, Assessment, Frame, Latency, Magnitudes
+from relpos.evaluation.iso18305 import Assessment, Frame, Latency
 from relpos.evaluation.metrics import Metrics
 from relpos.evaluation.regions import Ambiguity
 from relpos.evaluation.vertical import Vertical
@@ -34,24 +36,15 @@ def as_json(metrics: Metrics) -> dict[str, Any]:
         "ok_over_2_m": figure(metrics.ok_over_2_m),
         "ok_wrong_side": figure(metrics.ok_wrong_side),
         "pairs": [
-            {
-                "node": node,
-                "peer": peer,
-                "epochs": pair.epochs,
-                "distance_rmse_m": figure(pair.distance_rmse_m),
-                "distance_error_mean_m": figure(pair.distance_error_mean_m),
-                "distance_error_max_m": figure(pair.distance_error_max_m),
-                "body_frame_rmse_m": figure(pair.body_frame_rmse_m),
-                "nees_distance": figure(pair.nees_distance),
-            }
+            {"node": node, "peer": peer, **plain(pair)}
             for (node, peer), pair in metrics.pairs.items()
         ],
         "over_time": {
-            "time_s": _series(metrics.time_s.tolist()),
-            "relative_distance_rmse_m": _series(metrics.distance_rmse_over_time_m.tolist()),
-            "relative_position_rmse_m": _series(metrics.position_rmse_over_time_m.tolist()),
-            "body_frame_rmse_m": _series(metrics.body_frame_rmse_over_time_m.tolist()),
-            "nees_distance": _series(metrics.nees_over_time.tolist()),
+            "time_s": plain(metrics.time_s),
+            "relative_distance_rmse_m": plain(metrics.distance_rmse_over_time_m),
+            "relative_position_rmse_m": plain(metrics.position_rmse_over_time_m),
+            "body_frame_rmse_m": plain(metrics.body_frame_rmse_over_time_m),
+            "nees_distance": plain(metrics.nees_over_time),
         },
     }
 
@@ -90,11 +83,11 @@ def iso_as_json(iso: Assessment) -> dict[str, Any]:
     return {
         "headline": None if iso.headline is None else str(iso.headline),
         "frames": {
-            str(frame): _accuracy(iso.frames[frame]) if frame in iso.frames else None
+            str(frame): _without("frame", iso.frames[frame]) if frame in iso.frames else None
             for frame in Frame
         },
-        "nodes": [{"node": node, **_accuracy(one)} for node, one in iso.nodes.items()],
-        "relative": _magnitudes(iso.relative),
+        "nodes": [{"node": node, **_without("frame", one)} for node, one in iso.nodes.items()],
+        "relative": plain(iso.relative),
         "coverage": figure(iso.coverage),
         "latency": latency_as_json(iso.latency),
     }
@@ -105,39 +98,27 @@ def latency_as_json(latency: Latency | None) -> dict[str, float | None] | None:
 
     What it computed is left out: the same run and seed give the same numbers on every computer.
     """
-    if latency is None:
-        return None
-    return {
-        name: figure(getattr(latency, name)) for name in latency.__slots__ if name != "computing_s"
-    }
+    return None if latency is None else _without("computing_s", latency)
 
 
 def vertical_as_json(found: Vertical | None) -> dict[str, Any] | None:
     """Return the figures of heights, floors and stairs; None where the truth has no height."""
-    if found is None:
-        return None
-    values = {name: getattr(found, name) for name in found.__slots__}
-    return {
-        name: figure(value) if isinstance(value, float) else value for name, value in values.items()
-    }
+    return None if found is None else plain(found)
 
 
-def _accuracy(accuracy: Accuracy) -> dict[str, Any]:
-    return {
-        "mean_error_m": _series(accuracy.mean_error_m.tolist()),
-        "absolute_mean_m": figure(accuracy.absolute_mean_m),
-        "covariance_m2": [_series(row) for row in accuracy.covariance_m2.tolist()],
-        "horizontal": _magnitudes(accuracy.horizontal),
-        "vertical": _magnitudes(accuracy.vertical),
-        "spherical": _magnitudes(accuracy.spherical),
-    }
+def plain(value: Any) -> Any:
+    """Return figures for JSON: dataclasses by their fields, arrays as lists, floats rounded."""
+    if is_dataclass(value):
+        return {one.name: plain(getattr(value, one.name)) for one in fields(value)}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, list):
+        return [plain(one) for one in value]
+    return figure(value) if isinstance(value, float) else value
 
 
-def _magnitudes(kind: Magnitudes) -> dict[str, float | None]:
-    return {
-        "count": kind.count,
-        **{name: figure(getattr(kind, name)) for name in kind.__slots__[1:]},
-    }
+def _without(name: str, figures: Any) -> dict[str, Any]:
+    return {key: value for key, value in plain(figures).items() if key != name}
 
 
 def _interval(nees: consistency.Nees) -> list[float | None]:
@@ -152,7 +133,3 @@ def no_metrics() -> dict[str, None]:
 def figure(value: float) -> float | None:
     """Round a figure to six decimals; None where it is not finite."""
     return round(value, 6) if math.isfinite(value) else None
-
-
-def _series(values: Iterable[float]) -> list[float | None]:
-    return [figure(value) for value in values]

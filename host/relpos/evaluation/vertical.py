@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos import tracks
+from relpos.evaluation.finite import mean, root_mean
 from relpos.evaluation.iso18305 import percentile
 from relpos.evaluation.metrics import MIN_NODES_FOR_SHAPE, aligned_squared_distances
 from relpos.fusion.estimator import Estimate
@@ -150,12 +151,12 @@ def score(
     known_episodes = any(e.event == "episode" for e in events)
     found = Vertical(
         int(errors_m.size),
-        _root_mean(errors),
+        root_mean(errors**2),
         relative,
         percentile(errors_m, 0.95),
         _se95(nodes),
         aligned,
-        _mean((errors[told] / sigmas[told]) ** 2),
+        mean((errors[told] / sigmas[told]) ** 2),
         not_scored=tuple(
             words
             for words, missing in (
@@ -258,7 +259,7 @@ def _between(nodes: Mapping[int, _Node]) -> tuple[float, float]:
         if there.sum() >= MIN_NODES_FOR_SHAPE:
             off = z[there] - z[there].mean()
             squares.append(aligned_squared_distances(xy[there, :2], xy[there, 2:]) + off**2)
-    return _root_mean_of(_stacked(pairs)), _root_mean_of(_stacked(squares))
+    return root_mean(_stacked(pairs)), root_mean(_stacked(squares))
 
 
 def _se95(nodes: Mapping[int, _Node]) -> float:
@@ -292,10 +293,10 @@ def _with_floors(
         claims = np.isfinite(n.floor) & (n.floor_probability > CLAIMED)
         wrong += int((there & claims & ~fits).sum())
         scored += int(there.sum())
-    found = replace(found, floor_by_height=_mean(_stacked(near)))
+    found = replace(found, floor_by_height=mean(_stacked(near)))
     if not stated:
         return found
-    return replace(found, floor_right=_mean(_stacked(right)), wrong_claimed=wrong / max(scored, 1))
+    return replace(found, floor_right=mean(_stacked(right)), wrong_claimed=wrong / max(scored, 1))
 
 
 def _nearest(levels: Floats, z_m: Floats) -> npt.NDArray[np.int64]:
@@ -375,16 +376,3 @@ def _way_on_flights(n: _Node) -> tuple[float, float]:
 
 def _stacked(parts: object) -> Floats:
     return np.concatenate([np.empty(0), *parts])  # type: ignore[misc]
-
-
-def _mean(values: Floats) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if finite.size else math.nan
-
-
-def _root_mean(values: Floats) -> float:
-    return math.sqrt(_mean(values**2)) if np.isfinite(values).any() else math.nan
-
-
-def _root_mean_of(squares: Floats) -> float:
-    return math.sqrt(_mean(squares)) if np.isfinite(squares).any() else math.nan

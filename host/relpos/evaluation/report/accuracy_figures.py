@@ -63,15 +63,8 @@ def error_over_time(content: Content) -> Picture | None:
                 if np.isfinite(over).any():
                     lowest = min(lowest, float(np.nanquantile(over, 0.05)))
             if bound is not None:
-                totals = bound.totals()
-                over, whole = (
-                    (bound.smoothing_distance_m, totals.smoothing_distance_m)
-                    if smoothed
-                    else (bound.filtering_distance_m, totals.filtering_distance_m),
-                    (bound.smoothing_position_m, totals.smoothing_position_m)
-                    if smoothed
-                    else (bound.filtering_position_m, totals.filtering_position_m),
-                )[place]
+                over = bound.of(smoothed=smoothed)[place]
+                whole = bound.totals().of(smoothed=smoothed)[place]
                 axes.plot(
                     bound.time_s, over, color=INK, linestyle=(0, (2, 2)), linewidth=1.2, zorder=3,
                     label=f"bound: {whole:.2f} m",

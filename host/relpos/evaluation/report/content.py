@@ -12,6 +12,7 @@ import numpy as np
 from relpos import tracks
 from relpos.errors import DataError, RelposError
 from relpos.evaluation import health, metrics, ranging, scoring, summary
+from relpos.evaluation.finite import median
 from relpos.evaluation.metrics import Metrics
 from relpos.evaluation.result import Result, run_estimator
 from relpos.fusion.estimator import NodeStatus
@@ -92,9 +93,9 @@ class Content:
                     "peer": one.pair[1],
                     "ranges": int(one.range_m.size),
                     "failed": one.failed,
-                    "residual_median_m": summary.figure(ranging.median(one.residual_m)),
+                    "residual_median_m": summary.figure(median(one.residual_m)),
                     "residual_spread_m": summary.figure(ranging.spread(one.residual_m)),
-                    "error_median_m": summary.figure(ranging.median(one.error_m)),
+                    "error_median_m": summary.figure(median(one.error_m)),
                     "error_spread_m": summary.figure(ranging.spread(one.error_m)),
                 }
                 for one in self.ranges

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 
 from relpos.evaluation.iso18305 import Frame
@@ -13,49 +13,40 @@ from relpos.evaluation.report.drawing import Picture, colours
 from relpos.evaluation.report.tables import Table
 from relpos.version import __version__
 
-SECTIONS: Sequence[tuple[str, str, tuple[str, ...], tuple[str, ...]]] = (
-    ("where", "Positions", ("tracks",), ("located",)),
+Tables = tuple[Callable[[Content], Table | None], ...]
+
+SECTIONS: Sequence[tuple[str, str, tuple[str, ...], Tables]] = (
+    ("where", "Positions", ("tracks",), (tables.located,)),
     (
         "accuracy",
         "Accuracy",
         ("error", "error-distribution"),
-        ("main", "iso", "latency", "nodes", "pairs"),
+        (tables.main_figures, tables.iso, tables.latency, tables.nodes, tables.pairs),
     ),
     ("distances", "Distances", ("distances",), ()),
-    ("consistency", "Consistency", ("consistency", "status"), ("nees",)),
-    ("ranging", "Ranging", ("detection", "residuals"), ("ranges",)),
-    ("learned", "Learned on the way", ("parameters",), ("learned",)),
-    ("height", "Height", ("section", "height"), ("vertical",)),
-    ("health", "Links and nodes", ("health",), ("health", "reasons", "counters")),
-    ("log", "Log", (), ("log",)),
+    ("consistency", "Consistency", ("consistency", "status"), (tables.consistency,)),
+    ("ranging", "Ranging", ("detection", "residuals"), (tables.ranges,)),
+    ("learned", "Learned on the way", ("parameters",), (tables.learned,)),
+    ("height", "Height", ("section", "height"), (tables.vertical,)),
+    (
+        "health",
+        "Links and nodes",
+        ("health",),
+        (tables.health, tables.reasons, tables.counters),
+    ),
+    ("log", "Log", (), (tables.log,)),
 )
 """Sections of the page: id, title, pictures, tables. Empty ones are left out."""
 
 
 def page(content: Content, drawn: Mapping[str, tuple[Picture, str]]) -> str:
     """Write the page; ``drawn`` holds each picture with its inline SVG, by name."""
-    made: dict[str, Table | None] = {
-        "main": tables.main_figures(content),
-        "iso": tables.iso(content),
-        "latency": tables.latency(content),
-        "vertical": tables.vertical(content),
-        "nodes": tables.nodes(content),
-        "pairs": tables.pairs(content),
-        "nees": tables.consistency(content),
-        "ranges": tables.ranges(content),
-        "learned": tables.learned(content),
-        "health": tables.health(content),
-        "reasons": tables.reasons(content),
-        "counters": tables.counters(content),
-        "located": tables.located(content),
-        "log": tables.log(content),
-    }
     sections, links = [], []
-    for key, title, pictures, names in SECTIONS:
+    for key, title, pictures, made in SECTIONS:
         figures = [_figure(*drawn[name]) for name in pictures if name in drawn]
-        shown = [table.html() for name in names if (table := made[name]) is not None]
+        shown = [table.html() for make in made if (table := make(content)) is not None]
         # Figures that belong to numbers come after them, a map before its table.
-        parts = figures + shown if key not in ("accuracy",) else [*shown[:1], *figures, *shown[1:]]
+        parts = figures + shown if key != "accuracy" else [*shown[:1], *figures, *shown[1:]]
         if parts:
             sections.append(
                 f'<section id="{key}"><h2>{escape(title)}</h2>\n' + "\n".join(parts) + "</section>"

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.evaluation import ranging
+from relpos.evaluation.finite import median
 from relpos.evaluation.report.content import Content
 from relpos.evaluation.report.drawing import Picture, dots, grid
 from relpos.evaluation.style import (
@@ -102,7 +103,7 @@ def residuals(content: Content) -> Picture | None:
     rows = -(-len(shown) // columns)
     everything = np.concatenate([one.residual_m for one in shown])
     everything = everything[np.isfinite(everything)]
-    middle, spread = ranging.median(everything), ranging.spread(everything)
+    middle, spread = median(everything), ranging.spread(everything)
     room = max(4.0 * spread, 0.1)
     low = min(middle - room, 1.1 * float(np.quantile(everything, 0.02)), 0.0)
     high = max(middle + room, 1.1 * float(np.quantile(everything, 0.98)), 0.0)
@@ -153,7 +154,7 @@ def _draw_residuals(
     time_s, values = one.time_s[there], np.clip(one.residual_m[there], *limits)
     axes.axhline(0.0, color=INK, linewidth=0.8)
     dots(axes, time_s, values, FUSED, label="residual", markersize=4)
-    true = ranging.median(one.error_m)
+    true = median(one.error_m)
     if math.isfinite(true):
         axes.axhline(true, color=INK, linestyle="--", linewidth=1.0, label="true bias")
     if bias is not None:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.evaluation import ranging
+from relpos.evaluation.finite import median
 from relpos.evaluation.iso18305 import Accuracy, Frame, Magnitudes
 from relpos.evaluation.metrics import PairMetrics
 from relpos.evaluation.report.consistency_figures import STATUS_WORDS
@@ -329,12 +330,12 @@ def ranges(content: Content) -> Table | None:
         if failed:
             row.append(value(one.failed, "", 0))
         row += [
-            value(ranging.median(one.residual_m), "m", sign=True),
+            value(median(one.residual_m), "m", sign=True),
             value(ranging.spread(one.residual_m), "m"),
         ]
         if true:
             row += [
-                value(ranging.median(one.error_m), "m", sign=True),
+                value(median(one.error_m), "m", sign=True),
                 value(ranging.spread(one.error_m), "m"),
             ]
         if learned:
@@ -405,9 +406,9 @@ def health(content: Content) -> Table | None:
             total = one.colour.size
             row += [
                 value(_least(one.series["battery_v"]), "V"),
-                value(ranging.median(one.series["rssi_dbm"]), "dBm", 0),
+                value(median(one.series["rssi_dbm"]), "dBm", 0),
                 _share(one.loss),
-                _share(ranging.median(one.series["ranging"])),
+                _share(median(one.series["ranging"])),
                 value(len(one.restarts), "", 0),
                 *(
                     _share(float((one.colour == int(c)).sum() / total) if total else math.nan)
