@@ -11,8 +11,7 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from relpos.errors import DataError
-from relpos.recordings.tables import Archive, ConvertedRun, number
+from relpos.recordings.tables import Archive, ConvertedRun, described, imu_lines
 
 FOLDER = "data/site1/F1/path_data_files/"
 KINDS = ("TYPE_ACCELEROMETER", "TYPE_GYROSCOPE", "TYPE_MAGNETIC_FIELD")
@@ -20,10 +19,7 @@ KINDS = ("TYPE_ACCELEROMETER", "TYPE_GYROSCOPE", "TYPE_MAGNETIC_FIELD")
 
 def convert(archive: Archive) -> Iterator[ConvertedRun]:
     """Every path of the floor with two waypoints or more."""
-    paths = [n for n in archive.names if n.startswith(FOLDER)]
-    if not paths:
-        raise DataError(f"walk_handheld_waypoints: no {FOLDER}: the source has changed")
-    for path in paths:
+    for path in archive.below(FOLDER):
         run = _run(PurePosixPath(path).stem, archive.read(path))
         if run is not None:
             yield run
@@ -45,14 +41,11 @@ def _run(name: str, text: str) -> ConvertedRun | None:
     columns = [
         np.interp(times_s, table[:, 0], column) for table in tables for column in table[:, 1:].T
     ]
-    imu = [
-        f"{t - zero_s:.4f},1," + ",".join(map(number, cells))
-        for t, *cells in zip(times_s, *columns, strict=True)
-    ]
+    imu = imu_lines(times_s - zero_s, np.column_stack(columns), 6)
     truth = [f"{t - zero_s:.4f},1,{x:.6g},{y:.6g}," for t, x, y in rows["TYPE_WAYPOINT"]]
-    description = (
-        f'name = "walk_handheld_waypoints/{name}"\n'
-        f'source = "github.com/location-competition/indoor-location-competition-20 (MIT), {name}"\n'
-        'mount = "phone held flat at the chest, Android axes: x right, y forward, z up"\n'
+    description = described(
+        f"walk_handheld_waypoints/{name}",
+        f"github.com/location-competition/indoor-location-competition-20 (MIT), {name}",
+        'mount = "phone held flat at the chest, Android axes: x right, y forward, z up"',
     )
     return ConvertedRun(name, description, imu, truth=truth)
