@@ -38,7 +38,6 @@ SEED = 1
 
 GOOD_CONDITIONS = replace(
     SCENARIOS["paper"],
-    name="paper in good conditions",
     spacing_m=3.0,
     world=replace(
         SCENARIOS["paper"].world,

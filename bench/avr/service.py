@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 
-from relpos.emulator.air import UwbModel
+from relpos.emulator.air import EXCHANGE_US
 from relpos.emulator.ak8975 import ADDRESS as AK8975_ADDRESS
 from relpos.emulator.ak8975 import Ak8963, Ak8975
 from relpos.emulator.avr.board import BoardKind
@@ -129,7 +129,7 @@ class Service:
             self.counts["exchanges"] += 1
             initiator.finish_ranging(destination, result, UWB_TIMEOUT_ERROR, now_us, started=True)
 
-        self._at(time_us + UwbModel().exchange_us, end)
+        self._at(time_us + EXCHANGE_US, end)
 
     # -- the radio (Air) ------------------------------------------------------------------------
 

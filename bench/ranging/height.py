@@ -44,7 +44,7 @@ def climb(climbers: int, seed: int) -> list[tuple[FloatArray, FloatArray, FloatA
     reported: dict[int, list[tuple[float, float]]] = {walker.node: [] for walker in walkers}
     link = Link()
     with (
-        mock.patch.object(emulated, "make_team", return_value=(walkers, World(name="stairs"))),
+        mock.patch.object(emulated, "make_team", return_value=(walkers, World())),
         emulated.EmulatedTeam(
             emulated.TeamConfig("stairs", climbers, end_s, seed, beacons=True)
         ) as team,

@@ -69,12 +69,11 @@ def crowd(loss: float, detection: float | None) -> Scenario:
         uwb = replace(uwb, detection_near=detection, detection_far=detection)
     radio = replace(RadioChannel(), loss_probability=loss)
     return Scenario(
-        name="crowd",
         path_m=ROOM_M,
         speed_m_s=(0.9, 1.1),
         spacing_m=0.9,
         still_s=2.0,
-        world=World(name="crowd", size_m=ROOM_M, uwb=uwb, radio=radio),
+        world=World(size_m=ROOM_M, uwb=uwb, radio=radio),
     )
 
 

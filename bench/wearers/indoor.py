@@ -91,7 +91,6 @@ def _dipole(place: FloatArray, at: FloatArray, moment_ut: FloatArray) -> FloatAr
 
 
 INDOOR = World(
-    name="indoor",
     magnetic=IndoorField(disturbance_ut=4.5, wavelengths_m=(3.0, 40.0), modes=24),
 )
 """A building; its seed is the walker's."""

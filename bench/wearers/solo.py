@@ -79,7 +79,7 @@ def make_walker(
             plan = make_itinerary(plan_rng, wearer, listed)
     seconds = PAPER_SECONDS if paper else plan.end_s + _LEAST_TAIL_S
     seconds = math.floor(seconds * 50.0) / 50.0
-    world = World(name="solo") if world is None else world
+    world = World() if world is None else world
     world = replace(world, magnetic=replace(world.magnetic, seed=seed))
     heading = float(move_rng.uniform(-math.pi, math.pi))
     late = float(move_rng.uniform(2.0, 10.0))

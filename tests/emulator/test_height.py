@@ -50,7 +50,7 @@ def climb(tmp_path_factory):
         walkers.append(replace(truth, pressure_pa=hydrostatic_pa(truth.position_m[:, 2])))
     seconds = min(float(w.time_s[-1]) for w in walkers)
     patch = pytest.MonkeyPatch()
-    patch.setattr(emulated, "make_team", lambda *_: (walkers, World(name="stairs")))
+    patch.setattr(emulated, "make_team", lambda *_: (walkers, World()))
     try:
         run = record_team(
             TeamConfig(board="native", nodes=2, seconds=seconds, scenario="stairs", seed=1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from chips import Host, constant
 
-from relpos.emulator.air import Outcome, UwbAir, UwbModel, VirtualClock
+from relpos.emulator.air import EXCHANGE_US, FAILED_US, Outcome, UwbAir, VirtualClock
 from relpos.emulator.bus import BusStatus
 from relpos.emulator.pozyx import Pozyx, PressureErrors
 from relpos.simulation.world import UwbChannel, World
@@ -30,7 +30,7 @@ class Field:
             World(uwb=UwbChannel(**options)),
             lambda tag, _: np.array([self.place[tag], 0.0, 0.0]),
             np.random.default_rng(1),
-            UwbModel(collisions=collisions),
+            collisions,
         )
         self.hosts = []
         for k, x in enumerate(x_m):
@@ -156,10 +156,7 @@ def test_the_channel_reports_each_exchange_when_it_is_over():
         (4, 5, Outcome.RANGED),
         (4, 77, Outcome.ABSENT),
     ]
-    assert all(
-        r.end_us - r.begin_us in (field.air.model.exchange_us, field.air.model.failed_us)
-        for r in records
-    )
+    assert all(r.end_us - r.begin_us in (EXCHANGE_US, FAILED_US) for r in records)
 
 
 def test_a_tag_that_restarts_while_it_answers_knows_nothing_of_it():

@@ -56,26 +56,16 @@ class VirtualClock:
         self.now_us = max(self.now_us, until_us)
 
 
-@dataclass(frozen=True, slots=True)
-class UwbModel:
-    """How long ranging takes, and what happens where two exchanges meet. Assumed, not measured.
+EXCHANGE_US = 20_000
+"""From the call of an exchange to its end. Assumed, not measured.
 
-    At 110 kbit/s, a PRF of 64 MHz and a preamble of 1024 symbols of 1.018 us, a frame of 20 bytes
-    takes 3.0 ms on the air: preamble 1.04 ms, start delimiter 0.07 ms, header 0.17 ms (21 bits of
-    8.2 us), data 1.7 ms (160 bits and 48 of its Reed-Solomon code; IEEE 802.15.4a).
-    """
-
-    exchange_us: int = 20_000
-    """From the call to its end. Four such frames (poll, answer, final, report) are 12 ms, and
-    three replies of one to two milliseconds and the microcontrollers' work come on top. pypozyx
-    first allowed 25 ms for all of it."""
-    failed_us: int = 30_000
-    """Until the initiator gives up on an answer: pypozyx's 25 ms and some margin."""
-    collisions: bool = True
-    """Two exchanges that overlap in time, with a tag of the one in reach of a tag of the other,
-    both fail: a preamble hides other frames, and no tag is in two exchanges at once.
-    Harder than the air is: a strong frame may survive a weak one, and an initiator that waits in
-    vain disturbs no other."""
+At 110 kbit/s, a PRF of 64 MHz and a preamble of 1024 symbols of 1.018 us, a frame of 20 bytes takes
+3.0 ms on the air: preamble 1.04 ms, start delimiter 0.07 ms, header 0.17 ms (21 bits of 8.2 us),
+data 1.7 ms (160 bits and 48 of its Reed-Solomon code; IEEE 802.15.4a). Four such frames (poll,
+answer, final, report) are 12 ms, and three replies of one to two milliseconds and the
+microcontrollers' work come on top. pypozyx first allowed 25 ms for all of it."""
+FAILED_US = 30_000
+"""Until the initiator gives up on an answer: pypozyx's 25 ms and some margin."""
 
 
 class Outcome(StrEnum):
@@ -108,6 +98,11 @@ class _Exchange:
 class UwbAir:
     """Ranging between tags at their true positions.
 
+    With ``collisions`` two exchanges that overlap in time, with a tag of the one in reach of a tag
+    of the other, both fail: a preamble hides other frames, and no tag is in two exchanges at once.
+    Harder than the air is: a strong frame may survive a weak one, and an initiator that waits in
+    vain disturbs no other.
+
     ``counts``: attempts, ranges, undetected, collisions, absent; an undetected exchange that also
     collides is counted in both.
     """
@@ -118,9 +113,9 @@ class UwbAir:
         world: World,
         position_m: Callable[[Pozyx, int], FloatArray],
         rng: np.random.Generator,
-        model: UwbModel | None = None,
+        collisions: bool = True,
     ) -> None:
-        self.model = model or UwbModel()
+        self._collisions = collisions
         self.tags: list[Pozyx] = []
         self.counts: Counter[str] = Counter()
         self._clock = clock
@@ -154,11 +149,11 @@ class UwbAir:
                 measured = max(measured + delays_m, 0.0)
         spoilt = False
         if self.spoil is not None:
-            measured, spoilt = self.spoil(initiator, measured, time_us + self.model.exchange_us)
-        duration_us = self.model.failed_us if measured is None else self.model.exchange_us
+            measured, spoilt = self.spoil(initiator, measured, time_us + EXCHANGE_US)
+        duration_us = FAILED_US if measured is None else EXCHANGE_US
         exchange = _Exchange(time_us + duration_us, (initiator, responder), spoilt)
         self._under_way = [e for e in self._under_way if e.end_us > time_us]
-        if self.model.collisions:
+        if self._collisions:
             for other in self._under_way:
                 if self._in_reach(exchange, other, time_us):
                     other.collided = exchange.collided = True

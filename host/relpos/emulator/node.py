@@ -130,14 +130,13 @@ class EmulatedNode:
         clock: VirtualClock,
         medium: UwbMedium,
         air: Air,
-        eeprom: bytearray | None = None,
     ) -> None:
         if not isinstance(hardware, Hardware):
             hardware = Hardware(BoardKind(hardware))
         self.node = node
         self.surroundings = surroundings
         self.errors = errors
-        self.eeprom = prepared_eeprom(node) if eeprom is None else eeprom
+        self.eeprom = prepared_eeprom(node)
         self.bus = I2cBus()
         auxiliary: dict[int, ak8975.Ak8975] = {}
         successor = hardware.imu is ImuKind.MPU9250

@@ -22,7 +22,7 @@ from relpos.simulation.team import Scenario, make_team
 from relpos.simulation.walker import RATE_HZ, WalkerTruth
 from relpos.simulation.world import FloatArray
 
-from .air import STEP_US, RadioAir, UwbAir, UwbModel, VirtualClock
+from .air import STEP_US, RadioAir, UwbAir, VirtualClock
 from .faults import FaultSpec, parse_faults
 from .faults.boards import faulty_clock
 from .faults.injection import inject
@@ -103,8 +103,7 @@ class EmulatedTeam:
         self.end_us = round(config.seconds * 1e6)
         self.clock = VirtualClock()
         uwb_rng, radio_rng = (np.random.default_rng([seed, k, 0xA17]) for k in (1, 2))
-        model = UwbModel(collisions=config.collisions)
-        self.uwb = UwbAir(self.clock, self.world, self._tag_position_m, uwb_rng, model)
+        self.uwb = UwbAir(self.clock, self.world, self._tag_position_m, uwb_rng, config.collisions)
         self.radio = RadioAir(self.clock, self.world, self._module_distance_m, radio_rng)
         self._output: list[tuple[int, bytes]] = []
         self.host_fault: Callable[[int], int | None] | None = None

@@ -31,7 +31,6 @@ MAX_WALKERS = 20
 class Scenario:
     """What is the same for all people of a walk. Change one with `dataclasses.replace`."""
 
-    name: str
     path_m: tuple[float, float]
     """Sides of the rectangle that is walked counter-clockwise from the origin."""
     speed_m_s: tuple[float, float]
@@ -52,14 +51,12 @@ class Scenario:
 
 
 _HOUSE = Scenario(
-    name="building",
     # Stairs in the middle of both short sides, storeys on the long ones in turn.
     path_m=(24.0, 12.0),
     speed_m_s=(0.6, 1.0),
     spacing_m=5.0,
     pause_every_s=120.0,
     world=World(
-        name="building",
         size_m=(24.0, 12.0),
         uwb=UwbChannel(max_range_m=30.0),
         building=Building(tuple(STOREY_M * k for k in range(4)), ()),
@@ -69,15 +66,13 @@ _HOUSE = Scenario(
 
 SCENARIOS = {
     "paper": Scenario(
-        name="paper",
         path_m=(20.0, 10.0),
         speed_m_s=(0.5, 1.1),
         spacing_m=8.0,
         pause_every_s=120.0,
-        world=World(name="paper", size_m=(20.0, 10.0)),
+        world=World(size_m=(20.0, 10.0)),
     ),
     "lab": Scenario(
-        name="lab",
         # One metre from the walls of 25 m x 15 m.
         path_m=(23.0, 13.0),
         # 310 m of the 380 s, of which the first seconds are spent standing and waiting.
@@ -85,27 +80,23 @@ SCENARIOS = {
         spacing_m=4.0,
         distance_limit_m=310.0,
         world=World(
-            name="lab",
             size_m=(25.0, 15.0),
             uwb=UwbChannel(detection_near=0.9, detection_far=0.5, nlos_probability=0.05),
             magnetic=MagneticField(disturbance_ut=5.0),
         ),
     ),
     "straight": Scenario(
-        name="straight",
         # A wearer who walks a measured length once and stops: for `relpos node calibrate walk`.
         path_m=(60.0, 20.0),
         speed_m_s=(0.9, 1.3),
         spacing_m=4.0,
         still_s=10.0,
         distance_limit_m=40.0,
-        world=World(name="straight", size_m=(60.0, 20.0)),
+        world=World(size_m=(60.0, 20.0)),
     ),
     "building": _HOUSE,
-    "building-fan": replace(
-        _HOUSE, name="building-fan", air={"fan_pa": 25.0, "fan_s": 120.0, "fan_off_s": 200.0}
-    ),
-    "building-weather": replace(_HOUSE, name="building-weather", air={"weather_pa_h": 200.0}),
+    "building-fan": replace(_HOUSE, air={"fan_pa": 25.0, "fan_s": 120.0, "fan_off_s": 200.0}),
+    "building-weather": replace(_HOUSE, air={"weather_pa_h": 200.0}),
 }
 """By name. `paper` with the paper's own pace: replace(SCENARIOS["paper"], speed_m_s=(0.5, 0.5))."""
 
@@ -130,11 +121,10 @@ def make_team(
         raise DataError(f"a seed is not negative, unlike {seed}")
 
     if scenario == TURNTABLE:
-        world = World(name=TURNTABLE, size_m=(2.0, 2.0))
+        world = World(size_m=(2.0, 2.0))
         return [turn_by_hand(node, seconds, seed, world) for node in ids], world
     if scenario == BENCH:
         world = World(
-            name=BENCH,
             size_m=(SPACING_M * len(ids), SPACING_M),
             uwb=UwbChannel(detection_near=0.98, detection_far=0.5, nlos_probability=0.0),
         )

@@ -149,7 +149,6 @@ class MagneticField:
 class World:
     """Everything outside the walkers. Floor plane z = 0, world x along the first leg."""
 
-    name: str = "open"
     size_m: tuple[float, float] = (20.0, 10.0)
     uwb: UwbChannel = field(default_factory=UwbChannel)
     radio: RadioChannel = field(default_factory=RadioChannel)

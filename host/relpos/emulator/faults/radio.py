@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
-from relpos.emulator.air import VirtualClock
+from relpos.emulator.air import EXCHANGE_US, VirtualClock
 from relpos.emulator.pozyx import Pozyx
 from relpos.emulator.xbee import (
     BROADCAST,
@@ -196,7 +196,6 @@ def uwb(hooks: Hooks, spec: FaultSpec, rng: Rng) -> None:
     """Install a fault of the air between the tags."""
     air = hooks.team.uwb
     before = air.spoil
-    exchange_us = air.model.exchange_us  # of foreign tags too
     foreign: deque[int] = deque()
     next_us = [float(spec.from_us)]
     rate = spec.number("rate")
@@ -206,7 +205,7 @@ def uwb(hooks: Hooks, spec: FaultSpec, rng: Rng) -> None:
         while next_us[0] < end_us and rate > 0.0:
             foreign.append(round(next_us[0]))
             next_us[0] += 1e6 * float(rng.exponential(1.0 / rate))
-        while foreign and foreign[0] + exchange_us <= begin_us:
+        while foreign and foreign[0] + EXCHANGE_US <= begin_us:
             foreign.popleft()
         return bool(foreign) and foreign[0] < end_us
 

@@ -154,14 +154,14 @@ def dots(axes: Axes, x: Floats, y: Floats, colour: str, **more: Any) -> None:
     axes.plot(x, y, ".", color=colour, markeredgewidth=0.0, rasterized=x.size > MANY_DOTS, **given)
 
 
-def grid(figure: Figure, count: int, columns: int, *, sharey: bool = True) -> Sequence[Axes]:
+def grid(figure: Figure, count: int, columns: int) -> Sequence[Axes]:
     """Return ``count`` panels in rows of at most ``columns``, those of a column with one time axis.
 
     The labels of the time axis stand under the lowest panel of each column.
     """
     columns = min(columns, max(count, 1))
     rows = max(1, -(-count // columns))
-    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=sharey).ravel()
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
     for k, axes in enumerate(panels):
         axes.set_visible(k < count)
         if k + columns >= count:
