@@ -22,7 +22,8 @@ from pathlib import Path
 import numpy as np
 
 from relpos import fusion, tracks
-from relpos.evaluation import metrics
+from relpos.evaluation import metrics, ranging
+from relpos.evaluation.finite import median
 from relpos.fusion import Estimate, NodeStatus
 from relpos.runs import InitialPose, Run, load_run
 
@@ -55,17 +56,8 @@ def fuse(
 
 def true_biases(run: Run) -> dict[tuple[int, int], float]:
     """Give the median of each pair's ranges less the true distance, m."""
-    truth = tracks.true_tracks(run.truth)
-    residuals: dict[tuple[int, int], list[float]] = {}
-    for r in run.ranges:
-        if r.range_m > 0.0:
-            ends = [
-                np.array([np.interp(r.time_s, t.time_s, axis) for axis in (t.x_m, t.y_m)])
-                for t in (truth[r.node], truth[r.peer])
-            ]
-            pair = (min(r.node, r.peer), max(r.node, r.peer))
-            residuals.setdefault(pair, []).append(r.range_m - float(np.hypot(*(ends[1] - ends[0]))))
-    return {pair: float(np.median(of)) for pair, of in sorted(residuals.items())}
+    ranges = ranging.by_pair(run.ranges, {}, tracks.true_tracks(run.truth))
+    return {one.pair: median(one.error_m) for one in ranges}
 
 
 def print_biases(seeds: int, settings: Mapping[str, str]) -> None:

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import scipy
 
+from relpos.calibration.steps import LEG_OF_STATURE
 from relpos.simulation.team import SCENARIOS, make_team
 from relpos.simulation.world import FloatArray
 
@@ -174,29 +175,46 @@ def apparent_gain(
     return rise, length_m / (2.0 * math.sqrt(2.0 * leg_m * rise - rise**2))
 
 
-def recorded_gains(folder: Path) -> FloatArray:
-    """Speed, step length, walk ratio, rise and gain (k, 5) of the ways out in walk_lowerback_20m.
+def events_of(run: Path) -> list[tuple[float, str, str]]:
+    """Times, names and values of a run's events."""
+    with (run / "events.csv").open(encoding="utf-8") as file:
+        return [(float(r["time_s"]), r["event"], r["value"]) for r in csv.DictReader(file)]
 
-    The step length is the nominal 20 m over the number of foot contacts, the leg 0.53 of the
-    stature; runs without stature or with fewer than 8 contacts before the turn are left out.
+
+def about(run: Path) -> dict[str, float]:
+    """What is said of a run."""
+    return dict(tomllib.loads((run / "run.toml").read_text(encoding="utf-8")))
+
+
+def recorded_ways_out(folder: Path) -> tuple[FloatArray, FloatArray]:
+    """Of the ways out in walk_lowerback_20m: person (k,) and figures (k, 5).
+
+    Step length, cadence, rise, stature and pendulum gain. The step length is the nominal 20 m over
+    the number of foot contacts; runs without stature or with fewer than 8 contacts before the turn
+    are left out.
     """
-    rows = []
+    person, rows = [], []
     for run in sorted(folder.iterdir()):
-        about = tomllib.loads((run / "run.toml").read_text(encoding="utf-8"))
-        with (run / "events.csv").open(encoding="utf-8") as file:
-            events = [(float(r["time_s"]), r["event"]) for r in csv.DictReader(file)]
-        contacts = np.array([t for t, event in events if event == "foot_contact"])
-        turn = next((t for t, event in events if event == "uturn_start"), math.inf)
+        known, events = about(run), events_of(run)
+        contacts = np.array([t for t, event, _ in events if event == "foot_contact"])
+        turn = next((t for t, event, _ in events if event == "uturn_start"), math.inf)
         out = contacts[contacts < turn]
-        if "stature_m" not in about or len(out) < 8:
+        if "stature_m" not in known or len(out) < 8:
             continue
         time_s, values = read_samples(run)
         force = values[(time_s > out[1]) & (time_s < out[-1]), :3]
-        step_hz = (len(out) - 2) / (out[-1] - out[1])
-        length = 20.0 / len(contacts)
-        rise, gain = apparent_gain(force, 100.0, step_hz, length, 0.53 * about["stature_m"])
-        rows.append((length * step_hz, length, length / step_hz, rise, gain))
-    return np.array(rows)
+        step_hz, length = (len(out) - 2) / (out[-1] - out[1]), 20.0 / len(contacts)
+        stature = float(known["stature_m"])
+        rise, gain = apparent_gain(force, 100.0, step_hz, length, LEG_OF_STATURE * stature)
+        person.append(int(run.name.split("-")[0]))
+        rows.append((length, step_hz, rise, stature, gain))
+    return np.array(person), np.array(rows)
+
+
+def recorded_gains(folder: Path) -> FloatArray:
+    """Speed, step length, walk ratio, rise and gain (k, 5) of :func:`recorded_ways_out`."""
+    length, step_hz, rise, _, gain = recorded_ways_out(folder)[1].T
+    return np.column_stack([length * step_hz, length, length / step_hz, rise, gain])
 
 
 def simulated_gains(speed_m_s: tuple[float, float], walkers: int, seed: int) -> FloatArray:
@@ -208,7 +226,7 @@ def simulated_gains(speed_m_s: tuple[float, float], walkers: int, seed: int) -> 
         steps = (walker.steps.time_s > 10.0) & (walker.steps.time_s < 20.0)
         length = float(walker.steps.length_m[steps].mean())
         step_hz = 1.0 / float(np.diff(walker.steps.time_s[steps]).mean())
-        leg = 0.53 * walker.person.stature_m
+        leg = LEG_OF_STATURE * walker.person.stature_m
         rise, gain = apparent_gain(walker.specific_force_m_s2[part], 200.0, step_hz, length, leg)
         rows.append((length * step_hz, length, length / step_hz, rise, gain))
     return np.array(rows)

@@ -8,10 +8,8 @@ docs/gait.md shows of them; DATA is the folder of recordings, by default RELPOS_
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 import sys
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -22,12 +20,15 @@ import scipy
 
 from gait_statistics import (
     GaitStatistics,
+    about,
     apparent_gain,
     data_folder,
+    events_of,
     gait_statistics,
     print_statistics,
     read_samples,
     recorded_walk,
+    recorded_ways_out,
 )
 from relpos.calibration.steps import LEG_OF_STATURE
 from relpos.simulation.torso import rotation
@@ -42,15 +43,6 @@ from wearers.wearer import make_wearer
 
 LOWER_BACK = "walk_lowerback_20m"
 STAND = Activity("stand", seconds=4.0)
-
-
-def _events(folder: Path) -> list[tuple[float, str, str]]:
-    with (folder / "events.csv").open(encoding="utf-8") as file:
-        return [(float(r["time_s"]), r["event"], r["value"]) for r in csv.DictReader(file)]
-
-
-def _about(folder: Path) -> dict[str, float]:
-    return dict(tomllib.loads((folder / "run.toml").read_text(encoding="utf-8")))
 
 
 # -- step length against excursion ------------------------------------------------------------
@@ -102,30 +94,8 @@ class Excursions:
 
 
 def recorded_excursions(folder: Path) -> Excursions:
-    """Walks of walk_lowerback_20m whose person has a stature; rise on the way out.
-
-    The step length is the nominal 20 m over the number of foot contacts.
-    """
-    person, rows = [], []
-    for run in sorted((folder / LOWER_BACK).iterdir()):
-        about = _about(run)
-        events = _events(run)
-        contacts = np.array([t for t, event, _ in events if event == "foot_contact"])
-        turn = next((t for t, event, _ in events if event == "uturn_start"), math.inf)
-        out = contacts[contacts < turn]
-        if "stature_m" not in about or len(out) < 8:
-            continue
-        time_s, values = read_samples(run)
-        part = (time_s > out[1]) & (time_s < out[-1])
-        cadence = (len(out) - 2) / (out[-1] - out[1])
-        length = 20.0 / len(contacts)
-        stature = float(about["stature_m"])
-        rise, gain = apparent_gain(
-            values[part, :3], 100.0, cadence, length, LEG_OF_STATURE * stature
-        )
-        person.append(int(run.name.split("-")[0]))
-        rows.append((length, cadence, rise, stature, gain))
-    return Excursions(np.array(person), np.array(rows))
+    """Walks of walk_lowerback_20m whose person has a stature; rise on the way out."""
+    return Excursions(*recorded_ways_out(folder / LOWER_BACK))
 
 
 def simulated_excursions(people: int, walks: int, seed: int) -> Excursions:
@@ -287,9 +257,9 @@ def recorded_bouts(folder: Path) -> FloatArray:
     """Rows of `bout` (k, 5) of walk_daily_lowerback's bouts slower than 0.7 m/s."""
     rows = []
     for run in sorted((folder / "walk_daily_lowerback").iterdir()):
-        events = _events(run)
+        events = events_of(run)
         time_s, values = read_samples(run)
-        leg = LEG_OF_STATURE * float(_about(run)["stature_m"])
+        leg = LEG_OF_STATURE * float(about(run)["stature_m"])
         rate_hz = 1.0 / float(np.median(np.diff(time_s)))
         begins = [(t, float(v)) for t, event, v in events if event == "bout_start"]
         ends = [t for t, event, _ in events if event == "bout_end"]

@@ -83,13 +83,7 @@ def sense(truth: WearerTruth, rng: np.random.Generator, calibrated: bool) -> tup
 
     The field is read at 5 Hz and held between.
     """
-    around = Surroundings(
-        rate_hz=200.0,
-        specific_force_m_s2=truth.specific_force_m_s2,
-        angular_rate_rad_s=truth.angular_rate_rad_s,
-        magnetic_field_ut=truth.magnetic_field_ut,
-        pressure_pa=truth.pressure_pa,
-    )
+    around = Surroundings.of(truth)
     errors = magnetic_errors(rng, calibrated)
     chip = mpu9150.Mpu9150(around, inertial_errors(rng, calibrated))
     compass = ak8975.Ak8975(around, errors)
