@@ -81,8 +81,8 @@ def run_bank(
         for e in new:
             located = [n.node for n in e.nodes if n.status is NodeStatus.OK]
             if frame is None and located:
-                frame = regions.Frame() if priors else regions.frame_of([e], true)
-            looks = regions.look(e, true, frame or regions.Frame())
+                frame = tracks.UNMOVED if priors else regions.into_frame_of([e], true)
+            looks = regions.look(e, true, frame or tracks.UNMOVED)
             mean = [math.nan] * 3
             if looks:
                 mean = np.mean([(q.holds, q.area_m2, q.ring) for q in looks], axis=0).tolist()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -158,6 +158,10 @@ class Alignment:
         return np.column_stack((c * x - s * y, s * x + c * y)) + self.to_m
 
 
+UNMOVED = Alignment(1.0, 0.0, np.zeros(2), np.zeros(2))
+"""Everything stays."""
+
+
 def align(estimate_m: Floats, truth_m: Floats) -> Alignment:
     """Fit an estimate on the truth, (n, 2), (n, 2), in the least-squares sense.
 
@@ -191,12 +195,19 @@ def sample(tracks: Sequence[Track], at_s: Floats) -> tuple[Floats, Floats]:
 Row = tuple[float, float, float, float, float]
 
 
-def estimated_tracks(estimates: Iterable[Estimate]) -> dict[int, Track]:
-    """Return the track of every node, whatever its status: a guess is scored as one."""
+def estimated_tracks(
+    estimates: Iterable[Estimate], nowhere: Container[NodeStatus] = ()
+) -> dict[int, Track]:
+    """Return the track of every node: NaN while its status is one of ``nowhere``.
+
+    By default a guess is scored as one.
+    """
     rows: dict[int, list[Row]] = defaultdict(list)
     for estimate in estimates:
         for node in estimate.nodes:
             pose = (node.x_m, node.y_m, node.heading_rad)
+            if node.status in nowhere:
+                pose = (np.nan, np.nan, np.nan)
             rows[node.node].append((estimate.time_s, *pose, _height(node)))
     return {node: Track(*np.array(rows[node]).T) for node in sorted(rows)}
 
@@ -206,15 +217,7 @@ def located_tracks(estimates: Iterable[Estimate]) -> dict[int, Track]:
 
     The mean of what is possible jumps between the possibilities; a line through it says nothing.
     """
-    nowhere = (NodeStatus.AMBIGUOUS, NodeStatus.UNLOCATED)
-    rows: dict[int, list[Row]] = defaultdict(list)
-    for estimate in estimates:
-        for node in estimate.nodes:
-            pose = (node.x_m, node.y_m, node.heading_rad)
-            if node.status in nowhere:
-                pose = (np.nan, np.nan, np.nan)
-            rows[node.node].append((estimate.time_s, *pose, _height(node)))
-    return {node: Track(*np.array(rows[node]).T) for node in sorted(rows)}
+    return estimated_tracks(estimates, (NodeStatus.AMBIGUOUS, NodeStatus.UNLOCATED))
 
 
 def estimated_pairs(estimates: Iterable[Estimate]) -> dict[Pair, PairTrack]:

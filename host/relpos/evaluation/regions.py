@@ -18,7 +18,7 @@ import numpy.typing as npt
 from relpos.evaluation.consistency import Coverage, coverage
 from relpos.fusion.estimator import Alternative, Estimate, NodeStatus, Shape
 from relpos.measurements import Range
-from relpos.tracks import Track
+from relpos.tracks import UNMOVED, Alignment, Track
 
 Floats = npt.NDArray[np.float64]
 
@@ -29,21 +29,6 @@ DRAWS = 1500
 _LEAST_SIGMA_M = 0.01
 """An ellipse's axis or a ring's width below this would make densities of points that no
 measurement can distinguish differ."""
-
-
-@dataclass(frozen=True, slots=True)
-class Frame:
-    """Pose of the estimate's frame in the truth's: its origin (m) and heading (rad)."""
-
-    x_m: float = 0.0
-    y_m: float = 0.0
-    heading_rad: float = 0.0
-
-    def seen(self, x_m: float, y_m: float) -> tuple[float, float]:
-        """Return a position of the truth in the estimate's frame."""
-        dx, dy = x_m - self.x_m, y_m - self.y_m
-        c, s = math.cos(self.heading_rad), math.sin(self.heading_rad)
-        return c * dx + s * dy, c * dy - s * dx
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,10 +53,11 @@ class Ambiguity:
     rings: float
 
 
-def frame_of(estimates: Iterable[Estimate], truth: Mapping[int, Track]) -> Frame | None:
-    """Frame of an estimate without priors: the first located node's true pose at the start.
+def into_frame_of(estimates: Iterable[Estimate], truth: Mapping[int, Track]) -> Alignment | None:
+    """Motion of the truth into the frame of an estimate without priors.
 
-    None where no node was located or that node's truth has no heading.
+    That is the first located node's true pose at the start. None where no node was located or that
+    node's truth has no heading.
     """
     for estimate in estimates:
         for node in estimate.nodes:
@@ -80,16 +66,18 @@ def frame_of(estimates: Iterable[Estimate], truth: Mapping[int, Track]) -> Frame
                 heading = float(np.interp(0.0, track.time_s, np.unwrap(track.heading_rad)))
                 if not math.isfinite(heading):
                     return None
-                return Frame(
-                    float(np.interp(0.0, track.time_s, track.x_m)),
-                    float(np.interp(0.0, track.time_s, track.y_m)),
-                    heading,
+                origin_m = [np.interp(0.0, track.time_s, c) for c in (track.x_m, track.y_m)]
+                return Alignment(
+                    math.cos(heading), -math.sin(heading), np.array(origin_m), np.zeros(2)
                 )
     return None
 
 
-def look(estimate: Estimate, truth: Mapping[int, Track], frame: Frame) -> list[Look]:
-    """Hold the alternatives of every ambiguous node against where it truly is."""
+def look(estimate: Estimate, truth: Mapping[int, Track], moving: Alignment) -> list[Look]:
+    """Hold the alternatives of every ambiguous node against where it truly is.
+
+    ``moving`` takes the truth into the estimate's frame.
+    """
     looks = []
     for node in estimate.nodes:
         own = [a for a in estimate.alternatives if a.node == node.node]
@@ -99,9 +87,8 @@ def look(estimate: Estimate, truth: Mapping[int, Track], frame: Frame) -> list[L
         if not track.time_s[0] <= estimate.time_s <= track.time_s[-1]:
             continue
         region = Region.of(own, SHARE, DRAWS)
-        x_m = float(np.interp(estimate.time_s, track.time_s, track.x_m))
-        y_m = float(np.interp(estimate.time_s, track.time_s, track.y_m))
-        holds = region.contains(*frame.seen(x_m, y_m))
+        there_m = [np.interp(estimate.time_s, track.time_s, c) for c in (track.x_m, track.y_m)]
+        holds = region.contains(*moving(np.array([there_m]))[0])
         looks.append(
             Look(estimate.time_s, node.node, holds, region.area_m2, own[0].shape is Shape.RING)
         )
@@ -122,10 +109,10 @@ def summarise(
     starts_known: bool,
 ) -> Ambiguity | None:
     """Evaluate every epoch; None where nothing was ambiguous or the frame is not known."""
-    frame = Frame() if starts_known else frame_of(estimates, truth)
-    if frame is None:
+    moving = UNMOVED if starts_known else into_frame_of(estimates, truth)
+    if moving is None:
         return None
-    looks = [one for estimate in estimates for one in look(estimate, truth, frame)]
+    looks = [one for estimate in estimates for one in look(estimate, truth, moving)]
     if not looks:
         return None
     nodes = sorted({one.node for one in looks})

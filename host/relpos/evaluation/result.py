@@ -157,12 +157,9 @@ class Result:
         peer from node, with sigmas; ``parameters``: what was learned, in the unit of its name.
         RelposError for another table's name.
         """
-        columns = _columns(table)
-        rows = self._rows(table)
-        arrays = {}
-        for name, column in zip(columns, zip(*rows, strict=True) if rows else (), strict=False):
-            arrays[name] = _array(name, column)
-        return arrays or {name: _array(name, ()) for name in columns}
+        names, rows = _columns(table), self._rows(table)
+        columns = zip(*rows, strict=True) if rows else [()] * len(names)
+        return {name: _array(name, column) for name, column in zip(names, columns, strict=True)}
 
     def frame(self, table: str = "poses") -> Any:
         """Return a table as a pandas DataFrame; a NumPy record array without pandas.

@@ -17,7 +17,7 @@ from relpos.evaluation.metrics import Metrics
 from relpos.evaluation.result import Result, run_estimator
 from relpos.fusion.estimator import NodeStatus
 from relpos.measurements import Prior
-from relpos.tracks import Alignment, Pairs, Tracks, align, sample, whole_seconds
+from relpos.tracks import UNMOVED, Alignment, Pairs, Tracks, align, sample, whole_seconds
 
 if TYPE_CHECKING:
     from relpos.evaluation.bounds import Bound
@@ -213,5 +213,5 @@ def alignment(moving: Tracks, onto: Tracks) -> Alignment:
     p, q = p.reshape(-1, 2), q.reshape(-1, 2)
     both = np.isfinite(p).all(axis=1) & np.isfinite(q).all(axis=1)
     if not both.any():
-        return Alignment(1.0, 0.0, np.zeros(2), np.zeros(2))
+        return UNMOVED
     return align(p[both], q[both])

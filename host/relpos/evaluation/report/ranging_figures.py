@@ -11,7 +11,7 @@ import numpy.typing as npt
 from relpos.evaluation import ranging
 from relpos.evaluation.finite import median
 from relpos.evaluation.report.content import Content
-from relpos.evaluation.report.drawing import Picture, dots, grid
+from relpos.evaluation.report.drawing import MOST_PANELS, Picture, dots, grid
 from relpos.evaluation.style import (
     COLOURS,
     DEAD_RECKONING,
@@ -23,7 +23,6 @@ from relpos.evaluation.style import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-from relpos.evaluation.report.drawing import MOST_PANELS
 
 Floats = npt.NDArray[np.float64]
 

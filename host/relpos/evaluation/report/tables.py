@@ -160,25 +160,20 @@ def iso(content: Content) -> Table | None:
     if content.evaluation is None or not content.evaluation.iso.known:
         return None
     assessed = content.evaluation.iso
-    kinds = [(frame, assessed.frames[frame]) for frame in assessed.frames]
-
-    def row(words: str, cell: object) -> list[str]:
-        assert callable(cell)
-        return [words, *(cell(one) for _, one in kinds)]
-
+    kinds = assessed.frames.values()
     rows = [
-        row("test points", lambda a: value(a.horizontal.count, "", 0)),
-        row("mean error vector", lambda a: _vector(a)),
-        row("absolute mean", lambda a: value(a.absolute_mean_m, "m")),
-        row("variance x, y, z", lambda a: _variances(a)),
-        row("covariance xy", lambda a: value(float(a.covariance_m2[0, 1]), "m²", 3)),
+        ["test points", *(value(a.horizontal.count, "", 0) for a in kinds)],
+        ["mean error vector", *map(_vector, kinds)],
+        ["absolute mean", *(value(a.absolute_mean_m, "m") for a in kinds)],
+        ["variance x, y, z", *map(_variances, kinds)],
+        ["covariance xy", *(value(float(a.covariance_m2[0, 1]), "m²", 3) for a in kinds)],
     ]
     for words, name, letter in (
         ("horizontal", "horizontal", "CE"),
         ("vertical", "vertical", "VE"),
         ("spherical", "spherical", "SE"),
     ):
-        if not any(getattr(one, name).count for _, one in kinds):
+        if not any(getattr(a, name).count for a in kinds):
             continue
         for what, part, unit in (
             (f"mean {words} error", "mean_m", "m"),
@@ -189,7 +184,7 @@ def iso(content: Content) -> Table | None:
         ):
             digits = 3 if unit == "m²" else 2
             rows.append(
-                [what, *(value(getattr(getattr(a, name), part), unit, digits) for _, a in kinds)]
+                [what, *(value(getattr(getattr(a, name), part), unit, digits) for a in kinds)]
             )
     relative, headline = assessed.relative, assessed.headline
     words = FRAME_WORDS[headline] if headline is not None else ""
@@ -205,11 +200,11 @@ def iso(content: Content) -> Table | None:
         f"at 95 %. Coverage: a node was located at {100.0 * assessed.coverage:.1f} % of its test "
         "points. Floor and zone detection need a map and are left out."
     )
-    if not any(one.vertical.count for _, one in kinds):
+    if not any(a.vertical.count for a in kinds):
         note += " No height is known in both estimate and truth: no vertical or spherical error."
     return Table(
         "Metrics of ISO/IEC 18305:2016",
-        ["", *(FRAME_WORDS[frame] for frame, _ in kinds)],
+        ["", *(FRAME_WORDS[frame] for frame in assessed.frames)],
         rows,
         note,
     )
