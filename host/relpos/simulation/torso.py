@@ -42,19 +42,15 @@ def vertical_shape(phase: FloatArray, support: FloatArray) -> FloatArray:
     """
     turn = np.exp(2j * np.pi * phase)
     power = np.ones_like(turn)
-    top = np.zeros_like(phase)
-    out = np.zeros_like(phase)
+    top, out, at_support = np.zeros((3, *phase.shape))
     for n in range(1, 5):
         power = power * turn
         nd = n * support
         coefficient = np.sinc(nd) / (1.0 - nd**2) / n**2
         out -= coefficient * power.real
+        at_support -= coefficient
         if n % 2:
             top += 2.0 * coefficient
-    at_support = np.zeros_like(phase)
-    for n in range(1, 5):
-        nd = n * support
-        at_support -= np.sinc(nd) / (1.0 - nd**2) / n**2
     return np.asarray((out - at_support) / top, dtype=np.float64)
 
 

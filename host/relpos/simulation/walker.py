@@ -263,11 +263,10 @@ def make_plan(
     slow = 1.0 - 0.25 * np.minimum(route._bend * 0.7, 1.0)
     # Mean speed on a lap is what the person chose: the straights make up for the bends.
     straight_speed = person.speed_m_s * float(np.mean(1.0 / slow))
-    times, phases, paths = [-1e3, walk_start_s], [0.0, 0.0], [0.0, 0.0]
-    grounds: list[float] = [0.0, 0.0]
+    time_s, phase, path, ground, wander = walk_start_s, 0.0, 0.0, 0.0, 0.0
+    knots = [(-1e3, phase, path, ground), (time_s, phase, path, ground)]
     flights: list[Flight] = []
     strength: list[float] = []
-    time_s, phase, path, wander = walk_start_s, 0.0, 0.0, 0.0
     since_stand = 0
 
     def next_pause() -> float:
@@ -280,11 +279,8 @@ def make_plan(
         pausing = time_s >= pause_at
         finished = distance_limit_m is not None and path >= distance_limit_m
         if (pausing or finished) and since_stand > 0:
-            times.append(time_s + (1e6 if finished else float(rng.uniform(1.5, 5.0))))
-            phases.append(phase)
-            paths.append(path)
-            grounds.append(grounds[-1])
-            time_s = times[-1]
+            time_s += 1e6 if finished else float(rng.uniform(1.5, 5.0))
+            knots.append((time_s, phase, path, ground))
             pause_at = next_pause()
             since_stand = 0
             continue
@@ -294,10 +290,8 @@ def make_plan(
             flights.append(Flight(time_s, time_s + float(lasts_s.sum()), up))
             for each_s in lasts_s.tolist():
                 time_s, path, phase = time_s + each_s, path + stairs.tread_m, phase + 1.0
-                times.append(time_s)
-                phases.append(phase)
-                paths.append(path)
-                grounds.append(grounds[-1] + up * stairs.storey_m / stairs.risers)
+                ground += up * stairs.storey_m / stairs.risers
+                knots.append((time_s, phase, path, ground))
             strength += [lift] * stairs.risers
             continue
         wander = 0.9 * wander + 0.04 * math.sqrt(1 - 0.9**2) * rng.standard_normal()
@@ -317,22 +311,12 @@ def make_plan(
         path += length
         phase += 1.0
         since_stand += 1
-        times.append(time_s)
-        phases.append(phase)
-        paths.append(path)
-        grounds.append(grounds[-1])
+        knots.append((time_s, phase, path, ground))
         strength.append(
             (1.0 + side * 2.0 * person.asymmetry) * math.exp(0.06 * rng.standard_normal())
         )
-    return Plan(
-        np.array(times),
-        np.array(phases),
-        np.array(paths),
-        np.array(strength),
-        walk_start_s,
-        np.array(grounds),
-        tuple(flights),
-    )
+    times, phases, paths, grounds = np.array(knots).T
+    return Plan(times, phases, paths, np.array(strength), walk_start_s, grounds, tuple(flights))
 
 
 def _climb(
