@@ -25,7 +25,7 @@ import numpy as np
 from relpos import fusion
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.estimator import Bank
-from relpos.fusion.bank.settings import BankSettings
+from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.switching import SwitchingEstimator
 from relpos.measurements import Motion, Range
 from relpos.simulation.paper import SimulatedRun, simulate_paper

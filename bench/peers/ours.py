@@ -15,7 +15,7 @@ class Joint:
 
     def __init__(self, case: Case, seed: int) -> None:
         from relpos.fusion.bank.core import BankCore
-        from relpos.fusion.bank.settings import BankSettings
+        from relpos.fusion.estimator_settings import BankSettings
 
         alone = BankSettings(hypotheses=1, constants=0.0, outliers=0.0, biased=0.0)
         self.core = BankCore(alone, seed)

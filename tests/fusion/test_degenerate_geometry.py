@@ -11,9 +11,9 @@ import pytest
 from relpos import api, fusion
 from relpos.errors import RelposError
 from relpos.fusion.bank.core import BankCore
-from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import unpack
 from relpos.fusion.estimator import NodeStatus
+from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.smoother.graph import build_graph
 from relpos.fusion.smoother.problem import Problem
 from relpos.fusion.smoother.solution import smooth as optimum

@@ -21,8 +21,7 @@ from typing import TYPE_CHECKING
 
 from relpos.errors import RelposError
 from relpos.fusion import kernel_cache, plugins
-from relpos.fusion.bank.settings import BankSettings
-from relpos.fusion.deadreckoning import DeadReckoning, DeadReckoningSettings
+from relpos.fusion.deadreckoning import DeadReckoning
 from relpos.fusion.estimator import (
     Alternative,
     Estimate,
@@ -34,8 +33,13 @@ from relpos.fusion.estimator import (
     Progress,
     Shape,
 )
+from relpos.fusion.estimator_settings import (
+    SETTINGS,
+    BankSettings,
+    DeadReckoningSettings,
+    ParticleSettings,
+)
 from relpos.fusion.linear_algebra import one_thread
-from relpos.fusion.particle.settings import ParticleSettings
 from relpos.fusion.post import posts_of, referring
 from relpos.fusion.settings import SettingInfo, describe, parse
 from relpos.measurements import Heading, Height, Motion, Prior, Range
@@ -43,13 +47,6 @@ from relpos.measurements import Heading, Height, Motion, Prior, Range
 if TYPE_CHECKING:
     # With numba behind it, which who only emulates or records does without.
     from relpos.fusion.models.ranging import Mounting
-
-SETTINGS: Mapping[str, type] = {
-    "bank": BankSettings,
-    "particle": ParticleSettings,
-    "deadreckoning": DeadReckoningSettings,
-}
-"""Estimator name -> its settings."""
 
 ROOMS: Mapping[str, tuple[str, ...]] = {
     "bank": ("bank", "initialisation", "large_teams", "smoother"),

@@ -25,20 +25,12 @@ from relpos.fusion.estimator import (
     pairs_of,
     refuse_unmoved,
 )
+from relpos.fusion.estimator_settings import DeadReckoningSettings
 from relpos.fusion.initial_poses import by_node
-from relpos.fusion.settings import setting
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Timeline
 from relpos.measurements import Height, Measurement, Prior, Range
 
 Floats = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class DeadReckoningSettings:
-    """What ``--set`` may change."""
-
-    max_lag_s: float = setting(5.0, "how long a silent node is waited for", 0.0, 60.0)
-    reorder_s: float = setting(0.5, "how long measurements may be out of order", 0.0, 60.0)
 
 
 @dataclass(slots=True)

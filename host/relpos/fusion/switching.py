@@ -18,14 +18,14 @@ from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
-from relpos.fusion.bank import estimator as bank
-from relpos.fusion.bank.settings import BankSettings
+from relpos.fusion.bank.estimator import Bank
 from relpos.fusion.estimator import Estimate, NodeStatus, unlocated
+from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
-from relpos.fusion.large_teams import estimator as large_teams
+from relpos.fusion.large_teams.estimator import LargeTeam
 from relpos.fusion.models.ranging import Mounting
-from relpos.fusion.rewind import Rewinder
-from relpos.fusion.timeline import Displacement
+from relpos.fusion.rewind import Core, Rewinder
+from relpos.fusion.timeline import Displacement, Timeline
 from relpos.measurements import Measurement, Motion, Prior, Range
 
 LARGE_TEAM = 20
@@ -73,15 +73,26 @@ class SwitchingEstimator:
 
     def _bank(self, priors: Sequence[Prior]) -> Rewinder:
         initialiser = HypothesisInitialiser(seed=self._seed)
-        return bank.make(priors, initialiser, self._settings, self._seed, self._mountings)
+        return self._around(
+            Bank(priors, initialiser, self._settings, self._seed, self._mountings), priors
+        )
 
     def _large_team(self, priors: Sequence[Prior], start_s: float = 0.0) -> Rewinder:
         initialiser = HypothesisInitialiser(seed=self._seed, large_team=True)
+        core = LargeTeam(priors, initialiser, self._settings, self._mountings)
+        return self._around(core, priors, start_s)
+
+    def _around(self, core: Core, priors: Sequence[Prior], start_s: float = 0.0) -> Rewinder:
+        """Return the estimator around a core; motion counts from ``start_s``."""
         s = self._settings
-        settings = large_teams.LargeTeamSettings(
-            s.drift_rad_s, s.scale, s.reorder_s, s.max_lag_s, s.late_s
+        timeline = Timeline(
+            [p.node for p in priors],
+            start_s=start_s,
+            reorder_s=s.reorder_s,
+            max_lag_s=s.max_lag_s,
+            lazy=True,
         )
-        return large_teams.make(priors, initialiser, settings, self._mountings, start_s)
+        return Rewinder(core, timeline, s.late_s)
 
     def _is_large(self) -> bool:
         """Whether the team is a large one of which enough is located to continue from."""
@@ -90,7 +101,7 @@ class SwitchingEstimator:
 
     def process(self, measurement: Measurement) -> list[Estimate]:
         """Take one measurement; return the estimates it completes."""
-        if isinstance(self.estimator.core, large_teams.LargeTeam):
+        if isinstance(self.estimator.core, LargeTeam):
             return self.estimator.process(measurement)
         recent, time_s = self._recent, measurement.time_s
         recent.append(measurement)

@@ -10,8 +10,8 @@ from relpos.errors import RelposError
 from relpos.evaluation import metrics
 from relpos.fusion import settings
 from relpos.fusion.bank.core import BankCore
-from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.estimator import Estimate
+from relpos.fusion.estimator_settings import BankSettings
 from relpos.simulation.paper import simulate_paper
 
 

@@ -11,8 +11,8 @@ import relpos
 from reference import bank as reference
 from relpos.fusion.bank import common_rotation, hypothesis_set
 from relpos.fusion.bank.core import BankCore
-from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import PER_NODE
+from relpos.fusion.estimator_settings import BankSettings
 from relpos.measurements import Prior
 
 Floats = np.ndarray

@@ -10,12 +10,12 @@ from relpos import tracks
 from relpos.evaluation import metrics
 from relpos.fusion.bank import hypothesis_count
 from relpos.fusion.bank.core import BankCore
-from relpos.fusion.bank.estimator import Bank, make
-from relpos.fusion.bank.settings import BankSettings
+from relpos.fusion.bank.estimator import Bank
 from relpos.fusion.bank.storage import PER_NODE, StateIndex
 from relpos.fusion.estimator import Estimate
-from relpos.fusion.initialisation.initialiser import HypothesisInitialiser
+from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.rewind import Rewinder
+from relpos.fusion.switching import SwitchingEstimator
 from relpos.simulation.paper import simulate_paper
 
 GOOD = {"heading_noise_deg": 0.3, "turn_noise": 0.0, "distance_noise_scale": 0.16}
@@ -26,7 +26,7 @@ def _run(
     scenario: str, overrides: dict[str, float], seed: int = 0
 ) -> tuple[list[Estimate], list[int], Rewinder, metrics.Metrics]:
     run = simulate_paper(scenario, seed, overrides)
-    bank = make(run.priors, HypothesisInitialiser(), BankSettings(), seed, {})
+    bank = SwitchingEstimator(run.priors, seed=seed).estimator
     estimates: list[Estimate] = []
     counts = []
     for measurement in run.measurements:
@@ -178,7 +178,7 @@ def test_a_strongly_nonlinear_mixture_has_more_hypotheses_and_few_states_the_usu
 
 def test_people_are_not_lost_to_low_heading_noise() -> None:
     run = simulate_paper("paper-h", 1, {"seconds": 200.0})
-    bank = make(run.priors, HypothesisInitialiser(), BankSettings(steady=1.0), 1, {})
+    bank = SwitchingEstimator(run.priors, BankSettings(steady=1.0), 1).estimator
     estimates = [e for m in run.measurements for e in bank.process(m)] + bank.finish()
     core = _core(bank)
     assert float(core.hypotheses.weights() @ core.hypotheses.models.low_heading_noise) < 0.1

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from relpos.fusion.bank.core import BankCore
-from relpos.fusion.bank.settings import BankSettings
+from relpos.fusion.estimator_settings import BankSettings
 
 SIGMA_M = 0.1
 """Of the ranges; a bank begins with 0.3."""

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from relpos.fusion.bank.hypothesis_set import HypothesisSet
-from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import PER_NODE
+from relpos.fusion.estimator_settings import BankSettings
 
 HYPOTHESES = 12
 """One block and a half, so that some lanes stand for no hypothesis."""

@@ -8,8 +8,8 @@ import pytest
 import relpos
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.hypothesis_models import RangeErrors
-from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import PER_NODE, CommonIndex
+from relpos.fusion.estimator_settings import BankSettings
 
 
 @pytest.fixture(scope="module")

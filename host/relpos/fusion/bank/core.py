@@ -24,8 +24,8 @@ from relpos.fusion.bank.motion_update import Noise
 from relpos.fusion.bank.range_update import RangeModel, Ranges
 from relpos.fusion.bank.relocalisation import OPEN_UPDATES, Relocalisation
 from relpos.fusion.bank.sensors import Sensors
-from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import StateIndex, every_pair
+from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.models.detection import Detection
 from relpos.fusion.models.odometry_faults import JUMP_M, CusumDetector
 from relpos.fusion.models.ranging import Repeats, slant_height

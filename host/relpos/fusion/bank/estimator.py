@@ -22,7 +22,6 @@ from relpos.fusion.bank.detection_update import Attempts
 from relpos.fusion.bank.hypothesis_set import PAIR_BIASES
 from relpos.fusion.bank.mirrored import open_nodes
 from relpos.fusion.bank.reporting import Report
-from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import PER_NODE, CommonIndex, StateIndex
 from relpos.fusion.clocks import Clocks
 from relpos.fusion.estimator import (
@@ -32,6 +31,7 @@ from relpos.fusion.estimator import (
     refuse_unmoved,
     refuse_unranged,
 )
+from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.initial_poses import (
     HEADING_RESOLVED_RAD,
     Initialiser,
@@ -53,7 +53,6 @@ from relpos.fusion.models.ranging import (
 )
 from relpos.fusion.models.unseen_walk import UnseenWalk
 from relpos.fusion.post import posts_of
-from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.fusion.vertical.filter import VerticalFilter
 from relpos.measurements import Heading, Height, Prior, Range, nodes_of
@@ -91,7 +90,7 @@ class _Known(Presence):
 
 @dataclass(slots=True)
 class Bank:
-    """The filter; :func:`make` returns the :class:`~relpos.fusion.estimator.Estimator` around it.
+    """The core of the estimator (:class:`~relpos.fusion.rewind.Core`).
 
     ``initialiser`` seeks the nodes whose initial pose is unknown; once found they join the core.
     """
@@ -567,20 +566,3 @@ class Bank:
                 these.shift_common(entry, -step_s)
         # Otherwise whatever is dated back would come late.
         timeline.reorder_s = self.settings.reorder_s + self.clocks.longest_s
-
-
-def make(
-    priors: Sequence[Prior],
-    initialiser: Initialiser,
-    settings: BankSettings,
-    seed: int,
-    mounting: Mapping[int, Mounting],
-) -> Rewinder:
-    """Return the bank as an estimator that accepts late measurements."""
-    timeline = Timeline(
-        [p.node for p in priors],
-        reorder_s=settings.reorder_s,
-        max_lag_s=settings.max_lag_s,
-        lazy=True,
-    )
-    return Rewinder(Bank(priors, initialiser, settings, seed, mounting), timeline, settings.late_s)

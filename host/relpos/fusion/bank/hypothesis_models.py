@@ -8,7 +8,7 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.bank.settings import BankSettings
+from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.resampling import systematic
 
 Floats = npt.NDArray[np.float64]

@@ -20,9 +20,9 @@ from relpos.fusion.bank.hypothesis_models import (
 )
 from relpos.fusion.bank.lanes import LANES
 from relpos.fusion.bank.mixture import PERTURBED_LOSS
-from relpos.fusion.bank.settings import BankSettings
 from relpos.fusion.bank.storage import COMMON, PER_NODE, CommonIndex, Hypotheses, StateIndex
 from relpos.fusion.bank.variance_components import Draws, VarianceComponents
+from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.models.motion_variances import COMPONENTS
 from relpos.fusion.models.odometry_faults import JUMP_M
 from relpos.fusion.models.ranging import GROWTH_SD_M

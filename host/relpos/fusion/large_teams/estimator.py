@@ -28,6 +28,7 @@ from relpos.fusion.estimator import (
     refuse_unranged,
     unlocated,
 )
+from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.initial_poses import Initialiser, PoseMixture, by_node
 from relpos.fusion.large_teams.kernels import NEAREST_M, RangeModel, Ranges
 from relpos.fusion.large_teams.range_terms import RangeSlopes
@@ -43,46 +44,12 @@ from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_varia
 from relpos.fusion.models.odometry_faults import JUMP_M
 from relpos.fusion.models.ranging import Mounting, OutlierPersistence, RangeCorrelation
 from relpos.fusion.post import posts_of
-from relpos.fusion.rewind import Rewinder
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.fusion.vertical.filter import VerticalFilter
 from relpos.measurements import Height, Prior, Range, nodes_of
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True)
-class LargeTeamSettings:
-    """The bank's settings that a large team uses, too (``fusion/bank/settings.py``)."""
-
-    drift_rad_s: float
-    scale: float
-    reorder_s: float
-    max_lag_s: float
-    late_s: float
-
-
-def make(
-    priors: Sequence[Prior],
-    initialiser: Initialiser,
-    settings: LargeTeamSettings,
-    mountings: Mapping[int, Mounting],
-    start_s: float = 0.0,
-) -> Rewinder:
-    """Return the estimator for a large team; motion counts from ``start_s``.
-
-    ``initialiser`` seeks the nodes without a full prior.
-    """
-    timeline = Timeline(
-        [p.node for p in priors],
-        start_s=start_s,
-        reorder_s=settings.reorder_s,
-        max_lag_s=settings.max_lag_s,
-        lazy=True,
-    )
-    return Rewinder(LargeTeam(priors, initialiser, settings, mountings), timeline, settings.late_s)
-
 
 SIGMA_R_M = 0.3
 """Range sigma to begin with; a few instants of many ranges determine the true one."""
@@ -140,7 +107,7 @@ class LargeTeam:
 
     priors: Sequence[Prior]
     initialiser: Initialiser
-    settings: LargeTeamSettings
+    settings: BankSettings
     mountings: Mapping[int, Mounting]
     filter: NeighbourhoodFilter = field(init=False)
     vertical: VerticalFilter = field(init=False)

@@ -19,12 +19,12 @@ from relpos.fusion.estimator import (
     refuse_unmoved,
     refuse_unranged,
 )
+from relpos.fusion.estimator_settings import ParticleSettings
 from relpos.fusion.initial_poses import POSE, Initialiser, PoseMixture, by_node, sought_node
 from relpos.fusion.models.motion import MotionNoise
 from relpos.fusion.models.ranging import RangeNoise
 from relpos.fusion.particle.kernels import MIN_BANDWIDTH_M
 from relpos.fusion.particle.particle_set import ParticleSet
-from relpos.fusion.particle.settings import ParticleSettings
 from relpos.fusion.resampling import systematic
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.measurements import Height, Measurement, Prior, Range, nodes_of

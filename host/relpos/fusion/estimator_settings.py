@@ -1,4 +1,4 @@
-"""What ``--set`` may change of the estimator ``bank``; apart, so that help needs no kernels."""
+"""What ``--set`` may change of each estimator; apart, so that help needs no kernels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from relpos.fusion.settings import setting
 
 @dataclass(frozen=True, slots=True)
 class BankSettings:
-    """What ``--set`` may change; one set for all scenarios and recordings."""
+    """Of the bank, and of the filter that replaces it in a large team.
+
+    One set for all scenarios and recordings.
+    """
 
     FORMER: ClassVar[Mapping[str, float]] = {
         "outliers_short": 0.1, "jump_m": 3.0, "jump_rad": 0.0, "jumps": 0.0
@@ -34,3 +37,37 @@ class BankSettings:
     max_lag_s: float = setting(2.5, "how long a silent node is waited for", 0.0, 60.0)
     reorder_s: float = setting(0.3, "how long everything waits for what is under way", 0.0, 60.0)
     late_s: float = setting(5.0, "how late measurements may be put in their place", 0.0, 60.0)
+
+
+@dataclass(frozen=True, slots=True)
+class ParticleSettings:
+    """Of the particle filter; the defaults are the paper's."""
+
+    particles: int = setting(500, "particles per node (M)", 10, 1_000_000)
+    alpha: float = setting(
+        0.01, "fraction of dual particles; 0 switches the dual step off", 0.0, 0.9
+    )
+    sigma_r_m: float = setting(2.0, "standard deviation of a range", 1e-3, 100.0)
+    sigma_d: float = setting(0.2, "relative standard deviation of a displacement", 0.0, 10.0)
+    sigma_theta: float = setting(0.1, "relative standard deviation of a turn", 0.0, 10.0)
+    floor_d_m: float = setting(0.0, "least displacement noise, m/sqrt(s)", 0.0, 10.0)
+    floor_theta_rad: float = setting(0.0, "least heading noise, rad/sqrt(s)", 0.0, 10.0)
+    outliers: float = setting(0.0, "fraction of ranges that are outliers", 0.0, 0.9)
+    max_lag_s: float = setting(5.0, "how long a silent node is waited for", 0.0, 60.0)
+    reorder_s: float = setting(0.5, "how long measurements may be out of order", 0.0, 60.0)
+
+
+@dataclass(frozen=True, slots=True)
+class DeadReckoningSettings:
+    """Of dead reckoning alone."""
+
+    max_lag_s: float = setting(5.0, "how long a silent node is waited for", 0.0, 60.0)
+    reorder_s: float = setting(0.5, "how long measurements may be out of order", 0.0, 60.0)
+
+
+SETTINGS: Mapping[str, type] = {
+    "bank": BankSettings,
+    "particle": ParticleSettings,
+    "deadreckoning": DeadReckoningSettings,
+}
+"""Estimator name -> its settings."""
