@@ -6,9 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.initialisation.kernels import (
+    BIAS_VARIANCE_M2,
     OUTLIER_FRACTION,
     OUTLIER_VARIANCE_M2,
     PER_NODE,
+    SCALE_VARIANCE,
     Problem,
 )
 
@@ -36,7 +38,7 @@ def cost(parameters: Floats, problem: Problem) -> float:
     nodes = tracks.poses.shape[1]
     blocks = parameters[:-1].reshape(nodes, -1)
     bias = parameters[-1]
-    total = bias**2 / priors.bias_variance_m2 + (blocks[:, 3] ** 2 / priors.scale_variance).sum()
+    total = bias**2 / BIAS_VARIANCE_M2 + (blocks[:, 3] ** 2 / SCALE_VARIANCE).sum()
     total += (blocks[:, PER_NODE:].T ** 2 / tracks.turn_variance).sum()
 
     def pose(node: int, time: int) -> tuple[complex, float]:

@@ -24,6 +24,7 @@ from relpos.fusion.timeline import Advance
 from relpos.measurements import Prior, Range
 
 Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.intp]
 
 POSE = 3
 """Numbers of a pose: x, y (m), heading (rad)."""
@@ -51,23 +52,44 @@ class PoseMixture:
     best: int = 0
     """The hypothesis with the most weight near it."""
 
+    def of(self, index: int) -> tuple[Floats, Floats]:
+        """Return the poses (K, 3) of ``nodes[index]``, and their covariances (K, 3, 3)."""
+        own = slice(POSE * index, POSE * (index + 1))
+        return self.poses[:, index], self.covariances[:, own, own]
+
+    def part(
+        self, nodes: Sequence[int], which: npt.NDArray[np.bool_] | slice = slice(None)
+    ) -> PoseMixture:
+        """Return the hypotheses ``which`` about some nodes (indices), with their weights here."""
+        columns = pose_columns(nodes)
+        return PoseMixture(
+            tuple(self.nodes[i] for i in nodes),
+            self.weights[which],
+            self.poses[which][:, nodes],
+            self.covariances[which][:, columns][:, :, columns],
+            self.scales[nodes],
+        )
+
     def moments(self, index: int) -> tuple[Floats, Floats]:
         """Return mean (3,) and covariance (3, 3) of the pose of ``nodes[index]``."""
-        own = slice(POSE * index, POSE * (index + 1))
-        off = self.poses[:, index] - self.poses[self.best, index]
+        poses, covariances = self.of(index)
+        off = poses - poses[self.best]
         off[:, 2] = np.remainder(off[:, 2] + math.pi, 2.0 * math.pi) - math.pi
         mean = self.weights @ off
         off -= mean
-        covariance = np.einsum("k,kab->ab", self.weights, self.covariances[:, own, own])
+        covariance = np.einsum("k,kab->ab", self.weights, covariances)
         covariance += np.einsum("k,ka,kb->ab", self.weights, off, off)
-        return self.poses[self.best, index] + mean, covariance
+        return poses[self.best] + mean, covariance
 
     def heading_sigma_rad(self, index: int) -> float:
         """Return the standard deviation of the heading of ``nodes[index]``."""
-        own = slice(POSE * index, POSE * (index + 1))
-        return belief_of(
-            self.weights, self.poses[:, index], self.covariances[:, own, own]
-        ).sigma_heading_rad
+        return belief_of(self.weights, *self.of(index)).sigma_heading_rad
+
+
+def pose_columns(nodes: Sequence[int]) -> Indices:
+    """Return the columns of a covariance of poses that belong to ``nodes`` (indices)."""
+    columns: Indices = np.array(nodes, dtype=np.intp)[:, None] * POSE + np.arange(POSE)
+    return columns.ravel()
 
 
 class Initialiser(Protocol):
@@ -125,10 +147,7 @@ def sought_node(initialiser: Initialiser, node: int, presence: Presence) -> Node
     if mixture is None or node not in mixture.nodes:
         return unlocated(node, presence.vertical)
     n = mixture.nodes.index(node)
-    own = slice(POSE * n, POSE * (n + 1))
-    belief = belief_of(
-        mixture.weights, mixture.poses[:, n], mixture.covariances[:, own, own], mixture.best
-    )
+    belief = belief_of(mixture.weights, *mixture.of(n), mixture.best)
     status = presence.status
     if status is NodeStatus.OK and node not in initialiser.resolved:
         status = NodeStatus.AMBIGUOUS

@@ -125,7 +125,7 @@ def random_problem(seed: int) -> tuple[Problem, Floats]:
     tracks.knots[0] = 0.0
     priors = Priors(
         rng.integers(0, times, nodes).astype(np.intp), rng.normal(size=(nodes, 3)),
-        rng.uniform(0.1, 4.0, (nodes, 3)), np.full(nodes, 0.04), 0.09,
+        rng.uniform(0.1, 4.0, (nodes, 3)),
     )  # fmt: skip
     priors.precision[1] = 0.0
     ends = np.array([(0, 1), (0, 2), (1, 2), (1, -1), (-1, 2)], dtype=np.intp)
@@ -363,7 +363,7 @@ def test_a_copy_of_a_search_goes_on_as_the_search_does() -> None:
                 case Motion(time_s, node, dx, dy, turn):
                     one.advance(Advance(time_s, node, 1.0, dx, dy, turn))
                 case Range():
-                    one.update(measurement.time_s, [measurement], {})
+                    one.log.update(measurement.time_s, [measurement], {})
                     one.solve()
 
     for m in walk.measurements:

@@ -299,7 +299,7 @@ class Report:
         spread = np.zeros((len(mixture.weights), len(nodes), 2, 2))
         poses[:, :sought] = mixture.poses
         for i in range(sought):
-            spread[:, i] = mixture.covariances[:, 3 * i : 3 * i + 2, 3 * i : 3 * i + 2]
+            spread[:, i] = mixture.of(i)[1][:, :2, :2]
         for i, node in enumerate(located, sought):
             at = PER_NODE * self.row[node]
             poses[:, i] = self.mean[at : at + 3]

@@ -9,11 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.initial_poses import POSE
+from relpos.fusion.initial_poses import POSE, pose_columns
 from relpos.fusion.initialisation.kernels import PER_NODE, Fits, Problem, fit
 
 Floats = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.intp]
 
 _TWO_PI = 2.0 * np.pi
 
@@ -178,9 +177,3 @@ def fitted(parameters: Floats, iterations: int, problem: Problem) -> Fits:
     fits = Fits(parameters, np.zeros(count), np.zeros(count), np.zeros((count, size, size)))
     fit(fits, iterations, problem)
     return fits
-
-
-def pose_columns(nodes: Sequence[int]) -> Indices:
-    """Return the columns of a covariance of poses that belong to ``nodes`` (indices)."""
-    columns: Indices = np.array(nodes, dtype=np.intp)[:, None] * POSE + np.arange(POSE)
-    return columns.ravel()

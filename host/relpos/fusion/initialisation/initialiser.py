@@ -137,7 +137,7 @@ class HypothesisInitialiser:
             if not tied:
                 break
             self._seek(min(tied), time_s)
-        self.search.update(time_s, ranges, located, heights)
+        self.search.log.update(time_s, ranges, located, heights)
 
     def _free(self) -> bool:
         """Whether the search has room for another node."""

@@ -34,6 +34,9 @@ Bools = npt.NDArray[np.bool_]
 PER_NODE = 4
 """Parameters of a node before its turns: x, y, heading, log scale."""
 
+SCALE_VARIANCE, BIAS_VARIANCE_M2 = 0.2**2, 0.3**2
+"""Priors of the log scales and of the range bias, of sensors that have just been met."""
+
 OUTLIER_FRACTION = 0.05
 OUTLIER_VARIANCE_M2 = 9.0
 """Outlier mixture: 5 % with 3 m, as everywhere."""
@@ -69,7 +72,7 @@ class Tracks(NamedTuple):
 
 
 class Priors(NamedTuple):
-    """What is known of the nodes' poses at one time each, of their scales and of the bias."""
+    """What is known of the nodes' poses at one time each."""
 
     at: Indices
     """(N,), indices of times."""
@@ -77,9 +80,6 @@ class Priors(NamedTuple):
     """(N, 3)."""
     precision: Floats
     """(N, 3), zero where nothing is known."""
-    scale_variance: Floats
-    """(N,), of the log scales."""
-    bias_variance_m2: float
 
 
 class Ranges(NamedTuple):
@@ -185,14 +185,14 @@ def _add_parameter_priors(parameters: Floats, problem: Problem, system: System) 
             cost[0] += precision * turn * turn
             hessian[base + PER_NODE + k, base + PER_NODE + k] += precision
             gradient[base + PER_NODE + k] -= precision * turn
-        precision = 1.0 / problem.priors.scale_variance[i]
+        precision = 1.0 / SCALE_VARIANCE
         cost[0] += precision * parameters[base + 3] ** 2
         hessian[base + 3, base + 3] += precision
         gradient[base + 3] -= precision * parameters[base + 3]
-    bias, variance = parameters[parameters.size - 1], problem.priors.bias_variance_m2
-    cost[0] += bias * bias / variance
-    hessian[parameters.size - 1, parameters.size - 1] += 1.0 / variance
-    gradient[parameters.size - 1] -= bias / variance
+    bias = parameters[parameters.size - 1]
+    cost[0] += bias * bias / BIAS_VARIANCE_M2
+    hessian[parameters.size - 1, parameters.size - 1] += 1.0 / BIAS_VARIANCE_M2
+    gradient[parameters.size - 1] -= bias / BIAS_VARIANCE_M2
 
 
 @inner

@@ -24,26 +24,20 @@ from relpos.measurements import Range
 
 Floats = npt.NDArray[np.float64]
 
+RANGE_SIGMA_M = 0.25
+"""The range's own error, the rest of the pair's bias, and a margin for errors that repeat from
+range to range (evidence is the product of them all): of sensors that have just been met."""
 
-@dataclass(frozen=True, slots=True)
-class SensorModel:
-    """Errors of sensors that have just been met, and how long their data count."""
+_PATH_VARIANCE_M = 0.005
+"""Position variance (m^2) per metre of path."""
+_TURN_RATE_RAD, _TURN_FRACTION = 0.0175, 0.1
+"""Heading error per root second, and per root of a turn's square."""
 
-    range_sigma_m: float = 0.25
-    """The range's own error, the rest of the pair's bias, and a margin for errors that repeat
-    from range to range (evidence is the product of them all)."""
-    bias_m: float = 0.3
-    scale: float = 0.2
-    path_variance_m: float = 0.005
-    """Position variance (m^2) per metre of path."""
-    turn_rate_rad: float = 0.0175
-    """Heading error per root second."""
-    turn_fraction: float = 0.1
-    """Heading error per root of a turn's square."""
-    cell_rad: float = 0.4
-    """Where the data leave a direction open, a hypothesis stands for a cell of this size."""
-    memory_s: float = 240.0
+_CELL_RAD = 0.4
+"""Where the data leave a direction open, a hypothesis stands for a cell of this size."""
 
+_MEMORY_S = 240.0
+"""So long data count."""
 
 _MOST_KNOTS = 5
 _KNOT_RAD = 0.09
@@ -125,7 +119,6 @@ class _Prior(NamedTuple):
 class MeasurementLog:
     """Tracks and ranges of ``nodes``; ``changed`` is set by whatever a fit has to use."""
 
-    model: SensorModel
     counters: Counter[str]
     nodes: list[int] = field(default_factory=list)
     changed: bool = False
@@ -163,7 +156,7 @@ class MeasurementLog:
         if track is None:
             return None
         if faulty:
-            track.path_m += _FAULT_M**2 / self.model.path_variance_m
+            track.path_m += _FAULT_M**2 / _PATH_VARIANCE_M
             step = step._replace(dx_m=0.0, dy_m=0.0)
         length_m = math.hypot(step.dx_m, step.dy_m)
         c, s = math.cos(track.pose[2]), math.sin(track.pose[2])
@@ -174,8 +167,8 @@ class MeasurementLog:
         if length_m == 0.0 and step.dtheta_rad == 0.0:
             return None
         fraction = max(step.fraction, 1e-9)
-        variance = self.model.turn_rate_rad**2 * step.duration_s
-        variance += (self.model.turn_fraction * step.dtheta_rad) ** 2 / fraction
+        variance = _TURN_RATE_RAD**2 * step.duration_s
+        variance += (_TURN_FRACTION * step.dtheta_rad) ** 2 / fraction
         if step.sigma_theta_rad is not None:
             variance = max(variance, step.sigma_theta_rad**2)
         # A node that hardly moves does not lose its heading as one that walks does.
@@ -266,7 +259,7 @@ class MeasurementLog:
                     height_m**2, extra_m2,
                 )
             )  # fmt: skip
-        old = sum(self._times[r.time] < time_s - self.model.memory_s for r in self._ranges)
+        old = sum(self._times[r.time] < time_s - _MEMORY_S for r in self._ranges)
         if old > 20:
             self._ranges = self._ranges[old:]
             self.counters["start_ranges_forgotten"] += old
@@ -365,7 +358,7 @@ class MeasurementLog:
                 r.places[end] = problem.tracks.place(best[i], i, r.time)
                 # Most of a place's error is common to all places of a track, and to all tracks.
                 path_m = self._tracks[node].path_m - r.path_m[end]
-                r.extra_m2 += self.model.path_variance_m * path_m
+                r.extra_m2 += _PATH_VARIANCE_M * path_m
                 r.extra_m2 += min(0.5 * float(variances_m2[i]), _RELEASED_SIGMA_M**2)
             if r.node in nodes and r.peer not in nodes:
                 # The sought end comes first.
@@ -383,15 +376,12 @@ class MeasurementLog:
 
     def problem(self, active: frozenset[int], turns: int, range_sigma_m: float) -> Problem:
         """Lay out tracks, priors and ranges of the ``active`` nodes, ``turns`` turns a node."""
-        nodes, model, length = len(self.nodes), self.model, len(self._times)
+        nodes, length = len(self.nodes), len(self._times)
         tracks = Tracks(
             np.zeros((length, nodes, 3)), np.zeros((length, nodes), dtype=np.intp),
             np.zeros((turns + 1, nodes, 2)), np.ones((turns, nodes)),
         )  # fmt: skip
-        priors = Priors(
-            np.zeros(nodes, dtype=np.intp), np.zeros((nodes, 3)), np.zeros((nodes, 3)),
-            np.full(nodes, model.scale**2), model.bias_m**2,
-        )  # fmt: skip
+        priors = Priors(np.zeros(nodes, dtype=np.intp), np.zeros((nodes, 3)), np.zeros((nodes, 3)))
         paths_m = np.zeros((length, nodes))
         for i, node in enumerate(self.nodes):
             track = self._tracks[node]
@@ -412,11 +402,11 @@ class MeasurementLog:
             priors.precision[i] = precision if node in active else 1e-6
             if node in active and precision[0] > 0.0:
                 # The error of the path since then is not in the track's parameters.
-                grown = model.path_variance_m * paths_m[priors.at[i], i]
+                grown = _PATH_VARIANCE_M * paths_m[priors.at[i], i]
                 priors.precision[i, :2] = 1.0 / (1.0 / precision[:2] + grown)
         ranges = self._range_arrays(active, paths_m, range_sigma_m)
         # A cell is as long as an arc of the largest circle that the node is on stays straight.
-        cell = np.full((nodes, POSE), model.cell_rad)
+        cell = np.full((nodes, POSE), _CELL_RAD)
         for i in range(nodes):
             own = ranges.range_m[(ranges.ends == i).any(axis=1)]
             cell[i, :2] *= max(1.0, float(own.max()) if own.size else 0.0)
@@ -442,7 +432,7 @@ class MeasurementLog:
         variance += np.array([r.extra_m2 for r in used])
         for end in range(2):
             sought = ends[:, end] >= 0
-            variance[sought] += self.model.path_variance_m * paths_m[at[sought], ends[sought, end]]
+            variance[sought] += _PATH_VARIANCE_M * paths_m[at[sought], ends[sought, end]]
         return Ranges(
             ends, at, range_m, variance, np.array([r.height2_m2 for r in used]),
             range_m < 1.5 * range_sigma_m,

@@ -15,25 +15,19 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.initial_poses import HEADING_RESOLVED_RAD, POSE, UNKNOWN, PoseMixture
-from relpos.fusion.initialisation.hypotheses import (
-    Hypotheses,
-    fitted,
-    log_evidence,
-    pose_columns,
-)
+from relpos.fusion.initialisation.hypotheses import Hypotheses, fitted, log_evidence
 from relpos.fusion.initialisation.kernels import Problem
-from relpos.fusion.initialisation.measurement_log import MeasurementLog, SensorModel
+from relpos.fusion.initialisation.measurement_log import RANGE_SIGMA_M, MeasurementLog
 from relpos.fusion.initialisation.proposals import Proposals
 from relpos.fusion.modes import belief_of, best_mode, relative_poses
 from relpos.fusion.timeline import Advance
-from relpos.measurements import Range
 
 Floats = npt.NDArray[np.float64]
 
@@ -72,20 +66,19 @@ in 98.4, 96.6 and 94.2 % of the epochs with 1, 0.6 and 0.4; with two robots in 8
 
 @dataclass(slots=True)
 class HypothesisSearch:
-    """Call ``advance`` and ``update``, then ``solve`` at an epoch, and read ``mixture``.
+    """Call ``advance`` and ``log.update``, then ``solve`` at an epoch, and read ``mixture``.
 
     Located nodes are not sought: a range to one brings its place and the variance of that.
     """
 
     seed: int = 0
     counters: Counter[str] = field(default_factory=Counter)
-    model: SensorModel = field(default_factory=SensorModel)
     frame: int | None = None
     """The node whose initial pose is the frame, while no other is located."""
     log: MeasurementLog = field(init=False)
     active: frozenset[int] = frozenset()
     """Nodes that ranges, or a prior, tie to the others."""
-    range_sigma_m: float = field(init=False)
+    range_sigma_m: float = RANGE_SIGMA_M
     _rng: np.random.Generator = field(init=False)
     _hypotheses: Hypotheses = field(default_factory=Hypotheses)
     _fitted_poses: dict[int, Floats] = field(default_factory=dict)
@@ -94,8 +87,7 @@ class HypothesisSearch:
 
     def __post_init__(self) -> None:
         self._rng = np.random.default_rng(self.seed)
-        self.range_sigma_m = self.model.range_sigma_m
-        self.log = MeasurementLog(self.model, self.counters)
+        self.log = MeasurementLog(self.counters)
 
     @property
     def nodes(self) -> list[int]:
@@ -124,16 +116,6 @@ class HypothesisSearch:
             # Turns count back from the newest, knots from the oldest.
             last = change.knots - 1
             self._hypotheses.merge_turns(node, last - change.merged - 1, last)
-
-    def update(
-        self,
-        time_s: float,
-        ranges: Sequence[Range],
-        located: Mapping[int, tuple[float, float, float]],
-        heights: Mapping[int, float] | None = None,
-    ) -> None:
-        """Use the ranges of an instant (:meth:`MeasurementLog.update`)."""
-        self.log.update(time_s, ranges, located, heights)
 
     # -- fits ----------------------------------------------------------------------------------
 
@@ -232,17 +214,12 @@ class HypothesisSearch:
         active = [i for i, n in enumerate(self.nodes) if n in self.active]
         if not active or not len(self._hypotheses):
             return None
-        whole, columns = self.mixture, pose_columns(active)
-        places = np.stack(
-            [whole.covariances[:, 3 * i : 3 * i + 2, 3 * i : 3 * i + 2] for i in active], axis=1
-        )
-        return PoseMixture(
-            tuple(self.nodes[i] for i in active),
-            whole.weights,
-            whole.poses[:, active],
-            _REPORTED_VARIANCE * whole.covariances[:, columns][:, :, columns],
-            whole.scales[active],
-            best_mode(whole.weights, whole.poses[:, active], places),
+        part = self.mixture.part(active)
+        places = np.stack([part.of(i)[1][:, :2, :2] for i in range(len(active))], axis=1)
+        return replace(
+            part,
+            covariances=_REPORTED_VARIANCE * part.covariances,
+            best=best_mode(part.weights, part.poses, places),
         )
 
     def resolved(self, least: float) -> list[int]:
@@ -258,8 +235,7 @@ class HypothesisSearch:
             if node not in self.active or node == self.frame:
                 continue
             if self.frame is None:
-                own = slice(POSE * i, POSE * (i + 1))
-                poses, covariances = mixture.poses[:, i], mixture.covariances[:, own, own]
+                poses, covariances = mixture.of(i)
                 distance_m = 0.0
             else:
                 first = self.nodes.index(self.frame)
@@ -305,15 +281,10 @@ class HypothesisSearch:
         hypotheses = self._hypotheses
         leaving = [self.nodes.index(n) for n in nodes]
         staying = [i for i in range(len(self.nodes)) if i not in leaving]
-        agree, columns, mixture = hypotheses.agreeing(leaving), pose_columns(leaving), self.mixture
-        released = PoseMixture(
-            tuple(nodes),
-            mixture.weights[agree] / mixture.weights[agree].sum(),
-            mixture.poses[agree][:, leaving],
-            mixture.covariances[agree][:, columns][:, :, columns],
-            mixture.scales[leaving],
-        )
-        variance = mixture.covariances[0].diagonal().reshape(-1, POSE)
+        agree = hypotheses.agreeing(leaving)
+        released = self.mixture.part(leaving, agree)
+        released = replace(released, weights=released.weights / released.weights.sum())
+        variance = hypotheses.fits.covariances[0].diagonal().reshape(-1, POSE)
         best = hypotheses.by_node[0]
         self.log.remove(nodes, best, variance[:, 0] + variance[:, 1], hypotheses.turns)
         hypotheses.select(agree, staying)
