@@ -10,13 +10,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import combinations
 from math import atan2, hypot, inf, pi, sqrt
 from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
 
 from relpos.errors import RelposError
 from relpos.fusion.models.motion import unseen_variance
 from relpos.measurements import Measurement
 from relpos.said import Said
+
+Floats = npt.NDArray[np.float64]
 
 Progress = Callable[[str, int, int], None]
 """Called with the stage of a long task, and how many of how many parts of it are done.
@@ -379,22 +385,34 @@ def pairs_of(nodes: Sequence[NodeEstimate]) -> tuple[PairEstimate, ...]:
     unlocated nodes are left out.
     """
     located = [n for n in nodes if n.status is not NodeStatus.UNLOCATED]
-    return tuple(_pair(a, b) for k, a in enumerate(located) for b in located[k + 1 :])
+    covariance = np.zeros((len(located), 2, len(located), 2))
+    for k, n in enumerate(located):
+        covariance[k, 0, k] = n.variance_x_m2, n.covariance_xy_m2
+        covariance[k, 1, k] = n.covariance_xy_m2, n.variance_y_m2
+    places_m = np.array([(n.x_m, n.y_m) for n in located]).reshape(-1, 2)
+    return named_pairs([n.node for n in located], pair_moments(places_m, covariance))
 
 
-def _pair(node: NodeEstimate, peer: NodeEstimate) -> PairEstimate:
-    dx, dy = peer.x_m - node.x_m, peer.y_m - node.y_m
-    distance = hypot(dx, dy)
-    xx = node.variance_x_m2 + peer.variance_x_m2
-    yy = node.variance_y_m2 + peer.variance_y_m2
-    xy = node.covariance_xy_m2 + peer.covariance_xy_m2
-    if distance > 0.0:
-        c, s = dx / distance, dy / distance
-        along = c * c * xx + 2.0 * c * s * xy + s * s * yy
-        across = s * s * xx - 2.0 * c * s * xy + c * c * yy
-        bearing_sd = min(sqrt(max(across, 0.0)) / distance, ANY_ANGLE_RAD)
-    else:
-        along, bearing_sd = 0.5 * (xx + yy), ANY_ANGLE_RAD
-    return PairEstimate(
-        node.node, peer.node, distance, sqrt(max(along, 0.0)), atan2(dy, dx), bearing_sd
-    )
+def pair_moments(places_m: Floats, covariance: Floats) -> Floats:
+    """Return (P, 4) of every two of N places (N, 2), by their joint covariance (N, 2, N, 2).
+
+    Distance, its standard deviation (m), bearing and its deviation (rad), to first order; of two on
+    one spot any bearing is as likely.
+    """
+    i, j = np.triu_indices(len(places_m), 1)
+    off = places_m[j] - places_m[i]
+    spread = covariance[i, :, i] + covariance[j, :, j] - covariance[i, :, j] - covariance[j, :, i]
+    distance, bearing = np.hypot(off[:, 0], off[:, 1]), np.arctan2(off[:, 1], off[:, 0])
+    apart = distance > 0.0
+    unit = off / np.where(apart, distance, 1.0)[:, None]
+    axes = np.stack([unit, unit[:, ::-1] * (-1.0, 1.0)])
+    along, across = np.sqrt(np.maximum(np.einsum("dpa,pab,dpb->dp", axes, spread, axes), 0.0))
+    along = np.where(apart, along, np.sqrt(0.5 * np.trace(spread, axis1=1, axis2=2)))
+    sideways = np.where(apart, across / np.where(apart, distance, 1.0), ANY_ANGLE_RAD)
+    return np.column_stack([distance, along, bearing, np.minimum(sideways, ANY_ANGLE_RAD)])
+
+
+def named_pairs(nodes: Sequence[int], moments: Floats) -> tuple[PairEstimate, ...]:
+    """Return the pairs of every two of ``nodes`` by their :func:`pair_moments`."""
+    every = zip(combinations(nodes, 2), moments.tolist(), strict=True)
+    return tuple(PairEstimate(*two, *own) for two, own in every)

@@ -24,9 +24,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.bank.mixture import difference
 from relpos.fusion.bank.storage import PER_NODE
-from relpos.fusion.compiled import compiled
+from relpos.fusion.compiled import compiled, inner
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -96,6 +95,18 @@ def most(usual: int, size: int) -> int:
     return max(min(MORE * usual, int(WORK / size**3)), usual)
 
 
+@inner
+def _difference(
+    mean: Floats, covariance: Floats, a: int, b: int
+) -> tuple[float, float, float, float, float]:
+    """Return where user ``b`` is from ``a``, east and north, and its covariance xx, yy, xy."""
+    i, j = PER_NODE * a, PER_NODE * b
+    xx = covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j]
+    yy = covariance[i + 1, i + 1] + covariance[j + 1, j + 1] - 2.0 * covariance[i + 1, j + 1]
+    xy = covariance[i, i + 1] + covariance[j, j + 1] - (covariance[i, j + 1] + covariance[i + 1, j])
+    return mean[j] - mean[i], mean[j + 1] - mean[i + 1], xx, yy, xy
+
+
 @compiled
 def nonlinearity_index(
     mean: Floats, covariance: Floats, sigma_range_m: float, sigma_metre_m: Floats
@@ -109,7 +120,7 @@ def nonlinearity_index(
     nearest = np.full(nodes, np.inf)
     for a in range(nodes):
         for b in range(a + 1, nodes):
-            ux, uy, xx, yy, xy = difference(mean, covariance, a, b)
+            ux, uy, xx, yy, xy = _difference(mean, covariance, a, b)
             distance2 = max(ux * ux + uy * uy, 1e-6)
             across = (uy * uy * xx - 2.0 * ux * uy * xy + ux * ux * yy) / distance2
             greatest = max(greatest, max(across, 0.0) / (2.0 * math.sqrt(distance2)))

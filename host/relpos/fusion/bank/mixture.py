@@ -1,4 +1,4 @@
-"""What all hypotheses together say: weights, moments, ranges and pairs of the mixture."""
+"""What all hypotheses together say: weights, moments and ranges of the mixture."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import numpy.typing as npt
 from relpos.fusion.bank import lanes
 from relpos.fusion.bank.lanes import LANES, fill, greater, load, store
 from relpos.fusion.bank.range_update import predict_range
-from relpos.fusion.bank.storage import PER_NODE, POSE, Block, row_place
-from relpos.fusion.compiled import compiled, inner
-from relpos.fusion.estimator import ANY_ANGLE_RAD
+from relpos.fusion.bank.storage import POSE, Block, row_place
+from relpos.fusion.compiled import compiled
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -136,37 +135,3 @@ def moments(
             variance = variance + load(weight, b) * (own + away * away)
         cov[of[i], of[i]] = lanes.total(variance)
     return mean, cov
-
-
-@inner
-def difference(
-    mean: Floats, covariance: Floats, a: int, b: int
-) -> tuple[float, float, float, float, float]:
-    """Return where user ``b`` is from ``a``, east and north, and its covariance xx, yy, xy."""
-    i, j = PER_NODE * a, PER_NODE * b
-    xx = covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j]
-    yy = covariance[i + 1, i + 1] + covariance[j + 1, j + 1] - 2.0 * covariance[i + 1, j + 1]
-    xy = covariance[i, i + 1] + covariance[j, j + 1] - (covariance[i, j + 1] + covariance[i + 1, j])
-    return mean[j] - mean[i], mean[j + 1] - mean[i + 1], xx, yy, xy
-
-
-@compiled
-def bearings(mean: Floats, covariance: Floats, rows: Indices) -> Floats:
-    """Give (P, 2) of every two of the users ``rows`` (N,), by the mixture's moments (D,), (D, D).
-
-    Bearing and its standard deviation (rad), to first order; of two on one spot any is as likely.
-    """
-    several = rows.shape[0]
-    result = np.empty((several * (several - 1) // 2, 2))
-    n = 0
-    for a in range(several):
-        for b in range(a + 1, several):
-            east, north, xx, yy, xy = difference(mean, covariance, rows[a], rows[b])
-            square = east * east + north * north
-            sideways = ANY_ANGLE_RAD
-            if square > 0.0:
-                across = north * north * xx - 2.0 * east * north * xy + east * east * yy
-                sideways = min(math.sqrt(max(across, 0.0)) / square, ANY_ANGLE_RAD)
-            result[n, 0], result[n, 1] = math.atan2(north, east), sideways
-            n += 1
-    return result

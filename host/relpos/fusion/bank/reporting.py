@@ -16,7 +16,6 @@ from statistics import median
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.bank import mixture as mixture_kernels
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.hypothesis_models import RangeErrors
 from relpos.fusion.bank.mirrored import VAGUE_RAD
@@ -32,6 +31,8 @@ from relpos.fusion.estimator import (
     PairEstimate,
     Parameter,
     Presence,
+    named_pairs,
+    pair_moments,
 )
 from relpos.fusion.initial_poses import Initialiser, PoseMixture, sought_node
 from relpos.fusion.models.detection import Detection
@@ -234,16 +235,17 @@ class Report:
     def _pairs(self) -> list[PairEstimate]:
         nodes = sorted(self.row)
         rows = np.array([self.row[node] for node in nodes], dtype=np.int64)
-        bearings = mixture_kernels.bearings(self.mean, self.world_covariance, rows)
-        i, k = every_pair(len(rows))
+        places = PER_NODE * rows[:, None] + np.arange(2)
+        covariance = self.world_covariance[places[:, :, None, None], places]
+        moments = pair_moments(self.mean[places], covariance)
+        i, k = every_pair(len(nodes))
         distances, sigmas = self.distances
         own_m2 = np.array([self.presence[node].uneven_m2 for node in nodes])
         scale_m = self._range_scale_sd() * distances
         sigmas = np.sqrt(sigmas**2 + own_m2[i] + own_m2[k] + scale_m**2)
         # Two on one spot, known exactly, are 0 m apart, whatever was added to divide by.
-        figures = np.column_stack([np.round(distances, 9), np.round(sigmas, 9), bearings]).tolist()
-        every = combinations(nodes, 2)
-        return [PairEstimate(*two, *own) for two, own in zip(every, figures, strict=True)]
+        moments[:, 0], moments[:, 1] = np.round(distances, 9), np.round(sigmas, 9)
+        return list(named_pairs(nodes, moments))
 
     def _range_scale_sd(self) -> float:
         """Return the deviation of what ranges' biases share in proportion to distance."""

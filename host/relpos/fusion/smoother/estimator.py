@@ -26,6 +26,8 @@ from relpos.fusion.estimator import (
     NodeStatus,
     PairEstimate,
     Parameter,
+    named_pairs,
+    pair_moments,
 )
 from relpos.fusion.models.ranging import RANGE_SCALE_SD
 from relpos.fusion.models.unseen_walk import TURNS_RAD2_S, WALKING_M_S
@@ -289,28 +291,9 @@ def _facing(graph: Graph, poses: Floats) -> dict[tuple[int, int], tuple[float, f
 def _pairs(
     names: Sequence[int], poses: Floats, blocks: Floats, shown: Sequence[int], scale_sd: float
 ) -> tuple[PairEstimate, ...]:
-    pairs = []
-    for k, i in enumerate(shown):
-        for j in shown[k + 1 :]:
-            dx, dy = float(poses[j, 0] - poses[i, 0]), float(poses[j, 1] - poses[i, 1])
-            p = blocks[i, :2, i, :2] + blocks[j, :2, j, :2]
-            p = p - blocks[i, :2, j, :2] - blocks[j, :2, i, :2]
-            distance = math.hypot(dx, dy)
-            trace = float(p[0, 0] + p[1, 1])
-            if distance > 0.0:
-                u = np.array([dx, dy]) / distance
-                along = float(u @ p @ u)
-                bearing = min(math.sqrt(max(trace - along, 0.0)) / distance, ANY_ANGLE_RAD)
-            else:
-                along, bearing = 0.5 * trace, ANY_ANGLE_RAD
-            pairs.append(
-                PairEstimate(
-                    names[i], names[j], distance,
-                    math.hypot(math.sqrt(max(along, 0.0)), scale_sd * distance),
-                    math.atan2(dy, dx), bearing,
-                )
-            )  # fmt: skip
-    return tuple(pairs)
+    moments = pair_moments(poses[shown, :2], blocks[np.ix_(shown, (0, 1), shown, (0, 1))])
+    moments[:, 1] = np.hypot(moments[:, 1], scale_sd * moments[:, 0])
+    return named_pairs([names[n] for n in shown], moments)
 
 
 def _parameters(problem: Problem, solution: Solution, time_s: float) -> tuple[Parameter, ...]:
