@@ -17,7 +17,6 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from itertools import combinations
-from typing import TYPE_CHECKING
 
 from relpos.errors import RelposError
 from relpos.fusion import kernel_cache, plugins
@@ -40,13 +39,10 @@ from relpos.fusion.estimator_settings import (
     ParticleSettings,
 )
 from relpos.fusion.linear_algebra import one_thread
-from relpos.fusion.post import posts_of, referring
+from relpos.fusion.models.ranging import Mounting
+from relpos.fusion.post import referring
 from relpos.fusion.settings import SettingInfo, describe, parse
 from relpos.measurements import Heading, Height, Motion, Prior, Range
-
-if TYPE_CHECKING:
-    # With numba behind it, which who only emulates or records does without.
-    from relpos.fusion.models.ranging import Mounting
 
 ROOMS: Mapping[str, tuple[str, ...]] = {
     "bank": ("bank", "initialisation", "large_teams", "smoother"),
@@ -143,20 +139,7 @@ def make_smoother(
     # The others' seeds are far from what a user would choose as the next one.
     seeds = [seed + k * 1_000_003 for k in range(attempts)]
     online, *others = (_make(name, priors, settings or {}, one, nodes) for one in seeds)
-    worn = nodes or {}
-    smoother = Smoother(
-        online,
-        others,
-        priors,
-        {node: info.height_m for node, info in worn.items() if info.height_m is not None},
-        {
-            node: info.antenna_offset_m
-            for node, info in worn.items()
-            if info.antenna_offset_m is not None
-        },
-        posts_of(nodes),
-    )
-    return referring(smoother, nodes)
+    return referring(Smoother(online, others, priors, nodes or {}), nodes)
 
 
 SMOOTHER_ATTEMPTS = 4

@@ -29,14 +29,12 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from relpos.errors import RelposError
 from relpos.fusion.estimator import Estimate, Estimator
+from relpos.fusion.models.ranging import Mounting
 from relpos.measurements import Measurement, Prior
-
-if TYPE_CHECKING:
-    from relpos.fusion.models.ranging import Mounting
 
 GROUP = "relpos.estimators"
 """Entry point group: ``[project.entry-points."relpos.estimators"]`` of a package's pyproject."""

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 from relpos.fusion.estimator import Estimate, Estimator
 from relpos.fusion.models.pressure import Weather
+from relpos.fusion.models.ranging import Mounting
 from relpos.fusion.timeline import refusal
 from relpos.measurements import Height, Measurement, Motion, at_rest
-
-if TYPE_CHECKING:
-    from relpos.fusion.models.ranging import Mounting
 
 
 def posts_of(nodes: Mapping[int, Mounting] | None) -> frozenset[int]:

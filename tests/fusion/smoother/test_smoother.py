@@ -32,6 +32,7 @@ from relpos.fusion.smoother.variance_components import (
     weights_of,
 )
 from relpos.measurements import Height, Measurement, Motion, Prior, Range
+from relpos.runs.description import NodeInfo
 from relpos.simulation.missions import simulate_mission
 from relpos.simulation.paper import SimulatedRun, simulate_paper
 
@@ -51,7 +52,8 @@ def _problem(seed: int = 3) -> tuple[Problem, State, Weights]:
             measurements.append(Range(k + rng.uniform(0, 0.9), node, peer, rng.uniform(2.0, 9.0)))
     measurements.sort(key=lambda m: m.time_s)
     priors = [Prior(1, 0, 0, 0), Prior(2, 4, 1, 0.5, 0.1, 0.1), Prior(3, 1, 6, -1, 1.0, 0.5)]
-    graph, _ = build_graph(measurements, priors, {1: 0.4}, {3: (0.2, -0.1)})
+    worn = {1: NodeInfo(height_m=0.4), 3: NodeInfo(antenna_offset_m=(0.2, -0.1))}
+    graph, _ = build_graph(measurements, priors, worn)
     # Step scales of three parts.
     later = 3 * np.minimum(np.arange(graph.time_s.size - 1) // 4, 2)
     chords = graph.chords._replace(scale_at=graph.chords.scale_at + later)

@@ -48,6 +48,7 @@ from relpos.fusion.models.ranging import (
     OutlierPersistence,
     RangeCorrelation,
     Repeats,
+    antenna_m,
     slab_variance,
     slant_height,
 )
@@ -131,8 +132,9 @@ class Bank:
             self._meet(p.node)
             if p.is_known:
                 self._row[p.node] = self.core.add_node(
-                    (p.x_m, p.y_m, p.heading_rad), p.sigma_m, p.sigma_rad, self._lever_m(p.node)
-                )
+                    (p.x_m, p.y_m, p.heading_rad), p.sigma_m, p.sigma_rad,
+                    antenna_m(self.mounting, p.node),
+                )  # fmt: skip
             else:
                 self.initialiser.add(p.node, p)
 
@@ -200,10 +202,6 @@ class Bank:
                 self.core.hypotheses.know_heights()
                 known.vertical = Vertical(worn.height_m)
         return known
-
-    def _lever_m(self, node: int) -> tuple[float, float]:
-        worn = self.mounting.get(node)
-        return (0.0, 0.0) if worn is None else worn.antenna_offset_m or (0.0, 0.0)
 
     def _advance(self) -> None:
         """Process the displacements that wait."""
@@ -428,7 +426,7 @@ class Bank:
             return
         beside = self._nearest(mixture) if self._row else None
         rows = [
-            self.core.add_node((0.0, 0.0, 0.0), 1.0, 1.0, self._lever_m(node))
+            self.core.add_node((0.0, 0.0, 0.0), 1.0, 1.0, antenna_m(self.mounting, node))
             for node in mixture.nodes
         ]
         self._row.update(zip(mixture.nodes, rows, strict=True))

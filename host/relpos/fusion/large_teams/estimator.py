@@ -42,7 +42,13 @@ from relpos.fusion.large_teams.variance_components import VarianceComponents
 from relpos.fusion.models.motion import reported_sigmas
 from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_variances
 from relpos.fusion.models.odometry_faults import JUMP_M
-from relpos.fusion.models.ranging import Mounting, OutlierPersistence, RangeCorrelation
+from relpos.fusion.models.ranging import (
+    Mounting,
+    OutlierPersistence,
+    RangeCorrelation,
+    antenna_m,
+    tag_height_m,
+)
 from relpos.fusion.post import posts_of
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Step, Timeline
 from relpos.fusion.vertical.filter import VerticalFilter
@@ -204,9 +210,7 @@ class LargeTeam:
         return self._known.setdefault(node, Presence())
 
     def _height(self, node: int) -> float:
-        mounting = self.mountings.get(node)
-        tag_m = 0.0 if mounting is None or mounting.height_m is None else mounting.height_m
-        return tag_m + self._known[node].vertical.z_m
+        return tag_height_m(self.mountings, node) + self._known[node].vertical.z_m
 
     def _climb(self, time_s: float) -> None:
         """Update heights at the end of an epoch; take back what stairs have added to motion."""
@@ -226,9 +230,7 @@ class LargeTeam:
         for node in nodes:
             self._row[node] = len(self._nodes)
             self._nodes.append(node)
-            mounting = self.mountings.get(node)
-            if mounting is not None and mounting.antenna_offset_m is not None:
-                self.filter.antenna_m[self._row[node]] = mounting.antenna_offset_m
+            self.filter.antenna_m[self._row[node]] = antenna_m(self.mountings, node)
         self._outlying = np.append(self._outlying, np.zeros(len(nodes)))
         self._components.add(poses)
 

@@ -13,7 +13,7 @@ sqrt(|x_i - x_j|^2 + h^2).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
@@ -37,6 +37,18 @@ class Mounting(Protocol):
     @property
     def post(self) -> bool:
         """Whether nobody wears it: it lies still at the command post."""
+
+
+def tag_height_m(mountings: Mapping[int, Mounting], node: int) -> float:
+    """Return the height of a node's tag over the floor where it starts; 0 where none is told."""
+    worn = mountings.get(node)
+    return (worn.height_m if worn else None) or 0.0
+
+
+def antenna_m(mountings: Mapping[int, Mounting], node: int) -> tuple[float, float]:
+    """Return a node's antenna, forward and left of what moves; in its place where none is told."""
+    worn = mountings.get(node)
+    return (worn.antenna_offset_m if worn else None) or (0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)

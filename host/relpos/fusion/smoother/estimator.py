@@ -29,8 +29,9 @@ from relpos.fusion.estimator import (
     named_pairs,
     pair_moments,
 )
-from relpos.fusion.models.ranging import RANGE_SCALE_SD
+from relpos.fusion.models.ranging import RANGE_SCALE_SD, Mounting
 from relpos.fusion.models.unseen_walk import TURNS_RAD2_S, WALKING_M_S
+from relpos.fusion.post import posts_of
 from relpos.fusion.smoother.as_learned import as_learned, range_scale_sd
 from relpos.fusion.smoother.graph import Graph, build_graph
 from relpos.fusion.smoother.lasting import without_lasting_errors
@@ -79,9 +80,7 @@ class Smoother:
     online: Estimator
     others: Sequence[Estimator] = ()
     priors: Sequence[Prior] = ()
-    heights_m: Mapping[int, float] = field(default_factory=dict)
-    antennas_m: Mapping[int, tuple[float, float]] = field(default_factory=dict)
-    posts: frozenset[int] = frozenset()
+    mountings: Mapping[int, Mounting] = field(default_factory=dict)
     solutions: list[Solution] = field(default_factory=list)
     """All attempts of :meth:`finish`, the best first."""
     _measurements: list[Measurement] = field(default_factory=list)
@@ -98,12 +97,9 @@ class Smoother:
         """Smooth the whole run; RelposError if the data were unfit."""
         self._estimates += self.online.finish()
         nodes = [prior.node for prior in self.priors]
-        graph, unused = build_graph(
-            as_climbed(as_learned(self._measurements, self._estimates), nodes, self.posts),
-            self.priors,
-            self.heights_m,
-            self.antennas_m,
-        )
+        learned = as_learned(self._measurements, self._estimates)
+        climbed = as_climbed(learned, nodes, posts_of(self.mountings))
+        graph, unused = build_graph(climbed, self.priors, self.mountings)
         self._own.update(unused)
         graph = _with_frame(graph, self._estimates)
         problem = Problem(graph)

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from relpos.errors import RelposError
 from relpos.fusion.models.detection import Round, Rounds, on_one_floor
 from relpos.fusion.models.motion import unseen_variance
+from relpos.fusion.models.ranging import Mounting, antenna_m, tag_height_m
 from relpos.fusion.timeline import Advance, Epoch, Ranging, Sensed, Timeline
 from relpos.measurements import Height, Measurement, Prior
 
@@ -167,7 +168,7 @@ class _Entry(NamedTuple):
 class _Builder:
     """Runs the steps of a timeline into lists."""
 
-    heights: dict[int, float]
+    mountings: Mapping[int, Mounting]
     partial: dict[int, list[float]] = field(default_factory=dict)
     """Of the open chord: x, y, turn in the frame of its beginning, variances of both, the
     longest duration (s) of a report in it, the sum of the shares of reports, and that of their
@@ -231,25 +232,20 @@ class _Builder:
         return on_one_floor(dz_m, np.zeros(dz_m.size))
 
     def _height(self, node: int) -> float:
-        return self.heights.get(node, 0.0) + self.height_now.get(node, 0.0)
+        return tag_height_m(self.mountings, node) + self.height_now.get(node, 0.0)
 
 
 def build_graph(
     measurements: Iterable[Measurement],
     priors: Sequence[Prior] = (),
-    heights_m: Mapping[int, float] | None = None,
-    antennas_m: Mapping[int, tuple[float, float]] | None = None,
-    *,
-    reorder_s: float = 0.5,
-    max_lag_s: float = math.inf,
+    mountings: Mapping[int, Mounting] | None = None,
 ) -> tuple[Graph, Counter[str]]:
     """Put a run's measurements in order, and count what smoothing does not use.
 
-    ``heights_m`` are the tags' known heights, ``antennas_m`` their places on the body. Raises
-    RelposError where there is no motion at all.
+    Raises RelposError where there is no motion at all.
     """
-    timeline = Timeline([p.node for p in priors], reorder_s=reorder_s, max_lag_s=max_lag_s)
-    builder = _Builder(dict(heights_m or {}))
+    timeline = Timeline([p.node for p in priors], max_lag_s=math.inf)
+    builder = _Builder(mountings or {})
     for measurement in measurements:
         for step in timeline.push(measurement):
             builder.add(step, timeline.reported_s)
@@ -257,14 +253,10 @@ def build_graph(
         builder.add(step, timeline.reported_s)
     if not builder.times:
         raise RelposError("no motion was received: nothing can be smoothed")
-    return _finished(builder, priors, antennas_m or {}), builder.unused
+    return _finished(builder, priors), builder.unused
 
 
-def _finished(
-    builder: _Builder,
-    priors: Sequence[Prior],
-    antennas_m: Mapping[int, tuple[float, float]],
-) -> Graph:
+def _finished(builder: _Builder, priors: Sequence[Prior]) -> Graph:
     names = tuple(sorted(builder.seen | {p.node for p in priors}))
     row = {node: k for k, node in enumerate(names)}
     first_s = min([0.0, *(entry.time_s for entry in builder.ranges)])
@@ -288,10 +280,7 @@ def _finished(
     direction = np.where(length > 0.0, np.arctan2(chord[..., 1], chord[..., 0]), 0.0)
     turn = chord[..., 2].copy()
     walks = length > STILL_M
-    antenna = np.zeros((len(names), 2))
-    for node, place in antennas_m.items():
-        if node in row:
-            antenna[row[node]] = place
+    antenna = np.array([antenna_m(builder.mountings, node) for node in names], dtype=np.float64)
     ranges = _placed(kept, row, time_s, chord, antenna)
     ordered = np.sort(ranges.pair, axis=1)
     pairs, pair_index = (
