@@ -58,17 +58,22 @@ class PoseMixture:
         return self.poses[:, index], self.covariances[:, own, own]
 
     def part(
-        self, nodes: Sequence[int], which: npt.NDArray[np.bool_] | slice = slice(None)
+        self, nodes: Sequence[int], which: Indices | npt.NDArray[np.bool_] | None = None
     ) -> PoseMixture:
-        """Return the hypotheses ``which`` about some nodes (indices), with their weights here."""
-        columns = pose_columns(nodes)
+        """Return what the hypotheses ``which``, or all, say of some nodes (indices)."""
+        some = slice(None) if which is None else which
+        weights, columns = self.weights[some], pose_columns(nodes)
         return PoseMixture(
             tuple(self.nodes[i] for i in nodes),
-            self.weights[which],
-            self.poses[which][:, nodes],
-            self.covariances[which][:, columns][:, :, columns],
+            weights if which is None else weights / weights.sum(),
+            self.poses[some][:, nodes],
+            self.covariances[some][:, columns][:, :, columns],
             self.scales[nodes],
         )
+
+    def place_covariances(self) -> Floats:
+        """Return the covariances of the nodes' places (K, N, 2, 2)."""
+        return np.stack([self.of(i)[1][:, :2, :2] for i in range(len(self.nodes))], axis=1)
 
     def moments(self, index: int) -> tuple[Floats, Floats]:
         """Return mean (3,) and covariance (3, 3) of the pose of ``nodes[index]``."""

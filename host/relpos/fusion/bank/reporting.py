@@ -34,7 +34,7 @@ from relpos.fusion.estimator import (
     named_pairs,
     pair_moments,
 )
-from relpos.fusion.initial_poses import Initialiser, PoseMixture, sought_node
+from relpos.fusion.initial_poses import POSE, Initialiser, PoseMixture, sought_node
 from relpos.fusion.models.detection import Detection
 from relpos.fusion.models.ranging import RANGE_SCALE_SD
 from relpos.fusion.modes import alternatives_of, belief_of
@@ -79,22 +79,30 @@ class Report:
             for node, presence in self.presence.items()
             if node not in self.row
         ]
-        ambiguous = self.core.relocalisation.ambiguous
+        ambiguous = {n for n, row in self.row.items() if row in self.core.relocalisation.ambiguous}
         pairs = self._pairs()
         vague = self._vague(pairs)
         nodes = [self._node(node, vague) for node in sorted(self.row)]
         if len(pairs) == 1:
             nodes = self._moved_apart(nodes[0], nodes[1], pairs[0])
         alternatives: tuple[Alternative, ...] = ()
-        if ambiguous:
-            nodes = [self._at_mode(n) if self.row[n.node] in ambiguous else n for n in nodes]
-            pairs = [self._ambiguous_pair(pair) for pair in pairs]
         mixture = self.initialiser.mixture
+        if ambiguous:
+            team = self._hypotheses()
+            nodes = [_at_mode(n, team) if n.node in ambiguous else n for n in nodes]
+            pairs = [
+                p if ambiguous.isdisjoint((p.node, p.peer)) else _pair(team, p.node, p.peer)
+                for p in pairs
+            ]
+            if mixture is None:
+                likely = np.argsort(-team.weights, kind="stable")[:MOST_LISTED]
+                alternatives = self._alternatives(team.part(range(len(nodes)), likely))
         if mixture is not None:
-            pairs += self._sought_pairs(mixture)
-            alternatives = self._sought_alternatives(mixture)
-        elif ambiguous:
-            alternatives = self._ambiguous_alternatives()
+            team, open_ = self._with_located(mixture), set(mixture.nodes)
+            every = combinations(sorted(team.nodes), 2)
+            pairs += [_pair(team, *two) for two in every if not open_.isdisjoint(two)]
+            if not open_ <= self.initialiser.resolved:
+                alternatives = self._alternatives(team)
         together = sorted([*nodes, *sought], key=lambda n: n.node)
         return Estimate(
             self.time_s, tuple(together), tuple(pairs), alternatives, self._parameters(), north
@@ -253,88 +261,55 @@ class Report:
         wide = these.models.has(RangeErrors.PASSING) if these.biases else these.models.bias
         return RANGE_SCALE_SD * float(these.weights() @ wide)
 
-    # -- ambiguous nodes -----------------------------------------------------------------------
+    # -- the team while a node is ambiguous or sought ------------------------------------------
 
-    def _at_mode(self, node: NodeEstimate) -> NodeEstimate:
-        """Report an ambiguous node at its most probable position, not at the mean of them."""
-        these = self.core.hypotheses
-        belief = belief_of(these.weights(), *these.poses_of(self.row[node.node]))
-        spread = belief.covariance_m2
-        return replace(
-            node, x_m=belief.x_m, y_m=belief.y_m,
-            heading_rad=math.remainder(belief.heading_rad, math.tau),
-            variance_x_m2=float(spread[0, 0]), variance_y_m2=float(spread[1, 1]),
-            covariance_xy_m2=float(spread[0, 1]),
-            sigma_heading_rad=min(belief.sigma_heading_rad, ANY_ANGLE_RAD),
-        )  # fmt: skip
+    def _hypotheses(self) -> PoseMixture:
+        """Return what each hypothesis says of the located nodes; their mean may be nowhere."""
+        these, nodes = self.core.hypotheses, sorted(self.row)
+        poses, covariances = these.poses_of(*(self.row[node] for node in nodes))
+        poses = poses.reshape(these.count, -1, POSE)
+        return PoseMixture(tuple(nodes), these.weights(), poses, covariances, np.ones(len(nodes)))
 
-    def _ambiguous_pair(self, pair: PairEstimate) -> PairEstimate:
-        """Report a pair with an ambiguous node from all hypotheses: the mean says nothing."""
-        a, b = self.row[pair.node], self.row[pair.peer]
-        if {a, b}.isdisjoint(self.core.relocalisation.ambiguous):
-            return pair
-        these, here, there = self.core.hypotheses, slice(0, 2), slice(3, 5)
-        poses, p = these.poses_of(a, b)
-        spread = p[:, here, here] + p[:, there, there] - p[:, here, there] - p[:, there, here]
-        off = poses[:, there] - poses[:, here]
-        return _pair_of_mixture(pair.node, pair.peer, these.weights(), off, spread)
-
-    def _ambiguous_alternatives(self) -> tuple[Alternative, ...]:
-        """List the modes of the team while a node is ambiguous, from the likeliest hypotheses."""
-        these = self.core.hypotheses
-        weight = these.weights()
-        likely = np.argsort(-weight, kind="stable")[:MOST_LISTED]
-        nodes = sorted(self.row)
-        each = [these.poses_of(self.row[n]) for n in nodes]
-        poses = np.stack([poses[likely] for poses, _ in each], axis=1)
-        spread = np.stack([spread[likely, :2, :2] for _, spread in each], axis=1)
-        share = weight[likely] / weight[likely].sum()
-        return alternatives_of(self.time_s, nodes, share, poses, spread)
-
-    # -- sought nodes --------------------------------------------------------------------------
-
-    def _whole_team(self, mixture: PoseMixture) -> tuple[list[int], Floats, Floats]:
-        """Return sought and then located nodes, poses (K, N, 3), covariances (K, N, 2, 2)."""
-        sought, located = len(mixture.nodes), sorted(self.row)
-        nodes = [*mixture.nodes, *located]
-        poses = np.zeros((len(mixture.weights), len(nodes), 3))
-        spread = np.zeros((len(mixture.weights), len(nodes), 2, 2))
+    def _with_located(self, mixture: PoseMixture) -> PoseMixture:
+        """Return the mixture of sought nodes with the located ones, alike in all modes, behind."""
+        sought, nodes = len(mixture.nodes), (*mixture.nodes, *sorted(self.row))
+        poses = np.zeros((len(mixture.weights), len(nodes), POSE))
+        covariances = np.zeros((len(poses), POSE * len(nodes), POSE * len(nodes)))
         poses[:, :sought] = mixture.poses
-        for i in range(sought):
-            spread[:, i] = mixture.of(i)[1][:, :2, :2]
-        for i, node in enumerate(located, sought):
-            at = PER_NODE * self.row[node]
-            poses[:, i] = self.mean[at : at + 3]
-            spread[:, i] = self.world_covariance[at : at + 2, at : at + 2]
-        return nodes, poses, spread
+        covariances[:, : POSE * sought, : POSE * sought] = mixture.covariances
+        for i, node in enumerate(nodes[sought:], sought):
+            at, to = PER_NODE * self.row[node], POSE * i
+            own = slice(at, at + POSE)
+            poses[:, i] = self.mean[own]
+            covariances[:, to : to + POSE, to : to + POSE] = self.world_covariance[own, own]
+        return PoseMixture(nodes, mixture.weights, poses, covariances, np.ones(len(nodes)))
 
-    def _sought_pairs(self, mixture: PoseMixture) -> list[PairEstimate]:
-        """Pairs with at least one node whose initial pose is unknown: moments over all modes."""
-        nodes, poses, spread = self._whole_team(mixture)
-        sought, pairs = len(mixture.nodes), []
-        for i, j in combinations(sorted(range(len(nodes)), key=nodes.__getitem__), 2):
-            if min(i, j) >= sought:
-                continue
-            total = spread[:, i] + spread[:, j]
-            if max(i, j) < sought:
-                cross = mixture.covariances[:, 3 * i : 3 * i + 2, 3 * j : 3 * j + 2]
-                total = total - cross - cross.transpose(0, 2, 1)
-            off = poses[:, j, :2] - poses[:, i, :2]
-            pairs.append(_pair_of_mixture(nodes[i], nodes[j], mixture.weights, off, total))
-        return pairs
-
-    def _sought_alternatives(self, mixture: PoseMixture) -> tuple[Alternative, ...]:
-        """List the modes of the whole team while a node's initial pose is unknown."""
-        if set(mixture.nodes) <= self.initialiser.resolved:
-            return ()
-        nodes, poses, spread = self._whole_team(mixture)
-        return alternatives_of(self.time_s, nodes, mixture.weights, poses, spread)
+    def _alternatives(self, team: PoseMixture) -> tuple[Alternative, ...]:
+        """List the modes of the team."""
+        spread = team.place_covariances()
+        return alternatives_of(self.time_s, team.nodes, team.weights, team.poses, spread)
 
 
-def _pair_of_mixture(
-    node: int, peer: int, weights: Floats, off: Floats, spread: Floats
-) -> PairEstimate:
-    """Distance and bearing of a pair whose difference is a mixture: (K, 2), (K, 2, 2)."""
+def _at_mode(node: NodeEstimate, team: PoseMixture) -> NodeEstimate:
+    """Report an ambiguous node at its most probable position, not at the mean of them."""
+    belief = belief_of(team.weights, *team.of(team.nodes.index(node.node)))
+    spread = belief.covariance_m2
+    return replace(
+        node, x_m=belief.x_m, y_m=belief.y_m,
+        heading_rad=math.remainder(belief.heading_rad, math.tau),
+        variance_x_m2=float(spread[0, 0]), variance_y_m2=float(spread[1, 1]),
+        covariance_xy_m2=float(spread[0, 1]),
+        sigma_heading_rad=min(belief.sigma_heading_rad, ANY_ANGLE_RAD),
+    )  # fmt: skip
+
+
+def _pair(team: PoseMixture, node: int, peer: int) -> PairEstimate:
+    """Distance and bearing of a pair by all hypotheses about the team."""
+    i, j = team.nodes.index(node), team.nodes.index(peer)
+    here, there = (slice(POSE * k, POSE * k + 2) for k in (i, j))
+    p, weights = team.covariances, team.weights
+    off, cross = team.poses[:, j, :2] - team.poses[:, i, :2], p[:, here, there]
+    spread = p[:, here, here] + p[:, there, there] - cross - cross.transpose(0, 2, 1)
     distance = np.hypot(off[:, 0], off[:, 1])
     both = np.trace(spread, axis1=1, axis2=2)
     # On the same spot no direction is along; one is as good as the other.

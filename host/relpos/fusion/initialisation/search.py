@@ -215,11 +215,10 @@ class HypothesisSearch:
         if not active or not len(self._hypotheses):
             return None
         part = self.mixture.part(active)
-        places = np.stack([part.of(i)[1][:, :2, :2] for i in range(len(active))], axis=1)
         return replace(
             part,
             covariances=_REPORTED_VARIANCE * part.covariances,
-            best=best_mode(part.weights, part.poses, places),
+            best=best_mode(part.weights, part.poses, part.place_covariances()),
         )
 
     def resolved(self, least: float) -> list[int]:
@@ -283,7 +282,6 @@ class HypothesisSearch:
         staying = [i for i in range(len(self.nodes)) if i not in leaving]
         agree = hypotheses.agreeing(leaving)
         released = self.mixture.part(leaving, agree)
-        released = replace(released, weights=released.weights / released.weights.sum())
         variance = hypotheses.fits.covariances[0].diagonal().reshape(-1, POSE)
         best = hypotheses.by_node[0]
         self.log.remove(nodes, best, variance[:, 0] + variance[:, 1], hypotheses.turns)
