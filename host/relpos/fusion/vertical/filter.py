@@ -117,16 +117,20 @@ class _Interval:
     """How the plane has been moved so far."""
     share: Floats = field(init=False)
     """Of the displacements that is true."""
+    probability: Floats = field(init=False)
+    """Of airs and modes (N, AIRS, MODES), smoothed."""
+    happened: Happened = field(init=False)
 
-    def happened(self, probability: Floats) -> Happened:
-        """Return what did, by the probabilities (N, AIRS, MODES)."""
+    def smoothed(self, probability: Floats) -> None:
+        """Take what happened from the probabilities of airs and modes."""
+        self.probability = probability
         mode = probability.sum(axis=1)
         blown = probability[:, Air.BLOWN]
         pressed = mode[:, PRESSURE].sum(axis=1)
         common_m = common_rise(self.update.blown, blown)
         felt = blown @ FOLLOWS
         climbed = felt - blown[:, Mode.LEVEL] - blown[:, Mode.JUMP]
-        return Happened(
+        self.happened = Happened(
             1.0 - mode[:, Mode.LEVEL] - pressed,
             pressed + blown[:, Mode.LEVEL],
             felt * common_m,
@@ -168,9 +172,6 @@ class VerticalFilter:
     _tracks: dict[int, Track] = field(default_factory=dict)
     _beliefs: Beliefs = field(default_factory=lambda: episodes.begin(np.empty(0), np.empty(0)))
     _open: list[_Interval] = field(default_factory=list)
-    _smoothed: list[Floats] = field(default_factory=list)
-    """Probabilities of airs and modes in each open interval."""
-    _happened: list[Happened] = field(default_factory=list)
     _first_s: float = math.inf
     _closed_s: float = -math.inf
     _level_s: Floats = field(default_factory=lambda: np.empty(0))
@@ -268,10 +269,9 @@ class VerticalFilter:
         if not self._row or time_s < self._closed_s + INTERVAL_S:
             return []
         self._observe(time_s)
-        self._smoothed = episodes.smooth([one.update for one in self._open])
-        self._happened = [
-            one.happened(p) for one, p in zip(self._open, self._smoothed, strict=True)
-        ]
+        probabilities = episodes.smooth([one.update for one in self._open])
+        for one, probability in zip(self._open, probabilities, strict=True):
+            one.smoothed(probability)
         corrections = self._corrections(time_s)
         self._decide(time_s - LAG_S)
         return corrections
@@ -323,14 +323,9 @@ class VerticalFilter:
         shares, expected = true_shares(
             np.array([one.reported.steps for one in self._open]),
             np.array([one.way_m for one in self._open]),
-            np.array(
-                [
-                    one.rise_m - happened.pressed_m
-                    for one, happened in zip(self._open, self._happened, strict=True)
-                ]
-            ),
+            np.array([one.rise_m - one.happened.pressed_m for one in self._open]),
             *(
-                np.array([p[:, :, way].sum(axis=(1, 2)) for p in self._smoothed])
+                np.array([one.probability[:, :, way].sum(axis=(1, 2)) for one in self._open])
                 for way in (UP, DOWN)
             ),
         )
@@ -359,15 +354,15 @@ class VerticalFilter:
     def _decide(self, until_s: float) -> None:
         """Decide what happened in the intervals that ended by then."""
         count = sum(one.end_s <= until_s for one in self._open)
-        for one, happened in zip(self._open[:count], self._happened[:count], strict=True):
-            self._apply(one, happened)
-        del self._open[:count], self._smoothed[:count], self._happened[:count]
+        for one in self._open[:count]:
+            self._apply(one)
+        del self._open[:count]
 
-    def _apply(self, one: _Interval, happened: Happened) -> None:
+    def _apply(self, one: _Interval) -> None:
         """Let what happened in an interval move the heights."""
         duration_s = one.end_s - one.begin_s
         heights = self.heights
-        moving, disturbed, common_m, pressed_m = happened
+        moving, disturbed, common_m, pressed_m = one.happened
         heights.advance(duration_s, one.rise_m, moving, disturbed, one.silent_s, pressed_m)
         heights.moved(moving**2 * 2.0 * one.reported.variance_m2)
         heights.correct(one.reported.height_m, one.reported.variance_m2)
@@ -453,11 +448,12 @@ class VerticalFilter:
             return AT_POST if at_post else self._unmeasured(time_s)
         climbed = risen_m = unseen_m2 = 0.0
         doubt_m = self._doubt_m[row]
-        for one, modes, happened in zip(self._open, self._smoothed, self._happened, strict=True):
-            moving, pressed_m = float(happened.moving[row]), float(happened.pressed_m[row])
+        for one in self._open:
+            moving = float(one.happened.moving[row])
+            pressed_m = float(one.happened.pressed_m[row])
             rise = one.rise_m[row]
             risen_m += moving * rise - pressed_m
-            climbed += modes[row, :, STAIRS].sum() * rise - pressed_m
+            climbed += one.probability[row, :, STAIRS].sum() * rise - pressed_m
             undecided_m = math.sqrt(max(moving * (1.0 - moving), 0.0)) * rise
             doubt_m += -undecided_m if moving > 0.5 else undecided_m
             unseen_m2 += UNSEEN_M**2 * one.silent_s[row]
@@ -467,14 +463,14 @@ class VerticalFilter:
         doubted = 1.0 if self._settled[row] else self.floors.scatter
         variance_m2 += unseen_m2 + doubted * doubt_m**2 + (DOUBTED * ahead_m) ** 2
         # With the news of one more interval, where there is one.
-        modes = self._smoothed[-2:][0] if self._smoothed else self._beliefs.probability
+        modes = self._open[-2:][0].probability if self._open else self._beliefs.probability
         told = episodes.episodes_of(modes[row])
         if abs(climbed) < LEAST_CLIMB_M:
             told[episodes.EPISODES.index(Episode.LEVEL)] += told[_CLIMBS].sum()
             told[_CLIMBS] = 0.0
         k = int(np.argmax(told))
         where, steps = self.floors.probability[row], self._level_steps[row]
-        level = [float(happened.level[row]) for happened in self._happened]
+        level = [float(one.happened.level[row]) for one in self._open]
         stays = self._settled[row] and all(p >= 0.5 for p in level)
         if not stays:
             for one, p in zip(self._open, level, strict=True):
@@ -500,9 +496,9 @@ class VerticalFilter:
         """Return what a node rises until a time that no reported height shows yet."""
         if not self._open:
             return 0.0
-        one, happened = self._open[-1], self._happened[-1]
+        one = self._open[-1]
         late_s = min(time_s - self._tracks[node].height_s, INTERVAL_S * 2) + HEIGHT_LATE_S
-        rise_m = happened.moving[row] * one.rise_m[row] - happened.pressed_m[row]
+        rise_m = one.happened.moving[row] * one.rise_m[row] - one.happened.pressed_m[row]
         return float(late_s * rise_m / one.reported.since_s[row])
 
     def _unmeasured(self, time_s: float) -> Vertical:
