@@ -1,6 +1,8 @@
 """Optional libraries: what is missing, and the line that installs it."""
 
+import os
 import shlex
+import subprocess
 import sys
 import tomllib
 from importlib import metadata
@@ -74,3 +76,32 @@ def test_the_line_installs_beside_this_very_relpos(prefix, line, monkeypatch):
 def test_elsewhere_the_line_names_the_python_that_runs():
     words = shlex.split(extras.install_line(["mcap>=1"]))
     assert words == [sys.executable, "-m", "pip", "install", "mcap>=1"]
+
+
+WITHOUT_MCAP = """
+import sys
+class NotInstalled:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("foxglove", "mcap"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, NotInstalled())
+from relpos.cli.main import app
+app(sys.argv[1:])
+"""
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    ["fuse a.mcap --out o", "replay a.mcap", "replay a.mcap --log l.csv",
+     "convert a.mcap --to run --out o", "report a.mcap --out o"],
+)  # fmt: skip
+def test_a_recording_without_the_extra_is_one_clear_line(arguments, tmp_path):
+    (tmp_path / "a.mcap").write_bytes(b"recorded")
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_MCAP, *arguments.split()], cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT / "host")},
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    (line,) = done.stderr.splitlines()
+    assert done.returncode == 1
+    assert "(extra 'recording') is not installed" in line

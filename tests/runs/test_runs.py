@@ -289,6 +289,7 @@ source = "s"
 heading_known = true
 mount = "chest"
 stature_m = 1.8
+leg_length_m = 0.95
 sensor_height_m = 1
 true_distance_m = 20.0
 true_turn_deg = 180.0
@@ -311,6 +312,7 @@ antenna_offset_m = [0.1, -0.2]
     assert run.heading_known
     assert run.nodes[2].antenna_offset_m == (0.1, -0.2)
     assert run.nodes[2].leg_length_m == 0.9
+    assert run.description.leg_length_m == 0.95
     assert run.description.sensor_height_m == 1.0
     assert run.description.true_turn_deg == 180.0
     assert (run.description.mount, run.description.source) == ("chest", "s")

@@ -268,9 +268,10 @@ def _fuse_mcap(
     from relpos.live.inputs import PacedInput
     from relpos.measurements import Measurement
     from relpos.recording import open_recording
-    from relpos.recording.replay import Replay
 
     recording = open_recording(job.source)
+    from relpos.recording.replay import Replay  # it needs what opening has looked for
+
     about = recording.about
     if about is not None:
         estimator = job.estimator if "estimator" in given else about.estimator

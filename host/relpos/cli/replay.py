@@ -36,9 +36,9 @@ def replay(
     computed meanwhile and drawn beside them once they are there.
     """
     if log is not None:
-        from relpos.recording.moments import Moments
-
         played = Played.open(source)
+        from relpos.recording.moments import Moments  # it needs what `open` has looked for
+
         _write(log, played, Moments(played.paths), pins or ())
         return
     play(source, live.Options(True, view_listen, open_browser=open_browser, seconds=seconds))
@@ -88,12 +88,12 @@ def play(
 
     With ``admit``, of a mission, which keeps the devices that are let in meanwhile.
     """
-    from relpos.cli.smoothing import Smoothing
+    played = Played.open(source)
+    from relpos.cli.smoothing import Smoothing  # these need what `open` has looked for
     from relpos.live.team_view import Hello
     from relpos.recording.moments import Moments
     from relpos.recording.player import Player
 
-    played = Played.open(source)
     moments = Moments(played.paths)
     # The mission whose page this is does not go on beside it.
     live_port = None if admit else played.live_port

@@ -24,7 +24,7 @@ from relpos.errors import DataError, DeviceError
 from relpos.link.decoder import Decoder
 from relpos.measurements import Height, Motion, Step
 from relpos.protocol import messages as wire
-from relpos.runs import Run
+from relpos.runs import NodeInfo, Run
 from relpos.runs.imu import ImuRecording
 from relpos.simulation.world import World
 
@@ -381,11 +381,12 @@ def reckon_run(
 
 def leg_length_m(run: Run, node: int, stature_m: float | None = None) -> float | None:
     """The run's own, or 0.53 of ``stature_m`` or of its stature; None where nothing is known."""
-    info = run.description.nodes.get(node)
-    if stature_m is None and info is not None and info.leg_length_m is not None:
-        return info.leg_length_m
-    if stature_m is None and info is not None:
-        stature_m = info.stature_m
     if stature_m is None:
-        stature_m = run.description.stature_m
+        # The node's own, then that of a run of one node.
+        for known in (run.description.nodes.get(node, NodeInfo()), run.description):
+            if known.leg_length_m is not None:
+                return known.leg_length_m
+            if known.stature_m is not None:
+                stature_m = known.stature_m
+                break
     return None if stature_m is None else LEG_OF_STATURE * stature_m

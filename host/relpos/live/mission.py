@@ -283,7 +283,7 @@ class Journal:
                     break
                 found.append(item)
             lines += [line for _, line in found]
-            number = max([self._safe + 0, *(n for n, _ in found)])
+            number = max([self._safe, *(n for n, _ in found)])
             try:
                 self._write("".join(lines))
             except OSError as error:

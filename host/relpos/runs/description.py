@@ -59,6 +59,7 @@ class Description:
     priors: tuple[Prior, ...] = ()
     nodes: Mapping[int, NodeInfo] = field(default_factory=dict)
     stature_m: float | None = None
+    leg_length_m: float | None = None
     sensor_height_m: float | None = None
     mount: str | None = None
     true_distance_m: float | None = None
@@ -90,7 +91,9 @@ class Description:
 MOST_BYTES = 1 << 20
 """Of a ``run.toml``; names of a thousand nodes are a tenth of it."""
 MOST_DOTS = 200
-_PLAIN_NUMBERS = ("stature_m", "sensor_height_m", "true_distance_m", "true_turn_deg")
+_PLAIN_NUMBERS = (
+    "stature_m", "leg_length_m", "sensor_height_m", "true_distance_m", "true_turn_deg"
+)  # fmt: skip
 
 
 def read_description(path: Path) -> Description:

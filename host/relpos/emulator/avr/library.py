@@ -107,7 +107,6 @@ def load() -> ctypes.CDLL:
         "data_set": (None, [board, u16, u8]),
         "counters": (None, [board, u64s]),
         "ram_end": (u32, [board]),
-        "flash_size": (u32, [board]),
     }
     for name, (result, arguments) in signatures.items():
         function = getattr(library, f"relpos_avr_{name}")

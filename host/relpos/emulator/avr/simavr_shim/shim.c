@@ -887,4 +887,3 @@ void relpos_avr_set_supply(relpos_avr *e, uint32_t millivolts)
 }
 
 uint32_t relpos_avr_ram_end(const relpos_avr *e) { return e->avr->ramend; }
-uint32_t relpos_avr_flash_size(const relpos_avr *e) { return e->avr->flashend + 1; }

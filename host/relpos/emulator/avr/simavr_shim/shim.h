@@ -91,5 +91,4 @@ void relpos_avr_data_set(relpos_avr *, uint16_t address, uint8_t value);
 
 void relpos_avr_counters(const relpos_avr *, uint64_t out[COUNTER_COUNT]);
 uint32_t relpos_avr_ram_end(const relpos_avr *);
-uint32_t relpos_avr_flash_size(const relpos_avr *);
 #endif
