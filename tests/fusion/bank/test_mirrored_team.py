@@ -13,6 +13,7 @@ from relpos import fusion
 from relpos.fusion.bank.mirrored import open_sides
 from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.fusion.models.handedness import Handedness
+from relpos.fusion.timeline import Advance
 from relpos.measurements import Measurement, Motion, Prior, Range
 
 PEOPLE, SECONDS, STRAIGHT_S, SIGMA_M = 4, 60, 20, 0.1
@@ -175,9 +176,9 @@ def test_a_bent_way_tells_the_side_of_those_alone_whose_distance_to_it_is_known(
     near = {1: {2, 3}, 2: {1, 3}, 3: {1, 2}, 4: {5}, 5: {4}}
     assert handedness.unsure({1, 2, 3, 4}, near) == {1, 2, 3, 4}
     for _ in range(6):
-        handedness.move(5, 1.0, 0.0, 0.5)
+        handedness.move(Advance(0.0, 5, 1.0, 1.0, 0.0, 0.5))
     assert handedness.unsure(set(), near) == {1, 2, 3}
     assert handedness.unsure(set(), near | {3: {1, 2, 4, 5, 6}, 6: {3}}) == {1, 2}
     for _ in range(6):
-        handedness.move(3, 1.0, 0.0, 0.5)
+        handedness.move(Advance(0.0, 3, 1.0, 1.0, 0.0, 0.5))
     assert handedness.unsure(set(), near) == set()

@@ -19,6 +19,7 @@ from relpos.fusion.models.odometry_faults import (
     perturb,
     update_cusum,
 )
+from relpos.fusion.timeline import Advance
 from relpos.measurements import Measurement, Motion, Prior, Range
 from relpos.simulation.paper import simulate_paper
 
@@ -101,13 +102,13 @@ def test_only_a_node_that_is_ranged_now_is_named() -> None:
 
 def test_a_sprint_exceeds_the_gate_and_walking_after_standing_does_not() -> None:
     gate = SpeedGate()
-    assert not any(gate.exceeded(1, 0.25, 1.0) for _ in range(60))
-    assert gate.exceeded(1, 1.9, 1.0)
-    assert not gate.exceeded(1, 1.4, 1.0)
-    assert not gate.exceeded(2, 1.3, 1.0)  # a newcomer may walk at once
-    assert not gate.exceeded(1, 0.3, 0.0005)  # two clocks have crossed
+    assert not any(gate.exceeded(Advance(0.0, 1, 1.0, 0.25, 0.0, 0.0)) for _ in range(60))
+    assert gate.exceeded(Advance(0.0, 1, 1.0, 1.9, 0.0, 0.0))
+    assert not gate.exceeded(Advance(0.0, 1, 1.0, 1.4, 0.0, 0.0))
+    assert not gate.exceeded(Advance(0.0, 2, 1.0, 1.3, 0.0, 0.0))  # a newcomer may walk at once
+    assert not gate.exceeded(Advance(0.0, 1, 0.0005, 0.3, 0.0, 0.0))  # two clocks have crossed
     # A node that runs from now on is believed after some seconds.
-    assert sum(gate.exceeded(1, 3.0, 1.0) for _ in range(40)) < 15
+    assert sum(gate.exceeded(Advance(0.0, 1, 1.0, 3.0, 0.0, 0.0)) for _ in range(40)) < 15
 
 
 def test_perturbed_poses_lie_on_the_peers_ring_with_headings_all_round() -> None:
@@ -210,15 +211,17 @@ def test_a_heading_fault_that_no_hypothesis_covers_is_reported(seed: int) -> Non
 def test_noise_of_a_standing_sensor_is_distinguished_from_slow_motion() -> None:
     rng = np.random.default_rng(2)
     still, creeping = ZeroMotionDetector(), ZeroMotionDetector()
-    stood = [still.update(1, *rng.normal(0.0, 0.01, 3), 1.0, 1.0) for _ in range(200)]
+    stood = [still.update(Advance(0.0, 1, 1.0, *rng.normal(0.0, 0.01, 3))) for _ in range(200)]
     crept = [
-        creeping.update(1, 0.03 + rng.normal(0.0, 0.01), rng.normal(0.0, 0.01), 0.0, 1.0, 1.0)
+        creeping.update(
+            Advance(0.0, 1, 1.0, 0.03 + rng.normal(0.0, 0.01), rng.normal(0.0, 0.01), 0.0)
+        )
         for _ in range(200)
     ]
     assert np.mean(stood) > 0.5
     assert not any(crept)
-    assert not still.update(1, 0.5, 0.0, 0.0, 1.0, 1.0)
-    assert not still.update(1, 0.0, 0.0, 0.0, 1.0, 1.0)  # it has just moved
+    assert not still.update(Advance(0.0, 1, 1.0, 0.5, 0.0, 0.0))
+    assert not still.update(Advance(0.0, 1, 1.0, 0.0, 0.0, 0.0))  # it has just moved
 
 
 def test_a_report_in_pieces_is_one_report() -> None:
@@ -226,9 +229,9 @@ def test_a_report_in_pieces_is_one_report() -> None:
     whole, pieces = ZeroMotionDetector(), ZeroMotionDetector()
     for _ in range(50):
         dx, dy, turn = rng.normal(0.0, 0.01, 3)
-        reported = whole.update(1, dx, dy, turn, 1.0, 1.0)
+        reported = whole.update(Advance(0.0, 1, 1.0, dx, dy, turn))
         for part in (0.25, 0.75):
-            last = pieces.update(1, part * dx, part * dy, part * turn, part, part)
+            last = pieces.update(Advance(0.0, 1, part, part * dx, part * dy, part * turn, part))
         assert reported == last
 
 

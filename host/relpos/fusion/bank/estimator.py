@@ -167,7 +167,7 @@ class Bank:
             way_m = math.hypot(step.dx_m, step.dy_m)
             self.range_correlation.move(step.node, way_m, step.dtheta_rad)
             self._seek(step.node)
-            odd = self.speed_gate.exceeded(step.node, way_m, step.duration_s, step.fraction)
+            odd = self.speed_gate.exceeded(step)
             self._counters["motions_doubted"] += odd
             self.initialiser.advance(step, faulty=odd)
         elif isinstance(step, Ranging):
@@ -223,8 +223,8 @@ class Bank:
             known.received(time_s)
             way_m = math.hypot(dx_m, dy_m)
             self.range_correlation.move(node, way_m, turn_rad)
-            self.handedness.move(node, dx_m, dy_m, turn_rad)
-            self._velocity_m_s[node] = velocity_m_s(dx_m, dy_m, turn_rad, duration_s)
+            self.handedness.move(a)
+            self._velocity_m_s[node] = velocity_m_s(a)
             usual = speed_gate.usual_m_s.get(node, 0.0)
             known.within.move(way_m, duration_s, fraction, usual)
             # How it turned meanwhile its ranges cannot say.
@@ -238,12 +238,12 @@ class Bank:
             if reported is not None and vague is not None:
                 reported[k] = math.nan
                 self.core.relocalisation.inflate_covariance(int(rows[k]), *vague)
-            if zero_motion.update(node, dx_m, dy_m, turn_rad, duration_s, fraction):
+            if zero_motion.update(a):
                 self._counters["motions_still"] += dx_m != 0.0 or turn_rad != 0.0
                 moves[k, :3] = 0.0
                 self._velocity_m_s[node] = (0.0, 0.0)
                 continue
-            if speed_gate.exceeded(node, way_m, duration_s, fraction):
+            if speed_gate.exceeded(a):
                 self._make(rows, moves, reported, slice(begin, k))
                 self._move_doubtful(rows, moves, reported, k)
                 begin = k + 1

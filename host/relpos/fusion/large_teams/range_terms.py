@@ -24,8 +24,7 @@ class RangeSlopes:
 
     def move(self, step: Advance) -> None:
         """Note how fast a node moves."""
-        moves = step.dx_m, step.dy_m, step.dtheta_rad, step.duration_s
-        self._velocity_m_s[step.node] = velocity_m_s(*moves)
+        self._velocity_m_s[step.node] = velocity_m_s(step)
 
     def of(
         self,

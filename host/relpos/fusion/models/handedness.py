@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from relpos.fusion.timeline import Advance
+
 BENT_M = 0.7
 """A way so far from a straight one has no mirror image with the same ranges.
 
@@ -31,9 +33,9 @@ class _Way:
     now_m: complex = 0j
     facing: complex = 1.0 + 0j
 
-    def move(self, dx_m: float, dy_m: float, turn_rad: float) -> None:
-        self.now_m += self.facing * complex(dx_m, dy_m)
-        self.facing *= cmath.rect(1.0, turn_rad)
+    def move(self, step: Advance) -> None:
+        self.now_m += self.facing * complex(step.dx_m, step.dy_m)
+        self.facing *= cmath.rect(1.0, step.dtheta_rad)
         if abs(self.now_m - self.places_m[-1]) > APART_M:
             self.places_m.append(self.now_m)
 
@@ -59,10 +61,10 @@ class Handedness:
     _ways: dict[int, _Way] = field(default_factory=dict)
     """Node -> its way since nothing has been open."""
 
-    def move(self, node: int, dx_m: float, dy_m: float, turn_rad: float) -> None:
-        """Add a node's reported displacement (m, forward and left) and turn."""
+    def move(self, step: Advance) -> None:
+        """Add a piece of a node's reported motion."""
         if self._open:
-            self._ways.setdefault(node, _Way()).move(dx_m, dy_m, turn_rad)
+            self._ways.setdefault(step.node, _Way()).move(step)
 
     def unsure(self, unknown: Set[int], near: Mapping[int, Set[int]]) -> set[int]:
         """Return who may be its mirror image.

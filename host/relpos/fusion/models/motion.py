@@ -47,14 +47,13 @@ With 0, 5 and 12, the error of four people who fan out after six minutes side by
 """
 
 
-def velocity_m_s(
-    dx_m: float, dy_m: float, turn_rad: float, duration_s: float
-) -> tuple[float, float]:
+def velocity_m_s(step: Advance) -> tuple[float, float]:
     """Return the velocity, forward and left at its end, of a displacement given at its begin."""
+    turn_rad, duration_s = step.dtheta_rad, step.duration_s
     if duration_s <= 0.0:
         return 0.0, 0.0
     c, s = math.cos(turn_rad) / duration_s, math.sin(turn_rad) / duration_s
-    return c * dx_m + s * dy_m, c * dy_m - s * dx_m
+    return c * step.dx_m + s * step.dy_m, c * step.dy_m - s * step.dx_m
 
 
 def reported_sigmas(step: Advance) -> tuple[float, float, float]:

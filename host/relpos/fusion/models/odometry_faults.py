@@ -234,15 +234,14 @@ class SpeedGate:
     usual_m_s: dict[int, float] = field(default_factory=dict)
     _steps: dict[int, int] = field(default_factory=dict)
 
-    def exceeded(self, node: int, length_m: float, duration_s: float, share: float = 1.0) -> bool:
-        """Add a displacement; return whether it is far above the node's usual speed.
-
-        Of a piece of a report, ``share`` is how much of it.
-        """
+    def exceeded(self, step: Advance) -> bool:
+        """Add a piece of a report; return whether it is far above the node's usual speed."""
+        node, duration_s = step.node, step.duration_s
+        length_m = math.hypot(step.dx_m, step.dy_m)
         if length_m <= MOVING_M_S * duration_s or duration_s <= 0.0:
             return False
         # Two reports whose clocks cross may be a millisecond apart.
-        speed = length_m / max(duration_s, LEAST_S * share)
+        speed = length_m / max(duration_s, LEAST_S * step.fraction)
         usual = self.usual_m_s.get(node, USUAL_M_S)
         most = max(FAR_FASTER * usual, HASTE_M_S)
         seen = self._steps[node] = self._steps.get(node, PRIOR_STEPS) + 1
@@ -273,16 +272,9 @@ class ZeroMotionDetector:
     _open: dict[int, tuple[float, float, float, float]] = field(default_factory=dict)
     _recent: dict[int, tuple[tuple[float, float, float], ...]] = field(default_factory=dict)
 
-    def update(
-        self,
-        node: int,
-        dx_m: float,
-        dy_m: float,
-        dtheta_rad: float,
-        duration_s: float,
-        share: float,
-    ) -> bool:
-        """Add a piece of a report (``share`` of it); return whether the node stands there."""
+    def update(self, step: Advance) -> bool:
+        """Add a piece of a report; return whether the node stands there."""
+        _, node, duration_s, dx_m, dy_m, dtheta_rad, share = step[:7]
         turns = abs(dtheta_rad) > STILL_RAD_S * duration_s
         if turns or math.hypot(dx_m, dy_m) > STILL_M_S * duration_s:
             if node in self._open:
