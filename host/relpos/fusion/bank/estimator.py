@@ -39,7 +39,7 @@ from relpos.fusion.initial_poses import (
     by_node,
 )
 from relpos.fusion.models.detection import Detection, on_one_floor
-from relpos.fusion.models.handedness import Handedness
+from relpos.fusion.models.handedness import Handedness, Way
 from relpos.fusion.models.motion import WALK_S, WithinReport, reported_sigmas, velocity_m_s
 from relpos.fusion.models.north import North
 from relpos.fusion.models.odometry_faults import SpeedGate, ZeroMotionDetector, vagueness
@@ -115,9 +115,8 @@ class Bank:
     """Node -> velocity forward and left, by its newest displacement."""
     _row: dict[int, int] = field(default_factory=dict)
     _known: dict[int, _Known] = field(default_factory=dict)
-    _standing: dict[int, complex] = field(default_factory=dict)
-    """Located nodes without a heading: how far they have gone since, in their own first frame."""
-    _facing: dict[int, complex] = field(default_factory=dict)
+    _standing: dict[int, Way] = field(default_factory=dict)
+    """Located nodes without a heading: what they have gone since."""
     _pending: list[Advance] = field(default_factory=list)
     _counters: Counter[str] = field(default_factory=Counter)
     _moved: bool = False
@@ -439,7 +438,7 @@ class Bank:
         for n, (node, row) in enumerate(zip(mixture.nodes, rows, strict=True)):
             these.set_scale(row, float(mixture.scales[n]))
             if mixture.heading_sigma_rad(n) > HEADING_RESOLVED_RAD:
-                self._standing[node] = complex(0.0)
+                self._standing[node] = Way()
 
     def _nearest(self, mixture: PoseMixture) -> int:
         """Return the row of the located node nearest to the nodes that have been found."""
@@ -451,18 +450,14 @@ class Bank:
 
     def _set_off(self, step: Advance) -> None:
         """Give a node without a heading all directions once it has moved; its ranges select."""
-        gone = self._standing[step.node]
-        gone += complex(step.dx_m, step.dy_m) * self._facing.get(step.node, 1.0)
-        self._standing[step.node] = gone
-        self._facing[step.node] = self._facing.get(step.node, 1.0) * complex(
-            math.cos(step.dtheta_rad), math.sin(step.dtheta_rad)
-        )
-        if abs(gone) < SET_OFF_M:
+        way = self._standing[step.node]
+        way.move(step)
+        if abs(way.now_m) < SET_OFF_M:
             return
         self._advance()
-        del self._standing[step.node], self._facing[step.node]
+        del self._standing[step.node]
         self.core.adaptive.grow()
-        self.core.hypotheses.split_heading(self._row[step.node], abs(gone))
+        self.core.hypotheses.split_heading(self._row[step.node], abs(way.now_m))
         self._counters["headings_sought"] += 1
 
     def _pairs(self, pairs: Sequence[tuple[int, int]]) -> tuple[Indices, Indices, Floats, Floats]:

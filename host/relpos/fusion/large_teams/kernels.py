@@ -28,7 +28,7 @@ ENTRIES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (4, 4))
 
 @compiled
 def move(
-    state: Floats, lever: Floats, noise: Floats, headings: Floats, node: Indices, moved: Floats
+    state: Floats, lever: Floats, noise: Floats, moments: Floats, node: Indices, moved: Floats
 ) -> None:
     """Move nodes by pieces of reported displacements, one after the other.
 
@@ -37,8 +37,8 @@ def move(
     displacement (people turn, then move). What the covariance has to be changed by is collected
     per node: ``lever`` (N, 3, 3) is the derivative of the pose by heading, drift and scale of the
     last update (but for the heading's by itself), ``noise`` (N, 7) the covariance xx, xy, yy, xh,
-    yh, hh, and the scale's variance, added since. ``headings`` (N, 3) are the heading's variance at
-    the last update, its covariance with the drift, and the drift's variance.
+    yh, hh, and the scale's variance, added since. ``moments`` (N, 6) of the last update are xx, yy,
+    xy, the heading's variance, its covariance with the drift, and the drift's variance.
 
     A heading error e of variance v turns the displacement d: on average it is shorter by
     exp(-v/2), and varies along itself by d^2 (1 - exp(-v))^2 / 2, the second-order terms.
@@ -55,7 +55,7 @@ def move(
         # The turn's noise first: it turns this displacement, too.
         noise[i, 5] += moved[e, 5] * moved[e, 5]
         gained = lever[i, 2, 1]
-        spread = headings[i, 0] + gained * (2.0 * headings[i, 1] + gained * headings[i, 2])
+        spread = moments[i, 3] + gained * (2.0 * moments[i, 4] + gained * moments[i, 5])
         spread += noise[i, 5]
         shrunk = math.exp(-0.5 * spread)
         dx, dy = c * forward - s * left, s * forward + c * left

@@ -79,8 +79,9 @@ class NeighbourhoodFilter:
     """How often nodes changed strips, and strips were laid out anew or widened."""
     _lever: Floats = field(default_factory=lambda: np.empty((0, 3, 3)))
     _noise: Floats = field(default_factory=lambda: np.empty((0, len(kernels.ENTRIES))))
-    _heading: Floats = field(default_factory=lambda: np.empty((0, 3)))
-    """Variances of heading and of drift at the last update, and their covariance between (N, 3)."""
+    _moments: Floats = field(default_factory=lambda: np.empty((0, 6)))
+    """At the last update: variances of x and y, their covariance, the heading's variance, its
+    covariance with the drift, and the drift's variance (N, 6)."""
     _behind: bool = False
     _axis: Floats = field(default_factory=lambda: np.array([1.0, 0.0]))
     _origin_m: float = 0.0
@@ -145,7 +146,7 @@ class NeighbourhoodFilter:
             diagonal[k][:] = whole[np.ix_(at, at)]
             if k + 1 < len(states):
                 following[k][:] = whole[np.ix_(at, states[k + 1])]
-        self._heading = self._heading_moments()
+        self._moments = self._own_moments()
 
     def _dense(self, reach: int | None = None) -> Floats:
         """Return the whole covariance (5N, 5N), node by node: far blocks by the chain.
@@ -174,7 +175,7 @@ class NeighbourhoodFilter:
 
         Forward, left, turn, then the three standard deviations, then how long the node moved.
         """
-        kernels.move(self.state, self._lever, self._noise, self._heading, node, moved)
+        kernels.move(self.state, self._lever, self._noise, self._moments, node, moved)
         self._behind = True
 
     def _catch_up(self) -> None:
@@ -184,7 +185,7 @@ class NeighbourhoodFilter:
             self._carried[:, axis] += self._lever[:, axis, by, None] * self._carried[:, 2 + by]
         kernels.propagate(self._covariance, self._layout, self._lever, self._noise)
         self._behind = False
-        self._heading = self._heading_moments()
+        self._moments = self._own_moments()
 
     # -- ranges --------------------------------------------------------------------------------
 
@@ -223,7 +224,7 @@ class NeighbourhoodFilter:
         step = np.linalg.solve(self.terms_information, told[:, 0])
         self.terms = self.terms + step
         self.state += self._carried @ step
-        self._heading = self._heading_moments()
+        self._moments = self._own_moments()
         pull = np.zeros((len(self.state), 2))
         pulls = (weight * whitened[:, 0])[:, None] * lines[:, 1:3]
         np.subtract.at(pull, node, pulls)
@@ -271,23 +272,15 @@ class NeighbourhoodFilter:
     def marginals(self) -> Floats:
         """Return the variances xx, yy, the covariance xy, and the heading's variance: (N, 4)."""
         self._catch_up()
-        result = np.empty((self.pose.shape[0], 4))
-        for k, block in enumerate(self._layout.views(self._covariance, COVARIANCE)[0]):
-            n = len(block) // COVARIANCE
-            x, y = block[:n], block[n : 2 * n, n : 2 * n]
-            result[self._layout.nodes_of(k)] = np.column_stack(
-                (x.diagonal(), y.diagonal(), x.diagonal(n), block.diagonal()[2 * n : 3 * n])
-            )
-        return result
+        return self._moments[:, :4]
 
-    def _heading_moments(self) -> Floats:
-        result = np.empty((len(self.state), 3))
+    def _own_moments(self) -> Floats:
+        result = np.empty((len(self.state), 6))
         for k, block in enumerate(self._layout.views(self._covariance, COVARIANCE)[0]):
             n = len(block) // COVARIANCE
-            own = block.diagonal()
-            cross = block[2 * n : 3 * n, 3 * n : 4 * n].diagonal()
-            both = (own[2 * n : 3 * n], cross, own[3 * n : 4 * n])
-            result[self._layout.nodes_of(k)] = np.column_stack(both)
+            x, y, h, d = (block[a : a + n, a:].diagonal() for a in range(0, 4 * n, n))
+            xy, hd = block[:n, n:].diagonal(), block[2 * n : 3 * n, 3 * n :].diagonal()
+            result[self._layout.nodes_of(k)] = np.column_stack((x, y, xy, h, hd, d))
         return result
 
     def inflate(self, nodes: Indices, sigma_m: float, sigma_rad: float) -> None:

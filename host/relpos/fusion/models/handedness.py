@@ -26,7 +26,7 @@ PLACED = 3
 
 
 @dataclass(slots=True)
-class _Way:
+class Way:
     """What a node has gone, in the frame of its beginning."""
 
     places_m: list[complex] = field(default_factory=lambda: [0j])
@@ -34,6 +34,7 @@ class _Way:
     facing: complex = 1.0 + 0j
 
     def move(self, step: Advance) -> None:
+        """Add a piece of motion."""
         self.now_m += self.facing * complex(step.dx_m, step.dy_m)
         self.facing *= cmath.rect(1.0, step.dtheta_rad)
         if abs(self.now_m - self.places_m[-1]) > APART_M:
@@ -58,13 +59,13 @@ class Handedness:
     """
 
     _open: set[int] = field(default_factory=set)
-    _ways: dict[int, _Way] = field(default_factory=dict)
+    _ways: dict[int, Way] = field(default_factory=dict)
     """Node -> its way since nothing has been open."""
 
     def move(self, step: Advance) -> None:
         """Add a piece of a node's reported motion."""
         if self._open:
-            self._ways.setdefault(step.node, _Way()).move(step)
+            self._ways.setdefault(step.node, Way()).move(step)
 
     def unsure(self, unknown: Set[int], near: Mapping[int, Set[int]]) -> set[int]:
         """Return who may be its mirror image.
