@@ -10,7 +10,7 @@ import relpos
 from relpos import fusion
 from relpos.cli.fuse import Job
 from relpos.errors import DataError
-from relpos.fusion.post import Reference, referring
+from relpos.fusion.post import Referring, referring
 from relpos.measurements import Height, Motion, Prior
 from relpos.runs import NodeInfo
 from relpos.runs.description import Description, description_text, parse_description
@@ -19,7 +19,7 @@ POST, WEARER = 7, 1
 
 
 def test_the_weather_that_a_post_shows_is_no_climb_of_anybody() -> None:
-    reference = Reference(frozenset({POST}))
+    reference = Referring(fusion.make("deadreckoning", []), frozenset({POST}))
     weather_m_s = 0.01  # More than 4 hPa an hour.
     left_m = []
     for second in range(1200):

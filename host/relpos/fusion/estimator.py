@@ -257,6 +257,13 @@ LOST_EPOCHS = 10
 """Without news for so many epochs a node is ``stale``, then ``lost`` (run format, "Out")."""
 
 
+def by_silence(epochs: int) -> NodeStatus:
+    """Return the status of a located node without news for so many epochs."""
+    if epochs >= LOST_EPOCHS:
+        return NodeStatus.LOST
+    return NodeStatus.STALE if epochs >= STALE_EPOCHS else NodeStatus.OK
+
+
 PLACING_RANGES = 3
 """So many ranges place a node of a large team whose motion is missing: what it walks unseen begins
 at the oldest of them (``mission-gap-20``, 300 s: 0.76 m where it begins at the last report, 0.44
@@ -319,9 +326,7 @@ class Presence:
     @property
     def status(self) -> NodeStatus:
         """``ok``, ``stale`` or ``lost``, by silence alone."""
-        if self.silent_epochs >= LOST_EPOCHS:
-            return NodeStatus.LOST
-        return NodeStatus.STALE if self.silent_epochs >= STALE_EPOCHS else NodeStatus.OK
+        return by_silence(self.silent_epochs)
 
 
 TOLD_S = 0.1

@@ -58,7 +58,6 @@ def alternatives_of(
     weights: Floats,
     poses: Floats,
     covariances: Floats,
-    most: int = MAX_ALTERNATIVES,
 ) -> tuple[Alternative, ...]:
     """Give weights (K,), poses (K, N, 3), position covariances (K, N, 2, 2) as alternatives.
 
@@ -68,7 +67,7 @@ def alternatives_of(
         _circle(weights, poses[:, n, :2], covariances[:, n]) is not None for n in range(len(nodes))
     ]
     compact = np.flatnonzero(~np.array(ringed, dtype=bool))
-    group = _groups(weights, poses[:, compact, :2], covariances[:, compact], most)
+    group = _groups(weights, poses[:, compact, :2], covariances[:, compact])
     probability = np.bincount(group, weights=weights)
     rows = []
     for rank, g in enumerate(np.argsort(-probability, kind="stable")):
@@ -223,7 +222,7 @@ def _circle(
     return float(middle[0] + centre[0]), float(middle[1] + centre[1]), radius, width
 
 
-def _groups(weights: Floats, places: Floats, covariances: Floats, most: int) -> Indices:
+def _groups(weights: Floats, places: Floats, covariances: Floats) -> Indices:
     """Number hypotheses (K,) by mode: places (K, N, 2), covariances (K, N, 2, 2)."""
     count = weights.size
     if places.shape[1] == 0 or count == 1:
@@ -237,7 +236,7 @@ def _groups(weights: Floats, places: Floats, covariances: Floats, most: int) -> 
         for k in order:
             if group[k] >= 0:
                 continue
-            if len(leaders) == most:
+            if len(leaders) == MAX_ALTERNATIVES:
                 break
             off = places - places[k]
             near = ((off * off).sum(axis=2) < widen * reach2[k]).all(axis=1)

@@ -1,6 +1,6 @@
 """The command post's node: nobody wears it, and it lies still.
 
-Before any estimator (:class:`Reference`) its motion becomes none, and the drift of its pressure
+Before any estimator (:class:`Referring`) its motion becomes none, and the drift of its pressure
 is taken from the heights of all (:class:`~relpos.fusion.models.pressure.Weather`).
 """
 
@@ -22,9 +22,10 @@ def posts_of(nodes: Mapping[int, Mounting] | None) -> frozenset[int]:
 
 
 @dataclass(slots=True)
-class Reference:
-    """Refers what a team measures to its nodes at the command post (``posts``)."""
+class Referring:
+    """An estimator that gets what a team measures referred to its nodes at the command post."""
 
+    estimator: Estimator
     posts: frozenset[int]
     weather: Weather = field(default_factory=Weather)
     _start_m: dict[int, float] = field(default_factory=dict)
@@ -43,17 +44,9 @@ class Reference:
         drift_m -= self._start_m.setdefault(measured.node, drift_m)
         return replace(measured, height_m=measured.height_m - drift_m)
 
-
-@dataclass(slots=True)
-class Referring:
-    """An estimator that gets everything through a :class:`Reference`."""
-
-    estimator: Estimator
-    reference: Reference
-
     def process(self, measurement: Measurement) -> list[Estimate]:
         """Take one measurement; return the estimates it completes."""
-        return self.estimator.process(self.reference.refer(measurement))
+        return self.estimator.process(self.refer(measurement))
 
     def finish(self) -> list[Estimate]:
         """Process what waits for a later motion."""
@@ -67,4 +60,4 @@ class Referring:
 def referring(estimator: Estimator, nodes: Mapping[int, Mounting] | None) -> Estimator:
     """Let an estimator use the command post's nodes; without any it stays as it is."""
     posts = posts_of(nodes)
-    return Referring(estimator, Reference(posts)) if posts else estimator
+    return Referring(estimator, posts) if posts else estimator

@@ -18,14 +18,13 @@ import numpy.typing as npt
 
 from relpos.fusion.estimator import (
     ANY_ANGLE_RAD,
-    LOST_EPOCHS,
-    STALE_EPOCHS,
     Estimate,
     Estimator,
     NodeEstimate,
     NodeStatus,
     PairEstimate,
     Parameter,
+    by_silence,
     named_pairs,
     pair_moments,
 )
@@ -238,16 +237,12 @@ def _estimates(
                 (k, n), (float(poses[k, n, 2]), math.sqrt(max(float(p[2, 2]), 0.0)))
             )
             spread = math.sqrt(max(float(p[0, 0] + p[1, 1]), 0.0))
-            located = bool(begun[k - 1, n] and ranged[n])
-            status = NodeStatus.OK
-            if not located:
+            if not (begun[k - 1, n] and ranged[n]):
                 status = NodeStatus.UNLOCATED
             elif name in ambiguous and spread > SURE_M:
                 status = NodeStatus.AMBIGUOUS
-            elif silent[n] >= LOST_EPOCHS:
-                status = NodeStatus.LOST
-            elif silent[n] >= STALE_EPOCHS:
-                status = NodeStatus.STALE
+            else:
+                status = by_silence(int(silent[n]))
             rows.append(
                 NodeEstimate(
                     name, float(poses[k, n, 0]), float(poses[k, n, 1]),

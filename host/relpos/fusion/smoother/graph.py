@@ -371,11 +371,12 @@ def _unseen(duration_s: Floats, report_s: Floats, has_report: npt.NDArray[np.boo
     return np.where((report_s > GAP * usual_s) | ended, walked_m2[:, None], 0.0)
 
 
-def _usual_length(length_m: Floats, walks: npt.NDArray[np.bool_], half: int = 3) -> Floats:
+def _usual_length(length_m: Floats, walks: npt.NDArray[np.bool_]) -> Floats:
     """Mean length of the walked chords around each, (K - 1, N); as reported for a standing one.
 
     A chord that happened to be reported too short is not more certain than its neighbours.
     """
+    half = 3
     kernel = np.ones(2 * half + 1)
     total = np.empty_like(length_m)
     for i in range(length_m.shape[1]):
