@@ -275,6 +275,8 @@ class Presence:
     """What every estimator keeps of a node beside its pose: its height, and its last motion."""
 
     vertical: Vertical = AT_THE_START
+    velocity_m_s: tuple[float, float] = (0.0, 0.0)
+    """Forward and left, by its newest displacement."""
     news_s: float = -inf
     silent_epochs: int = 0
     diffused_s: float = -inf

@@ -111,8 +111,6 @@ class Bank:
     vertical: VerticalFilter = field(init=False)
     clocks: Clocks = field(default_factory=Clocks)
     handedness: Handedness = field(default_factory=Handedness)
-    _velocity_m_s: dict[int, tuple[float, float]] = field(default_factory=dict)
-    """Node -> velocity forward and left, by its newest displacement."""
     _row: dict[int, int] = field(default_factory=dict)
     _known: dict[int, _Known] = field(default_factory=dict)
     _standing: dict[int, Way] = field(default_factory=dict)
@@ -223,7 +221,7 @@ class Bank:
             way_m = math.hypot(dx_m, dy_m)
             self.range_correlation.move(node, way_m, turn_rad)
             self.handedness.move(a)
-            self._velocity_m_s[node] = velocity_m_s(a)
+            known.velocity_m_s = velocity_m_s(a)
             usual = speed_gate.usual_m_s.get(node, 0.0)
             known.within.move(way_m, duration_s, fraction, usual)
             # How it turned meanwhile its ranges cannot say.
@@ -240,7 +238,7 @@ class Bank:
             if zero_motion.update(a):
                 self._counters["motions_still"] += dx_m != 0.0 or turn_rad != 0.0
                 moves[k, :3] = 0.0
-                self._velocity_m_s[node] = (0.0, 0.0)
+                known.velocity_m_s = (0.0, 0.0)
                 continue
             if speed_gate.exceeded(a):
                 self._make(rows, moves, reported, slice(begin, k))
@@ -324,8 +322,8 @@ class Bank:
 
     def _velocity_at(self, node: int, time_s: float) -> tuple[float, float]:
         """Return a node's velocity forward and left (m/s); 0 where its motion is missing."""
-        missing = self._known[node].diffused_s >= time_s
-        return (0.0, 0.0) if missing else self._velocity_m_s.get(node, (0.0, 0.0))
+        known = self._known[node]
+        return (0.0, 0.0) if known.diffused_s >= time_s else known.velocity_m_s
 
     def _climb(self, time_s: float) -> None:
         """Update heights at the end of an epoch; take back what stairs have added to motion."""
@@ -374,7 +372,7 @@ class Bank:
         """Return a node's velocity by its last report, in world axes."""
         mean, _ = self.core.hypotheses.moments(poses_alone=True)
         heading = float(mean[PER_NODE * self._row[node] + StateIndex.HEADING])
-        forward, left = self._velocity_m_s.get(node, (0.0, 0.0))
+        forward, left = self._known[node].velocity_m_s
         c, s = math.cos(heading), math.sin(heading)
         return np.array([c * forward - s * left, s * forward + c * left])
 

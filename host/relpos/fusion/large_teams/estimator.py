@@ -31,7 +31,7 @@ from relpos.fusion.estimator import (
 from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.initial_poses import Initialiser, PoseMixture, by_node
 from relpos.fusion.large_teams.kernels import NEAREST_M, RangeModel, Ranges
-from relpos.fusion.large_teams.range_terms import RangeSlopes
+from relpos.fusion.large_teams.range_terms import slopes_of
 from relpos.fusion.large_teams.sparse_filter import (
     GROWTH,
     LATENESS,
@@ -39,7 +39,7 @@ from relpos.fusion.large_teams.sparse_filter import (
     NeighbourhoodFilter,
 )
 from relpos.fusion.large_teams.variance_components import VarianceComponents
-from relpos.fusion.models.motion import reported_sigmas
+from relpos.fusion.models.motion import reported_sigmas, velocity_m_s
 from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_variances
 from relpos.fusion.models.odometry_faults import JUMP_M
 from relpos.fusion.models.ranging import (
@@ -130,7 +130,6 @@ class LargeTeam:
     _outlying: Floats = field(default_factory=lambda: np.empty(0))
     """Fraction of outliers in each node's latest ranges."""
     _components: VarianceComponents = field(default_factory=VarianceComponents)
-    _slopes: RangeSlopes = field(default_factory=RangeSlopes)
     _outliers: OutlierPersistence = field(default_factory=OutlierPersistence)
     _correlation: RangeCorrelation = field(default_factory=RangeCorrelation)
     _sigma_count: float = SIGMA_R_COUNT
@@ -251,7 +250,7 @@ class LargeTeam:
         """Apply the displacements since the last call."""
         steps, self._pending = self._pending, []
         for a in steps:
-            self._slopes.move(a)
+            self._known[a.node].velocity_m_s = velocity_m_s(a)
             self._correlation.move(a.node, math.hypot(a.dx_m, a.dy_m), a.dtheta_rad)
             if a.node not in self._row:
                 self.initialiser.advance(a)
@@ -311,13 +310,14 @@ class LargeTeam:
         headings = self.filter.pose[rows, 2].tolist()
         for k, r in enumerate(ranges):
             height_m = self._height(r.peer) - self._height(r.node)
-            variance_m2 = sum(self._known[end].vertical.sigma_z_m ** 2 for end in (r.node, r.peer))
+            ends = self._known[r.node], self._known[r.peer]
+            variance_m2 = sum(known.vertical.sigma_z_m**2 for known in ends)
             horizontal_m = math.sqrt(max(r.range_m**2 - height_m**2 - variance_m2, 0.0))
             # Var(dz^2) / (4 r^2), as in the bank (``fusion/bank/range_update.py``).
             lifted_m2 = (height_m**2 + 0.5 * variance_m2) * variance_m2 / r.range_m**2
-            node, peer = (r.node, headings[k][0]), (r.peer, headings[k][1])
             apart_m = float(distance[k])
-            slopes = self._slopes.of((sight[k][0], sight[k][1]), apart_m, node, peer)
+            velocities = [known.velocity_m_s for known in ends]
+            slopes = slopes_of((sight[k][0], sight[k][1]), apart_m, headings[k], velocities)
             excess_m = horizontal_m - apart_m
             self._collected.append(_Collected(r, excess_m, slopes, lifted_m2))
             self._reach_m = max(self._reach_m * REACH_FADE, r.range_m)

@@ -8,41 +8,31 @@ all are too long, and the longer ones by more. The slopes are those of the bank
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 
-from relpos.fusion.models.motion import velocity_m_s
 from relpos.fusion.models.ranging import growth_slope, shadow_slope
-from relpos.fusion.timeline import Advance
+
+Vector = tuple[float, float]
 
 
-@dataclass(slots=True)
-class RangeSlopes:
-    """Slopes of ranges in the body's shadow, the lateness of time stamps, their bias and growth."""
+def slopes_of(
+    sight: Vector,
+    distance_m: float,
+    headings_rad: Sequence[float],
+    velocities_m_s: Sequence[Vector],
+) -> tuple[float, ...]:
+    """Return a range's slopes in the body's shadow, the lateness of time stamps, bias and growth.
 
-    _velocity_m_s: dict[int, tuple[float, float]] = field(default_factory=dict)
-    """Node -> velocity forward and left, by its newest displacement."""
+    ``sight`` is the direction from the node to the peer; the others are the node's and the peer's.
+    """
+    ends = zip(headings_rad, velocities_m_s, strict=True)
+    own, other = (_along(sight, heading, velocity) for heading, velocity in ends)
+    return shadow_slope(sight, *headings_rad), own - other, 1.0, growth_slope(distance_m)
 
-    def move(self, step: Advance) -> None:
-        """Note how fast a node moves."""
-        self._velocity_m_s[step.node] = velocity_m_s(step)
 
-    def of(
-        self,
-        sight: tuple[float, float],
-        distance_m: float,
-        node: tuple[int, float],
-        peer: tuple[int, float],
-    ) -> tuple[float, ...]:
-        """Return a range's slopes: ``sight`` is the direction from the node to the peer.
-
-        ``node`` and ``peer`` are ids and headings (rad).
-        """
-        lateness = self._along(sight, *node) - self._along(sight, *peer)
-        return shadow_slope(sight, node[1], peer[1]), lateness, 1.0, growth_slope(distance_m)
-
-    def _along(self, sight: tuple[float, float], node: int, heading_rad: float) -> float:
-        """Return the velocity (m/s) of a node along ``sight``."""
-        c, s = math.cos(heading_rad), math.sin(heading_rad)
-        forward, left = self._velocity_m_s.get(node, (0.0, 0.0))
-        ahead, aside = sight[0] * c + sight[1] * s, sight[1] * c - sight[0] * s
-        return ahead * forward + aside * left
+def _along(sight: Vector, heading_rad: float, velocity_m_s: Vector) -> float:
+    """Return along ``sight`` the velocity (m/s) of a node, given forward and left."""
+    c, s = math.cos(heading_rad), math.sin(heading_rad)
+    forward, left = velocity_m_s
+    ahead, aside = sight[0] * c + sight[1] * s, sight[1] * c - sight[0] * s
+    return ahead * forward + aside * left
