@@ -17,7 +17,8 @@ from relpos.fusion import Estimate, NodeStatus, switching
 from relpos.fusion.large_teams.estimator import LargeTeam
 from relpos.fusion.models.motion_variances import ALONG, WHITE
 from relpos.fusion.switching import LARGE_TEAM
-from relpos.measurements import Measurement, Motion, Prior, Range
+from relpos.measurements import Height, Measurement, Motion, Prior, Range
+from relpos.runs import NodeInfo
 
 CROWD = CrowdSettings(nodes=60, seconds=50)
 
@@ -256,3 +257,21 @@ def test_a_large_team_on_two_floors_without_heights_is_no_surer_than_right() -> 
     scored = relpos.evaluate(relpos.fuse(run), run, bound=False).metrics
     assert scored.relative_distance_rmse_m < 0.26
     assert 0.4 < scored.nees_distance < 2.0
+
+
+@pytest.mark.parametrize("size", [3, LARGE_TEAM + 2])
+@pytest.mark.parametrize("climbs", [False, True], ids=["level", "with heights"])
+def test_a_tag_is_as_high_as_it_is_worn_and_its_wearer_has_climbed(size: int, climbs: bool) -> None:
+    nodes = range(1, size + 1)
+    priors = [Prior(n, 3.0 * n, 0.0, 0.0, 0.1, 0.1) for n in nodes]
+    worn = {n: NodeInfo(height_m=1.3) for n in nodes}
+    made, estimates = fusion.make("bank", priors, {}, 0, worn), []
+    for second in range(1, 20):
+        for n in nodes:
+            estimates += made.process(Motion(float(second), n, 0.5, 0.0, 0.0))
+            if climbs:
+                estimates += made.process(Height(float(second), n, 0.0, 0.1))
+        for n in nodes[:-1]:
+            estimates += made.process(Range(second - 0.5, n, n + 1, 3.0))
+    for estimate in [*estimates, *made.finish()]:
+        assert [n.z_m for n in estimate.nodes] == pytest.approx([1.3] * size, abs=0.3)

@@ -24,6 +24,7 @@ from relpos.fusion.estimator import (
     PairEstimate,
     Parameter,
     Presence,
+    Vertical,
     refuse_unmoved,
     refuse_unranged,
     unlocated,
@@ -144,7 +145,7 @@ class LargeTeam:
         self.filter = NeighbourhoodFilter(math.inf, model)
         known: list[Prior] = []
         for p in by_node(self.priors):
-            self._known[p.node] = Presence()
+            self._presence(p.node)
             if p.is_known:
                 known.append(p)
             else:
@@ -206,21 +207,20 @@ class LargeTeam:
     # -- nodes ---------------------------------------------------------------------------------
 
     def _presence(self, node: int) -> Presence:
-        return self._known.setdefault(node, Presence())
-
-    def _height(self, node: int) -> float:
-        return tag_height_m(self.mountings, node) + self._known[node].vertical.z_m
+        if node not in self._known:
+            self._known[node] = Presence(Vertical(tag_height_m(self.mountings, node)))
+        return self._known[node]
 
     def _climb(self, time_s: float) -> None:
         """Update heights at the end of an epoch; take back what stairs have added to motion."""
         if not self.vertical.active:
             return
-        for back in self.vertical.close(time_s):
-            self._own["stairs_corrected"] += 1
-            self._pending.append(back)
-        self._predict()
+        corrections = self.vertical.close(time_s)
+        self._own["stairs_corrected"] += len(corrections)
+        self._move(corrections)
         for node, known in self._known.items():
-            known.vertical = self.vertical.of(node, time_s)
+            vertical, tag_m = self.vertical.of(node, time_s), tag_height_m(self.mountings, node)
+            known.vertical = vertical._replace(z_m=tag_m + vertical.z_m)
 
     def _add(self, nodes: Sequence[int], poses: Floats, covariances: Floats) -> None:
         if not nodes:
@@ -252,6 +252,11 @@ class LargeTeam:
         for a in steps:
             self._known[a.node].velocity_m_s = velocity_m_s(a)
             self._correlation.move(a.node, math.hypot(a.dx_m, a.dy_m), a.dtheta_rad)
+        self._move(steps)
+
+    def _move(self, steps: Sequence[Advance]) -> None:
+        """Move nodes, the sought ones, too."""
+        for a in steps:
             if a.node not in self._row:
                 self.initialiser.advance(a)
         steps = [a for a in steps if a.node in self._row]
@@ -309,8 +314,8 @@ class LargeTeam:
         sight = (off / np.maximum(distance, NEAREST_M)[:, None]).tolist()
         headings = self.filter.pose[rows, 2].tolist()
         for k, r in enumerate(ranges):
-            height_m = self._height(r.peer) - self._height(r.node)
             ends = self._known[r.node], self._known[r.peer]
+            height_m = ends[1].vertical.z_m - ends[0].vertical.z_m
             variance_m2 = sum(known.vertical.sigma_z_m**2 for known in ends)
             horizontal_m = math.sqrt(max(r.range_m**2 - height_m**2 - variance_m2, 0.0))
             # Var(dz^2) / (4 r^2), as in the bank (``fusion/bank/range_update.py``).
@@ -404,7 +409,7 @@ class LargeTeam:
                 located[node] = float(x), float(y), 0.5 * float(own[row, 0] + own[row, 1])
             elif node not in self.initialiser:
                 self.initialiser.add(node)
-        heights = {node: self._height(node) for node in nodes}
+        heights = {node: self._known[node].vertical.z_m for node in nodes}
         self.initialiser.update(step.time_s, ranges, located, heights)
         self._ranges_used += len(ranges)
 
