@@ -406,17 +406,24 @@ def pair_moments(places_m: Floats, covariance: Floats) -> Floats:
     Distance, its standard deviation (m), bearing and its deviation (rad), to first order; of two on
     one spot any bearing is as likely.
     """
-    i, j = np.triu_indices(len(places_m), 1)
-    off = places_m[j] - places_m[i]
-    spread = covariance[i, :, i] + covariance[j, :, j] - covariance[i, :, j] - covariance[j, :, i]
-    distance, bearing = np.hypot(off[:, 0], off[:, 1]), np.arctan2(off[:, 1], off[:, 0])
-    apart = distance > 0.0
-    unit = off / np.where(apart, distance, 1.0)[:, None]
-    axes = np.stack([unit, unit[:, ::-1] * (-1.0, 1.0)])
-    along, across = np.sqrt(np.maximum(np.einsum("dpa,pab,dpb->dp", axes, spread, axes), 0.0))
-    along = np.where(apart, along, np.sqrt(0.5 * np.trace(spread, axis1=1, axis2=2)))
-    sideways = np.where(apart, across / np.where(apart, distance, 1.0), ANY_ANGLE_RAD)
-    return np.column_stack([distance, along, bearing, np.minimum(sideways, ANY_ANGLE_RAD)])
+    # Numbers one by one: arrays so small take NumPy several times as long.
+    places, p, rows = places_m.tolist(), covariance.tolist(), []
+    for i, j in combinations(range(len(places)), 2):
+        dx, dy = places[j][0] - places[i][0], places[j][1] - places[i][1]
+        xx, yy, xy = (
+            p[i][a][i][b] + p[j][a][j][b] - p[i][a][j][b] - p[j][a][i][b]
+            for a, b in ((0, 0), (1, 1), (0, 1))
+        )
+        distance = hypot(dx, dy)
+        if distance > 0.0:
+            c, s = dx / distance, dy / distance
+            along = c * c * xx + 2.0 * c * s * xy + s * s * yy
+            across = s * s * xx - 2.0 * c * s * xy + c * c * yy
+            sideways = min(sqrt(max(across, 0.0)) / distance, ANY_ANGLE_RAD)
+        else:
+            along, sideways = 0.5 * (xx + yy), ANY_ANGLE_RAD
+        rows.append((distance, sqrt(max(along, 0.0)), atan2(dy, dx), sideways))
+    return np.array(rows).reshape(-1, 4)
 
 
 def named_pairs(nodes: Sequence[int], moments: Floats) -> tuple[PairEstimate, ...]:
