@@ -21,6 +21,7 @@ from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link import xbee
 from relpos.link.port import Link
 from relpos.measurements import Heading, Motion, Observation, Range, Status
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.protocol.schema import Message
 from relpos.simulation.team import SCENARIOS
@@ -58,13 +59,13 @@ class Record:
     walkers: Mapping[int, WalkerTruth]
     power_on_s: Mapping[int, float]
     clock_rates: Mapping[int, float]
-    frames: list[tuple[float, wire.Frame]] = field(default_factory=list)
+    frames: list[tuple[float, framing.Frame]] = field(default_factory=list)
     observations: list[tuple[float, Observation]] = field(default_factory=list)
     counts: dict[str, float] = field(default_factory=dict)
     dated: list[tuple[int, float, float]] = field(default_factory=list)
     """(node, its own time, the host's time) of every motion that was taken."""
 
-    def of(self, message: Message, node: int) -> list[tuple[float, wire.Frame]]:
+    def of(self, message: Message, node: int) -> list[tuple[float, framing.Frame]]:
         """A node's frames of one kind that were taken, with their arrivals."""
         return [(t, f) for t, f in self.frames if f.node == node and f.message is message]
 
@@ -179,14 +180,14 @@ class _Tap:
 
     def feed(
         self, data: bytes, arrival_s: float
-    ) -> Iterator[tuple[list[Observation], wire.Frame | None]]:
+    ) -> Iterator[tuple[list[Observation], framing.Frame | None]]:
         for packet in self._parser.feed(data):
             taken = self._received()
             observations = self.link.feed(xbee.encode(packet), arrival_s)
             frame = None
             if self._received() > taken and isinstance(packet, xbee.Receive16 | xbee.Receive64):
-                key = wire.node_key(self._key, packet.data[3])
-                frame = wire.decode(packet.data, key)
+                key = framing.node_key(self._key, packet.data[3])
+                frame = framing.decode(packet.data, key)
             yield observations, frame
 
     def _received(self) -> int:

@@ -19,6 +19,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "host"))
 
+from relpos.protocol import framing  # noqa: E402
 from relpos.protocol import messages as wire  # noqa: E402
 from relpos.protocol.schema import Message, Quantity  # noqa: E402
 
@@ -478,7 +479,7 @@ def read_vectors() -> list[dict[str, Any]]:
 def _bless() -> None:
     vectors = read_vectors()
     for v in vectors:
-        v["hex"] = wire.encode(
+        v["hex"] = framing.encode(
             wire.BY_NAME[v["message"]],
             v["node"],
             v["boot"],

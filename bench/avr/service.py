@@ -32,6 +32,7 @@ from relpos.emulator.surroundings import (
 )
 from relpos.emulator.xbee import DELIVERED, Transmission, XbeeModule, line_time_us
 from relpos.link.beacon import BEACON_PERIOD_S, BeaconSchedule
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.simulation.team import make_team
 
@@ -86,7 +87,7 @@ class Service:
         self.radio = XbeeModule(NODE, NODE, self, self._to_board)
         self.coordinator = XbeeModule(wire.COORDINATOR, 0x1000, self, lambda _time, _data: None)
         self.engine.on_transmit = self.radio.from_serial
-        self.frames: list[wire.Frame] = []
+        self.frames: list[framing.Frame] = []
         self.counts: Counter[str] = Counter()
         self._events: list[tuple[int, int, Callable[[int], None]]] = []
         self._order = itertools.count()
@@ -139,8 +140,8 @@ class Service:
         def arrive(now_us: int) -> None:
             sent.report(now_us, DELIVERED)
             try:
-                self.frames.append(wire.decode(sent.data))
-            except wire.FrameError as error:
+                self.frames.append(framing.decode(sent.data))
+            except framing.FrameError as error:
                 self.counts[type(error).__name__] += 1
 
         self._at(sent.time_us + AIR_US, arrive)
@@ -148,7 +149,7 @@ class Service:
     def _command(self, now_us: int) -> None:
         code, value = next(self._commands)
         self._counter += 1
-        data = wire.encode(
+        data = framing.encode(
             wire.COMMAND,
             NODE,
             0,
@@ -160,7 +161,7 @@ class Service:
 
     def _beacon(self, now_us: int) -> None:
         self._beacon_counter += 1
-        data = wire.encode(
+        data = framing.encode(
             wire.BEACON,
             wire.BROADCAST,
             0,

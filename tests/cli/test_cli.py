@@ -23,6 +23,7 @@ from relpos.cli import main, output
 from relpos.evaluation.summary import FIGURES
 from relpos.link import xbee
 from relpos.measurements import Motion, Step
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.runs import load_run, read_estimates
 
@@ -397,13 +398,13 @@ def test_a_port_that_vanishes_keeps_what_was_received(tmp_path: Path) -> None:
 def motion_bytes(node: int, second: int) -> bytes:
     """What a coordinator hands over when ``node`` reports half a metre a second."""
     values = dict.fromkeys(wire.MOTION.field, 0) | {"time_s": float(second), "x_m": 0.5 * second}
-    frame = wire.encode(wire.MOTION, node, 0, 2 * second, values)
+    frame = framing.encode(wire.MOTION, node, 0, 2 * second, values)
     return xbee.encode(xbee.Receive16(node, -50, frame), escaped=True)
 
 
 def ranges_bytes(node: int, second: int, peer: int, range_m: float) -> bytes:
     entry = {"peer": peer, "range_m": range_m, "rss_dbm": -80, "age_s": 0.0, "quality": 0}
-    frame = wire.encode(
+    frame = framing.encode(
         wire.RANGES, node, 0, 2 * second + 1, {"time_s": float(second), "ranges": [entry]}
     )
     return xbee.encode(xbee.Receive16(node, -50, frame), escaped=True)

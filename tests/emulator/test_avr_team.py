@@ -7,6 +7,7 @@ import pytest
 from relpos.emulator.avr.elf import default_build_folder
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link import xbee
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 
 SECONDS = 20.0
@@ -23,7 +24,7 @@ def motions(board):
         for _, data in team.stream():
             for packet in parser.feed(data):
                 if isinstance(packet, xbee.Receive16):
-                    frame = wire.decode(packet.data)
+                    frame = framing.decode(packet.data)
                     if frame.message is wire.MOTION:
                         latest.setdefault(frame.node, []).append(dict(frame.values))
     return latest

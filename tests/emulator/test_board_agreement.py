@@ -22,7 +22,7 @@ from relpos.emulator.node import draw_node_errors
 from relpos.emulator.surroundings import Surroundings
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link import xbee
-from relpos.protocol import messages as wire
+from relpos.protocol import framing
 
 SAMPLE_US = 20_000
 PHASE_US = 8_000
@@ -116,7 +116,7 @@ def frames(board, seconds):
         for _, data in team.stream():
             for packet in parser.feed(data):
                 if isinstance(packet, xbee.Receive16):
-                    frame = wire.decode(packet.data)
+                    frame = framing.decode(packet.data)
                     found[frame.node, frame.message.name].append(frame)
     return found
 

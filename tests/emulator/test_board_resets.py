@@ -10,6 +10,7 @@ from relpos.emulator.engine import NodeClockError
 from relpos.emulator.node import BoardKind, NodeErrors
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link import xbee
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 
 NEEDS = missing_parts()
@@ -46,7 +47,7 @@ class Listener:
     def _hear(self, data, at_us):
         for request in self.parser.feed(data):
             if isinstance(request, xbee.Transmit16):
-                self.frames.append((wire.decode(request.data), at_us * 1e-6))
+                self.frames.append((framing.decode(request.data), at_us * 1e-6))
 
     def until(self, time_us):
         """The frames up to then since the last call."""

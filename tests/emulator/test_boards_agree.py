@@ -21,6 +21,7 @@ from relpos.emulator.native import NativeEngine
 from relpos.emulator.node import prepared_eeprom
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.link import xbee
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 
 pytestmark = pytest.mark.skipif(missing_parts() is not None, reason=str(missing_parts()))
@@ -95,7 +96,7 @@ class Sent:
         self.data += data
         for request in self.parser.feed(data):
             if isinstance(request, xbee.Transmit16):
-                self.frames.append(wire.decode(request.data))
+                self.frames.append(framing.decode(request.data))
 
 
 def written_down(kind, seconds):

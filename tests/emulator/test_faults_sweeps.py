@@ -21,6 +21,7 @@ from relpos.emulator.node import EmulatedNode, draw_node_errors
 from relpos.emulator.pozyx import RangeResult
 from relpos.emulator.surroundings import Surroundings
 from relpos.emulator.xbee import DELIVERED, XbeeModule
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.simulation.team import make_team
 from relpos.simulation.walker import RATE_HZ
@@ -87,9 +88,9 @@ class Bench:
         frame = None
         for key in (OLD_KEY, NEW_KEY):
             try:
-                frame = wire.decode(sent.data, wire.node_key(key, sent.data[3]))
+                frame = framing.decode(sent.data, framing.node_key(key, sent.data[3]))
                 break
-            except wire.FrameTagError:
+            except framing.FrameTagError:
                 continue
         assert frame is not None, "a frame under no key that was ever given"
         self.frames.append((sent.time_us * 1e-6, frame))

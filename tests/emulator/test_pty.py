@@ -14,6 +14,7 @@ from relpos.emulator.pty import PseudoTerminal
 from relpos.errors import DeviceError
 from relpos.link.port import Link, observe
 from relpos.link.xbee import VIRTUAL_TIME, Parser, Receive16, UnknownFrame, encode
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 
 
@@ -201,7 +202,7 @@ def test_the_link_reads_motion_at_virtual_times_through_the_port():
                 "x_m": 0.02 * number,
                 "state": wire.MotionState.MOVING,
             }
-            return encode(Receive16(5, -40, wire.encode(wire.MOTION, 5, 0, number, values)))
+            return encode(Receive16(5, -40, framing.encode(wire.MOTION, 5, 0, number, values)))
 
     link = Link()
     motions = []
@@ -222,7 +223,7 @@ def test_the_link_lives_in_the_marked_time_whatever_its_own_clock_says():
     link = Link()
     motions = []
     for k in range(1, 100):
-        frame = wire.encode(wire.MOTION, 5, 0, k, values | {"time_s": float(k)})
+        frame = framing.encode(wire.MOTION, 5, 0, k, values | {"time_s": float(k)})
         data = encode(UnknownFrame(VIRTUAL_TIME, (k * 1_000_000 + 2_000).to_bytes(8, "big")))
         motions += link.feed(data + encode(Receive16(5, -40, frame)), arrival_s=0.05 * k)
     assert [m.time_s for m in motions] == pytest.approx([k + 0.002 for k in range(1, 100)])

@@ -15,6 +15,7 @@ from relpos.errors import DataError, RelposError
 from relpos.link.port import Link, observe, open_port
 from relpos.link.xbee import Parser, Receive16
 from relpos.measurements import Motion, Range, Status
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 
 SECONDS = 40.0
@@ -49,7 +50,7 @@ def test_everything_at_the_port_is_a_frame_of_this_protocol(received):
     _, chunks, _, _ = received
     frames = frames_of(chunks)
     assert all(isinstance(frame, Receive16) for frame in frames)
-    decoded = [wire.decode(frame.data) for frame in frames]
+    decoded = [framing.decode(frame.data) for frame in frames]
     assert {f.node for f in decoded} == {1, 2, 3}
     assert all(f.node == frame.source for f, frame in zip(decoded, frames, strict=True))
     assert {"motion", "ranges", "status"} <= {f.message.name for f in decoded}
@@ -143,7 +144,7 @@ def beacons_of(team, node, seconds):
 
     def tap(left_us, data):
         received.extend(
-            (left_us * 1e-6, wire.decode(frame.data, wire.node_key(team.key, frame.data[3])))
+            (left_us * 1e-6, framing.decode(frame.data, framing.node_key(team.key, frame.data[3])))
             for frame in parser.feed(data)
             if isinstance(frame, Receive16) and frame.data[2] == wire.BEACON.number
         )

@@ -24,6 +24,7 @@ from relpos.link import port as serial_port
 from relpos.link import xbee
 from relpos.link.decoder import Decoder
 from relpos.measurements import Observation
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.protocol.schema import OutOfRangeError
 
@@ -55,7 +56,7 @@ def crc_fits(data: bytes) -> bool:
 
 def key_of(frame: bytes) -> bytes:
     """The key of the node in whose name a frame is."""
-    return wire.node_key(KEY, frame[3] if len(frame) > 3 else wire.BROADCAST)
+    return framing.node_key(KEY, frame[3] if len(frame) > 3 else wire.BROADCAST)
 
 
 class CheckedDecoder(Decoder):
@@ -102,14 +103,15 @@ class CheckedDecoder(Decoder):
     def feed(self, data: bytes, arrival_s: float, rssi_dbm: int | None = None) -> list[Observation]:
         """As the decoder's; BrokenPromiseError where it does what it must not."""
         try:
-            frame = wire.decode(data, key_of(data))
-        except wire.FrameError:
+            frame = framing.decode(data, key_of(data))
+        except framing.FrameError:
             frame = None
         if frame is not None:
             require(data in self.genuine, "a frame without a genuine tag is accepted")
             values = (frame.message, frame.node, frame.boot, frame.counter, frame.values)
             require(
-                wire.encode(*values, key_of(data)) == data, "decoded, it is encoded as another one"
+                framing.encode(*values, key_of(data)) == data,
+                "decoded, it is encoded as another one",
             )
         received = self.received()
         before = repr(self.state())
@@ -202,7 +204,7 @@ class Script:
     # -- frames --
 
     def _seal(self, raw: bytes, key: bytes | None = None) -> bytes:
-        data = wire.seal(raw, key or key_of(raw))
+        data = framing.seal(raw, key or key_of(raw))
         if key is None:
             self._genuine.add(data)
         self._sent.append(data)
@@ -219,7 +221,7 @@ class Script:
 
     def _motion(self, node: int, counter: int) -> bytes:
         values = dict.fromkeys(wire.MOTION.field, 0)
-        data = wire.encode(wire.MOTION, node, 0, counter, values, wire.node_key(KEY, node))
+        data = framing.encode(wire.MOTION, node, 0, counter, values, framing.node_key(KEY, node))
         self._genuine.add(data)
         return data
 
@@ -286,7 +288,7 @@ class Script:
             data = self._mutant()
             if len(data) > 19:
                 raw = data[:-10]
-                data = raw + wire.crc16(raw).to_bytes(2, "little") + data[-8:]
+                data = raw + framing.crc16(raw).to_bytes(2, "little") + data[-8:]
             totals["forged"] += data not in self._genuine
             self._feed_frame(data)
         elif code in (7, 8, 9):
@@ -322,7 +324,7 @@ def refuses_with_its_own_errors(data: bytes) -> None:
     if message.entries is not None:
         values[message.entries.name] = []
     with contextlib.suppress(OutOfRangeError):
-        wire.encode(message, 1, 0, 0, values)
+        framing.encode(message, 1, 0, 0, values)
 
 
 def run_one(data: bytes, totals: Counter[str]) -> None:

@@ -31,6 +31,7 @@ from relpos.link.beacon import HostBeacons
 from relpos.link.decoder import REPLAYS_BEFORE_CHALLENGE, Decoder
 from relpos.link.dialogue import NodeDialogue
 from relpos.measurements import Motion, Range
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 
 KEY = bytes(range(16))
@@ -39,7 +40,7 @@ ZERO = dict.fromkeys(wire.MOTION.field, 0)
 
 def motion(counter, time_s, node=1, boot=0, key=wire.DEFAULT_KEY):
     values = ZERO | {"time_s": time_s}
-    return wire.encode(wire.MOTION, node, boot, counter, values, wire.node_key(key, node))
+    return framing.encode(wire.MOTION, node, boot, counter, values, framing.node_key(key, node))
 
 
 def test_the_hosts_counter_is_the_time_and_never_stands_or_goes_back():
@@ -205,11 +206,11 @@ def test_new_keys_travel_hidden_and_come_out_whole():
     new = bytes(range(100, 132))
     (request,) = xbee.Parser().feed(link.new_keys(3, new, token=77))
     assert new[:16] not in request.data
-    old = wire.node_key(KEY, 3)
-    frame = wire.decode(request.data, old)
+    old = framing.node_key(KEY, 3)
+    frame = framing.decode(request.data, old)
     assert (frame.message, frame.node, frame.values["token"]) == (wire.NEW_KEY, 3, 77)
     masked = b"".join(frame.values[f"masked_{k}"].to_bytes(4, "little") for k in range(8))
-    mask = wire.masked_keys(old, 77, frame.counter, bytes(32))
+    mask = framing.masked_keys(old, 77, frame.counter, bytes(32))
     mask = b"".join(mask[f"masked_{k}"].to_bytes(4, "little") for k in range(8))
     assert bytes(a ^ b for a, b in zip(masked, mask, strict=True)) == new
     # Meanwhile a node may answer under either key.
@@ -222,15 +223,15 @@ def test_new_keys_travel_hidden_and_come_out_whole():
 def test_a_nodes_key_says_nothing_of_the_teams_or_anothers():
     """The published construction, from the standard's own module, and no key twice."""
     said = hmac.new(KEY, b"relpos node key\x03", hashlib.sha256).digest()
-    assert wire.node_key(KEY, 3) == said[:16]
-    keys = {wire.node_key(KEY, node) for node in range(256)} | {KEY, wire.DEFAULT_KEY}
+    assert framing.node_key(KEY, 3) == said[:16]
+    keys = {framing.node_key(KEY, node) for node in range(256)} | {KEY, wire.DEFAULT_KEY}
     assert len(keys) == 258
-    assert {wire.node_key(wire.DEFAULT_KEY, node) for node in range(256)} == {wire.DEFAULT_KEY}
+    assert {framing.node_key(wire.DEFAULT_KEY, node) for node in range(256)} == {wire.DEFAULT_KEY}
 
 
 def test_a_stolen_node_speaks_and_commands_for_nobody_else():
     """An attacker has all that node 3 holds: its own key and the beacon's."""
-    held = wire.node_key(KEY, 3), wire.node_key(KEY, wire.BROADCAST)
+    held = framing.node_key(KEY, 3), framing.node_key(KEY, wire.BROADCAST)
     decoder = Decoder((KEY,))
     for n in range(10):
         for node in (1, 2, 3):
@@ -239,7 +240,7 @@ def test_a_stolen_node_speaks_and_commands_for_nobody_else():
     for n in range(10, 40):
         for node in (1, 2, 4):
             for key in held:
-                frame = wire.encode(wire.MOTION, node, 0, n, ZERO | {"time_s": 1.0 + n}, key)
+                frame = framing.encode(wire.MOTION, node, 0, n, ZERO | {"time_s": 1.0 + n}, key)
                 assert decoder.feed(frame, 1.0 + n) == []
     assert repr({n: decoder.nodes[n] for n in (1, 2)}) == before
     assert set(decoder.nodes) == {1, 2, 3}
@@ -252,12 +253,12 @@ def test_ranges_come_without_both_ends_offsets():
     status = dict.fromkeys(wire.STATUS.field, 0)
     for node, offset_m in ((1, 0.2), (2, -0.05)):
         values = status | {"time_s": 1.0, "range_offset_m": offset_m}
-        decoder.feed(wire.encode(wire.STATUS, node, 0, 0, values), 1.0)
+        decoder.feed(framing.encode(wire.STATUS, node, 0, 0, values), 1.0)
 
     def ranges(counter, range_m, peer=2):
         entry = {"peer": peer, "range_m": range_m, "rss_dbm": -80, "age_s": 0.0, "quality": 0}
         values = {"time_s": 2.0, "ranges": [entry]}
-        frame = wire.encode(wire.RANGES, 1, 0, counter, values)
+        frame = framing.encode(wire.RANGES, 1, 0, counter, values)
         return [o.range_m for o in decoder.feed(frame, 2.0) if isinstance(o, Range)]
 
     assert ranges(1, 5.0) == [pytest.approx(4.85)]
@@ -305,8 +306,8 @@ def test_counters_are_kept_beside_the_key_and_never_go_back(tmp_path):
 def answer(counter, challenge, command=wire.CommandCode.PING, boot=0, **other):
     values = {"token": challenge.token, "command": command, "value": challenge.value} | other
     values["result"] = wire.CommandResult.DONE
-    key = wire.node_key(KEY, challenge.node)
-    return wire.encode(wire.ACKNOWLEDGEMENT, challenge.node, boot, counter, values, key)
+    key = framing.node_key(KEY, challenge.node)
+    return framing.encode(wire.ACKNOWLEDGEMENT, challenge.node, boot, counter, values, key)
 
 
 def test_one_frame_of_the_last_counter_silences_no_node():

@@ -14,6 +14,7 @@ from relpos.link.beacon import FORGET_S, MAX_NODES, BeaconSchedule, HostBeacons
 from relpos.link.port import Link
 from relpos.live.inputs import PortInput
 from relpos.measurements import Status
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 
 
@@ -112,7 +113,7 @@ def test_every_beacon_fits_the_wire():
     for k in range(5000):
         values = schedule.values(k * 0.1234567)
         assert 0.0 <= values["phase_s"] < values["period_s"]
-        frame = wire.decode(wire.encode(wire.BEACON, wire.BROADCAST, 0, k + 1, values))
+        frame = framing.decode(framing.encode(wire.BEACON, wire.BROADCAST, 0, k + 1, values))
         assert ids(frame.values) == list(range(1, MAX_NODES + 1))
 
 
@@ -121,7 +122,7 @@ def test_every_beacon_fits_the_wire():
 
 def motion(node, counter):
     values = dict.fromkeys(wire.MOTION.field, 0)
-    data = wire.encode(wire.MOTION, node, 0, counter, values)
+    data = framing.encode(wire.MOTION, node, 0, counter, values)
     return xbee.encode(xbee.Receive16(node, -60, data))
 
 
@@ -132,13 +133,13 @@ def test_a_host_reports_the_nodes_that_it_receives():
     link.feed(motion(6, 1) + motion(2, 1), 0.5)
     (request,) = xbee.Parser().feed(beacons.due(3.25))
     assert request.destination == xbee.BROADCAST_16
-    frame = wire.decode(request.data)
+    frame = framing.decode(request.data)
     assert (frame.message, frame.node) == (wire.BEACON, wire.BROADCAST)
     assert ids(frame.values) == [2, 6]
     assert frame.values["phase_s"] == pytest.approx(1.25)
     assert beacons.due(3.3) == b""
     (later,) = xbee.Parser().feed(beacons.due(4.25))
-    assert wire.decode(later.data).counter > frame.counter
+    assert framing.decode(later.data).counter > frame.counter
 
 
 def test_a_host_sends_none_to_an_emulated_team_that_marks_its_own_time():
@@ -162,11 +163,11 @@ def test_a_node_that_takes_no_beacon_is_asked_once_in_ten_seconds():
     for k in range(1, 31):
         values = dict.fromkeys(wire.STATUS.field, 0) | {"time_s": float(k)}
         values["health"] = wire.Health.BEACON if k > 26 else 0
-        data = wire.encode(wire.STATUS, 6, 0, k, values)
+        data = framing.encode(wire.STATUS, 6, 0, k, values)
         link.feed(xbee.encode(xbee.Receive16(6, -60, data)), float(k))
         for request in xbee.Parser().feed(beacons.due(float(k))):
             if request.destination == 6:
-                assert wire.decode(request.data).values["command"] == wire.CommandCode.PING
+                assert framing.decode(request.data).values["command"] == wire.CommandCode.PING
                 asked_s.append(k)
     assert asked_s == [12, 23]
 
@@ -201,7 +202,7 @@ def test_a_command_that_listens_sends_beacons_to_the_nodes_it_receives(command, 
     finally:
         os.close(master)
         os.close(slave)
-    assert ids(wire.decode(request.data).values) == [3]
+    assert ids(framing.decode(request.data).values) == [3]
     if command == "monitor":
         assert "no team key" in capsys.readouterr().err
 

@@ -17,18 +17,19 @@ from relpos.link import xbee
 from relpos.link.clock import NodeClock
 from relpos.link.decoder import Decoder
 from relpos.measurements import Heading, Height, Motion, Range, Status, Step, out_of_bounds
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 
 MOTION_ZERO = dict.fromkeys(wire.MOTION.field, 0)
 
 
 def motion_frame(counter, node=1, boot=0, **values):
-    return wire.encode(wire.MOTION, node, boot, counter, MOTION_ZERO | values)
+    return framing.encode(wire.MOTION, node, boot, counter, MOTION_ZERO | values)
 
 
 def ranges_frame(counter, time_s, peer, range_m, age_s, node=1, boot=0):
     entry = {"peer": peer, "range_m": range_m, "rss_dbm": -80, "age_s": age_s, "quality": 0}
-    return wire.encode(wire.RANGES, node, boot, counter, {"time_s": time_s, "ranges": [entry]})
+    return framing.encode(wire.RANGES, node, boot, counter, {"time_s": time_s, "ranges": [entry]})
 
 
 # --- XBee frames against digi-xbee ------------------------------------------------------------
@@ -298,7 +299,7 @@ def test_a_restart_after_days_widens_within_the_bounds_of_a_motion():
 def test_a_restart_before_the_first_motion_widens_nothing():
     decoder = Decoder()
     status = dict.fromkeys(wire.STATUS.field, 0) | {"time_s": 1.0}
-    decoder.feed(wire.encode(wire.STATUS, 1, 4, 7, status), 1.0)
+    decoder.feed(framing.encode(wire.STATUS, 1, 4, 7, status), 1.0)
     (motion,) = motions(decoder.feed(motion_frame(1024, boot=5, time_s=1), 9.0))
     assert (motion.sigma_x_m, motion.sigma_y_m, motion.sigma_theta_rad) == (0.0, 0.0, 0.0)
 
@@ -365,7 +366,7 @@ def test_a_damaged_or_foreign_frame_changes_nothing():
     for foreign in ((wire.MAGIC, 1, 1, 9), (wire.MAGIC, 1, 1, 9), (wire.MAGIC, 1)):
         assert decoder.feed(bytes(foreign), 2.0) == []
     assert decoder.feed(good[:20] + bytes((good[20] ^ 1,)) + good[21:], 2.0) == []
-    forged = wire.encode(wire.MOTION, 1, 0, 1, MOTION_ZERO | {"time_s": 2}, bytes(range(16)))
+    forged = framing.encode(wire.MOTION, 1, 0, 1, MOTION_ZERO | {"time_s": 2}, bytes(range(16)))
     assert decoder.feed(forged, 2.0) == []
     assert repr(decoder.nodes) == before
     assert decoder.foreign_versions == {9: 1}
@@ -382,7 +383,7 @@ def test_a_damaged_or_foreign_frame_changes_nothing():
 def test_what_only_a_host_sends_and_what_only_a_host_is_called_are_no_nodes():
     decoder = Decoder()
     command = {"token": 1, "command": 4, "value": 930}
-    assert decoder.feed(wire.encode(wire.COMMAND, 1, 0, 1, command), 1.0) == []
+    assert decoder.feed(framing.encode(wire.COMMAND, 1, 0, 1, command), 1.0) == []
     for node in (wire.COORDINATOR, wire.BROADCAST):
         assert decoder.feed(motion_frame(1, node=node, time_s=1), 1.0) == []
     assert decoder.counts == {"not_from_a_node": 3}
@@ -392,7 +393,7 @@ def test_what_only_a_host_sends_and_what_only_a_host_is_called_are_no_nodes():
 def test_steps_are_dated_back_by_their_ages():
     steps = [{"length_m": 0.7, "age_s": 1.5}, {"length_m": 0.8, "age_s": 0.9}]
     values = {"time_s": 10.0, "steps": steps}
-    assert Decoder().feed(wire.encode(wire.STEPS, 1, 0, 0, values), 110.0) == [
+    assert Decoder().feed(framing.encode(wire.STEPS, 1, 0, 0, values), 110.0) == [
         Step(pytest.approx(108.5), 1, pytest.approx(0.7)),
         Step(pytest.approx(109.1), 1, pytest.approx(0.8)),
     ]
@@ -462,7 +463,7 @@ def test_a_command_reaches_the_node_as_the_wire_says():
     link = serial_port.Link()
     token, data = link.command(7, wire.CommandCode.SET_LEG_LENGTH_MM, 930)
     (request,) = xbee.Parser().feed(data)
-    frame = wire.decode(request.data)
+    frame = framing.decode(request.data)
     assert request.destination == 7
     assert dict(frame.values) == {"token": token, "command": 4, "value": 930}
 
@@ -471,7 +472,7 @@ def test_status_figures_carry_the_links_own_counts():
     decoder = Decoder()
     decoder.feed(motion_frame(0, time_s=1), 1.0)
     values = dict.fromkeys(wire.STATUS.field, 0) | {"time_s": 9.0, "battery_v": 3.7}
-    observed = decoder.feed(wire.encode(wire.STATUS, 1, 0, 3, values), 9.0, -61)
+    observed = decoder.feed(framing.encode(wire.STATUS, 1, 0, 3, values), 9.0, -61)
     figures = {o.name: o.value for o in observed if isinstance(o, Status)}
     assert (figures["battery_v"], figures["link_lost"], figures["link_rssi_dbm"]) == (3.7, 2, -61)
 

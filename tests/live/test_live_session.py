@@ -23,6 +23,7 @@ from relpos.live.requests import Request
 from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert
 from relpos.measurements import Event, Measurement, Motion
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.runs import Description, load_run, read_estimates
 
@@ -479,7 +480,7 @@ def test_a_full_disk_under_the_counters_file_ends_no_session(tmp_path):
     try:
         for counter in range(3):
             values = dict.fromkeys(wire.MOTION.field, 0) | {"time_s": 1.0 + counter}
-            data = wire.encode(wire.MOTION, 1, 0, counter, values)
+            data = framing.encode(wire.MOTION, 1, 0, counter, values)
             os.write(master, xbee.encode(xbee.Receive16(1, -40, data)))
             assert live.read(5.0) is not None
         (remark,) = live.remarks()

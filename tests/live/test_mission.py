@@ -29,6 +29,7 @@ from relpos.live.sinks import Sink
 from relpos.live.team_view import Alert
 from relpos.live.tracks import Tracks
 from relpos.measurements import Motion
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.recording import make_recorder
 from relpos.recording.about import About
@@ -356,7 +357,7 @@ def test_an_estimator_that_fails_in_a_mission_goes_on_from_its_last_estimate_but
 
 def test_a_start_at_one_pose_outlives_a_kill_before_the_first_checkpoint(tmp_path, monkeypatch):
     values = dict.fromkeys(wire.MOTION.field, 0) | {"time_s": 1.0}
-    sent = xbee.encode(xbee.Receive16(1, -40, wire.encode(wire.MOTION, 1, 0, 1, values)))
+    sent = xbee.encode(xbee.Receive16(1, -40, framing.encode(wire.MOTION, 1, 0, 1, values)))
     sessions = []
 
     def session(job, source, options, *, common, **_):

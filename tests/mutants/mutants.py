@@ -39,7 +39,7 @@ class Room:
 HOST, LIB = "host/relpos/", "firmware/lib/"
 ROOMS = {
     "protocol": Room(
-        (HOST + "protocol/messages.py",),
+        (HOST + "protocol/messages.py", HOST + "protocol/framing.py"),
         ("tests/protocol", "tests/link/test_link.py", "tests/link/test_authentication.py"),
     ),
     "authentication": Room(

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from relpos.cli import main
 from relpos.link.decoder import Decoder
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.recording import open_recording
 from relpos.recording.replay import Replay
@@ -67,7 +68,7 @@ def test_a_node_of_an_earlier_wire_version_is_named_and_changes_nothing(version)
 def test_a_host_of_an_earlier_version_finds_what_it_needs_to_name_this_one():
     """Versions 1 and 2 look at the magic, then at the version, and take the fourth byte's node."""
     for node in (1, 77, 254):
-        frame = wire.encode(
+        frame = framing.encode(
             wire.MOTION, node, 0, 1 << 31, dict.fromkeys(wire.MOTION.field, 0), bytes(range(16))
         )
         assert (frame[0], frame[1], frame[3]) == (0xB5, wire.PROTOCOL_VERSION, node)

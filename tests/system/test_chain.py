@@ -28,6 +28,7 @@ from relpos.evaluation.summary import FIGURES
 from relpos.link import xbee
 from relpos.link.port import Link
 from relpos.measurements import Motion, Range
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.runs import load_run, save_run
 
@@ -131,7 +132,7 @@ def test_half_of_the_frames_lost_lose_no_motion(team_bytes):
     last = {}
     for index, (_, data) in enumerate(frames):
         (packet,) = xbee.Parser().feed(data)
-        if wire.decode(packet.data).message is wire.MOTION:
+        if framing.decode(packet.data).message is wire.MOTION:
             last[packet.source] = index
     halved, ranges_left, link = end_poses(
         frame for k, frame in enumerate(frames) if k % 2 or k in last.values()

@@ -19,6 +19,7 @@ from boot_loaders import (
 from relpos.emulator.avr.board import BOARDS, Board, ResetCause
 from relpos.emulator.avr.elf import default_build_folder, find_firmware, read_firmware
 from relpos.link import xbee
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 
 pytestmark = pytest.mark.skipif(needs() is not None, reason=str(needs()))
@@ -107,7 +108,7 @@ class Started:
         self.board = Board(BOARDS[kind], replace(program, flash=bytes(image)))
         self.board.set_reset_vector(address)
         self.parser = xbee.Parser()
-        self.statuses: list[wire.Frame] = []
+        self.statuses: list[framing.Frame] = []
 
     def run(self, ms: int) -> None:
         """Run so long, answering the module's part."""
@@ -116,7 +117,7 @@ class Started:
             sent = bytes(value for _, value in self.board.take_sent())
             for request in self.parser.feed(sent):
                 if isinstance(request, xbee.Transmit16):
-                    frame = wire.decode(request.data)
+                    frame = framing.decode(request.data)
                     if frame.message is wire.STATUS:
                         self.statuses.append(frame)
                     status = xbee.TransmitStatus(request.frame_id, 0)
@@ -133,7 +134,7 @@ class Started:
             self.run(1)
         return None
 
-    def status(self) -> wire.Frame:
+    def status(self) -> framing.Frame:
         """The first status from now on."""
         self.statuses.clear()
         for _ in range(400):
@@ -158,7 +159,7 @@ class Started:
 
     def command(self, code: wire.CommandCode, node: int) -> None:
         values = {"token": 77, "command": int(code), "value": 0}
-        data = wire.encode(wire.COMMAND, node, 0, 1, values)
+        data = framing.encode(wire.COMMAND, node, 0, 1, values)
         self.board.receive(xbee.encode(xbee.Receive16(0, -40, data)), self.board.cycle)
 
 

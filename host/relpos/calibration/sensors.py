@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relpos.errors import DataError
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.protocol.schema import OutOfRangeError
 
@@ -82,4 +83,4 @@ class SensorCalibration:
 
 def checksum(words: Sequence[int]) -> int:
     """Return the checksum with which COMMIT_CALIBRATION puts these words into force."""
-    return wire.crc16(struct.pack(f"<{len(words)}h", *words))
+    return framing.crc16(struct.pack(f"<{len(words)}h", *words))

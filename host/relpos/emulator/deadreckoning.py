@@ -23,6 +23,7 @@ from relpos.calibration.steps import (
 from relpos.errors import DataError, DeviceError
 from relpos.link.decoder import Decoder
 from relpos.measurements import Height, Motion, Step
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.runs import NodeInfo, Run
 from relpos.runs.imu import ImuRecording
@@ -182,8 +183,8 @@ class _Recorder:
     def send(self, sent: Transmission) -> None:
         """See :class:`relpos.emulator.xbee.Air`."""
         try:
-            frame = wire.decode(sent.data)
-        except wire.FrameError:
+            frame = framing.decode(sent.data)
+        except framing.FrameError:
             arrival_s = sent.time_us * 1e-6
         else:
             # The node's clock is the recording's: as if the frame had arrived when it was stamped.

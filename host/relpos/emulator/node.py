@@ -7,6 +7,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 
 from . import ak8975, mpu9150, pozyx
@@ -226,15 +227,15 @@ class EmulatedNode:
     ) -> None:
         """Hand the node a command as its radio module would, without loss: set up beforehand."""
         values = {"token": token, "command": int(code), "value": value}
-        key = wire.node_key(key, self.node)
-        data = wire.encode(wire.COMMAND, self.node, 0, token, values, key)
+        key = framing.node_key(key, self.node)
+        data = framing.encode(wire.COMMAND, self.node, 0, token, values, key)
         self.hand(coordinator, data, at_us)
 
     def set_key(self, key: bytes, token: int, at_us: int) -> None:
         """Give a node without a key those of the team's ``key`` over its cable, likewise."""
-        keys = wire.node_key(key, self.node) + wire.node_key(key, wire.BROADCAST)
-        values = wire.masked_keys(wire.DEFAULT_KEY, token, token, keys)
-        data = wire.encode(wire.NEW_KEY, self.node, 0, token, values)
+        keys = framing.node_key(key, self.node) + framing.node_key(key, wire.BROADCAST)
+        values = framing.masked_keys(wire.DEFAULT_KEY, token, token, keys)
+        data = framing.encode(wire.NEW_KEY, self.node, 0, token, values)
         self._clock.at(at_us, lambda now_us: self.radio.deliver_by_cable(data, now_us))
 
     def hand(self, coordinator: XbeeModule, data: bytes, at_us: int) -> None:

@@ -17,6 +17,7 @@ from relpos.errors import DataError
 from relpos.link import xbee as api
 from relpos.link.beacon import BEACON_PERIOD_S, BeaconSchedule
 from relpos.measurements import Event, Prior, Truth
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.simulation.team import Scenario, make_team
 from relpos.simulation.walker import RATE_HZ, WalkerTruth
@@ -181,8 +182,8 @@ class EmulatedTeam:
         self.clock.at(now_us + round(BEACON_PERIOD_S * 1e6), self._send_beacon)
         self._beacon_counter += 1
         values = self._beacons.values(now_us * 1e-6)
-        key = wire.node_key(self.key, wire.BROADCAST)
-        data = wire.encode(wire.BEACON, wire.BROADCAST, 0, self._beacon_counter, values, key)
+        key = framing.node_key(self.key, wire.BROADCAST)
+        data = framing.encode(wire.BEACON, wire.BROADCAST, 0, self._beacon_counter, values, key)
         self.send(api.encode(api.Transmit16(0, api.BROADCAST_16, data)))
 
     def stream(self) -> Iterator[tuple[int, bytes]]:

@@ -1,7 +1,7 @@
 """The team key, and counters that distinguish a new frame from a repeated one.
 
 docs/protocol.md describes a frame's tag and counter. Nothing here changes state before a frame has
-been verified by :func:`relpos.protocol.messages.decode`.
+been verified by :func:`relpos.protocol.framing.decode`.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ from typing import Any
 from relpos.link.authentication import CounterWindow, Verdict
 from relpos.link.clock import NodeClock
 from relpos.measurements import Heading, Height, Motion, Observation, Range, RawSample, Status, Step
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.said import Said
 
@@ -130,7 +131,7 @@ class Decoder:
         """Return the observations of one frame that arrived at ``arrival_s`` of the host clock."""
         try:
             frame = self._open(data)
-        except wire.ForeignVersionError as error:
+        except framing.ForeignVersionError as error:
             self.counts["ForeignVersionError"] += 1
             if error.node is not None and error.node not in self.foreign_versions:
                 self.foreign_versions[error.node] = error.version
@@ -145,9 +146,9 @@ class Decoder:
                     )
                 )
             return []
-        except wire.FrameError as error:
+        except framing.FrameError as error:
             self.counts[type(error).__name__] += 1
-            if isinstance(error, wire.FrameTagError):
+            if isinstance(error, framing.FrameTagError):
                 self._note_forged(data[3])
             return []
         if frame.node in (wire.COORDINATOR, wire.BROADCAST) or frame.message in DOWN:
@@ -219,15 +220,15 @@ class Decoder:
             values["field_readings"],
         )
 
-    def _open(self, data: bytes) -> wire.Frame:
+    def _open(self, data: bytes) -> framing.Frame:
         node = data[3] if len(data) > 3 else wire.BROADCAST
-        keys = [wire.node_key(key, node) for key in self.keys] + [*self.extra_keys.get(node, ())]
+        keys = [framing.node_key(key, node) for key in self.keys] + [*self.extra_keys.get(node, ())]
         for key in keys[:-1]:
             try:
-                return wire.decode(data, key)
-            except wire.FrameTagError:
+                return framing.decode(data, key)
+            except framing.FrameTagError:
                 continue
-        return wire.decode(data, keys[-1])
+        return framing.decode(data, keys[-1])
 
     def _note_forged(self, node: int) -> None:
         """Count a frame in a node's name under another key; remark on several."""
@@ -276,7 +277,7 @@ class Decoder:
             elif track.window.newest < newest:
                 track.window = CounterWindow.after(newest)
 
-    def _track(self, frame: wire.Frame, arrival_s: float) -> NodeTrack | None:
+    def _track(self, frame: framing.Frame, arrival_s: float) -> NodeTrack | None:
         """Return the node's track and store the counter if the frame is new; else None."""
         track = self.nodes.get(frame.node)
         if track is None:
@@ -322,7 +323,7 @@ class Decoder:
 
     @staticmethod
     def _restarted(
-        track: NodeTrack, frame: wire.Frame, window: CounterWindow, arrival_s: float
+        track: NodeTrack, frame: framing.Frame, window: CounterWindow, arrival_s: float
     ) -> NodeTrack:
         """Return a track whose totals, clock and height begin anew; counts and pose go on.
 
@@ -341,7 +342,7 @@ class Decoder:
         )
 
     def _reject(
-        self, frame: wire.Frame, track: NodeTrack, verdict: Verdict, arrival_s: float
+        self, frame: framing.Frame, track: NodeTrack, verdict: Verdict, arrival_s: float
     ) -> None:
         node = frame.node
         track.counts[verdict.value] += 1
@@ -369,7 +370,7 @@ class Decoder:
         self._challenged[node] = arrival_s, challenge
         self.challenges.append(challenge)
 
-    def _answers_challenge(self, frame: wire.Frame) -> bool:
+    def _answers_challenge(self, frame: framing.Frame) -> bool:
         """Return whether a frame is a node's answer to its challenge, which then is over."""
         asked_s, challenge = self._challenged.get(frame.node, (0.0, None))
         if challenge is None or frame.message is not wire.ACKNOWLEDGEMENT:

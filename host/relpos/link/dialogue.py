@@ -17,6 +17,7 @@ from relpos.errors import DeviceError
 from relpos.link.decoder import MAX_KEPT, Acknowledged
 from relpos.link.port import Line, Link, observe, send
 from relpos.measurements import Observation, RawSample
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 
 ANSWER_S = 1.0
@@ -223,7 +224,7 @@ class NodeDialogue:
         The link then holds its key in ``node_keys``. DeviceError: see :meth:`set_key`.
         """
         link, node_keys = self.link, self.link.node_keys
-        old, new = link.key_of(self.node), wire.node_key(team_key, node)
+        old, new = link.key_of(self.node), framing.node_key(team_key, node)
         if old == new:
             self.demand(wire.CommandCode.PING, 0)
             return False
@@ -234,7 +235,7 @@ class NodeDialogue:
         node_keys[self.node] = old
         if old == wire.DEFAULT_KEY and not getattr(self._port, "by_cable", False):
             raise DeviceError(NEEDS_CABLE.format(node=self.node))
-        keys = new + wire.node_key(team_key, wire.BROADCAST)
+        keys = new + framing.node_key(team_key, wire.BROADCAST)
         token = self._next_token()
         for _ in range(FURTHER_ATTEMPTS):
             answer = self._send(token, link.new_keys(self.node, keys, token=token))

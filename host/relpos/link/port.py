@@ -16,6 +16,7 @@ from relpos.link import xbee
 from relpos.link.authentication import HostCounter, clock_fault, of_node
 from relpos.link.decoder import Decoder
 from relpos.measurements import BOUNDS, Observation
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 from relpos.protocol.schema import Message
 from relpos.said import Said
@@ -163,12 +164,12 @@ class Link:
         The node answers under the new key.
         """
         counter = self._next_counter(node)
-        values = wire.masked_keys(self.key_of(node), token, counter, keys)
+        values = framing.masked_keys(self.key_of(node), token, counter, keys)
         return self._sealed(wire.NEW_KEY, node, counter, values, False)
 
     def key_of(self, node: int) -> bytes:
         """Return the key of frames to a node, or of beacons (:data:`wire.BROADCAST`)."""
-        return self.node_keys.get(node) or wire.node_key(self.key, node)
+        return self.node_keys.get(node) or framing.node_key(self.key, node)
 
     def accept_keys(self, *keys: bytes) -> None:
         """Send under the first team's key from now on, and accept frames under any of them."""
@@ -197,7 +198,7 @@ class Link:
         if fault and not self._faults_told:
             self._faults_told.add(node)
             self.decoder.remarks.append(fault)
-        data = wire.encode(message, node, 0, counter, values, self.key_of(node))
+        data = framing.encode(message, node, 0, counter, values, self.key_of(node))
         address = xbee.BROADCAST_16 if broadcast or node == wire.BROADCAST else node
         return xbee.encode(xbee.Transmit16(0, address, data), escaped=self._escaped)
 

@@ -1,1 +1,1 @@
-"""The wire between node and host, written once: see ``messages.py``."""
+"""The wire between node and host, written once: what is said, and how it becomes bytes."""

@@ -235,7 +235,7 @@ TEST(another_teams_frame_is_refused) {
               wire::open(vectors::kCommandBytes, sizeof vectors::kCommandBytes, key, &header));
 }
 
-// messages.masked_keys(bytes(range(16)), 0x0605, 0x01020304, bytes(32)), from PyPI's siphash24.
+// framing.masked_keys(bytes(range(16)), 0x0605, 0x01020304, bytes(32)), from PyPI's siphash24.
 TEST(new_keys_come_out_from_under_their_mask) {
   uint8_t keys[2 * wire::kKeyBytes] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
   const uint8_t body[wire::kNewKeyBytes] = {

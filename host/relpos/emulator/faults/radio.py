@@ -16,6 +16,7 @@ from relpos.emulator.xbee import (
     Transmission,
     XbeeModule,
 )
+from relpos.protocol import framing
 from relpos.protocol import messages as wire
 
 from .hooks import Hooks, LineFault, Rng
@@ -153,8 +154,8 @@ def _foreign_sender(hooks: Hooks, spec: FaultSpec, rng: Rng) -> None:
         FOREIGN_ADDRESS, 0x40000000 + FOREIGN_ADDRESS, team.radio, lambda _time, _data: None
     )
     stolen = max(team.nodes) if spec.choice("key") == "stolen" else None
-    own = rng.bytes(wire.KEY_BYTES) if stolen is None else wire.node_key(team.key, stolen)
-    beacons = own if stolen is None else wire.node_key(team.key, wire.BROADCAST)
+    own = rng.bytes(wire.KEY_BYTES) if stolen is None else framing.node_key(team.key, stolen)
+    beacons = own if stolen is None else framing.node_key(team.key, wire.BROADCAST)
     others = [node for node in team.nodes if node != stolen]
     sent = [0]
 
@@ -189,7 +190,7 @@ def _foreign_frame(count: int, node: int, now_us: int, own: bytes, beacons: byte
         (wire.BEACON, wire.BROADCAST, beacon, beacons),
     )
     message, about, values, key = choices[count % len(choices)]
-    return wire.encode(message, about, 0, 0x40000000 + count, values, key)
+    return framing.encode(message, about, 0, 0x40000000 + count, values, key)
 
 
 def uwb(hooks: Hooks, spec: FaultSpec, rng: Rng) -> None:
