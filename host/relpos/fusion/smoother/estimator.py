@@ -103,9 +103,12 @@ class Smoother:
         graph = _with_frame(graph, self._estimates)
         problem = Problem(graph)
         others = (_replay(estimator, self._measurements) for estimator in self.others)
-        least = math.inf
+        least, begun = math.inf, np.empty(0)
         for estimates in chain([self._estimates], others):
-            state = problem.first_state(_poses(graph, estimates))
+            poses = _poses(graph, estimates)
+            if np.array_equal(poses, begun):  # a large team's estimate draws no random numbers
+                break
+            state, begun = problem.first_state(poses), poses
             found = [
                 smooth(problem, state, inliers=believed) for believed in beginnings(problem, state)
             ]
