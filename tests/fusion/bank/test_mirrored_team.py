@@ -10,7 +10,7 @@ import pytest
 
 import relpos
 from relpos import fusion
-from relpos.fusion.bank.mirrored import open_sides
+from relpos.fusion.bank.mirrored import mirror_image, open_sides
 from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.fusion.models.handedness import Handedness
 from relpos.fusion.timeline import Advance
@@ -52,6 +52,12 @@ def is_mirrored_and_ok(estimate: Estimate, truth: np.ndarray) -> bool:
     nodes = estimate.nodes
     if len(nodes) < PEOPLE or any(n.status is not NodeStatus.OK for n in nodes):
         return False
+    return is_mirrored(estimate, truth)
+
+
+def is_mirrored(estimate: Estimate, truth: np.ndarray) -> bool:
+    """Whether left and right are exchanged."""
+    nodes = estimate.nodes
     own = seen(
         np.array([complex(n.x_m, n.y_m) for n in nodes]), np.array([n.heading_rad for n in nodes])
     )
@@ -96,6 +102,54 @@ def test_a_mirrored_team_is_never_ok_for_more_than_five_seconds(start: str, seed
     ]
     assert (STRAIGHT_S - 1 in wrong) == (start == "mirrored")
     assert longest_s([second for second in wrong if second > since_s]) <= 5
+
+
+@pytest.mark.parametrize(
+    "seed", [0, 9, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 9))]
+)
+def test_turns_tell_a_team_that_is_sure_of_its_mirror_image(seed: int) -> None:
+    places, headings, rows = walks(seed)
+    told = zip(places[0].conj(), -headings[0], strict=True)
+    priors = [Prior(n + 1, z.real, z.imag, turned, 0.1, 0.05) for n, (z, turned) in enumerate(told)]
+    bank = fusion.make("bank", priors, seed=seed)
+    estimates = [e for m in rows for e in bank.process(m)] + bank.finish()
+    wrong = [
+        round(e.time_s)
+        for e in estimates
+        if e.time_s == round(e.time_s)
+        and is_mirrored(e, seen(places[round(e.time_s)], headings[round(e.time_s)]))
+    ]
+    assert STRAIGHT_S - 1 in wrong
+    assert max(wrong) < 40
+
+
+def test_a_mirror_image_has_the_same_distances_and_the_other_sides() -> None:
+    rng = np.random.default_rng(5)
+    nodes, size = 4, 5 * 4 + 3
+    x = rng.normal(size=(6, size)) * 3.0
+    root = rng.normal(size=(6, size, size))
+    p = root @ root.transpose(0, 2, 1)
+    image, spread = mirror_image(x, p, nodes)
+    for before, after, p_before, p_after in zip(x, image, p, spread, strict=True):
+        own, other = (
+            seen(state[0:20:5] + 1j * state[1:20:5], state[2:20:5]) for state in (before, after)
+        )
+        assert other == pytest.approx(own.conj())
+        assert after[[3, 4, 20, 21, 22]] == pytest.approx(before[[3, 4, 20, 21, 22]])
+        # How well a distance is known, alone and together with a constant, stays the same.
+        for i, k in ((0, 1), (2, 3)):
+            known = []
+            for state, covariance in ((before, p_before), (after, p_after)):
+                off = state[[5 * k, 5 * k + 1]] - state[[5 * i, 5 * i + 1]]
+                slope = np.zeros(size)
+                slope[[5 * k, 5 * k + 1]] = off / np.hypot(*off)
+                slope[[5 * i, 5 * i + 1]] = -slope[[5 * k, 5 * k + 1]]
+                known.append((slope @ covariance @ slope, slope @ covariance[:, 21]))
+            assert known[1] == pytest.approx(known[0])
+    again, back = mirror_image(image, spread, nodes)
+    assert np.exp(1j * (again - x)[:, 2:20:5]) == pytest.approx(np.ones((6, 4)))
+    assert again[:, 0:20:5] == pytest.approx(x[:, 0:20:5])
+    assert back == pytest.approx(p)
 
 
 def test_noise_alone_does_not_choose_between_a_team_and_its_mirror_image() -> None:

@@ -39,7 +39,7 @@ from relpos.fusion.initial_poses import (
     by_node,
 )
 from relpos.fusion.models.detection import Detection, on_one_floor
-from relpos.fusion.models.handedness import Handedness, Way
+from relpos.fusion.models.handedness import Handedness, TurnAgreement, Way
 from relpos.fusion.models.motion import WALK_S, WithinReport, reported_sigmas, velocity_m_s
 from relpos.fusion.models.north import North
 from relpos.fusion.models.odometry_faults import SpeedGate, ZeroMotionDetector, vagueness
@@ -111,6 +111,7 @@ class Bank:
     vertical: VerticalFilter = field(init=False)
     clocks: Clocks = field(default_factory=Clocks)
     handedness: Handedness = field(default_factory=Handedness)
+    turn_agreement: TurnAgreement = field(default_factory=TurnAgreement)
     _row: dict[int, int] = field(default_factory=dict)
     _known: dict[int, _Known] = field(default_factory=dict)
     _standing: dict[int, Way] = field(default_factory=dict)
@@ -221,6 +222,7 @@ class Bank:
             way_m = math.hypot(dx_m, dy_m)
             self.range_correlation.move(node, way_m, turn_rad)
             self.handedness.move(a)
+            self.turn_agreement.move(a)
             known.velocity_m_s = velocity_m_s(a)
             usual = speed_gate.usual_m_s.get(node, 0.0)
             known.within.move(way_m, duration_s, fraction, usual)
@@ -530,11 +532,22 @@ class Bank:
         unsure = self.handedness.unsure(
             *open_nodes(self._row, self.core.hypotheses, covariance, distances[1])
         )
+        heading_rad = {
+            node: float(mean[PER_NODE * row + StateIndex.HEADING])
+            for node, row in self._row.items()
+            if row not in self.core.relocalisation.ambiguous
+        }
+        turns = self.turn_agreement
+        contradicted = turns.close_epoch(heading_rad)
+        if turns.doubted:
+            unsure = self._row.keys() | unsure
         report = Report(
             time_s, self._row, self._known, self.core, mean, covariance, covariance + common,
             self.initialiser, self.detection, self.clocks, distances, unsure,
         )  # fmt: skip
         estimate = report.estimate(self.north.known())
+        if contradicted:
+            self.core.relocalisation.reflect_team()
         if since_s > -math.inf:
             self._slew_clocks(time_s - since_s, mean, covariance, timeline)
         return estimate

@@ -82,6 +82,32 @@ def open_sides(
     return sides
 
 
+def mirror_image(x: Floats, p: Floats, nodes: int) -> tuple[Floats, Floats]:
+    """Return means (K, D) and covariances (K, D, D) with the team reflected, which has N ``nodes``.
+
+    The line of reflection is each hypothesis' own: through the middle of the team, along its
+    greatest extent.
+    """
+    at = PER_NODE * np.arange(nodes)
+    place_m = x[:, at + StateIndex.X] + 1j * x[:, at + StateIndex.Y]
+    middle_m = place_m.mean(axis=1, keepdims=True)
+    off_m = place_m - middle_m
+    twice_rad = np.angle((off_m**2).sum(axis=1, keepdims=True))
+    place_m = middle_m + np.exp(1j * twice_rad) * off_m.conj()
+    image, change = x.copy(), np.zeros_like(p)
+    image[:, at + StateIndex.X], image[:, at + StateIndex.Y] = place_m.real, place_m.imag
+    image[:, at + StateIndex.HEADING] = twice_rad - x[:, at + StateIndex.HEADING]
+    change[:] = np.eye(x.shape[1])
+    change[:, at + StateIndex.X, at + StateIndex.X] = np.cos(twice_rad)
+    change[:, at + StateIndex.Y, at + StateIndex.Y] = -np.cos(twice_rad)
+    change[:, at + StateIndex.X, at + StateIndex.Y] = np.sin(twice_rad)
+    change[:, at + StateIndex.Y, at + StateIndex.X] = np.sin(twice_rad)
+    # A heading goes on to err with its drift as before.
+    for entry in (StateIndex.HEADING, StateIndex.DRIFT):
+        change[:, at + entry, at + entry] = -1.0
+    return image, change @ p @ change.transpose(0, 2, 1)
+
+
 def open_nodes(
     row: Mapping[int, int], these: HypothesisSet, covariance: Floats, sigma_m: Floats
 ) -> tuple[set[int], dict[int, set[int]]]:

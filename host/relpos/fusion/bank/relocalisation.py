@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from relpos.fusion.bank.adaptive_count import AdaptiveCount
 from relpos.fusion.bank.hypothesis_set import PERTURBED_UPDATES, HypothesisSet
+from relpos.fusion.bank.mirrored import mirror_image
 from relpos.fusion.bank.storage import PER_NODE, POSE, StateIndex
 from relpos.fusion.models.odometry_faults import (
     BELIEVING,
@@ -160,6 +161,22 @@ class Relocalisation:
             these.decorrelate(own[part], lost_there, which[~kept])
         # Neither the perturbed nor the others may say how noisy anything is.
         these.perturbed[:] = FAULT_UPDATES
+
+    def reflect_team(self) -> None:
+        """Let half the hypotheses be the team's mirror image; the ranges choose."""
+        these = self._hypotheses
+        if these.settings.hypotheses == 1 or these.nodes < 2:
+            return
+        self.since_fault = 0
+        self._adaptive.grow()
+        these.resample(these.weights(), max(these.count, HYPOTHESES))
+        half = these.rng.permutation(these.count)[: these.count // 2]
+        x, p = these.dense()
+        x[half], p[half] = mirror_image(x[half], p[half], these.nodes)
+        these.store(x, p)
+        these.perturbed[:] = FAULT_UPDATES
+        self.ambiguous.update(range(these.nodes))
+        self._counters["teams_reflected"] += 1
 
     def end_ambiguity(self, covariance: Floats) -> None:
         """Take users for found again, by the mixture's covariance (D, D)."""
