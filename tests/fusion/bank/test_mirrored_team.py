@@ -129,7 +129,7 @@ def test_a_mirror_image_has_the_same_distances_and_the_other_sides() -> None:
     x = rng.normal(size=(6, size)) * 3.0
     root = rng.normal(size=(6, size, size))
     p = root @ root.transpose(0, 2, 1)
-    image, spread = mirror_image(x, p, np.arange(nodes))
+    image, spread = mirror_image(x, p, nodes)
     for before, after, p_before, p_after in zip(x, image, p, spread, strict=True):
         own, other = (
             seen(state[0:20:5] + 1j * state[1:20:5], state[2:20:5]) for state in (before, after)
@@ -146,7 +146,7 @@ def test_a_mirror_image_has_the_same_distances_and_the_other_sides() -> None:
                 slope[[5 * i, 5 * i + 1]] = -slope[[5 * k, 5 * k + 1]]
                 known.append((slope @ covariance @ slope, slope @ covariance[:, 21]))
             assert known[1] == pytest.approx(known[0])
-    again, back = mirror_image(image, spread, np.arange(nodes))
+    again, back = mirror_image(image, spread, nodes)
     assert np.exp(1j * (again - x)[:, 2:20:5]) == pytest.approx(np.ones((6, 4)))
     assert again[:, 0:20:5] == pytest.approx(x[:, 0:20:5])
     assert back == pytest.approx(p)

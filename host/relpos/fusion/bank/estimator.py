@@ -535,9 +535,10 @@ class Bank:
         heading_rad = {
             node: float(mean[PER_NODE * row + StateIndex.HEADING])
             for node, row in self._row.items()
+            if row not in self.core.relocalisation.ambiguous
         }
         turns = self.turn_agreement
-        mirrored = turns.close_epoch(heading_rad)
+        contradicted = turns.close_epoch(heading_rad)
         if turns.doubted:
             unsure = self._row.keys() | unsure
         report = Report(
@@ -545,8 +546,8 @@ class Bank:
             self.initialiser, self.detection, self.clocks, distances, unsure,
         )  # fmt: skip
         estimate = report.estimate(self.north.known())
-        if mirrored:
-            self.core.relocalisation.reflect_team(sorted(self._row[node] for node in mirrored))
+        if contradicted:
+            self.core.relocalisation.reflect_team()
         if since_s > -math.inf:
             self._slew_clocks(time_s - since_s, mean, covariance, timeline)
         return estimate

@@ -82,13 +82,13 @@ def open_sides(
     return sides
 
 
-def mirror_image(x: Floats, p: Floats, rows: npt.NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Return means (K, D) and covariances (K, D, D) with the users ``rows`` reflected.
+def mirror_image(x: Floats, p: Floats, nodes: int) -> tuple[Floats, Floats]:
+    """Return means (K, D) and covariances (K, D, D) with the team reflected, which has N ``nodes``.
 
-    The line of reflection is each hypothesis' own: through the middle of these users, along their
+    The line of reflection is each hypothesis' own: through the middle of the team, along its
     greatest extent.
     """
-    at = PER_NODE * rows
+    at = PER_NODE * np.arange(nodes)
     place_m = x[:, at + StateIndex.X] + 1j * x[:, at + StateIndex.Y]
     middle_m = place_m.mean(axis=1, keepdims=True)
     off_m = place_m - middle_m

@@ -14,11 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.bank.adaptive_count import AdaptiveCount
-from relpos.fusion.bank.common_rotation import about_origin
 from relpos.fusion.bank.hypothesis_set import PERTURBED_UPDATES, HypothesisSet
 from relpos.fusion.bank.mirrored import mirror_image
 from relpos.fusion.bank.storage import PER_NODE, POSE, StateIndex
-from relpos.fusion.estimator import ANY_ANGLE_RAD
 from relpos.fusion.models.odometry_faults import (
     BELIEVING,
     HEADING_CELL_RAD,
@@ -164,11 +162,8 @@ class Relocalisation:
         # Neither the perturbed nor the others may say how noisy anything is.
         these.perturbed[:] = FAULT_UPDATES
 
-    def reflect_team(self, rows: Sequence[int]) -> None:
-        """Let half the hypotheses be mirror images, of the team or of ``rows``; the ranges choose.
-
-        A crew that has nobody else in reach may be mirrored alone.
-        """
+    def reflect_team(self) -> None:
+        """Let half the hypotheses be the team's mirror image; the ranges choose."""
         these = self._hypotheses
         if these.settings.hypotheses == 1 or these.nodes < 2:
             return
@@ -176,17 +171,10 @@ class Relocalisation:
         self._adaptive.grow()
         these.resample(these.weights(), max(these.count, HYPOTHESES))
         half = these.rng.permutation(these.count)[: these.count // 2]
-        whole = np.arange(these.nodes)
-        some = np.array(rows) if len(rows) > 1 else whole
         x, p = these.dense()
-        for which, reflected in ((half[::2], whole), (half[1::2], some)):
-            x[which], p[which] = mirror_image(x[which], p[which], reflected)
+        x[half], p[half] = mirror_image(x[half], p[half], these.nodes)
         these.store(x, p)
         these.perturbed[:] = FAULT_UPDATES
-        # How the image is turned in the world nobody knows.
-        mean, _ = these.moments(poses_alone=True)
-        middle = (float(mean[PER_NODE * whole + e].mean()) for e in (StateIndex.X, StateIndex.Y))
-        these.common += about_origin(np.diag([0.0, 0.0, ANY_ANGLE_RAD**2]), *middle)
         self.ambiguous.update(range(these.nodes))
         self._counters["teams_reflected"] += 1
 

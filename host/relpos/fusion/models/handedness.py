@@ -55,8 +55,8 @@ class TurnAgreement:
     _reported_rad: defaultdict[int, float] = field(default_factory=lambda: defaultdict(float))
     _past: dict[int, deque[tuple[float, float]]] = field(default_factory=dict)
     """Node -> its reported and its estimated heading at the last epochs."""
-    _seen: defaultdict[int, float] = field(default_factory=lambda: defaultdict(float))
-    _turned: defaultdict[int, float] = field(default_factory=lambda: defaultdict(float))
+    _seen: float = 0.0
+    _turned: float = 0.0
     doubted: bool = False
     """Since turns were seen as those of the mirror image, they have not been seen as reported."""
 
@@ -64,14 +64,14 @@ class TurnAgreement:
         """Add a piece of a node's reported motion."""
         self._reported_rad[step.node] += step.dtheta_rad
 
-    def close_epoch(self, heading_rad: Mapping[int, float]) -> set[int]:
-        """Return whose turns are seen as those of the mirror image, where the team's are.
+    def close_epoch(self, heading_rad: Mapping[int, float]) -> bool:
+        """Return whether turns are seen as those of the mirror image.
 
-        ``heading_rad`` are the estimated headings now.
+        ``heading_rad`` are the headings now, of all nodes whose heading is not open.
         """
-        for node in self._turned:
-            self._seen[node] *= FADE
-            self._turned[node] *= FADE
+        self._seen *= FADE
+        self._turned *= FADE
+        self._past = {node: past for node, past in self._past.items() if node in heading_rad}
         for node, now_rad in heading_rad.items():
             reported_rad = self._reported_rad[node]
             past = self._past.setdefault(node, deque(maxlen=TURN + LATER + 1))
@@ -82,19 +82,16 @@ class TurnAgreement:
             turn = math.sin(ended_rad - begun_rad)
             if abs(turn) > CLEAR:
                 since_rad = reported_rad - ended_rad
-                self._seen[node] += turn * math.sin(now_rad - before_rad - since_rad) / TURN
-                self._turned[node] += turn**2 / TURN
-        seen, turned = sum(self._seen.values()), sum(self._turned.values())
-        if turned < LEAST_TURNS:
-            return set()
-        self.doubted &= seen < AGREED * turned
-        if seen > CONTRADICTED * turned:
-            return set()
-        mirrored = {n for n, own in self._turned.items() if self._seen[n] < CONTRADICTED * own}
-        for remembered in (self._past, self._seen, self._turned):
-            remembered.clear()
+                self._seen += turn * math.sin(now_rad - before_rad - since_rad) / TURN
+                self._turned += turn**2 / TURN
+        if self._turned < LEAST_TURNS:
+            return False
+        self.doubted &= self._seen < AGREED * self._turned
+        if self._seen > CONTRADICTED * self._turned:
+            return False
+        self._seen = self._turned = 0.0
         self.doubted = True
-        return mirrored
+        return True
 
 
 @dataclass(slots=True)
