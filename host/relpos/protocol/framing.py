@@ -85,10 +85,10 @@ def tag(data: bytes, key: bytes) -> bytes:
 
 @functools.lru_cache(maxsize=1024)
 def node_key(team_key: bytes, node: int) -> bytes:
-    """The key of frames from and to ``node``; of :data:`BROADCAST`, the beacons'.
+    """The key of frames from and to ``node``; of ``BROADCAST``, the beacons'.
 
     The first 16 bytes of HMAC-SHA-256 (FIPS 198-1) under the team's key, so that nobody learns the
-    team's key or another node's from a node. Without a team key, all have :data:`DEFAULT_KEY`.
+    team's key or another node's from a node. Without a team key, all have ``DEFAULT_KEY``.
     """
     if team_key == DEFAULT_KEY:
         return DEFAULT_KEY
@@ -96,7 +96,7 @@ def node_key(team_key: bytes, node: int) -> bytes:
 
 
 def masked_keys(old_key: bytes, token: int, counter: int, keys: bytes) -> dict[str, int]:
-    """The values of a :data:`NEW_KEY` frame that gives ``keys``: a node's own, then the beacon's.
+    """The values of a ``NEW_KEY`` frame that gives ``keys``: a node's own, then the beacon's.
 
     They are XORed with four SipHash blocks of ``old_key`` over 0, block number, token (2 bytes),
     counter (4): no frame begins with 0.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cmath
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -64,6 +65,17 @@ def is_mirrored(estimate: Estimate, truth: np.ndarray) -> bool:
     return bool(np.abs(own.conj() - truth).sum() < 0.5 * np.abs(own - truth).sum())
 
 
+def seconds(
+    told: Callable[[Estimate, np.ndarray], bool],
+    estimates: list[Estimate],
+    places: np.ndarray,
+    headings: np.ndarray,
+) -> list[int]:
+    """Return the whole seconds at which ``told`` holds."""
+    whole = [(e, round(e.time_s)) for e in estimates if e.time_s == round(e.time_s)]
+    return [t for e, t in whole if told(e, seen(places[t], headings[t]))]
+
+
 def longest_s(seconds: list[int]) -> int:
     """How many of some rising seconds follow each other at most."""
     longest = run = 0
@@ -94,12 +106,7 @@ def test_a_mirrored_team_is_never_ok_for_more_than_five_seconds(start: str, seed
     ]
     bank = fusion.make("bank", () if start == "unknown" else priors, seed=seed)
     estimates = [e for m in rows for e in bank.process(m)] + bank.finish()
-    wrong = [
-        round(e.time_s)
-        for e in estimates
-        if e.time_s == round(e.time_s)
-        and is_mirrored_and_ok(e, seen(places[round(e.time_s)], headings[round(e.time_s)]))
-    ]
+    wrong = seconds(is_mirrored_and_ok, estimates, places, headings)
     assert (STRAIGHT_S - 1 in wrong) == (start == "mirrored")
     assert longest_s([second for second in wrong if second > since_s]) <= 5
 
@@ -113,12 +120,7 @@ def test_turns_tell_a_team_that_is_sure_of_its_mirror_image(seed: int) -> None:
     priors = [Prior(n + 1, z.real, z.imag, turned, 0.1, 0.05) for n, (z, turned) in enumerate(told)]
     bank = fusion.make("bank", priors, seed=seed)
     estimates = [e for m in rows for e in bank.process(m)] + bank.finish()
-    wrong = [
-        round(e.time_s)
-        for e in estimates
-        if e.time_s == round(e.time_s)
-        and is_mirrored(e, seen(places[round(e.time_s)], headings[round(e.time_s)]))
-    ]
+    wrong = seconds(is_mirrored, estimates, places, headings)
     assert STRAIGHT_S - 1 in wrong
     assert max(wrong) < 40
 

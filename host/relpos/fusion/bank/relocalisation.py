@@ -139,12 +139,9 @@ class Relocalisation:
         In all hypotheses, where its place or heading or both are ``lost``.
         """
         first, second, range_m = ranges
-        self.since_fault = 0
-        self._adaptive.grow()
         these = self._hypotheses
         # Of two alone either may be the one: what is between them is perturbed in the same way.
-        self.ambiguous.update([row] if these.nodes > 2 or lost else range(these.nodes))
-        these.resample(these.weights(), max(these.count, HYPOTHESES))
+        self._open_up([row] if these.nodes > 2 or lost else range(these.nodes))
         believing = BELIEVING if lost is None else 0.0
         which = these.rng.permutation(these.count)[round(believing * these.count) :]
         sights = np.flatnonzero((first == row) | (second == row))
@@ -167,16 +164,21 @@ class Relocalisation:
         these = self._hypotheses
         if these.settings.hypotheses == 1 or these.nodes < 2:
             return
-        self.since_fault = 0
-        self._adaptive.grow()
-        these.resample(these.weights(), max(these.count, HYPOTHESES))
+        self._open_up(range(these.nodes))
         half = these.rng.permutation(these.count)[: these.count // 2]
         x, p = these.dense()
         x[half], p[half] = mirror_image(x[half], p[half], these.nodes)
         these.store(x, p)
         these.perturbed[:] = FAULT_UPDATES
-        self.ambiguous.update(range(these.nodes))
         self._counters["teams_reflected"] += 1
+
+    def _open_up(self, rows: Sequence[int]) -> None:
+        """Take ``rows`` for ambiguous, and have enough hypotheses to find them again."""
+        self.since_fault = 0
+        self._adaptive.grow()
+        self.ambiguous.update(rows)
+        these = self._hypotheses
+        these.resample(these.weights(), max(these.count, HYPOTHESES))
 
     def end_ambiguity(self, covariance: Floats) -> None:
         """Take users for found again, by the mixture's covariance (D, D)."""
