@@ -123,6 +123,12 @@ def test_turns_tell_a_team_that_is_sure_of_its_mirror_image(seed: int) -> None:
     wrong = seconds(is_mirrored, estimates, places, headings)
     assert STRAIGHT_S - 1 in wrong
     assert max(wrong) < 40
+    # Nor is it told to be turned in the world as its image was.
+    off_rad = [
+        abs(cmath.phase(cmath.rect(1.0, node.heading_rad - turned))) / node.sigma_heading_rad
+        for node, turned in zip(estimates[-1].nodes, headings[-1], strict=True)
+    ]
+    assert max(off_rad) < 3.0
 
 
 def test_a_mirror_image_has_the_same_distances_and_the_other_sides() -> None:

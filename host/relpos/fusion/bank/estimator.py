@@ -547,7 +547,9 @@ class Bank:
         )  # fmt: skip
         estimate = report.estimate(self.north.known())
         if contradicted:
-            self.core.relocalisation.reflect_team()
+            self.core.relocalisation.reflect_team(
+                north_known=self.north.sigma_rad < NORTH_KNOWN_RAD
+            )
         if since_s > -math.inf:
             self._slew_clocks(time_s - since_s, mean, covariance, timeline)
         return estimate

@@ -14,9 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.bank.adaptive_count import AdaptiveCount
+from relpos.fusion.bank.common_rotation import about_origin
 from relpos.fusion.bank.hypothesis_set import PERTURBED_UPDATES, HypothesisSet
 from relpos.fusion.bank.mirrored import mirror_image
 from relpos.fusion.bank.storage import PER_NODE, POSE, StateIndex
+from relpos.fusion.estimator import ANY_ANGLE_RAD
 from relpos.fusion.models.odometry_faults import (
     BELIEVING,
     HEADING_CELL_RAD,
@@ -159,8 +161,11 @@ class Relocalisation:
         # Neither the perturbed nor the others may say how noisy anything is.
         these.perturbed[:] = FAULT_UPDATES
 
-    def reflect_team(self) -> None:
-        """Let half the hypotheses be the team's mirror image; the ranges choose."""
+    def reflect_team(self, *, north_known: bool) -> None:
+        """Let half the hypotheses be the team's mirror image; the ranges choose.
+
+        How the image is turned in the world only absolute headings tell, if north is known.
+        """
         these = self._hypotheses
         if these.settings.hypotheses == 1 or these.nodes < 2:
             return
@@ -170,6 +175,11 @@ class Relocalisation:
         x[half], p[half] = mirror_image(x[half], p[half], these.nodes)
         these.store(x, p)
         these.perturbed[:] = FAULT_UPDATES
+        if not north_known:
+            mean, _ = these.moments(poses_alone=True)
+            at = PER_NODE * np.arange(these.nodes)
+            middle_m = (float(mean[at + e].mean()) for e in (StateIndex.X, StateIndex.Y))
+            these.common += about_origin(np.diag([0.0, 0.0, ANY_ANGLE_RAD**2]), *middle_m)
         self._counters["teams_reflected"] += 1
 
     def _open_up(self, rows: Sequence[int]) -> None:

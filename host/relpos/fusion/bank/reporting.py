@@ -138,7 +138,10 @@ class Report:
         at = PER_NODE * row
         x, y, heading = self.mean[at : at + 3].tolist()
         own = self.world_covariance[at : at + 3, at : at + 3].tolist()
-        heading, sigma = presence.facing(self.time_s, heading, math.sqrt(own[2][2]))
+        within = float(self.covariance[at + 2, at + 2])
+        heading, sigma = presence.facing(self.time_s, heading, math.sqrt(within))
+        # The way that is walked is turned in the world as the team is.
+        sigma = math.hypot(sigma, math.sqrt(own[2][2] - within))
         return NodeEstimate(
             node, x, y, math.remainder(heading, math.tau), own[0][0], own[1][1], own[0][1],
             min(sigma, ANY_ANGLE_RAD), status, *presence.vertical,
