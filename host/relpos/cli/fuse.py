@@ -526,7 +526,7 @@ def _print_outcome(
     as_json: bool,
 ) -> None:
     from relpos.evaluation import summary
-    from relpos.fusion.estimator import time_offsets
+    from relpos.fusion.clocks import time_offsets
 
     reckoned = baseline.metrics if baseline else None
     if as_json:

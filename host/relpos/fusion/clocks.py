@@ -9,14 +9,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
+from relpos.fusion.estimator import Estimate
 from relpos.measurements import Measurement, Range
+from relpos.said import Said
 
 SLEW = 0.1
 """Seconds a second at most: consecutive reports of a node keep their order."""
 
 LEAST_S, LEAST_SIGMAS = 0.1, 3.0
-"""Smaller offsets, or less certain ones, stay in the state: a walker makes 10 cm in it."""
+"""Smaller offsets, or less certain ones, stay in the state, and are not told: a walker makes 10 cm
+in it."""
+
+
+def is_known(offset_s: float, sigma_s: float) -> bool:
+    """Whether an offset of time stamps is large and certain enough to be told, and put right."""
+    return abs(offset_s) > max(LEAST_S, LEAST_SIGMAS * sigma_s)
 
 
 @dataclass(slots=True)
@@ -65,7 +74,34 @@ class Clocks:
 
 
 def _step(duration_s: float, value_s: float, sigma_s: float) -> float:
-    if abs(value_s) <= max(LEAST_S, LEAST_SIGMAS * sigma_s):
+    if not is_known(value_s, sigma_s):
         return 0.0
     most_s = SLEW * duration_s
     return min(max(value_s, -most_s), most_s)
+
+
+_SOME: Mapping[str, Any] = {"seconds": 0.0, "node": ""}
+_OFFSETS = {
+    ("range_lateness_s", True): Said(
+        "ranges-late", "ranges are dated {seconds:.1f} s late", **_SOME
+    ),
+    ("range_lateness_s", False): Said(
+        "ranges-early", "ranges are dated {seconds:.1f} s early", **_SOME
+    ),
+    ("clock_offset_s", True): Said(
+        "clock-ahead", "the clock of node {node} is {seconds:.1f} s ahead", **_SOME
+    ),
+    ("clock_offset_s", False): Said(
+        "clock-behind", "the clock of node {node} is {seconds:.1f} s behind", **_SOME
+    ),
+}
+
+
+def time_offsets(estimate: Estimate) -> list[Said]:
+    """Return what the user should know of time stamps that are off, a sentence each."""
+    told = []
+    for p in estimate.parameters:
+        words = _OFFSETS.get((p.name, p.value > 0.0))
+        if words is not None and is_known(p.value, p.sigma):
+            told.append(words.filled(seconds=abs(p.value), node=str(p.node)))
+    return list(dict.fromkeys(told))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from itertools import combinations
 from math import atan2, hypot, inf, pi, sqrt
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,6 @@ import numpy.typing as npt
 from relpos.errors import RelposError
 from relpos.fusion.models.motion import unseen_variance
 from relpos.measurements import Measurement
-from relpos.said import Said
 
 Floats = npt.NDArray[np.float64]
 
@@ -329,39 +328,6 @@ class Presence:
     def status(self) -> NodeStatus:
         """``ok``, ``stale`` or ``lost``, by silence alone."""
         return by_silence(self.silent_epochs)
-
-
-TOLD_S = 0.1
-"""Time stamps that are off by less are nothing to tell: a walker makes 10 cm in it."""
-
-
-def time_offsets(estimate: Estimate) -> list[Said]:
-    """Return what the user should know of time stamps that are off, a sentence each."""
-    told = []
-    for p in estimate.parameters:
-        if abs(p.value) < max(TOLD_S, 3.0 * p.sigma):
-            continue
-        words = _OFFSETS.get((p.name, p.value > 0.0))
-        if words is not None:
-            told.append(words.filled(seconds=abs(p.value), node=str(p.node)))
-    return list(dict.fromkeys(told))
-
-
-_SOME: Mapping[str, Any] = {"seconds": 0.0, "node": ""}
-_OFFSETS = {
-    ("range_lateness_s", True): Said(
-        "ranges-late", "ranges are dated {seconds:.1f} s late", **_SOME
-    ),
-    ("range_lateness_s", False): Said(
-        "ranges-early", "ranges are dated {seconds:.1f} s early", **_SOME
-    ),
-    ("clock_offset_s", True): Said(
-        "clock-ahead", "the clock of node {node} is {seconds:.1f} s ahead", **_SOME
-    ),
-    ("clock_offset_s", False): Said(
-        "clock-behind", "the clock of node {node} is {seconds:.1f} s behind", **_SOME
-    ),
-}
 
 
 def unlocated(node: int, vertical: Vertical = AT_THE_START) -> NodeEstimate:

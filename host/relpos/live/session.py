@@ -19,7 +19,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from relpos.fusion.estimator import Estimate, NodeStatus, time_offsets
+from relpos.fusion.clocks import time_offsets
+from relpos.fusion.estimator import Estimate, NodeStatus
 from relpos.live.alarms import CLEARED, RAISED, KnownAlert
 from relpos.live.board import BOARD_EVENTS, Board, BoardError
 from relpos.live.composer import Composer

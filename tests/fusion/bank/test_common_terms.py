@@ -15,8 +15,8 @@ from relpos.fusion.bank import reporting
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.hypothesis_models import LEAST_SHARE, LEAST_WEIGHT, RangeErrors
 from relpos.fusion.bank.storage import COMMON, PER_NODE, CommonIndex, StateIndex
-from relpos.fusion.clocks import LEAST_S, SLEW, Clocks
-from relpos.fusion.estimator import Estimate, Parameter, time_offsets
+from relpos.fusion.clocks import LEAST_S, SLEW, Clocks, time_offsets
+from relpos.fusion.estimator import Estimate, Parameter
 from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.models.ranging import OUTLIERS_SHORT, PASSING_SHARE, Repeats
 from relpos.measurements import Measurement, Motion, Range
