@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib
+import json
 import os
 import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import groupby
 from pathlib import Path
@@ -145,20 +147,25 @@ def missing_call(title: str, calls: list[tuple[str, str]]) -> str | None:
     return next((name for name in python_names(title) if name not in called), None)
 
 
-class Phone:
-    """The page, with one press of a phone as if its process had passed it on."""
+class PressedPage(WebView):
+    """The page, with presses of a phone as if its process had passed them on."""
 
-    def __init__(self, page: WebView) -> None:
-        self.page = page
-        self.queue: list[Request] = []
+    def __init__(self, *args: object) -> None:
+        self.pressed: deque[bytes] = deque()
+        super().__init__(*args)  # type: ignore[arg-type]
 
     def press(self) -> None:
         now_ms = time.time() * 1e3
         press = {"id": "one", "landmark": "17", "unix_ms": now_ms}
         body = {"node": 1, "presses": [press], "sent_unix_ms": now_ms, "clock_offset_ms": 0.0}
-        line = '{"id": 1, "kind": "presses", "unix_s": %f, "body": %s}\n'
-        text = line % (now_ms * 1e-3, str(body).replace("'", '"'))
-        self.page._in += text.encode()
+        asked = {"id": 1, "kind": "presses", "unix_s": now_ms * 1e-3, "body": body}
+        self.pressed.append(json.dumps(asked).encode() + b"\n")
+
+    def requests(self) -> Sequence[Request]:
+        # In the session's thread, as what the process passes on: neither loses the other's bytes.
+        while self.pressed:
+            self._in = self.pressed.popleft() + self._in
+        return super().requests()
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
@@ -196,7 +203,7 @@ def traces(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[tuple[str
         priors = [Prior(node, 0.0, 0.0, 0.0) for node in NODES]
         thread = FusionThread(lambda p: fusion.make("bank", p, {"hypotheses": 16}, seed=0), priors)
         door, access = listen("127.0.0.1:0")
-        page = WebView(door, access, Hello("walk", "port", "bank", time.time()))
+        page = PressedPage(door, access, Hello("walk", "port", "bank", time.time()))
         recorder = make_recorder(
             out / "walk.mcap",
             About(
@@ -206,7 +213,6 @@ def traces(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[tuple[str
         files = FileSink(out / "fused", Description(), keep_received=True)
         source = PortInput(os.ttyname(slave), Link())
         session = LiveSession(source, thread, Composer(), [page, files, recorder], lasts=True)
-        phone = Phone(page)
 
         def write(begin: int, end: int) -> None:
             for _, data in chunks[begin:end]:
@@ -227,7 +233,7 @@ def traces(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[tuple[str
                 walk("One range", lambda: write(ranges, step))
                 trace.during(lambda: None, shown_thrice)
                 walk("One step", lambda: write(step, len(chunks)))
-                walk("One landmark press", phone.press)
+                walk("One landmark press", page.press)
             finally:
                 session.stop()
 
