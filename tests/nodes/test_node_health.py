@@ -99,13 +99,17 @@ def test_the_worst_comes_first():
 
 
 def test_counts_wrap_begin_anew_with_a_boot_and_leave_the_window():
-    counter = WindowedCount()
+    counter = WindowedCount(1 << 16)
     counter.update(0.0, 3, 65530)  # what was before the watch began is not counted
     counter.update(10.0, 3, 4)
     assert counter.within(10.0) == 10
     counter.update(20.0, 4, 7)  # another boot: all seven are new
     assert counter.within(20.0) == 17
     assert counter.within(45.0) == 7
+    short = WindowedCount(1 << 8)
+    short.update(0.0, 3, 250)
+    short.update(10.0, 3, 4)
+    assert short.within(10.0) == 10
 
 
 def test_a_view_has_loss_silence_and_ranging_of_the_last_half_minute():

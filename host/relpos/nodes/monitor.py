@@ -37,16 +37,17 @@ _FLAGS = {
 
 
 class WindowedCount:
-    """Growth within the window of a count that wraps at 16 bits and restarts with a boot."""
+    """Growth within the window of a count that wraps at ``modulus`` and restarts with a boot."""
 
-    def __init__(self) -> None:
+    def __init__(self, modulus: int) -> None:
+        self._modulus = modulus
         self._newest: tuple[int, int] | None = None
         self._growth: deque[tuple[float, int]] = deque()
 
     def update(self, time_s: float, boot: int, value: int) -> None:
         """Add the count's ``value`` at ``time_s`` in that boot."""
         if self._newest is not None and self._newest[0] == boot:
-            grown = (value - self._newest[1]) % (1 << 16)
+            grown = (value - self._newest[1]) % self._modulus
         else:
             # The count of a node that already runs is unknown before its first report; a new
             # boot's count starts at zero.
@@ -86,7 +87,8 @@ class NodeMonitor:
         """Add one value of a status report."""
         self.status[name] = value
         if name in _COUNTS:
-            counter = self._counters.setdefault(name, WindowedCount())
+            modulus = wire.STATUS.field[name].modulus
+            counter = self._counters.setdefault(name, WindowedCount(modulus))
             counter.update(now_s, self.boot, int(value))
 
     def add_link(self, now_s: float, received: int, lost: int) -> None:
