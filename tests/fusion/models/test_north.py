@@ -7,10 +7,11 @@ import math
 import numpy as np
 import pytest
 
+import relpos
 from relpos import fusion, tracks
 from relpos.evaluation import metrics
 from relpos.fusion.estimator import Estimate
-from relpos.fusion.models.north import North
+from relpos.fusion.models.north import OFFSET_RAD, North
 from relpos.measurements import Heading, Measurement
 from relpos.simulation.paper import simulate_paper
 
@@ -70,14 +71,35 @@ def test_the_angle_is_learned_from_heads_that_are_known() -> None:
     for second in range(400):
         measured = math.remainder(3.0 + rng.normal(0.0, SIGMA_RAD), math.tau)
         sigma = north.alone_sigma_rad(1 + second % 4, float(second), SIGMA_RAD)
-        north.learn(measured, sigma, 0.0, 0.01)
+        north.learn((1 + second % 4, "magnetic"), measured, sigma, 0.0, 0.01)
     assert abs(math.remainder(north.angle_rad - 3.0, math.tau)) < 3.0 * north.sigma_rad
     assert north.sigma_rad < math.radians(6.0)
 
 
+def test_compasses_that_err_for_good_make_north_no_better_known_than_they_are() -> None:
+    """While their errors were taken to pass, it was 17 and 13 degrees off with a sigma of 3."""
+    for seed, drift in ((2, 0.0), (6, 6.0)):
+        run = relpos.simulate(
+            "mission-base", seed, seconds=150, compass_deg=30, drift_deg_min=drift
+        )
+        last = relpos.fuse(run).estimates[-1]
+        off_rad = math.remainder(last.north.bearing_rad - math.pi / 2, math.tau)
+        assert math.radians(5.0) < abs(off_rad) < 3.0 * last.north.sigma_rad
+
+
+def test_a_heading_is_no_better_known_by_its_compass_than_that_is() -> None:
+    north, own_var = North(0.0, 0.05), 1.0
+    assert North().used_sigma_rad(0.01, own_var) is None
+    for _ in range(50):
+        used_rad = north.used_sigma_rad(0.1, own_var)
+        if used_rad is not None:
+            own_var = 1.0 / (1.0 / own_var + 1.0 / used_rad**2)
+    assert math.sqrt(own_var) == pytest.approx(OFFSET_RAD)
+
+
 def test_a_compass_beside_iron_does_not_turn_the_team() -> None:
     north = North(0.5, 0.1)
-    assert not north.learn(0.5 + math.pi, SIGMA_RAD, 0.0, 0.01)
+    assert not north.learn((1, "magnetic"), 0.5 + math.pi, SIGMA_RAD, 0.0, 0.01)
     assert (north.angle_rad, north.sigma_rad) == (0.5, 0.1)
 
 

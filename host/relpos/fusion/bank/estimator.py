@@ -41,7 +41,7 @@ from relpos.fusion.initial_poses import (
 from relpos.fusion.models.detection import Detection, on_one_floor
 from relpos.fusion.models.handedness import Handedness, TurnAgreement, Way
 from relpos.fusion.models.motion import WALK_S, WithinReport, reported_sigmas, velocity_m_s
-from relpos.fusion.models.north import North
+from relpos.fusion.models.north import KNOWN_RAD, North
 from relpos.fusion.models.odometry_faults import SpeedGate, ZeroMotionDetector, vagueness
 from relpos.fusion.models.ranging import (
     Mounting,
@@ -64,8 +64,6 @@ Indices = npt.NDArray[np.int64]
 SET_OFF_M = 0.3
 """A node without a heading has set off when it is this far from where it stood."""
 
-NORTH_KNOWN_RAD = 0.5
-"""Headings are used once north is known so well; before, they only teach where north is."""
 HEADING_SIGMA_RAD = 0.17
 """Of an absolute heading without a reported sigma: magnetic ones indoors are 10 degrees off."""
 
@@ -514,11 +512,11 @@ class Bank:
         mean, covariance = these.moments(poses_alone=True)
         place = PER_NODE * row + StateIndex.HEADING
         own, variance = float(mean[place]), float(covariance[place, place] + these.common[2, 2])
-        if north.sigma_rad < NORTH_KNOWN_RAD:
-            self.core.update_heading(
-                row, measured.heading_rad - north.angle_rad, math.hypot(sigma, north.sigma_rad)
-            )
-        if not north.learn(measured.heading_rad, sigma, own, variance):
+        used_rad = north.used_sigma_rad(sigma, variance)
+        if used_rad is not None:
+            self.core.update_heading(row, measured.heading_rad - north.angle_rad, used_rad)
+        compass = measured.node, measured.source
+        if not north.learn(compass, measured.heading_rad, sigma, own, variance):
             self._counters["headings_doubted"] += 1
 
     def _estimate(self, time_s: float, timeline: Timeline) -> Estimate:
@@ -547,9 +545,7 @@ class Bank:
         )  # fmt: skip
         estimate = report.estimate(self.north.known())
         if contradicted:
-            self.core.relocalisation.reflect_team(
-                north_known=self.north.sigma_rad < NORTH_KNOWN_RAD
-            )
+            self.core.relocalisation.reflect_team(north_known=self.north.sigma_rad < KNOWN_RAD)
         if since_s > -math.inf:
             self._slew_clocks(time_s - since_s, mean, covariance, timeline)
         return estimate
