@@ -41,7 +41,7 @@ from relpos.fusion.initial_poses import (
 from relpos.fusion.models.detection import Detection, on_one_floor
 from relpos.fusion.models.handedness import Handedness, TurnAgreement, Way
 from relpos.fusion.models.motion import WALK_S, WithinReport, reported_sigmas, velocity_m_s
-from relpos.fusion.models.north import KNOWN_RAD, North
+from relpos.fusion.models.north import North
 from relpos.fusion.models.odometry_faults import SpeedGate, ZeroMotionDetector, vagueness
 from relpos.fusion.models.ranging import (
     Mounting,
@@ -545,7 +545,7 @@ class Bank:
         )  # fmt: skip
         estimate = report.estimate(self.north.known())
         if contradicted:
-            self.core.relocalisation.reflect_team(north_known=self.north.sigma_rad < KNOWN_RAD)
+            self.core.relocalisation.reflect_team(north_known=self.north.is_usable)
         if since_s > -math.inf:
             self._slew_clocks(time_s - since_s, mean, covariance, timeline)
         return estimate

@@ -27,8 +27,8 @@ OFFSET_RAD = math.radians(6.0)
 10 degrees cost emulated teams, whose compasses err in places alone, 4 % of the body frame."""
 EXPECTED = 4.0
 """That deviation is as well known as from so many compasses; those there are tell of it, too."""
-KNOWN_RAD = 0.5
-"""Headings are used once north is known so well; before, they only teach where north is."""
+USABLE_RAD = 0.5
+"""Headings are used once north is known so well."""
 LEAST_SIGMA_RAD = math.radians(3.0)
 """Magnetic east itself is not one direction all over a building."""
 GATE = 3.0
@@ -43,9 +43,17 @@ class North:
     sigma_rad: float = ANY_ANGLE_RAD
     _offset_rad: dict[tuple[int, str | None], float] = field(default_factory=dict)
     """Compass, by node and source -> what it errs by."""
-    _covariance: npt.NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+    _covariance: npt.NDArray[np.float64] = field(init=False)
     """Of the angle and these offsets, in this order (1 + C, 1 + C)."""
     _reported_s: dict[int, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._covariance = np.array([[self.sigma_rad**2]])
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether headings may be used; before, they only teach where north is."""
+        return self.sigma_rad < USABLE_RAD
 
     def known(self) -> MagneticNorth | None:
         """Where north lies; None before the first reading."""
@@ -76,8 +84,6 @@ class North:
         of the angle and of this compass.
         """
         offset_rad, covariance = self._offset_rad.get(compass, 0.0), self._covariance
-        if not self._offset_rad:
-            covariance = np.array([[self.sigma_rad**2]])
         if compass not in self._offset_rad:
             covariance = np.pad(covariance, (0, 1))
             covariance[-1, -1] = OFFSET_RAD**2
@@ -93,18 +99,18 @@ class North:
         for learned, part in zip(self._offset_rad, gain[1:].tolist(), strict=True):
             self._offset_rad[learned] += part * innovation
         self.angle_rad = math.remainder(self.angle_rad + float(gain[0]) * innovation, math.tau)
-        sigma_rad = self._spread() * math.sqrt(float(self._covariance[0, 0]))
-        self.sigma_rad = max(sigma_rad, LEAST_SIGMA_RAD)
+        angle_sigma_rad = self._spread() * math.sqrt(float(self._covariance[0, 0]))
+        self.sigma_rad = max(angle_sigma_rad, LEAST_SIGMA_RAD)
         return True
 
     def used_sigma_rad(self, sigma_rad: float, own_var: float) -> float | None:
         """Deviation with which a reading leaves a heading no better known than a compass can be.
 
         ``sigma_rad`` is that of the reading and ``own_var`` the heading's variance before. None
-        where north is not known, or the heading is known as well already.
+        where readings are not used yet, or the heading is known as well already.
         """
         within = (self._spread() * OFFSET_RAD) ** 2
-        if self.sigma_rad >= KNOWN_RAD or own_var <= within:
+        if not self.is_usable or own_var <= within:
             return None
         least_rad = 1.0 / math.sqrt(1.0 / within - 1.0 / own_var)
         return max(math.hypot(sigma_rad, self.sigma_rad), least_rad)
