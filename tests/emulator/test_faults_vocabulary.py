@@ -1,5 +1,6 @@
 """The vocabulary of faults: what is understood, what is refused and in which words."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,14 @@ def test_every_fault_can_be_written_and_happens(fault):
     assert spec.node == (None if fault.team else 2)
     with EmulatedTeam(TeamConfig("paper", NODES, 6.0, 1, faults=[spec])) as team:
         assert sum(len(data) for _, data in team.stream()) > 500
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_a_behaviour_without_code_is_an_error_and_never_another_behaviour(fault):
+    spec = parse_fault(example(fault), NODES)
+    uncoded = replace(spec, fault=replace(fault, behaviour="uncoded"))
+    with pytest.raises(KeyError, match="uncoded"):
+        EmulatedTeam(TeamConfig("paper", NODES, 6.0, 1, faults=[uncoded]))
 
 
 @pytest.mark.parametrize(("target", "behaviour"), REFUSED, ids=":".join)

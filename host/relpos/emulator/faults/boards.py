@@ -22,14 +22,22 @@ def faulty_clock(errors: NodeErrors, node: int, specs: Sequence[FaultSpec]) -> N
     for spec in specs:
         if spec.fault.target != "clock" or spec.node not in (None, node):
             continue
-        clock = errors.clock
-        if spec.fault.behaviour == "wrong":
-            clock = replace(clock, drift_ppm=spec.number("value"))
-        elif spec.fault.behaviour == "wrap":
-            since_us = (spec.from_us - errors.power_on_us) * (1.0 + clock.drift_ppm * 1e-6)
-            clock = NodeClockError(clock.drift_ppm, (1 << 32) - round(since_us))
-        errors = replace(errors, clock=clock)
+        if spec.fault.behaviour in _MADE_WITH:
+            errors = replace(errors, clock=_MADE_WITH[spec.fault.behaviour](errors, spec))
     return errors
+
+
+def _wrong(errors: NodeErrors, spec: FaultSpec) -> NodeClockError:
+    return replace(errors.clock, drift_ppm=spec.number("value"))
+
+
+def _wrap(errors: NodeErrors, spec: FaultSpec) -> NodeClockError:
+    drift_ppm = errors.clock.drift_ppm
+    since_us = (spec.from_us - errors.power_on_us) * (1.0 + drift_ppm * 1e-6)
+    return NodeClockError(drift_ppm, (1 << 32) - round(since_us))
+
+
+_MADE_WITH = {"wrong": _wrong, "wrap": _wrap}
 
 
 def _power_cycle(node: EmulatedNode, now_us: int) -> None:
@@ -40,40 +48,32 @@ def _power_cycle(node: EmulatedNode, now_us: int) -> None:
 
 def clock(hooks: Hooks, spec: FaultSpec, rng: Rng, node: EmulatedNode) -> None:
     """Install an oscillator that stops; other clock faults are in :func:`faulty_clock`."""
-    if spec.fault.behaviour == "off":
 
-        def halt(now_us: int) -> None:
-            until_us = NEVER_US if spec.to_us is None else spec.to_us
-            node.stop(now_us, until_us)
-            if until_us - now_us > WATCHDOG_US:
-                hooks.clock.at(until_us, lambda at: node.restart(at, ResetCause.WATCHDOG))
+    def halt(now_us: int) -> None:
+        until_us = NEVER_US if spec.to_us is None else spec.to_us
+        node.stop(now_us, until_us)
+        if until_us - now_us > WATCHDOG_US:
+            hooks.clock.at(until_us, lambda at: node.restart(at, ResetCause.WATCHDOG))
 
-        hooks.clock.at(spec.from_us, halt)
-    elif spec.fault.behaviour == "intermittent":
+    def pause(now_us: int) -> None:
         stand_us = round(spec.number("value") * 1e3)
+        if spec.active(now_us):
+            node.stop(now_us, now_us + stand_us)
+            hooks.clock.at(now_us + stand_us + 1_000_000, pause)
 
-        def pause(now_us: int) -> None:
-            if spec.active(now_us):
-                node.stop(now_us, now_us + stand_us)
-                hooks.clock.at(now_us + stand_us + 1_000_000, pause)
-
-        hooks.clock.at(spec.from_us, pause)
+    if spec.fault.behaviour not in _MADE_WITH:
+        hooks.clock.at(spec.from_us, {"off": halt, "intermittent": pause}[spec.fault.behaviour])
 
 
 def supply(hooks: Hooks, spec: FaultSpec, rng: Rng, node: EmulatedNode) -> None:
     """Install a fault of the whole node's supply."""
     node.hold_frames = True
-    if spec.fault.behaviour == "brownout":
-        chips = spec.choice("chips") == "reset"
-
-        def dip(now_us: int) -> None:
-            node.restart(now_us, ResetCause.BROWN_OUT)
-            if chips:
-                _power_cycle(node, now_us)
-
-        hooks.clock.at(spec.from_us, dip)
-        return
     until_us = NEVER_US if spec.to_us is None else spec.to_us
+
+    def dip(now_us: int) -> None:
+        node.restart(now_us, ResetCause.BROWN_OUT)
+        if spec.choice("chips") == "reset":
+            _power_cycle(node, now_us)
 
     def switch_off(now_us: int) -> None:
         node.stop(now_us, until_us)
@@ -86,8 +86,9 @@ def supply(hooks: Hooks, spec: FaultSpec, rng: Rng, node: EmulatedNode) -> None:
         _power_cycle(node, now_us)
         node.radio.restart(now_us)
 
-    hooks.clock.at(spec.from_us, switch_off)
-    hooks.silence(node.radio, spec.active)
+    hooks.clock.at(spec.from_us, {"brownout": dip, "off": switch_off}[spec.fault.behaviour])
+    if spec.fault.behaviour == "off":
+        hooks.silence(node.radio, spec.active)
 
 
 def eeprom(hooks: Hooks, spec: FaultSpec, rng: Rng, node: EmulatedNode) -> None:
@@ -101,7 +102,7 @@ def eeprom(hooks: Hooks, spec: FaultSpec, rng: Rng, node: EmulatedNode) -> None:
         return {"erased": 0xFF, "old": old, "garbage": int(rng.integers(256))}[left]
 
     cut = cut_native if isinstance(node.engine, NativeEngine) else _cut_avr
-    cut(node, hooks.clock, spec.from_us, wanted, remains)
+    {"cut": cut}[spec.fault.behaviour](node, hooks.clock, spec.from_us, wanted, remains)
 
 
 def cut_native(

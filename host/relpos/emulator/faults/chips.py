@@ -136,18 +136,24 @@ def magnetometer(hooks: Hooks, spec: FaultSpec, rng: Rng, node: EmulatedNode) ->
     before = chip.spoil
     held: list[FloatArray] = []
 
-    def spoil(field: FloatArray) -> FloatArray:
-        field = field if before is None else before(field)
-        if not spec.active(chip.time_us):
-            held.clear()
-            return field
-        if spec.fault.behaviour == "wrong":
-            return np.asarray(field + spec.number("value"))
+    def stuck(field: FloatArray) -> FloatArray:
         if not held:
             held.append(field)
         return held[0]
 
-    chip.spoil = spoil
+    def wrong(field: FloatArray) -> FloatArray:
+        return np.asarray(field + spec.number("value"))
+
+    spoil = {"stuck": stuck, "wrong": wrong}[spec.fault.behaviour]
+
+    def while_active(field: FloatArray) -> FloatArray:
+        field = field if before is None else before(field)
+        if spec.active(chip.time_us):
+            return spoil(field)
+        held.clear()
+        return field
+
+    chip.spoil = while_active
 
 
 def pozyx_tag(hooks: Hooks, spec: FaultSpec, rng: Rng, node: EmulatedNode) -> None:
@@ -173,29 +179,32 @@ def _exchange_fault(hooks: Hooks, spec: FaultSpec, tag: pozyx.Pozyx) -> pozyx.Co
         tag.complete(peer, result, error, time_us)
 
     before = tag.intercept or finish
-    behaviour = spec.fault.behaviour
 
     def later_us(time_us: int) -> int:
         return time_us + round(spec.number("value") * 1e3)
 
+    def slow(peer: int, result: pozyx.RangeResult | None, error: int, time_us: int) -> None:
+        hooks.clock.at(later_us(time_us), lambda now_us: before(peer, result, error, now_us))
+
+    def delayed(peer: int, result: pozyx.RangeResult | None, error: int, time_us: int) -> None:
+        tag.ranging = False
+        hooks.clock.at(later_us(time_us), lambda now_us: tag.complete(peer, result, error, now_us))
+
+    def wrong(peer: int, result: pozyx.RangeResult | None, error: int, time_us: int) -> None:
+        if result is not None:
+            off_mm = result.distance_mm + round(spec.number("value") * 1e3)
+            result = replace(result, distance_mm=max(off_mm, 0))
+        before(peer, result, error, time_us)
+
+    def inverted(peer: int, result: pozyx.RangeResult | None, error: int, time_us: int) -> None:
+        tag.ranging = False
+        tag.complete(peer, result, error, time_us, inverted=True)
+
+    behaviours = {"slow": slow, "delayed": delayed, "wrong": wrong, "inverted": inverted}
+    spoil = behaviours[spec.fault.behaviour]
+
     def intercept(peer: int, result: pozyx.RangeResult | None, error: int, time_us: int) -> None:
-        if not spec.active(time_us):
-            before(peer, result, error, time_us)
-        elif behaviour == "slow":
-            hooks.clock.at(later_us(time_us), lambda now_us: before(peer, result, error, now_us))
-        elif behaviour == "delayed":
-            tag.ranging = False
-            hooks.clock.at(
-                later_us(time_us), lambda now_us: tag.complete(peer, result, error, now_us)
-            )
-        elif behaviour == "wrong":
-            if result is not None:
-                off_mm = result.distance_mm + round(spec.number("value") * 1e3)
-                result = replace(result, distance_mm=max(off_mm, 0))
-            before(peer, result, error, time_us)
-        else:
-            tag.ranging = False
-            tag.complete(peer, result, error, time_us, inverted=True)
+        (spoil if spec.active(time_us) else before)(peer, result, error, time_us)
 
     return intercept
 
@@ -205,20 +214,23 @@ def bus(hooks: Hooks, spec: FaultSpec, rng: Rng, node: EmulatedNode) -> None:
     wires: I2cBus = node.bus
     before = wires.fault
     freed: list[int] = []
-    line = spec.choice("line") if spec.fault.behaviour == "stuck" else ""
-    part = spec.choice("part") if spec.fault.behaviour == "nack" else ""
-    status = {"address": BusStatus.ADDRESS_NACK, "data": BusStatus.DATA_NACK}.get(part)
 
-    def fault(address: int, number: int) -> BusStatus | None:
-        failed = None if before is None else before(address, number)
-        if failed or not spec.active(wires.time_us):
-            return failed
-        if status is not None:
-            return status if rng.random() < spec.number("rate") else None
-        if line == "sda":
+    def stuck(number: int) -> BusStatus | None:
+        if spec.choice("line") == "sda":
             if freed:
                 return None
             freed.append(number)
         return BusStatus.TIMEOUT
+
+    def nack(_number: int) -> BusStatus | None:
+        if rng.random() >= spec.number("rate"):
+            return None
+        return BusStatus.DATA_NACK if spec.choice("part") == "data" else BusStatus.ADDRESS_NACK
+
+    fail = {"stuck": stuck, "nack": nack}[spec.fault.behaviour]
+
+    def fault(address: int, number: int) -> BusStatus | None:
+        failed = None if before is None else before(address, number)
+        return failed if failed or not spec.active(wires.time_us) else fail(number)
 
     wires.fault = fault

@@ -11,7 +11,7 @@ import numpy as np
 
 from relpos.emulator.node import EmulatedNode
 
-from . import boards, chips, radio
+from . import boards, chips, host, radio, uwb
 from .hooks import Hooks, Rng, Team
 from .spec import FaultSpec
 
@@ -26,8 +26,8 @@ _OF_NODE: Mapping[str, Callable[[Hooks, FaultSpec, Rng, EmulatedNode], None]] = 
 }
 _OF_TEAM: Mapping[str, Callable[[Hooks, FaultSpec, Rng], None]] = {
     "radio": radio.radio,
-    "uwb": radio.uwb,
-    "host": radio.host,
+    "uwb": uwb.uwb,
+    "host": host.host,
 }
 
 

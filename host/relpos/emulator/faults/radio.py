@@ -1,13 +1,11 @@
-"""Faults of the XBee modules, of both airs, and of the host at the coordinator's port."""
+"""Faults of the XBee modules, and of the air between them."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
-from relpos.emulator.air import EXCHANGE_US, VirtualClock
-from relpos.emulator.pozyx import Pozyx
+from relpos.emulator.air import VirtualClock
 from relpos.emulator.xbee import (
     BROADCAST,
     DELIVERED,
@@ -25,6 +23,9 @@ from .spec import FaultSpec
 RESTART_XBEE_US = 100_000
 FOREIGN_ADDRESS = 0x5A5A
 
+AirDamage = Callable[[bytes, int], list[tuple[int, bytes]]]
+"""(frame, its arrival) -> what arrives instead."""
+
 
 class _FaultyAir:
     """The air as a module with a fault reaches it."""
@@ -33,29 +34,32 @@ class _FaultyAir:
         self._air = air
         self._spec = spec
         self._clock = clock
+        behaviours = {"delayed": self._delayed, "slow": self._slow, "wrong": self._wrong}
+        self._spoil = behaviours[spec.fault.behaviour]
 
     def send(self, sent: Transmission) -> None:
         """See :class:`relpos.emulator.xbee.Air`."""
-        spec, clock = self._spec, self._clock
+        (self._spoil if self._spec.active(sent.time_us) else self._air.send)(sent)
 
+    def _delayed(self, sent: Transmission) -> None:
         def send_late(now_us: int) -> None:
             self._air.send(replace(sent, time_us=now_us, report=lambda _time_us, _status: None))
 
-        def report_late(at_us: int, status: int) -> None:
-            late_us = round(spec.number("value") * 1e3)
-            clock.at(at_us + late_us, lambda now_us: sent.report(now_us, status))
+        self._clock.at(sent.time_us + round(self._spec.number("value") * 1e6), send_late)
+        sent.report(sent.time_us, DELIVERED)
 
+    def _slow(self, sent: Transmission) -> None:
+        def report_late(at_us: int, status: int) -> None:
+            late_us = round(self._spec.number("value") * 1e3)
+            self._clock.at(at_us + late_us, lambda now_us: sent.report(now_us, status))
+
+        self._air.send(replace(sent, report=report_late))
+
+    def _wrong(self, sent: Transmission) -> None:
         def report_failure(at_us: int, _status: int) -> None:
             sent.report(at_us, NO_ACKNOWLEDGEMENT)
 
-        if not spec.active(sent.time_us):
-            self._air.send(sent)
-        elif spec.fault.behaviour == "delayed":
-            clock.at(sent.time_us + round(spec.number("value") * 1e6), send_late)
-            sent.report(sent.time_us, DELIVERED)
-        else:
-            slow = spec.fault.behaviour == "slow"
-            self._air.send(replace(sent, report=report_late if slow else report_failure))
+        self._air.send(replace(sent, report=report_failure))
 
 
 def xbee(hooks: Hooks, spec: FaultSpec, rng: Rng, module: XbeeModule) -> None:
@@ -81,27 +85,27 @@ def xbee(hooks: Hooks, spec: FaultSpec, rng: Rng, module: XbeeModule) -> None:
 
 
 def _line_damage(spec: FaultSpec, rng: Rng) -> LineFault:
-    behaviour = spec.fault.behaviour
-    rate = spec.number("rate") if "rate" in spec.fault.key_names() else 1.0
+    rate = spec.number("rate", otherwise=1.0)
 
-    def damage(data: bytes, to_module: bool) -> bytes:
-        if behaviour == "stuck":
-            return data if to_module else b""
-        if behaviour == "garbage":
-            return rng.bytes(len(data))
-        if behaviour == "intermittent":
-            return b"" if rng.random() < rate else data
-        out = bytearray()
-        for byte, struck in zip(data, rng.random(len(data)) < rate, strict=True):
-            if not struck:
-                out.append(byte)
-            elif behaviour == "bitflip":
-                out.append(byte ^ 1 << int(rng.integers(8)))
-            elif behaviour == "duplicate":
-                out += bytes((byte, byte))
-        return bytes(out)
+    def struck_bytes(strike: Callable[[int], bytes]) -> LineFault:
+        def damage(data: bytes, to_module: bool) -> bytes:
+            struck = rng.random(len(data)) < rate
+            return b"".join(
+                strike(byte) if hit else bytes((byte,))
+                for byte, hit in zip(data, struck, strict=True)
+            )
 
-    return damage
+        return damage
+
+    behaviours: Mapping[str, LineFault] = {
+        "stuck": lambda data, to_module: data if to_module else b"",
+        "garbage": lambda data, _to_module: rng.bytes(len(data)),
+        "intermittent": lambda data, _to_module: b"" if rng.random() < rate else data,
+        "bitflip": struck_bytes(lambda byte: bytes((byte ^ 1 << int(rng.integers(8)),))),
+        "truncate": struck_bytes(lambda _byte: b""),
+        "duplicate": struck_bytes(lambda byte: bytes((byte, byte))),
+    }
+    return behaviours[spec.fault.behaviour]
 
 
 def radio(hooks: Hooks, spec: FaultSpec, rng: Rng) -> None:
@@ -122,29 +126,26 @@ def radio(hooks: Hooks, spec: FaultSpec, rng: Rng) -> None:
     hooks.air(spoil)
 
 
-def _air_damage(spec: FaultSpec, rng: Rng) -> Callable[[bytes, int], list[tuple[int, bytes]]]:
-    behaviour = spec.fault.behaviour
-    rate = spec.number("rate") if "rate" in spec.fault.key_names() else 1.0
-    later_us = round(spec.number("value") * 1e6) if "value" in spec.fault.key_names() else 0
+def _air_damage(spec: FaultSpec, rng: Rng) -> AirDamage:
+    rate = spec.number("rate", otherwise=1.0)
+    later_us = round(spec.number("value", otherwise=0.0) * 1e6)
 
-    def damage(data: bytes, at_us: int) -> list[tuple[int, bytes]]:
-        if rng.random() >= rate:
-            return [(at_us, data)]
-        if behaviour == "loss":
-            return []
-        if behaviour == "bitflip":
-            spoilt = bytearray(data)
-            spoilt[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
-            return [(at_us, bytes(spoilt))]
-        if behaviour == "truncate":
-            return [(at_us, data[: int(rng.integers(len(data)))])]
-        if behaviour == "duplicate":
-            return [(at_us, data), (at_us + 1000, data)]
-        if behaviour == "replay":
-            return [(at_us, data), (at_us + later_us, data)]
-        return [(at_us + later_us, data)]
+    def bitflip(data: bytes, at_us: int) -> list[tuple[int, bytes]]:
+        spoilt = bytearray(data)
+        spoilt[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
+        return [(at_us, bytes(spoilt))]
 
-    return damage
+    behaviours: Mapping[str, AirDamage] = {
+        "loss": lambda _data, _at_us: [],
+        "bitflip": bitflip,
+        "truncate": lambda data, at_us: [(at_us, data[: int(rng.integers(len(data)))])],
+        "duplicate": lambda data, at_us: [(at_us, data), (at_us + 1000, data)],
+        "replay": lambda data, at_us: [(at_us, data), (at_us + later_us, data)],
+        "reorder": lambda data, at_us: [(at_us + later_us, data)],
+        "delayed": lambda data, at_us: [(at_us + later_us, data)],
+    }
+    damage = behaviours[spec.fault.behaviour]
+    return lambda data, at_us: damage(data, at_us) if rng.random() < rate else [(at_us, data)]
 
 
 def _foreign_sender(hooks: Hooks, spec: FaultSpec, rng: Rng) -> None:
@@ -191,51 +192,3 @@ def _foreign_frame(count: int, node: int, now_us: int, own: bytes, beacons: byte
     )
     message, about, values, key = choices[count % len(choices)]
     return framing.encode(message, about, 0, 0x40000000 + count, values, key)
-
-
-def uwb(hooks: Hooks, spec: FaultSpec, rng: Rng) -> None:
-    """Install a fault of the air between the tags."""
-    air = hooks.team.uwb
-    before = air.spoil
-    foreign: deque[int] = deque()
-    next_us = [float(spec.from_us)]
-    rate = spec.number("rate")
-
-    def met(begin_us: int, end_us: int) -> bool:
-        """Whether an exchange of foreign tags, at random times, overlaps."""
-        while next_us[0] < end_us and rate > 0.0:
-            foreign.append(round(next_us[0]))
-            next_us[0] += 1e6 * float(rng.exponential(1.0 / rate))
-        while foreign and foreign[0] + EXCHANGE_US <= begin_us:
-            foreign.popleft()
-        return bool(foreign) and foreign[0] < end_us
-
-    def spoil(initiator: Pozyx, measured_m: float | None, end_us: int) -> tuple[float | None, bool]:
-        collided = False
-        if before is not None:
-            measured_m, collided = before(initiator, measured_m, end_us)
-        now_us = hooks.clock.now_us
-        if not spec.active(now_us):
-            return measured_m, collided
-        if spec.fault.behaviour == "collisions":
-            return measured_m, met(now_us, end_us) or collided
-        if rng.random() < rate and measured_m is not None:
-            if spec.fault.behaviour == "loss":
-                return None, collided
-            measured_m += float(rng.uniform(0.0, spec.number("value")))
-        return measured_m, collided
-
-    air.spoil = spoil
-
-
-def host(hooks: Hooks, spec: FaultSpec, rng: Rng) -> None:
-    """Install a fault of the laptop at the coordinator's port."""
-    before = hooks.team.host_fault
-
-    def due_us(time_us: int) -> int | None:
-        at_us = time_us if before is None else before(time_us)
-        if at_us is None or not spec.active(at_us):
-            return at_us
-        return None if spec.fault.behaviour == "gone" else spec.to_us
-
-    hooks.team.host_fault = due_us

@@ -26,8 +26,10 @@ class FaultSpec:
     to_s: float = math.inf
     values: Mapping[str, float | str] = field(default_factory=dict)
 
-    def number(self, name: str) -> float:
-        """A key's number, given or default."""
+    def number(self, name: str, otherwise: float | None = None) -> float:
+        """A key's number, given or default; ``otherwise`` where the fault has no such key."""
+        if otherwise is not None and name not in self.fault.key_names():
+            return otherwise
         value = self._value(name)
         assert not isinstance(value, str)
         return value
