@@ -125,7 +125,9 @@ class UwbAir:
         self._under_way: list[_Exchange] = []
         self.on_end: Callable[[ExchangeRecord], None] | None = None
         """Called with each exchange when it is over: for measurements and tests."""
-        self.spoil: Callable[[Pozyx, float | None, int], tuple[float | None, bool]] | None = None
+        self.spoil: Callable[[Pozyx, float | None, int], tuple[float | None, bool]] = (
+            lambda _initiator, measured_m, _end_us: (measured_m, False)
+        )
         """Fault: (initiator, what would be measured in metres, end of the exchange) -> what is
         measured instead, and whether an exchange of foreign tags spoils it."""
 
@@ -147,9 +149,7 @@ class UwbAir:
             else:
                 delays_m = initiator.antenna_delay_m + responder.antenna_delay_m
                 measured = max(measured + delays_m, 0.0)
-        spoilt = False
-        if self.spoil is not None:
-            measured, spoilt = self.spoil(initiator, measured, time_us + EXCHANGE_US)
+        measured, spoilt = self.spoil(initiator, measured, time_us + EXCHANGE_US)
         duration_us = FAILED_US if measured is None else EXCHANGE_US
         exchange = _Exchange(time_us + duration_us, (initiator, responder), spoilt)
         self._under_way = [e for e in self._under_way if e.end_us > time_us]
@@ -227,9 +227,9 @@ class RadioAir:
         self._distance_m = distance_m
         self._rng = rng
         self._last_us: dict[int, int] = {}
-        self.spoil: (
-            Callable[[XbeeModule, XbeeModule, bytes, int], list[tuple[int, bytes]]] | None
-        ) = None
+        self.spoil: Callable[[XbeeModule, XbeeModule, bytes, int], list[tuple[int, bytes]]] = (
+            lambda _sender, _receiver, data, arrival_us: [(arrival_us, data)]
+        )
         """Fault: (sender, receiver, data, arrival) -> (arrival, data) of what comes instead;
         nothing: lost."""
 
@@ -258,12 +258,10 @@ class RadioAir:
                 sent.time_us + round(delay_s * 1e6),
                 self._last_us.get(sent.sender.serial_number, 0) + 1,
             )
-            arrivals = [(arrival_us, sent.data)]
-            if self.spoil is not None:
-                arrivals = self.spoil(sent.sender, receiver, sent.data, arrival_us)
-                if not arrivals:
-                    self.counts["lost"] += 1
-                    continue
+            arrivals = self.spoil(sent.sender, receiver, sent.data, arrival_us)
+            if not arrivals:
+                self.counts["lost"] += 1
+                continue
             received = True
             done_us = max(done_us, arrival_us)
             for at_us, came in arrivals:

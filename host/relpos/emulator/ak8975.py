@@ -62,7 +62,7 @@ class Ak8975(I2cDevice):
         self._rng = np.random.default_rng([self._errors.seed, 3])
         self.time_us = 0
         self.conversion_us = CONVERSION_US
-        self.spoil: Callable[[FloatArray], FloatArray] | None = None
+        self.spoil: Callable[[FloatArray], FloatArray] = lambda field: field
         """Fault: field (3,) in the chip's axes, microtesla -> what is measured instead."""
         self._begin()
 
@@ -104,8 +104,7 @@ class Ak8975(I2cDevice):
         if not np.all(np.isfinite(chip)):
             # A recording without magnetometer samples here: the conversion never ends.
             return
-        if self.spoil is not None:
-            chip = self.spoil(chip)
+        chip = self.spoil(chip)
         gain = (np.array(self._errors.adjustment) + 128.0) / 256.0
         counts = np.rint(chip / (self.ut_per_lsb * gain))
         raw = np.clip(counts, -self.most_raw - 1, self.most_raw)

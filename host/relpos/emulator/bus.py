@@ -86,7 +86,7 @@ class I2cBus:
     def __init__(self) -> None:
         self.time_us = 0
         self.devices: dict[int, I2cDevice] = {}
-        self.fault: Fault | None = None
+        self.fault: Fault = lambda _address, _number: None
         self.transactions = 0
         self.counts: Counter[tuple[int, BusStatus]] = Counter()
         self.stuck = False
@@ -114,7 +114,7 @@ class I2cBus:
         """``S addr+W first [Sr addr+W second] [Sr addr+R read] P`` as one step."""
         number = self.transactions
         self.transactions = number + 1
-        failure = None if self.fault is None else self.fault(address, number)
+        failure = self.fault(address, number)
         device = self.devices.get(address)
         if failure:
             self.counts[address, failure] += 1
@@ -137,7 +137,7 @@ class I2cBus:
             self._refuse_data = False
             number = self.transactions
             self.transactions = number + 1
-            failure = None if self.fault is None else self.fault(address, number)
+            failure = self.fault(address, number)
             if failure is BusStatus.TIMEOUT:
                 self.stuck = True
             self._refuse_data = failure is BusStatus.DATA_NACK

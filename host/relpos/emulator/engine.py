@@ -27,6 +27,10 @@ class NodeClockError:
     offset_us: int = 0
 
 
+def nowhere(_time_us: int, _data: bytes) -> None:
+    """Where an engine's UART leads until somebody listens."""
+
+
 class Engine(Protocol):
     """One board that executes the firmware in lock-step with the virtual clock."""
 

@@ -215,7 +215,7 @@ class Mpu9150(I2cDevice):
         self._errors = errors or InertialErrors()
         self._pipeline = _Pipeline(surroundings, self._errors)
         self.auxiliary: Mapping[int, I2cDevice] = {} if auxiliary is None else auxiliary
-        self.spoil: Callable[[bytes, int], bytes | None] | None = None
+        self.spoil: Callable[[bytes, int], bytes | None] = lambda data, _time_us: data
         """Fault: (a sample's 14 bytes, its time) -> what is shown for it; None: no new sample."""
         self.self_test_gain = 1.0
         """What its self-test moves the axes by, over what the factory measured."""
@@ -330,14 +330,10 @@ class Mpu9150(I2cDevice):
         if not 0 <= index < len(self._table):
             self._fill(sample)
             index = sample - self._table_first
-        data = self._table[index]
-        if self.spoil is not None:
-            shown = self.spoil(data, self._time_of(sample))
-            if shown is None:
-                return
-            data = shown
-        self._data = data
-        self._status |= DATA_READY
+        shown = self.spoil(self._table[index], self._time_of(sample))
+        if shown is not None:
+            self._data = shown
+            self._status |= DATA_READY
 
     def _fill(self, sample: int) -> None:
         """Make the words of ``sample`` and of those after it, no farther than its block."""

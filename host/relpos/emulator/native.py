@@ -21,7 +21,7 @@ from relpos.errors import DeviceError
 from relpos.protocol.messages import ResetCause
 
 from .bus import BusStatus, I2cBus
-from .engine import EEPROM_WRITE_US, JUMP_US, POWER_LOSS, RESTART_US, NodeClockError
+from .engine import EEPROM_WRITE_US, JUMP_US, POWER_LOSS, RESTART_US, NodeClockError, nowhere
 from .xbee import line_time_us
 
 _COMPILE = ("-std=gnu++11", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
@@ -134,10 +134,6 @@ def load(path: Path) -> ctypes.CDLL:
     return library
 
 
-def _nowhere(_time_us: int, _data: bytes) -> None:
-    """No listener yet."""
-
-
 class NativeEngine:
     """One node of the native library: an Engine.
 
@@ -161,7 +157,7 @@ class NativeEngine:
         self.node_id = node_id
         self._given_id = 0 if stored_id else node_id
         self.bus = bus
-        self.on_transmit: Callable[[int, bytes], None] = _nowhere
+        self.on_transmit: Callable[[int, bytes], None] = nowhere
         self.next_due_us = power_on_us
         self.resets = 0
         self.store: Callable[[int, int], None] = self._eeprom_write

@@ -146,7 +146,7 @@ class Pozyx(I2cDevice):
         """What it makes every range too long by."""
         self.ranging = False
         """Whether an exchange that this tag started is on the air."""
-        self.intercept: Completion | None = None
+        self.intercept: Completion = self._finish
         """Fault: takes (peer, result, error, time) of an exchange that this tag started, and sees
         to its :meth:`complete`."""
         self.frozen: Callable[[int], bool] | None = None
@@ -195,14 +195,13 @@ class Pozyx(I2cDevice):
     ) -> None:
         """Report the end of an exchange; ``started`` where this tag began it, else it answered."""
         if started:
-            if not self.ranging:
-                return  # reset in between
-            if self.intercept is not None:
+            if self.ranging:  # not reset in between
                 self.intercept(peer, result, error, time_us)
-                return
-            self.ranging = False
-        elif not self.awake(time_us):
-            return  # restarted in between
+        elif self.awake(time_us):  # not restarted in between
+            self.complete(peer, result, error, time_us)
+
+    def _finish(self, peer: int, result: RangeResult | None, error: int, time_us: int) -> None:
+        self.ranging = False
         self.complete(peer, result, error, time_us)
 
     def complete(

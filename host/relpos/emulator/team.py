@@ -107,7 +107,7 @@ class EmulatedTeam:
         self.uwb = UwbAir(self.clock, self.world, self._tag_position_m, uwb_rng, config.collisions)
         self.radio = RadioAir(self.clock, self.world, self._module_distance_m, radio_rng)
         self._output: list[tuple[int, bytes]] = []
-        self.host_fault: Callable[[int], int | None] | None = None
+        self.host_fault: Callable[[int], int | None] = lambda time_us: time_us
         """Fault: time at which something leaves the port -> when the host gets it, None: never."""
         self.coordinator = XbeeModule(
             wire.COORDINATOR, 0x40000000, self.radio, self._from_coordinator
@@ -195,7 +195,7 @@ class EmulatedTeam:
         self.clock.at(left_us, lambda now_us: self._to_host(now_us, data))
 
     def _to_host(self, now_us: int, data: bytes) -> None:
-        at_us = now_us if self.host_fault is None else self.host_fault(now_us)
+        at_us = self.host_fault(now_us)
         if at_us == now_us:
             self._output.append((now_us, data))
         elif at_us is not None:
@@ -203,7 +203,7 @@ class EmulatedTeam:
 
     def host_listens(self, time_us: int) -> bool:
         """Whether a host is at the port: what it would send then is sent."""
-        return self.host_fault is None or self.host_fault(time_us) == time_us
+        return self.host_fault(time_us) == time_us
 
     def close(self) -> None:
         """Free the boards."""

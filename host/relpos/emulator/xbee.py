@@ -97,7 +97,7 @@ class XbeeModule:
         self.on_serial = on_serial
         self.counts: Counter[str] = Counter()
         self.air = air
-        self.line_fault: Callable[[bytes, bool], bytes] | None = None
+        self.line_fault: Callable[[bytes, bool], bytes] = lambda data, _to_module: data
         """Fault: (bytes, whether they go to the module) -> what arrives of them."""
         self._escaped = escaped
         self._parser = Parser(escaped=escaped)
@@ -138,9 +138,7 @@ class XbeeModule:
 
     def from_serial(self, time_us: int, data: bytes) -> None:
         """Bytes that have arrived on the module's UART by ``time_us``."""
-        if self.line_fault is not None:
-            data = self.line_fault(data, True)
-        for frame in self._parser.feed(data):
+        for frame in self._parser.feed(self.line_fault(data, True)):
             self._handle(frame, time_us)
 
     def restart(self, time_us: int) -> None:
@@ -253,11 +251,9 @@ class XbeeModule:
         self._emit(time_us, Receive16(0, 0, data, CABLE_OPTIONS))
 
     def _emit(self, time_us: int, frame: ApiFrame) -> None:
-        data = encode(frame, escaped=self._escaped)
-        if self.line_fault is not None:
-            data = self.line_fault(data, False)
-            if not data:
-                return
+        data = self.line_fault(encode(frame, escaped=self._escaped), False)
+        if not data:
+            return
         begin = max(time_us, self._line_free_us)
         self._line_free_us = begin + line_time_us(len(data), self.baud)
         self.on_serial(self._line_free_us, data)

@@ -14,7 +14,7 @@ from relpos.emulator.avr.board import (
 from relpos.emulator.avr.elf import Firmware
 from relpos.emulator.avr.library import SimulatorError
 from relpos.emulator.bus import I2cBus
-from relpos.emulator.engine import RESTART_US, NodeClockError
+from relpos.emulator.engine import RESTART_US, NodeClockError, nowhere
 from relpos.protocol import messages as wire
 
 QUANTUM_US = 1000
@@ -94,7 +94,7 @@ class AvrEngine:
     ) -> None:
         self.node_id = node_id
         self.bus = bus
-        self.on_transmit: Callable[[int, bytes], None] = _nowhere
+        self.on_transmit: Callable[[int, bytes], None] = nowhere
         self.next_due_us = power_on_us
         clock = clock or NodeClockError()
         self._nominal_hz = kind.frequency_hz
@@ -226,7 +226,3 @@ class AvrEngine:
     def close(self) -> None:
         """Free the simulated board."""
         self.board.close()
-
-
-def _nowhere(_time_us: int, _data: bytes) -> None:
-    """No listener yet."""

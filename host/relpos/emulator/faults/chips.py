@@ -67,8 +67,8 @@ def imu(hooks: Hooks, spec: FaultSpec, rng: Rng, node: EmulatedNode) -> None:
     before = node.mpu.spoil
 
     def both(data: bytes, time_us: int) -> bytes | None:
-        shown = data if before is None else before(data, time_us)
-        return shown if shown is None else spoil(shown, time_us)
+        shown = before(data, time_us)
+        return None if shown is None else spoil(shown, time_us)
 
     node.mpu.spoil = both
 
@@ -147,7 +147,7 @@ def magnetometer(hooks: Hooks, spec: FaultSpec, rng: Rng, node: EmulatedNode) ->
     spoil = {"stuck": stuck, "wrong": wrong}[spec.fault.behaviour]
 
     def while_active(field: FloatArray) -> FloatArray:
-        field = field if before is None else before(field)
+        field = before(field)
         if spec.active(chip.time_us):
             return spoil(field)
         held.clear()
@@ -174,11 +174,7 @@ def pozyx_tag(hooks: Hooks, spec: FaultSpec, rng: Rng, node: EmulatedNode) -> No
 
 
 def _exchange_fault(hooks: Hooks, spec: FaultSpec, tag: pozyx.Pozyx) -> pozyx.Completion:
-    def finish(peer: int, result: pozyx.RangeResult | None, error: int, time_us: int) -> None:
-        tag.ranging = False
-        tag.complete(peer, result, error, time_us)
-
-    before = tag.intercept or finish
+    before = tag.intercept
 
     def later_us(time_us: int) -> int:
         return time_us + round(spec.number("value") * 1e3)
@@ -230,7 +226,7 @@ def bus(hooks: Hooks, spec: FaultSpec, rng: Rng, node: EmulatedNode) -> None:
     fail = {"stuck": stuck, "nack": nack}[spec.fault.behaviour]
 
     def fault(address: int, number: int) -> BusStatus | None:
-        failed = None if before is None else before(address, number)
+        failed = before(address, number)
         return failed if failed or not spec.active(wires.time_us) else fail(number)
 
     wires.fault = fault

@@ -29,7 +29,7 @@ class Team(Protocol):
     uwb: UwbAir
     coordinator: XbeeModule
     key: bytes
-    host_fault: Callable[[int], int | None] | None
+    host_fault: Callable[[int], int | None]
 
     @property
     def nodes(self) -> Mapping[int, EmulatedNode]:
@@ -119,25 +119,17 @@ class Hooks:
     def line(self, module: XbeeModule, fault: LineFault) -> None:
         """Pass what goes over the module's serial line through ``fault``, after earlier ones."""
         before = module.line_fault
-
-        def both(data: bytes, to_module: bool) -> bytes:
-            return fault(data if before is None else before(data, to_module), to_module)
-
-        module.line_fault = both
+        module.line_fault = lambda data, to_module: fault(before(data, to_module), to_module)
 
     def air(self, spoil: Spoil) -> None:
         """Pass what goes over the air through ``spoil``, after earlier ones."""
         before = self.team.radio.spoil
 
-        def both(
-            sender: XbeeModule, receiver: XbeeModule, data: bytes, arrival_us: int
-        ) -> list[tuple[int, bytes]]:
-            frames = [(arrival_us, data)]
-            if before is not None:
-                frames = before(sender, receiver, data, arrival_us)
-            return [out for at, frame in frames for out in spoil(sender, receiver, frame, at)]
-
-        self.team.radio.spoil = both
+        self.team.radio.spoil = lambda sender, receiver, data, arrival_us: [
+            out
+            for at, frame in before(sender, receiver, data, arrival_us)
+            for out in spoil(sender, receiver, frame, at)
+        ]
 
     def silence(self, module: XbeeModule, gone: Callable[[int], bool]) -> None:
         """Let the module neither send nor receive anything while ``gone(time)``."""

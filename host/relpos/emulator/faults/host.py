@@ -12,7 +12,7 @@ def host(hooks: Hooks, spec: FaultSpec, rng: Rng) -> None:
     wakes_us = {"gone": None, "delayed": spec.to_us}[spec.fault.behaviour]
 
     def due_us(time_us: int) -> int | None:
-        at_us = time_us if before is None else before(time_us)
+        at_us = before(time_us)
         return at_us if at_us is None or not spec.active(at_us) else wakes_us
 
     hooks.team.host_fault = due_us

@@ -40,9 +40,7 @@ def uwb(hooks: Hooks, spec: FaultSpec, rng: Rng) -> None:
     damage = {"collisions": collisions, "loss": loss, "wrong": wrong}[spec.fault.behaviour]
 
     def spoil(initiator: Pozyx, measured_m: float | None, end_us: int) -> tuple[float | None, bool]:
-        collided = False
-        if before is not None:
-            measured_m, collided = before(initiator, measured_m, end_us)
+        measured_m, collided = before(initiator, measured_m, end_us)
         if not spec.active(hooks.clock.now_us):
             return measured_m, collided
         measured_m, met = damage(measured_m, end_us)
