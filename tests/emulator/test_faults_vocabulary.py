@@ -123,6 +123,15 @@ def test_the_same_faults_and_seed_give_the_same_bytes():
         assert list(team.stream()) != runs[0]
 
 
+def test_a_tag_that_sticks_twice_sticks_the_first_time_too():
+    def bytes_with(*faults):
+        with EmulatedTeam(TeamConfig("paper", 2, 10.0, 3, faults=faults)) as team:
+            return list(team.stream())
+
+    again = "pozyx:stuck:from=9"
+    assert bytes_with("pozyx:stuck:from=3,to=8", again) != bytes_with(again)
+
+
 def test_the_table_of_reliability_has_a_row_for_every_fault():
     page = Path(__file__).parents[2] / "docs" / "reliability.md"
     rows = [line for line in page.read_text().splitlines() if line.startswith("| `")]

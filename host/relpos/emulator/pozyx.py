@@ -149,7 +149,7 @@ class Pozyx(I2cDevice):
         self.intercept: Completion = self._finish
         """Fault: takes (peer, result, error, time) of an exchange that this tag started, and sees
         to its :meth:`complete`."""
-        self.frozen: Callable[[int], bool] | None = None
+        self.frozen: Callable[[int], bool] = lambda _time_us: False
         """Fault: (time) -> whether what exchanges give is not stored, though reported as done."""
         self._begin()
 
@@ -215,7 +215,7 @@ class Pozyx(I2cDevice):
     ) -> None:
         """Store what an exchange gave and raise its flag; a fault inverts that."""
         room = peer in self._ranges or len(self._ranges) < MOST_DEVICES
-        if result is not None and room and not (self.frozen and self.frozen(time_us)):
+        if result is not None and room and not self.frozen(time_us):
             stamp_ms = (time_us - self._power_on_us) // 1000
             self._ranges[peer] = struct.pack(
                 "<IIh", stamp_ms & 0xFFFFFFFF, result.distance_mm, result.rss_dbm

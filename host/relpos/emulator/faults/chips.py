@@ -168,7 +168,8 @@ def pozyx_tag(hooks: Hooks, spec: FaultSpec, rng: Rng, node: EmulatedNode) -> No
     elif _any_chip(hooks, spec, rng, node, pozyx.ADDRESS):
         pass
     elif behaviour == "stuck":
-        tag.frozen = spec.active
+        before = tag.frozen
+        tag.frozen = lambda time_us: before(time_us) or spec.active(time_us)
     else:
         tag.intercept = _exchange_fault(hooks, spec, tag)
 
