@@ -98,7 +98,7 @@ def _make(
                 return ParticleFilter(priors, initialiser, particle, seed)
             case "deadreckoning":
                 reckoning = parse(DeadReckoningSettings, given, "deadreckoning")
-                return DeadReckoning(priors, reckoning, seed)
+                return DeadReckoning(priors, reckoning)
         return plugins.make(name, plugins.factory(name), priors, given, seed, nodes)
 
 

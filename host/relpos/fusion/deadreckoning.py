@@ -64,7 +64,6 @@ class DeadReckoning:
 
     priors: Sequence[Prior] = ()
     settings: DeadReckoningSettings = field(default_factory=DeadReckoningSettings)
-    seed: int = 0
     _timeline: Timeline = field(init=False)
     _nodes: dict[int, _Node] = field(default_factory=dict)
     _own: Counter[str] = field(default_factory=Counter)

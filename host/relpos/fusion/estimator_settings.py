@@ -11,9 +11,10 @@ from relpos.fusion.settings import setting
 
 @dataclass(frozen=True, slots=True)
 class BankSettings:
-    """Of the bank, and of the filter that replaces it in a large team.
+    """Of the bank; one set for all scenarios and recordings.
 
-    One set for all scenarios and recordings.
+    The filter that replaces it in a large team has one hypothesis, and learns less: of these it
+    uses ``scale``, ``drift_rad_s`` and ``bias_m``, and the times at the end.
     """
 
     FORMER: ClassVar[Mapping[str, float]] = {

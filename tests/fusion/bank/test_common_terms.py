@@ -14,11 +14,11 @@ from relpos import fusion, tracks
 from relpos.fusion.bank import reporting
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.hypothesis_models import LEAST_SHARE, LEAST_WEIGHT, RangeErrors
-from relpos.fusion.bank.storage import COMMON, PER_NODE, CommonIndex, StateIndex
+from relpos.fusion.bank.storage import COMMON, PER_NODE, StateIndex
 from relpos.fusion.clocks import LEAST_S, SLEW, Clocks, time_offsets
 from relpos.fusion.estimator import Estimate, Parameter
 from relpos.fusion.estimator_settings import BankSettings
-from relpos.fusion.models.ranging import OUTLIERS_SHORT, PASSING_SHARE, Repeats
+from relpos.fusion.models.ranging import OUTLIERS_SHORT, PASSING_SHARE, CommonIndex, Repeats
 from relpos.measurements import Measurement, Motion, Range
 from relpos.simulation.paper import simulate_paper
 
@@ -213,7 +213,7 @@ def test_a_model_that_hardly_any_weight_had_comes_back_after_hypotheses_are_join
     for n in range(NODES):
         core.add_node((3.0 * n, 0.0, 0.0), 0.1, 0.1)
     these = core.hypotheses
-    these.log_weight[:] -= 60.0 * np.maximum(these.models.bias, these.models.constants)
+    these.log_weight[:] -= 60.0 * np.maximum(these.models.has_biases, these.models.constants)
     core.adaptive._shrink(10, these.unperturbed_weights())
     core.adaptive.grow()
     for _ in range(40):
@@ -229,7 +229,7 @@ def test_each_kind_of_range_error_keeps_hypotheses_and_some_weight() -> None:
         core.add_node((3.0 * n, 0.0, 0.0), 0.1, 0.1)
     these = core.hypotheses
     these.bias_entries(np.array([0]), np.array([1]))
-    these.log_weight[:] -= 60.0 * these.models.bias
+    these.log_weight[:] -= 60.0 * these.models.has_biases
     for _ in range(5):
         these.resample(these.weights())
     numbers = np.bincount(these.models.range_errors)

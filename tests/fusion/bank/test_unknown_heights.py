@@ -8,8 +8,9 @@ import pytest
 import relpos
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.hypothesis_models import RangeErrors
-from relpos.fusion.bank.storage import PER_NODE, CommonIndex
+from relpos.fusion.bank.storage import PER_NODE
 from relpos.fusion.estimator_settings import BankSettings
+from relpos.fusion.models.ranging import CommonIndex
 
 
 @pytest.fixture(scope="module")

@@ -12,4 +12,7 @@ arrays); then ``hypothesis_set.py`` (storage and resampling), ``adaptive_count.p
 ``motion_update.py``, ``range_update.py``, ``heading_update.py``, ``detection_update.py``.
 ``sensors.py`` and ``variance_components.py`` learn the noise; ``mixture.py`` and ``reporting.py``
 sum up.
+
+Kernels know no settings. ``hypothesis_set.py`` turns a prior of ``BankSettings`` into a variance in
+the covariances; an entry without variance is one that the hypothesis does not model.
 """

@@ -22,7 +22,7 @@ from relpos.fusion.bank.detection_update import Attempts
 from relpos.fusion.bank.hypothesis_set import PAIR_BIASES
 from relpos.fusion.bank.mirrored import open_nodes
 from relpos.fusion.bank.reporting import Report
-from relpos.fusion.bank.storage import PER_NODE, CommonIndex, StateIndex
+from relpos.fusion.bank.storage import PER_NODE, StateIndex
 from relpos.fusion.clocks import Clocks
 from relpos.fusion.estimator import (
     Estimate,
@@ -44,6 +44,7 @@ from relpos.fusion.models.motion import WALK_S, WithinReport, reported_sigmas, v
 from relpos.fusion.models.north import North
 from relpos.fusion.models.odometry_faults import SpeedGate, ZeroMotionDetector, vagueness
 from relpos.fusion.models.ranging import (
+    CommonIndex,
     Mounting,
     OutlierPersistence,
     RangeCorrelation,

@@ -91,7 +91,7 @@ class Models:
         return has
 
     @property
-    def bias(self) -> Floats:
+    def has_biases(self) -> Floats:
         """1 where ranges have biases (K,), else 0."""
         return 1.0 - self.has(RangeErrors.NOISE)
 

@@ -20,12 +20,12 @@ from relpos.fusion.bank.hypothesis_models import (
 )
 from relpos.fusion.bank.lanes import LANES
 from relpos.fusion.bank.mixture import PERTURBED_LOSS
-from relpos.fusion.bank.storage import COMMON, PER_NODE, CommonIndex, Hypotheses, StateIndex
+from relpos.fusion.bank.storage import COMMON, PER_NODE, Hypotheses, StateIndex
 from relpos.fusion.bank.variance_components import Draws, VarianceComponents
 from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.models.motion_variances import COMPONENTS
 from relpos.fusion.models.odometry_faults import JUMP_M
-from relpos.fusion.models.ranging import GROWTH_SD_M
+from relpos.fusion.models.ranging import GROWTH_SD_M, CommonIndex
 from relpos.fusion.resampling import systematic
 
 Floats = npt.NDArray[np.float64]
@@ -53,7 +53,7 @@ class HypothesisSet:
 
     Users are *rows* 0 ... N-1 in the order of ``add_node``. The state has D = 6 N + 4 + pairs
     entries: five a user (:class:`~relpos.fusion.bank.storage.StateIndex`), what ranges have in
-    common (:class:`~relpos.fusion.bank.storage.CommonIndex`), each user's clock offset, and the
+    common (:class:`~relpos.fusion.models.ranging.CommonIndex`), each user's clock offset, and the
     range bias of each pair when it is first ranged.
     """
 
@@ -288,7 +288,7 @@ class HypothesisSet:
         p[:, scale, scale] = models.constants * s.scale**2
         self.nodes += 1
         clock = self.clock_entry(row)
-        p[:, clock, clock] = models.bias * CLOCK_SD_S**2
+        p[:, clock, clock] = models.has_biases * CLOCK_SD_S**2
         self.store(x, p)
         self.biases = {pair: place + PER_NODE + 1 for pair, place in self.biases.items()}
         self.components.add_node()
@@ -378,17 +378,17 @@ class HypothesisSet:
         return heights, dict(zip(self.biases, learned, strict=True))
 
     def _allow_common(self, which: Indices) -> None:
-        """Let hypotheses ``which`` (M,) of those with biases have what ranges have in common."""
-        priors = {self.common_entry(CommonIndex.SHADOW): SHADOW_SD_M}
-        priors[self.common_entry(CommonIndex.LATENESS)] = LATENESS_SD_S
-        priors[self.common_entry(CommonIndex.GROWTH)] = GROWTH_SD_M
-        priors |= {self.clock_entry(row): CLOCK_SD_S for row in range(self.nodes)}
+        """Let those of ``which`` (M,) that have biases model what ranges have in common."""
+        priors = {
+            self.common_entry(CommonIndex.BIAS): self.settings.bias_m,
+            self.common_entry(CommonIndex.SHADOW): SHADOW_SD_M,
+            self.common_entry(CommonIndex.LATENESS): LATENESS_SD_S,
+            self.common_entry(CommonIndex.GROWTH): GROWTH_SD_M,
+        } | {self.clock_entry(row): CLOCK_SD_S for row in range(self.nodes)}
         block, lane = self.at(which)
-        p, has = self.arrays.p, self.models.bias[which]
+        p, has = self.arrays.p, self.models.has_biases[which]
         for entry, sigma in priors.items():
             p[block, storage.triangle_place(entry, entry), lane] = has * sigma**2
-        common = self.common_entry(CommonIndex.BIAS)
-        p[block, storage.triangle_place(common, common), lane] = has * self.settings.bias_m**2
         self._begin_pairs(which)
 
     def _begin_pairs(self, which: Indices) -> None:
@@ -421,7 +421,7 @@ class HypothesisSet:
         """Return the prior variance of what a pair has of its own (M,), m^2 or m^4."""
         heights = self.models.has(RangeErrors.HEIGHT)[which]
         own = self.settings.pair_bias_m**2
-        variance: Floats = self.models.bias[which] * (own + heights * (STOREY_M2**2 - own))
+        variance: Floats = self.models.has_biases[which] * (own + heights * (STOREY_M2**2 - own))
         return variance
 
     def know_heights(self) -> None:
@@ -451,7 +451,7 @@ class HypothesisSet:
 
     def shift_common(self, entry: int, by: float) -> None:
         """Add to an entry of what ranges have in common in every hypothesis that models it."""
-        self.arrays.x[:, entry] += by * storage.lay_out((self.models.bias > 0.0).astype(np.float64))
+        self.arrays.x[:, entry] += by * storage.lay_out(self.models.has_biases)
 
     def set_scale(self, row: int, scale: float) -> None:
         """Start a user's step scale (true over reported) where it is modelled."""
@@ -464,7 +464,7 @@ class HypothesisSet:
         A pair's bias is the common one plus its own part, so a new pair begins with what is known
         of the common one. Where there are too many pairs, only the common one is modelled.
         """
-        if not self.models.bias.any():
+        if not self.models.has_biases.any():
             return np.full(len(first), -1, dtype=np.int64)
         common = self.common_entry(CommonIndex.BIAS)
         entries = np.full(len(first), common, dtype=np.int64)
@@ -526,7 +526,7 @@ class HypothesisSet:
         """Return those that are to have hypotheses; what began with biases cannot lose them."""
         if self.settings.biased == 0.0:
             return [RangeErrors.NOISE]
-        kinds = [] if self.models.bias.all() else [RangeErrors.NOISE]
+        kinds = [] if self.models.has_biases.all() else [RangeErrors.NOISE]
         kinds.append(RangeErrors.CONSTANT)
         if self.biases:
             kinds += [RangeErrors.PASSING] + [RangeErrors.HEIGHT] * (not self.heights_known)

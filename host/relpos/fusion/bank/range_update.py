@@ -35,7 +35,6 @@ from relpos.fusion.bank.storage import (
     POSE,
     TINY,
     Block,
-    CommonIndex,
     Hypotheses,
     block_of,
     correct,
@@ -50,6 +49,7 @@ from relpos.fusion.models.ranging import (
     GROWTH_USUAL_M,
     OUTLIERS_SHORT,
     PASSING_SHARE,
+    CommonIndex,
 )
 
 Floats = npt.NDArray[np.float64]

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.hypothesis_models import RangeErrors
 from relpos.fusion.bank.mirrored import VAGUE_RAD
-from relpos.fusion.bank.storage import PER_NODE, CommonIndex, StateIndex, every_pair
+from relpos.fusion.bank.storage import PER_NODE, StateIndex, every_pair
 from relpos.fusion.clocks import Clocks
 from relpos.fusion.estimator import (
     ANY_ANGLE_RAD,
@@ -36,7 +36,7 @@ from relpos.fusion.estimator import (
 )
 from relpos.fusion.initial_poses import POSE, Initialiser, PoseMixture, sought_node
 from relpos.fusion.models.detection import Detection
-from relpos.fusion.models.ranging import RANGE_SCALE_SD
+from relpos.fusion.models.ranging import RANGE_SCALE_SD, CommonIndex
 from relpos.fusion.modes import alternatives_of, belief_of
 
 Floats = npt.NDArray[np.float64]
@@ -214,7 +214,7 @@ class Report:
     def _common_parameters(self) -> list[Parameter]:
         """Return what ranges have in common; the team's figures stand beside every node."""
         these, clocks, nodes = self.core.hypotheses, self.clocks, sorted(self.row)
-        if not nodes or not these.models.bias.any():
+        if not nodes or not these.models.has_biases.any():
             return []
 
         def learned(index: CommonIndex) -> tuple[float, float]:
@@ -261,7 +261,7 @@ class Report:
     def _range_scale_sd(self) -> float:
         """Return the deviation of what ranges' biases share in proportion to distance."""
         these = self.core.hypotheses
-        wide = these.models.has(RangeErrors.PASSING) if these.biases else these.models.bias
+        wide = these.models.has(RangeErrors.PASSING) if these.biases else these.models.has_biases
         return RANGE_SCALE_SD * float(these.weights() @ wide)
 
     # -- the team while a node is ambiguous or sought ------------------------------------------

@@ -2,11 +2,11 @@
 
 One hypothesis is a mean (D,) and a covariance (D, D) over all users: five entries a user in the
 order of :class:`StateIndex`, then (where modelled) what many ranges have in common
-(:class:`CommonIndex`, and a clock offset a user), then the pairs' biases. ``x`` (B, D, LANES) and
-``p`` (B, D (D + 1) / 2, LANES) are B blocks of eight hypotheses (:mod:`.lanes`); of a covariance
-the lower triangle alone is stored, row by row. All users' poses (x, y, heading) come
-first, then all constants (drift, scale), then the biases, so that what a block does not model is
-at its end. :func:`pack` and :func:`unpack` convert.
+(:class:`~relpos.fusion.models.ranging.CommonIndex`, and a clock offset a user), then the pairs'
+biases. ``x`` (B, D, LANES) and ``p`` (B, D (D + 1) / 2, LANES) are B blocks of eight hypotheses
+(:mod:`.lanes`); of a covariance the lower triangle alone is stored, row by row. All users' poses
+(x, y, heading) come first, then all constants (drift, scale), then the biases, so that what a block
+does not model is at its end. :func:`pack` and :func:`unpack` convert.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import numpy.typing as npt
 from relpos.fusion.bank import lanes
 from relpos.fusion.bank.lanes import LANES, Lanes, load, some, store
 from relpos.fusion.compiled import compiled, inner
+from relpos.fusion.models.ranging import CommonIndex
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -42,21 +43,8 @@ class StateIndex(IntEnum):
     SCALE = 4
 
 
-class CommonIndex(IntEnum):
-    """The team's entries after the users', before their clock offsets.
-
-    ``BIAS`` (m) lengthens every range, ``SHADOW`` (m) those that pass through a body, ``LATENESS``
-    (s) is by how much ranges are dated late, ``GROWTH`` (m) by how much they grow with distance
-    (:func:`~relpos.fusion.models.ranging.growth_slope`).
-    """
-
-    BIAS = 0
-    SHADOW = 1
-    LATENESS = 2
-    GROWTH = 3
-
-
 COMMON = len(CommonIndex)
+"""Entries of the team after the users', before their clock offsets."""
 PER_NODE = len(StateIndex)
 POSE = 3
 """x, y and heading of a user are stored side by side."""

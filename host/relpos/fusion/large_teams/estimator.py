@@ -33,17 +33,13 @@ from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.initial_poses import Initialiser, PoseMixture, by_node
 from relpos.fusion.large_teams.kernels import NEAREST_M, RangeModel, Ranges
 from relpos.fusion.large_teams.range_terms import slopes_of
-from relpos.fusion.large_teams.sparse_filter import (
-    GROWTH,
-    LATENESS,
-    SHADOW,
-    NeighbourhoodFilter,
-)
+from relpos.fusion.large_teams.sparse_filter import NeighbourhoodFilter, prior_information
 from relpos.fusion.large_teams.variance_components import VarianceComponents
 from relpos.fusion.models.motion import reported_sigmas, velocity_m_s
 from relpos.fusion.models.motion_variances import ALONG, TURN, WHITE, base_variances
 from relpos.fusion.models.odometry_faults import JUMP_M
 from relpos.fusion.models.ranging import (
+    CommonIndex,
     Mounting,
     OutlierPersistence,
     RangeCorrelation,
@@ -142,7 +138,9 @@ class LargeTeam:
     def __post_init__(self) -> None:
         self.vertical = VerticalFilter(posts=posts_of(self.mountings))
         model = RangeModel(SIGMA_R_M, OUTLIERS, OUTLIER_M)
-        self.filter = NeighbourhoodFilter(math.inf, model)
+        self.filter = NeighbourhoodFilter(
+            math.inf, model, terms_information=prior_information(self.settings.bias_m)
+        )
         known: list[Prior] = []
         for p in by_node(self.priors):
             self._presence(p.node)
@@ -237,11 +235,11 @@ class LargeTeam:
         """Let what has been learned of time stamps go into those of later ranges."""
         if self._epoch_s > -math.inf:
             learned = (
-                float(self.filter.terms[LATENESS]),
-                float(self.filter.sigma_of_terms()[LATENESS]),
+                float(self.filter.terms[CommonIndex.LATENESS]),
+                float(self.filter.sigma_of_terms()[CommonIndex.LATENESS]),
             )
             late_s, _ = self.clocks.slew(time_s - self._epoch_s, learned, {})
-            self.filter.terms[LATENESS] -= late_s
+            self.filter.terms[CommonIndex.LATENESS] -= late_s
         timeline.reorder_s = self.settings.reorder_s + self.clocks.longest_s
 
     # -- motion --------------------------------------------------------------------------------
@@ -450,11 +448,11 @@ class LargeTeam:
     def _parameters(self, time_s: float) -> tuple[Parameter, ...]:
         """Return what ranges have in common; the team's figures stand beside every node."""
         terms, sigmas = self.filter.terms.tolist(), self.filter.sigma_of_terms().tolist()
-        late_s = terms[LATENESS] + self.clocks.lateness_s
+        late_s = terms[CommonIndex.LATENESS] + self.clocks.lateness_s
         learned = (
-            ("body_shadow_m", terms[SHADOW], sigmas[SHADOW]),
-            ("range_lateness_s", late_s, sigmas[LATENESS]),
-            ("range_growth_m", terms[GROWTH], sigmas[GROWTH]),
+            ("body_shadow_m", terms[CommonIndex.SHADOW], sigmas[CommonIndex.SHADOW]),
+            ("range_lateness_s", late_s, sigmas[CommonIndex.LATENESS]),
+            ("range_growth_m", terms[CommonIndex.GROWTH], sigmas[CommonIndex.GROWTH]),
         )
         return tuple(
             Parameter(time_s, node, None, *one) for node in sorted(self._row) for one in learned

@@ -21,13 +21,13 @@ def slopes_of(
     headings_rad: Sequence[float],
     velocities_m_s: Sequence[Vector],
 ) -> tuple[float, ...]:
-    """Return a range's slopes in the body's shadow, the lateness of time stamps, bias and growth.
+    """Return a range's slopes in what ranges have in common, in the order of ``CommonIndex``.
 
     ``sight`` is the direction from the node to the peer; the others are the node's and the peer's.
     """
     ends = zip(headings_rad, velocities_m_s, strict=True)
     own, other = (_along(sight, heading, velocity) for heading, velocity in ends)
-    return shadow_slope(sight, *headings_rad), own - other, 1.0, growth_slope(distance_m)
+    return 1.0, shadow_slope(sight, *headings_rad), own - other, growth_slope(distance_m)
 
 
 def _along(sight: Vector, heading_rad: float, velocity_m_s: Vector) -> float:

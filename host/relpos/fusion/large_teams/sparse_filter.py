@@ -27,7 +27,7 @@ import numpy.typing as npt
 from relpos.fusion.large_teams import chain, kernels
 from relpos.fusion.large_teams.kernels import RangeModel, Ranges
 from relpos.fusion.large_teams.layout import COVARIANCE, StripLayout, lay_out
-from relpos.fusion.models.ranging import GROWTH_SD_M
+from relpos.fusion.models.ranging import GROWTH_SD_M, CommonIndex
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -36,11 +36,9 @@ JITTER_M2, JITTER_CONSTANT = 1e-8, 1e-12
 """Least variances of an initial pose, (0.1 mm)^2 and as many rad^2, and of drift and scale: what is
 exact has no inverse."""
 
-TERMS_SD = (0.3, 0.3, 0.3, GROWTH_SD_M)
-"""Standard deviations of the terms beforehand: m, s, m, m."""
-
-TERMS = len(TERMS_SD)
-SHADOW, LATENESS, BIAS, GROWTH = range(TERMS)
+TERMS = len(CommonIndex)
+BIAS_SD_M, SHADOW_SD_M, LATENESS_SD_S = 0.3, 0.3, 0.3
+"""Standard deviations beforehand of a bias, of the body's shadow and of the lateness."""
 
 DIRECTIONS = 12
 """So many directions of the strips are tried."""
@@ -50,6 +48,17 @@ SLACK = 0.3
 
 MARGIN_M = 0.5
 """Strips that turn out too narrow become this much wider than the widest range needs."""
+
+
+def prior_information(bias_sd_m: float) -> Floats:
+    """Return the information (T, T) of what all ranges have in common, before any range."""
+    sigma = np.empty(TERMS)
+    sigma[CommonIndex.BIAS] = bias_sd_m
+    sigma[CommonIndex.SHADOW] = SHADOW_SD_M
+    sigma[CommonIndex.LATENESS] = LATENESS_SD_S
+    sigma[CommonIndex.GROWTH] = GROWTH_SD_M
+    information: Floats = np.diag(1.0 / (sigma**2 + JITTER_CONSTANT))
+    return information
 
 
 @dataclass(slots=True)
@@ -68,13 +77,10 @@ class NeighbourhoodFilter:
     antenna_m: Floats = field(default_factory=lambda: np.empty((0, 2)))
     """Where the antenna of each node is: forward and left of the point that moves, (N, 2)."""
     terms: Floats = field(default_factory=lambda: np.zeros(TERMS))
-    """What all ranges have in common: the body's shadow (m), the lateness of time stamps (s), their
-    bias (m) and its growth with the distance (m)."""
+    """What all ranges have in common (:class:`~relpos.fusion.models.ranging.CommonIndex`)."""
     _carried: Floats = field(default_factory=lambda: np.empty((0, COVARIANCE, TERMS)))
     """V (N, 5, T): derivative of the states by the terms."""
-    terms_information: Floats = field(
-        default_factory=lambda: np.diag(np.power(TERMS_SD, -2.0).astype(np.float64))
-    )
+    terms_information: Floats = field(default_factory=lambda: prior_information(BIAS_SD_M))
     counters: Counter[str] = field(default_factory=Counter)
     """How often nodes changed strips, and strips were laid out anew or widened."""
     _lever: Floats = field(default_factory=lambda: np.empty((0, 3, 3)))

@@ -15,12 +15,27 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import IntEnum
 from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
+
+
+class CommonIndex(IntEnum):
+    """What all ranges of a team have in common, in the order of its entries in a state.
+
+    ``BIAS`` (m) lengthens every range, ``SHADOW`` (m) those that pass through a body, ``LATENESS``
+    (s) is by how much ranges are dated late, ``GROWTH`` (m) by how much they grow with distance
+    (:func:`growth_slope`).
+    """
+
+    BIAS = 0
+    SHADOW = 1
+    LATENESS = 2
+    GROWTH = 3
 
 
 class Mounting(Protocol):
