@@ -140,6 +140,21 @@ def test_rooms_through_whose_walls_everybody_ranges_grow_little() -> None:
     assert 0.7 < scored.nees_distance < 1.4
 
 
+def test_a_bias_of_all_ranges_is_found_as_far_as_its_setting_allows(crowd: Crowd) -> None:
+    long = [
+        replace(m, range_m=m.range_m + 0.5) if isinstance(m, Range) else m
+        for m in crowd.measurements()
+        if m.time_s <= 16.0
+    ]
+
+    def error_m(bias_m: float) -> float:
+        made = fusion.make("bank", crowd.priors(), {"bias_m": bias_m}, 0)
+        result = [e for m in long for e in made.process(m)]
+        return float(distance_errors(crowd, result[-1])[0].mean())
+
+    assert error_m(0.3) < 0.5 * error_m(0.0)
+
+
 def test_late_ranges_give_the_estimates_of_ranges_in_time(crowd: Crowd) -> None:
     measurements = [m for m in crowd.measurements() if m.time_s <= 16.0]
     late = [m for m in measurements if isinstance(m, Range) and m.time_s == 10.0]

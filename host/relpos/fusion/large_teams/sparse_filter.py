@@ -38,7 +38,11 @@ exact has no inverse."""
 
 TERMS = len(CommonIndex)
 BIAS_SD_M, SHADOW_SD_M, LATENESS_SD_S = 0.3, 0.3, 0.3
-"""Standard deviations beforehand of a bias, of the body's shadow and of the lateness."""
+"""Standard deviations beforehand of a bias, of the body's shadow and of the lateness.
+
+Pairs have no biases here that shadows could be taken for, so that both may be larger than in the
+bank. 24 people, 100 s, seeds 14 and 15, with these and with the bank's .05 m and .1 s: ``shadow``
+.0680 and .0688 m, ``late-1`` .136 and .140, ``base`` and ``walls`` within .0006."""
 
 DIRECTIONS = 12
 """So many directions of the strips are tried."""
