@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import fault_runs
@@ -68,7 +69,7 @@ COLUMNS = (
 )
 
 
-def row(fault: Fault, outcome: Outcome, before: Fault | None = None) -> str:
+def row(fault: Fault, outcome: Outcome, before: Fault | None) -> str:
     """One line of the table; what it has in common with the fault ``before`` is not repeated."""
     recovery = outcome.recovery_s
     words = "never" if recovery is None else f"{recovery:.1f} s"
@@ -93,18 +94,22 @@ def table_line(cells: tuple[str, ...]) -> str:
     return "| " + " | ".join(cells) + " |\n"
 
 
-def page() -> str:
-    """All of it."""
-    specs = fault_runs.specs()
-    noise_m = max(map(abs, fault_runs.undisturbed().range_errors_m()))
-    text = HEAD.format(noise=noise_m) + table_line(COLUMNS) + "|---" * len(COLUMNS) + "|\n"
+def rows(names: Collection[str] = TARGETS) -> Iterator[str]:
+    """Lines of those targets or faults, as they stand in the whole table."""
     before: Fault | None = None
     for target in TARGETS:
-        for fault, spec in specs:
+        for fault, spec in fault_runs.specs():
             if fault.target == target:
-                text += row(fault, compare(spec), before)
+                if target in names or fault.name in names:
+                    yield row(fault, compare(spec), before)
                 before = fault
-    return text
+
+
+def page() -> str:
+    """All of it."""
+    noise_m = max(map(abs, fault_runs.undisturbed().range_errors_m()))
+    head = HEAD.format(noise=noise_m) + table_line(COLUMNS) + "|---" * len(COLUMNS) + "|\n"
+    return head + "".join(rows())
 
 
 def main() -> None:
@@ -114,9 +119,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=PAGE)
     arguments = parser.parse_args()
     if arguments.faults:
-        for fault, spec in fault_runs.specs():
-            if fault.name in arguments.faults or fault.target in arguments.faults:
-                print(row(fault, compare(spec)), end="")
+        print(*rows(arguments.faults), sep="", end="")
         return
     arguments.output.write_text(page(), encoding="utf-8")
     print(f"{arguments.output.name}: {len(fault_runs.specs())} faults")

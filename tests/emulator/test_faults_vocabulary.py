@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 import fault_runs
+import reliability
 from relpos.cli import main
 from relpos.emulator.faults import FAULTS, REFUSED, TARGETS, FaultError, help_text, parse_fault
 from relpos.emulator.team import EmulatedTeam, TeamConfig
@@ -150,3 +151,9 @@ def test_the_table_of_reliability_has_a_row_for_every_fault():
         assert cells[3].endswith(" s"), "recovers"
         if fault.target in ("radio", "xbee", "uwb", "pozyx", "host"):
             assert cells[4] == "0.00 m"
+
+
+def test_a_row_that_is_printed_alone_can_be_pasted_into_the_table():
+    page = (Path(__file__).parents[2] / "docs" / "reliability.md").read_text()
+    (row,) = reliability.rows(("imu:stuck",))
+    assert "|".join(row.split("|")[:4]) in page
