@@ -9,7 +9,9 @@ import typer
 
 from relpos.cli import live
 from relpos.errors import DataError
-from relpos.exchange.formats import Format, Kind
+from relpos.exchange.formats import TRAITS, Format, Kind
+
+FILES = [form for form, traits in TRAITS.items() if traits.one_file]
 
 
 def convert(
@@ -25,7 +27,7 @@ def convert(
     out: Annotated[
         Path,
         typer.Option(
-            metavar="PATH", help="Output: a file for mcap, geojson, gpx, rrd; else a directory."
+            metavar="PATH", help=f"Output: a file for {', '.join(FILES)}; else a directory."
         ),
     ],
     source_format: Annotated[
@@ -72,7 +74,7 @@ def convert(
     from relpos.geodesy import parse_pin
 
     placed = tuple(parse_pin(pin) for pin in pins or ())
-    if to in (Format.GEOJSON, Format.GPX) and not placed:
+    if TRAITS[to].on_map and not placed:
         raise typer.BadParameter(
             f"{to} needs geographic coordinates: give a known position ({live.PINS})",
             param_hint="--pin",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,7 @@ from relpos import tracks
 from relpos.errors import DataError
 from relpos.exchange.formats import Kind
 from relpos.fusion.estimator import Estimate, NodeEstimate, NodeStatus
-from relpos.geodesy import Locate
+from relpos.geodesy import Locate, MapFrame
 from relpos.measurements import Truth
 from relpos.runs.run import Run
 from relpos.tracks import Track, sample
@@ -28,6 +28,9 @@ PLACED = (NodeStatus.OK, NodeStatus.STALE, NodeStatus.LOST)
 MIN_JUMP_M = 3.0
 FASTEST_M_S = 5.0
 """Who has gone further has been located anew: the page's figures (``view/static/js/tracks.js``)."""
+
+_DECIMALS = 9
+"""Of a degree: a tenth of a millimetre."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +154,15 @@ def _pieces(
 def _jumps(before: Point, after: Point) -> bool:
     walked_m = FASTEST_M_S * (after.time_s - before.time_s)
     return math.hypot(after.x_m - before.x_m, after.y_m - before.y_m) > max(MIN_JUMP_M, walked_m)
+
+
+def on_map(points: Sequence[Point], frame: MapFrame) -> Iterator[tuple[float, float, float | None]]:
+    """Return each point's latitude and longitude, and its height where it is known."""
+    latitude, longitude = frame.to_map([p.x_m for p in points], [p.y_m for p in points])
+    for p, lat, lon in zip(points, latitude.tolist(), longitude.tolist(), strict=True):
+        altitude_m = frame.altitude_of(p.z_m)
+        height = None if altitude_m is None else round(altitude_m, 3)
+        yield round(lat, _DECIMALS), round(lon, _DECIMALS), height
 
 
 def as_truth(points: Iterable[Point]) -> tuple[Truth, ...]:

@@ -17,7 +17,7 @@ from relpos.exchange.content import (
     as_truth,
     points_of,
 )
-from relpos.exchange.formats import Format, Kind
+from relpos.exchange.formats import TRAITS, Format, Kind, format_of
 from relpos.exchange.times import iso_of
 from relpos.geodesy import MapFrame, Pin, place
 from relpos.recording import is_recording, open_recording, save_recording
@@ -36,17 +36,6 @@ _ESTIMATE_TABLES = (
     "parameters.csv",
     "summary.json",
 )
-_SUFFIXES = {
-    ".mcap": Format.MCAP,
-    ".tum": Format.TUM,
-    ".geojson": Format.GEOJSON,
-    ".json": Format.GEOJSON,
-    ".gpx": Format.GPX,
-}
-_ONE_WAY = (Format.ROSBAG2, Format.RRD)
-"""Formats that are written for other tools alone."""
-_FILES = (Format.MCAP, Format.GEOJSON, Format.GPX, Format.RRD)
-"""Formats that are one file; the others are directories."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +57,7 @@ class Hints:
 def read(source: Path, hints: Hints) -> Content:
     """Read whatever ``source`` is; DataError where it is nothing that is known."""
     form = hints.format or _format_of(source)
-    if form in _ONE_WAY:
+    if not TRAITS[form].readable:
         raise DataError(f"{source}: {form} is written, not read; convert its source instead")
     if form is Format.MCAP:
         return _started(_read_mcap(source), hints)
@@ -90,10 +79,10 @@ def _format_of(source: Path) -> Format:
         raise DataError(f"{source}: neither a run nor an estimate nor TUM trajectories in there")
     if is_recording(source):
         return Format.MCAP
-    try:
-        return _SUFFIXES[source.suffix.lower()]
-    except KeyError:
-        raise DataError(f"{source}: of what format is it? (--from {', '.join(Format)})") from None
+    form = format_of(source)
+    if form is None:
+        raise DataError(f"{source}: of what format is it? (--from {', '.join(Format)})")
+    return form
 
 
 def _base(source: Path, hints: Hints) -> Content:
@@ -214,13 +203,13 @@ def with_landmarks(content: Content, path: Path, pins: Sequence[Pin]) -> Content
             f"{run.name}: has a truth of its own (truth.csv) already; move it away to have the "
             "presses' instead"
         )
-    suffix = _SUFFIXES.get(path.suffix.lower())
+    form = format_of(path)
     remarks: tuple[str, ...] = tuple(r for r in content.remarks if r not in own.remarks())
     landmarks: Sequence[Landmark]
-    if suffix in (Format.GEOJSON, Format.GPX):
+    if form is not None and TRAITS[form].on_map:
         frame, words = frame_of(content, pins, Kind.TRUTH)
         remarks += words
-        landmarks = _maps_of(suffix).read_landmarks(path, frame)
+        landmarks = _maps_of(form).read_landmarks(path, frame)
     else:
         landmarks = read_landmarks(path)
     if not landmarks:
@@ -257,10 +246,10 @@ def write(
     the same format left is removed, because it is no part of this one.
     """
     _make_room(out, form, overwrite=overwrite)
-    if form in _FILES:
+    if TRAITS[form].one_file:
         out.parent.mkdir(parents=True, exist_ok=True)
-        is_map = form in (Format.GEOJSON, Format.GPX)
-        return _write_map(content, form, out, pins) if is_map else _WRITERS[form](content, out)
+        on_map = TRAITS[form].on_map
+        return _write_map(content, form, out, pins) if on_map else _WRITERS[form](content, out)
     new = not out.exists()
     out.mkdir(parents=True, exist_ok=True)
     try:
@@ -272,7 +261,7 @@ def write(
 
 
 def _make_room(out: Path, form: Format, *, overwrite: bool) -> None:
-    if form in _FILES:
+    if TRAITS[form].one_file:
         if out.is_dir():
             raise DataError(f"{out}: a directory; {form} is one file")
         if out.exists() and not overwrite:

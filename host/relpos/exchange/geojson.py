@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from relpos.errors import DataError
-from relpos.exchange.content import PLACED, Content, Point, stretches_of
+from relpos.exchange.content import PLACED, Content, Point, on_map, stretches_of
 from relpos.exchange.formats import Kind
 from relpos.exchange.times import iso_of, unix_of
 from relpos.fusion.estimator import NodeEstimate
@@ -27,8 +27,6 @@ from relpos.runs.table import read_text
 REGION = 0.95
 """The probability that a last position's region holds the wearer, where the sigmas are honest."""
 
-_DECIMALS = 9
-"""A tenth of a millimetre."""
 _CORNERS = 36
 
 
@@ -104,13 +102,9 @@ def _region(n: NodeEstimate, frame: MapFrame) -> list[list[float]]:
     angle = np.linspace(0.0, 2.0 * math.pi, _CORNERS, endpoint=False)
     along, across = reach * n.sigma_major_m * np.cos(angle), reach * n.sigma_minor_m * np.sin(angle)
     c, s = math.cos(n.sigma_angle_rad), math.sin(n.sigma_angle_rad)
-    latitude, longitude = frame.to_map(
-        n.x_m + c * along - s * across, n.y_m + s * along + c * across
-    )
-    ring = [
-        [round(float(lon), _DECIMALS), round(float(lat), _DECIMALS)]
-        for lat, lon in zip(latitude, longitude, strict=True)
-    ]
+    x_m, y_m = n.x_m + c * along - s * across, n.y_m + s * along + c * across
+    corners = zip(x_m.tolist(), y_m.tolist(), strict=True)
+    ring = _positions([Point(0.0, n.node, x, y) for x, y in corners], frame)
     return [*ring, ring[0]]
 
 
@@ -123,13 +117,10 @@ def _feature(shape: str, coordinates: Any, properties: Mapping[str, Any]) -> dic
 
 
 def _positions(points: Sequence[Point], frame: MapFrame) -> list[list[float]]:
-    latitude, longitude = frame.to_map([p.x_m for p in points], [p.y_m for p in points])
-    positions: list[list[float]] = []
-    for p, lat, lon in zip(points, latitude.tolist(), longitude.tolist(), strict=True):
-        altitude_m = frame.altitude_of(p.z_m)
-        height = [] if altitude_m is None else [round(altitude_m, 3)]
-        positions.append([round(lon, _DECIMALS), round(lat, _DECIMALS), *height])
-    return positions
+    return [
+        [lon, lat] if height is None else [lon, lat, height]
+        for lat, lon, height in on_map(points, frame)
+    ]
 
 
 def _course(heading_rad: float, frame: MapFrame) -> float | None:

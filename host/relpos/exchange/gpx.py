@@ -7,22 +7,19 @@ GPX has no time but the absolute: without the run's start the points go without.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from datetime import UTC
 from pathlib import Path
 from typing import Any
 
 from relpos.errors import DataError
-from relpos.exchange.content import Content, Point, stretches_of
+from relpos.exchange.content import Content, Point, on_map, stretches_of
 from relpos.exchange.formats import Kind
 from relpos.exchange.times import time_of
 from relpos.extras import missing_extra
 from relpos.geodesy import MapFrame
 from relpos.runs.landmarks import Landmark
 from relpos.runs.table import read_text
-
-_DECIMALS = 9
-"""A tenth of a millimetre."""
 
 
 def write_tracks(path: Path, content: Content, kinds: Iterable[Kind], frame: MapFrame) -> None:
@@ -35,7 +32,7 @@ def write_tracks(path: Path, content: Content, kinds: Iterable[Kind], frame: Map
         place = Point(0.0, 0, mark.x_m, mark.y_m, math.nan if mark.z_m is None else mark.z_m)
         document.waypoints += [
             gpx.GPXWaypoint(lat, lon, elevation=height, name=mark.landmark)
-            for lat, lon, height in _on_map([place], frame)
+            for lat, lon, height in on_map([place], frame)
         ]
     start_unix_s = content.start_unix_s
     for kind in kinds:
@@ -46,20 +43,10 @@ def write_tracks(path: Path, content: Content, kinds: Iterable[Kind], frame: Map
             for piece in pieces:
                 segment = gpx.GPXTrackSegment()
                 track.segments.append(segment)
-                for p, (lat, lon, height) in zip(piece, _on_map(piece, frame), strict=True):
+                for p, (lat, lon, height) in zip(piece, on_map(piece, frame), strict=True):
                     time = None if start_unix_s is None else time_of(start_unix_s + p.time_s)
                     segment.points.append(gpx.GPXTrackPoint(lat, lon, elevation=height, time=time))
     path.write_text(document.to_xml(version="1.1"), encoding="utf-8")
-
-
-def _on_map(
-    points: Sequence[Point], frame: MapFrame
-) -> Iterable[tuple[float, float, float | None]]:
-    latitude, longitude = frame.to_map([p.x_m for p in points], [p.y_m for p in points])
-    for p, lat, lon in zip(points, latitude.tolist(), longitude.tolist(), strict=True):
-        altitude_m = frame.altitude_of(p.z_m)
-        height = None if altitude_m is None else round(altitude_m, 3)
-        yield round(lat, _DECIMALS), round(lon, _DECIMALS), height
 
 
 def first_time(path: Path) -> float | None:
