@@ -14,8 +14,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from relpos.errors import DeviceError, RelposError
+from relpos.live.addresses import parse_listen
 from relpos.live.team_view import Hello, Notice, Person, TeamView
-from relpos.view.access import Allowance, listen, make_certificate, own_address, parse_listen
+from relpos.view.access import Allowance, listen, make_certificate, own_address
 from relpos.view.server import SessionProxy
 from relpos.view.web import WebView
 
@@ -312,6 +313,7 @@ def test_addresses_are_understood_or_refused_in_one_line():
     assert parse_listen("0.0.0.0:80") == ("0.0.0.0", 80)
     assert parse_listen("0.0.0.0")[0] == "0.0.0.0"
     assert parse_listen(":9000")[1] == 9000
+    assert parse_listen("9000") == ("127.0.0.1", 9000)
     assert parse_listen("[::1]:9000") == ("::1", 9000)
     with pytest.raises(RelposError, match="HOST:PORT"):
         parse_listen("0.0.0.0:http")

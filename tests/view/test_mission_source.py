@@ -17,9 +17,10 @@ from typer.testing import CliRunner
 from relpos.cli import live, waiting
 from relpos.cli.main import app
 from relpos.link.port import check_port
+from relpos.live.addresses import DEFAULT_HOST
 from relpos.live.mission import Mission
 from relpos.live.session import Outcome
-from relpos.view.access import DEFAULT_HOST, Access, listen
+from relpos.view.access import Access, listen
 from relpos.view.devices import Role
 
 

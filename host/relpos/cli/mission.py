@@ -261,6 +261,7 @@ def _earlier(
 
 def _print_invitation(found: Mission, role: str, view_listen: str | None) -> None:
     from relpos.errors import RelposError
+    from relpos.live.addresses import parse_listen
     from relpos.view import access as doors
     from relpos.view.devices import Role
 
@@ -268,7 +269,7 @@ def _print_invitation(found: Mission, role: str, view_listen: str | None) -> Non
         raise RelposError(f"--invite {role}: none of {', '.join(Role)}")
     if found.about.port is None:
         raise RelposError(f"{found.path}: no session has run yet")
-    host, _ = doors.parse_listen(view_listen or "0.0.0.0")
+    host, _ = parse_listen(view_listen or "0.0.0.0")
     door = doors.Access(found.about.port, doors.hosts_of(host), key=found.key)
     url = door.url("/phone" if role == Role.ACKNOWLEDGE else "/", role=Role(role))
     typer.echo(url)

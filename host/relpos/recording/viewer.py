@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from threading import Event, Thread
 
 from relpos.errors import DataError, DeviceError
+from relpos.live.addresses import parse_listen
 from relpos.recording.about import About
 from relpos.recording.encoder import Encoder, Item, ItemSink
 from relpos.recording.schemas import all_topics
@@ -24,7 +25,9 @@ class FoxgloveServer(ItemSink):
         import foxglove
 
         super().__init__()
-        host, port = parse_listen(listen)
+        host, port = parse_listen(listen, "--foxglove")
+        if port is None:
+            raise DataError(f"--foxglove {listen}: not HOST:PORT")
         self._encoder = Encoder(about.started_unix_ns, about.description.names)
         self._context = foxglove.Context()
         self._channels = {
@@ -84,11 +87,3 @@ class FoxgloveServer(ItemSink):
     def _send(self, at_s: float, item: Item) -> None:
         for message in self._encoder.messages(at_s, item):
             self._channels[message.topic].log(message.data, log_time=message.log_ns)
-
-
-def parse_listen(listen: str) -> tuple[str, int]:
-    """Host and port of ``HOST:PORT`` or ``PORT`` (on this computer); DataError where it is none."""
-    host, _, port = listen.rpartition(":")
-    if not port.isdigit() or int(port) > 65535:
-        raise DataError(f"{listen}: not HOST:PORT")
-    return host.strip("[]") or "127.0.0.1", int(port)

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
-from relpos.errors import DeviceError, RelposError
+from relpos.errors import DeviceError
 from relpos.extras import missing_extra
+from relpos.live.addresses import parse_listen
 from relpos.view.devices import Gate, Role
 
-DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8460
 LOOK_S = 0.1
 """How often a taken port is tried again."""
@@ -119,15 +119,6 @@ class Allowance:
         return allowed
 
 
-def parse_listen(address: str) -> tuple[str, int | None]:
-    """Split HOST:PORT, HOST or :PORT; RelposError where it is none of them."""
-    found = re.fullmatch(r"(?:\[([0-9a-fA-F:.]+)\]|([^:\s/\[\]]*))(?::(\d{1,5}))?", address)
-    number = None if found is None or found[3] is None else int(found[3])
-    if found is None or (number or 0) > 65535:
-        raise RelposError(f"--view-listen {address}: not HOST:PORT, like 0.0.0.0:{DEFAULT_PORT}")
-    return found[1] or found[2] or DEFAULT_HOST, number
-
-
 def listen(
     address: str | None, usual: int = DEFAULT_PORT, patience_s: float = 0.0
 ) -> tuple[socket.socket, Access]:
@@ -136,7 +127,7 @@ def listen(
     A port that is taken may become free within ``patience_s``. One that was asked for and stays
     taken is a DeviceError; where none was asked for, it is the ``usual`` one, or another.
     """
-    host, asked = parse_listen(address or DEFAULT_HOST)
+    host, asked = parse_listen(address or "")
     port = usual if asked is None else asked
     try:
         family, _, _, _, where = socket.getaddrinfo(
