@@ -37,6 +37,12 @@ NORTH_MOVES_RAD = math.radians(4.0)
 """The map keeps its orientation while north moves by less: a map that turns with every reading is
 unreadable."""
 
+POSE = (
+    "x_m", "y_m", "z_m", "sigma_z_m", "heading_rad", "sigma_major_m", "sigma_minor_m",
+    "sigma_angle_rad", "sigma_heading_rad", "episode_probability", "floor", "floor_probability",
+)  # fmt: skip
+"""What an estimate's node and a person on the page have in common, beside the episode."""
+
 
 class Composer:
     """Gathers everything that happens, in order, and composes the view of any moment.
@@ -217,8 +223,9 @@ class Composer:
             shelved_s=condition.shelved_s,
             rssi_dbm=None if monitor is None else monitor.rssi_dbm,
             post=node in self.posts,
+            episode=None if at is None or at.episode is None else str(at.episode),
             **self._health(node, now_s),
-            **({} if at is None else _pose(at)),
+            **({} if at is None else {name: getattr(at, name) for name in POSE}),
         )
 
 
@@ -232,24 +239,6 @@ def _shown_north(shown: MagneticNorth | None, known: MagneticNorth | None) -> Ma
     if shown is None or moved_rad > NORTH_MOVES_RAD:
         return known
     return MagneticNorth(shown.bearing_rad, known.sigma_rad)
-
-
-def _pose(at: NodeEstimate) -> dict[str, Any]:
-    return {
-        "x_m": at.x_m,
-        "y_m": at.y_m,
-        "z_m": at.z_m,
-        "sigma_z_m": at.sigma_z_m,
-        "episode": at.episode and str(at.episode),
-        "episode_probability": at.episode_probability,
-        "floor": at.floor,
-        "floor_probability": at.floor_probability,
-        "heading_rad": at.heading_rad,
-        "sigma_major_m": at.sigma_major_m,
-        "sigma_minor_m": at.sigma_minor_m,
-        "sigma_angle_rad": at.sigma_angle_rad,
-        "sigma_heading_rad": at.sigma_heading_rad,
-    }
 
 
 def _status(at: NodeEstimate | None, seen_s: float | None, condition: Condition) -> str:
