@@ -124,6 +124,7 @@ LIST_NAMES: Mapping[type, str] = {
     Alternative: "alternatives",
     Parameter: "parameters",
 }
+"""Class -> the list's name, in messages and in :class:`Estimate`."""
 
 DIGITS = 9
 
@@ -160,19 +161,15 @@ def encode_row(row: Row) -> tuple[str, bytes]:
 
 def encode_estimate(estimate: Estimate) -> Iterable[tuple[str, bytes]]:
     """Topics and messages of an estimate; what it has nothing of is left out."""
-    for kind, rows in (
-        (NodeEstimate, estimate.nodes),
-        (PairEstimate, estimate.pairs),
-        (Alternative, estimate.alternatives),
-        (Parameter, estimate.parameters),
-    ):
+    for kind, topic in LISTS.items():
+        rows = getattr(estimate, LIST_NAMES[kind])
         if rows or kind is NodeEstimate:
             names = list_names_of(kind)
             document = {
                 "time_s": estimate.time_s,
                 LIST_NAMES[kind]: [_rounded(_object(row, names)) for row in rows],
             }
-            yield LISTS[kind], _json(document)
+            yield topic, _json(document)
 
 
 def _object(row: Any, names: Iterable[str]) -> dict[str, Any]:
