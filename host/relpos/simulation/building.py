@@ -20,10 +20,10 @@ import numpy.typing as npt
 
 from relpos.errors import RelposError
 from relpos.fusion.settings import parse, setting
-from relpos.measurements import Event, Height, Measurement, Motion, Prior
+from relpos.measurements import Event, Height, Measurement, Motion
 from relpos.simulation import pressure
 from relpos.simulation.climbers import Climb, Climber, ClimberSettings, make_plan
-from relpos.simulation.paper import SimulatedRun, true_rows
+from relpos.simulation.paper import SimulatedRun
 from relpos.simulation.pressure import Surroundings
 from relpos.simulation.sensing import DISTURBED, RATE_HZ, Walk, motions, ranges
 from relpos.simulation.storeys import STOREY_M, Building, Place, StairKind, Stairwell
@@ -144,21 +144,11 @@ def simulate_building(
         m for m in measurements
         if m.time_s >= max(on_s.get(m.node, 0.0), on_s.get(getattr(m, "peer", m.node), 0.0))
     ]  # fmt: skip
-    priors = tuple(
-        Prior(k + 1, *map(float, pose))
-        for k, pose in enumerate(np.column_stack([truth.position_m[:, 0], truth.heading_rad[:, 0]]))
-        if k + 1 not in on_s
-    )
-    whole = slice(None, None, RATE_HZ)
-    rows = true_rows(
-        truth.time_s[whole], truth.position_m[:, whole], truth.heading_rad[:, whole],
-        truth.height_m[:, whole],
-    )  # fmt: skip
     return SimulatedRun(
         scenario,
         tuple(sorted(measurements, key=lambda m: m.time_s)),
-        priors,
-        tuple(row for row in rows if row.time_s >= on_s.get(row.node, 0.0)),
+        tuple(prior for prior in truth.priors() if prior.node not in on_s),
+        tuple(row for row in truth.rows() if row.time_s >= on_s.get(row.node, 0.0)),
         events=_episodes(climbs, on_s),
         floors_m=building.floors_m,
         posts=(settings.nodes + 1,) * settings.post,

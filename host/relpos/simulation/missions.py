@@ -24,10 +24,9 @@ from relpos.measurements import (
     Heading,
     Height,
     Measurement,
-    Prior,
     common_priors,
 )
-from relpos.simulation.paper import SimulatedRun, true_rows
+from relpos.simulation.paper import SimulatedRun
 from relpos.simulation.sensing import (
     RATE_HZ,
     SensingSettings,
@@ -232,15 +231,10 @@ def simulate_mission(
         *ranges(settings, truth, range_rng),
         *_sensed(settings, truth, sensed_rng),
     ]
-    priors = tuple(
-        Prior(k + 1, *map(float, pose))
-        for k, pose in enumerate(np.column_stack([truth.position_m[:, 0], truth.heading_rad[:, 0]]))
+    priors = truth.priors()
+    return SimulatedRun(
+        scenario,
+        tuple(sorted(measurements, key=lambda m: m.time_s)),
+        common_priors(p.node for p in priors) if common else priors,
+        truth.rows(),
     )
-    if common:
-        priors = common_priors(p.node for p in priors)
-    whole = slice(None, None, RATE_HZ)
-    rows = true_rows(
-        truth.time_s[whole], truth.position_m[:, whole], truth.heading_rad[:, whole],
-        truth.height_m[:, whole],
-    )  # fmt: skip
-    return SimulatedRun(scenario, tuple(sorted(measurements, key=lambda m: m.time_s)), priors, rows)

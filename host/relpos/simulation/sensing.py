@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.settings import setting
-from relpos.measurements import Motion, Range
+from relpos.measurements import Motion, Prior, Range, Truth
+from relpos.simulation.paper import true_rows
 from relpos.simulation.storeys import SLAB_EXCESS_M
 
 Floats = npt.NDArray[np.float64]
@@ -99,6 +100,17 @@ class Walk:
         if self.steps is None:
             return None
         return np.asarray(np.floor(np.interp(time_s, self.time_s, self.steps[node])))
+
+    def priors(self) -> tuple[Prior, ...]:
+        """Everybody's true pose at the start."""
+        starts = np.column_stack([self.position_m[:, 0], self.heading_rad[:, 0]])
+        return tuple(Prior(k + 1, *map(float, pose)) for k, pose in enumerate(starts))
+
+    def rows(self) -> tuple[Truth, ...]:
+        """Rows of ``truth.csv`` at whole seconds."""
+        whole = slice(None, None, RATE_HZ)
+        poses = self.position_m[:, whole], self.heading_rad[:, whole], self.height_m[:, whole]
+        return true_rows(self.time_s[whole], *poses)
 
 
 Obstacles = Callable[[int, int, Floats], tuple[Floats, Floats]]
