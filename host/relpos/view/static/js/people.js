@@ -1,16 +1,15 @@
-// The list of people beside the map, and the map as a table.
+// The list of people beside the map.
 
-import { isFresh, reachM } from "./age.js";
+import { isFresh } from "./age.js";
 import { hold } from "./board_view.js";
 import { inkOn } from "./colours.js";
 import { arrow, healthSign, make, setAttribute, setText } from "./dom.js";
 import { floorOf, floorUnknown, floorWords } from "./floors.js";
-import { number as figure, t, said } from "./i18n.js";
+import { t, said } from "./i18n.js";
 import { signOf } from "./marker.js";
-import { isPlaced, VAGUE_RAD } from "./relation.js";
 import {
-  ago, compass, dbm, directionWords, distance, healthWords, nodeName, percent, plusMinus, probability,
-  seconds, statusWords, timeOfDay, UNKNOWN, volts, whereabouts,
+  ago, compass, dbm, directionWords, distance, healthWords, percent, plusMinus, probability, seconds,
+  timeOfDay, UNKNOWN, volts,
 } from "./words.js";
 
 /** An alarm of somebody who is known to be well: a sentry, a node on a table. */
@@ -180,65 +179,4 @@ function lastPlace(heardMs) {
 function trouble(alarms, person) {
   const alarm = alarms.active.get(person.node);
   return alarm ? ["low", "medium", "high"].indexOf(alarm.level) + 1 : 0;
-}
-
-const number = (value) => (Number.isFinite(value) ? figure(value, 1) : UNKNOWN);
-
-/** The cells of one person's row: what the map draws, in words. */
-export function tableRow(team, person, me) {
-  const ranges = team.ranges
-    .filter(([node, peer]) => node === person.node || peer === person.node)
-    .map(([node, peer, rangeM]) => {
-      const other = team.person(node === person.node ? peer : node);
-      return `${other?.name ?? "?"} ${figure(rangeM, 1)}`;
-    });
-  const faces = isFresh(person) && !person.post && Number.isFinite(person.heading_rad) && (person.sigma_heading_rad ?? 0) < VAGUE_RAD;
-  const placed = isPlaced(person);
-  const from = me === null ? "" : whereabouts(team.relation(me, person.node), team.northRad);
-  return [
-    person.name,
-    [person.post ? t("post") : statusWords(person.status), isFresh(person) ? "" : t("table.heard", { ago: ago(person.seen_s) }),
-      person.moving === false && !person.post ? t("map.still", { time: seconds(person.still_s) }) : "",
-      healthWords(person.health)].filter(Boolean).join(", "),
-    placed ? number(person.x_m) : UNKNOWN,
-    placed ? number(person.y_m) : UNKNOWN,
-    placed ? number(person.sigma_major_m + reachM(person)) : UNKNOWN,
-    placed && faces ? compass(person.heading_rad, team.northRad) : UNKNOWN,
-    me === null ? UNKNOWN : me === person.node ? t("me")
-      : isFresh(person) ? from : t("table.from-last", { where: from }),
-    ranges.join(", ") || UNKNOWN,
-  ];
-}
-
-export function updateTable(body, team, me) {
-  const rows = team.list().map((person) => tableRow(team, person, me));
-  while (body.rows.length > rows.length) body.deleteRow(-1);
-  rows.forEach((cells, k) => {
-    let row = body.rows[k];
-    if (!row) {
-      row = body.insertRow();
-      row.append(make("th", { scope: "row" }), ...cells.slice(1).map(() => make("td")));
-    }
-    cells.forEach((text, c) => setText(row.cells[c], text));
-  });
-}
-
-/** The other possible places in words; empty while nothing is ambiguous. */
-export function alternativeWords(team) {
-  const { here, places, rings } = team.possible();
-  const name = (node) => team.person(node)?.name ?? nodeName(node);
-  const placed = (place) => ({
-    name: name(place.node), probability: probability(place.probability), radius: distance(place.sigma_major_m),
-    x: number(place.x_m), y: number(place.y_m),
-  });
-  const words = rings.map((ring) => t("other.ring", placed(ring)));
-  const listed = new Set();
-  for (const place of places) {
-    if (!listed.has(place.node) && here.has(place.node)) {
-      words.push(t("other.shown", { name: name(place.node), probability: probability(here.get(place.node)) }));
-    }
-    listed.add(place.node);
-    words.push(t(place.shape === "ring" ? "other.on-ring" : "other.at", placed(place)));
-  }
-  return words.join(" ");
 }
