@@ -10,7 +10,7 @@ from relpos.protocol import messages as wire
 
 WELL = HealthInputs(
     silent_s=0.8,
-    loss=0.02,
+    frame_loss=0.02,
     rssi_dbm=-70.0,
     battery_v=5.02,
     ranging=0.7,
@@ -44,8 +44,8 @@ def test_a_node_with_everything_is_green_and_says_nothing():
     [
         ({"silent_s": 5.1}, Health.RED, "silent for 5 s"),
         ({"imu": False}, Health.RED, "inertial sensor"),
-        ({"loss": 0.6}, Health.RED, "60 % of frames"),
-        ({"loss": 0.11}, Health.YELLOW, "11 % of frames"),
+        ({"frame_loss": 0.6}, Health.RED, "60 % of frames"),
+        ({"frame_loss": 0.11}, Health.YELLOW, "11 % of frames"),
         ({"battery_v": 4.1}, Health.RED, "4.10 V"),
         ({"battery_v": 4.4}, Health.YELLOW, "4.40 V"),
         ({"magnetometer": False}, Health.YELLOW, "magnetometer missing"),

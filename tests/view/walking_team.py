@@ -105,7 +105,7 @@ class WalkingTeam:
             acknowledged=node in self.acknowledged,
             acknowledged_by=self.acknowledged.get(node, ""),
             shelved_s=self.shelved_s.get(node, 0.0), health=health, reasons=reasons,
-            battery_v=5.02 - 0.03 * node, rssi_dbm=-52.0 - 3 * node, loss=0.005 * node,
+            battery_v=5.02 - 0.03 * node, rssi_dbm=-52.0 - 3 * node, frame_loss=0.005 * node,
             ranging=0.93 - 0.02 * node, neighbours=self.size - 1,
         )  # fmt: skip
 

@@ -43,13 +43,13 @@ class NodeHealth:
     silences: tuple[tuple[float, float], ...] = ()
     motions: int = 0
     received: int = 0
-    lost: int = 0
+    frames_lost: int = 0
 
     @property
-    def loss(self) -> float:
+    def frame_loss(self) -> float:
         """Share of its frames that were lost over the whole run; NaN where it is not known."""
-        total = self.received + self.lost
-        return self.lost / total if total else math.nan
+        total = self.received + self.frames_lost
+        return self.frames_lost / total if total else math.nan
 
     @property
     def worst(self) -> Health | None:
@@ -95,7 +95,7 @@ def _node(
             restarts.append((time_s, view.reset_cause() or "unknown"))
         if LINK_RECEIVED in figures:
             view.add_link(
-                time_s, int(figures[LINK_RECEIVED]), int(figures.get(LINK_LOST, view.lost))
+                time_s, int(figures[LINK_RECEIVED]), int(figures.get(LINK_LOST, view.frames_lost))
             )
         view.heard_s = time_s
         view.rssi_dbm = figures.get(LINK_RSSI, view.rssi_dbm)
@@ -111,7 +111,7 @@ def _node(
             # 0: this board does not measure it.
             "battery_v": view.status.get("battery_v") or None,
             "rssi_dbm": view.rssi_dbm,
-            "loss": view.loss(time_s),
+            "loss": view.frame_loss(time_s),
             "ranging": view.ranging(time_s)[0],
         }
         for name, now in latest.items():
@@ -127,7 +127,7 @@ def _node(
         tuple(gaps),
         len(moved),
         view.received,
-        view.lost,
+        view.frames_lost,
     )
 
 

@@ -197,7 +197,7 @@ class Composer:
             "reasons": tuple(reasons),
             # 0: this board does not measure it.
             "battery_v": monitor.status.get("battery_v") or None,
-            "loss": monitor.loss(now_s),
+            "frame_loss": monitor.frame_loss(now_s),
             "ranging": monitor.ranging(now_s)[0],
             "neighbours": None if neighbours is None else int(neighbours),
         }

@@ -91,8 +91,8 @@ class Person:
 
     The pose is the newest (nowcast): it contains all motion up to ``motion_s``. ``status`` is one
     of ``ok``, ``ambiguous``, ``unlocated``, ``stale``, ``lost``; ``episode`` one of ``level``,
-    ``up``, ``down``, ``lift``, ``disturbed``, ``falling``; ``floor`` 0 is the start's. ``loss`` and
-    ``ranging`` are fractions. ``acknowledged``: a user has confirmed the alert.
+    ``up``, ``down``, ``lift``, ``disturbed``, ``falling``; ``floor`` 0 is the start's.
+    ``frame_loss`` and ``ranging`` are fractions. ``acknowledged``: a user has confirmed the alert.
     ``shelved_s``: seconds for which the person's alarms are silenced. ``post``: nobody wears the
     node, it lies at the command post.
     """
@@ -125,7 +125,7 @@ class Person:
     reasons: tuple[str, ...] = ()
     battery_v: float | None = None
     rssi_dbm: float | None = None
-    loss: float | None = None
+    frame_loss: float | None = None
     ranging: float | None = None
     neighbours: int | None = None
     post: bool = False

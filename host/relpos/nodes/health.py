@@ -53,14 +53,15 @@ class Health(IntEnum):
 class HealthInputs:
     """The inputs of :func:`assess` for one node; None where unknown.
 
-    ``status`` says whether a status report has arrived. ``loss`` and ``ranging`` are fractions over
-    the last half minute, ``exchanges`` the number of exchanges in ``ranging``. ``missed_ticks``,
-    ``refused_frames``, ``damaged_bytes`` and ``lost_bytes`` are counts within that time.
+    ``status`` says whether a status report has arrived. ``frame_loss`` and ``ranging`` are
+    fractions over the last half minute, ``exchanges`` the number of exchanges in ``ranging``.
+    ``missed_ticks``, ``refused_frames``, ``damaged_bytes`` and ``lost_bytes`` are counts within
+    that time.
     """
 
     silent_s: float
     status: bool = True
-    loss: float | None = None
+    frame_loss: float | None = None
     rssi_dbm: float | None = None
     battery_v: float | None = None
     ranging: float | None = None
@@ -106,9 +107,9 @@ def _reasons(f: HealthInputs) -> Iterator[tuple[Health, str]]:
             yield yellow, Said("missing", "{part} missing", part=what)
         if f.beacon is False:
             yield yellow, Said("no-beacon", "receives no beacon")
-    if f.loss is not None and f.loss > LOSS_YELLOW:
-        colour = red if f.loss > LOSS_RED else yellow
-        yield colour, Said("loss", "{percent:.0f} % of frames lost", percent=100 * f.loss)
+    if f.frame_loss is not None and f.frame_loss > LOSS_YELLOW:
+        colour = red if f.frame_loss > LOSS_RED else yellow
+        yield colour, Said("loss", "{percent:.0f} % of frames lost", percent=100 * f.frame_loss)
     # 0: this board does not measure it.
     if f.battery_v and f.battery_v < BATTERY_YELLOW_V:
         colour = red if f.battery_v < BATTERY_RED_V else yellow

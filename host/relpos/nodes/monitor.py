@@ -70,7 +70,7 @@ class NodeMonitor:
     boot: int = 0
     heard_s: float = 0.0
     received: int = 0
-    lost: int = 0
+    frames_lost: int = 0
     rssi_dbm: float | None = None
     status: dict[str, float] = field(default_factory=dict)
     restarted: bool = False
@@ -93,7 +93,7 @@ class NodeMonitor:
 
     def add_link(self, now_s: float, received: int, lost: int) -> None:
         """Add the total numbers of frames received and lost."""
-        self.received, self.lost = received, lost
+        self.received, self.frames_lost = received, lost
         self.heard_s = now_s
         self._frames.append((now_s, received, lost))
 
@@ -107,14 +107,15 @@ class NodeMonitor:
         cause = self.status.get("reset_cause")
         return None if cause is None else wire.ResetCause(int(cause)).name.lower()
 
-    def loss(self, now_s: float) -> float | None:
+    def frame_loss(self, now_s: float) -> float | None:
         """Return the fraction of frames lost within the window; None without frames."""
         frames = self._frames
         while len(frames) > 1 and frames[1][0] < now_s - WINDOW_S:
             frames.popleft()
         if not frames:
             return None
-        received, lost = self.received - frames[0][1], self.lost - frames[0][2]
+        received = self.received - frames[0][1]
+        lost = self.frames_lost - frames[0][2]
         return max(lost, 0) / (received + lost) if received + lost > 0 else None
 
     def ranging(self, now_s: float) -> tuple[float | None, int]:
@@ -141,7 +142,7 @@ class NodeMonitor:
         return HealthInputs(
             silent_s=now_s - self.heard_s,
             status=bool(status),
-            loss=self.loss(now_s),
+            frame_loss=self.frame_loss(now_s),
             rssi_dbm=self.rssi_dbm,
             battery_v=status.get("battery_v"),
             ranging=success,
@@ -219,9 +220,9 @@ class TeamMonitor:
                     "boots": monitor.boot,
                     "battery_v": monitor.status.get("battery_v"),
                     "rssi_dbm": monitor.rssi_dbm,
-                    "loss": monitor.loss(now_s),
+                    "loss": monitor.frame_loss(now_s),
                     "received": monitor.received,
-                    "lost": monitor.lost,
+                    "lost": monitor.frames_lost,
                     "seen_s": round(now_s - monitor.heard_s, 3),
                     "ranging": success,
                     "exchanges": attempted,

@@ -104,7 +104,7 @@ class Content:
                 {
                     "node": one.node,
                     "worst": None if one.worst is None else one.worst.name.lower(),
-                    "loss": summary.figure(one.loss),
+                    "loss": summary.figure(one.frame_loss),
                     "restarts": len(one.restarts),
                     "silences": len(one.silences),
                 }

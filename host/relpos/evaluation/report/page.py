@@ -153,7 +153,7 @@ def _tiles(content: Content) -> str:
         (tables.value(ranges, "", 0), "ranges", f"{failed} failed" if failed else "measured")
     )
     received = sum(one.received for one in content.health.values())
-    lost = sum(one.lost for one in content.health.values())
+    lost = sum(one.frames_lost for one in content.health.values())
     if received:
         share = 100.0 * lost / (received + lost)
         tiles.append((f"{share:.1f} %", "frames lost", f"of {received + lost}"))

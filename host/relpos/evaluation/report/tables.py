@@ -402,7 +402,7 @@ def health(content: Content) -> Table | None:
             row += [
                 value(_least(one.series["battery_v"]), "V"),
                 value(median(one.series["rssi_dbm"]), "dBm", 0),
-                _share(one.loss),
+                _share(one.frame_loss),
                 _share(median(one.series["ranging"])),
                 value(len(one.restarts), "", 0),
                 *(

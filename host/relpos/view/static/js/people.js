@@ -111,7 +111,7 @@ class Card {
     setText(this.state, stateWords(person, alarm, here));
     const facts = {
       supply: volts(person.battery_v), radio: dbm(person.rssi_dbm),
-      loss: percent(person.loss), ranging: percent(person.ranging),
+      loss: percent(person.frame_loss), ranging: percent(person.ranging),
       hears: Number.isFinite(person.neighbours) ? String(person.neighbours) : UNKNOWN,
     };
     for (const [word, value] of Object.entries(facts)) setText(this.facts[word], value);
