@@ -127,7 +127,11 @@ class Alarms:
         """Nodes that lie at the command post."""
 
     def remember(self, node: int, heard_s: float, now_s: float, known: KnownAlert | None) -> None:
-        """Go on from a session before: last heard at ``heard_s``, with that alert."""
+        """Go on from a session before: last heard at ``heard_s``, with that alert.
+
+        Silence, the alert, who has seen it and its cause go on; movement, detection of falls, and a
+        fall that another alert hides begin anew. Shelving and MAYDAY come back by their own events.
+        """
         state = self._states.setdefault(node, Condition())
         state.silent_s = max(now_s - heard_s, 0.0)
         state.report_s = state.still_since_s = heard_s
