@@ -15,6 +15,15 @@ import {
 /** An alarm of somebody who is known to be well: a sentry, a node on a table. */
 const SHELVE_S = 600;
 
+/** What a selected person's card says of the node: the word of a message, and the figure in words. */
+const FACTS = [
+  ["supply", (person) => volts(person.battery_v)],
+  ["radio", (person) => dbm(person.rssi_dbm)],
+  ["loss", (person) => percent(person.frame_loss)],
+  ["ranging", (person) => percent(person.ranging)],
+  ["hears", (person) => (Number.isFinite(person.neighbours) ? String(person.neighbours) : UNKNOWN)],
+];
+
 /** A person's state in words. */
 export function stateWords(person, alarm, here) {
   if (person.post) return isFresh(person) ? t("post.state") : t("state.stale", { ago: ago(person.seen_s) });
@@ -51,12 +60,8 @@ class Card {
     this.where = make("div", { class: "where" }, this.arrow.element,
       make("p", {}, this.far, " ", this.sigma), make("p", {}, this.direction));
     this.state = make("p", { class: "state" });
-    this.facts = {};
-    const facts = ["supply", "radio", "loss", "ranging", "hears"].map((word) => {
-      const value = make("dd");
-      this.facts[word] = value;
-      return make("div", {}, make("dt", { "data-t": `fact.${word}` }), value);
-    });
+    this.facts = FACTS.map(() => make("dd"));
+    const facts = FACTS.map(([word], k) => make("div", {}, make("dt", { "data-t": `fact.${word}` }), this.facts[k]));
     this.reasons = make("p", { class: "reasons" });
     this.shelveButton = make("button", { type: "button" });
     this.shelveButton.addEventListener("click", () => actions.shelve(node, this.shelved ? 0 : SHELVE_S));
@@ -109,12 +114,7 @@ class Card {
       setText(this.compass, relation ? compass(relation.bearingRad, northRad) : "");
     }
     setText(this.state, stateWords(person, alarm, here));
-    const facts = {
-      supply: volts(person.battery_v), radio: dbm(person.rssi_dbm),
-      loss: percent(person.frame_loss), ranging: percent(person.ranging),
-      hears: Number.isFinite(person.neighbours) ? String(person.neighbours) : UNKNOWN,
-    };
-    for (const [word, value] of Object.entries(facts)) setText(this.facts[word], value);
+    FACTS.forEach(([, words], k) => setText(this.facts[k], words(person)));
     // That a node is silent is said above.
     setText(this.reasons, (person.reasons ?? []).map((reason, k) => [reason, person.said?.[k]]).filter(([reason]) => fresh || !reason.startsWith("silent"))
       .map(([reason, key]) => said(key, reason)).join("; "));
