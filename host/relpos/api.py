@@ -15,6 +15,8 @@ settings or an estimator is a :class:`relpos.RelposError` of one line.
 
 from __future__ import annotations
 
+import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -57,7 +59,7 @@ def simulate(scenario: str = "paper", seed: int = 0, **settings: float | str) ->
     """
     from relpos.simulation.scenarios import simulate_run
 
-    return simulate_run(scenario, seed, settings)
+    return simulate_run(scenario, _whole(seed), settings)
 
 
 def fuse(
@@ -88,6 +90,10 @@ def fuse(
     (its own error is the ``__cause__``); ``result`` of the error holds the estimates so far.
     """
     name = name_of(estimator)
+    _check_run(run)
+    seed = _whole(seed)
+    if not isinstance(settings, Mapping | None):
+        raise RelposError(f"settings: {settings!r} is no mapping of keys to values")
     run.check_usable(needs_ranges=isinstance(estimator, str) and name != "deadreckoning")
     priors = priors_of(run, initial)
     if isinstance(estimator, str):
@@ -117,6 +123,7 @@ def evaluate(
     """
     from relpos.evaluation import scoring
 
+    _check_run(run)
     scoring.check_truth(run)
     return scoring.evaluate(run, _result(result), bound=bound)
 
@@ -132,6 +139,7 @@ def plot(
     """
     from relpos.evaluation import report as reports
 
+    _check_run(run)
     return reports.draw(reports.gather(run, _result(result)), figure)
 
 
@@ -147,6 +155,7 @@ def report(
     """
     from relpos.evaluation import report as reports
 
+    _check_run(run)
     return reports.write(reports.gather(run, _result(result)), out, figures)
 
 
@@ -169,6 +178,11 @@ def priors_of(run: Run, initial: str | Sequence[Prior] | None = None) -> tuple[P
     if initial is None:
         return run.priors
     if not isinstance(initial, str):
+        for p in initial:
+            if not all(map(math.isfinite, (p.x_m, p.y_m, p.heading_rad))):
+                raise RelposError(f"initial: the pose of node {p.node} is not finite")
+            if not (p.sigma_m >= 0.0 and p.sigma_rad >= 0.0):
+                raise RelposError(f"initial: a sigma of node {p.node} is negative")
         return tuple(initial)
     words = {
         "unknown": InitialPose.UNKNOWN,
@@ -178,6 +192,23 @@ def priors_of(run: Run, initial: str | Sequence[Prior] | None = None) -> tuple[P
     if initial not in words:
         raise RelposError(f"initial: '{initial}' is none of {', '.join(words)}")
     return run.priors_for(words[initial])
+
+
+def _check_run(run: Run) -> None:
+    """Refuse a path: it is loaded first."""
+    if not isinstance(run, Run):
+        raise RelposError(f"run: {type(run).__name__}, not a relpos.Run: relpos.load reads one")
+
+
+def _whole(seed: int) -> int:
+    """Refuse what numpy would take as no seed at all, and so as another one each time."""
+    try:
+        whole = operator.index(seed)
+    except TypeError:
+        whole = -1
+    if whole < 0:
+        raise RelposError(f"seed: {seed!r} is not a whole number from 0 on")
+    return whole
 
 
 def _compile(name: str, settings: Mapping[str, object] | None, progress: Progress | None) -> None:
@@ -211,7 +242,8 @@ def _make(
             f"{name}: smoothing begins from an estimator that is named, as 'module:Class'"
         )
     if isinstance(estimator, type) or not hasattr(estimator, "process"):
-        assert callable(estimator)
+        if not callable(estimator):
+            raise RelposError(f"estimator: {estimator!r} is no name, class, function or estimator")
         made = plugins.make(name, estimator, priors, settings, seed, run.nodes)
         return referring(made, run.nodes)
     if settings:

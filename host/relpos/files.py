@@ -1,10 +1,18 @@
-"""Files that are written whole: after a kill or a power cut it is the old one or the new one."""
+"""What all files have in common that are written.
+
+They are written whole: after a kill or a power cut it is the old one or the new one.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
 from pathlib import Path
+
+
+def printable(text: str) -> str:
+    """Leave out what XML cannot hold: control characters."""
+    return "".join(letter for letter in text if letter.isprintable())
 
 
 def write_whole(path: Path, data: bytes, *, sync: bool = False, mode: int = 0o666) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -124,3 +126,54 @@ def test_a_run_without_truth_cannot_be_scored(run: relpos.Run, result: relpos.Re
 
     with pytest.raises(relpos.DataError, match="no truth"):
         relpos.evaluate(result, replace(run, truth=()))
+
+
+def test_a_run_that_is_saved_over_another_is_the_same_when_loaded(
+    run: relpos.Run, tmp_path: Path
+) -> None:
+    (tmp_path / "height.csv").write_text("time_s,node,height_m\n1.0,1,0.5\n")
+    (tmp_path / "motion.csv.gz").write_bytes(b"an older run")
+    relpos.save(run, tmp_path)
+    assert relpos.load(tmp_path).measurements == run.measurements
+
+
+@pytest.mark.parametrize("seed", [None, -1, "1", 1.5])
+def test_a_seed_that_is_no_whole_number_is_refused(run: relpos.Run, seed: Any) -> None:
+    with pytest.raises(relpos.RelposError, match="seed: "):
+        relpos.simulate("lab", seed)
+    with pytest.raises(relpos.RelposError, match="seed: "):
+        relpos.fuse(run, seed=seed)
+
+
+@pytest.mark.parametrize("estimator", [3, None])
+def test_what_is_no_estimator_is_refused(run: relpos.Run, estimator: Any) -> None:
+    with pytest.raises(relpos.RelposError, match="estimator: "):
+        relpos.fuse(run, estimator)
+
+
+def test_a_path_in_place_of_a_run_is_refused(result: relpos.Result) -> None:
+    path: Any = "walk"
+    with pytest.raises(relpos.RelposError, match="load reads one"):
+        relpos.fuse(path)
+    with pytest.raises(relpos.RelposError, match="load reads one"):
+        relpos.evaluate(result, path)
+
+
+@pytest.mark.parametrize(
+    ("prior", "words"),
+    [
+        (relpos.Prior(1, math.nan, 0.0, 0.0), "node 1 is not finite"),
+        (relpos.Prior(1, 0.0, 0.0, 0.0, -1.0), "sigma of node 1 is negative"),
+    ],
+)
+def test_a_start_that_cannot_be_is_refused(
+    run: relpos.Run, prior: relpos.Prior, words: str
+) -> None:
+    with pytest.raises(relpos.RelposError, match=words):
+        relpos.fuse(run, initial=[prior])
+
+
+def test_settings_that_are_no_mapping_are_refused(run: relpos.Run) -> None:
+    text: Any = "hypotheses=1"
+    with pytest.raises(relpos.RelposError, match="settings: "):
+        relpos.fuse(run, settings=text)

@@ -472,3 +472,30 @@ def test_a_session_at_a_port_never_overwrites_the_one_before(
     finally:
         os.close(master)
         os.close(slave)
+
+
+def test_a_run_that_was_not_simulated_is_not_replaced_by_one_that_is(
+    simulated: Path, tmp_path: Path
+) -> None:
+    recorded = a_run(tmp_path / "recorded")
+    before = (recorded / "motion.csv").read_bytes()
+    refused = one_clear_line(
+        relpos("simulate", "--scenario", "lab", "--seed", 3, "--out", recorded)
+    )
+    assert f"{recorded}: holds a run that was not simulated" in refused
+    assert (recorded / "motion.csv").read_bytes() == before
+    again = relpos(
+        "simulate", "--scenario", "lab", "--seed", 3, "--out", simulated, "--set", "seconds=5"
+    )
+    assert again.exit_code == 0, again.output
+
+
+def test_a_simulation_that_could_not_be_read_is_not_written(tmp_path: Path) -> None:
+    refused = one_clear_line(
+        relpos(
+            "simulate", "--scenario", "paper", "--seed", 1, "--out", tmp_path / "out",
+            "--set", "sigma_range_m=1e6", "--set", "seconds=20",
+        )
+    )  # fmt: skip
+    assert "range_m of" in refused
+    assert not (tmp_path / "out").exists()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -16,8 +17,9 @@ from typer.testing import CliRunner
 import relpos
 from relpos.cli.main import app
 from relpos.evaluation import report as reports
-from relpos.evaluation.report import PICTURES
+from relpos.evaluation.report import PICTURES, drawing
 from relpos.measurements import Height, Motion, Range, Status
+from relpos.runs import NodeInfo
 
 VOID = {"meta", "link", "br", "img", "input", "hr"}
 CLOSED_BY_ITSELF = {"path", "use", "rect", "image"}
@@ -303,3 +305,12 @@ def test_a_missing_run_or_estimate_is_one_clear_line(directory: Path, tmp_path: 
         assert outcome.exit_code == 1
         assert outcome.stderr.count("\n") == 1
         assert not (tmp_path / "r.html").exists()
+
+
+def test_a_name_in_letters_that_the_font_lacks_gives_no_warning(run: relpos.Run) -> None:
+    nodes = {node: NodeInfo(name="李雷") for node in run.node_ids}
+    named = replace(run, description=replace(run.description, nodes=nodes))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        document = drawing.svg(relpos.plot(relpos.fuse(run, "deadreckoning"), named))
+    assert "李雷" in document

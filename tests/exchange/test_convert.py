@@ -456,6 +456,16 @@ def test_gpx_is_read_back_by_gpxpy(tmp_path: Path) -> None:
     assert marks["18"].elevation == pytest.approx(523.25)
 
 
+def test_a_name_with_a_control_character_leaves_gpx_well_formed(tmp_path: Path) -> None:
+    import gpxpy
+
+    yard, _ = written(tmp_path)
+    save_run(replace(run(), name="yard\a"), yard)
+    path = tmp_path / "walk.gpx"
+    convert(yard, "--pin", PIN, "--start", START, "--to", "gpx", "--out", path)
+    assert gpxpy.parse(path.read_text("utf-8")).name == "yard"
+
+
 @pytest.mark.parametrize("form", ["geojson", "gpx"])
 def test_a_track_has_a_gap_where_a_node_was_not_located(tmp_path: Path, form: str) -> None:
     unsure = {(3, second): NodeStatus.AMBIGUOUS for second in (*range(1, 6), 20, 22)}

@@ -51,6 +51,17 @@ class Talkative(Adder):
         return "here I am"
 
 
+class Nowhere(Adder):
+    def process(self, measurement: Measurement) -> list[Estimate]:
+        self.stretch = math.nan
+        return super().process(measurement)
+
+
+class Leaving(Adder):
+    def process(self, measurement: Measurement) -> Any:
+        raise SystemExit(3)
+
+
 class Unfinished:
     def process(self, measurement: Measurement) -> list[Estimate]:
         return []

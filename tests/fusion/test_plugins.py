@@ -93,6 +93,8 @@ def test_an_object_is_used_as_it_is(run: relpos.Run) -> None:
     [
         (f"{OWN}:Crashing", ["process(Motion of node 1 at 6 s)", "KeyError", "own_estimators.py"]),
         (f"{OWN}:Talkative", ["process(Motion of node 1", "returned str"]),
+        (f"{OWN}:Nowhere", ["process(Motion of node 1", "pose of node 1 that is not finite"]),
+        (f"{OWN}:Leaving", ["process(Motion of node 1", "SystemExit"]),
         (f"{OWN}:Unfinished", ["it has no finish, counters"]),
         (f"{OWN}:Stillborn", ["ValueError: two lines"]),
         (f"{OWN}:Missing", ["no 'Missing'"]),

@@ -160,6 +160,7 @@ def test_a_range_of_zero_is_kept_as_the_failure_it_marks(tmp_path: Path) -> None
         ("1,1,0,,0", "line 3: column dy_m is empty"),
         ("1,1.5,0,0,0", "line 3: column node: '1.5' is not a whole number"),
         ("1,-1,0,0,0", "line 3: column node: '-1' is no node id"),
+        ("1,9007199254740993,0,0,0", "'9007199254740993' is greater than 9007199254740991"),
         ("1,1,0,0,0,7", "line 3: 6 cells for 5 columns"),
         ('1,1,0,0,"0', "line 3: not CSV"),
     ],

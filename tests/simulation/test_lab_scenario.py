@@ -120,6 +120,10 @@ def test_presses_name_the_landmark_that_was_passed(tmp_path: Path) -> None:
     assert len(from_presses.truth) == len(run.events)
 
 
+def test_who_has_not_set_off_yet_presses_nothing() -> None:
+    assert not lab.simulate_lab(1, {"seconds": 1}).events
+
+
 def test_dead_reckoning_errs_by_the_papers_3_m_and_ranges_help() -> None:
     """24 seeds of dead reckoning, within three standard errors of the paper's; 8 of the filter."""
     reckoned = study.run(

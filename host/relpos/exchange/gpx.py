@@ -17,6 +17,7 @@ from relpos.exchange.content import Content, Point, on_map, stretches_of
 from relpos.exchange.formats import Kind
 from relpos.exchange.times import time_of
 from relpos.extras import missing_extra
+from relpos.files import printable
 from relpos.geodesy import MapFrame
 from relpos.runs.landmarks import Landmark
 from relpos.runs.table import read_text
@@ -27,17 +28,17 @@ def write_tracks(path: Path, content: Content, kinds: Iterable[Kind], frame: Map
     gpx = _library()
     document = gpx.GPX()
     document.creator = "relpos"
-    document.name = content.run.name
+    document.name = printable(content.run.name)
     for mark in content.run.landmarks:
         place = Point(0.0, 0, mark.x_m, mark.y_m, math.nan if mark.z_m is None else mark.z_m)
         document.waypoints += [
-            gpx.GPXWaypoint(lat, lon, elevation=height, name=mark.landmark)
+            gpx.GPXWaypoint(lat, lon, elevation=height, name=printable(mark.landmark))
             for lat, lon, height in on_map([place], frame)
         ]
     start_unix_s = content.start_unix_s
     for kind in kinds:
         for node, pieces in stretches_of(content, kind).items():
-            track = gpx.GPXTrack(name=content.name_of(node), number=node)
+            track = gpx.GPXTrack(name=printable(content.name_of(node)), number=node)
             track.type = str(kind)
             document.tracks.append(track)
             for piece in pieces:

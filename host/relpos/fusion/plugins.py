@@ -22,6 +22,7 @@ import hashlib
 import importlib
 import importlib.util
 import inspect
+import math
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -76,7 +77,7 @@ def factory(name: str) -> Factory:
         raise EstimatorError(f"estimator '{name}': no '{attribute}' in {where}") from None
     except ModuleNotFoundError as error:
         raise EstimatorError(f"estimator '{name}': {error}") from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise EstimatorError(f"estimator '{name}': {_describe(error, None)}") from error
     if not callable(found):
         raise EstimatorError(f"estimator '{name}': '{attribute}' is no class or function")
@@ -99,7 +100,7 @@ def make(
         made: Any = maker(**arguments)
     except RelposError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise EstimatorError(f"estimator {name}: {_describe(error, maker)}") from error
     return guard(name, made)
 
@@ -142,12 +143,18 @@ class _Guarded:
             return method(*arguments)
         except RelposError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             words = _describe(error, type(self._estimator))
             raise EstimatorError(f"estimator {self._name}: {where} failed: {words}") from error
 
     def _listed(self, where: str, given: Any) -> list[Estimate]:
         if isinstance(given, list | tuple) and all(isinstance(one, Estimate) for one in given):
+            for node in (node for one in given for node in one.nodes):
+                if not all(map(math.isfinite, (node.x_m, node.y_m, node.heading_rad))):
+                    raise EstimatorError(
+                        f"estimator {self._name}: {where} returned a pose of node {node.node} "
+                        "that is not finite"
+                    )
             return list(given)
         raise EstimatorError(
             f"estimator {self._name}: {where} returned {type(given).__name__}, not a list of "
@@ -225,7 +232,7 @@ def _converted(name: str, key: str, value: object, default: object) -> object:
         return value
 
 
-def _describe(error: Exception, of: Any) -> str:
+def _describe(error: BaseException, of: Any) -> str:
     """Describe an error in one line, with the innermost place in the estimator's file."""
     frames = traceback.extract_tb(error.__traceback__)
     try:

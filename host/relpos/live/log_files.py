@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from xml.etree import ElementTree
 
+from relpos.files import printable
 from relpos.live.team_view import LogEntry
 
 KML = "http://www.opengis.net/kml/2.2"
@@ -36,9 +37,9 @@ def write_kml(
     ElementTree.SubElement(document, "name").text = name
     for entry in entries:
         mark = ElementTree.SubElement(document, "Placemark")
-        ElementTree.SubElement(mark, "name").text = _printable(entry.text)
+        ElementTree.SubElement(mark, "name").text = printable(entry.text)
         by = f", by {entry.by}" if entry.by else ""
-        ElementTree.SubElement(mark, "description").text = _printable(f"{entry.kind}{by}")
+        ElementTree.SubElement(mark, "description").text = printable(f"{entry.kind}{by}")
         stamp = ElementTree.SubElement(mark, "TimeStamp")
         at = datetime.fromtimestamp(entry.unix_s, UTC)
         ElementTree.SubElement(stamp, "when").text = at.strftime("%Y-%m-%dT%H:%M:%SZ")
@@ -49,8 +50,3 @@ def write_kml(
             where = f"{longitude:.9f},{latitude:.9f}"
             ElementTree.SubElement(point, "coordinates").text = where
     ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
-
-
-def _printable(text: str) -> str:
-    """XML cannot hold control characters."""
-    return "".join(letter for letter in text if letter.isprintable())

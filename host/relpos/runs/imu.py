@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from relpos.measurements import BOUNDS
 from relpos.runs.table import (
+    MOST_WHOLE,
     Column,
     bounded,
     find_columns,
@@ -95,7 +96,7 @@ def _read_fast(path: Path, text: str) -> npt.NDArray[np.float64] | None:
 
 
 def _are_node_ids(nodes: npt.NDArray[np.float64]) -> bool:
-    return bool(((nodes >= 0) & (nodes == np.floor(nodes))).all())
+    return bool(((nodes >= 0) & (nodes <= MOST_WHOLE) & (nodes == np.floor(nodes))).all())
 
 
 def _are_within_bounds(table: npt.NDArray[np.float64]) -> bool:

@@ -236,7 +236,8 @@ def assemble(
 def save_run(run: Run, path: Path | str) -> None:
     """Write a run directory that :func:`load_run` reads back to the same run.
 
-    Files that the run has nothing for are not written; ``imu.csv`` is copied through.
+    A table that the run has nothing for is not written, and not left of a run that was there;
+    ``imu.csv`` is copied through.
     """
     directory = Path(path)
     imu = run.load_imu()
@@ -244,21 +245,28 @@ def save_run(run: Run, path: Path | str) -> None:
     description = replace(run.description, name=run.name)
     write_description(directory / "run.toml", description)
     by_kind = _by_kind(chain(run.measurements, run.events, run.statuses, run.steps, run.truth))
+    former = {*TABLE_NAMES, "landmarks.csv", "imu.csv"}
+    former |= {f"{name}.gz" for name in former}
     for table in _TABLES:
         if rows := by_kind[table.kind]:
+            former.discard(table.name)
             write_rows(
                 directory / table.name,
                 table.names,
                 ([getattr(row, name) for name in table.names] for row in rows),
             )
     if run.landmarks:
+        former.discard("landmarks.csv")
         write_rows(
             directory / "landmarks.csv",
             ["id", "x_m", "y_m", "z_m"],
             ([mark.landmark, mark.x_m, mark.y_m, mark.z_m] for mark in run.landmarks),
         )
     if imu:
+        former.discard("imu.csv")
         write_imu(directory, imu)
+    for name in former:
+        (directory / name).unlink(missing_ok=True)
 
 
 def write_imu(directory: Path, recordings: Mapping[int, ImuRecording]) -> None:

@@ -107,6 +107,10 @@ def plain_type(hint: Any) -> tuple[bool, Any]:
     return False, hint
 
 
+MOST_WHOLE = 2**53 - 1
+"""Of greater ones, two that follow each other may be one number of 64 bits."""
+
+
 def whole(text: str) -> int:
     """Read a whole number; ``3.0`` is one, as spreadsheets write it."""
     try:
@@ -115,6 +119,8 @@ def whole(text: str) -> int:
         raise ValueError("is not a whole number") from None
     if value != int(value):
         raise ValueError("is not a whole number")
+    if abs(value) > MOST_WHOLE:
+        raise ValueError(f"is greater than {MOST_WHOLE}")
     return int(value)
 
 

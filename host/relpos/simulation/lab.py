@@ -315,6 +315,8 @@ def presses(settings: LabSettings, truth: Walk, rng: np.random.Generator) -> lis
     for row, path in enumerate(truth.path_m):
         moving = np.diff(path) > 0.0
         walking = np.append(moving, False) | np.append(False, moving)
+        if not walking.any():
+            continue
         time_s, way_m = truth.time_s[walking], path[walking]
         passed = np.arange(math.floor(way_m[0] / spacing_m) + 1, way_m[-1] // spacing_m + 1)
         last_s = -math.inf

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from relpos.errors import RelposError
+from relpos.measurements import out_of_bounds
 from relpos.simulation import building, missions, paper
 from relpos.simulation.lab import simulate_lab
 
@@ -44,6 +45,12 @@ def simulate_run(
 
     chosen = {key: str(value) for key, value in (overrides or {}).items()}
     simulated = simulate(scenario, seed, chosen)
+    for row in simulated.measurements:
+        if name := out_of_bounds(row):
+            raise RelposError(
+                f"{scenario}: {name} of {getattr(row, name):g} is more than relpos reads: "
+                "smaller settings"
+            )
     return Run(
         name=f"{scenario}-{seed}",
         description=Description(

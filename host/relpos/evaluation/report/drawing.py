@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -43,22 +45,29 @@ class Picture:
 
     def figure(self) -> Figure:
         """Draw it."""
-        import matplotlib as mpl
         from matplotlib.figure import Figure
 
         # The Figure class alone, without pyplot: no display, no global state.
-        with mpl.rc_context(STYLE):
+        with _styled():
             made = Figure(figsize=self.size_in, layout="constrained")
             self.draw(made)
         return made
 
 
-def svg(figure: Figure) -> str:
-    """Return a figure as an SVG document; the same figure is the same text."""
+@contextmanager
+def _styled() -> Iterator[None]:
+    """Draw in the project's style; letters that its font lacks are the browser's in an SVG."""
     import matplotlib as mpl
 
+    with mpl.rc_context(STYLE), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing")
+        yield
+
+
+def svg(figure: Figure) -> str:
+    """Return a figure as an SVG document; the same figure is the same text."""
     written = io.StringIO()
-    with mpl.rc_context(STYLE):
+    with _styled():
         # Laid out once, and not again by each way of saving it.
         if (engine := figure.get_layout_engine()) is not None:
             engine.execute(figure)
@@ -69,11 +78,9 @@ def svg(figure: Figure) -> str:
 
 def save(figure: Figure, document: str, directory: Path, name: str) -> list[Path]:
     """Write NAME.svg and NAME.png; return their paths."""
-    import matplotlib as mpl
-
     paths = [directory / f"{name}.svg", directory / f"{name}.png"]
     paths[0].write_text(document, encoding="utf-8")
-    with mpl.rc_context(STYLE):
+    with _styled():
         # Without a date in it the same report is the same file.
         figure.savefig(paths[1], dpi=130, metadata={"Software": None})
     return paths
