@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand
 
 from relpos import extras
 from relpos.cli import live, output
 from relpos.cli.estimators import BANK, DEADRECKONING, EstimatorName
 from relpos.cli.keys import KeyFile, team_key
+from relpos.cli.needs import Command
 from relpos.errors import DataError, DeviceError, FusionInterrupted, RelposError
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ class Initial(StrEnum):
     TRUTH = "truth"
 
 
-class FuseCommand(TyperCommand):
+class FuseCommand(Command):
     """The command whose help ends with the settings of every estimator."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

@@ -15,7 +15,6 @@ import typer
 
 from relpos.cli import output
 from relpos.cli.keys import make_link
-from relpos.errors import RelposError
 
 if TYPE_CHECKING:
     from relpos.live.assembly import MakeSink, MissionPlan, SessionPlan
@@ -149,8 +148,6 @@ class Options:
 
     def check(self) -> None:
         """Raise DataError or RelposError at once where an option cannot work."""
-        if self.view_listen is not None and not self.view:
-            raise RelposError("--view-listen: no page is served without --view")
         if self.record is not None or self.foxglove is not None:
             from relpos import recording
 

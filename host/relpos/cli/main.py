@@ -24,6 +24,7 @@ from relpos.cli import (
     figures,
     fuse,
     mission,
+    needs,
     node,
     recordings,
     replay,
@@ -82,16 +83,16 @@ def main(
     """Where everybody is, relative to each other: IMU and UWB, no anchors, no map."""
 
 
-app.command("demo", epilog=help_text())(demo.demo)
+app.command("demo", epilog=help_text(), cls=needs.Command)(demo.demo)
 app.command("emulate", epilog=help_text())(emulate.emulate)
 app.command("fuse", cls=fuse.FuseCommand)(fuse.fuse)
 app.command("mission")(mission.mission)
-app.command("replay")(replay.replay)
+app.command("replay", cls=needs.Command)(replay.replay)
 app.command("simulate")(simulate.simulate)
 app.command("evaluate")(evaluate.evaluate)
 app.command("convert")(convert.convert)
 app.command("figures")(figures.figures)
-app.command("report")(report.report)
+app.command("report", cls=needs.Command)(report.report)
 app.command("deadreckon")(deadreckon.deadreckon)
 app.command("doctor")(doctor.doctor)
 app.add_typer(node.app, name="node")

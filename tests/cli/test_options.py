@@ -1,0 +1,93 @@
+"""Options that cannot do what they say: refused in a line, before anything is computed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from relpos.cli import main
+
+
+def relpos(*arguments: object) -> Result:
+    return CliRunner().invoke(main.app, [str(a) for a in arguments], catch_exceptions=False)
+
+
+def refusal(*arguments: object) -> str:
+    result = relpos(*arguments)
+    assert (result.exit_code, result.stdout) == (1, ""), result.output
+    assert result.stderr.count("\n") == 1
+    return result.stderr.removeprefix("relpos: ")
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    rows = "".join(f"{t},{n},0.5,0,0.1\n" for t in range(1, 9) for n in (1, 2))
+    (tmp_path / "walk").mkdir()
+    (tmp_path / "walk" / "motion.csv").write_text("time_s,node,dx_m,dy_m,dtheta_rad\n" + rows)
+    (tmp_path / "walk" / "run.toml").write_text('initial_pose = "common"\n')
+    ranges = "".join(f"{t},1,2,{1 + 0.1 * t}\n" for t in range(1, 9))
+    (tmp_path / "walk" / "ranges.csv").write_text("time_s,node,peer,range_m\n" + ranges)
+    return tmp_path / "walk"
+
+
+QUICK = ("--estimator", "deadreckoning", "--no-report")
+
+
+@pytest.mark.parametrize(
+    ("words", "needs"),
+    [
+        ("fuse walk --view-listen 0.0.0.0", "--view"),
+        ("fuse walk --https", "--view"),
+        ("fuse walk --open", "--view"),
+        ("fuse walk --me 99", "--terminal"),
+        ("fuse walk --pin 48,11", "--cot"),
+        ("fuse walk --seconds 5", "of a port, --view"),
+        ("fuse walk --speed 3", "--view, --terminal"),
+        ("fuse walk --record a.mcap --speed 3", "--view, --terminal"),
+        ("fuse /dev/ttyNOPE7 --view --speed 3", "not of a port"),
+        ("fuse walk --key-file /nope", "a port or a recording"),
+        ("fuse walk --teach", "a port"),
+        ("fuse walk --view --report", "only on a port"),
+        ("fuse /dev/ttyNOPE7 --report", "--view"),
+        ("demo --view-listen 0.0.0.0", "--view"),
+        ("demo --terminal --https", "--view"),
+        ("demo --open", "--view"),
+        ("report walk --estimate e --smooth", "--estimate"),
+        ("report walk --estimate e --set a=b", "--estimate"),
+        ("report walk --estimate e --seed 0", "--estimate"),
+        ("report walk --estimate e --estimator particle", "--estimate"),
+        ("replay a.mcap --log log.csv --open", "--log"),
+        ("replay a.mcap --log log.csv --seconds 3", "--log"),
+        ("replay a.mcap --log log.csv --view-listen 0.0.0.0", "--log"),
+        ("replay a.mcap --log log.csv --pin 48,11", "--log FILE.kml"),
+        ("replay a.mcap --pin 48,11", "--log FILE.kml"),
+    ],
+)
+def test_an_option_that_has_no_effect_is_refused_with_what_it_needs(
+    run: Path, words: str, needs: str
+) -> None:
+    said = refusal(*words.split())
+    option, _, why = said.partition(": ")
+    assert option in words.split()
+    assert needs in why
+
+
+def test_options_that_switch_off_what_is_not_there_and_keys_of_the_environment_are_no_mistake(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RELPOS_KEY_FILE", "/nope")
+    done = relpos("fuse", run, *QUICK, "--no-open", "--no-teach", "--out", "out")
+    assert done.exit_code == 0, done.output
+
+
+def test_a_run_that_is_shown_takes_seconds_and_speed(run: Path) -> None:
+    words = ("--estimator", "deadreckoning", "--view", "--view-listen", "127.0.0.1:0", "--no-open")
+    done = relpos("fuse", run, *words, "--speed", 0, "--seconds", 0.1, "--out", "out")
+    assert done.exit_code == 0, done.output
+
+
+def test_a_source_that_is_missing_is_named_before_its_options(run: Path) -> None:
+    assert "nowhere" in refusal("fuse", "nowhere", "--seconds", 5)
