@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from relpos.cli import main
+from relpos.evaluation.report import page as report_page
 
 
 def relpos(*arguments: object) -> Result:
@@ -91,3 +92,19 @@ def test_a_run_that_is_shown_takes_seconds_and_speed(run: Path) -> None:
 
 def test_a_source_that_is_missing_is_named_before_its_options(run: Path) -> None:
     assert "nowhere" in refusal("fuse", "nowhere", "--seconds", 5)
+
+
+@pytest.mark.parametrize("shown", [(), ("--record", "walk.mcap")])
+def test_an_estimate_without_a_page_leaves_no_page_of_another_estimate_beside_it(
+    run: Path, tmp_path: Path, shown: tuple[str, ...]
+) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "index.html").write_text(report_page._PAGE)
+    assert relpos("fuse", run, *QUICK, "--out", "out", *shown).exit_code == 0
+    assert not (tmp_path / "out" / "index.html").exists()
+
+
+def test_a_page_of_somebody_else_stays_beside_an_estimate(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text("<title>My relpos site</title>")
+    assert relpos("fuse", run, *QUICK, "--out", ".").exit_code == 0
+    assert (tmp_path / "index.html").exists()

@@ -357,6 +357,7 @@ def fuse_recording(
     """
     from relpos import api
     from relpos.evaluation import report as reports
+    from relpos.runs import drop_page
 
     try:
         with output.progress(output.STAGES) as progress:
@@ -372,10 +373,12 @@ def fuse_recording(
             )
     except (RelposError, FusionInterrupted) as error:
         if error.result is not None:
+            drop_page(job.out)
             error.result.save(job.out, run.steps)
         if isinstance(error, FusionInterrupted):
             raise RelposError(f"interrupted; the estimates so far are in {job.out}") from None
         raise
+    drop_page(job.out)
     result.save(job.out, run.steps)
     evaluation, baseline = None, None
     if run.truth:

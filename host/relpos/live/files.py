@@ -10,7 +10,7 @@ from relpos.live.log_files import log_row
 from relpos.live.sinks import Sink
 from relpos.live.team_view import LogEntry
 from relpos.measurements import Observation, Step
-from relpos.runs import Description, EstimateFiles, RunFiles
+from relpos.runs import Description, EstimateFiles, RunFiles, drop_page
 from relpos.runs.appending import AppendedTable
 from relpos.runs.log import LOG_COLUMNS, LOG_FILE
 from relpos.said import Said
@@ -26,6 +26,7 @@ class FileSink(Sink):
         self, directory: Path, description: Description, *, keep_received: bool = True
     ) -> None:
         self._description = description
+        drop_page(directory)
         self._estimates = EstimateFiles(directory)
         self._log = AppendedTable(directory / LOG_FILE, LOG_COLUMNS, wanted=False)
         self._received = RunFiles(directory / "received", description) if keep_received else None

@@ -11,6 +11,7 @@ simulates, estimates or scores exchanges this package's classes; begin reading w
 from relpos.runs.description import Description, InitialPose, NodeInfo, Simulated
 from relpos.runs.estimates import (
     EstimateFiles,
+    drop_page,
     read_estimates,
     write_estimates,
 )
@@ -28,6 +29,7 @@ __all__ = [
     "Run",
     "RunFiles",
     "Simulated",
+    "drop_page",
     "load_run",
     "read_estimates",
     "save_run",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, TypeVar
@@ -193,6 +194,16 @@ class EstimateFiles:
     def close(self) -> None:
         """Finish them; OSError where something could not be written."""
         close_all(self.tables)
+
+
+def drop_page(directory: Path | str) -> None:
+    """Remove the report of the estimate that was there before; a page of somebody else stays."""
+    page = Path(directory) / "index.html"
+    with suppress(OSError):
+        with page.open("rb") as file:
+            is_report = b" - relpos</title>" in file.read(4096)
+        if is_report:
+            page.unlink()
 
 
 def read_estimates(directory: Path | str) -> list[Estimate]:
