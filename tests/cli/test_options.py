@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from relpos.cli import main
-from relpos.evaluation.report import page as report_page
+from relpos.evaluation.report.page import _PAGE
 
 
 def relpos(*arguments: object) -> Result:
@@ -99,7 +99,7 @@ def test_an_estimate_without_a_page_leaves_no_page_of_another_estimate_beside_it
     run: Path, tmp_path: Path, shown: tuple[str, ...]
 ) -> None:
     (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "index.html").write_text(report_page._PAGE)
+    (tmp_path / "out" / "index.html").write_text(_PAGE)
     assert relpos("fuse", run, *QUICK, "--out", "out", *shown).exit_code == 0
     assert not (tmp_path / "out" / "index.html").exists()
 
@@ -108,3 +108,53 @@ def test_a_page_of_somebody_else_stays_beside_an_estimate(run: Path, tmp_path: P
     (tmp_path / "index.html").write_text("<title>My relpos site</title>")
     assert relpos("fuse", run, *QUICK, "--out", ".").exit_code == 0
     assert (tmp_path / "index.html").exists()
+
+
+@pytest.fixture
+def nothing_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What takes minutes fails the test."""
+    for name in (
+        "relpos.api.fuse",
+        "relpos.emulator.serving.record_team",
+        "relpos.emulator.recorded_team.record_team",
+        "relpos.emulator.deadreckoning.reckon_run",
+        "relpos.fusion.warm_up",
+        "relpos.emulator.process.EmulatorProcess",
+    ):
+        monkeypatch.setattr(name, lambda *_, **__: pytest.fail("it computes first"))
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        ("fuse walk --out FILE", "FILE"),
+        ("fuse walk --out FILE/sub", "FILE/sub"),
+        ("fuse walk --view --out FILE", "FILE"),
+        ("report walk --out FOLDER", "FOLDER"),
+        ("report walk --out FILE/page.html", "FILE"),
+        ("report walk --figures FILE", "FILE"),
+        ("demo --out FILE", "FILE"),
+        ("demo --view --out FILE", "FILE"),
+        ("demo --view --view-listen 127.0.0.1:70000", "127.0.0.1:70000"),
+        ("demo --view --view-listen 192.0.2.1:8460", "192.0.2.1:8460"),
+        ("fuse walk --view --view-listen 127.0.0.1:70000", "127.0.0.1:70000"),
+        ("fuse walk --foxglove 127.0.0.1:70000", "127.0.0.1:70000"),
+        ("simulate --recordings a b --seed 1 --out FILE", "FILE"),
+        ("deadreckon walk --out FILE", "FILE"),
+    ],
+)
+def test_what_cannot_be_written_or_served_is_refused_before_anything_is_computed(
+    run: Path, nothing_computed: None, words: str, names: str
+) -> None:
+    Path("FILE").write_text("")
+    Path("FOLDER").mkdir()
+    head = "time_s,node,ax_m_s2,ay_m_s2,az_m_s2,gx_rad_s,gy_rad_s,gz_rad_s\n"
+    rows = "".join(f"{t / 100},1,0,0,9.8,0,0,0\n" for t in range(200))
+    (run / "imu.csv").write_text(head + rows)
+    assert names in refusal(*words.split())
+
+
+def test_looking_whether_a_folder_can_be_written_leaves_none(run: Path) -> None:
+    (run / "ranges.csv").unlink()
+    assert "no ranges" in refusal("fuse", run, "--out", "new/out")
+    assert not Path("new").exists()

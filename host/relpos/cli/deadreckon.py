@@ -61,6 +61,8 @@ def deadreckon(
         if not walk.load_imu():
             raise DataError(f"{path}: no inertial data in this run (imu.csv)")
         walks.append(walk)
+    if out is not None:
+        output.check_folder(out)
     with output.working("running the firmware over the recording"):
         played = reckon_run(recording, board=str(board), stature_m=stature, calibration=walks)
 

@@ -77,6 +77,7 @@ def demo(
     from relpos.runs import save_run
 
     faults = check_faults(fault, nodes)
+    output.check_folder(out)
     shown = view or terminal
     job = fuse.Job("emulated" if shown else str(out / "run"), BANK, {}, seed, out)
     config = TeamConfig(scenario, nodes, seconds, seed, str(board), faults)
@@ -89,6 +90,7 @@ def demo(
             sinks=[live.terminal_sink(None)] if terminal else [],
             screen=terminal,
         )
+        options.check()
         fuse_emulated(config, job, options, as_json=json)
         return
     from relpos.emulator.serving import record_team

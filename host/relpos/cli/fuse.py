@@ -156,6 +156,7 @@ def fuse(
     )
     options.check()
     job = Job(source, estimator, chosen, seed, out or _default_out(source), smooth, post)
+    output.check_folder(job.out)
     if sources.is_port(source):
         _fuse_port(job, initial, options, key_file, teach=teach, as_json=json)
     elif sources.is_recording(source):

@@ -15,6 +15,7 @@ import typer
 
 from relpos.cli import output
 from relpos.cli.keys import make_link
+from relpos.live.addresses import parse_listen
 
 if TYPE_CHECKING:
     from relpos.live.assembly import MakeSink, MissionPlan, SessionPlan
@@ -147,7 +148,13 @@ class Options:
         return self.view or bool(self.sinks) or self.foxglove is not None
 
     def check(self) -> None:
-        """Raise DataError or RelposError at once where an option cannot work."""
+        """Raise RelposError, before minutes of preparing, where an option cannot work."""
+        if self.view and self.door is None:
+            from relpos.view.access import listen
+
+            listen(self.view_listen)[0].close()
+        if self.foxglove is not None:
+            parse_listen(self.foxglove, "--foxglove")
         if self.record is not None or self.foxglove is not None:
             from relpos import recording
 

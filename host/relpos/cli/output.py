@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 import math
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import pairwise
+from pathlib import Path
 from threading import Timer
 from typing import TYPE_CHECKING, Any
 
 import typer
+
+from relpos.errors import DataError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -82,6 +86,29 @@ def parse_settings(pairs: Sequence[str]) -> dict[str, str]:
             raise typer.BadParameter(f"'{pair}' is not KEY=VALUE", param_hint="--set")
         settings[key.strip()] = value.strip()
     return settings
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder in which nothing can be written, before minutes are computed. DataError."""
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        # Rights alone do not tell: of /proc, or of a disk that is mounted to be read.
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be written: {error.strerror or error}") from None
+    finally:
+        for path in new:
+            with suppress(OSError):
+                path.rmdir()
+
+
+def check_file(path: Path) -> None:
+    """Refuse a file that cannot be written; see :func:`check_folder`. DataError."""
+    if path.is_dir():
+        raise DataError(f"{path}: a directory, where a file is to be written")
+    check_folder(path.parent)
 
 
 class Progress:

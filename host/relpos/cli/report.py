@@ -53,6 +53,11 @@ def report(
     if not json or out is not None or figures is not None:
         extras.require("report")
     recording = api.load(run)
+    where = out or (None if json else Path("out") / recording.name / "report.html")
+    if where is not None:
+        output.check_file(where)
+    if figures is not None:
+        output.check_folder(figures)
     if estimate is not None:
         result = read_result(estimate)
     else:
@@ -64,7 +69,6 @@ def report(
     with output.working("drawing"):
         words = [] if estimate is None else [f"relpos report {run} --estimate {estimate}"]
         content = reports.gather(recording, result, words=words)
-        where = out or (None if json else Path("out") / recording.name / "report.html")
         if where is not None:
             reports.write(content, where, figures)
         elif figures is not None:

@@ -43,6 +43,7 @@ def simulate(
     if (scenario is None) == (recordings is None):
         raise typer.BadParameter("give either --scenario NAME or --recordings DIR DIR...")
     _keep_recording(out)
+    output.check_folder(out)
     if recordings is not None:
         from relpos.emulator.recorded_team import record_team
 
