@@ -158,3 +158,11 @@ def test_looking_whether_a_folder_can_be_written_leaves_none(run: Path) -> None:
     (run / "ranges.csv").unlink()
     assert "no ranges" in refusal("fuse", run, "--out", "new/out")
     assert not Path("new").exists()
+
+
+@pytest.mark.parametrize("name", ["o/x.txt", "log", "FOLDER.csv"])
+def test_a_log_that_is_neither_a_table_nor_a_map_is_refused(run: Path, name: str) -> None:
+    Path("FOLDER.csv").mkdir()
+    said = refusal("replay", "a.mcap", "--log", name)
+    assert said.startswith(("--log", "FOLDER.csv"))
+    assert (".csv nor .kml" in said) is not name.endswith(".csv")

@@ -15,11 +15,12 @@ from relpos.cli import fuse, live, replay
 from relpos.emulator.team import EmulatedTeam, TeamConfig
 from relpos.errors import DataError
 from relpos.fusion.estimator import NodeStatus
-from relpos.live.log_files import write_kml
+from relpos.live.log_files import log_row, write_kml
 from relpos.live.team_view import LogEntry
 from relpos.measurements import Event
 from relpos.recording.player import History
 from relpos.runs import Description
+from relpos.runs.appending import write_rows
 from relpos.runs.log import LOG_COLUMNS, read_log
 
 ENTRIES = [
@@ -63,6 +64,20 @@ def test_the_log_of_a_replay_is_written_by_its_suffix_with_places_by_a_pin(
     # x points east: 100 m there are 100 / (111.32 km cos 48 deg) degrees.
     assert latitude == pytest.approx(48.0, abs=1e-5)
     assert longitude == pytest.approx(11.0 + 100.0 / 74625.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", ["=1+1", "+A", "-A", "@A", "'=A", "'A", "Anna"])
+def test_a_name_is_no_formula_in_a_spreadsheet_and_read_back_as_it_was(
+    tmp_path: Path, name
+) -> None:
+    entry = LogEntry(-1.5, 1.7e9, "board", f"{name} out", None, name)
+    write_rows(tmp_path / "log.csv", LOG_COLUMNS, [log_row(entry)])
+    with (tmp_path / "log.csv").open(newline="") as file:
+        (cells,) = csv.DictReader(file)
+    assert not {cells["by"][0], cells["text"][0]} & set("=+-@")
+    assert cells["time_s"] == "-1.50"
+    (row,) = read_log(tmp_path)
+    assert (row["by"], row["text"]) == (name, f"{name} out")
 
 
 def test_what_is_true_of_a_simulated_walker_is_no_landmark_in_its_log() -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from relpos.cli import live, output
+from relpos.errors import DataError
 
 if TYPE_CHECKING:
     from relpos.live.team_view import LogEntry
@@ -36,6 +37,9 @@ def replay(
     computed meanwhile and drawn beside them once they are there.
     """
     if log is not None:
+        if log.suffix.lower() not in (".csv", ".kml"):
+            raise DataError(f"--log {log}: neither .csv nor .kml")
+        output.check_file(log)
         played = Played.open(source)
         from relpos.recording.moments import Moments  # it needs what `open` has looked for
 
@@ -58,7 +62,6 @@ class Played:
     def open(cls, source: Path) -> Played:
         """Read what there is; DataError."""
         from relpos import recording
-        from relpos.errors import DataError
         from relpos.live.board import Board, BoardError
         from relpos.live.mission import Mission
 

@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 
 from relpos.files import printable
 from relpos.live.team_view import LogEntry
+from relpos.runs.log import shielded
 
 KML = "http://www.opengis.net/kml/2.2"
 Place = tuple[float, float]
@@ -17,8 +18,8 @@ Place = tuple[float, float]
 def log_row(entry: LogEntry) -> tuple[object, ...]:
     """Return an entry as a row of ``LOG_COLUMNS``."""
     return (
-        f"{entry.time_s:.2f}", f"{entry.unix_s:.2f}", entry.kind, entry.node or "", entry.by,
-        entry.text,
+        f"{entry.time_s:.2f}", f"{entry.unix_s:.2f}", entry.kind, entry.node or "",
+        shielded(entry.by), shielded(entry.text),
     )  # fmt: skip
 
 

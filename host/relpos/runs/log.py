@@ -3,12 +3,26 @@
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 
 from relpos.errors import DataError
 
 LOG_FILE = "log.csv"
 LOG_COLUMNS = ("time_s", "unix_s", "kind", "node", "by", "text")
+
+
+FORMULA = re.compile(r"'*[=+\-@]")
+"""What spreadsheets would compute, apostrophes before it included."""
+
+
+def shielded(text: str) -> str:
+    """Return a cell that a spreadsheet shows, and does not compute: names come from anybody."""
+    return f"'{text}" if FORMULA.match(text) else text
+
+
+def _plain(cell: str) -> str:
+    return cell[1:] if cell.startswith("'") and FORMULA.match(cell) else cell
 
 
 def read_log(directory: Path | str) -> list[dict[str, str]]:
@@ -21,4 +35,8 @@ def read_log(directory: Path | str) -> list[dict[str, str]]:
         return []
     except (OSError, ValueError, csv.Error) as error:
         raise DataError(f"{path}: not a log: {error}") from None
-    return [row for row in rows if all(isinstance(row.get(name), str) for name in LOG_COLUMNS)]
+    return [
+        {**row, "by": _plain(row["by"]), "text": _plain(row["text"])}
+        for row in rows
+        if all(isinstance(row.get(name), str) for name in LOG_COLUMNS)
+    ]
