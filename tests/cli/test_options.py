@@ -22,6 +22,11 @@ def refusal(*arguments: object) -> str:
     return result.stderr.removeprefix("relpos: ")
 
 
+IMU = "time_s,node,ax_m_s2,ay_m_s2,az_m_s2,gx_rad_s,gy_rad_s,gz_rad_s\n" + "".join(
+    f"{t / 100},1,0,0,9.8,0,0,0\n" for t in range(200)
+)
+
+
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
@@ -148,9 +153,7 @@ def test_what_cannot_be_written_or_served_is_refused_before_anything_is_computed
 ) -> None:
     Path("FILE").write_text("")
     Path("FOLDER").mkdir()
-    head = "time_s,node,ax_m_s2,ay_m_s2,az_m_s2,gx_rad_s,gy_rad_s,gz_rad_s\n"
-    rows = "".join(f"{t / 100},1,0,0,9.8,0,0,0\n" for t in range(200))
-    (run / "imu.csv").write_text(head + rows)
+    (run / "imu.csv").write_text(IMU)
     assert names in refusal(*words.split())
 
 
@@ -166,3 +169,15 @@ def test_a_log_that_is_neither_a_table_nor_a_map_is_refused(run: Path, name: str
     said = refusal("replay", "a.mcap", "--log", name)
     assert said.startswith(("--log", "FOLDER.csv"))
     assert (".csv nor .kml" in said) is not name.endswith(".csv")
+
+
+@pytest.mark.parametrize("folders", [("nowhere",), ("walk", "nowhere")])
+def test_recordings_that_are_missing_are_named_before_any_is_played(
+    run: Path, monkeypatch: pytest.MonkeyPatch, folders: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr(
+        "relpos.emulator.recorded_team.play", lambda *_, **__: pytest.fail("it plays first")
+    )
+    (run / "imu.csv").write_text(IMU)
+    said = refusal("simulate", "--recordings", *folders, "--seed", 1, "--out", "team")
+    assert said == "nowhere: no such folder\n"

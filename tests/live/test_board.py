@@ -92,6 +92,14 @@ def test_a_request_that_makes_no_sense_changes_nothing(bad):
     assert board == Board()
 
 
+@pytest.mark.parametrize(
+    ("kind", "lacking"), [("board", "node"), ("mayday", "node"), ("marker", "id")]
+)
+def test_what_a_request_lacks_is_named_in_plain_words(kind, lacking):
+    with pytest.raises(BoardError, match=f"^{lacking}: is missing$"):
+        Board().apply(event(kind))
+
+
 def test_the_same_events_give_the_same_board():
     events = [
         event("board", node=1, state="standby"),

@@ -29,6 +29,8 @@ def runs_of(wearer: str) -> list[Run]:
     """The recordings of one wearer: a run directory, a folder of them, or a pattern of either."""
     given = Path(wearer)
     found = sorted(given.parent.glob(given.name)) if given.name else [given]
+    if not found:
+        raise DataError(f"{wearer}: no such folder")
     runs = []
     for path in found:
         if (path / "run.toml").exists():
@@ -101,13 +103,15 @@ def record_team(
     DataError where a recording has no inertial data or nothing says its track.
     """
     settings = settings_of(overrides)
-    if len(wearers) < 2:
+    # All of them first: playing one takes a while.
+    recorded = [runs_of(wearer) for wearer in wearers]
+    if len(recorded) < 2:
         raise DataError("a team needs two wearers or more, each with recordings of its own")
     team = []
-    for number, wearer in enumerate(wearers):
-        runs = runs_of(wearer)
+    for number, runs in enumerate(recorded):
         # Wearers begin with different recordings, or two of the same folder would walk alike.
-        runs = runs[number % len(runs) :] + runs[: number % len(runs)]
+        first = number % len(runs)
+        runs = runs[first:] + runs[:first]
         tracks, recordings = [true_tracks(run) for run in runs], []
         for run in runs:
             nodes = list(run.load_imu().values())

@@ -167,7 +167,9 @@ class Board:
             return do(event)
         except BoardError:
             raise
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
+        except KeyError as error:
+            raise BoardError(f"{error.args[0]}: is missing") from None
+        except (TypeError, ValueError, OverflowError) as error:
             raise BoardError(f"not a request that the board knows: {error!r}") from None
 
     def _board(self, event: Mapping[str, Any]) -> Said | None:
