@@ -20,6 +20,7 @@ from relpos.evaluation import metrics
 from relpos.exchange import content
 from relpos.fusion.estimator import NodeStatus
 from relpos.measurements import Event, Truth
+from relpos.recording import MAGIC
 from relpos.runs import load_run, read_estimates, save_run, write_estimates
 from support.small_team import (
     LANDMARKS,
@@ -310,6 +311,14 @@ def test_a_recording_that_broke_off_is_read_and_reported(tmp_path: Path) -> None
     (tmp_path / "broken.mcap").write_bytes(b"not at all")
     line = refused(tmp_path / "broken.mcap", "--to", "run", "--out", tmp_path / "no")
     assert "no MCAP file" in line
+
+
+@pytest.mark.parametrize("content", [b"", MAGIC], ids=["no bytes", "its first bytes alone"])
+def test_a_recording_in_which_nothing_is_gives_no_run(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "e.mcap").write_bytes(content)
+    out = tmp_path / "out"
+    assert "e.mcap: empty" in refused(tmp_path / "e.mcap", "--to", "run", "--out", out)
+    assert not out.exists()
 
 
 def test_a_recording_is_not_left_half_written(tmp_path: Path) -> None:

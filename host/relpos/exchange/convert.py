@@ -124,6 +124,8 @@ def _started(content: Content, hints: Hints) -> Content:
 
 def _read_mcap(source: Path) -> Content:
     opened = open_recording(source)
+    if next(opened.entries(), None) is None:
+        raise DataError(f"{source}: empty: nothing was recorded")
     run = opened.run
     start_unix_s = None if opened.started_unix_ns is None else opened.started_unix_ns * 1e-9
     remarks = (*opened.remarks, *_press_remarks(run))
