@@ -16,7 +16,7 @@ from typer.core import TyperCommand
 from relpos.errors import RelposError
 
 Given = Mapping[str, Any]
-"""The command's parameters by name."""
+"""The command's parameters by name; paths are still text with old versions of Typer."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ NEEDS = {
         Need(
             "pins",
             "places are written by --log FILE.kml alone",
-            lambda g: g["log"] is not None and g["log"].suffix.lower() == ".kml",
+            lambda g: g["log"] is not None and Path(g["log"]).suffix.lower() == ".kml",
         ),
     ),
     "report": (
