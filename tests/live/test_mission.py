@@ -390,3 +390,12 @@ def test_a_file_that_a_running_session_replaces_meanwhile_is_no_foreign_one(
 
     monkeypatch.setattr(Path, "rglob", rglob)
     Mission.open(tmp_path / "m", "/dev/null")
+
+
+@pytest.mark.parametrize("https", [False, True])
+def test_an_invitation_has_the_address_at_which_the_page_is_served(tmp_path, https):
+    mission = Mission.open(tmp_path / "m", "/dev/null")
+    mission.about.port, mission.about.https = 8460, https
+    mission.save()
+    made = CliRunner().invoke(main.app, ["mission", str(mission.path), "--invite", "look"])
+    assert made.stdout.startswith("https://" if https else "http://"), made.output

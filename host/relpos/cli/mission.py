@@ -87,7 +87,7 @@ def mission(
             if before not in (None, access.port):
                 output.remark(f"the page was at port {before}: devices open its new address")
             # On the disk before anybody has the address.
-            found.about.port = access.port
+            found.about.port, found.about.https = access.port, https
             found.save()
             options = live.Options(
                 True, view_listen, https, open_browser, seconds, door=(door, access)
@@ -272,5 +272,6 @@ def _print_invitation(found: Mission, role: str, view_listen: str | None) -> Non
     host, _ = parse_listen(view_listen or "0.0.0.0")
     door = doors.Access(found.about.port, doors.hosts_of(host), key=found.key)
     url = door.url("/phone" if role == Role.ACKNOWLEDGE else "/", role=Role(role))
-    typer.echo(url)
+    # This process has no certificate; the one that serves the page may.
+    typer.echo(url.replace("http:", "https:", 1) if found.about.https else url)
     output.remark(doors.qr_terminal(url))

@@ -66,11 +66,14 @@ class About:
     """Whether the nodes started at one pose."""
     post: int | None = None
     """The command post's node."""
+    https: bool = False
+    """Whether its page is served encrypted."""
 
     @classmethod
     def read(cls, text: str) -> About:
         """Return what a file says. ValueError or KeyError where it is none of ours."""
-        found = {"common": False, "post": None} | _object(text)  # Earlier versions have none.
+        # Earlier versions have none of these.
+        found = {"common": False, "post": None, "https": False} | _object(text)
         about = cls(**{f.name: found[f.name] for f in fields(cls)})
         if not (
             isinstance(about.name, str)
@@ -80,6 +83,7 @@ class About:
             and (about.port is None or (type(about.port) is int and 0 < about.port < 65536))
             and (about.ended_unix_s is None or _is_number(about.ended_unix_s))
             and type(about.common) is bool
+            and type(about.https) is bool
             and (about.post is None or (type(about.post) is int and about.post > 0))
         ):
             raise ValueError("values of another kind")
