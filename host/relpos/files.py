@@ -1,7 +1,4 @@
-"""What all files have in common that are written.
-
-They are written whole: after a kill or a power cut it is the old one or the new one.
-"""
+"""Writing files: whole, so that after a kill or a power cut it is the old one or the new one."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from relpos.recording import is_recording, open_recording, save_recording
 from relpos.runs.estimates import read_estimates, write_estimates
 from relpos.runs.landmarks import PRESS, Landmark, read_landmarks, truth_from_presses
 from relpos.runs.run import TABLE_NAMES, Run, load_run, save_run
-from relpos.runs.table import find_table
+from relpos.runs.table import find_table, remove_table
 
 RECEIVED = "received"
 """Folder in which ``relpos fuse PORT`` stores the run of its estimates."""
@@ -278,11 +278,12 @@ def _make_room(out: Path, form: Format, *, overwrite: bool) -> None:
     old = list(out.glob("*.tum")) if form is Format.TUM else []
     if form is Format.ROSBAG2:
         old = [out / "metadata.yaml", *out.glob("*.mcap")]
-    if form in (Format.RUN, Format.CSV):
-        names = ("run.toml", "imu.csv", "landmarks.csv", *TABLE_NAMES, *_ESTIMATE_TABLES)
-        old = [out / f"{name}{packed}" for name in names for packed in ("", ".gz")]
     for path in old:
         path.unlink(missing_ok=True)
+    if form in (Format.RUN, Format.CSV):
+        # Those of a run are replaced or removed where it is written.
+        for name in _ESTIMATE_TABLES:
+            remove_table(out, name)
 
 
 _Written = tuple[list[Path], list[str]]

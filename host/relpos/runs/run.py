@@ -50,6 +50,7 @@ from relpos.runs.table import (
     numbered_rows,
     plain_type,
     read_text,
+    remove_table,
 )
 
 UNKNOWN_HEADING_SIGMA_RAD = math.pi
@@ -245,28 +246,24 @@ def save_run(run: Run, path: Path | str) -> None:
     description = replace(run.description, name=run.name)
     write_description(directory / "run.toml", description)
     by_kind = _by_kind(chain(run.measurements, run.events, run.statuses, run.steps, run.truth))
-    former = {*TABLE_NAMES, "landmarks.csv", "imu.csv"}
-    former |= {f"{name}.gz" for name in former}
     for table in _TABLES:
+        remove_table(directory, table.name)
         if rows := by_kind[table.kind]:
-            former.discard(table.name)
             write_rows(
                 directory / table.name,
                 table.names,
                 ([getattr(row, name) for name in table.names] for row in rows),
             )
+    remove_table(directory, "landmarks.csv")
     if run.landmarks:
-        former.discard("landmarks.csv")
         write_rows(
             directory / "landmarks.csv",
             ["id", "x_m", "y_m", "z_m"],
             ([mark.landmark, mark.x_m, mark.y_m, mark.z_m] for mark in run.landmarks),
         )
+    remove_table(directory, "imu.csv")
     if imu:
-        former.discard("imu.csv")
         write_imu(directory, imu)
-    for name in former:
-        (directory / name).unlink(missing_ok=True)
 
 
 def write_imu(directory: Path, recordings: Mapping[int, ImuRecording]) -> None:
@@ -304,8 +301,7 @@ class RunFiles:
         self._directory = Path(path)
         self._directory.mkdir(parents=True, exist_ok=True)
         for table in _TABLES:
-            for name in (table.name, f"{table.name}.gz"):
-                (self._directory / name).unlink(missing_ok=True)
+            remove_table(self._directory, table.name)
         self.describe(description)
         self._files = {
             table.kind: (

@@ -142,10 +142,20 @@ def flag(text: str) -> bool:
 
 def find_table(directory: Path, name: str) -> Path | None:
     """Return the file of a table: ``NAME`` or ``NAME.gz``, or None; both at once are refused."""
-    found = [p for p in (directory / name, directory / f"{name}.gz") if p.exists()]
+    found = [path for path in _files_of(directory, name) if path.exists()]
     if len(found) == 2:
         raise DataError(f"{directory}: both {name} and {name}.gz are there; which one counts?")
     return found[0] if found else None
+
+
+def remove_table(directory: Path, name: str) -> None:
+    """Remove the file of a table that an earlier run or estimate left, packed or not."""
+    for path in _files_of(directory, name):
+        path.unlink(missing_ok=True)
+
+
+def _files_of(directory: Path, name: str) -> tuple[Path, Path]:
+    return directory / name, directory / f"{name}.gz"
 
 
 def read_text(path: Path, most_bytes: int | None = None) -> str:

@@ -24,6 +24,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from relpos.fusion.estimator_settings import BankSettings
 from relpos.fusion.large_teams import chain, kernels
 from relpos.fusion.large_teams.kernels import RangeModel, Ranges
 from relpos.fusion.large_teams.layout import COVARIANCE, StripLayout, lay_out
@@ -33,12 +34,12 @@ Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 JITTER_M2, JITTER_CONSTANT = 1e-8, 1e-12
-"""Least variances of an initial pose, (0.1 mm)^2 and as many rad^2, and of drift and scale: what is
-exact has no inverse."""
+"""Least variances of an initial pose, (0.1 mm)^2 and as many rad^2, and of constants: what is exact
+has no inverse."""
 
 TERMS = len(CommonIndex)
-BIAS_SD_M, SHADOW_SD_M, LATENESS_SD_S = 0.3, 0.3, 0.3
-"""Standard deviations beforehand of a bias, of the body's shadow and of the lateness.
+SHADOW_SD_M, LATENESS_SD_S = 0.3, 0.3
+"""Standard deviations beforehand of the body's shadow and of the lateness.
 
 Pairs have no biases here that shadows could be taken for, so that both may be larger than in the
 bank. 24 people, 100 s, seeds 14 and 15, with these and with the bank's .05 m and .1 s: ``shadow``
@@ -84,7 +85,9 @@ class NeighbourhoodFilter:
     """What all ranges have in common (:class:`~relpos.fusion.models.ranging.CommonIndex`)."""
     _carried: Floats = field(default_factory=lambda: np.empty((0, COVARIANCE, TERMS)))
     """V (N, 5, T): derivative of the states by the terms."""
-    terms_information: Floats = field(default_factory=lambda: prior_information(BIAS_SD_M))
+    terms_information: Floats = field(
+        default_factory=lambda: prior_information(BankSettings().bias_m)
+    )
     counters: Counter[str] = field(default_factory=Counter)
     """How often nodes changed strips, and strips were laid out anew or widened."""
     _lever: Floats = field(default_factory=lambda: np.empty((0, 3, 3)))
