@@ -211,18 +211,23 @@ class Estimate:
     def pair_statuses(self) -> list[NodeStatus]:
         """Return the status of every pair, in their order.
 
-        It is the worse of its two nodes', and ``ambiguous`` at best where the distance is uncertain
-        by more than ``VAGUE_PAIR_M``: both may be well known relative to others.
+        It is the worse of its two nodes', and ``ambiguous`` at best where the distance between
+        their reported places is uncertain by more than ``VAGUE_PAIR_M``: both may be well known
+        relative to others. The mean of places on an arc lies inside it, so that places may be
+        nearer to each other than the pair's own distance says; that is a part of their error.
         """
-        of = {node.node: node.status for node in self.nodes}
+        of = {node.node: node for node in self.nodes}
         order = list(NodeStatus)
-        unknown = NodeStatus.UNLOCATED
         statuses = []
         for p in self.pairs:
-            vague = p.sigma_distance_m > VAGUE_PAIR_M
+            one, other = of.get(p.node), of.get(p.peer)
+            if one is None or other is None:
+                statuses.append(NodeStatus.UNLOCATED)
+                continue
+            between_m = hypot(one.x_m - other.x_m, one.y_m - other.y_m)
+            vague = hypot(p.sigma_distance_m, between_m - p.distance_m) > VAGUE_PAIR_M
             own = NodeStatus.AMBIGUOUS if vague else NodeStatus.OK
-            both = of.get(p.node, unknown), of.get(p.peer, unknown)
-            statuses.append(max((own, *both), key=order.index))
+            statuses.append(max((own, one.status, other.status), key=order.index))
         return statuses
 
 
@@ -244,9 +249,9 @@ ANY_ANGLE_RAD = pi / sqrt(3.0)
 """Standard deviation of a heading or bearing of which nothing is known."""
 
 VAGUE_PAIR_M = 0.67
-"""Greatest standard deviation of the distance of a pair that is ``ok``: an error of 2 m is then
-three deviations (``mission-split-hard``, seeds 620 and 621: 9.6 % of the ok pair-seconds err by
-more without this, 0.6 % with 1 m, 0.03 % with this)."""
+"""Greatest uncertainty of the distance between the places of a pair that is ``ok``: an error of
+2 m is then three deviations (``mission-split-hard``, seeds 620 and 621: 9.6 % of the ok
+pair-seconds err by more without this, 0.6 % with 1 m, 0.03 % with this)."""
 
 MAX_ALTERNATIVES = 16
 """At most so many modes are listed (run format, ``alternatives.csv``)."""
