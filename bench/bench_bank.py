@@ -56,7 +56,7 @@ def core_us(run: SimulatedRun, hypotheses: int) -> dict[str, np.ndarray]:
     core = core_of(run, hypotheses)
     parts: dict[str, list[float]] = {"advance": [], "update": [], "end_instant": []}
     moved = ranged = 0
-    for m, r in zip(move_ends.tolist(), range_ends.tolist(), strict=True):
+    for end_s, m, r in zip(ends_s.tolist(), move_ends.tolist(), range_ends.tolist(), strict=True):
         some_moves, some_ranges = slice(moved, m), slice(ranged, r)
         moved, ranged = m, r
         ours = core.hypotheses.count == hypotheses
@@ -68,7 +68,7 @@ def core_us(run: SimulatedRun, hypotheses: int) -> dict[str, np.ndarray]:
                 first[some_ranges], second[some_ranges], range_m[some_ranges], dz_m[some_ranges]
             )
         marks.append(time.thread_time())
-        core.end_instant()
+        core.end_instant(end_s)
         marks.append(time.thread_time())
         for name, spent in zip(parts, np.diff(marks), strict=True):
             parts[name].append(

@@ -215,7 +215,7 @@ def walk_the_core(case, count, seed):
             core.update_heading(
                 rng.choice(rows.tolist()), rng.uniform(-4.0, 4.0), rng.choice([1e-6, 0.4])
             )
-        core.end_instant()
+        core.end_instant(float(k))
         if k % EVERY == 0:
             check_matrices(hypotheses_of(core, len(nodes)))
             mean, covariance, shared = core.moments()

@@ -164,6 +164,16 @@ def test_distances_are_less_sure_where_walls_may_be_a_scale_of_ranges(
     assert so < 0.5 * too_sure()
 
 
+@pytest.mark.parametrize("seed", [602, pytest.param(603, marks=pytest.mark.soak)])
+def test_what_bodies_add_is_found_though_all_start_at_one_place(seed: int) -> None:
+    # Uncertain starts take it at first, so that noise alone seems to explain all ranges.
+    conditions = {"area_m": 15, "range_rate_hz": 3, "shadow_m": 0.3, "start_m": 0.5}
+    run = relpos.simulate("mission-base", seed, seconds=150, start_deg=10, **conditions)
+    metrics = relpos.evaluate(relpos.fuse(run, seed=seed), run, bound=False).metrics
+    assert metrics.nees_distance < 1.4
+    assert metrics.ok_over_3_sigma < 0.015
+
+
 def test_where_nothing_is_off_nothing_is_learned_and_nothing_told() -> None:
     learned = last_parameters("mission-base", 74, seconds=200)
     for (name, _), p in learned.items():

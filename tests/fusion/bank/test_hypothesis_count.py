@@ -135,7 +135,7 @@ def _epochs(core: BankCore, first: int, count: int) -> None:
             np.tile([0.02, 0.02, 0.005], (3, 1)),
         )
         core.update(*pair, distance + noise_m[k], np.zeros(3))
-        core.end_instant()
+        core.end_instant(float(k))
 
 
 def test_a_copy_is_exact_across_a_change_of_number() -> None:

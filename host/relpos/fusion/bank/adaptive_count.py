@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.fusion.bank import hypothesis_count, storage
-from relpos.fusion.bank.hypothesis_models import RangeErrors
+from relpos.fusion.bank.hypothesis_models import DECIDED_AFTER_S, RangeErrors
 from relpos.fusion.bank.hypothesis_set import HypothesisSet
 from relpos.fusion.bank.mixture import PERTURBED_LOSS
 from relpos.fusion.bank.storage import PER_NODE, POSE, StateIndex
@@ -34,12 +34,17 @@ class AdaptiveCount:
         """Ordinarily at most so many: more than usual while strongly nonlinear."""
         self.unambiguous = 0
         """For so many instants of ranges the mixture has been so."""
+        self._first_s = math.inf
+        """When the first ranges came."""
 
-    def resize(self, *, ambiguous: bool, since_fault: int) -> None:
+    def resize(self, time_s: float, *, ambiguous: bool, since_fault: int) -> None:
         """Shrink where the mixture has been unambiguous for a while; grow where it is not."""
         these = self._hypotheses
         if these.settings.hypotheses == 1 or not these.nodes:
             return
+        self._first_s = min(self._first_s, time_s)
+        young = time_s - self._first_s < DECIDED_AFTER_S
+        these.undecided = these.starts_uncertain and young
         most = these.count >= these.settings.hypotheses
         if most and since_fault % hypothesis_count.CHECKED_AFTER == 0:
             self._adapt_ceiling()
@@ -55,7 +60,11 @@ class AdaptiveCount:
         if index > hypothesis_count.NONLINEAR:
             self.unambiguous = 0
             self.grow()
-        elif index > hypothesis_count.LINEAR or not self._is_even(covariance, unperturbed):
+        elif (
+            these.undecided
+            or index > hypothesis_count.LINEAR
+            or not self._is_even(covariance, unperturbed)
+        ):
             self.unambiguous = 0
         else:
             self.unambiguous += 1

@@ -19,7 +19,8 @@ from relpos.fusion.bank import (
 )
 from relpos.fusion.bank.adaptive_count import AdaptiveCount
 from relpos.fusion.bank.detection_update import Attempts
-from relpos.fusion.bank.hypothesis_set import PERTURBED_UPDATES, HypothesisSet
+from relpos.fusion.bank.hypothesis_set import HypothesisSet
+from relpos.fusion.bank.mixture import PERTURBED_UPDATES
 from relpos.fusion.bank.motion_update import Noise
 from relpos.fusion.bank.range_update import RangeModel, Ranges
 from relpos.fusion.bank.relocalisation import OPEN_UPDATES, Relocalisation
@@ -231,7 +232,7 @@ class BankCore:
         i, k = every_pair(len(rows))
         return self.predicted_ranges(rows[i], rows[k], np.zeros(len(i)))
 
-    def end_instant(self) -> None:
+    def end_instant(self, time_s: float) -> None:
         """Resize, relocalise, resample where the weights are uneven, and perturb a few."""
         these, relocalisation = self.hypotheses, self.relocalisation
         known = self._sensors
@@ -241,7 +242,8 @@ class BankCore:
             self._alarm or relocalisation.ambiguous or relocalisation.lost
             or (known.surprise > usual).any()
         )  # fmt: skip
-        self.adaptive.resize(ambiguous=ambiguous, since_fault=relocalisation.since_fault)
+        since_fault = relocalisation.since_fault
+        self.adaptive.resize(time_s, ambiguous=ambiguous, since_fault=since_fault)
         _, effective = these.normalise()
         relocalisation.since_fault += 1
         if self._alarm is not None:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.bank.detection_update import Attempts
-from relpos.fusion.bank.hypothesis_set import PAIR_BIASES
+from relpos.fusion.bank.hypothesis_models import PAIR_BIASES
 from relpos.fusion.bank.mirrored import open_nodes
 from relpos.fusion.bank.reporting import Report
 from relpos.fusion.bank.storage import PER_NODE, StateIndex
@@ -305,7 +305,7 @@ class Bank:
                 walk.correct(moved - place, spread, left)
         for attempts in rounds:
             self.core.update_detection(attempts, self.detection)
-        self.core.end_instant()
+        self.core.end_instant(time_s)
 
     def _repeats(self, pairs: Sequence[tuple[int, int]]) -> Repeats:
         """Return what the ranges of ``pairs`` repeat; those that are less certain count less."""

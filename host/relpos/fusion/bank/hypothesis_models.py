@@ -14,6 +14,16 @@ from relpos.fusion.resampling import systematic
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
+PAIR_BIASES = 6
+"""Up to so many users each pair has a bias of its own in the state: 15 of them double its size.
+Of more, the common one is modelled."""
+
+SHADOW_SD_M, LATENESS_SD_S, CLOCK_SD_S = 0.05, 0.1, 0.07
+"""Prior standard deviations of what a body adds to a range, of how late ranges are dated, and of
+each clock's offset. Far larger ones are learned, too (``mission-late-1``: 0.99 m without, 0.16 so).
+0.3 of each learns them sooner (0.13 m), but takes the biases of pairs that are not calibrated for
+shadows: eight seeds of three walkers have 0.10 m with these, 0.20 with 0.3, 0.07 without any."""
+
 STOREY_M2 = 9.0
 """Prior deviation of the square of a pair's difference of height: that of one storey."""
 
@@ -40,6 +50,17 @@ Noise alone has less to explain in the first half minute, when its variance is u
 died out then was missing when it mattered: teams in an office (``bench/recorded_teams.py``, seeds
 0 to 7) had NEES 1.53, 3.4 % over three sigmas, 0.72 m; 1.29, 2.3 %, 0.68 m with this and biases
 that pass; ``paper-p1``, 52000 to 52007: 0.185 m both, 0.20 with ten times the least weight."""
+
+
+DECIDED_AFTER_S, UNDECIDED_WEIGHT = 60.0, 0.05
+"""So soon after the first ranges nothing is decided where starts are uncertain: there are no fewer
+hypotheses, and this is the least weight of each kind of range errors.
+
+Uncertain starts take what bodies and walls add to ranges: noise alone had 99 % of the weight after
+ten seconds, and the right kind 85 % after thirty. Six people who start at one place (0.5 m, 10
+degrees), three ranges a second and pair, body shadow 0.3 m, on 15 and on 30 m, seeds 540 to 545:
+NEES 2.2 and 2.1, 6 and 5 % over three sigmas without; 0.9 and 0.8, 0.4 and 0.2 % so; 0.7 and 0.6
+with four times the weight. 120 s are no better (docs/notebook/missions.md)."""
 
 
 class RangeErrors(IntEnum):
@@ -105,15 +126,20 @@ class Models:
         return Models(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
     def resample(
-        self, weight: Floats, kinds: list[RangeErrors], count: int, rng: np.random.Generator
+        self,
+        weight: Floats,
+        kinds: list[RangeErrors],
+        count: int,
+        rng: np.random.Generator,
+        least_weight: float = LEAST_WEIGHT,
     ) -> tuple[Indices, Indices, Floats]:
         """Draw ``count`` hypotheses by weight (K,), so many at least of each of ``kinds``.
 
-        Returns which, of what kind they are to be, and their log weights, (M,) each. A kind that
-        no hypothesis is of is drawn of all. Those that model the same come side by side: kernels
-        skip what a whole block lacks.
+        ``least_weight`` is the least that each kind counts for. Returns which, of what kind they
+        are to be, and their log weights, (M,) each. A kind that no hypothesis is of is drawn of
+        all. Those that model the same come side by side: kernels skip what a whole block lacks.
         """
-        share = np.maximum(self.share_of_kinds(weight)[kinds], LEAST_WEIGHT)
+        share = np.maximum(self.share_of_kinds(weight)[kinds], least_weight)
         share /= share.sum()
         wanted = LEAST_SHARE + (1.0 - LEAST_SHARE * len(kinds)) * share
         edges = np.round(count * np.cumsum(wanted)).astype(np.int64)

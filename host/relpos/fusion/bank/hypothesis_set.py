@@ -12,14 +12,20 @@ from relpos.errors import RelposError
 from relpos.fusion.bank import common_rotation, hypothesis_count, lanes, mixture, storage
 from relpos.fusion.bank import variance_components as components
 from relpos.fusion.bank.hypothesis_models import (
+    CLOCK_SD_S,
+    LATENESS_SD_S,
+    LEAST_WEIGHT,
+    PAIR_BIASES,
     RETURN_SHARE,
+    SHADOW_SD_M,
     STOREY_M2,
+    UNDECIDED_WEIGHT,
     USUAL_NOISE_SHARE,
     Models,
     RangeErrors,
 )
 from relpos.fusion.bank.lanes import LANES
-from relpos.fusion.bank.mixture import PERTURBED_LOSS
+from relpos.fusion.bank.mixture import PERTURBED_LOSS, PERTURBED_UPDATES
 from relpos.fusion.bank.storage import COMMON, PER_NODE, Hypotheses, StateIndex
 from relpos.fusion.bank.variance_components import Draws, VarianceComponents
 from relpos.fusion.estimator_settings import BankSettings
@@ -30,19 +36,6 @@ from relpos.fusion.resampling import systematic
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
-
-PAIR_BIASES = 6
-"""Up to so many users each pair has a bias of its own in the state: 15 of them double its size.
-Of more, the common one is modelled."""
-
-SHADOW_SD_M, LATENESS_SD_S, CLOCK_SD_S = 0.05, 0.1, 0.07
-"""Prior standard deviations of what a body adds to a range, of how late ranges are dated, and of
-each clock's offset. Far larger ones are learned, too (``mission-late-1``: 0.99 m without, 0.16 so).
-0.3 of each learns them sooner (0.13 m), but takes the biases of pairs that are not calibrated for
-shadows: eight seeds of three walkers have 0.10 m with these, 0.20 with 0.3, 0.07 without any."""
-
-PERTURBED_UPDATES = 5.0
-"""For so many instants of ranges a perturbed hypothesis teaches nothing about noise."""
 
 JITTER = 0.1
 """Standard deviation of the log components' jitter at resampling, in units of their spread."""
@@ -76,6 +69,10 @@ class HypothesisSet:
         self.components = VarianceComponents()
         self._normals: Floats = rng.standard_normal((count, 1))
         self.heights_known = False
+        self.starts_uncertain = False
+        """Whether an initial place is uncertain, given or found."""
+        self.undecided = False
+        """Whether the kinds of range errors cannot be told apart yet (``DECIDED_AFTER_S``)."""
         self.models = Models.draw(settings, count, rng)
         # Reported initial poses may all be wrong at once.
         many = int(settings.wrong_starts * count)
@@ -277,6 +274,7 @@ class HypothesisSet:
         x[:, at : at + 3] = pose
         for entry, sigma in ((0, sigma_m), (1, sigma_m), (2, sigma_rad)):
             p[:, at + entry, at + entry] = sigma**2
+        self.starts_uncertain |= sigma_m > 0.0
         wrong, s = self.wrong_start > 0.0, self.settings
         off = math.sqrt(0.5) * JUMP_M * self.rng.standard_normal((wrong.sum(), 2))
         x[wrong, at : at + 2] += off
@@ -509,7 +507,8 @@ class HypothesisSet:
             own = self.models.range_errors
             self.models.range_errors = np.minimum(own, RangeErrors.CONSTANT)
         kinds = self._kinds_of_range_errors()
-        chosen, kind, log_weight = self.models.resample(weight, kinds, count, self.rng)
+        least = UNDECIDED_WEIGHT if self.undecided else LEAST_WEIGHT
+        chosen, kind, log_weight = self.models.resample(weight, kinds, count, self.rng, least)
         self._select(chosen)
         self._turn_into(kind)
         # Children of one parent differ in their components, too.

@@ -16,6 +16,9 @@ from relpos.fusion.compiled import compiled
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
+PERTURBED_UPDATES = 5.0
+"""For so many instants of ranges a perturbed hypothesis teaches nothing about noise."""
+
 PERTURBED_LOSS = 20.0
 """Log likelihood that is subtracted from perturbed hypotheses where they do not count."""
 

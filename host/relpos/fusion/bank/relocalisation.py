@@ -15,8 +15,9 @@ import numpy.typing as npt
 
 from relpos.fusion.bank.adaptive_count import AdaptiveCount
 from relpos.fusion.bank.common_rotation import about_origin
-from relpos.fusion.bank.hypothesis_set import PERTURBED_UPDATES, HypothesisSet
+from relpos.fusion.bank.hypothesis_set import HypothesisSet
 from relpos.fusion.bank.mirrored import mirror_image
+from relpos.fusion.bank.mixture import PERTURBED_UPDATES
 from relpos.fusion.bank.storage import PER_NODE, POSE, StateIndex
 from relpos.fusion.estimator import ANY_ANGLE_RAD
 from relpos.fusion.models.odometry_faults import (
