@@ -43,8 +43,8 @@ class AdaptiveCount:
         if these.settings.hypotheses == 1 or not these.nodes:
             return
         self._first_s = min(self._first_s, time_s)
-        young = time_s - self._first_s < DECIDED_AFTER_S
-        these.undecided = these.starts_uncertain and young
+        age_s = time_s - self._first_s
+        these.undecided = these.starts_uncertain and age_s < DECIDED_AFTER_S
         most = these.count >= these.settings.hypotheses
         if most and since_fault % hypothesis_count.CHECKED_AFTER == 0:
             self._adapt_ceiling()

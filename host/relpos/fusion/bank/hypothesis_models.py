@@ -131,7 +131,7 @@ class Models:
         kinds: list[RangeErrors],
         count: int,
         rng: np.random.Generator,
-        least_weight: float = LEAST_WEIGHT,
+        least_weight: float,
     ) -> tuple[Indices, Indices, Floats]:
         """Draw ``count`` hypotheses by weight (K,), so many at least of each of ``kinds``.
 
