@@ -144,6 +144,8 @@ def nothing_computed(monkeypatch: pytest.MonkeyPatch) -> None:
         ("demo --view --view-listen 192.0.2.1:8460", "192.0.2.1:8460"),
         ("fuse walk --view --view-listen 127.0.0.1:70000", "127.0.0.1:70000"),
         ("fuse walk --foxglove 127.0.0.1:70000", "127.0.0.1:70000"),
+        ("fuse walk --record FILE/a.mcap", "FILE"),
+        ("fuse /dev/null --key-file nowhere", "nowhere"),
         ("simulate --recordings a b --seed 1 --out FILE", "FILE"),
         ("deadreckon walk --out FILE", "FILE"),
     ],
@@ -155,6 +157,11 @@ def test_what_cannot_be_written_or_served_is_refused_before_anything_is_computed
     Path("FOLDER").mkdir()
     (run / "imu.csv").write_text(IMU)
     assert names in refusal(*words.split())
+
+
+def test_a_session_is_recorded_into_a_folder_that_is_not_there_yet(run: Path) -> None:
+    assert relpos("fuse", run, *QUICK, "--record", "new/folder/walk.mcap").exit_code == 0
+    assert Path("new/folder/walk.mcap").stat().st_size
 
 
 def test_looking_whether_a_folder_can_be_written_leaves_none(run: Path) -> None:

@@ -159,6 +159,8 @@ class Options:
             from relpos import recording
 
             recording.check(self.record)
+        if self.record is not None:
+            output.check_file(self.record)
 
 
 def open_port(port: str, key_file: Path | None, *, teach: bool, reopen: bool) -> Input:

@@ -149,6 +149,7 @@ class Output:
         try:
             if second.exists():
                 raise FileExistsError(errno.EEXIST, "", str(second))
+            path.parent.mkdir(parents=True, exist_ok=True)
             self._begin(1)
         except FileExistsError as error:
             raise DataError(

@@ -38,8 +38,8 @@ def compass_findings(
         yield Finding(
             COMPASS,
             False,
-            "answers, but its measurements are not ready in time or never change",
-            "10 ms a measurement is usual: the sensor is defective",
+            "answers, but its measurements are not ready in time, never change or exceed its range",
+            "hold the node away from magnets; if that does not help, the sensor is defective",
         )
         return
     share = recording.field_readings() / len(recording.samples)
