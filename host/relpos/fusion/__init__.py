@@ -41,8 +41,8 @@ from relpos.fusion.estimator_settings import (
 from relpos.fusion.linear_algebra import one_thread
 from relpos.fusion.models.ranging import Mounting
 from relpos.fusion.post import referring
-from relpos.fusion.settings import SettingInfo, describe, parse
 from relpos.measurements import Heading, Height, Motion, Prior, Range
+from relpos.settings import SettingInfo, describe, parse
 
 ROOMS: Mapping[str, tuple[str, ...]] = {
     "bank": ("bank", "initialisation", "large_teams", "smoother"),

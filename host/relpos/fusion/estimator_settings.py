@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from relpos.fusion.settings import setting
+from relpos.settings import setting
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import RelposError
-from relpos.fusion.settings import parse, setting
 from relpos.measurements import Event, Height, Measurement, Motion
+from relpos.settings import parse, setting
 from relpos.simulation import pressure
 from relpos.simulation.climbers import Climb, Climber, ClimberSettings, make_plan
 from relpos.simulation.paper import SimulatedRun

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.settings import setting
+from relpos.settings import setting
 from relpos.simulation.pressure import AirSettings, Surroundings
 from relpos.simulation.sensing import DISTURBED, RATE_HZ, unicycle
 from relpos.simulation.storeys import SIZE_M, Building, Leg, Place, Stairwell, along

@@ -52,8 +52,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.settings import parse, setting
 from relpos.measurements import Event, Measurement, Prior, Range
+from relpos.settings import parse, setting
 from relpos.simulation.paper import (
     DISTANCE_NOISE,
     HEADING_PATTERN,

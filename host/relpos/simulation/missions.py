@@ -19,13 +19,13 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import RelposError
-from relpos.fusion.settings import parse, setting
 from relpos.measurements import (
     Heading,
     Height,
     Measurement,
     common_priors,
 )
+from relpos.settings import parse, setting
 from relpos.simulation.paper import SimulatedRun
 from relpos.simulation.sensing import (
     RATE_HZ,

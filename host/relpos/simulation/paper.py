@@ -31,8 +31,8 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import RelposError
-from relpos.fusion.settings import parse, setting
 from relpos.measurements import Event, Measurement, Motion, Prior, Range, Truth
+from relpos.settings import parse, setting
 
 Floats = npt.NDArray[np.float64]
 

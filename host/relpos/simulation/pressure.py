@@ -14,7 +14,7 @@ from itertools import accumulate
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.settings import setting
+from relpos.settings import setting
 from relpos.simulation.sensing import RATE_HZ, SensingSettings
 from relpos.simulation.storeys import STAIRWELLS, TAG_M, Place
 

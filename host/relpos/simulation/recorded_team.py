@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from relpos.errors import DataError
-from relpos.fusion.settings import parse, setting
 from relpos.measurements import Measurement, Motion, Prior, Range, Truth
 from relpos.runs import Description, Run
+from relpos.settings import parse, setting
 from relpos.simulation import range_errors
 
 Floats = npt.NDArray[np.float64]

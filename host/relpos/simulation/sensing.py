@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.settings import setting
 from relpos.measurements import Motion, Prior, Range, Truth
+from relpos.settings import setting
 from relpos.simulation.paper import true_rows
 from relpos.simulation.storeys import SLAB_EXCESS_M
 

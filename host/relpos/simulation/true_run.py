@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from relpos.fusion.settings import parse
 from relpos.measurements import Range
+from relpos.settings import parse
 from relpos.simulation.lab import LabSettings, simulate_lab
 from relpos.simulation.paper import (
     PaperSettings,

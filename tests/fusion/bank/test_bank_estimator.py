@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from relpos import fusion, tracks
+from relpos import fusion, settings, tracks
 from relpos.errors import RelposError
 from relpos.evaluation import metrics
-from relpos.fusion import settings
 from relpos.fusion.bank.core import BankCore
 from relpos.fusion.estimator import Estimate
 from relpos.fusion.estimator_settings import BankSettings
