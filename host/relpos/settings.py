@@ -1,4 +1,4 @@
-"""Typed settings of estimators and scenarios: documented defaults, bounds, and clear errors for ``--set``."""
+"""Typed settings of estimators and scenarios: documented defaults, bounds, clear errors."""
 
 from __future__ import annotations
 
