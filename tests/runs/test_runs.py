@@ -456,6 +456,16 @@ def test_a_saved_run_reads_back_the_same(tmp_path: Path) -> None:
     )
 
 
+def test_the_airs_pressure_is_saved(tmp_path: Path) -> None:
+    header = IMU_HEADER.rstrip("\n") + ",pressure_pa\n"
+    rows = "0,1,1,2,3,4,5,6,,,,101325.25\n0.01,1,1,2,3,4,5,6,,,,\n0,2,1,2,3,4,5,6,,,,\n"
+    before = load_run(write(tmp_path, imu_csv=header + rows))
+    save_run(before, tmp_path / "b")
+    after = load_run(tmp_path / "b").load_imu()
+    np.testing.assert_array_equal(after[1].pressure_pa, [101325.25, np.nan])
+    assert after[2].pressure_pa is None
+
+
 def an_estimate() -> Estimate:
     node = NodeEstimate(
         1, 1.0, 2.0, 0.5, 0.09, 0.04, 0.02, 0.1, NodeStatus.AMBIGUOUS, z_m=0.3, sigma_z_m=0.2

@@ -32,6 +32,7 @@ _COLUMNS = (
     *(Column(f"{axis}_ut", number, optional=True) for axis in ("mx", "my", "mz")),
     Column("pressure_pa", bounded("pressure_pa"), optional=True),
 )
+IMU_COLUMNS = tuple(column.name for column in _COLUMNS)
 
 
 @dataclass(frozen=True)

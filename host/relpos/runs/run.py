@@ -37,7 +37,7 @@ from relpos.runs.description import (
     read_description,
     write_description,
 )
-from relpos.runs.imu import ImuRecording, read_imu
+from relpos.runs.imu import IMU_COLUMNS, ImuRecording, read_imu
 from relpos.runs.landmarks import Landmark, read_landmarks, truth_from_presses
 from relpos.runs.table import (
     Column,
@@ -276,17 +276,21 @@ def write_imu(directory: Path, recordings: Mapping[int, ImuRecording]) -> None:
                 recording.acceleration_m_s2,
                 recording.angular_rate_rad_s,
                 recording.magnetic_field_ut,
+                np.full(recording.time_s.shape, np.nan)
+                if recording.pressure_pa is None
+                else recording.pressure_pa,
             )
         )
         for node, recording in recordings.items()
     ]
     table = np.concatenate(blocks)
     table = table[np.argsort(table[:, 0], kind="stable")]
-    header = "time_s,node,ax_m_s2,ay_m_s2,az_m_s2,gx_rad_s,gy_rad_s,gz_rad_s,mx_ut,my_ut,mz_ut"
+    # Rows of empty cells take many times as long to read.
+    width = len(IMU_COLUMNS) - bool(np.isnan(table[:, -1]).all())
     write_rows(
         directory / "imu.csv",
-        header.split(","),
-        ([row[0], int(row[1]), *row[2:]] for row in table.tolist()),
+        IMU_COLUMNS[:width],
+        ([row[0], int(row[1]), *row[2:width]] for row in table.tolist()),
     )
 
 
