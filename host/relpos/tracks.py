@@ -57,7 +57,7 @@ class Track:
 class PairTrack:
     """The estimated distance of one pair and its standard deviation over time, (n,) arrays.
 
-    ``ok`` is 1 where the status of both nodes is ok, else 0; 1 throughout where not given.
+    ``ok`` is 1 where the pair's status is ok, else 0; 1 throughout where not given.
     """
 
     time_s: Floats

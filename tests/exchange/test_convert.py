@@ -282,6 +282,16 @@ def test_a_run_and_its_estimate_come_back_from_a_recording(tmp_path: Path) -> No
     assert track["properties"]["coordTimes"][0] == "2026-05-04T09:30:01.000Z"
 
 
+def test_the_status_of_a_pair_comes_back_from_a_recording(tmp_path: Path) -> None:
+    yard, fused = written(tmp_path)
+    table = fused / "pairs.csv"
+    table.write_text(table.read_text().replace(",ok\n", ",stale\n"))
+    convert(fused, "--run", yard, "--to", "mcap", "--out", tmp_path / "walk.mcap")
+    convert(tmp_path / "walk.mcap", "--to", "run", "--out", tmp_path / "back")
+    statuses = {s for e in read_estimates(tmp_path / "back") for s in e.pair_statuses()}
+    assert statuses == {NodeStatus.STALE, NodeStatus.AMBIGUOUS}
+
+
 def test_a_recording_without_a_start_says_when_its_clock_begins(tmp_path: Path) -> None:
     yard, _ = written(tmp_path)
     result = convert(yard, "--to", "mcap", "--out", tmp_path / "walk.mcap")

@@ -38,6 +38,7 @@ from relpos.runs import (
     write_estimates,
 )
 from relpos.runs.run import assemble
+from relpos.tracks import estimated_pairs
 
 MOTION = "time_s,node,dx_m,dy_m,dtheta_rad\n1,1,0.5,0,0\n1,2,0.4,0.1,-0.2\n"
 RANGES = "time_s,node,peer,range_m\n0.5,1,2,3.25\n"
@@ -479,7 +480,7 @@ def test_estimates_read_back_as_they_were_written(tmp_path: Path) -> None:
     write_estimates(tmp_path, [estimate])
     (back,) = read_estimates(tmp_path)
     assert back.time_s == 1.5
-    assert back.pairs == estimate.pairs
+    assert back.pairs == (replace(estimate.pairs[0], status=NodeStatus.AMBIGUOUS),)
     for was, now in zip(estimate.nodes, back.nodes, strict=True):
         assert now.status is was.status
         for name in (
@@ -544,6 +545,21 @@ def test_a_foreign_estimate_needs_positions_alone(tmp_path: Path) -> None:
     assert estimate.nodes[0].x_m == 1.0
     assert math.isnan(estimate.nodes[1].x_m)
     assert math.isnan(estimate.nodes[0].heading_rad)
+
+
+def test_the_status_of_a_pair_is_that_of_the_file(tmp_path: Path) -> None:
+    nodes = "time_s,node,x_m,y_m\n" + "".join(f"{t},{n},{n},0\n" for t in (0, 1) for n in (1, 2, 3))
+    pairs = "time_s,node,peer,distance_m,sigma_distance_m,status\n" + "".join(
+        f"{t},{node},{peer},{peer - node},0.1,{status}\n"
+        for t in (0, 1)
+        for node, peer, status in ((1, 2, "ambiguous"), (1, 3, ""), (2, 3, "lost"))
+    )
+    write(tmp_path, estimate_csv=nodes, pairs_csv=pairs)
+    estimates = read_estimates(tmp_path)
+    assert estimates[0].pair_statuses() == ["ambiguous", "ok", "lost"]
+    assert estimated_pairs(estimates)[1, 2].ok.tolist() == [0.0, 0.0]
+    write_estimates(tmp_path, estimates)
+    assert read_estimates(tmp_path)[1].pair_statuses() == ["ambiguous", "ok", "lost"]
 
 
 def data_directory() -> Path:

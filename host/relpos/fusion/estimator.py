@@ -122,7 +122,10 @@ class NodeEstimate:
 
 @dataclass(frozen=True, slots=True)
 class PairEstimate:
-    """``peer`` as seen from ``node``; the bearing is in the common frame, from world x."""
+    """``peer`` as seen from ``node``; the bearing is in the common frame, from world x.
+
+    ``status`` is that of a file; None where :meth:`Estimate.pair_statuses` derives it.
+    """
 
     node: int
     peer: int
@@ -130,6 +133,7 @@ class PairEstimate:
     sigma_distance_m: float
     bearing_rad: float
     sigma_bearing_rad: float
+    status: NodeStatus | None = None
 
 
 class Shape(StrEnum):
@@ -211,15 +215,19 @@ class Estimate:
     def pair_statuses(self) -> list[NodeStatus]:
         """Return the status of every pair, in their order.
 
-        It is the worse of its two nodes', and ``ambiguous`` at best where the distance between
-        their reported places is uncertain by more than ``VAGUE_PAIR_M``: both may be well known
-        relative to others. The mean of places on an arc lies inside it, so that places may be
-        nearer to each other than the pair's own distance says; that is a part of their error.
+        Where a pair has none of its own, it is the worse of its two nodes', and ``ambiguous`` at
+        best where the distance between their reported places is uncertain by more than
+        ``VAGUE_PAIR_M``: both may be well known relative to others. The mean of places on an arc
+        lies inside it, so that places may be nearer to each other than the pair's own distance
+        says; that is a part of their error.
         """
         of = {node.node: node for node in self.nodes}
         order = list(NodeStatus)
         statuses = []
         for p in self.pairs:
+            if p.status is not None:
+                statuses.append(p.status)
+                continue
             one, other = of.get(p.node), of.get(p.peer)
             if one is None or other is None:
                 statuses.append(NodeStatus.UNLOCATED)

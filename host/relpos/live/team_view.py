@@ -221,7 +221,7 @@ class TeamView:
 
 @lru_cache(maxsize=4096)
 def _pair_json(pair: PairEstimate) -> str:
-    return _ENCODE([_plain(getattr(pair, name)) for name in pair.__slots__])
+    return _ENCODE([_plain(getattr(pair, name)) for name in pair.__slots__ if name != "status"])
 
 
 @dataclass(frozen=True)

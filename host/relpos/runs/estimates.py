@@ -210,7 +210,7 @@ def read_estimates(directory: Path | str) -> list[Estimate]:
     """Read what :func:`write_estimates` wrote, but for the steps, back, ordered by time.
 
     An estimate of another program may hold times, nodes and positions alone: a missing figure
-    becomes NaN, a missing status ``ok``. DataError where there is no ``estimate.csv``.
+    becomes NaN, a missing status of a node ``ok``. DataError where there is no ``estimate.csv``.
     """
     directory = Path(directory)
     if find_table(directory, "estimate.csv") is None:
@@ -255,8 +255,8 @@ def _by_time(
 
 
 def _pair_estimate(row: dict[str, Any]) -> PairEstimate:
-    node, peer = row["node"], row["peer"]
-    return PairEstimate(node, peer, *(_nan_if_none(row[name]) for name in PAIR_COLUMNS[3:-1]))
+    figures: dict[str, Any] = {name: _nan_if_none(row[name]) for name in PAIR_COLUMNS[3:-1]}
+    return PairEstimate(row["node"], row["peer"], **figures, status=row["status"])
 
 
 def _node_estimate(row: dict[str, Any]) -> NodeEstimate:
