@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from relpos.fusion.estimator import NodeStatus
-from relpos.runs import load_run, read_estimates
-from support.small_team import convert, refused, written
+from relpos.measurements import Range
+from relpos.runs import load_run, read_estimates, save_run
+from support.small_team import convert, refused, run, written
 
 START = "2026-05-04T09:30:00Z"
 START_UNIX_S = 1777887000.0
@@ -106,6 +108,26 @@ def test_the_mcap_support_of_ros_reads_ranges_odometry_and_transforms(
         place = message.pose.pose.position
         assert complex(place.x, place.y) == pytest.approx(at[node])
         assert message.child_frame_id == f"node_{node}"
+
+
+def test_a_failed_range_is_infinite_in_a_bag_as_rep_117_has_it(tmp_path: Path) -> None:
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    failed = Range(2.5, 2, 3, 0.0)
+    yard = run()
+    save_run(replace(yard, measurements=(*yard.measurements, failed)), tmp_path / "yard")
+    convert(tmp_path / "yard", "--to", "rosbag2", "--out", tmp_path / "bag")
+    with AnyReader(
+        [tmp_path / "bag"], default_typestore=get_typestore(Stores.ROS2_HUMBLE)
+    ) as reader:
+        told = {
+            c.topic: reader.deserialize(data, c.msgtype).range
+            for c, _, data in reader.messages()
+            if "/range_to_" in c.topic
+        }
+    assert told["/relpos/node_2/range_to_3"] == math.inf
+    assert math.isfinite(told["/relpos/node_1/range_to_2"])
 
 
 @pytest.mark.soak  # it needs 600 MB, which `make soak` installs

@@ -141,13 +141,15 @@ class _Messages:
             yield m.time_s, f"/relpos/node_{m.node}/odometry", kind, message
 
     def ranges(self) -> _Rows:
-        """Measured distances; the message has no kind for radio, so it says 0 (ultrasound)."""
+        """Measured distances; the message has no kind for radio, so it says 0 (ultrasound).
+
+        A failed one is +Inf (REP 117): no detection within reach; 0 would be a distance.
+        """
         kind = "sensor_msgs/msg/Range"
         for r in self._content.run.ranges:
             header = self._header(r.time_s, f"node_{r.node}")
-            message = self._make(
-                kind, header, 0, float(2.0 * math.pi), 0.0, MOST_RANGE_M, float(r.range_m)
-            )
+            range_m = float(r.range_m) if r.range_m > 0.0 else math.inf
+            message = self._make(kind, header, 0, 2.0 * math.pi, 0.0, MOST_RANGE_M, range_m)
             yield r.time_s, f"/relpos/node_{r.node}/range_to_{r.peer}", kind, message
 
     def truth(self) -> _Rows:
