@@ -251,6 +251,24 @@ def test_a_run_comes_back_as_it_went(tmp_path: Path) -> None:
     assert repr(read_estimates(tmp_path / "again")) == repr(read_estimates(fused))
 
 
+@pytest.mark.parametrize(
+    ("name", "table"),
+    [
+        (
+            "imu.csv",
+            "time_s,node,ax_m_s2,ay_m_s2,az_m_s2,gx_rad_s,gy_rad_s,gz_rad_s\n0,1,1,2,3,4,5,6\n",
+        ),
+        ("landmarks.csv", "id,x_m,y_m\nA,1,2\n"),
+    ],
+)
+def test_a_run_of_one_table_alone_is_a_run(tmp_path: Path, name: str, table: str) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / name).write_text(table)
+    convert(tmp_path / "run", "--to", "run", "--out", tmp_path / "again")
+    again = load_run(tmp_path / "again")
+    assert again.load_imu() or again.landmarks
+
+
 def test_the_files_of_a_live_session_are_converted_with_its_recording(tmp_path: Path) -> None:
     write_estimates(tmp_path / "live", estimates())
     save_run(run(truth=False), tmp_path / "live" / "received")

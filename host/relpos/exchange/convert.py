@@ -70,9 +70,8 @@ def _format_of(source: Path) -> Format:
     if not source.exists():
         raise DataError(f"{source}: no such file or directory")
     if source.is_dir():
-        if any(find_table(source, name) for name in ("estimate.csv", *TABLE_NAMES)) or (
-            (source / "run.toml").exists()
-        ):
+        tables = ("estimate.csv", "imu.csv", "landmarks.csv", *TABLE_NAMES)
+        if (source / "run.toml").exists() or any(find_table(source, name) for name in tables):
             return Format.RUN
         if any(source.glob("*.tum")):
             return Format.TUM
