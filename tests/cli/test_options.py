@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -87,6 +88,26 @@ def test_options_that_switch_off_what_is_not_there_and_keys_of_the_environment_a
     monkeypatch.setenv("RELPOS_KEY_FILE", "/nope")
     done = relpos("fuse", run, *QUICK, "--no-open", "--no-teach", "--out", "out")
     assert done.exit_code == 0, done.output
+
+
+def fused_remarks(run: Path) -> list[str]:
+    """What is told beside the result, which JSON holds too."""
+    told = relpos("fuse", run, *QUICK).stderr.splitlines()
+    remarks = json.loads(relpos("fuse", run, *QUICK, "--json").stdout)["remarks"]
+    assert set(remarks) <= set(told)
+    return remarks
+
+
+def test_nodes_that_range_and_report_no_motion_are_named(run: Path) -> None:
+    assert fused_remarks(run) == []
+    with (run / "ranges.csv").open("a") as table:
+        table.write("3,1,4,2.5\n4,3,1,2.5\n4,1,7,2\n4,1,8,0\n")
+    (run / "run.toml").write_text('initial_pose = "common"\n[nodes.7]\npost = true\n')
+    (line,) = fused_remarks(run)
+    assert line == (
+        "nodes 3, 4: no motion (motion.csv), so taken to stand still, as anchors do; whoever moves "
+        "needs rows"
+    )
 
 
 def test_a_run_that_is_shown_takes_seconds_and_speed(run: Path) -> None:

@@ -241,6 +241,8 @@ def replay_run(
 
     run = job.described(api.load(job.source))
     run.check_usable(needs_ranges=job.estimator != DEADRECKONING)
+    for words in run.remarks:
+        output.remark(words)
     priors = api.priors_of(run, initial)
     job.prepare(priors)
     return fuse_live(
@@ -392,7 +394,8 @@ def fuse_recording(
             content = reports.gather(run, result, evaluation=evaluation, baseline=baseline)
             reports.write(content, job.out / "index.html")
     counters = {**run.counters, **result.counters}
-    outcome = FusionSummary(run.name, counters, result.estimates, len(result.estimates))
+    estimates = result.estimates
+    outcome = FusionSummary(run.name, counters, estimates, len(estimates), run.remarks)
     _print_outcome(job, outcome, evaluation, baseline, as_json=as_json)
 
 
@@ -520,6 +523,7 @@ class FusionSummary:
     counters: Mapping[str, Any]
     estimates: Sequence[Estimate]
     count: int
+    remarks: Sequence[str] = ()
 
 
 def _print_outcome(
@@ -544,6 +548,7 @@ def _print_outcome(
                 "out": str(job.out),
                 "estimates": outcome.count,
                 "counters": outcome.counters,
+                "remarks": outcome.remarks,
                 **(summary.as_json(evaluation.metrics) if evaluation else summary.no_metrics()),
                 "iso_18305": summary.iso_as_json(evaluation.iso) if evaluation else None,
                 "dead_reckoning": summary.figures(reckoned) if reckoned else None,
@@ -566,6 +571,8 @@ def _print_outcome(
             output.print_bound(evaluation.bound)
     for text in time_offsets(outcome.estimates[-1]) if outcome.estimates else ():
         output.remark(f"{text}; this is taken into account")
+    for words in outcome.remarks:
+        output.remark(words)
     noted = {key: value for key, value in outcome.counters.items() if value}
     if noted:
         output.remark("counted: " + ", ".join(f"{k} {v:g}" for k, v in sorted(noted.items())))

@@ -140,6 +140,20 @@ class Run:
         priors = _priors_from_truth(self)
         return tuple(priors[node] for node in sorted(priors))
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What is worth a look before the run is fused, a line each."""
+        ranging = {n for r in self.ranges if r.range_m > 0.0 for n in (r.node, r.peer)}
+        moving = {motion.node for motion in self.motions}
+        posts = {node for node, info in self.nodes.items() if info.post}
+        if not (still := sorted(ranging - moving - posts)):
+            return ()
+        who = f"node{'s' * (len(still) > 1)} {', '.join(map(str, still))}"
+        return (
+            f"{who}: no motion (motion.csv), so taken to stand still, as anchors do; whoever moves "
+            "needs rows",
+        )
+
     def check_usable(self, *, needs_ranges: bool = True) -> None:
         """Raise DataError where nothing can be concluded: without motion, or without ranges."""
         where, ranges = self.directory or self.name, self.ranges
