@@ -110,6 +110,17 @@ def test_nodes_that_range_and_report_no_motion_are_named(run: Path) -> None:
     )
 
 
+def test_what_run_toml_says_in_vain_is_told(run: Path) -> None:
+    (run / "run.toml").write_text(
+        'inital_pose = "common"\n[nodes.1]\nstatur_m = 1.8\n[building]\nfloors_m = [0.0]\n'
+        + "".join(f"[initial.{n}]\nx_m = 0\ny_m = 0\nheading_rad = 0\n" for n in (1, 2, 99))
+    )
+    assert fused_remarks(run) == [
+        "run.toml: nothing reads inital_pose, nodes.1.statur_m: misspelt?",
+        "run.toml: no such node: [initial.99]",
+    ]
+
+
 def test_a_run_that_is_shown_takes_seconds_and_speed(run: Path) -> None:
     words = ("--estimator", "deadreckoning", "--view", "--view-listen", "127.0.0.1:0", "--no-open")
     done = relpos("fuse", run, *words, "--speed", 0, "--seconds", 0.1, "--out", "out")

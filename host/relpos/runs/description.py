@@ -6,7 +6,7 @@ import json
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -68,6 +68,8 @@ class Description:
     """The ``[simulated]`` table: the bound of such a run can be computed."""
     floors_m: tuple[float, ...] = ()
     """Heights of the floors over the start's, from the lowest on. For evaluation alone."""
+    unread: tuple[str, ...] = field(default=(), compare=False)
+    """Keys of the file that have no meaning: another program's, or misspelt."""
 
     @property
     def names(self) -> dict[int, str]:
@@ -152,6 +154,7 @@ def parse_description(path: Path | str, text: str) -> Description:
         mount=reader.text(document, "mount"),
         simulated=reader.simulated(document),
         floors_m=reader.floors(document),
+        unread=reader.unread(document),
         **{key: reader.number(document, key) for key in _PLAIN_NUMBERS},
     )
 
@@ -294,6 +297,16 @@ class _Reader:
             words = "does not go from the lowest floor over the start's, 0.0, to the highest"
             raise self._fail("building.", "floors_m", value, words)
         return floors_m
+
+    def unread(self, document: Mapping[str, Any]) -> tuple[str, ...]:
+        """Return the keys that nothing is read from."""
+        known = {"initial", "building", *(one.name for one in fields(Description))}
+        found = [key for key in document if key not in known - {"priors", "floors_m", "unread"}]
+        for group, kind in (("nodes", NodeInfo), ("initial", Prior)):
+            known = {one.name for one in fields(kind)} - {"node"}
+            for _, table, where in self.tables(document, group):
+                found += [where + key for key in table if key not in known]
+        return tuple(key if key.isprintable() else repr(key) for key in found)
 
     def tables(
         self, document: Mapping[str, Any], key: str

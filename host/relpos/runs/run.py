@@ -146,13 +146,21 @@ class Run:
         ranging = {n for r in self.ranges if r.range_m > 0.0 for n in (r.node, r.peer)}
         moving = {motion.node for motion in self.motions}
         posts = {node for node, info in self.nodes.items() if info.post}
-        if not (still := sorted(ranging - moving - posts)):
-            return ()
-        who = f"node{'s' * (len(still) > 1)} {', '.join(map(str, still))}"
-        return (
-            f"{who}: no motion (motion.csv), so taken to stand still, as anchors do; whoever moves "
-            "needs rows",
-        )
+        words = []
+        if still := sorted(ranging - moving - posts):
+            who = f"node{'s' * (len(still) > 1)} {', '.join(map(str, still))}"
+            words.append(
+                f"{who}: no motion (motion.csv), so taken to stand still, as anchors do; whoever "
+                "moves needs rows"
+            )
+        if unread := self.description.unread:
+            more = ", ..." * (len(unread) > 5)
+            words.append(f"run.toml: nothing reads {', '.join(unread[:5])}{more}: misspelt?")
+        strangers = {prior.node for prior in self.description.priors} - set(self.node_ids)
+        if strangers and self.measurements:
+            tables = ", ".join(f"[initial.{node}]" for node in sorted(strangers))
+            words.append(f"run.toml: no such node: {tables}")
+        return tuple(words)
 
     def check_usable(self, *, needs_ranges: bool = True) -> None:
         """Raise DataError where nothing can be concluded: without motion, or without ranges."""
