@@ -208,6 +208,15 @@ def test_a_truth_without_headings_says_so(tmp_path: Path) -> None:
     assert result.files == [tmp_path / "t" / "truth_1.tum"]
 
 
+def test_a_truth_without_heights_says_so(tmp_path: Path) -> None:
+    yard, fused = written(tmp_path)
+    flat = [replace(row, z_m=None if row.node == 2 else row.z_m) for row in run().truth]
+    save_run(replace(run(), truth=tuple(flat)), yard)
+    result = convert(fused, "--run", yard, "--to", "tum", "--out", tmp_path / "t")
+    (line,) = result.remarks
+    assert "truth has poses without a height, written as height 0 (node 2)" in line
+
+
 # -- tables ----------------------------------------------------------------------------------------
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from math import isnan
 from pathlib import Path
 from types import ModuleType
 
@@ -326,17 +326,20 @@ def _write_tum(content: Content, out: Path) -> _Written:
     files: list[Path] = []
     remarks: list[str] = []
     for kind in Kind:
-        headless: list[int] = []
-        for node, points in points_of(content, kind).items():
+        tracks = points_of(content, kind)
+        for node, points in tracks.items():
             files.append(out / file_name(kind, node))
             write_tum(files[-1], points)
-            if any(math.isnan(p.heading_rad) for p in points):
-                headless.append(node)
-        if headless:
-            remarks.append(
-                f"the {kind} has poses without a heading, written as heading 0 (node "
-                f"{', '.join(map(str, headless))}): compare positions, not angles"
-            )
+        for what, field, advice in (
+            ("heading", "heading_rad", "compare positions, not angles"),
+            ("height", "z_m", "compare x and y alone"),
+        ):
+            lacking = [n for n, ps in tracks.items() if any(isnan(getattr(p, field)) for p in ps)]
+            if lacking:
+                remarks.append(
+                    f"the {kind} has poses without a {what}, written as {what} 0 (node "
+                    f"{', '.join(map(str, lacking))}): {advice}"
+                )
     if not files:
         raise DataError(f"{content.run.name}: neither estimates nor truth: fuse it first")
     guesses = sum(n.status not in PLACED for e in content.estimates for n in e.nodes)

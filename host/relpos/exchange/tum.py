@@ -2,6 +2,7 @@
 
 Times are the run's own seconds and the frame is the run's. A heading is the turn about z; where
 none is known the quaternion is the unit one, which the format cannot distinguish from heading 0.
+An unknown height is 0 likewise.
 """
 
 from __future__ import annotations
