@@ -124,9 +124,17 @@ class Truth:
     z_m: float | None = None
 
 
+WIDEST_START_M, WIDEST_START_RAD = 15.0, 1.8
+"""A start that is less well known is searched for, as an unknown one is.
+
+Four people on 30 m x 30 m, all off by their sigma, distance RMSE: 0.6 m from 10 m, 4 to 5 m from
+20 m, 0.2 to 1.7 m where all is searched for. Headings cost 0.2 m at most up to 1.4 rad, 2.5 m at pi.
+"""
+
+
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """Known pose of ``node`` at the start; a sigma of 0 means exactly known."""
+    """Pose of ``node`` at the start; a sigma of 0 means exactly known, an infinite one unknown."""
 
     node: int
     x_m: float
@@ -137,8 +145,8 @@ class Prior:
 
     @property
     def is_known(self) -> bool:
-        """Whether place and heading have finite standard deviations."""
-        return math.isfinite(self.sigma_m) and math.isfinite(self.sigma_rad)
+        """Whether a filter can begin from it."""
+        return self.sigma_m < WIDEST_START_M and self.sigma_rad < WIDEST_START_RAD
 
 
 COMMON_M, COMMON_RAD = 0.5, math.radians(10.0)

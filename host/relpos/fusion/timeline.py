@@ -99,6 +99,9 @@ class Epoch:
 
 Step = Advance | Ranging | Sensed | Epoch
 
+LATEST_BEGIN_S = 60.0
+"""Times that begin later count from somewhere else than the start, as the time of day does."""
+
 
 @dataclass(frozen=True, slots=True)
 class Displacement:
@@ -263,6 +266,11 @@ class Timeline:
 
     def _add(self, measurement: Measurement) -> None:
         tracks, time_s = self._tracks, measurement.time_s
+        if self._pushed == 0 and time_s > self.start_s + LATEST_BEGIN_S:
+            # Another clock's zero: what was before the first measurement is no chord of anybody.
+            self.start_s = time_s
+            for node in tracks:
+                tracks[node] = _Track(time_s, time_s)
         if measurement.node not in tracks:
             self._track(measurement.node)
         if isinstance(measurement, Range) and measurement.peer not in tracks:

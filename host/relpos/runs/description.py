@@ -258,6 +258,8 @@ class _Reader:
         return value
 
     def sigma(self, table: Mapping[str, Any], key: str, where: str) -> float:
+        if table.get(key) == math.inf:  # unknown
+            return math.inf
         return self.number(table, key, where) or 0.0
 
     def offset(self, table: Mapping[str, Any], key: str, where: str) -> tuple[float, float] | None:

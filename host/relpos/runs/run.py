@@ -53,9 +53,6 @@ from relpos.runs.table import (
     remove_table,
 )
 
-UNKNOWN_HEADING_SIGMA_RAD = math.pi
-"""For a first truth pose without a heading: wider than any heading error."""
-
 PRIOR_FROM_TRUTH_WITHIN_S = 2.0
 """A first truth pose later than this after a node's start says nothing of its start. The same
 2 s as the metrics allow between two rows that are interpolated."""
@@ -446,13 +443,12 @@ def _priors_from_truth(run: Run) -> dict[int, Prior]:
         late_s = row.time_s - starts.get(row.node, row.time_s)
         if late_s > PRIOR_FROM_TRUTH_WITHIN_S:
             continue
-        known = row.heading_rad is not None
         priors[row.node] = Prior(
             row.node,
             row.x_m,
             row.y_m,
             row.heading_rad if row.heading_rad is not None else 0.0,
             sigma_m=0.0,
-            sigma_rad=0.0 if known else UNKNOWN_HEADING_SIGMA_RAD,
+            sigma_rad=0.0 if row.heading_rad is not None else math.inf,
         )
     return priors

@@ -529,7 +529,7 @@ class Bank:
         rows = np.array([self._row[node] for node in sorted(self._row)], dtype=np.int64)
         distances = self.core.distances(rows)
         unsure = self.handedness.unsure(
-            *open_nodes(self._row, self.core.hypotheses, covariance, distances[1])
+            *open_nodes(self._row, self.core.hypotheses, covariance, distances[1], self._standing)
         )
         heading_rad = {
             node: float(mean[PER_NODE * row + StateIndex.HEADING])

@@ -9,7 +9,7 @@ if their headings are not known well enough.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -109,12 +109,17 @@ def mirror_image(x: Floats, p: Floats, nodes: int) -> tuple[Floats, Floats]:
 
 
 def open_nodes(
-    row: Mapping[int, int], these: HypothesisSet, covariance: Floats, sigma_m: Floats
+    row: Mapping[int, int],
+    these: HypothesisSet,
+    covariance: Floats,
+    sigma_m: Floats,
+    standing: Container[int] = (),
 ) -> tuple[set[int], dict[int, set[int]]]:
     """Return who is open, and of each located node those whose distance to it is known.
 
     ``covariance`` (D, D) is without the team's rotation, ``sigma_m`` (P,) the deviations of the
-    distances of every two nodes, in order.
+    distances of every two nodes, in order. The heading of who is ``standing`` since it was found
+    says nothing of its side, as an anchor has none.
     """
     nodes = sorted(row)
     if len(nodes) < 2:
@@ -123,7 +128,7 @@ def open_nodes(
     i, k = storage.every_pair(len(rows))
     near = np.zeros((len(rows), len(rows)), dtype=np.bool_)
     near[i, k] = near[k, i] = sigma_m < VAGUE_PAIR_M
-    is_open = unknown_headings(covariance, rows)
+    is_open = unknown_headings(covariance, rows) & [node not in standing for node in nodes]
     if len(nodes) > 2 and these.count > 1:
         weight = these.unperturbed_weights().reshape(-1)[: these.count]
         at = storage.POSE * rows

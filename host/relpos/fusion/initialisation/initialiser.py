@@ -19,7 +19,7 @@ import numpy.typing as npt
 from relpos.fusion.initial_poses import PoseMixture
 from relpos.fusion.initialisation.search import MOVED_M, HypothesisSearch
 from relpos.fusion.timeline import Advance
-from relpos.measurements import Prior, Range
+from relpos.measurements import WIDEST_START_M, WIDEST_START_RAD, Prior, Range
 
 Floats = npt.NDArray[np.float64]
 
@@ -95,12 +95,13 @@ class HypothesisInitialiser:
         return node in self._unlocated or node in self.search.nodes
 
     def add(self, node: int, prior: Prior | None = None) -> None:
-        """Seek a node; of its pose nothing is known, or what ``prior`` has a finite sigma of."""
+        """Seek a node; of its pose nothing is known, or what ``prior`` knows well enough."""
         p = prior or Prior(node, 0.0, 0.0, 0.0, math.inf, math.inf)
         mean = np.array((p.x_m, p.y_m, p.heading_rad), float)
         sigma = np.array((p.sigma_m, p.sigma_m, p.sigma_rad), float)
+        sigma[sigma >= (WIDEST_START_M, WIDEST_START_M, WIDEST_START_RAD)] = math.inf
         self._unlocated[node] = _UnlocatedNode(mean, sigma)
-        if math.isfinite(p.sigma_m):
+        if math.isfinite(sigma[0]):
             self._has_frame = True
 
     def advance(self, step: Advance, *, faulty: bool = False) -> None:

@@ -60,9 +60,13 @@ def reported_sigmas(step: Advance) -> tuple[float, float, float]:
     """Return a piece's reported deviations of forward (m), left (m), turn (rad); NaN where none.
 
     Ranges correct the path as it goes: a common scale error does not build up, so that the
-    motion's error alone counts where it is reported.
+    motion's error alone counts where it is reported. Who moves without any error does not know it:
+    zeros stand for that elsewhere.
     """
     along = step.sigma_x_m if step.sigma_x_alone_m is None else step.sigma_x_alone_m
+    moved = step.dx_m != 0.0 or step.dy_m != 0.0
+    if moved and not (along or step.sigma_y_m or step.sigma_theta_rad):
+        return math.nan, math.nan, math.nan
     return (
         math.nan if along is None else along,
         math.nan if step.sigma_y_m is None else step.sigma_y_m,

@@ -253,13 +253,13 @@ def build_graph(
         builder.add(step, timeline.reported_s)
     if not builder.times:
         raise RelposError("no motion was received: nothing can be smoothed")
-    return _finished(builder, priors), builder.unused
+    return _finished(builder, priors, timeline.start_s), builder.unused
 
 
-def _finished(builder: _Builder, priors: Sequence[Prior]) -> Graph:
+def _finished(builder: _Builder, priors: Sequence[Prior], start_s: float) -> Graph:
     names = tuple(sorted(builder.seen | {p.node for p in priors}))
     row = {node: k for k, node in enumerate(names)}
-    first_s = min([0.0, *(entry.time_s for entry in builder.ranges)])
+    first_s = min([start_s, *(entry.time_s for entry in builder.ranges)])
     if builder.times[0] <= first_s:
         first_s = builder.times[0] - 1.0
     time_s = np.array([first_s, *builder.times])
