@@ -128,7 +128,7 @@ WIDEST_START_M, WIDEST_START_RAD = 15.0, 1.8
 """A start that is less well known is searched for, as an unknown one is.
 
 Four people on 30 m x 30 m, all off by their sigma, distance RMSE: 0.6 m from 10 m, 4 to 5 m from
-20 m, 0.2 to 1.7 m where all is searched for. Headings cost 0.2 m at most up to 1.4 rad, 2.5 m at pi.
+20 m, 0.2 to 1.7 m where all is searched for. Headings cost 0.2 m at most up to 1.4 rad, 2.5 at pi.
 """
 
 
