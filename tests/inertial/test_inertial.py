@@ -110,6 +110,14 @@ def test_the_covariance_stays_positive_definite_over_twenty_minutes(team, magnet
         assert result.counters["covariance_repairs"] == 0
 
 
+@pytest.mark.parametrize("walker", range(4))
+def test_two_hours_without_a_compass_end_as_they_began(team, walker):
+    lap = recorded(team[walker], walker)
+    path_m = replay.reckon(np.tile(lap, (40, 1))).rows["path_m"][len(lap) - 1 :: len(lap)]
+    laps_m = np.diff(path_m)
+    assert laps_m[-10:].mean() == pytest.approx(laps_m[:3].mean(), rel=0.08)
+
+
 # --- what a wearer relies on ------------------------------------------------------------------
 
 
@@ -148,6 +156,19 @@ def test_standing_on_learns_the_bias_better():
     ]
     assert off[0] > 0.2
     assert off[1] < 0.12
+
+
+def test_standing_finds_a_bias_that_the_filter_held_to_be_impossible(team):
+    # Switched on while walking, and off by four times what is expected: 240 degrees a minute.
+    walk = recorded(team[0], begin_s=20.0, bias_rad_s=0.0)[: 30 * RATE_HZ]
+    up = walk[:, :3].mean(axis=0)
+    up /= np.linalg.norm(up)
+    still = np.zeros((300 * RATE_HZ, 6))
+    still[:, :3] = 9.80665 * up
+    imu = np.vstack([walk, still])
+    imu[:, 3:] += np.radians(4.0) * up
+    imu += np.random.default_rng(1).standard_normal(imu.shape) * ([0.02] * 3 + [0.001] * 3)
+    assert np.degrees(replay.reckon(imu).bias_rad_s @ up) > 3.0
 
 
 def test_getting_ready_is_not_taken_for_bias():

@@ -17,7 +17,7 @@ namespace {
 const float kDefaults[] PROGMEM = {
     0.93f,          // 0.53 of the stature (Zijlstra and Hof 1997); here of 1.75 m
     2.14f,          // all people of docs/walkers.md
-    0.06f,          // what people differ by whose steps are not flagged (docs/walkers.md)
+    kPopulationScale,
     39.0f,          // just under 4 g
     17.4f,          // just under 1000 deg/s
     kPi / 180.0f,   // 1 deg/s: what a warmed-up, once zeroed MPU-9150 keeps
@@ -88,6 +88,9 @@ const float kStraight_rad = 12.0f * kDegree;    // two steps that turn more are 
 const float kStraightGate = 9.0f;               // innovation squared over its variance
 const float kStraightSigma_rad_s = 0.6f * kDegree;
 const float kSettled_s = 1.0f, kStill_s = 5.0f;  // standing, of which 5 s make a measurement
+// Standing is certain: what contradicts the bias makes it doubtful, by this share of the square (1/16
+// and 1/64 find a bias of 2 deg/s as well). Else one that moved with temperature is never found again.
+const float kStoodDoubt = 1.0f / 32;
 const float kStillSigma_m_s = 0.1f;   // sway of 2 cm/s that stays the same over several updates
 const float kLooseSigma_m_s = 0.5f;   // moving without steps: shuffling, bending
 const float kLooseNoise_m2_s = 0.05f;  // 0.2 m in a second may go unseen without a step
@@ -138,14 +141,15 @@ InertialConfig::InertialConfig() {
   memcpy_P(static_cast<void*>(this), kDefaults, sizeof kDefaults);
 }
 
-DeadReckoning::DeadReckoning() { reset(); }
+DeadReckoning::DeadReckoning() : bias_rad_s_() { reset(); }
 
 void DeadReckoning::reset() {
-  // All but the configuration starts at zero, cleared as one block: member by member it would be a
-  // kilobyte of the Uno's flash. Every member is a number, an enum or an array of such.
-  // The configuration is the first member and stays.
+  // All but what is known of the wearer and the sensor starts at zero, cleared as one block: member by
+  // member it would be a kilobyte of the Uno's flash. Every member is a number, an enum or an array of
+  // such. The configuration and the bias are the first members and stay.
   static_assert(__is_standard_layout(DeadReckoning), "the configuration is at its start");
-  memset(reinterpret_cast<uint8_t*>(this) + sizeof config_, 0, sizeof *this - sizeof config_);
+  const size_t kept = sizeof config_ + sizeof bias_rad_s_;
+  memset(reinterpret_cast<uint8_t*>(this) + kept, 0, sizeof *this - kept);
   displacement_.quality_flags = kStarting | kForwardUnknown | kBiasUncertain;
   filter_.reset(kTiltMoving_rad * kTiltMoving_rad,
                 config_.gyro_bias_sigma_rad_s * config_.gyro_bias_sigma_rad_s,
@@ -224,6 +228,7 @@ RELPOS_APART void DeadReckoning::initialise(bool still) {
         (since_.impulse_m_s[kX] - dot(position_m_, position_m_) * share) * share * kSwayShare;
     variance *= kStandingPrior;
     const float weight = variance / (variance + noise);
+    add_scaled(bias_rad_s_, bias_rad_s_, -weight, kAxes);
     add_scaled(bias_rad_s_, position_m_, share * weight, kAxes);
     variance = noise * weight;
   }
@@ -461,10 +466,8 @@ RELPOS_APART void DeadReckoning::capture_span() {
 
 RELPOS_APART void DeadReckoning::predict_attitude() {
   // What the heading loses while it turns, never what a compass gives back: totals only grow.
-  const float before = filter_.covariance(kAttitude + kZ, kAttitude + kZ);
   attitude_.normalise();
-  filter_.predict_attitude(rotation_, span_.time_s);
-  const float growth = filter_.covariance(kAttitude + kZ, kAttitude + kZ) - before;
+  const float growth = filter_.predict_attitude(rotation_, span_.time_s);
   if (growth > 0.0f) displacement_.variance_heading_rad2 += growth;
   motion_pending_ = true;
 }
@@ -514,8 +517,7 @@ void DeadReckoning::run(Job job) {
   switch (job) {
     case kFlush:
       predict_attitude();
-      if (!velocity_known_) job_ = kVertical;
-      if (!step_directed_) job_ = kVertical;
+      if (!velocity_known_ || !step_directed_) job_ = kVertical;
       return;
     case kForward:
       memcpy(direction, walk_, sizeof walk_);
@@ -574,7 +576,10 @@ void DeadReckoning::run(Job job) {
     memcpy_P(&sigma, &kSigmas[which], sizeof sigma);
   }
   float variance = sigma * sigma;
-  if (group == kBias && square > kStraightGate * rate_variance(variance, direction)) return;
+  if (group == kBias && square > kStraightGate * rate_variance(variance, direction)) {
+    if (job == kStood) filter_.widen(kBias, square * kStoodDoubt, kAxes);
+    return;
+  }
   // Errors of rate and field have long tails: the further off, the less a reading says.
   if (group <= kBias) variance += square;
   if (job == kForward) {

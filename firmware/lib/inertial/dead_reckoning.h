@@ -23,6 +23,8 @@ struct ImuSample {
   float angular_rate_rad_s[kAxes];
 };
 
+const float kPopulationScale = 0.06f;  // what people differ by whose steps are not flagged (docs/walkers.md)
+
 // What is known of the wearer and of the sensor. The defaults are used until configure().
 struct InertialConfig {
   InertialConfig();  // the defaults: kDefaults in dead_reckoning.cpp, in this order
@@ -52,7 +54,7 @@ class DeadReckoning {
   void configure(const InertialConfig& config) { config_ = config; }
   // To be changed in place: in force from the next step on, the bias's sigma from the next reset().
   InertialConfig& config() { return config_; }
-  void reset();
+  void reset();  // keeps the gyroscope's bias, which is as uncertain as configured
   void update(const ImuSample& sample, float dt_s);  // at 50 Hz; dt nominally 0.02 s
   void magnetometer(const float field_ut[kAxes]);    // in the accelerometer's axes, about 5 Hz
   const Displacement& displacement() const { return displacement_; }
@@ -112,6 +114,7 @@ class DeadReckoning {
 
   // What is small and often used first: the AVR reaches 64 bytes from a pointer in one instruction.
   InertialConfig config_;
+  float bias_rad_s_[kAxes];  // beside the configuration: reset() keeps both
 
   uint32_t ticks_;
   uint16_t step_ticks_;
@@ -140,7 +143,6 @@ class DeadReckoning {
   // Nominal state. While gathering, velocity_ and position_ hold the sums of force and rate.
   Attitude attitude_;
   float rotation_[kAxes * kAxes];  // the attitude as a matrix, as the tick has it at its beginning
-  float bias_rad_s_[kAxes];
   float velocity_m_s_[kAxes];
   float position_m_[kAxes];         // since the last mid-stance
   float stance_position_m_[kAxes];  // of the step whose updates are under way

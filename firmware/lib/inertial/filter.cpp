@@ -13,6 +13,12 @@ const float kDegree = kPi / 180.0f;
 const float kAttitudeNoise_rad2_s = (0.15f * kDegree) * (0.15f * kDegree);
 const float kVelocityNoise_m2_s3 = 0.25f * 0.25f;
 const float kBiasNoise_rad2_s3 = (0.004f * kDegree) * (0.004f * kDegree);
+// Without a compass the heading's variance grows for ever, and a step's measurements, in which errors
+// of heading and velocity cancel, are linear only for a small one. Twelve simulated people, two hours:
+// the way of the last half hour is 18 % (at worst 73 %) off that of the first minutes without a bound,
+// 2.1 (5) % with 0.3 rad2, 1.6 (5) % with 0.1; from 0.2 down, headings of people under 0.6 m/s are
+// surer than right (walk_treadmill_stroke_lumbar: NEES 1.7, 2.1).
+const float kMostHeading_rad2 = 0.3f, kLessHeading = 0.9f;
 // A variance never falls below these; float32 rounding would otherwise make it negative.
 const float kFloor[kStates / kAxes] = {1e-9f, 1e-12f, 1e-7f, 0.0f};
 
@@ -67,13 +73,21 @@ RELPOS_APART void ErrorFilter::add_column(float out[kStates], uint8_t state, flo
   }
 }
 
-void ErrorFilter::predict_attitude(const float rotation[kAxes * kAxes], float dt_s) {
+float ErrorFilter::predict_attitude(const float rotation[kAxes * kAxes], float dt_s) {
+  const uint8_t heading = kAttitude + kZ;
+  if (*at(heading, heading) > kMostHeading_rad2) {
+    // All covariances and the variance by the same factor: less correlated, it stays a covariance.
+    mix(heading, heading, kLessHeading - 1.0f);
+    reference_[0] *= kLessHeading;
+  }
+  const float before = *at(heading, heading);
   for (uint8_t i = 0; i < kAxes; ++i) {
     for (uint8_t j = 0; j < kAxes; ++j) mix(kAttitude + i, kBias + j, -dt_s * *rotation++);
   }
   reference_[0] -= dt_s * dot(rotation - kAxes, reference_ + 1);
   widen(kAttitude, kAttitudeNoise_rad2_s * dt_s, kAxes);
   widen(kBias, kBiasNoise_rad2_s3 * dt_s, kAxes);
+  return *at(heading, heading) - before;
 }
 
 void ErrorFilter::settle() {

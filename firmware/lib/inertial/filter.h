@@ -31,7 +31,8 @@ class ErrorFilter {
 
   // Diagonal start, from variances; the heading starts as known.
   void reset(float tilt_rad2, float bias_rad2_s2, float velocity_m2_s2);
-  void predict_attitude(const float rotation[kAxes * kAxes], float dt_s);
+  // Returns by how much the heading's variance grew.
+  float predict_attitude(const float rotation[kAxes * kAxes], float dt_s);
   void predict_motion(const float impulse_m_s[kAxes], float dt_s);
   // Before a measurement, a restart or a look at the position's variances.
   void settle();

@@ -187,7 +187,7 @@ void Node::show_health() {
     } else if (plan_.team() == 0) {
       turn = 1023 - 256;
     }
-    on = (static_cast<uint16_t>(clock_.ms()) & turn) < lit;
+    on = (now_ms() & turn) < lit;
   }
   if (on != led_) {
     led_ = on;
@@ -204,7 +204,8 @@ RELPOS_UNCLONED void Node::configure_inertial() {
   config.leg_length_m = static_cast<float>(settings_.leg_length_mm) * 1e-3f;
   config.step_gain = static_cast<float>(settings_.step_gain_permille) * 1e-3f;
   // A gain that was set comes from this wearer's walks or ranges.
-  if (settings_.step_gain_permille != kPopulationGainPermille) config.scale_sigma = kWearersScale;
+  config.scale_sigma =
+      settings_.step_gain_permille != kPopulationGainPermille ? kWearersScale : kPopulationScale;
   const int16_t sigma = settings_.calibration[wire::kGyroBiasSigma];
   if (sigma != 0) {
     config.gyro_bias_sigma_rad_s = sigma * wire::kCalibrationUnit;
@@ -596,22 +597,25 @@ bool Node::radio_free() {
 }
 
 // Motion and status are written when they are sent, so they cannot wait in a queue and be dropped;
-// ranges wait in a ring that gives up the oldest. They come last: they alone can fill the air.
+// ranges wait in a ring that gives up the oldest. They come last: they alone can fill the air. So can
+// motion, where the radio's reports do not arrive and a frame takes 200 ms: every other frame at most.
 RELPOS_APART bool Node::send_next() {
   uint8_t* body = frame_ + wire::kHeaderBytes;
+  const bool after_motion = frame_[wire::kTypeAt] == static_cast<uint8_t>(wire::MessageType::kMotion);
   if (answer_due() && !store_.saving()) {  // acknowledged once it is done for good
     send(wire::MessageType::kAcknowledgement, fill_answer(body));
-  } else if (period_over(&motion_ms_, settings_.report_period_ms)) {
+  } else if (!after_motion && period_over(&motion_ms_, settings_.report_period_ms)) {
     send(wire::MessageType::kMotion, fill_motion(body));
   } else if (period_over(&status_ms_, settings_.status_period_ms)) {
     send(wire::MessageType::kStatus, fill_status(body));
   } else if (steps_report_due()) {
     send(wire::MessageType::kSteps, fill_steps(body));
-  } else if (raw_reports_ != 0) {
-    if (!period_over(&raw_ms_, kRawPeriodMs)) return false;
+  } else if (raw_reports_ != 0 && period_over(&raw_ms_, kRawPeriodMs)) {
     send(wire::MessageType::kSamples, fill_samples(body));
   } else if (ranges_.count() >= wire::kMostRanges || (ranges_.count() > 0 && (plan_.resting() || !pozyx_.running()))) {
     send(wire::MessageType::kRanges, fill_ranges(body));
+  } else if (period_over(&motion_ms_, settings_.report_period_ms)) {  // nothing else waits
+    send(wire::MessageType::kMotion, fill_motion(body));
   } else {
     return false;
   }
@@ -721,7 +725,7 @@ uint8_t Node::fill_status(uint8_t* body) {
   if (magnetometer_.running()) health |= flag(wire::Health::kMagnetometer);
   if (pozyx_.running()) health |= flag(wire::Health::kPozyx);
   if (pozyx_.running() && barometer_.ready()) health |= flag(wire::Health::kPressure);
-  plan_.age(static_cast<uint16_t>(clock_.ms()));
+  plan_.age(now_ms());
   status.neighbours = plan_.neighbours();
   status.team = plan_.team();
   if (status.team != 0) health |= flag(wire::Health::kBeacon);
@@ -733,8 +737,7 @@ uint8_t Node::fill_status(uint8_t* body) {
 
 bool Node::steps_report_due() const {
   if (steps_.count() == 0) return false;
-  const uint16_t age_ms =
-      static_cast<uint16_t>(static_cast<uint16_t>(clock_.ms()) - steps_.oldest().time_ms);
+  const uint16_t age_ms = static_cast<uint16_t>(now_ms() - steps_.oldest().time_ms);
   return steps_.count() >= kPendingSteps / 2 || age_ms > kMostStepAgeMs;
 }
 
