@@ -155,8 +155,8 @@ def find(
     case: tuple[str, str, str],
     imu: str = "mpu9150",
     cable: bool = True,
-) -> None:
-    """Check a node with that fault until the line comes, before which none is wrong."""
+) -> str | None:
+    """Check a node with that fault until the line comes, before which none is wrong; its remedy."""
     fault, part, words = case
     keys = fault.split(":")[2:]
     spec = ":".join((*fault.split(":")[:2], ",".join((*keys, "node=1"))))
@@ -166,6 +166,7 @@ def find(
     assert named.part == part, named
     assert re.search(words, named.found), named
     assert named.remedy
+    return named.remedy
 
 
 @pytest.mark.parametrize("case", BY_CABLE, ids=[case[0] for case in BY_CABLE])
@@ -173,6 +174,13 @@ def test_each_fault_of_chips_and_bus_is_named(
     monkeypatch: pytest.MonkeyPatch, case: tuple[str, str, str]
 ) -> None:
     find(monkeypatch, case)
+
+
+def test_a_gyroscope_that_the_firmware_would_never_see_at_rest_is_to_be_calibrated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    remedy = find(monkeypatch, ("imu:wrong:value=12", "gyroscope", "at rest"))
+    assert remedy == "calibrate it: relpos node calibrate"
 
 
 @pytest.mark.parametrize("case", BY_RADIO, ids=[case[0] for case in BY_RADIO])
