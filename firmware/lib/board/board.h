@@ -8,6 +8,10 @@
 
 namespace relpos {
 
+// Whether `now` has reached `due`, on any counter that wraps, as long as they are less than half
+// its span apart.
+inline bool reached(uint32_t now, uint32_t due) { return static_cast<int32_t>(now - due) >= 0; }
+
 // How an I2C transaction ended. The numbers are part of native/engine.h.
 enum class BusStatus : uint8_t {
   kOk = 0,

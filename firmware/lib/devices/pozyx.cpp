@@ -60,10 +60,6 @@ const Exchange kExchanges[] RELPOS_FLASH = {
 };
 constexpr uint8_t kMostAnswer = 11;
 
-bool is_due(uint32_t now_us, uint32_t due_us) {
-  return static_cast<int32_t>(now_us - due_us) >= 0;
-}
-
 }  // namespace
 
 void Pozyx::begin(uint16_t network_id) {
@@ -139,7 +135,7 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
     *wait_us = kIdleUs;
     return Event::kNothing;
   }
-  if (state_ == State::kIdentify && !is_due(now_us, due_us_)) {
+  if (state_ == State::kIdentify && !reached(now_us, due_us_)) {
     *wait_us = due_us_ - now_us;
     return Event::kNothing;
   }
@@ -199,7 +195,7 @@ Pozyx::Event Pozyx::step(Board& board, uint32_t now_us, uint32_t* wait_us, Resul
         state_ = State::kFetch;
         return Event::kNothing;
       }
-      if (is_due(now_us, due_us_)) {
+      if (reached(now_us, due_us_)) {
         // Neither a result nor an error: setting the chip up anew may help. (Not by the mask, which
         // concerns the interrupt's pin: without it the flags show as well.)
         count_failure();

@@ -7,10 +7,6 @@
 
 namespace relpos {
 
-// Whether `now` has reached `due`, on any counter that wraps, as long as they are less than half
-// its span apart.
-inline bool reached(uint32_t now, uint32_t due) { return static_cast<int32_t>(now - due) >= 0; }
-
 // Milliseconds since begin(). They wrap after 49 days.
 class NodeClock {
  public:

@@ -119,7 +119,7 @@ RELPOS_UNCLONED void RangingPlan::done(bool success) {
     ranged_[byte] |= bit;
   } else if (count_ != 0 && lately != 0 && ++again_ <= kRetries) {
     --step_;
-    --tried_;
+    if (tried_ != 0) --tried_;  // a beacon may have begun the next round meanwhile
     return;
   }
   again_ = 0;

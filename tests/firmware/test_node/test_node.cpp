@@ -511,6 +511,35 @@ TEST(a_node_retries_only_peers_it_ranged_recently_in_its_window) {
   CHECK(others >= 3 * 29);     // thirty rounds, the gone one takes nothing from the others
 }
 
+TEST(an_exchange_that_fails_after_the_next_beacon_costs_no_round) {
+  wire::Beacon beacon;
+  beacon.period_ms = 2000;
+  beacon.count = 20;
+  for (uint8_t i = 0; i < beacon.count; ++i) beacon.entries[i].node = static_cast<uint8_t>(i + 1);
+  relpos::RangingPlan plan = relpos::RangingPlan();
+  plan.begin(0, 1);
+  uint8_t exchanges[12] = {};
+  uint16_t busy_until_ms = 0;
+  bool busy = false, fails = false;
+  for (uint16_t now_ms = 0; now_ms < 24000; ++now_ms) {
+    const uint8_t round = static_cast<uint8_t>(now_ms / 2000);
+    if (now_ms % 1000 == 0) {
+      beacon.phase_ms = now_ms % 2000;
+      beacon.round = round;
+      plan.beacon(now_ms, beacon, 20);
+    }
+    if (now_ms < busy_until_ms) continue;
+    if (busy) plan.done(!fails);
+    uint16_t wait_ms = 0;
+    busy = plan.next(now_ms, 20, 6, 2000, &wait_ms) != 0;
+    if (!busy) continue;
+    ++exchanges[round];
+    fails = round == 9 && now_ms % 2000 > 1955;  // it is still waited for when round 10 is told
+    busy_until_ms = static_cast<uint16_t>(now_ms + (fails ? 100 : 22));
+  }
+  CHECK_EQUAL(exchanges[8], exchanges[10]);
+}
+
 TEST(the_led_distinguishes_the_states) {
   enum State { kWell, kNoBeacon, kSupplyLow, kSensorMissing };
   // Flashes in 4.096 s, and the share of the time that it is lit, in per cent.
@@ -803,6 +832,18 @@ TEST(without_a_module_s_answer_telemetry_goes_on_and_counts_it) {
   wire::Status status;
   CHECK(team.read(wire::MessageType::kStatus, &status));
   CHECK(status.radio_failures > 10);
+}
+
+TEST(motion_that_is_always_due_leaves_room_for_ranges_and_status) {
+  Team team;
+  team.world.command(1, code(wire::CommandCode::kSetReportPeriodMs), 100);
+  team.run_ms(1500);
+  team.world.module_present = false;  // 5 frames a second at most
+  team.world.count = 0;
+  team.run_ms(30000);
+  CHECK(team.sent(wire::MessageType::kMotion) >= 70);
+  CHECK(team.sent(wire::MessageType::kRanges) >= 10);
+  CHECK(team.sent(wire::MessageType::kStatus) >= 2);
 }
 
 TEST(a_slow_line_drops_the_oldest_ranges_counts_them_and_keeps_the_motion) {
