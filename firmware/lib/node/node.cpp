@@ -601,7 +601,8 @@ bool Node::radio_free() {
 // motion, where the radio's reports do not arrive and a frame takes 200 ms: every other frame at most.
 RELPOS_APART bool Node::send_next() {
   uint8_t* body = frame_ + wire::kHeaderBytes;
-  const bool after_motion = frame_[wire::kTypeAt] == static_cast<uint8_t>(wire::MessageType::kMotion);
+  const bool after_motion = settings_.report_period_ms <= kTransmitStatusMs &&
+                            frame_[wire::kTypeAt] == static_cast<uint8_t>(wire::MessageType::kMotion);
   if (answer_due() && !store_.saving()) {  // acknowledged once it is done for good
     send(wire::MessageType::kAcknowledgement, fill_answer(body));
   } else if (!after_motion && period_over(&motion_ms_, settings_.report_period_ms)) {
