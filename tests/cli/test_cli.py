@@ -490,6 +490,19 @@ def test_a_run_that_was_not_simulated_is_not_replaced_by_one_that_is(
     assert again.exit_code == 0, again.output
 
 
+@pytest.mark.parametrize("name", ["imu.csv", "landmarks.csv"])
+def test_a_recording_of_one_table_is_not_replaced_by_a_simulation(
+    tmp_path: Path, name: str
+) -> None:
+    recorded = tmp_path / name
+    recorded.write_text("rows that nobody can make again\n")
+    refused = one_clear_line(
+        relpos("simulate", "--scenario", "lab", "--seed", 3, "--out", tmp_path)
+    )
+    assert "holds a run that was not simulated" in refused
+    assert recorded.read_text() == "rows that nobody can make again\n"
+
+
 def test_a_simulation_that_could_not_be_read_is_not_written(tmp_path: Path) -> None:
     refused = one_clear_line(
         relpos(

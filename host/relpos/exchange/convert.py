@@ -70,7 +70,7 @@ def _format_of(source: Path) -> Format:
     if not source.exists():
         raise DataError(f"{source}: no such file or directory")
     if source.is_dir():
-        tables = ("estimate.csv", "imu.csv", "landmarks.csv", *TABLE_NAMES)
+        tables = ("estimate.csv", *TABLE_NAMES)
         if (source / "run.toml").exists() or any(find_table(source, name) for name in tables):
             return Format.RUN
         if any(source.glob("*.tum")):

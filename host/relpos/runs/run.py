@@ -417,8 +417,8 @@ _TABLES = (
     _Table("steps.csv", Step),
     _Table("truth.csv", Truth),
 )
-TABLE_NAMES = tuple(table.name for table in _TABLES)
-"""The files of a run directory that hold rows by time and node."""
+TABLE_NAMES = (*(table.name for table in _TABLES), "imu.csv", "landmarks.csv")
+"""The tables of a run directory: a folder that has one of them holds a run."""
 
 
 def _by_kind(rows: Iterable[Observation | Truth]) -> dict[type, list[Any]]:
