@@ -228,6 +228,7 @@ RELPOS_APART void DeadReckoning::initialise(bool still) {
         (since_.impulse_m_s[kX] - dot(position_m_, position_m_) * share) * share * kSwayShare;
     variance *= kStandingPrior;
     const float weight = variance / (variance + noise);
+    // From what was known of the bias, nothing at first, towards the mean.
     add_scaled(bias_rad_s_, bias_rad_s_, -weight, kAxes);
     add_scaled(bias_rad_s_, position_m_, share * weight, kAxes);
     variance = noise * weight;

@@ -415,7 +415,7 @@ def _fuse_port(
     if initial is Initial.TRUTH:
         raise DataError(f"{job.source}: a port has no truth to start from")
     check_port(job.source)
-    team_key(key_file)
+    team_key(key_file)  # for its errors, before minutes of preparing
     # Before the port is open, because nothing reads it meanwhile. The nodes that start at one
     # place are received later; two stand for them here.
     some = common_priors((1, 2))

@@ -1,5 +1,5 @@
 // Torso dead reckoning on a synthetic walk: the same figures on the PC and on the AVR, whose compiler
-// has miscompiled float loops before. Physics on real walks: tests/host/test_inertial.py.
+// has miscompiled float loops before. Physics on real walks: tests/inertial/test_inertial.py.
 #include "support/check.h"
 
 #include <math.h>

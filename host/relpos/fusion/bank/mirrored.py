@@ -113,7 +113,7 @@ def open_nodes(
     these: HypothesisSet,
     covariance: Floats,
     sigma_m: Floats,
-    standing: Container[int] = (),
+    standing: Container[int],
 ) -> tuple[set[int], dict[int, set[int]]]:
     """Return who is open, and of each located node those whose distance to it is known.
 

@@ -39,8 +39,8 @@ RATE_HZ, RATE_TOLERANCE = 50.0, 0.02
 STILL_RAD_S, STILL_M_S2 = 0.02, 0.3
 """Standard deviation of a single sample on a table: a tenth of it."""
 SOUND_BIAS_DEG_S, FREE_BIAS_DEG_S, KNOWN_BIAS_DEG_S = 20.0, 10.0, 2.0
-"""What a data sheet allows; beyond what the firmware does not see that a node lies still; and what
-a calibrated sensor's bias moves by with temperature."""
+"""What a data sheet allows; beyond what the firmware does not see that a node lies still (its
+``kQuietRate_rad_s`` is 11.5); and what a calibrated sensor's bias moves by with temperature."""
 FORCE_TOLERANCE_M_S2 = 1.2
 """Data sheet: 80 mg along x and y, 3 % of scale."""
 GRAVITY_M_S2 = 9.80665
